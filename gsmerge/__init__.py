@@ -50,8 +50,7 @@ if TYPE_CHECKING:
     from gsmerge.stages.segment import superpixels as superpixels
     from gsmerge.types import Cameras as Cameras
     from gsmerge.types import Gaussians as Gaussians
-    from gsmerge.types import PixelScene as PixelScene
-    from gsmerge.types import UnalignedScene as UnalignedScene
+    from gsmerge.types import Scene as Scene
 
 __version__ = "0.1.0"
 
@@ -78,7 +77,7 @@ _PUBLIC = {
     "encoded.encode": ("encode_scene",),
     "encoded.encoded": ("Encoded",),
     "encoded.gsm_file": ("load_encoded", "save_encoded"),
-    "types": ("Cameras", "Gaussians", "UnalignedScene", "PixelScene"),
+    "types": ("Cameras", "Gaussians", "Scene", "Scene"),
 }
 _EXPORTS = {name: home for home, names in _PUBLIC.items() for name in names}
 

@@ -29,7 +29,7 @@ from gsmerge.pipeline import compact
 from gsmerge.report import report_document, to_json
 from gsmerge.runtime.memory import release_memory
 from gsmerge.runtime.record import Progress
-from gsmerge.types import PixelScene, UnalignedScene
+from gsmerge.types import Scene
 
 NO_PHOTOS = "no photos found, so nothing is fitted and no PSNR measured; name their folder with --images"
 
@@ -45,7 +45,7 @@ class SceneInput:
         notes: Of the reader.
     """
 
-    scene: PixelScene | UnalignedScene
+    scene: Scene
     recognised: dict[str, Any]
     comments: Sequence[str]
     notes: Sequence[str]
@@ -143,7 +143,7 @@ def read_input(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: Rea
         SceneError: If the scene cannot be read.
     """
     loaded = load_files(files, opacity=opacity, hints=hints)
-    no_photos = isinstance(loaded.scene, PixelScene) and loaded.scene.images is None
+    no_photos = loaded.scene.aligned and loaded.scene.images is None
     notes = (*loaded.notes, *([NO_PHOTOS] if no_photos else []), *compact_notes(loaded))
     scene_input = SceneInput(loaded.scene, recognised_of(loaded), kept_comments(loaded.ply), notes)
     del loaded  # its arrays are as large as the scene's
@@ -151,7 +151,7 @@ def read_input(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: Rea
     return scene_input
 
 
-def check_saved_cameras(scene: PixelScene | UnalignedScene, path: Path | None) -> None:
+def check_saved_cameras(scene: Scene, path: Path | None) -> None:
     """Refuse a file for the cameras of a scene without any."""
     if path is not None and len(scene) == 0:
         raise UsageError(f"--save-cameras {path}: expected a scene with cameras, got none")
@@ -161,7 +161,7 @@ def compact_notes(loaded: SceneLoad) -> tuple[str, ...]:
     """A note where a scene is a result of gsmerge: a file of its own with far fewer Gaussians than pixels."""
     scene = loaded.scene
     pixels = len(scene) * scene.cameras.height * scene.cameras.width
-    if isinstance(scene, PixelScene) or LOGIT_COMMENT not in loaded.ply.comments or scene.num_gaussians > pixels / 2:
+    if scene.aligned or LOGIT_COMMENT not in loaded.ply.comments or scene.num_gaussians > pixels / 2:
         return ()
     count = f"{scene.num_gaussians:,} Gaussians for {pixels:,} pixels" if pixels else "no Gaussian per pixel"
     return (f"the scene is compact already ({count}, written by gsmerge): start from the original for more detail",)

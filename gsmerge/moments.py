@@ -9,7 +9,7 @@ import numpy as np
 
 from gsmerge.kernels.gaussians.pool import decompose, pool
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import FeatureGaussians, Gaussians, PixelScene, UnalignedScene, to_float32
+from gsmerge.types import FeatureGaussians, Gaussians, Scene, to_float32
 
 Rule = Literal["depth", "paper"]
 
@@ -48,7 +48,7 @@ def _array(values: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(values, dtype=np.float32)
 
 
-def scene_members(scene: PixelScene) -> Members:
+def scene_members(scene: Scene) -> Members:
     """The members of a canonical scene, with the pixel footprint of each in its own view."""
     g, cameras = scene.gaussians, scene.cameras
     means = _array(g.means)
@@ -66,7 +66,7 @@ def scene_members(scene: PixelScene) -> Members:
     return gaussian_members(g, footprints)
 
 
-def unaligned_members(scene: UnalignedScene, pixels: np.ndarray) -> Members:
+def unaligned_members(scene: Scene, pixels: np.ndarray) -> Members:
     """The members of a canonical scene without an order, by the pixel that each belongs to.
 
     Args:

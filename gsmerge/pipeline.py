@@ -46,14 +46,14 @@ from gsmerge.stages.match import match
 from gsmerge.stages.merge import MergedViews, merge, refine
 from gsmerge.stages.prepare import PreparedScene, prepare, scene_depth
 from gsmerge.stages.segment import scene_saliency
-from gsmerge.types import Cameras, FeatureGaussians, Gaussians, PixelScene, Segmentation, UnalignedScene
+from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Scene, Segmentation
 
 if TYPE_CHECKING:
     from gsmerge.networks.apply import NetworkContext
 
 
 def compact(
-    scene: PixelScene | UnalignedScene | str | os.PathLike[str],
+    scene: Scene | str | os.PathLike[str],
     options: CompactOptions | None = None,
     *,
     progress: Progress | None = None,

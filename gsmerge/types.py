@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -191,35 +192,24 @@ class LargePhotos:
         return replace(self, Ks=self.Ks[list(views)], ids=tuple(self.ids[view] for view in views))
 
 
-def _expect_views(scene: PixelScene | UnalignedScene) -> None:
-    if scene.images is not None:
-        _expect("images", scene.images, (len(scene.cameras), scene.cameras.height, scene.cameras.width, 3))
-    for what, some in (("view names", scene.names), ("large photos", getattr(scene.large_photos, "ids", None))):
-        if some is not None and len(some) != len(scene.cameras):
-            raise ValueError(f"expected {len(scene.cameras)} {what}, got {len(some)}")
-
-
-def _arrays(scene: PixelScene | UnalignedScene) -> dict[str, Any]:
-    """The fields of a scene that may hold tensors, as NumPy arrays."""
-    fields_of = {"gaussians": scene.gaussians.numpy(), "cameras": scene.cameras.numpy()}
-    names = [name for name in ("images", "valid", "missing") if getattr(scene, name, None) is not None]
-    return fields_of | {name: as_array(getattr(scene, name)) for name in names}
-
-
 @dataclass(frozen=True)
-class PixelScene:
-    """A scene with one Gaussian per pixel and view, in view-major, row-major order.
+class Scene:
+    """Gaussians, and the views that they were made from or that see them.
+
+    A scene is aligned where every row's pixel is known, as feed-forward models export one Gaussian per pixel and view:
+    row ``(v·H + y)·W + x`` then belongs to pixel (x, y) of view v. Rows that were not finite in the file are kept, as
+    fully transparent ones, so that the order survives; pixels that the file has no row for are filled up with such
+    ones, or with what a depth map says.
 
     Args:
-        gaussians: V·H·W rows; row ``(v·H + y)·W + x`` belongs to pixel (x, y) of view v. Rows that were not
-            finite in the file are kept, as fully transparent ones, so that the order survives; pixels that the
-            file has no row for are filled up with such ones, or with what a depth map says.
-        cameras: The V views; width and height are the grid's.
+        gaussians: n rows, in the frame of the cameras; V·H·W of an aligned scene.
+        cameras: The V views; none where none are known.
         images: ``[v,h,w,3]`` photos, sRGB in [0, 1], float32; None where there are none.
-        valid: ``[v,h,w]`` bool, False where there is no finite Gaussian.
+        pixel_ids: ``[n]`` int32, the pixel that each row belongs to, which is the row's own number, or -1 where the row
+            is no finite Gaussian; None where the pixels are not known.
         names: The views' names (image file names where known).
         missing: ``[v,h,w]`` bool, True where the file has no row for the pixel; None: nowhere.
-        large_photos: The photos with more pixels than the grid; None where they have no more.
+        large_photos: The photos with more pixels than the views; None where they have no more.
 
     Raises:
         ValueError: If the sizes do not fit together.
@@ -228,26 +218,44 @@ class PixelScene:
     gaussians: Gaussians
     cameras: Cameras
     images: np.ndarray | None
-    valid: np.ndarray
+    pixel_ids: np.ndarray | None
     names: tuple[str, ...]
     missing: np.ndarray | None = None
     large_photos: LargePhotos | None = None
 
     def __post_init__(self) -> None:
         v, h, w = len(self.cameras), self.cameras.height, self.cameras.width
-        if len(self.gaussians) != v * h * w:
-            raise ValueError(f"expected {v} x {h} x {w} = {v * h * w} Gaussians, got {len(self.gaussians)}")
-        _expect("valid", self.valid, (v, h, w))
+        if self.pixel_ids is not None:
+            if len(self.gaussians) != v * h * w:
+                raise ValueError(f"expected {v} x {h} x {w} = {v * h * w} Gaussians, got {len(self.gaussians)}")
+            _expect("pixel_ids", self.pixel_ids, (v * h * w,))
         if self.missing is not None:
             _expect("missing", self.missing, (v, h, w))
-        _expect_views(self)
+        if self.images is not None:
+            _expect("images", self.images, (v, h, w, 3))
+        for what, some in (("view names", self.names), ("large photos", getattr(self.large_photos, "ids", None))):
+            if some is not None and len(some) != v:
+                raise ValueError(f"expected {v} {what}, got {len(some)}")
 
     def __len__(self) -> int:
         return len(self.cameras)
 
-    def numpy(self) -> PixelScene:
-        """The same scene with NumPy arrays in place of tensors."""
-        return replace(self, **_arrays(self))
+    def numpy(self) -> Scene:
+        """Return the same scene with NumPy arrays in place of tensors."""
+        names = [name for name in ("images", "pixel_ids", "missing") if getattr(self, name) is not None]
+        arrays: dict[str, Any] = {name: as_array(getattr(self, name)) for name in names}
+        return replace(self, gaussians=self.gaussians.numpy(), cameras=self.cameras.numpy(), **arrays)
+
+    @property
+    def aligned(self) -> bool:
+        """Whether the pixel of every row is known."""
+        return self.pixel_ids is not None
+
+    @cached_property
+    def valid(self) -> np.ndarray:
+        """``[v,h,w]`` bool of an aligned scene: pixels that have a finite Gaussian."""
+        assert self.pixel_ids is not None
+        return np.asarray(self.pixel_ids >= 0).reshape(len(self.cameras), self.cameras.height, self.cameras.width)
 
     @property
     def num_missing(self) -> int:
@@ -261,7 +269,7 @@ class PixelScene:
 
     @property
     def stored(self) -> np.ndarray:
-        """``[v,h,w]`` bool: pixels whose Gaussian is a finite one of the file."""
+        """``[v,h,w]`` bool of an aligned scene: pixels whose Gaussian is a finite one of the file."""
         return self.valid if self.missing is None else self.valid & ~self.missing
 
     @property
@@ -275,51 +283,10 @@ class PixelScene:
         return self.cameras.height * self.cameras.width
 
 
-@dataclass(frozen=True)
-class UnalignedScene:
-    """Gaussians that belong to no pixels, with views that see them.
-
-    Args:
-        gaussians: Any number of rows, in the frame of the cameras.
-        cameras: The V views; none where none are known.
-        images: ``[v,h,w,3]`` photos, sRGB in [0, 1], float32; None where there are none.
-        names: The views' names (image file names where known).
-        large_photos: The photos with more pixels than the views; None where they have no more.
-
-    Raises:
-        ValueError: If the sizes do not fit together.
-    """
-
-    gaussians: Gaussians
-    cameras: Cameras
-    images: np.ndarray | None
-    names: tuple[str, ...]
-    large_photos: LargePhotos | None = None
-
-    def __post_init__(self) -> None:
-        _expect_views(self)
-
-    def __len__(self) -> int:
-        return len(self.cameras)
-
-    def numpy(self) -> UnalignedScene:
-        """The same scene with NumPy arrays in place of tensors."""
-        return replace(self, **_arrays(self))
-
-    @property
-    def num_gaussians(self) -> int:
-        """Gaussians of the file."""
-        return len(self.gaussians)
-
-    @property
-    def file_gaussians(self) -> Gaussians:
-        """All of them."""
-        return self.gaussians
-
-    @property
-    def pixels_per_view(self) -> int:
-        """H·W."""
-        return self.cameras.height * self.cameras.width
+def grid_ids(valid: np.ndarray) -> np.ndarray:
+    """Return the ``pixel_ids [n]`` of an aligned scene whose rows are finite Gaussians where ``valid [v,h,w]`` is."""
+    flat = np.asarray(valid).reshape(-1)
+    return np.where(flat, np.arange(len(flat), dtype=np.int32), np.int32(-1))
 
 
 @dataclass(frozen=True)

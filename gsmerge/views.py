@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from gsmerge.runtime.estimate import MAX_SCORED_VIEWS, REPORT_VIEWS
-from gsmerge.types import PixelScene, UnalignedScene
+from gsmerge.types import Scene, grid_ids
 
 
 def even_views(num_views: int, count: int) -> list[int]:
@@ -62,7 +62,7 @@ def midpoint_views(contexts: Sequence[float], candidates: Sequence[float]) -> li
     return chosen
 
 
-def distinct_views(scene: PixelScene | UnalignedScene) -> tuple[list[int], list[int]]:
+def distinct_views(scene: Scene) -> tuple[list[int], list[int]]:
     """The views without those that repeat an earlier one: the same camera, the same photo, the same Gaussians.
 
     Returns:
@@ -79,18 +79,18 @@ def distinct_views(scene: PixelScene | UnalignedScene) -> tuple[list[int], list[
     return kept, places
 
 
-def _equal_views(scene: PixelScene | UnalignedScene, one: int, other: int) -> bool:
+def _equal_views(scene: Scene, one: int, other: int) -> bool:
     """Whether two views of one camera have the same photo and the same Gaussians."""
     if scene.images is not None and not np.array_equal(scene.images[one], scene.images[other]):
         return False
-    if isinstance(scene, UnalignedScene):
+    if not scene.aligned:
         return True
     size = scene.pixels_per_view
     a, b = (vars(scene.gaussians[view * size : (view + 1) * size]) for view in (one, other))
     return all(np.array_equal(a[name], b[name]) for name in a)
 
 
-def subset(scene: PixelScene | UnalignedScene, view_ids: Sequence[int]) -> PixelScene | UnalignedScene:
+def subset(scene: Scene, view_ids: Sequence[int]) -> Scene:
     """The scene as if only some of its views had been given: their Gaussians, cameras and photos.
 
     Unaligned Gaussians belong to no view, and all stay.
@@ -99,7 +99,7 @@ def subset(scene: PixelScene | UnalignedScene, view_ids: Sequence[int]) -> Pixel
     images = None if scene.images is None else scene.images[ids]
     names = tuple(scene.names[i] for i in ids)
     large = None if scene.large_photos is None else scene.large_photos[ids]
-    if isinstance(scene, UnalignedScene):
+    if not scene.aligned:
         return replace(scene, cameras=scene.cameras[ids], images=images, names=names, large_photos=large)
     size = scene.pixels_per_view
     rows = (np.asarray(ids, np.int64)[:, None] * size + np.arange(size)).reshape(-1)
@@ -108,7 +108,7 @@ def subset(scene: PixelScene | UnalignedScene, view_ids: Sequence[int]) -> Pixel
         gaussians=scene.gaussians[rows],
         cameras=scene.cameras[ids],
         images=images,
-        valid=scene.valid[ids],
+        pixel_ids=grid_ids(scene.valid[ids]),
         names=names,
         missing=None if scene.missing is None else scene.missing[ids],
         large_photos=large,

@@ -9,7 +9,7 @@ from gsmerge.baselines.baseline import Baseline
 from gsmerge.errors import UsageError
 from gsmerge.options import CompactOptions
 from gsmerge.stages.fit import FitOptions
-from gsmerge.types import PixelScene, UnalignedScene
+from gsmerge.types import Scene
 
 FULL_FIT_SETTINGS = tuple(f.name for f in fields(FitOptions) if f.name != "fit")
 _ALL = (
@@ -37,7 +37,7 @@ def find_baseline(name: str) -> Baseline | None:
     return BASELINES[name]
 
 
-def choose_baseline(options: CompactOptions, scene: PixelScene | UnalignedScene) -> tuple[Baseline | None, list[str]]:
+def choose_baseline(options: CompactOptions, scene: Scene) -> tuple[Baseline | None, list[str]]:
     """The baseline of the options, fit for the scene, and a note on changed settings that it does not use.
 
     A UsageError if the scene does not have what it needs, or a program is missing.
@@ -48,7 +48,7 @@ def choose_baseline(options: CompactOptions, scene: PixelScene | UnalignedScene)
     method = f"method {baseline.name}"
     if "photos" in baseline.needs and scene.images is None:
         raise UsageError(f"{method}: expected photos, found none; give --images, or another --method")
-    if "pixels" in baseline.needs and isinstance(scene, UnalignedScene):
+    if "pixels" in baseline.needs and not scene.aligned:
         raise UsageError(f"{method}: expected one Gaussian per pixel, found an unaligned scene; give another --method")
     check_program(baseline)
     default, used = CompactOptions().to_dict(), {*baseline.uses, *COMMON_SETTINGS}

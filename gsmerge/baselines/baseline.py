@@ -14,7 +14,7 @@ from gsmerge.stages.decode import DecodeOptions, decode
 from gsmerge.stages.encode import EncodeOptions, encode
 from gsmerge.stages.fit import Fitted
 from gsmerge.stages.prepare import PreparedScene
-from gsmerge.types import Gaussians, Groups, PixelScene, UnalignedScene
+from gsmerge.types import Gaussians, Groups, Scene
 
 Need = Literal["photos", "pixels", "node"]
 Run = Callable[[PreparedScene, int], Gaussians]
@@ -40,9 +40,9 @@ class Baseline:
         return Fitted(gaussians, prepared.scene.cameras, None)
 
 
-def own_gaussians(scene: PixelScene | UnalignedScene) -> Gaussians:
+def own_gaussians(scene: Scene) -> Gaussians:
     """The Gaussians that the file has, without the rows that only stand in for missing or broken ones."""
-    if isinstance(scene, PixelScene) and not bool(scene.stored.all()):
+    if scene.aligned and not bool(scene.stored.all()):
         return scene.gaussians[scene.stored.reshape(-1)]
     return scene.gaussians
 

@@ -14,7 +14,7 @@ from gsmerge.errors import SceneError, UsageError
 if TYPE_CHECKING:
     from gsmerge.io import PlyScene, SceneFiles, SceneLoad
     from gsmerge.measure.evaluate import Views
-    from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
+    from gsmerge.types import Cameras, Gaussians, Scene
 
 SAME = 1e-5  # difference of two poses, of 1 and of their numbers, that writing and reading may make
 
@@ -47,7 +47,7 @@ class BeforeAfter:
     """
 
     load: SceneLoad
-    scene: PixelScene | UnalignedScene
+    scene: Scene
     held_out: Views | None
     plys: dict[str, PlyScene]
     cameras: dict[str, Cameras]
@@ -64,11 +64,10 @@ def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
     from gsmerge.io import read_gaussians
     from gsmerge.runtime.record import record_run
     from gsmerge.stages.place_cameras import add_views
-    from gsmerge.types import UnalignedScene
 
     load, notes = args.load(files), list[str]()
     scene, held_out, adapted = held_out_views(load, args.targets, args.target_images, None)
-    if isinstance(scene, UnalignedScene):
+    if not scene.aligned:
         with record_run() as record:
             scene = add_views(scene)
         notes = record.notes
@@ -77,7 +76,7 @@ def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
     return BeforeAfter(load, scene, held_out, plys, cameras, [*load.notes, *adapted, *notes, *moved])
 
 
-def own_cameras(paths: Sequence[Path], scene: PixelScene | UnalignedScene) -> tuple[dict[str, Cameras], list[str]]:
+def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras], list[str]]:
     """The cameras that ``compact`` wrote beside results where it had moved them, by name of the result; and notes."""
     import numpy as np
 
@@ -110,7 +109,7 @@ def require_views(load: SceneLoad) -> None:
 
 def held_out_views(
     load: SceneLoad, targets: Path | None, target_images: Path | None, views: int | None
-) -> tuple[PixelScene | UnalignedScene, Views | None, tuple[str, ...]]:
+) -> tuple[Scene, Views | None, tuple[str, ...]]:
     """The scene with the context views of ``--views``, the held-out views, and notes about those."""
     from gsmerge.io import read_held_out
     from gsmerge.measure.evaluate import Views

@@ -13,7 +13,7 @@ from gsmerge.cli.options import Args, usage_errors
 if TYPE_CHECKING:
     from gsmerge.io import ReadHints, SceneFiles
     from gsmerge.options import CompactOptions
-    from gsmerge.types import PixelScene, UnalignedScene
+    from gsmerge.types import Scene
 
 
 def print_plan(args: Args, files: SceneFiles, settings: CompactOptions, out: Path, hints: ReadHints) -> None:
@@ -33,7 +33,7 @@ def print_plan(args: Args, files: SceneFiles, settings: CompactOptions, out: Pat
 
 
 def plan_document(
-    files: SceneFiles, scene: PixelScene | UnalignedScene, settings: CompactOptions, out: Path, notes: Sequence[str]
+    files: SceneFiles, scene: Scene, settings: CompactOptions, out: Path, notes: Sequence[str]
 ) -> dict[str, Any]:
     """What a run would make of a scene, and an estimate of its time and memory, as plain JSON types."""
     from gsmerge.options import to_schema

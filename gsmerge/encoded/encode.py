@@ -20,13 +20,13 @@ from gsmerge.stages.decode import MAX_CHILDREN, merged_count
 from gsmerge.stages.group import knee_count
 from gsmerge.stages.merge import MergedViews
 from gsmerge.stages.prepare import PreparedScene, prepare, require_children
-from gsmerge.types import PixelScene, UnalignedScene, as_array
+from gsmerge.types import Scene, as_array
 
 DEFAULT_MAX_K = 4  # children that are stored of a group, unless a number of Gaussians is asked for
 
 
 def encode_scene(
-    scene: PixelScene | UnalignedScene,
+    scene: Scene,
     options: CompactOptions | None = None,
     *,
     max_k: int | None = None,

@@ -18,7 +18,7 @@ from gsmerge.io.photos import as_floats, find_image, photo_size
 from gsmerge.io.scene import SceneLoad
 from gsmerge.io.scene_files import IMAGE_PLACES, SceneFiles
 from gsmerge.io.views import limit_photo_size, stored_photos
-from gsmerge.types import Cameras, PixelScene, UnalignedScene
+from gsmerge.types import Cameras, Scene
 
 _MAX_ANGLE = 0.2  # degrees that a view's two poses may differ by, once one frame is moved to the other
 _MAX_SHIFT = 0.005  # of the distance between the views
@@ -166,7 +166,7 @@ def _disagreement(moved: np.ndarray, ours: np.ndarray) -> tuple[float, float]:
     return float(np.degrees(np.arccos(cosines.clip(-1, 1))).max()), float(distance / spread)
 
 
-def _repeated(moved: np.ndarray, scene: PixelScene | UnalignedScene) -> dict[int, int]:
+def _repeated(moved: np.ndarray, scene: Scene) -> dict[int, int]:
     """Views that stand where one of the scene's does and look the same way, and which one that is."""
     if len(scene) == 0 or len(scene.gaussians) == 0:
         return {}

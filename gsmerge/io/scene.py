@@ -28,7 +28,7 @@ from gsmerge.io.scene_files import SceneFiles, find_scene_files
 from gsmerge.io.unaligned_scene import make_unaligned, usable_rows
 from gsmerge.io.views import find_large_photos, limit_photo_size, read_scene_cameras, stored_photos
 from gsmerge.runtime.threads import use_threads
-from gsmerge.types import Cameras, Gaussians, LargePhotos, PixelScene, UnalignedScene
+from gsmerge.types import Cameras, Gaussians, LargePhotos, Scene
 
 _MIN_CORRELATION = 0.5  # of a view's base colours with its photo
 _COLOR_SAMPLES = 5000  # pixels per view that it is computed from
@@ -50,7 +50,7 @@ class SceneLoad:
     """A scene and how it was read."""
 
     # the scene: one Gaussian per pixel, or an unaligned one where the rows belong to no pixels
-    scene: PixelScene | UnalignedScene
+    scene: Scene
     ply: PlyInfo
     files: SceneFiles
     # the cameras in the order of the views, as their file has them; None where there are none
@@ -65,9 +65,9 @@ class SceneLoad:
     # how far each camera was moved to its Gaussians; empty where none was
     moves: Sequence[dict[str, Any]] = ()
 
-    def pixel_scene(self) -> PixelScene:
+    def pixel_scene(self) -> Scene:
         """The scene, for those who need one Gaussian per pixel. SceneError if it is unaligned; says why."""
-        if isinstance(self.scene, PixelScene):
+        if self.scene.aligned:
             return self.scene
         raise SceneError(self.ply.path, self.problem or "expected one Gaussian per pixel")
 
@@ -79,7 +79,7 @@ def read_scene(
     images: str | os.PathLike[str] | None = None,
     opacity: OpacityChoice = "auto",
     **hints: Any,
-) -> PixelScene | UnalignedScene:
+) -> Scene:
     """Read a scene: ``.ply``, cameras, and images where there are any.
 
     Which row belongs to which pixel is found by measuring (docs/reference/exporters.md).
@@ -93,7 +93,7 @@ def read_scene(
             ``max_side``.
 
     Returns:
-        One Gaussian per pixel; a :class:`gsmerge.types.UnalignedScene` where the rows belong to no pixels.
+        One Gaussian per pixel; a :class:`gsmerge.types.Scene` where the rows belong to no pixels.
 
     Raises:
         SceneError: If a file is missing or damaged, or the Gaussians are not those of the cameras' views.
@@ -146,7 +146,7 @@ def align_scene(
     if camera_file is None and files.cameras is None and hints.order == "none":  # views are placed later
         gaussians, notes = usable_rows(ply, hints)
         problem = "expected one Gaussian per pixel, found no cameras that have any"
-        return _unaligned(ply, files, None, UnalignedScene(gaussians, NO_CAMERAS, None, ()), problem, hints, notes)
+        return _unaligned(ply, files, None, Scene(gaussians, NO_CAMERAS, None, None, ()), problem, hints, notes)
     exporter = find_exporter(hints.exporter)
     camera_file = read_scene_cameras(ply, files) if camera_file is None else camera_file
     known = camera_file.order if exporter is None else exporter.order
@@ -199,7 +199,7 @@ def _unaligned(
     ply: PlyScene,
     files: SceneFiles,
     camera_file: CameraFile | None,
-    scene: UnalignedScene,
+    scene: Scene,
     problem: str,
     hints: ReadHints,
     notes: list[str],
@@ -211,7 +211,7 @@ def _unaligned(
     return SceneLoad(scene, ply.info, files, camera_file, views, exporters, text, problem=problem)
 
 
-def _fill(scene: PixelScene, recovery: Recovery, inputs: AlignmentInput) -> tuple[PixelScene, list[str]]:
+def _fill(scene: Scene, recovery: Recovery, inputs: AlignmentInput) -> tuple[Scene, list[str]]:
     """Pixels that were dropped for being far, put back from the depth maps next to the cameras; and a note about it."""
     layout = recovery.best.layout
     maps = inputs.depths() if layout.kind == "box+depth" else None
@@ -222,7 +222,7 @@ def _fill(scene: PixelScene, recovery: Recovery, inputs: AlignmentInput) -> tupl
     return full, [f"{count:,} pixels that the exporter dropped are put back from the depth maps"] if count else []
 
 
-def _with_rotations(scene: PixelScene, hints: ReadHints, exporters: Sequence[Exporter]) -> tuple[PixelScene, list[str]]:
+def _with_rotations(scene: Scene, hints: ReadHints, exporters: Sequence[Exporter]) -> tuple[Scene, list[str]]:
     """Rotations read as given, as the given exporter stores them, or as fits the surface; and a note about the last."""
     if hints.quats != "auto":
         return read_rotations(scene, hints.quats), []
@@ -247,7 +247,7 @@ def _layout_notes(recovery: Recovery, inputs: AlignmentInput) -> list[str]:
     return notes + ([f"{used} of {len(inputs.cameras)} views are in the file"] if used < len(inputs.cameras) else [])
 
 
-def color_notes(scene: PixelScene) -> list[str]:
+def color_notes(scene: Scene) -> list[str]:
     """A note if the images do not look like the Gaussians: likely in another order, or of another scene."""
     if scene.images is None:
         return []
@@ -292,7 +292,7 @@ def place_cameras_in_scene(
             load = align_scene(ply, files, camera_file, hints=hints, photos=with_photos)
         except SceneError:
             continue
-        aligned = isinstance(load.scene, PixelScene)
+        aligned = load.scene.aligned
         notes = load.notes if aligned else load.notes[:-1]  # except the one that there are no pixels
         return CamerasInScene(load.scene.file_gaussians, load.views, notes)
     pictures = stored_photos(files, camera_file) if photos else None

@@ -28,7 +28,7 @@ from gsmerge.io.cameras.camera_file import (
 from gsmerge.io.formats.ply import clear_invalid
 from gsmerge.io.scene import NO_CAMERAS, color_notes
 from gsmerge.io.unaligned_scene import explain_misalignment, misalignment_error
-from gsmerge.types import Array, Cameras, Gaussians, PixelScene, UnalignedScene, as_array, to_float32
+from gsmerge.types import Array, Cameras, Gaussians, Scene, as_array, grid_ids, to_float32
 
 ORDERS = ("view-major", "none")
 _TOLERANCE = 1e-3  # by which opacities and images may leave [0, 1]
@@ -68,7 +68,7 @@ class TensorInput:
     check_rotations: bool
 
 
-def read_tensors(given: TensorInput) -> tuple[PixelScene | UnalignedScene, list[str]]:
+def read_tensors(given: TensorInput) -> tuple[Scene, list[str]]:
     """The scene of arrays or tensors, whose memory it does not share; and notes, one sentence each.
 
     Raises:
@@ -78,14 +78,14 @@ def read_tensors(given: TensorInput) -> tuple[PixelScene | UnalignedScene, list[
         raise ValueError(f"order: expected one of {', '.join(ORDERS)}, got {given.order!r}")
     gaussians, valid, notes = _read_gaussians(given)
     if given.order == "none" and given.viewmats is None and given.images is None:
-        return UnalignedScene(gaussians[valid], NO_CAMERAS, None, ()), notes
+        return Scene(gaussians[valid], NO_CAMERAS, None, None, ()), notes
     cameras, images = _read_views(given)
     names = tuple(f"view{i}" for i in range(len(cameras))) if given.names is None else tuple(map(str, given.names))
     if len(names) != len(cameras):
         raise SceneError("names", f"expected {len(cameras)} names, one for each view, found {len(names)}")
     if given.order == "none":
         notes += _check_seen(gaussians, valid, cameras, images)
-        return UnalignedScene(gaussians[valid], cameras, images, names), notes
+        return Scene(gaussians[valid], cameras, images, None, names), notes
     count = len(cameras) * cameras.height * cameras.width
     if len(gaussians) != count:
         sizes = f"{len(cameras)} x {cameras.height} x {cameras.width} = {count}"
@@ -93,7 +93,7 @@ def read_tensors(given: TensorInput) -> tuple[PixelScene | UnalignedScene, list[
         raise SceneError("means", problem, 'pass shape=(V, H, W) as the model has it, or order="none"')
     cameras, more = _check_pixels(gaussians, cameras, valid, names)
     notes += more
-    scene = PixelScene(gaussians, cameras, images, valid.reshape(-1, cameras.height, cameras.width), names)
+    scene = Scene(gaussians, cameras, images, grid_ids(valid), names)
     if given.check_rotations:
         _check_rotations(scene)
     return scene, notes + color_notes(scene)
@@ -308,7 +308,7 @@ def _check_pixels(
     raise misalignment_error("means", alignment, reason)
 
 
-def _check_rotations(scene: PixelScene) -> None:
+def _check_rotations(scene: Scene) -> None:
     """Refuse rotations that follow the surface far better when they are read in another way."""
     choice, note = choose_rotations(scene)
     if choice == "wxyz":

@@ -24,14 +24,14 @@ from gsmerge.io.hints import ReadHints
 from gsmerge.io.photos import ASPECT_TOLERANCE
 from gsmerge.io.scene_files import SceneFiles
 from gsmerge.io.views import limit_view_size
-from gsmerge.types import Cameras, Gaussians, UnalignedScene
+from gsmerge.types import Cameras, Gaussians, Scene
 
 MIN_PADDING = 16  # equal rows at the origin: fewer may be Gaussians
 
 
 def make_unaligned(
     ply: PlyScene, files: SceneFiles, fit: CameraFit, hints: ReadHints
-) -> tuple[UnalignedScene, CameraFile, str, list[str]]:
+) -> tuple[Scene, CameraFile, str, list[str]]:
     """The scene, if the cameras see its Gaussians; its cameras as they were read, why it has no pixels, and notes.
     SceneError if they do not, or if other cameras or another reading of them would make it one with pixels.
     """
@@ -55,7 +55,7 @@ def make_unaligned(
     text = "the rows belong to no pixels that could be found: unaligned"
     if hints.exporter != "auto":
         text += f"; only the layouts of {hints.exporter} were tried, as given; --exporter auto tries all"
-    scene = UnalignedScene(gaussians, cameras, images, camera_file.names)
+    scene = Scene(gaussians, cameras, images, None, camera_file.names)
     return scene, camera_file, problem, [*notes, *smaller, *padding, text]
 
 

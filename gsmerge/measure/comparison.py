@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from gsmerge.errors import UsageError
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Evaluation, Views, evaluate, near_plane
 from gsmerge.measure.speed import Speed, measure_speeds, overdraw
-from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
+from gsmerge.types import Cameras, Gaussians, Scene
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ def break_even(merge_seconds: float, before: float, after: float) -> float | Non
 
 
 def compare(
-    scene: PixelScene | UnalignedScene,
+    scene: Scene,
     results: Mapping[str, Gaussians],
     storage: Mapping[str, Storage],
     targets: Views | None = None,

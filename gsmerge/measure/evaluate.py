@@ -19,7 +19,7 @@ from gsmerge.render.metrics import psnr, ssim
 from gsmerge.render.photos import NEAR
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.prepare import scene_frame
-from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene, as_array
+from gsmerge.types import Cameras, Gaussians, Scene, as_array
 from gsmerge.views import pick_views
 
 NETS = ("vgg", "alex")
@@ -222,7 +222,7 @@ class _Look:
 
 
 def evaluate(
-    scene: PixelScene | UnalignedScene,
+    scene: Scene,
     results: Mapping[str, Gaussians],
     targets: Views | None = None,
     options: EvaluateOptions | None = None,
@@ -268,14 +268,14 @@ def evaluate(
     return Evaluation(tuple(scores), _reference(scene, counts), counts, _notes(splits), options)
 
 
-def _reference(scene: PixelScene | UnalignedScene, splits: Mapping[str, int]) -> str:
+def _reference(scene: Scene, splits: Mapping[str, int]) -> str:
     """What results are compared with, in words."""
     if scene.images is not None or "context" not in splits:
         return "photos"
     return "photos, and renders of the input in its own views" if "target" in splits else "renders of the input"
 
 
-def near_plane(scene: PixelScene | UnalignedScene) -> float:
+def near_plane(scene: Scene) -> float:
     """Near plane where a scene and its results are compared, world units; there must be a valid Gaussian and a view."""
     return NEAR * scene_frame(scene).unit
 
@@ -290,7 +290,7 @@ def _notes(splits: Mapping[str, _Split]) -> tuple[str, ...]:
 
 
 def _splits(
-    scene: PixelScene | UnalignedScene, own: Gaussians, targets: Views | None, options: EvaluateOptions, look: _Look
+    scene: Scene, own: Gaussians, targets: Views | None, options: EvaluateOptions, look: _Look
 ) -> dict[str, _Split]:
     """The views by split, with their photos or the input's renders, and their visible pixels."""
     points = context_points(scene, look.near)

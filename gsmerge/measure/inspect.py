@@ -37,7 +37,7 @@ from gsmerge.runtime.threads import available_threads, use_threads
 from gsmerge.stages.clean import BOX_QUANTILES, beyond_scene, floater_share
 from gsmerge.stages.group import default_count
 from gsmerge.stages.sky import sky_regions
-from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
+from gsmerge.types import Cameras, Gaussians, Scene
 
 MAX_SAMPLES = 200_000  # Gaussians that are measured
 HUGE_SCALE_SHARE = 0.1  # of the box's diagonal: larger scales show no detail
@@ -205,10 +205,10 @@ def _of_views(ply: PlyScene, files: SceneFiles, hints: ReadHints) -> dict[str, A
     }
 
 
-def _num_sky_views(scene: PixelScene | UnalignedScene) -> int:
+def _num_sky_views(scene: Scene) -> int:
     if len(scene) == 0 or scene.images is None:
         return 0
-    stored = scene.stored.reshape(-1) if isinstance(scene, PixelScene) else np.isfinite(scene.gaussians.means).all(1)
+    stored = scene.stored.reshape(-1) if scene.aligned else np.isfinite(scene.gaussians.means).all(1)
     return len(sky_regions(scene.gaussians.means[stored], scene.cameras, scene.images))
 
 
@@ -217,11 +217,11 @@ def _sight(load: SceneLoad) -> CameraCheck | None:
     if len(scene) == 0:
         return None
     whole = np.ones(len(scene.gaussians), bool)
-    valid = scene.stored.reshape(-1) if isinstance(scene, PixelScene) else whole
+    valid = scene.stored.reshape(-1) if scene.aligned else whole
     return check_cameras(scene.gaussians, valid, scene.cameras, scene.images)
 
 
-def estimate(scene: PixelScene | UnalignedScene) -> dict[str, Any]:
+def estimate(scene: Scene) -> dict[str, Any]:
     """What ``compact`` would make of a scene by default, see :attr:`Inspection.estimate`."""
     options, photos = CompactOptions(), scene.images is not None
     count = min(scene.num_gaussians, default_count(scene, options))
@@ -263,17 +263,17 @@ def extents(gaussians: Gaussians) -> Extents:
     )
 
 
-def coverage(scene: PixelScene | UnalignedScene) -> tuple[Coverage, ...]:
+def coverage(scene: Scene) -> tuple[Coverage, ...]:
     """What every view shows of a scene; of several Gaussians per pixel each layer is a view."""
     if len(scene) == 0:
         return ()
     rows = np.arange(0, len(scene.gaussians), -(-len(scene.gaussians) // MAX_SAMPLES))
-    if isinstance(scene, PixelScene):
+    if scene.aligned:
         rows = rows[scene.stored.reshape(-1)[rows]]
     points = scene.gaussians.means[rows].astype(np.float64)
     shares = [float(inside.mean()) if len(points) else 0.0 for inside in _inside(points, scene.cameras)]
     pixels: list[float | None] = [None] * len(scene)
-    if isinstance(scene, PixelScene):
+    if scene.aligned:
         visible = (scene.gaussians.opacities >= _TRANSPARENT).reshape(scene.valid.shape) & scene.stored
         pixels = [float(view.mean()) for view in visible]
     return tuple(map(Coverage, scene.names, pixels, shares))

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from gsmerge.render import render
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
+from gsmerge.types import Cameras, Gaussians, Scene
 
 Points = NDArray[np.float64]  # [n,3]
 _OPAQUE = 0.5  # alpha from which a rendered depth is that of a surface
@@ -16,12 +16,12 @@ _CHUNK = 1 << 18  # points at a time: all of them, in every thread, would take t
 _DILATION = 3  # pixels of the input views per side of the square that every sample marks
 
 
-def context_points(scene: PixelScene | UnalignedScene, near: float) -> Points:
+def context_points(scene: Scene, near: float) -> Points:
     """``[n,3]`` a point in the world for every pixel of the input views: their depth samples.
 
     Of a scene with pixels the Gaussians are the samples; otherwise depth beyond ``near``, world units, is rendered.
     """
-    if isinstance(scene, PixelScene):
+    if scene.aligned:
         return scene.gaussians.means[scene.valid.reshape(-1)].astype(np.float64)
     return np.concatenate([_rendered_points(scene.gaussians, scene.cameras[[i]], near) for i in range(len(scene))])
 

@@ -13,7 +13,7 @@ from gsmerge.online.options import merge_settings
 from gsmerge.online.state import OnlineState
 from gsmerge.runtime.record import Progress
 from gsmerge.stages.fit import FitOptions
-from gsmerge.types import Gaussians, PixelScene, UnalignedScene
+from gsmerge.types import Gaussians, Scene
 
 
 class Compactor:
@@ -65,7 +65,7 @@ class Compactor:
         """Numbers of every batch so far, see :class:`gsmerge.online.extend.BatchReport`."""
         return () if self._state is None else tuple(self._state.about["batches"])
 
-    def extend(self, scene: PixelScene | UnalignedScene, *, progress: Progress | None = None) -> BatchReport:
+    def extend(self, scene: Scene, *, progress: Progress | None = None) -> BatchReport:
         """Add a batch of views, see :func:`gsmerge.online.extend.extend`."""
         self._state, report = extend(self._state, scene, self._options, self._online, progress=progress)
         return report

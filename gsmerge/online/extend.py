@@ -45,7 +45,7 @@ from gsmerge.stages.fit import visible_mask
 from gsmerge.stages.match import MatchOptions, match
 from gsmerge.stages.merge import MergedViews, merge, take
 from gsmerge.stages.prepare import PreparedScene, prepare, require_children
-from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches, PixelScene, UnalignedScene
+from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches, Scene
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class BatchReport:
 
 def extend(
     state: OnlineState | None,
-    scene: PixelScene | UnalignedScene,
+    scene: Scene,
     options: CompactOptions | None = None,
     online: OnlineOptions | None = None,
     *,
@@ -153,7 +153,7 @@ def _add_batch(
     return replace(state, groups=groups, replay=replay), counts
 
 
-def _check(state: OnlineState | None, scene: PixelScene | UnalignedScene, options: CompactOptions, max_k: int) -> None:
+def _check(state: OnlineState | None, scene: Scene, options: CompactOptions, max_k: int) -> None:
     """Refuse what no state can have."""
     for name in options.whole_only:
         raise UsageError(f"{name}: goes with a whole scene, not with views that come one after the other; use compact")

@@ -15,7 +15,7 @@ from gsmerge.render.blend import composite
 from gsmerge.render.metrics import psnr
 from gsmerge.render.plan import Splats, plan_view, prepare
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
+from gsmerge.types import Cameras, Gaussians, Scene
 
 Score = TypeVar("Score")
 
@@ -72,7 +72,7 @@ class Photos:
         }
 
 
-def scene_pictures(scene: PixelScene | UnalignedScene) -> np.ndarray:
+def scene_pictures(scene: Scene) -> np.ndarray:
     """``[v,h,w,3]`` photos, or pictures made of the Gaussians' base colours where there are none.
 
     Raises:
@@ -80,13 +80,13 @@ def scene_pictures(scene: PixelScene | UnalignedScene) -> np.ndarray:
     """
     if scene.images is not None:
         return scene.images
-    if isinstance(scene, UnalignedScene):
+    if not scene.aligned:
         raise ValueError("expected a scene with images")
     shape = (len(scene), scene.cameras.height, scene.cameras.width, 3)
     return sh0_to_rgb(scene.gaussians.sh0[:, 0]).clip(0, 1).reshape(shape)
 
 
-def scene_photos(scene: PixelScene | UnalignedScene, level: float = 1) -> Photos:
+def scene_photos(scene: Scene, level: float = 1) -> Photos:
     """The scene's photos, each side divided by ``level`` (area averages)."""
     if scene.images is None:
         raise ValueError("expected a scene with images")

@@ -11,7 +11,7 @@ from gsmerge.moments import Members
 from gsmerge.networks.cross_view_stats import cross_view_stats
 from gsmerge.runtime.record import choose, note
 from gsmerge.stages.segment import AUTO_SHARE, SHARE
-from gsmerge.types import Cameras, FeatureGaussians, PixelScene, UnalignedScene
+from gsmerge.types import Cameras, FeatureGaussians, Scene
 
 if TYPE_CHECKING:
     from gsmerge.options import CompactOptions
@@ -25,9 +25,7 @@ SAMPLES = 65536  # pixels whose depths are compared
 MOST, FEWEST, WRONG = 0.08, 0.015, 0.38
 
 
-def choose_superpixels(
-    scene: PixelScene | UnalignedScene, members: Members | None, options: CompactOptions
-) -> CompactOptions:
+def choose_superpixels(scene: Scene, members: Members | None, options: CompactOptions) -> CompactOptions:
     """The options with a share of superpixels where they leave it to the scene.
 
     Args:
@@ -37,7 +35,7 @@ def choose_superpixels(
     """
     if options.segment.superpixels != AUTO_SHARE:
         return options
-    if members is None or not isinstance(scene, PixelScene) or len(scene) < 2:
+    if members is None or not scene.aligned or len(scene) < 2:
         text, why = SHARE, "depths of several views cannot be compared"
     else:
         wrong = contradicted_share(scene, members)
@@ -48,7 +46,7 @@ def choose_superpixels(
     return replace(options, segment=replace(options.segment, superpixels=text))
 
 
-def contradicted_share(scene: PixelScene, members: Members) -> float:
+def contradicted_share(scene: Scene, members: Members) -> float:
     """Share of the valid pixels, of some tens of thousands, that more views see through than have a surface there."""
     rows = np.flatnonzero(scene.valid)
     rows = rows[:: max(1, len(rows) // SAMPLES)]

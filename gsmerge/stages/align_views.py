@@ -26,7 +26,7 @@ from gsmerge.geometry import (
 )
 from gsmerge.render.photos import NEAR, photos_of
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import PixelScene
+from gsmerge.types import Scene
 
 SIDES = (60, 120, 240)  # longer side of the photos, pixels, one after the other
 MIN_SIDE = 24  # pixels of the shorter side at the first size, below which photos say too little
@@ -78,7 +78,7 @@ class _Pair:
     flow: float  # median distance from where the given poses show them, pixels of the views
 
 
-def align_views(scene: PixelScene, views: Sequence[int], *, always: bool = False) -> PixelScene | None:
+def align_views(scene: Scene, views: Sequence[int], *, always: bool = False) -> Scene | None:
     """The scene with every camera, and the Gaussians of its pixels, moved to where the photos agree.
 
     What all views would do together is left out: the median of their motions is none.
@@ -110,7 +110,7 @@ def align_views(scene: PixelScene, views: Sequence[int], *, always: bool = False
     return move_views(scene, viewmats)
 
 
-def move_views(scene: PixelScene, viewmats: np.ndarray) -> PixelScene:
+def move_views(scene: Scene, viewmats: np.ndarray) -> Scene:
     """The scene with other poses ``[v,4,4]``, and each view's Gaussians moved along.
 
     Higher harmonics are not turned: poses are off by a degree or two, and colours hardly change with that.
@@ -129,7 +129,7 @@ def move_views(scene: PixelScene, viewmats: np.ndarray) -> PixelScene:
     return replace(scene, gaussians=gaussians, cameras=replace(scene.cameras, viewmats=viewmats))
 
 
-def _choose_pairs(scene: PixelScene, views: Sequence[int]) -> list[tuple[int, int]]:
+def _choose_pairs(scene: Scene, views: Sequence[int]) -> list[tuple[int, int]]:
     """Pairs of views, both ways round: of each its neighbours, which see most of it and look where it looks."""
     cameras, means = scene.cameras, scene.gaussians.means.reshape(len(scene), -1, 3)
     step = max(1, scene.pixels_per_view // OVERLAP_SAMPLES)
@@ -146,7 +146,7 @@ def _choose_pairs(scene: PixelScene, views: Sequence[int]) -> list[tuple[int, in
     return sorted(pairs)
 
 
-def _level_of(scene: PixelScene, pairs: list[tuple[int, int]], level: float, samples: int) -> _Level:
+def _level_of(scene: Scene, pairs: list[tuple[int, int]], level: float, samples: int) -> _Level:
     """The photos with their sides divided by ``level``, and ``samples`` pixels of each where it changes most."""
     assert scene.images is not None
     photos = photos_of(scene.images, scene.cameras, level)

@@ -25,7 +25,7 @@ from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.decode import DecodeOptions, decode
 from gsmerge.stages.encode import from_moments
-from gsmerge.types import Gaussians, Groups, PixelScene, UnalignedScene
+from gsmerge.types import Gaussians, Groups, Scene
 
 if TYPE_CHECKING:
     from gsmerge.options import CompactOptions
@@ -60,13 +60,12 @@ class ContributionOptions:
             raise ValueError(f"min_owner_weight: expected at least 0, got {self.min_owner_weight}")
 
 
-def assign_members(scene: PixelScene | UnalignedScene, groups: Groups, options: ContributionOptions) -> Members:
+def assign_members(scene: Scene, groups: Groups, options: ContributionOptions) -> Members:
     """An unaligned scene's Gaussians as arrays, each with a pixel of the superpixel that it adds most to.
 
     Raises:
         UsageError: If no view sees any Gaussian.
     """
-    assert isinstance(scene, UnalignedScene)  # a scene with one Gaussian per pixel has its members
     pixels = owner_pixels(find_owners(scene, groups), groups, options.min_owner_weight)
     if not (pixels >= 0).any():
         raise UsageError(
@@ -76,9 +75,7 @@ def assign_members(scene: PixelScene | UnalignedScene, groups: Groups, options: 
     return unaligned_members(scene, pixels)
 
 
-def split_unseen(
-    scene: UnalignedScene, options: CompactOptions
-) -> tuple[UnalignedScene, CompactOptions, Gaussians | None]:
+def split_unseen(scene: Scene, options: CompactOptions) -> tuple[Scene, CompactOptions, Gaussians | None]:
     """With ``unseen="keep"``: the scene that some view sees, and the rest merged among neighbours at the same rate.
 
     Args:
@@ -106,7 +103,7 @@ def split_unseen(
     return replace(scene, gaussians=scene.gaussians[seen]), options, kept
 
 
-def merge_neighbors(gaussians: Gaussians, scene: UnalignedScene, count: int, options: CompactOptions) -> Gaussians:
+def merge_neighbors(gaussians: Gaussians, scene: Scene, count: int, options: CompactOptions) -> Gaussians:
     """At most ``count`` Gaussians in place of n >= count: runs along a space-filling curve (Morton's) are merged."""
     order = np.argsort(morton_codes(gaussians.means.astype(np.float64)), kind="stable")
     members = unaligned_members(replace(scene, gaussians=gaussians), np.full(len(gaussians), -1, np.int64))
@@ -131,7 +128,7 @@ class Owners:
     labels: np.ndarray
 
 
-def find_owners(scene: UnalignedScene, groups: Groups, near: float = 0.01) -> Owners:
+def find_owners(scene: Scene, groups: Groups, near: float = 0.01) -> Owners:
     """The dominant superpixel of every Gaussian, over all views; of equal ones the first view's first.
 
     Only the best superpixel so far is kept of each Gaussian, and of one row of tiles at a time which Gaussian adds
@@ -160,7 +157,7 @@ def find_owners(scene: UnalignedScene, groups: Groups, near: float = 0.01) -> Ow
     return best
 
 
-def seen_weights(scene: UnalignedScene, near: float = 0.01) -> np.ndarray:
+def seen_weights(scene: Scene, near: float = 0.01) -> np.ndarray:
     """``[n]`` float32: the most blending weight that each Gaussian has in one view, pixels.
 
     Args:
@@ -181,7 +178,7 @@ def seen_weights(scene: UnalignedScene, near: float = 0.01) -> np.ndarray:
     return most
 
 
-def seen_depths(scene: UnalignedScene, near: float = 0.01) -> tuple[np.ndarray, np.ndarray]:
+def seen_depths(scene: Scene, near: float = 0.01) -> tuple[np.ndarray, np.ndarray]:
     """``[v,h,w]`` mean depth of what each pixel shows, and ``[v,h,w]`` whether it mostly shows something.
 
     Args:

@@ -9,7 +9,7 @@ view whatever their depths are; the others are drawn.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -20,13 +20,12 @@ from gsmerge.render.photos import photo_errors, photos_of, scene_pictures
 from gsmerge.runtime.record import choose, note
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.place_cameras import sampled
-from gsmerge.types import PixelScene, UnalignedScene
+from gsmerge.types import Scene
 from gsmerge.views import subset
 
 if TYPE_CHECKING:
     from gsmerge.options import CompactOptions
 
-Scene = TypeVar("Scene", PixelScene, UnalignedScene)
 
 # On 14 captures right photos reach 0.99 and more with the colours of pixels, 0.13 to 0.8 with drawings; noise mostly
 # stays below 0.06, photos of other views below 0.3.
@@ -75,10 +74,10 @@ def leave_out_photos(scene: Scene, options: CompactOptions) -> tuple[Scene, Comp
     return replace(scene, images=images), options, tuple(view for view in views if view not in odd)
 
 
-def odd_photos(scene: PixelScene | UnalignedScene) -> list[int]:
+def odd_photos(scene: Scene) -> list[int]:
     """The views of a canonical scene whose photos do not show it, as far as the Gaussians can tell."""
     assert scene.images is not None
-    least = LEAST if isinstance(scene, PixelScene) else LEAST_DRAWN
+    least = LEAST if scene.aligned else LEAST_DRAWN
     level = max(scene.cameras.width, scene.cameras.height) / SIDE
     if min(scene.images.shape[1:3]) < 2 or scene.pixels_per_view / max(level, 1) ** 2 < MIN_PIXELS:
         return []
@@ -93,7 +92,7 @@ def odd_photos(scene: PixelScene | UnalignedScene) -> list[int]:
     return np.flatnonzero(judged & ((own < least) | (gains > GAIN))).tolist()
 
 
-def gradient_correlations(scene: PixelScene | UnalignedScene, level: float) -> tuple[np.ndarray, np.ndarray]:
+def gradient_correlations(scene: Scene, level: float) -> tuple[np.ndarray, np.ndarray]:
     """``[v,v]`` float64: how much alike view i, as the Gaussians show it, and photo j are, -1 to 1.
 
     Args:
@@ -105,7 +104,7 @@ def gradient_correlations(scene: PixelScene | UnalignedScene, level: float) -> t
     """
     assert scene.images is not None
     photos = photos_of(scene.images, scene.cameras, level)
-    if isinstance(scene, PixelScene):
+    if scene.aligned:
         shape, size = scene.valid.shape, (photos.width, photos.height)
         colors = scene.gaussians.sh0.reshape(*shape, 3)
         weights = np.where(scene.valid, scene.gaussians.opacities.reshape(shape), 0).astype(np.float32)
@@ -140,8 +139,8 @@ def _gradient_weights(weight: np.ndarray) -> np.ndarray:
     return np.concatenate([both, both])
 
 
-def _own_pictures(scene: PixelScene | UnalignedScene, views: list[int]) -> np.ndarray:
+def _own_pictures(scene: Scene, views: list[int]) -> np.ndarray:
     """``[n,h,w,3]`` some views of a scene in the colours of its Gaussians."""
-    if isinstance(scene, UnalignedScene):
+    if not scene.aligned:
         return np.asarray(render(scene.gaussians, scene.cameras[views]).images).clip(0, 1)
     return scene_pictures(replace(subset(scene, views), images=None))

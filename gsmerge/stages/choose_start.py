@@ -13,15 +13,13 @@ from gsmerge.render.photos import Photos, photo_errors, scene_photos, scene_pict
 from gsmerge.runtime.memory import release_memory
 from gsmerge.stages.decode import DecodeOptions, decode
 from gsmerge.stages.merge import MergedViews
-from gsmerge.types import Gaussians, PixelScene, UnalignedScene
+from gsmerge.types import Gaussians, Scene
 from gsmerge.views import pick_views
 
 MAX_VIEWS = 6  # that a start is judged by
 
 
-def choose_start(
-    starts: Sequence[MergedViews], scene: PixelScene | UnalignedScene, options: DecodeOptions, rule: Rule
-) -> MergedViews:
+def choose_start(starts: Sequence[MergedViews], scene: Scene, options: DecodeOptions, rule: Rule) -> MergedViews:
     """With or without networks: the start whose Gaussians, one for each Feature Gaussian, show the views better.
 
     The choice does not depend on K, so what is encoded once is what every K begins with. Networks learn what real
@@ -48,7 +46,7 @@ def choose_start(
     return replace(best, choices={**best.choices, "start_scores": scores})
 
 
-def views_psnr(gaussians: Gaussians, scene: PixelScene | UnalignedScene) -> float:
+def views_psnr(gaussians: Gaussians, scene: Scene) -> float:
     """PSNR (dB) of the views at half size, over the pixels that have a Gaussian of their own.
 
     Args:
@@ -66,16 +64,16 @@ def views_psnr(gaussians: Gaussians, scene: PixelScene | UnalignedScene) -> floa
     return float(-10 * np.log10(max(error / max(3 * count, 1), 1e-12)))
 
 
-def _photos(scene: PixelScene | UnalignedScene) -> Photos:
+def _photos(scene: Scene) -> Photos:
     """The photos at half size, or the pictures that stand in for them."""
     if scene.images is None:
         scene = replace(scene, images=scene_pictures(scene))
     return scene_photos(scene, 2)
 
 
-def _weight(scene: PixelScene | UnalignedScene, view: int, photos: Photos) -> np.ndarray:
+def _weight(scene: Scene, view: int, photos: Photos) -> np.ndarray:
     """``[h,w]`` share of each half-size pixel that has Gaussians; ones where Gaussians belong to no pixels."""
     size = photos.width, photos.height
-    if isinstance(scene, UnalignedScene):
+    if not scene.aligned:
         return np.ones(size[::-1], np.float32)
     return cv2.resize(scene.valid[view].astype(np.float32), size, interpolation=cv2.INTER_AREA)

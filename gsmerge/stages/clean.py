@@ -18,7 +18,7 @@ from gsmerge.errors import UsageError
 from gsmerge.runtime.record import Record, add_seconds, adopt, choose, note, record_part
 from gsmerge.stages.fit import Fitted
 from gsmerge.stages.sky import sky
-from gsmerge.types import Gaussians, PixelScene, UnalignedScene
+from gsmerge.types import Gaussians, Scene
 
 BOX_QUANTILES = (1, 99)  # % of the positions along each axis: the scene's box
 OUTLIER_BOX = 10.0  # times that box: what lies beyond is far from the scene
@@ -32,7 +32,6 @@ SIZES = {"sphere": 4, "box": 6}  # numbers of a crop
 
 Make = Callable[[int | None], Fitted]
 ToWorld = Callable[[Gaussians], Gaussians]
-Scene = PixelScene | UnalignedScene
 Counts = dict[str, int]
 
 
@@ -169,7 +168,7 @@ def make_clean(make: Make, count: int | None, options: CleanOptions, scene: Scen
     Raises:
         UsageError: If the crop holds none of the scene.
     """
-    given = scene.gaussians[scene.valid.reshape(-1)] if isinstance(scene, PixelScene) else scene.gaussians
+    given = scene.gaussians[scene.valid.reshape(-1)] if scene.aligned else scene.gaussians
     most, asked = len(given), count
     share = 1.0 if options.crop is None else float(inside_crop(to_world(given).means, options.crop).mean())
     if share == 0:

@@ -10,7 +10,7 @@ import numpy as np
 from gsmerge.kernels.gaussians.pool import group_members
 from gsmerge.moments import Members, Moments, Rule, pool_members
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import FeatureGaussians, Groups, PixelScene, UnalignedScene, to_float32
+from gsmerge.types import FeatureGaussians, Groups, Scene, to_float32
 
 if TYPE_CHECKING:
     from gsmerge.networks.apply import NetworkContext
@@ -40,7 +40,7 @@ class EncodeOptions:
 
 
 def encode(
-    scene: PixelScene | UnalignedScene,
+    scene: Scene,
     members: Members,
     groups: Groups,
     options: EncodeOptions,
@@ -67,11 +67,9 @@ def encode(
     return encode_features(features, networks)
 
 
-def member_rows(
-    scene: PixelScene | UnalignedScene, members: Members, groups: Groups
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def member_rows(scene: Scene, members: Members, groups: Groups) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Members by superpixel: ``starts [g+1]``, ``ids [m]`` int32, ``views [g]``; empty superpixels left out."""
-    if isinstance(scene, PixelScene):
+    if scene.aligned:
         return group_rows(scene, groups)
     assert members.pixels is not None
     counts = np.asarray(groups.counts)
@@ -83,7 +81,7 @@ def member_rows(
     return np.append(starts[:-1][filled], starts[-1]), ids.astype(np.int32), views[filled]
 
 
-def group_rows(scene: PixelScene, groups: Groups) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def group_rows(scene: Scene, groups: Groups) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rows of the scene by superpixel: ``starts [g+1]``, ``ids [m]`` int32, ``views [g]``; empty ones left out."""
     pixels = scene.pixels_per_view
 

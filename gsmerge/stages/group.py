@@ -11,7 +11,7 @@ from gsmerge.stages.assign import seen_depths
 from gsmerge.stages.fit import start_share
 from gsmerge.stages.region_tree import RegionTree, auto_count, cut_tree, pixel_depths, region_tree
 from gsmerge.stages.segment import MAX_FACTOR, count_for, segment
-from gsmerge.types import PixelScene, Segmentation, UnalignedScene
+from gsmerge.types import Scene, Segmentation
 
 if TYPE_CHECKING:
     from gsmerge.options import CompactOptions
@@ -44,7 +44,7 @@ class CountLimits:
         return limited_count(self.default, self.max_count, self.exact)
 
 
-def count_limits(scene: PixelScene | UnalignedScene, options: CompactOptions) -> CountLimits:
+def count_limits(scene: Scene, options: CompactOptions) -> CountLimits:
     """Limits of the number of Gaussians of a prepared scene.
 
     Raises:
@@ -63,23 +63,23 @@ def count_limits(scene: PixelScene | UnalignedScene, options: CompactOptions) ->
     )
 
 
-def default_count(scene: PixelScene | UnalignedScene, options: CompactOptions) -> int:
+def default_count(scene: Scene, options: CompactOptions) -> int:
     """Gaussians that ``superpixels`` and K ask for; of a scene without views, a share of its Gaussians."""
     if len(scene) == 0:
         return round(max(1, int(options.segment.share * scene.num_gaussians)) * options.decode.mean_k)
     per_view = superpixels_per_view(scene, options)
     total = per_view * scene.num_gaussians // scene.pixels_per_view
-    total = max(len(scene), total if isinstance(scene, PixelScene) else per_view * len(scene))
+    total = max(len(scene), total if scene.aligned else per_view * len(scene))
     return round(total * options.decode.mean_k)
 
 
-def largest_count(scene: PixelScene | UnalignedScene, options: CompactOptions) -> int:
+def largest_count(scene: Scene, options: CompactOptions) -> int:
     """Most Gaussians that ``superpixels`` and K give: more than they ask for where superpixels adapt."""
     default, max_count, _ = _counts(scene, options)
     return min(MAX_FACTOR * default, max_count) if options.segment.adapts else default
 
 
-def budget_count(scene: PixelScene | UnalignedScene, options: CompactOptions) -> int | None:
+def budget_count(scene: Scene, options: CompactOptions) -> int | None:
     """The number of Gaussians that a budget, a size or a device sets; None where ``superpixels`` and K do.
 
     Raises:
@@ -93,7 +93,7 @@ def limited_count(default: int, max_count: int, exact: int | None) -> int | None
     return exact if exact is not None else max_count if default > max_count else None
 
 
-def _counts(scene: PixelScene | UnalignedScene, options: CompactOptions) -> tuple[int, int, int | None]:
+def _counts(scene: Scene, options: CompactOptions) -> tuple[int, int, int | None]:
     """Default count, most that is allowed, and the count that a budget or a size asks for."""
     num_input, degree = scene.num_gaussians, scene.gaussians.sh_degree
     max_count = max_allowed(options.budget, num_input, degree)
@@ -102,11 +102,11 @@ def _counts(scene: PixelScene | UnalignedScene, options: CompactOptions) -> tupl
     return default_count(scene, options), max_count, exact_count(options.budget, num_input, degree)
 
 
-def superpixels_per_view(scene: PixelScene | UnalignedScene, options: CompactOptions) -> int:
+def superpixels_per_view(scene: Scene, options: CompactOptions) -> int:
     """Superpixels of each view. Where there are fewer Gaussians than pixels, a share is taken of the Gaussians."""
     cameras = scene.cameras
     per_view = count_for(options.segment, cameras.height, cameras.width)
-    if isinstance(scene, PixelScene) or options.segment.per_view is not None:
+    if scene.aligned or options.segment.per_view is not None:
         return per_view
     return max(1, min(per_view, int(options.segment.share * len(scene.gaussians) / len(cameras))))
 
@@ -152,7 +152,7 @@ def scene_tree(prepared: PreparedScene, count: int) -> RegionTree:
     scene, options, pictures = prepared.scene, prepared.options, prepared.pictures
     leaves = min(max(prepared.limits.per_view, -(-count // len(scene))), scene.pixels_per_view)
     fine = segment(pictures, options.segment, leaves)
-    depths, valid = seen_depths(scene) if isinstance(scene, UnalignedScene) else (pixel_depths(scene), scene.valid)
+    depths, valid = seen_depths(scene) if not scene.aligned else (pixel_depths(scene), scene.valid)
     return region_tree(pictures, depths, fine, valid, options.allocate)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from gsmerge.render import contributions, plan_view, prepare, render
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import Cameras, Gaussians, UnalignedScene
+from gsmerge.types import Cameras, Gaussians, Scene
 
 NUM_VIEWS = 24
 SAMPLES = 40_000  # Gaussians that candidates are judged by
@@ -24,7 +24,7 @@ CLEAR = 0.02  # near plane, as a share of the scene's radius
 ENOUGH = 1.0  # pixels of blending weight at which a Gaussian counts as seen
 
 
-def add_views(scene: UnalignedScene) -> UnalignedScene:
+def add_views(scene: Scene) -> Scene:
     """The finite Gaussians, and cameras where there are none; a note says what was done.
 
     Raises:
@@ -43,12 +43,12 @@ def add_views(scene: UnalignedScene) -> UnalignedScene:
     if len(scene) == 0:
         cameras = place_cameras(scene.gaussians)
         names = tuple(f"placed {view}" for view in range(len(cameras)))
-        scene = UnalignedScene(scene.gaussians, cameras, None, names)
+        scene = Scene(scene.gaussians, cameras, None, None, names)
         note(f"no cameras: {len(cameras)} placed around and inside the scene, where they show most of it")
     return scene
 
 
-def add_pictures(scene: UnalignedScene) -> UnalignedScene:
+def add_pictures(scene: Scene) -> Scene:
     """The canonical scene with renders of its own in place of photos where it has none."""
     if scene.images is not None:
         return scene

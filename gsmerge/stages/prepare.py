@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from gsmerge.stages.check_photos import leave_out_photos
 from gsmerge.stages.group import CountLimits, count_limits, with_tree
 from gsmerge.stages.place_cameras import add_pictures, add_views
 from gsmerge.stages.region_tree import RegionTree
-from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
+from gsmerge.types import Cameras, Gaussians, Scene
 from gsmerge.views import distinct_views, report_views, scored_views, subset
 
 if TYPE_CHECKING:
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from gsmerge.networks.checkpoint import Checkpoint
     from gsmerge.options import CompactOptions
 
-Scene = TypeVar("Scene", PixelScene, UnalignedScene)
 SAMPLES = 65536  # Gaussians that the frame is measured on
 ROWS = 65536  # Gaussians per task
 MAX_VIEWS = 32  # of an unaligned scene, that the unit is taken from
@@ -85,7 +84,7 @@ class Frame:
         return replace(cameras, viewmats=viewmats)
 
 
-def find_frame(scene: PixelScene) -> Frame:
+def find_frame(scene: Scene) -> Frame:
     """The canonical frame of a scene: median mean (float64) and median depth of its valid Gaussians.
 
     Raises:
@@ -98,7 +97,7 @@ def find_frame(scene: PixelScene) -> Frame:
     return Frame(lower_median(scene.gaussians.means[rows].astype(np.float64)), _unit(scene_depth(scene)))
 
 
-def find_unaligned_frame(scene: UnalignedScene) -> Frame:
+def find_unaligned_frame(scene: Scene) -> Frame:
     """The canonical frame of an unaligned scene: median mean, and median depth of the Gaussians inside the views.
 
     Raises:
@@ -115,9 +114,9 @@ def _unit(depth: float) -> float:
     return 2.0 ** round(math.log2(depth)) if depth > 0 and math.isfinite(depth) else 1.0
 
 
-def scene_depth(scene: PixelScene | UnalignedScene) -> float:
+def scene_depth(scene: Scene) -> float:
     """Median depth of a sample of the Gaussians, each in its own view, or in all that see it; 0 where none does."""
-    if isinstance(scene, PixelScene):
+    if scene.aligned:
         rows = np.flatnonzero(scene.valid)
         rows = rows[:: max(1, len(rows) // SAMPLES)]
         means, viewmats = scene.gaussians.means[rows].astype(np.float64), scene.cameras.viewmats
@@ -130,13 +129,13 @@ def scene_depth(scene: PixelScene | UnalignedScene) -> float:
     return float(lower_median(depths[seen])) if seen.any() else 0.0
 
 
-def scene_frame(scene: PixelScene | UnalignedScene) -> Frame:
+def scene_frame(scene: Scene) -> Frame:
     """The canonical frame of a scene of either kind.
 
     Raises:
         ValueError: As :func:`find_frame` and :func:`find_unaligned_frame`.
     """
-    return find_frame(scene) if isinstance(scene, PixelScene) else find_unaligned_frame(scene)
+    return find_frame(scene) if scene.aligned else find_unaligned_frame(scene)
 
 
 def canonicalise(scene: Scene, frame: Frame | None = None) -> tuple[Scene, Frame]:
@@ -166,8 +165,8 @@ class PreparedScene:
         repeated: Of every given view its place in the scene, or that of the view that it repeats.
     """
 
-    given: PixelScene | UnalignedScene
-    scene: PixelScene | UnalignedScene
+    given: Scene
+    scene: Scene
     pictures: np.ndarray
     frame: Frame
     settings: CompactOptions
@@ -219,10 +218,10 @@ class PreparedScene:
 
     def keeps_all(self, count: int | None) -> bool:
         """Whether so many Gaussians are asked for that an unaligned scene need not be grouped."""
-        return count is not None and isinstance(self.scene, UnalignedScene) and count >= len(self.scene.gaussians)
+        return count is not None and not self.scene.aligned and count >= len(self.scene.gaussians)
 
 
-def prepare(scene: PixelScene | UnalignedScene, settings: CompactOptions, frame: Frame | None = None) -> PreparedScene:
+def prepare(scene: Scene, settings: CompactOptions, frame: Frame | None = None) -> PreparedScene:
     """Everything that is known before superpixels are chosen.
 
     Args:
@@ -244,9 +243,9 @@ def prepare(scene: PixelScene | UnalignedScene, settings: CompactOptions, frame:
         own, options, repeated = drop_repeats(scene, settings)
         if scene.images is None:  # nothing says where cameras belong
             options = replace(options, fit=replace(options.fit, poses="fixed"))
-        canonical: PixelScene | UnalignedScene
+        canonical: Scene
         members, hidden, moved = None, None, False
-        if isinstance(own, PixelScene):
+        if own.aligned:
             aligned_scene, frame = canonicalise(own, frame)
             aligned_scene, options, shown = leave_out_photos(aligned_scene, options)
             canonical, options = move_wrong_views(aligned_scene, options, shown)
@@ -256,7 +255,7 @@ def prepare(scene: PixelScene | UnalignedScene, settings: CompactOptions, frame:
             unaligned, options, shown = leave_out_photos(unaligned, options)
             unaligned, options, hidden = split_unseen(unaligned, options)
             canonical = add_pictures(unaligned)
-        photos, aligned = scene.images is not None, isinstance(scene, PixelScene)
+        photos, aligned = scene.images is not None, scene.aligned
         name = options.networks(photos=photos, aligned=aligned)
         checkpoint, notes = find_networks(name, options)
         for text in notes:
@@ -275,9 +274,7 @@ def prepare(scene: PixelScene | UnalignedScene, settings: CompactOptions, frame:
         return with_tree(prepared)
 
 
-def move_wrong_views(
-    scene: PixelScene, options: CompactOptions, views: tuple[int, ...]
-) -> tuple[PixelScene, CompactOptions]:
+def move_wrong_views(scene: Scene, options: CompactOptions, views: tuple[int, ...]) -> tuple[Scene, CompactOptions]:
     """The canonical scene with its views where the photos agree, as far as ``poses`` asks for it; and the options.
 
     Where it leaves that to the scene, the options say what came of it: the fit moves the cameras on, or it does not.
@@ -332,9 +329,7 @@ def require_children(name: str, count: int, checkpoint: Checkpoint | None) -> No
         )
 
 
-def drop_repeats(
-    scene: PixelScene | UnalignedScene, options: CompactOptions
-) -> tuple[PixelScene | UnalignedScene, CompactOptions, tuple[int, ...]]:
+def drop_repeats(scene: Scene, options: CompactOptions) -> tuple[Scene, CompactOptions, tuple[int, ...]]:
     """The scene with every view once, the options with budgets that stay shares of the whole, and places of views."""
     views, places = distinct_views(scene)
     if len(views) == len(scene):

@@ -15,7 +15,7 @@ from gsmerge.kernels.superpixels.region_tree import OVERSIZE, PLANE_ERROR, ROW, 
 from gsmerge.kernels.superpixels.regions import pad_labels
 from gsmerge.kernels.superpixels.ward import adjacent_pairs
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import Groups, PixelScene
+from gsmerge.types import Groups, Scene
 
 DEPTH_RANGE = 1e3  # depths are clipped to this factor of the view's median
 KNEE_STEP = 1.25  # the slope of the curve is taken over this factor of the count
@@ -82,7 +82,7 @@ class RegionTree:
         return len(self) - np.arange(len(self.distortions))
 
 
-def pixel_depths(scene: PixelScene) -> np.ndarray:
+def pixel_depths(scene: Scene) -> np.ndarray:
     """``[v,h,w]`` float32 depth of every pixel's Gaussian in its own view, world units."""
     cameras, means = scene.cameras, scene.gaussians.means
     height, width, pixels = cameras.height, cameras.width, scene.pixels_per_view

@@ -17,7 +17,7 @@ from gsmerge.measure.preview import BORDER_COLOR, Picture, borders, to_picture
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.prepare import scene_frame
 from gsmerge.stages.segment import SegmentOptions, segment
-from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
+from gsmerge.types import Cameras, Gaussians, Scene
 from gsmerge.view.splats import MAX_GAUSSIANS, highest_degree, pack_splats
 from gsmerge.views import even_views
 
@@ -85,7 +85,7 @@ class ViewData:
 
 def collect(
     title: str,
-    scene: PixelScene | UnalignedScene,
+    scene: Scene,
     results: Mapping[str, Gaussians],
     file_bytes: Sequence[int],
     held_out: Views | None = None,

@@ -9,7 +9,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from gsmerge.geometry import rgb_to_sh0
-from gsmerge.types import Cameras, Gaussians, PixelScene
+from gsmerge.types import Cameras, Gaussians, Scene, grid_ids
 
 Order = Literal["auto", "view-major", "view-fastest", "layer-major", "column-major", "unordered", "none"]
 ORDERS: tuple[str, ...] = get_args(Order)
@@ -176,7 +176,7 @@ def to_grid(
     cameras: Cameras,
     images: np.ndarray | None,
     names: tuple[str, ...],
-) -> PixelScene:
+) -> Scene:
     """The scene on the full grid of the layout; pixels without a row get a fully transparent Gaussian.
 
     ``gaussians`` and ``valid [n]`` are the file's rows; cameras (in their frame and at the grid's size), ``images
@@ -188,24 +188,24 @@ def to_grid(
     grid = len(views), layout.height, layout.width
     names = tuple(names[view] for view in views)
     if layout.is_plain:
-        return PixelScene(gaussians, cameras, images, valid.reshape(grid), names)
+        return Scene(gaussians, cameras, images, grid_ids(valid), names)
     size = layout.width * layout.height
     source = np.full(size * len(views), -1, np.int64)
     for i, (rows, pixels) in enumerate(zip(layout.rows, layout.pixels, strict=True)):
         source[i * size + pixels] = rows.reshape(-1)
     missing = source < 0
     if not missing.any():
-        return PixelScene(gaussians[source], cameras, images, valid[source].reshape(grid), names)
+        return Scene(gaussians[source], cameras, images, grid_ids(valid[source]), names)
     before = np.maximum.accumulate(np.where(missing, np.argmin(missing), np.arange(len(source))))
     out, kept = gaussians[source[before]], valid[source[before]]
     kept[missing] = False
     for values in (out.opacities, out.sh0, out.shN):
         values[missing] = 0
     out.quats[missing] = (1, 0, 0, 0)
-    return PixelScene(out, cameras, images, kept.reshape(grid), names, missing.reshape(grid))
+    return Scene(out, cameras, images, grid_ids(kept), names, missing.reshape(grid))
 
 
-def fill_from_depths(scene: PixelScene, depths: np.ndarray) -> PixelScene:
+def fill_from_depths(scene: Scene, depths: np.ndarray) -> Scene:
     """The scene with a Gaussian for each pixel that the file has no row for.
 
     It lies on the pixel's ray at the depth of the map (``depths [v,h,w]`` of the scene's views), in units that follow
@@ -249,7 +249,7 @@ def fill_from_depths(scene: PixelScene, depths: np.ndarray) -> PixelScene:
     full.sh0[rows] = rgb_to_sh0(scene.images.reshape(-1, 1, 3)[rows])
     kept = scene.valid.reshape(-1).copy()
     kept[rows] = True
-    return replace(scene, gaussians=full, valid=kept.reshape(scene.valid.shape))
+    return replace(scene, gaussians=full, pixel_ids=grid_ids(kept))
 
 
 def _agreement(ratio: np.ndarray, far: int) -> tuple[float, float, int]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from gsmerge.geometry import multiply_quats, normalize, quat_to_rotmat, rotmat_to_quat
 from gsmerge.io.hints import QuatChoice
-from gsmerge.types import PixelScene
+from gsmerge.types import Scene
 
 _SAMPLES = 3000  # pixels per view whose surface is used
 _STEP = 2  # pixels to the neighbours that span the surface
@@ -27,7 +27,7 @@ _DESCRIPTIONS = {
 }
 
 
-def read_rotations(scene: PixelScene, quats: QuatChoice) -> PixelScene:
+def read_rotations(scene: Scene, quats: QuatChoice) -> Scene:
     """The scene with its stored rotations, which were read as wxyz, read in another way; see :class:`ReadHints`.
 
     Of the two square roots that "xyzw-root" has, the one whose thinnest axis follows the surface better is taken.
@@ -63,7 +63,7 @@ def square_roots(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return half, _half_a_turn_more(half)
 
 
-def choose_rotations(scene: PixelScene) -> tuple[QuatChoice, str]:
+def choose_rotations(scene: Scene) -> tuple[QuatChoice, str]:
     """How the rotations (read as wxyz) are to be read so that thinnest axes follow the surface's normals; and a note.
 
     "wxyz" and "" unless another reading is better by a large margin.
@@ -91,7 +91,7 @@ def choose_rotations(scene: PixelScene) -> tuple[QuatChoice, str]:
     )
 
 
-def _camera_quats(scene: PixelScene) -> np.ndarray:
+def _camera_quats(scene: Scene) -> np.ndarray:
     """``[v,4]`` rotations from each camera to the world, wxyz."""
     return rotmat_to_quat(scene.cameras.viewmats[:, :3, :3].swapaxes(1, 2)).astype(np.float32)
 
@@ -103,7 +103,7 @@ def _cosines(quats: np.ndarray, thinnest: np.ndarray, normals: np.ndarray) -> np
 
 
 def _is_root(
-    scene: PixelScene, rows: np.ndarray, single: list[np.ndarray], thinnest: np.ndarray, normals: np.ndarray
+    scene: Scene, rows: np.ndarray, single: list[np.ndarray], thinnest: np.ndarray, normals: np.ndarray
 ) -> bool:
     """Whether the roots of the rotations read as xyzw follow the surface by far better than all other readings.
 
@@ -135,7 +135,7 @@ def _half_a_turn_more(quats: np.ndarray) -> np.ndarray:
     return np.concatenate([-length, quats[:, :1] * axis], 1)
 
 
-def _smooth_normals(scene: PixelScene) -> np.ndarray:
+def _smooth_normals(scene: Scene) -> np.ndarray:
     """``[n,3]`` normals of the surface at all pixels, of means averaged over some pixels around."""
     v, h, w = scene.valid.shape
     weights = scene.valid[..., None].astype(np.float32)
@@ -150,7 +150,7 @@ def _smooth_normals(scene: PixelScene) -> np.ndarray:
     return normalize(np.cross(across, down).reshape(-1, 3))
 
 
-def _normals(scene: PixelScene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _normals(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Normals ``[t,3]`` of some pixels' surface, their rows and their views."""
     v, h, w = scene.valid.shape
     inner = np.arange(v * h * w).reshape(v, h, w)[:, _STEP:-_STEP, _STEP:-_STEP].reshape(v, -1)

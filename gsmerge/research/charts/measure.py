@@ -14,10 +14,9 @@ from gsmerge.measure.evaluate import EvaluateOptions, Views, evaluate, near_plan
 from gsmerge.measure.preview import Picture, heat_map, to_picture
 from gsmerge.render import render
 from gsmerge.research.charts.record import picture_path
-from gsmerge.types import Gaussians, PixelScene, UnalignedScene
+from gsmerge.types import Gaussians, Scene
 from gsmerge.views import even_views, midpoint_views, pick_views, subset
 
-Scene = PixelScene | UnalignedScene
 MAX_PICTURES = 2  # views of a run whose pictures are stored
 MAX_WIDTH = 640  # pixels of a stored picture
 MAX_ERROR = 0.25  # mean absolute error over the channels at the top of the error maps' scale

@@ -31,7 +31,7 @@ from gsmerge.research.charts.record import INPUT, RunRecord, append_run, experim
 from gsmerge.research.charts.scenes import SceneSource
 from gsmerge.runtime.estimate import work_seconds
 from gsmerge.runtime.threads import available_threads, use_threads
-from gsmerge.types import PixelScene, UnalignedScene
+from gsmerge.types import Scene
 from gsmerge.views import pick_views
 
 Progress = Callable[[str, int, int], None]
@@ -86,7 +86,7 @@ class Plan:
 class _LoadedScene:
     """A scene in memory with its held-out views."""
 
-    scene: PixelScene | UnalignedScene
+    scene: Scene
     held_out: HeldOutViews | None
     notes: tuple[str, ...]
 

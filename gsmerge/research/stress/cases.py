@@ -17,7 +17,7 @@ from gsmerge.io.cameras.camera_file import CONVENTIONS
 from gsmerge.measure.evaluate import Views
 from gsmerge.stages.align_views import move_views
 from gsmerge.stages.prepare import scene_frame
-from gsmerge.types import SH_C0, Cameras, PixelScene, UnalignedScene
+from gsmerge.types import SH_C0, Cameras, Scene, grid_ids
 from gsmerge.views import even_views, subset
 
 Needs = Literal["anything", "pixels", "photos", "file", "pixel-file"]
@@ -46,7 +46,7 @@ BROKEN_SHARE = 0.01  # share of the rows that become NaN
 class StressScene:
     """A scene and the views that its results are compared with."""
 
-    scene: PixelScene | UnalignedScene
+    scene: Scene
     views: Views | None  # held-out views in its world; None: its own views
 
 
@@ -92,7 +92,6 @@ def _move_cameras(cameras: Cameras, factor: float, offset: np.ndarray) -> Camera
 def perturb_poses(given: StressScene, degrees: float) -> StressScene:
     """Every view, with its Gaussians, rotated about its camera centre by a random axis."""
     scene = given.scene
-    assert isinstance(scene, PixelScene)
     viewmats = turn_cameras(scene.cameras.viewmats.astype(np.float64), degrees, slice(None))
     return replace(given, scene=move_views(scene, viewmats))
 
@@ -100,7 +99,6 @@ def perturb_poses(given: StressScene, degrees: float) -> StressScene:
 def move_view(given: StressScene, share: float) -> StressScene:
     """The middle view, with its Gaussians, moved sideways by a share of the scene's size."""
     scene = given.scene
-    assert isinstance(scene, PixelScene)
     view, viewmats = len(scene) // 2, scene.cameras.viewmats.astype(np.float64)
     step = viewmats[view, 0, :3] * share * scene_frame(scene).unit
     viewmats[view, :3, 3] -= viewmats[view, :3, :3] @ step
@@ -119,7 +117,6 @@ def turn_cameras(viewmats: np.ndarray, degrees: float, views: slice) -> np.ndarr
 def change_exposure(given: StressScene, share: float) -> StressScene:
     """Photos, and the Gaussians of their views, alternately brighter and darker."""
     scene = given.scene
-    assert isinstance(scene, PixelScene)
     assert scene.images is not None
     gains = np.array([1 + share if view % 2 else 1 - share for view in range(len(scene))], np.float32)
     rows = gains.repeat(scene.pixels_per_view)[:, None, None]
@@ -134,11 +131,11 @@ def break_rows(given: StressScene) -> StressScene:
     """Rows without finite numbers, which the reader leaves out."""
     scene = given.scene
     chosen = _choose(len(scene.gaussians), BROKEN_SHARE)
-    if isinstance(scene, UnalignedScene):
+    if not scene.aligned:
         return replace(given, scene=replace(scene, gaussians=scene.gaussians[~chosen]))
     gaussians = replace(scene.gaussians, opacities=np.where(chosen, np.float32(0), scene.gaussians.opacities))
     valid = scene.valid & ~chosen.reshape(scene.valid.shape)
-    return replace(given, scene=replace(scene, gaussians=gaussians, valid=valid))
+    return replace(given, scene=replace(scene, gaussians=gaussians, pixel_ids=grid_ids(valid)))
 
 
 def throw_away(given: StressScene) -> StressScene:

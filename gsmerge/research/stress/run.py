@@ -20,7 +20,7 @@ from gsmerge.measure.evaluate import EvaluateOptions, Views, evaluate
 from gsmerge.options import CompactOptions
 from gsmerge.pipeline import compact
 from gsmerge.research.stress.cases import CASES, PROPERTIES, Case, StressScene
-from gsmerge.types import Gaussians, PixelScene, UnalignedScene
+from gsmerge.types import Gaussians, Scene
 
 MAX_WORSE = 0.1  # dB that a result may be below its input
 MAX_SAME, MAX_NEAR = 0.2, 1.0  # dB that a changed scene's result may be below the unchanged one's
@@ -123,7 +123,7 @@ def _check_case(
 def _inapplicable(case: Case, load: SceneLoad) -> str | None:
     """Why a case does not apply to a scene; None where it does."""
     scene = load.scene
-    if case.needs in ("pixels", "photos", "pixel-file") and not isinstance(scene, PixelScene):
+    if case.needs in ("pixels", "photos", "pixel-file") and not scene.aligned:
         return "needs a Gaussian for each pixel"
     if case.needs == "photos" and scene.images is None:
         return "needs photos"
@@ -179,7 +179,7 @@ def _check_result(case: Case, base: _Result, result: _Result, slack: float) -> t
 def _check_again(given: StressScene, base: _Result, options: CompactOptions) -> tuple[bool, str]:
     """The result as a scene of its own, compacted to as many Gaussians as it has."""
     scene = given.scene
-    unaligned = UnalignedScene(base.gaussians, scene.cameras, scene.images, scene.names)
+    unaligned = Scene(base.gaussians, scene.cameras, scene.images, None, scene.names)
     once = replace(options, budget=BudgetOptions(budget=len(base.gaussians)), decode=replace(options.decode, k=1))
     after = _quality(given, compact(unaligned, once).gaussians)[1]
     return after >= base.after - MAX_SAME - _slack(options), f"{after:.2f} dB; before {base.after:.2f} dB"
@@ -223,7 +223,7 @@ def _read_again(load: SceneLoad, cameras: CameraFile, hints: ReadHints) -> Scene
     )
 
 
-def _find_defect(gaussians: Gaussians, scene: PixelScene | UnalignedScene) -> str | None:
+def _find_defect(gaussians: Gaussians, scene: Scene) -> str | None:
     """What is wrong with a result for any scene; None where nothing is."""
     for name in _FIELDS:
         if not np.isfinite(getattr(gaussians, name)).all():

@@ -34,7 +34,7 @@ from gsmerge.stages.encode import encode
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge, take
 from gsmerge.stages.segment import segment
-from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches, PixelScene
+from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +83,7 @@ def make_examples(
     """
     load = load_scene(path)
     scene, ply = load.scene, load.files.ply
-    if not isinstance(scene, PixelScene):
+    if not scene.aligned:
         raise SceneError(ply, "expected one Gaussian per pixel to learn from, found an unaligned scene")
     if scene.images is None:
         raise SceneError(ply, "expected photos to learn from, found none", "put them next to it in images/")

@@ -15,7 +15,7 @@ from gsmerge.render import composite, plan_view, prepare
 from gsmerge.render.photos import NEAR, Photos, scene_photos
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.prepare import canonicalise
-from gsmerge.types import Cameras, PixelScene, UnalignedScene
+from gsmerge.types import Cameras, Scene
 from gsmerge.views import even_views, subset
 
 OPAQUE = 0.5  # alpha from which the Gaussians cover a pixel
@@ -25,7 +25,7 @@ OPAQUE = 0.5  # alpha from which the Gaussians cover a pixel
 class TrainingScene:
     """Some views of a scene, in the canonical frame, and the photos of all."""
 
-    scene: PixelScene  # the chosen views
+    scene: Scene  # the chosen views
     members: Members  # its Gaussians
     cameras: Cameras  # of all photos, those of the chosen views first
     images: np.ndarray  # [p,h,w,3] float32, at the size of the scene's own
@@ -33,7 +33,7 @@ class TrainingScene:
     def photos(self, level: float = 1) -> Photos:
         """All photos, each side divided by ``level``."""
         names = tuple(map(str, range(len(self.cameras))))
-        unaligned = UnalignedScene(self.scene.gaussians[:0], self.cameras, self.images, names)
+        unaligned = Scene(self.scene.gaussians[:0], self.cameras, self.images, None, names)
         return scene_photos(unaligned, level)
 
 
@@ -43,14 +43,13 @@ def view_subsets(num_views: int, counts: Sequence[int]) -> list[list[int]]:
     return [ids for i, ids in enumerate(chosen) if ids not in chosen[:i]]
 
 
-def make_training_scene(scene: PixelScene, ids: Sequence[int], held_out: Views | None = None) -> TrainingScene:
+def make_training_scene(scene: Scene, ids: Sequence[int], held_out: Views | None = None) -> TrainingScene:
     """The views ``ids`` of a scene with one Gaussian per pixel, with all its photos.
 
     Photos of ``held_out`` views are added, resized to the scene's own.
     """
     assert scene.images is not None
     part = subset(scene, ids)
-    assert isinstance(part, PixelScene)
     canonical, frame = canonicalise(part)
     rest = [view for view in range(len(scene)) if view not in set(ids)]
     order = [*ids, *rest]

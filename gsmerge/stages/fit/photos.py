@@ -11,16 +11,14 @@ from gsmerge.render.photos import EPS2D, Photos, scene_photos
 from gsmerge.runtime.record import choose, note
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.fit.options import FitOptions
-from gsmerge.types import PixelScene, UnalignedScene
+from gsmerge.types import Scene
 
 AUTO_SCALE = 2.0  # most that "auto" looks at: steps cost as many pixels, and photos beyond that are rarely sharp
 MIN_AUTO_SCALE = 1.25  # below it "auto" leaves it at the views' size
 ALIKE = 0.01  # of the scale: the rounding of sizes
 
 
-def fit_photos(
-    scene: PixelScene | UnalignedScene, options: FitOptions, views: Sequence[int] | None = None
-) -> tuple[Photos, ...]:
+def fit_photos(scene: Scene, options: FitOptions, views: Sequence[int] | None = None) -> tuple[Photos, ...]:
     """The photos at full and at half size, and at the scale of the options where they look at larger ones.
 
     Those of ``views``, None: of all. The record gets the choice ``photo_scale`` where it is not 1, and a note on what
@@ -43,7 +41,7 @@ def fit_photos(
     return *photos, large
 
 
-def photo_scale(scene: PixelScene | UnalignedScene, options: FitOptions) -> tuple[float, str | None]:
+def photo_scale(scene: Scene, options: FitOptions) -> tuple[float, str | None]:
     """Times the views' size at which a fit to a scene looks at its photos, 1 or more; and why it is less than asked."""
     wanted, largest = options.photo_scale, largest_scale(scene)
     covered = options.fit == "full" and options.half_res_part < 1
@@ -59,7 +57,7 @@ def photo_scale(scene: PixelScene | UnalignedScene, options: FitOptions) -> tupl
     return float(min(wanted, largest)), None
 
 
-def largest_scale(scene: PixelScene | UnalignedScene) -> float:
+def largest_scale(scene: Scene) -> float:
     """Times the views' size that the photos have along either side, at least 1."""
     large = scene.large_photos
     if large is None or scene.images is None or len(scene) == 0:
@@ -68,7 +66,7 @@ def largest_scale(scene: PixelScene | UnalignedScene) -> float:
     return max(1.0, float((large.Ks[0][focals] / scene.cameras.Ks[0][focals]).min()))
 
 
-def large_photos(scene: PixelScene | UnalignedScene, scale: float) -> Photos:
+def large_photos(scene: Scene, scale: float) -> Photos:
     """The photos at ``scale`` times the views' size, at most :func:`largest_scale`, read one by one.
 
     As uint8, because they may be as large as the scene. Their low-pass is that of a viewer of this size: the views' own
