@@ -41,13 +41,13 @@ if TYPE_CHECKING:
     from gsmerge.measure.inspect import inspect as inspect
     from gsmerge.online.compactor import Compactor as Compactor
     from gsmerge.options import CompactOptions as CompactOptions
-    from gsmerge.pipeline import CompactReport as CompactReport
-    from gsmerge.pipeline import CompactResult as CompactResult
     from gsmerge.pipeline import compact as compact
     from gsmerge.render import Rendering as Rendering
     from gsmerge.render import render as render
-    from gsmerge.stages.segment import saliency as saliency
-    from gsmerge.stages.segment import superpixels as superpixels
+    from gsmerge.result import CompactReport as CompactReport
+    from gsmerge.result import CompactResult as CompactResult
+    from gsmerge.stages.superpixels import saliency as saliency
+    from gsmerge.stages.superpixels import superpixels as superpixels
     from gsmerge.types import Cameras as Cameras
     from gsmerge.types import Gaussians as Gaussians
     from gsmerge.types import Scene as Scene
@@ -70,14 +70,15 @@ _PUBLIC = {
     ),
     "online.compactor": ("Compactor",),
     "options": ("CompactOptions",),
-    "pipeline": ("CompactReport", "CompactResult", "compact"),
+    "pipeline": ("compact",),
     "render": ("Rendering", "render"),
-    "stages.segment": ("saliency", "superpixels"),
+    "result": ("CompactReport", "CompactResult"),
+    "stages.superpixels": ("saliency", "superpixels"),
     "encoded.decode": ("decode_scene",),
     "encoded.encode": ("encode_scene",),
     "encoded.encoded": ("Encoded",),
     "encoded.gsm_file": ("load_encoded", "save_encoded"),
-    "types": ("Cameras", "Gaussians", "Scene", "Scene"),
+    "types": ("Cameras", "Gaussians", "Scene"),
 }
 _EXPORTS = {name: home for home, names in _PUBLIC.items() for name in names}
 

@@ -1,55 +1,39 @@
-"""The story of a run: scene -> groups -> feature gaussians -> merged -> refined -> decoded -> fitted.
+"""The story of a run: scene -> groups -> feature gaussians -> merged -> refined -> decoded -> fitted -> result.
 
-:func:`compact` prepares the scene, chooses how many Gaussians, builds, and scores; :func:`build` is every arrow by its
-name, whose first half, :func:`merge_views`, encoding and views in batches share. A baseline takes the place of the
-arrows alone: preparing, scores and report stay the same.
+:func:`compact` finds facts, makes a plan, builds, and scores. :func:`build` is every arrow by its name, whose first
+half, :func:`merge_views`, encoding and views in batches share.
 """
 
 from __future__ import annotations
 
 import os
-from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from gsmerge.baselines import choose_baseline
-from gsmerge.io import load_scene
-from gsmerge.io.cameras.moves import describe_moves, list_moves
-from gsmerge.moments import Members, feature_to_gaussians
+from gsmerge.baselines import choose_method
+from gsmerge.io import read_noted
+from gsmerge.moments import Members
 from gsmerge.options import CompactOptions
-from gsmerge.render.photos import NEAR, photo_psnr, photos_of, scene_photos
-from gsmerge.report import CompactReport, CompactResult
-from gsmerge.runtime.memory import peak_memory
-from gsmerge.runtime.record import (
-    STAGES,
-    Progress,
-    choose,
-    current_record,
-    note,
-    record_part,
-    record_run,
-    report_progress,
-    stage,
-)
+from gsmerge.plan import Plan, make_plan
+from gsmerge.result import Candidate, CompactResult, make_result, score
+from gsmerge.runtime.record import Progress, choose, record_part, record_run
 from gsmerge.runtime.threads import use_threads
-from gsmerge.search import Build, choose_count, level_counts, search_quality
+from gsmerge.search import Build, level_counts, search_count
 from gsmerge.stages.agreement import weaken_contradicted
-from gsmerge.stages.assign import assign_members
+from gsmerge.stages.assign import assign
 from gsmerge.stages.choose_start import choose_start
-from gsmerge.stages.clean import clean, make_clean
-from gsmerge.stages.decode import MIXED, decode_merged
-from gsmerge.stages.encode import encode
-from gsmerge.stages.fit import Fitted, fit, fit_photos, record_fit, report_steps
-from gsmerge.stages.group import segment_scene
+from gsmerge.stages.clean import clean_to_count
+from gsmerge.stages.decode import Decoded, decode_merged
+from gsmerge.stages.encode import encode, make_context
+from gsmerge.stages.fit import Fitted, fit_scene
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import MergedViews, merge, refine
-from gsmerge.stages.prepare import PreparedScene, prepare, scene_depth
-from gsmerge.stages.segment import scene_saliency
-from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Scene, Segmentation
+from gsmerge.stages.prepare import Prepared, prepare
+from gsmerge.stages.segment import segment_scene
+from gsmerge.types import Scene, Segmentation
 
 if TYPE_CHECKING:
-    from gsmerge.networks.apply import NetworkContext
+    from gsmerge.networks.modules import Networks
 
 
 def compact(
@@ -62,9 +46,8 @@ def compact(
     """Replace a scene by a compact one that renders at least as well from new viewpoints.
 
     Args:
-        scene: One Gaussian per pixel and view, see :func:`gsmerge.read_scene`; or Gaussians that belong to no pixels,
-            which are given to the superpixels by what they add to the views. Tensors give tensors on their device. A
-            path is read by :func:`gsmerge.read_scene` with its defaults.
+        scene: Gaussians with their views, see :func:`gsmerge.read_scene`. Tensors give tensors on their device. A path
+            is read by :func:`gsmerge.read_scene` with its defaults.
         options: Settings of all stages; None: the defaults.
         progress: Called with (stage, done, total) as each stage begins, done and total in stages, and from within
             the longer ones with ("fit: ...", step, steps).
@@ -77,212 +60,79 @@ def compact(
         SceneError: If a path is given that cannot be read.
         ValueError: If a setting is unknown or out of range, or asks for what the scene does not have.
     """
-    read_notes: tuple[str, ...] = ()
-    if isinstance(scene, str | os.PathLike):
-        load = load_scene(scene)
-        scene, read_notes = load.scene, load.notes
-    options = (options or CompactOptions()).with_settings(settings).with_auto_steps()
-    options = options.with_chosen_device(scene.num_gaussians)
-    device = scene.gaussians.device
-    scene = scene.numpy()
+    options = (options or CompactOptions()).with_settings(settings)
     with use_threads(options.threads), record_run(progress):
-        baseline, notes = choose_baseline(options, scene)
-        for text in (*read_notes, *notes):
-            note(text)
-        prepared = prepare(scene, options)
-        make: Build = build if baseline is None else baseline.build
-        if prepared.options.clean.asked:
-            prepared, make = clean_up(prepared, make)
-        if options.budget.target_psnr is not None:
-            result, cameras = search_quality(prepared, make, score)
-        else:
-            fitted = make(prepared, choose_count(prepared, build))
-            result, cameras = score(fitted, prepared), fitted.cameras
-        coarser, placed = [], prepared.with_cameras(cameras)  # the cameras that are written are the finest level's
-        for count in level_counts(len(result.gaussians), options.budget.levels, prepared.limits.min_count):
-            with record_part():
-                coarser.append(score(make(placed, count), placed))
-        result = score_input(replace(result, coarser=tuple(coarser)), prepared)
-        report_progress("done", len(STAGES), len(STAGES))
-    return result if device is None else result.to(device)
+        given = scene if isinstance(scene, Scene) else read_noted(scene)
+        method = choose_method(options, given, build)  # ours, or a baseline
+        prepared = prepare(given.numpy(), options.prepare)  # facts: frame, photos, poses, unseen
+        plan = make_plan(prepared, options)  # every "auto" is decided once; options end here
+        search = search_count(prepared, plan, build)  # one count, or counts until a quality is met
+        for count in search:
+            search.add(build_scored(method, prepared, plan, count))
+        best = search.best
+        fixed = prepared.with_cameras(best.fitted.cameras), plan.with_fixed_cameras()
+        levels = [build_scored(method, *fixed, count) for count in level_counts(len(best.gaussians), plan)]
+        result = make_result(best, levels, prepared, plan, search.facts())
+    return result.to(given.gaussians.device)
 
 
-def build(prepared: PreparedScene, count: int | None) -> Fitted:
-    """Every arrow after the preparation: superpixels to fitted Gaussians, in the canonical frame.
+def build_scored(method: Build, prepared: Prepared, plan: Plan, count: int | None) -> Candidate:
+    """Build so many Gaussians, cleaned up if that was asked for, and score them, with a record of their own."""
+    with record_part():
+        fitted = clean_to_count(
+            partial(method, prepared, plan), count, plan.clean, prepared.scene, prepared.frame.leave
+        )
+        return score(count, fitted, prepared, plan)
+
+
+def build(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
+    """Build Gaussians from superpixels and fit them.
 
     Args:
         prepared: The scene.
+        plan: Of all stages.
         count: Gaussians in the result; None: as many as ``superpixels`` and K give.
-    """
-    scene, options = prepared.scene, prepared.options
-    gaussians, count, exact, analytic = begin(prepared, count)
-    if scene.images is None or not options.fit.needs_photos:
-        return Fitted(gaussians, scene.cameras, None)
-    with stage("fit"):
-        photos = fit_photos(scene, options.fit, prepared.photo_views)
-        choose(begun_with=len(gaussians))
-        if options.fit.device != "cpu":
-            choose(device=options.fit.device if len(photos) == 2 else "cpu")  # larger photos: the CPU alone
-        gaussians, report = fit(
-            gaussians, photos, options.fit, count, options.seed, report_steps, analytic, exact=exact
-        )
-    record_fit(report)
-    cameras = scene.cameras
-    if report is not None and report.viewmats is not None:
-        poses = cameras.viewmats.astype(np.float64)
-        poses[list(prepared.photo_views)] = report.viewmats
-        cameras = replace(cameras, viewmats=poses)
-    return Fitted(gaussians, cameras, report)
-
-
-def clean_up(prepared: PreparedScene, make: Build) -> tuple[PreparedScene, Build]:
-    """The prepared scene without hidden Gaussians that are not wanted, and ``make`` with clean-up of what it makes."""
-    options, scene, lost = prepared.options.clean, prepared.scene, 0
-    if prepared.hidden is not None:
-        kept = clean(prepared.hidden, options, scene, prepared.frame.leave)[0]
-        lost = len(prepared.hidden) - len(kept)
-        prepared = replace(prepared, hidden=kept)
-
-    def build_clean(prepared: PreparedScene, count: int | None) -> Fitted:
-        wanted = None if count is None else count + lost
-        return make_clean(lambda asked: make(prepared, asked), wanted, options, scene, prepared.frame.leave)
-
-    return prepared, build_clean
-
-
-def begin(prepared: PreparedScene, count: int | None) -> tuple[Gaussians, int, bool, Gaussians | None]:
-    """The arrows up to decoding; arguments as of :func:`build`.
 
     Returns:
-        Gaussians; the number that the fit may grow to, and whether it is to be met; another start that the fit may
-        beat instead, None for none.
+        Canonical Gaussians, and the cameras that they were fitted from.
     """
-    scene, options = prepared.scene, prepared.options
-    if prepared.keeps_all(count):  # merging some and splitting others would only blur
-        return scene.gaussians, len(scene.gaussians), True, None
-    merged = merge_views(prepared, count)
-    with stage("decode"):
-        gaussians = decode_merged(merged, options.decode, options.encode.rule, grows=options.fit.grows)
-    analytic = None
-    if merged.networks is not None and options.fit.fit == "full" and scene.images is not None:
-        groups = merged.segmentation.groups
-        analytic = feature_to_gaussians(encode(scene, merged.members, groups, options.encode))
-    return gaussians, merged.segmentation.count, merged.segmentation.exact, analytic
+    scene = prepared.scene
+    if keeps_all(scene, count):
+        decoded = Decoded(scene.gaussians, len(scene.gaussians), exact=True)  # merging some would only blur
+    else:
+        decoded = decode_merged(merge_views(prepared, plan, count), scene, plan.decode, grows=plan.fit.grows)
+    return fit_scene(decoded, scene, prepared.photo_views, plan.fit, plan.seed, plan.device)
 
 
-def merge_views(prepared: PreparedScene, count: int | None) -> MergedViews:
-    """The arrows from superpixels to Feature Gaussians that are merged across views and refined.
+def keeps_all(scene: Scene, count: int | None) -> bool:
+    """Tell whether so many Gaussians are asked for that an unaligned scene need not be grouped."""
+    return count is not None and not scene.aligned and count >= len(scene.gaussians)
 
-    Where networks compete with the analytic stages (``checkpoint="auto"``) both run, and the better start is kept.
-    """
-    scene, options = prepared.scene, prepared.options
-    with stage("segment"):
-        segmentation = segment_scene(prepared, count)
-    members = prepared.members
-    if members is None:
-        with stage("members"):
-            members = assign_members(scene, segmentation.groups, options.contribution)
-    saliency = scene_saliency(prepared.pictures) if options.decode.k == MIXED else None
-    starts = []
-    for networks in prepared.candidates(members):
-        features, choices = merge_with(networks, prepared, members, segmentation)
-        starts.append(MergedViews(features, members, segmentation, networks, choices, saliency=saliency))
-    start = starts[0]
-    if len(starts) > 1:
-        with stage("choose"):
-            start = choose_start(starts, scene, options.decode, options.encode.rule)
-    choose(**start.choices)
-    if start.networks is not None and prepared.checkpoint is not None:
-        choose(networks=prepared.checkpoint.facts())
+
+def merge_views(prepared: Prepared, plan: Plan, count: int | None) -> MergedViews:
+    """Merge superpixels across views: the half of the way that encoding and views in batches share."""
+    scene = prepared.scene
+    segmentation = segment_scene(scene, plan.superpixels, count)
+    members = assign(scene, segmentation.groups)
+    starts = [merge_features(scene, members, segmentation, plan, networks) for networks in plan.networks]
+    start = choose_start(starts, scene, plan.decode)
+    choose(groups=start.num_groups, clusters=len(start.features))
+    if start.networks is not None and plan.checkpoint is not None:
+        choose(networks=plan.checkpoint.facts())
     return start
 
 
-def merge_with(
-    networks: NetworkContext | None, prepared: PreparedScene, members: Members, segmentation: Segmentation
-) -> tuple[FeatureGaussians, dict[str, Any]]:
-    """Feature Gaussians of superpixels, merged and refined with these networks or with none; what the stages decided.
+def merge_features(
+    scene: Scene, members: Members, segmentation: Segmentation, plan: Plan, networks: Networks | None
+) -> MergedViews:
+    """Encode superpixels as Feature Gaussians, merge those that match, and refine them, with networks or with none.
 
-    What it holds besides the scene is as large as the result, several times: nothing of it outlives this function.
+    A separate function, so that its intermediates (several times the result) are freed on return.
     """
-    scene, options = prepared.scene, prepared.options
-    with stage("encode"):
-        features = encode(scene, members, segmentation.groups, options.encode, networks)
-    if networks is None and options.encode.agreement and prepared.limits.share < 1:  # a long fit follows
+    context = make_context(networks, members, scene.cameras, plan.seed)
+    features = encode(scene, members, segmentation.groups, context)
+    if networks is None and plan.weakens:
         features = weaken_contradicted(features, members, scene.cameras)
-    with stage("match"):
-        matches = match(features, options.match, networks)
-        merged = merge(features, matches, networks)
-    choices: dict[str, Any] = {"groups": len(features), "clusters": matches.count}
-    del features, matches
-    if networks is not None:
-        with stage("refine"):
-            merged = refine(merged, networks)
-    return merged, choices
-
-
-def score(fitted: Fitted, prepared: PreparedScene) -> CompactResult:
-    """Canonical Gaussians as a result in the world frame, with its report, scored on the input views."""
-    gaussians, record = fitted.gaussians, current_record()
-    if prepared.hidden is not None:
-        gaussians = Gaussians.concat([gaussians, prepared.hidden])
-    prepared = prepared.with_cameras(fitted.cameras)
-    gaussians, cameras = prepared.frame.leave(gaussians), prepared.final_cameras()
-    after = None
-    if cameras is not prepared.given.cameras:
-        note_moves(prepared, cameras)
-        prepared = replace(prepared, given=replace(prepared.given, cameras=cameras))
-    if prepared.given.images is not None:
-        with stage("score"):
-            after = input_psnr(gaussians, prepared)
-        choose(scored_views=len(prepared.scored_views()))
-    settings = prepared.settings.to_dict() | {"fit_steps": prepared.options.fit.steps}
-    counts = prepared.given.num_gaussians, len(gaussians)
-    return CompactResult(
-        gaussians,
-        CompactReport(*counts, record.seconds, None, after, record.choices, record.notes, settings, peak_memory()),
-        cameras,
-    )
-
-
-def note_moves(prepared: PreparedScene, cameras: Cameras) -> None:
-    """Tell how far each camera was moved."""
-    given, cause = prepared.given, "poses are free"
-    if prepared.settings.fit.poses == "auto":
-        cause = "the photos of some views agree only under other poses"
-    depth = scene_depth(prepared.scene) * prepared.frame.unit
-    moves = list_moves(given.names, given.cameras.viewmats, cameras.viewmats, depth)
-    choose(poses=moves)
-    note(f"{cause}: cameras were moved by {describe_moves(moves)}")
-
-
-def score_input(result: CompactResult, prepared: PreparedScene) -> CompactResult:
-    """The result and its further levels, with the PSNR of the input beside their own.
-
-    It comes last, when the kernels are compiled and memory is free again.
-    """
-    if prepared.given.images is None:
-        return result
-    with record_part() as own, stage("input"):
-        before = input_psnr(prepared.given.file_gaussians, prepared)
-
-    def with_input(one: CompactResult, seconds: dict[str, float]) -> CompactResult:
-        report = replace(one.report, psnr_before=before, seconds=one.report.seconds | seconds)
-        return replace(one, report=replace(report, peak_memory_bytes=peak_memory()))
-
-    return replace(with_input(result, own.seconds), coarser=tuple(with_input(one, {}) for one in result.coarser))
-
-
-def input_psnr(gaussians: Gaussians, prepared: PreparedScene) -> float:
-    """Mean PSNR (dB) of some input photos, see :meth:`PreparedScene.scored_views`, rendered from world-frame Gaussians.
-
-    In a quarter of every photo, or in the whole where a quality was asked for.
-    """
-    photos, exact = scene_photos(prepared.given), prepared.options.budget.target_psnr is not None
-    views, near = prepared.scored_views(), NEAR * prepared.frame.unit
-    if prepared.options.fit.device == "cpu":
-        return photo_psnr(gaussians, photos, views, quarter=not exact, near=near)
-    from gsmerge.gpu.score import score_photos  # torch; loaded where it is used alone
-
-    frame, device = prepared.frame, prepared.options.fit.device
-    photos = photos_of(photos.images, frame.enter_cameras(prepared.given.cameras))  # float32 wants small numbers
-    return score_photos(frame.enter(gaussians), photos, views, device, quarter=not exact)
+    merged = refine(merge(features, match(features, plan.match, context), context), context)
+    start = None if context is None or plan.fit.fit == "none" else encode(scene, members, segmentation.groups)
+    return MergedViews(merged, members, segmentation, len(features), context, start)

@@ -6,72 +6,19 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gsmerge import __version__
 from gsmerge.options import to_schema
+from gsmerge.result import CompactReport
 from gsmerge.runtime.memory import human_bytes
-from gsmerge.types import Cameras, Gaussians
 
 if TYPE_CHECKING:
-    import torch
+    pass
 
 SCHEMA_VERSION = 1
-
-
-@dataclass(frozen=True)
-class CompactReport:
-    """What a run did.
-
-    Args:
-        num_input: Gaussians in the scene.
-        num_output: Gaussians in the result.
-        seconds: Wall time of each stage.
-        psnr_before: Mean PSNR (dB) of the input views rendered from the input, of many views some, and in a fixed
-            quarter of each unless a quality was asked for; None without photos. :func:`gsmerge.evaluate` is exact.
-        psnr_after: The same from the result.
-        choices: What the stages decided (count, curve, merge, scores, clusters, fit).
-        notes: Warnings about the input and what was adapted, one sentence each.
-        options: All settings by flat name.
-        peak_memory_bytes: Largest resident memory of the process so far.
-        unmet: Why a target that was asked for is not met, and how far the result got; None if it is.
-    """
-
-    num_input: int
-    num_output: int
-    seconds: dict[str, float]
-    psnr_before: float | None
-    psnr_after: float | None
-    choices: dict[str, Any]
-    notes: list[str]
-    options: dict[str, Any]
-    peak_memory_bytes: int
-    unmet: str | None = None
-
-
-@dataclass(frozen=True)
-class CompactResult:
-    """The compact Gaussians, in the scene's own world frame, and the report.
-
-    Args:
-        gaussians: The Gaussians.
-        report: What was done.
-        cameras: The given views as the Gaussians were made from them, in the same frame: moved where their poses were
-            wrong, see ``poses`` of :class:`gsmerge.FitOptions`.
-        coarser: Further levels of detail, each with a quarter of the Gaussians of the one before.
-    """
-
-    gaussians: Gaussians
-    report: CompactReport
-    cameras: Cameras
-    coarser: tuple[CompactResult, ...] = ()
-
-    def to(self, device: torch.device | str) -> CompactResult:
-        """The same result with tensors on a device."""
-        coarser = tuple(one.to(device) for one in self.coarser)
-        return replace(self, gaussians=self.gaussians.to(device), coarser=coarser)
 
 
 def file_sha256(path: Path) -> str:

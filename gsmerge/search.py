@@ -6,25 +6,27 @@ A curve is measured by short fits, judged by parts of the photos that they left 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
+from gsmerge.plan import Plan
 from gsmerge.render.metrics import WINDOW, ssim
 from gsmerge.render.photos import Photos, render_photos, scene_photos
-from gsmerge.report import CompactResult
-from gsmerge.runtime.record import choose, current_record, record_part, report_progress, stage
+from gsmerge.result import Candidate
+from gsmerge.runtime.record import choose, record_part, report_progress, stage
 from gsmerge.runtime.threads import parallel_map
+from gsmerge.stages.clean import CleanOptions
 from gsmerge.stages.fit import FitOptions, Fitted
 from gsmerge.stages.fit.holdout import holdout_psnr, training_weights
-from gsmerge.stages.group import knee_count
-from gsmerge.stages.prepare import PreparedScene
-from gsmerge.types import Cameras, Gaussians
+from gsmerge.stages.prepare import Prepared
+from gsmerge.stages.segment import knee_count
+from gsmerge.types import Gaussians
 
-Build = Callable[[PreparedScene, int | None], Fitted]
-Score = Callable[[Fitted, PreparedScene], CompactResult]
+Build = Callable[[Prepared, Plan, int | None], Fitted]
 
 SHORT, LONG = 60, 300  # steps of half-size photos: enough to find the knee; to tell tenths of a dB on clean scenes
 HOLDOUT = 0.1  # share of the photos' blocks
@@ -51,73 +53,120 @@ class CurvePoint:
     lpips: float | None = None  # LPIPS (AlexNet), None where its weights are not installed
 
 
-def choose_count(prepared: PreparedScene, build: Build) -> int | None:
-    """The number of Gaussians, as the options and the scene's own curve have it; None: as ``superpixels`` and K say."""
-    limits, options = prepared.limits, prepared.options
-    drop = options.budget.max_drop
-    if drop is None and not options.budget.auto:
+@dataclass(eq=False)
+class CountSearch:
+    """The counts to build, one after the other: one alone, or several until a quality is met.
+
+    Args:
+        plan: Target and limits.
+        first: The count to begin with; None: as many as ``superpixels`` and K give.
+        candidates: What was built so far.
+    """
+
+    plan: Plan
+    first: int | None
+    candidates: list[Candidate] = field(default_factory=list)
+
+    def __iter__(self) -> Iterator[int | None]:
+        """Yield counts; each candidate is added before the next one is asked for."""
+        yield self.first
+        target, limits = self.plan.target_psnr, self.plan.limits
+        while target is not None and len(self.candidates) < MAX_RUNS:
+            count = next_count(self.tried, target, limits.min_count, self._max_count)
+            if count in self.tried:
+                return
+            yield count
+
+    @property
+    def _max_count(self) -> int:
+        return min(self.plan.limits.max_count, MAX_FACTOR * self.plan.limits.default)
+
+    @property
+    def tried(self) -> dict[int, float]:
+        """PSNR (dB) of the counts so far, in the order of the runs."""
+        return {one.count: one.psnr or 0.0 for one in self.candidates if one.count is not None}
+
+    def add(self, candidate: Candidate) -> None:
+        """Take note of what was built for the last count."""
+        self.candidates.append(candidate)
+
+    @property
+    def best(self) -> Candidate:
+        """The fewest Gaussians that reach the target; of all, those with the highest PSNR where none does."""
+        if self.plan.target_psnr is None:
+            return self.candidates[0]
+        chosen = best_count(self.tried, self.plan.target_psnr)
+        return next(one for one in self.candidates if one.count == chosen)
+
+    @property
+    def unmet(self) -> str | None:
+        """Why the target is not met; None if it is."""
+        if self.plan.target_psnr is None or max(self.tried.values()) >= self.plan.target_psnr:
+            return None
+        psnr, count = self.best.psnr or 0.0, len(self.best.gaussians)
+        reached = f"the input views reach {psnr:.2f} dB with {count} Gaussians"
+        return f"quality: {self.plan.target_psnr:g} dB was asked for, {reached}"
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        """Wall time of all candidates, by stage."""
+        names = dict.fromkeys(name for one in self.candidates for name in one.record.seconds)
+        return {name: sum(one.record.seconds.get(name, 0.0) for one in self.candidates) for name in names}
+
+    def facts(self) -> dict[str, Any]:
+        """Return what a report says of the search: ``seconds`` of all candidates, ``choices``, ``unmet``."""
+        choices: dict[str, Any] = {}
+        if self.plan.target_psnr is not None:
+            best, tried = self.best, tuple(self.tried.items())
+            choices["search"] = {"count": best.count, "psnr": best.psnr, "met": self.unmet is None, "tried": tried}
+        return {"seconds": self.seconds, "choices": choices, "unmet": self.unmet}
+
+
+def search_count(prepared: Prepared, plan: Plan, build: Build) -> CountSearch:
+    """Begin a search for the number of Gaussians, with the scene's own curve where that decides.
+
+    Args:
+        prepared: The scene.
+        plan: Target and limits.
+        build: Builds a scene with so many Gaussians.
+    """
+    if plan.target_psnr is not None:
+        limits = plan.limits
+        most = min(limits.max_count, MAX_FACTOR * limits.default)
+        return CountSearch(plan, min(max(min(limits.default, most), limits.min_count), most))
+    return CountSearch(plan, choose_count(prepared, plan, build))
+
+
+def choose_count(prepared: Prepared, plan: Plan, build: Build) -> int | None:
+    """Choose the number of Gaussians by the budget or the scene's own curve; None: ``superpixels`` and K decide."""
+    limits, drop = plan.limits, plan.max_drop
+    if drop is None and not plan.auto_count:
         return limits.count
-    if prepared.given.images is None or prepared.scene.images is None:
-        return knee_count(prepared)
+    if prepared.given.images is None or not prepared.photo_views:
+        return knee_count(prepared.scene, plan.superpixels)
     with stage("curve"):
         counts = rungs(AUTO_RUNGS if drop is None else RUNGS, limits.default, limits.min_count, limits.max_count)
-        points = measure_curve(prepared, build, SHORT if drop is None else LONG, counts)
+        points = measure_curve(prepared, plan, build, SHORT if drop is None else LONG, counts)
     choose(curve=[asdict(point) for point in points])
     return curve_knee(points) if drop is None else count_within(points, drop)
 
 
-def search_quality(prepared: PreparedScene, build: Build, score: Score) -> tuple[CompactResult, Cameras]:
-    """The fewest Gaussians that render the input photos at the PSNR among the options; the best result where none do.
+def measure_curve(prepared: Prepared, plan: Plan, build: Build, steps: int, counts: Sequence[int]) -> list[CurvePoint]:
+    """Measure PSNR, SSIM and, where its weights are installed, LPIPS (AlexNet) of the photos at some counts.
 
-    The seconds and notes of what came before enter the report. The second result are the canonical cameras.
-    """
-    target, limits = prepared.options.budget.target_psnr, prepared.limits
-    assert target is not None
-    results: dict[int, CompactResult] = {}
-    cameras: dict[int, Cameras] = {}
-    before = current_record()
-
-    def run(count: int) -> float:
-        with record_part():
-            fitted = build(prepared, count)
-            results[count], cameras[count] = score(fitted, prepared), fitted.cameras
-        return results[count].report.psnr_after or 0.0
-
-    max_count = min(limits.max_count, MAX_FACTOR * limits.default)
-    search = search_count(run, target, min(limits.default, max_count), limits.min_count, max_count)
-    result, seconds = results[search.count], dict(before.seconds)
-    for one in results.values():
-        for name, value in one.report.seconds.items():
-            seconds[name] = seconds.get(name, 0.0) + value
-    unmet = None
-    if not search.met:
-        unmet = (
-            f"quality: {target:g} dB was asked for, the input views reach {search.psnr:.2f} dB"
-            f" with {len(result.gaussians)} Gaussians"
-        )
-    choices = before.choices | result.report.choices | {"search": asdict(search)}
-    notes = [*before.notes, *result.report.notes]
-    report = replace(result.report, choices=choices, seconds=seconds, notes=notes, unmet=unmet)
-    return replace(result, report=report), cameras[search.count]
-
-
-def measure_curve(prepared: PreparedScene, build: Build, steps: int, counts: Sequence[int]) -> list[CurvePoint]:
-    """PSNR, SSIM and, where its weights are installed, LPIPS (AlexNet) of the photos at some counts.
-
-    The fits take ``steps``, whatever the options say. PSNR and SSIM are those of blocks that the fits leave out, at
+    The fits take ``steps``, whatever the plan says. PSNR and SSIM are those of blocks that the fits leave out, at
     full size; LPIPS needs whole pictures.
     """
-    options = prepared.options
-    short = FitOptions(fit="full", fit_steps=steps, half_res_share=1.0, holdout=HOLDOUT, rates=options.fit.rates)
-    limits = replace(prepared.limits, share=1.0)  # so short a fit does not grow
-    quick = replace(prepared, options=replace(options, fit=short), limits=limits, checkpoint=None)
+    short = FitOptions(fit="full", fit_steps=steps, half_res_share=1.0, holdout=HOLDOUT, rates=plan.fit.rates)
+    quick = replace(plan.with_fit(short), networks=(None,), checkpoint=None, clean=CleanOptions())  # nothing grows
     photos = scene_photos(prepared.scene)[prepared.photo_views]
-    weights = training_weights(photos, HOLDOUT, options.seed)
+    weights = training_weights(photos, HOLDOUT, plan.seed)
     points: list[CurvePoint] = []
     for count in counts:
         report_progress("curve: what each count brings", len(points), len(counts))
         with record_part(silent=True):
-            points.append(_point(count, build(quick, count).gaussians, photos, weights, short.min_gain))
+            gaussians = build(prepared, quick, count).gaussians
+        points.append(_point(count, gaussians, photos, weights, short.min_gain))
     return points
 
 
@@ -149,10 +198,10 @@ def rungs(shares: Sequence[float], usual: int, least: int, most: int) -> list[in
     return sorted({min(max(round(usual * share), least), most) for share in shares})
 
 
-def level_counts(finest: int, levels: int, least: int) -> list[int]:
-    """Gaussians of the levels of detail after the finest, as long as there are enough for a coarser one."""
-    counts = [finest // LEVEL_FACTOR**i for i in range(1, levels)]
-    return [count for count in counts if count >= least]
+def level_counts(finest: int, plan: Plan) -> list[int]:
+    """Return the Gaussians of the levels of detail after the finest, as long as a coarser one has one for each view."""
+    counts = [finest // LEVEL_FACTOR**i for i in range(1, plan.levels)]
+    return [count for count in counts if count >= plan.limits.min_count]
 
 
 def count_within(points: Sequence[CurvePoint], max_drop: float) -> int:
@@ -195,33 +244,23 @@ def curve_knee(points: Sequence[CurvePoint]) -> int:
     return round(2 ** (middles[steep] + share * (middles[steep + 1] - middles[steep])))
 
 
-@dataclass(frozen=True)
-class Search:
-    """The outcome of a search for a quality."""
-
-    count: int  # The count that was chosen
-    psnr: float  # What it reaches, dB
-    met: bool  # Whether that is the target
-    tried: tuple[tuple[int, float], ...]  # Every count that was run and its PSNR, in the order of the runs
+def best_count(tried: Mapping[int, float], target: float) -> int:
+    """Return the smallest count whose PSNR (dB) reaches the target; that of the highest PSNR where none does."""
+    reached = [count for count, psnr in tried.items() if psnr >= target]
+    return min(reached) if reached else max(tried, key=lambda count: tried[count])
 
 
-def search_count(run: Callable[[int], float], target: float, start: int, least: int, most: int) -> Search:
-    """The fewest Gaussians that reach a PSNR, within 15 %, by a few runs; the best of them where none does.
+def next_count(tried: Mapping[int, float], target: float, least: int, most: int) -> int:
+    """Choose where to look next for the fewest Gaussians that reach a PSNR, within 15 %.
 
-    ``run``: count -> PSNR (dB), taken to rise with the count.
+    A count that was tried already ends the search.
+
+    Args:
+        tried: PSNR (dB) of at least one count, taken to rise with the count.
+        target: PSNR (dB).
+        least: Smallest count.
+        most: Largest count.
     """
-    tried: dict[int, float] = {}
-    count = min(max(start, least), most)
-    while count not in tried and len(tried) < MAX_RUNS:
-        tried[count] = run(count)
-        count = _next_count(tried, target, least, most)
-    reached = [c for c, psnr in tried.items() if psnr >= target]
-    chosen = min(reached) if reached else max(tried, key=lambda c: tried[c])
-    return Search(chosen, tried[chosen], bool(reached), tuple(tried.items()))
-
-
-def _next_count(tried: dict[int, float], target: float, least: int, most: int) -> int:
-    """Where to look next; a count that was tried already ends the search."""
     above = min((c for c, psnr in tried.items() if psnr >= target), default=None)
     below = max((c for c, psnr in tried.items() if psnr < target and (above is None or c < above)), default=None)
     if above is not None and below is not None:

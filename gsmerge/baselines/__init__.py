@@ -8,10 +8,12 @@ from gsmerge.baselines import greedy, simple, splat_transform, voxel
 from gsmerge.baselines.baseline import Baseline
 from gsmerge.errors import UsageError
 from gsmerge.options import CompactOptions
+from gsmerge.runtime.record import note
+from gsmerge.search import Build
 from gsmerge.stages.fit import FitOptions
 from gsmerge.types import Scene
 
-FULL_FIT_SETTINGS = tuple(f.name for f in fields(FitOptions) if f.name != "fit")
+FULL_FIT_SETTINGS = ("effort", "device", "poses", *(f.name for f in fields(FitOptions) if f.name != "fit"))
 _ALL = (
     Baseline("unmerged", simple.unmerged, uses=()),
     Baseline("unmerged-fit", simple.unmerged_fit, needs=("photos",), uses=FULL_FIT_SETTINGS),
@@ -37,10 +39,23 @@ def find_baseline(name: str) -> Baseline | None:
     return BASELINES[name]
 
 
-def choose_baseline(options: CompactOptions, scene: Scene) -> tuple[Baseline | None, list[str]]:
-    """The baseline of the options, fit for the scene, and a note on changed settings that it does not use.
+def choose_method(options: CompactOptions, scene: Scene, ours: Build) -> Build:
+    """Choose what builds the Gaussians: ``ours`` or a baseline; a note says which settings a baseline does not use.
 
-    A UsageError if the scene does not have what it needs, or a program is missing.
+    Raises:
+        UsageError: If the scene does not have what a baseline needs, or its program is missing.
+    """
+    baseline, notes = choose_baseline(options, scene)
+    for text in notes:
+        note(text)
+    return ours if baseline is None else baseline.build
+
+
+def choose_baseline(options: CompactOptions, scene: Scene) -> tuple[Baseline | None, list[str]]:
+    """Find the baseline of the options, fit for the scene, and a note on changed settings that it does not use.
+
+    Raises:
+        UsageError: If the scene does not have what it needs, or a program is missing.
     """
     baseline = find_baseline(options.method)
     if baseline is None:

@@ -8,16 +8,17 @@ from typing import Literal
 
 import numpy as np
 
+from gsmerge.plan import Plan
 from gsmerge.runtime.record import stage
-from gsmerge.stages.assign import assign_members
+from gsmerge.stages.assign import assign
 from gsmerge.stages.decode import DecodeOptions, decode
-from gsmerge.stages.encode import EncodeOptions, encode
+from gsmerge.stages.encode import encode
 from gsmerge.stages.fit import Fitted
-from gsmerge.stages.prepare import PreparedScene
+from gsmerge.stages.prepare import Prepared
 from gsmerge.types import Gaussians, Groups, Scene
 
 Need = Literal["photos", "pixels", "node"]
-Run = Callable[[PreparedScene, int], Gaussians]
+Run = Callable[[Prepared, Plan, int], Gaussians]
 
 COUNTS = ("budget", "superpixels", "k")  # settings that decide how many
 
@@ -27,16 +28,16 @@ class Baseline:
     """One other method."""
 
     name: str  # as on the command line
-    # prepared scene, number of Gaussians -> canonical Gaussians, at most that many unless the method keeps the
+    # prepared scene, plan, number of Gaussians -> canonical Gaussians, at most that many unless the method keeps the
     # input's. It times itself, by stages of the record.
     run: Run
     # ``"photos"``; ``"pixels"``: one Gaussian per pixel; ``"node"``: a program that runs in Node.js
     needs: tuple[Need, ...] = ()
     uses: tuple[str, ...] = COUNTS  # settings that it uses, by flat name, besides those that all methods use
 
-    def build(self, prepared: PreparedScene, count: int | None) -> Fitted:
-        """Canonical Gaussians: ``count``, or None for as many as ``superpixels`` and K give."""
-        gaussians = self.run(prepared, prepared.limits.default if count is None else count)
+    def build(self, prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
+        """Build ``count`` canonical Gaussians; None: as many as ``superpixels`` and K give."""
+        gaussians = self.run(prepared, plan, plan.limits.default if count is None else count)
         return Fitted(gaussians, prepared.scene.cameras, None)
 
 
@@ -63,10 +64,9 @@ def most_important(importance: np.ndarray, count: int) -> np.ndarray:
     return np.sort(order[:count])
 
 
-def merge_groups(prepared: PreparedScene, groups: Groups, rule: Literal["depth", "paper"] = "depth") -> Gaussians:
+def merge_groups(prepared: Prepared, groups: Groups, rule: Literal["depth", "paper"] = "depth") -> Gaussians:
     """One Gaussian for each group, without matching across views; groups that hold nothing are left out."""
-    with stage("encode"):
-        members = prepared.members or assign_members(prepared.scene, groups, prepared.options.contribution)
-        features = encode(prepared.scene, members, groups, EncodeOptions(rule=rule))
+    members = assign(prepared.scene, groups)
+    features = encode(prepared.scene, members, groups, rule=rule)
     with stage("decode"):
         return decode(features, members, DecodeOptions(min_opacity=0.0), rule=rule)

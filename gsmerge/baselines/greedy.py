@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from gsmerge.baselines.baseline import own_gaussians
 from gsmerge.geometry import covariances
 from gsmerge.moments import MAX_OPACITY, principal_axes
+from gsmerge.plan import Plan
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map, use_threads
-from gsmerge.stages.prepare import PreparedScene
+from gsmerge.stages.prepare import Prepared
 from gsmerge.types import Gaussians
 
 Floats = NDArray[np.float64]
@@ -181,7 +182,7 @@ def reduce_to(cloud: Cloud, count: int) -> Cloud:
     return cloud
 
 
-def run(prepared: PreparedScene, count: int) -> Gaussians:
+def run(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
     """Exactly ``count``; the input itself where it has no more."""
     gaussians = own_gaussians(prepared.scene)
     if len(gaussians) <= count:

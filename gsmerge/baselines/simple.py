@@ -7,51 +7,44 @@ from dataclasses import replace
 import numpy as np
 
 from gsmerge.baselines.baseline import merge_groups, most_important, own_gaussians, view_shares
+from gsmerge.plan import Plan
 from gsmerge.render import contributions, plan_view, prepare
+from gsmerge.render.photos import scene_pictures
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.stages.fit import FitOptions, fit, fit_photos, record_fit, report_steps
-from gsmerge.stages.prepare import PreparedScene
-from gsmerge.stages.segment import grid_labels, superpixels
+from gsmerge.stages.decode import Decoded
+from gsmerge.stages.fit import fit_scene
+from gsmerge.stages.prepare import Prepared
+from gsmerge.stages.superpixels import grid_labels, superpixels
 from gsmerge.types import Cameras, Gaussians, Groups
 
 PAPER_SUPERPIXELS = "bass-st"  # BASS from seeds drawn by the Shi-Tomasi response
 MAX_PLANNED = 2_000_000  # Gaussians in the plans of the views under way: each plan is as large as they are
 
 
-def unmerged(prepared: PreparedScene, count: int) -> Gaussians:
+def unmerged(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
     """All Gaussians, whatever the count."""
     return own_gaussians(prepared.scene)
 
 
-def unmerged_fit(prepared: PreparedScene, count: int) -> Gaussians:
-    """The full fit, with as many steps or as much time as ours: what merging has to beat; whatever the count.
+def unmerged_fit(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
+    """Run the full fit on the input, with as many steps or as much time as ours: what merging has to beat.
 
-    Gaussians that no photo shows are replaced by others, so the number stays.
+    Gaussians that no photo shows are replaced by others, so the number stays, whatever the count.
     """
-    return _fit_input(prepared, replace(prepared.options.fit, fit="full"))
-
-
-def _fit_input(prepared: PreparedScene, options: FitOptions) -> Gaussians:
-    """All Gaussians, fitted to the photos."""
     gaussians = own_gaussians(prepared.scene)
-    if prepared.scene.images is None:
-        return gaussians
-    with stage("fit"):
-        photos = fit_photos(prepared.scene, options, prepared.photo_views)
-        gaussians, report = fit(gaussians, photos, options, len(gaussians), prepared.options.seed, report_steps)
-    record_fit(report)
-    return gaussians
+    start, options = Decoded(gaussians, len(gaussians), exact=False), replace(plan.fit, fit="full")
+    return fit_scene(start, prepared.scene, prepared.photo_views, options, plan.seed, plan.device).gaussians
 
 
-def prune_by_opacity(prepared: PreparedScene, count: int) -> Gaussians:
+def prune_by_opacity(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
     """The most opaque, unchanged and in their order; of equal ones the first of the file."""
     gaussians = own_gaussians(prepared.scene)
     with stage("reduce"):
         return gaussians[most_important(gaussians.opacities, count)]
 
 
-def prune_by_contribution(prepared: PreparedScene, count: int) -> Gaussians:
+def prune_by_contribution(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
     """Those that add most to the views (Mini-Splatting), unchanged and in their order; of equal ones the first."""
     gaussians = own_gaussians(prepared.scene)
     with stage("reduce"):
@@ -74,15 +67,15 @@ def summed_weights(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
     return total
 
 
-def prune_at_random(prepared: PreparedScene, count: int) -> Gaussians:
+def prune_at_random(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
     """A random choice that depends only on the seed, unchanged and in their order."""
     gaussians = own_gaussians(prepared.scene)
     with stage("reduce"):
-        rng = np.random.default_rng(prepared.options.seed)
+        rng = np.random.default_rng(plan.seed)
         return gaussians[np.sort(rng.choice(len(gaussians), min(count, len(gaussians)), replace=False))]
 
 
-def merge_blocks(prepared: PreparedScene, count: int) -> Gaussians:
+def merge_blocks(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
     """As many blocks as Gaussians, the same number in every view; those without a valid pixel are left out."""
     scene = prepared.scene
     height, width = scene.cameras.height, scene.cameras.width
@@ -92,7 +85,7 @@ def merge_blocks(prepared: PreparedScene, count: int) -> Gaussians:
     return merge_groups(prepared, Groups(labels, tuple(counts)))
 
 
-def match_moments(prepared: PreparedScene, count: int) -> Gaussians:
+def match_moments(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
     """The superpixel merging paper's moment matching: its baseline without a network ("Mom. Match.").
 
     One Gaussian for each superpixel: opacity-weighted mean and the spread of the members' means (eq. teacher_mean,
@@ -102,6 +95,6 @@ def match_moments(prepared: PreparedScene, count: int) -> Gaussians:
     scene = prepared.scene
     counts = view_shares(count, len(scene), scene.pixels_per_view)
     with stage("segment"):
-        views = range(len(scene))
-        labels = parallel_map(lambda view: superpixels(prepared.pictures[view], counts[view], PAPER_SUPERPIXELS), views)
+        pictures, views = scene_pictures(scene), range(len(scene))
+        labels = parallel_map(lambda view: superpixels(pictures[view], counts[view], PAPER_SUPERPIXELS), views)
     return merge_groups(prepared, Groups(np.stack(labels), tuple(counts)), rule="paper")

@@ -15,8 +15,9 @@ from pathlib import Path
 from gsmerge.baselines.baseline import own_gaussians
 from gsmerge.errors import GsmergeError, UsageError
 from gsmerge.io import read_ply, write_ply
+from gsmerge.plan import Plan
 from gsmerge.runtime.record import stage
-from gsmerge.stages.prepare import PreparedScene
+from gsmerge.stages.prepare import Prepared
 from gsmerge.types import Gaussians
 
 PROGRAM, VARIABLE = "splat-transform", "GSMERGE_SPLAT_TRANSFORM"
@@ -35,7 +36,7 @@ def find_program() -> str:
     return program
 
 
-def run(prepared: PreparedScene, count: int) -> Gaussians:
+def run(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
     """Exactly as many as the program makes of ``-d COUNT``; the input itself where it has no more than that."""
     gaussians, program = own_gaussians(prepared.scene), find_program()
     if len(gaussians) <= count:

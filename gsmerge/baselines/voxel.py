@@ -13,8 +13,9 @@ from dataclasses import fields
 import numpy as np
 
 from gsmerge.baselines.baseline import own_gaussians
+from gsmerge.plan import Plan
 from gsmerge.runtime.record import choose, stage
-from gsmerge.stages.prepare import PreparedScene
+from gsmerge.stages.prepare import Prepared
 from gsmerge.types import Gaussians
 
 BITS = 21  # of a voxel's number along each axis; what lies farther out is in the outermost ones
@@ -78,7 +79,7 @@ def fuse(gaussians: Gaussians, keys: np.ndarray) -> Gaussians:
     return Gaussians(*(array.astype(np.float32) for array in arrays))
 
 
-def run(prepared: PreparedScene, count: int) -> Gaussians:
+def run(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
     """At most ``count`` voxels, and hardly fewer."""
     gaussians = own_gaussians(prepared.scene)
     with stage("reduce"):

@@ -14,6 +14,7 @@ from gsmerge.batch.options import BatchOptions
 from gsmerge.errors import SceneError
 from gsmerge.io import find_scene_files
 from gsmerge.io.content_hash import cameras_of
+from gsmerge.plan import resolve_fit, resolved_settings
 from gsmerge.runtime.estimate import IMPORT_SECONDS, work_seconds
 from gsmerge.runtime.memory import human_bytes, machine_memory
 from gsmerge.runtime.threads import available_threads
@@ -64,7 +65,7 @@ def free_memory() -> int | None:
 
 def estimate_seconds(jobs: Sequence[Job], options: BatchOptions, schedule: Schedule) -> float:
     """Wall time of scenes, within a factor of about two."""
-    settings, steps = options.settings.resolved(photos=True), options.settings.fit.steps
+    settings, steps = resolved_settings(options.settings, photos=True), resolve_fit(options.settings).steps
     total = 0.0
     for job in jobs:
         views = max(1, _num_views(job))

@@ -37,6 +37,7 @@ def decode(args: opt.Args) -> None:
     from gsmerge.io import atomic_output, lost_harmonics, output_format, write_gaussians
     from gsmerge.online.decode import check_fit, decodable, decode_stored, default_fit, num_photos
     from gsmerge.online.file import load_stored
+    from gsmerge.plan import resolve_fit
     from gsmerge.report import document_head, seconds_document
 
     settings, imported, path = args.settings(), perf_counter(), args.encoded
@@ -52,7 +53,7 @@ def decode(args: opt.Args) -> None:
         **count,
     }  # fmt: skip
     notes = [lost] if lost else []
-    fit = settings.fit if args.fit is not None or num_photos(stored) else default_fit(stored)
+    fit = resolve_fit(settings) if args.fit is not None or num_photos(stored) else default_fit(stored)
     check_fit(stored, fit)
     if args.dry_run:
         encoded = decodable(stored)
@@ -66,8 +67,9 @@ def decode(args: opt.Args) -> None:
     with atomic_output(out, overwrite=args.overwrite) as temporary:
         with announce_compilation(quiet=args.silent), stage_progress(quiet=args.silent) as progress:
             decoded = decode_stored(
-                stored, **count, options=fit, seed=settings.seed, threads=settings.threads, progress=progress
-            )
+                stored, **count, options=fit, seed=settings.seed, threads=settings.threads, device=settings.device,
+                progress=progress,
+            )  # fmt: skip
         if len(decoded.gaussians) == 0:
             raise SceneError(path, "expected visible Gaussians, found none", "encode the scene again")
         if not all(np.isfinite(getattr(decoded.gaussians, name)).all() for name in ("means", "scales", "quats")):

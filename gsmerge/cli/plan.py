@@ -37,22 +37,24 @@ def plan_document(
 ) -> dict[str, Any]:
     """What a run would make of a scene, and an estimate of its time and memory, as plain JSON types."""
     from gsmerge.options import to_schema
+    from gsmerge.plan import EFFORTS, resolve_fit, resolved_settings, steps_for
     from gsmerge.runtime.estimate import estimate_run, fit_of
     from gsmerge.runtime.threads import available_threads
-    from gsmerge.stages.fit.photos import photo_scale
-    from gsmerge.stages.group import budget_count, default_count, largest_count, superpixels_per_view
+    from gsmerge.stages.counts import count_limits, largest_count
+    from gsmerge.stages.fit import photo_scale
 
     photos, grid = scene.images is not None, (len(scene), scene.cameras.height, scene.cameras.width)
-    options, budget = settings.resolved(photos=photos), budget_count(scene, settings)
+    options = resolved_settings(settings, photos=photos)
+    limits = count_limits(scene, settings.segment, settings.decode, settings.budget)
     pixels = max(len(scene) * scene.pixels_per_view, scene.num_gaussians)
-    num_gaussians = scene.num_gaussians or pixels
-    max_count = largest_count(scene, settings) if budget is None else budget
-    share = (budget or default_count(scene, settings)) / max(1, pixels)
+    num_gaussians, fit = scene.num_gaussians or pixels, resolve_fit(settings)
+    max_count = largest_count(limits, settings.segment)
+    auto = EFFORTS[settings.effort].large_photos and settings.device == "cpu"
     if settings.method.startswith("unmerged"):
         max_count = pixels
     per_view = None  # a budget distributes them by what it needs
-    if budget is None and options["budget"] != "auto":
-        per_view = superpixels_per_view(scene, settings) if len(scene) else 0
+    if limits.count is None and options["budget"] != "auto":
+        per_view = limits.per_view
     paths = {name: path and str(path) for name, path in vars(files).items()}
     return {
         "dry_run": True,
@@ -65,8 +67,9 @@ def plan_document(
         "fit": fit_of(options, photos=photos),
         "estimate": estimate_run(
             grid, options, pixels, photos=photos, threads=settings.threads or available_threads(),
-            fit_steps=settings.fit.with_steps_for(share).steps, num_rest=3 * scene.gaussians.shN.shape[1],
-            photo_scale=photo_scale(scene, settings.fit)[0],
+            fit_steps=steps_for(settings, limits.count or limits.default, scene),
+            num_rest=3 * scene.gaussians.shN.shape[1],
+            photo_scale=photo_scale(scene, fit, auto=auto)[0],
         ),
         "options": to_schema(options),
         "notes": list(notes),
@@ -77,7 +80,7 @@ def plan_lines(plan: Mapping[str, Any]) -> list[str]:
     """The plan for people."""
     from gsmerge.report import human_bytes
     from gsmerge.runtime.estimate import memory_problems
-    from gsmerge.stages.segment import SegmentOptions
+    from gsmerge.stages.superpixels import SegmentOptions
 
     scene, estimate, per_view = plan["input"], plan["estimate"], plan["superpixels_per_view"]
     superpixels = "where the scene needs them"

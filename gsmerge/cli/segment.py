@@ -16,7 +16,6 @@ KINDS = ("borders", "means", "saliency")
     opt.SCENE,
     "cameras images opacity exporter quats order scene_scale superpixels",
     opt.changed("segmentation", hidden=False),
-    "effort",
     opt.output("Folder for the pictures.", default=opt.REQUIRED),
     "overwrite dry_run threads",
 )
@@ -25,8 +24,8 @@ def segment(args: opt.Args) -> None:
     from gsmerge.measure.preview import draw_borders, draw_heat, draw_means
     from gsmerge.render.photos import scene_pictures
     from gsmerge.runtime.threads import use_threads
-    from gsmerge.stages.segment import SegmentOptions, count_for, saliency
-    from gsmerge.stages.segment import segment as segment_images
+    from gsmerge.stages.superpixels import SegmentOptions, count_for, saliency
+    from gsmerge.stages.superpixels import segment as segment_images
 
     with opt.usage_errors():
         options = SegmentOptions(**args.given(SegmentOptions.__dataclass_fields__))

@@ -27,7 +27,7 @@ from gsmerge.errors import UsageError
 def view(args: opt.Args) -> None:
     """Compare a scene with its compact versions in the browser: one file with photos, stills, 3D and scores."""
     from gsmerge.report import document_head
-    from gsmerge.stages.segment import SegmentOptions, count_for
+    from gsmerge.stages.superpixels import SegmentOptions, count_for
 
     with opt.usage_errors():
         segmentation = SegmentOptions(**args.given(SegmentOptions.__dataclass_fields__))

@@ -6,18 +6,18 @@ import numpy as np
 
 from gsmerge.encoded.encoded import Division
 from gsmerge.kernels.gaussians.bisect import gather_groups
-from gsmerge.moments import Members, Rule
+from gsmerge.moments import Members
 from gsmerge.stages.decode import deal_order, halve, pool_children
 from gsmerge.types import FeatureGaussians, Gaussians
 
 
-def divide_all(features: FeatureGaussians, members: Members, max_k: int, rule: Rule) -> Division:
+def divide_all(features: FeatureGaussians, members: Members, max_k: int) -> Division:
     """All children of every group, up to ``max_k`` of each."""
     count = len(features)
     rows = np.arange(count)
     sizes = np.diff(features.starts)[rows][:, None]
     none = np.zeros(0, np.int64)
-    parts = [pool_children(features, members, np.zeros(1, np.int64), none, none, rule)]
+    parts = [pool_children(features, members, np.zeros(1, np.int64), none, none)]
     owners, slots, uniform, uniform_children = [none], [none], none, parts[0]
     for number in range(2, max_k + 1):
         if len(rows) == 0:
@@ -28,13 +28,13 @@ def divide_all(features: FeatureGaussians, members: Members, max_k: int, rule: R
         if number == 2:
             uniform = rows[~grown]
             own_starts, own = gather_groups(starts, ids, first[~grown])
-            uniform_children = pool_children(features, members, own_starts, own, uniform, rule)
+            uniform_children = pool_children(features, members, own_starts, own, uniform)
         rows, before = rows[grown], sizes[grown]
         sizes = np.diff(starts)[first[grown, None] + np.arange(number)]
         slot = np.argmax(sizes[:, :-1] != before, axis=1)  # the run that got smaller is the one that was split
         pairs = (first[grown] + slot)[:, None] + np.arange(2)
         own_starts, own = gather_groups(starts, ids, pairs.ravel())
-        parts.append(pool_children(features, members, own_starts, own, rows.repeat(2), rule))
+        parts.append(pool_children(features, members, own_starts, own, rows.repeat(2)))
         owners.append(rows)
         slots.append(slot)
     owner = np.concatenate(owners)

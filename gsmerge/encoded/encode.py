@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,14 +13,15 @@ from gsmerge.encoded.divide import divide_all
 from gsmerge.encoded.encoded import Encoded, StoredHeads, StoredSettings, without_members
 from gsmerge.errors import UsageError
 from gsmerge.options import CompactOptions, to_schema
-from gsmerge.pipeline import build, merge_views
+from gsmerge.pipeline import build, keeps_all, merge_views
+from gsmerge.plan import Plan, make_plan, require_children
 from gsmerge.runtime.record import Progress, current_record, record_run, stage
 from gsmerge.runtime.threads import use_threads
 from gsmerge.search import choose_count
 from gsmerge.stages.decode import MAX_CHILDREN, merged_count
-from gsmerge.stages.group import knee_count
 from gsmerge.stages.merge import MergedViews
-from gsmerge.stages.prepare import PreparedScene, prepare, require_children
+from gsmerge.stages.prepare import Prepared, prepare
+from gsmerge.stages.segment import knee_count
 from gsmerge.types import Scene, as_array
 
 DEFAULT_MAX_K = 4  # children that are stored of a group, unless a number of Gaussians is asked for
@@ -56,14 +58,15 @@ def encode_scene(
     if max_k is not None and max_k < options.decode.max_k:
         raise UsageError(f"max k: expected at least {options.decode.k}, which is k, got {max_k}")
     with use_threads(options.threads), record_run(progress):
-        prepared = prepare(scene.numpy(), options)
-        require_children("max k", max_k or 1, prepared.checkpoint)
-        count = choose_count(prepared, build)
-        if prepared.keeps_all(count):
+        prepared = prepare(scene.numpy(), options.prepare)
+        plan = make_plan(prepared, options)
+        require_children("max k", max_k or 1, plan.checkpoint)
+        count = choose_count(prepared, plan, build)
+        if keeps_all(prepared.scene, count):
             raise UsageError(f"budget: {count} keeps every Gaussian, which needs no encoding; use compact")
-        merged = merge_views(prepared, count)
+        merged = merge_views(prepared, plan, count)
         with stage("decode"):
-            return _to_encoded(prepared, merged, max_k)
+            return _to_encoded(prepared, plan, merged, max_k)
 
 
 def _without_fit(options: CompactOptions, settings: dict[str, Any]) -> CompactOptions:
@@ -71,27 +74,26 @@ def _without_fit(options: CompactOptions, settings: dict[str, Any]) -> CompactOp
     fit = [f"fit {options.fit.fit}"] if settings.get("fit", "none") != "none" else []
     for name in (*fit, *options.whole_only):
         raise UsageError(f"{name}: cannot be encoded, as nothing is fitted or searched for; use compact")
-    return replace(options, fit=replace(options.fit, fit="none", poses="fixed"))
+    return replace(options, fit=replace(options.fit, fit="none"), prepare=replace(options.prepare, poses="fixed"))
 
 
-def _to_encoded(prepared: PreparedScene, merged: MergedViews, max_k: int | None) -> Encoded:
+def _to_encoded(prepared: Prepared, plan: Plan, merged: MergedViews, max_k: int | None) -> Encoded:
     """Everything that decoding needs of the merged Feature Gaussians."""
     features, networks, exact = merged.features, merged.networks, merged.segmentation.exact
-    options, scene = prepared.options, prepared.scene
-    count = merged_count(merged, options.decode, grows=options.fit.grows)
-    max_k = max_k or (DEFAULT_MAX_K if count is None and options.decode.max_k <= DEFAULT_MAX_K else MAX_CHILDREN)
+    options, scene = plan.decode, prepared.scene
+    count = merged_count(merged, options, grows=plan.fit.grows)
+    max_k = max_k or (DEFAULT_MAX_K if count is None and options.max_k <= DEFAULT_MAX_K else MAX_CHILDREN)
     if networks is not None:
         max_k = min(max_k, networks.networks.max_children)
-    prunes = scene.images is not None and options.fit.effort != "draft"
     settings = StoredSettings(
         num_input=prepared.given.num_gaussians,
-        k=AUTO if options.budget.auto else options.decode.k,
+        k=AUTO if plan.auto_count else options.k,
         max_k=max_k,
-        min_opacity=options.decode.min_opacity,
-        min_contribution=options.fit.min_contribution if prunes else 0.0,
+        min_opacity=options.min_opacity,
+        min_contribution=plan.fit.min_contribution if scene.images is not None else 0.0,
         target_count=count if exact else None,
-        num_slots=None if exact or count is None else count // options.decode.max_k,
-        knee_count=knee_count(prepared),
+        num_slots=None if exact or count is None else count // options.max_k,
+        knee_count=knee_count(scene, plan.superpixels),
     )
     heads = None
     if networks is not None:
@@ -99,19 +101,19 @@ def _to_encoded(prepared: PreparedScene, merged: MergedViews, max_k: int | None)
         heads = StoredHeads(networks.networks, as_array(group_features.views), as_array(group_features.group))
     return Encoded(
         features=without_members(features),
-        division=divide_all(features, merged.members, max_k, options.encode.rule),
-        kept=prepared.hidden,
+        division=divide_all(features, merged.members, max_k),
+        kept=plan.unseen,
         frame=prepared.frame,
         cameras=scene.cameras,
         settings=settings,
         heads=heads,
-        about=_about(prepared.settings),
+        about=_about(plan.settings),
     )
 
 
-def _about(options: CompactOptions) -> dict[str, Any]:
+def _about(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Version, options, choices and notes; nothing that depends on the machine."""
-    settings = to_schema(options.to_dict()) | {"checkpoint": Path(options.checkpoint).name}
+    settings = to_schema(settings) | {"checkpoint": Path(settings["checkpoint"]).name}
     del settings["threads"]
     record = current_record()
     choices = {name: value for name, value in record.choices.items() if name != "networks"}

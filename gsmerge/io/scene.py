@@ -27,6 +27,7 @@ from gsmerge.io.photos import as_floats, photo_size
 from gsmerge.io.scene_files import SceneFiles, find_scene_files
 from gsmerge.io.unaligned_scene import make_unaligned, usable_rows
 from gsmerge.io.views import find_large_photos, limit_photo_size, read_scene_cameras, stored_photos
+from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import Cameras, Gaussians, LargePhotos, Scene
 
@@ -103,6 +104,14 @@ def read_scene(
         >>> scene = read_scene("scene.ply")  # doctest: +SKIP
     """
     return load_scene(path, cameras=cameras, images=images, opacity=opacity, **hints).scene
+
+
+def read_noted(path: str | os.PathLike[str]) -> Scene:
+    """Read a scene with the defaults, and write what is odd about it to the record of the current run."""
+    load = load_scene(path)
+    for text in load.notes:
+        note(text)
+    return load.scene
 
 
 def load_scene(

@@ -31,11 +31,12 @@ from gsmerge.io.formats.ply_file import LOGIT_COMMENT
 from gsmerge.io.formats.writing import file_bytes
 from gsmerge.io.hints import make_hints
 from gsmerge.options import CompactOptions
+from gsmerge.plan import resolved_settings, steps_for
 from gsmerge.report import finite
 from gsmerge.runtime.estimate import estimate_run
 from gsmerge.runtime.threads import available_threads, use_threads
 from gsmerge.stages.clean import BOX_QUANTILES, beyond_scene, floater_share
-from gsmerge.stages.group import default_count
+from gsmerge.stages.counts import default_count
 from gsmerge.stages.sky import sky_regions
 from gsmerge.types import Cameras, Gaussians, Scene
 
@@ -224,7 +225,7 @@ def _sight(load: SceneLoad) -> CameraCheck | None:
 def estimate(scene: Scene) -> dict[str, Any]:
     """What ``compact`` would make of a scene by default, see :attr:`Inspection.estimate`."""
     options, photos = CompactOptions(), scene.images is not None
-    count = min(scene.num_gaussians, default_count(scene, options))
+    count = min(scene.num_gaussians, default_count(scene, options.segment, options.decode))
     grid = len(scene), scene.cameras.height, scene.cameras.width
     return {
         "num_gaussians": count,
@@ -232,11 +233,11 @@ def estimate(scene: Scene) -> dict[str, Any]:
         "bytes": file_bytes(count, scene.gaussians.sh_degree),
         **estimate_run(
             grid,
-            options.resolved(photos=photos),
+            resolved_settings(options, photos=photos),
             max(math.prod(grid), scene.num_gaussians),
             photos=photos,
             threads=available_threads(),
-            fit_steps=options.fit.steps,
+            fit_steps=steps_for(options, count, scene),
             num_rest=3 * scene.gaussians.shN.shape[1],
         ),
     }

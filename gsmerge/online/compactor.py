@@ -11,8 +11,9 @@ from gsmerge.online.extend import BatchReport, extend
 from gsmerge.online.file import load_state, save_state
 from gsmerge.online.options import merge_settings
 from gsmerge.online.state import OnlineState
+from gsmerge.options import CompactOptions
+from gsmerge.plan import resolve_fit
 from gsmerge.runtime.record import Progress
-from gsmerge.stages.fit import FitOptions
 from gsmerge.types import Gaussians, Scene
 
 
@@ -86,7 +87,8 @@ class Compactor:
         """
         if self._state is None:
             raise ValueError("expected at least one batch of views before decoding, got none")
-        options, seed, threads = FitOptions(**fit) if fit else None, self._options.seed, self._options.threads
+        options = resolve_fit(CompactOptions().with_settings(fit)) if fit else None
+        seed, threads = self._options.seed, self._options.threads
         return decode_stored(
             self._state, k=k, budget=budget, options=options, seed=seed, threads=threads, progress=progress
         ).gaussians

@@ -56,13 +56,14 @@ def decode_stored(
     options: FitOptions | None = None,
     seed: int = 0,
     threads: int | None = None,
+    device: str = "cpu",
     progress: Progress | None = None,
 ) -> DecodeResult:
     """A state as Gaussians in the world frame, fitted to its photos; or an encoded scene, which has none.
 
     Args:
         k, budget: As of :func:`gsmerge.decode_scene`. A full fit begins with fewer and grows to the number.
-        options: Of the fit; None: the full one at its defaults where there are photos, otherwise none.
+        options: Of the fit, with its steps; None: the full one at its defaults where there are photos, otherwise none.
 
     Raises:
         UsageError: If a fit is asked for and there are no photos, or K or the budget is out of range.
@@ -86,7 +87,7 @@ def decode_stored(
         replay = BatchPhotos(images, stored.cameras[stored.replay.views])
         photos = replay.photos(), replay.photos(2)
         with stage("fit"):
-            gaussians, report = fit(gaussians, photos, options, max_count, seed, report_steps)
+            gaussians, report = fit(gaussians, photos, options, max_count, seed, report_steps, device=device)
     if report is not None and not report.accepted:  # then the colours that were fitted batch by batch are better
         note = "the fit was not accepted: held-out parts of the photos did not get better"
         gaussians = decode_scene(to_encoded(stored), k=k, budget=budget, threads=threads)

@@ -36,7 +36,8 @@ from gsmerge.online.state import (
     with_fitted_colors,
 )
 from gsmerge.options import CompactOptions, to_schema
-from gsmerge.pipeline import build, merge_views
+from gsmerge.pipeline import build, keeps_all, merge_views
+from gsmerge.plan import Plan, make_plan, require_children
 from gsmerge.render.photos import scene_pictures
 from gsmerge.runtime.record import Progress, choose, record_run, stage
 from gsmerge.runtime.threads import use_threads
@@ -44,7 +45,7 @@ from gsmerge.search import choose_count
 from gsmerge.stages.fit import visible_mask
 from gsmerge.stages.match import MatchOptions, match
 from gsmerge.stages.merge import MergedViews, merge, take
-from gsmerge.stages.prepare import PreparedScene, prepare, require_children
+from gsmerge.stages.prepare import Prepared, prepare
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches, Scene
 
 
@@ -93,15 +94,16 @@ def extend(
     max_k = online.max_k if state is None else state.settings.max_k
     _check(state, scene, options, max_k)
     with use_threads(options.threads), record_run(progress) as record:
-        fixed = replace(options, fit=replace(options.fit, poses="fixed"))  # batches have to stay where the others are
+        fixed = replace(options.prepare, poses="fixed")  # batches have to stay where the others are
         prepared = prepare(scene.numpy(), fixed, None if state is None else state.frame)
-        require_children("max k", max_k, prepared.checkpoint)
-        prepared = replace(prepared, limits=replace(prepared.limits, share=1.0))  # nothing grows here
-        count = choose_count(prepared, build)
-        if prepared.keeps_all(count):
+        plan = make_plan(prepared, options)
+        plan = plan.with_fit(replace(plan.fit, min_contribution=options.fit.min_contribution))  # in drafts, too
+        require_children("max k", max_k, plan.checkpoint)
+        count = choose_count(prepared, plan, build)
+        if keeps_all(prepared.scene, count):
             raise UsageError(f"budget: {count} keeps every Gaussian, which needs no state; use compact")
-        merged = merge_views(prepared, count)
-        state, counts = _add_batch(state, prepared, merged, online, max_k)
+        merged = merge_views(prepared, plan, count)
+        state, counts = _add_batch(state, prepared, plan, merged, online, max_k)
     numbers = {"num_views": len(prepared.scene), "num_input": scene.num_gaussians, **counts, "num_groups": len(state)}
     settings = to_schema(options.to_dict()) | asdict(online)
     stored = {name: value for name, value in settings.items() if name != "threads"}  # which depend on the machine
@@ -114,13 +116,14 @@ def extend(
 
 def _add_batch(
     state: OnlineState | None,
-    prepared: PreparedScene,
+    prepared: Prepared,
+    plan: Plan,
     merged: MergedViews,
     online: OnlineOptions,
     max_k: int,
 ) -> tuple[OnlineState, dict[str, int]]:
     """The state with a batch in it, and what became of the batch's groups by key of the report."""
-    scene, options = prepared.scene, prepared.options
+    scene = prepared.scene
     size = scene.cameras if state is None else state.cameras
     photos = resize_photos(scene_pictures(scene), scene.cameras, size.width, size.height)
     counts = {"num_new": len(merged.features), "num_covered": 0, "num_joined": 0, "num_hidden": 0}
@@ -133,21 +136,21 @@ def _add_batch(
             counts["num_covered"] = len(features) - len(novel)
             features = take(features, novel)
     with stage("decode"):
-        new = bake(features, merged.members, merged.networks, max_k, options.encode.rule)
+        new = bake(features, merged.members, merged.networks, max_k)
     ids = np.arange(len(photos)) if state is None else view_ids(state.cameras, photos.cameras)
     with stage("join"):
         if state is None:
-            state = _first_state(new, prepared, max_k)
+            state = _first_state(new, prepared, plan, max_k)
         else:
-            groups, entered = _enter(state.groups, new, prepared, photos, rows, max_k)
-            state = _grown_state(state, groups, prepared, photos.cameras[ids >= len(state.cameras)])
+            groups, entered = _enter(state.groups, new, prepared, plan, photos, rows, max_k)
+            state = _grown_state(state, groups, prepared, plan, photos.cameras[ids >= len(state.cameras)])
             counts |= entered
     if prepared.given.images is None:
         return state, counts
     groups = state.groups
     if online.fit_colors:
         with stage("fit"):
-            groups, report = fit_batch_colors(groups, photos, options.fit, options.seed)
+            groups, report = fit_batch_colors(groups, photos, plan.fit, plan.seed)
             choose(fit=asdict(report))
     replay = update_replay(state.replay, photos, ids, len(state.cameras), online.replay)
     return replace(state, groups=groups, replay=replay), counts
@@ -168,23 +171,22 @@ def _check(state: OnlineState | None, scene: Scene, options: CompactOptions, max
 
 
 def _enter(
-    groups: GroupSet, new: GroupSet, prepared: PreparedScene, photos: BatchPhotos, rows: np.ndarray, max_k: int
+    groups: GroupSet, new: GroupSet, prepared: Prepared, plan: Plan, photos: BatchPhotos, rows: np.ndarray, max_k: int
 ) -> tuple[GroupSet, dict[str, int]]:
     """The state's groups with new ones among them, and how many were merged and how many no view shows.
 
     ``rows``: the state's groups that the batch's views may see.
     """
-    options = prepared.options
-    partners = find_partners(take(groups.features, rows), new.features, options.match)
+    partners = find_partners(take(groups.features, rows), new.features, plan.match)
     has_partner = partners >= 0
     joining = select_groups(new, np.flatnonzero(has_partner))
     groups = merge_into(groups, joining, rows[partners[has_partner]], max_k)
     alone = select_groups(new, np.flatnonzero(~has_partner))
     counts = {"num_joined": int(has_partner.sum())}
-    if options.fit.min_contribution > 0 and prepared.scene.images is not None:
+    if plan.fit.min_contribution > 0 and prepared.scene.images is not None:
         in_view = feature_to_gaussians(take(groups.features, rows))
         both = Gaussians.concat([in_view, feature_to_gaussians(alone.features)])
-        visible = visible_mask(both, photos.photos(2), options.fit.min_contribution)[len(in_view) :]
+        visible = visible_mask(both, photos.photos(2), plan.fit.min_contribution)[len(in_view) :]
         counts["num_hidden"] = int((~visible).sum())
         alone = select_groups(alone, np.flatnonzero(visible))
     return concat_groups([groups, alone]), counts
@@ -217,19 +219,19 @@ def merge_into(groups: GroupSet, new: GroupSet, rows: np.ndarray, max_k: int) ->
     return replace_groups(groups, rows, limit_children(merged, max_k))
 
 
-def _first_state(groups: GroupSet, prepared: PreparedScene, max_k: int) -> OnlineState:
+def _first_state(groups: GroupSet, prepared: Prepared, plan: Plan, max_k: int) -> OnlineState:
     """The state that a first batch makes."""
-    options, cameras = prepared.options, prepared.scene.cameras
+    cameras = prepared.scene.cameras
     settings = StoredSettings(
         num_input=prepared.given.num_gaussians,
-        k=AUTO if options.budget.auto else options.decode.k,
+        k=AUTO if plan.auto_count else plan.decode.k,
         max_k=max_k,
-        min_opacity=options.decode.min_opacity,
-        min_contribution=options.fit.min_contribution if prepared.given.images is not None else 0.0,
+        min_opacity=plan.decode.min_opacity,
+        min_contribution=plan.fit.min_contribution if prepared.given.images is not None else 0.0,
     )
     return OnlineState(
         groups=groups,
-        kept=prepared.hidden,
+        kept=plan.unseen,
         frame=prepared.frame,
         cameras=resize_cameras(cameras, cameras.width, cameras.height),
         replay=no_photos(cameras),
@@ -238,11 +240,13 @@ def _first_state(groups: GroupSet, prepared: PreparedScene, max_k: int) -> Onlin
     )
 
 
-def _grown_state(state: OnlineState, groups: GroupSet, prepared: PreparedScene, new_cameras: Cameras) -> OnlineState:
+def _grown_state(
+    state: OnlineState, groups: GroupSet, prepared: Prepared, plan: Plan, new_cameras: Cameras
+) -> OnlineState:
     """The state with other groups, and with the views and the unseen Gaussians of a further batch."""
-    kept = [gaussians for gaussians in (state.kept, prepared.hidden) if gaussians is not None]
-    num_input, options = state.settings.num_input + prepared.given.num_gaussians, prepared.options
-    k = AUTO if options.budget.auto else options.decode.k
+    kept = [gaussians for gaussians in (state.kept, plan.unseen) if gaussians is not None]
+    num_input = state.settings.num_input + prepared.given.num_gaussians
+    k = AUTO if plan.auto_count else plan.decode.k
     return replace(
         state,
         groups=groups,

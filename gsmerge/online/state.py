@@ -20,7 +20,6 @@ from gsmerge.types import Cameras, FeatureGaussians, Gaussians, to_float32
 if TYPE_CHECKING:
     from gsmerge.networks.apply import NetworkContext
 
-CHILD_RULE: Rule = "depth"  # children stand for many members: their own size counts, whatever rule they were made by
 CHILD_FOOTPRINT = 1e-3  # of the group's: children need no least size, as it is in their own
 
 
@@ -178,7 +177,7 @@ def limit_children(groups: GroupSet, max_k: int) -> GroupSet:
     if len(rows) == 0:
         return groups
     large = select_groups(groups, rows)
-    children, parents = divide(large.features, child_members(large), np.full(len(large), max_k), CHILD_RULE)
+    children, parents = divide(large.features, child_members(large), np.full(len(large), max_k))
     pooled = replace(large, features=with_child_rows(large.features, parents), children=children)
     return replace_groups(groups, rows, pooled)
 
@@ -205,7 +204,7 @@ def to_encoded(state: OnlineState, *, fitted_colors: bool = True) -> Encoded:
     features = groups.features
     return Encoded(
         features=without_members(features),
-        division=divide_all(features, child_members(groups), state.settings.max_k, CHILD_RULE),
+        division=divide_all(features, child_members(groups), state.settings.max_k),
         kept=state.kept,
         frame=state.frame,
         cameras=state.cameras,

@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gsmerge.moments import Members
+from gsmerge.moments import Members, scene_members
 from gsmerge.networks.cross_view_stats import cross_view_stats
-from gsmerge.runtime.record import choose, note
-from gsmerge.stages.segment import AUTO_SHARE, SHARE
+from gsmerge.runtime.record import choose, stage
 from gsmerge.types import Cameras, FeatureGaussians, Scene
-
-if TYPE_CHECKING:
-    from gsmerge.options import CompactOptions
 
 # Factors on the optical depth of groups that other views see through: those at whose place no other view has its
 # surface, and those of which fewer views have it there than see through it
@@ -25,25 +20,18 @@ SAMPLES = 65536  # pixels whose depths are compared
 MOST, FEWEST, WRONG = 0.08, 0.015, 0.38
 
 
-def choose_superpixels(scene: Scene, members: Members | None, options: CompactOptions) -> CompactOptions:
-    """The options with a share of superpixels where they leave it to the scene.
+def measured_share(scene: Scene) -> tuple[float | None, str]:
+    """Choose a share of superpixels by how well the views' depths agree.
 
-    Args:
-        scene: The canonical scene.
-        members: Its Gaussians, one per pixel; None for an unaligned scene, which gets the usual share.
-        options: Of all stages.
+    Returns:
+        Superpixels per pixel, None where depths of several views cannot be compared; and the reason, as a clause.
     """
-    if options.segment.superpixels != AUTO_SHARE:
-        return options
-    if members is None or not scene.aligned or len(scene) < 2:
-        text, why = SHARE, "depths of several views cannot be compared"
-    else:
-        wrong = contradicted_share(scene, members)
-        share = min(MOST, max(FEWEST, MOST * (1 - wrong / WRONG)))
-        text, why = f"{100 * share:.2g}%", f"other views see through {100 * wrong:.0f} % of the pixels"
-        choose(superpixels={"share": share, "contradicted": wrong})
-    note(f"superpixels: {text} of the pixels, because {why}")
-    return replace(options, segment=replace(options.segment, superpixels=text))
+    if not scene.aligned or len(scene) < 2:
+        return None, "depths of several views cannot be compared"
+    wrong = contradicted_share(scene, scene_members(scene))
+    share = min(MOST, max(FEWEST, MOST * (1 - wrong / WRONG)))
+    choose(superpixels={"share": share, "contradicted": wrong})
+    return share, f"other views see through {100 * wrong:.0f} % of the pixels"
 
 
 def contradicted_share(scene: Scene, members: Members) -> float:
@@ -55,8 +43,11 @@ def contradicted_share(scene: Scene, members: Members) -> float:
     return float((factors < 1).mean()) if len(rows) else 0.0
 
 
+@stage("encode")
 def weaken_contradicted(features: FeatureGaussians, members: Members, cameras: Cameras) -> FeatureGaussians:
-    """Less optical depth for groups that other views see through.
+    """Lower the optical depth of groups that other views see through.
+
+    Where a long fit follows, it closes the holes that this leaves, and moves what stands before other views less.
 
     Args:
         features: Of single views.

@@ -9,64 +9,37 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from threading import Lock
-from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from gsmerge.budget import exact_count
 from gsmerge.errors import UsageError
 from gsmerge.geometry import morton_codes
 from gsmerge.kernels.raster.contribution import PAIR, add_row, settle_row
 from gsmerge.kernels.raster.project import TILE
-from gsmerge.moments import Members, pool_members, unaligned_members
+from gsmerge.moments import Members, pool_members, scene_members, unaligned_members
 from gsmerge.render import ViewPlan, contributions, plan_view, prepare, render
 from gsmerge.render.plan import MAX_SIZE
-from gsmerge.runtime.record import note
+from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.decode import DecodeOptions, decode
 from gsmerge.stages.encode import from_moments
 from gsmerge.types import Gaussians, Groups, Scene
-
-if TYPE_CHECKING:
-    from gsmerge.options import CompactOptions
-
-Unseen = Literal["drop", "keep"]
 
 ONE_AT_A_TIME = 4_000_000  # Gaussians; the plan of a view is as large as they are
 FIRST_PAIRS = 1 << 16  # room for pairs of Gaussian and superpixel to begin with
 MIN_ALPHA = 0.5  # opacity of a pixel from which it counts when superpixels are merged
 
 
-@dataclass(frozen=True)
-class ContributionOptions:
-    """What becomes of Gaussians that belong to no pixels.
-
-    Args:
-        unseen: ``"drop"``: Gaussians that no view sees are left out. ``"keep"``: they are merged among their neighbours
-            in space, at the rate of the others, and added to the result.
-        min_owner_weight: Blending weight, in pixels of one view, below which a Gaussian counts as unseen.
-
-    Raises:
-        ValueError: If a setting is unknown or out of range.
-    """
-
-    unseen: Unseen = "drop"
-    min_owner_weight: float = 0.0
-
-    def __post_init__(self) -> None:
-        if self.unseen not in ("drop", "keep"):
-            raise ValueError(f'unseen: expected "drop" or "keep", got {self.unseen!r}')
-        if not self.min_owner_weight >= 0:
-            raise ValueError(f"min_owner_weight: expected at least 0, got {self.min_owner_weight}")
-
-
-def assign_members(scene: Scene, groups: Groups, options: ContributionOptions) -> Members:
-    """An unaligned scene's Gaussians as arrays, each with a pixel of the superpixel that it adds most to.
+@stage("members")
+def assign(scene: Scene, groups: Groups) -> Members:
+    """Give every Gaussian of a canonical scene its pixel: its own, or one of the superpixel that it adds most to.
 
     Raises:
         UsageError: If no view sees any Gaussian.
     """
-    pixels = owner_pixels(find_owners(scene, groups), groups, options.min_owner_weight)
+    if scene.aligned:
+        return scene_members(scene)
+    pixels = owner_pixels(find_owners(scene, groups), groups)
     if not (pixels >= 0).any():
         raise UsageError(
             f"expected views that see the scene, found that none of {len(scene)} sees any of {len(pixels)} Gaussians: "
@@ -75,41 +48,15 @@ def assign_members(scene: Scene, groups: Groups, options: ContributionOptions) -
     return unaligned_members(scene, pixels)
 
 
-def split_unseen(scene: Scene, options: CompactOptions) -> tuple[Scene, CompactOptions, Gaussians | None]:
-    """With ``unseen="keep"``: the scene that some view sees, and the rest merged among neighbours at the same rate.
+def merge_unseen(gaussians: Gaussians, scene: Scene, count: int) -> Gaussians:
+    """Merge n Gaussians that no view of a canonical scene sees into ``count``, 1 to n.
 
-    Args:
-        scene: The canonical scene.
-        options: All settings.
-
-    Returns:
-        The seen scene, the options with the rest of the budget, the merged unseen Gaussians or None.
+    Runs along a space-filling curve (Morton's) become one Gaussian each.
     """
-    if options.contribution.unseen != "keep":
-        return scene, options, None
-    weights = seen_weights(scene)
-    seen = (weights > 0) & (weights >= options.contribution.min_owner_weight)
-    num_unseen = int((~seen).sum())
-    note(f"{num_unseen if num_unseen < len(seen) else 0} Gaussians that no view sees are kept, merged")
-    if num_unseen in (0, len(seen)):
-        return scene, options, None
-    count = exact_count(options.budget, len(seen), scene.gaussians.sh_degree)
-    rate = options.segment.share * options.decode.mean_k if count is None else count / len(seen)
-    unseen = scene.gaussians[~seen & (scene.gaussians.opacities >= options.decode.min_opacity)]
-    num_kept = min(len(unseen), int(rate * num_unseen))
-    if count is not None:
-        options = replace(options, budget=replace(options.budget, budget=max(1, count - num_kept)))
-    kept = merge_neighbors(unseen, scene, num_kept, options) if num_kept else None
-    return replace(scene, gaussians=scene.gaussians[seen]), options, kept
-
-
-def merge_neighbors(gaussians: Gaussians, scene: Scene, count: int, options: CompactOptions) -> Gaussians:
-    """At most ``count`` Gaussians in place of n >= count: runs along a space-filling curve (Morton's) are merged."""
     order = np.argsort(morton_codes(gaussians.means.astype(np.float64)), kind="stable")
     members = unaligned_members(replace(scene, gaussians=gaussians), np.full(len(gaussians), -1, np.int64))
     starts = np.linspace(0, len(order), count + 1).astype(np.int64)
-    moments = pool_members(members, starts, order, options.encode.rule)
-    features = from_moments(moments, starts, order, np.full(count, -1))
+    features = from_moments(pool_members(members, starts, order), starts, order, np.full(count, -1))
     return decode(features, members, DecodeOptions(min_opacity=0.0))
 
 
@@ -225,13 +172,12 @@ def view_owners(plan: ViewPlan, labels: np.ndarray, count: int) -> tuple[np.ndar
     return values, owners
 
 
-def owner_pixels(owners: Owners, groups: Groups, min_owner_weight: float = 0.0) -> np.ndarray:
+def owner_pixels(owners: Owners, groups: Groups) -> np.ndarray:
     """The pixel in the middle of each Gaussian's superpixel, ``[n]`` int64 over all views; -1 for unseen ones.
 
     Args:
         owners: The dominant superpixels.
         groups: The superpixels.
-        min_owner_weight: Those with less are taken for unseen, too.
     """
     counts = np.asarray(groups.counts)
     size, first = groups.labels[0].size, np.cumsum(counts) - counts
@@ -240,8 +186,7 @@ def owner_pixels(owners: Owners, groups: Groups, min_owner_weight: float = 0.0) 
         return middle_pixels(groups.labels[view], groups.counts[view]) + view * size
 
     middles = np.concatenate(parallel_map(one_view, range(len(counts))))
-    seen = (owners.labels >= 0) & (owners.values >= min_owner_weight)
-    return np.where(seen, middles[first[owners.views] + owners.labels], -1)
+    return np.where(owners.labels >= 0, middles[first[owners.views] + owners.labels], -1)
 
 
 def middle_pixels(labels: np.ndarray, count: int) -> np.ndarray:

@@ -9,7 +9,6 @@ view whatever their depths are; the others are drawn.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -22,10 +21,6 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.place_cameras import sampled
 from gsmerge.types import Scene
 from gsmerge.views import subset
-
-if TYPE_CHECKING:
-    from gsmerge.options import CompactOptions
-
 
 # On 14 captures right photos reach 0.99 and more with the colours of pixels, 0.13 to 0.8 with drawings; noise mostly
 # stays below 0.06, photos of other views below 0.3.
@@ -40,23 +35,21 @@ CLOSEST = 0.995  # correlation above which photos are equally good
 NAMED = 4  # views that the note names
 
 
-def leave_out_photos(scene: Scene, options: CompactOptions) -> tuple[Scene, CompactOptions, tuple[int, ...]]:
-    """The scene without the photos that do not show it, whose place the Gaussians' own colours take.
+def leave_out_photos(scene: Scene) -> tuple[Scene, tuple[int, ...]]:
+    """Replace photos that do not show the scene by the Gaussians' own colours; leave out all where most do not.
 
-    Where they are most, there are no photos, no fit, and nothing that is known to be sky. The record gets a note and
-    the choice ``photos_left_out``.
+    The record gets a note and the choice ``photos_left_out``.
 
     Args:
         scene: Canonical.
-        options: Of all stages.
 
     Returns:
-        The scene, the options, and the views whose photos a fit may use.
+        The scene, and the views whose pictures a fit may use: none where there are photos and most do not show it.
     """
     views = tuple(range(len(scene)))
     odd = [] if scene.images is None else odd_photos(scene)
     if not odd or scene.images is None:
-        return scene, options, views
+        return scene, views
     names = [scene.names[view] for view in odd]
     choose(photos_left_out=names)
     more = f" and {len(odd) - NAMED} more" if len(odd) > NAMED else ""
@@ -64,14 +57,11 @@ def leave_out_photos(scene: Scene, options: CompactOptions) -> tuple[Scene, Comp
     problem = f"{len(odd)} of {len(views)} photos do not show what the Gaussians show"
     if 2 * len(odd) > len(views):
         note(f"{problem}, so none is used and nothing is fitted: {which}; check their names and order")
-        if options.clean.drop_sky:
-            note("drop_sky: no photo is used that could say where the sky is, so it stays")
-        fit, clean = replace(options.fit, fit="none"), replace(options.clean, drop_sky=False)
-        return replace(scene, images=None, large_photos=None), replace(options, fit=fit, clean=clean), views
+        return replace(scene, images=None, large_photos=None), ()
     note(f"{problem} and are not used: {which}")
     images = scene.images.copy()
     images[odd] = _own_pictures(scene, odd)
-    return replace(scene, images=images), options, tuple(view for view in views if view not in odd)
+    return replace(scene, images=images), tuple(view for view in views if view not in odd)
 
 
 def odd_photos(scene: Scene) -> list[int]:

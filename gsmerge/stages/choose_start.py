@@ -8,9 +8,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from gsmerge.moments import Rule
 from gsmerge.render.photos import Photos, photo_errors, scene_photos, scene_pictures
 from gsmerge.runtime.memory import release_memory
+from gsmerge.runtime.record import choose, stage
 from gsmerge.stages.decode import DecodeOptions, decode
 from gsmerge.stages.merge import MergedViews
 from gsmerge.types import Gaussians, Scene
@@ -19,8 +19,9 @@ from gsmerge.views import pick_views
 MAX_VIEWS = 6  # that a start is judged by
 
 
-def choose_start(starts: Sequence[MergedViews], scene: Scene, options: DecodeOptions, rule: Rule) -> MergedViews:
-    """With or without networks: the start whose Gaussians, one for each Feature Gaussian, show the views better.
+@stage("choose")
+def choose_start(starts: Sequence[MergedViews], scene: Scene, options: DecodeOptions) -> MergedViews:
+    """Choose the start, with or without networks, whose Gaussians at K = 1 show the views better; of one, that one.
 
     The choice does not depend on K, so what is encoded once is what every K begins with. Networks learn what real
     exports suffer from; a scene without those errors is better left as it is.
@@ -29,25 +30,27 @@ def choose_start(starts: Sequence[MergedViews], scene: Scene, options: DecodeOpt
         starts: The learned start, then the analytic one.
         scene: The canonical scene.
         options: Of decoding; K = 1 is taken.
-        rule: How children are pooled.
 
     Returns:
-        The better start, of equal ones the analytic, with its Gaussians and the PSNR (dB) of both among its choices.
+        The better start, of equal ones the analytic, with its Gaussians; the record gets the PSNR (dB) of both.
     """
+    if len(starts) == 1:
+        return starts[0]
     scores: dict[str, float] = {}
     best = starts[0]
     for start in starts:
         name = "analytic" if start.networks is None else "learned"
-        ones = decode(start.features, start.members, replace(options, k=1), None, rule, start.networks)
+        ones = decode(start.features, start.members, replace(options, k=1), networks=start.networks)
         release_memory()  # of the networks, in other threads
         scores[name] = views_psnr(ones, scene)
         if scores[name] >= max(scores.values()):
             best = replace(start, k1_gaussians=ones)
-    return replace(best, choices={**best.choices, "start_scores": scores})
+    choose(start_scores=scores)
+    return best
 
 
 def views_psnr(gaussians: Gaussians, scene: Scene) -> float:
-    """PSNR (dB) of the views at half size, over the pixels that have a Gaussian of their own.
+    """Measure the PSNR (dB) of the views at half size, over the pixels that have a Gaussian of their own.
 
     Args:
         gaussians: Canonical Gaussians.

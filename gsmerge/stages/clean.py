@@ -1,7 +1,7 @@
 """fitted Gaussians -> those that are wanted: cropped to a box or a sphere, without floaters or sky.
 
 A budget is met after clean-up: more Gaussians are made than are asked for, and the faintest of what is too many are
-left out (:func:`make_clean`).
+left out (:func:`clean_to_count`).
 """
 
 from __future__ import annotations
@@ -155,8 +155,8 @@ def clean(gaussians: Gaussians, options: CleanOptions, scene: Scene, to_world: T
     return gaussians, counts
 
 
-def make_clean(make: Make, count: int | None, options: CleanOptions, scene: Scene, to_world: ToWorld) -> Fitted:
-    """Gaussians after clean-up: exactly ``count`` of them, unless the whole scene does not hold so many.
+def clean_to_count(make: Make, count: int | None, options: CleanOptions, scene: Scene, to_world: ToWorld) -> Fitted:
+    """Make Gaussians and clean them up: exactly ``count`` are left, unless the whole scene does not hold so many.
 
     Args:
         make: Makes that many Gaussians before clean-up.
@@ -168,6 +168,8 @@ def make_clean(make: Make, count: int | None, options: CleanOptions, scene: Scen
     Raises:
         UsageError: If the crop holds none of the scene.
     """
+    if not options.asked:
+        return make(count)
     given = scene.gaussians[scene.valid.reshape(-1)] if scene.aligned else scene.gaussians
     most, asked = len(given), count
     share = 1.0 if options.crop is None else float(inside_crop(to_world(given).means, options.crop).mean())

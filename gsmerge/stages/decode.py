@@ -10,9 +10,12 @@ import numpy as np
 
 from gsmerge.kernels.gaussians.bisect import bisect, gather_groups, split_errors
 from gsmerge.moments import Members, Rule, feature_to_gaussians, pool_members, to_gaussians
+from gsmerge.render.photos import scene_pictures
+from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.merge import MergedViews
-from gsmerge.types import FeatureGaussians, Gaussians, as_array
+from gsmerge.stages.superpixels import scene_saliency
+from gsmerge.types import FeatureGaussians, Gaussians, Scene, as_array
 
 if TYPE_CHECKING:
     from gsmerge.networks.apply import NetworkContext
@@ -110,25 +113,45 @@ def decode(
     return gaussians[gaussians.opacities >= options.min_opacity]
 
 
-def decode_merged(merged: MergedViews, options: DecodeOptions, rule: Rule, *, grows: bool) -> Gaussians:
-    """The Gaussians of merged views: as many as were asked for exactly, or K for each Feature Gaussian.
+@dataclass(frozen=True, eq=False)
+class Decoded:
+    """What a fit begins with.
+
+    Args:
+        gaussians: Canonical Gaussians.
+        count: Number that the fit may grow to.
+        exact: Whether that number is to be met.
+        baseline_start: Gaussians that the fit may beat instead; None: none are compared.
+    """
+
+    gaussians: Gaussians
+    count: int
+    exact: bool
+    baseline_start: Gaussians | None = None
+
+
+@stage("decode")
+def decode_merged(merged: MergedViews, scene: Scene, options: DecodeOptions, *, grows: bool) -> Decoded:
+    """Decode merged views into as many Gaussians as were asked for exactly, or K for each Feature Gaussian.
 
     Args:
         merged: The Feature Gaussians.
+        scene: The canonical scene, whose pictures say where K is larger if it is mixed.
         options: K and the least opacity.
-        rule: How children are pooled, the encoder's.
         grows: Whether the fit that follows adds Gaussians up to an exact count.
     """
     asked = merged.segmentation
     if asked.exact and not grows:
-        return _decode_exactly(merged, asked.count, options, rule)
-    gaussians = _decode_count(merged, merged_count(merged, options, grows=grows), options, rule)
-    if asked.exact and len(gaussians) > asked.count:  # K each would be more than the fit may grow to
-        gaussians = _decode_count(merged, asked.count, options, rule)
-    return gaussians
+        gaussians = _decode_exactly(merged, asked.count, options)
+    else:
+        gaussians = _decode_count(merged, scene, merged_count(merged, options, grows=grows), options)
+        if asked.exact and len(gaussians) > asked.count:  # K each would be more than the fit may grow to
+            gaussians = _decode_count(merged, scene, asked.count, options)
+    start = None if merged.unlearned is None else feature_to_gaussians(merged.unlearned)
+    return Decoded(gaussians, asked.count, asked.exact, start)
 
 
-def _decode_count(merged: MergedViews, count: int | None, options: DecodeOptions, rule: Rule) -> Gaussians:
+def _decode_count(merged: MergedViews, scene: Scene, count: int | None, options: DecodeOptions) -> Gaussians:
     """``count`` Gaussians, spent where they lower distortion most; None: K of each Feature Gaussian."""
     if count is None and options.k == 1 and merged.k1_gaussians is not None:
         return merged.k1_gaussians
@@ -138,12 +161,11 @@ def _decode_count(merged: MergedViews, count: int | None, options: DecodeOptions
         most = MAX_CHILDREN if networks is None else networks.networks.max_children
         children = split_counts(features, members, max(0, count - len(features)), most)
     elif options.k == MIXED:
-        assert merged.saliency is not None
-        children = mixed_counts(features, members, merged.saliency, options)
-    return decode(features, members, options, children, rule, networks)
+        children = mixed_counts(features, members, scene_saliency(scene_pictures(scene)), options)
+    return decode(features, members, options, children, networks=networks)
 
 
-def _decode_exactly(merged: MergedViews, count: int, options: DecodeOptions, rule: Rule) -> Gaussians:
+def _decode_exactly(merged: MergedViews, count: int, options: DecodeOptions) -> Gaussians:
     """``count`` visible Gaussians, spent where they lower distortion most."""
     features, members, networks = merged.features, merged.members, merged.networks
     most = MAX_CHILDREN if networks is None else networks.networks.max_children
@@ -153,7 +175,7 @@ def _decode_exactly(merged: MergedViews, count: int, options: DecodeOptions, rul
         len(features),
         count,
         options.min_opacity,
-        lambda counts: decode(features, members, every, counts, rule, networks),
+        lambda counts: decode(features, members, every, counts, networks=networks),
     )
 
 
@@ -279,7 +301,12 @@ def halve(
 
 
 def pool_children(
-    features: FeatureGaussians, members: Members, starts: np.ndarray, ids: np.ndarray, parents: np.ndarray, rule: Rule
+    features: FeatureGaussians,
+    members: Members,
+    starts: np.ndarray,
+    ids: np.ndarray,
+    parents: np.ndarray,
+    rule: Rule = "depth",
 ) -> Gaussians:
     """One Gaussian for each run of members, with the gain of the Feature Gaussian that it is a child of."""
     moments = pool_members(members, starts, ids, rule)

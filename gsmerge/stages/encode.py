@@ -2,64 +2,53 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from gsmerge.kernels.gaussians.pool import group_members
 from gsmerge.moments import Members, Moments, Rule, pool_members
+from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import FeatureGaussians, Groups, Scene, to_float32
+from gsmerge.types import Cameras, FeatureGaussians, Groups, Scene, to_float32
 
 if TYPE_CHECKING:
     from gsmerge.networks.apply import NetworkContext
+    from gsmerge.networks.modules import Networks
 
 
-@dataclass(frozen=True)
-class EncodeOptions:
-    """How a group becomes one Gaussian.
+def make_context(networks: Networks | None, members: Members, cameras: Cameras, seed: int) -> NetworkContext | None:
+    """Join networks with what they read of a scene; None for none."""
+    if networks is None:
+        return None
+    from gsmerge.networks.apply import NetworkContext  # torch, loaded where there are networks
 
-    Args:
-        rule: ``"depth"``: opacity weights, total covariance of winsorised members, opacity from the conserved
-            optical depth. ``"paper"``: the paper's moment matching (eq. teacher_mean, teacher_cov; mean opacity),
-            a baseline.
-        agreement: Whether groups that other views see through begin fainter, where a fit of 150 steps or more
-            follows: it closes the holes that this leaves, and moves what stands before other views less.
-
-    Raises:
-        ValueError: If the rule is unknown.
-    """
-
-    rule: Rule = "depth"
-    agreement: bool = True
-
-    def __post_init__(self) -> None:
-        if self.rule not in ("depth", "paper"):
-            raise ValueError(f'rule: expected "depth" or "paper", got {self.rule!r}')
+    return NetworkContext(networks, members, cameras, seed)
 
 
+@stage("encode")
 def encode(
     scene: Scene,
     members: Members,
     groups: Groups,
-    options: EncodeOptions,
     networks: NetworkContext | None = None,
+    rule: Rule = "depth",
 ) -> FeatureGaussians:
-    """One Feature Gaussian per superpixel, view by view.
+    """Pool every superpixel into one Feature Gaussian, view by view.
 
     Args:
         scene: The canonical scene.
         members: Its Gaussians as arrays.
         groups: The superpixels of every view.
-        options: The rule.
         networks: Networks whose encoder corrects what is pooled; None: none does.
+        rule: ``"depth"``: opacity weights, total covariance of winsorised members, opacity from the conserved optical
+            depth. ``"paper"``: the paper's moment matching (eq. teacher_mean, teacher_cov; mean opacity).
 
     Returns:
         The Feature Gaussians in order of view and label; superpixels without a valid member are left out.
     """
     starts, ids, views = member_rows(scene, members, groups)
-    features = from_moments(pool_members(members, starts, ids, options.rule), starts, ids, views)
+    features = from_moments(pool_members(members, starts, ids, rule), starts, ids, views)
     if networks is None:
         return features
     from gsmerge.networks.apply import encode_features

@@ -10,6 +10,7 @@ import numpy as np
 from gsmerge.geometry import normalize
 from gsmerge.kernels.gaussians.cluster import connected_components, edge_scores, leader_clusters
 from gsmerge.networks.neighbors import nearest_of_other_views
+from gsmerge.runtime.record import stage
 from gsmerge.types import SH_C0, FeatureGaussians, Matches, as_array
 
 if TYPE_CHECKING:
@@ -26,8 +27,7 @@ class MatchOptions:
     Args:
         match: ``"overlap"``: Bhattacharyya coefficient (does not depend on the world's axes), similar colours, and
             star clusters that cannot chain. ``"aabb"``, as in the paper (section 4.4): box IoU, similar latents, and
-            connected components. ``"none"``: no merging across views. None: ``"overlap"``, but ``"none"`` for a draft.
-        effort: Of the whole run; ``"draft"`` matters here.
+            connected components. ``"none"``: no merging across views. None: ``"overlap"``, but ``"none"`` in a draft.
         geometry: Of what is compared where networks are loaded: ``"analytic"``, that of the moments, or ``"decoded"``,
             that of the K = 1 head (paper section 4.3), which merges less, takes longer and is no better.
         overlap: Least overlap of ``"overlap"``, 0 to 1.
@@ -44,7 +44,6 @@ class MatchOptions:
     """
 
     match: Method | None = None
-    effort: str = "default"
     geometry: Geometry = "analytic"
     overlap: float = 0.7
     iou: float = 0.2
@@ -70,10 +69,11 @@ class MatchOptions:
 
     @property
     def method(self) -> Method:
-        """How views are merged: as asked, otherwise by effort."""
-        return self.match or ("none" if self.effort == "draft" else "overlap")
+        """How views are merged."""
+        return self.match or "overlap"
 
 
+@stage("match")
 def match(features: FeatureGaussians, options: MatchOptions, networks: NetworkContext | None = None) -> Matches:
     """Clusters of Feature Gaussians of different views.
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from gsmerge.moments import Members
+from gsmerge.runtime.record import stage
 from gsmerge.types import Array, FeatureGaussians, Gaussians, Matches, Segmentation, as_tensor, to_float32
 
 if TYPE_CHECKING:
@@ -23,21 +23,22 @@ class MergedViews:
         features: The Feature Gaussians.
         members: The scene's Gaussians that ``features.members`` points into.
         segmentation: The superpixels that they come from, and how many Gaussians they are to become.
+        num_groups: Superpixels with Gaussians, before merging.
         networks: Networks that correct; None: those are not used.
-        choices: What the stages decided, for the report.
+        unlearned: Feature Gaussians without networks, which the fit may beat instead; None: none are compared.
         k1_gaussians: What they become at K = 1, where that had to be known to choose them; None elsewhere.
-        saliency: ``[v·h·w]`` corner response of every pixel, where K depends on it; None elsewhere.
     """
 
     features: FeatureGaussians
     members: Members
     segmentation: Segmentation
+    num_groups: int
     networks: NetworkContext | None = None
-    choices: Mapping[str, Any] = field(default_factory=dict)
+    unlearned: FeatureGaussians | None = None
     k1_gaussians: Gaussians | None = None
-    saliency: np.ndarray | None = None
 
 
+@stage("match")
 def merge(features: FeatureGaussians, matches: Matches, networks: NetworkContext | None = None) -> FeatureGaussians:
     """One Feature Gaussian per cluster; those that are alone pass unchanged.
 
@@ -75,7 +76,8 @@ def refine(features: FeatureGaussians, networks: NetworkContext | None) -> Featu
         return features
     from gsmerge.networks.apply import refine_features
 
-    return refine_features(features, networks)
+    with stage("refine"):
+        return refine_features(features, networks)
 
 
 def cluster_runs(matches: Matches) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""scene -> prepared scene: in the frame that all arithmetic runs in, with everything that the next stages need.
+"""scene -> prepared scene: facts about it, and the scene in the frame that all arithmetic runs in.
 
 The canonical frame has its origin at the scene's middle and the median depth as its unit, so that float32 keeps its
 precision far from the world's origin and thresholds (near plane, floors) mean the same at every scale. The unit is a
@@ -10,35 +10,26 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import Literal
 
 import numpy as np
 
-from gsmerge.budget import exact_count
-from gsmerge.errors import UsageError
 from gsmerge.geometry import lower_median, project
-from gsmerge.moments import Members, scene_members
-from gsmerge.render.photos import scene_pictures
 from gsmerge.runtime.record import note, stage
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.stages.agreement import choose_superpixels
 from gsmerge.stages.align_views import align_views
-from gsmerge.stages.assign import ContributionOptions, split_unseen
+from gsmerge.stages.assign import seen_weights
 from gsmerge.stages.check_photos import leave_out_photos
-from gsmerge.stages.group import CountLimits, count_limits, with_tree
 from gsmerge.stages.place_cameras import add_pictures, add_views
-from gsmerge.stages.region_tree import RegionTree
 from gsmerge.types import Cameras, Gaussians, Scene
-from gsmerge.views import distinct_views, report_views, scored_views, subset
-
-if TYPE_CHECKING:
-    from gsmerge.networks.apply import NetworkContext
-    from gsmerge.networks.checkpoint import Checkpoint
-    from gsmerge.options import CompactOptions
+from gsmerge.views import distinct_views, subset
 
 SAMPLES = 65536  # Gaussians that the frame is measured on
 ROWS = 65536  # Gaussians per task
 MAX_VIEWS = 32  # of an unaligned scene, that the unit is taken from
+
+Poses = Literal["auto", "fixed", "free"]
+Unseen = Literal["drop", "keep"]
 
 
 @dataclass(frozen=True)
@@ -54,7 +45,7 @@ class Frame:
     unit: float
 
     def enter(self, gaussians: Gaussians) -> Gaussians:
-        """World to canonical; means in float32."""
+        """Move Gaussians from the world into the frame; means in float32."""
         means, scales = np.empty(gaussians.means.shape, np.float32), np.empty_like(gaussians.scales)
 
         def fill(first: int) -> None:
@@ -66,277 +57,171 @@ class Frame:
         return replace(gaussians, means=means, scales=scales)
 
     def leave(self, gaussians: Gaussians) -> Gaussians:
-        """Canonical to world; means in float64."""
+        """Move Gaussians from the frame into the world; means in float64."""
         means = gaussians.means.astype(np.float64) * self.unit + self.origin
         return replace(gaussians, means=means, scales=gaussians.scales * self.unit)
 
     def leave_cameras(self, cameras: Cameras) -> Cameras:
-        """Canonical to world."""
+        """Move cameras from the frame into the world."""
         viewmats = cameras.viewmats.astype(np.float64)
         viewmats[:, :3, 3] = self.unit * viewmats[:, :3, 3] - viewmats[:, :3, :3] @ self.origin
         return replace(cameras, viewmats=viewmats)
 
     def enter_cameras(self, cameras: Cameras) -> Cameras:
-        """World to canonical."""
+        """Move cameras from the world into the frame."""
         viewmats = cameras.viewmats.astype(np.float64)
         shift = viewmats[:, :3, 3] + viewmats[:, :3, :3] @ self.origin
         viewmats[:, :3, 3] = shift / self.unit
         return replace(cameras, viewmats=viewmats)
 
 
-def find_frame(scene: Scene) -> Frame:
-    """The canonical frame of a scene: median mean (float64) and median depth of its valid Gaussians.
+def scene_frame(scene: Scene) -> Frame:
+    """Choose the canonical frame: median mean (float64) and median depth of the Gaussians that have a pixel, or of all.
 
     Raises:
-        ValueError: If no Gaussian is valid.
-    """
-    rows = np.flatnonzero(scene.valid)
-    if len(rows) == 0:
-        raise ValueError("expected at least one valid Gaussian, got none")
-    rows = rows[:: max(1, len(rows) // SAMPLES)]
-    return Frame(lower_median(scene.gaussians.means[rows].astype(np.float64)), _unit(scene_depth(scene)))
-
-
-def find_unaligned_frame(scene: Scene) -> Frame:
-    """The canonical frame of an unaligned scene: median mean, and median depth of the Gaussians inside the views.
-
-    Raises:
-        ValueError: If there is no Gaussian or no view.
+        ValueError: If there is no valid Gaussian, or no view.
     """
     if len(scene.gaussians) == 0 or len(scene) == 0:
         raise ValueError(f"expected Gaussians and views, got {len(scene.gaussians)} and {len(scene)}")
-    means = scene.gaussians.means[:: max(1, len(scene.gaussians) // SAMPLES)].astype(np.float64)
-    return Frame(lower_median(means), _unit(scene_depth(scene)))
-
-
-def _unit(depth: float) -> float:
-    """The power of two nearest to a depth."""
-    return 2.0 ** round(math.log2(depth)) if depth > 0 and math.isfinite(depth) else 1.0
+    means = scene.gaussians.means[_sample_rows(scene)].astype(np.float64)
+    depth = scene_depth(scene)
+    unit = 2.0 ** round(math.log2(depth)) if depth > 0 and math.isfinite(depth) else 1.0
+    return Frame(lower_median(means), unit)
 
 
 def scene_depth(scene: Scene) -> float:
-    """Median depth of a sample of the Gaussians, each in its own view, or in all that see it; 0 where none does."""
+    """Measure the median depth of some Gaussians, each in its own view, or in all that see it; 0 where none does."""
+    rows = _sample_rows(scene)
+    means = scene.gaussians.means[rows].astype(np.float64)
     if scene.aligned:
-        rows = np.flatnonzero(scene.valid)
-        rows = rows[:: max(1, len(rows) // SAMPLES)]
-        means, viewmats = scene.gaussians.means[rows].astype(np.float64), scene.cameras.viewmats
-        viewmats = viewmats[rows // scene.pixels_per_view]
-        return float(lower_median(np.abs((viewmats[:, 2, :3] * means).sum(1) + viewmats[:, 2, 3])))
-    means = scene.gaussians.means[:: max(1, len(scene.gaussians) // SAMPLES)].astype(np.float64)
+        thirds = scene.cameras.viewmats[rows // scene.pixels_per_view, 2]
+        return float(lower_median(np.abs((thirds[:, :3] * means).sum(1) + thirds[:, 3])))
     views = scene.cameras[:: max(1, len(scene) // MAX_VIEWS)]
     pixels, depths = project(means, views)
     seen = (depths > 0) & ((pixels > 0) & (pixels < (views.width, views.height))).all(-1)
     return float(lower_median(depths[seen])) if seen.any() else 0.0
 
 
-def scene_frame(scene: Scene) -> Frame:
-    """The canonical frame of a scene of either kind.
+def _sample_rows(scene: Scene) -> np.ndarray:
+    """Choose evenly spread rows among the valid ones.
 
     Raises:
-        ValueError: As :func:`find_frame` and :func:`find_unaligned_frame`.
+        ValueError: If no Gaussian is valid.
     """
-    return find_frame(scene) if scene.aligned else find_unaligned_frame(scene)
+    rows = np.arange(len(scene.gaussians)) if scene.pixel_ids is None else np.flatnonzero(scene.pixel_ids >= 0)
+    if len(rows) == 0:
+        raise ValueError("expected at least one valid Gaussian, got none")
+    return rows[:: max(1, len(rows) // SAMPLES)]
 
 
 def canonicalise(scene: Scene, frame: Frame | None = None) -> tuple[Scene, Frame]:
-    """The scene in its canonical frame, or in a given one, and the frame."""
+    """Move a scene into its canonical frame, or into a given one; return it and the frame."""
     frame = frame or scene_frame(scene)
     return replace(scene, gaussians=frame.enter(scene.gaussians), cameras=frame.enter_cameras(scene.cameras)), frame
 
 
+@dataclass(frozen=True)
+class PrepareOptions:
+    """What is done before anything is merged.
+
+    Args:
+        poses: ``"free"``: views of one Gaussian per pixel are moved to where their photos agree, and the full fit moves
+            the cameras on (on the CPU); ``"fixed"``: cameras stay where they are; ``"auto"``: free where some view is
+            more than 1.5 pixels off and its photo and the others agree clearly better elsewhere
+            (:mod:`gsmerge.stages.align_views` says by how much); fixed elsewhere, and without photos.
+        unseen: ``"drop"``: Gaussians without a pixel that no view sees are left out. ``"keep"``: they are merged among
+            their neighbours in space, at the rate of the others, and added to the result.
+
+    Raises:
+        ValueError: If a setting is unknown.
+    """
+
+    poses: Poses = "auto"
+    unseen: Unseen = "drop"
+
+    def __post_init__(self) -> None:
+        if self.poses not in ("auto", "fixed", "free"):
+            raise ValueError(f'poses: expected "auto", "fixed" or "free", got {self.poses!r}')
+        if self.unseen not in ("drop", "keep"):
+            raise ValueError(f'unseen: expected "drop" or "keep", got {self.unseen!r}')
+
+
 @dataclass(frozen=True, eq=False)
-class PreparedScene:
-    """A scene that the stages can work on.
+class Prepared:
+    """Facts about a scene, and the scene as the stages work on it.
 
     Args:
         given: The scene as it was given, in its own world frame.
-        scene: The canonical scene: every view once; an unaligned one has cameras, images and only finite Gaussians.
-        pictures: ``[v,h,w,3]`` what superpixels are cut from: the photos, or the Gaussians' own colours.
+        scene: The canonical scene: every view once, photos that do not show it replaced; an unaligned one has cameras,
+            pictures and only finite Gaussians that are seen, or all if none is set aside.
         frame: The canonical frame.
-        settings: What was asked for.
-        options: The same, with any budget less what ``hidden`` takes of it.
-        limits: What is known of the number of Gaussians.
-        members: The Gaussians as members of groups; None where the superpixels decide who belongs to them.
-        checkpoint: Networks that correct the analytic stages; None: those alone.
-        tree: All ways to cut the scene into fewer superpixels, where a count is asked for; None elsewhere.
-        hidden: Gaussians in place of those that no view sees, canonical; None without any.
         photo_views: Views whose photos a fit may use, see :mod:`gsmerge.stages.check_photos`.
-        moved: Whether views were moved to where their photos agree, before a fit or by it.
         repeated: Of every given view its place in the scene, or that of the view that it repeats.
+        moved: Whether views were moved to where their photos agree, before a fit or by it.
+        unseen: Canonical Gaussians that no view sees; None where they were not looked for, or there are none.
     """
 
     given: Scene
     scene: Scene
-    pictures: np.ndarray
     frame: Frame
-    settings: CompactOptions
-    options: CompactOptions
-    limits: CountLimits
-    members: Members | None
-    checkpoint: Checkpoint | None
-    tree: RegionTree | None
-    hidden: Gaussians | None
     photo_views: tuple[int, ...]
-    moved: bool
     repeated: tuple[int, ...]
+    moved: bool
+    unseen: Gaussians | None
 
-    def scored_views(self) -> list[int]:
-        """The given views that input and result are scored on: some of those whose photos show the scene.
-
-        More of them where a quality was asked for, which depends on the scores.
-        """
-        candidates: Sequence[int] = range(len(self.given))
-        if self.photo_views:  # numbers of the scene without repeated views
-            candidates = [view for view, place in enumerate(self.repeated) if place in self.photo_views]
-        choose = report_views if self.options.budget.target_psnr is None else scored_views
-        return [candidates[i] for i in choose(len(candidates))]
-
-    def with_cameras(self, cameras: Cameras) -> PreparedScene:
-        """Replace the canonical cameras by those of a fit, and keep them fixed; the scene's own change nothing."""
+    def with_cameras(self, cameras: Cameras) -> Prepared:
+        """Replace the canonical cameras by those of a fit; the scene's own change nothing."""
         if cameras is self.scene.cameras:
             return self
-        fixed = replace(self.options.fit, poses="fixed")
-        scene = replace(self.scene, cameras=cameras)
-        return replace(self, scene=scene, options=replace(self.options, fit=fixed), moved=True)
+        return replace(self, scene=replace(self.scene, cameras=cameras), moved=True)
 
     def final_cameras(self) -> Cameras:
-        """The given views' cameras as the result was made from them, in the world."""
+        """Return the given views' cameras as the result was made from them, in the world."""
         given = self.given.cameras
         if not self.moved:
             return given
         return replace(given, viewmats=self.frame.leave_cameras(self.scene.cameras).viewmats[list(self.repeated)])
 
-    def candidates(self, members: Members) -> list[NetworkContext | None]:
-        """What corrects the analytic stages: networks, None for nothing, or both in turn where they compete."""
-        if self.checkpoint is None:
-            return [None]
-        from gsmerge.networks.apply import NetworkContext
 
-        options = self.options
-        networks = NetworkContext(self.checkpoint.networks, members, self.scene.cameras, options.seed)
-        return [networks, None] if options.checkpoint == "auto" else [networks]
-
-    def keeps_all(self, count: int | None) -> bool:
-        """Whether so many Gaussians are asked for that an unaligned scene need not be grouped."""
-        return count is not None and not self.scene.aligned and count >= len(self.scene.gaussians)
-
-
-def prepare(scene: Scene, settings: CompactOptions, frame: Frame | None = None) -> PreparedScene:
-    """Everything that is known before superpixels are chosen.
+@stage("prepare")
+def prepare(scene: Scene, options: PrepareOptions | None = None, frame: Frame | None = None) -> Prepared:
+    """Find what is known of a scene before anything is decided; notes say what was missing and what stands in for it.
 
     Args:
         scene: As given.
-        settings: Of all stages.
+        options: What may be changed; None: the defaults.
         frame: Canonical frame; None: the scene's own.
 
     Raises:
         ValueError: If there is no finite Gaussian, or there are images without cameras.
-        UsageError: If the settings ask for what the scene does not have.
     """
-    if settings.method != "gsmerge":  # baselines set nothing aside and learn nothing
-        settings = replace(settings, contribution=ContributionOptions(), checkpoint="none", require_checkpoint=False)
-    if scene.images is None and settings.budget.quality is not None:
-        raise UsageError("a quality target needs photos, and the scene has none; give --images, or a --budget")
-    if scene.images is None and settings.clean.drop_sky:
-        raise UsageError("drop_sky: expected photos, which say where the sky is; name them with --images")
-    with stage("prepare"):
-        own, options, repeated = drop_repeats(scene, settings)
-        if scene.images is None:  # nothing says where cameras belong
-            options = replace(options, fit=replace(options.fit, poses="fixed"))
-        canonical: Scene
-        members, hidden, moved = None, None, False
-        if own.aligned:
-            aligned_scene, frame = canonicalise(own, frame)
-            aligned_scene, options, shown = leave_out_photos(aligned_scene, options)
-            canonical, options = move_wrong_views(aligned_scene, options, shown)
-            members, moved = scene_members(canonical), canonical is not aligned_scene
-        else:
-            unaligned, frame = canonicalise(add_views(own), frame)
-            unaligned, options, shown = leave_out_photos(unaligned, options)
-            unaligned, options, hidden = split_unseen(unaligned, options)
-            canonical = add_pictures(unaligned)
-        photos, aligned = scene.images is not None, scene.aligned
-        name = options.networks(photos=photos, aligned=aligned)
-        checkpoint, notes = find_networks(name, options)
-        for text in notes:
-            note(text)
-        options = choose_superpixels(canonical, members, options)
-        limits, pictures = count_limits(canonical, options), scene_pictures(canonical)
-        pixels = max(1, len(canonical) * canonical.pixels_per_view)
-        options = replace(options, fit=options.fit.with_steps_for((limits.count or limits.default) / pixels))
-    prepared = PreparedScene(
-        scene, canonical, pictures, frame, settings, options, limits, members, checkpoint, None, hidden, shown, moved,
-        repeated,
-    )  # fmt: skip
-    if settings.method != "gsmerge" or not (options.needs_tree or limits.count is not None):
-        return prepared
-    with stage("segment"):
-        return with_tree(prepared)
+    options = options or PrepareOptions()
+    views, repeated = distinct_views(scene)
+    own = scene
+    if len(views) < len(scene):
+        own = subset(scene, views)
+        note(f"{len(scene) - len(views)} views repeat others in every pixel and count once")
+    canonical, frame = canonicalise(add_views(own), frame)
+    checked, photo_views = leave_out_photos(canonical)
+    placed = _move_wrong_views(checked, photo_views, options.poses)
+    seen, unseen = _split_unseen(placed) if options.unseen == "keep" else (placed, None)
+    return Prepared(scene, add_pictures(seen), frame, photo_views, tuple(repeated), placed is not checked, unseen)
 
 
-def move_wrong_views(scene: Scene, options: CompactOptions, views: tuple[int, ...]) -> tuple[Scene, CompactOptions]:
-    """The canonical scene with its views where the photos agree, as far as ``poses`` asks for it; and the options.
-
-    Where it leaves that to the scene, the options say what came of it: the fit moves the cameras on, or it does not.
-    """
-    poses = options.fit.poses
-    if scene.images is None or options.method != "gsmerge" or poses == "fixed":
-        return scene, options
-    moved = align_views(scene, views, always=poses == "free")
-    if poses == "auto":
-        options = replace(options, fit=replace(options.fit, poses="fixed" if moved is None else "free"))
-    return scene if moved is None else moved, options
+def _move_wrong_views(scene: Scene, views: Sequence[int], poses: Poses) -> Scene:
+    """Move views to where the photos agree; the scene itself where none is wrong or may be moved."""
+    if not scene.aligned or scene.images is None or poses == "fixed":
+        return scene
+    return align_views(scene, views, always=poses == "free") or scene
 
 
-def find_networks(name: str, options: CompactOptions) -> tuple[Checkpoint | None, list[str]]:
-    """The checkpoint of this name, which gives what the options ask, and notes; None for ``"none"``.
-
-    Raises:
-        SceneError: If it is required and cannot be used.
-        UsageError: If it does not give what the options ask for.
-    """
-    if name == "none":  # torch is imported only where there are networks
-        return None, []
-    from gsmerge.networks.checkpoint import find_checkpoint
-
-    checkpoint, notes = find_checkpoint(name, required=options.require_checkpoint)
-    if checkpoint is not None:
-        check_networks(checkpoint, options)
-    return checkpoint, notes
-
-
-def check_networks(checkpoint: Checkpoint, options: CompactOptions) -> None:
-    """Do the networks give what the options ask of them?
-
-    Raises:
-        UsageError: If not.
-    """
-    outputs = checkpoint.networks.options.outputs
-    if options.recipe == "paper" and outputs != "absolute":
-        raise UsageError(
-            f"recipe paper: expected networks with absolute outputs, {checkpoint.path} has {outputs} ones;"
-            " gsmerge train --preset paper makes them"
-        )
-    require_children("k", options.decode.max_k, checkpoint)
-
-
-def require_children(name: str, count: int, checkpoint: Checkpoint | None) -> None:
-    """Raise UsageError where the heads of a checkpoint know fewer children than option ``name`` asks for."""
-    if checkpoint is not None and count > checkpoint.networks.max_children:
-        raise UsageError(
-            f"{name}: expected at most {checkpoint.networks.max_children} with the absolute outputs of"
-            f" {checkpoint.path}, got {count}"
-        )
-
-
-def drop_repeats(scene: Scene, options: CompactOptions) -> tuple[Scene, CompactOptions, tuple[int, ...]]:
-    """The scene with every view once, the options with budgets that stay shares of the whole, and places of views."""
-    views, places = distinct_views(scene)
-    if len(views) == len(scene):
-        return scene, options, tuple(places)
-    few = subset(scene, views)
-    count = exact_count(options.budget, scene.num_gaussians, scene.gaussians.sh_degree)
-    if count is not None:
-        options = replace(options, budget=replace(options.budget, budget=min(count, few.num_gaussians)))
-    note(f"{len(scene) - len(views)} views repeat others in every pixel and count once")
-    return few, options, tuple(places)
+def _split_unseen(scene: Scene) -> tuple[Scene, Gaussians | None]:
+    """Split a scene into what some view sees and the Gaussians that none does; None without any, or without others."""
+    if scene.aligned:
+        return scene, None
+    seen = seen_weights(scene) > 0
+    num_unseen = int((~seen).sum())
+    note(f"{num_unseen if num_unseen < len(seen) else 0} Gaussians that no view sees are kept, merged")
+    if num_unseen in (0, len(seen)):
+        return scene, None
+    return replace(scene, gaussians=scene.gaussians[seen]), scene.gaussians[~seen]

@@ -18,38 +18,14 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Groups, Scene
 
 DEPTH_RANGE = 1e3  # depths are clipped to this factor of the view's median
+DEPTH_WEIGHT = 1.0  # of squared relative depth errors against squared colour errors (sRGB in [0, 1])
+COMPACTNESS = 1e-5  # of squared pixels against squared colours; without it regions become snakes that no Gaussian fits
+# Largest side of a region, as a share of the image's longer side: the rasterizer's affine approximation bends larger
+# Gaussians. Exceeded only where the budget leaves no other choice.
+MAX_EXTENT = 1 / 8
 KNEE_STEP = 1.25  # the slope of the curve is taken over this factor of the count
-
-
-@dataclass(frozen=True)
-class AllocateOptions:
-    """What a good place for a Gaussian is, and when more are not worth it.
-
-    Args:
-        depth_weight: Of squared relative depth errors against squared colour errors (sRGB in [0, 1]).
-        region_compactness: Of squared pixels against squared colours while regions merge; without it they become
-            snakes that no Gaussian fits.
-        max_extent: Largest side of a region, as a share of the image's longer side: the rasterizer's affine
-            approximation bends larger Gaussians. Exceeded only when the budget leaves no other choice.
-        knee_slope: The automatic count stops where the predicted quality grows by less than this, dB per
-            relative increase of the count (1 means 0.01 dB per 1 % more).
-        knee_floor: Squared error per pixel and channel that no count removes (noise, views that disagree).
-    """
-
-    depth_weight: float = 1.0
-    region_compactness: float = 1e-5
-    max_extent: float = 1 / 8
-    knee_slope: float = 1.0
-    knee_floor: float = 3e-4
-
-    def __post_init__(self) -> None:
-        for name in ("depth_weight", "region_compactness", "knee_slope"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name}: expected a number of at least 0, got {getattr(self, name)}")
-        if not self.max_extent > 0:
-            raise ValueError(f"max_extent: expected a positive number, got {self.max_extent}")
-        if not self.knee_floor > 0:
-            raise ValueError(f"knee_floor: expected a positive number, got {self.knee_floor}")
+KNEE_SLOPE = 1.0  # dB of predicted quality per relative increase of the count: below it, more are not worth it
+KNEE_FLOOR = 3e-4  # squared error per pixel and channel that no count removes (noise, views that disagree)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +38,7 @@ class RegionTree:
         order: ``[m]`` int64, all merges, cheapest first; those of view v are numbered from ``first[v]`` on.
         first: ``[v+1]`` int64, merges in the views before.
         distortions: ``[m+1]`` float64, mean squared error per pixel and colour channel after the first i merges.
-        min_regions: Fewest regions before any is larger than ``max_extent``.
+        min_regions: Fewest regions before any is larger than ``MAX_EXTENT``.
     """
 
     groups: Groups
@@ -95,9 +71,7 @@ def pixel_depths(scene: Scene) -> np.ndarray:
     return np.stack(parallel_map(one_view, range(len(scene))))
 
 
-def region_tree(
-    images: np.ndarray, depths: np.ndarray, groups: Groups, valid: np.ndarray, options: AllocateOptions | None = None
-) -> RegionTree:
+def region_tree(images: np.ndarray, depths: np.ndarray, groups: Groups, valid: np.ndarray) -> RegionTree:
     """Merge neighbouring superpixels in order of the distortion that it adds, each view down to a single region.
 
     Args:
@@ -105,24 +79,21 @@ def region_tree(
         depths: ``[v,h,w]`` float, depth of each pixel; those of at most 0 count as very near.
         groups: The superpixels to start from, 4-connected, none empty.
         valid: ``[v,h,w]`` bool; pixels that do not count. Superpixels without a valid pixel merge first.
-        options: Weights.
 
     Raises:
         ValueError: If the shapes do not fit together or a superpixel has no pixel.
     """
-    options = options or AllocateOptions()
     _check_pictures(images, depths, groups, valid)
-    extent = max(1.0, options.max_extent * max(images.shape[1:3]))
+    extent = max(1.0, MAX_EXTENT * max(images.shape[1:3]))
 
     def one_view(view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, int]:
         usable = _usable_depths(depths[view], valid[view])
         labels, count = pad_labels(groups.labels[view]), groups.counts[view]
         pixels = np.ascontiguousarray(images[view], np.float32)
         rows = np.empty((2 * count, ROW))
-        weight = options.depth_weight
-        start = region_sums(labels, pixels, usable, count, rows) + weight * float(rows[:count, PLANE_ERROR].sum())
+        start = region_sums(labels, pixels, usable, count, rows) + DEPTH_WEIGHT * float(rows[:count, PLANE_ERROR].sum())
         pairs = adjacent_pairs(labels)
-        return *merge_order(pairs, rows, weight, options.region_compactness, extent), start, int((usable > 0).sum())
+        return *merge_order(pairs, rows, DEPTH_WEIGHT, COMPACTNESS, extent), start, int((usable > 0).sum())
 
     parents, of_view, growths, starts, num_pixels = zip(*parallel_map(one_view, range(len(images))), strict=True)
     first, heights = np.concatenate([[0], np.cumsum([len(h) for h in of_view])]), np.concatenate(of_view)
@@ -177,33 +148,31 @@ def cut_tree(tree: RegionTree, budget: int) -> Groups:
     return Groups(np.stack(labels), counts)
 
 
-def auto_count(tree: RegionTree, options: AllocateOptions | None = None) -> int:
-    """The :func:`knee` of a scene, among the counts that need no region larger than ``max_extent``."""
+def auto_count(tree: RegionTree) -> int:
+    """Find the :func:`knee` of a scene, among the counts that need no region larger than ``MAX_EXTENT``."""
     usable = tree.counts >= tree.min_regions
-    return knee(tree.counts[usable], tree.distortions[usable], options)
+    return knee(tree.counts[usable], tree.distortions[usable])
 
 
-def knee(counts: np.ndarray, distortions: np.ndarray, options: AllocateOptions | None = None) -> int:
-    """The count beyond which more Gaussians are not worth it.
+def knee(counts: np.ndarray, distortions: np.ndarray) -> int:
+    """Find the count beyond which more Gaussians are not worth it.
 
     Predicted quality is q(N) = -10 log10(floor + D(N)) dB. The knee is the largest count from whose surroundings
-    (a factor of 1.25) q still grows by ``knee_slope`` dB per relative increase; the least count if there is none.
+    (a factor of 1.25) q still grows by ``KNEE_SLOPE`` dB per relative increase; the least count if there is none.
 
     Args:
         counts: ``[m]`` in any order, all different.
         distortions: ``[m]`` mean squared error per pixel and channel at each count.
-        options: Slope and floor.
 
     Raises:
         ValueError: If there is no count.
     """
-    options = options or AllocateOptions()
     counts, distortions = np.asarray(counts), np.asarray(distortions, dtype=float)
     if len(counts) == 0 or counts.shape != distortions.shape:
         raise ValueError(f"expected as many distortions as counts, got {distortions.shape} for {counts.shape}")
     order = np.argsort(counts)
     scale, error = np.log(counts[order].astype(float)), np.maximum.accumulate(distortions[order][::-1])[::-1]
-    quality = -10 * np.log10(options.knee_floor + np.maximum(error, 0))
+    quality = -10 * np.log10(KNEE_FLOOR + np.maximum(error, 0))
     before = np.interp(scale - np.log(KNEE_STEP), scale, quality)
-    steep = (quality - before) / np.log(KNEE_STEP) >= max(options.knee_slope, 1e-12)
+    steep = (quality - before) / np.log(KNEE_STEP) >= KNEE_SLOPE
     return int(counts[order][np.flatnonzero(steep)[-1] if steep.any() else 0])

@@ -1,310 +1,79 @@
-"""Partition each view into superpixels of similar colour and regular shape (paper section 4.1).
-
-The default, ``rdseg``, spends the superpixels where they lower the squared colour error most: rectangles cut best
-first (more than asked for), merged with Ward's rule to the exact number, then exact moves of border pixels. ``bass``
-is Bayesian adaptive superpixel segmentation from a hexagonal grid, ``bass-st`` the same from seeds drawn by the
-Shi-Tomasi response, as in the paper, ``bass-adaptive`` the same with splits and merges, ``slic`` the common baseline,
-and ``grid`` plain rectangles: where they are a few pixels large and no fit follows, they are as good and cost nothing.
-No superpixel is empty, each is 4-connected, and a run repeats bit for bit.
-
-There are exactly as many superpixels as asked for, with one exception: from a share of the pixels, ``bass-adaptive``
-comes to a number of its own in each view, at most four times more or fewer. Where a number is asked for, here or by a
-budget, its moves go on to that number, those of the highest Hastings ratio first.
-"""
+"""scene -> groups: the superpixels of every view, evenly many or cut from a region tree."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
-import numpy as np
-
-from gsmerge.budget import parse_share
-from gsmerge.errors import UsageError
-from gsmerge.kernels.superpixels.kd import split_rectangles
-from gsmerge.kernels.superpixels.regions import pad_labels
-from gsmerge.kernels.superpixels.sweeps import refine
-from gsmerge.kernels.superpixels.ward import merge_regions
-from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import Array, Groups, as_array, like
-
-SEGMENTATIONS = ("rdseg", "bass", "bass-st", "bass-adaptive", "slic", "grid")
-# Effort -> (rectangles per superpixel, sweeps before merging).
-EFFORTS = {"draft": (1.0, 0), "fast": (1.0, 0), "default": (2.0, 0), "best": (3.0, 1)}
-NUM_SWEEPS = 2
-BLOCK = 32  # side of the squares that the cutting starts from, pixels
-PIXEL_START = 0.45  # above this many rectangles per pixel, merging starts from the pixels themselves
-RANGE_SLACK = 1e-3  # colours may leave [0, 1] by this much, as resampled pictures do
-MAX_FACTOR = 4  # most times more or fewer superpixels than bass-adaptive starts with
-
-SHARE = "4.4%"  # superpixels per pixel by default
-AUTO_SHARE = "auto"
+from gsmerge.render.photos import scene_pictures
+from gsmerge.runtime.record import stage
+from gsmerge.stages.assign import seen_depths
+from gsmerge.stages.counts import CountLimits
+from gsmerge.stages.region_tree import RegionTree, auto_count, cut_tree, pixel_depths, region_tree
+from gsmerge.stages.superpixels import SegmentOptions, segment
+from gsmerge.types import Scene, Segmentation
 
 
-@dataclass(frozen=True)
-class SegmentOptions:
-    """How to cut views into superpixels.
+@dataclass(frozen=True, eq=False)
+class SuperpixelPlan:
+    """How a scene is cut into superpixels.
 
     Args:
-        superpixels: Superpixels of each view: a number, or a share of its pixels as "4.4%"; ``"auto"``: 1.5 to 8 %,
-            the more the better the depths of the views agree. A share is where ``bass-adaptive`` starts from.
-        segmentation: ``rdseg``, ``bass``, ``bass-st``, ``bass-adaptive``, ``slic`` or ``grid``.
-        effort: Of ``rdseg`` only: ``draft`` or ``fast`` (the same), ``default`` or ``best``.
-        compactness: Of ``rdseg`` and ``slic``'s clean-up: weight of squared pixels against squared colours in
-            [0, 1]. At 0 the colours alone decide, and superpixels become snakes that no Gaussian fits.
-
-    Raises:
-        ValueError: If an option is out of range.
+        options: Method and number.
+        limits: Of the number of Gaussians.
+        start_share: Share of the Gaussians that the superpixels are cut for; a fit adds the others.
+        tree: All ways to cut the scene into fewer superpixels, where a count is asked for; None elsewhere.
     """
 
-    superpixels: int | str = SHARE
-    segmentation: str = "rdseg"
-    effort: str = "default"
-    compactness: float = 1e-5
-
-    def __post_init__(self) -> None:
-        if self.per_view is not None and self.per_view < 1:
-            raise ValueError(f"superpixels: expected at least 1, got {self.superpixels}")
-        if self.per_view is None and self.superpixels != AUTO_SHARE:
-            try:
-                parse_share(str(self.superpixels))
-            except ValueError as error:
-                raise ValueError(f"superpixels: expected a number, or {str(error).partition(' ')[2]}") from None
-        _check(self.segmentation, self.effort, self.compactness)
-
-    @property
-    def per_view(self) -> int | None:
-        """Superpixels of each view; None where a share of its pixels is asked for."""
-        text = str(self.superpixels)
-        return int(text) if text.removeprefix("-").isdecimal() else None
-
-    @property
-    def share(self) -> float:
-        """Superpixels per pixel; the default where a number is asked for, or where the scene has yet to choose."""
-        given = self.per_view is None and self.superpixels != AUTO_SHARE
-        return parse_share(str(self.superpixels) if given else SHARE)
-
-    @property
-    def adapts(self) -> bool:
-        """Whether views choose their number of superpixels: ``bass-adaptive`` from a share of the pixels."""
-        return self.segmentation == "bass-adaptive" and self.per_view is None
+    options: SegmentOptions
+    limits: CountLimits
+    start_share: float
+    tree: RegionTree | None
 
 
-def _check(segmentation: str, effort: str, compactness: float) -> None:
-    if segmentation not in SEGMENTATIONS:
-        raise ValueError(f"segmentation: expected one of {', '.join(SEGMENTATIONS)}, got {segmentation!r}")
-    if effort not in EFFORTS:
-        raise ValueError(f"effort: expected one of {', '.join(EFFORTS)}, got {effort!r}")
-    if not 0 <= compactness <= 1:
-        raise ValueError(f"compactness: expected a number in [0, 1], got {compactness}")
+@stage("segment")
+def segment_scene(scene: Scene, plan: SuperpixelPlan, count: int | None) -> Segmentation:
+    """Cut every view into as many superpixels as the plan says, or into those that become exactly ``count`` Gaussians.
 
-
-def count_for(options: SegmentOptions, height: int, width: int) -> int:
-    """Superpixels that ``options`` ask for in a view of this size.
-
-    Raises:
-        UsageError: If there are more than pixels.
+    A count is cut from the region tree, in which a plain wall ends up with few superpixels and a fern with many; from
+    a finer tree where the scene's own does not reach it. Superpixels that adapt change the number of Gaussians as
+    they change their own; where that is above what a budget allows, it is cut to the largest one allowed.
     """
-    if options.per_view is not None:
-        if options.per_view > height * width:
-            limit = f"{height * width}, one per pixel of {width} x {height}"
-            raise UsageError(f"superpixels: expected at most {limit}, got {options.per_view}")
-        return options.per_view
-    return max(1, int(options.share * height * width))
-
-
-def segment(
-    images: np.ndarray, options: SegmentOptions, count: int | None = None, *, adapt: float | None = None
-) -> Groups:
-    """Cut every view into superpixels, several views at once: the same number in each, unless they adapt.
-
-    Args:
-        images: ``[v,h,w,3]`` float in [0, 1] or uint8.
-        options: How, and how many.
-        count: Superpixels of each view; None to follow ``options``.
-        adapt: With a number, ``count`` is only where ``bass-adaptive`` starts from; see :func:`superpixels`.
-
-    Raises:
-        ValueError: If the images have the wrong shape or range, or fewer pixels than ``count``.
-    """
-    if images.ndim != 4 or images.shape[3] != 3:
-        raise ValueError(f"images: expected shape [v, h, w, 3], got {list(images.shape)}")
-    _, height, width, _ = images.shape
+    limits, options, views = plan.limits, plan.options, len(scene)
     if count is None:
-        count, adapt = count_for(options, height, width), 1.0 if options.adapts else None
-    kind, effort, compactness = options.segmentation, options.effort, options.compactness
+        pictures, each = scene_pictures(scene), max(1, int(limits.per_view * plan.start_share))
+        if not options.adapts:
+            return Segmentation(segment(pictures, options, each), limits.default, exact=False)
+        # to the number in the end, of which the fit begins with a share
+        groups = segment(pictures, options, limits.per_view, adapt=each / limits.per_view)
+        count = round(limits.default * len(groups) / (each * views))
+        if count <= limits.max_count:
+            return Segmentation(groups, count, exact=False)
+        count = limits.max_count
+    tree = plan.tree
+    first = max(views, int(count * plan.start_share))
+    if tree is None or first > len(tree):
+        tree = scene_tree(scene, options, limits, count)
+    return Segmentation(cut_tree(tree, first), count, exact=True)
 
-    def one_view(image: np.ndarray) -> np.ndarray:
-        return _labels(image, count, kind, effort=effort, compactness=compactness, adapt=adapt)
 
-    labels = parallel_map(one_view, images)
-    stacked = np.stack(labels) if labels else np.empty((0, height, width), np.int32)
-    return Groups(stacked, tuple(int(one.max()) + 1 for one in labels))
-
-
-def superpixels(
-    image: Array,
-    count: int,
-    segmentation: str = "rdseg",
-    *,
-    effort: str = "default",
-    compactness: float = 1e-5,
-    adapt: float | None = None,
-) -> Array:
-    """Cut an image into exactly ``count`` superpixels, each non-empty and 4-connected.
+@stage("segment")
+def scene_tree(scene: Scene, options: SegmentOptions, limits: CountLimits, count: int) -> RegionTree:
+    """Find all ways to cut a scene into fewer superpixels, those of all views merged where that costs least.
 
     Args:
-        image: ``[h,w,3]`` sRGB, float in [0, 1] or uint8; an array or a tensor.
-        count: Superpixels, 1 to h·w.
-        segmentation: ``rdseg``, ``bass``, ``bass-st``, ``bass-adaptive``, ``slic`` or ``grid``.
-        effort: Of ``rdseg`` only: ``draft`` or ``fast`` (the same), ``default`` or ``best``.
-        compactness: Weight of squared pixels against squared colours, in [0, 1] (not for the BASS methods).
-        adapt: Of ``bass-adaptive`` only: the share that is left of the number that it comes to from ``count``, which
-            is a quarter to four times as many, at most one per pixel; 1 keeps it. None: exactly ``count``.
-
-    Returns:
-        ``[h,w]`` int32, dense from 0, a tensor for a tensor; the same on every run.
-
-    Raises:
-        ValueError: If an argument is out of range.
-
-    Example:
-        >>> superpixels(np.zeros((2, 2, 3)), 1).tolist()
-        [[0, 0], [0, 0]]
+        scene: The canonical scene.
+        options: How the finest superpixels are cut.
+        limits: Of the number of Gaussians.
+        count: Most Gaussians that it will be cut to.
     """
-    labels = _labels(as_array(image), count, segmentation, effort=effort, compactness=compactness, adapt=adapt)
-    return like(labels, image)
+    pictures = scene_pictures(scene)
+    leaves = min(max(limits.per_view, -(-count // len(scene))), scene.pixels_per_view)
+    depths, valid = (pixel_depths(scene), scene.valid) if scene.aligned else seen_depths(scene)
+    return region_tree(pictures, depths, segment(pictures, options, leaves), valid)
 
 
-def _labels(
-    image: np.ndarray, count: int, segmentation: str, *, effort: str, compactness: float, adapt: float | None
-) -> np.ndarray:
-    """:func:`superpixels` of an array."""
-    _check(segmentation, effort, compactness)
-    pixels = _as_pixels(image)
-    height, width, _ = pixels.shape
-    if count < 1:
-        raise ValueError(f"count: expected at least 1 superpixel, got {count}")
-    if count > height * width:
-        raise ValueError(
-            f"count: expected at most {height * width} superpixels ({width} x {height} pixels), got {count}"
-        )
-    if segmentation == "rdseg":
-        labels = _rdseg(pixels, count, effort, compactness)
-    elif segmentation == "grid":
-        return grid_labels(height, width, count)
-    elif segmentation == "slic":
-        labels = _slic(pixels, count, compactness)
-    else:
-        labels = _bass(pixels, count, segmentation, adapt)
-    return np.ascontiguousarray(labels[1:-1, 1:-1])
-
-
-def grid_labels(height: int, width: int, count: int) -> np.ndarray:
-    """``[h,w]`` int32: exactly ``count`` rectangles about as high as wide, in rows that differ by at most one.
-
-    Args:
-        height: Rows of pixels.
-        width: Columns of pixels.
-        count: Rectangles, 1 to height x width.
-    """
-    min_rows = -(-count // width)  # rows of blocks that can hold them all
-    lines = min(height, count, max(min_rows, round((count * height / width) ** 0.5)))
-    first = np.arange(lines + 1) * count // lines  # first label of each row of blocks
-    line = np.arange(height) * lines // height
-    blocks = np.diff(first)[line]
-    return (first[line][:, None] + np.arange(width) * blocks[:, None] // width).astype(np.int32)
-
-
-def saliency(image: Array) -> Array:
-    """Shi-Tomasi corner response: the smaller eigenvalue of the structure tensor of the grey image, 3 x 3 pixels.
-
-    Args:
-        image: ``[h,w,3]`` sRGB, float in [0, 1] or uint8; an array or a tensor.
-
-    Returns:
-        ``[h,w]`` float32, at least 0; 0 everywhere in a flat image; a tensor for a tensor.
-
-    Raises:
-        ValueError: If the image has the wrong shape or range.
-    """
-    return like(_corner_response(_as_pixels(as_array(image))), image)
-
-
-def scene_saliency(images: np.ndarray) -> np.ndarray:
-    """``[v·h·w]`` :func:`saliency` of every pixel of all views ``[v,h,w,3]``."""
-    return np.concatenate(parallel_map(lambda image: _corner_response(_as_pixels(image)).reshape(-1), images))
-
-
-def _corner_response(pixels: np.ndarray) -> np.ndarray:
-    grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
-    return np.maximum(cv2.cornerMinEigenVal(grey, 3, ksize=3), 0)
-
-
-def _as_pixels(array: np.ndarray) -> np.ndarray:
-    """``[h,w,3]`` float32 in [0, 1], contiguous."""
-    if array.ndim != 3 or array.shape[2] != 3 or array.size == 0:
-        raise ValueError(f"image: expected shape [h, w, 3], got {list(array.shape)}")
-    if array.dtype == np.uint8:
-        return np.divide(array, np.float32(255), dtype=np.float32, order="C")
-    if not np.issubdtype(array.dtype, np.floating):
-        raise ValueError(f"image: expected uint8 or float, got {array.dtype}")
-    low, high = array.min(), array.max()
-    if not (low >= -RANGE_SLACK and high <= 1 + RANGE_SLACK):  # also refuses NaN
-        raise ValueError(f"image: expected values in [0, 1], got {low:g} to {high:g}")
-    return np.ascontiguousarray(array, np.float32)
-
-
-def _every_pixel(height: int, width: int) -> np.ndarray:
-    """Padded labels in which every pixel is its own region."""
-    return pad_labels(np.arange(height * width, dtype=np.int32).reshape(height, width))
-
-
-def _rdseg(pixels: np.ndarray, count: int, effort: str, compactness: float) -> np.ndarray:
-    """Over-split, merge to the exact number, move border pixels; padded labels."""
-    rectangles_each, num_first_sweeps = EFFORTS[effort]
-    height, width, _ = pixels.shape
-    spread = np.float32(compactness**0.5)
-    num_rectangles = int(rectangles_each * count)
-    if num_rectangles > PIXEL_START * height * width:
-        labels, num_regions = _every_pixel(height, width), height * width
-    else:
-        labels, num_regions = split_rectangles(pixels, num_rectangles, BLOCK, float(compactness))
-        labels = refine(labels, pixels, num_regions, num_first_sweeps, spread)
-    labels = merge_regions(labels, pixels, num_regions, count, spread)
-    return refine(labels, pixels, count, NUM_SWEEPS, spread)
-
-
-def _bass(pixels: np.ndarray, count: int, segmentation: str, adapt: float | None) -> np.ndarray:
-    """BASS from hexagonal or from saliency seeds; padded labels."""
-    from gsmerge.kernels.superpixels.bass import adapt_labels, infer_labels  # compiled only when used
-    from gsmerge.kernels.superpixels.seeds import hexagonal_seeds, seed_density, seeds_from_density, voronoi
-
-    height, width, _ = pixels.shape
-    if segmentation == "bass":
-        seeds = hexagonal_seeds(height, width, count)
-    else:
-        seeds = seeds_from_density(seed_density(_corner_response(pixels), count), count)
-    colours = np.ascontiguousarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2Lab) / np.float32(100))
-    labels = pad_labels(voronoi(seeds, height, width))
-    if segmentation == "bass-adaptive":
-        return adapt_labels(labels, colours, count, MAX_FACTOR, adapt)[0]
-    return infer_labels(labels, colours, count)
-
-
-def _slic(pixels: np.ndarray, count: int, compactness: float) -> np.ndarray:
-    """scikit-image's SLIC, its pieces merged with Ward's rule to the exact number; padded labels."""
-    from skimage.measure import label
-    from skimage.segmentation import slic
-
-    height, width, _ = pixels.shape
-    asked = count
-    while asked < height * width:
-        pieces = slic(pixels, n_segments=asked, compactness=10, start_label=0, channel_axis=-1)
-        pieces, num_pieces = label(pieces, background=-1, return_num=True, connectivity=1)
-        if num_pieces >= count:
-            break
-        asked = int(asked * 1.1) + 1
-    else:
-        return merge_regions(_every_pixel(height, width), pixels, height * width, count, np.float32(compactness**0.5))
-    return merge_regions(pad_labels(pieces - 1), pixels, num_pieces, count, np.float32(compactness**0.5))
+def knee_count(scene: Scene, plan: SuperpixelPlan) -> int:
+    """Find the knee of the scene's own curve of distortion, at most what is allowed."""
+    limits = plan.limits
+    tree = plan.tree or scene_tree(scene, plan.options, limits, limits.default)
+    return max(limits.min_count, min(auto_count(tree), limits.max_count))

@@ -16,7 +16,7 @@ from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Progress, Quality, 
 from gsmerge.measure.preview import BORDER_COLOR, Picture, borders, to_picture
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.prepare import scene_frame
-from gsmerge.stages.segment import SegmentOptions, segment
+from gsmerge.stages.superpixels import SegmentOptions, segment
 from gsmerge.types import Cameras, Gaussians, Scene
 from gsmerge.view.splats import MAX_GAUSSIANS, highest_degree, pack_splats
 from gsmerge.views import even_views

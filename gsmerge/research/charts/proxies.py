@@ -16,7 +16,7 @@ from gsmerge.render.metrics import psnr
 from gsmerge.research.charts.record import PROXIES, known_fields
 from gsmerge.runtime.jsonl import append_line, read_lines
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.stages.segment import superpixels
+from gsmerge.stages.superpixels import superpixels
 from gsmerge.views import pick_views
 
 SEGMENTATIONS = ("rdseg", "bass-adaptive", "bass-st", "bass", "slic")

@@ -24,6 +24,7 @@ from gsmerge.measure.evaluate import EvaluateOptions, near_plane
 from gsmerge.measure.speed import time_render
 from gsmerge.options import CompactOptions
 from gsmerge.pipeline import compact
+from gsmerge.plan import resolve_fit, resolved_settings
 from gsmerge.research.charts.experiment import Experiment, run_settings
 from gsmerge.research.charts.measure import choose_views, keep_pictures, measure
 from gsmerge.research.charts.proxies import measure_proxies, proxy_points, read_proxies
@@ -260,7 +261,11 @@ def estimate_seconds(
             total += share * median(times)
         elif experiment.method != INPUT:
             settings = CompactOptions().with_settings(run_settings(experiment.method, experiment.settings))
-            flat, steps, of_view = settings.resolved(photos=True), settings.fit.steps, gaussians / max(share * views, 1)
+            flat, steps, of_view = (
+                resolved_settings(settings, photos=True),
+                resolve_fit(settings).steps,
+                gaussians / max(share * views, 1),
+            )
             total += work_seconds(round(gaussians), of_view, flat, photos=True, fit_steps=steps) / threads
     return total
 

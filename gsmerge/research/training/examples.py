@@ -33,7 +33,7 @@ from gsmerge.research.training.targets import Progress, Targets, fit_targets
 from gsmerge.stages.encode import encode
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge, take
-from gsmerge.stages.segment import segment
+from gsmerge.stages.superpixels import segment
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches
 
 
@@ -130,7 +130,7 @@ def make_example(
     """
     changes = {"superpixels": share_text(density), "segmentation": options.segmentation, "seed": options.seed}
     settings, scene, members = CompactOptions().with_settings(changes), training.scene, training.members
-    features = encode(scene, members, segment(scene_pictures(scene), settings.segment), settings.encode)
+    features = encode(scene, members, segment(scene_pictures(scene), settings.segment))
     level = options.photo_level(scene.cameras.width, scene.cameras.height)
     images = (training.photos(level).images.clip(0, 1) * 255).round().astype(np.uint8)
     example = Example(

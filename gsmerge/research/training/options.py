@@ -16,7 +16,7 @@ from gsmerge.networks.modules import SLOTS
 from gsmerge.networks.options import NetworkOptions
 from gsmerge.stages.fit.loss import LOSS_WINDOW
 from gsmerge.stages.match import MatchOptions
-from gsmerge.stages.segment import SegmentOptions
+from gsmerge.stages.superpixels import SegmentOptions
 
 LISTS = ("levels", "densities", "views", "random_views")
 

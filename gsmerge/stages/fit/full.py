@@ -100,7 +100,7 @@ def plan_run(photos: tuple[Photos, ...], options: FitOptions, seed: int, masks: 
     if len(photos) > 2 and options.half_res_share is None:
         half_part -= EARLIER
     poses = None
-    if options.poses == "free":
+    if options.move_cameras:
         poses, photos = start_poses(photos)
     return Plan(photos, weights, (everywhere, trained, *ones), options, dropout, half_part, poses)
 

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Literal
 
-Device = Literal["cpu", "cuda", "auto"]
 Fit = Literal["none", "full"]
-Poses = Literal["auto", "fixed", "free"]
-STEPS = {"draft": 30, "fast": 55, "default": 240, "best": 1000}  # of the full fit, by effort
+STEPS = 240  # of the full fit
 LONG_STEPS = 600  # from here on full-size photos and a little dropout pay
 EARLIER = 0.1  # share of the steps by which half-size photos end sooner where larger ones follow
 HASTY_STEPS = 20  # shorter runs have no time for full-size photos
-USUAL_SHARE = 0.044  # of Gaussians in the pixels that STEPS are for; more of them need more steps, up to
-MOST_STEPS = 2.0  # times as many
 GROW_STEPS = 150  # shorter runs do better when they begin with all that they may have
 
 
@@ -63,9 +59,7 @@ class FitOptions:
 
     Args:
         fit: ``"full"``: all parameters; ``"none"``: nothing.
-        effort: ``"draft"``, ``"fast"``, ``"default"`` or ``"best"``: what ``fit_steps`` are unless given.
-        fit_steps: Steps of the full fit, one view each; None: by effort, and more for more Gaussians, see
-            :meth:`with_steps_for`.
+        fit_steps: Steps of the full fit, one view each; None: 240, and by effort and number of Gaussians.
         time_budget: Seconds after which the full fit stops, None for no limit. The steps are then chosen from the
             measured time of the first ones, and the result is no longer the same on every machine.
         dropout: Share of the Gaussians that a step leaves out; None: 0.1 for five views or fewer and 150 steps or
@@ -75,6 +69,7 @@ class FitOptions:
         photo_scale: Times the views' size at which two of every five steps after that look at larger photos, as far as
             the photos are that large. ``"auto"``: up to 2 with effort ``"default"`` and ``"best"`` where the photos are
             at least 1.25 times as large, on the CPU; 1 otherwise.
+        move_cameras: Whether the full fit moves the cameras on (on the CPU).
         average_share: Share of the steps, the last ones, over which the parameters are averaged.
         ssim_lambda: Share of structural similarity in the loss, the rest is L1.
         opacity_reg: Weight of the mean opacity in the loss of the full fit (3DGS-MCMC, Kheradmand et al. 2024): what
@@ -91,25 +86,18 @@ class FitOptions:
         holdout: Share of the photos' blocks that decides whether a fit is accepted.
         min_contribution: Least blending weight at some pixel of some photo; Gaussians below it in all photos that they
             lie in are left out.
-        poses: ``"free"``: views of one Gaussian per pixel are moved to where their photos agree before anything is
-            merged, and the full fit moves the cameras on (on the CPU); ``"fixed"``: cameras stay where they are;
-            ``"auto"``: free where some view is more than 1.5 pixels off and its photo and the others agree clearly
-            better elsewhere (:mod:`gsmerge.stages.align_views` says by how much); fixed elsewhere, and without photos.
-        device: Where the fit runs, and in :func:`gsmerge.compact` all stages that can: ``"cpu"``; ``"cuda"``, which
-            draws with gsplat, whose sums have no fixed order, so that runs differ in the last bits; ``"auto"``: CUDA
-            where it can be used and the scene is large enough that it pays.
 
     Raises:
-        ValueError: If a setting is unknown or out of range, or CUDA is asked for and cannot be used.
+        ValueError: If a setting is unknown or out of range.
     """
 
     fit: Fit = "full"
-    effort: str = "default"
     fit_steps: int | None = None
     time_budget: float | None = None
     dropout: float | None = None
     half_res_share: float | None = None
     photo_scale: float | Literal["auto"] = "auto"
+    move_cameras: bool = False
     average_share: float = 0.2
     ssim_lambda: float = 0.35
     opacity_reg: float = 0.03
@@ -122,25 +110,11 @@ class FitOptions:
     max_gain: float = 2.0
     holdout: float = 0.05
     min_contribution: float = 1 / 255
-    poses: Poses = "auto"
-    device: Device = "cpu"
 
     @property
     def steps(self) -> int:
         """Steps of the full fit."""
-        return STEPS[self.effort] if self.fit_steps is None else self.fit_steps
-
-    def with_steps_for(self, share: float) -> FitOptions:
-        """With more steps for more Gaussians, unless steps are given.
-
-        Args:
-            share: Gaussians for each pixel of all views, as superpixels and K or a budget ask for. Steps grow with its
-                square root from USUAL_SHARE on.
-        """
-        factor = min(math.sqrt(share / USUAL_SHARE), MOST_STEPS)
-        if self.fit_steps is not None or factor <= 1:
-            return self
-        return replace(self, fit_steps=round(factor * self.steps))
+        return STEPS if self.fit_steps is None else self.fit_steps
 
     @property
     def half_res_part(self) -> float:
@@ -152,7 +126,7 @@ class FitOptions:
     @property
     def needs_photos(self) -> bool:
         """Whether the photos are needed: to fit, or to leave out what none of them shows."""
-        return self.fit != "none" or (self.min_contribution > 0 and self.effort != "draft")
+        return self.fit != "none" or self.min_contribution > 0
 
     @property
     def grows(self) -> bool:
@@ -164,10 +138,6 @@ class FitOptions:
             object.__setattr__(self, "rates", LearningRates(**self.rates))
         if self.fit not in ("none", "full"):
             raise ValueError(f'fit: expected "none" or "full", got "{self.fit}"')
-        if self.poses not in ("auto", "fixed", "free"):
-            raise ValueError(f'poses: expected "auto", "fixed" or "free", got {self.poses!r}')
-        if self.effort not in STEPS:
-            raise ValueError(f"effort: expected one of {', '.join(STEPS)}, got {self.effort!r}")
         if self.steps < 1:
             raise ValueError(f"fit_steps: expected at least 1, got {self.steps}")
         if self.iterations < 1:
@@ -192,9 +162,3 @@ class FitOptions:
             raise ValueError(f"dropout: expected a number from 0 to below 1, got {self.dropout}")
         if self.time_budget is not None and not self.time_budget > 0:
             raise ValueError(f"time_budget: expected more than 0 seconds, got {self.time_budget}")
-        if self.device not in ("cpu", "cuda", "auto"):
-            raise ValueError(f'device: expected "cpu", "cuda" or "auto", got "{self.device}"')
-        if self.device != "cpu":
-            from gsmerge.render.cuda import usable_device
-
-            object.__setattr__(self, "device", usable_device(self.device))

@@ -19,16 +19,13 @@ ALIKE = 0.01  # of the scale: the rounding of sizes
 
 
 def fit_photos(scene: Scene, options: FitOptions, views: Sequence[int] | None = None) -> tuple[Photos, ...]:
-    """The photos at full and at half size, and at the scale of the options where they look at larger ones.
+    """Return the photos at full and at half size, and larger ones where ``photo_scale`` is a number above 1.
 
-    Those of ``views``, None: of all. The record gets the choice ``photo_scale`` where it is not 1, and a note on what
-    differs from what was asked for.
+    Those of ``views``, None: of all. The record gets the choice ``photo_scale`` and a note where there are larger ones.
     """
     views = range(len(scene)) if views is None else views
     photos = scene_photos(scene)[views], scene_photos(scene, 2)[views]
-    scale, problem = photo_scale(scene, options)
-    if problem is not None:
-        note(problem)
+    scale = 1.0 if options.photo_scale == "auto" else options.photo_scale
     if scale == 1:
         return photos
     large = large_photos(scene, scale)[views]
@@ -41,13 +38,16 @@ def fit_photos(scene: Scene, options: FitOptions, views: Sequence[int] | None = 
     return *photos, large
 
 
-def photo_scale(scene: Scene, options: FitOptions) -> tuple[float, str | None]:
-    """Times the views' size at which a fit to a scene looks at its photos, 1 or more; and why it is less than asked."""
+def photo_scale(scene: Scene, options: FitOptions, *, auto: bool) -> tuple[float, str | None]:
+    """Choose the multiple of the views' size, 1 or more, at which a fit looks at photos; and why it is less than asked.
+
+    ``auto``: whether ``photo_scale="auto"`` may be above 1.
+    """
     wanted, largest = options.photo_scale, largest_scale(scene)
     covered = options.fit == "full" and options.half_res_part < 1
     if wanted == "auto":
-        worth = covered and options.effort in ("default", "best") and options.device == "cpu"
-        return (min(largest, AUTO_SCALE) if worth and largest >= MIN_AUTO_SCALE else 1.0), None
+        worth = covered and auto and largest >= MIN_AUTO_SCALE
+        return (min(largest, AUTO_SCALE) if worth else 1.0), None
     if wanted == 1:
         return 1.0, None
     if not covered:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
@@ -10,14 +10,17 @@ import numpy as np
 
 from gsmerge.render import contributions, plan_view, prepare
 from gsmerge.render.photos import Photos, photo_errors
+from gsmerge.runtime.record import choose, stage
 from gsmerge.runtime.threads import in_turn
+from gsmerge.stages.decode import Decoded
 from gsmerge.stages.fit.color import draw, fit_colors
 from gsmerge.stages.fit.full import Progress, fit_full
 from gsmerge.stages.fit.grow import grow_to
 from gsmerge.stages.fit.options import FitOptions
-from gsmerge.stages.fit.report import FitReport
+from gsmerge.stages.fit.photos import fit_photos
+from gsmerge.stages.fit.report import FitReport, Fitted, record_fit, report_steps
 from gsmerge.stages.fit.state import gaussians_of, start_state
-from gsmerge.types import Array, Gaussians
+from gsmerge.types import Array, Gaussians, Scene
 
 FitResult = tuple[Gaussians, FitReport]
 PhotosT = TypeVar("PhotosT")  # photos of one size, where a back end has them
@@ -47,6 +50,7 @@ def fit(
     baseline_start: Gaussians | None = None,
     *,
     exact: bool = False,
+    device: str = "cpu",
 ) -> tuple[Gaussians, FitReport | None]:
     """Leave out what no photo shows, and fit the rest to the photos; a draft without a fit leaves out nothing.
 
@@ -62,17 +66,51 @@ def fit(
         baseline_start: Another start that the full fit may beat instead, see
             :func:`gsmerge.stages.fit.full.score_to_beat`.
         exact: Whether ``count`` is to be met: where nothing grows to it, nothing is left out either.
+        device: Where to fit, ``"cpu"`` or ``"cuda"``.
 
     Returns:
         The Gaussians that stay, fitted, and what was done; None if nothing was asked for.
     """
-    device = "cpu" if len(photos) > 2 else _device(options, photos[0])
     if device != "cpu":
         from gsmerge.gpu.fit import fit_gaussians  # torch; it stands above all stages, and is loaded for its use alone
 
         settings = options, count, seed, progress, baseline_start
         return fit_gaussians(gaussians, (photos[0], photos[1]), *settings, exact=exact, device=device)
     return fit_with(ON_CPU, gaussians, photos, options, count, seed, progress, baseline_start, exact=exact)
+
+
+@stage("fit")
+def fit_scene(
+    decoded: Decoded, scene: Scene, views: Sequence[int], options: FitOptions, seed: int, device: str
+) -> Fitted:
+    """Fit decoded Gaussians to the photos of some views; as they are where there are none, or nothing was asked for.
+
+    Args:
+        decoded: Where to begin, and the number of Gaussians to grow to.
+        scene: Canonical.
+        views: Of the scene, whose photos are used.
+        options: What to fit.
+        seed: Everything random.
+        device: Where to fit, ``"cpu"`` or ``"cuda"``. Larger photos are fitted to on the CPU alone.
+    """
+    if scene.images is None or not options.needs_photos:
+        return Fitted(decoded.gaussians, scene.cameras, None)
+    photos = fit_photos(scene, options, views)
+    choose(start_count=len(decoded.gaussians))
+    if device != "cpu":
+        device = device if len(photos) == 2 else "cpu"
+        choose(device=device)
+    gaussians, report = fit(
+        decoded.gaussians, photos, options, decoded.count, seed, report_steps, decoded.baseline_start,
+        exact=decoded.exact, device=device,
+    )  # fmt: skip
+    record_fit(report)
+    cameras = scene.cameras
+    if report is not None and report.viewmats is not None:
+        viewmats = cameras.viewmats.astype(np.float64)
+        viewmats[list(views)] = report.viewmats
+        cameras = replace(cameras, viewmats=viewmats)
+    return Fitted(gaussians, cameras, report)
 
 
 def fit_with(
@@ -123,15 +161,6 @@ def _better_of(
         return after, report
     why = "the photos as a whole were shown worse"
     return before, replace(report, method="none", accepted=False, stopped=why, viewmats=None)
-
-
-def _device(options: FitOptions, photos: Photos) -> str:
-    """Where a fit to some photos runs, ``"cpu"`` or ``"cuda"``."""
-    if options.device == "cpu":
-        return "cpu"
-    from gsmerge.render.cuda import chosen_device
-
-    return chosen_device(options.device, len(photos) * photos.height * photos.width)
 
 
 def visible_mask(gaussians: Gaussians, photos: Photos, min_weight: float) -> np.ndarray:

@@ -1,0 +1,338 @@
+"""Facts and options -> decisions: the one place that reads "auto", effort, device, budget, recipe and checkpoint names.
+
+:func:`make_plan` settles every choice once. Each stage is handed its own part of the plan, and no stage knows the
+options of another.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from gsmerge.budget import exact_count
+from gsmerge.errors import UsageError
+from gsmerge.options import CompactOptions
+from gsmerge.runtime.record import note, stage
+from gsmerge.stages.agreement import measured_share
+from gsmerge.stages.assign import merge_unseen
+from gsmerge.stages.clean import CleanOptions, clean
+from gsmerge.stages.counts import CountLimits, count_limits
+from gsmerge.stages.decode import DecodeOptions
+from gsmerge.stages.fit import FitOptions, photo_scale, start_share
+from gsmerge.stages.match import MatchOptions
+from gsmerge.stages.prepare import Prepared
+from gsmerge.stages.segment import SuperpixelPlan, scene_tree
+from gsmerge.stages.superpixels import AUTO_SHARE, SHARE, SegmentOptions
+from gsmerge.types import Gaussians, Scene
+from gsmerge.views import report_views, scored_views
+
+if TYPE_CHECKING:
+    from gsmerge.networks.checkpoint import Checkpoint
+    from gsmerge.networks.modules import Networks
+
+AUTO_STEPS = 2  # times the usual steps with budget auto: fewer Gaussians cost less, and need them for detail
+SHORT_STEPS = 60  # of a fit that a better start still matters to
+USUAL_SHARE = 0.044  # of Gaussians in the pixels that the steps of an effort are for; more need more steps, up to
+MOST_STEPS = 2.0  # times as many
+
+
+@dataclass(frozen=True)
+class Effort:
+    """What an effort means to the stages.
+
+    Args:
+        steps: Of the full fit.
+        rectangles: Of ``rdseg``, see :class:`gsmerge.SegmentOptions`.
+        early_sweeps: The same.
+        merges: Whether Gaussians of different views are merged.
+        networks: Whether ``checkpoint="auto"`` may load networks.
+        prunes: Whether Gaussians that no photo shows are left out where nothing is fitted.
+        large_photos: Whether ``photo_scale="auto"`` may look at larger photos.
+    """
+
+    steps: int
+    rectangles: float
+    early_sweeps: int
+    merges: bool = True
+    networks: bool = True
+    prunes: bool = True
+    large_photos: bool = True
+
+
+EFFORTS = {
+    "draft": Effort(30, 1.0, 0, merges=False, networks=False, prunes=False, large_photos=False),
+    "fast": Effort(55, 1.0, 0, networks=False, large_photos=False),
+    "default": Effort(240, 2.0, 0),
+    "best": Effort(1000, 3.0, 1),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """Everything that was decided before the first superpixel is cut.
+
+    Args:
+        superpixels: How each view is cut, and into how many.
+        networks: What corrects the analytic stages: networks, None for nothing, or both in turn where they compete.
+        match: Merging across views.
+        decode: Gaussians per group.
+        fit: Fit to the photos.
+        clean: What is left out of the result.
+        unseen: Canonical Gaussians in place of those that no view sees, which every result gets; None without any.
+        target_psnr: PSNR (dB) that the input photos have to reach; None: none was asked for.
+        max_drop: dB that may be lost against the best of the scene's curve; None: none was asked for.
+        auto_count: Whether the scene's own curve decides the number of Gaussians.
+        levels: Levels of detail.
+        scored_views: Given views that input and result are scored on.
+        device: Where the fit and the scores run, ``"cpu"`` or ``"cuda"``.
+        seed: Everything random depends on it alone.
+        checkpoint: Where the networks come from; None without any.
+        settings: All settings by flat name, for reports.
+    """
+
+    superpixels: SuperpixelPlan
+    networks: tuple[Networks | None, ...]
+    match: MatchOptions
+    decode: DecodeOptions
+    fit: FitOptions
+    clean: CleanOptions
+    unseen: Gaussians | None
+    target_psnr: float | None
+    max_drop: float | None
+    auto_count: bool
+    levels: int
+    scored_views: tuple[int, ...]
+    device: str
+    seed: int
+    checkpoint: Checkpoint | None
+    settings: dict[str, Any]
+
+    @property
+    def weakens(self) -> bool:
+        """Whether groups that other views see through begin fainter, as a long fit follows."""
+        return self.superpixels.start_share < 1
+
+    @property
+    def limits(self) -> CountLimits:
+        """What is known of the number of Gaussians."""
+        return self.superpixels.limits
+
+    def with_fixed_cameras(self) -> Plan:
+        """Keep the cameras where they are during the fit."""
+        return replace(self, fit=replace(self.fit, move_cameras=False))
+
+    def with_fit(self, fit: FitOptions, *, start_share: float = 1.0) -> Plan:
+        """Replace the fit, and the share of the Gaussians that it begins with."""
+        return replace(self, fit=fit, superpixels=replace(self.superpixels, start_share=start_share))
+
+
+def make_plan(prepared: Prepared, options: CompactOptions) -> Plan:
+    """Decide everything that the options leave open.
+
+    Notes say what was chosen for the scene, and what was asked for that it does not have.
+
+    Raises:
+        SceneError: If a checkpoint is required and cannot be used.
+        UsageError: If the settings ask for what the scene, or the checkpoint, does not have.
+    """
+    given, scene, effort = prepared.given, prepared.scene, EFFORTS[options.effort]
+    _check_photos(given, options)
+    own = options.method == "gsmerge"  # baselines learn nothing
+    with stage("prepare"):
+        checkpoint = _load_networks(options, given) if own else None
+        segment = _resolve_superpixels(options.segment, scene, effort)
+        clean_options = _resolve_clean(options.clean, prepared)
+        unseen, num_input = _merge_unseen(prepared, options, segment, clean_options)
+        limits = count_limits(
+            scene, segment, options.decode, options.budget,
+            num_input=num_input, num_reserved=0 if unseen is None else len(unseen),
+        )  # fmt: skip
+        device = _choose_device(options.device, given.num_gaussians)
+        fit = _resolve_fit_to(prepared, options, limits, device)
+    superpixels, tree = SuperpixelPlan(segment, limits, start_share(fit), None), None
+    searches = options.budget.quality is not None or options.budget.auto or options.budget.levels > 1
+    if own and (searches or limits.count is not None):
+        tree = scene_tree(scene, segment, limits, limits.exact or limits.default)
+    networks: tuple[Networks | None, ...] = (None,)
+    if checkpoint is not None:
+        networks = (checkpoint.networks, None) if options.checkpoint == "auto" else (checkpoint.networks,)
+    return Plan(
+        superpixels=replace(superpixels, tree=tree),
+        networks=networks,
+        match=replace(options.match, match=options.match.match or ("overlap" if effort.merges else "none")),
+        decode=options.decode,
+        fit=fit,
+        clean=clean_options,
+        unseen=unseen,
+        target_psnr=options.budget.target_psnr,
+        max_drop=options.budget.max_drop,
+        auto_count=options.budget.auto,
+        levels=options.budget.levels,
+        scored_views=_choose_scored_views(prepared, options),
+        device=device,
+        seed=options.seed,
+        checkpoint=checkpoint,
+        settings=options.to_dict() | {"fit_steps": fit.steps},
+    )
+
+
+def _check_photos(scene: Scene, options: CompactOptions) -> None:
+    """Refuse settings that need photos where there are none."""
+    if scene.images is None and options.budget.quality is not None:
+        raise UsageError("a quality target needs photos, and the scene has none; give --images, or a --budget")
+    if scene.images is None and options.clean.drop_sky:
+        raise UsageError("drop_sky: expected photos, which say where the sky is; name them with --images")
+
+
+def choose_networks(options: CompactOptions, *, photos: bool, aligned: bool = True) -> str:
+    """Name the checkpoint to load: as asked, or the shipped one where it improves results (docs/internals/networks.md).
+
+    That is where no fit follows, or a short one; not where time counts most.
+
+    Args:
+        options: All settings.
+        photos: Whether there are any to fit to.
+        aligned: Whether there is one Gaussian per pixel, which is what the shipped networks learnt from.
+    """
+    if options.checkpoint != "auto":
+        return options.checkpoint
+    steps = resolve_fit(options).steps * (AUTO_STEPS if options.budget.auto and options.fit.fit_steps is None else 1)
+    short = not photos or options.fit.fit == "none" or steps <= SHORT_STEPS
+    return "shipped" if aligned and short and EFFORTS[options.effort].networks else "none"
+
+
+def resolved_settings(options: CompactOptions, *, photos: bool) -> dict[str, Any]:
+    """Return all settings by flat name, with the checkpoint and the matching that are used where none was asked for."""
+    match = options.match.match or ("overlap" if EFFORTS[options.effort].merges else "none")
+    return options.to_dict() | {"checkpoint": choose_networks(options, photos=photos), "match": match}
+
+
+def _load_networks(options: CompactOptions, scene: Scene) -> Checkpoint | None:
+    """Load the checkpoint to use, which gives what the options ask for; None for the analytic stages alone."""
+    name = choose_networks(options, photos=scene.images is not None, aligned=scene.aligned)
+    if name == "none":  # torch is imported only where there are networks
+        return None
+    from gsmerge.networks.checkpoint import find_checkpoint
+
+    checkpoint, notes = find_checkpoint(name, required=options.require_checkpoint)
+    for text in notes:
+        note(text)
+    if checkpoint is None:
+        return None
+    outputs = checkpoint.networks.options.outputs
+    if options.recipe == "paper" and outputs != "absolute":
+        raise UsageError(
+            f"recipe paper: expected networks with absolute outputs, {checkpoint.path} has {outputs} ones;"
+            " gsmerge train --preset paper makes them"
+        )
+    require_children("k", options.decode.max_k, checkpoint)
+    return checkpoint
+
+
+def require_children(name: str, count: int, checkpoint: Checkpoint | None) -> None:
+    """Raise UsageError where the heads of a checkpoint know fewer children than option ``name`` asks for."""
+    if checkpoint is not None and count > checkpoint.networks.max_children:
+        raise UsageError(
+            f"{name}: expected at most {checkpoint.networks.max_children} with the absolute outputs of"
+            f" {checkpoint.path}, got {count}"
+        )
+
+
+def _resolve_superpixels(options: SegmentOptions, scene: Scene, effort: Effort) -> SegmentOptions:
+    """Fill in what effort and scene decide; a note says why."""
+    if options.superpixels == AUTO_SHARE:
+        share, why = measured_share(scene)
+        text = SHARE if share is None else f"{100 * share:.2g}%"
+        note(f"superpixels: {text} of the pixels, because {why}")
+        options = replace(options, superpixels=text)
+    rectangles = effort.rectangles if options.rectangles is None else options.rectangles
+    sweeps = effort.early_sweeps if options.early_sweeps is None else options.early_sweeps
+    return replace(options, rectangles=rectangles, early_sweeps=sweeps)
+
+
+def _resolve_clean(options: CleanOptions, prepared: Prepared) -> CleanOptions:
+    """Keep the sky where no photo is used that could say where it is."""
+    if options.drop_sky and not prepared.photo_views:
+        note("drop_sky: no photo is used that could say where the sky is, so it stays")
+        return replace(options, drop_sky=False)
+    return options
+
+
+def _merge_unseen(
+    prepared: Prepared, options: CompactOptions, segment: SegmentOptions, clean_options: CleanOptions
+) -> tuple[Gaussians | None, int | None]:
+    """Merge what no view sees at the rate of the rest, and clean it up.
+
+    Returns:
+        The Gaussians, None without any; and the number that shares of a budget refer to, None for the scene's own.
+    """
+    scene, unseen = prepared.scene, prepared.unseen
+    num_input = prepared.given.num_gaussians if len(scene) < len(prepared.given) else None
+    if unseen is None:
+        return None, num_input
+    num_input = scene.num_gaussians + len(unseen)
+    exact = exact_count(options.budget, num_input, unseen.sh_degree)
+    rate = segment.share * options.decode.mean_k if exact is None else exact / num_input
+    visible = unseen[unseen.opacities >= options.decode.min_opacity]
+    count = min(len(visible), int(rate * len(unseen)))
+    if count == 0:
+        return None, num_input
+    merged = merge_unseen(visible, scene, count)
+    return (clean(merged, clean_options, scene, prepared.frame.leave)[0] if clean_options.asked else merged), num_input
+
+
+def resolve_fit(options: CompactOptions) -> FitOptions:
+    """Fill in what effort decides of a fit: its steps, and whether Gaussians that no photo shows are left out."""
+    fit, effort = options.fit, EFFORTS[options.effort]
+    steps = effort.steps if fit.fit_steps is None else fit.fit_steps
+    prunes = fit.fit != "none" or effort.prunes
+    return replace(fit, fit_steps=steps, min_contribution=fit.min_contribution if prunes else 0.0)
+
+
+def steps_for(options: CompactOptions, num_gaussians: int, scene: Scene) -> int:
+    """Return the steps of the full fit: as given, or more for more Gaussians in the pixels of all views.
+
+    They grow with the square root of the share from ``USUAL_SHARE`` on.
+    """
+    if options.fit.fit_steps is not None:
+        return options.fit.fit_steps
+    steps = EFFORTS[options.effort].steps
+    if options.budget.auto:
+        return AUTO_STEPS * steps
+    share = num_gaussians / max(1, len(scene) * scene.pixels_per_view)
+    return round(min(max(1.0, math.sqrt(share / USUAL_SHARE)), MOST_STEPS) * steps)
+
+
+def _resolve_fit_to(prepared: Prepared, options: CompactOptions, limits: CountLimits, device: str) -> FitOptions:
+    """Fill in what effort, scene and device decide of the fit."""
+    scene = prepared.scene
+    if scene.images is None or not prepared.photo_views:
+        options = replace(options, fit=replace(options.fit, fit="none"))
+    fit = resolve_fit(options)
+    fit = replace(fit, fit_steps=steps_for(options, limits.count or limits.default, scene))
+    if scene.images is None or not fit.needs_photos:
+        return replace(fit, photo_scale=1.0)
+    auto = EFFORTS[options.effort].large_photos and device == "cpu"
+    scale, problem = photo_scale(scene, fit, auto=auto)
+    if problem is not None:
+        note(problem)
+    moves = options.prepare.poses == "free" or (options.prepare.poses == "auto" and prepared.moved)
+    return replace(fit, photo_scale=scale, move_cameras=moves and prepared.given.images is not None)
+
+
+def _choose_device(device: str, num_gaussians: int) -> str:
+    """Choose where the fit and the scores run."""
+    if device == "cpu":
+        return device
+    from gsmerge.render.cuda import chosen_device, usable_device
+
+    return chosen_device(usable_device(device), num_gaussians)
+
+
+def _choose_scored_views(prepared: Prepared, options: CompactOptions) -> tuple[int, ...]:
+    """Choose given views whose photos show the scene; more of them where a quality is asked for, which they decide."""
+    views = prepared.photo_views or range(len(prepared.scene))
+    candidates = [view for view, place in enumerate(prepared.repeated) if place in views]
+    choose_some = report_views if options.budget.target_psnr is None else scored_views
+    return tuple(candidates[i] for i in choose_some(len(candidates)))

@@ -1,0 +1,180 @@
+"""fitted -> result: Gaussians in the world, scored on the input photos, with the report of the run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from gsmerge.io.cameras.moves import describe_moves, list_moves
+from gsmerge.plan import Plan
+from gsmerge.render.photos import NEAR, photo_psnr, photos_of, scene_photos
+from gsmerge.runtime.memory import peak_memory
+from gsmerge.runtime.record import Record, choose, current_record, note, record_part, stage
+from gsmerge.stages.fit import Fitted
+from gsmerge.stages.prepare import Prepared, scene_depth
+from gsmerge.types import Cameras, Gaussians
+
+if TYPE_CHECKING:
+    import torch
+
+
+@dataclass(frozen=True)
+class CompactReport:
+    """What a run did.
+
+    Args:
+        num_input: Gaussians in the scene.
+        num_output: Gaussians in the result.
+        seconds: Wall time of each stage.
+        psnr_before: Mean PSNR (dB) of the input views rendered from the input, of many views some, and in a fixed
+            quarter of each unless a quality was asked for; None without photos. :func:`gsmerge.evaluate` is exact.
+        psnr_after: The same from the result.
+        choices: What the stages decided (count, curve, merge, scores, clusters, fit).
+        notes: Warnings about the input and what was adapted, one sentence each.
+        options: All settings by flat name.
+        peak_memory_bytes: Largest resident memory of the process so far.
+        unmet: Why a target that was asked for is not met, and how far the result got; None if it is.
+    """
+
+    num_input: int
+    num_output: int
+    seconds: dict[str, float]
+    psnr_before: float | None
+    psnr_after: float | None
+    choices: dict[str, Any]
+    notes: list[str]
+    options: dict[str, Any]
+    peak_memory_bytes: int
+    unmet: str | None = None
+
+
+@dataclass(frozen=True)
+class CompactResult:
+    """The compact Gaussians, in the scene's own world frame, and the report.
+
+    Args:
+        gaussians: The Gaussians.
+        report: What was done.
+        cameras: The given views as the Gaussians were made from them, in the same frame: moved where their poses were
+            wrong, see ``poses`` of :class:`gsmerge.PrepareOptions`.
+        coarser: Further levels of detail, each with a quarter of the Gaussians of the one before.
+    """
+
+    gaussians: Gaussians
+    report: CompactReport
+    cameras: Cameras
+    coarser: tuple[CompactResult, ...] = ()
+
+    def to(self, device: torch.device | str | None) -> CompactResult:
+        """Return the same result with tensors on a device; None: as it is, with NumPy arrays."""
+        if device is None:
+            return self
+        coarser = tuple(one.to(device) for one in self.coarser)
+        return replace(self, gaussians=self.gaussians.to(device), coarser=coarser)
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """Gaussians of one count, scored.
+
+    Args:
+        count: Gaussians that were asked for; None: as many as ``superpixels`` and K give.
+        fitted: What was built, canonical.
+        gaussians: The same in the world, with those that no view sees.
+        cameras: The given views as the Gaussians were made from them, in the world.
+        psnr: Mean PSNR (dB) of the scored views; None without photos.
+        record: Seconds, choices and notes of building and scoring it.
+    """
+
+    count: int | None
+    fitted: Fitted
+    gaussians: Gaussians
+    cameras: Cameras
+    psnr: float | None
+    record: Record
+
+
+def score(count: int | None, fitted: Fitted, prepared: Prepared, plan: Plan) -> Candidate:
+    """Bring canonical Gaussians into the world, with those that no view sees, and score them on the input photos."""
+    gaussians, prepared = fitted.gaussians, prepared.with_cameras(fitted.cameras)
+    if plan.unseen is not None:
+        gaussians = Gaussians.concat([gaussians, plan.unseen])
+    gaussians, cameras = prepared.frame.leave(gaussians), prepared.final_cameras()
+    if cameras is not prepared.given.cameras:
+        _note_moves(prepared, cameras, plan)
+        prepared = replace(prepared, given=replace(prepared.given, cameras=cameras))
+    psnr = None
+    if prepared.given.images is not None:
+        with stage("score"):
+            psnr = input_psnr(gaussians, prepared, plan)
+        choose(scored_views=len(plan.scored_views))
+    return Candidate(count, fitted, gaussians, cameras, psnr, current_record())
+
+
+def _note_moves(prepared: Prepared, cameras: Cameras, plan: Plan) -> None:
+    """Say how far each camera was moved."""
+    given, cause = prepared.given, "poses are free"
+    if plan.settings["poses"] == "auto":
+        cause = "the photos of some views agree only under other poses"
+    depth = scene_depth(prepared.scene) * prepared.frame.unit
+    moves = list_moves(given.names, given.cameras.viewmats, cameras.viewmats, depth)
+    choose(poses=moves)
+    note(f"{cause}: cameras were moved by {describe_moves(moves)}")
+
+
+def input_psnr(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> float:
+    """Measure the mean PSNR (dB) of the scored input photos, rendered from world-frame Gaussians.
+
+    In a quarter of every photo, or in the whole where a quality was asked for.
+    """
+    photos, frame, quarter = scene_photos(prepared.given), prepared.frame, plan.target_psnr is None
+    if plan.device == "cpu":
+        return photo_psnr(gaussians, photos, plan.scored_views, quarter=quarter, near=NEAR * frame.unit)
+    from gsmerge.gpu.score import score_photos  # torch; loaded where it is used alone
+
+    photos = photos_of(photos.images, frame.enter_cameras(prepared.given.cameras))  # float32 wants small numbers
+    return score_photos(frame.enter(gaussians), photos, plan.scored_views, plan.device, quarter=quarter)
+
+
+def make_result(
+    best: Candidate,
+    levels: Sequence[Candidate],
+    prepared: Prepared,
+    plan: Plan,
+    search: Mapping[str, Any],
+) -> CompactResult:
+    """Report the best candidate and its further levels of detail, with the input's PSNR beside their own.
+
+    Args:
+        best: The finest level.
+        levels: Coarser ones.
+        prepared: The scene.
+        plan: What was decided.
+        search: What the search for the finest says for the report, see :meth:`gsmerge.search.CountSearch.facts`.
+
+    The input is scored last, when the kernels are compiled and memory is free again. The seconds, choices and notes of
+    the current record, of what came before the candidates, enter the report.
+    """
+    before, run, seconds = None, current_record(), search["seconds"]
+    if prepared.given.images is not None:
+        with record_part() as own, stage("input"):
+            before = input_psnr(prepared.given.file_gaussians, prepared, plan)
+        seconds = {**seconds, **own.seconds}
+
+    def report(one: Candidate, seconds: Mapping[str, float]) -> CompactReport:
+        counts, record = (prepared.given.num_gaussians, len(one.gaussians)), one.record
+        return CompactReport(
+            *counts, dict(seconds), before, one.psnr, record.choices, record.notes, plan.settings, peak_memory()
+        )
+
+    main = report(best, _add_seconds(run.seconds, seconds))
+    choices, notes = run.choices | main.choices | search["choices"], [*run.notes, *main.notes]
+    main = replace(main, choices=choices, notes=notes, unmet=search["unmet"])
+    coarser = tuple(CompactResult(one.gaussians, report(one, one.record.seconds), one.cameras) for one in levels)
+    return CompactResult(best.gaussians, main, best.cameras, coarser)
+
+
+def _add_seconds(first: Mapping[str, float], second: Mapping[str, float]) -> dict[str, float]:
+    """Add two wall times of stages, by name."""
+    return {name: first.get(name, 0.0) + second.get(name, 0.0) for name in {**first, **second}}

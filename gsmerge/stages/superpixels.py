@@ -1,0 +1,320 @@
+"""Partition each view into superpixels of similar colour and regular shape (paper section 4.1).
+
+The default, ``rdseg``, spends the superpixels where they lower the squared colour error most: rectangles cut best
+first (more than asked for), merged with Ward's rule to the exact number, then exact moves of border pixels. ``bass``
+is Bayesian adaptive superpixel segmentation from a hexagonal grid, ``bass-st`` the same from seeds drawn by the
+Shi-Tomasi response, as in the paper, ``bass-adaptive`` the same with splits and merges, ``slic`` the common baseline,
+and ``grid`` plain rectangles: where they are a few pixels large and no fit follows, they are as good and cost nothing.
+No superpixel is empty, each is 4-connected, and a run repeats bit for bit.
+
+There are exactly as many superpixels as asked for, with one exception: from a share of the pixels, ``bass-adaptive``
+comes to a number of its own in each view, at most four times more or fewer. Where a number is asked for, here or by a
+budget, its moves go on to that number, those of the highest Hastings ratio first.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from gsmerge.budget import parse_share
+from gsmerge.errors import UsageError
+from gsmerge.kernels.superpixels.kd import split_rectangles
+from gsmerge.kernels.superpixels.regions import pad_labels
+from gsmerge.kernels.superpixels.sweeps import refine
+from gsmerge.kernels.superpixels.ward import merge_regions
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.types import Array, Groups, as_array, like
+
+SEGMENTATIONS = ("rdseg", "bass", "bass-st", "bass-adaptive", "slic", "grid")
+RECTANGLES, EARLY_SWEEPS = 2.0, 0  # rectangles per superpixel that rdseg merges, and sweeps before it does
+NUM_SWEEPS = 2
+BLOCK = 32  # side of the squares that the cutting starts from, pixels
+PIXEL_START = 0.45  # above this many rectangles per pixel, merging starts from the pixels themselves
+RANGE_SLACK = 1e-3  # colours may leave [0, 1] by this much, as resampled pictures do
+MAX_FACTOR = 4  # most times more or fewer superpixels than bass-adaptive starts with
+
+SHARE = "4.4%"  # superpixels per pixel by default
+AUTO_SHARE = "auto"
+
+
+@dataclass(frozen=True)
+class SegmentOptions:
+    """How to cut views into superpixels.
+
+    Args:
+        superpixels: Superpixels of each view: a number, or a share of its pixels as "4.4%"; ``"auto"``: 1.5 to 8 %,
+            the more the better the depths of the views agree. A share is where ``bass-adaptive`` starts from.
+        segmentation: ``rdseg``, ``bass``, ``bass-st``, ``bass-adaptive``, ``slic`` or ``grid``.
+        rectangles: Of ``rdseg``: rectangles per superpixel that it begins with, at least 1; None: 2, and by effort.
+        early_sweeps: Of ``rdseg``: sweeps over border pixels before rectangles are merged; None: 0, and by effort.
+        compactness: Of ``rdseg`` and ``slic``'s clean-up: weight of squared pixels against squared colours in
+            [0, 1]. At 0 the colours alone decide, and superpixels become snakes that no Gaussian fits.
+
+    Raises:
+        ValueError: If an option is out of range.
+    """
+
+    superpixels: int | str = SHARE
+    segmentation: str = "rdseg"
+    rectangles: float | None = None
+    early_sweeps: int | None = None
+    compactness: float = 1e-5
+
+    def __post_init__(self) -> None:
+        if self.per_view is not None and self.per_view < 1:
+            raise ValueError(f"superpixels: expected at least 1, got {self.superpixels}")
+        if self.per_view is None and self.superpixels != AUTO_SHARE:
+            try:
+                parse_share(str(self.superpixels))
+            except ValueError as error:
+                raise ValueError(f"superpixels: expected a number, or {str(error).partition(' ')[2]}") from None
+        rectangles = RECTANGLES if self.rectangles is None else self.rectangles
+        _check(self.segmentation, rectangles, self.compactness)
+
+    @property
+    def per_view(self) -> int | None:
+        """Superpixels of each view; None where a share of its pixels is asked for."""
+        text = str(self.superpixels)
+        return int(text) if text.removeprefix("-").isdecimal() else None
+
+    @property
+    def share(self) -> float:
+        """Superpixels per pixel; the default where a number is asked for, or where the scene has yet to choose."""
+        given = self.per_view is None and self.superpixels != AUTO_SHARE
+        return parse_share(str(self.superpixels) if given else SHARE)
+
+    @property
+    def adapts(self) -> bool:
+        """Whether views choose their number of superpixels: ``bass-adaptive`` from a share of the pixels."""
+        return self.segmentation == "bass-adaptive" and self.per_view is None
+
+
+def _check(segmentation: str, rectangles: float, compactness: float) -> None:
+    if segmentation not in SEGMENTATIONS:
+        raise ValueError(f"segmentation: expected one of {', '.join(SEGMENTATIONS)}, got {segmentation!r}")
+    if not rectangles >= 1:
+        raise ValueError(f"rectangles: expected at least 1 per superpixel, got {rectangles}")
+    if not 0 <= compactness <= 1:
+        raise ValueError(f"compactness: expected a number in [0, 1], got {compactness}")
+
+
+def count_for(options: SegmentOptions, height: int, width: int) -> int:
+    """Superpixels that ``options`` ask for in a view of this size.
+
+    Raises:
+        UsageError: If there are more than pixels.
+    """
+    if options.per_view is not None:
+        if options.per_view > height * width:
+            limit = f"{height * width}, one per pixel of {width} x {height}"
+            raise UsageError(f"superpixels: expected at most {limit}, got {options.per_view}")
+        return options.per_view
+    return max(1, int(options.share * height * width))
+
+
+def segment(
+    images: np.ndarray, options: SegmentOptions, count: int | None = None, *, adapt: float | None = None
+) -> Groups:
+    """Cut every view into superpixels, several views at once: the same number in each, unless they adapt.
+
+    Args:
+        images: ``[v,h,w,3]`` float in [0, 1] or uint8.
+        options: How, and how many.
+        count: Superpixels of each view; None to follow ``options``.
+        adapt: With a number, ``count`` is only where ``bass-adaptive`` starts from; see :func:`superpixels`.
+
+    Raises:
+        ValueError: If the images have the wrong shape or range, or fewer pixels than ``count``.
+    """
+    if images.ndim != 4 or images.shape[3] != 3:
+        raise ValueError(f"images: expected shape [v, h, w, 3], got {list(images.shape)}")
+    _, height, width, _ = images.shape
+    if count is None:
+        count, adapt = count_for(options, height, width), 1.0 if options.adapts else None
+    rectangles = RECTANGLES if options.rectangles is None else options.rectangles
+    early_sweeps = EARLY_SWEEPS if options.early_sweeps is None else options.early_sweeps
+
+    def one_view(image: np.ndarray) -> np.ndarray:
+        return _labels(image, count, options.segmentation, rectangles, early_sweeps, options.compactness, adapt)
+
+    labels = parallel_map(one_view, images)
+    stacked = np.stack(labels) if labels else np.empty((0, height, width), np.int32)
+    return Groups(stacked, tuple(int(one.max()) + 1 for one in labels))
+
+
+def superpixels(
+    image: Array,
+    count: int,
+    segmentation: str = "rdseg",
+    *,
+    rectangles: float = RECTANGLES,
+    early_sweeps: int = EARLY_SWEEPS,
+    compactness: float = 1e-5,
+    adapt: float | None = None,
+) -> Array:
+    """Cut an image into exactly ``count`` superpixels, each non-empty and 4-connected.
+
+    Args:
+        image: ``[h,w,3]`` sRGB, float in [0, 1] or uint8; an array or a tensor.
+        count: Superpixels, 1 to h·w.
+        segmentation: ``rdseg``, ``bass``, ``bass-st``, ``bass-adaptive``, ``slic`` or ``grid``.
+        rectangles: Of ``rdseg``: rectangles per superpixel that it begins with, at least 1. More take longer.
+        early_sweeps: Of ``rdseg``: sweeps over border pixels before rectangles are merged.
+        compactness: Weight of squared pixels against squared colours, in [0, 1] (not for the BASS methods).
+        adapt: Of ``bass-adaptive`` only: the share that is left of the number that it comes to from ``count``, which
+            is a quarter to four times as many, at most one per pixel; 1 keeps it. None: exactly ``count``.
+
+    Returns:
+        ``[h,w]`` int32, dense from 0, a tensor for a tensor; the same on every run.
+
+    Raises:
+        ValueError: If an argument is out of range.
+
+    Example:
+        >>> superpixels(np.zeros((2, 2, 3)), 1).tolist()
+        [[0, 0], [0, 0]]
+    """
+    labels = _labels(as_array(image), count, segmentation, rectangles, early_sweeps, compactness, adapt)
+    return like(labels, image)
+
+
+def _labels(
+    image: np.ndarray,
+    count: int,
+    segmentation: str,
+    rectangles: float,
+    early_sweeps: int,
+    compactness: float,
+    adapt: float | None,
+) -> np.ndarray:
+    """:func:`superpixels` of an array."""
+    _check(segmentation, rectangles, compactness)
+    pixels = _as_pixels(image)
+    height, width, _ = pixels.shape
+    if count < 1:
+        raise ValueError(f"count: expected at least 1 superpixel, got {count}")
+    if count > height * width:
+        raise ValueError(
+            f"count: expected at most {height * width} superpixels ({width} x {height} pixels), got {count}"
+        )
+    if segmentation == "rdseg":
+        labels = _rdseg(pixels, count, rectangles, early_sweeps, compactness)
+    elif segmentation == "grid":
+        return grid_labels(height, width, count)
+    elif segmentation == "slic":
+        labels = _slic(pixels, count, compactness)
+    else:
+        labels = _bass(pixels, count, segmentation, adapt)
+    return np.ascontiguousarray(labels[1:-1, 1:-1])
+
+
+def grid_labels(height: int, width: int, count: int) -> np.ndarray:
+    """``[h,w]`` int32: exactly ``count`` rectangles about as high as wide, in rows that differ by at most one.
+
+    Args:
+        height: Rows of pixels.
+        width: Columns of pixels.
+        count: Rectangles, 1 to height x width.
+    """
+    min_rows = -(-count // width)  # rows of blocks that can hold them all
+    lines = min(height, count, max(min_rows, round((count * height / width) ** 0.5)))
+    first = np.arange(lines + 1) * count // lines  # first label of each row of blocks
+    line = np.arange(height) * lines // height
+    blocks = np.diff(first)[line]
+    return (first[line][:, None] + np.arange(width) * blocks[:, None] // width).astype(np.int32)
+
+
+def saliency(image: Array) -> Array:
+    """Shi-Tomasi corner response: the smaller eigenvalue of the structure tensor of the grey image, 3 x 3 pixels.
+
+    Args:
+        image: ``[h,w,3]`` sRGB, float in [0, 1] or uint8; an array or a tensor.
+
+    Returns:
+        ``[h,w]`` float32, at least 0; 0 everywhere in a flat image; a tensor for a tensor.
+
+    Raises:
+        ValueError: If the image has the wrong shape or range.
+    """
+    return like(_corner_response(_as_pixels(as_array(image))), image)
+
+
+def scene_saliency(images: np.ndarray) -> np.ndarray:
+    """``[v·h·w]`` :func:`saliency` of every pixel of all views ``[v,h,w,3]``."""
+    return np.concatenate(parallel_map(lambda image: _corner_response(_as_pixels(image)).reshape(-1), images))
+
+
+def _corner_response(pixels: np.ndarray) -> np.ndarray:
+    grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
+    return np.maximum(cv2.cornerMinEigenVal(grey, 3, ksize=3), 0)
+
+
+def _as_pixels(array: np.ndarray) -> np.ndarray:
+    """``[h,w,3]`` float32 in [0, 1], contiguous."""
+    if array.ndim != 3 or array.shape[2] != 3 or array.size == 0:
+        raise ValueError(f"image: expected shape [h, w, 3], got {list(array.shape)}")
+    if array.dtype == np.uint8:
+        return np.divide(array, np.float32(255), dtype=np.float32, order="C")
+    if not np.issubdtype(array.dtype, np.floating):
+        raise ValueError(f"image: expected uint8 or float, got {array.dtype}")
+    low, high = array.min(), array.max()
+    if not (low >= -RANGE_SLACK and high <= 1 + RANGE_SLACK):  # also refuses NaN
+        raise ValueError(f"image: expected values in [0, 1], got {low:g} to {high:g}")
+    return np.ascontiguousarray(array, np.float32)
+
+
+def _every_pixel(height: int, width: int) -> np.ndarray:
+    """Padded labels in which every pixel is its own region."""
+    return pad_labels(np.arange(height * width, dtype=np.int32).reshape(height, width))
+
+
+def _rdseg(pixels: np.ndarray, count: int, rectangles: float, early_sweeps: int, compactness: float) -> np.ndarray:
+    """Over-split, merge to the exact number, move border pixels; padded labels."""
+    height, width, _ = pixels.shape
+    spread = np.float32(compactness**0.5)
+    num_rectangles = int(rectangles * count)
+    if num_rectangles > PIXEL_START * height * width:
+        labels, num_regions = _every_pixel(height, width), height * width
+    else:
+        labels, num_regions = split_rectangles(pixels, num_rectangles, BLOCK, float(compactness))
+        labels = refine(labels, pixels, num_regions, early_sweeps, spread)
+    labels = merge_regions(labels, pixels, num_regions, count, spread)
+    return refine(labels, pixels, count, NUM_SWEEPS, spread)
+
+
+def _bass(pixels: np.ndarray, count: int, segmentation: str, adapt: float | None) -> np.ndarray:
+    """BASS from hexagonal or from saliency seeds; padded labels."""
+    from gsmerge.kernels.superpixels.bass import adapt_labels, infer_labels  # compiled only when used
+    from gsmerge.kernels.superpixels.seeds import hexagonal_seeds, seed_density, seeds_from_density, voronoi
+
+    height, width, _ = pixels.shape
+    if segmentation == "bass":
+        seeds = hexagonal_seeds(height, width, count)
+    else:
+        seeds = seeds_from_density(seed_density(_corner_response(pixels), count), count)
+    colours = np.ascontiguousarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2Lab) / np.float32(100))
+    labels = pad_labels(voronoi(seeds, height, width))
+    if segmentation == "bass-adaptive":
+        return adapt_labels(labels, colours, count, MAX_FACTOR, adapt)[0]
+    return infer_labels(labels, colours, count)
+
+
+def _slic(pixels: np.ndarray, count: int, compactness: float) -> np.ndarray:
+    """scikit-image's SLIC, its pieces merged with Ward's rule to the exact number; padded labels."""
+    from skimage.measure import label
+    from skimage.segmentation import slic
+
+    height, width, _ = pixels.shape
+    asked = count
+    while asked < height * width:
+        pieces = slic(pixels, n_segments=asked, compactness=10, start_label=0, channel_axis=-1)
+        pieces, num_pieces = label(pieces, background=-1, return_num=True, connectivity=1)
+        if num_pieces >= count:
+            break
+        asked = int(asked * 1.1) + 1
+    else:
+        return merge_regions(_every_pixel(height, width), pixels, height * width, count, np.float32(compactness**0.5))
+    return merge_regions(pad_labels(pieces - 1), pixels, num_pieces, count, np.float32(compactness**0.5))
