@@ -11,19 +11,18 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from gsmerge.baselines import choose_method
-from gsmerge.io import read_noted
+from gsmerge.io import as_scene
 from gsmerge.moments import Members
 from gsmerge.options import CompactOptions
 from gsmerge.plan import Plan, make_plan
 from gsmerge.result import Candidate, CompactResult, make_result, score
-from gsmerge.runtime.record import Progress, choose, record_part, record_run
+from gsmerge.runtime.record import Progress, record_part, record_run
 from gsmerge.runtime.threads import use_threads
 from gsmerge.search import Build, level_counts, search_count
-from gsmerge.stages.agreement import weaken_contradicted
 from gsmerge.stages.assign import assign
 from gsmerge.stages.choose_start import choose_start
 from gsmerge.stages.clean import clean_to_count
-from gsmerge.stages.decode import Decoded, decode_merged
+from gsmerge.stages.decode import decode_merged, keep_all
 from gsmerge.stages.encode import encode, make_context
 from gsmerge.stages.fit import Fitted, fit_scene
 from gsmerge.stages.match import match
@@ -46,15 +45,10 @@ def compact(
     """Replace a scene by a compact one that renders at least as well from new viewpoints.
 
     Args:
-        scene: Gaussians with their views, see :func:`gsmerge.read_scene`. Tensors give tensors on their device. A path
-            is read by :func:`gsmerge.read_scene` with its defaults.
+        scene: What :func:`gsmerge.read_scene` returns, or the path that it reads. Tensors give tensors.
         options: Settings of all stages; None: the defaults.
-        progress: Called with (stage, done, total) as each stage begins, done and total in stages, and from within
-            the longer ones with ("fit: ...", step, steps).
+        progress: Called with (stage, done, stages), and from within longer ones with ("fit: ...", step, steps).
         **settings: Single settings by name, on top of ``options``: ``compact(scene, k=2, superpixels="1%")``.
-
-    Returns:
-        The Gaussians and a report; further levels of detail if they were asked for.
 
     Raises:
         SceneError: If a path is given that cannot be read.
@@ -62,7 +56,7 @@ def compact(
     """
     options = (options or CompactOptions()).with_settings(settings)
     with use_threads(options.threads), record_run(progress):
-        given = scene if isinstance(scene, Scene) else read_noted(scene)
+        given = as_scene(scene)
         method = choose_method(options, given, build)  # ours, or a baseline
         prepared = prepare(given.numpy(), options.prepare)  # facts: frame, photos, poses, unseen
         plan = make_plan(prepared, options)  # every "auto" is decided once; options end here
@@ -79,34 +73,17 @@ def compact(
 def build_scored(method: Build, prepared: Prepared, plan: Plan, count: int | None) -> Candidate:
     """Build so many Gaussians, cleaned up if that was asked for, and score them, with a record of their own."""
     with record_part():
-        fitted = clean_to_count(
-            partial(method, prepared, plan), count, plan.clean, prepared.scene, prepared.frame.leave
-        )
+        fitted = clean_to_count(partial(method, prepared, plan), count, plan.clean, prepared)
         return score(count, fitted, prepared, plan)
 
 
 def build(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
-    """Build Gaussians from superpixels and fit them.
-
-    Args:
-        prepared: The scene.
-        plan: Of all stages.
-        count: Gaussians in the result; None: as many as ``superpixels`` and K give.
-
-    Returns:
-        Canonical Gaussians, and the cameras that they were fitted from.
-    """
-    scene = prepared.scene
-    if keeps_all(scene, count):
-        decoded = Decoded(scene.gaussians, len(scene.gaussians), exact=True)  # merging some would only blur
-    else:
-        decoded = decode_merged(merge_views(prepared, plan, count), scene, plan.decode, grows=plan.fit.grows)
-    return fit_scene(decoded, scene, prepared.photo_views, plan.fit, plan.seed, plan.device)
-
-
-def keeps_all(scene: Scene, count: int | None) -> bool:
-    """Tell whether so many Gaussians are asked for that an unaligned scene need not be grouped."""
-    return count is not None and not scene.aligned and count >= len(scene.gaussians)
+    """Go from superpixels to ``count`` fitted Gaussians, canonical; None: as many as ``superpixels`` and K give."""
+    decoded = keep_all(prepared.scene, count)
+    if decoded is None:
+        merged = merge_views(prepared, plan, count)
+        decoded = decode_merged(merged, prepared.scene, plan.decode, grows=plan.fit.grows)
+    return fit_scene(decoded, prepared.scene, prepared.photo_views, plan.fit, plan.seed, plan.device)
 
 
 def merge_views(prepared: Prepared, plan: Plan, count: int | None) -> MergedViews:
@@ -115,24 +92,15 @@ def merge_views(prepared: Prepared, plan: Plan, count: int | None) -> MergedView
     segmentation = segment_scene(scene, plan.superpixels, count)
     members = assign(scene, segmentation.groups)
     starts = [merge_features(scene, members, segmentation, plan, networks) for networks in plan.networks]
-    start = choose_start(starts, scene, plan.decode)
-    choose(groups=start.num_groups, clusters=len(start.features))
-    if start.networks is not None and plan.checkpoint is not None:
-        choose(networks=plan.checkpoint.facts())
-    return start
+    return choose_start(starts, scene, plan.decode, plan.checkpoint)  # of one: that one
 
 
 def merge_features(
     scene: Scene, members: Members, segmentation: Segmentation, plan: Plan, networks: Networks | None
 ) -> MergedViews:
-    """Encode superpixels as Feature Gaussians, merge those that match, and refine them, with networks or with none.
-
-    A separate function, so that its intermediates (several times the result) are freed on return.
-    """
+    """Encode superpixels as Feature Gaussians, merge those that match, and refine them, with networks or with none."""
     context = make_context(networks, members, scene.cameras, plan.seed)
-    features = encode(scene, members, segmentation.groups, context)
-    if networks is None and plan.weakens:
-        features = weaken_contradicted(features, members, scene.cameras)
+    features = encode(scene, members, segmentation.groups, context, weaken=plan.weakens)
     merged = refine(merge(features, match(features, plan.match, context), context), context)
     start = None if context is None or plan.fit.fit == "none" else encode(scene, members, segmentation.groups)
     return MergedViews(merged, members, segmentation, len(features), context, start)

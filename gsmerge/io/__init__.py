@@ -29,10 +29,10 @@ from gsmerge.io.photos import read_images as read_images
 from gsmerge.io.scene import CamerasInScene as CamerasInScene
 from gsmerge.io.scene import SceneLoad as SceneLoad
 from gsmerge.io.scene import align_scene as align_scene
+from gsmerge.io.scene import as_scene as as_scene
 from gsmerge.io.scene import load_files as load_files
 from gsmerge.io.scene import load_scene as load_scene
 from gsmerge.io.scene import place_cameras_in_scene as place_cameras_in_scene
-from gsmerge.io.scene import read_noted as read_noted
 from gsmerge.io.scene import read_ply_with_hints as read_ply_with_hints
 from gsmerge.io.scene import read_scene as read_scene
 from gsmerge.io.scene_files import SceneFiles as SceneFiles

@@ -106,9 +106,11 @@ def read_scene(
     return load_scene(path, cameras=cameras, images=images, opacity=opacity, **hints).scene
 
 
-def read_noted(path: str | os.PathLike[str]) -> Scene:
-    """Read a scene with the defaults, and write what is odd about it to the record of the current run."""
-    load = load_scene(path)
+def as_scene(scene: Scene | str | os.PathLike[str]) -> Scene:
+    """Return a scene as it is, or read it from a path; notes say what is odd about the file."""
+    if isinstance(scene, Scene):
+        return scene
+    load = load_scene(scene)
     for text in load.notes:
         note(text)
     return load.scene

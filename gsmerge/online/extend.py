@@ -36,12 +36,13 @@ from gsmerge.online.state import (
     with_fitted_colors,
 )
 from gsmerge.options import CompactOptions, to_schema
-from gsmerge.pipeline import build, keeps_all, merge_views
+from gsmerge.pipeline import build, merge_views
 from gsmerge.plan import Plan, make_plan, require_children
 from gsmerge.render.photos import scene_pictures
 from gsmerge.runtime.record import Progress, choose, record_run, stage
 from gsmerge.runtime.threads import use_threads
 from gsmerge.search import choose_count
+from gsmerge.stages.decode import keep_all
 from gsmerge.stages.fit import visible_mask
 from gsmerge.stages.match import MatchOptions, match
 from gsmerge.stages.merge import MergedViews, merge, take
@@ -100,7 +101,7 @@ def extend(
         plan = plan.with_fit(replace(plan.fit, min_contribution=options.fit.min_contribution))  # in drafts, too
         require_children("max k", max_k, plan.checkpoint)
         count = choose_count(prepared, plan, build)
-        if keeps_all(prepared.scene, count):
+        if keep_all(prepared.scene, count) is not None:
             raise UsageError(f"budget: {count} keeps every Gaussian, which needs no state; use compact")
         merged = merge_views(prepared, plan, count)
         state, counts = _add_batch(state, prepared, plan, merged, online, max_k)

@@ -8,7 +8,7 @@ import numpy as np
 
 from gsmerge.moments import Members, scene_members
 from gsmerge.networks.cross_view_stats import cross_view_stats
-from gsmerge.runtime.record import choose, stage
+from gsmerge.runtime.record import choose
 from gsmerge.types import Cameras, FeatureGaussians, Scene
 
 # Factors on the optical depth of groups that other views see through: those at whose place no other view has its
@@ -43,11 +43,8 @@ def contradicted_share(scene: Scene, members: Members) -> float:
     return float((factors < 1).mean()) if len(rows) else 0.0
 
 
-@stage("encode")
 def weaken_contradicted(features: FeatureGaussians, members: Members, cameras: Cameras) -> FeatureGaussians:
     """Lower the optical depth of groups that other views see through.
-
-    Where a long fit follows, it closes the holes that this leaves, and moves what stands before other views less.
 
     Args:
         features: Of single views.

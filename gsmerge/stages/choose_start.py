@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -16,28 +17,40 @@ from gsmerge.stages.merge import MergedViews
 from gsmerge.types import Gaussians, Scene
 from gsmerge.views import pick_views
 
+if TYPE_CHECKING:
+    from gsmerge.networks.checkpoint import Checkpoint
+
 MAX_VIEWS = 6  # that a start is judged by
 
 
-@stage("choose")
-def choose_start(starts: Sequence[MergedViews], scene: Scene, options: DecodeOptions) -> MergedViews:
+def choose_start(
+    starts: Sequence[MergedViews], scene: Scene, options: DecodeOptions, checkpoint: Checkpoint | None
+) -> MergedViews:
     """Choose the start, with or without networks, whose Gaussians at K = 1 show the views better; of one, that one.
 
     The choice does not depend on K, so what is encoded once is what every K begins with. Networks learn what real
     exports suffer from; a scene without those errors is better left as it is.
 
     Args:
-        starts: The learned start, then the analytic one.
+        starts: The learned start, then the analytic one; or one alone.
         scene: The canonical scene.
         options: Of decoding; K = 1 is taken.
+        checkpoint: Where the networks come from, for the record.
 
     Returns:
         The better start, of equal ones the analytic, with its Gaussians; the record gets the PSNR (dB) of both.
     """
-    if len(starts) == 1:
-        return starts[0]
-    scores: dict[str, float] = {}
-    best = starts[0]
+    best = starts[0] if len(starts) == 1 else _better_start(starts, scene, options)
+    choose(groups=best.num_groups, clusters=len(best.features))
+    if best.networks is not None and checkpoint is not None:
+        choose(networks=checkpoint.facts())
+    return best
+
+
+@stage("choose")
+def _better_start(starts: Sequence[MergedViews], scene: Scene, options: DecodeOptions) -> MergedViews:
+    """Compare starts by what they become at K = 1."""
+    best, scores = starts[0], dict[str, float]()
     for start in starts:
         name = "analytic" if start.networks is None else "learned"
         ones = decode(start.features, start.members, replace(options, k=1), networks=start.networks)

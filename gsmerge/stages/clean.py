@@ -10,7 +10,7 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,6 +19,9 @@ from gsmerge.runtime.record import Record, add_seconds, adopt, choose, note, rec
 from gsmerge.stages.fit import Fitted
 from gsmerge.stages.sky import sky
 from gsmerge.types import Gaussians, Scene
+
+if TYPE_CHECKING:
+    from gsmerge.stages.prepare import Prepared
 
 BOX_QUANTILES = (1, 99)  # % of the positions along each axis: the scene's box
 OUTLIER_BOX = 10.0  # times that box: what lies beyond is far from the scene
@@ -155,21 +158,21 @@ def clean(gaussians: Gaussians, options: CleanOptions, scene: Scene, to_world: T
     return gaussians, counts
 
 
-def clean_to_count(make: Make, count: int | None, options: CleanOptions, scene: Scene, to_world: ToWorld) -> Fitted:
+def clean_to_count(make: Make, count: int | None, options: CleanOptions, prepared: Prepared) -> Fitted:
     """Make Gaussians and clean them up: exactly ``count`` are left, unless the whole scene does not hold so many.
 
     Args:
         make: Makes that many Gaussians before clean-up.
         count: Gaussians in the result; None: as many as are left.
         options: What is left out.
-        scene: In the canonical frame, as all Gaussians are; its own say how many a crop is likely to leave.
-        to_world: From that frame to the world's.
+        prepared: The scene, whose own Gaussians say how many a crop is likely to leave.
 
     Raises:
         UsageError: If the crop holds none of the scene.
     """
     if not options.asked:
         return make(count)
+    scene, to_world = prepared.scene, prepared.frame.leave
     given = scene.gaussians[scene.valid.reshape(-1)] if scene.aligned else scene.gaussians
     most, asked = len(given), count
     share = 1.0 if options.crop is None else float(inside_crop(to_world(given).means, options.crop).mean())

@@ -130,6 +130,13 @@ class Decoded:
     baseline_start: Gaussians | None = None
 
 
+def keep_all(scene: Scene, count: int | None) -> Decoded | None:
+    """Return all Gaussians of an unaligned scene where as many are asked for: merging some would only blur."""
+    if count is None or scene.aligned or count < len(scene.gaussians):
+        return None
+    return Decoded(scene.gaussians, len(scene.gaussians), exact=True)
+
+
 @stage("decode")
 def decode_merged(merged: MergedViews, scene: Scene, options: DecodeOptions, *, grows: bool) -> Decoded:
     """Decode merged views into as many Gaussians as were asked for exactly, or K for each Feature Gaussian.

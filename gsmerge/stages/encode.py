@@ -10,6 +10,7 @@ from gsmerge.kernels.gaussians.pool import group_members
 from gsmerge.moments import Members, Moments, Rule, pool_members
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
+from gsmerge.stages.agreement import weaken_contradicted
 from gsmerge.types import Cameras, FeatureGaussians, Groups, Scene, to_float32
 
 if TYPE_CHECKING:
@@ -33,6 +34,8 @@ def encode(
     groups: Groups,
     networks: NetworkContext | None = None,
     rule: Rule = "depth",
+    *,
+    weaken: bool = False,
 ) -> FeatureGaussians:
     """Pool every superpixel into one Feature Gaussian, view by view.
 
@@ -43,6 +46,8 @@ def encode(
         networks: Networks whose encoder corrects what is pooled; None: none does.
         rule: ``"depth"``: opacity weights, total covariance of winsorised members, opacity from the conserved optical
             depth. ``"paper"``: the paper's moment matching (eq. teacher_mean, teacher_cov; mean opacity).
+        weaken: Lower the optical depth of groups that other views see through, where no network corrects them. A long
+            fit closes the holes that this leaves, and moves what stands before other views less.
 
     Returns:
         The Feature Gaussians in order of view and label; superpixels without a valid member are left out.
@@ -50,7 +55,7 @@ def encode(
     starts, ids, views = member_rows(scene, members, groups)
     features = from_moments(pool_members(members, starts, ids, rule), starts, ids, views)
     if networks is None:
-        return features
+        return weaken_contradicted(features, members, scene.cameras) if weaken else features
     from gsmerge.networks.apply import encode_features
 
     return encode_features(features, networks)
