@@ -140,14 +140,6 @@ class CompactOptions:
             return self
         return replace(self, fit=replace(self.fit, fit_steps=AUTO_STEPS * self.fit.steps))
 
-    def with_chosen_device(self, num_gaussians: int) -> CompactOptions:
-        """With ``device="auto"`` settled for a scene of this size."""
-        if self.fit.device != "auto":
-            return self
-        from gsmerge.render.cuda import chosen_device
-
-        return replace(self, fit=replace(self.fit, device=chosen_device("auto", num_gaussians)))
-
     @property
     def needs_tree(self) -> bool:
         """Whether the number of Gaussians is searched for, or further levels of detail are cut."""

@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsmerge.baselines import choose_baseline
+from gsmerge.gpu import choose_backend
 from gsmerge.io import load_scene
 from gsmerge.io.cameras.moves import describe_moves, list_moves
 from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.options import CompactOptions
-from gsmerge.render.photos import NEAR, photo_psnr, photos_of, scene_photos
+from gsmerge.render.photos import NEAR, scene_photos
 from gsmerge.report import CompactReport, CompactResult
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.record import (
@@ -41,7 +42,7 @@ from gsmerge.stages.choose_merge import choose_merge, choose_start, close_holes
 from gsmerge.stages.clean import clean, make_clean
 from gsmerge.stages.decode import MIXED, decode_merged
 from gsmerge.stages.encode import encode
-from gsmerge.stages.fit import Fitted, fit, fit_photos, record_fit, report_steps
+from gsmerge.stages.fit import FitBackend, Fitted, fit, fit_photos, record_fit, report_steps, run_on
 from gsmerge.stages.group import segment_scene
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import MergedViews, merge, refine
@@ -83,12 +84,13 @@ def compact(
         load = load_scene(scene)
         scene, read_notes = load.scene, load.notes
     options = (options or CompactOptions()).with_settings(settings).with_auto_steps()
-    options = options.with_chosen_device(scene.num_gaussians)
     device = scene.gaussians.device
     scene = scene.numpy()
     with use_threads(options.threads), record_run(progress):
         baseline, notes = choose_baseline(options, scene)
-        for text in (*read_notes, *notes):
+        backend, problem = choose_backend(options.fit.device, scene.num_gaussians)
+        options = replace(options, fit=replace(options.fit, device=backend.device))
+        for text in (*read_notes, *notes, *([] if problem is None else [problem])):
             note(text)
         prepared = prepare(scene, options)
         make: Build = build if baseline is None else baseline.build
@@ -122,11 +124,10 @@ def build(prepared: PreparedScene, count: int | None) -> Fitted:
     with stage("fit"):
         photos = fit_photos(scene, options.fit, prepared.photo_views)
         choose(begun_with=len(gaussians))
-        if options.fit.device != "cpu":
-            choose(device=options.fit.device if len(photos) == 2 else "cpu")  # larger photos: the CPU alone
         gaussians, report = fit(
-            gaussians, photos, options.fit, count, options.seed, report_steps, analytic, exact=exact
-        )
+            gaussians, photos, options.fit, count, options.seed, report_steps, analytic,
+            exact=exact, backend=backend_for(prepared),
+        )  # fmt: skip
     record_fit(report)
     cameras = scene.cameras
     if report is not None and report.viewmats is not None:
@@ -277,11 +278,13 @@ def score_input(result: CompactResult, prepared: PreparedScene) -> CompactResult
     with record_part() as own, stage("input"):
         before = input_psnr(prepared.given.file_gaussians, prepared)
 
-    def with_input(one: CompactResult, seconds: dict[str, float]) -> CompactResult:
-        report = replace(one.report, psnr_before=before, seconds=one.report.seconds | seconds)
-        return replace(one, report=replace(report, peak_memory_bytes=peak_memory()))
+    def with_input(one: CompactResult, seconds: dict[str, float], notes: list[str]) -> CompactResult:
+        report = replace(one.report, psnr_before=before, peak_memory_bytes=peak_memory())
+        report = replace(report, seconds=report.seconds | seconds, notes=[*report.notes, *notes])
+        return replace(one, report=report)
 
-    return replace(with_input(result, own.seconds), coarser=tuple(with_input(one, {}) for one in result.coarser))
+    coarser = tuple(with_input(one, {}, []) for one in result.coarser)
+    return replace(with_input(result, own.seconds, own.notes), coarser=coarser)
 
 
 def input_psnr(gaussians: Gaussians, prepared: PreparedScene) -> float:
@@ -291,10 +294,13 @@ def input_psnr(gaussians: Gaussians, prepared: PreparedScene) -> float:
     """
     photos, exact = scene_photos(prepared.given), prepared.options.budget.target_psnr is not None
     views, near = prepared.scored_views(), NEAR * prepared.frame.unit
-    if prepared.options.fit.device == "cpu":
-        return photo_psnr(gaussians, photos, views, quarter=not exact, near=near)
-    from gsmerge.gpu.score import score_photos  # torch; loaded where it is used alone
 
-    frame, device = prepared.frame, prepared.options.fit.device
-    photos = photos_of(photos.images, frame.enter_cameras(prepared.given.cameras))  # float32 wants small numbers
-    return score_photos(frame.enter(gaussians), photos, views, device, quarter=not exact)
+    def score_on(backend: FitBackend[Any]) -> float:
+        return backend.photo_psnr(gaussians, photos, views, quarter=not exact, near=near)
+
+    return run_on(backend_for(prepared), "scores", score_on)
+
+
+def backend_for(prepared: PreparedScene) -> FitBackend[Any]:
+    """Choose where the fit and the scores of a prepared scene run."""
+    return choose_backend(prepared.options.fit.device, prepared.given.num_gaussians)[0]

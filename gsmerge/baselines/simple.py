@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from gsmerge.baselines.baseline import merge_groups, most_important, own_gaussians, view_shares
+from gsmerge.gpu import choose_backend
 from gsmerge.render import contributions, plan_view, prepare
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
@@ -44,7 +45,10 @@ def _fit_input(prepared: PreparedScene, options: FitOptions) -> Gaussians:
         return gaussians
     with stage("fit"):
         photos = fit_photos(prepared.scene, options, prepared.photo_views)
-        gaussians, report = fit(gaussians, photos, options, len(gaussians), prepared.options.seed, report_steps)
+        backend, _ = choose_backend(options.device, prepared.given.num_gaussians)
+        gaussians, report = fit(
+            gaussians, photos, options, len(gaussians), prepared.options.seed, report_steps, backend=backend
+        )
     record_fit(report)
     return gaussians
 

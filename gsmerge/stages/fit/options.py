@@ -95,12 +95,12 @@ class FitOptions:
             merged, and the full fit moves the cameras on (on the CPU); ``"fixed"``: cameras stay where they are;
             ``"auto"``: free where some view is more than 1.5 pixels off and its photo and the others agree clearly
             better elsewhere (:mod:`gsmerge.stages.align_views` says by how much); fixed elsewhere, and without photos.
-        device: Where the fit runs, and in :func:`gsmerge.compact` all stages that can: ``"cpu"``; ``"cuda"``, which
-            draws with gsplat, whose sums have no fixed order, so that runs differ in the last bits; ``"auto"``: CUDA
-            where it can be used and the scene is large enough that it pays.
+        device: Where the fit and the scores run: ``"cpu"``; ``"cuda"``, which draws with gsplat, whose sums have no
+            fixed order, so that runs differ in the last bits; ``"auto"``: CUDA where it can be used and the scene is
+            large enough that it pays. Where CUDA cannot be used, the CPU, with a note.
 
     Raises:
-        ValueError: If a setting is unknown or out of range, or CUDA is asked for and cannot be used.
+        ValueError: If a setting is unknown or out of range.
     """
 
     fit: Fit = "full"
@@ -194,7 +194,3 @@ class FitOptions:
             raise ValueError(f"time_budget: expected more than 0 seconds, got {self.time_budget}")
         if self.device not in ("cpu", "cuda", "auto"):
             raise ValueError(f'device: expected "cpu", "cuda" or "auto", got "{self.device}"')
-        if self.device != "cpu":
-            from gsmerge.render.cuda import usable_device
-
-            object.__setattr__(self, "device", usable_device(self.device))
