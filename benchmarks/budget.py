@@ -28,26 +28,26 @@ from gsmerge.stages.fit import FitOptions, fit
 from gsmerge.stages.prepare import Frame, canonicalise
 from gsmerge.stages.region_tree import auto_count, cut_tree, pixel_depths, region_tree
 from gsmerge.stages.segment import SegmentOptions, segment
-from gsmerge.types import Gaussians, Groups, PixelScene
+from gsmerge.types import Gaussians, Groups, Scene
 
 DENSITY = 0.044
 SHARES = (0.005, 0.01, 0.022, 0.044, 0.088)
 
 
-def cut_evenly(scene: PixelScene, count: int) -> Groups:
+def cut_evenly(scene: Scene, count: int) -> Groups:
     """The same number of superpixels in every view."""
     assert scene.images is not None
     return segment(scene.images, SegmentOptions(), max(1, count // len(scene)))
 
 
-def spent(scene: PixelScene, members: Members, groups: Groups, count: int) -> Gaussians:
+def spent(scene: Scene, members: Members, groups: Groups, count: int) -> Gaussians:
     """One Gaussian per region, and more where the regions are fewer than ``count``."""
     features = encode(scene, members, groups, EncodeOptions())
     extra = max(0, count - len(features))
     return decode(features, members, DecodeOptions(), split_counts(features, members, extra))
 
 
-def fitted(gaussians: Gaussians, scene: PixelScene, frame: Frame, steps: int) -> Gaussians:
+def fitted(gaussians: Gaussians, scene: Scene, frame: Frame, steps: int) -> Gaussians:
     photos = scene_photos(scene), scene_photos(scene, 2)
     return frame.leave(fit(gaussians, photos, FitOptions(fit="full", fit_steps=steps), 0)[0])
 

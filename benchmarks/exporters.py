@@ -20,7 +20,6 @@ from shared_scenes import Targets, exporter, read_held_out, scene_folders
 
 import gsmerge
 from gsmerge.io import Recovery, SceneLoad, load_scene
-from gsmerge.types import PixelScene
 
 STYLES: dict[str, tuple[str, float]] = {
     "plain": ("plain", 1.0),
@@ -80,7 +79,7 @@ def measure(scene: Path, name: str, max_views: int, cache: Path, quality: bool) 
     loaded = load_scene(ply)
     row: dict[str, Any] = {"scene": scene.name, "style": name, "views": max_views or "all"}
     row["seconds"] = time.perf_counter() - start
-    row["aligned"] = isinstance(loaded.scene, PixelScene)
+    row["aligned"] = loaded.scene.aligned
     row["at home"] = share_at_home(loaded, true_pixels(scene, style, max_views or None))
     row["margin"] = loaded.recovery.margin if loaded.recovery else float("nan")
     if quality:

@@ -22,14 +22,12 @@ from shared_scenes import LEFT_OUT, Targets, export, read_held_out, scene_folder
 
 import gsmerge
 from gsmerge.research.charts.statistics import mean_interval
-from gsmerge.types import PixelScene, UnalignedScene
+from gsmerge.types import Scene
 
 NAMES = ("PSNR", "SSIM", "LPIPS")
 
 
-def run(
-    scene: PixelScene | UnalignedScene, targets: Targets, settings: dict[str, Any], seed: int, lpips: bool
-) -> tuple[float, ...]:
+def run(scene: Scene, targets: Targets, settings: dict[str, Any], seed: int, lpips: bool) -> tuple[float, ...]:
     """Processor seconds, and the scores."""
     start = time.process_time()
     result = gsmerge.compact(scene, **settings, seed=seed)

@@ -22,7 +22,7 @@ from gsmerge.types import Cameras, LargePhotos
 HALF = 2
 
 
-def half_export(folder: Path) -> gsmerge.PixelScene:
+def half_export(folder: Path) -> gsmerge.Scene:
     """What the exporter would write of the scene at half its size, with the photos as they are."""
     tool, rng, parts = exporter(), np.random.default_rng(0), []
     views = tool.read_scene(folder)

@@ -26,9 +26,9 @@ from gsmerge.stages.assign import find_owners
 from gsmerge.stages.segment import SegmentOptions, segment
 
 
-def loosened(scene: gsmerge.PixelScene) -> gsmerge.UnalignedScene:
+def loosened(scene: gsmerge.Scene) -> gsmerge.Scene:
     """The Gaussians without their order."""
-    return gsmerge.UnalignedScene(scene.gaussians[scene.valid.reshape(-1)], scene.cameras, scene.images, scene.names)
+    return gsmerge.Scene(scene.gaussians[scene.valid.reshape(-1)], scene.cameras, scene.images, None, scene.names)
 
 
 def time_pass(folder: Path, cache: Path, threads: int) -> None:

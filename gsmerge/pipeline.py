@@ -83,7 +83,7 @@ def build(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
     if decoded is None:
         merged = merge_views(prepared, plan, count)
         decoded = decode_merged(merged, prepared.scene, plan.decode, grows=plan.fit.grows)
-    return fit_scene(decoded, prepared.scene, prepared.photo_views, plan.fit, plan.seed, plan.device)
+    return fit_scene(decoded, prepared.scene, prepared.photo_views, plan.fit, plan.seed, plan.backend)
 
 
 def merge_views(prepared: Prepared, plan: Plan, count: int | None) -> MergedViews:

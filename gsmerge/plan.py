@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from gsmerge.budget import exact_count
 from gsmerge.errors import UsageError
+from gsmerge.gpu import choose_backend
 from gsmerge.options import CompactOptions
 from gsmerge.runtime.record import note, stage
 from gsmerge.stages.agreement import measured_share
@@ -19,7 +20,7 @@ from gsmerge.stages.assign import merge_unseen
 from gsmerge.stages.clean import CleanOptions, clean
 from gsmerge.stages.counts import CountLimits, count_limits
 from gsmerge.stages.decode import DecodeOptions
-from gsmerge.stages.fit import FitOptions, photo_scale, start_share
+from gsmerge.stages.fit import FitBackend, FitOptions, photo_scale, start_share
 from gsmerge.stages.match import MatchOptions
 from gsmerge.stages.prepare import Prepared
 from gsmerge.stages.segment import SuperpixelPlan, scene_tree
@@ -85,7 +86,7 @@ class Plan:
         auto_count: Whether the scene's own curve decides the number of Gaussians.
         levels: Levels of detail.
         scored_views: Given views that input and result are scored on.
-        device: Where the fit and the scores run, ``"cpu"`` or ``"cuda"``.
+        backend: Where the fit and the scores run.
         seed: Everything random depends on it alone.
         checkpoint: Where the networks come from; None without any.
         settings: All settings by flat name, for reports.
@@ -103,7 +104,7 @@ class Plan:
     auto_count: bool
     levels: int
     scored_views: tuple[int, ...]
-    device: str
+    backend: FitBackend[Any]
     seed: int
     checkpoint: Checkpoint | None
     settings: dict[str, Any]
@@ -148,8 +149,10 @@ def make_plan(prepared: Prepared, options: CompactOptions) -> Plan:
             scene, segment, options.decode, options.budget,
             num_input=num_input, num_reserved=0 if unseen is None else len(unseen),
         )  # fmt: skip
-        device = _choose_device(options.device, given.num_gaussians)
-        fit = _resolve_fit_to(prepared, options, limits, device)
+        backend, problem = choose_backend(options.device, given.num_gaussians)
+        if problem is not None:
+            note(problem)
+        fit = _resolve_fit_to(prepared, options, limits, backend)
     superpixels, tree = SuperpixelPlan(segment, limits, start_share(fit), None), None
     searches = options.budget.quality is not None or options.budget.auto or options.budget.levels > 1
     if own and (searches or limits.count is not None):
@@ -170,7 +173,7 @@ def make_plan(prepared: Prepared, options: CompactOptions) -> Plan:
         auto_count=options.budget.auto,
         levels=options.budget.levels,
         scored_views=_choose_scored_views(prepared, options),
-        device=device,
+        backend=backend,
         seed=options.seed,
         checkpoint=checkpoint,
         settings=options.to_dict() | {"fit_steps": fit.steps},
@@ -304,7 +307,9 @@ def steps_for(options: CompactOptions, num_gaussians: int, scene: Scene) -> int:
     return round(min(max(1.0, math.sqrt(share / USUAL_SHARE)), MOST_STEPS) * steps)
 
 
-def _resolve_fit_to(prepared: Prepared, options: CompactOptions, limits: CountLimits, device: str) -> FitOptions:
+def _resolve_fit_to(
+    prepared: Prepared, options: CompactOptions, limits: CountLimits, backend: FitBackend[Any]
+) -> FitOptions:
     """Fill in what effort, scene and device decide of the fit."""
     scene = prepared.scene
     if scene.images is None or not prepared.photo_views:
@@ -313,21 +318,12 @@ def _resolve_fit_to(prepared: Prepared, options: CompactOptions, limits: CountLi
     fit = replace(fit, fit_steps=steps_for(options, limits.count or limits.default, scene))
     if scene.images is None or not fit.needs_photos:
         return replace(fit, photo_scale=1.0)
-    auto = EFFORTS[options.effort].large_photos and device == "cpu"
+    auto = EFFORTS[options.effort].large_photos and backend.device == "cpu"
     scale, problem = photo_scale(scene, fit, auto=auto)
     if problem is not None:
         note(problem)
     moves = options.prepare.poses == "free" or (options.prepare.poses == "auto" and prepared.moved)
     return replace(fit, photo_scale=scale, move_cameras=moves and prepared.given.images is not None)
-
-
-def _choose_device(device: str, num_gaussians: int) -> str:
-    """Choose where the fit and the scores run."""
-    if device == "cpu":
-        return device
-    from gsmerge.render.cuda import chosen_device, usable_device
-
-    return chosen_device(usable_device(device), num_gaussians)
 
 
 def _choose_scored_views(prepared: Prepared, options: CompactOptions) -> tuple[int, ...]:

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 from gsmerge.io.cameras.moves import describe_moves, list_moves
 from gsmerge.plan import Plan
-from gsmerge.render.photos import NEAR, photo_psnr, photos_of, scene_photos
+from gsmerge.render.photos import NEAR, scene_photos
 from gsmerge.runtime.memory import peak_memory
-from gsmerge.runtime.record import Record, choose, current_record, note, record_part, stage
-from gsmerge.stages.fit import Fitted
+from gsmerge.runtime.record import Record, choose, current_record, note, stage
+from gsmerge.stages.fit import FitBackend, Fitted, run_on
 from gsmerge.stages.prepare import Prepared, scene_depth
 from gsmerge.types import Cameras, Gaussians
 
@@ -128,13 +128,12 @@ def input_psnr(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> float:
 
     In a quarter of every photo, or in the whole where a quality was asked for.
     """
-    photos, frame, quarter = scene_photos(prepared.given), prepared.frame, plan.target_psnr is None
-    if plan.device == "cpu":
-        return photo_psnr(gaussians, photos, plan.scored_views, quarter=quarter, near=NEAR * frame.unit)
-    from gsmerge.gpu.score import score_photos  # torch; loaded where it is used alone
+    photos, near, quarter = scene_photos(prepared.given), NEAR * prepared.frame.unit, plan.target_psnr is None
 
-    photos = photos_of(photos.images, frame.enter_cameras(prepared.given.cameras))  # float32 wants small numbers
-    return score_photos(frame.enter(gaussians), photos, plan.scored_views, plan.device, quarter=quarter)
+    def score_on(backend: FitBackend[Any]) -> float:
+        return backend.photo_psnr(gaussians, photos, plan.scored_views, quarter=quarter, near=near)
+
+    return run_on(plan.backend, "scores", score_on)
 
 
 def make_result(
@@ -158,9 +157,8 @@ def make_result(
     """
     before, run, seconds = None, current_record(), search["seconds"]
     if prepared.given.images is not None:
-        with record_part() as own, stage("input"):
+        with stage("input"):
             before = input_psnr(prepared.given.file_gaussians, prepared, plan)
-        seconds = {**seconds, **own.seconds}
 
     def report(one: Candidate, seconds: Mapping[str, float]) -> CompactReport:
         counts, record = (prepared.given.num_gaussians, len(one.gaussians)), one.record
@@ -168,7 +166,10 @@ def make_result(
             *counts, dict(seconds), before, one.psnr, record.choices, record.notes, plan.settings, peak_memory()
         )
 
-    main = report(best, _add_seconds(run.seconds, seconds))
+    seconds = _add_seconds(run.seconds, seconds)
+    if "input" in seconds:
+        seconds["input"] = seconds.pop("input")  # the last stage, after those of the candidates
+    main = report(best, seconds)
     choices, notes = run.choices | main.choices | search["choices"], [*run.notes, *main.notes]
     main = replace(main, choices=choices, notes=notes, unmet=search["unmet"])
     coarser = tuple(CompactResult(one.gaussians, report(one, one.record.seconds), one.cameras) for one in levels)

@@ -323,8 +323,8 @@ _TABLE = (
         option("fit", ("full", "none"), "What is fitted to the photos.", wording="full"),
         option("effort", ("draft", "fast", "default", "best"), "How much work goes into superpixels and fit.",
                wording="default"),
-        option("device", ("cpu", "cuda", "auto"), "Where the stages run; cuda needs gsmerge[cuda]. auto: a GPU "
-               "where there is one and the scene is large enough.", wording="cpu"),
+        option("device", ("cpu", "cuda", "auto"), "Where the fit and the scores run; cuda needs gsmerge[cuda]. auto: "
+               "a GPU where there is one and the scene is large enough.", wording="cpu"),
         option("fit_steps", int, "Steps of the full fit. By default more Gaussians get more.", wording="by effort",
                rare=True, min=1),
         option("photo_scale", str, "Fit to photos that are larger than the views at up to so many times the views' "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,15 +21,19 @@ def print_plan(args: Args, files: SceneFiles, settings: CompactOptions, out: Pat
     """Print what would be done, as lines or JSON."""
     from gsmerge.baselines import choose_baseline
     from gsmerge.compact_file import check_saved_cameras, read_input
+    from gsmerge.gpu import choose_backend
     from gsmerge.report import document_head
 
     given = read_input(files, opacity=args.opacity, hints=hints)
     check_saved_cameras(given.scene, vars(args).get("save_cameras"))
     _, unused = choose_baseline(settings, given.scene)
+    backend, problem = choose_backend(settings.device, given.scene.num_gaussians)
+    settings = replace(settings, device=backend.device)
+    problems = [] if problem is None else [problem]
     refused = os.path.lexists(out) and not args.overwrite
     exists = [f"{out} exists already: --overwrite would replace it"] * refused
     with usage_errors():
-        document = plan_document(files, given.scene, settings, out, [*given.notes, *unused, *exists])
+        document = plan_document(files, given.scene, settings, out, [*given.notes, *unused, *problems, *exists])
     print_document({**document_head(), **document}, plan_lines(document), as_json=args.json, wrap=True)
 
 

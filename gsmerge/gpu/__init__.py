@@ -1,5 +1,61 @@
 """The fit, its growth, colours and scores on a GPU: plain functions on tensors of any device.
 
-Merging stays on the CPU. Nothing here is imported before ``--device`` resolves to CUDA. On the torch CPU device every
-function gives what the kernels give, which is how it is tested; docs/internals/gpu.md says what differs on a GPU.
+Merging stays on the CPU. torch is loaded only where :func:`choose_backend` is asked for CUDA. On the
+torch CPU device every function gives what the kernels give, which is how it is tested;
+docs/internals/gpu.md says what differs on a GPU.
 """
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+from gsmerge.stages.fit.stage import ON_CPU, FitBackend
+
+# Pixels of all views, as many as an aligned scene has Gaussians, from which "auto" takes CUDA. Starting
+# it and importing gsplat takes one to three seconds, in which two processors do a scene of this size from
+# end to end.
+MIN_PIXELS = 400_000
+NO_DEVICE = "torch finds no CUDA device"
+
+
+def choose_backend(device: str, num_pixels: int) -> tuple[FitBackend[Any], str | None]:
+    """Choose where the fit and the scores run.
+
+    Args:
+        device: ``"cpu"``; ``"cuda"``; or ``"auto"``: CUDA where it can be used and ``num_pixels`` are
+            enough.
+        num_pixels: Pixels of all views.
+
+    Returns:
+        The back end; and a note where CUDA was to be used but cannot be, so that it is the CPU's.
+        ``"auto"`` on a computer without a CUDA device is not worth a note.
+    """
+    if device == "cpu" or (device == "auto" and num_pixels < MIN_PIXELS):
+        return ON_CPU, None
+    problem = cuda_problem()
+    if problem is not None:
+        note = f"the fit and the scores run on the CPU, not on a GPU: {problem}"
+        return ON_CPU, None if device == "auto" and problem == NO_DEVICE else note
+    import torch
+
+    from gsmerge.gpu.backend import make_backend
+
+    return make_backend(torch.device("cuda")), None
+
+
+@cache
+def cuda_problem() -> str | None:
+    """Say what keeps CUDA devices from being used, as a clause; None where nothing does.
+
+    The first call of a process loads gsplat and compares what the device computes with the CPU, see
+    :mod:`gsmerge.gpu.self_check`.
+    """
+    import torch
+
+    if not torch.cuda.is_available():
+        return NO_DEVICE
+    from gsmerge.gpu.self_check import find_difference
+    from gsmerge.render.cuda import gsplat_problem
+
+    return gsplat_problem() or find_difference(torch.device("cuda"))

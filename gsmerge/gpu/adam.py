@@ -1,7 +1,7 @@
-"""One optimiser step on all parameters of all Gaussians, on a device: the kernel ``optimise.adam``.
+"""The parameters under optimisation on a device, and one step on all of them: the kernel ``optimise.adam``.
 
-On CUDA one Triton kernel does all of it (:mod:`gsmerge.gpu.adam_kernel`), elsewhere torch. Both also write what the new
-parameters mean to the rasterizer, so a step begins with nothing to compute.
+On CUDA one Triton kernel does all of a step (:mod:`gsmerge.gpu.adam_kernel`), elsewhere torch. Both also write what the
+new parameters mean to the rasterizer, so a step begins with nothing to compute.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from gsmerge.kernels.gaussians.optimise import COLOR, LOGIT, MAX_LOGIT, MIN_LOGIT, QUAT, SIZE
 from gsmerge.stages.fit.options import FitOptions
+from gsmerge.types import SH_C0, Gaussians
 
 
 @dataclass(eq=False)
@@ -56,7 +57,7 @@ class FitState:
 
 
 @dataclass(frozen=True, eq=False)
-class Gradients:
+class StepGradients:
     """Gradients of a loss in what the rasterizer is given; shapes as there. ``reached [n]`` bool: drawn in the view."""
 
     means: Tensor
@@ -67,8 +68,36 @@ class Gradients:
     reached: Tensor
 
 
+def start_state(gaussians: Gaussians) -> FitState:
+    """Make a fresh state at some Gaussians."""
+    opacities = gaussians.opacities.double().clamp(0.004, 0.999)
+    x = torch.cat(
+        [
+            gaussians.means,
+            gaussians.scales.clamp_min(1e-9).log(),
+            gaussians.quats,
+            (opacities / (1 - opacities)).log().float()[:, None],
+            0.5 + SH_C0 * gaussians.sh0[:, 0],
+        ],
+        1,
+    )
+    return state_of(x, gaussians.shN)
+
+
+def gaussians_of(x: Tensor, shN: Tensor) -> Gaussians:
+    """Return the Gaussians that parameters ``[n,14]`` and higher harmonics ``[n,k-1,3]`` stand for."""
+    return Gaussians(
+        means=x[:, :SIZE].contiguous(),
+        quats=x[:, QUAT:LOGIT].contiguous(),
+        scales=x[:, SIZE:QUAT].exp(),
+        opacities=x[:, LOGIT].sigmoid(),
+        sh0=((x[:, COLOR:] - 0.5) / SH_C0)[:, None],
+        shN=shN,
+    )
+
+
 def state_of(x: Tensor, shN: Tensor) -> FitState:
-    """A fresh state at parameters ``[n,14]`` and higher harmonics ``[n,k-1,3]``."""
+    """Make a fresh state at parameters ``[n,14]`` and higher harmonics ``[n,k-1,3]``."""
     sizes = x[:, SIZE:QUAT].sort(1).values
     units = ((sizes[:, 1] + sizes[:, 2]) / 2).exp()
     shown = (x[:, :SIZE], x[:, QUAT:LOGIT], x[:, SIZE:QUAT].exp(), x[:, LOGIT].sigmoid(), x[:, COLOR:])
@@ -79,8 +108,10 @@ def state_of(x: Tensor, shN: Tensor) -> FitState:
     )  # fmt: skip
 
 
-def adam_step(state: FitState, gradients: Gradients, options: FitOptions, rates: Tensor, step: int) -> None:
-    """Adam on a view's gradients, then the box about the start, in place; what the view does not show stays.
+def adam_step(state: FitState, gradients: StepGradients, options: FitOptions, rates: Tensor, step: int) -> None:
+    """Take an Adam step by a view's gradients, in place, within the box about the start.
+
+    Gaussians that the view does not show stay as they are.
 
     Args:
         state: n Gaussians.
@@ -99,12 +130,12 @@ def adam_step(state: FitState, gradients: Gradients, options: FitOptions, rates:
 
 @cache
 def has_triton() -> bool:
-    """Whether Triton is there; CUDA builds of torch for Linux bring it."""
+    """Return whether Triton is there; CUDA builds of torch for Linux bring it."""
     return find_spec("triton") is not None
 
 
-def step_in_torch(state: FitState, gradients: Gradients, options: FitOptions, rates: Tensor, step: int) -> None:
-    """:func:`adam_step` without Triton."""
+def step_in_torch(state: FitState, gradients: StepGradients, options: FitOptions, rates: Tensor, step: int) -> None:
+    """Take the step of :func:`adam_step` without Triton."""
     gradient, limits = parameter_gradient(state, gradients, options), options.rates
     energy = gradient * gradient
     for shared in (slice(0, SIZE), slice(QUAT, LOGIT)):  # one second moment, so that steps turn with the scene
@@ -124,8 +155,8 @@ def step_in_torch(state: FitState, gradients: Gradients, options: FitOptions, ra
         shown.copy_(meaning)
 
 
-def parameter_gradient(state: FitState, gradients: Gradients, options: FitOptions) -> Tensor:
-    """``[n,14]`` gradient in the optimiser's parameters: means in units of each size, log scales, logit."""
+def parameter_gradient(state: FitState, gradients: StepGradients, options: FitOptions) -> Tensor:
+    """Return the gradient ``[n,14]`` in the optimiser's parameters: means in units of each size, log, logit."""
     units, each = state.units[:, None], gradients.reached[:, None] / max(len(state), 1)
     slope = (state.opacities * (1 - state.opacities))[:, None]
     fade = gradients.opacities[:, None] + options.opacity_reg * each
@@ -136,7 +167,7 @@ def parameter_gradient(state: FitState, gradients: Gradients, options: FitOption
 
 
 def confine(state: FitState, x: Tensor, options: FitOptions) -> Tensor:
-    """New parameters ``[n,14]``, brought into the box about the start, with unit quaternions."""
+    """Bring new parameters ``[n,14]`` into the box about the start, with unit quaternions."""
     x0, rates, shares = state.x0, options.rates, state.box_shares[:, None]
     offset = x[:, :SIZE] - x0[:, :SIZE]
     far, reach = offset.norm(dim=1, keepdim=True), shares * rates.max_mean_shift * state.units[:, None]

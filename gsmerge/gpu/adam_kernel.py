@@ -5,7 +5,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from gsmerge.gpu.adam import FitState, Gradients
+from gsmerge.gpu.adam import FitState, StepGradients
 from gsmerge.stages.fit.options import FitOptions
 
 BLOCK = 128  # Gaussians to a program
@@ -16,7 +16,7 @@ DARKEST, BRIGHTEST = tl.constexpr(-0.05), tl.constexpr(1.05)
 
 @triton.jit
 def _move(m, v, at, mask, gradient, energy, b1, b2, c1, c2):
-    """Moments of one column, updated -> what Adam moves it by, for a rate of one."""
+    """Update the moments of one column, and return what Adam moves it by for a rate of one."""
     first = b1 * tl.load(m + at, mask, 0.0) + (1.0 - b1) * gradient
     second = b2 * tl.load(v + at, mask, 0.0) + (1.0 - b2) * energy
     tl.store(m + at, first, mask)
@@ -79,7 +79,7 @@ def _step_quats(x, m, v, g_quats, quats, rates, row, i, mask, b1, b2, c1, c2):
     tl.store(quats + 4 * i + 3, n3, mask)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count"])  # or it would be compiled again when the number of Gaussians grows
 def _step(
     x, x0, m, v, units, shares, least, g_means, g_quats, g_scales, g_opacities, g_colors, reached, rates,
     means, quats, scales, opacities, colors, count, opacity_pull, scale_pull,
@@ -120,15 +120,14 @@ def _step(
         tl.store(colors + 3 * i + c, new, mask)
 
 
-def launch(state: FitState, gradients: Gradients, options: FitOptions, rates: object, step: int) -> None:
-    """One step on tensors of one device, in place; arguments as of :func:`gsmerge.gpu.adam.adam_step`."""
+def launch(state: FitState, gradients: StepGradients, options: FitOptions, rates: object, step: int) -> None:
+    """Take one step on tensors of one device, in place; see :func:`gsmerge.gpu.adam.adam_step`."""
     count, limits, g = len(state), options.rates, gradients
     if count == 0:
         return
-    wanted = (g.means, g.quats, g.scales, g.opacities, g.colors)
     _step[(triton.cdiv(count, BLOCK),)](
         state.x, state.x0, state.m, state.v, state.units, state.box_shares, state.min_sizes,
-        *(tensor.contiguous() for tensor in wanted), g.reached, rates,
+        *(tensor.contiguous() for tensor in (g.means, g.quats, g.scales, g.opacities, g.colors)), g.reached, rates,
         state.means, state.quats, state.scales, state.opacities, state.colors, count,
         options.opacity_reg / count, options.scale_reg / count,
         limits.max_mean_shift, limits.max_scale_change, limits.max_opacity_change, limits.beta1, limits.beta2,

@@ -50,7 +50,7 @@ def measure_speeds(
     The scenes take turns, so that a machine that slows down slows all of them. ``long_sides`` are pixels along the
     longer side, ``near`` is in world units.
     """
-    from gsmerge.render.cuda import cuda_problem  # loads torch
+    from gsmerge.gpu import cuda_problem
 
     few = cameras[pick_views(len(cameras), NUM_VIEWS)]
     speeds: dict[str, list[Speed]] = {name: [] for name in scenes}

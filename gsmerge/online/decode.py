@@ -9,6 +9,7 @@ import numpy as np
 from gsmerge.encoded.decode import decode_scene, plan_decode
 from gsmerge.encoded.encoded import Encoded
 from gsmerge.errors import UsageError
+from gsmerge.gpu import choose_backend
 from gsmerge.online.photos import BatchPhotos
 from gsmerge.online.state import OnlineState, to_encoded
 from gsmerge.runtime.record import Progress, record_run, stage
@@ -81,13 +82,16 @@ def decode_stored(
     max_count = int(plan.counts.sum())
     start_count = max(len(encoded), int(start_share(options) * max_count)) + encoded.num_kept
     canonical = replace(encoded, frame=Frame(np.zeros(3), 1.0))
-    with use_threads(threads), record_run(progress):
+    with use_threads(threads), record_run(progress) as record:
         gaussians = decode_scene(canonical, budget=start_count, threads=threads)
         images = stored.replay.images.astype(np.float32) / np.float32(255)
         replay = BatchPhotos(images, stored.cameras[stored.replay.views])
         photos = replay.photos(), replay.photos(2)
+        num_pixels = len(photos[0]) * photos[0].height * photos[0].width
+        backend, problem = choose_backend(device, num_pixels)
         with stage("fit"):
-            gaussians, report = fit(gaussians, photos, options, max_count, seed, report_steps, device=device)
+            gaussians, report = fit(gaussians, photos, options, max_count, seed, report_steps, backend=backend)
+    notes = *notes, *([] if problem is None else [problem]), *record.notes
     if report is not None and not report.accepted:  # then the colours that were fitted batch by batch are better
         note = "the fit was not accepted: held-out parts of the photos did not get better"
         gaussians = decode_scene(to_encoded(stored), k=k, budget=budget, threads=threads)

@@ -161,11 +161,16 @@ def photo_psnr(
         return scored_tiles(view, photos.width, photos.height) if quarter else None
 
     def score(view: int, image: np.ndarray, _: np.ndarray) -> float:
-        chosen = tiles(view)
-        mask = None if chosen is None else chosen.repeat(TILE, 0).repeat(TILE, 1)[: photos.height, : photos.width]
-        return psnr(np.clip(image, 0, 1, out=image), photos.images[view], mask)
+        return view_psnr(image, photos, view, quarter=quarter)
 
     return float(np.mean(photo_errors(gaussians, photos, score, views, tiles=tiles, **settings)))
+
+
+def view_psnr(image: np.ndarray, photos: Photos, view: int, *, quarter: bool) -> float:
+    """Return the PSNR (dB) of a photo, or a quarter of it, and its render ``[h,w,3]``, clipped in place."""
+    tiles = scored_tiles(view, photos.width, photos.height) if quarter else None
+    mask = None if tiles is None else tiles.repeat(TILE, 0).repeat(TILE, 1)[: photos.height, : photos.width]
+    return psnr(np.clip(image, 0, 1, out=image), photos.images[view], mask)
 
 
 def scored_tiles(view: int, width: int, height: int) -> np.ndarray | None:

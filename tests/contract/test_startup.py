@@ -64,6 +64,12 @@ def test_compacting_needs_neither_torch_nor_scipy(made_scene: Path, tmp_path: Pa
     assert outputs[0].read_bytes() == outputs[1].read_bytes()
 
 
+def test_naming_a_device_loads_no_torch() -> None:
+    """Whether there is a GPU is asked when it is to be used."""
+    code = "from gsmerge import CompactOptions\nCompactOptions().with_settings({'device': 'cuda'})"
+    assert "torch" not in loaded_after(code)
+
+
 def test_missing_file_is_one_line() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "gsmerge", "compact", "nowhere.ply"], capture_output=True, text=True, check=False

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import errno
+import json
 import os
 import shutil
 import signal
@@ -15,6 +16,7 @@ from typing import Any
 
 import pytest
 
+from gsmerge import gpu
 from gsmerge.errors import OUT_OF_MEMORY, SceneError
 
 from .conftest import Run, listing
@@ -112,16 +114,22 @@ def test_more_superpixels_than_pixels_are_refused_before_the_page_is_made(
         assert "superpixels: expected at most 6144, one per pixel of 96 x 64, got 999999" in outcome.err
 
 
-def test_a_gpu_that_is_not_there_is_wrong_usage(scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Told before any work; ``auto`` takes the CPU, and says so in the report."""
+def test_gpu_that_is_not_there_is_noted(
+    scene_copy: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The CPU does the work; where CUDA was asked for a note says why, before the work, too."""
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    outcome = run("compact", scene_copy, "--device", "cuda")
-    assert outcome.code == 2
-    assert outcome.err.count("\n") == 1
-    assert 'device: expected "cpu" or a CUDA device that can be used, got "cuda", but torch finds no' in outcome.err
-    plan = run("compact", scene_copy, "--device", "auto", "--dry-run", "--json")
-    assert plan.code == 0
-    assert '"device": "cpu"' in plan.out
+    monkeypatch.setattr(gpu, "cuda_problem", gpu.cuda_problem.__wrapped__)
+    note = "the fit and the scores run on the CPU, not on a GPU: torch finds no CUDA device"
+    for device, is_noted in (("cuda", True), ("auto", False)):
+        plan = run("compact", scene_copy, "--device", device, "--dry-run", "--json")
+        assert plan.code == 0
+        assert json.loads(plan.out)["options"]["device"] == "cpu"
+        assert (note in json.loads(plan.out)["notes"]) == is_noted
+    call = ("compact", scene_copy, "-o", tmp_path / "a.ply", "--device", "cuda", "--effort", "draft", "--json")
+    outcome = run(*call)
+    assert outcome.code == 0
+    assert note in json.loads(outcome.out)["notes"]
 
 
 @pytest.mark.parametrize("more", [("--report", "none/report.json"), ("--levels", 2), ("--report", "report.json")])

@@ -1,12 +1,14 @@
 """gsplat's interface over the slow float64 renderer: strict about what it is given, on any device.
 
-The signature and the checks are those of ``gsplat.rasterization`` 1.5, and its kernels' demands (float32, one device)
-are added. Alpha is clamped at 0.99, as by the sources after 1.5.3 and by the CPU.
+The signature and the checks are those of ``gsplat.rasterization`` 1.5.3, and its kernels' demands (float32, one device)
+are added. As there alpha is clamped at 0.999, and what has no footprint has no mean and conic either (NaN here, memory
+as it was there).
 """
 
 from __future__ import annotations
 
 import sys
+from functools import cache
 from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import Any
@@ -16,6 +18,8 @@ import torch
 from reference_gradients import NAMES  # which makes the renderer's folder known
 from renderer import footprints, harmonics, render_reference
 from torch import Tensor
+
+from gsmerge.render import cuda
 
 assert NAMES
 CALLS: list[dict[str, Any]] = []
@@ -82,7 +86,7 @@ def rasterization(
             seen = (spherical_harmonics(sh_degree, means.double() - eye, seen) + 0.5).clamp_min(0)
         drawn = render_reference(
             *doubles, seen, viewmat, K, width, height, antialiased=rasterize_mode == "antialiased",
-            near=near_plane, far=far_plane, eps2d=eps2d,
+            near=near_plane, far=far_plane, eps2d=eps2d, max_alpha=0.999,
         )  # fmt: skip
         image = drawn.image + drawn.transmittance[..., None] * background
         images.append(torch.cat([image, drawn.depth[..., None]], -1) if render_mode == "RGB+ED" else image)
@@ -94,6 +98,8 @@ def rasterization(
     depths = torch.einsum("cij,nj->cni", viewmats[:, :3, :3], means)[..., 2] + viewmats[:, 2, 3:]
     radii = (depths > near_plane).int()[..., None].expand(-1, -1, 2)
     means2d, conics, drawn_opacities = (torch.stack(parts) for parts in zip(*shapes, strict=True))
+    for values in (means2d, conics):
+        values[radii[..., 0] == 0] = torch.nan
     details = {"radii": radii, "means2d": means2d, "conics": conics, "opacities": drawn_opacities}
     tiles = torch.zeros(c, -(-height // tile_size), -(-width // tile_size), dtype=torch.int32)
     details |= {"isect_offsets": tiles, "flatten_ids": depths.flatten().argsort().int(), "tile_size": tile_size}
@@ -122,7 +128,7 @@ def rasterize_to_indices_in_range(
     assert isect_offsets.shape == (1, -(-image_height // tile_size), -(-image_width // tile_size))
     order = flatten_ids.long()
     pixels, places = torch.nonzero(WEIGHTS[0][order].flatten(1).T > 0, as_tuple=True)
-    return order[places].int(), pixels.int(), torch.zeros_like(pixels)
+    return order[places], pixels, torch.zeros_like(pixels)
 
 
 def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None) -> Tensor:
@@ -138,10 +144,24 @@ def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks
 @pytest.fixture
 def fake_gsplat(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     """``import gsplat`` finds the functions above; gives their calls."""
-    module = ModuleType("gsplat")
-    module.__spec__ = ModuleSpec("gsplat", None)
+    install(monkeypatch, compiled=object())
     for function in (rasterization, spherical_harmonics, rasterize_to_indices_in_range):
-        setattr(module, function.__name__, function)
-    monkeypatch.setitem(sys.modules, "gsplat", module)
+        monkeypatch.setattr(sys.modules["gsplat"], function.__name__, function, raising=False)
     CALLS.clear()
     return CALLS
+
+
+def install(monkeypatch: pytest.MonkeyPatch, compiled: object) -> None:
+    """Put an empty gsplat in place of any that is there; ``compiled`` is its extension, None where it has none."""
+    for name in ("gsplat", "gsplat.cuda", "gsplat.cuda._backend"):
+        module = ModuleType(name)
+        module.__spec__ = ModuleSpec(name, None)
+        monkeypatch.setitem(sys.modules, name, module)
+    modules = [sys.modules[name] for name in ("gsplat.cuda", "gsplat.cuda._backend")]
+    modules[0]._backend, modules[1]._C = modules[1], compiled  # type: ignore[attr-defined]
+    forget(monkeypatch)
+
+
+def forget(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the adapter ask again whether gsplat is there, in this test and after it."""
+    monkeypatch.setattr(cuda, "gsplat_problem", cache(cuda.gsplat_problem.__wrapped__))

@@ -5,13 +5,13 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from importlib.util import find_spec
-from types import ModuleType
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from fake_gsplat import fake_gsplat  # noqa: F401 - a fixture
+from fake_gsplat import fake_gsplat, forget, install  # noqa: F401 - one is a fixture
 from reference_gradients import BACKGROUND, NAMES, assert_close, leaves, pixel_gradients, random_gaussians
 from reference_gradients import turned_cameras as cameras_of
 from torch import Tensor
@@ -19,12 +19,10 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 
 from gsmerge import Cameras, Gaussians, render
 from gsmerge.errors import GsmergeError
-from gsmerge.options import CompactOptions
 from gsmerge.render import Rendering, contributions, plan_view, prepare
 from gsmerge.render import cuda as adapter
 from gsmerge.render.colored import draw_colored, seen_colors
-from gsmerge.render.cuda import chosen_device, harmonic_colors, rasterize, render_cuda, usable_device
-from gsmerge.stages.fit import FitOptions
+from gsmerge.render.cuda import harmonic_colors, rasterize, render_cuda
 
 Calls = list[dict[str, Any]]
 DEFAULTS: dict[str, Any] = {"antialiased": False, "near": 0.01, "far": 1e10, "with_depths": False}
@@ -62,7 +60,7 @@ def assert_same(actual: Rendering, expected: Rendering, least: float = 80.0) -> 
 def test_images_are_the_cpu_s(degree: int, fake_gsplat: Calls) -> None:  # noqa: F811
     gaussians, cameras = random_gaussians(40, degree, degree), cameras_of()
     assert_same(by_adapter(gaussians, cameras), render(gaussians, cameras, BACKGROUND))
-    assert len(fake_gsplat) == 1  # all views at once
+    assert len(fake_gsplat) == len(cameras)  # view by view: all at once would copy the harmonics for each
 
 
 @pytest.mark.parametrize(
@@ -82,7 +80,7 @@ def test_what_gsplat_is_told(fake_gsplat: Calls) -> None:  # noqa: F811
     gaussians, cameras = random_gaussians(9, 2), cameras_of(3)
     by_adapter(gaussians, cameras, antialiased=True, near=0.5, far=7.0, with_depths=True)
     by_adapter(gaussians, cameras)
-    first, second = fake_gsplat
+    first, second = fake_gsplat[0], fake_gsplat[-1]
     assert (first["width"], first["height"], first["sh_degree"]) == (cameras.width, cameras.height, 2)
     assert (first["near_plane"], first["far_plane"], first["eps2d"]) == (0.5, 7.0, 0.3)
     assert (first["render_mode"], first["rasterize_mode"]) == ("RGB+ED", "antialiased")
@@ -91,7 +89,8 @@ def test_what_gsplat_is_told(fake_gsplat: Calls) -> None:  # noqa: F811
     assert torch.equal(first["quats"], gaussians.quats)
     assert torch.equal(first["scales"], gaussians.scales)
     assert torch.equal(first["opacities"], gaussians.opacities)
-    assert torch.equal(first["Ks"], cameras.Ks.float())
+    assert torch.equal(first["Ks"], cameras.Ks[:1].float())
+    assert torch.equal(second["Ks"], cameras.Ks[2:].float())
 
 
 @pytest.mark.parametrize("degree", [0, 3])
@@ -106,21 +105,34 @@ def test_gradients_are_the_cpu_s(degree: int, fake_gsplat: Calls) -> None:  # no
 def test_peaks_are_the_cpu_s(eps2d: float, fake_gsplat: Calls) -> None:  # noqa: F811
     gaussians, cameras = random_gaussians(40), cameras_of(1)
     shape = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities
-    views = cameras.viewmats, cameras.Ks, cameras.width, cameras.height
-    peaks, reached = adapter.peak_weights(shape, views, eps2d=eps2d)
+    camera = cameras.viewmats[0], cameras.Ks[0], cameras.width, cameras.height
+    peaks, reached = adapter.peak_weights(shape, camera, eps2d=eps2d)
     plan = plan_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], cameras.width, cameras.height, eps2d=eps2d)
     expected = contributions(plan)[1]
     assert (expected > 0.01).sum() > 20
     np.testing.assert_allclose(peaks, expected, atol=2e-4)
     assert reached[torch.from_numpy(expected > 0)].all()
-    assert len(adapter.peak_weights(tuple(tensor[:0] for tensor in shape), views)[0]) == 0  # type: ignore[arg-type]
+    assert len(adapter.peak_weights(tuple(tensor[:0] for tensor in shape), camera)[0]) == 0  # type: ignore[arg-type]
 
 
-def test_starting_draws_and_differentiates(fake_gsplat: Calls) -> None:  # noqa: F811
-    with torch.no_grad():  # as within a run
-        adapter.start_cuda(torch.device("cpu"))
-    assert len(fake_gsplat) == 1
-    assert fake_gsplat[0]["means"].requires_grad
+def test_peaks_have_gsplat_s_clamp(fake_gsplat: Calls) -> None:  # noqa: F811
+    """Of an opaque Gaussian whose centre is that of a pixel; in the image, too, so that the two agree."""
+    shape = torch.tensor([[0.0, 0, 2]]), torch.eye(4)[:1], torch.ones(1, 3), torch.ones(1)
+    camera = torch.eye(4), torch.tensor([[8.0, 0, 4.5], [0, 8, 4.5], [0, 0, 1]]), 9, 9
+    assert float(adapter.peak_weights(shape, camera)[0]) == pytest.approx(adapter.MAX_ALPHA)
+    image, *_ = rasterize(shape, torch.ones(1, 3), camera, torch.zeros(3))
+    assert float(image.max()) == pytest.approx(adapter.MAX_ALPHA)
+
+
+def test_nothing_to_list(fake_gsplat: Calls) -> None:  # noqa: F811
+    """Behind the camera: no pixel has an entry."""
+    gaussians, cameras = random_gaussians(5), cameras_of(1)
+    behind = gaussians.means - torch.tensor([0.0, 0, 9])
+    camera = cameras.viewmats[0], cameras.Ks[0], cameras.width, cameras.height
+    shape = behind, gaussians.quats, gaussians.scales, gaussians.opacities
+    peaks, reached = adapter.peak_weights(shape, camera)
+    assert not peaks.any()
+    assert not reached.any()
 
 
 def test_geographic_coordinates_keep_their_detail(fake_gsplat: Calls) -> None:  # noqa: F811
@@ -185,10 +197,9 @@ def test_given_colours_and_dilation_pass(fake_gsplat: Calls) -> None:  # noqa: F
             image, reached = draw_colored(shape, tensors[4], camera, background)
             assert reached.shape == (len(colors),)
         else:
-            views = viewmat[None], K[None], 37, 21
-            drawn, reached = rasterize(shape, tensors[4], views, torch.from_numpy(background), eps2d=0.075)
-            image = drawn.images[0]
-            assert reached.shape == (1, len(tensors[4]))
+            under = torch.from_numpy(background)
+            image, alpha, depth, reached = rasterize(shape, tensors[4], (viewmat, K, 37, 21), under, eps2d=0.075)
+            assert (alpha.shape, depth, reached.shape) == ((21, 37, 1), None, (len(tensors[4]),))
         (image * grad_image[0]).sum().backward()
         actual.append((image.detach(), [tensor.grad for tensor in tensors]))
     assert psnr(actual[0][0], actual[1][0]) > 80
@@ -229,8 +240,8 @@ def test_cuda_tensors_go_to_gsplat(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("with_depths", [False, True])
 def test_gsplat_gets_tensors_of_the_device_alone(with_depths: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """With tensors that have a device and no memory: mixing devices would fail."""
-    module = ModuleType("gsplat")
-    monkeypatch.setitem(sys.modules, "gsplat", module)
+    install(monkeypatch, compiled=object())
+    module = sys.modules["gsplat"]
 
     def rasterization(**given: Any) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
         assert all(value.is_meta for value in given.values() if isinstance(value, Tensor))
@@ -264,31 +275,37 @@ def test_devices_must_agree() -> None:
 
 def test_without_gsplat_it_is_said_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gsplat", None)
-    with pytest.raises(GsmergeError, match=r'gsplat.*; pip install "gsplat>=1.5,<2"$'):
+    forget(monkeypatch)
+    with pytest.raises(GsmergeError, match=r'gsplat, but .*; pip install "gsplat>=1.5,<1.6"$'):
         by_adapter(random_gaussians(3), cameras_of())
 
 
-def test_device_is_resolved(monkeypatch: pytest.MonkeyPatch, fake_gsplat: Calls) -> None:  # noqa: F811
-    assert usable_device("cpu") == FitOptions().device == "cpu"
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    assert [usable_device(name) for name in ("cuda", "auto")] == ["cuda", "auto"]
-    assert FitOptions(device="auto").device == "auto"
-    sizes = (adapter.MIN_PIXELS - 1, adapter.MIN_PIXELS)
-    assert [chosen_device("auto", size) for size in sizes] == ["cpu", "cuda"]
-    assert [chosen_device(name, 1) for name in ("cpu", "cuda")] == ["cpu", "cuda"]
-    options = CompactOptions().with_settings({"device": "auto"})
-    assert [options.with_chosen_device(size).fit.device for size in sizes] == ["cpu", "cuda"]
-    monkeypatch.delitem(sys.modules, "gsplat")
-    monkeypatch.setattr(adapter, "find_spec", lambda name: None)
-    assert usable_device("auto") == chosen_device("auto", 10**9) == "cpu"
-    with pytest.raises(ValueError, match=r'got "cuda", but gsplat is not installed; pip install "gsplat>=1.5,<2"$'):
-        usable_device("cuda")
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert FitOptions(device="auto").device == "cpu"
-    with pytest.raises(ValueError, match='got "cuda", but torch finds no CUDA device'):
-        FitOptions(device="cuda")
-    with pytest.raises(ValueError, match='device: expected "cpu", "cuda" or "auto", got "gpu"'):
-        FitOptions(device="gpu")  # type: ignore[arg-type]
+def test_gsplat_without_its_compiled_part_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a wheel and a compiler gsplat can be imported, and fails at its first kernel."""
+    install(monkeypatch, compiled=None)
+    with pytest.raises(GsmergeError, match="gsplat has no compiled part, and no CUDA toolkit was found to compile it"):
+        by_adapter(random_gaussians(3), cameras_of())
+
+
+def test_gsplat_that_cannot_be_compiled_is_told(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In one line, and once: compiling takes minutes. What gsplat prints stays off standard output."""
+    folder = tmp_path / "gsplat" / "cuda"
+    folder.mkdir(parents=True)
+    for name in ("__init__.py", "cuda/__init__.py"):
+        (tmp_path / "gsplat" / name).touch()
+    fails = 'print("gsplat: Setting up CUDA")\nraise RuntimeError("Error building extension\\nninja: failed")\n'
+    (folder / "_backend.py").write_text(fails)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    for name in ("gsplat", "gsplat.cuda", "gsplat.cuda._backend"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    forget(monkeypatch)
+    for _ in range(2):
+        with pytest.raises(GsmergeError, match=r"cannot be loaded \(RuntimeError: Error building extension\)$"):
+            by_adapter(random_gaussians(3), cameras_of())
+    printed = capsys.readouterr()
+    assert (printed.out, printed.err.count("Setting up CUDA")) == ("", 1)
 
 
 # both backends, on a GPU

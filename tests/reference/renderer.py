@@ -114,6 +114,7 @@ def render_reference(
     near: float = 0.01,
     far: float = 1e10,
     eps2d: float = 0.3,
+    max_alpha: float = 0.99,
 ) -> Reference:
     """Blend Gaussians of given colours ``[n,3]``, nearest first."""
     means2d, covars2d, depths = footprints(means, quats, scales, viewmat, K, width, height)
@@ -132,7 +133,7 @@ def render_reference(
             continue
         offset = pixels - means2d[g]
         alpha = opacities[g] * torch.exp(-0.5 * torch.einsum("hwi,ij,hwj->hw", offset, conics[g], offset))
-        alpha = torch.clamp(alpha, max=0.99)
+        alpha = torch.clamp(alpha, max=max_alpha)
         drawn = going & (alpha >= 1 / 255)
         following = transmittance * (1 - alpha)
         going = going & ~(drawn & (following <= 1e-4))

@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from copy import deepcopy
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from gsmerge.kernels.gaussians import optimise as kernels
 from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT
+from gsmerge.kernels.raster.walk import MAX_ALPHA
 from gsmerge.render import composite, plan_view, splat_adjoint
 from gsmerge.render.blend import blend, view_colors
 from gsmerge.render.gradient import gradients_of
@@ -118,7 +120,7 @@ def fit_step(state: State, plan: Plan, view: int, step: int, progress: float, rn
     background, opacities = rng.random(3, dtype=np.float32), None
     if plan.dropout > 0:
         kept = rng.random(len(state.x), dtype=np.float32) >= plan.dropout
-        opacities = kept * np.minimum(state.splats.opacities / np.float32(1 - plan.dropout), np.float32(0.99))
+        opacities = kept * np.minimum(state.splats.opacities / np.float32(1 - plan.dropout), MAX_ALPHA)
     drawn = plan_view(state.splats, **(photos.camera(view) | look_of(step, level, photos.eps2d)), opacities=opacities)
     all_colors = state.view_colors()
     colors = view_colors(drawn) if all_colors is None else all_colors.take(drawn.ids, 0)
@@ -264,8 +266,8 @@ def fit_full(
     own, state.box_shares[:], state.min_sizes[:] = initial_scores(state, plan)
     after = before = score_to_beat(own, baseline_start, plan)
     queue: list[int] = []
-    grows = options.grows
-    step, steps, started, error, judged = 0, options.steps, time.perf_counter(), 0.0, False
+    grows, step, steps, error, judged = options.grows, 0, options.steps, 0.0, False
+    started = start_clock(state, plan)
     while step < steps:
         part = step / steps
         if grows and part >= GROWTH and len(state.x) < count:
@@ -294,6 +296,14 @@ def fit_full(
     viewmats = None if plan.poses is None else plan.poses.viewmats
     fitted = gaussians_of(tail.of(state.x), state.splats.shN)
     return fitted, FitReport("full", True, step, before, after, why, viewmats)
+
+
+def start_clock(state: State, plan: Plan) -> float:
+    """Return the present time; for a time budget after a step on copies, which loads the kernels."""
+    if plan.options.time_budget is not None:
+        apart = replace(plan, poses=deepcopy(plan.poses))
+        fit_step(deepcopy(state), apart, 0, 1, 0.0, np.random.default_rng(0))
+    return time.perf_counter()
 
 
 def affordable_steps(seconds: float, plan: Plan) -> int:

@@ -22,6 +22,7 @@ class FitReport:
         holdout_after: The same after it.
         stopped: Why it ended.
         viewmats: ``[v,4,4]`` poses of the photos after the fit; None where they were fixed.
+        device: Where it ran: ``"cpu"`` or ``"cuda"``.
     """
 
     method: str
@@ -31,6 +32,7 @@ class FitReport:
     holdout_after: float
     stopped: str
     viewmats: np.ndarray | None = None
+    device: str = "cpu"
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
 from gsmerge.render import contributions, plan_view, prepare
-from gsmerge.render.photos import Photos, photo_errors
-from gsmerge.runtime.record import choose, stage
+from gsmerge.render.photos import Photos, photo_errors, photo_psnr
+from gsmerge.runtime.record import choose, note, stage
 from gsmerge.runtime.threads import in_turn
 from gsmerge.stages.decode import Decoded
 from gsmerge.stages.fit.color import draw, fit_colors
@@ -24,6 +24,8 @@ from gsmerge.types import Array, Gaussians, Scene
 
 FitResult = tuple[Gaussians, FitReport]
 PhotosT = TypeVar("PhotosT")  # photos of one size, where a back end has them
+ResultT = TypeVar("ResultT")
+DataT = TypeVar("DataT")  # on the CPU where it is used
 CLOSE = 1.0  # dB that the held-out blocks must gain; after less, the whole photos are compared
 ALWAYS = float("inf")  # where the full fit failed: it may have begun where another one ended
 START = 0.57  # share of the Gaussians that a run which grows begins with
@@ -31,136 +33,23 @@ START = 0.57  # share of the Gaussians that a run which grows begins with
 
 @dataclass(frozen=True)
 class FitBackend(Generic[PhotosT]):
-    """What the stage is made of: functions on arrays and :class:`Photos`, or on tensors and their device's photos."""
+    """The functions that the fit and the scores are made of, on the CPU (``ON_CPU``) or on a GPU.
 
+    ``photo_psnr`` takes Gaussians and photos as a caller has them, all others as ``upload`` and
+    ``upload_photos`` return them.
+    """
+
+    device: str  # "cpu" or "cuda"
+    upload: Callable[[Gaussians], Gaussians]
+    upload_photos: Callable[[Photos], PhotosT]
+    download: Callable[[Gaussians], Gaussians]
     visible_mask: Callable[[Gaussians, PhotosT, float], Array]  # see visible_mask
     fit_full: Callable[..., FitResult]  # see gsmerge.stages.fit.full.fit_full; without masks
     fit_colors: Callable[[Gaussians, PhotosT, FitOptions, int], FitResult]  # the last: a seed
     grow: Callable[[Gaussians, PhotosT, int], Gaussians]  # to a number, see gsmerge.stages.fit.grow.grow_to
     photo_error: Callable[[Gaussians, PhotosT], float]  # mean squared error of all photos
-
-
-def fit(
-    gaussians: Gaussians,
-    photos: tuple[Photos, ...],
-    options: FitOptions,
-    count: int = 0,
-    seed: int = 0,
-    progress: Progress | None = None,
-    baseline_start: Gaussians | None = None,
-    *,
-    exact: bool = False,
-    device: str = "cpu",
-) -> tuple[Gaussians, FitReport | None]:
-    """Leave out what no photo shows, and fit the rest to the photos; a draft without a fit leaves out nothing.
-
-    Where the full fit does not make held-out parts of the photos better, the colour fit is tried.
-
-    Args:
-        gaussians: Canonical Gaussians.
-        photos: The input views, see :func:`gsmerge.stages.fit.fit_photos`. Larger ones are fitted to on the CPU alone.
-        options: What to fit.
-        count: Number of Gaussians that the full fit may grow to.
-        seed: Everything random.
-        progress: Called after every step of the full fit.
-        baseline_start: Another start that the full fit may beat instead, see
-            :func:`gsmerge.stages.fit.full.score_to_beat`.
-        exact: Whether ``count`` is to be met: where nothing grows to it, nothing is left out either.
-        device: Where to fit, ``"cpu"`` or ``"cuda"``.
-
-    Returns:
-        The Gaussians that stay, fitted, and what was done; None if nothing was asked for.
-    """
-    if device != "cpu":
-        from gsmerge.gpu.fit import fit_gaussians  # torch; it stands above all stages, and is loaded for its use alone
-
-        settings = options, count, seed, progress, baseline_start
-        return fit_gaussians(gaussians, (photos[0], photos[1]), *settings, exact=exact, device=device)
-    return fit_with(ON_CPU, gaussians, photos, options, count, seed, progress, baseline_start, exact=exact)
-
-
-@stage("fit")
-def fit_scene(
-    decoded: Decoded, scene: Scene, views: Sequence[int], options: FitOptions, seed: int, device: str
-) -> Fitted:
-    """Fit decoded Gaussians to the photos of some views; as they are where there are none, or nothing was asked for.
-
-    Args:
-        decoded: Where to begin, and the number of Gaussians to grow to.
-        scene: Canonical.
-        views: Of the scene, whose photos are used.
-        options: What to fit.
-        seed: Everything random.
-        device: Where to fit, ``"cpu"`` or ``"cuda"``. Larger photos are fitted to on the CPU alone.
-    """
-    if scene.images is None or not options.needs_photos:
-        return Fitted(decoded.gaussians, scene.cameras, None)
-    photos = fit_photos(scene, options, views)
-    choose(start_count=len(decoded.gaussians))
-    if device != "cpu":
-        device = device if len(photos) == 2 else "cpu"
-        choose(device=device)
-    gaussians, report = fit(
-        decoded.gaussians, photos, options, decoded.count, seed, report_steps, decoded.baseline_start,
-        exact=decoded.exact, device=device,
-    )  # fmt: skip
-    record_fit(report)
-    cameras = scene.cameras
-    if report is not None and report.viewmats is not None:
-        viewmats = cameras.viewmats.astype(np.float64)
-        viewmats[list(views)] = report.viewmats
-        cameras = replace(cameras, viewmats=viewmats)
-    return Fitted(gaussians, cameras, report)
-
-
-def fit_with(
-    backend: FitBackend[PhotosT],
-    gaussians: Gaussians,
-    photos: tuple[PhotosT, ...],
-    options: FitOptions,
-    count: int = 0,
-    seed: int = 0,
-    progress: Progress | None = None,
-    baseline_start: Gaussians | None = None,
-    *,
-    exact: bool = False,
-) -> tuple[Gaussians, FitReport | None]:
-    """:func:`fit` by the functions of a back end, of Gaussians and photos that are its own."""
-    if exact and not options.grows:
-        options = replace(options, min_contribution=0.0)
-    if not options.needs_photos:  # it costs as much as all that was done before
-        return gaussians, None
-    full, half = photos[:2]
-    keep = backend.visible_mask(gaussians, half, options.min_contribution)
-    kept = gaussians[keep]
-    if options.fit == "none":
-        return kept, None
-    fitted, report = backend.fit_full(kept, photos, options, count, seed, progress, baseline_start=baseline_start)
-    fitted, report = _better_of(backend, full, kept, fitted, report, CLOSE)
-    if report.accepted:
-        return fitted, report
-    if options.grows:  # the stages before left room for a growth that did not happen
-        fitted, report = backend.fit_colors(backend.grow(kept, half, count), half, options, seed)
-        return _better_of(backend, full, kept, fitted, report, ALWAYS) if report.accepted else (kept, report)
-    fitted, report = backend.fit_colors(gaussians, half, options, seed)
-    return _better_of(backend, full, kept, fitted[keep], report, ALWAYS)
-
-
-def _better_of(
-    backend: FitBackend[PhotosT], photos: PhotosT, before: Gaussians, after: Gaussians, report: FitReport, close: float
-) -> FitResult:
-    """The fitted Gaussians; their start if the held-out blocks hardly gained and the photos as a whole lost.
-
-    Gaussians that were fitted already are where steps of the default size only scatter. After a gain of ``close`` dB or
-    more the photos are not compared.
-    """
-    if not report.accepted or report.holdout_after - report.holdout_before >= close:
-        return after, report
-    moved: PhotosT = photos if report.viewmats is None else replace(photos, viewmats=report.viewmats)  # type: ignore
-    if backend.photo_error(after, moved) <= backend.photo_error(before, photos):
-        return after, report
-    why = "the photos as a whole were shown worse"
-    return before, replace(report, method="none", accepted=False, stopped=why, viewmats=None)
+    photo_psnr: Callable[..., float]  # see gsmerge.render.photos.photo_psnr
+    memory_errors: tuple[type[Exception], ...] = ()  # of a device whose memory does not suffice
 
 
 def visible_mask(gaussians: Gaussians, photos: Photos, min_weight: float) -> np.ndarray:
@@ -202,7 +91,152 @@ def photo_error(gaussians: Gaussians, photos: Photos) -> float:
     return float(np.mean(photo_errors(gaussians, photos, score)))
 
 
-ON_CPU = FitBackend(visible_mask, fit_full, _fit_colors, _grow, photo_error)
+def _stay(data: DataT) -> DataT:
+    return data
+
+
+ON_CPU: FitBackend[Photos] = FitBackend(
+    device="cpu",
+    upload=_stay,
+    upload_photos=_stay,
+    download=_stay,
+    visible_mask=visible_mask,
+    fit_full=fit_full,
+    fit_colors=_fit_colors,
+    grow=_grow,
+    photo_error=photo_error,
+    photo_psnr=photo_psnr,
+)
+
+
+def fit(
+    gaussians: Gaussians,
+    photos: tuple[Photos, ...],
+    options: FitOptions,
+    count: int = 0,
+    seed: int = 0,
+    progress: Progress | None = None,
+    baseline_start: Gaussians | None = None,
+    *,
+    exact: bool = False,
+    backend: FitBackend[Any] = ON_CPU,
+) -> tuple[Gaussians, FitReport | None]:
+    """Leave out what no photo shows, and fit the rest to the photos; a draft without a fit leaves out nothing.
+
+    Where the full fit does not make held-out parts of the photos better, the colour fit is tried.
+
+    Args:
+        gaussians: Canonical Gaussians.
+        photos: The input views, see :func:`gsmerge.stages.fit.fit_photos`. Larger ones are fitted to on the CPU alone.
+        options: What to fit.
+        count: Number of Gaussians that the full fit may grow to.
+        seed: Everything random.
+        progress: Called after every step of the full fit, or on a GPU every few steps.
+        baseline_start: Another start that the full fit may beat instead, see
+            :func:`gsmerge.stages.fit.full.score_to_beat`.
+        exact: Whether ``count`` is to be met: where nothing grows to it, nothing is left out either.
+        backend: Where it runs, see :func:`gsmerge.gpu.choose_backend`.
+
+    Returns:
+        The Gaussians that stay, fitted, and what was done; None if nothing was asked for.
+    """
+    if exact and not options.grows:
+        options = replace(options, min_contribution=0.0)
+    if not options.needs_photos:  # it costs as much as all that was done before
+        return gaussians, None
+
+    def fit_on(chosen: FitBackend[Any]) -> tuple[Gaussians, FitReport | None]:
+        start = chosen.upload(gaussians)
+        other = None if baseline_start is None else chosen.upload(baseline_start)
+        sizes = tuple(chosen.upload_photos(one_size) for one_size in photos)
+        fitted, report = _choose_fit(chosen, start, sizes, options, count, seed, progress, other)
+        return chosen.download(fitted), report and replace(report, device=chosen.device)
+
+    return run_on(backend if len(photos) == 2 else ON_CPU, "fit", fit_on)
+
+
+@stage("fit")
+def fit_scene(
+    decoded: Decoded, scene: Scene, views: Sequence[int], options: FitOptions, seed: int, backend: FitBackend[Any]
+) -> Fitted:
+    """Fit decoded Gaussians to the photos of some views; as they are where there are none, or nothing was asked for.
+
+    Args:
+        decoded: Where to begin, and the number of Gaussians to grow to.
+        scene: Canonical.
+        views: Of the scene, whose photos are used.
+        options: What to fit.
+        seed: Everything random.
+        backend: Where to fit. Larger photos are fitted to on the CPU alone.
+    """
+    if scene.images is None or not options.needs_photos:
+        return Fitted(decoded.gaussians, scene.cameras, None)
+    photos = fit_photos(scene, options, views)
+    choose(start_count=len(decoded.gaussians))
+    gaussians, report = fit(
+        decoded.gaussians, photos, options, decoded.count, seed, report_steps, decoded.baseline_start,
+        exact=decoded.exact, backend=backend,
+    )  # fmt: skip
+    record_fit(report)
+    cameras = scene.cameras
+    if report is not None and report.viewmats is not None:
+        viewmats = cameras.viewmats.astype(np.float64)
+        viewmats[list(views)] = report.viewmats
+        cameras = replace(cameras, viewmats=viewmats)
+    return Fitted(gaussians, cameras, report)
+
+
+def run_on(backend: FitBackend[Any], name: str, work: Callable[[FitBackend[Any]], ResultT]) -> ResultT:
+    """Do some work on a back end; if its memory does not suffice, on the CPU, with a note."""
+    try:
+        return work(backend)
+    except backend.memory_errors:
+        note(f"the memory of the GPU did not suffice for the {name}: the CPU did it")
+    return work(ON_CPU)
+
+
+def _choose_fit(
+    backend: FitBackend[PhotosT],
+    gaussians: Gaussians,
+    photos: tuple[PhotosT, ...],
+    options: FitOptions,
+    count: int,
+    seed: int,
+    progress: Progress | None,
+    baseline_start: Gaussians | None,
+) -> tuple[Gaussians, FitReport | None]:
+    """:func:`fit` on a back end, of Gaussians and photos that are its own."""
+    full, half = photos[:2]
+    keep = backend.visible_mask(gaussians, half, options.min_contribution)
+    kept = gaussians[keep]
+    if options.fit == "none":
+        return kept, None
+    fitted, report = backend.fit_full(kept, photos, options, count, seed, progress, baseline_start=baseline_start)
+    fitted, report = _better_of(backend, full, kept, fitted, report, CLOSE)
+    if report.accepted:
+        return fitted, report
+    if options.grows:  # the stages before left room for a growth that did not happen
+        fitted, report = backend.fit_colors(backend.grow(kept, half, count), half, options, seed)
+        return _better_of(backend, full, kept, fitted, report, ALWAYS) if report.accepted else (kept, report)
+    fitted, report = backend.fit_colors(gaussians, half, options, seed)
+    return _better_of(backend, full, kept, fitted[keep], report, ALWAYS)
+
+
+def _better_of(
+    backend: FitBackend[PhotosT], photos: PhotosT, before: Gaussians, after: Gaussians, report: FitReport, close: float
+) -> FitResult:
+    """The fitted Gaussians; their start if the held-out blocks hardly gained and the photos as a whole lost.
+
+    Gaussians that were fitted already are where steps of the default size only scatter. After a gain of ``close`` dB or
+    more the photos are not compared.
+    """
+    if not report.accepted or report.holdout_after - report.holdout_before >= close:
+        return after, report
+    moved: PhotosT = photos if report.viewmats is None else replace(photos, viewmats=report.viewmats)  # type: ignore
+    if backend.photo_error(after, moved) <= backend.photo_error(before, photos):
+        return after, report
+    why = "the photos as a whole were shown worse"
+    return before, replace(report, method="none", accepted=False, stopped=why, viewmats=None)
 
 
 def start_share(options: FitOptions) -> float:

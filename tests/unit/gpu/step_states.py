@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import torch
 
-from gsmerge.gpu.adam import FitState, Gradients, state_of, step_in_torch
+from gsmerge.gpu.adam import FitState, StepGradients, state_of, step_in_torch
 from gsmerge.stages.fit.full import step_sizes
 from gsmerge.stages.fit.options import FitOptions, LearningRates
 
@@ -37,7 +37,7 @@ def odd_state(count: int, device: torch.device | str = "cpu") -> tuple[FitState,
     return FitState(**moved), replace(FitOptions(opacity_reg=0.5, scale_reg=0.7), rates=RATES)
 
 
-def gradients_of(state: FitState) -> Gradients:
+def gradients_of(state: FitState) -> StepGradients:
     """Random ones; a third of the Gaussians has none."""
     generator, count = torch.Generator().manual_seed(1), len(state)
     reached = torch.rand(count, generator=generator) > 0.3
@@ -45,7 +45,7 @@ def gradients_of(state: FitState) -> Gradients:
     shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, 3))
     rows = [torch.randn(*shape, generator=generator) for shape in shapes]
     rows = [row * (reached[:, None] if row.ndim == 2 else reached) for row in rows]
-    return Gradients(*(row.to(state.x.device) for row in rows), reached.to(state.x.device))
+    return StepGradients(*(row.to(state.x.device) for row in rows), reached.to(state.x.device))
 
 
 def compare_triton() -> None:

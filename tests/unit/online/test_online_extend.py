@@ -337,7 +337,7 @@ def test_a_full_fit_shows_more(scene: PixelScene, pairs: list[PixelScene]) -> No
 def test_a_fit_in_vain_leaves_the_solved_colours(pairs: list[PixelScene], monkeypatch: pytest.MonkeyPatch) -> None:
     from gsmerge.online import decode as decode_module
 
-    def refused(gaussians: Gaussians, *_: object) -> tuple[Gaussians, FitReport]:
+    def refused(gaussians: Gaussians, *_: object, **__: object) -> tuple[Gaussians, FitReport]:
         return gaussians, FitReport("none", False, 1, 20.0, 19.0, "in vain")
 
     monkeypatch.setattr(decode_module, "fit", refused)

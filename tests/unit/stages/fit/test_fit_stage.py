@@ -34,13 +34,12 @@ def test_stage_takes_the_full_fit(truth: Gaussians, photos: Pair) -> None:
     assert scenes.identical(result, expected)
 
 
-def test_stage_falls_back_to_colours(truth: Gaussians, photos: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stage_falls_back_to_colours(truth: Gaussians, photos: Pair) -> None:
     """Where the full fit is refused."""
     refused = FitReport("none", False, 7, 20.0, 19.0, "worse")
     backend = replace(stage.ON_CPU, fit_full=lambda gaussians, *_, **__: (gaussians, refused))
-    monkeypatch.setattr(stage, "ON_CPU", backend)
     start = replace(truth, sh0=truth.sh0 + 0.2 / SH_C0)
-    result, report = fit(start, photos, QUICK)
+    result, report = fit(start, photos, QUICK, backend=backend)
     assert report is not None
     assert (report.method, report.accepted) == ("color", True)
     colored, _ = fit(start, photos, replace(QUICK, fit="color"))

@@ -12,9 +12,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsmerge.gpu.holdout import exposure_gains, holdout_psnr
-from gsmerge.gpu.raster import Transpose, draw_all, draw_and_transpose, draw_black, shape_of
-from gsmerge.gpu.scene import DevicePhotos
+from gsmerge.gpu.device_photos import (
+    DevicePhotos,
+    Transpose,
+    draw_and_transpose,
+    draw_black,
+    draw_gaussians,
+    shape_of,
+)
+from gsmerge.gpu.image_scores import exposure_gains, holdout_psnr
 from gsmerge.stages.fit.color import HOLDOUT, add_offsets, solve_colors
 from gsmerge.stages.fit.holdout import training_weights
 from gsmerge.stages.fit.options import FitOptions
@@ -23,9 +29,9 @@ from gsmerge.types import Gaussians
 
 
 def fit_colors(
-    gaussians: Gaussians, photos: DevicePhotos, options: FitOptions, seed: int = 0
+    gaussians: Gaussians, photos: DevicePhotos, options: FitOptions, seed: int
 ) -> tuple[Gaussians, FitReport]:
-    """Base colours fitted to the photos, kept only if held-out blocks of the photos get better.
+    """Fit base colours to the photos, and keep them only if held-out blocks of the photos get better.
 
     Args:
         gaussians: Gaussians, whose geometry, opacities and higher harmonics stay as they are.
@@ -36,8 +42,9 @@ def fit_colors(
     device = gaussians.means.device
     train = training_weights(photos.host, min(0.5, HOLDOUT * options.holdout), seed)
     weights = torch.from_numpy(np.stack(train)).to(device)
-    images, gains = torch.stack(draw_all(gaussians, photos)), torch.ones(len(photos), 3, device=device)
-    system = _System(gaussians, photos, options, images, weights, weights, gains)
+    images = torch.stack([draw_gaussians(gaussians, photos, view) for view in range(len(photos))])
+    gains = torch.ones(len(photos), 3, device=device)
+    system = _DeviceSystem(gaussians, photos, options, images, weights, weights, gains)
     start = torch.zeros(len(gaussians), 3, dtype=torch.float64, device=device)
     offsets, report = solve_colors(system, start, options)
     if not report.accepted:
@@ -46,7 +53,7 @@ def fit_colors(
 
 
 @dataclass(frozen=True, eq=False)
-class _System:
+class _DeviceSystem:
     """:class:`gsmerge.stages.fit.color.ColorSystem` of tensors.
 
     Args:
@@ -69,12 +76,12 @@ class _System:
     precision: float = 0.0
 
     def _fitted(self, x: Tensor) -> Tensor:
-        """``[v,h,w,3]`` renders with offsets."""
+        """Render all photos ``[v,h,w,3]`` with offsets."""
         shape, colors = shape_of(self.gaussians), x.float()
         return torch.stack([image + draw_black(shape, colors, self.photos, i) for i, image in enumerate(self.images)])
 
     def _draw(self, x: Tensor, view: int) -> tuple[Tensor, Transpose]:
-        """The matrix of a view times ``x``, an image ``[h,w,3]``, and its transpose."""
+        """Multiply the matrix of a view by ``x``: an image ``[h,w,3]``, and the matrix' transpose."""
         return draw_and_transpose(shape_of(self.gaussians), x.float(), self.photos, view)
 
     def score(self, x: Tensor | None = None) -> float:
@@ -98,7 +105,7 @@ class _System:
             total += transpose(image * self.weights[view][..., None]) * self.gains[view] ** 2
         return total
 
-    def reweigh(self, x: Tensor, *, everywhere: bool = False) -> _System:
+    def reweigh(self, x: Tensor, *, everywhere: bool = False) -> _DeviceSystem:
         images, photos, options = self._fitted(x), self.photos.images, self.options
         base = torch.ones_like(self.train) if everywhere else self.train
         error = ((photos - images) ** 2).mean(-1).sqrt()

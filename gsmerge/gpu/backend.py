@@ -1,0 +1,96 @@
+"""The functions that the fit and the scores are made of, on a device."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsmerge.gpu.adam import gaussians_of, start_state
+from gsmerge.gpu.color_fit import fit_colors
+from gsmerge.gpu.device_photos import (
+    DevicePhotos,
+    draw_gaussians,
+    peak_weights,
+    upload_gaussians,
+    upload_photos,
+)
+from gsmerge.gpu.full_fit import fit_full, grow_to
+from gsmerge.render import render
+from gsmerge.render.photos import Photos, view_psnr
+from gsmerge.stages.fit.stage import FitBackend
+from gsmerge.types import Cameras, Gaussians, as_array
+
+
+def make_backend(device: torch.device) -> FitBackend[DevicePhotos]:
+    """Return the functions of the fit and the scores for one device."""
+    return FitBackend(
+        device="cuda" if device.type == "cuda" else "cpu",
+        upload=partial(upload_gaussians, device=device),
+        upload_photos=partial(upload_photos, device=device),
+        download=Gaussians.numpy,
+        visible_mask=visible_mask,
+        fit_full=fit_full,
+        fit_colors=fit_colors,
+        grow=grow,
+        photo_error=photo_error,
+        photo_psnr=partial(photo_psnr, device=device),
+        memory_errors=(torch.cuda.OutOfMemoryError,),
+    )
+
+
+def visible_mask(gaussians: Gaussians, photos: DevicePhotos, min_weight: float) -> Tensor:
+    """Mask ``[n]`` the Gaussians worth keeping, see :func:`gsmerge.stages.fit.stage.visible_mask`."""
+    peak = torch.zeros(len(gaussians), device=gaussians.means.device)
+    inside = torch.zeros_like(peak, dtype=torch.bool)
+    for view in range(len(photos)):
+        peaks, reached = peak_weights(gaussians, photos, view)
+        inside |= reached
+        peak = torch.maximum(peak, peaks)
+    return ~inside | (peak >= min_weight)
+
+
+def grow(gaussians: Gaussians, photos: DevicePhotos, count: int) -> Gaussians:
+    """Halve Gaussians where the photos are shown worst, until there are ``count``."""
+    state = grow_to(start_state(gaussians), photos, count)
+    return gaussians_of(state.x, state.shN)
+
+
+def photo_error(gaussians: Gaussians, photos: DevicePhotos) -> float:
+    """Return the mean squared error of all photos."""
+    errors = []
+    for view, photo in enumerate(photos.images):
+        image = draw_gaussians(gaussians, photos, view).clamp(0, 1)
+        errors.append((image - photo).square().mean(dtype=torch.float64))
+    return float(torch.stack(errors).mean())
+
+
+def photo_psnr(
+    gaussians: Gaussians,
+    photos: Photos,
+    views: Sequence[int],
+    *,
+    quarter: bool,
+    near: float,
+    device: torch.device,
+) -> float:
+    """Return the mean over some views of the PSNR (dB) of their photos, rendered on a device.
+
+    Args:
+        gaussians: In any frame, on the host.
+        photos: Of full size, in the same frame; they stay on the host.
+        views: Of the photos.
+        quarter: Score the tiles of :func:`gsmerge.render.photos.scored_tiles` alone.
+        near: Near plane, in the Gaussians' unit.
+        device: Where to draw.
+    """
+    uploaded = upload_gaussians(gaussians, device, dtype=None)  # float32 is too coarse far from the origin
+    cameras = Cameras(photos.viewmats, photos.Ks, photos.width, photos.height)
+    values = []
+    for view in views:
+        image = render(uploaded, cameras[[view]].to(device), near=near).images[0]
+        values.append(view_psnr(as_array(image), photos, view, quarter=quarter))
+    return float(np.mean(values))

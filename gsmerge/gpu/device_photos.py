@@ -1,0 +1,177 @@
+"""Gaussians and photos on a device, and Gaussians drawn into the photos' cameras, with the transposes of that.
+
+On CUDA gsplat draws, on the CPU the project's own kernels; all other files here work with either.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsmerge.render import contributions, plan_view
+from gsmerge.render.colored import Shape, draw_colored, seen_colors
+from gsmerge.render.photos import Photos
+from gsmerge.render.plan import Splats
+from gsmerge.types import SH_C0, Array, Gaussians
+
+
+@dataclass(frozen=True, eq=False)
+class DevicePhotos:
+    """V photos of one size on a device; see :class:`gsmerge.render.photos.Photos`.
+
+    Args:
+        images: ``[v,h,w,3]`` float32.
+        viewmats: ``[v,4,4]`` float32 world to camera.
+        Ks: ``[v,3,3]`` float32.
+        eyes: ``[v,3]`` float32 centres of the cameras.
+        host: The same photos in the computer's memory, whose cameras the kernels read.
+    """
+
+    images: Tensor
+    viewmats: Tensor
+    Ks: Tensor
+    eyes: Tensor
+    host: Photos
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    @property
+    def height(self) -> int:
+        """Rows."""
+        return self.images.shape[1]
+
+    @property
+    def width(self) -> int:
+        """Columns."""
+        return self.images.shape[2]
+
+    def camera(self, view: int) -> tuple[Tensor, Tensor, int, int]:
+        """Return a view's camera as :func:`gsmerge.render.cuda.rasterize` takes it."""
+        return self.viewmats[view], self.Ks[view], self.width, self.height
+
+
+def to_device(array: Array, device: torch.device, dtype: torch.dtype | None = None) -> Tensor:
+    """Bring an array of a core type, or a tensor, to a device."""
+    if isinstance(array, np.ndarray) and not array.flags.writeable:  # torch warns of those, though none is written to
+        array = array.copy()
+    return torch.as_tensor(array).to(device, dtype)
+
+
+def upload_photos(photos: Photos, device: torch.device) -> DevicePhotos:
+    """Bring photos and their cameras to a device."""
+    rotations, shifts = photos.viewmats[:, :3, :3], photos.viewmats[:, :3, 3]
+    eyes = -np.einsum("vji,vj->vi", rotations, shifts)
+    arrays = np.ascontiguousarray(photos.images), photos.viewmats, photos.Ks, eyes
+    images, viewmats, Ks, centres = (to_device(array, device, torch.float32) for array in arrays)
+    return DevicePhotos(images, viewmats, Ks, centres, photos)
+
+
+def upload_gaussians(
+    gaussians: Gaussians, device: torch.device, dtype: torch.dtype | None = torch.float32
+) -> Gaussians:
+    """Bring Gaussians to a device; None keeps the dtypes that they have."""
+    arrays = (getattr(gaussians, f.name) for f in fields(Gaussians))
+    return Gaussians(*(to_device(array, device, dtype) for array in arrays))
+
+
+def draw(
+    shape: Shape,
+    colors: Tensor,
+    photos: DevicePhotos,
+    view: int,
+    background: Tensor,
+    *,
+    eps2d: float | None = None,
+    antialiased: bool = False,
+) -> tuple[Tensor, Tensor]:
+    """Draw Gaussians into one view: image ``[h,w,3]``, and ``[n]`` bool, which of them have a footprint there.
+
+    Args:
+        shape: Means ``[n,3]``, quaternions ``[n,4]``, scales ``[n,3]`` and opacities ``[n]``, float32.
+        colors: ``[n,3]``, any sign. The image is differentiable in them and in the shape.
+        photos: Whose cameras.
+        view: Of the photos.
+        background: ``[3]``.
+        eps2d: Low-pass, square pixels; None: that of the photos.
+        antialiased: Lower the opacity by what the low-pass adds to the footprint.
+    """
+    eps2d = photos.host.eps2d if eps2d is None else eps2d
+    if colors.device.type == "cpu":
+        camera = photos.host.camera(view) | {"eps2d": eps2d, "antialiased": antialiased}
+        return draw_colored(shape, colors, camera, background.numpy())
+    from gsmerge.render.cuda import rasterize
+
+    image, _, _, reached = rasterize(
+        shape, colors, photos.camera(view), background, eps2d=eps2d, antialiased=antialiased
+    )
+    return image, reached
+
+
+def draw_black(shape: Shape, colors: Tensor, photos: DevicePhotos, view: int) -> Tensor:
+    """:func:`draw` over black, the image ``[h,w,3]`` alone."""
+    return draw(shape, colors, photos, view, torch.zeros(3, device=colors.device))[0]
+
+
+def draw_gaussians(gaussians: Gaussians, photos: DevicePhotos, view: int) -> Tensor:
+    """Render one photo ``[h,w,3]`` over black, not clipped."""
+    if gaussians.shN.shape[1] == 0:
+        colors = (0.5 + SH_C0 * gaussians.sh0[:, 0]).clamp_min(0)
+    else:
+        colors = harmonic_colors(gaussians.means, gaussians.sh0, gaussians.shN, photos, view)
+    return draw_black(shape_of(gaussians), colors, photos, view)
+
+
+def shape_of(gaussians: Gaussians) -> Shape:
+    """Return means, quaternions, scales and opacities."""
+    return gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities
+
+
+def harmonic_colors(means: Tensor, sh0: Tensor, shN: Tensor, photos: DevicePhotos, view: int) -> Tensor:
+    """Evaluate the colours ``[n,3]`` of harmonics in a view, not below 0, without gradient."""
+    if means.device.type == "cpu":
+        return seen_colors(means, sh0, shN, photos.host.viewmats[view])
+    from gsmerge.render import cuda
+
+    with torch.no_grad():
+        return cuda.harmonic_colors(means, torch.cat([sh0, shN], 1), photos.eyes[view])
+
+
+def draw_and_transpose(shape: Shape, colors: Tensor, photos: DevicePhotos, view: int) -> tuple[Tensor, Transpose]:
+    """Draw a view over black: the image, and the function that takes images back to the Gaussians."""
+    with torch.enable_grad():
+        leaf = colors.detach().requires_grad_()
+        image, reached = draw(shape, leaf, photos, view, torch.zeros(3, device=colors.device))
+    return image.detach(), Transpose(image, leaf, reached)
+
+
+class Transpose:
+    """Sums over the pixels of a view of every Gaussian's blending weight times an image.
+
+    It is the transpose of drawing as a linear map from colours to images, which is the gradient in the colours.
+    ``reached`` is ``[n]`` bool: which Gaussians have a footprint in the view.
+    """
+
+    def __init__(self, image: Tensor, colors: Tensor, reached: Tensor):
+        self.image, self.colors, self.reached = image, colors, reached
+
+    def __call__(self, values: Tensor) -> Tensor:
+        """Return the sums ``[n,3]`` of an image ``[h,w,3]``."""
+        return torch.autograd.grad(self.image, self.colors, values.contiguous(), retain_graph=True)[0]
+
+
+def peak_weights(gaussians: Gaussians, photos: DevicePhotos, view: int) -> tuple[Tensor, Tensor]:
+    """Find the largest blending weight ``[n]`` of every Gaussian in a view, and ``[n]`` which lie in it."""
+    if gaussians.means.device.type != "cpu":
+        from gsmerge.render import cuda
+
+        return cuda.peak_weights(shape_of(gaussians), photos.camera(view), eps2d=photos.host.eps2d)
+    means, quats, scales, opacities = (tensor.contiguous().numpy() for tensor in shape_of(gaussians))
+    sh0, shN = gaussians.sh0.numpy(), gaussians.shN.numpy()
+    plan = plan_view(Splats(means, quats, scales, opacities, sh0, shN, np.zeros(3)), **photos.host.camera(view))
+    inside = torch.zeros(len(gaussians), dtype=torch.bool)
+    inside[torch.from_numpy(plan.ids).long()] = True
+    return torch.from_numpy(contributions(plan)[1]), inside

@@ -1,0 +1,330 @@
+"""gaussians -> fitted gaussians, on a device: the run of :mod:`gsmerge.stages.fit.full`, which says why it is as it is.
+
+Order of the views and backgrounds are those of the CPU's run. What comes back from the device during the run are
+scores at its beginning and at the change of sizes, and the error once in ``READ_EVERY`` steps.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from copy import deepcopy
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsmerge.gpu.adam import FitState, StepGradients, adam_step, gaussians_of, start_state, state_of
+from gsmerge.gpu.device_photos import DevicePhotos, draw, draw_and_transpose, draw_black, harmonic_colors
+from gsmerge.gpu.image_scores import holdout_psnr, loss_gradient, photo_means
+from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT, SIZE
+from gsmerge.kernels.raster.walk import MAX_ALPHA
+from gsmerge.networks.residuals import quat_to_rotmat
+from gsmerge.render.colored import Shape
+from gsmerge.stages.fit.full import (
+    GROWTH,
+    MAX_STEPS,
+    PROBE,
+    Plan,
+    Progress,
+    TailMean,
+    affordable_steps,
+    look_of,
+    plan_run,
+    step_sizes,
+)
+from gsmerge.stages.fit.grow import DEPTH, OFFSET
+from gsmerge.stages.fit.options import FitOptions
+from gsmerge.stages.fit.report import FitReport
+from gsmerge.types import SH_C0, Gaussians
+
+READ_EVERY = 20  # steps; each reading waits for the device
+
+
+@dataclass(frozen=True, eq=False)
+class PhotoLevel:
+    """The photos of one size, and what a step needs of them.
+
+    Args:
+        photos: The photos.
+        means: ``[v,2,3,h,w]`` of their windows, see :func:`gsmerge.gpu.image_scores.photo_means`.
+        weights: ``[v,h,w]`` of the pixels in a step; of full size ``[1,h,w]``, the same for all views.
+        counts: ``[v]`` sum of each view's weights.
+    """
+
+    photos: DevicePhotos
+    means: Tensor
+    weights: Tensor
+    counts: tuple[float, ...]
+
+    def weight(self, view: int) -> Tensor:
+        """Return the weights ``[h,w]`` of a view."""
+        return self.weights[view if len(self.weights) > 1 else 0]
+
+
+def make_levels(photos: tuple[DevicePhotos, DevicePhotos], plan: Plan) -> tuple[PhotoLevel, PhotoLevel]:
+    """Give both sizes their weights: everything counts at full size, the training pixels at half size."""
+    full, half = photos
+    everywhere = torch.ones((1, full.height, full.width), device=full.images.device)
+    trained = torch.from_numpy(np.stack(plan.step_weights[1])).to(half.images.device)
+    counts = tuple(float(weight.sum()) for weight in plan.step_weights[1])
+    return (
+        PhotoLevel(full, photo_means(full.images), everywhere, (float(full.height * full.width),) * len(full)),
+        PhotoLevel(half, photo_means(half.images), trained, counts),
+    )
+
+
+def draw_order(seed: int, num_views: int, steps: int) -> tuple[list[int], np.ndarray]:
+    """Draw the view and ``[steps,3]`` the background of every step, as the CPU's run draws its numbers."""
+    rng = np.random.default_rng(seed)
+    queue: list[int] = []
+    views, backgrounds = [], np.empty((steps, 3), np.float32)
+    for step in range(steps):
+        queue = queue or rng.permutation(num_views).tolist()
+        views.append(queue.pop())
+        backgrounds[step] = rng.random(3, dtype=np.float32)
+    return views, backgrounds
+
+
+def state_shape(state: FitState) -> Shape:
+    """Return what the rasterizer takes of a state."""
+    return state.means, state.quats, state.scales, state.opacities
+
+
+def state_colors(state: FitState, photos: DevicePhotos, view: int) -> Tensor:
+    """Return the colours ``[n,3]`` of a state in a view: its own, or through the harmonics."""
+    if state.shN.shape[1] == 0:
+        return state.colors
+    return harmonic_colors(state.means, ((state.colors - 0.5) / SH_C0)[:, None], state.shN, photos, view)
+
+
+def holdout_score(state: FitState, photos: DevicePhotos, weights: Tensor, min_gain: float) -> float:
+    """Return the PSNR (dB) of a state on the held-out blocks of photos."""
+    views, shape = range(len(photos)), state_shape(state)
+    images = [draw_black(shape, state_colors(state, photos, view), photos, view) for view in views]
+    return holdout_psnr(torch.stack(images), photos.images, weights, min_gain)
+
+
+def initial_scores(
+    state: FitState, photos: tuple[DevicePhotos, DevicePhotos], weights: Tensor, options: FitOptions
+) -> tuple[float, Tensor, Tensor]:
+    """Return the PSNR (dB) of the half-size held-out blocks, ``[n]`` box shares, ``[n]`` least log scales.
+
+    See :func:`gsmerge.stages.fit.full.initial_scores`.
+    """
+    full, half = photos
+    images, shape, rates = [], state_shape(state), options.rates
+    sums, squares = (torch.zeros(len(state), dtype=torch.float64, device=state.x.device) for _ in range(2))
+    pixels = torch.full_like(state.units, torch.inf)
+    for view in range(len(half)):
+        image, transpose = draw_and_transpose(shape, state_colors(state, half, view), half, view)
+        each = transpose(torch.ones_like(image))[:, 0].double()
+        images.append(image)
+        sums += each
+        squares += each * each
+        ahead, focal = half.viewmats[view, 2], float(full.host.Ks[view][[0, 1], [0, 1]].max())
+        sizes = (state.means @ ahead[:3] + ahead[3]) / focal
+        pixels = torch.where(transpose.reached, pixels.minimum(sizes), pixels)
+    photos_each = sums**2 / squares.clamp_min(1e-12)
+    shares = (photos_each - 1).clamp(rates.single_view_share, 1).float()
+    min_sizes = (rates.min_scale * pixels.where(pixels.isfinite(), 0)).log()
+    return holdout_psnr(torch.stack(images), half.images, weights, options.min_gain), shares, min_sizes
+
+
+def error_masses(state: FitState, photos: DevicePhotos) -> Tensor:
+    """Sum ``[n]`` every Gaussian's blending weight times the absolute error over all pixels."""
+    masses = torch.zeros(len(state), dtype=torch.float64, device=state.x.device)
+    for view in range(len(photos)):
+        image, transpose = draw_and_transpose(state_shape(state), state_colors(state, photos, view), photos, view)
+        error = (image - photos.images[view]).abs().mean(-1, keepdim=True)
+        masses += transpose(error.expand_as(image))[:, 0]
+    return masses
+
+
+def grow_to(state: FitState, photos: DevicePhotos, count: int) -> FitState:
+    """Call :func:`grow` until there are ``count`` or nothing that the photos show is left to halve."""
+    before = 0
+    while before < len(state) < count:
+        before, state = len(state), grow(state, photos, count)
+    return state
+
+
+def grow(state: FitState, photos: DevicePhotos, count: int) -> FitState:
+    """Halve the Gaussians with the largest error masses, see :func:`gsmerge.stages.fit.grow.grow`."""
+    masses = error_masses(state, photos)
+    num = min(count - len(state), int((masses > 0).sum()))
+    if num <= 0:
+        return state
+    picked = torch.sort(-masses, stable=True).indices[:num].sort().values
+    parents, rows = state.x[picked], torch.arange(num, device=picked.device)
+    longest = parents[:, SIZE:QUAT].argmax(1)
+    reach = OFFSET * parents[rows, SIZE + longest].exp()
+    shift = quat_to_rotmat(parents[:, QUAT:LOGIT])[rows, :, longest] * reach[:, None]
+    halves = parents.clone()
+    halves[rows, SIZE + longest] += 0.5 * math.log(1 - OFFSET**2)
+    clear = (-halves[:, LOGIT].double()).sigmoid()  # 1 - opacity
+    halves[:, LOGIT] = (1 / clear**DEPTH - 1).log().float()
+    x = torch.cat([state.x, halves])
+    x[picked] = halves
+    x[picked, :3] -= shift
+    x[len(state) :, :3] += shift
+    source = torch.cat([torch.arange(len(state), device=picked.device), picked])
+    grown = state_of(x, state.shN[source])
+    old = torch.ones(len(state), dtype=torch.bool, device=picked.device)
+    old[picked] = False
+    rows = torch.nonzero(old)[:, 0]
+    grown.x0[rows], grown.units[rows] = state.x0[rows], state.units[rows]
+    for name in ("m", "v", "box_shares", "min_sizes"):
+        setattr(grown, name, getattr(state, name)[source])
+    return grown
+
+
+def step_gradients(
+    state: FitState,
+    level: PhotoLevel,
+    view: int,
+    background: Tensor,
+    kept: Tensor | None,
+    options: FitOptions,
+    look: dict[str, Any],
+) -> tuple[StepGradients, Tensor]:
+    """Differentiate one view's loss, and sum its weighted squared errors.
+
+    Args:
+        state: n Gaussians.
+        level: The photos.
+        view: Of them.
+        background: ``[3]``.
+        kept: ``[n]`` opacities of what is drawn; None: the state's own.
+        options: Of the loss.
+        look: Low-pass, and whether its energy is compensated; see :func:`gsmerge.stages.fit.full.look_of`.
+    """
+    photos = level.photos
+    shape = (state.means, state.quats, state.scales, state.opacities if kept is None else kept)
+    with torch.enable_grad():
+        leaves = [tensor.detach().requires_grad_() for tensor in (*shape, state_colors(state, photos, view))]
+        drawn = leaves[0], leaves[1], leaves[2], leaves[3]
+        image, reached = draw(drawn, leaves[4], photos, view, background, **look)
+    wanted, error = loss_gradient(
+        image.detach(), photos.images[view], level.means[view], level.weight(view), options.ssim_lambda
+    )
+    of_means, of_quats, of_scales, of_opacities, of_colors = torch.autograd.grad(image, leaves, wanted)
+    return StepGradients(of_means, of_quats, of_scales, of_opacities, of_colors, reached), error
+
+
+def leave_out(state: FitState, dropout: float, generator: torch.Generator) -> Tensor:
+    """Return opacities ``[n]`` with a share of the Gaussians left out, the others a little more opaque."""
+    kept = torch.rand(len(state), device=state.x.device, generator=generator) >= dropout
+    return kept * (state.opacities / (1 - dropout)).clamp_max(float(MAX_ALPHA))
+
+
+def fit_full(
+    gaussians: Gaussians,
+    photos: tuple[DevicePhotos, DevicePhotos],
+    options: FitOptions,
+    count: int,
+    seed: int,
+    progress: Progress | None,
+    baseline_start: Gaussians | None,
+) -> tuple[Gaussians, FitReport]:
+    """Fit all parameters to the photos; arguments as of :func:`gsmerge.stages.fit.full.fit_full`.
+
+    ``progress`` is called every ``READ_EVERY`` steps and at the end.
+    """
+    plan = plan_run((photos[0].host, photos[1].host), options, seed)
+    run = _Run(start_state(gaussians), make_levels(photos, plan), plan, count, seed, progress)
+    judged = torch.from_numpy(np.stack(plan.weights[1])).to(gaussians.means.device)
+    half = photos[1]
+    before, run.state.box_shares, run.state.min_sizes = initial_scores(run.state, photos, judged, options)
+    if baseline_start is not None:
+        before = min(before, holdout_score(start_state(baseline_start), half, judged, options.min_gain))
+    run.score, after = before, None
+    run.start_clock()
+    while run.step < run.steps:
+        run.grow()
+        if run.step / run.steps >= plan.half_part and after is None:
+            run.score = after = holdout_score(run.state, half, judged, options.min_gain)
+            if after <= before:
+                break
+        run.take_step()
+    after = holdout_score(run.state, half, judged, options.min_gain) if after is None else after
+    if after <= before:
+        why = f"held-out parts of the photos were no better after {run.step} steps"
+        return gaussians, FitReport("none", False, run.step, before, after, why)
+    if options.grows:  # a time budget may end before the growth
+        run.state = grow_to(run.state, half, count)
+    why = "time budget spent" if options.time_budget is not None else "all steps done"
+    fitted = gaussians_of(run.tail.of(run.state.x), run.state.shN)
+    return fitted, FitReport("full", True, run.step, before, after, why)
+
+
+class _Run:
+    """The steps of a run, and where it stands."""
+
+    def __init__(
+        self,
+        state: FitState,
+        levels: tuple[PhotoLevel, PhotoLevel],
+        plan: Plan,
+        count: int,
+        seed: int,
+        progress: Progress | None,
+    ):
+        device, options = state.x.device, plan.options
+        self.state, self.levels, self.plan, self.count, self.progress = state, levels, plan, count, progress
+        self.step, self.steps, self.started, self.score = 0, options.steps, 0.0, 0.0
+        self.tail, self.error = TailMean(), torch.zeros((), device=device)
+        most = max(self.steps, MAX_STEPS) if options.time_budget is not None else self.steps
+        self.views, backgrounds = draw_order(seed, len(levels[0].photos), most)
+        self.backgrounds = torch.from_numpy(backgrounds).to(device)
+        self.generator = torch.Generator(device).manual_seed(seed)
+        self.rates = self._all_rates()
+
+    def _all_rates(self) -> Tensor:
+        """Return the sizes ``[steps,14]`` of all steps."""
+        options = self.plan.options
+        rows = [step_sizes(options.rates, step / self.steps, options.steps) for step in range(self.steps)]
+        return torch.from_numpy(np.stack(rows)).to(self.state.x.device)
+
+    def start_clock(self) -> None:
+        """Start the clock of a time budget, after a step on a copy: loading kernels is not timed."""
+        if self.plan.options.time_budget is not None:
+            self._move(deepcopy(self.state), None)
+            self.read_error()  # which waits for the device
+            self.started = time.perf_counter()
+
+    def grow(self) -> None:
+        """Add Gaussians, once it is time."""
+        due = self.plan.options.grows and self.step / self.steps >= GROWTH
+        if due and len(self.state) < self.count:
+            self.state = grow_to(self.state, self.levels[1].photos, self.count)
+
+    def _move(self, state: FitState, kept: Tensor | None) -> Tensor:
+        """Move a state by the present step, and return the mean squared error of the view before it."""
+        at, options = self.plan.level_at(self.step + 1, self.step / self.steps), self.plan.options
+        level, view = self.levels[at], self.views[self.step]
+        look = look_of(self.step + 1, at, level.photos.host.eps2d)
+        gradients, error = step_gradients(state, level, view, self.backgrounds[self.step], kept, options, look)
+        adam_step(state, gradients, options, self.rates[self.step], self.step + 1)
+        return error / max(3 * level.counts[view], 1)
+
+    def take_step(self) -> None:
+        """Take one step on one view."""
+        options, dropout = self.plan.options, self.plan.dropout
+        mean = self._move(self.state, leave_out(self.state, dropout, self.generator) if dropout > 0 else None)
+        self.error.lerp_(mean, 1 / min(self.step + 1, 10))
+        self.step += 1
+        if self.step > self.steps * (1 - options.average_share):
+            self.tail.add(self.state.x)
+        if options.time_budget is not None and self.step == PROBE:
+            self.read_error()  # which waits for the device
+            self.steps = affordable_steps(time.perf_counter() - self.started, self.plan)
+            self.rates = self._all_rates()
+        if self.progress and (self.step % READ_EVERY == 0 or self.step == self.steps):
+            self.progress(self.step, self.steps, -10 * np.log10(max(self.read_error(), 1e-12)), self.score)
+
+    def read_error(self) -> float:
+        """Return the mean squared error of the last steps."""
+        return float(self.error)

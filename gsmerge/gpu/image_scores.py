@@ -1,0 +1,100 @@
+"""The loss of images on a device and its gradient, their exposures, and the PSNR of held-out blocks.
+
+The gradient is written out, as in the kernel ``image_gradient``: half as many launches as through autograd, and what
+depends on the photo alone is computed once.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from gsmerge.kernels.raster.image_loss import C1, C2, SIDE
+
+
+def window_means(planes: Tensor) -> Tensor:
+    """Take means over windows of 7 x 7 pixels about every pixel of planes ``[...,h,w]``, zero beyond."""
+    return avg_pool2d(planes, SIDE, 1, SIDE // 2)
+
+
+def photo_means(images: Tensor) -> Tensor:
+    """Take the window means ``[v,2,3,h,w]`` of photos ``[v,h,w,3]`` and of their squares."""
+    planes = images.permute(0, 3, 1, 2)
+    return torch.stack([window_means(planes), window_means(planes * planes)], 1)
+
+
+def loss_gradient(
+    image: Tensor, photo: Tensor, means: Tensor, weight: Tensor, ssim_lambda: float
+) -> tuple[Tensor, Tensor]:
+    """Differentiate (1 - l) |image - photo| + l (1 - SSIM), l = ``ssim_lambda``; sum the squared errors.
+
+    SSIM's windows are uniform, of 7 x 7 pixels, with population covariances, K1 = .01, K2 = .03 (Wang et al. 2004).
+
+    Args:
+        image: ``[h,w,3]``.
+        photo: ``[h,w,3]``.
+        means: ``[2,3,h,w]`` of the photo, see :func:`photo_means`.
+        weight: ``[h,w]`` weights of the pixels.
+        ssim_lambda: Share of structural similarity.
+
+    Returns:
+        ``[h,w,3]`` divided by the number of pixels, and a number: the sum over all channels.
+    """
+    off = image - photo
+    wide, pixels = weight[..., None], weight.numel()
+    gradient = (1 - ssim_lambda) / pixels * wide * off.sign()
+    if ssim_lambda > 0:
+        similar = ssim_lambda / pixels * _ssim_gradient(image.permute(2, 0, 1), photo.permute(2, 0, 1), means, weight)
+        gradient = gradient - similar.permute(1, 2, 0)
+    return gradient, (wide * off * off).sum()
+
+
+def _ssim_gradient(x: Tensor, y: Tensor, means: Tensor, weight: Tensor) -> Tensor:
+    """Differentiate the weighted sum of SSIM over the windows in the planes ``x [3,h,w]``."""
+    a, xx, xy = window_means(torch.cat([x, x * x, x * y])).split(3)
+    b, yy = means
+    c1, c2 = float(C1), float(C2)
+    ab = a * b
+    n1, n2 = 2 * ab + c1, 2 * (xy - ab) + c2
+    squares = a * a + b * b
+    d1, d2 = squares + c1, xx + yy - squares + c2
+    q = weight / (d1 * d2)
+    ssim = n1 * n2 / (d1 * d2)
+    square, cross = -ssim * d1 * q, 2 * n1 * q
+    plain = 2 * q * (b * n2 - a * ssim * d2) - 2 * a * square - b * cross
+    # the transpose of a mean over windows with zeros beyond the border is the same mean
+    by_mean, by_square, by_product = window_means(torch.cat([plain, square, cross])).split(3)
+    return by_mean + 2 * by_square * x + by_product * y
+
+
+def holdout_psnr(images: Tensor, photos: Tensor, weights: Tensor, min_gain: float) -> float:
+    """Return the PSNR (dB) of renders on the held-out blocks, exposure of the photos set aside.
+
+    Args:
+        images: ``[v,h,w,3]``.
+        photos: ``[v,h,w,3]``.
+        weights: ``[v,h,w]`` 0 on the held-out blocks, 1 elsewhere.
+        min_gain: Exposure against the mean, as a factor, from which on it is set aside.
+    """
+    clipped = images.clamp(0, 1)
+    gains = exposure_gains(clipped, photos, weights, min_gain)
+    mask = weights == 0
+    squares = ((clipped * gains[:, None, None] - photos) ** 2).sum(-1) * mask
+    error, count = squares.sum(dtype=torch.float64), mask.sum()
+    return float(-10 * (error / (3 * count).clamp_min(1)).clamp_min(1e-12).log10())
+
+
+def exposure_gains(images: Tensor, photos: Tensor, weights: Tensor, min_gain: float, max_gain: float = 2.0) -> Tensor:
+    """Find the factors ``[v,3]`` that bring renders to the photos' exposure, with geometric mean one.
+
+    Least squares on the weighted pixels, per view and channel; ones where no view differs by ``min_gain``.
+    """
+    weighted = weights[..., None] * images
+    with_photo, with_image = ((weighted * other).sum((1, 2), dtype=torch.float64) for other in (photos, images))
+    gains = (with_photo / with_image.clamp_min(1e-9)).clamp(1 / max_gain, max_gain)
+    gains = gains / gains.log().mean(0).exp()
+    differs = gains.log().abs().max() >= math.log(min_gain)
+    return torch.where(differs, gains, 1.0).float()

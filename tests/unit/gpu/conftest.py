@@ -1,0 +1,24 @@
+"""A small room, spoilt, with its photos; and how close a run on a device comes to that of the CPU."""
+
+from __future__ import annotations
+
+import pytest
+import scenes
+
+from gsmerge import Gaussians, PixelScene
+from gsmerge.render.photos import Photos
+
+
+@pytest.fixture(scope="module")
+def scene() -> PixelScene:
+    return scenes.self_made(0)[0]
+
+
+@pytest.fixture(scope="module")
+def start() -> Gaussians:
+    return scenes.spoil(scenes.self_made(0)[1], seed=1)
+
+
+@pytest.fixture(scope="module")
+def photos(scene: PixelScene) -> tuple[Photos, Photos]:
+    return scenes.pair_of(scene)
