@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
 from gsmerge.budget import BudgetOptions, new_settings
@@ -29,6 +29,11 @@ RECIPES: Mapping[str, Mapping[str, Any]] = {
         "k_low": 100 / 3, "k_high": 200 / 3, "checkpoint": "paper", "require_checkpoint": True,
     },
 }  # fmt: skip
+
+
+def setting_names(options: type) -> list[str]:
+    """Return the names of the fields of an options class that a user may set."""
+    return [f.name for f in fields(options) if f.metadata.get("setting", True)]
 
 
 @dataclass(frozen=True)
@@ -119,7 +124,8 @@ class CompactOptions:
         flat: dict[str, Any] = {}
         for f in fields(self):
             value = getattr(self, f.name)
-            flat.update(asdict(value) if is_dataclass(value) and not isinstance(value, type) else {f.name: value})
+            names = setting_names(type(value)) if is_dataclass(value) else []
+            flat.update({name: getattr(value, name) for name in names} if names else {f.name: value})
         return flat
 
     def with_settings(self, settings: Mapping[str, Any]) -> CompactOptions:
@@ -135,9 +141,8 @@ class CompactOptions:
         for f in fields(self):
             value = getattr(self, f.name)
             if is_dataclass(value) and not isinstance(value, type):
-                changes[f.name] = replace(
-                    value, **{g.name: settings[g.name] for g in fields(value) if g.name in settings}
-                )
+                names = setting_names(type(value))
+                changes[f.name] = replace(value, **{name: settings[name] for name in names if name in settings})
             elif f.name in settings:
                 changes[f.name] = settings[f.name]
         unknown = sorted(settings.keys() - self.to_dict().keys())

@@ -157,7 +157,7 @@ def measure_curve(prepared: Prepared, plan: Plan, build: Build, steps: int, coun
     The fits take ``steps``, whatever the plan says. PSNR and SSIM are those of blocks that the fits leave out, at
     full size; LPIPS needs whole pictures.
     """
-    short = FitOptions(fit="full", fit_steps=steps, half_res_share=1.0, holdout=HOLDOUT, rates=plan.fit.rates)
+    short = FitOptions(fit="full", fit_steps=steps, half_res_share=1.0, holdout=HOLDOUT, tuning=plan.fit.tuning)
     quick = replace(plan.with_fit(short), networks=(None,), checkpoint=None, clean=CleanOptions())  # nothing grows
     photos = scene_photos(prepared.scene)[prepared.photo_views]
     weights = training_weights(photos, HOLDOUT, plan.seed)
@@ -166,7 +166,7 @@ def measure_curve(prepared: Prepared, plan: Plan, build: Build, steps: int, coun
         report_progress("curve: what each count brings", len(points), len(counts))
         with record_part(silent=True):
             gaussians = build(prepared, quick, count).gaussians
-        points.append(_point(count, gaussians, photos, weights, short.min_gain))
+        points.append(_point(count, gaussians, photos, weights, short.tuning.min_gain))
     return points
 
 

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
-
 from gsmerge.baselines import greedy, simple, splat_transform, voxel
 from gsmerge.baselines.baseline import Baseline
 from gsmerge.errors import UsageError
-from gsmerge.options import CompactOptions
+from gsmerge.options import CompactOptions, setting_names
 from gsmerge.runtime.record import note
 from gsmerge.search import Build
 from gsmerge.stages.fit import FitOptions
 from gsmerge.types import Scene
 
-FULL_FIT_SETTINGS = ("effort", "device", "poses", *(f.name for f in fields(FitOptions) if f.name != "fit"))
+FULL_FIT_SETTINGS = ("effort", "device", "poses", *(name for name in setting_names(FitOptions) if name != "fit"))
 _ALL = (
     Baseline("unmerged", simple.unmerged, uses=()),
     Baseline("unmerged-fit", simple.unmerged_fit, needs=("photos",), uses=FULL_FIT_SETTINGS),

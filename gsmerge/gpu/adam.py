@@ -136,7 +136,7 @@ def has_triton() -> bool:
 
 def step_in_torch(state: FitState, gradients: StepGradients, options: FitOptions, rates: Tensor, step: int) -> None:
     """Take the step of :func:`adam_step` without Triton."""
-    gradient, limits = parameter_gradient(state, gradients, options), options.rates
+    gradient, limits = parameter_gradient(state, gradients, options), options.tuning
     energy = gradient * gradient
     for shared in (slice(0, SIZE), slice(QUAT, LOGIT)):  # one second moment, so that steps turn with the scene
         energy[:, shared] = energy[:, shared].sum(1, keepdim=True) / 3  # degrees of freedom, of a rotation too
@@ -159,8 +159,8 @@ def parameter_gradient(state: FitState, gradients: StepGradients, options: FitOp
     """Return the gradient ``[n,14]`` in the optimiser's parameters: means in units of each size, log, logit."""
     units, each = state.units[:, None], gradients.reached[:, None] / max(len(state), 1)
     slope = (state.opacities * (1 - state.opacities))[:, None]
-    fade = gradients.opacities[:, None] + options.opacity_reg * each
-    shrink = gradients.scales + options.scale_reg * each / units
+    fade = gradients.opacities[:, None] + options.tuning.opacity_reg * each
+    shrink = gradients.scales + options.tuning.scale_reg * each / units
     return torch.cat(
         (gradients.means * units, shrink * state.scales, gradients.quats, fade * slope, gradients.colors), 1
     )
@@ -168,7 +168,7 @@ def parameter_gradient(state: FitState, gradients: StepGradients, options: FitOp
 
 def confine(state: FitState, x: Tensor, options: FitOptions) -> Tensor:
     """Bring new parameters ``[n,14]`` into the box about the start, with unit quaternions."""
-    x0, rates, shares = state.x0, options.rates, state.box_shares[:, None]
+    x0, rates, shares = state.x0, options.tuning, state.box_shares[:, None]
     offset = x[:, :SIZE] - x0[:, :SIZE]
     far, reach = offset.norm(dim=1, keepdim=True), shares * rates.max_mean_shift * state.units[:, None]
     x[:, :SIZE] = torch.where(far > reach, x0[:, :SIZE] + reach / far * offset, x[:, :SIZE])

@@ -122,14 +122,14 @@ def _step(
 
 def launch(state: FitState, gradients: StepGradients, options: FitOptions, rates: object, step: int) -> None:
     """Take one step on tensors of one device, in place; see :func:`gsmerge.gpu.adam.adam_step`."""
-    count, limits, g = len(state), options.rates, gradients
+    count, limits, g = len(state), options.tuning, gradients
     if count == 0:
         return
     _step[(triton.cdiv(count, BLOCK),)](
         state.x, state.x0, state.m, state.v, state.units, state.box_shares, state.min_sizes,
         *(tensor.contiguous() for tensor in (g.means, g.quats, g.scales, g.opacities, g.colors)), g.reached, rates,
         state.means, state.quats, state.scales, state.opacities, state.colors, count,
-        options.opacity_reg / count, options.scale_reg / count,
+        options.tuning.opacity_reg / count, options.tuning.scale_reg / count,
         limits.max_mean_shift, limits.max_scale_change, limits.max_opacity_change, limits.beta1, limits.beta2,
         1 / (1 - limits.beta1**step), 1 / (1 - limits.beta2**step), BLOCK=BLOCK,
     )  # fmt: skip

@@ -86,7 +86,7 @@ class _DeviceSystem:
 
     def score(self, x: Tensor | None = None) -> float:
         images = self.images if x is None else self._fitted(x)
-        return holdout_psnr(images, self.photos.images, self.train, self.options.min_gain)
+        return holdout_psnr(images, self.photos.images, self.train, self.options.tuning.min_gain)
 
     def residual(self, x: Tensor) -> tuple[Tensor, Tensor]:
         mass, gradient = torch.zeros_like(x), torch.zeros_like(x)
@@ -106,11 +106,10 @@ class _DeviceSystem:
         return total
 
     def reweigh(self, x: Tensor, *, everywhere: bool = False) -> _DeviceSystem:
-        images, photos, options = self._fitted(x), self.photos.images, self.options
+        images, photos, tuning = self._fitted(x), self.photos.images, self.options.tuning
         base = torch.ones_like(self.train) if everywhere else self.train
         error = ((photos - images) ** 2).mean(-1).sqrt()
-        robust = base * (options.huber / error.clamp_min(1e-6)).clamp_max(1)
-        calm = base * (error < 2 * options.huber)
-        return replace(
-            self, weights=robust, gains=exposure_gains(images, photos, calm, options.min_gain, options.max_gain)
-        )
+        robust = base * (tuning.huber / error.clamp_min(1e-6)).clamp_max(1)
+        calm = base * (error < 2 * tuning.huber)
+        gains = exposure_gains(images, photos, calm, tuning.min_gain, tuning.max_gain)
+        return replace(self, weights=robust, gains=gains)

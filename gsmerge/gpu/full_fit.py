@@ -115,7 +115,7 @@ def initial_scores(
     See :func:`gsmerge.stages.fit.full.initial_scores`.
     """
     full, half = photos
-    images, shape, rates = [], state_shape(state), options.rates
+    images, shape, rates = [], state_shape(state), options.tuning
     sums, squares = (torch.zeros(len(state), dtype=torch.float64, device=state.x.device) for _ in range(2))
     pixels = torch.full_like(state.units, torch.inf)
     for view in range(len(half)):
@@ -130,7 +130,7 @@ def initial_scores(
     photos_each = sums**2 / squares.clamp_min(1e-12)
     shares = (photos_each - 1).clamp(rates.single_view_share, 1).float()
     min_sizes = (rates.min_scale * pixels.where(pixels.isfinite(), 0)).log()
-    return holdout_psnr(torch.stack(images), half.images, weights, options.min_gain), shares, min_sizes
+    return holdout_psnr(torch.stack(images), half.images, weights, options.tuning.min_gain), shares, min_sizes
 
 
 def error_masses(state: FitState, photos: DevicePhotos) -> Tensor:
@@ -208,7 +208,7 @@ def step_gradients(
         drawn = leaves[0], leaves[1], leaves[2], leaves[3]
         image, reached = draw(drawn, leaves[4], photos, view, background, **look)
     wanted, error = loss_gradient(
-        image.detach(), photos.images[view], level.means[view], level.weight(view), options.ssim_lambda
+        image.detach(), photos.images[view], level.means[view], level.weight(view), options.tuning.ssim_lambda
     )
     of_means, of_quats, of_scales, of_opacities, of_colors = torch.autograd.grad(image, leaves, wanted)
     return StepGradients(of_means, of_quats, of_scales, of_opacities, of_colors, reached), error
@@ -239,17 +239,17 @@ def fit_full(
     half = photos[1]
     before, run.state.box_shares, run.state.min_sizes = initial_scores(run.state, photos, judged, options)
     if baseline_start is not None:
-        before = min(before, holdout_score(start_state(baseline_start), half, judged, options.min_gain))
+        before = min(before, holdout_score(start_state(baseline_start), half, judged, options.tuning.min_gain))
     run.score, after = before, None
     run.start_clock()
     while run.step < run.steps:
         run.grow()
         if run.step / run.steps >= plan.half_part and after is None:
-            run.score = after = holdout_score(run.state, half, judged, options.min_gain)
+            run.score = after = holdout_score(run.state, half, judged, options.tuning.min_gain)
             if after <= before:
                 break
         run.take_step()
-    after = holdout_score(run.state, half, judged, options.min_gain) if after is None else after
+    after = holdout_score(run.state, half, judged, options.tuning.min_gain) if after is None else after
     if after <= before:
         why = f"held-out parts of the photos were no better after {run.step} steps"
         return gaussians, FitReport("none", False, run.step, before, after, why)
@@ -285,7 +285,7 @@ class _Run:
     def _all_rates(self) -> Tensor:
         """Return the sizes ``[steps,14]`` of all steps."""
         options = self.plan.options
-        rows = [step_sizes(options.rates, step / self.steps, options.steps) for step in range(self.steps)]
+        rows = [step_sizes(options.tuning, step / self.steps, options.steps) for step in range(self.steps)]
         return torch.from_numpy(np.stack(rows)).to(self.state.x.device)
 
     def start_clock(self) -> None:
@@ -316,7 +316,7 @@ class _Run:
         mean = self._move(self.state, leave_out(self.state, dropout, self.generator) if dropout > 0 else None)
         self.error.lerp_(mean, 1 / min(self.step + 1, 10))
         self.step += 1
-        if self.step > self.steps * (1 - options.average_share):
+        if self.step > self.steps * (1 - options.tuning.average_share):
             self.tail.add(self.state.x)
         if options.time_budget is not None and self.step == PROBE:
             self.read_error()  # which waits for the device

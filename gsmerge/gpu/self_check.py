@@ -126,7 +126,7 @@ def compare_steps(host: Gaussians, placed: Gaussians, gradients: StepGradients) 
     """Take an optimiser step by the same gradients on the CPU and on a device; the largest difference."""
     options = FitOptions()
     device = placed.means.device
-    rates = torch.from_numpy(step_sizes(options.rates, 0.0, options.steps))
+    rates = torch.from_numpy(step_sizes(options.tuning, 0.0, options.steps))
     state = start_state(host)
     other = start_state(placed)
     step_in_torch(state, gradients, options, rates, 1)

@@ -1,11 +1,11 @@
 """gaussians -> fitted gaussians: colours alone, or all parameters, against the input photos."""
 
-from gsmerge.stages.fit.options import Fit, FitOptions, LearningRates
+from gsmerge.stages.fit.options import Fit, FitOptions, Tuning
 from gsmerge.stages.fit.photos import fit_photos, photo_scale
 from gsmerge.stages.fit.report import FitReport, Fitted, record_fit, report_steps
 from gsmerge.stages.fit.stage import ON_CPU, FitBackend, fit, fit_scene, run_on, start_share, visible_mask
 
 __all__ = [
-    "ON_CPU", "Fit", "FitBackend", "FitOptions", "FitReport", "Fitted", "LearningRates", "fit", "fit_photos",
+    "ON_CPU", "Fit", "FitBackend", "FitOptions", "FitReport", "Fitted", "Tuning", "fit", "fit_photos",
     "fit_scene", "photo_scale", "record_fit", "report_steps", "run_on", "start_share", "visible_mask",
 ]  # fmt: skip

@@ -109,19 +109,20 @@ def solve_colors(system: ColorSystem, start: Array, options: FitOptions) -> tupl
     A third of the steps with plain weights; then pixels that still fit badly count less, exposure is compensated,
     and another third follows. The last ones are on all pixels.
     """
-    third = options.iterations // 3
-    before, prior_weight = system.score(), options.prior_weight
+    steps = options.tuning.iterations
+    third = steps // 3
+    before, prior_weight = system.score(), options.tuning.prior_weight
     for _ in range(1 + MAX_RETRIES):
         x = conjugate_gradients(system, start, max(1, third), prior_weight)
         x = conjugate_gradients(system.reweigh(x), x, max(1, third), prior_weight)
         after = system.score(x)
         if after > before:
-            last = max(1, options.iterations - 2 * third)
+            last = max(1, steps - 2 * third)
             x = conjugate_gradients(system.reweigh(x, everywhere=True), x, last, prior_weight)
-            return x, FitReport("color", True, options.iterations, before, after, f"prior weight {prior_weight:g}")
+            return x, FitReport("color", True, steps, before, after, f"prior weight {prior_weight:g}")
         prior_weight *= 8
     stopped = "held-out parts of the photos did not improve"
-    return start, FitReport("none", False, options.iterations, before, after, stopped)
+    return start, FitReport("none", False, steps, before, after, stopped)
 
 
 def conjugate_gradients(system: ColorSystem, x: Array, iterations: int, prior_weight: float) -> Array:
@@ -181,7 +182,7 @@ class _System:
 
     def score(self, x: np.ndarray | None = None) -> float:
         images = self.drawn.images if x is None else self._images(x)
-        return holdout_psnr(images, self.photos, self.train, self.options.min_gain)
+        return holdout_psnr(images, self.photos, self.train, self.options.tuning.min_gain)
 
     def residual(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         def one_view(view: int) -> np.ndarray:
@@ -213,9 +214,9 @@ class _System:
         def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
             base = np.ones_like(self.train[view]) if everywhere else self.train[view]
             error = np.sqrt(((self.photos.images[view] - images[view]) ** 2).mean(-1))
-            robust = base * np.minimum(1, options.huber / np.maximum(error, 1e-6)).astype(np.float32)
-            return robust, base * (error < 2 * options.huber)
+            robust = base * np.minimum(1, options.tuning.huber / np.maximum(error, 1e-6)).astype(np.float32)
+            return robust, base * (error < 2 * options.tuning.huber)
 
         weights, calm = zip(*parallel_map(one_view, range(len(self.photos))), strict=True)
-        gains = exposure_gains(images, self.photos.images, calm, options.min_gain, options.max_gain)
+        gains = exposure_gains(images, self.photos.images, calm, options.tuning.min_gain, options.tuning.max_gain)
         return replace(self, weights=list(weights), gains=gains)

@@ -26,7 +26,7 @@ from gsmerge.runtime.threads import in_turn, parallel_map
 from gsmerge.stages.fit.grow import grow_to
 from gsmerge.stages.fit.holdout import holdout_psnr, reduced, training_weights
 from gsmerge.stages.fit.loss import image_gradient
-from gsmerge.stages.fit.options import EARLIER, LONG_STEPS, FitOptions, LearningRates
+from gsmerge.stages.fit.options import EARLIER, LONG_STEPS, FitOptions, Tuning
 from gsmerge.stages.fit.poses import PoseState, start_poses
 from gsmerge.stages.fit.report import FitReport
 from gsmerge.stages.fit.state import State, gaussians_of, start_state
@@ -125,13 +125,13 @@ def fit_step(state: State, plan: Plan, view: int, step: int, progress: float, rn
     all_colors = state.view_colors()
     colors = view_colors(drawn) if all_colors is None else all_colors.take(drawn.ids, 0)
     image, transmittance = blend(drawn, colors, background)
-    gradient, error = image_gradient(image, photos.image(view), weight, plan.options.ssim_lambda)
+    gradient, error = image_gradient(image, photos.image(view), weight, plan.options.tuning.ssim_lambda)
     g = gradients_of(drawn, colors, image, transmittance, gradient, NO_LOSS, with_viewmat=plan.poses is not None)
     if plan.poses is not None and g.viewmat is not None:  # that harmonics change with the camera is left out
-        plan.poses.step(view, g.viewmat, plan.options.rates, progress)
-    rates, s, count = plan.options.rates, state.splats, max(len(state.x), 1)
-    g.opacities[:] += np.float32(plan.options.opacity_reg / count)
-    g.scales[:] += np.float32(plan.options.scale_reg / count) / state.units[g.ids, None]
+        plan.poses.step(view, g.viewmat, plan.options.tuning, progress)
+    rates, s, count = plan.options.tuning, state.splats, max(len(state.x), 1)
+    g.opacities[:] += np.float32(plan.options.tuning.opacity_reg / count)
+    g.scales[:] += np.float32(plan.options.tuning.scale_reg / count) / state.units[g.ids, None]
     steps = step_sizes(rates, progress, plan.options.steps)
     limits = np.array([rates.max_mean_shift, rates.max_scale_change, rates.max_opacity_change], np.float32)
     betas = np.array([rates.beta1, rates.beta2], np.float32)
@@ -161,7 +161,7 @@ def look_of(step: int, level: int, eps2d: float) -> dict[str, Any]:
     return {"eps2d": share * eps2d, "antialiased": antialiased}
 
 
-def step_sizes(rates: LearningRates, progress: float, steps: int) -> np.ndarray:
+def step_sizes(rates: Tuning, progress: float, steps: int) -> np.ndarray:
     """Step of each of the fourteen columns at a point of the run, decaying geometrically; farther in longer runs."""
     decay = rates.decay * min(1.0, LONG_RUN / steps)
     each = [rates.means_lr, rates.scales_lr, rates.quats_lr, rates.opacities_lr, rates.colors_lr]
@@ -175,7 +175,7 @@ def initial_scores(state: State, plan: Plan) -> tuple[float, np.ndarray, np.ndar
     effective number of them, (sum w)^2 / sum w^2 of its blending weights w in them. Its least scale is ``min_scale``
     pixels of the largest photo that it is nearest to (the 3D filter of Mip-Splatting); none where no photo shows it.
     """
-    photos, colors, rates = plan.photos[1], state.view_colors(), plan.options.rates
+    photos, colors, rates = plan.photos[1], state.view_colors(), plan.options.tuning
     everywhere = np.ones((photos.height, photos.width, 1), np.float32)
 
     def one_view(view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -195,13 +195,13 @@ def initial_scores(state: State, plan: Plan) -> tuple[float, np.ndarray, np.ndar
     box_shares = np.clip(photos_each - 1, rates.single_view_share, 1).astype(np.float32)
     with np.errstate(divide="ignore"):
         min_sizes = np.log(rates.min_scale * np.where(np.isfinite(pixels), pixels, 0)).astype(np.float32)
-    return holdout_psnr(images, photos, plan.weights[1], plan.options.min_gain), box_shares, min_sizes
+    return holdout_psnr(images, photos, plan.weights[1], plan.options.tuning.min_gain), box_shares, min_sizes
 
 
 def holdout_score(state: State, plan: Plan) -> float:
     """PSNR (dB) of the half-size held-out blocks."""
     images = render_photos(state.splats, plan.photos[1], colors=state.view_colors())
-    return holdout_psnr(images, plan.photos[1], plan.weights[1], plan.options.min_gain)
+    return holdout_psnr(images, plan.photos[1], plan.weights[1], plan.options.tuning.min_gain)
 
 
 def score_to_beat(own: float, baseline_start: Gaussians | None, plan: Plan) -> float:
@@ -280,7 +280,7 @@ def fit_full(
             queue = rng.permutation(len(photos[0])).tolist()
         error += (fit_step(state, plan, queue.pop(), step + 1, part, rng) - error) / min(step + 1, 10)
         step += 1
-        if step > steps * (1 - options.average_share):
+        if step > steps * (1 - options.tuning.average_share):
             tail.add(state.x)
         if options.time_budget is not None and step == PROBE:
             steps = affordable_steps(time.perf_counter() - started, plan)

@@ -12,11 +12,12 @@ LONG_STEPS = 600  # from here on full-size photos and a little dropout pay
 EARLIER = 0.1  # share of the steps by which half-size photos end sooner where larger ones follow
 HASTY_STEPS = 20  # shorter runs have no time for full-size photos
 GROW_STEPS = 150  # shorter runs do better when they begin with all that they may have
+NOT_A_SETTING = {"setting": False}  # of fields that a user does not set by name
 
 
 @dataclass(frozen=True)
-class LearningRates:
-    """How far a step of the full fit may go, and how far all of them together.
+class Tuning:
+    """Constants of the fit, chosen on training scenes; tests and research change them.
 
     Args:
         means_lr: Step of a mean, in units of the Gaussian's size.
@@ -35,6 +36,18 @@ class LearningRates:
             says what it looks like, not where it is. From two photos on the limits are whole.
         min_scale: Least scale, in pixels of the photo that a Gaussian is nearest to: thinner ones show as needles
             when a viewer enlarges them. 0 for none.
+        average_share: Share of the steps, the last ones, over which the parameters are averaged.
+        ssim_lambda: Share of structural similarity in the loss, the rest is L1.
+        opacity_reg: Weight of the mean opacity in the loss of the full fit (3DGS-MCMC, Kheradmand et al. 2024): what
+            the photos do not need fades, instead of standing in front of other views.
+        scale_reg: The same of the mean size, in units of each Gaussian's own at its start: fewer of them overlap, and
+            a step takes a third less time.
+        iterations: Conjugate-gradient steps of the colour fit.
+        prior_weight: Weight of the unfitted colours, relative to how much of each Gaussian is seen.
+        huber: Colour error beyond which a pixel counts less in the colour fit (moving things, reflections).
+        min_gain: Exposure of a view against the mean, as a factor, from which on the colour fit compensates it;
+            smaller differences come from holes and highlights as often as from the camera.
+        max_gain: Largest exposure factor that is believed.
     """
 
     means_lr: float = 0.1
@@ -51,6 +64,15 @@ class LearningRates:
     max_opacity_change: float = 4.0
     single_view_share: float = 0.3
     min_scale: float = 0.5
+    average_share: float = 0.2
+    ssim_lambda: float = 0.35
+    opacity_reg: float = 0.03
+    scale_reg: float = 0.01
+    iterations: int = 6
+    prior_weight: float = 0.03
+    huber: float = 0.2
+    min_gain: float = 1.15
+    max_gain: float = 2.0
 
 
 @dataclass(frozen=True)
@@ -62,30 +84,18 @@ class FitOptions:
         fit_steps: Steps of the full fit, one view each; None: 240, and by effort and number of Gaussians.
         time_budget: Seconds after which the full fit stops, None for no limit. The steps are then chosen from the
             measured time of the first ones, and the result is no longer the same on every machine.
+        photo_scale: Times the views' size at which two of every five steps after those on half-size photos look at
+            larger photos, as far as the photos are that large. ``"auto"``: up to 2 with effort ``"default"`` and
+            ``"best"`` where the photos are at least 1.25 times as large, on the CPU; 1 otherwise.
         dropout: Share of the Gaussians that a step leaves out; None: 0.1 for five views or fewer and 150 steps or
             more, where the fit would memorise the photos, otherwise 0.05 from 600 steps on and 0 below.
         half_res_share: Share of the steps on half-size photos; None: 0.7, from 600 steps on 0.5, below 20 all; 0.1 less
             where ``photo_scale`` is above 1.
-        photo_scale: Times the views' size at which two of every five steps after that look at larger photos, as far as
-            the photos are that large. ``"auto"``: up to 2 with effort ``"default"`` and ``"best"`` where the photos are
-            at least 1.25 times as large, on the CPU; 1 otherwise.
-        move_cameras: Whether the full fit moves the cameras on (on the CPU).
-        average_share: Share of the steps, the last ones, over which the parameters are averaged.
-        ssim_lambda: Share of structural similarity in the loss, the rest is L1.
-        opacity_reg: Weight of the mean opacity in the loss of the full fit (3DGS-MCMC, Kheradmand et al. 2024): what
-            the photos do not need fades, instead of standing in front of other views.
-        scale_reg: The same of the mean size, in units of each Gaussian's own at its start: fewer of them overlap, and
-            a step takes a third less time.
-        rates: Steps and limits of the full fit.
-        iterations: Conjugate-gradient steps of the colour fit.
-        prior_weight: Weight of the unfitted colours, relative to how much of each Gaussian is seen.
-        huber: Colour error beyond which a pixel counts less (moving things, reflections).
-        min_gain: Exposure of a view against the mean, as a factor, from which on the colour fit compensates it;
-            smaller differences come from holes and highlights as often as from the camera.
-        max_gain: Largest exposure factor that is believed.
         holdout: Share of the photos' blocks that decides whether a fit is accepted.
         min_contribution: Least blending weight at some pixel of some photo; Gaussians below it in all photos that they
             lie in are left out.
+        move_cameras: Whether the full fit moves the cameras on; a plan decides it by ``poses``.
+        tuning: Constants.
 
     Raises:
         ValueError: If a setting is unknown or out of range.
@@ -94,22 +104,13 @@ class FitOptions:
     fit: Fit = "full"
     fit_steps: int | None = None
     time_budget: float | None = None
+    photo_scale: float | Literal["auto"] = "auto"
     dropout: float | None = None
     half_res_share: float | None = None
-    photo_scale: float | Literal["auto"] = "auto"
-    move_cameras: bool = False
-    average_share: float = 0.2
-    ssim_lambda: float = 0.35
-    opacity_reg: float = 0.03
-    scale_reg: float = 0.01
-    rates: LearningRates = field(default_factory=LearningRates)
-    iterations: int = 6
-    prior_weight: float = 0.03
-    huber: float = 0.2
-    min_gain: float = 1.15
-    max_gain: float = 2.0
     holdout: float = 0.05
     min_contribution: float = 1 / 255
+    move_cameras: bool = field(default=False, metadata=NOT_A_SETTING)
+    tuning: Tuning = field(default_factory=Tuning, metadata=NOT_A_SETTING)
 
     @property
     def steps(self) -> int:
@@ -134,30 +135,18 @@ class FitOptions:
         return self.fit == "full" and self.steps >= GROW_STEPS
 
     def __post_init__(self) -> None:
-        if isinstance(self.rates, dict):  # as CompactOptions.to_dict() and JSON have it
-            object.__setattr__(self, "rates", LearningRates(**self.rates))
         if self.fit not in ("none", "full"):
             raise ValueError(f'fit: expected "none" or "full", got "{self.fit}"')
         if self.steps < 1:
             raise ValueError(f"fit_steps: expected at least 1, got {self.steps}")
-        if self.iterations < 1:
-            raise ValueError(f"iterations: expected at least 1, got {self.iterations}")
-        for name in ("prior_weight", "opacity_reg", "scale_reg"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name}: expected at least 0, got {getattr(self, name)}")
         if not 0 < self.holdout < 1:
             raise ValueError(f"holdout: expected a number between 0 and 1, got {self.holdout}")
-        for name in ("half_res_share", "average_share", "ssim_lambda", "min_contribution"):
+        for name in ("half_res_share", "min_contribution"):
             value = getattr(self, name)
             if value is not None and not 0 <= value <= 1:
                 raise ValueError(f"{name}: expected a number from 0 to 1, got {value}")
-        for name in ("min_gain", "max_gain"):
-            if not getattr(self, name) >= 1:
-                raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
         if self.photo_scale != "auto" and (isinstance(self.photo_scale, str) or not 1 <= self.photo_scale < math.inf):
             raise ValueError(f'photo_scale: expected "auto" or a number from 1, got {self.photo_scale!r}')
-        if not self.huber > 0:
-            raise ValueError(f"huber: expected more than 0, got {self.huber}")
         if self.dropout is not None and not 0 <= self.dropout < 1:
             raise ValueError(f"dropout: expected a number from 0 to below 1, got {self.dropout}")
         if self.time_budget is not None and not self.time_budget > 0:

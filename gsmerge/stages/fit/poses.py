@@ -8,7 +8,7 @@ import numpy as np
 
 from gsmerge.geometry import motion_matrices
 from gsmerge.render.photos import Photos
-from gsmerge.stages.fit.options import LearningRates
+from gsmerge.stages.fit.options import Tuning
 
 EPS = 1e-15  # of Adam
 
@@ -36,7 +36,7 @@ class PoseState:
     counts: np.ndarray
     pixel: float
 
-    def step(self, view: int, gradient: np.ndarray, rates: LearningRates, progress: float) -> None:
+    def step(self, view: int, gradient: np.ndarray, rates: Tuning, progress: float) -> None:
         """One Adam step of a view by the gradient ``[4,4]`` of its viewmat; steps fall to nothing at the end."""
         turns = self.viewmats[view, :3, :3].T @ gradient[:3]
         (_, ab, ac), (ba, _, bc), (ca, cb, _) = turns[:, :3]
