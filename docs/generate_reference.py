@@ -132,7 +132,7 @@ def _cell(text: str | None) -> str:
 
 
 def _training_page() -> str:
-    from gsmerge.networks.options import NetworkOptions
+    from gsmerge.networks.modules import NetworkOptions
     from gsmerge.research.training import TrainOptions
 
     lines = [NOTICE, "", "# Settings of a training run", ""]

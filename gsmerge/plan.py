@@ -18,12 +18,11 @@ from gsmerge.runtime.record import note, stage
 from gsmerge.stages.agreement import measured_share
 from gsmerge.stages.assign import merge_unseen
 from gsmerge.stages.clean import CleanOptions, clean
-from gsmerge.stages.counts import CountLimits, count_limits
 from gsmerge.stages.decode import DecodeOptions
 from gsmerge.stages.fit import FitBackend, FitOptions, photo_scale, start_share
 from gsmerge.stages.match import MatchOptions
 from gsmerge.stages.prepare import Prepared
-from gsmerge.stages.segment import SuperpixelPlan, scene_tree
+from gsmerge.stages.segment import CountLimits, SuperpixelPlan, count_limits, scene_tree
 from gsmerge.stages.superpixels import AUTO_SHARE, SHARE, SegmentOptions
 from gsmerge.types import Gaussians, Scene
 from gsmerge.views import report_views, scored_views

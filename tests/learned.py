@@ -13,7 +13,7 @@ from gsmerge.moments import Members, scene_members
 from gsmerge.networks.apply import NetworkContext
 from gsmerge.networks.checkpoint import save_checkpoint
 from gsmerge.networks.modules import Networks
-from gsmerge.networks.options import NetworkOptions
+from gsmerge.networks.modules import NetworkOptions
 from gsmerge.stages.encode import EncodeOptions, encode
 from gsmerge.types import FeatureGaussians, Groups, PixelScene
 

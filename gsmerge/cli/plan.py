@@ -45,8 +45,8 @@ def plan_document(
     from gsmerge.plan import EFFORTS, resolve_fit, resolved_settings, steps_for
     from gsmerge.runtime.estimate import estimate_run, fit_of
     from gsmerge.runtime.threads import available_threads
-    from gsmerge.stages.counts import count_limits, largest_count
     from gsmerge.stages.fit import photo_scale
+    from gsmerge.stages.segment import count_limits, largest_count
 
     photos, grid = scene.images is not None, (len(scene), scene.cameras.height, scene.cameras.width)
     options = resolved_settings(settings, photos=photos)

@@ -9,7 +9,7 @@ from typing import Any
 
 from gsmerge import __version__
 from gsmerge.budget import AUTO
-from gsmerge.encoded.divide import divide_all
+from gsmerge.encoded.decode import divide_all
 from gsmerge.encoded.encoded import Encoded, StoredHeads, StoredSettings, without_members
 from gsmerge.errors import UsageError
 from gsmerge.options import CompactOptions, to_schema

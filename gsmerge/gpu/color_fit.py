@@ -22,9 +22,8 @@ from gsmerge.gpu.device_photos import (
 )
 from gsmerge.gpu.image_scores import exposure_gains, holdout_psnr
 from gsmerge.stages.fit.color import HOLDOUT, add_offsets, solve_colors
-from gsmerge.stages.fit.holdout import training_weights
-from gsmerge.stages.fit.options import FitOptions
-from gsmerge.stages.fit.report import FitReport
+from gsmerge.stages.fit.options import FitOptions, FitReport
+from gsmerge.stages.fit.photos import training_weights
 from gsmerge.types import Gaussians
 
 

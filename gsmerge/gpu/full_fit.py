@@ -22,7 +22,7 @@ from gsmerge.gpu.image_scores import holdout_psnr, loss_gradient, photo_means
 from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT, SIZE
 from gsmerge.kernels.raster.walk import MAX_ALPHA
 from gsmerge.networks.residuals import quat_to_rotmat
-from gsmerge.render.colored import Shape
+from gsmerge.render.autograd import Shape
 from gsmerge.stages.fit.full import (
     GROWTH,
     MAX_STEPS,
@@ -35,9 +35,8 @@ from gsmerge.stages.fit.full import (
     plan_run,
     step_sizes,
 )
-from gsmerge.stages.fit.grow import DEPTH, OFFSET
-from gsmerge.stages.fit.options import FitOptions
-from gsmerge.stages.fit.report import FitReport
+from gsmerge.stages.fit.options import FitOptions, FitReport
+from gsmerge.stages.fit.state import DEPTH, OFFSET
 from gsmerge.types import SH_C0, Gaussians
 
 READ_EVERY = 20  # steps; each reading waits for the device
@@ -152,7 +151,7 @@ def grow_to(state: FitState, photos: DevicePhotos, count: int) -> FitState:
 
 
 def grow(state: FitState, photos: DevicePhotos, count: int) -> FitState:
-    """Halve the Gaussians with the largest error masses, see :func:`gsmerge.stages.fit.grow.grow`."""
+    """Halve the Gaussians with the largest error masses, see :func:`gsmerge.stages.fit.state.grow`."""
     masses = error_masses(state, photos)
     num = min(count - len(state), int((masses > 0).sum()))
     if num <= 0:

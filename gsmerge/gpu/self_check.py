@@ -16,7 +16,7 @@ from gsmerge.geometry import normalize, quat_to_rotmat
 from gsmerge.gpu.adam import StepGradients, adam_step, start_state, step_in_torch
 from gsmerge.gpu.device_photos import peak_weights, shape_of, upload_gaussians, upload_photos
 from gsmerge.render import cuda
-from gsmerge.render.colored import Shape, draw_colored, seen_colors
+from gsmerge.render.autograd import Shape, draw_colored, seen_colors
 from gsmerge.render.photos import EPS2D, Photos
 from gsmerge.stages.fit.full import step_sizes
 from gsmerge.stages.fit.options import FitOptions

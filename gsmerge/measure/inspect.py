@@ -36,7 +36,7 @@ from gsmerge.report import finite
 from gsmerge.runtime.estimate import estimate_run
 from gsmerge.runtime.threads import available_threads, use_threads
 from gsmerge.stages.clean import BOX_QUANTILES, beyond_scene, floater_share
-from gsmerge.stages.counts import default_count
+from gsmerge.stages.segment import default_count
 from gsmerge.stages.sky import sky_regions
 from gsmerge.types import Cameras, Gaussians, Scene
 

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from gsmerge.geometry import covariances, rotation_entries, rotmat_to_quat
 from gsmerge.moments import Members, feature_to_gaussians
+from gsmerge.networks.cross_view_stats import nearest_points
 from gsmerge.networks.modules import SLOTS, Networks
-from gsmerge.networks.neighbors import nearest_points
 from gsmerge.networks.residuals import (
     HALF,
     RESIDUAL,
@@ -21,8 +21,16 @@ from gsmerge.networks.residuals import (
     move_gaussians,
     tanh_bounded,
 )
-from gsmerge.networks.tables import group_rows, point_seeds, sample_members, split_tables
-from gsmerge.networks.tokens import GroupFeatures, compute_group_features, member_tokens, part_tokens
+from gsmerge.networks.tokens import (
+    GroupFeatures,
+    compute_group_features,
+    group_rows,
+    member_tokens,
+    part_tokens,
+    point_seeds,
+    sample_members,
+    split_tables,
+)
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, as_array, as_tensor
 

@@ -17,8 +17,7 @@ from torch import Tensor
 from gsmerge import __version__
 from gsmerge.errors import SceneError
 from gsmerge.io.atomic import atomic_output
-from gsmerge.networks.modules import Networks
-from gsmerge.networks.options import NetworkOptions
+from gsmerge.networks.modules import NetworkOptions, Networks
 
 SCHEMA = 1  # version of the tensors' names and of the tokens that they were trained on
 FORMAT = "gsmerge-networks"

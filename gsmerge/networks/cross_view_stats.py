@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from gsmerge.kernels.gaussians.cross_view import COLUMNS, sum_cross_view
+from gsmerge.kernels.gaussians.nearest import LEAF, build_tree, nearest_of_others
 from gsmerge.moments import Members
-from gsmerge.runtime.threads import parallel_map
+from gsmerge.render.plan import pieces
+from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import SH_C0, Cameras
 
 NUM_STATS = COLUMNS + 1
@@ -14,6 +16,7 @@ NEAR = 0.03  # largest difference of the logarithms of two depths on the same su
 FAR = 0.3  # larger differences of the logarithms of depths are clipped to this
 MIN_OPACITY = 1 / 255  # more transparent Gaussians show no surface
 ROWS = 8192  # points per task
+MOST = 64  # points that are looked at for each neighbour that is asked for
 
 
 def cross_view_stats(
@@ -53,3 +56,33 @@ def cross_view_stats(
     shares = [sums[:, 1] / num_seen, sums[:, 2] / num_seen, sums[:, 3] / num_seen, sums[:, 4] / num_same]
     stats[:, :6] = np.stack([np.log1p(sums[:, 0]) / 3, *shares, sums[:, 5] / num_seen / FAR], 1)
     return stats
+
+
+def nearest_of_other_views(means: np.ndarray, views: np.ndarray, count: int) -> np.ndarray:
+    """``[g,count]`` int64 nearest points of other views than the own (paper section 4.4), nearest first.
+
+    -1 where there are fewer, or where ``MOST`` times as many points, most of them of the own view, are nearer: what
+    lies behind those overlaps nothing.
+
+    Args:
+        means: ``[g,3]`` float64, finite.
+        views: ``[g]`` int64; points of views below 0 belong to none, and count as of another one.
+        count: Neighbours of each.
+    """
+    num = len(means)
+    num_nodes = 4 << (num // LEAF).bit_length()
+    order, neighbors = np.arange(num), np.empty((num, count), np.int64)
+    axes, splits = np.empty(num_nodes, np.int8), np.empty(num_nodes)
+    means = np.ascontiguousarray(means)
+    build_tree(means, order, axes, splits)
+    with use_threads() as threads:
+        parallel_map(
+            lambda span: nearest_of_others(means, views, order, axes, splits, *span, MOST * count, neighbors),
+            pieces(num, threads),
+        )
+    return neighbors
+
+
+def nearest_points(means: np.ndarray, count: int) -> np.ndarray:
+    """``[n,count]`` int64 nearest other points of ``means [n,3]``, nearest first; -1 where there are fewer."""
+    return nearest_of_other_views(means, np.full(len(means), -1, np.int64), count)

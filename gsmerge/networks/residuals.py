@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from gsmerge.geometry import rotation_entries
-from gsmerge.networks.options import Bounds
+from gsmerge.networks.modules import Bounds
 from gsmerge.types import SH_C0, FeatureGaussians, Gaussians, as_array, as_tensor
 
 MEAN, SIZE, ROTATION, LOGIT, COLOR = slice(0, 3), slice(3, 6), slice(6, 9), 9, slice(10, 13)

@@ -13,14 +13,15 @@ from gsmerge.budget import AUTO
 from gsmerge.encoded.encoded import StoredSettings
 from gsmerge.errors import UsageError
 from gsmerge.moments import feature_to_gaussians
-from gsmerge.online.novelty import novel_rows, rows_in_view
 from gsmerge.online.options import OnlineOptions
 from gsmerge.online.photos import (
     BatchPhotos,
     concat_cameras,
     fit_batch_colors,
+    novel_rows,
     resize_cameras,
     resize_photos,
+    rows_in_view,
     update_replay,
     view_ids,
 )

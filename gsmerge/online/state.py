@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gsmerge import __version__
-from gsmerge.encoded.decode import children_of
-from gsmerge.encoded.divide import divide_all
+from gsmerge.encoded.decode import children_of, divide_all
 from gsmerge.encoded.encoded import Encoded, StoredScene, without_members
 from gsmerge.geometry import covariances
 from gsmerge.moments import MAX_OPACITY, Members, Rule, feature_to_gaussians, gaussian_members

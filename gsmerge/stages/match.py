@@ -9,7 +9,7 @@ import numpy as np
 
 from gsmerge.geometry import normalize
 from gsmerge.kernels.gaussians.cluster import connected_components, edge_scores, leader_clusters
-from gsmerge.networks.neighbors import nearest_of_other_views
+from gsmerge.networks.cross_view_stats import nearest_of_other_views
 from gsmerge.runtime.record import stage
 from gsmerge.types import SH_C0, FeatureGaussians, Matches, as_array
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from gsmerge.budget import BudgetOptions, exact_count, max_allowed
+from gsmerge.errors import UsageError
 from gsmerge.render.photos import scene_pictures
 from gsmerge.runtime.record import stage
 from gsmerge.stages.assign import seen_depths
-from gsmerge.stages.counts import CountLimits
+from gsmerge.stages.decode import DecodeOptions
 from gsmerge.stages.region_tree import RegionTree, auto_count, cut_tree, pixel_depths, region_tree
-from gsmerge.stages.superpixels import SegmentOptions, segment
+from gsmerge.stages.superpixels import MAX_FACTOR, SegmentOptions, count_for, segment
 from gsmerge.types import Scene, Segmentation
 
 
@@ -77,3 +79,92 @@ def knee_count(scene: Scene, plan: SuperpixelPlan) -> int:
     limits = plan.limits
     tree = plan.tree or scene_tree(scene, plan.options, limits, limits.default)
     return max(limits.min_count, min(auto_count(tree), limits.max_count))
+
+
+@dataclass(frozen=True)
+class CountLimits:
+    """Numbers of Gaussians that the options leave.
+
+    Args:
+        per_view: Superpixels of each view that the options ask for.
+        default: Gaussians that ``superpixels`` and K ask for.
+        min_count: Fewest Gaussians that the scene can be cut to: one for each view.
+        max_count: Most Gaussians that a budget, a size or a device allows.
+        exact: Gaussians that a budget or a size asks for; None without either.
+    """
+
+    per_view: int
+    default: int
+    min_count: int
+    max_count: int
+    exact: int | None
+
+    @property
+    def count(self) -> int | None:
+        """The number that a budget, a size or a device sets; None where ``superpixels`` and K decide."""
+        if self.exact is not None:
+            return self.exact
+        return self.max_count if self.default > self.max_count else None
+
+
+def count_limits(
+    scene: Scene,
+    segment: SegmentOptions,
+    decode: DecodeOptions,
+    budget: BudgetOptions,
+    *,
+    num_input: int | None = None,
+    num_reserved: int = 0,
+) -> CountLimits:
+    """Compute the limits of the number of Gaussians.
+
+    Args:
+        scene: The views and their Gaussians.
+        segment: Superpixels of each view.
+        decode: K.
+        budget: What limits the number.
+        num_input: Gaussians that shares of a budget refer to; None: those of the scene.
+        num_reserved: Gaussians of the result that are settled already, such as those that no view sees.
+
+    Raises:
+        UsageError: If more superpixels are asked for than there are pixels, or fewer Gaussians than views.
+    """
+    degree, own = scene.gaussians.sh_degree, scene.num_gaussians
+    exact = exact_count(budget, own if num_input is None else num_input, degree)
+    if exact is not None:
+        exact = min(max(1, exact - num_reserved), own)
+    max_count = min(max_allowed(budget, own, degree), own if exact is None else exact)
+    if max_count < min(len(scene), own):
+        raise UsageError(f"budget: expected at least {len(scene)}, one for each view, got {max_count}")
+    return CountLimits(
+        per_view=superpixels_per_view(scene, segment) if len(scene) else 0,
+        default=default_count(scene, segment, decode),
+        min_count=len(scene),
+        max_count=max_count,
+        exact=exact,
+    )
+
+
+def superpixels_per_view(scene: Scene, segment: SegmentOptions) -> int:
+    """Return the superpixels of each view; where Gaussians are fewer than pixels, a share is taken of the Gaussians."""
+    cameras = scene.cameras
+    per_view = count_for(segment, cameras.height, cameras.width)
+    if scene.aligned or segment.per_view is not None:
+        return per_view
+    return max(1, min(per_view, int(segment.share * len(scene.gaussians) / len(cameras))))
+
+
+def default_count(scene: Scene, segment: SegmentOptions, decode: DecodeOptions) -> int:
+    """Return the Gaussians that ``superpixels`` and K ask for; of a scene without views, a share of its Gaussians."""
+    if len(scene) == 0:
+        return round(max(1, int(segment.share * scene.num_gaussians)) * decode.mean_k)
+    per_view = superpixels_per_view(scene, segment)
+    total = per_view * scene.num_gaussians // scene.pixels_per_view if scene.aligned else per_view * len(scene)
+    return round(max(len(scene), total) * decode.mean_k)
+
+
+def largest_count(limits: CountLimits, segment: SegmentOptions) -> int:
+    """Return the most Gaussians that a run can give: superpixels that adapt may become more than are asked for."""
+    if limits.count is not None:
+        return limits.count
+    return min(MAX_FACTOR * limits.default, limits.max_count) if segment.adapts else limits.default

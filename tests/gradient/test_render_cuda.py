@@ -21,7 +21,7 @@ from gsmerge import Cameras, Gaussians, render
 from gsmerge.errors import GsmergeError
 from gsmerge.render import Rendering, contributions, plan_view, prepare
 from gsmerge.render import cuda as adapter
-from gsmerge.render.colored import draw_colored, seen_colors
+from gsmerge.render.autograd import draw_colored, seen_colors
 from gsmerge.render.cuda import harmonic_colors, rasterize, render_cuda
 
 Calls = list[dict[str, Any]]

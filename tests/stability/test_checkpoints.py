@@ -14,7 +14,7 @@ from scenes import arc, assert_invariants, identical, make_scene, room
 
 import gsmerge
 from gsmerge.networks.modules import Networks
-from gsmerge.networks.options import Bounds
+from gsmerge.networks.modules import Bounds
 from gsmerge.types import SH_C0
 
 PLAIN = {"fit": "none", "match": "none", "superpixels": 100}

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from gsmerge.geometry import motion_matrices
 from gsmerge.kernels.gaussians import optimise as kernels
 from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT
 from gsmerge.kernels.raster.walk import MAX_ALPHA
@@ -23,13 +24,10 @@ from gsmerge.render.blend import blend, view_colors
 from gsmerge.render.gradient import gradients_of
 from gsmerge.render.photos import Photos, render_photos
 from gsmerge.runtime.threads import in_turn, parallel_map
-from gsmerge.stages.fit.grow import grow_to
-from gsmerge.stages.fit.holdout import holdout_psnr, reduced, training_weights
 from gsmerge.stages.fit.loss import image_gradient
-from gsmerge.stages.fit.options import EARLIER, LONG_STEPS, FitOptions, Tuning
-from gsmerge.stages.fit.poses import PoseState, start_poses
-from gsmerge.stages.fit.report import FitReport
-from gsmerge.stages.fit.state import State, gaussians_of, start_state
+from gsmerge.stages.fit.options import EARLIER, LONG_STEPS, FitOptions, FitReport, Tuning
+from gsmerge.stages.fit.photos import holdout_psnr, reduced, training_weights
+from gsmerge.stages.fit.state import State, gaussians_of, grow_to, start_state
 from gsmerge.types import Array, Gaussians
 
 ROWS = 16384  # Gaussians per piece of an optimiser step
@@ -53,6 +51,7 @@ NO_LOSS = np.empty((0, 0), np.float32)  # on the transmittance
 HIDDEN = np.float32(1e-9)  # a weight that is neither that of a held-out pixel nor one that counts
 Masks = tuple[np.ndarray, np.ndarray]  # of the photos at full and at half size, [v,h,w] bool
 Progress = Callable[[int, int, float, float], None]  # step, steps, PSNR of the photos and of their held-out blocks
+EPS = 1e-15  # of Adam
 
 
 @dataclass(frozen=True)
@@ -316,3 +315,50 @@ def affordable_steps(seconds: float, plan: Plan) -> int:
     pixels = [photos.height * photos.width for photos in plan.photos]
     mean_step = seconds / PROBE * (coarse + 3 * (1 - coarse) * (1 + max(pixels) / pixels[0]) / 2)
     return int(np.clip((budget - seconds) / mean_step + PROBE, PROBE + 1, MAX_STEPS))
+
+
+@dataclass(eq=False)
+class PoseState:
+    """Motions of the views under optimisation, whose mean is none, so that the scene stays where it is.
+
+    Args:
+        start: ``[v,4,4]`` viewmats before the fit.
+        viewmats: ``[v,4,4]`` float64, written by every step; the photos of all sizes share them.
+        x: ``[v,6]`` motion of each, see :func:`gsmerge.geometry.motion_vectors`: about the scene's middle, where turns
+            and shifts of a camera show differently.
+        m: First moment.
+        v: Second moment.
+        counts: ``[v]`` steps of each.
+        pixel: Angle of a pixel, radians, which is also its size at the scene's depth, canonical units.
+    """
+
+    start: np.ndarray
+    viewmats: np.ndarray
+    x: np.ndarray
+    m: np.ndarray
+    v: np.ndarray
+    counts: np.ndarray
+    pixel: float
+
+    def step(self, view: int, gradient: np.ndarray, rates: Tuning, progress: float) -> None:
+        """One Adam step of a view by the gradient ``[4,4]`` of its viewmat; steps fall to nothing at the end."""
+        turns = self.viewmats[view, :3, :3].T @ gradient[:3]
+        (_, ab, ac), (ba, _, bc), (ca, cb, _) = turns[:, :3]
+        slope = np.array([cb - bc, ac - ca, ba - ab, *turns[:, 3]])
+        self.counts[view] += 1
+        for moment, beta, value in ((self.m, rates.beta1, slope), (self.v, rates.beta2, slope**2)):
+            moment[view] += (1 - beta) * (value - moment[view])
+        first = self.m[view] / (1 - rates.beta1 ** self.counts[view])
+        second = self.v[view] / (1 - rates.beta2 ** self.counts[view])
+        self.x[view] -= rates.poses_lr * self.pixel * (1 - progress) * first / (np.sqrt(second) + EPS)
+        self.x -= self.x.mean(0)
+        self.viewmats[:] = self.start @ motion_matrices(self.x)
+
+
+def start_poses(photos: tuple[Photos, ...]) -> tuple[PoseState, tuple[Photos, ...]]:
+    """Motions at the poses of some photos, and the photos with viewmats that they share with it."""
+    start = photos[0].viewmats.astype(np.float64)
+    zero, shared = np.zeros((len(start), 6)), start.copy()
+    pixel = 1 / float(photos[0].Ks[:, [0, 1], [0, 1]].mean())
+    state = PoseState(start, shared, zero, zero.copy(), zero.copy(), np.zeros(len(start), np.int64), pixel)
+    return state, tuple(replace(some, viewmats=shared) for some in photos)

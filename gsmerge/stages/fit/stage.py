@@ -15,11 +15,9 @@ from gsmerge.runtime.threads import in_turn
 from gsmerge.stages.decode import Decoded
 from gsmerge.stages.fit.color import draw, fit_colors
 from gsmerge.stages.fit.full import Progress, fit_full
-from gsmerge.stages.fit.grow import grow_to
-from gsmerge.stages.fit.options import FitOptions
+from gsmerge.stages.fit.options import FitOptions, FitReport, Fitted, record_fit, report_steps
 from gsmerge.stages.fit.photos import fit_photos
-from gsmerge.stages.fit.report import FitReport, Fitted, record_fit, report_steps
-from gsmerge.stages.fit.state import gaussians_of, start_state
+from gsmerge.stages.fit.state import gaussians_of, grow_to, start_state
 from gsmerge.types import Array, Gaussians, Scene
 
 FitResult = tuple[Gaussians, FitReport]
@@ -46,7 +44,7 @@ class FitBackend(Generic[PhotosT]):
     visible_mask: Callable[[Gaussians, PhotosT, float], Array]  # see visible_mask
     fit_full: Callable[..., FitResult]  # see gsmerge.stages.fit.full.fit_full; without masks
     fit_colors: Callable[[Gaussians, PhotosT, FitOptions, int], FitResult]  # the last: a seed
-    grow: Callable[[Gaussians, PhotosT, int], Gaussians]  # to a number, see gsmerge.stages.fit.grow.grow_to
+    grow: Callable[[Gaussians, PhotosT, int], Gaussians]  # to a number, see gsmerge.stages.fit.state.grow_to
     photo_error: Callable[[Gaussians, PhotosT], float]  # mean squared error of all photos
     photo_psnr: Callable[..., float]  # see gsmerge.render.photos.photo_psnr
     memory_errors: tuple[type[Exception], ...] = ()  # of a device whose memory does not suffice

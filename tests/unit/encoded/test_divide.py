@@ -9,7 +9,7 @@ import pytest
 import scenes
 from learned import Made, made
 
-from gsmerge.encoded.divide import divide_all, pick_children
+from gsmerge.encoded.decode import divide_all, pick_children
 from gsmerge.encoded.encoded import Division
 from gsmerge.moments import feature_to_gaussians
 from gsmerge.stages.decode import divide, split_counts

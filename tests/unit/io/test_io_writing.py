@@ -15,7 +15,7 @@ import pytest
 import scenes
 
 from gsmerge import Gaussians, PixelScene
-from gsmerge.baselines.splat_transform import find_program
+from gsmerge.baselines.simple import find_program
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry import normalize
 from gsmerge.io import OUTPUT_FORMATS, lost_harmonics, output_format, read_gaussians, read_ply, write_gaussians

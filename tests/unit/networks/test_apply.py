@@ -21,7 +21,7 @@ from gsmerge.networks.apply import (
     run_heads,
 )
 from gsmerge.networks.modules import Networks
-from gsmerge.networks.options import NetworkOptions
+from gsmerge.networks.modules import NetworkOptions
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.decode import DecodeOptions, decode, divide
 from gsmerge.stages.match import MatchOptions, match

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsmerge.networks.neighbors import nearest_of_other_views
+from gsmerge.networks.cross_view_stats import nearest_of_other_views
 from gsmerge.runtime.threads import use_threads
 
 

@@ -15,7 +15,7 @@ from gsmerge.encoded.encode import encode_scene
 from gsmerge.errors import UsageError
 from gsmerge.networks.checkpoint import save_checkpoint
 from gsmerge.networks.modules import Networks
-from gsmerge.networks.options import NetworkOptions
+from gsmerge.networks.modules import NetworkOptions
 from gsmerge.online.extend import extend
 from gsmerge.online.options import OnlineOptions
 from gsmerge.options import CompactOptions

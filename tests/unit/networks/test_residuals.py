@@ -11,7 +11,7 @@ from scenes import make_features
 from gsmerge import geometry
 from gsmerge.geometry import covariances
 from gsmerge.moments import feature_to_gaussians
-from gsmerge.networks.options import Bounds
+from gsmerge.networks.modules import Bounds
 from gsmerge.networks.residuals import (
     COLOR,
     LOGIT,

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsmerge.networks.tables import group_rows, hash_uniform, point_seeds, sample_members, split_tables
+from gsmerge.networks.tokens import group_rows, hash_uniform, point_seeds, sample_members, split_tables
 
 
 def test_tables_hold_every_group_once() -> None:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from gsmerge import Cameras, Gaussians
 from gsmerge.moments import feature_to_gaussians, scene_members, unaligned_members
-from gsmerge.online.novelty import MARGIN, REACH, group_errors, groups_in_view, pixel_errors
+from gsmerge.online.extend import MARGIN, REACH, group_errors, groups_in_view, pixel_errors
 from gsmerge.online.state import moments_of
 from gsmerge.render import contributions, plan_view, prepare
 from gsmerge.render.photos import photos_of

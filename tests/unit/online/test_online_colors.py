@@ -11,7 +11,7 @@ from arriving import fed, room, same_group, state_of
 
 from gsmerge import Gaussians, PixelScene
 from gsmerge.moments import feature_to_gaussians
-from gsmerge.online.novelty import groups_in_view
+from gsmerge.online.extend import groups_in_view
 from gsmerge.online.photos import BatchPhotos, fit_batch_colors
 from gsmerge.online.state import GroupSet
 from gsmerge.render.photos import Photos, scene_photos

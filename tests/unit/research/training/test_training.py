@@ -17,7 +17,7 @@ from gsmerge.errors import SceneError
 from gsmerge.networks.apply import NetworkContext, encode_features, refine_features, run_heads
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.networks.modules import Networks
-from gsmerge.networks.options import Bounds, NetworkOptions
+from gsmerge.networks.modules import Bounds, NetworkOptions
 from gsmerge.networks.residuals import LOGIT, MEAN, SIZE, bound_residuals, move_gaussians
 from gsmerge.research.training import (
     Example,

@@ -17,7 +17,7 @@ from gsmerge.render.photos import Photos
 from gsmerge.stages.fit import FitOptions
 from gsmerge.stages.fit.full import NO_LOSS, fit_full
 from gsmerge.stages.fit.options import LearningRates
-from gsmerge.stages.fit.poses import start_poses
+from gsmerge.stages.fit.full import start_poses
 from gsmerge.stages.fit.state import start_state
 
 Pair = tuple[Photos, Photos]

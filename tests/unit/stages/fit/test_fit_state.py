@@ -13,8 +13,8 @@ from gsmerge.geometry import covariances
 from gsmerge.kernels.gaussians.optimise import COLOR, COLUMNS, LOGIT, QUAT, SIZE
 from gsmerge.render.metrics import psnr
 from gsmerge.render.photos import Photos, scene_photos
-from gsmerge.stages.fit.grow import error_masses, grow
-from gsmerge.stages.fit.holdout import holdout_psnr, reduced, training_weights
+from gsmerge.stages.fit.state import error_masses, grow
+from gsmerge.stages.fit.photos import holdout_psnr, reduced, training_weights
 from gsmerge.stages.fit.state import State, gaussians_of, start_state
 
 
