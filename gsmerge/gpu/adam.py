@@ -123,7 +123,7 @@ def adam_step(state: FitState, gradients: StepGradients, options: FitOptions, ra
     if state.x.is_cuda and has_triton():
         from gsmerge.gpu.adam_kernel import launch
 
-        launch(state, gradients, options, rates, step)
+        launch(state, gradients, options.tuning, rates, step)
     else:
         step_in_torch(state, gradients, options, rates, step)
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import triton
 import triton.language as tl
-
-from gsmerge.gpu.adam import FitState, StepGradients
-from gsmerge.stages.fit.options import FitOptions
 
 BLOCK = 128  # Gaussians to a program
 TINY = tl.constexpr(1e-15)  # beside the root of the second moment
@@ -120,16 +119,16 @@ def _step(
         tl.store(colors + 3 * i + c, new, mask)
 
 
-def launch(state: FitState, gradients: StepGradients, options: FitOptions, rates: object, step: int) -> None:
-    """Take one step on tensors of one device, in place; see :func:`gsmerge.gpu.adam.adam_step`."""
-    count, limits, g = len(state), options.tuning, gradients
+def launch(state: Any, gradients: Any, limits: Any, rates: Any, step: int) -> None:
+    """Take one step on tensors of one device, in place; :func:`gsmerge.gpu.adam.adam_step` says what they are."""
+    count, g = len(state), gradients
     if count == 0:
         return
     _step[(triton.cdiv(count, BLOCK),)](
         state.x, state.x0, state.m, state.v, state.units, state.box_shares, state.min_sizes,
         *(tensor.contiguous() for tensor in (g.means, g.quats, g.scales, g.opacities, g.colors)), g.reached, rates,
         state.means, state.quats, state.scales, state.opacities, state.colors, count,
-        options.tuning.opacity_reg / count, options.tuning.scale_reg / count,
+        limits.opacity_reg / count, limits.scale_reg / count,
         limits.max_mean_shift, limits.max_scale_change, limits.max_opacity_change, limits.beta1, limits.beta2,
         1 / (1 - limits.beta1**step), 1 / (1 - limits.beta2**step), BLOCK=BLOCK,
     )  # fmt: skip

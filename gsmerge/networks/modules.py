@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import scaled_dot_product_attention
 
-from gsmerge.networks.residuals import RESIDUAL
+from gsmerge.networks.residuals import RESIDUAL, WIDE, Bounds
 from gsmerge.networks.tokens import GROUP, MEMBER, PART
 
 SLOTS = (1, 2, 4)  # numbers of children that have a decoder head
@@ -199,43 +199,9 @@ class Networks(nn.Module):
         return sum(p.numel() for p in self.parameters())
 
 
-def _expect_number(name: str, value: Any, maximum: float) -> None:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= maximum:
-        raise ValueError(f"{name}: expected a number from 0 to {maximum:g}, got {value!r}")
-
-
 def _expect_count(name: str, value: Any, maximum: int) -> None:
     if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= maximum:
         raise ValueError(f"{name}: expected a whole number from 1 to {maximum}, got {value!r}")
-
-
-@dataclass(frozen=True)
-class Bounds:
-    """Largest correction that the decoder may make, 0: none; merger, refiner and encoder may each make half of it.
-
-    Args:
-        mean: Shift along each axis of the group's frame, in units of the Gaussian's size.
-        size: Change of each log scale.
-        turn: Rotation about each axis of the group's frame, radians.
-        logit: Change of the opacity's logit; of Feature Gaussians, of the logarithm of the optical depth.
-        color: Change of each channel of the base colour, sRGB in [0, 1].
-
-    Raises:
-        ValueError: If one is below 0, or too large to bound anything.
-    """
-
-    mean: float = 1.0
-    size: float = 1.1
-    turn: float = 0.5
-    logit: float = 3.0
-    color: float = 0.25
-
-    def __post_init__(self) -> None:
-        for f in fields(self):
-            _expect_number(f.name, getattr(self, f.name), 8.0)
-
-
-WIDE = Bounds(mean=4.0, size=6.0, turn=3.2, logit=8.0, color=0.75)  # of absolute outputs
 
 
 @dataclass(frozen=True)

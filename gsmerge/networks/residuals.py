@@ -6,7 +6,7 @@ scales (3) along the principal axes, of the opacity (1) and of the base colour (
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -14,13 +14,47 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from gsmerge.geometry import rotation_entries
-from gsmerge.networks.modules import Bounds
 from gsmerge.types import SH_C0, FeatureGaussians, Gaussians, as_array, as_tensor
 
 MEAN, SIZE, ROTATION, LOGIT, COLOR = slice(0, 3), slice(3, 6), slice(6, 9), 9, slice(10, 13)
 RESIDUAL = 13
 ROWS = 65_536  # that are moved at once: their float64 matrices are ten times as large as they
 HALF = 0.5  # share of the bounds that each stage before the decoder may use
+
+
+def expect_number(name: str, value: object, maximum: float) -> None:
+    """Raise ValueError where a setting is no number from 0 to ``maximum``."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= maximum:
+        raise ValueError(f"{name}: expected a number from 0 to {maximum:g}, got {value!r}")
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Largest correction that the decoder may make, 0: none; merger, refiner and encoder may each make half of it.
+
+    Args:
+        mean: Shift along each axis of the group's frame, in units of the Gaussian's size.
+        size: Change of each log scale.
+        turn: Rotation about each axis of the group's frame, radians.
+        logit: Change of the opacity's logit; of Feature Gaussians, of the logarithm of the optical depth.
+        color: Change of each channel of the base colour, sRGB in [0, 1].
+
+    Raises:
+        ValueError: If one is below 0, or too large to bound anything.
+    """
+
+    mean: float = 1.0
+    size: float = 1.1
+    turn: float = 0.5
+    logit: float = 3.0
+    color: float = 0.25
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            expect_number(f.name, getattr(self, f.name), 8.0)
+
+
+WIDE = Bounds(mean=4.0, size=6.0, turn=3.2, logit=8.0, color=0.75)  # of absolute outputs
 
 
 def residual_limits(bounds: Bounds) -> Tensor:

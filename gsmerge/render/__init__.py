@@ -13,8 +13,8 @@ Results do not depend on the number of threads: every Gaussian is projected and 
 summed over tiles is summed in the order of the tiles.
 """
 
-from gsmerge.render.blend import composite, contributions, splat_adjoint
-from gsmerge.render.images import Rendering, render
+from gsmerge.render.blend import Rendering, composite, contributions, splat_adjoint
+from gsmerge.render.images import render
 from gsmerge.render.plan import Splats, ViewPlan, plan_view, prepare
 
 __all__ = [

@@ -12,9 +12,8 @@ from torch.autograd.function import once_differentiable
 
 from gsmerge.kernels.raster import harmonics
 from gsmerge.kernels.raster.project_backward import add_rows
-from gsmerge.render.blend import composite, view_colors
+from gsmerge.render.blend import Rendering, composite, draw_views, prepare_views, view_colors
 from gsmerge.render.gradient import ColorGradients, color_gradients, gradients_of, plan_gradients, pose_gradient
-from gsmerge.render.images import Rendering, draw_views, prepare_views
 from gsmerge.render.plan import Array, Splats, ViewPlan, plan_view
 from gsmerge.types import Cameras, Gaussians
 

@@ -1,14 +1,19 @@
-"""Blending along a plan, and its transpose."""
+"""Blending along a plan, its transpose, and the images of several views."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from gsmerge.kernels.raster import blend as kernels
 from gsmerge.kernels.raster import harmonics
-from gsmerge.render.plan import Array, ViewPlan, pieces, tile_ranges
+from gsmerge.render.plan import Array, Splats, ViewPlan, pieces, prepare, tile_ranges
 from gsmerge.runtime.threads import parallel_map, use_threads
+from gsmerge.types import Array as AnyArray
+from gsmerge.types import Cameras, Gaussians
 
 
 def background_color(background: ArrayLike) -> Array:
@@ -118,3 +123,46 @@ def contributions(plan: ViewPlan) -> tuple[Array, Array]:
     mass, peak = np.zeros((2, len(plan.splats)), np.float32)
     mass[plan.ids], peak[plan.ids] = totals.T
     return mass, peak
+
+
+@dataclass(frozen=True, eq=False)
+class Rendering:
+    """Images of c views.
+
+    Args:
+        images: ``[c,h,w,3]`` float32 over the background, not clamped at 1.
+        alphas: ``[c,h,w,1]`` float32, 1 less the remaining transmittance.
+        depths: ``[c,h,w,1]`` float32 mean camera z of what was blended, 0 where nothing was; None if not asked for.
+    """
+
+    images: AnyArray
+    alphas: AnyArray
+    depths: AnyArray | None
+
+
+def prepare_views(gaussians: Gaussians, cameras: Cameras) -> tuple[Splats, Array, Array]:
+    """Gaussians around the cameras' own centre, and view matrices and intrinsics in float64.
+
+    The centre is taken off in float64, so that scenes in geographic coordinates keep their detail.
+    """
+    cameras = cameras.numpy()
+    origin = cameras.centres.astype(np.float64).mean(0) if len(cameras) else np.zeros(3)
+    return prepare(gaussians, origin), cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
+
+
+def draw_views(
+    plan_one: Callable[[int], ViewPlan], shape: tuple[int, int, int], background: AnyArray, with_depths: bool
+) -> Rendering:
+    """Draw the plans, one for the number of each view, of images of ``shape`` (views, height, width)."""
+    images, alphas = np.empty((*shape, 3), np.float32), np.empty((*shape, 1), np.float32)
+    depths = np.empty((*shape, 1), np.float32) if with_depths else None
+
+    def one(view: int) -> None:
+        plan = plan_one(view)
+        images[view], transmittance = blend(plan, view_colors(plan), background)
+        alphas[view, ..., 0] = 1 - transmittance
+        if depths is not None:
+            depths[view, ..., 0] = mean_depths(plan, alphas[view, ..., 0])
+
+    parallel_map(one, range(shape[0]))  # of one view alone, the pieces share the pool
+    return Rendering(images, alphas, depths)

@@ -30,7 +30,7 @@ import torch
 from torch import Tensor
 
 from gsmerge.errors import GsmergeError
-from gsmerge.render.images import Rendering
+from gsmerge.render.blend import Rendering
 from gsmerge.render.plan import EPS2D, Array, check_range
 from gsmerge.types import Cameras, Gaussians
 

@@ -2,62 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gsmerge.render.blend import background_color, blend, mean_depths, view_colors
-from gsmerge.render.plan import Splats, ViewPlan, plan_view, prepare
-from gsmerge.runtime.threads import parallel_map
+from gsmerge.render.blend import Rendering, background_color, draw_views, prepare_views
+from gsmerge.render.plan import ViewPlan, plan_view
 from gsmerge.types import Array, Cameras, Gaussians, as_tensor
 
 if TYPE_CHECKING:
     import torch
-
-
-@dataclass(frozen=True, eq=False)
-class Rendering:
-    """Images of c views.
-
-    Args:
-        images: ``[c,h,w,3]`` float32 over the background, not clamped at 1.
-        alphas: ``[c,h,w,1]`` float32, 1 less the remaining transmittance.
-        depths: ``[c,h,w,1]`` float32 mean camera z of what was blended, 0 where nothing was; None if not asked for.
-    """
-
-    images: Array
-    alphas: Array
-    depths: Array | None
-
-
-def prepare_views(gaussians: Gaussians, cameras: Cameras) -> tuple[Splats, Array, Array]:
-    """Gaussians around the cameras' own centre, and view matrices and intrinsics in float64.
-
-    The centre is taken off in float64, so that scenes in geographic coordinates keep their detail.
-    """
-    cameras = cameras.numpy()
-    origin = cameras.centres.astype(np.float64).mean(0) if len(cameras) else np.zeros(3)
-    return prepare(gaussians, origin), cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
-
-
-def draw_views(
-    plan_one: Callable[[int], ViewPlan], shape: tuple[int, int, int], background: Array, with_depths: bool
-) -> Rendering:
-    """Draw the plans, one for the number of each view, of images of ``shape`` (views, height, width)."""
-    images, alphas = np.empty((*shape, 3), np.float32), np.empty((*shape, 1), np.float32)
-    depths = np.empty((*shape, 1), np.float32) if with_depths else None
-
-    def one(view: int) -> None:
-        plan = plan_one(view)
-        images[view], transmittance = blend(plan, view_colors(plan), background)
-        alphas[view, ..., 0] = 1 - transmittance
-        if depths is not None:
-            depths[view, ..., 0] = mean_depths(plan, alphas[view, ..., 0])
-
-    parallel_map(one, range(shape[0]))  # of one view alone, the pieces share the pool
-    return Rendering(images, alphas, depths)
 
 
 def one_device(gaussians: Gaussians, cameras: Cameras) -> torch.device | None:
