@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import csv
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gsmerge.batch.locks import LOCK_TIMEOUT, BusyError, scene_lock
-from gsmerge.batch.records import COLUMNS, DONE, FAILED, SKIPPED, SUMMARY, each_record, row_of
-from gsmerge.errors import SceneError
+from gsmerge.batch.records import COLUMNS, DONE, FAILED, RECORDS, SKIPPED, SUMMARY, each_record, row_of
 from gsmerge.io import atomic_output
-from gsmerge.io.atomic import remove_leftovers
 from gsmerge.report import csv_cell, human_bytes
 
 MAX_LISTED = 20  # scenes in the table, and failures below it
@@ -54,23 +50,12 @@ class Totals:
 
 
 def write_summary(folder: Path) -> Path:
-    """Write the newest state of every scene in the folder, after other runs that are writing it.
-
-    A SceneError if the file cannot be written.
-    """
-    path = folder / SUMMARY
-    deadline = time.monotonic() + LOCK_TIMEOUT
-    while True:
-        try:
-            with scene_lock(folder, [SUMMARY]) as lock:
-                remove_leftovers(path)
-                _write_rows(path, _newest(folder))
-                lock.finish()
-                return path
-        except BusyError:
-            if time.monotonic() > deadline:
-                raise SceneError(path, "another run has been writing it for long", "run the same again") from None
-            time.sleep(0.05)
+    """Write the newest state of every scene in the folder; a SceneError if the file cannot be written."""
+    records, read = folder / RECORDS, -1
+    while (size := records.stat().st_size if records.exists() else 0) != read:  # other runs may add to them meanwhile
+        _write_rows(folder / SUMMARY, _newest(folder))
+        read = size
+    return folder / SUMMARY
 
 
 def _newest(folder: Path) -> list[dict[str, Any]]:

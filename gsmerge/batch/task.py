@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
@@ -12,7 +13,7 @@ from typing import Any
 
 from gsmerge import __version__
 from gsmerge.batch.find import Job, result_names
-from gsmerge.batch.locks import BusyError, Lock, scene_lock
+from gsmerge.batch.locks import BusyError, scene_lock
 from gsmerge.batch.options import BatchOptions
 from gsmerge.batch.records import (
     BUSY,
@@ -29,7 +30,7 @@ from gsmerge.batch.records import (
 from gsmerge.compact_file import compact_files
 from gsmerge.errors import SceneError, UsageError, error_line
 from gsmerge.io import SceneFiles, find_scene_files
-from gsmerge.io.atomic import remove_leftovers
+from gsmerge.io.atomic import remove_stale
 from gsmerge.io.content_hash import content_hash, digest, filled, read_files
 from gsmerge.options import CHECKPOINTS
 from gsmerge.report import SCHEMA_VERSION, file_sha256, finite
@@ -62,37 +63,35 @@ def run_task(task: Task, context: BatchContext, new_records: RecordIndex) -> dic
     """
     job = task.job
 
-    def work(lock: Lock) -> dict[str, Any]:
+    def work(begun: Path) -> dict[str, Any]:
         try:
             new_records.read_on()
-            outcome = _process(task, context, new_records, lock)
+            outcome = _process(task, context, new_records, begun)
         except Exception as error:  # a bad scene must not end the batch
             outcome = record(FAILED, job.scene, job.output, error=error_line(error), attempt=task.attempt)
         known = new_records.known.get(job.output, task.known)
         if outcome["status"] != SKIPPED or (known is not None and known.failed_since):
             append_line(context.folder / RECORDS, outcome)
-        lock.finish()
+        begun.unlink(missing_ok=True)
         return outcome
 
     return _locked(job, context, work)
 
 
-def _locked(job: Job, context: BatchContext, work: Callable[[Lock], dict[str, Any]]) -> dict[str, Any]:
-    """What ``work`` returns under the scene's lock, or that another process has it, or that nothing can be written."""
+def _locked(job: Job, context: BatchContext, work: Callable[[Path], dict[str, Any]]) -> dict[str, Any]:
+    """Work under the scene's lock; the record says where another process has it, or nothing can be written."""
     try:
-        with scene_lock(context.folder, result_names(job.output, context.options)) as lock:
-            return work(lock)
+        with scene_lock(context.folder, job.output) as begun:
+            return work(begun)
     except BusyError:
         return record(BUSY, job.scene, job.output)
     except SceneError as error:  # locks or records cannot be written, whatever the scene
         return record(STUCK, job.scene, job.output, error=str(error))
 
 
-def _process(task: Task, context: BatchContext, new_records: RecordIndex, lock: Lock) -> dict[str, Any]:
-    """The scene's record, with its files in place."""
+def _process(task: Task, context: BatchContext, new_records: RecordIndex, begun: Path) -> dict[str, Any]:
+    """Skip or compact a scene, and return its record."""
     job, options = task.job, context.options
-    if lock.abandoned:
-        _clean(job, context)
     files = _files_of(job, options)
     key = scene_key(files, options)
     before, since = task.known, new_records.known.get(job.output)
@@ -102,10 +101,13 @@ def _process(task: Task, context: BatchContext, new_records: RecordIndex, lock: 
             written = [{"path": name, "sha256": sha256, "bytes": sizes[name]} for name, sha256 in known.files]
             return record(SKIPPED, job.scene, job.output, key=key, files=written)
     own = {name for known in (before, since) if known is not None for name, _ in known.files}
-    for name in result_names(job.output, options):
-        if os.path.lexists(context.folder / name) and name not in own and not (lock.fresh or options.overwrite):
-            problem = "exists already, and no batch wrote it; pass --overwrite to replace it"
-            raise UsageError(f"{context.folder / name}: {problem}")
+    names = [name for name in result_names(job.output, options) if os.path.lexists(context.folder / name)]
+    foreign = [] if begun.exists() else [name for name in names if name not in own]
+    if foreign and not options.overwrite:
+        problem = "exists already, and no batch wrote it; pass --overwrite to replace it"
+        raise UsageError(f"{context.folder / foreign[0]}: {problem}")
+    if not foreign:
+        begun.write_text(f"{os.getpid()} {socket.gethostname()}", encoding="utf-8")
     return _compact(task, context, files, key)
 
 
@@ -146,38 +148,28 @@ def is_done(job: Job, known: DoneResult, context: BatchContext) -> bool:
         return False
 
 
-def _clean(job: Job, context: BatchContext) -> None:
-    """Remove what a killed process left next to a result and its further levels."""
-    for name in result_names(job.output, context.options):
-        if (context.folder / name).parent.is_dir():
-            remove_leftovers(context.folder / name)
-
-
 def record_failure(task: Task, context: BatchContext, error: str) -> dict[str, Any]:
-    """The record of a scene whose process died or took too long, after all retries."""
+    """Record a scene whose process died or took too long, after all retries."""
     failed = record(FAILED, task.job.scene, task.job.output, error=error, attempt=task.attempt)
 
-    def work(lock: Lock) -> dict[str, Any]:
-        _clean(task.job, context)
+    def work(begun: Path) -> dict[str, Any]:
+        _clean(task.job, context, begun)
         append_line(context.folder / RECORDS, failed)
-        _finish(lock, task, context)
         return failed
 
     return _locked(task.job, context, work)
 
 
 def clean_up(task: Task, context: BatchContext) -> None:
-    """Remove unfinished files of a scene whose process was ended on purpose; another process or the next run may."""
-    names = result_names(task.job.output, context.options)
-    with suppress(BusyError, SceneError), scene_lock(context.folder, names) as lock:
-        _clean(task.job, context)
-        _finish(lock, task, context)
+    """Remove the unfinished files of a scene whose process was ended on purpose; where that fails, the next run may."""
+    with suppress(BusyError, SceneError, OSError), scene_lock(context.folder, task.job.output) as begun:
+        _clean(task.job, context, begun)
 
 
-def _finish(lock: Lock, task: Task, context: BatchContext) -> None:
-    """Remove the lock's file, unless only it shows that a batch wrote the result."""
-    new_records = RecordIndex(context.folder, context.start)
-    new_records.read_on()
-    recorded = task.known is not None or task.job.output in new_records.known
-    if recorded or not os.path.lexists(context.folder / task.job.output):
-        lock.finish()
+def _clean(job: Job, context: BatchContext, begun: Path) -> None:
+    """Remove what a killed process left, but not the mark that alone shows that a batch wrote the result."""
+    paths = [context.folder / name for name in result_names(job.output, context.options)]
+    for folder in {path.parent for path in paths}:
+        remove_stale(folder)
+    if not any(os.path.lexists(path) for path in paths):
+        begun.unlink(missing_ok=True)

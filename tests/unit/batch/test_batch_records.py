@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
+import socket
 import subprocess
 import sys
 from dataclasses import replace
@@ -14,8 +16,8 @@ from typing import Any
 import pytest
 from batches import rows
 
-from gsmerge.batch import BatchOptions, Job, locks, plan
-from gsmerge.batch.locks import LOCKS, BusyError, run_lock, scene_lock
+from gsmerge.batch import BatchOptions, Job, plan
+from gsmerge.batch.locks import PREFIX, BusyError, run_lock, scene_lock
 from gsmerge.batch.plan import estimate_seconds, make_schedule
 from gsmerge.batch.records import (
     COLUMNS,
@@ -30,7 +32,6 @@ from gsmerge.batch.records import (
 )
 from gsmerge.batch.summary import MAX_LISTED, Totals, summary_lines, write_summary
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.io.atomic import temporary_path
 from gsmerge.options import CompactOptions
 from gsmerge.runtime.estimate import memory_bytes
 from gsmerge.runtime.jsonl import append_line, each_line, read_lines
@@ -190,58 +191,49 @@ except SceneError as error:
     assert path.read_bytes() == whole
 
 
-def test_a_lock_is_held_by_one_and_gone_when_it_is_finished(tmp_path: Path) -> None:
-    with scene_lock(tmp_path, ["a.ply"]) as lock:
-        assert not lock.abandoned
-        assert json.loads(lock.path.read_text())["pid"] == os.getpid()
-        with pytest.raises(BusyError), scene_lock(tmp_path, ["a.ply"]):
+def test_a_lock_is_of_one_process_and_leaves_nothing(tmp_path: Path) -> None:
+    with scene_lock(tmp_path, "a.ply") as begun:
+        assert not begun.exists()
+        with pytest.raises(BusyError), scene_lock(tmp_path, "a.ply"):
             pass
-        with scene_lock(tmp_path, ["b.ply"]) as other:
-            other.finish()
-        lock.finish()
+        with scene_lock(tmp_path, "b.ply") as other:
+            assert other != begun
+    assert list(tmp_path.iterdir()) == []
+    with scene_lock(tmp_path, "a.ply") as again:
+        assert again == begun
+
+
+TAKE_TURNS = """
+import os, pathlib, sys
+from gsmerge.batch.locks import BusyError, scene_lock
+folder, turns = pathlib.Path(sys.argv[1]), 0
+while turns < 300:
+    try:
+        with scene_lock(folder, "a.ply"):
+            os.close(os.open(folder / "taken", os.O_CREAT | os.O_EXCL))  # fails where another has the lock as well
+            os.unlink(folder / "taken")
+            turns += 1
+    except BusyError:
+        pass
+"""
+
+
+def test_processes_take_turns_though_each_removes_the_file(tmp_path: Path) -> None:
+    processes = [subprocess.Popen([sys.executable, "-c", TAKE_TURNS, str(tmp_path)]) for _ in range(4)]
+    assert [process.wait() for process in processes] == [0] * 4
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_lock_tells_that_it_was_abandoned_and_whether_there_was_a_file_before(tmp_path: Path) -> None:
-    (tmp_path / "old.ply").touch()
-    for name, fresh in (("new.ply", True), ("old.ply", False)):
-        with scene_lock(tmp_path, [name]):
-            pass  # as if killed: never finished
-        (tmp_path / name).touch()
-        for _ in range(2):
-            with scene_lock(tmp_path, [name]) as lock:
-                assert (lock.abandoned, lock.fresh) == (True, fresh)
-
-
-def test_a_lock_survives_that_its_file_is_removed_while_it_is_waited_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Between opening and locking, who held it finishes: the file that is locked then is nobody's any more."""
-    locked, calls = locks._lock, []
-
-    def removed_first(descriptor: int, path: Path, *, shared: bool) -> bool:
-        if not calls:
-            path.unlink()
-        calls.append(path)
-        return locked(descriptor, path, shared=shared)
-
-    monkeypatch.setattr(locks, "_lock", removed_first)
-    with scene_lock(tmp_path, ["a.ply"]) as lock:
-        assert len(calls) == 2
-        assert lock.path.exists()
-
-
 def test_a_lock_that_cannot_be_made_is_told(tmp_path: Path) -> None:
-    (tmp_path / LOCKS).touch()
-    with pytest.raises(SceneError, match="cannot be written"), scene_lock(tmp_path, ["a.ply"]):
-        pass
-    with pytest.raises(SceneError, match="cannot be written"), scene_lock(tmp_path / "gone", ["a.ply"]):
+    (tmp_path / "file").touch()
+    with pytest.raises(SceneError, match="cannot be written"), scene_lock(tmp_path / "file", "a.ply"):
         pass
 
 
 def test_runs_share_a_folder_if_they_make_the_same(tmp_path: Path) -> None:
+    (tmp_path / f"{PREFIX}old.0.1.gone.run").touch()  # of a run that was killed
     with run_lock(tmp_path, "same"), run_lock(tmp_path, "same"):
-        message = rf"other settings is at work there \(process {os.getpid()}"
+        message = rf"other settings is at work there \(process {os.getpid()} on {re.escape(socket.gethostname())}"
         with pytest.raises(UsageError, match=message), run_lock(tmp_path, "other"):
             pass
         with run_lock(tmp_path, "same"):
@@ -249,13 +241,6 @@ def test_runs_share_a_folder_if_they_make_the_same(tmp_path: Path) -> None:
     with run_lock(tmp_path, "other"):
         pass
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_run_that_was_killed_holds_nothing_up(tmp_path: Path) -> None:
-    (tmp_path / LOCKS).mkdir()
-    (tmp_path / LOCKS / "run.lock").write_text('{"what": "old", "pid": 1, "host": "gone"}')
-    with run_lock(tmp_path, "new"):
-        pass
 
 
 def test_runs_that_may_share_a_folder_have_one_name() -> None:
@@ -357,7 +342,6 @@ def test_the_summary_has_the_newest_of_every_scene(tmp_path: Path) -> None:
         append_line(tmp_path / RECORDS, one)
     append_line(tmp_path / RECORDS, done("c.ply"))
     append_line(tmp_path / RECORDS, record(FAILED, "in/c.ply", "c.ply", error="killed"))
-    temporary_path(tmp_path / "summary.csv").touch()  # of a killed run
     assert write_summary(tmp_path) == tmp_path / "summary.csv"
     actual = rows(tmp_path)
     assert list(actual[0]) == list(COLUMNS)

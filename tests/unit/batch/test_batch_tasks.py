@@ -156,9 +156,7 @@ def test_files_that_no_batch_wrote_are_not_replaced(scene: Path, out: Path) -> N
         actual = run(scene, out)
         assert "exists already, and no batch wrote it; pass --overwrite" in actual["error"]
         assert (out / "room.ply").read_bytes() == b"mine"
-    with scene_lock(out, ["room.ply"]):
-        pass  # killed before it was refused
-    assert run(scene, out)["status"] == FAILED
+    assert list(results(out)) == ["room.ply"]
     assert run(scene, out, replace(QUICK, overwrite=True))["status"] == DONE
 
 
@@ -173,11 +171,12 @@ def test_what_another_run_has_done_meanwhile_is_skipped(scene: Path, out: Path) 
 
 def test_what_another_run_works_on_is_left_to_it(scene: Path, out: Path) -> None:
     task, context, later = one_task(scene, out)
-    with scene_lock(out, ["room.ply"]) as lock:
+    with scene_lock(out, "room.ply"):
+        (out / left_by_a_dead_process()).touch()
         assert run_task(task, context, later)["status"] == BUSY
         assert record_failure(task, context, "died")["status"] == BUSY
         clean_up(task, context)
-        assert lock.path.exists()
+        assert len(results(out)) == 2  # the lock, and the file that the other process may yet clean up
     assert not (out / "batch.jsonl").exists()
 
 
@@ -199,7 +198,7 @@ KILLS = {
     "while it writes": ("gsmerge.compact_file.write_gaussians", False),
     "before the result is renamed": ("gsmerge.io.atomic._flush", True),
     "before the record": ("gsmerge.batch.task.append_line", True),
-    "before the lock is gone": ("gsmerge.batch.locks.Lock.finish", True),
+    "before the lock is gone": ("gsmerge.batch.task.Path.unlink", True),
 }
 
 
@@ -228,7 +227,7 @@ run_task(*one_task(Path({str(scene)!r}), Path({str(out)!r})))
 """
     killed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert killed.returncode == -signal.SIGKILL, killed.stderr
-    assert (out / ".batch").is_dir()
+    assert list(out.glob(".batch-*"))
     after = run(scene, out)
     recorded = moment == "before the lock is gone"
     assert after["status"] == (SKIPPED if recorded else DONE)
@@ -239,10 +238,9 @@ run_task(*one_task(Path({str(scene)!r}), Path({str(out)!r})))
 def test_a_record_cut_in_the_middle_is_done_again(scene: Path, out: Path, undisturbed: dict[str, str]) -> None:
     run(scene, out)
     path = out / "batch.jsonl"
-    kept = (out / "room.ply").rename(out / "kept.ply")
-    with scene_lock(out, ["room.ply"]):
-        kept.rename(out / "room.ply")
-        path.write_bytes(path.read_bytes()[:100])
+    with scene_lock(out, "room.ply") as begun:
+        begun.touch()
+    path.write_bytes(path.read_bytes()[:100])
     assert run(scene, out)["status"] == DONE
     assert results(out) == undisturbed
     assert len(records(out)) == 1
@@ -299,11 +297,25 @@ def test_a_folder_that_cannot_be_written_fails_the_scene(
     assert "cannot be written (Permission denied)" in run(scene, out)["error"]
 
 
+def left_by_a_dead_process() -> str:
+    """The name of a temporary file whose process has ended."""
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    return atomic.temporary_path(Path("room.ply")).name.replace(f"-{os.getpid()}-", f"-{process.pid}-")
+
+
+def killed(out: Path) -> Path:
+    """What a process leaves that was killed while it worked on the scene; the mark that it had begun."""
+    (out / left_by_a_dead_process()).touch()
+    with scene_lock(out, "room.ply") as begun:
+        begun.touch()
+    return begun
+
+
 def test_who_is_given_up_leaves_a_record_and_nothing_else(scene: Path, out: Path) -> None:
     task, context, _ = one_task(scene, out)
-    with scene_lock(out, ["room.ply"]):
-        atomic.temporary_path(out / "room.ply").touch()  # its process died here
-        (out / ".room-mine.ply").touch()
+    killed(out)
+    (out / ".room-mine.ply").touch()
     actual = record_failure(replace(task, attempt=2), context, "killed")
     assert (actual["status"], actual["error"], actual["attempt"]) == (FAILED, "killed", 2)
     assert records(out) == [actual]
@@ -312,23 +324,18 @@ def test_who_is_given_up_leaves_a_record_and_nothing_else(scene: Path, out: Path
 
 def test_who_is_stopped_leaves_nothing(scene: Path, out: Path) -> None:
     task, context, _ = one_task(scene, out)
-    with scene_lock(out, ["room.ply"]):
-        atomic.temporary_path(out / "room.ply").touch()
+    killed(out)
     clean_up(task, context)
     assert list(out.iterdir()) == []
 
 
-def test_who_is_stopped_between_result_and_record_leaves_the_lock_that_says_whose_it_is(scene: Path, out: Path) -> None:
+def test_who_is_stopped_between_result_and_record_leaves_the_mark_that_says_whose_it_is(scene: Path, out: Path) -> None:
     task, context, _ = one_task(scene, out)
-    with scene_lock(out, ["room.ply"]) as lock:
-        (out / "room.ply").write_bytes(b"ours")
+    begun = killed(out)
+    (out / "room.ply").write_bytes(b"ours")
     clean_up(task, context)
-    assert lock.path.exists()
+    assert sorted(out.iterdir()) == sorted([begun, out / "room.ply"])
     assert run(scene, out)["status"] == DONE
-    assert not lock.path.exists()
-    with scene_lock(out, ["room.ply"]):
-        pass  # killed when the record was written
-    clean_up(task, context)
     assert list(results(out)) == ["room.ply"]
 
 
