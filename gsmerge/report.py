@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gsmerge import __version__
-from gsmerge.options import to_schema
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.types import Cameras, Gaussians
 
@@ -140,7 +139,7 @@ def report_document(
         ],
         "viewer_cameras": None if cameras_path is None else os.fspath(cameras_path),
         "ratio": numbers["num_output"] / max(numbers["num_input"], 1),
-        "options": to_schema(report.options),
+        "options": dict(report.options),
         "seed": numbers["options"]["seed"],
         "choices": numbers["choices"],
         **seconds_document({**seconds_before, **report.seconds, **seconds_after}),

@@ -9,7 +9,7 @@ from typing import Any
 from gsmerge.io import AUTO, OUTPUT_FORMATS, ReadHints, output_format
 from gsmerge.io.content_hash import digest
 from gsmerge.io.formats.ply import OpacityChoice
-from gsmerge.options import CompactOptions, to_schema
+from gsmerge.options import CompactOptions
 
 FIELDS = ("stem", "parent", "index", "k")
 ENGINES = ("local", "ray")
@@ -58,7 +58,7 @@ class BatchOptions:
 
     def result_settings(self) -> dict[str, Any]:
         """Everything that a result depends on besides the scene's files, as plain values."""
-        settings = to_schema(self.settings.to_dict())
+        settings = self.settings.to_dict()
         del settings["threads"]
         return {"settings": settings, "opacity": self.opacity, "reading": vars(self.hints)}
 

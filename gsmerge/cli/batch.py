@@ -71,8 +71,6 @@ def parse_jobs(text: str) -> int:
 def batch(args: opt.Args) -> None:
     """Compact many scenes, each on its own: a failure stops no other scene, and a second call continues."""
     out = args.output
-    if "{" in str(out):
-        raise UsageError(opt.renamed("--output", "batch") or "")
     if out.exists() and not out.is_dir():
         raise UsageError(f"--output: expected a folder, found the file {out}")
     hints = args.hints()

@@ -36,7 +36,6 @@ def plan_document(
     files: SceneFiles, scene: PixelScene | UnalignedScene, settings: CompactOptions, out: Path, notes: Sequence[str]
 ) -> dict[str, Any]:
     """What a run would make of a scene, and an estimate of its time and memory, as plain JSON types."""
-    from gsmerge.options import to_schema
     from gsmerge.runtime.estimate import estimate_run, fit_of, is_robust
     from gsmerge.runtime.threads import available_threads
     from gsmerge.stages.fit.photos import photo_scale
@@ -69,7 +68,7 @@ def plan_document(
             fit_steps=settings.fit.with_steps_for(share).steps, num_rest=3 * scene.gaussians.shN.shape[1],
             photo_scale=photo_scale(scene, settings.fit)[0],
         ),
-        "options": to_schema(options),
+        "options": options,
         "notes": list(notes),
     }  # fmt: skip
 

@@ -11,7 +11,7 @@ from gsmerge.budget import AUTO
 from gsmerge.encoded.divide import divide_all
 from gsmerge.encoded.encoded import Encoded, StoredHeads, StoredSettings, without_members
 from gsmerge.errors import UsageError
-from gsmerge.options import CompactOptions, to_schema
+from gsmerge.options import CompactOptions
 from gsmerge.pipeline import build, merge_views
 from gsmerge.runtime.record import Progress, current_record, record_run, stage
 from gsmerge.runtime.threads import use_threads
@@ -111,7 +111,7 @@ def _to_encoded(prepared: PreparedScene, merged: MergedViews, max_k: int | None)
 
 def _about(options: CompactOptions) -> dict[str, Any]:
     """Version, options, choices and notes; nothing that depends on the machine."""
-    settings = to_schema(options.to_dict()) | {"checkpoint": Path(options.checkpoint).name}
+    settings = options.to_dict() | {"checkpoint": Path(options.checkpoint).name}
     del settings["threads"]
     record = current_record()
     choices = {name: value for name, value in record.choices.items() if name != "networks"}
