@@ -71,7 +71,7 @@ def holders(folder: Path) -> list[int]:
 
 
 class InlinePool:
-    """In place of :class:`gsmerge.batch.local.LocalPool`: one scene after the other in this process."""
+    """In place of :class:`gsmerge.batch.pools.LocalPool`: one scene after the other in this process."""
 
     def __init__(self, work: BatchContext, _: int) -> None:
         self.work, self.index = work, RecordIndex(work.folder, work.start)

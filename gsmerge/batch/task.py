@@ -1,19 +1,25 @@
-"""One scene: skipped if it is done, otherwise compacted and recorded, safe against a kill at any moment."""
+"""One scene of a batch: skipped if it is done, otherwise compacted and recorded, safe against a kill at any moment.
+
+Locks on a scene and on the output folder end with the process that has them, however it ends.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import os
+import secrets
 import socket
 import warnings
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock, Timeout
+
 from gsmerge import __version__
 from gsmerge.batch.find import Job, result_names
-from gsmerge.batch.locks import BusyError, scene_lock
 from gsmerge.batch.options import BatchOptions
 from gsmerge.batch.records import (
     BUSY,
@@ -36,10 +42,13 @@ from gsmerge.options import CHECKPOINTS
 from gsmerge.report import SCHEMA_VERSION, file_sha256, finite
 from gsmerge.runtime.jsonl import append_line
 
+PREFIX = ".batch-"  # of the names of all files here, which are in the output folder
+RUN_TIMEOUT = 10.0  # seconds: other runs look at the lock of a run for an instant only
+
 
 @dataclass(frozen=True)
 class Task:
-    """A scene to be compacted."""
+    """A scene to compact, and how often that was tried."""
 
     job: Job  # the scene
     known: DoneResult | None  # its result of former runs; None without one
@@ -48,7 +57,7 @@ class Task:
 
 @dataclass(frozen=True)
 class BatchContext:
-    """What all tasks of a run share."""
+    """The folder and the options that all tasks of a run share."""
 
     folder: Path  # the output folder
     options: BatchOptions  # of the run, with the threads of a scene
@@ -132,7 +141,7 @@ def _files_of(job: Job, options: BatchOptions) -> SceneFiles:
 
 
 def scene_key(files: SceneFiles, options: BatchOptions) -> str:
-    """Digest of everything that a result depends on: what is read, all settings, and the version."""
+    """Return a digest of all that a result depends on: what is read, all settings, and the version."""
     content: dict[str, Any] = {"scene": content_hash(read_files(files)), **options.result_settings()}
     checkpoint = Path(options.settings.checkpoint)
     if options.settings.checkpoint not in CHECKPOINTS and checkpoint.is_file():  # by its content, wherever it is
@@ -141,7 +150,7 @@ def scene_key(files: SceneFiles, options: BatchOptions) -> str:
 
 
 def is_done(job: Job, known: DoneResult, context: BatchContext) -> bool:
-    """Whether a result would be skipped."""
+    """Return whether a result would be skipped."""
     try:
         return known.holds(context.folder, scene_key(_files_of(job, context.options), context.options))
     except SceneError:
@@ -167,9 +176,74 @@ def clean_up(task: Task, context: BatchContext) -> None:
 
 
 def _clean(job: Job, context: BatchContext, begun: Path) -> None:
-    """Remove what a killed process left, but not the mark that alone shows that a batch wrote the result."""
+    """Remove the files that a killed process left, except the mark of a result that is there."""
     paths = [context.folder / name for name in result_names(job.output, context.options)]
     for folder in {path.parent for path in paths}:
         remove_stale(folder)
     if not any(os.path.lexists(path) for path in paths):
         begun.unlink(missing_ok=True)
+
+
+class BusyError(Exception):
+    """Another process has the lock."""
+
+
+@contextmanager
+def scene_lock(folder: Path, output: str) -> Iterator[Path]:
+    """Keep other processes from a result while the block runs.
+
+    Yields:
+        The file whose presence says that a batch has begun to write the result: one that was killed leaves it.
+
+    Raises:
+        BusyError: If another process works on the result.
+        SceneError: If the lock cannot be made.
+    """
+    name = hashlib.sha256(output.encode(errors="surrogateescape")).hexdigest()[:32]
+    with _lock(folder / f"{PREFIX}{name}.lock"):
+        yield folder / f"{PREFIX}{name}.begun"
+
+
+@contextmanager
+def run_lock(folder: Path, name: str) -> Iterator[None]:
+    """Share the folder only with runs of the same name, see :meth:`BatchOptions.name`, while the block runs.
+
+    Raises:
+        UsageError: If a run of another name uses the folder.
+        SceneError: If the lock cannot be made.
+    """
+    own = f"{PREFIX}{name[:32]}.{secrets.token_hex(4)}.{os.getpid()}.{socket.gethostname()}.run"
+    with _lock(folder / own, RUN_TIMEOUT):  # before others are looked for: of two, one sees the other
+        for path in folder.glob(f"{PREFIX}*.run"):
+            if path.name != own and _is_locked(path) and not path.name.startswith(f"{PREFIX}{name[:32]}."):
+                *_, process, host = path.stem.removeprefix(PREFIX).split(".", 3)
+                raise UsageError(
+                    f"{folder}: a batch with other settings is at work there (process {process} on {host}); wait for"
+                    " it, or name another --output"
+                )
+        yield
+
+
+@contextmanager
+def _lock(path: Path, seconds: float = 0.0) -> Iterator[None]:
+    """Lock a file that is removed after the block; a BusyError if that takes longer than so many seconds."""
+    lock = FileLock(path)
+    try:
+        lock.acquire(timeout=seconds)
+    except Timeout:
+        raise BusyError from None
+    except OSError as error:
+        raise SceneError(path, f"cannot be written ({error.strerror})", "name another folder with --output") from error
+    try:
+        yield
+    finally:
+        path.unlink(missing_ok=True)  # before the release: who waits for it sees that the file is nobody's any more
+        lock.release()
+
+
+def _is_locked(path: Path) -> bool:
+    try:
+        with _lock(path):
+            return False
+    except BusyError:
+        return True

@@ -1,15 +1,15 @@
-"""One scene at a time: what is done, skipped, refused, and what a kill at any moment leaves."""
+"""One scene at a time: what is done, skipped, refused, locked, and what a kill at any moment leaves."""
 
 from __future__ import annotations
 
 import errno
 import os
+import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
-import time
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,14 +17,71 @@ from typing import Any
 import pytest
 from batches import QUICK, one_task, records, results, statuses
 
-from gsmerge.batch import Job
 from gsmerge.batch import task as tasks
-from gsmerge.batch.locks import scene_lock
-from gsmerge.batch.records import BUSY, DONE, FAILED, LOST, SKIPPED, STUCK, record
-from gsmerge.batch.run import dispatch
-from gsmerge.batch.task import BatchContext, Task, clean_up, record_failure, run_task
-from gsmerge.errors import SceneError
+from gsmerge.batch.records import BUSY, DONE, FAILED, SKIPPED, STUCK
+from gsmerge.batch.task import (
+    PREFIX,
+    BusyError,
+    clean_up,
+    record_failure,
+    run_lock,
+    run_task,
+    scene_lock,
+)
+from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import atomic
+
+
+def test_a_lock_is_of_one_process_and_leaves_nothing(tmp_path: Path) -> None:
+    with scene_lock(tmp_path, "a.ply") as begun:
+        assert not begun.exists()
+        with pytest.raises(BusyError), scene_lock(tmp_path, "a.ply"):
+            pass
+        with scene_lock(tmp_path, "b.ply") as other:
+            assert other != begun
+    assert list(tmp_path.iterdir()) == []
+    with scene_lock(tmp_path, "a.ply") as again:
+        assert again == begun
+
+
+TAKE_TURNS = """
+import os, pathlib, sys
+from gsmerge.batch.task import BusyError, scene_lock
+folder, turns = pathlib.Path(sys.argv[1]), 0
+while turns < 300:
+    try:
+        with scene_lock(folder, "a.ply"):
+            os.close(os.open(folder / "taken", os.O_CREAT | os.O_EXCL))  # fails where another has the lock as well
+            os.unlink(folder / "taken")
+            turns += 1
+    except BusyError:
+        pass
+"""
+
+
+def test_processes_take_turns_though_each_removes_the_file(tmp_path: Path) -> None:
+    processes = [subprocess.Popen([sys.executable, "-c", TAKE_TURNS, str(tmp_path)]) for _ in range(4)]
+    assert [process.wait() for process in processes] == [0] * 4
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lock_that_cannot_be_made_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(SceneError, match="cannot be written"), scene_lock(tmp_path / "file", "a.ply"):
+        pass
+
+
+def test_runs_share_a_folder_if_they_make_the_same(tmp_path: Path) -> None:
+    (tmp_path / f"{PREFIX}old.0.1.gone.run").touch()  # of a run that was killed
+    with run_lock(tmp_path, "same"), run_lock(tmp_path, "same"):
+        message = rf"other settings is at work there \(process {os.getpid()} on {re.escape(socket.gethostname())}"
+        with pytest.raises(UsageError, match=message), run_lock(tmp_path, "other"):
+            pass
+        with run_lock(tmp_path, "same"):
+            pass
+    with run_lock(tmp_path, "other"):
+        pass
+    assert list(tmp_path.iterdir()) == []
 
 
 def run(scene: Path, out: Path, options: Any = QUICK) -> dict[str, Any]:
@@ -105,13 +162,13 @@ def test_levels_are_part_of_a_result(scene: Path, out: Path) -> None:
     assert run(scene, out, levels)["status"] == DONE
 
 
-@pytest.mark.parametrize("ending", [".compressed.ply", ".spz", ".sog", ".splat"])
+@pytest.mark.parametrize("ending", [".compressed.ply", ".spz"])
 def test_results_in_other_formats(ending: str, scene: Path, out: Path) -> None:
     said = replace(QUICK, settings=QUICK.settings.with_settings({"levels": 2}), output="{stem}" + ending)
     actual = run(scene, out, said)
     assert [file["path"] for file in actual["files"]] == [f"room{ending}", f"room.level1{ending}"]
     assert sorted(results(out)) == sorted(file["path"] for file in actual["files"])
-    start = {".compressed.ply": b"ply\n", ".spz": b"\x1f\x8b", ".sog": b"PK"}.get(ending, b"")
+    start = {".compressed.ply": b"ply\n", ".spz": b"\x1f\x8b"}[ending]
     assert (out / f"room{ending}").read_bytes().startswith(start)
     assert run(scene, out, said)["status"] == SKIPPED
     assert run(scene, out)["files"][0]["bytes"] > 2 * actual["files"][0]["bytes"]
@@ -337,71 +394,3 @@ def test_who_is_stopped_between_result_and_record_leaves_the_mark_that_says_whos
     assert sorted(out.iterdir()) == sorted([begun, out / "room.ply"])
     assert run(scene, out)["status"] == DONE
     assert list(results(out)) == ["room.ply"]
-
-
-class Script:
-    """A pool whose tasks end as it is told, in order; a scene without a script is done."""
-
-    def __init__(self, scripts: dict[str, list[str]], room: int = 2) -> None:
-        self.scripts, self.room, self.tasks, self.seen = scripts, room, list[Task](), list[tuple[str, int]]()
-
-    @property
-    def has_room(self) -> bool:
-        return len(self.tasks) < self.room
-
-    def submit(self, task: Task) -> None:
-        self.tasks.append(task)
-        self.seen.append((task.job.scene, task.attempt))
-
-    def wait(self, _: float) -> list[tuple[Task, dict[str, Any]]]:
-        task = self.tasks.pop(0)
-        script = self.scripts.get(task.job.scene, [])
-        status = script.pop(0) if script else DONE
-        return [(task, record(status, task.job.scene, task.job.output, error="told so"))]
-
-    def close(self) -> None:
-        pass
-
-
-def handed_out(pool: Script, context: BatchContext, count: int) -> list[tuple[str, str]]:
-    def each() -> Iterator[Task]:
-        for number in range(count):
-            assert len(pool.tasks) < pool.room  # nothing is asked for before there is room
-            yield Task(Job(number, str(number), f"{number}.ply", 0), None)
-
-    return [(actual["scene"], actual["status"]) for actual in dispatch(each(), pool, context)]
-
-
-@pytest.fixture
-def context(tmp_path: Path) -> BatchContext:
-    return BatchContext(tmp_path, replace(QUICK, retries=2), 0)
-
-
-def test_what_was_lost_is_tried_again_as_often_as_told(context: BatchContext) -> None:
-    pool = Script({"1": [LOST, LOST], "2": [LOST, LOST, LOST]})
-    assert sorted(handed_out(pool, context, 4)) == [("0", DONE), ("1", DONE), ("2", FAILED), ("3", DONE)]
-    assert [attempt for scene, attempt in pool.seen if scene == "2"] == [1, 2, 3]
-    assert [(r["scene"], r["error"], r["attempt"]) for r in records(context.folder)] == [("2", "told so", 3)]
-
-
-def test_what_failed_is_not_tried_again(context: BatchContext) -> None:
-    pool = Script({"0": [FAILED]})
-    assert handed_out(pool, context, 2) == [("0", FAILED), ("1", DONE)]
-    assert len(pool.seen) == 2
-
-
-def test_what_others_work_on_comes_last(context: BatchContext, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gsmerge.batch.run.BUSY_RETRY_SECONDS", 0.05)
-    pool = Script({"0": [BUSY, BUSY, SKIPPED]})
-    start = time.monotonic()
-    assert handed_out(pool, context, 3) == [("1", DONE), ("2", DONE), ("0", SKIPPED)]
-    assert time.monotonic() - start >= 0.1
-
-
-def test_a_batch_that_cannot_record_ends(context: BatchContext) -> None:
-    with pytest.raises(SceneError, match=r"batch\.jsonl: the batch cannot go on: told so"):
-        handed_out(Script({"1": [STUCK]}), context, 3)
-
-
-def test_nothing_to_do_is_done_at_once(context: BatchContext) -> None:
-    assert handed_out(Script({}), context, 0) == []

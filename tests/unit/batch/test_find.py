@@ -155,12 +155,3 @@ def test_names_are_filled_in(tmp_path: Path) -> None:
     assert name("{stem}.ply", ".") == f"{tmp_path.name}.ply"
     with pytest.raises(UsageError, match="does not fit"):
         name("{stem:d}.ply", "a.ply")
-
-
-@pytest.mark.parametrize(
-    "template",
-    ["{name}.ply", "{stem.real}.ply", "{0}.ply", "{}.ply", "{stem", "{stem}.txt", "/x/{stem}.ply", "../{stem}.ply"],
-)
-def test_templates_that_make_no_sense_are_refused(template: str) -> None:
-    with pytest.raises(ValueError, match="output: expected"):
-        BatchOptions(output=template)
