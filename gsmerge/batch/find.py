@@ -93,7 +93,9 @@ def output_name(options: BatchOptions, scene: Path, index: int) -> str:
 
 
 def find_scenes(given: Sequence[str], out: Path) -> Iterator[Path]:
-    """Yield the scenes of the arguments, in their order and sorted within each; some may come twice.
+    """Yield the scenes of the arguments, in their order and sorted within each.
+
+    Some may come twice.
 
     A SceneError if an argument does not exist or holds no scene, a UsageError if it is the output folder.
     """
@@ -124,7 +126,7 @@ def _require_some(scenes: Iterator[Path], argument: str, where: str) -> Iterator
 
 
 def _walk(folder: Path, skip: str, above: tuple[str, ...] = ()) -> Iterator[Path]:
-    """Yield the scenes in a folder: itself, if it has a file of a usual name, or every ``.ply``; then those below."""
+    """Yield the scenes in a folder, which is one itself if it has a file of a usual name."""
     real = os.path.realpath(folder)
     if real == skip or real in above:  # a link to a folder above would never end
         return
@@ -151,7 +153,7 @@ def _matches(pattern: str, skip: str) -> Iterator[Path]:
 
 
 def _listed(file: Path, skip: str) -> Iterator[Path]:
-    """Yield the scenes of a list, relative to its folder; a missing one fails when it is compacted."""
+    """Yield the scenes of a list, relative to its folder; a missing one fails in its turn."""
     text = read_text(file)
     if "\0" in text:
         raise SceneError(file, "expected a text file with one path per line, found no text")

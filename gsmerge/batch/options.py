@@ -63,7 +63,7 @@ class BatchOptions:
         return {"settings": settings, "opacity": self.opacity, "reading": vars(self.hints)}
 
     def name(self) -> str:
-        """Return a digest that is the same for runs that make the same results, and so may share an output folder."""
+        """Return a digest that runs share if they make the same results."""
         return digest({**self.result_settings(), "output": self.output, "cameras": self.cameras, "images": self.images})
 
 

@@ -51,7 +51,7 @@ class Pool(Protocol):
         """Take a scene."""
 
     def wait(self, seconds: float) -> list[tuple[Task, dict[str, Any]]]:
-        """Return the scenes that ended, after at most so many seconds, with their outcomes."""
+        """Wait for at most so many seconds; return the scenes that ended, with their records."""
 
     def close(self) -> None:
         """End all processes; unfinished scenes are left as they were."""
@@ -109,7 +109,7 @@ class LocalPool:
         idle.give(task)
 
     def wait(self, seconds: float) -> list[tuple[Task, dict[str, Any]]]:
-        """Return the scenes that ended, after at most so many seconds: their records, or that the process was lost."""
+        """Wait for at most so many seconds; return the scenes that ended, with their records."""
         busy = [worker for worker in self.workers if worker.task is not None]
         limit, now = self.context.options.timeout, time.monotonic()
         if limit is not None:
@@ -241,7 +241,7 @@ class RayPool:
         return self.context.options.settings.threads or 1
 
     def _largest(self, resource: str) -> float:
-        """Return the most of a resource that a node has: a task that needs more would wait for ever."""
+        """Return the most of a resource that a node has; a task that needs more waits forever."""
         nodes = [node["Resources"] for node in self.ray.nodes() if node["Alive"]]
         return max((node.get(resource, 0.0) for node in nodes), default=0.0)
 
@@ -253,7 +253,7 @@ class RayPool:
         self.tasks[ref] = task
 
     def wait(self, seconds: float) -> list[tuple[Task, dict[str, Any]]]:
-        """Return the scenes that ended, after at most so many seconds: records, or that process or node was lost."""
+        """Wait for at most so many seconds; return the scenes that ended, with their records."""
         ready, rest = self.ray.wait(list(self.tasks), num_returns=1, timeout=seconds)
         if ready and rest:
             ready += self.ray.wait(rest, num_returns=len(rest), timeout=0)[0]
@@ -314,7 +314,7 @@ def _new_records(folder: Path, start: int) -> RecordIndex:
 
 @contextlib.contextmanager
 def _limited(seconds: float | None) -> Iterator[None]:
-    """End the process if the block takes longer than ``seconds``, even while it runs compiled code."""
+    """End the process if the block takes longer, even while it runs compiled code."""
     if seconds is None:
         yield
         return

@@ -38,7 +38,7 @@ class DoneResult:
     failed_since: bool = False  # whether the scene failed when it was compacted again
 
     def holds(self, folder: Path, key: str) -> bool:
-        """Return whether it was made from the same content and settings, and every file is unchanged since."""
+        """Return whether content and settings are the same, and every file is unchanged."""
         paths = [folder / name for name, _ in self.files]
         try:
             if self.key != key or not paths or not all(path.is_file() for path in paths):  # a pipe would never end
@@ -78,7 +78,7 @@ class RecordIndex:
 
 
 def is_record(value: Mapping[str, Any]) -> bool:
-    """Return whether a line is a record: anybody may have written it, and one that is none must not stop a batch."""
+    """Return whether a line is a record: anybody may have written it."""
     try:
         texts = [value["scene"], value["output"]]
         texts += [text for file in value["files"] for text in (file["path"], file["sha256"])]
@@ -185,7 +185,7 @@ class Totals:
 
 
 def write_summary(folder: Path) -> Path:
-    """Write the newest state of every scene in the folder; a SceneError if the file cannot be written."""
+    """Write the newest state of every scene in the folder. SceneError if that fails."""
     records, read = folder / RECORDS, -1
     while (size := records.stat().st_size if records.exists() else 0) != read:  # other runs may add to them meanwhile
         _write_rows(folder / SUMMARY, _newest(folder))

@@ -1,4 +1,4 @@
-"""Runs of a batch: scenes are dispatched to a pool, tried again if their process died, and reported as they end."""
+"""Runs of a batch: a schedule, and tasks that a pool works on until every scene has ended."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Schedule:
 
 
 def make_schedule(jobs: Sequence[Job], options: BatchOptions, *, processors: int | None = None) -> Schedule:
-    """Distribute scenes over processors: one thread each where there are enough scenes and memory allows.
+    """Distribute scenes over processors, with one thread each if there are enough scenes.
 
     Memory must do for the largest scenes, which may come together; ``processors`` are all without a number.
     """
@@ -62,7 +62,7 @@ def make_schedule(jobs: Sequence[Job], options: BatchOptions, *, processors: int
 
 
 def free_memory() -> int | None:
-    """Return the bytes that a run may take by default, most of the free memory; None where that is unknown."""
+    """Return the bytes that a run may take by default: most of the free memory, or None."""
     with suppress(OSError, KeyError, ValueError), open("/proc/meminfo", encoding="ascii") as file:
         values = dict(line.split(":", 1) for line in file)
         return int(FREE_MEMORY_SHARE * int(values["MemAvailable"].split()[0]) * 1024)
@@ -132,7 +132,7 @@ def _pool(folder: Path, options: BatchOptions, schedule: Schedule, start: int) -
 
 
 def dispatch(tasks: Iterator[Task], pool: Pool, context: BatchContext) -> Iterator[dict[str, Any]]:
-    """Keep a pool busy until every scene has ended; a SceneError if nothing can be recorded any more."""
+    """Keep a pool busy until every scene has ended. SceneError if nothing can be recorded."""
     retried: deque[Task] = deque()  # their process died
     busy: deque[tuple[float, Task]] = deque()  # another run works on them; when to try again, and the task
     active = 0
@@ -161,7 +161,7 @@ def dispatch(tasks: Iterator[Task], pool: Pool, context: BatchContext) -> Iterat
 
 
 def _next(tasks: Iterator[Task], retried: deque[Task], busy: deque[tuple[float, Task]]) -> Task | None:
-    """Choose the next task: a lost one, a new one, or one that another run had; None if there is none yet."""
+    """Choose the next task: a lost one, a new one, one that another run had, or None yet."""
     if retried:
         return retried.popleft()
     task = next(tasks, None)

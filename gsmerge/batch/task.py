@@ -1,4 +1,6 @@
-"""One scene of a batch: skipped if it is done, otherwise compacted and recorded, safe against a kill at any moment.
+"""One scene of a batch: skipped if it is done, otherwise compacted and recorded.
+
+It is safe against a kill at any moment: locks end with the process that has them, however it ends.
 
 Locks on a scene and on the output folder end with the process that has them, however it ends.
 """
@@ -88,7 +90,7 @@ def run_task(task: Task, context: BatchContext, new_records: RecordIndex) -> dic
 
 
 def _locked(job: Job, context: BatchContext, work: Callable[[Path], dict[str, Any]]) -> dict[str, Any]:
-    """Work under the scene's lock; the record says where another process has it, or nothing can be written."""
+    """Work under the scene's lock; the record says if another process has it."""
     try:
         with scene_lock(context.folder, job.output) as begun:
             return work(begun)
@@ -141,7 +143,7 @@ def _files_of(job: Job, options: BatchOptions) -> SceneFiles:
 
 
 def scene_key(files: SceneFiles, options: BatchOptions) -> str:
-    """Return a digest of all that a result depends on: what is read, all settings, and the version."""
+    """Return a digest of all that a result depends on: files, settings, version."""
     content: dict[str, Any] = {"scene": content_hash(read_files(files)), **options.result_settings()}
     checkpoint = Path(options.settings.checkpoint)
     if options.settings.checkpoint not in CHECKPOINTS and checkpoint.is_file():  # by its content, wherever it is
@@ -170,7 +172,10 @@ def record_failure(task: Task, context: BatchContext, error: str) -> dict[str, A
 
 
 def clean_up(task: Task, context: BatchContext) -> None:
-    """Remove the unfinished files of a scene whose process was ended on purpose; where that fails, the next run may."""
+    """Remove the unfinished files of a scene whose process was ended on purpose.
+
+    Where that fails, the next run may.
+    """
     with suppress(BusyError, SceneError, OSError), scene_lock(context.folder, task.job.output) as begun:
         _clean(task.job, context, begun)
 
@@ -206,7 +211,7 @@ def scene_lock(folder: Path, output: str) -> Iterator[Path]:
 
 @contextmanager
 def run_lock(folder: Path, name: str) -> Iterator[None]:
-    """Share the folder only with runs of the same name, see :meth:`BatchOptions.name`, while the block runs.
+    """Share the folder only with runs of the same :meth:`BatchOptions.name` in the block.
 
     Raises:
         UsageError: If a run of another name uses the folder.
@@ -226,7 +231,7 @@ def run_lock(folder: Path, name: str) -> Iterator[None]:
 
 @contextmanager
 def _lock(path: Path, seconds: float = 0.0) -> Iterator[None]:
-    """Lock a file that is removed after the block; a BusyError if that takes longer than so many seconds."""
+    """Lock a file that is removed after the block. BusyError if another process keeps it."""
     lock = FileLock(path)
     try:
         lock.acquire(timeout=seconds)

@@ -33,7 +33,7 @@ _written: set[str] = set()  # the temporary files of this process
 
 @contextmanager
 def atomic_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> Iterator[Path]:
-    """Yield a temporary file next to ``path``, renamed to it when the block succeeds and removed when it fails.
+    """Yield a temporary file that is renamed to ``path`` when the block succeeds.
 
     Args:
         path: The file to be written. Its folder must exist. A link stays one: the file that it leads to is replaced.
@@ -102,7 +102,7 @@ def atomic_outputs(*, overwrite: bool = False) -> Iterator[Callable[[Path], Path
 
 
 def _rename_all(files: Sequence[tuple[str, Path]]) -> None:
-    """Give each temporary file its name; an interrupt in between takes effect once all have theirs."""
+    """Give each temporary file its name; an interrupt takes effect after the last."""
     try:
         for temporary, target in files:
             os.replace(temporary, target)
@@ -124,7 +124,10 @@ def _flush(path: str | Path) -> None:
 
 
 def temporary_path(path: Path) -> Path:
-    """Return a name beside ``path``, with its suffix, that says which process writes it and where that runs."""
+    """Return a name beside ``path`` that says which process writes it, and where.
+
+    It has the same suffix.
+    """
     suffix = path.suffix if len(os.fsencode(path.suffix)) <= _MAX_SUFFIX else ""
     return path.with_name(f".gsmerge-{_place()}-{os.getpid()}-{secrets.token_hex(4)}{suffix}")
 
@@ -139,7 +142,10 @@ def _place() -> str:
 
 
 def remove_stale(folder: Path) -> None:
-    """Remove the temporary files in a folder whose process has ended; those of other machines after a week."""
+    """Remove the temporary files in a folder whose process has ended.
+
+    Those of other machines are removed after a week.
+    """
     with suppress(OSError), os.scandir(folder) as entries:  # another may be cleaning as well, or may not
         for entry in list(entries):
             match = _TEMPORARY.fullmatch(entry.name)

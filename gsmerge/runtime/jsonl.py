@@ -1,4 +1,4 @@
-"""Files of JSON lines that survive being killed at any moment, also where several processes write at once."""
+"""Files of JSON lines that survive a kill at any moment, and several processes at once."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Lines:
 
 
 def read_lines(path: Path) -> Lines:
-    """Read a file of JSON lines; lines that are damaged or half-written are dropped, with a note each."""
+    """Read a file of JSON lines, and note those that are damaged or half-written."""
     lines = list(each_line(path))
     damaged = [f"line {number} is damaged" for number, (_, value) in enumerate(lines, 1) if value is None]
     end = lines[-1][0] if lines else 0

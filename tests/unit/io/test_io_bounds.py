@@ -12,8 +12,8 @@ import pytest
 from gsmerge.errors import SceneError
 from gsmerge.io import bounds
 from gsmerge.io.bounds import check_file, check_pixels, read_text
+from gsmerge.io.cameras.npz_files import array_names, read_arrays
 from gsmerge.io.content_hash import content_hash
-from gsmerge.io.formats.npz import array_names, read_arrays
 from gsmerge.io.photos import image_size, list_images, natural_key
 
 

@@ -14,8 +14,7 @@ from tiny_scene import Tiny, frames_of, write_colmap_binary, write_colmap_text, 
 
 from gsmerge.errors import SceneError
 from gsmerge.io import load_scene, read_cameras, to_cameras
-from gsmerge.io.cameras.camera_file import make_lens, select_views
-from gsmerge.io.cameras.lens import undistort_photos
+from gsmerge.io.cameras.camera_file import make_lens, select_views, undistort_photos
 from gsmerge.measure.inspect import inspect
 
 SMOOTH = smooth_scene(60, 45)

@@ -22,9 +22,8 @@ from gsmerge import Gaussians
 from gsmerge.cli import main
 from gsmerge.errors import SceneError
 from gsmerge.io import kept_comments, read_gaussians, write_gaussians
-from gsmerge.io.formats.codebooks import fit_codebook, fit_palette, nearest_codes
-from gsmerge.io.formats.sog_writer import sog_bytes
-from gsmerge.io.formats.spz_writer import spz_bytes
+from gsmerge.io.formats.sog import fit_codebook, fit_palette, nearest_codes, sog_bytes
+from gsmerge.io.formats.spz import spz_bytes
 
 
 @pytest.fixture(scope="module")

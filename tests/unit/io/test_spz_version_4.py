@@ -14,7 +14,7 @@ from gsmerge import Gaussians
 from gsmerge.cli import main
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import kept_comments, lost_harmonics, read_gaussians, write_gaussians
-from gsmerge.io.formats.spz_writer import spz_bytes
+from gsmerge.io.formats.spz import spz_bytes
 
 zstandard = pytest.importorskip("zstandard")
 

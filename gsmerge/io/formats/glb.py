@@ -22,7 +22,7 @@ _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
 def glb_bytes(gaussians: Gaussians) -> bytes:
-    """Content of a ``.glb`` file. ValueError if there is NaN or inf."""
+    """Encode a ``.glb`` file. ValueError if there is NaN or inf."""
     attributes = _attributes(to_columns(gaussians, MAX_DEGREE))
     document: dict[str, Any] = {"asset": {"version": "2.0", "generator": "gsmerge"}, "scene": 0, "scenes": [{}]}
     content = b""
@@ -56,7 +56,7 @@ _ENDS = {"min": np.min, "max": np.max}  # of the positions, which glTF asks for
 
 
 def _attributes(columns: Columns) -> dict[str, np.ndarray]:
-    """Values ``[n]`` or ``[n,d]`` by the name of the attribute, positions first; each a multiple of four bytes."""
+    """Return values ``[n]`` or ``[n,d]`` by attribute, positions first, each of whole words."""
     colors = to_bytes(255 * np.concatenate([columns.colors, columns.opacities[:, None]], 1))
     values = {
         "POSITION": columns.means,
