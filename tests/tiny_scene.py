@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from gsmerge.geometry import normalize
-from gsmerge.io import write_ply
+from gsmerge.io import CameraFile, write_ply
 from gsmerge.types import Gaussians
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -157,3 +157,17 @@ def write_npz(path: Path, tiny: Tiny, **changes: np.ndarray) -> None:
         "image": tiny.images,
     }
     np.savez(path, **{k: v for k, v in (arrays | changes).items() if v is not None})
+
+
+def assert_same(actual: CameraFile, tiny: Tiny, *, K: np.ndarray | None = None, atol: float = 1e-9) -> None:
+    assert actual.viewmats.dtype == actual.Ks.dtype == np.float64
+    assert np.allclose(actual.viewmats, tiny.w2c, atol=atol)
+    assert np.allclose(actual.Ks, tiny.K if K is None else K, atol=atol * 100)
+    assert actual.widths.tolist() == [tiny.width] * 3
+    assert actual.heights.tolist() == [tiny.height] * 3
+    assert len(actual) == 3
+
+
+def save_json(path: Path, data: object) -> Path:
+    path.write_text(json.dumps(data))
+    return path

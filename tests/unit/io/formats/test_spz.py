@@ -1,4 +1,4 @@
-"""``.spz`` of version 4: what Niantic's own program writes, what this one writes, damage, and a missing library."""
+"""``.spz`` of all versions: what Niantic's own program writes, what this one writes, damage, and a missing library."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import kept_comments, lost_harmonics, read_gaussians, write_gaussians
 from gsmerge.io.formats.spz import spz_bytes
 
+from .slow_readers import corners
+
 zstandard = pytest.importorskip("zstandard")
 
 # Two Gaussians of degree 1 as @adobe/spz 0.2.3 writes them, which is Niantic's library for browsers
@@ -26,6 +28,8 @@ NIANTIC = bytes.fromhex(
     "00000080ff28b52ffd2002110000ff3328b52ffd2006310000a6805980938028b52ffd2006310000a0908070605028b52ffd"
     "2008410000000000c069a5953628b52ffd2012910000a08080a08080a080808040c08040c08040c0"
 )
+
+
 SIZES = slice(32, 32 + 16 * 6)  # the table of a file with harmonics
 
 
@@ -71,6 +75,22 @@ def test_what_niantic_writes(tmp_path: Path) -> None:
     np.testing.assert_allclose(actual.shN[:, 1], [[0.25, 0, 0], [0, -0.5, 0.5]])
 
 
+@pytest.mark.parametrize("version", [1, 2])
+def test_older_spz(version: int, tmp_path: Path) -> None:
+    position = struct.pack("<3e", 1.5, -2, 0.25) if version == 1 else b"".join(
+        int(v * 4096).to_bytes(3, "little", signed=True) for v in (1.5, -2, 0.25)
+    )  # fmt: skip
+    half = round((0.5**0.5 + 1) * 127.5)
+    rest = bytes([255, 128, 128, 128, 160, 144, 128, half, 128, 128])
+    data = struct.pack("<3I4B", 0x5053474E, version, 1, 0, 12, 0, 0) + position + rest
+    (tmp_path / "a.spz").write_bytes(gzip.compress(data))
+    actual = read_gaussians(tmp_path / "a.spz").gaussians
+    np.testing.assert_allclose(actual.means[0], (1.5, -2, 0.25))
+    np.testing.assert_allclose(actual.quats[0], (0.5**0.5, 0.5**0.5, 0, 0), atol=0.01)
+    np.testing.assert_allclose(actual.scales[0], np.exp((0.0, -1, -2)), rtol=1e-6)
+    assert actual.opacities[0] == 1
+
+
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_columns_are_those_of_version_3(degree: int) -> None:
     older = gzip.decompress(spz_bytes(some(degree)))
@@ -102,8 +122,31 @@ def test_extensions_are_passed_over(tmp_path: Path) -> None:
         np.testing.assert_array_equal(getattr(extended, name), array)
 
 
+def spz_with(**changes: int) -> bytes:
+    names = ("magic", "version", "count", "degree", "fraction", "flags", "zero")
+    data = gzip.decompress(spz_bytes(corners()))
+    header = dict(zip(names, struct.unpack_from("<3I4B", data), strict=True)) | changes
+    return gzip.compress(struct.pack("<3I4B", *header.values()) + data[16:])
+
+
 WHOLE = spz_bytes(some(1), version=4)
-DAMAGED = {
+
+
+OLDER = {
+    "empty": b"",
+    "text": b"ply\n",
+    "cut short": spz_bytes(corners())[:40],
+    "short": gzip.compress(gzip.decompress(spz_bytes(corners()))[:-1]),
+    "other": spz_with(magic=1),
+    "later": b"NGSP\4\0\0\0",
+    "another version": spz_with(version=9),
+    "another degree": spz_with(degree=4),
+    "fraction": spz_with(fraction=200),
+    "no count": spz_with(count=0),
+    "a promise": spz_with(count=2**32 - 1),
+    "more": spz_with(count=4),
+}
+DAMAGED = OLDER | {
     "header": WHOLE[:15],
     "table": WHOLE[:60],
     "cut": WHOLE[:-3],

@@ -1,27 +1,36 @@
-"""Formats beside .ply: each against a slow, obvious reader, and against splat-transform where that is installed."""
+"""Formats of results: read back by slow, obvious readers, and by splat-transform where that is installed."""
 
 from __future__ import annotations
 
-import gzip
-import json
-import struct
 import subprocess
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import scenes
+from plyfile import PlyData
+from tiny_scene import Tiny
 
-from gsmerge import Gaussians, PixelScene
+from gsmerge import PixelScene
 from gsmerge.baselines.splat_transform import find_program
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry import normalize
-from gsmerge.io import OUTPUT_FORMATS, lost_harmonics, output_format, read_gaussians, read_ply, write_gaussians
-from gsmerge.types import SH_C0
+from gsmerge.io import (
+    OUTPUT_FORMATS,
+    lost_harmonics,
+    output_format,
+    read_ply,
+    write_gaussians,
+    write_ply,
+)
+from gsmerge.types import Gaussians
+
+from .slow_readers import corners, drawn, read_back
 
 QUANTISED = (".compressed.ply", ".spz", ".sog", ".splat")
+
+
 # dB between a render of the .ply and one of the file, of Gaussians with every parameter drawn at random; with rows in
 # another order alone, as in .compressed.ply and .sog, 44 of degree 0 and 37 of degree 3
 FLOORS = {
@@ -45,70 +54,9 @@ def scene() -> PixelScene:
     return scenes.make_scene(scenes.room(), scenes.arc(3, 96, 72))
 
 
-def drawn(scene: PixelScene, degree: int) -> Gaussians:
-    """Merged Gaussians with random rotations, sizes and harmonics."""
-    rng = np.random.default_rng(degree)
-    g = scenes.plain(scene, superpixels="10%")
-    quats = normalize(rng.normal(size=g.quats.shape).astype(np.float32))
-    shN = rng.normal(0, 0.1, (len(g), (degree + 1) ** 2 - 1, 3)).astype(np.float32)
-    scales = g.scales * rng.uniform(0.5, 1.5, g.scales.shape).astype(np.float32)
-    return replace(g, means=g.means.astype(np.float32), quats=quats, scales=scales, shN=shN)
-
-
 def psnr(scene: PixelScene, one: Gaussians, other: Gaussians) -> float:
     a, b = (scenes.images_of(g, scene.cameras)[0].clip(0, 1) for g in (one, other))
     return float(-10 * np.log10(max(((a - b) ** 2).mean(), 1e-12)))
-
-
-def arrays(*columns: np.ndarray, harmonics: np.ndarray) -> Gaussians:
-    means, quats, scales, opacities, colors = (np.asarray(c, np.float32) for c in columns)
-    quats = normalize(quats)
-    return Gaussians(means, quats, scales, opacities, ((colors - 0.5) / SH_C0)[:, None], harmonics)
-
-
-def read_splat(path: Path) -> Gaussians:
-    data, rows = path.read_bytes(), []
-    for start in range(0, len(data), 32):
-        values = struct.unpack_from("<6f8B", data, start)
-        rows.append([*values[:6], *(v / 255 for v in values[6:10]), *((v - 128) / 128 for v in values[10:])])
-    table = np.array(rows, np.float32)
-    none = np.zeros((len(table), 0, 3), np.float32)
-    return arrays(table[:, :3], table[:, 10:], table[:, 3:6], table[:, 9], table[:, 6:9], harmonics=none)
-
-
-def read_spz(path: Path) -> Gaussians:
-    data = gzip.decompress(path.read_bytes())
-    magic, version, count, degree, fraction, flags, reserved = struct.unpack_from("<3I4B", data)
-    assert (magic, version, flags, reserved) == (0x5053474E, 3, 0, 0)
-    at, num_higher = 16, (degree + 1) ** 2 - 1
-
-    def take(each: int) -> list[bytes]:
-        nonlocal at
-        rows = [data[at + i * each : at + (i + 1) * each] for i in range(count)]
-        at += count * each
-        return rows
-
-    means = [[int.from_bytes(r[i : i + 3], "little", signed=True) / 2**fraction for i in (0, 3, 6)] for r in take(9)]
-    opacities = [r[0] / 255 for r in take(1)]
-    colors = [[0.5 + SH_C0 * (v / 255 - 0.5) / 0.15 for v in r] for r in take(3)]
-    scales = [[np.exp(v / 16 - 10) for v in r] for r in take(3)]
-    quats = []
-    for row in take(4):
-        word = int.from_bytes(row, "little")
-        quat, largest = [0.0] * 4, word >> 30
-        for i in reversed([i for i in range(4) if i != largest]):
-            quat[i] = (-1 if word >> 9 & 1 else 1) * (word & 511) / 511 / np.sqrt(2)
-            word >>= 10
-        quat[largest] = np.sqrt(max(0.0, 1 - sum(v * v for v in quat)))
-        quats.append([quat[3], *quat[:3]])
-    harmonics = np.array([[(v - 128) / 128 for v in r] for r in take(3 * num_higher)], np.float32)
-    assert at == len(data)
-    harmonics = harmonics.reshape(count, num_higher, 3)
-    return arrays(*map(np.array, (means, quats, scales, opacities, colors)), harmonics=harmonics)
-
-
-def read_back(path: Path) -> Gaussians:
-    return {".spz": read_spz, ".splat": read_splat}.get(path.suffix, lambda p: read_gaussians(p).gaussians)(path)
 
 
 @pytest.mark.parametrize(("ending", "degree"), FLOORS)
@@ -145,18 +93,6 @@ def test_the_same_gaussians_give_the_same_bytes(ending: str, scene: PixelScene, 
     for name in "ab":
         write_gaussians(tmp_path / f"{name}{ending}", drawn(scene, 0))
     assert (tmp_path / f"a{ending}").read_bytes() == (tmp_path / f"b{ending}").read_bytes()
-
-
-def corners() -> Gaussians:
-    """Opacities of 0 and 1, scales of 0, colours beyond the range, one coordinate far away, a zero quaternion."""
-    return Gaussians(
-        means=np.array([[0.0, 0, 0], [1e5, -3, 2], [-7, 1e-8, 0.5]], np.float32),
-        quats=np.array([[0.0, 0, 0, 0], [-0.6, 0, 0.8, 0], [0, 0, 0, -1.0]], np.float32),
-        scales=np.array([[0.0, 1e-9, 1], [1e3, 1, 1], [0.01, 0.02, 0.03]], np.float32),
-        opacities=np.array([0.0, 1.0, 0.5], np.float32),
-        sh0=np.array([[[-9.0, 0, 9]], [[1, 2, 3]], [[0, 0, 0]]], np.float32),
-        shN=np.zeros((3, 0, 3), np.float32),
-    )
 
 
 @pytest.mark.parametrize("ending", [".ply", *QUANTISED])
@@ -246,46 +182,6 @@ def test_comments_reach_the_headers(tmp_path: Path) -> None:
         write_gaussians(tmp_path / "b.compressed.ply", corners(), comments=["two\nlines"])
 
 
-def read_glb(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """The document of a binary glTF, and the attributes of its only primitive."""
-    data = path.read_bytes()
-    magic, version, size, length, kind = struct.unpack_from("<4sII I4s", data)
-    assert (magic, version, size, kind, length % 4) == (b"glTF", 2, len(data), b"JSON", 0)
-    document, content = json.loads(data[20 : 20 + length]), data[28 + length :]
-    (primitive,) = document["meshes"][0]["primitives"]
-    assert (primitive["mode"], primitive["extensions"]["KHR_gaussian_splatting"]["kernel"]) == (0, "ellipse")
-    attributes = {}
-    for name, index in primitive["attributes"].items():
-        accessor = document["accessors"][index]
-        view = document["bufferViews"][accessor["bufferView"]]
-        dtype = {5126: "<f4", 5121: "u1"}[accessor["componentType"]]
-        values = np.frombuffer(content[view["byteOffset"] :][: view["byteLength"]], dtype)
-        attributes[name] = values.reshape(accessor["count"], {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]])
-        assert view["byteOffset"] % 4 == 0
-    return document, attributes
-
-
-@pytest.mark.parametrize("degree", [0, 3])
-def test_glb_holds_everything(degree: int, scene: PixelScene, tmp_path: Path) -> None:
-    gaussians = drawn(scene, degree)
-    write_gaussians(tmp_path / "a.glb", gaussians)
-    document, actual = read_glb(tmp_path / "a.glb")
-    prefix, n = "KHR_gaussian_splatting:", len(gaussians)
-    np.testing.assert_array_equal(actual["POSITION"], gaussians.means)
-    np.testing.assert_allclose(actual[f"{prefix}ROTATION"][:, [3, 0, 1, 2]], gaussians.quats, atol=1e-6)
-    np.testing.assert_allclose(actual[f"{prefix}SCALE"], gaussians.scales, rtol=1e-5)
-    np.testing.assert_allclose(actual[f"{prefix}OPACITY"][:, 0], gaussians.opacities)
-    np.testing.assert_array_equal(actual[f"{prefix}SH_DEGREE_0_COEF_0"], gaussians.sh0[:, 0])
-    places = [(d, i) for d in range(1, degree + 1) for i in range(2 * d + 1)]
-    harmonics = [actual[f"{prefix}SH_DEGREE_{d}_COEF_{i}"] for d, i in places]
-    np.testing.assert_array_equal(np.stack([np.zeros((n, 3)), *harmonics], 1)[:, 1:], gaussians.shN)
-    assert len(actual) == 6 + len(places)
-    assert actual["COLOR_0"].shape == (n, 4)
-    low = document["accessors"][document["meshes"][0]["primitives"][0]["attributes"]["POSITION"]]["min"]
-    np.testing.assert_array_equal(low, gaussians.means.min(0))
-    assert document["nodes"][0]["rotation"] == [0, 0, 1, 0]  # y up
-
-
 def test_no_normals_is_the_same_without_twelve_bytes(scene: PixelScene, tmp_path: Path) -> None:
     gaussians = drawn(scene, 1)
     for name, normals in {"with": True, "without": False}.items():
@@ -297,3 +193,86 @@ def test_no_normals_is_the_same_without_twelve_bytes(scene: PixelScene, tmp_path
     assert wide.info.file_bytes - narrow.info.file_bytes == 12 * len(gaussians) + 3 * line
     for name, array in vars(wide.gaussians).items():
         np.testing.assert_array_equal(getattr(narrow.gaussians, name), array)
+
+
+def with_harmonics(gaussians: Gaussians, degree: int) -> Gaussians:
+    shN = np.random.default_rng(0).normal(size=(len(gaussians), (degree + 1) ** 2 - 1, 3))
+    return replace(gaussians, shN=shN.astype(np.float32))
+
+
+def test_the_layout_is_inrias(tmp_path: Path, tiny: Tiny) -> None:
+    gaussians = with_harmonics(tiny.gaussians, 1)
+    write_ply(tmp_path / "a.ply", gaussians)
+    data = PlyData.read(str(tmp_path / "a.ply"))
+    vertex = data["vertex"]
+    assert (data.text, data.byte_order) == (False, "<")
+    assert [p.name for p in vertex.properties] == [
+        *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
+        *(f"f_rest_{i}" for i in range(9)),
+        *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+    ]
+    assert {p.val_dtype for p in vertex.properties} == {"f4"}
+    assert vertex["f_rest_4"].tolist() == gaussians.shN[:, 1, 1].tolist()
+    assert np.allclose(vertex["scale_2"], np.log(gaussians.scales[:, 2]), atol=1e-6)
+    opacities = gaussians.opacities.astype(np.float64)
+    assert np.allclose(vertex["opacity"], np.log(opacities / (1 - opacities)), atol=1e-6)
+    assert not vertex["nx"].any()
+
+
+def test_tensors_are_written_alike(tmp_path: Path, tiny: Tiny) -> None:
+    write_ply(tmp_path / "a.ply", tiny.gaussians)
+    tensors = tiny.gaussians.to("cpu")
+    write_ply(tmp_path / "b.ply", replace(tensors, means=tensors.means.clone().requires_grad_()))
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+def test_harmonics_are_dropped_on_demand(tmp_path: Path, tiny: Tiny) -> None:
+    gaussians = with_harmonics(tiny.gaussians, 3)
+    write_ply(tmp_path / "a.ply", gaussians, sh_degree=1)
+    assert np.array_equal(read_ply(tmp_path / "a.ply").gaussians.shN, gaussians.shN[:, :3])
+    write_ply(tmp_path / "b.ply", gaussians, sh_degree=0)
+    assert read_ply(tmp_path / "b.ply").info.layout == "17-column export"
+    with pytest.raises(ValueError, match="expected 0 to 3, got 4"):
+        write_ply(tmp_path / "c.ply", gaussians, sh_degree=4)
+
+
+def test_extremes_are_written_as_finite_numbers(tmp_path: Path, tiny: Tiny) -> None:
+    few = tiny.gaussians[:3]
+    extreme = replace(
+        few,
+        opacities=np.array([0.0, 1.0, 0.5], np.float32),
+        scales=np.array([[0.1, 0.1, 0.0], [1e-38, 1e30, 1.0], [1.0, 1.0, 1.0]], np.float32),
+        quats=np.array([[0.0, 0, 0, 0], [2, 0, 0, 0], [0, 0, -3, 4]], np.float32),
+    )
+    write_ply(tmp_path / "a.ply", extreme)
+    rows = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
+    assert all(np.isfinite(rows[name]).all() for name in rows.dtype.names)
+    back = read_ply(tmp_path / "a.ply").gaussians
+    assert back.opacities.tolist() == pytest.approx([0, 1, 0.5], abs=2e-7)
+    assert ((back.opacities > 0) & (back.opacities < 1)).all()
+    assert (back.scales > 0).all()
+    assert back.quats[0].tolist() == [1, 0, 0, 0]
+    assert back.quats[2].tolist() == pytest.approx([0, 0, -0.6, 0.8], abs=1e-6)
+
+
+@pytest.mark.parametrize("field", ["means", "scales", "opacities", "sh0", "quats"])
+def test_nan_is_never_written(tmp_path: Path, tiny: Tiny, field: str) -> None:
+    values = getattr(tiny.gaussians, field).copy()
+    values[5] = np.nan
+    with pytest.raises(ValueError, match="expected finite Gaussians"):
+        write_ply(tmp_path / "a.ply", replace(tiny.gaussians, **{field: values}))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_impossible_opacities_and_scales_are_refused(tmp_path: Path, tiny: Tiny) -> None:
+    for field, value in {"opacities": 1.5, "scales": -1.0}.items():
+        values = np.full_like(getattr(tiny.gaussians, field), value)
+        with pytest.raises(ValueError, match="expected finite Gaussians"):
+            write_ply(tmp_path / "a.ply", replace(tiny.gaussians, **{field: values}))
+
+
+def test_no_gaussians_make_a_file_that_says_so(tmp_path: Path, tiny: Tiny) -> None:
+    write_ply(tmp_path / "a.ply", tiny.gaussians[:0])
+    assert PlyData.read(str(tmp_path / "a.ply"))["vertex"].count == 0
+    with pytest.raises(SceneError, match="found 0 vertices"):
+        read_ply(tmp_path / "a.ply")

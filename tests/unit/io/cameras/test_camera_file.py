@@ -1,4 +1,4 @@
-"""Cameras whose lens is no pinhole."""
+"""Cameras of one size, and cameras whose lens is no pinhole."""
 
 from __future__ import annotations
 
@@ -10,14 +10,57 @@ import cv2
 import numpy as np
 import pytest
 from exports import smooth_scene
-from tiny_scene import Tiny, frames_of, write_colmap_binary, write_colmap_text, write_images, write_transforms
+from tiny_scene import (
+    FLIP,
+    Tiny,
+    frames_of,
+    save_json,
+    write_colmap_binary,
+    write_colmap_text,
+    write_images,
+    write_transforms,
+)
 
 from gsmerge.errors import SceneError
 from gsmerge.io import load_scene, read_cameras, to_cameras
 from gsmerge.io.cameras.camera_file import make_lens, select_views, undistort_photos
 from gsmerge.measure.inspect import inspect
 
+
+def test_to_cameras_scales_each_axis(tmp_path: Path, tiny: Tiny) -> None:
+    write_transforms(tmp_path / "transforms.json", tiny)
+    actual = read_cameras(tmp_path)
+    assert np.allclose(to_cameras(actual).Ks, tiny.K)
+    scaled = to_cameras(actual, (40, 21))
+    assert (scaled.width, scaled.height) == (40, 21)
+    assert np.allclose(scaled.Ks, tiny.K * np.array([[2], [1.5], [1]]))
+    assert np.allclose(scaled.centres, tiny.c2w[:, :3, 3])
+
+
+def test_to_cameras_needs_one_size(tmp_path: Path, tiny: Tiny) -> None:
+    data = frames_of(tiny)
+    data["frames"][1]["w"] = 30
+    actual = read_cameras(save_json(tmp_path / "transforms.json", data))
+    with pytest.raises(SceneError, match="expected cameras of one image size, found 20 x 14 and 30 x 14"):
+        to_cameras(actual)
+
+
+def test_axes_by_hand(tmp_path: Path) -> None:
+    """A camera at (0, 0, 5) that looks down the world's -z: an OpenGL identity rotation."""
+    pose = np.eye(4)
+    pose[2, 3] = 5
+    frame = {"file_path": "a", "transform_matrix": pose.tolist()}
+    data = {"fl_x": 10, "cx": 5, "cy": 5, "w": 10, "h": 10, "frames": [frame]}
+    cameras = to_cameras(read_cameras(save_json(tmp_path / "transforms.json", data)))
+    point = cameras.viewmats[0] @ np.array([1.0, 2.0, 0.0, 1.0], np.float64)
+    assert point.tolist() == [1.0, -2.0, 5.0, 1.0]  # right stays right, up becomes -y, 5 in front
+    assert np.allclose(cameras.viewmats[0], FLIP @ np.linalg.inv(pose))
+    assert cv2.Rodrigues(cameras.viewmats[0, :3, :3])[0][0, 0] == pytest.approx(np.pi)
+
+
 SMOOTH = smooth_scene(60, 45)
+
+
 K = np.array([[180.0, 0, 96], [0, 170, 77], [0, 0, 1]])
 
 

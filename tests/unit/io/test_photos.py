@@ -1,6 +1,10 @@
+"""Photos are found by name, decoded, and refused silently where they are damaged."""
+
 from __future__ import annotations
 
+import struct
 import weakref
+import zlib
 from pathlib import Path
 
 import cv2
@@ -10,7 +14,7 @@ from tiny_scene import Tiny, write_images
 
 from gsmerge.errors import SceneError
 from gsmerge.io import photos, read_images
-from gsmerge.io.photos import match_images, natural_key
+from gsmerge.io.photos import image_size, match_images, natural_key
 from gsmerge.runtime.threads import use_threads
 
 
@@ -100,19 +104,6 @@ def test_images_of_two_sizes_are_both_named(tmp_path: Path, tiny: Tiny) -> None:
         read_images(tmp_path, tiny.names)
 
 
-def test_grey_and_transparent_images_become_rgb(tmp_path: Path) -> None:
-    cv2.imwrite(str(tmp_path / "a.png"), np.full((2, 3), 51, np.uint8))
-    cv2.imwrite(str(tmp_path / "b.png"), np.full((2, 3, 4), 102, np.uint8))
-    images = read_images(tmp_path, ["a", "b"])
-    assert np.unique(images[0]).tolist() == pytest.approx([0.2])
-    assert np.unique(images[1]).tolist() == pytest.approx([0.4])
-
-
-def test_numbers_sort_as_numbers() -> None:
-    names = ["view 10", "view 2", "a/1", "3", "view 2b"]
-    assert sorted(names, key=natural_key) == ["3", "a/1", "view 2", "view 2b", "view 10"]
-
-
 def test_many_large_photos_are_decoded_one_by_one(tmp_path: Path, tiny: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:
     """As those in memory, in every way that photos are used; few at a time."""
     write_images(tmp_path, tiny)
@@ -151,3 +142,115 @@ def test_a_damaged_photo_among_many_large_ones(tmp_path: Path, tiny: Tiny, monke
     path.write_bytes(path.read_bytes()[:-20])
     with pytest.raises(SceneError, match="cannot be decoded"):
         read_images(tmp_path, tiny.names)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".webp", ".tiff", ".ppm", ".pgm"])
+@pytest.mark.parametrize("size", [(7, 5), (300, 20), (64, 513)])
+def test_stored_size_is_that_of_the_decoded_image(suffix: str, size: tuple[int, int], tmp_path: Path) -> None:
+    width, height = size
+    picture = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
+    path = tmp_path / f"a{suffix}"
+    assert cv2.imwrite(str(path), picture[..., 0] if suffix == ".pgm" else picture)
+    assert image_size(path) == size
+
+
+@pytest.mark.parametrize("flags", [[cv2.IMWRITE_JPEG_PROGRESSIVE, 1], [cv2.IMWRITE_JPEG_RST_INTERVAL, 2]])
+def test_stored_size_of_other_jpegs(flags: list[int], tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.jpg"), np.zeros((33, 17, 3), np.uint8), flags)
+    assert image_size(tmp_path / "a.jpg") == (17, 33)
+
+
+def test_stored_size_of_webp_without_loss(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.webp"), np.zeros((33, 17, 3), np.uint8), [cv2.IMWRITE_WEBP_QUALITY, 101])
+    assert image_size(tmp_path / "a.webp") == (17, 33)
+
+
+def test_natural_key_counts_any_number_of_digits() -> None:
+    names = ["a10", "a2", "a02b", "a" + "1" * 5000, "a1", "b0"]
+    assert sorted(names, key=natural_key) == ["a1", "a2", "a02b", "a10", "a" + "1" * 5000, "b0"]
+
+
+PICTURE = np.random.default_rng(0).integers(0, 255, (20, 30, 3), np.uint8)
+
+
+DATA = cv2.imencode(".png", PICTURE[..., ::-1])[1].tobytes()
+
+
+def chunk(kind: bytes, content: bytes, crc: int | None = None) -> bytes:
+    own = zlib.crc32(kind + content) if crc is None else crc
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", own)
+
+
+def beside(more: bytes) -> bytes:
+    """A chunk between the header and the picture."""
+    return DATA[:33] + more + DATA[33:]
+
+
+def read(path: Path, data: bytes) -> np.ndarray:
+    path.write_bytes(data)
+    return (read_images([path], ["a"])[0] * 255).round().astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        DATA,
+        DATA + b"junk",
+        DATA[:-1] + b"x",
+        beside(chunk(b"iCCP", b"ICC\0\0" + zlib.compress(b"no profile"))),
+        beside(chunk(b"tEXt", b"a\0b", crc=0)),
+        beside(chunk(b"gAMA", struct.pack(">I", 220_000))),
+        beside(chunk(b"eXIf", b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0")),
+    ],
+    ids=["sound", "more behind", "end", "profile", "text", "gamma", "orientation"],
+)
+def test_what_is_beside_the_picture_does_not_matter(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], data: bytes
+) -> None:
+    assert np.array_equal(read(tmp_path / "a.png", data), PICTURE)
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("share", [0.05, 0.3, 0.9, 0.999])
+def test_cut_files_are_refused_silently(tmp_path: Path, capfd: pytest.CaptureFixture[str], share: float) -> None:
+    with pytest.raises(SceneError, match="cannot be decoded"):
+        read(tmp_path / "a.png", DATA[: int(share * len(DATA))])
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("place", [10, 20, 30, 40, 500, 1500])
+def test_changed_bytes_are_refused_silently(tmp_path: Path, capfd: pytest.CaptureFixture[str], place: int) -> None:
+    data = bytearray(DATA)
+    data[place] ^= 0x55
+    with pytest.raises(SceneError):
+        read(tmp_path / "a.png", bytes(data))
+    assert capfd.readouterr().err == ""
+
+
+def test_an_unknown_critical_chunk_is_refused_silently(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SceneError, match="cannot be decoded"):
+        read(tmp_path / "a.png", beside(chunk(b"ABCD", b"")))
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("kind", ["grey", "16 bit", "alpha", "palette"])
+def test_kinds_of_png_are_decoded_as_ever(tmp_path: Path, kind: str) -> None:
+    rng, path = np.random.default_rng(1), tmp_path / "a.png"
+    pictures = {
+        "grey": PICTURE[..., 0],
+        "16 bit": rng.integers(0, 65535, (20, 30, 3), np.uint16),
+        "alpha": rng.integers(0, 255, (20, 30, 4), np.uint8),
+    }
+    if kind == "palette":
+        head = struct.pack(">IIBBBBB", 4, 1, 8, 3, 0, 0, 0)
+        parts = (
+            (b"IHDR", head),
+            (b"PLTE", bytes(range(12))),
+            (b"tRNS", b"\0\xff"),
+            (b"IDAT", zlib.compress(b"\0\0\1\2\3")),
+        )
+        data = DATA[:8] + b"".join(chunk(*part) for part in (*parts, (b"IEND", b"")))
+    else:
+        data = cv2.imencode(".png", pictures[kind])[1].tobytes()
+    expected = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    assert np.array_equal(read(path, data), expected[..., ::-1])

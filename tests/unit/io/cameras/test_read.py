@@ -1,4 +1,4 @@
-"""Camera files that single backbones write."""
+"""Camera files are told apart; those of single backbones are read."""
 
 from __future__ import annotations
 
@@ -8,8 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scenes
+from tiny_scene import (
+    Tiny,
+    write_colmap_text,
+    write_inria,
+    write_transforms,
+)
 
-from gsmerge import SceneError, read_cameras
+from gsmerge.errors import SceneError
+from gsmerge.io import read_cameras
 
 VIEWS = 3
 
@@ -129,3 +136,28 @@ def broken(kind: str, folder: Path, viewmats: np.ndarray, Ks: np.ndarray) -> Pat
 def test_what_is_wrong_is_named(tmp_path: Path, truth: tuple[np.ndarray, np.ndarray], kind: str, message: str) -> None:
     with pytest.raises(SceneError, match=message):
         read_cameras(broken(kind, tmp_path, *truth))
+
+
+def test_what_is_no_camera_file(tmp_path: Path) -> None:
+    for name, text, message in (
+        ("none.json", None, "no such file or folder"),
+        ("text.json", "hello", "expected JSON"),
+        ("other.json", '{"a": 1}', "expected 'frames' .* or a list of cameras"),
+        ("list.json", "[1, 2]", "expected 'frames' .* or a list of cameras"),
+        ("cameras.xml", "<a/>", "expected cameras as"),
+    ):
+        if text is not None:
+            (tmp_path / name).write_text(text)
+        with pytest.raises(SceneError, match=message):
+            read_cameras(tmp_path / name)
+    with pytest.raises(SceneError, match=r"expected transforms\.json, .* found none"):
+        read_cameras(tmp_path)
+
+
+def test_the_first_place_wins(tmp_path: Path, tiny: Tiny) -> None:
+    write_colmap_text(tmp_path / "sparse/0", tiny)
+    write_inria(tmp_path / "cameras.json", tiny)
+    assert read_cameras(tmp_path).source == "INRIA cameras.json"
+    write_transforms(tmp_path / "transforms.json", tiny)
+    assert read_cameras(tmp_path).source == "transforms.json"
+    assert read_cameras(tmp_path / "sparse").source == "COLMAP text"

@@ -1,18 +1,22 @@
+"""Gaussians are read from PLY files of any layout, and from the other formats as slow readers do."""
+
 from __future__ import annotations
 
-import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+import scenes
 from plyfile import PlyData, PlyElement
 
 from gsmerge.errors import SceneError
-from gsmerge.io import read_ply, write_gaussians, write_ply
-from gsmerge.io.formats.ply_file import header_counts, open_ply, open_rows
+from gsmerge.io import kept_comments, read_gaussians, read_ply, write_gaussians, write_ply
+from gsmerge.io.formats.sog import sog_bytes
+from gsmerge.io.formats.spz import spz_bytes
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import Gaussians
+
+from .slow_readers import corners, drawn, read_splat, read_spz
 
 NAMES = (
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
@@ -48,32 +52,6 @@ def test_values_are_activated_by_hand(tmp_path: Path) -> None:
     assert gaussians.sh0[:, 0, 2].tolist() == rows["f_dc_2"].tolist()
     assert gaussians.means.dtype == np.float32
     assert scene.valid.all()
-
-
-@pytest.mark.parametrize("comment", [b"caf\xe9", "caf\N{LATIN SMALL LETTER E WITH ACUTE}".encode(), b"\xff" * 100])
-@pytest.mark.parametrize("text", [True, False])
-def test_comments_may_hold_any_byte(tmp_path: Path, comment: bytes, text: bool) -> None:
-    path = save(tmp_path / "a.ply", columns(), text=text)
-    expected, (head, rows) = read_ply(path).gaussians, path.read_bytes().split(b"element", 1)
-    path.write_bytes(head + b"comment " + comment + b"\nobj_info " + comment + b"\nelement" + rows)
-    scene = read_ply(path)
-    assert np.array_equal(scene.gaussians.means, expected.means)
-    assert all(kept.isascii() for kept in scene.info.comments)
-    path.write_bytes(path.read_bytes().replace(b"float f_dc_0", b"float f_dc_\xe9").replace(b"comment", b"c\xe9mment"))
-    with pytest.raises(SceneError):
-        read_ply(path)
-
-
-@pytest.mark.parametrize("newline", [b"\n", b"\r\n"])
-def test_empty_lines_between_rows_of_text_are_passed_over(tmp_path: Path, newline: bytes) -> None:
-    path = save(tmp_path / "a.ply", columns(), text=True)
-    expected, (head, rows) = read_ply(path).gaussians, path.read_bytes().split(b"end_header\n", 1)
-    spaced = b"\n \t\n" + rows.replace(b"\n", b"\n\n\n") + b"\n\n"
-    path.write_bytes((head + b"end_header\n" + spaced).replace(b"\n", newline))
-    assert np.array_equal(read_ply(path).gaussians.means, expected.means)
-    path.write_bytes((head + b"end_header\n" + b"\n" * 10_000).replace(b"\n", newline))
-    with pytest.raises(SceneError, match="truncated or damaged"):
-        read_ply(path)
 
 
 def test_info_of_the_common_layouts(tmp_path: Path) -> None:
@@ -279,63 +257,56 @@ def test_harmonics_with_a_gap_are_refused(tmp_path: Path) -> None:
         read_ply(save(tmp_path / "a.ply", columns(names=names)))
 
 
-@pytest.mark.parametrize("packed", [False, True], ids=["plain", "packed"])
-@pytest.mark.parametrize("share", [0.0, 0.2, 0.9])
-def test_a_file_that_shrinks_while_it_is_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, share: float, packed: bool
-) -> None:
-    """One line, not the signal that reading mapped pages beyond the end would be."""
-    path = tmp_path / ("a.compressed.ply" if packed else "a.ply")
-    if packed:
-        write_gaussians(path, read_ply(save(tmp_path / "b.ply", columns(20_000))).gaussians)
-    else:
-        save(path, columns(20_000))
-    size, parse = path.stat().st_size, PlyData.read
-
-    def parse_then_cut(*arguments: Any, **settings: Any) -> PlyData:
-        data = parse(*arguments, **settings)
-        os.truncate(path, round(share * size))
-        return data
-
-    monkeypatch.setattr(PlyData, "read", parse_then_cut)
-    with pytest.raises(SceneError, match="it became shorter while it was read"):
-        read_ply(path)
+@pytest.fixture(scope="module")
+def gaussians() -> Gaussians:
+    return drawn(scenes.make_scene(scenes.room(), scenes.arc(3, 96, 72)), 3)
 
 
-@pytest.mark.parametrize("block", [slice(0, 7), slice(7, 12_345), slice(12_345, 20_000), slice(None)], ids=str)
-def test_rows_are_those_of_the_file(tmp_path: Path, block: slice) -> None:
-    rows, path = columns(20_000), tmp_path / "a.ply"
-    stored = open_ply(save(path, rows))["vertex"].data
-    assert isinstance(stored, np.memmap)
-    for some in (stored, rows):  # of no file: as they are
-        with open_rows(path, some) as read:
-            np.testing.assert_array_equal(read(block), rows[block])
+@pytest.mark.parametrize("ending", [".spz", ".splat"])
+def test_the_same_as_a_slow_reader(ending: str, gaussians: Gaussians, tmp_path: Path) -> None:
+    path = tmp_path / f"a{ending.upper()}"
+    write_gaussians(path, gaussians)
+    expected, actual = {".spz": read_spz, ".splat": read_splat}[ending](path), read_gaussians(path)
+    assert actual.valid.all()
+    for name, array in vars(expected).items():
+        np.testing.assert_allclose(getattr(actual.gaussians, name), array, rtol=1e-5, atol=1e-5, err_msg=name)
 
 
-@pytest.mark.skipif(not Path("/proc/self/smaps").exists(), reason="needs Linux")
-def test_a_file_that_was_read_takes_no_memory(tmp_path: Path) -> None:
-    path = save(tmp_path / "large.ply", columns(100_000))
-    stored = open_ply(path)["vertex"].data
-    with open_rows(path, stored) as read:
-        assert float(read(slice(None))["x"].sum()) != 0
-    assert resident(stored.filename) < 0.1 * stored.nbytes
+def test_what_the_file_is_called(gaussians: Gaussians, tmp_path: Path) -> None:
+    names = {
+        ".spz": ".spz version 3, SH degree 3",
+        ".splat": ".splat, SH degree 0",
+        ".sog": ".sog version 2, SH degree 3",
+    }
+    for ending, layout in names.items():
+        write_gaussians(tmp_path / f"a{ending}", gaussians)
+        info = read_gaussians(tmp_path / f"a{ending}").info
+        assert (info.layout, info.count, info.opacity_encoding) == (layout, len(gaussians), "raw")
+        assert info.file_bytes == (tmp_path / f"a{ending}").stat().st_size
+        assert not info.opacity_guessed
+        if ending != ".spz":  # whose sizes are those before gzip
+            assert 0.5 * info.file_bytes < sum(info.bytes_by_attribute.values()) <= info.file_bytes
 
 
-def resident(path: str) -> int:
-    """Bytes of a mapped file that are in this process's memory."""
-    total, inside = 0, False
-    for line in Path("/proc/self/smaps").read_text().splitlines():
-        if not line.split(":")[0].isalpha() and "-" in line.split()[0]:
-            inside = line.endswith(str(path))
-        elif inside and line.startswith("Rss:"):
-            total += 1024 * int(line.split()[1])
-    return total
+@pytest.mark.parametrize("ending", [".spz", ".sog"])
+def test_a_filter_of_their_own_is_passed_on(ending: str, gaussians: Gaussians, tmp_path: Path) -> None:
+    for name, comments in {"mip": ["SplatRenderMode: mip"], "plain": []}.items():
+        write_gaussians(tmp_path / f"{name}{ending}", gaussians, comments=comments)
+        assert list(kept_comments(read_gaussians(tmp_path / f"{name}{ending}").info)) == comments
 
 
-def test_what_a_header_promises(tmp_path: Path) -> None:
-    assert header_counts(save(tmp_path / "a.ply", columns(7))) == (7, 0)
-    assert header_counts(save(tmp_path / "b.ply", columns(9, num_rest=45))) == (9, 45)
-    assert header_counts(save(tmp_path / "c.ply", columns(3, num_rest=9), text=True)) == (3, 9)
-    (tmp_path / "d.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nend_header\nelement vertex 5\n")
-    assert header_counts(tmp_path / "d.ply") == (0, 0)
-    assert header_counts(tmp_path / "none.ply") == (0, 0)
+def test_noise_in_a_file_is_no_traceback(tmp_path: Path) -> None:
+    """Bytes changed at random either still give Gaussians, or one of our errors."""
+    rng, path, refused = np.random.default_rng(0), tmp_path, 0
+    for content, ending in ((spz_bytes(corners()), ".spz"), (sog_bytes(corners()), ".sog")):
+        path = tmp_path / f"a{ending}"
+        for _ in range(150):
+            data = bytearray(content)
+            for at in rng.integers(0, len(data), rng.integers(1, 4)):
+                data[at] = rng.integers(0, 256)
+            path.write_bytes(data)
+            try:
+                assert len(read_gaussians(path).gaussians) > 0
+            except SceneError:
+                refused += 1
+    assert refused > 100

@@ -294,7 +294,7 @@ def test_wrong_arguments(tmp_path: Path, smooth: Tiny, name: str, value: object)
         read_scene(path, **{name: value})
 
 
-def test_the_documented_dialects(root: Path) -> None:
+def test_every_exporter_is_documented(root: Path) -> None:
     text = (root / "docs" / "reference" / "exporters.md").read_text()
     assert [name for name in EXPORTERS if f"| `{name}` |" not in text] == []
 
