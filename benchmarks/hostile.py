@@ -227,9 +227,6 @@ def _limit(place: Path) -> None:
         os.dup2(descriptor, number)
     resource.setrlimit(resource.RLIMIT_AS, (_memory()[0] + MEMORY,) * 2)
     signal.setitimer(signal.ITIMER_REAL, SECONDS)
-    from gsmerge.io import atomic
-
-    atomic._clean.clear()
 
 
 def _memory() -> list[int]:

@@ -204,7 +204,7 @@ class Trial:
         after = contents(self.out)
         faults += self.half_written(name, code, before, after)
         left = {path for path in after if path not in before and path not in self.new}
-        own = {"batch.jsonl", "summary.csv"} | {path for path in left if path.startswith(".batch/")}  # for the next run
+        own = {"batch.jsonl", "summary.csv"} | {path for path in left if path.startswith(".batch-")}  # for the next run
         if orderly and left - own:
             faults.append(f"left {sorted(left)}")
         if left or again or self.command.resumes:

@@ -5,11 +5,9 @@ from __future__ import annotations
 import math
 import re
 import sys
-from collections.abc import Mapping
 from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
-from typing import Any
 
 from gsmerge.errors import UsageError
 from gsmerge.io.formats.writing import count_for_bytes
@@ -122,44 +120,6 @@ def share_text(share: float) -> str:
     if isinstance(share, bool) or not isinstance(share, int | float):
         raise ValueError(f"expected a share as a number, got {share!r}")
     return f"{(Decimal(repr(share)) * 100).normalize():f}%"
-
-
-def new_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings as files of version 0.1.0 name them, by their names of today.
-
-    Example:
-        >>> new_settings({"k": "auto", "density": 0.02, "superpixels": None})
-        {'superpixels': '2%', 'budget': 'auto'}
-    """
-    old = ("density", "superpixels", "max_bytes", "preset", "max_drop", "target_psnr", "k", "budget")
-    new, given = dict(settings), {name: settings[name] for name in old if settings.get(name) is not None}
-    for name in old[2:6]:
-        new.pop(name, None)
-    if "density" in new or new.get("superpixels", "") is None:
-        density = new.pop("density", None)
-        new["superpixels"] = given.get("superpixels") or share_text(0.044 if density is None else density)
-    if given.get("k") == AUTO:
-        given["auto"] = new.pop("k")
-    for name in ("auto", "preset", "max_bytes"):
-        if name in given and "budget" not in given:
-            size = given[name]
-            new["budget"] = f"{size}B" if isinstance(size, int) else size
-            given["budget"] = size
-    if "target_psnr" in given or "max_drop" in given:
-        new["quality"] = f"{given['target_psnr']:g}dB" if "target_psnr" in given else f"-{given['max_drop']:g}dB"
-    return new
-
-
-def old_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The reverse of :func:`new_settings` for superpixels and counts: keys of records are digests of the old names."""
-    old = dict(settings)
-    if isinstance(old.get("superpixels"), str):
-        old["density"] = parse_share(old.pop("superpixels"))
-    if old.get("budget") == AUTO:
-        old["k"] = old.pop("budget")
-    elif isinstance(old.get("budget"), str) and BudgetOptions(old["budget"]).in_bytes:
-        old["max_bytes"] = old.pop("budget")
-    return old
 
 
 def parse_budget(budget: str | int | None, num_input: int) -> int:

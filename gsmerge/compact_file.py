@@ -172,7 +172,7 @@ def recognised_of(loaded: SceneLoad) -> dict[str, Any]:
     names = ("layout", "sh_degree", "opacity_encoding", "num_nonfinite")
     cameras, recovery = loaded.scene.cameras, loaded.recovery
     views: dict[str, Any] = {"num_views": len(cameras), "height": cameras.height, "width": cameras.width}
-    views |= {"dialects": [exporter.name for exporter in loaded.exporters], "rows": recovery and recovery.description}
+    views |= {"exporters": [exporter.name for exporter in loaded.exporters], "rows": recovery and recovery.description}
     views["moved_cameras"] = list(loaded.moves)
     return views | {name: getattr(loaded.ply, name) for name in names}
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
-from gsmerge.budget import BudgetOptions, new_settings
+from gsmerge.budget import BudgetOptions
 from gsmerge.stages.clean import CleanOptions
 from gsmerge.stages.decode import MIXED, DecodeOptions
 from gsmerge.stages.fit import FitOptions
@@ -149,44 +149,3 @@ class CompactOptions:
         if unknown:
             raise ValueError(f"unknown setting {unknown[0]!r}; known: {', '.join(sorted(self.to_dict()))}")
         return replace(self, **changes)
-
-
-# Names of settings in reports, records and files, where the code's differ. They are a schema and do not change.
-SCHEMA_NAMES = {
-    "min_owner_weight": "min_contribution",
-    "half_res_share": "coarse",
-    "ssim_lambda": "dssim",
-    "opacity_reg": "opacity_pull",
-    "scale_reg": "size_pull",
-    "prior_weight": "pull",
-    "min_contribution": "prune",
-}
-RATE_SCHEMA_NAMES = {
-    "means_lr": "mean",
-    "scales_lr": "size",
-    "quats_lr": "quat",
-    "opacities_lr": "logit",
-    "colors_lr": "color",
-    "max_mean_shift": "reach_mean",
-    "max_scale_change": "reach_size",
-    "max_opacity_change": "reach_logit",
-    "single_view_share": "reach_alone",
-}
-
-
-def to_schema(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings by flat name -> the same by their names in reports, records and files."""
-    return _rename(settings, SCHEMA_NAMES, RATE_SCHEMA_NAMES)
-
-
-def from_schema(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The inverse of :func:`to_schema`; also of files from before ``superpixels``, ``budget`` and ``quality``."""
-    names, rate_names = ({old: new for new, old in both.items()} for both in (SCHEMA_NAMES, RATE_SCHEMA_NAMES))
-    return _rename(new_settings(settings), names, rate_names)
-
-
-def _rename(settings: Mapping[str, Any], names: Mapping[str, str], rates: Mapping[str, str]) -> dict[str, Any]:
-    renamed = {names.get(name, name): value for name, value in settings.items()}
-    if isinstance(renamed.get("rates"), Mapping):
-        renamed["rates"] = {rates.get(name, name): value for name, value in renamed["rates"].items()}
-    return renamed

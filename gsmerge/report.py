@@ -8,15 +8,11 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gsmerge import __version__
-from gsmerge.options import to_schema
 from gsmerge.result import CompactReport
 from gsmerge.runtime.memory import human_bytes
-
-if TYPE_CHECKING:
-    pass
 
 SCHEMA_VERSION = 1
 
@@ -87,7 +83,7 @@ def report_document(
         ],
         "viewer_cameras": None if cameras_path is None else os.fspath(cameras_path),
         "ratio": numbers["num_output"] / max(numbers["num_input"], 1),
-        "options": to_schema(report.options),
+        "options": dict(report.options),
         "seed": numbers["options"]["seed"],
         "choices": numbers["choices"],
         **seconds_document({**seconds_before, **report.seconds, **seconds_after}),

@@ -60,18 +60,18 @@ def finish(*arguments: object) -> int:
 
 
 def holders(folder: Path) -> list[int]:
-    """Processes that hold the locks of scenes."""
+    """Processes that have begun to compact scenes."""
     actual = []
-    for path in (folder / ".batch").glob("*.lock"):
+    for path in folder.glob(".batch-*.begun"):
         try:
-            actual += [json.loads(path.read_text())["pid"]] if path.name != "run.lock" else []
-        except (OSError, ValueError):
+            actual.append(int(path.read_text().split()[0]))
+        except (OSError, IndexError):
             continue  # it is being written, or has just gone
     return actual
 
 
 class InlinePool:
-    """In place of :class:`gsmerge.batch.local.LocalPool`: one scene after the other in this process."""
+    """In place of :class:`gsmerge.batch.pools.LocalPool`: one scene after the other in this process."""
 
     def __init__(self, work: BatchContext, _: int) -> None:
         self.work, self.index = work, RecordIndex(work.folder, work.start)

@@ -38,7 +38,7 @@ class Job:
 
 
 def find_jobs(given: Sequence[str], out: Path, options: BatchOptions, own: Collection[str] = ()) -> list[Job]:
-    """All scenes, each once, and where their results go in the output folder.
+    """List all scenes, each once, and where their results go in the output folder.
 
     ``given`` are folders, which are searched, except for ``out``; patterns; ``.ply`` files; text files with one of
     these per line. ``own`` has the real paths of results of former runs, which are no scenes. A SceneError if something
@@ -69,12 +69,12 @@ def find_jobs(given: Sequence[str], out: Path, options: BatchOptions, own: Colle
 
 
 def result_names(output: str, options: BatchOptions) -> list[str]:
-    """Names of a result and of its further levels of detail."""
+    """Return the names of a result and of its further levels of detail."""
     return [output, *(str(level_output(Path(output), level)) for level in range(1, options.settings.budget.levels))]
 
 
 def _ply_of(scene: Path) -> Path:
-    """The file that identifies a scene; the folder itself where several files could."""
+    """Return the file that identifies a scene; the folder itself where several files could."""
     if not scene.is_dir():
         return scene
     plys = other_plys(scene)
@@ -82,7 +82,7 @@ def _ply_of(scene: Path) -> Path:
 
 
 def output_name(options: BatchOptions, scene: Path, index: int) -> str:
-    """Name of a scene's result in the output folder."""
+    """Return the name of a scene's result in the output folder."""
     whole = Path(os.path.abspath(scene))
     stem = stem_of(whole).removesuffix(".compressed")  # which is the scene's format, not its result's
     values = {"stem": stem, "parent": whole.parent.name, "index": index, "k": options.settings.decode.k}
@@ -93,7 +93,9 @@ def output_name(options: BatchOptions, scene: Path, index: int) -> str:
 
 
 def find_scenes(given: Sequence[str], out: Path) -> Iterator[Path]:
-    """The scenes of the arguments, in their order and sorted within each; some may come twice.
+    """Yield the scenes of the arguments, in their order and sorted within each.
+
+    Some may come twice.
 
     A SceneError if an argument does not exist or holds no scene, a UsageError if it is the output folder.
     """
@@ -115,7 +117,7 @@ def find_scenes(given: Sequence[str], out: Path) -> Iterator[Path]:
 
 
 def _require_some(scenes: Iterator[Path], argument: str, where: str) -> Iterator[Path]:
-    """The scenes; none at all is an error."""
+    """Yield the scenes; a SceneError if there are none."""
     first = next(scenes, None)
     if first is None:
         raise SceneError(argument, f"expected scenes {where}, found none")
@@ -124,7 +126,7 @@ def _require_some(scenes: Iterator[Path], argument: str, where: str) -> Iterator
 
 
 def _walk(folder: Path, skip: str, above: tuple[str, ...] = ()) -> Iterator[Path]:
-    """A folder with a file of one of the usual names is one scene; every other ``.ply`` is one by itself."""
+    """Yield the scenes in a folder, which is one itself if it has a file of a usual name."""
     real = os.path.realpath(folder)
     if real == skip or real in above:  # a link to a folder above would never end
         return
@@ -151,7 +153,7 @@ def _matches(pattern: str, skip: str) -> Iterator[Path]:
 
 
 def _listed(file: Path, skip: str) -> Iterator[Path]:
-    """The scenes of a list, relative to its folder. What does not exist fails when the scene is compacted."""
+    """Yield the scenes of a list, relative to its folder; a missing one fails in its turn."""
     text = read_text(file)
     if "\0" in text:
         raise SceneError(file, "expected a text file with one path per line, found no text")

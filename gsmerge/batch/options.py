@@ -9,7 +9,7 @@ from typing import Any
 from gsmerge.io import AUTO, OUTPUT_FORMATS, ReadHints, output_format
 from gsmerge.io.content_hash import digest
 from gsmerge.io.formats.ply import OpacityChoice
-from gsmerge.options import CompactOptions, to_schema
+from gsmerge.options import CompactOptions
 
 FIELDS = ("stem", "parent", "index", "k")
 ENGINES = ("local", "ray")
@@ -57,18 +57,18 @@ class BatchOptions:
                 raise ValueError(problem)
 
     def result_settings(self) -> dict[str, Any]:
-        """Everything that a result depends on besides the scene's files, as plain values."""
-        settings = to_schema(self.settings.to_dict())
+        """Return all that a result depends on besides the scene's files, as plain values."""
+        settings = self.settings.to_dict()
         del settings["threads"]
         return {"settings": settings, "opacity": self.opacity, "reading": vars(self.hints)}
 
     def name(self) -> str:
-        """The same for all runs that may share an output folder, as they make the same results of the same scenes."""
+        """Return a digest that runs share if they make the same results."""
         return digest({**self.result_settings(), "output": self.output, "cameras": self.cameras, "images": self.images})
 
 
 def check_template(template: str) -> None:
-    """A ValueError if a template gives no valid names for results.
+    """Raise a ValueError if a template gives no valid names for results.
 
     It may hold the fields in ``FIELDS``, ends as one of the formats that can be written, and stays in the folder.
     """

@@ -1,7 +1,11 @@
-"""The records of a batch: one JSON line for each scene, on the disk before the next scene begins."""
+"""The records of a batch, one JSON line for each scene, and their summary for people.
+
+A line is on the disk before the next scene begins.
+"""
 
 from __future__ import annotations
 
+import csv
 import os
 import socket
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge.errors import SceneError
-from gsmerge.report import document_head, file_sha256
+from gsmerge.io import atomic_output
+from gsmerge.report import csv_cell, document_head, file_sha256, human_bytes
 from gsmerge.runtime.jsonl import each_line
 
 RECORDS, SUMMARY = "batch.jsonl", "summary.csv"
@@ -21,18 +26,19 @@ COLUMNS = (
     "scene", "output", "status", "num_input", "num_output", "ratio", "bytes_input", "bytes_output", "psnr_before",
     "psnr_after", "seconds", "peak_memory_bytes", "attempt", "unmet", "error",
 )  # fmt: skip
+MAX_LISTED = 20  # scenes in the table, and failures below it
 
 
 @dataclass(frozen=True)
 class DoneResult:
-    """A result that is done."""
+    """The record of a result that is done."""
 
     key: str  # of the scene's content, the settings and the version
     files: tuple[tuple[str, str], ...]  # name in the output folder and SHA-256 of each file
     failed_since: bool = False  # whether the scene failed when it was compacted again
 
     def holds(self, folder: Path, key: str) -> bool:
-        """Whether it was made from the same content and settings, and every file is unchanged since."""
+        """Return whether content and settings are the same, and every file is unchanged."""
         paths = [folder / name for name, _ in self.files]
         try:
             if self.key != key or not paths or not all(path.is_file() for path in paths):  # a pipe would never end
@@ -66,13 +72,13 @@ class RecordIndex:
                 self.known[output] = replace(self.known[output], failed_since=True)
 
     def result_paths(self) -> set[str]:
-        """Real paths of all results."""
+        """Return the real paths of all results."""
         names = [name for known in self.known.values() for name, _ in known.files]
         return {os.path.realpath(self.folder / name) for name in names}
 
 
 def is_record(value: Mapping[str, Any]) -> bool:
-    """Whether a line is a record: anybody may have written it, and one that is none must not stop a batch."""
+    """Return whether a line is a record: anybody may have written it."""
     try:
         texts = [value["scene"], value["output"]]
         texts += [text for file in value["files"] for text in (file["path"], file["sha256"])]
@@ -90,7 +96,7 @@ def is_record(value: Mapping[str, Any]) -> bool:
 
 
 def row_of(record: Mapping[str, Any]) -> dict[str, Any]:
-    """A record as a row of the CSV file, with None for unknown values."""
+    """Convert a record to a row of the CSV file, with None for unknown values."""
     row: dict[str, Any] = dict.fromkeys(COLUMNS)
     row |= {name: record.get(name) for name in ("scene", "output", "status", "attempt", "error")}
     report = record.get("report")
@@ -113,21 +119,21 @@ def row_of(record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def record(status: str, scene: str, output: str, **facts: Any) -> dict[str, Any]:
-    """A record: the keys that every line has, and ``facts``."""
+    """Make a record of the keys that every line has, and ``facts``."""
     blank: dict[str, Any] = {"key": None, "files": [], "attempt": 1, "error": None, "report": None}
     place = {"host": socket.gethostname(), "pid": os.getpid()}
     return {**document_head(), "status": status, "scene": scene, "output": output, **blank, **place, **facts}
 
 
 def written_files(folder: Path, names: Sequence[str]) -> list[dict[str, Any]]:
-    """The files of a result, as in its record."""
+    """Describe the files of a result for its record."""
     return [
         {"path": name, "sha256": file_sha256(folder / name), "bytes": (folder / name).stat().st_size} for name in names
     ]
 
 
 def each_record(folder: Path) -> Iterator[dict[str, Any]]:
-    """The records of a folder in their order, without damaged ones."""
+    """Yield the records of a folder in their order, without damaged ones."""
     for _, value in each_line(folder / RECORDS):
         if value is not None and is_record(value):
             yield value
@@ -142,3 +148,102 @@ def check_folder(folder: Path) -> None:
     except OSError as error:
         problem = f"cannot be written ({error.strerror})"
         raise SceneError(folder, problem, "name another folder with --output") from error
+
+
+@dataclass
+class Totals:
+    """Totals of a run so far, in a size that does not grow with the number of scenes."""
+
+    total: int  # scenes
+    counts: dict[str, int] = field(default_factory=lambda: {DONE: 0, SKIPPED: 0, FAILED: 0})  # of them by status
+    num_input: int = 0  # Gaussians in the scenes that were done
+    num_output: int = 0  # Gaussians in their results
+    bytes_input: int = 0  # bytes of the same
+    bytes_output: int = 0  # bytes of the same
+    unmet: int = 0  # results that miss their target
+    rows: list[dict[str, Any]] = field(default_factory=list)  # the first ones done, as in the CSV file
+    failures: list[tuple[str, str]] = field(default_factory=list)  # the first scenes that failed, and why
+
+    def add(self, record: Mapping[str, Any]) -> None:
+        """Count a scene."""
+        self.counts[record["status"]] += 1
+        row = row_of(record)
+        if record["status"] == DONE:
+            self.num_input += row["num_input"]
+            self.num_output += row["num_output"]
+            self.bytes_input += row["bytes_input"]
+            self.bytes_output += row["bytes_output"]
+            self.unmet += bool(row["unmet"])
+            self.rows += [row] if len(self.rows) < MAX_LISTED else []
+        elif record["status"] == FAILED and len(self.failures) < MAX_LISTED:
+            self.failures.append((str(record["scene"]), str(record["error"])))
+
+    @property
+    def ended(self) -> int:
+        """Scenes that have ended."""
+        return sum(self.counts.values())
+
+
+def write_summary(folder: Path) -> Path:
+    """Write the newest state of every scene in the folder. SceneError if that fails."""
+    records, read = folder / RECORDS, -1
+    while (size := records.stat().st_size if records.exists() else 0) != read:  # other runs may add to them meanwhile
+        _write_rows(folder / SUMMARY, _newest(folder))
+        read = size
+    return folder / SUMMARY
+
+
+def _newest(folder: Path) -> list[dict[str, Any]]:
+    """Return the newest row of every scene, by the name of its result."""
+    rows: dict[str, dict[str, Any]] = {}
+    done: dict[str, dict[str, Any]] = {}
+    for record in each_record(folder):
+        row = row_of(record)
+        if record["status"] == DONE:
+            done[record["output"]] = row
+        rows[record["output"]] = done.get(record["output"], row) if record["status"] == SKIPPED else row
+    return [rows[output] for output in sorted(rows)]
+
+
+def _write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    with (
+        atomic_output(path, overwrite=True) as temporary,
+        temporary.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file,
+    ):
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows({name: csv_cell(value) for name, value in row.items()} for row in rows)
+
+
+def summary_lines(totals: Totals, path: Path | None) -> list[str]:
+    """Format the totals of a run, as a table for people."""
+    lines = _table(totals.rows)
+    more = totals.counts[DONE] - len(totals.rows)
+    lines += [f"... and {more:,} more"] if more > 0 else []
+    lines += [f"failed: {scene}: {error}" for scene, error in totals.failures]
+    more = totals.counts[FAILED] - len(totals.failures)
+    lines += [f"... and {more:,} more failed"] if more > 0 else []
+    counts = [f"{count:,} {status}" for status, count in totals.counts.items() if count or status == DONE]
+    left = totals.total - totals.ended
+    line = f"{totals.total:,} scenes: {', '.join(counts)}" + (f", {left:,} left" if left else "")
+    if totals.num_input:
+        share = 100 * totals.num_output / totals.num_input
+        line += (
+            f"; {totals.num_input:,} -> {totals.num_output:,} Gaussians ({share:.2f} %),"
+            f" {human_bytes(totals.bytes_input)} -> {human_bytes(totals.bytes_output)}"
+        )
+    line += f"; {totals.unmet:,} missed the target" if totals.unmet else ""
+    return [*lines, line + (f"; all in {path}" if path is not None else "")]
+
+
+def _table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    if not rows:
+        return []
+    cells = [("result", "Gaussians", "of", "kept", "dB before", "after", "seconds")]
+    for row in sorted(rows, key=lambda row: str(row["output"])):
+        quality = ["" if row[name] is None else f"{row[name]:.2f}" for name in ("psnr_before", "psnr_after")]
+        share = f"{100 * row['ratio']:.2f} %"
+        counts = f"{row['num_output']:,}", f"{row['num_input']:,}"
+        cells.append((row["output"], *counts, share, *quality, f"{row['seconds']:.1f}"))
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    return ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in cells]

@@ -1,43 +1,95 @@
-"""The batch: scenes are dispatched to a pool, tried again if their process died, and reported as they end."""
+"""Runs of a batch: a schedule, and tasks that a pool works on until every scene has ended."""
 
 from __future__ import annotations
 
 import time
 from collections import deque
 from collections.abc import Generator, Iterator, Sequence
-from contextlib import ExitStack
-from dataclasses import replace
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, replace
+from heapq import nlargest
+from itertools import accumulate
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from gsmerge.batch.find import Job
-from gsmerge.batch.local import LocalPool
-from gsmerge.batch.locks import run_lock
 from gsmerge.batch.options import BatchOptions
-from gsmerge.batch.plan import Schedule, make_schedule
+from gsmerge.batch.pools import LocalPool, Pool, RayPool, with_whole_paths
 from gsmerge.batch.records import BUSY, LOST, RECORDS, STUCK, RecordIndex, check_folder
-from gsmerge.batch.task import BatchContext, Task, record_failure
+from gsmerge.batch.task import BatchContext, Task, record_failure, run_lock
 from gsmerge.errors import SceneError
+from gsmerge.io import find_scene_files
+from gsmerge.io.content_hash import cameras_of
+from gsmerge.plan import resolve_fit, resolved_settings
+from gsmerge.runtime.estimate import IMPORT_SECONDS, work_seconds
+from gsmerge.runtime.memory import human_bytes, machine_memory
+from gsmerge.runtime.threads import available_threads
 
+FREE_MEMORY_SHARE = 0.8  # of the free memory that is used by default
 POLL_SECONDS = 0.5  # between two queries of the pool
 BUSY_RETRY_SECONDS = 1.0  # until a scene that another run works on is tried again
 
 
-class Pool(Protocol):
-    """Where scenes are compacted."""
+@dataclass(frozen=True)
+class Schedule:
+    """The number of scenes that are compacted at once."""
 
-    @property
-    def has_room(self) -> bool:
-        """Whether another scene can be taken."""
+    jobs: int  # scenes at once; 0: as many as the cluster has processors for
+    threads: int  # of each
+    memory: int  # bytes that the largest of them may take together
+    notes: tuple[str, ...] = ()  # where it differs from the options
 
-    def submit(self, task: Task) -> None:
-        """Take a scene."""
 
-    def wait(self, seconds: float) -> list[tuple[Task, dict[str, Any]]]:
-        """Scenes that ended, after at most so many seconds, and their outcomes."""
+def make_schedule(jobs: Sequence[Job], options: BatchOptions, *, processors: int | None = None) -> Schedule:
+    """Distribute scenes over processors, with one thread each if there are enough scenes.
 
-    def close(self) -> None:
-        """End all processes; unfinished scenes are left as they were."""
+    Memory must do for the largest scenes, which may come together; ``processors`` are all without a number.
+    """
+    processors = available_threads() if processors is None else processors
+    threads = options.settings.threads
+    if options.engine == "ray":
+        return Schedule(options.jobs or 0, threads or 1, max((job.memory for job in jobs), default=0))
+    count = options.jobs or max(1, processors // (threads or 1))
+    sums = list(accumulate(nlargest(max(1, min(count, len(jobs))), (job.memory for job in jobs)))) or [0]
+    limit = free_memory() if options.max_memory is None else options.max_memory
+    count, notes = len(sums), []
+    if limit is not None and (options.jobs is None or options.max_memory is not None):
+        count = max(1, sum(total <= limit for total in sums))
+        if options.jobs is not None and count < len(sums):
+            notes.append(f"{count} at once instead of {len(sums)}: more may take {human_bytes(sums[count])}")
+        if sums[0] > limit:
+            notes.append(f"the largest scene alone may take {human_bytes(sums[0])}, the limit is {human_bytes(limit)}")
+    return Schedule(count, threads or max(1, processors // count), sums[count - 1], tuple(notes))
+
+
+def free_memory() -> int | None:
+    """Return the bytes that a run may take by default: most of the free memory, or None."""
+    with suppress(OSError, KeyError, ValueError), open("/proc/meminfo", encoding="ascii") as file:
+        values = dict(line.split(":", 1) for line in file)
+        return int(FREE_MEMORY_SHARE * int(values["MemAvailable"].split()[0]) * 1024)
+    machine = machine_memory()
+    return None if machine is None else int(FREE_MEMORY_SHARE * machine)
+
+
+def estimate_seconds(jobs: Sequence[Job], options: BatchOptions, schedule: Schedule) -> float:
+    """Estimate the wall time of scenes, within a factor of about two."""
+    settings, steps = resolved_settings(options.settings, photos=True), resolve_fit(options.settings).steps
+    total = 0.0
+    for job in jobs:
+        views = max(1, _num_views(job))
+        seconds = work_seconds(job.num_gaussians, job.num_gaussians / views, settings, photos=True, fit_steps=steps)
+        total += seconds / min(schedule.threads, views)
+    return IMPORT_SECONDS * bool(jobs) + total / max(1, min(schedule.jobs, len(jobs)))
+
+
+def _num_views(job: Job) -> int:
+    """Count the views of a scene's cameras; 1 where they cannot be read."""
+    try:
+        files = find_scene_files(Path(job.scene))
+    except SceneError:
+        return 1
+    cameras = None if files.cameras is None else cameras_of(files.cameras, files.ply.stem)
+    return 1 if cameras is None else len(cameras)
 
 
 def run_batch(
@@ -71,11 +123,9 @@ def run_batch(
 
 
 def _pool(folder: Path, options: BatchOptions, schedule: Schedule, start: int) -> tuple[Pool, BatchContext]:
-    """Where the scenes are compacted, and what they share."""
+    """Make the pool for the engine, and the context that its tasks share."""
     options = replace(options, settings=replace(options.settings, threads=schedule.threads))
     if options.engine == "ray":
-        from gsmerge.batch.ray_engine import RayPool, with_whole_paths
-
         context = BatchContext(folder.absolute(), with_whole_paths(options), start)
         return RayPool(context, schedule.jobs), context
     context = BatchContext(folder, options, start)
@@ -83,7 +133,7 @@ def _pool(folder: Path, options: BatchOptions, schedule: Schedule, start: int) -
 
 
 def dispatch(tasks: Iterator[Task], pool: Pool, context: BatchContext) -> Iterator[dict[str, Any]]:
-    """Keep a pool busy until every scene has ended; a SceneError if nothing can be recorded any more."""
+    """Keep a pool busy until every scene has ended. SceneError if nothing can be recorded."""
     retried: deque[Task] = deque()  # their process died
     busy: deque[tuple[float, Task]] = deque()  # another run works on them; when to try again, and the task
     active = 0
@@ -112,7 +162,7 @@ def dispatch(tasks: Iterator[Task], pool: Pool, context: BatchContext) -> Iterat
 
 
 def _next(tasks: Iterator[Task], retried: deque[Task], busy: deque[tuple[float, Task]]) -> Task | None:
-    """The next task: first the lost ones, then new ones, then those that other runs had; None if there is none yet."""
+    """Choose the next task: a lost one, a new one, one that another run had, or None yet."""
     if retried:
         return retried.popleft()
     task = next(tasks, None)

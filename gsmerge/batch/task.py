@@ -1,18 +1,27 @@
-"""One scene: skipped if it is done, otherwise compacted and recorded, safe against a kill at any moment."""
+"""One scene of a batch: skipped if it is done, otherwise compacted and recorded.
+
+It is safe against a kill at any moment: locks end with the process that has them, however it ends.
+
+Locks on a scene and on the output folder end with the process that has them, however it ends.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import os
+import secrets
+import socket
 import warnings
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock, Timeout
+
 from gsmerge import __version__
 from gsmerge.batch.find import Job, result_names
-from gsmerge.batch.locks import BusyError, Lock, scene_lock
 from gsmerge.batch.options import BatchOptions
 from gsmerge.batch.records import (
     BUSY,
@@ -29,16 +38,19 @@ from gsmerge.batch.records import (
 from gsmerge.compact_file import compact_files
 from gsmerge.errors import SceneError, UsageError, error_line
 from gsmerge.io import SceneFiles, find_scene_files
-from gsmerge.io.atomic import remove_leftovers
+from gsmerge.io.atomic import remove_stale
 from gsmerge.io.content_hash import content_hash, digest, filled, read_files
 from gsmerge.options import CHECKPOINTS
 from gsmerge.report import SCHEMA_VERSION, file_sha256, finite
 from gsmerge.runtime.jsonl import append_line
 
+PREFIX = ".batch-"  # of the names of all files here, which are in the output folder
+RUN_TIMEOUT = 10.0  # seconds: other runs look at the lock of a run for an instant only
+
 
 @dataclass(frozen=True)
 class Task:
-    """A scene to be compacted."""
+    """A scene to compact, and how often that was tried."""
 
     job: Job  # the scene
     known: DoneResult | None  # its result of former runs; None without one
@@ -47,7 +59,7 @@ class Task:
 
 @dataclass(frozen=True)
 class BatchContext:
-    """What all tasks of a run share."""
+    """The folder and the options that all tasks of a run share."""
 
     folder: Path  # the output folder
     options: BatchOptions  # of the run, with the threads of a scene
@@ -62,37 +74,35 @@ def run_task(task: Task, context: BatchContext, new_records: RecordIndex) -> dic
     """
     job = task.job
 
-    def work(lock: Lock) -> dict[str, Any]:
+    def work(begun: Path) -> dict[str, Any]:
         try:
             new_records.read_on()
-            outcome = _process(task, context, new_records, lock)
+            outcome = _process(task, context, new_records, begun)
         except Exception as error:  # a bad scene must not end the batch
             outcome = record(FAILED, job.scene, job.output, error=error_line(error), attempt=task.attempt)
         known = new_records.known.get(job.output, task.known)
         if outcome["status"] != SKIPPED or (known is not None and known.failed_since):
             append_line(context.folder / RECORDS, outcome)
-        lock.finish()
+        begun.unlink(missing_ok=True)
         return outcome
 
     return _locked(job, context, work)
 
 
-def _locked(job: Job, context: BatchContext, work: Callable[[Lock], dict[str, Any]]) -> dict[str, Any]:
-    """What ``work`` returns under the scene's lock, or that another process has it, or that nothing can be written."""
+def _locked(job: Job, context: BatchContext, work: Callable[[Path], dict[str, Any]]) -> dict[str, Any]:
+    """Work under the scene's lock; the record says if another process has it."""
     try:
-        with scene_lock(context.folder, result_names(job.output, context.options)) as lock:
-            return work(lock)
+        with scene_lock(context.folder, job.output) as begun:
+            return work(begun)
     except BusyError:
         return record(BUSY, job.scene, job.output)
     except SceneError as error:  # locks or records cannot be written, whatever the scene
         return record(STUCK, job.scene, job.output, error=str(error))
 
 
-def _process(task: Task, context: BatchContext, new_records: RecordIndex, lock: Lock) -> dict[str, Any]:
-    """The scene's record, with its files in place."""
+def _process(task: Task, context: BatchContext, new_records: RecordIndex, begun: Path) -> dict[str, Any]:
+    """Skip or compact a scene, and return its record."""
     job, options = task.job, context.options
-    if lock.abandoned:
-        _clean(job, context)
     files = _files_of(job, options)
     key = scene_key(files, options)
     before, since = task.known, new_records.known.get(job.output)
@@ -102,10 +112,13 @@ def _process(task: Task, context: BatchContext, new_records: RecordIndex, lock: 
             written = [{"path": name, "sha256": sha256, "bytes": sizes[name]} for name, sha256 in known.files]
             return record(SKIPPED, job.scene, job.output, key=key, files=written)
     own = {name for known in (before, since) if known is not None for name, _ in known.files}
-    for name in result_names(job.output, options):
-        if os.path.lexists(context.folder / name) and name not in own and not (lock.fresh or options.overwrite):
-            problem = "exists already, and no batch wrote it; pass --overwrite to replace it"
-            raise UsageError(f"{context.folder / name}: {problem}")
+    names = [name for name in result_names(job.output, options) if os.path.lexists(context.folder / name)]
+    foreign = [] if begun.exists() else [name for name in names if name not in own]
+    if foreign and not options.overwrite:
+        problem = "exists already, and no batch wrote it; pass --overwrite to replace it"
+        raise UsageError(f"{context.folder / foreign[0]}: {problem}")
+    if not foreign:
+        begun.write_text(f"{os.getpid()} {socket.gethostname()}", encoding="utf-8")
     return _compact(task, context, files, key)
 
 
@@ -130,7 +143,7 @@ def _files_of(job: Job, options: BatchOptions) -> SceneFiles:
 
 
 def scene_key(files: SceneFiles, options: BatchOptions) -> str:
-    """Digest of everything that a result depends on: what is read, all settings, and the version."""
+    """Return a digest of all that a result depends on: files, settings, version."""
     content: dict[str, Any] = {"scene": content_hash(read_files(files)), **options.result_settings()}
     checkpoint = Path(options.settings.checkpoint)
     if options.settings.checkpoint not in CHECKPOINTS and checkpoint.is_file():  # by its content, wherever it is
@@ -139,45 +152,103 @@ def scene_key(files: SceneFiles, options: BatchOptions) -> str:
 
 
 def is_done(job: Job, known: DoneResult, context: BatchContext) -> bool:
-    """Whether a result would be skipped."""
+    """Return whether a result would be skipped."""
     try:
         return known.holds(context.folder, scene_key(_files_of(job, context.options), context.options))
     except SceneError:
         return False
 
 
-def _clean(job: Job, context: BatchContext) -> None:
-    """Remove what a killed process left next to a result and its further levels."""
-    for name in result_names(job.output, context.options):
-        if (context.folder / name).parent.is_dir():
-            remove_leftovers(context.folder / name)
-
-
 def record_failure(task: Task, context: BatchContext, error: str) -> dict[str, Any]:
-    """The record of a scene whose process died or took too long, after all retries."""
+    """Record a scene whose process died or took too long, after all retries."""
     failed = record(FAILED, task.job.scene, task.job.output, error=error, attempt=task.attempt)
 
-    def work(lock: Lock) -> dict[str, Any]:
-        _clean(task.job, context)
+    def work(begun: Path) -> dict[str, Any]:
+        _clean(task.job, context, begun)
         append_line(context.folder / RECORDS, failed)
-        _finish(lock, task, context)
         return failed
 
     return _locked(task.job, context, work)
 
 
 def clean_up(task: Task, context: BatchContext) -> None:
-    """Remove unfinished files of a scene whose process was ended on purpose; another process or the next run may."""
-    names = result_names(task.job.output, context.options)
-    with suppress(BusyError, SceneError), scene_lock(context.folder, names) as lock:
-        _clean(task.job, context)
-        _finish(lock, task, context)
+    """Remove the unfinished files of a scene whose process was ended on purpose.
+
+    Where that fails, the next run may.
+    """
+    with suppress(BusyError, SceneError, OSError), scene_lock(context.folder, task.job.output) as begun:
+        _clean(task.job, context, begun)
 
 
-def _finish(lock: Lock, task: Task, context: BatchContext) -> None:
-    """Remove the lock's file, unless only it shows that a batch wrote the result."""
-    new_records = RecordIndex(context.folder, context.start)
-    new_records.read_on()
-    recorded = task.known is not None or task.job.output in new_records.known
-    if recorded or not os.path.lexists(context.folder / task.job.output):
-        lock.finish()
+def _clean(job: Job, context: BatchContext, begun: Path) -> None:
+    """Remove the files that a killed process left, except the mark of a result that is there."""
+    paths = [context.folder / name for name in result_names(job.output, context.options)]
+    for folder in {path.parent for path in paths}:
+        remove_stale(folder)
+    if not any(os.path.lexists(path) for path in paths):
+        begun.unlink(missing_ok=True)
+
+
+class BusyError(Exception):
+    """Another process has the lock."""
+
+
+@contextmanager
+def scene_lock(folder: Path, output: str) -> Iterator[Path]:
+    """Keep other processes from a result while the block runs.
+
+    Yields:
+        The file whose presence says that a batch has begun to write the result: one that was killed leaves it.
+
+    Raises:
+        BusyError: If another process works on the result.
+        SceneError: If the lock cannot be made.
+    """
+    name = hashlib.sha256(output.encode(errors="surrogateescape")).hexdigest()[:32]
+    with _lock(folder / f"{PREFIX}{name}.lock"):
+        yield folder / f"{PREFIX}{name}.begun"
+
+
+@contextmanager
+def run_lock(folder: Path, name: str) -> Iterator[None]:
+    """Share the folder only with runs of the same :meth:`BatchOptions.name` in the block.
+
+    Raises:
+        UsageError: If a run of another name uses the folder.
+        SceneError: If the lock cannot be made.
+    """
+    own = f"{PREFIX}{name[:32]}.{secrets.token_hex(4)}.{os.getpid()}.{socket.gethostname()}.run"
+    with _lock(folder / own, RUN_TIMEOUT):  # before others are looked for: of two, one sees the other
+        for path in folder.glob(f"{PREFIX}*.run"):
+            if path.name != own and _is_locked(path) and not path.name.startswith(f"{PREFIX}{name[:32]}."):
+                *_, process, host = path.stem.removeprefix(PREFIX).split(".", 3)
+                raise UsageError(
+                    f"{folder}: a batch with other settings is at work there (process {process} on {host}); wait for"
+                    " it, or name another --output"
+                )
+        yield
+
+
+@contextmanager
+def _lock(path: Path, seconds: float = 0.0) -> Iterator[None]:
+    """Lock a file that is removed after the block. BusyError if another process keeps it."""
+    lock = FileLock(path)
+    try:
+        lock.acquire(timeout=seconds)
+    except Timeout:
+        raise BusyError from None
+    except OSError as error:
+        raise SceneError(path, f"cannot be written ({error.strerror})", "name another folder with --output") from error
+    try:
+        yield
+    finally:
+        path.unlink(missing_ok=True)  # before the release: who waits for it sees that the file is nobody's any more
+        lock.release()
+
+
+def _is_locked(path: Path) -> bool:
+    try:
+        with _lock(path):
+            return False
+    except BusyError:
+        return True

@@ -16,7 +16,6 @@ import typer
 
 from gsmerge import __version__
 from gsmerge.cli.console import plain_warnings, say
-from gsmerge.cli.options import renamed
 from gsmerge.errors import (
     DAMAGED_OPENCV,
     GsmergeError,
@@ -77,10 +76,9 @@ def root(
 
 
 def _usage_message(error: Any) -> str:
-    """One line about wrong usage, where possible with the new name of an option that was renamed."""
+    """Describe wrong usage in one line."""
     place = PROGRAM if error.ctx is None else error.ctx.command_path
-    message = renamed(getattr(error, "option_name", ""), place.rpartition(" ")[2])
-    message = message or error.format_message().replace("Value error, ", "", 1)  # a prefix of checks inside Typer
+    message = error.format_message().replace("Value error, ", "", 1)  # a prefix of checks inside Typer
     return f"{message.rstrip('.')}; see '{place} --help'"
 
 

@@ -17,8 +17,8 @@ from gsmerge.errors import BatchError, TargetError, UsageError
 
 if TYPE_CHECKING:
     from gsmerge.batch import BatchOptions, Job
-    from gsmerge.batch.plan import Schedule
     from gsmerge.batch.records import RecordIndex
+    from gsmerge.batch.run import Schedule
 
 
 def parse_jobs(text: str) -> int:
@@ -71,14 +71,12 @@ def parse_jobs(text: str) -> int:
 def batch(args: opt.Args) -> None:
     """Compact many scenes, each on its own: a failure stops no other scene, and a second call continues."""
     out = args.output
-    if "{" in str(out):
-        raise UsageError(opt.renamed("--output", "batch") or "")
     if out.exists() and not out.is_dir():
         raise UsageError(f"--output: expected a folder, found the file {out}")
     hints = args.hints()
     from gsmerge.batch import BatchOptions, find_jobs
-    from gsmerge.batch.plan import make_schedule
     from gsmerge.batch.records import RecordIndex
+    from gsmerge.batch.run import make_schedule
 
     with opt.usage_errors():
         options = BatchOptions(
@@ -87,7 +85,7 @@ def batch(args: opt.Args) -> None:
             engine=args.engine, address=args.address,
         )  # fmt: skip
     if options.engine == "ray" and not args.dry_run:
-        from gsmerge.batch.ray_engine import require_ray
+        from gsmerge.batch.pools import require_ray
 
         require_ray()
     index = RecordIndex(out)
@@ -115,7 +113,7 @@ def _bytes(text: str | None) -> int | None:
 def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, index: RecordIndex, schedule: Schedule) -> None:
     """Compact all scenes, report each, and sum up."""
     from gsmerge.batch import run_batch
-    from gsmerge.batch.summary import Totals, summary_lines, write_summary
+    from gsmerge.batch.records import Totals, summary_lines, write_summary
 
     totals, out = Totals(len(jobs)), args.output
     at_once = f"{schedule.jobs or 'all it has room for'} at once, {schedule.threads} thread(s) each"
@@ -169,7 +167,7 @@ def _print_plan(
     schedule: Schedule,
     notes: Sequence[str],
 ) -> None:
-    from gsmerge.batch.plan import estimate_seconds
+    from gsmerge.batch.run import estimate_seconds
     from gsmerge.batch.task import BatchContext, is_done
     from gsmerge.report import document_head, human_bytes
 

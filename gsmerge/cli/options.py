@@ -32,27 +32,6 @@ INPUT, COUNT, MERGING, FITTING, MEASURING, OUTPUT, GENERAL = (
 )  # fmt: skip
 REQUIRED = Parameter.empty
 
-# Old option -> what to use instead; "command option" where an option was renamed in one command alone
-RENAMED = {
-    "--out": "-o/--output",
-    "--dialect": "--exporter",
-    "--precision": "gone: networks always work in float32",
-    "batch --output": "--name; -o/--output is the folder",
-    "--density": "--superpixels, such as --superpixels 4.4%",
-    "--densities": "--superpixels, such as --superpixels 2%,4.4%",
-    "--max-bytes": "--budget, such as --budget 5MB",
-    "--preset": "--budget, such as --budget quest3",
-    "--k auto": "--budget auto",
-    "--target-psnr": "--quality, such as --quality 30dB",
-    "--max-drop": "--quality, such as --quality -0.2dB",
-}
-
-
-def renamed(option: str, command: str = "") -> str | None:
-    """One line that says the new name of an option; None for a name that never was one."""
-    new = RENAMED.get(f"{command} {option}") or RENAMED.get(option)
-    return new and f"{option} is now {new}"
-
 
 class Args(SimpleNamespace):
     """The arguments and options of a command by name; values of choices are plain strings."""
@@ -207,8 +186,6 @@ def _show_all(context: typer.Context, value: bool) -> None:
 
 def parse_k(text: str) -> int | str:
     """``--k``: a number from 1 to 8, or mixed."""
-    if text == "auto":
-        raise UsageError(str(renamed("--k auto")))
     if text == "mixed":
         return text
     if not text.isdigit() or not 1 <= int(text) <= 8:

@@ -41,7 +41,6 @@ def plan_document(
     files: SceneFiles, scene: Scene, settings: CompactOptions, out: Path, notes: Sequence[str]
 ) -> dict[str, Any]:
     """What a run would make of a scene, and an estimate of its time and memory, as plain JSON types."""
-    from gsmerge.options import to_schema
     from gsmerge.plan import EFFORTS, resolve_fit, resolved_settings, steps_for
     from gsmerge.runtime.estimate import estimate_run, fit_of
     from gsmerge.runtime.threads import available_threads
@@ -76,7 +75,7 @@ def plan_document(
             num_rest=3 * scene.gaussians.shN.shape[1],
             photo_scale=photo_scale(scene, fit, auto=auto)[0],
         ),
-        "options": to_schema(options),
+        "options": options,
         "notes": list(notes),
     }  # fmt: skip
 

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 def stress(args: opt.Args) -> None:
     """Compact a scene under bad conditions, and say of each whether the result is what it should be."""
     hints = args.hints()
-    from gsmerge.options import to_schema
     from gsmerge.report import document_head, to_json
     from gsmerge.research.stress import stress as stress_scene
 
@@ -42,7 +41,7 @@ def stress(args: opt.Args) -> None:
     document = {
         **document_head(),
         "input": str(files.ply),
-        "options": to_schema(settings.to_dict()),
+        "options": settings.to_dict(),
         "cases": [outcome.to_dict() for outcome in outcomes],
         "held": sum(outcome.passed is True for outcome in outcomes),
         "failed": sum(outcome.passed is False for outcome in outcomes),

@@ -12,7 +12,7 @@ from gsmerge.budget import AUTO
 from gsmerge.encoded.decode import divide_all
 from gsmerge.encoded.encoded import Encoded, StoredHeads, StoredSettings, without_members
 from gsmerge.errors import UsageError
-from gsmerge.options import CompactOptions, to_schema
+from gsmerge.options import CompactOptions
 from gsmerge.pipeline import build, merge_views
 from gsmerge.plan import Plan, make_plan, require_children
 from gsmerge.runtime.record import Progress, current_record, record_run, stage
@@ -113,7 +113,7 @@ def _to_encoded(prepared: Prepared, plan: Plan, merged: MergedViews, max_k: int 
 
 def _about(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Version, options, choices and notes; nothing that depends on the machine."""
-    settings = to_schema(settings) | {"checkpoint": Path(settings["checkpoint"]).name}
+    settings = {**settings, "checkpoint": Path(settings["checkpoint"]).name}
     del settings["threads"]
     record = current_record()
     choices = {name: value for name, value in record.choices.items() if name != "networks"}

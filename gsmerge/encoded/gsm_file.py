@@ -2,9 +2,7 @@
 
 A safetensors file with one metadata entry, whose name says the kind of content and whose text is a header in JSON.
 Nothing in a file is ever executed; every array and every entry is checked before it is used. Within one major schema
-arrays and entries are only ever added, and unknown ones are ignored. Keys that differ from the names in the code are
-in SETTING_KEYS, and these: division.whole (Division.uniform), division.deals (Division.growth_order), features.solved
-(GroupSet.fitted_sh0), features.held (GroupSet.color_precision), kept (Gaussians that no view sees).
+arrays and entries are only ever added, and unknown ones are ignored. Keys are the names of fields in the code.
 """
 
 from __future__ import annotations
@@ -47,18 +45,11 @@ NOT_NEGATIVE = (
     "footprints",
     "scales",
     "opacities",
-    "held",
+    "color_precision",
 )  # of keys
 # Pixels of a view that a file may claim: each of its bytes says something about some of them, or it is a small one.
 PIXELS_PER_BYTE, SMALL_VIEW = 100, 1 << 20
 
-SETTING_KEYS = {
-    "max_k": "most",
-    "min_contribution": "prune",
-    "target_count": "wanted",
-    "num_slots": "places",
-    "knee_count": "knee",
-}
 COMMON_ENTRIES = {"settings": dict, "unit": float, "width": int, "height": int, "about": dict}
 ENTRIES: dict[str, dict[str, Any]] = {  # types of the header's entries, by kind of content
     ENCODED: COMMON_ENTRIES | {"networks": dict | None},
@@ -90,7 +81,7 @@ def write_gsm(
         "schema": SCHEMA,
         "gsmerge": __version__,
         "minor": MINOR,
-        "settings": {SETTING_KEYS.get(name, name): value for name, value in settings.items()},
+        "settings": settings,
         "unit": frame.unit,
         "width": cameras.width,
         "height": cameras.height,
@@ -138,8 +129,8 @@ def save_encoded(
     arrays = {
         "division.splits": division.splits,
         "division.slots": division.slots,
-        "division.whole": division.uniform.astype(np.int32),
-        "division.deals": division.growth_order.astype(np.int32),
+        "division.uniform": division.uniform.astype(np.int32),
+        "division.growth_order": division.growth_order.astype(np.int32),
     }
     if heads is not None:
         arrays |= {"heads.views": heads.views.astype(np.int32), "heads.group": _float32(heads.group)}
@@ -232,14 +223,13 @@ class GsmFile:
         """The settings that are known here, each within its range."""
         values: dict[str, Any] = {}
         for f in fields(StoredSettings):
-            key = SETTING_KEYS.get(f.name, f.name)
-            value, is_share = self.header["settings"].get(key), f.name in ("min_opacity", "min_contribution")
+            value, is_share = self.header["settings"].get(f.name), f.name in ("min_opacity", "min_contribution")
             low, high = (1, MAX_CHILDREN) if f.name in ("k", "max_k") else (0, 1 if is_share else MAX_COUNT)
-            absent = value is None and key in self.header["settings"] and f.name in ("target_count", "num_slots")
+            absent = value is None and f.name in {"target_count", "num_slots"} & self.header["settings"].keys()
             if not absent and not (f.name == "k" and value == "auto"):
                 number = isinstance(value, int | float if is_share else int) and not isinstance(value, bool)
                 if not number or not low <= value <= high:
-                    raise self.error(f"{key}: expected a number from {low} to {high}, found {value!r:.40}")
+                    raise self.error(f"{f.name}: expected a number from {low} to {high}, found {value!r:.40}")
             values[f.name] = value
         return StoredSettings(**values)
 
@@ -309,8 +299,8 @@ def _read_division(file: GsmFile, features: FeatureGaussians) -> Division:
     """The children, with every index within its range."""
     g = len(features)
     splits, slots = file.array("division.splits", np.uint8, g), file.array("division.slots", np.uint8, None)
-    uniform = file.array("division.whole", np.int32, None)
-    order = file.array("division.deals", np.int32, None)
+    uniform = file.array("division.uniform", np.int32, None)
+    order = file.array("division.growth_order", np.int32, None)
     counts = splits.astype(np.int64)
     ok = counts.max(initial=0) < MAX_CHILDREN and counts.sum() == len(slots)
     if ok:

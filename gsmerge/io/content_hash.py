@@ -11,9 +11,8 @@ from typing import Any
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import SCENE_SUFFIXES, CameraFile, SceneFiles, read_cameras
 from gsmerge.io.bounds import walk_files
-from gsmerge.io.cameras.json_files import FRAMES_FILE, POSE_FILE, SCALE_FILE
-from gsmerge.io.cameras.nerfstudio import NAME as DATAPARSER
-from gsmerge.io.cameras.trajectory import INTRINSICS
+from gsmerge.io.cameras.json_files import DATAPARSER, FRAMES_FILE, POSE_FILE, SCALE_FILE
+from gsmerge.io.cameras.read import INTRINSICS
 from gsmerge.io.scene_files import IMAGE_PLACES
 
 EXTRA_FILES = (DATAPARSER, *INTRINSICS, FRAMES_FILE, POSE_FILE, SCALE_FILE)  # read with some camera files

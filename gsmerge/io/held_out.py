@@ -10,8 +10,7 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.alignment.similarity import IDENTITY, Similarity
-from gsmerge.io.cameras.camera_file import CameraFile, select_views, to_cameras, with_convention
-from gsmerge.io.cameras.lens import as_pinholes
+from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views, to_cameras, with_convention
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.hints import AUTO
 from gsmerge.io.photos import as_floats, find_image, photo_size

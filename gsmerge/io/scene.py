@@ -18,8 +18,7 @@ from gsmerge.io.alignment.recover import Recovery
 from gsmerge.io.alignment.rotations import choose_rotations, read_rotations
 from gsmerge.io.alignment.score import Alignment, AlignmentInput, check_alignment
 from gsmerge.io.alignment.similarity import IDENTITY
-from gsmerge.io.cameras.camera_file import CameraFile, select_views, to_cameras
-from gsmerge.io.cameras.lens import as_pinholes
+from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views, to_cameras
 from gsmerge.io.exporters import Exporter, choose_exporters, find_exporter
 from gsmerge.io.formats.ply import OpacityChoice, PlyInfo, PlyScene, ply_notes, read_gaussians
 from gsmerge.io.hints import AUTO, ReadHints, make_hints

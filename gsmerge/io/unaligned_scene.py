@@ -17,8 +17,7 @@ from gsmerge.io.alignment.rotations import from_xyzw
 from gsmerge.io.alignment.score import Alignment, AlignmentInput, check_alignment, check_pairs, sample_pixels
 from gsmerge.io.alignment.similarity import IDENTITY, candidate_similarities, pixel_errors, scale_by, solve_pose
 from gsmerge.io.cameras.camera_file import CameraFile, Convention, with_convention
-from gsmerge.io.cameras.nerfstudio import NAME as DATAPARSER
-from gsmerge.io.cameras.nerfstudio import find_dataparser, read_dataparser
+from gsmerge.io.cameras.json_files import DATAPARSER, find_dataparser, read_dataparser
 from gsmerge.io.formats.ply import PlyInfo, PlyScene
 from gsmerge.io.hints import ReadHints
 from gsmerge.io.photos import ASPECT_TOLERANCE

@@ -10,12 +10,9 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.alignment.estimate_cameras import estimate_cameras
-from gsmerge.io.cameras.camera_file import CameraFile, to_cameras
-from gsmerge.io.cameras.lens import undistort_photos
+from gsmerge.io.cameras.camera_file import CameraFile, to_cameras, undistort_photos
 from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
-from gsmerge.io.cameras.read import CAMERA_PLACES, read_cameras
-from gsmerge.io.cameras.sharp import SOURCE as SHARP
-from gsmerge.io.cameras.sharp import read_sharp
+from gsmerge.io.cameras.read import CAMERA_PLACES, SHARP, read_cameras, read_sharp
 from gsmerge.io.formats.ply import PlyScene
 from gsmerge.io.photos import (
     Photos,

@@ -121,9 +121,7 @@ class Inspection:
 
     def to_dict(self) -> dict[str, Any]:
         """The same as dictionaries, lists and plain values, ready for JSON; what is not finite becomes None."""
-        plain: dict[str, Any] = finite(asdict(self))
-        plain["dialect"] = plain.pop("exporter")  # the name in the schema
-        return plain
+        return finite(asdict(self))
 
 
 def inspect(

@@ -22,7 +22,7 @@ def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
     lines = [
         f"file       {scene['path']}: {human_bytes(scene['bytes'])} ({parts})",
         f"layout     {scene['layout']}, {scene['format']}; opacity stored {_ENCODINGS[scene['opacity_encoding']]}",
-        f"dialect    {scene['dialect']}",
+        f"exporter   {scene['exporter']}",
         f"ignored    {', '.join(ignored)}" if ignored else "",
         f"Gaussians  {scene['count']:,}: {scene['num_nonfinite']} not finite, {scene['num_transparent']:,} transparent,"
         f" {scene['num_opaque']:,} opaque, {scene['num_saturated']:,} of opacity 0 or 1",

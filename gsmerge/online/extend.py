@@ -36,7 +36,7 @@ from gsmerge.online.state import (
     select_groups,
     with_fitted_colors,
 )
-from gsmerge.options import CompactOptions, to_schema
+from gsmerge.options import CompactOptions
 from gsmerge.pipeline import build, merge_views
 from gsmerge.plan import Plan, make_plan, require_children
 from gsmerge.render.photos import scene_pictures
@@ -107,7 +107,7 @@ def extend(
         merged = merge_views(prepared, plan, count)
         state, counts = _add_batch(state, prepared, plan, merged, online, max_k)
     numbers = {"num_views": len(prepared.scene), "num_input": scene.num_gaussians, **counts, "num_groups": len(state)}
-    settings = to_schema(options.to_dict()) | asdict(online)
+    settings = options.to_dict() | asdict(online)
     stored = {name: value for name, value in settings.items() if name != "threads"}  # which depend on the machine
     about = {"gsmerge": __version__, "options": stored, "batches": [*state.about.get("batches", []), numbers]}
     report = BatchReport(

@@ -32,8 +32,8 @@ def save_state(path: str | PathLike[str], state: OnlineState, *, overwrite: bool
     groups, replay = state.groups, state.replay
     arrays = {
         "children.counts": np.diff(groups.features.starts).astype(np.uint8),
-        "features.solved": groups.fitted_sh0,
-        "features.held": groups.color_precision,
+        "features.fitted_sh0": groups.fitted_sh0,
+        "features.color_precision": groups.color_precision,
         "replay.images": replay.images,
         "replay.views": replay.views.astype(np.int32),
     }
@@ -76,8 +76,8 @@ def _read_groups(file: GsmFile, max_k: int) -> GroupSet:
     return GroupSet(
         features=with_child_rows(features, np.arange(g).repeat(counts)),
         children=file.gaussians("children", int(counts.sum()), features.shN.shape[1]),
-        fitted_sh0=file.array("features.solved", np.float32, g, 1, 3),
-        color_precision=file.array("features.held", np.float32, g),
+        fitted_sh0=file.array("features.fitted_sh0", np.float32, g, 1, 3),
+        color_precision=file.array("features.color_precision", np.float32, g),
     )
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from gsmerge.encoded.encoded import StoredScene
-from gsmerge.options import CompactOptions, from_schema
+from gsmerge.options import CompactOptions
 from gsmerge.stages.decode import MAX_CHILDREN
 
 
@@ -55,7 +55,7 @@ def merge_settings(
     """
     names = OnlineOptions.__dataclass_fields__.keys()
     known = names | CompactOptions().to_dict().keys()
-    stored = {} if state is None else from_schema(state.about["options"])
+    stored = {} if state is None else state.about["options"]
     before = {name: value for name, value in stored.items() if name in known}
     merged = {"fit": "none"} | before | dict(settings)
     online = OnlineOptions(**{name: merged.pop(name) for name in names if name in merged})

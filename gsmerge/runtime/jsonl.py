@@ -1,12 +1,13 @@
-"""Files of JSON lines that survive being killed at any moment, also where several processes write at once."""
+"""Files of JSON lines that survive a kill at any moment, and several processes at once."""
 
 from __future__ import annotations
 
 import errno
+import fcntl
 import json
+import mmap
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
 from io import FileIO
 from pathlib import Path
@@ -14,40 +15,31 @@ from typing import Any
 
 from gsmerge.errors import SceneError
 
-try:
-    import fcntl
-except ImportError:  # not a POSIX system: one process at a time
-    fcntl = None  # type: ignore[assignment]
-
 
 @dataclass(frozen=True)
 class Lines:
-    """What a file of JSON lines holds."""
+    """The content of a file of JSON lines."""
 
-    values: tuple[dict[str, Any], ...]  # One per line that could be read
-    notes: tuple[str, ...]  # Lines that were dropped, one sentence each
+    values: tuple[dict[str, Any], ...]  # one per line that could be read
+    notes: tuple[str, ...]  # lines that were dropped, one sentence each
 
 
 def read_lines(path: Path) -> Lines:
-    """Read a file of JSON lines; what a killed run left half-written is dropped, and said."""
-    values: list[dict[str, Any]] = []
-    notes, last = [], 0
-    for number, (end, value) in enumerate(each_line(path), 1):
-        last = end
-        if value is None:
-            notes.append(f"{path}: line {number} is damaged and was dropped; its run is done again")
-        else:
-            values.append(value)
-    if path.exists() and last < path.stat().st_size:
-        notes.append(f"{path}: the last line is incomplete and was dropped; its run is done again")
-    return Lines(tuple(values), tuple(notes))
+    """Read a file of JSON lines, and note those that are damaged or half-written."""
+    lines = list(each_line(path))
+    damaged = [f"line {number} is damaged" for number, (_, value) in enumerate(lines, 1) if value is None]
+    end = lines[-1][0] if lines else 0
+    if path.exists() and end < path.stat().st_size:
+        damaged.append("the last line is incomplete")
+    notes = tuple(f"{path}: {problem} and was dropped; its run is done again" for problem in damaged)
+    return Lines(tuple(value for _, value in lines if value is not None), notes)
 
 
 def each_line(path: Path, start: int = 0) -> Iterator[tuple[int, dict[str, Any] | None]]:
-    """The complete lines of a file from a byte on, one at a time.
+    """Read the complete lines of a file from a byte on, one at a time.
 
     Yields:
-        The byte after the line, and what it holds; None if it is damaged.
+        The byte after the line, and its value; None if it is damaged.
     """
     if not path.exists():
         return
@@ -57,12 +49,12 @@ def each_line(path: Path, start: int = 0) -> Iterator[tuple[int, dict[str, Any] 
             for line in file:
                 if line.endswith(b"\n"):
                     end += len(line)
-                    yield end, _parsed(line)
+                    yield end, _parse(line)
     except OSError as error:
         raise SceneError(path, f"cannot be read ({error.strerror})") from error
 
 
-def _parsed(line: bytes) -> dict[str, Any] | None:
+def _parse(line: bytes) -> dict[str, Any] | None:
     try:
         value = json.loads(line)
     except (ValueError, RecursionError):
@@ -73,7 +65,7 @@ def _parsed(line: bytes) -> dict[str, Any] | None:
 def append_line(path: Path, value: Mapping[str, Any]) -> None:
     """Append one JSON line: on the disk when this returns, and in place of a half-written one.
 
-    What cannot be written whole leaves the file as it was.
+    A line that does not fit on the disk leaves the file as it was.
 
     Raises:
         SceneError: If the file cannot be written.
@@ -82,50 +74,22 @@ def append_line(path: Path, value: Mapping[str, Any]) -> None:
     line = json.dumps(value, separators=(",", ":"), ensure_ascii=True, allow_nan=False).encode("ascii") + b"\n"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with FileIO(path, "a+b") as file, alone(file.fileno()):
-            end = _whole_bytes(path)
+        with FileIO(path, "a+b") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)  # until the file is closed
+            end = _end_of_lines(file)
             file.truncate(end)
-            try:
-                _write(file, line)
-            except OSError:
+            if file.write(line) != len(line):  # a full disk takes the first part without an error
                 file.truncate(end)
-                raise
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             os.fsync(file.fileno())
     except OSError as error:
         raise SceneError(path, f"cannot be written ({error.strerror})", "name another folder with --output") from error
 
 
-def _write(file: FileIO, line: bytes) -> None:
-    """All of it: a full disk takes a part of what it is given first, and says so only when asked again."""
-    while line:
-        written = file.write(line)
-        if not written:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        line = line[written:]
-
-
-@contextmanager
-def alone(descriptor: int) -> Iterator[None]:
-    """A block in which no other process that asks the same is in its own for this open file."""
-    if fcntl is None:
-        yield
-        return
-    fcntl.flock(descriptor, fcntl.LOCK_EX)
-    try:
-        yield
-    finally:
-        fcntl.flock(descriptor, fcntl.LOCK_UN)
-
-
-def _whole_bytes(path: Path) -> int:
-    """Bytes up to the end of the last complete line."""
-    with path.open("rb") as file:
-        end = file.seek(0, os.SEEK_END)
-        while end > 0:
-            start = max(0, end - 65536)
-            file.seek(start)
-            newline = file.read(end - start).rfind(b"\n")
-            if newline >= 0:
-                return start + newline + 1
-            end = start
-    return 0
+def _end_of_lines(file: FileIO) -> int:
+    """Return the byte after the last complete line."""
+    size = file.seek(0, os.SEEK_END)
+    if size == 0:
+        return 0
+    with mmap.mmap(file.fileno(), size, access=mmap.ACCESS_READ) as data:
+        return data.rfind(b"\n") + 1

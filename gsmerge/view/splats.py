@@ -12,7 +12,7 @@ import zlib
 
 import numpy as np
 
-from gsmerge.io.formats import spz_writer
+from gsmerge.io.formats import spz
 from gsmerge.types import Gaussians
 
 MAX_GAUSSIANS = 2_000_000  # more take a browser too long to load and a page too many bytes: their stills alone
@@ -36,9 +36,9 @@ def pack_splats(gaussians: Gaussians) -> tuple[bytes | None, int]:
     count = int(drawn.sum())
     if count > MAX_GAUSSIANS:
         return None, 0
-    highest = min(highest_degree(gaussians.shN), spz_writer.MAX_DEGREES[3])
+    highest = min(highest_degree(gaussians.shN), spz.MAX_DEGREES[3])
     degree = max((d for d in range(highest + 1) if (20 + 3 * ((d + 1) ** 2 - 1)) * count <= MAX_SPZ_BYTES), default=0)
-    columns = spz_writer.spz_columns(gaussians[drawn], degree, fine=FINE)
+    columns = spz.spz_columns(gaussians[drawn], degree, fine=FINE)
     header = columns.header(3)
     checksum = zlib.crc32(header)
     for part in columns.parts:

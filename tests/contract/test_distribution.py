@@ -17,7 +17,7 @@ import pytest
 import tomllib
 
 import gsmerge
-from gsmerge.io.formats import spz_writer
+from gsmerge.io.formats import spz
 from gsmerge.render.cuda import INSTALL
 from gsmerge.research.charts.draw import INSTALL_HINT
 
@@ -94,9 +94,9 @@ def test_metadata(built: Path, root: Path, project: dict[str, Any]) -> None:
 
 def test_messages_install_what_the_extras_ask_for(root: Path, project: dict[str, Any]) -> None:
     extras = project["optional-dependencies"]
-    hints = [INSTALL, INSTALL_HINT, spz_writer.INSTALL]
+    hints = [INSTALL, INSTALL_HINT, spz.INSTALL]
     assert [f'pip install "{extras[name][0]}"' for name in ("cuda", "chart", "spz4")] == hints
-    assert f"pip install '{extras['ray'][0]}'" in (root / "gsmerge" / "batch" / "ray_engine.py").read_text()
+    assert f"pip install '{extras['ray'][0]}'" in (root / "gsmerge" / "batch" / "pools.py").read_text()
     pages = (*root.glob("*.md"), *(root / "docs").rglob("*.md"), *(root / "gsmerge").rglob("*.py"))
     assert [str(page) for page in pages if re.search(r"""pip install ["']gsmerge""", page.read_text())] == []
 

@@ -18,7 +18,7 @@ from gsmerge.batch import BatchOptions
 from gsmerge.batch.options import ENGINES
 from gsmerge.cli import main
 from gsmerge.cli.app import app
-from gsmerge.cli.options import OPTIONS, RENAMED
+from gsmerge.cli.options import OPTIONS
 from gsmerge.io import ReadHints
 from gsmerge.io.formats.ply import OpacityChoice
 from gsmerge.measure.evaluate import NETS
@@ -115,28 +115,6 @@ def test_output_is_one_option_everywhere(command: str) -> None:
     flags = {flag: p.name for p in COMMANDS[command].params for flag in p.opts}
     assert flags.get("-o") == flags.get("--output")
     assert "--out" not in flags
-
-
-@pytest.mark.parametrize(
-    ("words", "new"),
-    [
-        ("batch scenes --out small", "--out is now -o/--output"),
-        ("train --data a --out b", "--out is now -o/--output"),
-        ("chart scene --out b", "--out is now -o/--output"),
-        ("batch scenes -o {stem}.ply", "--output is now --name"),
-        ("generate rooms", "--output"),
-    ],
-)
-def test_an_old_name_says_the_new_one(words: str, new: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(words.split()) == 2
-    captured = capsys.readouterr()
-    assert new in captured.err
-    assert (captured.out, captured.err.count("\n")) == ("", 1)
-
-
-def test_old_names_are_no_options() -> None:
-    flags = {flag for command in COMMANDS.values() for p in command.params for flag in (*p.opts, *p.secondary_opts)}
-    assert [old for old in RENAMED if old in flags - {"--preset"}] == []  # which train has, of another meaning
 
 
 def help_of(capsys: pytest.CaptureFixture[str], *words: str) -> str:

@@ -142,7 +142,7 @@ def test_ctrl_c_ends_with_what_is_done(rooms: Path, tmp_path: Path, undisturbed:
     assert 1 <= len(done) < len(NAMES)
     assert said.splitlines()[-1].startswith("4 scenes: ")
     assert " left; " in said.splitlines()[-1]
-    assert {name for name in results(tmp_path) if not name.startswith(".batch/")} <= set(NAMES)  # nothing half-done
+    assert {name for name in results(tmp_path) if not name.startswith(".batch-")} <= set(NAMES)  # nothing half-done
     assert finish(rooms, "--output", tmp_path, *FAST, "--jobs", 1, "-q") == 0
     assert results(tmp_path) == undisturbed
     assert statuses(tmp_path) == {name: ["done"] for name in NAMES}

@@ -24,7 +24,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io import read_cameras, read_images, read_ply
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.cameras.npz_files import read_depths
-from gsmerge.io.cameras.sharp import read_sharp
+from gsmerge.io.cameras.read import read_sharp
 from gsmerge.io.formats.ply_file import REQUIRED
 
 EXAMPLES = int(os.environ.get("GSMERGE_FUZZ_EXAMPLES", "40"))

@@ -6,7 +6,6 @@ from dataclasses import FrozenInstanceError, fields, is_dataclass
 import pytest
 
 from gsmerge import CompactOptions
-from gsmerge.options import from_schema, to_schema
 
 STAGES = [f.name for f in fields(CompactOptions) if is_dataclass(getattr(CompactOptions(), f.name))]
 
@@ -91,14 +90,3 @@ def test_values_out_of_range_are_refused_before_any_work(setting: dict) -> None:
     (name,) = setting
     with pytest.raises(ValueError, match=name):
         CompactOptions().with_settings(setting)
-
-
-def test_schema_names_come_back() -> None:
-    """Reports and files keep the names of their first versions; one of them now names another setting."""
-    settings = CompactOptions().to_dict()
-    stored = to_schema(settings)
-    assert {"prune", "pull", "dssim", "min_contribution"} <= stored.keys()
-    assert (stored["prune"], stored["min_contribution"]) == (settings["min_contribution"], settings["min_owner_weight"])
-    assert {"mean", "reach_alone"} <= stored["rates"].keys()
-    assert from_schema(stored) == settings
-    assert list(from_schema(stored)) == list(settings)

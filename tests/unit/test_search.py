@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from gsmerge.budget import DEVICES, BudgetOptions, exact_count, max_allowed, new_settings, parse_share, share_text
+from gsmerge.budget import DEVICES, BudgetOptions, exact_count, max_allowed, parse_share, share_text
 from gsmerge.search import CurvePoint, count_within, curve_knee, level_counts, rungs, search_count
 
 
@@ -61,23 +61,6 @@ def test_qualities() -> None:
     assert (psnr.target_psnr, psnr.max_drop) == (30.0, None)
     assert (loss.target_psnr, loss.max_drop) == (None, 0.2)
     assert (best.target_psnr, best.max_drop) == (None, 0.0)
-
-
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        ({"density": 0.044, "superpixels": None, "k": 2}, {"superpixels": "4.4%", "k": 2}),
-        ({"density": 0.044, "superpixels": 300}, {"superpixels": 300}),
-        ({"k": "auto", "preset": None}, {"budget": "auto"}),
-        ({"budget": None, "max_bytes": 5000}, {"budget": "5000B"}),
-        ({"budget": None, "preset": "mobile", "fit": "none"}, {"budget": "mobile", "fit": "none"}),
-        ({"target_psnr": 30.0, "max_drop": None}, {"quality": "30dB"}),
-        ({"target_psnr": None, "max_drop": 0.2}, {"quality": "-0.2dB"}),
-        ({"superpixels": "2%", "budget": "auto", "quality": "30dB"}, None),
-    ],
-)
-def test_settings_of_older_files(old: dict[str, object], new: dict[str, object] | None) -> None:
-    assert new_settings(old) == (old if new is None else new)
 
 
 @pytest.mark.parametrize("share", [0.044, 0.02, 1, 1e-6, 0.087, 1 / 3])

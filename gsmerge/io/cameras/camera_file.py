@@ -1,4 +1,4 @@
-"""What every reader of camera files returns, and the conventions they translate from."""
+"""The cameras of a file, the conventions of formats, and photos without lens distortion."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
+import cv2
 import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import MAX_VIEWS, check_pixels
+from gsmerge.io.photos import Photos, Size, change_photos, photo_size, same_shape
 from gsmerge.types import Cameras
 
 MAX_NUMBER, _MAX_SIDE, _MIN_FOCAL = 1e12, 1e6, 1e-6  # beyond them no camera is, and numbers would overflow later
@@ -29,11 +31,14 @@ W2C_OPENGL: Convention = ("world-to-camera", "OpenGL")
 C2W_OPENGL: Convention = ("camera-to-world", "OpenGL")
 CONVENTIONS = (W2C_OPENCV, C2W_OPENCV, W2C_OPENGL, C2W_OPENGL)
 
-
 COEFFICIENTS = {  # their names, in order
     "perspective": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "fisheye": ("k1", "k2", "k3", "k4"),
 }
+# Share of an undistorted photo's pixels that lie within the photo, at least: at half of the image's diagonal r, a lens
+# with k1 = 1 / r^2, stronger than any, still has a third
+_MIN_SHARE = 0.25
+_GRID = 32  # pixels a side on which that is measured
 
 
 @dataclass(frozen=True)
@@ -46,13 +51,16 @@ class Lens:
 
 
 def make_lens(name: str, model: Literal["perspective", "fisheye"], coefficients: Sequence[float]) -> Lens | None:
-    """The lens; None for a perspective without distortion, which is a pinhole: a fisheye is none even then."""
+    """Make a lens; None for a perspective without distortion, which is a pinhole.
+
+    A fisheye is none even then.
+    """
     return Lens(name, model, tuple(coefficients)) if model == "fisheye" or any(coefficients) else None
 
 
 @dataclass(frozen=True)
 class CameraFile:
-    """c cameras in the order of their file."""
+    """The c cameras of a file, in its order."""
 
     path: str  # the file or folder
     viewmats: np.ndarray  # ``[c,4,4]`` world to camera, OpenCV axes, float64
@@ -81,7 +89,7 @@ class View(NamedTuple):
 
 
 def make_pinhole(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
-    """Intrinsics ``[3,3]``."""
+    """Make intrinsics ``[3,3]``."""
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)
 
 
@@ -92,9 +100,11 @@ def make_camera_file(
     views: Sequence[View],
     images: np.ndarray | None = None,
 ) -> CameraFile:
-    """Translate poses to the one convention and check that they are poses; ``images [c,h,w,3]`` if the file holds them.
-    SceneError if there is no camera, a number is not finite or one that no camera has, a rotation is not orthonormal,
-    or a focal length is not positive.
+    """Translate poses to the one convention and check that they are poses.
+
+    ``images [c,h,w,3]`` are given if the file holds them. SceneError if there is no camera, a
+    number is not finite or one that no camera has, a rotation is not orthonormal, or a focal length
+    is not positive.
     """
     if not views:
         raise SceneError(path, "expected at least one camera, found none")
@@ -130,7 +140,10 @@ def make_camera_file(
 
 
 def _in_pixels(Ks: np.ndarray, sizes: list[tuple[int, int]]) -> tuple[np.ndarray, list[tuple[int, int]]]:
-    """Intrinsics that are divided by the image's size, multiplied by it; where it is unknown, that of 1 x 1 pixels."""
+    """Multiply intrinsics that are divided by the image's size by it.
+
+    Where it is unknown, it is taken as 1 x 1 pixels.
+    """
     small = (Ks[:, 0, 0] < MAX_NORMALISED_FOCAL) & (Ks[:, 1, 1] < MAX_NORMALISED_FOCAL)
     small &= (np.abs(Ks[:, :2, 2] - 0.5) < 1).all(1)
     if not small.all() or any(0 < min(size) <= MAX_NORMALISED_FOCAL for size in sizes):
@@ -182,7 +195,7 @@ def check_size(path: str | os.PathLike[str], name: str, K: np.ndarray, size: tup
 
 
 def to_viewmats(poses: np.ndarray, convention: Convention) -> np.ndarray:
-    """World-to-camera matrices with OpenCV axes from ``[c,4,4]`` poses of a convention."""
+    """Convert poses ``[c,4,4]`` of a convention to world-to-camera matrices with OpenCV axes."""
     direction, axes = convention
     if direction == "camera-to-world":
         poses = np.linalg.inv(poses)
@@ -190,20 +203,20 @@ def to_viewmats(poses: np.ndarray, convention: Convention) -> np.ndarray:
 
 
 def from_viewmats(viewmats: np.ndarray, convention: Convention) -> np.ndarray:
-    """The inverse of :func:`to_viewmats`: the poses as a file of that convention holds them."""
+    """Invert :func:`to_viewmats`: return poses as a file of that convention holds them."""
     direction, axes = convention
     poses = FLIP @ viewmats if axes == "OpenGL" else viewmats
     return np.linalg.inv(poses) if direction == "camera-to-world" else poses
 
 
 def with_convention(camera_file: CameraFile, convention: Convention) -> CameraFile:
-    """The same file, its poses read in another convention."""
+    """Read the poses of a file in another convention."""
     stored = from_viewmats(camera_file.viewmats, camera_file.convention)
     return replace(camera_file, viewmats=to_viewmats(stored, convention), convention=convention)
 
 
 def select_views(cameras: CameraFile, view_ids: Sequence[int]) -> CameraFile:
-    """The views of these ids, in that order."""
+    """Return the views of these ids, in that order."""
     ids = list(view_ids)
     lenses = tuple(cameras.lenses[i] for i in ids) if cameras.lenses else ()
     arrays = {name: getattr(cameras, name)[ids] for name in ("viewmats", "Ks", "widths", "heights")}
@@ -217,12 +230,12 @@ def _stored_sizes(camera_file: CameraFile) -> list[tuple[int, int]]:
 
 
 def sizes_of(camera_file: CameraFile) -> list[tuple[int, int]]:
-    """All (width, height) that the file's cameras are known to have."""
+    """List every (width, height) that the file's cameras are known to have."""
     return [(w, h) for w, h in _stored_sizes(camera_file) if min(w, h) > 0 and (w, h) != (1, 1)]
 
 
 def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> Cameras:
-    """Cameras of one image size (width, height) in pixels; None takes the file's.
+    """Convert to cameras of one image size (width, height) in pixels; None takes the file's.
 
     Intrinsics of another size are scaled to it, each axis by itself.
 
@@ -248,3 +261,75 @@ def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> 
     Ks = camera_file.Ks.copy()
     Ks[:, :2] *= np.where(known, size / np.maximum(sides, 1), 1.0)[:, :, None]
     return Cameras(camera_file.viewmats, Ks, *size)
+
+
+def as_pinholes(camera_file: CameraFile, photos: Photos | None) -> tuple[CameraFile, Photos | None, list[str]]:
+    """Undistort photos, and make their cameras pinholes with the same intrinsics.
+
+    Returns a note about it, too. SceneError if a lens is no pinhole and there are no photos of the
+    camera's shape, or shows next to nothing of one.
+
+    SceneError if a lens is no pinhole and there are no photos of the camera's shape, or shows next
+    to nothing of one.
+    """
+    if not camera_file.lenses:
+        return camera_file, photos, []
+    pinholes = replace(camera_file, lenses=())
+    name = next(lens.name for lens in camera_file.lenses if lens is not None)
+    size = photo_size(photos)
+    if photos is None or size is None:
+        problem = f"expected a pinhole camera, or images to undistort, found {name} with lens distortion and no images"
+        raise SceneError(camera_file.path, problem, "name the images with --images, or undistort them first")
+    for w, h in sizes_of(camera_file):
+        if not same_shape((w, h), size):
+            problem = f"expected images of the cameras' {w} x {h} to undistort ({name}), found {size[0]} x {size[1]}"
+            raise SceneError(camera_file.path, problem, "give the images as they were taken, or undistort them first")
+    Ks = to_cameras(pinholes, size).Ks
+    for view, K, lens in zip(camera_file.names, Ks, camera_file.lenses, strict=True):
+        share = 1.0 if lens is None else _share_inside(K, lens, size)
+        if lens is not None and share < _MIN_SHARE:
+            values = zip(COEFFICIENTS[lens.model], lens.coefficients, strict=False)
+            found = ", ".join(f"{key} = {value:g}" for key, value in values if value)
+            problem = f"view {view}: expected {lens.name} coefficients of a lens, found {found}, with which"
+            problem += f" {100 * (1 - share):.0f} % of the undistorted photo would lie outside of the photo"
+            raise SceneError(camera_file.path, problem, "correct them, or undistort the images first")
+    straight = undistort_photos(photos, Ks, camera_file.lenses)
+    return pinholes, straight, [f"the photos are undistorted ({name}); the intrinsics stay"]
+
+
+def undistort_photos(photos: Photos, Ks: np.ndarray, lenses: Sequence[Lens | None]) -> Photos:
+    """Make the photos that pinholes with the same intrinsics would have taken.
+
+    Where one shows nothing, its border is repeated.
+
+    ``photos`` are uint8 ``[h,w,3]``; ``Ks [c,3,3]`` at their size, the top-left pixel's centre at (0.5, 0.5).
+    """
+
+    def one(view: int, photo: np.ndarray) -> np.ndarray:
+        lens = lenses[view]
+        if lens is None:
+            return photo
+        maps = _rectify_maps(Ks[view], lens, (photo.shape[1], photo.shape[0]))
+        return cv2.remap(photo, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+    return change_photos(photos, photo_size(photos), one)
+
+
+def _rectify_maps(K: np.ndarray, lens: Lens, size: Size) -> tuple[np.ndarray, np.ndarray]:
+    """Return where each pixel of a pinhole's image lies in the lens's image.
+
+    x and y are ``[h,w]`` float32, pixels.
+    """
+    centred = K.astype(np.float64).copy()
+    centred[:2, 2] -= 0.5  # OpenCV has the top-left pixel's centre at (0, 0)
+    coefficients = np.pad(lens.coefficients, (0, len(COEFFICIENTS[lens.model]) - len(lens.coefficients)))
+    make = cv2.fisheye.initUndistortRectifyMap if lens.model == "fisheye" else cv2.initUndistortRectifyMap
+    x, y = make(centred, coefficients.astype(np.float64), np.eye(3), centred, size, cv2.CV_32FC1)
+    return x, y
+
+
+def _share_inside(K: np.ndarray, lens: Lens, size: Size) -> float:
+    """Return the share of the undistorted photo's pixels that lie within the photo."""
+    small = np.diag([_GRID / size[0], _GRID / size[1], 1.0]) @ K
+    maps = _rectify_maps(small, lens, (_GRID, _GRID))
+    return float(np.all([(m >= -0.5) & (m <= _GRID - 0.5) for m in maps], 0).mean())

@@ -33,13 +33,15 @@ _Image = tuple[str, int, np.ndarray]  # name, camera id, pose [3,4]
 
 
 def is_colmap(folder: Path) -> bool:
-    """Whether a folder holds a COLMAP model."""
+    """Return whether a folder holds a COLMAP model."""
     return any((folder / f"cameras{s}").is_file() and (folder / f"images{s}").is_file() for s in (".bin", ".txt"))
 
 
 def read_colmap(folder: Path) -> CameraFile:
-    """Cameras of a COLMAP model in the order of its images file: world-to-camera, OpenCV axes. SceneError if a file is
-    missing or damaged, or a lens of an unknown kind.
+    """Read the cameras of a COLMAP model in the order of its images file.
+
+    Poses are world-to-camera, OpenCV axes. SceneError if a file is missing or damaged, or a lens of
+    an unknown kind.
     """
     binary = (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file()
     suffix = ".bin" if binary else ".txt"
@@ -66,14 +68,14 @@ def read_colmap(folder: Path) -> CameraFile:
 
 @contextmanager
 def _mapped(path: Path) -> Iterator[mmap.mmap]:
-    """A file as bytes that are only read where they are used; an empty one raises ValueError."""
+    """Map a file, so that only bytes in use are read; an empty one raises ValueError."""
     check_file(path)
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         yield data
 
 
 def _pose(numbers: list[float]) -> np.ndarray:
-    """``[3,4]`` from a quaternion wxyz and a translation."""
+    """Make a pose ``[3,4]`` of a quaternion wxyz and a translation."""
     if not np.isfinite(numbers).all():
         raise ValueError("a pose that is not finite")
     quat = np.array(numbers[:4]) / max(1e-12, *map(abs, numbers[:4]))
@@ -142,7 +144,7 @@ def _text_cameras(path: Path, text: str) -> dict[int, View]:
 
 
 def _text_images(text: str) -> list[_Image]:
-    """Two lines per image: pose and name (which may hold spaces), then its points (maybe an empty line)."""
+    """Parse two lines per image: pose and name (maybe with spaces), then its points, if any."""
     lines = iter(text.splitlines())
     images = []
     for line in lines:

@@ -7,15 +7,17 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from gsmerge.errors import SceneError
+from gsmerge.io.alignment.similarity import Similarity
 from gsmerge.io.bounds import read_json, read_text
 from gsmerge.io.cameras.camera_file import (
     C2W_OPENCV,
     C2W_OPENGL,
+    MAX_NUMBER,
     W2C_OPENCV,
     CameraFile,
     Lens,
@@ -28,6 +30,9 @@ from gsmerge.io.cameras.camera_file import (
 from gsmerge.io.photos import find_image, image_size
 from gsmerge.types import Cameras
 
+if TYPE_CHECKING:
+    from gsmerge.io.scene_files import SceneFiles
+
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # the order of "distortion_params"
 _DISTORTED = {"OPENCV", "RADIAL", "SIMPLE_RADIAL"}
 _PERSPECTIVE = {"PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", *_DISTORTED}
@@ -35,10 +40,12 @@ _MAX_NAME = 255  # bytes of a file's name
 _INRIA_KEYS = ("position", "rotation", "fx", "fy", "width", "height")
 # Next to the dataset file of Long-LRM: which frames it took, and how it moved the world.
 FRAMES_FILE, POSE_FILE, SCALE_FILE = "input_frame_idx.txt", "pos_avg_inv.txt", "scene_scale.txt"
+DATAPARSER = "dataparser_transforms.json"
+_ROTATION_TOLERANCE = 0.02  # of a rotation's columns, as for poses
 
 
 def read_json_cameras(path: Path) -> CameraFile:
-    """Cameras of any of the known JSON files. SceneError if it is none of them, or damaged."""
+    """Read the cameras of any known JSON file. SceneError if it is none of them, or damaged."""
     data = read_json(path)
     if isinstance(data, dict) and "frames" in data:
         frames = data["frames"]
@@ -56,7 +63,7 @@ def read_json_cameras(path: Path) -> CameraFile:
 
 
 def read_transforms(path: Path, data: Mapping[str, Any] | list[Any]) -> CameraFile:
-    """Cameras of a parsed ``transforms.json``.
+    """Read the cameras of a parsed ``transforms.json``.
 
     A dictionary with ``frames`` has camera-to-world poses with OpenGL axes; a bare list of frames (as one backbone
     writes) has camera-to-world poses with OpenCV axes. Intrinsics are global or per frame, in pixels or as field of
@@ -83,7 +90,10 @@ def read_transforms(path: Path, data: Mapping[str, Any] | list[Any]) -> CameraFi
 
 
 def _intrinsics(path: Path, name: str, values: Mapping[str, Any]) -> tuple[np.ndarray, tuple[int, int]]:
-    """Intrinsics [3,3] and (width, height) of one frame, its own values before the global ones."""
+    """Return intrinsics [3,3] and (width, height) of one frame.
+
+    Its own values go before the global ones.
+    """
     if not any(key in values for key in ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")):
         missing = ", ".join(key for key in ("fl_x", "w", "h") if key not in values)
         problem = f"expected intrinsics (fl_x, fl_y, cx, cy, w, h), found none of {missing} for view {name}"
@@ -101,7 +111,7 @@ def _intrinsics(path: Path, name: str, values: Mapping[str, Any]) -> tuple[np.nd
 
 
 def _focal(values: Mapping[str, Any], axis: str, size: float) -> float:
-    """Focal length along an axis in pixels, 0 where the file has none."""
+    """Return the focal length along an axis in pixels, 0 where the file has none."""
     if f"fl_{axis}" in values:
         return float(values[f"fl_{axis}"])
     if f"camera_angle_{axis}" in values:
@@ -110,7 +120,7 @@ def _focal(values: Mapping[str, Any], axis: str, size: float) -> float:
 
 
 def _lens(path: Path, name: str, values: Mapping[str, Any]) -> Lens | None:
-    """The lens of one frame, None for a pinhole."""
+    """Return the lens of one frame, None for a pinhole."""
     model = str(values.get("camera_model", "PINHOLE")).upper()
     params = {key: float(values.get(key) or 0) for key in (*_DISTORTION, "k5", "k6")}
     listed = [float(value) for value in values.get("distortion_params") or ()]
@@ -130,8 +140,10 @@ def _lens(path: Path, name: str, values: Mapping[str, Any]) -> Lens | None:
 
 
 def read_inria(path: Path, entries: list[dict[str, Any]]) -> CameraFile:
-    """Cameras of a parsed ``cameras.json``: camera-to-world rotation rows and centre, principal point in the middle.
-    SceneError if a key is missing or not a number.
+    """Read the cameras of a parsed ``cameras.json``.
+
+    It has rows of the camera-to-world rotation, and the centre; the principal point is in the
+    middle. SceneError if a key is missing or not a number.
     """
     views = []
     for i, entry in enumerate(entries):
@@ -152,7 +164,7 @@ def read_inria(path: Path, entries: list[dict[str, Any]]) -> CameraFile:
 
 
 def read_world_mirror(path: Path, data: Mapping[str, Any]) -> CameraFile:
-    """Cameras of a parsed ``camera_params.json``.
+    """Read the cameras of a parsed ``camera_params.json``.
 
     ``extrinsics`` and ``intrinsics`` are lists of ``{camera_id, matrix}``; poses are camera-to-world with OpenCV axes,
     intrinsics in pixels of the processed size, which only the images have. ``camera_id`` is the stem of the image's
@@ -184,7 +196,7 @@ def _matrices(path: Path, data: Mapping[str, Any], key: str, side: int) -> dict[
 
 
 def read_long_lrm(path: Path, data: Mapping[str, Any]) -> CameraFile:
-    """Cameras of a parsed dataset file: ``frames`` of ``fx fy cx cy w h`` and ``w2c``.
+    """Read the cameras of a parsed dataset file: ``frames`` of ``fx fy cx cy w h`` and ``w2c``.
 
     Next to it Long-LRM writes which frames it took (``input_frame_idx.txt``) and how the Gaussians' world lies in the
     cameras': X = scene_scale (pos_avg_inv X_cameras). The cameras are brought into the Gaussians' world. SceneError if
@@ -211,7 +223,10 @@ def read_long_lrm(path: Path, data: Mapping[str, Any]) -> CameraFile:
 
 
 def _moved(path: Path, viewmats: np.ndarray) -> np.ndarray:
-    """World-to-camera matrices of the Gaussians' world: with X' = s (A X), the rotation is R inv(A), the shift s t'."""
+    """Move world-to-camera matrices to the Gaussians' world.
+
+    With X' = s (A X), the rotation is R inv(A), the shift s t'.
+    """
     move, scale = _numbers(path.with_name(POSE_FILE)), _numbers(path.with_name(SCALE_FILE))
     if move is not None:
         if move.size != 16:
@@ -228,7 +243,7 @@ def _moved(path: Path, viewmats: np.ndarray) -> np.ndarray:
 
 
 def _numbers(path: Path) -> np.ndarray | None:
-    """All numbers of a text file; None where there is no such file."""
+    """Read all numbers of a text file; None where there is no such file."""
     if not path.is_file():
         return None
     try:
@@ -241,7 +256,7 @@ def _numbers(path: Path) -> np.ndarray | None:
 
 
 def viewer_cameras_path(output: Path) -> Path:
-    """``out.ply`` -> ``out.cameras.json``: where the cameras for viewers go."""
+    """Return where the cameras for viewers go: ``out.ply`` -> ``out.cameras.json``."""
     name = output.name
     stem = name[: -len(".compressed.ply")] if name.lower().endswith(".compressed.ply") else output.stem
     ending = ".cameras.json"
@@ -277,3 +292,52 @@ def write_viewer_cameras(path: Path, cameras: Cameras, names: Sequence[str]) -> 
         for i, name in enumerate(names)
     ]  # fmt: skip
     path.write_text(json.dumps(entries) + "\n", encoding="utf-8")
+
+
+def find_dataparser(files: SceneFiles) -> Path | None:
+    """Find ``dataparser_transforms.json`` next to the ``.ply``, or next to the cameras.
+
+    It says how nerfstudio moved the cameras before it trained.
+
+    It says how nerfstudio moved the cameras before it trained.
+    """
+    folders = [files.ply.parent] + ([] if files.cameras is None else [files.cameras.parent])
+    return next((folder / DATAPARSER for folder in folders if (folder / DATAPARSER).is_file()), None)
+
+
+def read_dataparser(path: Path, cameras: Path | None) -> list[Similarity]:
+    """Read the similarities that nerfstudio's file may mean: X' = scale (transform [X; 1]).
+
+    ``transform`` starts from the capture's own world. The poses of a ``transforms.json`` with ``applied_transform``
+    (and ``applied_scale``) are already moved by that, so it is undone; which of the two holds has to be measured.
+    SceneError if there is no rotation, shift and positive scale in it.
+    """
+    data = read_json(path)
+    try:
+        moved = _square(data["transform"])
+        scale = float(data["scale"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise SceneError(path, f"expected 'transform' of 3x4 numbers and 'scale' ({error})") from error
+    frames = [_similarity(path, moved, scale)]
+    camera_data = read_json(cameras) if cameras is not None and cameras.suffix == ".json" and cameras.is_file() else {}
+    if isinstance(camera_data, dict) and "applied_transform" in camera_data:
+        try:
+            applied, factor = _square(camera_data["applied_transform"]), float(camera_data.get("applied_scale") or 1)
+            frames.append(_similarity(path, moved @ np.linalg.inv(applied), scale / factor))
+        except (TypeError, ValueError, np.linalg.LinAlgError) as error:
+            raise SceneError(cameras or path, f"expected 'applied_transform' of 3x4 numbers ({error})") from error
+    return frames
+
+
+def _square(values: Any) -> np.ndarray:
+    matrix = np.asarray(values, np.float64)
+    if matrix.shape not in ((3, 4), (4, 4)) or not np.all(np.abs(matrix) < MAX_NUMBER):
+        raise ValueError(f"found shape {list(matrix.shape)}, or numbers that are not finite")
+    return np.concatenate([matrix[:3], [[0.0, 0, 0, 1]]])
+
+
+def _similarity(path: Path, matrix: np.ndarray, scale: float) -> Similarity:
+    R = matrix[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE or np.linalg.det(R) < 0 or not 0 < scale < MAX_NUMBER:
+        raise SceneError(path, "expected 'transform' to rotate and shift and 'scale' to be positive, found another map")
+    return Similarity(R, scale, scale * matrix[:3, 3], "moved as nerfstudio does", "other")

@@ -11,7 +11,9 @@ from gsmerge.geometry import pose_changes
 
 
 def list_moves(names: Sequence[str], start: np.ndarray, end: np.ndarray, depth: float) -> list[dict[str, Any]]:
-    """Of every view its name, the degrees that it turned, and the shift of its centre as a share of a depth.
+    """List for each view its name, the degrees it turned, and the shift of its centre.
+
+    The shift is a share of a depth.
 
     ``start`` and ``end`` are viewmats ``[v,4,4]``; ``depth`` is that of the scene, in their unit.
     """
@@ -24,7 +26,7 @@ def list_moves(names: Sequence[str], start: np.ndarray, end: np.ndarray, depth: 
 
 
 def describe_moves(moves: Sequence[dict[str, Any]]) -> str:
-    """Mean and largest of some moves."""
+    """Describe the mean and the largest of some moves."""
     turns, shifts = ([move[key] for move in moves] for key in ("degrees", "shift"))
     mean, most = (f"{f(turns):.2g} degrees and {100 * f(shifts):.2g} % of the depth" for f in (np.mean, max))
     return f"{mean} on average, {most} at most"

@@ -8,6 +8,10 @@ order of the rows of the ``.ply``, where it is known.
 
 from __future__ import annotations
 
+import math
+import warnings
+import zipfile
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,17 +19,21 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.alignment.layouts import ORDERS
-from gsmerge.io.bounds import check_pixels
+from gsmerge.io.bounds import check_file, check_pixels
 from gsmerge.io.cameras.camera_file import C2W_OPENCV, W2C_OPENCV, CameraFile, View, make_camera_file
-from gsmerge.io.formats.npz import array_names, read_arrays
 
 _EXTRINSICS, _INTRINSICS = ("extrinsics", "exts"), ("intrinsics", "ixts")
 _IMAGES, _DEPTHS = ("image", "images"), ("depth", "depths")
 _MAX_INTRINSIC, _SMALL = 1e12, 1e-9
+_FREE_BYTES = 64 << 20  # an array of that size is read however well it is compressed
+_MAX_RATIO = 100  # of unpacked to packed bytes; photos and depth maps reach 20
+_KINDS = "biufU"
 
 
 def read_da3(path: Path) -> CameraFile:
-    """Cameras (and images, where stored) of an npz: world-to-camera 3x4 or 4x4, intrinsics in pixels.
+    """Read the cameras (and images, if stored) of an npz: poses 3x4 or 4x4, intrinsics in pixels.
+
+    Poses are world-to-camera.
 
     Intrinsics of another image size than the depth maps' (they are stored so when a COLMAP export ran in the same
     call), or normalised ones, are scaled to it. SceneError if the file cannot be read or lacks an array.
@@ -48,13 +56,14 @@ def read_da3(path: Path) -> CameraFile:
 
 
 def is_dump(path: Path) -> bool:
-    """Whether an npz holds camera-to-world poses under the name ``c2w``; False if it cannot be read."""
+    """Return whether an npz holds poses under the name ``c2w``; False if it cannot be read."""
     return "c2w" in array_names(path)
 
 
 def read_dump(path: Path) -> CameraFile:
-    """Cameras and images of a ``views.npz``. SceneError if the file cannot be read, lacks an array, or one has another
-    shape than it should.
+    """Read the cameras and images of a ``views.npz``.
+
+    SceneError if the file cannot be read, lacks an array, or one has another shape than it should.
     """
     arrays = read_arrays(path, ("c2w", "K", "images", "order"))
     missing = [name for name in ("c2w", "K", "images") if name not in arrays]
@@ -71,12 +80,12 @@ def read_dump(path: Path) -> CameraFile:
 
 
 def holds_images(path: Path) -> bool:
-    """Whether an npz has the images themselves; False if it cannot be read."""
+    """Return whether an npz has the images themselves; False if it cannot be read."""
     return not array_names(path).isdisjoint(_IMAGES)
 
 
 def read_depths(path: Path) -> np.ndarray | None:
-    """The depth maps ``[c,h,w]`` of the cameras' file; None without any."""
+    """Read the depth maps ``[c,h,w]`` of the cameras' file; None without any."""
     if path.suffix != ".npz" or array_names(path).isdisjoint(_DEPTHS):
         return None
     depths = _first(read_arrays(path, _DEPTHS), _DEPTHS)
@@ -100,7 +109,10 @@ def _views(poses: np.ndarray, Ks: np.ndarray, size: tuple[int, int]) -> list[Vie
 
 
 def _check_poses(path: Path, poses: np.ndarray, Ks: np.ndarray, names: tuple[str, str]) -> None:
-    """Refuse what is not as many poses as intrinsics ``[c,3,3]``, of finite numbers; ``names`` have the shapes, too."""
+    """Refuse other arrays than c poses and ``[c,3,3]`` intrinsics of finite numbers.
+
+    ``names`` are the names with their shapes.
+    """
     for name, array in zip(names, (poses, Ks), strict=True):
         if array.dtype.kind not in "fiu":
             raise SceneError(path, f"expected numbers in {name}, found {array.dtype}")
@@ -111,7 +123,10 @@ def _check_poses(path: Path, poses: np.ndarray, Ks: np.ndarray, names: tuple[str
 
 
 def _as_images(path: Path, images: np.ndarray, count: int) -> np.ndarray:
-    """``[c,h,w,3]`` uint8 from images in any of the usual forms; what is not finite becomes black or white."""
+    """Convert images of any usual form to ``[c,h,w,3]`` uint8.
+
+    Values that are not finite become black or white.
+    """
     if images.ndim == 4 and images.shape[1] == 3 and images.shape[3] != 3:
         images = images.transpose(0, 2, 3, 1)
     if images.ndim != 4 or images.shape[0] != count or images.shape[3] != 3:
@@ -126,7 +141,7 @@ def _as_images(path: Path, images: np.ndarray, count: int) -> np.ndarray:
 
 
 def _at_size(Ks: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Intrinsics at the given size: these networks keep the principal point in the middle."""
+    """Scale intrinsics to the given size: these networks keep the principal point in the middle."""
     size = np.array([width, height])
     ratio = 2 * np.maximum(Ks[:, :2, 2], _SMALL) / size
     normalised = (Ks[:, 0, 0] < 10) & (Ks[:, 0, 2] < 2) & (width > 10)
@@ -137,3 +152,55 @@ def _at_size(Ks: np.ndarray, width: int, height: int) -> np.ndarray:
     other_size &= ~normalised
     scaled[other_size, :2] /= ratio[other_size, :, None]
     return scaled
+
+
+def array_names(path: Path) -> frozenset[str]:
+    """List the names of the arrays in an ``.npz``; none if it cannot be read."""
+    try:
+        if not path.is_file() or not zipfile.is_zipfile(path):
+            return frozenset()
+        with zipfile.ZipFile(path) as archive:
+            return frozenset(_members(archive))
+    except Exception:  # whatever a damaged archive makes the library raise
+        return frozenset()
+
+
+def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
+    """Read those of the named arrays that an ``.npz`` has, in its order.
+
+    SceneError if it cannot be read, an array holds anything but numbers and text, or one is larger
+    than its bytes in the archive allow.
+    """
+    check_file(path)
+    if not zipfile.is_zipfile(path):
+        raise SceneError(path, "expected a readable .npz file, found something else")
+    try:
+        with zipfile.ZipFile(path) as archive, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of headers in old styles
+            members = _members(archive)
+            return {name: _read_array(path, archive, info) for name, info in members.items() if name in names}
+    except SceneError:
+        raise
+    except Exception as error:  # whatever a damaged archive makes the libraries raise
+        raise SceneError(path, f"expected a readable .npz file, found a damaged one ({error})") from error
+
+
+def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
+    return {info.filename[:-4]: info for info in archive.infolist() if info.filename.endswith(".npy")}
+
+
+def _read_array(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
+    name = info.filename
+    if info.file_size > max(_FREE_BYTES, _MAX_RATIO * info.compress_size):
+        raise SceneError(path, f"{name}: found {info.file_size >> 20} MiB in {info.compress_size} packed bytes")
+    with archive.open(info) as file:
+        first = np.lib.format.read_magic(file) == (1, 0)
+        read_header = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read_header(file)
+    if dtype.kind not in _KINDS:
+        kind = "objects, which are not read because they could run code" if dtype.hasobject else str(dtype)[:40]
+        raise SceneError(path, f"{name}: expected numbers, found {kind}")
+    if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize > info.file_size:
+        raise SceneError(path, f"{name}: expected as many bytes as shape {list(shape)} needs, found fewer")
+    with archive.open(info) as file:
+        return np.asarray(np.lib.format.read_array(file, allow_pickle=False))

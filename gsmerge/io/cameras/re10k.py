@@ -25,7 +25,9 @@ _MAX_PHOTOS = 1 << 30  # bytes of the decoded photos
 
 
 def read_re10k(path: Path, scene: str | None = None) -> CameraFile:
-    """Cameras and photos of one scene of a chunk, by its key; where there is one scene only, it may be another or None.
+    """Read the cameras and photos of one scene of a chunk, by its key.
+
+    A chunk of one scene needs no key.
 
     A chunk is a list of ``{key, cameras, images}``: ``cameras [v,18]`` are fx, fy, cx, cy divided by the image's size,
     two zeros and a world-to-camera 3x4 (OpenCV axes); ``images`` are v JPEG files as tensors of bytes. Nothing in it is
@@ -95,14 +97,17 @@ def _rows(path: Path, cameras: Any) -> np.ndarray:
 
 
 def _has_values(tensor: torch.Tensor) -> bool:
-    """Whether its numbers are there, one after the other: a chunk may hold tensors of other kinds."""
+    """Return whether a tensor's numbers are there, one after the other.
+
+    A chunk may hold tensors of other kinds.
+    """
     import torch
 
     return tensor.layout == torch.strided and tensor.device.type == "cpu"
 
 
 def _photos(path: Path, images: Any, names: list[str]) -> np.ndarray | None:
-    """``[v,h,w,3]`` uint8; None where the chunk has none."""
+    """Decode the photos ``[v,h,w,3]`` uint8; None where the chunk has none."""
     import torch
 
     listed = isinstance(images, list | tuple)

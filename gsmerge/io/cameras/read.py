@@ -1,19 +1,26 @@
-"""Finding camera files and choosing their reader."""
+"""Readers of cameras by the kind of their file.
+
+Two small kinds are read here: lists of poses, and cameras inside a ``.ply``.
+"""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
 
+import numpy as np
+from plyfile import PlyListProperty
+
 from gsmerge.errors import SceneError
-from gsmerge.io.bounds import check_file
-from gsmerge.io.cameras.camera_file import CameraFile
+from gsmerge.io.bounds import MAX_VIEWS, check_file, read_text
+from gsmerge.io.cameras.camera_file import C2W_OPENCV, W2C_OPENCV, CameraFile, View, make_camera_file, make_pinhole
 from gsmerge.io.cameras.colmap import is_colmap, read_colmap
 from gsmerge.io.cameras.json_files import read_json_cameras
 from gsmerge.io.cameras.npz_files import is_dump, read_da3, read_dump
 from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
 from gsmerge.io.cameras.re10k import read_re10k
-from gsmerge.io.cameras.trajectory import is_trajectory, read_trajectory
+from gsmerge.io.formats.ply import READERS
+from gsmerge.io.formats.ply_file import open_ply
 
 # Where cameras are in a scene's folder, the first that exists wins; a COLMAP model directly in the folder comes last,
 # because Depth Anything 3 puts one there at the photos' own size.
@@ -33,10 +40,14 @@ CAMERA_PLACES = (
     "0",
     ".",
 )
+INTRINSICS = ("intrinsic.txt", "intrinsics.txt")
+SHARP = "SHARP"
+_SHARP_ELEMENTS = ("extrinsic", "intrinsic", "image_size")
+SHARP_LAYERS = 2  # Gaussians per cell: a front and a back layer
 
 
 def find_cameras(folder: Path) -> Path | None:
-    """The first of the known camera files below a folder, or its only ``.torch`` chunk; None where there is none."""
+    """Find the first known camera file below a folder, or its only ``.torch`` chunk."""
     for place in CAMERA_PLACES:
         candidate = folder / place
         if candidate.is_file() or (candidate.is_dir() and is_colmap(candidate)):
@@ -84,3 +95,84 @@ def read_cameras(path: str | os.PathLike[str], *, scene: str | None = None) -> C
     if path.suffix == ".json":
         return read_json_cameras(path)
     raise SceneError(path, "expected cameras as .json, .npz, .torch or a COLMAP folder, found another kind of file")
+
+
+def read_trajectory(path: Path) -> CameraFile:
+    """Read the cameras of a text file with a pose per line, as KITTI and DA3 write it.
+
+    A line has 12 or 16 numbers: camera-to-world, OpenCV axes, row by row.
+
+    Poses are camera-to-world, OpenCV axes, row by row.
+
+    Next to it is ``intrinsic.txt`` (or ``intrinsics.txt``) with fx, fy, cx, cy in pixels, one line for all views or one
+    for each. The images have the size. SceneError if a line has another number of numbers, or there are no intrinsics.
+    """
+    poses = _rows(path, (12, 16))
+    intrinsics = next((path.with_name(name) for name in INTRINSICS if path.with_name(name).is_file()), None)
+    if intrinsics is None:
+        problem = f"expected the intrinsics next to it in {INTRINSICS[0]}, found none"
+        raise SceneError(path, problem, "write fx fy cx cy")
+    values = _rows(intrinsics, (4,))
+    if len(values) not in (1, len(poses)):
+        raise SceneError(intrinsics, f"expected one line, or one for each of {len(poses)} views, found {len(values)}")
+    Ks = [make_pinhole(*row) for row in (values * len(poses) if len(values) == 1 else values)]
+    views = [View(f"{i:06d}", pose.reshape(-1, 4), K) for i, (pose, K) in enumerate(zip(poses, Ks, strict=True))]
+    return make_camera_file(path, "pose list", C2W_OPENCV, views)
+
+
+def is_trajectory(path: Path) -> bool:
+    """Return whether the first line holds 12 or 16 numbers."""
+    try:
+        with path.open(encoding="utf-8") as file:
+            return len(_numbers(file.readline(4096))) in (12, 16)
+    except (OSError, ValueError):
+        return False
+
+
+def _rows(path: Path, lengths: tuple[int, ...]) -> list[np.ndarray]:
+    lines = [(number, line) for number, line in enumerate(read_text(path).splitlines(), 1) if line.strip()]
+    if len(lines) > MAX_VIEWS:
+        raise SceneError(path, f"expected at most {MAX_VIEWS} views, found more")
+    rows = []
+    for number, line in lines:
+        try:
+            rows.append(_numbers(line))
+        except ValueError as error:
+            raise SceneError(path, f"line {number}: expected numbers ({error})") from error
+        if len(rows[-1]) not in lengths:
+            counts = " or ".join(map(str, lengths))
+            raise SceneError(path, f"line {number}: expected {counts} numbers, found {len(rows[-1])}")
+    return rows
+
+
+def _numbers(line: str) -> np.ndarray:
+    return np.array(line.replace(",", " ").split(), np.float64)
+
+
+def read_sharp(path: Path) -> CameraFile | None:
+    """Read the camera that SHARP writes into its ``.ply``; None without one.
+
+    It is at the size of the file's grid.
+
+    The grid is square whatever the photo's shape: the photo was stretched to it. SceneError if the numbers are damaged.
+    """
+    if path.suffix.lower() in READERS:
+        return None
+    data = open_ply(path)
+    if "vertex" not in data or not all(name in data for name in _SHARP_ELEMENTS):
+        return None
+    for element in (data[name] for name in _SHARP_ELEMENTS):
+        if element.count > 16 or len(element.properties) != 1 or isinstance(element.properties[0], PlyListProperty):
+            return None
+    extrinsic, intrinsic, size = (
+        np.asarray([row[0] for row in data[name].data], np.float64) for name in _SHARP_ELEMENTS
+    )
+    side = round((data["vertex"].count / SHARP_LAYERS) ** 0.5)
+    if SHARP_LAYERS * side * side != data["vertex"].count or len(size) != 2 or not (size > 0).all():
+        return None
+    if len(extrinsic) not in (12, 16) or len(intrinsic) not in (4, 9):
+        raise SceneError(path, f"expected 16 and 9 numbers of a camera, found {len(extrinsic)} and {len(intrinsic)}")
+    K = make_pinhole(*intrinsic) if len(intrinsic) == 4 else intrinsic.reshape(3, 3)
+    K = K * np.array([[side / size[0]], [side / size[1]], [1.0]])
+    view = View(path.stem, extrinsic.reshape(-1, 4), K, (side, side))
+    return make_camera_file(path, SHARP, W2C_OPENCV, [view])

@@ -1,5 +1,7 @@
-"""Gaussians in the units of most file formats: as float64 arrays, what all writers start from, and as rows of a PLY
-file, where all readers end.
+"""Gaussians in the units of most file formats.
+
+All writers start from float64 arrays, :class:`Columns`; all readers end in rows of a PLY file,
+:class:`StoredRows`.
 """
 
 from __future__ import annotations
@@ -15,8 +17,10 @@ from gsmerge.types import Array, Gaussians, as_array
 
 @dataclass(frozen=True)
 class Columns:
-    """n Gaussians: ``means [n,3]``, unit ``quats [n,4]`` wxyz, ``log_scales [n,3]``, ``opacities [n]``,
-    ``sh0 [n,3]``, and ``harmonics [n,k-1,3]``.
+    """The columns of n Gaussians in a file's units.
+
+    ``means [n,3]``, unit ``quats [n,4]`` wxyz, ``log_scales [n,3]``, ``opacities [n]``, ``sh0
+    [n,3]``, and ``harmonics [n,k-1,3]``.
     """
 
     means: np.ndarray
@@ -31,11 +35,11 @@ class Columns:
 
     @property
     def colors(self) -> np.ndarray:
-        """``[n,3]`` base colours, 0 to 1 in range."""
+        """The base colours ``[n,3]``, 0 to 1 in range."""
         return sh0_to_rgb(self.sh0)
 
     def select(self, order: np.ndarray) -> Columns:
-        """The rows in another order."""
+        """Return the rows in another order."""
         return Columns(*(column[order] for column in vars(self).values()))
 
 
@@ -53,8 +57,9 @@ class StoredRows:
 
 
 def to_rows(columns: Columns, name: str, sizes: dict[str, int], *, mip: bool = False) -> StoredRows:
-    """What a quantised file of that format holds, in so many bytes by attribute; ``mip`` if its Gaussians want a
-    filter of their own.
+    """Convert the columns of a quantised file to rows of a PLY file.
+
+    ``sizes`` are bytes by attribute; ``mip`` says that the Gaussians want a filter of their own.
     """
     count, num_higher = columns.harmonics.shape[:2]
     names = (*MEANS, *SH0, *(f"f_rest_{i}" for i in range(3 * num_higher)), "opacity", *SCALES, *QUATS)
@@ -73,8 +78,10 @@ def to_rows(columns: Columns, name: str, sizes: dict[str, int], *, mip: bool = F
 
 
 def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Columns:
-    """Finite Gaussians as arrays, without harmonics above a degree; ``first_row`` is the number of the first one.
-    ValueError if there is NaN or inf; says in which row.
+    """Convert finite Gaussians to columns, without harmonics above a degree.
+
+    ``first_row`` is the number of the first one. ValueError if there is NaN or inf; says in which
+    row.
     """
 
     def check(values: np.ndarray) -> np.ndarray:
@@ -104,12 +111,12 @@ def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Col
 
 
 def to_bytes(values: np.ndarray) -> np.ndarray:
-    """The nearest of 0 to 255, uint8."""
+    """Round to the nearest of 0 to 255, uint8."""
     return np.clip(np.floor(values + 0.5), 0, 255).astype(np.uint8)
 
 
 def from_smallest_three(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Unit quaternions ``[n,4]`` of what :func:`smallest_three` returns."""
+    """Restore unit quaternions ``[n,4]`` from what :func:`smallest_three` returns."""
     quats = np.empty((len(largest), 4))
     is_largest = np.arange(4) == largest[:, None]
     quats[~is_largest] = others.reshape(-1)
@@ -118,7 +125,9 @@ def from_smallest_three(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 
 def smallest_three(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Index ``[n]`` of the largest component of unit quaternions ``[n,4]``, and the other three ``[n,3]`` in order.
+    """Split unit quaternions ``[n,4]`` into the index ``[n]`` of the largest part and the others.
+
+    The others are ``[n,3]``, in order.
 
     The sign is chosen so that the largest one is positive, which makes it the one that need not be stored.
     """

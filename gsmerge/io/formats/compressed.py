@@ -31,13 +31,15 @@ MAX_DEGREE = 3  # of the harmonics that are written
 
 
 def is_compressed(data: PlyData) -> bool:
-    """Whether a PLY holds packed Gaussians."""
+    """Return whether a PLY holds packed Gaussians."""
     return "chunk" in data and "vertex" in data and {p.name for p in data["vertex"].properties} >= set(PACKED)
 
 
 def unpack(path: Path, data: PlyData) -> np.ndarray:
-    """The rows of an ordinary file: the columns of :mod:`gsmerge.io.formats.ply_file`, opacities as logits. SceneError
-    if chunks are missing or lack a column.
+    """Unpack a compressed file to the rows of an ordinary one, with opacities as logits.
+
+    The columns are those of :mod:`gsmerge.io.formats.ply_file`. SceneError if chunks are missing or
+    lack a column.
     """
     vertex, chunk = data["vertex"], data["chunk"]
     for element, needed, types in ((vertex, PACKED, ("u4", "i4")), (chunk, RANGES, ("f4", "f8"))):
@@ -82,7 +84,10 @@ def _num_rest(path: Path, data: PlyData, count: int) -> int:
 def _fill_between(
     rows: np.ndarray, columns: tuple[str, ...], shares: list[np.ndarray], chunk: PlyElement, ranges: tuple[str, ...]
 ) -> None:
-    """Three columns from shares between a chunk's minima and maxima, which older files do not have for colours."""
+    """Fill three columns from shares between a chunk's least and largest values.
+
+    Older files have no such values for colours.
+    """
     ids, dtype = np.arange(len(rows)) // CHUNK, chunk.data.dtype
     has_ranges = all(name in dtype.names and dtype[name].kind == "f" for name in ranges)
     for column, share, low, high in zip(columns, shares, ranges[:3], ranges[3:], strict=True):
@@ -93,7 +98,10 @@ def _fill_between(
 
 
 def _fill_rotations(rows: np.ndarray, words: np.ndarray) -> None:
-    """Two bits name the largest component of wxyz; the others follow at 10 bits each, over +-sqrt(1/2)."""
+    """Fill the rotations: 2 bits name the largest of wxyz, the others have 10 each.
+
+    Those span +-sqrt(1/2).
+    """
     largest = (words >> np.uint32(30)).astype(np.int64)
     others = (np.stack(_shares(words, (10, 10, 10)), 1) - 0.5) * np.sqrt(2.0)
     quats = from_smallest_three(largest, others)
@@ -102,7 +110,7 @@ def _fill_rotations(rows: np.ndarray, words: np.ndarray) -> None:
 
 
 def _shares(words: np.ndarray, bits: tuple[int, ...]) -> list[np.ndarray]:
-    """Numbers between 0 and 1 that stand side by side in the lowest bits of words, the last one at the bottom."""
+    """Unpack numbers between 0 and 1 from the lowest bits of words, the last at the bottom."""
     out = []
     for i, width in enumerate(bits):
         shifted = words >> np.uint32(sum(bits[i + 1 :]))
@@ -111,8 +119,12 @@ def _shares(words: np.ndarray, bits: tuple[int, ...]) -> list[np.ndarray]:
 
 
 def compressed_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
-    """Content of a ``.compressed.ply``; rows along a space-filling curve, so that chunks are small. ValueError if there
-    is NaN or inf.
+    """Encode a ``.compressed.ply`` file.
+
+    Rows go along a space-filling curve, so that chunks are small. ValueError if there is NaN or
+    inf.
+
+    ValueError if there is NaN or inf.
     """
     columns = to_columns(gaussians, MAX_DEGREE)
     columns = columns.select(np.argsort(morton_codes(columns.means), kind="stable"))
@@ -136,7 +148,10 @@ def compressed_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> byte
 
 
 def _ranged(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Smallest and largest values ``[c,3]`` of every chunk, as float32 holds them, and all values between 0 and 1."""
+    """Return least and largest values ``[c,3]`` of each chunk, and all values between 0 and 1.
+
+    The ends are as float32 holds them.
+    """
     starts = np.arange(0, len(values), CHUNK)
     if len(starts) == 0:
         return values, values, values
@@ -146,7 +161,7 @@ def _ranged(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _packed(shares: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
-    """Numbers between 0 and 1 side by side in a word, the first one on top."""
+    """Pack numbers between 0 and 1 side by side in a word, the first one on top."""
     words = np.zeros(len(shares), np.uint32)
     for column, width in zip(shares.T, bits, strict=True):
         top = 2**width - 1

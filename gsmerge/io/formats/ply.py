@@ -13,7 +13,7 @@ from plyfile import PlyData, PlyElement
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import rgb_to_sh0
-from gsmerge.io.formats import sog_reader, splat, spz_reader
+from gsmerge.io.formats import sog, splat, spz
 from gsmerge.io.formats.arrays import StoredRows
 from gsmerge.io.formats.compressed import is_compressed, unpack
 from gsmerge.io.formats.ply_file import (
@@ -44,16 +44,19 @@ OpacityChoice = Literal["auto", "logit", "raw"]
 
 # What reads a file of Gaussians, by its ending; all other files are taken for PLY
 READERS: dict[str, Callable[[Path], StoredRows]] = {
-    ".spz": spz_reader.read_rows,
+    ".spz": spz.read_rows,
     ".splat": splat.read_rows,
-    ".sog": sog_reader.read_rows,
+    ".sog": sog.read_rows,
 }
 SCENE_SUFFIXES = (".ply", *READERS)
 
 
 @dataclass(frozen=True)
 class PlyInfo:
-    """What the file of Gaussians at ``path`` holds; of another format than PLY, as rows of a PLY file of float32."""
+    """Facts about a file of Gaussians.
+
+    Of another format than PLY, they are those of its rows as a PLY file of float32.
+    """
 
     path: str
     layout: str  # name of the column layout, as "17-column export" or "INRIA, SH degree 3"
@@ -92,13 +95,13 @@ class PlyScene:
 
 
 def kept_comments(info: PlyInfo) -> tuple[str, ...]:
-    """Comments of a file's header that say how its Gaussians are to be rendered, to be passed on."""
+    """Return the comments of a file's header that say how its Gaussians are to be rendered."""
     lines = (comment for comment in info.comments if comment.isascii() and comment.isprintable())
     return tuple(comment for comment in lines if comment.startswith(RENDER_COMMENT))
 
 
 def ply_notes(info: PlyInfo) -> tuple[str, ...]:
-    """What was adapted or looks odd in a PLY file, one sentence each, without a full stop."""
+    """Describe what was adapted or looks odd in a PLY file, one sentence each, without a full stop."""
     counted = {
         "row(s) with NaN or inf, set aside": info.num_nonfinite,
         "Gaussian(s) with extreme scales or colours, clipped": info.num_clipped_scales,
@@ -237,7 +240,10 @@ def _allocate(rows: np.ndarray, num_higher: int) -> dict[str, np.ndarray]:
 
 
 def _convert_all(rows: np.ndarray, read: Callable[[slice], np.ndarray], out: dict[str, np.ndarray]) -> tuple[int, int]:
-    """Fill the arrays block by block, in parallel; how many rows were clipped, and had no rotation."""
+    """Fill the arrays block by block, in parallel.
+
+    Returns how many rows were clipped, and how many had no rotation.
+    """
     size = max(1, BLOCK_BYTES // rows.dtype.itemsize)
 
     def convert(start: int) -> tuple[int, int]:
@@ -296,7 +302,7 @@ def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int, int]:
 
 
 def _exactly_valid(rows: np.ndarray, num_higher: int) -> np.ndarray:
-    """Whether rows are usable: all finite, but an infinite logit or a scale of exactly zero is a value."""
+    """Return which rows are usable: all finite, but for infinite logits and scales of zero."""
     valid = ~np.isnan(rows["opacity"].astype(np.float32))
     colors = color_columns(rows.dtype.names)
     for name in (*MEANS, *colors, *QUATS, *(f"f_rest_{i}" for i in range(3 * num_higher))):
@@ -308,7 +314,7 @@ def _exactly_valid(rows: np.ndarray, num_higher: int) -> np.ndarray:
 
 
 def _normalise(quats: list[np.ndarray], out: np.ndarray) -> np.ndarray:
-    """Write unit quaternions; returns the mask of the zero ones, which become the identity."""
+    """Write unit quaternions; return the mask of the zero ones, which become the identity."""
     w, x, y, z = quats
     squared = w * w + x * x + y * y + z * z
     inverse = 1 / np.sqrt(squared)
@@ -326,7 +332,10 @@ def _normalise(quats: list[np.ndarray], out: np.ndarray) -> np.ndarray:
 
 
 def _likely_encoding(opacities: np.ndarray) -> str:
-    """Whether all finite opacities, of which there is one, lie in [0, 1]: "raw"; otherwise "logit"."""
+    """Return "raw" if all finite opacities lie in [0, 1], otherwise "logit".
+
+    At least one is finite.
+    """
     finite = np.isfinite(opacities)
     low, high = opacities.min(where=finite, initial=np.inf), opacities.max(where=finite, initial=-np.inf)
     return "raw" if 0 <= low <= high <= 1 else "logit"
@@ -345,7 +354,7 @@ def _activate(opacities: np.ndarray, valid: np.ndarray, encoding: str) -> None:
 
 
 def clear_invalid(path: str | Path, out: dict[str, np.ndarray]) -> int:
-    """Make the invalid rows transparent, in place; returns their number."""
+    """Make the invalid rows transparent, in place; return their number."""
     valid = out["valid"]
     bad = np.flatnonzero(~valid)
     if len(bad) == 0:

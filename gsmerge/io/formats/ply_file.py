@@ -47,9 +47,13 @@ _SIZES = {
 
 
 def open_ply(path: Path) -> PlyData:
-    """A PLY file, whose vertices are mapped into memory where they are binary and not packed: :func:`open_rows` reads
-    them. SceneError if it is no PLY file, is truncated or damaged, or
-    its header asks for more than it holds.
+    """Open a PLY file; its binary vertices, unless packed, are mapped for :func:`open_rows`.
+
+    SceneError if it is no PLY file, is truncated or damaged, or its header asks for more than it
+    holds.
+
+    SceneError if it is no PLY file, is truncated or damaged, or its header asks for more than it
+    holds.
     """
     size = check_file(path)
     try:
@@ -78,8 +82,10 @@ def open_ply(path: Path) -> PlyData:
 
 
 def _stream(path: Path, end: int, *, text: bool) -> IO[Any]:
-    """A PLY file as the parser takes it; what it does not know is no harm: bytes that are no ASCII in the header, which
-    ends at ``end``, and empty lines between rows of text.
+    """Open a PLY file for the parser, and hide from it what it does not know and is no harm.
+
+    That is bytes that are no ASCII in the header, which ends at ``end``, and empty lines between
+    rows of text.
     """
     if text:
         return _TextRows(path.open("rb"), "ascii", "backslashreplace", newline="")
@@ -108,7 +114,7 @@ class _BinaryRows(BufferedReader):
 
 @contextmanager
 def open_rows(path: Path, rows: np.ndarray) -> Iterator[Callable[[slice], np.ndarray]]:
-    """A function that gives blocks of a PLY file's rows; those of a mapped file are read, also by several threads.
+    """Yield a function that returns blocks of a PLY file's rows; several threads may call it.
 
     Mapped pages of a file that shrinks would end the process; reading it is a SceneError.
     """
@@ -133,7 +139,10 @@ def open_rows(path: Path, rows: np.ndarray) -> Iterator[Callable[[slice], np.nda
 
 
 def header_counts(path: Path) -> tuple[int, int]:
-    """Gaussians and columns of higher harmonics that a PLY file's header says; zeros where it cannot be read."""
+    """Return the numbers of Gaussians and of higher harmonics' columns in a PLY file's header.
+
+    Zeros if it cannot be read.
+    """
     try:
         with path.open("rb") as file:
             header = file.read(1 << 16).partition(b"end_header")[0]
@@ -144,8 +153,13 @@ def header_counts(path: Path) -> tuple[int, int]:
 
 
 def _check_header(path: Path, start: bytes, size: int) -> tuple[int, bool]:
-    """Refuse a header (``start`` has the first bytes of ``size``) that never ends, or elements that the rest of the
-    file has not bytes enough for. Everything else is left to the parser. Returns its size, and whether rows are text.
+    """Refuse a header that never ends, or elements that the file has too few bytes for.
+
+    ``start`` has the first bytes of ``size``. Everything else is left to the parser. Returns the
+    header's size, and whether rows are text.
+
+    ``start`` has the first bytes of ``size``. Everything else is left to the parser. Returns the
+    header's size, and whether rows are text.
     """
     newline = b"\r\n" if start[3:5] == b"\r\n" else start[3:4]
     last = newline + b"end_header" + newline
@@ -185,17 +199,17 @@ def _truncated(path: Path, promise: str, num_whole: int, reason: str) -> SceneEr
 
 
 def sh_degree(num_rest: int) -> int:
-    """SH degree of that many ``f_rest`` columns."""
+    """Return the SH degree of that many ``f_rest`` columns."""
     return round((num_rest / 3 + 1) ** 0.5) - 1
 
 
 def color_columns(names: tuple[str, ...] | None) -> tuple[str, ...]:
-    """The columns that hold the base colour."""
+    """Return the names of the columns that hold the base colour."""
     return SH0 if names is None or SH0[0] in names else RGB
 
 
 def spread_low_degree(shN: np.ndarray) -> None:
-    """Put harmonics of a low degree in their places, where ``shN [n,15,3]`` has columns of degree 3; in place.
+    """Move harmonics of a low degree to their places in ``shN [n,15,3]``, in place.
 
     Long-LRM writes 45 columns whatever the degree: those of degree 1 (or 2) are channel-major in the first 9 (or 24).
     """
@@ -211,7 +225,7 @@ def spread_low_degree(shN: np.ndarray) -> None:
 
 
 def layout_name(names: tuple[str, ...], num_rest: int) -> str:
-    """What to call a file with these columns."""
+    """Name the layout of a file with these columns."""
     normals = set(NORMALS) <= set(names)
     if SH0[0] not in names:
         return "columns of red, green and blue"
@@ -221,7 +235,7 @@ def layout_name(names: tuple[str, ...], num_rest: int) -> str:
 
 
 def bytes_by_attribute(rows: np.ndarray, extra: tuple[str, ...]) -> dict[str, int]:
-    """Bytes of all rows by attribute; ``extra`` are the columns that are ignored."""
+    """Count the bytes of all rows by attribute; ``extra`` are the columns that are ignored."""
     groups = {"means": MEANS, "normals": NORMALS, "sh0": color_columns(rows.dtype.names), "opacities": ("opacity",)}
     groups |= {"scales": SCALES, "quats": QUATS, "extra": extra}
     kinds = {name: kind for kind, names in groups.items() for name in names}

@@ -20,7 +20,7 @@ ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colors", "u1", 4), 
 
 
 def splat_bytes(gaussians: Gaussians) -> bytes:
-    """Content of a ``.splat`` file. ValueError if there is NaN or inf."""
+    """Encode a ``.splat`` file. ValueError if there is NaN or inf."""
     columns = to_columns(gaussians, MAX_DEGREE)
     rows = np.empty(len(columns), ROW)
     rows["means"], rows["scales"] = columns.means, np.exp(columns.log_scales)
@@ -30,7 +30,7 @@ def splat_bytes(gaussians: Gaussians) -> bytes:
 
 
 def read_rows(path: Path) -> StoredRows:
-    """The Gaussians of a ``.splat``. SceneError if its size is no multiple of 32 bytes, or it is empty."""
+    """Read the Gaussians of a ``.splat``. SceneError if it has no whole rows of 32 bytes."""
     size = check_file(path)
     if size == 0 or size % ROW.itemsize:
         problem = f"expected a .splat of {ROW.itemsize} bytes per Gaussian, found {size} bytes"

@@ -1,4 +1,4 @@
-"""Gaussians to a file, in the format that its name asks for."""
+"""Writers of Gaussians, by the format that a file's name asks for."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from gsmerge.errors import UsageError
 from gsmerge.io.atomic import atomic_output
-from gsmerge.io.formats import compressed, glb_writer, sog_writer, splat, spz_writer
+from gsmerge.io.formats import compressed, glb, sog, splat, spz
 from gsmerge.io.formats.arrays import Columns, to_columns
 from gsmerge.io.formats.ply_file import (
     BLOCK_BYTES,
@@ -29,15 +29,15 @@ from gsmerge.types import Gaussians
 OUTPUT_FORMATS = {
     ".compressed.ply": compressed.MAX_DEGREE,
     ".ply": 4,
-    ".spz": spz_writer.MAX_DEGREES[3],
-    ".sog": sog_writer.MAX_DEGREE,
+    ".spz": spz.MAX_DEGREES[3],
+    ".sog": sog.MAX_DEGREE,
     ".splat": splat.MAX_DEGREE,
-    ".glb": glb_writer.MAX_DEGREE,
+    ".glb": glb.MAX_DEGREE,
 }
 
 
 def output_format(path: str | os.PathLike[str], spz_version: int = 3) -> str:
-    """The ending of an output's name that says how it is written.
+    """Return the ending of an output's name that says how it is written.
 
     Raises:
         UsageError: If it is none of ``OUTPUT_FORMATS``, or a ``.spz`` of that version needs what is not installed.
@@ -48,14 +48,17 @@ def output_format(path: str | os.PathLike[str], spz_version: int = 3) -> str:
         *first, last = OUTPUT_FORMATS
         raise UsageError(f"{path}: expected a name that ends in {', '.join(first)} or {last}")
     if ending == ".spz" and spz_version == 4:
-        spz_writer.zstandard()
+        spz.zstandard()
     return ending
 
 
 def lost_harmonics(path: str | os.PathLike[str], sh_degree: int, spz_version: int = 3) -> str | None:
-    """What a format has no room for, as a note; None if it holds everything. Raises as :func:`output_format`."""
+    """Describe the harmonics that a format has no room for; None if it holds all.
+
+    Raises as :func:`output_format`.
+    """
     ending = output_format(path)
-    highest = spz_writer.MAX_DEGREES[spz_version] if ending == ".spz" else OUTPUT_FORMATS[ending]
+    highest = spz.MAX_DEGREES[spz_version] if ending == ".spz" else OUTPUT_FORMATS[ending]
     return None if sh_degree <= highest else f"{ending} has no room for harmonics above degree {highest}: left out"
 
 
@@ -101,11 +104,11 @@ def _content(gaussians: Gaussians, ending: str, comments: Sequence[str], spz_ver
     if ending == ".compressed.ply":
         return compressed.compressed_bytes(gaussians, comments)
     if ending in (".splat", ".glb"):
-        return splat.splat_bytes(gaussians) if ending == ".splat" else glb_writer.glb_bytes(gaussians)
+        return splat.splat_bytes(gaussians) if ending == ".splat" else glb.glb_bytes(gaussians)
     mip = MIP_COMMENT in comments
     if ending == ".spz":
-        return spz_writer.spz_bytes(gaussians, mip=mip, version=spz_version)
-    return sog_writer.sog_bytes(gaussians, mip=mip)
+        return spz.spz_bytes(gaussians, mip=mip, version=spz_version)
+    return sog.sog_bytes(gaussians, mip=mip)
 
 
 def write_ply(
@@ -155,7 +158,10 @@ def _check_comments(comments: Sequence[str]) -> None:
 
 
 def _header(count: int, sh_degree: int, comments: Sequence[str] = (), *, normals: bool = True) -> tuple[bytes, int]:
-    """The header of a ``.ply`` of that many Gaussians, and its number of columns, all of them float32."""
+    """Return the header of a ``.ply`` of that many Gaussians, and its number of columns.
+
+    All are float32.
+    """
     num_rest = 3 * ((sh_degree + 1) ** 2 - 1)
     start = (*MEANS, *NORMALS) if normals else MEANS
     names = [*start, *SH0, *(f"f_rest_{i}" for i in range(num_rest)), "opacity", *SCALES, *QUATS]
@@ -166,7 +172,7 @@ def _header(count: int, sh_degree: int, comments: Sequence[str] = (), *, normals
 
 
 def _ply_rows(columns: Columns, *, normals: bool) -> np.ndarray:
-    """``[m,columns]`` float32 values in the order of the header."""
+    """Return ``[m,columns]`` float32 values in the order of the header."""
     with np.errstate(all="ignore"):  # opacities 0 and 1 are clipped, impossible ones become NaN
         logits = np.log(columns.opacities) - np.log1p(-columns.opacities)
     parts = [
@@ -182,13 +188,13 @@ def _ply_rows(columns: Columns, *, normals: bool) -> np.ndarray:
 
 
 def file_bytes(count: int, sh_degree: int) -> int:
-    """Size of the ``.ply`` of that many Gaussians, as :func:`write_ply` writes it without comments."""
+    """Return the size of the ``.ply`` of that many Gaussians, written without comments."""
     header, num_columns = _header(count, sh_degree)
     return len(header) + 4 * num_columns * count
 
 
 def count_for_bytes(max_bytes: int, sh_degree: int) -> int:
-    """Largest number of Gaussians whose ``.ply`` has at most ``max_bytes``.
+    """Return the largest number of Gaussians whose ``.ply`` has at most ``max_bytes``.
 
     Raises:
         ValueError: If the degree is not 0 to 4.

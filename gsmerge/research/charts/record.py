@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge import __version__
-from gsmerge.budget import new_settings, old_settings
 from gsmerge.io.content_hash import digest
 from gsmerge.runtime.jsonl import append_line, read_lines
 
@@ -120,7 +119,6 @@ class RunRecord:
         known = known_fields(RunRecord, values)
         for name in ("pictures", "notes"):
             known[name] = tuple(known.get(name, ()))
-        known["settings"] = new_settings(known.get("settings", {}))
         try:
             return RunRecord(**known)
         except TypeError as error:
@@ -136,7 +134,7 @@ def experiment_key(scene_sha256: str, method: str, settings: Mapping[str, Any], 
         {
             "scene": scene_sha256,
             "method": method,
-            "settings": old_settings(settings),
+            "settings": dict(settings),
             "views": views,
             "tool_version": __version__,
             "schema_version": SCHEMA_VERSION,

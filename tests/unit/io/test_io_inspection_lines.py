@@ -89,10 +89,10 @@ def test_what_compact_would_refuse(tmp_path: Path, cameras: bool) -> None:
     lines = said(tmp_path)
     assert lines["alignment"].startswith("not measured: ")
     assert lines["compact"] == "would refuse the scene as it is"
-    assert lines["dialect"] == "not known before the cameras fit"
+    assert lines["exporter"] == "not known before the cameras fit"
 
 
 def test_our_own_files(tmp_path: Path) -> None:
     save_export(tmp_path, SMOOTH, export_rows(SMOOTH))
     write_ply(tmp_path / "own.ply", read_ply(tmp_path / "scene.ply").gaussians[::7])
-    assert said(tmp_path / "own.ply")["dialect"] == "gsmerge"
+    assert said(tmp_path / "own.ply")["exporter"] == "gsmerge"

@@ -56,12 +56,3 @@ def test_the_state_s_settings_come_before_the_defaults() -> None:
     options, online = merge_settings({"tolerance": 0.3, "seed": 4}, state)
     assert options.to_dict().items() >= {"superpixels": "7%", "fit": "none", "seed": 4}.items()
     assert online.tolerance == 0.3
-
-
-def test_stored_settings_keep_their_first_names() -> None:
-    """``min_contribution`` was the name of another setting."""
-    stored = {"prune": 0.01, "min_contribution": 0.2, "rates": {"mean": 0.2, "reach_alone": 0.1}}
-    state: Any = SimpleNamespace(about={"options": stored, "batches": []})
-    options, _ = merge_settings({}, state)
-    assert (options.fit.min_contribution, options.contribution.min_owner_weight) == (0.01, 0.2)
-    assert (options.fit.rates.means_lr, options.fit.rates.single_view_share) == (0.2, 0.1)

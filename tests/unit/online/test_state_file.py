@@ -35,7 +35,14 @@ def path(state: OnlineState, tmp_path: Path) -> Path:
 
 ARRAYS = (
     *(f"features.{name}" for name in ("means", "covars", "weights", "masses", "extinctions", "latents", "footprints")),
-    *("features.sh0", "features.shN", "features.views", "features.backing", "features.solved", "features.held"),
+    *(
+        "features.sh0",
+        "features.shN",
+        "features.views",
+        "features.backing",
+        "features.fitted_sh0",
+        "features.color_precision",
+    ),
     *(f"children.{name}" for name in ("means", "quats", "scales", "opacities", "sh0", "shN", "counts")),
     *("kept.means", "cameras.viewmats", "cameras.Ks", "frame.origin", "replay.images", "replay.views"),
 )
@@ -75,10 +82,10 @@ DAMAGED: dict[str, Spoil] = {
     "batches by number": with_header(about={"options": {}, "batches": {"0": 1}}),
     "k of nine": with_settings(k=9),
     "k of words": with_settings(k="many"),
-    "most of none": with_settings(most=0),
-    "most of fewer than there are": with_settings(most=1),
+    "most of none": with_settings(max_k=0),
+    "most of fewer than there are": with_settings(max_k=1),
     "an opacity of two": with_settings(min_opacity=2.0),
-    "a share that is none": with_settings(prune=float("nan")),
+    "a share that is none": with_settings(min_contribution=float("nan")),
     "a negative number": with_settings(num_input=-1),
     "a group without children": with_array("children.counts", filled(0)),
     "a group with too many": with_array("children.counts", filled(9)),

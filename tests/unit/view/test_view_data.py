@@ -15,7 +15,7 @@ import pytest
 import scenes
 
 from gsmerge import Gaussians, PixelScene, evaluate, render
-from gsmerge.io.formats.spz_writer import spz_bytes
+from gsmerge.io.formats.spz import spz_bytes
 from gsmerge.measure.evaluate import EvaluateOptions, Views, near_plane
 from gsmerge.measure.preview import to_picture
 from gsmerge.render.metrics import psnr

@@ -1,0 +1,344 @@
+"""``.sog`` version 2: a zip of WebP textures, one pixel per Gaussian, and ``meta.json``.
+
+The format is described at developer.playcanvas.com, "The SOG format". Textures are without loss.
+
+The format is described at developer.playcanvas.com, "The SOG format".
+
+Positions are 16 bits of their signed logarithms, rotations their three smaller components at 8 bits, log scales,
+colours and harmonics codes of codebooks of 256; all harmonics of a Gaussian are one of at most 65,536 of a palette.
+"""
+
+from __future__ import annotations
+
+import heapq
+import io
+import json
+import math
+import zipfile
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from gsmerge.errors import SceneError
+from gsmerge.geometry import morton_codes
+from gsmerge.io.bounds import check_file
+from gsmerge.io.formats.arrays import (
+    Columns,
+    StoredRows,
+    from_smallest_three,
+    smallest_three,
+    to_bytes,
+    to_columns,
+    to_rows,
+)
+from gsmerge.types import Gaussians
+
+MAX_DEGREE = 3
+VERSION = 2
+FIRST_MODE = 252  # alpha of a rotation whose largest component is the first
+PALETTE_BITS = 16
+PALETTE_COLUMNS = 64  # sets of harmonics side by side in the texture of the palette
+_LOSSLESS = 101  # OpenCV's WebP quality
+MAX_PER_BYTE = 16  # Gaussians: no real file has more than a fifth of one
+MAX_META_BYTES = 1 << 20
+CODES = 256
+_CELLS = 1 << 11  # as many of equal width, and of equally many values
+_MAX_STEPS = 200
+
+
+def read_rows(path: Path) -> StoredRows:
+    """Read the Gaussians of a ``.sog``. SceneError if it is none, of another version, or damaged."""
+    size = check_file(path)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            sog = _Sog(path, archive, size)
+            meta = json.loads(sog.member("meta.json", MAX_META_BYTES))
+            _check_version(path, meta)
+            count = int(meta["count"])
+            if not 0 < count <= MAX_PER_BYTE * size:
+                raise SceneError(path, f"expected Gaussians in {size} bytes, found {count} promised")
+            mip = meta.get("antialias") is True or meta.get("model") == "antialiased"
+            columns = _read_columns(sog, meta, count)
+            keys = [key for key in ("means", "scales", "quats", "sh0", "shN") if meta.get(key)]
+            sizes = {key: sum(archive.getinfo(name).compress_size for name in meta[key]["files"]) for key in keys}
+            return to_rows(columns, f".sog version {VERSION}", sizes, mip=mip)
+    except OSError as error:
+        raise SceneError(path, f"cannot be read ({error.strerror})") from error
+    except zipfile.BadZipFile as error:
+        raise SceneError(path, f"expected a .sog file, found no complete zip ({error})", "copy it again") from error
+    except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError, EOFError) as error:
+        problem = f"expected meta.json and textures of .sog version {VERSION}, found others ({error})"
+        raise SceneError(path, " ".join(problem.split()), "export it again") from error
+    except (zlib.error, MemoryError) as error:
+        raise SceneError(path, f"expected a readable .sog file, found a damaged one ({error})") from error
+
+
+def _check_version(path: Path, meta: Any) -> None:
+    version = meta.get("version", 1) if isinstance(meta, dict) else "none"
+    if version != VERSION:
+        raise SceneError(path, f"expected .sog version {VERSION}, found {version}", "export it with a newer program")
+
+
+@dataclass(frozen=True)
+class _Sog:
+    """An archive, from which nothing is taken that is larger than its size allows."""
+
+    path: Path
+    archive: zipfile.ZipFile
+    size: int
+
+    def member(self, name: str, limit: int) -> bytes:
+        info = self.archive.getinfo(name)
+        if info.file_size > limit:
+            raise ValueError(f"{name} of {info.file_size} bytes")
+        return self.archive.read(info)
+
+    def texture(self, name: str, count: int) -> np.ndarray:
+        """Decode ``[count,4]`` pixels RGBA of a texture; alpha is 255 if it has none."""
+        data = self.member(name, self.size)
+        width, height = _webp_size(data)
+        if not count <= width * height <= 4 * count + (1 << 16):
+            raise ValueError(f"{name} of {width} x {height} pixels for {count}")
+        try:
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        except cv2.error as error:
+            raise ValueError(f"{name} is damaged") from error
+        if image is None or image.shape[:2] != (height, width) or image.ndim != 3:
+            raise ValueError(f"{name} is damaged")
+        pixels = image.reshape(width * height, -1)[:count]
+        colors, alpha = pixels[:, 2::-1], pixels[:, 3:] if pixels.shape[1] == 4 else np.full((count, 1), 255, np.uint8)
+        return np.concatenate([colors, alpha], 1)
+
+
+def _webp_size(data: bytes) -> tuple[int, int]:
+    """Return (width, height) of a WebP file without loss. ValueError if it is none."""
+    kind = data[12:16] if data[:4] == b"RIFF" and data[8:12] == b"WEBP" else b""
+    if kind == b"VP8X" and len(data) >= 30:
+        return int.from_bytes(data[24:27], "little") + 1, int.from_bytes(data[27:30], "little") + 1
+    if kind == b"VP8L" and len(data) >= 25:
+        bits = int.from_bytes(data[21:25], "little")
+        return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    raise ValueError("no WebP texture without loss")
+
+
+def _read_columns(sog: _Sog, meta: dict[str, Any], count: int) -> Columns:
+    def texture(key: str, index: int = 0) -> np.ndarray:
+        return sog.texture(meta[key]["files"][index], count)
+
+    low, high = (_check_numbers(meta["means"][key], 3) for key in ("mins", "maxs"))
+    fixed = texture("means", 0)[:, :3] + 256.0 * texture("means", 1)[:, :3]
+    quats, colors = texture("quats"), texture("sh0")
+    if quats[:, 3].min() < FIRST_MODE:
+        raise ValueError(f"rotations of mode {quats[:, 3].min()}")
+    with np.errstate(all="ignore"):  # what is not finite is set aside later
+        logs = low + (high - low) * fixed / 65535
+        return Columns(
+            means=np.sign(logs) * np.expm1(np.abs(logs)),
+            quats=from_smallest_three(quats[:, 3].astype(int) - FIRST_MODE, (quats[:, :3] / 255 - 0.5) * np.sqrt(2.0)),
+            log_scales=_decode_values(meta["scales"], texture("scales")[:, :3]),
+            opacities=colors[:, 3] / 255,
+            sh0=_decode_values(meta["sh0"], colors[:, :3]),
+            harmonics=_read_harmonics(sog, meta["shN"], count) if meta.get("shN") else np.zeros((count, 0, 3)),
+        )
+
+
+def _check_numbers(values: Any, length: int) -> np.ndarray:
+    numbers = np.asarray(values, np.float64)
+    if numbers.shape != (length,):
+        raise ValueError(f"{numbers.shape} numbers instead of {length}")
+    return numbers
+
+
+def _decode_values(part: dict[str, Any], codes: np.ndarray) -> np.ndarray:
+    """Look codes up in the codebook of a part."""
+    return _check_numbers(part["codebook"], 256)[codes]
+
+
+def _read_harmonics(sog: _Sog, part: dict[str, Any], count: int) -> np.ndarray:
+    size, bands = int(part["count"]), int(part["bands"])
+    if not (1 <= bands <= MAX_DEGREE and 1 <= size <= 2**PALETTE_BITS):
+        raise ValueError(f"{size} harmonics of degree {bands}")
+    num_higher = (bands + 1) ** 2 - 1
+    name, labels_name = part["files"]
+    low, high = sog.texture(labels_name, count)[:, :2].T.astype(int)
+    labels = low + 256 * high
+    rows = max(-(-size // PALETTE_COLUMNS), labels.max() // PALETTE_COLUMNS + 1)
+    centroids = sog.texture(name, rows * PALETTE_COLUMNS * num_higher)[:, :3]
+    return _decode_values(part, centroids.reshape(-1, num_higher, 3)[labels])
+
+
+def sog_bytes(gaussians: Gaussians, *, mip: bool = False) -> bytes:
+    """Encode a ``.sog`` file; ``mip`` marks antialiased Gaussians.
+
+    Rows go along a space-filling curve. ValueError if there is NaN or inf.
+
+    ValueError if there is NaN or inf.
+    """
+    columns = to_columns(gaussians, MAX_DEGREE)
+    columns = columns.select(np.argsort(morton_codes(columns.means), kind="stable"))
+    count = len(columns)
+    meta: dict[str, Any] = {"version": VERSION, "asset": {"generator": "gsmerge"}, "count": count, "antialias": mip}
+    if mip:
+        meta["model"] = "antialiased"  # as splat-transform says it
+    textures: dict[str, np.ndarray] = {}
+
+    def add(key: str, files: dict[str, np.ndarray], **numbers: Any) -> None:
+        meta[key] = {**numbers, "files": list(files)}
+        textures.update(files)
+
+    low, high, fixed = _log_positions(columns.means)
+    halves = {"means_l.webp": fixed & 255, "means_u.webp": fixed >> 8}
+    add("means", {name: _texture(half) for name, half in halves.items()}, mins=_shorten(low), maxs=_shorten(high))
+    scales, sh0 = fit_codebook(columns.log_scales), fit_codebook(columns.sh0)
+    add("scales", {"scales.webp": _texture(nearest_codes(scales, columns.log_scales))}, codebook=_shorten(scales))
+    add("quats", {"quats.webp": _texture(_rotation_bytes(columns.quats))})
+    colors = np.concatenate([nearest_codes(sh0, columns.sh0), to_bytes(255 * columns.opacities)[:, None]], 1)
+    add("sh0", {"sh0.webp": _texture(colors)}, codebook=_shorten(sh0))
+    if columns.harmonics.size:
+        files, numbers = _harmonic_textures(columns)
+        add("shN", files, **numbers)
+    return _zip({name: _webp(texture) for name, texture in textures.items()}, meta)
+
+
+def _log_positions(means: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the least and largest signed logarithms ``[3]``, and all as 16 bits ``[n,3]``."""
+    logs = np.sign(means) * np.log1p(np.abs(means))
+    if len(logs) == 0:
+        return np.zeros(3), np.zeros(3), np.zeros((0, 3), int)
+    low, high = logs.min(0), logs.max(0)
+    return low, high, np.round((logs - low) / np.where(high > low, high - low, 1) * 65535).astype(int)
+
+
+def _rotation_bytes(quats: np.ndarray) -> np.ndarray:
+    largest, others = smallest_three(quats)
+    return np.concatenate([to_bytes(255 * (others / np.sqrt(2.0) + 0.5)), FIRST_MODE + largest[:, None]], 1)
+
+
+def _harmonic_textures(columns: Columns) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Make the textures of palette and indices, and their entries in ``meta.json``."""
+    count, num_higher = columns.harmonics.shape[:2]
+    palette, labels = fit_palette(columns.harmonics.reshape(count, -1), PALETTE_BITS)
+    codebook = fit_codebook(palette)
+    rows = -(-len(palette) // PALETTE_COLUMNS)
+    centroids = np.zeros((rows * PALETTE_COLUMNS, num_higher, 3), np.uint8)
+    centroids[: len(palette)] = nearest_codes(codebook, palette).reshape(-1, num_higher, 3)
+    files = {
+        "shN_centroids.webp": centroids.reshape(rows, PALETTE_COLUMNS * num_higher, 3),
+        "shN_labels.webp": _texture(np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], 1)),
+    }
+    bands = round((num_higher + 1) ** 0.5) - 1
+    return files, {"count": len(palette), "bands": bands, "codebook": _shorten(codebook)}
+
+
+def _shorten(values: np.ndarray) -> list[float]:
+    """Round to as few digits as float32 allows."""
+    return [float(f"{value:.8g}") for value in values]
+
+
+def _texture(values: np.ndarray) -> np.ndarray:
+    """Arrange rows of channels as an image about as high as wide, filled up with zeros."""
+    width = max(4, math.ceil(math.sqrt(len(values)) / 4) * 4)
+    height = max(4, math.ceil(len(values) / width / 4) * 4)
+    pixels = np.zeros((height * width, values.shape[1]), np.uint8)
+    pixels[: len(values)] = values
+    return pixels.reshape(height, width, -1)
+
+
+def _webp(image: np.ndarray) -> bytes:
+    """Encode WebP without loss, but for colours of pixels whose alpha is 0."""
+    order = [2, 1, 0, 3][: image.shape[2]]
+    _, data = cv2.imencode(".webp", np.ascontiguousarray(image[..., order]), [cv2.IMWRITE_WEBP_QUALITY, _LOSSLESS])
+    return data.tobytes()
+
+
+def _zip(files: dict[str, bytes], meta: dict[str, Any]) -> bytes:
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as archive:
+        for name, data in {**files, "meta.json": json.dumps(meta).encode("ascii")}.items():
+            archive.writestr(zipfile.ZipInfo(name), data)  # of 1980: the same bytes at any time
+    return content.getvalue()
+
+
+def fit_codebook(values: np.ndarray) -> np.ndarray:
+    """Choose ``[256]`` values, rising, that stand for finite numbers of any shape, by 1-D k-means.
+
+    Thousands of narrow cells are merged, always the two neighbours that add the least squared error (Ward 1963), until
+    256 are left, and Lloyd's steps improve those. Values far from all others so keep codes of their own. Codes that are
+    left over repeat the last one.
+    """
+    ordered = np.sort(values, axis=None)
+    distinct = np.unique(ordered)
+    if len(distinct) <= CODES:
+        return np.pad(distinct, (0, CODES - len(distinct)), "edge" if len(distinct) else "constant")
+    sums = np.concatenate([[0], np.cumsum(ordered)])
+    even = np.searchsorted(ordered, np.linspace(ordered[0], ordered[-1], _CELLS))
+    ends = np.unique([*even, *np.linspace(0, len(ordered), _CELLS).astype(int)])
+    codes = _merge_cells(np.diff(ends).astype(float), np.diff(sums[ends]) / np.diff(ends))
+    for _ in range(_MAX_STEPS):
+        ends = np.searchsorted(ordered, (codes[1:] + codes[:-1]) / 2)
+        ends = np.concatenate([[0], ends, [len(ordered)]])
+        number, total = np.diff(ends), np.diff(sums[ends])
+        moved = np.where(number > 0, total / np.maximum(number, 1), codes)
+        if np.array_equal(moved, codes):
+            break
+        codes = np.sort(moved)
+    return codes
+
+
+def _merge_cells(numbers: np.ndarray, means: np.ndarray) -> np.ndarray:
+    """Merge neighbouring cells until there are 256, and return the means of those that are left."""
+    n, m = numbers.tolist(), means.tolist()
+    left, right = list(range(-1, len(n) - 1)), list(range(1, len(n) + 1))
+
+    def cost(i: int) -> tuple[float, int, int, float, float]:
+        j = right[i]
+        return n[i] * n[j] / (n[i] + n[j]) * (m[i] - m[j]) ** 2, i, j, n[i], n[j]
+
+    heap = [cost(i) for i in range(len(n) - 1)]
+    heapq.heapify(heap)
+    for _ in range(len(n) - CODES):
+        _, i, j, *sizes = heapq.heappop(heap)
+        while right[i] != j or [n[i], n[j]] != sizes:  # one of the two has grown, or is gone
+            _, i, j, *sizes = heapq.heappop(heap)
+        m[i], n[i], n[j] = (n[i] * m[i] + n[j] * m[j]) / (n[i] + n[j]), n[i] + n[j], 0.0
+        right[i] = right[j]
+        if right[i] < len(n):
+            left[right[i]] = i
+            heapq.heappush(heap, cost(i))
+        if left[i] >= 0:
+            heapq.heappush(heap, cost(left[i]))
+    return np.array([mean for mean, number in zip(m, n, strict=True) if number > 0])
+
+
+def nearest_codes(codebook: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the index of the code nearest to each value, uint8, in the shape of ``values``."""
+    return np.searchsorted((codebook[1:] + codebook[:-1]) / 2, values).astype(np.uint8)
+
+
+def fit_palette(vectors: np.ndarray, max_bits: int) -> tuple[np.ndarray, np.ndarray]:
+    """Choose at most ``2**max_bits`` vectors for ``[n,d]`` ones, and each one's index ``[n]``.
+
+    Vectors are halved at the median of the coordinate in which they differ most, group by group, and the means of the
+    last groups are the palette. Where there are few enough, every vector is its own.
+    """
+    count = len(vectors)
+    if count <= 2**max_bits:
+        return vectors, np.arange(count)
+    order = np.arange(count)
+    starts = np.zeros(1, int)
+    for _ in range(max_bits):
+        sizes = np.diff([*starts, count])
+        groups = np.repeat(np.arange(len(starts)), sizes)
+        ordered = vectors[order]
+        means = np.add.reduceat(ordered, starts) / sizes[:, None]
+        axes = np.add.reduceat((ordered - means[groups]) ** 2, starts).argmax(1)
+        order = order[np.lexsort((ordered[np.arange(count), axes[groups]], groups))]
+        starts = np.stack([starts, starts + sizes // 2], 1).reshape(-1)
+    sizes = np.diff([*starts, count])
+    labels = np.empty(count, int)
+    labels[order] = np.repeat(np.arange(len(starts)), sizes)
+    return np.add.reduceat(vectors[order], starts) / sizes[:, None], labels

@@ -1,0 +1,291 @@
+"""``.spz``: quantised columns (github.com/nianticlabs/spz, README and load-spz.cc).
+
+Positions are fixed-point numbers of 24 bits, log scales steps of 1/16 from -10 on, opacities and colours bytes,
+rotations their three smaller components with sign and 9 bits each, harmonics bytes of which 5 (degree 1) or 4 bits are
+used. Version 3 is one gzip stream, with harmonics up to degree 3; version 4 has a header in the clear, a table of
+compressed and uncompressed sizes, and one Zstandard stream for each column.
+
+The README says that axes are right, up and back. The converters that come with it, splat-transform and SuperSplat all
+keep those of the ``.ply`` instead, and so does this: the file shows what the ``.ply`` shows.
+"""
+
+from __future__ import annotations
+
+import gzip
+import struct
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+from gsmerge.errors import SceneError, UsageError
+from gsmerge.geometry import rgb_to_sh0
+from gsmerge.io.bounds import check_file
+from gsmerge.io.formats.arrays import (
+    Columns,
+    StoredRows,
+    from_smallest_three,
+    smallest_three,
+    to_bytes,
+    to_columns,
+    to_rows,
+)
+from gsmerge.types import SH_C0, Gaussians
+
+VERSIONS = (3, 4)  # that are written; Spark 2.2 does not read 4
+MAX_DEGREES = {3: 3, 4: 4}  # of the harmonics, by version
+MAGIC = 0x5053474E
+HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fraction bits, flags; zero, or number of streams
+TABLE_START = struct.Struct("<I12x")  # where the table of version 4 begins, in bytes from the file's start
+TABLE_ROW = struct.Struct("<QQ")  # bytes of a stream: compressed, uncompressed
+MIP_FLAG = 1  # the Gaussians want to be rendered with a filter of their own
+FINE = 14  # bits of a position within the scene: a sixteenth of a pixel where it fills a thousand
+MAX_FRACTION = 23
+ZSTD_LEVEL = 12
+INSTALL = 'pip install "zstandard>=0.23,<1"'  # as the extra spz4 asks for; works beside a wheel and in a checkout
+LARGEST = 2**23 - 1
+COLOR_SCALE = 0.15  # of sh0: colours somewhat outside [0, 1] survive
+ATTRIBUTES = ("means", "opacities", "sh0", "scales", "quats", "shN")  # in the order of the file
+MAX_READ_DEGREE = 4  # which some write as version 3, too
+MAX_RATIO = 1032  # of gzip: no stream unpacks to more; nor do the columns of version 4 together, of any scene
+FOUND_EARLY_END = "expected a .spz file, found an early end of file"
+AGAIN = "copy or export it again"
+
+
+@dataclass(frozen=True)
+class _Header:
+    version: int
+    count: int
+    degree: int
+    fraction: int
+    flags: int
+    num_streams: int  # of version 4
+
+    @property
+    def widths(self) -> tuple[int, ...]:
+        """Bytes per Gaussian of each attribute."""
+        harmonics = 3 * ((self.degree + 1) ** 2 - 1)
+        return 6 if self.version == 1 else 9, 1, 3, 3, 4 if self.version > 2 else 3, harmonics
+
+
+def read_rows(path: Path) -> StoredRows:
+    """Read the Gaussians of a ``.spz``.
+
+    Raises:
+        SceneError: If it is none, of another version, truncated or damaged.
+        UsageError: If it is of version 4 and ``zstandard`` is not installed.
+    """
+    check_file(path)
+    try:
+        packed = path.read_bytes()
+    except OSError as error:
+        raise SceneError(path, f"cannot be read ({error.strerror})") from error
+    read = _zstandard_parts if packed[:4] == MAGIC.to_bytes(4, "little") else _gzip_parts
+    header, parts = read(path, packed)
+    sizes = {name: part.size for name, part in zip(ATTRIBUTES, parts, strict=True) if part.size}
+    mip = bool(header.flags & MIP_FLAG)
+    return to_rows(_read_columns(parts, header), f".spz version {header.version}", sizes, mip=mip)
+
+
+def _read_header(path: Path, packed: bytes, start: bytes, versions: Sequence[int]) -> _Header:
+    """Read the header, and check it against the bytes of the file."""
+    if len(start) < HEADER.size:
+        raise SceneError(path, FOUND_EARLY_END, AGAIN)
+    magic, *numbers = HEADER.unpack(start)
+    header = _Header(*numbers)
+    if magic != MAGIC or header.version not in versions or header.degree > MAX_READ_DEGREE or header.fraction > 30:
+        found = f"version {header.version}, SH degree {header.degree}" if magic == MAGIC else "another file"
+        raise SceneError(path, f"expected .spz of version 1 to 4 and SH degree 0 to {MAX_READ_DEGREE}, found {found}")
+    if header.count == 0 or header.count * sum(header.widths) > MAX_RATIO * len(packed):
+        raise SceneError(path, f"expected Gaussians in {len(packed)} bytes, found {header.count} promised")
+    return header
+
+
+def _gzip_parts(path: Path, packed: bytes) -> tuple[_Header, list[np.ndarray]]:
+    stream = zlib.decompressobj(wbits=31)
+    try:
+        header = _read_header(path, packed, stream.decompress(packed, HEADER.size), (1, 2, 3))
+        data = stream.decompress(stream.unconsumed_tail, header.count * sum(header.widths))
+    except zlib.error as error:
+        raise SceneError(path, "expected a gzip stream of .spz, found another or damaged file") from error
+    ends = np.cumsum([0, *header.widths]) * header.count
+    if len(data) < ends[-1]:
+        problem = f"truncated or damaged: expected {ends[-1]} bytes for {header.count} Gaussians, found {len(data)}"
+        raise SceneError(path, problem, AGAIN)
+    parts = [np.frombuffer(data, np.uint8, end - at, at).reshape(header.count, -1) for at, end in pairwise(ends)]
+    return header, parts
+
+
+def _zstandard_parts(path: Path, packed: bytes) -> tuple[_Header, list[np.ndarray]]:
+    """Read header and parts of version 4.
+
+    Extensions, which lie between header and table, say nothing about the Gaussians.
+    """
+    header = _read_header(path, packed, packed[: HEADER.size], (4,))
+    sizes = [header.count * width for width in header.widths if width]
+    try:
+        (at,) = TABLE_START.unpack_from(packed, HEADER.size)
+        table = [TABLE_ROW.unpack_from(packed, at + i * TABLE_ROW.size) for i in range(header.num_streams)]
+    except struct.error as error:
+        raise SceneError(path, FOUND_EARLY_END, AGAIN) from error
+    if [row[1] for row in table] != sizes:
+        problem = f"damaged: expected columns of {sizes} bytes for {header.count} Gaussians, found others"
+        raise SceneError(path, problem, AGAIN)
+    ends = at + len(table) * TABLE_ROW.size + np.cumsum([0, *(row[0] for row in table)], dtype=object)
+    if ends[-1] > len(packed):
+        problem = f"truncated or damaged: expected {ends[-1]} bytes for {header.count} Gaussians, found {len(packed)}"
+        raise SceneError(path, problem, AGAIN)
+    library = zstandard()
+    unpacker = library.ZstdDecompressor()
+    try:  # one byte more than expected at most, whatever a stream says of its size
+        columns = [
+            unpacker.stream_reader(packed[i:j]).read(size + 1)
+            for (i, j), size in zip(pairwise(ends), sizes, strict=True)
+        ]
+    except library.ZstdError as error:
+        raise SceneError(path, "damaged: expected Zstandard streams of .spz version 4, found others", AGAIN) from error
+    if [len(column) for column in columns] != sizes:
+        raise SceneError(path, "truncated or damaged: a column of .spz version 4 is of another size", AGAIN)
+    columns += [b""] * (len(header.widths) - len(columns))
+    return header, [np.frombuffer(column, np.uint8).reshape(header.count, -1) for column in columns]
+
+
+def _read_columns(parts: list[np.ndarray], header: _Header) -> Columns:
+    version, fraction = header.version, header.fraction
+    means, opacities, colors, scales, rotations, harmonics = parts
+    return Columns(
+        means=means.view("<f2").astype(float) if version == 1 else _fixed_points(means) / 2.0**fraction,
+        quats=_three_bytes(rotations) if version < 3 else _smallest_three(rotations.view("<u4")[:, 0]),
+        log_scales=scales / 16 - 10,
+        opacities=opacities[:, 0] / 255,
+        sh0=rgb_to_sh0(0.5 + SH_C0 * (colors / 255 - 0.5) / COLOR_SCALE),
+        harmonics=(harmonics.reshape(len(harmonics), -1, 3) - 128.0) / 128,
+    )
+
+
+def _fixed_points(stored: np.ndarray) -> np.ndarray:
+    """Convert three little-endian bytes each to signed numbers ``[n,3]``."""
+    words = np.zeros((len(stored), 3, 4), np.uint8)
+    words[..., 1:] = stored.reshape(-1, 3, 3)
+    return words.view("<i4")[..., 0] >> 8
+
+
+def _three_bytes(stored: np.ndarray) -> np.ndarray:
+    xyz = stored / 127.5 - 1
+    w = np.sqrt(np.clip(1 - (xyz**2).sum(1, keepdims=True), 0, None))
+    return np.concatenate([w, xyz], 1)
+
+
+def _smallest_three(words: np.ndarray) -> np.ndarray:
+    """Restore quaternions wxyz from words whose top two bits name the largest of xyzw."""
+    parts = np.stack([words >> np.uint32(shift) & np.uint32(1023) for shift in (20, 10, 0)], 1)
+    others = np.where(parts & 512, -1.0, 1.0) * (parts & 511) / (511 * np.sqrt(2.0))
+    return np.roll(from_smallest_three((words >> np.uint32(30)).astype(int), others), 1, axis=1)
+
+
+@dataclass(frozen=True)
+class SpzColumns:
+    """The content of a ``.spz`` of n Gaussians.
+
+    ``parts`` are ``[n,bytes]`` uint8 in the order of the file.
+    """
+
+    count: int
+    degree: int  # of the harmonics
+    fraction: int  # bits of a position behind the point
+    mip: bool
+    parts: tuple[np.ndarray, ...]
+
+    def header(self, version: int) -> bytes:
+        """Return the first 16 bytes, of version 3 before gzip."""
+        last = len(self.streams) if version == 4 else 0
+        return HEADER.pack(MAGIC, version, self.count, self.degree, self.fraction, MIP_FLAG * self.mip, last)
+
+    @property
+    def streams(self) -> list[bytes]:
+        """The parts as bytes, without that of harmonics where there are none."""
+        return [part.tobytes() for part in self.parts if part.shape[1]]
+
+
+def spz_columns(gaussians: Gaussians, max_degree: int, *, mip: bool = False, fine: int = FINE) -> SpzColumns:
+    """Quantise Gaussians; ``fine`` is the number of bits of a position within the scene.
+
+    ValueError if there is NaN or inf.
+    """
+    columns = to_columns(gaussians, max_degree)
+    fraction = _fraction_bits(columns.means, fine)
+    fixed = np.clip(np.round(columns.means * 2.0**fraction), -LARGEST, LARGEST).astype("<i4")
+    parts = (
+        fixed.view(np.uint8).reshape(-1, 3, 4)[..., :3].reshape(-1, 9),  # three little-endian bytes a coordinate
+        to_bytes(255 * columns.opacities)[:, None],
+        to_bytes(255 * (COLOR_SCALE * (columns.colors - 0.5) / SH_C0 + 0.5)),
+        to_bytes(16 * (columns.log_scales + 10)),
+        _rotation_bytes(columns.quats),
+        _harmonic_bytes(columns.harmonics),
+    )
+    degree = round((columns.harmonics.shape[1] + 1) ** 0.5) - 1
+    return SpzColumns(len(columns), degree, fraction, mip, parts)
+
+
+def spz_bytes(gaussians: Gaussians, *, mip: bool = False, version: int = 3) -> bytes:
+    """Encode a ``.spz`` file; ``mip`` sets the flag of antialiased Gaussians.
+
+    Raises:
+        ValueError: If there is NaN or inf, or the version is not 3 or 4.
+        UsageError: If version 4 is asked for and ``zstandard`` is not installed.
+    """
+    if version not in VERSIONS:
+        raise ValueError(f"spz_version: expected 3 or 4, got {version}")
+    columns = spz_columns(gaussians, MAX_DEGREES[version], mip=mip)
+    if version == 3:
+        return gzip.compress(columns.header(3) + b"".join(columns.streams), mtime=0)  # the same bytes at any time
+    compressor = zstandard().ZstdCompressor(level=ZSTD_LEVEL)
+    packed = [compressor.compress(stream) for stream in columns.streams]
+    sizes = [TABLE_ROW.pack(*map(len, pair)) for pair in zip(packed, columns.streams, strict=True)]
+    start = TABLE_START.pack(HEADER.size + TABLE_START.size)
+    return b"".join([columns.header(4), start, *sizes, *packed])
+
+
+def zstandard() -> ModuleType:
+    """Import the compression of version 4. UsageError if it is not installed."""
+    try:
+        import zstandard
+    except ImportError as error:
+        raise UsageError(f".spz of version 4: zstandard is not installed; {INSTALL}") from error
+    return zstandard
+
+
+def _fraction_bits(means: np.ndarray, fine: int) -> int:
+    """Choose the bits behind the point, by the scene's size and its farthest Gaussian."""
+    if len(means) == 0:
+        return 0
+    size = np.median(np.abs(means - np.median(means, axis=0)).max(axis=1))
+    wanted = fine - np.log2(max(size, 1e-6))
+    left = np.log2(LARGEST / max(np.abs(means).max(), 1e-6))
+    return int(np.clip(min(np.ceil(wanted), np.floor(left)), 0, MAX_FRACTION))
+
+
+def _rotation_bytes(quats: np.ndarray) -> np.ndarray:
+    """Pack rotations into ``[n,4]`` bytes.
+
+    From the top: index of the largest of xyzw, then sign and magnitude of the others.
+    """
+    largest, others = smallest_three(np.roll(quats, -1, axis=1))
+    parts = np.minimum(np.floor(511 * np.abs(others) * np.sqrt(2.0) + 0.5), 511).astype(np.uint32)
+    parts |= (others < 0).astype(np.uint32) << np.uint32(9)
+    words = largest.astype(np.uint32) << np.uint32(30)
+    for i, shift in enumerate((20, 10, 0)):
+        words |= parts[:, i] << np.uint32(shift)
+    return words.astype("<u4")[:, None].view(np.uint8)
+
+
+def _harmonic_bytes(harmonics: np.ndarray) -> np.ndarray:
+    """Encode ``[n,3 (k-1)]`` bytes 128 + 128 x, rounded to steps of 8 for degree 1 and of 16 above."""
+    steps = np.where(np.arange(harmonics.shape[1]) < 3, 8, 16)[:, None]
+    values = np.round(np.clip(harmonics, -2, 2) * 128) + 128
+    stepped = np.clip((values + steps // 2) // steps * steps, 0, 255).astype(np.uint8)
+    return stepped.reshape(len(stepped), 3 * harmonics.shape[1])

@@ -1,0 +1,157 @@
+"""Scenes are found in any layout, each once, and no two are written to one file."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from gsmerge.batch import BatchOptions, find_jobs
+from gsmerge.batch.find import find_scenes, output_name
+from gsmerge.errors import SceneError, UsageError
+from gsmerge.options import CompactOptions
+
+OUT = Path("out")
+
+
+@pytest.fixture(autouse=True)
+def inside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def touch(*names: str) -> None:
+    for name in names:
+        Path(name).parent.mkdir(parents=True, exist_ok=True)
+        Path(name).write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 7\nend_header\n")
+
+
+def actual(*given: str, out: Path = OUT) -> list[str]:
+    return [str(scene) for scene in find_scenes(given, out)]
+
+
+def outputs(*given: str, options: BatchOptions | None = None, own: set[str] | None = None) -> dict[str, str]:
+    return {job.output: job.scene for job in find_jobs(given, OUT, options or BatchOptions(), own or set())}
+
+
+def test_folders_are_searched() -> None:
+    touch("all/b/scene.ply", "all/b/other.ply", "all/a/x.ply", "all/a/y.ply", "all/deep/er/gs_ply/0000.ply")
+    touch("all/inria/point_cloud/iteration_7000/point_cloud.ply", "all/inria/input.ply", "all/z.ply")
+    expected = ["all/z.ply", "all/a/x.ply", "all/a/y.ply", "all/b", "all/deep/er", "all/inria"]
+    assert actual("all") == expected
+
+
+def test_what_is_no_scene_is_passed_by() -> None:
+    touch("all/a.ply", "all/a.compact.ply", "all/a.compact.level1.ply", "all/.a-00112233.ply", "all/.hidden/b.ply")
+    touch("all/points3D.ply", "all/c/scene.ply", "all/c/images/mask.ply", "all/input/d.ply")
+    assert actual("all") == ["all/a.ply", "all/c", "all/input/d.ply"]
+
+
+def test_a_scene_s_own_folders_are_no_scenes_of_their_own() -> None:
+    touch("all/scene.ply", "all/gs_ply/0000.ply", "all/more/scene.ply")
+    assert actual("all") == ["all", "all/more"]
+
+
+def test_the_output_folder_is_not_searched() -> None:
+    touch("all/a.ply", "all/out/a.ply", "all/out/deep/b.ply")
+    assert actual("all", out=Path("all/out")) == ["all/a.ply"]
+    assert actual("all/*", out=Path("all/out")) == ["all/a.ply"]
+    with pytest.raises(UsageError, match="another folder for the results"):
+        actual("all", out=Path("all"))
+
+
+def test_results_of_former_runs_are_no_scenes() -> None:
+    touch("a.ply", "b.ply")
+    assert outputs("*.ply", own={os.path.realpath("b.ply")}) == {"a.ply": "a.ply"}
+
+
+def test_patterns_and_lists() -> None:
+    touch("s/one/scene.ply", "s/two/scene.ply", "s/notes.ply.txt", "s/x.ply")
+    assert actual("s/*") == ["s/one", "s/two", "s/x.ply"]
+    assert actual("s/**/scene.ply") == ["s/one/scene.ply", "s/two/scene.ply"]
+    Path("s/list.txt").write_text("# mine\none\n\n  x.ply  \ngone.ply\n")
+    assert actual("s/list.txt") == ["s/one", "s/x.ply", "s/gone.ply"]  # what is gone fails when its turn comes
+
+
+def test_names_that_look_like_patterns_are_names() -> None:
+    touch("run[1]/scene.ply")
+    assert actual("run[1]") == ["run[1]"]
+
+
+def test_links_in_a_circle_end() -> None:
+    touch("all/a.ply")
+    Path("all/again").symlink_to("..", target_is_directory=True)
+    assert actual("all")[0] == "all/a.ply"
+    assert len(outputs("all")) == 1
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ("gone.ply", "no such file"),
+        ("gone", "no such file or folder"),
+        ("gone/*", "scenes that match, found none"),
+        ("empty", "scenes in the folder, found none"),
+        ("blank.txt", "scenes in the list, found none"),
+        ("binary.bin", "no text"),
+    ],
+)
+def test_what_holds_no_scene_is_told(given: str, said: str) -> None:
+    Path("empty").mkdir()
+    Path("blank.txt").write_text("\n# nothing\n")
+    Path("binary.bin").write_bytes(b"a\0b")
+    with pytest.raises(SceneError, match=said) as raised:
+        actual(given)
+    assert given in str(raised.value)
+
+
+def test_each_scene_comes_once() -> None:
+    touch("s/a/scene.ply", "s/b.ply")
+    assert outputs("s", "s/a/scene.ply", "s/*", "s/b.ply") == {"b.ply": "s/b.ply", "a.ply": "s/a"}
+
+
+def test_two_scenes_are_not_written_to_one_file() -> None:
+    touch("s/a/scene.ply", "t/a/scene.ply")
+    with pytest.raises(UsageError, match=r"out/a\.ply.* of s/a and of t/a; .*--name"):
+        outputs("s", "t")
+    apart = outputs("s", "t", options=BatchOptions(output="{parent}/{stem}.ply"))
+    assert apart == {"s/a.ply": "s/a", "t/a.ply": "t/a"}
+
+
+def test_levels_need_files_of_their_own_too() -> None:
+    touch("a.ply", "a.level1.ply")
+    levels = BatchOptions(CompactOptions().with_settings({"levels": 2}))
+    assert len(outputs("*.ply")) == 2
+    with pytest.raises(UsageError, match=r"a\.level1\.ply"):
+        outputs("*.ply", options=levels)
+
+
+def test_a_result_does_not_replace_a_scene() -> None:
+    touch("out/a.ply", "b/a.ply")
+    with pytest.raises(UsageError, match="is one of the scenes"):
+        outputs("out/a.ply")
+
+
+def test_counts_come_from_the_header() -> None:
+    touch("a.ply")
+    Path("b.ply").write_text("no header")
+    assert [job.num_gaussians for job in find_jobs(["a.ply", "b.ply"], OUT, BatchOptions())] == [7, 0]
+
+
+def test_names_are_filled_in(tmp_path: Path) -> None:
+    options = BatchOptions(CompactOptions().with_settings({"k": 2}))
+
+    def name(template: str, scene: str) -> str:
+        return output_name(replace(options, output=template), Path(scene), 12)
+
+    touch("set/room.v2/scene.ply")
+    assert name("{stem}.ply", "set/room.v2") == "room.v2.ply"
+    assert name("{stem}.ply", "set/room.v2/scene.ply") == "scene.ply"
+    assert name("{parent}-{stem}.k{k}.ply", "set/a.ply") == "set-a.k2.ply"
+    assert name("{index:04d}.ply", "a.ply") == "0012.ply"
+    assert name("{stem}.ply", "a.compressed.ply") == "a.ply"
+    assert name("{stem}.compressed.ply", "a.ply") == "a.compressed.ply"
+    assert name("{stem}.ply", ".") == f"{tmp_path.name}.ply"
+    with pytest.raises(UsageError, match="does not fit"):
+        name("{stem:d}.ply", "a.ply")

@@ -1,0 +1,74 @@
+"""COLMAP models, as text and binary, whole and damaged."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from tiny_scene import (
+    Tiny,
+    assert_same,
+    write_colmap_binary,
+    write_colmap_text,
+)
+
+from gsmerge.errors import SceneError
+from gsmerge.io import read_cameras
+
+
+@pytest.mark.parametrize("write", [write_colmap_text, write_colmap_binary])
+@pytest.mark.parametrize("place", [".", "sparse/0", "sparse", "colmap/sparse/0", "colmap"])
+def test_colmap_models(tmp_path: Path, tiny: Tiny, write: Callable[[Path, Tiny], None], place: str) -> None:
+    write(tmp_path / place, tiny)
+    actual = read_cameras(tmp_path)
+    assert_same(actual, tiny)
+    assert actual.names == tiny.names
+    assert actual.convention == ("world-to-camera", "OpenCV")
+
+
+def test_colmap_by_one_of_its_files(tmp_path: Path, tiny: Tiny) -> None:
+    write_colmap_binary(tmp_path, tiny)
+    assert_same(read_cameras(tmp_path / "images.bin"), tiny)
+    (tmp_path / "cameras.bin").unlink()
+    with pytest.raises(SceneError, match="expected a COLMAP model with cameras and images"):
+        read_cameras(tmp_path / "images.bin")
+
+
+def test_colmap_models_without_distortion(tmp_path: Path, tiny: Tiny) -> None:
+    write_colmap_text(tmp_path / "a", tiny, "OPENCV", " 0 0 0 0")
+    assert_same(read_cameras(tmp_path / "a"), tiny)
+    write_colmap_binary(tmp_path / "b", tiny, 4, (0.0, 0.0, 0.0, 0.0))
+    assert_same(read_cameras(tmp_path / "b"), tiny)
+    (tmp_path / "a" / "cameras.txt").write_text("7 SIMPLE_RADIAL 20 14 30 9 8 0\n")
+    assert read_cameras(tmp_path / "a").Ks[0].tolist() == [[30, 0, 9], [0, 30, 8], [0, 0, 1]]
+    (tmp_path / "a" / "cameras.txt").write_text("7 SIMPLE_PINHOLE 20 14 30 9 8\n")
+    assert read_cameras(tmp_path / "a").Ks[0, 1, 1] == 30
+
+
+def test_unknown_colmap_models_are_refused(tmp_path: Path, tiny: Tiny) -> None:
+    for name, model, extra in (("a", 7, (0.1,)), ("b", 10, (0.0,) * 8), ("c", 99, ())):
+        write_colmap_binary(tmp_path / name, tiny, model, extra)
+        with pytest.raises(SceneError, match=r"camera 7: expected a pinhole, .* found (FOV|THIN|model 99).*undistort"):
+            read_cameras(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin"])
+def test_truncated_colmap_files_are_named(tmp_path: Path, tiny: Tiny, name: str) -> None:
+    write_colmap_binary(tmp_path, tiny)
+    data = (tmp_path / name).read_bytes()
+    for length in (3, 20, len(data) - 5):
+        (tmp_path / name).write_bytes(data[:length])
+        with pytest.raises(SceneError, match=r"found damaged cameras or images\.bin"):
+            read_cameras(tmp_path)
+
+
+def test_damaged_colmap_text(tmp_path: Path, tiny: Tiny) -> None:
+    write_colmap_text(tmp_path, tiny)
+    (tmp_path / "images.txt").write_text("1 0.5 0.5 nonsense\n\n")
+    with pytest.raises(SceneError, match=r"found damaged cameras or images\.txt"):
+        read_cameras(tmp_path)
+    write_colmap_text(tmp_path, tiny)
+    (tmp_path / "cameras.txt").write_text("8 PINHOLE 20 14 1 1 1 1\n")
+    with pytest.raises(SceneError, match=r"view a b/2\.png: its camera is not in cameras\.txt"):
+        read_cameras(tmp_path)

@@ -1,0 +1,230 @@
+"""Cameras in JSON: nerfstudio's, INRIA's, and in another frame than the Gaussians."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from exports import smooth_scene
+from tiny_scene import (
+    FLIP,
+    Tiny,
+    assert_same,
+    frames_of,
+    rotation,
+    save_json,
+    write_colmap_text,
+    write_images,
+    write_inria,
+    write_transforms,
+)
+
+from gsmerge.errors import SceneError
+from gsmerge.io import load_scene, read_cameras, to_cameras
+from gsmerge.types import UnalignedScene
+
+
+def test_transforms_with_global_intrinsics(tmp_path: Path, tiny: Tiny) -> None:
+    write_transforms(tmp_path / "transforms.json", tiny)
+    actual = read_cameras(tmp_path / "transforms.json")
+    assert_same(actual, tiny)
+    assert actual.names == tuple(f"images/{n}" for n in tiny.names)
+    assert actual.source == "transforms.json"
+    assert actual.images is None
+
+
+def test_transforms_with_intrinsics_of_each_view(tmp_path: Path, tiny: Tiny) -> None:
+    data = frames_of(tiny)
+    for i, frame in enumerate(data["frames"]):
+        frame |= {"fl_x": 10.0 + i, "fl_y": 20.0, "cx": 3.0, "cy": 4.0, "w": 30 + i, "h": 40}
+    actual = read_cameras(save_json(tmp_path / "transforms.json", data))
+    assert actual.Ks[2].tolist() == [[12, 0, 3], [0, 20, 4], [0, 0, 1]]
+    assert actual.widths.tolist() == [30, 31, 32]
+
+
+def test_transforms_from_the_angle_of_view(tmp_path: Path, tiny: Tiny) -> None:
+    data = {"camera_angle_x": 2 * np.arctan(0.5), "w": 20, "h": 14, "frames": frames_of(tiny)["frames"]}
+    actual = read_cameras(save_json(tmp_path / "transforms.json", data))
+    assert np.allclose(actual.Ks[0], [[20, 0, 10], [0, 20, 7], [0, 0, 1]])
+    data |= {"camera_angle_y": 2 * np.arctan(0.25)}
+    assert np.allclose(read_cameras(save_json(tmp_path / "t.json", data)).Ks[0, 1, 1], 28)
+
+
+def test_transforms_without_a_size_take_the_images(tmp_path: Path, tiny: Tiny) -> None:
+    write_images(tmp_path / "images", tiny)
+    frames = frames_of(tiny)["frames"]
+    for frame in frames:
+        frame["file_path"] = frame["file_path"].removesuffix(".png")
+    data = {"camera_angle_x": 2 * np.arctan(0.5), "frames": frames}
+    actual = read_cameras(save_json(tmp_path / "transforms.json", data))
+    assert actual.widths.tolist() == [20] * 3
+    assert np.allclose(actual.Ks[0], [[20, 0, 10], [0, 20, 7], [0, 0, 1]])
+    with pytest.raises(SceneError, match="expected 'w' and 'h', found neither them nor the image"):
+        read_cameras(save_json(tmp_path / "images" / "transforms.json", data))
+
+
+def test_transforms_with_full_intrinsics_need_no_size(tmp_path: Path, tiny: Tiny) -> None:
+    data = frames_of(tiny)
+    del data["w"], data["h"]
+    actual = read_cameras(save_json(tmp_path / "transforms.json", data))
+    assert actual.widths.tolist() == [0] * 3
+    with pytest.raises(SceneError, match="expected the image size"):
+        to_cameras(actual)
+    assert to_cameras(actual, (20, 14)).width == 20
+
+
+def test_applied_transform_is_not_applied(tmp_path: Path, tiny: Tiny) -> None:
+    data = frames_of(tiny) | {"applied_transform": [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]], "applied_scale": 3}
+    assert_same(read_cameras(save_json(tmp_path / "transforms.json", data)), tiny)
+
+
+def test_a_bare_list_is_opencv_and_lacks_intrinsics(tmp_path: Path, tiny: Tiny) -> None:
+    frames = [{"file_path": n, "transform_matrix": m} for n, m in zip(tiny.names, tiny.c2w.tolist(), strict=True)]
+    with pytest.raises(SceneError, match=r"expected intrinsics .*found none of fl_x, w, h for view a b/2\.png; add"):
+        read_cameras(save_json(tmp_path / "transforms.json", frames))
+    common = {k: v for k, v in frames_of(tiny).items() if k != "frames"}
+    actual = read_cameras(save_json(tmp_path / "transforms.json", [f | common for f in frames]))
+    assert_same(actual, tiny)
+    assert actual.convention == ("camera-to-world", "OpenCV")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"camera_model": "EQUIRECTANGULAR"}, "found camera model EQUIRECTANGULAR; undistort"),
+        ({"k4": 0.1}, "found lens distortion k4, which formats understand differently; undistort"),
+        ({"fl_x": -3}, "expected positive focal lengths"),
+        ({"fl_x": "wide"}, "expected numbers"),
+        ({"w": 1e999}, "expected numbers"),
+        ({"h": -14}, "expected a positive image size, found 20 x -14"),
+        ({"cx": float("nan")}, "expected finite numbers"),
+        ({"frames": []}, "expected at least one camera"),
+        ({"frames": {"a": 1}}, "expected 'frames' to be a list"),
+        ({"frames": [{"file_path": "a.png"}]}, r"view a\.png: expected 'transform_matrix', found none"),
+        ({"frames": [{"transform_matrix": [[1, 0], [0, 1]]}]}, "expected a pose of 3x4 or 4x4"),
+        ({"frames": [{"transform_matrix": np.diag([1.0, 1, -1, 1]).tolist()}]}, "found a mirrored"),
+        ({"frames": [{"transform_matrix": np.diag([2.0, 2, 2, 1]).tolist()}]}, "axes are not orthonormal"),
+    ],
+)
+def test_transforms_that_are_refused(tmp_path: Path, tiny: Tiny, change: dict, message: str) -> None:
+    path = save_json(tmp_path / "transforms.json", frames_of(tiny) | change)
+    with pytest.raises(SceneError, match=message):
+        read_cameras(path)
+
+
+def test_zero_distortion_is_a_pinhole(tmp_path: Path, tiny: Tiny) -> None:
+    data = frames_of(tiny) | {"camera_model": "OPENCV", "k1": 0.0, "k2": 0, "p1": 0, "distortion_params": [0, 0]}
+    assert_same(read_cameras(save_json(tmp_path / "transforms.json", data)), tiny)
+
+
+def test_inria_cameras(tmp_path: Path, tiny: Tiny) -> None:
+    write_inria(tmp_path / "cameras.json", tiny)
+    centred = tiny.K.copy()
+    centred[:2, 2] = tiny.width / 2, tiny.height / 2
+    actual = read_cameras(tmp_path)
+    assert_same(actual, tiny, K=centred)
+    assert actual.names == ("2", "10", "11")
+
+
+def test_inria_cameras_with_something_missing(tmp_path: Path) -> None:
+    path = save_json(tmp_path / "cameras.json", [{"img_name": "a", "position": [0, 0, 0], "fx": 3}])
+    with pytest.raises(SceneError, match="view a: missing rotation, fy, width, height"):
+        read_cameras(path)
+
+
+SMOOTH = smooth_scene(40, 30)
+
+
+TURN, SHIFT, SCALE = rotation(0.4, -1.2, 0.7), np.array([1.5, -2.0, 0.5]), 0.3
+
+
+NOTE = "the cameras are moved into the Gaussians' frame by dataparser_transforms.json"
+
+
+def trained(folder: Path, *, move: bool = True) -> Tiny:
+    """Some of the Gaussians in no order, where nerfstudio puts them: X' = s (T [X; 1]); photos beside them."""
+    some = np.random.default_rng(0).permutation(3600)[:2400]
+    gaussians = SMOOTH.gaussians[some]
+    if move:
+        means = SCALE * (gaussians.means.astype(np.float64) @ TURN.T + SHIFT)
+        gaussians = replace(gaussians, means=means.astype(np.float32), scales=SCALE * gaussians.scales)
+    there = replace(SMOOTH, gaussians=gaussians)
+    there.save(folder, cameras=False)
+    write_dataparser(folder)
+    return there
+
+
+def write_dataparser(folder: Path, **changes: object) -> None:
+    matrix = np.concatenate([TURN, SHIFT[:, None]], 1).tolist()
+    (folder / "dataparser_transforms.json").write_text(json.dumps({"transform": matrix, "scale": SCALE} | changes))
+
+
+def assert_moved(folder: Path) -> None:
+    loaded = load_scene(folder)
+    assert isinstance(loaded.scene, UnalignedScene)
+    assert NOTE in loaded.notes
+    centres = SCALE * (SMOOTH.c2w[:, :3, 3] @ TURN.T + SHIFT)
+    assert np.allclose(loaded.scene.cameras.centres, centres)
+    assert np.allclose(loaded.scene.cameras.viewmats[:, :3, :3], SMOOTH.w2c[:, :3, :3] @ TURN.T)
+    assert np.array_equal(loaded.cameras.viewmats, loaded.scene.cameras.viewmats)
+
+
+def test_cameras_of_the_capture_are_moved(tmp_path: Path) -> None:
+    trained(tmp_path)
+    write_colmap_text(tmp_path / "sparse", SMOOTH)
+    assert_moved(tmp_path)
+
+
+def test_poses_that_are_moved_already(tmp_path: Path) -> None:
+    """``transform`` starts from the world before ``applied_transform``, in which the poses no longer are."""
+    trained(tmp_path)
+    applied = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0.25], [0, 0, 0, 1]])
+    data = frames_of(SMOOTH)
+    poses = applied @ SMOOTH.c2w @ FLIP
+    poses[:, :3, 3] *= 2
+    for frame, pose in zip(data["frames"], poses, strict=True):
+        frame["transform_matrix"] = pose.tolist()
+    data |= {"applied_transform": applied[:3].tolist(), "applied_scale": 2.0}
+    (tmp_path / "transforms.json").write_text(json.dumps(data))
+    own = np.eye(4)  # from the saved poses to where nerfstudio puts them, but for its scale of SCALE / 2
+    own[:3, :3] = TURN @ applied[:3, :3].T
+    own[:3, 3] = 2 * (SHIFT - own[:3, :3] @ applied[:3, 3])
+    write_dataparser(tmp_path, transform=(own @ applied)[:3].tolist(), scale=SCALE / 2 * 2)
+    assert_moved(tmp_path)
+
+
+def test_it_is_left_alone_where_it_does_not_help(tmp_path: Path) -> None:
+    trained(tmp_path, move=False)
+    write_colmap_text(tmp_path / "sparse", SMOOTH)
+    loaded = load_scene(tmp_path)
+    assert NOTE not in loaded.notes
+    assert np.allclose(loaded.scene.cameras.viewmats, SMOOTH.w2c)
+
+
+def test_without_it_the_cameras_do_not_see_the_gaussians(tmp_path: Path) -> None:
+    trained(tmp_path)
+    write_colmap_text(tmp_path / "sparse", SMOOTH)
+    (tmp_path / "dataparser_transforms.json").unlink()
+    with pytest.raises(SceneError, match="the cameras see"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("no", "dataparser_transforms.json: expected JSON"),
+        ("{}", "expected 'transform' of 3x4 numbers and 'scale'"),
+        (json.dumps({"transform": [[1, 2], [3, 4]], "scale": 1}), r"found shape \[2, 2\]"),
+        (json.dumps({"transform": np.eye(4).tolist(), "scale": -1}), "found another map"),
+        (json.dumps({"transform": (2 * np.eye(4)).tolist(), "scale": 1}), "found another map"),
+    ],
+)
+def test_a_damaged_file(tmp_path: Path, text: str, message: str) -> None:
+    trained(tmp_path)
+    write_colmap_text(tmp_path / "sparse", SMOOTH)
+    (tmp_path / "dataparser_transforms.json").write_text(text)
+    with pytest.raises(SceneError, match=message):
+        load_scene(tmp_path)

@@ -1,0 +1,80 @@
+"""Cameras and arrays in ``.npz``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_scene import (
+    Tiny,
+    assert_same,
+    write_npz,
+)
+
+from gsmerge.errors import SceneError
+from gsmerge.io import read_cameras
+from gsmerge.io.cameras.npz_files import array_names, read_arrays
+
+
+def test_npz_with_images(tmp_path: Path, tiny: Tiny) -> None:
+    write_npz(tmp_path / "exports/npz/results.npz", tiny)
+    actual = read_cameras(tmp_path)
+    assert_same(actual, tiny, atol=1e-6)
+    assert np.array_equal(actual.images, tiny.images)
+    assert actual.names == ("view 0", "view 1", "view 2")
+
+
+def test_npz_forms(tmp_path: Path, tiny: Tiny) -> None:
+    write_npz(tmp_path / "a.npz", tiny, extrinsics=tiny.w2c, image=None)
+    actual = read_cameras(tmp_path / "a.npz")
+    assert_same(actual, tiny, atol=1e-6)
+    assert actual.images is None
+    centred = np.tile(np.array([[22.0, 0, 10], [0, 22, 7], [0, 0, 1]]), (3, 1, 1))
+    write_npz(tmp_path / "b.npz", tiny, intrinsics=centred, image=None, depth=None)
+    assert_same(read_cameras(tmp_path / "b.npz"), tiny, K=centred, atol=1e-6)
+    write_npz(tmp_path / "c.npz", tiny, image=(tiny.images / 255).astype(np.float32).transpose(0, 3, 1, 2))
+    assert np.array_equal(read_cameras(tmp_path / "c.npz").images, tiny.images)
+
+
+def test_npz_intrinsics_of_another_size_are_scaled(tmp_path: Path, tiny: Tiny) -> None:
+    centred = np.array([[22.0, 0, 10], [0, 21, 7], [0, 0, 1]])
+    original = centred * np.array([[8.1], [8.0], [1]])
+    write_npz(tmp_path / "a.npz", tiny, intrinsics=np.tile(original, (3, 1, 1)))
+    assert_same(read_cameras(tmp_path / "a.npz"), tiny, K=centred, atol=1e-6)
+    normalised = centred / np.array([[20], [14], [1]])
+    write_npz(tmp_path / "b.npz", tiny, intrinsics=np.tile(normalised, (3, 1, 1)))
+    assert_same(read_cameras(tmp_path / "b.npz"), tiny, K=centred, atol=1e-6)
+
+
+def test_npz_that_are_refused(tmp_path: Path, tiny: Tiny) -> None:
+    write_npz(tmp_path / "a.npz", tiny, extrinsics=None, intrinsics=None)
+    with pytest.raises(SceneError, match="missing arrays extrinsics, intrinsics, found"):
+        read_cameras(tmp_path / "a.npz")
+    write_npz(tmp_path / "b.npz", tiny, intrinsics=np.eye(3))
+    with pytest.raises(SceneError, match=r"expected extrinsics \[c,3,4\]"):
+        read_cameras(tmp_path / "b.npz")
+    write_npz(tmp_path / "c.npz", tiny, image=tiny.images[:2])
+    with pytest.raises(SceneError, match=r"expected images \[3,h,w,3\], found \[2, 14, 20, 3\]"):
+        read_cameras(tmp_path / "c.npz")
+    (tmp_path / "d.npz").write_bytes(b"no archive")
+    with pytest.raises(SceneError, match=r"readable \.npz file, found something else"):
+        read_cameras(tmp_path / "d.npz")
+    write_npz(tmp_path / "e.npz", tiny)
+    data = bytearray((tmp_path / "e.npz").read_bytes())
+    data[200:240] = bytes(40)  # in the first array: its checksum no longer fits
+    (tmp_path / "e.npz").write_bytes(data)
+    with pytest.raises(SceneError, match=r"readable \.npz file, found a damaged one"):
+        read_cameras(tmp_path / "e.npz")
+
+
+def test_arrays_are_read_by_name(tmp_path: Path) -> None:
+    arrays = {"a": np.arange(6.0).reshape(2, 3), "b": np.asfortranarray(np.eye(3, 2)), "c": np.array("text")}
+    np.savez_compressed(tmp_path / "a.npz", **arrays, d=np.array([{}]))
+    assert array_names(tmp_path / "a.npz") == {"a", "b", "c", "d"}
+    actual = read_arrays(tmp_path / "a.npz", ("a", "b", "c", "e"))
+    assert actual.keys() == {"a", "b", "c"}
+    assert all(np.array_equal(actual[name], arrays[name]) for name in actual)
+    with pytest.raises(SceneError, match="found objects, which are not read because they could run code"):
+        read_arrays(tmp_path / "a.npz", ("d",))
+    assert array_names(tmp_path / "none.npz") == frozenset()

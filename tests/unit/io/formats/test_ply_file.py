@@ -1,0 +1,105 @@
+"""PLY files are opened with their header checked, and read though they change."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from plyfile import PlyData
+
+from gsmerge.errors import SceneError
+from gsmerge.io import read_ply, write_gaussians
+from gsmerge.io.formats.ply_file import header_counts, open_ply, open_rows
+
+from .test_ply import columns, save
+
+
+@pytest.mark.parametrize("comment", [b"caf\xe9", "caf\N{LATIN SMALL LETTER E WITH ACUTE}".encode(), b"\xff" * 100])
+@pytest.mark.parametrize("text", [True, False])
+def test_comments_may_hold_any_byte(tmp_path: Path, comment: bytes, text: bool) -> None:
+    path = save(tmp_path / "a.ply", columns(), text=text)
+    expected, (head, rows) = read_ply(path).gaussians, path.read_bytes().split(b"element", 1)
+    path.write_bytes(head + b"comment " + comment + b"\nobj_info " + comment + b"\nelement" + rows)
+    scene = read_ply(path)
+    assert np.array_equal(scene.gaussians.means, expected.means)
+    assert all(kept.isascii() for kept in scene.info.comments)
+    path.write_bytes(path.read_bytes().replace(b"float f_dc_0", b"float f_dc_\xe9").replace(b"comment", b"c\xe9mment"))
+    with pytest.raises(SceneError):
+        read_ply(path)
+
+
+@pytest.mark.parametrize("newline", [b"\n", b"\r\n"])
+def test_empty_lines_between_rows_of_text_are_passed_over(tmp_path: Path, newline: bytes) -> None:
+    path = save(tmp_path / "a.ply", columns(), text=True)
+    expected, (head, rows) = read_ply(path).gaussians, path.read_bytes().split(b"end_header\n", 1)
+    spaced = b"\n \t\n" + rows.replace(b"\n", b"\n\n\n") + b"\n\n"
+    path.write_bytes((head + b"end_header\n" + spaced).replace(b"\n", newline))
+    assert np.array_equal(read_ply(path).gaussians.means, expected.means)
+    path.write_bytes((head + b"end_header\n" + b"\n" * 10_000).replace(b"\n", newline))
+    with pytest.raises(SceneError, match="truncated or damaged"):
+        read_ply(path)
+
+
+@pytest.mark.parametrize("packed", [False, True], ids=["plain", "packed"])
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.9])
+def test_a_file_that_shrinks_while_it_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, share: float, packed: bool
+) -> None:
+    """One line, not the signal that reading mapped pages beyond the end would be."""
+    path = tmp_path / ("a.compressed.ply" if packed else "a.ply")
+    if packed:
+        write_gaussians(path, read_ply(save(tmp_path / "b.ply", columns(20_000))).gaussians)
+    else:
+        save(path, columns(20_000))
+    size, parse = path.stat().st_size, PlyData.read
+
+    def parse_then_cut(*arguments: Any, **settings: Any) -> PlyData:
+        data = parse(*arguments, **settings)
+        os.truncate(path, round(share * size))
+        return data
+
+    monkeypatch.setattr(PlyData, "read", parse_then_cut)
+    with pytest.raises(SceneError, match="it became shorter while it was read"):
+        read_ply(path)
+
+
+@pytest.mark.parametrize("block", [slice(0, 7), slice(7, 12_345), slice(12_345, 20_000), slice(None)], ids=str)
+def test_rows_are_those_of_the_file(tmp_path: Path, block: slice) -> None:
+    rows, path = columns(20_000), tmp_path / "a.ply"
+    stored = open_ply(save(path, rows))["vertex"].data
+    assert isinstance(stored, np.memmap)
+    for some in (stored, rows):  # of no file: as they are
+        with open_rows(path, some) as read:
+            np.testing.assert_array_equal(read(block), rows[block])
+
+
+@pytest.mark.skipif(not Path("/proc/self/smaps").exists(), reason="needs Linux")
+def test_a_file_that_was_read_takes_no_memory(tmp_path: Path) -> None:
+    path = save(tmp_path / "large.ply", columns(100_000))
+    stored = open_ply(path)["vertex"].data
+    with open_rows(path, stored) as read:
+        assert float(read(slice(None))["x"].sum()) != 0
+    assert resident(stored.filename) < 0.1 * stored.nbytes
+
+
+def resident(path: str) -> int:
+    """Bytes of a mapped file that are in this process's memory."""
+    total, inside = 0, False
+    for line in Path("/proc/self/smaps").read_text().splitlines():
+        if not line.split(":")[0].isalpha() and "-" in line.split()[0]:
+            inside = line.endswith(str(path))
+        elif inside and line.startswith("Rss:"):
+            total += 1024 * int(line.split()[1])
+    return total
+
+
+def test_what_a_header_promises(tmp_path: Path) -> None:
+    assert header_counts(save(tmp_path / "a.ply", columns(7))) == (7, 0)
+    assert header_counts(save(tmp_path / "b.ply", columns(9, num_rest=45))) == (9, 45)
+    assert header_counts(save(tmp_path / "c.ply", columns(3, num_rest=9), text=True)) == (3, 9)
+    (tmp_path / "d.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nend_header\nelement vertex 5\n")
+    assert header_counts(tmp_path / "d.ply") == (0, 0)
+    assert header_counts(tmp_path / "none.ply") == (0, 0)

@@ -1,0 +1,139 @@
+"""``.sog``: textures without loss, and codebooks and palettes that stand for many values."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import scenes
+
+from gsmerge import Gaussians
+from gsmerge.cli import main
+from gsmerge.errors import SceneError
+from gsmerge.io import read_gaussians, write_gaussians
+from gsmerge.io.formats.sog import fit_codebook, fit_palette, nearest_codes, sog_bytes
+
+from .slow_readers import corners, drawn
+
+
+@pytest.fixture(scope="module")
+def gaussians() -> Gaussians:
+    return drawn(scenes.make_scene(scenes.room(), scenes.arc(3, 96, 72)), 3)
+
+
+def test_sog_keeps_what_is_transparent_or_opaque(tmp_path: Path) -> None:
+    """Where every alpha is 255, or 0, WebP stores no alpha, or no colours."""
+    for opacity in (0.0, 1.0):
+        one = replace(corners(), opacities=np.full(3, opacity, np.float32))
+        write_gaussians(tmp_path / "a.sog", one, overwrite=True)
+        actual = read_gaussians(tmp_path / "a.sog").gaussians
+        np.testing.assert_array_equal(actual.opacities, one.opacities)
+        assert np.isfinite(actual.sh0).all()
+
+
+def test_sog_textures_lose_nothing(gaussians: Gaussians) -> None:
+    """Written again, what is read gives the same textures but for the rounding of rotations."""
+    with zipfile.ZipFile(io.BytesIO(sog_bytes(gaussians))) as archive:
+        meta = json.loads(archive.read("meta.json"))
+        quats, labels = (
+            cv2.imdecode(np.frombuffer(archive.read(name), np.uint8), cv2.IMREAD_UNCHANGED)
+            for name in ("quats.webp", "shN_labels.webp")
+        )
+    assert set(np.unique(quats.reshape(-1, 4)[: len(gaussians), 3])) <= {252, 253, 254, 255}
+    places = labels.reshape(-1, 3)[: len(gaussians), ::-1].astype(int) @ (1, 256, 0)
+    np.testing.assert_array_equal(places, np.arange(len(gaussians)))
+    assert (meta["count"], meta["shN"]["bands"], len(meta["shN"]["codebook"])) == (len(gaussians), 3, 256)
+
+
+def test_a_codebook_is_nearly_the_best_one() -> None:
+    """Of a normal distribution, 256 codes at best leave pi sqrt(3) / 2 / 256^2 of the variance (Panter and Dite)."""
+    values = np.random.default_rng(0).normal(size=200_000)
+    codebook = fit_codebook(values)
+    error = ((values - codebook[nearest_codes(codebook, values)]) ** 2).mean()
+    assert error < 1.05 * np.pi * np.sqrt(3) / 2 / 256**2
+
+
+def test_a_codebook_has_room_for_what_is_far_away() -> None:
+    values = np.concatenate([np.random.default_rng(0).normal(size=10_000), [-400.0, 1e4]])
+    codebook = fit_codebook(values)
+    assert (codebook.shape, codebook[0], codebook[-1]) == ((256,), -400, 1e4)
+    assert (np.diff(codebook) >= 0).all()
+
+
+@pytest.mark.parametrize("values", [[], [3.0], [1.0, 2.0, 2.0]])
+def test_few_values_are_their_own_codes(values: list[float]) -> None:
+    codebook = fit_codebook(np.array(values))
+    np.testing.assert_array_equal(codebook[nearest_codes(codebook, np.array(values))], values)
+    assert codebook.shape == (256,)
+
+
+def test_a_palette_stands_for_all_vectors() -> None:
+    rng = np.random.default_rng(0)
+    centres = rng.normal(size=(16, 9))
+    vectors = centres[rng.integers(0, 16, 1000)] + rng.normal(0, 1e-3, (1000, 9))
+    palette, labels = fit_palette(vectors, 6)
+    assert palette.shape == (64, 9)
+    assert np.bincount(labels, minlength=64).min() >= 1000 // 64
+    spread = np.abs(vectors - vectors.mean(0)).mean()
+    assert np.abs(vectors - palette[labels]).mean() < spread / 4
+    few, own = fit_palette(vectors, 10)
+    np.testing.assert_array_equal(few[own], vectors)
+
+
+def sog_with(change: Callable[[dict[str, Any], dict[str, bytes]], None]) -> bytes:
+    """A .sog of three Gaussians whose meta.json and files were changed."""
+    with zipfile.ZipFile(io.BytesIO(sog_bytes(corners()))) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    meta = json.loads(files.pop("meta.json"))
+    change(meta, files)
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as archive:
+        for name, data in {**files, "meta.json": json.dumps(meta).encode()}.items():
+            archive.writestr(name, data)
+    return content.getvalue()
+
+
+def webp(height: int, width: int, *settings: int) -> bytes:
+    return cv2.imencode(".webp", np.zeros((height, width, 3), np.uint8), settings)[1].tobytes()
+
+
+LOSSLESS = (cv2.IMWRITE_WEBP_QUALITY, 101)
+DAMAGED = {
+    "empty": b"",
+    "text": b"PK\3\4 and no more",
+    "cut": sog_bytes(corners())[:-9],
+    "old": sog_with(lambda meta, files: meta.pop("version") and None),
+    "list": sog_with(lambda meta, files: meta.update(version=[2])),
+    "promise": sog_with(lambda meta, files: meta.update(count=10**18)),
+    "count": sog_with(lambda meta, files: meta.update(count=17)),
+    "word": sog_with(lambda meta, files: meta.update(count="three\nlines")),
+    "absent": sog_with(lambda meta, files: files.pop("quats.webp") and None),
+    "outside": sog_with(lambda meta, files: meta["quats"].update(files=["../../etc/passwd"])),
+    "codes": sog_with(lambda meta, files: meta["sh0"].update(codebook=[0.5])),
+    "huge": sog_with(lambda meta, files: meta["means"].update(mins=[10**400] * 3)),
+    "nan": sog_with(lambda meta, files: meta["means"].update(mins=[float("nan")] * 3)),
+    "lossy": sog_with(lambda meta, files: files.update({"scales.webp": webp(4, 4, cv2.IMWRITE_WEBP_QUALITY, 50)})),
+    "pixels": sog_with(lambda meta, files: files.update({"scales.webp": webp(4096, 4096, *LOSSLESS)})),
+    "mode": sog_with(lambda meta, files: files.update({"quats.webp": files["sh0.webp"]})),
+    "header": sog_with(lambda meta, files: files.update({"scales.webp": files["scales.webp"][:25]})),
+    "harmonics": sog_with(lambda meta, files: meta.update(shN={"count": 10**9, "bands": 3, "files": ["a", "b"]})),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGED)
+def test_damage_is_one_line(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / f"{name}.sog"
+    path.write_bytes(DAMAGED[name])
+    with pytest.raises(SceneError):
+        read_gaussians(path)
+    assert main(["inspect", str(path)]) == 3
+    captured = capsys.readouterr()
+    assert (captured.out, captured.err.count("\n")) == ("", 1)

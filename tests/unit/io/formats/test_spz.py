@@ -1,0 +1,194 @@
+"""``.spz`` of all versions: what Niantic's own program writes, what this one writes, damage, and a missing library."""
+
+from __future__ import annotations
+
+import gzip
+import struct
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsmerge import Gaussians
+from gsmerge.cli import main
+from gsmerge.errors import SceneError, UsageError
+from gsmerge.io import kept_comments, lost_harmonics, read_gaussians, write_gaussians
+from gsmerge.io.formats.spz import spz_bytes
+
+from .slow_readers import corners
+
+zstandard = pytest.importorskip("zstandard")
+
+# Two Gaussians of degree 1 as @adobe/spz 0.2.3 writes them, which is Niantic's library for browsers
+NIANTIC = bytes.fromhex(
+    "4e4753500400000002000000010c0006200000000000000000000000000000001b0000000000000012000000000000000b00"
+    "00000000000002000000000000000f0000000000000006000000000000000f00000000000000060000000000000011000000"
+    "0000000008000000000000001b00000000000000120000000000000028b52ffd201291000000180000e0ff00040000000000"
+    "00000080ff28b52ffd2002110000ff3328b52ffd2006310000a6805980938028b52ffd2006310000a0908070605028b52ffd"
+    "2008410000000000c069a5953628b52ffd2012910000a08080a08080a080808040c08040c08040c0"
+)
+
+
+SIZES = slice(32, 32 + 16 * 6)  # the table of a file with harmonics
+
+
+def some(degree: int, count: int = 50) -> Gaussians:
+    rng = np.random.default_rng(degree)
+    quats = rng.normal(size=(count, 4))
+    columns = (
+        rng.normal(size=(count, 3)),
+        quats / np.linalg.norm(quats, axis=1, keepdims=True),
+        rng.uniform(0.01, 0.1, (count, 3)),
+        rng.uniform(size=count),
+        rng.normal(size=(count, 1, 3)),
+        rng.uniform(-0.5, 0.5, (count, (degree + 1) ** 2 - 1, 3)),
+    )
+    return Gaussians(*(column.astype(np.float32) for column in columns))
+
+
+def columns_of(content: bytes) -> tuple[tuple[int, ...], bytes]:
+    """Numbers of the header of a file of version 4, and all its columns."""
+    *header, num_streams, start = struct.unpack_from("<3I4BI12x", content)
+    sizes = [struct.unpack_from("<QQ", content, start + 16 * i) for i in range(num_streams)]
+    at, parts = start + 16 * num_streams, []
+    for packed, size in sizes:
+        parts.append(zstandard.ZstdDecompressor().decompress(content[at : at + packed]))
+        assert len(parts[-1]) == size
+        at += packed
+    assert at == len(content)
+    return (*header, num_streams), b"".join(parts)
+
+
+def test_what_niantic_writes(tmp_path: Path) -> None:
+    (tmp_path / "a.spz").write_bytes(NIANTIC)
+    ply = read_gaussians(tmp_path / "a.spz")
+    actual = ply.gaussians
+    assert ply.info.layout == ".spz version 4, SH degree 1"
+    np.testing.assert_array_equal(actual.means, [[1.5, -2, 0.25], [0, 0, -8]])
+    np.testing.assert_allclose(np.log(actual.scales), [[0, -1, -2], [-3, -4, -5]], atol=1e-5)
+    np.testing.assert_allclose(actual.opacities, [1, 0.2])
+    np.testing.assert_allclose(actual.sh0[:, 0], [[1, 0, -1], [0, 0.5, 0]], atol=0.02)
+    np.testing.assert_allclose(
+        np.abs(actual.quats @ [[1, 0.5], [0, 0.5], [0, -0.5], [0, 0.5]]).diagonal(), 1, atol=2e-3
+    )
+    np.testing.assert_allclose(actual.shN[:, 1], [[0.25, 0, 0], [0, -0.5, 0.5]])
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_older_spz(version: int, tmp_path: Path) -> None:
+    position = struct.pack("<3e", 1.5, -2, 0.25) if version == 1 else b"".join(
+        int(v * 4096).to_bytes(3, "little", signed=True) for v in (1.5, -2, 0.25)
+    )  # fmt: skip
+    half = round((0.5**0.5 + 1) * 127.5)
+    rest = bytes([255, 128, 128, 128, 160, 144, 128, half, 128, 128])
+    data = struct.pack("<3I4B", 0x5053474E, version, 1, 0, 12, 0, 0) + position + rest
+    (tmp_path / "a.spz").write_bytes(gzip.compress(data))
+    actual = read_gaussians(tmp_path / "a.spz").gaussians
+    np.testing.assert_allclose(actual.means[0], (1.5, -2, 0.25))
+    np.testing.assert_allclose(actual.quats[0], (0.5**0.5, 0.5**0.5, 0, 0), atol=0.01)
+    np.testing.assert_allclose(actual.scales[0], np.exp((0.0, -1, -2)), rtol=1e-6)
+    assert actual.opacities[0] == 1
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_columns_are_those_of_version_3(degree: int) -> None:
+    older = gzip.decompress(spz_bytes(some(degree)))
+    header, columns = columns_of(spz_bytes(some(degree), version=4, mip=True))
+    assert columns == older[16:]
+    fraction = older[13]
+    assert header == (0x5053474E, 4, 50, degree, fraction, 1, 6 if degree else 5)
+
+
+def test_harmonics_of_degree_4(tmp_path: Path) -> None:
+    path, gaussians = tmp_path / "a.spz", some(4)
+    write_gaussians(path, gaussians, spz_version=4, comments=["SplatRenderMode: mip"])
+    ply = read_gaussians(path)
+    assert ply.info.bytes_by_attribute["shN"] == 72 * len(gaussians)
+    assert float(np.abs(ply.gaussians.shN - gaussians.shN).max()) <= 8.5 / 128
+    np.testing.assert_allclose(ply.gaussians.means, gaussians.means, atol=1e-4)
+    assert list(kept_comments(ply.info)) == ["SplatRenderMode: mip"]
+    assert lost_harmonics("a.spz", 4, 4) is None
+    assert "above degree 3" in str(lost_harmonics("a.spz", 4))
+
+
+def test_extensions_are_passed_over(tmp_path: Path) -> None:
+    content, more = spz_bytes(some(1), version=4), struct.pack("<II4x", 0xADBE0003, 4)
+    moved = content[:16] + struct.pack("<I", 32 + len(more)) + content[20:32] + more + content[32:]
+    for name, data in {"plain": content, "more": moved}.items():
+        (tmp_path / f"{name}.spz").write_bytes(data)
+    plain, extended = (read_gaussians(tmp_path / f"{name}.spz").gaussians for name in ("plain", "more"))
+    for name, array in vars(plain).items():
+        np.testing.assert_array_equal(getattr(extended, name), array)
+
+
+def spz_with(**changes: int) -> bytes:
+    names = ("magic", "version", "count", "degree", "fraction", "flags", "zero")
+    data = gzip.decompress(spz_bytes(corners()))
+    header = dict(zip(names, struct.unpack_from("<3I4B", data), strict=True)) | changes
+    return gzip.compress(struct.pack("<3I4B", *header.values()) + data[16:])
+
+
+WHOLE = spz_bytes(some(1), version=4)
+
+
+OLDER = {
+    "empty": b"",
+    "text": b"ply\n",
+    "cut short": spz_bytes(corners())[:40],
+    "short": gzip.compress(gzip.decompress(spz_bytes(corners()))[:-1]),
+    "other": spz_with(magic=1),
+    "later": b"NGSP\4\0\0\0",
+    "another version": spz_with(version=9),
+    "another degree": spz_with(degree=4),
+    "fraction": spz_with(fraction=200),
+    "no count": spz_with(count=0),
+    "a promise": spz_with(count=2**32 - 1),
+    "more": spz_with(count=4),
+}
+DAMAGED = OLDER | {
+    "header": WHOLE[:15],
+    "table": WHOLE[:60],
+    "cut": WHOLE[:-3],
+    "promise": WHOLE[:8] + b"\xff\xff\xff\xff" + WHOLE[12:],
+    "none": WHOLE[:8] + bytes(4) + WHOLE[12:],
+    "degree": WHOLE[:12] + b"\5" + WHOLE[13:],
+    "streams": WHOLE[:15] + b"\3" + WHOLE[16:],
+    "far": WHOLE[:16] + b"\xff\xff\xff\x7f" + WHOLE[20:],
+    "sizes": WHOLE[:32] + struct.pack("<QQ", 2**63, 450) + WHOLE[48:],
+    "larger": WHOLE[:40] + struct.pack("<Q", 2**40) + WHOLE[48:],
+    "stream": WHOLE[: SIZES.stop] + b"none" + WHOLE[SIZES.stop + 4 :],
+    "frame": WHOLE[: SIZES.stop] + b"\x28\xb5\x2f\xfd\xe0" + b"\xff" * 7 + b"\x00" + WHOLE[SIZES.stop + 13 :],
+    "longer": WHOLE[:32] + struct.pack("<QQ", len(zeros := zstandard.compress(bytes(10**6))), 450)
+    + WHOLE[48 : SIZES.stop] + zeros + WHOLE[SIZES.stop + struct.unpack_from("<Q", WHOLE, 32)[0] :],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", DAMAGED)
+def test_damage_is_one_line(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / f"{name}.spz"
+    path.write_bytes(DAMAGED[name])
+    with pytest.raises(SceneError, match="spz"):
+        read_gaussians(path)
+    assert main(["inspect", str(path)]) == 3
+    captured = capsys.readouterr()
+    assert (captured.out, captured.err.count("\n")) == ("", 1)
+
+
+def test_another_version_is_refused() -> None:
+    with pytest.raises(ValueError, match="spz_version: expected 3 or 4, got 2"):
+        spz_bytes(some(0), version=2)
+
+
+def test_without_the_library(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.spz"
+    path.write_bytes(NIANTIC)
+    monkeypatch.setitem(sys.modules, "zstandard", None)
+    with pytest.raises(UsageError, match=r'pip install "zstandard'):
+        write_gaussians(tmp_path / "b.spz", some(0), spz_version=4)
+    assert main(["inspect", str(path)]) == 2
+    assert "zstandard is not installed; pip install" in capsys.readouterr().err
+    write_gaussians(tmp_path / "b.spz", some(0))
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["a.spz", "b.spz"]

@@ -1,0 +1,309 @@
+from __future__ import annotations
+
+import errno
+import itertools
+import os
+import signal
+import stat
+import subprocess
+import sys
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gsmerge.errors import SceneError
+from gsmerge.io import atomic, atomic_output, atomic_outputs
+from gsmerge.io.atomic import remove_stale, temporary_path
+
+
+def write_half_and_fail(path: Path, error: BaseException) -> None:
+    with atomic_output(path, overwrite=True) as temporary:
+        temporary.write_text("half")
+        raise error
+
+
+def write_while_another_does(path: Path) -> None:
+    with atomic_output(path) as temporary:
+        temporary.write_text("ours")
+        path.write_text("theirs")
+
+
+def test_a_finished_file_takes_its_name(tmp_path: Path) -> None:
+    with atomic_output(tmp_path / "out.png") as temporary:
+        assert temporary.parent == tmp_path
+        assert temporary.suffix == ".png"
+        assert not (tmp_path / "out.png").exists()
+        temporary.write_text("done")
+    assert [p.name for p in tmp_path.iterdir()] == ["out.png"]
+    assert (tmp_path / "out.png").read_text() == "done"
+
+
+@pytest.mark.parametrize("error", [RuntimeError("boom"), KeyboardInterrupt()])
+@pytest.mark.parametrize("earlier", [[], ["out.txt"]])
+def test_a_failure_in_the_middle_leaves_what_was_there(
+    tmp_path: Path, error: BaseException, earlier: list[str]
+) -> None:
+    for name in earlier:
+        (tmp_path / name).write_text("old")
+    with pytest.raises(type(error)):
+        write_half_and_fail(tmp_path / "out.txt", error)
+    assert [path.name for path in tmp_path.iterdir()] == earlier
+    assert all((tmp_path / name).read_text() == "old" for name in earlier)
+
+
+def test_an_existing_file_needs_overwrite(tmp_path: Path) -> None:
+    target = tmp_path / "out.txt"
+    target.write_text("old")
+    with pytest.raises(SceneError, match="exists already"), atomic_output(target) as temporary:
+        temporary.write_text("new")
+    assert target.read_text() == "old"
+    with atomic_output(target, overwrite=True) as temporary:
+        temporary.write_text("new")
+    assert target.read_text() == "new"
+
+
+def test_a_file_that_appears_meanwhile_is_kept(tmp_path: Path) -> None:
+    target = tmp_path / "out.txt"
+    with pytest.raises(SceneError, match="exists already"):
+        write_while_another_does(target)
+    assert [p.name for p in tmp_path.iterdir()] == ["out.txt"]
+    assert target.read_text() == "theirs"
+
+
+def test_a_missing_folder_and_a_folder_as_target_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(SceneError, match="does not exist"), atomic_output(tmp_path / "no" / "out.txt"):
+        pass
+    with pytest.raises(SceneError, match="found a folder"), atomic_output(tmp_path, overwrite=True):
+        pass
+
+
+def test_what_a_writer_inside_says_names_the_file_that_was_asked_for(tmp_path: Path) -> None:
+    """Writers that are atomic themselves know the temporary file only."""
+    with pytest.raises(SceneError) as raised, atomic_output(tmp_path / "out.ply") as temporary:
+        raise SceneError(temporary, "could not be written (No space left on device)")
+    assert str(raised.value) == f"{tmp_path / 'out.ply'}: could not be written (No space left on device)"
+    with pytest.raises(SceneError, match="other"), atomic_output(tmp_path / "out.ply"):
+        raise SceneError(tmp_path / "other.ply", "no such file")
+
+
+def left_by(pid: int, path: Path) -> Path:
+    """The temporary file of an output that a process has left."""
+    ours = temporary_path(path)
+    return ours.with_name(ours.name.replace(f"-{os.getpid()}-", f"-{pid}-"))
+
+
+def dead_process() -> int:
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    return process.pid
+
+
+@pytest.mark.skipif(os.name == "nt", reason="processes as POSIX has them")
+def test_what_dead_processes_left_is_removed_and_what_others_write_is_not(tmp_path: Path) -> None:
+    dead = [left_by(dead_process(), tmp_path / name) for name in ("out.ply", "other name.tar.gz", "no suffix")]
+    kept = [
+        left_by(os.getppid(), tmp_path / "out.ply"),
+        left_by(1, tmp_path / "out.ply"),
+        tmp_path / ".out-00112233.ply",
+    ]
+    elsewhere = [left_by(dead_process(), tmp_path / name) for name in ("out.ply", "old.ply")]
+    recent, old = [path.with_name(path.name.replace(atomic._place(), "00000000")) for path in elsewhere]
+    for path in (*dead[:2], *kept, recent, old):
+        path.touch()
+    os.utime(old, (0, 0))
+    dead[2].mkdir()
+    (dead[2] / "file").touch()
+    with atomic_output(tmp_path / "out.ply"):
+        pass
+    assert sorted(tmp_path.iterdir()) == sorted([*kept, recent, tmp_path / "out.ply"])
+
+
+def write_both(folder: Path, second: str, *, fail: bool = False) -> None:
+    with atomic_outputs(overwrite=True) as add:
+        add(folder / "a.txt").write_text("new")
+        temporary = add(folder / second)
+        temporary.write_text("new")
+        if fail:
+            raise OSError(errno.ENOSPC, "No space left on device", str(temporary))
+
+
+def test_several_files_are_all_there_or_none(tmp_path: Path) -> None:
+    (tmp_path / "b.txt").write_text("old")
+    with pytest.raises(SceneError, match=r"b\.txt: could not be written"):
+        write_both(tmp_path, "b.txt", fail=True)
+    with pytest.raises(SceneError, match="does not exist"):
+        write_both(tmp_path, "none/b.txt")
+    assert {p.name: p.read_text() for p in tmp_path.iterdir()} == {"b.txt": "old"}
+    write_both(tmp_path, "b.txt")
+    assert {p.name: p.read_text() for p in tmp_path.iterdir()} == {"a.txt": "new", "b.txt": "new"}
+
+
+def fail_at(monkeypatch: pytest.MonkeyPatch, call: int, error: BaseException) -> None:
+    """Let the rename of that number fail, counted from 0."""
+    replace, calls = os.replace, itertools.count()
+
+    def rename(*paths: Any) -> None:
+        if next(calls) == call:
+            raise error
+        replace(*paths)
+
+    monkeypatch.setattr(os, "replace", rename)
+
+
+def write_three(folder: Path) -> None:
+    with atomic_outputs(overwrite=True) as add:
+        for name in ("a.txt", "b.txt", "c.txt"):
+            add(folder / name).write_text("new")
+
+
+def contents(folder: Path) -> list[str | None]:
+    """The texts of the three files, after a look that nothing else is there."""
+    names = ["a.txt", "b.txt", "c.txt"]
+    assert {path.name for path in folder.iterdir()} <= set(names)
+    return [(folder / name).read_text() if (folder / name).exists() else None for name in names]
+
+
+@pytest.mark.parametrize("call", [0, 1, 2])
+def test_a_rename_that_fails_leaves_each_file_old_or_new(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: int
+) -> None:
+    for name in ("a.txt", "b.txt"):
+        (tmp_path / name).write_text("old")
+    fail_at(monkeypatch, call, OSError(errno.EIO, "Input/output error"))
+    with pytest.raises(SceneError, match="could not be written"):
+        write_three(tmp_path)
+    assert contents(tmp_path) == ["new"] * call + ["old", "old", None][call:]
+
+
+@pytest.mark.parametrize("call", [0, 1, 2])
+def test_an_interrupt_between_renames_waits_for_the_last(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: int
+) -> None:
+    (tmp_path / "a.txt").write_text("old")
+    fail_at(monkeypatch, call, KeyboardInterrupt())
+    with pytest.raises(KeyboardInterrupt):
+        write_three(tmp_path)
+    assert contents(tmp_path) == ["new"] * 3
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="signals as POSIX has them")
+@pytest.mark.parametrize("call", range(4))
+def test_a_kill_between_renames_leaves_each_file_old_or_new(tmp_path: Path, call: int) -> None:
+    """A kill before each of three renames, and after the last."""
+    for name in ("a.txt", "b.txt"):
+        (tmp_path / name).write_text("old")
+    program = f"""
+import itertools, os, signal
+from pathlib import Path
+from gsmerge.io import atomic_outputs
+calls, replace = itertools.count(), os.replace
+def kill_or_rename(*paths):
+    if next(calls) == {call}:
+        os.kill(os.getpid(), signal.SIGKILL)
+    replace(*paths)
+os.replace = kill_or_rename
+with atomic_outputs(overwrite=True) as add:
+    for name in ("a.txt", "b.txt", "c.txt"):
+        add(Path({str(tmp_path)!r}, name)).write_text("new")
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, check=False)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    remove_stale(tmp_path)
+    assert contents(tmp_path) == ["new"] * call + ["old", "old", None][call:]
+
+
+def test_a_writer_inside_writes_the_same_file(tmp_path: Path) -> None:
+    with atomic_output(tmp_path / "a.txt") as outer, atomic_output(outer, overwrite=True) as inner:
+        assert inner == outer
+        inner.write_text("new")
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+
+
+@pytest.mark.parametrize("inside", [False, True])
+def test_a_disk_error_names_the_file_that_was_asked_for(tmp_path: Path, inside: bool) -> None:
+    with (
+        pytest.raises(SceneError, match=r"out\.txt: could not be written \(No space left"),
+        atomic_output(tmp_path / "out.txt") if inside else nullcontext(tmp_path / "out.txt") as path,
+    ):
+        write_half_and_fail(path, OSError(errno.ENOSPC, "No space left on device"))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_data_is_on_the_disk_before_the_name_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    events: list[str] = []
+    flush, replace = os.fsync, os.replace
+
+    def note_flush(descriptor: int) -> None:
+        events.append("folder" if stat.S_ISDIR(os.fstat(descriptor).st_mode) else "file")
+        flush(descriptor)
+
+    def note_rename(*paths: Any) -> None:
+        events.append("rename")
+        replace(*paths)
+
+    monkeypatch.setattr(os, "fsync", note_flush)
+    monkeypatch.setattr(os, "replace", note_rename)
+    with atomic_outputs() as add:
+        for name in ("a.txt", "b.txt"):
+            add(tmp_path / name).write_text("new")
+    assert events == ["file", "file", "rename", "rename", "folder"]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links as POSIX has them")
+def test_a_link_stays_one_and_what_it_leads_to_is_replaced(tmp_path: Path) -> None:
+    (tmp_path / "far").mkdir()
+    (tmp_path / "far" / "file.txt").write_text("old")
+    for name, target in (("link.txt", "far/file.txt"), ("dangling.txt", "far/new.txt")):
+        (tmp_path / name).symlink_to(target)
+        with pytest.raises(SceneError, match="exists already"), atomic_output(tmp_path / name):
+            pass
+        with atomic_output(tmp_path / name, overwrite=True) as temporary:
+            temporary.write_text("new")
+        assert (tmp_path / name).is_symlink()
+        assert (tmp_path / target).read_text() == "new"
+    assert len(list(tmp_path.rglob("*"))) == 5
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")
+def test_pipes_and_devices_are_not_replaced(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", Path("/dev/null")):
+        with pytest.raises(SceneError, match="found a pipe or a device"), atomic_output(path, overwrite=True):
+            pass
+
+
+@pytest.mark.parametrize("name", ["a" * 251 + ".ply", "\N{SNOWMAN}" * 83 + ".ply", "a." + "b" * 250, "." + "a" * 254])
+def test_names_as_long_as_there_are(tmp_path: Path, name: str) -> None:
+    with atomic_output(tmp_path / name) as temporary:
+        temporary.write_text("new")
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+    with pytest.raises(SceneError, match="File name too long"), atomic_output(tmp_path / ("a" * 300)):
+        pass
+
+
+def test_an_error_of_the_caller_stays_what_it_is(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError), atomic_output(tmp_path / "out.txt"):
+        (tmp_path / "no such input").read_text()
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="needs POSIX permissions")
+def test_an_unwritable_folder_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> int:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(os, "open", refuse)  # permissions mean nothing to root, which tests may run as
+    with pytest.raises(SceneError, match=r"cannot be written \(Permission denied\)"), atomic_output(tmp_path / "o.ply"):
+        pass
+    monkeypatch.undo()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_files_get_the_usual_permissions(tmp_path: Path) -> None:
+    (tmp_path / "plain").touch()
+    with atomic_output(tmp_path / "atomic"):
+        pass
+    assert (tmp_path / "atomic").stat().st_mode == (tmp_path / "plain").stat().st_mode

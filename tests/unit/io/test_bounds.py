@@ -1,0 +1,79 @@
+"""Limits on what a file may ask for."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from gsmerge.errors import SceneError
+from gsmerge.io import bounds
+from gsmerge.io.bounds import check_file, check_pixels, read_table, read_text
+from gsmerge.io.content_hash import content_hash
+from gsmerge.io.photos import list_images
+
+
+def test_images_beyond_all_use_are_refused(tmp_path: Path) -> None:
+    check_pixels("a", 8192, 8192)
+    with pytest.raises(SceneError, match="at most 67 million pixels an image, found 8193 x 8192"):
+        check_pixels("a", 8193, 8192)
+    with pytest.raises(SceneError, match="positive image size"):
+        check_pixels("a", 0, 5)
+
+
+def test_only_files_are_read(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(SceneError, match="found a pipe or a device"):
+        check_file(tmp_path / "pipe")
+    with pytest.raises(SceneError, match="found a folder"):
+        check_file(tmp_path)
+    with pytest.raises(SceneError, match="no such file"):
+        check_file(tmp_path / "none")
+    (tmp_path / "a").write_bytes(b"\xef\xbb\xbfab")
+    assert check_file(tmp_path / "a") == 5
+    assert read_text(tmp_path / "a") == "ab"
+    with pytest.raises(SceneError, match="of at most 0 MiB"):
+        read_text(tmp_path / "a", 4)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links as POSIX has them")
+def test_folders_of_photos_have_an_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("a/1.png", "a/b/2.png"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    (tmp_path / "a" / "up").symlink_to(tmp_path)
+    (tmp_path / "images").symlink_to("a")
+    assert [path.name for path in list_images(tmp_path / "images")] == ["1.png", "2.png"]
+    monkeypatch.setattr(bounds, "MAX_FILES", 3)
+    for read in (list_images, lambda folder: content_hash([folder])):
+        with pytest.raises(SceneError, match=r"more than 3 files and folders; name the folder .* with --images"):
+            read(tmp_path / "images")
+
+
+def test_json_and_toml(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text('{"steps": 3, "network": {"width": 16}}')
+    assert read_table(tmp_path / "a.json") == {"steps": 3, "network": {"width": 16}}
+    (tmp_path / "a.toml").write_text("steps = 3\n[network]\nwidth = 16\n")
+    if sys.version_info >= (3, 11):
+        assert read_table(tmp_path / "a.toml") == {"steps": 3, "network": {"width": 16}}
+    else:
+        with pytest.raises(SceneError, match="JSON"):
+            read_table(tmp_path / "a.toml")
+
+
+@pytest.mark.parametrize("text", ["[1]", "{", "3", "[" * 100_000, "\x00"])
+def test_what_is_no_table_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "a.json"
+    path.write_text(text)
+    with pytest.raises(SceneError, match="expected") as caught:
+        read_table(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+    (tmp_path / "bytes.json").write_bytes(b"\xff\xfe\x00")
+    for name in ("nowhere.json", "bytes.json", "."):
+        with pytest.raises(SceneError, match="can be read"):
+            read_table(tmp_path / name)

@@ -1,0 +1,256 @@
+"""Photos are found by name, decoded, and refused silently where they are damaged."""
+
+from __future__ import annotations
+
+import struct
+import weakref
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from tiny_scene import Tiny, write_images
+
+from gsmerge.errors import SceneError
+from gsmerge.io import photos, read_images
+from gsmerge.io.photos import image_size, match_images, natural_key
+from gsmerge.runtime.threads import use_threads
+
+
+def touch(folder: Path, *names: str) -> Path:
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).touch()
+    return folder
+
+
+def test_values_and_colour_order(tmp_path: Path, tiny: Tiny) -> None:
+    write_images(tmp_path, tiny)
+    images = read_images(tmp_path, tiny.names)
+    assert images.dtype == np.float32
+    assert images.shape == (3, 14, 20, 3)
+    assert np.array_equal((images * 255).round(), tiny.images)
+    assert images.max() <= 1
+
+
+@pytest.mark.parametrize("shorten", [
+    lambda n: n, lambda n: Path(n).name, lambda n: Path(n).stem, lambda n: f"images/{n}", lambda n: f"./{n}",
+    lambda n: n.removesuffix(".png"), lambda n: n.replace(".png", ".jpg"), lambda n: n.replace("/", "\\"),
+])  # fmt: skip
+def test_names_with_and_without_folder_and_extension(tmp_path: Path, tiny: Tiny, shorten) -> None:
+    write_images(tmp_path, tiny)
+    order = [2, 0, 1]
+    images = read_images(tmp_path, [shorten(tiny.names[i]) for i in order])
+    assert np.array_equal((images * 255).round(), tiny.images[order])
+
+
+def test_names_with_dots(tmp_path: Path) -> None:
+    touch(tmp_path, "view.0001.png", "view.0002.png")
+    assert [p.name for p in match_images(tmp_path, ["view.0002", "view.0001"])] == ["view.0002.png", "view.0001.png"]
+
+
+def test_the_longest_path_decides(tmp_path: Path) -> None:
+    touch(tmp_path, "left/1.png", "right/1.png")
+    actual = match_images(tmp_path, ["right/1", "left/1.png"])
+    assert [p.parent.name for p in actual] == ["right", "left"]
+    with pytest.raises(SceneError, match=r"expected one image named 1\.png, found 1\.png and 1\.png"):
+        match_images(tmp_path, ["1.png", "left/1.png"])
+
+
+def test_unknown_names_take_the_order_if_the_counts_agree(tmp_path: Path) -> None:
+    touch(tmp_path, "2.png", "10.png", "1.png", "notes.txt", ".hidden.png")
+    actual = match_images(tmp_path, ["view 0", "view 1", "view 2"])
+    assert [p.name for p in actual] == ["1.png", "2.png", "10.png"]
+    with pytest.raises(SceneError, match="expected 2 images, one per camera, found 3 and none for view 0"):
+        match_images(tmp_path, ["view 0", "view 1"])
+    with pytest.raises(SceneError, match="expected 3 images, one per camera, found 3 and none for view 1"):
+        match_images(tmp_path, ["1", "view 1", "2"])
+
+
+def test_a_list_of_files(tmp_path: Path) -> None:
+    touch(tmp_path, "a.png", "b.png")
+    files = [tmp_path / "b.png", tmp_path / "a.png"]
+    assert match_images(files, ["a", "b"]) == files[::-1]
+    assert match_images(files, ["view 0", "view 1"]) == files
+    with pytest.raises(SceneError, match="expected 3 images, one per camera, found 2"):
+        match_images(files, ["a", "b", "c"])
+
+
+def test_one_image_cannot_serve_two_views(tmp_path: Path) -> None:
+    touch(tmp_path, "1.png", "2.png")
+    with pytest.raises(SceneError, match=r"an image of its own for each camera, found 1\.png for two"):
+        match_images(tmp_path, ["left/1.png", "right/1.png"])
+
+
+def test_what_cannot_be_read(tmp_path: Path, tiny: Tiny) -> None:
+    write_images(tmp_path, tiny)
+    (tmp_path / tiny.names[1]).write_text("no image")
+    with pytest.raises(SceneError, match=r"10\.png: expected an image, found a file that cannot be decoded"):
+        read_images(tmp_path, tiny.names)
+    (tmp_path / tiny.names[1]).write_bytes(b"")
+    with pytest.raises(SceneError, match=r"10\.png: expected an image"):
+        read_images(tmp_path, tiny.names)
+    with pytest.raises(SceneError, match="no such folder"):
+        read_images(tmp_path / "none", tiny.names)
+    with pytest.raises(SceneError, match="expected a folder of images, found a file"):
+        read_images(tmp_path / tiny.names[0], tiny.names)
+
+
+def test_images_of_two_sizes_are_both_named(tmp_path: Path, tiny: Tiny) -> None:
+    write_images(tmp_path, tiny)
+    cv2.imwrite(str(tmp_path / tiny.names[2]), np.zeros((7, 10, 3), np.uint8))
+    with pytest.raises(SceneError, match=r"11\.png: .*found 10 x 7 here and 20 x 14 in .*2\.png"):
+        read_images(tmp_path, tiny.names)
+
+
+def test_many_large_photos_are_decoded_one_by_one(tmp_path: Path, tiny: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As those in memory, in every way that photos are used; few at a time."""
+    write_images(tmp_path, tiny)
+    kept = photos.decode_images(photos.match_images(tmp_path, tiny.names))
+    monkeypatch.setattr(photos, "_AT_ONCE", 0)
+    held, most = [0], [0]
+
+    def decode(path: Path, size: tuple[int, int]) -> np.ndarray:
+        image = decode_image(path, size)
+        held[0] += 1
+        most[0] = max(most[0], held[0])
+        weakref.finalize(image, lambda: held.__setitem__(0, held[0] - 1))
+        return image
+
+    decode_image = photos.decode_image
+    monkeypatch.setattr(photos, "decode_image", decode)
+    read = photos.decode_images(photos.match_images(tmp_path, tiny.names))
+    assert isinstance(read, photos.PhotoReader)
+    with use_threads(1):
+        np.testing.assert_array_equal(photos.as_floats(read), photos.as_floats(kept))
+        assert photos.photo_size(read) == photos.photo_size(kept)
+        smaller = photos.resize_to(photos.photo_size(read), (4, 3))
+        expected = smaller.photos(kept)
+        for actual in (smaller.photos(read), photos.keep_photos(smaller.photos(read))):
+            assert photos.photo_size(actual) == (4, 3)
+            np.testing.assert_array_equal(photos.as_floats(actual), photos.as_floats(expected))
+    assert most[0] <= 2
+    with pytest.raises(IndexError):
+        read[len(tiny.names)]
+
+
+def test_a_damaged_photo_among_many_large_ones(tmp_path: Path, tiny: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(photos, "_AT_ONCE", 0)
+    write_images(tmp_path, tiny)
+    path = photos.match_images(tmp_path, tiny.names)[-1]
+    path.write_bytes(path.read_bytes()[:-20])
+    with pytest.raises(SceneError, match="cannot be decoded"):
+        read_images(tmp_path, tiny.names)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".webp", ".tiff", ".ppm", ".pgm"])
+@pytest.mark.parametrize("size", [(7, 5), (300, 20), (64, 513)])
+def test_stored_size_is_that_of_the_decoded_image(suffix: str, size: tuple[int, int], tmp_path: Path) -> None:
+    width, height = size
+    picture = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
+    path = tmp_path / f"a{suffix}"
+    assert cv2.imwrite(str(path), picture[..., 0] if suffix == ".pgm" else picture)
+    assert image_size(path) == size
+
+
+@pytest.mark.parametrize("flags", [[cv2.IMWRITE_JPEG_PROGRESSIVE, 1], [cv2.IMWRITE_JPEG_RST_INTERVAL, 2]])
+def test_stored_size_of_other_jpegs(flags: list[int], tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.jpg"), np.zeros((33, 17, 3), np.uint8), flags)
+    assert image_size(tmp_path / "a.jpg") == (17, 33)
+
+
+def test_stored_size_of_webp_without_loss(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.webp"), np.zeros((33, 17, 3), np.uint8), [cv2.IMWRITE_WEBP_QUALITY, 101])
+    assert image_size(tmp_path / "a.webp") == (17, 33)
+
+
+def test_natural_key_counts_any_number_of_digits() -> None:
+    names = ["a10", "a2", "a02b", "a" + "1" * 5000, "a1", "b0"]
+    assert sorted(names, key=natural_key) == ["a1", "a2", "a02b", "a10", "a" + "1" * 5000, "b0"]
+
+
+PICTURE = np.random.default_rng(0).integers(0, 255, (20, 30, 3), np.uint8)
+
+
+DATA = cv2.imencode(".png", PICTURE[..., ::-1])[1].tobytes()
+
+
+def chunk(kind: bytes, content: bytes, crc: int | None = None) -> bytes:
+    own = zlib.crc32(kind + content) if crc is None else crc
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", own)
+
+
+def beside(more: bytes) -> bytes:
+    """A chunk between the header and the picture."""
+    return DATA[:33] + more + DATA[33:]
+
+
+def read(path: Path, data: bytes) -> np.ndarray:
+    path.write_bytes(data)
+    return (read_images([path], ["a"])[0] * 255).round().astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        DATA,
+        DATA + b"junk",
+        DATA[:-1] + b"x",
+        beside(chunk(b"iCCP", b"ICC\0\0" + zlib.compress(b"no profile"))),
+        beside(chunk(b"tEXt", b"a\0b", crc=0)),
+        beside(chunk(b"gAMA", struct.pack(">I", 220_000))),
+        beside(chunk(b"eXIf", b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0")),
+    ],
+    ids=["sound", "more behind", "end", "profile", "text", "gamma", "orientation"],
+)
+def test_what_is_beside_the_picture_does_not_matter(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], data: bytes
+) -> None:
+    assert np.array_equal(read(tmp_path / "a.png", data), PICTURE)
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("share", [0.05, 0.3, 0.9, 0.999])
+def test_cut_files_are_refused_silently(tmp_path: Path, capfd: pytest.CaptureFixture[str], share: float) -> None:
+    with pytest.raises(SceneError, match="cannot be decoded"):
+        read(tmp_path / "a.png", DATA[: int(share * len(DATA))])
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("place", [10, 20, 30, 40, 500, 1500])
+def test_changed_bytes_are_refused_silently(tmp_path: Path, capfd: pytest.CaptureFixture[str], place: int) -> None:
+    data = bytearray(DATA)
+    data[place] ^= 0x55
+    with pytest.raises(SceneError):
+        read(tmp_path / "a.png", bytes(data))
+    assert capfd.readouterr().err == ""
+
+
+def test_an_unknown_critical_chunk_is_refused_silently(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SceneError, match="cannot be decoded"):
+        read(tmp_path / "a.png", beside(chunk(b"ABCD", b"")))
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("kind", ["grey", "16 bit", "alpha", "palette"])
+def test_kinds_of_png_are_decoded_as_ever(tmp_path: Path, kind: str) -> None:
+    rng, path = np.random.default_rng(1), tmp_path / "a.png"
+    pictures = {
+        "grey": PICTURE[..., 0],
+        "16 bit": rng.integers(0, 65535, (20, 30, 3), np.uint16),
+        "alpha": rng.integers(0, 255, (20, 30, 4), np.uint8),
+    }
+    if kind == "palette":
+        head = struct.pack(">IIBBBBB", 4, 1, 8, 3, 0, 0, 0)
+        parts = (
+            (b"IHDR", head),
+            (b"PLTE", bytes(range(12))),
+            (b"tRNS", b"\0\xff"),
+            (b"IDAT", zlib.compress(b"\0\0\1\2\3")),
+        )
+        data = DATA[:8] + b"".join(chunk(*part) for part in (*parts, (b"IEND", b"")))
+    else:
+        data = cv2.imencode(".png", pictures[kind])[1].tobytes()
+    expected = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    assert np.array_equal(read(path, data), expected[..., ::-1])
