@@ -64,11 +64,12 @@ def free_memory() -> int | None:
 
 def estimate_seconds(jobs: Sequence[Job], options: BatchOptions, schedule: Schedule) -> float:
     """Wall time of scenes, within a factor of about two."""
-    settings, steps = options.settings.resolved(photos=True), options.settings.fit.steps
     total = 0.0
     for job in jobs:
         views = max(1, _num_views(job))
-        seconds = work_seconds(job.num_gaussians, job.num_gaussians / views, settings, photos=True, fit_steps=steps)
+        own = options.settings if job.work is None else job.work.settings
+        flat = own.resolved(photos=True)
+        seconds = work_seconds(job.num_gaussians, job.num_gaussians / views, flat, photos=True, fit_steps=own.fit.steps)
         total += seconds / min(schedule.threads, views)
     return IMPORT_SECONDS * bool(jobs) + total / max(1, min(schedule.jobs, len(jobs)))
 

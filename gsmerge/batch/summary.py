@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import csv
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from gsmerge.batch.locks import LOCK_TIMEOUT, BusyError, scene_lock
 from gsmerge.batch.records import COLUMNS, DONE, FAILED, SKIPPED, SUMMARY, each_record, row_of
@@ -16,6 +16,7 @@ from gsmerge.io import atomic_output
 from gsmerge.io.atomic import remove_leftovers
 from gsmerge.report import csv_cell, human_bytes
 
+T = TypeVar("T")
 MAX_LISTED = 20  # scenes in the table, and failures below it
 
 
@@ -24,6 +25,7 @@ class Totals:
     """A run so far, in a size that does not grow with the number of scenes."""
 
     total: int  # scenes
+    name: str = "scene"  # key of a record that says in messages which one it is
     counts: dict[str, int] = field(default_factory=lambda: {DONE: 0, SKIPPED: 0, FAILED: 0})  # of them by status
     num_input: int = 0  # Gaussians in the scenes that were done
     num_output: int = 0  # Gaussians in their results
@@ -45,7 +47,7 @@ class Totals:
             self.unmet += bool(row["unmet"])
             self.rows += [row] if len(self.rows) < MAX_LISTED else []
         elif record["status"] == FAILED and len(self.failures) < MAX_LISTED:
-            self.failures.append((str(record["scene"]), str(record["error"])))
+            self.failures.append((str(record[self.name]), str(record["error"])))
 
     @property
     def ended(self) -> int:
@@ -64,7 +66,7 @@ def write_summary(folder: Path) -> Path:
         try:
             with scene_lock(folder, [SUMMARY]) as lock:
                 remove_leftovers(path)
-                _write_rows(path, _newest(folder))
+                _write_rows(path, [row for _, row in sorted(newest_records(folder, row_of).items())])
                 lock.finish()
                 return path
         except BusyError:
@@ -73,16 +75,17 @@ def write_summary(folder: Path) -> Path:
             time.sleep(0.05)
 
 
-def _newest(folder: Path) -> list[dict[str, Any]]:
-    """The newest row of every scene, by the name of its result."""
-    rows: dict[str, dict[str, Any]] = {}
-    done: dict[str, dict[str, Any]] = {}
+def newest_records(folder: Path, keep: Callable[[dict[str, Any]], T]) -> dict[str, T]:
+    """Read what to ``keep`` of the newest record of every result; of a skipped one that of the time it was done."""
+    newest: dict[str, T] = {}
+    done: dict[str, T] = {}
     for record in each_record(folder):
-        row = row_of(record)
+        output, kept = record["output"], keep(record)
         if record["status"] == DONE:
-            done[record["output"]] = row
-        rows[record["output"]] = done.get(record["output"], row) if record["status"] == SKIPPED else row
-    return [rows[output] for output in sorted(rows)]
+            done[output] = kept
+        newest.pop(output, None)  # a repeated result moves to the end
+        newest[output] = done.get(output, kept) if record["status"] == SKIPPED else kept
+    return newest
 
 
 def _write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -7,7 +7,6 @@ import json
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from io import FileIO
 from pathlib import Path
 from typing import Any
@@ -18,29 +17,6 @@ try:
     import fcntl
 except ImportError:  # not a POSIX system: one process at a time
     fcntl = None  # type: ignore[assignment]
-
-
-@dataclass(frozen=True)
-class Lines:
-    """What a file of JSON lines holds."""
-
-    values: tuple[dict[str, Any], ...]  # One per line that could be read
-    notes: tuple[str, ...]  # Lines that were dropped, one sentence each
-
-
-def read_lines(path: Path) -> Lines:
-    """Read a file of JSON lines; what a killed run left half-written is dropped, and said."""
-    values: list[dict[str, Any]] = []
-    notes, last = [], 0
-    for number, (end, value) in enumerate(each_line(path), 1):
-        last = end
-        if value is None:
-            notes.append(f"{path}: line {number} is damaged and was dropped; its run is done again")
-        else:
-            values.append(value)
-    if path.exists() and last < path.stat().st_size:
-        notes.append(f"{path}: the last line is incomplete and was dropped; its run is done again")
-    return Lines(tuple(values), tuple(notes))
 
 
 def each_line(path: Path, start: int = 0) -> Iterator[tuple[int, dict[str, Any] | None]]:

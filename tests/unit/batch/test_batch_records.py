@@ -33,7 +33,7 @@ from gsmerge.errors import SceneError, UsageError
 from gsmerge.io.atomic import temporary_path
 from gsmerge.options import CompactOptions
 from gsmerge.runtime.estimate import memory_bytes
-from gsmerge.runtime.jsonl import append_line, each_line, read_lines
+from gsmerge.runtime.jsonl import append_line, each_line
 
 SHA = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"  # of abc
 
@@ -154,10 +154,10 @@ def test_lines_of_several_processes_stay_whole(tmp_path: Path) -> None:
     path.write_bytes(b'{"torn": ')
     processes = [subprocess.Popen([sys.executable, "-c", APPEND, str(path), name]) for name in "ab"]
     assert [process.wait() for process in processes] == [0, 0]
-    lines = read_lines(path)
-    assert lines.notes == ()
+    lines = [value for _, value in each_line(path) if value is not None]
+    assert len(lines) == 50
     for name in "ab":
-        assert [line["number"] for line in lines.values if line["name"] == name] == list(range(25))
+        assert [line["number"] for line in lines if line["name"] == name] == list(range(25))
 
 
 def test_lines_can_be_read_from_the_middle(tmp_path: Path) -> None:
