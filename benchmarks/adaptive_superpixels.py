@@ -24,7 +24,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 from segmentation_scores import proxy_psnr, splat_psnr  # noqa: E402
 
-from gsmerge.stages.segment import superpixels  # noqa: E402
+from gsmerge.stages.superpixels import superpixels  # noqa: E402
 
 METHODS = ("bass-adaptive", "bass-st", "rdseg")
 ENDINGS = {".jpg", ".jpeg", ".png"}

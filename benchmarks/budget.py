@@ -27,7 +27,7 @@ from gsmerge.stages.encode import EncodeOptions, encode
 from gsmerge.stages.fit import FitOptions, fit
 from gsmerge.stages.prepare import Frame, canonicalise
 from gsmerge.stages.region_tree import auto_count, cut_tree, pixel_depths, region_tree
-from gsmerge.stages.segment import SegmentOptions, segment
+from gsmerge.stages.superpixels import SegmentOptions, segment
 from gsmerge.types import Gaussians, Groups, Scene
 
 DENSITY = 0.044

@@ -111,12 +111,15 @@ KINDS = {
     "batch.jsonl": Kind(20, ("batch/batch.jsonl",), change_lines,
                         lambda folder, out: ["batch", str(folder / "scene.ply"), "-o", str(out), "--jobs", "1",
                                              "--overwrite", *FAST], ("scene.ply", "batch.jsonl", "summary.csv")),
-    "runs.jsonl": Kind(20, ("charts/runs.jsonl",), change_lines,
+    "batch.jsonl of runs": Kind(20, ("charts/batch.jsonl",), change_lines,
                        lambda folder, out: ["chart", "--draw-only", "-o", str(out)], ("index.html",)),
     "checkpoint": Kind(20, ("checkpoint.safetensors",), any_of(change_bytes, in_safetensors, in_safetensors),
                        lambda folder, out: [*compact()(folder, out)[:-1], str(folder / "checkpoint.safetensors")]),
 }  # fmt: skip
-STARTED_FROM = {"batch.jsonl": "batch", "runs.jsonl": "charts"}  # kinds that are in the output folder themselves
+STARTED_FROM = {
+    "batch.jsonl": "batch",
+    "batch.jsonl of runs": "charts",
+}  # kinds that are in the output folder themselves
 
 
 def make_inputs(folder: Path) -> Path:
@@ -134,7 +137,7 @@ def make_inputs(folder: Path) -> Path:
         ["encode", folder / "scene.ply", "-o", folder / "a.gsm", "--checkpoint", "none", *quick],
         ["extend", folder / "state.gsm", folder / "scene.ply", "--checkpoint", "none", *quick],
         ["batch", folder / "scene.ply", "-o", folder / "batch", "--jobs", "1", *FAST, "--quiet"],
-        ["chart", folder / "scene.ply", "-o", folder / "charts", "--fit", "none", "--methods", "gsmerge,input",
+        ["chart", folder / "scene.ply", "-o", folder / "charts", "--fit", "none", "--methods", "gsmerge,random",
          "--budgets", "2%,5%", "--quiet"],
     ):  # fmt: skip
         if command([str(word) for word in words]):

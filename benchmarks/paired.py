@@ -21,7 +21,7 @@ from quality import score, setting
 from shared_scenes import LEFT_OUT, Targets, export, read_held_out, scene_folders
 
 import gsmerge
-from gsmerge.research.charts.statistics import mean_interval
+from gsmerge.research.charts.lines import mean_interval
 from gsmerge.types import Scene
 
 NAMES = ("PSNR", "SSIM", "LPIPS")

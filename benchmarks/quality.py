@@ -72,7 +72,7 @@ def main() -> None:
         row["input views"] = f"{report.psnr_before:.2f} -> {report.psnr_after:.2f}"
         row["seconds"] = f"{seconds:.1f}"
         if args.unmerged_fit:
-            steps = gsmerge.CompactOptions().with_settings(settings).fit.steps
+            steps = report.choices["fit"]["steps"]
             for name, limit in (("equal steps", None), ("equal time", report.seconds["fit"])):
                 other = gsmerge.compact(scene, method="unmerged-fit", fit_steps=steps, time_budget=limit)
                 row[f"unmerged, {name}"] = score(other.gaussians, targets, args.lpips)

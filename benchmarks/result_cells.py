@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from gsmerge.research.charts.record import INPUT, RunRecord
-from gsmerge.research.charts.statistics import mean_interval
+from gsmerge.research.charts.lines import mean_interval
+from gsmerge.research.charts.run import INPUT, RunRecord
 
 Row = Sequence[str]
 
@@ -18,12 +18,12 @@ def make_table(head: Row, rows: Sequence[Row]) -> str:
 
 
 def format_mean(records: Sequence[RunRecord], name: str, digits: int = 2) -> str:
-    values = [v for r in records if (v := getattr(r, name)) is not None]
+    values = [v for r in records if (v := r.value(name)) is not None]
     return f"{np.mean(values):.{digits}f}" if values else "-"
 
 
 def format_interval(records: Sequence[RunRecord], name: str) -> str:
-    values = [v for r in records if (v := getattr(r, name)) is not None]
+    values = [v for r in records if (v := r.value(name)) is not None]
     if len(values) < 2:
         return "-"
     interval = mean_interval(values)

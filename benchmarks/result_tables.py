@@ -21,8 +21,8 @@ from result_cells import (
 
 from gsmerge.measure.comparison import break_even
 from gsmerge.report import human_bytes
-from gsmerge.research.charts.figures import make_verdict_tables
-from gsmerge.research.charts.record import INPUT, RunRecord
+from gsmerge.research.charts.lines import Results, make_verdict_tables
+from gsmerge.research.charts.run import INPUT, SUPERPIXELS, RunRecord
 
 OURS = "gsmerge"
 COMMAND = "python benchmarks/results.py"
@@ -30,13 +30,13 @@ COMMAND = "python benchmarks/results.py"
 
 def page_of(records: Mapping[str, Sequence[RunRecord]], defaults: Sequence[Mapping[str, Any]]) -> str:
     """The whole document; parts that were not run are left out. ``defaults`` are those of ``defaults.py``."""
-    good = {name: [r for r in some if r.error is None] for name, some in records.items()}
+    good = {name: [r for r in some if r.error is None and r.method != SUPERPIXELS] for name, some in records.items()}
     failed = [r for some in records.values() for r in some if r.error is not None]
     sections = [_head(good), *_methods(good), *_verdicts(good), *_backbones(good), *_views(good), *_timing(good)]
     sections += [*_ablation(good), *_voxels(good), *_proxy(good), *_scenes(good), make_section(defaults)]
     sections += [_losing(good), _missing()]
     if failed:
-        lines = sorted({f"- {r.scene}, {r.method}: {r.error}" for r in failed})
+        lines = sorted({f"- {r.scene}, {r.label}: {r.error}" for r in failed})
         sections.append("## Runs that failed\n\n" + "\n".join(lines))
     return "\n\n".join(section for section in sections if section) + "\n"
 
@@ -87,7 +87,7 @@ def _methods(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
 
 def _verdicts(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
     """Whether a baseline's point lies above gsmerge at equal cost."""
-    tables = make_verdict_tables(list(parts.get("sizes", ())))
+    tables = make_verdict_tables(Results(parts.get("sizes", ())))
     head = ("baseline", "its value", "gsmerge", "difference", "verdict")
     out = []
     for table in tables:
@@ -214,7 +214,7 @@ def _timing(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
 
 
 def _pair_means(pairs: Sequence[tuple[RunRecord, RunRecord]], name: str) -> tuple[float, float]:
-    first, second = (float(np.mean([getattr(pair[i], name) or 0 for pair in pairs])) for i in (0, 1))
+    first, second = (float(np.mean([pair[i].value(name) or 0 for pair in pairs])) for i in (0, 1))
     return first, second
 
 
@@ -317,21 +317,23 @@ def _gains(parts: Mapping[str, Sequence[RunRecord]]) -> list[Row]:
     for name, some in parts.items():
         for r in some:
             before = inputs.get((name, r.scene, r.views_asked))
-            if r.method != OURS or before is None or None in (r.psnr_target_visible, before.psnr_target_visible):
+            if r.method != OURS or before is None:
                 continue
-            assert r.psnr_target_visible is not None
-            assert before.psnr_target_visible is not None
+            mine, theirs = r.value("psnr_target_visible"), before.value("psnr_target_visible")
+            if mine is None or theirs is None:
+                continue
             views = "all" if r.views_asked is None else str(r.views_asked)
             changed = ", ".join(f"{k} {v}" for k, v in r.settings.items()) or "defaults"
-            gain = r.psnr_target_visible - before.psnr_target_visible
-            rows.append((r.scene, name, views, changed, f"{before.psnr_target_visible:.2f}", f"{gain:+.2f}"))
+            rows.append((r.scene, name, views, changed, f"{theirs:.2f}", f"{mine - theirs:+.2f}"))
     return rows
 
 
 def _too_many(records: Sequence[RunRecord]) -> str:
     """What a number of Gaussians brings, by scene: where depth or poses are poor, more of them fit what is wrong."""
     runs = [
-        r for r in records if r.method == OURS and set(r.settings) == {"budget"} and r.psnr_target_visible is not None
+        r
+        for r in records
+        if r.method == OURS and set(r.settings) == {"budget"} and r.value("psnr_target_visible") is not None
     ]
     budgets = sorted({str(r.settings["budget"]) for r in runs}, key=lambda text: float(text.rstrip("%")))
     if len(budgets) < 2:
@@ -340,7 +342,7 @@ def _too_many(records: Sequence[RunRecord]) -> str:
     rows = []
     for scene in sorted({r.scene for r in runs}):
         values = [
-            (by_scene[scene, b].psnr_target_visible, by_scene[scene, b].psnr_context)
+            (by_scene[scene, b].scores["psnr_target_visible"], by_scene[scene, b].scores["psnr_context"])
             for b in budgets
             if (scene, b) in by_scene
         ]

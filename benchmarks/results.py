@@ -24,7 +24,8 @@ from result_tables import page_of
 from shared_scenes import exporter, scene_folders, shared_folder
 
 from gsmerge.cli import main as gsmerge
-from gsmerge.research.charts.record import CHARTS, RunRecord, read_runs
+from gsmerge.cli.chart import CHARTS
+from gsmerge.research.charts.run import RunRecord, read_runs
 
 ROOT = Path(__file__).parents[1]
 FAST_BASELINES = "random,opacity,contribution,blocks,voxel,moment-matching"
@@ -65,7 +66,7 @@ PARTS = (
             ("--budgets", "0.5%,4.4%,20%", "--fit", "none", *PLAIN, *NO_PROXIES),
             ("--superpixels", "0.5%,1%,2%,4.4%,20%", "--efforts", "draft", *NO_PROXIES),
             ("--superpixels", "4.4%,20%", "--fit", "none", "--efforts", "draft", *GRID, *NO_PROXIES),
-            ("--methods", "unmerged-color,unmerged-fit", "--efforts", "fast", *NO_PROXIES),
+            ("--methods", "unmerged-fit", "--efforts", "fast", *NO_PROXIES),
             ("--methods", "greedy,splat-transform", "--budgets", "1%,4.4%", *NO_PROXIES),
         ),
         ("quality-seconds", "quality-ratio", "stages", "proxy", "break-even"),
@@ -135,7 +136,7 @@ def main() -> None:
         if not folder.is_dir():
             continue
         gsmerge(["chart", "--draw-only", "--output", str(folder)])
-        records[part.name] = list(read_runs(folder)[0].values())
+        records[part.name], _ = read_runs(folder)
         for figure in part.figures:
             for suffix in ("png", "svg"):
                 source = folder / CHARTS / f"{figure}.{suffix}"

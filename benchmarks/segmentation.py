@@ -29,7 +29,7 @@ import torch  # noqa: E402
 from segmentation_scores import DENSITIES, SIDE, count_at, photos, proxy_psnr, shrink, splat_psnr  # noqa: E402
 from shared_scenes import scene_folders  # noqa: E402
 
-from gsmerge.stages.segment import superpixels  # noqa: E402
+from gsmerge.stages.superpixels import superpixels  # noqa: E402
 
 RUNS = [
     ("bass-st", "default"),

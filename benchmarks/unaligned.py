@@ -23,7 +23,7 @@ import gsmerge
 from gsmerge import read_scene
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.assign import find_owners
-from gsmerge.stages.segment import SegmentOptions, segment
+from gsmerge.stages.superpixels import SegmentOptions, segment
 
 
 def loosened(scene: gsmerge.Scene) -> gsmerge.Scene:

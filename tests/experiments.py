@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from gsmerge.research.charts.proxies import SEGMENTATIONS, SHARES, Proxy
-from gsmerge.research.charts.record import RunRecord
+from gsmerge.research.charts.run import SEGMENTATIONS, SHARES, SUPERPIXELS, RunRecord, describe
 
 SCENES = ("apples", "fern", "fox")
 LEVELS = {"apples": 2.0, "fern": 0.0, "fox": -3.0}  # how hard a scene is, dB
@@ -24,9 +23,11 @@ def make_record(scene: str, method: str, settings: dict[str, Any] | None = None,
     quality = GAINS[method] + LEVELS.get(scene, 0.0) + 0.5 * math.log2(ratio / 0.044) * (method != "input") + wobble
     quality -= 3 * (settings.get("fit") == "none") + 0.5 * math.log2(12 / views)
     seconds = TIMES[method] * (ratio / 0.044) ** 0.2
+    label = describe(method, settings, views_asked)
     values: dict[str, Any] = {
-        "key": f"{scene}/{method}/{sorted(settings.items())}/{views_asked}",
         "scene": scene,
+        "label": label,
+        "output": f"{scene}/{label}",
         "scene_sha256": scene * 16,
         "method": method,
         "settings": settings,
@@ -36,15 +37,16 @@ def make_record(scene: str, method: str, settings: dict[str, Any] | None = None,
         "views": views,
         "num_input": views * 1000,
         "count": round(views * 1000 * ratio),
-        "ratio": ratio,
         "bytes": round(68_000 * views * ratio),
         "seconds": seconds,
         "stages": {} if method == "input" else {"segment": 0.2 * seconds, "fit": 0.8 * seconds, "score": 0.5},
         "render_ms": 60.0 if method == "input" else 5.0,
-        "psnr_target_visible": quality,
-        "ssim_target_visible": 0.5 + quality / 80,
-        "lpips_vgg_target_visible": 0.8 - quality / 50,
-        "psnr_context": quality + 2,
+        "scores": {
+            "psnr_target_visible": quality,
+            "ssim_target_visible": 0.5 + quality / 80,
+            "lpips_vgg_target_visible": 0.8 - quality / 50,
+            "psnr_context": quality + 2,
+        },
     }
     return RunRecord(**{**values, **changes})
 
@@ -64,13 +66,13 @@ def make_grid(
     return records
 
 
-def make_proxies() -> list[Proxy]:
+def make_proxies() -> list[RunRecord]:
     """Superpixel methods, each 1 dB below the one before."""
-    return [
-        Proxy(
-            f"{scene}{name}{share}", scene, name, round(share * 100_000), share, 2, 30 - i + 2 * math.log2(share / 0.01)
-        )
-        for scene in SCENES
+    points = {
+        f"{name} {share:g}": 30 - i + 2 * math.log2(share / 0.01)
         for i, name in enumerate(SEGMENTATIONS)
         for share in SHARES
+    }
+    return [
+        RunRecord(scene, SUPERPIXELS, method=SUPERPIXELS, views=2, count=100_000, scores=points) for scene in SCENES
     ]

@@ -19,9 +19,9 @@ from gsmerge import Cameras, Gaussians, PixelScene, compact, render
 from gsmerge.geometry import covariances, normalize, quat_to_rotmat
 from gsmerge.pipeline import CompactReport, CompactResult
 from gsmerge.render.photos import Photos, scene_photos
-from gsmerge.research.generate import objects, paths, photograph, shapes
-from gsmerge.research.generate.noise import TrueView, pixel_gaussians
-from gsmerge.research.generate.options import Noise
+from gsmerge.research.generate import objects, photograph, shapes
+from gsmerge.research.generate.noise import Noise, TrueView, pixel_gaussians
+from gsmerge.research.generate.scene import look_at as camera_to_world
 from gsmerge.types import SH_C0, FeatureGaussians
 from gsmerge.views import subset
 
@@ -102,7 +102,7 @@ def arc(num_views: int, width: int = 48, height: int = 36, *, span: float = 0.8,
 
 def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
     """World to camera, OpenCV axes, y down."""
-    return np.linalg.inv(paths.look_at(eye, target))
+    return np.linalg.inv(camera_to_world(eye, target))
 
 
 def intrinsics(num_views: int, width: int, height: int) -> np.ndarray:

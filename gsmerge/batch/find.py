@@ -7,18 +7,34 @@ import os
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Protocol
 
 from gsmerge.batch.options import BatchOptions
 from gsmerge.compact_file import level_output
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.io import SCENE_SUFFIXES
+from gsmerge.io import SCENE_SUFFIXES, SceneFiles
 from gsmerge.io.bounds import read_text
 from gsmerge.io.content_hash import stem_of
 from gsmerge.io.formats.ply_file import header_counts
 from gsmerge.io.scene_files import IMAGE_PLACES, PLY_PLACES, named_ply, other_plys
+from gsmerge.options import CompactOptions
 from gsmerge.runtime.estimate import memory_bytes
 
 SCENE_PARTS = {Path(place).parts[0] for place in PLY_PLACES} | {"point_cloud", *IMAGE_PLACES}
+
+
+class Work(Protocol):
+    """Other work on a scene than compacting it with the settings of the batch."""
+
+    @property
+    def settings(self) -> CompactOptions:
+        """Settings that its time is estimated from."""
+
+    def key(self, options: BatchOptions) -> str:
+        """Digest everything that the result depends on."""
+
+    def run(self, files: SceneFiles, options: BatchOptions, out: Path) -> tuple[dict[str, Any], list[Path]]:
+        """Do it, and return the report, with the keys that records have, and the files that were written."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +46,7 @@ class Job:
     output: str  # name of the result in the output folder
     num_gaussians: int  # by the header of its file; 0 where it cannot be read
     num_rest: int = 0  # columns of higher harmonics, likewise
+    work: Work | None = None  # what is done with it; None: it is compacted with the settings of the batch
 
     @property
     def memory(self) -> int:
@@ -48,7 +65,7 @@ def find_jobs(given: Sequence[str], out: Path, options: BatchOptions, own: Colle
     owners: dict[str, str] = {}
     inputs: set[str] = set()
     for scene in find_scenes(given, out):
-        ply = _ply_of(scene)
+        ply = main_file(scene)
         real = os.path.realpath(ply)
         if real in inputs or real in own:
             continue
@@ -73,8 +90,8 @@ def result_names(output: str, options: BatchOptions) -> list[str]:
     return [output, *(str(level_output(Path(output), level)) for level in range(1, options.settings.budget.levels))]
 
 
-def _ply_of(scene: Path) -> Path:
-    """Return the file that identifies a scene; the folder itself where several files could."""
+def main_file(scene: Path) -> Path:
+    """Find the file that identifies a scene; the folder itself where several files could."""
     if not scene.is_dir():
         return scene
     plys = other_plys(scene)

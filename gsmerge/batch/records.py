@@ -8,10 +8,10 @@ from __future__ import annotations
 import csv
 import os
 import socket
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from gsmerge.errors import SceneError
 from gsmerge.io import atomic_output
@@ -26,6 +26,7 @@ COLUMNS = (
     "scene", "output", "status", "num_input", "num_output", "ratio", "bytes_input", "bytes_output", "psnr_before",
     "psnr_after", "seconds", "peak_memory_bytes", "attempt", "unmet", "error",
 )  # fmt: skip
+T = TypeVar("T")
 MAX_LISTED = 20  # scenes in the table, and failures below it
 
 
@@ -155,6 +156,7 @@ class Totals:
     """Totals of a run so far, in a size that does not grow with the number of scenes."""
 
     total: int  # scenes
+    name: str = "scene"  # key of a record that says in messages which one it is
     counts: dict[str, int] = field(default_factory=lambda: {DONE: 0, SKIPPED: 0, FAILED: 0})  # of them by status
     num_input: int = 0  # Gaussians in the scenes that were done
     num_output: int = 0  # Gaussians in their results
@@ -176,7 +178,7 @@ class Totals:
             self.unmet += bool(row["unmet"])
             self.rows += [row] if len(self.rows) < MAX_LISTED else []
         elif record["status"] == FAILED and len(self.failures) < MAX_LISTED:
-            self.failures.append((str(record["scene"]), str(record["error"])))
+            self.failures.append((str(record[self.name]), str(record["error"])))
 
     @property
     def ended(self) -> int:
@@ -188,21 +190,22 @@ def write_summary(folder: Path) -> Path:
     """Write the newest state of every scene in the folder. SceneError if that fails."""
     records, read = folder / RECORDS, -1
     while (size := records.stat().st_size if records.exists() else 0) != read:  # other runs may add to them meanwhile
-        _write_rows(folder / SUMMARY, _newest(folder))
+        _write_rows(folder / SUMMARY, [row for _, row in sorted(newest_records(folder, row_of).items())])
         read = size
     return folder / SUMMARY
 
 
-def _newest(folder: Path) -> list[dict[str, Any]]:
-    """Return the newest row of every scene, by the name of its result."""
-    rows: dict[str, dict[str, Any]] = {}
-    done: dict[str, dict[str, Any]] = {}
+def newest_records(folder: Path, keep: Callable[[dict[str, Any]], T]) -> dict[str, T]:
+    """Read what to ``keep`` of the newest record of every result; of a skipped one that of the time it was done."""
+    newest: dict[str, T] = {}
+    done: dict[str, T] = {}
     for record in each_record(folder):
-        row = row_of(record)
+        output, kept = record["output"], keep(record)
         if record["status"] == DONE:
-            done[record["output"]] = row
-        rows[record["output"]] = done.get(record["output"], row) if record["status"] == SKIPPED else row
-    return [rows[output] for output in sorted(rows)]
+            done[output] = kept
+        newest.pop(output, None)  # a repeated result moves to the end
+        newest[output] = done.get(output, kept) if record["status"] == SKIPPED else kept
+    return newest
 
 
 def _write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -73,10 +73,11 @@ def free_memory() -> int | None:
 
 def estimate_seconds(jobs: Sequence[Job], options: BatchOptions, schedule: Schedule) -> float:
     """Estimate the wall time of scenes, within a factor of about two."""
-    settings, steps = resolved_settings(options.settings, photos=True), resolve_fit(options.settings).steps
     total = 0.0
     for job in jobs:
         views = max(1, _num_views(job))
+        own = options.settings if job.work is None else job.work.settings
+        settings, steps = resolved_settings(own, photos=True), resolve_fit(own).steps
         seconds = work_seconds(job.num_gaussians, job.num_gaussians / views, settings, photos=True, fit_steps=steps)
         total += seconds / min(schedule.threads, views)
     return IMPORT_SECONDS * bool(jobs) + total / max(1, min(schedule.jobs, len(jobs)))

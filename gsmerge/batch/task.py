@@ -104,7 +104,7 @@ def _process(task: Task, context: BatchContext, new_records: RecordIndex, begun:
     """Skip or compact a scene, and return its record."""
     job, options = task.job, context.options
     files = _files_of(job, options)
-    key = scene_key(files, options)
+    key = _key_of(job, files, options)
     before, since = task.known, new_records.known.get(job.output)
     for known in (since, None if options.rerun else before):
         if known is not None and known.holds(context.folder, key):
@@ -128,11 +128,15 @@ def _compact(task: Task, context: BatchContext, files: SceneFiles, key: str) -> 
     out.parent.mkdir(parents=True, exist_ok=True)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("default")
-        document = compact_files(
-            files, options.settings, out, opacity=options.opacity, hints=options.hints, overwrite=True, hashed=True
-        )
+        if job.work is None:
+            document = compact_files(
+                files, options.settings, out, opacity=options.opacity, hints=options.hints, overwrite=True, hashed=True
+            )
+            written = [out, *(Path(level["path"]) for level in document["levels"])]
+        else:
+            document, written = job.work.run(files, options, out)
     document["notes"] += list(dict.fromkeys(str(warning.message) for warning in caught))
-    names = [job.output, *(os.path.relpath(level["path"], context.folder) for level in document["levels"])]
+    names = [os.path.relpath(path, context.folder) for path in written]
     facts = {"key": key, "files": written_files(context.folder, names), "report": finite(document)}
     return record(DONE, job.scene, job.output, attempt=task.attempt, **facts)
 
@@ -140,6 +144,10 @@ def _compact(task: Task, context: BatchContext, files: SceneFiles, key: str) -> 
 def _files_of(job: Job, options: BatchOptions) -> SceneFiles:
     scene = Path(job.scene)
     return find_scene_files(scene, cameras=filled(options.cameras, scene), images=filled(options.images, scene))
+
+
+def _key_of(job: Job, files: SceneFiles, options: BatchOptions) -> str:
+    return scene_key(files, options) if job.work is None else job.work.key(options)
 
 
 def scene_key(files: SceneFiles, options: BatchOptions) -> str:
@@ -154,7 +162,7 @@ def scene_key(files: SceneFiles, options: BatchOptions) -> str:
 def is_done(job: Job, known: DoneResult, context: BatchContext) -> bool:
     """Return whether a result would be skipped."""
     try:
-        return known.holds(context.folder, scene_key(_files_of(job, context.options), context.options))
+        return known.holds(context.folder, _key_of(job, _files_of(job, context.options), context.options))
     except SceneError:
         return False
 

@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, redirect_stdout
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TextIO
 
 import typer
 
@@ -16,8 +16,10 @@ from gsmerge.cli.console import duration, one_line, print_document, say, say_not
 from gsmerge.errors import BatchError, TargetError, UsageError
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from gsmerge.batch import BatchOptions, Job
-    from gsmerge.batch.records import RecordIndex
+    from gsmerge.batch.records import RecordIndex, Totals
     from gsmerge.batch.run import Schedule
 
 
@@ -95,7 +97,7 @@ def batch(args: opt.Args) -> None:
     damaged = [f"{index.damaged} damaged line(s) of the records were ignored"] if index.damaged else []
     notes = [*damaged, *schedule.notes]
     if args.dry_run:
-        _print_plan(args, jobs, options, index, schedule, notes)
+        print_plan(args, jobs, options, index, schedule, notes)
         return
     say_notes(notes, quiet=args.silent)
     _run(args, jobs, options, index, schedule)
@@ -112,7 +114,6 @@ def _bytes(text: str | None) -> int | None:
 
 def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, index: RecordIndex, schedule: Schedule) -> None:
     """Compact all scenes, report each, and sum up."""
-    from gsmerge.batch import run_batch
     from gsmerge.batch.records import Totals, summary_lines, write_summary
 
     totals, out = Totals(len(jobs)), args.output
@@ -120,19 +121,7 @@ def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, index: Reco
     say(f"{len(jobs):,} scenes, {at_once}", quiet=args.silent)
     interrupted = False
     try:
-        lines = sys.stdout if args.json else None
-        with (
-            _separate_stdout(options, quiet=args.silent),
-            closing(run_batch(jobs, out, options, index=index, schedule=schedule)) as records,
-            total_progress(totals.total, quiet=args.silent) as progress,
-        ):
-            for record in records:
-                totals.add(record)
-                if lines is not None:
-                    print(json.dumps(record, separators=(",", ":")), file=lines, flush=True)
-                failed = f", {totals.counts['failed']} failed" if totals.counts["failed"] else ""
-                why = f": {record['error']}" if record["error"] else ""
-                progress(f"{record['scene']} {record['status']}{why}{failed}", totals.ended, totals.total)
+        run_jobs(args, totals, jobs, options, index, schedule, sys.stdout if args.json else None)
     except KeyboardInterrupt:
         interrupted = True
         raise
@@ -141,12 +130,43 @@ def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, index: Reco
             path = write_summary(out)
             if not args.silent:
                 print("\n".join(map(one_line, summary_lines(totals, path))))
+    check_failures(totals, "scenes")
+    if totals.unmet:
+        raise TargetError(f"{totals.unmet} of {totals.total} results miss the target")
+
+
+def run_jobs(
+    args: opt.Args,
+    totals: Totals,
+    jobs: Sequence[Job],
+    options: BatchOptions,
+    index: RecordIndex,
+    schedule: Schedule,
+    lines: TextIO | None = None,
+) -> None:
+    """Run jobs with progress, count them, and print their records as JSON to ``lines``."""
+    from gsmerge.batch import run_batch
+
+    with (
+        _separate_stdout(options, quiet=args.silent),
+        closing(run_batch(jobs, args.output, options, index=index, schedule=schedule)) as records,
+        total_progress(totals.total, quiet=args.silent) as progress,
+    ):
+        for record in records:
+            totals.add(record)
+            if lines is not None:
+                print(json.dumps(record, separators=(",", ":")), file=lines, flush=True)
+            failed = f", {totals.counts['failed']} failed" if totals.counts["failed"] else ""
+            why = f": {record['error']}" if record["error"] else ""
+            progress(f"{record[totals.name]} {record['status']}{why}{failed}", totals.ended, totals.total)
+
+
+def check_failures(totals: Totals, unit: str) -> None:
+    """Raise a BatchError if a job failed."""
     num_failed = totals.counts["failed"]
     if num_failed:
         scene, why = totals.failures[0]
-        raise BatchError(f"{num_failed} of {totals.total} scenes failed; the first: {scene}: {why}")
-    if totals.unmet:
-        raise TargetError(f"{totals.unmet} of {totals.total} results miss the target")
+        raise BatchError(f"{num_failed} of {totals.total} {unit} failed; the first: {scene}: {why}")
 
 
 @contextmanager
@@ -159,35 +179,42 @@ def _separate_stdout(options: BatchOptions, *, quiet: bool) -> Iterator[None]:
         yield
 
 
-def _print_plan(
+def pending_jobs(jobs: Sequence[Job], out: Path, options: BatchOptions, index: RecordIndex) -> list[Job]:
+    """List the jobs whose results are not in the folder, or whatever is there if they are to be run again."""
+    from gsmerge.batch.task import BatchContext, is_done
+
+    shared = BatchContext(out, options, 0)
+    known = {} if options.rerun else index.known
+    return [job for job in jobs if job.output not in known or not is_done(job, known[job.output], shared)]
+
+
+def print_plan(
     args: opt.Args,
     jobs: Sequence[Job],
     options: BatchOptions,
     index: RecordIndex,
     schedule: Schedule,
     notes: Sequence[str],
+    unit: str = "scenes",
 ) -> None:
+    """Print what would be done and how long it would take; ``unit`` says what the jobs are called."""
     from gsmerge.batch.run import estimate_seconds
-    from gsmerge.batch.task import BatchContext, is_done
     from gsmerge.report import document_head, human_bytes
 
-    out, done = args.output, set()
-    if not options.rerun:
-        shared = BatchContext(out, options, 0)
-        done = {job.output for job in jobs if (known := index.known.get(job.output)) and is_done(job, known, shared)}
-    pending = [job for job in jobs if job.output not in done]
+    out, pending = args.output, pending_jobs(jobs, args.output, options, index)
+    left = {job.output for job in pending}
     seconds = estimate_seconds(pending, options, schedule)
     document = {
         **document_head(),
         "dry_run": True,
         "output": str(out),
-        "num_scenes": len(jobs),
+        f"num_{unit}": len(jobs),
         "num_pending": len(pending),
         "jobs": schedule.jobs,
         "threads": schedule.threads,
         "estimate": {"seconds": round(seconds, 1), "memory_bytes": schedule.memory},
-        "scenes": [
-            {"scene": j.scene, "output": j.output, "num_gaussians": j.num_gaussians, "done": j.output in done}
+        unit: [
+            {"scene": j.scene, "output": j.output, "num_gaussians": j.num_gaussians, "done": j.output not in left}
             for j in jobs
         ],
         "options": options.result_settings()["settings"],
@@ -195,7 +222,7 @@ def _print_plan(
     }
     lines = [f"{job.scene} -> {out / job.output}" for job in pending]
     lines += [f"note: {note}" for note in notes]
-    lines.append(f"would write {out}: {len(pending):,} of {len(jobs):,} scenes to do")
+    lines.append(f"would write {out}: {len(pending):,} of {len(jobs):,} {unit} to do")
     lines.append(
         f"at once     {schedule.jobs or 'as many as the cluster has room for'}, {schedule.threads} thread(s) each"
     )

@@ -1,4 +1,4 @@
-"""``gsmerge chart``: a grid of experiments, charts of it and a page."""
+"""``gsmerge chart``: a grid of runs, charts of them and a page."""
 
 from __future__ import annotations
 
@@ -11,18 +11,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gsmerge.cli import options as opt
-from gsmerge.cli.console import announce_compilation, duration, print_document, say_notes, total_progress
+from gsmerge.cli.batch import check_failures, pending_jobs, print_plan, run_jobs
+from gsmerge.cli.console import announce_compilation, print_document, say_notes
 from gsmerge.cli.held_out import lpips_networks
 from gsmerge.cli.paths import write_texts
-from gsmerge.errors import BatchError, UsageError
+from gsmerge.errors import UsageError
 
 if TYPE_CHECKING:
-    from gsmerge.research.charts.record import RunRecord
-    from gsmerge.research.charts.run import Plan, RunOptions
+    from gsmerge.batch import BatchOptions, Job
 
 GRID = "Grid: comma-separated lists, whose product is run"
 LISTS = ("methods", "k", "budgets", "superpixels", "segmentations", "fit", "efforts", "matches", "views")
 HINTS = ("opacity", "exporter", "quats", "order", "scene_scale", "max_side")
+CHARTS, PAGE, TABLE = "charts", "index.html", "runs.csv"  # in the folder
 
 
 def _list(name: str, help: str, wording: str) -> Parameter:
@@ -30,7 +31,8 @@ def _list(name: str, help: str, wording: str) -> Parameter:
 
 
 @opt.command(
-    opt.argument("scenes", list[Path] | None, "SCENES", ".ply files, or the folders that they are in.", default=None),
+    opt.argument("scenes", list[str] | None, "SCENES", "Folders to search for scenes, patterns, .ply files, or text "
+                 "files with one of these per line.", default=None),
     *opt.panel(
         GRID,
         _list("methods", "Methods: gsmerge and baselines.", "gsmerge"),
@@ -71,35 +73,29 @@ def chart(args: opt.Args) -> None:
     scenes, out = args.scenes or [], args.output
     _check_usage(args, scenes, out)
     if args.draw_only:
-        _print_drawn(args, _draw(out, [], 0), 0)
+        _draw(args, [], 0)
         return
-    from gsmerge.research.charts.run import RunOptions, run_plan
+    from gsmerge.batch.records import RecordIndex, Totals
+    from gsmerge.batch.run import make_schedule
 
-    nets, missing = lpips_networks(args.lpips)
-    with opt.usage_errors():
-        options = RunOptions(
-            nets, args.lpips_views, args.seed or 0, args.threads, args.proxy_views, args.rerun,
-            _command(args, scenes, out), hints=args.hints(), opacity=args.opacity,
-        )  # fmt: skip
-    plan, stored, notes = _make_plan(args, scenes, options)
-    notes = [*missing, *notes]
+    jobs, options, notes = _make_jobs(args, scenes)
+    index, schedule = RecordIndex(out), make_schedule(jobs, options)
+    index.read_on()
+    notes += [f"{index.damaged} damaged line(s) of the records were ignored"] if index.damaged else []
     if args.dry_run:
-        _print_plan(args, plan, stored, options, notes)
+        print_plan(args, jobs, options, index, schedule, notes, "runs")
         return
     say_notes(notes, quiet=args.silent)
-    done: list[RunRecord] = []
-    more: list[str] = []
-    if plan.total > 0:
-        with announce_compilation(quiet=args.silent), total_progress(plan.total, quiet=args.silent) as progress:
-            done, more = run_plan(plan, out, options, progress)
-    say_notes(more, quiet=args.silent)
-    _print_drawn(args, _draw(out, [*notes, *more], len(done)), len(notes) + len(more))
-    failed = [record for record in done if record.error is not None]
-    if failed:
-        raise BatchError(f"{len(failed)} of {len(done)} runs failed; the first: {failed[0].scene}: {failed[0].error}")
+    pending = pending_jobs(jobs, out, options, index)
+    totals = Totals(len(pending), "output")
+    if pending:
+        with announce_compilation(quiet=args.silent):
+            run_jobs(args, totals, pending, options, index, schedule)
+    _draw(args, notes, len(pending))
+    check_failures(totals, "runs")
 
 
-def _check_usage(args: opt.Args, scenes: Sequence[Path], out: Path) -> None:
+def _check_usage(args: opt.Args, scenes: Sequence[str], out: Path) -> None:
     """Refuse wrong usage before anything heavy is loaded."""
     if args.draw_only == bool(scenes):
         raise UsageError("expected scenes to run, or --draw-only without any")
@@ -107,17 +103,37 @@ def _check_usage(args: opt.Args, scenes: Sequence[Path], out: Path) -> None:
         raise UsageError("--dry-run: expected something to run, got --draw-only")
     if os.path.lexists(out) and not out.is_dir():
         raise UsageError(f"--output: expected a folder, found the file {out}")
-    if any(os.path.realpath(out) == os.path.realpath(scene) for scene in scenes):
-        raise UsageError(f"--output: expected a folder of its own, got the scene {out}")
     if not args.dry_run:
-        from gsmerge.research.charts.draw import require_matplotlib
+        from gsmerge.research.charts import require_matplotlib
 
         require_matplotlib()
 
 
-def _command(args: opt.Args, scenes: Sequence[Path], out: Path) -> str:
+def _make_jobs(args: opt.Args, scenes: Sequence[str]) -> tuple[list[Job], BatchOptions, list[str]]:
+    """Make the jobs of the grid, the options of their batch, and notes."""
+    from gsmerge.batch import BatchOptions
+    from gsmerge.measure.evaluate import EvaluateOptions
+    from gsmerge.options import CompactOptions
+    from gsmerge.research.charts.grid import Grid, find_sources, make_jobs, parse_grid, read_grid
+
+    nets, notes = lpips_networks(args.lpips)
+    base = Grid() if args.grid is None else read_grid(args.grid)
+    base = replace(base, fixed=tuple(args.fixed)) if args.fixed else base
+    grid = parse_grid({name: getattr(args, name) for name in LISTS}, base)
+    with opt.usage_errors():
+        measured = EvaluateOptions(nets, args.lpips_views)
+        settings = CompactOptions().with_settings(args.given(("seed", "threads")))
+        # one at a time, so that none slows another
+        options = BatchOptions(settings, args.opacity, args.hints(), jobs=1, rerun=args.rerun, overwrite=True)
+    sources = find_sources(scenes, args.output, args.targets, args.target_images)
+    more: dict[str, Any] = {"seed": settings.seed, "proxy_views": args.proxy_views, "command": _command(args, scenes)}
+    jobs, left_out = make_jobs(sources, grid, measured, **more)
+    return jobs, options, [*notes, *left_out]
+
+
+def _command(args: opt.Args, scenes: Sequence[str]) -> str:
     """The command line that does the same, without options left at their default."""
-    words = ["gsmerge", "chart", *map(str, scenes), "--output", str(out)]
+    words = ["gsmerge", "chart", *scenes, "--output", str(args.output)]
     names = [*LISTS, "fixed", "grid", "targets", "target_images", *HINTS, "lpips", "lpips_views", "proxy_views"]
     for name, value in args.given([*names, "seed", "threads"]).items():
         if value != "auto" or name not in HINTS:
@@ -126,88 +142,35 @@ def _command(args: opt.Args, scenes: Sequence[Path], out: Path) -> str:
     return shlex.join(words)
 
 
-def _make_plan(
-    args: opt.Args, scenes: Sequence[Path], options: RunOptions
-) -> tuple[Plan, dict[str, RunRecord], list[str]]:
-    """The runs of the grid, records of earlier runs, and notes."""
-    from gsmerge.research.charts.experiment import Grid, make_experiments, parse_grid, read_grid
-    from gsmerge.research.charts.run import make_plan
-    from gsmerge.research.charts.scenes import find_scenes
-
-    base = Grid() if args.grid is None else read_grid(args.grid)
-    base = replace(base, fixed=tuple(args.fixed)) if args.fixed else base
-    experiments, notes = make_experiments(scenes, parse_grid({name: getattr(args, name) for name in LISTS}, base))
-    places = find_scenes(scenes, args.targets, args.target_images)
-    plan, stored = make_plan(experiments, places, args.output, options)
-    return plan, stored, [*notes, *plan.notes]
-
-
-def _print_plan(
-    args: opt.Args, plan: Plan, stored: dict[str, RunRecord], options: RunOptions, notes: Sequence[str]
-) -> None:
+def _draw(args: opt.Args, notes: Sequence[str], num_done: int) -> None:
+    """Draw charts, page and table of everything in the folder, and say so; ``notes`` were printed before."""
     from gsmerge.report import document_head
-    from gsmerge.research.charts.run import describe, estimate_seconds
+    from gsmerge.research.charts.figures import draw_figures, make_figures
+    from gsmerge.research.charts.lines import Results
+    from gsmerge.research.charts.page import make_page, make_table
+    from gsmerge.research.charts.run import read_runs
 
-    out, runs = args.output, [run for run in plan.runs if run[0] in plan.pending]
-    seconds = estimate_seconds(runs, stored, options)
-    proxies = sum(map(len, plan.proxies.values()))
-    document = {
-        **document_head(),
-        "dry_run": True,
-        "output": str(out),
-        "num_runs": len(plan.runs),
-        "num_pending": len(runs),
-        "num_proxies": proxies,
-        "estimate": {"seconds": round(seconds, 1)},
-        "runs": [
-            {"scene": place.name, "run": describe(e), "pending": key in plan.pending} for key, e, place in plan.runs
-        ],
-        "notes": list(notes),
-    }
-    lines = [f"{place.name}: {describe(experiment)}" for _, experiment, place in runs]
-    lines += [f"note: {note}" for note in notes]
-    lines.append(f"would write {out}: {len(runs)} of {len(plan.runs)} runs to do, {proxies} points of superpixels")
-    lines.append(f"estimate    about {duration(seconds)}")
-    print_document(document, lines, as_json=args.json)
-
-
-def _draw(out: Path, notes: Sequence[str], num_done: int) -> dict[str, Any]:
-    """Draw charts and page of everything in the folder; returns the document about them."""
-    from gsmerge.report import document_head
-    from gsmerge.research.charts.draw import draw_figures
-    from gsmerge.research.charts.figures import make_figures, make_verdict_tables
-    from gsmerge.research.charts.page import make_page
-    from gsmerge.research.charts.proxies import read_proxies
-    from gsmerge.research.charts.record import CHARTS, PAGE, read_runs
-    from gsmerge.research.charts.series import newest
-
-    stored, unread = read_runs(out)
-    proxies, more = read_proxies(out)
-    if not stored:
+    out = args.output
+    records, more = read_runs(out)
+    if not records:
         raise UsageError(f"{out}: expected finished runs, found none; name scenes to run")
-    records, passed = newest(list(stored.values()))
-    figures, verdicts = make_figures(records, list(proxies.values())), make_verdict_tables(records)
+    say_notes(more, quiet=args.silent)
+    figures = make_figures(Results(records))
     drawings = draw_figures(figures, out / CHARTS)
     command = shlex.join(["gsmerge", "chart", "--draw-only", "--output", str(out)])
-    page = make_page(records, figures, drawings, verdicts, out, command=command)
-    write_texts({out / PAGE: page}, overwrite=True)
-    return {
+    page = make_page(records, figures, drawings, out, command)
+    write_texts({out / PAGE: page, out / TABLE: make_table(records)}, overwrite=True)
+    failed = sum(record.error is not None for record in records)
+    document = {
         **document_head(),
         "output": str(out),
         "page": str(out / PAGE),
         "charts": [str(out / CHARTS / f"{figure.name}.{suffix}") for figure in figures for suffix in ("png", "svg")],
         "num_runs": len(records),
         "num_done": num_done,
-        "num_failed": sum(record.error is not None for record in records),
+        "num_failed": failed,
         "runs": [record.to_dict() for record in records],
-        "notes": [*notes, *(note for note in (*unread, *more, *passed) if note not in notes)],
+        "notes": [*notes, *more],
     }
-
-
-def _print_drawn(args: opt.Args, document: dict[str, Any], num_said: int) -> None:
-    """Print what was drawn, and the notes except for the first ones, which were printed before."""
-    say_notes(document["notes"][num_said:], quiet=args.silent)
-    failed = f", {document['num_failed']} failed" if document["num_failed"] else ""
-    line = f"{document['page']}: {document['num_runs']} runs ({document['num_done']} new{failed}),"
-    line += f" {len(document['charts']) // 2} charts"
-    print_document(document, line, as_json=args.json, quiet=args.quiet)
+    line = f"{out / PAGE}: {len(records)} runs ({num_done} new{f', {failed} failed' if failed else ''}),"
+    print_document(document, f"{line} {len(figures)} charts", as_json=args.json, quiet=args.quiet)

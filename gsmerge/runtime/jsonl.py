@@ -8,31 +8,11 @@ import json
 import mmap
 import os
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from io import FileIO
 from pathlib import Path
 from typing import Any
 
 from gsmerge.errors import SceneError
-
-
-@dataclass(frozen=True)
-class Lines:
-    """The content of a file of JSON lines."""
-
-    values: tuple[dict[str, Any], ...]  # one per line that could be read
-    notes: tuple[str, ...]  # lines that were dropped, one sentence each
-
-
-def read_lines(path: Path) -> Lines:
-    """Read a file of JSON lines, and note those that are damaged or half-written."""
-    lines = list(each_line(path))
-    damaged = [f"line {number} is damaged" for number, (_, value) in enumerate(lines, 1) if value is None]
-    end = lines[-1][0] if lines else 0
-    if path.exists() and end < path.stat().st_size:
-        damaged.append("the last line is incomplete")
-    notes = tuple(f"{path}: {problem} and was dropped; its run is done again" for problem in damaged)
-    return Lines(tuple(value for _, value in lines if value is not None), notes)
 
 
 def each_line(path: Path, start: int = 0) -> Iterator[tuple[int, dict[str, Any] | None]]:

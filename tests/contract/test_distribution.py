@@ -19,7 +19,7 @@ import tomllib
 import gsmerge
 from gsmerge.io.formats import spz
 from gsmerge.render.cuda import INSTALL
-from gsmerge.research.charts.draw import INSTALL_HINT
+from gsmerge.research.charts import INSTALL_HINT
 
 pytest.importorskip("setuptools", minversion="77")
 BUILD = "import sys; from setuptools import build_meta as b; to = sys.argv[1]; b.build_wheel(to); b.build_sdist(to)"

@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from batches import InlinePool
 
 import gsmerge
+from gsmerge.options import CompactOptions
 from gsmerge.research.charts import run as running
-from gsmerge.research.charts.record import read_runs
+from gsmerge.research.charts.run import RunRecord, read_runs
 
 from .conftest import Outcome, Run, listing
 
@@ -38,18 +40,35 @@ def copied(results: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(results, tmp_path / "grid"))
 
 
+@pytest.fixture(autouse=True)
+def _inline(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run the jobs of a test in this process, where they can be watched; the fixture above has processes."""
+    monkeypatch.setattr("gsmerge.batch.run.LocalPool", InlinePool)
+
+
 @pytest.fixture
-def merges(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+def merges(monkeypatch: pytest.MonkeyPatch) -> list[CompactOptions]:
     """The settings of every merge from now on."""
-    seen: list[dict[str, Any]] = []
+    seen: list[CompactOptions] = []
     compact = running.compact
 
-    def watched(scene: Any, **settings: Any) -> Any:
+    def watched(scene: Any, settings: CompactOptions) -> Any:
         seen.append(settings)
-        return compact(scene, **settings)
+        return compact(scene, settings)
 
     monkeypatch.setattr(running, "compact", watched)
     return seen
+
+
+def budgets(merges: list[CompactOptions]) -> list[object]:
+    return [settings.budget.budget for settings in merges]
+
+
+def runs(folder: Path) -> dict[str, RunRecord]:
+    """All runs by their label; none may be left out."""
+    records, notes = read_runs(folder)
+    assert notes == []
+    return {record.label: record for record in records}
 
 
 def again(run: Run, folder: Path, *options: object) -> Outcome:
@@ -57,73 +76,71 @@ def again(run: Run, folder: Path, *options: object) -> Outcome:
 
 
 def test_what_a_grid_leaves_behind(results: Path) -> None:
-    records, notes = read_runs(results / "out")
-    assert notes == ()
-    assert [(r.method, dict(r.settings)) for r in records.values()] == [
-        ("input", {}),
-        ("gsmerge", {"budget": "1%", "fit": "none"}),
-        ("gsmerge", {"budget": "2%", "fit": "none"}),
-    ]
+    records = runs(results / "out")
+    expected = ["input", "gsmerge, budget 1%, fit none", "gsmerge, budget 2%, fit none", "superpixels, 1 views"]
+    assert list(records) == expected
+    first, one, two, proxies = records.values()
     pixels = 3 * 64 * 48
-    for record in records.values():
+    for record in (first, one, two):
         assert record.error is None
         assert (record.scene, record.views, record.num_input) == ("room", 3, pixels)
-        assert record.psnr_target is not None
-        assert record.psnr_target_visible is not None
-        assert record.ssim_context is not None
-        assert record.lpips_vgg_target is None
+        assert {"psnr_target", "psnr_target_visible", "ssim_context"} < record.scores.keys()
+        assert record.value("lpips_vgg_target") is None
         assert (record.render_ms or 0) > 0
         assert record.environment["gsmerge"] == gsmerge.__version__
         assert record.command.startswith("gsmerge chart ")
         assert "--budgets 1%,2% --fit none" in record.command
-    first, one, two = records.values()
+    assert len(proxies.scores) == 30
     assert (first.ratio, one.count, two.count) == (1.0, pixels // 100, pixels // 50)
-    assert one.bytes is not None
-    assert two.bytes is not None
     assert first.seconds == 0
     assert one.seconds == pytest.approx(sum(v for k, v in one.stages.items() if k not in ("score", "input")))
     page = (results / "out" / "index.html").read_text()
     assert "3 runs on 1 scene(s): room" in page
     assert page.count('<input type="range"') == 2
+    assert len((results / "out" / "runs.csv").read_text().splitlines()) == 1 + 4
     names = {path.name for path in (results / "out" / "charts").iterdir()}
     assert {"quality-ratio.png", "quality-ratio.svg", "proxy.png", "break-even.svg", "stages.png"} <= names
     assert not any(name.startswith(".") for name in listing(results / "out"))
 
 
 def test_the_bytes_are_those_of_the_file(results: Path, tmp_path: Path) -> None:
-    record = list(read_runs(results / "out")[0].values())[1]
+    record = runs(results / "out")["gsmerge, budget 1%, fit none"]
     result = gsmerge.compact(gsmerge.read_scene(results / "room"), budget="1%", fit="none")
     gsmerge.write_ply(tmp_path / "small.ply", result.gaussians)
     assert (tmp_path / "small.ply").stat().st_size == record.bytes
 
 
-def test_nothing_is_run_twice(copied: Path, merges: list[dict[str, Any]], run: Run) -> None:
-    before = (copied / "out" / "runs.jsonl").read_bytes()
+def test_nothing_is_run_twice(copied: Path, merges: list[CompactOptions], run: Run) -> None:
+    before = (copied / "out" / "batch.jsonl").read_bytes()
     page = (copied / "out" / "index.html").read_bytes()
     outcome = again(run, copied)
     assert outcome.code == 0, outcome.err
     assert merges == []
-    assert (copied / "out" / "runs.jsonl").read_bytes() == before
-    assert "3 runs (0 new), " in outcome.out
+    assert (copied / "out" / "batch.jsonl").read_bytes() == before
+    assert "4 runs (0 new), " in outcome.out
     assert len((copied / "out" / "index.html").read_bytes()) == pytest.approx(len(page), rel=0.01)
 
 
-def test_a_killed_grid_goes_on_where_it_was(copied: Path, merges: list[dict[str, Any]], run: Run) -> None:
-    path = copied / "out" / "runs.jsonl"
-    path.write_bytes(path.read_bytes()[:-40])
+def test_a_killed_grid_goes_on_where_it_was(copied: Path, merges: list[CompactOptions], run: Run) -> None:
+    path = copied / "out" / "batch.jsonl"
+    lines = path.read_bytes().splitlines(keepends=True)
+    assert b"budget 2%" in lines[2]
+    path.write_bytes(lines[0] + lines[1] + lines[3] + lines[2][:-40])
     outcome = again(run, copied)
     assert outcome.code == 0, outcome.err
-    assert "the last line is incomplete and was dropped" in outcome.err
-    assert {settings["budget"] for settings in merges} == {"2%"}
-    assert len(read_runs(copied / "out")[0]) == 3
+    assert set(budgets(merges)) == {"2%"}
+    assert len(runs(copied / "out")) == 4
+    next((copied / "out" / "room").glob("*1%*.jpg")).unlink()
+    assert again(run, copied).code == 0
+    assert budgets(merges)[-1] == "1%"
 
 
-def test_another_scene_another_setting_and_rerun_do_run(copied: Path, merges: list[dict[str, Any]], run: Run) -> None:
+def test_another_scene_another_setting_and_rerun_do_run(copied: Path, merges: list[CompactOptions], run: Run) -> None:
     assert again(run, copied, "--rerun").code == 0
-    assert [s["budget"] for s in merges[-2:]] == ["1%", "2%"]
+    assert budgets(merges)[-2:] == ["1%", "2%"]
     count = len(merges)
     assert again(run, copied, "--seed", 1).code == 0
-    assert {settings["seed"] for settings in merges[count:]} == {1}
+    assert {settings.seed for settings in merges[count:]} == {1}
     ply = copied / "room" / "scene.ply"
     data = bytearray(ply.read_bytes())
     data[-1] ^= 1
@@ -141,25 +158,27 @@ def test_what_is_told_of_the_file_counts_for_all_scenes(copied: Path, run: Run) 
     shutil.copyfile(copied / "room" / "targets" / "transforms.json", copied / "room" / "transforms.json")
     shutil.copytree(copied / "room" / "targets" / "images", copied / "room" / "images")
     assert run("chart", copied / "room", "--output", copied / "loose", *said).code == 0
-    records = [record for record in read_runs(copied / "loose")[0].values() if record.error is None]
-    assert {record.views for record in records} == {2}
-    assert "--order none" in records[0].command
+    records = runs(copied / "loose").values()
+    assert {(record.views, record.error) for record in records} == {(2, None)}
+    assert all("--order none" in record.command for record in records)
 
 
 def test_a_failed_run_does_not_end_the_grid(copied: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     compact = running.compact
 
-    def broken(scene: Any, **settings: Any) -> Any:
-        if settings.get("budget") == "3%":
+    def broken(scene: Any, settings: CompactOptions) -> Any:
+        if settings.budget.budget == "3%":
             raise ValueError("two\nlines")
-        return compact(scene, **settings)
+        return compact(scene, settings)
 
     monkeypatch.setattr(running, "compact", broken)
     options = ("--budgets", "3%,1%", "--output", copied / "new")
     outcome = again(run, copied, *options)
     assert outcome.code == 5
     last = outcome.err.splitlines()[-1]
-    assert last == "gsmerge: error: 1 of 3 runs failed; the first: room: ValueError: two lines"
+    assert last == (
+        "gsmerge: error: 1 of 3 runs failed; the first: room/gsmerge, budget 3%, fit none: ValueError: two lines"
+    )
     assert "3 runs (3 new, 1 failed)" in outcome.out
     page = (copied / "new" / "index.html").read_text()
     assert "ValueError: two lines" in page
@@ -174,7 +193,7 @@ def test_a_scene_that_cannot_be_read_is_a_failure_of_its_runs(copied: Path, run:
     (bad / "scene.ply").write_text("ply\nThese are notes.\n")
     outcome = run("chart", bad, copied / "room", "--output", copied / "out", *TARGETS, *FAST, "--quiet")
     assert outcome.code == 5
-    assert outcome.err.startswith("gsmerge: error: 3 of 3 runs failed; the first: bad: ")
+    assert outcome.err.startswith("gsmerge: error: 3 of 3 runs failed; the first: bad/input: ")
     assert outcome.err.count("\n") == 1
 
 
@@ -184,14 +203,14 @@ def test_views_are_chosen_and_those_too_many_left_out(copied: Path, run: Run) ->
     document = json.loads(outcome.out)
     assert document["num_done"] == 3
     assert document["notes"] == ["room has fewer views than asked for: 3 run(s) left out"]
-    assert {r["views"] for r in document["runs"] if r["views_asked"] == 2} == {2}
+    assert {r["views"] for r in document["runs"] if r["views_asked"] == 2 and r["method"] != "superpixels"} == {2}
 
 
 def test_a_dry_run_tells_the_plan_and_writes_nothing(copied: Path, run: Run) -> None:
     before = listing(copied)
     outcome = again(run, copied, "--budgets", "1%,5%", "--dry-run")
     assert outcome.code == 0
-    assert "room: gsmerge, budget 5%, fit none" in outcome.out
+    assert f"{copied / 'room'} -> {copied / 'out'}/room/gsmerge, budget 5%, fit none" in outcome.out
     assert "budget 1%" not in outcome.out
     assert f"would write {copied / 'out'}: 1 of 3 runs to do" in outcome.out
     assert "estimate    about" in outcome.out
@@ -207,30 +226,18 @@ def test_drawing_alone(copied: Path, run: Run) -> None:
     assert (outcome.code, outcome.err) == (0, "")
     document = json.loads(outcome.out)
     assert document["schema_version"] == 1
-    assert (document["num_runs"], document["num_done"], document["num_failed"]) == (3, 0, 0)
+    assert (document["num_runs"], document["num_done"], document["num_failed"]) == (4, 0, 0)
     assert all(Path(path).stat().st_size > 1000 for path in document["charts"])
     assert Path(document["page"]).is_file()
 
 
-def test_a_grid_from_a_file(copied: Path, merges: list[dict[str, Any]], run: Run) -> None:
+def test_a_grid_from_a_file(copied: Path, merges: list[CompactOptions], run: Run) -> None:
     grid = copied / "grid.json"
-    grid.write_text('{"budgets": ["1%"], "densities": [0.02], "fit": "none"}')
-    outcome = run(
-        "chart",
-        copied / "room",
-        "--output",
-        copied / "out",
-        *TARGETS,
-        "--grid",
-        grid,
-        "--proxy-views",
-        0,
-        "--lpips",
-        "none",
-        "--json",
-    )
+    grid.write_text('{"budgets": ["1%"], "superpixels": ["2%"], "fit": "none"}')
+    options = ("--grid", grid, "--proxy-views", 0, "--lpips", "none", "--json")
+    outcome = run("chart", copied / "room", "--output", copied / "out", *TARGETS, *options)
     assert outcome.code == 0
-    assert {settings.get("superpixels") for settings in merges} == {"2%"}
+    assert {settings.segment.superpixels for settings in merges} == {"2%"}
     assert json.loads(outcome.out)["num_done"] == 1
 
 
@@ -243,13 +250,12 @@ def test_a_grid_from_a_file(copied: Path, merges: list[dict[str, Any]], run: Run
         (("--draw-only",), 2, "expected finished runs, found none"),
         (("room", "--k", "9"), 2, "expected"),
         (("room", "--views", "0"), 2, "views: expected numbers from 1"),
-        (("room", "room"), 2, "expected every scene once"),
         (("nowhere",), 3, "nowhere"),
         (("room", "--targets", "{scene}/none.json"), 3, "expected cameras of held-out views"),
         (("room", "--targets", "{room}/none.json"), 2, "expected {scene}, {parent} or {stem}"),
         (("room", "--lpips", "some"), 2, "--lpips"),
         (("room", "--output", "room/scene.ply"), 2, "expected a folder, found the file"),
-        (("room", "--output", "room"), 2, "expected a folder of its own"),
+        (("room", "--output", "room"), 2, "expected another folder for the results"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
 )
@@ -266,9 +272,9 @@ def test_wrong_usage(
 
 
 def test_missing_matplotlib_is_told_before_anything_is_run(
-    copied: Path, merges: list[dict[str, Any]], run: Run, monkeypatch: pytest.MonkeyPatch
+    copied: Path, merges: list[CompactOptions], run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gsmerge.research.charts.draw.find_spec", lambda name: None)
+    monkeypatch.setattr("gsmerge.research.charts.find_spec", lambda name: None)
     outcome = again(run, copied, "--rerun")
     assert (outcome.code, merges) == (1, [])
     assert outcome.err == (

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsmerge.research.generate.cast import BLOB, BOX, CONE, ELLIPSOID, LEAF, QUAD, SHEET, add_light, cast
+from gsmerge.research.generate.cast import BLOB, BOX, CONE, ELLIPSOID, LEAF, QUAD, add_light, cast
 from gsmerge.research.generate.shapes import NO_WAVES, Material, Shape, ShapeArrays, pack
 
 FAR, STEPS = 12.0, 60_000
-KINDS = {"quad": QUAD, "box": BOX, "ellipsoid": ELLIPSOID, "cone": CONE, "leaf": LEAF, "blob": BLOB, "sheet": SHEET}
+KINDS = {"quad": QUAD, "box": BOX, "ellipsoid": ELLIPSOID, "cone": CONE, "leaf": LEAF, "blob": BLOB}
 
 
 def rotation(rng: np.random.Generator) -> np.ndarray:
@@ -21,8 +21,8 @@ def rotation(rng: np.random.Generator) -> np.ndarray:
 def random_shape(kind: int, rng: np.random.Generator) -> Shape:
     """Around (0, 0, 4), about 1 large, in any attitude."""
     waves = NO_WAVES
-    if kind in (BLOB, SHEET):
-        numbers = rng.normal(0, 2, (4, 3)) * ([1, 1, 1] if kind == BLOB else [1, 1, 0])
+    if kind == BLOB:
+        numbers = rng.normal(0, 2, (4, 3))
         waves = np.concatenate([numbers, rng.uniform(0, 6, (4, 1)), rng.uniform(0.02, 0.06, (4, 1))], 1)
     size = (*rng.uniform(0.5, 1.2, 3), rng.uniform(0.3, 1.6))
     return Shape(kind, size, Material(0), np.array([0, 0, 4.0]) + rng.normal(0, 0.2, 3), rotation(rng), waves)
@@ -37,8 +37,6 @@ def sides(shape: Shape, points: np.ndarray) -> np.ndarray:
     if shape.kind == CONE:
         radius = 1 + (taper - 1) * (y / b + 1) / 2
         return (np.abs(y) <= b) & (np.hypot(x / a, z / c) <= radius)
-    if shape.kind == SHEET:
-        return z > (np.sin(points @ number.T + phase) * height).sum(1)
     if shape.kind in (ELLIPSOID, BLOB):
         scaled = points / [a, b, c]
         swing = (np.sin(scaled @ number.T + phase) * height).sum(1) if shape.kind == BLOB else 0.0
@@ -49,7 +47,7 @@ def sides(shape: Shape, points: np.ndarray) -> np.ndarray:
 def within(shape: Shape, point: np.ndarray) -> bool:
     """Whether a point of the surface's level belongs to it: open surfaces end."""
     (x, y, _), (a, b, *_) = np.abs(point), shape.size
-    if shape.kind in (QUAD, SHEET):
+    if shape.kind == QUAD:
         return bool(x <= a and y <= b)
     if shape.kind == LEAF:
         return bool(y <= b and x <= a * (1 - (y / b) ** 2))

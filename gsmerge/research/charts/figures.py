@@ -1,32 +1,59 @@
-"""What each figure shows, as plain numbers: everything that is decided before drawing."""
+"""Figures of runs: what each shows, and drawing them in one style, with colours that the colour-blind tell apart."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+import io
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import astuple, dataclass, field, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
 
+import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure as Drawing
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
+from gsmerge.io import atomic_output
 from gsmerge.measure.comparison import break_even
-from gsmerge.research.charts import series
-from gsmerge.research.charts.experiment import OURS
-from gsmerge.research.charts.proxies import SEGMENTATIONS, Proxy
-from gsmerge.research.charts.record import HIGHER_IS_BETTER, INPUT, RunRecord
-from gsmerge.research.charts.run import SCORING
-from gsmerge.research.charts.series import Getter, Line, Point
-from gsmerge.research.charts.statistics import Verdict, judge, paired_intervals
+from gsmerge.research.charts.lines import METRICS, PARTS, Line, Results, make_lines, size_label
+from gsmerge.research.charts.run import INPUT, SCORING, SEGMENTATIONS, SHARES, RunRecord
 from gsmerge.runtime.record import STAGES
 
-RATIOS = (0.0045, 0.22)  # of the points of baselines that are compared: 0.5 % to 20 %, with room for rounding
-SAME_COUNT = 0.01  # counts that differ by less than this share are drawn once
+MAX_LINES = 12  # of a figure; of more, one for each method is drawn
 MIN_GAIN = 0.05  # share of the render time; smaller gains are noise
 MIN_STAGE = 0.03  # share of the longest bar; shorter stages are shown together
-INTERVAL_NOTE = (
-    "Means over {scenes}; bands, from three scenes on: 95 % t intervals of the differences between"
-    " settings, without those between scenes."
-)
+MIN_SCENES = 3  # scenes that an interval is drawn from; that of two scenes is too wide to be of use
 
-DIGITS = {"psnr": 2, "ssim": 3, "lpips_vgg": 3, "lpips_alex": 3}  # decimals that are shown of a metric
+PANEL_WIDTH, SINGLE_WIDTH, HEIGHT = 2.9, 4.4, 2.5  # inches: one of several panels, the only panel
+KEY_WIDTH, KEY_LINE = 2.3, 0.135  # of the key: inches, inches per line
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7B4173", "#8C6D31")  # Okabe, Ito 2008
+MARKERS = "osD^vPX"  # as many as have no divisor in common with the colours
+DASHES: tuple[Any, ...] = ("-", (0, (4, 1.5)), (0, (1, 1.2)))  # the next for every round through the colours
+RC: dict[Any, Any] = {
+    "axes.axisbelow": True,
+    "axes.grid": True,
+    "axes.labelsize": 8,
+    "axes.linewidth": 0.6,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.xmargin": 0.06,
+    "axes.ymargin": 0.12,
+    "font.size": 7.5,
+    "grid.color": "#e6e6e6",
+    "grid.linewidth": 0.5,
+    "legend.fontsize": 7,
+    "legend.frameon": False,
+    "savefig.dpi": 300,
+    "svg.hashsalt": "gsmerge",
+    **{
+        f"{axis}tick.{name}": 7 if name == "labelsize" else 2.5 for axis in "xy" for name in ("labelsize", "major.size")
+    },
+}
 
 
 @dataclass(frozen=True)
@@ -34,283 +61,289 @@ class Panel:
     """One pair of axes."""
 
     y_label: str  # with unit
-    higher: bool  # whether higher is better
-    lines: tuple[Line, ...]  # the lines
-    reference: tuple[str, float] | None = None  # a level to compare with: its name and value
+    higher: bool | None  # whether higher is better; None: neither is
+    lines: tuple[Line, ...]
+    reference: float | None = None  # the level of the input
 
 
 @dataclass(frozen=True)
-class Curves:
-    """Lines over one x."""
+class Figure:
+    """Lines over one x, or bars."""
 
     name: str  # of its files
     title: str  # of the section
-    caption: str  # of the figure
+    caption: str
     x_label: str  # with unit
-    panels: tuple[Panel, ...]  # side by side
-    x_scale: str = "log"  # log or linear
-    y_scale: str = "linear"  # the same
-    percent: bool = False  # whether x is a share, shown in per cent
-    front: bool = False  # whether the Pareto front is marked
-    all_of: str | None = None  # the figure that shows the main lines of this one; None: it is no such figure's
+    head: tuple[str, ...]  # of the table of its numbers
+    rows: tuple[tuple[str, ...], ...]  # of the same
+    panels: tuple[Panel, ...] = ()  # side by side
+    log: str = ""  # axis that is logarithmic: x, y or none
+    bars: Mapping[str, Sequence[float]] = field(default_factory=dict)  # instead of panels: parts of each row's bar
 
 
-@dataclass(frozen=True)
-class Bars:
-    """Stacked bars: seconds by stage."""
-
-    name: str  # of its files
-    title: str  # of the section
-    caption: str  # of the figure
-    rows: tuple[str, ...]  # names of the bars, ours first
-    stages: dict[str, tuple[float, ...]]  # seconds of each row by stage, in the order of the stages
+def make_figures(results: Results) -> list[Figure]:
+    """Make all figures that there are data for."""
+    if not results.runs:
+        return [figure for figure in (_superpixels(results),) if figure]
+    figures = [_against(results, "seconds"), _against(results, "percent"), _stages(results), _superpixels(results)]
+    figures += [_counts(results), _over_views(results), _break_even(results)]
+    return [figure for figure in figures if figure is not None]
 
 
-@dataclass(frozen=True)
-class BreakEven:
-    """When merging has saved as much render time as it took."""
-
-    name: str  # of its files
-    title: str  # of the section
-    caption: str  # of the figure
-    input_ms: float  # milliseconds per view of the input
-    # name, seconds of the merge, milliseconds per view afterwards, frames to break even (None: never)
-    rows: tuple[tuple[str, float, float, float | None], ...]
-    all_of: str | None = None  # as of curves
-
-
-Figure = Curves | Bars | BreakEven
-
-
-def make_figures(records: Sequence[RunRecord], proxies: Sequence[Proxy] = ()) -> list[Figure]:
-    """All figures that the records have data for."""
-    done = series.successful(records)
-    part = series.choose_part(done)
-    figures: list[Figure | None] = [_against(done, part, "seconds"), _against(done, part, "ratio"), _stages(done)]
-    figures += [_proxy(proxies), _counts(done), _over_views(done, part), _break_even(done)]
-    return [one for figure in figures if figure is not None for one in main_and_all(figure)]
-
-
-def main_and_all(figure: Figure) -> list[Figure]:
-    """A figure of quality or of break-even with one line for each method, and the whole one; itself if it has no more.
-
-    The main line of a method has the best mean in the first panel; a single point is one only where there is no line.
-    """
-    names: dict[str, str] = {}
-    if isinstance(figure, Curves) and figure.name.startswith("quality"):
-        first = figure.panels[0]
-        sign = 1 if first.higher else -1
-        for line in sorted(first.lines, key=lambda one: (len(one.points) > 1, sign * _mean_quality(one))):
-            names[_method(line.name)] = line.name
-        lines = {line.name for panel in figure.panels for line in panel.lines}
-    elif isinstance(figure, BreakEven):
-        for name, *_ in reversed(figure.rows):  # those with the fewest settings come first
-            names[_method(name)] = name
-        lines = {name for name, *_ in figure.rows}
-    else:
-        return [figure]
-    kept = set(names.values())
-    if lines == kept:
-        return [figure]
-    caption = f"{figure.caption} One line for each method; the page has all."
-    whole = replace(figure, name=f"{figure.name}-all", all_of=figure.name)
-    if isinstance(figure, BreakEven):
-        return [replace(figure, caption=caption, rows=tuple(row for row in figure.rows if row[0] in kept)), whole]
-    panels = [replace(panel, lines=tuple(line for line in panel.lines if line.name in kept)) for panel in figure.panels]
-    return [replace(figure, caption=caption, panels=tuple(panel for panel in panels if panel.lines)), whole]
-
-
-def _method(name: str) -> str:
-    """The method of a line, whose name goes on with settings."""
-    return name.split(", ")[0]
-
-
-def _mean_quality(line: Line) -> float:
-    return float(np.mean([point.y.mean for point in line.points]))
-
-
-def _cost(name: str) -> Getter:
-    return lambda record: getattr(record, name) or None
-
-
-def _scenes(lines: Sequence[Line]) -> list[str]:
-    return sorted({scene for line in lines for point in line.points for scene in point.by_scene})
-
-
-def _over(lines: Sequence[Line]) -> str:
-    scenes = _scenes(lines)
-    if len(scenes) == 1:
-        return f"Scene: {scenes[0]}; one scene has no intervals."
-    names = ", ".join(scenes[:8]) + (", ..." if len(scenes) > 8 else "")
-    return INTERVAL_NOTE.format(scenes=f"{len(scenes)} scenes ({names})")
-
-
-def _panels(records: Sequence[RunRecord], part: str, lines_of: Callable[[Getter], list[Line]]) -> list[Panel]:
-    """One for each metric that was measured, with its level for the input at the typical number of views."""
-    panels = []
-    for metric in series.list_metrics(records, part):
-        value = series.score_getter(metric, part)
-        lines = lines_of(value)
-        level = series.input_mean(records, value, _scenes(lines))
-        reference = None if level is None else ("input", level)
-        panels.append(Panel(series.METRIC_LABELS[metric], HIGHER_IS_BETTER[metric], tuple(lines), reference))
-    return panels
-
-
-def _against(records: Sequence[RunRecord], part: str, cost: str) -> Curves | None:
-    """Quality against seconds or against the share of Gaussians that is kept."""
-    panels = _panels(records, part, lambda value: series.by_size(records, _cost(cost), value))
+def _curves(name: str, title: str, caption: str, x_label: str, panels: Sequence[Panel], log: str = "") -> Figure | None:
+    """Make a figure of panels with the table of all their points; None without lines."""
     panels = [panel for panel in panels if panel.lines]
     if not panels:
         return None
-    words = f"Measured on {series.PART_LABELS[part]}. Rings: the Pareto front. {_over(panels[0].lines)}"
+    rows = [
+        (panel.y_label, line.name, point.label, f"{point.x:.4g}", *(f"{y:.5g}" for y in astuple(point.y)[:3]))
+        for panel in panels
+        for line in panel.lines
+        for point in line.points
+    ]
+    head = ("Panel", "Line", "Point", x_label, "Mean", "Low", "High")
+    scenes = sorted({scene for line in panels[0].lines for point in line.points for scene in point.by_scene})
+    over = f"{', '.join(scenes[:8])}{', ...' if len(scenes) > 8 else ''}"
+    words = f"Scene: {over}; one scene has no intervals."
+    if len(scenes) > 1:
+        words = f"Means over {len(scenes)} scenes ({over}); bands, from three scenes on: 95 % t intervals of the"
+        words += " differences between settings, without those between scenes."
+    kept = choose_lines(panels[0])
+    if any(line.name not in kept for panel in panels for line in panel.lines):
+        words += " One line for each method; the table has all."
+        panels = [replace(panel, lines=tuple(line for line in panel.lines if line.name in kept)) for panel in panels]
+    return Figure(name, title, f"{caption} {words}", x_label, head, tuple(rows), tuple(panels), log)
+
+
+def choose_lines(panel: Panel) -> set[str]:
+    """Name the lines to draw: all, or if there are many the best mean of each method, of several points if any."""
+    if len(panel.lines) <= MAX_LINES:
+        return {line.name for line in panel.lines}
+    sign = 1 if panel.higher else -1
+    quality = {line.name: sign * np.mean([point.y.mean for point in line.points]) for line in panel.lines}
+    order = sorted(panel.lines, key=lambda line: (len(line.points) > 1, quality[line.name]))
+    return set({_method(line.name): line.name for line in order}.values())
+
+
+def _method(name: str) -> str:
+    """Cut the settings off a line's name, which begins with the method."""
+    return name.split(", ")[0]
+
+
+def _quality_panels(results: Results, lines_of: Callable[[str], list[Line]], *, level: bool) -> list[Panel]:
+    """Make a panel for each metric, with the level of the input at the typical number of views."""
+    panels = []
+    for name in results.metrics:
+        score, metric = f"{name}_{results.part}", METRICS[name]
+        lines = lines_of(score)
+        scenes = {scene for line in lines for point in line.points for scene in point.by_scene}
+        reference = results.input_mean(score, scenes) if level else None
+        panels.append(Panel(metric.label, metric.higher, tuple(lines), reference))
+    return panels
+
+
+def _against(results: Results, cost: str) -> Figure | None:
+    """Show quality against seconds or against the share of Gaussians that is kept."""
+    panels = _quality_panels(results, lambda score: results.by_size(cost, score), level=True)
+    where = f"Measured on {PARTS[results.part]}."
     if cost == "seconds":
-        caption = f"Quality against the wall time of the merge (reading and writing not counted). {words}"
-        return Curves("quality-seconds", "Quality against time", caption, "Seconds", tuple(panels), front=True)
-    caption = f"Quality against the share of the input's Gaussians that is kept. {words}"
-    return Curves(
-        "quality-ratio", "Quality against size", caption, "Gaussians kept (%)", tuple(panels), percent=True, front=True
-    )
+        caption = f"Quality against the wall time of the merge (reading and writing not counted). {where}"
+        return _curves("quality-seconds", "Quality against time", caption, "Seconds", panels, "x")
+    caption = f"Quality against the share of the input's Gaussians that is kept. {where}"
+    return _curves("quality-ratio", "Quality against size", caption, "Gaussians kept (%)", panels, "x")
 
 
-def _typical_runs(records: Sequence[RunRecord]) -> dict[str, list[RunRecord]]:
-    """Runs of the typical size and number of views by the name of their line, ours first, all over the same scenes."""
-    size, views = series.typical_size(records), series.typical_views(records)
-    chosen = [r for r in records if series.is_typical(r, size) and r.views_asked == views]
-    names, rows = series.names_of(records), dict[str, list[RunRecord]]()
-    for record in series.ours_first(chosen):
-        rows.setdefault(names[series.line_key(record)], []).append(record)
-    kept = series.keep_common({name: {record.scene for record in group} for name, group in rows.items()}, 0.5)
-    common = {name: [record for record in rows[name] if record.scene in scenes] for name, scenes in kept.items()}
-    return common or rows
+def _size_words(results: Results) -> str:
+    return f"Size: {results.size or 'the default superpixels'}."
 
 
-def _size_words(records: Sequence[RunRecord]) -> str:
-    size = series.typical_size(records)
-    return f"Size: {size}." if size else "Size: the default superpixels."
-
-
-def _stages(records: Sequence[RunRecord]) -> Bars | None:
-    rows = _typical_runs(records)
+def _stages(results: Results) -> Figure | None:
+    """Show seconds by stage, stacked."""
+    rows = results.typical_runs()
     if not rows:
         return None
-    order = [stage for stage in STAGES if stage not in SCORING]
     known = {stage for group in rows.values() for record in group for stage in record.stages} - set(SCORING)
-    order += sorted(known - set(order))
+    order = sorted(known, key=lambda stage: (STAGES.index(stage) if stage in STAGES else len(STAGES), stage))
     table = {
-        stage: tuple(float(np.mean([r.stages.get(stage, 0.0) for r in group])) for group in rows.values())
+        stage: [float(np.mean([record.stages.get(stage, 0.0) for record in group])) for group in rows.values()]
         for stage in order
     }
-    longest = max(sum(column) for column in zip(*table.values(), strict=True))
-    large = {stage: values for stage, values in table.items() if max(values) > MIN_STAGE * longest}
-    rest = [values for stage, values in table.items() if stage not in large]
-    others = tuple(float(sum(column)) for column in zip(*rest, strict=True)) if rest else ()
-    stages = large | ({"other": others} if others and max(others) > 0 else {})
-    scenes = len({r.scene for group in rows.values() for r in group})
-    caption = f"Seconds by stage, scoring left out, means over {scenes} scene(s). {_size_words(records)}"
-    return Bars("stages", "Where the time goes", caption, tuple(rows), stages)
+    totals = np.sum(list(table.values()), 0) if table else np.zeros(len(rows))
+    bars = {stage: values for stage, values in table.items() if max(values) > MIN_STAGE * totals.max()}
+    others = totals - np.sum(list(bars.values()), 0) if bars else totals
+    bars |= {"other": others.tolist()} if others.max() > 1e-9 else {}
+    cells = [(name, *(f"{values[i]:.3g}" for values in bars.values())) for i, name in enumerate(rows)]
+    scenes = len({record.scene for group in rows.values() for record in group})
+    caption = f"Seconds by stage, scoring left out, means over {scenes} scene(s). {_size_words(results)}"
+    return Figure("stages", "Where the time goes", caption, "Seconds", ("Line", *bars), tuple(cells), bars=bars)
 
 
-def _proxy(proxies: Sequence[Proxy]) -> Curves | None:
-    """How well superpixels alone approximate the photos (the paper's proxy)."""
-    lines = []
-    complete = sorted({p.scene for p in proxies})
-    for name in SEGMENTATIONS:
-        by_share: dict[float, dict[str, tuple[float, float]]] = {}
-        for p in proxies:
-            if p.segmentation == name:
-                by_share.setdefault(p.share, {})[p.scene] = (float(p.superpixels), p.psnr)
-        columns = {share: by_share[share] for share in sorted(by_share) if len(by_share[share]) == len(complete)}
-        if columns:
-            values = np.array([[by_scene[scene][1] for by_scene in columns.values()] for scene in complete])
-            points = tuple(
-                Point(f"{100 * share:g}%", float(np.mean([x for x, _ in by_scene.values()])), interval, by_scene)
-                for (share, by_scene), interval in zip(columns.items(), paired_intervals(values), strict=True)
-            )
-            lines.append(Line(name, name == SEGMENTATIONS[0], points))
-    if not lines:
-        return None
+def _superpixels(results: Results) -> Figure | None:
+    """Show how well superpixels alone approximate the photos (the paper's proxy)."""
+
+    def point(record: RunRecord, name: str, share: float) -> RunRecord:
+        """Make a record of its own of one of the points."""
+        scores = {"psnr_context": record.scores[f"{name} {share:g}"]}
+        settings = {"superpixels": f"{100 * share:g}%"}
+        count = round(share * (record.count or 0))
+        return replace(record, method=name, settings=settings, scores=scores, count=count)
+
+    known = [(r, *one) for r in results.superpixels for one in product(SEGMENTATIONS, SHARES)]
+    points = [point(*one) for one in known if f"{one[1]} {one[2]:g}" in one[0].scores]
+    lines = make_lines(points, size_label, "count", "count", "psnr_context")
     caption = (
         "Every pixel takes the mean colour of its superpixel; PSNR against the photo, the best that a superpixel method"
-        f" could reach. {_over(lines)}"
+        " could reach."
     )
-    panels = (Panel("Proxy PSNR (dB)", True, tuple(lines)),)
-    return Curves("proxy", "Superpixels alone", caption, "Superpixels per view", panels)
+    lines = [replace(line, ours=line.name == SEGMENTATIONS[0]) for line in lines]
+    panel = Panel("Proxy PSNR (dB)", True, tuple(sorted(lines, key=lambda line: not line.ours)))
+    return _curves("proxy", "Superpixels alone", caption, "Superpixels per view", [panel], "x")
 
 
-def _counts(records: Sequence[RunRecord]) -> Curves | None:
-    own = [record for record in records if record.method in (OURS, INPUT)]
-    lines = series.by_views(own, lambda record: record.count, with_input=True)
-    lines = [line for i, line in enumerate(lines) if not any(_coincide(line, other) for other in lines[:i])]
-    if not any(line.ours for line in lines):
-        return None
-    caption = f"Gaussians against the number of input views. {_size_words(records)} {_over(lines)}"
-    panels = (Panel("Gaussians", False, tuple(lines)),)
-    return Curves("count-views", "Count against views", caption, "Input views", panels, "linear", "log")
+def _counts(results: Results) -> Figure | None:
+    """Show Gaussians against the number of input views, of ours and of the input."""
+    lines = results.by_views("count")
+    lines = [line for line in lines if line.ours or line.name == INPUT]
+    panels = [Panel("Gaussians", None, tuple(lines))] if any(line.ours for line in lines) else []
+    caption = f"Gaussians against the number of input views. {_size_words(results)}"
+    return _curves("count-views", "Count against views", caption, "Input views", panels, "y")
 
 
-def _coincide(one: Line, other: Line) -> bool:
-    """Whether two lines coincide, since every method meets a budget."""
-    pairs = list(zip(one.points, other.points, strict=False))
-    same = all(a.x == b.x and abs(a.y.mean - b.y.mean) <= SAME_COUNT * b.y.mean for a, b in pairs)
-    return len(one.points) == len(other.points) and same
-
-
-def _over_views(records: Sequence[RunRecord], part: str) -> Curves | None:
-    panels = _panels(records, part, lambda value: series.by_views(records, value, with_input=True))
-    panels = [replace(panel, reference=None) for panel in panels if any(line.ours for line in panel.lines)]
-    if not panels:
-        return None
+def _over_views(results: Results) -> Figure | None:
+    panels = _quality_panels(results, results.by_views, level=False)
+    panels = [panel for panel in panels if any(line.ours for line in panel.lines)]
     caption = (
-        f"Quality against the number of input views, evenly spread; held-out views lie midway between them where their"
-        f" order is known. Measured on {series.PART_LABELS[part]}. {_size_words(records)} {_over(panels[0].lines)}"
+        "Quality against the number of input views, evenly spread; held-out views lie midway between them where their"
+        f" order is known. Measured on {PARTS[results.part]}. {_size_words(results)}"
     )
-    return Curves("quality-views", "Quality against views", caption, "Input views", tuple(panels), "linear")
+    return _curves("quality-views", "Quality against views", caption, "Input views", panels)
 
 
-def _break_even(records: Sequence[RunRecord]) -> BreakEven | None:
-    rows = _typical_runs(records)
-    scenes = sorted({r.scene for group in rows.values() for r in group})
-    before = series.input_mean(records, lambda record: record.render_ms, scenes)
-    if before is None or not rows:
+def _break_even(results: Results) -> Figure | None:
+    """Show when merging has saved as much render time as it took."""
+    groups = results.typical_runs()
+    scenes = sorted({record.scene for group in groups.values() for record in group})
+    before = results.input_mean("render_ms", scenes)
+    if before is None or not groups:
         return None
-    table = []
-    for name, group in rows.items():
-        seconds = float(np.mean([r.seconds for r in group if r.seconds is not None]))
-        after = float(np.mean([r.render_ms for r in group if r.render_ms is not None]))
+    rows, frames = [], dict[str, int]()
+    for name, group in groups.items():
+        seconds = float(np.mean([record.seconds or 0.0 for record in group]))
+        after = float(np.mean([record.render_ms or before for record in group]))
         even = break_even(seconds, before / 1000, after / 1000) if after < (1 - MIN_GAIN) * before else None
-        table.append((name, seconds, after, even))
+        rows.append((name, f"{seconds:.2f}", f"{after:.1f}", "never" if even is None else f"{math.ceil(even):,}"))
+        frames |= {} if even is None else {name: math.ceil(even)}
     caption = (
-        "Time to render a number of frames, the merge included, on the processor that ran the grid. Dots: where merging"
-        f" breaks even. {_size_words(records)} Means over {len(scenes)} scene(s)."
+        "Frames to render until merging has saved as much time as it took, on the processor that ran the grid; a method"
+        f" without a bar never saves any. {_size_words(results)} Means over {len(scenes)} scene(s)."
     )
-    return BreakEven("break-even", "When merging pays", caption, before, tuple(table))
+    head, bars = ("Line", "Seconds", "ms/view", "Frames"), {"frames": [frames.get(name, 0) for name in groups]}
+    return Figure("break-even", "When merging pays", caption, "Frames", head, tuple(rows), bars=bars)
 
 
-@dataclass(frozen=True)
-class VerdictTable:
-    """Points of baselines compared with ours at equal cost."""
+def draw_figures(figures: Sequence[Figure], folder: Path) -> dict[str, bytes]:
+    """Draw figures into a folder, each as ``NAME.png`` and ``NAME.svg``, and return the SVG of each by name.
 
-    title: str  # metric and cost
-    rows: tuple[tuple[str, Verdict], ...]  # one per point of a baseline, with the label of its size
-    decimals: int  # of the metric
+    The same numbers give the same bytes.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    names = dict.fromkeys((line.name, line.ours) for f in figures for panel in f.panels for line in panel.lines)
+    drawn, styles = {}, line_styles(names)
+    for figure in figures:
+        with matplotlib.rc_context():
+            matplotlib.rcdefaults()  # independent of the user's own settings
+            matplotlib.rcParams.update(RC)
+            drawing = draw_bars(figure) if figure.bars else draw_curves(figure, styles)
+            for suffix, unknown in (("png", ("Software",)), ("svg", ("Date", "Creator", "Format", "Type"))):
+                data = io.BytesIO()
+                drawing.savefig(data, format=suffix, metadata=dict.fromkeys(unknown))
+                with atomic_output(folder / f"{figure.name}.{suffix}", overwrite=True) as temporary:
+                    temporary.write_bytes(data.getvalue())
+        drawn[figure.name] = data.getvalue()
+    return drawn
 
 
-def make_verdict_tables(records: Sequence[RunRecord]) -> list[VerdictTable]:
-    """Points of baselines compared with ours at equal seconds, and at an equal share of the Gaussians."""
-    done = series.successful(records)
-    part = series.choose_part(done)
-    tables = []
-    for cost, words in (("seconds", "at equal time"), ("ratio", "at equal size")):
-        for metric in series.list_metrics(done, part):
-            value = series.score_getter(metric, part)
-            ours = series.scene_points(done, _cost(cost), value)
-            rows = [
-                (point.label, judge(line.name, point.by_scene, ours, higher=HIGHER_IS_BETTER[metric]))
-                for line in series.by_size(done, _cost(cost), value)
-                for point in line.points
-                if not line.ours and (cost != "ratio" or RATIOS[0] <= point.x <= RATIOS[1])
-            ]
-            if rows and ours:
-                tables.append(VerdictTable(f"{series.METRIC_LABELS[metric]} {words}", tuple(rows), DIGITS[metric]))
-    return tables
+Style = dict[str, Any]  # arguments of a line
+
+
+def line_styles(names: Iterable[tuple[str, bool]]) -> dict[str, Style]:
+    """Make a style for every line by its name and whether it is ours: ours are broader and in front."""
+    styles: dict[str, Style] = {INPUT: {"color": "#555555", "ls": (0, (2, 2)), "marker": "s", "lw": 1.0, "zorder": 2}}
+    for i, (name, ours) in enumerate(one for one in names if one[0] != INPUT):
+        dash = DASHES[i // len(COLORS) % len(DASHES)]
+        look = {"color": COLORS[i % len(COLORS)], "ls": dash, "marker": MARKERS[i % len(MARKERS)]}
+        styles[name] = {**look, "lw": 1.5 if ours else 1.1, "zorder": 4 + ours}
+    return styles
+
+
+def _subplots(num_panels: int, height: float = HEIGHT) -> tuple[Drawing, list[Axes]]:
+    width = SINGLE_WIDTH if num_panels == 1 else PANEL_WIDTH * num_panels
+    drawing = Drawing(figsize=(width, height), layout=ConstrainedLayoutEngine(w_pad=0.08))
+    return drawing, list(np.atleast_1d(drawing.subplots(1, num_panels)))
+
+
+def draw_curves(figure: Figure, styles: Mapping[str, Style]) -> Drawing:
+    """Draw lines in panels side by side, with one key of their names beside them, by which the drawing grows."""
+    drawing, all_axes = _subplots(len(figure.panels))
+    for axes, panel in zip(all_axes, figure.panels, strict=True):
+        for line in panel.lines:
+            _draw_line(axes, line, styles[line.name])
+        if panel.reference is not None:
+            axes.axhline(panel.reference, **{**styles[INPUT], "marker": ""})
+        arrow = {True: " ↑", False: " ↓", None: ""}[panel.higher]
+        axes.set(xlabel=figure.x_label, ylabel=panel.y_label + arrow)
+        ticks = sorted({point.x for line in panel.lines for point in line.points})
+        if figure.log:
+            axes.set(**{f"{figure.log}scale": "log"})
+            axis = axes.xaxis if figure.log == "x" else axes.yaxis
+            axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.9g}"))
+            axis.set_minor_locator(NullLocator())
+        if figure.log != "x" and len(ticks) <= 8:
+            axes.set_xticks(ticks)
+    names = list(dict.fromkeys(line.name for panel in figure.panels for line in panel.lines))
+    names += [INPUT] * (INPUT not in names and any(panel.reference is not None for panel in figure.panels))
+    width, height = drawing.get_size_inches()
+    drawing.set_size_inches(width + KEY_WIDTH, max(height, KEY_LINE * len(names)))
+    drawing.legend(
+        [Line2D([], [], markersize=4, **styles[name]) for name in names], [_plain(name) for name in names],
+        loc="outside right center", handlelength=2.6, labelspacing=0.15, borderpad=0,
+    )  # fmt: skip
+    return drawing
+
+
+def _plain(name: str) -> str:
+    """Keep matplotlib from taking a name for a formula."""
+    return name.replace("$", r"\$")
+
+
+def _draw_line(axes: Axes, line: Line, style: Style) -> None:
+    x, y = [p.x for p in line.points], [p.y.mean for p in line.points]
+    low, high = [p.y.low for p in line.points], [p.y.high for p in line.points]
+    if min(p.y.count for p in line.points) >= MIN_SCENES and low != high:
+        band = {"color": style["color"], "zorder": style["zorder"] - 1}
+        if len(x) > 1:
+            axes.fill_between(x, low, high, alpha=0.13, linewidth=0, **band)
+        else:
+            axes.vlines(x, low, high, alpha=0.35, linewidth=2.5, **band)
+    axes.plot(x, y, markersize=3.6, markeredgecolor="white", markeredgewidth=0.5, **style)
+
+
+def draw_bars(figure: Figure) -> Drawing:
+    """Draw one stacked bar for each row."""
+    names = [row[0] for row in figure.rows]
+    drawing, (axes,) = _subplots(1, 0.75 + 0.3 * max(len(names), 2))
+    left = np.zeros(len(names))
+    for i, (part, values) in enumerate(figure.bars.items()):
+        color = "#bbbbbb" if part == "other" else COLORS[i % len(COLORS)]
+        axes.barh(range(len(names)), values, 0.62, left, color=color, edgecolor="white", linewidth=0.6, label=part)
+        left += np.array(values)
+    for row, total in enumerate(left):
+        axes.text(total, row, f" {total:,.3g}" if total else "", va="center")
+    axes.set_yticks(range(len(names)), [_plain(name) for name in names])
+    axes.invert_yaxis()
+    axes.grid(visible=False, axis="y")
+    axes.set(xlim=(0, 1.12 * left.max() or 1), xlabel=figure.x_label)
+    if len(figure.bars) > 1:
+        drawing.legend(loc="outside upper center", ncols=min(len(figure.bars), 7), handlelength=0.9, columnspacing=1.0)
+    return drawing

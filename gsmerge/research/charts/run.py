@@ -1,293 +1,368 @@
-"""Planning and running experiments: those that are not done yet, each stored as soon as it is done."""
+"""One run of a grid: merge a scene, or leave it as it is, measure the result, and keep pictures and a record."""
 
 from __future__ import annotations
 
+import math
 import os
 import platform
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+import sys
+from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from functools import partial
-from importlib.metadata import PackageNotFoundError, version
-from itertools import groupby
+from dataclasses import asdict, dataclass, field, fields, replace
+from functools import lru_cache, partial
+from itertools import product
 from pathlib import Path
 from statistics import median
+from types import NoneType
 from typing import Any
 
+import cv2
+import numpy as np
+
 from gsmerge import __version__
-from gsmerge.errors import error_line
-from gsmerge.io import AUTO, HeldOutViews, ReadHints, load_files, read_held_out
+from gsmerge.batch import BatchOptions
+from gsmerge.batch.records import FAILED, newest_records
+from gsmerge.io import HeldOutViews, ReadHints, SceneFiles, atomic_output, load_files, read_held_out
+from gsmerge.io.content_hash import digest
 from gsmerge.io.formats.ply import OpacityChoice
 from gsmerge.io.formats.writing import file_bytes
-from gsmerge.measure.evaluate import EvaluateOptions, near_plane
+from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Views, evaluate, near_plane
+from gsmerge.measure.preview import Picture, draw_means, heat_map, to_picture
 from gsmerge.measure.speed import time_render
 from gsmerge.options import CompactOptions
 from gsmerge.pipeline import compact
-from gsmerge.plan import resolve_fit, resolved_settings
-from gsmerge.research.charts.experiment import Experiment, run_settings
-from gsmerge.research.charts.measure import choose_views, keep_pictures, measure
-from gsmerge.research.charts.proxies import measure_proxies, proxy_points, read_proxies
-from gsmerge.research.charts.record import INPUT, RunRecord, append_run, experiment_key, read_runs
-from gsmerge.research.charts.scenes import SceneSource
-from gsmerge.runtime.estimate import work_seconds
-from gsmerge.runtime.threads import available_threads, use_threads
-from gsmerge.types import Scene
-from gsmerge.views import pick_views
+from gsmerge.render import render
+from gsmerge.render.metrics import psnr
+from gsmerge.report import document_head
+from gsmerge.runtime.memory import peak_memory
+from gsmerge.runtime.threads import available_threads, parallel_map, use_threads
+from gsmerge.stages.superpixels import superpixels
+from gsmerge.types import Gaussians, Scene
+from gsmerge.views import even_views, midpoint_views, pick_views, subset
 
-Progress = Callable[[str, int, int], None]
+RECORD_VERSION = 1  # of what a run records; another version is run again
+OURS, SUPERPIXELS = "gsmerge", "superpixels"  # methods of runs, as INPUT (nothing is merged) and baselines
 SCORING = ("score", "input")  # stages of a run that only measure
-PACKAGES = ("torch", "numpy", "numba", "opencv-contrib-python-headless")
-BYTES_PER_GAUSSIAN = 68  # of a .ply without higher harmonics
+MEASURES = ("psnr", "ssim", "lpips_vgg", "lpips_alex")
+SCORES = tuple(map("".join, product(MEASURES, ("_context", "_target"), ("", "_visible"))))
+SEGMENTATIONS = ("rdseg", "bass-adaptive", "bass-st", "bass", "slic")
+SHARES = (0.0025, 0.005, 0.01, 0.02, 0.044, 0.1)  # superpixels per pixel
+PACKAGES = ("torch", "numpy", "numba", "cv2")
 MAX_TIMED = 4  # views that are rendered for the time
-COST_EVALUATE = 2.5  # seconds per million pixels of all views, to score input and result
-COST_LPIPS = 12.0  # the same for each network
+MAX_PICTURES, MAX_WIDTH, QUALITY = 2, 640, 88  # views of a run with pictures, their pixels, quality of the JPEG files
+MAX_ERROR = 0.25  # mean absolute error over the channels at the top of the error maps' scale
+MAX_DB = 100.0  # PSNR of equal pictures, since JSON has no infinity
+_tried: set[tuple[Any, ...]] = set()  # kinds of runs that this process has done before
 
 
 @dataclass(frozen=True)
-class RunOptions:
-    """How a grid is run."""
+class RunRecord:
+    """One finished run, successful or not.
 
-    lpips: tuple[str, ...] = ()  # networks of the perceptual distance; slow
-    lpips_views: int | None = None  # views of each split that are measured with them; None: all
-    seed: int = 0  # seed of all random numbers
-    threads: int | None = None  # threads; None: all processors
-    proxy_views: int = 2  # photos of each scene whose superpixels alone are measured; 0: none
-    rerun: bool = False  # repeat what is done already
-    command: str = ""  # the command line, for the record
-    hints: ReadHints = AUTO  # facts about the scenes that are given instead of detected
-    opacity: OpacityChoice = "auto"  # the same of their opacities
+    ``scores`` are means over the views of a split, by names such as ``psnr_target_visible``: ``context`` are the views
+    that the scene was made of, ``target`` held-out ones; ``_visible`` counts only pixels that the context views see.
+    """
 
-    def key_of(self, experiment: Experiment, source: SceneSource) -> str:
-        """Key of a run with these options."""
-        measured: dict[str, Any] = {"lpips": list(self.lpips), "lpips_views": self.lpips_views, "seed": self.seed}
-        measured |= {name: value for name, value in vars(self.hints).items() if value != getattr(AUTO, name)}
-        measured |= {} if self.opacity == "auto" else {"opacity": self.opacity}
-        settings = {**experiment.settings, "measured": measured}
-        return experiment_key(source.sha256, experiment.method, settings, experiment.views)
-
-
-@dataclass(frozen=True)
-class Plan:
-    """The runs of a grid, and which of them are still to be done."""
-
-    runs: tuple[tuple[str, Experiment, SceneSource], ...]  # key, experiment and scene of every run; one for each key
-    pending: frozenset[str]  # keys of the runs that are not done yet, or failed
-    # segmentation and share by key of the proxy points that are not measured yet, by scene
-    proxies: Mapping[str, Mapping[str, tuple[str, float]]]
-    notes: tuple[str, ...]  # what was left out
+    scene: str  # its name
+    label: str  # method, settings and number of views in words
+    output: str = ""  # name of its files in the folder
+    scene_sha256: str = ""  # hash of everything that was read
+    method: str = ""  # gsmerge, the name of a baseline, input (the scene as it is), or superpixels alone
+    settings: Mapping[str, Any] = field(default_factory=dict)  # settings by flat name; the rest are defaults
+    views_asked: int | None = None  # number of views that was asked for; None: all
+    command: str = ""  # the command line of the run
+    environment: Mapping[str, str] = field(default_factory=dict)  # processor, threads and versions
+    views: int | None = None  # views that went in
+    num_input: int | None = None  # Gaussians of those views
+    count: int | None = None  # Gaussians of the result; of superpixels alone the pixels of a view
+    bytes: int | None = None  # size of the result as a .ply
+    seconds: float | None = None  # wall time of the merge with everything but reading, writing and scoring
+    stages: Mapping[str, float] = field(default_factory=dict)  # the same by stage, scoring included
+    render_ms: float | None = None  # milliseconds that one view takes to render, the median
+    scores: Mapping[str, float] = field(default_factory=dict)
+    pictures: tuple[str, ...] = ()  # names of the views whose pictures were kept
+    notes: tuple[str, ...] = ()  # of the reader and of the run
+    error: str | None = None  # why the run failed, in one line; None if it did not
+    record_version: int = RECORD_VERSION
 
     @property
-    def total(self) -> int:
-        """Runs and proxy points that are to be done."""
-        return len(self.pending) + sum(map(len, self.proxies.values()))
+    def ratio(self) -> float | None:
+        """Share of the input's Gaussians that is kept."""
+        return None if self.count is None or self.num_input is None else self.count / max(self.num_input, 1)
+
+    @property
+    def percent(self) -> float | None:
+        """The same in per cent."""
+        return None if self.ratio is None else 100 * self.ratio
+
+    def value(self, name: str) -> float | None:
+        """Look up a score, or a field that is a number; None where it was not measured."""
+        return self.scores.get(name) if name in SCORES else getattr(self, name)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Convert the record to plain JSON types, with every score by its own name."""
+        return {**asdict(self), "ratio": self.ratio, **{name: self.value(name) for name in SCORES}}
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+
+
+def _is_sound(name: str, value: Any) -> bool:
+    """Check that a value read from JSON is of the kind of its field."""
+    default = getattr(BLANK, name)
+    if isinstance(default, Mapping):
+        words = () if name in ("stages", "scores") else (str, bool, NoneType)
+        return isinstance(value, dict) and all(_is_number(one) or isinstance(one, words) for one in value.values())
+    if isinstance(default, tuple):
+        return isinstance(value, list) and all(isinstance(one, str) for one in value)
+    return isinstance(value, str) if isinstance(default, str) else value is None or _is_number(value)
+
+
+BLANK = RunRecord("", "")
+
+
+def read_runs(folder: Path) -> tuple[list[RunRecord], list[str]]:
+    """Read the newest record of each run in a folder, and notes on those that were left out.
+
+    Left out are records of another version, and those of other content of a scene's files than that of the last run of
+    the scene, so that no two scenes are taken for one.
+    """
+    newest = newest_records(folder, _read_record).items()
+    records = [record for _, record in newest if record is not None]
+    foreign = len(newest) - len(records)
+    content = {record.scene: record.scene_sha256 for record in records if record.error is None}
+    kept = [record for record in records if record.error is not None or record.scene_sha256 == content[record.scene]]
+    notes = [f"{folder}: {foreign} record(s) of another version or kind were passed over"] if foreign else []
+    other = len(records) - len(kept)
+    notes += [f"{other} run(s) left out, which read other files than the last one of their scene"] if other else []
+    return kept, notes
+
+
+def _read_record(record: Mapping[str, Any]) -> RunRecord | None:
+    """Read a run from the record of a batch; None if it is of another version or kind."""
+    scene, _, label = record["output"].rpartition("/")
+    if record["status"] == FAILED:
+        return RunRecord(scene, label, error=record["error"] or "unknown")
+    run, names = (record["report"] or {}).get("run"), [f.name for f in fields(RunRecord)]
+    if not isinstance(run, dict) or not all(name in run and _is_sound(name, run[name]) for name in names):
+        return None
+    if run["record_version"] != RECORD_VERSION or run["error"] is not None:
+        return None
+    lists = {name: tuple(run[name]) for name in ("pictures", "notes")}
+    return RunRecord(**{**{name: run[name] for name in names}, **lists})
+
+
+def picture_path(folder: Path, output: str, view: int, kind: str) -> Path:
+    """Name a picture of a run or, with the output ``SCENE/photo``, of a scene; ``kind``: photo, render or error."""
+    return folder / f"{output}.{view}.{kind}.{'png' if kind == 'error' else 'jpg'}"
+
+
+def describe(method: str, settings: Mapping[str, Any], views: int | None) -> str:
+    """Describe a run in a few words."""
+    words = [f"{name} {value}" for name, value in settings.items()]
+    return ", ".join([method, *words, *([] if views is None else [f"{views} views"])])
 
 
 @dataclass(frozen=True)
-class _LoadedScene:
-    """A scene in memory with its held-out views."""
+class Run:
+    """The work on one scene, see :class:`gsmerge.batch.find.Work`."""
 
-    scene: Scene
-    held_out: HeldOutViews | None
-    notes: tuple[str, ...]
+    record: RunRecord  # what is known beforehand
+    settings: CompactOptions  # all settings
+    measured: EvaluateOptions  # what is measured
+    targets: Path | None = None  # cameras of held-out views
+    target_images: Path | None = None  # folder of their photos; None: found by their cameras
+
+    def key(self, options: BatchOptions) -> str:
+        """Digest everything that the measurements depend on."""
+        run = asdict(replace(self.record, command=""))
+        how = {"measured": asdict(self.measured), "seed": self.settings.seed, "tool_version": __version__}
+        return digest({"run": run, **how, "opacity": options.opacity, "reading": vars(options.hints)})
+
+    def run(self, files: SceneFiles, options: BatchOptions, out: Path) -> tuple[dict[str, Any], list[Path]]:
+        """Merge, score, time and keep pictures; returns the report and the pictures."""
+        threads = options.settings.threads
+        with use_threads(threads):
+            source = files, self.targets, self.target_images, self.record.scene_sha256
+            scene, held_out, notes = _load(*source, options.opacity, options.hints)
+            if self.record.method == SUPERPIXELS:
+                facts, pictures = self._measure_superpixels(scene, out)
+            else:
+                facts, pictures = self._measure(scene, held_out, out, threads)
+        facts["notes"] = (*notes, *facts.get("notes", ()))
+        record = replace(self.record, environment=environment(threads), **facts)
+        return _report(files, record), pictures
+
+    def _measure(
+        self, scene: Scene, held_out: HeldOutViews | None, out: Path, threads: int | None
+    ) -> tuple[dict[str, Any], list[Path]]:
+        method, views = self.record.method, self.record.views_asked
+        if views is not None and views > len(scene):
+            raise ValueError(f"expected at most {len(scene)} views, got {views}")
+        part, targets = choose_views(scene, held_out, views)
+        facts: dict[str, Any] = {"seconds": 0.0}
+        gaussians = part.file_gaussians
+        if method != INPUT:
+            settings = replace(self.settings, threads=threads)
+            kind = (method, *(self.record.settings.get(name) for name in ("fit", "segmentation", "k")))
+            if kind not in _tried:  # on two views, so that loading kernels does not count as time of the first run
+                compact(choose_views(scene, None, 2)[0], settings)
+                _tried.add(kind)
+            done = compact(part, settings)
+            gaussians, seconds = done.gaussians, done.report.seconds
+            merge = sum(value for name, value in seconds.items() if name not in SCORING)
+            facts = {"seconds": merge, "stages": dict(seconds), "notes": tuple(done.report.notes)}
+        measured = replace(self.measured, threads=threads)
+        cameras, near = part.cameras if targets is None else targets.cameras, near_plane(part)
+        timed = pick_views(len(cameras), MAX_TIMED)
+        pictures, names = keep_pictures(out, gaussians, scene, held_out)
+        facts |= {
+            "views": len(part),
+            "num_input": part.num_gaussians,
+            "count": len(gaussians),
+            "bytes": file_bytes(len(gaussians), gaussians.sh_degree),
+            "scores": measure(part, None if method == INPUT else gaussians, targets, measured),
+            "render_ms": 1000 * median(time_render(gaussians, cameras[[view]], near) for view in timed),
+            "pictures": names,
+        }
+        return facts, pictures
+
+    def _measure_superpixels(self, scene: Scene, out: Path) -> tuple[dict[str, Any], list[Path]]:
+        """Measure how well superpixels alone approximate a few photos (paper, section 5), as stages are: by name."""
+        if scene.images is None:
+            return {"notes": ("no photos to measure superpixels on",)}, []
+        photos = scene.images[pick_views(len(scene), self.record.views_asked or len(scene))]
+        pixels, points = photos.shape[1] * photos.shape[2], dict[str, float]()
+        for name, share in product(SEGMENTATIONS, SHARES):
+            score = partial(proxy_psnr, count=max(1, round(share * pixels)), segmentation=name)
+            points[f"{name} {share:g}"] = float(np.mean([min(one, MAX_DB) for one in parallel_map(score, photos)]))
+        shown = draw_means(photos[0], superpixels(photos[0], max(1, round(SHARES[-2] * pixels)), SEGMENTATIONS[0]))
+        path = picture_path(out.parent, out.name, 0, "render")
+        _write(path, shown)
+        return {"views": len(photos), "count": pixels, "scores": points}, [path]
 
 
-def make_plan(
-    experiments: Sequence[Experiment], sources: Sequence[SceneSource], folder: Path, options: RunOptions
-) -> tuple[Plan, dict[str, RunRecord]]:
-    """The plan of a grid, and the runs that the folder holds already, by key."""
-    stored, notes = read_runs(folder)
-    done_proxies, more = read_proxies(folder)
-    by_path = {source.path: source for source in sources}
-    runs: dict[str, tuple[str, Experiment, SceneSource]] = {}
-    too_few: Counter[str] = Counter()
-    for experiment in experiments:
-        source = by_path[experiment.scene]
-        if experiment.views is not None and source.num_views is not None and experiment.views > source.num_views:
-            too_few[source.name] += 1
-        else:
-            key = options.key_of(experiment, source)
-            runs.setdefault(key, (key, experiment, source))
-    skipped = [f"{name} has fewer views than asked for: {count} run(s) left out" for name, count in too_few.items()]
-    pending = {k for k in runs if options.rerun or k not in stored or stored[k].error is not None}
-    proxies: dict[str, Mapping[str, tuple[str, float]]] = {}
-    for source in sources:
-        points = proxy_points(source.sha256, options.proxy_views) if options.proxy_views else {}
-        left = {key: point for key, point in points.items() if options.rerun or key not in done_proxies}
-        proxies |= {source.name: left} if left else {}
-    return Plan(tuple(runs.values()), frozenset(pending), proxies, (*notes, *more, *skipped)), stored
+def proxy_psnr(image: np.ndarray, count: int, segmentation: str) -> float:
+    """Compute the PSNR (dB) of a photo ``[h,w,3]`` (sRGB, 0 to 1) with ``count`` superpixels in their mean colours."""
+    means = draw_means(image, superpixels(image, count, segmentation))
+    return psnr(means.astype(np.float64) / 255, image.astype(np.float64))
 
 
-def run_plan(plan: Plan, folder: Path, options: RunOptions, progress: Progress) -> tuple[list[RunRecord], list[str]]:
-    """Run what is pending, scene by scene; returns the records of what was run, and notes.
+@lru_cache(maxsize=1)
+def _load(
+    files: SceneFiles,
+    targets: Path | None,
+    target_images: Path | None,
+    sha256: str,
+    opacity: OpacityChoice,
+    hints: ReadHints,
+) -> tuple[Scene, HeldOutViews | None, tuple[str, ...]]:
+    """Read a scene with its held-out views, once for several runs in a row; ``sha256`` is that of the files."""
+    load = load_files(files, opacity=opacity, hints=hints)
+    held_out = None if targets is None else read_held_out(load, targets, target_images)
+    return load.scene, held_out, tuple(load.notes)
 
-    A run that fails gives a record with the reason, and the others go on. ``progress`` is called with (step, done,
-    total) before each run and after the last.
+
+def choose_views(scene: Scene, held_out: HeldOutViews | None, count: int | None) -> tuple[Scene, Views | None]:
+    """Choose ``count`` of the scene's views, evenly spread, and the held-out ones nearest the middle between them.
+
+    Without ``count`` all views are kept, and where their places along the trajectory are not known all held-out ones.
     """
-    done: list[RunRecord] = []
-    notes: list[str] = []
-    count = 0
-
-    def step(text: str, add: int = 1) -> None:
-        nonlocal count
-        progress(text, count, plan.total)
-        count += add
-
-    warm: set[tuple[Any, ...]] = set()
-    with use_threads(options.threads):
-        for source, group in groupby(plan.runs, key=lambda run: run[2]):
-            runs = [(key, experiment) for key, experiment, _ in group if key in plan.pending]
-            proxies = plan.proxies.get(source.name, {})
-            if not runs and not proxies:
-                continue
-            step(f"{source.name}: reading", 0)
-            loaded = _read(source, options)
-            for key, experiment in runs:
-                step(f"{source.name}: {describe(experiment)}")
-                record = _start_record(key, source, experiment, options)
-                try:
-                    record = _run(record, loaded, folder, options, warm)
-                except Exception as error:  # one bad run must not end the grid; Ctrl-C does
-                    record = replace(record, error=error_line(error))
-                append_run(folder, record)
-                done.append(record)
-            if proxies and isinstance(loaded, _LoadedScene) and loaded.scene.images is not None:
-                photos, report = loaded.scene.images, partial(step, f"{source.name}: superpixels")
-                measure_proxies(folder, source.name, photos, proxies, max_views=options.proxy_views, progress=report)
-            elif proxies:
-                notes.append(f"{source.name}: no photos to measure superpixels on")
-                count += len(proxies)
-            del loaded
-    progress("done", plan.total, plan.total)
-    return done, notes
+    targets = None if held_out is None else Views(held_out.cameras, held_out.images, held_out.names)
+    if count is None or count >= len(scene):
+        return scene, targets
+    ids = even_views(len(scene), count)
+    if held_out is not None and held_out.context_places is not None:
+        chosen = midpoint_views([held_out.context_places[i] for i in ids], held_out.places)
+        names = tuple(held_out.names[i] for i in chosen)
+        targets = Views(held_out.cameras[chosen], held_out.images[chosen], names) if chosen else None
+    return subset(scene, ids), targets
 
 
-def describe(run: Experiment | RunRecord) -> str:
-    """A run in a few words."""
-    settings = [f"{name} {value}" for name, value in run.settings.items()]
-    count = run.views if isinstance(run, Experiment) else run.views_asked
-    return ", ".join([run.method, *settings, *([] if count is None else [f"{count} views"])])
+def measure(
+    scene: Scene, gaussians: Gaussians | None, targets: Views | None, options: EvaluateOptions
+) -> dict[str, float]:
+    """Measure scores by name (``psnr_target_visible``, ...), means over the views, without those that do not exist.
 
-
-def _read(source: SceneSource, options: RunOptions) -> _LoadedScene | Exception:
-    """The scene with its held-out views, or why it cannot be read."""
-    try:
-        load = load_files(source.files, opacity=options.opacity, hints=options.hints)
-        held_out = None if source.targets is None else read_held_out(load, source.targets, source.target_images)
-        return _LoadedScene(load.scene, held_out, tuple(load.notes))
-    except Exception as error:
-        return error
-
-
-def _start_record(key: str, source: SceneSource, experiment: Experiment, options: RunOptions) -> RunRecord:
-    """What is known of a run beforehand."""
-    return RunRecord(
-        key=key,
-        scene=source.name,
-        scene_sha256=source.sha256,
-        method=experiment.method,
-        settings=dict(experiment.settings),
-        views_asked=experiment.views,
-        command=options.command,
-        environment=environment(options.threads),
-    )
-
-
-def _run(
-    record: RunRecord, loaded: _LoadedScene | Exception, folder: Path, options: RunOptions, warm: set[tuple[Any, ...]]
-) -> RunRecord:
-    """Merge, score, time, store pictures.
-
-    ``warm`` has the kinds of runs that this process has done before, and is added to. The first of a kind is tried on
-    two views, so that compiling and loading of kernels does not count as its time.
+    Without ``gaussians`` the scene's own are measured.
     """
-    if isinstance(loaded, Exception):
-        raise loaded
-    if record.views_asked is not None and record.views_asked > len(loaded.scene):
-        raise ValueError(f"expected at most {len(loaded.scene)} views, got {record.views_asked}")
-    scene, targets = choose_views(loaded.scene, loaded.held_out, record.views_asked)
-    settings = run_settings(record.method, record.settings) | {"seed": options.seed, "threads": options.threads}
-    seconds: dict[str, float] = {}
-    notes: tuple[str, ...] = loaded.notes
-    result = None
-    if record.method != INPUT:
-        kind = (record.method, *(record.settings.get(name) for name in ("fit", "segmentation", "k")))
-        if kind not in warm:
-            compact(choose_views(scene, None, 2)[0], **settings)
-            warm.add(kind)
-        done = compact(scene, **settings)
-        result, seconds = done.gaussians, done.report.seconds
-        notes = (*notes, *done.report.notes)
-    evaluation = EvaluateOptions(lpips=options.lpips, lpips_views=options.lpips_views, threads=options.threads)
-    scores: dict[str, Any] = {**measure(scene, result, targets, evaluation)}
-    gaussians = scene.file_gaussians if result is None else result
-    count = scene.num_gaussians if result is None else len(result)
-    cameras, near = scene.cameras if targets is None else targets.cameras, near_plane(scene)
-    views = pick_views(len(cameras), MAX_TIMED)
-    return replace(
-        record,
-        views=len(scene),
-        num_input=scene.num_gaussians,
-        count=count,
-        ratio=count / max(scene.num_gaussians, 1),
-        bytes=file_bytes(count, gaussians.sh_degree),
-        seconds=sum(value for name, value in seconds.items() if name not in SCORING),
-        stages=dict(seconds),
-        render_ms=1000 * median(time_render(gaussians, cameras[[view]], near) for view in views),
-        pictures=keep_pictures(folder, record.key, record.scene_sha256, gaussians, loaded.scene, loaded.held_out),
-        notes=notes,
-        **scores,
-    )
+    results = {} if gaussians is None else {"result": gaussians}
+    evaluation = evaluate(scene, results, targets, replace(options, own=gaussians is None))
+    scores: dict[str, float] = {}
+    for split in evaluation.num_views:
+        full, masked = evaluation.results[-1].mean(split)
+        for part, quality in (("", full), ("_visible", masked)):
+            for name, value in asdict(quality).items():
+                if value is not None and not math.isnan(value):
+                    scores[f"{name}_{split}{part}"] = min(value, MAX_DB)
+    return scores
 
 
-def estimate_seconds(
-    runs: Sequence[tuple[str, Experiment, SceneSource]], stored: Mapping[str, RunRecord], options: RunOptions
-) -> float:
-    """Wall time of runs, within a factor of about two; from times of the same scene and method in ``stored`` if any."""
-    threads = options.threads or available_threads()
-    known: dict[tuple[str, str], list[float]] = {}
-    for record in stored.values():
-        if record.seconds is not None and record.error is None:
-            known.setdefault((record.scene, record.method), []).append(record.seconds)
-    total = 0.0
-    for _, experiment, source in runs:
-        views = source.num_views or 1
-        share = min(1.0, (experiment.views or views) / views)
-        gaussians = share * source.files.ply.stat().st_size / BYTES_PER_GAUSSIAN
-        lpips_share = min(1.0, (options.lpips_views or views) / max(share * views, 1.0))
-        total += gaussians / 1e6 * (COST_EVALUATE + lpips_share * COST_LPIPS * len(options.lpips)) / threads
-        times = known.get((source.name, experiment.method))
-        if times:
-            total += share * median(times)
-        elif experiment.method != INPUT:
-            settings = CompactOptions().with_settings(run_settings(experiment.method, experiment.settings))
-            flat, steps, of_view = (
-                resolved_settings(settings, photos=True),
-                resolve_fit(settings).steps,
-                gaussians / max(share * views, 1),
-            )
-            total += work_seconds(round(gaussians), of_view, flat, photos=True, fit_steps=steps) / threads
-    return total
+def keep_pictures(
+    out: Path, gaussians: Gaussians, scene: Scene, held_out: HeldOutViews | None
+) -> tuple[list[Path], tuple[str, ...]]:
+    """Write renders and error maps of a few views of a run, and the photos; returns paths of the former and view names.
+
+    The views are the held-out ones, or the scene's without any; ``scene`` and ``held_out`` have all of them, so that
+    all runs of a scene have pictures of the same ones.
+    """
+    views = scene if held_out is None else held_out
+    photos, names = views.images, views.names
+    ids, near = pick_views(len(names), MAX_PICTURES), near_plane(scene)
+    paths = []
+    for i, view in enumerate(ids):
+        image = render(gaussians, views.cameras[[view]], near=near).images[0].clip(0, 1)
+        paths.append(picture_path(out.parent, out.name, i, "render"))
+        _write(paths[-1], to_picture(image))
+        if photos is not None:
+            _write(picture_path(out.parent, "photo", i, "photo"), to_picture(photos[view]))
+            paths.append(picture_path(out.parent, out.name, i, "error"))
+            _write(paths[-1], heat_map((np.abs(image - photos[view]).mean(2) / MAX_ERROR).clip(0, 1)))
+    return paths, tuple(names[view] for view in ids)
+
+
+def _write(path: Path, picture: Picture) -> None:
+    height, width = picture.shape[:2]
+    if width > MAX_WIDTH:
+        size = MAX_WIDTH, max(1, round(height * MAX_WIDTH / width))
+        picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+    settings = [cv2.IMWRITE_JPEG_QUALITY, QUALITY] if path.suffix == ".jpg" else []
+    _, data = cv2.imencode(path.suffix, picture[..., ::-1], settings)
+    with atomic_output(path, overwrite=True) as temporary:
+        temporary.write_bytes(data.tobytes())
+
+
+def _report(files: SceneFiles, record: RunRecord) -> dict[str, Any]:
+    """Make the report of a run with the keys that the records of a batch have, and the run's own record in it."""
+    size = files.ply.stat().st_size
+    return {
+        **document_head(),
+        "input": {"path": os.fspath(files.ply), "bytes": size, "num_gaussians": record.num_input or 0},
+        "output": {"bytes": record.bytes or 0, "num_gaussians": record.count or 0},
+        "levels": [],
+        "ratio": record.ratio,
+        "psnr_input_views": {"before": None, "after": record.value("psnr_context")},
+        "total_seconds": record.seconds or 0.0,
+        "peak_memory_bytes": peak_memory(),
+        "unmet": None,
+        "notes": list(record.notes),
+        "run": asdict(record),
+    }
 
 
 def environment(threads: int | None) -> dict[str, str]:
-    """Processor, threads and versions that results and times depend on."""
-    values = {
+    """List processor, threads and versions, which results and times depend on."""
+    processor = platform.processor() or platform.machine()
+    with suppress(OSError), open("/proc/cpuinfo", encoding="utf-8") as file:  # only Linux has it
+        models = (line.split(":", 1)[1].strip() for line in file if line.startswith("model name"))
+        processor = next(models, processor)
+    versions = {name: sys.modules[name].__version__ for name in PACKAGES if name in sys.modules}
+    return {
         "gsmerge": __version__,
-        "processor": _processor(),
+        "processor": f"{processor}, {os.cpu_count() or 1} processors",
         "threads": str(threads or available_threads()),
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
+        **versions,
     }
-    for name in PACKAGES:
-        with suppress(PackageNotFoundError):  # installed under another name
-            values[name] = version(name)
-    return values
-
-
-def _processor() -> str:
-    """Its model, and the number of processors."""
-    name = platform.processor() or platform.machine()
-    with suppress(OSError), open("/proc/cpuinfo", encoding="utf-8") as file:  # only Linux has it
-        name = next((line.split(":", 1)[1].strip() for line in file if line.startswith("model name")), name)
-    return f"{name}, {os.cpu_count() or 1} processors"

@@ -8,7 +8,6 @@ Every shape has a frame of its own (centre, rotation local to world) and half si
 - CONE: a cylinder about y, whose radius is ``extra`` times as large at +y as at -y, with both ends closed
 - LEAF: the part of z = 0 where ``|x| <= hx (1 - (y / hy)^2)``
 - BLOB: an ellipsoid whose radius is 1 + waves, in units of the half sizes
-- SHEET: the surface z = waves of x and y over the rectangle
 
 ``waves[m,4,5]`` are sines: three wave numbers, phase and amplitude each.
 """
@@ -17,9 +16,9 @@ import math
 
 from gsmerge.kernels.jit import kernel
 
-QUAD, BOX, ELLIPSOID, CONE, LEAF, BLOB, SHEET = range(7)
+QUAD, BOX, ELLIPSOID, CONE, LEAF, BLOB = range(6)
 NEAR = 1e-4  # of the depth unit: hits nearer than this do not count
-MARCH, BISECT = 24, 10  # most steps over a waved shape's bounds, and halvings of the step with the change of sign
+MARCH, BISECT = 24, 10  # most steps over a blob's bounds, and halvings of the step with the change of sign
 MISS = 1e30
 
 
@@ -33,7 +32,7 @@ def _wave(waves, x, y, z):
 
 @kernel
 def _limits(waves):
-    """The most that the waves add up to, and the steepest that they get."""
+    """Compute the most that the waves add up to, and the steepest that they get."""
     reach, slope = 0.0, 0.0
     for k in range(waves.shape[0]):
         reach += abs(waves[k, 4])
@@ -43,7 +42,7 @@ def _limits(waves):
 
 @kernel
 def _slab(o, d, h):
-    """Entry and exit of a ray between -h and h along one axis."""
+    """Compute entry and exit of a ray between -h and h along one axis."""
     if d == 0.0:
         if abs(o) <= h:
             return -MISS, MISS
@@ -83,7 +82,7 @@ def _box(s, ox, oy, oz, dx, dy, dz):
 
 @kernel
 def _sphere(radius, ox, oy, oz, dx, dy, dz):
-    """Entry and exit of the sphere about the origin."""
+    """Compute entry and exit of the sphere about the origin."""
     a = dx * dx + dy * dy + dz * dz
     b = ox * dx + oy * dy + oz * dz
     c = ox * ox + oy * oy + oz * oz - radius * radius
@@ -96,7 +95,7 @@ def _sphere(radius, ox, oy, oz, dx, dy, dz):
 
 @kernel
 def _cone(s, ox, oy, oz, dx, dy, dz):
-    """Side and ends of a tapered cylinder; x and z come in units of the radii at -y, y in half heights."""
+    """Hit side or ends of a tapered cylinder; x and z come in units of the radii at -y, y in half heights."""
     best = MISS
     mean, slope = 0.5 * (1.0 + s[3]), 0.5 * (s[3] - 1.0)
     r, dr = mean + slope * oy, slope * dy
@@ -121,16 +120,14 @@ def _cone(s, ox, oy, oz, dx, dy, dz):
 
 
 @kernel
-def _level(blob, waves, x, y, z):
-    """Zero on a waved surface."""
-    if blob:
-        return math.sqrt(x * x + y * y + z * z) - 1.0 - _wave(waves, x, y, z)
-    return z - _wave(waves, x, y, 0.0)
+def _level(waves, x, y, z):
+    """Compute the distance from a blob in its own frame, about; 0 on its surface."""
+    return math.sqrt(x * x + y * y + z * z) - 1.0 - _wave(waves, x, y, z)
 
 
 @kernel
-def _march(blob, waves, pace, first, last, ox, oy, oz, dx, dy, dz):
-    """First change of sign between two depths, by steps that cannot cross the surface, or not by much.
+def _march(waves, pace, first, last, ox, oy, oz, dx, dy, dz):
+    """Find the first change of sign between two depths, by steps that hardly cross the surface.
 
     ``pace`` is the most that the level may change per unit of depth.
     """
@@ -138,17 +135,17 @@ def _march(blob, waves, pace, first, last, ox, oy, oz, dx, dy, dz):
     if last <= first:
         return MISS
     least, t = (last - first) / MARCH, first
-    level = _level(blob, waves, ox + t * dx, oy + t * dy, oz + t * dz)
+    level = _level(waves, ox + t * dx, oy + t * dy, oz + t * dz)
     outside = level > 0.0
     while t < last:
         before = t
         t = min(t + max(abs(level) / pace, least), last)
-        level = _level(blob, waves, ox + t * dx, oy + t * dy, oz + t * dz)
+        level = _level(waves, ox + t * dx, oy + t * dy, oz + t * dz)
         if (level > 0.0) != outside:
             low, high = before, t
             for _ in range(BISECT):
                 t = 0.5 * (low + high)
-                if (_level(blob, waves, ox + t * dx, oy + t * dy, oz + t * dz) > 0.0) == outside:
+                if (_level(waves, ox + t * dx, oy + t * dy, oz + t * dz) > 0.0) == outside:
                     low = t
                 else:
                     high = t
@@ -158,24 +155,18 @@ def _march(blob, waves, pace, first, last, ox, oy, oz, dx, dy, dz):
 
 @kernel
 def _hit(kind, s, waves, reach, slope, limit, ox, oy, oz, dx, dy, dz):
-    """Depth of the nearest hit, in the shape's own frame; what lies beyond ``limit`` need not be found."""
+    """Compute the depth of the nearest hit, in the shape's own frame; what lies beyond ``limit`` need not be found."""
     if kind in (QUAD, LEAF):
         return _flat(kind == LEAF, s, ox, oy, oz, dx, dy, dz)
     if kind == BOX:
         return _box(s, ox, oy, oz, dx, dy, dz)
-    if kind == SHEET:
-        x0, x1 = _slab(ox, dx, s[0])
-        y0, y1 = _slab(oy, dy, s[1])
-        z0, z1 = _slab(oz, dz, reach)
-        pace = abs(dz) + slope * math.sqrt(dx * dx + dy * dy)
-        return _march(False, waves, pace, max(x0, y0, z0), min(x1, y1, z1, limit), ox, oy, oz, dx, dy, dz)
     ox, oy, oz, dx, dy, dz = ox / s[0], oy / s[1], oz / s[2], dx / s[0], dy / s[1], dz / s[2]
     if kind == CONE:
         return _cone(s, ox, oy, oz, dx, dy, dz)
     if kind == BLOB:
         near, far = _sphere(1.0 + reach, ox, oy, oz, dx, dy, dz)
         pace = (1.0 + slope) * math.sqrt(dx * dx + dy * dy + dz * dz)
-        return _march(True, waves, pace, near, min(far, limit), ox, oy, oz, dx, dy, dz)
+        return _march(waves, pace, near, min(far, limit), ox, oy, oz, dx, dy, dz)
     near, far = _sphere(1.0, ox, oy, oz, dx, dy, dz)
     if near >= NEAR:
         return near
@@ -184,7 +175,7 @@ def _hit(kind, s, waves, reach, slope, limit, ox, oy, oz, dx, dy, dz):
 
 @kernel
 def _normal(kind, s, waves, x, y, z):
-    """Outward normal in the shape's own frame, any length."""
+    """Compute the outward normal in the shape's own frame, any length."""
     if kind in (QUAD, LEAF):
         return 0.0, 0.0, 1.0
     a, b, c = x / s[0], y / s[1], z / max(s[2], 1e-12)
@@ -199,26 +190,20 @@ def _normal(kind, s, waves, x, y, z):
             return 0.0, b, 0.0
         radius = 0.5 * (1.0 + s[3]) + 0.5 * (s[3] - 1.0) * b
         return a / s[0], -radius * 0.5 * (s[3] - 1.0) / s[1], c / s[2]
-    if kind == SHEET:
-        a, b, c, nx, ny, nz = x, y, 0.0, 0.0, 0.0, 1.0
-    else:
-        length = math.sqrt(a * a + b * b + c * c)
-        nx, ny, nz = a / length, b / length, c / length
-    if kind in (BLOB, SHEET):
+    length = math.sqrt(a * a + b * b + c * c)
+    nx, ny, nz = a / length, b / length, c / length
+    if kind == BLOB:
         for k in range(waves.shape[0]):
             swing = waves[k, 4] * math.cos(waves[k, 0] * a + waves[k, 1] * b + waves[k, 2] * c + waves[k, 3])
             nx -= swing * waves[k, 0]
             ny -= swing * waves[k, 1]
-            if kind == BLOB:
-                nz -= swing * waves[k, 2]
-    if kind == SHEET:
-        return nx, ny, nz
+            nz -= swing * waves[k, 2]
     return nx / s[0], ny / s[1], nz / s[2]
 
 
 @kernel
 def _local(rotation, centre, eye, dx, dy, dz):
-    """Origin and direction of a ray in the shape's frame."""
+    """Move origin and direction of a ray into the shape's frame."""
     ex, ey, ez = eye[0] - centre[0], eye[1] - centre[1], eye[2] - centre[2]
     return (
         rotation[0, 0] * ex + rotation[1, 0] * ey + rotation[2, 0] * ez,
@@ -232,7 +217,7 @@ def _local(rotation, centre, eye, dx, dy, dz):
 
 @kernel
 def _ray(axes, lens, step, i, j):
-    """Direction of pixel row i and column j, of length 1 along the camera's z."""
+    """Compute the direction of pixel row i and column j, of length 1 along the camera's z."""
     u, v = ((j + 0.5) * step - lens[2]) / lens[0], ((i + 0.5) * step - lens[3]) / lens[1]
     return (
         axes[0, 0] * u + axes[0, 1] * v + axes[0, 2],
@@ -279,7 +264,7 @@ def cast(eye, axes, lens, step, kinds, rotations, centres, sizes, waves, rects, 
 
 @kernel
 def add_light(points, normals, axes, centre, radius, maps, bias, weights, out):
-    """Share of each light that reaches points, times the cosine and its weight, summed over the lights.
+    """Add up the share of each light that reaches points, times the cosine and its weight.
 
     ``axes [k,3,3]`` rows right, down and forward of the lights' parallel rays, ``maps [k,s,s]`` how far forward of
     ``centre`` the first surface lies over the square of half side ``radius``, ``out [n]`` is added to.

@@ -2,17 +2,123 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, make_dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import cv2
 import numpy as np
 
+from gsmerge.errors import SceneError
+from gsmerge.io.bounds import read_table
 from gsmerge.kernels.raster.harmonics import view_colors
-from gsmerge.research.generate.options import Noise
-from gsmerge.research.generate.patterns import enlarge
 from gsmerge.research.generate.photograph import Float, Lens
 from gsmerge.research.generate.shapes import Array
+from gsmerge.research.generate.textures import enlarge
 from gsmerge.types import SH_C0, Gaussians
+
+Range = tuple[float, float]
+ERRORS = (  # ranges that --noise scales; the others are habits of the exporter
+    *("view_bias", "drift", "patches", "patch_error", "grain", "bleed", "floaters", "turn", "shift"),
+    *("exposure", "tint", "oversized", "tilt"),
+)
+SPREAD = ("view_bias", "drift", "grain", "turn", "shift", "unit")  # drawn uniformly in their logarithm
+POSITIVE = (*SPREAD, "far", "scale", "bleed_width", "flatness", "blur")
+
+
+@dataclass(frozen=True)
+class NoiseOptions:
+    """Ranges of every error and habit of an exporter, from which each scene draws its values.
+
+    Depth errors are deviations of the logarithm of depth, so about parts of the depth. docs/internals/generator.md
+    compares them with real exports. A ValueError if a range is empty or impossible.
+    """
+
+    view_bias: Range = (0.0002, 0.02)  # scale error of a view
+    drift: Range = (0.0003, 0.02)  # slow error across a view
+    patches: Range = (0.0, 0.3)  # share of a view whose depth is wrong
+    patch_error: Range = (0.02, 0.5)  # error of these patches
+    grain: Range = (0.0007, 0.003)  # independent error of each pixel
+    blank: Range = (0.0, 3.0)  # factor of additional errors where the photo has no texture
+    bleed: Range = (0.1, 1.0)  # blend towards a smoothed inverse depth at edges, 0 to 1
+    bleed_width: Range = (0.6, 1.8)  # deviation of that smoothing, pixels
+    far: Range = (4.0, 12.0)  # largest depth that the network predicts, in medians of the depth
+    # share of the pixels that float in front of their surface; eleven times as many at edges
+    floaters: Range = (0.0, 0.004)
+    turn: Range = (0.005, 0.3)  # rotation error of a pose, degrees
+    shift: Range = (0.0001, 0.004)  # translation error of a pose, in median depths
+    exposure: Range = (0.0, 0.12)  # deviation of the logarithm of a photo's brightness
+    tint: Range = (0.0, 0.03)  # the same for each colour
+    blur: Range = (0.3, 0.75)  # deviation of the lens's blur, pixels
+    offset: Range = (0.0, 0.3)  # largest distance of a mean from its pixel's centre, pixels
+    scale: Range = (0.5, 1.5)  # scale of a Gaussian across its normal, in footprints of its pixel
+    scale_jitter: Range = (0.05, 0.35)  # deviation of the scales' logarithms
+    flatness: Range = (0.15, 1.0)  # thickness along the normal, relative to the other axes
+    tilt: Range = (0.02, 0.4)  # error of the normals, radians
+    oversized: Range = (0.0, 0.006)  # share of the Gaussians that are far too large
+    oversize: Range = (3.0, 12.0)  # largest factor of their size, at least 2
+    trust: Range = (0.25, 1.0)  # confidence of pixels without errors
+    constant_opacity: float = 0.2  # chance that all opacities are the same
+    opacity_low: Range = (0.05, 0.4)  # opacity where the confidence is 0
+    opacity_high: Range = (0.75, 0.99)  # opacity where the confidence is 1
+    opacity_grain: Range = (0.0, 0.08)  # independent deviation of each opacity
+    color_grain: Range = (0.0, 0.02)  # error of each colour
+    color_blur: Range = (0.0, 0.6)  # deviation of the smoothing of colours, pixels; below 0.2: none
+    sh_degrees: tuple[int, ...] = (0, 0, 0, 1, 2)  # degrees of the spherical harmonics, drawn with equal chances
+    harmonics: Range = (0.0, 0.06)  # deviation of the higher coefficients
+    unit: Range = (0.2, 5.0)  # world units per metre
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if f.name == "constant_opacity":
+                ok = 0 <= value <= 1
+            elif f.name == "sh_degrees":
+                ok = len(value) > 0 and all(degree in (0, 1, 2, 3) for degree in value)
+            else:
+                ok = len(value) == 2 and 0 <= value[0] <= value[1] < float("inf")
+                ok = ok and (value[0] > 0 or f.name not in POSITIVE)
+            if not ok:
+                raise ValueError(f"{f.name}: expected a range of possible values, got {value!r}")
+
+
+def read_ranges(path: Path) -> NoiseOptions:
+    """Read ranges from a TOML or JSON file: a table with some of the names, and two numbers for each.
+
+    A SceneError if the file cannot be read, or holds an unknown name or an impossible range.
+    """
+    table = read_table(path)
+    unknown = sorted(table.keys() - {f.name for f in fields(NoiseOptions)})
+    if unknown:
+        raise SceneError(path, f"unknown range {unknown[0]!r}", "docs/internals/generator.md has the names")
+    values: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in table.items()}
+    try:
+        return NoiseOptions(**values)
+    except (ValueError, TypeError) as error:
+        raise SceneError(path, str(error), "docs/internals/generator.md has the ranges") from error
+
+
+RANGES = [f.name for f in fields(NoiseOptions) if f.name not in ("constant_opacity", "sh_degrees")]
+if TYPE_CHECKING:
+    Noise: TypeAlias = Any
+else:  # the values that one scene drew, under the names of their ranges
+    Noise = make_dataclass("Noise", [*RANGES, "sh_degree"], frozen=True)
+
+
+def draw_noise(options: NoiseOptions, rng: np.random.Generator, factor: float = 1.0) -> Noise:
+    """Draw values for one scene, all errors but no habits times ``factor``; shares and ``bleed`` are at most 1."""
+    drawn: dict[str, float] = {}
+    for name in RANGES:
+        bounds = getattr(options, name)
+        drawn[name] = float(np.exp(rng.uniform(*np.log(bounds))) if name in SPREAD else rng.uniform(*bounds))
+    for name in ERRORS:
+        drawn[name] *= factor
+    for name in ("bleed", "patches", "floaters", "oversized"):
+        drawn[name] = min(drawn[name], 1.0)
+    degree = int(options.sh_degrees[rng.integers(len(options.sh_degrees))])
+    if rng.random() < options.constant_opacity:
+        drawn["opacity_low"], drawn["opacity_grain"] = drawn["opacity_high"], 0.0
+    return Noise(**drawn, sh_degree=degree)
 
 
 @dataclass(frozen=True)
@@ -26,14 +132,14 @@ class TrueView:
 
 
 def smooth_noise(rng: np.random.Generator, height: int, width: int, cells: int) -> Float:
-    """``[height,width]`` smooth noise of deviation about 1, ``cells`` cells along the longer side."""
+    """Draw smooth noise ``[height,width]`` of deviation about 1, ``cells`` cells along the longer side."""
     side = max(height, width)
     field = enlarge(rng.normal(0, 1, (cells, cells)), side)[:height, :width]
     return field / max(float(field.std()), 1e-3)
 
 
 def edge_mask(depth: Array) -> Float:
-    """``[h,w]`` 0 on smooth surfaces to 1 where depth jumps by a tenth or more between neighbours."""
+    """Rate pixels ``[h,w]`` from 0 on smooth surfaces to 1 where depth jumps by a tenth or more between neighbours."""
     inverse = (1 / depth).astype(np.float32)
     square = np.ones((3, 3), np.uint8)
     jump = np.log(cv2.dilate(inverse, square) / cv2.erode(inverse, square))
@@ -43,7 +149,7 @@ def edge_mask(depth: Array) -> Float:
 
 
 def texture_mask(image: Float) -> Float:
-    """``[h,w]`` 0 where a photo has no texture, 1 where it has detail."""
+    """Rate pixels ``[h,w]`` from 0 where a photo has no texture to 1 where it has detail."""
     grey = image.mean(2)
     mean = cv2.blur(grey, (7, 7))
     deviation = np.sqrt(np.maximum(cv2.blur(grey * grey, (7, 7)) - mean * mean, 0))
@@ -51,7 +157,7 @@ def texture_mask(image: Float) -> Float:
 
 
 def predict_depth(seen: TrueView, noise: Noise, rng: np.random.Generator) -> tuple[Float, Float]:
-    """Depth as a network predicts it, and its confidence in [0, 1], both ``[h,w]``.
+    """Predict depth as a network does, and its confidence in [0, 1], both ``[h,w]``.
 
     Errors are of the logarithm of depth: a bias of the view, a slow drift, wrong patches, and fine grain, all larger
     where the photo has no texture; inverse depth bleeds over edges; depth is limited; and some pixels float in front
@@ -81,14 +187,14 @@ def predict_depth(seen: TrueView, noise: Noise, rng: np.random.Generator) -> tup
 
 
 def quats_facing(normals: Array) -> Array:
-    """``[n,4]`` wxyz: the shortest rotations of +z onto normals or their opposites."""
+    """Compute quats ``[n,4]``, wxyz: the shortest rotations of +z onto normals or their opposites."""
     z = normals * np.where(normals[:, 2:] < 0, -1, 1)
     quats = np.stack([1 + z[:, 2], -z[:, 1], z[:, 0], np.zeros(len(z))], 1)
     return quats / np.linalg.norm(quats, axis=1, keepdims=True)
 
 
 def _harmonics(colors: Float, means: Float, eye: Array, noise: Noise, rng: np.random.Generator) -> tuple[Float, Float]:
-    """sh0 ``[n,1,3]`` and shN ``[n,k-1,3]`` that give Gaussians their colours in their own view."""
+    """Compute sh0 ``[n,1,3]`` and shN ``[n,k-1,3]`` that give Gaussians their colours in their own view."""
     n, num = len(colors), (noise.sh_degree + 1) ** 2 - 1
     sh0 = ((colors - 0.5) / SH_C0)[:, None].astype(np.float32)
     common = rng.normal(0, 1, (1, num, 3))  # highlights of a view are on one side
@@ -102,7 +208,7 @@ def _harmonics(colors: Float, means: Float, eye: Array, noise: Noise, rng: np.ra
 
 
 def pixel_gaussians(seen: TrueView, lens: Lens, noise: Noise, rng: np.random.Generator) -> Gaussians:
-    """One Gaussian for each pixel of a view, in row-major order."""
+    """Make one Gaussian for each pixel of a view, in row-major order."""
     height, width = seen.depth.shape
     n = height * width
     depth, confidence = (a.reshape(-1).astype(np.float64) for a in predict_depth(seen, noise, rng))

@@ -1,4 +1,4 @@
-"""Objects of synthetic scenes, each standing at the origin; y points down. Sizes are in metres."""
+"""Objects of synthetic scenes, each standing at the origin, and stages of them; y points down. Sizes are in metres."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from gsmerge.research.generate.photograph import Light, Stage
 from gsmerge.research.generate.shapes import (
     LYING,
     Array,
@@ -23,13 +24,13 @@ from gsmerge.research.generate.shapes import (
     quad,
     rod,
 )
-from gsmerge.research.generate.textures import Palette
+from gsmerge.research.generate.textures import Palette, color
 
 Shapes = list[Shape]
 
 
 def table(pal: Palette, width: float, depth: float, height: float) -> Shapes:
-    """A table with four legs, or a round one with one."""
+    """Build a table with four legs, or a round one with one."""
     rng, top = pal.rng, pal.material("wood", "wood", "plain", "plain", "marble", "granite", repeat=0.8)
     legs = pal.material("wood", "plain")
     thick = rng.uniform(0.02, 0.06)
@@ -46,7 +47,7 @@ def table(pal: Palette, width: float, depth: float, height: float) -> Shapes:
 
 
 def chair(pal: Palette) -> Shapes:
-    """A chair with a slatted or closed back."""
+    """Build a chair with a slatted or closed back."""
     rng, seat, wood = pal.rng, pal.material("cloth", "wood", "plain"), pal.material("wood", "plain")
     w, h, back = rng.uniform(0.38, 0.5), rng.uniform(0.42, 0.5), rng.uniform(0.8, 1.05)
     out = [box((-w / 2, -h, -w / 2), (w / 2, 0.05 - h, w / 2), seat)]
@@ -61,7 +62,7 @@ def chair(pal: Palette) -> Shapes:
 
 
 def shelf(pal: Palette, width: float, height: float) -> Shapes:
-    """Boards with books and objects on them, its back at z = 0."""
+    """Build boards with books and objects on them, its back at z = 0."""
     rng, board, depth = pal.rng, pal.material("wood", "plain", "plaster", repeat=0.7), 0.3
     out = [box((x - 0.012, -height, -depth), (x + 0.012, 0, 0), board) for x in (-width / 2, width / 2)]
     out.append(box((-width / 2, -height, -0.01), (width / 2, 0, 0), board))
@@ -82,7 +83,7 @@ def shelf(pal: Palette, width: float, height: float) -> Shapes:
 
 
 def lamp(pal: Palette, height: float) -> Shapes:
-    """A standing lamp on a thin pole."""
+    """Build a standing lamp on a thin pole."""
     pole, shade = pal.material("plain", gloss=0.6), pal.material("plain", "cloth")
     radius = pal.rng.uniform(0.1, 0.2)
     out = [column((0, 0, 0), 0.02, radius, pole), rod((0, 0, 0), (0, -height, 0), pal.rng.uniform(0.006, 0.015), pole)]
@@ -90,13 +91,13 @@ def lamp(pal: Palette, height: float) -> Shapes:
 
 
 def carton(pal: Palette) -> Shapes:
-    """A package."""
+    """Build a package."""
     w, h, d = pal.rng.uniform(0.04, 0.16, 3) * [1, 1.4, 1]
     return [box((-w / 2, -h, -d / 2), (w / 2, 0, d / 2), pal.material("label", "printed", "label", "plain"))]
 
 
 def can(pal: Palette) -> Shapes:
-    """A can, a jar or a mug."""
+    """Build a can, a jar or a mug."""
     rng, r, h = pal.rng, pal.rng.uniform(0.025, 0.05), pal.rng.uniform(0.07, 0.16)
     wrapping = pal.material("label", "label", "plain", "marble", gloss=rng.uniform(0, 0.8))
     body = column((0, 0, 0), h, r, wrapping, top=rng.uniform(0.9, 1.15))
@@ -104,7 +105,7 @@ def can(pal: Palette) -> Shapes:
 
 
 def bottle(pal: Palette) -> Shapes:
-    """A bottle or vase with a neck."""
+    """Build a bottle or vase with a neck."""
     rng, glass = pal.rng, pal.material("plain", "gradient", "marble", gloss=0.9)
     r, h = rng.uniform(0.025, 0.06), rng.uniform(0.12, 0.3)
     out = [column((0, 0, 0), 0.65 * h, r, glass), column((0, -0.65 * h, 0), 0.15 * h, r, glass, top=0.35)]
@@ -113,7 +114,7 @@ def bottle(pal: Palette) -> Shapes:
 
 
 def bowl(pal: Palette) -> Shapes:
-    """A bowl with fruit."""
+    """Build a bowl with fruit."""
     rng, r = pal.rng, pal.rng.uniform(0.07, 0.14)
     out = [column((0, 0, 0), 0.06, r * 0.5, pal.material("plain", "cloth", gloss=0.5), top=2.0)]
     fruit = pal.material("plaster", "gradient", gloss=0.3)
@@ -124,7 +125,7 @@ def bowl(pal: Palette) -> Shapes:
 
 
 def toy(pal: Palette) -> Shapes:
-    """A figure of uneven lumps."""
+    """Build a figure of uneven lumps."""
     rng, skin, other = pal.rng, pal.material("plain", "cloth", "plaster"), pal.material("plain", "cloth", "gradient")
     h = rng.uniform(0.12, 0.3)
     out = [blob((0, -0.35 * h, 0), h * np.array([0.26, 0.36, 0.24]), skin, rng, 0.15)]
@@ -138,7 +139,7 @@ def toy(pal: Palette) -> Shapes:
 
 
 def books(pal: Palette) -> Shapes:
-    """A pile of books."""
+    """Build a pile of books."""
     rng, y, out = pal.rng, 0.0, []
     for _ in range(rng.integers(1, 6)):
         w, d, h = rng.uniform(0.12, 0.22), rng.uniform(0.1, 0.16), rng.uniform(0.01, 0.04)
@@ -149,22 +150,13 @@ def books(pal: Palette) -> Shapes:
 
 
 def paper(pal: Palette) -> Shapes:
-    """A sheet of paper."""
+    """Build a sheet of paper."""
     half = pal.rng.uniform(0.06, 0.15), pal.rng.uniform(0.08, 0.2)
     return [quad((0, -0.003, 0), half, pal.material("printed", "label", "printed"), LYING)]
 
 
-def laptop(pal: Palette) -> Shapes:
-    """A computer with a page on its screen."""
-    case, lid = pal.material("plain", gloss=0.4), axis_rotation(0, pal.rng.uniform(-0.5, -0.1))
-    screen = replace(quad((0, -0.11, -0.006), (0.15, 0.1), pal.material("printed", "label")), glow=True)
-    keys = quad((0, -0.019, -0.02), (0.14, 0.07), pal.material("printed", "tiles"), LYING)
-    cover = place([screen, box((-0.16, -0.22, -0.004), (0.16, 0, 0.004), case)], (0, -0.015, 0.11), rotation=lid)
-    return [box((-0.16, -0.018, -0.11), (0.16, 0, 0.11), case), keys, *cover]
-
-
 def plant(pal: Palette, height: float, leaves: int) -> Shapes:
-    """A pot with stems and leaves."""
+    """Build a pot with stems and leaves."""
     rng, green, stem = pal.rng, pal.material("foliage"), pal.material("plain", "bark")
     pot = 0.25 * height
     out = [column((0, 0, 0), pot, 0.16 * height, pal.material("plain", "plaster", "cloth", "marble"), top=1.3)]
@@ -178,14 +170,14 @@ def plant(pal: Palette, height: float, leaves: int) -> Shapes:
 
 
 def random_rotation(rng: np.random.Generator) -> Array:
-    """``[3,3]`` random rotation."""
+    """Draw a random rotation ``[3,3]``."""
     q, r = np.linalg.qr(rng.normal(size=(3, 3)))
     q *= np.sign(np.diag(r))
     return q if np.linalg.det(q) > 0 else -q
 
 
 def bush(pal: Palette, radius: float, leaves: int) -> Shapes:
-    """An uneven core covered with leaves."""
+    """Build an uneven core covered with leaves."""
     rng, green = pal.rng, pal.material("foliage")
     radii = radius * rng.uniform(0.7, 1.2, 3)
     out = [blob((0, -0.8 * radii[1], 0), 0.8 * radii, pal.material("crown", repeat=1.2 / radius, gloss=0.0), rng, 0.5)]
@@ -199,52 +191,28 @@ def bush(pal: Palette, radius: float, leaves: int) -> Shapes:
     return out
 
 
-def tree(pal: Palette, height: float, leaves: int) -> Shapes:
-    """A trunk, branches, lumps of foliage and single leaves."""
-    rng, bark, green = pal.rng, pal.material("bark", repeat=0.8, gloss=0.0), pal.material("foliage", gloss=0.1)
-    crown = pal.material("crown", repeat=0.8, gloss=0.0)
+def tree(pal: Palette, height: float) -> Shapes:
+    """Build a trunk and branches that end in bushes."""
+    rng, bark = pal.rng, pal.material("bark", repeat=0.8, gloss=0.0)
     fork = np.array([rng.normal(0, 0.05), -0.5, rng.normal(0, 0.05)]) * height
     out = [rod((0, 0.1, 0), fork, 0.03 * height, bark)]
     for _ in range(rng.integers(4, 8)):
-        tip = fork + rng.normal(0, 0.17, 3) * height + [0, -0.25 * height, 0]
-        out.append(rod(fork, tip, 0.008 * height, bark))
-        out.append(blob(tip, height * rng.uniform(0.06, 0.16, 3), crown, rng, 0.5))
-        for _ in range(leaves // 6):
-            size = height * rng.uniform(0.012, 0.035)
-            out.append(leaf(tip + rng.normal(0, 0.1, 3) * height, (0.4 * size, size), green, random_rotation(rng)))
+        tip = fork + rng.normal(0, 0.17, 3) * height + [0, -0.15 * height, 0]
+        out += [rod(fork, tip, 0.008 * height, bark)]
+        out += place(bush(pal, height * rng.uniform(0.06, 0.16), 20), tip)
     return out
 
 
-def steps(pal: Palette, width: float, count: int) -> Shapes:
-    """Steps that go up away from the cameras."""
-    material = pal.material("plaster", "granite", "wood", "bricks", repeat=0.7)
-    rise, tread = pal.rng.uniform(0.12, 0.18), pal.rng.uniform(0.25, 0.35)
-    return [
-        box((-width / 2, -rise * (k + 1), tread * k), (width / 2, 0, tread * (count + 1)), material)
-        for k in range(count)
-    ]
-
-
 def wire(pal: Palette, start: Array, end: Array, sag: float, radius: float) -> Shapes:
-    """A hanging cable."""
+    """Build a hanging cable."""
     t = np.linspace(0, 1, 9)[:, None]
     points = start + (end - start) * t + [0, 4 * sag, 0] * t * (1 - t)
     material = pal.material("plain", gloss=0.2)
     return [rod(a, b, radius, material) for a, b in itertools.pairwise(points)]
 
 
-def fence(pal: Palette, width: float, height: float) -> Shapes:
-    """Thin bars between two rails."""
-    material, gap = pal.material("plain", "wood", "bark"), pal.rng.uniform(0.1, 0.25)
-    radius = pal.rng.uniform(0.006, 0.02)
-    out = [rod((x, 0, 0), (x, -height, 0), radius, material) for x in np.arange(-width / 2, width / 2, gap)]
-    return out + [
-        rod((-width / 2, -h, 0), (width / 2, -h, 0), 1.4 * radius, material) for h in (0.15 * height, 0.9 * height)
-    ]
-
-
 def window(pal: Palette, width: float, height: float, material: Material, *, glow: bool) -> Shapes:
-    """A pane with a frame and bars, in the plane z = 0, its foot at the origin."""
+    """Build a pane with a frame and bars, in the plane z = 0, its foot at the origin."""
     pane = replace(quad((0, -height / 2, -0.01), (width / 2, height / 2), material), shell=glow, glow=glow)
     frame, t = pal.material("plain", "wood"), pal.rng.uniform(0.03, 0.07)
     w, h = width / 2, height
@@ -254,7 +222,7 @@ def window(pal: Palette, width: float, height: float, material: Material, *, glo
 
 
 def picture(pal: Palette, width: float, height: float) -> Shapes:
-    """A framed print, its back at z = 0, its foot at the origin."""
+    """Build a framed print, its back at z = 0, its foot at the origin."""
     material = pal.material("label", "printed", "marble", "crown", "spines", "sky", "cloth")
     t = pal.rng.uniform(0.01, 0.03)
     frame = box((-width / 2 - t, -height - t, -0.02), (width / 2 + t, t, 0), pal.material("plain", "wood"))
@@ -265,12 +233,12 @@ SMALL: tuple[Callable[[Palette], Shapes], ...] = (carton, carton, can, bottle, b
 
 
 def small_object(pal: Palette) -> Shapes:
-    """A random object of those that stand on tables."""
+    """Build a random object of those that stand on tables."""
     return SMALL[pal.rng.integers(len(SMALL))](pal)
 
 
 def clutter(pal: Palette, count: int, half: tuple[float, float], height: float) -> Shapes:
-    """Small objects spread over a rectangle without touching, with papers and cables between them."""
+    """Spread small objects over a rectangle without touching, with papers and cables between them."""
     rng, out = pal.rng, []
     taken: list[Array] = []
     for _ in range(count * 4):
@@ -286,3 +254,130 @@ def clutter(pal: Palette, count: int, half: tuple[float, float], height: float) 
         a, b = (np.array([x, -height - 0.004, z]) for x, z in ends)
         out += wire(pal, a, b, 0.0, rng.uniform(0.002, 0.005))
     return out
+
+
+FACING = axis_rotation(1, np.pi / 2)  # rotates -z to -x
+
+
+def _shell(shapes: list[Shape], *, glow: bool = False) -> list[Shape]:
+    return [replace(s, shell=True, glow=glow) for s in shapes]
+
+
+def light(rng: np.random.Generator, lamp_at: Array | None) -> Light:
+    """Draw a sun or a lamp from above and somewhere in front, warm or cool."""
+    side, up = rng.uniform(-1.2, 1.2), rng.uniform(0.5, 1.3)
+    towards = np.array([np.sin(side), -up, -np.cos(side)])
+    key = rng.uniform(0.8, 4.0) * (1 + (0.4 * color(rng, strength=(0, 0.4), light=(0.9, 1)) - 0.4))
+    ambient = rng.uniform(0.5, 1.1) * (1 + (0.3 * color(rng, hue=(0.5, 0.7), strength=(0, 0.3), light=(0.9, 1)) - 0.3))
+    return Light(towards / np.linalg.norm(towards), lamp_at, key, ambient, rng.uniform(0.02, 0.2))
+
+
+def _walls(pal: Palette, width: float, depth: float, height: float) -> Shapes:
+    """Build floor, ceiling and four walls about the origin, with pictures, a window, a skirting and a pipe."""
+    rng = pal.rng
+    kinds = ("plain", "plain", "plain", "plaster", "bricks", "cloth", "tiles", "wood")
+    papers = [pal.material(*kinds, repeat=rng.uniform(0.3, 0.8), gloss=0.0) for _ in range(2)]
+    floor = pal.material("wood", "wood", "tiles", "carpet", "granite", "plaster", "plain", repeat=rng.uniform(0.3, 0.8))
+    w, d, h = width / 2, depth / 2, height
+    out = [quad((0, 0, 0), (w, d), floor, LYING), quad((0, -h, 0), (w, d), pal.material("plain", gloss=0.0), LYING)]
+    out += [quad((0, -h / 2, z), (w, h / 2), papers[0]) for z in (d, -d)]
+    out += [quad((x, -h / 2, 0), (d, h / 2), papers[k], FACING) for x, k in ((-w, 1), (w, rng.integers(2)))]
+    out = _shell(out)
+    skirting = pal.material("plain", "wood")
+    out.append(box((-w, -0.09, d - 0.02), (w, 0, d), skirting))
+    out += [box((x - 0.02, -0.09, -d), (x + 0.02, 0, d), skirting) for x in (-w, w)]
+    for half, spot, facing in ((w, (0, 0, d), np.eye(3)), (d, (-w, 0, 0), FACING.T), (d, (w, 0, 0), FACING)):
+        out += place(_wall_objects(pal, half, h), spot, rotation=facing)
+    pipe = rng.uniform(-w, w)
+    return [*out, rod((pipe, 0, d - 0.06), (pipe, -h, d - 0.06), rng.uniform(0.01, 0.04), skirting)]
+
+
+def _wall_objects(pal: Palette, half: float, height: float) -> Shapes:
+    """Build pictures, a window, a shelf or a door, side by side on the plane z = 0."""
+    rng, out, x = pal.rng, [], -half + 0.3
+    while x < half - 0.5:
+        wide, kind = rng.uniform(0.3, 1.2), rng.integers(0, 5)
+        at = (x + wide / 2, 0.0, 0.0)
+        if kind <= 1:
+            frame = picture(pal, wide, min(wide * rng.uniform(0.6, 1.4), 0.45 * height))
+            out += place(frame, (at[0], -rng.uniform(0.35, 0.5) * height, 0))
+        elif kind == 2:
+            pane = window(pal, wide, rng.uniform(0.35, 0.55) * height, pal.material("sky", "crown"), glow=True)
+            out += place(pane, (at[0], -0.35 * height, 0))
+        elif kind == 3:
+            out += place(shelf(pal, wide, rng.uniform(0.4, 0.85) * height), at)
+        else:
+            out += place([box((-0.45, -0.8 * height, -0.04), (0.45, 0, 0), pal.material("wood", "plain", "cloth"))], at)
+        x += wide + rng.uniform(0.15, 0.8)
+    return out
+
+
+def room(pal: Palette) -> Stage:
+    """Build a furnished room: walls with pictures and shelves, tables, chairs, plants, lamps, cables."""
+    rng = pal.rng
+    w, d, h = rng.uniform(4.0, 7.0), rng.uniform(4.5, 7.0), rng.uniform(2.3, 3.2)
+    shapes = _walls(pal, w, d, h)
+    spots = [(x * w, z * d) for x in (-0.3, 0.0, 0.3) for z in (0.05, 0.32)]
+    for i in rng.permutation(len(spots))[: rng.integers(3, 6)]:
+        at = spots[i][0] + rng.normal(0, 0.15), 0.0, spots[i][1] + rng.normal(0, 0.15)
+        shapes += place(_furniture(pal), at, yaw=rng.normal(0, 0.5))
+    pot = plant(pal, rng.uniform(0.6, 1.6), int(rng.integers(20, 90)))
+    shapes += place(pot, (rng.uniform(-0.4, 0.4) * w, 0, 0.4 * d))
+    shapes += place(lamp(pal, rng.uniform(1.1, 1.8)), (rng.uniform(-0.4, 0.4) * w, 0, rng.uniform(0, 0.4) * d))
+    a, b = (np.array([x * w, -h * rng.uniform(0.75, 1), rng.uniform(0, 0.45) * d]) for x in (-0.5, 0.5))
+    shapes += wire(pal, a, b, rng.uniform(0.05, 0.4), rng.uniform(0.003, 0.008))
+    focus = np.array([rng.normal(0, 0.2), -rng.uniform(0.4, 1.0), rng.uniform(0.15, 0.35) * d])
+    lamp_at = np.array([rng.uniform(-0.3, 0.3) * w, -h + 0.1, rng.uniform(-0.3, 0.2) * d])
+    reach = focus[2] + 0.42 * d
+    return Stage(tuple(shapes), tuple(pal.textures), light(rng, lamp_at), focus, (0.6 * reach, reach), (0.9, 1.8), 35)
+
+
+def _furniture(pal: Palette) -> Shapes:
+    rng, kind = pal.rng, pal.rng.integers(0, 4)
+    if kind == 0:
+        return chair(pal)
+    if kind == 1:
+        soft = pal.material("cloth", "carpet", repeat=0.9)
+        seat = [box((-0.9, -0.42, -0.4), (0.9, 0, 0.4), soft), box((-0.9, -0.85, 0.25), (0.9, 0, 0.45), soft)]
+        pillow = pal.material("cloth", "carpet", "label")
+        return seat + [ball((x, -0.55, 0.1), (0.22, 0.18, 0.12), pillow) for x in rng.uniform(-0.7, 0.7, 2)]
+    width, depth, height = rng.uniform(0.7, 1.5), rng.uniform(0.5, 0.9), rng.uniform(0.4, 0.8)
+    top = clutter(pal, int(rng.integers(2, 7)), (0.3 * width, 0.3 * depth), height)
+    out = table(pal, width, depth, height) + top
+    return out + (place(chair(pal), (0, 0, -0.7), yaw=np.pi) if rng.random() < 0.5 else [])
+
+
+def garden(pal: Palette) -> Stage:
+    """Build bushes, plants and trees under the sky, near and far, behind a fence or wires."""
+    rng, size = pal.rng, 6.0
+    ground = pal.material("grass", "plaster", repeat=rng.uniform(0.3, 0.8), gloss=0.0)
+    shapes = [quad((0, 0, 0), (40 * size, 40 * size), ground, LYING)]
+    crown = pal.material("crown", repeat=2 / size, gloss=0.0)
+    for angle in rng.uniform(0, 2 * np.pi, rng.integers(0, 25)):
+        away, tall = size * rng.uniform(3, 12), size * rng.uniform(0.2, 0.9)
+        spot = away * np.sin(angle), -0.4 * tall, away * np.cos(angle)
+        shapes.append(blob(spot, (tall * rng.uniform(0.5, 2), tall, tall), crown, rng, 0.5))
+    dome = ball((0, 0, 0), (30 * size, 18 * size, 30 * size), pal.material("sky", gloss=0.0))
+    shapes = [*_shell(shapes), *_shell([dome], glow=True)]
+    for _ in range(rng.integers(2, 5)):
+        at = rng.uniform(-1.6, 1.6), 0, rng.uniform(-0.3, 1.2)
+        shapes += place(bush(pal, rng.uniform(0.25, 0.6), int(rng.integers(200, 500))), at)
+    for _ in range(rng.integers(1, 4)):
+        pot = plant(pal, rng.uniform(0.4, 1.0), int(rng.integers(30, 120)))
+        shapes += place(pot, (rng.uniform(-1.2, 1.2), 0, rng.uniform(-0.8, 0.4)))
+    for _ in range(rng.integers(1, 5)):
+        shapes += place(tree(pal, rng.uniform(2.0, 4.5)), (rng.uniform(-4, 4), 0, rng.uniform(2, 6)))
+    if rng.random() < 0.6:
+        wall = pal.material("bricks", "plaster", "wood", repeat=0.4)
+        shapes.append(box((-6, -rng.uniform(1, 3), 6.5), (6, 0, 7), wall))
+    post = pal.material("bark", "plain", "wood")
+    for x in np.arange(-2.5, 2.5, rng.uniform(0.1, 0.25)):  # a fence
+        shapes.append(rod((x, 0, 1.8), (x, -0.9, 1.8), 0.012, post))
+    poles = [np.array([x, -2.4, 2.0]) for x in (-2.5, 2.5)]
+    shapes += [rod((pole[0], 0, pole[2]), pole, 0.025, post) for pole in poles]
+    shapes += wire(pal, poles[0], poles[1], rng.uniform(0.1, 0.4), rng.uniform(0.004, 0.012))
+    focus = np.array([rng.normal(0, 0.2), -rng.uniform(0.2, 0.6), rng.uniform(0.0, 0.6)])
+    return Stage(tuple(shapes), tuple(pal.textures), light(rng, None), focus, (1.4, 3.0), (0.5, 1.6), 180)
+
+
+STYLES: dict[str, Callable[[Palette], Stage]] = {"room": room, "garden": garden}

@@ -90,7 +90,7 @@ class LitStage:
 
 
 def screen_boxes(shapes: ShapeArrays, c2w: Array, lens: Lens, samples: int) -> NDArray[np.int32]:
-    """``[m,4]`` x0, y0, x1, y1 of the samples that may see each shape."""
+    """Compute x0, y0, x1, y1 ``[m,4]`` of the samples that may see each shape."""
     half = bounds(shapes)
     signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), -1).reshape(-1, 3)
     corners = np.einsum("mij,mcj->mci", shapes.rotations, half[:, None] * signs) + shapes.centres[:, None]
@@ -123,7 +123,7 @@ def trace(shapes: ShapeArrays, c2w: Array, lens: Lens, samples: int) -> Hits:
 
 
 def _axes(towards: Array) -> Array:
-    """``[3,3]`` rows right, down, forward of light that comes from a direction."""
+    """Compute the rows right, down, forward ``[3,3]`` of light that comes from a direction."""
     forward = -towards / np.linalg.norm(towards)
     right = np.cross([0.3, 1.0, 0.2], forward)
     right /= np.linalg.norm(right)
@@ -131,7 +131,7 @@ def _axes(towards: Array) -> Array:
 
 
 def _shadow_map(shapes: ShapeArrays, axes: Array, middle: Array, radius: float, size: int) -> Float:
-    """``[size,size]`` shadow map: depth of the first surface, relative to the middle."""
+    """Compute a shadow map ``[size,size]``: depth of the first surface, relative to the middle."""
     c2w = np.eye(4)
     c2w[:3, :3], c2w[:3, 3] = axes.T, middle - BEHIND * radius * axes[2]
     hits = trace(shapes, c2w, Lens(size, size, BEHIND * size / 2), 1)
@@ -166,7 +166,7 @@ def light_stage(stage: Stage) -> LitStage:
 
 
 def coordinates(shapes: ShapeArrays, ids: NDArray[np.int32], points: Float) -> tuple[Float, Float]:
-    """Texture coordinates ``[n]`` of points in the frames of shapes, and texture repeats per world unit ``[n]``."""
+    """Compute texture coordinates ``[n,2]`` of points in the shapes' frames, and repeats per world unit ``[n]``."""
     kinds, half = shapes.kinds[ids], shapes.sizes[ids, :3].astype(np.float32)
     x, y, z = points.T
     a, b, c = (np.abs(points) / np.maximum(half, 1e-9)).T
@@ -189,7 +189,7 @@ def coordinates(shapes: ShapeArrays, ids: NDArray[np.int32], points: Float) -> t
 
 
 def paint(view: LitStage, ids: NDArray[np.int32], points: Float, spread: Float) -> Float:
-    """``[n,3]`` colours of the textures, sRGB; ``spread`` is the size of a sample on the surface, world units."""
+    """Look up the textures' colours ``[n,3]``, sRGB; ``spread`` is the size of a sample on the surface, world units."""
     uv, repeat = coordinates(view.shapes, ids, points)
     textures = np.array([s.material.texture for s in view.shapes.shapes])[ids]
     size = len(view.mips[0][0])
@@ -206,7 +206,7 @@ def paint(view: LitStage, ids: NDArray[np.int32], points: Float, spread: Float) 
 
 
 def _lookup(texture: Picture, uv: Float) -> Float:
-    """Bilinear samples of a texture that repeats; y of the texture is down."""
+    """Sample a texture that repeats, bilinearly; y of the texture is down."""
     width = 4096  # cv2.remap takes at most 32767 columns
     size = len(texture)
     rows = -(-len(uv) // width)
@@ -218,7 +218,7 @@ def _lookup(texture: Picture, uv: Float) -> Float:
 
 
 def radiance(view: LitStage, c2w: Array, lens: Lens, samples: int) -> tuple[Float, Hits]:
-    """Linear light ``[h,w,3]`` of every pixel, and the hits of all samples."""
+    """Compute the linear light ``[h,w,3]`` of every pixel, and the hits of all samples."""
     hits = trace(view.shapes, c2w, lens, samples)
     h, w = hits.depth.shape
     seen = hits.ids.reshape(-1) >= 0
@@ -238,7 +238,7 @@ def radiance(view: LitStage, c2w: Array, lens: Lens, samples: int) -> tuple[Floa
 
 
 def _shade(view: LitStage, ids: NDArray[np.int32], albedo: Float, world: Float, normals: Float, rays: Float) -> Float:
-    """Linear light that points reflect or emit towards the camera."""
+    """Compute the linear light that points reflect or emit towards the camera."""
     light, shapes = view.stage.light, view.shapes.shapes
     direct, indirect = np.zeros((2, len(ids)), np.float32)
     bias = 2.0 * 2 * view.radius / KEY_SIZE
@@ -264,7 +264,7 @@ def _shade(view: LitStage, ids: NDArray[np.int32], albedo: Float, world: Float, 
 
 
 def find_exposure(pictures: Sequence[Float], brightness: float) -> float:
-    """The factor on linear light that makes the pictures' mean about ``brightness``, sRGB."""
+    """Find the factor on linear light that makes the pictures' mean about ``brightness``, sRGB."""
     values = np.concatenate([p.reshape(-1) for p in pictures])
     low, high = 1e-3, 1e3
     for _ in range(30):
@@ -274,6 +274,6 @@ def find_exposure(pictures: Sequence[Float], brightness: float) -> float:
 
 
 def develop(linear: Float) -> Float:
-    """sRGB in [0, 1] of linear light: a film curve (Narkowicz 2015), then gamma."""
+    """Convert linear light to sRGB in [0, 1]: a film curve (Narkowicz 2015), then gamma."""
     x = 0.6 * linear
     return np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0, 1) ** (1 / 2.2)

@@ -17,9 +17,8 @@ import numpy as np
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import write_ply
 from gsmerge.io.atomic import remove_stale, temporary_path
-from gsmerge.research.generate.noise import Float
-from gsmerge.research.generate.options import GenerateOptions
-from gsmerge.research.generate.scene import SyntheticScene, make_scene
+from gsmerge.research.generate.photograph import Float
+from gsmerge.research.generate.scene import GenerateOptions, SyntheticScene, make_scene
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import Cameras
 
@@ -35,7 +34,7 @@ class SceneFolder:
 def plan(
     out: Path, count: int, options: GenerateOptions, *, seed: int = 0, overwrite: bool = False
 ) -> list[SceneFolder]:
-    """The folders that :func:`generate` would write; nothing is written.
+    """List the folders that :func:`generate` would write; nothing is written.
 
     A ValueError if ``count`` or ``seed`` is out of range, a UsageError if a folder holds something else.
     """
@@ -103,17 +102,17 @@ def generate(
 
 
 RECORD = "generated.json"
-RECORD_VERSION = 1  # increases when the same seed and options give other scenes
+RECORD_VERSION = 2  # increases when the same seed and options give other scenes
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL camera axes <-> OpenCV camera axes
 
 
 def scene_key(seed: int, index: int, options: GenerateOptions) -> dict[str, Any]:
-    """Everything that a scene depends on."""
+    """List everything that a scene depends on."""
     return {"record_version": RECORD_VERSION, "seed": seed, "index": index, "options": options.to_dict()}
 
 
 def is_complete(folder: Path, key: Mapping[str, Any]) -> bool:
-    """Whether a folder holds this scene."""
+    """Say whether a folder holds this scene."""
     try:
         record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -122,7 +121,7 @@ def is_complete(folder: Path, key: Mapping[str, Any]) -> bool:
 
 
 def check_replaceable(folder: Path, *, overwrite: bool) -> None:
-    """A UsageError where a folder holds no synthetic scene, or one of other options and ``overwrite`` is False."""
+    """Raise a UsageError where a folder holds no synthetic scene, or one of other options without ``overwrite``."""
     if not os.path.lexists(folder):
         return
     if not (folder / RECORD).is_file():
@@ -153,7 +152,7 @@ def write_scene(folder: Path, scene: SyntheticScene, key: Mapping[str, Any]) -> 
 
 @contextmanager
 def _folder(folder: Path) -> Iterator[Path]:
-    """A hidden folder next to the final one, which takes its place when the block succeeds."""
+    """Make a hidden folder next to the final one, whose place it takes when the block succeeds."""
     remove_stale(folder.parent)
     temporary, earlier = temporary_path(folder), temporary_path(folder)
     try:
@@ -172,7 +171,7 @@ def _folder(folder: Path) -> Iterator[Path]:
 
 
 def _write_views(folder: Path, cameras: Cameras, images: Sequence[Float]) -> None:
-    """``images/`` and ``transforms.json`` (nerfstudio: camera to world, OpenGL axes)."""
+    """Write ``images/`` and ``transforms.json`` (nerfstudio: camera to world, OpenGL axes)."""
     (folder / "images").mkdir(parents=True)
     frames = []
     for i, image in enumerate(images):

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
 from functools import partial
+from typing import Any
 
 import cv2
 import numpy as np
 
-from gsmerge.research.generate.noise import Float, TrueView, pixel_gaussians
-from gsmerge.research.generate.options import MIXED, GenerateOptions, Noise, draw_noise
-from gsmerge.research.generate.paths import PATHS, Pose, is_usable
+from gsmerge.research.generate.noise import Noise, NoiseOptions, TrueView, draw_noise, pixel_gaussians
+from gsmerge.research.generate.objects import STYLES
 from gsmerge.research.generate.photograph import (
     FAR,
     SAMPLES,
+    Float,
+    Hits,
     Lens,
     LitStage,
+    Stage,
     develop,
     find_exposure,
     light_stage,
@@ -24,13 +28,131 @@ from gsmerge.research.generate.photograph import (
     trace,
 )
 from gsmerge.research.generate.shapes import Array
-from gsmerge.research.generate.styles import STYLES
 from gsmerge.research.generate.textures import Palette
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians
 
 PATH_TRIES, STAGE_TRIES = 6, 6  # paths per stage, and stages, until all views are usable
 SMALL = 8  # views are checked, and exposures computed, at this fraction of the size
+MIXED = "mixed"
+MIN_NEAR = 0.22  # first percentile of the depths, as a share of their median
+MAX_TURN = 50  # degrees between neighbouring views
+Pose = Callable[[float], Array]  # camera to world at 0, the start of a path, to 1
+Path = Callable[[Stage, np.random.Generator, int], Pose]
+
+
+def look_at(eye: Array, target: Array, roll: float = 0.0) -> Array:
+    """Compute camera to world ``[4,4]``, OpenCV axes, the image's down near +y, rotated by ``roll`` radians."""
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross([0.0, 1.0, 0.0], forward)
+    right /= np.linalg.norm(right)
+    down = np.cross(forward, right)
+    out = np.eye(4)
+    out[:3, 0] = np.cos(roll) * right + np.sin(roll) * down
+    out[:3, 1] = np.cos(roll) * down - np.sin(roll) * right
+    out[:3, 2], out[:3, 3] = forward, eye
+    return out
+
+
+def _orbit_point(stage: Stage, angle: float, distance: float, height: float) -> Array:
+    """Compute the position ``[3]`` at an angle (degrees, 0 towards -z), a distance from the focus and a height."""
+    x, _, z = stage.focus
+    return np.array([x + distance * np.sin(np.deg2rad(angle)), -height, z - distance * np.cos(np.deg2rad(angle))])
+
+
+def arc(stage: Stage, rng: np.random.Generator, num_views: int, low: float, high: float) -> Pose:
+    """Move along an arc of ``low`` to ``high`` degrees about the focus, or as far as there is room, and up and down."""
+    limit = MAX_TURN * max(1, num_views - 1)
+    span = min(rng.uniform(min(low, limit), min(high, limit)), 2 * stage.swing)
+    start = rng.uniform(-stage.swing, stage.swing - span) if span < 2 * stage.swing else -span / 2
+    distance, height = rng.uniform(*stage.distance), rng.uniform(*stage.height)
+    swing = rng.uniform(0, 0.4) * (stage.height[1] - stage.height[0])
+    phase, closer = rng.uniform(0, 6.28), rng.uniform(-0.12, 0.12)
+
+    def pose(s: float) -> Array:
+        eye = _orbit_point(stage, start + span * s, distance * (1 + closer * s), height + swing * np.sin(6 * s + phase))
+        return look_at(eye, stage.focus, 0.03 * np.sin(5 * s + phase))
+
+    return pose
+
+
+def forward(stage: Stage, rng: np.random.Generator, num_views: int) -> Pose:
+    """Move back and forth in a plane, in one direction of view."""
+    angle, distance = rng.uniform(-0.5, 0.5) * min(stage.swing, 40), rng.uniform(*stage.distance)
+    eye = _orbit_point(stage, angle, distance, rng.uniform(*stage.height))
+    axes, reach = look_at(eye, stage.focus), rng.uniform(0.06, 0.2) * distance
+    sways, turn = rng.integers(2, 4), rng.normal(0, 0.03, 3)
+
+    def pose(s: float) -> Array:
+        across, down = reach * np.sin(2 * np.pi * sways * s), reach * (s - 0.5)
+        place = eye + across * axes[:3, 0] + down * axes[:3, 1]
+        return look_at(place, stage.focus + place - eye + turn * np.sin(7 * s + np.arange(3)), 0.02 * np.sin(9 * s))
+
+    return pose
+
+
+def walk(stage: Stage, rng: np.random.Generator, num_views: int) -> Pose:
+    """Walk from one position towards another, the direction of view varying."""
+    side = min(stage.swing, 40)
+    a, b = (_orbit_point(stage, rng.uniform(-side, side), d, rng.uniform(*stage.height)) for d in stage.distance[::-1])
+    b = a + rng.uniform(0.3, 0.9) * (b - a)
+    wander = rng.normal(0, 0.12, 3) * stage.distance[0]
+    phase = rng.uniform(0, 6.28, 3)
+
+    def pose(s: float) -> Array:
+        return look_at(a + (b - a) * s, stage.focus + wander * np.sin(4 * s + phase), 0.03 * np.sin(6 * s + phase[0]))
+
+    return pose
+
+
+PATHS: dict[str, Path] = {
+    "arc": partial(arc, low=15, high=60),
+    "forward": forward,
+    "walk": walk,
+    "orbit": partial(arc, low=200, high=340),
+    "wide": partial(arc, low=60, high=110),
+}
+
+
+def is_usable(hits: Hits) -> bool:
+    """Say whether a view is neither inside a shape nor too close to one."""
+    depth = hits.depth[hits.depth < FAR]
+    if depth.size < 0.6 * hits.depth.size:
+        return False
+    return bool(np.percentile(depth, 1) > MIN_NEAR * np.median(depth) or np.percentile(depth, 1) > 0.6)
+
+
+@dataclass(frozen=True)
+class GenerateOptions:
+    """Settings of synthetic scenes; a ValueError if one is out of range."""
+
+    views: tuple[int, int] = (6, 6)  # range of their number in a scene; one target is between any two neighbours
+    width: int = 320  # of the views, pixels: 16 to 2048
+    height: int = 240  # the same
+    photo_scale: int = 1  # times the views' size that the photos have, 1 to 8; the network sees the views' own
+    style: str = MIXED  # one of STYLES, or "mixed": each in turn
+    path: str = MIXED  # one of PATHS, or "mixed": any
+    noise: float = 1.0  # factor on the errors: 0 to 10
+    ranges: NoiseOptions = field(default_factory=NoiseOptions)  # the errors and habits
+
+    def __post_init__(self) -> None:
+        low, high = self.views
+        if not 2 <= low <= high <= 200:
+            raise ValueError(f"views: expected 2 to 200, got {low} to {high}")
+        for name in ("width", "height"):
+            if not 16 <= getattr(self, name) <= 2048:
+                raise ValueError(f"{name}: expected 16 to 2048 pixels, got {getattr(self, name)}")
+        if not 1 <= self.photo_scale <= 8:
+            raise ValueError(f"photo_scale: expected 1 to 8, got {self.photo_scale}")
+        for name, known in (("style", STYLES), ("path", PATHS)):
+            if getattr(self, name) not in (MIXED, *known):
+                raise ValueError(f"{name}: expected {', '.join((MIXED, *known))}, got {getattr(self, name)!r}")
+        if not 0 <= self.noise <= 10:
+            raise ValueError(f"noise: expected 0 to 10, got {self.noise:g}")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Convert all settings to JSON types."""
+        return dict(json.loads(json.dumps(asdict(self))))
 
 
 @dataclass(frozen=True)
@@ -48,7 +170,7 @@ class SyntheticScene:
 
 
 def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScene:
-    """Scene ``index`` of a series; the same arguments give the same bits, on any number of threads."""
+    """Make scene ``index`` of a series; the same arguments give the same bits, on any number of threads."""
     rng = np.random.default_rng([seed, index])
     num_views = int(rng.integers(options.views[0], options.views[1] + 1))
     style = options.style if options.style != MIXED else list(STYLES)[(seed + index) % len(STYLES)]
@@ -95,7 +217,7 @@ def _shrink(lens: Lens) -> Lens:
 
 
 def _find_stage(rng: np.random.Generator, style: str, path: str, lens: Lens, num_views: int) -> tuple[LitStage, Pose]:
-    """A stage and a path through it with usable views only, or the last ones tried."""
+    """Draw a stage and a path through it with usable views only, or the last ones tried."""
     size = 1 << int(np.clip(np.log2(1.6 * max(lens.width, lens.height)), 7, 10))
     for _ in range(STAGE_TRIES):
         view = light_stage(STYLES[style](Palette(rng, size)))
@@ -110,7 +232,7 @@ def _find_stage(rng: np.random.Generator, style: str, path: str, lens: Lens, num
 def _photo(
     view: LitStage, grid: Lens, lens: Lens, noise: Noise, gain: float, given: tuple[Array, int]
 ) -> tuple[Float, Array, Float]:
-    """The photo from a pose, with the errors of lens, sensor and exposure, and exact depth and normals of the grid."""
+    """Take a photo with the errors of lens, sensor and exposure, and exact depth and normals of the grid."""
     pose, seed = given
     rng = np.random.default_rng(seed)
     linear, _ = radiance(view, pose, lens, SAMPLES)
@@ -125,7 +247,7 @@ def _photo(
 
 
 def _perturb_pose(pose: Array, noise: Noise, depth: float, rng: np.random.Generator) -> Array:
-    """The pose with the network's error."""
+    """Add the network's error to a pose."""
     turn, _ = cv2.Rodrigues(np.deg2rad(noise.turn) * rng.normal(0, 1, 3) / 3**0.5)
     out = pose.copy()
     out[:3, :3] = pose[:3, :3] @ turn
@@ -134,7 +256,7 @@ def _perturb_pose(pose: Array, noise: Noise, depth: float, rng: np.random.Genera
 
 
 def _move_pose(pose: Array, world: Array, unit: float) -> Array:
-    """The pose in the world of the exporter, in its units."""
+    """Move a pose into the world of the exporter, in its units."""
     out = world @ pose
     out[:3, 3] *= unit
     return out

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from gsmerge.research.generate.cast import BLOB, BOX, CONE, ELLIPSOID, LEAF, QUAD, SHEET
+from gsmerge.research.generate.cast import BLOB, BOX, CONE, ELLIPSOID, LEAF, QUAD
 
 Array: TypeAlias = NDArray[Any]
 Vector: TypeAlias = Sequence[float] | Array  # of length 3
@@ -43,7 +43,7 @@ class Shape:
 
 
 def axis_rotation(axis: int, angle: float) -> Array:
-    """``[3,3]`` rotation about a coordinate axis, radians."""
+    """Compute the rotation ``[3,3]`` about a coordinate axis, radians."""
     out = np.eye(3)
     i, j = [(1, 2), (2, 0), (0, 1)][axis]
     out[i, i] = out[j, j] = np.cos(angle)
@@ -51,35 +51,35 @@ def axis_rotation(axis: int, angle: float) -> Array:
     return out
 
 
-UPRIGHT, LYING = np.eye(3), axis_rotation(0, np.pi / 2)  # of quads, leaves and sheets: facing -z, facing up
+UPRIGHT, LYING = np.eye(3), axis_rotation(0, np.pi / 2)  # of quads and leaves: facing -z, facing up
 
 
 def box(low: Vector, high: Vector, material: Material) -> Shape:
-    """A box between two corners."""
+    """Make a box between two corners."""
     a, b = np.asarray(low, float), np.asarray(high, float)
     half = np.abs(b - a) / 2
     return Shape(BOX, (*half, 1.0), material, (a + b) / 2)
 
 
 def quad(centre: Vector, half: Pair, material: Material, rotation: Array = UPRIGHT) -> Shape:
-    """A rectangle."""
+    """Make a rectangle."""
     return Shape(QUAD, (*half, 0.0, 1.0), material, np.asarray(centre, float), rotation)
 
 
 def ball(centre: Vector, radii: Vector, material: Material) -> Shape:
-    """An ellipsoid."""
+    """Make an ellipsoid."""
     return Shape(ELLIPSOID, (radii[0], radii[1], radii[2], 1.0), material, np.asarray(centre, float))
 
 
 def column(foot: Vector, height: float, radius: float, material: Material, *, top: float = 1.0) -> Shape:
-    """An upright cylinder that stands on ``foot``; its radius at the top is ``top`` times that at the foot."""
+    """Make an upright cylinder that stands on ``foot``; its radius at the top is ``top`` times that at the foot."""
     x, y, z = foot
     size = (radius * top, height / 2, radius * top, 1 / top)  # the kernel's radii are those at -y, which is up
     return Shape(CONE, size, material, np.array([x, y - height / 2, z]))
 
 
 def rod(start: Vector, end: Vector, radius: float, material: Material) -> Shape:
-    """A cylinder between two points."""
+    """Make a cylinder between two points."""
     a, b = np.asarray(start, float), np.asarray(end, float)
     length = float(np.linalg.norm(b - a))
     y = (b - a) / length
@@ -89,32 +89,21 @@ def rod(start: Vector, end: Vector, radius: float, material: Material) -> Shape:
 
 
 def leaf(centre: Vector, half: Pair, material: Material, rotation: Array) -> Shape:
-    """A pointed leaf, its tips along local y."""
+    """Make a pointed leaf, its tips along local y."""
     return Shape(LEAF, (*half, 0.0, 1.0), material, np.asarray(centre, float), rotation)
 
 
 def blob(centre: Vector, radii: Vector, material: Material, rng: np.random.Generator, rough: float) -> Shape:
-    """An uneven ellipsoid; ``rough`` is the amplitude of its relief, as a share of its size."""
+    """Make an uneven ellipsoid; ``rough`` is the amplitude of its relief, as a share of its size."""
     waves = np.concatenate([rng.normal(0, 2.2, (NUM_WAVES, 3)), rng.uniform(0, 6.28, (NUM_WAVES, 1))], 1)
     waves = np.concatenate([waves, np.full((NUM_WAVES, 1), rough / NUM_WAVES)], 1)
     return Shape(BLOB, (radii[0], radii[1], radii[2], 1.0), material, np.asarray(centre, float), waves=waves)
 
 
-def sheet(
-    centre: Vector, half: Pair, material: Material, rng: np.random.Generator, height: float, *, length: float
-) -> Shape:
-    """An uneven lying rectangle, with waves of about ``length`` and amplitude ``height``, shorter ones lower."""
-    waves = np.zeros((NUM_WAVES, 5))
-    for k in range(NUM_WAVES):
-        angle, number = rng.uniform(0, 2 * np.pi), 2 * np.pi / length * 1.7**k
-        waves[k] = number * np.cos(angle), number * np.sin(angle), 0, rng.uniform(0, 6.28), 0.5 * height / 1.9**k
-    return Shape(SHEET, (*half, 0.0, 1.0), material, np.asarray(centre, float), LYING, waves)
-
-
 def place(
     shapes: Iterable[Shape], at: Vector = (0, 0, 0), *, yaw: float = 0.0, rotation: Array | None = None
 ) -> list[Shape]:
-    """Shapes rotated about the origin, about y by ``yaw`` or by ``rotation``, then moved to ``at``."""
+    """Rotate shapes about the origin, about y by ``yaw`` or by ``rotation``, then move them to ``at``."""
     rotation = axis_rotation(1, yaw) if rotation is None else rotation
     offset = np.asarray(at, float)
     return [replace(s, centre=rotation @ s.centre + offset, rotation=rotation @ s.rotation) for s in shapes]
@@ -133,7 +122,7 @@ class ShapeArrays:
 
 
 def pack(shapes: Sequence[Shape]) -> ShapeArrays:
-    """The arrays of shapes."""
+    """Put shapes into arrays."""
     return ShapeArrays(
         tuple(shapes),
         np.array([s.kind for s in shapes], np.int32),
@@ -145,10 +134,9 @@ def pack(shapes: Sequence[Shape]) -> ShapeArrays:
 
 
 def bounds(given: ShapeArrays) -> Array:
-    """``[m,3]`` half sizes of the shapes' bounding boxes, in their frames."""
+    """Compute half sizes ``[m,3]`` of the shapes' bounding boxes, in their frames."""
     half = given.sizes[:, :3].copy()
     reach = np.abs(given.waves[:, :, 4]).sum(1)
-    half[given.kinds == SHEET, 2] = reach[given.kinds == SHEET]
     half[given.kinds == BLOB] *= 1 + reach[given.kinds == BLOB, None]
     wide = np.maximum(given.sizes[:, 3], 1)[given.kinds == CONE]
     half[given.kinds == CONE] *= np.stack([wide, np.ones_like(wide), wide], 1)

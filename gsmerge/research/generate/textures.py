@@ -13,11 +13,117 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsmerge.research.generate.patterns import Grey, cells, courses, enlarge, glyphs, grid, noise, text_line, warp
 from gsmerge.research.generate.shapes import Material
 
 Picture: TypeAlias = NDArray[Any]  # float32
 Color: TypeAlias = NDArray[Any]
+Grey: TypeAlias = NDArray[Any]  # float32: square, repeating without a seam, 0 to 1
+
+
+def enlarge(cells: NDArray[np.float64], size: int) -> Grey:
+    """Enlarge a small repeating picture smoothly to ``[size,size]``."""
+    rows, columns = cells.shape
+    pad = 3
+    wide = np.pad(cells, pad, mode="wrap").astype(np.float32)
+    y = (np.arange(size, dtype=np.float32) + 0.5) * rows / size - 0.5 + pad
+    x = (np.arange(size, dtype=np.float32) + 0.5) * columns / size - 0.5 + pad
+    at_x, at_y = np.meshgrid(x, y)
+    return cv2.remap(wide, at_x, at_y, cv2.INTER_CUBIC)
+
+
+def noise(
+    rng: np.random.Generator, size: int, *, first: int = 4, fade: float = 0.6, stretch: int = 1, ridged: bool = False
+) -> Grey:
+    """Add octaves of random cells, each ``fade`` times as strong as the previous one: 0.3 gives clouds, 0.9 grit.
+
+    ``first`` is the number of cells of the coarsest octave along a side, ``stretch`` the ratio of their length to their
+    height; ``ridged`` gives sharp crests, as of rock and bark.
+    """
+    out, strength, cells = np.zeros((size, size), np.float32), 1.0, min(first, size // 2)
+    while cells <= size // 2:
+        layer = enlarge(rng.uniform(-1, 1, (cells, max(1, cells // stretch))), size)
+        out += strength * (1 - 2 * np.abs(layer) if ridged else layer)
+        strength, cells = strength * fade, cells * 2
+    low, high = np.percentile(out, (1, 99))
+    return np.clip((out - low) / (high - low), 0, 1).astype(np.float32)
+
+
+def grid(size: int) -> tuple[Grey, Grey]:
+    """Compute x and y of every pixel, 0 to 1."""
+    at = (np.arange(size, dtype=np.float32) + 0.5) / size
+    x, y = np.meshgrid(at, at)
+    return x, y
+
+
+def warp(picture: Grey, dx: Grey, dy: Grey, amount: float) -> Grey:
+    """Displace a picture by ``dx`` and ``dy`` (0 to 1) times ``amount``, a share of its side."""
+    size = len(picture)
+    x, y = grid(size)
+    at_x = (x + amount * (dx - 0.5)) * size - 0.5
+    at_y = (y + amount * (dy - 0.5)) * size - 0.5
+    return cv2.remap(picture, at_x % size, at_y % size, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+
+
+def courses(
+    rng: np.random.Generator, size: int, rows: int, columns: int, *, joint: float, offset: float
+) -> tuple[Grey, Grey]:
+    """Draw ``rows`` courses of ``columns`` bricks or tiles: a random tone for each, and 1 on the joints.
+
+    ``joint`` is the width of the joints, as a share of a stone's height, and ``offset`` that of each second course, as
+    a share of a stone's width.
+    """
+    x, y = grid(size)
+    row = np.floor(y * rows).astype(int)
+    along = x * columns + offset * (row % 2)
+    down, across = y * rows - row, along - np.floor(along)
+    tones = rng.uniform(0, 1, (rows, columns)).astype(np.float32)
+    width = joint * columns / rows
+    lines = np.minimum(np.minimum(down, 1 - down) / joint, np.minimum(across, 1 - across) / width)
+    return tones[row, np.floor(along).astype(int) % columns], np.clip(1.5 - 2 * lines, 0, 1).astype(np.float32)
+
+
+def cells(rng: np.random.Generator, size: int, count: int) -> tuple[Grey, Grey]:
+    """Draw pebbles: a random tone for each of ``count``² cells, and the distance of a pixel from the cell's edge."""
+    at = (np.stack(np.meshgrid(np.arange(count), np.arange(count)), -1) + rng.uniform(0, 1, (count, count, 2))) / count
+    tones = rng.uniform(0, 1, (count, count)).astype(np.float32)
+    x, y = grid(size)
+    column, row = np.floor(x * count).astype(int), np.floor(y * count).astype(int)
+    nearest, second = np.full((size, size), 9.0, np.float32), np.full((size, size), 9.0, np.float32)
+    tone = np.zeros((size, size), np.float32)
+    for i in (-1, 0, 1):
+        for j in (-1, 0, 1):
+            centre = at[(row + i) % count, (column + j) % count]
+            dx, dy = x - centre[..., 0], y - centre[..., 1]
+            d = np.hypot(dx - np.round(dx), dy - np.round(dy))
+            tone = np.where(d < nearest, tones[(row + i) % count, (column + j) % count], tone)
+            second = np.minimum(second, np.maximum(d, nearest))
+            nearest = np.minimum(nearest, d)
+    return tone, np.clip((second - nearest) * count, 0, 1).astype(np.float32)
+
+
+def glyphs(rng: np.random.Generator, count: int) -> NDArray[np.uint8]:
+    """Draw letters ``[count,7,5]`` of an invented alphabet, a few strokes each."""
+    out = np.zeros((count, 7, 5), np.uint8)
+    for letter in out:
+        for _ in range(rng.integers(2, 5)):
+            if rng.random() < 0.5:
+                letter[rng.integers(1, 7) if rng.random() < 0.8 else 0, rng.integers(0, 3) : rng.integers(3, 6)] = 1
+            else:
+                letter[rng.integers(0, 4) : rng.integers(4, 8), rng.integers(0, 5)] = 1
+    return out
+
+
+def text_line(rng: np.random.Generator, alphabet: NDArray[np.uint8], height: int, width: int) -> Grey:
+    """Draw the ink ``[height,width]`` of one line of words."""
+    line = np.zeros((7, max(6, 7 * width // height)), np.uint8)
+    at = 0
+    while at < line.shape[1] - 6:
+        for letter in alphabet[rng.integers(0, len(alphabet), rng.integers(2, 10))]:
+            if at < line.shape[1] - 6:
+                line[:, at : at + 5] = letter
+            at += 6
+        at += 4
+    return cv2.resize(line.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
 
 
 def color(
@@ -27,7 +133,7 @@ def color(
     strength: tuple[float, float] = (0.05, 0.6),
     light: tuple[float, float] = (0.2, 0.85),
 ) -> Color:
-    """``[3]`` a random colour: hue 0 to 1 around the circle (None: all, mostly warm ones), saturation, value."""
+    """Draw a random colour ``[3]``: hue 0 to 1 around the circle (None: all, mostly warm ones), saturation, value."""
     h = rng.uniform(*hue) % 1 if hue is not None else rng.normal(0.08, 0.06) % 1 if rng.random() < 0.5 else rng.random()
     s, v = strength[0] + (strength[1] - strength[0]) * rng.random() ** 1.5, rng.uniform(*light)
     ramp = np.clip(np.abs(np.mod(6 * h + np.array([0, 4, 2]), 6) - 3) - 1, 0, 1)
@@ -35,31 +141,31 @@ def color(
 
 
 def shades(rng: np.random.Generator, base: Color, contrast: float) -> tuple[Color, Color]:
-    """A darker and a lighter neighbour of a colour."""
+    """Draw a darker and a lighter neighbour of a colour."""
     tint = rng.normal(0, 0.03, 3) * contrast
     return np.clip(base * (1 - contrast) - tint, 0, 1), np.clip(base + (1 - base) * contrast * 0.6 + tint, 0, 1)
 
 
 def mix(low: Color, high: Color, amount: Grey) -> Picture:
-    """Colours between two, one for each pixel."""
+    """Mix two colours, by an amount for each pixel."""
     return low + (high - low) * amount[..., None].astype(np.float32)
 
 
 def plain(rng: np.random.Generator, size: int) -> Picture:
-    """Paint: almost no texture."""
+    """Draw paint: almost no texture."""
     base = color(rng, light=(0.35, 0.95), strength=(0, 0.5))
     return mix(*shades(rng, base, rng.uniform(0.01, 0.05)), noise(rng, size, first=2, fade=0.5))
 
 
 def plaster(rng: np.random.Generator, size: int) -> Picture:
-    """Rough paint, stone, concrete."""
+    """Draw rough paint, stone, concrete."""
     low, high = shades(rng, color(rng, strength=(0, 0.3)), rng.uniform(0.1, 0.4))
     clouds, grit = noise(rng, size, fade=0.6), noise(rng, size, first=64, fade=0.9)
     return mix(low, high, 0.6 * clouds + 0.4 * grit)
 
 
 def granite(rng: np.random.Generator, size: int) -> Picture:
-    """Speckles of three colours."""
+    """Draw speckles of three colours."""
     base = color(rng, strength=(0, 0.25))
     out = mix(*shades(rng, base, 0.3), noise(rng, size, first=64, fade=0.9))
     speck = noise(rng, size, first=128, fade=0.7)[..., None]
@@ -68,7 +174,7 @@ def granite(rng: np.random.Generator, size: int) -> Picture:
 
 
 def marble(rng: np.random.Generator, size: int) -> Picture:
-    """Veins."""
+    """Draw the veins of marble."""
     low, high = shades(rng, color(rng, strength=(0, 0.3), light=(0.4, 0.9)), 0.5)
     bend = noise(rng, size, fade=0.55)
     x, y = grid(size)
@@ -77,7 +183,7 @@ def marble(rng: np.random.Generator, size: int) -> Picture:
 
 
 def wood(rng: np.random.Generator, size: int) -> Picture:
-    """Planks with grain along x."""
+    """Draw planks with grain along x."""
     low, high = shades(rng, color(rng, hue=(0.04, 0.11), strength=(0.3, 0.7), light=(0.3, 0.8)), 0.45)
     planks = int(rng.integers(2, 7))
     tone, joint = courses(rng, size, planks, int(rng.integers(1, 3)), joint=rng.uniform(0.01, 0.03), offset=0.5)
@@ -88,7 +194,7 @@ def wood(rng: np.random.Generator, size: int) -> Picture:
 
 
 def tiles(rng: np.random.Generator, size: int) -> Picture:
-    """Tiles with joints, of one colour or chequered."""
+    """Draw tiles with joints, of one colour or chequered."""
     count = 2 * int(rng.integers(1, 5))
     base = color(rng, strength=(0, 0.5))
     low, high = shades(rng, base, rng.uniform(0.05, 0.3))
@@ -101,7 +207,7 @@ def tiles(rng: np.random.Generator, size: int) -> Picture:
 
 
 def bricks(rng: np.random.Generator, size: int) -> Picture:
-    """Courses of bricks or hewn stones."""
+    """Draw courses of bricks or hewn stones."""
     rows = 2 * int(rng.integers(3, 7))
     stone = rng.random() < 0.5
     hue = (0.05, 0.13) if stone else (0.0, 0.07)
@@ -115,7 +221,7 @@ def bricks(rng: np.random.Generator, size: int) -> Picture:
 
 
 def cloth(rng: np.random.Generator, size: int) -> Picture:
-    """A weave with stripes or checks."""
+    """Draw a weave with stripes or checks."""
     x, y = grid(size)
     count, base = int(rng.integers(3, 12)), color(rng, strength=(0.1, 0.8))
     other = color(rng, strength=(0.0, 0.7))
@@ -129,7 +235,7 @@ def cloth(rng: np.random.Generator, size: int) -> Picture:
 
 
 def carpet(rng: np.random.Generator, size: int) -> Picture:
-    """Pile, or an ornament of a few colours."""
+    """Draw pile, or an ornament of a few colours."""
     base = color(rng, strength=(0.1, 0.7), light=(0.2, 0.6))
     out = mix(*shades(rng, base, 0.4), noise(rng, size, first=32, fade=0.95))
     if rng.random() < 0.5:
@@ -139,16 +245,8 @@ def carpet(rng: np.random.Generator, size: int) -> Picture:
     return out.astype(np.float32)
 
 
-def gravel(rng: np.random.Generator, size: int) -> Picture:
-    """Pebbles or cobbles."""
-    tone, edge = cells(rng, size, int(rng.integers(16, 64)))
-    low, high = shades(rng, color(rng, strength=(0, 0.3), light=(0.3, 0.7)), 0.5)
-    out = mix(low, high, 0.7 * tone + 0.3 * noise(rng, size, first=32, fade=0.9))
-    return out * (0.35 + 0.65 * np.clip(3 * edge, 0, 1))[..., None]
-
-
 def grass(rng: np.random.Generator, size: int) -> Picture:
-    """Meadow or leaf litter, from blades to patches."""
+    """Draw meadow or leaf litter, from blades to patches."""
     base = color(rng, hue=(0.18, 0.34) if rng.random() < 0.7 else (0.05, 0.12), strength=(0.3, 0.7), light=(0.25, 0.55))
     low, high = shades(rng, base, 0.6)
     blades = noise(rng, size, first=64, fade=0.9, stretch=2).T
@@ -156,13 +254,13 @@ def grass(rng: np.random.Generator, size: int) -> Picture:
 
 
 def bark(rng: np.random.Generator, size: int) -> Picture:
-    """Furrows along y."""
+    """Draw furrows along y."""
     base = color(rng, hue=(0.04, 0.12), strength=(0.1, 0.5), light=(0.25, 0.55))
     return mix(*shades(rng, base, 0.6), noise(rng, size, first=32, fade=0.75, stretch=4, ridged=True).T)
 
 
 def foliage(rng: np.random.Generator, size: int) -> Picture:
-    """One leaf: veins from a middle rib."""
+    """Draw one leaf: veins from a middle rib."""
     base = color(rng, hue=(0.2, 0.38), strength=(0.4, 0.85), light=(0.2, 0.6))
     if rng.random() < 0.25:  # petals
         base = color(rng, hue=(0.8, 1.12), strength=(0.4, 0.9), light=(0.6, 0.95))
@@ -175,7 +273,7 @@ def foliage(rng: np.random.Generator, size: int) -> Picture:
 
 
 def crown(rng: np.random.Generator, size: int) -> Picture:
-    """Leaves from afar, for bushes and trees."""
+    """Draw leaves from afar, for bushes and trees."""
     tone, edge = cells(rng, size, int(rng.integers(24, 56)))
     base = color(rng, hue=(0.18, 0.36), strength=(0.35, 0.8), light=(0.25, 0.55))
     low, high = shades(rng, base, 0.6)
@@ -184,13 +282,13 @@ def crown(rng: np.random.Generator, size: int) -> Picture:
 
 
 def gradient(rng: np.random.Generator, size: int) -> Picture:
-    """From one colour into another and back."""
+    """Fade from one colour into another and back."""
     _, y = grid(size)
     return mix(color(rng), color(rng), 0.5 - 0.5 * np.cos(2 * np.pi * y))
 
 
 def printed(rng: np.random.Generator, size: int) -> Picture:
-    """A page: heading, columns of text, pictures."""
+    """Draw a page: heading, columns of text, pictures."""
     paper = color(rng, strength=(0, 0.12), light=(0.8, 1)) if rng.random() < 0.7 else color(rng)
     ink = color(rng, light=(0.02, 0.3)) if paper.mean() > 0.45 else color(rng, light=(0.85, 1), strength=(0, 0.2))
     page, letters = np.tile(paper, (size, size, 1)).astype(np.float32), glyphs(rng, 26)
@@ -213,7 +311,7 @@ def printed(rng: np.random.Generator, size: int) -> Picture:
 
 
 def label(rng: np.random.Generator, size: int) -> Picture:
-    """A package: bands, discs, large and small letters."""
+    """Draw a package: bands, discs, large and small letters."""
     x, y = grid(size)
     page = mix(color(rng, strength=(0.3, 0.95)), color(rng, strength=(0.2, 0.9)), np.abs(2 * y - 1))
     for _ in range(rng.integers(2, 6)):
@@ -231,7 +329,7 @@ def label(rng: np.random.Generator, size: int) -> Picture:
 
 
 def spines(rng: np.random.Generator, size: int) -> Picture:
-    """A row of books, or files, or planks of many colours."""
+    """Draw a row of books, or files, or planks of many colours."""
     page, letters, x = np.zeros((size, size, 3), np.float32), glyphs(rng, 26), 0
     while x < size:
         width = int(rng.uniform(0.02, 0.09) * size)
@@ -247,7 +345,7 @@ def spines(rng: np.random.Generator, size: int) -> Picture:
 
 
 def sky(rng: np.random.Generator, size: int) -> Picture:
-    """Blue or grey with clouds; the horizon at y = 1/2."""
+    """Draw a blue or grey sky with clouds; the horizon at y = 1/2."""
     _, y = grid(size)
     high = color(rng, hue=(0.56, 0.63), strength=(0.0, 0.6), light=(0.6, 0.95))
     low = np.array([0.9, 0.92, 0.95], np.float32)
@@ -256,18 +354,17 @@ def sky(rng: np.random.Generator, size: int) -> Picture:
     return out + (0.97 - out) * clouds[..., None]
 
 
-Maker = Callable[[np.random.Generator, int], Picture]
-KINDS: dict[str, Maker] = {
+KINDS: dict[str, Callable[[np.random.Generator, int], Picture]] = {
     maker.__name__: maker
     for maker in (
-        *(plain, plaster, granite, marble, wood, tiles, bricks, cloth, carpet, gravel, grass, bark),
+        *(plain, plaster, granite, marble, wood, tiles, bricks, cloth, carpet, grass, bark),
         *(foliage, crown, gradient, printed, label, spines, sky),
     )
 }
 
 
 def pyramid(texture: Picture) -> list[Picture]:
-    """The texture, and halves of it down to 8 pixels, so that far surfaces do not alias."""
+    """Halve a texture down to 8 pixels, again and again, so that far surfaces do not alias."""
     out: list[Picture] = [np.ascontiguousarray(texture, np.float32)]
     while len(out[-1]) > 8:
         half = len(out[-1]) // 2
@@ -288,7 +385,7 @@ class Palette:
     by_kind: dict[str, list[int]] = field(default_factory=dict)  # their indices
 
     def material(self, *kinds: str, repeat: float = 0.0, gloss: float | None = None) -> Material:
-        """A material of one of the kinds: with a new texture, or an old one if the scene has enough of the kind.
+        """Make a material of one of the kinds: with a new texture, or an old one if the scene has enough of the kind.
 
         ``repeat`` is in repeats per world unit, 0: once over every face. ``gloss`` is at random if None, mostly none.
         """

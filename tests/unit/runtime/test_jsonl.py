@@ -6,7 +6,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-from gsmerge.runtime.jsonl import append_line, each_line, read_lines
+import pytest
+
+from gsmerge.errors import SceneError
+from gsmerge.runtime.jsonl import append_line, each_line
 
 APPEND = """
 import pathlib, sys
@@ -21,10 +24,10 @@ def test_lines_of_several_processes_stay_whole(tmp_path: Path) -> None:
     path.write_bytes(b'{"torn": ')
     processes = [subprocess.Popen([sys.executable, "-c", APPEND, str(path), name]) for name in "ab"]
     assert [process.wait() for process in processes] == [0, 0]
-    lines = read_lines(path)
-    assert lines.notes == ()
+    lines = [value for _, value in each_line(path) if value is not None]
+    assert len(lines) == 50
     for name in "ab":
-        assert [line["number"] for line in lines.values if line["name"] == name] == list(range(25))
+        assert [line["number"] for line in lines if line["name"] == name] == list(range(25))
 
 
 def test_lines_can_be_read_from_the_middle(tmp_path: Path) -> None:
@@ -55,3 +58,49 @@ except SceneError as error:
     message = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert "lines.jsonl: cannot be written (" in message
     assert path.read_bytes() == whole
+
+
+def values(path: Path) -> list[object]:
+    return [value for _, value in each_line(path)]
+
+
+def test_every_way_to_cut_the_last_line(tmp_path: Path) -> None:
+    path = tmp_path / "lines.jsonl"
+    append_line(path, {"a": "odd \u2028 line\n"})
+    start = path.stat().st_size
+    append_line(path, {"b": 2})
+    whole = path.read_bytes()
+    for length in range(start, len(whole)):
+        path.write_bytes(whole[:length])
+        assert values(path) == [{"a": "odd \u2028 line\n"}]
+        append_line(path, {"b": 2})
+        assert path.read_bytes() == whole
+
+
+def test_a_damaged_line_in_the_middle_costs_that_line_alone(tmp_path: Path) -> None:
+    path = tmp_path / "lines.jsonl"
+    path.write_bytes(b'{"a": 1}\n' + b"\x00" * 20 + b"\n" + b"[" * 100_000 + b'\n{"b": 2}\n')
+    assert values(path) == [{"a": 1}, None, None, {"b": 2}]
+
+
+def test_long_lines_are_cut_back_to_the_right_place(tmp_path: Path) -> None:
+    path = tmp_path / "lines.jsonl"
+    append_line(path, {"a": 1})
+    with path.open("ab") as file:
+        file.write(b"x" * 200_000)
+    append_line(path, {"b": 2})
+    assert values(path) == [{"a": 1}, {"b": 2}]
+
+
+def test_what_is_no_json_is_refused_and_leaves_the_file_alone(tmp_path: Path) -> None:
+    path = tmp_path / "lines.jsonl"
+    append_line(path, {"a": 1})
+    with pytest.raises(ValueError, match="JSON"):
+        append_line(path, {"a": float("nan")})
+    assert values(path) == [{"a": 1}]
+
+
+def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SceneError, match="cannot be written"):
+        append_line(tmp_path / "file" / "lines.jsonl", {})

@@ -15,7 +15,7 @@ from gsmerge.geometry import project
 from gsmerge.io import load_scene, read_held_out
 from gsmerge.render.metrics import psnr
 from gsmerge.research.generate import GenerateOptions, generate, make_scene
-from gsmerge.research.generate.styles import STYLES
+from gsmerge.research.generate.objects import STYLES
 from gsmerge.runtime.threads import use_threads
 
 TINY = GenerateOptions(views=(3, 3), width=48, height=36)
@@ -82,14 +82,14 @@ def test_any_number_of_threads_makes_the_same_bytes(tmp_path: Path) -> None:
 
 
 def test_every_scene_is_different() -> None:
-    scenes = [make_scene(seed, index, TINY) for seed, index in ((0, 0), (0, 5), (5, 0))]
+    scenes = [make_scene(seed, index, TINY) for seed, index in ((0, 0), (0, 2), (2, 0))]
     assert {scene.style for scene in scenes} == {"room"}
     for a, b in ((0, 1), (0, 2), (1, 2)):
         assert np.abs(np.array(scenes[a].images) - np.array(scenes[b].images)).mean() > 0.05
 
 
 def test_the_number_of_views_is_drawn_from_its_range() -> None:
-    options = GenerateOptions(views=(2, 4), width=16, height=16, style="desk", path="arc")
+    options = GenerateOptions(views=(2, 4), width=16, height=16, style="room", path="arc")
     assert {len(make_scene(0, index, options).cameras) for index in (0, 1, 8, 9)} == {2, 3, 4}
 
 

@@ -14,16 +14,18 @@ from gsmerge.geometry import project, quat_to_rotmat
 from gsmerge.kernels.raster.harmonics import view_colors
 from gsmerge.research.generate import GenerateOptions, NoiseOptions, read_ranges
 from gsmerge.research.generate.noise import (
+    ERRORS,
+    Noise,
     TrueView,
+    draw_noise,
     edge_mask,
     pixel_gaussians,
     predict_depth,
     quats_facing,
     texture_mask,
 )
-from gsmerge.research.generate.options import ERRORS, Noise, draw_noise
-from gsmerge.research.generate.paths import look_at
 from gsmerge.research.generate.photograph import Lens
+from gsmerge.research.generate.scene import look_at
 
 W, H = 64, 48
 LENS = Lens(W, H, 60.0)

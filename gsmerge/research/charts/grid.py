@@ -1,0 +1,246 @@
+"""The grid of runs: lists of settings, whose product over scenes makes the jobs of a batch."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from gsmerge.batch.find import Job, find_scenes, main_file
+from gsmerge.errors import SceneError, UsageError
+from gsmerge.io import find_scene_files
+from gsmerge.io.bounds import read_table
+from gsmerge.io.cameras.colmap import is_colmap
+from gsmerge.io.cameras.read import find_cameras
+from gsmerge.io.content_hash import cameras_of, content_hash, digest, filled, photos_of, read_files, stem_of
+from gsmerge.io.formats.ply_file import header_counts
+from gsmerge.measure.evaluate import EvaluateOptions
+from gsmerge.options import CompactOptions
+from gsmerge.research.charts.lines import ONE_SIZE
+from gsmerge.research.charts.run import INPUT, OURS, SUPERPIXELS, Run, RunRecord, describe
+
+ALL = "all"  # word for all views
+OWN_OPTIONS = {"method": "--methods", "seed": "--seed", "threads": "--threads"}  # that set the same
+FITTED = {"unmerged-fit": ("effort",)}  # settings of ours that baselines have, too
+NUMBERS = ("k", "budgets", "superpixels", "views")  # lists whose values may be numbers
+# Settings whose lists are multiplied, and the lists' names:
+SETTINGS = {"k": "k", "segmentation": "segmentations", "fit": "fit", "effort": "efforts", "match": "matches"}
+MAX_NAME = 100  # characters of a run in names of files
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Lists whose product is run; a ValueError if one is empty that must not be, or a value is impossible."""
+
+    methods: tuple[str, ...] = (OURS,)  # ``gsmerge`` and baselines
+    k: tuple[int, ...] = (1,)  # Gaussians per superpixel: 1 to 8
+    budgets: tuple[int | str, ...] = ()  # Gaussians in the result, such as 40000, "2%" or "auto"
+    # superpixels per view, such as 3000 or "4.4%"; in addition to the budgets, not times them
+    superpixels: tuple[int | str, ...] = ()
+    segmentations: tuple[str, ...] = ("rdseg",)  # superpixel methods
+    fit: tuple[str, ...] = ("full",)  # ``full``, ``color``, ``none``
+    efforts: tuple[str, ...] = ("default",)  # ``draft``, ``fast``, ``default``, ``best``
+    matches: tuple[str, ...] = ("overlap",)  # merging across views: ``overlap``, ``aabb``, ``none``
+    views: tuple[int | str, ...] = (ALL,)  # numbers of views; "all" for all
+    fixed: tuple[str, ...] = ()  # any other settings of ours, each "name=value", the same in all runs
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if not value and f.name not in ("budgets", "superpixels", "fixed"):
+                raise ValueError(f"{f.name}: expected at least one value, got none")
+            if len(set(value)) < len(value):
+                raise ValueError(f"{f.name}: expected every value once, got {', '.join(map(str, value))}")
+        for value in self.views:
+            if value != ALL and not (isinstance(value, int) and value >= 1):
+                raise ValueError(f'views: expected numbers from 1 or "all", got {value!r}')
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The fixed settings by name; a UsageError if one is not "name=value", or a setting that cannot be fixed."""
+        settings: dict[str, Any] = {}
+        for text in self.fixed:
+            name, sign, value = str(text).partition("=")
+            if not (name and sign):
+                raise UsageError(f"fixed: expected NAME=VALUE, got {text!r}")
+            if name in OWN_OPTIONS:
+                raise UsageError(f"fixed: expected another setting, got {name}; use {OWN_OPTIONS[name]}")
+            try:
+                settings[name] = json.loads(value)
+            except ValueError:  # a word
+                settings[name] = value
+            if isinstance(settings[name], list | dict) or settings[name] != settings[name]:
+                raise UsageError(f"fixed: expected a word or a number for {name}, got {value}")
+        return settings
+
+
+def parse_grid(lists: Mapping[str, str | None], base: Grid | None = None) -> Grid:
+    """Make a grid from comma-separated lists; None leaves the base's. A UsageError if a value is impossible."""
+    values: dict[str, tuple[Any, ...]] = {}
+    for name, text in lists.items():
+        if text is not None:
+            parts = [part.strip() for part in text.split(",") if part.strip()]
+            values[name] = tuple(int(part) if name in NUMBERS and part.isdecimal() else part for part in parts)
+    try:
+        return replace(base or Grid(), **values)
+    except ValueError as error:
+        raise UsageError(str(error)) from error
+
+
+def read_grid(path: Path) -> Grid:
+    """Read a grid from a small TOML or JSON file whose keys are the fields of :class:`Grid`.
+
+    A SceneError if the file cannot be read, or holds anything else.
+    """
+    values, known = read_table(path), {f.name for f in fields(Grid)}
+    if values.keys() - known:
+        odd = ", ".join(sorted(values.keys() - known))
+        raise SceneError(path, f"expected lists named {', '.join(sorted(known))}, found {odd}")
+    try:
+        return Grid(**{name: tuple(value) if isinstance(value, list) else (value,) for name, value in values.items()})
+    except (TypeError, ValueError) as error:
+        raise SceneError(path, str(error)) from error
+
+
+def list_settings(grid: Grid) -> tuple[list[tuple[str, dict[str, Any]]], list[str]]:
+    """List method and settings of every run on one scene, the unmerged input first, and notes on what was left out.
+
+    Only settings that differ from the defaults are set. Baselines do not have most settings and run once per size, or
+    once where they keep all Gaussians.
+    """
+    sizes: list[dict[str, Any]] = [{"budget": b} for b in grid.budgets] + [{"superpixels": s} for s in grid.superpixels]
+    runs = {describe(INPUT, {}, None): (INPUT, dict[str, Any]())}
+    repeated = 0
+    for method, *values, size in product(
+        grid.methods, *(getattr(grid, name) for name in SETTINGS.values()), sizes or [{}]
+    ):
+        own = SETTINGS if method == OURS else FITTED.get(method, ())
+        chosen = dict(zip(SETTINGS, values, strict=True))
+        settings = {} if method in (INPUT, *ONE_SIZE) else dict(size)
+        settings |= {name: chosen[name] for name in own if chosen[name] != getattr(Grid, SETTINGS[name])[0]}
+        settings |= grid.settings if method == OURS else {}
+        label = describe(method, settings, None)
+        repeated += label in runs
+        runs.setdefault(label, (method, settings))
+    notes = [f"{repeated} combination(s) left out: their method does not use the settings that differ"]
+    return list(runs.values()), notes if repeated else []
+
+
+def _options_of(method: str, settings: Mapping[str, Any], seed: int) -> CompactOptions:
+    """Make the options of a run; a UsageError if the library does not take a setting, or a program is missing."""
+    from gsmerge.baselines import check_program, find_baseline
+
+    own = {} if method in (OURS, INPUT) else {"method": method}
+    try:
+        options = CompactOptions().with_settings({**settings, **own, "seed": seed})
+        baseline = None if method == INPUT else find_baseline(method)
+    except ValueError as error:
+        raise UsageError(str(error)) from error
+    except TypeError as error:  # text instead of a number
+        given = ", ".join(f"{name}={value}" for name, value in settings.items())
+        raise UsageError(f"{method}: expected settings that compact takes, got {given}") from error
+    if baseline is not None:
+        check_program(baseline)
+    return options
+
+
+@dataclass(frozen=True)
+class Source:
+    """A scene before it is read."""
+
+    path: Path  # the ``.ply``, or the folder that it is in
+    name: str  # short name, different for every scene of a grid
+    targets: Path | None  # cameras of held-out views
+    target_images: Path | None  # folder of their photos; None: found by their cameras
+    num_views: int | None  # views of its camera file, an upper bound for those of the scene; None if unknown
+    sha256: str  # of everything that is read
+
+
+def find_sources(
+    given: Sequence[str], out: Path, targets: str | None = None, target_images: str | None = None
+) -> list[Source]:
+    """Find the scenes that ``gsmerge batch`` would find, and hash everything that is read of each.
+
+    ``targets``, cameras of held-out views, and ``target_images``, the folder of their photos, are one path for all or a
+    template with ``{scene}`` (as given), ``{parent}`` (its folder) and ``{stem}`` (its name without extension) in it. A
+    SceneError if a file is missing, a UsageError if a template holds another name.
+    """
+    scenes = list({main_file(scene).resolve(): scene for scene in find_scenes(given, out)}.values())
+    named = zip(scenes, scene_names(scenes), strict=True)
+    return [_source(scene, name, filled(targets, scene), filled(target_images, scene)) for scene, name in named]
+
+
+def _source(scene: Path, name: str, targets: Path | None, target_images: Path | None) -> Source:
+    files = find_scene_files(scene)
+    read = read_files(files)
+    if targets is not None:
+        if not targets.exists():
+            raise SceneError(targets, f"expected cameras of held-out views of {scene}, found nothing")
+        # other files of a folder of cameras, such as results, do not count
+        inside = find_cameras(targets) if targets.is_dir() and not is_colmap(targets) else None
+        read += [inside or targets, *photos_of(targets)]
+    read += [] if target_images is None else [target_images]
+    cameras = None if files.cameras is None else cameras_of(files.cameras, files.ply.stem)
+    num_views = None if cameras is None else len(cameras)
+    return Source(scene, name, targets, target_images, num_views, content_hash(list(dict.fromkeys(read))))
+
+
+def scene_names(scenes: Sequence[Path]) -> list[str]:
+    """Name each scene as its file or folder, with as many folders before it as it takes to tell them apart."""
+    parts = [(*scene.absolute().parent.parts[1:], stem_of(scene.absolute())) for scene in scenes]
+    for depth in range(1, max(map(len, parts), default=0)):
+        names = ["/".join(part[-depth:]) for part in parts]
+        if len(set(names)) == len(names):
+            return names
+    return ["/".join(part) for part in parts]
+
+
+def make_jobs(
+    sources: Sequence[Source],
+    grid: Grid,
+    measured: EvaluateOptions,
+    *,
+    seed: int = 0,
+    proxy_views: int = 0,
+    command: str = "",
+) -> tuple[list[Job], list[str]]:
+    """Make the jobs of a grid, scene by scene, and notes on what was left out.
+
+    ``proxy_views``: photos of each scene on which superpixels alone are measured; 0: none. ``command``: the command
+    line, for the records. A UsageError if the library does not take a setting.
+    """
+    combinations, notes = list_settings(grid)
+    counts = [None if count == ALL else int(count) for count in grid.views]
+    chosen = [
+        (method, settings, count, _options_of(method, settings, seed))
+        for count, (method, settings) in product(counts, combinations)
+    ]
+    if proxy_views:
+        chosen.append((SUPERPIXELS, {}, proxy_views, CompactOptions().with_settings({"method": "unmerged"})))
+    jobs: list[Job] = []
+    for source in sources:
+        most = source.num_views or math.inf
+        some = [one for one in chosen if one[0] == SUPERPIXELS or (one[2] or 0) <= most]
+        if len(some) < len(chosen):
+            few = len(chosen) - len(some)
+            notes.append(f"{source.name} has fewer views than asked for: {few} run(s) left out")
+        num_gaussians, num_rest = header_counts(main_file(source.path))
+        for method, settings, views, options in some:
+            label = describe(method, settings, views)
+            output = f"{source.name}/{_file_name(label)}"
+            record = RunRecord(source.name, label, output, source.sha256, method, settings, views, command)
+            run = Run(record, options, measured, source.targets, source.target_images)
+            share = min(1.0, (views or most) / most) if source.num_views else 1.0
+            jobs.append(Job(len(jobs), str(source.path), output, round(share * num_gaussians), num_rest, run))
+    return jobs, notes
+
+
+def _file_name(label: str) -> str:
+    """Make a name of files of a label: short, without characters that file systems or shells know."""
+    name = re.sub(r"[^\w.%+=, -]", "_", label)[:MAX_NAME]
+    return name if name == label else f"{name} {digest({'label': label})[:6]}"

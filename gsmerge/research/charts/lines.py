@@ -1,0 +1,364 @@
+"""Records -> lines over scenes: which runs belong together, means with intervals, and comparisons at equal cost."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtrit
+
+from gsmerge.research.charts.run import INPUT, OURS, SUPERPIXELS, RunRecord
+
+LEVEL = 0.95  # confidence of the intervals
+MIN_SHARE = 0.5  # of the scenes that a point of a line must have
+MIN_SHARE_VIEWS = 0.4  # the same over the number of views: not all scenes have as many views
+TYPICAL_RATIO = 0.044  # share of the Gaussians: runs nearest it represent all sizes
+RATIOS = (0.0045, 0.22)  # of the points of baselines that are compared: 0.5 % to 20 %, with room for rounding
+SIZES = ("budget", "superpixels")  # settings that say how many Gaussians there will be
+ONE_SIZE = ("unmerged", "unmerged-fit")  # methods that keep all Gaussians
+PARTS = {  # what scores are means over, the most meaningful first
+    "target_visible": "held-out views, pixels that the input views see",
+    "target": "held-out views",
+    "context_visible": "input views, pixels that they see",
+    "context": "input views",
+}
+ByScene = Mapping[str, tuple[float, float]]  # x and y of each scene
+LineKey = tuple[str, tuple[tuple[str, Any], ...]]  # method, settings without the size
+K = TypeVar("K")
+
+
+@dataclass(frozen=True)
+class Metric:
+    """How a score is shown."""
+
+    label: str
+    higher: bool  # whether higher is better
+    digits: int  # decimals
+
+
+METRICS = {
+    "psnr": Metric("PSNR (dB)", True, 2),
+    "ssim": Metric("SSIM", True, 3),
+    "lpips_vgg": Metric("LPIPS (VGG)", False, 3),
+    "lpips_alex": Metric("LPIPS (AlexNet)", False, 3),
+}
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A mean and its confidence interval."""
+
+    mean: float  # over the scenes
+    low: float  # lower end of the interval; equal to the mean where there is only one scene
+    high: float  # upper end
+    count: int  # scenes
+
+
+@dataclass(frozen=True)
+class Point:
+    """A method at one size or number of views, over all scenes."""
+
+    label: str  # size or number of views
+    x: float  # mean cost over the scenes (geometric)
+    y: Interval  # mean quality with its interval
+    by_scene: ByScene
+
+
+@dataclass(frozen=True)
+class Line:
+    """A method with its settings, from size to size."""
+
+    name: str  # of the method and its settings
+    ours: bool  # whether it is ours, not a baseline's
+    points: tuple[Point, ...]  # by ascending size or number of views
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A point of a baseline compared with our curve at the same cost."""
+
+    baseline: str  # name of the baseline's line
+    cost: float  # mean cost of the point
+    quality: float  # mean quality of the point, over the scenes where ours is known at that cost
+    ours: float | None  # our quality at the same cost; None where no scene has so cheap a result of ours
+    ahead: Interval | None  # our quality less the baseline's, paired by scene; None with ours
+    words: str  # ours above, baseline above, undecided or ours has none so cheap
+
+
+@dataclass(frozen=True)
+class VerdictTable:
+    """Points of baselines compared with ours at equal cost."""
+
+    title: str  # metric and cost
+    rows: tuple[tuple[str, Verdict], ...]  # one per point of a baseline, with the label of its size
+    decimals: int  # of the metric
+
+
+def mean_interval(values: Sequence[float]) -> Interval:
+    """Compute the mean of at least one value with its two-sided t interval (Student 1908).
+
+    Few scenes make it wide: 12.7 standard errors for two.
+    """
+    if not len(values):
+        raise ValueError("expected at least one value, got none")
+    array = np.asarray(values, np.float64)
+    mean, half = float(array.mean()), 0.0
+    if len(array) > 1:
+        factor = float(stdtrit(len(array) - 1, 0.5 + LEVEL / 2))
+        half = factor * float(array.std(ddof=1)) / math.sqrt(len(array))
+    return Interval(mean, mean - half, mean + half, len(array))
+
+
+def paired_difference(ours: Mapping[str, float], theirs: Mapping[str, float]) -> Interval:
+    """Subtract over the scenes that both have, at least one, so that the difficulty of a scene cancels."""
+    return mean_interval([ours[scene] - theirs[scene] for scene in ours if scene in theirs])
+
+
+def paired_intervals(values: NDArray[np.float64]) -> list[Interval]:
+    """Compute intervals of ``values [scenes, conditions]``, neither of them 0, without differences between scenes.
+
+    Scenes differ by several dB and conditions by tenths, so plain intervals would hide the conditions. Here every
+    scene's own mean is subtracted first (Cousineau 2005), with the correction for it (Morey 2008).
+    """
+    num_scenes, num_conditions = values.shape
+    if num_conditions == 1 or num_scenes == 1:
+        return [mean_interval(column) for column in values.T.tolist()]
+    centred = values - values.mean(1, keepdims=True)
+    factor = math.sqrt(num_conditions / (num_conditions - 1))
+    halves = [factor * (one.high - one.mean) for one in map(mean_interval, centred.T.tolist())]
+    means = values.mean(0).tolist()
+    return [Interval(mean, mean - half, mean + half, num_scenes) for mean, half in zip(means, halves, strict=True)]
+
+
+def pareto_front(costs: Sequence[float], qualities: Sequence[float]) -> list[int]:
+    """List the points that no other dominates, by ascending cost; of equal points the first.
+
+    A point dominates one that is as cheap and worse (a lower quality), or dearer and no better.
+    """
+    best, front = -math.inf, []
+    for i in sorted(range(len(costs)), key=lambda i: (costs[i], -qualities[i], i)):
+        if qualities[i] > best:
+            best = qualities[i]
+            front.append(i)
+    return front
+
+
+def quality_at(costs: Sequence[float], qualities: Sequence[float], cost: float) -> float | None:
+    """Interpolate a method's front at a cost, over the logarithm of the cost; None below its cheapest point.
+
+    Costs are positive, and a higher quality is better. Beyond the most expensive point the quality is constant.
+    """
+    front = pareto_front(costs, qualities)
+    if not front or cost < costs[front[0]]:
+        return None
+    return float(np.interp(math.log(cost), np.log([costs[i] for i in front]), [qualities[i] for i in front]))
+
+
+def judge(
+    baseline: str, points: ByScene, ours: Mapping[str, Sequence[tuple[float, float]]], *, higher: bool = True
+) -> Verdict:
+    """Judge whether a baseline's point lies above our curve at equal cost, scene by scene.
+
+    ``points`` has the (cost, quality) of the baseline's point by scene, at least one, ``ours`` all those of ours. A
+    side is named only where zero lies outside the interval of the difference, or the baseline has only one scene.
+    """
+    sign = 1.0 if higher else -1.0
+    curves = {scene: ours.get(scene, ()) for scene in points}
+    at = {
+        s: quality_at([c for c, _ in curve], [sign * q for _, q in curve], points[s][0]) for s, curve in curves.items()
+    }
+    known = {scene: quality for scene, quality in at.items() if quality is not None}
+    cost = _mean_cost(points)
+    quality = float(np.mean([points[scene][1] for scene in known or points]))
+    if not known:
+        return Verdict(baseline, cost, quality, None, None, "ours has none so cheap")
+    ahead = paired_difference(known, {scene: sign * points[scene][1] for scene in known})
+    words = "ours above" if ahead.low > 0 else "baseline above" if ahead.high < 0 else "undecided"
+    if len(known) == 1 < len(points):  # one scene of several is no evidence for the others
+        words = "undecided"
+    return Verdict(baseline, cost, quality, sign * float(np.mean(list(known.values()))), ahead, words)
+
+
+def line_key(record: RunRecord) -> LineKey:
+    """Make the key of a record's line."""
+    settings = {name: value for name, value in record.settings.items() if name not in SIZES}
+    return record.method, tuple(sorted(settings.items()))
+
+
+def size_label(record: RunRecord) -> str:
+    """Name the size that was set; empty for the default one."""
+    for name in SIZES:
+        if name in record.settings:
+            value = record.settings[name]
+            number = f"{value:,}" if isinstance(value, int) else str(value)
+            return number if name == "budget" else f"{number} superpixels"
+    return ""
+
+
+def line_names(keys: Sequence[LineKey]) -> dict[LineKey, str]:
+    """Name every line by its method, and those of its settings that differ between its lines."""
+    names = {}
+    for method, settings in keys:
+        others = [dict(other) for name, other in keys if name == method]
+        differ = [(n, v) for n, v in settings if len(others) == 1 or any(other.get(n) != v for other in others)]
+        names[method, settings] = ", ".join([method, *(_setting_label(name, value) for name, value in differ)])
+    return names
+
+
+def _setting_label(name: str, value: Any) -> str:
+    if name == "fit":
+        return {"none": "no fit", "color": "colour fit", "full": "full fit"}.get(value, f"fit {value}")
+    return f"K = {value}" if name == "k" else str(value) if name == "segmentation" else f"{name} {value}"
+
+
+def ours_first(records: Iterable[RunRecord]) -> list[RunRecord]:
+    """Sort runs: ours, then those of baselines; those with the fewest settings first."""
+    return sorted(records, key=lambda record: (record.method != OURS, len(line_key(record)[1])))
+
+
+class Results:
+    """Runs that did not fail, with what tables and figures of them have in common.
+
+    Attributes:
+        runs: The runs.
+        superpixels: Records of superpixels alone.
+        names: Name of each line; that of the input is its method.
+        part: What scores are means over: the most meaningful that nine of ten runs have.
+        metrics: Names of the metrics that were measured, of PSNR, SSIM and one LPIPS, VGG if possible.
+        views: Number of views asked for in figures over other quantities: all (None), or the largest.
+        size: Size in figures over other quantities: whose results are nearest the typical share of the input.
+    """
+
+    def __init__(self, records: Iterable[RunRecord]) -> None:
+        done = [record for record in records if record.error is None]
+        self.superpixels = [record for record in done if record.method == SUPERPIXELS]
+        self.runs = [record for record in done if record.method != SUPERPIXELS]
+        keys = dict.fromkeys(map(line_key, ours_first(self.runs)))
+        self.names = {key: INPUT for key in keys if key[0] == INPUT}
+        self.names |= line_names([key for key in keys if key[0] != INPUT])
+        known = {part: sum(r.value(f"psnr_{part}") is not None for r in self.runs) for part in PARTS}
+        self.part = next((p for p in known if self.runs and known[p] >= 0.9 * len(self.runs)), "context")
+        names = [m for m in METRICS if any(r.value(f"{m}_{self.part}") is not None for r in self.runs)]
+        self.metrics = [m for m in names if m != "lpips_alex" or "lpips_vgg" not in names]
+        asked = {record.views_asked for record in self.runs}
+        self.views = None if None in asked else max((views for views in asked if views is not None), default=None)
+        ratios: dict[str, list[float]] = {}
+        for record in self.runs:
+            if record.method == OURS and record.ratio:
+                ratios.setdefault(size_label(record), []).append(math.log(record.ratio / TYPICAL_RATIO))
+        self.size = min(ratios, key=lambda size: (abs(float(np.mean(ratios[size]))), size), default="")
+
+    def name(self, record: RunRecord) -> str:
+        """Name the line of a run."""
+        return self.names[line_key(record)]
+
+    def is_typical(self, record: RunRecord) -> bool:
+        """Say whether a run has the typical size, or a method that has only one size."""
+        return record.method != INPUT and (size_label(record) == self.size or record.method in ONE_SIZE)
+
+    def typical_runs(self) -> dict[str, list[RunRecord]]:
+        """Group runs of the typical size and number of views by their line, ours first, all over the same scenes."""
+        rows = dict[str, list[RunRecord]]()
+        for record in ours_first(self.runs):
+            if self.is_typical(record) and record.views_asked == self.views:
+                rows.setdefault(self.name(record), []).append(record)
+        kept = keep_common({name: {record.scene for record in group} for name, group in rows.items()}, MIN_SHARE)
+        return {name: [record for record in rows[name] if record.scene in scenes] for name, scenes in kept.items()}
+
+    def by_size(self, x: str, y: str) -> list[Line]:
+        """Make lines of two values over the size, at the typical number of views."""
+        merged = [r for r in self.runs if r.method != INPUT and r.views_asked == self.views]
+        return make_lines(merged, size_label, "ratio", x, y)
+
+    def by_views(self, y: str) -> list[Line]:
+        """Make lines of a value over the number of views, at the typical size; empty with only one number."""
+        chosen = [r for r in self.runs if r.method == INPUT or self.is_typical(r)]
+        lines = make_lines(chosen, lambda r: str(r.views), "views", "views", y, MIN_SHARE_VIEWS)
+        return [line for line in lines if len(line.points) > 1]
+
+    def input_mean(self, name: str, scenes: Iterable[str]) -> float | None:
+        """Average a value of the unmerged input over some scenes; None where one does not have it."""
+        inputs = {r.scene: r.value(name) for r in self.runs if r.method == INPUT and r.views_asked == self.views}
+        values = [inputs.get(scene) for scene in scenes]
+        known = [one for one in values if one is not None]
+        return float(np.mean(known)) if known and len(known) == len(values) else None
+
+
+def make_lines(
+    records: Sequence[RunRecord],
+    label: Callable[[RunRecord], str],
+    order: str,
+    x: str,
+    y: str,
+    min_share: float = MIN_SHARE,
+) -> list[Line]:
+    """Make lines of points that have at least a share of the scenes, all over the same scenes.
+
+    ``order``, ``x`` and ``y`` are names of values of a record; costs x must be positive.
+    """
+    cells: dict[tuple[LineKey, str], dict[str, tuple[float, float]]] = {}
+    for record in sorted(records, key=lambda record: record.value(order) or 0.0):
+        at, value = record.value(x), record.value(y)
+        if at and value is not None:
+            cells.setdefault((line_key(record), label(record)), {})[record.scene] = float(at), value
+    kept = keep_common({cell: set(points) for cell, points in cells.items()}, min_share)
+    by_cell = {cell: {s: xy for s, xy in cells[cell].items() if s in scenes} for cell, scenes in kept.items()}
+    intervals = _intervals(list(by_cell.values()))
+    points: dict[LineKey, list[Point]] = {}
+    for ((key, name), by_scene), interval in zip(by_cell.items(), intervals, strict=True):
+        points.setdefault(key, []).append(Point(name, _mean_cost(by_scene), interval, by_scene))
+    names = line_names(list(points))
+    keys = sorted(points, key=lambda key: (key[0] != OURS, len(key[1])))
+    return [Line(names[key], key[0] == OURS, tuple(points[key])) for key in keys]
+
+
+def keep_common(scenes: Mapping[K, set[str]], min_share: float) -> dict[K, set[str]]:
+    """Keep the scenes that all have, so that all means are over the same scenes; each its own, if there are none.
+
+    Those that have too few of the scenes are left out first, so that a few failed runs do not remove the others.
+    """
+    fewest = min_share * len(set().union(*scenes.values()))
+    kept = {name: own for name, own in scenes.items() if len(own) >= fewest}
+    common = set.intersection(*kept.values()) if kept else set()
+    return {name: common or own for name, own in kept.items()}
+
+
+def _mean_cost(points: ByScene) -> float:
+    """Average positive costs geometrically; equal ones exactly."""
+    costs = [x for x, _ in points.values()]
+    return costs[0] if min(costs) == max(costs) else float(np.exp(np.mean(np.log(costs))))
+
+
+def _intervals(columns: Sequence[ByScene]) -> list[Interval]:
+    """Make one for each column, without differences between scenes; of zero width where columns have other scenes."""
+    if columns and all(column.keys() == columns[0].keys() for column in columns):
+        values = [[column[scene][1] for column in columns] for scene in sorted(columns[0])]
+        return paired_intervals(np.array(values, np.float64))
+    means = [float(np.mean([y for _, y in column.values()])) for column in columns]
+    return [Interval(mean, mean, mean, len(column)) for mean, column in zip(means, columns, strict=True)]
+
+
+def make_verdict_tables(results: Results) -> list[VerdictTable]:
+    """Compare points of baselines with ours at equal seconds, and at an equal share of the Gaussians."""
+    tables = []
+    for (cost, words), metric in product((("seconds", "time"), ("ratio", "size")), results.metrics):
+        score, ours = f"{metric}_{results.part}", dict[str, list[tuple[float, float]]]()
+        for record in results.runs:
+            at, value = record.value(cost), record.value(score)
+            if record.method == OURS and record.views_asked == results.views and at and value is not None:
+                ours.setdefault(record.scene, []).append((at, value))
+        rows = [
+            (point.label, judge(line.name, point.by_scene, ours, higher=METRICS[metric].higher))
+            for line in results.by_size(cost, score)
+            for point in line.points
+            if not line.ours and (cost != "ratio" or RATIOS[0] <= point.x <= RATIOS[1])
+        ]
+        if rows and ours:
+            title = f"{METRICS[metric].label} at equal {words}"
+            tables.append(VerdictTable(title, tuple(rows), METRICS[metric].digits))
+    return tables

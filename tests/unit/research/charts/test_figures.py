@@ -1,0 +1,149 @@
+"""What figures show, their key with the names of the lines, and drawings that repeat to the byte."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import matplotlib
+import pytest
+from experiments import make_grid, make_proxies, make_record
+
+from gsmerge.research.charts import require_matplotlib
+from gsmerge.research.charts.figures import (
+    MAX_LINES,
+    RC,
+    Figure,
+    Panel,
+    choose_lines,
+    draw_curves,
+    draw_figures,
+    line_styles,
+    make_figures,
+)
+from gsmerge.research.charts.lines import Interval, Line, Point, Results
+from gsmerge.research.charts.run import RunRecord
+
+METHODS = ("gsmerge", "voxel")
+NAMES = ["quality-seconds", "quality-ratio", "stages", "proxy", "count-views", "quality-views", "break-even"]
+
+
+def figures_of(records: list[RunRecord]) -> list[Figure]:
+    return make_figures(Results(records))
+
+
+def test_all_figures() -> None:
+    figures = figures_of([*make_grid(), *make_proxies()])
+    assert [figure.name for figure in figures] == NAMES
+    assert all("3 scenes" in f.caption or "3 scene(s)" in f.caption for f in figures)
+    assert all(len(row) == len(f.head) for f in figures for row in f.rows)
+    by_name = {figure.name: figure for figure in figures}
+    stages, even, counts = by_name["stages"], by_name["break-even"], by_name["count-views"]
+    assert [row[0] for row in stages.rows] == ["gsmerge", "gsmerge, no fit", "voxel", "random"]
+    assert stages.bars["fit"][0] == pytest.approx(4.8)
+    assert "score" not in stages.bars
+    assert even.bars["frames"][0] == 110  # 6 s are 109.1 times 55 ms
+    assert even.rows[0] == ("gsmerge", "6.00", "5.0", "110")
+    assert [line.name for line in counts.panels[0].lines] == ["gsmerge", "gsmerge, no fit", "input"]
+    assert [line.name for line in by_name["proxy"].panels[0].lines][:2] == ["rdseg", "bass-adaptive"]
+    assert by_name["proxy"].panels[0].lines[0].points[2].x == pytest.approx(1000)
+
+
+def test_bars_and_break_even_are_over_the_same_scenes() -> None:
+    records = [r for r in make_grid() if not (r.scene == "fox" and r.method == "voxel")]
+    records = [r for r in records if not (r.scene != "fern" and r.method == "random")]
+    slow = [replace(r, seconds=100.0, stages={"fit": 100.0}) if r.scene == "fox" and r.seconds else r for r in records]
+    stages, even = (f for f in figures_of(slow) if f.name in ("stages", "break-even"))
+    assert [row[0] for row in stages.rows] == [row[0] for row in even.rows] == ["gsmerge", "gsmerge, no fit", "voxel"]
+    assert stages.bars["fit"][0] == pytest.approx(4.8)
+    assert even.rows[0][1] == "6.00"
+
+
+def test_a_method_that_renders_no_faster_never_breaks_even() -> None:
+    slow = [replace(r, render_ms=59.0) if r.method == "voxel" else r for r in make_grid()]
+    (even,) = (figure for figure in figures_of(slow) if figure.name == "break-even")
+    assert [row[-1] for row in even.rows if row[0] == "voxel"] == ["never"]
+
+
+def test_figures_need_their_data() -> None:
+    assert figures_of([]) == []
+    assert figures_of([replace(r, error="out of memory") for r in make_grid()]) == []
+    alone = figures_of([make_record("fern", "gsmerge")])
+    assert [f.name for f in alone] == ["quality-seconds", "quality-ratio", "stages"]
+    assert "one scene has no intervals" in alone[0].caption
+    assert [f.name for f in figures_of(make_proxies())] == ["proxy"]
+
+
+@pytest.mark.parametrize("count", [1, 3, 10, 25])
+def test_the_key_names_every_line_and_fits(count: int) -> None:
+    """The reference is a name, too."""
+    points = [(Interval(20 + i, 19 + i, 21 + i, 4), 0.1 * (i + 1)) for i in range(count)]
+    lines = tuple(Line(f"method {i}", i == 0, (Point("1%", x, y, {}),)) for i, (y, x) in enumerate(points))
+    panels = tuple(Panel(word, True, lines, 22.0) for word in ("PSNR", "SSIM"))
+    figure, styles = Figure("quality", "", "", "Seconds", (), (), panels), line_styles((x.name, False) for x in lines)
+    with matplotlib.rc_context(RC):
+        drawing = draw_curves(figure, styles)
+        drawing.draw_without_rendering()
+    (key,) = drawing.legends
+    assert [text.get_text() for text in key.get_texts()] == [*(line.name for line in lines), "input"]
+    box = key.get_window_extent()
+    assert drawing.bbox.x0 <= box.x0 < box.x1 <= drawing.bbox.x1
+    assert drawing.bbox.y0 <= box.y0 < box.y1 <= drawing.bbox.y1
+    assert all(axes.bbox.x1 <= box.x0 for axes in drawing.axes)
+
+
+def test_no_two_lines_have_one_colour_and_mark() -> None:
+    names = [(f"{name} {i}", name == "gsmerge") for name in METHODS for i in range(20)]
+    styles = line_styles([("input", False), *names])
+    assert len({(style["color"], style["marker"]) for style in styles.values()}) == 41
+
+
+def line(name: str, *quality: float) -> Line:
+    points = (Point(f"{i} %", i + 1.0, Interval(y, y, y, 1), {}) for i, y in enumerate(quality))
+    return Line(name, name.startswith("gsmerge"), tuple(points))
+
+
+def test_of_many_lines_one_for_each_method_is_drawn() -> None:
+    """The best of those with several points; a few lines are all drawn."""
+    lines = (
+        line("gsmerge", 20, 21), line("gsmerge, fast", 19, 20, 20), line("gsmerge, best", 30), line("voxel, a", 9, 9),
+        line("voxel, b", 10, 12),
+    )  # fmt: skip
+    many = (*lines, *(line(f"random, {i}", 5 - i) for i in range(MAX_LINES)))
+    assert choose_lines(Panel("PSNR", True, lines)) == {one.name for one in lines}
+    assert choose_lines(Panel("PSNR", True, many)) == {"gsmerge", "voxel, b", "random, 0"}
+    assert choose_lines(Panel("LPIPS", False, many)) == {"gsmerge, fast", "voxel, a", f"random, {MAX_LINES - 1}"}
+    records = [make_record("fern", "gsmerge", {"budget": "1%", "max_color": i / 20}) for i in range(MAX_LINES + 1)]
+    figure = figures_of(records)[0]
+    assert len(figure.panels[0].lines) == 1
+    assert figure.caption.endswith("One line for each method; the table has all.")
+    assert len({row[1] for row in figure.rows}) == MAX_LINES + 1
+
+
+def test_drawings_repeat_to_the_byte(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    figures = [f for f in figures_of(make_grid()) if f.name in ("quality-ratio", "stages", "break-even")]
+    draw_figures(figures, tmp_path / "a")
+    monkeypatch.setitem(matplotlib.rcParams, "font.size", 30)  # the user's own style does not matter
+    drawn = draw_figures(figures, tmp_path / "b")
+    names = sorted(path.name for path in (tmp_path / "a").iterdir())
+    assert len(names) == 6
+    for name in names:
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+    assert matplotlib.rcParams["font.size"] == 30
+    assert drawn["stages"] == (tmp_path / "a" / "stages.svg").read_bytes()
+    assert b"<dc:date>" not in drawn["stages"]
+
+
+@pytest.mark.parametrize("name", ["a $\\frac{$ b", "$x$", "_\\$", "=1|x"])
+def test_names_are_no_formulas_in_drawings(name: str, tmp_path: Path) -> None:
+    records = [replace(r, settings={**r.settings, "checkpoint": name}) for r in make_grid() if r.method != "input"]
+    records += [replace(r, settings=dict(r.settings)) for r in make_grid() if r.method == "gsmerge"]
+    assert draw_figures(figures_of(records), tmp_path)
+
+
+def test_missing_matplotlib_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    from gsmerge.errors import GsmergeError
+
+    monkeypatch.setattr("gsmerge.research.charts.find_spec", lambda name: None)
+    with pytest.raises(GsmergeError, match=r'not installed: pip install "matplotlib>=3.8,<4"'):
+        require_matplotlib()

@@ -1,0 +1,259 @@
+"""The grid: products, what is left out, files that hold one, and the scenes that it is run on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gsmerge.batch import BatchOptions
+from gsmerge.batch.plan import Schedule, estimate_seconds
+from gsmerge.errors import SceneError, UsageError
+from gsmerge.io import ReadHints
+from gsmerge.measure.evaluate import EvaluateOptions
+from gsmerge.research.charts.grid import (
+    Grid,
+    find_sources,
+    list_settings,
+    make_jobs,
+    parse_grid,
+    read_grid,
+    scene_names,
+)
+from gsmerge.research.charts.run import Run
+
+
+def test_the_smallest_grid_is_the_input_and_the_defaults() -> None:
+    assert list_settings(Grid()) == ([("input", {}), ("gsmerge", {})], [])
+
+
+def test_the_product() -> None:
+    grid = parse_grid({"k": "1,2", "budgets": "0.5%, 2%,4000", "fit": "full,none"})
+    made, notes = list_settings(grid)
+    assert len(made) == 1 + 2 * 3 * 2
+    assert len({(method, *sorted(settings.items())) for method, settings in made}) == len(made)
+    assert notes == []
+    assert made[1] == ("gsmerge", {"budget": "0.5%"})
+    assert ("gsmerge", {"budget": 4000, "k": 2, "fit": "none"}) in made
+
+
+def test_baselines_run_once_per_size() -> None:
+    combinations, notes = list_settings(
+        Grid(methods=("gsmerge", "voxel"), k=(1, 2), budgets=("1%",), superpixels=("10%",), fit=("full", "none"))
+    )
+    assert [settings for method, settings in combinations if method == "voxel"] == [
+        {"budget": "1%"},
+        {"superpixels": "10%"},
+    ]
+    assert len(combinations) == 1 + 2 * 2 * 2 + 2
+    assert notes == ["6 combination(s) left out: their method does not use the settings that differ"]
+
+
+def test_methods_that_keep_all_run_once_and_fits_once_per_effort() -> None:
+    grid = Grid(methods=("unmerged", "unmerged-fit"), budgets=("1%", "2%"), efforts=("fast", "default"), fit=("none",))
+    combinations, notes = list_settings(grid)
+    assert combinations == [
+        ("input", {}),
+        ("unmerged", {}),
+        ("unmerged-fit", {"effort": "fast"}),
+        ("unmerged-fit", {}),
+    ]
+    assert notes == ["5 combination(s) left out: their method does not use the settings that differ"]
+
+
+@pytest.mark.parametrize(
+    ("lists", "message"),
+    [
+        ({"k": "1,1"}, "k: expected every value once"),
+        ({"k": " , "}, "k: expected at least one value"),
+        ({"views": "0"}, "views: expected numbers from 1"),
+        ({"views": "some"}, "views: expected numbers from 1"),
+    ],
+)
+def test_lists_that_cannot_be(lists: dict[str, str], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        parse_grid(lists)
+
+
+@pytest.mark.parametrize(
+    ("lists", "message"), [({"k": "9"}, "expected"), ({"fit": "some"}, "fit: expected"), ({"budgets": "x"}, "expected")]
+)
+def test_settings_that_the_library_refuses(lists: dict[str, str], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        make_jobs([], parse_grid(lists), EvaluateOptions(()))
+
+
+def test_files(tmp_path: Path) -> None:
+    grid = tmp_path / "grid.json"
+    grid.write_text('{"k": [1, 2], "budgets": ["1%", 500], "views": "all"}')
+    assert read_grid(grid) == Grid(k=(1, 2), budgets=("1%", 500), views=("all",))
+    assert parse_grid({"k": "2", "fit": None}, read_grid(grid)) == Grid(k=(2,), budgets=("1%", 500))
+
+
+def test_toml_files(tmp_path: Path) -> None:
+    pytest.importorskip("tomllib")
+    grid = tmp_path / "grid.toml"
+    grid.write_text('methods = ["gsmerge", "voxel"]\nviews = [3, 6]\n')
+    assert read_grid(grid) == Grid(methods=("gsmerge", "voxel"), views=(3, 6))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "found a mistake"),
+        ("[]", "found no table"),
+        ('{"kk": [1]}', "found kk"),
+        ('{"views": [0]}', "views: expected"),
+        ('{"views": [[1]]}', "grid.json"),
+    ],
+)
+def test_files_that_hold_no_grid(text: str, message: str, tmp_path: Path) -> None:
+    grid = tmp_path / "grid.json"
+    grid.write_text(text)
+    with pytest.raises(SceneError, match=message):
+        read_grid(grid)
+
+
+def test_a_missing_file_is_told(tmp_path: Path) -> None:
+    with pytest.raises(SceneError, match="expected a TOML or JSON file"):
+        read_grid(tmp_path / "grid.toml")
+
+
+def test_fixed_settings_are_those_of_ours_alone() -> None:
+    grid = Grid(methods=("gsmerge", "random"), budgets=("1%",), fixed=("robust=false", "match=none", "iterations=3"))
+    combinations, _ = list_settings(grid)
+    assert combinations[1:] == [
+        ("gsmerge", {"budget": "1%", "robust": False, "match": "none", "iterations": 3}),
+        ("random", {"budget": "1%"}),
+    ]
+
+
+@pytest.mark.parametrize("text", ["robust", "=1", ""])
+def test_fixed_settings_are_names_and_values(text: str) -> None:
+    with pytest.raises(UsageError, match="NAME=VALUE"):
+        list_settings(Grid(fixed=(text,)))
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["method=voxel", "seed=3", "threads=1", "min_contribution=[1]", "min_contribution={}", "min_contribution=NaN"],
+)
+def test_what_cannot_be_fixed(text: str) -> None:
+    with pytest.raises(UsageError, match="fixed: expected"):
+        list_settings(Grid(fixed=(text,)))
+
+
+def test_a_program_that_is_missing_is_told_before_anything_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GSMERGE_SPLAT_TRANSFORM", "/nowhere/splat-transform")
+    with pytest.raises(UsageError, match="install it with"):
+        make_jobs([], Grid(methods=("gsmerge", "splat-transform"), budgets=("1%",)), EvaluateOptions(()))
+
+
+def test_names_are_as_short_as_can_be() -> None:
+    assert scene_names([Path("a/room"), Path("b/fern.ply")]) == ["room", "fern"]
+    assert scene_names([Path("a/scene.ply"), Path("b/scene.ply")]) == ["a/scene", "b/scene"]
+    assert scene_names([]) == []
+    assert scene_names([Path("room.1"), Path("room.2")]) == ["room.1", "room.2"]
+
+
+def sources(*given: object, targets: str | None = None) -> list[Any]:
+    return find_sources([str(one) for one in given], Path("nowhere"), targets)
+
+
+def test_a_scene_is_found_once(scene_copy: Path) -> None:
+    assert [source.name for source in sources(scene_copy, scene_copy / "scene.ply")] == ["scene"]
+
+
+def test_targets_are_one_file_or_a_template(scene_copy: Path) -> None:
+    ply = scene_copy / "scene.ply"
+    for scene, template in (
+        (scene_copy, "{scene}/targets/transforms.json"),
+        (ply, "{parent}/targets/transforms.json"),
+        (scene_copy, "{parent}/targets/transforms.json"),
+        (ply, str(scene_copy / "targets" / "transforms.json")),
+    ):
+        (source,) = sources(scene, targets=template)
+        assert source.targets == scene_copy / "targets" / "transforms.json"
+        assert source.num_views == 5
+    (named,) = sources(ply, targets="{parent}/{stem}.ply")
+    assert named.targets == ply
+    (scene_copy / "transforms.json").write_text("{")  # an error when the scene is read
+    assert sources(scene_copy)[0].num_views is None
+    with pytest.raises(SceneError, match="expected cameras of held-out views"):
+        sources(scene_copy, targets="{scene}/nothing.json")
+    for template in ("{}/targets", "{scene.foo}/targets", "{stem[foo]}", "{"):
+        with pytest.raises(UsageError, match="in braces"):
+            sources(scene_copy, targets=template)
+
+
+@pytest.mark.parametrize(
+    ("name", "counts"),
+    [
+        ("scene.ply", True),
+        ("transforms.json", True),
+        ("images/view_000.png", True),
+        ("targets/transforms.json", True),
+        ("targets/images/view_000.png", True),
+        ("notes.txt", False),
+    ],
+)
+def test_the_hash_knows_all_that_is_read(name: str, counts: bool, scene_copy: Path) -> None:
+    def sha256() -> str:
+        return str(sources(scene_copy, targets="{scene}/targets/transforms.json")[0].sha256)
+
+    before = sha256()
+    assert before == sha256()
+    path = scene_copy / name
+    path.write_bytes((path.read_bytes() if path.exists() else b"") + b" ")
+    assert (sha256() != before) is counts
+
+
+def test_results_beside_targets_do_not_count(scene_copy: Path) -> None:
+    before = sources(scene_copy, targets="{scene}/targets")[0].sha256
+    (scene_copy / "targets" / "charts").mkdir()
+    (scene_copy / "targets" / "charts" / "batch.jsonl").write_text("{}")
+    assert sources(scene_copy, targets="{scene}/targets")[0].sha256 == before
+    (scene_copy / "targets" / "transforms.json").write_text("{}")
+    assert sources(scene_copy, targets="{scene}/targets")[0].sha256 != before
+
+
+def test_a_copy_has_the_same_hash(scene_copy: Path, made_scene: Path) -> None:
+    assert sources(scene_copy)[0].sha256 == sources(made_scene)[0].sha256
+
+
+def test_jobs_are_runs_of_each_scene_with_files_of_their_own(made_scene: Path) -> None:
+    fixed = ("checkpoint=a/b.safetensors", "backing=false")
+    grid = Grid(methods=("gsmerge", "random"), budgets=("1%",), views=(2, 9, "all"), fixed=fixed)
+    jobs, notes = make_jobs(sources(made_scene), grid, EvaluateOptions(()), proxy_views=1)
+    assert len({job.output for job in jobs}) == len(jobs) == 2 * 3 + 1
+    assert notes == [f"{made_scene.name} has fewer views than asked for: 3 run(s) left out"]
+    assert all(job.output.startswith(f"{made_scene.name}/") and job.output.count("/") == 1 for job in jobs)
+    assert jobs[1].num_gaussians == pytest.approx(0.4 * jobs[-2].num_gaussians)
+    runs = [job.work for job in jobs]
+    assert len({run.key(BatchOptions()) for run in runs if run is not None}) == len(runs)
+
+
+def test_keys_depend_on_what_changes_measurements(made_scene: Path) -> None:
+    def key(options: BatchOptions | None = None, **more: Any) -> str:
+        given = sources(made_scene), more.pop("grid", Grid()), more.pop("measured", EvaluateOptions(()))
+        (_, job), _ = make_jobs(*given, **more)
+        assert isinstance(job.work, Run)
+        return job.work.key(options or BatchOptions())
+
+    assert key() == key(BatchOptions(jobs=2), command="another")
+    others = [key(measured=EvaluateOptions(("vgg",))), key(BatchOptions(opacity="raw")), key(seed=1)]
+    others += [key(BatchOptions(hints=ReadHints(order="none"))), key(grid=Grid(budgets=("1%",)))]
+    assert len({key(), *others}) == 6
+
+
+def estimate(scene: Path, grid: Grid | None = None) -> float:
+    jobs, _ = make_jobs(sources(scene), grid or Grid(), EvaluateOptions(()))
+    return estimate_seconds(jobs[1:], BatchOptions(), Schedule(1, 2, 0))
+
+
+def test_estimates_grow_with_the_work(made_scene: Path) -> None:
+    usual = estimate(made_scene)
+    assert estimate(made_scene, Grid(fit=("none",))) < usual < estimate(made_scene, Grid(efforts=("best",)))
+    costs = [estimate(made_scene, Grid(methods=(name,))) for name in ("random", "greedy", "unmerged-fit")]
+    assert costs == sorted(costs)

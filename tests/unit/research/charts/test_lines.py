@@ -1,0 +1,249 @@
+"""Which runs make a line, what it is called, its means, and statistics against known values and slow twins."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from experiments import SCENES, make_grid, make_record
+
+from gsmerge.research.charts.lines import (
+    Results,
+    judge,
+    line_key,
+    line_names,
+    make_verdict_tables,
+    mean_interval,
+    paired_difference,
+    paired_intervals,
+    pareto_front,
+    quality_at,
+    size_label,
+)
+
+PSNR = "psnr_target_visible"
+
+
+def test_lines_are_methods_with_their_settings() -> None:
+    lines = Results(make_grid()).by_size("ratio", PSNR)
+    assert [line.name for line in lines] == ["gsmerge", "gsmerge, no fit", "voxel", "random"]
+    assert [line.ours for line in lines] == [True, True, False, False]
+    assert [p.label for p in lines[0].points] == ["1%", "4.4%", "20%"]
+    point = lines[0].points[1]
+    assert point.x == pytest.approx(0.044)
+    assert point.y.mean == pytest.approx(np.mean([26, 24.01, 21.02]))
+    assert point.y.count == 3
+    assert point.y.high - point.y.low < 0.2  # the scenes' own level, 5 dB apart, is taken off
+
+
+def test_names_tell_only_what_differs() -> None:
+    records = [
+        make_record("fern", "gsmerge", {"k": 2, "effort": "fast"}),
+        make_record("fern", "gsmerge", {"k": 2, "effort": "best", "segmentation": "slic"}),
+        make_record("fern", "voxel"),
+    ]
+    names = line_names([line_key(r) for r in records])
+    assert list(names.values()) == ["gsmerge, effort fast", "gsmerge, effort best, slic", "voxel"]
+    alone = line_names([line_key(records[0])])
+    assert list(alone.values()) == ["gsmerge, effort fast, K = 2"]
+
+
+def test_sizes_have_names() -> None:
+    sizes = [{"budget": "2%"}, {"budget": 40000}, {"superpixels": "1%"}, {}]
+    labels = [size_label(replace(make_record("fern", "gsmerge"), settings=settings)) for settings in sizes]
+    assert labels == ["2%", "40,000", "1% superpixels", ""]
+
+
+def test_means_are_over_the_same_scenes() -> None:
+    records = [
+        r for r in make_grid() if not (r.scene == "fox" and r.method == "voxel" and r.settings["budget"] == "1%")
+    ]
+    lines = Results(records).by_size("ratio", PSNR)
+    assert {frozenset(p.by_scene) for line in lines for p in line.points} == {frozenset({"apples", "fern"})}
+
+
+def test_one_bad_setting_does_not_cost_the_scenes_of_the_others() -> None:
+    records = [r for r in make_grid() if not (r.scene != "fern" and r.method == "random")]
+    lines = Results(records).by_size("ratio", PSNR)
+    assert [line.name for line in lines] == ["gsmerge", "gsmerge, no fit", "voxel"]
+    assert {len(p.by_scene) for line in lines for p in line.points} == {3}
+
+
+def test_usual_size_and_views() -> None:
+    assert Results(make_grid(("0.5%", "5%", "20%"), views=(None,))).size == "5%"
+    assert Results(make_grid()).views is None
+    assert Results(make_grid(views=(3, 6))).views == 6
+    assert (Results([]).size, Results([]).views) == ("", None)
+
+
+def test_views_make_lines_where_there_are_several() -> None:
+    lines = Results(make_grid(views=(None, 3, 6))).by_views(PSNR)
+    assert [line.name for line in lines] == ["gsmerge", "gsmerge, no fit", "input", "voxel", "random"]
+    assert [p.x for p in lines[0].points] == [3, 6, 12]
+    assert Results(make_grid(views=(None,))).by_views(PSNR) == []
+
+
+def test_scenes_with_fewer_views_do_not_end_the_line() -> None:
+    records = [r for r in make_grid(views=(3, 6)) if r.views_asked == 3 or r.scene != "a"]
+    scenes = {r.scene for r in records}
+    lines = Results(records).by_views(PSNR)
+    assert [[point.label for point in line.points] for line in lines] == [["3", "6"]] * len(lines) != []
+    assert all(set(point.by_scene) == scenes - {"a"} for line in lines for point in line.points)
+
+
+def test_parts_and_metrics() -> None:
+    records = make_grid()
+    assert Results(records).part == "target_visible"
+    assert Results(records).metrics == ["psnr", "ssim", "lpips_vgg"]
+    without = [replace(r, scores={"psnr_context": 20.0}) for r in records]
+    assert Results(without).part == "context"
+    assert Results(without[:2] + records[2:]).part == "target_visible"  # nine of ten are enough
+    assert Results([]).part == "context"
+
+
+def test_the_input_is_a_level() -> None:
+    assert Results(make_grid()).input_mean(PSNR, SCENES) == pytest.approx(18 + (2 + 0 - 3) / 3 + 0.01)
+    assert Results(make_grid()).input_mean(PSNR, ["unknown"]) is None
+
+
+def test_verdict_tables() -> None:
+    tables = make_verdict_tables(Results(make_grid()))
+    assert [t.title for t in tables[3:]] == [
+        "PSNR (dB) at equal size",
+        "SSIM at equal size",
+        "LPIPS (VGG) at equal size",
+    ]
+    assert [t.title.split(" at ")[1] for t in tables] == ["equal time"] * 3 + ["equal size"] * 3
+    assert {verdict.words for _, verdict in tables[0].rows} == {"ours has none so cheap"}
+    assert [label for label, _ in tables[3].rows] == ["1%", "4.4%", "20%"] * 2
+    for table in tables[3:]:
+        assert {verdict.words for _, verdict in table.rows} == {"ours above"}
+    voxel = tables[3].rows[1][1]
+    assert voxel.ahead is not None
+    assert voxel.ahead.mean == pytest.approx(7)
+    assert make_verdict_tables(Results(r for r in make_grid() if r.method != "gsmerge")) == []
+
+
+@pytest.mark.parametrize(("count", "factor"), [(2, 12.706), (3, 4.303), (5, 2.776), (11, 2.228), (31, 2.042)])
+def test_t_factors_are_those_of_the_tables(count: int, factor: float) -> None:
+    values = [0.0, 1.0] + [0.5] * (count - 2)
+    half = mean_interval(values).high - 0.5
+    assert half * math.sqrt(count) / np.std(values, ddof=1) == pytest.approx(factor, abs=5e-4)
+
+
+def test_mean_interval() -> None:
+    actual = mean_interval([20.0, 22.0, 27.0])
+    half = 4.302653 * np.std([20, 22, 27], ddof=1) / math.sqrt(3)
+    assert (actual.mean, actual.count) == (23, 3)
+    assert actual.low == pytest.approx(23 - half, abs=1e-5)
+    assert actual.high == pytest.approx(23 + half, abs=1e-5)
+
+
+def test_one_scene_has_a_mean_and_no_width() -> None:
+    actual = mean_interval([21.5])
+    assert (actual.mean, actual.low, actual.high, actual.count) == (21.5, 21.5, 21.5, 1)
+    with pytest.raises(ValueError, match="at least one value"):
+        mean_interval([])
+
+
+def test_pairing_takes_out_what_scenes_differ_by() -> None:
+    ours = {"a": 15.0, "b": 25.0, "c": 31.0, "only ours": 99.0}
+    theirs = {"a": 14.0, "b": 24.1, "c": 29.9}
+    actual = paired_difference(ours, theirs)
+    assert actual.mean == pytest.approx(1.0)
+    assert actual.count == 3
+    assert actual.low > 0.7
+    assert mean_interval(list(ours.values())[:3]).high - mean_interval([15, 25, 31]).low > 10
+
+
+def test_paired_intervals_match_a_slow_twin() -> None:
+    rng = np.random.default_rng(0)
+    values = rng.normal(20, 5, (6, 1)) + rng.normal(0, 0.3, (6, 4))
+    actual = paired_intervals(values)
+    for j, interval in enumerate(actual):
+        own = [values[i, j] - np.mean(values[i]) + np.mean(values) for i in range(6)]
+        half = 2.570582 * np.std(own, ddof=1) / math.sqrt(6) * math.sqrt(4 / 3)
+        assert interval.mean == pytest.approx(np.mean(values[:, j]))
+        assert interval.high - interval.mean == pytest.approx(half)
+        assert interval.mean - interval.low == pytest.approx(half)
+        assert half < 1.0
+
+
+def test_paired_intervals_of_one_scene_or_one_condition() -> None:
+    one_scene = paired_intervals(np.array([[1.0, 2.0]]))
+    assert [(i.low, i.high) for i in one_scene] == [(1, 1), (2, 2)]
+    assert paired_intervals(np.array([[1.0], [3.0]])) == [mean_interval([1.0, 3.0])]
+
+
+def test_front_by_hand() -> None:
+    costs, qualities = [1, 2, 2, 3, 4, 5], [10, 9, 12, 12, 11, 13]
+    assert pareto_front(costs, qualities) == [0, 2, 5]
+    assert pareto_front([], []) == []
+    assert pareto_front([1, 1], [5, 5]) == [0]
+
+
+def test_front_holds_what_nothing_beats() -> None:
+    rng = np.random.default_rng(1)
+    costs, qualities = rng.integers(1, 9, 40).tolist(), rng.integers(1, 9, 40).tolist()
+    front = pareto_front(costs, qualities)
+
+    def beaten(i: int) -> bool:
+        better = [(costs[j] <= costs[i] and qualities[j] > qualities[i]) for j in range(40)]
+        cheaper = [(costs[j] < costs[i] and qualities[j] >= qualities[i]) for j in range(40)]
+        return any(better) or any(cheaper)
+
+    points = {(costs[i], qualities[i]) for i in range(40) if not beaten(i)}
+    assert {(costs[i], qualities[i]) for i in front} == points
+    assert len(front) == len(points)
+
+
+def test_quality_between_beyond_and_below() -> None:
+    costs, qualities = [1.0, 100.0, 10.0], [20.0, 26.0, 22.0]
+    assert quality_at(costs, qualities, math.sqrt(10)) == pytest.approx(21)
+    assert quality_at(costs, qualities, 10) == pytest.approx(22)
+    assert quality_at(costs, qualities, 1e6) == 26
+    assert quality_at(costs, qualities, 0.99) is None
+    assert quality_at([], [], 1.0) is None
+    assert quality_at([1, 10, 100], [20, 25, 22], 100) == 25  # a worse and dearer point does not pull the front down
+
+
+OURS = {scene: [(1.0, 20.0 + i), (10.0, 24.0 + i)] for i, scene in enumerate("abc")}
+
+
+@pytest.mark.parametrize(
+    ("shift", "words"),
+    [((-1.0, -1.1, -0.9), "ours above"), ((1, 1.1, 0.9), "baseline above"), ((-1, 1, 0), "undecided")],
+)
+def test_verdicts(shift: tuple[float, ...], words: str) -> None:
+    points = {scene: (10.0, 24.0 + i + shift[i]) for i, scene in enumerate("abc")}
+    actual = judge("voxel", points, OURS)
+    assert (actual.baseline, actual.words) == ("voxel", words)
+    assert actual.ahead is not None
+    assert actual.ahead.mean == pytest.approx(-np.mean(shift))
+    assert actual.ours == pytest.approx(25)
+    assert actual.quality == pytest.approx(25 + np.mean(shift))
+
+
+def test_verdicts_where_less_is_better() -> None:
+    ours = {"a": [(1.0, 0.3), (10.0, 0.2)]}
+    actual = judge("voxel", {"a": (10.0, 0.25)}, ours, higher=False)
+    assert actual.words == "ours above"
+    assert actual.ours == pytest.approx(0.2)
+    assert actual.quality == pytest.approx(0.25)
+    assert actual.ahead is not None
+    assert actual.ahead.mean == pytest.approx(0.05)
+
+
+def test_nothing_is_said_where_ours_has_nothing_as_cheap() -> None:
+    actual = judge("random", {"a": (0.1, 30.0)}, OURS)
+    assert (actual.ours, actual.ahead, actual.quality) == (None, None, 30)
+    assert actual.words == "ours has none so cheap"
+
+
+def test_one_scene_of_several_says_nothing() -> None:
+    curve = {"a": [(1.0, 20.0)], "b": [(9.0, 20.0)]}
+    actual = judge("voxel", {"a": (2.0, 15.0), "b": (2.0, 15.0)}, curve)
+    assert (actual.words, actual.ahead and actual.ahead.count) == ("undecided", 1)
+    assert judge("voxel", {"a": (2.0, 15.0)}, curve).words == "ours above"
