@@ -1,7 +1,6 @@
-"""The story of a run: scene -> groups -> feature gaussians -> merged -> refined -> decoded -> fitted -> result.
+"""Compact a scene: scene -> groups -> feature gaussians -> merged -> refined -> decoded -> fitted -> result.
 
-:func:`compact` finds facts, makes a plan, builds, and scores. :func:`build` is every arrow by its name, whose first
-half, :func:`merge_views`, encoding and views in batches share.
+:func:`build` goes the whole way; encoding and views in batches share its first half, :func:`merge_views`.
 """
 
 from __future__ import annotations
@@ -50,9 +49,7 @@ def compact(
         progress: Called with (stage, done, stages), and from within longer ones with ("fit: ...", step, steps).
         **settings: Single settings by name, on top of ``options``: ``compact(scene, k=2, superpixels="1%")``.
 
-    Raises:
-        SceneError: If a path is given that cannot be read.
-        ValueError: If a setting is unknown or out of range, or asks for what the scene does not have.
+    Raises SceneError for a path that cannot be read, ValueError for a setting that is unknown or out of range.
     """
     options = (options or CompactOptions()).with_settings(settings)
     with use_threads(options.threads), record_run(progress):
@@ -66,15 +63,14 @@ def compact(
         best = search.best
         fixed = prepared.with_cameras(best.fitted.cameras), plan.with_fixed_cameras()
         levels = [build_scored(method, *fixed, count) for count in level_counts(len(best.gaussians), plan)]
-        result = make_result(best, levels, prepared, plan, search.facts())
-    return result.to(given.gaussians.device)
+        return make_result(best, levels, prepared, plan, search.facts()).to(given.gaussians.device)
 
 
+@record_part()
 def build_scored(method: Build, prepared: Prepared, plan: Plan, count: int | None) -> Candidate:
     """Build so many Gaussians, cleaned up if that was asked for, and score them, with a record of their own."""
-    with record_part():
-        fitted = clean_to_count(partial(method, prepared, plan), count, plan.clean, prepared)
-        return score(count, fitted, prepared, plan)
+    fitted = clean_to_count(partial(method, prepared, plan), count, plan.clean, prepared)
+    return score(count, fitted, prepared, plan)
 
 
 def build(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
