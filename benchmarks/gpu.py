@@ -22,11 +22,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import torch
 from gsmerge.gpu.build import DeviceScene
+from gsmerge.runtime.run_log import RunLog
 
 from gsmerge import CompactOptions, read_scene
 from gsmerge.pipeline import begin, build, input_psnr, score, score_input
 from gsmerge.report import CompactReport
-from gsmerge.runtime.run_log import RunLog
 from gsmerge.runtime.threads import available_threads, use_threads
 from gsmerge.stages.prepare import prepare
 from gsmerge.types import PixelScene, UnalignedScene

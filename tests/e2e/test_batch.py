@@ -139,7 +139,7 @@ def test_a_target_that_is_missed_is_told_and_the_result_kept(rooms: Path, tmp_pa
 @pytest.mark.parametrize(
     ("arguments", "code", "said"),
     [
-        (("--fit", "color", "--quality", "30"), 2, 'quality: expected a PSNR as "30dB"'),
+        (("--fit", "none", "--quality", "30"), 2, 'quality: expected a PSNR as "30dB"'),
         (("--method", "voxel", "--budget", "auto"), 2, "method voxel"),
         (("--require-checkpoint", "--checkpoint", "none"), 2, "require_checkpoint"),
         (("--jobs", "many"), 2, "auto"),

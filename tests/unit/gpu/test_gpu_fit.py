@@ -127,14 +127,10 @@ def test_dropout_and_budget(start: Gaussians, photos: Pair, scene: PixelScene) -
 
 
 def test_colors_are_the_kernels(start: Gaussians, photos: Pair) -> None:
-    options = FitOptions(fit="color")
-    (ours, report), (expected, other) = (
-        fit_gaussians(start, photos, options, device=CPU),
-        fit(start, photos, options),
-    )
-    close(ours, expected, 1e-4)
-    assert report is not None
-    assert other is not None
+    ours, report = ON_DEVICE.fit_colors(start.to("cpu"), upload_photos(photos[1], CPU), FitOptions(), 0)
+    expected, other = stage.ON_CPU.fit_colors(start, photos[1], FitOptions(), 0)
+    assert report.accepted
+    close(ours.numpy(), expected, 1e-4)
     assert report.holdout_after == pytest.approx(other.holdout_after, abs=1e-4)
 
 
@@ -325,8 +321,8 @@ def test_gpu_reaches_the_same(scene: PixelScene, start: Gaussians, photos: Pair)
 @gpu
 def test_gpu_step_and_colors_are_the_cpus(start: Gaussians, photos: Pair) -> None:
     cuda = torch.device("cuda")
-    options = FitOptions(fit="color")
-    close(fit_gaussians(start, photos, options, device=cuda)[0], fit(start, photos, options)[0], 0.05)
+    colored, _ = ON_DEVICE.fit_colors(upload_gaussians(start, cuda), upload_photos(photos[1], cuda), FitOptions(), 0)
+    close(colored.numpy(), stage.ON_CPU.fit_colors(start, photos[1], FitOptions(), 0)[0], 0.05)
     masks = [
         visible_mask(upload_gaussians(start, device), upload_photos(photos[1], device), 1 / 255).cpu()
         for device in (cuda, CPU)

@@ -122,15 +122,16 @@ def test_a_missing_file_is_told(tmp_path: Path) -> None:
 
 
 def test_fixed_settings_are_those_of_ours_alone() -> None:
-    grid = Grid(methods=("gsmerge", "random"), budgets=("1%",), fixed=("robust=false", "match=none", "iterations=3"))
+    fixed = ("agreement=false", "match=none", "iterations=3")
+    grid = Grid(methods=("gsmerge", "random"), budgets=("1%",), fixed=fixed)
     combinations, _ = grid_settings(grid)
     assert combinations[1:] == [
-        ("gsmerge", {"budget": "1%", "match": "none", "iterations": 3}),
+        ("gsmerge", {"budget": "1%", "agreement": False, "match": "none", "iterations": 3}),
         ("random", {"budget": "1%"}),
     ]
 
 
-@pytest.mark.parametrize("text", ["robust", "=1", ""])
+@pytest.mark.parametrize("text", ["match", "=1", ""])
 def test_fixed_settings_are_names_and_values(text: str) -> None:
     with pytest.raises(UsageError, match="NAME=VALUE"):
         grid_settings(Grid(fixed=(text,)))

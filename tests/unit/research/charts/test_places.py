@@ -99,7 +99,7 @@ def test_estimates_grow_with_the_work(made_scene: Path) -> None:
     assert estimate(place, settings={"fit": "none"}) < usual < estimate(place, settings={"effort": "best"})
     assert estimate(place, views=2) < usual < estimate(place, lpips=("vgg",))
     assert usual < estimate(place, lpips=("vgg",), lpips_views=1) < estimate(place, lpips=("vgg",))
-    costs = [estimate(place, method=name) for name in ("random", "unmerged-color", "greedy", "unmerged-fit")]
+    costs = [estimate(place, method=name) for name in ("random", "greedy", "unmerged-fit")]
     assert costs == sorted(costs)
 
 
