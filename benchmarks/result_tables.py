@@ -52,7 +52,7 @@ Everything here is measured by `{COMMAND}`, which is resumable; `--only PART` me
 Figures are means over the scenes, of held-out views midway between the input views and over the pixels that the input
 views have seen (the paper's supplement A), unless a section says otherwise. LPIPS is that of VGG, on two views of each
 scene. Seconds are the wall time of the merge alone, without reading, writing and scoring. Intervals are 95 % t
-intervals over the scenes. Settings have their names in Python: `robust False` is `--no-robust`.
+intervals over the scenes. Settings have their names in Python.
 
 Machine: {machine}."""
 
@@ -221,8 +221,7 @@ def _pair_means(pairs: Sequence[tuple[RunRecord, RunRecord]], name: str) -> tupl
 ABLATION = {
     (): "full (K = 1)",
     (("match", "none"),): "without merging across views",
-    (("fit", "color"),): "without the full fit: colours alone, merge chosen by the photos",
-    (("checkpoint", "none"), ("fit", "none")): "without any fit: merge chosen by the photos",
+    (("checkpoint", "none"), ("fit", "none")): "without any fit: the analytic stages alone",
     (("checkpoint", "shipped"), ("fit", "none")): "without any fit: the trained encoder, merger, refiner and heads",
     (("superpixels", "2%"),): "larger superpixels",
     (("superpixels", "8.7%"),): "smaller superpixels",

@@ -50,7 +50,6 @@ class Part:
     figures: tuple[str, ...] = ()
 
 
-PLAIN = ("--fixed", "robust=false", "--fixed", "checkpoint=none")
 GRID = ("--segmentations", "grid")
 SIZES = ("--budgets", "0.5%,1%,4.4%,20%", "--proxy-views", "1")
 VIEWS = ("--views", "3,6,9,12", "--k", "1,2,4", *NO_PROXIES)
@@ -61,9 +60,8 @@ PARTS = (
         (
             ("--methods", f"gsmerge,{FAST_BASELINES}", *SIZES),
             ("--budgets", "4.4%", "--efforts", "fast,best", *NO_PROXIES),
-            ("--budgets", "4.4%", "--fit", "color", *NO_PROXIES),
             ("--budgets", "0.5%,4.4%,20%", "--fit", "none", "--fixed", "checkpoint=shipped", *NO_PROXIES),
-            ("--budgets", "0.5%,4.4%,20%", "--fit", "none", *PLAIN, *NO_PROXIES),
+            ("--budgets", "0.5%,4.4%,20%", "--fit", "none", "--fixed", "checkpoint=none", *NO_PROXIES),
             ("--superpixels", "0.5%,1%,2%,4.4%,20%", "--efforts", "draft", *NO_PROXIES),
             ("--superpixels", "4.4%,20%", "--fit", "none", "--efforts", "draft", *GRID, *NO_PROXIES),
             ("--methods", "unmerged-fit", "--efforts", "fast", *NO_PROXIES),
@@ -77,7 +75,6 @@ PARTS = (
         "plain",
         (
             ("--matches", "overlap,none", *NO_PROXIES),
-            ("--fit", "color", *NO_PROXIES),
             ("--fit", "none", "--fixed", "checkpoint=none", *NO_PROXIES),
             ("--fit", "none", "--fixed", "checkpoint=shipped", *NO_PROXIES),
             ("--superpixels", "2%,8.7%", *NO_PROXIES),

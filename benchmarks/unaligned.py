@@ -1,7 +1,7 @@
 """Scenes in no order of pixels against the plain export: visible PSNR of held-out views, and the contribution pass.
 
     python benchmarks/unaligned.py eval                    # defaults
-    python benchmarks/unaligned.py carton,flower --set fit=color
+    python benchmarks/unaligned.py carton,flower --set fit=none
     python benchmarks/unaligned.py fox --pass-only         # seconds of processor time, and over those of one rendering
 
 ``loose`` are the plain export's Gaussians without their order (goal: at most 0.2 dB below it), ``anysplat`` voxels

@@ -297,7 +297,7 @@ def compacted(scene: PixelScene, **settings: Any) -> CompactResult:
 
 
 def plain(scene: PixelScene, **settings: Any) -> Gaussians:
-    """The merge alone: no choice by photos, no networks, no fit."""
+    """The merge alone: no networks, no fit."""
     return compacted(scene, **{"fit": "none", "checkpoint": "none", **settings}).gaussians
 
 
@@ -377,12 +377,10 @@ def make_features(
         masses=opacity * scales.prod(1) * (2 * math.pi) ** 1.5,
         extinctions=-np.log1p(-opacity) * np.sort(scales, 1)[:, 1:].prod(1),
         gains=np.ones(g, np.float32),
-        spreads=np.ones(g, np.float32),
         sh0=(full(colors, g, 3)[:, None] - 0.5) / SH_C0,
         shN=np.zeros((g, (degree + 1) ** 2 - 1, 3), np.float32),
         footprints=scales.mean(1),
         views=np.arange(g) if views is None else np.asarray(views),
-        backing=np.zeros(g, bool),
         starts=np.arange(g + 1),
         members=np.arange(g),
         latents=np.zeros((g, 0), np.float32),

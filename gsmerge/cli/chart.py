@@ -40,7 +40,7 @@ def _list(name: str, help: str, wording: str) -> Parameter:
         _list("budgets", "Gaussians in the result, such as 0.5%,2%,40000,auto.", "as superpixels and K say"),
         _list("superpixels", "Superpixels per view, such as 3000,4.4%, next to the budgets.", "4.4%"),
         _list("segmentations", "Superpixel methods.", "rdseg"),
-        _list("fit", "What is fitted: full, color, none.", "full"),
+        _list("fit", "What is fitted: full, none.", "full"),
         _list("efforts", "Amount of work: fast, default, best.", "default"),
         _list("matches", "Merging across views: overlap, aabb, none.", "overlap"),
         _list("views", "Numbers of input views, evenly spread; all for all.", "all"),

@@ -190,7 +190,6 @@ def test_defaults_in_help_are_the_library_s() -> None:
         "segmentation",
         "method",
         "effort",
-        "robust",
         "match",
         "fit",
         "fit_steps",
@@ -201,10 +200,8 @@ def test_defaults_in_help_are_the_library_s() -> None:
     known |= {"levels", "device", "checkpoint", "geometry", "k_low", "k_high", "k_rule", "min_opacity"}
     known |= {"neighbors", "overlap", "iou", "similarity", "max_color"}
     assert set(in_help) == known
-    assert library["robust"] is None
     assert library["fit_steps"] is None
     worded = {
-        "robust": "unless --fit full or a draft",
         "fit_steps": "by effort",
         "match": "overlap, none for a draft",
         "min_opacity": "1/255",
@@ -229,7 +226,7 @@ def test_every_option_is_a_field_of_the_api() -> None:
     own = {"output", "overwrite", "report", "json", "quiet", "dry-run", "debug", "cameras", "images", "opacity"}
     own |= {"exporter", "quats", "order", "scene-scale", "max-side", "no-normals", "spz-version"}
     own |= {"no-viewer-cameras", "save-cameras"}
-    names = {option.removeprefix("--") for option in options(COMMANDS["compact"])} - own - {"no-robust"}
+    names = {option.removeprefix("--") for option in options(COMMANDS["compact"])} - own
     assert {name.replace("-", "_") for name in names} - fields == set()
 
 

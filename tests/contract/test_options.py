@@ -30,8 +30,8 @@ COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[
 SETTINGS = gsmerge.CompactOptions().to_dict()
 # Defaults that help describes, because they depend on other settings or on the machine
 WORDED = {
-    "robust": "unless --fit full or a draft", "fit_steps": "by effort", "match": "overlap, none for a draft",
-    "threads": "all processors", "min_opacity": "1/255",
+    "fit_steps": "by effort", "match": "overlap, none for a draft", "threads": "all processors",
+    "min_opacity": "1/255",
 }  # fmt: skip
 
 

@@ -139,6 +139,7 @@ def test_a_target_that_is_missed_is_told_and_the_result_kept(rooms: Path, tmp_pa
 @pytest.mark.parametrize(
     ("arguments", "code", "said"),
     [
+        (("--fit", "none", "--quality", "30"), 2, 'quality: expected a PSNR as "30dB"'),
         (("--method", "voxel", "--budget", "auto"), 2, "method voxel"),
         (("--jobs", "many"), 2, "auto"),
         (("--max-memory", "lots"), 2, "--max-memory: expected a size such as 8GB"),

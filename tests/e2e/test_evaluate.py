@@ -15,7 +15,7 @@ from .conftest import Run
 
 @pytest.fixture
 def small(scene_copy: Path, run: Run) -> Path:
-    assert run("compact", scene_copy, "-o", scene_copy / "small.ply", "--fit", "color", "-q").code == 0
+    assert run("compact", scene_copy, "-o", scene_copy / "small.ply", "--effort", "draft", "-q").code == 0
     return scene_copy / "small.ply"
 
 

@@ -127,12 +127,12 @@ def test_quiet_says_nothing(state: Path, walks: list[Path], run: Run) -> None:
 
 def test_settings_are_those_of_the_state(walks: list[Path], tmp_path: Path, run: Run) -> None:
     state = tmp_path / "state.gsm"
-    said = (*SMALL, "--fit", "none", "--tolerance", 0, "--max-k", 2, "--replay", 2, "--seed", 5)
+    said = (*SMALL, "--no-fit-colors", "--tolerance", 0, "--max-k", 2, "--replay", 2, "--seed", 5)
     assert run("extend", state, walks[0], *said).code == 0
     first = load_state(state).about["options"]
     document = json.loads(run("extend", state, walks[1], "--json").out)["batches"][0]
     assert document["num_covered"] == 0
-    same = {"superpixels": 60, "fit": "none", "tolerance": 0.0, "max_k": 2, "replay": 2, "seed": 5}
+    same = {"superpixels": 60, "fit_colors": False, "tolerance": 0.0, "max_k": 2, "replay": 2, "seed": 5}
     assert same.items() <= first.items()
     assert same.items() <= document["options"].items()
     assert len(load_state(state).replay) <= 2
@@ -147,7 +147,7 @@ def test_an_encoded_scene_is_extended(encoded: Path, walks: list[Path], tmp_path
     assert outcome.code == 0, outcome.err
     assert "batch 2, 4 views" in outcome.out
     assert len(load_state(state).replay) == 4
-    assert run("decode", state, "--fit", "color", "-o", tmp_path / "a.ply").code == 0
+    assert run("decode", state, "--fit-steps", 4, "-o", tmp_path / "a.ply").code == 0
 
 
 def test_cameras_of_one_batch(state: Path, walks: list[Path], tmp_path: Path, run: Run) -> None:
@@ -180,7 +180,7 @@ def test_every_number_that_can_be_decoded(states: list[Path], tmp_path: Path, ru
 
 def test_fits_to_the_photos_that_were_kept(states: list[Path], tmp_path: Path, run: Run) -> None:
     said = ("--fit-steps", 4)
-    for fit in ((), ("--fit", "full"), ("--fit", "color")):
+    for fit in ((), ("--fit", "full")):
         out = tmp_path / f"{len(listing(tmp_path))}.ply"
         outcome = run("decode", states[1], *fit, *said, "-o", out, "--json")
         assert (outcome.code, outcome.err) == (0, "")
@@ -226,10 +226,9 @@ def test_wrong_decoding_is_one_line(
     assert listing(tmp_path) == {}
 
 
-@pytest.mark.parametrize("fit", ["full"])
-def test_an_encoded_scene_has_no_photos(fit: str, encoded: Path, tmp_path: Path, run: Run) -> None:
-    outcome = run("decode", encoded, "--fit", fit, "-o", tmp_path / "a.ply")
-    assert_refused(outcome, 2, f"fit {fit}: expected a state with photos, found none")
+def test_an_encoded_scene_has_no_photos(encoded: Path, tmp_path: Path, run: Run) -> None:
+    outcome = run("decode", encoded, "--fit", "full", "-o", tmp_path / "a.ply")
+    assert_refused(outcome, 2, "fit full: expected a state with photos, found none")
     assert listing(tmp_path) == {}
     assert run("decode", encoded, "-o", tmp_path / "a.ply").code == 0
 

@@ -91,7 +91,7 @@ def random_groups(seed: int) -> tuple[FeatureGaussians, Members]:
     members = Members(*(np.ascontiguousarray(c, np.float32) for c in (*columns, *harmonics, np.full(n, 0.01))))
     features = make_features(rng.normal(size=(g, 3)) * 0.01)
     starts = np.concatenate([[0], np.cumsum(sizes)])
-    return replace(features, starts=starts, members=np.arange(n), backing=(rng.random(g) < 0.2)), members
+    return replace(features, starts=starts, members=np.arange(n)), members
 
 
 @FEW
@@ -104,5 +104,4 @@ def test_splits_are_exact_and_monotone(seed: int, one: int, other: int, max_chil
     assert many.sum() == min(len(features) + max(one, other), most.sum())
     assert (few <= many).all()
     assert (many <= most).all()
-    assert (few[features.backing] == 1).all()
     assert (few >= 1).all()

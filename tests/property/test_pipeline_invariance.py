@@ -47,8 +47,8 @@ def test_map_coordinates(east: float, north: float) -> None:
 
 
 CASES = [
-    {}, {"match": "aabb", "fit": "color"},
-    {"segmentation": "bass-st", "fit": "none"}, {"robust": True, "dropout": 0.2, "k": 2, "seed": 5},
+    {}, {"fit": "none", "k": 4, "seed": 3}, {"match": "aabb", "effort": "draft"},
+    {"segmentation": "bass-st", "fit": "none"}, {"dropout": 0.2, "k": 2, "seed": 5},
 ]  # fmt: skip
 
 

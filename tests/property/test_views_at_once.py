@@ -11,6 +11,9 @@ import scenes
 
 from gsmerge import PixelScene, compact
 from gsmerge.moments import scene_members
+from gsmerge.render.photos import scene_photos
+from gsmerge.stages.fit import FitOptions
+from gsmerge.stages.fit.color import draw, fit_colors
 
 
 @pytest.fixture(scope="module")
@@ -21,8 +24,7 @@ def scene() -> PixelScene:
 @pytest.mark.parametrize(
     "settings",
     [
-        {"fit": "none", "checkpoint": "none", "robust": True},
-        {"fit": "color"},
+        {"fit": "none", "checkpoint": "none"},
         {"budget": "8%", "fit_steps": 30, "effort": "best"},  # grows
     ],
     ids=str,
@@ -36,6 +38,17 @@ def test_one_view_at_a_time_or_all(
         actual.append(scenes.compacted(scene, **settings).gaussians)
     assert scenes.identical(actual[0], actual[1])
     assert scenes.identical(actual[0], actual[2])
+
+
+def test_colours_are_fitted_one_view_at_a_time_or_all(scene: PixelScene, monkeypatch: pytest.MonkeyPatch) -> None:
+    gaussians, photos = scenes.plain(scene), scene_photos(scene, 2)
+    drawn, actual = draw(gaussians, photos), []
+    for at_once in (1, 2, 100):
+        monkeypatch.setattr("gsmerge.runtime.threads.AT_ONCE", at_once)
+        actual.append(fit_colors(gaussians, drawn, photos, FitOptions())[0].sh0)
+    assert not np.array_equal(actual[0], gaussians.sh0)
+    assert np.array_equal(actual[0], actual[1])
+    assert np.array_equal(actual[0], actual[2])
 
 
 def test_higher_harmonics_are_not_copied() -> None:

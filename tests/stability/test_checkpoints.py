@@ -25,7 +25,7 @@ PLAIN = {"fit": "none", "match": "none", "superpixels": 100}
     [
         {},
         {"k": 2},
-        {"k": 4, "robust": True},
+        {"k": 4},
         {"match": "aabb", "similarity": -1.0, "max_color": 2.0},
         {"fit": "full", "fit_steps": 4},
         {"budget": 150},
@@ -35,7 +35,7 @@ PLAIN = {"fit": "none", "match": "none", "superpixels": 100}
 def test_untrained_networks_are_the_analytic_pipeline(tmp_path: Path, settings: dict[str, object]) -> None:
     scene = make_scene(room(), arc(3))
     path = written(tmp_path / "a.safetensors", Networks())
-    chosen = {"superpixels": 80, "fit": "color", **settings}
+    chosen = {"superpixels": 80, "fit": "none", **settings}
     plain, networks = (
         gsmerge.compact(scene, **chosen, checkpoint="none"),
         gsmerge.compact(scene, **chosen, checkpoint=str(path)),

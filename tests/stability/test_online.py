@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -86,23 +86,22 @@ def test_batches_of_any_size(size: int, made: list[PixelScene], whole: list[Comp
     The fewer the groups that batches leave, the more of these are divided: equal numbers are what compares.
     """
     batched = [fed(parts_of(scene, size)) for scene in made]
-    for wish in FULL:
-        difference = []
-        for scene, one, other in zip(made, whole, batched, strict=True):
-            assert len(other) <= 1.1 * len(one)
-            count = int(1.5 * len(one))
-            actual = [scenes.psnr_of(c.decode(budget=count, **wish), scene) for c in (one, other)]
-            difference.append(actual[1] - actual[0])
-        assert np.mean(difference) > -0.3, wish
+    difference = []
+    for scene, one, other in zip(made, whole, batched, strict=True):
+        assert len(other) <= 1.1 * len(one)
+        count = int(1.5 * len(one))
+        actual = [scenes.psnr_of(c.decode(budget=count, **FULL), scene) for c in (one, other)]
+        difference.append(actual[1] - actual[0])
+    assert np.mean(difference) > -0.3
 
 
 def test_as_they_come_batches_need_no_more_gaussians(
-    made: list[PixelScene], whole: list[Compactor], forward: list[Compactor]
+    made: list[PixelScene], whole: list[Compactor], forward: list[Compactor], floor: Callable[..., None]
 ) -> None:
-    """Decoded at K = 1, pairs of views give fewer Gaussians than all at once, and at most 0.6 dB less."""
+    """Decoded at K = 1, pairs of views give fewer Gaussians than all at once, and are hardly worse."""
     assert all(0.8 * len(one) < len(two) < len(one) for one, two in zip(whole, forward, strict=True))
-    difference = psnrs(forward, made, fit="color") - psnrs(whole, made, fit="color")
-    assert difference.mean() > -0.6
+    difference = psnrs(forward, made, **FULL) - psnrs(whole, made, **FULL)
+    floor(difference.mean())
 
 
 # 53: the file is versioned

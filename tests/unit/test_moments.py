@@ -26,7 +26,7 @@ def copies(of: Members, count: int) -> Members:
 def merged(of: Members) -> Gaussians:
     """All members as one Gaussian."""
     m = pool_members(of, np.array([0, len(of.means)]), np.arange(len(of.means)))
-    return to_gaussians(m.covars, m.extinctions, np.ones(1), m.means, m.sh)
+    return to_gaussians(m.covars, m.extinctions, m.means, m.sh)
 
 
 def own_covariance(of: Members, row: int = 0) -> np.ndarray:
@@ -106,13 +106,6 @@ def test_uniform_weights_without_opacity() -> None:
     assert result.opacities.tolist() == [0]
 
 
-def test_spread_widens_but_does_not_thin() -> None:
-    m = pool_members(members(5), np.array([0, 5]), np.arange(5))
-    one, two = (to_gaussians(m.covars, m.extinctions, np.array([s]), m.means, m.sh) for s in (1.0, 2.0))
-    np.testing.assert_allclose(two.scales, 2 * one.scales)
-    assert np.array_equal(two.opacities, one.opacities)
-
-
 def test_many_groups_match_one_by_one() -> None:
     """More groups than one task takes."""
     of = members(9000)
@@ -133,7 +126,7 @@ def test_paper_rule_by_hand() -> None:
     np.testing.assert_allclose(m.means[0], [0.5, 2, 0], atol=1e-6)
     floor = 0.005**2
     np.testing.assert_allclose(m.covars[0], [[0.75 + floor, -1, 0], [-1, 4 + floor, 0], [0, 0, floor]], atol=1e-6)
-    made = to_gaussians(m.covars, m.extinctions, np.ones(1), m.means, m.sh)
+    made = to_gaussians(m.covars, m.extinctions, m.means, m.sh)
     assert float(made.opacities[0]) == pytest.approx(0.8 / 3, rel=1e-5)
 
 
@@ -142,7 +135,7 @@ def test_paper_rule_keeps_an_opacity_that_all_have(opacity: float) -> None:
     """The own rule makes layers of them."""
     of, groups = members(30, opacity=opacity), (np.array([0, 10, 11, 30]), np.arange(30))
     m = pool_members(of, *groups, "paper")
-    made = to_gaussians(m.covars, m.extinctions, np.ones(3), m.means, m.sh)
+    made = to_gaussians(m.covars, m.extinctions, m.means, m.sh)
     np.testing.assert_allclose(made.opacities, opacity, rtol=1e-4)
 
 

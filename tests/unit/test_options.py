@@ -35,15 +35,11 @@ def test_a_draft_merges_no_views_and_takes_few_steps() -> None:
 
 
 def test_settings_reach_their_stage() -> None:
-    options = CompactOptions().with_settings(
-        {"k": 2, "superpixels": "1%", "match": "aabb", "fit": "none", "backing": 0.01, "seed": 3}
-    )
+    options = CompactOptions().with_settings({"k": 2, "superpixels": "1%", "match": "aabb", "fit": "none", "seed": 3})
     assert options.decode.k == 2
     assert options.segment.share == 0.01
     assert options.match.match == "aabb"
-    assert options.robust.robust is False
     assert options.fit.fit == "none"
-    assert options.backing.backing == 0.01
     assert (options.seed, options.threads) == (3, None)
     assert options.encode == CompactOptions().encode
 
@@ -81,8 +77,7 @@ def test_every_setting_is_documented(stage: str) -> None:
         {"segmentation": "voronoi"}, {"effort": "slow"}, {"match": "iou"}, {"rule": "mean"}, {"fit": "everything"},
         {"cluster_size": 0}, {"neighbors": 0}, {"fit_steps": 0}, {"time_budget": 0.0}, {"holdout": 2.0},
         {"dropout": 1.0}, {"dropout": -0.1}, {"holdout": 0.0}, {"iterations": 0}, {"prior_weight": -1.0},
-        {"min_opacity": -1.0}, {"rounds": -1}, {"tolerance": 0.0}, {"overlap": float("nan")}, {"boost": 0.0},
-        {"widen": 0.0}, {"backing": 1.5}, {"push": -0.1}, {"backing_spread": 0.0}, {"compactness": 2.0},
+        {"min_opacity": -1.0}, {"overlap": float("nan")}, {"compactness": 2.0},
     ],
     ids=str,
 )  # fmt: skip

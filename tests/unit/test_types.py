@@ -35,8 +35,8 @@ def features(sizes: list[int]) -> FeatureGaussians:
     column = np.arange(g, dtype=np.float32)
     return FeatureGaussians(
         means=np.stack([column] * 3, 1), covars=column[:, None, None] * np.ones((3, 3), np.float32), weights=column,
-        masses=column, extinctions=column, gains=column, spreads=column, sh0=np.zeros((g, 1, 3), np.float32),
-        shN=np.zeros((g, 0, 3), np.float32), footprints=column, views=np.arange(g), backing=np.zeros(g, bool),
+        masses=column, extinctions=column, gains=column, sh0=np.zeros((g, 1, 3), np.float32),
+        shN=np.zeros((g, 0, 3), np.float32), footprints=column, views=np.arange(g),
         starts=starts, members=np.arange(starts[-1]), latents=np.zeros((g, 0), np.float32),
     )  # fmt: skip
 
@@ -249,7 +249,7 @@ def test_features_concat_shifts_the_starts() -> None:
     assert both.weights.tolist() == [0, 1, 0]
 
 
-@pytest.mark.parametrize("name", ["weights", "masses", "extinctions", "gains", "spreads", "footprints", "starts"])
+@pytest.mark.parametrize("name", ["weights", "masses", "extinctions", "gains", "footprints", "starts"])
 def test_wrong_features_are_refused(name: str) -> None:
     with pytest.raises(ValueError, match=f"{name}: expected shape"):
         replace(features([1, 2]), **{name: np.zeros(7)})

@@ -19,7 +19,7 @@ from gsmerge.pipeline import CompactResult
 from gsmerge.stages.segment import grid_labels
 
 COUNT = 200
-KEEPERS = ("unmerged", "unmerged-color", "unmerged-fit")
+KEEPERS = ("unmerged", "unmerged-fit")
 PRUNERS = ("opacity", "contribution", "random")
 EXACT = (*PRUNERS, "moment-matching", "blocks", "greedy")
 OWN = sorted(set(BASELINES) - {"splat-transform"})  # which need no program
@@ -109,13 +109,12 @@ def test_rows_that_are_not_there_stay_out(scene: PixelScene, method: str) -> Non
     assert len(result.gaussians) <= int(valid.sum())
 
 
-@pytest.mark.parametrize("method", ["unmerged-color", "unmerged-fit"])
-def test_photos_are_asked_for(scene: PixelScene, method: str) -> None:
-    with pytest.raises(UsageError, match=f"method {method}: expected photos, found none"):
-        made(replace(scene, images=None), method)
+def test_photos_are_asked_for(scene: PixelScene) -> None:
+    with pytest.raises(UsageError, match="method unmerged-fit: expected photos, found none"):
+        made(replace(scene, images=None), "unmerged-fit")
 
 
-@pytest.mark.parametrize("method", sorted(set(OWN) - {"unmerged-color", "unmerged-fit"}))
+@pytest.mark.parametrize("method", sorted(set(OWN) - {"unmerged-fit"}))
 def test_the_others_do_without_photos(scene: PixelScene, method: str) -> None:
     result = made(replace(scene, images=None), method)
     assert result.report.psnr_after is None
@@ -149,7 +148,7 @@ def test_only_its_stages_are_timed(scene: PixelScene) -> None:
     assert set(made(scene, "unmerged").report.seconds) == around
     assert set(made(scene, "opacity").report.seconds) == around | {"reduce"}
     assert set(made(scene, "moment-matching").report.seconds) == around | {"segment", "encode", "decode"}
-    assert set(made(scene, "unmerged-color").report.seconds) == around | {"fit"}
+    assert set(made(scene, "unmerged-fit").report.seconds) == around | {"fit"}
 
 
 def test_unmerged_is_the_input(scene: PixelScene) -> None:
@@ -158,19 +157,9 @@ def test_unmerged_is_the_input(scene: PixelScene) -> None:
     assert actual.report.psnr_after == pytest.approx(actual.report.psnr_before, abs=1e-3)
 
 
-def test_colors_alone_are_solved(scene: PixelScene) -> None:
-    plain, solved = made(scene, "unmerged"), made(scene, "unmerged-color")
-    assert solved.report.choices["fit"]["method"] == "color"
-    for name in ("means", "quats", "scales", "opacities"):
-        np.testing.assert_array_equal(getattr(plain.gaussians, name), getattr(solved.gaussians, name), name)
-    assert solved.report.psnr_after is not None
-    assert plain.report.psnr_after is not None
-    assert solved.report.psnr_after > plain.report.psnr_after + 1
-
-
 def test_the_same_fit_for_the_input(scene: PixelScene) -> None:
     """By steps, or by time; whatever ``fit`` says."""
-    actual = made(scene, "unmerged-fit", fit_steps=20, fit="color")
+    actual = made(scene, "unmerged-fit", fit_steps=20, fit="none")
     assert (actual.report.choices["fit"]["method"], actual.report.choices["fit"]["steps"]) == ("full", 20)
     assert "method unmerged-fit does not use fit, budget" in actual.report.notes
     limited = made(scene, "unmerged-fit", fit_steps=20, time_budget=1e-3).report.choices["fit"]

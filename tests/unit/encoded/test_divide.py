@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import scenes
@@ -20,9 +18,7 @@ MOST = 8
 
 @pytest.fixture(scope="module")
 def scene() -> Made:
-    actual = made()
-    backing = np.arange(len(actual.features)) % 7 == 3
-    return replace(actual, features=replace(actual.features, backing=backing))
+    return made()
 
 
 @pytest.fixture(scope="module")
@@ -59,11 +55,10 @@ def test_deals_are_those_of_a_budget(extra: int, scene: Made, division: Division
 
 
 def test_groups_that_cannot_be_divided_are_whole(scene: Made, division: Division) -> None:
-    single = np.flatnonzero((np.diff(scene.features.starts) == 1) & ~scene.features.backing)
+    single = np.flatnonzero(np.diff(scene.features.starts) == 1)
     assert len(single) > 3
     assert set(single) <= set(division.uniform.tolist())
     assert not division.splits[division.uniform].any()
-    assert not division.splits[scene.features.backing].any()
     assert len(division.children) == 2 * len(division.slots) + len(division.uniform)
 
 
@@ -79,10 +74,3 @@ def test_no_groups(scene: Made) -> None:
     division = divide_all(none, scene.members, MOST, "depth")
     rows, parents = pick_children(division, np.zeros(0, np.int64))
     assert (len(rows), len(parents), len(division.children)) == (0, 0, 0)
-
-
-def test_a_backing_layer_alone(scene: Made) -> None:
-    features = replace(scene.features, backing=np.ones(len(scene.features), dtype=bool))
-    division = divide_all(features, scene.members, MOST, "depth")
-    rows, _ = pick_children(division, np.full(len(features), 4))
-    np.testing.assert_array_equal(rows, np.arange(len(features)))

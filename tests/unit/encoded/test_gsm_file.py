@@ -33,7 +33,7 @@ def path(encoded: Encoded, tmp_path: Path) -> Path:
 
 
 ARRAYS = (
-    *(f"features.{name}" for name in ("means", "covars", "masses", "latents", "views", "backing", "sh0", "shN")),
+    *(f"features.{name}" for name in ("means", "covars", "masses", "latents", "views", "sh0", "shN")),
     *(
         "division.splits",
         "division.slots",

@@ -164,17 +164,6 @@ def test_many_children_are_corrected_in_halves(scene: Made) -> None:
     assert not np.array_equal(together.means, children.means)
 
 
-def test_the_backing_layer_stays_as_it_is(scene: Made) -> None:
-    context, options = scene.networks(noisy()), DecodeOptions(k=6, min_opacity=0)
-    encoded = encode_features(scene.features, context)
-    behind = replace(scene.features, backing=np.ones(len(encoded), bool))
-    encoded = encode_features(behind, context)
-    assert np.array_equal(encoded.means, behind.means)
-    refined = refine(encoded, context)
-    assert_close(refined, encoded)
-    assert_close(decode(refined, scene.members, options, networks=context), feature_to_gaussians(refined))
-
-
 def test_refiner_reads_the_neighbours(scene: Made) -> None:
     context = scene.networks(noisy())
     encoded = encode_features(scene.features, context)
@@ -192,10 +181,6 @@ def test_nearest_by_hand(scene: Made) -> None:
     line = np.array([0, 1, 3, 7, 7.5, 9], np.float32)
     features = replace(features, means=np.stack([line, line * 0, line * 0], 1))
     assert find_neighbors(features, 2).tolist() == [[1, 2], [0, 2], [1, 0], [4, 5], [3, 5], [4, 3]]
-    behind = np.array([False, False, True, True, False, False])
-    actual = find_neighbors(replace(features, backing=behind), 2)
-    assert actual[2].tolist() == [3, -1]
-    assert actual[0].tolist() == [1, 4]
     piled = find_neighbors(replace(features, means=np.zeros((6, 3), np.float32)), 3)
     assert (piled != np.arange(6)[:, None]).all()
     assert find_neighbors(take(features, np.array([0])), 2).tolist() == [[-1, -1]]
@@ -319,13 +304,11 @@ def test_absolute_heads_know_no_children(scene: Made) -> None:
 
 def test_absolute_heads_leave_alone_what_no_head_looks_at(scene: Made) -> None:
     context = scene.networks(noisy(replace(SMALL, outputs="absolute")))
-    backing = np.zeros(len(scene.features), bool)
-    backing[0] = True
-    features = encode_features(replace(scene.features, backing=backing), context)
+    features = encode_features(scene.features, context)
     options = DecodeOptions(k=6, min_opacity=0.0)
     plain, actual = decode(features, scene.members, options), decode(features, scene.members, options, networks=context)
     sizes = np.bincount(parents_of(features, scene, 6), minlength=len(features))
-    whole = np.repeat((sizes > 4) | backing, sizes)
+    whole = np.repeat(sizes > 4, sizes)
     assert whole.any()
     assert_close(actual[whole], plain[whole])
     assert not np.array_equal(actual.means[~whole], plain.means[~whole])

@@ -20,7 +20,7 @@ from gsmerge.stages.fit import FitOptions
 from gsmerge.stages.fit.color import Drawn, draw, fit_colors
 from gsmerge.types import SH_C0
 
-FEW = FitOptions(fit="color", holdout=0.05)
+FEW = FitOptions(holdout=0.05)
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,7 @@ def scene() -> PixelScene:
 @pytest.fixture(scope="module")
 def groups(scene: PixelScene) -> GroupSet:
     """Groups of all views, their colours off by a little."""
-    actual = state_of(fed([scene], fit="none")).groups
+    actual = state_of(fed([scene], fit_colors=False)).groups
     noise = np.random.default_rng(0).normal(0, 0.1 / SH_C0, actual.features.sh0.shape).astype(np.float32)
     sh0 = actual.features.sh0 + noise
     return replace(actual, features=replace(actual.features, sh0=sh0), fitted_sh0=sh0)
@@ -40,7 +40,7 @@ def groups(scene: PixelScene) -> GroupSet:
 @pytest.fixture(scope="module")
 def batch_photos(scene: PixelScene) -> BatchPhotos:
     """Photos, in the state's own frame, with noise of their own."""
-    state = state_of(fed([scene], fit="none"))
+    state = state_of(fed([scene], fit_colors=False))
     assert scene.images is not None
     rng = np.random.default_rng(0)
     images = scene.images + rng.normal(0, 0.15, scene.images.shape).astype(np.float32)
@@ -60,7 +60,7 @@ def rms(one: np.ndarray, other: np.ndarray) -> float:
 
 @pytest.fixture(scope="module")
 def drawn(groups: GroupSet, scene: PixelScene) -> tuple[Gaussians, Photos, Drawn]:
-    gaussians = state_of(fed([scene], fit="none")).frame.leave(feature_to_gaussians(groups.features))
+    gaussians = state_of(fed([scene], fit_colors=False)).frame.leave(feature_to_gaussians(groups.features))
     photos = scene_photos(scene, 2)
     return gaussians, photos, draw(gaussians, photos)
 

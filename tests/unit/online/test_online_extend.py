@@ -41,28 +41,33 @@ def first(pairs: list[PixelScene]) -> OnlineState:
 
 
 def options(**settings: Any) -> CompactOptions:
-    return CompactOptions().with_settings({**FAST, "fit": "color", **settings})
+    return CompactOptions().with_settings({**FAST, "fit": "none", **settings})
 
 
 # the first batch
 
 
 @pytest.mark.parametrize("k", [1, 4])
-@pytest.mark.parametrize("robust", [False, True])
-def test_a_first_batch_is_an_encoded_scene(robust: bool, k: int, scene: PixelScene) -> None:
+def test_a_first_batch_is_an_encoded_scene(k: int, scene: PixelScene) -> None:
     """As many Gaussians, about the same ones: what is solid is told by the moments, in float32."""
-    settings = FAST | {"robust": robust}
-    actual = fed([scene], fit="none", robust=robust).decode(k=k, fit="none")
-    expected = decode_scene(encode_scene(scene, **settings), k=k)
+    actual = fed([scene], fit_colors=False).decode(k=k, fit="none")
+    expected = decode_scene(encode_scene(scene, **FAST), k=k)
     scenes.assert_same_set(actual, expected, atol=5e-3, unit=0.05)
 
 
 def test_a_first_batch_with_networks(scene: PixelScene, tmp_path: Any) -> None:
     checkpoint = str(written(tmp_path / "a.safetensors", noisy()))
     for k in (1, 4):
-        actual = fed([scene], fit="none", checkpoint=checkpoint).decode(k=k, fit="none")
+        actual = fed([scene], fit_colors=False, checkpoint=checkpoint).decode(k=k, fit="none")
         expected = decode_scene(encode_scene(scene, **FAST | {"checkpoint": checkpoint}), k=k)
         scenes.assert_same_set(actual, expected, atol=5e-3, unit=0.05)
+
+
+def test_shipped_networks_compete_in_every_batch(pairs: list[PixelScene]) -> None:
+    """Unless a checkpoint is named."""
+    compactor = Compactor(superpixels="10%")
+    for pair in pairs[:2]:
+        assert sorted(compactor.extend(pair).choices["start_scores"]) == ["analytic", "learned"]
 
 
 def test_a_first_batch_keeps_its_frame_and_views(scene: PixelScene) -> None:
@@ -75,7 +80,7 @@ def test_a_first_batch_keeps_its_frame_and_views(scene: PixelScene) -> None:
 
 
 def test_a_colour_fit_helps(scene: PixelScene) -> None:
-    fitted, plain = (fed(parts_of(scene, 2), fit=fit).decode(fit="none") for fit in ("color", "none"))
+    fitted, plain = (fed(parts_of(scene, 2), fit_colors=fit).decode(fit="none") for fit in (True, False))
     assert scenes.psnr_of(fitted, scene) > scenes.psnr_of(plain, scene)
 
 
@@ -131,7 +136,7 @@ def test_the_same_batch_twice_adds_nothing(scene: PixelScene) -> None:
     assert abs(one - other) < 0.2
 
 
-@pytest.mark.parametrize("settings", [{}, {"robust": True, "k": 2}, {"checkpoint": "auto"}], ids=str)
+@pytest.mark.parametrize("settings", [{}, {"k": 2}, {"checkpoint": "auto"}], ids=str)
 def test_the_threads_do_not_matter(settings: dict[str, Any], pairs: list[PixelScene]) -> None:
     states, actual = [], []
     for threads in (1, 2, 8):
@@ -182,8 +187,8 @@ def test_without_photos(pairs: list[PixelScene]) -> None:
     assert len(compactor) < sum(len(fed([pair])) for pair in bare)
     plain = compactor.decode()
     assert scenes.identical(plain, compactor.decode(fit="none"))
-    with pytest.raises(UsageError, match="fit color: expected a state with photos, found none"):
-        compactor.decode(fit="color")
+    with pytest.raises(UsageError, match="fit full: expected a state with photos, found none"):
+        compactor.decode(fit="full")
 
 
 @pytest.mark.parametrize("bare", [0, 1])
@@ -203,7 +208,7 @@ def test_gaussians_in_no_order(change: Change, pairs: list[PixelScene], floor: C
         compactor = fed(batches)  # type: ignore[arg-type]
         assert compactor.batches[1]["num_covered"] + compactor.batches[1]["num_joined"] > 0
         both = scenes.take_views(room(), range(4))
-        floor(scenes.psnr_of(compactor.decode(fit="color"), both), str(number))
+        floor(scenes.psnr_of(compactor.decode(fit="none"), both), str(number))
 
 
 def test_gaussians_without_photos_in_no_order(pairs: list[PixelScene]) -> None:
@@ -221,7 +226,7 @@ def test_gaussians_without_cameras(first: bool, pairs: list[PixelScene], floor: 
     compactor = fed([bare, pairs[1]] if first else [pairs[1], bare])  # type: ignore[list-item]
     assert compactor.batches[1]["num_covered"] > 0
     assert len(state_of(compactor).replay) == 2
-    floor(scenes.psnr_of(compactor.decode(fit="color"), pairs[1]))
+    floor(scenes.psnr_of(compactor.decode(fit="none"), pairs[1]))
 
 
 def test_what_no_view_sees_is_kept(pairs: list[PixelScene]) -> None:
@@ -277,7 +282,7 @@ def test_an_encoded_scene_is_extended(pairs: list[PixelScene]) -> None:
     assert len(state) > len(encoded)
     assert state.replay.views.tolist() == [2, 3]
     assert [batch["num_views"] for batch in state.about["batches"]] == [2, 2]
-    other, _ = extend(state_of(fed(pairs[:1], fit="none")), pairs[1], options())
+    other, _ = extend(state_of(fed(pairs[:1], fit_colors=False)), pairs[1], options())
     assert abs(len(state) - len(other)) < 0.1 * len(other)
 
 
@@ -317,20 +322,17 @@ def test_every_k_up_to_the_most(pairs: list[PixelScene]) -> None:
 
 
 @pytest.mark.parametrize("rule", ["depth", "paper"])
-@pytest.mark.parametrize(("batches", "decoded"), [("color", "color"), ("none", "none")])
-def test_more_children_show_more(
-    rule: str, batches: str, decoded: str, scene: PixelScene, pairs: list[PixelScene]
-) -> None:
-    """Where the colours are solved for as many as there are, or for none; however often children were pooled."""
-    compactor = fed(pairs, rule=rule, fit=batches)
-    one, two, four = (scenes.psnr_of(compactor.decode(k=k, fit=decoded), scene) for k in (1, 2, 4))
+def test_more_children_show_more(rule: str, scene: PixelScene, pairs: list[PixelScene]) -> None:
+    """However often children were pooled; in the exports' colours, as fitted ones are those of the group."""
+    compactor = fed(pairs, rule=rule, fit_colors=False)
+    one, two, four = (scenes.psnr_of(compactor.decode(k=k, fit="none"), scene) for k in (1, 2, 4))
     assert four > two > one
 
 
 def test_a_full_fit_shows_more(scene: PixelScene, pairs: list[PixelScene]) -> None:
     compactor = fed(pairs)
-    color, full = compactor.decode(fit="color"), compactor.decode(fit="full", fit_steps=30)
-    assert scenes.psnr_of(full, scene) > scenes.psnr_of(color, scene) + 0.5
+    colors, full = compactor.decode(fit="none"), compactor.decode(fit="full", fit_steps=30)
+    assert scenes.psnr_of(full, scene) > scenes.psnr_of(colors, scene) + 0.5
     assert scenes.identical(compactor.decode(fit="full", fit_steps=30), full)
 
 
@@ -342,7 +344,7 @@ def test_a_fit_in_vain_leaves_the_solved_colours(pairs: list[PixelScene], monkey
 
     monkeypatch.setattr(decode_module, "fit", refused)
     compactor = fed(pairs)
-    actual = decode_stored(state_of(compactor), k=1, options=FitOptions(fit="color"))
+    actual = decode_stored(state_of(compactor), k=1, options=FitOptions(fit_steps=4))
     assert actual.fit is not None
     assert not actual.fit.accepted
     assert [note for note in actual.notes if "the fit was not accepted" in note]
@@ -354,7 +356,7 @@ def test_numbers_that_each_batch_is_cut_to(settings: dict[str, Any], pairs: list
     compactor = fed(pairs[:2], **settings)
     own, _ = extend(from_encoded(encode_scene(pairs[0], **FAST | settings)), pairs[1], options(**settings))
     assert abs(len(own) - len(compactor)) < 0.1 * len(own)
-    assert len(decode_stored(own, options=FitOptions(fit="color")).gaussians) >= len(own) - 5
+    assert len(decode_stored(own, options=FitOptions(fit="none")).gaussians) >= len(own) - 5
 
 
 def test_decoding_changes_nothing(pairs: list[PixelScene]) -> None:
@@ -366,9 +368,7 @@ def test_decoding_changes_nothing(pairs: list[PixelScene]) -> None:
 def test_results_are_in_the_world(scene: PixelScene, floor: Callable[..., None]) -> None:
     turn, shift = scenes.random_rotation(0), np.array([30.0, -20.0, 10.0])
     moved = scenes.move(scene, turn, 4.0, shift)
-    compactor = fed(parts_of(moved, 3))
-    for fit in ("none", "color"):
-        floor(scenes.psnr_of(compactor.decode(fit=fit), moved), fit)
+    floor(scenes.psnr_of(fed(parts_of(moved, 3)).decode(fit="none"), moved))
 
 
 # what is refused

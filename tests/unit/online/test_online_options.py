@@ -45,14 +45,15 @@ def test_other_settings_are_checked_too(values: dict[str, Any]) -> None:
 
 def test_colours_are_fitted_unless_told_otherwise() -> None:
     options, online = merge_settings({})
-    assert options.fit.fit == "color"
+    assert options.fit.fit == "none"
     assert online == OnlineOptions()
-    assert merge_settings({"fit": "none"})[0].fit.fit == "none"
+    assert online.fit_colors
+    assert not merge_settings({"fit_colors": False})[1].fit_colors
 
 
 def test_the_state_s_settings_come_before_the_defaults() -> None:
-    said = {"superpixels": "7%", "fit": "none", "tolerance": 0.2, "threads": 3, "of another version": 5}
+    said = {"superpixels": "7%", "fit_colors": False, "tolerance": 0.2, "threads": 3, "of another version": 5}
     state: Any = SimpleNamespace(about={"options": said, "batches": []})
     options, online = merge_settings({"tolerance": 0.3, "seed": 4}, state)
-    assert options.to_dict().items() >= {"superpixels": "7%", "fit": "none", "seed": 4}.items()
-    assert online.tolerance == 0.3
+    assert options.to_dict().items() >= {"superpixels": "7%", "seed": 4}.items()
+    assert (online.tolerance, online.fit_colors) == (0.3, False)

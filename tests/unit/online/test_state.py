@@ -43,10 +43,9 @@ def some() -> Made:
 
 @pytest.fixture(scope="module")
 def uneven(some: Made) -> FeatureGaussians:
-    """Groups with gains and spreads of their own, as the photos leave them."""
-    rng = np.random.default_rng(0)
-    gains, spreads = rng.uniform(0.3, 3.0, (2, len(some.features)))
-    return replace(some.features, gains=gains.astype(np.float32), spreads=spreads.astype(np.float32))
+    """Groups with gains of their own, as the photos leave them."""
+    gains = np.random.default_rng(0).uniform(0.3, 3.0, len(some.features))
+    return replace(some.features, gains=gains.astype(np.float32))
 
 
 @pytest.fixture(scope="module")
@@ -108,9 +107,8 @@ def test_heads_are_in_what_is_baked(some: Made) -> None:
 def test_baked_groups_are_plain(groups: GroupSet, uneven: FeatureGaussians) -> None:
     f = groups.features
     assert bool((f.gains == 1).all())
-    assert bool((f.spreads == 1).all())
     np.testing.assert_array_equal(f.members, np.arange(len(groups.children)))
-    for name in ("weights", "masses", "footprints", "views", "backing"):
+    for name in ("weights", "masses", "footprints", "views"):
         np.testing.assert_array_equal(getattr(f, name), getattr(uneven, name), name)
 
 

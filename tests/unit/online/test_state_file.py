@@ -35,18 +35,11 @@ def path(state: OnlineState, tmp_path: Path) -> Path:
 
 ARRAYS = (
     *(f"features.{name}" for name in ("means", "covars", "weights", "masses", "extinctions", "latents", "footprints")),
-    *(
-        "features.sh0",
-        "features.shN",
-        "features.views",
-        "features.backing",
-        "features.fitted_sh0",
-        "features.color_precision",
-    ),
+    *("features.sh0", "features.shN", "features.views", "features.fitted_sh0", "features.color_precision"),
     *(f"children.{name}" for name in ("means", "quats", "scales", "opacities", "sh0", "shN", "counts")),
     *("kept.means", "cameras.viewmats", "cameras.Ks", "frame.origin", "replay.images", "replay.views"),
 )
-FLOATS = [name for name in ARRAYS if name.split(".")[1] not in ("views", "backing", "counts", "images")]
+FLOATS = [name for name in ARRAYS if name.split(".")[1] not in ("views", "counts", "images")]
 FLOATS = [name for name in FLOATS if name not in ("features.latents", "kept.means")]  # nothing is in those
 DAMAGED: dict[str, Spoil] = {
     "missing": Path.unlink,

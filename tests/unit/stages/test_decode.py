@@ -103,12 +103,6 @@ def test_mixed_k_by_distortion_has_as_many(features: FeatureGaussians, members: 
     np.testing.assert_array_equal(by_distortion, split_counts(features, members, (by_saliency - 1).sum(), 4))
 
 
-def test_mixed_k_of_the_backing_layer_is_one(features: FeatureGaussians, members: Members) -> None:
-    saliency = np.random.default_rng(0).random(len(members.means)).astype(np.float32)
-    behind = replace(features, backing=np.ones(len(features), bool))
-    assert (mixed_counts(behind, members, saliency, DecodeOptions(k="mixed")) == 1).all()
-
-
 @pytest.mark.parametrize(("low", "high"), [(-1, 50), (101, 101), (60, 50), (50, 101), (float("nan"), 50)])
 def test_percentiles_out_of_range_are_refused(low: float, high: float) -> None:
     with pytest.raises(ValueError, match=r"k_low|k_high: expected"):
@@ -131,11 +125,11 @@ def test_single_members_stay_themselves(scene: PixelScene, members: Members) -> 
     assert_alike(decode(features, members, DecodeOptions(k=4)), decode(features, members, DecodeOptions(k=1)))
 
 
-def test_gains_and_spreads_reach_the_children(features: FeatureGaussians, members: Members) -> None:
+def test_gains_reach_the_children(features: FeatureGaussians, members: Members) -> None:
     plain = decode(features, members, DecodeOptions(k=2, min_opacity=0))
-    stronger = replace(features, gains=2 * features.gains, spreads=1.5 * features.spreads)
+    stronger = replace(features, gains=2 * features.gains)
     changed = decode(stronger, members, DecodeOptions(k=2, min_opacity=0))
-    np.testing.assert_allclose(changed.scales, 1.5 * plain.scales, rtol=1e-5)
+    np.testing.assert_array_equal(changed.scales, plain.scales)
     expected = 1 - (1 - plain.opacities.astype(np.float64)) ** 2
     np.testing.assert_allclose(changed.opacities, expected.clip(max=0.999), rtol=1e-4)
 
@@ -145,21 +139,6 @@ def test_merged_features_are_split_again(features: FeatureGaussians, members: Me
     merged = merge(features, Matches(clusters, COUNT))
     children = decode(merged, members, DecodeOptions(k=2, min_opacity=0))
     assert len(children) == 2 * COUNT
-
-
-@pytest.mark.parametrize("k", [1, 2])
-def test_backing_stays_at_one(features: FeatureGaussians, members: Members, k: int) -> None:
-    behind = replace(features, backing=np.ones(len(features), bool), extinctions=2 * features.extinctions)
-    both = FeatureGaussians.concat([features, behind])
-    actual = decode(both, members, DecodeOptions(k=k, min_opacity=0))
-    assert len(actual) == 2 * COUNT * (k + 1)
-    assert_alike(actual[2 * COUNT * k :], feature_to_gaussians(behind))
-
-
-@pytest.mark.parametrize("k", [1, 2])
-def test_only_backing(features: FeatureGaussians, members: Members, k: int) -> None:
-    behind = replace(features, backing=np.ones(len(features), bool))
-    assert len(decode(behind, members, DecodeOptions(k=k))) == 2 * COUNT
 
 
 @pytest.mark.parametrize("k", [1, 2])

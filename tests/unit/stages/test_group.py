@@ -43,14 +43,12 @@ def test_gaussians_follow_the_number_of_superpixels(scene: PixelScene) -> None:
 
 def test_a_fit_begins_with_a_share_of_the_number(scene: PixelScene) -> None:
     whole = segment_scene(prepared_scene(scene, **ADAPTIVE), None)
-    prepared = prepared_scene(scene, **ADAPTIVE, fit="full", robust=True)
+    prepared = prepared_scene(scene, **ADAPTIVE, fit="full")
     limits = prepared.limits
     assert limits.share < 1
     segmentation = segment_scene(prepared, None)
-    assert segmentation.coarse is not None
     assert segmentation.count == pytest.approx(whole.count, rel=0.02)
-    begun = len(segmentation.groups) + len(segmentation.coarse)
-    assert begun < 1.02 * limits.share * segmentation.count
+    assert len(segmentation.groups) < 1.02 * limits.share * segmentation.count
 
 
 def test_what_exceeds_a_limit_is_cut_to_it(scene: PixelScene) -> None:

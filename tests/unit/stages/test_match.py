@@ -91,13 +91,6 @@ def test_one_view_is_left_alone(method: str) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_backing_is_matched_by_itself(method: str) -> None:
-    features = make_features(np.zeros((4, 3)))
-    features = replace(features, backing=np.array([False, True, False, True]))
-    assert sets(features, match=method) == {frozenset([0, 2]), frozenset([1, 3])}
-
-
-@pytest.mark.parametrize("method", METHODS)
 def test_transparent_ones_are_left_alone(method: str) -> None:
     features = make_features(np.zeros((4, 3)), opacities=[0.8, 0.0, 0.8, 0.0])
     assert sets(features, match=method) == {frozenset([0, 2]), frozenset([1]), frozenset([3])}

@@ -40,7 +40,6 @@ def test_two_by_hand() -> None:
     features = replace(
         with_members(features, [2, 1, 3]),
         shN=np.array([0.0, 5.0, 1.0], np.float32)[:, None, None] * np.ones((3, 3), np.float32),
-        spreads=np.array([1.0, 1.0, 1.2], np.float32),
     )
     merged = merge(features, matches(0, 1, 0))
     assert len(merged) == 2
@@ -51,7 +50,6 @@ def test_two_by_hand() -> None:
     assert float(merged.weights[1]) == pytest.approx(0.8)
     assert float(merged.masses[1]) == pytest.approx(float(features.masses[[0, 2]].sum()))
     assert float(merged.extinctions[1]) == pytest.approx(-np.log(0.4) - np.log(0.8), rel=1e-5)
-    assert float(merged.spreads[1]) == pytest.approx(1.2)
     assert merged.views.tolist() == [1, -1]
     assert merged.starts.tolist() == [0, 1, 6]
     assert merged.members.tolist() == [102, 100, 101, 103, 104, 105]
@@ -105,15 +103,8 @@ def test_far_from_the_origin_nothing_cancels() -> None:
     np.testing.assert_allclose(np.diag(merged.covars[0]), [1e-4 + (apart / 2) ** 2, 1e-4, 1e-4], rtol=1e-3)
 
 
-def test_backing_stays_backing() -> None:
-    features = replace(make_features(np.zeros((3, 3))), backing=np.array([False, True, False]))
-    assert merge(features, matches(0, 1, 0)).backing.tolist() == [True, False]
-
-
-def test_merged_backing_is_backing() -> None:
-    features = replace(make_features(np.zeros((5, 3))), backing=np.array([True, False, True, False, True]))
-    merged = merge(features, matches(0, 1, 0, 1, 2))
-    assert merged.backing.tolist() == [True, True, False]
+def test_merged_ones_belong_to_no_view() -> None:
+    merged = merge(make_features(np.zeros((5, 3))), matches(0, 1, 0, 1, 2))
     assert merged.views.tolist() == [4, -1, -1]
 
 

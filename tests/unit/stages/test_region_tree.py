@@ -266,13 +266,6 @@ def test_a_first_step_that_only_pays_with_the_second() -> None:
     assert gains.tolist() == [[5, 5], [4, 0], [2, -np.inf], [-np.inf, -np.inf]]
 
 
-def test_splits_leave_the_backing_alone(features: FeatureGaussians, members: Members) -> None:
-    backing = np.arange(24) % 2 == 0
-    counts = split_counts(replace(features, backing=backing), members, 1000)
-    assert counts.tolist() == [1, 8] * 12
-    assert split_counts(replace(features, backing=np.ones(24, bool)), members, 5).tolist() == [1] * 24
-
-
 def test_splits_of_nothing(members: Members) -> None:
     assert split_counts(scenes.make_features(np.zeros((0, 3))), members, 5).tolist() == []
 
@@ -326,4 +319,4 @@ def test_colours_of_sh_and_of_photos_weigh_the_same() -> None:
         np.zeros((4, 0, 3), np.float32), np.ones(4, np.float32),
     )  # fmt: skip
     one = replace(scenes.make_features(np.zeros((1, 3))), starts=np.array([0, 4]), members=np.arange(4))
-    np.testing.assert_allclose(_child_errors(one, same, np.array([0]), 3), [[0.12, 0, np.nan]], atol=1e-7)
+    np.testing.assert_allclose(_child_errors(one, same, 3), [[0.12, 0, np.nan]], atol=1e-7)

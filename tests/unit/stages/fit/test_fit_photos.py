@@ -48,7 +48,7 @@ def with_large(scene: PixelScene, scale: float, read: list[int] | None = None) -
     ("larger", "settings", "expected"),
     [
         (4, {}, 2), (1.5, {}, 1.5), (1.2, {}, 1), (4, {"effort": "fast"}, 1), (4, {"effort": "best"}, 2),
-        (4, 1), (4, {"fit_steps": 12}, 1), (4, {"photo_scale": 1}, 1), (4, {"photo_scale": 3}, 3),
+        (4, {"fit": "none"}, 1), (4, {"fit_steps": 12}, 1), (4, {"photo_scale": 1}, 1), (4, {"photo_scale": 3}, 3),
         (4, {"photo_scale": 1.5, "effort": "fast"}, 1.5), (1.2, {"photo_scale": 1.1}, 1.1),
     ],
     ids=str,
@@ -63,7 +63,7 @@ def test_scale_is_chosen(scene: PixelScene, larger: float, settings: dict[str, A
     ("larger", "settings", "expected", "reason"),
     [
         (1.5, {"photo_scale": 4}, 1.5, "photo_scale 4 is 1.5: the photos are no larger"),
-        (2, {"photo_scale": 2, "fit": "color"}, 1, "photo_scale 2 is 1: larger photos need the full fit"),
+        (2, {"photo_scale": 2, "fit": "none"}, 1, "photo_scale 2 is 1: larger photos need the full fit"),
         (2, {"photo_scale": 2, "fit_steps": 12}, 1, "photo_scale 2 is 1: larger photos need the full fit"),
     ],
     ids=str,

@@ -12,6 +12,7 @@ import scenes
 from gsmerge import Gaussians
 from gsmerge.render.photos import Photos
 from gsmerge.stages.fit import FitOptions, FitReport, fit, stage
+from gsmerge.stages.fit.color import draw, fit_colors
 from gsmerge.stages.fit.full import fit_full
 from gsmerge.stages.fit.stage import visible_mask
 from gsmerge.types import SH_C0
@@ -42,8 +43,8 @@ def test_stage_falls_back_to_colours(truth: Gaussians, photos: Pair) -> None:
     result, report = fit(start, photos, QUICK, backend=backend)
     assert report is not None
     assert (report.method, report.accepted) == ("color", True)
-    colored, _ = fit(start, photos, replace(QUICK, fit="color"))
-    assert scenes.identical(result, colored)
+    colored, _ = fit_colors(start, draw(start, photos[1]), photos[1], QUICK)
+    assert scenes.identical(result, colored[visible_mask(start, photos[1], QUICK.min_contribution)])
     assert np.array_equal(result.means, start.means)
     assert not np.array_equal(result.sh0, start.sh0)
 
@@ -76,10 +77,8 @@ def test_stage_without_a_fit_only_prunes(truth: Gaussians, photos: Pair) -> None
 def test_stage_prunes_before_it_fits(truth: Gaussians, photos: Pair) -> None:
     opaque = replace(truth, opacities=np.full_like(truth.opacities, 0.98), scales=2 * truth.scales)
     hidden = replace(truth[:3], means=4 * truth.means[:3], scales=0.2 * truth.scales[:3])
-    for method in ("color", "full"):
-        options = replace(QUICK, fit=method)  # type: ignore[arg-type]
-        alone, both = (fit(g, photos, options)[0] for g in (opaque, Gaussians.concat([opaque, hidden])))
-        assert len(both) == len(alone)
+    alone, both = (fit(g, photos, QUICK)[0] for g in (opaque, Gaussians.concat([opaque, hidden])))
+    assert len(both) == len(alone)
 
 
 @pytest.mark.parametrize("method", ["none", "full"])
