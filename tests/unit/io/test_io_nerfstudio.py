@@ -13,7 +13,6 @@ from tiny_scene import FLIP, Tiny, frames_of, rotation, write_colmap_text
 
 from gsmerge.errors import SceneError
 from gsmerge.io import load_scene
-from gsmerge.types import UnalignedScene
 
 SMOOTH = smooth_scene(40, 30)
 TURN, SHIFT, SCALE = rotation(0.4, -1.2, 0.7), np.array([1.5, -2.0, 0.5]), 0.3
@@ -40,7 +39,7 @@ def write_dataparser(folder: Path, **changes: object) -> None:
 
 def assert_moved(folder: Path) -> None:
     loaded = load_scene(folder)
-    assert isinstance(loaded.scene, UnalignedScene)
+    assert not loaded.scene.aligned
     assert NOTE in loaded.notes
     centres = SCALE * (SMOOTH.c2w[:, :3, 3] @ TURN.T + SHIFT)
     assert np.allclose(loaded.scene.cameras.centres, centres)

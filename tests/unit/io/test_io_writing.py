@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import scenes
 
-from gsmerge import Gaussians, PixelScene
+from gsmerge import Gaussians, Scene
 from gsmerge.baselines.splat_transform import find_program
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry import normalize
@@ -41,11 +41,11 @@ needs_program = pytest.mark.skipif(program() is None, reason="needs splat-transf
 
 
 @pytest.fixture(scope="module")
-def scene() -> PixelScene:
+def scene() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(3, 96, 72))
 
 
-def drawn(scene: PixelScene, degree: int) -> Gaussians:
+def drawn(scene: Scene, degree: int) -> Gaussians:
     """Merged Gaussians with random rotations, sizes and harmonics."""
     rng = np.random.default_rng(degree)
     g = scenes.plain(scene, superpixels="10%")
@@ -55,7 +55,7 @@ def drawn(scene: PixelScene, degree: int) -> Gaussians:
     return replace(g, means=g.means.astype(np.float32), quats=quats, scales=scales, shN=shN)
 
 
-def psnr(scene: PixelScene, one: Gaussians, other: Gaussians) -> float:
+def psnr(scene: Scene, one: Gaussians, other: Gaussians) -> float:
     a, b = (scenes.images_of(g, scene.cameras)[0].clip(0, 1) for g in (one, other))
     return float(-10 * np.log10(max(((a - b) ** 2).mean(), 1e-12)))
 
@@ -112,7 +112,7 @@ def read_back(path: Path) -> Gaussians:
 
 
 @pytest.mark.parametrize(("ending", "degree"), FLOORS)
-def test_what_is_read_back_shows_the_same(ending: str, degree: int, scene: PixelScene, tmp_path: Path) -> None:
+def test_what_is_read_back_shows_the_same(ending: str, degree: int, scene: Scene, tmp_path: Path) -> None:
     gaussians, path = drawn(scene, degree), tmp_path / f"a{ending}"
     write_gaussians(path, gaussians)
     actual = read_back(path)
@@ -122,7 +122,7 @@ def test_what_is_read_back_shows_the_same(ending: str, degree: int, scene: Pixel
 
 @needs_program
 @pytest.mark.parametrize(("ending", "degree"), FLOORS)
-def test_splat_transform_reads_the_same(ending: str, degree: int, scene: PixelScene, tmp_path: Path) -> None:
+def test_splat_transform_reads_the_same(ending: str, degree: int, scene: Scene, tmp_path: Path) -> None:
     gaussians, path, back = drawn(scene, degree), tmp_path / f"a{ending}", tmp_path / "back.ply"
     write_gaussians(path, gaussians)
     subprocess.run([str(program()), "-q", str(path), str(back)], check=True, capture_output=True)
@@ -133,7 +133,7 @@ def test_splat_transform_reads_the_same(ending: str, degree: int, scene: PixelSc
 
 
 @pytest.mark.parametrize("ending", QUANTISED)
-def test_they_are_smaller(ending: str, scene: PixelScene, tmp_path: Path) -> None:
+def test_they_are_smaller(ending: str, scene: Scene, tmp_path: Path) -> None:
     gaussians = drawn(scene, 0)
     write_gaussians(tmp_path / "a.ply", gaussians)
     write_gaussians(tmp_path / f"b{ending}", gaussians)
@@ -141,7 +141,7 @@ def test_they_are_smaller(ending: str, scene: PixelScene, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("ending", OUTPUT_FORMATS)
-def test_the_same_gaussians_give_the_same_bytes(ending: str, scene: PixelScene, tmp_path: Path) -> None:
+def test_the_same_gaussians_give_the_same_bytes(ending: str, scene: Scene, tmp_path: Path) -> None:
     for name in "ab":
         write_gaussians(tmp_path / f"{name}{ending}", drawn(scene, 0))
     assert (tmp_path / f"a{ending}").read_bytes() == (tmp_path / f"b{ending}").read_bytes()
@@ -195,7 +195,7 @@ def test_harmonics_without_room_are_noted() -> None:
     assert "above degree 3" in str(lost_harmonics("a.COMPRESSED.ply", 4))
 
 
-def test_a_higher_degree_loses_its_top(scene: PixelScene, tmp_path: Path) -> None:
+def test_a_higher_degree_loses_its_top(scene: Scene, tmp_path: Path) -> None:
     for ending, degree in ((".spz", 3), (".sog", 3), (".compressed.ply", 3), (".splat", 0)):
         write_gaussians(tmp_path / f"a{ending}", drawn(scene, 4))
         assert read_back(tmp_path / f"a{ending}").sh_degree == degree
@@ -266,7 +266,7 @@ def read_glb(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-def test_glb_holds_everything(degree: int, scene: PixelScene, tmp_path: Path) -> None:
+def test_glb_holds_everything(degree: int, scene: Scene, tmp_path: Path) -> None:
     gaussians = drawn(scene, degree)
     write_gaussians(tmp_path / "a.glb", gaussians)
     document, actual = read_glb(tmp_path / "a.glb")
@@ -286,7 +286,7 @@ def test_glb_holds_everything(degree: int, scene: PixelScene, tmp_path: Path) ->
     assert document["nodes"][0]["rotation"] == [0, 0, 1, 0]  # y up
 
 
-def test_no_normals_is_the_same_without_twelve_bytes(scene: PixelScene, tmp_path: Path) -> None:
+def test_no_normals_is_the_same_without_twelve_bytes(scene: Scene, tmp_path: Path) -> None:
     gaussians = drawn(scene, 1)
     for name, normals in {"with": True, "without": False}.items():
         write_gaussians(tmp_path / f"{name}.ply", gaussians, normals=normals)
