@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import scenes
 
-from gsmerge import Compactor, PixelScene
+from gsmerge import Compactor, Scene
 from gsmerge.online.state import GroupSet, OnlineState
 from gsmerge.stages.merge import take
 from gsmerge.types import SH_C0, Gaussians
@@ -17,12 +17,12 @@ from gsmerge.types import SH_C0, Gaussians
 FAST: dict[str, Any] = {"superpixels": "10%", "checkpoint": "none"}
 
 
-def room(num_views: int = 6, width: int = 36, height: int = 24, **settings: Any) -> PixelScene:
+def room(num_views: int = 6, width: int = 36, height: int = 24, **settings: Any) -> Scene:
     """Views side by side of a ball before a wall."""
     return scenes.make_scene(scenes.room(), scenes.arc(num_views, width, height), noise=0.005, **settings)
 
 
-def parts_of(scene: PixelScene, size: int, *, backwards: bool = False) -> list[PixelScene]:
+def parts_of(scene: Scene, size: int, *, backwards: bool = False) -> list[Scene]:
     """The scene's views in batches of a size, the first or the last first."""
     actual = [
         scenes.take_views(scene, range(first, min(first + size, len(scene)))) for first in range(0, len(scene), size)
@@ -30,7 +30,7 @@ def parts_of(scene: PixelScene, size: int, *, backwards: bool = False) -> list[P
     return actual[::-1] if backwards else actual
 
 
-def fed(batches: Iterable[PixelScene], **settings: Any) -> Compactor:
+def fed(batches: Iterable[Scene], **settings: Any) -> Compactor:
     """What becomes of batches, one after the other."""
     compactor = Compactor(**{**FAST, **settings})
     for batch in batches:
@@ -104,7 +104,7 @@ def random_gaussians(count: int, seed: int, *, size: tuple[float, float] = (0.01
     return Gaussians(*(column.astype(np.float32) for column in columns))
 
 
-def repainted(scene: PixelScene, images: np.ndarray) -> PixelScene:
+def repainted(scene: Scene, images: np.ndarray) -> Scene:
     """The scene with other photos."""
     return replace(scene, images=images.astype(np.float32))
 

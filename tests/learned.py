@@ -15,7 +15,7 @@ from gsmerge.networks.checkpoint import save_checkpoint
 from gsmerge.networks.modules import Networks
 from gsmerge.networks.modules import NetworkOptions
 from gsmerge.stages.encode import EncodeOptions, encode
-from gsmerge.types import FeatureGaussians, Groups, PixelScene
+from gsmerge.types import FeatureGaussians, Groups, Scene
 
 SMALL = NetworkOptions(width=16, heads=2, latent=8, members=8, neighbors=4)
 
@@ -48,7 +48,7 @@ def written(path: Path, networks: Networks) -> Path:
 class Made:
     """A made scene, its members and analytic Feature Gaussians of groups of many sizes."""
 
-    scene: PixelScene
+    scene: Scene
     members: Members
     features: FeatureGaussians
 

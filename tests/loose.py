@@ -6,24 +6,24 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmerge import Cameras, Gaussians, PixelScene, UnalignedScene
+from gsmerge import Cameras, Gaussians, Scene
 from gsmerge.geometry import normalize
 
 NO_CAMERAS = Cameras(np.empty((0, 4, 4)), np.empty((0, 3, 3)), 1, 1)
 
 
-def loosened(scene: PixelScene, order: np.ndarray | None = None) -> UnalignedScene:
+def loosened(scene: Scene, order: np.ndarray | None = None) -> Scene:
     """The same Gaussians without their order."""
     gaussians = scene.gaussians if order is None else scene.gaussians[order]
-    return UnalignedScene(gaussians, scene.cameras, scene.images, scene.names)
+    return Scene(gaussians, scene.cameras, scene.images, None, scene.names)
 
 
-def shuffled(scene: PixelScene, seed: int = 0) -> UnalignedScene:
+def shuffled(scene: Scene, seed: int = 0) -> Scene:
     """In a random order."""
     return loosened(scene, np.random.default_rng(seed).permutation(len(scene.gaussians)))
 
 
-def voxels(scene: PixelScene, size: float) -> UnalignedScene:
+def voxels(scene: Scene, size: float) -> Scene:
     """One Gaussian per occupied cell: the means of what it holds."""
     g = scene.gaussians
     cells = np.floor(g.means / size).astype(np.int64)
@@ -38,7 +38,7 @@ def voxels(scene: PixelScene, size: float) -> UnalignedScene:
 
     merged = Gaussians(*(mean(values) for values in vars(g).values()))
     merged = replace(merged, quats=normalize(merged.quats))
-    return UnalignedScene(merged, scene.cameras, scene.images, scene.names)
+    return Scene(merged, scene.cameras, scene.images, None, scene.names)
 
 
 def far_behind(gaussians: Gaussians, count: int) -> Gaussians:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge import PixelScene
+from gsmerge import Scene
 from gsmerge.geometry import motion_matrices
 from gsmerge.stages.align_views import move_views
 
@@ -16,7 +16,7 @@ def random_motions(count: int, degrees: float, shift: float) -> np.ndarray:
     return motion_matrices(np.concatenate([np.deg2rad(degrees) * parts[0], shift * parts[1]], 1))
 
 
-def disagreeing(scene: PixelScene, degrees: float = 0.8, shift: float = 0.01, views: slice = slice(None)) -> PixelScene:
+def disagreeing(scene: Scene, degrees: float = 0.8, shift: float = 0.01, views: slice = slice(None)) -> Scene:
     """The scene with some views moved, each camera with its Gaussians."""
     viewmats = scene.cameras.viewmats.astype(np.float64)
     viewmats[views] = (random_motions(len(scene), degrees, shift) @ viewmats)[views]

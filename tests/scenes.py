@@ -15,14 +15,21 @@ from typing import Any
 import numpy as np
 from floors import nudged
 
-from gsmerge import Cameras, Gaussians, PixelScene, compact, render
+from gsmerge import Cameras, Gaussians, Scene, compact, render
 from gsmerge.geometry import covariances, normalize, quat_to_rotmat
-from gsmerge.pipeline import CompactReport, CompactResult
+from gsmerge.result import CompactReport, CompactResult
 from gsmerge.render.photos import Photos, scene_photos
+<<<<<<< ours
 from gsmerge.research.generate import objects, photograph, shapes
 from gsmerge.research.generate.noise import Noise, TrueView, pixel_gaussians
 from gsmerge.research.generate.scene import look_at as camera_to_world
 from gsmerge.types import SH_C0, FeatureGaussians
+=======
+from gsmerge.research.generate import objects, paths, photograph, shapes
+from gsmerge.research.generate.noise import TrueView, pixel_gaussians
+from gsmerge.research.generate.options import Noise
+from gsmerge.types import SH_C0, FeatureGaussians, grid_ids
+>>>>>>> theirs
 from gsmerge.views import subset
 
 Texture = Callable[[np.ndarray], np.ndarray]
@@ -151,7 +158,7 @@ def make_scene(
     opacity: tuple[float, float] = (0.6, 0.95),
     degree: int = 0,
     photos: bool = True,
-) -> PixelScene:
+) -> Scene:
     """One Gaussian per pixel on the surfaces.
 
     Args:
@@ -181,7 +188,7 @@ def make_scene(
         means = np.concatenate([world_points(h.depth, c2w, lens).reshape(-1, 3) for c2w, h, _ in actual])
     gaussians = nudged(replace(gaussians, means=means))
     valid = np.ones((len(cameras), cameras.height, cameras.width), bool)
-    return PixelScene(gaussians, cameras, np.stack(images) if photos else None, valid, names(len(cameras)))
+    return Scene(gaussians, cameras, np.stack(images) if photos else None, grid_ids(valid), names(len(cameras)))
 
 
 def names(count: int) -> tuple[str, ...]:
@@ -189,10 +196,9 @@ def names(count: int) -> tuple[str, ...]:
     return tuple(f"{view:03d}.png" for view in range(count))
 
 
-def take_views(scene: PixelScene, order: Sequence[int]) -> PixelScene:
+def take_views(scene: Scene, order: Sequence[int]) -> Scene:
     """The scene's views in another order, repeated or left out."""
     taken = subset(scene, order)
-    assert isinstance(taken, PixelScene)
     return replace(taken, names=names(len(order)))
 
 
@@ -207,7 +213,7 @@ def move_gaussians(gaussians: Gaussians, rotation: np.ndarray, factor: float, sh
     )
 
 
-def move(scene: PixelScene, rotation: np.ndarray, factor: float, shift: np.ndarray) -> PixelScene:
+def move(scene: Scene, rotation: np.ndarray, factor: float, shift: np.ndarray) -> Scene:
     """The scene with its cameras after the same."""
     viewmats = scene.cameras.viewmats.copy()
     viewmats[:, :3, :3] = viewmats[:, :3, :3] @ rotation.T
@@ -258,7 +264,7 @@ def spoil(gaussians: Gaussians, size: float = 1.0, seed: int = 0) -> Gaussians:
     )
 
 
-def self_made(degree: int, views: int = 3) -> tuple[PixelScene, Gaussians]:
+def self_made(degree: int, views: int = 3) -> tuple[Scene, Gaussians]:
     """A scene whose photos show exactly these Gaussians."""
     scene = make_scene(room(), arc(views, 48, 36), degree=degree)
     gaussians = plain(scene, superpixels="8%")
@@ -267,7 +273,7 @@ def self_made(degree: int, views: int = 3) -> tuple[PixelScene, Gaussians]:
     return replace(scene, images=images.astype(np.float32)), gaussians
 
 
-def pair_of(scene: PixelScene) -> tuple[Photos, Photos]:
+def pair_of(scene: Scene) -> tuple[Photos, Photos]:
     """The photos at full and at half size, as the fit takes them."""
     return scene_photos(scene), scene_photos(scene, 2)
 
@@ -279,14 +285,14 @@ def noise_for(photos: tuple[Photos, Photos]) -> tuple[Photos, Photos]:
     return replace(photos[0], images=made[0]), replace(photos[1], images=made[1])
 
 
-def psnr_of(gaussians: Gaussians, scene: PixelScene) -> float:
+def psnr_of(gaussians: Gaussians, scene: Scene) -> float:
     """PSNR (dB) over all views of a scene with photos."""
     assert scene.images is not None
     image = np.clip(images_of(gaussians, scene.cameras)[0], 0, 1)
     return float(-10 * np.log10(((image - scene.images.astype(np.float64)) ** 2).mean()))
 
 
-def compacted(scene: PixelScene, **settings: Any) -> CompactResult:
+def compacted(scene: Scene, **settings: Any) -> CompactResult:
     """``compact`` with the invariants checked; a tenth of the pixels unless told."""
     if "superpixels" not in settings:
         settings = {"superpixels": "10%", **settings}
@@ -296,8 +302,13 @@ def compacted(scene: PixelScene, **settings: Any) -> CompactResult:
     return result
 
 
+<<<<<<< ours
 def plain(scene: PixelScene, **settings: Any) -> Gaussians:
     """The merge alone: no networks, no fit."""
+=======
+def plain(scene: Scene, **settings: Any) -> Gaussians:
+    """The merge alone: no choice by photos, no networks, no fit."""
+>>>>>>> theirs
     return compacted(scene, **{"fit": "none", "checkpoint": "none", **settings}).gaussians
 
 
@@ -306,7 +317,7 @@ def identical(a: Gaussians, b: Gaussians) -> bool:
     return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in FIELDS)
 
 
-def assert_invariants(gaussians: Gaussians, scene: PixelScene) -> None:
+def assert_invariants(gaussians: Gaussians, scene: Scene) -> None:
     """What must hold of the Gaussians of every compact scene."""
     for name in FIELDS:
         assert np.isfinite(getattr(gaussians, name)).all(), name
@@ -325,7 +336,7 @@ def assert_invariants(gaussians: Gaussians, scene: PixelScene) -> None:
     assert np.isfinite(drawn.alphas).all()
 
 
-def assert_consistent(report: CompactReport, scene: PixelScene, gaussians: Gaussians) -> None:
+def assert_consistent(report: CompactReport, scene: Scene, gaussians: Gaussians) -> None:
     """The report tells what the run did."""
     assert (report.num_input, report.num_output) == (scene.num_gaussians, len(gaussians))
     assert (report.psnr_before is None) == (report.psnr_after is None) == (scene.images is None)

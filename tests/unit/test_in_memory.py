@@ -14,7 +14,7 @@ import pytest
 import torch
 from scenes import FIELDS, arc, make_scene, move, room
 
-from gsmerge import CompactTensors, Gaussians, PixelScene, SceneError, compact, compact_tensors, read_cameras, read_ply
+from gsmerge import CompactTensors, Gaussians, Scene, SceneError, compact, compact_tensors, read_cameras, read_ply
 from gsmerge.geometry import sh0_to_rgb
 
 FAST: dict[str, Any] = {"effort": "draft", "superpixels": "10%", "fit": "none"}
@@ -23,20 +23,20 @@ Change = Callable[[np.ndarray], np.ndarray]
 
 
 @pytest.fixture(scope="module")
-def scene() -> PixelScene:
+def scene() -> Scene:
     """Turned, so that no rotation is about an axis of the world."""
     turn, _ = cv2.Rodrigues(np.array([0.4, -0.7, 0.5]))
     return move(make_scene(room(), arc(3)), turn, 1.0, np.array([0.3, -0.2, 0.1]))
 
 
-def tensors_of(scene: PixelScene, **changes: Any) -> dict[str, Any]:
+def tensors_of(scene: Scene, **changes: Any) -> dict[str, Any]:
     """What ``compact_tensors`` takes, as arrays, some of it changed or left out (None)."""
     given = {name: getattr(scene.gaussians, name) for name in FIELDS if name != "shN"}
     given |= {"images": scene.images, "viewmats": scene.cameras.viewmats, "Ks": scene.cameras.Ks}
     return {name: value for name, value in (given | changes).items() if value is not None}
 
 
-def changed(scene: PixelScene, name: str, change: Change) -> dict[str, Any]:
+def changed(scene: Scene, name: str, change: Change) -> dict[str, Any]:
     given = tensors_of(scene)
     return given | {name: change(np.array(given[name]))}
 
@@ -45,7 +45,7 @@ def same(small: CompactTensors, gaussians: Gaussians) -> bool:
     return all(np.array_equal(np.asarray(getattr(small, name)), getattr(gaussians, name)) for name in FIELDS)
 
 
-def test_arrays_give_what_compact_gives(scene: PixelScene) -> None:
+def test_arrays_give_what_compact_gives(scene: Scene) -> None:
     small, result = compact_tensors(**tensors_of(scene), **FAST), compact(scene, **FAST)
     assert same(small, result.gaussians)
     assert isinstance(small.means, np.ndarray)
@@ -54,7 +54,7 @@ def test_arrays_give_what_compact_gives(scene: PixelScene) -> None:
     assert len(small) == len(small.gaussians) == small.report.num_output < 0.2 * len(scene.gaussians)
 
 
-def test_tensors_give_tensors(scene: PixelScene) -> None:
+def test_tensors_give_tensors(scene: Scene) -> None:
     """With further axes in front, gradients, 3 x 4 poses and another type."""
     given: dict[str, Any] = {name: torch.tensor(value) for name, value in tensors_of(scene).items()}
     given["means"] = given["means"].reshape(*SHAPE, 3).requires_grad_()
@@ -67,19 +67,19 @@ def test_tensors_give_tensors(scene: PixelScene) -> None:
     assert same(small, compact(scene, **FAST).gaussians)
 
 
-def test_bfloat16_is_read(scene: PixelScene) -> None:
+def test_bfloat16_is_read(scene: Scene) -> None:
     opacities = torch.tensor(scene.gaussians.opacities).bfloat16()
     small = compact_tensors(**tensors_of(scene, opacities=opacities), **FAST)
     assert small.opacities.dtype == np.float32
 
 
-def test_colors_stand_for_harmonics(scene: PixelScene) -> None:
+def test_colors_stand_for_harmonics(scene: Scene) -> None:
     colors = sh0_to_rgb(scene.gaussians.sh0[:, 0])
     small = compact_tensors(**tensors_of(scene, sh0=None, colors=colors), **FAST)
     np.testing.assert_allclose(small.sh0, compact_tensors(**tensors_of(scene), **FAST).sh0, atol=1e-5)
 
 
-def test_input_is_left_alone_and_odd_rows_are_set_aside(scene: PixelScene) -> None:
+def test_input_is_left_alone_and_odd_rows_are_set_aside(scene: Scene) -> None:
     given = changed(scene, "scales", lambda s: np.where(np.arange(len(s))[:, None] == 7, np.nan, s))
     before = {name: np.array(value) for name, value in given.items()}
     small = compact_tensors(**given, **FAST)
@@ -88,7 +88,7 @@ def test_input_is_left_alone_and_odd_rows_are_set_aside(scene: PixelScene) -> No
     assert np.isfinite(small.means).all()
 
 
-def test_gaussians_of_no_pixels(scene: PixelScene) -> None:
+def test_gaussians_of_no_pixels(scene: Scene) -> None:
     rows = np.random.default_rng(0).permutation(len(scene.gaussians))[:-9]
     given = tensors_of(scene, **{name: getattr(scene.gaussians, name)[rows] for name in FIELDS})
     small = compact_tensors(**given, order="none", **FAST)
@@ -134,7 +134,7 @@ WRONG: list[tuple[str, Change, str]] = [
 
 
 @pytest.mark.parametrize(("name", "change", "words"), WRONG, ids=[f"{name}-{i}" for i, (name, *_) in enumerate(WRONG)])
-def test_a_wrong_convention_is_named(scene: PixelScene, name: str, change: Change, words: str) -> None:
+def test_a_wrong_convention_is_named(scene: Scene, name: str, change: Change, words: str) -> None:
     with pytest.raises(SceneError) as error:
         compact_tensors(**changed(scene, name, change), **FAST)
     assert str(error.value).startswith(f"{name}: ")
@@ -142,7 +142,7 @@ def test_a_wrong_convention_is_named(scene: PixelScene, name: str, change: Chang
     assert "\n" not in str(error.value)
 
 
-def test_colors_of_bytes_and_channel_major_harmonics_are_named(scene: PixelScene) -> None:
+def test_colors_of_bytes_and_channel_major_harmonics_are_named(scene: Scene) -> None:
     colors = 255 * sh0_to_rgb(scene.gaussians.sh0[:, 0]).clip(0, 1)
     with pytest.raises(SceneError, match=r"^colors: .*pass colors / 255"):
         compact_tensors(**tensors_of(scene, sh0=None, colors=colors), **FAST)
@@ -153,7 +153,7 @@ def test_colors_of_bytes_and_channel_major_harmonics_are_named(scene: PixelScene
             compact_tensors(**tensors_of(scene, **more), **FAST)
 
 
-def test_wrong_sizes_are_named(scene: PixelScene) -> None:
+def test_wrong_sizes_are_named(scene: Scene) -> None:
     with pytest.raises(SceneError, match=r"^means: expected one Gaussian per pixel, 3 x 35 x 48 = 5040"):
         compact_tensors(**tensors_of(scene, images=None), shape=(3, 35, 48), **FAST)
     with pytest.raises(SceneError, match=r"^shape: .*found neither"):
@@ -174,7 +174,7 @@ def test_wrong_sizes_are_named(scene: PixelScene) -> None:
         compact_tensors(**tensors_of(scene), order="layers", **FAST)
 
 
-def test_rotations_may_be_left_unchecked(scene: PixelScene) -> None:
+def test_rotations_may_be_left_unchecked(scene: Scene) -> None:
     given = changed(scene, "quats", lambda q: q[:, [1, 2, 3, 0]])
     notes = compact_tensors(**given, check_rotations=False, **FAST).report.notes
     signed = changed(scene, "quats", lambda q: (q * np.where(q[:, :1] < 0, -1, 1))[:, [1, 2, 3, 0]])
@@ -184,14 +184,14 @@ def test_rotations_may_be_left_unchecked(scene: PixelScene) -> None:
     ]  # fmt: skip
 
 
-def test_centres_at_corners_get_a_note(scene: PixelScene) -> None:
+def test_centres_at_corners_get_a_note(scene: Scene) -> None:
     shifted = changed(scene, "Ks", lambda K: K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]))
     notes = compact_tensors(**shifted, **FAST).report.notes
     assert any("add 0.5 to cx, cy" in note for note in notes)
     assert not any("0.5" in note for note in compact_tensors(**tensors_of(scene), **FAST).report.notes)
 
 
-def test_saving(scene: PixelScene, tmp_path: Path) -> None:
+def test_saving(scene: Scene, tmp_path: Path) -> None:
     small = compact_tensors(**tensors_of(scene), names=[f"photo {i}" for i in range(3)], **FAST)
     small.save(tmp_path / "room.ply")
     assert len(read_ply(tmp_path / "room.ply").gaussians) == len(small)

@@ -11,7 +11,7 @@ import pytest
 import torch
 from scenes import arc, make_scene, move, room
 
-from gsmerge import Gaussians, PixelScene, SceneError, compact_tensors, integrations
+from gsmerge import Gaussians, Scene, SceneError, compact_tensors, integrations
 from gsmerge.geometry import covariances
 from gsmerge.types import SH_C0, as_array
 
@@ -21,12 +21,12 @@ FLIP = np.diag([1.0, -1, -1, 1])
 
 
 @pytest.fixture(scope="module")
-def scene() -> PixelScene:
+def scene() -> Scene:
     turn, _ = cv2.Rodrigues(np.array([0.4, -0.7, 0.5]))
     return move(make_scene(room(), arc(3), degree=0), turn, 1.0, np.array([0.3, -0.2, 0.1]))
 
 
-def photos_of(scene: PixelScene) -> np.ndarray:
+def photos_of(scene: Scene) -> np.ndarray:
     assert scene.images is not None
     return scene.images
 
@@ -35,7 +35,7 @@ def batch(values: np.ndarray) -> torch.Tensor:
     return torch.tensor(np.asarray(values, np.float32))[None]
 
 
-def family(scene: PixelScene) -> SimpleNamespace:
+def family(scene: Scene) -> SimpleNamespace:
     """Gaussians as the pixelSplat family, AnySplat and Depth Anything 3 keep them, with harmonics of degree 1."""
     gaussians = scene.gaussians
     harmonics = np.concatenate([gaussians.sh0, np.full((len(gaussians), 3, 3), 0.01)], 1).transpose(0, 2, 1)
@@ -46,11 +46,11 @@ def family(scene: PixelScene) -> SimpleNamespace:
     )  # fmt: skip
 
 
-def poses_of(scene: PixelScene, extrinsics: str, intrinsics: str) -> dict[str, torch.Tensor]:
+def poses_of(scene: Scene, extrinsics: str, intrinsics: str) -> dict[str, torch.Tensor]:
     return {extrinsics: batch(np.linalg.inv(scene.cameras.viewmats)), intrinsics: batch(scene.cameras.Ks / SIZES)}
 
 
-def prediction_of(scene: PixelScene, **more: Any) -> SimpleNamespace:
+def prediction_of(scene: Scene, **more: Any) -> SimpleNamespace:
     fields: dict[str, Any] = {
         "gaussians": family(scene), "extrinsics": scene.cameras.viewmats[:, :3].astype(np.float32),
         "intrinsics": scene.cameras.Ks.astype(np.float32), "depth": np.ones((3, 36, 48), np.float32), "is_metric": 0,
@@ -59,7 +59,7 @@ def prediction_of(scene: PixelScene, **more: Any) -> SimpleNamespace:
     return SimpleNamespace(**fields | more)
 
 
-def assert_holds(given: dict[str, Any], scene: PixelScene, *, quats: bool = True) -> None:
+def assert_holds(given: dict[str, Any], scene: Scene, *, quats: bool = True) -> None:
     """What an adapter gives is the scene, and is taken."""
     gaussians = scene.gaussians
     n = len(gaussians)
@@ -81,14 +81,14 @@ def assert_holds(given: dict[str, Any], scene: PixelScene, *, quats: bool = True
     assert small.report.psnr_after > 15
 
 
-def test_depth_anything_3(scene: PixelScene) -> None:
+def test_depth_anything_3(scene: Scene) -> None:
     given = integrations.depth_anything_3(prediction_of(scene))
     assert_holds(given, scene)
     assert (given["shN"].shape[1], given["check_rotations"]) == (0, False)
     assert integrations.depth_anything_3(prediction_of(scene), sh_degree=1)["shN"].shape == (len(scene.gaussians), 3, 3)
 
 
-def test_depth_anything_3_in_metres_and_after_writing_colmap(scene: PixelScene) -> None:
+def test_depth_anything_3_in_metres_and_after_writing_colmap(scene: Scene) -> None:
     """The nested models scale the poses alone; its COLMAP writer leaves intrinsics at the original photos' size."""
     metric, original = scene.cameras.viewmats[:, :3].copy(), scene.cameras.Ks * np.array([2.5, 2.4, 1])[:, None]
     metric[:, :, 3] *= 4
@@ -97,12 +97,12 @@ def test_depth_anything_3_in_metres_and_after_writing_colmap(scene: PixelScene) 
     np.testing.assert_array_equal(prediction.extrinsics, metric)
 
 
-def test_depth_anything_3_without_gaussians(scene: PixelScene) -> None:
+def test_depth_anything_3_without_gaussians(scene: Scene) -> None:
     with pytest.raises(SceneError, match=r"prediction: expected a field gaussians, found none; .*infer_gs=True"):
         integrations.depth_anything_3(prediction_of(scene, gaussians=None))
 
 
-def test_anysplat(scene: PixelScene) -> None:
+def test_anysplat(scene: Scene) -> None:
     """Voxels: fewer Gaussians than pixels, in another order."""
     rows = np.random.default_rng(0).permutation(len(scene.gaussians))[:-50]
     fewer = replace_gaussians(scene, scene.gaussians[rows])
@@ -117,13 +117,13 @@ def test_anysplat(scene: PixelScene) -> None:
         integrations.anysplat(two, poses_of(scene, "extrinsic", "intrinsic"), images)
 
 
-def replace_gaussians(scene: PixelScene, gaussians: Gaussians) -> Any:
+def replace_gaussians(scene: Scene, gaussians: Gaussians) -> Any:
     """A stand-in for a scene with any number of Gaussians."""
     return SimpleNamespace(gaussians=gaussians, cameras=scene.cameras, images=scene.images)
 
 
 @pytest.mark.parametrize("wrapped", [False, True])
-def test_depthsplat(scene: PixelScene, wrapped: bool) -> None:
+def test_depthsplat(scene: Scene, wrapped: bool) -> None:
     """Rotations beside the covariances are the cameras', and are not read."""
     gaussians = family(scene)
     del gaussians.rotations, gaussians.scales
@@ -142,7 +142,7 @@ def trained(gaussians: Gaussians) -> dict[str, torch.Tensor]:
     return {"means": means, "scales": scales, "quats": 2.5 * tensors.quats, "opacities": logits}
 
 
-def test_gsplat(scene: PixelScene) -> None:
+def test_gsplat(scene: Scene) -> None:
     harmonics = {"sh0": torch.tensor(scene.gaussians.sh0), "shN": torch.zeros(len(scene.gaussians), 15, 3)}
     splats = torch.nn.ParameterDict({**trained(scene.gaussians), **harmonics})
     photos = torch.tensor(np.round(255 * photos_of(scene)).astype(np.uint8))
@@ -152,7 +152,7 @@ def test_gsplat(scene: PixelScene) -> None:
         integrations.gsplat(trained(scene.gaussians))
 
 
-def test_nerfstudio(scene: PixelScene) -> None:
+def test_nerfstudio(scene: Scene) -> None:
     base = torch.tensor(scene.gaussians.sh0[:, 0])
     params = {**trained(scene.gaussians), "features_dc": base, "features_rest": torch.zeros(len(base), 15, 3)}
     params["opacities"] = params["opacities"][:, None]
@@ -168,7 +168,7 @@ def test_nerfstudio(scene: PixelScene) -> None:
         integrations.nerfstudio(model, cameras)
 
 
-def test_nerfstudio_without_harmonics(scene: PixelScene) -> None:
+def test_nerfstudio_without_harmonics(scene: Scene) -> None:
     """With degree 0 it trains logits of colours."""
     rgb = (0.5 + SH_C0 * scene.gaussians.sh0[:, 0].astype(np.float64)).clip(0.01, 0.99)
     params = {**trained(scene.gaussians), "features_dc": torch.tensor(np.log(rgb / (1 - rgb)))}

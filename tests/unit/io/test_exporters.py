@@ -25,7 +25,7 @@ from tiny_scene import Tiny, make_tiny, write_npz
 from gsmerge.errors import SceneError
 from gsmerge.io import load_scene, read_ply, read_scene
 from gsmerge.io.exporters import EXPORTERS
-from gsmerge.types import PixelScene, UnalignedScene
+from gsmerge.types import Scene
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def smooth() -> Tiny:
     return smooth_scene(48, 36)
 
 
-def home(scene: PixelScene, tiny: Tiny, kept: np.ndarray | None = None) -> float:
+def home(scene: Scene, tiny: Tiny, kept: np.ndarray | None = None) -> float:
     """Share of the valid (or of the kept) pixels whose Gaussian is the one made for them, recognised by its opacity."""
     actual, want = scene.gaussians.opacities, tiny.gaussians.opacities
     valid = scene.valid.reshape(-1) if kept is None else kept
@@ -262,7 +262,7 @@ def test_voxels_are_unaligned(tmp_path: Path, smooth: Tiny) -> None:
     rows = export_rows(smooth, np.lexsort(smooth.gaussians.means.round(1).T)[::2])
     rows["opacity"] = 1 / (1 + np.exp(-rows["opacity"]))
     loaded = load_scene(save_export(tmp_path, smooth, rows))
-    assert isinstance(loaded.scene, UnalignedScene)
+    assert not loaded.scene.aligned
     assert len(loaded.scene.gaussians) == len(rows)
     assert loaded.scene.images is not None
     assert {d.name for d in loaded.exporters} == {"anysplat", "worldmirror"}
@@ -272,8 +272,8 @@ def test_voxels_are_unaligned(tmp_path: Path, smooth: Tiny) -> None:
 
 def test_a_scene_can_be_given_as_unaligned(tmp_path: Path, smooth: Tiny) -> None:
     path = save_export(tmp_path, smooth, export_rows(smooth))
-    assert isinstance(read_scene(path, order="none"), UnalignedScene)
-    assert isinstance(read_scene(path, exporter="volsplat"), UnalignedScene)
+    assert not read_scene(path, order="none").aligned
+    assert not read_scene(path, exporter="volsplat").aligned
 
 
 def test_a_given_scale(tmp_path: Path, smooth: Tiny) -> None:
@@ -282,7 +282,7 @@ def test_a_given_scale(tmp_path: Path, smooth: Tiny) -> None:
     path = save_export(tmp_path, replace(smooth, c2w=c2w), export_rows(smooth))
     scene = read_scene(path, scene_scale=0.5)
     assert np.allclose(scene.cameras.viewmats, smooth.w2c)
-    assert not isinstance(read_scene(path), UnalignedScene)
+    assert read_scene(path).aligned
 
 
 @pytest.mark.parametrize(
@@ -332,7 +332,7 @@ def test_views_dumped_from_a_model(tmp_path: Path, smooth: Tiny, root: Path) -> 
         assert loaded.cameras.source == "dump of a model"
         assert np.allclose(scene.cameras.Ks, smooth.K)
         assert np.array_equal((scene.images * 255).round(), smooth.images)
-    assert isinstance(read_scene(dump_of(smooth, tmp_path / "none", root, order="none")), UnalignedScene)
+    assert not read_scene(dump_of(smooth, tmp_path / "none", root, order="none")).aligned
 
 
 def test_a_damaged_dump(tmp_path: Path, smooth: Tiny, root: Path) -> None:

@@ -15,7 +15,7 @@ from tiny_scene import FLIP, Tiny, make_tiny, rotation
 from gsmerge.errors import SceneError
 from gsmerge.io import load_scene, read_cameras, read_held_out, views
 from gsmerge.io.held_out import fit_similarity
-from gsmerge.types import UnalignedScene
+from gsmerge.types import Scene
 
 
 @pytest.fixture(scope="module")
@@ -152,7 +152,7 @@ def test_no_such_file(tiny: Tiny, tmp_path: Path) -> None:
 
 def test_targets_of_a_scene_without_views(tiny: Tiny, tmp_path: Path) -> None:
     load = load_scene(tiny.save(tmp_path / "scene"))
-    bare = replace(load, scene=UnalignedScene(load.scene.gaussians, load.scene.cameras[[]], None, ()))
+    bare = replace(load, scene=Scene(load.scene.gaussians, load.scene.cameras[[]], None, None, ()))
     targets = read_held_out(bare, write_views(tmp_path / "held", {"q": between(tiny)}, tiny))
     assert (len(targets), targets.context_places) == (1, None)
 

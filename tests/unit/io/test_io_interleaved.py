@@ -9,7 +9,6 @@ import pytest
 from exports import Smooth, export_rows, save_export, smooth_scene
 
 from gsmerge.io import load_scene
-from gsmerge.types import UnalignedScene
 
 
 @pytest.fixture(scope="module")
@@ -43,4 +42,4 @@ def test_nearly_every_row_comes_to_its_pixel(tmp_path: Path, smooth: Smooth, dro
 
 def test_rows_in_no_order_stay_unaligned(tmp_path: Path, smooth: Smooth) -> None:
     kept = np.random.default_rng(1).permutation(view_fastest(smooth, 0.3))
-    assert isinstance(load_scene(save_export(tmp_path, smooth, export_rows(smooth, kept))).scene, UnalignedScene)
+    assert not load_scene(save_export(tmp_path, smooth, export_rows(smooth, kept))).scene.aligned

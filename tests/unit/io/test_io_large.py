@@ -12,7 +12,6 @@ from exports import export_rows, save_export, smooth_scene
 from tiny_scene import Tiny
 
 from gsmerge.io import load_scene
-from gsmerge.types import PixelScene, UnalignedScene
 
 SMOOTH = smooth_scene(48, 36)
 LARGE = replace(
@@ -34,7 +33,7 @@ def save(folder: Path, *, shuffled: bool = True, tiny: Tiny = LARGE) -> Path:
 def test_views_of_unaligned_scenes_are_resized(tmp_path: Path, order: str) -> None:
     loaded = load_scene(save(tmp_path), order=order, max_side=96)
     scene = loaded.scene
-    assert isinstance(scene, UnalignedScene)
+    assert not scene.aligned
     assert NOTE in loaded.notes
     assert scene.images is not None
     assert scene.images.shape == (3, 72, 96, 3)
@@ -63,7 +62,7 @@ def test_cameras_without_photos_are_resized_too(tmp_path: Path) -> None:
 
 def test_scenes_with_pixels_keep_their_grid(tmp_path: Path) -> None:
     loaded = load_scene(save(tmp_path, shuffled=False), max_side=16)
-    assert isinstance(loaded.scene, PixelScene)
+    assert loaded.scene.aligned
     assert loaded.scene.cameras.width == 48
 
 
@@ -75,7 +74,7 @@ def test_memory_is_bounded_before_pixels_are_known(
     monkeypatch.setattr("gsmerge.io.views._MAX_BYTES", 3 * 100 * 75 * 12)
     loaded = load_scene(save(tmp_path, shuffled=shuffled), max_side=96)
     assert NOTE in loaded.notes
-    assert isinstance(loaded.scene, UnalignedScene) == shuffled
+    assert loaded.scene.aligned != shuffled
     size = (96, 72) if shuffled else (48, 36)
     assert (loaded.scene.cameras.width, loaded.scene.cameras.height) == size
 

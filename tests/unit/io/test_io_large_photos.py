@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import gsmerge
-from gsmerge import PixelScene, UnalignedScene
+from gsmerge import Scene
 from gsmerge.errors import SceneError
 from gsmerge.render.metrics import psnr
 from gsmerge.research.generate import GenerateOptions, generate_scene
@@ -48,7 +48,7 @@ def enlarge(document: dict[str, float]) -> None:
         document[name] *= SCALE
 
 
-def shift_between(scene: PixelScene, scale: float) -> tuple[float, float]:
+def shift_between(scene: Scene, scale: float) -> tuple[float, float]:
     """Where a larger photo, brought to the grid by the two cameras, fits the grid's own best, in the grid's pixels."""
     assert scene.images is not None
     photos = large_photos(scene, scale)
@@ -71,7 +71,7 @@ def shift_between(scene: PixelScene, scale: float) -> tuple[float, float]:
 @pytest.mark.parametrize("scale", [1.5, 2, 3])
 def test_larger_photos_show_what_the_grid_shows(made: Path, scale: float) -> None:
     scene = gsmerge.read_scene(made)
-    assert isinstance(scene, PixelScene)
+    assert scene.aligned
     assert largest_scale(scene) == pytest.approx(SCALE)
     assert shift_between(scene, scale) == (0, 0)
 
@@ -101,7 +101,7 @@ def test_cropped_and_distorted_photos(folder: Path, k1: float) -> None:
 
     change_cameras(folder, widen)
     scene = gsmerge.read_scene(folder)
-    assert isinstance(scene, PixelScene)
+    assert scene.aligned
     assert scene.large_photos is not None
     assert (scene.cameras.width, scene.cameras.height) == (WIDTH, HEIGHT)
     assert WIDTH * SCALE <= scene.large_photos.width <= WIDTH * SCALE + 2
@@ -120,7 +120,7 @@ def test_photos_of_the_grids_size_are_not_large(folder: Path) -> None:
 def test_views_of_an_unaligned_scene_are_reduced_but_not_their_photos(folder: Path) -> None:
     change_cameras(folder, enlarge)
     scene = gsmerge.read_scene(folder, order="none", max_side=WIDTH)
-    assert isinstance(scene, UnalignedScene)
+    assert not scene.aligned
     assert (scene.cameras.width, largest_scale(scene)) == (WIDTH, pytest.approx(SCALE))
     assert scene.large_photos is not None
     np.testing.assert_allclose(scene.large_photos.Ks, scene.cameras.Ks * [[SCALE], [SCALE], [1]])

@@ -15,7 +15,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io import load_scene
 from gsmerge.io.alignment.poses import choose_poses, other_conventions
 from gsmerge.io.cameras.camera_file import C2W_OPENGL, CONVENTIONS, W2C_OPENCV, from_viewmats
-from gsmerge.types import Cameras, UnalignedScene
+from gsmerge.types import Cameras
 
 SMOOTH = smooth_scene(40, 30)
 
@@ -53,7 +53,7 @@ def test_without_pixels_the_photos_tell(tmp_path: Path, true: tuple[str, str]) -
     folder = some_rows(SMOOTH).save(tmp_path / "scene")
     rewrite_poses(folder, SMOOTH, true)
     loaded = load_scene(folder)
-    assert isinstance(loaded.scene, UnalignedScene)
+    assert not loaded.scene.aligned
     assert np.allclose(loaded.scene.cameras.viewmats, SMOOTH.w2c)
     assert any(f"when read as {true[0]} matrices with {true[1]} axes" in note for note in loaded.notes)
 

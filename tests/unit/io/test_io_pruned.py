@@ -10,7 +10,6 @@ import pytest
 from exports import export_rows, save_export, smooth_scene
 
 from gsmerge.io import load_scene
-from gsmerge.types import UnalignedScene
 
 
 @pytest.mark.parametrize("size", [(96, 72), (64, 48)])
@@ -40,4 +39,4 @@ def test_a_scale_that_cannot_be_measured_is_not_guessed(tmp_path: Path) -> None:
     c2w[:, :3, 3] *= 1.5
     kept = np.flatnonzero(rng.random(len(means)) > 0.4)
     folder = save_export(tmp_path, replace(tiny, c2w=c2w), export_rows(tiny, kept))
-    assert isinstance(load_scene(folder, order="view-major").scene, UnalignedScene)
+    assert not load_scene(folder, order="view-major").scene.aligned

@@ -16,7 +16,7 @@ from gsmerge.io import load_scene, read_cameras, to_cameras
 from gsmerge.io.alignment.grid import grids_of_count, patch_grids
 from gsmerge.io.cameras.camera_file import C2W_OPENGL, CONVENTIONS, W2C_OPENCV, View, from_viewmats, make_camera_file
 from gsmerge.io.photos import PhotoTransform, resize_and_crop, resize_to
-from gsmerge.types import Cameras, PixelScene
+from gsmerge.types import Cameras
 
 SMOOTH = smooth_scene(48, 36)
 
@@ -151,7 +151,7 @@ def test_dropped_pixels_of_a_patched_grid(tmp_path: Path) -> None:
     write_photos(tmp_path, tiny, photos)
     write_cameras(tmp_path, tiny, K, (1008, 56))
     loaded = load_scene(tmp_path)
-    assert isinstance(loaded.scene, PixelScene)
+    assert loaded.scene.aligned
     assert (loaded.scene.cameras.width, loaded.scene.cameras.height) == (504, 28)
     assert any("resized to 504 x 28, the Gaussian grid's size" in note for note in loaded.notes)
 

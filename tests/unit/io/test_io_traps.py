@@ -23,7 +23,7 @@ from plyfile import PlyData, PlyElement
 from tiny_scene import Tiny, rotation, write_colmap_text, write_inria, write_npz
 
 from gsmerge.io import load_scene, read_ply, read_scene
-from gsmerge.types import SH_C0, PixelScene, UnalignedScene
+from gsmerge.types import SH_C0, Scene
 
 SMOOTH = smooth_scene(48, 36)
 
@@ -32,7 +32,7 @@ UNIT = 0.01  # of the maps in the Gaussians' world: six decimals are a ten thous
 ROWS = np.arange(3 * 36 * 48).reshape(3, 36, 48)
 
 
-def home(scene: PixelScene, tiny: Tiny) -> float:
+def home(scene: Scene, tiny: Tiny) -> float:
     """Share of the valid pixels whose Gaussian is the one made for them, recognised by its opacity."""
     same = np.abs(scene.gaussians.opacities - tiny.gaussians.opacities) < 1e-5
     return float(same[scene.valid.reshape(-1)].mean())
@@ -168,7 +168,7 @@ def test_rows_sorted_by_opacity(tmp_path: Path) -> None:
     """VicaSplat's and Long-LRM's pruning leaves no order: nothing is guessed, and nothing is lost but what was cut."""
     order = np.argsort(-SMOOTH.gaussians.opacities, kind="stable")[:4000]
     loaded = load_scene(save_export(tmp_path, SMOOTH, export_rows(SMOOTH, order, rest=72)))
-    assert isinstance(loaded.scene, UnalignedScene)
+    assert not loaded.scene.aligned
     assert np.array_equal(loaded.scene.gaussians.means, SMOOTH.gaussians.means[order])
     assert "vicasplat" in [d.name for d in loaded.exporters]
 

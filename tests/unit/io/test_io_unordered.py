@@ -14,7 +14,7 @@ from gsmerge.io import load_scene
 from gsmerge.io.alignment.projected_rows import ProjectedRows
 from gsmerge.io.alignment.similarity import IDENTITY
 from gsmerge.io.alignment.unordered import unordered_layout
-from gsmerge.types import SH_C0, UnalignedScene
+from gsmerge.types import SH_C0
 
 MANY_OR_FEW = [3, pytest.param(8, marks=pytest.mark.slow)]  # views
 
@@ -119,7 +119,7 @@ def test_rows_anywhere_in_their_pixels_stay_unaligned(tmp_path: Path, views: int
     tiny = scene_on_rays(views, jitter)
     folder = save_export(tmp_path, tiny, export_rows(tiny, by_opacity(tiny, 0.3)))
     for order in ("auto", "unordered"):
-        assert isinstance(load_scene(folder, order=order).scene, UnalignedScene)
+        assert not load_scene(folder, order=order).scene.aligned
 
 
 @pytest.mark.slow
@@ -127,7 +127,7 @@ def test_many_views_make_chance(tmp_path: Path) -> None:
     """Sixty views: most rows are within a twentieth of a pixel of some view's centre."""
     tiny = scene_on_rays(60, 0.5, (32, 24))
     folder = save_export(tmp_path, tiny, export_rows(tiny, by_opacity(tiny, 0.5)))
-    assert isinstance(load_scene(folder, exporter="vicasplat").scene, UnalignedScene)
+    assert not load_scene(folder, exporter="vicasplat").scene.aligned
 
 
 def test_the_given_order_and_exporter(tmp_path: Path) -> None:
@@ -141,7 +141,7 @@ def test_the_given_order_and_exporter(tmp_path: Path) -> None:
         assert [d.name for d in loaded.exporters] == ["longlrm-sorted"]
     assert loaded.recovery is not None
     assert loaded.recovery.best.frame.scale == IDENTITY.scale
-    assert isinstance(load_scene(folder, order="view-major").scene, UnalignedScene)
+    assert not load_scene(folder, order="view-major").scene.aligned
 
 
 def test_rows_without_finite_positions(tmp_path: Path) -> None:
@@ -168,5 +168,5 @@ def test_two_views_of_one_pose(tmp_path: Path, names: tuple[str, str]) -> None:
     )
     twice.save(tmp_path)
     loaded = load_scene(tmp_path)
-    assert not isinstance(loaded.scene, UnalignedScene)
+    assert loaded.scene.aligned
     assert len(loaded.scene) == 2

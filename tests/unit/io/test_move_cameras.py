@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from tiny_scene import Tiny, make_tiny
 
-from gsmerge import PixelScene, compact_tensors
+from gsmerge import compact_tensors
 from gsmerge.errors import SceneError
 from gsmerge.geometry import pose_changes
 from gsmerge.io import load_scene
@@ -106,7 +106,7 @@ def save_with(tiny: Tiny, folder: Path, viewmats: np.ndarray) -> Path:
 
 def test_a_file_whose_cameras_are_off_is_read_with_a_note(large: Tiny, tmp_path: Path) -> None:
     load = load_scene(save_with(large, tmp_path / "scene", off(large, 0.7, 0.02)))
-    assert isinstance(load.scene, PixelScene)
+    assert load.scene.aligned
     assert pose_changes(large.w2c, load.scene.cameras.viewmats)[0].max() < 0.05
     assert sum("the cameras are off by a median of up to" in note for note in load.notes) == 1
     assert len(load.moves) == 3

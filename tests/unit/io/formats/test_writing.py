@@ -12,8 +12,8 @@ import scenes
 from plyfile import PlyData
 from tiny_scene import Tiny
 
-from gsmerge import PixelScene
-from gsmerge.baselines.splat_transform import find_program
+from gsmerge import Scene
+from gsmerge.baselines.simple import find_program
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry import normalize
 from gsmerge.io import (
@@ -50,17 +50,17 @@ needs_program = pytest.mark.skipif(program() is None, reason="needs splat-transf
 
 
 @pytest.fixture(scope="module")
-def scene() -> PixelScene:
+def scene() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(3, 96, 72))
 
 
-def psnr(scene: PixelScene, one: Gaussians, other: Gaussians) -> float:
+def psnr(scene: Scene, one: Gaussians, other: Gaussians) -> float:
     a, b = (scenes.images_of(g, scene.cameras)[0].clip(0, 1) for g in (one, other))
     return float(-10 * np.log10(max(((a - b) ** 2).mean(), 1e-12)))
 
 
 @pytest.mark.parametrize(("ending", "degree"), FLOORS)
-def test_what_is_read_back_shows_the_same(ending: str, degree: int, scene: PixelScene, tmp_path: Path) -> None:
+def test_what_is_read_back_shows_the_same(ending: str, degree: int, scene: Scene, tmp_path: Path) -> None:
     gaussians, path = drawn(scene, degree), tmp_path / f"a{ending}"
     write_gaussians(path, gaussians)
     actual = read_back(path)
@@ -70,7 +70,7 @@ def test_what_is_read_back_shows_the_same(ending: str, degree: int, scene: Pixel
 
 @needs_program
 @pytest.mark.parametrize(("ending", "degree"), FLOORS)
-def test_splat_transform_reads_the_same(ending: str, degree: int, scene: PixelScene, tmp_path: Path) -> None:
+def test_splat_transform_reads_the_same(ending: str, degree: int, scene: Scene, tmp_path: Path) -> None:
     gaussians, path, back = drawn(scene, degree), tmp_path / f"a{ending}", tmp_path / "back.ply"
     write_gaussians(path, gaussians)
     subprocess.run([str(program()), "-q", str(path), str(back)], check=True, capture_output=True)
@@ -81,7 +81,7 @@ def test_splat_transform_reads_the_same(ending: str, degree: int, scene: PixelSc
 
 
 @pytest.mark.parametrize("ending", QUANTISED)
-def test_they_are_smaller(ending: str, scene: PixelScene, tmp_path: Path) -> None:
+def test_they_are_smaller(ending: str, scene: Scene, tmp_path: Path) -> None:
     gaussians = drawn(scene, 0)
     write_gaussians(tmp_path / "a.ply", gaussians)
     write_gaussians(tmp_path / f"b{ending}", gaussians)
@@ -89,7 +89,7 @@ def test_they_are_smaller(ending: str, scene: PixelScene, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("ending", OUTPUT_FORMATS)
-def test_the_same_gaussians_give_the_same_bytes(ending: str, scene: PixelScene, tmp_path: Path) -> None:
+def test_the_same_gaussians_give_the_same_bytes(ending: str, scene: Scene, tmp_path: Path) -> None:
     for name in "ab":
         write_gaussians(tmp_path / f"{name}{ending}", drawn(scene, 0))
     assert (tmp_path / f"a{ending}").read_bytes() == (tmp_path / f"b{ending}").read_bytes()
@@ -131,7 +131,7 @@ def test_harmonics_without_room_are_noted() -> None:
     assert "above degree 3" in str(lost_harmonics("a.COMPRESSED.ply", 4))
 
 
-def test_a_higher_degree_loses_its_top(scene: PixelScene, tmp_path: Path) -> None:
+def test_a_higher_degree_loses_its_top(scene: Scene, tmp_path: Path) -> None:
     for ending, degree in ((".spz", 3), (".sog", 3), (".compressed.ply", 3), (".splat", 0)):
         write_gaussians(tmp_path / f"a{ending}", drawn(scene, 4))
         assert read_back(tmp_path / f"a{ending}").sh_degree == degree
@@ -182,7 +182,7 @@ def test_comments_reach_the_headers(tmp_path: Path) -> None:
         write_gaussians(tmp_path / "b.compressed.ply", corners(), comments=["two\nlines"])
 
 
-def test_no_normals_is_the_same_without_twelve_bytes(scene: PixelScene, tmp_path: Path) -> None:
+def test_no_normals_is_the_same_without_twelve_bytes(scene: Scene, tmp_path: Path) -> None:
     gaussians = drawn(scene, 1)
     for name, normals in {"with": True, "without": False}.items():
         write_gaussians(tmp_path / f"{name}.ply", gaussians, normals=normals)
