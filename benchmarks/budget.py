@@ -23,7 +23,7 @@ from gsmerge.moments import Members, scene_members
 from gsmerge.render.photos import scene_photos
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.decode import DecodeOptions, decode, split_counts
-from gsmerge.stages.encode import EncodeOptions, encode
+from gsmerge.stages.encode import encode
 from gsmerge.stages.fit import FitOptions, fit
 from gsmerge.stages.prepare import Frame, canonicalise
 from gsmerge.stages.region_tree import auto_count, cut_tree, pixel_depths, region_tree
@@ -42,7 +42,7 @@ def cut_evenly(scene: Scene, count: int) -> Groups:
 
 def spent(scene: Scene, members: Members, groups: Groups, count: int) -> Gaussians:
     """One Gaussian per region, and more where the regions are fewer than ``count``."""
-    features = encode(scene, members, groups, EncodeOptions())
+    features = encode(scene, members, groups)
     extra = max(0, count - len(features))
     return decode(features, members, DecodeOptions(), split_counts(features, members, extra))
 

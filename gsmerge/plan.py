@@ -175,7 +175,7 @@ def make_plan(prepared: Prepared, options: CompactOptions) -> Plan:
         backend=backend,
         seed=options.seed,
         checkpoint=checkpoint,
-        settings=options.to_dict() | {"fit_steps": fit.steps},
+        settings=options.to_dict() | {"fit_steps": fit.steps, "device": backend.device},
     )
 
 

@@ -205,7 +205,8 @@ def prepare(scene: Scene, options: PrepareOptions | None = None, frame: Frame | 
     checked, photo_views = leave_out_photos(canonical)
     placed = _move_wrong_views(checked, photo_views, options.poses)
     seen, unseen = _split_unseen(placed) if options.unseen == "keep" else (placed, None)
-    return Prepared(scene, add_pictures(seen), frame, photo_views, tuple(repeated), placed is not checked, unseen)
+    shown = seen if seen.aligned else add_pictures(seen)  # pixels that are known have colours of their own
+    return Prepared(scene, shown, frame, photo_views, tuple(repeated), placed is not checked, unseen)
 
 
 def _move_wrong_views(scene: Scene, views: Sequence[int], poses: Poses) -> Scene:

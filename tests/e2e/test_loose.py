@@ -6,9 +6,9 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-import loose
 import numpy as np
 import pytest
+import unaligned_scenes
 from plyfile import PlyData
 
 import gsmerge
@@ -22,7 +22,7 @@ def made(made_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The made scene as voxels."""
     folder = Path(shutil.copytree(made_scene, tmp_path_factory.mktemp("loose") / "scene"))
     scene = gsmerge.read_scene(folder)
-    gsmerge.write_ply(folder / "scene.ply", loose.voxels(scene, 0.03).gaussians, overwrite=True)
+    gsmerge.write_ply(folder / "scene.ply", unaligned_scenes.voxels(scene, 0.03).gaussians, overwrite=True)
     return folder
 
 
@@ -40,7 +40,7 @@ def test_a_grid_without_its_order(made_scene: Path, tmp_path: Path, target_psnr:
     """About as good as with it."""
     scene = gsmerge.read_scene(made_scene)
     actual = []
-    for name, one in (("grid", scene), ("loose", loose.shuffled(scene))):
+    for name, one in (("grid", scene), ("loose", unaligned_scenes.shuffled(scene))):
         gsmerge.write_ply(tmp_path / f"{name}.ply", gsmerge.compact(one).gaussians)
         actual.append(target_psnr(made_scene / "targets", tmp_path / f"{name}.ply"))
     assert actual[1] > actual[0] - 1.0

@@ -6,18 +6,18 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import loose
 import pytest
 import scenes
+import unaligned_scenes
 
-from gsmerge import PixelScene, compact, read_ply
+from gsmerge import Scene, compact, read_ply
 from gsmerge.errors import UsageError
 
 from .conftest import Run
 
 
 @pytest.fixture(scope="module")
-def scene() -> PixelScene:
+def scene() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(3, 64, 48), noise=0.01)
 
 
@@ -44,14 +44,14 @@ def test_no_level_replaces_a_file(made_scene: Path, tmp_path: Path, run: Run) ->
     assert sorted(path.name for path in tmp_path.iterdir()) == ["chain.level2.ply"]
 
 
-def test_the_finest_level_is_the_result_without_levels(scene: PixelScene) -> None:
+def test_the_finest_level_is_the_result_without_levels(scene: Scene) -> None:
     alone, chain = compact(scene, fit_steps=12), compact(scene, fit_steps=12, levels=2)
     assert scenes.identical(alone.gaussians, chain.gaussians)
     assert len(chain.coarser) == 1
     assert alone.coarser == ()
 
 
-def test_a_psnr_is_met_with_few(scene: PixelScene) -> None:
+def test_a_psnr_is_met_with_few(scene: Scene) -> None:
     usual = compact(scene, fit_steps=20)
     assert usual.report.psnr_after is not None
     expected = usual.report.psnr_after - 1
@@ -73,7 +73,7 @@ def test_a_target_out_of_reach_ends_with_4(made_scene: Path, tmp_path: Path, run
     assert str(out) in said.out
 
 
-def test_a_loss_spends_less_where_more_may_be_lost(scene: PixelScene) -> None:
+def test_a_loss_spends_less_where_more_may_be_lost(scene: Scene) -> None:
     few, many = (compact(scene, fit_steps=12, quality=f"-{drop}dB") for drop in (3.0, 0.0))
     assert len(few.gaussians) < len(many.gaussians)
     curve = many.report.choices["curve"]
@@ -89,20 +89,20 @@ def test_auto_reports_its_curve(made_scene: Path, tmp_path: Path, run: Run) -> N
     assert len(lines) == 7
 
 
-def test_a_device_is_a_limit(scene: PixelScene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_device_is_a_limit(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     assert scenes.identical(compact(scene, fit="none", budget="quest3").gaussians, compact(scene, fit="none").gaussians)
     monkeypatch.setitem(__import__("gsmerge.budget").budget.DEVICES, "quest3", 200)
     assert len(compact(scene, fit_steps=12, budget="quest3").gaussians) == 200
 
 
 @pytest.mark.parametrize("settings", [{"quality": "-0.2dB"}, {"quality": "30dB"}])
-def test_quality_needs_photos(scene: PixelScene, settings: dict[str, str]) -> None:
+def test_quality_needs_photos(scene: Scene, settings: dict[str, str]) -> None:
     with pytest.raises(UsageError, match="needs photos"):
         compact(replace(scene, images=None), **settings)
 
 
-def test_a_search_keeps_what_reading_had_to_say(scene: PixelScene) -> None:
-    whole = loose.loosened(scene)
+def test_a_search_keeps_what_reading_had_to_say(scene: Scene) -> None:
+    whole = unaligned_scenes.loosened(scene)
     means = whole.gaussians.means.copy()
     means[0] = float("nan")
     spoilt = replace(whole, gaussians=replace(whole.gaussians, means=means))

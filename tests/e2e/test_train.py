@@ -14,7 +14,7 @@ from shutil import copytree, rmtree
 
 import numpy as np
 import pytest
-from learned import SMALL, noisy, written
+from network_fixtures import SMALL, noisy, written
 
 from gsmerge.cli.train import find_training_scenes
 from gsmerge.networks.checkpoint import load_checkpoint

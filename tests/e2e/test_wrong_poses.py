@@ -13,7 +13,6 @@ import motions
 import numpy as np
 import pytest
 
-from gsmerge import PixelScene
 from gsmerge.geometry import pose_changes
 from gsmerge.io import load_scene, write_gaussians
 from gsmerge.io.cameras.json_files import write_transforms
@@ -81,7 +80,6 @@ def test_the_cameras_as_used_are_written(exact: Path, wrong: Path, tmp_path: Pat
 def test_results_are_measured_from_where_they_were_made(exact: Path, tmp_path: Path, run: Run) -> None:
     """Views that do not agree with each other: ``compact`` moves them, and writes the cameras beside the result."""
     scene = load_scene(exact).scene
-    assert isinstance(scene, PixelScene)
     wrong = motions.disagreeing(scene, 0.8, 0.01)
     folder = Path(shutil.copytree(exact, tmp_path / "wrong"))
     write_gaussians(folder / "scene.ply", wrong.gaussians, overwrite=True)

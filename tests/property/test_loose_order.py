@@ -6,15 +6,15 @@ import itertools
 from dataclasses import replace
 from functools import cache
 
-import loose
 import numpy as np
 import pytest
 import scenes
+import unaligned_scenes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from gsmerge import PixelScene, compact
+from gsmerge import Scene, compact
 from gsmerge.moments import unaligned_members
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.assign import Owners, find_owners, owner_pixels
@@ -39,9 +39,9 @@ def owners_equal(one: Owners, other: Owners) -> bool:
 
 @FEW
 @given(st.integers(0, 1000), st.integers(1, 300), st.sampled_from([ROOM, TURNED]))
-def test_permuted_gaussians_have_permuted_owners(seed: int, count: int, scene: PixelScene) -> None:
+def test_permuted_gaussians_have_permuted_owners(seed: int, count: int, scene: Scene) -> None:
     """Of so few no two have the same depth in float32, so that each view has one order."""
-    few = replace(loose.loosened(scene), gaussians=scene.gaussians[::8])
+    few = replace(unaligned_scenes.loosened(scene), gaussians=scene.gaussians[::8])
     order = np.random.default_rng(seed).permutation(len(few.gaussians))
     one = find_owners(few, groups(count))
     other = find_owners(replace(few, gaussians=few.gaussians[order]), groups(count))
@@ -51,7 +51,7 @@ def test_permuted_gaussians_have_permuted_owners(seed: int, count: int, scene: P
 @FEW
 @given(st.integers(1, 300), st.floats(0, 2))
 def test_each_gaussian_is_in_at_most_one_superpixel(count: int, least: float) -> None:
-    scene = loose.loosened(TURNED)
+    scene = unaligned_scenes.loosened(TURNED)
     owners = find_owners(scene, groups(count))
     members = unaligned_members(scene, owner_pixels(owners, groups(count), least))
     starts, ids, views = member_rows(scene, members, groups(count))
@@ -70,7 +70,7 @@ def test_each_gaussian_is_in_at_most_one_superpixel(count: int, least: float) ->
 def test_permuted_gaussians_merge_alike(seed: int, options: dict) -> None:
     one, other = (
         compact(scene, superpixels="10%", fit="none", **options).gaussians
-        for scene in (loose.loosened(ROOM), loose.shuffled(ROOM, seed))
+        for scene in (unaligned_scenes.loosened(ROOM), unaligned_scenes.shuffled(ROOM, seed))
     )
     assert abs(len(one) - len(other)) <= 2
     assert abs(scenes.psnr_of(one, ROOM) - scenes.psnr_of(other, ROOM)) < 0.1
@@ -81,13 +81,13 @@ def test_threads_change_no_owner(count: int) -> None:
     actual = []
     for threads in (1, 2, 8):
         with use_threads(threads):
-            actual.append(find_owners(loose.loosened(TURNED), groups(count)))
+            actual.append(find_owners(unaligned_scenes.loosened(TURNED), groups(count)))
     assert all(owners_equal(a, b) for a, b in itertools.pairwise(actual))
 
 
 @pytest.mark.parametrize("options", [{"fit_steps": 12, "budget": 150}, {"budget": "auto"}], ids=str)
 def test_threads_change_no_bit(options: dict) -> None:
-    scene = loose.voxels(ROOM, 0.06)
+    scene = unaligned_scenes.voxels(ROOM, 0.06)
     actual = [compact(scene, superpixels="10%", threads=threads, **options).gaussians for threads in (1, 2, 8)]
     assert all(scenes.identical(a, b) for a, b in itertools.pairwise(actual))
 
@@ -100,7 +100,9 @@ def test_similarity(seed: int, exponent: float) -> None:
     factor = 10.0**exponent
     transform = scenes.random_rotation(seed), factor, factor * rng.uniform(-10, 10, 3)
     moved = scenes.move(ROOM, *transform)
-    one, other = (compact(loose.loosened(scene), superpixels="10%", fit="none").gaussians for scene in (ROOM, moved))
+    one, other = (
+        compact(unaligned_scenes.loosened(scene), superpixels="10%", fit="none").gaussians for scene in (ROOM, moved)
+    )
     expected = scenes.move_gaussians(one, *transform)
     assert abs(len(one) - len(other)) <= 2
     distances = cKDTree(expected.means.astype(np.float64)).query(other.means.astype(np.float64))[0] / factor

@@ -11,7 +11,7 @@ import scenes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsmerge import Gaussians, PixelScene
+from gsmerge import Gaussians, Scene
 
 FEW = settings(max_examples=5, deadline=None, derandomize=True)
 ROOM = scenes.make_scene(scenes.room(), scenes.arc(4, 40, 30), noise=0.005)
@@ -72,7 +72,7 @@ def test_two_runs_at_once_do_not_disturb_each_other() -> None:
 
 def test_large_groups_of_tasks_change_no_bit() -> None:
     """More superpixels than one task takes."""
-    scene: PixelScene = scenes.make_scene(scenes.wall(), scenes.arc(2, 128, 96))
+    scene: Scene = scenes.make_scene(scenes.wall(), scenes.arc(2, 128, 96))
     options = {"superpixels": "45%", "k": 2, "fit": "none"}
     actual = [scenes.compacted(scene, threads=threads, **options).gaussians for threads in (1, 3)]
     assert len(actual[0]) > 8192

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import loose
 import numpy as np
 import pytest
 import scenes
+import unaligned_scenes
 
-from gsmerge import PixelScene, compact
+from gsmerge import Scene, compact
 from gsmerge.moments import scene_members
 from gsmerge.render.photos import scene_photos
 from gsmerge.stages.fit import FitOptions
@@ -17,7 +17,7 @@ from gsmerge.stages.fit.color import draw, fit_colors
 
 
 @pytest.fixture(scope="module")
-def scene() -> PixelScene:
+def scene() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(5, 32, 24), noise=0.01)
 
 
@@ -29,9 +29,7 @@ def scene() -> PixelScene:
     ],
     ids=str,
 )
-def test_one_view_at_a_time_or_all(
-    scene: PixelScene, monkeypatch: pytest.MonkeyPatch, settings: dict[str, Any]
-) -> None:
+def test_one_view_at_a_time_or_all(scene: Scene, monkeypatch: pytest.MonkeyPatch, settings: dict[str, Any]) -> None:
     actual = []
     for at_once in (1, 2, 100):
         monkeypatch.setattr("gsmerge.runtime.threads.AT_ONCE", at_once)
@@ -40,7 +38,7 @@ def test_one_view_at_a_time_or_all(
     assert scenes.identical(actual[0], actual[2])
 
 
-def test_colours_are_fitted_one_view_at_a_time_or_all(scene: PixelScene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_colours_are_fitted_one_view_at_a_time_or_all(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     gaussians, photos = scenes.plain(scene), scene_photos(scene, 2)
     drawn, actual = draw(gaussians, photos), []
     for at_once in (1, 2, 100):
@@ -58,9 +56,9 @@ def test_higher_harmonics_are_not_copied() -> None:
     assert np.shares_memory(members.shN, g.gaussians.shN)
 
 
-def test_of_many_gaussians_one_view_at_a_time(scene: PixelScene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_many_gaussians_one_view_at_a_time(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     actual = []
     for many in (0, 10**9):
         monkeypatch.setattr("gsmerge.stages.assign.ONE_AT_A_TIME", many)
-        actual.append(compact(loose.loosened(scene), fit="none", superpixels="10%", unseen="keep").gaussians)
+        actual.append(compact(unaligned_scenes.loosened(scene), fit="none", superpixels="10%", unseen="keep").gaussians)
     assert scenes.identical(actual[0], actual[1])

@@ -12,8 +12,8 @@ from renderer import render_arrays
 from gsmerge.geometry import normalize
 from gsmerge.render import contributions, plan_view, prepare
 from gsmerge.stages.assign import FIRST_PAIRS, find_owners, view_owners
-from gsmerge.stages.segment import superpixels
-from gsmerge.types import Cameras, Gaussians, Groups, UnalignedScene
+from gsmerge.stages.superpixels import superpixels
+from gsmerge.types import Cameras, Gaussians, Groups, Scene
 
 WIDTH, HEIGHT = 75, 53  # not multiples of a tile
 K = np.array([[60.0, 0, 36.3], [0, 62.0, 27.1], [0, 0, 1]])
@@ -105,7 +105,7 @@ def test_the_best_of_all_views(seed: int) -> None:
     viewmats[1, 0, 3], viewmats[2, 2, 3] = 0.7, 1.0
     cameras = Cameras(viewmats, np.stack([K] * 3), WIDTH, HEIGHT)
     labels = np.stack([some_labels(60, view) for view in range(3)])
-    scene = UnalignedScene(gaussians, cameras, None, ("a", "b", "c"))
+    scene = Scene(gaussians, cameras, None, None, ("a", "b", "c"))
     owners = find_owners(scene, Groups(labels, (60,) * 3))
     sums = np.stack([superpixel_sums(gaussians, labels[v], viewmats[v]) for v in range(3)], 1)
     assert_allclose(owners.values, sums.max((1, 2)), rtol=1e-3, atol=1e-4)
@@ -118,5 +118,5 @@ def test_of_equal_views_the_first() -> None:
     gaussians = random_gaussians(100, 3)
     cameras = Cameras(np.stack([np.eye(4)] * 4), np.stack([K] * 4), WIDTH, HEIGHT)
     labels = np.stack([some_labels(30)] * 4)
-    owners = find_owners(UnalignedScene(gaussians, cameras, None, tuple("abcd")), Groups(labels, (30,) * 4))
+    owners = find_owners(Scene(gaussians, cameras, None, None, tuple("abcd")), Groups(labels, (30,) * 4))
     assert set(owners.views.tolist()) <= {-1, 0}

@@ -10,7 +10,7 @@ from gsmerge.geometry import project
 from gsmerge.moments import Members, scene_members
 from gsmerge.networks.cross_view_stats import FAR, MIN_OPACITY, NEAR, cross_view_stats
 from gsmerge.runtime.threads import use_threads
-from gsmerge.types import SH_C0, Cameras, PixelScene
+from gsmerge.types import SH_C0, Cameras, Scene
 
 
 def slowly(means: np.ndarray, sh0: np.ndarray, views: np.ndarray, members: Members, cameras: Cameras) -> np.ndarray:
@@ -39,11 +39,11 @@ def slowly(means: np.ndarray, sh0: np.ndarray, views: np.ndarray, members: Membe
 
 
 @pytest.fixture(scope="module")
-def scene() -> PixelScene:
+def scene() -> Scene:
     return make_scene(room(), arc(4, 24, 18))
 
 
-def test_every_point_and_view(scene: PixelScene) -> None:
+def test_every_point_and_view(scene: Scene) -> None:
     """Points on surfaces, before and behind them, behind cameras, and of no view."""
     rng = np.random.default_rng(0)
     rows = rng.permutation(len(scene.gaussians))[:160]

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import scenes
 
-from gsmerge import PixelScene
+from gsmerge import Scene
 from gsmerge.moments import scene_members
-from gsmerge.stages.prepare import find_frame
+from gsmerge.stages.prepare import scene_frame
 
 UTM = np.array([4e5, 5e6, 120.0])
 
 
 @pytest.fixture(scope="module")
-def room() -> PixelScene:
+def room() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(3), noise=0.005)
 
 
@@ -24,13 +24,13 @@ def room() -> PixelScene:
 
 
 @pytest.mark.parametrize("settings", [{}, {"fit": "none"}, {"fit": "none", "match": "aabb"}], ids=str)
-def test_flyaways_do_not_disturb_the_rest(room: PixelScene, settings: dict) -> None:
+def test_flyaways_do_not_disturb_the_rest(room: Scene, settings: dict) -> None:
     means = room.gaussians.means.copy()
     rows = np.random.default_rng(0).choice(len(means), 5, replace=False)
     eyes = room.cameras.centres.repeat(room.pixels_per_view, 0)[rows]
     means[rows] = eyes + 1e5 * (means[rows] - eyes)
     scene = replace(room, gaussians=replace(room.gaussians, means=means))
-    assert find_frame(scene).unit == find_frame(room).unit
+    assert scene_frame(scene).unit == scene_frame(room).unit
     clean, actual = scenes.compacted(room, **settings), scenes.compacted(scene, **settings)
     assert abs(len(actual.gaussians) - len(clean.gaussians)) <= 2 * len(rows)
     near = actual.gaussians[np.linalg.norm(actual.gaussians.means, axis=1) < 10]
@@ -42,7 +42,7 @@ def test_flyaways_do_not_disturb_the_rest(room: PixelScene, settings: dict) -> N
 
 
 @pytest.mark.parametrize("settings", [{"fit": "none"}, {"fit": "none", "checkpoint": "none", "k": 2}], ids=str)
-def test_map_coordinates(room: PixelScene, settings: dict) -> None:
+def test_map_coordinates(room: Scene, settings: dict) -> None:
     far = scenes.move(room, np.eye(3), 1.0, UTM)
     here, there = scenes.compacted(room, **settings).gaussians, scenes.compacted(far, **settings).gaussians
     footprint = float(np.median(scene_members(room).footprints))
@@ -52,7 +52,7 @@ def test_map_coordinates(room: PixelScene, settings: dict) -> None:
     scenes.assert_same_set(here, back, atol=1e-3 * footprint + 1e-4)
 
 
-def test_map_coordinates_at_every_stage_of_the_report(room: PixelScene) -> None:
+def test_map_coordinates_at_every_stage_of_the_report(room: Scene) -> None:
     far = scenes.move(room, np.eye(3), 1.0, UTM)
     here, there = scenes.compacted(room, fit="none").report, scenes.compacted(far, fit="none").report
     assert there.psnr_before == pytest.approx(here.psnr_before, abs=0.01)
@@ -60,7 +60,7 @@ def test_map_coordinates_at_every_stage_of_the_report(room: PixelScene) -> None:
     assert ("networks" in there.choices) == ("networks" in here.choices)
 
 
-def test_map_coordinates_with_the_full_fit(room: PixelScene) -> None:
+def test_map_coordinates_with_the_full_fit(room: Scene) -> None:
     """Its steps make much of the last bit, but not of what it reaches."""
     far = scenes.move(room, np.eye(3), 1.0, UTM)
     here, there = scenes.compacted(room), scenes.compacted(far)
@@ -73,13 +73,13 @@ def test_map_coordinates_with_the_full_fit(room: PixelScene) -> None:
 
 @pytest.mark.parametrize("factor", [1e-4, 0.37, 1e4])
 @pytest.mark.parametrize("match", ["overlap", "none"])
-def test_similarity(room: PixelScene, factor: float, match: str) -> None:
+def test_similarity(room: Scene, factor: float, match: str) -> None:
     transform = scenes.random_rotation(1), factor, factor * np.array([1.0, -2.0, 3.0])
     one, other = scenes.plain(room, match=match), scenes.plain(scenes.move(room, *transform), match=match)
     scenes.assert_same_set(other, scenes.move_gaussians(one, *transform), atol=2e-4, unit=factor)
 
 
-def test_similarity_of_equal_opacities(room: PixelScene) -> None:
+def test_similarity_of_equal_opacities(room: Scene) -> None:
     """Equal weights: ties must not be broken along the world's axes."""
     even = replace(room, gaussians=replace(room.gaussians, opacities=np.full_like(room.gaussians.opacities, 0.8)))
     counts = [len(scenes.plain(even))]
@@ -89,7 +89,7 @@ def test_similarity_of_equal_opacities(room: PixelScene) -> None:
 
 
 @pytest.mark.parametrize("factor", [1e-4, 1.0, 1e4])
-def test_similarity_with_everything_on(room: PixelScene, factor: float) -> None:
+def test_similarity_with_everything_on(room: Scene, factor: float) -> None:
     moved = scenes.move(room, scenes.random_rotation(2), factor, np.zeros(3))
     for settings, most in (({"fit": "none"}, 0.1), ({}, 0.7)):
         one, other = (scenes.compacted(s, k=2, **settings) for s in (room, moved))

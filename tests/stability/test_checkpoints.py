@@ -7,14 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from learned import noisy, scaled, written
-from loose import shuffled
+from network_fixtures import noisy, scaled, written
 from safetensors.numpy import load_file, save_file
 from scenes import arc, assert_invariants, identical, make_scene, room
+from unaligned_scenes import shuffled
 
 import gsmerge
-from gsmerge.networks.modules import Networks
-from gsmerge.networks.modules import Bounds
+from gsmerge.networks.modules import Bounds, Networks
 from gsmerge.types import SH_C0
 
 PLAIN = {"fit": "none", "match": "none", "superpixels": 100}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scenes
 
-from gsmerge import Gaussians, PixelScene
+from gsmerge import Gaussians, Scene
 from gsmerge.render.photos import scene_photos
 from gsmerge.stages.fit import FitOptions
 from gsmerge.stages.fit.color import draw, fit_colors
@@ -23,21 +23,21 @@ def novel_psnr(gaussians: Gaussians, surfaces: list[scenes.Surface], start: floa
     return float(-10 * np.log10(((image - truth) ** 2).mean()))
 
 
-def painted(scene: PixelScene, images: np.ndarray) -> PixelScene:
+def painted(scene: Scene, images: np.ndarray) -> Scene:
     """With other photos, and Gaussians of their colours."""
     sh0 = ((images.reshape(-1, 1, 3) - 0.5) / SH_C0).astype(np.float32)
     return replace(scene, images=images.astype(np.float32), gaussians=replace(scene.gaussians, sh0=sh0))
 
 
 @pytest.fixture(scope="module")
-def room() -> PixelScene:
+def room() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(4), noise=0.005)
 
 
 # 29: exposure
 
 
-def test_exposure_that_changes_between_views(room: PixelScene) -> None:
+def test_exposure_that_changes_between_views(room: Scene) -> None:
     """The fit compensates; factors with geometric mean one, one merge for both."""
     assert room.images is not None
     factors = np.array([0.8, 1.2, 1 / 1.2, 1.25], np.float32)[:, None, None, None]
@@ -52,7 +52,7 @@ def test_exposure_that_changes_between_views(room: PixelScene) -> None:
     assert varied > steady - 0.2
 
 
-def test_exposure_of_photos_and_gaussians(room: PixelScene) -> None:
+def test_exposure_of_photos_and_gaussians(room: Scene) -> None:
     """The whole command: the fit never hurts, and mostly helps."""
     assert room.images is not None
     factors = np.array([0.8, 1.2, 1 / 1.2, 1.25], np.float32)[:, None, None, None]
@@ -69,7 +69,7 @@ def test_exposure_of_photos_and_gaussians(room: PixelScene) -> None:
 
 @pytest.mark.parametrize("grey", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize("segmentation", ["rdseg", "bass-st"])
-def test_flat_pictures(room: PixelScene, grey: float, segmentation: str) -> None:
+def test_flat_pictures(room: Scene, grey: float, segmentation: str) -> None:
     assert room.images is not None
     flat = painted(room, np.full_like(room.images, grey))
     result = scenes.compacted(flat, segmentation=segmentation, superpixels=60)
@@ -78,7 +78,7 @@ def test_flat_pictures(room: PixelScene, grey: float, segmentation: str) -> None
 
 
 @pytest.mark.parametrize("segmentation", ["rdseg", "bass-st"])
-def test_noise_does_not_explode(room: PixelScene, segmentation: str) -> None:
+def test_noise_does_not_explode(room: Scene, segmentation: str) -> None:
     assert room.images is not None
     noise = np.random.default_rng(0).random(room.images.shape, np.float32)
     result = scenes.compacted(painted(room, noise), segmentation=segmentation, superpixels=60)
@@ -88,7 +88,7 @@ def test_noise_does_not_explode(room: PixelScene, segmentation: str) -> None:
 # 40: view-dependent colour
 
 
-def shiny(scene: PixelScene, strength: float) -> PixelScene:
+def shiny(scene: Scene, strength: float) -> Scene:
     """Degree 3, the same strong harmonics everywhere, photos rendered from the Gaussians."""
     coefficients = np.random.default_rng(1).normal(0, strength, (1, 15, 3)).astype(np.float32)
     shN = coefficients.repeat(len(scene.gaussians), 0)
@@ -98,7 +98,7 @@ def shiny(scene: PixelScene, strength: float) -> PixelScene:
 
 
 @pytest.mark.parametrize("settings", [{}, {"fit": "none"}, {"k": 2}], ids=str)
-def test_harmonics_survive(room: PixelScene, settings: dict) -> None:
+def test_harmonics_survive(room: Scene, settings: dict) -> None:
     scene = shiny(room, 0.3)
     actual = scenes.compacted(scene, **settings).gaussians
     assert actual.sh_degree == 3
@@ -106,13 +106,13 @@ def test_harmonics_survive(room: PixelScene, settings: dict) -> None:
     assert scenes.psnr_of(actual, scene) > scenes.psnr_of(stripped, scene) + 3
 
 
-def test_equal_harmonics_stay_equal(room: PixelScene) -> None:
+def test_equal_harmonics_stay_equal(room: Scene) -> None:
     scene = shiny(room, 0.3)
     actual = scenes.plain(scene)
     np.testing.assert_allclose(actual.shN, scene.gaussians.shN[:1].repeat(len(actual), 0), atol=1e-5)
 
 
-def test_base_colours_outside_the_range_are_kept(room: PixelScene) -> None:
+def test_base_colours_outside_the_range_are_kept(room: Scene) -> None:
     """A base colour below 0 or above 1 that the harmonics bring back."""
     scene = shiny(room, 0.0)
     sh0 = scene.gaussians.sh0 - 1.5
@@ -131,7 +131,7 @@ def test_base_colours_outside_the_range_are_kept(room: PixelScene) -> None:
 # 54: something that moves
 
 
-def test_passer_by_in_one_view_does_not_haunt_the_others(room: PixelScene) -> None:
+def test_passer_by_in_one_view_does_not_haunt_the_others(room: Scene) -> None:
     """A red patch in the photo of view 1 and on its Gaussians."""
     assert room.images is not None
     images = room.images.copy()

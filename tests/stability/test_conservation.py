@@ -8,28 +8,28 @@ import numpy as np
 import pytest
 import scenes
 
-from gsmerge import Gaussians, PixelScene, UnalignedScene, compact
+from gsmerge import Gaussians, Scene, compact
 
 SCENES = {"wall": scenes.wall, "planes": scenes.two_planes, "room": scenes.room}
 
 
-def build(name: str, noise: float) -> PixelScene:
+def build(name: str, noise: float) -> Scene:
     return scenes.make_scene(SCENES[name](), scenes.arc(3, 96, 72), noise=noise)
 
 
 @pytest.fixture(scope="module", params=list(SCENES))
-def scene(request: pytest.FixtureRequest) -> PixelScene:
+def scene(request: pytest.FixtureRequest) -> Scene:
     """With the depth noise of a network."""
     return build(request.param, 0.02)
 
 
 @pytest.fixture(scope="module", params=list(SCENES))
-def clean(request: pytest.FixtureRequest) -> PixelScene:
+def clean(request: pytest.FixtureRequest) -> Scene:
     """With hardly any, so that groups are thin."""
     return build(request.param, 0.005)
 
 
-def coverage(gaussians: Gaussians, scene: PixelScene) -> tuple[float, float]:
+def coverage(gaussians: Gaussians, scene: Scene) -> tuple[float, float]:
     """Mean alpha and luma over all views."""
     images, alphas = scenes.images_of(gaussians, scene.cameras)
     return float(alphas.mean()), float((images @ np.array([0.299, 0.587, 0.114])).mean())
@@ -39,14 +39,14 @@ def coverage(gaussians: Gaussians, scene: PixelScene) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("settings", [{}, {"fit": "none", "checkpoint": "none"}], ids=str)
-def test_more_children_show_more(scene: PixelScene, settings: dict) -> None:
+def test_more_children_show_more(scene: Scene, settings: dict) -> None:
     actual = [scenes.compacted(scene, superpixels="4.4%", k=k, **settings).gaussians for k in (1, 2, 4, 8)]
     assert (np.diff([len(g) for g in actual]) > 0).all()
     assert (np.diff([scenes.psnr_of(g, scene) for g in actual]) > -0.05).all()
 
 
 @pytest.mark.parametrize("settings", [{}, {"fit": "none", "checkpoint": "none"}], ids=str)
-def test_more_superpixels_show_more(scene: PixelScene, settings: dict) -> None:
+def test_more_superpixels_show_more(scene: Scene, settings: dict) -> None:
     actual = [scenes.compacted(scene, superpixels=share, **settings).gaussians for share in ("1%", "3%", "10%")]
     assert (np.diff([len(g) for g in actual]) > 0).all()
     assert (np.diff([scenes.psnr_of(g, scene) for g in actual]) > -0.05).all()
@@ -56,7 +56,7 @@ def test_more_superpixels_show_more(scene: PixelScene, settings: dict) -> None:
 
 
 @pytest.mark.parametrize("settings", [{}, {"k": 4}, {"match": "none"}], ids=str)
-def test_photos_keep_coverage_and_brightness(scene: PixelScene, settings: dict) -> None:
+def test_photos_keep_coverage_and_brightness(scene: Scene, settings: dict) -> None:
     """The full fit, within a hundredth."""
     before = coverage(scene.gaussians, scene)
     after = coverage(scenes.compacted(scene, superpixels="4.4%", **settings).gaussians, scene)
@@ -70,7 +70,7 @@ LOSSES = {(1, 1): 0.34, (1, 4): 0.16, (3, 1): 0.23, (3, 4): 0.08}
 
 
 @pytest.mark.parametrize(("views", "k"), list(LOSSES))
-def test_plain_merging_loses_a_known_part_of_coverage(clean: PixelScene, views: int, k: int) -> None:
+def test_plain_merging_loses_a_known_part_of_coverage(clean: Scene, views: int, k: int) -> None:
     own = scenes.take_views(clean, list(range(views)))
     before = coverage(own.gaussians, own)
     after = coverage(scenes.plain(own, superpixels="4.4%", k=k), own)
@@ -78,7 +78,7 @@ def test_plain_merging_loses_a_known_part_of_coverage(clean: PixelScene, views: 
         assert (1 - LOSSES[views, k]) * old < new < 1.01 * old
 
 
-def test_merging_across_views_keeps_coverage(clean: PixelScene) -> None:
+def test_merging_across_views_keeps_coverage(clean: Scene) -> None:
     """A cluster stands for all its members: not thinner than one view alone."""
     alone = coverage(scenes.plain(scenes.take_views(clean, [0])), scenes.take_views(clean, [0]))
     together = coverage(scenes.plain(clean), scenes.take_views(clean, [0]))
@@ -89,7 +89,7 @@ def test_merging_across_views_keeps_coverage(clean: PixelScene) -> None:
 
 
 @pytest.mark.parametrize("settings", [{}, {"fit": "none"}, {"match": "none"}], ids=str)
-def test_faint_scenes_are_not_pruned(scene: PixelScene, settings: dict) -> None:
+def test_faint_scenes_are_not_pruned(scene: Scene, settings: dict) -> None:
     opacities = np.full_like(scene.gaussians.opacities, 0.05)
     faint = replace(scene, gaussians=replace(scene.gaussians, opacities=opacities))
     usual = scenes.compacted(scene, superpixels="4.4%", **settings).gaussians
@@ -98,7 +98,7 @@ def test_faint_scenes_are_not_pruned(scene: PixelScene, settings: dict) -> None:
 
 
 @pytest.mark.parametrize("match", ["overlap", "none"])
-def test_faint_scenes_keep_their_coverage(clean: PixelScene, match: str) -> None:
+def test_faint_scenes_keep_their_coverage(clean: Scene, match: str) -> None:
     """Where little is hidden, integrated optical depth is what is seen; in pictures so fine that the low-pass of the
     renderer, which thickens small Gaussians, does not count."""
     opacities = np.full_like(clean.gaussians.opacities, 0.05)
@@ -114,9 +114,9 @@ def test_faint_scenes_keep_their_coverage(clean: PixelScene, match: str) -> None
 # 46: a compact scene compacted once more
 
 
-def test_a_second_pass_neither_blurs_nor_darkens(scene: PixelScene) -> None:
+def test_a_second_pass_neither_blurs_nor_darkens(scene: Scene) -> None:
     once = scenes.compacted(scene, superpixels="4.4%").gaussians
-    loose = UnalignedScene(once, scene.cameras, scene.images, scene.names)
+    loose = Scene(once, scene.cameras, scene.images, None, scene.names)
     twice = compact(loose, budget=len(once)).gaussians
     assert 0.95 * len(once) <= len(twice) <= len(once)  # what the pull on opacities has faded goes
     assert scenes.psnr_of(twice, scene) > scenes.psnr_of(once, scene) - 0.2

@@ -8,44 +8,44 @@ import numpy as np
 import pytest
 import scenes
 
-from gsmerge import Gaussians, PixelScene
+from gsmerge import Gaussians, Scene
 from gsmerge.geometry import covariances, project, quat_to_rotmat
 from gsmerge.moments import feature_to_gaussians, scene_members
-from gsmerge.stages.encode import EncodeOptions, encode
-from gsmerge.types import FeatureGaussians, Groups
+from gsmerge.stages.encode import encode
+from gsmerge.types import FeatureGaussians, Groups, grid_ids
 
 
 @pytest.fixture(scope="module")
-def room() -> PixelScene:
+def room() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(3), noise=0.005)
 
 
 @pytest.fixture(scope="module")
-def small() -> PixelScene:
+def small() -> Scene:
     return scenes.make_scene(scenes.wall(), scenes.arc(1, 16, 12))
 
 
-def changed(scene: PixelScene, **columns: np.ndarray) -> PixelScene:
+def changed(scene: Scene, **columns: np.ndarray) -> Scene:
     return replace(scene, gaussians=replace(scene.gaussians, **columns))
 
 
-def one_group_per_view(scene: PixelScene) -> FeatureGaussians:
+def one_group_per_view(scene: Scene) -> FeatureGaussians:
     labels = np.zeros(scene.valid.shape, np.int32)
-    return encode(scene, scene_members(scene), Groups(labels, (1,) * len(scene)), EncodeOptions())
+    return encode(scene, scene_members(scene), Groups(labels, (1,) * len(scene)))
 
 
 # 1: coincident Gaussians
 
 
 @pytest.mark.parametrize("settings", [{}, {"match": "aabb"}, {"fit": "none"}, {"fit": "none", "k": 4}], ids=str)
-def test_all_gaussians_in_one_place(room: PixelScene, settings: dict) -> None:
+def test_all_gaussians_in_one_place(room: Scene, settings: dict) -> None:
     columns = {name: getattr(room.gaussians, name) for name in scenes.FIELDS}
     first = {name: np.broadcast_to(column[:1], column.shape) for name, column in columns.items()}
     means = np.broadcast_to([0.0, 0.0, 3.0], room.gaussians.means.shape)
     scenes.compacted(changed(room, **{**first, "means": means}), **settings)
 
 
-def test_coincident_members_stack(small: PixelScene) -> None:
+def test_coincident_members_stack(small: Scene) -> None:
     count = small.pixels_per_view
     same = {name: getattr(small.gaussians, name)[:1].repeat(count, 0) for name in scenes.FIELDS}
     same["opacities"] = np.full(count, 0.02, np.float32)
@@ -63,7 +63,7 @@ def test_coincident_members_stack(small: PixelScene) -> None:
 # 2: one member is left as it is
 
 
-def test_every_pixel_its_own_superpixel(small: PixelScene) -> None:
+def test_every_pixel_its_own_superpixel(small: Scene) -> None:
     actual = scenes.plain(small, superpixels="100%")
     order = np.linalg.norm(small.gaussians.means[:, None] - actual.means, axis=-1).argmin(1)
     assert len(np.unique(order)) == len(actual) == len(small.gaussians)
@@ -82,7 +82,7 @@ def test_every_pixel_its_own_superpixel(small: PixelScene) -> None:
 
 
 @pytest.mark.parametrize("axes", [[0], [0, 1]], ids=["line", "sheet"])
-def test_flat_groups_have_a_smallest_scale(small: PixelScene, axes: list[int]) -> None:
+def test_flat_groups_have_a_smallest_scale(small: Scene, axes: list[int]) -> None:
     means = np.tile([0.0, 0.0, 3.0], (len(small.gaussians), 1))
     means[:, axes] = small.gaussians.means[:, axes]
     scene = changed(small, means=means, scales=np.full_like(small.gaussians.scales, 1e-9))
@@ -97,9 +97,9 @@ def test_flat_groups_have_a_smallest_scale(small: PixelScene, axes: list[int]) -
 
 
 @pytest.mark.parametrize("size", [2, 3, 4, 16])
-def test_needle_in_a_group(small: PixelScene, size: int) -> None:
+def test_needle_in_a_group(small: Scene, size: int) -> None:
     """Aspect 1e4: the merged Gaussian keeps within three times the group's extent."""
-    scene = replace(small, valid=np.zeros_like(small.valid))
+    scene = replace(small, pixel_ids=grid_ids(np.zeros_like(small.valid)))
     scene.valid.reshape(-1)[:size] = True
     scales = scene.gaussians.scales.copy()
     scales[0, 0] *= 1e4
@@ -108,7 +108,7 @@ def test_needle_in_a_group(small: PixelScene, size: int) -> None:
     assert float(actual.scales.max()) <= 3 * extent
 
 
-def test_needles_hardly_show(room: PixelScene) -> None:
+def test_needles_hardly_show(room: Scene) -> None:
     scales = room.gaussians.scales.copy()
     scales[::40, 0] *= 1e4
     clean, actual = scenes.plain(room), scenes.plain(changed(room, scales=scales))
@@ -116,7 +116,7 @@ def test_needles_hardly_show(room: PixelScene) -> None:
 
 
 @pytest.mark.parametrize("settings", [{}, {"fit": "none"}, {"fit": "none", "k": 4}], ids=str)
-def test_scales_at_the_ends_of_the_range(room: PixelScene, settings: dict) -> None:
+def test_scales_at_the_ends_of_the_range(room: Scene, settings: dict) -> None:
     scales = room.gaussians.scales.copy()
     scales[::30] = 2e17  # exp(40)
     scales[7::30] = 4e-18  # exp(-40)
@@ -124,7 +124,7 @@ def test_scales_at_the_ends_of_the_range(room: PixelScene, settings: dict) -> No
     scenes.compacted(changed(room, scales=scales), **settings)
 
 
-def test_oversized_members_cost_less_than_a_decibel(room: PixelScene) -> None:
+def test_oversized_members_cost_less_than_a_decibel(room: Scene) -> None:
     rng = np.random.default_rng(0)
     scales = room.gaussians.scales.copy()
     rows = rng.choice(len(scales), len(scales) // 100, replace=False)
@@ -138,7 +138,7 @@ def test_oversized_members_cost_less_than_a_decibel(room: PixelScene) -> None:
 
 
 @pytest.mark.parametrize("k", [1, 4])
-def test_transparent_pixels_leave_nothing(room: PixelScene, k: int) -> None:
+def test_transparent_pixels_leave_nothing(room: Scene, k: int) -> None:
     opacities = room.gaussians.opacities.copy().reshape(room.valid.shape)
     opacities[0] = 0
     half = replace(changed(room, opacities=opacities.reshape(-1)), images=None)  # photos would prune what view 0 hides
@@ -149,33 +149,33 @@ def test_transparent_pixels_leave_nothing(room: PixelScene, k: int) -> None:
 
 @pytest.mark.parametrize("fit", ["none", "full"])
 @pytest.mark.parametrize("opacity", [0.0, 1e-5])
-def test_wholly_transparent_scene(room: PixelScene, opacity: float, fit: str) -> None:
+def test_wholly_transparent_scene(room: Scene, opacity: float, fit: str) -> None:
     scene = changed(room, opacities=np.full_like(room.gaussians.opacities, opacity))
     scenes.compacted(scene, fit=fit)
 
 
-def test_wholly_opaque_scene(room: PixelScene) -> None:
+def test_wholly_opaque_scene(room: Scene) -> None:
     scenes.compacted(changed(room, opacities=np.ones_like(room.gaussians.opacities)))
 
 
 # 10, 11: quaternions
 
 
-def test_sign_and_length_of_quaternions_do_not_matter(room: PixelScene) -> None:
+def test_sign_and_length_of_quaternions_do_not_matter(room: Scene) -> None:
     rng = np.random.default_rng(0)
     factors = (rng.choice([-1, 1], (len(room.gaussians), 1)) * rng.uniform(0.01, 100)).astype(np.float32)
     before, after = scenes.plain(room), scenes.plain(changed(room, quats=room.gaussians.quats * factors))
     scenes.assert_same_set(before, after, atol=1e-5)
 
 
-def test_zero_quaternions_mean_no_rotation(room: PixelScene) -> None:
+def test_zero_quaternions_mean_no_rotation(room: Scene) -> None:
     zero, one = room.gaussians.quats.copy(), room.gaussians.quats.copy()
     zero[::3], one[::3] = 0, [1, 0, 0, 0]
     a, b = (scenes.compacted(changed(room, quats=q), fit="none").gaussians for q in (zero, one))
     scenes.assert_same_set(a, b, atol=1e-6)
 
 
-def test_tiny_changes_make_tiny_changes(room: PixelScene) -> None:
+def test_tiny_changes_make_tiny_changes(room: Scene) -> None:
     """Axes may flip, covariances must not."""
     nudge = np.random.default_rng(0).normal(0, 1e-7, room.gaussians.means.shape)
     moved = changed(room, means=room.gaussians.means + nudge)
@@ -187,7 +187,7 @@ def test_tiny_changes_make_tiny_changes(room: PixelScene) -> None:
 # 14: something huge and near
 
 
-def test_huge_gaussian_in_front_of_one_camera(room: PixelScene) -> None:
+def test_huge_gaussian_in_front_of_one_camera(room: Scene) -> None:
     """In the corner of view 0; the others must not notice."""
     means, scales = room.gaussians.means.copy(), room.gaussians.scales.copy()
     eye = room.cameras.centres[0]
@@ -201,7 +201,7 @@ def test_huge_gaussian_in_front_of_one_camera(room: PixelScene) -> None:
 
 @pytest.mark.parametrize("where", ["at", "behind"])
 @pytest.mark.parametrize("settings", [{}, {"fit": "none"}, {"fit": "none", "k": 4}], ids=str)
-def test_pixels_at_and_behind_their_own_eye(room: PixelScene, where: str, settings: dict) -> None:
+def test_pixels_at_and_behind_their_own_eye(room: Scene, where: str, settings: dict) -> None:
     """A tenth of every view, superpixels as a whole among them."""
     means = room.gaussians.means.copy().reshape(3, 36, 48, 3)
     eyes = room.cameras.centres[:, None, None]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scenes
 
-from gsmerge import PixelScene, UnalignedScene, compact
+from gsmerge import Scene, compact
 from gsmerge.errors import UsageError
 
 VIEWS = 4
@@ -17,16 +17,16 @@ PLAIN = {"fit": "none", "checkpoint": "none"}
 
 
 @pytest.fixture(scope="module")
-def room() -> PixelScene:
+def room() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(VIEWS, 32, 24), noise=0.005)
 
 
-def unaligned(scene: PixelScene) -> UnalignedScene:
-    return UnalignedScene(scene.gaussians, scene.cameras, scene.images, scene.names)
+def unaligned(scene: Scene) -> Scene:
+    return Scene(scene.gaussians, scene.cameras, scene.images, None, scene.names)
 
 
 @pytest.mark.parametrize("settings", [PLAIN, {"fit": "none"}, {"fit_steps": 20}, {"k": 4, **PLAIN}], ids=str)
-def test_the_smallest_budget(room: PixelScene, settings: dict[str, Any]) -> None:
+def test_the_smallest_budget(room: Scene, settings: dict[str, Any]) -> None:
     """One Gaussian for each view: met, visible, in the colours of the scene; and one fewer is refused."""
     result = scenes.compacted(room, superpixels="auto", budget=VIEWS, **settings)
     assert len(result.gaussians) == VIEWS
@@ -40,14 +40,14 @@ def test_the_smallest_budget(room: PixelScene, settings: dict[str, Any]) -> None
 
 
 @pytest.mark.parametrize("settings", [PLAIN, {"fit": "none"}, {"fit_steps": 20}], ids=str)
-def test_a_budget_of_everything(room: PixelScene, settings: dict[str, Any]) -> None:
+def test_a_budget_of_everything(room: Scene, settings: dict[str, Any]) -> None:
     """Every pixel its own: as many as the input, and as good."""
     result = scenes.compacted(room, superpixels="auto", budget="100%", match="none", **settings)
     assert len(result.gaussians) == room.num_gaussians
     assert scenes.psnr_of(result.gaussians, room) > scenes.psnr_of(room.gaussians, room) - 0.1
 
 
-def test_a_budget_of_every_unaligned_gaussian_changes_none(room: PixelScene) -> None:
+def test_a_budget_of_every_unaligned_gaussian_changes_none(room: Scene) -> None:
     result = compact(unaligned(room), budget="100%", **PLAIN)
     assert scenes.identical(result.gaussians, compact(unaligned(room), budget=room.num_gaussians, **PLAIN).gaussians)
     np.testing.assert_allclose(result.gaussians.means, room.gaussians.means, atol=1e-6)
@@ -57,7 +57,7 @@ def test_a_budget_of_every_unaligned_gaussian_changes_none(room: PixelScene) -> 
 @pytest.mark.parametrize("aligned", [True, False], ids=["aligned", "unaligned"])
 @pytest.mark.parametrize("budget", [5, 97, 500, 1501])
 @pytest.mark.parametrize("settings", [{}, PLAIN, {"k": 2}, {"k": 8, **PLAIN}, {"segmentation": "grid"}], ids=str)
-def test_budgets_without_a_fit_are_met(room: PixelScene, budget: int, settings: dict[str, Any], aligned: bool) -> None:
+def test_budgets_without_a_fit_are_met(room: Scene, budget: int, settings: dict[str, Any], aligned: bool) -> None:
     scene = room if aligned else unaligned(room)
     result = compact(scene, budget=budget, **{"fit": "none", **settings})
     assert len(result.gaussians) == result.report.num_output == budget

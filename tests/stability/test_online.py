@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 import scenes
-from arriving import fed, parts_of, state_of
 from safetensors.numpy import load_file, save_file
+from view_batches import fed, parts_of, state_of
 
-from gsmerge import Compactor, PixelScene, SceneError
+from gsmerge import Compactor, Scene, SceneError
 from gsmerge.encoded.gsm_file import SCHEMA
 
 SHAPES = {"room": scenes.room, "wall": scenes.wall, "planes": scenes.two_planes}
@@ -20,23 +20,23 @@ FULL = {"fit": "full", "fit_steps": 30}
 
 
 @pytest.fixture(scope="module")
-def made() -> list[PixelScene]:
+def made() -> list[Scene]:
     """Three scenes of six views."""
     return [scenes.make_scene(shape(), scenes.arc(6, 48, 36), noise=0.005) for shape in SHAPES.values()]
 
 
-def psnrs(compactors: Sequence[Compactor], made: Sequence[PixelScene], **wish: Any) -> np.ndarray:
+def psnrs(compactors: Sequence[Compactor], made: Sequence[Scene], **wish: Any) -> np.ndarray:
     """PSNR (dB) of each over all of its scene's views, those of later batches and of earlier ones."""
     return np.array([scenes.psnr_of(c.decode(**wish), scene) for c, scene in zip(compactors, made, strict=True)])
 
 
 @pytest.fixture(scope="module")
-def forward(made: list[PixelScene]) -> list[Compactor]:
+def forward(made: list[Scene]) -> list[Compactor]:
     return [fed(parts_of(scene, 2)) for scene in made]
 
 
 @pytest.fixture(scope="module")
-def whole(made: list[PixelScene]) -> list[Compactor]:
+def whole(made: list[Scene]) -> list[Compactor]:
     """All views at once."""
     return [fed([scene]) for scene in made]
 
@@ -44,7 +44,7 @@ def whole(made: list[PixelScene]) -> list[Compactor]:
 # 53: the same batch twice
 
 
-def test_a_batch_fed_twice(made: list[PixelScene], whole: list[Compactor]) -> None:
+def test_a_batch_fed_twice(made: list[Scene], whole: list[Compactor]) -> None:
     """Count within 2 %, quality within 0.2 dB in every scene."""
     twice = [fed([scene, scene]) for scene in made]
     for one, two in zip(whole, twice, strict=True):
@@ -54,7 +54,7 @@ def test_a_batch_fed_twice(made: list[PixelScene], whole: list[Compactor]) -> No
         assert difference.min() > -0.2, wish
 
 
-def test_batches_fed_again_and_again(made: list[PixelScene]) -> None:
+def test_batches_fed_again_and_again(made: list[Scene]) -> None:
     """Three times over all batches: what is there is enough after the first."""
     batches = parts_of(made[0], 2)
     rounds = [len(fed(batches * times)) for times in (1, 2, 3)]
@@ -66,7 +66,7 @@ def test_batches_fed_again_and_again(made: list[PixelScene]) -> None:
 
 
 @pytest.mark.parametrize("wish", [{"fit": "none"}, FULL], ids=str)
-def test_batches_in_reverse(wish: dict[str, Any], made: list[PixelScene], forward: list[Compactor]) -> None:
+def test_batches_in_reverse(wish: dict[str, Any], made: list[Scene], forward: list[Compactor]) -> None:
     """Within 0.2 dB on average over the scenes, 0.5 dB in each: tiny ones, of some 260 Gaussians."""
     backward = [fed(parts_of(scene, 2, backwards=True)) for scene in made]
     for one, other in zip(forward, backward, strict=True):
@@ -80,7 +80,7 @@ def test_batches_in_reverse(wish: dict[str, Any], made: list[PixelScene], forwar
 
 
 @pytest.mark.parametrize("size", [1, 2, 3])
-def test_batches_of_any_size(size: int, made: list[PixelScene], whole: list[Compactor]) -> None:
+def test_batches_of_any_size(size: int, made: list[Scene], whole: list[Compactor]) -> None:
     """For as many Gaussians, no more than 0.3 dB below all views at once, on average over the scenes.
 
     The fewer the groups that batches leave, the more of these are divided: equal numbers are what compares.
@@ -96,7 +96,7 @@ def test_batches_of_any_size(size: int, made: list[PixelScene], whole: list[Comp
 
 
 def test_as_they_come_batches_need_no_more_gaussians(
-    made: list[PixelScene], whole: list[Compactor], forward: list[Compactor], floor: Callable[..., None]
+    made: list[Scene], whole: list[Compactor], forward: list[Compactor], floor: Callable[..., None]
 ) -> None:
     """Decoded at K = 1, pairs of views give fewer Gaussians than all at once, and are hardly worse."""
     assert all(0.8 * len(one) < len(two) < len(one) for one, two in zip(whole, forward, strict=True))
@@ -120,7 +120,7 @@ def test_a_file_of_another_version_is_refused(forward: list[Compactor], tmp_path
         Compactor.load(path)
 
 
-def test_the_same_views_again_are_none_that_are_new(made: list[PixelScene], tmp_path: Path) -> None:
+def test_the_same_views_again_are_none_that_are_new(made: list[Scene], tmp_path: Path) -> None:
     """Neither their cameras nor their photos are kept twice, so that a limit on photos leaves room for others."""
     one, two = (fed([made[0]] * times, replay=6) for times in (1, 2))
     assert len(state_of(two).cameras) == 6

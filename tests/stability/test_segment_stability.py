@@ -12,7 +12,8 @@ from segmentation_scores import DENSITIES, count_at, photos, proxy_psnr, splat_p
 from gsmerge.kernels.superpixels.regions import pad_labels, region_rows
 from gsmerge.kernels.superpixels.sweeps import refine
 from gsmerge.runtime.threads import use_threads
-from gsmerge.stages.segment import SEGMENTATIONS, SegmentOptions, segment, superpixels
+from gsmerge.stages.segment import SegmentOptions, segment
+from gsmerge.stages.superpixels import SEGMENTATIONS, superpixels
 
 
 @pytest.mark.parametrize("segmentation", SEGMENTATIONS)
@@ -80,5 +81,7 @@ def test_splits_and_merges_pay() -> None:
 def test_presets_trade_time_for_quality() -> None:
     image = photos()["china"]
     count = count_at(image, 12_000)
-    scores = [proxy_psnr(image, superpixels(image, count, effort=effort)) for effort in ("fast", "default", "best")]
+    scores = [
+        proxy_psnr(image, superpixels(image, count, rectangles=r, early_sweeps=e)) for r, e in ((1, 0), (2, 0), (3, 1))
+    ]
     assert scores == sorted(scores)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import scenes
 
-from gsmerge import CompactResult, Gaussians, PixelScene, UnalignedScene, compact
+from gsmerge import CompactResult, Gaussians, Scene, compact
 from gsmerge.stages.check_photos import odd_photos
 from gsmerge.stages.fit import FitOptions, fit_photos
 
@@ -71,19 +71,19 @@ SPOILT = [
 
 
 @pytest.fixture(scope="module")
-def room() -> PixelScene:
+def room() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(VIEWS, 96, 72), noise=0.005)
 
 
 @pytest.fixture(scope="module")
-def unspoilt(room: PixelScene) -> CompactResult:
+def unspoilt(room: Scene) -> CompactResult:
     return compact(room, **FIT)
 
 
-def with_photos(room: PixelScene, change: Callable[[Photos], Photos], *, aligned: bool = True) -> Any:
+def with_photos(room: Scene, change: Callable[[Photos], Photos], *, aligned: bool = True) -> Any:
     assert room.images is not None
     scene = replace(room, images=change(room.images))
-    return scene if aligned else UnalignedScene(scene.gaussians, scene.cameras, scene.images, scene.names)
+    return scene if aligned else Scene(scene.gaussians, scene.cameras, scene.images, None, scene.names)
 
 
 def novel_psnr(gaussians: Gaussians) -> float:
@@ -96,7 +96,7 @@ def novel_psnr(gaussians: Gaussians) -> float:
 
 @pytest.mark.parametrize("aligned", [True, False], ids=["aligned", "unaligned"])
 @pytest.mark.parametrize(("change", "odd"), SPOILT, ids=lambda case: getattr(case, "__name__", None))
-def test_they_are_found(room: PixelScene, change: Callable[[Photos], Photos], odd: list[int], aligned: bool) -> None:
+def test_they_are_found(room: Scene, change: Callable[[Photos], Photos], odd: list[int], aligned: bool) -> None:
     assert odd_photos(with_photos(room, change, aligned=aligned)) == odd
 
 
@@ -120,12 +120,12 @@ def shifted(photos: Photos) -> Photos:
 
 @pytest.mark.parametrize("aligned", [True, False], ids=["aligned", "unaligned"])
 @pytest.mark.parametrize("change", [lambda photos: photos, darker, overexposed, tinted, shifted])
-def test_right_ones_stay(room: PixelScene, change: Callable[[Photos], Photos], aligned: bool) -> None:
+def test_right_ones_stay(room: Scene, change: Callable[[Photos], Photos], aligned: bool) -> None:
     assert odd_photos(with_photos(room, change, aligned=aligned)) == []
 
 
 @pytest.mark.parametrize("aligned", [True, False], ids=["aligned", "unaligned"])
-def test_gaussians_that_show_nothing_cannot_tell(room: PixelScene, aligned: bool) -> None:
+def test_gaussians_that_show_nothing_cannot_tell(room: Scene, aligned: bool) -> None:
     flat = replace(room, gaussians=replace(room.gaussians, sh0=np.zeros_like(room.gaussians.sh0)))
     if aligned:  # drawn, edges and gaps show
         assert odd_photos(with_photos(flat, all_noise, aligned=aligned)) == []
@@ -133,14 +133,12 @@ def test_gaussians_that_show_nothing_cannot_tell(room: PixelScene, aligned: bool
     assert odd_photos(with_photos(tiny, np.zeros_like, aligned=aligned)) == []
 
 
-def test_a_view_given_twice_is_no_swap(room: PixelScene) -> None:
+def test_a_view_given_twice_is_no_swap(room: Scene) -> None:
     assert odd_photos(scenes.take_views(room, [0, 1, 1, 2, 3])) == []
 
 
 @pytest.mark.parametrize("change", [swapped, one_black, one_of_noise, one_of_another_scene])
-def test_the_fit_does_without_some(
-    room: PixelScene, unspoilt: CompactResult, change: Callable[[Photos], Photos]
-) -> None:
+def test_the_fit_does_without_some(room: Scene, unspoilt: CompactResult, change: Callable[[Photos], Photos]) -> None:
     """Nearly as good as with all photos, and as the input; the note and the report name them."""
     odd = dict(SPOILT)[change]
     result = compact(with_photos(room, change), **FIT)
@@ -155,9 +153,7 @@ def test_the_fit_does_without_some(
 
 @pytest.mark.parametrize("change", [all_black, all_noise, moved_on, another_scene])
 @pytest.mark.parametrize("settings", [{}, {"budget": 500}, {"budget": "auto"}], ids=str)
-def test_no_fit_where_most_are_wrong(
-    room: PixelScene, change: Callable[[Photos], Photos], settings: dict[str, Any]
-) -> None:
+def test_no_fit_where_most_are_wrong(room: Scene, change: Callable[[Photos], Photos], settings: dict[str, Any]) -> None:
     """As where there are no photos."""
     wanted = {**FIT, **settings}
     result, without = (compact(one, **wanted) for one in (with_photos(room, change), replace(room, images=None)))
@@ -170,7 +166,7 @@ def test_no_fit_where_most_are_wrong(
         assert scenes.identical(result.gaussians, without.gaussians)
 
 
-def test_unaligned_gaussians_without_a_fit(room: PixelScene) -> None:
+def test_unaligned_gaussians_without_a_fit(room: Scene) -> None:
     """As where there are no photos and no fit is asked for."""
     scene = with_photos(room, all_black, aligned=False)
     result, without = compact(scene, **FIT), compact(replace(scene, images=None), **FIT, fit="none")
@@ -179,7 +175,7 @@ def test_unaligned_gaussians_without_a_fit(room: PixelScene) -> None:
 
 
 @pytest.mark.parametrize("aligned", [True, False], ids=["aligned", "unaligned"])
-def test_sky_stays_where_most_are_wrong(room: PixelScene, aligned: bool) -> None:
+def test_sky_stays_where_most_are_wrong(room: Scene, aligned: bool) -> None:
     scene = with_photos(room, all_black, aligned=aligned)
     whole, same = (compact(scene, **FIT, drop_sky=drop_sky) for drop_sky in (False, True))
     assert scenes.identical(whole.gaussians, same.gaussians)
@@ -189,7 +185,7 @@ def test_sky_stays_where_most_are_wrong(room: PixelScene, aligned: bool) -> None
     assert "clean" not in same.report.choices
 
 
-def test_an_unaligned_scene_does_without_one(room: PixelScene) -> None:
+def test_an_unaligned_scene_does_without_one(room: Scene) -> None:
     right, wrong = (
         compact(with_photos(room, change, aligned=False), **FIT) for change in (lambda photos: photos, one_black)
     )
@@ -202,7 +198,7 @@ def test_no_note_on_good_photos(unspoilt: CompactResult) -> None:
     assert "photos_left_out" not in unspoilt.report.choices
 
 
-def test_the_views_of_a_fit(room: PixelScene) -> None:
+def test_the_views_of_a_fit(room: Scene) -> None:
     full, half = fit_photos(room, FitOptions(), (0, 2, 5))
     assert room.images is not None
     np.testing.assert_array_equal(full.images, room.images[[0, 2, 5]])
@@ -210,7 +206,7 @@ def test_the_views_of_a_fit(room: PixelScene) -> None:
     np.testing.assert_array_equal(half.viewmats, room.cameras.viewmats[[0, 2, 5]])
 
 
-def test_the_quality_asked_for_is_that_of_the_others(room: PixelScene) -> None:
+def test_the_quality_asked_for_is_that_of_the_others(room: Scene) -> None:
     """A black photo would keep any result from it."""
     result = compact(with_photos(room, one_black), quality="22dB", **FIT)
     assert result.report.unmet is None

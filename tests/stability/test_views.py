@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import scenes
 
-from gsmerge import Cameras, PixelScene
+from gsmerge import Cameras, Scene
 from gsmerge.online.photos import concat_cameras
 
 
 @pytest.fixture(scope="module")
-def room() -> PixelScene:
+def room() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(3), noise=0.005)
 
 
@@ -21,21 +21,21 @@ def room() -> PixelScene:
 
 
 @pytest.mark.parametrize("times", [2, 3, 6])
-def test_repeated_view_counts_once(room: PixelScene, times: int) -> None:
+def test_repeated_view_counts_once(room: Scene, times: int) -> None:
     single, repeated = scenes.take_views(room, [0]), scenes.take_views(room, [0] * times)
     one, many = scenes.plain(single), scenes.plain(repeated)
     assert len(many) <= 1.05 * len(one)
 
 
 @pytest.mark.parametrize("times", [2, 3, 6])
-def test_repeated_view_looks_the_same(room: PixelScene, times: int) -> None:
+def test_repeated_view_looks_the_same(room: Scene, times: int) -> None:
     """Layers add up, so coverage may only grow."""
     single, repeated = scenes.take_views(room, [0]), scenes.take_views(room, [0] * times)
     one, many = scenes.plain(single), scenes.plain(repeated)
     assert scenes.psnr_of(many, single) > scenes.psnr_of(one, single) - 0.2
 
 
-def test_repeated_view_with_the_full_fit(room: PixelScene) -> None:
+def test_repeated_view_with_the_full_fit(room: Scene) -> None:
     """It grows to the number asked for, however few are left to begin with."""
     single, repeated = scenes.take_views(room, [0]), scenes.take_views(room, [0] * 3)
     one, many = scenes.compacted(single), scenes.compacted(repeated)
@@ -60,7 +60,7 @@ def test_pure_rotation() -> None:
 # 23: one view
 
 
-def test_single_view(room: PixelScene) -> None:
+def test_single_view(room: Scene) -> None:
     single = scenes.take_views(room, [1])
     matched, apart = scenes.compacted(single), scenes.compacted(single, match="none")
     for name in scenes.FIELDS:
@@ -93,18 +93,18 @@ def test_disjoint_views_are_merged_like_single_ones() -> None:
 
 @pytest.mark.parametrize("order", [[2, 0, 1], [1, 0, 2]])
 @pytest.mark.parametrize("k", [1, 2])
-def test_order_of_views_does_not_matter(room: PixelScene, order: list[int], k: int) -> None:
+def test_order_of_views_does_not_matter(room: Scene, order: list[int], k: int) -> None:
     one, other = scenes.plain(room, k=k), scenes.plain(scenes.take_views(room, order), k=k)
     scenes.assert_same_set(one, other, atol=1e-4)
 
 
-def test_order_of_views_does_not_matter_to_the_choice_of_start(room: PixelScene) -> None:
+def test_order_of_views_does_not_matter_to_the_choice_of_start(room: Scene) -> None:
     one, other = scenes.compacted(room, fit="none"), scenes.compacted(scenes.take_views(room, [2, 0, 1]), fit="none")
     assert ("networks" in one.report.choices) == ("networks" in other.report.choices)
     scenes.assert_same_set(one.gaussians, other.gaussians, atol=1e-3)
 
 
-def test_order_of_views_hardly_matters_to_the_fit(room: PixelScene) -> None:
+def test_order_of_views_hardly_matters_to_the_fit(room: Scene) -> None:
     """Other blocks are held out, and the fit looks at the views in another order."""
     one, other = (scenes.compacted(s) for s in (room, scenes.take_views(room, [2, 0, 1])))
     assert len(one.gaussians) == len(other.gaussians)
@@ -114,7 +114,7 @@ def test_order_of_views_hardly_matters_to_the_fit(room: PixelScene) -> None:
 # 27: wrong poses
 
 
-def misplaced(scene: PixelScene, degrees: float) -> PixelScene:
+def misplaced(scene: Scene, degrees: float) -> Scene:
     """Views 1 and 2 with their Gaussians turned about their own eyes, one to either side."""
     means, viewmats = scene.gaussians.means.copy().reshape(3, -1, 3), scene.cameras.viewmats.copy()
     for view, sign in ((1, 1), (2, -1)):
@@ -133,7 +133,7 @@ def misplaced(scene: PixelScene, degrees: float) -> PixelScene:
 DEGREES = (0.0, 0.2, 1.0, 5.0, 20.0)
 
 
-def test_wrong_poses_degrade_step_by_step(room: PixelScene) -> None:
+def test_wrong_poses_degrade_step_by_step(room: Scene) -> None:
     """Where they stay. Where photos move them they are no worse, and much better where they were worst."""
     wrong = [misplaced(room, degrees) for degrees in DEGREES[:4]]
     fixed, auto = (
@@ -146,7 +146,7 @@ def test_wrong_poses_degrade_step_by_step(room: PixelScene) -> None:
 
 
 @pytest.mark.parametrize("degrees", DEGREES)
-def test_fit_never_hurts_under_wrong_poses(room: PixelScene, degrees: float) -> None:
+def test_fit_never_hurts_under_wrong_poses(room: Scene, degrees: float) -> None:
     scene = misplaced(room, degrees)
     fitted, unfitted = (scenes.compacted(scene, fit=fit) for fit in ("full", "none"))
     fit = fitted.report.choices["fit"]

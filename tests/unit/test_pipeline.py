@@ -7,20 +7,20 @@ import pytest
 import scenes
 import torch
 
-from gsmerge import CompactOptions, PixelScene, compact
+from gsmerge import CompactOptions, Scene, compact
 from gsmerge.runtime.record import STAGES
-from gsmerge.stages.segment import SEGMENTATIONS
+from gsmerge.stages.superpixels import SEGMENTATIONS
 
 USUAL = [stage for stage in STAGES if stage not in ("curve", "reduce", "members", "refine", "cover", "choose", "join")]
 UNFITTED = {"fit": "none", "checkpoint": "none"}
 
 
 @pytest.fixture(scope="module")
-def scene() -> PixelScene:
+def scene() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24), noise=0.01)
 
 
-def test_report(scene: PixelScene) -> None:
+def test_report(scene: Scene) -> None:
     result = scenes.compacted(scene)
     report = result.report
     assert report.num_input == 3 * 32 * 24
@@ -33,7 +33,7 @@ def test_report(scene: PixelScene) -> None:
     assert report.options["superpixels"] == "10%"
 
 
-def test_the_input_is_scored_as_its_file_has_it(scene: PixelScene) -> None:
+def test_the_input_is_scored_as_its_file_has_it(scene: Scene) -> None:
     """What was put back from depth maps is merged, but is not the input's."""
     missing = np.zeros_like(scene.valid)
     missing[:, 6:18, 8:24] = True
@@ -45,7 +45,7 @@ def test_the_input_is_scored_as_its_file_has_it(scene: PixelScene) -> None:
     assert before.psnr_after > before.psnr_before
 
 
-def test_many_views_are_scored_by_some(scene: PixelScene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_views_are_scored_by_some(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of both the same ones, and it is said."""
     monkeypatch.setattr("gsmerge.views.REPORT_VIEWS", 1)
     result = scenes.compacted(scene, fit="none")
@@ -58,13 +58,13 @@ def test_many_views_are_scored_by_some(scene: PixelScene, monkeypatch: pytest.Mo
     assert better.report.choices["scored_views"] == len(scene)
 
 
-def test_more_gaussians_are_fitted_in_more_steps(scene: PixelScene) -> None:
+def test_more_gaussians_are_fitted_in_more_steps(scene: Scene) -> None:
     few, many = (scenes.compacted(scene, effort="draft", superpixels=share).report for share in ("4%", "9.9%"))
     assert (few.options["fit_steps"], few.choices["fit"]["steps"]) == (30, 30)
     assert (many.options["fit_steps"], many.choices["fit"]["steps"]) == (45, 45)
 
 
-def test_progress_tells_every_stage(scene: PixelScene) -> None:
+def test_progress_tells_every_stage(scene: Scene) -> None:
     calls: list[tuple[str, int, int]] = []
     compact(scene, **UNFITTED, progress=lambda *call: calls.append(call))
     assert [name for name, _, _ in calls] == [*USUAL, "done"]
@@ -72,7 +72,7 @@ def test_progress_tells_every_stage(scene: PixelScene) -> None:
     assert {total for _, _, total in calls} == {len(STAGES)}
 
 
-def test_progress_tells_every_step_of_the_full_fit(scene: PixelScene) -> None:
+def test_progress_tells_every_step_of_the_full_fit(scene: Scene) -> None:
     calls: list[tuple[str, int, int]] = []
     compact(scene, fit_steps=12, checkpoint="none", progress=lambda *call: calls.append(call))
     steps = [call for call in calls if call[0].startswith("fit:")]
@@ -81,13 +81,13 @@ def test_progress_tells_every_step_of_the_full_fit(scene: PixelScene) -> None:
     assert [name for name, _, _ in calls if not name.startswith("fit:")] == [*USUAL, "done"]
 
 
-def test_without_photos(scene: PixelScene) -> None:
+def test_without_photos(scene: Scene) -> None:
     result = scenes.compacted(replace(scene, images=None))
     assert result.report.psnr_before is None
     assert not {"input", "curve", "members", "fit", "score"} & set(result.report.seconds)
 
 
-def test_options_and_settings_combine(scene: PixelScene) -> None:
+def test_options_and_settings_combine(scene: Scene) -> None:
     options = CompactOptions().with_settings({"fit": "none"})
     one = compact(scene, options, superpixels=30)
     two = compact(scene, superpixels=30, fit="none")
@@ -97,7 +97,7 @@ def test_options_and_settings_combine(scene: PixelScene) -> None:
 
 @pytest.mark.parametrize("match", ["overlap", "aabb", "none"])
 @pytest.mark.parametrize("k", [1, 2, 4])
-def test_count_is_what_was_asked_for(scene: PixelScene, match: str, k: int) -> None:
+def test_count_is_what_was_asked_for(scene: Scene, match: str, k: int) -> None:
     actual = scenes.compacted(scene, superpixels=40, match=match, k=k, **UNFITTED)
     assert len(actual.gaussians) <= 3 * 40 * k
     if match == "none":
@@ -105,7 +105,7 @@ def test_count_is_what_was_asked_for(scene: PixelScene, match: str, k: int) -> N
 
 
 @pytest.mark.parametrize("superpixels", [1, 2, 3, 768])
-def test_extreme_numbers_of_superpixels(scene: PixelScene, superpixels: int) -> None:
+def test_extreme_numbers_of_superpixels(scene: Scene, superpixels: int) -> None:
     assert len(scenes.compacted(scene, superpixels=superpixels).gaussians) <= 3 * superpixels
 
 
@@ -116,12 +116,12 @@ def test_tiny_images(size: tuple[int, int], views: int) -> None:
 
 
 @pytest.mark.parametrize("segmentation", SEGMENTATIONS)
-def test_every_segmentation(scene: PixelScene, segmentation: str) -> None:
+def test_every_segmentation(scene: Scene, segmentation: str) -> None:
     assert len(scenes.compacted(scene, segmentation=segmentation, superpixels=40).gaussians) <= 120
 
 
 @pytest.mark.parametrize("k", [1, 2, 4])
-def test_paper_rule(scene: PixelScene, k: int) -> None:
+def test_paper_rule(scene: Scene, k: int) -> None:
     """The baseline's Gaussians, children too, have their members' mean opacity."""
     actual = scenes.plain(scene, rule="paper", match="none", k=k).opacities
     assert float(actual.max()) <= float(scene.gaussians.opacities.max()) + 1e-4
@@ -135,7 +135,7 @@ def test_harmonics_keep_their_degree(degree: int) -> None:
     assert scenes.compacted(scene, k=2).gaussians.sh_degree == degree
 
 
-def test_result_is_in_world_coordinates(scene: PixelScene) -> None:
+def test_result_is_in_world_coordinates(scene: Scene) -> None:
     actual = scenes.plain(scene)
     low, high = scene.gaussians.means.min(0), scene.gaussians.means.max(0)
     assert actual.means.dtype == np.float64
@@ -143,7 +143,7 @@ def test_result_is_in_world_coordinates(scene: PixelScene) -> None:
     assert (actual.means <= high + 0.2).all()
 
 
-def test_result_can_be_used_like_any_array_or_tensor(scene: PixelScene) -> None:
+def test_result_can_be_used_like_any_array_or_tensor(scene: Scene) -> None:
     """Changed in place, and as tensors differentiated through."""
     actual = compact(scene).gaussians
     for name in scenes.FIELDS:
@@ -156,7 +156,7 @@ def test_result_can_be_used_like_any_array_or_tensor(scene: PixelScene) -> None:
 
 
 @pytest.mark.parametrize("photos", [True, False])
-def test_tensors_give_tensors_of_the_same_values(scene: PixelScene, photos: bool) -> None:
+def test_tensors_give_tensors_of_the_same_values(scene: Scene, photos: bool) -> None:
     """Of Gaussians that autograd follows, too; the input stays as it is."""
     given = scene if photos else replace(scene, images=None)
     tensors = replace(given, gaussians=given.gaussians.to("cpu"), cameras=given.cameras.to("cpu"))
@@ -178,7 +178,7 @@ def test_tensors_give_tensors_of_the_same_values(scene: PixelScene, photos: bool
     assert actual.report.psnr_after == expected.report.psnr_after
 
 
-def test_double_precision_input(scene: PixelScene) -> None:
+def test_double_precision_input(scene: Scene) -> None:
     columns = {name: getattr(scene.gaussians, name).astype(np.float64) for name in scenes.FIELDS}
     assert scene.images is not None
     doubled = replace(scene, gaussians=replace(scene.gaussians, **columns), images=scene.images.astype(np.float64))
@@ -189,7 +189,7 @@ def test_double_precision_input(scene: PixelScene) -> None:
     )
 
 
-def test_input_is_left_alone(scene: PixelScene) -> None:
+def test_input_is_left_alone(scene: Scene) -> None:
     before = [getattr(scene.gaussians, name).copy() for name in scenes.FIELDS]
     assert scene.images is not None
     images = scene.images.copy()
@@ -208,19 +208,19 @@ def test_input_is_left_alone(scene: PixelScene) -> None:
         ({"threads": 0}, "expected at least 1 thread"),
     ],
 )
-def test_wrong_settings_are_refused(scene: PixelScene, settings: dict, message: str) -> None:
+def test_wrong_settings_are_refused(scene: Scene, settings: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         compact(scene, **settings)
 
 
-def test_wrong_settings_are_refused_before_any_stage(scene: PixelScene) -> None:
+def test_wrong_settings_are_refused_before_any_stage(scene: Scene) -> None:
     calls: list[str] = []
     with pytest.raises(ValueError, match="k: expected 1 to 8"):
         compact(scene, k=0, progress=lambda name, *_: calls.append(name))
     assert calls == []
 
 
-def test_networks_are_used_where_they_show_the_views_better(scene: PixelScene) -> None:
+def test_networks_are_used_where_they_show_the_views_better(scene: Scene) -> None:
     """Depths that are off by what networks learnt to mend, and by more than that."""
     starts = set()
     for one in (scene, scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24), noise=0.05)):
@@ -239,18 +239,18 @@ def test_networks_are_used_where_they_show_the_views_better(scene: PixelScene) -
     "settings",
     [{"effort": "draft"}, {"effort": "fast"}, {}, {"checkpoint": "none"}],
 )
-def test_networks_are_left_out(scene: PixelScene, settings: dict) -> None:
+def test_networks_are_left_out(scene: Scene, settings: dict) -> None:
     assert not {"networks", "start_scores"} & set(scenes.compacted(scene, **settings).report.choices)
 
 
-def test_networks_without_photos_are_judged_by_the_colours_of_the_pixels(scene: PixelScene) -> None:
+def test_networks_without_photos_are_judged_by_the_colours_of_the_pixels(scene: Scene) -> None:
     actual = scenes.compacted(replace(scene, images=None)).report.choices["start_scores"]
     with_photos = scenes.compacted(scene, fit="none").report.choices["start_scores"]
     assert actual == pytest.approx(with_photos, abs=0.5)
 
 
 @pytest.mark.parametrize("k", [1, 2, 4, 8])
-def test_a_budget_is_met_whatever_k_is_and_however_the_fit_grows(scene: PixelScene, k: int) -> None:
+def test_a_budget_is_met_whatever_k_is_and_however_the_fit_grows(scene: Scene, k: int) -> None:
     actual = scenes.compacted(scene, k=k, budget=300, fit_steps=160)
     assert actual.report.choices["fit"]["accepted"]
     assert len(actual.gaussians) == 300

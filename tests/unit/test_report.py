@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 
 from gsmerge import report
-from gsmerge.pipeline import CompactOptions, CompactReport
+from gsmerge.pipeline import CompactOptions
+from gsmerge.result import CompactReport
 
 
 @pytest.fixture

@@ -11,10 +11,10 @@ from gsmerge.types import (
     FeatureGaussians,
     Gaussians,
     Groups,
-    PixelScene,
-    UnalignedScene,
+    Scene,
     as_array,
     as_tensor,
+    grid_ids,
     like,
 )
 
@@ -172,9 +172,9 @@ def test_wrong_cameras_are_refused(change: dict, message: str) -> None:
         replace(cameras(), **change)
 
 
-def scene() -> PixelScene:
+def scene() -> Scene:
     images, valid = np.zeros((2, 3, 4, 3), np.float32), np.ones((2, 3, 4), bool)
-    return PixelScene(gaussians(24), cameras(), images, valid, ("a", "b"))
+    return Scene(gaussians(24), cameras(), images, grid_ids(valid), ("a", "b"))
 
 
 def test_scene() -> None:
@@ -202,7 +202,7 @@ def test_scenes_of_tensors_become_such_of_arrays(missing: np.ndarray | None) -> 
     changed |= {name: as_tensor(getattr(given, name)) for name in ("images", "valid")}
     if missing is not None:
         changed["missing"] = as_tensor(missing)
-    loose = UnalignedScene(changed["gaussians"], changed["cameras"], changed["images"], given.names)
+    loose = Scene(changed["gaussians"], changed["cameras"], changed["images"], None, given.names)
     for tensors in (
         replace(given, **changed),
         replace(given, **{**changed, "images": None}),

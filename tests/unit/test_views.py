@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scenes
 
-from gsmerge.types import PixelScene, UnalignedScene
+from gsmerge.types import Scene
 from gsmerge.views import (
     MAX_SCORED_VIEWS,
     REPORT_VIEWS,
@@ -81,7 +81,7 @@ def test_subset_of_a_scene_without_photos() -> None:
 
 def test_gaussians_in_no_order_all_stay() -> None:
     scene = scenes.make_scene(scenes.room(), scenes.arc(3))
-    loose = UnalignedScene(scene.gaussians, scene.cameras, scene.images, scene.names)
+    loose = Scene(scene.gaussians, scene.cameras, scene.images, None, scene.names)
     small = subset(loose, [2])
     assert len(small.gaussians) == len(scene.gaussians)
     assert np.array_equal(small.cameras.viewmats, scene.cameras.viewmats[2:])
@@ -93,7 +93,6 @@ def test_only_true_repeats_count_as_such() -> None:
     assert distinct_views(scene)[0] == [0, 1, 2]
     assert distinct_views(twice)[0] == [0, 1, 3]
     assert distinct_views(twice)[1] == [0, 1, 0, 2, 1]
-    assert isinstance(twice, PixelScene)
     assert twice.images is not None
     other_photo = twice.images.copy()
     other_photo[2, 0, 0] = 0
@@ -101,7 +100,7 @@ def test_only_true_repeats_count_as_such() -> None:
     other_depth = twice.gaussians.means.copy()
     other_depth[-1] += 1
     assert distinct_views(replace(twice, gaussians=replace(twice.gaussians, means=other_depth)))[0] == [0, 1, 3, 4]
-    loose = UnalignedScene(scene.gaussians, twice.cameras, twice.images, twice.names)
+    loose = Scene(scene.gaussians, twice.cameras, twice.images, None, twice.names)
     assert distinct_views(loose)[0] == [0, 1, 3]
 
 

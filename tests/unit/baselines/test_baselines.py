@@ -5,18 +5,19 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-import loose
 import numpy as np
 import pytest
 import scenes
+import unaligned_scenes
 
-from gsmerge import CompactOptions, Gaussians, PixelScene, compact
+from gsmerge import CompactOptions, Gaussians, Scene, compact
 from gsmerge.baselines import BASELINES
 from gsmerge.baselines.simple import summed_weights
 from gsmerge.errors import UsageError
 from gsmerge.options import METHODS
 from gsmerge.pipeline import CompactResult
-from gsmerge.stages.segment import grid_labels
+from gsmerge.stages.superpixels import grid_labels
+from gsmerge.types import grid_ids
 
 COUNT = 200
 KEEPERS = ("unmerged", "unmerged-fit")
@@ -26,11 +27,11 @@ OWN = sorted(set(BASELINES) - {"splat-transform"})  # which need no program
 
 
 @pytest.fixture(scope="module")
-def scene() -> PixelScene:
+def scene() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24), noise=0.01)
 
 
-def made(scene: PixelScene, method: str, **settings: Any) -> CompactResult:
+def made(scene: Scene, method: str, **settings: Any) -> CompactResult:
     """With a few steps of the fit for the one that has one."""
     quick = {"fit_steps": 12} if method == "unmerged-fit" else {}
     return compact(scene, method=method, **{"budget": COUNT, **quick, **settings})
@@ -58,7 +59,7 @@ def test_used_settings_exist() -> None:
 
 @pytest.mark.parametrize("method", EXACT)
 @pytest.mark.parametrize("count", [3, 100, 2000, 3 * 32 * 24])
-def test_budgets_are_met(scene: PixelScene, method: str, count: int) -> None:
+def test_budgets_are_met(scene: Scene, method: str, count: int) -> None:
     result = made(scene, method, budget=count)
     assert len(result.gaussians) == count
     scenes.assert_invariants(result.gaussians, scene)
@@ -66,56 +67,58 @@ def test_budgets_are_met(scene: PixelScene, method: str, count: int) -> None:
 
 
 @pytest.mark.parametrize("method", EXACT)
-def test_the_usual_count_without_a_budget(scene: PixelScene, method: str) -> None:
+def test_the_usual_count_without_a_budget(scene: Scene, method: str) -> None:
     assert len(made(scene, method, budget=None, superpixels="10%").gaussians) == 3 * 76
     assert len(made(scene, method, budget=None, superpixels="10%", k=2).gaussians) == 2 * 3 * 76
 
 
 @pytest.mark.parametrize("method", OWN)
-def test_a_run_repeats_on_any_number_of_threads(scene: PixelScene, method: str) -> None:
+def test_a_run_repeats_on_any_number_of_threads(scene: Scene, method: str) -> None:
     one, other = (made(scene, method, threads=threads).gaussians for threads in (1, 3))
     assert scenes.identical(one, other)
 
 
 @pytest.mark.parametrize("method", OWN)
-def test_scenes_without_an_order(scene: PixelScene, method: str) -> None:
+def test_scenes_without_an_order(scene: Scene, method: str) -> None:
     if method == "blocks":
         with pytest.raises(
             UsageError, match="method blocks: expected one Gaussian per pixel, found an unaligned scene"
         ):
-            compact(loose.shuffled(scene), method=method)
+            compact(unaligned_scenes.shuffled(scene), method=method)
         return
-    result = compact(loose.shuffled(scene), method=method, budget=COUNT, fit_steps=4)
+    result = compact(unaligned_scenes.shuffled(scene), method=method, budget=COUNT, fit_steps=4)
     assert method in KEEPERS or len(result.gaussians) <= COUNT
     assert len(result.gaussians) > COUNT / 2
 
 
 @pytest.mark.parametrize("method", ["unmerged", "opacity", "contribution", "voxel", "greedy"])
-def test_the_order_of_the_rows_does_not_matter(scene: PixelScene, method: str) -> None:
-    actual = [compact(loose.shuffled(scene, seed), method=method, budget=COUNT).gaussians for seed in (1, 2)]
+def test_the_order_of_the_rows_does_not_matter(scene: Scene, method: str) -> None:
+    actual = [compact(unaligned_scenes.shuffled(scene, seed), method=method, budget=COUNT).gaussians for seed in (1, 2)]
     scenes.assert_same_set(*actual, atol=1e-4)
 
 
 @pytest.mark.parametrize("method", OWN)
-def test_rows_that_are_not_there_stay_out(scene: PixelScene, method: str) -> None:
+def test_rows_that_are_not_there_stay_out(scene: Scene, method: str) -> None:
     valid = scene.valid.copy()
     valid[:, :4] = False
     gone = ~valid.reshape(-1)
     means, opacities = scene.gaussians.means.copy(), scene.gaussians.opacities.copy()
     opacities[gone], means[gone] = 0, 50.0
-    holed = replace(scene, gaussians=replace(scene.gaussians, means=means, opacities=opacities), valid=valid)
+    holed = replace(
+        scene, gaussians=replace(scene.gaussians, means=means, opacities=opacities), pixel_ids=grid_ids(valid)
+    )
     result = made(holed, method)
     assert np.abs(result.gaussians.means).max() < 10
     assert len(result.gaussians) <= int(valid.sum())
 
 
-def test_photos_are_asked_for(scene: PixelScene) -> None:
+def test_photos_are_asked_for(scene: Scene) -> None:
     with pytest.raises(UsageError, match="method unmerged-fit: expected photos, found none"):
         made(replace(scene, images=None), "unmerged-fit")
 
 
 @pytest.mark.parametrize("method", sorted(set(OWN) - {"unmerged-fit"}))
-def test_the_others_do_without_photos(scene: PixelScene, method: str) -> None:
+def test_the_others_do_without_photos(scene: Scene, method: str) -> None:
     result = made(replace(scene, images=None), method)
     assert result.report.psnr_after is None
     assert len(result.gaussians) > COUNT / 2
@@ -136,14 +139,14 @@ def test_unknown_methods_are_refused() -> None:
         CompactOptions(method="magic")
 
 
-def test_settings_without_effect_are_told(scene: PixelScene) -> None:
+def test_settings_without_effect_are_told(scene: Scene) -> None:
     assert made(scene, "voxel", seed=3, threads=1).report.notes == []
     assert made(scene, "voxel", effort="best", match="none").report.notes == ["method voxel does not use effort, match"]
     assert made(scene, "unmerged-fit", budget=None, effort="fast").report.notes == []
     assert made(scene, "unmerged").report.notes == ["method unmerged does not use budget"]
 
 
-def test_only_its_stages_are_timed(scene: PixelScene) -> None:
+def test_only_its_stages_are_timed(scene: Scene) -> None:
     around = {"prepare", "score", "input"}
     assert set(made(scene, "unmerged").report.seconds) == around
     assert set(made(scene, "opacity").report.seconds) == around | {"reduce"}
@@ -151,13 +154,13 @@ def test_only_its_stages_are_timed(scene: PixelScene) -> None:
     assert set(made(scene, "unmerged-fit").report.seconds) == around | {"fit"}
 
 
-def test_unmerged_is_the_input(scene: PixelScene) -> None:
+def test_unmerged_is_the_input(scene: Scene) -> None:
     actual = made(scene, "unmerged")
     scenes.assert_same_set(actual.gaussians, scene.gaussians, atol=1e-5)
     assert actual.report.psnr_after == pytest.approx(actual.report.psnr_before, abs=1e-3)
 
 
-def test_the_same_fit_for_the_input(scene: PixelScene) -> None:
+def test_the_same_fit_for_the_input(scene: Scene) -> None:
     """By steps, or by time; whatever ``fit`` says."""
     actual = made(scene, "unmerged-fit", fit_steps=20, fit="none")
     assert (actual.report.choices["fit"]["method"], actual.report.choices["fit"]["steps"]) == ("full", 20)
@@ -166,7 +169,7 @@ def test_the_same_fit_for_the_input(scene: PixelScene) -> None:
     assert limited["steps"] < 20
 
 
-def test_the_most_opaque_stay(scene: PixelScene) -> None:
+def test_the_most_opaque_stay(scene: Scene) -> None:
     kept = rows_of(made(scene, "opacity").gaussians, scene.gaussians)
     assert kept == sorted(kept)
     left = np.setdiff1d(np.arange(len(scene.gaussians)), kept)
@@ -174,12 +177,12 @@ def test_the_most_opaque_stay(scene: PixelScene) -> None:
     assert opacities[kept].min() >= opacities[left].max()
 
 
-def test_the_first_of_equally_opaque_ones_stay(scene: PixelScene) -> None:
+def test_the_first_of_equally_opaque_ones_stay(scene: Scene) -> None:
     equal = replace(scene, gaussians=replace(scene.gaussians, opacities=np.full_like(scene.gaussians.opacities, 0.5)))
     np.testing.assert_array_equal(made(equal, "opacity").gaussians.sh0, scene.gaussians.sh0[:COUNT])
 
 
-def test_those_that_show_most_stay(scene: PixelScene) -> None:
+def test_those_that_show_most_stay(scene: Scene) -> None:
     kept = rows_of(made(scene, "contribution").gaussians, scene.gaussians)
     weights = summed_weights(scene.gaussians, scene.cameras)
     left = np.setdiff1d(np.arange(len(weights)), kept)
@@ -188,7 +191,7 @@ def test_those_that_show_most_stay(scene: PixelScene) -> None:
     assert weights.sum() == pytest.approx(alphas.sum(), rel=1e-3)
 
 
-def test_the_seed_chooses(scene: PixelScene) -> None:
+def test_the_seed_chooses(scene: Scene) -> None:
     one, two = (rows_of(made(scene, "random", seed=seed).gaussians, scene.gaussians) for seed in (1, 2))
     assert len(set(one)) == COUNT
     assert one == sorted(one)

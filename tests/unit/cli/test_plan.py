@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge import Cameras, CompactOptions, Gaussians, PixelScene
+from gsmerge import Cameras, CompactOptions, Gaussians, Scene
 from gsmerge.cli.plan import plan_document, plan_lines
 from gsmerge.io import SceneFiles
+from gsmerge.types import grid_ids
 
 HEIGHT, WIDTH = 100, 200
 
@@ -18,11 +19,11 @@ def plan(*, photos: bool = True, views: int = 12, **settings: Any) -> dict[str, 
     shape = (views, HEIGHT, WIDTH)
     n = views * HEIGHT * WIDTH
     sizes = ((n, 3), (n, 4), (n, 3), (n,), (n, 1, 3), (n, 0, 3))
-    scene = PixelScene(
+    scene = Scene(
         gaussians=Gaussians(*(np.zeros(size, np.float32) for size in sizes)),
         cameras=Cameras(np.tile(np.eye(4), (views, 1, 1)), np.tile(np.eye(3), (views, 1, 1)), WIDTH, HEIGHT),
         images=np.zeros((*shape, 3), np.float32) if photos else None,
-        valid=np.ones(shape, bool),
+        pixel_ids=grid_ids(np.ones(shape, bool)),
         names=tuple(map(str, range(views))),
     )
     options = CompactOptions().with_settings({"superpixels": 800, "threads": 2} | settings)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scenes
-from learned import Made, made
+from network_fixtures import Made, made
 
 from gsmerge.encoded.decode import divide_all, pick_children
 from gsmerge.encoded.encoded import Division

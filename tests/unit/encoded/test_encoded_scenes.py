@@ -9,35 +9,34 @@ from typing import Any
 import motions
 import pytest
 import scenes
-from learned import noisy, written
-from loose import far_behind, shuffled, voxels
+from network_fixtures import noisy, written
+from unaligned_scenes import far_behind, shuffled, voxels
 
 import gsmerge
-from gsmerge import Encoded, Gaussians, PixelScene, UnalignedScene, compact, decode_scene, encode_scene
+from gsmerge import Encoded, Gaussians, Scene, compact, decode_scene, encode_scene
 from gsmerge.encoded.decode import plan_decode
 from gsmerge.errors import UsageError
 
 SHARE = "10%"
-Scene = PixelScene | UnalignedScene
 
 
 @pytest.fixture(scope="module")
-def pixels() -> PixelScene:
+def pixels() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(4))
 
 
 @pytest.fixture(scope="module")
-def bare(pixels: PixelScene) -> PixelScene:
+def bare(pixels: Scene) -> Scene:
     return replace(pixels, images=None)
 
 
 @pytest.fixture(scope="module")
-def encoded(pixels: PixelScene) -> Encoded:
+def encoded(pixels: Scene) -> Encoded:
     return encode_scene(pixels, superpixels=SHARE)
 
 
 @pytest.fixture(scope="module")
-def encoded_bare(bare: PixelScene) -> Encoded:
+def encoded_bare(bare: Scene) -> Encoded:
     return encode_scene(bare, superpixels=SHARE)
 
 
@@ -61,23 +60,23 @@ def assert_equal_to_compact(scene: Scene, **settings: Any) -> Gaussians:
 
 
 @pytest.mark.parametrize("k", [1, 2, 3, 4])
-def test_one_encoding_gives_every_k(k: int, pixels: PixelScene, encoded: Encoded) -> None:
+def test_one_encoding_gives_every_k(k: int, pixels: Scene, encoded: Encoded) -> None:
     assert scenes.identical(decode_scene(encoded, k=k), unfitted(pixels, k=k))
 
 
-def test_tensors_too(pixels: PixelScene, encoded: Encoded) -> None:
+def test_tensors_too(pixels: Scene, encoded: Encoded) -> None:
     given = replace(pixels, gaussians=pixels.gaussians.to("cpu"), cameras=pixels.cameras.to("cpu"))
     actual = encode_scene(given, superpixels=SHARE)
     assert scenes.identical(decode_scene(actual), decode_scene(encoded))
 
 
 @pytest.mark.parametrize("k", [1, 2, 4])
-def test_one_encoding_gives_every_k_without_photos(k: int, bare: PixelScene, encoded_bare: Encoded) -> None:
+def test_one_encoding_gives_every_k_without_photos(k: int, bare: Scene, encoded_bare: Encoded) -> None:
     assert encoded_bare.settings.min_contribution == 0
     assert scenes.identical(decode_scene(encoded_bare, k=k), unfitted(bare, k=k))
 
 
-def test_pruning_by_what_the_views_see_is_done_without_photos(pixels: PixelScene) -> None:
+def test_pruning_by_what_the_views_see_is_done_without_photos(pixels: Scene) -> None:
     encoded = encode_scene(pixels, superpixels=SHARE, min_contribution=0.2)
     actual = decode_scene(encoded, k=4)
     everything = replace(encoded, settings=replace(encoded.settings, min_contribution=0.0))
@@ -100,17 +99,17 @@ def test_pruning_by_what_the_views_see_is_done_without_photos(pixels: PixelScene
     ],
     ids=str,
 )
-def test_the_same_settings_give_the_same_gaussians(settings: dict[str, Any], pixels: PixelScene) -> None:
+def test_the_same_settings_give_the_same_gaussians(settings: dict[str, Any], pixels: Scene) -> None:
     assert_equal_to_compact(pixels, **settings)
 
 
 @pytest.mark.parametrize("settings", [{"budget": "6%"}, {"budget": "auto"}, {"budget": "quest3", "k": 2}], ids=str)
-def test_the_same_without_photos(settings: dict[str, Any], bare: PixelScene) -> None:
+def test_the_same_without_photos(settings: dict[str, Any], bare: Scene) -> None:
     assert_equal_to_compact(bare, **settings)
 
 
 @pytest.mark.parametrize("settings", [{"k": 1}, {"k": 2}, {"k": 4}, {"budget": "7%"}], ids=str)
-def test_networks_are_kept_with_the_scene(settings: dict[str, Any], pixels: PixelScene, tmp_path: Path) -> None:
+def test_networks_are_kept_with_the_scene(settings: dict[str, Any], pixels: Scene, tmp_path: Path) -> None:
     checkpoint = written(tmp_path / "networks.safetensors", noisy())
     actual = assert_equal_to_compact(pixels, checkpoint=str(checkpoint), **settings)
     assert not scenes.identical(actual, unfitted(pixels, **settings))
@@ -121,7 +120,7 @@ def test_networks_are_kept_with_the_scene(settings: dict[str, Any], pixels: Pixe
 
 
 @pytest.mark.parametrize("k", [1, 2, 4])
-def test_scenes_in_no_order(k: int, pixels: PixelScene) -> None:
+def test_scenes_in_no_order(k: int, pixels: Scene) -> None:
     loose = voxels(pixels, 0.05)
     actual = encode_scene(loose, superpixels="20%")
     assert actual.settings.num_slots is not None
@@ -129,12 +128,12 @@ def test_scenes_in_no_order(k: int, pixels: PixelScene) -> None:
     assert scenes.identical(decode_scene(actual, k=k), unfitted(loose, k=k, superpixels="20%"))
 
 
-def test_shuffled_rows_and_a_budget(pixels: PixelScene) -> None:
+def test_shuffled_rows_and_a_budget(pixels: Scene) -> None:
     assert_equal_to_compact(shuffled(pixels), budget="4%")
 
 
 @pytest.mark.parametrize("settings", [{"k": 1}, {"k": 2}, {"budget": "5%"}], ids=str)
-def test_what_no_view_sees_is_kept(settings: dict[str, Any], pixels: PixelScene) -> None:
+def test_what_no_view_sees_is_kept(settings: dict[str, Any], pixels: Scene) -> None:
     loose = shuffled(pixels)
     hidden = far_behind(loose.gaussians, 200)
     both = replace(loose, gaussians=Gaussians.concat([loose.gaussians, hidden]))
@@ -161,7 +160,7 @@ def test_more_than_there_is_to_divide_is_told(encoded: Encoded) -> None:
     assert len(decode_scene(encoded, budget=encoded.settings.num_input)) <= encoded.max_gaussians
 
 
-def test_auto_takes_what_compact_would_without_photos(bare: PixelScene, encoded_bare: Encoded) -> None:
+def test_auto_takes_what_compact_would_without_photos(bare: Scene, encoded_bare: Encoded) -> None:
     expected = len(unfitted(bare, budget="auto"))
     assert encoded_bare.settings.knee_count == expected
     plan = plan_decode(encoded_bare, budget="auto")
@@ -172,12 +171,12 @@ def test_auto_takes_what_compact_would_without_photos(bare: PixelScene, encoded_
     assert "fewer than there are groups" in plan.notes[0]
 
 
-def test_auto_of_what_was_encoded_so(pixels: PixelScene) -> None:
+def test_auto_of_what_was_encoded_so(pixels: Scene) -> None:
     actual = encode_scene(pixels, superpixels=SHARE, budget="auto")
     assert scenes.identical(decode_scene(actual), decode_scene(actual, budget="auto"))
 
 
-def test_the_result_does_not_depend_on_the_threads(pixels: PixelScene, encoded: Encoded) -> None:
+def test_the_result_does_not_depend_on_the_threads(pixels: Scene, encoded: Encoded) -> None:
     one = decode_scene(encode_scene(pixels, superpixels=SHARE, threads=1), k=2, threads=1)
     assert scenes.identical(one, decode_scene(encoded, k=2, threads=2))
 
@@ -211,17 +210,17 @@ def test_wishes_that_cannot_be_met(wish: dict[str, Any], words: str, encoded: En
         ({"max_k": 2, "k": 3}, "max k: expected at least 3, which is k, got 2"),
     ],
 )
-def test_what_cannot_be_encoded(settings: dict[str, Any], words: str, pixels: PixelScene) -> None:
+def test_what_cannot_be_encoded(settings: dict[str, Any], words: str, pixels: Scene) -> None:
     with pytest.raises(UsageError, match=words):
         encode_scene(pixels, **settings)
 
 
-def test_a_budget_that_keeps_everything_needs_no_encoding(pixels: PixelScene) -> None:
+def test_a_budget_that_keeps_everything_needs_no_encoding(pixels: Scene) -> None:
     with pytest.raises(UsageError, match="keeps every Gaussian"):
         encode_scene(shuffled(pixels), budget="100%")
 
 
-def test_fewer_children_take_less_space(pixels: PixelScene, encoded: Encoded) -> None:
+def test_fewer_children_take_less_space(pixels: Scene, encoded: Encoded) -> None:
     small = encode_scene(pixels, superpixels=SHARE, max_k=1)
     assert len(small.division.children) == 0
     assert scenes.identical(decode_scene(small), decode_scene(encoded, k=1))

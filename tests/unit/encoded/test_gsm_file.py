@@ -10,9 +10,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scenes
-from learned import noisy, written
+from damaged_files import (
+    WILD_NUMBERS,
+    Spoil,
+    cut,
+    filled,
+    header,
+    with_array,
+    with_header,
+    with_settings,
+    with_text,
+    without,
+)
+from network_fixtures import noisy, written
 from safetensors.numpy import load_file, save_file
-from spoils import WILD_NUMBERS, Spoil, cut, filled, header, with_array, with_header, with_settings, with_text, without
 
 from gsmerge import Encoded, decode_scene, encode_scene, load_encoded, save_encoded
 from gsmerge.encoded.gsm_file import ENCODED

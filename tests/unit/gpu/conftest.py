@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 import scenes
 
-from gsmerge import Gaussians, PixelScene
+from gsmerge import Gaussians, Scene
 from gsmerge.render.photos import Photos
 
 
 @pytest.fixture(scope="module")
-def scene() -> PixelScene:
+def scene() -> Scene:
     return scenes.self_made(0)[0]
 
 
@@ -20,5 +20,5 @@ def start() -> Gaussians:
 
 
 @pytest.fixture(scope="module")
-def photos(scene: PixelScene) -> tuple[Photos, Photos]:
+def photos(scene: Scene) -> tuple[Photos, Photos]:
     return scenes.pair_of(scene)

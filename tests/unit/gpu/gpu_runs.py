@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from importlib.util import find_spec
 
 import numpy as np
@@ -15,7 +14,7 @@ from gsmerge.gpu.backend import make_backend
 from gsmerge.gpu.device_photos import DevicePhotos, upload_photos
 from gsmerge.render.photos import Photos
 from gsmerge.stages.fit import FitOptions
-from gsmerge.stages.fit.options import LearningRates
+from gsmerge.stages.fit.options import Tuning
 
 Pair = tuple[Photos, Photos]
 CPU = torch.device("cpu")
@@ -24,9 +23,9 @@ gpu = pytest.mark.skipif(
     not torch.cuda.is_available() or find_spec("gsplat") is None, reason="needs a CUDA device and gsplat"
 )
 # A long memory: with a short one a difference in the last bit is a full step sooner.
-PULLS = FitOptions(fit_steps=8, holdout=0.2, rates=LearningRates(beta1=0.7, beta2=0.99))
+PULLS = FitOptions(fit_steps=8, holdout=0.2, tuning=Tuning(beta1=0.7, beta2=0.99))
 # Without the pulls: where they are the whole gradient, Adam turns its last bit into a full step.
-QUICK = replace(PULLS, opacity_reg=0.0, scale_reg=0.0)
+QUICK = scenes.tuned(PULLS, opacity_reg=0.0, scale_reg=0.0)
 
 
 def on_device(photos: Pair, device: torch.device = CPU) -> tuple[DevicePhotos, DevicePhotos]:

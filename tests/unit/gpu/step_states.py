@@ -9,9 +9,9 @@ import torch
 
 from gsmerge.gpu.adam import FitState, StepGradients, state_of, step_in_torch
 from gsmerge.stages.fit.full import step_sizes
-from gsmerge.stages.fit.options import FitOptions, LearningRates
+from gsmerge.stages.fit.options import FitOptions, Tuning
 
-RATES = LearningRates(
+RATES = Tuning(
     means_lr=3.0, scales_lr=3.0, opacities_lr=5.0, colors_lr=1.0, max_mean_shift=0.2, max_scale_change=0.1,
     max_opacity_change=0.3,
 )  # fmt: skip
@@ -34,7 +34,7 @@ def odd_state(count: int, device: torch.device | str = "cpu") -> tuple[FitState,
     state.box_shares = torch.rand(count, generator=generator)
     state.min_sizes = torch.where(torch.rand(count, generator=generator) < 0.5, -torch.inf, normal(count))
     moved = {name: getattr(state, name).to(device) for name in FitState.__dataclass_fields__}
-    return FitState(**moved), replace(FitOptions(opacity_reg=0.5, scale_reg=0.7), rates=RATES)
+    return FitState(**moved), FitOptions(tuning=replace(RATES, opacity_reg=0.5, scale_reg=0.7))
 
 
 def gradients_of(state: FitState) -> StepGradients:

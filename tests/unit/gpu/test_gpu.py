@@ -9,11 +9,11 @@ import pytest
 import torch
 from gpu_runs import gpu
 
-from gsmerge import PixelScene, compact
+from gsmerge import CompactOptions, Scene, compact
 from gsmerge import gpu as package
 from gsmerge.gpu import MIN_PIXELS, choose_backend, self_check
 from gsmerge.render import cuda
-from gsmerge.stages.fit import ON_CPU, FitOptions
+from gsmerge.stages.fit import ON_CPU
 
 QUICK = {"fit_steps": 8, "superpixels": "20%", "checkpoint": "none"}
 
@@ -70,12 +70,12 @@ def test_computer_without_cuda_is_noted_only_where_cuda_is_asked_for(monkeypatch
 
 def test_options_only_name_a_device() -> None:
     """Whether there is one is asked when it is used."""
-    assert [FitOptions(device=name).device for name in ("cpu", "cuda", "auto")] == ["cpu", "cuda", "auto"]
-    with pytest.raises(ValueError, match='device: expected "cpu", "cuda" or "auto", got "gpu"'):
-        FitOptions(device="gpu")  # type: ignore[arg-type]
+    assert [CompactOptions(device=name).device for name in ("cpu", "cuda", "auto")] == ["cpu", "cuda", "auto"]
+    with pytest.raises(ValueError, match="device: expected one of cpu, cuda, auto, got 'gpu'"):
+        CompactOptions(device="gpu")  # type: ignore[arg-type]
 
 
-def test_compact_runs_on_the_cpu_and_says_why(scene: PixelScene, checks: list[str | None]) -> None:
+def test_compact_runs_on_the_cpu_and_says_why(scene: Scene, checks: list[str | None]) -> None:
     checks.append("the image differed")
     actual, expected = (compact(scene, device=device, **QUICK) for device in ("cuda", "cpu"))
     note = "the fit and the scores run on the CPU, not on a GPU: the image differed"
@@ -86,7 +86,7 @@ def test_compact_runs_on_the_cpu_and_says_why(scene: PixelScene, checks: list[st
 
 
 @gpu
-def test_gpu_passes_its_check(scene: PixelScene) -> None:
+def test_gpu_passes_its_check(scene: Scene) -> None:
     assert find_spec("gsplat") is not None
     assert package.cuda_problem() is None
     result = compact(scene, device="cuda", **QUICK)

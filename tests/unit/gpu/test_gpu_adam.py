@@ -31,15 +31,15 @@ def test_step_is_the_kernels(step: int) -> None:
     ]
     ids = np.flatnonzero(gradients.reached.numpy()).astype(np.int32)
     g = [getattr(gradients, name).numpy()[ids] for name in ("means", "quats", "scales", "opacities", "colors")]
-    g[3] += np.float32(options.opacity_reg / 300)
-    g[2] += np.float32(options.scale_reg / 300) / arrays[4][ids, None]
-    rates = step_sizes(options.rates, 0.3, 8)
-    limits = options.rates.max_mean_shift, options.rates.max_scale_change, options.rates.max_opacity_change
+    g[3] += np.float32(options.tuning.opacity_reg / 300)
+    g[2] += np.float32(options.tuning.scale_reg / 300) / arrays[4][ids, None]
+    rates = step_sizes(options.tuning, 0.3, 8)
+    limits = options.tuning.max_mean_shift, options.tuning.max_scale_change, options.tuning.max_opacity_change
     names = ("means", "quats", "scales", "opacities", "colors")
     shown = [getattr(state, name).clone().numpy() for name in names]
     optimise.adam(
         *arrays, ids, *g, rates, np.array(limits, np.float32),
-        np.array([options.rates.beta1, options.rates.beta2], np.float32), step, 0, len(ids), *shown,
+        np.array([options.tuning.beta1, options.tuning.beta2], np.float32), step, 0, len(ids), *shown,
     )  # fmt: skip
     adam_step(state, gradients, options, torch.from_numpy(rates), step)
     assert (np.abs(arrays[0] - arrays[1]) > 0.01).any(1)[ids].mean() > 0.9
@@ -62,6 +62,6 @@ def test_triton_step_is_the_one_in_torch() -> None:
 def test_step_of_a_gpu_is_that_of_torch() -> None:
     (state, options), (other, _) = odd_state(300), odd_state(300, "cuda")
     for one in (state, other):
-        rates = torch.from_numpy(step_sizes(options.rates, 0.3, 8)).to(one.x.device)
+        rates = torch.from_numpy(step_sizes(options.tuning, 0.3, 8)).to(one.x.device)
         adam_step(one, gradients_of(one), options, rates, 1)
     torch.testing.assert_close(other.x.cpu(), state.x, rtol=1e-4, atol=1e-5)

@@ -11,7 +11,7 @@ import scenes
 import torch
 from gpu_runs import CPU, ON_TORCH, QUICK, Pair, gpu, on_device
 
-from gsmerge import Gaussians, PixelScene
+from gsmerge import Gaussians, Scene
 from gsmerge.gpu.backend import make_backend, photo_error, visible_mask
 from gsmerge.gpu.device_photos import upload_gaussians
 from gsmerge.render import photos as render_photos
@@ -35,7 +35,7 @@ def test_failing_fit_falls_back_as_the_stage_does(start: Gaussians, photos: Pair
 
 
 def test_nothing_is_fitted_where_nothing_is_asked_for(start: Gaussians, photos: Pair) -> None:
-    same, report = fit(start, photos, replace(QUICK, fit="none", effort="draft"), backend=ON_TORCH)
+    same, report = fit(start, photos, replace(QUICK, fit="none", min_contribution=0.0), backend=ON_TORCH)
     assert same is start
     assert report is None
     few, _ = fit(start[:0], photos, QUICK, backend=ON_TORCH)
@@ -126,7 +126,7 @@ def test_devices_have_names() -> None:
 
 
 @gpu
-def test_mask_and_scores_of_a_gpu_are_the_cpus(scene: PixelScene, start: Gaussians, photos: Pair) -> None:
+def test_mask_and_scores_of_a_gpu_are_the_cpus(scene: Scene, start: Gaussians, photos: Pair) -> None:
     cuda = torch.device("cuda")
     masks = [
         visible_mask(upload_gaussians(start, device), on_device(photos, device)[1], 1 / 255).cpu()

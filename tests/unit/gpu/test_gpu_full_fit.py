@@ -11,21 +11,21 @@ import scenes
 import torch
 from gpu_runs import CPU, ON_TORCH, PULLS, QUICK, Pair, assert_close, gpu, on_device
 
-from gsmerge import Gaussians, PixelScene
+from gsmerge import Gaussians, Scene
 from gsmerge.gpu import choose_backend, full_fit
 from gsmerge.gpu.adam import adam_step, gaussians_of, start_state
 from gsmerge.gpu.device_photos import upload_gaussians, upload_photos
 from gsmerge.gpu.full_fit import draw_order, error_masses, grow_to, make_levels, step_gradients
 from gsmerge.stages.fit import fit
 from gsmerge.stages.fit import full as stage_full
-from gsmerge.stages.fit import grow as stage_grow
 from gsmerge.stages.fit import state as stage_state
 
 
 @pytest.mark.parametrize("settings", [{}, {"ssim_lambda": 0.0}, {"half_res_share": 1.0}, {"opacity_reg": 3.0}], ids=str)
 def test_runs_are_the_kernels(start: Gaussians, photos: Pair, settings: dict[str, Any]) -> None:
     """The same views, backgrounds and steps: a run that does something else is far away after eight."""
-    options = replace(QUICK, **settings)
+    constants = settings.keys() & {"ssim_lambda", "opacity_reg"}
+    options = scenes.tuned(QUICK, **settings) if constants else replace(QUICK, **settings)
     actual, report = fit(start, photos, options, seed=4, backend=ON_TORCH)
     expected, other = fit(start, photos, options, seed=4)
     assert_close(actual, expected, 1e-3)
@@ -44,7 +44,7 @@ def test_runs_with_harmonics_are_the_kernels() -> None:
     assert_close(fit(start, photos, QUICK, backend=ON_TORCH)[0], fit(start, photos, QUICK)[0], 2e-3)
 
 
-def test_long_run_grows_to_the_count(scene: PixelScene, start: Gaussians, photos: Pair) -> None:
+def test_long_run_grows_to_the_count(scene: Scene, start: Gaussians, photos: Pair) -> None:
     steps: list[int] = []
     options, count = replace(PULLS, fit_steps=150), len(start) + 20
     result, report = fit(start, photos, options, count, progress=lambda step, *_: steps.append(step), backend=ON_TORCH)
@@ -59,7 +59,7 @@ def test_long_run_grows_to_the_count(scene: PixelScene, start: Gaussians, photos
     assert means[0] == pytest.approx(means[1], abs=0.5)
 
 
-def test_dropout_and_budget(start: Gaussians, photos: Pair, scene: PixelScene) -> None:
+def test_dropout_and_budget(start: Gaussians, photos: Pair, scene: Scene) -> None:
     options = replace(QUICK, dropout=0.2, time_budget=0.5)
     result, report = fit(start, photos, options, backend=ON_TORCH)
     assert report is not None
@@ -105,12 +105,12 @@ def test_growth_is_the_stages(start: Gaussians, photos: Pair) -> None:
     actual, expected = start_state(upload_gaussians(start, CPU)), stage_state.start_state(start)
     half = on_device(photos)[1]
     np.testing.assert_allclose(
-        error_masses(actual, half), stage_grow.error_masses(expected, photos[1]), rtol=1e-4, atol=1e-5
+        error_masses(actual, half), stage_state.error_masses(expected, photos[1]), rtol=1e-4, atol=1e-5
     )
     actual.m += 0.5
     expected.m += 0.5
     actual.min_sizes[:], expected.min_sizes[:] = -3, -3
-    grown, other = grow_to(actual, half, len(start) + 30), stage_grow.grow_to(expected, photos[1], len(start) + 30)
+    grown, other = grow_to(actual, half, len(start) + 30), stage_state.grow_to(expected, photos[1], len(start) + 30)
     for name in ("x", "x0", "m", "units", "box_shares", "min_sizes"):
         np.testing.assert_allclose(getattr(grown, name), getattr(other, name), rtol=1e-4, atol=1e-5, err_msg=name)
     for name in ("means", "quats", "scales", "opacities"):
@@ -152,7 +152,7 @@ def test_all_of_a_step_is_on_the_device(start: Gaussians, photos: Pair, monkeypa
 
 
 @gpu
-def test_gpu_reaches_the_same(scene: PixelScene, start: Gaussians, photos: Pair) -> None:
+def test_gpu_reaches_the_same(scene: Scene, start: Gaussians, photos: Pair) -> None:
     options, count = replace(QUICK, fit_steps=160), len(start) + 20
     backend, problem = choose_backend("cuda", 0)
     assert problem is None

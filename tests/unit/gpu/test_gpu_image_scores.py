@@ -8,7 +8,7 @@ import torch
 from gpu_runs import Pair
 
 from gsmerge.gpu.image_scores import exposure_gains, holdout_psnr, loss_gradient, photo_means
-from gsmerge.stages.fit import holdout as stage_holdout
+from gsmerge.stages.fit import photos as fit_photos
 from gsmerge.stages.fit.loss import image_gradient
 
 
@@ -31,10 +31,10 @@ def test_exposures_and_held_out_blocks_are_the_stages(photos: Pair) -> None:
     rng = np.random.default_rng(0)
     images = (photos[1].images * np.array([1.5, 1.0, 0.9])[:, None, None, None]).astype(np.float32)
     images += rng.normal(size=images.shape).astype(np.float32) * 0.05
-    weights = stage_holdout.training_weights(photos[1], 0.3, 0)
+    weights = fit_photos.training_weights(photos[1], 0.3, 0)
     tensors = [torch.from_numpy(array) for array in (images, photos[1].images, np.stack(weights))]
     for min_gain in (1.15, 3.0):
-        expected = stage_holdout.exposure_gains(list(images), photos[1].images, weights, min_gain)
+        expected = fit_photos.exposure_gains(list(images), photos[1].images, weights, min_gain)
         np.testing.assert_allclose(exposure_gains(*tensors, min_gain), expected, rtol=1e-5)
-        score = stage_holdout.holdout_psnr(list(images), photos[1], weights, min_gain)
+        score = fit_photos.holdout_psnr(list(images), photos[1], weights, min_gain)
         assert holdout_psnr(*tensors, min_gain) == pytest.approx(score, abs=1e-4)

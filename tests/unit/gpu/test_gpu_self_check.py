@@ -123,7 +123,9 @@ def nan_at(images: Tensor) -> Tensor:
 
 def test_wrong_steps_are_told(fake_gsplat: Any, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
     def step_otherwise(state: Any, gradients: Any, options: Any, rates: Tensor, step: int) -> None:
-        self_check.step_in_torch(state, gradients, replace(options, opacity_reg=1.0), 1.1 * rates, step)
+        self_check.step_in_torch(
+            state, gradients, replace(options, tuning=replace(options.tuning, opacity_reg=1.0)), 1.1 * rates, step
+        )
 
     monkeypatch.setattr(self_check, "adam_step", step_otherwise)
     assert "the optimiser step differed from the CPU's by " in (find_difference(CPU) or "")

@@ -17,7 +17,7 @@ from gsmerge.measure.speed import Speed, measure_speeds, overdraw, resized
 from gsmerge.render import plan_view, prepare
 from gsmerge.render.weights import view_weights
 from gsmerge.report import to_json
-from gsmerge.types import PixelScene
+from gsmerge.types import Scene
 
 PLAIN = EvaluateOptions(lpips=())
 
@@ -27,12 +27,12 @@ def storage(name: str, count: int, each: int = 68) -> Storage:
 
 
 @pytest.fixture(scope="module")
-def scene() -> PixelScene:
+def scene() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(3))
 
 
 @pytest.fixture(scope="module")
-def actual(scene: PixelScene) -> Comparison:
+def actual(scene: Scene) -> Comparison:
     half = scene.gaussians[::2]
     sizes = {"input": storage("input", len(scene.gaussians)), "a|b<i>": storage("half", len(half), 34)}
     return compare(scene, {"a|b<i>": half}, sizes, None, PLAIN, merge_seconds={"a|b<i>": 2.0})
@@ -49,14 +49,14 @@ def test_sizes_keep_the_view() -> None:
     assert (resized(scenes.arc(1, 48, 2), 3).height) == 1
 
 
-def test_every_scene_is_drawn_at_every_size(scene: PixelScene) -> None:
+def test_every_scene_is_drawn_at_every_size(scene: Scene) -> None:
     actual = measure_speeds({"a": scene.gaussians, "b": scene.gaussians[:10]}, scene.cameras, (48, 96), 0.01, threads=1)
     cpu = [speed for speed in actual["a"] if speed.device == "cpu"]
     assert [(s.width, s.height, s.threads) for s in cpu] == [(48, 36, 1), (96, 72, 1)]
     assert all(speed.seconds > 0 for speeds in actual.values() for speed in speeds)
 
 
-def test_overdraw_counts_what_is_blended(scene: PixelScene) -> None:
+def test_overdraw_counts_what_is_blended(scene: Scene) -> None:
     one = scenes.arc(1)
     plan = plan_view(
         prepare(scene.gaussians), one.viewmats[0].astype(np.float64), one.Ks[0].astype(np.float64), 48, 36, near=0.01
@@ -103,7 +103,7 @@ def test_documents(actual: Comparison) -> None:
         assert len(widths) == 1, table
 
 
-def test_without_merge_seconds_nothing_is_earned_back(scene: PixelScene) -> None:
+def test_without_merge_seconds_nothing_is_earned_back(scene: Scene) -> None:
     side = SceneCosts("input", storage("input", 10), (Speed("cpu", 4, 3, 1, 0.2),), 1.0, None)
     after = replace(side, name="b", speeds=(Speed("cpu", 4, 3, 1, 0.1),))
     quality = compare(scene, {}, {"input": storage("input", 1)}, None, PLAIN, long_sides=(8,)).quality
@@ -113,6 +113,6 @@ def test_without_merge_seconds_nothing_is_earned_back(scene: PixelScene) -> None
 
 
 @pytest.mark.parametrize("sides", [(), (0,)])
-def test_bad_sizes(sides: tuple[int, ...], scene: PixelScene) -> None:
+def test_bad_sizes(sides: tuple[int, ...], scene: Scene) -> None:
     with pytest.raises(ValueError, match="long_sides"):
         compare(scene, {}, {"input": storage("input", 1)}, None, PLAIN, long_sides=sides)

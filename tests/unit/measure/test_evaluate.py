@@ -19,7 +19,7 @@ import gsmerge
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Evaluation, Views, evaluate
 from gsmerge.measure.scores import CSV_COLUMNS, evaluation_csv, evaluation_document, evaluation_lines
 from gsmerge.report import to_json
-from gsmerge.types import Gaussians, PixelScene, UnalignedScene
+from gsmerge.types import Gaussians, Scene
 
 PLAIN = EvaluateOptions(lpips=())
 
@@ -31,17 +31,17 @@ def held_out(span: float = 2.0) -> Views:
 
 
 @pytest.fixture(scope="module")
-def scene() -> PixelScene:
+def scene() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(3), noise=0.01)
 
 
 @pytest.fixture(scope="module")
-def half(scene: PixelScene) -> Gaussians:
+def half(scene: Scene) -> Gaussians:
     return scene.gaussians[::2]
 
 
 @pytest.fixture(scope="module")
-def actual(scene: PixelScene, half: Gaussians) -> Evaluation:
+def actual(scene: Scene, half: Gaussians) -> Evaluation:
     return evaluate(scene, {"half": half}, held_out(), PLAIN)
 
 
@@ -65,7 +65,7 @@ def test_masked_figures_count_visible_pixels_alone(actual: Evaluation) -> None:
     assert all(s.masked == s.full for s in actual.results[0].scores if s.split == "context")
 
 
-def test_what_is_counted(actual: Evaluation, scene: PixelScene, half: Gaussians) -> None:
+def test_what_is_counted(actual: Evaluation, scene: Scene, half: Gaussians) -> None:
     assert [r.name for r in actual.results] == [INPUT, "half"]
     assert actual.results[1].num_gaussians == len(half)
     assert actual.results[1].ratio == pytest.approx(len(half) / len(scene.gaussians))
@@ -74,7 +74,7 @@ def test_what_is_counted(actual: Evaluation, scene: PixelScene, half: Gaussians)
     assert actual.notes == ()
 
 
-def test_without_photos_the_input_s_renders_are_the_reference(scene: PixelScene, half: Gaussians) -> None:
+def test_without_photos_the_input_s_renders_are_the_reference(scene: Scene, half: Gaussians) -> None:
     actual = evaluate(replace(scene, images=None), {"half": half}, None, PLAIN)
     assert actual.reference == "renders of the input"
     assert all(math.isinf(s.full.psnr or 0) for s in actual.results[0].scores)
@@ -84,7 +84,7 @@ def test_without_photos_the_input_s_renders_are_the_reference(scene: PixelScene,
     assert document["results"][0]["mean"]["context"]["psnr"] is None  # strict JSON knows no infinity
 
 
-def test_views_of_another_world_are_told(scene: PixelScene) -> None:
+def test_views_of_another_world_are_told(scene: Scene) -> None:
     away = held_out()
     viewmats = away.cameras.viewmats.copy()
     viewmats[:, 0, 3] -= 50
@@ -92,8 +92,8 @@ def test_views_of_another_world_are_told(scene: PixelScene) -> None:
     assert "of the same world?" in evaluate(scene, {}, away, PLAIN).notes[0]
 
 
-def test_a_scene_in_no_order(scene: PixelScene, half: Gaussians) -> None:
-    loose = UnalignedScene(scene.gaussians, scene.cameras, scene.images, scene.names)
+def test_a_scene_in_no_order(scene: Scene, half: Gaussians) -> None:
+    loose = Scene(scene.gaussians, scene.cameras, scene.images, None, scene.names)
     actual = evaluate(loose, {"half": half}, held_out(), PLAIN)
     usual = evaluate(scene, {"half": half}, held_out(), PLAIN)
     for one, other in zip(actual.results[1].scores, usual.results[1].scores, strict=True):
@@ -102,7 +102,7 @@ def test_a_scene_in_no_order(scene: PixelScene, half: Gaussians) -> None:
 
 
 @pytest.mark.parametrize("factor", [1e-4, 1e4])
-def test_units_change_nothing(factor: float, scene: PixelScene, half: Gaussians) -> None:
+def test_units_change_nothing(factor: float, scene: Scene, half: Gaussians) -> None:
     moved = scenes.move(scene, np.eye(3), factor, np.zeros(3))
     small = scenes.move_gaussians(half, np.eye(3), factor, np.zeros(3))
     actual = evaluate(moved, {"half": small}, None, PLAIN)
@@ -111,25 +111,25 @@ def test_units_change_nothing(factor: float, scene: PixelScene, half: Gaussians)
         assert one.full.psnr == pytest.approx(other.full.psnr, abs=0.05)
 
 
-def test_only_held_out_views(scene: PixelScene) -> None:
+def test_only_held_out_views(scene: Scene) -> None:
     actual = evaluate(scene, {}, held_out(), replace(PLAIN, context=False))
     assert actual.num_views == {"target": 2}
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-def test_threads_do_not_matter(threads: int, scene: PixelScene, half: Gaussians, actual: Evaluation) -> None:
+def test_threads_do_not_matter(threads: int, scene: Scene, half: Gaussians, actual: Evaluation) -> None:
     again = evaluate(scene, {"half": half}, held_out(), replace(PLAIN, threads=threads))
     assert [r.scores for r in again.results] == [r.scores for r in actual.results]
 
 
-def test_bad_arguments(scene: PixelScene, half: Gaussians) -> None:
+def test_bad_arguments(scene: Scene, half: Gaussians) -> None:
     with pytest.raises(ValueError, match="vgg or alex"):
         EvaluateOptions(lpips=("squeeze",))
     with pytest.raises(ValueError, match="at least 1"):
         EvaluateOptions(lpips_views=0)
     with pytest.raises(ValueError, match="other than 'input'"):
         evaluate(scene, {INPUT: half}, None, PLAIN)
-    empty = UnalignedScene(half, scene.cameras[[]], None, ())
+    empty = Scene(half, scene.cameras[[]], None, None, ())
     with pytest.raises(ValueError, match="a scene with views"):
         evaluate(empty, {}, None, PLAIN)
 
@@ -142,7 +142,7 @@ def test_bad_zooms(zoom: tuple[float, ...], words: str) -> None:
         EvaluateOptions(zoom=zoom)
 
 
-def test_zooms_are_renders_at_that_size(scene: PixelScene, half: Gaussians) -> None:
+def test_zooms_are_renders_at_that_size(scene: Scene, half: Gaussians) -> None:
     views, options = held_out(), replace(PLAIN, zoom=(0.5, 1, 2), context=False)
     result = evaluate(scene, {"half": half}, views, options).results[1]
     for score in result.scores:
@@ -158,14 +158,14 @@ def test_zooms_are_renders_at_that_size(scene: PixelScene, half: Gaussians) -> N
     assert result.mean("target", zoom=2)[1].ssim == pytest.approx(mean)
 
 
-def test_the_input_s_renders_are_the_reference_at_every_size(scene: PixelScene, half: Gaussians) -> None:
+def test_the_input_s_renders_are_the_reference_at_every_size(scene: Scene, half: Gaussians) -> None:
     options = replace(PLAIN, zoom=(0.5, 2), antialiased=True)
     actual = evaluate(replace(scene, images=None), {"half": half}, None, options)
     assert all(math.isinf(one.full.psnr or 0) for s in actual.results[0].scores for one in s.zooms)
     assert all((one.full.psnr or 99) < 60 for s in actual.results[1].scores for one in s.zooms)
 
 
-def test_antialiased(scene: PixelScene, half: Gaussians, actual: Evaluation) -> None:
+def test_antialiased(scene: Scene, half: Gaussians, actual: Evaluation) -> None:
     views = held_out()
     result = evaluate(scene, {"half": half}, views, replace(PLAIN, antialiased=True, context=False)).results[1]
     image = gsmerge.render(half, views.cameras[[0]], antialiased=True).images[0].clip(0, 1)
@@ -174,7 +174,7 @@ def test_antialiased(scene: PixelScene, half: Gaussians, actual: Evaluation) -> 
     assert result.mean("target") != actual.results[1].mean("target")
 
 
-def test_documents_have_zooms_where_they_were_asked_for(scene: PixelScene, actual: Evaluation) -> None:
+def test_documents_have_zooms_where_they_were_asked_for(scene: Scene, actual: Evaluation) -> None:
     plain = evaluation_document(actual, {})
     assert "zooms" not in plain["results"][0]["views"][0]
     assert "antialiased" not in plain
@@ -192,14 +192,14 @@ def test_documents_have_zooms_where_they_were_asked_for(scene: PixelScene, actua
 
 
 @pytest.mark.parametrize("align", [("colour",), ("pose", "pose")])
-def test_bad_alignments(align: tuple[str, ...], scene: PixelScene) -> None:
+def test_bad_alignments(align: tuple[str, ...], scene: Scene) -> None:
     with pytest.raises(ValueError, match="color or pose"):
         EvaluateOptions(align=align)
     with pytest.raises(ValueError, match="held-out views"):
         evaluate(scene, {}, None, replace(PLAIN, align=("color",)))
 
 
-def test_aligned_scores_stand_beside_the_plain_ones(scene: PixelScene, half: Gaussians, actual: Evaluation) -> None:
+def test_aligned_scores_stand_beside_the_plain_ones(scene: Scene, half: Gaussians, actual: Evaluation) -> None:
     options = replace(PLAIN, align=("pose", "color"))
     aligned = evaluate(scene, {"half": half}, held_out(), options)
     for one, plain in zip(aligned.results[1].scores, actual.results[1].scores, strict=True):
@@ -225,7 +225,7 @@ def test_aligned_scores_stand_beside_the_plain_ones(scene: PixelScene, half: Gau
     assert "degrees" in lines[-2]
 
 
-def test_colours_alone(scene: PixelScene) -> None:
+def test_colours_alone(scene: Scene) -> None:
     views = held_out()
     dimmed = replace(views, images=0.6 * views.images + 0.1)
     actual = evaluate(scene, {}, dimmed, replace(PLAIN, align=("color",))).results[0]
@@ -260,13 +260,13 @@ def test_table_for_people(actual: Evaluation) -> None:
     assert "LPIPS" not in lines[1]
 
 
-def test_progress_is_told(scene: PixelScene, half: Gaussians) -> None:
+def test_progress_is_told(scene: Scene, half: Gaussians) -> None:
     said: list[tuple[str, int, int]] = []
     evaluate(scene, {"half": half}, None, PLAIN, progress=lambda *step: said.append(step))
     assert said == [("evaluate", 1, 2), ("evaluate", 2, 2)]
 
 
-def test_tensors_give_the_same(scene: PixelScene, half: Gaussians) -> None:
+def test_tensors_give_the_same(scene: Scene, half: Gaussians) -> None:
     views = held_out()
     tensors = Views(views.cameras.to("cpu"), torch.from_numpy(views.images), views.names)
     actual, expected = (
@@ -292,7 +292,7 @@ def test_pictures_too_small_for_lpips(monkeypatch: pytest.MonkeyPatch) -> None:
     assert looked == ["vgg"]
 
 
-def test_what_results_are_compared_with(scene: PixelScene) -> None:
+def test_what_results_are_compared_with(scene: Scene) -> None:
     bare = replace(scene, images=None)
     assert evaluate(bare, {}, held_out(), PLAIN).reference == "photos, and renders of the input in its own views"
     assert evaluate(bare, {}, held_out(), replace(PLAIN, context=False)).reference == "photos"

@@ -11,7 +11,7 @@ import scenes
 from gsmerge.measure import visibility
 from gsmerge.measure.speed import resized
 from gsmerge.measure.visibility import context_points, visible_pixels
-from gsmerge.types import Cameras, UnalignedScene
+from gsmerge.types import Cameras, Scene, grid_ids
 from gsmerge.views import subset
 
 
@@ -59,7 +59,7 @@ def test_pixels_without_a_gaussian_give_no_sample() -> None:
     scene = scenes.make_scene(scenes.room(), scenes.arc(1, 24, 18))
     valid = scene.valid.copy()
     valid[0, :, 12:] = False
-    masks = visible_pixels(context_points(replace(scene, valid=valid), 0.01), scene.cameras, 0.01)
+    masks = visible_pixels(context_points(replace(scene, pixel_ids=grid_ids(valid)), 0.01), scene.cameras, 0.01)
     assert masks[0, :, :13].all()  # a column more than there are samples: every sample marks its neighbours
     assert not masks[0, :, 13:].any()
 
@@ -72,7 +72,7 @@ def test_what_lies_behind_the_camera_is_not_seen() -> None:
 
 def test_a_scene_in_no_order_is_sampled_by_its_rendered_depth() -> None:
     scene = scenes.make_scene(scenes.wall(), scenes.arc(2, 32, 24), opacity=(0.95, 0.99))
-    loose = UnalignedScene(scene.gaussians, scene.cameras, None, scene.names)
+    loose = Scene(scene.gaussians, scene.cameras, None, None, scene.names)
     points = context_points(loose, 0.01)
     assert len(points) > 0.9 * len(scene.gaussians)
     assert np.abs(points[:, 2] - 3.0).max() < 0.1  # the wall is at z = 3

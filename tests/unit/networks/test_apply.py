@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
-from learned import SMALL, Made, made, noisy
+from network_fixtures import SMALL, Made, made, noisy
 
 from gsmerge.geometry import covariances
 from gsmerge.moments import feature_to_gaussians
@@ -20,8 +20,7 @@ from gsmerge.networks.apply import (
     run_encoder,
     run_heads,
 )
-from gsmerge.networks.modules import Networks
-from gsmerge.networks.modules import NetworkOptions
+from gsmerge.networks.modules import NetworkOptions, Networks
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.decode import DecodeOptions, decode, divide
 from gsmerge.stages.match import MatchOptions, match

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from learned import SMALL, noisy, written
+from network_fixtures import SMALL, noisy, written
 from safetensors.torch import load_file, save_file
 
 import gsmerge

@@ -7,10 +7,10 @@ from scenes import arc, make_scene, plane, room, waves
 
 from gsmerge.moments import scene_members
 from gsmerge.networks.cross_view_stats import cross_view_stats
-from gsmerge.types import PixelScene
+from gsmerge.types import Scene
 
 
-def of_view(scene: PixelScene, view: int, factor: float = 1.0) -> np.ndarray:
+def of_view(scene: Scene, view: int, factor: float = 1.0) -> np.ndarray:
     """Statistics of a view's Gaussians, moved along their rays."""
     pixels = scene.pixels_per_view
     rows = slice(view * pixels, (view + 1) * pixels)

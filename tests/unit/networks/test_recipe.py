@@ -10,12 +10,11 @@ import pytest
 import scenes
 import torch
 
-from gsmerge import PixelScene
+from gsmerge import Scene
 from gsmerge.encoded.encode import encode_scene
 from gsmerge.errors import UsageError
 from gsmerge.networks.checkpoint import save_checkpoint
-from gsmerge.networks.modules import Networks
-from gsmerge.networks.modules import NetworkOptions
+from gsmerge.networks.modules import NetworkOptions, Networks
 from gsmerge.online.extend import extend
 from gsmerge.online.options import OnlineOptions
 from gsmerge.options import CompactOptions
@@ -24,7 +23,7 @@ SMALL = NetworkOptions(width=16, heads=2, latent=8, members=4, neighbors=4, outp
 
 
 @pytest.fixture(scope="module")
-def scene() -> PixelScene:
+def scene() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24), noise=0.01)
 
 
@@ -40,7 +39,7 @@ def absolute(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_recipe_is_its_settings(scene: PixelScene, absolute: Path) -> None:
+def test_recipe_is_its_settings(scene: Scene, absolute: Path) -> None:
     actual = scenes.compacted(scene, recipe="paper", checkpoint=str(absolute))
     settings = {"segmentation": "bass-st", "match": "aabb", "geometry": "decoded", "fit": "none"}
     expected = scenes.compacted(scene, **settings, checkpoint=str(absolute))
@@ -58,7 +57,7 @@ def test_what_is_set_besides_goes_before() -> None:
     assert options.with_settings({"k": 2}).match.match == "none"
 
 
-def test_decoded_geometry_decides_what_is_merged(scene: PixelScene, absolute: Path) -> None:
+def test_decoded_geometry_decides_what_is_merged(scene: Scene, absolute: Path) -> None:
     """Also with absolute outputs, whose heads do not read the moments."""
     counts = {
         geometry: scenes.compacted(
@@ -75,7 +74,7 @@ def test_it_needs_networks(checkpoint: str) -> None:
         CompactOptions().with_settings({"recipe": "paper", "checkpoint": checkpoint})
 
 
-def test_other_networks_are_refused(scene: PixelScene, tmp_path: Path) -> None:
+def test_other_networks_are_refused(scene: Scene, tmp_path: Path) -> None:
     path = tmp_path / "residual.safetensors"
     save_checkpoint(path, Networks(replace(SMALL, outputs="residual")), {})
     for checkpoint in (str(path), "shipped"):
@@ -83,13 +82,13 @@ def test_other_networks_are_refused(scene: PixelScene, tmp_path: Path) -> None:
             scenes.compacted(scene, recipe="paper", checkpoint=checkpoint)
 
 
-def test_networks_with_absolute_outputs_ship(scene: PixelScene) -> None:
+def test_networks_with_absolute_outputs_ship(scene: Scene) -> None:
     networks = scenes.compacted(scene, recipe="paper").report.choices["networks"]
     assert networks["checkpoint"] == "paper"
     assert networks["options"]["outputs"] == "absolute"
 
 
-def test_more_children_than_a_head_has_are_refused(scene: PixelScene, absolute: Path) -> None:
+def test_more_children_than_a_head_has_are_refused(scene: Scene, absolute: Path) -> None:
     with pytest.raises(UsageError, match=r"k: expected at most 4 with the absolute outputs of .*, got 5"):
         scenes.compacted(scene, recipe="paper", checkpoint=str(absolute), k=5)
     options = CompactOptions().with_settings({"recipe": "paper", "checkpoint": str(absolute)})
@@ -101,7 +100,7 @@ def test_more_children_than_a_head_has_are_refused(scene: PixelScene, absolute: 
 
 @pytest.mark.parametrize("rule", ["saliency", "distortion"])
 @pytest.mark.parametrize("settings", [{"fit": "none"}, {"fit_steps": 12}], ids=str)
-def test_mixed_k_lies_between_one_and_two(scene: PixelScene, settings: dict, rule: str) -> None:
+def test_mixed_k_lies_between_one_and_two(scene: Scene, settings: dict, rule: str) -> None:
     one, mixed, two = (
         len(scenes.compacted(scene, k=k, k_rule=rule, checkpoint="none", **settings).gaussians) for k in (1, "mixed", 2)
     )

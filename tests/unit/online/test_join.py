@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
-from arriving import FAST, fed, group, parts_of, room, same_group, state_of
+from view_batches import FAST, fed, group, parts_of, room, same_group, state_of
 
 from gsmerge.encoded.decode import divide_all
 from gsmerge.online.extend import find_partners, merge_into

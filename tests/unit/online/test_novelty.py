@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
-from arriving import random_gaussians, room
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from view_batches import random_gaussians, room
 
 from gsmerge import Cameras, Gaussians
 from gsmerge.moments import feature_to_gaussians, scene_members, unaligned_members
-from gsmerge.online.extend import MARGIN, REACH, group_errors, groups_in_view, pixel_errors
+from gsmerge.online.photos import MARGIN, REACH, group_errors, groups_in_view, pixel_errors
 from gsmerge.online.state import moments_of
 from gsmerge.render import contributions, plan_view, prepare
 from gsmerge.render.photos import photos_of
@@ -144,7 +144,7 @@ def test_group_errors_against_a_loop() -> None:
 def test_members_of_no_pixel_count_as_fully_wrong() -> None:
     loose = scenes.take_views(room(2), [0, 1])
     pixels = np.array([-1, 5, -1, -1, 7, 40] + [0] * (len(loose.gaussians) - 6))
-    from loose import loosened
+    from unaligned_scenes import loosened
 
     members = unaligned_members(loosened(loose), pixels)
     errors = np.zeros((2, 24, 36), np.float32)

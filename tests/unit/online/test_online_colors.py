@@ -7,12 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
-from arriving import fed, room, same_group, state_of
+from view_batches import fed, room, same_group, state_of
 
-from gsmerge import Gaussians, PixelScene
+from gsmerge import Gaussians, Scene
 from gsmerge.moments import feature_to_gaussians
-from gsmerge.online.extend import groups_in_view
-from gsmerge.online.photos import BatchPhotos, fit_batch_colors
+from gsmerge.online.photos import BatchPhotos, fit_batch_colors, groups_in_view
 from gsmerge.online.state import GroupSet
 from gsmerge.render.photos import Photos, scene_photos
 from gsmerge.render.weights import apply
@@ -24,12 +23,12 @@ FEW = FitOptions(holdout=0.05)
 
 
 @pytest.fixture(scope="module")
-def scene() -> PixelScene:
+def scene() -> Scene:
     return room(6, 48, 36)
 
 
 @pytest.fixture(scope="module")
-def groups(scene: PixelScene) -> GroupSet:
+def groups(scene: Scene) -> GroupSet:
     """Groups of all views, their colours off by a little."""
     actual = state_of(fed([scene], fit_colors=False)).groups
     noise = np.random.default_rng(0).normal(0, 0.1 / SH_C0, actual.features.sh0.shape).astype(np.float32)
@@ -38,7 +37,7 @@ def groups(scene: PixelScene) -> GroupSet:
 
 
 @pytest.fixture(scope="module")
-def batch_photos(scene: PixelScene) -> BatchPhotos:
+def batch_photos(scene: Scene) -> BatchPhotos:
     """Photos, in the state's own frame, with noise of their own."""
     state = state_of(fed([scene], fit_colors=False))
     assert scene.images is not None
@@ -59,7 +58,7 @@ def rms(one: np.ndarray, other: np.ndarray) -> float:
 
 
 @pytest.fixture(scope="module")
-def drawn(groups: GroupSet, scene: PixelScene) -> tuple[Gaussians, Photos, Drawn]:
+def drawn(groups: GroupSet, scene: Scene) -> tuple[Gaussians, Photos, Drawn]:
     gaussians = state_of(fed([scene], fit_colors=False)).frame.leave(feature_to_gaussians(groups.features))
     photos = scene_photos(scene, 2)
     return gaussians, photos, draw(gaussians, photos)
@@ -99,7 +98,7 @@ def test_the_solution_is_where_the_gradient_vanishes(drawn: tuple[Gaussians, Pho
     """The equations by hand: a dense least-squares problem with what is held on its diagonal."""
     gaussians, photos, views = drawn
     precision = np.random.default_rng(1).uniform(1, 50, len(gaussians))
-    options = replace(FEW, prior_weight=1e-9, iterations=400, huber=1e6, min_gain=1.0, max_gain=1.0)
+    options = scenes.tuned(FEW, prior_weight=1e-9, iterations=400, huber=1e6, min_gain=1.0, max_gain=1.0)
     actual, report = fit_colors(gaussians, views, photos, options, 0, precision)
     assert report.accepted
     n = len(gaussians)
@@ -153,7 +152,7 @@ def test_one_batch_after_the_other_is_near_all_at_once(
     groups: GroupSet, batch_photos: BatchPhotos, tint: tuple[float, float, float]
 ) -> None:
     """Batches of other tints, which say different things: nearer than where earlier ones are forgotten."""
-    steady = replace(FEW, min_gain=1.0, max_gain=1.0)
+    steady = scenes.tuned(FEW, min_gain=1.0, max_gain=1.0)
     sides = np.array([1, -1, 1, -1, 1, -1], np.float32)[:, None, None, None]
     images = 0.6 * batch_photos.images + 0.2 + sides * np.array(tint, np.float32)
     tinted = BatchPhotos(images, batch_photos.cameras)

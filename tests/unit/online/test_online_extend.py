@@ -9,33 +9,34 @@ from typing import Any
 import numpy as np
 import pytest
 import scenes
-from arriving import FAST, counts, fed, parts_of, room, same_groups, same_state, state_of
-from learned import noisy, written
-from loose import NO_CAMERAS, far_behind, loosened, shuffled
+from network_fixtures import noisy, written
+from unaligned_scenes import NO_CAMERAS, far_behind, loosened, shuffled
+from view_batches import FAST, counts, fed, parts_of, room, same_groups, same_state, state_of
 
-from gsmerge import Compactor, Gaussians, PixelScene, UnalignedScene, decode_scene, encode_scene
+from gsmerge import Compactor, Gaussians, Scene, decode_scene, encode_scene
 from gsmerge.errors import UsageError
 from gsmerge.online.decode import decode_stored
 from gsmerge.online.extend import extend
 from gsmerge.online.state import OnlineState, from_encoded
 from gsmerge.options import CompactOptions
 from gsmerge.stages.fit import FitOptions, FitReport
+from gsmerge.types import grid_ids
 
-Change = Callable[[PixelScene], PixelScene | UnalignedScene]
+Change = Callable[[Scene], Scene]
 
 
 @pytest.fixture(scope="module")
-def scene() -> PixelScene:
+def scene() -> Scene:
     return room()
 
 
 @pytest.fixture(scope="module")
-def pairs(scene: PixelScene) -> list[PixelScene]:
+def pairs(scene: Scene) -> list[Scene]:
     return parts_of(scene, 2)
 
 
 @pytest.fixture(scope="module")
-def first(pairs: list[PixelScene]) -> OnlineState:
+def first(pairs: list[Scene]) -> OnlineState:
     """Of the first pair alone."""
     return state_of(fed(pairs[:1]))
 
@@ -48,14 +49,14 @@ def options(**settings: Any) -> CompactOptions:
 
 
 @pytest.mark.parametrize("k", [1, 4])
-def test_a_first_batch_is_an_encoded_scene(k: int, scene: PixelScene) -> None:
+def test_a_first_batch_is_an_encoded_scene(k: int, scene: Scene) -> None:
     """As many Gaussians, about the same ones: what is solid is told by the moments, in float32."""
     actual = fed([scene], fit_colors=False).decode(k=k, fit="none")
     expected = decode_scene(encode_scene(scene, **FAST), k=k)
     scenes.assert_same_set(actual, expected, atol=5e-3, unit=0.05)
 
 
-def test_a_first_batch_with_networks(scene: PixelScene, tmp_path: Any) -> None:
+def test_a_first_batch_with_networks(scene: Scene, tmp_path: Any) -> None:
     checkpoint = str(written(tmp_path / "a.safetensors", noisy()))
     for k in (1, 4):
         actual = fed([scene], fit_colors=False, checkpoint=checkpoint).decode(k=k, fit="none")
@@ -63,14 +64,14 @@ def test_a_first_batch_with_networks(scene: PixelScene, tmp_path: Any) -> None:
         scenes.assert_same_set(actual, expected, atol=5e-3, unit=0.05)
 
 
-def test_shipped_networks_compete_in_every_batch(pairs: list[PixelScene]) -> None:
+def test_shipped_networks_compete_in_every_batch(pairs: list[Scene]) -> None:
     """Unless a checkpoint is named."""
     compactor = Compactor(superpixels="10%")
     for pair in pairs[:2]:
         assert sorted(compactor.extend(pair).choices["start_scores"]) == ["analytic", "learned"]
 
 
-def test_a_first_batch_keeps_its_frame_and_views(scene: PixelScene) -> None:
+def test_a_first_batch_keeps_its_frame_and_views(scene: Scene) -> None:
     state = state_of(fed([scene]))
     assert (len(state.cameras), state.cameras.width, state.cameras.height) == (6, 36, 24)
     assert state.settings.num_input == scene.num_gaussians
@@ -79,7 +80,7 @@ def test_a_first_batch_keeps_its_frame_and_views(scene: PixelScene) -> None:
     np.testing.assert_allclose(state.replay.images / 255, scene.images, atol=0.5 / 255 + 1e-6)
 
 
-def test_a_colour_fit_helps(scene: PixelScene) -> None:
+def test_a_colour_fit_helps(scene: Scene) -> None:
     fitted, plain = (fed(parts_of(scene, 2), fit_colors=fit).decode(fit="none") for fit in (True, False))
     assert scenes.psnr_of(fitted, scene) > scenes.psnr_of(plain, scene)
 
@@ -87,7 +88,7 @@ def test_a_colour_fit_helps(scene: PixelScene) -> None:
 # further batches
 
 
-def test_reports_add_up(pairs: list[PixelScene]) -> None:
+def test_reports_add_up(pairs: list[Scene]) -> None:
     compactor = Compactor(**FAST)
     reports = [compactor.extend(batch) for batch in pairs]
     assert counts(reports, "num_views") == [2, 2, 2]
@@ -108,7 +109,7 @@ def test_reports_add_up(pairs: list[PixelScene]) -> None:
     assert len(state_of(compactor).cameras) == 6
 
 
-def test_stages_are_told(pairs: list[PixelScene]) -> None:
+def test_stages_are_told(pairs: list[Scene]) -> None:
     said: list[str] = []
     compactor = Compactor(**FAST)
     for batch in pairs[:2]:
@@ -116,7 +117,7 @@ def test_stages_are_told(pairs: list[PixelScene]) -> None:
     assert {"prepare", "segment", "encode", "match", "cover", "join", "fit"} <= {name.split(":")[0] for name in said}
 
 
-def test_the_old_state_is_left_as_it_is(pairs: list[PixelScene], first: OnlineState) -> None:
+def test_the_old_state_is_left_as_it_is(pairs: list[Scene], first: OnlineState) -> None:
     before = state_of(fed(pairs[:1]))
     after, _ = extend(first, pairs[1], options())
     assert after is not first
@@ -124,12 +125,12 @@ def test_the_old_state_is_left_as_it_is(pairs: list[PixelScene], first: OnlineSt
     same_state(first, before)
 
 
-def test_tensors_too(scene: PixelScene) -> None:
+def test_tensors_too(scene: Scene) -> None:
     given = replace(scene, gaussians=scene.gaussians.to("cpu"), cameras=scene.cameras.to("cpu"))
     same_state(state_of(fed([given])), state_of(fed([scene])))
 
 
-def test_the_same_batch_twice_adds_nothing(scene: PixelScene) -> None:
+def test_the_same_batch_twice_adds_nothing(scene: Scene) -> None:
     once, twice = fed([scene]), fed([scene, scene])
     assert len(twice) <= 1.02 * len(once)
     one, other = (scenes.psnr_of(c.decode(fit="none"), scene) for c in (once, twice))
@@ -137,7 +138,7 @@ def test_the_same_batch_twice_adds_nothing(scene: PixelScene) -> None:
 
 
 @pytest.mark.parametrize("settings", [{}, {"k": 2}, {"checkpoint": "auto"}], ids=str)
-def test_the_threads_do_not_matter(settings: dict[str, Any], pairs: list[PixelScene]) -> None:
+def test_the_threads_do_not_matter(settings: dict[str, Any], pairs: list[Scene]) -> None:
     states, actual = [], []
     for threads in (1, 2, 8):
         compactor = fed(pairs, **settings, threads=threads)
@@ -148,14 +149,14 @@ def test_the_threads_do_not_matter(settings: dict[str, Any], pairs: list[PixelSc
         assert scenes.identical(gaussians, actual[0])
 
 
-def test_the_same_seed_gives_the_same(pairs: list[PixelScene]) -> None:
+def test_the_same_seed_gives_the_same(pairs: list[Scene]) -> None:
     one, other = fed(pairs, seed=3), fed(pairs, seed=3)
     same_state(state_of(one), state_of(other))
     fits = [c.decode(fit="full", fit_steps=4) for c in (one, other)]
     assert scenes.identical(*fits)
 
 
-def test_the_settings_of_each_batch_are_its_own(pairs: list[PixelScene], first: OnlineState) -> None:
+def test_the_settings_of_each_batch_are_its_own(pairs: list[Scene], first: OnlineState) -> None:
     _, few = extend(first, pairs[1], options(superpixels=20))
     _, many = extend(first, pairs[1], options(superpixels=60))
     assert few.num_new < many.num_new
@@ -164,7 +165,7 @@ def test_the_settings_of_each_batch_are_its_own(pairs: list[PixelScene], first: 
 # what batches may be
 
 
-def test_pictures_of_another_size(scene: PixelScene, first: OnlineState, floor: Callable[..., None]) -> None:
+def test_pictures_of_another_size(scene: Scene, first: OnlineState, floor: Callable[..., None]) -> None:
     large = room(6, 54, 36)
     state, report = extend(first, scenes.take_views(large, [2, 3]), options())
     assert report.num_input == 2 * 54 * 36
@@ -177,7 +178,7 @@ def test_pictures_of_another_size(scene: PixelScene, first: OnlineState, floor: 
     np.testing.assert_allclose(state.cameras.Ks, single.cameras.Ks, rtol=1e-9)
 
 
-def test_without_photos(pairs: list[PixelScene]) -> None:
+def test_without_photos(pairs: list[Scene]) -> None:
     """Pictures of the Gaussians' colours stand in for them, and nothing is fitted or kept."""
     bare = [replace(pair, images=None) for pair in pairs]
     compactor = fed(bare)
@@ -192,7 +193,7 @@ def test_without_photos(pairs: list[PixelScene]) -> None:
 
 
 @pytest.mark.parametrize("bare", [0, 1])
-def test_photos_of_some_batches(bare: int, pairs: list[PixelScene]) -> None:
+def test_photos_of_some_batches(bare: int, pairs: list[Scene]) -> None:
     batches = list(pairs[:2])
     batches[bare] = replace(batches[bare], images=None)
     compactor = fed(batches)
@@ -202,7 +203,7 @@ def test_photos_of_some_batches(bare: int, pairs: list[PixelScene]) -> None:
 
 
 @pytest.mark.parametrize("change", [loosened, shuffled], ids=["loosened", "shuffled"])
-def test_gaussians_in_no_order(change: Change, pairs: list[PixelScene], floor: Callable[..., None]) -> None:
+def test_gaussians_in_no_order(change: Change, pairs: list[Scene], floor: Callable[..., None]) -> None:
     choices = ([change(pairs[0]), pairs[1]], [pairs[0], change(pairs[1])], [change(pair) for pair in pairs[:2]])
     for number, batches in enumerate(choices):
         compactor = fed(batches)  # type: ignore[arg-type]
@@ -211,7 +212,7 @@ def test_gaussians_in_no_order(change: Change, pairs: list[PixelScene], floor: C
         floor(scenes.psnr_of(compactor.decode(fit="none"), both), str(number))
 
 
-def test_gaussians_without_photos_in_no_order(pairs: list[PixelScene]) -> None:
+def test_gaussians_without_photos_in_no_order(pairs: list[Scene]) -> None:
     """Pictures are rendered of the Gaussians, and count for as long as it takes to make room for them."""
     bare = [replace(loosened(pair), images=None) for pair in pairs[:2]]
     compactor = fed(bare)  # type: ignore[arg-type]
@@ -220,16 +221,16 @@ def test_gaussians_without_photos_in_no_order(pairs: list[PixelScene]) -> None:
 
 
 @pytest.mark.parametrize("first", [True, False])
-def test_gaussians_without_cameras(first: bool, pairs: list[PixelScene], floor: Callable[..., None]) -> None:
+def test_gaussians_without_cameras(first: bool, pairs: list[Scene], floor: Callable[..., None]) -> None:
     """Views are placed for them."""
-    bare = UnalignedScene(pairs[0].gaussians, NO_CAMERAS, None, ())
+    bare = Scene(pairs[0].gaussians, NO_CAMERAS, None, None, ())
     compactor = fed([bare, pairs[1]] if first else [pairs[1], bare])  # type: ignore[list-item]
     assert compactor.batches[1]["num_covered"] > 0
     assert len(state_of(compactor).replay) == 2
     floor(scenes.psnr_of(compactor.decode(fit="none"), pairs[1]))
 
 
-def test_what_no_view_sees_is_kept(pairs: list[PixelScene]) -> None:
+def test_what_no_view_sees_is_kept(pairs: list[Scene]) -> None:
     batches = []
     for pair in pairs[:2]:
         loose = loosened(pair)
@@ -259,9 +260,9 @@ def test_views_that_see_nothing_of_the_state(first: OnlineState) -> None:
     same_groups(picked(state.groups, select_groups), picked(before.groups, select_groups))
 
 
-def test_a_batch_without_a_valid_gaussian(pairs: list[PixelScene], first: OnlineState) -> None:
+def test_a_batch_without_a_valid_gaussian(pairs: list[Scene], first: OnlineState) -> None:
     """Its photos count all the same."""
-    nothing = replace(pairs[1], valid=np.zeros_like(pairs[1].valid))
+    nothing = replace(pairs[1], pixel_ids=grid_ids(np.zeros_like(pairs[1].valid)))
     state, report = extend(first, nothing, options())
     assert (report.num_new, len(state)) == (0, len(first))
     assert len(state.replay) == 4
@@ -270,12 +271,12 @@ def test_a_batch_without_a_valid_gaussian(pairs: list[PixelScene], first: Online
         Compactor(**FAST).extend(nothing)
 
 
-def test_one_view(scene: PixelScene) -> None:
+def test_one_view(scene: Scene) -> None:
     compactor = fed(parts_of(scenes.take_views(scene, [0, 1]), 1))
     assert len(state_of(compactor).cameras) == 2
 
 
-def test_an_encoded_scene_is_extended(pairs: list[PixelScene]) -> None:
+def test_an_encoded_scene_is_extended(pairs: list[Scene]) -> None:
     encoded = encode_scene(pairs[0], **FAST)
     state, report = extend(from_encoded(encoded), pairs[1], options())
     assert report.num_covered + report.num_joined > 0
@@ -286,7 +287,7 @@ def test_an_encoded_scene_is_extended(pairs: list[PixelScene]) -> None:
     assert abs(len(state) - len(other)) < 0.1 * len(other)
 
 
-def test_everything_counts_without_a_tolerance(pairs: list[PixelScene]) -> None:
+def test_everything_counts_without_a_tolerance(pairs: list[Scene]) -> None:
     compactor = fed(pairs, tolerance=0)
     assert [batch["num_covered"] for batch in compactor.batches] == [0, 0, 0]
     assert len(compactor) > len(fed(pairs))
@@ -301,7 +302,7 @@ def test_higher_harmonics_of_the_same_degree() -> None:
 
 
 @pytest.mark.parametrize("fit", ["none", "full"])
-def test_a_budget_is_met(fit: str, pairs: list[PixelScene]) -> None:
+def test_a_budget_is_met(fit: str, pairs: list[Scene]) -> None:
     compactor = fed(pairs)
     expected = len(compactor) + 60
     steps = {"fit_steps": 6} if fit == "full" else {}
@@ -310,7 +311,7 @@ def test_a_budget_is_met(fit: str, pairs: list[PixelScene]) -> None:
         compactor.decode(budget=10, fit=fit)
 
 
-def test_every_k_up_to_the_most(pairs: list[PixelScene]) -> None:
+def test_every_k_up_to_the_most(pairs: list[Scene]) -> None:
     compactor = fed(pairs, max_k=2)
     one, two = (compactor.decode(k=k, fit="none") for k in (1, 2))
     assert len(compactor) >= len(one)
@@ -322,21 +323,21 @@ def test_every_k_up_to_the_most(pairs: list[PixelScene]) -> None:
 
 
 @pytest.mark.parametrize("rule", ["depth", "paper"])
-def test_more_children_show_more(rule: str, scene: PixelScene, pairs: list[PixelScene]) -> None:
+def test_more_children_show_more(rule: str, scene: Scene, pairs: list[Scene]) -> None:
     """However often children were pooled; in the exports' colours, as fitted ones are those of the group."""
     compactor = fed(pairs, rule=rule, fit_colors=False)
     one, two, four = (scenes.psnr_of(compactor.decode(k=k, fit="none"), scene) for k in (1, 2, 4))
     assert four > two > one
 
 
-def test_a_full_fit_shows_more(scene: PixelScene, pairs: list[PixelScene]) -> None:
+def test_a_full_fit_shows_more(scene: Scene, pairs: list[Scene]) -> None:
     compactor = fed(pairs)
     colors, full = compactor.decode(fit="none"), compactor.decode(fit="full", fit_steps=30)
     assert scenes.psnr_of(full, scene) > scenes.psnr_of(colors, scene) + 0.5
     assert scenes.identical(compactor.decode(fit="full", fit_steps=30), full)
 
 
-def test_a_fit_in_vain_leaves_the_solved_colours(pairs: list[PixelScene], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fit_in_vain_leaves_the_solved_colours(pairs: list[Scene], monkeypatch: pytest.MonkeyPatch) -> None:
     from gsmerge.online import decode as decode_module
 
     def refused(gaussians: Gaussians, *_: object, **__: object) -> tuple[Gaussians, FitReport]:
@@ -352,20 +353,20 @@ def test_a_fit_in_vain_leaves_the_solved_colours(pairs: list[PixelScene], monkey
 
 
 @pytest.mark.parametrize("settings", [{"budget": "10%"}, {"budget": "auto"}, {"budget": "20KB"}], ids=str)
-def test_numbers_that_each_batch_is_cut_to(settings: dict[str, Any], pairs: list[PixelScene]) -> None:
+def test_numbers_that_each_batch_is_cut_to(settings: dict[str, Any], pairs: list[Scene]) -> None:
     compactor = fed(pairs[:2], **settings)
     own, _ = extend(from_encoded(encode_scene(pairs[0], **FAST | settings)), pairs[1], options(**settings))
     assert abs(len(own) - len(compactor)) < 0.1 * len(own)
     assert len(decode_stored(own, options=FitOptions(fit="none")).gaussians) >= len(own) - 5
 
 
-def test_decoding_changes_nothing(pairs: list[PixelScene]) -> None:
+def test_decoding_changes_nothing(pairs: list[Scene]) -> None:
     compactor = fed(pairs)
     compactor.decode(fit="full", fit_steps=4)
     same_state(state_of(compactor), state_of(fed(pairs)))
 
 
-def test_results_are_in_the_world(scene: PixelScene, floor: Callable[..., None]) -> None:
+def test_results_are_in_the_world(scene: Scene, floor: Callable[..., None]) -> None:
     turn, shift = scenes.random_rotation(0), np.array([30.0, -20.0, 10.0])
     moved = scenes.move(scene, turn, 4.0, shift)
     floor(scenes.psnr_of(fed(parts_of(moved, 3)).decode(fit="none"), moved))
@@ -384,7 +385,7 @@ def test_results_are_in_the_world(scene: PixelScene, floor: Callable[..., None])
         ({"quality": "20dB"}, "quality 20dB: goes with a whole scene"),
     ],
 )
-def test_what_a_state_cannot_have(settings: dict[str, Any], words: str, pairs: list[PixelScene]) -> None:
+def test_what_a_state_cannot_have(settings: dict[str, Any], words: str, pairs: list[Scene]) -> None:
     compactor = Compactor(**FAST | settings)
     with pytest.raises(UsageError, match=words):
         compactor.extend(pairs[0])
@@ -396,14 +397,14 @@ def test_harmonics_of_another_degree(first: OnlineState) -> None:
         extend(first, room(2, degree=1), options())
 
 
-def test_more_gaussians_of_a_group_than_are_kept(pairs: list[PixelScene], first: OnlineState) -> None:
+def test_more_gaussians_of_a_group_than_are_kept(pairs: list[Scene], first: OnlineState) -> None:
     with pytest.raises(UsageError, match="max k: expected at least 3, which is k, got 2"):
         Compactor(**FAST, k=3, max_k=2).extend(pairs[0])
     with pytest.raises(UsageError, match="max k: expected at least 5, which is k, got 4"):
         extend(first, pairs[1], options(k=5))
 
 
-def test_a_budget_that_keeps_everything(pairs: list[PixelScene]) -> None:
+def test_a_budget_that_keeps_everything(pairs: list[Scene]) -> None:
     with pytest.raises(UsageError, match="keeps every Gaussian"):
         Compactor(**FAST, budget="100%").extend(loosened(pairs[0]))
 
@@ -418,7 +419,7 @@ def test_nothing_before_the_first_batch(tmp_path: Any) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_batch_that_fails_changes_nothing(pairs: list[PixelScene]) -> None:
+def test_a_batch_that_fails_changes_nothing(pairs: list[Scene]) -> None:
     compactor = fed(pairs[:1])
     before = compactor.state
     with pytest.raises(UsageError):

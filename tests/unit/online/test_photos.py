@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from arriving import room
+from view_batches import room
 
 from gsmerge import Cameras
 from gsmerge.geometry import project

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scenes
-from arriving import group, random_gaussians, same_group, same_groups
-from learned import SMALL, Made, made, noisy, written
-from loose import far_behind, shuffled, voxels
+from network_fixtures import SMALL, Made, made, noisy, written
+from unaligned_scenes import far_behind, shuffled, voxels
+from view_batches import group, random_gaussians, same_group, same_groups
 
-from gsmerge import Gaussians, PixelScene, decode_scene, encode_scene
+from gsmerge import Gaussians, Scene, decode_scene, encode_scene
 from gsmerge.geometry import covariances
 from gsmerge.moments import feature_to_gaussians, gaussian_members
 from gsmerge.networks.apply import encode_features
@@ -233,13 +233,13 @@ def test_part_members_know_the_footprint_of_their_group(groups: GroupSet) -> Non
 
 
 @pytest.fixture(scope="module")
-def pixels() -> PixelScene:
+def pixels() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(3), degree=1)
 
 
 @pytest.mark.parametrize("most", [1, 2, 4])
 @pytest.mark.parametrize("networks", [False, True])
-def test_an_encoded_scene_is_a_state(networks: bool, most: int, pixels: PixelScene, tmp_path: Path) -> None:
+def test_an_encoded_scene_is_a_state(networks: bool, most: int, pixels: Scene, tmp_path: Path) -> None:
     checkpoint = str(written(tmp_path / "a.safetensors", noisy())) if networks else "none"
     encoded = encode_scene(pixels, superpixels="5%", max_k=most, checkpoint=checkpoint)
     assert (encoded.heads is not None) == networks
@@ -252,7 +252,7 @@ def test_an_encoded_scene_is_a_state(networks: bool, most: int, pixels: PixelSce
 
 
 @pytest.mark.parametrize("settings", [{"budget": "10%"}, {"budget": "auto"}, {"k": 2, "rule": "paper"}], ids=str)
-def test_settings_of_an_encoded_scene(settings: dict[str, object], pixels: PixelScene) -> None:
+def test_settings_of_an_encoded_scene(settings: dict[str, object], pixels: Scene) -> None:
     encoded = encode_scene(pixels, superpixels="5%", checkpoint="none", **settings)
     state = from_encoded(encoded)
     assert state.settings.target_count is None
@@ -263,7 +263,7 @@ def test_settings_of_an_encoded_scene(settings: dict[str, object], pixels: Pixel
         assert_same_children(decode_scene(actual, k=k), decode_scene(encoded, k=k))
 
 
-def test_division_between_one_and_most_is_about_as_good(pixels: PixelScene) -> None:
+def test_division_between_one_and_most_is_about_as_good(pixels: Scene) -> None:
     """Children are divided again, of what they are and not of the pixels: close, not equal."""
     for rule in ("depth", "paper"):
         encoded = encode_scene(pixels, superpixels="5%", checkpoint="none", rule=rule)
@@ -273,7 +273,7 @@ def test_division_between_one_and_most_is_about_as_good(pixels: PixelScene) -> N
             assert after > before - 0.3, (rule, k)
 
 
-def test_scenes_in_no_order_and_what_no_view_sees(pixels: PixelScene) -> None:
+def test_scenes_in_no_order_and_what_no_view_sees(pixels: Scene) -> None:
     loose = voxels(pixels, 0.05)
     state = from_encoded(encode_scene(loose, superpixels="10%"))
     assert state.settings.num_slots is None
@@ -288,7 +288,7 @@ def test_scenes_in_no_order_and_what_no_view_sees(pixels: PixelScene) -> None:
     assert to_encoded(state).num_kept == encoded.num_kept > 0
 
 
-def test_what_is_told_of_an_encoded_scene(pixels: PixelScene) -> None:
+def test_what_is_told_of_an_encoded_scene(pixels: Scene) -> None:
     encoded = encode_scene(pixels, superpixels="5%", checkpoint="none")
     about = from_encoded(encoded).about
     assert about["options"]["superpixels"] == "5%"
@@ -298,7 +298,7 @@ def test_what_is_told_of_an_encoded_scene(pixels: PixelScene) -> None:
     assert about["batches"][0]["num_input"] == pixels.num_gaussians
 
 
-def test_unsolved_colours_are_there_too(groups: GroupSet, pixels: PixelScene) -> None:
+def test_unsolved_colours_are_there_too(groups: GroupSet, pixels: Scene) -> None:
     state = from_encoded(encode_scene(pixels, superpixels="5%", checkpoint="none"))
     state = replace(state, groups=replace(state.groups, fitted_sh0=state.groups.fitted_sh0 + 0.2 / SH_C0))
     as_came, fitted = to_encoded(state, fitted_colors=False), to_encoded(state)

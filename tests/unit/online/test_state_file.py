@@ -10,10 +10,21 @@ from typing import Any
 
 import numpy as np
 import pytest
-from arriving import fed, parts_of, room, same_state, state_of
-from loose import far_behind, shuffled
+from damaged_files import (
+    WILD_NUMBERS,
+    Spoil,
+    cut,
+    filled,
+    header,
+    with_array,
+    with_header,
+    with_settings,
+    with_text,
+    without,
+)
 from safetensors.numpy import load_file, save_file
-from spoils import WILD_NUMBERS, Spoil, cut, filled, header, with_array, with_header, with_settings, with_text, without
+from unaligned_scenes import far_behind, shuffled
+from view_batches import fed, parts_of, room, same_state, state_of
 
 from gsmerge import Compactor, Encoded, Gaussians, encode_scene, load_encoded, save_encoded
 from gsmerge.encoded.gsm_file import STATE

@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 import scenes
 
-from gsmerge import PixelScene
+from gsmerge import Scene
 from gsmerge.render.blend import composite
 from gsmerge.render.photos import NEAR, photo_psnr, scene_photos, scored_tiles
 from gsmerge.render.plan import plan_view, prepare
 
 
 @pytest.fixture(scope="module")
-def scene() -> PixelScene:
+def scene() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(4, 160, 128), noise=0.05)
 
 
-def test_wanted_tiles_are_drawn_as_in_the_whole(scene: PixelScene) -> None:
+def test_wanted_tiles_are_drawn_as_in_the_whole(scene: Scene) -> None:
     """Bit for bit, with Gaussians of all sizes, from fewer of them."""
     rng, splats = np.random.default_rng(0), prepare(scene.gaussians)
     scales = splats.scales * rng.choice([0.2, 1, 30], (len(splats), 1)).astype(np.float32)
@@ -51,7 +51,7 @@ def test_odd_sizes_have_about_a_quarter(width: int, height: int) -> None:
         assert tiles.mean() == pytest.approx(0.25, abs=0.1)
 
 
-def test_quarter_is_near_the_whole(scene: PixelScene) -> None:
+def test_quarter_is_near_the_whole(scene: Scene) -> None:
     photos, views = scene_photos(scene), range(len(scene))
     whole, quarter = (photo_psnr(scene.gaussians, photos, views, near=NEAR, quarter=part) for part in (False, True))
     assert quarter == pytest.approx(whole, abs=0.5)

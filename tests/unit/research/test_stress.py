@@ -18,13 +18,13 @@ from gsmerge.measure.evaluate import Views
 from gsmerge.options import CompactOptions
 from gsmerge.research.stress import CASES, cases, run, stress
 from gsmerge.research.stress.cases import StressScene
-from gsmerge.types import PixelScene, UnalignedScene
+from gsmerge.types import Scene
 
 FAST = CompactOptions().with_settings({"fit": "none"})
 
 
 @pytest.fixture(scope="module")
-def scene() -> PixelScene:
+def scene() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(3))
 
 
@@ -33,7 +33,7 @@ def load(made_scene: Path) -> SceneLoad:
     return load_scene(made_scene)
 
 
-def offsets(scene: PixelScene) -> float:
+def offsets(scene: Scene) -> float:
     """Largest distance (pixels) of a Gaussian from its pixel."""
     pixels, _ = project(scene.gaussians.means, scene.cameras)
     v, h, w = scene.valid.shape
@@ -42,13 +42,12 @@ def offsets(scene: PixelScene) -> float:
     return float(np.abs(own - np.stack([x, y], -1)).max())
 
 
-def pixel_scene(judged: StressScene) -> PixelScene:
-    assert isinstance(judged.scene, PixelScene)
+def pixel_scene(judged: StressScene) -> Scene:
     return judged.scene
 
 
 @pytest.mark.parametrize("degrees", [0.2, 5.0])
-def test_wrong_poses_keep_every_gaussian_on_its_pixel(degrees: float, scene: PixelScene) -> None:
+def test_wrong_poses_keep_every_gaussian_on_its_pixel(degrees: float, scene: Scene) -> None:
     turned = pixel_scene(cases.perturb_poses(StressScene(scene, None), degrees))
     assert offsets(turned) < 1e-3
     for old, new in zip(scene.cameras.viewmats, turned.cameras.viewmats, strict=True):
@@ -58,7 +57,7 @@ def test_wrong_poses_keep_every_gaussian_on_its_pixel(degrees: float, scene: Pix
 
 
 @pytest.mark.parametrize(("factor", "shift"), [(1e-4, (0, 0, 0)), (1e4, (0, 0, 0)), (1.0, (4e5, 5e6, 100))])
-def test_moved_scenes_move_their_judges(factor: float, shift: tuple[float, ...], scene: PixelScene) -> None:
+def test_moved_scenes_move_their_judges(factor: float, shift: tuple[float, ...], scene: Scene) -> None:
     assert scene.images is not None
     views = Views(scene.cameras, scene.images, scene.names)
     move = cases.move(StressScene(scene, views), factor, shift)
@@ -67,7 +66,7 @@ def test_moved_scenes_move_their_judges(factor: float, shift: tuple[float, ...],
     np.testing.assert_allclose(move.views.cameras.viewmats, move.scene.cameras.viewmats)
 
 
-def test_exposure_changes_photos_and_colours_alike(scene: PixelScene) -> None:
+def test_exposure_changes_photos_and_colours_alike(scene: Scene) -> None:
     changed = pixel_scene(cases.change_exposure(StressScene(scene, None), 0.2))
     assert changed.images is not None
     assert scene.images is not None
@@ -76,7 +75,7 @@ def test_exposure_changes_photos_and_colours_alike(scene: PixelScene) -> None:
     np.testing.assert_allclose(colors[1].clip(0, 1), changed.images[1], rtol=1e-5, atol=1e-5)
 
 
-def test_rows_that_are_spoilt(scene: PixelScene) -> None:
+def test_rows_that_are_spoilt(scene: Scene) -> None:
     scene_in, n = StressScene(scene, None), len(scene.gaussians)
     broken = pixel_scene(cases.break_rows(scene_in))
     assert int((~broken.valid).sum()) == round(0.01 * n)
@@ -85,11 +84,11 @@ def test_rows_that_are_spoilt(scene: PixelScene) -> None:
     assert sorted(set(large[:, 0].round().tolist())) == [1.0, 8.0]
     away = (cases.throw_away(scene_in).scene.gaussians.means != scene.gaussians.means).any(1)
     assert int(away.sum()) == 1
-    loose = UnalignedScene(scene.gaussians, scene.cameras, scene.images, scene.names)
+    loose = Scene(scene.gaussians, scene.cameras, scene.images, None, scene.names)
     assert len(cases.break_rows(StressScene(loose, None)).scene.gaussians) == n - round(0.01 * n)
 
 
-def test_views_are_taken_away_shuffled_and_repeated(scene: PixelScene) -> None:
+def test_views_are_taken_away_shuffled_and_repeated(scene: Scene) -> None:
     scene_in = StressScene(scene, None)
     assert len(cases.halve_views(scene_in).scene) == 1
     assert len(cases.fewer_views(scene_in, 2).scene) == 2
@@ -116,8 +115,7 @@ def test_every_case_on_a_scene_with_held_out_views(load: SceneLoad, made_scene: 
 
 
 def test_a_scene_in_no_order_skips_what_needs_pixels(load: SceneLoad) -> None:
-    assert isinstance(load.scene, PixelScene)
-    loose = UnalignedScene(load.scene.gaussians, load.scene.cameras, load.scene.images, load.scene.names)
+    loose = Scene(load.scene.gaussians, load.scene.cameras, load.scene.images, None, load.scene.names)
     actual = stress(replace(load, scene=loose, cameras=None), FAST, cases=["order", "views-3", "large", "c2w-opencv"])
     assert [outcome.passed for outcome in actual] == [None, None, True, None]
 
@@ -185,6 +183,6 @@ def test_wrong_conventions_that_are_believed_are_noticed(load: SceneLoad, monkey
 def test_bad_arguments(load: SceneLoad) -> None:
     with pytest.raises(ValueError, match="cases: expected some of unchanged"):
         stress(load, FAST, cases=["nonsense"])
-    bare = UnalignedScene(load.scene.gaussians, load.scene.cameras[[]], None, ())
+    bare = Scene(load.scene.gaussians, load.scene.cameras[[]], None, None, ())
     with pytest.raises(ValueError, match="a scene with views"):
         stress(replace(load, scene=bare), FAST)

@@ -7,25 +7,28 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
+import unaligned_scenes
 
 import gsmerge
-from gsmerge import PixelScene
+from gsmerge import Scene
 from gsmerge.moments import scene_members
 from gsmerge.options import CompactOptions
+from gsmerge.plan import make_plan
 from gsmerge.runtime.record import record_run
-from gsmerge.stages.agreement import choose_superpixels, contradicted_share, weaken_contradicted
-from gsmerge.stages.encode import EncodeOptions, encode
-from gsmerge.types import Groups
+from gsmerge.stages.agreement import contradicted_share, weaken_contradicted
+from gsmerge.stages.encode import encode
+from gsmerge.stages.prepare import prepare
+from gsmerge.types import Groups, grid_ids
 
 AUTO = CompactOptions().with_settings({"superpixels": "auto"})
 
 
 @pytest.fixture(scope="module")
-def wall() -> PixelScene:
+def wall() -> Scene:
     return scenes.make_scene(scenes.wall(), scenes.arc(4, 48, 36))
 
 
-def with_nearer_half(scene: PixelScene, views: list[int]) -> PixelScene:
+def with_nearer_half(scene: Scene, views: list[int]) -> Scene:
     """The right half of some views stands at six tenths of its depth."""
     means = scene.gaussians.means.reshape(4, 36, 48, 3).copy()
     for view in views:
@@ -34,12 +37,12 @@ def with_nearer_half(scene: PixelScene, views: list[int]) -> PixelScene:
     return replace(scene, gaussians=replace(scene.gaussians, means=means.reshape(-1, 3)))
 
 
-def test_what_other_views_see_through_begins_fainter(wall: PixelScene) -> None:
+def test_what_other_views_see_through_begins_fainter(wall: Scene) -> None:
     """One view's right half stands nearer than the wall that all others see; the wall itself stays as it is."""
     wrong = with_nearer_half(wall, [1])
     labels = np.arange(48 * 36, dtype=np.int32).reshape(36, 48) // 6
     groups = Groups(np.broadcast_to(labels, (4, 36, 48)).copy(), (288,) * 4)
-    features = encode(wrong, scene_members(wrong), groups, EncodeOptions())
+    features = encode(wrong, scene_members(wrong), groups)
     thin = weaken_contradicted(features, scene_members(wrong), wrong.cameras)
     moved = (features.views == 1) & (np.arange(len(features)) % 8 >= 4)
     factors = thin.gains / features.gains
@@ -49,36 +52,35 @@ def test_what_other_views_see_through_begins_fainter(wall: PixelScene) -> None:
     np.testing.assert_array_equal(thin.means, features.means)
 
 
-def test_share_that_other_views_see_through(wall: PixelScene) -> None:
+def test_share_that_other_views_see_through(wall: Scene) -> None:
     one, two = (contradicted_share(some, scene_members(some)) for some in (wall, with_nearer_half(wall, [1])))
     assert one < 0.02
     assert two == pytest.approx(1 / 8, abs=0.03)
-    nothing = replace(wall, valid=np.zeros_like(wall.valid))
+    nothing = replace(wall, pixel_ids=grid_ids(np.zeros_like(wall.valid)))
     assert contradicted_share(nothing, scene_members(nothing)) == 0
 
 
-def test_views_that_agree_get_more_superpixels(wall: PixelScene) -> None:
+def test_views_that_agree_get_more_superpixels(wall: Scene) -> None:
     shares = []
     for scene in (wall, with_nearer_half(wall, [1]), with_nearer_half(wall, [0, 2])):
         with record_run() as log:
-            options = choose_superpixels(scene, scene_members(scene), AUTO)
-        shares.append(options.segment.share)
-        assert log.choices["superpixels"]["share"] == pytest.approx(options.segment.share, rel=0.05)
+            plan = make_plan(prepare(scene), AUTO)
+        shares.append(plan.superpixels.options.share)
+        assert log.choices["superpixels"]["share"] == pytest.approx(shares[-1], rel=0.05)
         assert len(log.notes) == 1
         assert "see through" in log.notes[0]
     assert 0.08 >= shares[0] > shares[1] > shares[2] >= 0.015
 
 
-def test_scenes_whose_depths_cannot_be_compared_get_the_usual_share(wall: PixelScene) -> None:
-    alone = scenes.take_views(wall, [0])
-    for scene, members in ((alone, scene_members(alone)), (wall, None)):
+def test_scenes_whose_depths_cannot_be_compared_get_the_usual_share(wall: Scene) -> None:
+    for scene in (scenes.take_views(wall, [0]), unaligned_scenes.loosened(wall)):
         with record_run() as log:
-            assert choose_superpixels(scene, members, AUTO).segment == CompactOptions().segment
+            assert make_plan(prepare(scene), AUTO).superpixels.options.share == CompactOptions().segment.share
         assert "cannot be compared" in log.notes[0]
         assert "superpixels" not in log.choices
 
 
-def test_a_run_says_what_it_chose(wall: PixelScene) -> None:
+def test_a_run_says_what_it_chose(wall: Scene) -> None:
     auto, usual = (scenes.compacted(wall, superpixels=share, effort="draft") for share in ("auto", "4.4%"))
     assert len(auto.gaussians) > 1.4 * len(usual.gaussians)
     assert auto.report.options["superpixels"] == "auto"

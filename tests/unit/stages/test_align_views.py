@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 import scenes
 
-from gsmerge import CompactOptions, PixelScene, UnalignedScene, compact
+from gsmerge import CompactOptions, Scene, compact
 from gsmerge.geometry import motion_matrices, motion_vectors, pose_changes, project, quat_to_rotmat
 from gsmerge.geometry import without_common_motion as without_common
+from gsmerge.plan import make_plan
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.align_views import align_views
-from gsmerge.stages.clean import CleanOptions, make_clean
+from gsmerge.stages.clean import CleanOptions, clean_to_count
 from gsmerge.stages.fit import Fitted
 from gsmerge.stages.prepare import prepare
 
@@ -22,20 +23,20 @@ VIEWS = range(5)
 
 
 @pytest.fixture(scope="module")
-def scene() -> PixelScene:
+def scene() -> Scene:
     made = scenes.make_scene(scenes.room(), scenes.arc(5, 160, 120))
     back = -np.median(made.gaussians.means[:, 2])  # the canonical frame is about the scene's middle
     return scenes.move(made, np.eye(3), 0.5, np.array([0, 0, 0.5 * back]))
 
 
-def worst_error(scene: PixelScene, truth: PixelScene) -> tuple[float, float]:
+def worst_error(scene: Scene, truth: Scene) -> tuple[float, float]:
     """Degrees and distances between relative poses."""
     relative = [one.cameras.viewmats @ np.linalg.inv(one.cameras.viewmats[2]) for one in (scene, truth)]
     degrees, distances = pose_changes(*relative)
     return float(degrees.max()), float(distances.max())
 
 
-def test_moved_gaussians_stay_at_their_pixels(scene: PixelScene) -> None:
+def test_moved_gaussians_stay_at_their_pixels(scene: Scene) -> None:
     moved = motions.disagreeing(scene)
     for view in VIEWS:
         rows = slice(view * scene.pixels_per_view, (view + 1) * scene.pixels_per_view)
@@ -48,12 +49,12 @@ def test_moved_gaussians_stay_at_their_pixels(scene: PixelScene) -> None:
         np.testing.assert_allclose(*axes, atol=1e-5)
 
 
-def test_views_that_agree_are_left_alone(scene: PixelScene) -> None:
+def test_views_that_agree_are_left_alone(scene: Scene) -> None:
     assert align_views(scene, VIEWS) is None
 
 
 @pytest.mark.parametrize("views", [slice(None), slice(1, 2)], ids=["all", "one"])
-def test_views_are_moved_to_where_they_agree(views: slice, scene: PixelScene) -> None:
+def test_views_are_moved_to_where_they_agree(views: slice, scene: Scene) -> None:
     wrong = motions.disagreeing(scene, views=views)
     before = worst_error(wrong, scene)
     found = align_views(wrong, VIEWS)
@@ -65,7 +66,7 @@ def test_views_are_moved_to_where_they_agree(views: slice, scene: PixelScene) ->
     np.testing.assert_allclose(np.median(common, 0), 0, atol=2e-3)
 
 
-def test_views_that_are_left_out_stay(scene: PixelScene) -> None:
+def test_views_that_are_left_out_stay(scene: Scene) -> None:
     wrong = motions.disagreeing(scene)
     found = align_views(wrong, range(4))
     assert found is not None
@@ -76,45 +77,46 @@ def test_views_that_are_left_out_stay(scene: PixelScene) -> None:
     np.testing.assert_allclose(np.median(common[:4], 0), 0, atol=2e-3)
 
 
-def test_cameras_of_repeated_views_and_of_views_that_share_one(scene: PixelScene) -> None:
+def test_cameras_of_repeated_views_and_of_views_that_share_one(scene: Scene) -> None:
     viewmats = scene.cameras.viewmats.copy()
     viewmats[1] = viewmats[0]  # of other Gaussians and another photo
     shared = scenes.take_views(replace(scene, cameras=replace(scene.cameras, viewmats=viewmats)), [0, 1, 0, 2])
-    prepared = prepare(shared, CompactOptions().with_settings({"fit": "none", "poses": "fixed"}))
+    options = CompactOptions().with_settings({"fit": "none", "poses": "fixed"})
+    prepared = prepare(shared, options.prepare)
     assert prepared.repeated == (0, 1, 0, 2)
     assert prepared.final_cameras() is shared.cameras
     placed = motions.random_motions(3, 1.0, 0.1) @ prepared.scene.cameras.viewmats
     found = prepared.with_cameras(replace(prepared.scene.cameras, viewmats=placed)).final_cameras()
     np.testing.assert_allclose(prepared.frame.enter_cameras(found).viewmats, placed[[0, 1, 0, 2]], atol=1e-9)
-    assert replace(prepared, photo_views=(0, 2)).scored_views() == [0, 2, 3]
+    assert make_plan(replace(prepared, photo_views=(0, 2)), options).scored_views == (0, 2, 3)
 
 
 @pytest.mark.parametrize("cameras", [True, False])
-def test_nothing_is_moved_without_photos(cameras: bool, scene: PixelScene) -> None:
+def test_nothing_is_moved_without_photos(cameras: bool, scene: Scene) -> None:
     places, names = (scene.cameras, scene.names) if cameras else (scene.cameras[[]], ())
-    loose = UnalignedScene(scene.gaussians[::8], places, None, names)
+    loose = Scene(scene.gaussians[::8], places, None, None, names)
     result = compact(loose, poses="free", budget=200, fit_steps=4)
     assert "poses" not in result.report.choices
     np.testing.assert_array_equal(result.cameras.viewmats, places.viewmats)
 
 
-def test_all_levels_have_the_cameras_of_the_finest(scene: PixelScene) -> None:
+def test_all_levels_have_the_cameras_of_the_finest(scene: Scene) -> None:
     result = compact(scene, poses="free", fit_steps=12, superpixels="2%", levels=2)
     assert np.abs(result.cameras.viewmats - scene.cameras.viewmats).max() > 0
     np.testing.assert_array_equal(result.coarser[0].cameras.viewmats, result.cameras.viewmats)
 
 
-def test_clean_up_keeps_the_poses_of_the_fit(scene: PixelScene) -> None:
+def test_clean_up_keeps_the_poses_of_the_fit(scene: Scene) -> None:
     moved = replace(scene.cameras, viewmats=scene.cameras.viewmats + 0.01)
 
     def make(count: int | None) -> Fitted:
         return Fitted(scene.gaussians, moved, None)
 
-    cleaned = make_clean(make, None, CleanOptions(drop_floaters=True), scene, lambda gaussians: gaussians)
+    cleaned = clean_to_count(make, None, CleanOptions(drop_floaters=True), prepare(scene))
     assert cleaned.cameras is moved
 
 
-def test_the_same_with_one_thread(scene: PixelScene) -> None:
+def test_the_same_with_one_thread(scene: Scene) -> None:
     wrong, found = motions.disagreeing(scene), []
     for threads in (1, 2):
         with use_threads(threads):
@@ -131,7 +133,7 @@ def test_nothing_can_be_told_of_tiny_photos(size: tuple[int, int]) -> None:
     assert align_views(tiny, range(3), always=True) is None
 
 
-def test_one_view_agrees_with_itself(scene: PixelScene) -> None:
+def test_one_view_agrees_with_itself(scene: Scene) -> None:
     assert align_views(scenes.take_views(scene, [0]), [0], always=True) is None
 
 
@@ -141,7 +143,7 @@ def test_no_motion_in_common() -> None:
     np.testing.assert_allclose(without_common(start, together, np.mean), start, atol=1e-12)
 
 
-def test_compacting_says_how_far_views_were_moved(scene: PixelScene) -> None:
+def test_compacting_says_how_far_views_were_moved(scene: Scene) -> None:
     wrong, settings = motions.disagreeing(scene), {"effort": "draft", "superpixels": "2%", "match": "overlap"}
     fixed, auto = (compact(wrong, **settings, poses=poses) for poses in ("fixed", "auto"))
     assert "poses" not in fixed.report.choices
@@ -153,7 +155,7 @@ def test_compacting_says_how_far_views_were_moved(scene: PixelScene) -> None:
     assert auto.report.psnr_after > fixed.report.psnr_after - 0.2
 
 
-def test_right_poses_are_the_same_run(scene: PixelScene) -> None:
+def test_right_poses_are_the_same_run(scene: Scene) -> None:
     settings = {"fit_steps": 12, "superpixels": "2%"}
     fixed, auto = (compact(scene, **settings, poses=poses) for poses in ("fixed", "auto"))
     np.testing.assert_array_equal(fixed.gaussians.means, auto.gaussians.means)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scenes
 
-from gsmerge import CompactOptions, Gaussians, PixelScene, compact
+from gsmerge import CompactOptions, Gaussians, Scene, compact
 from gsmerge.errors import UsageError
 from gsmerge.stages.clean import CleanOptions, clean, faintest_dropped, floater_share, floaters, inside_crop, parse_crop
 
@@ -16,11 +16,11 @@ QUICK = {"fit": "none", "checkpoint": "none", "superpixels": 60}
 
 
 @pytest.fixture(scope="module")
-def scene() -> PixelScene:
+def scene() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(3, 64, 48), noise=0.01)
 
 
-def sphere_in(scene: PixelScene, share: float) -> str:
+def sphere_in(scene: Scene, share: float) -> str:
     """A sphere about the scene's middle that holds that share of its Gaussians."""
     means = scene.gaussians.means.astype(float)
     middle = np.median(means, axis=0)
@@ -63,7 +63,7 @@ def test_crops_keep_what_is_inside() -> None:
     assert parse_crop("sphere:1,2,3,4")[1].tolist() == [1, 2, 3, 4]
 
 
-def test_floaters_are_alone_or_far_away(scene: PixelScene) -> None:
+def test_floaters_are_alone_or_far_away(scene: Scene) -> None:
     given = wall()
     assert not floaters(given).any()
     means = given.means.copy()
@@ -88,7 +88,7 @@ def test_the_faintest_go_first() -> None:
 
 
 @pytest.mark.parametrize("share", [0.3, 0.7])
-def test_a_budget_is_met_after_the_crop(scene: PixelScene, share: float) -> None:
+def test_a_budget_is_met_after_the_crop(scene: Scene, share: float) -> None:
     crop = sphere_in(scene, share)
     result = compact(scene, **QUICK, crop=crop, drop_floaters=True, budget=150)
     assert len(result.gaussians) == 150
@@ -98,7 +98,7 @@ def test_a_budget_is_met_after_the_crop(scene: PixelScene, share: float) -> None
     assert sum(note.startswith("left out by clean-up: ") for note in result.report.notes) == 1
 
 
-def test_a_crop_without_a_budget_keeps_the_rest_as_it_is(scene: PixelScene) -> None:
+def test_a_crop_without_a_budget_keeps_the_rest_as_it_is(scene: Scene) -> None:
     crop = sphere_in(scene, 0.5)
     whole, part = compact(scene, **QUICK), compact(scene, **QUICK, crop=crop)
     inside = inside_crop(whole.gaussians.means, crop)
@@ -107,7 +107,7 @@ def test_a_crop_without_a_budget_keeps_the_rest_as_it_is(scene: PixelScene) -> N
     assert "clean" not in whole.report.choices
 
 
-def test_levels_and_baselines_are_cropped(scene: PixelScene) -> None:
+def test_levels_and_baselines_are_cropped(scene: Scene) -> None:
     crop = sphere_in(scene, 0.5)
     result = compact(scene, **QUICK, crop=crop, budget=160, levels=2)
     assert [len(one.gaussians) for one in (result, *result.coarser)] == [160, 40]
@@ -118,7 +118,7 @@ def test_levels_and_baselines_are_cropped(scene: PixelScene) -> None:
     assert not any("does not use" in note for note in opaque.report.notes)
 
 
-def test_what_cannot_be(scene: PixelScene) -> None:
+def test_what_cannot_be(scene: Scene) -> None:
     with pytest.raises(UsageError, match="expected Gaussians of the scene in sphere:0,0,1e9,1, found none"):
         compact(scene, **QUICK, crop="sphere:0,0,1e9,1")
     with pytest.raises(ValueError, match="crop: expected a budget or superpixels, got quality 30dB"):

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import scenes
 
-from gsmerge import Gaussians, PixelScene
+from gsmerge import Gaussians, Scene
 from gsmerge.geometry import covariances
 from gsmerge.moments import Members, feature_to_gaussians, scene_members
 from gsmerge.stages.decode import DecodeOptions, deal_visible, decode, mixed_counts, split_counts
-from gsmerge.stages.encode import EncodeOptions, encode
+from gsmerge.stages.encode import encode
 from gsmerge.stages.merge import merge
 from gsmerge.stages.segment import SegmentOptions, segment
 from gsmerge.types import FeatureGaussians, Groups, Matches
@@ -20,20 +20,20 @@ COUNT = 8  # so that no superpixel has fewer than 8 pixels
 
 
 @pytest.fixture(scope="module")
-def scene() -> PixelScene:
+def scene() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(2, 24, 18), degree=1)
 
 
 @pytest.fixture(scope="module")
-def members(scene: PixelScene) -> Members:
+def members(scene: Scene) -> Members:
     return scene_members(scene)
 
 
 @pytest.fixture(scope="module")
-def features(scene: PixelScene, members: Members) -> FeatureGaussians:
+def features(scene: Scene, members: Members) -> FeatureGaussians:
     assert scene.images is not None
     groups = segment(scene.images, SegmentOptions(), COUNT)
-    return encode(scene, members, groups, EncodeOptions())
+    return encode(scene, members, groups)
 
 
 def assert_alike(a: Gaussians, b: Gaussians) -> None:
@@ -69,12 +69,12 @@ def test_children_keep_the_groups_moments(features: FeatureGaussians, members: M
 
 
 @pytest.mark.parametrize("k", [1, 2, 4])
-def test_children_are_pooled_by_the_rule(scene: PixelScene, members: Members, k: int) -> None:
+def test_children_are_pooled_by_the_rule(scene: Scene, members: Members, k: int) -> None:
     """The paper's: members of one opacity have children of that opacity; the own rule makes them denser."""
     assert scene.images is not None
     even = replace(members, opacities=np.full_like(members.opacities, 0.5))
     groups = segment(scene.images, SegmentOptions(), COUNT)
-    paper = encode(scene, even, groups, EncodeOptions("paper"))
+    paper = encode(scene, even, groups, rule="paper")
     actual = decode(paper, even, DecodeOptions(k=k), rule="paper")
     assert len(actual) == 2 * COUNT * k
     np.testing.assert_allclose(actual.opacities, 0.5, rtol=1e-3)
@@ -109,7 +109,7 @@ def test_percentiles_out_of_range_are_refused(low: float, high: float) -> None:
         DecodeOptions(k="mixed", k_low=low, k_high=high)
 
 
-def test_identical_members_stay_one_child(scene: PixelScene, members: Members) -> None:
+def test_identical_members_stay_one_child(scene: Scene, members: Members) -> None:
     same = Members(
         *(np.repeat(getattr(members, n)[:1], 10, axis=0) for n in members.__dataclass_fields__ if n != "pixels")
     )
@@ -118,10 +118,10 @@ def test_identical_members_stay_one_child(scene: PixelScene, members: Members) -
     assert len(decode(one, same, DecodeOptions(k=4))) == 1
 
 
-def test_single_members_stay_themselves(scene: PixelScene, members: Members) -> None:
+def test_single_members_stay_themselves(scene: Scene, members: Members) -> None:
     """Every pixel its own superpixel: K changes nothing."""
     labels = np.stack([np.arange(scene.pixels_per_view, dtype=np.int32).reshape(18, 24)] * 2)
-    features = encode(scene, members, Groups(labels, (432, 432)), EncodeOptions())
+    features = encode(scene, members, Groups(labels, (432, 432)))
     assert_alike(decode(features, members, DecodeOptions(k=4)), decode(features, members, DecodeOptions(k=1)))
 
 
@@ -148,13 +148,13 @@ def test_nothing(members: Members, k: int) -> None:
 
 
 @pytest.mark.parametrize("k", [1, 4])
-def test_faint_ones_are_left_out(scene: PixelScene, k: int) -> None:
+def test_faint_ones_are_left_out(scene: Scene, k: int) -> None:
     opacities = scene.gaussians.opacities.copy()
     opacities[: scene.pixels_per_view] = 0
     half = replace(scene, gaussians=replace(scene.gaussians, opacities=opacities))
     own = scene_members(half)
     assert half.images is not None
-    features = encode(half, own, segment(half.images, SegmentOptions(), COUNT), EncodeOptions())
+    features = encode(half, own, segment(half.images, SegmentOptions(), COUNT))
     assert len(features) == 2 * COUNT
     actual = decode(features, own, DecodeOptions(k=k))
     assert len(actual) == COUNT * k

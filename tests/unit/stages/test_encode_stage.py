@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 import scenes
 
-from gsmerge import PixelScene
+from gsmerge import Scene
 from gsmerge.moments import feature_to_gaussians, scene_members
-from gsmerge.stages.encode import EncodeOptions, encode, group_rows
-from gsmerge.types import FeatureGaussians, Groups
+from gsmerge.stages.encode import encode, group_rows
+from gsmerge.types import FeatureGaussians, Groups, grid_ids
 
 WIDTH, HEIGHT = 12, 8
 
 
 @pytest.fixture(scope="module")
-def scene() -> PixelScene:
+def scene() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(2, WIDTH, HEIGHT), degree=1)
 
 
@@ -27,11 +27,11 @@ def groups() -> Groups:
     return Groups(np.stack([labels, labels]), (6, 6))
 
 
-def encoded(scene: PixelScene, groups: Groups, rule: str = "depth") -> FeatureGaussians:
-    return encode(scene, scene_members(scene), groups, EncodeOptions(rule))  # type: ignore[arg-type]
+def encoded(scene: Scene, groups: Groups, rule: str = "depth") -> FeatureGaussians:
+    return encode(scene, scene_members(scene), groups, rule=rule)  # type: ignore[arg-type]
 
 
-def test_rows_of_the_groups(scene: PixelScene, groups: Groups) -> None:
+def test_rows_of_the_groups(scene: Scene, groups: Groups) -> None:
     starts, ids, views = group_rows(scene, groups)
     assert np.diff(starts).tolist() == [16] * 12
     assert views.tolist() == [0] * 6 + [1] * 6
@@ -42,32 +42,32 @@ def test_rows_of_the_groups(scene: PixelScene, groups: Groups) -> None:
         assert (own // (WIDTH * HEIGHT) == g // 6).all()
 
 
-def test_invalid_pixels_are_left_out(scene: PixelScene, groups: Groups) -> None:
+def test_invalid_pixels_are_left_out(scene: Scene, groups: Groups) -> None:
     valid = scene.valid.copy()
     valid[0, :4, :4] = False  # a whole superpixel
     valid[1, 0, 0] = False
-    starts, ids, views = group_rows(replace(scene, valid=valid), groups)
+    starts, ids, views = group_rows(replace(scene, pixel_ids=grid_ids(valid)), groups)
     assert np.diff(starts).tolist() == [16] * 5 + [15] + [16] * 5
     assert views.tolist() == [0] * 5 + [1] * 6
     assert valid.reshape(-1)[ids].all()
     assert len(np.unique(ids)) == len(ids) == int(valid.sum())
-    features = encoded(replace(scene, valid=valid), groups)
+    features = encoded(replace(scene, pixel_ids=grid_ids(valid)), groups)
     assert len(features) == 11
 
 
 @pytest.mark.parametrize("rule", ["depth", "paper"])
-def test_no_valid_pixel(scene: PixelScene, groups: Groups, rule: str) -> None:
-    assert len(encoded(replace(scene, valid=np.zeros_like(scene.valid)), groups, rule)) == 0
+def test_no_valid_pixel(scene: Scene, groups: Groups, rule: str) -> None:
+    assert len(encoded(replace(scene, pixel_ids=grid_ids(np.zeros_like(scene.valid))), groups, rule)) == 0
 
 
-def test_views_may_have_different_counts(scene: PixelScene, groups: Groups) -> None:
+def test_views_may_have_different_counts(scene: Scene, groups: Groups) -> None:
     labels = groups.labels.copy()
     labels[1] = 0
     _, _, views = group_rows(scene, Groups(labels, (6, 1)))
     assert views.tolist() == [0] * 6 + [1]
 
 
-def test_sums_add_up(scene: PixelScene, groups: Groups) -> None:
+def test_sums_add_up(scene: Scene, groups: Groups) -> None:
     features = encoded(scene, groups)
     assert len(features) == 12
     assert float(features.weights.sum()) == pytest.approx(float(scene.gaussians.opacities.sum()), rel=1e-5)
@@ -81,7 +81,7 @@ def test_sums_add_up(scene: PixelScene, groups: Groups) -> None:
     assert features.shN.shape == (12, 3, 3)
 
 
-def test_paper_rule_is_moment_matching_with_the_mean_opacity(scene: PixelScene, groups: Groups) -> None:
+def test_paper_rule_is_moment_matching_with_the_mean_opacity(scene: Scene, groups: Groups) -> None:
     features = encoded(scene, groups, "paper")
     gaussians = feature_to_gaussians(features)
     rows = group_rows(scene, groups)[1].reshape(12, 16)
@@ -95,8 +95,3 @@ def test_paper_rule_is_moment_matching_with_the_mean_opacity(scene: PixelScene, 
         np.testing.assert_allclose(features.means[g], mean, atol=1e-5)
         np.testing.assert_allclose(features.covars[g], covar + floor, rtol=1e-3, atol=1e-7)
         assert float(gaussians.opacities[g]) == pytest.approx(float(members.opacities[own].mean()), rel=1e-4)
-
-
-def test_unknown_rule_is_refused(scene: PixelScene, groups: Groups) -> None:
-    with pytest.raises(ValueError, match="rule"):
-        encoded(scene, groups, "mean")

@@ -2,18 +2,19 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from unittest import mock
 
 import numpy as np
 import pytest
 import scenes
 
-from gsmerge import PixelScene
+from gsmerge import Scene
 from gsmerge.baselines.baseline import most_important
 from gsmerge.moments import Members, scene_members
+from gsmerge.stages import region_tree as module
 from gsmerge.stages.decode import DecodeOptions, decode, split_counts
-from gsmerge.stages.encode import EncodeOptions, encode
+from gsmerge.stages.encode import encode
 from gsmerge.stages.region_tree import (
-    AllocateOptions,
     RegionTree,
     auto_count,
     cut_tree,
@@ -31,9 +32,11 @@ def cut(images: np.ndarray, count: int) -> Groups:
     return segment(images, SegmentOptions(), count)
 
 
-def tree_of(images: np.ndarray, depths: np.ndarray, count: int = 200, **weights: float) -> RegionTree:
+def tree_of(images: np.ndarray, depths: np.ndarray, count: int = 200, **constants: float) -> RegionTree:
+    """The tree of whole pictures, with other constants, named as those of the module."""
     valid = np.ones(depths.shape, bool)
-    return region_tree(images, depths, cut(images, count), valid, AllocateOptions(**weights))
+    with mock.patch.dict(vars(module), constants):
+        return region_tree(images, depths, cut(images, count), valid)
 
 
 def grey(num_views: int = 1) -> np.ndarray:
@@ -56,7 +59,7 @@ def slanted(num_views: int = 1) -> np.ndarray:
 def test_wall_is_cheap_and_texture_is_not() -> None:
     """One view of a plain wall and one of noise: nearly all regions go to the noise."""
     images = np.concatenate([grey(), noise()])
-    groups = cut_tree(tree_of(images, slanted(2), max_extent=0.5), 200)
+    groups = cut_tree(tree_of(images, slanted(2), MAX_EXTENT=0.5), 200)
     assert groups.counts[0] + groups.counts[1] == 200
     assert groups.counts[0] < 15
 
@@ -68,17 +71,13 @@ def test_depth_edges_are_kept() -> None:
     images = grey()
     labels = np.arange(HEIGHT * WIDTH // 4, dtype=np.int32).reshape(1, HEIGHT // 2, WIDTH // 2)
     fine = labels.repeat(2, 1).repeat(2, 2)
-    tree = region_tree(
-        images,
-        depths,
-        Groups(fine, (HEIGHT * WIDTH // 4,)),
-        np.ones_like(depths, dtype=bool),
-        AllocateOptions(max_extent=1.0),
-    )
+    groups = Groups(fine, (HEIGHT * WIDTH // 4,))
+    with mock.patch.object(module, "MAX_EXTENT", 1.0):
+        tree = region_tree(images, depths, groups, np.ones_like(depths, dtype=bool))
     coarse = cut_tree(tree, 20).labels[0]
     assert not set(np.unique(coarse[:, : WIDTH // 2])) & set(np.unique(coarse[:, WIDTH // 2 :]))
     assert tree.distortions[-1] > 10 * tree.distortions[-20]
-    without = tree_of(images, depths, depth_weight=0.0)
+    without = tree_of(images, depths, DEPTH_WEIGHT=0.0)
     np.testing.assert_allclose(without.distortions, 0, atol=1e-9)
 
 
@@ -88,7 +87,7 @@ def test_regions_keep_below_the_largest_extent_until_there_is_no_other_way(portr
     images, depths = grey(), slanted()
     if portrait:
         images, depths = images.swapaxes(1, 2), depths.swapaxes(1, 2)
-    tree = tree_of(images, depths, max_extent=1 / 4)
+    tree = tree_of(images, depths, MAX_EXTENT=1 / 4)
     side = WIDTH / 4
 
     def extents(count: int) -> np.ndarray:
@@ -103,7 +102,7 @@ def test_regions_keep_below_the_largest_extent_until_there_is_no_other_way(portr
 
 @pytest.mark.parametrize("depth_weight", [0.0, 4.0])
 def test_distortions_are_those_of_the_cuts(depth_weight: float) -> None:
-    images, tree = noise(2), tree_of(noise(2), slanted(2), 50, depth_weight=depth_weight)
+    images, tree = noise(2), tree_of(noise(2), slanted(2), 50, DEPTH_WEIGHT=depth_weight)
     assert tree.counts.tolist() == list(range(100, 1, -1))
     assert (np.diff(tree.distortions) >= 0).all()
     for count in (100, 60, 20, 2):
@@ -166,12 +165,6 @@ def test_arguments_that_do_not_fit(change: dict[str, object], message: str) -> N
         region_tree(**{**good, **change})  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("change", [{"depth_weight": -1}, {"max_extent": 0}, {"knee_floor": 0}, {"knee_slope": -1}])
-def test_options_out_of_range(change: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match=next(iter(change))):
-        AllocateOptions(**change)
-
-
 def test_budget_below_the_number_of_views() -> None:
     with pytest.raises(ValueError, match="budget: expected at least 2, one per view, got 1"):
         cut_tree(tree_of(noise(2), slanted(2)), 1)
@@ -195,19 +188,23 @@ def test_auto_count_of_a_wall_is_the_least_that_keeps_regions_small() -> None:
     assert auto_count(texture) == knee(texture.counts, texture.distortions) > wall.min_regions
 
 
-def test_knee_is_where_the_slope_is_the_one_asked_for() -> None:
+def test_knee_is_where_the_slope_is_the_one_that_is_worth_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """D = 0.1 / N without a floor: 10 / ln 10 = 4.3 dB per relative increase everywhere; with one it falls."""
     counts = np.arange(1, 2000)
+    monkeypatch.setattr(module, "KNEE_SLOPE", 2.0)
     for floor in (1e-3, 1e-4):
-        actual = knee(counts, 0.1 / counts, AllocateOptions(knee_slope=2.0, knee_floor=floor))
+        monkeypatch.setattr(module, "KNEE_FLOOR", floor)
+        actual = knee(counts, 0.1 / counts)
         middle = actual / 1.25**0.5  # the slope is measured over a factor of 1.25
         share = (0.1 / middle) / (floor + 0.1 / middle)
         assert 10 / np.log(10) * share == pytest.approx(2.0, rel=0.02)
 
 
-def test_knee_does_not_rise_with_the_slope() -> None:
-    tree = tree_of(noise(), slanted())
-    actual = [knee(tree.counts, tree.distortions, AllocateOptions(knee_slope=s)) for s in (0.1, 0.5, 1, 2, 4, 50)]
+def test_knee_does_not_rise_with_the_slope(monkeypatch: pytest.MonkeyPatch) -> None:
+    tree, actual = tree_of(noise(), slanted()), []
+    for slope in (0.1, 0.5, 1, 2, 4, 50):
+        monkeypatch.setattr(module, "KNEE_SLOPE", slope)
+        actual.append(knee(tree.counts, tree.distortions))
     assert actual == sorted(actual, reverse=True)
     assert actual[-1] == 1
 
@@ -221,19 +218,19 @@ def test_knee_of_nothing() -> None:
 
 
 @pytest.fixture(scope="module")
-def scene() -> PixelScene:
+def scene() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(2, 24, 18))
 
 
 @pytest.fixture(scope="module")
-def members(scene: PixelScene) -> Members:
+def members(scene: Scene) -> Members:
     return scene_members(scene)
 
 
 @pytest.fixture(scope="module")
-def features(scene: PixelScene, members: Members) -> FeatureGaussians:
+def features(scene: Scene, members: Members) -> FeatureGaussians:
     assert scene.images is not None
-    return encode(scene, members, cut(scene.images, 12), EncodeOptions())
+    return encode(scene, members, cut(scene.images, 12))
 
 
 @pytest.mark.parametrize("extra", [0, 1, 7, 40, 100, 24 * 7])

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import scenes
 
-from gsmerge import Gaussians, PixelScene, evaluate, render
+from gsmerge import Gaussians, Scene, evaluate, render
 from gsmerge.io.formats.spz import spz_bytes
 from gsmerge.measure.evaluate import EvaluateOptions, Views, near_plane
 from gsmerge.measure.preview import to_picture
@@ -26,12 +26,12 @@ from gsmerge.view.splats import pack_splats
 
 
 @pytest.fixture(scope="module")
-def scene() -> PixelScene:
+def scene() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(3, 160, 120), noise=0.05)
 
 
 @pytest.fixture(scope="module")
-def half(scene: PixelScene) -> Gaussians:
+def half(scene: Scene) -> Gaussians:
     return scene.gaussians[::2]
 
 
@@ -43,7 +43,7 @@ def held_out() -> Views:
 
 
 @pytest.fixture(scope="module")
-def actual(scene: PixelScene, half: Gaussians, held_out: Views) -> ViewData:
+def actual(scene: Scene, half: Gaussians, held_out: Views) -> ViewData:
     return collect("room", scene, {"half": half, "all": scene.gaussians}, (300, 200, 100), held_out)
 
 
@@ -69,7 +69,7 @@ def unpacked(packed: bytes | None) -> bytes:
     return content
 
 
-def test_numbers_are_those_of_evaluate(actual: ViewData, scene: PixelScene, half: Gaussians, held_out: Views) -> None:
+def test_numbers_are_those_of_evaluate(actual: ViewData, scene: Scene, half: Gaussians, held_out: Views) -> None:
     expected = evaluate(scene, {"half": half}, held_out, EvaluateOptions(lpips=()))
     by_place = sorted(actual.views, key=lambda view: view.place)
     for side, result in enumerate(expected.results):
@@ -86,7 +86,7 @@ def test_the_worst_view_comes_first(actual: ViewData) -> None:
     assert values == sorted(values, key=lambda value: value or 0)
 
 
-def test_stills_are_our_renders(actual: ViewData, scene: PixelScene, half: Gaussians, held_out: Views) -> None:
+def test_stills_are_our_renders(actual: ViewData, scene: Scene, half: Gaussians, held_out: Views) -> None:
     for view in actual.views:
         split, i = (held_out, view.place - 3) if view.held_out else (scene, view.place)
         assert split.images is not None
@@ -98,7 +98,7 @@ def test_stills_are_our_renders(actual: ViewData, scene: PixelScene, half: Gauss
             assert psnr(decoded(still), picture) > 34  # 41 where pictures are not as small and colourful
 
 
-def test_cameras_and_gaussians_are_in_one_frame(actual: ViewData, half: Gaussians, scene: PixelScene) -> None:
+def test_cameras_and_gaussians_are_in_one_frame(actual: ViewData, half: Gaussians, scene: Scene) -> None:
     """What a view sees in the world it sees in the page's frame."""
     raw = unpacked(actual.sides[1].splats)
     count, _, fraction = struct.unpack_from("<IBB", raw, 8)
@@ -114,7 +114,7 @@ def test_cameras_and_gaussians_are_in_one_frame(actual: ViewData, half: Gaussian
     assert view.distance == pytest.approx(np.median(ours[:, 2]), rel=0.3)
 
 
-def test_too_many_gaussians_are_left_out(scene: PixelScene, half: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_many_gaussians_are_left_out(scene: Scene, half: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(splats, "MAX_GAUSSIANS", len(half) + 1)
     actual = collect("room", scene, {"half": half}, (2, 1))
     assert actual.sides[0].splats is None
@@ -131,7 +131,7 @@ def test_harmonics_that_do_not_fit_are_left_out(half: Gaussians, monkeypatch: py
     assert len(unpacked(content)) < 45 * len(half)
 
 
-def test_harmonics_of_zeros_are_left_out(scene: PixelScene, half: Gaussians) -> None:
+def test_harmonics_of_zeros_are_left_out(scene: Scene, half: Gaussians) -> None:
     flat = np.zeros((len(half), 15, 3), np.float32)
     flat[:, :3] = 0.1
     assert pack_splats(replace(half, shN=flat))[1] == 1
@@ -140,7 +140,7 @@ def test_harmonics_of_zeros_are_left_out(scene: PixelScene, half: Gaussians) -> 
     assert not any("harmonics" in note for note in actual.notes)
 
 
-def test_pixels_in_order_take_less_than_their_spz(scene: PixelScene) -> None:
+def test_pixels_in_order_take_less_than_their_spz(scene: Scene) -> None:
     packed, _ = pack_splats(scene.gaussians)
     assert packed is not None
     assert len(packed) < 0.8 * len(spz_bytes(scene.gaussians))
@@ -155,7 +155,7 @@ def test_what_is_not_finite_or_faint_is_left_out(half: Gaussians) -> None:
     assert counts[0] == counts[1] - 2
 
 
-def test_outlines_are_the_borders_of_superpixels(actual: ViewData, scene: PixelScene) -> None:
+def test_outlines_are_the_borders_of_superpixels(actual: ViewData, scene: Scene) -> None:
     """Of the input photos alone, as compact cuts them."""
     assert actual.num_superpixels == (int(0.044 * 160 * 120),) * 2
     assert [view.outlines is None for view in actual.views] == [view.held_out for view in actual.views]
@@ -174,7 +174,7 @@ def test_outlines_are_the_borders_of_superpixels(actual: ViewData, scene: PixelS
     assert not lines[factor // 2 :: factor, factor // 2 :: factor].any()  # the middles of pixels
 
 
-def test_superpixels_as_asked_for(scene: PixelScene, half: Gaussians) -> None:
+def test_superpixels_as_asked_for(scene: Scene, half: Gaussians) -> None:
     asked = collect("room", scene, {"half": half}, (2, 1), segmentation=SegmentOptions(superpixels=50))
     assert asked.num_superpixels == (50, 50)
     none = collect("room", replace(scene, images=None), {"half": half}, (2, 1))
@@ -182,7 +182,7 @@ def test_superpixels_as_asked_for(scene: PixelScene, half: Gaussians) -> None:
     assert {view.outlines for view in none.views} == {None}
 
 
-def test_many_views_are_thinned(scene: PixelScene, half: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_views_are_thinned(scene: Scene, half: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(data, "MAX_VIEWS", 1)
     actual = collect("room", scene, {"half": half}, (2, 1))
     everything = evaluate(scene, {"half": half}, None, EvaluateOptions(lpips=())).results[1].scores
@@ -191,7 +191,7 @@ def test_many_views_are_thinned(scene: PixelScene, half: Gaussians, monkeypatch:
     assert any(f"{len(actual.views)} of 3 views" in note for note in actual.notes)
 
 
-def test_without_photos_results_are_compared_with_the_input(scene: PixelScene, half: Gaussians) -> None:
+def test_without_photos_results_are_compared_with_the_input(scene: Scene, half: Gaussians) -> None:
     actual = collect("room", replace(scene, images=None), {"half": half}, (2, 1))
     assert [view.photo for view in actual.views] == [None] * 3
     assert actual.reference == "renders of the input"
@@ -225,7 +225,7 @@ def test_a_still_keeps_red_red() -> None:
     assert psnr(decoded(encode_still(to_picture(red))), red) > 30
 
 
-def test_stills_of_a_result_are_from_its_own_cameras(scene: PixelScene, half: Gaussians) -> None:
+def test_stills_of_a_result_are_from_its_own_cameras(scene: Scene, half: Gaussians) -> None:
     own = replace(scene.cameras, viewmats=motions.random_motions(len(scene), 2.0, 0.1) @ scene.cameras.viewmats)
     given, moved = (collect("room", scene, {"half": half}, (2, 1), cameras=one) for one in (None, {"half": own}))
     for before, after in zip(*(sorted(one.views, key=attrgetter("place")) for one in (given, moved)), strict=True):

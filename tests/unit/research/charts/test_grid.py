@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from gsmerge.batch import BatchOptions
-from gsmerge.batch.plan import Schedule, estimate_seconds
+from gsmerge.batch.run import Schedule, estimate_seconds
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import ReadHints
 from gsmerge.measure.evaluate import EvaluateOptions

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import gsmerge
-from gsmerge import PixelScene
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry import project
 from gsmerge.io import load_scene, read_held_out
@@ -47,7 +46,6 @@ def test_the_folders_are_complete(folder: Path) -> None:
 def test_scenes_are_read_back_aligned(folder: Path, index: int) -> None:
     load = load_scene(folder / f"scene_{index:04d}")
     scene = load.scene
-    assert isinstance(scene, PixelScene)
     assert load.notes == ()
     assert scene.valid.all()
     pixels, depths = project(scene.gaussians.means, scene.cameras)

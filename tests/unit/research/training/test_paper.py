@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from learned import noisy
+from network_fixtures import noisy
 from scenes import arc, make_scene, room
 from training_runs import PAPER, TINY, written
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from learned import noisy
+from network_fixtures import noisy
 from scenes import arc, make_scene, room
 from scipy.ndimage import uniform_filter
 from training_runs import OPTIONS, TINY, written
@@ -37,7 +37,7 @@ from gsmerge.research.training.scenes import coverage, covered_pixels, reduced_m
 from gsmerge.research.training.windows import Box, Window, sample_window, whole_photo
 from gsmerge.stages.decode import DecodeOptions, decode
 from gsmerge.stages.merge import merge
-from gsmerge.types import Cameras, Gaussians, PixelScene
+from gsmerge.types import Cameras, Gaussians, Scene
 
 PHOTO = replace(OPTIONS, photo_start=0.0, window=16)
 WIDTH, HEIGHT = 48, 36
@@ -46,7 +46,7 @@ WIDTH, HEIGHT = 48, 36
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def scene() -> PixelScene:
+def scene() -> Scene:
     return make_scene(room(), arc(4, WIDTH, HEIGHT))
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from learned import noisy
+from network_fixtures import noisy
 from scenes import arc, make_scene, room
 from training_runs import OPTIONS, TINY, written
 
@@ -16,8 +16,7 @@ import gsmerge
 from gsmerge.errors import SceneError
 from gsmerge.networks.apply import NetworkContext, encode_features, refine_features, run_heads
 from gsmerge.networks.checkpoint import load_checkpoint
-from gsmerge.networks.modules import Networks
-from gsmerge.networks.modules import Bounds, NetworkOptions
+from gsmerge.networks.modules import Bounds, NetworkOptions, Networks
 from gsmerge.networks.residuals import LOGIT, MEAN, SIZE, bound_residuals, move_gaussians
 from gsmerge.research.training import (
     Example,
@@ -35,14 +34,14 @@ from gsmerge.research.training.targets import corrections_between
 from gsmerge.research.training.windows import Crop, sample_crop
 from gsmerge.stages.decode import DecodeOptions, decode, divide
 from gsmerge.stages.merge import merge
-from gsmerge.types import PixelScene
+from gsmerge.types import Scene
 
 
 class StoppedError(Exception):
     """What a test interrupts a run with."""
 
 
-def scene(views: int = 3) -> PixelScene:
+def scene(views: int = 3) -> Scene:
     return make_scene(room(), arc(views, 32, 24))
 
 

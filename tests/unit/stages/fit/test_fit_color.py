@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scenes
 
-from gsmerge import Gaussians, PixelScene
+from gsmerge import Gaussians, Scene
 from gsmerge.render.photos import Photos, scene_photos
 from gsmerge.stages.fit import FitOptions, FitReport
 from gsmerge.stages.fit.color import draw, fit_colors
@@ -16,17 +16,17 @@ FEW = FitOptions(holdout=0.25)
 
 
 @pytest.fixture(scope="module")
-def scene() -> PixelScene:
+def scene() -> Scene:
     return scenes.make_scene(scenes.wall(), scenes.arc(3, 64, 48))
 
 
 @pytest.fixture(scope="module")
-def gaussians(scene: PixelScene) -> Gaussians:
+def gaussians(scene: Scene) -> Gaussians:
     return scenes.plain(scene)
 
 
 @pytest.fixture(scope="module")
-def photos(scene: PixelScene, gaussians: Gaussians) -> Photos:
+def photos(scene: Scene, gaussians: Gaussians) -> Photos:
     """What the Gaussians themselves show: their own colours are the answer."""
     images = scenes.images_of(gaussians, scene.cameras)[0].astype(np.float32)
     return scene_photos(replace(scene, images=images))
@@ -44,7 +44,9 @@ def test_wrong_colours_come_back(gaussians: Gaussians, photos: Photos) -> None:
     noise = 0.1 * np.random.default_rng(0).normal(size=gaussians.sh0.shape).astype(np.float32)
     spoilt = replace(gaussians, sh0=gaussians.sh0 + noise / SH_C0)
     # one block in twenty is held out
-    result, report = fitted(spoilt, photos, replace(FEW, prior_weight=0.01, iterations=18, holdout=0.0125))
+    result, report = fitted(
+        spoilt, photos, scenes.tuned(replace(FEW, holdout=0.0125), prior_weight=0.01, iterations=18)
+    )
     assert report.accepted
     assert report.holdout_after > report.holdout_before + 6
     error = SH_C0 * (result.sh0 - gaussians.sh0)
@@ -69,7 +71,7 @@ def test_fit_that_makes_it_worse_is_refused(gaussians: Gaussians, photos: Photos
     rng = np.random.default_rng(0)
     noise = replace(photos, images=rng.choice([0.0, 1.0], photos.images.shape).astype(np.float32))
     grey = replace(gaussians, sh0=np.zeros_like(gaussians.sh0))
-    result, report = fitted(grey, noise, replace(FEW, prior_weight=1e-6, iterations=60, huber=10.0))
+    result, report = fitted(grey, noise, scenes.tuned(FEW, prior_weight=1e-6, iterations=60, huber=10.0))
     assert not report.accepted
     assert report.method == "none"
     assert report.holdout_after <= report.holdout_before
@@ -106,7 +108,7 @@ def test_pull_holds_the_colours(gaussians: Gaussians, photos: Photos) -> None:
     start = recolored(gaussians, 0.1)
     moves = []
     for prior_weight in (0.01, 1.0, 100.0):
-        result, _ = fitted(start, photos, replace(FEW, prior_weight=prior_weight))
+        result, _ = fitted(start, photos, scenes.tuned(FEW, prior_weight=prior_weight))
         moves.append(float(np.abs(SH_C0 * (result.sh0 - start.sh0)).mean()))
     assert moves[0] > moves[1] > moves[2]
     assert moves[2] < 0.005

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import scenes
 
-from gsmerge import Gaussians, PixelScene
+from gsmerge import Gaussians, Scene
 from gsmerge.render import plan_view, splat_adjoint
 from gsmerge.render.photos import Photos
 from gsmerge.runtime.threads import use_threads
-from gsmerge.stages.fit import FitOptions, LearningRates, start_share
+from gsmerge.stages.fit import FitOptions, start_share
 from gsmerge.stages.fit import full as full_module
 from gsmerge.stages.fit.full import (
     affordable_steps,
@@ -26,6 +26,7 @@ from gsmerge.stages.fit.full import (
     plan_run,
     step_sizes,
 )
+from gsmerge.stages.fit.options import Tuning
 from gsmerge.stages.fit.state import start_state
 from gsmerge.types import SH_C0
 
@@ -42,7 +43,7 @@ def noise(photos: Pair) -> Pair:
 # what it reaches
 
 
-def test_perturbed_scene_comes_back(scene: PixelScene, truth: Gaussians, photos: Pair) -> None:
+def test_perturbed_scene_comes_back(scene: Scene, truth: Gaussians, photos: Pair) -> None:
     start = scenes.spoil(truth)
     result, report = fit_full(start, photos, replace(LONG, dropout=0.0))
     assert (report.method, report.accepted, report.steps) == ("full", True, 160)
@@ -52,7 +53,7 @@ def test_perturbed_scene_comes_back(scene: PixelScene, truth: Gaussians, photos:
     scenes.assert_invariants(result, scene)
 
 
-def test_view_between_gets_better(scene: PixelScene, truth: Gaussians, photos: Pair) -> None:
+def test_view_between_gets_better(scene: Scene, truth: Gaussians, photos: Pair) -> None:
     """Not one of the photos."""
     between = scenes.arc(1, 48, 36, start=-0.25)
     expected = scenes.images_of(truth, between)[0].clip(0, 1)
@@ -84,9 +85,9 @@ def test_every_kind_of_parameter_moves(truth: Gaussians, photos: Pair) -> None:
 
 
 def test_moves_stay_in_the_box(truth: Gaussians, photos: Pair) -> None:
-    rates = LearningRates(max_mean_shift=0.5, max_scale_change=0.1, max_opacity_change=0.2, min_scale=0)
+    box = {"max_mean_shift": 0.5, "max_scale_change": 0.1, "max_opacity_change": 0.2, "min_scale": 0}
     start = scenes.spoil(truth)
-    result, report = fit_full(start, photos, replace(QUICK, rates=rates))
+    result, report = fit_full(start, photos, scenes.tuned(QUICK, **box))
     assert report.accepted
     unit = np.sort(start.scales, 1)[:, 1:].prod(1) ** 0.5
     assert (np.linalg.norm(result.means - start.means, axis=1) <= 0.501 * unit).all()
@@ -96,7 +97,7 @@ def test_moves_stay_in_the_box(truth: Gaussians, photos: Pair) -> None:
 
 
 def test_what_one_photo_shows_has_a_smaller_box(truth: Gaussians, photos: Pair) -> None:
-    state, least = start_state(truth), QUICK.rates.single_view_share
+    state, least = start_state(truth), QUICK.tuning.single_view_share
 
     def shares_of(some: Pair) -> np.ndarray:
         plan = plan_run(some, QUICK, 0)
@@ -125,7 +126,7 @@ def test_nothing_becomes_thinner_than_half_a_pixel(truth: Gaussians, photos: Pai
     views = photos[0].viewmats
     depths = start.means @ views[:, 2, :3].T + views[:, 2, 3]
     np.testing.assert_allclose(np.exp(min_sizes), 0.5 * depths.min(1) / photos[0].Ks[0, 0, 0], rtol=1e-4)
-    free = replace(QUICK, rates=replace(QUICK.rates, min_scale=0.0))
+    free = scenes.tuned(QUICK, min_scale=0.0)
     kept, report = fit_full(thin, photos, QUICK)
     needles, other = fit_full(thin, photos, free)
     assert report.accepted
@@ -144,19 +145,21 @@ def test_full_size_steps_draw_as_viewers_do() -> None:
 
 def test_single_photo_moves_less(truth: Gaussians) -> None:
     scene, _ = scenes.self_made(0, 1)
-    start, rates = scenes.spoil(truth), replace(QUICK.rates, min_scale=0.0)
-    result, report = fit_full(start, scenes.pair_of(scene), replace(QUICK, rates=rates))
+    start, free = scenes.spoil(truth), scenes.tuned(QUICK, min_scale=0.0)
+    result, report = fit_full(start, scenes.pair_of(scene), free)
     assert report.accepted
     unit = np.sort(start.scales, 1)[:, 1:].prod(1) ** 0.5
-    share = 1.001 * rates.single_view_share
-    assert (np.linalg.norm(result.means - start.means, axis=1) <= share * rates.max_mean_shift * unit).all()
-    assert float(np.abs(np.log(result.scales / start.scales)).max()) <= share * rates.max_scale_change
+    share = 1.001 * free.tuning.single_view_share
+    assert (np.linalg.norm(result.means - start.means, axis=1) <= share * free.tuning.max_mean_shift * unit).all()
+    assert float(np.abs(np.log(result.scales / start.scales)).max()) <= share * free.tuning.max_scale_change
 
 
 @pytest.mark.parametrize(("name", "field"), [("opacity_reg", "opacities"), ("scale_reg", "scales")])
 def test_pulls_make_them_fade_and_shrink(truth: Gaussians, photos: Pair, name: str, field: str) -> None:
     start = scenes.spoil(truth)
-    free, pulled = (fit_full(start, photos, replace(QUICK, **{name: prior_weight}))[0] for prior_weight in (0.0, 0.05))
+    free, pulled = (
+        fit_full(start, photos, scenes.tuned(QUICK, **{name: prior_weight}))[0] for prior_weight in (0.0, 0.05)
+    )
     assert np.log(getattr(pulled, field)).mean() < np.log(getattr(free, field)).mean() - 0.02
 
 
@@ -186,7 +189,7 @@ def test_short_runs_do_not_grow(truth: Gaussians, photos: Pair) -> None:
     assert 0 < start_share(LONG) < 1
 
 
-def test_growing_pays(scene: PixelScene, photos: Pair) -> None:
+def test_growing_pays(scene: Scene, photos: Pair) -> None:
     """At the same final number, against nothing but the first ones."""
     start = scenes.plain(scene, superpixels="3%")
     start = replace(start, means=start.means.astype(np.float32))
@@ -230,7 +233,7 @@ def test_input_is_left_alone(truth: Gaussians, photos: Pair) -> None:
         np.testing.assert_array_equal(photo.images, image)
 
 
-def test_perfect_start_is_not_spoilt(scene: PixelScene, truth: Gaussians, photos: Pair) -> None:
+def test_perfect_start_is_not_spoilt(scene: Scene, truth: Gaussians, photos: Pair) -> None:
     result, report = fit_full(truth, photos, LONG)
     assert report.accepted == (report.holdout_after > report.holdout_before)
     assert report.accepted or result is truth
@@ -240,7 +243,7 @@ def test_perfect_start_is_not_spoilt(scene: PixelScene, truth: Gaussians, photos
 
 def test_held_out_blocks_teach_nothing_while_they_judge(truth: Gaussians, photos: Pair) -> None:
     """All steps at half size: what the photos show there does not matter. (SSIM's windows do reach into them.)"""
-    options = replace(QUICK, half_res_share=1.0, ssim_lambda=0.0)
+    options = scenes.tuned(replace(QUICK, half_res_share=1.0), ssim_lambda=0.0)
     start = scenes.spoil(truth)
     weights = plan_run(photos, options, seed=0).weights[1]
     painted = photos[1].images.copy()
@@ -327,7 +330,7 @@ def test_clock_of_a_budget_starts_after_a_step_on_copies(
     for budget, expected in ((None, 0), (1.0, 1)):
         steps.clear()
         state = start_state(scenes.spoil(truth))
-        plan = plan_run(photos, replace(QUICK, time_budget=budget, poses="free"), 0)
+        plan = plan_run(photos, replace(QUICK, time_budget=budget, move_cameras=True), 0)
         before = state.x.copy(), plan.photos[0].viewmats.copy()
         assert full_module.start_clock(state, plan) <= time.perf_counter()
         assert len(steps) == expected
@@ -355,7 +358,7 @@ def test_steps_follow_the_time_budget(photos: Pair) -> None:
 
 
 def test_rates_decay() -> None:
-    rates = LearningRates()
+    rates = Tuning()
     start, half, end = (step_sizes(rates, p, 100) for p in (0.0, 0.5, 1.0))
     expected = (
         [rates.means_lr] * 3
@@ -425,7 +428,7 @@ def test_tiny_photos(size: tuple[int, int]) -> None:
 
 
 def test_longer_runs_end_with_smaller_steps() -> None:
-    rates = FitOptions().rates
+    rates = Tuning()
     usual, long = step_sizes(rates, 1.0, 300), step_sizes(rates, 1.0, 900)
     np.testing.assert_allclose(long, usual / 3, rtol=1e-6)
     np.testing.assert_array_equal(step_sizes(rates, 0.0, 300), step_sizes(rates, 0.0, 900))

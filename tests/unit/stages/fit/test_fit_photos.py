@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import scenes
 
-from gsmerge import Gaussians, PixelScene, compact
+from gsmerge import Gaussians, Scene, compact
 from gsmerge.geometry import project
 from gsmerge.render.photos import EPS2D, photo_psnr
 from gsmerge.runtime.record import record_run
@@ -24,7 +24,7 @@ from gsmerge.views import subset
 LONG = FitOptions(fit_steps=160, holdout=0.2)
 
 
-def with_large(scene: PixelScene, scale: float, read: list[int] | None = None) -> PixelScene:
+def with_large(scene: Scene, scale: float, read: list[int] | None = None) -> Scene:
     """The scene with enlarged photos of its own; ``read`` gets the number of every photo that is read."""
     assert scene.images is not None
     width, height = (round(scale * side) for side in (scene.cameras.width, scene.cameras.height))
@@ -45,16 +45,16 @@ def with_large(scene: PixelScene, scale: float, read: list[int] | None = None) -
 
 
 @pytest.mark.parametrize(
-    ("larger", "settings", "expected"),
+    ("larger", "auto", "settings", "expected"),
     [
-        (4, {}, 2), (1.5, {}, 1.5), (1.2, {}, 1), (4, {"effort": "fast"}, 1), (4, {"effort": "best"}, 2),
-        (4, {"fit": "none"}, 1), (4, {"fit_steps": 12}, 1), (4, {"photo_scale": 1}, 1), (4, {"photo_scale": 3}, 3),
-        (4, {"photo_scale": 1.5, "effort": "fast"}, 1.5), (1.2, {"photo_scale": 1.1}, 1.1),
+        (4, True, {}, 2), (1.5, True, {}, 1.5), (1.2, True, {}, 1), (4, False, {}, 1), (4, True, {"fit": "none"}, 1),
+        (4, True, {"fit_steps": 12}, 1), (4, True, {"photo_scale": 1}, 1), (4, True, {"photo_scale": 3}, 3),
+        (4, False, {"photo_scale": 1.5}, 1.5), (1.2, True, {"photo_scale": 1.1}, 1.1),
     ],
     ids=str,
 )  # fmt: skip
-def test_scale_is_chosen(scene: PixelScene, larger: float, settings: dict[str, Any], expected: float) -> None:
-    actual, problem = photo_scale(with_large(scene, larger), FitOptions(**settings))
+def test_scale_is_chosen(scene: Scene, larger: float, auto: bool, settings: dict[str, Any], expected: float) -> None:
+    actual, problem = photo_scale(with_large(scene, larger), FitOptions(**settings), auto=auto)
     assert actual == pytest.approx(expected, rel=0.02)
     assert problem is None
 
@@ -69,19 +69,30 @@ def test_scale_is_chosen(scene: PixelScene, larger: float, settings: dict[str, A
     ids=str,
 )
 def test_less_than_asked_for_is_said(
-    scene: PixelScene, larger: float, settings: dict[str, Any], expected: float, reason: str
+    scene: Scene, larger: float, settings: dict[str, Any], expected: float, reason: str
 ) -> None:
-    with record_run() as log:
-        photos = fit_photos(with_large(scene, larger), FitOptions(**settings))
-    assert len(photos) == (3 if expected > 1 else 2)
-    assert log.notes[0].startswith(reason)
-    assert log.choices.get("photo_scale", 1) == pytest.approx(expected, rel=0.02)
+    actual, problem = photo_scale(with_large(scene, larger), FitOptions(**settings), auto=True)
+    assert actual == pytest.approx(expected, rel=0.02)
+    assert problem is not None
+    assert problem.startswith(reason)
 
 
-def test_photos_of_the_views_size_are_no_larger(scene: PixelScene) -> None:
+def test_larger_photos_are_recorded(scene: Scene) -> None:
+    for scale, levels in ((1.0, 2), (2.0, 3)):
+        with record_run() as record:
+            photos = fit_photos(with_large(scene, 2), FitOptions(photo_scale=scale))
+        assert len(photos) == levels
+        assert record.choices == ({"photo_scale": scale} if scale > 1 else {})
+        assert len(record.notes) == levels - 2
+
+
+def test_photos_of_the_views_size_are_no_larger(scene: Scene) -> None:
     assert largest_scale(scene) == 1
-    assert photo_scale(scene, FitOptions()) == (1, None)
-    assert photo_scale(scene, FitOptions(photo_scale=2)) == (1, "photo_scale 2 is 1: the photos are no larger")
+    assert photo_scale(scene, FitOptions(), auto=True) == (1, None)
+    assert photo_scale(scene, FitOptions(photo_scale=2), auto=True) == (
+        1,
+        "photo_scale 2 is 1: the photos are no larger",
+    )
     with pytest.raises(ValueError, match="expected a scene with photos larger than its views"):
         large_photos(scene, 2)
 
@@ -95,7 +106,7 @@ def test_impossible_scales_are_refused(value: Any) -> None:
 # what is read
 
 
-def test_photos_are_read_once_at_their_scale(scene: PixelScene) -> None:
+def test_photos_are_read_once_at_their_scale(scene: Scene) -> None:
     read: list[int] = []
     large = with_large(scene, 4, read)
     photos = large_photos(large, 2)
@@ -110,7 +121,7 @@ def test_photos_are_read_once_at_their_scale(scene: PixelScene) -> None:
     np.testing.assert_allclose(photos.image(1), small / 255, atol=1e-6)
 
 
-def test_a_point_has_the_same_place_in_every_size(scene: PixelScene) -> None:
+def test_a_point_has_the_same_place_in_every_size(scene: Scene) -> None:
     photos = large_photos(with_large(scene, 3), 1.7)
     shape = np.array([photos.width / scene.cameras.width, photos.height / scene.cameras.height])
     places, _ = project(scene.gaussians.means[:50].astype(np.float64), scene.cameras)
@@ -118,7 +129,7 @@ def test_a_point_has_the_same_place_in_every_size(scene: PixelScene) -> None:
     np.testing.assert_allclose(project(scene.gaussians.means[:50].astype(np.float64), large)[0], places * shape)
 
 
-def test_some_views_have_their_own_photos(scene: PixelScene) -> None:
+def test_some_views_have_their_own_photos(scene: Scene) -> None:
     read: list[int] = []
     large_photos(subset(with_large(scene, 2, read), [2, 0]), 2)
     assert sorted(read) == [0, 2]
@@ -132,8 +143,8 @@ def test_some_views_have_their_own_photos(scene: PixelScene) -> None:
 # the steps
 
 
-def test_steps_look_at_half_full_and_larger_photos(scene: PixelScene) -> None:
-    options = FitOptions(fit_steps=200)
+def test_steps_look_at_half_full_and_larger_photos(scene: Scene) -> None:
+    options = FitOptions(fit_steps=200, photo_scale=2)
     plan = plan_run(fit_photos(with_large(scene, 2), options), options, 0)
     levels = [plan.level_at(step + 1, step / 200) for step in range(200)]
     assert [levels.count(level) for level in (1, 0, 2)] == [120, 48, 32]
@@ -142,17 +153,17 @@ def test_steps_look_at_half_full_and_larger_photos(scene: PixelScene) -> None:
     assert [usual.level_at(step + 1, step / 200) for step in range(200)] == [1] * 140 + [0] * 60
 
 
-def test_the_users_share_of_half_size_steps_stays(scene: PixelScene) -> None:
-    options = FitOptions(half_res_share=0.8)
+def test_the_users_share_of_half_size_steps_stays(scene: Scene) -> None:
+    options = FitOptions(half_res_share=0.8, photo_scale=2)
     assert plan_run(fit_photos(with_large(scene, 2), options), options, 0).half_part == 0.8
 
 
-def test_large_photos_count_in_every_pixel(scene: PixelScene) -> None:
-    plan = plan_run(fit_photos(with_large(scene, 2), LONG), LONG, 0)
+def test_large_photos_count_in_every_pixel(scene: Scene) -> None:
+    plan = plan_run(fit_photos(with_large(scene, 2), replace(LONG, photo_scale=2)), LONG, 0)
     assert all((weight == 1).all() for weight in plan.step_weights[2])
 
 
-def test_time_budget_counts_larger_photos(scene: PixelScene) -> None:
+def test_time_budget_counts_larger_photos(scene: Scene) -> None:
     options = replace(LONG, time_budget=1.0)
     steps = [
         affordable_steps(0.06, plan_run(fit_photos(with_large(scene, s), replace(options, photo_scale=s)), o, 0))
@@ -161,7 +172,7 @@ def test_time_budget_counts_larger_photos(scene: PixelScene) -> None:
     assert steps[0] > steps[1] > steps[2]
 
 
-def test_result_shows_larger_photos_better(truth: Gaussians, scene: PixelScene) -> None:
+def test_result_shows_larger_photos_better(truth: Gaussians, scene: Scene) -> None:
     large, start = with_large(scene, 2), scenes.spoil(truth)
     near = large_photos(large, 2)
     near = replace(near, images=np.stack([near.image(view) for view in range(len(near))]))
@@ -171,16 +182,16 @@ def test_result_shows_larger_photos_better(truth: Gaussians, scene: PixelScene) 
     assert photo_psnr(sharp, near, views) > photo_psnr(usual, near, views) + 0.3
 
 
-def test_result_does_not_depend_on_threads(truth: Gaussians, scene: PixelScene) -> None:
+def test_result_does_not_depend_on_threads(truth: Gaussians, scene: Scene) -> None:
     results, start = [], scenes.spoil(truth)
     for threads in (1, 3):
         with use_threads(threads):
-            photos = fit_photos(with_large(scene, 2), LONG)
+            photos = fit_photos(with_large(scene, 2), replace(LONG, photo_scale=2))
             results.append(fit(start, photos, LONG, count=len(start) + 20)[0])
     assert scenes.identical(*results)
 
 
-def test_a_run_says_at_what_scale_it_looked(scene: PixelScene) -> None:
+def test_a_run_says_at_what_scale_it_looked(scene: Scene) -> None:
     report = compact(with_large(scene, 2), superpixels="10%", fit_steps=30).report
     assert report.choices["photo_scale"] == 2
     assert [note for note in report.notes if "--photo-scale 1 does without" in note]

@@ -15,13 +15,12 @@ from gsmerge.render.blend import blend, view_colors
 from gsmerge.render.gradient import gradients_of
 from gsmerge.render.photos import Photos
 from gsmerge.stages.fit import FitOptions
-from gsmerge.stages.fit.full import NO_LOSS, fit_full
-from gsmerge.stages.fit.options import LearningRates
-from gsmerge.stages.fit.full import start_poses
+from gsmerge.stages.fit.full import NO_LOSS, fit_full, start_poses
+from gsmerge.stages.fit.options import Tuning
 from gsmerge.stages.fit.state import start_state
 
 Pair = tuple[Photos, Photos]
-FREE = FitOptions(fit_steps=120, holdout=0.2, poses="free", dropout=0.0)
+FREE = FitOptions(fit_steps=120, holdout=0.2, move_cameras=True, dropout=0.0)
 
 
 def spoil(photos: Pair, size: float = 0.01) -> Pair:
@@ -46,7 +45,7 @@ def squared_error(truth: Gaussians, photos: Photos, view: int) -> tuple[float, n
 def test_steps_of_a_pose_lower_the_loss(view: int, truth: Gaussians, photos: Pair) -> None:
     poses, (full, _) = start_poses(spoil(photos))
     before = squared_error(truth, full, view)[0]
-    rates = LearningRates(poses_lr=0.1)
+    rates = Tuning(poses_lr=0.1)
     for _ in range(10):
         poses.step(view, squared_error(truth, full, view)[1], rates, 0.0)
     assert squared_error(truth, full, view)[0] < 0.9 * before
@@ -57,7 +56,7 @@ def test_steps_of_a_pose_lower_the_loss(view: int, truth: Gaussians, photos: Pai
 def test_the_fit_finds_the_cameras(truth: Gaussians, photos: Pair) -> None:
     wrong, start = spoil(photos), scenes.spoil(truth)
     free, report = fit_full(start, wrong, FREE)
-    fixed, other = fit_full(start, wrong, replace(FREE, poses="fixed"))
+    fixed, other = fit_full(start, wrong, replace(FREE, move_cameras=False))
     assert other.viewmats is None
     assert report.viewmats is not None
     pixels = [project_points(truth.means, one, photos[0].Ks)[0] for one in (
@@ -68,14 +67,3 @@ def test_the_fit_finds_the_cameras(truth: Gaussians, photos: Pair) -> None:
     assert report.holdout_after > other.holdout_after + 0.5
     np.testing.assert_allclose(motion_vectors(wrong[0].viewmats, report.viewmats).mean(0), 0, atol=1e-9)
     assert len(free) == len(fixed)
-
-
-def test_auto_is_fixed_where_nobody_decided(truth: Gaussians, photos: Pair) -> None:
-    start = scenes.spoil(truth)
-    runs = [fit_full(start, photos, replace(FREE, poses=poses, fit_steps=10)) for poses in ("auto", "fixed")]
-    np.testing.assert_array_equal(runs[0][0].means, runs[1][0].means)
-
-
-def test_unknown_names_are_refused() -> None:
-    with pytest.raises(ValueError, match=r'poses: expected "auto", "fixed" or "free", got \'wild\''):
-        FitOptions(poses="wild")  # type: ignore[arg-type]

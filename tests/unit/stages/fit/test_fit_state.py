@@ -8,24 +8,23 @@ import numpy as np
 import pytest
 import scenes
 
-from gsmerge import Gaussians, PixelScene
+from gsmerge import Gaussians, Scene
 from gsmerge.geometry import covariances
 from gsmerge.kernels.gaussians.optimise import COLOR, COLUMNS, LOGIT, QUAT, SIZE
 from gsmerge.render.metrics import psnr
 from gsmerge.render.photos import Photos, scene_photos
-from gsmerge.stages.fit.state import error_masses, grow
 from gsmerge.stages.fit.photos import holdout_psnr, reduced, training_weights
-from gsmerge.stages.fit.state import State, gaussians_of, start_state
+from gsmerge.stages.fit.state import State, error_masses, gaussians_of, grow, start_state
 
 
-def make(degree: int) -> tuple[PixelScene, Gaussians]:
+def make(degree: int) -> tuple[Scene, Gaussians]:
     scene = scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24), degree=degree)
     actual = scenes.plain(scene, superpixels="8%")
     return scene, replace(actual, means=actual.means.astype(np.float32))
 
 
 @pytest.fixture(scope="module")
-def scene() -> PixelScene:
+def scene() -> Scene:
     return make(0)[0]
 
 
@@ -35,7 +34,7 @@ def gaussians() -> Gaussians:
 
 
 @pytest.fixture(scope="module")
-def photos(scene: PixelScene) -> Photos:
+def photos(scene: Scene) -> Photos:
     return scene_photos(scene)
 
 
@@ -162,7 +161,7 @@ def test_halves_have_their_parents_moments(gaussians: Gaussians, photos: Photos)
     np.testing.assert_array_equal(first[:, QUAT:LOGIT], state.x[:, QUAT:LOGIT])
 
 
-def test_halves_cover_what_their_parent_did(gaussians: Gaussians, scene: PixelScene, photos: Photos) -> None:
+def test_halves_cover_what_their_parent_did(gaussians: Gaussians, scene: Scene, photos: Photos) -> None:
     """Each is clearer than the parent; both together cover a little more, so as to close gaps."""
     state = start_state(gaussians)
     n = len(gaussians)
@@ -199,7 +198,7 @@ def test_harmonics_are_inherited(photos: Photos) -> None:
     np.testing.assert_array_equal(grown.splats.shN[n:], state.splats.shN)
 
 
-def test_growing_happens_where_the_error_is(scene: PixelScene, gaussians: Gaussians) -> None:
+def test_growing_happens_where_the_error_is(scene: Scene, gaussians: Gaussians) -> None:
     """Photos of the Gaussians themselves but for a corner of every one."""
     images = scenes.images_of(gaussians, scene.cameras)[0].astype(np.float32)
     images[:, :12, :16] = 1 - images[:, :12, :16]

@@ -12,9 +12,8 @@ from scenes import arc, make_scene, room
 from gsmerge.moments import Members, scene_members
 from gsmerge.networks.apply import NetworkContext
 from gsmerge.networks.checkpoint import save_checkpoint
-from gsmerge.networks.modules import Networks
-from gsmerge.networks.modules import NetworkOptions
-from gsmerge.stages.encode import EncodeOptions, encode
+from gsmerge.networks.modules import NetworkOptions, Networks
+from gsmerge.stages.encode import encode
 from gsmerge.types import FeatureGaussians, Groups, Scene
 
 SMALL = NetworkOptions(width=16, heads=2, latent=8, members=8, neighbors=4)
@@ -67,4 +66,4 @@ def made(num_views: int = 2) -> Made:
     labels = np.searchsorted(edges, np.arange(24 * 18), side="right").reshape(18, 24).astype(np.int32)
     count = len(edges) + 1
     groups = Groups(np.stack([labels] * num_views), (count,) * num_views)
-    return Made(scene, members, encode(scene, members, groups, EncodeOptions()))
+    return Made(scene, members, encode(scene, members, groups))

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from skimage.measure import label as connected_parts
 
-from gsmerge.stages.segment import superpixels
+from gsmerge.stages.superpixels import superpixels
 
 SEGMENTATIONS = [
-    ("rdseg", "fast"),
-    ("rdseg", "default"),
-    ("rdseg", "best"),
-    ("bass", "default"),
-    ("bass-st", "default"),
-    ("bass-adaptive", "default"),
+    ("rdseg", {"rectangles": 1.0, "early_sweeps": 0}),
+    ("rdseg", {}),
+    ("rdseg", {"rectangles": 3.0, "early_sweeps": 1}),
+    ("bass", {}),
+    ("bass-st", {}),
+    ("bass-adaptive", {}),
 ]
 
 
@@ -55,12 +57,12 @@ def counts_of(num_pixels: int) -> list[int]:
 
 
 @pytest.mark.parametrize("picture", PICTURES)
-@pytest.mark.parametrize(("segmentation", "effort"), [*SEGMENTATIONS, ("slic", "default")])
-def test_exact_count_in_one_piece_each(picture: str, segmentation: str, effort: str) -> None:
+@pytest.mark.parametrize(("segmentation", "rounds"), [*SEGMENTATIONS, ("slic", {})])
+def test_exact_count_in_one_piece_each(picture: str, segmentation: str, rounds: dict[str, Any]) -> None:
     image = PICTURES[picture]
     height, width, _ = image.shape
     for count in counts_of(height * width):
-        labels = superpixels(image, count, segmentation, effort=effort)
+        labels = superpixels(image, count, segmentation, **rounds)
         assert_partition(labels, height, width, count)
 
 
@@ -100,11 +102,11 @@ def test_any_size(height: int, width: int, share: float, colours: int, kind: tup
     """Few colours make ties; sizes down to one pixel."""
     image = np.random.default_rng(seed).integers(0, colours, (height, width, 3)) / max(colours - 1, 1)
     count = 1 + int(share * (height * width - 1))
-    assert_partition(superpixels(image, count, kind[0], effort=kind[1]), height, width, count)
+    assert_partition(superpixels(image, count, kind[0], **kind[1]), height, width, count)
 
 
-@pytest.mark.parametrize(("segmentation", "effort"), [*SEGMENTATIONS, ("slic", "default")])
-def test_a_run_repeats(segmentation: str, effort: str) -> None:
+@pytest.mark.parametrize(("segmentation", "rounds"), [*SEGMENTATIONS, ("slic", {})])
+def test_a_run_repeats(segmentation: str, rounds: dict[str, Any]) -> None:
     image = PICTURES["noise"]
-    first = superpixels(image, 80, segmentation, effort=effort)
-    assert np.array_equal(first, superpixels(image.copy(), 80, segmentation, effort=effort))
+    first = superpixels(image, 80, segmentation, **rounds)
+    assert np.array_equal(first, superpixels(image.copy(), 80, segmentation, **rounds))

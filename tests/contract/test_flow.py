@@ -1,0 +1,82 @@
+"""The flow reads from top to bottom: options end in the plan, notes go to the record, one scene."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from dataclasses import fields
+from pathlib import Path
+
+import gsmerge
+from gsmerge.stages.prepare import Prepared, PrepareOptions
+
+PACKAGE = Path(gsmerge.__file__).parent
+
+
+def functions(path: Path) -> Iterator[ast.FunctionDef]:
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    yield from (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))
+
+
+def names_in(node: ast.AST) -> set[str]:
+    return {part.id for part in ast.walk(node) if isinstance(part, ast.Name)}
+
+
+def test_the_pipeline_fits_on_a_screen() -> None:
+    path = PACKAGE / "pipeline.py"
+    assert len(path.read_text(encoding="utf-8").splitlines()) <= 100
+    compact = next(node for node in functions(path) if node.name == "compact")
+    body = compact.body[1:]  # without its docstring
+    assert (body[-1].end_lineno or 0) - body[0].lineno < 20
+    nested = [
+        inner.name
+        for outer in functions(path)
+        for inner in ast.walk(outer)
+        if isinstance(inner, ast.FunctionDef) and inner is not outer
+    ]
+    assert nested == []
+
+
+def test_no_stage_knows_the_options_of_another() -> None:
+    """Each is handed its own part of the plan."""
+    paths = sorted((PACKAGE / "stages").rglob("*.py"))
+    assert len(paths) > 15
+    assert [path.name for path in paths if "CompactOptions" in path.read_text(encoding="utf-8")] == []
+
+
+def test_only_the_plan_reads_what_is_left_to_it() -> None:
+    """Effort, device, recipe and checkpoint names."""
+    open_choices = {"effort", "device", "recipe", "checkpoint"}
+    for path in sorted((PACKAGE / "stages").rglob("*.py")):
+        read = {
+            node.attr
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "options"
+        }
+        assert not read & open_choices, path
+
+
+def test_the_record_is_in_no_signature() -> None:
+    for path in sorted(PACKAGE.rglob("*.py")):
+        if path.name == "record.py":
+            continue
+        for function in functions(path):
+            arguments = [*function.args.args, *function.args.kwonlyargs]
+            kinds = {ast.unparse(one.annotation) for one in arguments if one.annotation is not None}
+            assert not {"Record", "Record | None"} & kinds, f"{path}: {function.name}"
+
+
+def test_scenes_are_of_one_kind() -> None:
+    """Whether the pixels are known is asked of the scene, and only readers ask what they were given."""
+    for path in sorted(PACKAGE.rglob("*.py")):
+        if PACKAGE / "io" in path.parents:
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "isinstance":
+                assert "Scene" not in names_in(node.args[1]), path
+
+
+def test_facts_are_few_and_hold_no_options() -> None:
+    assert len(fields(Prepared)) <= 7
+    assert not {f.name for f in fields(Prepared)} & {f.name for f in fields(PrepareOptions)} - {"unseen"}
+    assert all("Options" not in str(f.type) for f in fields(Prepared))

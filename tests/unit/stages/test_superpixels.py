@@ -1,0 +1,216 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from gsmerge.kernels.superpixels.seeds import hexagonal_seeds, seed_density, seeds_from_density
+from gsmerge.stages.segment import SegmentOptions, count_for, segment
+from gsmerge.stages.superpixels import SEGMENTATIONS, saliency, superpixels
+
+
+def random_image(height: int, width: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).random((height, width, 3), dtype=np.float32)
+
+
+def test_two_colours_part_where_they_meet() -> None:
+    image = np.zeros((12, 17, 3))
+    image[:, 7:] = 1
+    labels = superpixels(image, 2)
+    assert len(np.unique(labels[:, :7])) == 1
+    assert len(np.unique(labels[:, 7:])) == 1
+    assert labels[0, 0] != labels[0, 16]
+
+
+def test_detail_gets_the_superpixels() -> None:
+    image = np.full((64, 64, 3), 0.5)
+    image[:, 32:] = random_image(64, 32)
+    for segmentation in ("rdseg", "bass-st"):
+        labels = superpixels(image, 200, segmentation)
+        assert len(np.unique(labels[:, 34:])) > 2 * len(np.unique(labels[:, :30])), segmentation
+
+
+def test_as_many_superpixels_as_pixels() -> None:
+    labels = superpixels(random_image(4, 5), 20)
+    assert sorted(labels.reshape(-1).tolist()) == list(range(20))
+
+
+def test_bytes_and_floats_are_the_same_picture() -> None:
+    image = (random_image(20, 30) * 255).astype(np.uint8)
+    expected = superpixels(image, 40)
+    assert np.array_equal(superpixels(image / 255.0, 40), expected)
+    assert np.array_equal(superpixels(np.asfortranarray(image), 40), expected)
+    assert expected.dtype == np.int32
+
+
+@pytest.mark.parametrize("segmentation", SEGMENTATIONS)
+def test_tensors_give_tensors(segmentation: str) -> None:
+    """With the labels and the saliency of arrays; one that collects gradients, too."""
+    image = random_image(20, 30)
+    bytes_, followed = torch.from_numpy((image * 255).astype(np.uint8)), torch.from_numpy(image).requires_grad_()
+    for tensor in (torch.from_numpy(image), followed, bytes_):
+        labels, response = superpixels(tensor, 40, segmentation), saliency(tensor)
+        assert labels.dtype == torch.int32
+        assert response.dtype == torch.float32
+        array = tensor.detach().numpy()
+        assert isinstance(superpixels(array, 40, segmentation), np.ndarray)
+        assert np.array_equal(labels.numpy(), superpixels(array, 40, segmentation))
+        assert np.array_equal(response.numpy(), saliency(array))
+
+
+@pytest.mark.parametrize("segmentation", SEGMENTATIONS)
+def test_count_is_checked(segmentation: str) -> None:
+    image = random_image(4, 5)
+    with pytest.raises(ValueError, match=r"expected at most 20 superpixels \(5 x 4 pixels\), got 21"):
+        superpixels(image, 21, segmentation)
+    with pytest.raises(ValueError, match="expected at least 1 superpixel, got 0"):
+        superpixels(image, 0, segmentation)
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (np.zeros((4, 4)), r"expected shape \[h, w, 3\], got \[4, 4\]"),
+        (np.zeros((4, 4, 4)), r"got \[4, 4, 4\]"),
+        (np.zeros((0, 4, 3)), r"got \[0, 4, 3\]"),
+        (np.full((4, 4, 3), 255.0), r"expected values in \[0, 1\], got 255 to 255"),
+        (np.full((4, 4, 3), np.nan), r"expected values in \[0, 1\], got nan"),
+        (np.full((4, 4, 3), np.inf), r"expected values in \[0, 1\], got inf"),
+        (np.zeros((4, 4, 3), np.int64), "expected uint8 or float, got int64"),
+    ],
+)
+def test_image_is_checked(image: np.ndarray, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        superpixels(image, 2)
+    with pytest.raises(ValueError, match=message):
+        saliency(image)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            {"segmentation": "watershed"},
+            "segmentation: expected one of rdseg, bass, bass-st, bass-adaptive, slic, grid, got 'watershed'",
+        ),
+        ({"compactness": -1.0}, r"compactness: expected a number in \[0, 1\], got -1.0"),
+        ({"compactness": float("nan")}, "compactness: expected a number"),
+    ],
+)
+def test_options_are_checked(options: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        superpixels(random_image(4, 4), 2, **options)
+    with pytest.raises(ValueError, match=message):
+        SegmentOptions(**options)
+
+
+def test_counts_of_options() -> None:
+    assert count_for(SegmentOptions(superpixels=7), 100, 100) == 7
+    assert count_for(SegmentOptions(superpixels="5%"), 20, 30) == 30
+    assert count_for(SegmentOptions(superpixels="0.1%"), 5, 5) == 1
+    with pytest.raises(ValueError, match="superpixels: expected at least 1, got 0"):
+        SegmentOptions(superpixels=0)
+    with pytest.raises(ValueError, match=r'superpixels: expected a number, or a share as "4\.4%", above 0'):
+        SegmentOptions(superpixels="0%")
+
+
+def test_segment_treats_each_view_alone() -> None:
+    images = np.stack([random_image(16, 24, seed) for seed in range(3)])
+    groups = segment(images, SegmentOptions(superpixels="10%"))
+    assert groups.counts == (38, 38, 38)
+    for view in range(3):
+        assert np.array_equal(groups.labels[view], superpixels(images[view], 38))
+    assert segment(images, SegmentOptions(), count=5).counts == (5, 5, 5)
+    assert segment(images[:0], SegmentOptions()).labels.shape == (0, 16, 24)
+    with pytest.raises(ValueError, match=r"images: expected shape \[v, h, w, 3\], got \[16, 24, 3\]"):
+        segment(images[0], SegmentOptions())
+
+
+def test_saliency_is_high_at_a_corner_only() -> None:
+    image = np.zeros((21, 21, 3))
+    image[10:, 10:] = 1
+    response = saliency(image)
+    assert response.dtype == np.float32
+    y, x = divmod(int(response.argmax()), 21)
+    assert abs(y - 10) <= 1
+    assert abs(x - 10) <= 1
+    assert response[0:5].max() == 0  # flat
+    assert response[20, 5:15].max() < 1e-6  # straight edge
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0])
+def test_flat_pictures_get_even_seeds(value: float) -> None:
+    response = saliency(np.full((40, 60, 3), value))
+    assert response.max() == 0
+    density = seed_density(response, 240)
+    assert density == pytest.approx(np.full((40, 60), 0.1))
+    seeds = seeds_from_density(density, 240)
+    quarters = np.histogram2d(seeds[:, 0], seeds[:, 1], bins=2, range=[[0, 40], [0, 60]])[0]
+    assert quarters == pytest.approx(np.full((2, 2), 60), abs=6)
+
+
+def test_density_is_at_most_one_and_sums_to_the_count() -> None:
+    response = np.zeros((10, 10), np.float32)
+    response[3:5] = 100
+    for count in (1, 20, 50, 99, 100):
+        density = seed_density(response, count)
+        assert density.max() <= 1
+        assert density.min() >= 0
+        assert density.sum() == pytest.approx(count)
+
+
+def test_hexagonal_seeds_are_distinct_pixels() -> None:
+    for height, width in ((1, 9), (9, 1), (3, 3), (7, 12), (30, 8)):
+        for count in {1, 2, height * width // 3, height * width - 1, height * width}:
+            seeds = hexagonal_seeds(height, width, count)
+            assert len({(y, x) for y, x in seeds.tolist()}) == count
+            assert (seeds >= 0).all()
+            assert (seeds < [height, width]).all()
+
+
+def test_hexagonal_rows_are_shifted() -> None:
+    seeds = hexagonal_seeds(26, 30, 30)  # rows of hexagons of 26 pixels are 4.75 apart
+    rows = [seeds[seeds[:, 0] == y][:, 1] for y in np.unique(seeds[:, 0])]
+    assert len(rows) == 5
+    assert np.diff(rows[0]) == pytest.approx(5)
+    assert rows[1][0] - rows[0][0] == pytest.approx(2.5, abs=0.6)
+
+
+def patchwork(height: int, width: int) -> np.ndarray:
+    """Tones that change every four pixels."""
+    return np.kron(random_image(height // 4, width // 4), np.ones((4, 4, 1), np.float32))
+
+
+@pytest.mark.parametrize("start", [80, 150, 250])
+def test_adaptive_superpixels_follow_the_picture(start: int) -> None:
+    """As many superpixels as patches, wherever it starts from; a flat picture keeps few."""
+    image = patchwork(48, 64)
+    labels = superpixels(image, start, "bass-adaptive", adapt=1.0)
+    assert len(np.unique(labels)) == 12 * 16
+    for k in range(12 * 16):
+        assert np.ptp(image[labels == k], axis=0).max() == 0
+    flat = superpixels(np.full_like(image, 0.5), start, "bass-adaptive", adapt=1.0)
+    assert start / 4 <= int(flat.max()) + 1 < start
+    assert int(superpixels(image, start, "bass-adaptive").max()) + 1 == start
+
+
+def test_adaptive_counts_differ_from_view_to_view() -> None:
+    images = np.full((2, 24, 32, 3), 0.5, np.float32)
+    images[1] = patchwork(24, 32)
+    share = SegmentOptions(superpixels="10%", segmentation="bass-adaptive")
+    groups = segment(images, share)
+    assert groups.counts[0] != groups.counts[1] == 48  # patches
+    for view in range(2):
+        assert np.array_equal(np.unique(groups.labels[view]), np.arange(groups.counts[view]))
+    assert segment(images, share, 76, adapt=1.0).counts == groups.counts
+    assert segment(images, share, 76, adapt=0.5).counts == tuple(round(n / 2) for n in groups.counts)
+    # An exact number, however it is asked for, is met.
+    assert segment(images, share, 76).counts == (76, 76)
+    assert segment(images, SegmentOptions(superpixels=76, segmentation="bass-adaptive")).counts == (76, 76)
+
+
+@pytest.mark.parametrize("segmentation", sorted(set(SEGMENTATIONS) - {"bass-adaptive"}))
+def test_other_segmentations_do_not_adapt(segmentation: str) -> None:
+    options = SegmentOptions(superpixels="10%", segmentation=segmentation)
+    assert not options.adapts
+    assert segment(random_image(24, 32)[None], options).counts == (76,)

@@ -1,0 +1,176 @@
+"""What a plan makes of facts and options."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import scenes
+import unaligned_scenes
+
+from gsmerge import CompactOptions, Scene, compact
+from gsmerge.errors import UsageError
+from gsmerge.options import EFFORTS as NAMES
+from gsmerge.plan import EFFORTS, Plan, choose_networks, make_plan, resolve_fit, resolved_settings, steps_for
+from gsmerge.runtime.record import record_run
+from gsmerge.stages.prepare import prepare
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return scenes.make_scene(scenes.room(), scenes.arc(3), noise=0.01)
+
+
+def options_of(**settings: Any) -> CompactOptions:
+    return CompactOptions().with_settings(settings)
+
+
+def plan_of(scene: Scene, **settings: Any) -> Plan:
+    options = options_of(**settings)
+    return make_plan(prepare(scene, options.prepare), options)
+
+
+def test_every_effort_has_a_meaning() -> None:
+    assert tuple(EFFORTS) == NAMES
+    steps = [EFFORTS[name].steps for name in NAMES]
+    assert steps == sorted(steps)
+
+
+@pytest.mark.parametrize("effort", NAMES)
+def test_effort_decides_what_is_left_open(effort: str, scene: Scene) -> None:
+    plan, own = plan_of(scene, effort=effort), EFFORTS[effort]
+    assert plan.fit.steps == own.steps
+    assert plan.match.method == ("overlap" if own.merges else "none")
+    assert plan.superpixels.options.rectangles == own.rectangles
+    assert plan.superpixels.options.early_sweeps == own.early_sweeps
+
+
+def test_what_is_given_goes_before_effort(scene: Scene) -> None:
+    plan = plan_of(scene, effort="draft", fit_steps=7, match="aabb", rectangles=1.5, early_sweeps=2)
+    assert plan.fit.steps == 7
+    assert plan.match.method == "aabb"
+    assert (plan.superpixels.options.rectangles, plan.superpixels.options.early_sweeps) == (1.5, 2)
+
+
+def test_steps_grow_with_the_root_of_the_share(scene: Scene) -> None:
+    pixels, usual = len(scene) * scene.pixels_per_view, EFFORTS["default"].steps
+    steps = [steps_for(options_of(), round(share * pixels), scene) for share in (0.01, 0.044, 0.088, 0.176, 1.0)]
+    assert steps == [usual, usual, pytest.approx(usual * 2**0.5, abs=2), pytest.approx(2 * usual, abs=2), 2 * usual]
+    assert steps_for(options_of(fit_steps=9), pixels, scene) == 9
+    assert steps_for(options_of(budget="auto"), 10, scene) == 2 * usual
+
+
+def test_a_draft_without_a_fit_leaves_out_nothing() -> None:
+    assert not resolve_fit(options_of(effort="draft", fit="none")).needs_photos
+    assert resolve_fit(options_of(effort="draft")).needs_photos
+    assert resolve_fit(options_of(fit="none")).needs_photos
+
+
+@pytest.mark.parametrize(
+    ("settings", "photos", "aligned", "name"),
+    [
+        ({}, True, True, "none"), ({}, False, True, "shipped"), ({"fit": "none"}, True, True, "shipped"),
+        ({"fit_steps": 60}, True, True, "shipped"), ({"fit_steps": 61}, True, True, "none"),
+        ({"effort": "fast", "fit": "none"}, True, True, "none"), ({"fit": "none"}, True, False, "none"),
+        ({"checkpoint": "own.safetensors"}, True, True, "own.safetensors"), ({"checkpoint": "none"}, False, True, "none"),
+    ],
+)  # fmt: skip
+def test_networks_are_loaded_where_they_help(settings: dict[str, Any], photos: bool, aligned: bool, name: str) -> None:
+    assert choose_networks(options_of(**settings), photos=photos, aligned=aligned) == name
+
+
+def test_networks_compete_unless_they_are_named(scene: Scene) -> None:
+    blind = replace(scene, images=None)
+    assert [one is None for one in plan_of(blind).networks] == [False, True]
+    assert [one is None for one in plan_of(blind, checkpoint="shipped").networks] == [False]
+    assert plan_of(blind, checkpoint="none").networks == (None,)
+
+
+def test_a_missing_checkpoint_is_noted(scene: Scene) -> None:
+    with record_run() as record:
+        plan = plan_of(scene, checkpoint="missing.safetensors")
+    assert plan.networks == (None,)
+    assert "no networks, analytic stages alone" in record.notes[0]
+
+
+def test_without_photos_nothing_is_fitted_and_a_budget_is_met(scene: Scene) -> None:
+    blind = replace(scene, images=None)
+    assert plan_of(blind).fit.fit == "none"
+    assert plan_of(blind).superpixels.start_share == 1
+    assert len(compact(blind, budget=150).gaussians) == 150
+
+
+def test_a_long_fit_begins_with_a_share(scene: Scene) -> None:
+    plan = plan_of(scene)
+    assert plan.superpixels.start_share < 1
+    assert plan.weakens
+    assert not plan.with_fit(replace(plan.fit, fit="none")).weakens
+    assert not plan_of(scene, fit_steps=10).weakens
+
+
+@pytest.mark.parametrize(
+    ("settings", "has_tree"), [({}, False), ({"budget": 90}, True), ({"levels": 2}, True), ({"quality": "20dB"}, True)]
+)
+def test_counts_are_cut_from_a_tree(settings: dict[str, Any], has_tree: bool, scene: Scene) -> None:
+    assert (plan_of(scene, **settings).superpixels.tree is not None) == has_tree
+
+
+def test_a_budget_counts_repeated_views(scene: Scene) -> None:
+    twice = scenes.take_views(scene, [0, 1, 2, 0, 1, 2])
+    assert plan_of(twice, budget="2%").limits.exact == round(0.02 * len(twice.gaussians))
+
+
+def test_what_no_view_sees_takes_its_share_of_a_budget(scene: Scene) -> None:
+    loose = unaligned_scenes.loosened(scene)
+    means = loose.gaussians.means.copy()
+    means[::4] *= -1  # behind the cameras
+    hidden = replace(loose, gaussians=replace(loose.gaussians, means=means))
+    plan = plan_of(hidden, unseen="keep", budget=400)
+    assert plan.unseen is not None
+    assert 0 < len(plan.unseen) < 400
+    assert (plan.limits.exact or 0) + len(plan.unseen) == 400
+    assert plan_of(hidden, budget=400).unseen is None
+
+
+@pytest.mark.parametrize(
+    ("settings", "reason"), [({"quality": "20dB"}, "a quality target needs photos"), ({"drop_sky": True}, "drop_sky")]
+)
+def test_settings_that_need_photos_are_refused(settings: dict[str, Any], reason: str, scene: Scene) -> None:
+    with pytest.raises(UsageError, match=reason):
+        plan_of(replace(scene, images=None), **settings)
+
+
+def test_sky_stays_where_no_photo_is_used(scene: Scene) -> None:
+    rng = np.random.default_rng(0)
+    assert scene.images is not None
+    noise = replace(scene, images=rng.random(scene.images.shape, np.float32))
+    with record_run() as record:
+        plan = plan_of(noise, drop_sky=True)
+    assert plan.fit.fit == "none"
+    assert not plan.clean.drop_sky
+    assert any("drop_sky" in note for note in record.notes)
+
+
+def test_cameras_move_where_it_is_asked_for(scene: Scene) -> None:
+    assert not plan_of(scene).fit.move_cameras
+    free = plan_of(scene, poses="free")
+    assert free.fit.move_cameras
+    assert not free.with_fixed_cameras().fit.move_cameras
+    assert not plan_of(scene, poses="fixed").fit.move_cameras
+
+
+def test_more_views_are_scored_for_a_quality(scene: Scene) -> None:
+    wide = scenes.make_scene(scenes.room(), scenes.arc(6))
+    assert len(plan_of(wide).scored_views) < len(plan_of(wide, quality="20dB").scored_views) == 6
+
+
+def test_reports_say_what_was_settled(scene: Scene) -> None:
+    plan = plan_of(scene, k=2, effort="fast")
+    assert plan.settings["k"] == 2
+    assert plan.settings["fit_steps"] == plan.fit.steps
+    assert "tuning" not in plan.settings
+    assert "move_cameras" not in plan.settings
+    settled = resolved_settings(options_of(effort="draft"), photos=True)
+    assert (settled["match"], settled["checkpoint"]) == ("none", "none")
