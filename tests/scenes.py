@@ -17,19 +17,13 @@ from floors import nudged
 
 from gsmerge import Cameras, Gaussians, Scene, compact, render
 from gsmerge.geometry import covariances, normalize, quat_to_rotmat
-from gsmerge.result import CompactReport, CompactResult
 from gsmerge.render.photos import Photos, scene_photos
-<<<<<<< ours
 from gsmerge.research.generate import objects, photograph, shapes
 from gsmerge.research.generate.noise import Noise, TrueView, pixel_gaussians
 from gsmerge.research.generate.scene import look_at as camera_to_world
-from gsmerge.types import SH_C0, FeatureGaussians
-=======
-from gsmerge.research.generate import objects, paths, photograph, shapes
-from gsmerge.research.generate.noise import TrueView, pixel_gaussians
-from gsmerge.research.generate.options import Noise
+from gsmerge.result import CompactReport, CompactResult
+from gsmerge.stages.fit import FitOptions
 from gsmerge.types import SH_C0, FeatureGaussians, grid_ids
->>>>>>> theirs
 from gsmerge.views import subset
 
 Texture = Callable[[np.ndarray], np.ndarray]
@@ -278,6 +272,11 @@ def pair_of(scene: Scene) -> tuple[Photos, Photos]:
     return scene_photos(scene), scene_photos(scene, 2)
 
 
+def tuned(options: FitOptions, **constants: float) -> FitOptions:
+    """The options with other constants of the fit."""
+    return replace(options, tuning=replace(options.tuning, **constants))  # type: ignore[arg-type]
+
+
 def noise_for(photos: tuple[Photos, Photos]) -> tuple[Photos, Photos]:
     """Photos of noise: nothing that is learned of one block holds in another."""
     rng = np.random.default_rng(0)
@@ -302,13 +301,8 @@ def compacted(scene: Scene, **settings: Any) -> CompactResult:
     return result
 
 
-<<<<<<< ours
-def plain(scene: PixelScene, **settings: Any) -> Gaussians:
-    """The merge alone: no networks, no fit."""
-=======
 def plain(scene: Scene, **settings: Any) -> Gaussians:
-    """The merge alone: no choice by photos, no networks, no fit."""
->>>>>>> theirs
+    """The merge alone: no networks, no fit."""
     return compacted(scene, **{"fit": "none", "checkpoint": "none", **settings}).gaussians
 
 

@@ -24,7 +24,6 @@ from tiny_scene import (
 
 from gsmerge.errors import SceneError
 from gsmerge.io import load_scene, read_cameras, to_cameras
-from gsmerge.types import UnalignedScene
 
 
 def test_transforms_with_global_intrinsics(tmp_path: Path, tiny: Tiny) -> None:
@@ -164,7 +163,6 @@ def write_dataparser(folder: Path, **changes: object) -> None:
 
 def assert_moved(folder: Path) -> None:
     loaded = load_scene(folder)
-    assert isinstance(loaded.scene, UnalignedScene)
     assert NOTE in loaded.notes
     centres = SCALE * (SMOOTH.c2w[:, :3, 3] @ TURN.T + SHIFT)
     assert np.allclose(loaded.scene.cameras.centres, centres)

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import scenes
 
-from gsmerge import Gaussians, PixelScene
+from gsmerge import Gaussians, Scene
 from gsmerge.geometry import normalize
 from gsmerge.io import read_gaussians
 from gsmerge.types import SH_C0
 
 
-def drawn(scene: PixelScene, degree: int) -> Gaussians:
+def drawn(scene: Scene, degree: int) -> Gaussians:
     """Merged Gaussians with random rotations, sizes and harmonics."""
     rng = np.random.default_rng(degree)
     g = scenes.plain(scene, superpixels="10%")

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 import scenes
 
-from gsmerge import PixelScene
+from gsmerge import Scene
 from gsmerge.io import write_gaussians
 
 from .slow_readers import drawn
 
 
 @pytest.fixture(scope="module")
-def scene() -> PixelScene:
+def scene() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(3, 96, 72))
 
 
@@ -42,7 +42,7 @@ def read_glb(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-def test_glb_holds_everything(degree: int, scene: PixelScene, tmp_path: Path) -> None:
+def test_glb_holds_everything(degree: int, scene: Scene, tmp_path: Path) -> None:
     gaussians = drawn(scene, degree)
     write_gaussians(tmp_path / "a.glb", gaussians)
     document, actual = read_glb(tmp_path / "a.glb")
