@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from gsmerge.encoded.gsm_file import save_encoded as save_encoded
     from gsmerge.errors import GsmergeError as GsmergeError
     from gsmerge.errors import SceneError as SceneError
-    from gsmerge.in_memory import CompactTensors as CompactTensors
     from gsmerge.in_memory import compact_tensors as compact_tensors
     from gsmerge.io import read_cameras as read_cameras
     from gsmerge.io import read_gaussians as read_gaussians
@@ -56,7 +55,7 @@ __version__ = "0.1.0"
 
 _PUBLIC = {
     "errors": ("GsmergeError", "SceneError"),
-    "in_memory": ("CompactTensors", "compact_tensors"),
+    "in_memory": ("compact_tensors",),
     "measure.evaluate": ("EvaluateOptions", "Evaluation", "Views", "evaluate"),
     "measure.inspect": ("inspect",),
     "io": (

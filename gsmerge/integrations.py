@@ -1,4 +1,4 @@
-"""What other libraries return -> what :func:`gsmerge.compact_tensors` takes, by the names of fields alone.
+"""Turn what other libraries return into the arguments of :func:`gsmerge.compact_tensors`, by the names of fields.
 
 None of the libraries is imported. Each function returns keyword arguments, so that any of them can be changed:
 
@@ -13,16 +13,15 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import normalize, rotmat_to_quat
+from gsmerge.geometry import rotmat_to_quat
 from gsmerge.types import Array, as_array, like
 
-_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL camera axes <-> OpenCV
 _OTHER_SIZE = 0.1  # share by which a principal point is farther from the middle than one of this size ever is
 _BYTES = 255.0  # largest value of an image of bytes
 
 
 def depth_anything_3(prediction: Any, *, sh_degree: int = 0) -> dict[str, Any]:
-    """Of a ``Prediction`` of Depth Anything 3, made with ``infer_gs=True``: all of its Gaussians, one per pixel.
+    """Take all Gaussians, one per pixel, of a ``Prediction`` of Depth Anything 3, made with ``infer_gs=True``.
 
     Its files lack those at borders and far away. The nested models' poses are brought to the scale of the Gaussians.
 
@@ -52,7 +51,9 @@ def depth_anything_3(prediction: Any, *, sh_degree: int = 0) -> dict[str, Any]:
 
 
 def anysplat(gaussians: Any, poses: Mapping[str, Array], images: Array, *, sh_degree: int = 0) -> dict[str, Any]:
-    """Of what AnySplat's ``model.inference`` returns: Gaussians of voxels, which belong to no pixels.
+    """Take what AnySplat's ``model.inference`` returns: Gaussians of voxels, which belong to no pixels, and cameras.
+
+    Its files have no cameras.
 
     Args:
         gaussians: Has ``means``, ``scales``, ``rotations`` xyzw (its files have w first), ``harmonics [1,n,3,k]`` and
@@ -74,9 +75,10 @@ def anysplat(gaussians: Any, poses: Mapping[str, Array], images: Array, *, sh_de
 
 
 def depthsplat(output: Any, context: Mapping[str, Array], *, sh_degree: int = 0) -> dict[str, Any]:
-    """Of what DepthSplat's encoder returns: one Gaussian per pixel. MVSplat and pixelSplat (with one) have the same.
+    """Take what DepthSplat's encoder returns, one Gaussian per pixel; MVSplat and pixelSplat (with one) have the same.
 
-    Scales and rotations come from the covariances, because the rotations it keeps beside them are the cameras'.
+    Its files lack the pixels at borders. Scales and rotations come from the covariances, because the rotations it
+    keeps beside them are the cameras'.
 
     Args:
         output: The encoder's: Gaussians with ``means``, ``covariances``, ``harmonics [1,n,3,k]`` and ``opacities``, or
@@ -99,70 +101,6 @@ def depthsplat(output: Any, context: Mapping[str, Array], *, sh_degree: int = 0)
     }
 
 
-def gsplat(
-    splats: Mapping[str, Array],
-    viewmats: Array | None = None,
-    Ks: Array | None = None,
-    images: Array | None = None,
-    *,
-    shape: tuple[int, int, int] | None = None,
-) -> dict[str, Any]:
-    """Of the parameters that gsplat's ``simple_trainer`` optimises: a trained scene, which belongs to no pixels.
-
-    Args:
-        splats: ``means``, ``scales`` as logarithms, ``quats`` of any length, ``opacities`` as logits, ``sh0`` and
-            ``shN``; a ``ParameterDict``, or the ``splats`` of a checkpoint.
-        viewmats: ``[V,4,4]`` world to camera, as for ``rasterization``; None: cameras are placed.
-        Ks: ``[V,3,3]`` intrinsics in pixels.
-        images: ``[V,H,W,3]`` photos, bytes or in [0, 1].
-        shape: Views, height and width; None: those of the images.
-
-    Raises:
-        SceneError: If a parameter is missing.
-    """
-    base = {"sh0": _item("splats", splats, "sh0"), "shN": splats.get("shN")}
-    return {
-        **_activated(splats), **base, "viewmats": viewmats, "Ks": Ks, "shape": shape, "order": "none",
-        "images": None if images is None else _as_floats(as_array(images)),
-    }  # fmt: skip
-
-
-def nerfstudio(model: Any, cameras: Any = None, images: Array | None = None) -> dict[str, Any]:
-    """Of nerfstudio's splatfacto: a trained scene, which belongs to no pixels, in nerfstudio's frame.
-
-    Args:
-        model: Has ``gauss_params`` (``pipeline.model``).
-        cameras: Its ``Cameras`` of one size: ``camera_to_worlds [V,3,4]`` with OpenGL axes, ``fx``, ``fy``, ``cx``,
-            ``cy``, ``width`` and ``height``, such as ``pipeline.datamanager.train_dataset.cameras``; None: cameras are
-            placed.
-        images: ``[V,H,W,3]`` photos of that size, bytes or in [0, 1].
-
-    Raises:
-        SceneError: If a field is missing, or the cameras have several sizes.
-    """
-    params = _field("model", model, "gauss_params")
-    base, rest = _item("gauss_params", params, "features_dc"), _item("gauss_params", params, "features_rest")
-    given: dict[str, Any] = {**_activated(params), "order": "none"}
-    if getattr(getattr(model, "config", None), "sh_degree", 1) == 0:  # then these are logits of colours
-        given["colors"] = like(_sigmoid(as_array(base)), base)
-    else:
-        given |= {"sh0": base, "shN": rest}
-    if cameras is None:
-        return given
-    c2w = as_array(_field("cameras", cameras, "camera_to_worlds")).astype(np.float64)
-    poses = np.tile(np.eye(4), (len(c2w), 1, 1))
-    poses[:, :3] = c2w[:, :3]
-    columns = (as_array(_field("cameras", cameras, name)).reshape(-1) for name in ("fx", "fy", "cx", "cy"))
-    Ks = np.tile(np.eye(3), (len(c2w), 1, 1))
-    Ks[:, 0, 0], Ks[:, 1, 1], Ks[:, 0, 2], Ks[:, 1, 2] = columns
-    sizes = [np.unique(as_array(_field("cameras", cameras, name))) for name in ("height", "width")]
-    if any(len(size) != 1 for size in sizes):
-        problem = f"expected cameras of one size, found heights {sizes[0].tolist()} and widths {sizes[1].tolist()}"
-        raise SceneError("cameras", problem, "pass those of one size and their images")
-    given |= {"viewmats": np.linalg.inv(poses @ _FLIP), "Ks": Ks, "shape": (len(c2w), *(int(s[0]) for s in sizes))}
-    return given | {"images": None if images is None else _as_floats(as_array(images))}
-
-
 def _field(owner: str, value: Any, name: str) -> Any:
     content = getattr(value, name, None)
     if content is None:
@@ -178,7 +116,7 @@ def _item(owner: str, values: Mapping[str, Array], name: str) -> Array:
 
 
 def _one(name: str, values: Array, num_axes: int) -> Array:
-    """Values without the axis of a batch of one."""
+    """Remove the axis of a batch of one."""
     if values.ndim == num_axes:
         return values
     if values.ndim != num_axes + 1 or values.shape[0] != 1:
@@ -187,7 +125,7 @@ def _one(name: str, values: Array, num_axes: int) -> Array:
 
 
 def _gaussians(gaussians: Any, sh_degree: int) -> dict[str, Array]:
-    """Means, opacities and harmonics, which these models keep channel-major."""
+    """Take means, opacities and harmonics, which these models keep channel-major."""
     harmonics = _one("harmonics", _field("gaussians", gaussians, "harmonics"), 3)
     rows = harmonics.swapaxes(1, 2)[:, : (sh_degree + 1) ** 2]
     opacities = _field("gaussians", gaussians, "opacities")
@@ -196,7 +134,7 @@ def _gaussians(gaussians: Any, sh_degree: int) -> dict[str, Array]:
 
 
 def _family_views(poses: Mapping[str, Array], extrinsics: str, intrinsics: str, images: Array) -> dict[str, np.ndarray]:
-    """Views of the pixelSplat family: camera to world, intrinsics divided by the image's size, channels first."""
+    """Convert views of the pixelSplat family: camera to world, intrinsics over the image's size, channels first."""
     c2w = as_array(_one(extrinsics, _item("poses", poses, extrinsics), 3)).astype(np.float64)
     photos = as_array(_one("images", images, 4)).transpose(0, 2, 3, 1)
     sizes = np.array([photos.shape[2], photos.shape[1], 1.0])
@@ -205,12 +143,12 @@ def _family_views(poses: Mapping[str, Array], extrinsics: str, intrinsics: str, 
 
 
 def _as_floats(photos: np.ndarray) -> np.ndarray:
-    """Photos of bytes in [0, 1]; others as they are."""
+    """Bring photos of bytes to [0, 1]; leave others as they are."""
     return photos / np.float32(_BYTES) if photos.dtype == np.uint8 else photos
 
 
 def _in_pixels_of(photos: np.ndarray, Ks: np.ndarray) -> np.ndarray:
-    """Intrinsics at the photos' size: writing COLMAP files leaves Depth Anything 3's at the original photos'.
+    """Bring intrinsics to the photos' size: writing COLMAP files leaves Depth Anything 3's at the original photos'.
 
     Its principal point is in the middle of whichever size they are of.
     """
@@ -220,25 +158,10 @@ def _in_pixels_of(photos: np.ndarray, Ks: np.ndarray) -> np.ndarray:
 
 
 def _axes(covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Standard deviations ``[n,3]`` and rotations ``[n,4]`` wxyz of covariances ``[n,3,3]``."""
+    """Split covariances ``[n,3,3]`` into standard deviations ``[n,3]`` and rotations ``[n,4]`` wxyz."""
     finite = np.isfinite(covariances).all((1, 2))
     squares, axes = np.linalg.eigh(np.where(finite[:, None, None], covariances, np.eye(3)))
     axes[:, :, 0] = np.cross(axes[:, :, 1], axes[:, :, 2])  # a rotation, no mirror
     scales = np.sqrt(np.maximum(squares, 0))
     scales[~finite] = np.nan
     return scales.astype(np.float32), rotmat_to_quat(axes).astype(np.float32)
-
-
-def _activated(params: Mapping[str, Array]) -> dict[str, Array]:
-    """Parameters as trainers optimise them, as they are rendered."""
-    given = {name: _item("splats", params, name) for name in ("means", "scales", "quats", "opacities")}
-    with np.errstate(over="ignore"):
-        scales = np.exp(as_array(given["scales"]))
-    quats, opacities = normalize(as_array(given["quats"])), _sigmoid(as_array(given["opacities"]))
-    values = {"scales": scales, "quats": quats, "opacities": opacities}
-    return {"means": given["means"]} | {name: like(value, given[name]) for name, value in values.items()}
-
-
-def _sigmoid(logits: np.ndarray) -> np.ndarray:
-    with np.errstate(over="ignore"):
-        return 1 / (1 + np.exp(-logits))

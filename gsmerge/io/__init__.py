@@ -1,14 +1,16 @@
 """Files: the only place that knows their formats."""
 
-from gsmerge.io.alignment.recover import Recovery as Recovery
-from gsmerge.io.alignment.score import Alignment as Alignment
-from gsmerge.io.alignment.score import check_alignment as check_alignment
+from gsmerge.io.alignment import Alignment as Alignment
+from gsmerge.io.alignment import Recovery as Recovery
+from gsmerge.io.alignment import check_alignment as check_alignment
 from gsmerge.io.atomic import atomic_output as atomic_output
 from gsmerge.io.atomic import atomic_outputs as atomic_outputs
 from gsmerge.io.bounds import read_json as read_json
 from gsmerge.io.cameras.camera_file import CameraFile as CameraFile
 from gsmerge.io.cameras.camera_file import to_cameras as to_cameras
 from gsmerge.io.cameras.read import read_cameras as read_cameras
+from gsmerge.io.exporters import AUTO as AUTO
+from gsmerge.io.exporters import ReadHints as ReadHints
 from gsmerge.io.formats.ply import SCENE_SUFFIXES as SCENE_SUFFIXES
 from gsmerge.io.formats.ply import PlyInfo as PlyInfo
 from gsmerge.io.formats.ply import PlyScene as PlyScene
@@ -23,8 +25,6 @@ from gsmerge.io.formats.writing import write_gaussians as write_gaussians
 from gsmerge.io.formats.writing import write_ply as write_ply
 from gsmerge.io.held_out import HeldOutViews as HeldOutViews
 from gsmerge.io.held_out import read_held_out as read_held_out
-from gsmerge.io.hints import AUTO as AUTO
-from gsmerge.io.hints import ReadHints as ReadHints
 from gsmerge.io.photos import read_images as read_images
 from gsmerge.io.scene import CamerasInScene as CamerasInScene
 from gsmerge.io.scene import SceneLoad as SceneLoad

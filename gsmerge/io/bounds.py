@@ -1,4 +1,4 @@
-"""What a file may ask for: checked before anything is read from it or allocated for it."""
+"""Check what a file asks for before anything is read from it or allocated for it."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ MAX_PIXELS = 1 << 26  # of one image
 
 
 def check_file(path: Path) -> int:
-    """The size of a file, bytes. SceneError if there is none, or it is a folder, a pipe or a device, which could block
-    or never end.
+    """Return the size of a file, bytes.
+
+    SceneError if there is none, or it is a folder, a pipe or a device, which could block or never end.
     """
     try:
         status = os.stat(path)
@@ -36,8 +37,9 @@ def check_file(path: Path) -> int:
 
 
 def walk_files(folder: Path) -> list[Path]:
-    """All files below a folder, links to other folders left out. SceneError if there are too many: a link to the root
-    of the disk would be read for minutes.
+    """List all files below a folder, links to other folders left out.
+
+    SceneError if there are too many: a link to the root of the disk would be read for minutes.
     """
     files: list[Path] = []
     for num_folders, (base, _, names) in enumerate(os.walk(folder), 1):
@@ -49,7 +51,8 @@ def walk_files(folder: Path) -> list[Path]:
 
 
 def read_text(path: Path, limit: int = MAX_TEXT_BYTES) -> str:
-    """The text of a small file in UTF-8.
+    """Read the text of a small file in UTF-8.
+
     SceneError if it cannot be read, is no text, or has more than ``limit`` bytes.
     """
     size = check_file(path)
@@ -64,7 +67,7 @@ def read_text(path: Path, limit: int = MAX_TEXT_BYTES) -> str:
 
 
 def read_json(path: Path) -> Any:
-    """What a JSON file of at most 32 MiB holds.
+    """Read a JSON file of at most 32 MiB.
 
     Raises:
         SceneError: If it cannot be read or is no JSON.
@@ -77,8 +80,9 @@ def read_json(path: Path) -> Any:
 
 
 def read_table(path: Path) -> dict[str, Any]:
-    """The table of a ``.json`` file, or of any other as TOML. SceneError if the file cannot be read or holds no table,
-    or TOML is read on Python 3.10.
+    """Read the table of a ``.json`` file, or of any other as TOML.
+
+    SceneError if the file cannot be read or holds no table, or TOML is read on Python 3.10.
     """
     try:
         text = path.read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Scenes by what is in their files: hashes of everything that is read, and names made of a scene's own."""
+"""Hash everything that is read of a scene, and make names from a scene's own."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ EXTRA_FILES = (DATAPARSER, *INTRINSICS, FRAMES_FILE, POSE_FILE, SCALE_FILE)  # r
 
 
 def digest(value: Mapping[str, Any]) -> str:
-    """SHA-256 of plain JSON types; the order of the keys does not matter."""
+    """Compute SHA-256 of plain JSON types; the order of the keys does not matter."""
     text = json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
     return hashlib.sha256(text.encode("ascii")).hexdigest()
 
 
 def content_hash(files: Sequence[Path]) -> str:
-    """SHA-256 over the names and contents of files; of folders, over everything in them."""
+    """Compute SHA-256 over the names and contents of files; of folders, over everything in them."""
     state = hashlib.sha256()
     for given in files:
         inside = sorted(p for p in walk_files(given) if p.is_file()) if given.is_dir() else [given]
@@ -42,7 +42,7 @@ def content_hash(files: Sequence[Path]) -> str:
 
 
 def read_files(files: SceneFiles) -> list[Path]:
-    """Everything that is read of a scene, each once: files, and folders of which everything is."""
+    """List everything that is read of a scene, each once: files, and folders that are read as a whole."""
     paths = [path for path in (files.ply, files.cameras, files.images) if path is not None]
     if files.cameras is not None:
         root = files.cameras if files.cameras.is_dir() else files.cameras.parent
@@ -52,7 +52,7 @@ def read_files(files: SceneFiles) -> list[Path]:
 
 
 def photos_of(cameras: Path) -> list[Path]:
-    """Where the photos of a camera file may be, by its names or next to it."""
+    """List where the photos of a camera file may be, by its names or next to it."""
     camera_file = cameras_of(cameras)
     root = cameras if cameras.is_dir() else cameras.parent
     names = () if camera_file is None else camera_file.names
@@ -61,7 +61,7 @@ def photos_of(cameras: Path) -> list[Path]:
 
 
 def cameras_of(path: Path, scene: str | None = None) -> CameraFile | None:
-    """The cameras of a file; None where it cannot be read, which is reported when the scene is read."""
+    """Read the cameras of a file; None where it cannot be read, which is reported when the scene is read."""
     try:
         return read_cameras(path, scene=scene)
     except SceneError:
@@ -69,12 +69,13 @@ def cameras_of(path: Path, scene: str | None = None) -> CameraFile | None:
 
 
 def stem_of(scene: Path) -> str:
-    """A scene's name; of a file without the extension. Folders may have dots in theirs."""
+    """Return a scene's name; of a file without the extension. Folders may have dots in theirs."""
     return scene.stem if scene.suffix in SCENE_SUFFIXES else scene.name
 
 
 def filled(template: str | None, scene: Path) -> Path | None:
-    """A path with ``{scene}`` (the scene as given), ``{parent}`` (its folder) and ``{stem}`` (its name) filled in.
+    """Fill ``{scene}`` (the scene as given), ``{parent}`` (its folder) and ``{stem}`` (its name) into a path.
+
     UsageError if the template holds another name.
     """
     if template is None:

@@ -1,20 +1,64 @@
-"""Exporters that are known by name: what their files look like, and how they are to be read.
+"""How files may be read: by what a caller says, and by exporters that are known by name.
 
-To add one, add an :class:`Exporter` to the tuple below and a row to docs/reference/exporters.md.
+To add an exporter, add an :class:`Exporter` to the tuple below and a row to docs/reference/exporters.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
-from gsmerge.io.alignment.layouts import MAY_BE_UNALIGNED, Layout
-from gsmerge.io.alignment.similarity import Similarity
-from gsmerge.io.formats.ply import PlyInfo
-from gsmerge.io.hints import QuatChoice
+if TYPE_CHECKING:
+    from gsmerge.io.alignment import Layout, Similarity
+    from gsmerge.io.formats.ply import PlyInfo
 
+Order = Literal["auto", "view-major", "view-fastest", "layer-major", "column-major", "unordered", "none"]
+ORDERS: tuple[str, ...] = get_args(Order)
+MAY_BE_UNALIGNED: tuple[str, ...] = ("unordered", "none")  # orders of files whose rows need not belong to pixels
+QuatChoice = Literal["auto", "wxyz", "xyzw", "xyzw-root", "camera"]
+QUATS: tuple[str, ...] = get_args(QuatChoice)
 FrameKind = Literal["same", "scaled", "shifted", "first", "middle", "upright", "other"]
+
+
+@dataclass(frozen=True)
+class ReadHints:
+    """How to read a file where its values do not show it, or mislead; ValueError if a value is no possible one."""
+
+    exporter: str = "auto"  # which one wrote it, of :data:`EXPORTERS`; "auto": recognised
+    # How rotations are stored: "wxyz"; "xyzw"; "xyzw-root": xyzw, each applied twice, so the roots are used where the
+    # pixels are known; "camera": wxyz, relative to the own view's camera; "auto": as the exporter says, and checked
+    # against the surface where the pixels are known.
+    quats: QuatChoice = "auto"
+    order: Order = "auto"  # of the rows; "unordered": each may be made of a pixel; "none": they belong to no pixels
+    scene_scale: float | None = None  # size of the Gaussians' world in units of the cameras'; None: solved for
+    max_side: int = 1200  # longest side of the views of unaligned Gaussians, pixels; larger ones are resized
+
+    def __post_init__(self) -> None:
+        for name, known in (("quats", QUATS), ("order", ORDERS)):
+            if getattr(self, name) not in known:
+                raise ValueError(f"{name}: expected {_listed(known)}, got {getattr(self, name)!r}")
+        if self.scene_scale is not None and not 0 < self.scene_scale < float("inf"):
+            raise ValueError(f"scene_scale: expected a positive number, got {self.scene_scale}")
+        if isinstance(self.max_side, bool) or not isinstance(self.max_side, int) or self.max_side < 16:
+            raise ValueError(f"max_side: expected a whole number of at least 16 pixels, got {self.max_side!r}")
+
+
+AUTO = ReadHints()
+
+
+def make_hints(values: dict[str, Any]) -> ReadHints:
+    """Make hints from keyword arguments; ValueError if one is unknown or none of its possible values."""
+    known = {field.name for field in fields(ReadHints)}
+    unknown = sorted(values.keys() - known)
+    if unknown:
+        raise ValueError(f"expected {_listed(sorted(known))}, got {unknown[0]!r}")
+    return ReadHints(**values)
+
+
+def _listed(names: Iterable[str]) -> str:
+    *first, last = (repr(name) for name in names)
+    return f"{', '.join(first)} or {last}"
 
 
 @dataclass(frozen=True)
@@ -25,8 +69,8 @@ class Exporter:
     title: str  # as people call it
     opacity: Literal["logit", "raw"]  # how it stores opacities
     order: str  # order of its rows; "unordered": none, but each is made of a pixel; "none": they belong to no pixels
-    kinds: tuple[str, ...] = ("full",)  # which pixels it keeps; see :class:`gsmerge.io.alignment.layouts.Layout`
-    # where its Gaussians may lie in the frame of the cameras; see :class:`gsmerge.io.alignment.similarity.Similarity`
+    kinds: tuple[str, ...] = ("full",)  # which pixels it keeps; see ``gsmerge/io/alignment/layouts.py``
+    # where its Gaussians may lie in the frame of the cameras; see :class:`gsmerge.io.alignment.Similarity`
     frames: tuple[FrameKind, ...] = ("same",)
     per_pixel: tuple[int, ...] = (1,)  # Gaussians per pixel
     degrees: tuple[int, ...] = (0,)  # SH degrees that it writes
@@ -39,7 +83,7 @@ class Exporter:
     cameras: tuple[str, ...] = ()  # formats of cameras that it writes; empty: none, any may be given
 
     def may_have_written(self, info: PlyInfo, layout: Layout | None, frame: Similarity | None, cameras: str) -> bool:
-        """Whether a file looks like one of this exporter's; see :func:`choose_exporters`."""
+        """Tell whether a file looks like one of this exporter's; see :func:`choose_exporters`."""
         header = (
             info.sh_degree in self.degrees
             and self.normals == ("nx" in info.columns)
@@ -119,7 +163,7 @@ EXPORTERS = {exporter.name: exporter for exporter in _EXPORTERS}
 
 
 def find_exporter(name: str) -> Exporter | None:
-    """The exporter of that name; None for "auto". ValueError if there is none of that name."""
+    """Return the exporter of that name; None for "auto". ValueError if there is none of that name."""
     if name != "auto" and name not in EXPORTERS:
         raise ValueError(f"exporter: expected 'auto' or one of {', '.join(EXPORTERS)}, got {name!r}")
     return EXPORTERS.get(name)
@@ -128,7 +172,7 @@ def find_exporter(name: str) -> Exporter | None:
 def choose_exporters(
     name: str, info: PlyInfo, layout: Layout | None, frame: Similarity | None, cameras: str
 ) -> tuple[Exporter, ...]:
-    """The exporter of that name; for "auto", all that may have written a file with cameras of a format.
+    """Return the exporter of that name; for "auto", all that may have written a file with cameras of a format.
 
     Those that leave a mark of their own in the header go before those that leave none. ``layout`` and ``frame`` say
     which row is which pixel, and where; None where the rows belong to no pixels.
@@ -142,7 +186,7 @@ def choose_exporters(
 
 
 def exporter_names(exporters: Sequence[Exporter]) -> str:
-    """For people: the one exporter, or all that it may be."""
+    """Say for people which the exporter is, or which it may be."""
     if not exporters:
         return "none that is known by name"
     titles = [exporter.title for exporter in exporters]

@@ -1,4 +1,4 @@
-"""Held-out photos with their cameras, in the frame of a scene: what its renders are compared with."""
+"""Read held-out photos with their cameras in the frame of a scene, to compare its renders with."""
 
 from __future__ import annotations
 
@@ -9,14 +9,13 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.io.alignment.similarity import IDENTITY, Similarity
+from gsmerge.io.alignment import IDENTITY, Similarity
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views, to_cameras, with_convention
 from gsmerge.io.cameras.read import read_cameras
-from gsmerge.io.hints import AUTO
+from gsmerge.io.exporters import AUTO
 from gsmerge.io.photos import as_floats, find_image, photo_size
 from gsmerge.io.scene import SceneLoad
-from gsmerge.io.scene_files import IMAGE_PLACES, SceneFiles
-from gsmerge.io.views import limit_photo_size, stored_photos
+from gsmerge.io.scene_files import IMAGE_PLACES, SceneFiles, limit_photo_size, stored_photos
 from gsmerge.types import Cameras, Scene
 
 _MAX_ANGLE = 0.2  # degrees that a view's two poses may differ by, once one frame is moved to the other
@@ -85,7 +84,7 @@ def read_held_out(
 
 
 def _readings(camera_file: CameraFile, load: SceneLoad) -> list[CameraFile]:
-    """The file as it may be meant, the likeliest first: as the scene's cameras of the same format had to be read."""
+    """List the ways to read the file, the likeliest first: as the scene's cameras of the format had to be read."""
     own = load.cameras
     if own is None or own.source != camera_file.source or own.convention == camera_file.convention:
         return [camera_file]
@@ -93,13 +92,13 @@ def _readings(camera_file: CameraFile, load: SceneLoad) -> list[CameraFile]:
 
 
 def _missing(path: Path, cameras: CameraFile) -> str:
-    """The first view that has no photo where the camera file says."""
+    """Name the first view that has no photo where the camera file says."""
     root = path if path.is_dir() else path.parent
     return next((name for name in cameras.names if find_image(root, name) is None), cameras.names[0])
 
 
 def _folder(path: Path, cameras: CameraFile, images: str | os.PathLike[str] | None) -> Path | None:
-    """Where the photos are: as given, or in a folder next to cameras that do not say it."""
+    """Find the folder of the photos: as given, or next to cameras that do not say it."""
     if images is not None:
         if not Path(images).is_dir():
             raise SceneError(images, "expected a folder of photos")
@@ -112,7 +111,7 @@ def _folder(path: Path, cameras: CameraFile, images: str | os.PathLike[str] | No
 
 
 def _shared_views(camera_file: CameraFile, names: tuple[str, ...]) -> dict[int, int]:
-    """Index in the file -> view of the scene, for views that both name; empty if stems are not unique."""
+    """Map indices in the file to views of the scene that have the same name; empty if stems are not unique."""
     place, own = (
         {PurePosixPath(name.replace("\\", "/")).stem: i for i, name in enumerate(some)}
         for some in (camera_file.names, names)
@@ -123,7 +122,7 @@ def _shared_views(camera_file: CameraFile, names: tuple[str, ...]) -> dict[int, 
 
 
 def _find_world(camera_file: CameraFile, named: dict[int, int], load: SceneLoad) -> tuple[Similarity, dict[int, int]]:
-    """How the file's world lies to that of the Gaussians, and which of its views are the scene's by name and pose."""
+    """Find how the file's world lies to that of the Gaussians, and which of its views are the scene's."""
     stored = IDENTITY if load.recovery is None else load.recovery.best.frame
     if not named:
         return stored, {}
@@ -138,8 +137,9 @@ def _find_world(camera_file: CameraFile, named: dict[int, int], load: SceneLoad)
 
 
 def fit_similarity(theirs: np.ndarray, ours: np.ndarray, scale: float = 1.0) -> Similarity:
-    """The similarity that moves cameras ``theirs [c,4,4]`` (world to camera) onto their poses ``ours`` in another
-    world, least squares; with the given scale where all stand in one place and do not determine it.
+    """Fit the similarity that moves cameras ``theirs [c,4,4]`` (world to camera) onto their poses ``ours`` elsewhere.
+
+    Least squares; with the given scale where all stand in one place and do not determine it.
     """
     rotations = np.einsum("nji,njk->ik", ours[:, :3, :3], theirs[:, :3, :3])
     u, _, vt = np.linalg.svd(rotations)
@@ -157,7 +157,7 @@ def _centres(viewmats: np.ndarray) -> np.ndarray:
 
 
 def _disagreement(moved: np.ndarray, ours: np.ndarray) -> tuple[float, float]:
-    """Largest angle (degrees) and largest distance (over that of the outermost views) between two sets of poses."""
+    """Measure the largest angle (degrees) and distance (over that of the outermost views) between two sets of poses."""
     cosines = (np.einsum("nij,nij->n", moved[:, :3, :3], ours[:, :3, :3]) - 1) / 2
     centres = _centres(ours)
     distance = np.linalg.norm(_centres(moved) - centres, axis=1).max()
@@ -166,7 +166,7 @@ def _disagreement(moved: np.ndarray, ours: np.ndarray) -> tuple[float, float]:
 
 
 def _repeated(moved: np.ndarray, scene: Scene) -> dict[int, int]:
-    """Views that stand where one of the scene's does and look the same way, and which one that is."""
+    """Map views to those of the scene that stand in the same place and look the same way."""
     if len(scene) == 0 or len(scene.gaussians) == 0:
         return {}
     ours, middle = scene.cameras.viewmats, np.median(scene.gaussians.means, 0)

@@ -1,38 +1,55 @@
-"""From files to a scene: with one Gaussian per pixel, verified, or unaligned."""
+"""Read a scene: files in, one :class:`gsmerge.types.Scene` out, with the pixel of every row where it has one."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.io.alignment.estimate_cameras import SOURCE as ESTIMATED
-from gsmerge.io.alignment.fit_cameras import CameraFit, fit_cameras
-from gsmerge.io.alignment.layouts import fill_from_depths, to_grid
-from gsmerge.io.alignment.recover import Recovery
-from gsmerge.io.alignment.rotations import choose_rotations, read_rotations
-from gsmerge.io.alignment.score import Alignment, AlignmentInput, check_alignment
-from gsmerge.io.alignment.similarity import IDENTITY
+from gsmerge.geometry import lower_median
+from gsmerge.io.alignment import (
+    Alignment,
+    AlignmentResult,
+    Recovery,
+    Similarity,
+    align,
+    check_alignment,
+    choose_rotations,
+    fill_from_depths,
+    read_rotations,
+)
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views, to_cameras
-from gsmerge.io.exporters import Exporter, choose_exporters, find_exporter
+from gsmerge.io.cameras.json_files import DATAPARSER, find_dataparser, read_dataparser
+from gsmerge.io.cameras.npz_files import read_depths
+from gsmerge.io.exporters import AUTO, Exporter, ReadHints, choose_exporters, find_exporter, make_hints
 from gsmerge.io.formats.ply import OpacityChoice, PlyInfo, PlyScene, ply_notes, read_gaussians
-from gsmerge.io.hints import AUTO, ReadHints, make_hints
 from gsmerge.io.photos import as_floats, photo_size
-from gsmerge.io.scene_files import SceneFiles, find_scene_files
-from gsmerge.io.unaligned_scene import make_unaligned, usable_rows
-from gsmerge.io.views import find_large_photos, limit_photo_size, read_scene_cameras, stored_photos
+from gsmerge.io.scene_files import (
+    SceneFiles,
+    find_large_photos,
+    find_scene_files,
+    limit_photo_size,
+    limit_view_size,
+    read_scene_cameras,
+    stored_photos,
+)
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import use_threads
-from gsmerge.types import Cameras, Gaussians, LargePhotos, Scene
+from gsmerge.types import Cameras, Gaussians, LargePhotos, Scene, grid_ids
 
 _MIN_CORRELATION = 0.5  # of a view's base colours with its photo
 _COLOR_SAMPLES = 5000  # pixels per view that it is computed from
+_MIN_PADDING = 16  # equal rows at the origin: fewer may be Gaussians
 NO_CAMERAS = Cameras(np.empty((0, 4, 4)), np.empty((0, 3, 3)), 1, 1)
+_NO_ALIGNMENT = AlignmentResult(
+    None, NO_CAMERAS, None, None, problem="expected one Gaussian per pixel, found no cameras that have any"
+)
 
 
 @dataclass(frozen=True)
@@ -66,7 +83,7 @@ class SceneLoad:
     moves: Sequence[dict[str, Any]] = ()
 
     def pixel_scene(self) -> Scene:
-        """The scene, for those who need one Gaussian per pixel. SceneError if it is unaligned; says why."""
+        """Return the scene, if it has one Gaussian per pixel; otherwise raise the SceneError that says why not."""
         if self.scene.aligned:
             return self.scene
         raise SceneError(self.ply.path, self.problem or "expected one Gaussian per pixel")
@@ -93,7 +110,7 @@ def read_scene(
             ``max_side``.
 
     Returns:
-        One Gaussian per pixel; a :class:`gsmerge.types.Scene` where the rows belong to no pixels.
+        The scene; its ``pixel_ids`` are None where the rows belong to no pixels.
 
     Raises:
         SceneError: If a file is missing or damaged, or the Gaussians are not those of the cameras' views.
@@ -123,19 +140,19 @@ def load_scene(
     opacity: OpacityChoice = "auto",
     **hints: Any,
 ) -> SceneLoad:
-    """:func:`read_scene` with everything that was learned on the way."""
+    """Read a scene as :func:`read_scene` does, with everything that was learned on the way."""
     read_hints = make_hints(hints)
     return load_files(find_scene_files(path, cameras=cameras, images=images), opacity=opacity, hints=read_hints)
 
 
 def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = AUTO) -> SceneLoad:
-    """:func:`load_scene` of given files."""
+    """Read the scene of given files as :func:`load_scene` does."""
     with use_threads():
         return align_scene(read_ply_with_hints(files.ply, opacity=opacity, hints=hints), files, hints=hints)
 
 
 def read_ply_with_hints(path: Path, *, opacity: OpacityChoice, hints: ReadHints) -> PlyScene:
-    """The file's rows, with opacities read as given, or as the given exporter stores them."""
+    """Read the file's rows, with opacities as given, or as the given exporter stores them."""
     exporter = find_exporter(hints.exporter)
     return read_gaussians(path, opacity=opacity if exporter is None or opacity != "auto" else exporter.opacity)
 
@@ -148,93 +165,149 @@ def align_scene(
     hints: ReadHints = AUTO,
     photos: bool = True,
 ) -> SceneLoad:
-    """Put Gaussians, cameras and images together and decide which row belongs to which pixel.
+    """Put Gaussians, cameras and photos together, with the pixel of every row where it has one.
 
     Raises as :func:`read_scene`. ``camera_file`` has the cameras if they are read already; without ``photos`` none are
     looked for.
     """
-    if camera_file is None and files.cameras is None and hints.order == "none":  # views are placed later
-        gaussians, notes = usable_rows(ply, hints)
-        problem = "expected one Gaussian per pixel, found no cameras that have any"
-        return _unaligned(ply, files, None, Scene(gaussians, NO_CAMERAS, None, None, ()), problem, hints, notes)
+    if camera_file is None and files.cameras is None and hints.order == "none":  # cameras are placed later
+        return _make_load(ply, files, hints, _NO_ALIGNMENT, [])
     exporter = find_exporter(hints.exporter)
     camera_file = read_scene_cameras(ply, files) if camera_file is None else camera_file
     known = camera_file.order if exporter is None else exporter.order
     order = known if hints.order == "auto" else hints.order
-    pictures, as_read = stored_photos(files, camera_file) if photos else None, camera_file
-    camera_file, pictures, notes = as_pinholes(camera_file, pictures)
+    pinholes, pictures, notes = as_pinholes(camera_file, stored_photos(files, camera_file) if photos else None)
     limited, smaller = limit_photo_size(pictures, len(ply.gaussians), hints.max_side, unaligned=order == "none")
-    fit = fit_cameras(ply, camera_file, limited, order=order, scale=hints.scene_scale)
-    notes += [*smaller, *fit.notes]
-    sizes = pictures, photo_size(limited), fit.transform
-    if fit.recovery is not None:
-        large = find_large_photos(files, as_read, *sizes, fit.inputs.cameras)
-        load = _aligned(ply, files, fit, fit.recovery, hints, notes, large)
-        return load if fit.moved is None else replace(load, moves=fit.moved.moves)
-    scene, camera_file, problem, more = make_unaligned(ply, files, fit, hints)
-    scene = replace(scene, large_photos=find_large_photos(files, as_read, *sizes, scene.cameras))
-    return _unaligned(ply, files, camera_file, scene, problem, hints, notes + more)
+    result = align(
+        ply,
+        pinholes,
+        limited,
+        order=order,
+        scale=hints.scene_scale,
+        depths=partial(read_depths, Path(camera_file.path)),
+        frames=partial(_read_frames, files),
+    )
+    notes += [*smaller, *result.notes]
+    if result.pixel_ids is None:
+        cameras, images, smaller = limit_view_size(result.cameras, result.images, hints.max_side)
+        result = replace(result, cameras=cameras, images=images)
+        notes += smaller
+    size = photo_size(limited)
+    large = find_large_photos(files, camera_file, pictures, size, result.transform, result.cameras)
+    return _make_load(ply, files, hints, result, notes, large)
 
 
-def _aligned(
+def _read_frames(files: SceneFiles) -> list[Similarity]:
+    """Read the frames in which nerfstudio's cameras may see the Gaussians, where it left a file about it."""
+    path = find_dataparser(files)
+    frames = [] if path is None else read_dataparser(path, files.cameras)
+    return [replace(frame, description=f"moved into the Gaussians' frame by {DATAPARSER}") for frame in frames]
+
+
+def _make_load(
     ply: PlyScene,
     files: SceneFiles,
-    fit: CameraFit,
-    recovery: Recovery,
     hints: ReadHints,
-    notes: list[str],
-    large: LargePhotos | None,
+    result: AlignmentResult,
+    notes: Sequence[str] = (),
+    large: LargePhotos | None = None,
 ) -> SceneLoad:
-    inputs, camera_file = fit.inputs, fit.camera_file
-    layout, frame, cameras = recovery.best.layout, recovery.best.frame, inputs.cameras
-    exporters = choose_exporters(hints.exporter, ply.info, layout, frame, camera_file.source)
-    if frame is not IDENTITY:
-        cameras = replace(cameras, viewmats=frame.move_viewmats(inputs.cameras.viewmats))
-    views = Views(cameras, inputs.images, camera_file.names, tuple(dict.fromkeys(layout.views)))
-    scene = to_grid(ply.gaussians, ply.valid, layout, cameras, inputs.images, camera_file.names)
-    scene = replace(scene, large_photos=None if large is None else large[layout.views])
-    scene, filled = _fill(scene, recovery, inputs)
-    scene, rotated = _with_rotations(scene, hints, exporters)
-    if layout.per_pixel == 1:
-        camera_file = select_views(camera_file, layout.views)
-    if camera_file.source == ESTIMATED:
-        notes.append("no cameras were given: poses and focal length are estimated from the Gaussians' own grid")
-    notes += _layout_notes(recovery, inputs) + filled + rotated + color_notes(scene)
-    alignment = check_alignment(scene.gaussians, scene.cameras, scene.stored)
-    text = (*ply_notes(ply.info), *notes)
-    return SceneLoad(scene, ply.info, files, camera_file, views, exporters, text, alignment, recovery)
-
-
-def _unaligned(
-    ply: PlyScene,
-    files: SceneFiles,
-    camera_file: CameraFile | None,
-    scene: Scene,
-    problem: str,
-    hints: ReadHints,
-    notes: list[str],
-) -> SceneLoad:
+    """Make the scene of rows, their pixels and the views, and say how it was read."""
+    camera_file, layout, views = result.camera_file, result.layout, list(result.views)
+    names = () if camera_file is None else camera_file.names
+    gaussians, pixel_ids, missing, more = _place_rows(ply, result)
+    cameras, images = result.cameras, result.images
+    if views != list(range(len(cameras))):
+        cameras, images = cameras[views], None if images is None else images[views]
+    large = None if large is None else large[views]
+    scene = Scene(gaussians, cameras, images, pixel_ids, tuple(names[view] for view in views), missing, large)
+    if camera_file is not None and layout is not None:
+        if layout.kind == "box+depth":
+            scene, filled = _fill(scene, read_depths(Path(camera_file.path)), views)
+            more += filled
+        if layout.per_pixel == 1:
+            camera_file = select_views(camera_file, views)
+    frame = None if result.recovery is None else result.recovery.best.frame
     source = "" if camera_file is None else camera_file.source
-    exporters = choose_exporters(hints.exporter, ply.info, None, None, source)
-    views = Views(scene.cameras, scene.images, scene.names, tuple(range(len(scene))))
-    text = (*ply_notes(ply.info), *notes)
-    return SceneLoad(scene, ply.info, files, camera_file, views, exporters, text, problem=problem)
+    exporters = choose_exporters(hints.exporter, ply.info, layout, frame, source)
+    scene, turned = _with_rotations(scene, hints, exporters)
+    more += turned
+    if scene.aligned:
+        more += color_notes(scene)
+    elif camera_file is not None:
+        more.append("the rows belong to no pixels that could be found: unaligned")
+        if hints.exporter != "auto":
+            more[-1] += f"; only the layouts of {hints.exporter} were tried, as given; --exporter auto tries all"
+    return SceneLoad(
+        scene=scene,
+        ply=ply.info,
+        files=files,
+        cameras=camera_file,
+        views=Views(result.cameras, result.images, names, tuple(dict.fromkeys(views))),
+        exporters=exporters,
+        notes=(*ply_notes(ply.info), *notes, *more),
+        alignment=check_alignment(scene.gaussians, scene.cameras, scene.stored) if scene.aligned else None,
+        recovery=result.recovery,
+        problem=result.problem,
+        moves=result.moves,
+    )
 
 
-def _fill(scene: Scene, recovery: Recovery, inputs: AlignmentInput) -> tuple[Scene, list[str]]:
-    """Pixels that were dropped for being far, put back from the depth maps next to the cameras; and a note about it."""
-    layout = recovery.best.layout
-    maps = inputs.depths() if layout.kind == "box+depth" else None
-    if maps is None:
+def _place_rows(
+    ply: PlyScene, result: AlignmentResult
+) -> tuple[Gaussians, np.ndarray | None, np.ndarray | None, list[str]]:
+    """Bring rows to the pixels of the grid; return Gaussians, ``pixel_ids``, ``missing`` and notes.
+
+    Pixels without a row get a fully transparent Gaussian. Of rows without pixels, those that are finite stay, without
+    those that only pad the file.
+    """
+    if result.pixel_ids is None:
+        keep = ply.valid & ~_is_padding(ply.gaussians)
+        count = int(ply.valid.sum()) - int(keep.sum())
+        notes = [f"{count:,} rows that only fill the file up are left out"] if count else []
+        return ply.gaussians[keep], None, None, notes
+    grid = len(result.views), result.cameras.height, result.cameras.width
+    size, ids = int(np.prod(grid)), result.pixel_ids
+    if len(ids) == size and np.array_equal(ids, np.arange(size)):
+        return ply.gaussians, grid_ids(ply.valid), None, []
+    source = np.full(size, -1, np.int64)
+    rows = np.flatnonzero(ids >= 0)
+    source[ids[rows]] = rows
+    missing = source < 0
+    if not missing.any():
+        return ply.gaussians[source], grid_ids(ply.valid[source]), None, []
+    before = np.maximum.accumulate(np.where(missing, np.argmin(missing), np.arange(size)))
+    out = ply.gaussians[source[before]]
+    valid = ply.valid[source[before]] & ~missing
+    for values in (out.opacities, out.sh0, out.shN):
+        values[missing] = 0
+    out.quats[missing] = (1, 0, 0, 0)
+    return out, grid_ids(valid), missing.reshape(grid), []
+
+
+def _is_padding(gaussians: Gaussians) -> np.ndarray:
+    """Find rows ``[n]`` at the very origin that are all alike, with which VolSplat fills up its files."""
+    rows = np.flatnonzero((gaussians.means == 0).all(1))
+    padding = np.zeros(len(gaussians), bool)
+    if len(rows) < _MIN_PADDING:
+        return padding
+    shape = np.concatenate([gaussians.scales, gaussians.opacities[:, None], gaussians.sh0[:, 0]], 1)[rows]
+    padding[rows[(shape == lower_median(shape)).all(1)]] = True
+    return padding
+
+
+def _fill(scene: Scene, depths: np.ndarray | None, views: list[int]) -> tuple[Scene, list[str]]:
+    """Put pixels that were dropped for being far back from the depth maps of all cameras; with a note about it."""
+    if depths is None:
         return scene, []
-    full = fill_from_depths(scene, maps[list(layout.views)])
+    full = fill_from_depths(scene, depths[views])
     count = int(full.valid.sum()) - int(scene.valid.sum())
     return full, [f"{count:,} pixels that the exporter dropped are put back from the depth maps"] if count else []
 
 
 def _with_rotations(scene: Scene, hints: ReadHints, exporters: Sequence[Exporter]) -> tuple[Scene, list[str]]:
-    """Rotations read as given, as the given exporter stores them, or as fits the surface; and a note about the last."""
-    if hints.quats != "auto":
+    """Read rotations as given, as the given exporter stores them, or as fits the surface; with a note."""
+    if hints.quats != "auto" or not scene.aligned:
         return read_rotations(scene, hints.quats), []
     if hints.exporter != "auto":
         return read_rotations(scene, exporters[0].quats), []
@@ -244,21 +317,8 @@ def _with_rotations(scene: Scene, hints: ReadHints, exporters: Sequence[Exporter
     return read_rotations(scene, choice), [note] if note else []
 
 
-def _layout_notes(recovery: Recovery, inputs: AlignmentInput) -> list[str]:
-    """How the rows were read, unless the file was simply in order."""
-    layout = recovery.best.layout
-    if layout.is_plain and recovery.best.frame is IDENTITY and len(layout.views) == len(inputs.cameras):
-        if layout.views == tuple(inputs.labellings[0]):
-            return []
-        if layout.views == tuple(inputs.labellings[1]):
-            return ["views are in the order of the image names, not of the camera file"]
-    notes = [f"read as: {recovery.description}"]
-    used = len(set(layout.views))
-    return notes + ([f"{used} of {len(inputs.cameras)} views are in the file"] if used < len(inputs.cameras) else [])
-
-
 def color_notes(scene: Scene) -> list[str]:
-    """A note if the images do not look like the Gaussians: likely in another order, or of another scene."""
+    """Note if the images do not look like the Gaussians: likely in another order, or of another scene."""
     if scene.images is None:
         return []
     step = max(1, scene.pixels_per_view // _COLOR_SAMPLES)
@@ -271,7 +331,7 @@ def color_notes(scene: Scene) -> list[str]:
 
 
 def _correlation(a: np.ndarray, b: np.ndarray) -> float:
-    """Pearson's correlation, 1 where one of the two hardly varies."""
+    """Compute Pearson's correlation, 1 where one of the two hardly varies."""
     if len(a) < 16 or min(a.std(ddof=1), b.std(ddof=1)) < 0.01:
         return 1.0
     return float(np.corrcoef(a, b)[0, 1])
@@ -279,7 +339,7 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class CamerasInScene:
-    """Gaussians and views of one frame."""
+    """Gaussians and views in one frame."""
 
     gaussians: Gaussians  # the file's, with rotations read as the scene has them
     views: Views  # of the camera file
@@ -289,7 +349,7 @@ class CamerasInScene:
 def place_cameras_in_scene(
     ply: PlyScene, files: SceneFiles, *, hints: ReadHints = AUTO, photos: bool = True
 ) -> CamerasInScene:
-    """Views in the frame of the Gaussians, if their pixels or colours show it; otherwise as their file has them.
+    """Bring views into the frame of the Gaussians, if pixels or colours show it; otherwise keep them as in their file.
 
     ``photos`` that cannot be read are an error; with False they are left out.
 

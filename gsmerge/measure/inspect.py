@@ -24,12 +24,11 @@ from gsmerge.io import (
     read_cameras,
     read_ply_with_hints,
 )
-from gsmerge.io.alignment.poses import CameraCheck, check_cameras
-from gsmerge.io.exporters import exporter_names
+from gsmerge.io.alignment import CameraCheck, check_cameras
+from gsmerge.io.exporters import exporter_names, make_hints
 from gsmerge.io.formats.ply import OpacityChoice
 from gsmerge.io.formats.ply_file import LOGIT_COMMENT
 from gsmerge.io.formats.writing import file_bytes
-from gsmerge.io.hints import make_hints
 from gsmerge.options import CompactOptions
 from gsmerge.plan import resolved_settings, steps_for
 from gsmerge.report import finite

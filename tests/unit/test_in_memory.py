@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +13,7 @@ import pytest
 import torch
 from scenes import FIELDS, arc, make_scene, move, room
 
-from gsmerge import CompactTensors, Gaussians, Scene, SceneError, compact, compact_tensors, read_cameras, read_ply
+from gsmerge import CompactResult, Gaussians, Scene, SceneError, compact, compact_tensors
 from gsmerge.geometry import sh0_to_rgb
 
 FAST: dict[str, Any] = {"effort": "draft", "superpixels": "10%", "fit": "none"}
@@ -41,17 +40,16 @@ def changed(scene: Scene, name: str, change: Change) -> dict[str, Any]:
     return given | {name: change(np.array(given[name]))}
 
 
-def same(small: CompactTensors, gaussians: Gaussians) -> bool:
-    return all(np.array_equal(np.asarray(getattr(small, name)), getattr(gaussians, name)) for name in FIELDS)
+def same(small: CompactResult, gaussians: Gaussians) -> bool:
+    return all(np.array_equal(np.asarray(getattr(small.gaussians, name)), getattr(gaussians, name)) for name in FIELDS)
 
 
 def test_arrays_give_what_compact_gives(scene: Scene) -> None:
     small, result = compact_tensors(**tensors_of(scene), **FAST), compact(scene, **FAST)
     assert same(small, result.gaussians)
-    assert isinstance(small.means, np.ndarray)
+    assert isinstance(small.gaussians.means, np.ndarray)
     assert small.report.psnr_after == result.report.psnr_after
-    np.testing.assert_array_equal(small.colors, sh0_to_rgb(result.gaussians.sh0[:, 0]))
-    assert len(small) == len(small.gaussians) == small.report.num_output < 0.2 * len(scene.gaussians)
+    assert len(small.gaussians) == small.report.num_output < 0.2 * len(scene.gaussians)
 
 
 def test_tensors_give_tensors(scene: Scene) -> None:
@@ -61,22 +59,23 @@ def test_tensors_give_tensors(scene: Scene) -> None:
     given["scales"], given["opacities"] = given["scales"][None], given["opacities"][None, :, None].double()
     given["viewmats"] = given["viewmats"][:, :3]
     small = compact_tensors(**given, **FAST)
-    assert all(isinstance(getattr(small, name), torch.Tensor) for name in (*FIELDS, "colors"))
-    assert small.means.device == given["means"].device
-    assert not small.means.requires_grad
+    assert all(isinstance(getattr(small.gaussians, name), torch.Tensor) for name in FIELDS)
+    assert small.gaussians.device == given["means"].device
+    assert not small.gaussians.means.requires_grad
     assert same(small, compact(scene, **FAST).gaussians)
 
 
 def test_bfloat16_is_read(scene: Scene) -> None:
     opacities = torch.tensor(scene.gaussians.opacities).bfloat16()
     small = compact_tensors(**tensors_of(scene, opacities=opacities), **FAST)
-    assert small.opacities.dtype == np.float32
+    assert small.gaussians.opacities.dtype == np.float32
 
 
 def test_colors_stand_for_harmonics(scene: Scene) -> None:
     colors = sh0_to_rgb(scene.gaussians.sh0[:, 0])
     small = compact_tensors(**tensors_of(scene, sh0=None, colors=colors), **FAST)
-    np.testing.assert_allclose(small.sh0, compact_tensors(**tensors_of(scene), **FAST).sh0, atol=1e-5)
+    expected = compact_tensors(**tensors_of(scene), **FAST).gaussians.sh0
+    np.testing.assert_allclose(small.gaussians.sh0, expected, atol=1e-5)
 
 
 def test_input_is_left_alone_and_odd_rows_are_set_aside(scene: Scene) -> None:
@@ -85,14 +84,14 @@ def test_input_is_left_alone_and_odd_rows_are_set_aside(scene: Scene) -> None:
     small = compact_tensors(**given, **FAST)
     assert "1 row(s) with NaN or inf, set aside" in small.report.notes
     assert all(np.array_equal(before[name], given[name], equal_nan=True) for name in before)
-    assert np.isfinite(small.means).all()
+    assert np.isfinite(small.gaussians.means).all()
 
 
 def test_gaussians_of_no_pixels(scene: Scene) -> None:
     rows = np.random.default_rng(0).permutation(len(scene.gaussians))[:-9]
     given = tensors_of(scene, **{name: getattr(scene.gaussians, name)[rows] for name in FIELDS})
     small = compact_tensors(**given, order="none", **FAST)
-    assert 0 < len(small) < len(rows)
+    assert 0 < len(small.gaussians) < len(rows)
     bare = {name: given[name] for name in FIELDS}
     assert len(compact_tensors(**bare, order="none", **FAST).cameras) == 0
     with pytest.raises(SceneError, match=r"^viewmats: .*camera-to-world .*; pass their inverse"):
@@ -191,21 +190,17 @@ def test_centres_at_corners_get_a_note(scene: Scene) -> None:
     assert not any("0.5" in note for note in compact_tensors(**tensors_of(scene), **FAST).report.notes)
 
 
-def test_saving(scene: Scene, tmp_path: Path) -> None:
+def test_levels_are_tensors_as_well(scene: Scene) -> None:
+    given = {name: torch.tensor(value) for name, value in tensors_of(scene).items()}
+    small = compact_tensors(**given, **FAST, levels=2)
+    assert [isinstance(one.gaussians.means, torch.Tensor) for one in small.coarser] == [True]
+
+
+def test_cameras_stay_where_they_fit(scene: Scene) -> None:
+    """The result has them, so that it can be written with :func:`gsmerge.write_gaussians` and shown from them."""
     small = compact_tensors(**tensors_of(scene), names=[f"photo {i}" for i in range(3)], **FAST)
-    small.save(tmp_path / "room.ply")
-    assert len(read_ply(tmp_path / "room.ply").gaussians) == len(small)
-    entries = json.loads((tmp_path / "room.cameras.json").read_text())
-    assert [(entry["id"], entry["img_name"], entry["width"]) for entry in entries] == [
-        (i, f"photo {i}", 48) for i in range(3)
-    ]
-    back = read_cameras(tmp_path / "room.cameras.json")
-    np.testing.assert_allclose(back.viewmats, scene.cameras.viewmats, atol=1e-12)
-    np.testing.assert_allclose(back.Ks, scene.cameras.Ks)
-    with pytest.raises(SceneError, match="exists already"):
-        small.save(tmp_path / "room.ply")
-    small.save(tmp_path / "alone.compressed.ply", cameras=False)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["alone.compressed.ply", "room.cameras.json", "room.ply"]
+    np.testing.assert_array_equal(small.cameras.viewmats, scene.cameras.viewmats)
+    np.testing.assert_array_equal(small.cameras.Ks, scene.cameras.Ks)
 
 
 def test_a_path_in_place_of_a_scene(made_scene: Path) -> None:

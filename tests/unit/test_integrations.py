@@ -13,11 +13,10 @@ from scenes import arc, make_scene, move, room
 
 from gsmerge import Gaussians, Scene, SceneError, compact_tensors, integrations
 from gsmerge.geometry import covariances
-from gsmerge.types import SH_C0, as_array
+from gsmerge.types import as_array
 
 FAST: dict[str, Any] = {"effort": "draft", "superpixels": "10%", "fit": "none"}
 SIZES = np.array([48, 36, 1.0])[:, None]
-FLIP = np.diag([1.0, -1, -1, 1])
 
 
 @pytest.fixture(scope="module")
@@ -75,8 +74,8 @@ def assert_holds(given: dict[str, Any], scene: Scene, *, quats: bool = True) -> 
     np.testing.assert_allclose(as_array(given["Ks"]), scene.cameras.Ks, atol=1e-4)
     np.testing.assert_allclose(as_array(given["images"]), photos_of(scene), atol=0.003)
     small = compact_tensors(**given, **FAST)
-    assert isinstance(small.means, torch.Tensor)
-    assert 0 < len(small) < 0.3 * n
+    assert isinstance(small.gaussians.means, torch.Tensor)
+    assert 0 < len(small.gaussians) < 0.3 * n
     assert small.report.psnr_after is not None
     assert small.report.psnr_after > 15
 
@@ -133,47 +132,3 @@ def test_depthsplat(scene: Scene, wrapped: bool) -> None:
     given = integrations.depthsplat(output, context)
     assert_holds(given, scene)
     np.testing.assert_allclose(torch.linalg.norm(given["quats"], dim=-1), 1, atol=1e-5)
-
-
-def trained(gaussians: Gaussians) -> dict[str, torch.Tensor]:
-    tensors = gaussians.to("cpu")
-    logits = torch.logit(tensors.opacities.double()).float()
-    means, scales = tensors.means.float(), tensors.scales.log()
-    return {"means": means, "scales": scales, "quats": 2.5 * tensors.quats, "opacities": logits}
-
-
-def test_gsplat(scene: Scene) -> None:
-    harmonics = {"sh0": torch.tensor(scene.gaussians.sh0), "shN": torch.zeros(len(scene.gaussians), 15, 3)}
-    splats = torch.nn.ParameterDict({**trained(scene.gaussians), **harmonics})
-    photos = torch.tensor(np.round(255 * photos_of(scene)).astype(np.uint8))
-    cameras = torch.tensor(scene.cameras.viewmats), torch.tensor(scene.cameras.Ks)
-    assert_holds(integrations.gsplat(splats, *cameras, photos), scene)
-    with pytest.raises(SceneError, match="splats: expected an entry 'sh0', found 'means'"):
-        integrations.gsplat(trained(scene.gaussians))
-
-
-def test_nerfstudio(scene: Scene) -> None:
-    base = torch.tensor(scene.gaussians.sh0[:, 0])
-    params = {**trained(scene.gaussians), "features_dc": base, "features_rest": torch.zeros(len(base), 15, 3)}
-    params["opacities"] = params["opacities"][:, None]
-    model = SimpleNamespace(gauss_params=torch.nn.ParameterDict(params), config=SimpleNamespace(sh_degree=3))
-    c2w, K = np.linalg.inv(scene.cameras.viewmats) @ FLIP, scene.cameras.Ks
-    columns = {"fx": K[:, 0, 0], "fy": K[:, 1, 1], "cx": K[:, 0, 2], "cy": K[:, 1, 2]}
-    sizes = {"width": np.full(3, 48), "height": np.full(3, 36)}
-    fields = {name: torch.tensor(values)[:, None] for name, values in (columns | sizes).items()}
-    cameras = SimpleNamespace(camera_to_worlds=torch.tensor(c2w[:, :3]), **fields)
-    assert_holds(integrations.nerfstudio(model, cameras, photos_of(scene)), scene)
-    cameras.width = torch.tensor([48, 48, 50])[:, None]
-    with pytest.raises(SceneError, match=r"cameras: expected cameras of one size, found .* widths \[48, 50\]"):
-        integrations.nerfstudio(model, cameras)
-
-
-def test_nerfstudio_without_harmonics(scene: Scene) -> None:
-    """With degree 0 it trains logits of colours."""
-    rgb = (0.5 + SH_C0 * scene.gaussians.sh0[:, 0].astype(np.float64)).clip(0.01, 0.99)
-    params = {**trained(scene.gaussians), "features_dc": torch.tensor(np.log(rgb / (1 - rgb)))}
-    params["features_rest"] = torch.zeros(len(rgb), 0, 3)
-    model = SimpleNamespace(gauss_params=params, config=SimpleNamespace(sh_degree=0))
-    given = integrations.nerfstudio(model)
-    np.testing.assert_allclose(given["colors"], rgb, atol=1e-6)
-    assert len(compact_tensors(**given, **FAST)) > 0

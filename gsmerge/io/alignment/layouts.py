@@ -1,29 +1,33 @@
-"""Which row of a file may belong to which pixel: what the number of rows allows; and scenes laid out accordingly."""
+"""Lay rows out as pixels: which layouts the number of rows allows, and which size the grid of Gaussians may have."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
-from typing import Literal, get_args
 
 import numpy as np
 
+from gsmerge.errors import SceneError
 from gsmerge.geometry import rgb_to_sh0
+from gsmerge.io.cameras.camera_file import CameraFile, sizes_of, to_cameras
+from gsmerge.io.formats.ply import PlyInfo
+from gsmerge.io.photos import ASPECT_TOLERANCE, PhotoTransform, Size, resize_and_crop, resize_to, same_shape
 from gsmerge.types import Cameras, Gaussians, Scene, grid_ids
-
-Order = Literal["auto", "view-major", "view-fastest", "layer-major", "column-major", "unordered", "none"]
-ORDERS: tuple[str, ...] = get_args(Order)
-MAY_BE_UNALIGNED: tuple[str, ...] = ("unordered", "none")  # orders of files whose rows need not belong to pixels
 
 TRIM = 8  # pixels that DepthSplat and its relatives cut off at every side
 PER_PIXEL = (1, 2, 3, 4, 16)  # Gaussians per pixel that backbones write
-_MAX_SPREAD = 0.15  # of the Gaussians' depth over a depth map's: above it the map is not that of the Gaussians
 DEPTH_SHARE = 0.9  # of each view's pixels, the nearest ones, that Depth Anything 3 keeps
+_MAX_SPREAD = 0.15  # of the Gaussians' depth over a depth map's: above it the map is not that of the Gaussians
+PATCH = 14  # sides of vision transformers' inputs are multiples of it
+SIDES = (504, 518)  # to which Depth Anything 3 and others resize the longer or the shorter side, pixels
+_ROUND = (8, PATCH)  # sides of grids that photos are cropped to are multiples of one of them
+_MIN_KEPT = 0.5  # of a photo's area, when it is cropped
+_MAX_ENLARGED = 1.5  # times the side of a photo; some networks enlarge small ones
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Rows and pixels, block by block: a block is what one view (or one layer of it) wrote."""
+    """Rows and their pixels, block by block: a block is what one view (or one layer of it) wrote."""
 
     description: str  # what it is, for people
     kind: str  # "full", "trim", "box", "box+depth" or "pruned": which pixels there are
@@ -40,6 +44,15 @@ class Layout:
         """Whether the rows are the grid as they are: nothing to move, nothing missing."""
         return self.kind == "full" and self.order == "view-major" and self.per_pixel == 1
 
+    def pixel_ids(self, count: int) -> np.ndarray:
+        """Return the pixel ``(block·H + y)·W + x`` of each of ``count`` rows, int64; -1 for rows without one."""
+        if self.is_plain:
+            return np.arange(count, dtype=np.int64)
+        ids = np.full(count, -1, np.int64)
+        for block, (rows, pixels) in enumerate(zip(self.rows, self.pixels, strict=True)):
+            ids[rows.reshape(-1)] = block * self.width * self.height + pixels
+        return ids
+
 
 @dataclass(frozen=True)
 class Box:
@@ -51,13 +64,13 @@ class Box:
     left: int
 
     def pixels(self, width: int, height: int) -> np.ndarray:
-        """Pixels of the box, row by row."""
+        """Return the pixels of the box, row by row."""
         grid = np.arange(width * height, dtype=np.int64).reshape(height, width)
         return grid[self.top : height - self.top, self.left : width - self.left]
 
 
 def boxes(width: int, height: int) -> list[Box]:
-    """What is cut off at the border: nothing, 8 pixels, or 8/256 of each side as Depth Anything 3 does."""
+    """List what may be cut off at the border: nothing, 8 pixels, or 8/256 of each side as Depth Anything 3 does."""
     out = [Box("full", "every pixel", 0, 0)]
     if min(width, height) > 2 * TRIM:
         out.append(Box("trim", f"{TRIM} pixels trimmed at every border", TRIM, TRIM))
@@ -68,23 +81,23 @@ def boxes(width: int, height: int) -> list[Box]:
 
 
 def da3_box(width: int, height: int) -> Box:
-    """What Depth Anything 3 cuts off."""
+    """Return what Depth Anything 3 cuts off."""
     top, left = int(8 / 256 * height), int(8 / 256 * width)
     return Box("box", f"{top} rows and {left} columns trimmed at every border", top, left)
 
 
 def every_nth(views: int) -> list[tuple[int, ...]]:
-    """The choices of views of exporters that take every n-th one, for all n."""
+    """List the views that exporters keep which take every n-th one, for all n."""
     return [tuple(range(0, views, step)) for step in range(1, views + 1)]
 
 
 def plain_layout(views: int, width: int, height: int) -> Layout:
-    """One Gaussian per pixel, view by view and row by row."""
+    """Return the layout of one Gaussian per pixel, view by view and row by row."""
     return next(one for one in exact_layouts(views * width * height, views, width, height) if one.is_plain)
 
 
 def exact_layouts(count: int, views: int, width: int, height: int) -> Iterator[Layout]:
-    """Layouts with exactly ``count`` rows, for every number of views up to ``views``.
+    """Yield the layouts with exactly ``count`` rows, for every number of views up to ``views``.
 
     Which camera a block belongs to is a first guess: the cameras in order, or every n-th of them.
     """
@@ -124,7 +137,7 @@ def _orders(count: int, box: Box, per_pixel: int, views: tuple[int, ...], width:
 
 
 def depth_layouts(count: int, depths: np.ndarray) -> list[Layout]:
-    """The layout of Depth Anything 3 from its depth maps: border, nearest 90 % of each view, every n-th view.
+    """Make the layout of Depth Anything 3 from its depth maps: border, nearest 90 % of each view, every n-th view.
 
     Of ``depths [v,h,w]`` only the order matters, so any scale will do. Empty if no choice of views has ``count``
     pixels.
@@ -144,7 +157,7 @@ def depth_layouts(count: int, depths: np.ndarray) -> list[Layout]:
 
 
 def depth_mask(depth: np.ndarray) -> np.ndarray:
-    """Pixels of one view that Depth Anything 3 keeps, in order.
+    """Return the pixels of one view that Depth Anything 3 keeps, in order.
 
     Its threshold is the 90 % quantile of all the view's depths, interpolated: between two depths that occur, so
     the lower of the two decides.
@@ -156,57 +169,8 @@ def depth_mask(depth: np.ndarray) -> np.ndarray:
     return inside[mask.reshape(-1)[inside]]
 
 
-def subsample(layout: Layout, per_block: int) -> Layout:
-    """About ``per_block`` rows of each block, spread over all columns and rows."""
-    rows, pixels = [], []
-    for some, where in zip(layout.rows, layout.pixels, strict=True):
-        step = max(1, -(-some.size // per_block))
-        while step > 1 and np.gcd(step, layout.width) > 1:  # a step that divides the width sees some columns only
-            step += 1
-        chosen = np.arange(0, some.size, step)
-        rows.append(some.flat[chosen])
-        pixels.append(where[chosen])
-    return replace(layout, rows=tuple(rows), pixels=tuple(pixels))
-
-
-def to_grid(
-    gaussians: Gaussians,
-    valid: np.ndarray,
-    layout: Layout,
-    cameras: Cameras,
-    images: np.ndarray | None,
-    names: tuple[str, ...],
-) -> Scene:
-    """The scene on the full grid of the layout; pixels without a row get a fully transparent Gaussian.
-
-    ``gaussians`` and ``valid [n]`` are the file's rows; cameras (in their frame and at the grid's size), ``images
-    [c,h,w,3]`` and names are those of all views.
-    """
-    views = list(layout.views)
-    if views != list(range(len(cameras))):
-        cameras, images = cameras[views], None if images is None else images[views]
-    grid = len(views), layout.height, layout.width
-    names = tuple(names[view] for view in views)
-    if layout.is_plain:
-        return Scene(gaussians, cameras, images, grid_ids(valid), names)
-    size = layout.width * layout.height
-    source = np.full(size * len(views), -1, np.int64)
-    for i, (rows, pixels) in enumerate(zip(layout.rows, layout.pixels, strict=True)):
-        source[i * size + pixels] = rows.reshape(-1)
-    missing = source < 0
-    if not missing.any():
-        return Scene(gaussians[source], cameras, images, grid_ids(valid[source]), names)
-    before = np.maximum.accumulate(np.where(missing, np.argmin(missing), np.arange(len(source))))
-    out, kept = gaussians[source[before]], valid[source[before]]
-    kept[missing] = False
-    for values in (out.opacities, out.sh0, out.shN):
-        values[missing] = 0
-    out.quats[missing] = (1, 0, 0, 0)
-    return Scene(out, cameras, images, grid_ids(kept), names, missing.reshape(grid))
-
-
 def fill_from_depths(scene: Scene, depths: np.ndarray) -> Scene:
-    """The scene with a Gaussian for each pixel that the file has no row for.
+    """Add a Gaussian for each pixel that the file has no row for.
 
     It lies on the pixel's ray at the depth of the map (``depths [v,h,w]`` of the scene's views), in units that follow
     from the other pixels: as depth along z or as distance, whichever they agree with. Its colour is the photo's; its
@@ -253,6 +217,155 @@ def fill_from_depths(scene: Scene, depths: np.ndarray) -> Scene:
 
 
 def _agreement(ratio: np.ndarray, far: int) -> tuple[float, float, int]:
-    """(spread, median, kind) of the Gaussians' depth over the map's."""
+    """Compute (spread, median, kind) of the Gaussians' depth over the map's."""
     middle = float(np.median(ratio))
     return float(np.median(np.abs(ratio / middle - 1))), middle, far
+
+
+def subsample(layout: Layout, per_block: int) -> Layout:
+    """Thin a layout to about ``per_block`` rows of each block, spread over all columns and rows."""
+    rows, pixels = [], []
+    for some, where in zip(layout.rows, layout.pixels, strict=True):
+        chosen = np.arange(0, some.size, spread_step(-(-some.size // per_block), layout.width))
+        rows.append(some.flat[chosen])
+        pixels.append(where[chosen])
+    return replace(layout, rows=tuple(rows), pixels=tuple(pixels))
+
+
+def spread_step(step: int, width: int) -> int:
+    """Enlarge a step until it shares no divisor with the width: otherwise it would see some columns only."""
+    step = max(1, step)
+    while step > 1 and np.gcd(step, width) > 1:
+        step += 1
+    return step
+
+
+@dataclass(frozen=True)
+class GridFit:
+    """One way to bring cameras and photos to the size of the grid.
+
+    Its rank is what speaks for it: a size that files have (0); the number of rows and the photos' shape (1); the number
+    of rows alone (2); a network's usual sizes (3).
+    """
+
+    cameras: Cameras  # at the grid's size
+    transform: PhotoTransform | None  # what is done to the photos, if anything
+    notes: tuple[str, ...]  # what it is, for people
+    rank: int = 0
+
+    @property
+    def size(self) -> Size:
+        """(width, height) of the grid."""
+        return self.cameras.width, self.cameras.height
+
+    @property
+    def guessed(self) -> bool:
+        """Whether it is one of many that the number of rows allows."""
+        return self.rank in (1, 2)
+
+
+def photo_grid(camera_file: CameraFile, size: Size | None) -> GridFit:
+    """Assume that the grid has the photos' size, or that of the cameras where there are no photos.
+
+    SceneError if the cameras' size is not the photos' or a multiple of it.
+    """
+    if size is None:
+        return GridFit(to_cameras(camera_file), None, ())
+    width, height = size
+    for w, h in sizes_of(camera_file):
+        if not same_shape((w, h), size):
+            problem = f"expected cameras of the images' size {width} x {height} or a multiple of it, found {w} x {h}"
+            swapped = (w, h) == (height, width)
+            remedy = "width and height are swapped" if swapped else "crop cameras and images alike"
+            raise SceneError(camera_file.path, problem, remedy)
+    other = [s for s in sizes_of(camera_file) if s != size]
+    notes = tuple(f"intrinsics scaled from {w} x {h} to the images' {width} x {height}" for w, h in other)
+    return GridFit(to_cameras(camera_file, size), None, notes)
+
+
+def other_grids(ply: PlyInfo, camera_file: CameraFile, size: Size | None) -> Iterator[GridFit]:
+    """Yield all other grids that the files and the number of rows allow, the likely ones first.
+
+    ``size`` is the photos'.
+    """
+    known = sizes_of(camera_file)
+    own = known[0] if len(known) == 1 else None
+    if size is not None and own is not None and own != size:
+        yield from _between(camera_file, size, own)
+    base = size or own
+    if base is None or any(not same_shape(s, base) for s in known):
+        return
+    cameras = to_cameras(camera_file, base)
+    what = "photos and cameras" if size is not None else "cameras"
+    ranked = [(2 if t.crops else 1, t) for t in grids_of_count(ply.count, len(camera_file), base)]
+    if ply.sh_degree == 0 and ply.opacity_encoding == "logit":
+        ranked += [(3, t) for t in patch_grids(base) if ply.count < len(camera_file) * t.width * t.height]
+    for rank, transform in ranked:
+        note = f"{what} of {base[0]} x {base[1]} are {transform.description}, the Gaussian grid's size"
+        yield GridFit(transform.cameras(cameras), transform, (note,), rank)
+        if not known and transform.crops:
+            whole = to_cameras(camera_file, (transform.width, transform.height))
+            yield GridFit(whole, transform, (f"{note}; the intrinsics are those of the result",), rank)
+
+
+def _between(camera_file: CameraFile, size: Size, own: Size) -> Iterator[GridFit]:
+    """Bring photos to the cameras' size, or cameras of uncropped pictures to the photos'."""
+    cameras = to_cameras(camera_file, own)
+    for transform in (resize_to(size, own), resize_and_crop(size, own)):
+        if max(transform.scale_x, transform.scale_y) > _MAX_ENLARGED:
+            continue  # previews: a fit to them would blur the Gaussians
+        note = f"photos of {size[0]} x {size[1]} are {transform.description}, the cameras' and the Gaussian grid's size"
+        yield GridFit(cameras, transform, (note,))
+    if not same_shape(own, size):
+        for transform in (resize_to(own, size), resize_and_crop(own, size)):
+            note = f"cameras of {own[0]} x {own[1]} are {transform.description}, the images' size"
+            yield GridFit(transform.cameras(cameras), None, (note,))
+
+
+def grids_of_count(count: int, views: int, size: Size) -> Iterator[PhotoTransform]:
+    """Yield transforms of photos to smaller grids that ``count`` rows allow, as many for each of all ``views``."""
+    crops: list[PhotoTransform] = []
+    for trim in (0, TRIM):
+        for per_pixel in PER_PIXEL:
+            pixels, rest = divmod(count, views * per_pixel)
+            if rest:
+                continue
+            for to in _sizes_of_area(pixels, trim, size):
+                aspect = to[0] * size[1] / (to[1] * size[0])
+                if abs(aspect - 1) <= ASPECT_TOLERANCE:
+                    yield resize_to(size, to)
+                is_round = to[0] == to[1] or any(to[0] % side == to[1] % side == 0 for side in _ROUND)
+                if to[0] * to[1] < size[0] * size[1] and min(aspect, 1 / aspect) >= _MIN_KEPT and is_round:
+                    crops.append(resize_and_crop(size, to))
+    yield from (crop for crop in crops if crop.crops)
+
+
+def _sizes_of_area(pixels: int, trim: int, size: Size) -> Iterator[Size]:
+    """Yield sizes up to ``size`` that leave so many pixels when ``trim`` is cut off at every border."""
+    for width in range(max(1, pixels // size[1]), min(size[0], pixels) + 1):
+        height, rest = divmod(pixels, width)
+        to = width + 2 * trim, height + 2 * trim
+        if not rest and to != size and to[0] <= size[0] and to[1] <= size[1]:
+            yield to
+
+
+def patch_grids(size: Size) -> list[PhotoTransform]:
+    """List transforms for networks that take multiples of 14: each side to the nearest one, or cropped to it."""
+    transforms = []
+    for side in SIDES:
+        for scale in (side / max(size), side / min(size)):
+            if scale <= 1:
+                width, height = (PATCH * max(1, round(s * scale / PATCH)) for s in size)
+                transforms.append(resize_to(size, (width, height)))
+                width, height = (PATCH * max(1, round(s * scale) // PATCH) for s in size)
+                transforms.append(resize_and_crop(size, (width, height), scale))
+    return list(dict.fromkeys(transforms))
+
+
+def small_photos_error(ply: PlyInfo, camera_file: CameraFile, size: Size | None) -> SceneError | None:
+    """Explain that photos are too small where the rows are as many as the cameras have pixels; None where not."""
+    own = next((s for s in sizes_of(camera_file) if ply.count == len(camera_file) * s[0] * s[1]), None)
+    if size is None or own is None or own == size:
+        return None
+    problem = f"expected images of the Gaussian grid's size {own[0]} x {own[1]} or larger, found {size[0]} x {size[1]}"
+    return SceneError(camera_file.path, problem, "give the images that the backbone saw, or their originals")

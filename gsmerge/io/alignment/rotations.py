@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 
 from gsmerge.geometry import multiply_quats, normalize, quat_to_rotmat, rotmat_to_quat
-from gsmerge.io.hints import QuatChoice
+from gsmerge.io.alignment.layouts import spread_step
+from gsmerge.io.exporters import QuatChoice
 from gsmerge.types import Scene
 
 _SAMPLES = 3000  # pixels per view whose surface is used
@@ -28,11 +29,12 @@ _DESCRIPTIONS = {
 
 
 def read_rotations(scene: Scene, quats: QuatChoice) -> Scene:
-    """The scene with its stored rotations, which were read as wxyz, read in another way; see :class:`ReadHints`.
+    """Read a scene's stored rotations, which were read as wxyz, in another way; see :class:`ReadHints`.
 
-    Of the two square roots that "xyzw-root" has, the one whose thinnest axis follows the surface better is taken.
+    Of the two square roots that "xyzw-root" has, the one whose thinnest axis follows the surface better is taken. Where
+    rows belong to no pixels, only "xyzw" changes anything.
     """
-    if quats in ("auto", "wxyz"):
+    if quats in ("auto", "wxyz") or not (scene.aligned or quats == "xyzw"):
         return scene
     stored = scene.gaussians.quats
     if quats == "xyzw":
@@ -48,12 +50,12 @@ def read_rotations(scene: Scene, quats: QuatChoice) -> Scene:
 
 
 def from_xyzw(quats: np.ndarray) -> np.ndarray:
-    """``[n,4]`` xyzw -> wxyz."""
+    """Bring ``[n,4]`` xyzw into the order wxyz."""
     return quats[:, [3, 0, 1, 2]]
 
 
 def square_roots(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The two rotations that give those of ``quats [n,4]`` wxyz when applied twice: half the angle; half a turn more.
+    """Compute the two rotations that, applied twice, give ``quats [n,4]`` wxyz: half the angle; half a turn more.
 
     Where there is no angle, the second is half a turn about an arbitrary axis.
     """
@@ -64,7 +66,7 @@ def square_roots(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def choose_rotations(scene: Scene) -> tuple[QuatChoice, str]:
-    """How the rotations (read as wxyz) are to be read so that thinnest axes follow the surface's normals; and a note.
+    """Choose how rotations (read as wxyz) are read so that thinnest axes follow the surface's normals; and a note.
 
     "wxyz" and "" unless another reading is better by a large margin.
     """
@@ -92,12 +94,12 @@ def choose_rotations(scene: Scene) -> tuple[QuatChoice, str]:
 
 
 def _camera_quats(scene: Scene) -> np.ndarray:
-    """``[v,4]`` rotations from each camera to the world, wxyz."""
+    """Compute rotations ``[v,4]`` from each camera to the world, wxyz."""
     return rotmat_to_quat(scene.cameras.viewmats[:, :3, :3].swapaxes(1, 2)).astype(np.float32)
 
 
 def _cosines(quats: np.ndarray, thinnest: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """``[n]`` between the thinnest axes of Gaussians with rotations ``[n,4]`` and the normals, 0 to 1."""
+    """Compute ``[n]`` between the thinnest axes of Gaussians with rotations ``[n,4]`` and the normals, 0 to 1."""
     axes = np.take_along_axis(quat_to_rotmat(quats), thinnest[:, None, None], 2)[:, :, 0]
     return np.abs((axes * normals).sum(1))
 
@@ -105,7 +107,7 @@ def _cosines(quats: np.ndarray, thinnest: np.ndarray, normals: np.ndarray) -> np
 def _is_root(
     scene: Scene, rows: np.ndarray, single: list[np.ndarray], thinnest: np.ndarray, normals: np.ndarray
 ) -> bool:
-    """Whether the roots of the rotations read as xyzw follow the surface by far better than all other readings.
+    """Tell whether the roots of the rotations as xyzw follow the surface by far better than all other readings.
 
     The better of two is better by chance as well: every other reading gets a second rotation as the roots have it, half
     a turn more about the same axis. ``single`` are the readings ``[t,4]`` of some Gaussians, as stored first, as xyzw
@@ -123,20 +125,20 @@ def _is_root(
 def _better_of(
     pair: tuple[np.ndarray, np.ndarray], thinnest: np.ndarray, normals: np.ndarray, threshold: float
 ) -> float:
-    """Mean cosine if each Gaussian has the better one of two rotations ``[n,4]``; the share above a threshold > 0."""
+    """Average the cosine of the better of two rotations ``[n,4]``; with a threshold > 0, the share above it."""
     better = np.maximum(*(_cosines(quats, thinnest, normals) for quats in pair))
     return float((better > threshold).mean() if threshold else better.mean())
 
 
 def _half_a_turn_more(quats: np.ndarray) -> np.ndarray:
-    """Rotations ``[n,4]`` with half a turn more about their own axes."""
+    """Turn rotations ``[n,4]`` by half a turn more about their own axes."""
     length = np.linalg.norm(quats[:, 1:], axis=1, keepdims=True)
     axis = np.where(length > 0, normalize(quats[:, 1:]), np.array((0, 0, 1), quats.dtype))
     return np.concatenate([-length, quats[:, :1] * axis], 1)
 
 
 def _smooth_normals(scene: Scene) -> np.ndarray:
-    """``[n,3]`` normals of the surface at all pixels, of means averaged over some pixels around."""
+    """Compute normals ``[n,3]`` of the surface at all pixels, of means averaged over some pixels around."""
     v, h, w = scene.valid.shape
     weights = scene.valid[..., None].astype(np.float32)
     means = scene.gaussians.means.reshape(v, h, w, 3)
@@ -151,12 +153,10 @@ def _smooth_normals(scene: Scene) -> np.ndarray:
 
 
 def _normals(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Normals ``[t,3]`` of some pixels' surface, their rows and their views."""
+    """Compute normals ``[t,3]`` of some pixels' surface; also return their rows and their views."""
     v, h, w = scene.valid.shape
     inner = np.arange(v * h * w).reshape(v, h, w)[:, _STEP:-_STEP, _STEP:-_STEP].reshape(v, -1)
-    step = max(1, inner.shape[1] // _SAMPLES)
-    while step > 1 and np.gcd(step, w - 2 * _STEP) > 1:
-        step += 1
+    step = spread_step(inner.shape[1] // _SAMPLES, w - 2 * _STEP)
     rows = inner[:, ::step].reshape(-1)
     valid, means = scene.valid.reshape(-1), scene.gaussians.means
     good = valid[rows]

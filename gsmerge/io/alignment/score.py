@@ -1,21 +1,229 @@
-"""How well a reading of a file fits: where its Gaussians project to, and which colours the photos have there."""
+"""Score how well rows fit pixels: where Gaussians project to, from cameras that may stand in another frame.
+
+A Gaussian lies on the ray of its pixel: ``(x - c) x d = 0`` with the camera's centre c and the ray's direction d. The
+Gaussians stay where they are; the cameras are moved.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
-from gsmerge.geometry import sh0_to_rgb
+from gsmerge.geometry import project_points, sh0_to_rgb
 from gsmerge.io.alignment.layouts import Layout, plain_layout, subsample
-from gsmerge.io.alignment.similarity import Correspondences, Similarity, pixel_errors
 from gsmerge.types import Cameras, Gaussians
 
-QUICK_SAMPLES, SAMPLES, MIN_SAMPLES = 1500, 6000, 60  # Gaussians that a reading is scored on; per view at least
+MARGIN = 2.0  # by which the best reading must beat the next one
+QUICK_SAMPLES, SAMPLES, MIN_SAMPLES = 1500, 6000, 60  # Gaussians of a score; per view at least
 MAX_CHECKED = 5_000  # pixels per view that an alignment is checked on
 MAX_MEDIAN_PX = 1.5  # backbones move a Gaussian within its pixel, and some a little beyond
+_ROUNDS = 4  # of reweighted least squares
+_MAX_POINTS = 2000  # that a camera's pose is solved from
+_SMALL_ROTATION, _SMALL_SCALE = 10.0, 0.05  # degrees, and natural logarithm
+_AS_GOOD, _AS_GOOD_PX = 1.5, 0.05  # one similarity for all cameras, compared with a pose for each
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """``x_gaussians = scale * rotation @ x_cameras + shift``."""
+
+    rotation: np.ndarray  # ``[3,3]``
+    scale: float  # positive
+    shift: np.ndarray  # ``[3]``, units of the Gaussians
+    description: str = ""  # what it is, for people; empty where both frames are the same
+    # "same", "scaled", "shifted"; "first", "middle" or "upright" by which camera it was rotated; "other"
+    kind: str = "same"
+
+    def move_viewmats(self, viewmats: np.ndarray) -> np.ndarray:
+        """Move world-to-camera matrices ``[c,4,4]`` into the frame of the Gaussians."""
+        out = viewmats.copy()
+        out[:, :3, :3] = viewmats[:, :3, :3] @ self.rotation.T
+        out[:, :3, 3] = self.scale * viewmats[:, :3, 3] - out[:, :3, :3] @ self.shift
+        return out
+
+    def move(self, cameras: Cameras) -> Cameras:
+        """Move cameras into the frame of the Gaussians."""
+        return replace(cameras, viewmats=self.move_viewmats(cameras.viewmats))
+
+
+IDENTITY = Similarity(np.eye(3), 1.0, np.zeros(3))
+
+
+def scale_by(scale: float, note: str = "") -> Similarity:
+    """Return the similarity that only changes the unit."""
+    text = f"positions scaled by {scale:.4g}{note}"
+    return Similarity(np.eye(3), scale, np.zeros(3), text, "scaled")
+
+
+@dataclass(frozen=True)
+class Correspondences:
+    """t Gaussians, each with the pixel and the view to which it is assumed to belong."""
+
+    points: np.ndarray  # ``[t,3]`` float64 means
+    pixels: np.ndarray  # ``[t,2]`` pixel centres (x, y)
+    views: np.ndarray  # ``[t]`` rows of the camera arrays
+    blocks: np.ndarray  # ``[t]`` what wrote them, in order: a view, or one layer of it
+    rows: np.ndarray  # ``[t]`` of the file
+
+    def select(self, some: np.ndarray) -> Correspondences:
+        """Return some of them."""
+        return Correspondences(*(column[some] for column in vars(self).values()))
+
+    def split(self, values: np.ndarray, blocks: int) -> list[np.ndarray]:
+        """Split values ``[t,...]`` by block."""
+        return np.split(values, np.cumsum(np.bincount(self.blocks, minlength=blocks))[:-1])
+
+
+def pixel_errors(pairs: Correspondences, cameras: Cameras) -> np.ndarray:
+    """Measure the distances ``[t]`` of projected Gaussians from their pixels' centres, pixels; inf behind a camera."""
+    with np.errstate(all="ignore"):
+        viewmats, Ks = cameras.viewmats[pairs.views], cameras.Ks[pairs.views]
+        xy, depth = project_points(pairs.points[:, None], viewmats, Ks)
+        error = np.linalg.norm(xy[:, 0] - pairs.pixels, axis=1)
+    return np.where((depth[:, 0] > 0) & np.isfinite(error), error, np.inf)
+
+
+def _ray_directions(pairs: Correspondences, cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
+    """Compute unit directions ``[t,3]`` and origins ``[t,3]`` of the pixels' rays in the cameras' world."""
+    ones = np.ones((len(pairs.pixels), 1))
+    inverse = np.linalg.inv(cameras.Ks)
+    local = np.einsum("tij,tj->ti", inverse[pairs.views], np.concatenate([pairs.pixels, ones], 1))
+    rotations = cameras.viewmats[:, :3, :3]
+    rays = np.einsum("tji,tj->ti", rotations[pairs.views], local)
+    centres = -np.einsum("vji,vj->vi", rotations, cameras.viewmats[:, :3, 3])
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True), centres[pairs.views]
+
+
+def candidate_similarities(
+    pairs: Correspondences | None, cameras: Cameras, *, scale: float | None = None, effort: int = 2
+) -> Iterator[Similarity]:
+    """Yield similarities between the frames of cameras and Gaussians, the simplest and most plausible first.
+
+    They are: the same frame; a scale; rotated by the first or the middle camera, alone, scaled, or scaled and shifted,
+    as exporters do; any, from the poses that the pixels ask for.
+
+    ``scale`` is the size of the Gaussians' world in units of the cameras', where it is given. Effort 0 solves for
+    nothing (then there may be no pairs), 1 for scale and shift, 2 for the rotation as well.
+    """
+    yield IDENTITY if scale is None else scale_by(scale, ", as given")
+    rays = None if pairs is None or effort == 0 else _ray_directions(pairs, cameras)
+    for rotation, name, kind in _known_rotations(cameras.viewmats):
+        if name:
+            yield Similarity(rotation, scale or 1.0, np.zeros(3), name, kind)
+        if pairs is None or rays is None:
+            continue
+        for shifted in (False, True) if scale is None else (True,):
+            frame = _solve(pairs.points, rays, rotation, shifted=shifted)
+            if frame is not None:
+                text = f"positions scaled by {frame.scale:.4g}" + (" and shifted" if shifted else "")
+                text = f"{name}, {text}" if name else text
+                yield replace(frame, description=text, kind=kind or ("shifted" if shifted else "scaled"))
+    if pairs is None or rays is None or effort < 2:
+        return
+    free = _mean_rotation(_solve_poses(pairs, cameras.Ks), cameras.viewmats)
+    frame = None if free is None else _solve(pairs.points, rays, free, shifted=True)
+    if frame is not None:
+        angle = np.degrees(np.arccos(np.clip((np.trace(frame.rotation) - 1) / 2, -1, 1)))
+        if angle < _SMALL_ROTATION and abs(np.log(frame.scale)) < _SMALL_SCALE:
+            return  # no exporter does so: the cameras are inexact, and a rotation hides it
+        text = f"rotated by {angle:.1f} degrees, positions scaled by {frame.scale:.4g} and shifted"
+        yield replace(frame, description=text, kind="other")
+
+
+def _known_rotations(viewmats: np.ndarray) -> Iterator[tuple[np.ndarray, str, str]]:
+    yield np.eye(3), "", ""
+    first = viewmats[0, :3, :3]
+    middle = viewmats[len(viewmats) // 2, :3, :3]
+    half = np.sqrt(0.5)
+    turn = np.array([[half, half, 0], [-half, half, 0], [0, 0, 1]])
+    upright = turn @ np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
+    yield first, "rotated into the first camera", "first"
+    yield middle, "rotated into the middle camera", "middle"
+    yield upright @ first, "rotated upright from the first camera", "upright"
+
+
+def _solve(
+    points: np.ndarray, rays_and_centres: tuple[np.ndarray, np.ndarray], rotation: np.ndarray, *, shifted: bool
+) -> Similarity | None:
+    """Solve robustly for the scale and shift that, after a rotation, bring every point nearest to its ray.
+
+    None if the scale is not positive.
+    """
+    rays, centres = (part @ rotation.T for part in rays_and_centres)
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+    columns = [np.einsum("tij,tj->ti", across, centres)[:, :, None]] + ([across] if shifted else [])
+    A, b = np.concatenate(columns, 2), np.einsum("tij,tj->ti", across, points)
+    weights, solution = np.ones(len(points)), np.zeros(A.shape[2])
+    for _ in range(_ROUNDS):
+        heavy = (A * weights[:, None, None]).reshape(-1, A.shape[2])
+        left, right = heavy.T @ A.reshape(-1, A.shape[2]), heavy.T @ b.reshape(-1)
+        unit = np.sqrt(np.maximum(np.diag(left), 1e-300))
+        solution = np.linalg.lstsq(left / np.outer(unit, unit), right / unit, rcond=1e-12)[0] / unit
+        if not np.isfinite(solution).all() or solution[0] <= 0:
+            return None
+        shift = solution[1:] if shifted else np.zeros(3)
+        away = points - solution[0] * centres - shift
+        depth = np.abs((away * rays).sum(1)) + 1e-12
+        angle = np.linalg.norm(np.einsum("tij,tj->ti", across, away), axis=1) / depth
+        spread = 3 * np.median(angle) + 1e-12
+        weights = 1 / (depth**2 * (1 + (angle / spread) ** 2))
+    return Similarity(rotation, float(solution[0]), shift)
+
+
+def _solve_poses(pairs: Correspondences, Ks: np.ndarray) -> dict[int, np.ndarray]:
+    """Solve for the pose of each view from its pixels, whatever its camera says."""
+    poses = ((int(view), solve_pose(pairs, int(view), Ks[view])) for view in np.unique(pairs.views))
+    return {view: pose for view, pose in poses if pose is not None}
+
+
+def _mean_rotation(poses: dict[int, np.ndarray], viewmats: np.ndarray) -> np.ndarray | None:
+    """Average the rotations between the two frames; None where the views disagree."""
+    if not poses:
+        return None
+    rotations = [pose[:3, :3].T @ viewmats[view, :3, :3] for view, pose in poses.items()]
+    u, size, vt = np.linalg.svd(np.mean(rotations, 0))
+    if size[-1] < 0.9:  # rotations that agree have a mean that is nearly one
+        return None
+    return np.asarray(u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt)
+
+
+def fits_all_cameras(frame: Similarity, pairs: Correspondences, cameras: Cameras) -> bool:
+    """Tell whether one similarity does about as well as a pose for each camera: otherwise the cameras are wrong."""
+    own = cameras.viewmats.copy()
+    for view, pose in _solve_poses(pairs, cameras.Ks).items():
+        own[view] = pose
+    best = float(np.median(pixel_errors(pairs, replace(cameras, viewmats=own))))
+    return float(np.median(pixel_errors(pairs, frame.move(cameras)))) <= max(_AS_GOOD * best, best + _AS_GOOD_PX)
+
+
+def solve_pose(pairs: Correspondences, view: int, K: np.ndarray) -> np.ndarray | None:
+    """Solve for world-to-camera ``[4,4]`` of one view in the frame of the Gaussians, from its pixels alone."""
+    rows = np.flatnonzero(pairs.views == view)
+    rows = rows[:: max(1, len(rows) // _MAX_POINTS)]
+    if len(rows) < 6:
+        return None
+    points, pixels = pairs.points[rows], pairs.pixels[rows]
+    middle, unit = np.median(points, 0), float(np.median(np.abs(points - np.median(points, 0)))) or 1.0
+    near = (points - middle) / unit
+    try:
+        for _ in range(2):
+            solved, rotation, shift = cv2.solvePnP(near, pixels, K, None, flags=cv2.SOLVEPNP_SQPNP)
+            if not solved:
+                return None
+            error = np.linalg.norm(cv2.projectPoints(near, rotation, shift, K, None)[0][:, 0] - pixels, axis=1)
+            good = error <= max(1.0, 3 * float(np.median(error)))
+            near, pixels = near[good], pixels[good]
+        rotation, shift = cv2.solvePnPRefineLM(near, pixels, K, None, rotation, shift)
+    except cv2.error:  # points in one place
+        return None
+    pose = np.eye(4)
+    pose[:3, :3] = cv2.Rodrigues(rotation)[0]
+    pose[:3, 3] = unit * shift[:, 0] - pose[:3, :3] @ middle
+    return pose if np.isfinite(pose).all() else None
 
 
 @dataclass(frozen=True)
@@ -31,6 +239,21 @@ class AlignmentInput:
     depths: Callable[[], np.ndarray | None]
     order: str = "auto"  # the order of the rows where it is given, otherwise "auto"
     scale: float | None = None  # size of the Gaussians' world in units of the cameras', where it is given
+
+    def pairs(self, layout: Layout) -> Correspondences:
+        """Return the valid rows of a layout with their pixels and views."""
+        return find_correspondences(self.gaussians.means, self.valid, layout)
+
+
+def find_correspondences(means: np.ndarray, valid: np.ndarray, layout: Layout) -> Correspondences:
+    """Return the valid rows of a layout (``means [n,3]``, ``valid [n]``) with their pixels and views."""
+    rows, pixels = np.concatenate(layout.rows), np.concatenate(layout.pixels)
+    blocks = np.repeat(np.arange(len(layout.views)), [len(some) for some in layout.rows])
+    good = valid[rows]
+    rows, pixels, blocks = rows[good], pixels[good], blocks[good]
+    y, x = np.divmod(pixels, layout.width)
+    points = means[rows].astype(np.float64)
+    return Correspondences(points, np.stack([x, y], 1) + 0.5, np.array(layout.views)[blocks], blocks, rows)
 
 
 @dataclass(frozen=True)
@@ -50,51 +273,39 @@ class AlignmentScore:
 
 
 def pixel_limit(width: int, height: int) -> float:
-    """Median distance in pixels up to which Gaussians count as those of their pixels."""
+    """Return the median distance in pixels up to which Gaussians count as those of their pixels."""
     return max(0.5, min(MAX_MEDIAN_PX, 0.1 * math.sqrt(width * height)))
 
 
 def sample_layout(layout: Layout, samples: int = SAMPLES) -> Layout:
-    """The part of a layout that its reading is scored on."""
+    """Thin a layout to the rows that its reading is scored on."""
     return subsample(layout, max(MIN_SAMPLES, samples // len(layout.views)))
-
-
-def find_correspondences(means: np.ndarray, valid: np.ndarray, layout: Layout) -> Correspondences:
-    """The valid rows of a layout (``means [n,3]``, ``valid [n]``) with their pixels and views."""
-    rows, pixels = np.concatenate(layout.rows), np.concatenate(layout.pixels)
-    blocks = np.repeat(np.arange(len(layout.views)), [len(some) for some in layout.rows])
-    good = valid[rows]
-    rows, pixels, blocks = rows[good], pixels[good], blocks[good]
-    y, x = np.divmod(pixels, layout.width)
-    points = means[rows].astype(np.float64)
-    return Correspondences(points, np.stack([x, y], 1) + 0.5, np.array(layout.views)[blocks], blocks, rows)
 
 
 def score_layout(
     inputs: AlignmentInput, layout: Layout, frame: Similarity, pairs: Correspondences | None = None
 ) -> AlignmentScore:
-    """The score of a layout in a frame, on a sample of its rows: ``pairs``, where they are at hand."""
+    """Score a layout in a frame, on a sample of its rows: ``pairs``, where they are at hand."""
     if pairs is None:
-        pairs = find_correspondences(inputs.gaussians.means, inputs.valid, sample_layout(layout))
-    errors = pixel_errors(pairs, frame.move_viewmats(inputs.cameras.viewmats), inputs.cameras.Ks)
-    medians = [float(np.median(part)) for part in split_blocks(errors, pairs, len(layout.views)) if len(part)]
+        pairs = inputs.pairs(sample_layout(layout))
+    errors = pixel_errors(pairs, frame.move(inputs.cameras))
+    medians = [float(np.median(part)) for part in pairs.split(errors, len(layout.views)) if len(part)]
     median, worst = float(np.median(errors)) if len(errors) else math.inf, max(medians, default=math.inf)
     ok = bool(medians) and worst < pixel_limit(layout.width, layout.height) and bool(np.isfinite(errors).mean() > 0.5)
     return AlignmentScore(layout, frame, median, worst, ok)
 
 
-def shuffled_score(inputs: AlignmentInput, best: AlignmentScore) -> tuple[float, float]:
-    """Median distance, pixels, and mean distance of the colours, with a reading's pixels shuffled within each block."""
+def score_shuffled(inputs: AlignmentInput, best: AlignmentScore) -> tuple[float, float]:
+    """Measure the median distance, pixels, and the colours' mean one, with pixels shuffled within each block."""
     rng, some = np.random.default_rng(0), sample_layout(best.layout)
-    shuffled = replace(some, pixels=tuple(rng.permutation(pixels) for pixels in some.pixels))
-    pairs = find_correspondences(inputs.gaussians.means, inputs.valid, shuffled)
-    errors = pixel_errors(pairs, best.frame.move_viewmats(inputs.cameras.viewmats), inputs.cameras.Ks)
+    pairs = inputs.pairs(replace(some, pixels=tuple(rng.permutation(pixels) for pixels in some.pixels)))
+    errors = pixel_errors(pairs, best.frame.move(inputs.cameras))
     return float(np.median(errors)), _color_distance(inputs, pairs)
 
 
 def color_error(inputs: AlignmentInput, layout: Layout) -> float:
-    """Mean distance of the base colours from the photos at a layout's pixels, 0 to 1; NaN without photos."""
-    return _color_distance(inputs, find_correspondences(inputs.gaussians.means, inputs.valid, sample_layout(layout)))
+    """Measure the mean distance of base colours from the photos at a layout's pixels, 0 to 1; NaN without photos."""
+    return _color_distance(inputs, inputs.pairs(sample_layout(layout)))
 
 
 def _color_distance(inputs: AlignmentInput, pairs: Correspondences) -> float:
@@ -133,7 +344,7 @@ def check_alignment(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray) -
 
 
 def sample_pixels(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray) -> Correspondences:
-    """The sample of :func:`check_alignment`."""
+    """Take the sample of :func:`check_alignment`."""
     views, width, height = len(cameras), cameras.width, cameras.height
     if len(gaussians) != views * height * width:
         raise ValueError(f"expected {views} x {height} x {width} Gaussians, got {len(gaussians)}")
@@ -142,19 +353,14 @@ def sample_pixels(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray) -> 
 
 
 def check_pairs(pairs: Correspondences, cameras: Cameras) -> Alignment:
-    """:func:`check_alignment` of a sample under cameras that may be others."""
+    """Check a sample under cameras that may be others; see :func:`check_alignment`."""
     limit = pixel_limit(cameras.width, cameras.height)
-    errors = pixel_errors(pairs, cameras.viewmats, cameras.Ks)
+    errors = pixel_errors(pairs, cameras)
     medians = tuple(
         float(np.quantile(part, 0.5, method="lower")) if len(part) else math.nan
-        for part in split_blocks(errors, pairs, len(cameras))
+        for part in pairs.split(errors, len(cameras))
     )
     count = max(1, len(errors))
     in_front, near = float(np.isfinite(errors).sum()) / count, float((errors <= 1).sum()) / count
     fits = [median < limit for median in medians if not math.isnan(median)]
     return Alignment(medians, in_front, near, limit, bool(fits) and all(fits) and in_front > 0.5)
-
-
-def split_blocks(errors: np.ndarray, pairs: Correspondences, count: int) -> list[np.ndarray]:
-    """The errors of each of ``count`` blocks."""
-    return np.split(errors, np.cumsum(np.bincount(pairs.blocks, minlength=count))[:-1])

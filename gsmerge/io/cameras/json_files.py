@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.io.alignment.similarity import Similarity
+from gsmerge.io.alignment import Similarity
 from gsmerge.io.bounds import read_json, read_text
 from gsmerge.io.cameras.camera_file import (
     C2W_OPENCV,

@@ -12,10 +12,9 @@ import numpy as np
 
 from gsmerge.budget import BudgetOptions
 from gsmerge.errors import GsmergeError, SceneError, UsageError
-from gsmerge.io import SceneLoad, align_scene, read_ply_with_hints
+from gsmerge.io import AUTO, ReadHints, SceneLoad, align_scene, read_ply_with_hints
 from gsmerge.io.cameras.camera_file import CameraFile, from_viewmats, to_viewmats
 from gsmerge.io.formats.ply import OpacityChoice
-from gsmerge.io.hints import AUTO, ReadHints
 from gsmerge.measure.evaluate import EvaluateOptions, Views, evaluate
 from gsmerge.options import CompactOptions
 from gsmerge.pipeline import compact

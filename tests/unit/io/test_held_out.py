@@ -13,7 +13,7 @@ import pytest
 from tiny_scene import FLIP, Tiny, make_tiny, rotation
 
 from gsmerge.errors import SceneError
-from gsmerge.io import load_scene, read_cameras, read_held_out, views
+from gsmerge.io import load_scene, read_cameras, read_held_out, scene_files
 from gsmerge.io.held_out import fit_similarity
 from gsmerge.types import Scene
 
@@ -189,7 +189,7 @@ def test_photos_beyond_all_memory_are_made_smaller(tiny: Tiny, tmp_path: Path, m
     load = load_scene(tiny.save(tmp_path / "scene"))
     cameras = write_views(tmp_path / "held", {"q": between(tiny)}, tiny, (1600, 1200))
     assert read_held_out(load, cameras).images.shape[2] == 1600
-    monkeypatch.setattr(views, "_MAX_BYTES", 1 << 20)
+    monkeypatch.setattr(scene_files, "_MAX_BYTES", 1 << 20)
     targets = read_held_out(load, cameras)
     assert targets.images.shape[2] == targets.cameras.width == 1200
     assert np.allclose(targets.cameras.Ks[0][:2], 1200 / tiny.width * tiny.K[:2])

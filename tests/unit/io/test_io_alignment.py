@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from tiny_scene import Tiny, make_tiny
 
-from gsmerge.io import check_alignment
+from gsmerge.io.alignment import check_alignment, explain_misalignment
 from gsmerge.io.cameras.camera_file import CONVENTIONS, FLIP, W2C_OPENCV, from_viewmats, to_viewmats
-from gsmerge.io.unaligned_scene import explain_misalignment
 from gsmerge.types import Cameras
 
 

@@ -11,8 +11,8 @@ from exports import Smooth, export_rows, save_export, smooth_scene, write_transf
 from tiny_scene import make_tiny, write_images
 
 from gsmerge.io import load_scene
-from gsmerge.io.alignment import recover as recovery
-from gsmerge.io.alignment.recover import COLOR_MARGIN, SHUFFLED_MARGIN, Recovery, recover
+from gsmerge.io.alignment import recovery
+from gsmerge.io.alignment.recovery import COLOR_MARGIN, SHUFFLED_MARGIN, Recovery, recover
 from gsmerge.io.alignment.score import AlignmentInput
 from gsmerge.types import SH_C0, Cameras
 
@@ -116,7 +116,7 @@ def test_a_note_says_that_photos_do_not_confirm(tmp_path: Path) -> None:
 def test_a_plain_file_is_not_searched(monkeypatch: pytest.MonkeyPatch) -> None:
     """Files in which the rows as they are leave a doubt are."""
     tiny, searched = smooth_scene(48, 36), []
-    monkeypatch.setattr(recovery, "exact_layouts_of", lambda inputs: searched.append(inputs) or [])
+    monkeypatch.setattr(recovery, "possible_layouts", lambda inputs: searched.append(inputs) or [])
     plain = clues_of(tiny, tiny.images)
     actual = recover(plain)
     assert isinstance(actual, Recovery)

@@ -13,7 +13,7 @@ from tiny_scene import Tiny, make_tiny
 
 from gsmerge.errors import SceneError
 from gsmerge.io import load_scene
-from gsmerge.io.alignment.poses import choose_poses, other_conventions
+from gsmerge.io.alignment import choose_poses, other_conventions
 from gsmerge.io.cameras.camera_file import C2W_OPENGL, CONVENTIONS, W2C_OPENCV, from_viewmats
 from gsmerge.types import Cameras
 
@@ -95,7 +95,7 @@ def test_two_readings_that_fit_are_refused(tmp_path: Path, monkeypatch: pytest.M
     true = other_conventions(SMOOTH.w2c, C2W_OPENGL)[0]
     same = replace(true, viewmats=SMOOTH.w2c)
     monkeypatch.setattr(
-        "gsmerge.io.alignment.poses.other_conventions", lambda *_: [same, replace(same, convention=("another", "way"))]
+        "gsmerge.io.alignment.other_conventions", lambda *_: [same, replace(same, convention=("another", "way"))]
     )
     with pytest.raises(SceneError, match=r"expected poses that fit in one reading, found that they fit as .* another"):
         load_scene(folder)

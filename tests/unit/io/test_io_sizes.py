@@ -13,7 +13,7 @@ from tiny_scene import Tiny, frames_of, write_colmap_text, write_npz
 
 from gsmerge.errors import SceneError
 from gsmerge.io import load_scene, read_cameras, to_cameras
-from gsmerge.io.alignment.grid import grids_of_count, patch_grids
+from gsmerge.io.alignment.layouts import grids_of_count, patch_grids
 from gsmerge.io.cameras.camera_file import C2W_OPENGL, CONVENTIONS, W2C_OPENCV, View, from_viewmats, make_camera_file
 from gsmerge.io.photos import PhotoTransform, resize_and_crop, resize_to
 from gsmerge.types import Cameras

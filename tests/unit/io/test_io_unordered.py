@@ -11,10 +11,10 @@ from exports import export_rows, save_export, turned
 from tiny_scene import Tiny, make_tiny, rotation
 
 from gsmerge.io import load_scene
-from gsmerge.io.alignment.projected_rows import ProjectedRows
-from gsmerge.io.alignment.similarity import IDENTITY
-from gsmerge.io.alignment.unordered import unordered_layout
-from gsmerge.types import SH_C0
+from gsmerge.io.alignment import IDENTITY
+from gsmerge.io.alignment.incomplete import read_unordered
+from gsmerge.io.alignment.ordered_rows import ProjectedRows
+from gsmerge.types import SH_C0, Cameras
 
 MANY_OR_FEW = [3, pytest.param(8, marks=pytest.mark.slow)]  # views
 
@@ -89,11 +89,11 @@ def test_colours_decide_between_near_views() -> None:
     kept = by_opacity(tiny, 0.2)
     points, base = tiny.gaussians.means.astype(np.float64)[kept], tiny.images.reshape(-1, 3)[kept] / 255
     photos = tiny.images.reshape(8, -1, 3) / 255
-    Ks = np.tile(tiny.K, (8, 1, 1))
-    projected = ProjectedRows(points, np.arange(len(points)), tiny.w2c, Ks, tiny.width, tiny.height)
+    cameras = Cameras(tiny.w2c, np.tile(tiny.K, (8, 1, 1)), tiny.width, tiny.height)
+    projected = ProjectedRows(points, np.arange(len(points)), cameras)
     wrong = []
     for color_of in (None, lambda rows, view, pixels: np.abs(base[rows] - photos[view, pixels]).mean(1)):
-        layout = unordered_layout(projected, color_of=color_of)
+        layout = read_unordered(projected, color_of=color_of)
         assert layout is not None
         at = np.full(len(kept), -1)
         for view, rows, pixels in zip(layout.views, layout.rows, layout.pixels, strict=True):

@@ -15,7 +15,7 @@ from gsmerge import compact_tensors
 from gsmerge.errors import SceneError
 from gsmerge.geometry import pose_changes
 from gsmerge.io import load_scene
-from gsmerge.io.alignment.move_cameras import max_pixels, move_cameras
+from gsmerge.io.alignment.cameras import max_pixels, move_cameras
 from gsmerge.io.alignment.score import sample_pixels
 from gsmerge.io.cameras.json_files import write_transforms
 from gsmerge.io.cameras.read import read_cameras

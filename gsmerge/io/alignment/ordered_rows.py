@@ -1,19 +1,24 @@
-"""Pixels of incomplete files that have one view after the other, each row by row.
+"""Find the pixels of rows in a file that lacks some, unknown which, but keeps an order.
 
-Where one view ends and the next begins, the projected rows start again from the top; within a view the pixels can
-only go forward.
+Either the file has one view after the other, each row by row: where one view ends and the next begins, the projected
+rows start again from the top, and within a view the pixels can only go forward. Or it goes pixel by pixel, the views of
+one pixel side by side.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gsmerge.geometry import project_points
 from gsmerge.io.alignment.layouts import Layout
-from gsmerge.io.alignment.projected_rows import MIN_BLOCK, ProjectedRows
-from gsmerge.io.alignment.similarity import scale_by
+from gsmerge.io.alignment.score import Similarity, scale_by
+from gsmerge.kernels.view_paths import cheapest_views
+from gsmerge.types import Cameras
 
+MIN_BLOCK = 500  # rows of a view; fewer cannot be distinguished from noise
 WINDOW = 40  # rows averaged on either side of a restart
 RESTART = 0.25  # of the image's height: how far back a restart goes at least
 SHORT = 1500  # rows that say which view a block is of
@@ -23,23 +28,80 @@ MAX_SCALES = 400  # that are tried
 TRIED_BLOCKS, STRETCH = 4, 2000  # blocks, and rows of each in a row, that a scale is tried on
 _SMALL = 1e-6  # weight of a point that says nothing
 _MAX_UNEVENNESS = 10.0  # of one block, so that no single one decides
+MAX_BACK = 0.01  # share of the steps that may go back; of rows in no such order a quarter or more do
+MIN_CHANGES = 0.3  # share of the steps that change the view: fewer are views one after the other
+PROBES, PROBE = 5, 4000  # pieces of a file that are tried first, and the rows of each
+MAX_PATH_VIEWS = 127  # that an int8 can count
+MAX_CELLS = 300_000_000  # rows times views that are worth the memory
 
 
-def pruned_layout(rows: ProjectedRows) -> Layout | None:
-    """Which pixel of which view every row is, block by block."""
-    blocks = _blocks(rows)
+@dataclass(frozen=True)
+class ProjectedRows:
+    """n finite rows of a file and the cameras of the c views to which they may belong.
+
+    The searches ``read_view_major``, ``read_view_fastest`` and ``read_unordered`` take these and return a layout whose
+    pixels still have to be measured, or None if the rows do not look like what they search for.
+    """
+
+    points: np.ndarray  # ``[n,3]`` float64 means
+    ids: np.ndarray  # ``[n]`` rows of the file
+    cameras: Cameras  # at the size of the grid, in the frame of the Gaussians
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def with_frame(self, frame: Similarity) -> ProjectedRows:
+        """Return the same rows, seen by the cameras once these are moved to another frame."""
+        return replace(self, cameras=frame.move(self.cameras))
+
+    def project(self, rows: np.ndarray | slice, view: int) -> tuple[np.ndarray, np.ndarray]:
+        """Project some rows to columns and rows ``[r]`` of the image, pixels; NaN behind the camera."""
+        with np.errstate(all="ignore"):
+            xy, depth = project_points(self.points[rows], self.cameras.viewmats[view], self.cameras.Ks[view])
+        xy[depth <= 0] = np.nan
+        return xy[:, 0], xy[:, 1]
+
+    def pixels(self, rows: np.ndarray | slice, view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Find the pixels ``y·W + x`` that some rows lie in, ``[r]`` int32, -1 outside; and what they project to."""
+        u, v = self.project(rows, view)
+        inside = (u >= 0) & (v >= 0) & (u < self.cameras.width) & (v < self.cameras.height)
+        pixels = np.full(len(u), -1, np.int32)
+        pixels[inside] = v[inside].astype(np.int32) * self.cameras.width + u[inside].astype(np.int32)
+        return pixels, u, v
+
+    def layout(
+        self, order: str, parts: Sequence[tuple[int, np.ndarray, np.ndarray]], *, missing: int, note: str = ""
+    ) -> Layout:
+        """Make a search's result: ``parts`` are views, some of these rows, and their pixels; ``missing`` have none."""
+        words = "in no order" if order == "unordered" else order
+        return Layout(
+            description=f"{missing:,} pixels of {len(parts)} views dropped, {words}{note}",
+            kind="pruned",
+            order=order,
+            width=self.cameras.width,
+            height=self.cameras.height,
+            views=tuple(view for view, _, _ in parts),
+            rows=tuple(self.ids[rows] for _, rows, _ in parts),
+            pixels=tuple(pixels for _, _, pixels in parts),
+        )
+
+
+def read_view_major(rows: ProjectedRows) -> Layout | None:
+    """Find the pixel of every row in a file of one view after the other."""
+    blocks = _find_blocks(rows)
     if blocks is None:
         return None
-    parts = [(v, some, assign_pixels(*rows.project(some, v), rows.width, rows.height)) for v, some in blocks]
-    return rows.layout("view-major", parts, missing=len(blocks) * rows.width * rows.height - len(rows))
+    width, height = rows.cameras.width, rows.cameras.height
+    parts = [(view, some, assign_pixels(*rows.project(some, view), width, height)) for view, some in blocks]
+    return rows.layout("view-major", parts, missing=len(blocks) * width * height - len(rows))
 
 
-def _blocks(rows: ProjectedRows) -> list[tuple[int, np.ndarray]] | None:
-    """(view, rows) of each block, views increasing; None if the rows do not look like that.
+def _find_blocks(rows: ProjectedRows) -> list[tuple[int, np.ndarray]] | None:
+    """Find (view, rows) of each block, views increasing; None if the rows do not look like that.
 
     Where a block ends shows in any view that is nearly its own. Which views they are is decided for all together.
     """
-    count, views, largest = len(rows), rows.num_views, rows.width * rows.height
+    count, views, largest = len(rows), len(rows.cameras), rows.cameras.width * rows.cameras.height
     start, view = 0, -1
     parts: list[np.ndarray] = []
     costs: list[np.ndarray] = []
@@ -61,7 +123,7 @@ def _blocks(rows: ProjectedRows) -> list[tuple[int, np.ndarray]] | None:
 
 
 def _increasing(costs: np.ndarray) -> list[int] | None:
-    """Increasing columns of ``[b,v]``, one for each row, with the smallest sum; None where every choice is infinite."""
+    """Choose increasing columns of ``[b,v]``, one a row, of the smallest sum; None if every choice is infinite."""
     total, came_from = costs[0], []
     for cost in costs[1:]:
         best = np.minimum.accumulate(total)
@@ -77,7 +139,7 @@ def _increasing(costs: np.ndarray) -> list[int] | None:
 
 
 def _unevenness(u: np.ndarray, v: np.ndarray) -> float:
-    """How far the typical step is from one pixel to the right, pixels."""
+    """Measure how far the typical step is from one pixel to the right, pixels."""
     du, dv = np.diff(u), np.diff(v)
     good = np.isfinite(du) & np.isfinite(dv)
     if good.sum() < max(8, 0.5 * len(du)):
@@ -86,8 +148,8 @@ def _unevenness(u: np.ndarray, v: np.ndarray) -> float:
 
 
 def _block_end(rows: ProjectedRows, start: int, stop: int, view: int) -> int:
-    """The row after the last one of the block: the first clear restart, at its steepest step."""
-    height = rows.height
+    """Find the row after the last one of the block: the first clear restart, at its steepest step."""
+    height = rows.cameras.height
     _, v = rows.project(np.arange(start, stop), view)
     v = np.clip(np.nan_to_num(v, nan=0.0), -height, 2 * height)
     if len(v) < 2 * WINDOW:
@@ -108,7 +170,7 @@ def _block_end(rows: ProjectedRows, start: int, stop: int, view: int) -> int:
 
 
 def assign_pixels(u: np.ndarray, v: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Strictly increasing pixels for the rows of one view, projected to ``u [n]``, ``v [n]``; NaN where unknown.
+    """Assign strictly increasing pixels to the rows of one view, projected to ``u [n]``, ``v [n]``; NaN if unknown.
 
     The rows are cut into scanlines where u falls back; a scanline's row is the median of v, never decreasing. With the
     row known, ``pixel - rank`` never decreases, and follows from isotonic regression, which averages the jitter over
@@ -129,7 +191,7 @@ def assign_pixels(u: np.ndarray, v: np.ndarray, width: int, height: int) -> np.n
 
 
 def _rows_of(scanline: np.ndarray, v: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Median of the known v of every scanline, made never to decrease."""
+    """Take the median of the known v of every scanline, made never to decrease."""
     from scipy.ndimage import median
 
     counts = np.bincount(scanline[known], minlength=scanline[-1] + 1)
@@ -140,22 +202,23 @@ def _rows_of(scanline: np.ndarray, v: np.ndarray, known: np.ndarray) -> np.ndarr
 
 
 def _never_falling(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """The nearest non-decreasing sequence, by weighted squares."""
+    """Return the nearest non-decreasing sequence, by weighted squares."""
     from scipy.optimize import isotonic_regression  # loads slowly, and is seldom needed
 
     return np.asarray(isotonic_regression(values, weights=weights).x)
 
 
 def rough_scale(rows: ProjectedRows) -> float:
-    """The scale of the cameras' positions under which rows step by single pixels, before any pixel is known."""
-    middles = (np.arange(rows.num_views) + 0.5) / rows.num_views * len(rows)
+    """Find the scale of the cameras' positions under which rows step by single pixels; no pixel is known yet."""
+    views = len(rows.cameras)
+    middles = (np.arange(views) + 0.5) / views * len(rows)
     windows = [
         np.arange(middle - SHORT // 4, middle + SHORT // 4).clip(0, len(rows) - 1).astype(np.int64)
         for middle in middles
     ]
 
     def cost(scale: float) -> float:
-        there = _scaled(rows, scale)
+        there = rows.with_frame(scale_by(scale))
         uneven = (_unevenness(*there.project(some, view)) for view, some in enumerate(windows))
         return float(np.mean([min(pixels, _MAX_UNEVENNESS) for pixels in uneven]))
 
@@ -166,7 +229,7 @@ def rough_scale(rows: ProjectedRows) -> float:
 
 
 def finer_scale(rows: ProjectedRows, layout: Layout, rough: float) -> float:
-    """The scale, up to a quarter off ``rough``, under which rows lie nearest to the pixels that they come to.
+    """Find the scale, up to a quarter off ``rough``, under which rows lie nearest to the pixels that they come to.
 
     A scale that is wrong by little moves rows by parts of a pixel, which finding their pixels hides: so scales are
     tried in steps that move most rows by a quarter of a pixel at most. The cameras are in their own frame; the blocks
@@ -177,7 +240,7 @@ def finer_scale(rows: ProjectedRows, layout: Layout, rough: float) -> float:
     parts = [(layout.views[b], layout.rows[b][a : a + STRETCH]) for b, a in zip(chosen, starts, strict=True)]
 
     def projected(scale: float) -> list[tuple[np.ndarray, np.ndarray]]:
-        there = _scaled(rows, scale)
+        there = rows.with_frame(scale_by(scale))
         return [there.project(some, view) for view, some in parts]
 
     def cost(scale: float) -> float:
@@ -197,12 +260,50 @@ def finer_scale(rows: ProjectedRows, layout: Layout, rough: float) -> float:
     return best
 
 
-def _scaled(rows: ProjectedRows, scale: float) -> ProjectedRows:
-    return replace(rows, viewmats=scale_by(scale).move_viewmats(rows.viewmats))
-
-
 def _distance(u: np.ndarray, v: np.ndarray, width: int, height: int) -> float:
-    """Median distance of projected rows from the pixels that they come to, pixels."""
+    """Measure the median distance of projected rows from the pixels that they come to, pixels."""
     y, x = np.divmod(assign_pixels(u, v, width, height), width)
     away = np.hypot(u - x - 0.5, v - y - 0.5)
     return float(np.median(np.where(np.isfinite(away), away, width)))
+
+
+def read_view_fastest(rows: ProjectedRows) -> Layout | None:
+    """Find the pixel of every row in a file of one pixel after the other, if means lie inside their pixels.
+
+    Every row lies in some pixel of every view. In the order of the file the true ones can only go forward: pixel by
+    pixel, within a pixel view by view. The path through the views that goes forward in the smallest steps wins; None if
+    none goes forward, or hardly any step changes the view.
+    """
+    count, views = len(rows), len(rows.cameras)
+    if not 1 < views <= MAX_PATH_VIEWS or count < MIN_BLOCK * views or count * views > MAX_CELLS:
+        return None
+    if count > PROBES * PROBE:  # a few pieces quickly show the many files that have no such order
+        starts = np.linspace(0, count - PROBE, PROBES).astype(int)
+        if not all(_best_path(_pixels_in_views(rows, slice(start, start + PROBE)))[1] for start in starts):
+            return None
+    pixels = _pixels_in_views(rows, slice(None))
+    chosen, goes_forward = _best_path(pixels)
+    if not goes_forward:
+        return None
+    own_pixel = pixels[np.arange(count), chosen]
+    parts = []
+    for view in range(views):
+        own = np.flatnonzero((chosen == view) & (own_pixel >= 0))
+        first = np.unique(own_pixel[own], return_index=True)[1]  # a step back may come to a pixel twice
+        own = own[np.sort(first)]
+        parts.append((view, own, own_pixel[own].astype(np.int64)))
+    if min(len(own) for _, own, _ in parts) < MIN_BLOCK:
+        return None
+    return rows.layout("view-fastest", parts, missing=views * rows.cameras.width * rows.cameras.height - count)
+
+
+def _best_path(pixels: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Choose the view ``[n]`` of every row; and tell whether its pixels then only go forward, from view to view."""
+    chosen = np.empty(len(pixels), np.int64)
+    back = cheapest_views(pixels, np.zeros(pixels.shape, np.int8), chosen)
+    return chosen, bool(back <= MAX_BACK * len(pixels) and np.mean(chosen[1:] != chosen[:-1]) >= MIN_CHANGES)
+
+
+def _pixels_in_views(rows: ProjectedRows, some: slice) -> np.ndarray:
+    """Find the pixel ``[r,c]`` int32 that each of some rows lies in, in each view; -1 outside."""
+    return np.stack([rows.pixels(some, view)[0] for view in range(len(rows.cameras))], 1)

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from gsmerge.io.alignment.interleaved import BACK, FAR, cheapest_views
+from gsmerge.kernels.view_paths import BACK, FAR, cheapest_views
 
 
 def slow_cost(before: int, view_before: int, after: int, view: int) -> float:

@@ -1,0 +1,375 @@
+"""Recover which row is which pixel by measuring: every layout that the number of rows allows is projected and compared.
+
+Where none fits, explain why.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gsmerge.errors import SceneError
+from gsmerge.io.alignment.cameras import other_conventions
+from gsmerge.io.alignment.incomplete import score_incomplete
+from gsmerge.io.alignment.layouts import Layout, depth_layouts, exact_layouts, plain_layout, subsample
+from gsmerge.io.alignment.score import (
+    IDENTITY,
+    MARGIN,
+    QUICK_SAMPLES,
+    SAMPLES,
+    Alignment,
+    AlignmentInput,
+    AlignmentScore,
+    candidate_similarities,
+    check_alignment,
+    check_pairs,
+    color_error,
+    fits_all_cameras,
+    pixel_errors,
+    sample_layout,
+    sample_pixels,
+    score_layout,
+    score_shuffled,
+    solve_pose,
+)
+from gsmerge.io.cameras.camera_file import CameraFile, Convention
+from gsmerge.io.exporters import MAY_BE_UNALIGNED
+from gsmerge.io.formats.ply import PlyInfo
+from gsmerge.io.photos import ASPECT_TOLERANCE
+from gsmerge.types import Cameras, Gaussians
+
+SHUFFLED_MARGIN = 5.0  # and by which it must beat shuffled pixels
+COLOR_MARGIN = 1.5  # by which the colours must beat the next reading's and shuffled ones, where pixels do not decide
+ENOUGH, FEW = 24, 0.05  # finite rows that decide between readings; fewer will do where they are no such small share
+_UNCONFIRMED = 0.9  # of the colours' distance from shuffled pixels: as good as random
+_VARIES = 0.01  # mean distance of colours from shuffled pixels below which photos say nothing
+_SIMPLER = 1.15  # a simpler frame wins unless it is worse than this factor ...
+_SIMPLER_PX = 0.02  # ... and this many pixels
+_PLAIN_PX = 0.5  # a file whose rows are the grid as they are is not searched if it is this near to its pixels
+_SMALLEST_PX = 1e-3  # distances are compared as if none were smaller, pixels
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """The reading that won."""
+
+    best: AlignmentScore
+    runner_up: AlignmentScore | None  # the next best; None where the count allows no other
+    # how many times nearer the winner's Gaussians are to their pixels than the runner-up's, or than to shuffled pixels
+    margin: float
+    # how many times farther from the photos the runner-up's colours are, where only that decides between the two; None
+    # where the pixels do
+    color_margin: float | None = None
+    # whether the photos' colours agree with the reading; None where there are no photos, or none that could decide
+    confirmed: bool | None = None
+
+    @property
+    def description(self) -> str:
+        """Which reading won and by how much."""
+        other = "shuffled pixels" if self.runner_up is None else self.runner_up.description
+        text = f"{self.best.description}: median {self.best.median_px:.2f} px from the pixels, "
+        if self.color_margin is None:
+            text += f"{min(self.margin, 9999):.0f} times nearer than the next reading ({other})"
+        else:
+            text += f"and the photos' colours {min(self.color_margin, 9999):.1f} times nearer than under the next"
+            text += f" reading ({other}), which fits the pixels as well"
+        return text + ("; the photos' colours do not confirm it" if self.confirmed is False else "")
+
+
+def recover(inputs: AlignmentInput, *, exact_frames: bool = False) -> Recovery | None:
+    """Find the reading under which every Gaussian projects into its own pixel; None where none stands out.
+
+    Of readings that put the Gaussians about equally near to their pixels, the photos' colours choose one. With
+    ``exact_frames`` only cameras in the frame of their file and files without missing pixels are considered: quick.
+    """
+    finite = int(inputs.valid.sum())
+    if inputs.order == "none" or (finite < ENOUGH and finite < FEW * len(inputs.gaussians)):
+        return None
+    inputs = _without_same_labellings(inputs)
+    plain = _recover_plain(inputs)
+    if plain is not None:
+        return plain
+    scores: list[AlignmentScore] = []
+    layouts = possible_layouts(inputs)
+    for effort in (0,) if exact_frames else (0, 1, 2):
+        if not any(score.ok for score in scores):
+            scores += [score for layout in layouts for score in _score_labellings(inputs, layout, effort)]
+    if not (exact_frames or any(score.ok for score in scores)):
+        scores += score_incomplete(inputs)
+    scores.sort(key=lambda score: (not score.ok, score.worst_px))
+    if not scores or not scores[0].ok:
+        return None
+    first, *others = scores
+    others = [other for other in others if _differs(other.layout, first.layout)]
+    best = _refine(inputs, first)
+    close = [other for other in others if other.worst_px < MARGIN * max(best.worst_px, _SMALLEST_PX)]
+    if close:
+        return _choose_by_colors(inputs, [first, *close])
+    runner_up = min(others, key=lambda e: e.worst_px, default=None)
+    return _accept(inputs, best, runner_up)
+
+
+def _without_same_labellings(inputs: AlignmentInput) -> AlignmentInput:
+    """Take orders that only exchange views of one pose with equal photos, or without any, for one: either is right."""
+    cameras, images, (first, *others) = inputs.cameras, inputs.images, inputs.labellings
+    facts = np.concatenate([cameras.viewmats[:, :3].reshape(-1, 12), cameras.Ks.reshape(-1, 9)], 1)
+
+    def same(other: Sequence[int]) -> bool:
+        moved = [(a, b) for a, b in zip(first, other, strict=True) if a != b]
+        alike = images is None or all(np.array_equal(images[a], images[b]) for a, b in moved)
+        return alike and all(np.array_equal(facts[a], facts[b]) for a, b in moved)
+
+    return replace(inputs, labellings=[first, *(first if same(other) else other for other in others)])
+
+
+def _accept(inputs: AlignmentInput, best: AlignmentScore, runner_up: AlignmentScore | None) -> Recovery | None:
+    """Accept a reading that the pixels alone decide for; None where shuffled pixels are about as near."""
+    shuffled_px, shuffled_color = score_shuffled(inputs, best)
+    if not _stands_out(best, shuffled_px):
+        return None
+    next_px = min(shuffled_px, math.inf if runner_up is None else runner_up.worst_px)
+    margin = next_px / max(best.worst_px, _SMALLEST_PX)
+    return Recovery(best, runner_up, margin, None, _confirm(inputs, best, shuffled_color))
+
+
+def _confirm(inputs: AlignmentInput, best: AlignmentScore, shuffled_color: float) -> bool | None:
+    """Tell whether the photos' colours agree with a reading; None where they cannot tell."""
+    if not shuffled_color > _VARIES:
+        return None
+    return color_error(inputs, best.layout) <= _UNCONFIRMED * shuffled_color
+
+
+def _recover_plain(inputs: AlignmentInput) -> Recovery | None:
+    """Take the rows as they are, under the cameras as they are; None where that leaves a doubt.
+
+    Most files are so, and trying the other readings takes longer than reading the file.
+    """
+    cameras, count = inputs.cameras, len(inputs.gaussians)
+    expected = len(cameras) * cameras.width * cameras.height
+    if inputs.order not in ("auto", "view-major") or inputs.scale is not None or count != expected:
+        return None
+    layout = plain_layout(len(cameras), cameras.width, cameras.height)
+    best, *others = (
+        score_layout(inputs, replace(layout, views=views), IDENTITY)
+        for views in dict.fromkeys(map(tuple, inputs.labellings))
+    )
+    distance = max(best.worst_px, _SMALLEST_PX)
+    if best.worst_px > _PLAIN_PX or any(other.worst_px < SHUFFLED_MARGIN * distance for other in others):
+        return None
+    return _accept(inputs, best, None)
+
+
+def _choose_by_colors(inputs: AlignmentInput, close: list[AlignmentScore]) -> Recovery | None:
+    """Choose the one of several readings, about equally near to their pixels, whose colours the photos have by far."""
+    ranked = sorted((color_error(inputs, score.layout), i) for i, score in enumerate(close))
+    (color, first), (next_color, second) = ranked[:2]
+    best, runner_up = _refine(inputs, close[first]), close[second]
+    shuffled_px, shuffled_color = score_shuffled(inputs, best)
+    others = min(next_color, shuffled_color)  # NaN without photos, which no comparison holds for
+    if not (_stands_out(best, shuffled_px) and others > _VARIES and others >= COLOR_MARGIN * color):
+        return None
+    margin = min(shuffled_px, runner_up.worst_px) / max(best.worst_px, _SMALLEST_PX)
+    return Recovery(best, runner_up, margin, others / max(color, 1e-3), True)
+
+
+def _stands_out(best: AlignmentScore, shuffled_px: float) -> bool:
+    """Tell whether a reading is near enough to its pixels, and shuffled pixels are far from them."""
+    return best.ok and shuffled_px >= SHUFFLED_MARGIN * max(best.worst_px, _SMALLEST_PX)
+
+
+def possible_layouts(inputs: AlignmentInput) -> list[Layout]:
+    """List the layouts that the number of rows allows, or the depth maps next to the cameras."""
+    cameras, count = inputs.cameras, len(inputs.gaussians)
+    layouts = list(exact_layouts(count, len(cameras), cameras.width, cameras.height))
+    if count < len(cameras) * cameras.width * cameras.height and inputs.order in ("auto", "view-major"):
+        depths = inputs.depths()
+        if depths is not None and depths.shape == (len(cameras), cameras.height, cameras.width):
+            layouts += depth_layouts(count, depths)
+    return [layout for layout in layouts if inputs.order in ("auto", layout.order)]
+
+
+def _score_labellings(inputs: AlignmentInput, layout: Layout, effort: int) -> list[AlignmentScore]:
+    """Score the layout under the best frame, for each order that the views may be in.
+
+    Any order at all is tried with the most effort, or where the file lacks views.
+    """
+    out: dict[tuple[int, ...], AlignmentScore] = {}
+    labellings = [[labelling[view] for view in layout.views] for labelling in inputs.labellings]
+    lacks_views = len(set(layout.views)) < len(inputs.cameras)
+    if (lacks_views or effort == 2) and inputs.scale is None:
+        labellings.append(_nearest_views(inputs, layout) or [])
+    for labelling in labellings:
+        views = tuple(labelling)
+        if views and views not in out:
+            out[views] = _best_frame(inputs, replace(layout, views=views), QUICK_SAMPLES, effort)
+    return list(out.values())
+
+
+def _best_frame(inputs: AlignmentInput, layout: Layout, samples: int, effort: int) -> AlignmentScore:
+    pairs = inputs.pairs(sample_layout(layout, samples))
+    frames = candidate_similarities(pairs, inputs.cameras, scale=inputs.scale, effort=effort)
+    scores = [score_layout(inputs, layout, frame, pairs) for frame in frames]
+    lowest = min(score.worst_px for score in scores)
+    best = next(score for score in scores if score.worst_px <= max(_SIMPLER * lowest, lowest + _SIMPLER_PX))
+    if best.ok and best.frame is not IDENTITY and inputs.scale is None:
+        return replace(best, ok=fits_all_cameras(best.frame, pairs, inputs.cameras))
+    return best
+
+
+def _refine(inputs: AlignmentInput, score: AlignmentScore) -> AlignmentScore:
+    """Score the winner again, and solve its frame again, on more Gaussians."""
+    if score.layout.kind == "pruned":
+        return score
+    return _best_frame(inputs, score.layout, SAMPLES, 2 if score.frame.kind == "other" else 1)
+
+
+def _nearest_views(inputs: AlignmentInput, layout: Layout) -> list[int] | None:
+    """Find for each block the camera into whose pixels it projects best; None where two want the same."""
+    pairs = inputs.pairs(subsample(layout, 300))
+    chosen = []
+    for block in range(len(layout.views)):
+        own = pairs.select(pairs.blocks == block)
+        if not len(own.rows):
+            return None
+        views = (np.full(len(own.rows), view) for view in range(len(inputs.cameras)))
+        errors = [np.median(pixel_errors(replace(own, views=some), inputs.cameras)) for some in views]
+        chosen.append(int(np.argmin(errors)))
+    return chosen if len(set(chosen)) * layout.per_pixel == len(chosen) else None
+
+
+def _differs(one: Layout, other: Layout) -> bool:
+    """Tell whether two layouts put rows to different pixels, judged by some rows of each block."""
+    if one.views != other.views or [r.size for r in one.rows] != [r.size for r in other.rows]:
+        return True
+    a, b = subsample(one, 200), subsample(other, 200)
+    return not all(np.array_equal(x, y) for x, y in zip((*a.rows, *a.pixels), (*b.rows, *b.pixels), strict=True))
+
+
+def explain_count(ply: PlyInfo, inputs: AlignmentInput, camera_file: CameraFile) -> SceneError:
+    """Explain why the rows are not the pixels of the cameras.
+
+    Raises the SceneError where other cameras, or another reading of them, would make pixels of the rows.
+    """
+    cameras, count = inputs.cameras, len(inputs.gaussians)
+    views, width, height = len(cameras), cameras.width, cameras.height
+    expected = f"{views} x {height} x {width} = {views * height * width} (views x height x width)"
+    problem = f"expected one Gaussian per pixel, {expected}, found {ply.count}"
+    if inputs.order not in MAY_BE_UNALIGNED:
+        if count == views * width * height:
+            rows = inputs.gaussians, cameras, inputs.valid
+            alignment = check_alignment(*rows)
+            reason = explain_misalignment(*rows, camera_file.convention)
+            if reason or _looks_like_a_grid(*rows, 4 * alignment.limit_px):
+                raise misalignment_error(camera_file.path, alignment, reason)
+            problem = f"expected one Gaussian per pixel, found {ply.count} rows that are in no known order"
+        elif _lacks_cameras(inputs):
+            raise SceneError(ply.path, problem, _count_remedy(ply.count, cameras))
+    return SceneError(ply.path, problem, _count_remedy(ply.count, cameras))
+
+
+def _lacks_cameras(inputs: AlignmentInput) -> bool:
+    """Tell whether the first views are in order, and there are more of them than cameras."""
+    count, each = len(inputs.gaussians), inputs.cameras.width * inputs.cameras.height
+    pixels = len(inputs.cameras) * each
+    if count <= pixels or count % each:
+        return False
+    first = replace(inputs, gaussians=inputs.gaussians[:pixels], valid=inputs.valid[:pixels], order="view-major")
+    return recover(first) is not None
+
+
+def _count_remedy(count: int, cameras: Cameras) -> str:
+    """Say which simple reading the number of Gaussians has instead."""
+    views, width, height = len(cameras), cameras.width, cameras.height
+    pixels = width * height
+    if count % (views * pixels) == 0:
+        return f"that is {count // (views * pixels)} Gaussians per pixel"
+    if count % pixels == 0:
+        return f"that is {count // pixels} views of this size: give the cameras of just those"
+    if count == views * (width - 16) * (height - 16):
+        return f"that is {height - 16} x {width - 16} per view: 8 pixels were trimmed at every border"
+    each = count / views
+    guess = round((each * width / height) ** 0.5)
+    for w in range(max(1, guess - 14), guess + 15):
+        h = each / w
+        if h == round(h) and h and abs(w * height / (h * width) - 1) < ASPECT_TOLERANCE:
+            return f"that is {round(h)} x {w} per view: give cameras and images of that size"
+    if count < views * pixels:
+        return "pixels were dropped or merged by the exporter, which is not supported"
+    return "give the cameras and images that belong to it"
+
+
+def misalignment_error(path: str, alignment: Alignment, reason: str | None) -> SceneError:
+    """Say that the rows would be enough, but do not lie on their pixels' rays, or as well on those of others."""
+    if alignment.ok:
+        problem = f"expected rows that fit the pixels in one way, found several that do, to {alignment.worst_px:.1f} px"
+        return SceneError(path, problem, "name the order of the rows with --order")
+    problem = (
+        f"expected every view's Gaussians within {alignment.limit_px:g} px of their own pixels, "
+        f"found a median of up to {alignment.worst_px:.1f} px and "
+        f"{100 * alignment.share_in_front:.0f} % in front of their camera"
+    )
+    unknown = "no other convention fits either: give the cameras that belong to the Gaussians"
+    return SceneError(path, problem, f"{reason}: convert one to the other" if reason else unknown)
+
+
+def explain_misalignment(
+    gaussians: Gaussians, cameras: Cameras, valid: np.ndarray, convention: Convention
+) -> str | None:
+    """Name the other reading of the cameras or of the row order under which the scene would fit; None without any.
+
+    Gaussians, cameras (read under ``convention``) and ``valid`` are as for :func:`check_alignment`.
+    """
+    pairs = sample_pixels(gaussians, cameras, valid)
+    given = cameras.viewmats
+    frames = candidate_similarities(pairs, cameras, effort=1)
+    scaled = [f for f in frames if f.kind == "scaled"]
+    others = [(f"the cameras fit with their {f.description}", f.move_viewmats(given)) for f in scaled]
+    for reason, viewmats in [*_other_viewmats(cameras, convention), *others]:
+        if check_pairs(pairs, replace(cameras, viewmats=viewmats)).ok:
+            return reason
+    for reason, order in _other_orders(len(cameras), cameras.height, cameras.width):
+        if check_alignment(gaussians[order], cameras, valid.reshape(-1)[order]).ok:
+            return reason
+    swapped = replace(cameras, width=cameras.height, height=cameras.width)
+    if check_alignment(gaussians, swapped, valid).ok:
+        return "the cameras fit with width and height swapped"
+    return None
+
+
+def _looks_like_a_grid(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray, limit: float) -> bool:
+    """Tell whether the first view's rows are pixels of some camera, if not of the given one: wrong cameras, then.
+
+    The intrinsics may be what is wrong: a pose that takes most of it up, to a median of ``limit`` pixels, is enough.
+    """
+    pairs = sample_pixels(gaussians, cameras, valid)
+    pairs = pairs.select(pairs.views == 0)
+    pose = solve_pose(pairs, 0, cameras.Ks[0])
+    if pose is None:
+        return False
+    return bool(np.median(pixel_errors(pairs, replace(cameras[:1], viewmats=pose[None]))) < limit)
+
+
+def _other_viewmats(cameras: Cameras, convention: Convention) -> Iterator[tuple[str, np.ndarray]]:
+    given = cameras.viewmats
+    for poses in other_conventions(given, convention):
+        yield poses.describe(convention), poses.viewmats
+    transposed = given.copy()
+    transposed[:, :3, :3] = given[:, :3, :3].transpose(0, 2, 1)
+    transposed[:, :3, 3] = -np.einsum("vij,vj->vi", transposed[:, :3, :3], cameras.centres)
+    yield "the cameras fit with their rotations transposed", transposed
+    for axis, words in ((1, "y axis flipped (rows counted from the bottom)"), (0, "x axis flipped (mirrored images)")):
+        mirrored = given.copy()
+        mirrored[:, axis] *= -1
+        yield f"the cameras fit with the {words}", mirrored
+
+
+def _other_orders(views: int, height: int, width: int) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield permutations that bring rows of another order into view-major, row-major order."""
+    rows = np.arange(views * height * width)
+    by_pixel, by_column = rows.reshape(height, width, views), rows.reshape(views, width, height)
+    yield "the rows fit in the order row, column, view (view fastest)", by_pixel.transpose(2, 0, 1).reshape(-1)
+    yield "the rows fit in the order view, column, row (column-major)", by_column.transpose(0, 2, 1).reshape(-1)
+    yield "the rows fit with the views in reverse order", rows.reshape(views, -1)[::-1].reshape(-1)
