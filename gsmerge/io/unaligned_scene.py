@@ -53,7 +53,7 @@ def make_unaligned(
     gaussians, padding = usable_rows(ply, hints)
     text = "the rows belong to no pixels that could be found: unaligned"
     if hints.exporter != "auto":
-        text += f"; only the layouts of {hints.exporter} were tried, as given; --exporter auto tries all"
+        text += f"; only the layouts of {hints.exporter} were tried, as given; --hint exporter=auto tries all"
     scene = Scene(gaussians, cameras, images, None, camera_file.names)
     return scene, camera_file, problem, [*notes, *smaller, *padding, text]
 
@@ -155,7 +155,7 @@ def misalignment_error(path: str, alignment: Alignment, reason: str | None) -> S
     """That the rows would be enough, but do not lie on the rays of their pixels, or as well on those of others."""
     if alignment.ok:
         problem = f"expected rows that fit the pixels in one way, found several that do, to {alignment.worst_px:.1f} px"
-        return SceneError(path, problem, "name the order of the rows with --order")
+        return SceneError(path, problem, "name the order of the rows with --hint order=NAME")
     problem = (
         f"expected every view's Gaussians within {alignment.limit_px:g} px of their own pixels, "
         f"found a median of up to {alignment.worst_px:.1f} px and "
