@@ -6,7 +6,9 @@ import csv
 import io
 import json
 import math
+import re
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,9 +19,15 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 import gsmerge
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Evaluation, Views, evaluate
-from gsmerge.measure.scores import CSV_COLUMNS, evaluation_csv, evaluation_document, evaluation_lines
+from gsmerge.measure.scores import (
+    CSV_COLUMNS,
+    evaluation_csv,
+    evaluation_document,
+    evaluation_lines,
+    evaluation_markdown,
+)
 from gsmerge.report import to_json
-from gsmerge.types import Gaussians, PixelScene, UnalignedScene
+from gsmerge.types import Gaussians, Scene
 
 PLAIN = EvaluateOptions(lpips=())
 
@@ -31,17 +39,17 @@ def held_out(span: float = 2.0) -> Views:
 
 
 @pytest.fixture(scope="module")
-def scene() -> PixelScene:
+def scene() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(3), noise=0.01)
 
 
 @pytest.fixture(scope="module")
-def half(scene: PixelScene) -> Gaussians:
+def half(scene: Scene) -> Gaussians:
     return scene.gaussians[::2]
 
 
 @pytest.fixture(scope="module")
-def actual(scene: PixelScene, half: Gaussians) -> Evaluation:
+def actual(scene: Scene, half: Gaussians) -> Evaluation:
     return evaluate(scene, {"half": half}, held_out(), PLAIN)
 
 
@@ -65,7 +73,7 @@ def test_masked_figures_count_visible_pixels_alone(actual: Evaluation) -> None:
     assert all(s.masked == s.full for s in actual.results[0].scores if s.split == "context")
 
 
-def test_what_is_counted(actual: Evaluation, scene: PixelScene, half: Gaussians) -> None:
+def test_what_is_counted(actual: Evaluation, scene: Scene, half: Gaussians) -> None:
     assert [r.name for r in actual.results] == [INPUT, "half"]
     assert actual.results[1].num_gaussians == len(half)
     assert actual.results[1].ratio == pytest.approx(len(half) / len(scene.gaussians))
@@ -74,7 +82,7 @@ def test_what_is_counted(actual: Evaluation, scene: PixelScene, half: Gaussians)
     assert actual.notes == ()
 
 
-def test_without_photos_the_input_s_renders_are_the_reference(scene: PixelScene, half: Gaussians) -> None:
+def test_without_photos_the_input_s_renders_are_the_reference(scene: Scene, half: Gaussians) -> None:
     actual = evaluate(replace(scene, images=None), {"half": half}, None, PLAIN)
     assert actual.reference == "renders of the input"
     assert all(math.isinf(s.full.psnr or 0) for s in actual.results[0].scores)
@@ -84,7 +92,7 @@ def test_without_photos_the_input_s_renders_are_the_reference(scene: PixelScene,
     assert document["results"][0]["mean"]["context"]["psnr"] is None  # strict JSON knows no infinity
 
 
-def test_views_of_another_world_are_told(scene: PixelScene) -> None:
+def test_views_of_another_world_are_told(scene: Scene) -> None:
     away = held_out()
     viewmats = away.cameras.viewmats.copy()
     viewmats[:, 0, 3] -= 50
@@ -92,8 +100,8 @@ def test_views_of_another_world_are_told(scene: PixelScene) -> None:
     assert "of the same world?" in evaluate(scene, {}, away, PLAIN).notes[0]
 
 
-def test_a_scene_in_no_order(scene: PixelScene, half: Gaussians) -> None:
-    loose = UnalignedScene(scene.gaussians, scene.cameras, scene.images, scene.names)
+def test_a_scene_in_no_order(scene: Scene, half: Gaussians) -> None:
+    loose = Scene(scene.gaussians, scene.cameras, scene.images, None, scene.names)
     actual = evaluate(loose, {"half": half}, held_out(), PLAIN)
     usual = evaluate(scene, {"half": half}, held_out(), PLAIN)
     for one, other in zip(actual.results[1].scores, usual.results[1].scores, strict=True):
@@ -102,7 +110,7 @@ def test_a_scene_in_no_order(scene: PixelScene, half: Gaussians) -> None:
 
 
 @pytest.mark.parametrize("factor", [1e-4, 1e4])
-def test_units_change_nothing(factor: float, scene: PixelScene, half: Gaussians) -> None:
+def test_units_change_nothing(factor: float, scene: Scene, half: Gaussians) -> None:
     moved = scenes.move(scene, np.eye(3), factor, np.zeros(3))
     small = scenes.move_gaussians(half, np.eye(3), factor, np.zeros(3))
     actual = evaluate(moved, {"half": small}, None, PLAIN)
@@ -111,25 +119,25 @@ def test_units_change_nothing(factor: float, scene: PixelScene, half: Gaussians)
         assert one.full.psnr == pytest.approx(other.full.psnr, abs=0.05)
 
 
-def test_only_held_out_views(scene: PixelScene) -> None:
+def test_only_held_out_views(scene: Scene) -> None:
     actual = evaluate(scene, {}, held_out(), replace(PLAIN, context=False))
     assert actual.num_views == {"target": 2}
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-def test_threads_do_not_matter(threads: int, scene: PixelScene, half: Gaussians, actual: Evaluation) -> None:
+def test_threads_do_not_matter(threads: int, scene: Scene, half: Gaussians, actual: Evaluation) -> None:
     again = evaluate(scene, {"half": half}, held_out(), replace(PLAIN, threads=threads))
     assert [r.scores for r in again.results] == [r.scores for r in actual.results]
 
 
-def test_bad_arguments(scene: PixelScene, half: Gaussians) -> None:
+def test_bad_arguments(scene: Scene, half: Gaussians) -> None:
     with pytest.raises(ValueError, match="vgg or alex"):
         EvaluateOptions(lpips=("squeeze",))
     with pytest.raises(ValueError, match="at least 1"):
         EvaluateOptions(lpips_views=0)
     with pytest.raises(ValueError, match="other than 'input'"):
         evaluate(scene, {INPUT: half}, None, PLAIN)
-    empty = UnalignedScene(half, scene.cameras[[]], None, ())
+    empty = Scene(half, scene.cameras[[]], None, None, ())
     with pytest.raises(ValueError, match="a scene with views"):
         evaluate(empty, {}, None, PLAIN)
 
@@ -142,7 +150,7 @@ def test_bad_zooms(zoom: tuple[float, ...], words: str) -> None:
         EvaluateOptions(zoom=zoom)
 
 
-def test_zooms_are_renders_at_that_size(scene: PixelScene, half: Gaussians) -> None:
+def test_zooms_are_renders_at_that_size(scene: Scene, half: Gaussians) -> None:
     views, options = held_out(), replace(PLAIN, zoom=(0.5, 1, 2), context=False)
     result = evaluate(scene, {"half": half}, views, options).results[1]
     for score in result.scores:
@@ -158,14 +166,14 @@ def test_zooms_are_renders_at_that_size(scene: PixelScene, half: Gaussians) -> N
     assert result.mean("target", zoom=2)[1].ssim == pytest.approx(mean)
 
 
-def test_the_input_s_renders_are_the_reference_at_every_size(scene: PixelScene, half: Gaussians) -> None:
+def test_the_input_s_renders_are_the_reference_at_every_size(scene: Scene, half: Gaussians) -> None:
     options = replace(PLAIN, zoom=(0.5, 2), antialiased=True)
     actual = evaluate(replace(scene, images=None), {"half": half}, None, options)
     assert all(math.isinf(one.full.psnr or 0) for s in actual.results[0].scores for one in s.zooms)
     assert all((one.full.psnr or 99) < 60 for s in actual.results[1].scores for one in s.zooms)
 
 
-def test_antialiased(scene: PixelScene, half: Gaussians, actual: Evaluation) -> None:
+def test_antialiased(scene: Scene, half: Gaussians, actual: Evaluation) -> None:
     views = held_out()
     result = evaluate(scene, {"half": half}, views, replace(PLAIN, antialiased=True, context=False)).results[1]
     image = gsmerge.render(half, views.cameras[[0]], antialiased=True).images[0].clip(0, 1)
@@ -174,7 +182,7 @@ def test_antialiased(scene: PixelScene, half: Gaussians, actual: Evaluation) -> 
     assert result.mean("target") != actual.results[1].mean("target")
 
 
-def test_documents_have_zooms_where_they_were_asked_for(scene: PixelScene, actual: Evaluation) -> None:
+def test_documents_have_zooms_where_they_were_asked_for(scene: Scene, actual: Evaluation) -> None:
     plain = evaluation_document(actual, {})
     assert "zooms" not in plain["results"][0]["views"][0]
     assert "antialiased" not in plain
@@ -186,20 +194,20 @@ def test_documents_have_zooms_where_they_were_asked_for(scene: PixelScene, actua
     row = list(csv.DictReader(io.StringIO(evaluation_csv(document))))[-1]
     assert float(row["psnr_visible_zoom_0.5"]) == zoomed.results[0].scores[-1].zooms[0].masked.psnr
     lines = evaluation_lines(document)
-    assert len(lines) == 4 + 4
-    assert "PSNR 0.5x" in lines[5]
+    assert lines[-4] == "At other sizes, photos resized"
+    assert "PSNR 0.5x" in lines[-3]
     assert f"{sizes[0]['psnr_visible']:.2f}" in lines[-1]
 
 
 @pytest.mark.parametrize("align", [("colour",), ("pose", "pose")])
-def test_bad_alignments(align: tuple[str, ...], scene: PixelScene) -> None:
+def test_bad_alignments(align: tuple[str, ...], scene: Scene) -> None:
     with pytest.raises(ValueError, match="color or pose"):
         EvaluateOptions(align=align)
     with pytest.raises(ValueError, match="held-out views"):
         evaluate(scene, {}, None, replace(PLAIN, align=("color",)))
 
 
-def test_aligned_scores_stand_beside_the_plain_ones(scene: PixelScene, half: Gaussians, actual: Evaluation) -> None:
+def test_aligned_scores_stand_beside_the_plain_ones(scene: Scene, half: Gaussians, actual: Evaluation) -> None:
     options = replace(PLAIN, align=("pose", "color"))
     aligned = evaluate(scene, {"half": half}, held_out(), options)
     for one, plain in zip(aligned.results[1].scores, actual.results[1].scores, strict=True):
@@ -221,11 +229,11 @@ def test_aligned_scores_stand_beside_the_plain_ones(scene: PixelScene, half: Gau
     assert float(row["psnr_visible_align_color"]) == aligned.results[1].scores[-1].aligned[0].masked.psnr
     assert float(row["pose_degrees"]) == aligned.results[1].scores[-1].pose_change.degrees
     lines = evaluation_lines(document)
-    assert len(lines) == 2 + 4 + 2 + 6
+    assert lines[-8] == "Held-out views, aligned with their photos"
     assert "degrees" in lines[-2]
 
 
-def test_colours_alone(scene: PixelScene) -> None:
+def test_colours_alone(scene: Scene) -> None:
     views = held_out()
     dimmed = replace(views, images=0.6 * views.images + 0.1)
     actual = evaluate(scene, {}, dimmed, replace(PLAIN, align=("color",))).results[0]
@@ -252,21 +260,53 @@ def test_names_in_csv_are_no_formulas(actual: Evaluation) -> None:
         assert float(rows[0]["psnr"]) > 0
 
 
-def test_table_for_people(actual: Evaluation) -> None:
+def document_of(actual: Evaluation) -> dict[str, Any]:
+    """A document with facts of files and costs, under a name that is markup."""
+    odd = replace(actual, results=(actual.results[0], replace(actual.results[1], name="a|b<i>")))
+    speeds = [{"device": "cpu", "width": 4, "height": 3, "threads": 1, "seconds": s} for s in (0.2, 0.1)]
+    facts: dict[str, dict[str, Any]] = {
+        "input": {"path": "in.ply", "bytes": 4000, "overdraw": 9.0, "speeds": speeds[:1]},
+        "a|b<i>": {"bytes": 1000, "bytes_by_attribute": {"means": 34 * len(actual.results[1].scores)},
+                   "overdraw": 3.0, "merge_seconds": 2.0,
+                   "speeds": [{**speeds[1], "speedup": 2.0, "break_even_frames": 20.0}]},
+    }  # fmt: skip
+    return evaluation_document(odd, facts, ["first <note>"])
+
+
+def test_tables_for_people(actual: Evaluation) -> None:
     lines = evaluation_lines(evaluation_document(actual, {"half": {"bytes": 1234}}))
-    assert lines[0].startswith("against photos")
-    assert len(lines) == 2 + 4
-    assert "1.2 kB" in lines[-1]
-    assert "LPIPS" not in lines[1]
+    assert lines[0] == "Size"
+    assert lines[4].startswith("Quality against photos")
+    assert len(lines) == 1 + 3 + 1 + 5
+    assert "1.2 kB" in lines[3]
+    assert "LPIPS" not in lines[5]
+    assert "smaller by" not in lines[1]
 
 
-def test_progress_is_told(scene: PixelScene, half: Gaussians) -> None:
+def test_costs_are_columns(actual: Evaluation) -> None:
+    text = "\n".join(evaluation_lines(document_of(actual)))
+    assert "4.0 x" in text
+    assert "20 frames (2.0 s of merging)" in text
+    assert "overdraw" in text
+
+
+def test_markdown_has_whole_tables(actual: Evaluation) -> None:
+    markdown = evaluation_markdown(document_of(actual))
+    assert markdown.startswith("# in.ply: before and after\n")
+    assert "- first &lt;note&gt;" in markdown
+    tables = [block for block in markdown.split("\n\n") if block.startswith("|")]
+    assert len(tables) == 3
+    for table in tables:
+        assert len({len(re.findall(r"(?<!\\)\|", line)) for line in table.splitlines()}) == 1, table
+
+
+def test_progress_is_told(scene: Scene, half: Gaussians) -> None:
     said: list[tuple[str, int, int]] = []
     evaluate(scene, {"half": half}, None, PLAIN, progress=lambda *step: said.append(step))
     assert said == [("evaluate", 1, 2), ("evaluate", 2, 2)]
 
 
-def test_tensors_give_the_same(scene: PixelScene, half: Gaussians) -> None:
+def test_tensors_give_the_same(scene: Scene, half: Gaussians) -> None:
     views = held_out()
     tensors = Views(views.cameras.to("cpu"), torch.from_numpy(views.images), views.names)
     actual, expected = (
@@ -292,7 +332,7 @@ def test_pictures_too_small_for_lpips(monkeypatch: pytest.MonkeyPatch) -> None:
     assert looked == ["vgg"]
 
 
-def test_what_results_are_compared_with(scene: PixelScene) -> None:
+def test_what_results_are_compared_with(scene: Scene) -> None:
     bare = replace(scene, images=None)
     assert evaluate(bare, {}, held_out(), PLAIN).reference == "photos, and renders of the input in its own views"
     assert evaluate(bare, {}, held_out(), replace(PLAIN, context=False)).reference == "photos"
