@@ -28,7 +28,7 @@ from gsmerge import compact, plan, read_scene
 from gsmerge.gpu import cuda_problem
 from gsmerge.gpu.backend import make_backend
 from gsmerge.measure.evaluate import near_plane
-from gsmerge.measure.speed import measure_speeds
+from gsmerge.measure.speed import measure_costs
 from gsmerge.result import CompactResult
 from gsmerge.runtime.threads import available_threads
 from gsmerge.types import Scene
@@ -103,12 +103,11 @@ def result_rows(runs: tuple[Run, Run]) -> list[tuple[str, ...]]:
 def speed_rows(scene: Scene, result: CompactResult) -> list[tuple[str, ...]]:
     """Milliseconds to render a view of the input and of the result, on the CPU and on a GPU where there is one."""
     scenes, cameras = {"input": scene.file_gaussians, "result": result.gaussians}, scene.cameras
-    long_side = max(cameras.width, cameras.height)
-    speeds = measure_speeds(scenes, cameras, (long_side,), near_plane(scene))
+    costs = measure_costs(scenes, cameras, (1,), near_plane(scene))
     return [
-        (f"render the {name}, {speed.width} x {speed.height}", speed.device, f"{1e3 * speed.seconds:.2f}")
-        for name, measured in speeds.items()
-        for speed in measured
+        (f"render the {name}, {speed['width']} x {speed['height']}", speed["device"], f"{1e3 * speed['seconds']:.2f}")
+        for name, cost in costs.items()
+        for speed in cost["speeds"]
     ]
 
 

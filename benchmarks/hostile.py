@@ -60,7 +60,7 @@ COUNT = 1000
 SECONDS, MEMORY = 60, 3 << 30  # limits of a process
 TIMES_INPUT, SLACK = 3, 32 << 20  # memory beyond the sound run's: times the input, and what differs by chance
 CODES = (0, 2, 3, 4, 5)
-FAST = ("--effort", "draft", "--fit-steps", "4", "--threads", "1", "--checkpoint", "none")
+FAST = ("--effort", "draft", "--set", "fit_steps=4", "--threads", "1", "--set", "checkpoint=none")
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ KINDS = {
                                               "--threads", "1"]),
     "gsm, state": Kind(50, ("state.gsm",), any_of(change_bytes, in_safetensors, in_safetensors),
                        lambda folder, out: ["decode", str(folder / "state.gsm"), "-o", str(out / "a.ply"),
-                                            "--fit-steps", "4", "--threads", "1"]),
+                                            "--set", "fit_steps=4", "--threads", "1"]),
     "views.npz": Kind(70, ("cameras/views.npz",), any_of(change_bytes, inside_zip(member)),
                       compact_with("cameras/views.npz")),
     "transforms.json": Kind(80, ("transforms.json",), any_of(change_json, change_json, change_bytes), compact()),
@@ -114,7 +114,8 @@ KINDS = {
     "batch.jsonl of runs": Kind(20, ("charts/batch.jsonl",), change_lines,
                        lambda folder, out: ["chart", "--draw-only", "-o", str(out)], ("index.html",)),
     "checkpoint": Kind(20, ("checkpoint.safetensors",), any_of(change_bytes, in_safetensors, in_safetensors),
-                       lambda folder, out: [*compact()(folder, out)[:-1], str(folder / "checkpoint.safetensors")]),
+                       lambda folder, out: [*compact()(folder, out)[:-1],
+                                            f"checkpoint={folder}/checkpoint.safetensors"]),
 }  # fmt: skip
 STARTED_FROM = {
     "batch.jsonl": "batch",

@@ -19,7 +19,7 @@ from result_cells import (
     make_table,
 )
 
-from gsmerge.measure.comparison import break_even
+from gsmerge.measure.speed import break_even
 from gsmerge.report import human_bytes
 from gsmerge.research.charts.lines import Results, make_verdict_tables
 from gsmerge.research.charts.run import INPUT, SUPERPIXELS, RunRecord
@@ -52,7 +52,7 @@ Everything here is measured by `{COMMAND}`, which is resumable; `--only PART` me
 Figures are means over the scenes, of held-out views midway between the input views and over the pixels that the input
 views have seen (the paper's supplement A), unless a section says otherwise. LPIPS is that of VGG, on two views of each
 scene. Seconds are the wall time of the merge alone, without reading, writing and scoring. Intervals are 95 % t
-intervals over the scenes. Settings have their names in Python.
+intervals over the scenes. Settings have their names in Python: `match none` is `--set match=none`.
 
 Machine: {machine}."""
 

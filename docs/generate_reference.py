@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import re
 import sys
+from collections.abc import Sequence
 from dataclasses import fields
 from enum import Enum
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, get_args, get_type_hints
 
 import typer.main
 
 REFERENCE = Path(__file__).parent / "reference"
-COMMANDS, TRAINING = "commands", "training-settings.md"
+COMMANDS, SETTINGS, TRAINING = "commands", "settings.md", "training-settings.md"
 NOTICE = "<!-- Made by docs/generate_reference.py from the program: change the help there and run it again. -->"
 KINDS = {int: "whole number", float: "number", str: "text", Path: "path"}
 
@@ -56,7 +57,7 @@ def make_pages() -> dict[str, str]:
     commands: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
     pages = {f"{COMMANDS}/{name}.md": command_page(name, command) for name, command in commands.items()}
     pages[f"{COMMANDS}/README.md"] = _index(commands)
-    pages[TRAINING] = _training_page()
+    pages[SETTINGS], pages[TRAINING] = _settings_page(), _training_page()
     return pages
 
 
@@ -131,6 +132,41 @@ def _cell(text: str | None) -> str:
     return " ".join((text or "").split()).replace("\\[", "[").replace("|", "\\|")
 
 
+def _settings_page() -> str:
+    from gsmerge.cli.options import HINTS, words_for
+    from gsmerge.cli.paths import FileOptions
+    from gsmerge.io import ReadHints
+    from gsmerge.io.formats.ply import OpacityChoice
+    from gsmerge.online.options import OnlineOptions
+    from gsmerge.options import CompactOptions
+
+    stages = {f.name: f.default_factory for f in fields(CompactOptions) if isinstance(f.default_factory, type)}
+    tables = {
+        "How many Gaussians": _settings(stages["budget"]) + _settings(stages["decode"])[2:],
+        "Superpixels": _settings(stages["segment"]),
+        "Merging across views": _settings(stages["match"]),
+        "Fit": _settings(stages["fit"]),
+        "Before and after": _settings(stages["prepare"]) + _settings(stages["clean"])[2:],
+        "The whole run": _settings(CompactOptions, [f.name for f in fields(CompactOptions) if f.name not in stages]),
+        "Files": _settings(FileOptions),
+        "`gsmerge extend`": _settings(OnlineOptions),
+    }
+    lines = [NOTICE, "", "# Settings", ""]
+    lines += ["`compact`, `batch`, `encode`, `extend` and `stress` take them as `--set NAME=VALUE`, such as"]
+    lines += ["`--set poses=fixed --set drop_sky=true`; `decode` takes those of the fit, `render` and `view` those of"]
+    lines += ["superpixels, `compact` and `decode` those of files. In Python they are arguments of `gsmerge.compact`."]
+    lines += ["A value is JSON, or text as it is; an empty default is `null`: the program chooses. Settings with"]
+    lines += ["an option of their own are listed too: `--k 2` is `--set k=2`."]
+    for title, rows in tables.items():
+        lines += ["", f"## {title}", "", *rows]
+    kinds = get_type_hints(ReadHints) | {"opacity": OpacityChoice}
+    defaults = {"opacity": "auto", **vars(ReadHints())}
+    lines += ["", "## Hints", "", "`--hint NAME=VALUE` says how to read a file that is recognised wrongly."]
+    lines += ["", "| hint | default | values | what it is |", "|---|---|---|---|"]
+    lines += [_row(name, defaults[name], words_for(kinds[name]), about) for name, about in HINTS.items()]
+    return "\n".join([*lines, ""])
+
+
 def _training_page() -> str:
     from gsmerge.networks.modules import NetworkOptions
     from gsmerge.research.training import TrainOptions
@@ -141,22 +177,39 @@ def _training_page() -> str:
     return "\n".join(lines)
 
 
-def _settings(options: type) -> list[str]:
-    """A table of a dataclass: name, default, and what its docstring says of it."""
+def _settings(options: Any, names: Sequence[str] | None = None) -> list[str]:
+    """A table of a dataclass, or of some of its fields: name, default, values, and what its docstring says of it."""
+    from gsmerge.cli.options import words_for
+    from gsmerge.options import DEVICES, EFFORTS, METHODS
+    from gsmerge.stages.decode import K_RULES
+    from gsmerge.stages.superpixels import SEGMENTATIONS
+
+    named = {"method": METHODS, "effort": EFFORTS, "device": DEVICES}
+    named |= {"segmentation": SEGMENTATIONS, "k_rule": K_RULES}
     arguments = (options.__doc__ or "").partition("Args:")[2].partition("Raises:")[0]
     described = dict(re.findall(r"^ {8}(\w+): (.*?)(?=^ {8}\w+: |\Z)", arguments, re.DOTALL | re.MULTILINE))
-    values = options()
-    rows = []
-    for field in fields(options):
-        value = getattr(values, field.name)
-        default = "a table" if hasattr(value, "__dataclass_fields__") else f"`{_plain(value)}`"
-        about = re.sub(r", see :\w+:`[^`]*`|``", "", _cell(described[field.name]))
-        rows.append(f"| `{field.name}` | {default} | {about} |")
-    return ["| setting | default | what it is |", "|---|---|---|", *rows]
+    values, kinds = vars(options()), get_type_hints(options)
+    if names is None:
+        names = [f.name for f in fields(options) if f.metadata.get("setting", True)]
+    words = {name: ", ".join(named[name]) if name in named else words_for(kinds[name]) for name in names}
+    rows = [_row(name, values[name], words[name], described[name]) for name in names]
+    return ["| setting | default | values | what it is |", "|---|---|---|---|", *rows]
+
+
+def _row(name: str, default: Any, kind: str, about: str) -> str:
+    if hasattr(default, "__dataclass_fields__"):
+        default = None
+    shown = "" if default is None else f"`{_plain(default)}`"
+    text = re.sub(r", see :\w+:`[^`]*`", "", _cell(about))
+    text = re.sub(r":\w+:`~?([^`]*)`", r"`\1`", text.replace("``", "`"))
+    return f"| `{name}` | {shown} | {_cell(kind)} | {text} |"
 
 
 def _plain(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value
+    """A value as TOML or JSON has it."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return list(value) if isinstance(value, tuple) else f"{value:.3g}" if isinstance(value, float) else value
 
 
 if __name__ == "__main__":

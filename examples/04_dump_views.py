@@ -19,7 +19,8 @@ Where the values come from:
       dump_views("views.npz", c2w=c2w_of_first_camera(context["extrinsics"][0].cpu().numpy()),
                  K=context["intrinsics"][0].cpu().numpy(), images=(context["image"][0].cpu().numpy() + 1) / 2)
 
-* Splatt3R: the poses and the focal length that its aligner finds (``demo.py``); rotations need ``--exporter splatt3r``
+* Splatt3R: the poses and the focal length that its aligner finds (``demo.py``); rotations need
+  ``--hint exporter=splatt3r``
 
       dump_views("views.npz", c2w=scene.get_im_poses().cpu().numpy(), K=scene.get_intrinsics().cpu().numpy(),
                  images=numpy.stack(scene.imgs))

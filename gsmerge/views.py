@@ -8,8 +8,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from gsmerge.runtime.estimate import MAX_SCORED_VIEWS, REPORT_VIEWS
 from gsmerge.types import Scene, grid_ids
+
+MAX_SCORED_VIEWS = 24  # views by which whole scenes are judged where something depends on it
+REPORT_VIEWS = 4  # views that input and result are scored on for the report alone
 
 
 def even_views(num_views: int, count: int) -> list[int]:

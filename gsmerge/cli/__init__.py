@@ -29,7 +29,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _open_streams() -> None:
-    """Output and errors that exist and take any character, as names in files and folders may hold all of them."""
+    """Make sure that stdout and stderr exist and take any character, as names of files may hold all of them."""
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:  # closed by the caller
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - as long as the process
@@ -39,7 +39,7 @@ def _open_streams() -> None:
 
 
 def program() -> NoReturn:
-    """The installed program: :func:`main`, then the end of the process.
+    """Run :func:`main` as the installed program, and end the process.
 
     Exit handlers run and output is flushed, but the interpreter is not taken apart: with hundreds of compiled kernels
     and gigabytes of arrays that took 0.3 s.

@@ -16,6 +16,7 @@ import typer
 
 from gsmerge import __version__
 from gsmerge.cli.console import plain_warnings, say
+from gsmerge.cli.options import HINTS
 from gsmerge.errors import (
     DAMAGED_OPENCV,
     GsmergeError,
@@ -28,18 +29,19 @@ from gsmerge.errors import (
 
 PROGRAM = "gsmerge"
 INTERRUPTED = 130
+DEBUG = "--debug"
 
 # Panel of the help -> commands, each the function of its name in the module of its name
 COMMANDS = {
     "Compact": ("compact",),
     "Many scenes, and encoding once": ("batch", "encode", "decode", "extend"),
-    "Look and measure": ("inspect", "view", "preview", "render", "segment", "evaluate", "report"),
+    "Look and measure": ("inspect", "view", "render", "evaluate"),
     "Research": ("stress", "chart", "generate", "train"),
 }
 
 
 def make_app(only: str | None = None) -> typer.Typer:
-    """The application with all commands, or with one alone, which imports no other."""
+    """Make the application with all commands, or with one alone, which imports no other."""
     made = typer.Typer(
         name=PROGRAM, pretty_exceptions_enable=False, context_settings={"help_option_names": ["-h", "--help"]}
     )
@@ -69,6 +71,9 @@ def root(
     _: Annotated[
         bool, typer.Option("--version", help="Print the version.", callback=_print_version, is_eager=True)
     ] = False,
+    __: Annotated[
+        bool, typer.Option(DEBUG, help="Print tracebacks of errors; also after the name of a command.")
+    ] = False,
 ) -> None:
     """Compact per-pixel 3D Gaussian scenes: 1 to 10 % of the Gaussians, seconds on a CPU."""
     if context.invoked_subcommand is None:
@@ -76,10 +81,31 @@ def root(
 
 
 def _usage_message(error: Any) -> str:
-    """Describe wrong usage in one line."""
+    """Describe wrong usage in one line, with the new way to give what is no option of its own any more."""
     place = PROGRAM if error.ctx is None else error.ctx.command_path
-    message = error.format_message().replace("Value error, ", "", 1)  # a prefix of checks inside Typer
-    return f"{message.rstrip('.')}; see '{place} --help'"
+    message = error.format_message().replace("Value error, ", "", 1).rstrip(".")  # a prefix of checks inside Typer
+    if hasattr(error, "option_name") and error.ctx is not None:
+        message = _suggest(error.option_name, error.ctx.command.params) or message
+    return f"{message}; see '{place} --help'"
+
+
+def _suggest(option: str, parameters: Sequence[Any]) -> str | None:
+    """Say how to give a command a setting or a hint for which it has no option; None where it is neither."""
+    from gsmerge.cli.paths import FileOptions
+    from gsmerge.options import CompactOptions
+
+    name = option.lstrip("-").replace("-", "_")
+    names = {parameter.name for parameter in parameters}
+    if name in names:
+        return None
+    if name in HINTS and "hint" in names:
+        return f"{option} is no option: use --hint {name}=VALUE"
+    known = {**CompactOptions().to_dict(), **vars(FileOptions())}
+    positive = name.removeprefix("no_")
+    if positive not in known or "set" not in names:
+        return None
+    value = str(not known[positive]).lower() if isinstance(known[positive], bool) else "VALUE"
+    return f"{option} is no option: use --set {positive}={value}"
 
 
 def _check_folder() -> None:
@@ -94,7 +120,7 @@ _SOON = 0.02  # seconds after which a signal is raised again that came where it 
 
 @contextmanager
 def _orderly_stop(signals: list[signal.Signals]) -> Iterator[None]:
-    """A block that SIGTERM and SIGHUP end as Ctrl-C does, so that nothing unfinished is left; adds those that came.
+    """Let SIGTERM and SIGHUP end a block as Ctrl-C does, so that nothing unfinished is left; list those that came.
 
     What the caller has handled or ignored, as under nohup, stays so.
     """
@@ -135,20 +161,21 @@ def _orderly_stop(signals: list[signal.Signals]) -> Iterator[None]:
 
 
 def _is_compiling() -> bool:
-    """Whether this thread compiles or loads a kernel; numba is not imported to find out."""
+    """Tell whether this thread compiles or loads a kernel; numba is not imported to find out."""
     module = sys.modules.get("numba.core.compiler_lock")
     return module is not None and bool(module.global_compiler_lock.is_locked())
 
 
 def run(args: Sequence[str] | None = None) -> int:
     """Run the application; every error becomes one line on stderr and an exit code."""
-    words = list(sys.argv[1:] if args is None else args)
+    given = list(sys.argv[1:] if args is None else args)
+    words = [word for word in given if word != DEBUG]
 
     def fail(message: str, code: int) -> int:
         cause = getattr(sys.exc_info()[1], "__cause__", None)
         if code < 128 and (signals or isinstance(cause, KeyboardInterrupt)):
             return stopped()  # libraries make errors of their own of it
-        if "--debug" in words:
+        if DEBUG in given:
             traceback.print_exc()
         say(f"{PROGRAM}: error: {message}")
         return code

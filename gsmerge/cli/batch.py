@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def parse_jobs(text: str) -> int:
-    """``--jobs``: a number, or auto (0)."""
+    """Parse ``--jobs``: a number, or auto (0)."""
     if text == "auto":
         return 0
     if not text.isdecimal() or int(text) < 1:
@@ -41,8 +41,7 @@ def parse_jobs(text: str) -> int:
                    "it.", wording="beside each"),
         opt.option("images", str, "Folder of the photos, in the same way.", wording="beside each"),
     ),
-    opt.HINTS,
-    f"{opt.COUNTS} {opt.MERGE} method {opt.NETWORKS} {opt.FIT} {opt.CLEAN}",
+    "hint k superpixels budget quality effort fit device set",
     *opt.panel(
         "Running",
         opt.option("jobs", str, "Scenes at once: a number, or auto.", wording="auto", parser=parse_jobs,
@@ -69,6 +68,7 @@ def parse_jobs(text: str) -> int:
     "dry_run seed",
     opt.changed("threads", help="Threads of each scene.", show_default="processors by jobs"),
     opt.changed("json", False, help="Print one line of JSON per scene on stdout."),
+    rare="hint fit seed threads quiet",
 )  # fmt: skip
 def batch(args: opt.Args) -> None:
     """Compact many scenes, each on its own: a failure stops no other scene, and a second call continues."""
@@ -171,7 +171,7 @@ def check_failures(totals: Totals, unit: str) -> None:
 
 @contextmanager
 def _separate_stdout(options: BatchOptions, *, quiet: bool) -> Iterator[None]:
-    """A block in which Ray's own lines on stdout, about processes that were lost, do not mix with our lines."""
+    """Keep Ray's own lines on stdout, about processes that were lost, apart from our lines in a block."""
     if options.engine != "ray":
         yield
         return

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 from gsmerge.cli import options as opt
 from gsmerge.cli.batch import check_failures, pending_jobs, print_plan, run_jobs
+from gsmerge.cli.before_after import lpips_networks
 from gsmerge.cli.console import announce_compilation, print_document, say_notes
-from gsmerge.cli.held_out import lpips_networks
 from gsmerge.cli.paths import write_texts
 from gsmerge.errors import UsageError
 
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 GRID = "Grid: comma-separated lists, whose product is run"
 LISTS = ("methods", "k", "budgets", "superpixels", "segmentations", "fit", "efforts", "matches", "views")
-HINTS = ("opacity", "exporter", "quats", "order", "scene_scale", "max_side")
 CHARTS, PAGE, TABLE = "charts", "index.html", "runs.csv"  # in the folder
 
 
@@ -48,7 +47,7 @@ def _list(name: str, help: str, wording: str) -> Parameter:
                    metavar="NAME=VALUE"),
         opt.option("grid", Path, "TOML or JSON file with these lists; options win."),
     ),
-    opt.HINTS,
+    "hint",
     *opt.panel(
         opt.INPUT,
         opt.option("targets", str, "Cameras of held-out photos: one file, or with {scene}, {parent} and {stem} of each "
@@ -132,13 +131,12 @@ def _make_jobs(args: opt.Args, scenes: Sequence[str]) -> tuple[list[Job], BatchO
 
 
 def _command(args: opt.Args, scenes: Sequence[str]) -> str:
-    """The command line that does the same, without options left at their default."""
+    """Write the command line that does the same, without options left at their default."""
     words = ["gsmerge", "chart", *scenes, "--output", str(args.output)]
-    names = [*LISTS, "fixed", "grid", "targets", "target_images", *HINTS, "lpips", "lpips_views", "proxy_views"]
+    names = [*LISTS, "fixed", "grid", "targets", "target_images", "hint", "lpips", "lpips_views", "proxy_views"]
     for name, value in args.given([*names, "seed", "threads"]).items():
-        if value != "auto" or name not in HINTS:
-            for one in value if isinstance(value, list) else [value]:
-                words += [f"--{name.replace('_', '-')}", str(one)]
+        for one in value if isinstance(value, list) else [value]:
+            words += [f"--{name.replace('_', '-')}", str(one)]
     return shlex.join(words)
 
 

@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import sys
+from dataclasses import replace
 from time import perf_counter
 from typing import TYPE_CHECKING
 
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, print_document, say, say_notes, stage_progress
-from gsmerge.cli.paths import check_format, check_outputs, checkpoint_files, default_output, input_files
+from gsmerge.cli.paths import FileOptions, check_format, check_outputs, checkpoint_files, default_output, input_files
 from gsmerge.errors import TargetError
 
 if TYPE_CHECKING:
-    from gsmerge.io import SceneFiles
+    from pathlib import Path
+
+    from gsmerge.io import ReadHints, SceneFiles
+    from gsmerge.options import CompactOptions
 
 
 @opt.command(
     opt.SCENE,
-    f"{opt.READING} {opt.COUNTS} {opt.MERGE} method {opt.NETWORKS} {opt.FIT} {opt.CLEAN}",
+    f"{opt.READING} k superpixels budget quality levels effort fit device method recipe checkpoint set crop",
     opt.output(opt.COMPACT_SCENE, "SCENE.compact.ply"),
-    f"no_normals spz_version overwrite report no_viewer_cameras save_cameras dry_run {opt.RUN}",
+    f"overwrite report save_cameras dry_run {opt.RUN}",
+    rare=f"hint levels fit method recipe checkpoint crop save_cameras json quiet {opt.RUN}",
 )
 def compact(args: opt.Args) -> None:
     """Write a compact scene that renders like the given one, or better, with 1 to 10 % of its Gaussians."""
@@ -28,20 +34,19 @@ def compact(args: opt.Args) -> None:
     hints = args.hints()
     from gsmerge.compact_file import level_output
     from gsmerge.io.cameras.json_files import viewer_cameras_path
+    from gsmerge.options import CompactOptions
 
+    settings, writing = args.make(CompactOptions, FileOptions)
     files = args.files(args.scene)
     out = args.output or default_output(files.ply)
-    levels = [level_output(out, level) for level in range(1, args.levels or 1)]
-    cameras = None if args.no_viewer_cameras else viewer_cameras_path(out)
-    inputs = (*input_files(files), *checkpoint_files(args.checkpoint))
+    levels = [level_output(out, level) for level in range(1, settings.budget.levels)]
+    cameras = viewer_cameras_path(out) if writing.viewer_cameras else None
+    inputs = (*input_files(files), *checkpoint_files(settings.checkpoint))
     check_outputs(
         (out, *levels, args.report, cameras, args.save_cameras), inputs, overwrite=args.overwrite or args.dry_run
     )
-    settings = args.settings()
-    check_format(out, args.spz_version, settings.budget)
+    check_format(out, writing, settings.budget)
     if args.dry_run:
-        from gsmerge.cli.plan import print_plan
-
         print_plan(args, files, settings, out, hints)
         return
     _warn_of_memory(files, quiet=args.silent)
@@ -63,7 +68,7 @@ def compact(args: opt.Args) -> None:
         document = compact_files(
             files, settings, out, opacity=args.opacity, hints=hints, overwrite=args.overwrite, progress=move,
             hashed=args.json or args.report is not None, seconds_before=seconds_before, report_path=args.report,
-            normals=not args.no_normals, spz_version=args.spz_version, cameras_path=cameras,
+            normals=writing.normals, spz_version=writing.spz_version, cameras_path=cameras,
             saved_cameras=args.save_cameras,
         )  # fmt: skip
 
@@ -81,9 +86,45 @@ def _warn_of_memory(files: SceneFiles, *, quiet: bool) -> None:
     """Warn before anything is read if the scene is not likely to fit into this machine's memory."""
     from gsmerge.io.formats.ply_file import header_counts
     from gsmerge.runtime.estimate import memory_bytes, memory_problem
-    from gsmerge.runtime.memory import machine_memory
 
     count, num_rest = header_counts(files.ply)
-    problem = memory_problem(memory_bytes(count, photos=True, num_rest=num_rest), machine_memory())
+    problem = memory_problem(memory_bytes(count, photos=True, num_rest=num_rest))
     if problem is not None:
         say(f"gsmerge: warning: {problem}", quiet=quiet)
+
+
+def print_plan(args: opt.Args, files: SceneFiles, settings: CompactOptions, out: Path, hints: ReadHints) -> None:
+    """Print what compact or encode would make of a scene, as ``gsmerge inspect`` does, with the settings given."""
+    from gsmerge.baselines import choose_baseline
+    from gsmerge.compact_file import check_saved_cameras, read_input
+    from gsmerge.gpu import choose_backend
+    from gsmerge.measure.inspect import estimate, estimate_lines
+    from gsmerge.report import document_head
+
+    given = read_input(files, opacity=args.opacity, hints=hints)
+    scene, paths = given.scene, {name: path and str(path) for name, path in vars(files).items()}
+    check_saved_cameras(scene, vars(args).get("save_cameras"))
+    _, unused = choose_baseline(settings, scene)
+    backend, problem = choose_backend(settings.device, scene.num_gaussians)
+    settings = replace(settings, device=backend.device)
+    notes = [*given.notes, *unused, *([] if problem is None else [problem])]
+    if os.path.lexists(out) and not args.overwrite:
+        notes.append(f"{out} exists already: --overwrite would replace it")
+    with opt.usage_errors():
+        run = estimate(scene, settings)
+    document = {
+        **document_head(),
+        "dry_run": True,
+        "input": {**paths, "num_gaussians": scene.num_gaussians, **given.recognised},
+        "output": {"path": str(out)},
+        "compact": run,
+        "options": settings.to_dict(),
+        "notes": notes,
+    }
+    lines = [
+        f"would read {files.ply}: {len(scene)} views of {scene.cameras.width} x {scene.cameras.height}",
+        f"would write {out}",
+        *estimate_lines(run),
+        *(f"note       {note}" for note in notes),
+    ]
+    print_document(document, lines, as_json=args.json, wrap=True)

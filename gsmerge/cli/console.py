@@ -19,7 +19,7 @@ MAX_LINE = 5000  # characters
 
 
 def one_line(text: str) -> str:
-    """Text from files or names as one line that does nothing to a terminal: what cannot be printed is escaped."""
+    """Make text from files or names one line that does nothing to a terminal: escape what cannot be printed."""
     clean = text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
     return clean if len(clean) <= MAX_LINE else f"{clean[: MAX_LINE // 2]} ... {clean[-MAX_LINE // 2 :]}"
 
@@ -39,12 +39,12 @@ def say_notes(notes: Sequence[str], *, quiet: bool = False) -> None:
 
 
 def _columns(stream: Any) -> int | None:
-    """Width of the terminal that a stream goes to; None where it goes to none."""
+    """Return the width of the terminal that a stream goes to; None where it goes to none."""
     return shutil.get_terminal_size().columns if stream.isatty() else None
 
 
 def wrap_line(line: str, columns: int | None) -> list[str]:
-    """A line in pieces of at most so many columns, broken between words; further ones begin below its first value.
+    """Break a line between words into pieces of at most so many columns, the further ones below its first value.
 
     Words longer than that, such as paths, stay whole. ``columns`` None: one piece.
     """
@@ -74,7 +74,7 @@ def print_document(
 
 @contextmanager
 def plain_warnings() -> Iterator[None]:
-    """Warnings as one line each, without the place in the code that raised them."""
+    """Print warnings as one line each in a block, without the place in the code that raised them."""
 
     def show(message: Warning | str, *_: Any, **__: Any) -> None:
         say(f"gsmerge: warning: {message}")
@@ -86,7 +86,7 @@ def plain_warnings() -> Iterator[None]:
 
 @contextmanager
 def announce_compilation(*, quiet: bool, share: bool = False) -> Iterator[Callable[[], None]]:
-    """A block that says so, once, when a kernel has to be compiled (the first run after installation).
+    """Say so, once in a block, when a kernel has to be compiled (in the first run after installation).
 
     Args:
         quiet: Say nothing.
@@ -120,7 +120,7 @@ def announce_compilation(*, quiet: bool, share: bool = False) -> Iterator[Callab
 
 
 def _terminal(*, quiet: bool) -> Any:
-    """Rich's console on stderr; None when quiet or where stderr is no terminal."""
+    """Open Rich's console on stderr; None when quiet or where stderr is no terminal."""
     if quiet:
         return None
     from rich.console import Console
@@ -132,7 +132,7 @@ def _terminal(*, quiet: bool) -> Any:
 
 @contextmanager
 def stage_progress(*, quiet: bool) -> Iterator[Progress]:
-    """A progress bar per stage on stderr, unless quiet or where stderr is no terminal.
+    """Show a progress bar per stage on stderr, unless quiet or where stderr is no terminal.
 
     A stage is done when the next one begins. ``FORCE_COLOR`` in the environment makes anything a terminal.
 
@@ -180,7 +180,7 @@ def stage_progress(*, quiet: bool) -> Iterator[Progress]:
 
 @contextmanager
 def total_progress(total: int, *, quiet: bool) -> Iterator[Progress]:
-    """One bar for many runs on stderr: done of total, time left; a line per run where there is no terminal.
+    """Show one bar for many runs on stderr: done of total, time left; a line per run where there is no terminal.
 
     Yields:
         ``(text, done, total) -> None``.
@@ -201,7 +201,7 @@ def total_progress(total: int, *, quiet: bool) -> Iterator[Progress]:
 
 
 def duration(seconds: float) -> str:
-    """``95`` -> ``95 s``, ``600`` -> ``10 min``, ``9000`` -> ``2.5 h``."""
+    """Write seconds for people: ``95`` -> ``95 s``, ``600`` -> ``10 min``, ``9000`` -> ``2.5 h``."""
     if seconds < 120:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, print_document, say_notes, stage_progress
-from gsmerge.cli.paths import check_format, check_outputs, default_output
+from gsmerge.cli.paths import FileOptions, check_format, check_outputs, default_output
 from gsmerge.errors import SceneError
 
 
@@ -21,29 +21,35 @@ from gsmerge.errors import SceneError
                 "5MB; at least one per group. auto: as many as compact takes without photos."),
     opt.changed("fit", help="What is fitted to the photos that a state has kept.",
                 show_default="full where there are photos"),
-    "effort device fit_steps time_budget",
+    "effort device set",
     opt.output(opt.COMPACT_SCENE, "ENCODED.compact.ply"),
-    f"no_normals spz_version overwrite dry_run {opt.RUN}",
+    f"overwrite dry_run {opt.RUN}",
 )  # fmt: skip
 def decode(args: opt.Args) -> None:
-    """Write a compact scene from an encoded one, as compact --fit none, or from a state, fitted to its photos."""
+    """Write a compact scene from an encoded one, or from a state of gsmerge extend, fitted to its photos."""
     start = perf_counter()
     out = args.output or default_output(args.encoded)
     check_outputs((out,), (args.encoded,), overwrite=args.overwrite or args.dry_run)
-    check_format(out, args.spz_version)
     import numpy as np
 
     from gsmerge.encoded.decode import plan_decode
     from gsmerge.io import atomic_output, lost_harmonics, output_format, write_gaussians
     from gsmerge.online.decode import check_fit, decodable, decode_stored, default_fit, num_photos
     from gsmerge.online.file import load_stored
+    from gsmerge.options import CompactOptions
     from gsmerge.plan import resolve_fit
     from gsmerge.report import document_head, seconds_document
+    from gsmerge.stages.fit import FitOptions
 
-    settings, imported, path = args.settings(), perf_counter(), args.encoded
+    wanted, writing = args.make(FitOptions, FileOptions)
+    check_format(out, writing)
+    run = args.given(("effort", "device", "seed", "threads"))
+    with opt.usage_errors():
+        settings = replace(CompactOptions(fit=wanted), **run)
+    imported, path = perf_counter(), args.encoded
     count = {"k": args.k, "budget": args.budget}
     stored = load_stored(path)
-    lost, read = lost_harmonics(out, stored.sh_degree, args.spz_version), perf_counter()
+    lost, read = lost_harmonics(out, stored.sh_degree, writing.spz_version), perf_counter()
     document: dict[str, Any] = {
         **document_head(),
         "input": {
@@ -77,7 +83,7 @@ def decode(args: opt.Args) -> None:
         done, ending = perf_counter(), output_format(out)
         write_gaussians(
             temporary, decoded.gaussians, overwrite=True, comments=_comments(stored.about), ending=ending,
-            normals=not args.no_normals, spz_version=args.spz_version,
+            normals=writing.normals, spz_version=writing.spz_version,
         )  # fmt: skip
     seconds = {"import": imported - start, "read": read - imported, "decode": done - read}
     seconds["write"] = perf_counter() - done
@@ -93,7 +99,7 @@ def decode(args: opt.Args) -> None:
 
 
 def _comments(about: Mapping[str, Any]) -> Sequence[str]:
-    """Comments in the header of the scene's file, which compact copies too."""
+    """Return the comments in the header of the scene's file, which compact copies too."""
     source = about.get("source")
     comments = source.get("comments") if isinstance(source, dict) else None
     lines = [line for line in comments if isinstance(line, str)] if isinstance(comments, list) else []
@@ -101,7 +107,7 @@ def _comments(about: Mapping[str, Any]) -> Sequence[str]:
 
 
 def _summary(document: Mapping[str, Any]) -> str:
-    """The line that the command ends with."""
+    """Write the line that the command ends with."""
     from gsmerge.report import human_bytes, seconds_line
 
     before, after = document["input"], document["output"]

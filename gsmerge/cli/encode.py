@@ -14,19 +14,19 @@ from gsmerge.cli.paths import check_outputs, checkpoint_files, input_files
 @opt.command(
     opt.SCENE,
     opt.output("The encoded scene.", "SCENE.gsm"),
-    f"{opt.READING} k max_k superpixels budget effort {opt.MERGE} {opt.NETWORKS}",
+    f"{opt.READING} k max_k superpixels budget effort checkpoint set",
     f"overwrite dry_run {opt.RUN}",
 )
 def encode(args: opt.Args) -> None:
-    """Keep a scene as merged Feature Gaussians, of which gsmerge decode makes what compact --fit none makes."""
-    start, hints, files = perf_counter(), args.hints(), args.files(args.scene)
+    """Store a scene as merged Feature Gaussians, from which gsmerge decode makes results of any size."""
+    start = perf_counter()
+    hints, settings = args.hints(), args.settings(fit="none")
+    files = args.files(args.scene)
     out = args.output or files.ply.with_suffix(".gsm")
-    check_outputs(
-        (out,), (*input_files(files), *checkpoint_files(args.checkpoint)), overwrite=args.overwrite or args.dry_run
-    )
-    settings = args.settings(fit="none")
+    inputs = (*input_files(files), *checkpoint_files(settings.checkpoint))
+    check_outputs((out,), inputs, overwrite=args.overwrite or args.dry_run)
     if args.dry_run:
-        from gsmerge.cli.plan import print_plan
+        from gsmerge.cli.compact import print_plan
 
         print_plan(args, files, settings, out, hints)
         return
@@ -66,7 +66,7 @@ def encode(args: opt.Args) -> None:
 
 
 def _summary(document: Mapping[str, Any]) -> str:
-    """The line that the command ends with."""
+    """Write the line that the command ends with."""
     from gsmerge.report import human_bytes, seconds_line
 
     scene, file = document["input"], document["output"]

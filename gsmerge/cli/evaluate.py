@@ -1,27 +1,31 @@
-"""``gsmerge evaluate``: a scene and its compact versions against photos."""
+"""``gsmerge evaluate``: a scene and its compact versions: quality against photos, bytes, render time."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
 
 from gsmerge.cli import options as opt
+from gsmerge.cli.before_after import BeforeAfter, lpips_networks, read_before_after
 from gsmerge.cli.console import announce_compilation, print_document, say_notes, stage_progress
-from gsmerge.cli.held_out import file_names, held_out_views, lpips_networks, own_cameras, require_views
 from gsmerge.cli.paths import check_outputs, input_files, write_texts
-from gsmerge.errors import UsageError
+from gsmerge.errors import SceneError, UsageError
 
 if TYPE_CHECKING:
     from gsmerge.io import PlyInfo, PlyScene
     from gsmerge.types import Cameras
 
 OUTSIDE = 0.03  # share of a result's Gaussians beyond all of its own views: what merging and a fit move there
+SUFFIXES = (".json", ".csv", ".md", ".html")
+SPEED_ZOOMS = (1.0, 2.0)  # sizes of pictures whose render time is measured where --zoom names none
+PAGE_VIEWS = 2  # pictures on a page
 
 
 def parse_zoom(text: str) -> tuple[float, ...]:
-    """``--zoom``: numbers with commas between."""
+    """Parse ``--zoom``: numbers with commas between."""
     try:
         return tuple(float(part) for part in text.split(","))
     except ValueError:
@@ -29,13 +33,14 @@ def parse_zoom(text: str) -> tuple[float, ...]:
 
 
 def parse_align(text: str) -> tuple[str, ...]:
-    """``--align``: names with commas between."""
+    """Parse ``--align``: names with commas between."""
     return tuple(part.strip() for part in text.split(","))
 
 
 @opt.command(
-    opt.SCENE,
-    opt.argument("results", list[Path] | None, "[RESULTS]...", "Compact .ply files of that scene.", default=None),
+    opt.BEFORE,
+    opt.argument("after", list[Path] | None, "[AFTER]...", "Compact files of that scene: .ply, .spz, .sog or .splat.",
+                 default=None),
     f"{opt.READING} {opt.TARGETS}",
     *opt.panel(
         opt.MEASURING,
@@ -48,53 +53,102 @@ def parse_align(text: str) -> tuple[str, ...]:
                    "(color), of the cameras (pose), or both (color,pose).", metavar="LIST", parser=parse_align),
     ),
     "lpips lpips_views antialiased",
-    *opt.panel(opt.OUTPUT, opt.option("csv", Path, "Write a row for each result and view to this file.")),
-    "report overwrite threads",
+    *opt.panel(
+        opt.MEASURING,
+        opt.switch("speed", "Also measure render time, at the sizes of --zoom or at 1 and 2, and Gaussians per pixel."),
+        opt.option("merge_seconds", list[str], "Seconds that making each AFTER took, or the --report of its compact "
+                   "run, to say after how many frames they are earned back; repeated in their order.",
+                   metavar="SECONDS|REPORT"),
+    ),
+    *opt.panel(
+        opt.OUTPUT,
+        opt.option("output", list[Path], "A file to write: .json, .csv (a row for each result and view), .md, or .html "
+                   "with pictures; may be repeated.", "--output", "-o"),
+    ),
+    "overwrite threads",
 )  # fmt: skip
 def evaluate(args: opt.Args) -> None:
-    """Measure compact scenes against photos: PSNR, SSIM, LPIPS, counts, sizes, render time."""
+    """Measure a scene and its compact versions against photos: PSNR, SSIM, LPIPS, counts, bytes, render time."""
     if not args.context and args.targets is None:
         raise UsageError("--no-context: expected held-out views to measure instead; name them with --targets")
     if args.align and args.targets is None:
         raise UsageError("--align: expected held-out views, whose photos to align with; name them with --targets")
-    from gsmerge.io import read_gaussians
     from gsmerge.measure.evaluate import EvaluateOptions
     from gsmerge.measure.evaluate import evaluate as evaluate_scene
-    from gsmerge.measure.scores import evaluation_csv, evaluation_document, evaluation_lines
-    from gsmerge.report import to_json
+    from gsmerge.measure.scores import evaluation_document, evaluation_lines
 
-    files, paths = args.files(args.scene), args.results or []
-    inputs = (*input_files(files), *paths, args.targets, args.target_images)
-    check_outputs((args.csv, args.report), inputs, overwrite=args.overwrite)
+    args.after = args.after or []
+    files, outputs = args.files(args.before), args.output or []
+    for path in outputs:
+        if path.suffix not in SUFFIXES:
+            raise UsageError(f"{path}: expected a name that ends in {', '.join(SUFFIXES)}")
+    inputs = (*input_files(files), *args.after, args.targets, args.target_images)
+    check_outputs(outputs, inputs, overwrite=args.overwrite)
+    seconds = _merge_seconds(args.merge_seconds or [], args.after)
     nets, missing = lpips_networks(args.lpips)
     with opt.usage_errors():
         options = EvaluateOptions(
             nets, args.lpips_views, args.context, threads=args.threads, antialiased=args.antialiased,
             **args.given(("zoom", "align")),
         )  # fmt: skip
-    load = args.load(files)
-    require_views(load)
-    scene, held_out, adapted = held_out_views(load, args.targets, args.target_images, args.views)
-    plys = {name: read_gaussians(path) for name, path in zip(file_names(paths), paths, strict=True)}
-    cameras, moved = own_cameras(paths, scene)
-    notes = [*load.notes, *adapted, *missing, *moved]
-    if len(scene) < len(load.scene):
-        notes += [_more_views(name, ply, scene.cameras) for name, ply in plys.items()]
+    given = read_before_after(args, files)
+    notes = [*given.notes, *missing]
+    if len(given.scene) < len(given.load.scene):
+        notes += [_more_views(name, ply, given.scene.cameras) for name, ply in given.plys.items()]
     say_notes(notes, quiet=args.silent)
-    gaussians = {name: ply.gaussians for name, ply in plys.items()}
     with announce_compilation(quiet=args.silent), stage_progress(quiet=args.silent) as progress:
-        evaluation = evaluate_scene(scene, gaussians, held_out, options, cameras=cameras, progress=progress)
-    facts = {"input": _file(load.ply), **{name: _file(ply.info) for name, ply in plys.items()}}
+        evaluation = evaluate_scene(
+            given.scene, given.gaussians, given.held_out, options, cameras=given.cameras, progress=progress
+        )
+        facts = _facts(args, given, dict(zip(given.plys, seconds, strict=False)))
     document = evaluation_document(evaluation, facts, notes)
-    texts = {args.report: to_json(document), args.csv: evaluation_csv(document)}
-    write_texts({path: text for path, text in texts.items() if path is not None}, overwrite=args.overwrite)
+    _write(outputs, document, given, overwrite=args.overwrite)
     print_document(document, evaluation_lines(document), as_json=args.json, quiet=args.quiet)
     say_notes(evaluation.notes, quiet=args.silent)
 
 
+def _facts(args: opt.Args, given: BeforeAfter, seconds: Mapping[str, float]) -> dict[str, dict[str, Any]]:
+    """Collect what is known of each file by name, with the costs of drawing it where they are asked for."""
+    from gsmerge.measure.evaluate import INPUT, near_plane
+    from gsmerge.measure.speed import measure_costs
+
+    infos = {INPUT: given.load.ply, **{name: ply.info for name, ply in given.plys.items()}}
+    facts = {name: _file(info) for name, info in infos.items()}
+    if args.speed or args.merge_seconds:
+        scenes = {INPUT: given.scene.file_gaussians, **given.gaussians}
+        zooms, near = args.zoom or SPEED_ZOOMS, near_plane(given.scene)
+        costs = measure_costs(scenes, given.scene.cameras, zooms, near, merge_seconds=seconds, threads=args.threads)
+        facts = {name: facts[name] | costs[name] for name in facts}
+    return facts
+
+
+def _file(info: PlyInfo) -> dict[str, Any]:
+    return {"path": info.path, "bytes": info.file_bytes, "bytes_by_attribute": info.bytes_by_attribute}
+
+
+def _merge_seconds(given: Sequence[str], after: Sequence[Path]) -> list[float]:
+    """Read the seconds that making each result took; empty where not given."""
+    if given and len(given) != len(after):
+        raise UsageError(f"--merge-seconds: expected that of each of {len(after)} AFTER, got {len(given)}")
+    return [_seconds_of(text) for text in given]
+
+
+def _seconds_of(text: str) -> float:
+    from gsmerge.io import read_json
+
+    try:
+        seconds: Any = float(text)
+    except ValueError:
+        document = read_json(Path(text))
+        seconds = document.get("total_seconds") if isinstance(document, dict) else None
+    if not isinstance(seconds, int | float) or isinstance(seconds, bool) or not 0 <= seconds < 1e9:
+        raise SceneError(Path(text), "expected seconds or the report of a compact run (total_seconds), found neither")
+    return float(seconds)
+
+
 def _more_views(name: str, ply: PlyScene, cameras: Cameras) -> str:
-    """What is known of a result that is measured as one of some views, but may be made of all."""
-    from gsmerge.measure.inspect import share_outside
+    """Say what is known of a result that is measured as one of some views, but may be made of all."""
+    from gsmerge.measure.visibility import share_outside
 
     views, outside = len(cameras), share_outside(ply.gaussians[ply.valid], cameras)
     if outside > OUTSIDE:
@@ -105,5 +159,25 @@ def _more_views(name: str, ply: PlyScene, cameras: Cameras) -> str:
     return f"{name}: measured as a result of {views} views; if it was made of more, it has seen what it is asked here"
 
 
-def _file(info: PlyInfo) -> dict[str, Any]:
-    return {"path": info.path, "bytes": info.file_bytes, "bytes_by_attribute": info.bytes_by_attribute}
+def _write(outputs: Sequence[Path], document: Mapping[str, Any], given: BeforeAfter, *, overwrite: bool) -> None:
+    """Write the files, each in the format that its name asks for."""
+    from gsmerge.measure.scores import evaluation_csv, evaluation_markdown
+    from gsmerge.report import to_json
+
+    writers = {".json": to_json, ".csv": evaluation_csv, ".md": evaluation_markdown}
+    texts = {}
+    for path in outputs:
+        texts[path] = _page(document, given) if path.suffix == ".html" else writers[path.suffix](document)
+    write_texts(texts, overwrite=overwrite)
+
+
+def _page(document: Mapping[str, Any], given: BeforeAfter) -> str:
+    """Make the page, with pictures of some views."""
+    from gsmerge.measure.evaluate import near_plane
+    from gsmerge.measure.preview import view_pictures
+    from gsmerge.view.page import report_page
+
+    scene = given.scene
+    parts = [("before", scene.file_gaussians), *given.gaussians.items()]
+    near = near_plane(scene)
+    return report_page(document, view_pictures(parts, scene.cameras, scene.images, max_views=PAGE_VIEWS, near=near))

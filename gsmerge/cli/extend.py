@@ -20,19 +20,7 @@ from gsmerge.errors import UsageError
     f"{opt.READING} k superpixels budget",
     opt.changed("max_k", help="Most Gaussians per superpixel that can be decoded later: fixed by the first batch.",
                 show_default="4"),
-    *opt.panel(
-        opt.COUNT,
-        opt.option("tolerance", float, "A new Gaussian is left out where the state's colour error is below this; 0: "
-                   "none is left out.", wording="0.06", min=0.0, max=1.0),
-    ),
-    f"effort {opt.MERGE} {opt.NETWORKS}",
-    *opt.panel(
-        opt.FITTING,
-        opt.option("fit_colors", bool, "Fit the colours to each batch's photos; gsmerge decode makes the full fit.",
-                   "--fit-colors/--no-fit-colors", wording="fit"),
-        opt.option("replay", int, "Most photos that the state keeps for the full fit of gsmerge decode.", wording="96",
-                   min=0),
-    ),
+    "effort checkpoint set",
     opt.RUN,
 )  # fmt: skip
 def extend(args: opt.Args) -> None:
@@ -45,11 +33,11 @@ def extend(args: opt.Args) -> None:
     from gsmerge.online.options import OnlineOptions
     from gsmerge.options import CompactOptions
 
+    settings = args.values(CompactOptions, OnlineOptions)
     batches = [args.files(scene) for scene in args.scenes]
     for files in batches:
         if any(path.resolve() == args.state.resolve() for path in input_files(files)):
             raise UsageError(f"{args.state}: expected a state other than the input; name another file")
-    settings = args.given([*CompactOptions().to_dict(), *OnlineOptions.__dataclass_fields__])
     documents: list[dict[str, Any]] = []
     with announce_compilation(quiet=args.silent):
         for files in batches:
@@ -70,7 +58,7 @@ def extend(args: opt.Args) -> None:
 
 
 def _summary(document: Mapping[str, Any]) -> str:
-    """The line about a batch."""
+    """Write the line about a batch."""
     from gsmerge.report import human_bytes, seconds_line
 
     state, dropped = document["state"], document["num_covered"] + document["num_hidden"]

@@ -61,7 +61,7 @@ def generate(args: opt.Args) -> None:
 
 
 def _options(args: opt.Args) -> GenerateOptions:
-    """The settings of the scenes."""
+    """Parse the settings of the scenes."""
     from gsmerge.research.generate import GenerateOptions, read_ranges
 
     counts = re.fullmatch(r"(\d{1,4})(?:-(\d{1,4}))?", args.views)

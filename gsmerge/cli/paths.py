@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,20 +16,47 @@ if TYPE_CHECKING:
     from gsmerge.io import SceneFiles
 
 
+@dataclass(frozen=True)
+class FileOptions:
+    """How a result is written.
+
+    Args:
+        normals: Write the three columns of zeros that some viewers want of a ``.ply``, 12 of its 68 bytes per
+            Gaussian; a ``budget`` in bytes counts them.
+        spz_version: Version of a ``.spz``: 3, which most programs read, or 4, with room for harmonics of degree 4;
+            it needs ``gsmerge[spz4]``.
+        viewer_cameras: Write the input views beside the result, as ``NAME.cameras.json`` for viewers.
+
+    Raises:
+        ValueError: If the version is unknown.
+    """
+
+    normals: bool = True
+    spz_version: int = 3
+    viewer_cameras: bool = True
+
+    def __post_init__(self) -> None:
+        if self.spz_version not in (3, 4):
+            raise ValueError(f"spz_version: expected 3 or 4, got {self.spz_version}")
+
+
 def default_output(ply: Path) -> Path:
-    """``scene.ply`` -> ``scene.compact.ply`` beside it."""
+    """Name the result of a scene: ``scene.ply`` -> ``scene.compact.ply`` beside it."""
     return ply.with_name(f"{ply.stem}.compact.ply")
 
 
-def check_format(output: Path, spz_version: int, budget: BudgetOptions | None = None) -> None:
-    """Refuse an output whose name says no known format, what that needs and is not installed, a version of ``.spz`` for
-    another format, or a budget in bytes for a format of unknown size.
+def check_format(output: Path, options: FileOptions, budget: BudgetOptions | None = None) -> None:
+    """Refuse an output in a format that cannot be written, or that the options or a budget in bytes do not fit.
+
+    Raises:
+        UsageError: If its name ends as no known format does, or what that needs is not installed; if a version of
+            ``.spz`` is given for another format, or a size for a format of unknown size.
     """
     from gsmerge.io import output_format
 
-    ending = output_format(output, spz_version)
-    if spz_version != 3 and ending != ".spz":
-        raise UsageError(f"--spz-version {spz_version}: expected an output as .spz, got {ending}")
+    ending = output_format(output, options.spz_version)
+    if options.spz_version != 3 and ending != ".spz":
+        raise UsageError(f"spz_version {options.spz_version}: expected an output as .spz, got {ending}")
     if budget is not None and budget.in_bytes and ending != ".ply":
         raise UsageError(f"--budget {budget.budget}: expected an output as .ply, got {ending}; give a number")
 
@@ -80,15 +108,15 @@ def _is_photo(path: Path) -> bool:
 
 
 def input_files(files: SceneFiles) -> tuple[Path, ...]:
-    """Gaussians, cameras and photos that are read."""
+    """List the files of Gaussians, cameras and photos that are read."""
     return tuple(path for path in (files.ply, files.cameras, files.images) if path is not None)
 
 
-def checkpoint_files(checkpoint: str | None) -> tuple[Path, ...]:
-    """The file that ``--checkpoint`` names; none where it is one of the package's own names."""
+def checkpoint_files(checkpoint: str) -> tuple[Path, ...]:
+    """Return the file that ``checkpoint`` names; none where it is one of the package's own names."""
     from gsmerge.options import CHECKPOINTS
 
-    return () if checkpoint is None or checkpoint in CHECKPOINTS else (Path(checkpoint),)
+    return () if checkpoint in CHECKPOINTS else (Path(checkpoint),)
 
 
 def write_texts(texts: Mapping[Path, str], *, overwrite: bool) -> None:
@@ -122,7 +150,7 @@ def check_folder(folder: Path, inputs: tuple[Path, ...], *, overwrite: bool) -> 
 
 
 def source_of(ply: Path) -> Path | None:
-    """The scene that a file was compacted from, if it is beside it: ``scene.ply`` for ``scene.compact.ply``."""
+    """Find the scene that a file was compacted from beside it, as ``scene.ply`` for ``scene.compact.ply``."""
     match = re.fullmatch(r"(.+)\.compact(\.level\d+)?(\.compressed)?\.(ply|spz|sog|splat)", ply.name)
     source = None if match is None else ply.with_name(f"{match[1]}.ply")
     return source if source is not None and source.is_file() else None

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from gsmerge.cli import options as opt
+from gsmerge.cli.before_after import held_out_views, require_views
 from gsmerge.cli.console import announce_compilation, print_document, say_notes, stage_progress
-from gsmerge.cli.held_out import held_out_views, require_views
 from gsmerge.cli.paths import check_outputs, input_files, write_texts
 from gsmerge.errors import TargetError
 
@@ -17,12 +17,12 @@ if TYPE_CHECKING:
 
 @opt.command(
     opt.SCENE,
-    f"{opt.READING} {opt.TARGETS} k superpixels budget fit effort fit_steps",
+    f"{opt.READING} {opt.TARGETS} budget effort set",
     *opt.panel(opt.MEASURING, opt.option("cases", str, "Run only these cases.", wording="all", metavar="NAME,...")),
-    f"report overwrite {opt.RUN}",
+    "report overwrite threads",
 )
 def stress(args: opt.Args) -> None:
-    """Compact a scene under bad conditions, and say of each whether the result is what it should be."""
+    """Compact a scene under bad conditions, and say of each whether the result holds."""
     hints = args.hints()
     from gsmerge.report import document_head, to_json
     from gsmerge.research.stress import stress as stress_scene
@@ -56,7 +56,7 @@ def stress(args: opt.Args) -> None:
 
 
 def _lines(outcomes: Sequence[StressOutcome]) -> list[str]:
-    """One line for each case, and how many held."""
+    """Write one line for each case, and how many held."""
     marks = {True: "held", False: "FAILED", None: "-"}
     width = max((len(outcome.change) for outcome in outcomes), default=0)
     lines = [f"{marks[o.passed]:<7} {o.change:<{width}}  {o.measured}" for o in outcomes]

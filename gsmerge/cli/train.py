@@ -75,7 +75,7 @@ def train(args: opt.Args) -> None:
 
 
 def find_training_scenes(given: Sequence[Path], out: Path, apart: Collection[Path] = ()) -> list[Path]:
-    """The named scenes, and those in the named folders, each once.
+    """Find the named scenes, and those in the named folders, each once.
 
     Args:
         given: Scenes, and folders with scenes, as ``gsmerge batch`` finds them.

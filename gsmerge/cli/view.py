@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 
 from gsmerge.cli import options as opt
+from gsmerge.cli.before_after import read_before_after
 from gsmerge.cli.console import announce_compilation, print_document, say, say_notes, stage_progress
-from gsmerge.cli.held_out import read_before_after
 from gsmerge.cli.paths import check_outputs, input_files, write_texts
 from gsmerge.errors import UsageError
 
@@ -17,9 +17,8 @@ from gsmerge.errors import UsageError
     opt.BEFORE,
     opt.AFTER,
     f"{opt.READING} {opt.TARGETS}",
-    opt.changed("superpixels", hidden=True, help="Superpixels per view of the outlines on the page: what the results "
-                "were made with."),
-    opt.changed("segmentation", help="Superpixel method of these outlines."),
+    opt.changed("set", help="How the outlined superpixels are cut, where results were made with another than the "
+                "default, such as superpixels=2%; may be repeated."),
     opt.output("The page, .html.", wording="AFTER.compare.html, beside it"),
     *opt.panel(opt.OUTPUT, opt.option("open", bool, "Open the page in the browser.", "--open/--no-open", default=True)),
     "overwrite dry_run threads",
@@ -29,8 +28,7 @@ def view(args: opt.Args) -> None:
     from gsmerge.report import document_head
     from gsmerge.stages.superpixels import SegmentOptions, count_for
 
-    with opt.usage_errors():
-        segmentation = SegmentOptions(**args.given(SegmentOptions.__dataclass_fields__))
+    (segmentation,) = args.make(SegmentOptions)
     files, after = args.files(args.before), args.after
     output = args.output or after[0].with_name(f"{after[0].stem}.compare.html")
     inputs = (*input_files(files), *after, args.targets, args.target_images)

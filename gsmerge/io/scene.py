@@ -237,7 +237,7 @@ def _make_load(
     elif camera_file is not None:
         more.append("the rows belong to no pixels that could be found: unaligned")
         if hints.exporter != "auto":
-            more[-1] += f"; only the layouts of {hints.exporter} were tried, as given; --exporter auto tries all"
+            more[-1] += f"; only the layouts of {hints.exporter} were tried, as given; --hint exporter=auto tries all"
     return SceneLoad(
         scene=scene,
         ply=ply.info,

@@ -147,7 +147,7 @@ def read_scene_cameras(ply: PlyScene, files: SceneFiles) -> CameraFile:
     if cameras is None:
         places = ", ".join(place for place in CAMERA_PLACES if len(place) > 1)
         problem = f"no cameras found next to it (looked for {places}, one .torch chunk)"
-        raise SceneError(files.ply, problem, "name them with --cameras, or have views placed with --order none")
+        raise SceneError(files.ply, problem, "name them with --cameras, or have views placed with --hint order=none")
     return cameras
 
 

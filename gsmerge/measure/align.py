@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsmerge.geometry import pose_changes
-from gsmerge.measure.zoom import resize_mask
+from gsmerge.measure.visibility import resize_mask
 from gsmerge.render import Splats, ViewPlan, composite, plan_view
 from gsmerge.render.blend import mean_depths
 from gsmerge.render.gradient import color_gradients, plan_gradients, pose_gradient
@@ -42,7 +42,7 @@ class PoseChange:
 
 
 def fit_colors(image: np.ndarray, photo: np.ndarray, mask: NDArray[np.bool_]) -> np.ndarray:
-    """A render ``[h,w,3]`` after the affine map of its colours (3 x 4) that brings it closest to its photo.
+    """Map a render's colours ``[h,w,3]`` by the affine map (3 x 4) that brings it closest to its photo.
 
     Least squares over the pixels ``[h,w]`` of the mask, clipped to [0, 1]; the render itself where there are none.
     """
@@ -116,7 +116,7 @@ def refine_pose(
     near: float,
     antialiased: bool = False,
 ) -> tuple[Cameras, PoseChange]:
-    """The camera moved to where its render is closest to its photo; itself where the squared error does not fall.
+    """Move a camera to where its render is closest to its photo; it stays where the squared error does not fall.
 
     At a quarter, at half and at the full size of the photo. Pixels whose error is large count less, so that the camera
     is not moved to get a flaw of the scene out of the picture.
@@ -156,7 +156,7 @@ def refine_pose(
 
 
 def _descend(target: _Target, best: _Trial, unit: float, doubt: float) -> _Trial:
-    """The pose after steps that each lower the error; lengths are taken in ``unit`` world units."""
+    """Take steps that each lower the error, and return the pose; lengths are in ``unit`` world units."""
     damping, error = FIRST_DAMPING, best.error(doubt)
     slope, curvature = _slope(target, best, unit, doubt), _curvature(target, best, unit, doubt)
     for _ in range(STEPS):
@@ -182,7 +182,7 @@ def _descend(target: _Target, best: _Trial, unit: float, doubt: float) -> _Trial
 
 
 def _slope(target: _Target, trial: _Trial, unit: float, doubt: float) -> np.ndarray:
-    """``[6]`` derivatives of the error with respect to a turn about the centre (radians) and a shift (in ``unit``)."""
+    """Derive the error with respect to a turn about the centre (radians) and a shift (in ``unit``): ``[6]``."""
     inside = (trial.image > 0) & (trial.image < 1)  # clipped values stay as they are
     grad_image = np.where(inside, 2 * trial.residual * trial.weights(doubt)[..., None], np.float32(0))
     plan, drawn = trial.plan, {"image": trial.image, "transmittance": trial.transmittance}
@@ -196,7 +196,7 @@ def _slope(target: _Target, trial: _Trial, unit: float, doubt: float) -> np.ndar
 
 
 def _curvature(target: _Target, trial: _Trial, unit: float, doubt: float) -> np.ndarray:
-    """``[6,6]`` Gauss-Newton's second derivatives, of the picture moved as its depth says."""
+    """Compute Gauss-Newton's second derivatives ``[6,6]``, of the picture moved as its depth says."""
     depth = trial.depth().astype(np.float64)
     y, x = np.nonzero(target.mask & (depth > 0))
     dy, dx = np.gradient(trial.image.clip(0, 1), axis=(0, 1))
@@ -219,7 +219,7 @@ def _in_camera(point: np.ndarray, viewmat: np.ndarray) -> np.ndarray:
 
 
 def _moved(viewmat: np.ndarray, step: np.ndarray, target: _Target, unit: float) -> np.ndarray:
-    """The view matrix after a turn about the centre, ``step[:3]`` radians, and a shift, ``step[3:]`` in ``unit``."""
+    """Turn a view matrix about the centre by ``step[:3]`` radians, and shift it by ``step[3:]`` in ``unit``."""
     turn, centre = cv2.Rodrigues(step[:3])[0], _in_camera(target.centre, viewmat)
     moved = np.eye(4)
     moved[:3, :3] = turn @ viewmat[:3, :3]

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from gsmerge.errors import UsageError
 from gsmerge.measure.align import PoseChange, fit_colors, refine_pose
-from gsmerge.measure.visibility import context_points, visible_pixels
-from gsmerge.measure.zoom import resize_mask, resize_photo, zoom_cameras
+from gsmerge.measure.speed import zoom_cameras
+from gsmerge.measure.visibility import context_points, resize_mask, resize_photo, visible_pixels
 from gsmerge.render import prepare, render
 from gsmerge.render.metrics import psnr, ssim
 from gsmerge.render.photos import NEAR
@@ -155,7 +155,7 @@ class ResultScores:
     scores: tuple[ViewScore, ...]  # one for each view
 
     def mean(self, split: str, *, zoom: float | None = None, align: str | None = None) -> tuple[Quality, Quality]:
-        """Means over the views of a split, or over their scores at one size or after one alignment.
+        """Average over the views of a split, or over their scores at one size or after one alignment.
 
         Over all pixels, and over the visible ones.
         """
@@ -168,7 +168,7 @@ class ResultScores:
         return _mean([score.full for score in mine]), _mean([score.masked for score in mine])
 
     def mean_pose_change(self, split: str) -> PoseChange | None:
-        """Mean over the views of a split; None where no camera was aligned."""
+        """Average over the views of a split; None where no camera was aligned."""
         moves = [score.pose_change for score in self.scores if score.split == split and score.pose_change]
         return PoseChange(*np.mean([(m.degrees, m.shift) for m in moves], axis=0).tolist()) if moves else None
 
@@ -202,7 +202,7 @@ class _Split:
     drawn: Gaussians | None  # the input, whose renders stand in for photos; None where there are photos
 
     def under(self, cameras: Cameras | None) -> _Split:
-        """The same from where a result's own cameras stand; renders of the input are shown from the given ones."""
+        """Look from where a result's own cameras stand; renders of the input are shown from the given ones."""
         own = self.views.cameras if cameras is None or self.drawn is not None else cameras.numpy()
         return replace(self, views=replace(self.views, cameras=own))
 
@@ -216,7 +216,7 @@ class _Look:
     centre: np.ndarray  # [3] the scene's middle in the world
 
     def image(self, gaussians: Gaussians, cameras: Cameras, view: int) -> np.ndarray:
-        """``[h,w,3]``: one view, by the one call that renders here, so that equal Gaussians give equal images."""
+        """Render one view ``[h,w,3]``, by the one call that renders here: equal Gaussians give equal images."""
         drawn = render(gaussians, cameras[[view]], near=self.near, antialiased=self.antialiased)
         return np.asarray(drawn.images[0].clip(0, 1))
 
@@ -269,14 +269,14 @@ def evaluate(
 
 
 def _reference(scene: Scene, splits: Mapping[str, int]) -> str:
-    """What results are compared with, in words."""
+    """Say what results are compared with."""
     if scene.images is not None or "context" not in splits:
         return "photos"
     return "photos, and renders of the input in its own views" if "target" in splits else "renders of the input"
 
 
 def near_plane(scene: Scene) -> float:
-    """Near plane where a scene and its results are compared, world units; there must be a valid Gaussian and a view."""
+    """Choose the near plane for comparing a scene and its results, world units; there must be a Gaussian and a view."""
     return NEAR * scene_frame(scene).unit
 
 
@@ -292,7 +292,7 @@ def _notes(splits: Mapping[str, _Split]) -> tuple[str, ...]:
 def _splits(
     scene: Scene, own: Gaussians, targets: Views | None, options: EvaluateOptions, look: _Look
 ) -> dict[str, _Split]:
-    """The views by split, with their photos or the input's renders, and their visible pixels."""
+    """Split the views into input and held-out ones, with photos or the input's renders, and visible pixels."""
     points = context_points(scene, look.near)
 
     def split(views: Views, drawn: Gaussians | None) -> _Split:
@@ -358,7 +358,7 @@ def _align_score(
     options: EvaluateOptions,
     look: _Look,
 ) -> ViewScore:
-    """A score with those of the render ``image [h,w,3]`` after alignment."""
+    """Add to a score those of the render ``image [h,w,3]`` after alignment."""
     cameras, photo, seen = split.views.cameras[[view]], split.views.images[view], split.visible[view]
     pictures, change = {"plain": image}, None
     if "pose" in options.align:
@@ -377,7 +377,7 @@ def _align_score(
 def _both(
     image: np.ndarray, photo: np.ndarray, seen: NDArray[np.bool_], nets: Sequence[str]
 ) -> tuple[Quality, Quality]:
-    """Over all pixels, and over those that the input views have seen."""
+    """Measure the quality over all pixels, and over those that the input views have seen."""
     full = _quality(image, photo, None, nets)
     return full, full if seen.all() else _quality(image, photo, seen, nets) if seen.any() else Quality()
 

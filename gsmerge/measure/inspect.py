@@ -1,23 +1,19 @@
-"""What a ``.ply`` and the files next to it hold, as plain numbers."""
+"""A scene's files -> one document: what they hold, and what ``compact`` would make of them."""
 
 from __future__ import annotations
 
-import math
 import os
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import project
 from gsmerge.io import (
-    Alignment,
     PlyScene,
     ReadHints,
     SceneFiles,
-    SceneLoad,
     align_scene,
     find_scene_files,
     ply_notes,
@@ -29,98 +25,28 @@ from gsmerge.io.exporters import exporter_names, make_hints
 from gsmerge.io.formats.ply import OpacityChoice
 from gsmerge.io.formats.ply_file import LOGIT_COMMENT
 from gsmerge.io.formats.writing import file_bytes
+from gsmerge.measure.visibility import MAX_SAMPLES, inside_views
 from gsmerge.options import CompactOptions
 from gsmerge.plan import resolved_settings, steps_for
-from gsmerge.report import finite
-from gsmerge.runtime.estimate import estimate_run
+from gsmerge.report import finite, human_bytes
+from gsmerge.runtime.estimate import fit_of, memory_bytes, memory_problem, wall_seconds
 from gsmerge.runtime.threads import available_threads, use_threads
 from gsmerge.stages.clean import BOX_QUANTILES, beyond_scene, floater_share
-from gsmerge.stages.segment import default_count
+from gsmerge.stages.segment import count_limits, largest_count
 from gsmerge.stages.sky import sky_regions
-from gsmerge.types import Cameras, Gaussians, Scene
+from gsmerge.types import Gaussians, Scene
 
-MAX_SAMPLES = 200_000  # Gaussians that are measured
 HUGE_SCALE_SHARE = 0.1  # of the box's diagonal: larger scales show no detail
 _TRANSPARENT, _OPAQUE = 1 / 255, 0.995  # opacities: one step of an 8-bit image; where optical depth is capped
 _SATURATED = 1e-6  # of an opacity's distance to 0 or 1: its logit changes in float32
 _OWN = "gsmerge"  # the exporter's name of files that gsmerge wrote
-
-
-@dataclass(frozen=True)
-class Extents:
-    """Where the Gaussians lie and how large they are, world units."""
-
-    box_low: tuple[float, ...]  # 1 % quantile of the positions per axis
-    box_high: tuple[float, ...]  # 99 % quantile of the same
-    diagonal: float  # of that box
-    share_outliers: float  # share of the Gaussians outside of the box made ten times as large about its middle
-    scale_median: float  # of each Gaussian's largest scale
-    scale_max: float  # the largest scale of all
-    share_floaters: float  # share of the Gaussians that are isolated or far beyond the scene, of many estimated
-    share_huge: float  # share of the Gaussians whose largest scale is above a tenth of the diagonal
-
-
-@dataclass(frozen=True)
-class Coverage:
-    """What one view shows."""
-
-    name: str  # of its image
-    share_of_pixels: float | None  # share of the pixels that have a visible Gaussian of their own; None without pixels
-    share_of_gaussians: float  # share of all Gaussians whose centre is inside the picture
-
-
-@dataclass(frozen=True)
-class Inspection:
-    """Everything that was recognised, in plain Python values."""
-
-    path: str  # the ``.ply``
-    layout: str  # name of the column layout
-    format: str  # "ascii", "binary little-endian" or "binary big-endian"
-    count: int  # Gaussians in the file
-    bytes: int  # size of the file
-    bytes_by_attribute: dict[str, int]  # bytes of the rows by attribute
-    extra_columns: tuple[str, ...]  # columns that mean nothing here
-    extra_elements: tuple[str, ...]  # elements besides ``vertex``
-    sh_degree: int  # 0 to 4
-    opacity_encoding: str  # "logit" or "raw"
-    extents: Extents  # how far the Gaussians reach, outliers, and how large they are
-    box_low: tuple[float, ...]  # 1 % quantile of the positions per axis, world units
-    box_high: tuple[float, ...]  # 99 % quantile of the same
-    num_nonfinite: int  # rows with NaN or inf
-    num_clipped_scales: int  # Gaussians with a scale beyond what a float32 covariance can hold
-    num_zero_quats: int  # Gaussians without a rotation
-    num_opaque: int  # Gaussians with an opacity of at least 0.995
-    num_transparent: int  # finite Gaussians with an opacity below 1/255
-    num_saturated: int  # finite Gaussians with an opacity within 1e-6 of 0 or 1
-    notes: tuple[str, ...]  # warnings about the input and what was adapted, one sentence each
-    exporter: str  # the exporters that may have written the file
-    num_views: int = 0  # cameras, 0 without; with pixels, those that the file has
-    per_pixel: int = 0  # Gaussians of each pixel; 0 without pixels
-    num_missing: int = 0  # pixels of the views that the file has no Gaussian for
-    width: int = 0  # of the Gaussian grid, pixels; 0 while it is not verified
-    height: int = 0  # the same
-    cameras: str | None = None  # where the cameras are; None without
-    camera_format: str | None = None  # name of their format
-    images: str | None = None  # where the images are; None without
-    alignment: Alignment | None = None  # the measured alignment; None if it could not be measured
-    alignment_problem: str | None = None  # why the scene is not known to have one Gaussian per pixel; None if it has
-    rows: str | None = None  # which order of the rows fits best, and by how much; None without pixels
-    # share of the Gaussians at most one pixel from their pixels' centres; None without pixels
-    alignment_score: float | None = None
-    # how many times nearer they are than in the second-best order; None without pixels
-    alignment_margin: float | None = None
-    # how many of the Gaussians the cameras see, and how far colours are from the photos; None without cameras that fit
-    sight: CameraCheck | None = None
-    coverage: tuple[Coverage, ...] = ()  # what every view shows
-    num_sky_views: int = 0  # views whose photos show sky, where those are enough for ``drop_sky``
-    # what ``compact`` would make of it by default: ``num_gaussians``, ``ratio``, ``bytes``, ``seconds``,
-    # ``memory_bytes`` and ``machine_memory_bytes``; right within a factor of about two. None where it would refuse the
-    # scene.
-    estimate: dict[str, float] | None = None
-
-    def to_dict(self) -> dict[str, Any]:
-        """The same as dictionaries, lists and plain values, ready for JSON; what is not finite becomes None."""
-        return finite(asdict(self))
+_FILE_KEYS = (
+    "path", "layout", "format", "count", "bytes_by_attribute", "extra_columns", "extra_elements", "sh_degree",
+    "opacity_encoding", "num_nonfinite", "num_clipped_scales", "num_zero_quats",
+)  # fmt: skip
+_CAMERA_ELEMENTS = ("extrinsic", "intrinsic", "image_size")
+_REPEATED = ("read as: ", "the rows belong to no pixels")  # notes that repeat a line of their own
+_ENCODINGS = {"logit": "as logits", "raw": "in [0, 1]"}
 
 
 def inspect(
@@ -130,50 +56,63 @@ def inspect(
     images: str | os.PathLike[str] | None = None,
     opacity: OpacityChoice = "auto",
     **hints: Any,
-) -> Inspection:
+) -> dict[str, Any]:
     """Say what a scene, a ``.ply`` or the folder of one, is made of, and whether it has one Gaussian per pixel.
 
-    Cameras that are missing or do not fit are reported, not raised. ``cameras``, a file or a folder, and ``images``, a
-    folder or an ``.npz``, are searched next to the ``.ply`` unless they are given. ``opacity`` is as of
-    :func:`gsmerge.io.read_ply`; ``hints`` are fields of :class:`gsmerge.io.ReadHints`: ``exporter``, ``quats``,
-    ``order``, ``scene_scale``, ``max_side``.
+    Args:
+        path: The scene.
+        cameras: A file or a folder; None: searched next to the ``.ply``, and so are the images.
+        images: A folder or an ``.npz``.
+        opacity: As of :func:`gsmerge.io.read_ply`.
+        hints: Fields of :class:`gsmerge.io.ReadHints`: ``exporter``, ``quats``, ``order``, ``scene_scale``,
+            ``max_side``.
+
+    Returns:
+        Plain JSON types, None for what is not finite or not known. Of the file: ``path``, ``bytes``,
+        ``bytes_by_attribute``, ``layout``, ``format``, ``exporter``, ``extra_columns`` and ``extra_elements`` (which
+        mean nothing here), ``sh_degree``, ``opacity_encoding``. Of the Gaussians: ``count``, ``num_nonfinite``,
+        ``num_clipped_scales``, ``num_zero_quats``, ``num_opaque`` (from 0.995 on), ``num_transparent`` (below 1/255),
+        ``num_saturated`` (within 1e-6 of 0 or 1), ``extents`` (:func:`extents`). Of the views: ``cameras``,
+        ``camera_format``, ``images``, ``num_views``, ``width`` and ``height`` (0 without a grid of pixels),
+        ``per_pixel``, ``num_missing`` (pixels without a Gaussian), ``rows`` (their order), ``alignment`` (or
+        ``alignment_problem``, why it could not be measured), ``sight`` (what the cameras see), ``coverage`` (shares of
+        the pixels and of the Gaussians in each view), ``num_sky_views``. ``compact``: :func:`estimate` with the
+        defaults, None where ``compact`` would refuse the scene. ``notes``: warnings.
 
     Raises:
-        SceneError: If the ``.ply`` cannot be read, or a named file does not exist.
+        SceneError: If the ``.ply`` cannot be read, or a named file does not exist; cameras that are missing or do not
+            fit are reported instead.
     """
     read_hints = make_hints(hints)
     files = find_scene_files(path, cameras=cameras, images=images)
     with use_threads():
         ply = read_ply_with_hints(files.ply, opacity=opacity, hints=read_hints)
-        return Inspection(**_of_ply(ply), **_of_views(ply, files, read_hints))
+        document: dict[str, Any] = finite(_describe_file(ply) | _describe_views(ply, files, read_hints))
+    return document
 
 
-def _of_ply(ply: PlyScene) -> dict[str, Any]:
+def _describe_file(ply: PlyScene) -> dict[str, Any]:
     info, opacities = ply.info, ply.gaussians.opacities[ply.valid]
-    size = extents(ply.gaussians[ply.valid] if info.num_nonfinite else ply.gaussians)
-    same = (
-        "path", "layout", "format", "count", "bytes_by_attribute", "extra_columns", "extra_elements", "sh_degree",
-        "opacity_encoding", "num_nonfinite", "num_clipped_scales", "num_zero_quats",
-    )  # fmt: skip
     return {
-        **{name: getattr(info, name) for name in same},
+        **{name: getattr(info, name) for name in _FILE_KEYS},
         "bytes": info.file_bytes,
-        "extents": size,
-        "box_low": size.box_low,
-        "box_high": size.box_high,
+        "extents": extents(ply.gaussians[ply.valid] if info.num_nonfinite else ply.gaussians),
         "num_opaque": int((opacities >= _OPAQUE).sum()),
         "num_transparent": int((opacities < _TRANSPARENT).sum()),
         "num_saturated": int(((opacities <= _SATURATED) | (opacities >= 1 - _SATURATED)).sum()),
     }
 
 
-def _of_views(ply: PlyScene, files: SceneFiles, hints: ReadHints) -> dict[str, Any]:
+def _describe_views(ply: PlyScene, files: SceneFiles, hints: ReadHints) -> dict[str, Any]:
     own = LOGIT_COMMENT in ply.info.comments
     facts: dict[str, Any] = {
         "cameras": files.cameras and str(files.cameras),
         "images": files.images and str(files.images),
         "exporter": _OWN if own else "not known before the cameras fit",
         "notes": ply_notes(ply.info),
+        **dict.fromkeys(("num_views", "width", "height", "per_pixel", "num_missing", "num_sky_views"), 0),
+        **dict.fromkeys(("camera_format", "rows", "alignment", "alignment_problem", "sight", "compact")),
+        "coverage": [],
     }
     camera_file = None
     try:
@@ -183,111 +122,217 @@ def _of_views(ply: PlyScene, files: SceneFiles, hints: ReadHints) -> dict[str, A
         load = align_scene(ply, files, camera_file, hints=hints)
     except SceneError as error:
         return facts | {"alignment_problem": str(error)}
-    if not own:
-        facts["exporter"] = exporter_names(load.exporters)
+    scene, sight = load.scene, _check_sight(load.scene)
     facts |= {"notes": load.notes, "num_views": len(load.views.used)}
     facts |= {"camera_format": load.cameras and load.cameras.source}
-    facts |= {"coverage": coverage(load.scene), "estimate": estimate(load.scene), "sight": _sight(load)}
-    facts |= {"num_sky_views": _num_sky_views(load.scene)}
+    facts |= {"coverage": coverage(scene), "sight": sight and asdict(sight)}
+    facts |= {"num_sky_views": _num_sky_views(scene), "compact": estimate(scene, CompactOptions())}
+    if not own:
+        facts["exporter"] = exporter_names(load.exporters)
     if load.recovery is None or load.alignment is None:
         return facts | {"alignment_problem": load.problem}
     return facts | {
-        "width": load.scene.cameras.width,
-        "height": load.scene.cameras.height,
+        "width": scene.cameras.width,
+        "height": scene.cameras.height,
         "per_pixel": load.recovery.best.layout.per_pixel,
         "num_missing": load.pixel_scene().num_missing,
-        "alignment": load.alignment,
-        "alignment_score": load.alignment.share_within_1px,
-        "alignment_margin": load.recovery.margin,
+        "alignment": asdict(load.alignment),
         "rows": load.recovery.description,
     }
 
 
 def _num_sky_views(scene: Scene) -> int:
+    """Count the views whose photos show sky, where those are enough for ``drop_sky``."""
     if len(scene) == 0 or scene.images is None:
         return 0
     stored = scene.stored.reshape(-1) if scene.aligned else np.isfinite(scene.gaussians.means).all(1)
     return len(sky_regions(scene.gaussians.means[stored], scene.cameras, scene.images))
 
 
-def _sight(load: SceneLoad) -> CameraCheck | None:
-    scene = load.scene
+def _check_sight(scene: Scene) -> CameraCheck | None:
+    """Measure what the cameras see of the Gaussians, and how far colours are from the photos; None without cameras."""
     if len(scene) == 0:
         return None
-    whole = np.ones(len(scene.gaussians), bool)
-    valid = scene.stored.reshape(-1) if scene.aligned else whole
+    valid = scene.stored.reshape(-1) if scene.aligned else np.ones(len(scene.gaussians), bool)
     return check_cameras(scene.gaussians, valid, scene.cameras, scene.images)
 
 
-def estimate(scene: Scene) -> dict[str, Any]:
-    """What ``compact`` would make of a scene by default, see :attr:`Inspection.estimate`."""
-    options, photos = CompactOptions(), scene.images is not None
-    count = min(scene.num_gaussians, default_count(scene, options.segment, options.decode))
-    grid = len(scene), scene.cameras.height, scene.cameras.width
-    return {
-        "num_gaussians": count,
-        "ratio": count / max(1, scene.num_gaussians),
-        "bytes": file_bytes(count, scene.gaussians.sh_degree),
-        **estimate_run(
-            grid,
-            resolved_settings(options, photos=photos),
-            max(math.prod(grid), scene.num_gaussians),
-            photos=photos,
-            threads=available_threads(),
-            fit_steps=steps_for(options, count, scene),
-            num_rest=3 * scene.gaussians.shN.shape[1],
-        ),
-    }
+def extents(gaussians: Gaussians) -> dict[str, Any]:
+    """Measure where finite Gaussians lie and how large they are, in world units; of many, some are measured.
 
-
-def extents(gaussians: Gaussians) -> Extents:
-    """Measure finite Gaussians; zeros where there are none. Large scenes are sampled, except for the largest scale."""
+    Returns:
+        ``box_low`` and ``box_high``: 1 % and 99 % of the positions per axis; ``diagonal`` of that box;
+        ``share_outliers`` beyond ten times the box about its middle; ``share_floaters``: isolated, or beyond that;
+        ``scale_median`` of each Gaussian's largest scale; ``scale_max`` of all; ``share_huge``: scales above a tenth
+        of the diagonal. Zeros where there are no Gaussians.
+    """
+    names = ("diagonal", "share_outliers", "share_floaters", "scale_median", "scale_max", "share_huge")
     if len(gaussians) == 0:
-        return Extents((0.0,) * 3, (0.0,) * 3, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        return {"box_low": [0.0] * 3, "box_high": [0.0] * 3, **dict.fromkeys(names, 0.0)}
     step = -(-len(gaussians) // MAX_SAMPLES)
-    points = gaussians.means[::step].astype(np.float64)
-    largest = gaussians.scales.max(1)
+    points, largest = gaussians.means[::step].astype(np.float64), gaussians.scales.max(1)
     low, high = np.percentile(points, BOX_QUANTILES, axis=0)
-    diagonal = float(np.linalg.norm(high - low))
-    return Extents(
-        box_low=tuple(map(float, low)),
-        box_high=tuple(map(float, high)),
-        diagonal=diagonal,
-        share_outliers=float(beyond_scene(points).mean()),
-        share_floaters=floater_share(gaussians),
-        scale_median=float(np.median(largest[::step])),
-        scale_max=float(largest.max()),
-        share_huge=float((largest[::step] > HUGE_SCALE_SHARE * diagonal).mean()),
-    )
+    diagonal = np.linalg.norm(high - low)
+    values = (
+        diagonal, beyond_scene(points).mean(), floater_share(gaussians), np.median(largest[::step]), largest.max(),
+        (largest[::step] > HUGE_SCALE_SHARE * diagonal).mean(),
+    )  # fmt: skip
+    shares = {name: float(value) for name, value in zip(names, values, strict=True)}
+    return {"box_low": low.tolist(), "box_high": high.tolist(), **shares}
 
 
-def coverage(scene: Scene) -> tuple[Coverage, ...]:
-    """What every view shows of a scene; of several Gaussians per pixel each layer is a view."""
+def coverage(scene: Scene) -> list[dict[str, Any]]:
+    """Measure what every view shows; of several Gaussians per pixel each layer is a view.
+
+    Returns:
+        For each view its ``name``, ``share_of_pixels`` that have a visible Gaussian of their own (None without
+        pixels), and ``share_of_gaussians`` whose centre is inside the picture.
+    """
     if len(scene) == 0:
-        return ()
+        return []
     rows = np.arange(0, len(scene.gaussians), -(-len(scene.gaussians) // MAX_SAMPLES))
     if scene.aligned:
         rows = rows[scene.stored.reshape(-1)[rows]]
     points = scene.gaussians.means[rows].astype(np.float64)
-    shares = [float(inside.mean()) if len(points) else 0.0 for inside in _inside(points, scene.cameras)]
+    shares = [float(inside.mean()) if len(points) else 0.0 for inside in inside_views(points, scene.cameras)]
     pixels: list[float | None] = [None] * len(scene)
     if scene.aligned:
         visible = (scene.gaussians.opacities >= _TRANSPARENT).reshape(scene.valid.shape) & scene.stored
         pixels = [float(view.mean()) for view in visible]
-    return tuple(map(Coverage, scene.names, pixels, shares))
+    keys = ("name", "share_of_pixels", "share_of_gaussians")
+    return [dict(zip(keys, view, strict=True)) for view in zip(scene.names, pixels, shares, strict=True)]
 
 
-def share_outside(gaussians: Gaussians, cameras: Cameras) -> float:
-    """Share of the Gaussians, of many some, whose centres are inside no view's picture; 0 without any."""
-    points = gaussians.means[:: max(1, -(-len(gaussians) // MAX_SAMPLES))].astype(np.float64)
-    seen = np.zeros(len(points), bool)
-    for inside in _inside(points, cameras):
-        seen |= inside
-    return float(1 - seen.mean()) if len(points) else 0.0
+def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
+    """Estimate what a run would make of a scene, without working on it.
+
+    Returns:
+        ``num_gaussians``: the most that the result can have; ``ratio`` to the input, ``bytes`` as a ``.ply``;
+        ``method``, ``superpixels_per_view`` (None where a budget distributes them), ``k``, ``match``, ``checkpoint``
+        and ``fit`` as they are used; ``seconds`` and ``memory_bytes``, to two digits and right within a factor of
+        about two once the kernels are compiled; ``memory_problem``, None where this machine has enough.
+    """
+    photos, settings = scene.images is not None, resolved_settings(options, photos=scene.images is not None)
+    limits = count_limits(scene, options.segment, options.decode, options.budget)
+    pixels = max(len(scene) * scene.pixels_per_view, scene.num_gaussians)
+    most = pixels if options.method.startswith("unmerged") else largest_count(limits, options.segment)
+    count = min(scene.num_gaussians or pixels, most)
+    seconds = wall_seconds(
+        pixels, len(scene), settings, photos=photos, threads=options.threads or available_threads(),
+        fit_steps=steps_for(options, limits.count or limits.default, scene),
+    )  # fmt: skip
+    memory = memory_bytes(pixels, photos=photos, num_rest=3 * scene.gaussians.shN.shape[1])
+    distributed = limits.count is not None or options.budget.auto
+    return {
+        "num_gaussians": count,
+        "ratio": count / max(1, scene.num_gaussians),
+        "bytes": file_bytes(count, scene.gaussians.sh_degree),
+        "method": options.method,
+        "superpixels_per_view": None if distributed else limits.per_view,
+        **{name: settings[name] for name in ("k", "match", "checkpoint")},
+        "fit": fit_of(settings, photos=photos),
+        "seconds": float(f"{seconds:.2g}"),
+        "memory_bytes": int(float(f"{memory:.2g}")),
+        "memory_problem": memory_problem(memory),
+    }
 
 
-def _inside(points: np.ndarray, cameras: Cameras) -> Iterator[np.ndarray]:
-    """``[n]`` bool of each view: which points its picture shows."""
-    for view in range(len(cameras)):
-        (pixels,), (depths,) = project(points, cameras[[view]])
-        yield (depths > 0) & ((pixels >= 0) & (pixels < (cameras.width, cameras.height))).all(1)
+def estimate_lines(run: Mapping[str, Any]) -> list[str]:
+    """Write an estimate as lines for people."""
+    per_view = run["superpixels_per_view"]
+    superpixels = "superpixels where the scene needs them"
+    if per_view is not None:
+        superpixels = f"{per_view:,} superpixels per view, {run['k']} Gaussian(s) each"
+    own = f"{superpixels}; merging across views: {run['match']}; networks: {run['checkpoint']}"
+    return [
+        f"compact    at most {run['num_gaussians']:,} Gaussians ({100 * run['ratio']:.1f} %),"
+        f" {human_bytes(run['bytes'])} as .ply, in about {run['seconds']:g} s with {run['memory_bytes'] / 1e9:g} GB of"
+        " memory",
+        f"method     {own if run['method'] == 'gsmerge' else run['method']}; fit: {run['fit']}",
+        *([f"memory     {run['memory_problem']}"] if run["memory_problem"] else []),
+    ]
+
+
+def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
+    """Write the document of :func:`inspect` as lines for people."""
+    parts = ", ".join(f"{name} {human_bytes(size)}" for name, size in scene["bytes_by_attribute"].items())
+    ignored, size = _ignored(scene), scene["extents"]
+    low, high = (" ".join(f"{value:.4g}" for value in size[key]) for key in ("box_low", "box_high"))
+    lines = [
+        f"file       {scene['path']}: {human_bytes(scene['bytes'])} ({parts})",
+        f"layout     {scene['layout']}, {scene['format']}; opacity stored {_ENCODINGS[scene['opacity_encoding']]}",
+        f"exporter   {scene['exporter']}",
+        f"ignored    {', '.join(ignored)}" if ignored else "",
+        f"Gaussians  {scene['count']:,}: {scene['num_nonfinite']} not finite, {scene['num_transparent']:,} transparent,"
+        f" {scene['num_opaque']:,} opaque, {scene['num_saturated']:,} of opacity 0 or 1",
+        f"extent     {low}  to  {high}  (1 % to 99 %); {100 * size['share_outliers']:.2g} % beyond ten times that box",
+        f"floaters   about {round(size['share_floaters'] * scene['count']):,}: isolated, or beyond that;"
+        " compact --set drop_floaters=true leaves them out",
+        f"sky        in {scene['num_sky_views']} photos; compact --set drop_sky=true leaves it out"
+        if scene["num_sky_views"]
+        else "",
+        f"scales     median {size['scale_median']:.3g}, largest {size['scale_max']:.3g} in a scene of"
+        f" {size['diagonal']:.3g}; {100 * size['share_huge']:.2g} % above a tenth of it",
+        f"cameras    {_describe_cameras(scene)}",
+        f"images     {scene['images'] or 'none found'}",
+        *_alignment_lines(scene),
+        *_coverage_lines(scene),
+    ]
+    run = scene["compact"]
+    lines += ["compact    would refuse the scene as it is"] if run is None else estimate_lines(run)
+    repeated = () if scene["alignment_problem"] is None and scene["rows"] is None else _REPEATED
+    notes = [note for note in scene["notes"] if not note.startswith(repeated)]
+    return [line for line in lines if line] + [f"note       {note}" for note in notes]
+
+
+def _ignored(scene: Mapping[str, Any]) -> list[str]:
+    """List the columns and elements that mean nothing here; those that hold the camera do."""
+    used = _CAMERA_ELEMENTS if scene["cameras"] is None and scene["camera_format"] else ()
+    elements = [name for name in scene["extra_elements"] if name not in used]
+    return [*scene["extra_columns"], *(f"element {name}" for name in elements)]
+
+
+def _describe_cameras(scene: Mapping[str, Any]) -> str:
+    if not scene["num_views"]:
+        return scene["cameras"] or "none found"
+    inside = set(_CAMERA_ELEMENTS) <= set(scene["extra_elements"])
+    where = scene["cameras"] or ("inside the .ply" if inside else "none found")
+    return f"{where}: {scene['num_views']} ({scene['camera_format']})"
+
+
+def _alignment_lines(scene: Mapping[str, Any]) -> list[str]:
+    """Say which row is which pixel, and how far from it; or why that is not known."""
+    alignment, problem = scene["alignment"], scene["alignment_problem"]
+    if problem is not None and scene["compact"] is None:
+        return [f"alignment  not measured: {problem}"]
+    if problem is not None:
+        return [f"alignment  not one Gaussian per pixel: {problem.removeprefix('expected one Gaussian per pixel, ')}"]
+    if alignment is None:
+        return []
+    worst = max(m for m in alignment["median_px"] if m is not None)
+    number = "one Gaussian" if scene["per_pixel"] == 1 else f"{scene['per_pixel']} Gaussians"
+    missing = f", none for {scene['num_missing']:,} of them" if scene["num_missing"] else ""
+    return [
+        f"rows       {scene['rows']}",
+        f"alignment  {number} per pixel, {scene['num_views']} x {scene['height']} x {scene['width']} (views x height x"
+        f" width){missing}; median offset {worst:.2f} px in the worst view,"
+        f" {100 * alignment['share_within_1px']:.1f} % within 1 px",
+    ]
+
+
+def _coverage_lines(scene: Mapping[str, Any]) -> list[str]:
+    """Say what the views show, and which shows least."""
+    views, seen = scene["coverage"], scene["sight"]
+    if not views or seen is None:
+        return []
+    colors = ""
+    if seen["color_ratio"] is not None:
+        colors = f"; colours {seen['color_ratio']:.2f} times as far from their own pixels as from any others"
+    pixelwise = views[0]["share_of_pixels"] is not None
+    key, what = ("share_of_pixels", "pixels") if pixelwise else ("share_of_gaussians", "Gaussians")
+    shares = [view[key] for view in views]
+    low, high = f"{100 * min(shares):.0f}", f"{100 * max(shares):.0f}"
+    each = f"{high} % of the {what} in every view"
+    if low != high:
+        each = f"{low} to {high} % of the {what} per view, least in {views[shares.index(min(shares))]['name']}"
+    return [f"coverage   {each}; {100 * seen['share_seen']:.0f} % of the Gaussians seen{colors}"]

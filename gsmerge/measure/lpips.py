@@ -80,7 +80,7 @@ class _Layer:
 
 
 def lpips(image: Array, reference: Array, net: str = "vgg", mask: Array | None = None) -> float:
-    """Learned perceptual distance (LPIPS, Zhang et al. 2018, version 0.1): 0 for equal images, lower is closer.
+    """Measure the learned perceptual distance (LPIPS 0.1, Zhang et al. 2018): 0 for equal images, lower is closer.
 
     The images are ``[h,w,3]`` sRGB in [0, 1], arrays or tensors, at least 16 x 16 pixels for ``"vgg"`` (VGG-16), 31 x
     31 for ``"alex"`` (AlexNet); the figures of the two do not compare. Pixels outside of ``mask [h,w]`` are taken from
@@ -108,7 +108,7 @@ def lpips(image: Array, reference: Array, net: str = "vgg", mask: Array | None =
 
 
 def lpips_available(net: str = "vgg") -> bool:
-    """Whether the weights of ``net``, ``"vgg"`` or ``"alex"``, are installed."""
+    """Tell whether the weights of ``net``, ``"vgg"`` or ``"alex"``, are installed."""
     return _find_weights(net) is not None
 
 
@@ -118,19 +118,19 @@ def require_lpips(net: str) -> None:
 
 
 def min_size(net: str) -> int:
-    """Pixels per side of the smallest image that ``net`` takes."""
+    """Return the pixels per side of the smallest image that ``net`` takes."""
     return _architecture(net).min_size
 
 
 def _architecture(net: str) -> _Architecture:
-    """A ValueError if ``net`` is unknown."""
+    """Look up the layers of ``net``; a ValueError if it is unknown."""
     if net not in _ARCHITECTURES:
         raise ValueError(f"net: expected {' or '.join(_ARCHITECTURES)}, got {net}")
     return _ARCHITECTURES[net]
 
 
 def lpips_loss(image: Tensor, reference: Tensor, mask: Tensor, net: str = "vgg") -> Tensor:
-    """:func:`lpips`, differentiable in ``image``, ``[h,w,3]`` float32 on the CPU; the reference has no gradient.
+    """Measure :func:`lpips`, differentiable in ``image [h,w,3]`` float32 on the CPU; the reference has no gradient.
 
     0 where the images are too small for the network or no pixel counts.
     """
@@ -147,7 +147,7 @@ def _as_tensor(image: np.ndarray) -> Tensor:
 
 
 def _weighted(units: Iterable[Tensor], others: Iterable[Tensor], layers: tuple[_Layer, ...]) -> Tensor:
-    """Squared differences of unit features, weighted, averaged over pixels, added up (equation 1 of Zhang et al.)."""
+    """Weight squared differences of unit features, average over pixels, and add up (equation 1 of Zhang et al.)."""
     distance = torch.zeros((), dtype=torch.float64)
     compared = [layer.weights for layer in layers if layer.weights is not None]
     for weights, unit, other in zip(compared, units, others, strict=True):
@@ -156,7 +156,7 @@ def _weighted(units: Iterable[Tensor], others: Iterable[Tensor], layers: tuple[_
 
 
 def _kept_features(reference: np.ndarray, layers: tuple[_Layer, ...]) -> list[Tensor]:
-    """Of a reference, which is often compared with several images in a row: the last few are cached."""
+    """Compute the features of a reference; the last few are cached, as several images in a row have the same one."""
     key = (id(layers), reference.shape, hashlib.sha256(np.ascontiguousarray(reference).tobytes()).digest())
     if key not in _CACHE:
         with torch.inference_mode():
@@ -174,7 +174,7 @@ _CACHE: dict[tuple[object, ...], tuple[tuple[_Layer, ...], list[Tensor]]] = {}
 
 
 def _unit_features(image: Tensor, layers: tuple[_Layer, ...]) -> Iterator[Tensor]:
-    """``[c,h,w]`` features of unit length at every pixel, of each layer that is compared."""
+    """Compute features ``[c,h,w]`` of unit length at every pixel, of each layer that is compared."""
     values = (2 * image[None] - 1 - torch.tensor(SHIFT)) / torch.tensor(SCALE)
     features = values.permute(0, 3, 1, 2)  # channels last in memory
     for layer in layers:
@@ -187,7 +187,7 @@ def _unit_features(image: Tensor, layers: tuple[_Layer, ...]) -> Iterator[Tensor
 
 
 def _find_weights(net: str) -> Path | None:
-    """The file of weights of ``net``; None if it is not installed."""
+    """Find the file of weights of ``net``; None if it is not installed."""
     file = _architecture(net).file
     spec = find_spec(PACKAGE)  # finds a top-level package without importing it
     folders = [] if spec is None else spec.submodule_search_locations or []
@@ -203,7 +203,7 @@ def _weights_file(net: str) -> Path:
 
 @lru_cache(maxsize=2)
 def _load(path: Path, net: str) -> tuple[_Layer, ...]:
-    """The layers of ``net`` from its file; a SceneError if that is no pickle of float arrays, or of other ones."""
+    """Load the layers of ``net`` from its file; a SceneError if that is no pickle of float arrays, or of other ones."""
     with path.open("rb") as stream:
         try:
             return _layers(_ArrayUnpickler(stream).load(), _architecture(net))
@@ -213,7 +213,7 @@ def _load(path: Path, net: str) -> tuple[_Layer, ...]:
 
 
 def _layers(tree: Mapping[str, Any], architecture: _Architecture) -> tuple[_Layer, ...]:
-    """The layers from flax's nested dictionaries, whose kernels are ``[h,w,in,out]``."""
+    """Read the layers from flax's nested dictionaries, whose kernels are ``[h,w,in,out]``."""
     layers: list[_Layer] = []
     inputs, compared = 3, 0
     for i, conv in enumerate(architecture.convs):
@@ -263,7 +263,7 @@ class _ArrayUnpickler(pickle.Unpickler):
     """An unpickler that knows only the two stand-ins above: a pickle can call nothing else."""
 
     def find_class(self, module: str, name: str) -> type[_StoredArray] | type[_StoredDtype]:
-        """The stand-in for a name of numpy's."""
+        """Return the stand-in for a name of numpy's."""
         if (module, name) not in _STAND_INS:
             raise pickle.UnpicklingError(f"refused to load {module}.{name}")
         return _STAND_INS[module, name]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,12 +21,12 @@ BORDER_COLOR = (255, 230, 40)  # of superpixels: seldom in photos
 
 
 def to_picture(image: np.ndarray) -> Picture:
-    """``[h,w,3]`` float in [0, 1] -> 8 bit, RGB."""
+    """Round a picture ``[h,w,3]``, float in [0, 1], to 8 bit RGB."""
     return (image.clip(0, 1) * 255).round().astype(np.uint8)
 
 
 def label(picture: Picture, text: str) -> Picture:
-    """The picture under a dark band with a line of text, shortened until it fits."""
+    """Put a picture under a dark band with a line of text, shortened until it fits."""
     text = text.encode("utf-8", "replace").decode()  # OpenCV does not survive halves of characters
     face, scale = cv2.FONT_HERSHEY_SIMPLEX, 0.42
     while len(text) > 1 and cv2.getTextSize(text, face, scale, 1)[0][0] > picture.shape[1] - 8:
@@ -41,15 +42,15 @@ def view_pictures(
     photos: np.ndarray | None = None,
     *,
     max_views: int = 4,
-    near: float = 0.01,
+    **drawing: Any,
 ) -> list[list[tuple[str, np.ndarray]]]:
-    """For each view, at most ``max_views``: the photo where there is one, then each scene from the same camera.
+    """Render each scene from at most ``max_views`` views, after the photo where there is one.
 
     Every render ``[h,w,3]`` comes with a line of text: its name, its number of Gaussians, and its PSNR against the
-    photo ``[c,h,w,3]``, or without photos against the first scene.
+    photo ``[c,h,w,3]``, or without photos against the first scene. ``drawing`` is passed on to :func:`gsmerge.render`.
     """
     ids = pick_views(len(cameras), max_views)
-    renders = [render(gaussians, cameras[ids], near=near).images.clip(0, 1) for _, gaussians in scenes]
+    renders = [render(gaussians, cameras[ids], **drawing).images.clip(0, 1) for _, gaussians in scenes]
     views = []
     for row, view in enumerate(ids):
         pictures = [] if photos is None else [(f"photo, view {view}", photos[view])]
@@ -62,7 +63,7 @@ def view_pictures(
 
 
 def contact_sheet(views: Sequence[Sequence[tuple[str, np.ndarray]]], *, min_width: int = 320) -> Picture:
-    """One row per view with its pictures under their labels.
+    """Put the pictures of each view in a row, under their labels.
 
     Small ones are enlarged by a whole factor until a tile has ``min_width`` columns.
     """
@@ -77,7 +78,7 @@ def _tile(image: np.ndarray, text: str, factor: int) -> Picture:
 
 
 def _join(pictures: Sequence[Picture], axis: int) -> Picture:
-    """Pictures in a row or a column, with a gap between."""
+    """Put pictures in a row or a column, with a gap between."""
     shape = list(pictures[0].shape)
     shape[axis] = GAP
     gap = np.full(shape, 255, np.uint8)
@@ -86,14 +87,14 @@ def _join(pictures: Sequence[Picture], axis: int) -> Picture:
 
 
 def draw_borders(image: np.ndarray, labels: np.ndarray) -> Picture:
-    """The photo ``[h,w,3]`` (sRGB in [0, 1]) with the borders between superpixels ``[h,w]`` in yellow."""
+    """Draw the borders between superpixels ``[h,w]`` in yellow over a photo ``[h,w,3]``, sRGB in [0, 1]."""
     picture = to_picture(image)
     picture[borders(labels)] = BORDER_COLOR
     return picture
 
 
 def borders(labels: np.ndarray) -> np.ndarray:
-    """``[h,w]`` bool: pixels whose left or upper neighbour belongs to another superpixel ``[h,w]``."""
+    """Mark the pixels, ``[h,w]`` bool, whose left or upper neighbour belongs to another superpixel ``[h,w]``."""
     border = np.zeros(labels.shape, bool)
     border[:, 1:] |= labels[:, 1:] != labels[:, :-1]
     border[1:] |= labels[1:] != labels[:-1]
@@ -101,7 +102,7 @@ def borders(labels: np.ndarray) -> np.ndarray:
 
 
 def draw_means(image: np.ndarray, labels: np.ndarray) -> Picture:
-    """Every superpixel ``[h,w]`` (from 0) filled with its mean colour of ``[h,w,3]`` sRGB in [0, 1]."""
+    """Fill every superpixel ``[h,w]`` (from 0) with its mean colour of ``[h,w,3]``, sRGB in [0, 1]."""
     flat = labels.reshape(-1)
     sizes = np.maximum(np.bincount(flat), 1)
     means = np.stack([np.bincount(flat, channel) / sizes for channel in image.reshape(-1, 3).T], 1)
@@ -109,12 +110,12 @@ def draw_means(image: np.ndarray, labels: np.ndarray) -> Picture:
 
 
 def draw_heat(values: np.ndarray) -> Picture:
-    """``[h,w]`` non-negative values as a heat map, the 99th percentile at the top."""
+    """Draw non-negative values ``[h,w]`` as a heat map, the 99th percentile at the top."""
     values = values.astype(np.float64)
     return heat_map((values / (np.quantile(values, 0.99) or 1.0)).clip(0, 1))
 
 
 def heat_map(levels: np.ndarray) -> Picture:
-    """``[h,w]`` levels in [0, 1] from black through red to yellow."""
+    """Draw levels ``[h,w]`` in [0, 1] from black through red to yellow."""
     colored = cv2.applyColorMap((levels * 255).round().astype(np.uint8), cv2.COLORMAP_INFERNO)
     return np.ascontiguousarray(colored[..., ::-1], np.uint8)

@@ -1,10 +1,11 @@
-"""An evaluation -> a JSON document with a stable schema, a CSV of one row per view, and a table for people."""
+"""An evaluation -> a JSON document with a stable schema, a CSV of one row per view, and tables for people."""
 
 from __future__ import annotations
 
 import csv
+import html
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, fields
 from typing import Any
 
@@ -12,7 +13,11 @@ from gsmerge.measure.align import PoseChange
 from gsmerge.measure.evaluate import AlignedScore, Evaluation, Quality, ResultScores, ZoomScore
 from gsmerge.report import csv_cell, document_head, human_bytes
 
-ZOOMED = {"psnr": 2, "ssim": 3}  # what is measured at other sizes, with the decimals that people are shown
+Row = Sequence[str]
+Table = tuple[str, Row, Sequence[Row]]  # heading, columns, rows
+
+ZOOMED = ("psnr", "ssim")  # what is measured at other sizes
+COLUMNS = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips_vgg": "LPIPS VGG", "lpips_alex": "LPIPS AlexNet"}
 METRICS = tuple(field.name for field in fields(Quality))
 MASKED = "_visible"  # suffix of what is measured over the pixels that the input views have seen
 CSV_COLUMNS = (
@@ -22,11 +27,11 @@ CSV_COLUMNS = (
 
 
 def evaluation_document(
-    evaluation: Evaluation, files: Mapping[str, Mapping[str, Any]], notes: Sequence[str] = ()
+    evaluation: Evaluation, facts: Mapping[str, Mapping[str, Any]], notes: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """An evaluation as plain JSON types, with what is known of each result's file (path, bytes, bytes by attribute).
+    """Write an evaluation as plain JSON types, with further facts on each result, such as its file's path and bytes.
 
-    ``schema_version`` 1: tool, reference, views, results (file, count, ratio, render seconds, means by split, a score
+    ``schema_version`` 1: tool, reference, views, results (facts, count, ratio, render seconds, means by split, a score
     for each view), notes. Means and scores have ``zooms`` where other sizes than the photos' own were asked for,
     those of held-out views ``aligned`` and ``pose_change`` where that was, and ``antialiased`` is there where it is
     true. Keys are only ever added within one schema version.
@@ -36,15 +41,15 @@ def evaluation_document(
         "reference": evaluation.reference,
         **({"antialiased": True} if evaluation.options.antialiased else {}),
         "num_views": dict(evaluation.num_views),
-        "results": [_result(one, evaluation, files.get(one.name, {})) for one in evaluation.results],
+        "results": [_result(one, evaluation, facts.get(one.name, {})) for one in evaluation.results],
         "notes": [*notes, *evaluation.notes],
     }
 
 
-def _result(one: ResultScores, evaluation: Evaluation, file: Mapping[str, Any]) -> dict[str, Any]:
+def _result(one: ResultScores, evaluation: Evaluation, facts: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "name": one.name,
-        **file,
+        **facts,
         "num_gaussians": one.num_gaussians,
         "ratio": one.ratio,
         "render_seconds": round(one.render_seconds, 5),
@@ -75,13 +80,13 @@ def _mean(one: ResultScores, split: str, evaluation: Evaluation) -> dict[str, An
 
 
 def _aligned(scores: Sequence[AlignedScore], change: PoseChange | None) -> dict[str, Any]:
-    """``aligned`` by way and ``pose_change``, where there are any."""
+    """Make ``aligned`` by way, and ``pose_change``, where there are any."""
     ways = {"aligned": {one.align: _flat(one.full, one.masked) for one in scores}} if scores else {}
     return ways | ({"pose_change": asdict(change)} if change else {})
 
 
 def _zooms(scores: Sequence[ZoomScore]) -> dict[str, Any]:
-    """``zooms``, where there are any: a list, in the order that was asked for."""
+    """Make ``zooms`` where there are any: a list, in the order that was asked for."""
     names = [name + suffix for suffix in ("", MASKED) for name in ZOOMED]
     flat = [(one.zoom, _flat(one.full, one.masked)) for one in scores]
     return {"zooms": [{"zoom": zoom, **{name: score[name] for name in names}} for zoom, score in flat]} if flat else {}
@@ -92,7 +97,7 @@ def _flat(full: Quality, masked: Quality) -> dict[str, float | None]:
 
 
 def evaluation_csv(document: Mapping[str, Any]) -> str:
-    """One row for each result and view; empty where something was not measured.
+    """Write one row for each result and view; a cell is empty where something was not measured.
 
     Columns such as ``psnr_zoom_0.5`` and ``psnr_visible_zoom_0.5`` follow where other sizes were measured, and such as
     ``psnr_align_pose``, ``pose_degrees`` and ``pose_shift`` where held-out views were aligned.
@@ -111,7 +116,7 @@ def evaluation_csv(document: Mapping[str, Any]) -> str:
 
 
 def _more_columns(view: Mapping[str, Any]) -> dict[str, Any]:
-    """The score of a view, with a column for each figure at another size or after alignment."""
+    """Flatten the score of a view: a column for each figure at another size or after alignment."""
     row = {key: value for key, value in view.items() if key not in ("zooms", "aligned", "pose_change")}
     for score in view.get("zooms", ()):
         row |= {f"{key}_zoom_{score['zoom']:g}": value for key, value in score.items() if key != "zoom"}
@@ -120,59 +125,119 @@ def _more_columns(view: Mapping[str, Any]) -> dict[str, Any]:
     return row | {f"pose_{key}": value for key, value in view.get("pose_change", {}).items()}
 
 
-def evaluation_lines(document: Mapping[str, Any]) -> list[str]:
-    """A table for people: one line for each result and split, over the pixels that the input views have seen."""
-    means = [mean for result in document["results"] for mean in result["mean"].values()]
-    nets = [net for net in ("lpips_vgg", "lpips_alex") if any(mean[net + MASKED] is not None for mean in means)]
-    width = max(6, *(len(result["name"]) for result in document["results"]))
-    head = f"{'result':{width}}  {'Gaussians':>12}  {'kept':>7}  {'size':>9}  {'ms/view':>8}  {'views':<8} {'PSNR':>6}"
-    head += "   SSIM" + "".join(f"  {name.replace('lpips_', 'LPIPS '):>10}" for name in nets)
+def evaluation_tables(document: Mapping[str, Any]) -> Iterator[Table]:
+    """Make the tables of an evaluation for people: heading, columns, and rows of text."""
+    results = document["results"]
+    yield (
+        "Size",
+        ("", "Gaussians", "kept", "file", "smaller by", "bytes each", "ms/view", "overdraw"),
+        [_size_row(result, results[0]) for result in results],
+    )
     how = ", rendered antialiased" if document.get("antialiased") else ""
-    lines = [f"against {document['reference']}, over the pixels that the input views have seen{how}", head]
-    for result in document["results"]:
-        size = human_bytes(result["bytes"]) if "bytes" in result else ""
-        for split, mean in result["mean"].items():
-            line = f"{result['name']:{width}}  {result['num_gaussians']:>12,}  {100 * result['ratio']:>6.2f}%"
-            line += f"  {size:>9}  {1000 * result['render_seconds']:>8.1f}  {split:<8}"
-            line += f" {_number(mean['psnr' + MASKED], 2):>6}  {_number(mean['ssim' + MASKED], 3)}"
-            lines.append(line + "".join(f"  {_number(mean[name + MASKED], 3):>10}" for name in nets))
-    return lines + _zoom_lines(document, width) + _aligned_lines(document, width, nets)
+    seen = f"against {document['reference']}, over the pixels that the input views have seen{how}"
+    means = [(result["name"], split, mean) for result in results for split, mean in result["mean"].items()]
+    yield (
+        f"Quality {seen}",
+        ("", "views", *COLUMNS.values()),
+        [(name, f"{split} ({document['num_views'][split]})", *_cells(mean)) for name, split, mean in means],
+    )
+    sizes = [one["zoom"] for one in means[0][2].get("zooms", ())]
+    heads = [f"{name.upper()} {zoom:g}x" for zoom in sizes for name in ZOOMED]
+    yield "At other sizes, photos resized", ("", "views", *heads), [
+        (name, split, *(cell for one in mean["zooms"] for cell in _cells(one, ZOOMED)))
+        for name, split, mean in means if sizes
+    ]  # fmt: skip
+    yield (
+        "Held-out views, aligned with their photos",
+        ("", "aligned", *COLUMNS.values(), "cameras moved by (mean)"),
+        [
+            (name, way, *_cells(scores), _move(mean) if way == "pose" else "")
+            for name, _, mean in means
+            for way, scores in mean.get("aligned", {}).items()
+        ],
+    )
+    yield (
+        "Render time",
+        ("", "device", "pixels", "ms/frame", "faster by", "earned back after"),
+        [_speed_row(result, speed) for result in results for speed in result.get("speeds", ())],
+    )
 
 
-def _zoom_lines(document: Mapping[str, Any], width: int) -> list[str]:
-    """PSNR and SSIM at other sizes: a line for each result and split, two columns for each size; empty without them."""
-    lines: list[str] = []
-    for result in document["results"]:
-        for split, mean in result["mean"].items():
-            sizes = mean.get("zooms", ())
-            if sizes and not lines:
-                names = [f"{name} {one['zoom']:g}x" for one in sizes for name in ("PSNR", "SSIM")]
-                lines = ["at other sizes, photos resized", f"{'result':{width}}  {'views':<8}"]
-                lines[1] += "".join(f" {name:>11}" for name in names)
-            if sizes:
-                cells = [_number(one[name + MASKED], digits) for one in sizes for name, digits in ZOOMED.items()]
-                lines.append(f"{result['name']:{width}}  {split:<8}" + "".join(f" {cell:>11}" for cell in cells))
+def _size_row(result: Mapping[str, Any], first: Mapping[str, Any]) -> Row:
+    size, whole, overdraw = result.get("bytes"), first.get("bytes"), result.get("overdraw")
+    each = sum(result.get("bytes_by_attribute", {}).values()) / max(result["num_gaussians"], 1)
+    return (
+        result["name"],
+        f"{result['num_gaussians']:,}",
+        f"{100 * result['ratio']:.2f} %",
+        "" if size is None else human_bytes(size),
+        "" if result is first or not (size and whole) else f"{whole / size:.1f} x",
+        f"{each:.1f}" if each else "",
+        f"{1000 * result['render_seconds']:.1f}",
+        "" if overdraw is None else f"{overdraw:.1f}",
+    )
+
+
+def _speed_row(result: Mapping[str, Any], speed: Mapping[str, Any]) -> Row:
+    threads = f", {speed['threads']} threads" if speed["threads"] else ""
+    faster = f"{speed['speedup']:.1f} x" if "speedup" in speed else ""
+    frames, merge = speed.get("break_even_frames"), result.get("merge_seconds")
+    earned = "" if merge is None else "never" if frames is None else f"{frames:,.0f} frames ({merge:.1f} s of merging)"
+    size = f"{speed['width']} x {speed['height']}"
+    return result["name"], speed["device"] + threads, size, f"{1000 * speed['seconds']:.1f}", faster, earned
+
+
+def _cells(score: Mapping[str, Any], names: Iterable[str] = METRICS) -> Iterator[str]:
+    """Format the figures of the visible pixels; empty where one was not measured."""
+    for name in names:
+        value = score[name + MASKED]
+        yield "" if value is None else f"{value:.{2 if name == 'psnr' else 3}f}"
+
+
+def _move(mean: Mapping[str, Any]) -> str:
+    change = mean["pose_change"]
+    return f"{change['degrees']:.2f} degrees, {100 * change['shift']:.2f} % of the depth"
+
+
+def filled_tables(document: Mapping[str, Any]) -> Iterator[Table]:
+    """Make the tables as of :func:`evaluation_tables`, without columns and tables in which nothing was measured."""
+    for heading, head, rows in evaluation_tables(document):
+        kept = [i for i in range(len(head)) if i == 0 or any(row[i] for row in rows)]
+        if rows:
+            yield heading, [head[i] for i in kept], [[row[i] for i in kept] for row in rows]
+
+
+def evaluation_lines(document: Mapping[str, Any]) -> list[str]:
+    """Write the tables as lines for a terminal: the first column to the left, the others to the right."""
+    lines = []
+    for heading, head, rows in filled_tables(document):
+        widths = [max(len(row[i]) for row in (head, *rows)) for i in range(len(head))]
+        lines.append(heading)
+        for name, *cells in (head, *rows):
+            aligned = (cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True))
+            lines.append("  ".join((f"  {name:{widths[0]}}", *aligned)))
     return lines
 
 
-def _aligned_lines(document: Mapping[str, Any], width: int, nets: Sequence[str]) -> list[str]:
-    """Figures after alignment: a line for each result and way; empty without them."""
-    lines: list[str] = []
-    digits = {"psnr": 2, "ssim": 3, **dict.fromkeys(nets, 3)}
-    for result in document["results"]:
-        mean = result["mean"].get("target", {})
-        for way, scores in mean.get("aligned", {}).items():
-            cells = [f"  {_number(scores[name + MASKED], places):>10}" for name, places in digits.items()]
-            change = mean.get("pose_change") if way == "pose" else None
-            moved = f"  {change['degrees']:.2f} degrees, {100 * change['shift']:.2f}% of the depth" if change else ""
-            lines.append(f"{result['name']:{width}}  {way:<8}" + "".join(cells) + moved)
-    if not lines:
-        return []
-    names = (name.upper() if name in ZOOMED else name.replace("lpips_", "LPIPS ") for name in digits)
-    head = f"{'result':{width}}  {'aligned':<8}" + "".join(f"  {name:>10}" for name in names)
-    poses = any("pose_change" in result["mean"].get("target", {}) for result in document["results"])
-    return ["held-out views, aligned with their photos", head + ("  cameras moved by (mean)" if poses else ""), *lines]
+def evaluation_markdown(document: Mapping[str, Any]) -> str:
+    """Write the tables in Markdown, and the notes below them."""
+    lines = [f"# {_plain(page_title(document))}", ""]
+    for title, head, rows in filled_tables(document):
+        lines += [f"## {title}", "", _line(head), _line(["---", *["---:"] * (len(head) - 1)]), *map(_line, rows), ""]
+    lines += [f"- {_plain(note)}" for note in document["notes"]]
+    return "\n".join(lines).rstrip() + "\n"
 
 
-def _number(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
+def page_title(document: Mapping[str, Any]) -> str:
+    """Name the scene of an evaluation, and the results that it is compared with."""
+    first, *others = document["results"]
+    return f"{first.get('path', first['name'])}" + (": before and after" if others else "")
+
+
+def _line(cells: Row) -> str:
+    return "| " + " | ".join(_plain(cell).replace("|", "\\|") for cell in cells) + " |"
+
+
+def _plain(text: str) -> str:
+    """Escape text so that it is one line and no HTML in Markdown."""
+    return " ".join(html.escape(text, quote=False).split())

@@ -1,10 +1,11 @@
-"""Render time of scenes, and how many Gaussians are blended into a pixel."""
+"""The costs of drawing scenes: render time, Gaussians blended into a pixel, and frames until merging pays."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -18,56 +19,68 @@ NUM_VIEWS, REPEATS = 3, 3  # evenly spread views that are rendered, each so many
 MAX_REPEATED_SECONDS = 2.0  # what takes longer is rendered once
 
 
-@dataclass(frozen=True)
-class Speed:
-    """Time to render one view of a scene."""
-
-    device: str  # "cpu" or "cuda"
-    width: int  # of the picture, pixels
-    height: int  # the same
-    threads: int  # processor threads that rendered it; 0 on a GPU
-    seconds: float  # mean over some views of the shortest of some repetitions
-
-
-def resized(cameras: Cameras, long_side: int) -> Cameras:
-    """The same cameras with images whose longer side has ``long_side`` pixels."""
-    factor = long_side / max(cameras.width, cameras.height)
+def zoom_cameras(cameras: Cameras, zoom: float) -> Cameras:
+    """Resize the cameras' images to ``zoom`` times as many pixels per side, with intrinsics of that size."""
+    long_side = max(cameras.width, cameras.height)
+    factor = max(1, round(zoom * long_side)) / long_side
     size = max(1, round(cameras.width * factor)), max(1, round(cameras.height * factor))
     scale = np.array([size[0] / cameras.width, size[1] / cameras.height, 1.0], cameras.Ks.dtype)
     return replace(cameras, Ks=cameras.Ks * scale[:, None], width=size[0], height=size[1])
 
 
-def measure_speeds(
+def measure_costs(
     scenes: Mapping[str, Gaussians],
     cameras: Cameras,
-    long_sides: Sequence[int],
+    zooms: Sequence[float],
     near: float,
     *,
+    merge_seconds: Mapping[str, float] | None = None,
     threads: int | None = None,
-) -> dict[str, tuple[Speed, ...]]:
-    """Render scenes from a few of the views at several sizes, also with CUDA where it can be used.
+) -> dict[str, dict[str, Any]]:
+    """Measure what drawing each scene costs, also with CUDA where it can be used.
 
-    The scenes take turns, so that a machine that slows down slows all of them. ``long_sides`` are pixels along the
-    longer side, ``near`` is in world units.
+    The scenes take turns, so that a machine that slows down slows all of them.
+
+    Args:
+        scenes: The first is the one that the others are compared with.
+        cameras: Views to draw, of which a few are chosen.
+        zooms: Sizes of the pictures, in units of the cameras' own.
+        near: Near plane, world units.
+        merge_seconds: Time that making a scene took, where it is known.
+        threads: Processor threads; None: all.
+
+    Returns:
+        Plain JSON types by name: ``overdraw``, Gaussians blended into a pixel; ``speeds`` by device and zoom: seconds
+        per view, and of all scenes but the first ``speedup`` and ``break_even_frames``, next to ``merge_seconds``.
     """
     from gsmerge.gpu import cuda_problem
 
     few = cameras[pick_views(len(cameras), NUM_VIEWS)]
-    speeds: dict[str, list[Speed]] = {name: [] for name in scenes}
+    costs: dict[str, dict[str, Any]] = {
+        name: {"overdraw": round(overdraw(gaussians, few, near), 3), "speeds": []} for name, gaussians in scenes.items()
+    }
     with use_threads(threads) as used:
         for device in ("cpu",) if cuda_problem() else ("cpu", "cuda"):
             on_cpu = device == "cpu"
             placed = scenes if on_cpu else {name: gaussians.to(device) for name, gaussians in scenes.items()}
-            for side in long_sides:
-                views = resized(few, side)
+            for zoom in zooms:
+                views = zoom_cameras(few, zoom)
+                head = {"device": device, "width": views.width, "height": views.height}
+                head["threads"] = used if on_cpu else 0
                 for name, seconds in _time_in_turns(placed, views if on_cpu else views.to(device), near).items():
-                    count = used if on_cpu else 0
-                    speeds[name].append(Speed(device, views.width, views.height, count, seconds))
-    return {name: tuple(measured) for name, measured in speeds.items()}
+                    costs[name]["speeds"].append({**head, "seconds": round(seconds, 6)})
+    first, *others = scenes
+    for name in others:
+        costs[name]["merge_seconds"] = merge = (merge_seconds or {}).get(name)
+        for base, speed in zip(costs[first]["speeds"], costs[name]["speeds"], strict=True):
+            before, after = base["seconds"], speed["seconds"]
+            speed["speedup"] = before / after
+            speed["break_even_frames"] = None if merge is None else break_even(merge, before, after)
+    return costs
 
 
 def _time_in_turns(scenes: Mapping[str, Gaussians], views: Cameras, near: float) -> dict[str, float]:
-    """Seconds per view of each scene, one after the other and again."""
+    """Time each scene's views, one scene after the other and again; return seconds per view."""
     shortest = {name: np.full(len(views), np.inf) for name in scenes}
     for gaussians in scenes.values():  # compiles, and fills caches
         time_render(gaussians, views[[0]], near)
@@ -81,7 +94,7 @@ def _time_in_turns(scenes: Mapping[str, Gaussians], views: Cameras, near: float)
 
 
 def time_render(gaussians: Gaussians, view: Cameras, near: float) -> float:
-    """Seconds to render a view."""
+    """Time the rendering of a view, seconds."""
     start = time.perf_counter()
     image = render(gaussians, view, near=near).images
     if not isinstance(image, np.ndarray) and image.is_cuda:
@@ -91,12 +104,19 @@ def time_render(gaussians: Gaussians, view: Cameras, near: float) -> float:
     return time.perf_counter() - start
 
 
+def break_even(merge_seconds: float, before: float, after: float) -> float | None:
+    """Count the frames after which merging has paid for itself in render time (paper, supplement: timing).
+
+    ``before`` and ``after`` are seconds per frame; None where the result does not render faster.
+    """
+    return merge_seconds / (before - after) if after < before else None
+
+
 def overdraw(gaussians: Gaussians, cameras: Cameras, near: float) -> float:
-    """Gaussians blended into a pixel, on average over some of the views: what render time depends on."""
-    splats, entries, pixels = prepare(gaussians), 0, 0
+    """Count the Gaussians blended into a pixel, on average over the views: render time depends on it."""
+    splats, entries = prepare(gaussians), 0
     viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
-    for view in pick_views(len(cameras), NUM_VIEWS):
+    for view in range(len(cameras)):
         plan = plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, near=near)
         entries += len(view_weights(plan).lanes)
-        pixels += cameras.width * cameras.height
-    return entries / max(pixels, 1)
+    return entries / max(len(cameras) * cameras.width * cameras.height, 1)

@@ -1,23 +1,27 @@
-"""Which pixels of a view show what the input views have seen; the rest is extrapolation (supplement A)."""
+"""Pixels of a view that show what the input views have seen (supplement A), and photos and masks at other sizes."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsmerge.geometry import project
 from gsmerge.render import render
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, Scene
 
 Points = NDArray[np.float64]  # [n,3]
 _OPAQUE = 0.5  # alpha from which a rendered depth is that of a surface
+MAX_SAMPLES = 200_000  # Gaussians that a share is measured on
 _CHUNK = 1 << 18  # points at a time: all of them, in every thread, would take too much memory
 _DILATION = 3  # pixels of the input views per side of the square that every sample marks
 
 
 def context_points(scene: Scene, near: float) -> Points:
-    """``[n,3]`` a point in the world for every pixel of the input views: their depth samples.
+    """Find a point in the world for every pixel of the input views, ``[n,3]``: their depth samples.
 
     Of a scene with pixels the Gaussians are the samples; otherwise depth beyond ``near``, world units, is rendered.
     """
@@ -37,7 +41,7 @@ def _rendered_points(gaussians: Gaussians, camera: Cameras, near: float) -> Poin
 
 
 def visible_pixels(points: Points, cameras: Cameras, near: float, sources: Cameras | None = None) -> NDArray[np.bool_]:
-    """``[c,h,w]`` pixels on which, or next to which, at least one of the points ``[n,3]`` falls, whatever occludes it.
+    """Mark the pixels ``[c,h,w]`` on or next to which at least one of the points ``[n,3]`` falls, occluded or not.
 
     Points nearer than ``near``, world units, do not count. Where the views have smaller pixels than those that the
     points come from (``sources``), a point marks proportionally more of them, as there would be gaps otherwise.
@@ -61,8 +65,47 @@ def visible_pixels(points: Points, cameras: Cameras, near: float, sources: Camer
 
 
 def _side(K: np.ndarray, sources: Cameras | None) -> int:
-    """Pixels per side, an odd number, of the square that a sample marks in a view with the intrinsics ``K [3,3]``."""
+    """Choose the side, an odd number of pixels, of the square that a sample marks under the intrinsics ``K [3,3]``."""
     if sources is None:
         return _DILATION
     focals = [np.sqrt(one[..., 0, 0] * one[..., 1, 1]) for one in (K, sources.Ks.astype(np.float64))]  # pixels
     return max(_DILATION, 2 * round((_DILATION * float(focals[0] / np.median(focals[1])) - 1) / 2) + 1)
+
+
+def share_outside(gaussians: Gaussians, cameras: Cameras) -> float:
+    """Measure the share of the Gaussians, of many some, whose centres no view's picture shows; 0 without any."""
+    points = gaussians.means[:: max(1, -(-len(gaussians) // MAX_SAMPLES))].astype(np.float64)
+    seen = np.zeros(len(points), bool)
+    for inside in inside_views(points, cameras):
+        seen |= inside
+    return float(1 - seen.mean()) if len(points) else 0.0
+
+
+def inside_views(points: np.ndarray, cameras: Cameras) -> Iterator[np.ndarray]:
+    """Tell for each view which points ``[n,3]`` its picture shows, ``[n]`` bool."""
+    for view in range(len(cameras)):
+        (pixels,), (depths,) = project(points, cameras[[view]])
+        yield (depths > 0) & ((pixels >= 0) & (pixels < (cameras.width, cameras.height))).all(1)
+
+
+def resize_photo(photo: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Resize a photo ``[h,w,3]`` to a size in pixels: area averages where it is smaller, cubic where it is larger."""
+    smaller = width * height < photo.shape[0] * photo.shape[1]
+    way = cv2.INTER_AREA if smaller else cv2.INTER_CUBIC
+    return np.asarray(cv2.resize(photo, (width, height), interpolation=way)).clip(0, 1)
+
+
+def resize_mask(mask: NDArray[np.bool_], width: int, height: int) -> NDArray[np.bool_]:
+    """Resize a mask ``[h,w]``: ``[height,width]``, of which every part of a pixel lies in the mask."""
+    holes = np.pad(np.cumsum(np.cumsum(~mask, 0, dtype=np.int64), 1), ((1, 0), (1, 0)))
+    (top, bottom), (left, right) = (
+        _covered(old, new) for old, new in zip(mask.shape, (height, width), strict=True)
+    )  # fmt: skip
+    inside = holes[bottom][:, right] - holes[top][:, right] - holes[bottom][:, left] + holes[top][:, left]
+    return np.asarray(inside == 0)
+
+
+def _covered(old: int, new: int) -> tuple[np.ndarray, np.ndarray]:
+    """Find the first pixel, and the one after the last, of ``old`` in a row that each of ``new`` pixels overlaps."""
+    pixel = np.arange(new)
+    return pixel * old // new, -(-(pixel + 1) * old // new)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
@@ -11,8 +12,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsmerge import __version__
+from gsmerge.measure.preview import to_picture
+from gsmerge.measure.scores import filled_tables, page_title
 from gsmerge.report import human_bytes
-from gsmerge.view.data import PageView, Side, ViewData
+from gsmerge.view.data import PageView, Side, ViewData, encode_still
 
 if TYPE_CHECKING:
     import jinja2
@@ -55,6 +58,36 @@ def view_page(data: ViewData) -> str:
         splats=splats,
         engine=engine and base64_text(engine),
     )
+
+
+def report_page(document: Mapping[str, Any], pictures: Sequence[Sequence[tuple[str, np.ndarray]]]) -> str:
+    """Make the page of an evaluation: headline, pictures with a swipe, tables.
+
+    Args:
+        document: As of :func:`gsmerge.measure.scores.evaluation_document`.
+        pictures: For each view the text and the picture ``[h,w,3]`` of each scene, sRGB in [0, 1].
+    """
+    results = document["results"]
+    title = headline = page_title(document)
+    tiles: list[tuple[str, str, str]] = []
+    if len(results) > 1:
+        before, after = results[:2]
+        split = "target" if "target" in before["mean"] else "context"
+        psnrs = [one["mean"][split]["psnr_visible"] for one in (before, after)]
+        headline = headline_of(before["num_gaussians"], after["num_gaussians"], *psnrs)
+        milliseconds = [1000 * one["render_seconds"] for one in (before, after)]
+        tiles = [
+            ("Gaussians", f"{before['num_gaussians']:,}", f"{after['num_gaussians']:,}"),
+            ("File", human_bytes(before["bytes"]), human_bytes(after["bytes"])),
+            ("Render time", f"{milliseconds[0]:.1f}", f"{milliseconds[1]:.1f} ms"),
+        ]
+    views = [
+        [(text, data_uri(encode_still(to_picture(image)), "image/webp")) for text, image in one] for one in pictures
+    ]
+    return render_template(
+        "report.html", policy=PICTURES, title=title, views=views, headline=headline, tiles=tiles,
+        tables=list(filled_tables(document)), notes=document["notes"],
+    )  # fmt: skip
 
 
 def headline(before: Side, after: Side) -> str:

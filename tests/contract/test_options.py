@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import re
 from collections.abc import Callable
 from enum import Enum
@@ -18,9 +17,8 @@ from gsmerge.batch import BatchOptions
 from gsmerge.batch.options import ENGINES
 from gsmerge.cli import main
 from gsmerge.cli.app import app
-from gsmerge.cli.options import OPTIONS
+from gsmerge.cli.options import HINTS, OPTIONS, setting_kinds
 from gsmerge.io import ReadHints
-from gsmerge.io.formats.ply import OpacityChoice
 from gsmerge.measure.evaluate import NETS
 from gsmerge.online.options import OnlineOptions
 from gsmerge.research.generate import GenerateOptions
@@ -29,10 +27,7 @@ from gsmerge.research.training import preset_options
 COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 SETTINGS = gsmerge.CompactOptions().to_dict()
 # Defaults that help describes, because they depend on other settings or on the machine
-WORDED = {
-    "fit_steps": "by effort", "match": "overlap, none for a draft", "threads": "all processors",
-    "min_opacity": "1/255",
-}  # fmt: skip
+WORDED = {"threads": "all processors"}
 
 
 def choices(parameter: Parameter) -> tuple[str, ...]:
@@ -56,10 +51,8 @@ def test_choices_are_the_library_s(name: str) -> None:
     given = choices(OPTIONS[name])
     if name in SETTINGS:
         known = expected(gsmerge.CompactOptions().with_settings, {name: "?"})
-    elif name in ("quats", "order"):
-        known = expected(ReadHints, **{name: "?"})
     else:
-        known = set({"opacity": get_args(OpacityChoice), "lpips": (*NETS, "both", "none")}[name])
+        known = {"lpips": {*NETS, "both", "none"}}[name]
     assert set(given) == known
 
 
@@ -83,11 +76,7 @@ def shown(command: str, name: str) -> Any:
 
 
 def test_defaults_of_single_commands_are_the_library_s() -> None:
-    assert shown("compact", "max_side") == str(ReadHints().max_side)
-    assert shown("compact", "exporter") == ReadHints().exporter
-    assert [shown("extend", name) for name in ("max_k", "tolerance", "replay")] == [
-        str(getattr(OnlineOptions(), name)) for name in ("max_k", "tolerance", "replay")
-    ]
+    assert shown("extend", "max_k") == str(OnlineOptions().max_k)
     assert [shown("batch", name) for name in ("retries", "engine", "timeout")] == [1, "local", None]
     assert (BatchOptions().retries, BatchOptions().engine, BatchOptions().timeout) == (1, ENGINES[0], None)
     assert shown("batch", "name") == BatchOptions().output
@@ -98,23 +87,54 @@ def test_defaults_of_single_commands_are_the_library_s() -> None:
     assert shown("train", "steps") == str(preset_options("default").steps)
 
 
-def declared(path: Path) -> int:
-    """Options and arguments that are written down in a file; not those declared elsewhere and worded anew."""
-    calls = [node.func for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
-    names = [f.attr if isinstance(f, ast.Attribute) else getattr(f, "id", "") for f in calls]
-    return sum(names.count(name) for name in ("option", "switch", "argument", "_list"))
+def test_there_are_few_options() -> None:
+    """401 before settings and hints were given by name."""
+    assert sum(len(command.params) for command in COMMANDS.values()) <= 230
+    assert sum(not getattr(p, "hidden", False) for p in COMMANDS["compact"].params) <= 15
 
 
-def test_options_are_declared_once(root: Path) -> None:
-    """366 before there was a table of them."""
-    assert sum(map(declared, (root / "gsmerge" / "cli").glob("*.py"))) <= 130
+def test_settings_and_hints_are_the_library_s() -> None:
+    assert set(setting_kinds(gsmerge.CompactOptions)) == set(SETTINGS)
+    assert set(HINTS) == {"opacity", *vars(ReadHints())}
+
+
+def flags_of(command: str) -> dict[str, str]:
+    return {flag: p.name for p in COMMANDS[command].params for flag in (*p.opts, *p.secondary_opts)}
 
 
 @pytest.mark.parametrize("command", sorted(COMMANDS))
 def test_output_is_one_option_everywhere(command: str) -> None:
-    flags = {flag: p.name for p in COMMANDS[command].params for flag in p.opts}
+    flags = flags_of(command)
     assert flags.get("-o") == flags.get("--output")
-    assert "--out" not in flags
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("compact scene --fit-steps 60", "--fit-steps is no option: use --set fit_steps=VALUE"),
+        ("batch scene --drop-sky", "--drop-sky is no option: use --set drop_sky=true"),
+        ("decode a.gsm --no-normals", "--no-normals is no option: use --set normals=false"),
+        ("inspect scene --order none", "--order is no option: use --hint order=VALUE"),
+        ("inspect scene --poses fixed", "No such option: --poses"),
+        ("generate -o rooms --segmentation grid", "No such option: --segmentation"),
+    ],
+)
+def test_settings_without_an_option_say_how_to_give_them(
+    words: str, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(words.split()) == 2
+    captured = capsys.readouterr()
+    assert said in captured.err
+    assert (captured.out, captured.err.count("\n")) == ("", 1)
+
+
+def test_the_package_names_only_options_that_exist(root: Path) -> None:
+    """In messages, notes and docstrings."""
+    others = {"--help", "--version", "--debug", "--no-deps", "--force-reinstall", "--head"}
+    known = others | {flag for name in COMMANDS for flag in flags_of(name)}
+    files = sorted((root / "gsmerge").rglob("*.py"))
+    named = {(file.name, flag) for file in files for flag in re.findall(r"(?<![\w-])--[a-z][a-z-]+", file.read_text())}
+    assert [pair for pair in sorted(named) if pair[1] not in known] == []
 
 
 def help_of(capsys: pytest.CaptureFixture[str], *words: str) -> str:
@@ -126,17 +146,17 @@ def test_short_help_and_all_of_it(capsys: pytest.CaptureFixture[str], monkeypatc
     monkeypatch.setenv("COLUMNS", "160")
     brief, full = help_of(capsys, "compact", "--help"), help_of(capsys, "compact", "--help-all")
     listed = [set(re.findall(r"^│ (--[\w-]+)", text, re.MULTILINE)) for text in (brief, full)]
-    assert 10 <= len(listed[0] - {"--help", "--help-all"}) <= 15
+    assert len(listed[0] - {"--help"}) == 14  # and the argument SCENE
     every = {p.opts[0] for p in COMMANDS["compact"].params if p.opts[0].startswith("--")}
     assert listed[1] - {"--help"} == every
-    assert all(title in brief for title in ("─ Input ─", "─ How many Gaussians ─", "─ Fitting ─", "─ Output ─"))
+    assert all(title in brief for title in ("─ Input ─", "─ How many Gaussians ─", "─ Method ─", "─ Output ─"))
     assert help_of(capsys, "compact", "--help") == brief
 
 
 def test_help_prints_brackets(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "160")
     assert "gsmerge[cuda]" in help_of(capsys, "compact", "--help")
-    assert "gsmerge[ray]" in help_of(capsys, "batch", "--help")
+    assert "gsmerge[ray]" in help_of(capsys, "batch", "--help-all")
 
 
 def test_commands_are_grouped(capsys: pytest.CaptureFixture[str]) -> None:

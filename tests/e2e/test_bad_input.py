@@ -177,15 +177,21 @@ CASES: dict[str, tuple[Spoil, int, list[str]]] = {
     "output is the input, renamed": (output_is_the_input_by_another_name, 2, ["other than the input"]),
     "output exists": (output_exists, 2, ["scene.compact.ply", "--overwrite"]),
     "report is the output": (report_is_the_output, 2, ["small.ply"]),
-    "K = 0": (given("--k", 0), 2, ["--k"]),
-    "K = 9": (given("--k", 9), 2, ["--k"]),
+    "K = 0": (given("--k", 0), 2, ["k: expected 1 to 8 or mixed, got 0"]),
+    "K = 9": (given("--k", 9), 2, ["k: expected 1 to 8 or mixed, got 9"]),
     "more superpixels than pixels": (given("--superpixels", 48 * 32 + 1), 2, ["1536", "1537"]),
     "no superpixels": (given("--superpixels", 0), 2, ["superpixels"]),
     "share zero": (given("--superpixels", "0%"), 2, ["superpixels"]),
     "share above one": (given("--superpixels", "150%"), 2, ["superpixels"]),
-    "unknown segmentation": (given("--segmentation", "magic"), 2, ["--segmentation", "rdseg"]),
-    "unknown match": (given("--match", "magic"), 2, ["--match", "overlap"]),
+    "unknown segmentation": (given("--set", "segmentation=magic"), 2, ["segmentation", "rdseg"]),
+    "unknown match": (given("--set", "match=magic"), 2, ["--set match", "overlap"]),
     "unknown option": (given("--magic"), 2, ["--magic"]),
+    "unknown setting": (given("--set", "pose=free"), 2, ["--set pose", "the closest name is poses", "settings.md"]),
+    "no setting": (given("--set", "poses"), 2, ["--set: expected NAME=VALUE, got 'poses'"]),
+    "a setting of another type": (given("--set", "overlap=much"), 2, ["--set overlap: expected a number, got 'much'"]),
+    "a setting given twice": (given("--k", 2, "--set", "k=2"), 2, ["--set k: expected it once, got --k too"]),
+    "unknown hint": (given("--hint", "oder=none"), 2, ["--hint oder", "the closest name is order"]),
+    "impossible hint": (given("--hint", "max_side=4"), 2, ["max_side: expected a whole number of at least 16"]),
     "no threads": (given("--threads", 0), 2, ["--threads"]),
 }
 
@@ -220,23 +226,23 @@ def test_a_folder_without_permission_is_told(scene_copy: Path, run: Run) -> None
     assert list(locked.iterdir()) == []
 
 
-@pytest.mark.parametrize("command", ["inspect", "segment", "render", "preview"])
+@pytest.mark.parametrize(
+    "command", ["inspect", "render -o {}/p.png", "render -o {}/out", "render --as superpixels -o {}/out"]
+)
 def test_other_commands_tell_bad_input_too(command: str, scene_copy: Path, run: Run) -> None:
     text_file(scene_copy)
-    scene = scene_copy / "scene.ply" if command == "preview" else scene_copy
-    output = {"inspect": [], "preview": ["-o", scene_copy / "p.png"]}.get(command, ["-o", scene_copy / "out"])
-    outcome = run(command, scene, *output)
+    outcome = run(*command.format(scene_copy).split(), scene_copy)
     assert outcome.code == 3
     assert outcome.err.count("\n") == 1
     assert "expected a PLY file" in outcome.err
     assert not (scene_copy / "p.png").exists()
 
 
-@pytest.mark.parametrize("command", ["segment", "render"])
-def test_occupied_folders_are_refused(command: str, made_scene: Path, tmp_path: Path, run: Run) -> None:
+@pytest.mark.parametrize("kind", ["views", "superpixels"])
+def test_occupied_folders_are_refused(kind: str, made_scene: Path, tmp_path: Path, run: Run) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "mine.txt").write_text("precious")
-    outcome = run(command, made_scene, "-o", tmp_path / "out")
+    outcome = run("render", made_scene, "--as", kind, "-o", tmp_path / "out")
     assert outcome.code == 2
     assert "--overwrite" in outcome.err
     assert listing(tmp_path) == {"out/mine.txt": 8}

@@ -120,7 +120,7 @@ def test_a_killed_process_costs_its_scene_alone(
 def test_a_scene_that_takes_too_long_fails_alone(rooms: Path, tmp_path: Path) -> None:
     quick, slow = rooms / "room0", tmp_path / "slow"
     shutil.copytree(rooms / "room1", slow)
-    said = ("--timeout", 3, "--retries", 0, "--jobs", 1, "-q", "--fit-steps", 1_000_000, "--effort", "draft")
+    said = ("--timeout", 3, "--retries", 0, "--jobs", 1, "-q", "--set", "fit_steps=1000000", "--effort", "draft")
     process = start(slow, "--output", tmp_path / "out", *said)
     errors = process.communicate()[1]
     assert process.returncode == 5

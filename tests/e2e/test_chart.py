@@ -152,7 +152,7 @@ def test_another_scene_another_setting_and_rerun_do_run(copied: Path, merges: li
 def test_what_is_told_of_the_file_counts_for_all_scenes(copied: Path, run: Run) -> None:
     (copied / "room" / "transforms.json").unlink()  # no pixels can be found, and views have to be placed
     shutil.rmtree(copied / "room" / "images")
-    said = ("--order", "none", "--fit", "none", "--budgets", "2%", "--proxy-views", "0", "--lpips", "none")
+    said = ("--hint", "order=none", "--fit", "none", "--budgets", "2%", "--proxy-views", "0", "--lpips", "none")
     outcome = run("chart", copied / "room", "--output", copied / "loose", *said)
     assert outcome.code == 5, "nothing to measure from"
     shutil.copyfile(copied / "room" / "targets" / "transforms.json", copied / "room" / "transforms.json")
@@ -160,7 +160,7 @@ def test_what_is_told_of_the_file_counts_for_all_scenes(copied: Path, run: Run) 
     assert run("chart", copied / "room", "--output", copied / "loose", *said).code == 0
     records = runs(copied / "loose").values()
     assert {(record.views, record.error) for record in records} == {(2, None)}
-    assert all("--order none" in record.command for record in records)
+    assert all("--hint order=none" in record.command for record in records)
 
 
 def test_a_failed_run_does_not_end_the_grid(copied: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -97,7 +97,7 @@ def test_cameras_that_are_not_there_cannot_be_saved(
     monkeypatch.setattr("gsmerge.compact_file.compact", Broken(KeyError("lost")))
     shutil.copy(made_scene / "scene.ply", tmp_path / "alone.ply")
     outcome = run(
-        "compact", tmp_path / "alone.ply", "--order", "none", "--save-cameras", tmp_path / "saved.json", *more
+        "compact", tmp_path / "alone.ply", "--hint", "order=none", "--save-cameras", tmp_path / "saved.json", *more
     )
     assert (outcome.code, outcome.err.count("\n")) == (2, 1), outcome.err
     assert "saved.json: expected a scene with cameras, got none" in outcome.err
@@ -108,7 +108,7 @@ def test_more_superpixels_than_pixels_are_refused_before_the_page_is_made(
     scene_copy: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gsmerge.view.data.evaluate", Broken(KeyError("lost")))
-    call = ("view", scene_copy, scene_copy / "scene.ply", "-o", tmp_path / "a.html", "--superpixels", 999_999)
+    call = ("view", scene_copy, scene_copy / "scene.ply", "-o", tmp_path / "a.html", "--set", "superpixels=999999")
     for more in ((), ("--dry-run",)):
         outcome = run(*call, *more)
         assert (outcome.code, outcome.err.count("\n")) == (2, 1), outcome.err

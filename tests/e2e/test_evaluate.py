@@ -15,15 +15,16 @@ from .conftest import Run
 
 @pytest.fixture
 def small(scene_copy: Path, run: Run) -> Path:
-    assert run("compact", scene_copy, "-o", scene_copy / "small.ply", "--effort", "draft", "-q").code == 0
-    return scene_copy / "small.ply"
+    out = scene_copy / "small.ply"
+    assert run("compact", scene_copy, "-o", out, "-q", "--report", scene_copy / "run.json").code == 0
+    return out
 
 
 def test_table_and_files(scene_copy: Path, small: Path, run: Run, floor: Callable[..., None]) -> None:
     table, report = scene_copy / "a.csv", scene_copy / "a.json"
     outcome = run(
         "evaluate", scene_copy / "scene.ply", small, "--targets", scene_copy / "targets", "--lpips", "none",
-        "--csv", table, "--report", report,
+        "-o", table, "-o", report,
     )  # fmt: skip
     assert (outcome.code, outcome.err) == (0, "")
     assert "small.ply" in outcome.out
@@ -105,27 +106,22 @@ def test_a_trajectory_with_both_kinds_of_views(scene_copy: Path, run: Run) -> No
 def test_no_input_is_replaced(given: str, scene_copy: Path, run: Run) -> None:
     cameras = scene_copy / "targets" / "transforms.json"
     before = cameras.read_bytes()
-    for flags in (("evaluate", scene_copy), ("stress", scene_copy), ("report", scene_copy, scene_copy / "scene.ply")):
-        flag = "-o" if flags[0] == "report" else "--report"
-        path = cameras.with_suffix(".json")
-        outcome = run(*flags, "--targets", scene_copy / given, flag, path, "--overwrite")
+    for command, flag in (("evaluate", "-o"), ("stress", "--report")):
+        outcome = run(command, scene_copy, "--targets", scene_copy / given, flag, cameras, "--overwrite")
         assert (outcome.code, outcome.err.count("\n")) == (2, 1)
         assert "other than the input" in outcome.err
     assert cameras.read_bytes() == before
 
 
-@pytest.mark.parametrize("command", ["evaluate", "report"])
-def test_networks_that_are_not_installed(
-    command: str, scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_networks_that_are_not_installed(scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gsmerge.measure.lpips.lpips_available", lambda net: False)
-    outcome = run(command, scene_copy, scene_copy / "scene.ply", "--lpips", "vgg")
+    outcome = run("evaluate", scene_copy, scene_copy / "scene.ply", "--lpips", "vgg")
     assert outcome.code == 2
     assert "weights are not installed" in outcome.err
 
 
 def test_outputs_are_files_of_their_own(scene_copy: Path, run: Run) -> None:
-    both = ("--csv", scene_copy / "a", "--report", scene_copy / "a")
+    both = ("-o", scene_copy / "a.md", "-o", scene_copy / "a.md")
     assert "got it twice" in run("evaluate", scene_copy, "--lpips", "none", *both).err
     assert "got scene.ply twice" in run("evaluate", scene_copy, "scene.ply", "scene.ply").err
 
@@ -133,7 +129,7 @@ def test_outputs_are_files_of_their_own(scene_copy: Path, run: Run) -> None:
 @pytest.mark.parametrize("command", ["evaluate", "stress"])
 def test_a_scene_without_cameras(command: str, scene_copy: Path, run: Run) -> None:
     (scene_copy / "transforms.json").unlink()
-    outcome = run(command, scene_copy / "scene.ply", "--order", "none", "--targets", scene_copy / "targets")
+    outcome = run(command, scene_copy / "scene.ply", "--hint", "order=none", "--targets", scene_copy / "targets")
     assert outcome.code == 3
     assert "scene.ply: expected cameras to measure from" in outcome.err
 
@@ -145,7 +141,9 @@ def test_a_scene_without_cameras(command: str, scene_copy: Path, run: Run) -> No
         (("--target-images", "images"), 2, "--targets"),
         (("--targets", "nowhere.json"), 3, "expected cameras of held-out views"),
         (("--targets", "transforms.json"), 3, "the scene was not made of"),
-        (("--csv", "scene.ply"), 2, "other than the input"),
+        (("-o", "scene.ply"), 2, "ends in .json, .csv, .md, .html"),
+        (("-o", "transforms.json"), 2, "other than the input"),
+        (("--merge-seconds", "1"), 2, "that of each of 0 AFTER, got 1"),
         (("--align=color",), 2, "expected held-out views"),
         (("--align=colour", "--targets", "targets"), 2, "color or pose"),
         (("--zoom=a,2",), 2, "sizes such as .5,1,2,4"),
@@ -162,3 +160,53 @@ def test_bad_calls(arguments: tuple[str, ...], code: int, words: str, scene_copy
     assert outcome.code == code
     assert words in outcome.err
     assert outcome.err.count("\n") == 1
+
+
+def test_costs_and_files_of_every_kind(scene_copy: Path, small: Path, run: Run) -> None:
+    outputs = {suffix: scene_copy / f"page.{suffix}" for suffix in ("json", "csv", "md", "html")}
+    flags = [part for path in outputs.values() for part in ("-o", path)]
+    call = ("evaluate", scene_copy / "scene.ply", small, "--lpips", "none")
+    outcome = run(*call, *flags, "--zoom", "1,.5", "--merge-seconds", scene_copy / "run.json")
+    assert outcome.code == 0, outcome.err
+    document = json.loads(outputs["json"].read_text())
+    before, after = document["results"]
+    assert [speed["width"] for speed in before["speeds"][:2]] == [96, 48]
+    assert 1 < after["overdraw"] < before["overdraw"]
+    assert after["merge_seconds"] == json.loads((scene_copy / "run.json").read_text())["total_seconds"]
+    assert "| small.ply |" in outputs["md"].read_text()
+    assert "data:image/webp;base64," in outputs["html"].read_text()
+    assert "Render time" in outcome.out
+    assert "overdraw" not in run(*call).out
+    again = run(*call, "-o", outputs["md"])
+    assert (again.code, "--overwrite" in again.err) == (2, True)
+
+
+def test_views_are_placed_in_a_scene_without_cameras(scene_copy: Path, small: Path, run: Run) -> None:
+    (scene_copy / "transforms.json").unlink()
+    small.with_name("small.cameras.json").unlink()
+    outcome = run("evaluate", scene_copy / "scene.ply", small, "--hint", "order=none", "--lpips", "none", "--json")
+    assert outcome.code == 0, outcome.err
+    document = json.loads(outcome.out)
+    assert document["reference"] == "renders of the input"
+    assert any("placed" in note for note in document["notes"])
+
+
+def test_names_that_are_no_text(scene_copy: Path, small: Path, run: Run) -> None:
+    odd = small.rename(scene_copy / "odd\udcff\x1b[31m.ply")
+    outputs = [scene_copy / f"page.{suffix}" for suffix in ("md", "html", "json", "csv")]
+    flags = [part for path in outputs for part in ("-o", path)]
+    outcome = run("evaluate", scene_copy, odd, "--lpips", "none", *flags)
+    assert outcome.code == 0, outcome.err
+    assert all("odd" in path.read_text(encoding="utf-8") for path in outputs)
+    assert r"odd\udcff\x1b[31m.ply" in outcome.out
+
+
+@pytest.mark.parametrize(
+    ("given", "words"), [("transforms.json", "total_seconds"), ("scene.ply", "cannot be read as text")]
+)
+def test_reports_that_are_none(
+    given: str, words: str, scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(scene_copy)
+    outcome = run("evaluate", "scene.ply", "scene.ply", "--lpips", "none", "--merge-seconds", given)
+    assert (outcome.code, words in outcome.err, outcome.err.count("\n")) == (3, True, 1)

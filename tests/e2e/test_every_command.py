@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import gsmerge
-from gsmerge.cli.pictures import picture_stems
+from gsmerge.cli.render import picture_stems
 from gsmerge.io import load_scene
 
 from .conftest import Run, listing
@@ -18,25 +18,25 @@ VIEWS = 5
 WRITERS: dict[str, tuple[str, ...]] = {
     "compact": ("small.ply", "--superpixels", "100", "--fit", "none"),
     "encode": ("small.gsm", "--superpixels", "100"),
-    "segment": ("overlays", "--superpixels", "100"),
-    "render": ("renders",),
-    "preview": ("sheet.png", "--views", "1"),
+    "render --as superpixels": ("overlays", "--superpixels", "100"),
+    "render --as views": ("renders",),
+    "render --as panel": ("sheet.png", "--views", "1"),
     "view": ("page.html", "--no-open"),
 }
 COMMANDS = ("inspect", "evaluate", *WRITERS)
+PICTURES = ("render --as superpixels", "render --as views", "render --as panel")
 
 
 def call(command: str, scene: Path) -> list[object]:
     """The command with its scene, its output, and what makes it fast."""
-    given: Path = scene / "scene.ply" if command == "preview" else scene
     targets = ["--targets", scene / "targets"]
     if command == "inspect":
-        return [command, given]
+        return [command, scene]
     if command == "evaluate":
-        return [command, given, *targets, "--lpips", "none"]
+        return [command, scene, *targets, "--lpips", "none"]
     output, *rest = WRITERS[command]
     more = [scene / "scene.ply", *targets] if command == "view" else []
-    return [command, given, *more, "-o", scene / output, *rest]
+    return [*command.split(), scene, *more, "-o", scene / output, *rest]
 
 
 def spoil_rows(ply: Path) -> None:
@@ -58,13 +58,13 @@ def test_json_is_all_there_is_on_stdout(command: str, scene_copy: Path, run: Run
     assert document["notes"] == []
 
 
-@pytest.mark.parametrize("command", ["segment", "render", "preview"])
+@pytest.mark.parametrize("command", PICTURES)
 def test_json_names_the_pictures(command: str, scene_copy: Path, run: Run) -> None:
     before = listing(scene_copy)
     document = json.loads(run(*call(command, scene_copy), "--json").out)
     written = sorted(str(scene_copy / name) for name in set(listing(scene_copy)) - set(before))
     assert sorted(document["pictures"]) == written
-    assert len(written) == {"segment": 3 * VIEWS, "render": VIEWS, "preview": 1}[command]
+    assert len(written) == dict(zip(PICTURES, (3 * VIEWS, VIEWS, 1), strict=True))[command]
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -92,8 +92,8 @@ def test_a_dry_run_writes_nothing(command: str, scene_copy: Path, run: Run) -> N
 )
 def test_a_dry_run_knows_budgets(wish: tuple[str, ...], most: int, scene_copy: Path, run: Run) -> None:
     arguments = ["compact", scene_copy, "--superpixels", 200, *wish, "--dry-run"]
-    plan = json.loads(run(*arguments, "--json").out)
-    assert plan["output"]["num_gaussians_at_most"] == most
+    plan = json.loads(run(*arguments, "--json").out)["compact"]
+    assert plan["num_gaussians"] == most
     assert plan["superpixels_per_view"] is None
     assert f"at most {most:,} Gaussians" in run(*arguments).out
 
@@ -119,16 +119,16 @@ def test_odd_rows_reach_the_scene_s_notes_and_the_report(scene_copy: Path, run: 
     assert len(named) == 2  # who names the encoding need not be told
 
 
-@pytest.mark.parametrize("command", ["segment", "render"])
+@pytest.mark.parametrize("command", PICTURES[:2])
 def test_no_folder_is_left_where_the_input_is_bad(command: str, scene_copy: Path, run: Run) -> None:
     (scene_copy / "scene.ply").write_text("These are notes, not Gaussians.\n")
     assert run(*call(command, scene_copy)).code == 3
     assert not (scene_copy / WRITERS[command][0]).exists()
 
 
-@pytest.mark.parametrize("command", ["segment", "render"])
+@pytest.mark.parametrize("command", PICTURES[:2])
 def test_folders_that_cannot_be_made_are_told_first(command: str, scene_copy: Path, run: Run) -> None:
-    outcome = run(command, scene_copy, "-o", scene_copy / "scene.ply" / "pictures")
+    outcome = run(*command.split(), scene_copy, "-o", scene_copy / "scene.ply" / "pictures")
     assert outcome.code == 3
     assert "found the file" in outcome.err
     assert outcome.err.count("\n") == 1
@@ -139,10 +139,9 @@ def test_folders_that_cannot_be_made_are_told_first(command: str, scene_copy: Pa
     [
         ("compact", "transforms.json"),
         ("encode", "transforms.json"),
-        ("preview", "transforms.json"),
-        ("preview", "images/view_000.png"),
-        ("render", "images"),
-        ("segment", "images"),
+        ("render", "images/view_000.png"),
+        ("render --as views", "images"),
+        ("render --as superpixels", "images"),
         ("view", "transforms.json"),
     ],
 )
@@ -150,13 +149,13 @@ def test_inputs_are_not_replaced(command: str, output: str, scene_copy: Path, ru
     before = listing(scene_copy)
     scene = scene_copy / "scene.ply"
     results = [scene] if command == "view" else []
-    outcome = run(command, scene, *results, "-o", scene_copy / output, "--overwrite")
+    outcome = run(*command.split(), scene, *results, "-o", scene_copy / output, "--overwrite")
     assert outcome.code == 2
     assert "other than the input" in outcome.err
     assert listing(scene_copy) == before
 
 
-@pytest.mark.parametrize("command", ["segment", "render"])
+@pytest.mark.parametrize("command", PICTURES[:2])
 def test_images_of_one_name_in_several_folders(command: str, scene_copy: Path, run: Run) -> None:
     path = scene_copy / "transforms.json"
     data = json.loads(path.read_text())

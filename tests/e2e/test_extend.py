@@ -127,7 +127,7 @@ def test_quiet_says_nothing(state: Path, walks: list[Path], run: Run) -> None:
 
 def test_settings_are_those_of_the_state(walks: list[Path], tmp_path: Path, run: Run) -> None:
     state = tmp_path / "state.gsm"
-    said = (*SMALL, "--no-fit-colors", "--tolerance", 0, "--max-k", 2, "--replay", 2, "--seed", 5)
+    said = (*SMALL, "--set", "fit_colors=false", "--set", "tolerance=0", "--max-k", 2, "--set", "replay=2", "--seed", 5)
     assert run("extend", state, walks[0], *said).code == 0
     first = load_state(state).about["options"]
     document = json.loads(run("extend", state, walks[1], "--json").out)["batches"][0]
@@ -136,7 +136,7 @@ def test_settings_are_those_of_the_state(walks: list[Path], tmp_path: Path, run:
     assert same.items() <= first.items()
     assert same.items() <= document["options"].items()
     assert len(load_state(state).replay) <= 2
-    document = json.loads(run("extend", state, walks[0], "--tolerance", 0.5, "--json").out)["batches"][0]
+    document = json.loads(run("extend", state, walks[0], "--set", "tolerance=0.5", "--json").out)["batches"][0]
     assert (document["options"]["tolerance"], document["options"]["superpixels"]) == (0.5, 60)
     assert document["num_covered"] > 0
 
@@ -147,7 +147,7 @@ def test_an_encoded_scene_is_extended(encoded: Path, walks: list[Path], tmp_path
     assert outcome.code == 0, outcome.err
     assert "batch 2, 4 views" in outcome.out
     assert len(load_state(state).replay) == 4
-    assert run("decode", state, "--fit-steps", 4, "-o", tmp_path / "a.ply").code == 0
+    assert run("decode", state, "--set", "fit_steps=4", "-o", tmp_path / "a.ply").code == 0
 
 
 def test_cameras_of_one_batch(state: Path, walks: list[Path], tmp_path: Path, run: Run) -> None:
@@ -179,7 +179,7 @@ def test_every_number_that_can_be_decoded(states: list[Path], tmp_path: Path, ru
 
 
 def test_fits_to_the_photos_that_were_kept(states: list[Path], tmp_path: Path, run: Run) -> None:
-    said = ("--fit-steps", 4)
+    said = ("--set", "fit_steps=4")
     for fit in ((), ("--fit", "full")):
         out = tmp_path / f"{len(listing(tmp_path))}.ply"
         outcome = run("decode", states[1], *fit, *said, "-o", out, "--json")
@@ -192,7 +192,7 @@ def test_fits_to_the_photos_that_were_kept(states: list[Path], tmp_path: Path, r
 
 def test_decoding_twice_gives_the_same_bytes(states: list[Path], tmp_path: Path, run: Run) -> None:
     for threads in (1, 2):
-        said = ("--fit-steps", 4, "--threads", threads, "-o", tmp_path / f"{threads}.ply")
+        said = ("--set", "fit_steps=4", "--threads", threads, "-o", tmp_path / f"{threads}.ply")
         assert run("decode", states[1], *said).code == 0
     assert (tmp_path / "1.ply").read_bytes() == (tmp_path / "2.ply").read_bytes()
 
@@ -240,12 +240,12 @@ def test_an_encoded_scene_has_no_photos(encoded: Path, tmp_path: Path, run: Run)
     ("arguments", "words"),
     [
         (("--fit", "full"), "--fit"),
-        (("--tolerance", "2"), "--tolerance"),
+        (("--set", "tolerance=2"), "tolerance"),
         (("--max-k", "9"), "--max-k"),
-        (("--replay", "-1"), "--replay"),
+        (("--set", "replay=-1"), "replay"),
         (("--superpixels", "0%"), "superpixels"),
         (("--budget", "many"), "budget"),
-        (("--exporter", "nobody"), "exporter"),
+        (("--hint", "exporter=nobody"), "exporter"),
     ],
 )
 def test_wrong_usage_is_one_line(

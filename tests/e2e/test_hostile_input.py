@@ -117,7 +117,7 @@ def test_hostile_input_can_be_inspected(name: str, scene: Path, run: Run) -> Non
 @pytest.mark.parametrize("name", COMPACTED)
 def test_odd_values_are_compacted(name: str, scene: Path, run: Run) -> None:
     CASES[name].spoil(scene)
-    outcome = run("compact", scene, "-o", scene / "small.ply", "--fit-steps", 2, "--quiet")
+    outcome = run("compact", scene, "-o", scene / "small.ply", "--set", "fit_steps=2", "--quiet")
     assert outcome.code == 0, outcome.err
     assert "gsmerge: warning" not in outcome.err
     actual = run("inspect", scene / "small.ply", "--json").out

@@ -41,7 +41,7 @@ def test_every_method_writes_a_ply(
     method: str, made_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("GSMERGE_SPLAT_TRANSFORM", str(program(tmp_path, FAKE)))
-    out, settings = tmp_path / "small.ply", ["--fit-steps", 8] if method == "unmerged-fit" else []
+    out, settings = tmp_path / "small.ply", ["--set", "fit_steps=8"] if method == "unmerged-fit" else []
     said = run("compact", made_scene, "-o", out, "--method", method, "--budget", 400, *settings, "--json")
     assert said.code == 0, said.err
     document, total = json.loads(said.out), 5 * 96 * 64
@@ -112,7 +112,7 @@ def test_a_failing_program_is_told(
         (["--method", "voxel", "--levels", 2], ["method voxel", "levels"]),
         (["--method", "voxel", "--quality", "20dB"], ["method voxel", "quality 20dB"]),
         (["--method", "voxel", "--quality", "-1dB"], ["method voxel", "quality -1dB"]),
-        (["--method", "blocks", "--order", "none"], ["method blocks", "one Gaussian per pixel"]),
+        (["--method", "blocks", "--hint", "order=none"], ["method blocks", "one Gaussian per pixel"]),
     ],
     ids=str,
 )
@@ -140,11 +140,11 @@ def test_a_plan_names_the_method(
     monkeypatch.setenv("GSMERGE_SPLAT_TRANSFORM", str(program(tmp_path, FAKE)))
     said = run("compact", made_scene, "--method", method, "--dry-run", "--budget", 400)
     assert said.code == 0, said.err
-    assert (f"method       {method}" in said.out) == (method != "gsmerge")
-    assert ("superpixels " in said.out) == (method == "gsmerge")
+    assert (f"method     {method}; fit" in said.out) == (method != "gsmerge")
+    assert ("merging across views" in said.out) == (method == "gsmerge")
     document = json.loads(run("compact", made_scene, "--method", method, "--dry-run", "--json").out)
-    assert document["method"] == method
-    assert document["estimate"]["seconds"] > 0
+    assert document["compact"]["method"] == method
+    assert document["compact"]["seconds"] > 0
     assert document["notes"] == []
-    kept = document["output"]["num_gaussians_at_most"]
+    kept = document["compact"]["num_gaussians"]
     assert (kept == 5 * 96 * 64) == method.startswith("unmerged")

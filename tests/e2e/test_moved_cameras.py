@@ -70,7 +70,7 @@ def test_preview_and_render_agree_with_photos_that_are_broken(
     outcome = run("render", moved_scene, "-o", tmp_path / "out")
     assert outcome.code == 0, outcome.err
     floor(psnr(tmp_path / "out", photos))
-    assert run("preview", moved_scene / "scene.ply", "-o", tmp_path / "sheet.png").code == 3
+    assert run("render", moved_scene / "scene.ply", "-o", tmp_path / "sheet.png").code == 3
 
 
 def test_cameras_that_do_not_fit_are_said(scene_copy: Path, tmp_path: Path, run: Run) -> None:

@@ -13,7 +13,8 @@ from floors import nudged
 
 import gsmerge
 from gsmerge.io import read_images
-from gsmerge.measure.zoom import resize_photo, zoom_cameras
+from gsmerge.measure.speed import zoom_cameras
+from gsmerge.measure.visibility import resize_photo
 from gsmerge.render.metrics import psnr
 from gsmerge.research.generate import GenerateOptions, NoiseOptions, generate_scene
 
@@ -51,7 +52,7 @@ def test_larger_photos_make_the_result_sharper(
     folder: Path, tmp_path: Path, run: Callable[..., Any], floor: Floor
 ) -> None:
     documents, values = [], []
-    for name, options in (("own", ("--photo-scale", 1)), ("large", ())):
+    for name, options in (("own", ("--set", "photo_scale=1")), ("large", ())):
         out = tmp_path / f"{name}.ply"
         done = run("compact", folder, "-o", out, "--superpixels", SUPERPIXELS, "--json", *options)
         assert done.code == 0, done.err
@@ -69,7 +70,7 @@ def test_larger_photos_make_the_result_sharper(
 
 @pytest.mark.parametrize("value", ["0.5", "small"])
 def test_impossible_scales_are_wrong_usage(folder: Path, tmp_path: Path, run: Callable[..., Any], value: str) -> None:
-    done = run("compact", folder, "-o", tmp_path / "out.ply", "--photo-scale", value)
+    done = run("compact", folder, "-o", tmp_path / "out.ply", "--set", f"photo_scale={value}")
     assert done.code == 2
     assert done.out == ""
     assert "photo" in done.err

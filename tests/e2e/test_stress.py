@@ -7,7 +7,7 @@ from pathlib import Path
 
 from .conftest import Run
 
-FAST = ("--fit", "none", "--cases", "order, threads,w2c-opengl")
+FAST = ("--set", "fit=none", "--cases", "order, threads,w2c-opengl")
 
 
 def test_table(scene_copy: Path, run: Run) -> None:
@@ -35,7 +35,8 @@ def test_an_unknown_case(scene_copy: Path, run: Run) -> None:
 
 
 def test_a_case_that_fails_is_a_target_not_met(scene_copy: Path, run: Run) -> None:
-    outcome = run("stress", scene_copy, "--fit", "none", "--superpixels", "1%", "--cases", "order,views-1,unchanged")
+    poor = ("--set", "fit=none", "--set", "superpixels=1%")
+    outcome = run("stress", scene_copy, *poor, "--cases", "order,views-1,unchanged")
     failed = [line for line in outcome.out.splitlines() if line.startswith("FAILED")]
     assert failed, "so few Gaussians without a fit must be worse than the input somewhere"
     assert outcome.code == 4

@@ -23,7 +23,7 @@ def scene() -> Scene:
 
 def test_levels_are_a_chain(made_scene: Path, tmp_path: Path, run: Run) -> None:
     out = tmp_path / "chain.ply"
-    said = run("compact", made_scene, "-o", out, "--levels", 3, "--fit-steps", 20, "--superpixels", 300, "--json")
+    said = run("compact", made_scene, "-o", out, "--levels", 3, "--set", "fit_steps=20", "--superpixels", 300, "--json")
     assert said.code == 0, said.err
     document = json.loads(said.out)
     paths = [out, tmp_path / "chain.level1.ply", tmp_path / "chain.level2.ply"]
@@ -65,7 +65,7 @@ def test_a_psnr_is_met_with_few(scene: Scene) -> None:
 
 def test_a_target_out_of_reach_ends_with_4(made_scene: Path, tmp_path: Path, run: Run) -> None:
     out = tmp_path / "best.ply"
-    said = run("compact", made_scene, "-o", out, "--quality", "90dB", "--fit-steps", 8, "--budget", "20KB")
+    said = run("compact", made_scene, "-o", out, "--quality", "90dB", "--set", "fit_steps=8", "--budget", "20KB")
     assert said.code == 4
     assert "quality: 90 dB was asked for, the input views reach" in said.err
     assert len(read_ply(out).gaussians) > 0
@@ -82,7 +82,7 @@ def test_a_loss_spends_less_where_more_may_be_lost(scene: Scene) -> None:
 
 
 def test_auto_reports_its_curve(made_scene: Path, tmp_path: Path, run: Run) -> None:
-    said = run("compact", made_scene, "-o", tmp_path / "a.ply", "--budget", "auto", "--fit-steps", 12)
+    said = run("compact", made_scene, "-o", tmp_path / "a.ply", "--budget", "auto", "--set", "fit_steps=12")
     assert said.code == 0, said.err
     lines = said.out.splitlines()
     assert "PSNR" in lines[2]

@@ -71,7 +71,7 @@ def in_terminal(*arguments: object, interrupt_at: bytes | None = None) -> tuple[
 
 def test_compact_ends_with_a_table(scene_copy: Path, tmp_path: Path) -> None:
     out = tmp_path / "small.ply"
-    code, output = in_terminal("compact", scene_copy, "-o", out, "--superpixels", 200, "--fit-steps", 20)
+    code, output = in_terminal("compact", scene_copy, "-o", out, "--superpixels", 200, "--set", "fit_steps=20")
     lines = [line for line in screen(output) if not line.startswith("compiling")]
     assert code == 0
     first = next(i for i, line in enumerate(lines) if line.startswith("  Gaussians"))
@@ -86,7 +86,7 @@ def test_compact_ends_with_a_table(scene_copy: Path, tmp_path: Path) -> None:
 
 
 def test_ctrl_c_leaves_no_bar(scene_copy: Path, tmp_path: Path) -> None:
-    words = ("compact", scene_copy, "-o", tmp_path / "small.ply", "--superpixels", 200, "--fit-steps", 100_000)
+    words = ("compact", scene_copy, "-o", tmp_path / "small.ply", "--superpixels", 200, "--set", "fit_steps=100000")
     code, output = in_terminal(*words, interrupt_at=b"held out")
     assert code == 130
     lines = [line for line in screen(output) if not line.startswith("compiling")]
@@ -116,7 +116,7 @@ def test_a_dry_run_replaces_nothing_and_refuses_nothing(scene_copy: Path, tmp_pa
     out.write_text("mine")
     said = run("compact", scene_copy, "-o", out, "--dry-run")
     assert said.code == 0
-    assert f"note         {out} exists already: --overwrite would replace it" in said.out
+    assert f"note       {out} exists already: --overwrite would replace it" in said.out
     assert "exists" not in run("compact", scene_copy, "-o", out, "--dry-run", "--overwrite").out
     assert out.read_text() == "mine"
 

@@ -167,10 +167,10 @@ def test_a_checkpoint_that_cannot_be_used(scene_copy: Path, run: Run) -> None:
     notes = [line for line in outcome.err.splitlines() if line.startswith("note")]
     assert len(notes) == 1
     assert str(missing) in notes[0]
-    outcome = run("compact", scene_copy, *FAST, "--checkpoint", missing, "--require-checkpoint")
+    outcome = run("compact", scene_copy, *FAST, "--checkpoint", missing, "--set", "require_checkpoint=true")
     assert outcome.code == 3
     assert outcome.err.count("\n") == 1
-    assert run("compact", scene_copy, *FAST, "--checkpoint", "none", "--require-checkpoint").code == 2
+    assert run("compact", scene_copy, *FAST, "--checkpoint", "none", "--set", "require_checkpoint=true").code == 2
 
 
 def test_a_checkpoint_is_not_replaced(scene_copy: Path, run: Run) -> None:

@@ -47,11 +47,11 @@ def test_they_are_in_the_frame_of_the_gaussians(scene_copy: Path, run: Run) -> N
 def test_none_are_written_unless_there_are_any(scene_copy: Path, run: Run, tmp_path: Path) -> None:
     out = tmp_path / "out"
     out.mkdir()
-    done = run("compact", scene_copy, "-o", out / "a.ply", "--no-viewer-cameras", *QUICK, "--json")
+    done = run("compact", scene_copy, "-o", out / "a.ply", "--set", "viewer_cameras=false", *QUICK, "--json")
     assert done.code == 0, done.err
     assert json.loads(done.out)["viewer_cameras"] is None
     (out / "scene.ply").write_bytes((scene_copy / "scene.ply").read_bytes())
-    done = run("compact", out / "scene.ply", "-o", out / "b.ply", "--order", "none", *QUICK)
+    done = run("compact", out / "scene.ply", "-o", out / "b.ply", "--hint", "order=none", *QUICK)
     assert done.code == 0, done.err
     assert "cameras for viewers" not in done.out
     assert sorted(path.name for path in out.iterdir()) == ["a.ply", "b.ply", "scene.ply"]

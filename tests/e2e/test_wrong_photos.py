@@ -12,7 +12,7 @@ import pytest
 
 from .conftest import Run
 
-SETTINGS = ("--superpixels", 256, "--fit-steps", 60)
+SETTINGS = ("--superpixels", 256, "--set", "fit_steps=60")
 SLACK = 1.5  # dB that one or two photos of five less may cost; a swapped pair that passes costs 6.7
 
 

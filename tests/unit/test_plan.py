@@ -74,7 +74,8 @@ def test_a_draft_without_a_fit_leaves_out_nothing() -> None:
         ({}, True, True, "none"), ({}, False, True, "shipped"), ({"fit": "none"}, True, True, "shipped"),
         ({"fit_steps": 60}, True, True, "shipped"), ({"fit_steps": 61}, True, True, "none"),
         ({"effort": "fast", "fit": "none"}, True, True, "none"), ({"fit": "none"}, True, False, "none"),
-        ({"checkpoint": "own.safetensors"}, True, True, "own.safetensors"), ({"checkpoint": "none"}, False, True, "none"),
+        ({"checkpoint": "own.safetensors"}, True, True, "own.safetensors"),
+        ({"checkpoint": "none"}, False, True, "none"),
     ],
 )  # fmt: skip
 def test_networks_are_loaded_where_they_help(settings: dict[str, Any], photos: bool, aligned: bool, name: str) -> None:

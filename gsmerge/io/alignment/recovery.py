@@ -305,7 +305,7 @@ def misalignment_error(path: str, alignment: Alignment, reason: str | None) -> S
     """Say that the rows would be enough, but do not lie on their pixels' rays, or as well on those of others."""
     if alignment.ok:
         problem = f"expected rows that fit the pixels in one way, found several that do, to {alignment.worst_px:.1f} px"
-        return SceneError(path, problem, "name the order of the rows with --order")
+        return SceneError(path, problem, "name the order of the rows with --hint order=NAME")
     problem = (
         f"expected every view's Gaussians within {alignment.limit_px:g} px of their own pixels, "
         f"found a median of up to {alignment.worst_px:.1f} px and "

@@ -19,7 +19,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from gsmerge.io import atomic_output
-from gsmerge.measure.comparison import break_even
+from gsmerge.measure.speed import break_even
 from gsmerge.research.charts.lines import METRICS, PARTS, Line, Results, make_lines, size_label
 from gsmerge.research.charts.run import INPUT, SCORING, SEGMENTATIONS, SHARES, RunRecord
 from gsmerge.runtime.record import STAGES

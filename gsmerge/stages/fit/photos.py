@@ -34,7 +34,7 @@ def fit_photos(scene: Scene, options: FitOptions, views: Sequence[int] | None = 
     choose(photo_scale=round(scale, 4))
     note(
         f"the photos are larger than the views of {photos[0].width} x {photos[0].height}: the fit looks at them at"
-        f" {size} as well, which takes time; --photo-scale 1 does without"
+        f" {size} as well, which takes time; --set photo_scale=1 does without"
     )
     return *photos, large
 

@@ -11,8 +11,7 @@ from plyfile import PlyData, PlyElement
 from tiny_scene import write_npz
 
 from gsmerge.io import read_ply, write_ply
-from gsmerge.measure.inspect import inspect
-from gsmerge.measure.inspection_lines import inspection_lines
+from gsmerge.measure.inspect import inspect, inspection_lines
 
 SMOOTH = smooth_scene(48, 36)
 PIXELS = np.arange(3 * 36 * 48).reshape(3, 36 * 48)
@@ -21,7 +20,7 @@ PIXELS = np.arange(3 * 36 * 48).reshape(3, 36 * 48)
 def said(path: Path) -> dict[str, str]:
     """The lines by their first word; notes and all lines of one word joined."""
     actual: dict[str, str] = {}
-    for line in inspection_lines(inspect(path).to_dict()):
+    for line in inspection_lines(inspect(path)):
         word, rest = line[:11].strip(), line[11:]
         actual[word] = f"{actual[word]}; {rest}" if word in actual else rest
     return actual
@@ -52,7 +51,7 @@ def test_dropped_pixels(tmp_path: Path) -> None:
     assert lines["note"] == f"{missing:,} pixels that the exporter dropped are put back from the depth maps"
     assert not lines["coverage"].startswith("100 %")
     actual = inspect(tmp_path)
-    assert (actual.num_missing, actual.per_pixel) == (missing, 1)
+    assert (actual["num_missing"], actual["per_pixel"]) == (missing, 1)
 
 
 def test_the_camera_inside_the_file(tmp_path: Path) -> None:

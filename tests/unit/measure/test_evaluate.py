@@ -6,7 +6,9 @@ import csv
 import io
 import json
 import math
+import re
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,7 +19,13 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 import gsmerge
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Evaluation, Views, evaluate
-from gsmerge.measure.scores import CSV_COLUMNS, evaluation_csv, evaluation_document, evaluation_lines
+from gsmerge.measure.scores import (
+    CSV_COLUMNS,
+    evaluation_csv,
+    evaluation_document,
+    evaluation_lines,
+    evaluation_markdown,
+)
 from gsmerge.report import to_json
 from gsmerge.types import Gaussians, Scene
 
@@ -186,8 +194,8 @@ def test_documents_have_zooms_where_they_were_asked_for(scene: Scene, actual: Ev
     row = list(csv.DictReader(io.StringIO(evaluation_csv(document))))[-1]
     assert float(row["psnr_visible_zoom_0.5"]) == zoomed.results[0].scores[-1].zooms[0].masked.psnr
     lines = evaluation_lines(document)
-    assert len(lines) == 4 + 4
-    assert "PSNR 0.5x" in lines[5]
+    assert lines[-4] == "At other sizes, photos resized"
+    assert "PSNR 0.5x" in lines[-3]
     assert f"{sizes[0]['psnr_visible']:.2f}" in lines[-1]
 
 
@@ -221,7 +229,7 @@ def test_aligned_scores_stand_beside_the_plain_ones(scene: Scene, half: Gaussian
     assert float(row["psnr_visible_align_color"]) == aligned.results[1].scores[-1].aligned[0].masked.psnr
     assert float(row["pose_degrees"]) == aligned.results[1].scores[-1].pose_change.degrees
     lines = evaluation_lines(document)
-    assert len(lines) == 2 + 4 + 2 + 6
+    assert lines[-8] == "Held-out views, aligned with their photos"
     assert "degrees" in lines[-2]
 
 
@@ -252,12 +260,44 @@ def test_names_in_csv_are_no_formulas(actual: Evaluation) -> None:
         assert float(rows[0]["psnr"]) > 0
 
 
-def test_table_for_people(actual: Evaluation) -> None:
+def document_of(actual: Evaluation) -> dict[str, Any]:
+    """A document with facts of files and costs, under a name that is markup."""
+    odd = replace(actual, results=(actual.results[0], replace(actual.results[1], name="a|b<i>")))
+    speeds = [{"device": "cpu", "width": 4, "height": 3, "threads": 1, "seconds": s} for s in (0.2, 0.1)]
+    facts: dict[str, dict[str, Any]] = {
+        "input": {"path": "in.ply", "bytes": 4000, "overdraw": 9.0, "speeds": speeds[:1]},
+        "a|b<i>": {"bytes": 1000, "bytes_by_attribute": {"means": 34 * len(actual.results[1].scores)},
+                   "overdraw": 3.0, "merge_seconds": 2.0,
+                   "speeds": [{**speeds[1], "speedup": 2.0, "break_even_frames": 20.0}]},
+    }  # fmt: skip
+    return evaluation_document(odd, facts, ["first <note>"])
+
+
+def test_tables_for_people(actual: Evaluation) -> None:
     lines = evaluation_lines(evaluation_document(actual, {"half": {"bytes": 1234}}))
-    assert lines[0].startswith("against photos")
-    assert len(lines) == 2 + 4
-    assert "1.2 kB" in lines[-1]
-    assert "LPIPS" not in lines[1]
+    assert lines[0] == "Size"
+    assert lines[4].startswith("Quality against photos")
+    assert len(lines) == 1 + 3 + 1 + 5
+    assert "1.2 kB" in lines[3]
+    assert "LPIPS" not in lines[5]
+    assert "smaller by" not in lines[1]
+
+
+def test_costs_are_columns(actual: Evaluation) -> None:
+    text = "\n".join(evaluation_lines(document_of(actual)))
+    assert "4.0 x" in text
+    assert "20 frames (2.0 s of merging)" in text
+    assert "overdraw" in text
+
+
+def test_markdown_has_whole_tables(actual: Evaluation) -> None:
+    markdown = evaluation_markdown(document_of(actual))
+    assert markdown.startswith("# in.ply: before and after\n")
+    assert "- first &lt;note&gt;" in markdown
+    tables = [block for block in markdown.split("\n\n") if block.startswith("|")]
+    assert len(tables) == 3
+    for table in tables:
+        assert len({len(re.findall(r"(?<!\\)\|", line)) for line in table.splitlines()}) == 1, table
 
 
 def test_progress_is_told(scene: Scene, half: Gaussians) -> None:

@@ -169,7 +169,7 @@ def test_no_photos_or_others_are_refused(tmp_path: Path) -> None:
     ) as caught:
         load_scene(tmp_path)
     assert "\n" not in str(caught.value)
-    assert "no images" in str(inspect(tmp_path).alignment_problem)
+    assert "no images" in inspect(tmp_path)["alignment_problem"]
     with pytest.raises(SceneError, match="found OPENCV with lens distortion; undistort the images first"):
         to_cameras(read_cameras(tmp_path))
     write_images(tmp_path / "images", replace(SMOOTH, images=SMOOTH.images[:, :, :40]))

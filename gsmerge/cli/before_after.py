@@ -1,4 +1,4 @@
-"""Held-out views and LPIPS networks, for the commands that measure."""
+"""A scene, its compact versions and held-out views, for the commands that compare or measure them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SAME = 1e-5  # difference of two poses, of 1 and of their numbers, that writing 
 
 
 def lpips_networks(choice: str | None) -> tuple[tuple[str, ...], list[str]]:
-    """The networks of ``--lpips``; without that option those that are installed, with a note where none is."""
+    """Choose the networks of ``--lpips``; without that option those that are installed, with a note where none is."""
     from gsmerge.measure.evaluate import NETS
     from gsmerge.measure.lpips import INSTALL, lpips_available
 
@@ -55,18 +55,21 @@ class BeforeAfter:
 
     @property
     def gaussians(self) -> dict[str, Gaussians]:
-        """Those of the compact versions."""
+        """The Gaussians of the compact versions."""
         return {name: ply.gaussians for name, ply in self.plys.items()}
 
 
 def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
-    """What the arguments BEFORE, whose files are given, and AFTER name, and the views of ``--targets``."""
+    """Read what the arguments BEFORE, whose files are given, and AFTER name, and the views of ``--targets``."""
     from gsmerge.io import read_gaussians
     from gsmerge.runtime.record import record_run
     from gsmerge.stages.place_cameras import add_views
 
     load, notes = args.load(files), list[str]()
-    scene, held_out, adapted = held_out_views(load, args.targets, args.target_images, None)
+    if args.targets is not None:
+        require_views(load)
+    views = vars(args).get("views")
+    scene, held_out, adapted = held_out_views(load, args.targets, args.target_images, views)
     if not scene.aligned:
         with record_run() as record:
             scene = add_views(scene)
@@ -77,7 +80,7 @@ def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
 
 
 def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras], list[str]]:
-    """The cameras that ``compact`` wrote beside results where it had moved them, by name of the result; and notes."""
+    """Read the cameras that ``compact`` wrote beside results where it had moved them, by result; and notes."""
     import numpy as np
 
     from gsmerge.io.cameras.json_files import viewer_cameras_path
@@ -110,7 +113,7 @@ def require_views(load: SceneLoad) -> None:
 def held_out_views(
     load: SceneLoad, targets: Path | None, target_images: Path | None, views: int | None
 ) -> tuple[Scene, Views | None, tuple[str, ...]]:
-    """The scene with the context views of ``--views``, the held-out views, and notes about those."""
+    """Choose the context views of ``--views`` and the held-out views; return the scene, those, and notes about them."""
     from gsmerge.io import read_held_out
     from gsmerge.measure.evaluate import Views
     from gsmerge.views import even_views, midpoint_views, subset
@@ -137,7 +140,7 @@ def held_out_views(
 
 
 def file_names(paths: Sequence[Path]) -> list[str]:
-    """A short name for each file: its own where no two are alike, otherwise its path. No file may be given twice."""
+    """Name each file: by its own name where no two are alike, otherwise by its path; none may be given twice."""
     if len(set(paths)) < len(paths):
         raise UsageError(f"expected every result once, got {max(paths, key=paths.count)} twice")
     short = [path.name for path in paths]

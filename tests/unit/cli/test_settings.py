@@ -1,0 +1,91 @@
+"""Settings and hints by name, as ``--set`` and ``--hint`` read them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import pytest
+
+from gsmerge.cli.options import Args, parse_pairs, setting_kinds, words_for
+from gsmerge.errors import UsageError
+from gsmerge.online.options import OnlineOptions
+from gsmerge.options import CompactOptions
+
+KINDS = setting_kinds(CompactOptions)
+
+
+@pytest.mark.parametrize(
+    ("pair", "expected"),
+    [
+        ("k=2", {"k": 2}),
+        ("k=mixed", {"k": "mixed"}),
+        ("superpixels=4.4%", {"superpixels": "4.4%"}),
+        ("poses=fixed", {"poses": "fixed"}),
+        ("drop_sky=true", {"drop_sky": True}),
+        ("drop-sky=false", {"drop_sky": False}),
+        ("overlap=1", {"overlap": 1}),
+        ("quality=30dB", {"quality": "30dB"}),
+        ("quality=null", {"quality": None}),
+        ("checkpoint=7", {"checkpoint": "7"}),  # the name of a file
+        ("checkpoint=a=b", {"checkpoint": "a=b"}),
+        ("crop=", {"crop": ""}),
+        ("photo_scale=2.5", {"photo_scale": 2.5}),
+    ],
+)
+def test_values_are_json_or_text(pair: str, expected: dict[str, Any]) -> None:
+    assert parse_pairs("--set", [pair], KINDS) == expected
+
+
+@pytest.mark.parametrize(
+    ("pairs", "words"),
+    [
+        (["k"], "--set: expected NAME=VALUE, got 'k'"),
+        (["=2"], "--set : unknown"),
+        (["pose=free"], "--set pose: unknown, the closest name is poses; docs/reference/settings.md lists all"),
+        (["k=1", "k=2"], "--set k: expected it once, got it twice"),
+        (["drop_sky=1"], "--set drop_sky: expected true or false, got '1'"),
+        (["neighbors=true"], "--set neighbors: expected a whole number, got 'true'"),
+        (["neighbors=2.5"], "--set neighbors: expected a whole number, got '2.5'"),
+        (["match=all"], "--set match: expected overlap, aabb, none or null, got 'all'"),
+        (["k=" + "[" * 100_000], "[["),
+    ],
+)
+def test_what_cannot_be_meant(pairs: list[str], words: str) -> None:
+    kinds = {"k": int, **{name: kind for name, kind in KINDS.items() if name != "k"}}
+    with pytest.raises(UsageError) as error:
+        parse_pairs("--set", pairs, kinds)
+    assert words in str(error.value)
+
+
+def test_options_and_set_are_one() -> None:
+    args = Args(k=2, effort="fast", set=["overlap=0.5"])
+    settings = args.settings()
+    assert (settings.decode.k, settings.effort, settings.match.overlap) == (2, "fast", 0.5)
+    with pytest.raises(UsageError, match="--set k: expected it once, got --k too"):
+        Args(k=2, set=["k=3"]).settings()
+    with pytest.raises(UsageError, match="iou: expected 0 to 1, got 2"):
+        Args(set=["iou=2"]).settings()
+    with pytest.raises(UsageError, match="--set fit: unknown"):
+        Args(set=["fit=full"]).settings(fit="none")
+
+
+def test_several_kinds_of_settings() -> None:
+    assert Args(set=["k=2", "replay=3"], max_k=4).values(CompactOptions, OnlineOptions) == {
+        "k": 2, "replay": 3, "max_k": 4,
+    }  # fmt: skip
+    made, online = Args(set=["recipe=paper", "replay=3"]).make(CompactOptions, OnlineOptions)
+    assert (made.segment.segmentation, online.replay) == ("bass-st", 3)
+
+
+@dataclass
+class Kinds:
+    choice: Literal["a", "b"] | None
+    numbers: tuple[int, ...]
+    size: int | float
+
+
+def test_values_in_words() -> None:
+    assert [words_for(kind) for kind in setting_kinds(Kinds).values()] == [
+        "a, b or null", "a list", "a whole number or a number",
+    ]  # fmt: skip

@@ -1,0 +1,59 @@
+"""The costs of drawing a scene: render time, overdraw, frames to break even."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scenes
+
+from gsmerge.measure.speed import break_even, measure_costs, overdraw, zoom_cameras
+from gsmerge.render import plan_view, prepare
+from gsmerge.render.weights import view_weights
+from gsmerge.types import Scene
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return scenes.make_scene(scenes.room(), scenes.arc(3))
+
+
+def test_intrinsics_go_with_the_size() -> None:
+    cameras = scenes.arc(2, 48, 36)
+    twice = zoom_cameras(cameras, 2)
+    assert (twice.width, twice.height) == (96, 72)
+    np.testing.assert_allclose(twice.Ks[:, :2], 2 * cameras.Ks[:, :2])
+    np.testing.assert_allclose(twice.Ks[:, 2], cameras.Ks[:, 2])
+    odd = zoom_cameras(cameras, 7 / 48)
+    assert (odd.width, odd.height) == (7, 5)
+    assert zoom_cameras(scenes.arc(1, 48, 2), 1 / 16).height == 1
+
+
+def test_overdraw_counts_what_is_blended(scene: Scene) -> None:
+    one = scenes.arc(1)
+    plan = plan_view(
+        prepare(scene.gaussians), one.viewmats[0].astype(np.float64), one.Ks[0].astype(np.float64), 48, 36, near=0.01
+    )
+    assert overdraw(scene.gaussians, one, 0.01) == len(view_weights(plan).lanes) / (48 * 36)
+    assert overdraw(scene.gaussians[:0], one, 0.01) == 0
+    assert 1 < overdraw(scene.gaussians[::4], one, 0.01) < overdraw(scene.gaussians, one, 0.01)
+
+
+def test_break_even() -> None:
+    assert break_even(10.0, 0.3, 0.1) == pytest.approx(50)
+    assert break_even(10.0, 0.1, 0.1) is None
+    assert break_even(0.0, 0.3, 0.1) == 0
+
+
+def test_costs_are_compared_with_those_of_the_first(scene: Scene) -> None:
+    parts = {"input": scene.gaussians, "half": scene.gaussians[::2], "quarter": scene.gaussians[::4]}
+    actual = measure_costs(parts, scene.cameras, (0.5, 1), 0.01, merge_seconds={"half": 2.0}, threads=1)
+    sizes = [(speed["width"], speed["height"], speed["threads"]) for speed in actual["half"]["speeds"][:2]]
+    assert sizes == [(24, 18, 1), (48, 36, 1)]
+    assert all(speed["seconds"] > 0 for cost in actual.values() for speed in cost["speeds"])
+    assert "merge_seconds" not in actual["input"]
+    assert actual["quarter"]["merge_seconds"] is None
+    assert all(speed["break_even_frames"] is None for speed in actual["quarter"]["speeds"])
+    for before, after in zip(actual["input"]["speeds"], actual["half"]["speeds"], strict=True):
+        saved = before["seconds"] - after["seconds"]
+        assert after["speedup"] == pytest.approx(before["seconds"] / after["seconds"])
+        assert after["break_even_frames"] == (pytest.approx(2.0 / saved) if saved > 0 else None)
