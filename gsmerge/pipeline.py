@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import os
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -28,18 +27,14 @@ from gsmerge.stages.match import match
 from gsmerge.stages.merge import MergedViews, merge, refine
 from gsmerge.stages.prepare import Prepared, prepare
 from gsmerge.stages.segment import segment_scene
-from gsmerge.types import Scene, Segmentation
+from gsmerge.types import Scene, Segmentation, StrPath
 
 if TYPE_CHECKING:
     from gsmerge.networks.modules import Networks
 
 
 def compact(
-    scene: Scene | str | os.PathLike[str],
-    options: CompactOptions | None = None,
-    *,
-    progress: Progress | None = None,
-    **settings: Any,
+    scene: Scene | StrPath, options: CompactOptions | None = None, *, progress: Progress | None = None, **settings: Any
 ) -> CompactResult:
     """Replace a scene by a compact one that renders at least as well from new viewpoints.
 

@@ -9,6 +9,7 @@ rotate local to world, world-to-camera matrices with OpenCV axes, pixel centres 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -19,6 +20,7 @@ import numpy as np
 if TYPE_CHECKING:
     import torch
 
+StrPath = str | os.PathLike[str]
 Array = Any  # a NumPy array, or a torch tensor where a docstring allows one
 
 SH_C0 = 0.28209479177387814  # spherical harmonic of degree 0: rgb = 0.5 + SH_C0 * sh0

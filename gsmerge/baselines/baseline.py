@@ -69,4 +69,4 @@ def merge_groups(prepared: Prepared, groups: Groups, rule: Literal["depth", "pap
     members = assign(prepared.scene, groups)
     features = encode(prepared.scene, members, groups, rule=rule)
     with stage("decode"):
-        return decode(features, members, DecodeOptions(min_opacity=0.0), rule=rule)
+        return decode(features, members, DecodeOptions(min_opacity=0.0))

@@ -21,6 +21,7 @@ from functools import cache
 from pathlib import Path
 
 from gsmerge.errors import SceneError
+from gsmerge.types import StrPath
 
 # What the disk itself may answer in the middle of writing; any other OSError is the caller's own.
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS}
@@ -32,7 +33,7 @@ _written: set[str] = set()  # the temporary files of this process
 
 
 @contextmanager
-def atomic_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> Iterator[Path]:
+def atomic_output(path: StrPath, *, overwrite: bool = False) -> Iterator[Path]:
     """Yield a temporary file that is renamed to ``path`` when the block succeeds.
 
     Args:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge.errors import SceneError
+from gsmerge.types import StrPath
 
 MAX_TEXT_BYTES = 32 << 20  # of a camera file, far more than any has
 MAX_MODEL_BYTES = 256 << 20  # of a COLMAP text file, which lists the points of every image as well
@@ -105,7 +106,7 @@ def _toml(path: Path, text: str) -> Any:
     raise SceneError(path, "TOML needs Python 3.11", "write the settings as JSON")
 
 
-def check_pixels(path: str | os.PathLike[str], width: int, height: int) -> None:
+def check_pixels(path: StrPath, width: int, height: int) -> None:
     """Refuse an image size that no image of Gaussians has. SceneError if it is not positive, or has too many pixels."""
     if width < 1 or height < 1:
         raise SceneError(path, f"expected a positive image size, found {width} x {height}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
@@ -16,7 +15,7 @@ from gsmerge.io.exporters import AUTO
 from gsmerge.io.photos import as_floats, find_image, photo_size
 from gsmerge.io.scene import SceneLoad
 from gsmerge.io.scene_files import IMAGE_PLACES, SceneFiles, limit_photo_size, stored_photos
-from gsmerge.types import Cameras, Scene
+from gsmerge.types import Cameras, Scene, StrPath
 
 _MAX_ANGLE = 0.2  # degrees that a view's two poses may differ by, once one frame is moved to the other
 _MAX_SHIFT = 0.005  # of the distance between the views
@@ -39,9 +38,7 @@ class HeldOutViews:
         return len(self.cameras)
 
 
-def read_held_out(
-    load: SceneLoad, cameras: str | os.PathLike[str], images: str | os.PathLike[str] | None = None
-) -> HeldOutViews:
+def read_held_out(load: SceneLoad, cameras: StrPath, images: StrPath | None = None) -> HeldOutViews:
     """Read held-out photos and their cameras, in any of the forms that scenes may have.
 
     Views that the scene was made of are left out. Where the file has those too, under the same names, their poses
@@ -97,7 +94,7 @@ def _missing(path: Path, cameras: CameraFile) -> str:
     return next((name for name in cameras.names if find_image(root, name) is None), cameras.names[0])
 
 
-def _folder(path: Path, cameras: CameraFile, images: str | os.PathLike[str] | None) -> Path | None:
+def _folder(path: Path, cameras: CameraFile, images: StrPath | None) -> Path | None:
     """Find the folder of the photos: as given, or next to cameras that do not say it."""
     if images is not None:
         if not Path(images).is_dir():

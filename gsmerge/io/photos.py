@@ -20,7 +20,7 @@ from PIL import Image
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import MAX_PIXELS, check_file, check_pixels, walk_files
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import Cameras
+from gsmerge.types import Cameras, StrPath
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".ppm"})
 _FORMATS = ("JPEG", "WEBP", "BMP", "TIFF", "PPM")  # besides PNG, whose header is read here
@@ -30,7 +30,7 @@ ASPECT_TOLERANCE = 0.04  # of width over height: backbones round each side to a 
 _PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
 _PNG_CHUNKS = frozenset({b"IHDR", b"PLTE", b"tRNS", b"IDAT"})
 
-ImageSource = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
+ImageSource = StrPath | Sequence[StrPath]
 Size = tuple[int, int]  # width, height, pixels
 _AT_ONCE = 128 << 20  # bytes of decoded photos; more are decoded one by one, when they are used
 

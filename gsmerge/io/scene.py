@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -41,7 +40,7 @@ from gsmerge.io.scene_files import (
 )
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import use_threads
-from gsmerge.types import Cameras, Gaussians, LargePhotos, Scene, grid_ids
+from gsmerge.types import Cameras, Gaussians, LargePhotos, Scene, StrPath, grid_ids
 
 _MIN_CORRELATION = 0.5  # of a view's base colours with its photo
 _COLOR_SAMPLES = 5000  # pixels per view that it is computed from
@@ -90,10 +89,10 @@ class SceneLoad:
 
 
 def read_scene(
-    path: str | os.PathLike[str],
+    path: StrPath,
     *,
-    cameras: str | os.PathLike[str] | None = None,
-    images: str | os.PathLike[str] | None = None,
+    cameras: StrPath | None = None,
+    images: StrPath | None = None,
     opacity: OpacityChoice = "auto",
     **hints: Any,
 ) -> Scene:
@@ -122,7 +121,7 @@ def read_scene(
     return load_scene(path, cameras=cameras, images=images, opacity=opacity, **hints).scene
 
 
-def as_scene(scene: Scene | str | os.PathLike[str]) -> Scene:
+def as_scene(scene: Scene | StrPath) -> Scene:
     """Return a scene as it is, or read it from a path; notes say what is odd about the file."""
     if isinstance(scene, Scene):
         return scene
@@ -133,10 +132,10 @@ def as_scene(scene: Scene | str | os.PathLike[str]) -> Scene:
 
 
 def load_scene(
-    path: str | os.PathLike[str],
+    path: StrPath,
     *,
-    cameras: str | os.PathLike[str] | None = None,
-    images: str | os.PathLike[str] | None = None,
+    cameras: StrPath | None = None,
+    images: StrPath | None = None,
     opacity: OpacityChoice = "auto",
     **hints: Any,
 ) -> SceneLoad:

@@ -31,7 +31,7 @@ from gsmerge.io.photos import (
     photo_size,
     resize_to,
 )
-from gsmerge.types import Cameras, LargePhotos
+from gsmerge.types import Cameras, LargePhotos, StrPath
 
 # The first that exists wins; then the folder's only .ply.
 PLY_PLACES = ("scene.ply", "gaussians.ply", "gs_ply/0000.ply", "point_cloud.ply")
@@ -53,10 +53,10 @@ class SceneFiles:
 
 
 def find_scene_files(
-    path: str | os.PathLike[str],
+    path: StrPath,
     *,
-    cameras: str | os.PathLike[str] | None = None,
-    images: str | os.PathLike[str] | None = None,
+    cameras: StrPath | None = None,
+    images: StrPath | None = None,
 ) -> SceneFiles:
     """Find a scene's files.
 
@@ -86,7 +86,7 @@ def find_scene_files(
     return SceneFiles(ply, camera_path, image_path)
 
 
-def _named(path: str | os.PathLike[str] | None) -> Path | None:
+def _named(path: StrPath | None) -> Path | None:
     if path is None:
         return None
     if not os.path.exists(path):

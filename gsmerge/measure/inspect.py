@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
@@ -34,7 +33,7 @@ from gsmerge.runtime.threads import available_threads, use_threads
 from gsmerge.stages.clean import BOX_QUANTILES, beyond_scene, floater_share
 from gsmerge.stages.segment import count_limits, largest_count
 from gsmerge.stages.sky import sky_regions
-from gsmerge.types import Gaussians, Scene
+from gsmerge.types import Gaussians, Scene, StrPath
 
 HUGE_SCALE_SHARE = 0.1  # of the box's diagonal: larger scales show no detail
 _TRANSPARENT, _OPAQUE = 1 / 255, 0.995  # opacities: one step of an 8-bit image; where optical depth is capped
@@ -50,10 +49,10 @@ _ENCODINGS = {"logit": "as logits", "raw": "in [0, 1]"}
 
 
 def inspect(
-    path: str | os.PathLike[str],
+    path: StrPath,
     *,
-    cameras: str | os.PathLike[str] | None = None,
-    images: str | os.PathLike[str] | None = None,
+    cameras: StrPath | None = None,
+    images: StrPath | None = None,
     opacity: OpacityChoice = "auto",
     **hints: Any,
 ) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from gsmerge import __version__
 from gsmerge.encoded.decode import children_of, divide_all
 from gsmerge.encoded.encoded import Encoded, StoredScene, without_members
 from gsmerge.geometry import covariances
-from gsmerge.moments import MAX_OPACITY, Members, Rule, feature_to_gaussians, gaussian_members
+from gsmerge.moments import MAX_OPACITY, Members, feature_to_gaussians, gaussian_members
 from gsmerge.stages.decode import divide
 from gsmerge.stages.merge import take
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, to_float32
@@ -77,14 +77,12 @@ class OnlineState(StoredScene):
         return self.groups.children.sh_degree
 
 
-def bake(
-    features: FeatureGaussians, members: Members, networks: NetworkContext | None, max_k: int, rule: Rule = "depth"
-) -> GroupSet:
+def bake(features: FeatureGaussians, members: Members, networks: NetworkContext | None, max_k: int) -> GroupSet:
     """Groups as what they decode to, so that gains, latents and decoder heads are needed no more."""
     ones = feature_to_gaussians(features)
     children, parents = ones, np.arange(len(features))
     if max_k > 1:
-        children, parents = divide(features, members, np.full(len(features), max_k), rule)
+        children, parents = divide(features, members, np.full(len(features), max_k))
     if networks is not None:
         from gsmerge.networks.apply import decode_gaussians
 

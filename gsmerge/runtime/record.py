@@ -40,13 +40,10 @@ _current: ContextVar[Record | None] = ContextVar("record", default=None)
 
 @contextmanager
 def record_run(progress: Progress | None = None) -> Iterator[Record]:
-    """Begin a record, to which everything in the block reports."""
-    record = Record(progress)
-    token = _current.set(record)
-    try:
+    """Begin a record, to which everything in the block reports; ``progress`` hears of its end as "done"."""
+    with _write_to(Record(progress)) as record:
         yield record
-    finally:
-        _current.reset(token)
+        report_progress("done", len(STAGES), len(STAGES))
 
 
 def current_record() -> Record:
@@ -58,8 +55,17 @@ def current_record() -> Record:
 def record_part(*, silent: bool = False) -> Iterator[Record]:
     """Begin a record of its own for a part of the current run; ``silent``: without its progress."""
     outer = _current.get()
-    with record_run(None if silent or outer is None else outer.progress) as record:
+    with _write_to(Record(None if silent or outer is None else outer.progress)) as record:
         yield record
+
+
+@contextmanager
+def _write_to(record: Record) -> Iterator[Record]:
+    token = _current.set(record)
+    try:
+        yield record
+    finally:
+        _current.reset(token)
 
 
 @contextmanager
@@ -69,7 +75,8 @@ def stage(name: str) -> Iterator[None]:
     if record is None or record.running is not None:
         yield
         return
-    report_progress(name, STAGES.index(name), len(STAGES))
+    if name not in record.seconds:  # a stage in two parts is one step
+        report_progress(name, STAGES.index(name), len(STAGES))
     record.running, start = name, time.perf_counter()
     try:
         yield

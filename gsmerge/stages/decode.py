@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gsmerge.kernels.gaussians.bisect import bisect, gather_groups, split_errors
-from gsmerge.moments import Members, Rule, feature_to_gaussians, pool_members, to_gaussians
+from gsmerge.moments import Members, feature_to_gaussians, pool_members, to_gaussians
 from gsmerge.render.photos import scene_pictures
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
@@ -79,20 +79,18 @@ def decode(
     members: Members,
     options: DecodeOptions,
     counts: np.ndarray | None = None,
-    rule: Rule = "depth",
     networks: NetworkContext | None = None,
 ) -> Gaussians:
     """K Gaussians for each Feature Gaussian, fewer where its members are alike.
 
     Children are found by halving the members again and again across their widest direction in colour and
-    position, so that those of K = 2 are unions of those of K = 4, and are pooled by the encoder's rule.
+    position, so that those of K = 2 are unions of those of K = 4.
 
     Args:
         features: The Feature Gaussians; at K > 1 their members are looked up again.
         members: The scene's Gaussians that ``features.members`` points into.
         options: K and the least opacity.
         counts: ``[g]`` a K for every group instead, from 1 on. Needed where K is mixed.
-        rule: How children are pooled, the encoder's.
         networks: Networks whose heads correct the children; None: none does.
 
     Returns:
@@ -105,7 +103,7 @@ def decode(
         counts = np.full(len(features), options.max_k)
     if counts.shape != (len(features),) or counts.min(initial=1) < 1:
         raise ValueError(f"counts: expected {len(features)} numbers from 1 on, got shape {list(counts.shape)}")
-    gaussians, parents = divide(features, members, counts, rule)
+    gaussians, parents = divide(features, members, counts)
     if networks is not None:
         from gsmerge.networks.apply import decode_gaussians
 
@@ -256,14 +254,12 @@ def merged_count(merged: MergedViews, options: DecodeOptions, *, grows: bool) ->
     return min(segmentation.count, options.max_k * (len(merged.features) + len(groups) - num_filled))
 
 
-def divide(
-    features: FeatureGaussians, members: Members, counts: np.ndarray, rule: Rule = "depth"
-) -> tuple[Gaussians, np.ndarray]:
+def divide(features: FeatureGaussians, members: Members, counts: np.ndarray) -> tuple[Gaussians, np.ndarray]:
     """The analytic children of :func:`decode`, however faint, and the Feature Gaussian ``[n]`` of each, rising."""
     divided = counts > 1
     gaussians, parents = feature_to_gaussians(features), np.arange(len(features))
     if divided.any():
-        children, of_children = _children(features, members, np.flatnonzero(divided), counts, rule)
+        children, of_children = _children(features, members, np.flatnonzero(divided), counts)
         whole = np.flatnonzero(~divided)
         parents = np.concatenate([whole, of_children])
         order = np.argsort(parents, kind="stable")
@@ -273,11 +269,11 @@ def divide(
 
 
 def _children(
-    features: FeatureGaussians, members: Members, groups: np.ndarray, counts: np.ndarray, rule: Rule
+    features: FeatureGaussians, members: Members, groups: np.ndarray, counts: np.ndarray
 ) -> tuple[Gaussians, np.ndarray]:
     """Gaussians of the children of some groups, and the group of each."""
     starts, ids, parents = halve(features, members, groups, counts)
-    return pool_children(features, members, starts, ids, parents, rule), parents
+    return pool_children(features, members, starts, ids, parents), parents
 
 
 def halve(
@@ -313,10 +309,9 @@ def pool_children(
     starts: np.ndarray,
     ids: np.ndarray,
     parents: np.ndarray,
-    rule: Rule = "depth",
 ) -> Gaussians:
     """One Gaussian for each run of members, with the gain of the Feature Gaussian that it is a child of."""
-    moments = pool_members(members, starts, ids, rule)
+    moments = pool_members(members, starts, ids)
     extinctions = moments.extinctions * features.gains[parents]
     return to_gaussians(moments.covars, extinctions, moments.means, moments.sh)
 

@@ -49,14 +49,14 @@ def test_permuted_gaussians_have_permuted_owners(seed: int, count: int, scene: S
 
 
 @FEW
-@given(st.integers(1, 300), st.floats(0, 2))
-def test_each_gaussian_is_in_at_most_one_superpixel(count: int, least: float) -> None:
+@given(st.integers(1, 300))
+def test_each_gaussian_is_in_at_most_one_superpixel(count: int) -> None:
     scene = unaligned_scenes.loosened(TURNED)
     owners = find_owners(scene, groups(count))
-    members = unaligned_members(scene, owner_pixels(owners, groups(count), least))
+    members = unaligned_members(scene, owner_pixels(owners, groups(count)))
     starts, ids, views = member_rows(scene, members, groups(count))
     assert len(np.unique(ids)) == len(ids)
-    assert set(ids) == set(np.flatnonzero((owners.values >= least) & (owners.labels >= 0)))
+    assert set(ids) == set(np.flatnonzero(owners.labels >= 0))
     assert (np.diff(starts) > 0).all()
     assert starts[-1] == len(ids)
     assert len(views) == len(starts) - 1

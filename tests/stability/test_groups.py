@@ -99,8 +99,8 @@ def test_flat_groups_have_a_smallest_scale(small: Scene, axes: list[int]) -> Non
 @pytest.mark.parametrize("size", [2, 3, 4, 16])
 def test_needle_in_a_group(small: Scene, size: int) -> None:
     """Aspect 1e4: the merged Gaussian keeps within three times the group's extent."""
-    scene = replace(small, pixel_ids=grid_ids(np.zeros_like(small.valid)))
-    scene.valid.reshape(-1)[:size] = True
+    pixels = np.arange(small.valid.size).reshape(small.valid.shape)
+    scene = replace(small, pixel_ids=grid_ids(pixels < size))
     scales = scene.gaussians.scales.copy()
     scales[0, 0] *= 1e4
     clean, actual = (feature_to_gaussians(one_group_per_view(s)) for s in (scene, changed(scene, scales=scales)))

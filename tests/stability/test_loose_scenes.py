@@ -33,7 +33,6 @@ def compacted(scene: Scene, **settings: Any) -> CompactResult:
 SETTINGS = [
     {}, {"k": 2}, {"fit": "none"}, {"budget": 150}, {"budget": 150, "fit_steps": 160}, {"budget": "auto"},
     {"match": "none"}, {"match": "aabb"}, {"segmentation": "slic"}, {"budget": "12KB"}, {"unseen": "keep"},
-    {"rule": "paper"}, {"min_owner_weight": 0.1},
 ]  # fmt: skip
 
 
@@ -42,7 +41,7 @@ def test_every_setting(room: Scene, settings: dict, floor: Callable[..., None]) 
     result = compacted(unaligned_scenes.shuffled(room), **settings)
     if settings.get("budget") == 150:
         assert len(result.gaussians) == 150
-    if not {"fit", "fit_steps", "rule"} & settings.keys():
+    if not {"fit", "fit_steps"} & settings.keys():
         floor(scenes.psnr_of(result.gaussians, room))
 
 

@@ -6,32 +6,17 @@ from dataclasses import FrozenInstanceError, fields, is_dataclass
 import pytest
 
 from gsmerge import CompactOptions
+from gsmerge.options import setting_names
 
 STAGES = [f.name for f in fields(CompactOptions) if is_dataclass(getattr(CompactOptions(), f.name))]
 
 
 def test_flat_names_are_unique() -> None:
     options = CompactOptions()
-    names = [f.name for stage in STAGES for f in fields(getattr(options, stage))]
+    names = [name for stage in STAGES for name in setting_names(type(getattr(options, stage)))]
     names += [f.name for f in fields(options) if f.name not in STAGES]
-    assert {name for name in names if names.count(name) > 1} == {"effort"}  # shared on purpose
-    assert sorted(options.to_dict()) == sorted(set(names))
-
-
-def test_a_shared_name_reaches_every_stage_that_has_it() -> None:
-    options = CompactOptions().with_settings({"effort": "fast"})
-    assert options.segment.effort == options.fit.effort == "fast"
-    assert options.fit.steps < CompactOptions().fit.steps
-    assert options.with_settings({"fit_steps": 77}).fit.steps == 77
-
-
-def test_a_draft_merges_no_views_and_takes_few_steps() -> None:
-    draft = CompactOptions().with_settings({"effort": "draft"})
-    assert draft.match.method == "none"
-    assert (draft.fit.steps, draft.fit.half_res_part, draft.fit.grows) == (30, 0.7, False)
-    assert draft.with_settings({"fit_steps": 12}).fit.half_res_part == 1  # no time for photos of full size
-    assert CompactOptions().match.method == "overlap"
-    assert draft.with_settings({"match": "aabb"}).match.method == "aabb"
+    assert len(names) == len(set(names))
+    assert sorted(options.to_dict()) == sorted(names)
 
 
 def test_settings_reach_their_stage() -> None:
@@ -41,7 +26,7 @@ def test_settings_reach_their_stage() -> None:
     assert options.match.match == "aabb"
     assert options.fit.fit == "none"
     assert (options.seed, options.threads) == (3, None)
-    assert options.encode == CompactOptions().encode
+    assert options.clean == CompactOptions().clean
 
 
 def test_flat_settings_make_the_same_options() -> None:
@@ -74,7 +59,7 @@ def test_every_setting_is_documented(stage: str) -> None:
     "setting",
     [
         {"k": 0}, {"k": 9}, {"k": -1}, {"superpixels": 0}, {"superpixels": "0%"}, {"superpixels": "150%"},
-        {"segmentation": "voronoi"}, {"effort": "slow"}, {"match": "iou"}, {"rule": "mean"}, {"fit": "everything"},
+        {"segmentation": "voronoi"}, {"effort": "slow"}, {"match": "iou"}, {"fit": "everything"},
         {"cluster_size": 0}, {"neighbors": 0}, {"fit_steps": 0}, {"time_budget": 0.0}, {"holdout": 2.0},
         {"dropout": 1.0}, {"dropout": -0.1}, {"holdout": 0.0},
         {"min_opacity": -1.0}, {"overlap": float("nan")}, {"compactness": 2.0},

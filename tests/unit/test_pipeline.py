@@ -11,7 +11,7 @@ from gsmerge import CompactOptions, Scene, compact
 from gsmerge.runtime.record import STAGES
 from gsmerge.stages.superpixels import SEGMENTATIONS
 
-USUAL = [stage for stage in STAGES if stage not in ("curve", "reduce", "members", "refine", "cover", "choose", "join")]
+USUAL = [stage for stage in STAGES if stage not in ("curve", "reduce", "refine", "cover", "choose", "join")]
 UNFITTED = {"fit": "none", "checkpoint": "none"}
 
 
@@ -84,7 +84,7 @@ def test_progress_tells_every_step_of_the_full_fit(scene: Scene) -> None:
 def test_without_photos(scene: Scene) -> None:
     result = scenes.compacted(replace(scene, images=None))
     assert result.report.psnr_before is None
-    assert not {"input", "curve", "members", "fit", "score"} & set(result.report.seconds)
+    assert not {"input", "curve", "fit", "score"} & set(result.report.seconds)
 
 
 def test_options_and_settings_combine(scene: Scene) -> None:
@@ -120,15 +120,6 @@ def test_every_segmentation(scene: Scene, segmentation: str) -> None:
     assert len(scenes.compacted(scene, segmentation=segmentation, superpixels=40).gaussians) <= 120
 
 
-@pytest.mark.parametrize("k", [1, 2, 4])
-def test_paper_rule(scene: Scene, k: int) -> None:
-    """The baseline's Gaussians, children too, have their members' mean opacity."""
-    actual = scenes.plain(scene, rule="paper", match="none", k=k).opacities
-    assert float(actual.max()) <= float(scene.gaussians.opacities.max()) + 1e-4
-    assert float(actual.min()) >= float(scene.gaussians.opacities.min()) - 1e-4
-    scenes.plain(scene, rule="paper", match="aabb", k=k)
-
-
 @pytest.mark.parametrize("degree", [1, 2, 3, 4])
 def test_harmonics_keep_their_degree(degree: int) -> None:
     scene = scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24), degree=degree)
@@ -160,7 +151,7 @@ def test_tensors_give_tensors_of_the_same_values(scene: Scene, photos: bool) -> 
     """Of Gaussians that autograd follows, too; the input stays as it is."""
     given = scene if photos else replace(scene, images=None)
     tensors = replace(given, gaussians=given.gaussians.to("cpu"), cameras=given.cameras.to("cpu"))
-    tensors = replace(tensors, valid=torch.from_numpy(given.valid))
+    tensors = replace(tensors, pixel_ids=torch.from_numpy(given.pixel_ids))
     if given.images is not None:
         tensors = replace(tensors, images=torch.from_numpy(given.images))
     tensors.gaussians.means.requires_grad_()

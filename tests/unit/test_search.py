@@ -4,15 +4,37 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 
 from gsmerge.budget import DEVICES, BudgetOptions, exact_count, max_allowed, parse_share, share_text
-from gsmerge.search import CurvePoint, count_within, curve_knee, level_counts, rungs, search_count
+from gsmerge.plan import Plan
+from gsmerge.search import (
+    MAX_RUNS,
+    Build,
+    CountSearch,
+    CurvePoint,
+    count_within,
+    curve_knee,
+    level_counts,
+    rungs,
+    search_count,
+)
+from gsmerge.stages.prepare import Prepared
 
 
 def points(*values: tuple[int, float, float]) -> list[CurvePoint]:
     return [CurvePoint(*value) for value in values]
+
+
+def make_plan(
+    target_psnr: float | None = None, least: int = 1, most: int = 10**6, default: int | None = None, levels: int = 1
+) -> Plan:
+    """What a search reads of a plan."""
+    limits = SimpleNamespace(min_count=least, max_count=most, default=most if default is None else default)
+    return cast("Plan", SimpleNamespace(target_psnr=target_psnr, limits=limits, levels=levels))
 
 
 @pytest.mark.parametrize(
@@ -75,9 +97,9 @@ def test_rungs_rise_within_their_limits() -> None:
 
 
 def test_levels_end_where_a_view_would_have_none() -> None:
-    assert level_counts(6400, 4, 12) == [1600, 400, 100]
-    assert level_counts(6400, 4, 200) == [1600, 400]
-    assert level_counts(6400, 1, 12) == []
+    assert level_counts(6400, make_plan(levels=4, least=12)) == [1600, 400, 100]
+    assert level_counts(6400, make_plan(levels=4, least=200)) == [1600, 400]
+    assert level_counts(6400, make_plan(levels=1, least=12)) == []
 
 
 def test_count_within_is_read_off_the_curve() -> None:
@@ -123,35 +145,59 @@ def rises(count: int) -> float:
     return 20 + 2 * math.log2(count / 1000)
 
 
+def search(curve: Callable[[int], float], target: float, start: int, least: int, most: int) -> CountSearch:
+    """Run a search on a curve that is known, instead of building scenes."""
+    counts = CountSearch(make_plan(target_psnr=target, least=least, most=most), start)
+    for count in counts:
+        assert count is not None
+        counts.add(SimpleNamespace(count=count, psnr=curve(count), gaussians=range(count)))  # type: ignore[arg-type]
+    return counts
+
+
 @pytest.mark.parametrize("start", [10, 300, 1000, 4000, 90_000])
 @pytest.mark.parametrize("target", [17.0, 20.0, 23.3, 27.0])
 def test_search_finds_the_fewest(start: int, target: float) -> None:
-    actual = search_count(rises, target, start, 10, 100_000)
+    actual = search(rises, target, start, 10, 100_000)
     fewest = 1000 * 2 ** ((target - 20) / 2)
-    assert actual.met
-    assert actual.psnr == rises(actual.count) >= target
-    assert actual.count <= max(2.5 * fewest, 10)
-    assert (actual.count, actual.psnr) in actual.tried
-    assert len(actual.tried) <= 6
+    best = actual.best
+    assert actual.unmet is None
+    assert best.count is not None
+    assert best.psnr == rises(best.count) >= target
+    assert best.count <= max(2.5 * fewest, 10)
+    assert len(actual.tried) <= MAX_RUNS
 
 
 def test_search_near_the_answer_ends_close_to_it() -> None:
-    actual = search_count(rises, 24.0, 3000, 10, 100_000)
-    assert 4000 <= actual.count <= 4000 * 1.3
+    count = search(rises, 24.0, 3000, 10, 100_000).best.count
+    assert count is not None
+    assert 4000 <= count <= 4000 * 1.3
 
 
 def test_search_says_when_it_is_out_of_reach() -> None:
-    actual = search_count(rises, 40.0, 1000, 10, 5000)
-    assert not actual.met
-    assert (actual.count, actual.psnr) == (5000, rises(5000))
+    actual = search(rises, 40.0, 1000, 10, 5000)
+    assert (
+        actual.unmet == f"quality: 40 dB was asked for, the input views reach {rises(5000):.2f} dB with 5000 Gaussians"
+    )
+    assert (actual.best.count, actual.best.psnr) == (5000, rises(5000))
 
 
 def test_search_keeps_the_best_of_a_curve_that_falls() -> None:
-    actual = search_count(lambda count: 20 - abs(math.log2(count / 1000)), 25.0, 1000, 10, 5000)
-    assert (actual.met, actual.count) == (False, 1000)
+    actual = search(lambda count: 20 - abs(math.log2(count / 1000)), 25.0, 1000, 10, 5000)
+    assert actual.unmet is not None
+    assert actual.best.count == 1000
 
 
 def test_search_stays_within_its_limits() -> None:
-    tried = search_count(rises, 25.0, 10_000, 700, 900).tried
-    assert all(700 <= count <= 900 for count, _ in tried)
-    assert search_count(rises, 1.0, 5000, 700, 9000).count >= 700
+    assert all(700 <= count <= 900 for count in search(rises, 25.0, 800, 700, 900).tried)
+    assert all(count >= 700 for count in search(rises, 1.0, 5000, 700, 9000).tried)
+
+
+@pytest.mark.parametrize(("default", "first"), [(500, 700), (800, 800), (100_000, 900)])
+def test_search_begins_within_its_limits(default: int, first: int) -> None:
+    plan = make_plan(target_psnr=25.0, least=700, most=900, default=default)
+    assert search_count(cast("Prepared", None), plan, cast("Build", None)).first == first
+
+
+def test_one_count_is_built_once_where_no_quality_is_asked_for() -> None:
+    assert list(CountSearch(make_plan(), 300)) == [300]
+    assert list(CountSearch(make_plan(), None)) == [None]

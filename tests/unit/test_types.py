@@ -199,7 +199,7 @@ def test_scenes_of_tensors_become_such_of_arrays(missing: np.ndarray | None) -> 
     given = replace(scene(), missing=missing)
     assert isinstance(given.numpy().gaussians.means, np.ndarray)
     changed = {"gaussians": given.gaussians.to("cpu"), "cameras": given.cameras.to("cpu")}
-    changed |= {name: as_tensor(getattr(given, name)) for name in ("images", "valid")}
+    changed |= {name: as_tensor(getattr(given, name)) for name in ("images", "pixel_ids")}
     if missing is not None:
         changed["missing"] = as_tensor(missing)
     loose = Scene(changed["gaussians"], changed["cameras"], changed["images"], None, given.names)
@@ -214,7 +214,7 @@ def test_scenes_of_tensors_become_such_of_arrays(missing: np.ndarray | None) -> 
         assert arrays.names == given.names
         for one in (*vars(arrays.gaussians).values(), arrays.cameras.viewmats, arrays.cameras.Ks):
             assert isinstance(one, np.ndarray)
-        for name in ("images", "valid", "missing"):
+        for name in ("images", "pixel_ids", "missing"):
             one, other = getattr(arrays, name, None), getattr(tensors, name, None)
             assert (one is None) == (other is None)
             assert one is None or (isinstance(one, np.ndarray) and np.array_equal(one, getattr(given, name)))
@@ -224,7 +224,7 @@ def test_scenes_of_tensors_become_such_of_arrays(missing: np.ndarray | None) -> 
     ("change", "message"),
     [
         ({"gaussians": gaussians(23)}, "expected 2 x 3 x 4 = 24 Gaussians, got 23"),
-        ({"valid": np.ones((2, 4, 3), bool)}, "valid: expected shape"),
+        ({"pixel_ids": np.ones((2, 4), int)}, "pixel_ids: expected shape"),
         ({"images": np.zeros((2, 3, 4, 4))}, "images: expected shape"),
         ({"names": ("a",)}, "expected 2 view names, got 1"),
         ({"missing": np.ones((2, 4, 3), bool)}, "missing: expected shape"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
@@ -13,7 +12,7 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import MAX_VIEWS, check_pixels
 from gsmerge.io.photos import Photos, Size, change_photos, photo_size, same_shape
-from gsmerge.types import Cameras
+from gsmerge.types import Cameras, StrPath
 
 MAX_NUMBER, _MAX_SIDE, _MIN_FOCAL = 1e12, 1e6, 1e-6  # beyond them no camera is, and numbers would overflow later
 _MAX_COEFFICIENT = 1e6  # of a lens; what a smaller one does to the photos is checked with them
@@ -94,7 +93,7 @@ def make_pinhole(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
 
 
 def make_camera_file(
-    path: str | os.PathLike[str],
+    path: StrPath,
     source: str,
     convention: Convention,
     views: Sequence[View],
@@ -152,7 +151,7 @@ def _in_pixels(Ks: np.ndarray, sizes: list[tuple[int, int]]) -> tuple[np.ndarray
     return Ks * np.array([(w, h, 1) for w, h in sizes], np.float64)[:, :, None], sizes
 
 
-def check_camera(path: str | os.PathLike[str], name: str, pose: np.ndarray, K: np.ndarray) -> None:
+def check_camera(path: StrPath, name: str, pose: np.ndarray, K: np.ndarray) -> None:
     """Refuse a pose ``[4,4]`` or intrinsics ``[3,3]`` that no camera has, as a SceneError."""
     if not (np.isfinite(pose).all() and np.isfinite(K).all()):
         raise SceneError(path, f"view {name}: expected finite numbers, found NaN or inf")
@@ -171,7 +170,7 @@ def check_camera(path: str | os.PathLike[str], name: str, pose: np.ndarray, K: n
         raise SceneError(path, f"view {name}: expected intrinsics whose last row is 0 0 1, found others")
 
 
-def _check_lens(path: str | os.PathLike[str], name: str, lens: Lens | None) -> None:
+def _check_lens(path: StrPath, name: str, lens: Lens | None) -> None:
     if lens is None:
         return
     keys = COEFFICIENTS[lens.model]
@@ -181,7 +180,7 @@ def _check_lens(path: str | os.PathLike[str], name: str, lens: Lens | None) -> N
             raise SceneError(path, f"{problem} ({lens.name})", "correct it, or undistort the images first")
 
 
-def check_size(path: str | os.PathLike[str], name: str, K: np.ndarray, size: tuple[int, int]) -> None:
+def check_size(path: StrPath, name: str, K: np.ndarray, size: tuple[int, int]) -> None:
     """Refuse intrinsics ``[3,3]`` in pixels that do not fit an image of (width, height), as a SceneError."""
     side = max(size)
     if min(size) <= 1:  # not known

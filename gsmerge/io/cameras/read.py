@@ -21,6 +21,7 @@ from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
 from gsmerge.io.cameras.re10k import read_re10k
 from gsmerge.io.formats.ply import READERS
 from gsmerge.io.formats.ply_file import open_ply
+from gsmerge.types import StrPath
 
 # Where cameras are in a scene's folder, the first that exists wins; a COLMAP model directly in the folder comes last,
 # because Depth Anything 3 puts one there at the photos' own size.
@@ -56,7 +57,7 @@ def find_cameras(folder: Path) -> Path | None:
     return chunks[0] if len(chunks) == 1 else None
 
 
-def read_cameras(path: str | os.PathLike[str], *, scene: str | None = None) -> CameraFile:
+def read_cameras(path: StrPath, *, scene: str | None = None) -> CameraFile:
     """Read cameras from a file, or from a folder that holds one of the known kinds.
 
     ``transforms.json`` (nerfstudio, instant-ngp), COLMAP text and binary models, INRIA's ``cameras.json``,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,7 +37,7 @@ from gsmerge.io.formats.ply_file import (
     spread_low_degree,
 )
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import Gaussians
+from gsmerge.types import Gaussians, StrPath
 
 OpacityChoice = Literal["auto", "logit", "raw"]
 
@@ -112,7 +111,7 @@ def ply_notes(info: PlyInfo) -> tuple[str, ...]:
     return (*notes, *(f"{count:,} {what}" for what, count in counted.items() if count))
 
 
-def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -> PlyScene:
+def read_ply(path: StrPath, *, opacity: OpacityChoice = "auto") -> PlyScene:
     """Read a PLY file of Gaussians: binary or ascii, any SH degree up to 4, extra columns and elements ignored.
 
     Args:
@@ -131,7 +130,7 @@ def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -
     return _to_scene(Path(path), _ply_rows(Path(path)), opacity)
 
 
-def read_gaussians(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -> PlyScene:
+def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto") -> PlyScene:
     """Read a file of Gaussians in the format that the ending of its name says.
 
     Those are ``.spz`` (versions 1 to 3), ``.splat`` and ``.sog`` (version 2). Everything else is read as by

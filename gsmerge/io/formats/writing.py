@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -23,7 +22,7 @@ from gsmerge.io.formats.ply_file import (
     SCALES,
     SH0,
 )
-from gsmerge.types import Gaussians
+from gsmerge.types import Gaussians, StrPath
 
 # File endings, the longest first, and the highest degree of the harmonics that there is room for.
 OUTPUT_FORMATS = {
@@ -36,7 +35,7 @@ OUTPUT_FORMATS = {
 }
 
 
-def output_format(path: str | os.PathLike[str], spz_version: int = 3) -> str:
+def output_format(path: StrPath, spz_version: int = 3) -> str:
     """Return the ending of an output's name that says how it is written.
 
     Raises:
@@ -52,7 +51,7 @@ def output_format(path: str | os.PathLike[str], spz_version: int = 3) -> str:
     return ending
 
 
-def lost_harmonics(path: str | os.PathLike[str], sh_degree: int, spz_version: int = 3) -> str | None:
+def lost_harmonics(path: StrPath, sh_degree: int, spz_version: int = 3) -> str | None:
     """Describe the harmonics that a format has no room for; None if it holds all.
 
     Raises as :func:`output_format`.
@@ -63,7 +62,7 @@ def lost_harmonics(path: str | os.PathLike[str], sh_degree: int, spz_version: in
 
 
 def write_gaussians(
-    path: str | os.PathLike[str],
+    path: StrPath,
     gaussians: Gaussians,
     *,
     overwrite: bool = False,
@@ -112,7 +111,7 @@ def _content(gaussians: Gaussians, ending: str, comments: Sequence[str], spz_ver
 
 
 def write_ply(
-    path: str | os.PathLike[str],
+    path: StrPath,
     gaussians: Gaussians,
     *,
     overwrite: bool = False,

@@ -153,7 +153,6 @@ def fit(
     return run_on(backend if len(photos) == 2 else ON_CPU, "fit", fit_on)
 
 
-@stage("fit")
 def fit_scene(
     decoded: Decoded, scene: Scene, views: Sequence[int], options: FitOptions, seed: int, backend: FitBackend[Any]
 ) -> Fitted:
@@ -169,13 +168,14 @@ def fit_scene(
     """
     if scene.images is None or not options.needs_photos:
         return Fitted(decoded.gaussians, scene.cameras, None)
-    photos = fit_photos(scene, options, views)
-    choose(start_count=len(decoded.gaussians))
-    gaussians, report = fit(
-        decoded.gaussians, photos, options, decoded.count, seed, report_steps, decoded.baseline_start,
-        exact=decoded.exact, backend=backend,
-    )  # fmt: skip
-    record_fit(report)
+    with stage("fit"):
+        photos = fit_photos(scene, options, views)
+        choose(start_count=len(decoded.gaussians))
+        gaussians, report = fit(
+            decoded.gaussians, photos, options, decoded.count, seed, report_steps, decoded.baseline_start,
+            exact=decoded.exact, backend=backend,
+        )  # fmt: skip
+        record_fit(report)
     cameras = scene.cameras
     if report is not None and report.viewmats is not None:
         viewmats = cameras.viewmats.astype(np.float64)

@@ -141,7 +141,7 @@ def test_unknown_methods_are_refused() -> None:
 
 def test_settings_without_effect_are_told(scene: Scene) -> None:
     assert made(scene, "voxel", seed=3, threads=1).report.notes == []
-    assert made(scene, "voxel", effort="best", match="none").report.notes == ["method voxel does not use effort, match"]
+    assert made(scene, "voxel", effort="best", match="none").report.notes == ["method voxel does not use match, effort"]
     assert made(scene, "unmerged-fit", budget=None, effort="fast").report.notes == []
     assert made(scene, "unmerged").report.notes == ["method unmerged does not use budget"]
 
@@ -150,7 +150,7 @@ def test_only_its_stages_are_timed(scene: Scene) -> None:
     around = {"prepare", "score", "input"}
     assert set(made(scene, "unmerged").report.seconds) == around
     assert set(made(scene, "opacity").report.seconds) == around | {"reduce"}
-    assert set(made(scene, "moment-matching").report.seconds) == around | {"segment", "encode", "decode"}
+    assert set(made(scene, "moment-matching").report.seconds) == around | {"segment", "members", "encode", "decode"}
     assert set(made(scene, "unmerged-fit").report.seconds) == around | {"fit"}
 
 

@@ -23,7 +23,7 @@ def scene() -> Made:
 
 @pytest.fixture(scope="module")
 def division(scene: Made) -> Division:
-    return divide_all(scene.features, scene.members, MOST, "depth")
+    return divide_all(scene.features, scene.members, MOST)
 
 
 def picked(features: FeatureGaussians, division: Division, counts: np.ndarray) -> tuple[Gaussians, np.ndarray]:
@@ -63,7 +63,7 @@ def test_groups_that_cannot_be_divided_are_whole(scene: Made, division: Division
 
 
 def test_one_child_keeps_nothing(scene: Made) -> None:
-    division = divide_all(scene.features, scene.members, 1, "depth")
+    division = divide_all(scene.features, scene.members, 1)
     sizes = [len(part) for part in (division.slots, division.uniform, division.children, division.growth_order)]
     assert sizes == [0, 0, 0, 0]
     assert not division.splits.any()
@@ -71,6 +71,6 @@ def test_one_child_keeps_nothing(scene: Made) -> None:
 
 def test_no_groups(scene: Made) -> None:
     none = scenes.make_features(np.zeros((0, 3)))
-    division = divide_all(none, scene.members, MOST, "depth")
+    division = divide_all(none, scene.members, MOST)
     rows, parents = pick_children(division, np.zeros(0, np.int64))
     assert (len(rows), len(parents), len(division.children)) == (0, 0, 0)

@@ -93,7 +93,6 @@ def test_pruning_by_what_the_views_see_is_done_without_photos(pixels: Scene) -> 
         {"budget": "auto"},
         {"effort": "draft", "k": 2},
         {"match": "aabb", "k": 2},
-        {"rule": "paper", "k": 2},
         {"min_opacity": 0.3, "k": 2},
         {"min_contribution": 0.2},
     ],

@@ -132,7 +132,7 @@ def test_nothing_to_absorb_changes_nothing(sides: tuple[GroupSet, GroupSet]) -> 
 def test_all_groups_can_be_divided_afterwards(sides: tuple[GroupSet, GroupSet], actual: np.ndarray) -> None:
     new, rows = joined_pairs(sides, actual)
     after = merge_into(sides[0], new, rows, 4)
-    division = divide_all(after.features, child_members(after), 4, "depth")
+    division = divide_all(after.features, child_members(after), 4)
     assert np.isfinite(division.children.sh0).all()
     assert DecodeOptions().k == 1
     assert FAST["superpixels"] == "10%"

@@ -322,10 +322,9 @@ def test_every_k_up_to_the_most(pairs: list[Scene]) -> None:
         compactor.decode(k=1, budget=500)
 
 
-@pytest.mark.parametrize("rule", ["depth", "paper"])
-def test_more_children_show_more(rule: str, scene: Scene, pairs: list[Scene]) -> None:
+def test_more_children_show_more(scene: Scene, pairs: list[Scene]) -> None:
     """However often children were pooled; in the exports' colours, as fitted ones are those of the group."""
-    compactor = fed(pairs, rule=rule, fit_colors=False)
+    compactor = fed(pairs, fit_colors=False)
     one, two, four = (scenes.psnr_of(compactor.decode(k=k, fit="none"), scene) for k in (1, 2, 4))
     assert four > two > one
 

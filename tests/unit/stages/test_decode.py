@@ -68,20 +68,6 @@ def test_children_keep_the_groups_moments(features: FeatureGaussians, members: M
         assert (own <= high + 1e-5).all()
 
 
-@pytest.mark.parametrize("k", [1, 2, 4])
-def test_children_are_pooled_by_the_rule(scene: Scene, members: Members, k: int) -> None:
-    """The paper's: members of one opacity have children of that opacity; the own rule makes them denser."""
-    assert scene.images is not None
-    even = replace(members, opacities=np.full_like(members.opacities, 0.5))
-    groups = segment(scene.images, SegmentOptions(), COUNT)
-    paper = encode(scene, even, groups, rule="paper")
-    actual = decode(paper, even, DecodeOptions(k=k), rule="paper")
-    assert len(actual) == 2 * COUNT * k
-    np.testing.assert_allclose(actual.opacities, 0.5, rtol=1e-3)
-    if k > 1:
-        assert np.abs(decode(paper, even, DecodeOptions(k=k)).opacities - 0.5).max() > 0.1
-
-
 def test_mixed_k_goes_by_the_saliency(features: FeatureGaussians, members: Members) -> None:
     """Half of the groups one, a third two, the rest four: those whose pixels are the most salient."""
     saliency = np.random.default_rng(0).random(len(members.means)).astype(np.float32)

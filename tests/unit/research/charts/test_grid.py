@@ -223,7 +223,7 @@ def test_a_copy_has_the_same_hash(scene_copy: Path, made_scene: Path) -> None:
 
 
 def test_jobs_are_runs_of_each_scene_with_files_of_their_own(made_scene: Path) -> None:
-    fixed = ("checkpoint=a/b.safetensors", "backing=false")
+    fixed = ("checkpoint=a/b.safetensors", "min_opacity=0.1")
     grid = Grid(methods=("gsmerge", "random"), budgets=("1%",), views=(2, 9, "all"), fixed=fixed)
     jobs, notes = make_jobs(sources(made_scene), grid, EvaluateOptions(()), proxy_views=1)
     assert len({job.output for job in jobs}) == len(jobs) == 2 * 3 + 1
