@@ -23,8 +23,9 @@ from shared_scenes import export, scene_folders
 import gsmerge
 from gsmerge.io import load_scene
 from gsmerge.io.held_out import read_held_out as read_views
-from gsmerge.measure.evaluate import ALIGNMENTS, EvaluateOptions, Views, evaluate
+from gsmerge.measure.evaluate import ALIGNMENTS, EvaluateOptions, evaluate
 from gsmerge.research.charts.lines import mean_interval
+from gsmerge.types import Views
 
 NAME = "defaults.jsonl"
 ZOOMS = (0.5, 1.0, 2.0, 4.0)

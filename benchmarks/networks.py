@@ -24,9 +24,10 @@ import torch
 from shared_scenes import LEFT_OUT, export, read_held_out, scene_folders
 
 import gsmerge
-from gsmerge.measure.evaluate import EvaluateOptions, Views, evaluate
+from gsmerge.measure.evaluate import EvaluateOptions, evaluate
 from gsmerge.networks.checkpoint import SHIPPED, load_checkpoint, save_checkpoint
 from gsmerge.research.charts.lines import Interval, mean_interval, paired_difference
+from gsmerge.types import Views
 from gsmerge.views import even_views, subset
 
 MEASURES = ("psnr", "ssim", "lpips_vgg")

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from gsmerge.research.charts.lines import mean_interval
-from gsmerge.research.charts.run import INPUT, RunRecord
+from gsmerge.research.charts.measure_run import INPUT, RunRecord
 
 Row = Sequence[str]
 

@@ -22,7 +22,7 @@ from result_cells import (
 from gsmerge.measure.speed import break_even
 from gsmerge.report import human_bytes
 from gsmerge.research.charts.lines import Results, make_verdict_tables
-from gsmerge.research.charts.run import INPUT, SUPERPIXELS, RunRecord
+from gsmerge.research.charts.measure_run import INPUT, SUPERPIXELS, RunRecord
 
 OURS = "gsmerge"
 COMMAND = "python benchmarks/results.py"

@@ -24,8 +24,8 @@ from result_tables import page_of
 from shared_scenes import exporter, scene_folders, shared_folder
 
 from gsmerge.cli import main as gsmerge
-from gsmerge.cli.chart import CHARTS
-from gsmerge.research.charts.run import RunRecord, read_runs
+from gsmerge.cli.chart_command import CHARTS
+from gsmerge.research.charts.measure_run import RunRecord, read_runs
 
 ROOT = Path(__file__).parents[1]
 FAST_BASELINES = "random,opacity,contribution,blocks,voxel,moment-matching"

@@ -133,7 +133,7 @@ def _cell(text: str | None) -> str:
 
 
 def _settings_page() -> str:
-    from gsmerge.cli.options import HINTS, words_for
+    from gsmerge.cli.parameters import HINTS, words_for
     from gsmerge.cli.paths import FileOptions
     from gsmerge.io import ReadHints
     from gsmerge.io.formats.ply import OpacityChoice
@@ -179,7 +179,7 @@ def _training_page() -> str:
 
 def _settings(options: Any, names: Sequence[str] | None = None) -> list[str]:
     """A table of a dataclass, or of some of its fields: name, default, values, and what its docstring says of it."""
-    from gsmerge.cli.options import words_for
+    from gsmerge.cli.parameters import words_for
     from gsmerge.options import DEVICES, EFFORTS, METHODS
     from gsmerge.stages.decode import K_RULES
     from gsmerge.stages.superpixels import SEGMENTATIONS

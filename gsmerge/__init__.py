@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gsmerge import integrations as integrations
-    from gsmerge.encoded.decode import decode_scene as decode_scene
-    from gsmerge.encoded.encode import encode_scene as encode_scene
     from gsmerge.encoded.encoded import Encoded as Encoded
     from gsmerge.encoded.gsm_file import load_encoded as load_encoded
     from gsmerge.encoded.gsm_file import save_encoded as save_encoded
+    from gsmerge.encoded.to_encoded import encode_scene as encode_scene
+    from gsmerge.encoded.to_gaussians import decode_scene as decode_scene
     from gsmerge.errors import GsmergeError as GsmergeError
     from gsmerge.errors import SceneError as SceneError
     from gsmerge.in_memory import compact_tensors as compact_tensors
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from gsmerge.io import write_ply as write_ply
     from gsmerge.measure.evaluate import EvaluateOptions as EvaluateOptions
     from gsmerge.measure.evaluate import Evaluation as Evaluation
-    from gsmerge.measure.evaluate import Views as Views
     from gsmerge.measure.evaluate import evaluate as evaluate
     from gsmerge.measure.inspect import inspect as inspect
     from gsmerge.online.compactor import Compactor as Compactor
@@ -50,13 +49,14 @@ if TYPE_CHECKING:
     from gsmerge.types import Cameras as Cameras
     from gsmerge.types import Gaussians as Gaussians
     from gsmerge.types import Scene as Scene
+    from gsmerge.types import Views as Views
 
 __version__ = "0.1.0"
 
 _PUBLIC = {
     "errors": ("GsmergeError", "SceneError"),
     "in_memory": ("compact_tensors",),
-    "measure.evaluate": ("EvaluateOptions", "Evaluation", "Views", "evaluate"),
+    "measure.evaluate": ("EvaluateOptions", "Evaluation", "evaluate"),
     "measure.inspect": ("inspect",),
     "io": (
         "read_cameras",
@@ -73,11 +73,11 @@ _PUBLIC = {
     "render": ("Rendering", "render"),
     "result": ("CompactReport", "CompactResult"),
     "stages.superpixels": ("saliency", "superpixels"),
-    "encoded.decode": ("decode_scene",),
-    "encoded.encode": ("encode_scene",),
+    "encoded.to_gaussians": ("decode_scene",),
+    "encoded.to_encoded": ("encode_scene",),
     "encoded.encoded": ("Encoded",),
     "encoded.gsm_file": ("load_encoded", "save_encoded"),
-    "types": ("Cameras", "Gaussians", "Scene"),
+    "types": ("Cameras", "Gaussians", "Scene", "Views"),
 }
 _EXPORTS = {name: home for home, names in _PUBLIC.items() for name in names}
 

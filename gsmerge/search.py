@@ -21,7 +21,7 @@ from gsmerge.runtime.record import choose, record_part, report_progress, stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.clean import CleanOptions
 from gsmerge.stages.fit import FitOptions, Fitted
-from gsmerge.stages.fit.photos import holdout_psnr, training_weights
+from gsmerge.stages.fit.photo_sizes import holdout_psnr, training_weights
 from gsmerge.stages.prepare import Prepared
 from gsmerge.stages.segment import knee_count
 from gsmerge.types import Gaussians

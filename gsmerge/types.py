@@ -195,6 +195,30 @@ class LargePhotos:
 
 
 @dataclass(frozen=True)
+class Views:
+    """Cameras with their photos.
+
+    Args:
+        cameras: v cameras, in the world of the Gaussians that they look at.
+        images: ``[v,h,w,3]`` sRGB in [0, 1].
+        names: One for each view.
+    """
+
+    cameras: Cameras
+    images: Array
+    names: tuple[str, ...]
+
+    def __len__(self) -> int:
+        """Return v."""
+        return len(self.cameras)
+
+    def __getitem__(self, ids: Sequence[int]) -> Views:
+        """Select views by their ids."""
+        ids = list(ids)
+        return Views(self.cameras[ids], self.images[ids], tuple(self.names[i] for i in ids))
+
+
+@dataclass(frozen=True)
 class Scene:
     """Gaussians, and the views that they were made from or that see them.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from gsmerge.research.charts.run import SEGMENTATIONS, SHARES, SUPERPIXELS, RunRecord, describe
+from gsmerge.research.charts.measure_run import SEGMENTATIONS, SHARES, SUPERPIXELS, RunRecord, describe
 
 SCENES = ("apples", "fern", "fox")
 LEVELS = {"apples": 2.0, "fern": 0.0, "fox": -3.0}  # how hard a scene is, dB

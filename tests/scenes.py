@@ -20,7 +20,7 @@ from gsmerge.geometry import covariances, normalize, quat_to_rotmat
 from gsmerge.render.photos import Photos, scene_photos
 from gsmerge.research.generate import objects, photograph, shapes
 from gsmerge.research.generate.noise import Noise, TrueView, pixel_gaussians
-from gsmerge.research.generate.scene import look_at as camera_to_world
+from gsmerge.research.generate.synthetic_scene import look_at as camera_to_world
 from gsmerge.result import CompactReport, CompactResult
 from gsmerge.stages.fit import FitOptions
 from gsmerge.types import SH_C0, FeatureGaussians, grid_ids
@@ -108,14 +108,14 @@ def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 def intrinsics(num_views: int, width: int, height: int) -> np.ndarray:
     """A lens whose focal length is the image's width."""
-    return np.stack([photograph.Lens(width, height, width).intrinsics] * num_views)
+    return np.stack([photograph.Pinhole(width, height, width).intrinsics] * num_views)
 
 
 def views_of(
     surfaces: Sequence[Surface], cameras: Cameras
-) -> tuple[photograph.Lens, list[tuple[np.ndarray, photograph.Hits, np.ndarray]]]:
+) -> tuple[photograph.Pinhole, list[tuple[np.ndarray, photograph.Hits, np.ndarray]]]:
     """The lens; for every view its camera to world, what its rays meet, and the colours ``[h,w,3]`` of that."""
-    lens = photograph.Lens(cameras.width, cameras.height, float(cameras.Ks[0, 0, 0]))
+    lens = photograph.Pinhole(cameras.width, cameras.height, float(cameras.Ks[0, 0, 0]))
     assert np.allclose(cameras.Ks, lens.intrinsics)
     packed, actual = shapes.pack([surface.shape for surface in surfaces]), []
     for viewmat in cameras.viewmats.astype(np.float64):
@@ -129,7 +129,7 @@ def views_of(
     return lens, actual
 
 
-def world_points(depth: np.ndarray, c2w: np.ndarray, lens: photograph.Lens) -> np.ndarray:
+def world_points(depth: np.ndarray, c2w: np.ndarray, lens: photograph.Pinhole) -> np.ndarray:
     """World positions ``[h,w,3]`` of pixels' centres at depths ``[h,w]``."""
     y, x = np.mgrid[: lens.height, : lens.width] + 0.5
     rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(lens.intrinsics).T  # of unit depth

@@ -1,7 +1,7 @@
 """Many scenes: each on its own, recorded as soon as it is done, on this machine or on a cluster."""
 
+from gsmerge.batch.batch_options import BatchOptions
 from gsmerge.batch.find import Job, find_jobs
-from gsmerge.batch.options import BatchOptions
-from gsmerge.batch.run import run_batch
+from gsmerge.batch.schedule import run_batch
 
 __all__ = ["BatchOptions", "Job", "find_jobs", "run_batch"]

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from gsmerge.batch.options import BatchOptions
+from gsmerge.batch.batch_options import BatchOptions
 from gsmerge.compact_file import level_output
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import SCENE_SUFFIXES, SceneFiles

@@ -26,7 +26,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Protocol
 
-from gsmerge.batch.options import BatchOptions
+from gsmerge.batch.batch_options import BatchOptions
 from gsmerge.batch.records import LOST, RecordIndex, record
 from gsmerge.batch.task import BatchContext, Task, clean_up, run_task
 from gsmerge.errors import SceneError, UsageError

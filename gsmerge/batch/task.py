@@ -21,8 +21,8 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from gsmerge import __version__
+from gsmerge.batch.batch_options import BatchOptions
 from gsmerge.batch.find import Job, result_names
-from gsmerge.batch.options import BatchOptions
 from gsmerge.batch.records import (
     BUSY,
     DONE,

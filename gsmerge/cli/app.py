@@ -16,7 +16,7 @@ import typer
 
 from gsmerge import __version__
 from gsmerge.cli.console import plain_warnings, say
-from gsmerge.cli.options import HINTS
+from gsmerge.cli.parameters import HINTS
 from gsmerge.errors import (
     DAMAGED_OPENCV,
     GsmergeError,
@@ -49,7 +49,7 @@ def make_app(only: str | None = None) -> typer.Typer:
     for panel, names in COMMANDS.items():
         for name in names:
             if only in (None, name):
-                function = getattr(import_module(f"gsmerge.cli.{name}"), name)
+                function = getattr(import_module(f"gsmerge.cli.{name}_command"), name)
                 made.command(rich_help_panel=panel)(function)
     return made
 

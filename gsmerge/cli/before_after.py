@@ -8,13 +8,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gsmerge.cli.options import Args, usage_errors
+from gsmerge.cli.parameters import Args, usage_errors
 from gsmerge.errors import SceneError, UsageError
 
 if TYPE_CHECKING:
     from gsmerge.io import PlyScene, SceneFiles, SceneLoad
-    from gsmerge.measure.evaluate import Views
-    from gsmerge.types import Cameras, Gaussians, Scene
+    from gsmerge.types import Cameras, Gaussians, Scene, Views
 
 SAME = 1e-5  # difference of two poses, of 1 and of their numbers, that writing and reading may make
 
@@ -115,18 +114,17 @@ def held_out_views(
 ) -> tuple[Scene, Views | None, tuple[str, ...]]:
     """Choose the context views of ``--views`` and the held-out views; return the scene, those, and notes about them."""
     from gsmerge.io import read_held_out
-    from gsmerge.measure.evaluate import Views
     from gsmerge.views import even_views, midpoint_views, subset
 
     if target_images is not None and targets is None:
         raise UsageError("--target-images: expected the cameras of those photos too; name them with --targets")
     read = None if targets is None else read_held_out(load, targets, target_images)
-    held_out = None if read is None else Views(read.cameras, read.images, read.names)
     notes = () if read is None else read.notes
     if views is None:
-        return load.scene, held_out, notes
+        return load.scene, read, notes
     with usage_errors():
         ids = even_views(len(load.scene), views)
+    chosen: Sequence[int] = ()
     if read is not None:
         if read.context_places is None:
             raise UsageError(
@@ -135,8 +133,7 @@ def held_out_views(
         chosen = midpoint_views([read.context_places[i] for i in ids], read.places)
         if not chosen:
             raise UsageError(f"--views {views}: expected held-out views between the input views, found none")
-        held_out = Views(read.cameras[chosen], read.images[chosen], tuple(read.names[i] for i in chosen))
-    return subset(load.scene, ids), held_out, notes
+    return subset(load.scene, ids), read and read[chosen], notes
 
 
 def file_names(paths: Sequence[Path]) -> list[str]:

@@ -102,7 +102,7 @@ def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
 
 
 def _is_photo(path: Path) -> bool:
-    from gsmerge.io.photos import IMAGE_SUFFIXES
+    from gsmerge.io.photo_files import IMAGE_SUFFIXES
 
     return path.suffix.lower() in IMAGE_SUFFIXES and path.exists()
 

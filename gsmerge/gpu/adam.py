@@ -14,13 +14,13 @@ import torch
 from torch import Tensor
 
 from gsmerge.kernels.gaussians.optimise import COLOR, LOGIT, MAX_LOGIT, MIN_LOGIT, QUAT, SIZE
-from gsmerge.stages.fit.options import FitOptions
+from gsmerge.stages.fit.fit_options import FitOptions
 from gsmerge.types import SH_C0, Gaussians
 
 
 @dataclass(eq=False)
 class FitState:
-    """Parameters under optimisation, and what they mean to the rasterizer; see :class:`gsmerge.stages.fit.state.State`.
+    """Parameters under optimisation, and what they mean to the rasterizer; see :mod:`gsmerge.stages.fit.fit_state`.
 
     Args:
         x: ``[n,14]`` float32: mean, log scale, quaternion, opacity logit, colour; so are the next three.

@@ -22,8 +22,8 @@ from gsmerge.gpu.device_photos import (
 )
 from gsmerge.gpu.image_scores import exposure_gains, holdout_psnr
 from gsmerge.stages.fit.color import HOLDOUT, add_offsets, solve_colors
-from gsmerge.stages.fit.options import FitOptions, FitReport
-from gsmerge.stages.fit.photos import training_weights
+from gsmerge.stages.fit.fit_options import FitOptions, FitReport
+from gsmerge.stages.fit.photo_sizes import training_weights
 from gsmerge.types import Gaussians
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from gsmerge.render import contributions, plan_view
 from gsmerge.render.autograd import Shape, draw_colored, seen_colors
 from gsmerge.render.photos import Photos
-from gsmerge.render.plan import Splats
+from gsmerge.render.view_plan import Splats
 from gsmerge.types import SH_C0, Array, Gaussians
 
 

@@ -23,11 +23,13 @@ from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT, SIZE
 from gsmerge.kernels.raster.walk import MAX_ALPHA
 from gsmerge.networks.residuals import quat_to_rotmat
 from gsmerge.render.autograd import Shape
+from gsmerge.stages.fit.fit_options import FitOptions, FitReport
+from gsmerge.stages.fit.fit_state import DEPTH, OFFSET
 from gsmerge.stages.fit.full import (
     GROWTH,
     MAX_STEPS,
     PROBE,
-    Plan,
+    FitPlan,
     Progress,
     TailMean,
     affordable_steps,
@@ -35,8 +37,6 @@ from gsmerge.stages.fit.full import (
     plan_run,
     step_sizes,
 )
-from gsmerge.stages.fit.options import FitOptions, FitReport
-from gsmerge.stages.fit.state import DEPTH, OFFSET
 from gsmerge.types import SH_C0, Gaussians
 
 READ_EVERY = 20  # steps; each reading waits for the device
@@ -63,7 +63,7 @@ class PhotoLevel:
         return self.weights[view if len(self.weights) > 1 else 0]
 
 
-def make_levels(photos: tuple[DevicePhotos, DevicePhotos], plan: Plan) -> tuple[PhotoLevel, PhotoLevel]:
+def make_levels(photos: tuple[DevicePhotos, DevicePhotos], plan: FitPlan) -> tuple[PhotoLevel, PhotoLevel]:
     """Give both sizes their weights: everything counts at full size, the training pixels at half size."""
     full, half = photos
     everywhere = torch.ones((1, full.height, full.width), device=full.images.device)
@@ -151,7 +151,7 @@ def grow_to(state: FitState, photos: DevicePhotos, count: int) -> FitState:
 
 
 def grow(state: FitState, photos: DevicePhotos, count: int) -> FitState:
-    """Halve the Gaussians with the largest error masses, see :func:`gsmerge.stages.fit.state.grow`."""
+    """Halve the Gaussians with the largest error masses, see :func:`gsmerge.stages.fit.fit_state.grow`."""
     masses = error_masses(state, photos)
     num = min(count - len(state), int((masses > 0).sum()))
     if num <= 0:
@@ -266,7 +266,7 @@ class _Run:
         self,
         state: FitState,
         levels: tuple[PhotoLevel, PhotoLevel],
-        plan: Plan,
+        plan: FitPlan,
         count: int,
         seed: int,
         progress: Progress | None,

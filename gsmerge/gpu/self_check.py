@@ -18,8 +18,8 @@ from gsmerge.gpu.device_photos import peak_weights, shape_of, upload_gaussians, 
 from gsmerge.render import cuda
 from gsmerge.render.autograd import Shape, draw_colored, seen_colors
 from gsmerge.render.photos import EPS2D, Photos
+from gsmerge.stages.fit.fit_options import FitOptions
 from gsmerge.stages.fit.full import step_sizes
-from gsmerge.stages.fit.options import FitOptions
 from gsmerge.types import Gaussians
 
 CPU = torch.device("cpu")

@@ -25,7 +25,7 @@ from gsmerge.io.formats.writing import write_gaussians as write_gaussians
 from gsmerge.io.formats.writing import write_ply as write_ply
 from gsmerge.io.held_out import HeldOutViews as HeldOutViews
 from gsmerge.io.held_out import read_held_out as read_held_out
-from gsmerge.io.photos import read_images as read_images
+from gsmerge.io.photo_files import read_images as read_images
 from gsmerge.io.scene import CamerasInScene as CamerasInScene
 from gsmerge.io.scene import SceneLoad as SceneLoad
 from gsmerge.io.scene import align_scene as align_scene

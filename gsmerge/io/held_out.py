@@ -12,10 +12,10 @@ from gsmerge.io.alignment import IDENTITY, Similarity
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views, to_cameras, with_convention
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.exporters import AUTO
-from gsmerge.io.photos import as_floats, find_image, photo_size
+from gsmerge.io.photo_files import as_floats, find_image, photo_size
 from gsmerge.io.scene import SceneLoad
 from gsmerge.io.scene_files import IMAGE_PLACES, SceneFiles, limit_photo_size, stored_photos
-from gsmerge.types import Cameras, Scene, StrPath
+from gsmerge.types import Scene, StrPath, Views
 
 _MAX_ANGLE = 0.2  # degrees that a view's two poses may differ by, once one frame is moved to the other
 _MAX_SHIFT = 0.005  # of the distance between the views
@@ -24,18 +24,12 @@ _SAME_POSE = 1e-4  # of the distance to the scene, and in entries of the rotatio
 
 
 @dataclass(frozen=True)
-class HeldOutViews:
-    """t views that were no input, in the frame of the scene's Gaussians."""
+class HeldOutViews(Views):
+    """t views that were no input, in the frame of the scene's Gaussians, named as in their camera file."""
 
-    cameras: Cameras
-    images: np.ndarray  # ``[t,h,w,3]`` photos, sRGB in [0, 1], float32
-    names: tuple[str, ...]  # as their camera file has them
     places: tuple[int, ...]  # of each along the trajectory: its index in the camera file
     context_places: tuple[int, ...] | None  # the same of the scene's views; None where they are not all in the file
     notes: tuple[str, ...] = ()  # what was adapted, one sentence each
-
-    def __len__(self) -> int:
-        return len(self.cameras)
 
 
 def read_held_out(load: SceneLoad, cameras: StrPath, images: StrPath | None = None) -> HeldOutViews:

@@ -28,7 +28,7 @@ from gsmerge.io.cameras.json_files import DATAPARSER, find_dataparser, read_data
 from gsmerge.io.cameras.npz_files import read_depths
 from gsmerge.io.exporters import AUTO, Exporter, ReadHints, choose_exporters, find_exporter, make_hints
 from gsmerge.io.formats.ply import OpacityChoice, PlyInfo, PlyScene, ply_notes, read_gaussians
-from gsmerge.io.photos import as_floats, photo_size
+from gsmerge.io.photo_files import as_floats, photo_size
 from gsmerge.io.scene_files import (
     SceneFiles,
     find_large_photos,
@@ -52,7 +52,7 @@ _NO_ALIGNMENT = AlignmentResult(
 
 
 @dataclass(frozen=True)
-class Views:
+class SceneViews:
     """All c views of the camera file, in the frame of the Gaussians and at the size of the scene's pictures."""
 
     cameras: Cameras
@@ -71,7 +71,7 @@ class SceneLoad:
     files: SceneFiles
     # the cameras in the order of the views, as their file has them; None where there are none
     cameras: CameraFile | None
-    views: Views  # all views that there are cameras of, also those that the scene does not have
+    views: SceneViews  # all views that there are cameras of, also those that the scene does not have
     exporters: tuple[Exporter, ...]  # the exporters that may have written the file, or the one that the caller named
     notes: tuple[str, ...]  # what was adapted or looks odd, one sentence each, without a full stop
     # how well every view's Gaussians project into their own pixels; None for an unaligned scene
@@ -242,7 +242,7 @@ def _make_load(
         ply=ply.info,
         files=files,
         cameras=camera_file,
-        views=Views(result.cameras, result.images, names, tuple(dict.fromkeys(views))),
+        views=SceneViews(result.cameras, result.images, names, tuple(dict.fromkeys(views))),
         exporters=exporters,
         notes=(*ply_notes(ply.info), *notes, *more),
         alignment=check_alignment(scene.gaussians, scene.cameras, scene.stored) if scene.aligned else None,
@@ -341,7 +341,7 @@ class CamerasInScene:
     """Gaussians and views in one frame."""
 
     gaussians: Gaussians  # the file's, with rotations read as the scene has them
-    views: Views  # of the camera file
+    views: SceneViews  # of the camera file
     notes: tuple[str, ...]  # what was adapted or looks odd, one sentence each, without a full stop
 
 
@@ -367,6 +367,6 @@ def place_cameras_in_scene(
     pictures = stored_photos(files, camera_file) if photos else None
     images = None if pictures is None else as_floats(pictures)
     cameras = to_cameras(camera_file, photo_size(pictures))
-    views = Views(cameras, images, camera_file.names, tuple(range(len(cameras))))
+    views = SceneViews(cameras, images, camera_file.names, tuple(range(len(cameras))))
     note = "the cameras do not fit the Gaussians and stay as their file has them"
     return CamerasInScene(ply.gaussians, views, (*ply_notes(ply.info), note))

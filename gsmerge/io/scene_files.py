@@ -17,7 +17,7 @@ from gsmerge.io.cameras.npz_files import holds_images
 from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
 from gsmerge.io.cameras.read import CAMERA_PLACES, SHARP, find_cameras, read_cameras, read_sharp
 from gsmerge.io.formats.ply import PlyScene
-from gsmerge.io.photos import (
+from gsmerge.io.photo_files import (
     Photos,
     PhotoTransform,
     Size,

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from gsmerge.geometry import pose_changes
 from gsmerge.measure.visibility import resize_mask
 from gsmerge.render import Splats, ViewPlan, composite, plan_view
-from gsmerge.render.blend import mean_depths
+from gsmerge.render.composite import mean_depths
 from gsmerge.render.gradient import color_gradients, plan_gradients, pose_gradient
 from gsmerge.render.photos import photos_of
 from gsmerge.types import Cameras

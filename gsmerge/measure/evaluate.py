@@ -19,7 +19,7 @@ from gsmerge.render.metrics import psnr, ssim
 from gsmerge.render.photos import NEAR
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.prepare import scene_frame
-from gsmerge.types import Cameras, Gaussians, Scene, as_array
+from gsmerge.types import Cameras, Gaussians, Scene, Views, as_array
 from gsmerge.views import pick_views
 
 NETS = ("vgg", "alex")
@@ -85,21 +85,6 @@ class EvaluateOptions:
 
 def _listed(values: Sequence[object]) -> str:
     return ",".join(map(str, values)) or "none"
-
-
-@dataclass(frozen=True)
-class Views:
-    """Views with their photos.
-
-    Args:
-        cameras: v cameras, in the scene's world.
-        images: ``[v,h,w,3]`` sRGB in [0, 1].
-        names: Of the views.
-    """
-
-    cameras: Cameras
-    images: np.ndarray
-    names: tuple[str, ...]
 
 
 @dataclass(frozen=True)

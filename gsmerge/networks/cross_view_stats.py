@@ -7,7 +7,7 @@ import numpy as np
 from gsmerge.kernels.gaussians.cross_view import COLUMNS, sum_cross_view
 from gsmerge.kernels.gaussians.nearest import LEAF, build_tree, nearest_of_others
 from gsmerge.moments import Members
-from gsmerge.render.plan import pieces
+from gsmerge.render.view_plan import pieces
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import SH_C0, Cameras
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from os import PathLike
 from typing import Any
 
-from gsmerge.online.decode import decode_stored
+from gsmerge.online.decode_stored import decode_stored
 from gsmerge.online.extend import BatchReport, extend
 from gsmerge.online.file import load_state, save_state
 from gsmerge.online.options import merge_settings
@@ -74,7 +74,7 @@ class Compactor:
     def decode(
         self, *, k: int | None = None, budget: int | str | None = None, progress: Progress | None = None, **fit: Any
     ) -> Gaussians:
-        """The Gaussians so far, see :func:`gsmerge.online.decode.decode_stored`.
+        """The Gaussians so far, see :func:`gsmerge.online.decode_stored.decode_stored`.
 
         Args:
             k: Gaussians of each group; None: as in the settings.

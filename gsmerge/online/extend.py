@@ -13,8 +13,7 @@ from gsmerge.budget import AUTO
 from gsmerge.encoded.encoded import StoredSettings
 from gsmerge.errors import UsageError
 from gsmerge.moments import feature_to_gaussians
-from gsmerge.online.options import OnlineOptions
-from gsmerge.online.photos import (
+from gsmerge.online.batch_photos import (
     BatchPhotos,
     concat_cameras,
     fit_batch_colors,
@@ -25,6 +24,7 @@ from gsmerge.online.photos import (
     update_replay,
     view_ids,
 )
+from gsmerge.online.options import OnlineOptions
 from gsmerge.online.state import (
     GroupSet,
     OnlineState,

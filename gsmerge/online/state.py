@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gsmerge import __version__
-from gsmerge.encoded.decode import children_of, divide_all
 from gsmerge.encoded.encoded import Encoded, StoredScene, without_members
+from gsmerge.encoded.to_gaussians import children_of, divide_all
 from gsmerge.geometry import covariances
 from gsmerge.moments import MAX_OPACITY, Members, feature_to_gaussians, gaussian_members
 from gsmerge.stages.decode import divide

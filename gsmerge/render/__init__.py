@@ -13,9 +13,9 @@ Results do not depend on the number of threads: every Gaussian is projected and 
 summed over tiles is summed in the order of the tiles.
 """
 
-from gsmerge.render.blend import Rendering, composite, contributions, splat_adjoint
+from gsmerge.render.composite import Rendering, composite, contributions, splat_adjoint
 from gsmerge.render.images import render
-from gsmerge.render.plan import Splats, ViewPlan, plan_view, prepare
+from gsmerge.render.view_plan import Splats, ViewPlan, plan_view, prepare
 
 __all__ = [
     "Rendering",

@@ -12,9 +12,9 @@ from torch.autograd.function import once_differentiable
 
 from gsmerge.kernels.raster import harmonics
 from gsmerge.kernels.raster.project_backward import add_rows
-from gsmerge.render.blend import Rendering, composite, draw_views, prepare_views, view_colors
+from gsmerge.render.composite import Rendering, composite, draw_views, prepare_views, view_colors
 from gsmerge.render.gradient import ColorGradients, color_gradients, gradients_of, plan_gradients, pose_gradient
-from gsmerge.render.plan import Array, Splats, ViewPlan, plan_view
+from gsmerge.render.view_plan import Array, Splats, ViewPlan, plan_view
 from gsmerge.types import Cameras, Gaussians
 
 Shape = tuple[Tensor, Tensor, Tensor, Tensor]  # means, quaternions, scales, opacities

@@ -30,8 +30,8 @@ import torch
 from torch import Tensor
 
 from gsmerge.errors import GsmergeError
-from gsmerge.render.blend import Rendering
-from gsmerge.render.plan import EPS2D, Array, check_range
+from gsmerge.render.composite import Rendering
+from gsmerge.render.view_plan import EPS2D, Array, check_range
 from gsmerge.types import Cameras, Gaussians
 
 # Where gsplat 1.5 clamps alpha, as RasterizeToPixels3DGSFwd.cu, RasterizeToPixels3DGSBwd.cu and

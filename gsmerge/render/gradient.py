@@ -19,8 +19,8 @@ from itertools import pairwise
 import numpy as np
 
 from gsmerge.kernels.raster import blend_backward, harmonics, project_backward
-from gsmerge.render.blend import view_colors
-from gsmerge.render.plan import Array, ViewPlan, pieces, tile_ranges
+from gsmerge.render.composite import view_colors
+from gsmerge.render.view_plan import Array, ViewPlan, pieces, tile_ranges
 from gsmerge.runtime.threads import parallel_map, use_threads
 
 WORTH = 1 << 12  # intersections or Gaussians that are worth handing to another thread: they take longer than forward

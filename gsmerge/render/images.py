@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gsmerge.render.blend import Rendering, background_color, draw_views, prepare_views
-from gsmerge.render.plan import ViewPlan, plan_view
+from gsmerge.render.composite import Rendering, background_color, draw_views, prepare_views
+from gsmerge.render.view_plan import ViewPlan, plan_view
 from gsmerge.types import Array, Cameras, Gaussians, as_tensor
 
 if TYPE_CHECKING:

@@ -11,9 +11,9 @@ import numpy as np
 
 from gsmerge.geometry import sh0_to_rgb
 from gsmerge.kernels.raster.project import TILE
-from gsmerge.render.blend import composite
+from gsmerge.render.composite import composite
 from gsmerge.render.metrics import psnr
-from gsmerge.render.plan import Splats, plan_view, prepare
+from gsmerge.render.view_plan import Splats, plan_view, prepare
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, Scene
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsmerge.kernels.raster import weights as kernels
+from gsmerge.kernels.raster import list_weights as kernels
 from gsmerge.render import ViewPlan
 
 Array = NDArray[Any]

@@ -18,7 +18,7 @@ from gsmerge.kernels.raster.contribution import PAIR, add_row, settle_row
 from gsmerge.kernels.raster.project import TILE
 from gsmerge.moments import Members, pool_members, scene_members, unaligned_members
 from gsmerge.render import ViewPlan, contributions, plan_view, prepare, render
-from gsmerge.render.plan import MAX_SIZE
+from gsmerge.render.view_plan import MAX_SIZE
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.decode import DecodeOptions, decode

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmerge.kernels.superpixels.region_tree import OVERSIZE, PLANE_ERROR, ROW, cut_labels, merge_order, region_sums
+from gsmerge.kernels.superpixels.merge_tree import OVERSIZE, PLANE_ERROR, ROW, cut_labels, merge_order, region_sums
 from gsmerge.kernels.superpixels.regions import pad_labels
 from gsmerge.kernels.superpixels.ward import adjacent_pairs
 from gsmerge.runtime.threads import parallel_map

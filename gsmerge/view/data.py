@@ -12,12 +12,12 @@ import cv2
 import numpy as np
 
 from gsmerge.geometry import project
-from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Progress, Quality, ResultScores, Views, evaluate
+from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Progress, Quality, ResultScores, evaluate
 from gsmerge.measure.preview import BORDER_COLOR, Picture, borders, to_picture
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.prepare import scene_frame
 from gsmerge.stages.superpixels import SegmentOptions, segment
-from gsmerge.types import Cameras, Gaussians, Scene
+from gsmerge.types import Cameras, Gaussians, Scene, Views
 from gsmerge.view.splats import MAX_GAUSSIANS, highest_degree, pack_splats
 from gsmerge.views import even_views
 

@@ -235,7 +235,7 @@ def test_stability_cases_name_tests_that_are_there(root: Path) -> None:
 def test_generator_names_every_range_style_and_path(root: Path) -> None:
     from gsmerge.research.generate import NoiseOptions
     from gsmerge.research.generate.objects import STYLES
-    from gsmerge.research.generate.scene import PATHS
+    from gsmerge.research.generate.synthetic_scene import PATHS
 
     text = (root / "docs" / "internals" / "generator.md").read_text()
     names = [f.name for f in fields(NoiseOptions)] + [*STYLES, *PATHS]

@@ -14,10 +14,10 @@ import typer.main
 
 import gsmerge
 from gsmerge.batch import BatchOptions
-from gsmerge.batch.options import ENGINES
+from gsmerge.batch.batch_options import ENGINES
 from gsmerge.cli import main
 from gsmerge.cli.app import app
-from gsmerge.cli.options import HINTS, OPTIONS, setting_kinds
+from gsmerge.cli.parameters import HINTS, OPTIONS, setting_kinds
 from gsmerge.io import ReadHints
 from gsmerge.measure.evaluate import NETS
 from gsmerge.online.options import OnlineOptions

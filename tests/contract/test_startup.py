@@ -38,7 +38,9 @@ def test_help_loads_nothing_heavy(arguments: list[str]) -> None:
 def test_a_command_loads_no_other() -> None:
     code = "from gsmerge.cli import main\nassert main(['compact', '--help']) == 0\nimport sys\n"
     modules = run_python(f"{code}print(*(m for m in sys.modules if m.startswith('gsmerge.cli.')))").splitlines()[-1]
-    assert set(modules.split()) == {f"gsmerge.cli.{name}" for name in ("app", "compact", "console", "options", "paths")}
+    assert set(modules.split()) == {
+        f"gsmerge.cli.{name}" for name in ("app", "compact_command", "console", "parameters", "paths")
+    }
 
 
 def test_import_loads_nothing_heavy() -> None:

@@ -12,8 +12,8 @@ from batches import InlinePool
 
 import gsmerge
 from gsmerge.options import CompactOptions
-from gsmerge.research.charts import run as running
-from gsmerge.research.charts.run import RunRecord, read_runs
+from gsmerge.research.charts import measure_run as running
+from gsmerge.research.charts.measure_run import RunRecord, read_runs
 
 from .conftest import Outcome, Run, listing
 
@@ -43,7 +43,7 @@ def copied(results: Path, tmp_path: Path) -> Path:
 @pytest.fixture(autouse=True)
 def _inline(monkeypatch: pytest.MonkeyPatch) -> None:
     """Run the jobs of a test in this process, where they can be watched; the fixture above has processes."""
-    monkeypatch.setattr("gsmerge.batch.run.LocalPool", InlinePool)
+    monkeypatch.setattr("gsmerge.batch.schedule.LocalPool", InlinePool)
 
 
 @pytest.fixture

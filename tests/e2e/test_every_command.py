@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import gsmerge
-from gsmerge.cli.render import picture_stems
+from gsmerge.cli.render_command import picture_stems
 from gsmerge.io import load_scene
 
 from .conftest import Run, listing

@@ -148,7 +148,7 @@ def test_finite_differences() -> None:
 
 @pytest.mark.parametrize("threads", [2, 8])
 def test_threads_change_nothing(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys.modules["gsmerge.render.plan"], "PIECE", 200)
+    monkeypatch.setattr(sys.modules["gsmerge.render.view_plan"], "PIECE", 200)
     monkeypatch.setattr(sys.modules["gsmerge.render.gradient"], "WORTH", 200)
     gaussians, cameras = random_gaussians(2000, 3, 10).numpy(), turned_cameras(1).numpy()
     gaussians = replace(gaussians, scales=gaussians.scales * 0.3)

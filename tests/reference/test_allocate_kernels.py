@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gsmerge.kernels.gaussians.bisect import bisect, split_errors
-from gsmerge.kernels.superpixels import region_tree as kernels
+from gsmerge.kernels.superpixels import merge_tree as kernels
 from gsmerge.kernels.superpixels.regions import pad_labels
 from gsmerge.kernels.superpixels.seeds import hexagonal_seeds, voronoi
 from gsmerge.kernels.superpixels.ward import adjacent_pairs

@@ -11,7 +11,7 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry import rgb_to_sh0
 from gsmerge.io.cameras.camera_file import CameraFile, sizes_of, to_cameras
 from gsmerge.io.formats.ply import PlyInfo
-from gsmerge.io.photos import ASPECT_TOLERANCE, PhotoTransform, Size, resize_and_crop, resize_to, same_shape
+from gsmerge.io.photo_files import ASPECT_TOLERANCE, PhotoTransform, Size, resize_and_crop, resize_to, same_shape
 from gsmerge.types import Cameras, Gaussians, Scene, grid_ids
 
 TRIM = 8  # pixels that DepthSplat and its relatives cut off at every side
@@ -55,7 +55,7 @@ class Layout:
 
 
 @dataclass(frozen=True)
-class Box:
+class KeptBox:
     """The part of a view that was kept: rows ``top`` to ``height - top``, columns ``left`` to ``width - left``."""
 
     kind: str
@@ -69,21 +69,21 @@ class Box:
         return grid[self.top : height - self.top, self.left : width - self.left]
 
 
-def boxes(width: int, height: int) -> list[Box]:
+def boxes(width: int, height: int) -> list[KeptBox]:
     """List what may be cut off at the border: nothing, 8 pixels, or 8/256 of each side as Depth Anything 3 does."""
-    out = [Box("full", "every pixel", 0, 0)]
+    out = [KeptBox("full", "every pixel", 0, 0)]
     if min(width, height) > 2 * TRIM:
-        out.append(Box("trim", f"{TRIM} pixels trimmed at every border", TRIM, TRIM))
+        out.append(KeptBox("trim", f"{TRIM} pixels trimmed at every border", TRIM, TRIM))
     da3 = da3_box(width, height)
     if (da3.top or da3.left) and (da3.top, da3.left) != (TRIM, TRIM):
         out.append(da3)
     return out
 
 
-def da3_box(width: int, height: int) -> Box:
+def da3_box(width: int, height: int) -> KeptBox:
     """Return what Depth Anything 3 cuts off."""
     top, left = int(8 / 256 * height), int(8 / 256 * width)
-    return Box("box", f"{top} rows and {left} columns trimmed at every border", top, left)
+    return KeptBox("box", f"{top} rows and {left} columns trimmed at every border", top, left)
 
 
 def every_nth(views: int) -> list[tuple[int, ...]]:
@@ -110,7 +110,9 @@ def exact_layouts(count: int, views: int, width: int, height: int) -> Iterator[L
             yield from _orders(count, box, per_pixel, chosen, width, height)
 
 
-def _orders(count: int, box: Box, per_pixel: int, views: tuple[int, ...], width: int, height: int) -> Iterator[Layout]:
+def _orders(
+    count: int, box: KeptBox, per_pixel: int, views: tuple[int, ...], width: int, height: int
+) -> Iterator[Layout]:
     index, grid = np.arange(count, dtype=np.int64), box.pixels(width, height)
     rows, columns, blocks = *grid.shape, len(views)
     arranged = {

@@ -38,7 +38,7 @@ from gsmerge.io.alignment.score import (
 from gsmerge.io.cameras.camera_file import CameraFile, Convention
 from gsmerge.io.exporters import MAY_BE_UNALIGNED
 from gsmerge.io.formats.ply import PlyInfo
-from gsmerge.io.photos import ASPECT_TOLERANCE
+from gsmerge.io.photo_files import ASPECT_TOLERANCE
 from gsmerge.types import Cameras, Gaussians
 
 SHUFFLED_MARGIN = 5.0  # and by which it must beat shuffled pixels

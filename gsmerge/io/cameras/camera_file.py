@@ -11,7 +11,7 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import MAX_VIEWS, check_pixels
-from gsmerge.io.photos import Photos, Size, change_photos, photo_size, same_shape
+from gsmerge.io.photo_files import Photos, Size, change_photos, photo_size, same_shape
 from gsmerge.types import Cameras, StrPath
 
 MAX_NUMBER, _MAX_SIDE, _MIN_FOCAL = 1e12, 1e6, 1e-6  # beyond them no camera is, and numbers would overflow later

@@ -27,7 +27,7 @@ from gsmerge.io.cameras.camera_file import (
     make_lens,
     make_pinhole,
 )
-from gsmerge.io.photos import find_image, image_size
+from gsmerge.io.photo_files import find_image, image_size
 from gsmerge.types import Cameras
 
 if TYPE_CHECKING:

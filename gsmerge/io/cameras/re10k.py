@@ -13,7 +13,7 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import MAX_VIEWS, check_file
 from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, View, make_camera_file, make_pinhole
-from gsmerge.io.photos import decode_embedded, photo_size
+from gsmerge.io.photo_files import decode_embedded, photo_size
 
 if TYPE_CHECKING:
     import torch  # imported only where there is a chunk

@@ -12,9 +12,9 @@ from numpy import float32 as f4
 
 from gsmerge.kernels.jit import kernel
 from gsmerge.kernels.raster.blend import P1, batch_rows, gather, live_rows, new_batch, open_tile
+from gsmerge.kernels.raster.list_weights import batch_columns
 from gsmerge.kernels.raster.project import TILE
 from gsmerge.kernels.raster.walk import BATCH, PLANE, weigh_rows
-from gsmerge.kernels.raster.weights import batch_columns
 
 LAST_ROW = 7  # column of a footprint
 LABEL, SUM, NEXT, PAIR = 0, 1, 2, 3  # columns of a pair, the last the next pair of the same Gaussian, -1 for none

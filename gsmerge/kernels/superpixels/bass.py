@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsmerge.kernels.jit import kernel
-from gsmerge.kernels.superpixels.moves import merge, split
+from gsmerge.kernels.superpixels.split_merge import merge, split
 from gsmerge.kernels.superpixels.sweeps import ring_mask
 
 COLOUR_DEVIATION = 0.018 / 2  # CIELAB / 100

@@ -21,7 +21,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from gsmerge.io import atomic_output
 from gsmerge.measure.speed import break_even
 from gsmerge.research.charts.lines import METRICS, PARTS, Line, Results, make_lines, size_label
-from gsmerge.research.charts.run import INPUT, SCORING, SEGMENTATIONS, SHARES, RunRecord
+from gsmerge.research.charts.measure_run import INPUT, SCORING, SEGMENTATIONS, SHARES, RunRecord
 from gsmerge.runtime.record import STAGES
 
 MAX_LINES = 12  # of a figure; of more, one for each method is drawn

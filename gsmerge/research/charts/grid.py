@@ -22,7 +22,7 @@ from gsmerge.io.formats.ply_file import header_counts
 from gsmerge.measure.evaluate import EvaluateOptions
 from gsmerge.options import CompactOptions
 from gsmerge.research.charts.lines import ONE_SIZE
-from gsmerge.research.charts.run import INPUT, OURS, SUPERPIXELS, Run, RunRecord, describe
+from gsmerge.research.charts.measure_run import INPUT, OURS, SUPERPIXELS, ChartRun, RunRecord, describe
 
 ALL = "all"  # word for all views
 OWN_OPTIONS = {"method": "--methods", "seed": "--seed", "threads": "--threads"}  # that set the same
@@ -234,7 +234,7 @@ def make_jobs(
             label = describe(method, settings, views)
             output = f"{source.name}/{_file_name(label)}"
             record = RunRecord(source.name, label, output, source.sha256, method, settings, views, command)
-            run = Run(record, options, measured, source.targets, source.target_images)
+            run = ChartRun(record, options, measured, source.targets, source.target_images)
             share = min(1.0, (views or most) / most) if source.num_views else 1.0
             jobs.append(Job(len(jobs), str(source.path), output, round(share * num_gaussians), num_rest, run))
     return jobs, notes

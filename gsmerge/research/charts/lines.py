@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from gsmerge.research.charts.run import INPUT, OURS, SUPERPIXELS, RunRecord
+from gsmerge.research.charts.measure_run import INPUT, OURS, SUPERPIXELS, RunRecord
 
 LEVEL = 0.95  # confidence of the intervals
 MIN_SHARE = 0.5  # of the scenes that a point of a line must have

@@ -1,8 +1,8 @@
 """Synthetic scenes from random numbers alone, as a feed-forward network would export them, for training and tests."""
 
+from gsmerge.research.generate.folders import SceneFolder, generate, generate_scene, plan
 from gsmerge.research.generate.noise import NoiseOptions, read_ranges
-from gsmerge.research.generate.run import SceneFolder, generate, generate_scene, plan
-from gsmerge.research.generate.scene import GenerateOptions, SyntheticScene, make_scene
+from gsmerge.research.generate.synthetic_scene import GenerateOptions, SyntheticScene, make_scene
 
 __all__ = [
     "GenerateOptions",

@@ -12,7 +12,7 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import read_table
 from gsmerge.kernels.raster.harmonics import view_colors
-from gsmerge.research.generate.photograph import Float, Lens
+from gsmerge.research.generate.photograph import Float, Pinhole
 from gsmerge.research.generate.shapes import Array
 from gsmerge.research.generate.textures import enlarge
 from gsmerge.types import SH_C0, Gaussians
@@ -207,7 +207,7 @@ def _harmonics(colors: Float, means: Float, eye: Array, noise: Noise, rng: np.ra
     return sh0, shN
 
 
-def pixel_gaussians(seen: TrueView, lens: Lens, noise: Noise, rng: np.random.Generator) -> Gaussians:
+def pixel_gaussians(seen: TrueView, lens: Pinhole, noise: Noise, rng: np.random.Generator) -> Gaussians:
     """Make one Gaussian for each pixel of a view, in row-major order."""
     height, width = seen.depth.shape
     n = height * width

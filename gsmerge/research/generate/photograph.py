@@ -51,7 +51,7 @@ class Stage:
 
 
 @dataclass(frozen=True)
-class Lens:
+class Pinhole:
     """An image size and focal length, pixels."""
 
     width: int
@@ -89,7 +89,7 @@ class LitStage:
     weights: Array  # [k] of the ambient maps
 
 
-def screen_boxes(shapes: ShapeArrays, c2w: Array, lens: Lens, samples: int) -> NDArray[np.int32]:
+def screen_boxes(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -> NDArray[np.int32]:
     """Compute x0, y0, x1, y1 ``[m,4]`` of the samples that may see each shape."""
     half = bounds(shapes)
     signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), -1).reshape(-1, 3)
@@ -109,7 +109,7 @@ def screen_boxes(shapes: ShapeArrays, c2w: Array, lens: Lens, samples: int) -> N
     return np.concatenate([np.clip(low, 0, limits), np.clip(high, 0, limits)], 1).astype(np.int32)
 
 
-def trace(shapes: ShapeArrays, c2w: Array, lens: Lens, samples: int) -> Hits:
+def trace(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -> Hits:
     """Cast ``samples`` x ``samples`` rays for each pixel."""
     h, w = lens.height * samples, lens.width * samples
     hits = Hits(np.full((h, w), FAR), np.full((h, w), -1, np.int32), *np.zeros((2, h, w, 3), np.float32))
@@ -134,7 +134,7 @@ def _shadow_map(shapes: ShapeArrays, axes: Array, middle: Array, radius: float, 
     """Compute a shadow map ``[size,size]``: depth of the first surface, relative to the middle."""
     c2w = np.eye(4)
     c2w[:3, :3], c2w[:3, 3] = axes.T, middle - BEHIND * radius * axes[2]
-    hits = trace(shapes, c2w, Lens(size, size, BEHIND * size / 2), 1)
+    hits = trace(shapes, c2w, Pinhole(size, size, BEHIND * size / 2), 1)
     return (hits.depth - BEHIND * radius).astype(np.float32)
 
 
@@ -217,7 +217,7 @@ def _lookup(texture: Picture, uv: Float) -> Float:
     return colors.reshape(-1, 3)[: len(uv)]
 
 
-def radiance(view: LitStage, c2w: Array, lens: Lens, samples: int) -> tuple[Float, Hits]:
+def radiance(view: LitStage, c2w: Array, lens: Pinhole, samples: int) -> tuple[Float, Hits]:
     """Compute the linear light ``[h,w,3]`` of every pixel, and the hits of all samples."""
     hits = trace(view.shapes, c2w, lens, samples)
     h, w = hits.depth.shape

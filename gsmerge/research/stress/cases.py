@@ -14,10 +14,9 @@ import cv2
 import numpy as np
 
 from gsmerge.io.cameras.camera_file import CONVENTIONS
-from gsmerge.measure.evaluate import Views
 from gsmerge.stages.align_views import move_views
 from gsmerge.stages.prepare import scene_frame
-from gsmerge.types import SH_C0, Cameras, Scene, grid_ids
+from gsmerge.types import SH_C0, Cameras, Scene, Views, grid_ids
 from gsmerge.views import even_views, subset
 
 Needs = Literal["anything", "pixels", "photos", "file", "pixel-file"]

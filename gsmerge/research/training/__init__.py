@@ -2,10 +2,10 @@
 
 from gsmerge.research.training.examples import Example, make_example
 from gsmerge.research.training.loop import TrainResult, choose_device, train
-from gsmerge.research.training.options import TrainOptions, preset_options, read_config
 from gsmerge.research.training.processes import Processes, join_processes
 from gsmerge.research.training.scenes import TrainingScene, make_training_scene
 from gsmerge.research.training.shards import Shard, prepare_shards, read_shard, write_shard
+from gsmerge.research.training.train_options import TrainOptions, preset_options, read_config
 
 __all__ = [
     "Example",

@@ -17,11 +17,9 @@ from gsmerge.budget import share_text
 from gsmerge.errors import SceneError
 from gsmerge.geometry import lower_median
 from gsmerge.io import SceneLoad, load_scene, read_held_out
-from gsmerge.measure.evaluate import Views
 from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.options import CompactOptions
 from gsmerge.render.photos import Photos, blank_photos, scene_pictures
-from gsmerge.research.training.options import TrainOptions
 from gsmerge.research.training.scenes import (
     TrainingScene,
     coverage,
@@ -30,11 +28,12 @@ from gsmerge.research.training.scenes import (
     view_subsets,
 )
 from gsmerge.research.training.targets import Progress, Targets, fit_targets
+from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.stages.encode import encode
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge, take
 from gsmerge.stages.superpixels import segment
-from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches
+from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches, Views
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,8 +108,7 @@ def _read_held_out(load: SceneLoad) -> Views | None:
     folder = load.files.ply.parent / "targets"
     if not folder.is_dir():
         return None
-    read = read_held_out(load, folder)
-    return Views(read.cameras, read.images, read.names)
+    return read_held_out(load, folder)
 
 
 def make_example(

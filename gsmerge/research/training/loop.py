@@ -30,11 +30,11 @@ from gsmerge.networks.modules import Head, Networks
 from gsmerge.networks.residuals import LOGIT
 from gsmerge.research.training.examples import Example, draw_views
 from gsmerge.research.training.losses import correction_loss, scaled_corrections, target_scales, window_loss
-from gsmerge.research.training.options import TrainOptions
 from gsmerge.research.training.predict import predict
 from gsmerge.research.training.processes import ALONE, Processes
 from gsmerge.research.training.shards import Shard, read_targets
 from gsmerge.research.training.stream import ExampleStreams, open_streams
+from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.research.training.validation import Row, validate
 from gsmerge.research.training.windows import sample_crop, sample_window
 from gsmerge.runtime.threads import parallel_map, use_threads
@@ -46,7 +46,7 @@ REMEDY = "choose another --output, or remove it to start again"
 
 
 @dataclass(frozen=True)
-class Run:
+class TrainingRun:
     """What every step of a run reads."""
 
     options: TrainOptions
@@ -124,7 +124,7 @@ def train(
     chosen = [chosen[i] for i in even_views(len(chosen), min(len(chosen), options.validation_examples))]
     with use_threads(threads):
         targets = map(read_targets, shards) if options.uses_fit else ()
-        run = Run(options, target_scales(targets), processes)
+        run = TrainingRun(options, target_scales(targets), processes)
         return _train(run, shards, chosen, out, choose_device(device), progress)
 
 
@@ -143,7 +143,12 @@ def choose_device(name: str) -> str:
 
 
 def _train(
-    run: Run, shards: Sequence[Shard], validation: Sequence[Shard], out: Path, device: str, progress: Progress | None
+    run: TrainingRun,
+    shards: Sequence[Shard],
+    validation: Sequence[Shard],
+    out: Path,
+    device: str,
+    progress: Progress | None,
 ) -> TrainResult:
     options, processes = run.options, run.processes
     state, losses = _new_state(options, device), list[Tensor]()
@@ -222,7 +227,7 @@ def _resume(out: Path, state: TrainingState, expected: dict[str, Any]) -> tuple[
     return int(facts["step"]), list(facts["rows"])
 
 
-def _step(state: TrainingState, streams: ExampleStreams, run: Run, step: int) -> Tensor:
+def _step(state: TrainingState, streams: ExampleStreams, run: TrainingRun, step: int) -> Tensor:
     """Do one step; returns its loss."""
     options, parameters = run.options, list(state.networks.parameters())
     streams.move_to(step)
@@ -251,7 +256,7 @@ def _step(state: TrainingState, streams: ExampleStreams, run: Run, step: int) ->
     return mean[-1].cpu()
 
 
-def _loss(networks: Networks, example: Example, run: Run, step: int, rng: np.random.Generator) -> Tensor:
+def _loss(networks: Networks, example: Example, run: TrainingRun, step: int, rng: np.random.Generator) -> Tensor:
     """Loss of a random crop or window of an example."""
     options = run.options
     if step < options.photo_step:

@@ -20,9 +20,9 @@ from gsmerge.networks.modules import Networks
 from gsmerge.networks.residuals import RESIDUAL, ROTATION, gaussian_sizes, quat_to_rotmat, residual_limits
 from gsmerge.render.autograd import render_tensors
 from gsmerge.render.photos import NEAR
-from gsmerge.research.training.options import TrainOptions
 from gsmerge.research.training.predict import Prediction, analytic_gaussians, crop_targets, predict
 from gsmerge.research.training.targets import Targets
+from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.research.training.windows import Crop, Window
 from gsmerge.stages.fit.loss import loss_ssim
 from gsmerge.types import Gaussians

@@ -22,8 +22,8 @@ from gsmerge.networks.apply import (
 from gsmerge.networks.modules import Networks
 from gsmerge.networks.residuals import MEAN, move_gaussians, rotate_vectors
 from gsmerge.networks.tokens import GroupFeatures
-from gsmerge.research.training.options import TrainOptions
 from gsmerge.research.training.targets import corrections_between
+from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.research.training.windows import Crop
 from gsmerge.stages.decode import divide
 from gsmerge.stages.match import match

@@ -8,14 +8,13 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from gsmerge.measure.evaluate import Views
 from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.moments import Members, scene_members
 from gsmerge.render import composite, plan_view, prepare
 from gsmerge.render.photos import NEAR, Photos, scene_photos
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.prepare import canonicalise
-from gsmerge.types import Cameras, Scene
+from gsmerge.types import Cameras, Scene, Views
 from gsmerge.views import even_views, subset
 
 OPAQUE = 0.5  # alpha from which the Gaussians cover a pixel

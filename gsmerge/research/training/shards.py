@@ -25,9 +25,9 @@ from gsmerge.io.atomic import atomic_output
 from gsmerge.moments import Members
 from gsmerge.render.photos import Photos
 from gsmerge.research.training.examples import Example, make_examples, scene_name
-from gsmerge.research.training.options import TrainOptions
 from gsmerge.research.training.processes import ALONE, Processes
 from gsmerge.research.training.targets import Targets
+from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches
 
 Report = Callable[[str, int, int], None]  # what is done, step, steps

@@ -17,8 +17,8 @@ from functools import lru_cache
 import numpy as np
 
 from gsmerge.research.training.examples import Example
-from gsmerge.research.training.options import TrainOptions
 from gsmerge.research.training.shards import Shard, read_shard
+from gsmerge.research.training.train_options import TrainOptions
 
 ORDER = 2**32 + 1  # takes the place of the step in the seed of the order's random numbers
 

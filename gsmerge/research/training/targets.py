@@ -17,11 +17,11 @@ from gsmerge.errors import SceneError
 from gsmerge.networks.residuals import COLOR, LOGIT, MEAN, RESIDUAL, ROTATION, SIZE, gaussian_sizes, quat_to_rotmat
 from gsmerge.networks.tokens import compute_group_features
 from gsmerge.render.photos import Photos
-from gsmerge.research.training.options import TrainOptions
 from gsmerge.research.training.scenes import TrainingScene, coverage, covered_pixels, reduced_masks
+from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.stages.decode import DecodeOptions, divide
+from gsmerge.stages.fit.fit_options import FitOptions
 from gsmerge.stages.fit.full import Masks, fit_full
-from gsmerge.stages.fit.options import FitOptions
 from gsmerge.stages.fit.stage import visible_mask
 from gsmerge.types import SH_C0, FeatureGaussians, Gaussians
 

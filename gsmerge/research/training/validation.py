@@ -16,10 +16,10 @@ from gsmerge.networks.modules import Networks
 from gsmerge.networks.residuals import COLOR, LOGIT, MEAN, ROTATION, SIZE
 from gsmerge.research.training.examples import Example, draw_views
 from gsmerge.research.training.losses import correction_loss, render_window, scaled_corrections, window_psnr
-from gsmerge.research.training.options import TrainOptions
 from gsmerge.research.training.predict import predict
 from gsmerge.research.training.processes import Processes
 from gsmerge.research.training.shards import Shard, read_shard
+from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.research.training.windows import Crop, Window, sample_crop, sample_window, whole_photo
 from gsmerge.runtime.threads import parallel_map
 

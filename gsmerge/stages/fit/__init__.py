@@ -1,7 +1,7 @@
 """gaussians -> fitted gaussians: colours alone, or all parameters, against the input photos."""
 
-from gsmerge.stages.fit.options import Fit, FitOptions, FitReport, Fitted, Tuning, record_fit, report_steps
-from gsmerge.stages.fit.photos import fit_photos, photo_scale
+from gsmerge.stages.fit.fit_options import Fit, FitOptions, FitReport, Fitted, Tuning, record_fit, report_steps
+from gsmerge.stages.fit.photo_sizes import fit_photos, photo_scale
 from gsmerge.stages.fit.stage import ON_CPU, FitBackend, fit, fit_scene, run_on, start_share, visible_mask
 
 __all__ = [

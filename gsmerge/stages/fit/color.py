@@ -16,8 +16,8 @@ from gsmerge.render import Splats, composite, plan_view, prepare
 from gsmerge.render.photos import Photos
 from gsmerge.render.weights import ViewWeights, apply, apply_transposed, view_weights
 from gsmerge.runtime.threads import in_turn, parallel_map
-from gsmerge.stages.fit.options import FitOptions, FitReport
-from gsmerge.stages.fit.photos import exposure_gains, holdout_psnr, training_weights
+from gsmerge.stages.fit.fit_options import FitOptions, FitReport
+from gsmerge.stages.fit.photo_sizes import exposure_gains, holdout_psnr, training_weights
 from gsmerge.types import Array, Gaussians
 
 MAX_RETRIES = 2

@@ -20,14 +20,14 @@ from gsmerge.kernels.gaussians import optimise as kernels
 from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT
 from gsmerge.kernels.raster.walk import MAX_ALPHA
 from gsmerge.render import composite, plan_view, splat_adjoint
-from gsmerge.render.blend import blend, view_colors
+from gsmerge.render.composite import blend, view_colors
 from gsmerge.render.gradient import gradients_of
 from gsmerge.render.photos import Photos, render_photos
 from gsmerge.runtime.threads import in_turn, parallel_map
+from gsmerge.stages.fit.fit_options import EARLIER, LONG_STEPS, FitOptions, FitReport, Tuning
+from gsmerge.stages.fit.fit_state import State, gaussians_of, grow_to, start_state
 from gsmerge.stages.fit.loss import image_gradient
-from gsmerge.stages.fit.options import EARLIER, LONG_STEPS, FitOptions, FitReport, Tuning
-from gsmerge.stages.fit.photos import holdout_psnr, reduced, training_weights
-from gsmerge.stages.fit.state import State, gaussians_of, grow_to, start_state
+from gsmerge.stages.fit.photo_sizes import holdout_psnr, reduced, training_weights
 from gsmerge.types import Array, Gaussians
 
 ROWS = 16384  # Gaussians per piece of an optimiser step
@@ -55,7 +55,7 @@ EPS = 1e-15  # of Adam
 
 
 @dataclass(frozen=True)
-class Plan:
+class FitPlan:
     """How a run goes.
 
     Args:
@@ -85,7 +85,7 @@ class Plan:
         return 2 if len(self.photos) > 2 and step % 5 in LARGE_STEPS else 0
 
 
-def plan_run(photos: tuple[Photos, ...], options: FitOptions, seed: int, masks: Masks | None = None) -> Plan:
+def plan_run(photos: tuple[Photos, ...], options: FitOptions, seed: int, masks: Masks | None = None) -> FitPlan:
     """Held-out blocks, hidden pixels, and dropout where there are few views."""
     full = training_weights(photos[0], options.holdout, seed)
     few = len(photos[0]) <= FEW_VIEWS and options.steps >= MANY_STEPS
@@ -103,7 +103,7 @@ def plan_run(photos: tuple[Photos, ...], options: FitOptions, seed: int, masks: 
     poses = None
     if options.move_cameras:
         poses, photos = start_poses(photos)
-    return Plan(photos, weights, (everywhere, trained, *ones), options, dropout, half_part, poses)
+    return FitPlan(photos, weights, (everywhere, trained, *ones), options, dropout, half_part, poses)
 
 
 def _hidden(weights: list[np.ndarray], masks: np.ndarray) -> list[np.ndarray]:
@@ -111,7 +111,7 @@ def _hidden(weights: list[np.ndarray], masks: np.ndarray) -> list[np.ndarray]:
     return [np.where(mask, weight, HIDDEN) for weight, mask in zip(weights, masks, strict=True)]
 
 
-def fit_step(state: State, plan: Plan, view: int, step: int, progress: float, rng: np.random.Generator) -> float:
+def fit_step(state: State, plan: FitPlan, view: int, step: int, progress: float, rng: np.random.Generator) -> float:
     """One Adam step on one view -> mean squared error of its training pixels."""
     level = plan.level_at(step, progress)
     photos = plan.photos[level]
@@ -167,7 +167,7 @@ def step_sizes(rates: Tuning, progress: float, steps: int) -> np.ndarray:
     return (np.repeat(each, [3, 3, 4, 1, 3]) * decay**progress).astype(np.float32)
 
 
-def initial_scores(state: State, plan: Plan) -> tuple[float, np.ndarray, np.ndarray]:
+def initial_scores(state: State, plan: FitPlan) -> tuple[float, np.ndarray, np.ndarray]:
     """PSNR (dB) of the half-size held-out blocks; ``[n]`` box shares and ``[n]`` least log scales, both float32.
 
     The share of its box that a Gaussian may use is ``single_view_share`` to 1, by how many photos show it: the
@@ -197,13 +197,13 @@ def initial_scores(state: State, plan: Plan) -> tuple[float, np.ndarray, np.ndar
     return holdout_psnr(images, photos, plan.weights[1], plan.options.tuning.min_gain), box_shares, min_sizes
 
 
-def holdout_score(state: State, plan: Plan) -> float:
+def holdout_score(state: State, plan: FitPlan) -> float:
     """PSNR (dB) of the half-size held-out blocks."""
     images = render_photos(state.splats, plan.photos[1], colors=state.view_colors())
     return holdout_psnr(images, plan.photos[1], plan.weights[1], plan.options.tuning.min_gain)
 
 
-def score_to_beat(own: float, baseline_start: Gaussians | None, plan: Plan) -> float:
+def score_to_beat(own: float, baseline_start: Gaussians | None, plan: FitPlan) -> float:
     """PSNR (dB) of the held-out blocks that a fit has to beat: of its start, or of a worse baseline start.
 
     Networks learn to show whole photos. A fit to the other blocks then makes the held-out ones worse and new views
@@ -297,7 +297,7 @@ def fit_full(
     return fitted, FitReport("full", True, step, before, after, why, viewmats)
 
 
-def start_clock(state: State, plan: Plan) -> float:
+def start_clock(state: State, plan: FitPlan) -> float:
     """Return the present time; for a time budget after a step on copies, which loads the kernels."""
     if plan.options.time_budget is not None:
         apart = replace(plan, poses=deepcopy(plan.poses))
@@ -305,7 +305,7 @@ def start_clock(state: State, plan: Plan) -> float:
     return time.perf_counter()
 
 
-def affordable_steps(seconds: float, plan: Plan) -> int:
+def affordable_steps(seconds: float, plan: FitPlan) -> int:
     """Steps that fit into the time budget, from the time of the first PROBE ones at half size.
 
     A step at full size costs up to three times as much, one on larger photos more by their pixels.

@@ -14,10 +14,10 @@ from gsmerge.runtime.record import choose, note, stage
 from gsmerge.runtime.threads import in_turn
 from gsmerge.stages.decode import Decoded
 from gsmerge.stages.fit.color import draw, fit_colors
+from gsmerge.stages.fit.fit_options import FitOptions, FitReport, Fitted, record_fit, report_steps
+from gsmerge.stages.fit.fit_state import gaussians_of, grow_to, start_state
 from gsmerge.stages.fit.full import Progress, fit_full
-from gsmerge.stages.fit.options import FitOptions, FitReport, Fitted, record_fit, report_steps
-from gsmerge.stages.fit.photos import fit_photos
-from gsmerge.stages.fit.state import gaussians_of, grow_to, start_state
+from gsmerge.stages.fit.photo_sizes import fit_photos
 from gsmerge.types import Array, Gaussians, Scene
 
 FitResult = tuple[Gaussians, FitReport]
@@ -44,7 +44,7 @@ class FitBackend(Generic[PhotosT]):
     visible_mask: Callable[[Gaussians, PhotosT, float], Array]  # see visible_mask
     fit_full: Callable[..., FitResult]  # see gsmerge.stages.fit.full.fit_full; without masks
     fit_colors: Callable[[Gaussians, PhotosT, FitOptions, int], FitResult]  # the last: a seed
-    grow: Callable[[Gaussians, PhotosT, int], Gaussians]  # to a number, see gsmerge.stages.fit.state.grow_to
+    grow: Callable[[Gaussians, PhotosT, int], Gaussians]  # to a number, see gsmerge.stages.fit.fit_state.grow_to
     photo_error: Callable[[Gaussians, PhotosT], float]  # mean squared error of all photos
     photo_psnr: Callable[..., float]  # see gsmerge.render.photos.photo_psnr
     memory_errors: tuple[type[Exception], ...] = ()  # of a device whose memory does not suffice
@@ -125,7 +125,7 @@ def fit(
 
     Args:
         gaussians: Canonical Gaussians.
-        photos: The input views, see :func:`gsmerge.stages.fit.fit_photos`. Larger ones are fitted to on the CPU alone.
+        photos: The input views, see :func:`gsmerge.stages.fit.photo_sizes`. Larger ones are fitted to on the CPU alone.
         options: What to fit.
         count: Number of Gaussians that the full fit may grow to.
         seed: Everything random.

@@ -12,7 +12,7 @@ import pytest
 from batches import QUICK, records
 
 from gsmerge.batch import BatchOptions, Job
-from gsmerge.batch import run as runs
+from gsmerge.batch import schedule as runs
 from gsmerge.batch.records import (
     BUSY,
     DONE,
@@ -22,7 +22,7 @@ from gsmerge.batch.records import (
     STUCK,
     record,
 )
-from gsmerge.batch.run import dispatch, estimate_seconds, make_schedule
+from gsmerge.batch.schedule import dispatch, estimate_seconds, make_schedule
 from gsmerge.batch.task import BatchContext, Task
 from gsmerge.errors import SceneError
 from gsmerge.options import CompactOptions
@@ -142,7 +142,7 @@ def test_what_failed_is_not_tried_again(context: BatchContext) -> None:
 
 
 def test_what_others_work_on_comes_last(context: BatchContext, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gsmerge.batch.run.BUSY_RETRY_SECONDS", 0.05)
+    monkeypatch.setattr("gsmerge.batch.schedule.BUSY_RETRY_SECONDS", 0.05)
     pool = Script({"0": [BUSY, BUSY, SKIPPED]})
     start = time.monotonic()
     assert handed_out(pool, context, 3) == [("1", DONE), ("2", DONE), ("0", SKIPPED)]

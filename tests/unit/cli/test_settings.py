@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import pytest
 
-from gsmerge.cli.options import Args, parse_pairs, setting_kinds, words_for
+from gsmerge.cli.parameters import Args, parse_pairs, setting_kinds, words_for
 from gsmerge.errors import UsageError
 from gsmerge.online.options import OnlineOptions
 from gsmerge.options import CompactOptions

@@ -7,8 +7,8 @@ import pytest
 import scenes
 from network_fixtures import Made, made
 
-from gsmerge.encoded.decode import divide_all, pick_children
 from gsmerge.encoded.encoded import Division
+from gsmerge.encoded.to_gaussians import divide_all, pick_children
 from gsmerge.moments import feature_to_gaussians
 from gsmerge.stages.decode import divide, split_counts
 from gsmerge.types import FeatureGaussians, Gaussians

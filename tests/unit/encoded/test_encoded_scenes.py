@@ -14,7 +14,7 @@ from unaligned_scenes import far_behind, shuffled, voxels
 
 import gsmerge
 from gsmerge import Encoded, Gaussians, Scene, compact, decode_scene, encode_scene
-from gsmerge.encoded.decode import plan_decode
+from gsmerge.encoded.to_gaussians import plan_decode
 from gsmerge.errors import UsageError
 
 SHARE = "10%"

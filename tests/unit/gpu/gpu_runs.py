@@ -14,7 +14,7 @@ from gsmerge.gpu.backend import make_backend
 from gsmerge.gpu.device_photos import DevicePhotos, upload_photos
 from gsmerge.render.photos import Photos
 from gsmerge.stages.fit import FitOptions
-from gsmerge.stages.fit.options import Tuning
+from gsmerge.stages.fit.fit_options import Tuning
 
 Pair = tuple[Photos, Photos]
 CPU = torch.device("cpu")

@@ -8,8 +8,8 @@ from dataclasses import replace
 import torch
 
 from gsmerge.gpu.adam import FitState, StepGradients, state_of, step_in_torch
+from gsmerge.stages.fit.fit_options import FitOptions, Tuning
 from gsmerge.stages.fit.full import step_sizes
-from gsmerge.stages.fit.options import FitOptions, Tuning
 
 RATES = Tuning(
     means_lr=3.0, scales_lr=3.0, opacities_lr=5.0, colors_lr=1.0, max_mean_shift=0.2, max_scale_change=0.1,
@@ -58,7 +58,7 @@ def compare_triton() -> None:
     state, options = odd_state(300)
     other, gradients = deepcopy(state), gradients_of(state)
     for step in (1, 2, 3):
-        rates = torch.from_numpy(step_sizes(options.rates, 0.3, 8))
+        rates = torch.from_numpy(step_sizes(options.tuning, 0.3, 8))
         step_in_torch(state, gradients, options, rates, step)
         adam_kernel.launch(other, gradients, options, rates, step)
         for name in ("x", "m", "v", "means", "quats", "scales", "opacities", "colors"):

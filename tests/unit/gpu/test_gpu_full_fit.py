@@ -17,8 +17,8 @@ from gsmerge.gpu.adam import adam_step, gaussians_of, start_state
 from gsmerge.gpu.device_photos import upload_gaussians, upload_photos
 from gsmerge.gpu.full_fit import draw_order, error_masses, grow_to, make_levels, step_gradients
 from gsmerge.stages.fit import fit
+from gsmerge.stages.fit import fit_state as stage_state
 from gsmerge.stages.fit import full as stage_full
-from gsmerge.stages.fit import state as stage_state
 
 
 @pytest.mark.parametrize("settings", [{}, {"ssim_lambda": 0.0}, {"half_res_share": 1.0}, {"opacity_reg": 3.0}], ids=str)

@@ -8,7 +8,7 @@ import torch
 from gpu_runs import Pair
 
 from gsmerge.gpu.image_scores import exposure_gains, holdout_psnr, loss_gradient, photo_means
-from gsmerge.stages.fit import photos as fit_photos
+from gsmerge.stages.fit import photo_sizes as fit_photos
 from gsmerge.stages.fit.loss import image_gradient
 
 

@@ -16,7 +16,7 @@ from gsmerge import Scene
 from gsmerge.errors import SceneError
 from gsmerge.render.metrics import psnr
 from gsmerge.research.generate import GenerateOptions, generate_scene
-from gsmerge.stages.fit.photos import large_photos, largest_scale
+from gsmerge.stages.fit.photo_sizes import large_photos, largest_scale
 
 WIDTH, HEIGHT, SCALE = 72, 48, 3
 

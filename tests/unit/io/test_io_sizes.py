@@ -15,7 +15,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io import load_scene, read_cameras, to_cameras
 from gsmerge.io.alignment.layouts import grids_of_count, patch_grids
 from gsmerge.io.cameras.camera_file import C2W_OPENGL, CONVENTIONS, W2C_OPENCV, View, from_viewmats, make_camera_file
-from gsmerge.io.photos import PhotoTransform, resize_and_crop, resize_to
+from gsmerge.io.photo_files import PhotoTransform, resize_and_crop, resize_to
 from gsmerge.types import Cameras
 
 SMOOTH = smooth_scene(48, 36)

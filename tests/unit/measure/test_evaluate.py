@@ -18,7 +18,7 @@ import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 import gsmerge
-from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Evaluation, Views, evaluate
+from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Evaluation, evaluate
 from gsmerge.measure.scores import (
     CSV_COLUMNS,
     evaluation_csv,
@@ -27,7 +27,7 @@ from gsmerge.measure.scores import (
     evaluation_markdown,
 )
 from gsmerge.report import to_json
-from gsmerge.types import Gaussians, Scene
+from gsmerge.types import Gaussians, Scene, Views
 
 PLAIN = EvaluateOptions(lpips=())
 

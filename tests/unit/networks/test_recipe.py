@@ -11,7 +11,7 @@ import scenes
 import torch
 
 from gsmerge import Scene
-from gsmerge.encoded.encode import encode_scene
+from gsmerge.encoded.to_encoded import encode_scene
 from gsmerge.errors import UsageError
 from gsmerge.networks.checkpoint import save_checkpoint
 from gsmerge.networks.modules import NetworkOptions, Networks

@@ -9,7 +9,7 @@ import pytest
 import scenes
 from view_batches import FAST, fed, group, parts_of, room, same_group, state_of
 
-from gsmerge.encoded.decode import divide_all
+from gsmerge.encoded.to_gaussians import divide_all
 from gsmerge.online.extend import find_partners, merge_into
 from gsmerge.online.state import GroupSet, child_members, limit_children, select_groups
 from gsmerge.stages.decode import DecodeOptions

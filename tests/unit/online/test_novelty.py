@@ -13,7 +13,7 @@ from view_batches import random_gaussians, room
 
 from gsmerge import Cameras, Gaussians
 from gsmerge.moments import feature_to_gaussians, scene_members, unaligned_members
-from gsmerge.online.photos import MARGIN, REACH, group_errors, groups_in_view, pixel_errors
+from gsmerge.online.batch_photos import MARGIN, REACH, group_errors, groups_in_view, pixel_errors
 from gsmerge.online.state import moments_of
 from gsmerge.render import contributions, plan_view, prepare
 from gsmerge.render.photos import photos_of

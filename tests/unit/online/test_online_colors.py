@@ -11,7 +11,7 @@ from view_batches import fed, room, same_group, state_of
 
 from gsmerge import Gaussians, Scene
 from gsmerge.moments import feature_to_gaussians
-from gsmerge.online.photos import BatchPhotos, fit_batch_colors, groups_in_view
+from gsmerge.online.batch_photos import BatchPhotos, fit_batch_colors, groups_in_view
 from gsmerge.online.state import GroupSet
 from gsmerge.render.photos import Photos, scene_photos
 from gsmerge.render.weights import apply

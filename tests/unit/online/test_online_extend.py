@@ -15,7 +15,7 @@ from view_batches import FAST, counts, fed, parts_of, room, same_groups, same_st
 
 from gsmerge import Compactor, Gaussians, Scene, decode_scene, encode_scene
 from gsmerge.errors import UsageError
-from gsmerge.online.decode import decode_stored
+from gsmerge.online.decode_stored import decode_stored
 from gsmerge.online.extend import extend
 from gsmerge.online.state import OnlineState, from_encoded
 from gsmerge.options import CompactOptions
@@ -337,7 +337,7 @@ def test_a_full_fit_shows_more(scene: Scene, pairs: list[Scene]) -> None:
 
 
 def test_a_fit_in_vain_leaves_the_solved_colours(pairs: list[Scene], monkeypatch: pytest.MonkeyPatch) -> None:
-    from gsmerge.online import decode as decode_module
+    from gsmerge.online import decode_stored as decode_module
 
     def refused(gaussians: Gaussians, *_: object, **__: object) -> tuple[Gaussians, FitReport]:
         return gaussians, FitReport("none", False, 1, 20.0, 19.0, "in vain")

@@ -8,7 +8,14 @@ from view_batches import room
 
 from gsmerge import Cameras
 from gsmerge.geometry import project
-from gsmerge.online.photos import BatchPhotos, concat_cameras, resize_cameras, resize_photos, update_replay, view_ids
+from gsmerge.online.batch_photos import (
+    BatchPhotos,
+    concat_cameras,
+    resize_cameras,
+    resize_photos,
+    update_replay,
+    view_ids,
+)
 from gsmerge.online.state import Replay
 
 NOTHING = Replay(np.zeros((0, 2, 3, 3), np.uint8), np.zeros(0, np.int64))

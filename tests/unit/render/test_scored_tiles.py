@@ -7,9 +7,9 @@ import pytest
 import scenes
 
 from gsmerge import Scene
-from gsmerge.render.blend import composite
+from gsmerge.render.composite import composite
 from gsmerge.render.photos import NEAR, photo_psnr, scene_photos, scored_tiles
-from gsmerge.render.plan import plan_view, prepare
+from gsmerge.render.view_plan import plan_view, prepare
 
 
 @pytest.fixture(scope="module")

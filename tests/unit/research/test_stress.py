@@ -14,11 +14,10 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry import project
 from gsmerge.io import load_scene, read_held_out
 from gsmerge.io.scene import SceneLoad
-from gsmerge.measure.evaluate import Views
 from gsmerge.options import CompactOptions
-from gsmerge.research.stress import CASES, cases, run, stress
+from gsmerge.research.stress import CASES, cases, check, stress
 from gsmerge.research.stress.cases import StressScene
-from gsmerge.types import Scene
+from gsmerge.types import Scene, Views
 
 FAST = CompactOptions().with_settings({"fit": "none"})
 
@@ -129,14 +128,14 @@ def test_without_photos(load: SceneLoad) -> None:
 
 def spoilt(monkeypatch: pytest.MonkeyPatch, change: Any) -> None:
     """Every run after the first one goes wrong in some way."""
-    genuine, runs = run.compact, []
+    genuine, runs = check.compact, []
 
     def compact(scene: Any, options: CompactOptions) -> Any:
         runs.append(scene)
         result = genuine(scene, options)
         return result if len(runs) == 1 else replace(result, gaussians=change(result.gaussians))
 
-    monkeypatch.setattr(run, "compact", compact)
+    monkeypatch.setattr(check, "compact", compact)
 
 
 @pytest.mark.parametrize(
@@ -175,7 +174,7 @@ def test_an_error_is_an_outcome(load: SceneLoad, monkeypatch: pytest.MonkeyPatch
 
 def test_wrong_conventions_that_are_believed_are_noticed(load: SceneLoad, monkeypatch: pytest.MonkeyPatch) -> None:
     wrong = replace(load, scene=replace(load.scene, cameras=load.scene.cameras[[1, 0, 2, 3, 4]]))
-    monkeypatch.setattr(run, "align_scene", lambda *_, **__: wrong)
+    monkeypatch.setattr(check, "align_scene", lambda *_, **__: wrong)
     outcome = stress(load, FAST, cases=["w2c-opencv"])[0]
     assert (outcome.passed, outcome.measured) == (False, "taken for something else")
 

@@ -41,7 +41,8 @@ def test_stages_notes_and_choices_go_to_the_current_run() -> None:
     assert list(record.seconds) == ["encode"]
     assert record.notes == ["odd", "odd"]
     assert record.choices == {"groups": 3}
-    assert events == [("encode", STAGES.index("encode"), len(STAGES))] * 2 + [("fit: step", 1, 2)]
+    count = len(STAGES)
+    assert events == [("encode", STAGES.index("encode"), count), ("fit: step", 1, 2), ("done", count, count)]
 
 
 def test_a_stage_inside_another_is_part_of_it() -> None:
@@ -73,7 +74,7 @@ def test_a_part_has_a_record_of_its_own_until_it_is_adopted() -> None:
         adopt(part)
     assert record.notes == ["first", "second"]
     assert record.choices == {"steps": 2}
-    assert events == ["fit"]
+    assert events == ["fit", "done"]
 
 
 def test_threads_of_the_caller_have_runs_of_their_own() -> None:

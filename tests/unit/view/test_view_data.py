@@ -16,10 +16,11 @@ import scenes
 
 from gsmerge import Gaussians, Scene, evaluate, render
 from gsmerge.io.formats.spz import spz_bytes
-from gsmerge.measure.evaluate import EvaluateOptions, Views, near_plane
+from gsmerge.measure.evaluate import EvaluateOptions, near_plane
 from gsmerge.measure.preview import to_picture
 from gsmerge.render.metrics import psnr
 from gsmerge.stages.segment import SegmentOptions, segment
+from gsmerge.types import Views
 from gsmerge.view import data, splats
 from gsmerge.view.data import ViewData, collect, encode_still, middle_depth, short_names
 from gsmerge.view.splats import pack_splats

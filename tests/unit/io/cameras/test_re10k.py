@@ -17,7 +17,7 @@ from tiny_scene import Tiny
 
 from gsmerge.errors import SceneError
 from gsmerge.io import find_scene_files, load_scene, read_cameras
-from gsmerge.io.photos import resize_and_crop
+from gsmerge.io.photo_files import resize_and_crop
 
 SMOOTH = smooth_scene(48, 36)
 

@@ -22,7 +22,7 @@ from gsmerge.research.charts.figures import (
     make_figures,
 )
 from gsmerge.research.charts.lines import Interval, Line, Point, Results
-from gsmerge.research.charts.run import RunRecord
+from gsmerge.research.charts.measure_run import RunRecord
 
 METHODS = ("gsmerge", "voxel")
 NAMES = ["quality-seconds", "quality-ratio", "stages", "proxy", "count-views", "quality-views", "break-even"]

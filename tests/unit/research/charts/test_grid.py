@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from gsmerge.batch import BatchOptions
-from gsmerge.batch.run import Schedule, estimate_seconds
+from gsmerge.batch.schedule import Schedule, estimate_seconds
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import ReadHints
 from gsmerge.measure.evaluate import EvaluateOptions
@@ -21,7 +21,7 @@ from gsmerge.research.charts.grid import (
     read_grid,
     scene_names,
 )
-from gsmerge.research.charts.run import Run
+from gsmerge.research.charts.measure_run import ChartRun
 
 
 def test_the_smallest_grid_is_the_input_and_the_defaults() -> None:
@@ -238,7 +238,7 @@ def test_keys_depend_on_what_changes_measurements(made_scene: Path) -> None:
     def key(options: BatchOptions | None = None, **more: Any) -> str:
         given = sources(made_scene), more.pop("grid", Grid()), more.pop("measured", EvaluateOptions(()))
         (_, job), _ = make_jobs(*given, **more)
-        assert isinstance(job.work, Run)
+        assert isinstance(job.work, ChartRun)
         return job.work.key(options or BatchOptions())
 
     assert key() == key(BatchOptions(jobs=2), command="another")

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from experiments import make_grid, make_proxies
 
+from gsmerge.research.charts.chart_page import make_page, make_table
 from gsmerge.research.charts.figures import draw_figures, make_figures
 from gsmerge.research.charts.lines import Results
-from gsmerge.research.charts.page import make_page, make_table
-from gsmerge.research.charts.run import RunRecord, picture_path
+from gsmerge.research.charts.measure_run import RunRecord, picture_path
 
 EVIL = "<script>alert('x')</script>\"&</title>"
 

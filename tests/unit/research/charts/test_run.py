@@ -19,10 +19,10 @@ from gsmerge.batch.records import DONE, FAILED, RECORDS, SKIPPED, record
 from gsmerge.io import find_scene_files
 from gsmerge.measure.evaluate import EvaluateOptions
 from gsmerge.options import CompactOptions
-from gsmerge.research.charts.run import (
+from gsmerge.research.charts.measure_run import (
     SEGMENTATIONS,
     SHARES,
-    Run,
+    ChartRun,
     RunRecord,
     keep_pictures,
     proxy_psnr,
@@ -128,7 +128,7 @@ def test_superpixels_alone_are_measured_on_photos(made_scene: Path, tmp_path: Pa
     assert images is not None
     coarse, fine = (proxy_psnr(images[0], count, "rdseg") for count in (20, 600))
     assert 10 < coarse < fine - 3
-    run = Run(
+    run = ChartRun(
         RunRecord("room", "superpixels", method="superpixels", views_asked=1), CompactOptions(), EvaluateOptions()
     )
     report, pictures = run.run(find_scene_files(made_scene), BatchOptions(), tmp_path / "superpixels")

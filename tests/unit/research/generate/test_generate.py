@@ -129,7 +129,7 @@ def test_what_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("gsmerge.research.generate.run.write_ply", full)
+    monkeypatch.setattr("gsmerge.research.generate.folders.write_ply", full)
     with pytest.raises(SceneError, match="No space left"):
         generate(tmp_path, 1, TINY)
     assert list(tmp_path.iterdir()) == []

@@ -24,11 +24,11 @@ from gsmerge.research.generate.noise import (
     quats_facing,
     texture_mask,
 )
-from gsmerge.research.generate.photograph import Lens
-from gsmerge.research.generate.scene import look_at
+from gsmerge.research.generate.photograph import Pinhole
+from gsmerge.research.generate.synthetic_scene import look_at
 
 W, H = 64, 48
-LENS = Lens(W, H, 60.0)
+LENS = Pinhole(W, H, 60.0)
 POSE = look_at(np.array([0.3, -0.2, 0.1]), np.array([0.5, 0.1, 3.0]), 0.1)
 NONE = Noise(**{f.name: 0 for f in fields(Noise)})
 CLEAN = replace(

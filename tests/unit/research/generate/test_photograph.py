@@ -9,8 +9,8 @@ import pytest
 
 from gsmerge.research.generate.objects import STYLES
 from gsmerge.research.generate.photograph import (
-    Lens,
     Light,
+    Pinhole,
     Stage,
     develop,
     find_exposure,
@@ -19,12 +19,12 @@ from gsmerge.research.generate.photograph import (
     screen_boxes,
     trace,
 )
-from gsmerge.research.generate.scene import PATHS, is_usable, look_at
 from gsmerge.research.generate.shapes import LYING, Material, Shape, ball, blob, box, column, pack, place, quad, rod
+from gsmerge.research.generate.synthetic_scene import PATHS, is_usable, look_at
 from gsmerge.research.generate.textures import KINDS, Palette
 
 LOOK = Material(0)
-LENS = Lens(40, 30, 40.0)
+LENS = Pinhole(40, 30, 40.0)
 WHITE = np.ones((32, 32, 3), np.float32)
 DOWN = Light(np.array([0.0, -1.0, 0.0]), None, np.ones(3), 0.2 * np.ones(3), 0.01)
 
@@ -40,7 +40,7 @@ def test_a_wall_has_its_own_depth_everywhere() -> None:
 
 
 def test_a_ball_is_as_near_as_its_front_and_as_wide_as_its_cone() -> None:
-    hits = trace(pack([ball((0, 0, 4), (1, 1, 1), LOOK)]), np.eye(4), Lens(401, 301, 300.0), 1)
+    hits = trace(pack([ball((0, 0, 4), (1, 1, 1), LOOK)]), np.eye(4), Pinhole(401, 301, 300.0), 1)
     assert hits.depth.min() == pytest.approx(3, abs=1e-4)
     radius = np.sqrt((hits.ids == 0).sum() / np.pi)
     assert radius == pytest.approx(300 / np.sqrt(15), rel=0.01)  # tangent of the cone that touches the ball
@@ -48,7 +48,7 @@ def test_a_ball_is_as_near_as_its_front_and_as_wide_as_its_cone() -> None:
 
 def test_a_column_stands_on_its_foot() -> None:
     shape = column((0.0, 1.0, 3.0), 1.5, 0.2, LOOK, top=0.5)
-    hits = trace(pack([shape]), np.eye(4), Lens(200, 200, 200.0), 1)
+    hits = trace(pack([shape]), np.eye(4), Pinhole(200, 200, 200.0), 1)
     rows = np.flatnonzero((hits.ids == 0).any(1))
     assert (rows[-1] + 1 - 100) / 200 * hits.depth[rows[-1], 100] == pytest.approx(1.0, abs=0.02)
     widths = (hits.ids == 0).sum(1)
@@ -83,7 +83,7 @@ def test_a_thing_throws_shade_on_the_ground() -> None:
     ground = replace(quad((0, 0, 0), (4, 4), LOOK, LYING), shell=True)
     view = light_stage(stage(ground, box((-0.5, -1, -0.5), (0.5, -0.6, 0.5), LOOK)))
     from_side = look_at(np.array([0.0, -0.45, -3.0]), np.array([0.0, 0.0, 0.0]))
-    image, hits = radiance(view, from_side, Lens(60, 60, 60.0), 1)
+    image, hits = radiance(view, from_side, Pinhole(60, 60, 60.0), 1)
     y, x = np.mgrid[:60, :60] + 0.5
     rays = np.stack([(x - 30) / 60, (y - 30) / 60, np.ones_like(x)], -1) @ from_side[:3, :3].T
     world = from_side[:3, 3] + rays * hits.depth[..., None]

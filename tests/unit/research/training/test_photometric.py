@@ -14,7 +14,6 @@ from scipy.ndimage import uniform_filter
 from training_runs import OPTIONS, TINY, written
 
 from gsmerge.errors import GsmergeError
-from gsmerge.measure.evaluate import Views
 from gsmerge.measure.lpips import lpips, lpips_available, lpips_loss
 from gsmerge.networks.apply import NetworkContext, encode_features, refine_features
 from gsmerge.networks.modules import Networks
@@ -37,7 +36,7 @@ from gsmerge.research.training.scenes import coverage, covered_pixels, reduced_m
 from gsmerge.research.training.windows import Box, Window, sample_window, whole_photo
 from gsmerge.stages.decode import DecodeOptions, decode
 from gsmerge.stages.merge import merge
-from gsmerge.types import Cameras, Gaussians, Scene
+from gsmerge.types import Cameras, Gaussians, Scene, Views
 
 PHOTO = replace(OPTIONS, photo_start=0.0, window=16)
 WIDTH, HEIGHT = 48, 36

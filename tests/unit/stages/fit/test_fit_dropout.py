@@ -12,9 +12,9 @@ from gsmerge import Gaussians
 from gsmerge.render.photos import Photos
 from gsmerge.stages.fit import FitOptions
 from gsmerge.stages.fit import full as full_module
+from gsmerge.stages.fit.fit_options import LONG_STEPS
+from gsmerge.stages.fit.fit_state import start_state
 from gsmerge.stages.fit.full import fit_full, plan_run
-from gsmerge.stages.fit.options import LONG_STEPS
-from gsmerge.stages.fit.state import start_state
 
 QUICK = FitOptions(fit_steps=30, holdout=0.2)
 LONG = FitOptions(fit_steps=160, holdout=0.2)

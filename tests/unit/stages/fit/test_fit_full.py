@@ -17,6 +17,8 @@ from gsmerge.render.photos import Photos
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.fit import FitOptions, start_share
 from gsmerge.stages.fit import full as full_module
+from gsmerge.stages.fit.fit_options import Tuning
+from gsmerge.stages.fit.fit_state import start_state
 from gsmerge.stages.fit.full import (
     affordable_steps,
     fit_full,
@@ -26,8 +28,6 @@ from gsmerge.stages.fit.full import (
     plan_run,
     step_sizes,
 )
-from gsmerge.stages.fit.options import Tuning
-from gsmerge.stages.fit.state import start_state
 from gsmerge.types import SH_C0
 
 Pair = tuple[Photos, Photos]

@@ -17,7 +17,7 @@ from gsmerge.runtime.record import record_run
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.fit import FitOptions, fit, fit_photos
 from gsmerge.stages.fit.full import affordable_steps, fit_full, plan_run
-from gsmerge.stages.fit.photos import large_photos, largest_scale, photo_scale
+from gsmerge.stages.fit.photo_sizes import large_photos, largest_scale, photo_scale
 from gsmerge.types import LargePhotos
 from gsmerge.views import subset
 

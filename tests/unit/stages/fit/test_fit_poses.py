@@ -11,13 +11,13 @@ import scenes
 from gsmerge import Gaussians
 from gsmerge.geometry import motion_matrices, motion_vectors, project_points
 from gsmerge.render import plan_view
-from gsmerge.render.blend import blend, view_colors
+from gsmerge.render.composite import blend, view_colors
 from gsmerge.render.gradient import gradients_of
 from gsmerge.render.photos import Photos
 from gsmerge.stages.fit import FitOptions
+from gsmerge.stages.fit.fit_options import Tuning
+from gsmerge.stages.fit.fit_state import start_state
 from gsmerge.stages.fit.full import NO_LOSS, fit_full, start_poses
-from gsmerge.stages.fit.options import Tuning
-from gsmerge.stages.fit.state import start_state
 
 Pair = tuple[Photos, Photos]
 FREE = FitOptions(fit_steps=120, holdout=0.2, move_cameras=True, dropout=0.0)

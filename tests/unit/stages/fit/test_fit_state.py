@@ -13,8 +13,8 @@ from gsmerge.geometry import covariances
 from gsmerge.kernels.gaussians.optimise import COLOR, COLUMNS, LOGIT, QUAT, SIZE
 from gsmerge.render.metrics import psnr
 from gsmerge.render.photos import Photos, scene_photos
-from gsmerge.stages.fit.photos import holdout_psnr, reduced, training_weights
-from gsmerge.stages.fit.state import State, error_masses, gaussians_of, grow, start_state
+from gsmerge.stages.fit.fit_state import State, error_masses, gaussians_of, grow, start_state
+from gsmerge.stages.fit.photo_sizes import holdout_psnr, reduced, training_weights
 
 
 def make(degree: int) -> tuple[Scene, Gaussians]:

@@ -17,7 +17,7 @@ ENGINES = ("local", "ray")
 
 @dataclass(frozen=True)
 class BatchOptions:
-    """Settings of :func:`gsmerge.batch.run_batch`; a ValueError if one is out of range."""
+    """Settings of :func:`gsmerge.batch.schedule`; a ValueError if one is out of range."""
 
     settings: CompactOptions = field(default_factory=CompactOptions)  # of a scene; no threads: processors by jobs
     opacity: OpacityChoice = "auto"  # how all files store opacity

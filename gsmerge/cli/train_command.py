@@ -8,7 +8,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from gsmerge.cli import options as opt
+from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import announce_compilation, print_document, say_notes, stage_progress
 
 

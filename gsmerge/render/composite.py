@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from gsmerge.kernels.raster import blend as kernels
 from gsmerge.kernels.raster import harmonics
-from gsmerge.render.plan import Array, Splats, ViewPlan, pieces, prepare, tile_ranges
+from gsmerge.render.view_plan import Array, Splats, ViewPlan, pieces, prepare, tile_ranges
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import Array as AnyArray
 from gsmerge.types import Cameras, Gaussians

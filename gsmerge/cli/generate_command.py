@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gsmerge.cli import options as opt
+from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import announce_compilation, print_document, stage_progress
 from gsmerge.errors import SceneError, UsageError
 

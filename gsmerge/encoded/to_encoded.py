@@ -9,8 +9,8 @@ from typing import Any
 
 from gsmerge import __version__
 from gsmerge.budget import AUTO
-from gsmerge.encoded.decode import divide_all
 from gsmerge.encoded.encoded import Encoded, StoredHeads, StoredSettings, without_members
+from gsmerge.encoded.to_gaussians import divide_all
 from gsmerge.errors import UsageError
 from gsmerge.options import CompactOptions
 from gsmerge.pipeline import build, merge_views

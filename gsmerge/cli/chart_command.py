@@ -10,8 +10,8 @@ from inspect import Parameter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gsmerge.cli import options as opt
-from gsmerge.cli.batch import check_failures, pending_jobs, print_plan, run_jobs
+from gsmerge.cli import parameters as opt
+from gsmerge.cli.batch_command import check_failures, pending_jobs, print_plan, run_jobs
 from gsmerge.cli.before_after import lpips_networks
 from gsmerge.cli.console import announce_compilation, print_document, say_notes
 from gsmerge.cli.paths import write_texts
@@ -75,7 +75,7 @@ def chart(args: opt.Args) -> None:
         _draw(args, [], 0)
         return
     from gsmerge.batch.records import RecordIndex, Totals
-    from gsmerge.batch.run import make_schedule
+    from gsmerge.batch.schedule import make_schedule
 
     jobs, options, notes = _make_jobs(args, scenes)
     index, schedule = RecordIndex(out), make_schedule(jobs, options)
@@ -143,10 +143,10 @@ def _command(args: opt.Args, scenes: Sequence[str]) -> str:
 def _draw(args: opt.Args, notes: Sequence[str], num_done: int) -> None:
     """Draw charts, page and table of everything in the folder, and say so; ``notes`` were printed before."""
     from gsmerge.report import document_head
+    from gsmerge.research.charts.chart_page import make_page, make_table
     from gsmerge.research.charts.figures import draw_figures, make_figures
     from gsmerge.research.charts.lines import Results
-    from gsmerge.research.charts.page import make_page, make_table
-    from gsmerge.research.charts.run import read_runs
+    from gsmerge.research.charts.measure_run import read_runs
 
     out = args.output
     records, more = read_runs(out)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gsmerge.cli import options as opt
+from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from gsmerge.cli import options as opt
+from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import announce_compilation, print_document, say_notes, stage_progress
 from gsmerge.cli.paths import FileOptions, check_format, check_outputs, default_output
 from gsmerge.errors import SceneError
@@ -32,9 +32,9 @@ def decode(args: opt.Args) -> None:
     check_outputs((out,), (args.encoded,), overwrite=args.overwrite or args.dry_run)
     import numpy as np
 
-    from gsmerge.encoded.decode import plan_decode
+    from gsmerge.encoded.to_gaussians import plan_decode
     from gsmerge.io import atomic_output, lost_harmonics, output_format, write_gaussians
-    from gsmerge.online.decode import check_fit, decodable, decode_stored, default_fit, num_photos
+    from gsmerge.online.decode_stored import check_fit, decodable, decode_stored, default_fit, num_photos
     from gsmerge.online.file import load_stored
     from gsmerge.options import CompactOptions
     from gsmerge.plan import resolve_fit

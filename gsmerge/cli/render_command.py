@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gsmerge.cli import options as opt
+from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import announce_compilation, print_document, say, say_notes, stage_progress
 from gsmerge.cli.paths import check_cameras, check_folder, check_outputs, input_files, source_of
 from gsmerge.errors import SceneError, UsageError
@@ -205,7 +205,7 @@ def picture_stems(names: Sequence[str]) -> list[str]:
     The image's own name where that tells the views apart, else its path with ``_`` between the folders, else the
     number of the view.
     """
-    from gsmerge.io.photos import IMAGE_SUFFIXES
+    from gsmerge.io.photo_files import IMAGE_SUFFIXES
 
     paths = []
     for name in names:

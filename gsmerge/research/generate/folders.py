@@ -18,7 +18,7 @@ from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import write_ply
 from gsmerge.io.atomic import remove_stale, temporary_path
 from gsmerge.research.generate.photograph import Float
-from gsmerge.research.generate.scene import GenerateOptions, SyntheticScene, make_scene
+from gsmerge.research.generate.synthetic_scene import GenerateOptions, SyntheticScene, make_scene
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import Cameras
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from time import perf_counter
 from typing import Any
 
-from gsmerge.cli import options as opt
+from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import announce_compilation, print_document, say_notes, stage_progress
 from gsmerge.cli.paths import check_outputs, checkpoint_files, input_files
 
@@ -26,13 +26,13 @@ def encode(args: opt.Args) -> None:
     inputs = (*input_files(files), *checkpoint_files(settings.checkpoint))
     check_outputs((out,), inputs, overwrite=args.overwrite or args.dry_run)
     if args.dry_run:
-        from gsmerge.cli.compact import print_plan
+        from gsmerge.cli.compact_command import print_plan
 
         print_plan(args, files, settings, out, hints)
         return
     from gsmerge.compact_file import read_input
-    from gsmerge.encoded.encode import encode_scene
     from gsmerge.encoded.gsm_file import save_encoded
+    from gsmerge.encoded.to_encoded import encode_scene
     from gsmerge.io import atomic_output
     from gsmerge.report import document_head, file_sha256, seconds_document
 

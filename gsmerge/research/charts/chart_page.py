@@ -19,7 +19,7 @@ from gsmerge.research.charts.lines import (
     ours_first,
     size_label,
 )
-from gsmerge.research.charts.run import INPUT, MAX_ERROR, OURS, SCORES, RunRecord, picture_path
+from gsmerge.research.charts.measure_run import INPUT, MAX_ERROR, OURS, SCORES, RunRecord, picture_path
 from gsmerge.view.page import PICTURES, data_uri, render_template
 
 MAX_SCENES = 6  # with pictures on the page

@@ -15,7 +15,7 @@ from gsmerge.render.weights import apply_transposed
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.fit import FitReport
 from gsmerge.stages.fit.color import draw, fit_colors
-from gsmerge.stages.fit.options import FitOptions
+from gsmerge.stages.fit.fit_options import FitOptions
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
 
 REACH = 3.34  # standard deviations to where an opaque Gaussian adds 1/255

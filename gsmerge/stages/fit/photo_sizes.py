@@ -10,7 +10,7 @@ import numpy as np
 from gsmerge.render.photos import EPS2D, Photos, scene_photos
 from gsmerge.runtime.record import choose, note
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.stages.fit.options import FitOptions
+from gsmerge.stages.fit.fit_options import FitOptions
 from gsmerge.types import Scene
 
 AUTO_SCALE = 2.0  # most that "auto" looks at: steps cost as many pixels, and photos beyond that are rarely sharp

@@ -26,7 +26,7 @@ from gsmerge.io import HeldOutViews, ReadHints, SceneFiles, atomic_output, load_
 from gsmerge.io.content_hash import digest
 from gsmerge.io.formats.ply import OpacityChoice
 from gsmerge.io.formats.writing import file_bytes
-from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Views, evaluate, near_plane
+from gsmerge.measure.evaluate import INPUT, EvaluateOptions, evaluate, near_plane
 from gsmerge.measure.preview import Picture, draw_means, heat_map, to_picture
 from gsmerge.measure.speed import time_render
 from gsmerge.options import CompactOptions
@@ -37,7 +37,7 @@ from gsmerge.report import document_head
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.threads import available_threads, parallel_map, use_threads
 from gsmerge.stages.superpixels import superpixels
-from gsmerge.types import Gaussians, Scene
+from gsmerge.types import Gaussians, Scene, Views
 from gsmerge.views import even_views, midpoint_views, pick_views, subset
 
 RECORD_VERSION = 1  # of what a run records; another version is run again
@@ -165,7 +165,7 @@ def describe(method: str, settings: Mapping[str, Any], views: int | None) -> str
 
 
 @dataclass(frozen=True)
-class Run:
+class ChartRun:
     """The work on one scene, see :class:`gsmerge.batch.find.Work`."""
 
     record: RunRecord  # what is known beforehand
@@ -269,15 +269,13 @@ def choose_views(scene: Scene, held_out: HeldOutViews | None, count: int | None)
 
     Without ``count`` all views are kept, and where their places along the trajectory are not known all held-out ones.
     """
-    targets = None if held_out is None else Views(held_out.cameras, held_out.images, held_out.names)
     if count is None or count >= len(scene):
-        return scene, targets
+        return scene, held_out
     ids = even_views(len(scene), count)
-    if held_out is not None and held_out.context_places is not None:
-        chosen = midpoint_views([held_out.context_places[i] for i in ids], held_out.places)
-        names = tuple(held_out.names[i] for i in chosen)
-        targets = Views(held_out.cameras[chosen], held_out.images[chosen], names) if chosen else None
-    return subset(scene, ids), targets
+    if held_out is None or held_out.context_places is None:
+        return subset(scene, ids), held_out
+    chosen = midpoint_views([held_out.context_places[i] for i in ids], held_out.places)
+    return subset(scene, ids), held_out[chosen] if chosen else None
 
 
 def measure(

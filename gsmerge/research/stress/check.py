@@ -15,11 +15,11 @@ from gsmerge.errors import GsmergeError, SceneError, UsageError
 from gsmerge.io import AUTO, ReadHints, SceneLoad, align_scene, read_ply_with_hints
 from gsmerge.io.cameras.camera_file import CameraFile, from_viewmats, to_viewmats
 from gsmerge.io.formats.ply import OpacityChoice
-from gsmerge.measure.evaluate import EvaluateOptions, Views, evaluate
+from gsmerge.measure.evaluate import EvaluateOptions, evaluate
 from gsmerge.options import CompactOptions
 from gsmerge.pipeline import compact
 from gsmerge.research.stress.cases import CASES, PROPERTIES, Case, StressScene
-from gsmerge.types import Gaussians, Scene
+from gsmerge.types import Gaussians, Scene, Views
 
 MAX_WORSE = 0.1  # dB that a result may be below its input
 MAX_SAME, MAX_NEAR = 0.2, 1.0  # dB that a changed scene's result may be below the unchanged one's

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, TextIO
 
 import typer
 
-from gsmerge.cli import options as opt
+from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import duration, one_line, print_document, say, say_notes, total_progress
 from gsmerge.errors import BatchError, TargetError, UsageError
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from gsmerge.batch import BatchOptions, Job
     from gsmerge.batch.records import RecordIndex, Totals
-    from gsmerge.batch.run import Schedule
+    from gsmerge.batch.schedule import Schedule
 
 
 def parse_jobs(text: str) -> int:
@@ -78,7 +78,7 @@ def batch(args: opt.Args) -> None:
     hints = args.hints()
     from gsmerge.batch import BatchOptions, find_jobs
     from gsmerge.batch.records import RecordIndex
-    from gsmerge.batch.run import make_schedule
+    from gsmerge.batch.schedule import make_schedule
 
     with opt.usage_errors():
         options = BatchOptions(
@@ -198,7 +198,7 @@ def print_plan(
     unit: str = "scenes",
 ) -> None:
     """Print what would be done and how long it would take; ``unit`` says what the jobs are called."""
-    from gsmerge.batch.run import estimate_seconds
+    from gsmerge.batch.schedule import estimate_seconds
     from gsmerge.report import document_head, human_bytes
 
     out, pending = args.output, pending_jobs(jobs, args.output, options, index)

@@ -6,7 +6,7 @@ import os
 import sys
 from pathlib import Path
 
-from gsmerge.cli import options as opt
+from gsmerge.cli import parameters as opt
 from gsmerge.cli.before_after import read_before_after
 from gsmerge.cli.console import announce_compilation, print_document, say, say_notes, stage_progress
 from gsmerge.cli.paths import check_outputs, input_files, write_texts

@@ -18,8 +18,8 @@ from gsmerge.research.generate.photograph import (
     SAMPLES,
     Float,
     Hits,
-    Lens,
     LitStage,
+    Pinhole,
     Stage,
     develop,
     find_exposure,
@@ -176,7 +176,7 @@ def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScen
     style = options.style if options.style != MIXED else list(STYLES)[(seed + index) % len(STYLES)]
     path = options.path if options.path != MIXED else list(PATHS)[rng.integers(len(PATHS))]
     noise = draw_noise(options.ranges, rng, options.noise)
-    lens = Lens(options.width, options.height, max(options.width, options.height) * rng.uniform(0.58, 1.75))
+    lens = Pinhole(options.width, options.height, max(options.width, options.height) * rng.uniform(0.58, 1.75))
     large = _scale(lens, options.photo_scale)  # of the photos; the network sees them at the views' size
     view, pose = _find_stage(rng, style, path, large, num_views)
     places = np.linspace(0, 1, 2 * num_views - 1)
@@ -208,15 +208,17 @@ def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScen
     )
 
 
-def _scale(lens: Lens, factor: int) -> Lens:
-    return Lens(factor * lens.width, factor * lens.height, factor * lens.focal)
+def _scale(lens: Pinhole, factor: int) -> Pinhole:
+    return Pinhole(factor * lens.width, factor * lens.height, factor * lens.focal)
 
 
-def _shrink(lens: Lens) -> Lens:
-    return Lens(max(8, lens.width // SMALL), max(8, lens.height // SMALL), lens.focal / SMALL)
+def _shrink(lens: Pinhole) -> Pinhole:
+    return Pinhole(max(8, lens.width // SMALL), max(8, lens.height // SMALL), lens.focal / SMALL)
 
 
-def _find_stage(rng: np.random.Generator, style: str, path: str, lens: Lens, num_views: int) -> tuple[LitStage, Pose]:
+def _find_stage(
+    rng: np.random.Generator, style: str, path: str, lens: Pinhole, num_views: int
+) -> tuple[LitStage, Pose]:
     """Draw a stage and a path through it with usable views only, or the last ones tried."""
     size = 1 << int(np.clip(np.log2(1.6 * max(lens.width, lens.height)), 7, 10))
     for _ in range(STAGE_TRIES):
@@ -230,7 +232,7 @@ def _find_stage(rng: np.random.Generator, style: str, path: str, lens: Lens, num
 
 
 def _photo(
-    view: LitStage, grid: Lens, lens: Lens, noise: Noise, gain: float, given: tuple[Array, int]
+    view: LitStage, grid: Pinhole, lens: Pinhole, noise: Noise, gain: float, given: tuple[Array, int]
 ) -> tuple[Float, Array, Float]:
     """Take a photo with the errors of lens, sensor and exposure, and exact depth and normals of the grid."""
     pose, seed = given
@@ -262,6 +264,6 @@ def _move_pose(pose: Array, world: Array, unit: float) -> Array:
     return out
 
 
-def _cameras(poses: Sequence[Array], lens: Lens) -> Cameras:
+def _cameras(poses: Sequence[Array], lens: Pinhole) -> Cameras:
     viewmats = np.stack([np.linalg.inv(pose) for pose in poses])
     return Cameras(viewmats, np.repeat(lens.intrinsics[None], len(poses), 0), lens.width, lens.height)

@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsmerge.encoded.decode import decode_scene, plan_decode
 from gsmerge.encoded.encoded import Encoded
+from gsmerge.encoded.to_gaussians import decode_scene, plan_decode
 from gsmerge.errors import UsageError
 from gsmerge.gpu import choose_backend
-from gsmerge.online.photos import BatchPhotos
+from gsmerge.online.batch_photos import BatchPhotos
 from gsmerge.online.state import OnlineState, to_encoded
 from gsmerge.runtime.record import Progress, record_run, stage
 from gsmerge.runtime.threads import use_threads

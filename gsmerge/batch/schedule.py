@@ -12,8 +12,8 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
+from gsmerge.batch.batch_options import BatchOptions
 from gsmerge.batch.find import Job
-from gsmerge.batch.options import BatchOptions
 from gsmerge.batch.pools import LocalPool, Pool, RayPool, with_whole_paths
 from gsmerge.batch.records import BUSY, LOST, RECORDS, STUCK, RecordIndex, check_folder
 from gsmerge.batch.task import BatchContext, Task, record_failure, run_lock
