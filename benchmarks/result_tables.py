@@ -1,4 +1,4 @@
-"""The text of docs/results.md: tables of run records, each under the words that say what it is of."""
+"""Tables of run records as one page, each under the words that say what it is of."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def page_of(records: Mapping[str, Sequence[RunRecord]], defaults: Sequence[Mappi
     failed = [r for some in records.values() for r in some if r.error is not None]
     sections = [_head(good), *_methods(good), *_verdicts(good), *_backbones(good), *_views(good), *_timing(good)]
     sections += [*_ablation(good), *_voxels(good), *_proxy(good), *_scenes(good), make_section(defaults)]
-    sections += [_losing(good), _missing()]
+    sections.append(_losing(good))
     if failed:
         lines = sorted({f"- {r.scene}, {r.label}: {r.error}" for r in failed})
         sections.append("## Runs that failed\n\n" + "\n".join(lines))
@@ -246,11 +246,7 @@ def _ablation(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
     if not rows:
         return []
     head = ("variant", "kept", "PSNR (dB)", *QUALITY[1:], "seconds")
-    words = (
-        "Plain export, all views. [Networks](internals/networks.md#stage-by-stage) says what encoder, merger and"
-        " refiner add."
-    )
-    return [_section("Ablation", "ablation", words, make_table(head, rows))]
+    return [_section("Ablation", "ablation", "Plain export, all views.", make_table(head, rows))]
 
 
 def _voxels(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
@@ -366,19 +362,3 @@ def _without(records: Sequence[RunRecord]) -> str:
         "### Without photos\n\nWithout photos nothing can be fitted, and the merge alone has to do: at most"
         f" {without} dB instead of {full} dB (the input: {before} dB)."
     )
-
-
-def _missing() -> str:
-    return """## Tables of the paper without a counterpart
-
-What the paper shows and this page does not, and where else it is:
-
-- Other backbones, each with its own errors (`tab:nvs`): one depth network stands in for all, see above. Its benchmarks
-  (DL3DV, Mip-NeRF 360, Tanks and Temples) are not here; the scenes are five captures.
-- The learned method of the paper itself: [networks](internals/networks.md#the-papers-own-method).
-- Online reconstruction (`tab:online`, `fig:online`): [views in batches](internals/views-in-batches.md).
-- Superpixel sizes without training again (right of `fig:sp_proxy_pareto`): rows of the ablation, after the fit.
-- K by superpixel (supplement, method extensions): [how many Gaussians](guide/how-many.md).
-- Depth Anything 3 with and without poses (`tab:da3_posed_unposed`), ReSplat, VolSplat: they need the models.
-- Qualitative figures: no photo of the captures enters the project; the README's picture is of a synthetic scene.
-- Training: steps, time and memory of the paper's schedule were not repeated."""

