@@ -1,8 +1,8 @@
 """Renders aligned with photos whose exposure or pose is not quite that of the scene, so that the rest is measured.
 
-Colours: the affine map of colours that brings a render closest to its photo, as evaluations of photo collections use
-it (Martin-Brualla et al. 2021). Poses: the camera is moved to where its render is closest, as methods without known
-poses are scored (Lin et al. 2021), by Levenberg-Marquardt steps. Their slope is the rasterizer's own gradient; their
+Colours: the affine map of colours that brings a render closest to its photo, as evaluations of photo collections use it
+(Martin-Brualla et al. 2021). Poses: the camera is moved to where its render is closest, as methods without known poses
+are scored (Lin et al. 2021), by Levenberg-Marquardt steps. Their slope is the rasterizer's own gradient; their
 curvature comes from how the picture would move, given its depth.
 """
 
@@ -35,7 +35,7 @@ OPAQUE = 0.5  # alpha from which a rendered depth is that of a surface
 
 @dataclass(frozen=True)
 class PoseChange:
-    """How far a camera was moved."""
+    """Distance that a camera was moved."""
 
     degrees: float  # that it turned
     shift: float  # of its centre, as a share of the median depth of what it sees
@@ -55,7 +55,7 @@ def fit_colors(image: np.ndarray, photo: np.ndarray, mask: NDArray[np.bool_]) ->
 
 @dataclass(frozen=True, eq=False)
 class _Target:
-    """A photo at one size, and how a pose is judged there."""
+    """A photo at one size, and the settings that a pose is judged with there."""
 
     splats: Splats
     photo: np.ndarray  # [h,w,3]
@@ -77,14 +77,14 @@ class _Target:
         return _Trial(viewmat, plan, image, transmittance, residual, (residual**2).sum(2))
 
     def doubt(self, trial: _Trial) -> float:
-        """Squared residual from which on a pixel counts less."""
+        """Compute the squared residual from which on a pixel counts less."""
         median = float(np.sqrt(np.median(trial.squares[self.mask])))
         return (DOUBT * max(median, MIN_RESIDUAL)) ** 2
 
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """What a camera sees."""
+    """A camera's picture and its residual."""
 
     viewmat: np.ndarray  # [4,4] world to camera, float64
     plan: ViewPlan
@@ -94,15 +94,15 @@ class _Trial:
     squares: np.ndarray  # [h,w] of it, summed over channels
 
     def error(self, doubt: float) -> float:
-        """Sum of a robust error (Cauchy's), which grows as the squares do up to ``doubt`` and slowly beyond."""
+        """Sum a robust error (Cauchy's), which grows as the squares do up to ``doubt`` and slowly beyond."""
         return doubt * float(np.log1p(self.squares / doubt).sum(dtype=np.float64))
 
     def weights(self, doubt: float) -> np.ndarray:
-        """``[h,w]`` derivatives of that error with respect to the squares."""
+        """Compute the derivatives ``[h,w]`` of that error with respect to the squares."""
         return np.asarray(1 / (1 + self.squares / doubt))
 
     def depth(self) -> np.ndarray:
-        """``[h,w]`` mean depth of what is drawn, world units; 0 where little is."""
+        """Compute the mean depth ``[h,w]`` of the drawn Gaussians, world units; 0 where little is drawn."""
         return mean_depths(self.plan, 1 - self.transmittance, OPAQUE)
 
 
@@ -118,17 +118,10 @@ def refine_pose(
 ) -> tuple[Cameras, PoseChange]:
     """Move a camera to where its render is closest to its photo; it stays where the squared error does not fall.
 
-    At a quarter, at half and at the full size of the photo. Pixels whose error is large count less, so that the camera
-    is not moved to get a flaw of the scene out of the picture.
-
-    Args:
-        splats: The Gaussians, from :func:`gsmerge.render.prepare`.
-        camera: One camera.
-        photo: ``[h,w,3]`` sRGB in [0, 1].
-        mask: ``[h,w]`` pixels that count.
-        centre: ``[3]`` the scene's middle in the world.
-        near: Near plane, world units.
-        antialiased: Whether the opacity of small Gaussians is lowered by what the low-pass adds to them.
+    The photo ``[h,w,3]``, sRGB in [0, 1], is compared within ``mask [h,w]`` at a quarter, at half and at its full size.
+    Pixels whose error is large count less, so that the camera is not moved to get a flaw of the scene out of the
+    picture. It turns about ``centre [3]``, the scene's middle in the world. ``splats`` are those of
+    :func:`gsmerge.render.prepare`, ``near`` is in world units, ``antialiased`` that of :func:`gsmerge.render`.
     """
     start = camera.viewmats[0].astype(np.float64)
     viewmat, unit = start, 0.0

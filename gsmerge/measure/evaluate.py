@@ -1,11 +1,11 @@
-"""The quality of compact scenes: their renders compared with photos, view by view, next to the input's own."""
+"""Quality of compact scenes: their renders compared with photos, view by view, next to the input's own."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,7 @@ OnImage = Callable[[str, str, int, np.ndarray], None]
 
 @dataclass(frozen=True)
 class EvaluateOptions:
-    """What is measured.
+    """Settings of an evaluation.
 
     Args:
         lpips: Networks of the perceptual distance, of "vgg" and "alex"; none: it is left out, which is much faster.
@@ -78,7 +78,7 @@ class EvaluateOptions:
 
     @property
     def alignments(self) -> tuple[str, ...]:
-        """Names of the aligned scores: of "color", "pose" and "both"."""
+        """Names of the aligned scores, of "color", "pose" and "both"."""
         chosen = tuple(name for name in ALIGNMENTS if name in self.align)
         return (*chosen, "both") if chosen == ALIGNMENTS else chosen
 
@@ -89,7 +89,7 @@ def _listed(values: Sequence[object]) -> str:
 
 @dataclass(frozen=True)
 class Quality:
-    """How close an image is to another one; None where it was not measured."""
+    """Closeness of an image to another one; None where it was not measured."""
 
     psnr: float | None = None  # dB; inf for equal pictures
     ssim: float | None = None  # at most 1
@@ -97,41 +97,30 @@ class Quality:
     lpips_alex: float | None = None  # the same with AlexNet
 
 
-@dataclass(frozen=True)
-class ZoomScore:
-    """One result in one view at another size; LPIPS is not measured there."""
-
-    zoom: float  # pixels per side, of the photo's
-    full: Quality  # over all pixels
-    masked: Quality  # over those of which the input views have seen every part
-
-
-@dataclass(frozen=True)
-class AlignedScore:
-    """One result in one held-out view after its colours, its camera, or both were aligned with the photo."""
-
-    align: str  # "color", "pose", or "both": the camera first
-    full: Quality  # over all pixels
-    masked: Quality  # over those that the input views have seen, which is what was aligned
+Pair = tuple[Quality, Quality]  # over all pixels, and over those that the input views have seen
 
 
 @dataclass(frozen=True)
 class ViewScore:
-    """One result in one view."""
+    """Scores of one result in one view."""
 
     split: str  # "context": an input view; "target": one that was held out
     view: str  # its name
     visible: float  # share of the pixels that the input views have seen
     full: Quality  # over all pixels
     masked: Quality  # over those that the input views have seen (supplement A)
-    zooms: tuple[ZoomScore, ...] = ()  # one for each size that was asked for, where another one than 1 was
-    aligned: tuple[AlignedScore, ...] = ()  # of a held-out view, one for each way that was asked for
+    # By pixels per side in units of the photo's, where other sizes than 1 were asked for: scores without LPIPS over all
+    # pixels, and over those of which the input views have seen every part.
+    zooms: Mapping[float, Pair] = field(default_factory=dict)
+    # Of a held-out view, by "color", "pose" or "both" (the camera first): scores after the alignment with the photo,
+    # over all pixels and over those that the input views have seen, which are aligned.
+    aligned: Mapping[str, Pair] = field(default_factory=dict)
     pose_change: PoseChange | None = None  # how far the camera was moved, where poses were aligned
 
 
 @dataclass(frozen=True)
 class ResultScores:
-    """One result."""
+    """Scores of one result."""
 
     name: str  # as given
     num_gaussians: int  # their number
@@ -139,18 +128,18 @@ class ResultScores:
     render_seconds: float  # mean wall time of one view, all threads
     scores: tuple[ViewScore, ...]  # one for each view
 
-    def mean(self, split: str, *, zoom: float | None = None, align: str | None = None) -> tuple[Quality, Quality]:
+    def mean(self, split: str, *, zoom: float | None = None, align: str | None = None) -> Pair:
         """Average over the views of a split, or over their scores at one size or after one alignment.
 
         Over all pixels, and over the visible ones.
         """
         views = [score for score in self.scores if score.split == split]
-        mine: list[ViewScore | ZoomScore | AlignedScore] = [*views]
+        pairs = [(score.full, score.masked) for score in views]
         if zoom is not None:
-            mine = [one for score in views for one in score.zooms if one.zoom == zoom]
+            pairs = [score.zooms[zoom] for score in views if zoom in score.zooms]
         if align is not None:
-            mine = [one for score in views for one in score.aligned if one.align == align]
-        return _mean([score.full for score in mine]), _mean([score.masked for score in mine])
+            pairs = [score.aligned[align] for score in views if align in score.aligned]
+        return _mean([full for full, _ in pairs]), _mean([masked for _, masked in pairs])
 
     def mean_pose_change(self, split: str) -> PoseChange | None:
         """Average over the views of a split; None where no camera was aligned."""
@@ -187,22 +176,22 @@ class _Split:
     drawn: Gaussians | None  # the input, whose renders stand in for photos; None where there are photos
 
     def under(self, cameras: Cameras | None) -> _Split:
-        """Look from where a result's own cameras stand; renders of the input are shown from the given ones."""
+        """Move the views to a result's own cameras; renders of the input are shown from the given cameras."""
         own = self.views.cameras if cameras is None or self.drawn is not None else cameras.numpy()
         return replace(self, views=replace(self.views, cameras=own))
 
 
 @dataclass(frozen=True, eq=False)
-class _Look:
-    """How pictures are drawn."""
+class _Renderer:
+    """Settings that pictures are drawn with."""
 
     near: float  # near plane, world units
-    antialiased: bool  # whether small Gaussians keep their energy
     centre: np.ndarray  # [3] the scene's middle in the world
+    options: EvaluateOptions
 
     def image(self, gaussians: Gaussians, cameras: Cameras, view: int) -> np.ndarray:
         """Render one view ``[h,w,3]``, by the one call that renders here: equal Gaussians give equal images."""
-        drawn = render(gaussians, cameras[[view]], near=self.near, antialiased=self.antialiased)
+        drawn = render(gaussians, cameras[[view]], near=self.near, antialiased=self.options.antialiased)
         return np.asarray(drawn.images[0].clip(0, 1))
 
 
@@ -240,24 +229,22 @@ def evaluate(
         targets = replace(targets, cameras=targets.cameras.numpy(), images=as_array(targets.images))
     with use_threads(options.threads):
         frame = scene_frame(scene)
-        look = _Look(NEAR * frame.unit, options.antialiased, frame.origin)
-        splits, scores = _splits(scene, own, targets, options, look), []
+        renderer = _Renderer(NEAR * frame.unit, frame.origin, options)
+        splits, scores = _splits(scene, own, targets, renderer), []
         named = {INPUT: own, **results} if options.own else results
-        look.image(own[:1], scene.cameras, 0)  # loads the kernels, so that no result's time contains that
+        renderer.image(own[:1], scene.cameras, 0)  # loads the kernels, so that no result's time contains that
         for i, (name, gaussians) in enumerate(named.items()):
             mine = {kind: one.under(cameras.get(name)) if kind == "context" else one for kind, one in splits.items()}
-            scores.append(_score_result(name, gaussians, len(own), mine, options, look, on_image))
+            scores.append(_score_result(name, gaussians, len(own), mine, renderer, on_image))
             if progress:
                 progress("evaluate", i + 1, len(named))
     counts = {name: len(split.views.names) for name, split in splits.items()}
-    return Evaluation(tuple(scores), _reference(scene, counts), counts, _notes(splits), options)
-
-
-def _reference(scene: Scene, splits: Mapping[str, int]) -> str:
-    """Say what results are compared with."""
-    if scene.images is not None or "context" not in splits:
-        return "photos"
-    return "photos, and renders of the input in its own views" if "target" in splits else "renders of the input"
+    reference = "photos"
+    if scene.images is None and "context" in counts:
+        reference = (
+            "photos, and renders of the input in its own views" if "target" in counts else "renders of the input"
+        )
+    return Evaluation(tuple(scores), reference, counts, _notes(splits), options)
 
 
 def near_plane(scene: Scene) -> float:
@@ -274,21 +261,19 @@ def _notes(splits: Mapping[str, _Split]) -> tuple[str, ...]:
     return ()
 
 
-def _splits(
-    scene: Scene, own: Gaussians, targets: Views | None, options: EvaluateOptions, look: _Look
-) -> dict[str, _Split]:
+def _splits(scene: Scene, own: Gaussians, targets: Views | None, renderer: _Renderer) -> dict[str, _Split]:
     """Split the views into input and held-out ones, with photos or the input's renders, and visible pixels."""
-    points = context_points(scene, look.near)
+    points = context_points(scene, renderer.near)
 
     def split(views: Views, drawn: Gaussians | None) -> _Split:
-        return _Split(views, visible_pixels(points, views.cameras, look.near, scene.cameras), drawn)
+        return _Split(views, visible_pixels(points, views.cameras, renderer.near, scene.cameras), drawn)
 
     target = {} if targets is None else {"target": split(targets, None)}
-    if targets is not None and not options.context:
+    if targets is not None and not renderer.options.context:
         return target
     images, drawn = scene.images, own if scene.images is None else None
     if images is None:
-        images = np.stack([look.image(own, scene.cameras, view) for view in range(len(scene))])
+        images = np.stack([renderer.image(own, scene.cameras, view) for view in range(len(scene))])
     return {"context": split(Views(scene.cameras, images, scene.names), drawn), **target}
 
 
@@ -297,40 +282,41 @@ def _score_result(
     gaussians: Gaussians,
     num_input: int,
     splits: Mapping[str, _Split],
-    options: EvaluateOptions,
-    look: _Look,
+    renderer: _Renderer,
     on_image: OnImage,
 ) -> ResultScores:
-    scores, seconds = list[ViewScore](), 0.0
+    scores, seconds, options = list[ViewScore](), 0.0, renderer.options
     for kind, split in splits.items():
         views = split.views
         perceptual = pick_views(len(views.names), options.lpips_views or len(views.names))
         for i, view in enumerate(views.names):
             start = time.perf_counter()
-            image = look.image(gaussians, views.cameras, i)
+            image = renderer.image(gaussians, views.cameras, i)
             seconds += time.perf_counter() - start
             on_image(name, kind, i, image)
             seen, nets = split.visible[i], options.lpips if i in perceptual else ()
             both = _both(image, views.images[i], seen, nets)
-            zooms = () if options.zoom == (1,) else tuple(
-                _score_zoom(gaussians, split, i, zoom, look) if zoom != 1
-                else ZoomScore(1, *(replace(one, lpips_vgg=None, lpips_alex=None) for one in both))
-                for zoom in options.zoom
-            )  # fmt: skip
+            sizes = () if options.zoom == (1,) else options.zoom
+            full, masked = (replace(one, lpips_vgg=None, lpips_alex=None) for one in both)
+            zooms = {
+                zoom: (full, masked) if zoom == 1 else _score_zoom(gaussians, split, i, zoom, renderer)
+                for zoom in sizes
+            }
             score = ViewScore(kind, view, float(seen.mean()), *both, zooms)
             if options.align and kind == "target":
-                score = _align_score(score, gaussians, image, split, i, nets, options, look)
+                score = _align_score(score, gaussians, image, split, i, nets, renderer)
             scores.append(score)
     ratio = len(gaussians) / max(num_input, 1)
     return ResultScores(name, len(gaussians), ratio, seconds / max(len(scores), 1), tuple(scores))
 
 
-def _score_zoom(gaussians: Gaussians, split: _Split, view: int, zoom: float, look: _Look) -> ZoomScore:
+def _score_zoom(gaussians: Gaussians, split: _Split, view: int, zoom: float, renderer: _Renderer) -> Pair:
+    """Score a render at another size against the photo, or the input's render, at that size."""
     (cameras, drawn), photo = (zoom_cameras(split.views.cameras, zoom), split.drawn), split.views.images[view]
     size = cameras.width, cameras.height
-    photo = resize_photo(photo, *size) if drawn is None else look.image(drawn, cameras, view)
-    image, seen = look.image(gaussians, cameras, view), resize_mask(split.visible[view], *size)
-    return ZoomScore(zoom, *_both(image, photo, seen, ()))
+    photo = resize_photo(photo, *size) if drawn is None else renderer.image(drawn, cameras, view)
+    image, seen = renderer.image(gaussians, cameras, view), resize_mask(split.visible[view], *size)
+    return _both(image, photo, seen, ())
 
 
 def _align_score(
@@ -340,28 +326,26 @@ def _align_score(
     split: _Split,
     view: int,
     nets: Sequence[str],
-    options: EvaluateOptions,
-    look: _Look,
+    renderer: _Renderer,
 ) -> ViewScore:
     """Add to a score those of the render ``image [h,w,3]`` after alignment."""
-    cameras, photo, seen = split.views.cameras[[view]], split.views.images[view], split.visible[view]
+    options, cameras = renderer.options, split.views.cameras[[view]]
+    photo, seen = split.views.images[view], split.visible[view]
     pictures, change = {"plain": image}, None
     if "pose" in options.align:
         cameras, change = refine_pose(
             prepare(gaussians), cameras, photo, seen,
-            centre=look.centre, near=look.near, antialiased=look.antialiased,
+            centre=renderer.centre, near=renderer.near, antialiased=options.antialiased,
         )  # fmt: skip
-        pictures["pose"] = look.image(gaussians, cameras, 0)
+        pictures["pose"] = renderer.image(gaussians, cameras, 0)
     if "color" in options.align:
         after = {"plain": "color", "pose": "both"}
         pictures |= {after[name]: fit_colors(picture, photo, seen) for name, picture in pictures.items()}
-    aligned = (AlignedScore(name, *_both(pictures[name], photo, seen, nets)) for name in options.alignments)
-    return replace(score, aligned=tuple(aligned), pose_change=change)
+    aligned = {name: _both(pictures[name], photo, seen, nets) for name in options.alignments}
+    return replace(score, aligned=aligned, pose_change=change)
 
 
-def _both(
-    image: np.ndarray, photo: np.ndarray, seen: NDArray[np.bool_], nets: Sequence[str]
-) -> tuple[Quality, Quality]:
+def _both(image: np.ndarray, photo: np.ndarray, seen: NDArray[np.bool_], nets: Sequence[str]) -> Pair:
     """Measure the quality over all pixels, and over those that the input views have seen."""
     full = _quality(image, photo, None, nets)
     return full, full if seen.all() else _quality(image, photo, seen, nets) if seen.any() else Quality()

@@ -1,4 +1,4 @@
-"""A scene's files -> one document: what they hold, and what ``compact`` would make of them."""
+"""Inspection of a scene's files: one document of their content, and of the result that ``compact`` would make."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from gsmerge.io import (
     read_cameras,
     read_ply_with_hints,
 )
-from gsmerge.io.alignment import CameraCheck, check_cameras
+from gsmerge.io.alignment import check_cameras
 from gsmerge.io.exporters import exporter_names, make_hints
 from gsmerge.io.formats.ply import OpacityChoice
 from gsmerge.io.formats.ply_file import LOGIT_COMMENT
@@ -56,7 +56,7 @@ def inspect(
     opacity: OpacityChoice = "auto",
     **hints: Any,
 ) -> dict[str, Any]:
-    """Say what a scene, a ``.ply`` or the folder of one, is made of, and whether it has one Gaussian per pixel.
+    """Describe a scene, a ``.ply`` or the folder of one, and measure whether it has one Gaussian per pixel.
 
     Args:
         path: The scene.
@@ -121,11 +121,18 @@ def _describe_views(ply: PlyScene, files: SceneFiles, hints: ReadHints) -> dict[
         load = align_scene(ply, files, camera_file, hints=hints)
     except SceneError as error:
         return facts | {"alignment_problem": str(error)}
-    scene, sight = load.scene, _check_sight(load.scene)
+    scene, sight, num_sky_views = load.scene, None, 0
+    if len(scene):
+        gaussians = scene.gaussians
+        stored = scene.stored.reshape(-1) if scene.aligned else np.ones(len(gaussians), bool)
+        sight = check_cameras(gaussians, stored, scene.cameras, scene.images)
+        if scene.images is not None:
+            means = gaussians.means[stored & np.isfinite(gaussians.means).all(1)]
+            num_sky_views = len(sky_regions(means, scene.cameras, scene.images))
     facts |= {"notes": load.notes, "num_views": len(load.views.used)}
     facts |= {"camera_format": load.cameras and load.cameras.source}
     facts |= {"coverage": coverage(scene), "sight": sight and asdict(sight)}
-    facts |= {"num_sky_views": _num_sky_views(scene), "compact": estimate(scene, CompactOptions())}
+    facts |= {"num_sky_views": num_sky_views, "compact": estimate(scene, CompactOptions())}
     if not own:
         facts["exporter"] = exporter_names(load.exporters)
     if load.recovery is None or load.alignment is None:
@@ -138,22 +145,6 @@ def _describe_views(ply: PlyScene, files: SceneFiles, hints: ReadHints) -> dict[
         "alignment": asdict(load.alignment),
         "rows": load.recovery.description,
     }
-
-
-def _num_sky_views(scene: Scene) -> int:
-    """Count the views whose photos show sky, where those are enough for ``drop_sky``."""
-    if len(scene) == 0 or scene.images is None:
-        return 0
-    stored = scene.stored.reshape(-1) if scene.aligned else np.isfinite(scene.gaussians.means).all(1)
-    return len(sky_regions(scene.gaussians.means[stored], scene.cameras, scene.images))
-
-
-def _check_sight(scene: Scene) -> CameraCheck | None:
-    """Measure what the cameras see of the Gaussians, and how far colours are from the photos; None without cameras."""
-    if len(scene) == 0:
-        return None
-    valid = scene.stored.reshape(-1) if scene.aligned else np.ones(len(scene.gaussians), bool)
-    return check_cameras(scene.gaussians, valid, scene.cameras, scene.images)
 
 
 def extents(gaussians: Gaussians) -> dict[str, Any]:
@@ -181,11 +172,10 @@ def extents(gaussians: Gaussians) -> dict[str, Any]:
 
 
 def coverage(scene: Scene) -> list[dict[str, Any]]:
-    """Measure what every view shows; of several Gaussians per pixel each layer is a view.
+    """Measure the share of its picture that every view shows; of several Gaussians per pixel each layer is a view.
 
-    Returns:
-        For each view its ``name``, ``share_of_pixels`` that have a visible Gaussian of their own (None without
-        pixels), and ``share_of_gaussians`` whose centre is inside the picture.
+    For each view: its ``name``, ``share_of_pixels`` that have a visible Gaussian of their own (None without pixels),
+    and ``share_of_gaussians`` whose centre is inside the picture.
     """
     if len(scene) == 0:
         return []
@@ -203,7 +193,7 @@ def coverage(scene: Scene) -> list[dict[str, Any]]:
 
 
 def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
-    """Estimate what a run would make of a scene, without working on it.
+    """Estimate the result of a run on a scene, without working on it.
 
     Returns:
         ``num_gaussians``: the most that the result can have; ``ratio`` to the input, ``bytes`` as a ``.ply``;
@@ -300,7 +290,7 @@ def _describe_cameras(scene: Mapping[str, Any]) -> str:
 
 
 def _alignment_lines(scene: Mapping[str, Any]) -> list[str]:
-    """Say which row is which pixel, and how far from it; or why that is not known."""
+    """Write which row is which pixel, and how far from it; or why that is not known."""
     alignment, problem = scene["alignment"], scene["alignment_problem"]
     if problem is not None and scene["compact"] is None:
         return [f"alignment  not measured: {problem}"]
@@ -320,7 +310,7 @@ def _alignment_lines(scene: Mapping[str, Any]) -> list[str]:
 
 
 def _coverage_lines(scene: Mapping[str, Any]) -> list[str]:
-    """Say what the views show, and which shows least."""
+    """Write the shares that the views show, and the view that shows least."""
     views, seen = scene["coverage"], scene["sight"]
     if not views or seen is None:
         return []

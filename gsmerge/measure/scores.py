@@ -1,4 +1,4 @@
-"""An evaluation -> a JSON document with a stable schema, a CSV of one row per view, and tables for people."""
+"""Documents of evaluations: JSON with a stable schema, a CSV of one row per view, and tables for people."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dataclasses import asdict, fields
 from typing import Any
 
 from gsmerge.measure.align import PoseChange
-from gsmerge.measure.evaluate import AlignedScore, Evaluation, Quality, ResultScores, ZoomScore
+from gsmerge.measure.evaluate import Evaluation, Pair, Quality, ResultScores
 from gsmerge.report import csv_cell, document_head, human_bytes
 
 Row = Sequence[str]
@@ -59,7 +59,7 @@ def _result(one: ResultScores, evaluation: Evaluation, facts: Mapping[str, Any])
                 "split": s.split,
                 "view": s.view,
                 "visible_share": s.visible,
-                **_flat(s.full, s.masked),
+                **_flat((s.full, s.masked)),
                 **_zooms(s.zooms),
                 **_aligned(s.aligned, s.pose_change),
             }
@@ -73,27 +73,28 @@ def _mean(one: ResultScores, split: str, evaluation: Evaluation) -> dict[str, An
     sizes = () if options.zoom == (1,) else options.zoom
     ways = options.alignments if split == "target" else ()
     return {
-        **_flat(*one.mean(split)),
-        **_zooms([ZoomScore(zoom, *one.mean(split, zoom=zoom)) for zoom in sizes]),
-        **_aligned([AlignedScore(way, *one.mean(split, align=way)) for way in ways], one.mean_pose_change(split)),
+        **_flat(one.mean(split)),
+        **_zooms({zoom: one.mean(split, zoom=zoom) for zoom in sizes}),
+        **_aligned({way: one.mean(split, align=way) for way in ways}, one.mean_pose_change(split)),
     }
 
 
-def _aligned(scores: Sequence[AlignedScore], change: PoseChange | None) -> dict[str, Any]:
+def _aligned(scores: Mapping[str, Pair], change: PoseChange | None) -> dict[str, Any]:
     """Make ``aligned`` by way, and ``pose_change``, where there are any."""
-    ways = {"aligned": {one.align: _flat(one.full, one.masked) for one in scores}} if scores else {}
+    ways = {"aligned": {way: _flat(pair) for way, pair in scores.items()}} if scores else {}
     return ways | ({"pose_change": asdict(change)} if change else {})
 
 
-def _zooms(scores: Sequence[ZoomScore]) -> dict[str, Any]:
+def _zooms(scores: Mapping[float, Pair]) -> dict[str, Any]:
     """Make ``zooms`` where there are any: a list, in the order that was asked for."""
     names = [name + suffix for suffix in ("", MASKED) for name in ZOOMED]
-    flat = [(one.zoom, _flat(one.full, one.masked)) for one in scores]
+    flat = [(zoom, _flat(pair)) for zoom, pair in scores.items()]
     return {"zooms": [{"zoom": zoom, **{name: score[name] for name in names}} for zoom, score in flat]} if flat else {}
 
 
-def _flat(full: Quality, masked: Quality) -> dict[str, float | None]:
-    return {**asdict(full), **{name + MASKED: value for name, value in asdict(masked).items()}}
+def _flat(pair: Pair) -> dict[str, float | None]:
+    full, masked = map(asdict, pair)
+    return full | {name + MASKED: value for name, value in masked.items()}
 
 
 def evaluation_csv(document: Mapping[str, Any]) -> str:
@@ -108,10 +109,15 @@ def evaluation_csv(document: Mapping[str, Any]) -> str:
         same |= {name: result[name] for name in ("num_gaussians", "ratio")}
         rows += [same | _more_columns(view) for view in result["views"]]
     columns = dict.fromkeys(CSV_COLUMNS) | dict.fromkeys(name for row in rows for name in row)
+    return csv_text(list(columns), rows)
+
+
+def csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
+    """Write rows as comma-separated values under a line of the columns; other keys are left out."""
     out = io.StringIO()
-    writer = csv.DictWriter(out, list(columns), lineterminator="\n")
+    writer = csv.DictWriter(out, columns, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
-    writer.writerows({key: csv_cell(value) for key, value in row.items()} for row in rows)
+    writer.writerows({name: csv_cell(value) for name, value in row.items()} for row in rows)
     return out.getvalue()
 
 

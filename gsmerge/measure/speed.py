@@ -1,4 +1,4 @@
-"""The costs of drawing scenes: render time, Gaussians blended into a pixel, and frames until merging pays."""
+"""Costs of drawing scenes: render time, Gaussians blended into a pixel, and frames until merging pays."""
 
 from __future__ import annotations
 
@@ -37,21 +37,13 @@ def measure_costs(
     merge_seconds: Mapping[str, float] | None = None,
     threads: int | None = None,
 ) -> dict[str, dict[str, Any]]:
-    """Measure what drawing each scene costs, also with CUDA where it can be used.
+    """Measure the costs of drawing each scene, also with CUDA where it can be used.
 
-    The scenes take turns, so that a machine that slows down slows all of them.
-
-    Args:
-        scenes: The first is the one that the others are compared with.
-        cameras: Views to draw, of which a few are chosen.
-        zooms: Sizes of the pictures, in units of the cameras' own.
-        near: Near plane, world units.
-        merge_seconds: Time that making a scene took, where it is known.
-        threads: Processor threads; None: all.
-
-    Returns:
-        Plain JSON types by name: ``overdraw``, Gaussians blended into a pixel; ``speeds`` by device and zoom: seconds
-        per view, and of all scenes but the first ``speedup`` and ``break_even_frames``, next to ``merge_seconds``.
+    The scenes take turns, so that a machine that slows down slows all of them; the others are compared with the first.
+    A few of the ``cameras`` are drawn, at ``zooms`` times their own size. ``near`` is in world units;
+    ``merge_seconds`` is the time that making a scene took, where it is known; ``threads`` None: all. Returned are
+    plain JSON types by name: ``overdraw``, Gaussians blended into a pixel; ``speeds`` by device and zoom: seconds per
+    view, and of all scenes but the first ``speedup`` and ``break_even_frames``, next to ``merge_seconds``.
     """
     from gsmerge.gpu import cuda_problem
 

@@ -82,7 +82,7 @@ def share_outside(gaussians: Gaussians, cameras: Cameras) -> float:
 
 
 def inside_views(points: np.ndarray, cameras: Cameras) -> Iterator[np.ndarray]:
-    """Tell for each view which points ``[n,3]`` its picture shows, ``[n]`` bool."""
+    """Yield for each view which points ``[n,3]`` its picture shows, ``[n]`` bool."""
     for view in range(len(cameras)):
         (pixels,), (depths,) = project(points, cameras[[view]])
         yield (depths > 0) & ((pixels >= 0) & (pixels < (cameras.width, cameras.height))).all(1)

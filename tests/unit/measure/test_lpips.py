@@ -336,7 +336,7 @@ def true_tree(net: str) -> dict[str, Any]:
     def plain(node: Any) -> Any:
         return {k: plain(v) for k, v in node.items()} if isinstance(node, dict) else node.values
 
-    with perceptual._weights_file(net).open("rb") as stream:
+    with perceptual.require_lpips(net).open("rb") as stream:
         tree: dict[str, Any] = plain(perceptual._ArrayUnpickler(stream).load())
     return tree
 
@@ -358,7 +358,7 @@ def test_distance_with_true_weights_is_the_plain_one(net: str) -> None:
 @installed
 @pytest.mark.parametrize("net", NETS)
 def test_true_linear_layers_are_not_negative(net: str) -> None:
-    layers = perceptual._load(perceptual._weights_file(net), net)
+    layers = perceptual._load(perceptual.require_lpips(net), net)
     compared = [layer.weights for layer in layers if layer.weights is not None]
     assert len(compared) == 5
     assert all(bool((weights >= 0).all()) and bool((weights > 0).any()) for weights in compared)
