@@ -1,4 +1,4 @@
-"""Networks in a file: safetensors, so data alone, with their sizes and their training in the header."""
+"""Networks in a safetensors file: data alone, with their sizes and their training in the header."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Checkpoint:
     training: Mapping[str, Any]  # facts about the training, as the trainer wrote them
 
     def facts(self) -> dict[str, Any]:
-        """Entry of a report."""
+        """Describe the checkpoint for a report."""
         sizes = {"num_parameters": self.networks.num_parameters, "options": asdict(self.networks.options)}
         name = next((name for name, path in IN_PACKAGE.items() if path == self.path), str(self.path))
         head = {"checkpoint": name, "schema": SCHEMA, "gsmerge": self.version}
@@ -44,11 +44,7 @@ class Checkpoint:
 
 
 def save_checkpoint(path: str | PathLike[str], networks: Networks, training: Mapping[str, Any]) -> None:
-    """Write networks and facts about their training; an existing file is replaced.
-
-    Raises:
-        SceneError: If the file cannot be written.
-    """
+    """Write networks and facts about their training in place of an existing file; a SceneError if that fails."""
     header = {"schema": SCHEMA, "gsmerge": __version__, "options": asdict(networks.options), "training": dict(training)}
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in networks.state_dict().items()}
     with atomic_output(path, overwrite=True) as temporary:
@@ -79,22 +75,30 @@ def load_checkpoint(path: str | PathLike[str]) -> Checkpoint:
 def build_networks(
     path: Path, options: Mapping[str, Any], tensors: Mapping[str, Tensor], remedy: str = REMEDY
 ) -> Networks:
-    """Networks from sizes (as of ``asdict``) and weights by name; ``path`` and ``remedy`` are for the error.
+    """Build networks from sizes, see ``NetworkOptions.from_dict``, and weights by name.
 
-    Raises:
-        SceneError: If the sizes are out of range, or the weights do not fit them.
+    A SceneError with ``path`` and ``remedy`` if the sizes are out of range, or the weights do not fit them.
     """
     try:
         networks = Networks(NetworkOptions.from_dict(options))
     except (ValueError, TypeError) as error:
         raise _header_error(path, error, remedy) from error
-    _check_tensors(path, tensors, networks.state_dict(), remedy)
+    expected = networks.state_dict()
+    for name in sorted(tensors.keys() ^ expected.keys()):
+        difference = "a tensor too many" if name in tensors else "none"
+        raise SceneError(path, f"expected the tensors of its networks, found {difference}: {name}", remedy)
+    for name, tensor in tensors.items():
+        if tensor.shape != expected[name].shape or tensor.dtype != torch.float32:
+            have, want = list(tensor.shape), list(expected[name].shape)
+            raise SceneError(path, f"{name}: expected float32 {want}, found {tensor.dtype} {have}", remedy)
+        if not bool(torch.isfinite(tensor).all()):
+            raise SceneError(path, f"{name}: expected finite numbers, found others", remedy)
     networks.load_state_dict(dict(tensors))
     return networks.eval().requires_grad_(False)
 
 
 def _header(path: Path, header: Mapping[str, str]) -> tuple[dict[str, Any], dict[str, Any], str]:
-    """Sizes of the networks, facts about the training, and the version that wrote them."""
+    """Read sizes of the networks, facts about the training, and the version that wrote them."""
     if FORMAT not in header:
         raise SceneError(path, "expected networks of gsmerge, found another safetensors file", REMEDY)
     try:
@@ -115,28 +119,11 @@ def _header_error(path: Path, error: Exception, remedy: str) -> SceneError:
     return SceneError(path, f"expected a header that describes the networks ({reason})", remedy)
 
 
-def _check_tensors(path: Path, tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor], remedy: str) -> None:
-    """Raise unless all tensors are there, with the expected shape and type, and finite."""
-    for name in sorted(tensors.keys() ^ expected.keys()):
-        difference = "a tensor too many" if name in tensors else "none"
-        raise SceneError(path, f"expected the tensors of its networks, found {difference}: {name}", remedy)
-    for name, tensor in tensors.items():
-        if tensor.shape != expected[name].shape or tensor.dtype != torch.float32:
-            have, want = list(tensor.shape), list(expected[name].shape)
-            raise SceneError(path, f"{name}: expected float32 {want}, found {tensor.dtype} {have}", remedy)
-        if not bool(torch.isfinite(tensor).all()):
-            raise SceneError(path, f"{name}: expected finite numbers, found others", remedy)
-
-
 def find_checkpoint(name: str, *, required: bool) -> tuple[Checkpoint | None, list[str]]:
-    """The checkpoint of this name, and notes for the user; None for the analytic stages alone.
+    """Find a checkpoint, and notes for the user; None for the analytic stages alone.
 
-    Args:
-        name: A file, ``"shipped"`` or ``"paper"``: those in the package, or ``"none"``.
-        required: A checkpoint that cannot be used is an error; otherwise a note, and the stages run without.
-
-    Raises:
-        SceneError: If it is required and cannot be used.
+    ``name`` is a file, ``"shipped"`` or ``"paper"`` in the package, or ``"none"``. A checkpoint that cannot be used is
+    a SceneError where it is ``required``, otherwise a note, and the stages run without it.
     """
     if name == "none":
         return None, []

@@ -1,4 +1,4 @@
-"""How well the Gaussians of the other views agree with a Feature Gaussian, without any photo."""
+"""Agreement of the Gaussians of other views with a Feature Gaussian, without any photo, and nearest neighbours."""
 
 from __future__ import annotations
 
@@ -22,19 +22,12 @@ MOST = 64  # points that are looked at for each neighbour that is asked for
 def cross_view_stats(
     means: np.ndarray, sh0: np.ndarray, views: np.ndarray, members: Members, cameras: Cameras
 ) -> np.ndarray:
-    """Agreement with the Gaussian of the pixel that each point projects to in every other view.
+    """Measure agreement with the Gaussian of the pixel that each point projects to in every other view.
 
-    Args:
-        means: ``[g,3]`` points, world.
-        sh0: ``[g,1,3]`` base colours.
-        views: ``[g]`` int64 view that each belongs to, which is left out.
-        members: The scene's Gaussians, one per pixel; for an unaligned scene the statistics are zero.
-        cameras: All views.
-
-    Returns:
-        ``[g,7]`` float32: logarithm of the number of views that see the point; the shares of these views whose surface
-        is at the point, behind it and in front of it; the mean difference of colours and of relative depths; the
-        logarithm of the number of views.
+    Points ``means [g,3]`` with base colours ``sh0 [g,1,3]`` belong to ``views [g]`` int64, which are left out. The
+    statistics ``[g,7]`` float32 are the logarithm of the number of views that see the point; the shares of these views
+    whose surface is at the point, behind it and in front of it; the mean difference of colours and of relative depths;
+    the logarithm of the number of views. For an unaligned scene the first six are zero.
     """
     stats = np.zeros((len(means), NUM_STATS), np.float32)
     stats[:, 6] = np.log(len(cameras)) / 4
@@ -59,15 +52,10 @@ def cross_view_stats(
 
 
 def nearest_of_other_views(means: np.ndarray, views: np.ndarray, count: int) -> np.ndarray:
-    """``[g,count]`` int64 nearest points of other views than the own (paper section 4.4), nearest first.
+    """Find the nearest points of other views, ``[g,count]`` int64, nearest first (paper section 4.4).
 
     -1 where there are fewer, or where ``MOST`` times as many points, most of them of the own view, are nearer: what
-    lies behind those overlaps nothing.
-
-    Args:
-        means: ``[g,3]`` float64, finite.
-        views: ``[g]`` int64; points of views below 0 belong to none, and count as of another one.
-        count: Neighbours of each.
+    lies behind those overlaps nothing. Points are ``means [g,3]`` float64, finite; a view below 0 counts as another.
     """
     num = len(means)
     num_nodes = 4 << (num // LEAF).bit_length()
@@ -81,8 +69,3 @@ def nearest_of_other_views(means: np.ndarray, views: np.ndarray, count: int) -> 
             pieces(num, threads),
         )
     return neighbors
-
-
-def nearest_points(means: np.ndarray, count: int) -> np.ndarray:
-    """``[n,count]`` int64 nearest other points of ``means [n,3]``, nearest first; -1 where there are fewer."""
-    return nearest_of_other_views(means, np.full(len(means), -1, np.int64), count)

@@ -26,7 +26,7 @@ OUTPUTS = ("residual", "absolute")
 
 
 def mlp(*widths: int) -> nn.Sequential:
-    """Linear layers with GELU between them."""
+    """Stack linear layers with GELU between them."""
     layers: list[nn.Module] = []
     for before, after in pairwise(widths):
         layers += [nn.Linear(before, after), nn.GELU()]
@@ -34,7 +34,7 @@ def mlp(*widths: int) -> nn.Sequential:
 
 
 def zero_init(layer: nn.Linear) -> nn.Linear:
-    """The layer with weights and bias zero: until trained, it corrects nothing."""
+    """Set a layer's weights and bias to zero: until trained, it corrects nothing."""
     nn.init.zeros_(layer.weight)
     nn.init.zeros_(layer.bias)
     return layer
@@ -49,7 +49,7 @@ class Attention(nn.Module):
         self.query, self.pair, self.out = nn.Linear(width, width), nn.Linear(width, 2 * width), nn.Linear(width, width)
 
     def forward(self, x: Tensor, context: Tensor, mask: Tensor) -> Tensor:
-        """``[b,q,w]``."""
+        """Return the mixed values ``[b,q,w]``."""
         key, value = self.pair(context).chunk(2, -1)
         split = [t.unflatten(-1, (self.heads, -1)).transpose(1, 2) for t in (self.query(x), key, value)]
         mixed = scaled_dot_product_attention(split[0], split[1], split[2], attn_mask=mask[:, None, None])
@@ -69,7 +69,7 @@ class AttentionBlock(nn.Module):
         self.attention, self.mlp = Attention(width, heads), mlp(width, 2 * width, width)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """``[b,n,w]`` tokens after attending to each other."""
+        """Return the tokens ``[b,n,w]`` after attending to each other."""
         context = self.before(x)
         if self.first:
             x = x[:, :1]
@@ -78,7 +78,7 @@ class AttentionBlock(nn.Module):
 
 
 class Pooling(nn.Module):
-    """One token for a set, from a learned query (paper fig. architecture: PMA)."""
+    """Reduction of a set to one token by a learned query (paper fig. architecture: PMA)."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -87,14 +87,14 @@ class Pooling(nn.Module):
         self.attention, self.mlp = Attention(width, heads), mlp(width, 2 * width, width)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """``[b,w]``."""
+        """Return one token for each set, ``[b,w]``."""
         query = self.seed.expand(len(x), -1, -1)
         pooled = query + self.attention(query, self.before(x), mask)
         return (pooled + self.mlp(self.between(pooled)))[:, 0]
 
 
 class SetNetwork(nn.Module):
-    """Common to encoder and merger: MLP of the tokens, attention blocks, pooling, MLP with the group's numbers."""
+    """Part that encoder and merger share: MLP of tokens, attention blocks, pooling, MLP with the group's numbers."""
 
     def __init__(self, token: int, out: int, options: NetworkOptions) -> None:
         super().__init__()
@@ -104,7 +104,7 @@ class SetNetwork(nn.Module):
         self.pool, self.join = Pooling(width, heads), mlp(width + GROUP, 2 * width, out)
 
     def forward(self, tokens: Tensor, mask: Tensor, group: Tensor) -> Tensor:
-        """``[b,out]`` of ``tokens [b,n,token]``, ``mask [b,n]`` and ``group [b,GROUP]``."""
+        """Compute ``[b,out]`` from ``tokens [b,n,token]``, ``mask [b,n]`` and ``group [b,GROUP]``."""
         x = self.embed(tokens)
         for block in self.blocks:
             x = block(x, mask)
@@ -112,7 +112,7 @@ class SetNetwork(nn.Module):
 
 
 class Encoder(nn.Module):
-    """Members of a group -> its latent and a shift of its mean."""
+    """Network from the members of a group to its latent and a shift of its mean."""
 
     def __init__(self, options: NetworkOptions) -> None:
         super().__init__()
@@ -120,13 +120,13 @@ class Encoder(nn.Module):
         self.latent, self.shift = nn.Linear(options.width, options.latent), zero_init(nn.Linear(options.width, 3))
 
     def forward(self, tokens: Tensor, mask: Tensor, group: Tensor) -> tuple[Tensor, Tensor]:
-        """Raw latent ``[b,latent]`` and raw shift ``[b,3]``."""
+        """Return raw latent ``[b,latent]`` and raw shift ``[b,3]``."""
         hidden = nn.functional.gelu(self.set(tokens, mask, group))
         return self.latent(hidden), self.shift(hidden)
 
 
 class Head(nn.Module):
-    """A Feature Gaussian and its K analytic children -> corrections of the children."""
+    """Network from a Feature Gaussian and its K analytic children to corrections of the children."""
 
     def __init__(self, slots: int, options: NetworkOptions) -> None:
         super().__init__()
@@ -137,13 +137,13 @@ class Head(nn.Module):
         self.out = zero_init(nn.Linear(width, RESIDUAL))
 
     def forward(self, latents: Tensor, group: Tensor, children: Tensor, mask: Tensor) -> Tensor:
-        """Raw corrections ``[b,slots,RESIDUAL]`` of ``children [b,slots,PART]`` with ``mask [b,slots]``."""
+        """Return raw corrections ``[b,slots,RESIDUAL]`` of ``children [b,slots,PART]`` with ``mask [b,slots]``."""
         seeds = self.seeds(torch.cat([latents, group], -1)).unflatten(-1, (self.slots, -1))
         return self.out(self.norm(self.block(seeds + self.child(children), mask)))
 
 
 class Merger(nn.Module):
-    """The Feature Gaussians of a cluster -> corrections of the pooled one and of its latent."""
+    """Network from the Feature Gaussians of a cluster to corrections of the pooled one and of its latent."""
 
     def __init__(self, options: NetworkOptions) -> None:
         super().__init__()
@@ -151,12 +151,12 @@ class Merger(nn.Module):
         self.out = zero_init(nn.Linear(options.width, RESIDUAL + options.latent))
 
     def forward(self, tokens: Tensor, mask: Tensor, group: Tensor) -> Tensor:
-        """Raw corrections ``[b,RESIDUAL+latent]``."""
+        """Return raw corrections ``[b,RESIDUAL+latent]``."""
         return self.out(nn.functional.gelu(self.set(tokens, mask, group)))
 
 
 class Refiner(nn.Module):
-    """A Feature Gaussian and its nearest neighbours -> corrections of the Feature Gaussian and of its latent."""
+    """Network from a Feature Gaussian and its nearest neighbours to corrections of it and of its latent."""
 
     def __init__(self, options: NetworkOptions) -> None:
         super().__init__()
@@ -169,7 +169,7 @@ class Refiner(nn.Module):
         self.out = zero_init(nn.Linear(width, RESIDUAL + options.latent))
 
     def forward(self, tokens: Tensor, mask: Tensor, group: Tensor) -> Tensor:
-        """Raw corrections ``[b,RESIDUAL+latent]``; the first token is the Feature Gaussian itself."""
+        """Return raw corrections ``[b,RESIDUAL+latent]``; the first token is the Feature Gaussian itself."""
         x = self.embed(tokens)
         for block in self.blocks:
             x = block(x, mask)
@@ -178,7 +178,7 @@ class Refiner(nn.Module):
 
 
 class Networks(nn.Module):
-    """All networks of a checkpoint; those that the options leave out are None."""
+    """The networks of a checkpoint, None for each that the options leave out."""
 
     def __init__(self, options: NetworkOptions | None = None) -> None:
         super().__init__()
@@ -190,18 +190,13 @@ class Networks(nn.Module):
 
     @property
     def max_children(self) -> int:
-        """Most children of a group that the heads correct; many in two halves, which absolute outputs do not know."""
+        """Largest number of children that the heads correct; five or more in two halves, not for absolute outputs."""
         return SLOTS[-1] if self.options.outputs == "absolute" else 2 * SLOTS[-1]
 
     @property
     def num_parameters(self) -> int:
-        """Weights in the checkpoint."""
+        """Number of weights in the checkpoint."""
         return sum(p.numel() for p in self.parameters())
-
-
-def _expect_count(name: str, value: Any, maximum: int) -> None:
-    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= maximum:
-        raise ValueError(f"{name}: expected a whole number from 1 to {maximum}, got {value!r}")
 
 
 @dataclass(frozen=True)
@@ -250,7 +245,9 @@ class NetworkOptions:
             raise ValueError(f"outputs: expected {' or '.join(OUTPUTS)}, got {self.outputs!r}")
         limits = {"width": 512, "heads": 16, "blocks": 8, "refine_blocks": 8, "latent": 256, "members": 256}
         for name, limit in (limits | {"neighbors": 64}).items():
-            _expect_count(name, getattr(self, name), limit)
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= limit:
+                raise ValueError(f"{name}: expected a whole number from 1 to {limit}, got {value!r}")
         for name in ("encoder", "merger", "refiner"):
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"{name}: expected true or false, got {getattr(self, name)!r}")
@@ -259,11 +256,7 @@ class NetworkOptions:
 
     @staticmethod
     def from_dict(values: Mapping[str, Any]) -> NetworkOptions:
-        """The options that ``dataclasses.asdict`` gave.
-
-        Raises:
-            ValueError: If a name is unknown or a value out of range.
-        """
+        """Read options from what ``dataclasses.asdict`` gave; a ValueError if a name or a value is impossible."""
         unknown = sorted(values.keys() - {f.name for f in fields(NetworkOptions)})
         bounds = values.get("bounds", {})
         if not isinstance(bounds, Mapping):

@@ -22,12 +22,6 @@ ROWS = 65_536  # that are moved at once: their float64 matrices are ten times as
 HALF = 0.5  # share of the bounds that each stage before the decoder may use
 
 
-def expect_number(name: str, value: object, maximum: float) -> None:
-    """Raise ValueError where a setting is no number from 0 to ``maximum``."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= maximum:
-        raise ValueError(f"{name}: expected a number from 0 to {maximum:g}, got {value!r}")
-
-
 @dataclass(frozen=True)
 class Bounds:
     """Largest correction that the decoder may make, 0: none; merger, refiner and encoder may each make half of it.
@@ -51,42 +45,44 @@ class Bounds:
 
     def __post_init__(self) -> None:
         for f in fields(self):
-            expect_number(f.name, getattr(self, f.name), 8.0)
+            value = getattr(self, f.name)
+            if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= 8:
+                raise ValueError(f"{f.name}: expected a number from 0 to 8, got {value!r}")
 
 
 WIDE = Bounds(mean=4.0, size=6.0, turn=3.2, logit=8.0, color=0.75)  # of absolute outputs
 
 
 def residual_limits(bounds: Bounds) -> Tensor:
-    """``[13]`` largest correction of every column."""
+    """Return the largest correction of every column, ``[13]``."""
     b = bounds
     return torch.tensor([b.mean] * 3 + [b.size] * 3 + [b.turn] * 3 + [b.logit] + [b.color] * 3)
 
 
 def bound_residuals(raw: Tensor, bounds: Bounds, share: float = 1.0) -> Tensor:
-    """Corrections ``[...,13]`` of raw outputs, always within ``share`` of the bounds."""
+    """Convert raw outputs to corrections ``[...,13]`` within ``share`` of the bounds."""
     return share * residual_limits(bounds).to(raw) * tanh_bounded(raw)
 
 
 def tanh_bounded(raw: Tensor) -> Tensor:
-    """Tanh of raw outputs, within -1 to 1; NaN becomes 0."""
+    """Compute the tanh of raw outputs, with 0 for NaN."""
     return torch.tanh(raw.nan_to_num())
 
 
 def gaussian_sizes(scales: Tensor) -> Tensor:
-    """``[n]`` sizes of Gaussians: geometric mean of the two largest of ``scales [n,3]``."""
+    """Compute the sizes ``[n]`` of Gaussians: geometric mean of the two largest of ``scales [n,3]``."""
     top = scales.sort(-1).values
     return (top[..., 1] * top[..., 2]).sqrt()
 
 
 def quat_to_rotmat(quats: Tensor) -> Tensor:
-    """:func:`gsmerge.geometry.quat_to_rotmat` for tensors, differentiable."""
+    """Convert quaternions ``[...,4]`` to rotations ``[...,3,3]``, differentiable."""
     entries = rotation_entries(*normalize(quats, dim=-1).unbind(-1))
     return torch.stack(entries, -1).reshape(*quats.shape[:-1], 3, 3)
 
 
 def rotation_matrices(vectors: Tensor) -> Tensor:
-    """Rotations ``[n,3,3]`` of rotation vectors ``[n,3]`` (Rodrigues); exactly the identity for zero."""
+    """Convert rotation vectors ``[n,3]`` to rotations ``[n,3,3]`` (Rodrigues); zero to exactly the identity."""
     x, y, z = vectors.unbind(-1)
     zero = torch.zeros_like(x)
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
@@ -95,7 +91,7 @@ def rotation_matrices(vectors: Tensor) -> Tensor:
 
 
 def rotate_quats(vectors: Tensor, quats: Tensor) -> Tensor:
-    """Quaternions ``[n,4]`` rotated by rotation vectors ``[n,3]`` in the world."""
+    """Rotate quaternions ``[n,4]`` by rotation vectors ``[n,3]`` in the world."""
     half = vectors.norm(dim=-1, keepdim=True).clamp_min(1e-12) / 2
     w, (x, y, z) = half.cos()[:, 0], (half.sin() / (2 * half) * vectors).unbind(-1)
     a, b, c, d = quats.unbind(-1)
@@ -106,18 +102,12 @@ def rotate_quats(vectors: Tensor, quats: Tensor) -> Tensor:
 
 
 def rotate_vectors(frames: Tensor, vectors: Tensor) -> Tensor:
-    """Vectors ``[n,3]`` given in frames ``[n,3,3]``, in the world."""
+    """Convert vectors ``[n,3]`` from frames ``[n,3,3]`` to the world."""
     return (frames @ vectors[:, :, None])[:, :, 0]
 
 
 def move_gaussians(gaussians: Gaussians, residuals: Tensor, frames: Tensor) -> Gaussians:
-    """Gaussians with corrections applied.
-
-    Args:
-        gaussians: n Gaussians, tensors.
-        residuals: ``[n,13]``.
-        frames: ``[n,3,3]`` axes of each Gaussian's group as columns, world.
-    """
+    """Apply corrections ``[n,13]`` to n Gaussians, tensors, in frames ``[n,3,3]`` with axes as columns, world."""
     g = gaussians
     odds, factor = g.opacities, torch.exp(residuals[:, LOGIT])
     return replace(
@@ -131,13 +121,10 @@ def move_gaussians(gaussians: Gaussians, residuals: Tensor, frames: Tensor) -> G
 
 
 def move_features(features: FeatureGaussians, base: Gaussians, residuals: Tensor, frames: Tensor) -> FeatureGaussians:
-    """Feature Gaussians with corrections applied; opacity depends only on its own column, not on the scales.
+    """Apply corrections ``[g,13]`` to Feature Gaussians; opacity depends only on its own column, not on the scales.
 
-    Args:
-        features: g Feature Gaussians.
-        base: The Gaussian of each as tensors, see :func:`gsmerge.moments.feature_to_gaussians`.
-        residuals: ``[g,13]``, whose gradients end here; the tenth is added to the logarithm of the optical depth.
-        frames: ``[g,3,3]`` axes of each group as columns, world.
+    ``base`` has the Gaussian of each as tensors, ``frames [g,3,3]`` the axes of each group as columns, world. Gradients
+    end here. The tenth correction is added to the logarithm of the integrated optical depth.
     """
     starts = range(0, max(1, len(features)), ROWS)
     parts = [_move_rows(features, base, residuals, frames, slice(first, first + ROWS)) for first in starts]
@@ -147,7 +134,7 @@ def move_features(features: FeatureGaussians, base: Gaussians, residuals: Tensor
 def _move_rows(
     features: FeatureGaussians, base: Gaussians, residuals: Tensor, frames: Tensor, rows: slice
 ) -> dict[str, np.ndarray]:
-    """The columns of some rows that :func:`move_features` changes."""
+    """Compute the columns of some rows that :func:`move_features` changes."""
     names = ("means", "covars", "masses", "extinctions", "sh0")
     f = {name: as_tensor(getattr(features, name)[rows]) for name in names}
     base, residuals = base[rows], residuals[rows]

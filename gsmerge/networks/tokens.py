@@ -28,8 +28,9 @@ TOKENS = 4096  # tokens of one table: a megabyte of activations, which stay in a
 
 @dataclass(frozen=True, eq=False)
 class GroupFeatures:
-    """Feature Gaussians as the networks read them: tensors."""
+    """Feature Gaussians as tensors that the networks read."""
 
+    features: FeatureGaussians  # g of them
     base: Gaussians  # g Gaussians without corrections
     frames: Tensor  # [g,3,3] axes (right, down, away) as columns, world
     sizes: Tensor  # [g] geometric mean of the two largest scales, world units
@@ -39,27 +40,28 @@ class GroupFeatures:
 
 
 def compute_group_features(features: FeatureGaussians, members: Members, cameras: Cameras) -> GroupFeatures:
-    """Inputs of the networks for Feature Gaussians."""
+    """Compute the networks' inputs for Feature Gaussians."""
     views = _choose_views(features, members, cameras)
     bare = make_group_features(features, views, np.zeros((len(features), 0), np.float32), cameras)
-    tangents = _image_tangents(bare.base.means, bare.views, cameras.to("cpu"))
+    viewmats = cameras.to("cpu").viewmats.float()[bare.views]
+    places = (viewmats[:, :3, :3] @ bare.base.means[:, :, None])[:, :, 0] + viewmats[:, :3, 3]
+    tangents = (places[:, :2] / places[:, 2:].clamp_min(1e-6)).clamp(-3, 3)  # of the angles to the view's axis
     stats = as_tensor(cross_view_stats(features.means, features.sh0, views, members, cameras))
-    return replace(bare, group=torch.cat([_group_numbers(features, bare), tangents, stats], 1).nan_to_num())
+    return replace(bare, group=torch.cat([_group_numbers(bare), tangents, stats], 1).nan_to_num())
 
 
 def make_group_features(features: FeatureGaussians, views: Array, group: Array, cameras: Cameras) -> GroupFeatures:
-    """Inputs from known ``views [g]`` and numbers ``group [g,GROUP]``, without the scene's members."""
+    """Make the networks' inputs from known ``views [g]`` and numbers ``group [g,GROUP]``, without the members."""
     base, views = feature_to_gaussians(features).to("cpu"), as_tensor(views)
     sizes = gaussian_sizes(base.scales).clamp_min(TINY)
     footprints = as_tensor(features.footprints).clamp_min(TINY)
-    return GroupFeatures(
-        base, _ray_frames(base.means, views, cameras.to("cpu")), sizes, footprints, views, as_tensor(group)
-    )
+    frames = _ray_frames(base.means, views, cameras.to("cpu"))
+    return GroupFeatures(features, base, frames, sizes, footprints, views, as_tensor(group))
 
 
-def _group_numbers(features: FeatureGaussians, bare: GroupFeatures) -> Tensor:
-    """``[g,17]``: scales, opacity, mass, optical depth, members, colour, covariance."""
-    base, frames, sizes, footprints = bare.base, bare.frames, bare.sizes, bare.footprints
+def _group_numbers(bare: GroupFeatures) -> Tensor:
+    """Describe groups by ``[g,17]`` scales, opacity, mass, optical depth, members, colour and covariance."""
+    features, base, frames, sizes, footprints = bare.features, bare.base, bare.frames, bare.sizes, bare.footprints
     names = ("covars", "masses", "extinctions", "weights")
     covars, masses, extinctions, weights = (as_tensor(getattr(features, name)) for name in names)
     num_members = as_tensor(np.diff(features.starts)).float()
@@ -78,12 +80,12 @@ def _group_numbers(features: FeatureGaussians, bare: GroupFeatures) -> Tensor:
 
 
 def _logits(opacities: Tensor) -> Tensor:
-    """Logits of opacities, clamped to finite bounds, divided by 3."""
+    """Compute logits of opacities, clamped to finite bounds, divided by 3."""
     return torch.logit(opacities.clamp(1e-4, 1 - 1e-4)) / 3
 
 
 def _choose_views(features: FeatureGaussians, members: Members, cameras: Cameras) -> np.ndarray:
-    """``[g]`` int64 view of each Feature Gaussian: its own; of merged ones, the view that gave it most opacity."""
+    """Choose the view of each Feature Gaussian, ``[g]`` int64: its own, or if merged the one with most opacity."""
     views = features.views.copy()
     merged = np.flatnonzero(views < 0)
     if len(merged) == 0:
@@ -98,7 +100,7 @@ def _choose_views(features: FeatureGaussians, members: Members, cameras: Cameras
 
 
 def _ray_frames(means: Tensor, views: Tensor, cameras: Cameras) -> Tensor:
-    """``[n,3,3]`` frames of points ``[n,3]`` seen in ``views [n]``: image right, image down and the ray as columns."""
+    """Compute frames ``[n,3,3]`` of points in ``views [n]``: image right, image down and the ray as columns."""
     rotations, centres = cameras.viewmats[:, :3, :3].float()[views], cameras.centres.float()[views]
     normalize = torch.nn.functional.normalize
     away = means - centres
@@ -108,15 +110,8 @@ def _ray_frames(means: Tensor, views: Tensor, cameras: Cameras) -> Tensor:
     return torch.stack([right, torch.linalg.cross(away, right), away], 2)
 
 
-def _image_tangents(means: Tensor, views: Tensor, cameras: Cameras) -> Tensor:
-    """``[n,2]`` tangents of the angles to the axis of each point's view, clamped to 3."""
-    viewmats = cameras.viewmats.float()[views]
-    camera = (viewmats[:, :3, :3] @ means[:, :, None])[:, :, 0] + viewmats[:, :3, 3]
-    return (camera[:, :2] / camera[:, 2:].clamp_min(1e-6)).clamp(-3, 3)
-
-
 def part_tokens(parts: Gaussians, group_features: GroupFeatures, owners: Tensor) -> Tensor:
-    """``[n,PART]``: n Gaussians relative to the Feature Gaussians ``owners [n]`` that they belong to."""
+    """Describe n Gaussians relative to the Feature Gaussians ``owners [n]`` that they belong to, ``[n,PART]``."""
     g = group_features
     frames = g.frames[owners].transpose(1, 2)
     normals = quat_to_rotmat(parts.quats)[torch.arange(len(parts)), :, parts.scales.argmin(1)]
@@ -135,7 +130,7 @@ def part_tokens(parts: Gaussians, group_features: GroupFeatures, owners: Tensor)
 
 
 def member_tokens(members: Members, ids: np.ndarray, group_features: GroupFeatures, owners: Tensor) -> Tensor:
-    """``[n,MEMBER]``: rows ``ids [n]`` of the members, relative to their Feature Gaussians ``owners [n]``."""
+    """Describe members ``ids [n]`` relative to their Feature Gaussians ``owners [n]``, ``[n,MEMBER]``."""
     columns = (members.means, members.quats, members.scales, members.opacities, members.sh0, members.shN[:, :0])
     picked = Gaussians(*(torch.from_numpy(column[ids]) for column in columns))
     tokens = part_tokens(picked, group_features, owners)
@@ -144,13 +139,9 @@ def member_tokens(members: Members, ids: np.ndarray, group_features: GroupFeatur
 
 
 def split_tables(sizes: np.ndarray, max_width: int) -> Iterator[tuple[np.ndarray, int]]:
-    """Tables of groups of similar size: rows of ``sizes`` and the table's width, a power of two.
+    """Split groups of ``sizes [g]`` into tables of similar size: rows of ``sizes``, and a width, a power of two.
 
-    Which groups share a table depends only on the sizes.
-
-    Args:
-        sizes: ``[g]`` members of each group, at least 1.
-        max_width: Width of the widest table; larger groups are sampled.
+    Which groups share a table depends only on the sizes. Groups larger than ``max_width`` are sampled.
     """
     widths = np.minimum(1 << np.ceil(np.log2(np.maximum(sizes, 1))).astype(np.int64), max_width)
     for width in np.unique(widths):
@@ -161,26 +152,19 @@ def split_tables(sizes: np.ndarray, max_width: int) -> Iterator[tuple[np.ndarray
 
 
 def group_rows(begins: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Positions of all members of groups that begin at ``begins [g]``, group by group, and the group of each."""
+    """Find the positions of all members of groups that begin at ``begins [g]``, and the group of each."""
     owners = np.repeat(np.arange(len(sizes)), sizes)
     first = np.cumsum(sizes) - sizes
     return np.arange(len(owners)) - first[owners] + begins[owners], owners
 
 
 def sample_members(keys: np.ndarray, sizes: np.ndarray, width: int, seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """At most ``width`` members of every group, sorted by a key, whatever their order in the input.
+    """Choose at most ``width`` members of every group, sorted by their ``keys [m]``, whatever their order.
 
-    A group that is too large is cut along its key into ``width`` runs as equal as possible, and one member of each is
-    taken at random: the sample covers the group (paper supplement, encoder compute).
-
-    Args:
-        keys: ``[m]`` key of each member, group by group.
-        sizes: ``[g]`` members of each group.
-        width: Columns of the table.
-        seeds: ``[g]`` uint64 seed of each group's random numbers.
-
-    Returns:
-        ``[g,width]`` positions into ``keys``, and a mask of the valid ones; the others repeat the group's first.
+    Keys come group by group, ``sizes [g]`` of each. A group that is too large is cut along its key into ``width`` runs
+    as equal as possible, and one member of each is taken at random from ``seeds [g]`` uint64: the sample covers the
+    group (paper supplement, encoder compute). Returned are ``[g,width]`` positions into ``keys``, and a mask of the
+    valid ones; the others repeat the group's first.
     """
     first = np.cumsum(sizes) - sizes
     order = np.lexsort((keys, np.repeat(np.arange(len(sizes)), sizes)))
@@ -195,12 +179,12 @@ def sample_members(keys: np.ndarray, sizes: np.ndarray, width: int, seeds: np.nd
 
 
 def hash_uniform(seeds: np.ndarray, salts: np.ndarray) -> np.ndarray:
-    """Numbers in [0, 1) that depend only on seeds and salts (splitmix64, Steele et al. 2014)."""
+    """Draw numbers in [0, 1) that depend only on seeds and salts (splitmix64, Steele et al. 2014)."""
     return (hash_pairs(seeds, salts) >> np.uint64(11)).astype(np.float64) * 2.0**-53
 
 
 def hash_pairs(seeds: np.ndarray, salts: np.ndarray) -> np.ndarray:
-    """uint64 hashes of pairs of uint64."""
+    """Hash pairs of uint64 to uint64."""
     x = seeds + (salts + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -208,7 +192,7 @@ def hash_pairs(seeds: np.ndarray, salts: np.ndarray) -> np.ndarray:
 
 
 def point_seeds(points: np.ndarray, seed: int) -> np.ndarray:
-    """``[n]`` uint64 that depend on float32 positions ``[n,3]`` and a seed, not on the order of the points."""
+    """Hash float32 positions ``[n,3]`` with a seed to ``[n]`` uint64, whatever the order of the points."""
     bits = np.ascontiguousarray(points, np.float32).view(np.uint32).astype(np.uint64)
     hashes = np.full(len(points), seed & (2**64 - 1), np.uint64)
     for column in bits.T:

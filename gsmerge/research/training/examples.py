@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ import numpy as np
 from gsmerge.budget import share_text
 from gsmerge.errors import SceneError
 from gsmerge.geometry import lower_median
-from gsmerge.io import SceneLoad, load_scene, read_held_out
+from gsmerge.io import load_scene, read_held_out
 from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.options import CompactOptions
 from gsmerge.render.photos import Photos, blank_photos, scene_pictures
@@ -33,7 +34,7 @@ from gsmerge.stages.encode import encode
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge, take
 from gsmerge.stages.superpixels import segment
-from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches, Views
+from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,11 +54,11 @@ class Example:
     targets: Mapping[int, Targets]  # of the fit, by number of children K; empty without a fit
 
     def mask(self, photo: int) -> np.ndarray:
-        """``[h,w]`` bool: pixels of a photo that the views cover."""
+        """Mark the pixels ``[h,w]`` of a photo that the views cover."""
         return covered_pixels(self.covers[:, photo])
 
     def photo_ids(self, *, novel: bool) -> list[int]:
-        """Photos with a pixel that the views cover: their own, or novel ones."""
+        """List the photos with a pixel that the views cover: their own, or novel ones."""
         span = range(len(self.cameras), len(self.photos)) if novel else range(len(self.cameras))
         return [photo for photo in span if self.mask(photo).any()]
 
@@ -65,20 +66,11 @@ class Example:
 def make_examples(
     path: Path, options: TrainOptions, progress: Progress | None = None
 ) -> Iterator[tuple[str, Callable[[], Example]]]:
-    """A scene folder or ``.ply`` with each number of views and at every density, see :func:`make_example`.
+    """Yield a short name, unique in the scene, and a maker of each example, see :func:`make_example`.
 
-    Photos of a folder ``targets`` next to the ``.ply``, with their cameras, are novel views.
-
-    Args:
-        path: The scene.
-        options: Numbers of views, densities, matching, steps of the fit, seed.
-        progress: Called with (step, steps) of the fits.
-
-    Yields:
-        A short name of each example, unique in the scene, and what makes it.
-
-    Raises:
-        SceneError: If the scene cannot be read, is not one Gaussian per pixel, has no photos, or cannot be fitted.
+    There is one for each number of views and every density of the ``options``. Photos of a folder ``targets`` next to
+    the ``.ply``, with their cameras, are novel views. A SceneError if the scene cannot be read, is not one Gaussian per
+    pixel, has no photos, or cannot be fitted.
     """
     load = load_scene(path)
     scene, ply = load.scene, load.files.ply
@@ -86,29 +78,19 @@ def make_examples(
         raise SceneError(ply, "expected one Gaussian per pixel to learn from, found an unaligned scene")
     if scene.images is None:
         raise SceneError(ply, "expected photos to learn from, found none", "put them next to it in images/")
-    held_out = _read_held_out(load)
+    targets = ply.parent / "targets"
+    held_out = read_held_out(load, targets) if targets.is_dir() else None
     for ids in view_subsets(len(scene), options.example_views):
         training = make_training_scene(scene, ids, held_out)
         for density in options.densities:
-
-            def make(training: TrainingScene = training, density: float = density) -> Example:
-                return make_example(training, options, density, scene_name(path), progress)
-
+            make = partial(make_example, training, options, density, scene_name(path), progress)
             yield f"{len(ids)}-views-{share_text(density).rstrip('%')}", make
 
 
 def scene_name(path: Path) -> str:
-    """The folder's name, with that of the file if the path is a file."""
+    """Name a scene as its folder, with the name of the file if the path is a file."""
     path = path.absolute()
     return f"{path.parent.name}-{path.stem}" if path.is_file() else path.name
-
-
-def _read_held_out(load: SceneLoad) -> Views | None:
-    """Photos and cameras in the folder ``targets`` next to the scene, if there is one."""
-    folder = load.files.ply.parent / "targets"
-    if not folder.is_dir():
-        return None
-    return read_held_out(load, folder)
 
 
 def make_example(
@@ -116,23 +98,19 @@ def make_example(
 ) -> Example:
     """Segment and encode a scene without networks; where a loss uses a fit, match, merge and fit it too.
 
-    Args:
-        training: The scene and the photos.
-        options: Segmentation, levels, matching, steps of the fit, size of the photos, seed.
-        density: Superpixels per pixel.
-        name: Of the scene.
-        progress: Called with (step, steps) of the fit.
-
-    Raises:
-        SceneError: If the fit does not improve held-out parts of the photos.
+    ``density`` is in superpixels per pixel; ``progress`` is called with (step, steps) of the fit. A SceneError if the
+    fit does not improve held-out parts of the photos.
     """
     changes = {"superpixels": share_text(density), "segmentation": options.segmentation, "seed": options.seed}
     settings, scene, members = CompactOptions().with_settings(changes), training.scene, training.members
     features = encode(scene, members, segment(scene_pictures(scene), settings.segment))
     level = options.photo_level(scene.cameras.width, scene.cameras.height)
     images = (training.photos(level).images.clip(0, 1) * 255).round().astype(np.uint8)
+    focals = np.sqrt(np.abs(scene.cameras.Ks[:, 0, 0] * scene.cameras.Ks[:, 1, 1]))
+    # a footprint is a pixel in a Feature Gaussian's own view
+    unit = float(lower_median(features.footprints * focals.astype(np.float64)[features.views]))
     example = Example(
-        name, _median_depth(features, scene.cameras), members, scene.cameras, features, feature_to_gaussians(features),
+        name, unit, members, scene.cameras, features, feature_to_gaussians(features),
         blank_photos(training.cameras, level), images, coverage(training, level), None, {},
     )  # fmt: skip
     if not options.uses_fit:
@@ -143,19 +121,8 @@ def make_example(
     )
 
 
-def _median_depth(features: FeatureGaussians, cameras: Cameras) -> float:
-    """Of Feature Gaussians in their own views; a footprint is a pixel there."""
-    focals = np.sqrt(np.abs(cameras.Ks[:, 0, 0] * cameras.Ks[:, 1, 1]))
-    return float(lower_median(features.footprints * focals.astype(np.float64)[features.views]))
-
-
 def select_views(example: Example, ids: Sequence[int]) -> Example:
-    """Some views of an example without a fit; the photos of the others are novel ones.
-
-    Args:
-        example: Of v views.
-        ids: Ascending, within v.
-    """
+    """Keep the views ``ids``, ascending, of an example without a fit; the photos of the others become novel ones."""
     views, pixels = len(example.cameras), example.cameras.width * example.cameras.height
     if len(ids) == views:
         return example
@@ -181,7 +148,7 @@ def select_views(example: Example, ids: Sequence[int]) -> Example:
 
 
 def draw_views(example: Example, options: TrainOptions, rng: np.random.Generator) -> Example:
-    """A random subset of the views, see ``options.random_views`` (paper supplement C); the example without it."""
+    """Draw a random subset of the views, see ``options.random_views`` (paper supplement C); the example without it."""
     if not options.random_views:
         return example
     least, most = (min(count, len(example.cameras)) for count in options.random_views)

@@ -35,7 +35,7 @@ from gsmerge.research.training.processes import ALONE, Processes
 from gsmerge.research.training.shards import Shard, read_targets
 from gsmerge.research.training.stream import ExampleStreams, open_streams
 from gsmerge.research.training.train_options import TrainOptions
-from gsmerge.research.training.validation import Row, validate
+from gsmerge.research.training.validation import Row, TrainingRun, validate
 from gsmerge.research.training.windows import sample_crop, sample_window
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.views import even_views
@@ -45,32 +45,23 @@ FORMAT = "gsmerge-training"
 REMEDY = "choose another --output, or remove it to start again"
 
 
-@dataclass(frozen=True)
-class TrainingRun:
-    """What every step of a run reads."""
-
-    options: TrainOptions
-    scales: Mapping[int, Tensor]  # of the targets of each K; empty where no loss uses a fit
-    processes: Processes
-
-
 @dataclass(frozen=True, eq=False)
 class TrainingState:
-    """Networks, the running mean of their weights, and the optimiser's moments: everything that a step changes."""
+    """Everything that a step changes: networks, running mean of their weights, and the optimiser's moments."""
 
     networks: Networks
     smooth: Networks
     optimizer: torch.optim.Optimizer
 
     def pairs(self) -> Iterator[tuple[str, Parameter, Parameter]]:
-        """Name, parameter, and its running mean."""
+        """Yield name, parameter, and its running mean."""
         for (name, parameter), mean in zip(self.networks.named_parameters(), self.smooth.parameters(), strict=True):
             yield name, parameter, mean
 
 
 @dataclass(frozen=True)
 class TrainResult:
-    """The files and figures of a run."""
+    """Files and figures of a run."""
 
     best: Path  # checkpoint with the highest PSNR of validation; before renders are compared, with the least loss
     last: Path  # checkpoint of the last step
@@ -103,10 +94,10 @@ def train(
             of each validation scene.
         options: Settings.
         threads: Threads to use; None: all processors. The result does not depend on it.
-        device: Where the networks run: ``"cpu"``, ``"cuda"``, or ``"auto"``: CUDA if torch finds it. Windows are
-            rendered on the CPU. On CUDA a run repeats up to rounding, not to the bit.
-        processes: Among which the crops of every step are shared.
-        progress: Called after every step.
+        device: Where the networks run, see :func:`choose_device`. Windows are rendered on the CPU. On CUDA a run
+            repeats up to rounding, not to the bit.
+        processes: Processes that share the crops of every step.
+        progress: Called with (step, steps, loss) after every step.
 
     Raises:
         ValueError: If there are no examples, the crops of a step cannot be shared evenly, or torch finds no CUDA
@@ -129,10 +120,9 @@ def train(
 
 
 def choose_device(name: str) -> str:
-    """The device that ``"cpu"``, ``"cuda"`` or ``"auto"`` means on this machine.
+    """Choose the device that ``"cpu"``, ``"cuda"`` or ``"auto"`` (CUDA if torch finds it) means on this machine.
 
-    Raises:
-        ValueError: If the name is unknown, or is "cuda" and torch finds no CUDA device.
+    A ValueError if the name is unknown, or is "cuda" and torch finds no CUDA device.
     """
     if name not in ("cpu", "cuda", "auto"):
         raise ValueError(f'device: expected "cpu", "cuda" or "auto", got {name!r}')
@@ -151,7 +141,12 @@ def _train(
     progress: Progress | None,
 ) -> TrainResult:
     options, processes = run.options, run.processes
-    state, losses = _new_state(options, device), list[Tensor]()
+    with torch.random.fork_rng(devices=[]):  # new networks depend only on the seed
+        torch.manual_seed(options.seed)
+        networks = Networks(options.network).to(device)
+    optimizer = torch.optim.AdamW(networks.parameters(), lr=options.rate, weight_decay=options.decay)
+    state = TrainingState(networks, deepcopy(networks).requires_grad_(False), optimizer)
+    losses = list[Tensor]()
     hashes = {kind: [shard.sha256 for shard in part] for kind, part in (("data", shards), ("validation", validation))}
     head = {"options": options.to_dict(), **hashes}
     step, rows = _resume(out, state, head)
@@ -163,7 +158,7 @@ def _train(
             if progress:
                 progress(step, options.steps, float(losses[-1]))
             if step % options.save_every == 0 or step == options.steps:
-                scores = validate(state.smooth, validation, run.scales, options, out, processes)
+                scores = validate(state.smooth, validation, run, out)
                 mean = float(torch.stack(losses).mean())
                 rows.append({"step": step, "rate": options.rate_at(step - 1), "loss": mean, **scores})
                 losses = []
@@ -179,26 +174,22 @@ def _save(out: Path, state: TrainingState, rows: Sequence[Row], head: Mapping[st
     """Write the checkpoints, the table of losses and what a resumed run goes on from."""
     figures = {name: value for name, value in rows[-1].items() if name not in ("step", "rate", "loss")}
     training = {"step": rows[-1]["step"], "loss": rows[-1]["loss"], "figures": figures, **head}
-    networks = with_opacity_shift(state.smooth, options.opacity_shift)
+    networks = deepcopy(state.smooth)
+    with torch.no_grad():
+        for module in networks.heads.values():
+            assert isinstance(module, Head)
+            module.out.bias[LOGIT] += options.opacity_shift
     if is_best(rows, options):
         save_checkpoint(out / "best.safetensors", networks, training)
     save_checkpoint(out / "last.safetensors", networks, training)
-    write_losses(out / "losses.csv", rows)
+    lines = [",".join(rows[0]), *(",".join(f"{value:.8g}" for value in row.values()) for row in rows)]
+    with atomic_output(out / "losses.csv", overwrite=True) as temporary:
+        temporary.write_text("\n".join(lines) + "\n")
     save_state(out / "state.safetensors", state, {"step": rows[-1]["step"], "rows": rows, **head})
 
 
-def with_opacity_shift(networks: Networks, shift: float) -> Networks:
-    """A copy whose heads add ``shift`` to the raw correction of the opacity's logit."""
-    shifted = deepcopy(networks)
-    with torch.no_grad():
-        for head in shifted.heads.values():
-            assert isinstance(head, Head)
-            head.out.bias[LOGIT] += shift
-    return shifted
-
-
 def is_best(rows: Sequence[Row], options: TrainOptions) -> bool:
-    """Whether the last row is the best: of the rows that compared renders, if it did."""
+    """Return whether the last row is the best one: among the rows that compared renders, if it did."""
     *before, last = rows
     if last["step"] > options.photo_step:
         earlier = [row["psnr_learned"] for row in before if row["step"] > options.photo_step]
@@ -206,17 +197,8 @@ def is_best(rows: Sequence[Row], options: TrainOptions) -> bool:
     return last["validation_loss"] < min((row["validation_loss"] for row in before), default=float("inf"))
 
 
-def _new_state(options: TrainOptions, device: str) -> TrainingState:
-    """New networks, which depend only on the seed."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(options.seed)
-        networks = Networks(options.network).to(device)
-    optimizer = torch.optim.AdamW(networks.parameters(), lr=options.rate, weight_decay=options.decay)
-    return TrainingState(networks, deepcopy(networks).requires_grad_(False), optimizer)
-
-
 def _resume(out: Path, state: TrainingState, expected: dict[str, Any]) -> tuple[int, list[Row]]:
-    """Step and table of losses of the run in the folder; those of a new run if there is none."""
+    """Read step and table of losses of the run in the folder; those of a new run if there is none."""
     path = out / "state.safetensors"
     if not path.exists():
         return 0, []
@@ -228,7 +210,7 @@ def _resume(out: Path, state: TrainingState, expected: dict[str, Any]) -> tuple[
 
 
 def _step(state: TrainingState, streams: ExampleStreams, run: TrainingRun, step: int) -> Tensor:
-    """Do one step; returns its loss."""
+    """Do one step, and return its loss."""
     options, parameters = run.options, list(state.networks.parameters())
     streams.move_to(step)
 
@@ -257,7 +239,7 @@ def _step(state: TrainingState, streams: ExampleStreams, run: TrainingRun, step:
 
 
 def _loss(networks: Networks, example: Example, run: TrainingRun, step: int, rng: np.random.Generator) -> Tensor:
-    """Loss of a random crop or window of an example."""
+    """Compute the loss of a random crop or window of an example."""
     options = run.options
     if step < options.photo_step:
         crop = sample_crop(example, options.levels, options.crop, options.inner, rng)
@@ -269,7 +251,7 @@ def _loss(networks: Networks, example: Example, run: TrainingRun, step: int, rng
 
 
 def save_state(path: Path, state: TrainingState, facts: Mapping[str, Any]) -> None:
-    """Write weights, their means, moments and facts about the run; an existing file is replaced."""
+    """Write weights, their means, moments and facts about the run in place of an existing file."""
     tensors: dict[str, torch.Tensor] = {}
     for name, parameter, mean in state.pairs():
         moments = state.optimizer.state[parameter]
@@ -280,10 +262,9 @@ def save_state(path: Path, state: TrainingState, facts: Mapping[str, Any]) -> No
 
 
 def load_state(path: Path, state: TrainingState) -> dict[str, Any]:
-    """Read weights, means and moments into ``state``; returns the facts about the run.
+    """Read weights, means and moments into ``state``, and return the facts about the run.
 
-    Raises:
-        SceneError: If the file is damaged or of other networks.
+    A SceneError if the file is damaged or of other networks.
     """
     try:
         with safe_open(path, "pt") as file:
@@ -301,11 +282,3 @@ def load_state(path: Path, state: TrainingState) -> dict[str, Any]:
             path, "expected the state of a training run, found a damaged file or another", REMEDY
         ) from error
     return dict(facts)
-
-
-def write_losses(path: Path, rows: Sequence[Row]) -> None:
-    """Write the table of losses as CSV; an existing file is replaced."""
-    lines = [",".join(rows[0])] if rows else []
-    lines += [",".join(f"{value:.8g}" for value in row.values()) for row in rows]
-    with atomic_output(path, overwrite=True) as temporary:
-        temporary.write_text("\n".join(lines) + "\n")

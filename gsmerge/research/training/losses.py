@@ -1,4 +1,4 @@
-"""The losses: renders compared with photos, corrections compared with those of the fit, and regularizers.
+"""Losses: renders compared with photos, corrections compared with those of the fit, and regularizers.
 
 A window of a photo is rendered from all Feature Gaussians that reach into it, each run through all networks (paper
 section 4.6). Pixels that the scene does not cover have no loss, so that networks need not guess them. Regularizers hold
@@ -31,7 +31,7 @@ MAX_DEVIATIONS = 4.0  # standard deviations that targets are clamped to
 
 
 def target_scales(every: Iterable[Mapping[int, Targets]]) -> dict[int, Tensor]:
-    """``[13]`` standard deviation of every column of the targets of each K, at least a thousandth."""
+    """Compute the standard deviation of every column of the targets of each K, ``[13]``, at least a thousandth."""
     sums: dict[int, Tensor] = {}
     for levels in every:
         for k, targets in levels.items():
@@ -45,7 +45,7 @@ def target_scales(every: Iterable[Mapping[int, Targets]]) -> dict[int, Tensor]:
 def scaled_corrections(
     crop: Crop, corrections: Tensor, scales: Mapping[int, Tensor], options: TrainOptions
 ) -> tuple[Tensor, Tensor]:
-    """``[j,13]`` corrections and targets of the scored children, in standard deviations of the targets.
+    """Compute corrections and targets of the scored children, both ``[j,13]``, in standard deviations of the targets.
 
     Targets are clamped to the bounds of the networks, and to a few standard deviations.
     """
@@ -56,7 +56,7 @@ def scaled_corrections(
 
 
 def correction_loss(corrections: Tensor, targets: Tensor, options: TrainOptions) -> Tensor:
-    """Mean smooth L1 of corrections ``[j,13]``; 0 of none."""
+    """Compute the mean smooth L1 of corrections ``[j,13]``; 0 of none."""
     weights = torch.ones(RESIDUAL)
     weights[ROTATION] = options.turn_weight
     losses = torch.nn.functional.smooth_l1_loss(corrections, targets, reduction="none") * weights
@@ -71,7 +71,7 @@ def window_loss(
     step: int,
     rng: np.random.Generator,
 ) -> Tensor:
-    """Loss of a window of a photo: its render on a random background, and the regularizers of its Gaussians.
+    """Compute the loss of a window of a photo: its render on a random background, and the regularizers.
 
     ``scales`` are the standard deviations of the targets of each K, see :func:`target_scales`.
     """
@@ -94,27 +94,27 @@ MAX_DB = 100.0  # PSNR of windows without an error
 
 
 def draw_window(gaussians: Gaussians, window: Window, background: np.ndarray) -> Tensor:
-    """``[h,w,3]`` render of a window, differentiable."""
+    """Render a window ``[h,w,3]``, differentiable."""
     eps2d = window.crop.example.photos.eps2d
     camera = window.camera.to("cpu")
     return render_tensors(gaussians, camera, background, with_depths=False, eps2d=eps2d, near=NEAR).images[0]
 
 
 def color_loss(image: Tensor, photo: Tensor, mask: Tensor, kind: str) -> Tensor:
-    """Mean absolute (``"l1"``) or squared (``"mse"``) difference of images ``[h,w,3]`` within ``mask [h,w]``."""
+    """Average absolute (``"l1"``) or squared (``"mse"``) differences of images ``[h,w,3]`` within ``mask [h,w]``."""
     difference = (image - photo).abs() if kind == "l1" else (image - photo).square()
     return (difference * mask[..., None]).sum() / (3 * mask.sum()).clamp_min(1)
 
 
 def masked_ssim(image: Tensor, photo: Tensor, mask: Tensor) -> Tensor:
-    """Mean :func:`gsmerge.stages.fit.loss.loss_ssim` of images ``[h,w,3]`` within ``mask [h,w]``; 1 if it is empty."""
+    """Average the SSIM of the fit's loss over images ``[h,w,3]`` within ``mask [h,w]``; 1 if it is empty."""
     if not bool(mask.any()):
         return torch.ones(())
     return (loss_ssim(image, photo).mean(-1) * mask).sum() / mask.sum()
 
 
 def photometric_loss(image: Tensor, window: Window, options: TrainOptions, step: int) -> Tensor:
-    """Weighted sum of the difference of colours, 1 - SSIM and, if it has a weight in this step, LPIPS (VGG)."""
+    """Add up the weighted difference of colours, 1 - SSIM and, if it has a weight in this step, LPIPS (VGG)."""
     photo, mask = window.image, window.mask
     color = color_loss(image, photo, mask, options.photo_loss)
     similar = masked_ssim(image, photo, mask) if options.ssim_weight else torch.ones(())
@@ -124,9 +124,9 @@ def photometric_loss(image: Tensor, window: Window, options: TrainOptions, step:
 
 
 def render_window(window: Window, networks: Networks | None, options: TrainOptions) -> tuple[Tensor, float]:
-    """``[h,w,3]`` render of a window on black within [0, 1], and the share of Feature Gaussians that were merged.
+    """Render a window ``[h,w,3]`` on black within [0, 1], and return it with the share of Feature Gaussians merged.
 
-    Without networks of the analytic stages alone, and the share is 0.
+    Without networks the analytic stages alone are used, and the share is 0.
     """
     with torch.no_grad():
         if networks is None:
@@ -138,13 +138,13 @@ def render_window(window: Window, networks: Networks | None, options: TrainOptio
 
 
 def window_psnr(window: Window, image: Tensor) -> float:
-    """PSNR (dB) of a render ``[h,w,3]`` of a window within the mask."""
+    """Compute the PSNR (dB) of a render ``[h,w,3]`` of a window within the mask."""
     error = float(color_loss(image, window.image, window.mask, "mse"))
     return min(MAX_DB, -10 * float(np.log10(max(error, 1e-12))))
 
 
 def teacher_loss(prediction: Prediction, members: Members) -> Tensor:
-    """Distance of Gaussians from the moments of the groups that they stand for (paper section 4.6).
+    """Measure the distance of Gaussians from the moments of the groups that they stand for (paper section 4.6).
 
     The teacher of a group is one Gaussian with the opacity-weighted mean and covariance of its members' means (eq.
     teacher_mean, teacher_cov). The loss is the angle between the rotations, and the L1 distance of the means, in
@@ -164,7 +164,7 @@ def teacher_loss(prediction: Prediction, members: Members) -> Tensor:
 
 
 def _nearest_axes(scales: Tensor, quats: Tensor, predicted: Tensor) -> tuple[Tensor, Tensor]:
-    """Scales ``[n,3]`` in the order of axes that is nearest to predicted rotations ``[n,4]``; the angles ``[n]``."""
+    """Order axes by nearness to predicted rotations ``[n,4]``, and return scales ``[n,3]`` and the angles ``[n]``."""
     signed = torch.stack([torch.diag(torch.tensor(signs)) for signs in product((1.0, -1.0), repeat=3)])
     orders = torch.stack([torch.eye(3)[list(order)] for order in permutations(range(3))])
     proper = (signed[:, None] @ orders).reshape(-1, 3, 3)
@@ -184,13 +184,10 @@ GEOMETRY, OPACITY = 0.75, 0.25  # weights of the two terms of the diversificatio
 
 
 def diversity_loss(gaussians: Gaussians, parents: Tensor, unit: float) -> Tensor:
-    """Pairs of siblings that overlap too much or too little, or differ in opacity (paper supplement D).
+    """Penalise siblings that overlap too much or too little, or differ in opacity (paper supplement D).
 
-    Args:
-        gaussians: n children.
-        parents: ``[n]`` the parent of each, ascending.
-        unit: The scene's unit of length; pairs are weighted by their volumes in it, so that the loss does not depend
-            on the scale of the world.
+    ``parents [n]`` are those of n children, ascending. Pairs are weighted by their volumes in the scene's ``unit`` of
+    length, so that the loss does not depend on the scale of the world.
     """
     one, other = sibling_pairs(parents)
     if len(one) == 0:
@@ -203,7 +200,7 @@ def diversity_loss(gaussians: Gaussians, parents: Tensor, unit: float) -> Tensor
 
 
 def sibling_pairs(parents: Tensor) -> tuple[Tensor, Tensor]:
-    """Rows of all pairs of children with the same parent, each once."""
+    """List the rows of all pairs of children with the same parent, each once."""
     count = int(torch.bincount(parents).max()) if len(parents) else 0
     rows = torch.arange(len(parents))
     firsts = [rows[: len(rows) - gap][parents[: len(rows) - gap] == parents[gap:]] for gap in range(1, count)]
@@ -214,7 +211,7 @@ def sibling_pairs(parents: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def overlap_profile(gaussians: Gaussians, one: Tensor, other: Tensor) -> Tensor:
-    """``[p]`` the paper's U-shaped profile of pairs: 0 where their boxes overlap by half.
+    """Compute the paper's U-shaped profile of pairs ``[p]``: 0 where their boxes overlap by half.
 
     Boxes are those of one standard deviation along the world's axes, as in matching.
     """

@@ -1,4 +1,4 @@
-"""Crops of examples through all networks, with gradients: the sum of the corrections of all stages."""
+"""Predictions of all networks for crops of examples, with gradients: the sum of the corrections of all stages."""
 
 from __future__ import annotations
 
@@ -8,17 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsmerge.networks.apply import (
-    NetworkContext,
-    apply_corrections,
-    apply_encoding,
-    find_neighbors,
-    prepare_children,
-    run_encoder,
-    run_heads,
-    run_merger,
-    run_refiner,
-)
+from gsmerge.networks.apply import NetworkContext, prepare_children, run_encoder, run_heads, run_merger, run_refiner
 from gsmerge.networks.modules import Networks
 from gsmerge.networks.residuals import MEAN, move_gaussians, rotate_vectors
 from gsmerge.networks.tokens import GroupFeatures
@@ -43,7 +33,7 @@ class Prediction:
 
 
 def predict(crop: Crop, networks: Networks, options: TrainOptions, seed: int) -> Prediction:
-    """A crop through all networks.
+    """Run a crop through all networks.
 
     Each stage reads the results of those before it; gradients go through the latents and the corrections. At K = 1 the
     corrections of all stages add up; the children of a larger K are pooled again from the members, so the stages before
@@ -55,16 +45,14 @@ def predict(crop: Crop, networks: Networks, options: TrainOptions, seed: int) ->
     context = NetworkContext(networks, example.members, example.cameras, seed)
     parts = take(example.features, crop.rows)
     group_features = context.describe(parts)
-    encoded, shifts = apply_encoding(parts, group_features, run_encoder(parts, group_features, context), networks)
+    encoded, shifts = run_encoder(group_features, context)
     matches = match_crop(crop, encoded, options, context)
     merged, before = _merged(encoded, group_features, shifts, matches, context)
-    group_features = context.describe(merged)
-    raw = run_refiner(merged, group_features, find_neighbors(merged, networks.options.neighbors), context)
-    refined, residuals = apply_corrections(merged, group_features, raw, networks)
+    refined, residuals = run_refiner(context.describe(merged), context)
     group_features = context.describe(refined)
     children, parents = divide(refined, example.members, np.full(len(refined), crop.k))
-    children = prepare_children(children.to("cpu"), parents, refined, group_features, networks)
-    heads = run_heads(children, parents, refined, group_features, context)
+    children = prepare_children(children.to("cpu"), parents, group_features, networks)
+    heads = run_heads(children, parents, group_features, context)
     before = before + residuals if crop.k == 1 else torch.zeros_like(heads)
     last = heads + (before - before.detach())  # adds the gradient of earlier corrections, which the base has already
     own = torch.from_numpy(parents)
@@ -73,11 +61,13 @@ def predict(crop: Crop, networks: Networks, options: TrainOptions, seed: int) ->
     if example.targets and networks.options.outputs == "absolute":
         analytic, _ = divide(merge(parts, matches), example.members, np.full(len(refined), crop.k))
         corrections = corrections_between(analytic.to("cpu"), gaussians, frames)
-    return Prediction(gaussians, own, refined, corrections, _matched(matches))
+    sizes = np.bincount(matches.clusters, minlength=matches.count)
+    matched = float(sizes[sizes > 1].sum()) / max(1, len(matches.clusters))
+    return Prediction(gaussians, own, refined, corrections, matched)
 
 
 def analytic_gaussians(crop: Crop, options: TrainOptions) -> Gaussians:
-    """A crop's children without networks."""
+    """Decode a crop's children without networks."""
     parts = take(crop.example.features, crop.rows)
     merged = merge(parts, match_crop(crop, parts, options))
     return divide(merged, crop.example.members, np.full(len(merged), crop.k))[0]
@@ -86,7 +76,7 @@ def analytic_gaussians(crop: Crop, options: TrainOptions) -> Gaussians:
 def match_crop(
     crop: Crop, parts: FeatureGaussians, options: TrainOptions, context: NetworkContext | None = None
 ) -> Matches:
-    """Clusters of the r Feature Gaussians ``parts`` of a crop: those that were fitted, or what matches now."""
+    """Match the r Feature Gaussians ``parts`` of a crop, unless its clusters were fitted and so are known."""
     known = crop.example.matches
     if known is not None:
         ids, local = np.unique(known.clusters[crop.rows], return_inverse=True)
@@ -96,7 +86,7 @@ def match_crop(
 
 
 def crop_targets(crop: Crop) -> tuple[Tensor, Tensor]:
-    """``[n,13]`` corrections by the fit of a crop's children, and ``[n]`` bool: those that count."""
+    """Return the fit's corrections of a crop's children, ``[n,13]``, and a mask ``[n]`` of those that count."""
     matches = crop.example.matches
     assert matches is not None
     rows, targets = merged_rows(matches), crop.example.targets[crop.k]
@@ -108,7 +98,7 @@ def crop_targets(crop: Crop) -> tuple[Tensor, Tensor]:
 
 
 def merged_rows(matches: Matches) -> np.ndarray:
-    """``[g]`` row after merging of every Feature Gaussian before merging."""
+    """Find the row after merging of every Feature Gaussian before merging, ``[g]``."""
     alone, order, cuts = cluster_runs(matches)
     rows = np.empty(len(matches.clusters), np.int64)
     rows[alone] = np.arange(len(alone))
@@ -118,16 +108,10 @@ def merged_rows(matches: Matches) -> np.ndarray:
     return rows
 
 
-def _matched(matches: Matches) -> float:
-    """Share of the Feature Gaussians that are not alone in their cluster."""
-    sizes = np.bincount(matches.clusters, minlength=matches.count)
-    return float(sizes[sizes > 1].sum()) / max(1, len(matches.clusters))
-
-
 def _merged(
     parts: FeatureGaussians, group_features: GroupFeatures, shifts: Tensor, matches: Matches, context: NetworkContext
 ) -> tuple[FeatureGaussians, Tensor]:
-    """Merged Feature Gaussians, and the corrections of each by encoder and merger."""
+    """Merge Feature Gaussians, and return them with the corrections of each by encoder and merger."""
     alone, order, cuts = cluster_runs(matches)
     if len(order) == 0:
         return parts, shifts
@@ -139,8 +123,7 @@ def _merged(
     share = weights / torch.zeros(len(cuts)).index_add(0, run, weights)[run].clamp_min(1e-12)
     world = torch.zeros(len(cuts), 3).index_add(0, run, share[:, None] * moved)
     local = rotate_vectors(of_pooled.frames.transpose(1, 2), world) / of_pooled.sizes[:, None]
-    raw = run_merger(pooled, of_pooled, parts, order, cuts, context)
-    pooled, residuals = apply_corrections(pooled, of_pooled, raw, context.networks)
+    pooled, residuals = run_merger(of_pooled, parts, order, cuts, context)
     from_encoder = torch.cat([local, torch.zeros(len(cuts), residuals.shape[1] - 3)], 1)
     merged = FeatureGaussians.concat([take(parts, alone), pooled])
     return merged, torch.cat([shifts[alone], residuals + from_encoder])

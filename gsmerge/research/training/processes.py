@@ -1,4 +1,4 @@
-"""Training in several processes, as ``torchrun`` starts them: each works on its share, then all know everything."""
+"""Training in several processes, started by ``torchrun``, that share the work and gather all results."""
 
 from __future__ import annotations
 
@@ -19,26 +19,22 @@ TIMEOUT = timedelta(days=2)  # of waiting for a process that still prepares exam
 
 @dataclass(frozen=True)
 class Processes:
-    """The processes of a run; alone without ``torchrun``. Of a list, one takes every ``count``-th item."""
+    """The processes of a run, of which one takes every ``count``-th item; alone without ``torchrun``."""
 
     rank: int = 0  # of this process
     count: int = 1
 
     def require_even(self, crops: int) -> None:
-        """Refuse a number of crops per step that the processes cannot share evenly.
-
-        Raises:
-            ValueError: If it is no multiple of theirs.
-        """
+        """Raise a ValueError for a number of crops per step that the processes cannot share evenly."""
         if crops % self.count:
             raise ValueError(f"crops: expected a multiple of the {self.count} processes, got {crops}")
 
     def share(self, items: Sequence[T]) -> Sequence[T]:
-        """The items of this process."""
+        """Return the items of this process."""
         return items[self.rank :: self.count]
 
     def gather(self, results: list[T]) -> list[T]:
-        """The results for all items, in their order, from those for each process's share."""
+        """Collect the results for all items, in their order, from those for each process's share."""
         if self.count == 1:
             return results
         parts: list[Any] = [None] * self.count
@@ -49,7 +45,7 @@ class Processes:
         return merged  # type: ignore[return-value]
 
     def gather_rows(self, rows: Tensor) -> Tensor:
-        """``[n,d]`` rows for all items, in their order, from those ``[n/count,d]`` of each process's share."""
+        """Collect the rows ``[n,d]`` for all items, in their order, from ``[n/count,d]`` of each process's share."""
         if self.count == 1:
             return rows
         parts = [torch.empty_like(rows) for _ in range(self.count)]
@@ -62,12 +58,12 @@ ALONE = Processes()
 
 @contextmanager
 def join_processes(device: str) -> Iterator[Processes]:
-    """Meet the other processes that ``torchrun`` has started, if it has, over gloo or, on ``"cuda"``, NCCL."""
+    """Meet the other processes that ``torchrun`` has started, if any, over gloo or, on ``"cuda"``, NCCL."""
     if not {"RANK", "WORLD_SIZE", "MASTER_ADDR"} <= os.environ.keys() or os.environ["WORLD_SIZE"] == "1":
         yield ALONE
         return
     if device == "cuda":
-        torch.cuda.set_device(local_rank())
+        torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")))
     dist.init_process_group("nccl" if device == "cuda" else "gloo", timeout=TIMEOUT)
     try:
         yield Processes(dist.get_rank(), dist.get_world_size())
@@ -75,11 +71,6 @@ def join_processes(device: str) -> Iterator[Processes]:
         dist.destroy_process_group()
 
 
-def local_rank() -> int:
-    """Number of this process on its machine; 0 without ``torchrun``."""
-    return int(os.environ.get("LOCAL_RANK", "0"))
-
-
 def local_count() -> int:
-    """Processes of the run on this machine; 1 without ``torchrun``."""
+    """Return the number of processes of the run on this machine; 1 without ``torchrun``."""
     return int(os.environ.get("LOCAL_WORLD_SIZE", "1"))

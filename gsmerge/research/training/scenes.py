@@ -1,4 +1,4 @@
-"""Scenes of which the networks get some views, with all their photos."""
+"""Scenes with all their photos, and some views that the networks get."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from gsmerge.measure.visibility import context_points, visible_pixels
+from gsmerge.measure.visibility import context_points, resize_photo, visible_pixels
 from gsmerge.moments import Members, scene_members
 from gsmerge.render import composite, plan_view, prepare
 from gsmerge.render.photos import NEAR, Photos, scene_photos
@@ -30,20 +30,20 @@ class TrainingScene:
     images: np.ndarray  # [p,h,w,3] float32, at the size of the scene's own
 
     def photos(self, level: float = 1) -> Photos:
-        """All photos, each side divided by ``level``."""
+        """Prepare all photos, each side divided by ``level``."""
         names = tuple(map(str, range(len(self.cameras))))
         unaligned = Scene(self.scene.gaussians[:0], self.cameras, self.images, None, names)
         return scene_photos(unaligned, level)
 
 
 def view_subsets(num_views: int, counts: Sequence[int]) -> list[list[int]]:
-    """Views of each count, evenly spread; 0, or more than there are, means all. Every selection is returned once."""
+    """Choose views of each count, evenly spread; 0, or more than there are, means all. Each selection comes once."""
     chosen = [even_views(num_views, count if 0 < count < num_views else num_views) for count in counts]
     return [ids for i, ids in enumerate(chosen) if ids not in chosen[:i]]
 
 
 def make_training_scene(scene: Scene, ids: Sequence[int], held_out: Views | None = None) -> TrainingScene:
-    """The views ``ids`` of a scene with one Gaussian per pixel, with all its photos.
+    """Prepare the views ``ids`` of a scene with one Gaussian per pixel, with all its photos.
 
     Photos of ``held_out`` views are added, resized to the scene's own.
     """
@@ -61,29 +61,16 @@ def make_training_scene(scene: Scene, ids: Sequence[int], held_out: Views | None
             viewmats=np.concatenate([cameras.viewmats, held_out.cameras.viewmats]).astype(np.float64),
             Ks=np.concatenate([cameras.Ks, held_out.cameras.Ks * ratio[:, None]]).astype(np.float64),
         )
-        resized = [_resize(image, width, height) for image in held_out.images]
+        resized = [resize_photo(image, width, height) for image in held_out.images]
         images = np.concatenate([images, np.stack(resized)])
     return TrainingScene(canonical, scene_members(canonical), frame.enter_cameras(cameras), images)
 
 
-def _resize(image: np.ndarray, width: int, height: int) -> np.ndarray:
-    """The photo at another size, by area averages where it shrinks."""
-    if image.shape[:2] == (height, width):
-        return image
-    smaller = width * height < image.shape[0] * image.shape[1]
-    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
-
-
 def coverage(training: TrainingScene, level: float = 1) -> np.ndarray:
-    """How much of every photo each chosen view covers.
+    """Measure how much of every photo each chosen view covers, ``[v,p,h,w]`` uint8.
 
-    Args:
-        training: The scene, of v chosen views, and its p photos.
-        level: Factor by which the sides of the photos are divided.
-
-    Returns:
-        ``[v,p,h,w]`` uint8: opacity of the view's Gaussians times 255; 0 on surfaces that the view does not see. The
-        transmittances of views multiply, so this says what any subset of them covers.
+    Values are the opacity of the view's Gaussians times 255, and 0 on surfaces that the view does not see. The
+    transmittances of views multiply, so this tells what any subset of them covers. ``level`` divides the photos' sides.
     """
     scene, photos = training.scene, training.photos(level)
     cameras = Cameras(photos.viewmats, photos.Ks, photos.width, photos.height)
@@ -101,7 +88,7 @@ def coverage(training: TrainingScene, level: float = 1) -> np.ndarray:
 
 
 def covered_pixels(covers: np.ndarray) -> np.ndarray:
-    """``[...]`` bool: pixels that views cover together; ``covers [v,...]`` as of :func:`coverage`."""
+    """Mark the pixels that views cover together, from ``covers [v,...]`` of :func:`coverage`."""
     left = np.ones(covers.shape[1:], np.float32)
     for cover in covers:
         left *= 1 - cover.astype(np.float32) / 255
@@ -109,7 +96,7 @@ def covered_pixels(covers: np.ndarray) -> np.ndarray:
 
 
 def reduced_masks(masks: np.ndarray, photos: Photos) -> np.ndarray:
-    """Masks ``[p,h,w]`` of full-size photos for smaller ones: pixels of which more than half is in the mask."""
+    """Reduce masks ``[p,h,w]`` of full-size photos to smaller ones: pixels of which more than half is in the mask."""
     size = photos.width, photos.height
     small = [cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5 for mask in masks]
     return np.stack(small)

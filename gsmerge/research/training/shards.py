@@ -22,6 +22,7 @@ from gsmerge import __version__
 from gsmerge.errors import SceneError
 from gsmerge.io import find_scene_files
 from gsmerge.io.atomic import atomic_output
+from gsmerge.io.content_hash import content_hash, digest, read_files
 from gsmerge.moments import Members
 from gsmerge.render.photos import Photos
 from gsmerge.research.training.examples import Example, make_examples, scene_name
@@ -56,17 +57,10 @@ def prepare_shards(
     processes: Processes = ALONE,
     report: Report | None = None,
 ) -> list[Shard]:
-    """The shards of all scenes, in their order; those that are missing are made, by all processes together.
+    """Return the shards of all scenes, in their order, and make those that are missing, shared by all processes.
 
-    Args:
-        scenes: Folders or ``.ply`` files, see :func:`gsmerge.research.training.examples.make_examples`.
-        options: What the examples depend on.
-        folder: Of the shards, created if it is missing.
-        processes: Of which each prepares some of the scenes.
-        report: Called with (what is done, step, steps).
-
-    Raises:
-        SceneError: If a scene cannot be used, or the folder cannot be written.
+    ``scenes`` are folders or ``.ply`` files; ``report`` is called with (words, step, steps). A SceneError if a scene
+    cannot be used, or the folder cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -100,30 +94,18 @@ def _scene_shards(scene: Path, options: TrainOptions, folder: Path, report: Repo
 
 
 def scene_key(scene: Path, options: TrainOptions) -> str:
-    """Hash of a scene's files and of the settings that its examples depend on.
-
-    Raises:
-        SceneError: If there is no scene.
-    """
+    """Hash a scene's files and the settings that its examples depend on; a SceneError if there is no scene."""
     names = (*SETTINGS, *FIT_SETTINGS) if options.uses_fit else SETTINGS
     head = {"layout": LAYOUT, "gsmerge": __version__, "fit": options.uses_fit, "views": options.example_views}
     head |= {name: getattr(options, name) for name in names}
-    state = hashlib.sha256(json.dumps(head, sort_keys=True).encode("ascii"))
     files = find_scene_files(scene)
-    for root in dict.fromkeys((files.ply, files.cameras, files.images, files.ply.parent / "targets")):
-        if root is None:
-            continue
-        inside = sorted(p for p in root.rglob("*") if p.is_file()) if root.is_dir() else [root] * root.is_file()
-        for path in inside:
-            state.update(f"{path.relative_to(root.parent)} {path.stat().st_size}\n".encode("utf-8", "surrogateescape"))
-            with path.open("rb") as stream:
-                while block := stream.read(1 << 20):
-                    state.update(block)
-    return state.hexdigest()
+    targets = files.ply.parent / "targets"
+    read = [*read_files(files), *([targets] if targets.is_dir() else [])]
+    return digest({**head, "content": content_hash(read)})
 
 
 def _read_record(path: Path) -> dict[str, str] | None:
-    """Hash of each shard of a scene; None if the scene is not complete."""
+    """Read the hash of each shard of a scene; None if the scene is not complete."""
     try:
         known = json.loads(path.read_text())
         complete = all(_content_hash(path.with_name(file)) == sha256 for file, sha256 in known.items())
@@ -133,20 +115,15 @@ def _read_record(path: Path) -> dict[str, str] | None:
 
 
 def _content_hash(path: Path) -> str | None:
-    """What the header says; None if there is no complete shard."""
+    """Read a shard's hash from its header; None if there is no complete shard."""
     try:
-        with safe_open(path, "np") as file:
-            return str(json.loads((file.metadata() or {})[FORMAT])["sha256"])
-    except (SafetensorError, OSError, ValueError, KeyError, TypeError):
+        return str(_read(path, "none")[1]["sha256"])
+    except (SceneError, KeyError, TypeError):
         return None
 
 
 def write_shard(path: Path, example: Example) -> str:
-    """Write an example, in place of an existing file, and return the hash of its arrays.
-
-    Raises:
-        SceneError: If the file cannot be written.
-    """
+    """Write an example, in place of an existing file, and return the hash of its arrays; a SceneError if that fails."""
     arrays = dict(_arrays(example))
     facts = {"layout": LAYOUT, "sha256": hash_arrays(arrays), "unit": example.unit, "eps2d": example.photos.eps2d}
     facts |= {"size": [example.cameras.width, example.cameras.height], "levels": list(example.targets)}
@@ -173,7 +150,7 @@ def _arrays(example: Example) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def hash_arrays(arrays: Mapping[str, np.ndarray]) -> str:
-    """SHA-256 of names, types, shapes and values."""
+    """Hash names, types, shapes and values by SHA-256."""
     state = hashlib.sha256()
     for name, array in sorted(arrays.items()):
         state.update(json.dumps([name, str(array.dtype), *array.shape]).encode("ascii"))
@@ -182,14 +159,9 @@ def hash_arrays(arrays: Mapping[str, np.ndarray]) -> str:
 
 
 def read_shard(shard: Shard, *, check: bool = True) -> Example:
-    """The example of a shard.
+    """Read the example of a shard; ``check`` compares the arrays with their hash.
 
-    Args:
-        shard: Its file.
-        check: Compare the arrays with their hash.
-
-    Raises:
-        SceneError: If the file is missing, damaged, or another than when the run began.
+    A SceneError if the file is missing, damaged, or another than when the run began.
     """
     arrays, facts = _read(shard.path)
     if facts["sha256"] != shard.sha256 or (check and hash_arrays(arrays) != shard.sha256):
@@ -217,7 +189,7 @@ def read_shard(shard: Shard, *, check: bool = True) -> Example:
 
 
 def _read(path: Path, prefix: str = "") -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Arrays whose name begins with ``prefix``, and the header's facts."""
+    """Read arrays whose name begins with ``prefix``, and the header's facts."""
     try:
         with safe_open(path, "np") as file:
             facts = json.loads((file.metadata() or {})[FORMAT])
@@ -227,11 +199,7 @@ def _read(path: Path, prefix: str = "") -> tuple[dict[str, np.ndarray], dict[str
 
 
 def read_targets(shard: Shard) -> dict[int, Targets]:
-    """The targets alone of a shard's example.
-
-    Raises:
-        SceneError: If the file is missing or damaged.
-    """
+    """Read the targets alone of a shard's example; a SceneError if the file is missing or damaged."""
     arrays, facts = _read(shard.path, "targets.")
     names = [f.name for f in fields(Targets)]
     return {k: Targets(*(arrays[f"targets.{k}.{n}"] for n in names)) for k in facts["levels"]}

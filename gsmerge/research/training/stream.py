@@ -24,7 +24,7 @@ ORDER = 2**32 + 1  # takes the place of the step in the seed of the order's rand
 
 
 class ExampleStreams:
-    """The streams of some of a step's crops."""
+    """Streams of examples, one for each of some of a step's crops."""
 
     def __init__(self, shards: Sequence[Shard], options: TrainOptions, crops: Sequence[int]) -> None:
         self.shards, self.options, self.crops = shards, options, crops
@@ -43,12 +43,12 @@ class ExampleStreams:
                 self.examples[number] = self.pool.submit(self._read, number)
 
     def draw(self, step: int, crop: int, rng: np.random.Generator) -> Example:
-        """One of the examples of a crop of the step that was moved to."""
+        """Draw one of the examples of a crop of the step that was moved to."""
         slot = int(rng.integers(self.options.buffer))
         return self.examples[self.shard_id(step, crop, slot)].result()
 
     def shard_id(self, step: int, crop: int, slot: int) -> int:
-        """Number of the shard that a crop's stream has in a slot: 0 is the oldest."""
+        """Return the number of the shard that a crop's stream has in a slot: 0 is the oldest."""
         position = (step // self.options.refresh + slot) * self.options.crops + crop
         epoch, rest = divmod(position, len(self.shards))
         return int(_order(self.options.seed, epoch, len(self.shards))[rest])
@@ -61,7 +61,7 @@ class ExampleStreams:
 
 @contextmanager
 def open_streams(shards: Sequence[Shard], options: TrainOptions, crops: Sequence[int]) -> Iterator[ExampleStreams]:
-    """Streams whose threads end with the block."""
+    """Open streams whose threads end with the block."""
     streams = ExampleStreams(shards, options, crops)
     try:
         yield streams
@@ -71,5 +71,5 @@ def open_streams(shards: Sequence[Shard], options: TrainOptions, crops: Sequence
 
 @lru_cache(maxsize=4)
 def _order(seed: int, epoch: int, count: int) -> np.ndarray:
-    """``[count]`` the order of all shards in one pass over them."""
+    """Shuffle all shards for one pass over them, ``[count]``."""
     return np.random.default_rng([seed, ORDER, epoch]).permutation(count)

@@ -1,4 +1,4 @@
-"""What the full fit changes in the K analytic Gaussians of every merged Feature Gaussian.
+"""Targets of training: changes by the full fit in the K analytic Gaussians of every merged Feature Gaussian.
 
 A full fit of these to all photos, without growth, gives a target for each: fitted minus analytic, in the columns that
 networks correct. Gaussians that no photo shows have no target.
@@ -44,17 +44,10 @@ def fit_targets(
     name: str,
     progress: Progress | None = None,
 ) -> dict[int, Targets]:
-    """The targets of every K of ``options.levels``.
+    """Compute the targets of every K of ``options.levels`` from analytic Feature Gaussians, merged across views.
 
-    Args:
-        training: The scene and its photos.
-        merged: Its analytic Feature Gaussians, merged across views.
-        options: Levels, steps of the fit, seed.
-        name: Of the scene, for errors.
-        progress: Called with (step, steps) of the fits.
-
-    Raises:
-        SceneError: If the fit does not improve held-out parts of the photos.
+    ``name`` is the scene's, for errors; ``progress`` is called with (step, steps) of the fits. A SceneError if the fit
+    does not improve held-out parts of the photos.
     """
     photos, masks = (training.photos(), training.photos(2)), covered_pixels(coverage(training))
     masks[: len(training.scene)] = True  # of the other photos, only what the scene covers counts
@@ -84,7 +77,7 @@ def _fit_level(
     options: TrainOptions,
     progress: Callable[[int, int, float, float], None],
 ) -> tuple[Gaussians, np.ndarray]:
-    """Gaussians after a full fit without growth, and a mask ``[n]`` of those that were fitted, which a photo shows."""
+    """Fit Gaussians fully without growth; return them with a mask ``[n]`` of those that a photo shows."""
     fit = FitOptions(fit_steps=options.fit_steps)
     mask = start.opacities >= DecodeOptions().min_opacity
     mask[mask.copy()] = visible_mask(start[mask], photos[1], fit.min_contribution)
@@ -96,7 +89,7 @@ def _fit_level(
 
 
 def corrections_between(start: Gaussians, end: Gaussians, frames: Tensor) -> Tensor:
-    """``[n,13]`` corrections in frames ``[n,3,3]`` that turn ``start`` into ``end``, all of them tensors."""
+    """Compute the corrections ``[n,13]`` in frames ``[n,3,3]`` that turn ``start`` into ``end``, all tensors."""
     back, sizes = frames.transpose(1, 2), gaussian_sizes(start.scales).clamp_min(1e-12)
     residuals = torch.zeros(len(start), RESIDUAL)
     residuals[:, MEAN] = (back @ (end.means - start.means)[:, :, None])[:, :, 0] / sizes[:, None]
@@ -110,7 +103,7 @@ def corrections_between(start: Gaussians, end: Gaussians, frames: Tensor) -> Ten
 
 
 def rotation_vectors(rotations: Tensor) -> Tensor:
-    """Rotation vectors ``[n,3]`` of rotations ``[n,3,3]`` well below half a turn."""
+    """Convert rotations ``[n,3,3]`` well below half a turn to rotation vectors ``[n,3]``."""
     skew = rotations - rotations.transpose(1, 2)
     axis = torch.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], 1) / 2
     sine, cosine = axis.norm(dim=1), (rotations.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 from gsmerge.errors import SceneError
@@ -18,11 +17,27 @@ from gsmerge.stages.match import MatchOptions
 from gsmerge.stages.superpixels import SegmentOptions
 
 LISTS = ("levels", "densities", "views", "random_views")
+COUNTS = (
+    "fit_steps", "steps", "crops", "crop", "save_every", "validation_crops", "photo_scale", "most",
+    "validation_windows", "teacher_steps", "diversity_steps", "buffer", "refresh", "workers", "validation_examples",
+)  # fmt: skip
+WEIGHTS = ("photo_weight", "ssim_weight", "lpips_weight", "regression_weight", "teacher_weight", "diversity_weight")
+RANGES: tuple[tuple[tuple[str, ...], float, float, bool], ...] = (  # settings, least, most, whole numbers
+    (COUNTS, 1, 10**9, True),
+    (("warmup", "seed", "photo_side"), 0, 10**9, True),
+    (("window",), LOSS_WINDOW, 10**9, True),
+    (("average", "photo_start", "novel", "lpips_start", "overlap", "iou"), 0, 1, False),
+    (("rate", "least_rate", "clip"), 1e-12, 1e6, False),
+    (("decay", "turn_weight", *WEIGHTS), 0, 1e6, False),
+    (("inner",), 1e-6, 1, False),
+    (("opacity_shift",), -8, 8, False),
+    (("similarity",), -1, 1, False),
+)
 
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """What networks are trained on, and how.
+    """Settings of a training run: what networks are trained on, and how.
 
     Args:
         network: Sizes of the networks.
@@ -138,29 +153,23 @@ class TrainOptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("fit_steps", "steps", "crops", "crop", "save_every", "validation_crops", "photo_scale", "most",
-                     "validation_windows", "teacher_steps", "diversity_steps", "buffer", "refresh", "workers",
-                     "validation_examples"):  # fmt: skip
-            self._expect(name, getattr(self, name), 1, 10**9, whole=True)
-        for name in ("warmup", "seed", "photo_side"):
-            self._expect(name, getattr(self, name), 0, 10**9, whole=True)
-        self._expect("inner", self.inner, 1e-6, 1)
-        self._expect("opacity_shift", self.opacity_shift, -8, 8)
-        self._expect("window", self.window, LOSS_WINDOW, 10**9, whole=True)
-        for name in ("average", "photo_start", "novel", "lpips_start"):
-            self._expect(name, getattr(self, name), 0, 1)
-        for name in ("rate", "least_rate", "clip"):
-            self._expect(name, getattr(self, name), 1e-12, 1e6)
-        weights = [f.name for f in fields(self) if f.name.endswith("_weight")]
-        for name in ("decay", *weights):
-            self._expect(name, getattr(self, name), 0, 1e6)
+        for names, low, high, whole in RANGES:
+            for name in names:
+                self._expect(name, getattr(self, name), low, high, whole=whole)
         for name in LISTS:  # JSON and TOML have lists
             object.__setattr__(self, name, tuple(getattr(self, name)))
-        self._check_views()
-        if not self.densities:
-            raise ValueError("densities: expected at least one, got none")
+        for name, least in (("views", 0), ("random_views", 1)):
+            for count in getattr(self, name):
+                self._expect(name, count, least, 10**6, whole=True)
         for density in self.densities:
             self._expect("densities", density, 1e-6, 1)
+        for name in ("views", "densities"):
+            if not getattr(self, name):
+                raise ValueError(f"{name}: expected at least one number, got none")
+        if self.random_views and (len(self.random_views) != 2 or self.random_views[0] > self.random_views[1]):
+            raise ValueError(f"random_views: expected the least and the most, got {list(self.random_views)}")
+        if self.random_views and self.uses_fit:
+            raise ValueError("random_views: expected regression_weight 0 and photo_start 0, got a loss that uses a fit")
         if self.photo_loss not in ("l1", "mse"):
             raise ValueError(f'photo_loss: expected "l1" or "mse", got {self.photo_loss!r}')
         if not self.levels or len(set(self.levels)) < len(self.levels) or not set(self.levels) <= set(SLOTS):
@@ -168,22 +177,7 @@ class TrainOptions:
         if self.match is None:
             raise ValueError('match: expected "overlap", "aabb" or "none", got None')
         SegmentOptions(segmentation=self.segmentation)
-        for name in ("overlap", "iou"):
-            self._expect(name, getattr(self, name), 0, 1)
-        self._expect("similarity", self.similarity, -1, 1)
         self.match_options()
-
-    def _check_views(self) -> None:
-        if not self.views:
-            raise ValueError("views: expected at least one number, got none")
-        for count in self.views:
-            self._expect("views", count, 0, 10**6, whole=True)
-        for count in self.random_views:
-            self._expect("random_views", count, 1, 10**6, whole=True)
-        if self.random_views and (len(self.random_views) != 2 or self.random_views[0] > self.random_views[1]):
-            raise ValueError(f"random_views: expected the least and the most, got {list(self.random_views)}")
-        if self.random_views and self.uses_fit:
-            raise ValueError("random_views: expected regression_weight 0 and photo_start 0, got a loss that uses a fit")
 
     @staticmethod
     def _expect(name: str, value: Any, low: float, high: float, *, whole: bool = False) -> None:
@@ -203,34 +197,30 @@ class TrainOptions:
         return (0,) if self.random_views else self.views
 
     def match_options(self) -> MatchOptions:
-        """How Feature Gaussians are matched across views."""
+        """Return the options of matching Feature Gaussians across views."""
         names = ("match", "overlap", "iou", "similarity", "geometry")
         return MatchOptions(**{name: getattr(self, name) for name in names})
 
     def photo_level(self, width: int, height: int) -> float:
-        """Factor by which the sides of photos of ``width`` by ``height`` pixels are divided."""
+        """Return the factor by which the sides of photos of ``width`` by ``height`` pixels are divided."""
         return max(1.0, max(width, height) / self.photo_side) if self.photo_side else self.photo_scale
 
     def require_weights(self) -> None:
-        """Refuse to start without what the losses need.
-
-        Raises:
-            GsmergeError: If LPIPS has a weight, and its weights are not installed.
-        """
+        """Raise a GsmergeError if LPIPS has a weight, and its weights are not installed."""
         if self.lpips_weight:
             require_lpips("vgg")
 
     def lpips_weight_at(self, step: int) -> float:
-        """Weight of LPIPS in a step, counted from 0."""
+        """Return the weight of LPIPS in a step, counted from 0."""
         return self.lpips_weight if step >= self.lpips_start * self.steps else 0.0
 
     @property
     def photo_step(self) -> int:
-        """The first step, counted from 0, that compares renders with photos."""
+        """Number of the first step, counted from 0, that compares renders with photos."""
         return math.ceil(self.photo_start * self.steps)
 
     def regularizer_weights(self, step: int) -> tuple[float, float, float]:
-        """Weights of regression, teacher and diversification in a step that compares renders."""
+        """Return the weights of regression, teacher and diversification in a step that compares renders."""
         done = step - self.photo_step
 
         def left(steps: int) -> float:
@@ -243,30 +233,20 @@ class TrainOptions:
         )
 
     def rate_at(self, step: int) -> float:
-        """Learning rate of a step, counted from 0: a linear increase, then half a cosine."""
+        """Return the learning rate of a step, counted from 0: a linear increase, then half a cosine."""
         if step < self.warmup:
             return self.rate * (step + 1) / self.warmup
         part = (step - self.warmup) / max(1, self.steps - self.warmup)
         return self.least_rate + (self.rate - self.least_rate) * (1 + math.cos(math.pi * part)) / 2
 
     def to_dict(self) -> dict[str, Any]:
-        """All settings as plain values."""
+        """Convert all settings to plain values."""
         return asdict(self) | {name: list(getattr(self, name)) for name in LISTS}
 
-    @staticmethod
-    def from_dict(values: Mapping[str, Any]) -> TrainOptions:
-        """The defaults with some settings changed; ``network`` is a table in the table.
-
-        Raises:
-            ValueError: If a name is unknown or a value out of range.
-        """
-        return TrainOptions().with_settings(values)
-
     def with_settings(self, values: Mapping[str, Any]) -> TrainOptions:
-        """Some settings changed, as in :meth:`from_dict`; so are those in the tables ``network`` and ``bounds``.
+        """Change some settings by name, also those in the tables ``network`` and ``bounds``.
 
-        Raises:
-            ValueError: If a name is unknown or a value out of range.
+        A ValueError if a name is unknown or a value out of range.
         """
         unknown = sorted(values.keys() - {f.name for f in fields(TrainOptions)})
         if unknown:
@@ -281,10 +261,9 @@ class TrainOptions:
 
 
 def read_config(path: Path, start: TrainOptions | None = None) -> TrainOptions:
-    """``start``, or the defaults, with settings of a TOML or JSON file, named as the fields of :class:`TrainOptions`.
+    """Change ``start``, or the defaults, by settings of a TOML or JSON file, named as in :class:`TrainOptions`.
 
-    Raises:
-        SceneError: If the file cannot be read or a setting is unknown or out of range.
+    A SceneError if the file cannot be read or a setting is unknown or out of range.
     """
     table = read_table(path)
     try:
@@ -295,61 +274,51 @@ def read_config(path: Path, start: TrainOptions | None = None) -> TrainOptions:
 
 # Table of hyperparameters, sections 4.1, 4.4 and 5.1 of the paper; settings that it does not give are the defaults, but
 # for the densities, of which the fit alone needs two.
-PAPER: Mapping[str, Any] = MappingProxyType(
-    {
-        "network": {"outputs": "absolute"},
-        "random_views": (1, 12),
-        "densities": (0.044,),
-        "segmentation": "bass-st",
-        "match": "aabb",
-        "iou": 0.2,
-        "geometry": "decoded",
-        "photo_side": 476,
-        "levels": (1, 2, 4),
-        "steps": 300_000,
-        "warmup": 2_000,
-        "rate": 5e-5,
-        "least_rate": 1e-6,
-        "clip": 10.0,
-        "photo_start": 0.0,
-        "photo_loss": "mse",
-        "photo_weight": 1.0,
-        "ssim_weight": 0.05,
-        "lpips_weight": 0.05,
-        "regression_weight": 0.0,
-        "teacher_weight": 0.25,
-        "teacher_steps": 2_000,
-        "diversity_weight": 1.0,
-        "diversity_steps": 50_000,
-    }
-)
+PAPER: Mapping[str, Any] = {
+    "network": {"outputs": "absolute"},
+    "random_views": (1, 12),
+    "densities": (0.044,),
+    "segmentation": "bass-st",
+    "match": "aabb",
+    "iou": 0.2,
+    "geometry": "decoded",
+    "photo_side": 476,
+    "levels": (1, 2, 4),
+    "steps": 300_000,
+    "warmup": 2_000,
+    "rate": 5e-5,
+    "least_rate": 1e-6,
+    "clip": 10.0,
+    "photo_start": 0.0,
+    "photo_loss": "mse",
+    "photo_weight": 1.0,
+    "ssim_weight": 0.05,
+    "lpips_weight": 0.05,
+    "regression_weight": 0.0,
+    "teacher_weight": 0.25,
+    "teacher_steps": 2_000,
+    "diversity_weight": 1.0,
+    "diversity_steps": 50_000,
+}
 # What the package ships is trained with. Encoder and merger gained nothing that validation showed; colour corrections
 # learnt the exposure of the training photos. docs/internals/networks.md has the figures.
-SHIPPED: Mapping[str, Any] = MappingProxyType(
-    {
-        "network": {"encoder": False, "merger": False, "bounds": {"color": 0.0}},
-        "views": (3, 0),
-        "fit_steps": 100,
-        "steps": 2_600,
-        "lpips_weight": 0.06,
-        "lpips_start": 0.8,
-        "opacity_shift": 0.3,
-        "save_every": 100,
-        "validation_crops": 4,
-        "validation_windows": 6,
-    }
-)
-PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
-    {"default": MappingProxyType({}), "shipped": SHIPPED, "paper": PAPER}
-)
+SHIPPED: Mapping[str, Any] = {
+    "network": {"encoder": False, "merger": False, "bounds": {"color": 0.0}},
+    "views": (3, 0),
+    "fit_steps": 100,
+    "steps": 2_600,
+    "lpips_weight": 0.06,
+    "lpips_start": 0.8,
+    "opacity_shift": 0.3,
+    "save_every": 100,
+    "validation_crops": 4,
+    "validation_windows": 6,
+}
+PRESETS: Mapping[str, Mapping[str, Any]] = {"default": {}, "shipped": SHIPPED, "paper": PAPER}
 
 
 def preset_options(name: str) -> TrainOptions:
-    """The settings under a name.
-
-    Raises:
-        ValueError: If the name is unknown.
-    """
+    """Return the settings under a name; a ValueError if it is unknown."""
     if name not in PRESETS:
         raise ValueError(f"preset: expected {' or '.join(PRESETS)}, got {name!r}")
-    return TrainOptions.from_dict(PRESETS[name])
+    return TrainOptions().with_settings(PRESETS[name])

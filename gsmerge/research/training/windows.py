@@ -38,7 +38,7 @@ class Box:
     height: int
 
     def halved(self) -> Box:
-        """The middle half of the longer side, at least ``MIN_SIDE`` pixels."""
+        """Return the middle half of the longer side, at least ``MIN_SIDE`` pixels."""
         if self.width >= self.height:
             width = max(min(MIN_SIDE, self.width), self.width // 2)
             return Box(self.left + (self.width - width) // 2, self.top, width, self.height)
@@ -56,18 +56,18 @@ class Window:
 
     @property
     def camera(self) -> Cameras:
-        """One camera whose image is the box."""
+        """Camera whose image is the box."""
         c = box_camera(self.crop.example.photos, self.photo, self.box)
         return Cameras(c["viewmat"][None], c["K"][None], c["width"], c["height"])
 
     @property
     def image(self) -> Tensor:
-        """``[h,w,3]`` the part of the photo, sRGB in [0, 1]."""
+        """Part of the photo, ``[h,w,3]`` sRGB in [0, 1]."""
         return torch.from_numpy(self._part(self.crop.example.images[self.photo])).float() / 255
 
     @property
     def mask(self) -> Tensor:
-        """``[h,w]`` bool: pixels that the example's views cover."""
+        """Pixels that the example's views cover, ``[h,w]`` bool."""
         return torch.from_numpy(self._part(self.crop.example.mask(self.photo)))
 
     def _part(self, picture: np.ndarray) -> np.ndarray:
@@ -76,7 +76,7 @@ class Window:
 
 
 def sample_crop(example: Example, levels: tuple[int, ...], count: int, inner: float, rng: np.random.Generator) -> Crop:
-    """The ``count`` Feature Gaussians nearest to a random one, of which the share ``inner`` nearest to it is scored."""
+    """Choose the ``count`` Feature Gaussians nearest to a random one; the share ``inner`` nearest to it is scored."""
     k, means = levels[int(rng.integers(len(levels)))], example.features.means
     order = np.argsort(np.square(means - means[rng.integers(len(means))]).sum(1), kind="stable")[:count]
     near, close = np.zeros((2, len(means)), bool)
@@ -88,15 +88,11 @@ def sample_crop(example: Example, levels: tuple[int, ...], count: int, inner: fl
 def sample_window(
     example: Example, levels: tuple[int, ...], side: int, most: int, novel: float, rng: np.random.Generator
 ) -> Window:
-    """A window around a random pixel that the example's views cover.
+    """Choose a window around a random pixel that the example's views cover.
 
-    Args:
-        example: The scene.
-        levels: Numbers of children K, of which one is drawn.
-        side: Of the window, pixels; shorter where the photo is.
-        most: Feature Gaussians that may reach into it; a window with more is halved.
-        novel: Share of the windows in novel views, if there are any.
-        rng: Chooses K, photo and pixel.
+    One of the ``levels`` is drawn as K. The window is ``side`` pixels wide, less where the photo is, and is halved
+    while more than ``most`` Feature Gaussians reach into it. ``novel`` is the share of windows in novel views, if there
+    are any.
     """
     k = levels[int(rng.integers(len(levels)))]
     own = len(example.cameras)
@@ -109,7 +105,9 @@ def sample_window(
             break
     pixel = int(pixels[rng.integers(len(pixels))]) if len(pixels) else 0
     height, width = example.images.shape[1:3]
-    box = _box_around(pixel % width, pixel // width, side, width, height)
+    w, h = min(side, width), min(side, height)
+    left, top = (max(0, at - part // 2) for at, part in ((pixel % width, w), (pixel // width, h)))
+    box = Box(min(left, width - w), min(top, height - h), w, h)  # moved into the photo
     rows = _rows(example, photo, box)
     while len(rows) > most and box.halved() != box:
         box = box.halved()
@@ -118,20 +116,14 @@ def sample_window(
 
 
 def whole_photo(example: Example, photo: int, k: int = 1) -> Window:
-    """A whole photo, with all Feature Gaussians."""
+    """Take a whole photo, with all Feature Gaussians."""
     height, width = example.images.shape[1:3]
     rows = np.arange(len(example.features))
     return Window(photo, Box(0, 0, width, height), Crop(example, k, rows, np.ones(len(rows), bool)))
 
 
-def _box_around(x: int, y: int, side: int, width: int, height: int) -> Box:
-    """The window around a pixel, moved into the photo."""
-    w, h = min(side, width), min(side, height)
-    return Box(min(max(0, x - w // 2), width - w), min(max(0, y - h // 2), height - h), w, h)
-
-
 def _rows(example: Example, photo: int, box: Box) -> np.ndarray:
-    """Ascending rows of the Feature Gaussians that reach into the window, or nearly do."""
+    """Find the ascending rows of the Feature Gaussians that reach into the window, or nearly do."""
     wide = Box(box.left - BORDER, box.top - BORDER, box.width + 2 * BORDER, box.height + 2 * BORDER)
     plan = plan_view(prepare(example.base, np.zeros(3)), **box_camera(example.photos, photo, wide), near=NEAR)
     reached = np.zeros(len(example.base), bool)
@@ -140,7 +132,7 @@ def _rows(example: Example, photo: int, box: Box) -> np.ndarray:
 
 
 def _whole_clusters(example: Example, chosen: np.ndarray) -> np.ndarray:
-    """Ascending rows of the ``chosen [g]`` Feature Gaussians, and of those that were fitted as one with them."""
+    """Find the ascending rows of the ``chosen [g]`` Feature Gaussians, and of others fitted as one with them."""
     if example.matches is not None:
         inside = np.zeros(example.matches.count, bool)
         inside[example.matches.clusters[chosen]] = True
@@ -149,7 +141,7 @@ def _whole_clusters(example: Example, chosen: np.ndarray) -> np.ndarray:
 
 
 def box_camera(photos: Photos, photo: int, box: Box) -> dict[str, Any]:
-    """The camera whose image is a part of a photo, as arguments of :func:`gsmerge.render.plan_view`."""
+    """Make the camera whose image is a part of a photo, as arguments of :func:`gsmerge.render.plan_view`."""
     K = photos.Ks[photo].copy()
     K[:2, 2] -= box.left, box.top
     return {**photos.camera(photo), "K": K, "width": box.width, "height": box.height}

@@ -131,7 +131,7 @@ def test_what_is_trained_is_what_runs(example: Example) -> None:
         real = predict(everything(example, 2), networks, OPTIONS, 5).corrections
     group_features = learned.describe(refined)
     children, parents = divide(refined, example.members, np.full(len(refined), 2))
-    expected = run_heads(children.to("cpu"), parents, refined, group_features, learned)
+    expected = run_heads(children.to("cpu"), parents, group_features, learned)
     torch.testing.assert_close(real, expected, atol=1e-5, rtol=1e-5)
     with torch.no_grad():
         total = predict(everything(example, 1), networks, OPTIONS, 5).corrections
@@ -246,10 +246,10 @@ def test_settings_are_checked(tmp_path: Path) -> None:
     ):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             replace(OPTIONS, **wrong)  # type: ignore[arg-type]
-    assert TrainOptions.from_dict(json.loads(json.dumps(OPTIONS.to_dict()))) == OPTIONS
+    assert TrainOptions().with_settings(json.loads(json.dumps(OPTIONS.to_dict()))) == OPTIONS
     for values in ({"step": 3}, {"network": {"depth": 1}}, {"network": 3}):
         with pytest.raises(ValueError, match=r"unknown|network"):
-            TrainOptions.from_dict(values)
+            TrainOptions().with_settings(values)
 
 
 def test_checkpoints_show_more_than_the_networks_in_training(shard: Shard, tmp_path: Path) -> None:
