@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from gsmerge.report import csv_cell, human_bytes
+from gsmerge.measure.scores import csv_text
+from gsmerge.report import human_bytes
 from gsmerge.research.charts.figures import Figure
 from gsmerge.research.charts.lines import (
     METRICS,
@@ -71,19 +70,6 @@ def _number(value: float | None, digits: int) -> str:
     return "" if value is None else f"{value:,.{digits}f}"
 
 
-def _costs(group: Sequence[RunRecord]) -> list[str]:
-    count, kept, size, seconds, ms = (
-        _mean(group, name) for name in ("count", "percent", "bytes", "seconds", "render_ms")
-    )
-    return [
-        _number(count, 0),
-        "" if kept is None else f"{kept:.2f} %",
-        "" if size is None else human_bytes(size),
-        _number(seconds or None, 2),
-        _number(ms, 1),
-    ]
-
-
 def _results(results: Results) -> Table:
     """Average over the scenes by method, settings and size."""
     intervals = {
@@ -99,7 +85,10 @@ def _results(results: Results) -> Table:
             groups.setdefault((results.name(record), size_label(record)), []).append(record)
     rows = []
     for (name, size), group in groups.items():
-        row = [name, size, str(len(group)), *_costs(group)]
+        values = ("count", "percent", "bytes", "seconds", "render_ms")
+        count, kept, num_bytes, seconds, ms = (_mean(group, value) for value in values)
+        row = [name, size, str(len(group)), _number(count, 0), "" if kept is None else f"{kept:.2f} %"]
+        row += ["" if num_bytes is None else human_bytes(num_bytes), _number(seconds or None, 2), _number(ms, 1)]
         for metric in results.metrics:
             known, digits = intervals.get((metric, name, size)), METRICS[metric].digits
             mean = _number(_mean(group, f"{metric}_{results.part}"), digits)
@@ -150,9 +139,5 @@ def _views(results: Results, folder: Path) -> list[tuple[str, list[tuple[str, st
 
 def make_table(records: Sequence[RunRecord]) -> str:
     """Make a table of all runs and scores as comma-separated values."""
-    out = io.StringIO()
     names = ("scene", "label", "method", "views", "num_input", "count", "ratio", "bytes", "seconds", "render_ms")
-    writer = csv.DictWriter(out, (*names, *SCORES, "error"), extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({name: csv_cell(value) for name, value in record.to_dict().items()} for record in records)
-    return out.getvalue()
+    return csv_text((*names, *SCORES, "error"), (record.to_dict() for record in records))

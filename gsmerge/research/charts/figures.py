@@ -1,4 +1,4 @@
-"""Figures of runs: what each shows, and drawing them in one style, with colours that the colour-blind tell apart."""
+"""Figures of runs, drawn in one style, with colours that the colour-blind tell apart."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from gsmerge.io import atomic_output
 from gsmerge.measure.speed import break_even
 from gsmerge.research.charts.lines import METRICS, PARTS, Line, Results, make_lines, size_label
-from gsmerge.research.charts.measure_run import INPUT, SCORING, SEGMENTATIONS, SHARES, RunRecord
+from gsmerge.research.charts.measure_run import INPUT, SCORING, SEGMENTATIONS, SHARES
 from gsmerge.runtime.record import STAGES
 
 MAX_LINES = 12  # of a figure; of more, one for each method is drawn
@@ -83,10 +83,13 @@ class Figure:
 
 def make_figures(results: Results) -> list[Figure]:
     """Make all figures that there are data for."""
-    if not results.runs:
-        return [figure for figure in (_superpixels(results),) if figure]
-    figures = [_against(results, "seconds"), _against(results, "percent"), _stages(results), _superpixels(results)]
-    figures += [_counts(results), _over_views(results), _break_even(results)]
+    time = "Quality against time", "the wall time of the merge (reading and writing not counted)", "Seconds"
+    size = "Quality against size", "the share of the input's Gaussians that is kept", "Gaussians kept (%)"
+    figures = [
+        _against(results, "seconds", "quality-seconds", time),
+        _against(results, "percent", "quality-ratio", size),
+    ]
+    figures += [_stages(results), _superpixels(results), _counts(results), _over_views(results), _break_even(results)]
     return [figure for figure in figures if figure is not None]
 
 
@@ -122,12 +125,7 @@ def choose_lines(panel: Panel) -> set[str]:
     sign = 1 if panel.higher else -1
     quality = {line.name: sign * np.mean([point.y.mean for point in line.points]) for line in panel.lines}
     order = sorted(panel.lines, key=lambda line: (len(line.points) > 1, quality[line.name]))
-    return set({_method(line.name): line.name for line in order}.values())
-
-
-def _method(name: str) -> str:
-    """Cut the settings off a line's name, which begins with the method."""
-    return name.split(", ")[0]
+    return set({line.name.split(", ")[0]: line.name for line in order}.values())  # a name begins with the method
 
 
 def _quality_panels(results: Results, lines_of: Callable[[str], list[Line]], *, level: bool) -> list[Panel]:
@@ -142,15 +140,12 @@ def _quality_panels(results: Results, lines_of: Callable[[str], list[Line]], *, 
     return panels
 
 
-def _against(results: Results, cost: str) -> Figure | None:
-    """Show quality against seconds or against the share of Gaussians that is kept."""
+def _against(results: Results, cost: str, name: str, words: tuple[str, str, str]) -> Figure | None:
+    """Show quality against a cost, whose title, description and label are ``words``."""
+    title, described, label = words
     panels = _quality_panels(results, lambda score: results.by_size(cost, score), level=True)
-    where = f"Measured on {PARTS[results.part]}."
-    if cost == "seconds":
-        caption = f"Quality against the wall time of the merge (reading and writing not counted). {where}"
-        return _curves("quality-seconds", "Quality against time", caption, "Seconds", panels, "x")
-    caption = f"Quality against the share of the input's Gaussians that is kept. {where}"
-    return _curves("quality-ratio", "Quality against size", caption, "Gaussians kept (%)", panels, "x")
+    caption = f"Quality against {described}. Measured on {PARTS[results.part]}."
+    return _curves(name, title, caption, label, panels, "x")
 
 
 def _size_words(results: Results) -> str:
@@ -179,17 +174,15 @@ def _stages(results: Results) -> Figure | None:
 
 
 def _superpixels(results: Results) -> Figure | None:
-    """Show how well superpixels alone approximate the photos (the paper's proxy)."""
+    """Show the quality of superpixels alone as approximations of the photos (the paper's proxy)."""
 
-    def point(record: RunRecord, name: str, share: float) -> RunRecord:
-        """Make a record of its own of one of the points."""
-        scores = {"psnr_context": record.scores[f"{name} {share:g}"]}
-        settings = {"superpixels": f"{100 * share:g}%"}
-        count = round(share * (record.count or 0))
-        return replace(record, method=name, settings=settings, scores=scores, count=count)
-
-    known = [(r, *one) for r in results.superpixels for one in product(SEGMENTATIONS, SHARES)]
-    points = [point(*one) for one in known if f"{one[1]} {one[2]:g}" in one[0].scores]
+    points = []
+    for record, name, share in product(results.superpixels, SEGMENTATIONS, SHARES):
+        score = record.scores.get(f"{name} {share:g}")
+        if score is not None:
+            settings = {"superpixels": f"{100 * share:g}%"}
+            count = round(share * (record.count or 0))
+            points.append(replace(record, method=name, settings=settings, scores={"psnr_context": score}, count=count))
     lines = make_lines(points, size_label, "count", "count", "psnr_context")
     caption = (
         "Every pixel takes the mean colour of its superpixel; PSNR against the photo, the best that a superpixel method"

@@ -1,4 +1,4 @@
-"""The grid of runs: lists of settings, whose product over scenes makes the jobs of a batch."""
+"""Grid of runs: lists of settings, whose product over scenes makes the jobs of a batch."""
 
 from __future__ import annotations
 
@@ -171,23 +171,23 @@ def find_sources(
     SceneError if a file is missing, a UsageError if a template holds another name.
     """
     scenes = list({main_file(scene).resolve(): scene for scene in find_scenes(given, out)}.values())
-    named = zip(scenes, scene_names(scenes), strict=True)
-    return [_source(scene, name, filled(targets, scene), filled(target_images, scene)) for scene, name in named]
-
-
-def _source(scene: Path, name: str, targets: Path | None, target_images: Path | None) -> Source:
-    files = find_scene_files(scene)
-    read = read_files(files)
-    if targets is not None:
-        if not targets.exists():
-            raise SceneError(targets, f"expected cameras of held-out views of {scene}, found nothing")
-        # other files of a folder of cameras, such as results, do not count
-        inside = find_cameras(targets) if targets.is_dir() and not is_colmap(targets) else None
-        read += [inside or targets, *photos_of(targets)]
-    read += [] if target_images is None else [target_images]
-    cameras = None if files.cameras is None else cameras_of(files.cameras, files.ply.stem)
-    num_views = None if cameras is None else len(cameras)
-    return Source(scene, name, targets, target_images, num_views, content_hash(list(dict.fromkeys(read))))
+    sources = []
+    for scene, name in zip(scenes, scene_names(scenes), strict=True):
+        files, cameras = find_scene_files(scene), filled(targets, scene)
+        photos = filled(target_images, scene)
+        read = read_files(files)
+        if cameras is not None:
+            if not cameras.exists():
+                raise SceneError(cameras, f"expected cameras of held-out views of {scene}, found nothing")
+            # other files of a folder of cameras, such as results, do not count
+            inside = find_cameras(cameras) if cameras.is_dir() and not is_colmap(cameras) else None
+            read += [inside or cameras, *photos_of(cameras)]
+        read += [] if photos is None else [photos]
+        known = None if files.cameras is None else cameras_of(files.cameras, files.ply.stem)
+        num_views = None if known is None else len(known)
+        sha256 = content_hash(list(dict.fromkeys(read)))
+        sources.append(Source(scene, name, cameras, photos, num_views, sha256))
+    return sources
 
 
 def scene_names(scenes: Sequence[Path]) -> list[str]:
@@ -232,15 +232,11 @@ def make_jobs(
         num_gaussians, num_rest = header_counts(main_file(source.path))
         for method, settings, views, options in some:
             label = describe(method, settings, views)
-            output = f"{source.name}/{_file_name(label)}"
+            name = re.sub(r"[^\w.%+=, -]", "_", label)[:MAX_NAME]  # which file systems and shells take
+            name = name if name == label else f"{name} {digest({'label': label})[:6]}"
+            output = f"{source.name}/{name}"
             record = RunRecord(source.name, label, output, source.sha256, method, settings, views, command)
             run = ChartRun(record, options, measured, source.targets, source.target_images)
             share = min(1.0, (views or most) / most) if source.num_views else 1.0
             jobs.append(Job(len(jobs), str(source.path), output, round(share * num_gaussians), num_rest, run))
     return jobs, notes
-
-
-def _file_name(label: str) -> str:
-    """Make a name of files of a label: short, without characters that file systems or shells know."""
-    name = re.sub(r"[^\w.%+=, -]", "_", label)[:MAX_NAME]
-    return name if name == label else f"{name} {digest({'label': label})[:6]}"

@@ -1,4 +1,4 @@
-"""Records -> lines over scenes: which runs belong together, means with intervals, and comparisons at equal cost."""
+"""Lines over scenes from records: which runs belong together, means with intervals, and comparisons at equal cost."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ K = TypeVar("K")
 
 @dataclass(frozen=True)
 class Metric:
-    """How a score is shown."""
+    """Label, direction and decimals of a score."""
 
     label: str
     higher: bool  # whether higher is better
@@ -135,28 +135,18 @@ def paired_intervals(values: NDArray[np.float64]) -> list[Interval]:
     return [Interval(mean, mean - half, mean + half, num_scenes) for mean, half in zip(means, halves, strict=True)]
 
 
-def pareto_front(costs: Sequence[float], qualities: Sequence[float]) -> list[int]:
-    """List the points that no other dominates, by ascending cost; of equal points the first.
-
-    A point dominates one that is as cheap and worse (a lower quality), or dearer and no better.
-    """
-    best, front = -math.inf, []
-    for i in sorted(range(len(costs)), key=lambda i: (costs[i], -qualities[i], i)):
-        if qualities[i] > best:
-            best = qualities[i]
-            front.append(i)
-    return front
-
-
 def quality_at(costs: Sequence[float], qualities: Sequence[float], cost: float) -> float | None:
-    """Interpolate a method's front at a cost, over the logarithm of the cost; None below its cheapest point.
+    """Interpolate the best quality at a cost, over the logarithm of the cost; None below a method's cheapest point.
 
-    Costs are positive, and a higher quality is better. Beyond the most expensive point the quality is constant.
+    Costs are positive, and a higher quality is better. Points that are dearer and no better than another do not count.
+    Beyond the most expensive point the quality is constant.
     """
-    front = pareto_front(costs, qualities)
-    if not front or cost < costs[front[0]]:
+    if not len(costs) or cost < min(costs):
         return None
-    return float(np.interp(math.log(cost), np.log([costs[i] for i in front]), [qualities[i] for i in front]))
+    order = np.lexsort((-np.asarray(qualities), np.asarray(costs)))
+    best = np.maximum.accumulate(np.asarray(qualities)[order])
+    front = np.diff(best, prepend=-math.inf) > 0
+    return float(np.interp(math.log(cost), np.log(np.asarray(costs)[order][front]), best[front]))
 
 
 def judge(
@@ -168,11 +158,12 @@ def judge(
     side is named only where zero lies outside the interval of the difference, or the baseline has only one scene.
     """
     sign = 1.0 if higher else -1.0
-    curves = {scene: ours.get(scene, ()) for scene in points}
-    at = {
-        s: quality_at([c for c, _ in curve], [sign * q for _, q in curve], points[s][0]) for s, curve in curves.items()
-    }
-    known = {scene: quality for scene, quality in at.items() if quality is not None}
+    known: dict[str, float] = {}
+    for scene, (cost, _) in points.items():
+        curve = ours.get(scene, ())
+        best = quality_at([c for c, _ in curve], [sign * q for _, q in curve], cost)
+        if best is not None:
+            known[scene] = best
     cost = _mean_cost(points)
     quality = float(np.mean([points[scene][1] for scene in known or points]))
     if not known:
@@ -258,7 +249,7 @@ class Results:
         return self.names[line_key(record)]
 
     def is_typical(self, record: RunRecord) -> bool:
-        """Say whether a run has the typical size, or a method that has only one size."""
+        """Return whether a run has the typical size, or a method that has only one size."""
         return record.method != INPUT and (size_label(record) == self.size or record.method in ONE_SIZE)
 
     def typical_runs(self) -> dict[str, list[RunRecord]]:
@@ -329,13 +320,16 @@ def keep_common(scenes: Mapping[K, set[str]], min_share: float) -> dict[K, set[s
 
 
 def _mean_cost(points: ByScene) -> float:
-    """Average positive costs geometrically; equal ones exactly."""
+    """Average positive costs geometrically, exactly where all are equal."""
     costs = [x for x, _ in points.values()]
     return costs[0] if min(costs) == max(costs) else float(np.exp(np.mean(np.log(costs))))
 
 
 def _intervals(columns: Sequence[ByScene]) -> list[Interval]:
-    """Make one for each column, without differences between scenes; of zero width where columns have other scenes."""
+    """Make an interval for each column, without differences between scenes.
+
+    Intervals have no width where columns have other scenes.
+    """
     if columns and all(column.keys() == columns[0].keys() for column in columns):
         values = [[column[scene][1] for column in columns] for scene in sorted(columns[0])]
         return paired_intervals(np.array(values, np.float64))

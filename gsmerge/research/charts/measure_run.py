@@ -1,4 +1,4 @@
-"""One run of a grid: merge a scene, or leave it as it is, measure the result, and keep pictures and a record."""
+"""One run of a grid: merge a scene, or keep it unmerged, measure the result, and keep pictures and a record."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ import numpy as np
 from gsmerge import __version__
 from gsmerge.batch import BatchOptions
 from gsmerge.batch.records import FAILED, newest_records
-from gsmerge.io import HeldOutViews, ReadHints, SceneFiles, atomic_output, load_files, read_held_out
+from gsmerge.io import HeldOutViews, ReadHints, SceneFiles, load_files, read_held_out
 from gsmerge.io.content_hash import digest
 from gsmerge.io.formats.ply import OpacityChoice
 from gsmerge.io.formats.writing import file_bytes
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, evaluate, near_plane
-from gsmerge.measure.preview import Picture, draw_means, heat_map, to_picture
+from gsmerge.measure.preview import Picture, draw_means, heat_map, save_picture, to_picture
 from gsmerge.measure.speed import time_render
 from gsmerge.options import CompactOptions
 from gsmerge.pipeline import compact
@@ -92,7 +92,7 @@ class RunRecord:
 
     @property
     def percent(self) -> float | None:
-        """The same in per cent."""
+        """Share of the input's Gaussians that is kept, per cent."""
         return None if self.ratio is None else 100 * self.ratio
 
     def value(self, name: str) -> float | None:
@@ -109,7 +109,7 @@ def _is_number(value: object) -> bool:
 
 
 def _is_sound(name: str, value: Any) -> bool:
-    """Check that a value read from JSON is of the kind of its field."""
+    """Return whether a value read from JSON is of the kind of its field."""
     default = getattr(BLANK, name)
     if isinstance(default, Mapping):
         words = () if name in ("stages", "scores") else (str, bool, NoneType)
@@ -166,7 +166,7 @@ def describe(method: str, settings: Mapping[str, Any], views: int | None) -> str
 
 @dataclass(frozen=True)
 class ChartRun:
-    """The work on one scene, see :class:`gsmerge.batch.find.Work`."""
+    """Work on one scene, see :class:`gsmerge.batch.find.Work`."""
 
     record: RunRecord  # what is known beforehand
     settings: CompactOptions  # all settings
@@ -181,7 +181,7 @@ class ChartRun:
         return digest({"run": run, **how, "opacity": options.opacity, "reading": vars(options.hints)})
 
     def run(self, files: SceneFiles, options: BatchOptions, out: Path) -> tuple[dict[str, Any], list[Path]]:
-        """Merge, score, time and keep pictures; returns the report and the pictures."""
+        """Merge, score, time and keep pictures; return a report with the keys of batch records, and the pictures."""
         threads = options.settings.threads
         with use_threads(threads):
             source = files, self.targets, self.target_images, self.record.scene_sha256
@@ -192,7 +192,21 @@ class ChartRun:
                 facts, pictures = self._measure(scene, held_out, out, threads)
         facts["notes"] = (*notes, *facts.get("notes", ()))
         record = replace(self.record, environment=environment(threads), **facts)
-        return _report(files, record), pictures
+        size = files.ply.stat().st_size
+        report = {
+            **document_head(),
+            "input": {"path": os.fspath(files.ply), "bytes": size, "num_gaussians": record.num_input or 0},
+            "output": {"bytes": record.bytes or 0, "num_gaussians": record.count or 0},
+            "levels": [],
+            "ratio": record.ratio,
+            "psnr_input_views": {"before": None, "after": record.value("psnr_context")},
+            "total_seconds": record.seconds or 0.0,
+            "peak_memory_bytes": peak_memory(),
+            "unmet": None,
+            "notes": list(record.notes),
+            "run": asdict(record),
+        }
+        return report, pictures
 
     def _measure(
         self, scene: Scene, held_out: HeldOutViews | None, out: Path, threads: int | None
@@ -229,7 +243,7 @@ class ChartRun:
         return facts, pictures
 
     def _measure_superpixels(self, scene: Scene, out: Path) -> tuple[dict[str, Any], list[Path]]:
-        """Measure how well superpixels alone approximate a few photos (paper, section 5), as stages are: by name."""
+        """Measure the quality of superpixels alone as approximations of a few photos, by name (paper, section 5)."""
         if scene.images is None:
             return {"notes": ("no photos to measure superpixels on",)}, []
         photos = scene.images[pick_views(len(scene), self.record.views_asked or len(scene))]
@@ -265,9 +279,9 @@ def _load(
 
 
 def choose_views(scene: Scene, held_out: HeldOutViews | None, count: int | None) -> tuple[Scene, Views | None]:
-    """Choose ``count`` of the scene's views, evenly spread, and the held-out ones nearest the middle between them.
+    """Choose ``count`` of the scene's views, evenly spread, and held-out views nearest the middle between them.
 
-    Without ``count`` all views are kept, and where their places along the trajectory are not known all held-out ones.
+    Without ``count`` all views are kept, and where their places along the trajectory are not known all held-out views.
     """
     if count is None or count >= len(scene):
         return scene, held_out
@@ -325,28 +339,7 @@ def _write(path: Path, picture: Picture) -> None:
     if width > MAX_WIDTH:
         size = MAX_WIDTH, max(1, round(height * MAX_WIDTH / width))
         picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
-    settings = [cv2.IMWRITE_JPEG_QUALITY, QUALITY] if path.suffix == ".jpg" else []
-    _, data = cv2.imencode(path.suffix, picture[..., ::-1], settings)
-    with atomic_output(path, overwrite=True) as temporary:
-        temporary.write_bytes(data.tobytes())
-
-
-def _report(files: SceneFiles, record: RunRecord) -> dict[str, Any]:
-    """Make the report of a run with the keys that the records of a batch have, and the run's own record in it."""
-    size = files.ply.stat().st_size
-    return {
-        **document_head(),
-        "input": {"path": os.fspath(files.ply), "bytes": size, "num_gaussians": record.num_input or 0},
-        "output": {"bytes": record.bytes or 0, "num_gaussians": record.count or 0},
-        "levels": [],
-        "ratio": record.ratio,
-        "psnr_input_views": {"before": None, "after": record.value("psnr_context")},
-        "total_seconds": record.seconds or 0.0,
-        "peak_memory_bytes": peak_memory(),
-        "unmet": None,
-        "notes": list(record.notes),
-        "run": asdict(record),
-    }
+    save_picture(path, picture, *((cv2.IMWRITE_JPEG_QUALITY, QUALITY) if path.suffix == ".jpg" else ()))
 
 
 def environment(threads: int | None) -> dict[str, str]:

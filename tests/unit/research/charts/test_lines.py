@@ -18,7 +18,6 @@ from gsmerge.research.charts.lines import (
     mean_interval,
     paired_difference,
     paired_intervals,
-    pareto_front,
     quality_at,
     size_label,
 )
@@ -177,28 +176,6 @@ def test_paired_intervals_of_one_scene_or_one_condition() -> None:
     assert paired_intervals(np.array([[1.0], [3.0]])) == [mean_interval([1.0, 3.0])]
 
 
-def test_front_by_hand() -> None:
-    costs, qualities = [1, 2, 2, 3, 4, 5], [10, 9, 12, 12, 11, 13]
-    assert pareto_front(costs, qualities) == [0, 2, 5]
-    assert pareto_front([], []) == []
-    assert pareto_front([1, 1], [5, 5]) == [0]
-
-
-def test_front_holds_what_nothing_beats() -> None:
-    rng = np.random.default_rng(1)
-    costs, qualities = rng.integers(1, 9, 40).tolist(), rng.integers(1, 9, 40).tolist()
-    front = pareto_front(costs, qualities)
-
-    def beaten(i: int) -> bool:
-        better = [(costs[j] <= costs[i] and qualities[j] > qualities[i]) for j in range(40)]
-        cheaper = [(costs[j] < costs[i] and qualities[j] >= qualities[i]) for j in range(40)]
-        return any(better) or any(cheaper)
-
-    points = {(costs[i], qualities[i]) for i in range(40) if not beaten(i)}
-    assert {(costs[i], qualities[i]) for i in front} == points
-    assert len(front) == len(points)
-
-
 def test_quality_between_beyond_and_below() -> None:
     costs, qualities = [1.0, 100.0, 10.0], [20.0, 26.0, 22.0]
     assert quality_at(costs, qualities, math.sqrt(10)) == pytest.approx(21)
@@ -207,6 +184,15 @@ def test_quality_between_beyond_and_below() -> None:
     assert quality_at(costs, qualities, 0.99) is None
     assert quality_at([], [], 1.0) is None
     assert quality_at([1, 10, 100], [20, 25, 22], 100) == 25  # a worse and dearer point does not pull the front down
+
+
+def test_quality_at_a_point_is_the_best_of_those_as_cheap() -> None:
+    rng = np.random.default_rng(1)
+    costs, qualities = rng.integers(1, 9, 40).tolist(), rng.integers(1, 9, 40).tolist()
+    for i in range(40):
+        if all(qualities[j] < qualities[i] for j in range(40) if costs[j] < costs[i]):
+            best = max(qualities[j] for j in range(40) if costs[j] <= costs[i])
+            assert quality_at(costs, qualities, costs[i]) == best
 
 
 OURS = {scene: [(1.0, 20.0 + i), (10.0, 24.0 + i)] for i, scene in enumerate("abc")}
