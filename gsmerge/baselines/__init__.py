@@ -1,8 +1,8 @@
-"""Baselines, other methods behind one interface, run by ``compact(scene, method=NAME)``."""
+"""Baselines: other methods behind one interface, run by ``compact(scene, method=NAME)``."""
 
 from __future__ import annotations
 
-from gsmerge.baselines import greedy, simple, splat_transform, voxel
+from gsmerge.baselines import greedy, simple, voxel
 from gsmerge.baselines.baseline import Baseline
 from gsmerge.errors import UsageError
 from gsmerge.options import CompactOptions, setting_names
@@ -22,14 +22,14 @@ _ALL = (
     Baseline("random", simple.prune_at_random),
     Baseline("blocks", simple.merge_blocks, needs=("pixels",)),
     Baseline("greedy", greedy.run),
-    Baseline("splat-transform", splat_transform.run, needs=("node",)),
+    Baseline("splat-transform", simple.splat_transform, needs=("node",)),
 )
 BASELINES = {baseline.name: baseline for baseline in _ALL}
 COMMON_SETTINGS = {"method", "seed", "threads", "crop", "drop_floaters", "drop_sky"}  # that every method uses
 
 
 def find_baseline(name: str) -> Baseline | None:
-    """The baseline of that name, None for our own method, "gsmerge"; a ValueError if there is none of that name."""
+    """Find a baseline by name; None for our own method, "gsmerge". A ValueError if there is none of that name."""
     if name == "gsmerge":
         return None
     if name not in BASELINES:
@@ -38,10 +38,9 @@ def find_baseline(name: str) -> Baseline | None:
 
 
 def choose_method(options: CompactOptions, scene: Scene, ours: Build) -> Build:
-    """Choose what builds the Gaussians: ``ours`` or a baseline; a note says which settings a baseline does not use.
+    """Choose the builder of the Gaussians: ``ours`` or a baseline, with a note on settings that it does not use.
 
-    Raises:
-        UsageError: If the scene does not have what a baseline needs, or its program is missing.
+    A UsageError if the scene does not have what a baseline needs, or its program is missing.
     """
     baseline, notes = choose_baseline(options, scene)
     for text in notes:
@@ -50,10 +49,9 @@ def choose_method(options: CompactOptions, scene: Scene, ours: Build) -> Build:
 
 
 def choose_baseline(options: CompactOptions, scene: Scene) -> tuple[Baseline | None, list[str]]:
-    """Find the baseline of the options, fit for the scene, and a note on changed settings that it does not use.
+    """Find the baseline of the options, and a note on changed settings that it does not use.
 
-    Raises:
-        UsageError: If the scene does not have what it needs, or a program is missing.
+    A UsageError if the scene does not have what it needs, or a program is missing.
     """
     baseline = find_baseline(options.method)
     if baseline is None:
@@ -72,4 +70,4 @@ def choose_baseline(options: CompactOptions, scene: Scene) -> tuple[Baseline | N
 def check_program(baseline: Baseline) -> None:
     """Raise a UsageError if a method's program is missing."""
     if "node" in baseline.needs:
-        splat_transform.find_program()
+        simple.find_program()

@@ -1,4 +1,4 @@
-"""What a baseline (another method) is: a name, what it needs, which settings it uses, and a function."""
+"""Interface of baselines (other methods): a name, needs, settings in use, and a function."""
 
 from __future__ import annotations
 
@@ -42,19 +42,19 @@ class Baseline:
 
 
 def own_gaussians(scene: Scene) -> Gaussians:
-    """The Gaussians that the file has, without the rows that only stand in for missing or broken ones."""
+    """Return the Gaussians that the file has, without rows that only stand in for missing or broken ones."""
     if scene.aligned and not bool(scene.stored.all()):
         return scene.gaussians[scene.stored.reshape(-1)]
     return scene.gaussians
 
 
 def view_shares(count: int, num_views: int, max_per_view: int) -> list[int]:
-    """A number divided evenly among the views, at most ``max_per_view`` each; the first views get the rest."""
+    """Divide a number evenly among the views, at most ``max_per_view`` each; the first views get the rest."""
     return [min(max_per_view, count // num_views + (view < count % num_views)) for view in range(num_views)]
 
 
 def most_important(importance: np.ndarray, count: int) -> np.ndarray:
-    """Indices, rising, of the ``count`` most important Gaussians, or all; of equal ones the first are kept.
+    """Find the rising indices of the ``count`` most important Gaussians, or all; of equal ones the first.
 
     ``importance [n]`` is for instance the summed blending weight over all photos. A ValueError if ``count`` is below 0.
     """
@@ -65,7 +65,7 @@ def most_important(importance: np.ndarray, count: int) -> np.ndarray:
 
 
 def merge_groups(prepared: Prepared, groups: Groups, rule: Literal["depth", "paper"] = "depth") -> Gaussians:
-    """One Gaussian for each group, without matching across views; groups that hold nothing are left out."""
+    """Make one Gaussian for each group, without matching across views; empty groups are left out."""
     members = assign(prepared.scene, groups)
     features = encode(prepared.scene, members, groups, rule=rule)
     with stage("decode"):

@@ -1,9 +1,9 @@
 """Pairwise greedy merging, the idea of NanoGS (2026) and of splat-transform's decimation.
 
-Round after round: a graph of nearest neighbours, the cost of merging every two that are joined, disjoint pairs in
-the order of their cost, and each pair replaced by the Gaussian with its moments. Weights are opacity times the area
-of the ellipsoid, which adds up and so gives the opacity back in the end, at most 1 (as splat-transform has it). The
-cost is Runnalls' bound on the Kullback-Leibler divergence (2007), per unit of weight, plus the squared distance of the
+Each round builds a graph of nearest neighbours, the cost of merging every two that are joined, disjoint pairs in the
+order of their cost, and replaces each pair by the Gaussian with its moments. Weights are opacity times the area of the
+ellipsoid, which adds up and so gives the opacity back in the end, at most 1 (as splat-transform has it). The cost is
+Runnalls' bound on the Kullback-Leibler divergence (2007), per unit of weight, plus the squared distance of the
 harmonics: it knows no size, a far pair costs what a near one does.
 """
 
@@ -37,7 +37,7 @@ UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """n Gaussians in the form that is merged."""
+    """n Gaussians as moments, the form that is merged."""
 
     means: Floats  # ``[n,3]``
     covars: Floats  # ``[n,6]`` upper triangles: xx, xy, xz, yy, yz, zz
@@ -50,20 +50,20 @@ class Cloud:
 
 
 def area(scales: Floats) -> Floats:
-    """``[n]`` surfaces of ellipsoids with half axes ``[n,3]``, within 1 % (Knud Thomsen's formula)."""
+    """Compute the surfaces ``[n]`` of ellipsoids with half axes ``[n,3]``, within 1 % (Knud Thomsen's formula)."""
     a, b, c = (scales**AREA_EXPONENT).T
     return 4 * np.pi * ((a * b + a * c + b * c) / 3) ** (1 / AREA_EXPONENT)
 
 
 def log_determinants(covars: Floats) -> Floats:
-    """``[n]`` logarithms of the determinants of upper triangles ``[n,6]``."""
+    """Compute the logarithms ``[n]`` of the determinants of upper triangles ``[n,6]``."""
     xx, xy, xz, yy, yz, zz = covars.T
     values = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
     return np.log(np.maximum(values, 1e-300))
 
 
 def cloud_of(gaussians: Gaussians) -> Cloud:
-    """Moments and masses of some Gaussians; flat ones get a little thickness."""
+    """Compute moments and masses of Gaussians; flat ones get a little thickness."""
     scales = gaussians.scales.astype(np.float64)
     scales = np.maximum(scales, MIN_FLATNESS * scales.max(1, keepdims=True).clip(1e-12))
     full = covariances(gaussians.quats.astype(np.float64), scales)
@@ -76,7 +76,7 @@ def cloud_of(gaussians: Gaussians) -> Cloud:
 
 
 def gaussians_of(cloud: Cloud) -> Gaussians:
-    """Back again: opacity is mass over area, at most just below 1."""
+    """Convert moments back to Gaussians; opacity is mass over area, at most just below 1."""
     scales, quats = principal_axes(cloud.covars[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3))
     sh = cloud.sh.reshape(len(cloud), -1, 3)
     return Gaussians(
@@ -90,7 +90,7 @@ def gaussians_of(cloud: Cloud) -> Gaussians:
 
 
 def merge_moments(cloud: Cloud, left: Ints, right: Ints) -> tuple[Floats, Floats, Floats]:
-    """Shares ``[m]`` of the left ones, means ``[m,3]`` and covariances ``[m,6]`` of merged pairs."""
+    """Compute shares ``[m]`` of the left ones, means ``[m,3]`` and covariances ``[m,6]`` of merged pairs."""
     share = cloud.masses[left] / (cloud.masses[left] + cloud.masses[right])
     p, q = share[:, None], 1 - share[:, None]
     apart = cloud.means[left] - cloud.means[right]
@@ -100,14 +100,14 @@ def merge_moments(cloud: Cloud, left: Ints, right: Ints) -> tuple[Floats, Floats
 
 
 def pair_costs(cloud: Cloud, left: Ints, right: Ints) -> Floats:
-    """``[m]`` what merging two costs: Runnalls' bound over their common weight, and the distance of the harmonics."""
+    """Compute the costs ``[m]`` of merging: Runnalls' bound over the common weight, and the distance of harmonics."""
     share, _, covars = merge_moments(cloud, left, right)
     lost = log_determinants(covars) - share * cloud.logdets[left] - (1 - share) * cloud.logdets[right]
     return 0.5 * lost + COLOR_WEIGHT * ((cloud.sh[left] - cloud.sh[right]) ** 2).sum(1)
 
 
 def neighbor_pairs(cloud: Cloud) -> tuple[Ints, Ints, Floats]:
-    """Every two of which one is among the other's nearest, once: the lower row, the higher one, the cost."""
+    """List every two of which one is among the other's nearest, once: the lower row, the higher one, the cost."""
     from scipy.spatial import cKDTree
 
     with use_threads() as threads:
@@ -132,7 +132,7 @@ def neighbor_pairs(cloud: Cloud) -> tuple[Ints, Ints, Floats]:
 
 
 def cheapest_disjoint(left: Ints, right: Ints, costs: Floats, limit: int) -> Ints:
-    """At most ``limit`` pairs without a common member, as taken one by one in the order of their costs ``[m]``.
+    """Choose at most ``limit`` pairs without a common member, one by one in the order of their costs ``[m]``.
 
     A pair that is the cheapest of both of its members is taken sooner or later, whatever comes before it; so all of
     those are taken at once, and again among the rest. Of equal costs the first pair counts as cheaper. The result is
@@ -155,7 +155,7 @@ def cheapest_disjoint(left: Ints, right: Ints, costs: Floats, limit: int) -> Int
 
 
 def merge_pairs(cloud: Cloud, left: Ints, right: Ints) -> Cloud:
-    """Those in no pair in their order, then the merged pairs."""
+    """Merge pairs, and put them after the Gaussians in no pair, which keep their order."""
     share, means, covars = merge_moments(cloud, left, right)
     alone = np.ones(len(cloud), bool)
     alone[left] = alone[right] = False
@@ -170,9 +170,9 @@ def merge_pairs(cloud: Cloud, left: Ints, right: Ints) -> Cloud:
 
 
 def reduce_to(cloud: Cloud, count: int) -> Cloud:
-    """Rounds of merging until ``count`` are left; nothing is done where there are no more.
+    """Merge in rounds until ``count`` are left; nothing is done where there are no more.
 
-    A round takes every pair that it can. Fewer at a time keep cheap regions growing while the rest stays as it is, and
+    A round takes every pair that it can. Fewer at a time keep cheap regions growing while the rest stays unmerged, and
     render worse: on a real capture by 0.6 dB at a third of the Gaussians a round, by 1.6 dB at a sixth.
     """
     while len(cloud) > max(count, 1):
@@ -183,7 +183,7 @@ def reduce_to(cloud: Cloud, count: int) -> Cloud:
 
 
 def run(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """Exactly ``count``; the input itself where it has no more."""
+    """Merge to exactly ``count`` Gaussians; the input itself where it has no more."""
     gaussians = own_gaussians(prepared.scene)
     if len(gaussians) <= count:
         return gaussians

@@ -1,12 +1,19 @@
-"""Baselines of a few lines: the input as it is or fitted, pruned, or merged over blocks of pixels or superpixels."""
+"""Baselines of a few lines: the input unmerged or fitted, pruned, merged over blocks, or by splat-transform."""
 
 from __future__ import annotations
 
+import os
+import shutil
+import subprocess
+import tempfile
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from gsmerge.baselines.baseline import merge_groups, most_important, own_gaussians, view_shares
+from gsmerge.errors import GsmergeError, UsageError
+from gsmerge.io import read_ply, write_ply
 from gsmerge.plan import Plan
 from gsmerge.render import contributions, plan_view, prepare
 from gsmerge.render.photos import scene_pictures
@@ -18,12 +25,15 @@ from gsmerge.stages.prepare import Prepared
 from gsmerge.stages.superpixels import grid_labels, superpixels
 from gsmerge.types import Cameras, Gaussians, Groups
 
+PROGRAM, VARIABLE = "splat-transform", "GSMERGE_SPLAT_TRANSFORM"
+INSTALL = "npm install -g @playcanvas/splat-transform@3.7.0"
+MAX_OUTPUT = 300  # characters of the program's own output in an error
 PAPER_SUPERPIXELS = "bass-st"  # BASS from seeds drawn by the Shi-Tomasi response
 MAX_PLANNED = 2_000_000  # Gaussians in the plans of the views under way: each plan is as large as they are
 
 
 def unmerged(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """All Gaussians, whatever the count."""
+    """Return all Gaussians, whatever the count."""
     return own_gaussians(prepared.scene)
 
 
@@ -38,21 +48,21 @@ def unmerged_fit(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
 
 
 def prune_by_opacity(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """The most opaque, unchanged and in their order; of equal ones the first of the file."""
+    """Keep the most opaque Gaussians, unchanged and in their order; of equal ones the first of the file."""
     gaussians = own_gaussians(prepared.scene)
     with stage("reduce"):
         return gaussians[most_important(gaussians.opacities, count)]
 
 
 def prune_by_contribution(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """Those that add most to the views (Mini-Splatting), unchanged and in their order; of equal ones the first."""
+    """Keep the Gaussians that add most to the views (Mini-Splatting), unchanged and in their order."""
     gaussians = own_gaussians(prepared.scene)
     with stage("reduce"):
         return gaussians[most_important(summed_weights(gaussians, prepared.scene.cameras), count)]
 
 
 def summed_weights(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
-    """``[n]`` float64 blending weights summed over the pixels of all views; the same on any number of threads."""
+    """Sum the blending weights ``[n]`` float64 over the pixels of all views; the same on any number of threads."""
     splats = prepare(gaussians)
     viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
 
@@ -68,7 +78,7 @@ def summed_weights(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
 
 
 def prune_at_random(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """A random choice that depends only on the seed, unchanged and in their order."""
+    """Keep a random choice that depends only on the seed, unchanged and in their order."""
     gaussians = own_gaussians(prepared.scene)
     with stage("reduce"):
         rng = np.random.default_rng(plan.seed)
@@ -76,7 +86,7 @@ def prune_at_random(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
 
 
 def merge_blocks(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """As many blocks as Gaussians, the same number in every view; those without a valid pixel are left out."""
+    """Merge as many blocks as Gaussians, the same number in every view; blocks without a valid pixel are left out."""
     scene = prepared.scene
     height, width = scene.cameras.height, scene.cameras.width
     with stage("segment"):
@@ -86,11 +96,11 @@ def merge_blocks(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
 
 
 def match_moments(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """The superpixel merging paper's moment matching: its baseline without a network ("Mom. Match.").
+    """Merge superpixels by the paper's moment matching, its baseline without a network ("Mom. Match.").
 
     One Gaussian for each superpixel: opacity-weighted mean and the spread of the members' means (eq. teacher_mean,
     teacher_cov). The paper states no opacity; the members' mean is taken. Superpixels are the paper's, as many as
-    Gaussians, the same number in every view; those that hold nothing are left out.
+    Gaussians, the same number in every view; empty ones are left out.
     """
     scene = prepared.scene
     counts = view_shares(count, len(scene), scene.pixels_per_view)
@@ -98,3 +108,36 @@ def match_moments(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
         pictures, views = scene_pictures(scene), range(len(scene))
         labels = parallel_map(lambda view: superpixels(pictures[view], counts[view], PAPER_SUPERPIXELS), views)
     return merge_groups(prepared, Groups(np.stack(labels), tuple(counts)), rule="paper")
+
+
+def find_program() -> str:
+    """Find the path of splat-transform; a UsageError if there is none."""
+    named = os.environ.get(VARIABLE)
+    program = shutil.which(named or PROGRAM)
+    if program is None:
+        place = f"at {VARIABLE}={named}" if named else f"on PATH or named by {VARIABLE}"
+        problem = f"expected the program {place}, found none; install it with: {INSTALL}"
+        raise UsageError(f"method splat-transform: {problem}")
+    return program
+
+
+def splat_transform(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
+    """Merge by PlayCanvas' splat-transform, an installed program: ``-d COUNT`` on the CPU, by its own defaults.
+
+    The input itself is returned where it has no more. Nothing is downloaded. Only the program's own run counts as time,
+    start-up included; handing the Gaussians over and back does not.
+    """
+    gaussians, program = own_gaussians(prepared.scene), find_program()
+    if len(gaussians) <= count:
+        return gaussians
+    with tempfile.TemporaryDirectory(prefix="gsmerge-") as folder:
+        before, after = Path(folder) / "in.ply", Path(folder) / "out.ply"
+        write_ply(before, gaussians)
+        command = [program, "-w", "-g", "cpu", str(before), "-d", str(count), str(after)]
+        with stage("reduce"):
+            done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False)
+        if done.returncode != 0 or not after.exists():
+            output = " ".join((done.stderr or done.stdout).decode(errors="replace").split())[-MAX_OUTPUT:]
+            problem = f"expected a decimated .ply, it ended with code {done.returncode}: {output or 'without output'}"
+            raise GsmergeError(f"{program}: {problem}")
+        return read_ply(after, opacity="logit").gaussians

@@ -25,14 +25,14 @@ MIN_OPACITY, MIN_SCALE = 1e-6, 1e-12  # least that logits and logarithms are tak
 
 
 def voxel_keys(means: np.ndarray, size: float) -> np.ndarray:
-    """``[n]`` int64: the voxel of each mean ``[n,3]``, by the nearest multiple of ``size``."""
+    """Number the voxel of each mean ``[n,3]``, ``[n]`` int64, by the nearest multiple of ``size``."""
     half = 1 << (BITS - 1)
     index = np.clip(np.rint(means / size), -half, half - 1).astype(np.int64) + half
     return (index[:, 0] << 2 * BITS) | (index[:, 1] << BITS) | index[:, 2]
 
 
 def voxel_size(means: np.ndarray, count: int) -> float:
-    """The smallest size, within a ten-thousandth octave, that leaves at most ``count`` voxels of ``[n,3]`` occupied."""
+    """Find the smallest size, within a ten-thousandth octave, that leaves at most ``count`` voxels occupied."""
 
     def occupied(octave: float) -> int:
         keys = np.sort(voxel_keys(means, 2.0**octave))
@@ -49,7 +49,7 @@ def voxel_size(means: np.ndarray, count: int) -> float:
 
 
 def fuse(gaussians: Gaussians, keys: np.ndarray) -> Gaussians:
-    """One Gaussian for each voxel, in the order of the keys ``[n]``: means with weights exp(opacity).
+    """Make one Gaussian for each voxel, in the order of the keys ``[n]``: means with weights exp(opacity).
 
     Rotations are averaged whatever the sign of their quaternions (Markley et al. 2007).
     """
@@ -80,7 +80,7 @@ def fuse(gaussians: Gaussians, keys: np.ndarray) -> Gaussians:
 
 
 def run(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """At most ``count`` voxels, and hardly fewer."""
+    """Merge to at most ``count`` voxels, and hardly fewer."""
     gaussians = own_gaussians(prepared.scene)
     with stage("reduce"):
         means = gaussians.means.astype(np.float64)

@@ -1,4 +1,4 @@
-"""How a scene is compacted under bad conditions: with worse views, poses, photos or rows."""
+"""Compaction of a scene under bad conditions: with worse views, poses, photos or rows."""
 
 from gsmerge.research.stress.cases import CASES, Case
 from gsmerge.research.stress.check import StressOutcome, stress

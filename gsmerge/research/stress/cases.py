@@ -1,4 +1,4 @@
-"""The cases: how a scene is changed, which scenes they are for, and the property that must hold.
+"""Cases of the stress test: how a scene is changed, which scenes they are for, and the property that must hold.
 
 Every change returns a new scene and applies to the views that results are compared with, too.
 """
@@ -49,29 +49,13 @@ class StressScene:
     views: Views | None  # held-out views in its world; None: its own views
 
 
-def fewer_views(given: StressScene, count: int) -> StressScene:
-    """``count`` of the views, at equal intervals."""
-    return replace(given, scene=subset(given.scene, even_views(len(given.scene), min(count, len(given.scene)))))
-
-
-def halve_views(given: StressScene) -> StressScene:
-    """About every second view."""
-    return fewer_views(given, max(1, len(given.scene) // 2))
-
-
-def reorder(given: StressScene) -> StressScene:
-    """The views in another order."""
-    order = np.random.default_rng(SEED).permutation(len(given.scene)).tolist()
-    return replace(given, scene=subset(given.scene, order))
-
-
-def repeat_views(given: StressScene) -> StressScene:
-    """Every view twice."""
-    return replace(given, scene=subset(given.scene, [*range(len(given.scene))] * 2))
+def keep_views(given: StressScene, choose: Callable[[int], Sequence[int]]) -> StressScene:
+    """Keep the views that ``choose`` lists, given their number."""
+    return replace(given, scene=subset(given.scene, choose(len(given.scene))))
 
 
 def move(given: StressScene, factor: float, shift: Sequence[float]) -> StressScene:
-    """The world scaled, and moved by ``shift`` in units of its own size."""
+    """Scale the world, and move it by ``shift`` in units of its own size."""
     offset = np.array(shift, np.float64) * scene_frame(given.scene).unit * factor
     scene, views = given.scene, given.views
     means = factor * scene.gaussians.means.astype(np.float64) + offset
@@ -89,14 +73,14 @@ def _move_cameras(cameras: Cameras, factor: float, offset: np.ndarray) -> Camera
 
 
 def perturb_poses(given: StressScene, degrees: float) -> StressScene:
-    """Every view, with its Gaussians, rotated about its camera centre by a random axis."""
+    """Rotate every view, with its Gaussians, about its camera centre by a random axis."""
     scene = given.scene
     viewmats = turn_cameras(scene.cameras.viewmats.astype(np.float64), degrees, slice(None))
     return replace(given, scene=move_views(scene, viewmats))
 
 
 def move_view(given: StressScene, share: float) -> StressScene:
-    """The middle view, with its Gaussians, moved sideways by a share of the scene's size."""
+    """Move the middle view, with its Gaussians, sideways by a share of the scene's size."""
     scene = given.scene
     view, viewmats = len(scene) // 2, scene.cameras.viewmats.astype(np.float64)
     step = viewmats[view, 0, :3] * share * scene_frame(scene).unit
@@ -105,7 +89,7 @@ def move_view(given: StressScene, share: float) -> StressScene:
 
 
 def turn_cameras(viewmats: np.ndarray, degrees: float, views: slice) -> np.ndarray:
-    """Some cameras, without their Gaussians, turned about their centres, each about another axis."""
+    """Turn some cameras, without their Gaussians, about their centres, each about another axis."""
     turned, rng = viewmats.copy(), np.random.default_rng(SEED)
     for view in range(len(viewmats))[views]:
         axis = rng.normal(size=3)
@@ -114,7 +98,7 @@ def turn_cameras(viewmats: np.ndarray, degrees: float, views: slice) -> np.ndarr
 
 
 def change_exposure(given: StressScene, share: float) -> StressScene:
-    """Photos, and the Gaussians of their views, alternately brighter and darker."""
+    """Make photos, and the Gaussians of their views, alternately brighter and darker."""
     scene = given.scene
     assert scene.images is not None
     gains = np.array([1 + share if view % 2 else 1 - share for view in range(len(scene))], np.float32)
@@ -127,7 +111,7 @@ def change_exposure(given: StressScene, share: float) -> StressScene:
 
 
 def break_rows(given: StressScene) -> StressScene:
-    """Rows without finite numbers, which the reader leaves out."""
+    """Take away the finite numbers of some rows, which the reader leaves out."""
     scene = given.scene
     chosen = _choose(len(scene.gaussians), BROKEN_SHARE)
     if not scene.aligned:
@@ -138,7 +122,7 @@ def break_rows(given: StressScene) -> StressScene:
 
 
 def throw_away(given: StressScene) -> StressScene:
-    """A few Gaussians a thousand times as far away."""
+    """Move a few Gaussians a thousand times as far away."""
     scene = given.scene
     chosen = _choose(len(scene.gaussians), FAR_SHARE)[:, None]
     means = np.where(chosen, 1000 * scene.gaussians.means, scene.gaussians.means)
@@ -146,7 +130,7 @@ def throw_away(given: StressScene) -> StressScene:
 
 
 def enlarge(given: StressScene) -> StressScene:
-    """Some Gaussians many times as large."""
+    """Make some Gaussians many times as large."""
     gaussians = given.scene.gaussians
     chosen = _choose(len(gaussians), LARGE_SHARE)[:, None]
     scales = np.where(chosen, LARGE_FACTOR * gaussians.scales, gaussians.scales)
@@ -154,7 +138,7 @@ def enlarge(given: StressScene) -> StressScene:
 
 
 def _choose(count: int, share: float) -> np.ndarray:
-    """``[count]`` bool: a random share of them, at least one."""
+    """Mark a random share of the rows, ``[count]`` bool, at least one."""
     chosen = np.zeros(count, bool)
     chosen[np.random.default_rng(SEED).choice(count, max(1, round(share * count)), replace=False)] = True
     return chosen
@@ -178,7 +162,7 @@ class Case:
 
 
 def _rewrite_poses(direction: str, axes: str) -> Case:
-    """Poses in another convention; "camera-to-world" and "OpenCV" make "c2w-opencv"."""
+    """Make a case of poses in another convention, such as "c2w-opencv" of "camera-to-world" and "OpenCV"."""
     name = direction[0] + "2" + direction.split("-")[2][0] + "-" + axes.lower()
     return Case(name, f"poses written {direction}, {axes} axes", "convention", "file", convention=(direction, axes))
 
@@ -187,11 +171,15 @@ CASES: dict[str, Case] = {
     case.name: case
     for case in (
         Case("unchanged", "the scene as it is", "better"),
-        Case("views-half", "half of the views", "better", "pixels", halve_views),
-        Case("views-3", "three views", "better", "pixels", partial(fewer_views, count=3)),
-        Case("views-1", "one view", "better", "pixels", partial(fewer_views, count=1)),
-        Case("order", "views in another order", "same", "pixels", reorder),
-        Case("twice", "every view twice", "once", "pixels", repeat_views),
+        Case("views-half", "half of the views", "better", "pixels",
+             partial(keep_views, choose=lambda num: even_views(num, max(1, num // 2)))),
+        Case("views-3", "three views", "better", "pixels",
+             partial(keep_views, choose=lambda num: even_views(num, min(3, num)))),
+        Case("views-1", "one view", "better", "pixels", partial(keep_views, choose=lambda num: even_views(num, 1))),
+        Case("order", "views in another order", "same", "pixels",
+             partial(keep_views, choose=lambda num: np.random.default_rng(SEED).permutation(num).tolist())),
+        Case("twice", "every view twice", "once", "pixels",
+             partial(keep_views, choose=lambda num: [*range(num)] * 2)),
         Case("poses-0.2", "poses 0.2 degrees off", "better", "photos", partial(perturb_poses, degrees=0.2)),
         Case("poses-1", "poses 1 degree off", "better", "photos", partial(perturb_poses, degrees=1.0)),
         Case("poses-5", "poses 5 degrees off", "better", "photos", partial(perturb_poses, degrees=5.0)),

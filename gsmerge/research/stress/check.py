@@ -1,4 +1,4 @@
-"""Runs the cases on a scene and checks the property of each."""
+"""Runs of the stress cases on a scene, and checks of the property of each."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class StressOutcome:
-    """The outcome of one case."""
+    """Outcome of one case."""
 
     case: str  # its name
     change: str  # how the scene was changed, in words
@@ -42,7 +42,7 @@ class StressOutcome:
     seconds: float  # wall time
 
     def to_dict(self) -> dict[str, Any]:
-        """The outcome under the keys of the report."""
+        """Return the outcome under the keys of the report."""
         keys = ("case", "words", "wanted", "held", "found", "seconds")
         return dict(zip(keys, vars(self).values(), strict=True))
 
@@ -81,7 +81,8 @@ def stress(
     if len(load.scene) == 0:
         raise UsageError("expected a scene with views, got none")
     options = options or CompactOptions()
-    report = progress or (lambda *_: None)
+    report, slack = progress or (lambda *_: None), _slack(options)
+    limits = {"same": MAX_SAME + slack, "near": MAX_NEAR + slack, "worse": MAX_WORSE}
     given = StressScene(load.scene, targets)
     base = _run(given, options) if any(CASES[name].needs not in ("file", "pixel-file") for name in names) else None
     out = []
@@ -89,8 +90,8 @@ def stress(
         case, start = CASES[name], time.perf_counter()
         report(case.words, i, len(names))
         passed, measured = _check_case(case, load, given, base, options, hints)
-        seconds = time.perf_counter() - start
-        out.append(StressOutcome(name, case.words, _property_text(case, options), passed, measured, seconds))
+        seconds, expected = time.perf_counter() - start, PROPERTIES[case.check].format(**limits)
+        out.append(StressOutcome(name, case.words, expected, passed, measured, seconds))
     report("done", len(names), len(names))
     return tuple(out)
 
@@ -98,7 +99,7 @@ def stress(
 def _check_case(
     case: Case, load: SceneLoad, given: StressScene, base: _Result | None, options: CompactOptions, hints: ReadHints
 ) -> tuple[bool | None, str]:
-    """Whether the case's property holds, and the figures."""
+    """Check whether the case's property holds, and return that with the figures."""
     problem = _inapplicable(case, load)
     if problem is not None:
         return None, problem
@@ -120,7 +121,7 @@ def _check_case(
 
 
 def _inapplicable(case: Case, load: SceneLoad) -> str | None:
-    """Why a case does not apply to a scene; None where it does."""
+    """Say why a case does not apply to a scene; None where it does."""
     scene = load.scene
     if case.needs in ("pixels", "photos", "pixel-file") and not scene.aligned:
         return "needs a Gaussian for each pixel"
@@ -140,7 +141,7 @@ def _run(given: StressScene, options: CompactOptions) -> _Result:
 
 
 def _quality(given: StressScene, gaussians: Gaussians) -> tuple[float, float]:
-    """PSNR (dB) of the input and of a result on the views; the input's is infinite where it is the reference itself."""
+    """Measure the PSNR (dB) of the input and of a result on the views; infinite for an input that is the reference."""
     evaluation = evaluate(given.scene, {"result": gaussians}, given.views, replace(_QUICK, context=given.views is None))
     split = "context" if given.views is None else "target"
     before, after = (one.mean(split)[1].psnr for one in evaluation.results)
@@ -149,11 +150,6 @@ def _quality(given: StressScene, gaussians: Gaussians) -> tuple[float, float]:
 
 def _slack(options: CompactOptions) -> float:
     return FIT_SLACK if options.fit.fit == "full" else 0.0
-
-
-def _property_text(case: Case, options: CompactOptions) -> str:
-    slack = _slack(options)
-    return PROPERTIES[case.check].format(same=MAX_SAME + slack, near=MAX_NEAR + slack, worse=MAX_WORSE)
 
 
 def _check_result(case: Case, base: _Result, result: _Result, slack: float) -> tuple[bool, str]:
@@ -176,7 +172,7 @@ def _check_result(case: Case, base: _Result, result: _Result, slack: float) -> t
 
 
 def _check_again(given: StressScene, base: _Result, options: CompactOptions) -> tuple[bool, str]:
-    """The result as a scene of its own, compacted to as many Gaussians as it has."""
+    """Compact the result as a scene of its own to as many Gaussians as it has."""
     scene = given.scene
     unaligned = Scene(base.gaussians, scene.cameras, scene.images, None, scene.names)
     once = replace(options, budget=BudgetOptions(budget=len(base.gaussians)), decode=replace(options.decode, k=1))
@@ -185,7 +181,7 @@ def _check_again(given: StressScene, base: _Result, options: CompactOptions) -> 
 
 
 def _check_convention(case: Case, load: SceneLoad, hints: ReadHints) -> tuple[bool, str]:
-    """The scene read from cameras whose poses are in another convention than that of their format."""
+    """Read the scene from cameras whose poses are in another convention than that of their format."""
     assert load.cameras is not None
     assert case.convention is not None
     stored = from_viewmats(load.cameras.viewmats, case.convention)
@@ -201,7 +197,7 @@ def _check_convention(case: Case, load: SceneLoad, hints: ReadHints) -> tuple[bo
 
 
 def _check_cameras(case: Case, load: SceneLoad, hints: ReadHints) -> tuple[bool, str]:
-    """The scene read from cameras that are off, whose Gaussians are not."""
+    """Read the scene from cameras that are off, with Gaussians that are not."""
     assert load.cameras is not None
     assert case.cameras is not None
     wrong = replace(load.cameras, viewmats=case.cameras(load.cameras.viewmats))
@@ -215,7 +211,7 @@ def _check_cameras(case: Case, load: SceneLoad, hints: ReadHints) -> tuple[bool,
 
 
 def _read_again(load: SceneLoad, cameras: CameraFile, hints: ReadHints) -> SceneLoad:
-    """The scene's own file with other cameras."""
+    """Read the scene's own file with other cameras."""
     opacity: OpacityChoice = "raw" if load.ply.opacity_encoding == "raw" else "logit"
     return align_scene(
         read_ply_with_hints(load.files.ply, opacity=opacity, hints=hints), load.files, cameras, hints=hints
@@ -223,7 +219,7 @@ def _read_again(load: SceneLoad, cameras: CameraFile, hints: ReadHints) -> Scene
 
 
 def _find_defect(gaussians: Gaussians, scene: Scene) -> str | None:
-    """What is wrong with a result for any scene; None where nothing is."""
+    """Say what is wrong with a result for any scene; None where nothing is."""
     for name in _FIELDS:
         if not np.isfinite(getattr(gaussians, name)).all():
             return f"{name} are not finite"

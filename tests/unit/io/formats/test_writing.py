@@ -13,7 +13,7 @@ from plyfile import PlyData
 from tiny_scene import Tiny
 
 from gsmerge import Scene
-from gsmerge.baselines.splat_transform import find_program
+from gsmerge.baselines.simple import find_program
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry import normalize
 from gsmerge.io import (
