@@ -1,4 +1,4 @@
-"""Rays of a pinhole camera against a list of shapes: the nearest hit of every pixel.
+"""Casting of rays of a pinhole camera against a list of shapes: the nearest hit of every pixel.
 
 Every shape has a frame of its own (centre, rotation local to world) and half sizes x, y, z along its axes:
 
@@ -155,7 +155,7 @@ def _march(waves, pace, first, last, ox, oy, oz, dx, dy, dz):
 
 @kernel
 def _hit(kind, s, waves, reach, slope, limit, ox, oy, oz, dx, dy, dz):
-    """Compute the depth of the nearest hit, in the shape's own frame; what lies beyond ``limit`` need not be found."""
+    """Compute the depth of the nearest hit, in the shape's own frame, if it is nearer than ``limit``."""
     if kind in (QUAD, LEAF):
         return _flat(kind == LEAF, s, ox, oy, oz, dx, dy, dz)
     if kind == BOX:

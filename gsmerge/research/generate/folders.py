@@ -1,4 +1,4 @@
-"""Many synthetic scenes in folders, each complete or absent; existing ones are not made again."""
+"""Folders of synthetic scenes, each complete or absent; existing ones are not made again."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import write_ply
 from gsmerge.io.atomic import remove_stale, temporary_path
 from gsmerge.research.generate.photograph import Float
-from gsmerge.research.generate.synthetic_scene import GenerateOptions, SyntheticScene, make_scene
+from gsmerge.research.generate.synthetic_scene import GenerateOptions, make_scene
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import Cameras
 
 
 @dataclass(frozen=True)
 class SceneFolder:
-    """The folder of one scene of a series, and whether the scene existed already."""
+    """Folder of one scene of a series, and whether the scene existed already."""
 
     folder: Path
     kept: bool
@@ -60,7 +60,20 @@ def generate_scene(
     key = scene_key(seed, index, options)
     if not is_complete(folder, key):
         check_replaceable(folder, overwrite=overwrite)
-        write_scene(folder, make_scene(seed, index, options), key)
+        scene = make_scene(seed, index, options)
+        record = {
+            **key,
+            "style": scene.style,
+            "path": scene.path,
+            "num_views": len(scene.cameras),
+            "num_gaussians": len(scene.gaussians),
+            "noise": asdict(scene.noise),
+        }
+        with _folder(folder) as temporary:
+            _write_views(temporary, scene.cameras, scene.images)
+            _write_views(temporary / "targets", scene.targets, scene.target_images)
+            write_ply(temporary / "scene.ply", scene.gaussians)
+            (temporary / RECORD).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     return folder
 
 
@@ -112,7 +125,7 @@ def scene_key(seed: int, index: int, options: GenerateOptions) -> dict[str, Any]
 
 
 def is_complete(folder: Path, key: Mapping[str, Any]) -> bool:
-    """Say whether a folder holds this scene."""
+    """Return whether a folder holds this scene."""
     try:
         record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -122,32 +135,12 @@ def is_complete(folder: Path, key: Mapping[str, Any]) -> bool:
 
 def check_replaceable(folder: Path, *, overwrite: bool) -> None:
     """Raise a UsageError where a folder holds no synthetic scene, or one of other options without ``overwrite``."""
-    if not os.path.lexists(folder):
-        return
-    if not (folder / RECORD).is_file():
+    if os.path.lexists(folder) and not (folder / RECORD).is_file():
         problem = "expected no folder, or a synthetic scene, found something else; choose another OUT"
-    elif not overwrite:
+        raise UsageError(f"{folder}: {problem}")
+    if os.path.lexists(folder) and not overwrite:
         problem = "holds a scene of other options; pass --overwrite to replace it, or choose another OUT"
-    else:
-        return
-    raise UsageError(f"{folder}: {problem}")
-
-
-def write_scene(folder: Path, scene: SyntheticScene, key: Mapping[str, Any]) -> None:
-    """Write a scene, in place of an existing one; a SceneError if it cannot be written."""
-    record = {
-        **key,
-        "style": scene.style,
-        "path": scene.path,
-        "num_views": len(scene.cameras),
-        "num_gaussians": len(scene.gaussians),
-        "noise": asdict(scene.noise),
-    }
-    with _folder(folder) as temporary:
-        _write_views(temporary, scene.cameras, scene.images)
-        _write_views(temporary / "targets", scene.targets, scene.target_images)
-        write_ply(temporary / "scene.ply", scene.gaussians)
-        (temporary / RECORD).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+        raise UsageError(f"{folder}: {problem}")
 
 
 @contextmanager

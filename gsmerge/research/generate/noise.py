@@ -1,4 +1,4 @@
-"""The output of a simulated feed-forward network for a view: depth, confidence, and one Gaussian for each pixel."""
+"""Output of a simulated feed-forward network for a view: depth, confidence, and one Gaussian for each pixel."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def draw_noise(options: NoiseOptions, rng: np.random.Generator, factor: float = 
 
 @dataclass(frozen=True)
 class TrueView:
-    """The photo of a view, exact geometry at the pixels' centres, and the network's estimate of the pose."""
+    """Photo of a view, exact geometry at the pixels' centres, and the network's estimate of the pose."""
 
     image: Float  # [h,w,3] sRGB
     depth: Array  # [h,w] along z

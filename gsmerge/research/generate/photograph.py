@@ -60,7 +60,7 @@ class Pinhole:
 
     @property
     def intrinsics(self) -> Array:
-        """``[3,3]``, the principal point in the middle."""
+        """Intrinsics ``[3,3]`` with the principal point in the middle."""
         return np.array([[self.focal, 0, self.width / 2], [0, self.focal, self.height / 2], [0, 0, 1.0]])
 
 

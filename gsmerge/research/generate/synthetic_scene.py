@@ -115,7 +115,7 @@ PATHS: dict[str, Path] = {
 
 
 def is_usable(hits: Hits) -> bool:
-    """Say whether a view is neither inside a shape nor too close to one."""
+    """Return whether a view is neither inside a shape nor too close to one."""
     depth = hits.depth[hits.depth < FAR]
     if depth.size < 0.6 * hits.depth.size:
         return False
@@ -177,7 +177,8 @@ def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScen
     path = options.path if options.path != MIXED else list(PATHS)[rng.integers(len(PATHS))]
     noise = draw_noise(options.ranges, rng, options.noise)
     lens = Pinhole(options.width, options.height, max(options.width, options.height) * rng.uniform(0.58, 1.75))
-    large = _scale(lens, options.photo_scale)  # of the photos; the network sees them at the views' size
+    scale = options.photo_scale
+    large = Pinhole(scale * lens.width, scale * lens.height, scale * lens.focal)  # of the photos
     view, pose = _find_stage(rng, style, path, large, num_views)
     places = np.linspace(0, 1, 2 * num_views - 1)
     poses = [pose(s) for s in places]
@@ -206,10 +207,6 @@ def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScen
         path=path,
         noise=noise,
     )
-
-
-def _scale(lens: Pinhole, factor: int) -> Pinhole:
-    return Pinhole(factor * lens.width, factor * lens.height, factor * lens.focal)
 
 
 def _shrink(lens: Pinhole) -> Pinhole:

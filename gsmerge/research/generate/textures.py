@@ -55,15 +55,6 @@ def grid(size: int) -> tuple[Grey, Grey]:
     return x, y
 
 
-def warp(picture: Grey, dx: Grey, dy: Grey, amount: float) -> Grey:
-    """Displace a picture by ``dx`` and ``dy`` (0 to 1) times ``amount``, a share of its side."""
-    size = len(picture)
-    x, y = grid(size)
-    at_x = (x + amount * (dx - 0.5)) * size - 0.5
-    at_y = (y + amount * (dy - 0.5)) * size - 0.5
-    return cv2.remap(picture, at_x % size, at_y % size, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
-
-
 def courses(
     rng: np.random.Generator, size: int, rows: int, columns: int, *, joint: float, offset: float
 ) -> tuple[Grey, Grey]:
@@ -215,7 +206,11 @@ def bricks(rng: np.random.Generator, size: int) -> Picture:
     low, high = shades(rng, base, 0.35)
     tone, joint = courses(rng, size, rows, rows // 2, joint=rng.uniform(0.05, 0.1), offset=0.5)
     dx, dy = (noise(rng, size, first=16, fade=0.6) for _ in range(2))
-    tone, joint = (warp(picture, dx, dy, 0.01) for picture in (tone, joint))
+    x, y = grid(size)
+    at_x, at_y = (((at + 0.01 * (shift - 0.5)) * size - 0.5) % size for at, shift in ((x, dx), (y, dy)))
+    tone, joint = (
+        cv2.remap(picture, at_x, at_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP) for picture in (tone, joint)
+    )
     out = mix(low, high, 0.5 * tone + 0.5 * noise(rng, size, first=8, fade=0.85))
     return out + (color(rng, strength=(0, 0.15), light=(0.4, 0.8)) - out) * joint[..., None]
 
