@@ -42,7 +42,7 @@ class Baseline:
 
 
 def own_gaussians(scene: Scene) -> Gaussians:
-    """Return the Gaussians that the file has, without rows that only stand in for missing or broken ones."""
+    """Return the Gaussians of the file, without rows that only stand in for missing or broken Gaussians."""
     if scene.aligned and not bool(scene.stored.all()):
         return scene.gaussians[scene.stored.reshape(-1)]
     return scene.gaussians
@@ -54,7 +54,7 @@ def view_shares(count: int, num_views: int, max_per_view: int) -> list[int]:
 
 
 def most_important(importance: np.ndarray, count: int) -> np.ndarray:
-    """Find the rising indices of the ``count`` most important Gaussians, or all; of equal ones the first.
+    """Find the rising indices of the ``count`` most important Gaussians, or all; the first of equals.
 
     ``importance [n]`` is for instance the summed blending weight over all photos. A ValueError if ``count`` is below 0.
     """

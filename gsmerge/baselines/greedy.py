@@ -63,7 +63,7 @@ def log_determinants(covars: Floats) -> Floats:
 
 
 def cloud_of(gaussians: Gaussians) -> Cloud:
-    """Compute moments and masses of Gaussians; flat ones get a little thickness."""
+    """Compute moments and masses of Gaussians; flat Gaussians get a little thickness."""
     scales = gaussians.scales.astype(np.float64)
     scales = np.maximum(scales, MIN_FLATNESS * scales.max(1, keepdims=True).clip(1e-12))
     full = covariances(gaussians.quats.astype(np.float64), scales)
@@ -90,7 +90,7 @@ def gaussians_of(cloud: Cloud) -> Gaussians:
 
 
 def merge_moments(cloud: Cloud, left: Ints, right: Ints) -> tuple[Floats, Floats, Floats]:
-    """Compute shares ``[m]`` of the left ones, means ``[m,3]`` and covariances ``[m,6]`` of merged pairs."""
+    """Compute shares ``[m]`` of the left members, means ``[m,3]`` and covariances ``[m,6]`` of merged pairs."""
     share = cloud.masses[left] / (cloud.masses[left] + cloud.masses[right])
     p, q = share[:, None], 1 - share[:, None]
     apart = cloud.means[left] - cloud.means[right]

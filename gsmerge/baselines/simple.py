@@ -48,7 +48,7 @@ def unmerged_fit(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
 
 
 def prune_by_opacity(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """Keep the most opaque Gaussians, unchanged and in their order; of equal ones the first of the file."""
+    """Keep the most opaque Gaussians, unchanged and in their order; the first of equals."""
     gaussians = own_gaussians(prepared.scene)
     with stage("reduce"):
         return gaussians[most_important(gaussians.opacities, count)]

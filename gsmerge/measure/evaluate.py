@@ -262,7 +262,7 @@ def _notes(splits: Mapping[str, _Split]) -> tuple[str, ...]:
 
 
 def _splits(scene: Scene, own: Gaussians, targets: Views | None, renderer: _Renderer) -> dict[str, _Split]:
-    """Split the views into input and held-out ones, with photos or the input's renders, and visible pixels."""
+    """Split the views into input and held-out views, with photos or the input's renders, and visible pixels."""
     points = context_points(scene, renderer.near)
 
     def split(views: Views, drawn: Gaussians | None) -> _Split:

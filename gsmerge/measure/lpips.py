@@ -199,7 +199,7 @@ def _find_weights(net: str) -> Path | None:
 
 @lru_cache(maxsize=2)
 def _load(path: Path, net: str) -> tuple[_Layer, ...]:
-    """Load the layers of ``net`` from its file; a SceneError if that is no pickle of float arrays, or of other ones."""
+    """Load the layers of ``net`` from its file; a SceneError if that is no pickle of the expected float arrays."""
     with path.open("rb") as stream:
         try:
             return _layers(_ArrayUnpickler(stream).load(), _architecture(net))

@@ -242,7 +242,7 @@ def decode_with_group_features(
 def prepare_children(
     children: Gaussians, parents: np.ndarray, group_features: GroupFeatures, networks: Networks
 ) -> Gaussians:
-    """Replace children by the Gaussians that the heads correct: themselves, or round ones for absolute outputs.
+    """Replace children by the Gaussians that the heads correct: themselves, or round Gaussians for absolute outputs.
 
     A round Gaussian lies at its group's mean, with its base colour and the axes of its frame, from which the head's
     outputs are offsets (paper section 4.3). It is as large as the group and half transparent. Five or more children of

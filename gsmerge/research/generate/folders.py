@@ -1,4 +1,4 @@
-"""Folders of synthetic scenes, each complete or absent; existing ones are not made again."""
+"""Folders of synthetic scenes, each complete or absent; existing scenes are not made again."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def check_replaceable(folder: Path, *, overwrite: bool) -> None:
 
 @contextmanager
 def _folder(folder: Path) -> Iterator[Path]:
-    """Make a hidden folder next to the final one, whose place it takes when the block succeeds."""
+    """Make a hidden folder next to the final folder, whose place it takes when the block succeeds."""
     remove_stale(folder.parent)
     temporary, earlier = temporary_path(folder), temporary_path(folder)
     try:

@@ -216,7 +216,7 @@ def _shrink(lens: Pinhole) -> Pinhole:
 def _find_stage(
     rng: np.random.Generator, style: str, path: str, lens: Pinhole, num_views: int
 ) -> tuple[LitStage, Pose]:
-    """Draw a stage and a path through it with usable views only, or the last ones tried."""
+    """Draw a stage and a path through it with usable views only, or the last try."""
     size = 1 << int(np.clip(np.log2(1.6 * max(lens.width, lens.height)), 7, 10))
     for _ in range(STAGE_TRIES):
         view = light_stage(STYLES[style](Palette(rng, size)))

@@ -382,7 +382,8 @@ class Palette:
     def material(self, *kinds: str, repeat: float = 0.0, gloss: float | None = None) -> Material:
         """Make a material of one of the kinds: with a new texture, or an old one if the scene has enough of the kind.
 
-        ``repeat`` is in repeats per world unit, 0: once over every face. ``gloss`` is at random if None, mostly none.
+        ``repeat`` is in repeats per world unit, 0: once over every face. ``gloss`` None is drawn at random, mostly
+        none.
         """
         kind = kinds[self.rng.integers(len(kinds))]
         known = self.by_kind.setdefault(kind, [])

@@ -58,7 +58,7 @@ class Example:
         return covered_pixels(self.covers[:, photo])
 
     def photo_ids(self, *, novel: bool) -> list[int]:
-        """List the photos with a pixel that the views cover: their own, or novel ones."""
+        """List the photos with a pixel that the views cover: their own, or those of novel views."""
         span = range(len(self.cameras), len(self.photos)) if novel else range(len(self.cameras))
         return [photo for photo in span if self.mask(photo).any()]
 
@@ -122,7 +122,7 @@ def make_example(
 
 
 def select_views(example: Example, ids: Sequence[int]) -> Example:
-    """Keep the views ``ids``, ascending, of an example without a fit; the photos of the others become novel ones."""
+    """Keep the views ``ids``, ascending, of an example without a fit; the photos of the others become novel views."""
     views, pixels = len(example.cameras), example.cameras.width * example.cameras.height
     if len(ids) == views:
         return example

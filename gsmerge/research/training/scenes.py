@@ -96,7 +96,7 @@ def covered_pixels(covers: np.ndarray) -> np.ndarray:
 
 
 def reduced_masks(masks: np.ndarray, photos: Photos) -> np.ndarray:
-    """Reduce masks ``[p,h,w]`` of full-size photos to smaller ones: pixels of which more than half is in the mask."""
+    """Reduce masks ``[p,h,w]`` to the size of smaller photos: pixels of which more than half is in the mask."""
     size = photos.width, photos.height
     small = [cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5 for mask in masks]
     return np.stack(small)
