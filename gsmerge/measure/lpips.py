@@ -6,7 +6,6 @@ is imported, and of what its pickles may hold only dictionaries and arrays of fl
 
 from __future__ import annotations
 
-import hashlib
 import pickle
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -101,10 +100,14 @@ def lpips(image: Array, reference: Array, net: str = "vgg", mask: Array | None =
     if mask is not None:
         first = np.where(pixel_mask(mask, first)[..., None], first, second)
     hold_torch()
-    layers = _load(require_lpips(net), net)
-    features = _kept_features(second, layers)
+    path, values = require_lpips(net), np.ascontiguousarray(second, np.float32)
+    layers = _load(path, net)
+    small = values.shape[0] * values.shape[1] <= MAX_CACHED_PIXELS
+    compute = _kept_features if small else _kept_features.__wrapped__
+    features = compute(values.tobytes(), values.shape, path, net)
     with torch.inference_mode():
-        return float(_weighted(_unit_features(_as_tensor(first), layers), features, layers))
+        image = torch.from_numpy(np.ascontiguousarray(first, np.float32))
+        return float(_weighted(_unit_features(image, layers), features, layers))
 
 
 def lpips_available(net: str = "vgg") -> bool:
@@ -145,10 +148,6 @@ def lpips_loss(image: Tensor, reference: Tensor, mask: Tensor, net: str = "vgg")
     return _weighted(_unit_features(torch.where(mask[..., None], image, reference), layers), features, layers)
 
 
-def _as_tensor(image: np.ndarray) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(image, np.float32))
-
-
 def _weighted(units: Iterable[Tensor], others: Iterable[Tensor], layers: tuple[_Layer, ...]) -> Tensor:
     """Weight squared differences of unit features, average over pixels, and add up (equation 1 of Zhang et al.)."""
     distance = torch.zeros((), dtype=torch.float64)
@@ -158,22 +157,12 @@ def _weighted(units: Iterable[Tensor], others: Iterable[Tensor], layers: tuple[_
     return distance
 
 
-def _kept_features(reference: np.ndarray, layers: tuple[_Layer, ...]) -> list[Tensor]:
-    """Compute the features of a reference; the last few are cached, as several images in a row have the same one."""
-    key = (id(layers), reference.shape, hashlib.sha256(np.ascontiguousarray(reference).tobytes()).digest())
-    if key not in _CACHE:
-        with torch.inference_mode():
-            features = list(_unit_features(_as_tensor(reference), layers))
-        if reference.shape[0] * reference.shape[1] > MAX_CACHED_PIXELS:
-            return features
-        while len(_CACHE) >= MAX_CACHED:
-            del _CACHE[next(iter(_CACHE))]
-        _CACHE[key] = layers, features
-    return _CACHE[key][1]
-
-
-# With the layers, so that no others can take their identity in the meantime.
-_CACHE: dict[tuple[object, ...], tuple[tuple[_Layer, ...], list[Tensor]]] = {}
+@lru_cache(maxsize=MAX_CACHED)  # several images in a row have the same reference
+def _kept_features(reference: bytes, shape: tuple[int, ...], path: Path, net: str) -> list[Tensor]:
+    """Compute the features of a reference, float32 values of a ``shape``."""
+    values = np.frombuffer(reference, np.float32).reshape(shape)
+    with torch.inference_mode():
+        return list(_unit_features(torch.tensor(values), _load(path, net)))
 
 
 def _unit_features(image: Tensor, layers: tuple[_Layer, ...]) -> Iterator[Tensor]:

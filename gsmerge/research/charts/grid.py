@@ -43,7 +43,7 @@ class Grid:
     # superpixels per view, such as 3000 or "4.4%"; in addition to the budgets, not times them
     superpixels: tuple[int | str, ...] = ()
     segmentations: tuple[str, ...] = ("rdseg",)  # superpixel methods
-    fit: tuple[str, ...] = ("full",)  # ``full``, ``color``, ``none``
+    fit: tuple[str, ...] = ("full",)  # ``full``, ``none``
     efforts: tuple[str, ...] = ("default",)  # ``draft``, ``fast``, ``default``, ``best``
     matches: tuple[str, ...] = ("overlap",)  # merging across views: ``overlap``, ``aabb``, ``none``
     views: tuple[int | str, ...] = (ALL,)  # numbers of views; "all" for all

@@ -202,9 +202,9 @@ def line_names(keys: Sequence[LineKey]) -> dict[LineKey, str]:
 
 
 def _setting_label(name: str, value: Any) -> str:
-    if name == "fit":
-        return {"none": "no fit", "color": "colour fit", "full": "full fit"}.get(value, f"fit {value}")
-    return f"K = {value}" if name == "k" else str(value) if name == "segmentation" else f"{name} {value}"
+    if (name, value) == ("fit", "none"):
+        return "no fit"
+    return {"k": f"K = {value}", "segmentation": str(value)}.get(name, f"{name} {value}")
 
 
 def ours_first(records: Iterable[RunRecord]) -> list[RunRecord]:
