@@ -1,4 +1,4 @@
-"""Check what a file asks for before anything is read from it or allocated for it."""
+"""Check the size of a file before anything is read from it or allocated for it."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ import json
 import os
 import stat
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +22,18 @@ MAX_FILES = 100_000  # below a folder of photos
 MAX_PIXELS = 1 << 26  # of one image
 
 
-def check_file(path: Path) -> int:
-    """Return the size of a file, bytes.
+@contextmanager
+def read_errors(path: StrPath) -> Iterator[None]:
+    """Turn an OSError of the block into a SceneError that names the file."""
+    try:
+        yield
+    except OSError as error:
+        raise SceneError(path, f"cannot be read ({error.strerror})") from error
 
-    SceneError if there is none, or it is a folder, a pipe or a device, which could block or never end.
+
+def check_file(path: Path) -> int:
+    """Return the size of a file in bytes; SceneError if it is missing, a folder, a pipe or a
+    device.
     """
     try:
         status = os.stat(path)
@@ -38,10 +49,7 @@ def check_file(path: Path) -> int:
 
 
 def walk_files(folder: Path) -> list[Path]:
-    """List all files below a folder, links to other folders left out.
-
-    SceneError if there are too many: a link to the root of the disk would be read for minutes.
-    """
+    """List all files below a folder without following links to folders; SceneError if too many."""
     files: list[Path] = []
     for num_folders, (base, _, names) in enumerate(os.walk(folder), 1):
         files += [Path(base) / name for name in names]
@@ -52,27 +60,19 @@ def walk_files(folder: Path) -> list[Path]:
 
 
 def read_text(path: Path, limit: int = MAX_TEXT_BYTES) -> str:
-    """Read the text of a small file in UTF-8.
-
-    SceneError if it cannot be read, is no text, or has more than ``limit`` bytes.
-    """
+    """Read a UTF-8 text file; SceneError if it is no text or has more than ``limit`` bytes."""
     size = check_file(path)
     if size > limit:
         raise SceneError(path, f"expected a text file of at most {limit >> 20} MiB, found {size >> 20} MiB")
     try:
-        return path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise SceneError(path, f"cannot be read ({error.strerror})") from error
+        with read_errors(path):
+            return path.read_text(encoding="utf-8-sig")
     except ValueError as error:
         raise SceneError(path, f"cannot be read as text ({error})") from error
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file of at most 32 MiB.
-
-    Raises:
-        SceneError: If it cannot be read or is no JSON.
-    """
+    """Read a JSON file of at most 32 MiB; SceneError if it cannot be read or is no JSON."""
     text = read_text(path)
     try:
         return json.loads(text)
@@ -81,16 +81,16 @@ def read_json(path: Path) -> Any:
 
 
 def read_table(path: Path) -> dict[str, Any]:
-    """Read the table of a ``.json`` file, or of any other as TOML.
-
-    SceneError if the file cannot be read or holds no table, or TOML is read on Python 3.10.
-    """
+    """Read a table from a ``.json`` file or, from Python 3.11 on, a TOML file; SceneError on failure."""
+    is_json = path.suffix.lower() == ".json"
+    if not is_json and sys.version_info < (3, 11):
+        raise SceneError(path, "TOML needs Python 3.11", "write the settings as JSON")
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise SceneError(path, "expected a TOML or JSON file, found none that can be read") from error
     try:
-        table = json.loads(text) if path.suffix.lower() == ".json" else _toml(path, text)
+        table = json.loads(text) if is_json else import_module("tomllib").loads(text)
     except (ValueError, RecursionError) as error:
         raise SceneError(path, f"expected TOML or JSON, found a mistake ({str(error).splitlines()[0]})") from error
     if not isinstance(table, dict):
@@ -98,16 +98,8 @@ def read_table(path: Path) -> dict[str, Any]:
     return table
 
 
-def _toml(path: Path, text: str) -> Any:
-    if sys.version_info >= (3, 11):
-        import tomllib
-
-        return tomllib.loads(text)
-    raise SceneError(path, "TOML needs Python 3.11", "write the settings as JSON")
-
-
 def check_pixels(path: StrPath, width: int, height: int) -> None:
-    """Refuse an image size that no image of Gaussians has. SceneError if it is not positive, or has too many pixels."""
+    """Raise a SceneError if an image size is not positive or has more than 2^26 pixels."""
     if width < 1 or height < 1:
         raise SceneError(path, f"expected a positive image size, found {width} x {height}")
     if width * height > MAX_PIXELS:

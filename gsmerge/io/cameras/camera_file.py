@@ -42,7 +42,7 @@ _GRID = 32  # pixels a side on which that is measured
 
 @dataclass(frozen=True)
 class Lens:
-    """A lens that is no pinhole."""
+    """A lens with distortion, or a fisheye."""
 
     name: str  # as the camera file calls the model
     model: Literal["perspective", "fisheye"]  # radial and tangential, as ``cv2.undistort``; as ``cv2.fisheye``
@@ -50,10 +50,7 @@ class Lens:
 
 
 def make_lens(name: str, model: Literal["perspective", "fisheye"], coefficients: Sequence[float]) -> Lens | None:
-    """Make a lens; None for a perspective without distortion, which is a pinhole.
-
-    A fisheye is none even then.
-    """
+    """Make a lens; None for a perspective one without distortion, which is a pinhole."""
     return Lens(name, model, tuple(coefficients)) if model == "fisheye" or any(coefficients) else None
 
 
@@ -78,7 +75,7 @@ class CameraFile:
 
 
 class View(NamedTuple):
-    """One camera as its file has it."""
+    """One camera in the convention of its file."""
 
     name: str  # of its image
     pose: np.ndarray  # 3x4 or 4x4, in the file's convention
@@ -99,11 +96,10 @@ def make_camera_file(
     views: Sequence[View],
     images: np.ndarray | None = None,
 ) -> CameraFile:
-    """Translate poses to the one convention and check that they are poses.
+    """Translate poses to world-to-camera with OpenCV axes, and check that they are poses.
 
-    ``images [c,h,w,3]`` are given if the file holds them. SceneError if there is no camera, a
-    number is not finite or one that no camera has, a rotation is not orthonormal, or a focal length
-    is not positive.
+    ``images [c,h,w,3]`` are given if the file holds them. SceneError if there is no camera, a number is infinite or
+    too large, a rotation is not orthonormal, or a focal length is not positive.
     """
     if not views:
         raise SceneError(path, "expected at least one camera, found none")
@@ -139,10 +135,7 @@ def make_camera_file(
 
 
 def _in_pixels(Ks: np.ndarray, sizes: list[tuple[int, int]]) -> tuple[np.ndarray, list[tuple[int, int]]]:
-    """Multiply intrinsics that are divided by the image's size by it.
-
-    Where it is unknown, it is taken as 1 x 1 pixels.
-    """
+    """Multiply intrinsics that are divided by the image's size by it; an unknown size is taken as 1 x 1."""
     small = (Ks[:, 0, 0] < MAX_NORMALISED_FOCAL) & (Ks[:, 1, 1] < MAX_NORMALISED_FOCAL)
     small &= (np.abs(Ks[:, :2, 2] - 0.5) < 1).all(1)
     if not small.all() or any(0 < min(size) <= MAX_NORMALISED_FOCAL for size in sizes):
@@ -152,7 +145,7 @@ def _in_pixels(Ks: np.ndarray, sizes: list[tuple[int, int]]) -> tuple[np.ndarray
 
 
 def check_camera(path: StrPath, name: str, pose: np.ndarray, K: np.ndarray) -> None:
-    """Refuse a pose ``[4,4]`` or intrinsics ``[3,3]`` that no camera has, as a SceneError."""
+    """Raise a SceneError for a pose ``[4,4]`` or intrinsics ``[3,3]`` that no camera has."""
     if not (np.isfinite(pose).all() and np.isfinite(K).all()):
         raise SceneError(path, f"view {name}: expected finite numbers, found NaN or inf")
     largest = max(np.abs(pose).max(), np.abs(K).max())
@@ -181,16 +174,16 @@ def _check_lens(path: StrPath, name: str, lens: Lens | None) -> None:
 
 
 def check_size(path: StrPath, name: str, K: np.ndarray, size: tuple[int, int]) -> None:
-    """Refuse intrinsics ``[3,3]`` in pixels that do not fit an image of (width, height), as a SceneError."""
-    side = max(size)
+    """Raise a SceneError for intrinsics ``[3,3]`` in pixels that do not fit an image of (width, height)."""
     if min(size) <= 1:  # not known
         return
-    focal, centre = max(K[0, 0], K[1, 1]), np.abs(K[:2, 2]).max()
-    what = "a focal length" if focal > _MAX_FOCAL_SIDES * side else "a principal point"
-    if focal > _MAX_FOCAL_SIDES * side or centre > _MAX_CENTRE_SIDES * side:
-        found = focal if what == "a focal length" else centre
-        problem = f"view {name}: expected {what} that fits an image of {size[0]} x {size[1]}, found {found:g} pixels"
-        raise SceneError(path, problem, "give fx, fy, cx, cy in pixels of that size")
+    for what, value, sides in (
+        ("a focal length", max(K[0, 0], K[1, 1]), _MAX_FOCAL_SIDES),
+        ("a principal point", np.abs(K[:2, 2]).max(), _MAX_CENTRE_SIDES),
+    ):
+        if value > sides * max(size):
+            problem = f"expected {what} that fits an image of {size[0]} x {size[1]}, found {value:g} pixels"
+            raise SceneError(path, f"view {name}: {problem}", "give fx, fy, cx, cy in pixels of that size")
 
 
 def to_viewmats(poses: np.ndarray, convention: Convention) -> np.ndarray:
@@ -202,7 +195,7 @@ def to_viewmats(poses: np.ndarray, convention: Convention) -> np.ndarray:
 
 
 def from_viewmats(viewmats: np.ndarray, convention: Convention) -> np.ndarray:
-    """Invert :func:`to_viewmats`: return poses as a file of that convention holds them."""
+    """Invert :func:`to_viewmats`: return poses in the convention of a file."""
     direction, axes = convention
     poses = FLIP @ viewmats if axes == "OpenGL" else viewmats
     return np.linalg.inv(poses) if direction == "camera-to-world" else poses
@@ -215,7 +208,7 @@ def with_convention(camera_file: CameraFile, convention: Convention) -> CameraFi
 
 
 def select_views(cameras: CameraFile, view_ids: Sequence[int]) -> CameraFile:
-    """Return the views of these ids, in that order."""
+    """Select views by their ids, in that order."""
     ids = list(view_ids)
     lenses = tuple(cameras.lenses[i] for i in ids) if cameras.lenses else ()
     arrays = {name: getattr(cameras, name)[ids] for name in ("viewmats", "Ks", "widths", "heights")}
@@ -263,13 +256,10 @@ def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> 
 
 
 def as_pinholes(camera_file: CameraFile, photos: Photos | None) -> tuple[CameraFile, Photos | None, list[str]]:
-    """Undistort photos, and make their cameras pinholes with the same intrinsics.
+    """Undistort photos, and make their cameras pinholes with the same intrinsics; also return a note.
 
-    Returns a note about it, too. SceneError if a lens is no pinhole and there are no photos of the
-    camera's shape, or shows next to nothing of one.
-
-    SceneError if a lens is no pinhole and there are no photos of the camera's shape, or shows next
-    to nothing of one.
+    SceneError if a lens is no pinhole and there are no photos of the camera's shape, or shows next to nothing of
+    one.
     """
     if not camera_file.lenses:
         return camera_file, photos, []
@@ -297,9 +287,7 @@ def as_pinholes(camera_file: CameraFile, photos: Photos | None) -> tuple[CameraF
 
 
 def undistort_photos(photos: Photos, Ks: np.ndarray, lenses: Sequence[Lens | None]) -> Photos:
-    """Make the photos that pinholes with the same intrinsics would have taken.
-
-    Where one shows nothing, its border is repeated.
+    """Make the photos that pinholes with the same intrinsics would have taken; their borders repeat the lens's.
 
     ``photos`` are uint8 ``[h,w,3]``; ``Ks [c,3,3]`` at their size, the top-left pixel's centre at (0.5, 0.5).
     """
@@ -315,10 +303,7 @@ def undistort_photos(photos: Photos, Ks: np.ndarray, lenses: Sequence[Lens | Non
 
 
 def _rectify_maps(K: np.ndarray, lens: Lens, size: Size) -> tuple[np.ndarray, np.ndarray]:
-    """Return where each pixel of a pinhole's image lies in the lens's image.
-
-    x and y are ``[h,w]`` float32, pixels.
-    """
+    """Return x and y ``[h,w]`` float32 in the lens's image of each pixel of a pinhole's image."""
     centred = K.astype(np.float64).copy()
     centred[:2, 2] -= 0.5  # OpenCV has the top-left pixel's centre at (0, 0)
     coefficients = np.pad(lens.coefficients, (0, len(COEFFICIENTS[lens.model]) - len(lens.coefficients)))

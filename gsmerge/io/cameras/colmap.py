@@ -1,4 +1,4 @@
-"""COLMAP models: ``cameras`` and ``images`` as text or binary; points, rigs and frames are not needed."""
+"""COLMAP models: ``cameras`` and ``images`` as text or binary, without points, rigs and frames."""
 
 from __future__ import annotations
 
@@ -38,11 +38,7 @@ def is_colmap(folder: Path) -> bool:
 
 
 def read_colmap(folder: Path) -> CameraFile:
-    """Read the cameras of a COLMAP model in the order of its images file.
-
-    Poses are world-to-camera, OpenCV axes. SceneError if a file is missing or damaged, or a lens of
-    an unknown kind.
-    """
+    """Read the cameras of a COLMAP model in the order of its images; SceneError if it is damaged or unknown."""
     binary = (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file()
     suffix = ".bin" if binary else ".txt"
     camera_path, image_path = folder / f"cameras{suffix}", folder / f"images{suffix}"
@@ -75,7 +71,7 @@ def _mapped(path: Path) -> Iterator[mmap.mmap]:
 
 
 def _pose(numbers: list[float]) -> np.ndarray:
-    """Make a pose ``[3,4]`` of a quaternion wxyz and a translation."""
+    """Make a pose ``[3,4]`` from a quaternion wxyz and a translation."""
     if not np.isfinite(numbers).all():
         raise ValueError("a pose that is not finite")
     quat = np.array(numbers[:4]) / max(1e-12, *map(abs, numbers[:4]))

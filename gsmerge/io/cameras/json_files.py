@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,7 +46,7 @@ _ROTATION_TOLERANCE = 0.02  # of a rotation's columns, as for poses
 
 
 def read_json_cameras(path: Path) -> CameraFile:
-    """Read the cameras of any known JSON file. SceneError if it is none of them, or damaged."""
+    """Read the cameras of any known JSON file; SceneError if it is none of them, or damaged."""
     data = read_json(path)
     if isinstance(data, dict) and "frames" in data:
         frames = data["frames"]
@@ -60,6 +61,15 @@ def read_json_cameras(path: Path) -> CameraFile:
     if isinstance(data, dict) and {"extrinsics", "intrinsics"} <= data.keys():
         return read_world_mirror(path, data)
     raise SceneError(path, "expected 'frames' (nerfstudio) or a list of cameras (INRIA), found neither")
+
+
+@contextmanager
+def _number_errors(path: Path, expected: str) -> Iterator[None]:
+    """Turn what missing keys and impossible numbers raise in the block into a SceneError."""
+    try:
+        yield
+    except (KeyError, TypeError, ValueError, ArithmeticError) as error:
+        raise SceneError(path, f"{expected} ({error})") from error
 
 
 def read_transforms(path: Path, data: Mapping[str, Any] | list[Any]) -> CameraFile:
@@ -80,20 +90,15 @@ def read_transforms(path: Path, data: Mapping[str, Any] | list[Any]) -> CameraFi
         if "transform_matrix" not in frame:
             raise SceneError(path, f"view {name}: expected 'transform_matrix', found none")
         values = {**common, **frame}
-        try:
+        with _number_errors(path, f"view {name}: expected numbers"):
             pose = np.array(frame["transform_matrix"], np.float64)
             lens = _lens(path, name, values)
             views.append(View(name, pose, *_intrinsics(path, name, values), lens))
-        except (TypeError, ValueError, ArithmeticError) as error:
-            raise SceneError(path, f"view {name}: expected numbers ({error})") from error
     return make_camera_file(path, source, convention, views)
 
 
 def _intrinsics(path: Path, name: str, values: Mapping[str, Any]) -> tuple[np.ndarray, tuple[int, int]]:
-    """Return intrinsics [3,3] and (width, height) of one frame.
-
-    Its own values go before the global ones.
-    """
+    """Return intrinsics ``[3,3]`` and (width, height) of a frame, from its own values or those of all frames."""
     if not any(key in values for key in ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")):
         missing = ", ".join(key for key in ("fl_x", "w", "h") if key not in values)
         problem = f"expected intrinsics (fl_x, fl_y, cx, cy, w, h), found none of {missing} for view {name}"
@@ -120,7 +125,7 @@ def _focal(values: Mapping[str, Any], axis: str, size: float) -> float:
 
 
 def _lens(path: Path, name: str, values: Mapping[str, Any]) -> Lens | None:
-    """Return the lens of one frame, None for a pinhole."""
+    """Return the lens of a frame, None for a pinhole."""
     model = str(values.get("camera_model", "PINHOLE")).upper()
     params = {key: float(values.get(key) or 0) for key in (*_DISTORTION, "k5", "k6")}
     listed = [float(value) for value in values.get("distortion_params") or ()]
@@ -130,9 +135,8 @@ def _lens(path: Path, name: str, values: Mapping[str, Any]) -> Lens | None:
         return make_lens("OPENCV_FISHEYE", "fisheye", [params[key] for key in ("k1", "k2", "k3", "k4")])
     odd = next((key for key in ("k4", "k5", "k6") if params[key]), None)
     if model not in _PERSPECTIVE or odd is not None:
-        what = f"camera model {model}"
-        if odd is not None:
-            what = f"lens distortion {odd}, which formats understand differently"
+        odd_lens = f"lens distortion {odd}, which formats understand differently"
+        what = odd_lens if odd is not None else f"camera model {model}"
         problem = f"view {name}: expected a pinhole, OPENCV or OPENCV_FISHEYE camera, found {what}"
         raise SceneError(path, problem, "undistort the images first")
     coefficients = [params[key] for key in ("k1", "k2", "p1", "p2", "k3")]
@@ -140,10 +144,9 @@ def _lens(path: Path, name: str, values: Mapping[str, Any]) -> Lens | None:
 
 
 def read_inria(path: Path, entries: list[dict[str, Any]]) -> CameraFile:
-    """Read the cameras of a parsed ``cameras.json``.
+    """Read the cameras of a parsed ``cameras.json``; SceneError if a key is missing or not a number.
 
-    It has rows of the camera-to-world rotation, and the centre; the principal point is in the
-    middle. SceneError if a key is missing or not a number.
+    It has rows of the camera-to-world rotation, and the centre; the principal point is in the middle.
     """
     views = []
     for i, entry in enumerate(entries):
@@ -151,13 +154,11 @@ def read_inria(path: Path, entries: list[dict[str, Any]]) -> CameraFile:
         missing = [key for key in _INRIA_KEYS if key not in entry]
         if missing:
             raise SceneError(path, f"view {name}: missing {', '.join(missing)}")
-        try:
+        with _number_errors(path, f"view {name}: expected numbers"):
             rotation = np.array(entry["rotation"], np.float64).reshape(3, 3)
             centre = np.array(entry["position"], np.float64).reshape(3, 1)
             fx, fy, width, height = (float(entry[key]) for key in ("fx", "fy", "width", "height"))
             size = round(width), round(height)
-        except (TypeError, ValueError, ArithmeticError) as error:
-            raise SceneError(path, f"view {name}: expected numbers ({error})") from error
         K = make_pinhole(fx, fy, width / 2, height / 2)
         views.append(View(name, np.concatenate([rotation, centre], 1), K, size))
     return make_camera_file(path, "INRIA cameras.json", C2W_OPENCV, views)
@@ -166,10 +167,10 @@ def read_inria(path: Path, entries: list[dict[str, Any]]) -> CameraFile:
 def read_world_mirror(path: Path, data: Mapping[str, Any]) -> CameraFile:
     """Read the cameras of a parsed ``camera_params.json``.
 
-    ``extrinsics`` and ``intrinsics`` are lists of ``{camera_id, matrix}``; poses are camera-to-world with OpenCV axes,
-    intrinsics in pixels of the processed size, which only the images have. ``camera_id`` is the stem of the image's
-    name, or the image's number, by which the cameras are then sorted. SceneError if the two lists do not name the same
-    cameras, or a matrix is none.
+    ``extrinsics`` and ``intrinsics`` are lists of ``{camera_id, matrix}``; poses are camera-to-world with OpenCV
+    axes, intrinsics in pixels of the processed size, which only the images have. ``camera_id`` is the stem of the
+    image's name, or its number, by which the cameras are then sorted. SceneError if the lists differ in cameras, or
+    a matrix is damaged.
     """
     poses, Ks = (_matrices(path, data, key, side) for key, side in (("extrinsics", 4), ("intrinsics", 3)))
     if poses.keys() != Ks.keys():
@@ -185,10 +186,8 @@ def _matrices(path: Path, data: Mapping[str, Any], key: str, side: int) -> dict[
         raise SceneError(path, f"expected {key!r} to be a list, found something else")
     matrices = {}
     for entry in entries:
-        try:
+        with _number_errors(path, f"{key}: expected entries of 'camera_id' and 'matrix'"):
             name, matrix = str(entry["camera_id"]), np.array(entry["matrix"], np.float64)
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise SceneError(path, f"{key}: expected entries of 'camera_id' and 'matrix' ({error})") from error
         if matrix.shape not in ((side, side), (3, side)):
             raise SceneError(path, f"{key} of {name}: expected {side}x{side} numbers, found shape {matrix.shape}")
         matrices[name] = matrix
@@ -198,19 +197,17 @@ def _matrices(path: Path, data: Mapping[str, Any], key: str, side: int) -> dict[
 def read_long_lrm(path: Path, data: Mapping[str, Any]) -> CameraFile:
     """Read the cameras of a parsed dataset file: ``frames`` of ``fx fy cx cy w h`` and ``w2c``.
 
-    Next to it Long-LRM writes which frames it took (``input_frame_idx.txt``) and how the Gaussians' world lies in the
-    cameras': X = scene_scale (pos_avg_inv X_cameras). The cameras are brought into the Gaussians' world. SceneError if
-    an entry is missing or no number, or a frame is named that is not there.
+    Next to it Long-LRM writes which frames it took (``input_frame_idx.txt``) and how the Gaussians' world lies in
+    the cameras': X = scene_scale (pos_avg_inv X_cameras). The cameras are moved into the Gaussians' world.
+    SceneError if an entry is missing or no number, or a frame does not exist.
     """
     frames = []
     for i, frame in enumerate(data["frames"]):
         name = str(frame.get("file_path") or frame.get("image_path") or f"view {i}")
-        try:
+        with _number_errors(path, f"view {name}: expected w2c, fx, fy, cx, cy, w, h as numbers"):
             pose = np.array(frame["w2c"], np.float64).reshape(4, 4)
             K = make_pinhole(*(float(frame[key]) for key in ("fx", "fy", "cx", "cy")))
             frames.append(View(name, pose, K, (round(float(frame["w"])), round(float(frame["h"])))))
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise SceneError(path, f"view {name}: expected w2c, fx, fy, cx, cy, w, h as numbers ({error})") from error
     frame_ids = _numbers(path.with_name(FRAMES_FILE))
     ids = range(len(frames)) if frame_ids is None else [round(value) for value in frame_ids]
     odd = next((i for i in ids if not 0 <= i < len(frames)), None)
@@ -223,10 +220,7 @@ def read_long_lrm(path: Path, data: Mapping[str, Any]) -> CameraFile:
 
 
 def _moved(path: Path, viewmats: np.ndarray) -> np.ndarray:
-    """Move world-to-camera matrices to the Gaussians' world.
-
-    With X' = s (A X), the rotation is R inv(A), the shift s t'.
-    """
+    """Move world-to-camera matrices to the Gaussians' world X' = s (A X): the rotation is R inv(A), the shift s t'."""
     move, scale = _numbers(path.with_name(POSE_FILE)), _numbers(path.with_name(SCALE_FILE))
     if move is not None:
         if move.size != 16:
@@ -243,20 +237,18 @@ def _moved(path: Path, viewmats: np.ndarray) -> np.ndarray:
 
 
 def _numbers(path: Path) -> np.ndarray | None:
-    """Read all numbers of a text file; None where there is no such file."""
+    """Read all numbers of a text file; None where there is no file."""
     if not path.is_file():
         return None
-    try:
+    with _number_errors(path, "expected numbers"):
         values = np.array(read_text(path).replace(",", " ").split(), np.float64)
-    except ValueError as error:
-        raise SceneError(path, f"expected numbers ({error})") from error
     if not np.isfinite(values).all():
         raise SceneError(path, "expected finite numbers, found NaN or inf")
     return values
 
 
 def viewer_cameras_path(output: Path) -> Path:
-    """Return where the cameras for viewers go: ``out.ply`` -> ``out.cameras.json``."""
+    """Return the path of the cameras for viewers: ``out.ply`` -> ``out.cameras.json``."""
     name = output.name
     stem = name[: -len(".compressed.ply")] if name.lower().endswith(".compressed.ply") else output.stem
     ending = ".cameras.json"
@@ -278,7 +270,7 @@ def write_transforms(path: Path, cameras: Cameras, names: Sequence[str]) -> None
 
 
 def write_viewer_cameras(path: Path, cameras: Cameras, names: Sequence[str]) -> None:
-    """Write cameras as INRIA's ``cameras.json``, which SuperSplat and other viewers open; :func:`read_inria` reads it.
+    """Write cameras as INRIA's ``cameras.json``, for SuperSplat and other viewers; :func:`read_inria` reads it.
 
     It has no principal point: cameras are written as if theirs were in the middle.
     """
@@ -295,12 +287,7 @@ def write_viewer_cameras(path: Path, cameras: Cameras, names: Sequence[str]) -> 
 
 
 def find_dataparser(files: SceneFiles) -> Path | None:
-    """Find ``dataparser_transforms.json`` next to the ``.ply``, or next to the cameras.
-
-    It says how nerfstudio moved the cameras before it trained.
-
-    It says how nerfstudio moved the cameras before it trained.
-    """
+    """Find the file in which nerfstudio writes how it moved cameras, next to the ``.ply`` or the cameras."""
     folders = [files.ply.parent] + ([] if files.cameras is None else [files.cameras.parent])
     return next((folder / DATAPARSER for folder in folders if (folder / DATAPARSER).is_file()), None)
 
@@ -309,23 +296,19 @@ def read_dataparser(path: Path, cameras: Path | None) -> list[Similarity]:
     """Read the similarities that nerfstudio's file may mean: X' = scale (transform [X; 1]).
 
     ``transform`` starts from the capture's own world. The poses of a ``transforms.json`` with ``applied_transform``
-    (and ``applied_scale``) are already moved by that, so it is undone; which of the two holds has to be measured.
-    SceneError if there is no rotation, shift and positive scale in it.
+    (and ``applied_scale``) are already moved by that, so it is undone; the reading has to be measured. SceneError
+    if the file lacks a rotation, shift and positive scale.
     """
     data = read_json(path)
-    try:
+    with _number_errors(path, "expected 'transform' of 3x4 numbers and 'scale'"):
         moved = _square(data["transform"])
         scale = float(data["scale"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise SceneError(path, f"expected 'transform' of 3x4 numbers and 'scale' ({error})") from error
     frames = [_similarity(path, moved, scale)]
     camera_data = read_json(cameras) if cameras is not None and cameras.suffix == ".json" and cameras.is_file() else {}
     if isinstance(camera_data, dict) and "applied_transform" in camera_data:
-        try:
+        with _number_errors(cameras or path, "expected 'applied_transform' of 3x4 numbers"):
             applied, factor = _square(camera_data["applied_transform"]), float(camera_data.get("applied_scale") or 1)
             frames.append(_similarity(path, moved @ np.linalg.inv(applied), scale / factor))
-        except (TypeError, ValueError, np.linalg.LinAlgError) as error:
-            raise SceneError(cameras or path, f"expected 'applied_transform' of 3x4 numbers ({error})") from error
     return frames
 
 

@@ -31,12 +31,10 @@ _KINDS = "biufU"
 
 
 def read_da3(path: Path) -> CameraFile:
-    """Read the cameras (and images, if stored) of an npz: poses 3x4 or 4x4, intrinsics in pixels.
+    """Read the cameras (and images, if stored) of an npz: world-to-camera 3x4 or 4x4, intrinsics in pixels.
 
-    Poses are world-to-camera.
-
-    Intrinsics of another image size than the depth maps' (they are stored so when a COLMAP export ran in the same
-    call), or normalised ones, are scaled to it. SceneError if the file cannot be read or lacks an array.
+    Intrinsics of another image size than the depth maps' (a COLMAP export in the same call writes those), or
+    normalised ones, are scaled to it. SceneError if the file cannot be read or lacks an array.
     """
     sizes = () if holds_images(path) else _DEPTHS  # of depths only the shape counts, the confidence is never read
     arrays = read_arrays(path, {*_EXTRINSICS, *_INTRINSICS, *_IMAGES, *sizes})
@@ -55,16 +53,8 @@ def read_da3(path: Path) -> CameraFile:
     return make_camera_file(path, "DA3 npz", W2C_OPENCV, _views(poses, Ks, (width, height)), images)
 
 
-def is_dump(path: Path) -> bool:
-    """Return whether an npz holds poses under the name ``c2w``; False if it cannot be read."""
-    return "c2w" in array_names(path)
-
-
 def read_dump(path: Path) -> CameraFile:
-    """Read the cameras and images of a ``views.npz``.
-
-    SceneError if the file cannot be read, lacks an array, or one has another shape than it should.
-    """
+    """Read the cameras and images of a ``views.npz``; SceneError if an array is missing or of another shape."""
     arrays = read_arrays(path, ("c2w", "K", "images", "order"))
     missing = [name for name in ("c2w", "K", "images") if name not in arrays]
     if missing:
@@ -91,8 +81,7 @@ def read_depths(path: Path) -> np.ndarray | None:
     depths = _first(read_arrays(path, _DEPTHS), _DEPTHS)
     if depths is not None and depths.ndim == 4 and depths.shape[3] == 1:
         depths = depths[..., 0]
-    usable = depths is not None and depths.ndim == 3 and depths.dtype.kind in "fiu"
-    return depths if usable else None
+    return depths if depths is not None and depths.ndim == 3 and depths.dtype.kind in "fiu" else None
 
 
 def _first(arrays: dict[str, np.ndarray], names: tuple[str, ...]) -> np.ndarray | None:
@@ -100,8 +89,7 @@ def _first(arrays: dict[str, np.ndarray], names: tuple[str, ...]) -> np.ndarray 
 
 
 def _missing(path: Path, missing: list[str], arrays: dict[str, np.ndarray]) -> SceneError:
-    problem = f"missing array{'s' * (len(missing) > 1)} {', '.join(missing)}, found {list(arrays)}"
-    return SceneError(path, problem)
+    return SceneError(path, f"missing array{'s' * (len(missing) > 1)} {', '.join(missing)}, found {list(arrays)}")
 
 
 def _views(poses: np.ndarray, Ks: np.ndarray, size: tuple[int, int]) -> list[View]:
@@ -109,10 +97,7 @@ def _views(poses: np.ndarray, Ks: np.ndarray, size: tuple[int, int]) -> list[Vie
 
 
 def _check_poses(path: Path, poses: np.ndarray, Ks: np.ndarray, names: tuple[str, str]) -> None:
-    """Refuse other arrays than c poses and ``[c,3,3]`` intrinsics of finite numbers.
-
-    ``names`` are the names with their shapes.
-    """
+    """Refuse arrays other than c poses and ``[c,3,3]`` intrinsics of finite numbers; ``names`` are for messages."""
     for name, array in zip(names, (poses, Ks), strict=True):
         if array.dtype.kind not in "fiu":
             raise SceneError(path, f"expected numbers in {name}, found {array.dtype}")
@@ -123,10 +108,7 @@ def _check_poses(path: Path, poses: np.ndarray, Ks: np.ndarray, names: tuple[str
 
 
 def _as_images(path: Path, images: np.ndarray, count: int) -> np.ndarray:
-    """Convert images of any usual form to ``[c,h,w,3]`` uint8.
-
-    Values that are not finite become black or white.
-    """
+    """Convert images of any usual form to ``[c,h,w,3]`` uint8; infinite values become black or white."""
     if images.ndim == 4 and images.shape[1] == 3 and images.shape[3] != 3:
         images = images.transpose(0, 2, 3, 1)
     if images.ndim != 4 or images.shape[0] != count or images.shape[3] != 3:
@@ -141,7 +123,7 @@ def _as_images(path: Path, images: np.ndarray, count: int) -> np.ndarray:
 
 
 def _at_size(Ks: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Scale intrinsics to the given size: these networks keep the principal point in the middle."""
+    """Scale intrinsics to an image size: these networks keep the principal point in the middle."""
     size = np.array([width, height])
     ratio = 2 * np.maximum(Ks[:, :2, 2], _SMALL) / size
     normalised = (Ks[:, 0, 0] < 10) & (Ks[:, 0, 2] < 2) & (width > 10)
@@ -168,8 +150,8 @@ def array_names(path: Path) -> frozenset[str]:
 def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
     """Read those of the named arrays that an ``.npz`` has, in its order.
 
-    SceneError if it cannot be read, an array holds anything but numbers and text, or one is larger
-    than its bytes in the archive allow.
+    SceneError if it cannot be read, an array has anything but numbers and text, or is larger than its bytes in the
+    archive allow.
     """
     check_file(path)
     if not zipfile.is_zipfile(path):

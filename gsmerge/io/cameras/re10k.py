@@ -25,16 +25,14 @@ _MAX_PHOTOS = 1 << 30  # bytes of the decoded photos
 
 
 def read_re10k(path: Path, scene: str | None = None) -> CameraFile:
-    """Read the cameras and photos of one scene of a chunk, by its key.
+    """Read the cameras and photos of one scene of a chunk by its key, which a chunk of one scene need not have.
 
-    A chunk of one scene needs no key.
-
-    A chunk is a list of ``{key, cameras, images}``: ``cameras [v,18]`` are fx, fy, cx, cy divided by the image's size,
-    two zeros and a world-to-camera 3x4 (OpenCV axes); ``images`` are v JPEG files as tensors of bytes. Nothing in it is
-    executed: only tensors and plain containers are read. SceneError if it cannot be read, has no such scene, or an
-    array has another shape than it should.
+    A chunk is a list of ``{key, cameras, images}``: ``cameras [v,18]`` are fx, fy, cx, cy divided by the image's
+    size, two zeros and a world-to-camera 3x4 (OpenCV axes); ``images`` are v JPEG files as tensors of bytes.
+    Nothing in it is executed: only tensors and plain containers are read. SceneError if it cannot be read, has no
+    scene of that key, or an array has another shape.
     """
-    entry = _chosen(path, _load(path), scene)
+    entry = _choose_scene(path, _load(path), scene)
     rows = _rows(path, entry.get("cameras"))
     names = [f"view {i}" for i in range(len(rows))]
     photos = _photos(path, entry.get("images"), names)
@@ -72,12 +70,10 @@ def _load(path: Path) -> list[Mapping[str, Any]]:
     return entries
 
 
-def _chosen(path: Path, entries: list[Mapping[str, Any]], scene: str | None) -> Mapping[str, Any]:
-    if len(entries) == 1:
-        return entries[0]
+def _choose_scene(path: Path, entries: list[Mapping[str, Any]], scene: str | None) -> Mapping[str, Any]:
     named = [entry for entry in entries if isinstance(entry.get("key"), str) and entry["key"] == scene]
-    if len(named) == 1:
-        return named[0]
+    if len(entries) == 1 or len(named) == 1:
+        return (named or entries)[0]
     keys = ", ".join(str(entry.get("key"))[:40] for entry in entries[:3])
     problem = f"expected one scene with the key {scene!r}, found {len(named)} among {len(entries)} ({keys}, ...)"
     raise SceneError(path, problem, "name the .ply as its scene is named")
@@ -97,10 +93,7 @@ def _rows(path: Path, cameras: Any) -> np.ndarray:
 
 
 def _has_values(tensor: torch.Tensor) -> bool:
-    """Return whether a tensor's numbers are there, one after the other.
-
-    A chunk may hold tensors of other kinds.
-    """
+    """Return whether the numbers of a tensor are in memory, one after the other: others may be in a chunk."""
     import torch
 
     return tensor.layout == torch.strided and tensor.device.type == "cpu"

@@ -1,11 +1,9 @@
-"""Readers of cameras by the kind of their file.
-
-Two small kinds are read here: lists of poses, and cameras inside a ``.ply``.
-"""
+"""Read cameras by the kind of their file; lists of poses and cameras inside a ``.ply`` are read here."""
 
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +14,7 @@ from gsmerge.io.bounds import MAX_VIEWS, check_file, read_text
 from gsmerge.io.cameras.camera_file import C2W_OPENCV, W2C_OPENCV, CameraFile, View, make_camera_file, make_pinhole
 from gsmerge.io.cameras.colmap import is_colmap, read_colmap
 from gsmerge.io.cameras.json_files import read_json_cameras
-from gsmerge.io.cameras.npz_files import is_dump, read_da3, read_dump
+from gsmerge.io.cameras.npz_files import array_names, read_da3, read_dump
 from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
 from gsmerge.io.cameras.re10k import read_re10k
 from gsmerge.io.formats.ply import READERS
@@ -26,21 +24,10 @@ from gsmerge.types import StrPath
 # Where cameras are in a scene's folder, the first that exists wins; a COLMAP model directly in the folder comes last,
 # because Depth Anything 3 puts one there at the photos' own size.
 CAMERA_PLACES = (
-    "views.npz",
-    "transforms.json",
-    "cameras.json",
-    "camera_params.json",
-    "sparse/0",
-    "sparse",
-    "colmap/sparse/0",
-    "colmap",
-    "exports/npz/results.npz",
-    "exports/mini_npz/results.npz",
-    "results.npz",
-    "camera_poses.txt",
-    "0",
-    ".",
-)
+    "views.npz", "transforms.json", "cameras.json", "camera_params.json", "sparse/0", "sparse",
+    "colmap/sparse/0", "colmap", "exports/npz/results.npz", "exports/mini_npz/results.npz",
+    "results.npz", "camera_poses.txt", "0", ".",
+)  # fmt: skip
 INTRINSICS = ("intrinsic.txt", "intrinsics.txt")
 SHARP = "SHARP"
 _SHARP_ELEMENTS = ("extrinsic", "intrinsic", "image_size")
@@ -84,13 +71,14 @@ def read_cameras(path: StrPath, *, scene: str | None = None) -> CameraFile:
         return read_colmap(path)
     check_file(path)
     if path.suffix in (".bin", ".txt"):
-        if is_trajectory(path):
-            return read_trajectory(path)
+        with suppress(OSError, ValueError), path.open(encoding="utf-8") as file:
+            if len(_numbers(file.readline(4096))) in (12, 16):
+                return read_trajectory(path)
         if not is_colmap(path.parent):
             raise SceneError(path, "expected a COLMAP model with cameras and images files, found no pair of them")
         return read_colmap(path.parent)
     if path.suffix == ".npz":
-        return read_dump(path) if is_dump(path) else read_da3(path)
+        return read_dump(path) if "c2w" in array_names(path) else read_da3(path)
     if path.suffix == CHUNK:
         return read_re10k(path, scene)
     if path.suffix == ".json":
@@ -99,14 +87,11 @@ def read_cameras(path: StrPath, *, scene: str | None = None) -> CameraFile:
 
 
 def read_trajectory(path: Path) -> CameraFile:
-    """Read the cameras of a text file with a pose per line, as KITTI and DA3 write it.
+    """Read the cameras of a text file with one pose per line, as KITTI and DA3 write it.
 
-    A line has 12 or 16 numbers: camera-to-world, OpenCV axes, row by row.
-
-    Poses are camera-to-world, OpenCV axes, row by row.
-
-    Next to it is ``intrinsic.txt`` (or ``intrinsics.txt``) with fx, fy, cx, cy in pixels, one line for all views or one
-    for each. The images have the size. SceneError if a line has another number of numbers, or there are no intrinsics.
+    A line has 12 or 16 numbers: camera-to-world, OpenCV axes, row by row. Next to the file is ``intrinsic.txt`` (or
+    ``intrinsics.txt``) with fx, fy, cx, cy in pixels, one line for all views or one for each; the images have the
+    size. SceneError if a line has another number of numbers, or there are no intrinsics.
     """
     poses = _rows(path, (12, 16))
     intrinsics = next((path.with_name(name) for name in INTRINSICS if path.with_name(name).is_file()), None)
@@ -119,15 +104,6 @@ def read_trajectory(path: Path) -> CameraFile:
     Ks = [make_pinhole(*row) for row in (values * len(poses) if len(values) == 1 else values)]
     views = [View(f"{i:06d}", pose.reshape(-1, 4), K) for i, (pose, K) in enumerate(zip(poses, Ks, strict=True))]
     return make_camera_file(path, "pose list", C2W_OPENCV, views)
-
-
-def is_trajectory(path: Path) -> bool:
-    """Return whether the first line holds 12 or 16 numbers."""
-    try:
-        with path.open(encoding="utf-8") as file:
-            return len(_numbers(file.readline(4096))) in (12, 16)
-    except (OSError, ValueError):
-        return False
 
 
 def _rows(path: Path, lengths: tuple[int, ...]) -> list[np.ndarray]:
@@ -151,11 +127,10 @@ def _numbers(line: str) -> np.ndarray:
 
 
 def read_sharp(path: Path) -> CameraFile | None:
-    """Read the camera that SHARP writes into its ``.ply``; None without one.
+    """Read the camera that SHARP writes into its ``.ply``, at the size of the file's grid; None without one.
 
-    It is at the size of the file's grid.
-
-    The grid is square whatever the photo's shape: the photo was stretched to it. SceneError if the numbers are damaged.
+    The grid is square whatever the photo's shape: the photo was stretched to it. SceneError if the numbers are
+    damaged.
     """
     if path.suffix.lower() in READERS:
         return None

@@ -1,7 +1,5 @@
-"""Gaussians in the units of most file formats.
-
-All writers start from float64 arrays, :class:`Columns`; all readers end in rows of a PLY file,
-:class:`StoredRows`.
+"""Gaussians in the units of most file formats: :class:`Columns` to write, :class:`StoredRows` as
+read.
 """
 
 from __future__ import annotations
@@ -10,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmerge.geometry import sh0_to_rgb
+from gsmerge.geometry import morton_codes, sh0_to_rgb
 from gsmerge.io.formats.ply_file import MAX_LOG_SCALE, MEANS, MIP_COMMENT, QUATS, SCALES, SH0
 from gsmerge.types import Array, Gaussians, as_array
 
@@ -20,7 +18,7 @@ class Columns:
     """The columns of n Gaussians in a file's units.
 
     ``means [n,3]``, unit ``quats [n,4]`` wxyz, ``log_scales [n,3]``, ``opacities [n]``, ``sh0
-    [n,3]``, and ``harmonics [n,k-1,3]``.
+    [n,3]``, ``harmonics [n,k-1,3]``.
     """
 
     means: np.ndarray
@@ -35,11 +33,12 @@ class Columns:
 
     @property
     def colors(self) -> np.ndarray:
-        """The base colours ``[n,3]``, 0 to 1 in range."""
+        """Base colours ``[n,3]``, 0 to 1 where they can be displayed."""
         return sh0_to_rgb(self.sh0)
 
-    def select(self, order: np.ndarray) -> Columns:
-        """Return the rows in another order."""
+    def along_curve(self) -> Columns:
+        """Sort the rows along a space-filling curve, so that neighbours are close in the file."""
+        order = np.argsort(morton_codes(self.means), kind="stable")
         return Columns(*(column[order] for column in vars(self).values()))
 
 
@@ -57,9 +56,8 @@ class StoredRows:
 
 
 def to_rows(columns: Columns, name: str, sizes: dict[str, int], *, mip: bool = False) -> StoredRows:
-    """Convert the columns of a quantised file to rows of a PLY file.
-
-    ``sizes`` are bytes by attribute; ``mip`` says that the Gaussians want a filter of their own.
+    """Convert columns to rows of a PLY file; ``sizes`` are bytes by attribute, ``mip`` marks
+    antialiased ones.
     """
     count, num_higher = columns.harmonics.shape[:2]
     names = (*MEANS, *SH0, *(f"f_rest_{i}" for i in range(3 * num_higher)), "opacity", *SCALES, *QUATS)
@@ -78,10 +76,8 @@ def to_rows(columns: Columns, name: str, sizes: dict[str, int], *, mip: bool = F
 
 
 def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Columns:
-    """Convert finite Gaussians to columns, without harmonics above a degree.
-
-    ``first_row`` is the number of the first one. ValueError if there is NaN or inf; says in which
-    row.
+    """Convert Gaussians up to a degree to columns; ValueError that names the row if one is not
+    finite.
     """
 
     def check(values: np.ndarray) -> np.ndarray:
@@ -111,12 +107,12 @@ def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Col
 
 
 def to_bytes(values: np.ndarray) -> np.ndarray:
-    """Round to the nearest of 0 to 255, uint8."""
+    """Round to the nearest of 0 to 255, as uint8."""
     return np.clip(np.floor(values + 0.5), 0, 255).astype(np.uint8)
 
 
 def from_smallest_three(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Restore unit quaternions ``[n,4]`` from what :func:`smallest_three` returns."""
+    """Invert :func:`smallest_three`: restore unit quaternions ``[n,4]``."""
     quats = np.empty((len(largest), 4))
     is_largest = np.arange(4) == largest[:, None]
     quats[~is_largest] = others.reshape(-1)
@@ -125,11 +121,10 @@ def from_smallest_three(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 
 def smallest_three(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Split unit quaternions ``[n,4]`` into the index ``[n]`` of the largest part and the others.
+    """Split unit quaternions ``[n,4]`` into the index ``[n]`` of the largest part and the others
+    ``[n,3]``.
 
-    The others are ``[n,3]``, in order.
-
-    The sign is chosen so that the largest one is positive, which makes it the one that need not be stored.
+    The sign is chosen so that the largest part is positive and need not be stored.
     """
     largest, rows = np.abs(quats).argmax(1), np.arange(len(quats))
     quats = quats * np.where(quats[rows, largest] < 0, -1.0, 1.0)[:, None]

@@ -1,8 +1,9 @@
-"""Compressed PLY (PlayCanvas, SuperSplat, gsplat): four packed words per Gaussian, ranges per chunk of 256.
+"""Compressed PLY (PlayCanvas, SuperSplat, gsplat): four packed words per Gaussian, ranges per chunk
+of 256.
 
-The layout is that of PlayCanvas' reader: positions and scales 11-10-11 bits between a chunk's minimum and maximum,
-rotations as their three smaller components at 10 bits, colours and opacity at 8 bits; higher harmonics, where there are
-any, as bytes in an element ``sh``.
+The layout is that of PlayCanvas' reader: positions and scales 11-10-11 bits between a chunk's
+minimum and maximum, rotations as their three smaller components at 10 bits, colours and opacity at
+8 bits, harmonics as bytes in ``sh``.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import morton_codes, rgb_to_sh0
+from gsmerge.geometry import rgb_to_sh0
 from gsmerge.io.formats.arrays import from_smallest_three, smallest_three, to_bytes, to_columns
 from gsmerge.io.formats.ply_file import MEANS, QUATS, REQUIRED, SCALES, SH0
 from gsmerge.types import Gaussians
@@ -31,16 +32,12 @@ MAX_DEGREE = 3  # of the harmonics that are written
 
 
 def is_compressed(data: PlyData) -> bool:
-    """Return whether a PLY holds packed Gaussians."""
+    """Return whether a PLY file has packed Gaussians."""
     return "chunk" in data and "vertex" in data and {p.name for p in data["vertex"].properties} >= set(PACKED)
 
 
 def unpack(path: Path, data: PlyData) -> np.ndarray:
-    """Unpack a compressed file to the rows of an ordinary one, with opacities as logits.
-
-    The columns are those of :mod:`gsmerge.io.formats.ply_file`. SceneError if chunks are missing or
-    lack a column.
-    """
+    """Unpack a compressed file to the rows of an ordinary one, with opacities as logits."""
     vertex, chunk = data["vertex"], data["chunk"]
     for element, needed, types in ((vertex, PACKED, ("u4", "i4")), (chunk, RANGES, ("f4", "f8"))):
         dtypes = {p.name: p.val_dtype for p in element.properties if not isinstance(p, PlyListProperty)}
@@ -63,7 +60,11 @@ def unpack(path: Path, data: PlyData) -> np.ndarray:
         *colors, alpha = _shares(words["packed_color"], (8, 8, 8, 8))
         _fill_between(rows, SH0, colors, chunk, COLORS)
         rows["opacity"] = np.log(alpha) - np.log1p(-alpha)  # infinite for 0 and 1, which the reader takes as such
-    _fill_rotations(rows, words["packed_rotation"])
+    largest = (words["packed_rotation"] >> np.uint32(30)).astype(np.int64)  # of wxyz
+    others = np.stack(_shares(words["packed_rotation"], (10, 10, 10)), 1) - 0.5  # within +-sqrt(1/2)
+    quats = from_smallest_three(largest, others * np.sqrt(2.0))
+    for i, name in enumerate(QUATS):
+        rows[name] = quats[:, i]
     for i in range(num_rest):
         stored = np.asarray(data["sh"][f"f_rest_{i}"], np.float32)
         share = np.where(stored == 0, 0, np.where(stored == 255, 1, (stored + 0.5) / 256))
@@ -84,9 +85,8 @@ def _num_rest(path: Path, data: PlyData, count: int) -> int:
 def _fill_between(
     rows: np.ndarray, columns: tuple[str, ...], shares: list[np.ndarray], chunk: PlyElement, ranges: tuple[str, ...]
 ) -> None:
-    """Fill three columns from shares between a chunk's least and largest values.
-
-    Older files have no such values for colours.
+    """Fill three columns from shares between a chunk's least and largest values, if the file has
+    them.
     """
     ids, dtype = np.arange(len(rows)) // CHUNK, chunk.data.dtype
     has_ranges = all(name in dtype.names and dtype[name].kind == "f" for name in ranges)
@@ -97,20 +97,8 @@ def _fill_between(
         rows[column] = rgb_to_sh0(share) if column in SH0 else share
 
 
-def _fill_rotations(rows: np.ndarray, words: np.ndarray) -> None:
-    """Fill the rotations: 2 bits name the largest of wxyz, the others have 10 each.
-
-    Those span +-sqrt(1/2).
-    """
-    largest = (words >> np.uint32(30)).astype(np.int64)
-    others = (np.stack(_shares(words, (10, 10, 10)), 1) - 0.5) * np.sqrt(2.0)
-    quats = from_smallest_three(largest, others)
-    for i, name in enumerate(QUATS):
-        rows[name] = quats[:, i]
-
-
 def _shares(words: np.ndarray, bits: tuple[int, ...]) -> list[np.ndarray]:
-    """Unpack numbers between 0 and 1 from the lowest bits of words, the last at the bottom."""
+    """Unpack numbers between 0 and 1 from words, the last at the bottom."""
     out = []
     for i, width in enumerate(bits):
         shifted = words >> np.uint32(sum(bits[i + 1 :]))
@@ -119,15 +107,10 @@ def _shares(words: np.ndarray, bits: tuple[int, ...]) -> list[np.ndarray]:
 
 
 def compressed_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
-    """Encode a ``.compressed.ply`` file.
-
-    Rows go along a space-filling curve, so that chunks are small. ValueError if there is NaN or
+    """Encode a ``.compressed.ply`` file along a space-filling curve; ValueError if there is NaN or
     inf.
-
-    ValueError if there is NaN or inf.
     """
-    columns = to_columns(gaussians, MAX_DEGREE)
-    columns = columns.select(np.argsort(morton_codes(columns.means), kind="stable"))
+    columns = to_columns(gaussians, MAX_DEGREE).along_curve()
     count, num_rest = len(columns), 3 * columns.harmonics.shape[1]
     ranged = [_ranged(values) for values in (columns.means, columns.log_scales, columns.colors)]
     chunks = np.concatenate([end for low, high, _ in ranged for end in (low, high)], 1)
@@ -148,10 +131,7 @@ def compressed_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> byte
 
 
 def _ranged(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return least and largest values ``[c,3]`` of each chunk, and all values between 0 and 1.
-
-    The ends are as float32 holds them.
-    """
+    """Return the float32 minima and maxima ``[c,3]`` of each chunk, and all values between 0 and 1."""
     starts = np.arange(0, len(values), CHUNK)
     if len(starts) == 0:
         return values, values, values
@@ -161,7 +141,7 @@ def _ranged(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _packed(shares: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
-    """Pack numbers between 0 and 1 side by side in a word, the first one on top."""
+    """Pack numbers between 0 and 1 side by side into words, the first at the top."""
     words = np.zeros(len(shares), np.uint32)
     for column, width in zip(shares.T, bits, strict=True):
         top = 2**width - 1

@@ -1,7 +1,8 @@
-"""``.glb``: binary glTF 2.0 with the extension ``KHR_gaussian_splatting`` (github.com/KhronosGroup/glTF), float32.
+"""Binary glTF 2.0 (``.glb``) with the extension ``KHR_gaussian_splatting`` of
+github.com/KhronosGroup/glTF.
 
-Its axis y points up, that of a ``.ply`` down: a node turns the Gaussians by half a turn about z, as viewers of ``.ply``
-do. Viewers that do not know the extension show points in the base colours.
+Its axis y points up, that of a ``.ply`` down: a node turns the Gaussians by half a turn about z.
+Viewers that do not know the extension show points in the base colours.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
 def glb_bytes(gaussians: Gaussians) -> bytes:
-    """Encode a ``.glb`` file. ValueError if there is NaN or inf."""
+    """Encode a ``.glb`` file; ValueError if there is NaN or inf."""
     attributes = _attributes(to_columns(gaussians, MAX_DEGREE))
     document: dict[str, Any] = {"asset": {"version": "2.0", "generator": "gsmerge"}, "scene": 0, "scenes": [{}]}
     content = b""
@@ -31,9 +32,14 @@ def glb_bytes(gaussians: Gaussians) -> bytes:
         accessors: list[dict[str, Any]] = []
         for values in attributes.values():
             views.append({"buffer": 0, "byteOffset": at, "byteLength": values.nbytes, "target": _VERTICES})
-            accessors.append(_accessor(len(accessors), values))
+            kind = {"componentType": _BYTE, "normalized": True}
+            if values.dtype != np.uint8:
+                kind = {"componentType": _FLOAT}
+            shape = {"count": len(values), "type": _TYPES[values[0].size]}
+            accessors.append({"bufferView": len(accessors), **kind, **shape})
             at += values.nbytes
-        accessors[0] |= {name: end(attributes["POSITION"], axis=0).tolist() for name, end in _ENDS.items()}
+        for name, end in (("min", np.min), ("max", np.max)):  # of the positions, which glTF asks for
+            accessors[0][name] = end(attributes["POSITION"], axis=0).tolist()
         content = b"".join(values.tobytes() for values in attributes.values())
         splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
         splats |= {"sortingMethod": "cameraDistance", "projection": "perspective"}
@@ -52,9 +58,6 @@ def glb_bytes(gaussians: Gaussians) -> bytes:
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
 
-_ENDS = {"min": np.min, "max": np.max}  # of the positions, which glTF asks for
-
-
 def _attributes(columns: Columns) -> dict[str, np.ndarray]:
     """Return values ``[n]`` or ``[n,d]`` by attribute, positions first, each of whole words."""
     colors = to_bytes(255 * np.concatenate([columns.colors, columns.opacities[:, None]], 1))
@@ -69,13 +72,6 @@ def _attributes(columns: Columns) -> dict[str, np.ndarray]:
         degree = int((i + 1) ** 0.5)
         values[f"{NAME}:SH_DEGREE_{degree}_COEF_{i + 1 - degree**2}"] = columns.harmonics[:, i]
     return {**{name: array.astype("<f4") for name, array in values.items()}, "COLOR_0": colors}
-
-
-def _accessor(view: int, values: np.ndarray) -> dict[str, Any]:
-    kind = _TYPES[values[0].size]
-    if values.dtype == np.uint8:
-        return {"bufferView": view, "componentType": _BYTE, "normalized": True, "count": len(values), "type": kind}
-    return {"bufferView": view, "componentType": _FLOAT, "count": len(values), "type": kind}
 
 
 def _chunk(kind: bytes, content: bytes, padding: bytes) -> bytes:

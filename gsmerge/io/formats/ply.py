@@ -1,4 +1,4 @@
-"""Reading Gaussian splats from files: log scales, logits and channel-major harmonics end here."""
+"""Read Gaussian splats from files: log scales, logits and channel-major harmonics end here."""
 
 from __future__ import annotations
 
@@ -52,9 +52,8 @@ SCENE_SUFFIXES = (".ply", *READERS)
 
 @dataclass(frozen=True)
 class PlyInfo:
-    """Facts about a file of Gaussians.
-
-    Of another format than PLY, they are those of its rows as a PLY file of float32.
+    """Facts about a file of Gaussians; of another format than PLY, about its rows as float32
+    columns.
     """
 
     path: str
@@ -94,7 +93,7 @@ class PlyScene:
 
 
 def kept_comments(info: PlyInfo) -> tuple[str, ...]:
-    """Return the comments of a file's header that say how its Gaussians are to be rendered."""
+    """Return the comments of a file's header that tell viewers how to render its Gaussians."""
     lines = (comment for comment in info.comments if comment.isascii() and comment.isprintable())
     return tuple(comment for comment in lines if comment.startswith(RENDER_COMMENT))
 
@@ -114,12 +113,12 @@ def ply_notes(info: PlyInfo) -> tuple[str, ...]:
 def read_ply(path: StrPath, *, opacity: OpacityChoice = "auto") -> PlyScene:
     """Read a PLY file of Gaussians: binary or ascii, any SH degree up to 4, extra columns and elements ignored.
 
+    Colours may be red, green and blue (bytes, or floats in [0, 1]) where the harmonics of degree 0 are missing.
+
     Args:
         path: The file.
         opacity: How opacities are stored; "auto" takes them as activated if all finite ones lie in [0, 1], else
             as logits. Infinite logits are opacities of 0 and 1.
-
-    Colours may be red, green and blue (bytes, or floats in [0, 1]) where the harmonics of degree 0 are missing.
 
     Raises:
         SceneError: If the file cannot be read, lacks columns, or holds no finite Gaussian.
@@ -127,14 +126,29 @@ def read_ply(path: StrPath, *, opacity: OpacityChoice = "auto") -> PlyScene:
     """
     if opacity not in ("auto", "logit", "raw"):
         raise ValueError(f"opacity: expected 'auto', 'logit' or 'raw', got {opacity!r}")
-    return _to_scene(Path(path), _ply_rows(Path(path)), opacity)
+    path = Path(path)
+    data = open_ply(path)
+    compressed = is_compressed(data)
+    rows = unpack(path, data) if compressed else _vertex(path, data).data
+    names = tuple(np.asarray(rows).dtype.names or ())
+    num_rest = _num_rest(path, names)
+    comments = (*data.comments, *(c for e in data.elements for c in e.comments))
+    stored = StoredRows(
+        rows=rows,
+        layout=f"compressed, SH degree {sh_degree(num_rest)}" if compressed else layout_name(names, num_rest),
+        format="ascii" if data.text else "binary big-endian" if data.byte_order == ">" else "binary little-endian",
+        encoding="logit" if compressed or LOGIT_COMMENT in comments else None,
+        comments=comments,
+        extra_elements=tuple(e.name for e in data.elements if e.name != "vertex"),
+    )
+    return _to_scene(path, stored, opacity)
 
 
 def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto") -> PlyScene:
-    """Read a file of Gaussians in the format that the ending of its name says.
+    """Read a file of Gaussians in the format of its ending.
 
-    Those are ``.spz`` (versions 1 to 3), ``.splat`` and ``.sog`` (version 2). Everything else is read as by
-    :func:`read_ply`; ``opacity`` is for those.
+    Endings are ``.spz`` (versions 1 to 4), ``.splat`` and ``.sog`` (version 2). Everything else is
+    read by :func:`read_ply`; ``opacity`` is for those.
 
     Raises:
         SceneError: If the file cannot be read, is damaged, or holds no finite Gaussian.
@@ -144,33 +158,24 @@ def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto") -> PlyScen
     return read_ply(path, opacity=opacity) if read is None else _to_scene(Path(path), read(Path(path)), "auto")
 
 
-def _ply_rows(path: Path) -> StoredRows:
-    data = open_ply(path)
-    compressed = is_compressed(data)
-    rows = unpack(path, data) if compressed else _vertex(path, data).data
-    names = tuple(np.asarray(rows).dtype.names or ())
-    num_rest = _num_rest(path, names)
-    comments = (*data.comments, *(c for e in data.elements for c in e.comments))
-    return StoredRows(
-        rows=rows,
-        layout=f"compressed, SH degree {sh_degree(num_rest)}" if compressed else layout_name(names, num_rest),
-        format="ascii" if data.text else "binary big-endian" if data.byte_order == ">" else "binary little-endian",
-        encoding="logit" if compressed or LOGIT_COMMENT in comments else None,
-        comments=comments,
-        extra_elements=tuple(e.name for e in data.elements if e.name != "vertex"),
-    )
-
-
 def _to_scene(path: Path, stored: StoredRows, opacity: OpacityChoice) -> PlyScene:
     rows = np.asarray(stored.rows)
     names = tuple(rows.dtype.names or ())
     num_rest = _num_rest(path, names)
-    out = _allocate(rows, num_rest // 3)
+    n, size = len(rows), max(1, BLOCK_BYTES // rows.dtype.itemsize)
+    wide = any(rows.dtype[name].kind == "f" and rows.dtype[name].itemsize == 8 for name in MEANS)
+    shapes = {"quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh0": (n, 1, 3), "shN": (n, num_rest // 3, 3)}
+    out = {"means": np.empty((n, 3), np.float64 if wide else np.float32), "valid": np.empty(n, np.bool_)}
+    out |= {name: np.empty(shape, np.float32) for name, shape in shapes.items()}
     with open_rows(path, stored.rows) as read:
-        num_clipped, num_zero_quats = _convert_all(rows, read, out)
+
+        def convert(start: int) -> tuple[int, int]:
+            block = slice(start, min(start + size, n))
+            return _convert(read(block), {name: column[block] for name, column in out.items()})
+
+        num_clipped, num_zero_quats = map(sum, zip(*parallel_map(convert, range(0, n, size)), strict=True))
     known = opacity if opacity != "auto" else stored.encoding
-    encoding = known or _likely_encoding(out["opacities"])
-    _activate(out["opacities"], out["valid"], encoding)
+    encoding = _activate(out["opacities"], out["valid"], known)
     num_bad = clear_invalid(path, out)
     byte_columns = tuple(name for name in names if rows.dtype[name].itemsize == 1)
     if byte_columns == NORMALS:
@@ -181,7 +186,7 @@ def _to_scene(path: Path, stored: StoredRows, opacity: OpacityChoice) -> PlyScen
         path=str(path),
         layout=stored.layout,
         format=stored.format,
-        count=len(rows),
+        count=n,
         file_bytes=path.stat().st_size,
         bytes_by_attribute=stored.sizes or bytes_by_attribute(rows, extra),
         columns=names,
@@ -228,29 +233,6 @@ def _num_rest(path: Path, columns: tuple[str, ...]) -> int:
         numbers = "f_rest_0 to f_rest_8, _23, _44 or _71 (SH degree 1 to 4)"
         raise SceneError(path, f"expected columns {numbers} or none, found {len(names)} f_rest columns")
     return len(names)
-
-
-def _allocate(rows: np.ndarray, num_higher: int) -> dict[str, np.ndarray]:
-    n = len(rows)
-    wide = any(rows.dtype[name].kind == "f" and rows.dtype[name].itemsize == 8 for name in MEANS)
-    shapes = {"quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh0": (n, 1, 3), "shN": (n, num_higher, 3)}
-    out = {"means": np.empty((n, 3), np.float64 if wide else np.float32), "valid": np.empty(n, np.bool_)}
-    return out | {name: np.empty(shape, np.float32) for name, shape in shapes.items()}
-
-
-def _convert_all(rows: np.ndarray, read: Callable[[slice], np.ndarray], out: dict[str, np.ndarray]) -> tuple[int, int]:
-    """Fill the arrays block by block, in parallel.
-
-    Returns how many rows were clipped, and how many had no rotation.
-    """
-    size = max(1, BLOCK_BYTES // rows.dtype.itemsize)
-
-    def convert(start: int) -> tuple[int, int]:
-        block = slice(start, min(start + size, len(rows)))
-        return _convert(read(block), {name: column[block] for name, column in out.items()})
-
-    counts = parallel_map(convert, range(0, len(rows), size))
-    return sum(clipped for clipped, _ in counts), sum(zero for _, zero in counts)
 
 
 def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int, int]:
@@ -301,7 +283,7 @@ def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int, int]:
 
 
 def _exactly_valid(rows: np.ndarray, num_higher: int) -> np.ndarray:
-    """Return which rows are usable: all finite, but for infinite logits and scales of zero."""
+    """Return which rows are usable: finite, except for infinite logits and scales of zero."""
     valid = ~np.isnan(rows["opacity"].astype(np.float32))
     colors = color_columns(rows.dtype.names)
     for name in (*MEANS, *colors, *QUATS, *(f"f_rest_{i}" for i in range(3 * num_higher))):
@@ -330,26 +312,25 @@ def _normalise(quats: list[np.ndarray], out: np.ndarray) -> np.ndarray:
     return zero
 
 
-def _likely_encoding(opacities: np.ndarray) -> str:
-    """Return "raw" if all finite opacities lie in [0, 1], otherwise "logit".
+def _activate(opacities: np.ndarray, valid: np.ndarray, known: str | None) -> str:
+    """Convert stored opacities to [0, 1] in place, and return their encoding, guessed where it is not known.
 
-    At least one is finite.
+    They are raw if all finite ones lie in [0, 1]. An infinite raw one makes its row invalid.
     """
     finite = np.isfinite(opacities)
-    low, high = opacities.min(where=finite, initial=np.inf), opacities.max(where=finite, initial=-np.inf)
-    return "raw" if 0 <= low <= high <= 1 else "logit"
-
-
-def _activate(opacities: np.ndarray, valid: np.ndarray, encoding: str) -> None:
-    """Turn stored opacities into [0, 1], in place; an infinite activated one makes its row invalid."""
-    if encoding == "raw":
-        valid &= np.isfinite(opacities)
+    if known is None:
+        low = opacities.min(where=finite, initial=np.inf)
+        high = opacities.max(where=finite, initial=-np.inf)
+        known = "raw" if 0 <= low <= high <= 1 else "logit"
+    if known == "raw":
+        valid &= finite
         np.clip(opacities, 0, 1, out=opacities)
-        return
+        return known
     with np.errstate(all="ignore"):
         np.exp(np.negative(opacities, out=opacities), out=opacities)
         np.add(opacities, 1, out=opacities)
         np.reciprocal(opacities, out=opacities)
+    return known
 
 
 def clear_invalid(path: str | Path, out: dict[str, np.ndarray]) -> int:

@@ -49,11 +49,8 @@ _SIZES = {
 def open_ply(path: Path) -> PlyData:
     """Open a PLY file; its binary vertices, unless packed, are mapped for :func:`open_rows`.
 
-    SceneError if it is no PLY file, is truncated or damaged, or its header asks for more than it
-    holds.
-
-    SceneError if it is no PLY file, is truncated or damaged, or its header asks for more than it
-    holds.
+    SceneError if it is no PLY file, is truncated or damaged, or its header promises more than it
+    has.
     """
     size = check_file(path)
     try:
@@ -82,10 +79,8 @@ def open_ply(path: Path) -> PlyData:
 
 
 def _stream(path: Path, end: int, *, text: bool) -> IO[Any]:
-    """Open a PLY file for the parser, and hide from it what it does not know and is no harm.
-
-    That is bytes that are no ASCII in the header, which ends at ``end``, and empty lines between
-    rows of text.
+    """Open a PLY file for the parser, without bytes beyond ASCII in the header and empty lines in
+    the text.
     """
     if text:
         return _TextRows(path.open("rb"), "ascii", "backslashreplace", newline="")
@@ -116,7 +111,7 @@ class _BinaryRows(BufferedReader):
 def open_rows(path: Path, rows: np.ndarray) -> Iterator[Callable[[slice], np.ndarray]]:
     """Yield a function that returns blocks of a PLY file's rows; several threads may call it.
 
-    Mapped pages of a file that shrinks would end the process; reading it is a SceneError.
+    Mapped pages of a file that shrinks would end the process; reading such a file is a SceneError.
     """
     if not isinstance(rows, np.memmap):
         yield rows.__getitem__
@@ -139,9 +134,8 @@ def open_rows(path: Path, rows: np.ndarray) -> Iterator[Callable[[slice], np.nda
 
 
 def header_counts(path: Path) -> tuple[int, int]:
-    """Return the numbers of Gaussians and of higher harmonics' columns in a PLY file's header.
-
-    Zeros if it cannot be read.
+    """Return the numbers of Gaussians and of ``f_rest`` columns in a PLY file's header; zeros if
+    unreadable.
     """
     try:
         with path.open("rb") as file:
@@ -153,13 +147,10 @@ def header_counts(path: Path) -> tuple[int, int]:
 
 
 def _check_header(path: Path, start: bytes, size: int) -> tuple[int, bool]:
-    """Refuse a header that never ends, or elements that the file has too few bytes for.
+    """Return the size of a header and whether rows are text; SceneError if the file is too short
+    for it.
 
-    ``start`` has the first bytes of ``size``. Everything else is left to the parser. Returns the
-    header's size, and whether rows are text.
-
-    ``start`` has the first bytes of ``size``. Everything else is left to the parser. Returns the
-    header's size, and whether rows are text.
+    ``start`` has the first bytes of ``size``. Everything else is left to the parser.
     """
     newline = b"\r\n" if start[3:5] == b"\r\n" else start[3:4]
     last = newline + b"end_header" + newline
@@ -199,19 +190,20 @@ def _truncated(path: Path, promise: str, num_whole: int, reason: str) -> SceneEr
 
 
 def sh_degree(num_rest: int) -> int:
-    """Return the SH degree of that many ``f_rest`` columns."""
+    """Return the SH degree of a number of ``f_rest`` columns."""
     return round((num_rest / 3 + 1) ** 0.5) - 1
 
 
 def color_columns(names: tuple[str, ...] | None) -> tuple[str, ...]:
-    """Return the names of the columns that hold the base colour."""
+    """Name the columns of the base colour."""
     return SH0 if names is None or SH0[0] in names else RGB
 
 
 def spread_low_degree(shN: np.ndarray) -> None:
     """Move harmonics of a low degree to their places in ``shN [n,15,3]``, in place.
 
-    Long-LRM writes 45 columns whatever the degree: those of degree 1 (or 2) are channel-major in the first 9 (or 24).
+    Long-LRM writes 45 columns whatever the degree, the used ones channel-major in the first 9 or
+    24.
     """
     if shN.shape[1] != 15:
         return
@@ -235,7 +227,7 @@ def layout_name(names: tuple[str, ...], num_rest: int) -> str:
 
 
 def bytes_by_attribute(rows: np.ndarray, extra: tuple[str, ...]) -> dict[str, int]:
-    """Count the bytes of all rows by attribute; ``extra`` are the columns that are ignored."""
+    """Count the bytes of all rows by attribute; ``extra`` columns are ignored by readers."""
     groups = {"means": MEANS, "normals": NORMALS, "sh0": color_columns(rows.dtype.names), "opacities": ("opacity",)}
     groups |= {"scales": SCALES, "quats": QUATS, "extra": extra}
     kinds = {name: kind for kind, names in groups.items() for name in names}

@@ -1,11 +1,8 @@
-"""``.sog`` version 2: a zip of WebP textures, one pixel per Gaussian, and ``meta.json``.
+"""``.sog`` version 2 (developer.playcanvas.com, "The SOG format"): lossless WebP textures in a zip.
 
-The format is described at developer.playcanvas.com, "The SOG format". Textures are without loss.
-
-The format is described at developer.playcanvas.com, "The SOG format".
-
-Positions are 16 bits of their signed logarithms, rotations their three smaller components at 8 bits, log scales,
-colours and harmonics codes of codebooks of 256; all harmonics of a Gaussian are one of at most 65,536 of a palette.
+A pixel is a Gaussian. Positions are 16 bits of their signed logarithms, rotations their three
+smaller components at 8 bits, log scales, colours and harmonics codes of codebooks of 256; all
+harmonics of a Gaussian are one of at most 65,536 of a palette.
 """
 
 from __future__ import annotations
@@ -24,8 +21,7 @@ import cv2
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import morton_codes
-from gsmerge.io.bounds import check_file
+from gsmerge.io.bounds import check_file, read_errors
 from gsmerge.io.formats.arrays import (
     Columns,
     StoredRows,
@@ -51,13 +47,18 @@ _MAX_STEPS = 200
 
 
 def read_rows(path: Path) -> StoredRows:
-    """Read the Gaussians of a ``.sog``. SceneError if it is none, of another version, or damaged."""
+    """Read the Gaussians of a ``.sog``; SceneError if it is another file, another version, or
+    damaged.
+    """
     size = check_file(path)
     try:
-        with zipfile.ZipFile(path) as archive:
-            sog = _Sog(path, archive, size)
+        with read_errors(path), zipfile.ZipFile(path) as archive:
+            sog = _Sog(archive, size)
             meta = json.loads(sog.member("meta.json", MAX_META_BYTES))
-            _check_version(path, meta)
+            version = meta.get("version", 1) if isinstance(meta, dict) else "none"
+            if version != VERSION:
+                problem = f"expected .sog version {VERSION}, found {version}"
+                raise SceneError(path, problem, "export it with a newer program")
             count = int(meta["count"])
             if not 0 < count <= MAX_PER_BYTE * size:
                 raise SceneError(path, f"expected Gaussians in {size} bytes, found {count} promised")
@@ -66,8 +67,6 @@ def read_rows(path: Path) -> StoredRows:
             keys = [key for key in ("means", "scales", "quats", "sh0", "shN") if meta.get(key)]
             sizes = {key: sum(archive.getinfo(name).compress_size for name in meta[key]["files"]) for key in keys}
             return to_rows(columns, f".sog version {VERSION}", sizes, mip=mip)
-    except OSError as error:
-        raise SceneError(path, f"cannot be read ({error.strerror})") from error
     except zipfile.BadZipFile as error:
         raise SceneError(path, f"expected a .sog file, found no complete zip ({error})", "copy it again") from error
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError, EOFError) as error:
@@ -77,17 +76,10 @@ def read_rows(path: Path) -> StoredRows:
         raise SceneError(path, f"expected a readable .sog file, found a damaged one ({error})") from error
 
 
-def _check_version(path: Path, meta: Any) -> None:
-    version = meta.get("version", 1) if isinstance(meta, dict) else "none"
-    if version != VERSION:
-        raise SceneError(path, f"expected .sog version {VERSION}, found {version}", "export it with a newer program")
-
-
 @dataclass(frozen=True)
 class _Sog:
-    """An archive, from which nothing is taken that is larger than its size allows."""
+    """An archive of which nothing is read that is larger than its size allows."""
 
-    path: Path
     archive: zipfile.ZipFile
     size: int
 
@@ -115,7 +107,7 @@ class _Sog:
 
 
 def _webp_size(data: bytes) -> tuple[int, int]:
-    """Return (width, height) of a WebP file without loss. ValueError if it is none."""
+    """Return (width, height) of a lossless WebP file; ValueError if it is none."""
     kind = data[12:16] if data[:4] == b"RIFF" and data[8:12] == b"WEBP" else b""
     if kind == b"VP8X" and len(data) >= 30:
         return int.from_bytes(data[24:27], "little") + 1, int.from_bytes(data[27:30], "little") + 1
@@ -172,53 +164,43 @@ def _read_harmonics(sog: _Sog, part: dict[str, Any], count: int) -> np.ndarray:
 
 
 def sog_bytes(gaussians: Gaussians, *, mip: bool = False) -> bytes:
-    """Encode a ``.sog`` file; ``mip`` marks antialiased Gaussians.
-
-    Rows go along a space-filling curve. ValueError if there is NaN or inf.
-
-    ValueError if there is NaN or inf.
+    """Encode a ``.sog`` along a space-filling curve; ``mip`` marks antialiased Gaussians, NaN is a
+    ValueError.
     """
-    columns = to_columns(gaussians, MAX_DEGREE)
-    columns = columns.select(np.argsort(morton_codes(columns.means), kind="stable"))
+    columns = to_columns(gaussians, MAX_DEGREE).along_curve()
     count = len(columns)
     meta: dict[str, Any] = {"version": VERSION, "asset": {"generator": "gsmerge"}, "count": count, "antialias": mip}
     if mip:
         meta["model"] = "antialiased"  # as splat-transform says it
-    textures: dict[str, np.ndarray] = {}
+    textures: dict[str, bytes] = {}
 
-    def add(key: str, files: dict[str, np.ndarray], **numbers: Any) -> None:
+    def add(key: str, files: dict[str, bytes], **numbers: Any) -> None:
         meta[key] = {**numbers, "files": list(files)}
         textures.update(files)
 
-    low, high, fixed = _log_positions(columns.means)
-    halves = {"means_l.webp": fixed & 255, "means_u.webp": fixed >> 8}
-    add("means", {name: _texture(half) for name, half in halves.items()}, mins=_shorten(low), maxs=_shorten(high))
+    logs = np.sign(columns.means) * np.log1p(np.abs(columns.means))
+    low, high = (end(logs, axis=0) if count else np.zeros(3) for end in (np.min, np.max))
+    fixed = np.round((logs - low) / np.where(high > low, high - low, 1) * 65535).astype(int)
+    halves = {"means_l.webp": _texture(fixed & 255), "means_u.webp": _texture(fixed >> 8)}
+    add("means", halves, mins=_shorten(low), maxs=_shorten(high))
     scales, sh0 = fit_codebook(columns.log_scales), fit_codebook(columns.sh0)
     add("scales", {"scales.webp": _texture(nearest_codes(scales, columns.log_scales))}, codebook=_shorten(scales))
-    add("quats", {"quats.webp": _texture(_rotation_bytes(columns.quats))})
+    largest, others = smallest_three(columns.quats)
+    quats = np.concatenate([to_bytes(255 * (others / np.sqrt(2.0) + 0.5)), FIRST_MODE + largest[:, None]], 1)
+    add("quats", {"quats.webp": _texture(quats)})
     colors = np.concatenate([nearest_codes(sh0, columns.sh0), to_bytes(255 * columns.opacities)[:, None]], 1)
     add("sh0", {"sh0.webp": _texture(colors)}, codebook=_shorten(sh0))
     if columns.harmonics.size:
         files, numbers = _harmonic_textures(columns)
         add("shN", files, **numbers)
-    return _zip({name: _webp(texture) for name, texture in textures.items()}, meta)
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as archive:
+        for name, data in {**textures, "meta.json": json.dumps(meta).encode("ascii")}.items():
+            archive.writestr(zipfile.ZipInfo(name), data)  # of 1980: the same bytes at any time
+    return content.getvalue()
 
 
-def _log_positions(means: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the least and largest signed logarithms ``[3]``, and all as 16 bits ``[n,3]``."""
-    logs = np.sign(means) * np.log1p(np.abs(means))
-    if len(logs) == 0:
-        return np.zeros(3), np.zeros(3), np.zeros((0, 3), int)
-    low, high = logs.min(0), logs.max(0)
-    return low, high, np.round((logs - low) / np.where(high > low, high - low, 1) * 65535).astype(int)
-
-
-def _rotation_bytes(quats: np.ndarray) -> np.ndarray:
-    largest, others = smallest_three(quats)
-    return np.concatenate([to_bytes(255 * (others / np.sqrt(2.0) + 0.5)), FIRST_MODE + largest[:, None]], 1)
-
-
-def _harmonic_textures(columns: Columns) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def _harmonic_textures(columns: Columns) -> tuple[dict[str, bytes], dict[str, Any]]:
     """Make the textures of palette and indices, and their entries in ``meta.json``."""
     count, num_higher = columns.harmonics.shape[:2]
     palette, labels = fit_palette(columns.harmonics.reshape(count, -1), PALETTE_BITS)
@@ -227,7 +209,7 @@ def _harmonic_textures(columns: Columns) -> tuple[dict[str, np.ndarray], dict[st
     centroids = np.zeros((rows * PALETTE_COLUMNS, num_higher, 3), np.uint8)
     centroids[: len(palette)] = nearest_codes(codebook, palette).reshape(-1, num_higher, 3)
     files = {
-        "shN_centroids.webp": centroids.reshape(rows, PALETTE_COLUMNS * num_higher, 3),
+        "shN_centroids.webp": _webp(centroids.reshape(rows, PALETTE_COLUMNS * num_higher, 3)),
         "shN_labels.webp": _texture(np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], 1)),
     }
     bands = round((num_higher + 1) ** 0.5) - 1
@@ -235,17 +217,17 @@ def _harmonic_textures(columns: Columns) -> tuple[dict[str, np.ndarray], dict[st
 
 
 def _shorten(values: np.ndarray) -> list[float]:
-    """Round to as few digits as float32 allows."""
+    """Round to as few digits as float32 needs."""
     return [float(f"{value:.8g}") for value in values]
 
 
-def _texture(values: np.ndarray) -> np.ndarray:
-    """Arrange rows of channels as an image about as high as wide, filled up with zeros."""
+def _texture(values: np.ndarray) -> bytes:
+    """Encode rows of channels as a lossless WebP image about as high as wide, padded with zeros."""
     width = max(4, math.ceil(math.sqrt(len(values)) / 4) * 4)
     height = max(4, math.ceil(len(values) / width / 4) * 4)
     pixels = np.zeros((height * width, values.shape[1]), np.uint8)
     pixels[: len(values)] = values
-    return pixels.reshape(height, width, -1)
+    return _webp(pixels.reshape(height, width, -1))
 
 
 def _webp(image: np.ndarray) -> bytes:
@@ -255,20 +237,12 @@ def _webp(image: np.ndarray) -> bytes:
     return data.tobytes()
 
 
-def _zip(files: dict[str, bytes], meta: dict[str, Any]) -> bytes:
-    content = io.BytesIO()
-    with zipfile.ZipFile(content, "w") as archive:
-        for name, data in {**files, "meta.json": json.dumps(meta).encode("ascii")}.items():
-            archive.writestr(zipfile.ZipInfo(name), data)  # of 1980: the same bytes at any time
-    return content.getvalue()
-
-
 def fit_codebook(values: np.ndarray) -> np.ndarray:
-    """Choose ``[256]`` values, rising, that stand for finite numbers of any shape, by 1-D k-means.
+    """Choose ``[256]`` rising values that represent finite numbers of any shape, by 1-D k-means.
 
-    Thousands of narrow cells are merged, always the two neighbours that add the least squared error (Ward 1963), until
-    256 are left, and Lloyd's steps improve those. Values far from all others so keep codes of their own. Codes that are
-    left over repeat the last one.
+    Thousands of narrow cells are merged, always the two neighbours that add the least squared error
+    (Ward 1963), until 256 are left; Lloyd's steps improve those. So values far from all others keep
+    codes of their own. Unused codes repeat the last one.
     """
     ordered = np.sort(values, axis=None)
     distinct = np.unique(ordered)
@@ -290,7 +264,7 @@ def fit_codebook(values: np.ndarray) -> np.ndarray:
 
 
 def _merge_cells(numbers: np.ndarray, means: np.ndarray) -> np.ndarray:
-    """Merge neighbouring cells until there are 256, and return the means of those that are left."""
+    """Merge neighbouring cells until 256 are left, and return their means."""
     n, m = numbers.tolist(), means.tolist()
     left, right = list(range(-1, len(n) - 1)), list(range(1, len(n) + 1))
 
@@ -315,15 +289,16 @@ def _merge_cells(numbers: np.ndarray, means: np.ndarray) -> np.ndarray:
 
 
 def nearest_codes(codebook: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the index of the code nearest to each value, uint8, in the shape of ``values``."""
+    """Return the index of the nearest code of each value, uint8, in the shape of ``values``."""
     return np.searchsorted((codebook[1:] + codebook[:-1]) / 2, values).astype(np.uint8)
 
 
 def fit_palette(vectors: np.ndarray, max_bits: int) -> tuple[np.ndarray, np.ndarray]:
-    """Choose at most ``2**max_bits`` vectors for ``[n,d]`` ones, and each one's index ``[n]``.
+    """Choose at most ``2**max_bits`` vectors that represent ``vectors [n,d]``, and the index
+    ``[n]`` of each.
 
-    Vectors are halved at the median of the coordinate in which they differ most, group by group, and the means of the
-    last groups are the palette. Where there are few enough, every vector is its own.
+    Groups are halved at the median of the coordinate in which they differ most; the means of the
+    last groups are the palette. Where there are few enough vectors, each is its own.
     """
     count = len(vectors)
     if count <= 2**max_bits:

@@ -11,7 +11,7 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import rgb_to_sh0
-from gsmerge.io.bounds import check_file
+from gsmerge.io.bounds import check_file, read_errors
 from gsmerge.io.formats.arrays import Columns, StoredRows, to_bytes, to_columns, to_rows
 from gsmerge.types import Gaussians
 
@@ -20,7 +20,7 @@ ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colors", "u1", 4), 
 
 
 def splat_bytes(gaussians: Gaussians) -> bytes:
-    """Encode a ``.splat`` file. ValueError if there is NaN or inf."""
+    """Encode a ``.splat`` file; ValueError if there is NaN or inf."""
     columns = to_columns(gaussians, MAX_DEGREE)
     rows = np.empty(len(columns), ROW)
     rows["means"], rows["scales"] = columns.means, np.exp(columns.log_scales)
@@ -30,15 +30,13 @@ def splat_bytes(gaussians: Gaussians) -> bytes:
 
 
 def read_rows(path: Path) -> StoredRows:
-    """Read the Gaussians of a ``.splat``. SceneError if it has no whole rows of 32 bytes."""
+    """Read the Gaussians of a ``.splat``; SceneError if it has no whole rows of 32 bytes."""
     size = check_file(path)
     if size == 0 or size % ROW.itemsize:
         problem = f"expected a .splat of {ROW.itemsize} bytes per Gaussian, found {size} bytes"
         raise SceneError(path, problem, "copy or export it again")
-    try:
+    with read_errors(path):
         rows = np.fromfile(path, ROW)
-    except OSError as error:
-        raise SceneError(path, f"cannot be read ({error.strerror})") from error
     colors = rows["colors"] / 255
     with np.errstate(all="ignore"):  # a scale of 0 is a value, what is not finite is set aside later
         columns = Columns(

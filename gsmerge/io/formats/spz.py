@@ -24,7 +24,7 @@ import numpy as np
 
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry import rgb_to_sh0
-from gsmerge.io.bounds import check_file
+from gsmerge.io.bounds import check_file, read_errors
 from gsmerge.io.formats.arrays import (
     Columns,
     StoredRows,
@@ -80,10 +80,8 @@ def read_rows(path: Path) -> StoredRows:
         UsageError: If it is of version 4 and ``zstandard`` is not installed.
     """
     check_file(path)
-    try:
+    with read_errors(path):
         packed = path.read_bytes()
-    except OSError as error:
-        raise SceneError(path, f"cannot be read ({error.strerror})") from error
     read = _zstandard_parts if packed[:4] == MAGIC.to_bytes(4, "little") else _gzip_parts
     header, parts = read(path, packed)
     sizes = {name: part.size for name, part in zip(ATTRIBUTES, parts, strict=True) if part.size}
@@ -92,7 +90,7 @@ def read_rows(path: Path) -> StoredRows:
 
 
 def _read_header(path: Path, packed: bytes, start: bytes, versions: Sequence[int]) -> _Header:
-    """Read the header, and check it against the bytes of the file."""
+    """Read the header, and check it against the number of bytes of the file."""
     if len(start) < HEADER.size:
         raise SceneError(path, FOUND_EARLY_END, AGAIN)
     magic, *numbers = HEADER.unpack(start)
@@ -121,10 +119,7 @@ def _gzip_parts(path: Path, packed: bytes) -> tuple[_Header, list[np.ndarray]]:
 
 
 def _zstandard_parts(path: Path, packed: bytes) -> tuple[_Header, list[np.ndarray]]:
-    """Read header and parts of version 4.
-
-    Extensions, which lie between header and table, say nothing about the Gaussians.
-    """
+    """Read header and parts of version 4, without extensions, which do not describe the Gaussians."""
     header = _read_header(path, packed, packed[: HEADER.size], (4,))
     sizes = [header.count * width for width in header.widths if width]
     try:
@@ -157,9 +152,12 @@ def _zstandard_parts(path: Path, packed: bytes) -> tuple[_Header, list[np.ndarra
 def _read_columns(parts: list[np.ndarray], header: _Header) -> Columns:
     version, fraction = header.version, header.fraction
     means, opacities, colors, scales, rotations, harmonics = parts
+    words = np.zeros((header.count, 3, 4), np.uint8)  # signed numbers of three little-endian bytes
+    if version > 1:
+        words[..., 1:] = means.reshape(-1, 3, 3)
     return Columns(
-        means=means.view("<f2").astype(float) if version == 1 else _fixed_points(means) / 2.0**fraction,
-        quats=_three_bytes(rotations) if version < 3 else _smallest_three(rotations.view("<u4")[:, 0]),
+        means=means.view("<f2").astype(float) if version == 1 else (words.view("<i4")[..., 0] >> 8) / 2.0**fraction,
+        quats=_read_rotations(rotations, version),
         log_scales=scales / 16 - 10,
         opacities=opacities[:, 0] / 255,
         sh0=rgb_to_sh0(0.5 + SH_C0 * (colors / 255 - 0.5) / COLOR_SCALE),
@@ -167,21 +165,13 @@ def _read_columns(parts: list[np.ndarray], header: _Header) -> Columns:
     )
 
 
-def _fixed_points(stored: np.ndarray) -> np.ndarray:
-    """Convert three little-endian bytes each to signed numbers ``[n,3]``."""
-    words = np.zeros((len(stored), 3, 4), np.uint8)
-    words[..., 1:] = stored.reshape(-1, 3, 3)
-    return words.view("<i4")[..., 0] >> 8
-
-
-def _three_bytes(stored: np.ndarray) -> np.ndarray:
-    xyz = stored / 127.5 - 1
-    w = np.sqrt(np.clip(1 - (xyz**2).sum(1, keepdims=True), 0, None))
-    return np.concatenate([w, xyz], 1)
-
-
-def _smallest_three(words: np.ndarray) -> np.ndarray:
-    """Restore quaternions wxyz from words whose top two bits name the largest of xyzw."""
+def _read_rotations(stored: np.ndarray, version: int) -> np.ndarray:
+    """Restore quaternions ``[n,4]`` wxyz: from xyz as bytes, since version 3 from packed words."""
+    if version < 3:
+        xyz = stored / 127.5 - 1
+        w = np.sqrt(np.clip(1 - (xyz**2).sum(1, keepdims=True), 0, None))
+        return np.concatenate([w, xyz], 1)
+    words = stored.view("<u4")[:, 0]  # the top two bits name the largest of xyzw
     parts = np.stack([words >> np.uint32(shift) & np.uint32(1023) for shift in (20, 10, 0)], 1)
     others = np.where(parts & 512, -1.0, 1.0) * (parts & 511) / (511 * np.sqrt(2.0))
     return np.roll(from_smallest_three((words >> np.uint32(30)).astype(int), others), 1, axis=1)
@@ -189,9 +179,8 @@ def _smallest_three(words: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class SpzColumns:
-    """The content of a ``.spz`` of n Gaussians.
-
-    ``parts`` are ``[n,bytes]`` uint8 in the order of the file.
+    """The content of a ``.spz`` of n Gaussians, with ``parts [n,bytes]`` uint8 in the order of the
+    file.
     """
 
     count: int
@@ -201,31 +190,32 @@ class SpzColumns:
     parts: tuple[np.ndarray, ...]
 
     def header(self, version: int) -> bytes:
-        """Return the first 16 bytes, of version 3 before gzip."""
+        """Return the first 16 bytes; in version 3 they are compressed with the rest."""
         last = len(self.streams) if version == 4 else 0
         return HEADER.pack(MAGIC, version, self.count, self.degree, self.fraction, MIP_FLAG * self.mip, last)
 
     @property
     def streams(self) -> list[bytes]:
-        """The parts as bytes, without that of harmonics where there are none."""
+        """Bytes of each part, without harmonics where there are none."""
         return [part.tobytes() for part in self.parts if part.shape[1]]
 
 
 def spz_columns(gaussians: Gaussians, max_degree: int, *, mip: bool = False, fine: int = FINE) -> SpzColumns:
-    """Quantise Gaussians; ``fine`` is the number of bits of a position within the scene.
-
-    ValueError if there is NaN or inf.
+    """Quantise Gaussians, positions to ``fine`` bits within the scene; ValueError if there is NaN
+    or inf.
     """
     columns = to_columns(gaussians, max_degree)
     fraction = _fraction_bits(columns.means, fine)
     fixed = np.clip(np.round(columns.means * 2.0**fraction), -LARGEST, LARGEST).astype("<i4")
+    steps = np.where(np.arange(columns.harmonics.shape[1]) < 3, 8, 16)[:, None]  # of degree 1, and above
+    stepped = (np.round(np.clip(columns.harmonics, -2, 2) * 128) + 128 + steps // 2) // steps * steps
     parts = (
         fixed.view(np.uint8).reshape(-1, 3, 4)[..., :3].reshape(-1, 9),  # three little-endian bytes a coordinate
         to_bytes(255 * columns.opacities)[:, None],
         to_bytes(255 * (COLOR_SCALE * (columns.colors - 0.5) / SH_C0 + 0.5)),
         to_bytes(16 * (columns.log_scales + 10)),
         _rotation_bytes(columns.quats),
-        _harmonic_bytes(columns.harmonics),
+        np.clip(stepped, 0, 255).astype(np.uint8).reshape(len(stepped), 3 * stepped.shape[1]),
     )
     degree = round((columns.harmonics.shape[1] + 1) ** 0.5) - 1
     return SpzColumns(len(columns), degree, fraction, mip, parts)
@@ -251,7 +241,7 @@ def spz_bytes(gaussians: Gaussians, *, mip: bool = False, version: int = 3) -> b
 
 
 def zstandard() -> ModuleType:
-    """Import the compression of version 4. UsageError if it is not installed."""
+    """Import the compression of version 4; UsageError if it is not installed."""
     try:
         import zstandard
     except ImportError as error:
@@ -260,7 +250,7 @@ def zstandard() -> ModuleType:
 
 
 def _fraction_bits(means: np.ndarray, fine: int) -> int:
-    """Choose the bits behind the point, by the scene's size and its farthest Gaussian."""
+    """Choose the bits behind the point from the scene's size and its farthest Gaussian."""
     if len(means) == 0:
         return 0
     size = np.median(np.abs(means - np.median(means, axis=0)).max(axis=1))
@@ -270,9 +260,8 @@ def _fraction_bits(means: np.ndarray, fine: int) -> int:
 
 
 def _rotation_bytes(quats: np.ndarray) -> np.ndarray:
-    """Pack rotations into ``[n,4]`` bytes.
-
-    From the top: index of the largest of xyzw, then sign and magnitude of the others.
+    """Pack rotations into ``[n,4]`` bytes: index of the largest of xyzw, then sign and magnitude of
+    the others.
     """
     largest, others = smallest_three(np.roll(quats, -1, axis=1))
     parts = np.minimum(np.floor(511 * np.abs(others) * np.sqrt(2.0) + 0.5), 511).astype(np.uint32)
@@ -281,11 +270,3 @@ def _rotation_bytes(quats: np.ndarray) -> np.ndarray:
     for i, shift in enumerate((20, 10, 0)):
         words |= parts[:, i] << np.uint32(shift)
     return words.astype("<u4")[:, None].view(np.uint8)
-
-
-def _harmonic_bytes(harmonics: np.ndarray) -> np.ndarray:
-    """Encode ``[n,3 (k-1)]`` bytes 128 + 128 x, rounded to steps of 8 for degree 1 and of 16 above."""
-    steps = np.where(np.arange(harmonics.shape[1]) < 3, 8, 16)[:, None]
-    values = np.round(np.clip(harmonics, -2, 2) * 128) + 128
-    stepped = np.clip((values + steps // 2) // steps * steps, 0, 255).astype(np.uint8)
-    return stepped.reshape(len(stepped), 3 * harmonics.shape[1])

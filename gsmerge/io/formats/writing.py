@@ -36,10 +36,10 @@ OUTPUT_FORMATS = {
 
 
 def output_format(path: StrPath, spz_version: int = 3) -> str:
-    """Return the ending of an output's name that says how it is written.
+    """Return the ending of an output's name, by which its format is chosen.
 
     Raises:
-        UsageError: If it is none of ``OUTPUT_FORMATS``, or a ``.spz`` of that version needs what is not installed.
+        UsageError: If it is none of ``OUTPUT_FORMATS``, or a ``.spz`` of that version needs a missing package.
     """
     name = Path(path).name.lower()
     ending = next((ending for ending in OUTPUT_FORMATS if name.endswith(ending)), None)
@@ -52,10 +52,7 @@ def output_format(path: StrPath, spz_version: int = 3) -> str:
 
 
 def lost_harmonics(path: StrPath, sh_degree: int, spz_version: int = 3) -> str | None:
-    """Describe the harmonics that a format has no room for; None if it holds all.
-
-    Raises as :func:`output_format`.
-    """
+    """Describe the harmonics that a format has no room for; None if it holds all."""
     ending = output_format(path)
     highest = spz.MAX_DEGREES[spz_version] if ending == ".spz" else OUTPUT_FORMATS[ending]
     return None if sh_degree <= highest else f"{ending} has no room for harmonics above degree {highest}: left out"
@@ -95,19 +92,17 @@ def write_gaussians(
         write_ply(path, gaussians, overwrite=overwrite, comments=comments, normals=normals)
         return
     _check_comments(comments)
-    with atomic_output(path, overwrite=overwrite) as temporary:
-        temporary.write_bytes(_content(gaussians, ending, comments, spz_version))
-
-
-def _content(gaussians: Gaussians, ending: str, comments: Sequence[str], spz_version: int) -> bytes:
-    if ending == ".compressed.ply":
-        return compressed.compressed_bytes(gaussians, comments)
-    if ending in (".splat", ".glb"):
-        return splat.splat_bytes(gaussians) if ending == ".splat" else glb.glb_bytes(gaussians)
     mip = MIP_COMMENT in comments
-    if ending == ".spz":
-        return spz.spz_bytes(gaussians, mip=mip, version=spz_version)
-    return sog.sog_bytes(gaussians, mip=mip)
+    with atomic_output(path, overwrite=overwrite) as temporary:
+        if ending == ".compressed.ply":
+            content = compressed.compressed_bytes(gaussians, comments)
+        elif ending == ".spz":
+            content = spz.spz_bytes(gaussians, mip=mip, version=spz_version)
+        elif ending == ".sog":
+            content = sog.sog_bytes(gaussians, mip=mip)
+        else:
+            content = splat.splat_bytes(gaussians) if ending == ".splat" else glb.glb_bytes(gaussians)
+        temporary.write_bytes(content)
 
 
 def write_ply(
@@ -157,10 +152,7 @@ def _check_comments(comments: Sequence[str]) -> None:
 
 
 def _header(count: int, sh_degree: int, comments: Sequence[str] = (), *, normals: bool = True) -> tuple[bytes, int]:
-    """Return the header of a ``.ply`` of that many Gaussians, and its number of columns.
-
-    All are float32.
-    """
+    """Return the header of a float32 ``.ply`` of ``count`` Gaussians, and its number of columns."""
     num_rest = 3 * ((sh_degree + 1) ** 2 - 1)
     start = (*MEANS, *NORMALS) if normals else MEANS
     names = [*start, *SH0, *(f"f_rest_{i}" for i in range(num_rest)), "opacity", *SCALES, *QUATS]
@@ -187,7 +179,7 @@ def _ply_rows(columns: Columns, *, normals: bool) -> np.ndarray:
 
 
 def file_bytes(count: int, sh_degree: int) -> int:
-    """Return the size of the ``.ply`` of that many Gaussians, written without comments."""
+    """Return the size in bytes of the ``.ply`` of ``count`` Gaussians, without comments."""
     header, num_columns = _header(count, sh_degree)
     return len(header) + 4 * num_columns * count
 
