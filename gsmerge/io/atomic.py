@@ -1,7 +1,8 @@
-"""Files that are either complete or not there, one or several together.
+"""Write files that are either complete or not there, one or several together.
 
-Each is written under another name beside its place. When all are written and on the disk, all are renamed. The other
-name holds the process that writes the file and where that runs, so that a later one can remove what a killed one left.
+Each is written under another name beside its place. When all are written and on the disk, all are renamed. The
+other name has the process that writes the file and its machine, so that a later one can remove the rest of a killed
+one.
 """
 
 from __future__ import annotations
@@ -55,8 +56,8 @@ def atomic_output(path: StrPath, *, overwrite: bool = False) -> Iterator[Path]:
 def atomic_outputs(*, overwrite: bool = False) -> Iterator[Callable[[Path], Path]]:
     """Write several files and then rename all; a block that fails leaves none of them.
 
-    Yields a function that makes each file, as :func:`atomic_output`. A process that is killed between two renames, or a
-    disk that fails there, leaves each file whole, old or new.
+    Yields a function that makes each file, as :func:`atomic_output`. A process that is killed between two renames,
+    or a disk that fails there, leaves each file whole, old or new.
     """
     made: dict[str, tuple[Path, Path]] = {}  # temporary file -> as it was asked for, where it goes
 
@@ -125,17 +126,14 @@ def _flush(path: str | Path) -> None:
 
 
 def temporary_path(path: Path) -> Path:
-    """Return a name beside ``path`` that says which process writes it, and where.
-
-    It has the same suffix.
-    """
+    """Return a name beside ``path``, of the same suffix, with the process that writes it and its place."""
     suffix = path.suffix if len(os.fsencode(path.suffix)) <= _MAX_SUFFIX else ""
     return path.with_name(f".gsmerge-{_place()}-{os.getpid()}-{secrets.token_hex(4)}{suffix}")
 
 
 @cache
 def _place() -> str:
-    """Return a hash of where process numbers mean the same: the machine, and the container."""
+    """Return a hash of the machine and the container, within which process numbers are unique."""
     names = socket.gethostname()
     with suppress(OSError):
         names += os.readlink("/proc/self/ns/pid")
@@ -143,10 +141,7 @@ def _place() -> str:
 
 
 def remove_stale(folder: Path) -> None:
-    """Remove the temporary files in a folder whose process has ended.
-
-    Those of other machines are removed after a week.
-    """
+    """Remove the temporary files in a folder whose process has ended; of other machines after a week."""
     with suppress(OSError), os.scandir(folder) as entries:  # another may be cleaning as well, or may not
         for entry in list(entries):
             match = _TEMPORARY.fullmatch(entry.name)

@@ -10,7 +10,7 @@ from typing import Any
 
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import SCENE_SUFFIXES, CameraFile, SceneFiles, read_cameras
-from gsmerge.io.bounds import walk_files
+from gsmerge.io.bounds import read_errors, walk_files
 from gsmerge.io.cameras.json_files import DATAPARSER, FRAMES_FILE, POSE_FILE, SCALE_FILE
 from gsmerge.io.cameras.read import INTRINSICS
 from gsmerge.io.scene_files import IMAGE_PLACES
@@ -31,13 +31,10 @@ def content_hash(files: Sequence[Path]) -> str:
         inside = sorted(p for p in walk_files(given) if p.is_file()) if given.is_dir() else [given]
         for path in inside:
             name = path.relative_to(given).as_posix() if given.is_dir() else path.name
-            try:
-                with path.open("rb") as file:
-                    state.update(f"{len(name)}:{name}:{path.stat().st_size}:".encode())
-                    while block := file.read(1 << 20):
-                        state.update(block)
-            except OSError as error:
-                raise SceneError(path, f"cannot be read ({error.strerror})") from error
+            with read_errors(path), path.open("rb") as file:
+                state.update(f"{len(name)}:{name}:{path.stat().st_size}:".encode())
+                while block := file.read(1 << 20):
+                    state.update(block)
     return state.hexdigest()
 
 
@@ -61,7 +58,7 @@ def photos_of(cameras: Path) -> list[Path]:
 
 
 def cameras_of(path: Path, scene: str | None = None) -> CameraFile | None:
-    """Read the cameras of a file; None where it cannot be read, which is reported when the scene is read."""
+    """Read the cameras of a file; None where they cannot be read, which reading the scene reports."""
     try:
         return read_cameras(path, scene=scene)
     except SceneError:
@@ -69,15 +66,12 @@ def cameras_of(path: Path, scene: str | None = None) -> CameraFile | None:
 
 
 def stem_of(scene: Path) -> str:
-    """Return a scene's name; of a file without the extension. Folders may have dots in theirs."""
+    """Return a scene's name: of a file without the extension, of a folder as it stands."""
     return scene.stem if scene.suffix in SCENE_SUFFIXES else scene.name
 
 
 def filled(template: str | None, scene: Path) -> Path | None:
-    """Fill ``{scene}`` (the scene as given), ``{parent}`` (its folder) and ``{stem}`` (its name) into a path.
-
-    UsageError if the template holds another name.
-    """
+    """Fill ``{scene}``, ``{parent}`` (its folder) and ``{stem}`` (its name) into a path; UsageError on other names."""
     if template is None:
         return None
     parent = scene if scene.is_dir() else scene.parent

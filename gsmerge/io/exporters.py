@@ -1,4 +1,4 @@
-"""How files may be read: by what a caller says, and by exporters that are known by name.
+"""Hints on how to read a file, by its caller and by the exporters that are known by name.
 
 To add an exporter, add an :class:`Exporter` to the tuple below and a row to docs/reference/exporters.md.
 """
@@ -23,7 +23,7 @@ FrameKind = Literal["same", "scaled", "shifted", "first", "middle", "upright", "
 
 @dataclass(frozen=True)
 class ReadHints:
-    """How to read a file where its values do not show it, or mislead; ValueError if a value is no possible one."""
+    """Hints on how to read a file whose values do not show it, or mislead; ValueError for an unknown value."""
 
     exporter: str = "auto"  # which one wrote it, of :data:`EXPORTERS`; "auto": recognised
     # How rotations are stored: "wxyz"; "xyzw"; "xyzw-root": xyzw, each applied twice, so the roots are used where the
@@ -48,7 +48,7 @@ AUTO = ReadHints()
 
 
 def make_hints(values: dict[str, Any]) -> ReadHints:
-    """Make hints from keyword arguments; ValueError if one is unknown or none of its possible values."""
+    """Make hints from keyword arguments; ValueError if a name or a value is unknown."""
     known = {field.name for field in fields(ReadHints)}
     unknown = sorted(values.keys() - known)
     if unknown:
@@ -63,7 +63,7 @@ def _listed(names: Iterable[str]) -> str:
 
 @dataclass(frozen=True)
 class Exporter:
-    """One exporter."""
+    """A program that writes files of Gaussians, and how it writes them."""
 
     name: str  # as on the command line
     title: str  # as people call it
@@ -83,7 +83,7 @@ class Exporter:
     cameras: tuple[str, ...] = ()  # formats of cameras that it writes; empty: none, any may be given
 
     def may_have_written(self, info: PlyInfo, layout: Layout | None, frame: Similarity | None, cameras: str) -> bool:
-        """Tell whether a file looks like one of this exporter's; see :func:`choose_exporters`."""
+        """Return whether a file looks like one of this exporter; see :func:`choose_exporters`."""
         header = (
             info.sh_degree in self.degrees
             and self.normals == ("nx" in info.columns)
@@ -163,7 +163,7 @@ EXPORTERS = {exporter.name: exporter for exporter in _EXPORTERS}
 
 
 def find_exporter(name: str) -> Exporter | None:
-    """Return the exporter of that name; None for "auto". ValueError if there is none of that name."""
+    """Return the exporter with a name; None for "auto", ValueError if there is none."""
     if name != "auto" and name not in EXPORTERS:
         raise ValueError(f"exporter: expected 'auto' or one of {', '.join(EXPORTERS)}, got {name!r}")
     return EXPORTERS.get(name)
@@ -172,10 +172,10 @@ def find_exporter(name: str) -> Exporter | None:
 def choose_exporters(
     name: str, info: PlyInfo, layout: Layout | None, frame: Similarity | None, cameras: str
 ) -> tuple[Exporter, ...]:
-    """Return the exporter of that name; for "auto", all that may have written a file with cameras of a format.
+    """Return the exporter with a name; for "auto", all that may have written a file with cameras of a format.
 
-    Those that leave a mark of their own in the header go before those that leave none. ``layout`` and ``frame`` say
-    which row is which pixel, and where; None where the rows belong to no pixels.
+    Exporters that leave a mark of their own in the header go before those that leave none. ``layout`` and ``frame``
+    are those of the rows; None where the rows belong to no pixels.
     """
     exporter = find_exporter(name)
     if exporter is not None:
@@ -186,7 +186,7 @@ def choose_exporters(
 
 
 def exporter_names(exporters: Sequence[Exporter]) -> str:
-    """Say for people which the exporter is, or which it may be."""
+    """Write the exporter's title for people, or the titles of all that are possible."""
     if not exporters:
         return "none that is known by name"
     titles = [exporter.title for exporter in exporters]

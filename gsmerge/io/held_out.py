@@ -1,4 +1,4 @@
-"""Read held-out photos with their cameras in the frame of a scene, to compare its renders with."""
+"""Read unseen photos with their cameras in the frame of a scene, to compare its renders with."""
 
 from __future__ import annotations
 
@@ -36,8 +36,9 @@ def read_held_out(load: SceneLoad, cameras: StrPath, images: StrPath | None = No
     """Read held-out photos and their cameras, in any of the forms that scenes may have.
 
     Views that the scene was made of are left out. Where the file has those too, under the same names, their poses
-    determine how its world lies to that of the Gaussians; otherwise it is assumed to be the world of the scene's own
-    cameras. If the poses of the scene's cameras had to be read in another convention than their format's, so are these.
+    determine how its world lies to that of the Gaussians; otherwise it is assumed to be the world of the scene's
+    own cameras. If the poses of the scene's cameras had to be read in another convention than their format's, so
+    are these.
 
     ``images`` is the folder of the photos; None: where the camera file says.
 
@@ -47,7 +48,10 @@ def read_held_out(load: SceneLoad, cameras: StrPath, images: StrPath | None = No
     path = Path(cameras)
     if not path.exists():
         raise SceneError(path, "expected cameras of held-out views, found nothing")
-    readings = _readings(read_cameras(path, scene=load.files.ply.stem), load)
+    stored, own = read_cameras(path, scene=load.files.ply.stem), load.cameras
+    readings = [stored]
+    if own is not None and own.source == stored.source and own.convention != stored.convention:
+        readings.insert(0, with_convention(stored, own.convention))  # as the scene's own had to be read
     worlds = [(one, *_find_world(one, _shared_views(one, load.scene.names), load)) for one in readings]
     camera_file, world, shared = next((one for one in worlds if one[2]), worlds[0])
     moved = world.move_viewmats(camera_file.viewmats)
@@ -58,7 +62,9 @@ def read_held_out(load: SceneLoad, cameras: StrPath, images: StrPath | None = No
     chosen = select_views(camera_file, places)
     photos = stored_photos(SceneFiles(load.files.ply, path, _folder(path, chosen, images)), chosen)
     if photos is None:
-        raise SceneError(path, f"no photo found for {_missing(path, chosen)}", "name their folder with --target-images")
+        root = path if path.is_dir() else path.parent
+        missing = next((name for name in chosen.names if find_image(root, name) is None), chosen.names[0])
+        raise SceneError(path, f"no photo found for {missing}", "name their folder with --target-images")
     pinholes, photos, _ = as_pinholes(chosen, photos)
     photos, notes = limit_photo_size(photos, 0, AUTO.max_side, unaligned=False)
     assert photos is not None
@@ -74,22 +80,8 @@ def read_held_out(load: SceneLoad, cameras: StrPath, images: StrPath | None = No
     )
 
 
-def _readings(camera_file: CameraFile, load: SceneLoad) -> list[CameraFile]:
-    """List the ways to read the file, the likeliest first: as the scene's cameras of the format had to be read."""
-    own = load.cameras
-    if own is None or own.source != camera_file.source or own.convention == camera_file.convention:
-        return [camera_file]
-    return [with_convention(camera_file, own.convention), camera_file]
-
-
-def _missing(path: Path, cameras: CameraFile) -> str:
-    """Name the first view that has no photo where the camera file says."""
-    root = path if path.is_dir() else path.parent
-    return next((name for name in cameras.names if find_image(root, name) is None), cameras.names[0])
-
-
 def _folder(path: Path, cameras: CameraFile, images: StrPath | None) -> Path | None:
-    """Find the folder of the photos: as given, or next to cameras that do not say it."""
+    """Find the folder of the photos: the given one, or one next to cameras that do not name files."""
     if images is not None:
         if not Path(images).is_dir():
             raise SceneError(images, "expected a folder of photos")
@@ -113,7 +105,7 @@ def _shared_views(camera_file: CameraFile, names: tuple[str, ...]) -> dict[int, 
 
 
 def _find_world(camera_file: CameraFile, named: dict[int, int], load: SceneLoad) -> tuple[Similarity, dict[int, int]]:
-    """Find how the file's world lies to that of the Gaussians, and which of its views are the scene's."""
+    """Find the similarity from the file's world to that of the Gaussians, and the views that the scene has too."""
     stored = IDENTITY if load.recovery is None else load.recovery.best.frame
     if not named:
         return stored, {}
@@ -128,9 +120,9 @@ def _find_world(camera_file: CameraFile, named: dict[int, int], load: SceneLoad)
 
 
 def fit_similarity(theirs: np.ndarray, ours: np.ndarray, scale: float = 1.0) -> Similarity:
-    """Fit the similarity that moves cameras ``theirs [c,4,4]`` (world to camera) onto their poses ``ours`` elsewhere.
+    """Fit the similarity that moves cameras ``theirs [c,4,4]`` (world to camera) onto their poses ``ours``.
 
-    Least squares; with the given scale where all stand in one place and do not determine it.
+    By least squares; with the given scale where all stand in one place and do not determine it.
     """
     rotations = np.einsum("nji,njk->ik", ours[:, :3, :3], theirs[:, :3, :3])
     u, _, vt = np.linalg.svd(rotations)
@@ -148,7 +140,7 @@ def _centres(viewmats: np.ndarray) -> np.ndarray:
 
 
 def _disagreement(moved: np.ndarray, ours: np.ndarray) -> tuple[float, float]:
-    """Measure the largest angle (degrees) and distance (over that of the outermost views) between two sets of poses."""
+    """Measure the largest angle (degrees) and distance (over the spread of the views) between two sets of poses."""
     cosines = (np.einsum("nij,nij->n", moved[:, :3, :3], ours[:, :3, :3]) - 1) / 2
     centres = _centres(ours)
     distance = np.linalg.norm(_centres(moved) - centres, axis=1).max()
@@ -157,7 +149,7 @@ def _disagreement(moved: np.ndarray, ours: np.ndarray) -> tuple[float, float]:
 
 
 def _repeated(moved: np.ndarray, scene: Scene) -> dict[int, int]:
-    """Map views to those of the scene that stand in the same place and look the same way."""
+    """Map views to the views of the scene that stand in the same place and look the same way."""
     if len(scene) == 0 or len(scene.gaussians) == 0:
         return {}
     ours, middle = scene.cameras.viewmats, np.median(scene.gaussians.means, 0)

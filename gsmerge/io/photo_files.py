@@ -1,4 +1,4 @@
-"""Photos of a scene: found by name, decoded in parallel, resized and cropped."""
+"""Photos of a scene: matched by name, decoded in parallel, resized and cropped."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import numpy as np
 from PIL import Image
 
 from gsmerge.errors import SceneError
-from gsmerge.io.bounds import MAX_PIXELS, check_file, check_pixels, walk_files
+from gsmerge.io.bounds import MAX_PIXELS, check_file, check_pixels, read_errors, walk_files
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, StrPath
 
@@ -37,7 +37,7 @@ _AT_ONCE = 128 << 20  # bytes of decoded photos; more are decoded one by one, wh
 
 @dataclass(frozen=True)
 class PhotoReader:
-    """c photos of one size ``(width, height)`` that are decoded each time they are asked for, and not kept."""
+    """c photos of one size ``(width, height)`` that are decoded at each use, and not kept in memory."""
 
     count: int
     size: Size
@@ -71,10 +71,7 @@ def read_images(source: ImageSource, names: Sequence[str]) -> np.ndarray:
 
 
 def decode_images(paths: Sequence[Path]) -> Photos:
-    """The images of these files, ``[h,w,3]`` uint8 each; many large ones are decoded when they are used.
-
-    SceneError if two differ in size, or one cannot be read: of many large ones, when it is used.
-    """
+    """Decode image files to ``[h,w,3]`` uint8; many large ones are decoded at each use. SceneError if sizes differ."""
     sizes = [image_size(path) for path in paths]
     for path, (w, h) in zip(paths, sizes, strict=True):
         if (w, h) != sizes[0]:
@@ -87,27 +84,25 @@ def decode_images(paths: Sequence[Path]) -> Photos:
 
 
 def change_photos(photos: Photos, size: Size, change: Callable[[int, np.ndarray], np.ndarray]) -> Photos:
-    """``change(number, photo)`` of every photo, ``size`` in the end; of those that are decoded when used, then."""
+    """Apply ``change(number, photo)`` to every photo, which has ``size`` then; to a reader's photos at each use."""
     if isinstance(photos, PhotoReader):
         return PhotoReader(len(photos), size, lambda photo: change(photo, photos[photo]))
     return parallel_map(lambda photo: change(photo, photos[photo]), range(len(photos)))
 
 
 def keep_photos(photos: Photos) -> Photos:
-    """The photos in memory, for what uses them more than once."""
+    """Decode photos into memory, for callers that use them more than once."""
     return parallel_map(photos.read, range(len(photos))) if isinstance(photos, PhotoReader) else photos
 
 
 def decode_image(path: Path, size: Size) -> np.ndarray:
-    """``[h,w,3]`` uint8 sRGB from a file whose header says that size. SceneError if it cannot be read."""
-    try:
+    """Decode a file whose header has that size to ``[h,w,3]`` uint8 sRGB; SceneError if it cannot be read."""
+    with read_errors(path):
         return _decode(path, np.fromfile(path, np.uint8), size)
-    except OSError as error:
-        raise SceneError(path, f"cannot be read ({error.strerror})") from error
 
 
 def as_floats(images: Photos) -> np.ndarray:
-    """``[c,h,w,3]`` float32 in [0, 1] from c uint8 images of one size."""
+    """Convert c uint8 images of one size to ``[c,h,w,3]`` float32 in [0, 1]."""
     width, height = photo_size(images)
     out = np.empty((len(images), height, width, 3), np.float32)
     parallel_map(lambda i: np.multiply(images[i], np.float32(1 / 255), out=out[i]), range(len(images)))
@@ -123,19 +118,19 @@ def photo_size(photos: Photos | None) -> Size | None: ...
 
 
 def photo_size(photos: Photos | None) -> Size | None:
-    """(width, height) of the photos; None without any."""
+    """Return (width, height) of the photos; None without any."""
     if photos is None or isinstance(photos, PhotoReader):
         return None if photos is None else photos.size
     return photos[0].shape[1], photos[0].shape[0]
 
 
 def same_shape(one: Size, other: Size) -> bool:
-    """Whether two sizes have the same shape, except for rounding."""
+    """Return whether two sizes have the same shape, except for rounding."""
     return abs(one[0] * other[1] / (one[1] * other[0]) - 1) <= ASPECT_TOLERANCE
 
 
 def match_images(source: ImageSource, names: Sequence[str]) -> list[Path]:
-    """The image file of every view; see :func:`read_images`."""
+    """Find the image file of every view; see :func:`read_images`."""
     if isinstance(source, str | os.PathLike):
         root = Path(source)
         if not root.is_dir():
@@ -164,7 +159,7 @@ def match_images(source: ImageSource, names: Sequence[str]) -> list[Path]:
 
 
 def _endings(path: PurePath) -> list[str]:
-    """Every ending of a path, the longest first, with and without its extension."""
+    """List every ending of a path, the longest first, with and without its extension."""
     endings = [PurePosixPath(*path.parts[i:]) for i in range(len(path.parts))]
     return list(dict.fromkeys(str(some) for ending in endings for some in (ending, ending.with_suffix(""))))
 
@@ -178,34 +173,32 @@ def _lookup(root: Path, by_ending: dict[str, list[Path]], name: str) -> Path | N
 
 
 def list_images(folder: Path) -> list[Path]:
-    """All images below a folder, numbers in their names counted as numbers. Raises as :func:`walk_files`."""
+    """List all images below a folder, sorted with numbers in names as numbers; SceneError if too many files."""
     images = [f for f in walk_files(folder) if f.suffix.lower() in IMAGE_SUFFIXES and not f.name.startswith(".")]
     return sorted(images, key=lambda f: natural_key(f.relative_to(folder).as_posix()))
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
-    """Sort key that puts "view 2" before "view 10"."""
+    """Make a sort key that puts "view 2" before "view 10"."""
     parts = [(p, p.lstrip("0")) for p in re.split(r"([0-9]+)", name) if p]
     return [(0, len(digits), digits) if p[0] in "0123456789" else (1, 0, p) for p, digits in parts]
 
 
 def find_image(folder: Path, name: str) -> Path | None:
-    """The image that a camera file next to it names, with or without its extension; None where there is none."""
+    """Find the image that a camera file in the folder names, with or without extension; None without one."""
     path = os.path.join(folder, name)
     candidates = [path, *(path + suffix for suffix in sorted(IMAGE_SUFFIXES))]
     return next((Path(c) for c in candidates if os.path.isfile(c)), None)
 
 
 def image_size(path: Path) -> Size:
-    """(width, height) that the header of a PNG, JPEG, WebP, BMP, TIFF or PNM file says; its orientation is ignored.
-    SceneError if it is no such file, cannot be read, or says a size that no image of Gaussians has.
+    """Read (width, height) from the header of a PNG, JPEG, WebP, BMP, TIFF or PNM file; its orientation is ignored.
+
+    SceneError if it is another file, cannot be read, or has a size that no image of Gaussians has.
     """
     num_bytes = check_file(path)
-    try:
-        with path.open("rb") as file:
-            width, height = _header_size(path, file)
-    except OSError as error:
-        raise SceneError(path, f"cannot be read ({error.strerror})") from error
+    with read_errors(path), path.open("rb") as file:
+        width, height = _header_size(path, file)
     if num_bytes > _MAX_PIXEL_BYTES * width * height + _MAX_EXTRA:
         raise SceneError(path, f"expected an image of {width} x {height}, found {num_bytes >> 20} MiB for it")
     return width, height
@@ -233,7 +226,8 @@ def _header_size(path: Path, file: BinaryIO) -> Size:
 
 
 def decode_embedded(path: Path, names: Sequence[str], files: Sequence[np.ndarray], limit: int) -> np.ndarray:
-    """Images ``[c,h,w,3]`` uint8 sRGB, stored in the file ``path`` as the bytes of image files (``[b]`` uint8 each).
+    """Decode images that the file ``path`` holds as bytes of image files (``[b]`` uint8) to ``[c,h,w,3]`` uint8.
+
     SceneError if one cannot be decoded, two differ in size, or they have more than ``limit`` bytes when decoded.
     """
     sizes = [_header_size(path, io.BytesIO(data.tobytes())) for data in files]
@@ -250,7 +244,7 @@ def decode_embedded(path: Path, names: Sequence[str], files: Sequence[np.ndarray
 
 
 def _decode(path: Path, data: np.ndarray, size: Size) -> np.ndarray:
-    """``[h,w,3]`` uint8 sRGB. The orientation tag is ignored, as camera solvers do."""
+    """Decode ``[h,w,3]`` uint8 sRGB; the orientation tag is ignored, as camera solvers do."""
     width, height = size
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     pixels = _png_pixels(data) if data[: len(_PNG)].tobytes() == _PNG else data
@@ -266,7 +260,7 @@ def _decode(path: Path, data: np.ndarray, size: Size) -> np.ndarray:
 
 
 def _png_pixels(data: np.ndarray) -> np.ndarray | None:
-    """A PNG file ``[b]`` uint8 without all that does not change its pixels; None where it is damaged.
+    """Strip a PNG file ``[b]`` uint8 of all that does not change its pixels; None where it is damaged.
 
     The decoder prints lines of its own about damage, in colour profiles and texts as well.
     """
@@ -289,9 +283,7 @@ def _png_pixels(data: np.ndarray) -> np.ndarray | None:
 
 @dataclass(frozen=True)
 class PhotoTransform:
-    """A photo is resized, then cropped to ``width`` x ``height`` pixels: ``u' = scale_x u - left``,
-    ``v' = scale_y v - top``.
-    """
+    """A resize and then a crop to ``width`` x ``height``: ``u' = scale_x u - left``, ``v' = scale_y v - top``."""
 
     width: int
     height: int
@@ -307,16 +299,16 @@ class PhotoTransform:
 
     @property
     def description(self) -> str:
-        """What is done to a photo."""
+        """Words for the transform of a photo."""
         return f"resized{' and centre-cropped' if self.crops else ''} to {self.width} x {self.height}"
 
     def cameras(self, cameras: Cameras) -> Cameras:
-        """The cameras of the results; intrinsics in float64."""
+        """Return the cameras of the transformed photos, with intrinsics in float64."""
         matrix = [[self.scale_x, 0.0, -self.left], [0.0, self.scale_y, -self.top], [0.0, 0.0, 1.0]]
         return replace(cameras, Ks=np.array(matrix) @ cameras.Ks, width=self.width, height=self.height)
 
     def photos(self, images: Photos) -> Photos:
-        """The results for c uint8 photos ``[h,w,3]``."""
+        """Transform c uint8 photos ``[h,w,3]``."""
 
         def one(_: int, image: np.ndarray) -> np.ndarray:
             height, width = image.shape[:2]
@@ -329,12 +321,12 @@ class PhotoTransform:
 
 
 def resize_to(size: Size, to: Size) -> PhotoTransform:
-    """Each side is scaled by itself."""
+    """Make the transform that scales each side by itself."""
     return PhotoTransform(*to, to[0] / size[0], to[1] / size[1])
 
 
 def resize_and_crop(size: Size, to: Size, scale: float | None = None) -> PhotoTransform:
-    """Both sides are scaled alike, rounded to whole pixels, and centre-cropped; None scales until ``to`` is covered."""
+    """Make the transform that scales both sides alike, by default to cover ``to``, and crops the centre."""
     if scale is None:
         scale = max(to[0] / size[0], to[1] / size[1])
     width, height = (max(side, round(whole * scale)) for side, whole in zip(to, size, strict=True))

@@ -1,4 +1,4 @@
-"""Read a scene: files in, one :class:`gsmerge.types.Scene` out, with the pixel of every row where it has one."""
+"""Read a scene from its files: a :class:`gsmerge.types.Scene` with the pixel of every row where it has one."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class SceneLoad:
     moves: Sequence[dict[str, Any]] = ()
 
     def pixel_scene(self) -> Scene:
-        """Return the scene, if it has one Gaussian per pixel; otherwise raise the SceneError that says why not."""
+        """Return the scene if it has one Gaussian per pixel; otherwise raise a SceneError with the reason."""
         if self.scene.aligned:
             return self.scene
         raise SceneError(self.ply.path, self.problem or "expected one Gaussian per pixel")
@@ -122,7 +122,7 @@ def read_scene(
 
 
 def as_scene(scene: Scene | StrPath) -> Scene:
-    """Return a scene as it is, or read it from a path; notes say what is odd about the file."""
+    """Return a scene, or read it from a path and note what is odd about the file."""
     if isinstance(scene, Scene):
         return scene
     load = load_scene(scene)
@@ -139,7 +139,7 @@ def load_scene(
     opacity: OpacityChoice = "auto",
     **hints: Any,
 ) -> SceneLoad:
-    """Read a scene as :func:`read_scene` does, with everything that was learned on the way."""
+    """Read a scene as :func:`read_scene` does, with all facts about its files."""
     read_hints = make_hints(hints)
     return load_files(find_scene_files(path, cameras=cameras, images=images), opacity=opacity, hints=read_hints)
 
@@ -151,7 +151,7 @@ def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: Rea
 
 
 def read_ply_with_hints(path: Path, *, opacity: OpacityChoice, hints: ReadHints) -> PlyScene:
-    """Read the file's rows, with opacities as given, or as the given exporter stores them."""
+    """Read the rows of a file, with opacities as given, or as the given exporter stores them."""
     exporter = find_exporter(hints.exporter)
     return read_gaussians(path, opacity=opacity if exporter is None or opacity != "auto" else exporter.opacity)
 
@@ -166,8 +166,8 @@ def align_scene(
 ) -> SceneLoad:
     """Put Gaussians, cameras and photos together, with the pixel of every row where it has one.
 
-    Raises as :func:`read_scene`. ``camera_file`` has the cameras if they are read already; without ``photos`` none are
-    looked for.
+    Raises as :func:`read_scene`. ``camera_file`` has the cameras if they are read already; without ``photos`` none
+    are searched.
     """
     if camera_file is None and files.cameras is None and hints.order == "none":  # cameras are placed later
         return _make_load(ply, files, hints, _NO_ALIGNMENT, [])
@@ -211,7 +211,7 @@ def _make_load(
     notes: Sequence[str] = (),
     large: LargePhotos | None = None,
 ) -> SceneLoad:
-    """Make the scene of rows, their pixels and the views, and say how it was read."""
+    """Make the scene of rows, their pixels and the views, with notes on how it was read."""
     camera_file, layout, views = result.camera_file, result.layout, list(result.views)
     names = () if camera_file is None else camera_file.names
     gaussians, pixel_ids, missing, more = _place_rows(ply, result)
@@ -221,9 +221,12 @@ def _make_load(
     large = None if large is None else large[views]
     scene = Scene(gaussians, cameras, images, pixel_ids, tuple(names[view] for view in views), missing, large)
     if camera_file is not None and layout is not None:
-        if layout.kind == "box+depth":
-            scene, filled = _fill(scene, read_depths(Path(camera_file.path)), views)
-            more += filled
+        depths = read_depths(Path(camera_file.path)) if layout.kind == "box+depth" else None
+        if depths is not None:
+            full = fill_from_depths(scene, depths[views])
+            count = int(full.valid.sum()) - int(scene.valid.sum())
+            scene = full
+            more += [f"{count:,} pixels that the exporter dropped are put back from the depth maps"] * (count > 0)
         if layout.per_pixel == 1:
             camera_file = select_views(camera_file, views)
     frame = None if result.recovery is None else result.recovery.best.frame
@@ -257,8 +260,8 @@ def _place_rows(
 ) -> tuple[Gaussians, np.ndarray | None, np.ndarray | None, list[str]]:
     """Bring rows to the pixels of the grid; return Gaussians, ``pixel_ids``, ``missing`` and notes.
 
-    Pixels without a row get a fully transparent Gaussian. Of rows without pixels, those that are finite stay, without
-    those that only pad the file.
+    Pixels without a row get a fully transparent Gaussian. Of rows without pixels the finite ones stay, except for
+    padding.
     """
     if result.pixel_ids is None:
         keep = ply.valid & ~_is_padding(ply.gaussians)
@@ -285,7 +288,7 @@ def _place_rows(
 
 
 def _is_padding(gaussians: Gaussians) -> np.ndarray:
-    """Find rows ``[n]`` at the very origin that are all alike, with which VolSplat fills up its files."""
+    """Find rows ``[n]`` at the very origin that are all alike, with which VolSplat pads its files."""
     rows = np.flatnonzero((gaussians.means == 0).all(1))
     padding = np.zeros(len(gaussians), bool)
     if len(rows) < _MIN_PADDING:
@@ -293,15 +296,6 @@ def _is_padding(gaussians: Gaussians) -> np.ndarray:
     shape = np.concatenate([gaussians.scales, gaussians.opacities[:, None], gaussians.sh0[:, 0]], 1)[rows]
     padding[rows[(shape == lower_median(shape)).all(1)]] = True
     return padding
-
-
-def _fill(scene: Scene, depths: np.ndarray | None, views: list[int]) -> tuple[Scene, list[str]]:
-    """Put pixels that were dropped for being far back from the depth maps of all cameras; with a note about it."""
-    if depths is None:
-        return scene, []
-    full = fill_from_depths(scene, depths[views])
-    count = int(full.valid.sum()) - int(scene.valid.sum())
-    return full, [f"{count:,} pixels that the exporter dropped are put back from the depth maps"] if count else []
 
 
 def _with_rotations(scene: Scene, hints: ReadHints, exporters: Sequence[Exporter]) -> tuple[Scene, list[str]]:
@@ -348,7 +342,7 @@ class CamerasInScene:
 def place_cameras_in_scene(
     ply: PlyScene, files: SceneFiles, *, hints: ReadHints = AUTO, photos: bool = True
 ) -> CamerasInScene:
-    """Bring views into the frame of the Gaussians, if pixels or colours show it; otherwise keep them as in their file.
+    """Move views into the frame of the Gaussians, if pixels or colours show it; otherwise keep their file's.
 
     ``photos`` that cannot be read are an error; with False they are left out.
 

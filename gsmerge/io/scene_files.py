@@ -1,4 +1,4 @@
-"""Find the cameras and photos that belong to a ``.ply``, and read them at a size that memory has room for."""
+"""Find the cameras and photos of a ``.ply``, and read them at a size that memory has room for."""
 
 from __future__ import annotations
 
@@ -58,14 +58,12 @@ def find_scene_files(
     cameras: StrPath | None = None,
     images: StrPath | None = None,
 ) -> SceneFiles:
-    """Find a scene's files.
+    """Find a scene's files; cameras and images that the user names are used instead of searching.
 
-    The given folder is searched, then the ``.ply``'s own, then the one above it for ``gs_ply/`` and two above
-    it for ``point_cloud/iteration_n/``; in each the places of ``PLY_PLACES``, ``CAMERA_PLACES`` and
-    ``IMAGE_PLACES`` in their order. Images inside the cameras' ``.npz`` or ``.torch`` go before a folder, because they
-    are those that the model saw.
-
-    Cameras and images that the user names are used instead of searching.
+    The given folder is searched, then the ``.ply``'s own, then the one above it for ``gs_ply/`` and two above it
+    for ``point_cloud/iteration_n/``; in each the places of ``PLY_PLACES``, ``CAMERA_PLACES`` and ``IMAGE_PLACES``
+    in their order. Images inside the cameras' ``.npz`` or ``.torch`` go before a folder, because they are those
+    that the model saw.
 
     Raises:
         SceneError: If there is no ``.ply``, several to choose from, or a named file does not exist.
@@ -74,7 +72,11 @@ def find_scene_files(
     ply = _find_ply(path) if os.path.isdir(path) else path
     check_file(ply)
     given = path if ply != path else ply.parent
-    roots = list(dict.fromkeys(Path(os.path.realpath(root)) for root in (given, *_roots(ply))))
+    folder = Path(os.path.realpath(ply.parent))
+    above = [folder.parent] * (folder.name == "gs_ply")
+    if folder.name.startswith("iteration_") and folder.parent.name == "point_cloud":
+        above = [folder.parent.parent]
+    roots = list(dict.fromkeys((Path(os.path.realpath(given)), folder, *above)))
     camera_path = _named(cameras) or next((c for c in map(find_cameras, roots) if c is not None), None)
     image_path = _named(images)
     if image_path is None and camera_path is not None:
@@ -96,28 +98,19 @@ def _named(path: StrPath | None) -> Path | None:
     return Path(path)
 
 
-def _roots(ply: Path) -> list[Path]:
-    folder = Path(os.path.realpath(ply.parent))
-    if folder.name == "gs_ply":
-        return [folder, folder.parent]
-    if folder.name.startswith("iteration_") and folder.parent.name == "point_cloud":
-        return [folder, folder.parent.parent]
-    return [folder]
-
-
 def _find_ply(folder: Path) -> Path:
     named = named_ply(folder)
     plys = other_plys(folder) if named is None else [named]
+    if len(plys) == 1:
+        return plys[0]
     if not plys:
         raise SceneError(folder, "expected a .ply file in the folder, found none")
-    if len(plys) > 1:
-        names = ", ".join(p.name for p in plys[:4])
-        raise SceneError(folder, f"expected one .ply file in the folder, found {len(plys)} ({names})", "name one")
-    return plys[0]
+    names = ", ".join(p.name for p in plys[:4])
+    raise SceneError(folder, f"expected one .ply file in the folder, found {len(plys)} ({names})", "name one")
 
 
 def named_ply(folder: Path) -> Path | None:
-    """Find the file in a folder that is the scene whatever else is in it; None without one."""
+    """Find the file in a folder that is the scene by its name; None without one."""
     for place in PLY_PLACES:
         if (folder / place).is_file():
             return folder / place
@@ -132,10 +125,7 @@ def other_plys(folder: Path) -> list[Path]:
 
 
 def read_scene_cameras(ply: PlyScene, files: SceneFiles) -> CameraFile:
-    """Read the cameras from their file or the ``.ply`` itself, or estimate them for the images where there are none.
-
-    SceneError if they cannot be estimated.
-    """
+    """Read the cameras from their file or the ``.ply``, or estimate them for the images; SceneError if all fail."""
     if files.cameras is not None:
         return read_cameras(files.cameras, scene=files.ply.stem)
     cameras = read_sharp(files.ply)
@@ -152,10 +142,7 @@ def read_scene_cameras(ply: PlyScene, files: SceneFiles) -> CameraFile:
 
 
 def stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos | None:
-    """Read the photos of the cameras: from the folder, an ``.npz`` or ``.torch``, or where the camera file says.
-
-    None if there are none. Raises as :func:`gsmerge.io.read_images`.
-    """
+    """Read the photos of the cameras from a folder, a file that holds them, or where the camera file says; or None."""
     photos = _stored_photos(files, camera_file)
     old, size = photo_size(photos), (int(camera_file.widths[0]), int(camera_file.heights[0]))
     if photos is None or old is None or camera_file.source != SHARP or old == size:
@@ -238,10 +225,10 @@ def find_large_photos(
 def limit_photo_size(
     photos: Photos | None, rows: int, max_side: int, *, unaligned: bool
 ) -> tuple[Photos | None, list[str]]:
-    """Bring photos to a size that memory has room for, with no side longer than ``max_side`` if they are too large.
+    """Resize photos that are too large for memory to at most ``max_side`` pixels a side, with notes about it.
 
-    Where the file's Gaussians (``rows``) may be the photos' pixels as they are, the photos stay; not where they are
-    known to be unaligned. Notes say what was done.
+    Where the file's Gaussians (``rows``) may be the photos' pixels, the photos stay; not where they are known to be
+    unaligned.
     """
     size = photo_size(photos)
     if photos is None or size is None:
@@ -256,7 +243,7 @@ def limit_photo_size(
 def limit_view_size(
     cameras: Cameras, images: np.ndarray | None, max_side: int
 ) -> tuple[Cameras, np.ndarray | None, list[str]]:
-    """Bring cameras and photos ``[c,h,w,3]`` to sides of at most ``max_side`` pixels; with a note."""
+    """Resize cameras and photos ``[c,h,w,3]`` to sides of at most ``max_side`` pixels; with a note."""
     transform, notes = _limit((cameras.width, cameras.height), max_side)
     if transform is not None:
         cameras = transform.cameras(cameras)

@@ -1,7 +1,8 @@
 """Find the pixel that each row of a file belongs to; :func:`align` is the door, and the modules here are private.
 
-``layouts`` lists what may be, ``ordered_rows`` and ``incomplete`` search files that lack pixels, ``score`` measures,
-``recovery`` decides or explains, ``cameras`` reads, moves or estimates poses, ``rotations`` reads quaternions.
+``layouts`` lists possible orders, ``ordered_rows`` and ``incomplete`` search files that lack pixels, ``score``
+measures, ``recovery`` decides or explains, ``cameras`` reads, moves or estimates poses, ``rotations`` reads
+quaternions.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ _MOVED_SAMPLES = 2000  # Gaussians of a view that its moved pose is solved from
 
 @dataclass(frozen=True)
 class AlignmentResult:
-    """The pixel of every row, or the cameras that see rows without pixels; and how they were found."""
+    """The pixel of every row, or the cameras that see rows without pixels, with a description of the search."""
 
     # ``[n]`` int64, the pixel ``(block·H + y)·W + x`` of each row, -1: none; None where the rows belong to no pixels.
     # A block is a view, or one layer of a view with several Gaussians per pixel
@@ -67,18 +68,18 @@ class AlignmentResult:
 
     @property
     def layout(self) -> Layout | None:
-        """Which row is which pixel, block by block; None without pixels."""
+        """Layout of the rows, block by block; None without pixels."""
         return None if self.recovery is None else self.recovery.best.layout
 
     @property
     def views(self) -> tuple[int, ...]:
-        """The camera of each block; all of them without pixels."""
+        """Camera of each block; all cameras without pixels."""
         return tuple(range(len(self.cameras))) if self.layout is None else self.layout.views
 
 
 @dataclass(frozen=True)
 class _Source:
-    """All but the cameras: Gaussians, photos, and what is known of the rows."""
+    """The Gaussians, the photos and the known facts about the rows."""
 
     ply: PlyScene
     photos: Photos | None
@@ -146,13 +147,20 @@ def align(
     small = small_photos_error(ply.info, camera_file, photo_size(photos)) if order not in MAY_BE_UNALIGNED else None
     if small is not None:
         raise small
-    return _without_pixels(ply, inputs(), camera_file, grid, frames)
+    final = inputs()
+    why = explain_count(ply.info, final, camera_file)
+    if scale is not None:
+        final = replace(final, cameras=scale_by(scale).move(final.cameras))
+    cameras, camera_file, notes = choose_cameras(final, camera_file, frames(), why)
+    return AlignmentResult(
+        None, cameras, final.images, camera_file, (*grid.notes, *notes), grid.transform, problem=why.problem
+    )
 
 
 def _readings(
     source: _Source, camera_file: CameraFile, grid: GridFit, make_inputs: Callable[[], AlignmentInput]
 ) -> Iterator[AlignmentResult | None]:
-    """Try the size of the photos and all others, poses as they are, moved, and in other conventions, as is likely."""
+    """Try the photos' size and all others, with poses as stored, moved, and in other conventions, the likely first."""
     large = len(grid.cameras) * math.prod(grid.size) > _LARGE * len(source.ply.gaussians)
     others = _other_sizes(source, camera_file)
     if large:
@@ -180,8 +188,8 @@ def _change_size(
 ) -> AlignmentResult | None:
     """Find the other size that puts the Gaussians nearest to their pixels; None where grids of two sizes do.
 
-    Those that only the number of rows speaks for are tried in the frame of the cameras first, because there may be
-    many; with ``exact_frames`` all are tried in that frame only.
+    Sizes that only the number of rows suggests may be many, so they are tried in the cameras' own frame first; with
+    ``exact_frames`` all are tried in that frame only.
     """
     recoveries: list[tuple[GridFit, Recovery]] = []
     guesses: list[GridFit] = []
@@ -221,10 +229,7 @@ def _change_size(
 def _change_poses(
     camera_file: CameraFile, read: Callable[[CameraFile, str], AlignmentResult | None]
 ) -> AlignmentResult | None:
-    """Read poses in the one other convention under which the rows are pixels; None where there is none.
-
-    SceneError if several fit, none of them twice as well as the next.
-    """
+    """Read poses in the one other convention that fits; None without one, SceneError if several fit about as well."""
     fits = []
     for poses in other_conventions(camera_file.viewmats, camera_file.convention):
         other = replace(camera_file, viewmats=poses.viewmats, convention=poses.convention)
@@ -248,10 +253,10 @@ def _read_poses(inputs: AlignmentInput, grid: GridFit, camera_file: CameraFile, 
 
 
 def _move_cameras(inputs: AlignmentInput, camera_file: CameraFile, grid: GridFit) -> AlignmentResult | None:
-    """Read a file without missing pixels under cameras that are moved a little; None where that does not do.
+    """Read a file without missing pixels under slightly moved cameras; None where that does not fit.
 
-    None, too, where the poses fit in another convention, or the photos' colours speak against it: views in the wrong
-    order look like cameras that are off. SceneError as of :func:`move_cameras`.
+    None, too, where the poses fit in another convention, or the photos' colours disagree: views in the wrong order
+    look like inexact cameras. SceneError as of :func:`move_cameras`.
     """
     if inputs.scale is not None:
         return None
@@ -286,53 +291,31 @@ def _with_pixels(
     *notes: str,
     moves: Sequence[dict[str, Any]] = (),
 ) -> AlignmentResult | None:
-    """Make the result of rows that are pixels, with the cameras in the frame of the Gaussians; None if they are not."""
+    """Make the result of rows that are pixels, with the cameras in the frame of the Gaussians; None if they are
+    not.
+    """
     if recovery is None:
         return None
-    frame = recovery.best.frame
+    frame, layout, count = recovery.best.frame, recovery.best.layout, len(inputs.cameras)
     if camera_file.source == ESTIMATED:
         text = "no cameras were given: poses and focal length are estimated from the Gaussians' own grid"
         notes = (*notes, text)
+    in_order = layout.is_plain and frame is IDENTITY and len(layout.views) == count
+    if in_order and layout.views == tuple(inputs.labellings[0]):
+        pass
+    elif in_order and layout.views == tuple(inputs.labellings[1]):
+        notes = (*notes, "views are in the order of the image names, not of the camera file")
+    else:
+        used = len(set(layout.views))
+        notes = (*notes, f"read as: {recovery.description}")
+        notes += (f"{used} of {count} views are in the file",) * (used < count)
     return AlignmentResult(
-        pixel_ids=recovery.best.layout.pixel_ids(len(inputs.gaussians)),
+        pixel_ids=layout.pixel_ids(len(inputs.gaussians)),
         cameras=inputs.cameras if frame is IDENTITY else frame.move(inputs.cameras),
         images=inputs.images,
         camera_file=camera_file,
-        notes=(*grid.notes, *notes, *_describe(recovery, inputs)),
+        notes=(*grid.notes, *notes),
         transform=grid.transform,
         recovery=recovery,
         moves=moves,
-    )
-
-
-def _describe(recovery: Recovery, inputs: AlignmentInput) -> list[str]:
-    """Say how the rows were read, unless the file was simply in order."""
-    layout = recovery.best.layout
-    if layout.is_plain and recovery.best.frame is IDENTITY and len(layout.views) == len(inputs.cameras):
-        if layout.views == tuple(inputs.labellings[0]):
-            return []
-        if layout.views == tuple(inputs.labellings[1]):
-            return ["views are in the order of the image names, not of the camera file"]
-    notes = [f"read as: {recovery.description}"]
-    used = len(set(layout.views))
-    return notes + ([f"{used} of {len(inputs.cameras)} views are in the file"] if used < len(inputs.cameras) else [])
-
-
-def _without_pixels(
-    ply: PlyScene,
-    inputs: AlignmentInput,
-    camera_file: CameraFile,
-    grid: GridFit,
-    frames: Callable[[], Sequence[Similarity]],
-) -> AlignmentResult:
-    """Make the result of rows that belong to no pixels, if the cameras see their Gaussians.
-
-    SceneError if they do not, or if other cameras or another reading of them would make pixels of the rows.
-    """
-    why = explain_count(ply.info, inputs, camera_file)
-    if inputs.scale is not None:
-        inputs = replace(inputs, cameras=scale_by(inputs.scale).move(inputs.cameras))
-    cameras, camera_file, notes = choose_cameras(inputs, camera_file, frames(), why)
-    return AlignmentResult(
-        None, cameras, inputs.images, camera_file, (*grid.notes, *notes), grid.transform, problem=why.problem
     )

@@ -1,8 +1,8 @@
-"""Read, estimate and move cameras: poses in another convention, none at all, or some pixels off.
+"""Read poses in another convention, estimate missing ones, and move inexact cameras.
 
 Models that predict poses write Gaussians and cameras that differ a little. A pose for each view follows from its
-pixels and their Gaussians alone. Which of the two was wrong is for the photos to say, much later: see
-``gsmerge/stages/align_views.py``.
+pixels and their Gaussians alone; the photos show much later which of the two was wrong
+(``gsmerge/stages/align_views.py``).
 """
 
 from __future__ import annotations
@@ -67,27 +67,27 @@ _LINE_ROUNDS = 4  # of reweighted least squares
 
 @dataclass(frozen=True)
 class Poses:
-    """One reading of the poses: a convention, and ``viewmats [c,4,4]`` float64 world to camera under it."""
+    """Poses in one convention: ``viewmats [c,4,4]`` float64, world to camera."""
 
     convention: Convention
     viewmats: np.ndarray
 
     @property
     def description(self) -> str:
-        """What it takes the poses for."""
+        """Words for the convention."""
         return f"{self.convention[0]} matrices with {self.convention[1]} axes"
 
     def describe(self, usual: Convention) -> str:
-        """Say that these fit, not the poses as their format has them."""
+        """Write that these poses fit, in place of those in the format's ``usual`` convention."""
         return f"the poses fit when read as {self.description}, where this format has {usual[0]} with {usual[1]} axes"
 
     def note(self, usual: Convention) -> str:
-        """Say that the poses are read so."""
+        """Write that the poses are read in this convention."""
         return f"{self.describe(usual)}: read so"
 
 
 def other_conventions(viewmats: np.ndarray, convention: Convention) -> list[Poses]:
-    """Read poses ``viewmats [c,4,4]`` of one convention in the others; none twice, and none that changes nothing."""
+    """Read poses ``viewmats [c,4,4]`` in all other conventions, without repetitions."""
     stored, readings = from_viewmats(viewmats, convention), [Poses(convention, viewmats)]
     for other in CONVENTIONS:
         read = to_viewmats(stored, other)
@@ -99,7 +99,7 @@ def other_conventions(viewmats: np.ndarray, convention: Convention) -> list[Pose
 
 @dataclass(frozen=True)
 class CameraCheck:
-    """What the cameras see of some Gaussians."""
+    """Measures of how well cameras see some Gaussians."""
 
     share_seen: float  # share of the Gaussians inside at least one picture
     # distance of their colours from the photos where they are seen, over the distance from the same pixels shuffled;
@@ -122,7 +122,7 @@ class CameraCheck:
 
 
 def check_cameras(gaussians: Gaussians, valid: np.ndarray, cameras: Cameras, images: np.ndarray | None) -> CameraCheck:
-    """Project some valid Gaussians into all views, and compare them with ``images [c,h,w,3]`` where there are any."""
+    """Project some valid Gaussians into all views, and compare their colours with ``images [c,h,w,3]``, if any."""
     rows = np.flatnonzero(valid)
     rows = rows[:: max(1, len(rows) // _SEEN_SAMPLES)]
     points = gaussians.means[rows].astype(np.float64)
@@ -149,13 +149,11 @@ def check_cameras(gaussians: Gaussians, valid: np.ndarray, cameras: Cameras, ima
 def choose_poses(
     gaussians: Gaussians, valid: np.ndarray, cameras: Cameras, images: np.ndarray | None, convention: Convention
 ) -> tuple[Poses | None, CameraCheck, str | None]:
-    """Choose the reading of the poses that sees unaligned Gaussians, by how many it sees and by their colours.
+    """Choose the convention of the poses that sees most unaligned Gaussians, with colours nearest to the photos.
 
-    Arguments are as for :func:`check_cameras`, with the cameras under the usual convention.
-
-    Returns:
-        The reading that is clearly better than the usual one and than all others, or None for the usual one; what it
-        sees; and a note where another one sees as much as the usual one.
+    Arguments are as for :func:`check_cameras`, with the cameras under the usual convention. Returns the poses if
+    they are clearly better than the usual ones and all others, otherwise None; the check of the chosen ones; and a
+    note where others see as much as the usual ones.
     """
     usual = check_cameras(gaussians, valid, cameras, images)
     others = [
@@ -177,9 +175,9 @@ def choose_poses(
 def choose_cameras(
     inputs: AlignmentInput, camera_file: CameraFile, frames: Sequence[Similarity], why: SceneError
 ) -> tuple[Cameras, CameraFile, list[str]]:
-    """Choose cameras that see the Gaussians: as they are, in another frame, or in another convention; and notes.
+    """Choose cameras that see the Gaussians: as given, in another frame, or in another convention; with notes.
 
-    SceneError if none of these does, with the reason why there are no pixels.
+    SceneError if none of these does, with the reason ``why`` there are no pixels.
     """
     rows = inputs.gaussians, inputs.valid
     moved = [(frame, frame.move(inputs.cameras)) for frame in (IDENTITY, *frames)]
@@ -204,8 +202,8 @@ def estimate_cameras(
 ) -> CameraFile | None:
     """Estimate poses and one focal length under which rows of a full or trimmed grid project into their own pixels.
 
-    ``names`` are those of the views, all ``width`` x ``height`` pixels; ``valid [n]`` bool; ``path`` is for messages.
-    None if no order of the rows fits at least twice as well as all others.
+    ``names`` are those of the views, all ``width`` x ``height`` pixels; ``valid [n]`` bool; ``path`` is for
+    messages. None if no order of the rows fits at least twice as well as all others.
     """
     layouts = exact_layouts(len(gaussians), len(names), width, height)
     possible = [layout for layout in layouts if layout.per_pixel == 1 and len(layout.views) == len(names)]
@@ -221,7 +219,7 @@ def estimate_cameras(
 
 
 def _calibrate(means: np.ndarray, valid: np.ndarray, layout: Layout) -> tuple[float, float, list[np.ndarray]]:
-    """Solve for (largest median distance in pixels, focal length, poses) of one order of the rows; inf without one."""
+    """Solve for (largest median distance in pixels, focal length, poses) of one order of the rows; inf on failure."""
     pairs = find_correspondences(means, valid, layout)
     middle = np.median(pairs.points, 0)
     unit = float(np.median(np.abs(pairs.points - middle))) or 1.0
@@ -254,7 +252,7 @@ def _calibrate(means: np.ndarray, valid: np.ndarray, layout: Layout) -> tuple[fl
 
 @dataclass(frozen=True)
 class MovedCameras:
-    """Cameras in their new places."""
+    """Cameras in their new places, and how far they were moved."""
 
     cameras: Cameras
     worst_px: float  # the largest median distance of a view's Gaussians from their pixels before
@@ -262,7 +260,7 @@ class MovedCameras:
 
     @property
     def note(self) -> str:
-        """What was done, in one sentence."""
+        """A sentence on the move."""
         return (
             f"the cameras are off by a median of up to {self.worst_px:.1f} px: each was moved to where its Gaussians"
             f" lie in their pixels, {describe_moves(self.moves)}"
@@ -279,7 +277,7 @@ def move_cameras(
 ) -> MovedCameras | None:
     """Move cameras to where the Gaussians of a sample project into their pixels; None where some are too far off.
 
-    SceneError, which names ``source``, where not the poses are wrong but the intrinsics.
+    SceneError, which names ``source``, where the intrinsics are wrong rather than the poses.
     """
     before = check_pairs(pairs, cameras)
     if not before.worst_px <= max_pixels(cameras.width, cameras.height):
@@ -302,7 +300,7 @@ def move_cameras(
 
 
 def _check_intrinsics(pairs: Correspondences, cameras: Cameras, before_px: float, moved_px: float, source: str) -> None:
-    """Refuse cameras whose Gaussians lie as near to their pixels under one change of all Ks as under moved poses."""
+    """Raise a SceneError where one change of all Ks fits the Gaussians as well as moved poses."""
     if len(np.unique(pairs.views)) < 2:  # in one view a turn and a shift of the picture are one
         return
     factors, shifts = np.ones(2), np.zeros(2)

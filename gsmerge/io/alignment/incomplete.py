@@ -1,7 +1,7 @@
-"""Score readings of files that lack pixels without saying which, or have their rows in no order.
+"""Score readings of files that lack unknown pixels, or have their rows in no order.
 
-Rows in no order can be read where Gaussians were made on the rays of their pixels' centres: a Gaussian then projects to
-the very centre of a pixel in its own view, and anywhere in a pixel of the others.
+Rows in no order can be read where Gaussians were made on the rays of their pixels' centres: a Gaussian then
+projects to the very centre of a pixel in its own view, and anywhere in a pixel of the others.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ _BETTER = 2.0  # times nearer to the pixels: another scale, where the same fits 
 
 
 def score_incomplete(inputs: AlignmentInput) -> list[AlignmentScore]:
-    """Score readings with pixels missing, in the possible orders: the next one is tried only where none fits."""
+    """Score readings with missing pixels in the possible orders, each tried only where none before it fits."""
     cameras = inputs.cameras
     missing = len(cameras) * cameras.width * cameras.height - len(inputs.gaussians)
     ids = np.flatnonzero(inputs.valid)
@@ -73,13 +73,13 @@ def score_incomplete(inputs: AlignmentInput) -> list[AlignmentScore]:
 def _score(
     inputs: AlignmentInput, rows: ProjectedRows, search: Callable[[ProjectedRows], Layout | None], frame: Similarity
 ) -> AlignmentScore | None:
-    """Score what a search makes of the rows in one frame; None where that is nothing."""
+    """Score the layout that a search makes of the rows in one frame; None without one."""
     layout = search(rows.with_frame(frame))
     return None if layout is None else score_layout(inputs, layout, frame)
 
 
 def _score_view_major(inputs: AlignmentInput, rows: ProjectedRows, frame: Similarity) -> AlignmentScore | None:
-    """Score one view after the other: in a frame, and at any other scale where that does not fit well or at all."""
+    """Score one view after the other in a frame, and at any other scale where that does not fit well."""
     same = _score(inputs, rows, read_view_major, frame)
     if same is not None and same.worst_px >= _CERTAIN_PX:
         num_pixels = len(same.layout.views) * rows.cameras.width * rows.cameras.height
@@ -127,7 +127,7 @@ def _score_unordered(inputs: AlignmentInput, rows: ProjectedRows, frames: list[S
 
 @dataclass(frozen=True)
 class _Spread:
-    """How far rows are from their own pixels."""
+    """Typical distances of rows from their own pixels."""
 
     tolerance: float  # pixels from a centre within which a view may be a row's own
     px: float  # median distance from the centre in the own view, pixels
@@ -135,11 +135,9 @@ class _Spread:
 
 
 def read_unordered(rows: ProjectedRows, *, color_of: ColorOf | None = None) -> Layout | None:
-    """Find the pixel of every row in a file without an order.
+    """Find the pixel of every row in a file without an order; None unless nearly all are at centres, not by chance.
 
-    None unless nearly all rows are at centres, and many more than by chance.
-
-    Each row goes to the view in which it is nearest to a pixel's centre; between several that are near, the colours of
+    Each row goes to the view in which it is nearest to a pixel's centre; between several near ones, the colours of
     the photos count as well. A pixel keeps the row that fits it best, the others go to their second choice.
     """
     count, num_views = len(rows), len(rows.cameras)
@@ -164,8 +162,8 @@ def read_unordered(rows: ProjectedRows, *, color_of: ColorOf | None = None) -> L
 def _measure_spread(rows: ProjectedRows, color_of: ColorOf | None) -> _Spread | None:
     """Measure how near rows are to the centres of pixels, on a sample; None where it may be chance.
 
-    Chance is what the same rows show at the corners of pixels, where only views that are not their own have any, and
-    what they show in the second nearest view: cameras side by side share rows of pixels, so it is more than the area.
+    Chance is measured at the corners of pixels, where only views that are not their own have rows, and in the
+    second nearest view: cameras side by side share rows of pixels, so it is more than the area.
     """
     if len(rows) < MIN_BLOCK:
         return None
@@ -194,7 +192,9 @@ def _measure_spread(rows: ProjectedRows, color_of: ColorOf | None) -> _Spread | 
 
 
 def _distances(rows: ProjectedRows, some: np.ndarray, *, shift: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Measure distances ``[r,c]`` from the nearest pixel's centre in each view, inf outside; and find that pixel."""
+    """Measure distances ``[r,c]`` from the nearest pixel's centre in each view, inf outside; also return the
+    pixels.
+    """
     distances = np.full((len(some), len(rows.cameras)), np.inf, np.float32)
     pixels = np.zeros((len(some), len(rows.cameras)), np.int32)
     for view in range(len(rows.cameras)):
@@ -230,7 +230,7 @@ def _choices(
 
 
 def _assign(slots: np.ndarray, cost: np.ndarray, size: int) -> np.ndarray:
-    """Choose the row that each slot keeps ``[size]``, -1 for none: the cheapest; second choices take what is free."""
+    """Choose the row that each slot keeps ``[size]``, -1 for none: the cheapest; second choices take free slots."""
     owner = np.full(size, -1, np.int64)
     waiting = np.arange(len(slots))
     for choice in range(2):

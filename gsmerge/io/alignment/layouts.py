@@ -1,4 +1,4 @@
-"""Lay rows out as pixels: which layouts the number of rows allows, and which size the grid of Gaussians may have."""
+"""Lay rows out as pixels: the layouts that a number of rows allows, and the possible sizes of their grid."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _MAX_ENLARGED = 1.5  # times the side of a photo; some networks enlarge small on
 
 @dataclass(frozen=True)
 class Layout:
-    """Rows and their pixels, block by block: a block is what one view (or one layer of it) wrote."""
+    """Rows and their pixels, block by block; a block is one view, or one layer of a view."""
 
     description: str  # what it is, for people
     kind: str  # "full", "trim", "box", "box+depth" or "pruned": which pixels there are
@@ -41,7 +41,7 @@ class Layout:
 
     @property
     def is_plain(self) -> bool:
-        """Whether the rows are the grid as they are: nothing to move, nothing missing."""
+        """Whether the rows are the grid in order: nothing to move, nothing missing."""
         return self.kind == "full" and self.order == "view-major" and self.per_pixel == 1
 
     def pixel_ids(self, count: int) -> np.ndarray:
@@ -56,7 +56,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class KeptBox:
-    """The part of a view that was kept: rows ``top`` to ``height - top``, columns ``left`` to ``width - left``."""
+    """The kept part of a view: rows ``top`` to ``height - top``, columns ``left`` to ``width - left``."""
 
     kind: str
     description: str
@@ -70,7 +70,7 @@ class KeptBox:
 
 
 def boxes(width: int, height: int) -> list[KeptBox]:
-    """List what may be cut off at the border: nothing, 8 pixels, or 8/256 of each side as Depth Anything 3 does."""
+    """List possible borders: none, 8 pixels, or 8/256 of each side as Depth Anything 3 trims."""
     out = [KeptBox("full", "every pixel", 0, 0)]
     if min(width, height) > 2 * TRIM:
         out.append(KeptBox("trim", f"{TRIM} pixels trimmed at every border", TRIM, TRIM))
@@ -81,13 +81,13 @@ def boxes(width: int, height: int) -> list[KeptBox]:
 
 
 def da3_box(width: int, height: int) -> KeptBox:
-    """Return what Depth Anything 3 cuts off."""
+    """Return the box that Depth Anything 3 keeps."""
     top, left = int(8 / 256 * height), int(8 / 256 * width)
     return KeptBox("box", f"{top} rows and {left} columns trimmed at every border", top, left)
 
 
 def every_nth(views: int) -> list[tuple[int, ...]]:
-    """List the views that exporters keep which take every n-th one, for all n."""
+    """List the choices of every n-th view, for all n."""
     return [tuple(range(0, views, step)) for step in range(1, views + 1)]
 
 
@@ -99,7 +99,7 @@ def plain_layout(views: int, width: int, height: int) -> Layout:
 def exact_layouts(count: int, views: int, width: int, height: int) -> Iterator[Layout]:
     """Yield the layouts with exactly ``count`` rows, for every number of views up to ``views``.
 
-    Which camera a block belongs to is a first guess: the cameras in order, or every n-th of them.
+    The cameras of the blocks are a first guess: in order, or every n-th of them.
     """
     for box in boxes(width, height):
         for per_pixel in PER_PIXEL:
@@ -141,7 +141,7 @@ def _orders(
 def depth_layouts(count: int, depths: np.ndarray) -> list[Layout]:
     """Make the layout of Depth Anything 3 from its depth maps: border, nearest 90 % of each view, every n-th view.
 
-    Of ``depths [v,h,w]`` only the order matters, so any scale will do. Empty if no choice of views has ``count``
+    Only the order of ``depths [v,h,w]`` matters, so any scale will do. Empty if no choice of views has ``count``
     pixels.
     """
     views, height, width = depths.shape
@@ -161,8 +161,8 @@ def depth_layouts(count: int, depths: np.ndarray) -> list[Layout]:
 def depth_mask(depth: np.ndarray) -> np.ndarray:
     """Return the pixels of one view that Depth Anything 3 keeps, in order.
 
-    Its threshold is the 90 % quantile of all the view's depths, interpolated: between two depths that occur, so
-    the lower of the two decides.
+    Its threshold is the interpolated 90 % quantile of the view's depths; the lower of the two depths around it
+    decides.
     """
     height, width = depth.shape
     rank = int(DEPTH_SHARE * (depth.size - 1))
@@ -174,10 +174,10 @@ def depth_mask(depth: np.ndarray) -> np.ndarray:
 def fill_from_depths(scene: Scene, depths: np.ndarray) -> Scene:
     """Add a Gaussian for each pixel that the file has no row for.
 
-    It lies on the pixel's ray at the depth of the map (``depths [v,h,w]`` of the scene's views), in units that follow
-    from the other pixels: as depth along z or as distance, whichever they agree with. Its colour is the photo's; its
-    opacity, rotation and size in pixels are those of the pixel before it in the same row. The scene stays as it is if
-    it has no photos, lacks nothing, or its Gaussians do not lie at the maps' depths.
+    It lies on the pixel's ray at the depth of the map (``depths [v,h,w]``), in units that follow from the other
+    pixels: as depth along z or as distance, whichever fits better. Its colour is the photo's; its opacity, rotation
+    and size in pixels are those of the pixel before it in the same row. The scene is unchanged if it has no photos,
+    lacks nothing, or its Gaussians do not lie at the maps' depths.
     """
     if scene.images is None or scene.missing is None:
         return scene
@@ -195,7 +195,11 @@ def fill_from_depths(scene: Scene, depths: np.ndarray) -> Scene:
     if not usable.any():
         return scene
     ratio = z[usable] / maps[usable]
-    spread, unit, along = min(_agreement(ratio, 0), _agreement(ratio * length[usable], 1))
+    fits = []
+    for along, ratios in enumerate((ratio, ratio * length[usable])):  # depth along z, distance
+        middle = float(np.median(ratios))
+        fits.append((float(np.median(np.abs(ratios / middle - 1))), middle, along))
+    spread, unit, along = min(fits)
     if spread > _MAX_SPREAD:
         return scene
     new_z = unit * maps / (length if along else 1)
@@ -218,12 +222,6 @@ def fill_from_depths(scene: Scene, depths: np.ndarray) -> Scene:
     return replace(scene, gaussians=full, pixel_ids=grid_ids(kept))
 
 
-def _agreement(ratio: np.ndarray, far: int) -> tuple[float, float, int]:
-    """Compute (spread, median, kind) of the Gaussians' depth over the map's."""
-    middle = float(np.median(ratio))
-    return float(np.median(np.abs(ratio / middle - 1))), middle, far
-
-
 def subsample(layout: Layout, per_block: int) -> Layout:
     """Thin a layout to about ``per_block`` rows of each block, spread over all columns and rows."""
     rows, pixels = [], []
@@ -235,7 +233,7 @@ def subsample(layout: Layout, per_block: int) -> Layout:
 
 
 def spread_step(step: int, width: int) -> int:
-    """Enlarge a step until it shares no divisor with the width: otherwise it would see some columns only."""
+    """Enlarge a step until it shares no divisor with the width, so that samples spread over all columns."""
     step = max(1, step)
     while step > 1 and np.gcd(step, width) > 1:
         step += 1
@@ -246,8 +244,8 @@ def spread_step(step: int, width: int) -> int:
 class GridFit:
     """One way to bring cameras and photos to the size of the grid.
 
-    Its rank is what speaks for it: a size that files have (0); the number of rows and the photos' shape (1); the number
-    of rows alone (2); a network's usual sizes (3).
+    Its rank says what suggests it: a size in files (0); the number of rows and the photos' shape (1); the number of
+    rows alone (2); a network's usual sizes (3).
     """
 
     cameras: Cameras  # at the grid's size
@@ -257,20 +255,17 @@ class GridFit:
 
     @property
     def size(self) -> Size:
-        """(width, height) of the grid."""
+        """(width, height) of the grid, pixels."""
         return self.cameras.width, self.cameras.height
 
     @property
     def guessed(self) -> bool:
-        """Whether it is one of many that the number of rows allows."""
+        """Whether the number of rows allows many others."""
         return self.rank in (1, 2)
 
 
 def photo_grid(camera_file: CameraFile, size: Size | None) -> GridFit:
-    """Assume that the grid has the photos' size, or that of the cameras where there are no photos.
-
-    SceneError if the cameras' size is not the photos' or a multiple of it.
-    """
+    """Assume that the grid has the photos' size, or the cameras' without photos; SceneError if the two disagree."""
     if size is None:
         return GridFit(to_cameras(camera_file), None, ())
     width, height = size
@@ -286,10 +281,7 @@ def photo_grid(camera_file: CameraFile, size: Size | None) -> GridFit:
 
 
 def other_grids(ply: PlyInfo, camera_file: CameraFile, size: Size | None) -> Iterator[GridFit]:
-    """Yield all other grids that the files and the number of rows allow, the likely ones first.
-
-    ``size`` is the photos'.
-    """
+    """Yield all other grids that the files and the number of rows allow, the likely first; ``size`` is the photos'."""
     known = sizes_of(camera_file)
     own = known[0] if len(known) == 1 else None
     if size is not None and own is not None and own != size:
@@ -325,7 +317,7 @@ def _between(camera_file: CameraFile, size: Size, own: Size) -> Iterator[GridFit
 
 
 def grids_of_count(count: int, views: int, size: Size) -> Iterator[PhotoTransform]:
-    """Yield transforms of photos to smaller grids that ``count`` rows allow, as many for each of all ``views``."""
+    """Yield transforms of photos to smaller grids of which ``views`` have ``count`` rows."""
     crops: list[PhotoTransform] = []
     for trim in (0, TRIM):
         for per_pixel in PER_PIXEL:
@@ -343,7 +335,7 @@ def grids_of_count(count: int, views: int, size: Size) -> Iterator[PhotoTransfor
 
 
 def _sizes_of_area(pixels: int, trim: int, size: Size) -> Iterator[Size]:
-    """Yield sizes up to ``size`` that leave so many pixels when ``trim`` is cut off at every border."""
+    """Yield sizes up to ``size`` that have ``pixels`` pixels when ``trim`` is cut off at every border."""
     for width in range(max(1, pixels // size[1]), min(size[0], pixels) + 1):
         height, rest = divmod(pixels, width)
         to = width + 2 * trim, height + 2 * trim
@@ -365,7 +357,7 @@ def patch_grids(size: Size) -> list[PhotoTransform]:
 
 
 def small_photos_error(ply: PlyInfo, camera_file: CameraFile, size: Size | None) -> SceneError | None:
-    """Explain that photos are too small where the rows are as many as the cameras have pixels; None where not."""
+    """Make the SceneError for photos smaller than the cameras' size, of which the rows are the pixels; or None."""
     own = next((s for s in sizes_of(camera_file) if ply.count == len(camera_file) * s[0] * s[1]), None)
     if size is None or own is None or own == size:
         return None

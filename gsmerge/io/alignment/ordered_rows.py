@@ -1,8 +1,7 @@
 """Find the pixels of rows in a file that lacks some, unknown which, but keeps an order.
 
-Either the file has one view after the other, each row by row: where one view ends and the next begins, the projected
-rows start again from the top, and within a view the pixels can only go forward. Or it goes pixel by pixel, the views of
-one pixel side by side.
+View by view: where one view ends and the next begins, the projected rows start again from the top, and within a
+view the pixels only go forward. Pixel by pixel: the views of one pixel are side by side.
 """
 
 from __future__ import annotations
@@ -39,8 +38,8 @@ MAX_CELLS = 300_000_000  # rows times views that are worth the memory
 class ProjectedRows:
     """n finite rows of a file and the cameras of the c views to which they may belong.
 
-    The searches ``read_view_major``, ``read_view_fastest`` and ``read_unordered`` take these and return a layout whose
-    pixels still have to be measured, or None if the rows do not look like what they search for.
+    Searches take these and return a layout whose pixels still have to be measured, or None if the rows do not look
+    like it.
     """
 
     points: np.ndarray  # ``[n,3]`` float64 means
@@ -51,7 +50,7 @@ class ProjectedRows:
         return len(self.points)
 
     def with_frame(self, frame: Similarity) -> ProjectedRows:
-        """Return the same rows, seen by the cameras once these are moved to another frame."""
+        """Return the same rows with the cameras moved to another frame."""
         return replace(self, cameras=frame.move(self.cameras))
 
     def project(self, rows: np.ndarray | slice, view: int) -> tuple[np.ndarray, np.ndarray]:
@@ -62,7 +61,7 @@ class ProjectedRows:
         return xy[:, 0], xy[:, 1]
 
     def pixels(self, rows: np.ndarray | slice, view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Find the pixels ``y·W + x`` that some rows lie in, ``[r]`` int32, -1 outside; and what they project to."""
+        """Find the pixels ``y·W + x`` of some rows, ``[r]`` int32, -1 outside; and their projections."""
         u, v = self.project(rows, view)
         inside = (u >= 0) & (v >= 0) & (u < self.cameras.width) & (v < self.cameras.height)
         pixels = np.full(len(u), -1, np.int32)
@@ -72,7 +71,7 @@ class ProjectedRows:
     def layout(
         self, order: str, parts: Sequence[tuple[int, np.ndarray, np.ndarray]], *, missing: int, note: str = ""
     ) -> Layout:
-        """Make a search's result: ``parts`` are views, some of these rows, and their pixels; ``missing`` have none."""
+        """Make a layout from parts of (view, some of these rows, their pixels); ``missing`` pixels have no row."""
         words = "in no order" if order == "unordered" else order
         return Layout(
             description=f"{missing:,} pixels of {len(parts)} views dropped, {words}{note}",
@@ -87,7 +86,7 @@ class ProjectedRows:
 
 
 def read_view_major(rows: ProjectedRows) -> Layout | None:
-    """Find the pixel of every row in a file of one view after the other."""
+    """Find the pixel of every row in a file of one view after the other; None if blocks cannot be found."""
     blocks = _find_blocks(rows)
     if blocks is None:
         return None
@@ -97,9 +96,9 @@ def read_view_major(rows: ProjectedRows) -> Layout | None:
 
 
 def _find_blocks(rows: ProjectedRows) -> list[tuple[int, np.ndarray]] | None:
-    """Find (view, rows) of each block, views increasing; None if the rows do not look like that.
+    """Find (view, rows) of each block, views increasing; None if the rows do not look like blocks.
 
-    Where a block ends shows in any view that is nearly its own. Which views they are is decided for all together.
+    The end of a block shows in any view that is nearly its own; the views are chosen for all blocks together.
     """
     count, views, largest = len(rows), len(rows.cameras), rows.cameras.width * rows.cameras.height
     start, view = 0, -1
@@ -139,7 +138,7 @@ def _increasing(costs: np.ndarray) -> list[int] | None:
 
 
 def _unevenness(u: np.ndarray, v: np.ndarray) -> float:
-    """Measure how far the typical step is from one pixel to the right, pixels."""
+    """Measure the distance of the typical step from one pixel to the right, pixels."""
     du, dv = np.diff(u), np.diff(v)
     good = np.isfinite(du) & np.isfinite(dv)
     if good.sum() < max(8, 0.5 * len(du)):
@@ -172,17 +171,24 @@ def _block_end(rows: ProjectedRows, start: int, stop: int, view: int) -> int:
 def assign_pixels(u: np.ndarray, v: np.ndarray, width: int, height: int) -> np.ndarray:
     """Assign strictly increasing pixels to the rows of one view, projected to ``u [n]``, ``v [n]``; NaN if unknown.
 
-    The rows are cut into scanlines where u falls back; a scanline's row is the median of v, never decreasing. With the
-    row known, ``pixel - rank`` never decreases, and follows from isotonic regression, which averages the jitter over
-    stretches without gaps.
+    The rows are cut into scanlines where u falls back; a scanline's row is the median of v, never decreasing. With
+    the row known, ``pixel - rank`` never decreases: isotonic regression finds it, and averages the jitter between
+    gaps.
     """
+    from scipy.ndimage import median
+
     count, known = len(u), np.isfinite(u) & np.isfinite(v)
     u, v = np.where(known, u, 0.0), np.where(known, v, 0.0)
     du = np.diff(u)
     noise = float(np.median(np.abs(du[known[1:] & known[:-1]] - 1))) if (known[1:] & known[:-1]).any() else 0.0
     cut = (du < -max(2.0, 4 * noise + 1)) & known[1:] & known[:-1]
     scanline = np.concatenate([[0], np.cumsum(cut)])
-    row = np.clip(np.floor(_rows_of(scanline, v, known)), 0, height - 1)[scanline]
+    counts = np.bincount(scanline[known], minlength=scanline[-1] + 1)
+    medians, some = np.zeros(len(counts)), np.flatnonzero(counts)
+    if len(some):
+        medians[some] = median(v[known], scanline[known], some)
+    rows = _never_falling(medians, np.maximum(counts, _SMALL))
+    row = np.clip(np.floor(rows), 0, height - 1)[scanline]
     rank = np.arange(count)
     sure = known & (np.abs(v - row - 0.5) < 2 + 4 * noise) & (u > -2 - 4 * noise) & (u < width + 2 + 4 * noise)
     key = row * width + np.clip(u, 0, width) - 0.5 - rank
@@ -190,19 +196,8 @@ def assign_pixels(u: np.ndarray, v: np.ndarray, width: int, height: int) -> np.n
     return np.asarray(np.clip(np.rint(pixels), 0, width * height - count), np.int64) + rank
 
 
-def _rows_of(scanline: np.ndarray, v: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Take the median of the known v of every scanline, made never to decrease."""
-    from scipy.ndimage import median
-
-    counts = np.bincount(scanline[known], minlength=scanline[-1] + 1)
-    medians, some = np.zeros(len(counts)), np.flatnonzero(counts)
-    if len(some):
-        medians[some] = median(v[known], scanline[known], some)
-    return _never_falling(medians, np.maximum(counts, _SMALL))
-
-
 def _never_falling(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the nearest non-decreasing sequence, by weighted squares."""
+    """Compute the nearest non-decreasing sequence, by weighted squares."""
     from scipy.optimize import isotonic_regression  # loads slowly, and is seldom needed
 
     return np.asarray(isotonic_regression(values, weights=weights).x)
@@ -229,11 +224,10 @@ def rough_scale(rows: ProjectedRows) -> float:
 
 
 def finer_scale(rows: ProjectedRows, layout: Layout, rough: float) -> float:
-    """Find the scale, up to a quarter off ``rough``, under which rows lie nearest to the pixels that they come to.
+    """Find the scale, up to a quarter off ``rough``, under which rows lie nearest to their assigned pixels.
 
-    A scale that is wrong by little moves rows by parts of a pixel, which finding their pixels hides: so scales are
-    tried in steps that move most rows by a quarter of a pixel at most. The cameras are in their own frame; the blocks
-    of the layout are right, its pixels need not be.
+    A slightly wrong scale moves rows by parts of a pixel, which the assignment hides: so scales are tried in steps
+    that move most rows by a quarter of a pixel at most. The layout's blocks are right, its pixels need not be.
     """
     chosen = np.unique(np.linspace(0, len(layout.views) - 1, TRIED_BLOCKS).astype(int))
     starts = [max(0, (len(layout.rows[b]) - STRETCH) // 2) for b in chosen]
@@ -243,8 +237,13 @@ def finer_scale(rows: ProjectedRows, layout: Layout, rough: float) -> float:
         there = rows.with_frame(scale_by(scale))
         return [there.project(some, view) for view, some in parts]
 
+    def distance(u: np.ndarray, v: np.ndarray) -> float:
+        y, x = np.divmod(assign_pixels(u, v, layout.width, layout.height), layout.width)
+        away = np.hypot(u - x - 0.5, v - y - 0.5)
+        return float(np.median(np.where(np.isfinite(away), away, layout.width)))
+
     def cost(scale: float) -> float:
-        return float(np.mean([_distance(u, v, layout.width, layout.height) for u, v in projected(scale)]))
+        return float(np.mean([distance(u, v) for u, v in projected(scale)]))
 
     here, there = projected(rough), projected(rough * 1.001)
     moved = np.concatenate([np.hypot(b[0] - a[0], b[1] - a[1]) for a, b in zip(here, there, strict=True)]) / 0.001
@@ -260,19 +259,12 @@ def finer_scale(rows: ProjectedRows, layout: Layout, rough: float) -> float:
     return best
 
 
-def _distance(u: np.ndarray, v: np.ndarray, width: int, height: int) -> float:
-    """Measure the median distance of projected rows from the pixels that they come to, pixels."""
-    y, x = np.divmod(assign_pixels(u, v, width, height), width)
-    away = np.hypot(u - x - 0.5, v - y - 0.5)
-    return float(np.median(np.where(np.isfinite(away), away, width)))
-
-
 def read_view_fastest(rows: ProjectedRows) -> Layout | None:
     """Find the pixel of every row in a file of one pixel after the other, if means lie inside their pixels.
 
-    Every row lies in some pixel of every view. In the order of the file the true ones can only go forward: pixel by
-    pixel, within a pixel view by view. The path through the views that goes forward in the smallest steps wins; None if
-    none goes forward, or hardly any step changes the view.
+    Every row lies in some pixel of every view. In the order of the file the true pixels only go forward, and within
+    a pixel the views do. The path through the views with the smallest steps wins; None if it goes back, or hardly
+    changes views.
     """
     count, views = len(rows), len(rows.cameras)
     if not 1 < views <= MAX_PATH_VIEWS or count < MIN_BLOCK * views or count * views > MAX_CELLS:
@@ -298,12 +290,12 @@ def read_view_fastest(rows: ProjectedRows) -> Layout | None:
 
 
 def _best_path(pixels: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Choose the view ``[n]`` of every row; and tell whether its pixels then only go forward, from view to view."""
+    """Choose the view ``[n]`` of every row; also return whether its pixels then only go forward, from view to view."""
     chosen = np.empty(len(pixels), np.int64)
     back = cheapest_views(pixels, np.zeros(pixels.shape, np.int8), chosen)
     return chosen, bool(back <= MAX_BACK * len(pixels) and np.mean(chosen[1:] != chosen[:-1]) >= MIN_CHANGES)
 
 
 def _pixels_in_views(rows: ProjectedRows, some: slice) -> np.ndarray:
-    """Find the pixel ``[r,c]`` int32 that each of some rows lies in, in each view; -1 outside."""
+    """Find the pixel ``[r,c]`` int32 of some rows in each view; -1 outside."""
     return np.stack([rows.pixels(some, view)[0] for view in range(len(rows.cameras))], 1)

@@ -1,7 +1,4 @@
-"""Recover which row is which pixel by measuring: every layout that the number of rows allows is projected and compared.
-
-Where none fits, explain why.
-"""
+"""Recover the pixel of each row: project every layout that the number of rows allows, and compare; or explain."""
 
 from __future__ import annotations
 
@@ -54,7 +51,7 @@ _SMALLEST_PX = 1e-3  # distances are compared as if none were smaller, pixels
 
 @dataclass(frozen=True)
 class Recovery:
-    """The reading that won."""
+    """The winning reading of the rows, with its margin."""
 
     best: AlignmentScore
     runner_up: AlignmentScore | None  # the next best; None where the count allows no other
@@ -68,7 +65,7 @@ class Recovery:
 
     @property
     def description(self) -> str:
-        """Which reading won and by how much."""
+        """Words for the reading and its margin."""
         other = "shuffled pixels" if self.runner_up is None else self.runner_up.description
         text = f"{self.best.description}: median {self.best.median_px:.2f} px from the pixels, "
         if self.color_margin is None:
@@ -82,8 +79,8 @@ class Recovery:
 def recover(inputs: AlignmentInput, *, exact_frames: bool = False) -> Recovery | None:
     """Find the reading under which every Gaussian projects into its own pixel; None where none stands out.
 
-    Of readings that put the Gaussians about equally near to their pixels, the photos' colours choose one. With
-    ``exact_frames`` only cameras in the frame of their file and files without missing pixels are considered: quick.
+    Of readings about equally near to the pixels, the photos' colours choose one. With ``exact_frames`` only cameras
+    in the frame of their file and files without missing pixels are considered: quick.
     """
     finite = int(inputs.valid.sum())
     if inputs.order == "none" or (finite < ENOUGH and finite < FEW * len(inputs.gaussians)):
@@ -113,7 +110,7 @@ def recover(inputs: AlignmentInput, *, exact_frames: bool = False) -> Recovery |
 
 
 def _without_same_labellings(inputs: AlignmentInput) -> AlignmentInput:
-    """Take orders that only exchange views of one pose with equal photos, or without any, for one: either is right."""
+    """Drop orders that only exchange views of one pose with equal photos, or without any: either is right."""
     cameras, images, (first, *others) = inputs.cameras, inputs.images, inputs.labellings
     facts = np.concatenate([cameras.viewmats[:, :3].reshape(-1, 12), cameras.Ks.reshape(-1, 9)], 1)
 
@@ -132,21 +129,14 @@ def _accept(inputs: AlignmentInput, best: AlignmentScore, runner_up: AlignmentSc
         return None
     next_px = min(shuffled_px, math.inf if runner_up is None else runner_up.worst_px)
     margin = next_px / max(best.worst_px, _SMALLEST_PX)
-    return Recovery(best, runner_up, margin, None, _confirm(inputs, best, shuffled_color))
-
-
-def _confirm(inputs: AlignmentInput, best: AlignmentScore, shuffled_color: float) -> bool | None:
-    """Tell whether the photos' colours agree with a reading; None where they cannot tell."""
-    if not shuffled_color > _VARIES:
-        return None
-    return color_error(inputs, best.layout) <= _UNCONFIRMED * shuffled_color
+    confirmed = None  # where colours hardly vary, or there are no photos
+    if shuffled_color > _VARIES:
+        confirmed = color_error(inputs, best.layout) <= _UNCONFIRMED * shuffled_color
+    return Recovery(best, runner_up, margin, None, confirmed)
 
 
 def _recover_plain(inputs: AlignmentInput) -> Recovery | None:
-    """Take the rows as they are, under the cameras as they are; None where that leaves a doubt.
-
-    Most files are so, and trying the other readings takes longer than reading the file.
-    """
+    """Take the rows in order under the stored cameras, as most files need; None in doubt, for a longer search."""
     cameras, count = inputs.cameras, len(inputs.gaussians)
     expected = len(cameras) * cameras.width * cameras.height
     if inputs.order not in ("auto", "view-major") or inputs.scale is not None or count != expected:
@@ -163,7 +153,7 @@ def _recover_plain(inputs: AlignmentInput) -> Recovery | None:
 
 
 def _choose_by_colors(inputs: AlignmentInput, close: list[AlignmentScore]) -> Recovery | None:
-    """Choose the one of several readings, about equally near to their pixels, whose colours the photos have by far."""
+    """Choose the reading whose colours the photos have by far, of several about equally near to their pixels."""
     ranked = sorted((color_error(inputs, score.layout), i) for i, score in enumerate(close))
     (color, first), (next_color, second) = ranked[:2]
     best, runner_up = _refine(inputs, close[first]), close[second]
@@ -176,7 +166,7 @@ def _choose_by_colors(inputs: AlignmentInput, close: list[AlignmentScore]) -> Re
 
 
 def _stands_out(best: AlignmentScore, shuffled_px: float) -> bool:
-    """Tell whether a reading is near enough to its pixels, and shuffled pixels are far from them."""
+    """Return whether a reading is near to its pixels, and shuffled pixels are far from them."""
     return best.ok and shuffled_px >= SHUFFLED_MARGIN * max(best.worst_px, _SMALLEST_PX)
 
 
@@ -192,9 +182,8 @@ def possible_layouts(inputs: AlignmentInput) -> list[Layout]:
 
 
 def _score_labellings(inputs: AlignmentInput, layout: Layout, effort: int) -> list[AlignmentScore]:
-    """Score the layout under the best frame, for each order that the views may be in.
-
-    Any order at all is tried with the most effort, or where the file lacks views.
+    """Score the layout under the best frame, for each likely order of the views; for any with most effort or too
+    few.
     """
     out: dict[tuple[int, ...], AlignmentScore] = {}
     labellings = [[labelling[view] for view in layout.views] for labelling in inputs.labellings]
@@ -227,7 +216,7 @@ def _refine(inputs: AlignmentInput, score: AlignmentScore) -> AlignmentScore:
 
 
 def _nearest_views(inputs: AlignmentInput, layout: Layout) -> list[int] | None:
-    """Find for each block the camera into whose pixels it projects best; None where two want the same."""
+    """Find for each block the camera into whose pixels it projects best; None where two choose the same."""
     pairs = inputs.pairs(subsample(layout, 300))
     chosen = []
     for block in range(len(layout.views)):
@@ -241,7 +230,7 @@ def _nearest_views(inputs: AlignmentInput, layout: Layout) -> list[int] | None:
 
 
 def _differs(one: Layout, other: Layout) -> bool:
-    """Tell whether two layouts put rows to different pixels, judged by some rows of each block."""
+    """Return whether two layouts put rows to different pixels, judged by some rows of each block."""
     if one.views != other.views or [r.size for r in one.rows] != [r.size for r in other.rows]:
         return True
     a, b = subsample(one, 200), subsample(other, 200)
@@ -249,10 +238,7 @@ def _differs(one: Layout, other: Layout) -> bool:
 
 
 def explain_count(ply: PlyInfo, inputs: AlignmentInput, camera_file: CameraFile) -> SceneError:
-    """Explain why the rows are not the pixels of the cameras.
-
-    Raises the SceneError where other cameras, or another reading of them, would make pixels of the rows.
-    """
+    """Make the SceneError of rows that are no pixels; raise it where other cameras would make pixels of them."""
     cameras, count = inputs.cameras, len(inputs.gaussians)
     views, width, height = len(cameras), cameras.width, cameras.height
     expected = f"{views} x {height} x {width} = {views * height * width} (views x height x width)"
@@ -271,7 +257,7 @@ def explain_count(ply: PlyInfo, inputs: AlignmentInput, camera_file: CameraFile)
 
 
 def _lacks_cameras(inputs: AlignmentInput) -> bool:
-    """Tell whether the first views are in order, and there are more of them than cameras."""
+    """Return whether the first views are in order, and there are more of them than cameras."""
     count, each = len(inputs.gaussians), inputs.cameras.width * inputs.cameras.height
     pixels = len(inputs.cameras) * each
     if count <= pixels or count % each:
@@ -281,7 +267,7 @@ def _lacks_cameras(inputs: AlignmentInput) -> bool:
 
 
 def _count_remedy(count: int, cameras: Cameras) -> str:
-    """Say which simple reading the number of Gaussians has instead."""
+    """Name the simple reading that the number of Gaussians has instead."""
     views, width, height = len(cameras), cameras.width, cameras.height
     pixels = width * height
     if count % (views * pixels) == 0:
@@ -302,7 +288,7 @@ def _count_remedy(count: int, cameras: Cameras) -> str:
 
 
 def misalignment_error(path: str, alignment: Alignment, reason: str | None) -> SceneError:
-    """Say that the rows would be enough, but do not lie on their pixels' rays, or as well on those of others."""
+    """Make the SceneError of enough rows that lie on no pixels' rays, or as well on those of others."""
     if alignment.ok:
         problem = f"expected rows that fit the pixels in one way, found several that do, to {alignment.worst_px:.1f} px"
         return SceneError(path, problem, "name the order of the rows with --hint order=NAME")
@@ -318,9 +304,8 @@ def misalignment_error(path: str, alignment: Alignment, reason: str | None) -> S
 def explain_misalignment(
     gaussians: Gaussians, cameras: Cameras, valid: np.ndarray, convention: Convention
 ) -> str | None:
-    """Name the other reading of the cameras or of the row order under which the scene would fit; None without any.
-
-    Gaussians, cameras (read under ``convention``) and ``valid`` are as for :func:`check_alignment`.
+    """Name the other reading of cameras or row order under which the scene fits, as in :func:`check_alignment`; or
+    None.
     """
     pairs = sample_pixels(gaussians, cameras, valid)
     given = cameras.viewmats
@@ -340,9 +325,8 @@ def explain_misalignment(
 
 
 def _looks_like_a_grid(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray, limit: float) -> bool:
-    """Tell whether the first view's rows are pixels of some camera, if not of the given one: wrong cameras, then.
-
-    The intrinsics may be what is wrong: a pose that takes most of it up, to a median of ``limit`` pixels, is enough.
+    """Return whether a pose puts the first view's rows on pixels, to a median of ``limit``: the cameras are wrong
+    then.
     """
     pairs = sample_pixels(gaussians, cameras, valid)
     pairs = pairs.select(pairs.views == 0)

@@ -1,4 +1,4 @@
-"""Rotations that an exporter stored in another order, or left in the camera's frame."""
+"""Read rotations that an exporter stored in another order, or left in the camera's frame."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ _DESCRIPTIONS = {
 def read_rotations(scene: Scene, quats: QuatChoice) -> Scene:
     """Read a scene's stored rotations, which were read as wxyz, in another way; see :class:`ReadHints`.
 
-    Of the two square roots that "xyzw-root" has, the one whose thinnest axis follows the surface better is taken. Where
-    rows belong to no pixels, only "xyzw" changes anything.
+    Of the two square roots that "xyzw-root" has, the one whose thinnest axis follows the surface better is taken.
+    Where rows belong to no pixels, only "xyzw" changes anything.
     """
     if quats in ("auto", "wxyz") or not (scene.aligned or quats == "xyzw"):
         return scene
@@ -55,9 +55,8 @@ def from_xyzw(quats: np.ndarray) -> np.ndarray:
 
 
 def square_roots(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the two rotations that, applied twice, give ``quats [n,4]`` wxyz: half the angle; half a turn more.
-
-    Where there is no angle, the second is half a turn about an arbitrary axis.
+    """Compute the two rotations that, applied twice, give ``quats [n,4]`` wxyz: half the angle, and half a turn
+    more.
     """
     unit = normalize(quats)
     unit = np.where(unit[:, :1] < 0, -unit, unit)
@@ -66,10 +65,7 @@ def square_roots(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def choose_rotations(scene: Scene) -> tuple[QuatChoice, str]:
-    """Choose how rotations (read as wxyz) are read so that thinnest axes follow the surface's normals; and a note.
-
-    "wxyz" and "" unless another reading is better by a large margin.
-    """
+    """Choose the reading whose thinnest axes follow the surface's normals, with a note; "wxyz" and "" in doubt."""
     normals, rows, views = _normals(scene)
     scales = scene.gaussians.scales[rows]
     ordered = np.sort(scales, 1)
@@ -99,7 +95,7 @@ def _camera_quats(scene: Scene) -> np.ndarray:
 
 
 def _cosines(quats: np.ndarray, thinnest: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Compute ``[n]`` between the thinnest axes of Gaussians with rotations ``[n,4]`` and the normals, 0 to 1."""
+    """Compute cosines ``[n]`` between Gaussians' thinnest axes under ``quats [n,4]`` and the normals, 0 to 1."""
     axes = np.take_along_axis(quat_to_rotmat(quats), thinnest[:, None, None], 2)[:, :, 0]
     return np.abs((axes * normals).sum(1))
 
@@ -107,11 +103,11 @@ def _cosines(quats: np.ndarray, thinnest: np.ndarray, normals: np.ndarray) -> np
 def _is_root(
     scene: Scene, rows: np.ndarray, single: list[np.ndarray], thinnest: np.ndarray, normals: np.ndarray
 ) -> bool:
-    """Tell whether the roots of the rotations as xyzw follow the surface by far better than all other readings.
+    """Return whether the roots of the rotations as xyzw follow the surface far better than all other readings.
 
-    The better of two is better by chance as well: every other reading gets a second rotation as the roots have it, half
-    a turn more about the same axis. ``single`` are the readings ``[t,4]`` of some Gaussians, as stored first, as xyzw
-    next; ``normals`` are rough: a first comparison, which takes little time.
+    The better of two is better by chance as well: so every other reading gets a second rotation, half a turn more
+    about the same axis. ``single`` are the readings ``[t,4]`` of some Gaussians, as stored first, as xyzw next;
+    ``normals`` are rough, for a first, quick comparison.
     """
     others = [square_roots(single[0]), *((one, _half_a_turn_more(one)) for one in single)]
     roots = square_roots(single[1])
@@ -131,29 +127,32 @@ def _better_of(
 
 
 def _half_a_turn_more(quats: np.ndarray) -> np.ndarray:
-    """Turn rotations ``[n,4]`` by half a turn more about their own axes."""
+    """Turn rotations ``[n,4]`` by half a turn more about their own axes, or an arbitrary axis without an angle."""
     length = np.linalg.norm(quats[:, 1:], axis=1, keepdims=True)
     axis = np.where(length > 0, normalize(quats[:, 1:]), np.array((0, 0, 1), quats.dtype))
     return np.concatenate([-length, quats[:, :1] * axis], 1)
 
 
 def _smooth_normals(scene: Scene) -> np.ndarray:
-    """Compute normals ``[n,3]`` of the surface at all pixels, of means averaged over some pixels around."""
+    """Compute normals ``[n,3]`` of the surface at all pixels from means that are averaged around; 0 on overflow."""
     v, h, w = scene.valid.shape
     weights = scene.valid[..., None].astype(np.float32)
     means = scene.gaussians.means.reshape(v, h, w, 3)
     middle = means.mean((0, 1, 2), np.float64, where=weights > 0).astype(means.dtype)
-    both = np.concatenate([np.where(weights > 0, means - middle, 0).astype(np.float32), weights], 3)
+    with np.errstate(over="ignore"):
+        both = np.concatenate([np.where(weights > 0, means - middle, 0).astype(np.float32), weights], 3)
     around = np.stack([cv2.blur(view, (_AROUND, _AROUND), borderType=cv2.BORDER_CONSTANT) for view in both])
     grid = around[..., :3] / np.maximum(around[..., 3:], np.float32(1e-6))
     x, y = np.arange(w), np.arange(h)
-    across = grid[:, :, np.minimum(x + _STEP, w - 1)] - grid[:, :, np.maximum(x - _STEP, 0)]
-    down = grid[:, np.minimum(y + _STEP, h - 1)] - grid[:, np.maximum(y - _STEP, 0)]
-    return normalize(np.cross(across, down).reshape(-1, 3))
+    with np.errstate(all="ignore"):  # means as large as 1e38 overflow
+        across = grid[:, :, np.minimum(x + _STEP, w - 1)] - grid[:, :, np.maximum(x - _STEP, 0)]
+        down = grid[:, np.minimum(y + _STEP, h - 1)] - grid[:, np.maximum(y - _STEP, 0)]
+        normals = normalize(np.cross(across, down).reshape(-1, 3))
+    return np.where(np.isfinite(normals).all(1, keepdims=True), normals, 0)
 
 
 def _normals(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Compute normals ``[t,3]`` of some pixels' surface; also return their rows and their views."""
+    """Compute normals ``[t,3]`` of some pixels' surface; also return their rows and views."""
     v, h, w = scene.valid.shape
     inner = np.arange(v * h * w).reshape(v, h, w)[:, _STEP:-_STEP, _STEP:-_STEP].reshape(v, -1)
     step = spread_step(inner.shape[1] // _SAMPLES, w - 2 * _STEP)
@@ -163,6 +162,10 @@ def _normals(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     for offset in (_STEP, -_STEP, _STEP * w, -_STEP * w):
         good = good & valid[rows + offset]
     rows = rows[good]
-    across = (means[rows + _STEP] - means[rows - _STEP]).astype(np.float32)
-    down = (means[rows + _STEP * w] - means[rows - _STEP * w]).astype(np.float32)
-    return normalize(np.cross(across, down)), rows, rows // (h * w)
+    with np.errstate(all="ignore"):  # means as large as 1e38 overflow: their pixels are left out
+        across = (means[rows + _STEP] - means[rows - _STEP]).astype(np.float32)
+        down = (means[rows + _STEP * w] - means[rows - _STEP * w]).astype(np.float32)
+        normals = normalize(np.cross(across, down))
+    finite = np.isfinite(normals).all(1)
+    rows = rows[finite]
+    return normals[finite], rows, rows // (h * w)

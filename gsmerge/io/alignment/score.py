@@ -1,7 +1,7 @@
-"""Score how well rows fit pixels: where Gaussians project to, from cameras that may stand in another frame.
+"""Score how near Gaussians project to their pixels, from cameras that may stand in another frame.
 
-A Gaussian lies on the ray of its pixel: ``(x - c) x d = 0`` with the camera's centre c and the ray's direction d. The
-Gaussians stay where they are; the cameras are moved.
+A Gaussian lies on the ray of its pixel: ``(x - c) x d = 0`` with the camera's centre c and the ray's direction d.
+The Gaussians stay in place; the cameras are moved.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _AS_GOOD, _AS_GOOD_PX = 1.5, 0.05  # one similarity for all cameras, compared wi
 
 @dataclass(frozen=True)
 class Similarity:
-    """``x_gaussians = scale * rotation @ x_cameras + shift``."""
+    """A map ``x_gaussians = scale * rotation @ x_cameras + shift`` between frames."""
 
     rotation: np.ndarray  # ``[3,3]``
     scale: float  # positive
@@ -51,6 +51,9 @@ class Similarity:
 
 
 IDENTITY = Similarity(np.eye(3), 1.0, np.zeros(3))
+_HALF = np.sqrt(0.5)
+_TURN = np.array([[_HALF, _HALF, 0], [-_HALF, _HALF, 0], [0, 0, 1]])
+_UPRIGHT = _TURN @ np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])  # as the pixelSplat family turns its world
 
 
 def scale_by(scale: float, note: str = "") -> Similarity:
@@ -70,7 +73,7 @@ class Correspondences:
     rows: np.ndarray  # ``[t]`` of the file
 
     def select(self, some: np.ndarray) -> Correspondences:
-        """Return some of them."""
+        """Select some rows."""
         return Correspondences(*(column[some] for column in vars(self).values()))
 
     def split(self, values: np.ndarray, blocks: int) -> list[np.ndarray]:
@@ -101,17 +104,23 @@ def _ray_directions(pairs: Correspondences, cameras: Cameras) -> tuple[np.ndarra
 def candidate_similarities(
     pairs: Correspondences | None, cameras: Cameras, *, scale: float | None = None, effort: int = 2
 ) -> Iterator[Similarity]:
-    """Yield similarities between the frames of cameras and Gaussians, the simplest and most plausible first.
+    """Yield similarities from the frame of cameras to that of Gaussians, the simplest and most plausible first.
 
-    They are: the same frame; a scale; rotated by the first or the middle camera, alone, scaled, or scaled and shifted,
-    as exporters do; any, from the poses that the pixels ask for.
-
-    ``scale`` is the size of the Gaussians' world in units of the cameras', where it is given. Effort 0 solves for
-    nothing (then there may be no pairs), 1 for scale and shift, 2 for the rotation as well.
+    They are: the same frame; a scale; rotated by the first or the middle camera, alone, scaled, or scaled and
+    shifted, as exporters do; any, from the poses that the pixels ask for. ``scale`` is the size of the Gaussians'
+    world in units of the cameras', where it is given. Effort 0 solves for nothing (then there may be no pairs), 1
+    for scale and shift, 2 for the rotation as well.
     """
     yield IDENTITY if scale is None else scale_by(scale, ", as given")
     rays = None if pairs is None or effort == 0 else _ray_directions(pairs, cameras)
-    for rotation, name, kind in _known_rotations(cameras.viewmats):
+    first, middle = cameras.viewmats[0, :3, :3], cameras.viewmats[len(cameras) // 2, :3, :3]
+    known = (
+        (np.eye(3), "", ""),
+        (first, "rotated into the first camera", "first"),
+        (middle, "rotated into the middle camera", "middle"),
+        (_UPRIGHT @ first, "rotated upright from the first camera", "upright"),
+    )
+    for rotation, name, kind in known:
         if name:
             yield Similarity(rotation, scale or 1.0, np.zeros(3), name, kind)
         if pairs is None or rays is None:
@@ -134,24 +143,11 @@ def candidate_similarities(
         yield replace(frame, description=text, kind="other")
 
 
-def _known_rotations(viewmats: np.ndarray) -> Iterator[tuple[np.ndarray, str, str]]:
-    yield np.eye(3), "", ""
-    first = viewmats[0, :3, :3]
-    middle = viewmats[len(viewmats) // 2, :3, :3]
-    half = np.sqrt(0.5)
-    turn = np.array([[half, half, 0], [-half, half, 0], [0, 0, 1]])
-    upright = turn @ np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
-    yield first, "rotated into the first camera", "first"
-    yield middle, "rotated into the middle camera", "middle"
-    yield upright @ first, "rotated upright from the first camera", "upright"
-
-
 def _solve(
     points: np.ndarray, rays_and_centres: tuple[np.ndarray, np.ndarray], rotation: np.ndarray, *, shifted: bool
 ) -> Similarity | None:
-    """Solve robustly for the scale and shift that, after a rotation, bring every point nearest to its ray.
-
-    None if the scale is not positive.
+    """Solve robustly for the scale (None if not positive) and shift that bring rotated points nearest to their
+    rays.
     """
     rays, centres = (part @ rotation.T for part in rays_and_centres)
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
@@ -175,7 +171,7 @@ def _solve(
 
 
 def _solve_poses(pairs: Correspondences, Ks: np.ndarray) -> dict[int, np.ndarray]:
-    """Solve for the pose of each view from its pixels, whatever its camera says."""
+    """Solve for the pose of each view from its pixels alone."""
     poses = ((int(view), solve_pose(pairs, int(view), Ks[view])) for view in np.unique(pairs.views))
     return {view: pose for view, pose in poses if pose is not None}
 
@@ -192,7 +188,7 @@ def _mean_rotation(poses: dict[int, np.ndarray], viewmats: np.ndarray) -> np.nda
 
 
 def fits_all_cameras(frame: Similarity, pairs: Correspondences, cameras: Cameras) -> bool:
-    """Tell whether one similarity does about as well as a pose for each camera: otherwise the cameras are wrong."""
+    """Return whether one similarity does about as well as a pose for each camera: otherwise the cameras are wrong."""
     own = cameras.viewmats.copy()
     for view, pose in _solve_poses(pairs, cameras.Ks).items():
         own[view] = pose
@@ -228,7 +224,7 @@ def solve_pose(pairs: Correspondences, view: int, K: np.ndarray) -> np.ndarray |
 
 @dataclass(frozen=True)
 class AlignmentInput:
-    """What the pixels are recovered from."""
+    """Rows, cameras and photos from which the pixels are recovered."""
 
     gaussians: Gaussians  # the file's n rows
     valid: np.ndarray  # ``[n]`` bool
@@ -268,7 +264,7 @@ class AlignmentScore:
 
     @property
     def description(self) -> str:
-        """What it is, for people."""
+        """Words for the reading."""
         return ", ".join(part for part in (self.layout.description, self.frame.description) if part)
 
 
@@ -285,7 +281,7 @@ def sample_layout(layout: Layout, samples: int = SAMPLES) -> Layout:
 def score_layout(
     inputs: AlignmentInput, layout: Layout, frame: Similarity, pairs: Correspondences | None = None
 ) -> AlignmentScore:
-    """Score a layout in a frame, on a sample of its rows: ``pairs``, where they are at hand."""
+    """Score a layout in a frame, on a sample of its rows or on ``pairs`` that are at hand."""
     if pairs is None:
         pairs = inputs.pairs(sample_layout(layout))
     errors = pixel_errors(pairs, frame.move(inputs.cameras))
@@ -296,7 +292,7 @@ def score_layout(
 
 
 def score_shuffled(inputs: AlignmentInput, best: AlignmentScore) -> tuple[float, float]:
-    """Measure the median distance, pixels, and the colours' mean one, with pixels shuffled within each block."""
+    """Measure the median distance, pixels, and the mean colour distance, with pixels shuffled within each block."""
     rng, some = np.random.default_rng(0), sample_layout(best.layout)
     pairs = inputs.pairs(replace(some, pixels=tuple(rng.permutation(pixels) for pixels in some.pixels)))
     errors = pixel_errors(pairs, best.frame.move(inputs.cameras))
@@ -318,7 +314,7 @@ def _color_distance(inputs: AlignmentInput, pairs: Correspondences) -> float:
 
 @dataclass(frozen=True)
 class Alignment:
-    """How well every view's own Gaussians project into their own pixels."""
+    """Distances of every view's own Gaussians from their own pixels."""
 
     # median distance from the pixel centre per view, pixels; inf where most are behind the camera, NaN where a view has
     # no finite Gaussian
@@ -330,15 +326,15 @@ class Alignment:
 
     @property
     def worst_px(self) -> float:
-        """The largest median of a view."""
+        """Largest median of a view, pixels."""
         return max((m for m in self.median_px if not math.isnan(m)), default=math.nan)
 
 
 def check_alignment(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray) -> Alignment:
     """Project a sample of every view's own Gaussians into that view.
 
-    ``gaussians`` are V·H·W rows, assumed to be in view-major, row-major order; rows that are False in ``valid [V·H·W]``
-    (or ``[V,H,W]``) are left out. ValueError if the number of rows is another.
+    ``gaussians`` are V·H·W rows, assumed to be in view-major, row-major order; rows that are False in ``valid
+    [V·H·W]`` (or ``[V,H,W]``) are left out. ValueError for another number of rows.
     """
     return check_pairs(sample_pixels(gaussians, cameras, valid), cameras)
 
@@ -353,7 +349,7 @@ def sample_pixels(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray) -> 
 
 
 def check_pairs(pairs: Correspondences, cameras: Cameras) -> Alignment:
-    """Check a sample under cameras that may be others; see :func:`check_alignment`."""
+    """Check a sample under any cameras; see :func:`check_alignment`."""
     limit = pixel_limit(cameras.width, cameras.height)
     errors = pixel_errors(pairs, cameras)
     medians = tuple(
