@@ -17,7 +17,7 @@ ENGINES = ("local", "ray")
 
 @dataclass(frozen=True)
 class BatchOptions:
-    """Settings of :func:`gsmerge.batch.schedule`; a ValueError if one is out of range."""
+    """Settings of :func:`gsmerge.batch.run_batch`; ValueError if one is out of range."""
 
     settings: CompactOptions = field(default_factory=CompactOptions)  # of a scene; no threads: processors by jobs
     opacity: OpacityChoice = "auto"  # how all files store opacity
@@ -57,21 +57,18 @@ class BatchOptions:
                 raise ValueError(problem)
 
     def result_settings(self) -> dict[str, Any]:
-        """Return all that a result depends on besides the scene's files, as plain values."""
+        """Return everything that a result depends on besides the scene's files, as plain values."""
         settings = self.settings.to_dict()
         del settings["threads"]
         return {"settings": settings, "opacity": self.opacity, "reading": vars(self.hints)}
 
     def name(self) -> str:
-        """Return a digest that runs share if they make the same results."""
+        """Return a digest that is equal for runs that make the same results."""
         return digest({**self.result_settings(), "output": self.output, "cameras": self.cameras, "images": self.images})
 
 
 def check_template(template: str) -> None:
-    """Raise a ValueError if a template gives no valid names for results.
-
-    It may hold the fields in ``FIELDS``, ends as one of the formats that can be written, and stays in the folder.
-    """
+    """Raise a ValueError if a template has other fields than ``FIELDS``, an unknown ending, or leaves the folder."""
     try:
         names = [name for _, name, _, _ in Formatter().parse(template) if name is not None]
         example = template.format(**dict.fromkeys(FIELDS, 1))

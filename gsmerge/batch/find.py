@@ -1,4 +1,4 @@
-"""Scenes in any layout, and the files that their results go to."""
+"""Find scenes in any layout, and name the files of their results."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ SCENE_PARTS = {Path(place).parts[0] for place in PLY_PLACES} | {"point_cloud", *
 
 
 class Work(Protocol):
-    """Other work on a scene than compacting it with the settings of the batch."""
+    """Work on a scene other than compacting it with the settings of the batch."""
 
     @property
     def settings(self) -> CompactOptions:
-        """Settings that its time is estimated from."""
+        """Settings that the time is estimated from."""
 
     def key(self, options: BatchOptions) -> str:
         """Digest everything that the result depends on."""
 
     def run(self, files: SceneFiles, options: BatchOptions, out: Path) -> tuple[dict[str, Any], list[Path]]:
-        """Do it, and return the report, with the keys that records have, and the files that were written."""
+        """Do the work, and return the report, with the keys of a record's, and the written files."""
 
 
 @dataclass(frozen=True)
@@ -50,16 +50,16 @@ class Job:
 
     @property
     def memory(self) -> int:
-        """Bytes that it may take, within a factor of about two."""
+        """Bytes that the scene may take, within a factor of about two."""
         return memory_bytes(self.num_gaussians, photos=True, num_rest=self.num_rest)
 
 
 def find_jobs(given: Sequence[str], out: Path, options: BatchOptions, own: Collection[str] = ()) -> list[Job]:
     """List all scenes, each once, and where their results go in the output folder.
 
-    ``given`` are folders, which are searched, except for ``out``; patterns; ``.ply`` files; text files with one of
-    these per line. ``own`` has the real paths of results of former runs, which are no scenes. A SceneError if something
-    does not exist or holds no scene, a UsageError if two scenes would be written to one file, or one over another.
+    ``given`` are folders, which are searched except for ``out``; patterns; ``.ply`` files; text files with one of
+    these per line. ``own`` has the real paths of former results, which are no scenes. SceneError if something does
+    not exist or has no scene, UsageError if two scenes would be written to one file, or one over another.
     """
     jobs: list[Job] = []
     owners: dict[str, str] = {}
@@ -110,11 +110,9 @@ def output_name(options: BatchOptions, scene: Path, index: int) -> str:
 
 
 def find_scenes(given: Sequence[str], out: Path) -> Iterator[Path]:
-    """Yield the scenes of the arguments, in their order and sorted within each.
+    """Yield the scenes of the arguments, in their order and sorted within each; some may come twice.
 
-    Some may come twice.
-
-    A SceneError if an argument does not exist or holds no scene, a UsageError if it is the output folder.
+    SceneError if an argument does not exist or has no scene, UsageError if it is the output folder.
     """
     skip = os.path.realpath(out)
     for argument in given:
@@ -134,7 +132,7 @@ def find_scenes(given: Sequence[str], out: Path) -> Iterator[Path]:
 
 
 def _require_some(scenes: Iterator[Path], argument: str, where: str) -> Iterator[Path]:
-    """Yield the scenes; a SceneError if there are none."""
+    """Yield the scenes; SceneError if there are none."""
     first = next(scenes, None)
     if first is None:
         raise SceneError(argument, f"expected scenes {where}, found none")
@@ -170,7 +168,7 @@ def _matches(pattern: str, skip: str) -> Iterator[Path]:
 
 
 def _listed(file: Path, skip: str) -> Iterator[Path]:
-    """Yield the scenes of a list, relative to its folder; a missing one fails in its turn."""
+    """Yield the scenes of a list, relative to its folder; a missing one fails when it is read."""
     text = read_text(file)
     if "\0" in text:
         raise SceneError(file, "expected a text file with one path per line, found no text")

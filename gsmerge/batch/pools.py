@@ -1,9 +1,8 @@
-"""Pools that compact the scenes of a batch: processes on this machine, or a Ray cluster.
+"""Compact the scenes of a batch side by side: in processes on this machine, or on a Ray cluster.
 
 A process takes scene after scene; one that dies affects no other scene. Ray is an extra, imported only for
-``engine="ray"``. It schedules by a scene's threads and memory, and reports which tasks were lost with a process or a
-node; retries, records and locks are those of any other run. Scenes and output folder must have the same paths on all
-nodes.
+``engine="ray"``. It schedules by a scene's threads and memory, and reports lost tasks; retries, records and locks
+are those of any other run. Scenes and output folder must have the same paths on all nodes.
 """
 
 from __future__ import annotations
@@ -71,13 +70,6 @@ class Worker:
         self.since: float | None = None
         self.count = 0
 
-    def give(self, task: Task) -> None:
-        """Send the process a scene; if it has ended already, :meth:`LocalPool.wait` sees that."""
-        self.task, self.since = task, None
-        self.count += 1
-        with contextlib.suppress(OSError):
-            self.pipe.send(task)
-
     def stop(self, *, now: bool) -> None:
         """End the process: at once, or as soon as it reads that the pipe is closed."""
         self.pipe.close()
@@ -106,7 +98,10 @@ class LocalPool:
         if idle is None:
             idle = Worker(self.context)
             self.workers.append(idle)
-        idle.give(task)
+        idle.task, idle.since = task, None
+        idle.count += 1
+        with contextlib.suppress(OSError):  # a process that has ended already is noticed by wait
+            idle.pipe.send(task)
 
     def wait(self, seconds: float) -> list[tuple[Task, dict[str, Any]]]:
         """Wait for at most so many seconds; return the scenes that ended, with their records."""
@@ -183,10 +178,17 @@ def _library_threads(count: int) -> Iterator[None]:
 
 
 def run_worker(pipe: Connection, context: BatchContext) -> None:
-    """Work on the tasks from the pipe until it is closed; the main function of a process."""
+    """Work on the tasks from the pipe until it is closed, as the main function of a process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run handles it, and ends its processes
     os.dup2(2, 1)  # only the run itself prints to stdout
-    threading.Thread(target=_end_with, args=(multiprocessing.parent_process(),), daemon=True).start()
+    parent = multiprocessing.parent_process()
+
+    def end_with_parent() -> None:
+        if parent is not None:
+            wait([parent.sentinel])
+            os._exit(1)  # whatever this process is doing
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
     new_records = RecordIndex(context.folder, context.start)
     with contextlib.suppress(EOFError, OSError):  # raised when the run has ended
         while True:
@@ -195,15 +197,8 @@ def run_worker(pipe: Connection, context: BatchContext) -> None:
             pipe.send(run_task(task, context, new_records))
 
 
-def _end_with(parent: BaseProcess | None) -> None:
-    """End this process, whatever it is doing, when its parent ends."""
-    if parent is not None:
-        wait([parent.sentinel])
-        os._exit(1)
-
-
 def require_ray() -> ModuleType:
-    """Import Ray; a UsageError if it is not installed."""
+    """Import Ray; UsageError if it is not installed."""
     try:
         import ray
     except ImportError as error:
@@ -212,9 +207,8 @@ def require_ray() -> ModuleType:
 
 
 class RayPool:
-    """A pool of tasks of a Ray cluster: ``jobs`` at once; 0: as many as it has processors for.
-
-    A UsageError if Ray is not installed, a SceneError if there is no cluster at the address.
+    """A pool of ``jobs`` tasks of a Ray cluster, 0: by its processors; UsageError without Ray, SceneError without a
+    cluster.
     """
 
     def __init__(self, context: BatchContext, jobs: int) -> None:
@@ -286,18 +280,13 @@ def _join(ray: ModuleType, options: BatchOptions) -> None:
         ray.init(address="local", include_dashboard=False, object_store_memory=100 << 20, **quiet)
         return
     try:
-        _check_connection(options.address)
+        host, _, port = options.address.removeprefix("ray://").rpartition(":")
+        if host and port.isdecimal():  # where nothing listens, Ray itself would wait for minutes
+            socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_TIMEOUT).close()
         ray.init(address=options.address, **quiet)
     except (OSError, ValueError, RuntimeError) as error:
         problem = f"no Ray cluster answers there ({' '.join(str(error).split())[:200]})"
         raise SceneError(options.address, problem, "start one with ray start --head") from error
-
-
-def _check_connection(address: str) -> None:
-    """Raise an OSError if nothing listens at the address; Ray itself would wait for minutes."""
-    host, _, port = address.removeprefix("ray://").rpartition(":")
-    if host and port.isdecimal():
-        socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_TIMEOUT).close()
 
 
 def run_remote(task: Task, context: BatchContext) -> dict[str, Any]:

@@ -1,14 +1,11 @@
-"""The records of a batch, one JSON line for each scene, and their summary for people.
-
-A line is on the disk before the next scene begins.
-"""
+"""Records of a batch, one JSON line per scene written before the next begins, and their summary for people."""
 
 from __future__ import annotations
 
 import csv
 import os
 import socket
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -32,7 +29,7 @@ MAX_LISTED = 20  # scenes in the table, and failures below it
 
 @dataclass(frozen=True)
 class DoneResult:
-    """The record of a result that is done."""
+    """The record of a finished result."""
 
     key: str  # of the scene's content, the settings and the version
     files: tuple[tuple[str, str], ...]  # name in the output folder and SHA-256 of each file
@@ -59,7 +56,7 @@ class RecordIndex:
     damaged: int = 0  # lines that could not be read
 
     def read_on(self) -> None:
-        """Read the lines that were added since."""
+        """Read the lines that were added since the last call."""
         for end, value in each_line(self.folder / RECORDS, self.end):
             self.end = end
             if value is None or not is_record(value):
@@ -79,7 +76,7 @@ class RecordIndex:
 
 
 def is_record(value: Mapping[str, Any]) -> bool:
-    """Return whether a line is a record: anybody may have written it."""
+    """Return whether a line is a valid record: anybody may have written it."""
     try:
         texts = [value["scene"], value["output"]]
         texts += [text for file in value["files"] for text in (file["path"], file["sha256"])]
@@ -120,7 +117,7 @@ def row_of(record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def record(status: str, scene: str, output: str, **facts: Any) -> dict[str, Any]:
-    """Make a record of the keys that every line has, and ``facts``."""
+    """Make a record with the keys of every line, and ``facts``."""
     blank: dict[str, Any] = {"key": None, "files": [], "attempt": 1, "error": None, "report": None}
     place = {"host": socket.gethostname(), "pid": os.getpid()}
     return {**document_head(), "status": status, "scene": scene, "output": output, **blank, **place, **facts}
@@ -133,15 +130,8 @@ def written_files(folder: Path, names: Sequence[str]) -> list[dict[str, Any]]:
     ]
 
 
-def each_record(folder: Path) -> Iterator[dict[str, Any]]:
-    """Yield the records of a folder in their order, without damaged ones."""
-    for _, value in each_line(folder / RECORDS):
-        if value is not None and is_record(value):
-            yield value
-
-
 def check_folder(folder: Path) -> None:
-    """Make the output folder, and raise a SceneError if records cannot be written to it."""
+    """Make the output folder; SceneError if records cannot be written to it."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with (folder / RECORDS).open("ab"):
@@ -182,24 +172,33 @@ class Totals:
 
     @property
     def ended(self) -> int:
-        """Scenes that have ended."""
+        """Number of scenes that have ended."""
         return sum(self.counts.values())
 
 
 def write_summary(folder: Path) -> Path:
-    """Write the newest state of every scene in the folder. SceneError if that fails."""
+    """Write the newest state of every scene in the folder; SceneError if that fails."""
     records, read = folder / RECORDS, -1
     while (size := records.stat().st_size if records.exists() else 0) != read:  # other runs may add to them meanwhile
-        _write_rows(folder / SUMMARY, [row for _, row in sorted(newest_records(folder, row_of).items())])
+        rows = [row for _, row in sorted(newest_records(folder, row_of).items())]
+        with (
+            atomic_output(folder / SUMMARY, overwrite=True) as temporary,
+            temporary.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file,
+        ):
+            writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+            writer.writeheader()
+            writer.writerows({name: csv_cell(value) for name, value in row.items()} for row in rows)
         read = size
     return folder / SUMMARY
 
 
 def newest_records(folder: Path, keep: Callable[[dict[str, Any]], T]) -> dict[str, T]:
-    """Read what to ``keep`` of the newest record of every result; of a skipped one that of the time it was done."""
+    """Apply ``keep`` to the newest record of every result; to the finished one before a skipped one."""
     newest: dict[str, T] = {}
     done: dict[str, T] = {}
-    for record in each_record(folder):
+    for _, record in each_line(folder / RECORDS):
+        if record is None or not is_record(record):
+            continue
         output, kept = record["output"], keep(record)
         if record["status"] == DONE:
             done[output] = kept
@@ -208,18 +207,8 @@ def newest_records(folder: Path, keep: Callable[[dict[str, Any]], T]) -> dict[st
     return newest
 
 
-def _write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    with (
-        atomic_output(path, overwrite=True) as temporary,
-        temporary.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file,
-    ):
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows({name: csv_cell(value) for name, value in row.items()} for row in rows)
-
-
 def summary_lines(totals: Totals, path: Path | None) -> list[str]:
-    """Format the totals of a run, as a table for people."""
+    """Format the totals of a run as a table for people."""
     lines = _table(totals.rows)
     more = totals.counts[DONE] - len(totals.rows)
     lines += [f"... and {more:,} more"] if more > 0 else []

@@ -1,4 +1,4 @@
-"""Runs of a batch: a schedule, and tasks that a pool works on until every scene has ended."""
+"""Run a batch: schedule its scenes, and keep a pool busy until every scene has ended."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ BUSY_RETRY_SECONDS = 1.0  # until a scene that another run works on is tried aga
 
 @dataclass(frozen=True)
 class Schedule:
-    """The number of scenes that are compacted at once."""
+    """The number of scenes that are compacted at once, with their threads and memory."""
 
     jobs: int  # scenes at once; 0: as many as the cluster has processors for
     threads: int  # of each
@@ -41,10 +41,7 @@ class Schedule:
 
 
 def make_schedule(jobs: Sequence[Job], options: BatchOptions, *, processors: int | None = None) -> Schedule:
-    """Distribute scenes over processors, with one thread each if there are enough scenes.
-
-    Memory must do for the largest scenes, which may come together; ``processors`` are all without a number.
-    """
+    """Distribute scenes over processors (None: all), one thread each if enough, as many as memory allows."""
     processors = available_threads() if processors is None else processors
     threads = options.settings.threads
     if options.engine == "ray":
@@ -63,7 +60,7 @@ def make_schedule(jobs: Sequence[Job], options: BatchOptions, *, processors: int
 
 
 def free_memory() -> int | None:
-    """Return the bytes that a run may take by default: most of the free memory, or None."""
+    """Return most of the free memory in bytes, for a run to use by default; None if unknown."""
     with suppress(OSError, KeyError, ValueError), open("/proc/meminfo", encoding="ascii") as file:
         values = dict(line.split(":", 1) for line in file)
         return int(FREE_MEMORY_SHARE * int(values["MemAvailable"].split()[0]) * 1024)
@@ -75,22 +72,16 @@ def estimate_seconds(jobs: Sequence[Job], options: BatchOptions, schedule: Sched
     """Estimate the wall time of scenes, within a factor of about two."""
     total = 0.0
     for job in jobs:
-        views = max(1, _num_views(job))
+        views = 1  # where cameras cannot be read
+        with suppress(SceneError):
+            files = find_scene_files(Path(job.scene))
+            cameras = None if files.cameras is None else cameras_of(files.cameras, files.ply.stem)
+            views = max(1, len(cameras or ()))
         own = options.settings if job.work is None else job.work.settings
         settings, steps = resolved_settings(own, photos=True), resolve_fit(own).steps
         seconds = work_seconds(job.num_gaussians, job.num_gaussians / views, settings, photos=True, fit_steps=steps)
         total += seconds / min(schedule.threads, views)
     return IMPORT_SECONDS * bool(jobs) + total / max(1, min(schedule.jobs, len(jobs)))
-
-
-def _num_views(job: Job) -> int:
-    """Count the views of a scene's cameras; 1 where they cannot be read."""
-    try:
-        files = find_scene_files(Path(job.scene))
-    except SceneError:
-        return 1
-    cameras = None if files.cameras is None else cameras_of(files.cameras, files.ply.stem)
-    return 1 if cameras is None else len(cameras)
 
 
 def run_batch(
@@ -118,28 +109,32 @@ def run_batch(
         index.read_on()
     with ExitStack() as stack:
         stack.enter_context(run_lock(folder, options.name()))
-        pool, context = _pool(folder, options, schedule, index.end)
+        options = replace(options, settings=replace(options.settings, threads=schedule.threads))
+        pool: Pool
+        if options.engine == "ray":
+            context = BatchContext(folder.absolute(), with_whole_paths(options), index.end)
+            pool = RayPool(context, schedule.jobs)
+        else:
+            context = BatchContext(folder, options, index.end)
+            pool = LocalPool(context, schedule.jobs)
         stack.callback(pool.close)
         yield from dispatch((Task(job, index.known.get(job.output)) for job in jobs), pool, context)
 
 
-def _pool(folder: Path, options: BatchOptions, schedule: Schedule, start: int) -> tuple[Pool, BatchContext]:
-    """Make the pool for the engine, and the context that its tasks share."""
-    options = replace(options, settings=replace(options.settings, threads=schedule.threads))
-    if options.engine == "ray":
-        context = BatchContext(folder.absolute(), with_whole_paths(options), start)
-        return RayPool(context, schedule.jobs), context
-    context = BatchContext(folder, options, start)
-    return LocalPool(context, schedule.jobs), context
-
-
 def dispatch(tasks: Iterator[Task], pool: Pool, context: BatchContext) -> Iterator[dict[str, Any]]:
-    """Keep a pool busy until every scene has ended. SceneError if nothing can be recorded."""
+    """Keep a pool busy until every scene has ended; SceneError if nothing can be recorded."""
     retried: deque[Task] = deque()  # their process died
     busy: deque[tuple[float, Task]] = deque()  # another run works on them; when to try again, and the task
     active = 0
+
+    def next_task() -> Task | None:
+        task = retried.popleft() if retried else next(tasks, None)
+        if task is None and busy and busy[0][0] <= time.monotonic():
+            return busy.popleft()[1]
+        return task
+
     while True:
-        while pool.has_room and (task := _next(tasks, retried, busy)) is not None:
+        while pool.has_room and (task := next_task()) is not None:
             pool.submit(task)
             active += 1
         if not active and not busy:
@@ -160,13 +155,3 @@ def dispatch(tasks: Iterator[Task], pool: Pool, context: BatchContext) -> Iterat
                 raise SceneError(context.folder / RECORDS, f"the batch cannot go on: {outcome['error']}")
             else:
                 yield outcome
-
-
-def _next(tasks: Iterator[Task], retried: deque[Task], busy: deque[tuple[float, Task]]) -> Task | None:
-    """Choose the next task: a lost one, a new one, one that another run had, or None yet."""
-    if retried:
-        return retried.popleft()
-    task = next(tasks, None)
-    if task is None and busy and busy[0][0] <= time.monotonic():
-        return busy.popleft()[1]
-    return task

@@ -1,8 +1,6 @@
-"""One scene of a batch: skipped if it is done, otherwise compacted and recorded.
+"""Compact one scene of a batch, unless it is done, and record it.
 
-It is safe against a kill at any moment: locks end with the process that has them, however it ends.
-
-Locks on a scene and on the output folder end with the process that has them, however it ends.
+A kill is safe at any moment: locks on a scene and on the folder end with their process.
 """
 
 from __future__ import annotations
@@ -67,10 +65,10 @@ class BatchContext:
 
 
 def run_task(task: Task, context: BatchContext, new_records: RecordIndex) -> dict[str, Any]:
-    """Compact a scene, unless it is done, and return its record.
+    """Compact a scene, unless it is done, and return its record; ``new_records`` are those since the run began.
 
-    One that is not written has the ``status`` skipped, busy (another process has the scene), or stuck (records cannot
-    be written). ``new_records``, since the run began, are shared by the tasks of a process.
+    A record that is not written has the ``status`` skipped, busy (another process has the scene), or stuck (records
+    cannot be written).
     """
     job = task.job
 
@@ -151,7 +149,7 @@ def _key_of(job: Job, files: SceneFiles, options: BatchOptions) -> str:
 
 
 def scene_key(files: SceneFiles, options: BatchOptions) -> str:
-    """Return a digest of all that a result depends on: files, settings, version."""
+    """Digest everything that a result depends on: files, settings, version."""
     content: dict[str, Any] = {"scene": content_hash(read_files(files)), **options.result_settings()}
     checkpoint = Path(options.settings.checkpoint)
     if options.settings.checkpoint not in CHECKPOINTS and checkpoint.is_file():  # by its content, wherever it is
@@ -180,16 +178,13 @@ def record_failure(task: Task, context: BatchContext, error: str) -> dict[str, A
 
 
 def clean_up(task: Task, context: BatchContext) -> None:
-    """Remove the unfinished files of a scene whose process was ended on purpose.
-
-    Where that fails, the next run may.
-    """
+    """Remove the unfinished files of a scene whose process was ended on purpose; the next run may where that fails."""
     with suppress(BusyError, SceneError, OSError), scene_lock(context.folder, task.job.output) as begun:
         _clean(task.job, context, begun)
 
 
 def _clean(job: Job, context: BatchContext, begun: Path) -> None:
-    """Remove the files that a killed process left, except the mark of a result that is there."""
+    """Remove the files that a killed process left, except the mark of a finished result."""
     paths = [context.folder / name for name in result_names(job.output, context.options)]
     for folder in {path.parent for path in paths}:
         remove_stale(folder)
@@ -203,14 +198,9 @@ class BusyError(Exception):
 
 @contextmanager
 def scene_lock(folder: Path, output: str) -> Iterator[Path]:
-    """Keep other processes from a result while the block runs.
+    """Keep other processes from a result while the block runs; BusyError, or SceneError if the lock cannot be made.
 
-    Yields:
-        The file whose presence says that a batch has begun to write the result: one that was killed leaves it.
-
-    Raises:
-        BusyError: If another process works on the result.
-        SceneError: If the lock cannot be made.
+    Yields the file whose presence says that a batch has begun to write the result: a killed one leaves it.
     """
     name = hashlib.sha256(output.encode(errors="surrogateescape")).hexdigest()[:32]
     with _lock(folder / f"{PREFIX}{name}.lock"):
@@ -221,25 +211,28 @@ def scene_lock(folder: Path, output: str) -> Iterator[Path]:
 def run_lock(folder: Path, name: str) -> Iterator[None]:
     """Share the folder only with runs of the same :meth:`BatchOptions.name` in the block.
 
-    Raises:
-        UsageError: If a run of another name uses the folder.
-        SceneError: If the lock cannot be made.
+    UsageError if a run of another name uses the folder, SceneError if the lock cannot be made.
     """
     own = f"{PREFIX}{name[:32]}.{secrets.token_hex(4)}.{os.getpid()}.{socket.gethostname()}.run"
     with _lock(folder / own, RUN_TIMEOUT):  # before others are looked for: of two, one sees the other
         for path in folder.glob(f"{PREFIX}*.run"):
-            if path.name != own and _is_locked(path) and not path.name.startswith(f"{PREFIX}{name[:32]}."):
+            if path.name == own or path.name.startswith(f"{PREFIX}{name[:32]}."):
+                continue
+            try:
+                with _lock(path):
+                    continue
+            except BusyError:
                 *_, process, host = path.stem.removeprefix(PREFIX).split(".", 3)
                 raise UsageError(
                     f"{folder}: a batch with other settings is at work there (process {process} on {host}); wait for"
                     " it, or name another --output"
-                )
+                ) from None
         yield
 
 
 @contextmanager
 def _lock(path: Path, seconds: float = 0.0) -> Iterator[None]:
-    """Lock a file that is removed after the block. BusyError if another process keeps it."""
+    """Lock a file that is removed after the block; BusyError if another process keeps it."""
     lock = FileLock(path)
     try:
         lock.acquire(timeout=seconds)
@@ -252,11 +245,3 @@ def _lock(path: Path, seconds: float = 0.0) -> Iterator[None]:
     finally:
         path.unlink(missing_ok=True)  # before the release: who waits for it sees that the file is nobody's any more
         lock.release()
-
-
-def _is_locked(path: Path) -> bool:
-    try:
-        with _lock(path):
-            return False
-    except BusyError:
-        return True

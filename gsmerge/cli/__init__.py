@@ -1,4 +1,4 @@
-"""The command line: parse, call, print. Nothing heavy is imported before a command runs."""
+"""The command line, which parses, calls and prints; nothing heavy is imported before a command runs."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _open_streams() -> None:
-    """Make sure that stdout and stderr exist and take any character, as names of files may hold all of them."""
+    """Make sure that stdout and stderr exist and take any character, which names of files may have."""
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:  # closed by the caller
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - as long as the process

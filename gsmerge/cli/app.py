@@ -1,4 +1,4 @@
-"""The Typer application, and the one place that turns exceptions into a line and an exit code."""
+"""The Typer application; it turns exceptions into a line and an exit code."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def root(
 
 
 def _usage_message(error: Any) -> str:
-    """Describe wrong usage in one line, with the new way to give what is no option of its own any more."""
+    """Describe wrong usage in one line, with the way to give a setting that has no option of its own."""
     place = PROGRAM if error.ctx is None else error.ctx.command_path
     message = error.format_message().replace("Value error, ", "", 1).rstrip(".")  # a prefix of checks inside Typer
     if hasattr(error, "option_name") and error.ctx is not None:
@@ -90,7 +90,7 @@ def _usage_message(error: Any) -> str:
 
 
 def _suggest(option: str, parameters: Sequence[Any]) -> str | None:
-    """Say how to give a command a setting or a hint for which it has no option; None where it is neither."""
+    """Write how to give a command a setting or a hint for which it has no option; None where it is neither."""
     from gsmerge.cli.paths import FileOptions
     from gsmerge.options import CompactOptions
 
@@ -108,21 +108,14 @@ def _suggest(option: str, parameters: Sequence[Any]) -> str | None:
     return f"{option} is no option: use --set {positive}={value}"
 
 
-def _check_folder() -> None:
-    try:
-        os.getcwd()
-    except OSError as error:  # libraries fail in ways of their own where there is none
-        raise SceneError(os.curdir, f"the working directory cannot be used ({error.strerror})", "change it") from error
-
-
 _SOON = 0.02  # seconds after which a signal is raised again that came where it could not be handled
 
 
 @contextmanager
 def _orderly_stop(signals: list[signal.Signals]) -> Iterator[None]:
-    """Let SIGTERM and SIGHUP end a block as Ctrl-C does, so that nothing unfinished is left; list those that came.
+    """Let SIGTERM and SIGHUP end a block as Ctrl-C does, without unfinished files; list the signals that came.
 
-    What the caller has handled or ignored, as under nohup, stays so.
+    Signals that the caller has handled or ignored, as under nohup, stay so.
     """
 
     def again(number: int) -> None:
@@ -131,7 +124,8 @@ def _orderly_stop(signals: list[signal.Signals]) -> Iterator[None]:
         timer.start()
 
     def stop(number: int, _: object) -> None:
-        if _is_compiling():  # numba would keep its lock, for which other threads wait
+        numba = sys.modules.get("numba.core.compiler_lock")
+        if numba is not None and numba.global_compiler_lock.is_locked():  # it would keep its lock, others wait for it
             again(number)
             return
         if number != signal.SIGINT:
@@ -160,12 +154,6 @@ def _orderly_stop(signals: list[signal.Signals]) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _is_compiling() -> bool:
-    """Tell whether this thread compiles or loads a kernel; numba is not imported to find out."""
-    module = sys.modules.get("numba.core.compiler_lock")
-    return module is not None and bool(module.global_compiler_lock.is_locked())
-
-
 def run(args: Sequence[str] | None = None) -> int:
     """Run the application; every error becomes one line on stderr and an exit code."""
     given = list(sys.argv[1:] if args is None else args)
@@ -188,7 +176,11 @@ def run(args: Sequence[str] | None = None) -> int:
 
     try:
         with plain_warnings(), _orderly_stop(signals):
-            _check_folder()
+            try:
+                os.getcwd()
+            except OSError as error:  # libraries fail in ways of their own without a folder
+                reason = f"the working directory cannot be used ({error.strerror})"
+                raise SceneError(os.curdir, reason, "change it") from error
             app = make_app(words[0] if known else None)
             code = app(args=words, prog_name=PROGRAM, standalone_mode=False) or 0
             with suppress(BrokenPipeError):  # whoever read our output has seen enough

@@ -1,4 +1,4 @@
-"""A scene, its compact versions and held-out views, for the commands that compare or measure them."""
+"""Read a scene, its compact versions and unseen views, for the commands that compare or measure them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SAME = 1e-5  # difference of two poses, of 1 and of their numbers, that writing 
 
 
 def lpips_networks(choice: str | None) -> tuple[tuple[str, ...], list[str]]:
-    """Choose the networks of ``--lpips``; without that option those that are installed, with a note where none is."""
+    """Choose the networks of ``--lpips``, or those that are installed, with a note where none is."""
     from gsmerge.measure.evaluate import NETS
     from gsmerge.measure.lpips import INSTALL, lpips_available
 
@@ -34,32 +34,23 @@ def lpips_networks(choice: str | None) -> tuple[tuple[str, ...], list[str]]:
 
 @dataclass(frozen=True)
 class BeforeAfter:
-    """A scene and its compact versions, as commands compare them.
+    """A scene and its compact versions, as commands compare them."""
 
-    Args:
-        load: The scene as it was read.
-        scene: The same with views: placed ones where it has none.
-        held_out: Views that were no input.
-        plys: The compact versions by name.
-        cameras: Those of the input views, by name of a version that was made with others than the scene's.
-        notes: What was adapted, one sentence each.
-    """
-
-    load: SceneLoad
-    scene: Scene
-    held_out: Views | None
-    plys: dict[str, PlyScene]
-    cameras: dict[str, Cameras]
-    notes: list[str]
+    load: SceneLoad  # the scene as it was read
+    scene: Scene  # the same with views: placed ones where it has none
+    held_out: Views | None  # views that were no input
+    plys: dict[str, PlyScene]  # the compact versions by name
+    cameras: dict[str, Cameras]  # of the input views, by name of a version that was made with others than the scene's
+    notes: list[str]  # what was adapted, one sentence each
 
     @property
     def gaussians(self) -> dict[str, Gaussians]:
-        """The Gaussians of the compact versions."""
+        """Gaussians of the compact versions by name."""
         return {name: ply.gaussians for name, ply in self.plys.items()}
 
 
 def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
-    """Read what the arguments BEFORE, whose files are given, and AFTER name, and the views of ``--targets``."""
+    """Read the scenes that BEFORE (``files``) and AFTER name, and the views of ``--targets``."""
     from gsmerge.io import read_gaussians
     from gsmerge.runtime.record import record_run
     from gsmerge.stages.place_cameras import add_views
@@ -79,7 +70,7 @@ def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
 
 
 def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras], list[str]]:
-    """Read the cameras that ``compact`` wrote beside results where it had moved them, by result; and notes."""
+    """Read the moved cameras that ``compact`` wrote beside results, by result; with notes."""
     import numpy as np
 
     from gsmerge.io.cameras.json_files import viewer_cameras_path
@@ -103,7 +94,7 @@ def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras]
 
 
 def require_views(load: SceneLoad) -> None:
-    """Refuse a scene without cameras."""
+    """Raise a SceneError for a scene without cameras."""
     if len(load.scene) == 0:
         problem = "expected cameras to measure from, found none beside it"
         raise SceneError(load.files.ply, problem, "name them with --cameras")
@@ -112,7 +103,7 @@ def require_views(load: SceneLoad) -> None:
 def held_out_views(
     load: SceneLoad, targets: Path | None, target_images: Path | None, views: int | None
 ) -> tuple[Scene, Views | None, tuple[str, ...]]:
-    """Choose the context views of ``--views`` and the held-out views; return the scene, those, and notes about them."""
+    """Choose the context views of ``--views`` and the unseen views; return the scene, the views, and notes."""
     from gsmerge.io import read_held_out
     from gsmerge.views import even_views, midpoint_views, subset
 
@@ -137,7 +128,7 @@ def held_out_views(
 
 
 def file_names(paths: Sequence[Path]) -> list[str]:
-    """Name each file: by its own name where no two are alike, otherwise by its path; none may be given twice."""
+    """Name each file by its own name where no two are alike, otherwise by its path; UsageError on repetitions."""
     if len(set(paths)) < len(paths):
         raise UsageError(f"expected every result once, got {max(paths, key=paths.count)} twice")
     short = [path.name for path in paths]

@@ -83,7 +83,7 @@ def compact(args: opt.Args) -> None:
 
 
 def _warn_of_memory(files: SceneFiles, *, quiet: bool) -> None:
-    """Warn before anything is read if the scene is not likely to fit into this machine's memory."""
+    """Warn before anything is read if the scene is not likely to fit into memory."""
     from gsmerge.io.formats.ply_file import header_counts
     from gsmerge.runtime.estimate import memory_bytes, memory_problem
 
@@ -94,7 +94,7 @@ def _warn_of_memory(files: SceneFiles, *, quiet: bool) -> None:
 
 
 def print_plan(args: opt.Args, files: SceneFiles, settings: CompactOptions, out: Path, hints: ReadHints) -> None:
-    """Print what compact or encode would make of a scene, as ``gsmerge inspect`` does, with the settings given."""
+    """Print an estimate of what compact or encode would make of a scene."""
     from gsmerge.baselines import choose_baseline
     from gsmerge.compact_file import check_saved_cameras, read_input
     from gsmerge.gpu import choose_backend

@@ -1,4 +1,4 @@
-"""What the command line says on stderr: status lines, progress bars, warnings. Data goes to stdout."""
+"""Print status lines, progress bars and warnings on stderr, and data on stdout."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ MAX_LINE = 5000  # characters
 
 
 def one_line(text: str) -> str:
-    """Make text from files or names one line that does nothing to a terminal: escape what cannot be printed."""
+    """Escape what a terminal cannot print in text from files or names, and shorten it to one line."""
     clean = text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
     return clean if len(clean) <= MAX_LINE else f"{clean[: MAX_LINE // 2]} ... {clean[-MAX_LINE // 2 :]}"
 
 
 def say(message: str, *, quiet: bool = False) -> None:
-    """Print one status line on stderr unless ``quiet``; that nobody can read it is no reason to stop."""
+    """Print one status line on stderr unless ``quiet``; a closed stderr is no reason to stop."""
     if not quiet:
         with suppress(OSError):
             print(one_line(message), file=sys.stderr, flush=True)
@@ -39,15 +39,12 @@ def say_notes(notes: Sequence[str], *, quiet: bool = False) -> None:
 
 
 def _columns(stream: Any) -> int | None:
-    """Return the width of the terminal that a stream goes to; None where it goes to none."""
+    """Return the width of a stream's terminal; None where it has none."""
     return shutil.get_terminal_size().columns if stream.isatty() else None
 
 
 def wrap_line(line: str, columns: int | None) -> list[str]:
-    """Break a line between words into pieces of at most so many columns, the further ones below its first value.
-
-    Words longer than that, such as paths, stay whole. ``columns`` None: one piece.
-    """
+    """Break a line between words at ``columns`` (None: not at all), with further lines below its first value."""
     if columns is None or len(line) <= columns:
         return [line]
     label = re.match(r" *\S+(?: \S+)?  +|note: ", line)
@@ -58,10 +55,7 @@ def wrap_line(line: str, columns: int | None) -> list[str]:
 def print_document(
     document: Mapping[str, Any], lines: Sequence[str] | str, *, as_json: bool, quiet: bool = False, wrap: bool = False
 ) -> None:
-    """Print the result of a command on stdout: the document as JSON, or lines for people unless ``quiet``.
-
-    ``wrap``: break them between words where a terminal is narrower.
-    """
+    """Print a result on stdout: as JSON, or as lines for people unless ``quiet``; ``wrap`` fits them to a terminal."""
     from gsmerge.report import to_json
 
     if as_json:
@@ -86,14 +80,10 @@ def plain_warnings() -> Iterator[None]:
 
 @contextmanager
 def announce_compilation(*, quiet: bool, share: bool = False) -> Iterator[Callable[[], None]]:
-    """Say so, once in a block, when a kernel has to be compiled (in the first run after installation).
+    """Print a line, once in a block, when a kernel has to be compiled (in the first run after installation).
 
-    Args:
-        quiet: Say nothing.
-        share: Let a second process compile the kernels of the fit in the meantime.
-
-    Yields:
-        What waits for the second process; to be called before the fit, which would compile the same again.
+    With ``share`` a second process compiles the kernels of the fit in the meantime. Yields a function that waits
+    for it, to be called before the fit.
     """
     from gsmerge.kernels.compilation import watch_compilation
 
@@ -132,13 +122,10 @@ def _terminal(*, quiet: bool) -> Any:
 
 @contextmanager
 def stage_progress(*, quiet: bool) -> Iterator[Progress]:
-    """Show a progress bar per stage on stderr, unless quiet or where stderr is no terminal.
+    """Show a progress bar per stage on stderr, unless quiet or without a terminal (``FORCE_COLOR`` makes one).
 
-    A stage is done when the next one begins. ``FORCE_COLOR`` in the environment makes anything a terminal.
-
-    Yields:
-        ``(stage, done, total) -> None``; a stage of :data:`gsmerge.runtime.record.STAGES` without a detail counts no
-        steps of its own.
+    Yields ``(stage, done, total) -> None``. A stage is done when the next one begins; one of
+    :data:`gsmerge.runtime.record.STAGES` without a detail counts no steps of its own.
     """
     console = _terminal(quiet=quiet)
     if console is None:
@@ -180,10 +167,9 @@ def stage_progress(*, quiet: bool) -> Iterator[Progress]:
 
 @contextmanager
 def total_progress(total: int, *, quiet: bool) -> Iterator[Progress]:
-    """Show one bar for many runs on stderr: done of total, time left; a line per run where there is no terminal.
+    """Show one bar for many runs on stderr: done of total, time left; a line per run without a terminal.
 
-    Yields:
-        ``(text, done, total) -> None``.
+    Yields ``(text, done, total) -> None``.
     """
     console = _terminal(quiet=quiet)
     if console is None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from time import perf_counter
@@ -81,8 +81,12 @@ def decode(args: opt.Args) -> None:
         if not all(np.isfinite(getattr(decoded.gaussians, name)).all() for name in ("means", "scales", "quats")):
             raise SceneError(path, "expected Gaussians of finite numbers, found others", "encode the scene again")
         done, ending = perf_counter(), output_format(out)
+        source = stored.about.get("source")
+        texts = source.get("comments") if isinstance(source, dict) else None
+        lines = [line for line in texts if isinstance(line, str)] if isinstance(texts, list) else []
+        comments = [line for line in lines if line.isascii() and line.isprintable()]  # compact copies them too
         write_gaussians(
-            temporary, decoded.gaussians, overwrite=True, comments=_comments(stored.about), ending=ending,
+            temporary, decoded.gaussians, overwrite=True, comments=comments, ending=ending,
             normals=writing.normals, spz_version=writing.spz_version,
         )  # fmt: skip
     seconds = {"import": imported - start, "read": read - imported, "decode": done - read}
@@ -96,14 +100,6 @@ def decode(args: opt.Args) -> None:
     }
     say_notes(document["notes"], quiet=args.silent)
     print_document(document, _summary(document), as_json=args.json, quiet=args.quiet)
-
-
-def _comments(about: Mapping[str, Any]) -> Sequence[str]:
-    """Return the comments in the header of the scene's file, which compact copies too."""
-    source = about.get("source")
-    comments = source.get("comments") if isinstance(source, dict) else None
-    lines = [line for line in comments if isinstance(line, str)] if isinstance(comments, list) else []
-    return [line for line in lines if line.isascii() and line.isprintable()]
 
 
 def _summary(document: Mapping[str, Any]) -> str:

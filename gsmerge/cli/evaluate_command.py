@@ -15,7 +15,7 @@ from gsmerge.cli.paths import check_outputs, input_files, write_texts
 from gsmerge.errors import SceneError, UsageError
 
 if TYPE_CHECKING:
-    from gsmerge.io import PlyInfo, PlyScene
+    from gsmerge.io import PlyScene
     from gsmerge.types import Cameras
 
 OUTSIDE = 0.03  # share of a result's Gaussians beyond all of its own views: what merging and a fit move there
@@ -84,7 +84,10 @@ def evaluate(args: opt.Args) -> None:
             raise UsageError(f"{path}: expected a name that ends in {', '.join(SUFFIXES)}")
     inputs = (*input_files(files), *args.after, args.targets, args.target_images)
     check_outputs(outputs, inputs, overwrite=args.overwrite)
-    seconds = _merge_seconds(args.merge_seconds or [], args.after)
+    makings = args.merge_seconds or []
+    if makings and len(makings) != len(args.after):
+        raise UsageError(f"--merge-seconds: expected that of each of {len(args.after)} AFTER, got {len(makings)}")
+    seconds = [_seconds_of(text) for text in makings]
     nets, missing = lpips_networks(args.lpips)
     with opt.usage_errors():
         options = EvaluateOptions(
@@ -108,29 +111,21 @@ def evaluate(args: opt.Args) -> None:
 
 
 def _facts(args: opt.Args, given: BeforeAfter, seconds: Mapping[str, float]) -> dict[str, dict[str, Any]]:
-    """Collect what is known of each file by name, with the costs of drawing it where they are asked for."""
+    """Collect the facts of each file by name, with the costs of drawing it where they are asked for."""
     from gsmerge.measure.evaluate import INPUT, near_plane
     from gsmerge.measure.speed import measure_costs
 
     infos = {INPUT: given.load.ply, **{name: ply.info for name, ply in given.plys.items()}}
-    facts = {name: _file(info) for name, info in infos.items()}
+    facts: dict[str, dict[str, Any]] = {
+        name: {"path": info.path, "bytes": info.file_bytes, "bytes_by_attribute": info.bytes_by_attribute}
+        for name, info in infos.items()
+    }
     if args.speed or args.merge_seconds:
         scenes = {INPUT: given.scene.file_gaussians, **given.gaussians}
         zooms, near = args.zoom or SPEED_ZOOMS, near_plane(given.scene)
         costs = measure_costs(scenes, given.scene.cameras, zooms, near, merge_seconds=seconds, threads=args.threads)
         facts = {name: facts[name] | costs[name] for name in facts}
     return facts
-
-
-def _file(info: PlyInfo) -> dict[str, Any]:
-    return {"path": info.path, "bytes": info.file_bytes, "bytes_by_attribute": info.bytes_by_attribute}
-
-
-def _merge_seconds(given: Sequence[str], after: Sequence[Path]) -> list[float]:
-    """Read the seconds that making each result took; empty where not given."""
-    if given and len(given) != len(after):
-        raise UsageError(f"--merge-seconds: expected that of each of {len(after)} AFTER, got {len(given)}")
-    return [_seconds_of(text) for text in given]
 
 
 def _seconds_of(text: str) -> float:
@@ -147,7 +142,7 @@ def _seconds_of(text: str) -> float:
 
 
 def _more_views(name: str, ply: PlyScene, cameras: Cameras) -> str:
-    """Say what is known of a result that is measured as one of some views, but may be made of all."""
+    """Write what is known of a result that is measured as one of some views, but may be made of all."""
     from gsmerge.measure.visibility import share_outside
 
     views, outside = len(cameras), share_outside(ply.gaussians[ply.valid], cameras)
@@ -160,7 +155,7 @@ def _more_views(name: str, ply: PlyScene, cameras: Cameras) -> str:
 
 
 def _write(outputs: Sequence[Path], document: Mapping[str, Any], given: BeforeAfter, *, overwrite: bool) -> None:
-    """Write the files, each in the format that its name asks for."""
+    """Write the files, each in the format of its ending."""
     from gsmerge.measure.scores import evaluation_csv, evaluation_markdown
     from gsmerge.report import to_json
 

@@ -1,9 +1,9 @@
-"""The options of the command line, each declared once, and how a command gets them.
+"""Declare the options of the command line, each once, and make settings of them.
 
 A command is a function of one :class:`Args`; :func:`command` lists its parameters for Typer: names of options
-declared here, and its own. An option that is a setting of the library carries the setting's name and no default: None
-leaves the library's own. What help says about that default and the possible values is compared with the library by
-``tests/contract/test_options.py``: the library's classes load torch, which ``--help`` must not.
+declared here, and its own. An option that is a setting of the library carries the setting's name and no default.
+The defaults and values in help are compared with the library by ``tests/contract/test_options.py``: the library's
+classes load torch, which ``--help`` must not.
 """
 
 from __future__ import annotations
@@ -54,31 +54,30 @@ class Args(SimpleNamespace):
 
     @property
     def silent(self) -> bool:
-        """Whether nothing but data may be printed."""
+        """Whether only data may be printed."""
         return bool(self.quiet or self.json)
 
     def given(self, names: Iterable[str]) -> dict[str, Any]:
-        """Return those of the named options that were given."""
+        """Return the named options that were given."""
         values = vars(self)
         return {name: values[name] for name in names if values.get(name) is not None}
 
     def make(self, *kinds: type, **changes: Any) -> list[Any]:
-        """Make settings of each kind, from options of their own and from ``--set``.
+        """Make settings of each dataclass of ``kinds``, from options of their own and from ``--set``.
 
-        Args:
-            kinds: Dataclasses of settings; ``--set`` takes the names of all of them.
-            changes: Values that the user has no say in.
-
-        Raises:
-            UsageError: If a name is unknown or given twice, or a value is out of range.
+        ``changes`` are values that the user cannot choose. UsageError if a name is unknown or given twice, or a
+        value is out of range.
         """
         values = self.values(*kinds, but=changes) | changes
         own = [{name: values[name] for name in setting_kinds(kind) if name in values} for kind in kinds]
         with usage_errors():
-            return [_make(kind, some) for kind, some in zip(kinds, own, strict=True)]
+            return [
+                kind().with_settings(some) if hasattr(kind, "with_settings") else kind(**some)
+                for kind, some in zip(kinds, own, strict=True)
+            ]
 
     def values(self, *kinds: type, but: Collection[str] = ()) -> dict[str, Any]:
-        """Collect the settings of these kinds that were given, by flat name; ``but`` some are not known here."""
+        """Collect the settings of these kinds that were given, by flat name, without the names in ``but``."""
         known = {name: kind for one in kinds for name, kind in setting_kinds(one).items() if name not in but}
         own = self.given(known)
         chosen = parse_pairs("--set", vars(self).get("set") or (), known)
@@ -87,7 +86,7 @@ class Args(SimpleNamespace):
         return own | chosen
 
     def settings(self, **changes: Any) -> CompactOptions:
-        """Make the library's options of those that were given, as :meth:`make` does."""
+        """Make the library's options, as :meth:`make` does."""
         from gsmerge.options import CompactOptions
 
         made: CompactOptions = self.make(CompactOptions, **changes)[0]
@@ -95,16 +94,12 @@ class Args(SimpleNamespace):
 
     @property
     def opacity(self) -> OpacityChoice:
-        """How the file stores opacity."""
+        """Storage of opacities in the file, from ``--hint``."""
         choice: OpacityChoice = self._parse_hints().get("opacity", "auto")
         return choice
 
     def hints(self) -> ReadHints:
-        """Make the hints on how to read the scene.
-
-        Raises:
-            UsageError: If a name is unknown, or a value is none of the possible ones.
-        """
+        """Make the hints on how to read the scene; UsageError if a name or a value is unknown."""
         from gsmerge.io import ReadHints
         from gsmerge.io.exporters import find_exporter
 
@@ -120,7 +115,7 @@ class Args(SimpleNamespace):
         return parse_pairs("--hint", self.hint or (), setting_kinds(ReadHints) | {"opacity": OpacityChoice})
 
     def files(self, scene: Path) -> SceneFiles:
-        """Find the scene's .ply, its cameras and its photos: those named, or those beside it."""
+        """Find the scene's .ply, its cameras and its photos: the named ones, or those beside it."""
         from gsmerge.io import find_scene_files
 
         return find_scene_files(scene, cameras=self.cameras, images=vars(self).get("images"))
@@ -132,12 +127,8 @@ class Args(SimpleNamespace):
         return load_files(files, opacity=self.opacity, hints=self.hints())
 
 
-def _make(options: Any, values: dict[str, Any]) -> Any:
-    return options().with_settings(values) if hasattr(options, "with_settings") else options(**values)
-
-
 def setting_kinds(options: Any) -> dict[str, Any]:
-    """List the settings of a dataclass by flat name, with the type of each; those of a stage stand in its place."""
+    """List the settings of a dataclass by flat name with their types; a stage's own settings replace the stage."""
     hints, kinds = get_type_hints(options), dict[str, Any]()
     for field in fields(options):
         kind = hints[field.name]
@@ -147,10 +138,8 @@ def setting_kinds(options: Any) -> dict[str, Any]:
 
 
 def parse_pairs(flag: str, pairs: Iterable[str], kinds: Mapping[str, Any]) -> dict[str, Any]:
-    """Parse the NAME=VALUE of ``--set`` or ``--hint``: JSON where that is what the setting takes, text otherwise.
-
-    Raises:
-        UsageError: If a name is unknown or given twice, or a value is of another type.
+    """Parse the NAME=VALUE of ``--set`` or ``--hint``, as JSON where that fits; UsageError on an unknown name or
+    value.
     """
     values: dict[str, Any] = {}
     for pair in pairs:
@@ -174,7 +163,7 @@ def parse_pairs(flag: str, pairs: Iterable[str], kinds: Mapping[str, Any]) -> di
 
 
 def _fits(value: Any, kind: Any) -> bool:
-    """Tell whether a value is of a type, which may be a union or a list of literals."""
+    """Return whether a value is of a type, which may be a union or a list of literals."""
     if get_origin(kind) is Literal:
         return value in get_args(kind)
     if get_args(kind):
@@ -185,7 +174,7 @@ def _fits(value: Any, kind: Any) -> bool:
 
 
 def words_for(kind: Any) -> str:
-    """Describe the values of a type: possible words, or what they are."""
+    """Describe the values of a type: possible words, or a kind of value."""
     plain = {int: "a whole number", float: "a number", bool: "true or false", str: "text", type(None): "null"}
     words: list[str] = []
     for one in [kind] if get_origin(kind) is tuple else get_args(kind) or [kind]:
@@ -264,12 +253,7 @@ def _escape(help: str) -> str:
 
 
 def command(*parameters: str | Parameter, rare: str = "") -> Callable[[Callable[[Args], None]], Callable[..., None]]:
-    """Give a command its parameters, in the order of help.
-
-    Args:
-        parameters: Names of declared options with spaces between, and parameters of the command alone.
-        rare: Names of those that only ``--help-all`` shows.
-    """
+    """Give a command its parameters in the order of help; ``rare`` names are shown by ``--help-all`` alone."""
     listed: dict[str, Parameter] = {}
     for given in (*parameters, "json quiet", *(["help_all"] if rare else [])):
         for name in given.split() if isinstance(given, str) else [given.name]:

@@ -1,4 +1,4 @@
-"""Where a command reads from and writes to, checked before any work is done."""
+"""Check where a command reads from and writes to, before any work is done."""
 
 from __future__ import annotations
 
@@ -48,9 +48,7 @@ def default_output(ply: Path) -> Path:
 def check_format(output: Path, options: FileOptions, budget: BudgetOptions | None = None) -> None:
     """Refuse an output in a format that cannot be written, or that the options or a budget in bytes do not fit.
 
-    Raises:
-        UsageError: If its name ends as no known format does, or what that needs is not installed; if a version of
-            ``.spz`` is given for another format, or a size for a format of unknown size.
+    UsageError for an unknown ending, a missing package, a version of ``.spz`` or a size in bytes for another format.
     """
     from gsmerge.io import output_format
 
@@ -62,11 +60,9 @@ def check_format(output: Path, options: FileOptions, budget: BudgetOptions | Non
 
 
 def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None], *, overwrite: bool) -> None:
-    """Refuse an output file that is one of the inputs, that exists, whose folder does not, or that is named twice.
+    """Refuse an output file that is an input, exists without ``overwrite``, is named twice, or has no folder.
 
-    Args:
-        inputs: Files that are read, and folders of photos: no photo is replaced.
-        overwrite: Whether the files may exist.
+    ``inputs`` are files that are read, and folders of photos: no photo is replaced.
     """
     from gsmerge.io.cameras.read import find_cameras
 
@@ -83,6 +79,8 @@ def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None],
 
 
 def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
+    from gsmerge.io.photo_files import IMAGE_SUFFIXES
+
     try:
         os.lstat(output)
     except FileNotFoundError:
@@ -93,18 +91,13 @@ def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
     if output.is_dir():
         raise UsageError(f"{output}: expected a file to write, found a folder; name a file in it")
     target = Path(os.path.realpath(output))
-    if not inputs.isdisjoint((str(target), str(target.parent if _is_photo(target) else target))):
+    is_photo = target.suffix.lower() in IMAGE_SUFFIXES and target.exists()
+    if str(target) in inputs or (is_photo and str(target.parent) in inputs):
         raise UsageError(f"{output}: expected an output other than the input; name another file with --output")
     if os.path.lexists(output) and not overwrite:
         raise UsageError(f"{output}: exists already; pass --overwrite to replace it, or name another with --output")
     if not output.parent.is_dir():
         raise SceneError(output, f"expected a folder to write to, found no {output.parent}", "make it first")
-
-
-def _is_photo(path: Path) -> bool:
-    from gsmerge.io.photo_files import IMAGE_SUFFIXES
-
-    return path.suffix.lower() in IMAGE_SUFFIXES and path.exists()
 
 
 def input_files(files: SceneFiles) -> tuple[Path, ...]:

@@ -167,10 +167,9 @@ def _frame_files(args: opt.Args, files: SceneFiles) -> SceneFiles:
     from gsmerge.io import find_scene_files
 
     source = args.frame_of or source_of(files.ply)
-    like = files
-    if source is not None:
-        like = find_scene_files(source, cameras=args.cameras or files.cameras, images=args.images)
-    return like
+    if source is None:
+        return files
+    return find_scene_files(source, cameras=args.cameras or files.cameras, images=args.images)
 
 
 def _read(
@@ -200,11 +199,7 @@ def _read(
 
 
 def picture_stems(names: Sequence[str]) -> list[str]:
-    """Choose a file name without extension for every view, each of its own.
-
-    The image's own name where that tells the views apart, else its path with ``_`` between the folders, else the
-    number of the view.
-    """
+    """Choose a different file name per view: the image's name, its path joined by ``_``, or the view's number."""
     from gsmerge.io.photo_files import IMAGE_SUFFIXES
 
     paths = []

@@ -75,16 +75,10 @@ def train(args: opt.Args) -> None:
 
 
 def find_training_scenes(given: Sequence[Path], out: Path, apart: Collection[Path] = ()) -> list[Path]:
-    """Find the named scenes, and those in the named folders, each once.
+    """Find the scenes in ``given`` files and folders, each once; the folder ``out`` of the run is not searched.
 
-    Args:
-        given: Scenes, and folders with scenes, as ``gsmerge batch`` finds them.
-        out: Folder of the run, in which no scenes are looked for.
-        apart: Scenes for validation: left out where a folder holds them, kept where they are named.
-
-    Raises:
-        SceneError: If something named does not exist or holds no scene.
-        UsageError: If no scene is left.
+    Scenes of ``apart``, for validation, are left out where a folder holds them, and kept where they are named.
+    SceneError if a path does not exist or has no scene, UsageError if no scene is left.
     """
     from gsmerge.batch.find import find_scenes
     from gsmerge.errors import UsageError

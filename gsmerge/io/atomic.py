@@ -1,8 +1,7 @@
 """Write files that are either complete or not there, one or several together.
 
-Each is written under another name beside its place. When all are written and on the disk, all are renamed. The
-other name has the process that writes the file and its machine, so that a later one can remove the rest of a killed
-one.
+Each is written under another name beside its place. When all are written and on the disk, all are renamed. The other
+name has the process that writes the file and its machine, so that a later one can remove the rest of a killed one.
 """
 
 from __future__ import annotations

@@ -32,9 +32,7 @@ def read_errors(path: StrPath) -> Iterator[None]:
 
 
 def check_file(path: Path) -> int:
-    """Return the size of a file in bytes; SceneError if it is missing, a folder, a pipe or a
-    device.
-    """
+    """Return the size of a file in bytes; SceneError if it is missing, a folder, a pipe or a device."""
     try:
         status = os.stat(path)
     except (OSError, ValueError) as error:

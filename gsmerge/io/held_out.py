@@ -113,8 +113,12 @@ def _find_world(camera_file: CameraFile, named: dict[int, int], load: SceneLoad)
     ours = load.scene.cameras.viewmats[list(named.values())]
     frames = [stored] + [fit_similarity(theirs, ours, stored.scale)] * (len(named) >= _MIN_SHARED)
     for frame in frames:
-        angle, shift = _disagreement(frame.move_viewmats(theirs), ours)
-        if angle <= _MAX_ANGLE and shift <= _MAX_SHIFT:
+        moved, centres = frame.move_viewmats(theirs), _centres(ours)
+        cosines = (np.einsum("nij,nij->n", moved[:, :3, :3], ours[:, :3, :3]) - 1) / 2
+        distance = np.linalg.norm(_centres(moved) - centres, axis=1).max()
+        spread = float(np.linalg.norm(np.ptp(centres, axis=0))) or 1.0
+        angle = np.degrees(np.arccos(cosines.clip(-1, 1))).max()
+        if angle <= _MAX_ANGLE and distance / spread <= _MAX_SHIFT:
             return frame, dict(named)
     return stored, {}
 
@@ -137,15 +141,6 @@ def fit_similarity(theirs: np.ndarray, ours: np.ndarray, scale: float = 1.0) -> 
 
 def _centres(viewmats: np.ndarray) -> np.ndarray:
     return -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
-
-
-def _disagreement(moved: np.ndarray, ours: np.ndarray) -> tuple[float, float]:
-    """Measure the largest angle (degrees) and distance (over the spread of the views) between two sets of poses."""
-    cosines = (np.einsum("nij,nij->n", moved[:, :3, :3], ours[:, :3, :3]) - 1) / 2
-    centres = _centres(ours)
-    distance = np.linalg.norm(_centres(moved) - centres, axis=1).max()
-    spread = float(np.linalg.norm(np.ptp(centres, axis=0))) or 1.0
-    return float(np.degrees(np.arccos(cosines.clip(-1, 1))).max()), float(distance / spread)
 
 
 def _repeated(moved: np.ndarray, scene: Scene) -> dict[int, int]:

@@ -281,6 +281,15 @@ def _png_pixels(data: np.ndarray) -> np.ndarray | None:
     return None
 
 
+def encode_mask(mask: np.ndarray, color: Sequence[int]) -> bytes:
+    """Encode ``mask [h,w]`` as a PNG of one bit a pixel: ``color`` (sRGB, 0 to 255) where True, else transparent."""
+    image = Image.fromarray(mask.astype(np.uint8)).convert("P")
+    image.putpalette([0, 0, 0, *color])
+    content = io.BytesIO()
+    image.save(content, "PNG", bits=1, transparency=0, optimize=True)
+    return content.getvalue()
+
+
 @dataclass(frozen=True)
 class PhotoTransform:
     """A resize and then a crop to ``width`` x ``height``: ``u' = scale_x u - left``, ``v' = scale_y v - top``."""

@@ -177,6 +177,12 @@ def align_scene(
     order = known if hints.order == "auto" else hints.order
     pinholes, pictures, notes = as_pinholes(camera_file, stored_photos(files, camera_file) if photos else None)
     limited, smaller = limit_photo_size(pictures, len(ply.gaussians), hints.max_side, unaligned=order == "none")
+
+    def read_frames() -> list[Similarity]:
+        path = find_dataparser(files)
+        frames = [] if path is None else read_dataparser(path, files.cameras)
+        return [replace(frame, description=f"moved into the Gaussians' frame by {DATAPARSER}") for frame in frames]
+
     result = align(
         ply,
         pinholes,
@@ -184,7 +190,7 @@ def align_scene(
         order=order,
         scale=hints.scene_scale,
         depths=partial(read_depths, Path(camera_file.path)),
-        frames=partial(_read_frames, files),
+        frames=read_frames,
     )
     notes += [*smaller, *result.notes]
     if result.pixel_ids is None:
@@ -194,13 +200,6 @@ def align_scene(
     size = photo_size(limited)
     large = find_large_photos(files, camera_file, pictures, size, result.transform, result.cameras)
     return _make_load(ply, files, hints, result, notes, large)
-
-
-def _read_frames(files: SceneFiles) -> list[Similarity]:
-    """Read the frames in which nerfstudio's cameras may see the Gaussians, where it left a file about it."""
-    path = find_dataparser(files)
-    frames = [] if path is None else read_dataparser(path, files.cameras)
-    return [replace(frame, description=f"moved into the Gaussians' frame by {DATAPARSER}") for frame in frames]
 
 
 def _make_load(
@@ -264,7 +263,12 @@ def _place_rows(
     padding.
     """
     if result.pixel_ids is None:
-        keep = ply.valid & ~_is_padding(ply.gaussians)
+        gaussians, padding = ply.gaussians, np.zeros(len(ply.valid), bool)
+        rows = np.flatnonzero((gaussians.means == 0).all(1))
+        if len(rows) >= _MIN_PADDING:  # equal rows at the origin, with which VolSplat pads its files
+            shape = np.concatenate([gaussians.scales, gaussians.opacities[:, None], gaussians.sh0[:, 0]], 1)[rows]
+            padding[rows[(shape == lower_median(shape)).all(1)]] = True
+        keep = ply.valid & ~padding
         count = int(ply.valid.sum()) - int(keep.sum())
         notes = [f"{count:,} rows that only fill the file up are left out"] if count else []
         return ply.gaussians[keep], None, None, notes
@@ -285,17 +289,6 @@ def _place_rows(
         values[missing] = 0
     out.quats[missing] = (1, 0, 0, 0)
     return out, grid_ids(valid), missing.reshape(grid), []
-
-
-def _is_padding(gaussians: Gaussians) -> np.ndarray:
-    """Find rows ``[n]`` at the very origin that are all alike, with which VolSplat pads its files."""
-    rows = np.flatnonzero((gaussians.means == 0).all(1))
-    padding = np.zeros(len(gaussians), bool)
-    if len(rows) < _MIN_PADDING:
-        return padding
-    shape = np.concatenate([gaussians.scales, gaussians.opacities[:, None], gaussians.sh0[:, 0]], 1)[rows]
-    padding[rows[(shape == lower_median(shape)).all(1)]] = True
-    return padding
 
 
 def _with_rotations(scene: Scene, hints: ReadHints, exporters: Sequence[Exporter]) -> tuple[Scene, list[str]]:

@@ -1,8 +1,8 @@
-"""What the page of a scene before and after shows: stills, cameras, scores, and Gaussians for the browser."""
+"""Collect the content of the page of a scene before and after: stills, cameras, scores, Gaussians."""
 
 from __future__ import annotations
 
-import struct
+import gzip
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,18 +12,23 @@ import cv2
 import numpy as np
 
 from gsmerge.geometry import project
+from gsmerge.io.formats import spz
+from gsmerge.io.photo_files import encode_mask
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Progress, Quality, ResultScores, evaluate
 from gsmerge.measure.preview import BORDER_COLOR, Picture, borders, to_picture
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.prepare import scene_frame
 from gsmerge.stages.superpixels import SegmentOptions, segment
 from gsmerge.types import Cameras, Gaussians, Scene, Views
-from gsmerge.view.splats import MAX_GAUSSIANS, highest_degree, pack_splats
 from gsmerge.views import even_views
 
 MAX_VIEWS = 32  # of more, some at equal intervals: each takes up to 300 kB
 WEBP_QUALITY = 90  # stills are within 1 dB of the scores of lossless ones
 OUTLINE_SIDE = 1280  # pixels of the longer side of superpixels' outlines, at most
+MAX_GAUSSIANS = 2_000_000  # more take a browser too long to load and a page too many bytes: their stills alone
+MAX_SPZ_BYTES = 40_000_000  # before compression: 2 million without harmonics, fewer with them
+MIN_OPACITY = 1 / 255  # what is fainter is not drawn
+FINE = 11  # bits of a position within the scene: the browser keeps 10 and the sign
 DEPTH_SAMPLE = 50_000  # Gaussians that say how far away the middle of a view lies
 
 
@@ -35,7 +40,7 @@ class Side:
     num_gaussians: int
     file_bytes: int
     mean: Quality  # over the views that count: the held-out ones where there are any
-    splats: bytes | None  # the Gaussians in the page's frame, see :mod:`gsmerge.view.splats`; None: too many for a page
+    splats: bytes | None  # the Gaussians in the page's frame, see :func:`pack_splats`; None: too many for a page
     sh_degree: int  # of the harmonics that the page has
     file_sh_degree: int  # of those in the file
 
@@ -57,29 +62,19 @@ class PageView:
 
 @dataclass(frozen=True)
 class ViewData:
-    """What a page shows.
+    """The content of a page."""
 
-    Args:
-        title: Name of the scene.
-        sides: The scene itself, then its results.
-        views: The worst of the first result first.
-        num_views: Views that were measured, which may be more.
-        reference: What scores compare with, in words.
-        notes: Warnings and limits, one sentence each.
-        num_superpixels: Least and most of a photo with outlines; None where there are none.
-    """
-
-    title: str
-    sides: tuple[Side, ...]
-    views: tuple[PageView, ...]
-    num_views: int
-    reference: str
-    notes: tuple[str, ...]
-    num_superpixels: tuple[int, int] | None = None
+    title: str  # name of the scene
+    sides: tuple[Side, ...]  # the scene itself, then its results
+    views: tuple[PageView, ...]  # the worst of the first result first
+    num_views: int  # views that were measured, which may be more
+    reference: str  # words for the pictures that scores compare with
+    notes: tuple[str, ...]  # warnings and limits, one sentence each
+    num_superpixels: tuple[int, int] | None = None  # least and most of a photo; None without outlines
 
     @property
     def held_out(self) -> bool:
-        """Whether the means are over held-out views."""
+        """Whether the means are over unseen views."""
         return any(view.held_out for view in self.views)
 
 
@@ -95,7 +90,7 @@ def collect(
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> ViewData:
-    """Draw and measure a scene and its results in all views.
+    """Draw and measure a scene, which has at least one view, and its results in all views.
 
     Args:
         title: Name of the scene.
@@ -147,7 +142,7 @@ def collect(
 def with_outlines(
     views: Sequence[PageView], photos: np.ndarray | None, options: SegmentOptions
 ) -> tuple[tuple[PageView, ...], tuple[int, int] | None]:
-    """The views with outlines of the superpixels of the input photos ``[v,h,w,3]``, and least and most of a photo."""
+    """Add outlines of the superpixels of the input photos ``[v,h,w,3]``; also return their least and most number."""
     places = [i for i, view in enumerate(views) if not view.held_out]
     if photos is None or not places:
         return tuple(views), None
@@ -159,38 +154,25 @@ def with_outlines(
 
 
 def short_names(names: Sequence[str]) -> list[str]:
-    """Names of photos without folders and endings, where that tells them apart."""
+    """Shorten names of photos to those without folders and endings, where that tells them apart."""
     stems = [PurePosixPath(name.replace("\\", "/")).stem or name for name in names]
     return stems if len(set(stems)) == len(stems) else list(names)
 
 
 def encode_still(picture: Picture) -> bytes:
-    """A picture as WebP."""
+    """Encode a picture as WebP."""
     _, data = cv2.imencode(".webp", picture[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, WEBP_QUALITY])
     return bytes(data.tobytes())
 
 
 def encode_outlines(labels: np.ndarray) -> bytes:
-    """Borders between superpixels ``[h,w]`` as PNG of several times their size: fine lines on nothing."""
+    """Encode the borders of superpixels ``[h,w]`` as a transparent PNG several times as large."""
     factor = max(1, OUTLINE_SIDE // max(labels.shape))
-    lines = borders(labels.repeat(factor, 0).repeat(factor, 1))
-    rows = np.pad(np.packbits(lines, axis=1), ((0, 0), (1, 0)))  # a zero begins each: stored as it is
-    parts = {
-        b"IHDR": struct.pack(">IIBBBBB", lines.shape[1], lines.shape[0], 1, 3, 0, 0, 0),  # one bit, a palette
-        b"PLTE": bytes(3) + bytes(BORDER_COLOR),
-        b"tRNS": bytes([0, 255]),
-        b"IDAT": zlib.compress(rows.tobytes(), 9),
-        b"IEND": b"",
-    }
-    chunks = [
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-        for kind, data in parts.items()
-    ]
-    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
+    return encode_mask(borders(labels.repeat(factor, 0).repeat(factor, 1)), BORDER_COLOR)
 
 
 def middle_depth(means: np.ndarray, camera: Cameras) -> float:
-    """Median depth of the points ``[n,3]`` that one camera has in its picture; 1 where there is none."""
+    """Measure the median depth of the points ``[n,3]`` that one camera has in its picture; 1 without any."""
     points = means[:: max(1, len(means) // DEPTH_SAMPLE)]
     (pixels,), (depths,) = project(points, camera)
     inside = (depths > 0) & ((pixels >= 0) & (pixels <= (camera.width, camera.height))).all(1)
@@ -204,7 +186,7 @@ def _side(result: ResultScores, gaussians: Gaussians, file_bytes: int, split: st
 
 
 def _shown(views: Sequence[PageView]) -> tuple[PageView, ...]:
-    """At most ``MAX_VIEWS`` of them and the worst, the worst of the first result first."""
+    """Choose at most ``MAX_VIEWS`` views and the worst, sorted from the worst of the first result."""
 
     def quality(view: PageView) -> float:
         score = view.scores[1].psnr
@@ -216,7 +198,7 @@ def _shown(views: Sequence[PageView]) -> tuple[PageView, ...]:
 
 
 def _limits(sides: Sequence[Side], num_shown: int, num_views: int) -> list[str]:
-    """What the page leaves out."""
+    """List what the page leaves out."""
     notes = []
     for side in sides:
         if side.splats is None:
@@ -229,3 +211,34 @@ def _limits(sides: Sequence[Side], num_shown: int, num_views: int) -> list[str]:
     if num_shown < num_views:
         notes.append(f"{num_shown} of {num_views} views are shown, the worst among them; means are over all")
     return notes
+
+
+def pack_splats(gaussians: Gaussians) -> tuple[bytes | None, int]:
+    """Pack the visible Gaussians with as many harmonics as fit, and return their degree; None for too many.
+
+    Neighbouring rows are alike, so the bytes of a ``.spz`` are stored as differences from the row before, column by
+    column, in 60 % of its size. The gzip stream has the header of an uncompressed ``.spz`` of version 3, the checksum
+    of its whole content (CRC-32, little-endian), and the columns; the page's script restores the ``.spz``.
+    ``gaussians`` are in the page's frame, where the scene is about 1 large: browsers keep means in 16 bits.
+    """
+    drawn = gaussians.opacities >= MIN_OPACITY
+    for values in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh0, gaussians.shN):
+        drawn &= np.isfinite(values).reshape(len(values), -1).all(1)
+    count = int(drawn.sum())
+    if count > MAX_GAUSSIANS:
+        return None, 0
+    highest = min(highest_degree(gaussians.shN), spz.MAX_DEGREES[3])
+    degree = max((d for d in range(highest + 1) if (20 + 3 * ((d + 1) ** 2 - 1)) * count <= MAX_SPZ_BYTES), default=0)
+    columns = spz.spz_columns(gaussians[drawn], degree, fine=FINE)
+    header = columns.header(3)
+    checksum = zlib.crc32(header)
+    for part in columns.parts:
+        checksum = zlib.crc32(part.tobytes(), checksum)
+    planes = [np.diff(part, axis=0, prepend=part[:1] & 0).T.tobytes() for part in columns.parts]
+    return gzip.compress(b"".join([header, checksum.to_bytes(4, "little"), *planes]), mtime=0), degree
+
+
+def highest_degree(harmonics: np.ndarray) -> int:
+    """Return the highest degree of harmonics ``[n,k-1,3]`` that is not zero everywhere."""
+    used = np.flatnonzero(harmonics.any((0, 2)))
+    return int(np.sqrt(used[-1] + 1)) if len(used) else 0

@@ -1,4 +1,4 @@
-"""Pages: templates and styles of this package, filled; everything that they show is in the one file."""
+"""Fill the templates of pages; everything that a page shows is in its one file."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ENGINE = "vendor/spark-three.js.gz"
 
 
 def view_page(data: ViewData) -> str:
-    """The page of a scene before and after, in HTML."""
+    """Make the page of a scene before and after, as HTML."""
     photos = any(view.photo is not None for view in data.views)
     sources: list[dict[str, Any]] = [{"name": "photo", "splats": None, "count": 0}] if photos else []
     sources += [
@@ -91,12 +91,12 @@ def report_page(document: Mapping[str, Any], pictures: Sequence[Sequence[tuple[s
 
 
 def headline(before: Side, after: Side) -> str:
-    """What became of the scene, in one line: how many Gaussians, and how much closer to the photos."""
+    """Write the share of Gaussians and the change of quality in one line."""
     return headline_of(before.num_gaussians, after.num_gaussians, before.mean.psnr, after.mean.psnr)
 
 
 def headline_of(num_before: int, num_after: int, old: float | None, new: float | None) -> str:
-    """The same of numbers; ``old`` and ``new`` are PSNR in dB, the former infinite where the input is the reference."""
+    """Write the same line from numbers; ``old`` and ``new`` are PSNR in dB, ``old`` is infinite for the reference."""
     share = 100 * num_after / max(num_before, 1)
     said = f"{share:.{1 if share >= 1 else 2}f} % of the Gaussians"
     if new is None or old is None or not np.isfinite(new):
@@ -107,7 +107,7 @@ def headline_of(num_before: int, num_after: int, old: float | None, new: float |
 
 
 def _view(view: PageView) -> dict[str, Any]:
-    """A view for the page's script: row-major world to camera, intrinsics in pixels."""
+    """Convert a view for the page's script: row-major world to camera, intrinsics in pixels."""
     camera = view.camera
     return {
         "name": view.name,
@@ -122,22 +122,22 @@ def _view(view: PageView) -> dict[str, Any]:
 
 
 def _finite(value: float | None) -> float | None:
-    """JSON knows no infinity, which is the PSNR of equal pictures."""
+    """Round a number for JSON, which has no infinity, the PSNR of equal pictures."""
     return None if value is None or value == float("inf") else round(value, 4)
 
 
 def data_uri(content: bytes, kind: str) -> str:
-    """A file as an address that holds it."""
+    """Make an address that holds the content of a file."""
     return f"data:{kind};base64,{base64_text(content)}"
 
 
 def base64_text(content: bytes) -> str:
-    """Bytes in the 64 characters that HTML leaves alone."""
+    """Encode bytes in the 64 characters that HTML leaves alone."""
     return base64.b64encode(content).decode("ascii")
 
 
 def render_template(name: str, **values: Any) -> str:
-    """A template with these values, which are escaped unless it says otherwise."""
+    """Fill a template with values, which are escaped unless it says otherwise."""
     text = _environment().get_template(name).render(version=__version__, **values)
     return text.encode("utf-8", "replace").decode("utf-8")  # names of files may hold halves of characters
 

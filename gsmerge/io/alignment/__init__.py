@@ -291,9 +291,7 @@ def _with_pixels(
     *notes: str,
     moves: Sequence[dict[str, Any]] = (),
 ) -> AlignmentResult | None:
-    """Make the result of rows that are pixels, with the cameras in the frame of the Gaussians; None if they are
-    not.
-    """
+    """Make the result of rows that are pixels, with the cameras in the frame of the Gaussians; None if they are not."""
     if recovery is None:
         return None
     frame, layout, count = recovery.best.frame, recovery.best.layout, len(inputs.cameras)

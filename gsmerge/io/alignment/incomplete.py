@@ -192,9 +192,7 @@ def _measure_spread(rows: ProjectedRows, color_of: ColorOf | None) -> _Spread | 
 
 
 def _distances(rows: ProjectedRows, some: np.ndarray, *, shift: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Measure distances ``[r,c]`` from the nearest pixel's centre in each view, inf outside; also return the
-    pixels.
-    """
+    """Measure distances ``[r,c]`` from the nearest pixel's centre in each view, inf outside; also return the pixels."""
     distances = np.full((len(some), len(rows.cameras)), np.inf, np.float32)
     pixels = np.zeros((len(some), len(rows.cameras)), np.int32)
     for view in range(len(rows.cameras)):

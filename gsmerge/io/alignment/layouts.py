@@ -145,7 +145,13 @@ def depth_layouts(count: int, depths: np.ndarray) -> list[Layout]:
     pixels.
     """
     views, height, width = depths.shape
-    kept = [depth_mask(depth) for depth in depths]
+    inside = da3_box(width, height).pixels(width, height)
+    # the threshold is the interpolated 90 % quantile of all the view's depths: the lower of the two around it decides
+    rank = int(DEPTH_SHARE * (width * height - 1))
+    kept = []
+    for depth in depths:
+        mask = depth <= np.partition(depth.reshape(-1), rank)[rank]
+        kept.append(inside[mask.reshape(-1)[inside]])
     for step, chosen in enumerate(every_nth(views), 1):
         pixels = tuple(kept[view] for view in chosen)
         ends = np.cumsum([len(some) for some in pixels])
@@ -156,19 +162,6 @@ def depth_layouts(count: int, depths: np.ndarray) -> list[Layout]:
             rows = tuple(np.split(np.arange(count, dtype=np.int64), ends[:-1]))
             return [Layout(description, "box+depth", "view-major", width, height, chosen, rows, pixels)]
     return []
-
-
-def depth_mask(depth: np.ndarray) -> np.ndarray:
-    """Return the pixels of one view that Depth Anything 3 keeps, in order.
-
-    Its threshold is the interpolated 90 % quantile of the view's depths; the lower of the two depths around it
-    decides.
-    """
-    height, width = depth.shape
-    rank = int(DEPTH_SHARE * (depth.size - 1))
-    mask = depth <= np.partition(depth.reshape(-1), rank)[rank]
-    inside = da3_box(width, height).pixels(width, height)
-    return inside[mask.reshape(-1)[inside]]
 
 
 def fill_from_depths(scene: Scene, depths: np.ndarray) -> Scene:

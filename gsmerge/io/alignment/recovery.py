@@ -182,9 +182,7 @@ def possible_layouts(inputs: AlignmentInput) -> list[Layout]:
 
 
 def _score_labellings(inputs: AlignmentInput, layout: Layout, effort: int) -> list[AlignmentScore]:
-    """Score the layout under the best frame, for each likely order of the views; for any with most effort or too
-    few.
-    """
+    """Score the layout under the best frame for each likely order of the views, or any with effort 2 or views missing."""
     out: dict[tuple[int, ...], AlignmentScore] = {}
     labellings = [[labelling[view] for view in layout.views] for labelling in inputs.labellings]
     lacks_views = len(set(layout.views)) < len(inputs.cameras)
@@ -251,19 +249,12 @@ def explain_count(ply: PlyInfo, inputs: AlignmentInput, camera_file: CameraFile)
             if reason or _looks_like_a_grid(*rows, 4 * alignment.limit_px):
                 raise misalignment_error(camera_file.path, alignment, reason)
             problem = f"expected one Gaussian per pixel, found {ply.count} rows that are in no known order"
-        elif _lacks_cameras(inputs):
-            raise SceneError(ply.path, problem, _count_remedy(ply.count, cameras))
+        elif count > views * width * height and count % (width * height) == 0:
+            size = views * width * height
+            first = replace(inputs, gaussians=inputs.gaussians[:size], valid=inputs.valid[:size], order="view-major")
+            if recover(first) is not None:  # more views than cameras, the first in order
+                raise SceneError(ply.path, problem, _count_remedy(ply.count, cameras))
     return SceneError(ply.path, problem, _count_remedy(ply.count, cameras))
-
-
-def _lacks_cameras(inputs: AlignmentInput) -> bool:
-    """Return whether the first views are in order, and there are more of them than cameras."""
-    count, each = len(inputs.gaussians), inputs.cameras.width * inputs.cameras.height
-    pixels = len(inputs.cameras) * each
-    if count <= pixels or count % each:
-        return False
-    first = replace(inputs, gaussians=inputs.gaussians[:pixels], valid=inputs.valid[:pixels], order="view-major")
-    return recover(first) is not None
 
 
 def _count_remedy(count: int, cameras: Cameras) -> str:

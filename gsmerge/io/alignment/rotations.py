@@ -55,9 +55,7 @@ def from_xyzw(quats: np.ndarray) -> np.ndarray:
 
 
 def square_roots(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the two rotations that, applied twice, give ``quats [n,4]`` wxyz: half the angle, and half a turn
-    more.
-    """
+    """Compute both rotations that, applied twice, give ``quats [n,4]`` wxyz: half the angle, and half a turn more."""
     unit = normalize(quats)
     unit = np.where(unit[:, :1] < 0, -unit, unit)
     half = normalize(unit + np.array((1, 0, 0, 0), unit.dtype))

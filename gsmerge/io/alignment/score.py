@@ -146,9 +146,7 @@ def candidate_similarities(
 def _solve(
     points: np.ndarray, rays_and_centres: tuple[np.ndarray, np.ndarray], rotation: np.ndarray, *, shifted: bool
 ) -> Similarity | None:
-    """Solve robustly for the scale (None if not positive) and shift that bring rotated points nearest to their
-    rays.
-    """
+    """Solve robustly for the scale (None if not positive) and shift that bring rotated points nearest to their rays."""
     rays, centres = (part @ rotation.T for part in rays_and_centres)
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
     columns = [np.einsum("tij,tj->ti", across, centres)[:, :, None]] + ([across] if shifted else [])

@@ -258,8 +258,7 @@ def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> 
 def as_pinholes(camera_file: CameraFile, photos: Photos | None) -> tuple[CameraFile, Photos | None, list[str]]:
     """Undistort photos, and make their cameras pinholes with the same intrinsics; also return a note.
 
-    SceneError if a lens is no pinhole and there are no photos of the camera's shape, or shows next to nothing of
-    one.
+    SceneError if a lens is no pinhole and there are no photos of the camera's shape, or shows next to nothing of one.
     """
     if not camera_file.lenses:
         return camera_file, photos, []

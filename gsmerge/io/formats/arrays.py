@@ -1,6 +1,4 @@
-"""Gaussians in the units of most file formats: :class:`Columns` to write, :class:`StoredRows` as
-read.
-"""
+"""Gaussians in the units of most file formats: :class:`Columns` to write, :class:`StoredRows` as read."""
 
 from __future__ import annotations
 
@@ -56,9 +54,7 @@ class StoredRows:
 
 
 def to_rows(columns: Columns, name: str, sizes: dict[str, int], *, mip: bool = False) -> StoredRows:
-    """Convert columns to rows of a PLY file; ``sizes`` are bytes by attribute, ``mip`` marks
-    antialiased ones.
-    """
+    """Convert columns to rows of a PLY file; ``sizes`` are bytes by attribute, ``mip`` marks antialiased ones."""
     count, num_higher = columns.harmonics.shape[:2]
     names = (*MEANS, *SH0, *(f"f_rest_{i}" for i in range(3 * num_higher)), "opacity", *SCALES, *QUATS)
     harmonics = columns.harmonics.transpose(0, 2, 1).reshape(count, 3 * num_higher)
@@ -76,9 +72,7 @@ def to_rows(columns: Columns, name: str, sizes: dict[str, int], *, mip: bool = F
 
 
 def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Columns:
-    """Convert Gaussians up to a degree to columns; ValueError that names the row if one is not
-    finite.
-    """
+    """Convert Gaussians up to a degree to columns; ValueError that names the row if one is not finite."""
 
     def check(values: np.ndarray) -> np.ndarray:
         with np.errstate(over="ignore"):
@@ -121,8 +115,7 @@ def from_smallest_three(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 
 def smallest_three(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Split unit quaternions ``[n,4]`` into the index ``[n]`` of the largest part and the others
-    ``[n,3]``.
+    """Split unit quaternions ``[n,4]`` into the index ``[n]`` of the largest part and the others ``[n,3]``.
 
     The sign is chosen so that the largest part is positive and need not be stored.
     """

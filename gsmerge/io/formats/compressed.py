@@ -1,9 +1,7 @@
-"""Compressed PLY (PlayCanvas, SuperSplat, gsplat): four packed words per Gaussian, ranges per chunk
-of 256.
+"""Compressed PLY (PlayCanvas, SuperSplat, gsplat): four packed words per Gaussian, ranges per chunk of 256.
 
-The layout is that of PlayCanvas' reader: positions and scales 11-10-11 bits between a chunk's
-minimum and maximum, rotations as their three smaller components at 10 bits, colours and opacity at
-8 bits, harmonics as bytes in ``sh``.
+The layout is that of PlayCanvas' reader: positions and scales 11-10-11 bits between a chunk's minimum and maximum,
+rotations as their three smaller components at 10 bits, colours and opacity at 8 bits, harmonics as bytes in ``sh``.
 """
 
 from __future__ import annotations
@@ -85,9 +83,7 @@ def _num_rest(path: Path, data: PlyData, count: int) -> int:
 def _fill_between(
     rows: np.ndarray, columns: tuple[str, ...], shares: list[np.ndarray], chunk: PlyElement, ranges: tuple[str, ...]
 ) -> None:
-    """Fill three columns from shares between a chunk's least and largest values, if the file has
-    them.
-    """
+    """Fill three columns from shares between a chunk's least and largest values, if the file has them."""
     ids, dtype = np.arange(len(rows)) // CHUNK, chunk.data.dtype
     has_ranges = all(name in dtype.names and dtype[name].kind == "f" for name in ranges)
     for column, share, low, high in zip(columns, shares, ranges[:3], ranges[3:], strict=True):
@@ -107,9 +103,7 @@ def _shares(words: np.ndarray, bits: tuple[int, ...]) -> list[np.ndarray]:
 
 
 def compressed_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
-    """Encode a ``.compressed.ply`` file along a space-filling curve; ValueError if there is NaN or
-    inf.
-    """
+    """Encode a ``.compressed.ply`` file along a space-filling curve; ValueError if there is NaN or inf."""
     columns = to_columns(gaussians, MAX_DEGREE).along_curve()
     count, num_rest = len(columns), 3 * columns.harmonics.shape[1]
     ranged = [_ranged(values) for values in (columns.means, columns.log_scales, columns.colors)]

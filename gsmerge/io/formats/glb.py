@@ -1,8 +1,7 @@
-"""Binary glTF 2.0 (``.glb``) with the extension ``KHR_gaussian_splatting`` of
-github.com/KhronosGroup/glTF.
+"""Binary glTF 2.0 (``.glb``) with the extension ``KHR_gaussian_splatting`` of github.com/KhronosGroup/glTF.
 
-Its axis y points up, that of a ``.ply`` down: a node turns the Gaussians by half a turn about z.
-Viewers that do not know the extension show points in the base colours.
+Its axis y points up, that of a ``.ply`` down: a node turns the Gaussians by half a turn about z. Viewers that do not
+know the extension show points in the base colours.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.io.formats.arrays import Columns, to_bytes, to_columns
+from gsmerge.io.formats.arrays import to_bytes, to_columns
 from gsmerge.types import Gaussians
 
 MAX_DEGREE = 3
@@ -24,23 +23,35 @@ _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 def glb_bytes(gaussians: Gaussians) -> bytes:
     """Encode a ``.glb`` file; ValueError if there is NaN or inf."""
-    attributes = _attributes(to_columns(gaussians, MAX_DEGREE))
+    columns = to_columns(gaussians, MAX_DEGREE)
+    values = {
+        "POSITION": columns.means,
+        f"{NAME}:ROTATION": np.roll(columns.quats, -1, axis=1),  # xyzw
+        f"{NAME}:SCALE": np.exp(columns.log_scales),
+        f"{NAME}:OPACITY": columns.opacities,
+        f"{NAME}:SH_DEGREE_0_COEF_0": columns.sh0,
+    }
+    for i in range(columns.harmonics.shape[1]):
+        degree = int((i + 1) ** 0.5)
+        values[f"{NAME}:SH_DEGREE_{degree}_COEF_{i + 1 - degree**2}"] = columns.harmonics[:, i]
+    attributes = {name: array.astype("<f4") for name, array in values.items()}
+    attributes["COLOR_0"] = to_bytes(255 * np.concatenate([columns.colors, columns.opacities[:, None]], 1))
     document: dict[str, Any] = {"asset": {"version": "2.0", "generator": "gsmerge"}, "scene": 0, "scenes": [{}]}
     content = b""
     if len(gaussians):
         at, views = 0, []
         accessors: list[dict[str, Any]] = []
-        for values in attributes.values():
-            views.append({"buffer": 0, "byteOffset": at, "byteLength": values.nbytes, "target": _VERTICES})
+        for array in attributes.values():
+            views.append({"buffer": 0, "byteOffset": at, "byteLength": array.nbytes, "target": _VERTICES})
             kind = {"componentType": _BYTE, "normalized": True}
-            if values.dtype != np.uint8:
+            if array.dtype != np.uint8:
                 kind = {"componentType": _FLOAT}
-            shape = {"count": len(values), "type": _TYPES[values[0].size]}
+            shape = {"count": len(array), "type": _TYPES[array[0].size]}
             accessors.append({"bufferView": len(accessors), **kind, **shape})
-            at += values.nbytes
+            at += array.nbytes
         for name, end in (("min", np.min), ("max", np.max)):  # of the positions, which glTF asks for
             accessors[0][name] = end(attributes["POSITION"], axis=0).tolist()
-        content = b"".join(values.tobytes() for values in attributes.values())
+        content = b"".join(array.tobytes() for array in attributes.values())
         splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
         splats |= {"sortingMethod": "cameraDistance", "projection": "perspective"}
         places = {name: i for i, name in enumerate(attributes)}
@@ -56,22 +67,6 @@ def glb_bytes(gaussians: Gaussians) -> bytes:
     text = json.dumps(document, separators=(",", ":")).encode("ascii")
     chunks = _chunk(b"JSON", text, b" ") + (_chunk(b"BIN\0", content, b"\0") if content else b"")
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
-
-
-def _attributes(columns: Columns) -> dict[str, np.ndarray]:
-    """Return values ``[n]`` or ``[n,d]`` by attribute, positions first, each of whole words."""
-    colors = to_bytes(255 * np.concatenate([columns.colors, columns.opacities[:, None]], 1))
-    values = {
-        "POSITION": columns.means,
-        f"{NAME}:ROTATION": np.roll(columns.quats, -1, axis=1),  # xyzw
-        f"{NAME}:SCALE": np.exp(columns.log_scales),
-        f"{NAME}:OPACITY": columns.opacities,
-        f"{NAME}:SH_DEGREE_0_COEF_0": columns.sh0,
-    }
-    for i in range(columns.harmonics.shape[1]):
-        degree = int((i + 1) ** 0.5)
-        values[f"{NAME}:SH_DEGREE_{degree}_COEF_{i + 1 - degree**2}"] = columns.harmonics[:, i]
-    return {**{name: array.astype("<f4") for name, array in values.items()}, "COLOR_0": colors}
 
 
 def _chunk(kind: bytes, content: bytes, padding: bytes) -> bytes:

@@ -12,30 +12,9 @@ from plyfile import PlyData, PlyElement
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import rgb_to_sh0
-from gsmerge.io.formats import sog, splat, spz
+from gsmerge.io.formats import ply_file, sog, splat, spz
 from gsmerge.io.formats.arrays import StoredRows
 from gsmerge.io.formats.compressed import is_compressed, unpack
-from gsmerge.io.formats.ply_file import (
-    BLOCK_BYTES,
-    LOGIT_COMMENT,
-    MAX_HARMONIC,
-    MAX_LOG_SCALE,
-    MEANS,
-    NORMALS,
-    QUATS,
-    RENDER_COMMENT,
-    REQUIRED,
-    RGB,
-    SCALES,
-    SH0,
-    bytes_by_attribute,
-    color_columns,
-    layout_name,
-    open_ply,
-    open_rows,
-    sh_degree,
-    spread_low_degree,
-)
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Gaussians, StrPath
 
@@ -52,9 +31,7 @@ SCENE_SUFFIXES = (".ply", *READERS)
 
 @dataclass(frozen=True)
 class PlyInfo:
-    """Facts about a file of Gaussians; of another format than PLY, about its rows as float32
-    columns.
-    """
+    """Facts about a file of Gaussians; of another format than PLY, about its rows as float32 columns."""
 
     path: str
     layout: str  # name of the column layout, as "17-column export" or "INRIA, SH degree 3"
@@ -95,7 +72,7 @@ class PlyScene:
 def kept_comments(info: PlyInfo) -> tuple[str, ...]:
     """Return the comments of a file's header that tell viewers how to render its Gaussians."""
     lines = (comment for comment in info.comments if comment.isascii() and comment.isprintable())
-    return tuple(comment for comment in lines if comment.startswith(RENDER_COMMENT))
+    return tuple(comment for comment in lines if comment.startswith(ply_file.RENDER_COMMENT))
 
 
 def ply_notes(info: PlyInfo) -> tuple[str, ...]:
@@ -127,7 +104,7 @@ def read_ply(path: StrPath, *, opacity: OpacityChoice = "auto") -> PlyScene:
     if opacity not in ("auto", "logit", "raw"):
         raise ValueError(f"opacity: expected 'auto', 'logit' or 'raw', got {opacity!r}")
     path = Path(path)
-    data = open_ply(path)
+    data = ply_file.open_ply(path)
     compressed = is_compressed(data)
     rows = unpack(path, data) if compressed else _vertex(path, data).data
     names = tuple(np.asarray(rows).dtype.names or ())
@@ -135,9 +112,9 @@ def read_ply(path: StrPath, *, opacity: OpacityChoice = "auto") -> PlyScene:
     comments = (*data.comments, *(c for e in data.elements for c in e.comments))
     stored = StoredRows(
         rows=rows,
-        layout=f"compressed, SH degree {sh_degree(num_rest)}" if compressed else layout_name(names, num_rest),
+        layout=ply_file.layout_name(names, num_rest, compressed=compressed),
         format="ascii" if data.text else "binary big-endian" if data.byte_order == ">" else "binary little-endian",
-        encoding="logit" if compressed or LOGIT_COMMENT in comments else None,
+        encoding="logit" if compressed or ply_file.LOGIT_COMMENT in comments else None,
         comments=comments,
         extra_elements=tuple(e.name for e in data.elements if e.name != "vertex"),
     )
@@ -162,12 +139,12 @@ def _to_scene(path: Path, stored: StoredRows, opacity: OpacityChoice) -> PlyScen
     rows = np.asarray(stored.rows)
     names = tuple(rows.dtype.names or ())
     num_rest = _num_rest(path, names)
-    n, size = len(rows), max(1, BLOCK_BYTES // rows.dtype.itemsize)
-    wide = any(rows.dtype[name].kind == "f" and rows.dtype[name].itemsize == 8 for name in MEANS)
+    n, size = len(rows), max(1, ply_file.BLOCK_BYTES // rows.dtype.itemsize)
+    wide = any(rows.dtype[name].kind == "f" and rows.dtype[name].itemsize == 8 for name in ply_file.MEANS)
     shapes = {"quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh0": (n, 1, 3), "shN": (n, num_rest // 3, 3)}
     out = {"means": np.empty((n, 3), np.float64 if wide else np.float32), "valid": np.empty(n, np.bool_)}
     out |= {name: np.empty(shape, np.float32) for name, shape in shapes.items()}
-    with open_rows(path, stored.rows) as read:
+    with ply_file.open_rows(path, stored.rows) as read:
 
         def convert(start: int) -> tuple[int, int]:
             block = slice(start, min(start + size, n))
@@ -178,23 +155,23 @@ def _to_scene(path: Path, stored: StoredRows, opacity: OpacityChoice) -> PlyScen
     encoding = _activate(out["opacities"], out["valid"], known)
     num_bad = clear_invalid(path, out)
     byte_columns = tuple(name for name in names if rows.dtype[name].itemsize == 1)
-    if byte_columns == NORMALS:
-        spread_low_degree(out["shN"])
-    used = {*REQUIRED, *color_columns(names), *NORMALS, *(f"f_rest_{i}" for i in range(num_rest))}
-    extra = tuple(name for name in names if name not in used)
+    if byte_columns == ply_file.NORMALS:
+        ply_file.spread_low_degree(out["shN"])
+    used = {*ply_file.REQUIRED, *ply_file.color_columns(names), *ply_file.NORMALS}
+    extra = tuple(name for name in names if name not in used and not name.startswith("f_rest_"))
     info = PlyInfo(
         path=str(path),
         layout=stored.layout,
         format=stored.format,
         count=n,
         file_bytes=path.stat().st_size,
-        bytes_by_attribute=stored.sizes or bytes_by_attribute(rows, extra),
+        bytes_by_attribute=stored.sizes or ply_file.bytes_by_attribute(rows, extra),
         columns=names,
         extra_columns=extra,
         extra_elements=stored.extra_elements,
         byte_columns=byte_columns,
         comments=stored.comments,
-        sh_degree=sh_degree(num_rest),
+        sh_degree=ply_file.sh_degree(num_rest),
         opacity_encoding=encoding,
         opacity_guessed=known is None,
         num_nonfinite=num_bad,
@@ -210,16 +187,16 @@ def _vertex(path: Path, data: PlyData) -> PlyElement:
         raise SceneError(path, f"expected an element 'vertex', found {names}")
     vertex = data["vertex"]
     columns = {p.name for p in vertex.properties}
-    missing = [name for name in REQUIRED if name not in columns]
-    if columns.issuperset(RGB):
-        missing = [name for name in missing if name not in SH0]
+    missing = [name for name in ply_file.REQUIRED if name not in columns]
+    if columns.issuperset(ply_file.RGB):
+        missing = [name for name in missing if name not in ply_file.SH0]
     if missing:
         remedy = "this is no Gaussian splat"
         if any(name.startswith("packed_") for name in columns):
             remedy = "it is compressed, but lacks its element 'chunk'"
         elif missing == ["scale_2"]:
             remedy = "flat 2D Gaussians need a scale_2 column of their own"
-        elif len(missing) < len(REQUIRED) // 2:
+        elif len(missing) < len(ply_file.REQUIRED) // 2:
             remedy = "export it again with them"
         raise SceneError(path, f"missing column{'s' * (len(missing) > 1)} {', '.join(missing)}", remedy)
     if vertex.count == 0:
@@ -245,7 +222,7 @@ def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int, int]:
             np.add(total, column, out=total)
             return column
 
-        for j, name in enumerate(MEANS):
+        for j, name in enumerate(ply_file.MEANS):
             column = take(name)
             out["means"][:, j] = column if out["means"].dtype == np.float32 else rows[name]
         clipped = np.zeros(len(rows), np.bool_)
@@ -253,26 +230,26 @@ def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int, int]:
         def take_harmonic(name: str) -> np.ndarray:
             column = take(name)
             size = np.abs(column)
-            if not size.max() <= MAX_HARMONIC:
-                np.logical_or(clipped, size > MAX_HARMONIC, out=clipped)
-                np.clip(column, -MAX_HARMONIC, MAX_HARMONIC, out=column)
+            if not size.max() <= ply_file.MAX_HARMONIC:
+                np.logical_or(clipped, size > ply_file.MAX_HARMONIC, out=clipped)
+                np.clip(column, -ply_file.MAX_HARMONIC, ply_file.MAX_HARMONIC, out=column)
             return column
 
-        for j, name in enumerate(color_columns(rows.dtype.names)):
+        for j, name in enumerate(ply_file.color_columns(rows.dtype.names)):
             column = take_harmonic(name)
-            if name in RGB:
+            if name in ply_file.RGB:
                 column = rgb_to_sh0(column / (255 if rows.dtype[name].kind == "u" else 1))
             out["sh0"][:, 0, j] = column
         num_higher = out["shN"].shape[1]
         for channel in range(3):
             for j in range(num_higher):
                 out["shN"][:, j, channel] = take_harmonic(f"f_rest_{channel * num_higher + j}")
-        for j, name in enumerate(SCALES):
+        for j, name in enumerate(ply_file.SCALES):
             column = take(name)
-            clipped |= np.abs(column) > MAX_LOG_SCALE
-            np.clip(column, -MAX_LOG_SCALE, MAX_LOG_SCALE, out=column)
+            clipped |= np.abs(column) > ply_file.MAX_LOG_SCALE
+            np.clip(column, -ply_file.MAX_LOG_SCALE, ply_file.MAX_LOG_SCALE, out=column)
             out["scales"][:, j] = np.exp(column, out=column)
-        quats = [take(name) for name in QUATS]
+        quats = [take(name) for name in ply_file.QUATS]
         zero = _normalise(quats, out["quats"])
         out["opacities"][:] = take("opacity")
         valid = np.isfinite(total, out=out["valid"])
@@ -285,10 +262,10 @@ def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int, int]:
 def _exactly_valid(rows: np.ndarray, num_higher: int) -> np.ndarray:
     """Return which rows are usable: finite, except for infinite logits and scales of zero."""
     valid = ~np.isnan(rows["opacity"].astype(np.float32))
-    colors = color_columns(rows.dtype.names)
-    for name in (*MEANS, *colors, *QUATS, *(f"f_rest_{i}" for i in range(3 * num_higher))):
+    colors = ply_file.color_columns(rows.dtype.names)
+    for name in (*ply_file.MEANS, *colors, *ply_file.QUATS, *(f"f_rest_{i}" for i in range(3 * num_higher))):
         valid &= np.isfinite(rows[name].astype(np.float32))
-    for name in SCALES:
+    for name in ply_file.SCALES:
         column = rows[name].astype(np.float32)
         valid &= np.isfinite(column) | (column == -np.inf)
     return valid

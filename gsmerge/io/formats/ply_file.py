@@ -49,8 +49,7 @@ _SIZES = {
 def open_ply(path: Path) -> PlyData:
     """Open a PLY file; its binary vertices, unless packed, are mapped for :func:`open_rows`.
 
-    SceneError if it is no PLY file, is truncated or damaged, or its header promises more than it
-    has.
+    SceneError if it is no PLY file, is truncated or damaged, or its header promises more than it has.
     """
     size = check_file(path)
     try:
@@ -79,9 +78,7 @@ def open_ply(path: Path) -> PlyData:
 
 
 def _stream(path: Path, end: int, *, text: bool) -> IO[Any]:
-    """Open a PLY file for the parser, without bytes beyond ASCII in the header and empty lines in
-    the text.
-    """
+    """Open a PLY file for the parser, without bytes beyond ASCII in the header and empty lines in the text."""
     if text:
         return _TextRows(path.open("rb"), "ascii", "backslashreplace", newline="")
     file = _BinaryRows(FileIO(str(path)))
@@ -134,9 +131,7 @@ def open_rows(path: Path, rows: np.ndarray) -> Iterator[Callable[[slice], np.nda
 
 
 def header_counts(path: Path) -> tuple[int, int]:
-    """Return the numbers of Gaussians and of ``f_rest`` columns in a PLY file's header; zeros if
-    unreadable.
-    """
+    """Return the numbers of Gaussians and of ``f_rest`` columns in a PLY file's header; zeros if unreadable."""
     try:
         with path.open("rb") as file:
             header = file.read(1 << 16).partition(b"end_header")[0]
@@ -147,8 +142,7 @@ def header_counts(path: Path) -> tuple[int, int]:
 
 
 def _check_header(path: Path, start: bytes, size: int) -> tuple[int, bool]:
-    """Return the size of a header and whether rows are text; SceneError if the file is too short
-    for it.
+    """Return the size of a header and whether rows are text; SceneError if the file is too short for it.
 
     ``start`` has the first bytes of ``size``. Everything else is left to the parser.
     """
@@ -202,8 +196,7 @@ def color_columns(names: tuple[str, ...] | None) -> tuple[str, ...]:
 def spread_low_degree(shN: np.ndarray) -> None:
     """Move harmonics of a low degree to their places in ``shN [n,15,3]``, in place.
 
-    Long-LRM writes 45 columns whatever the degree, the used ones channel-major in the first 9 or
-    24.
+    Long-LRM writes 45 columns whatever the degree, the used ones channel-major in the first 9 or 24.
     """
     if shN.shape[1] != 15:
         return
@@ -216,11 +209,13 @@ def spread_low_degree(shN: np.ndarray) -> None:
             return
 
 
-def layout_name(names: tuple[str, ...], num_rest: int) -> str:
+def layout_name(names: tuple[str, ...], num_rest: int, *, compressed: bool) -> str:
     """Name the layout of a file with these columns."""
-    normals = set(NORMALS) <= set(names)
+    if compressed:
+        return f"compressed, SH degree {sh_degree(num_rest)}"
     if SH0[0] not in names:
         return "columns of red, green and blue"
+    normals = set(NORMALS) <= set(names)
     if num_rest == 0:
         return "17-column export" if normals else "14-column export (no normals)"
     return f"INRIA, SH degree {sh_degree(num_rest)}" + ("" if normals else " (no normals)")

@@ -22,15 +22,7 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file, read_errors
-from gsmerge.io.formats.arrays import (
-    Columns,
-    StoredRows,
-    from_smallest_three,
-    smallest_three,
-    to_bytes,
-    to_columns,
-    to_rows,
-)
+from gsmerge.io.formats import arrays
 from gsmerge.types import Gaussians
 
 MAX_DEGREE = 3
@@ -46,10 +38,8 @@ _CELLS = 1 << 11  # as many of equal width, and of equally many values
 _MAX_STEPS = 200
 
 
-def read_rows(path: Path) -> StoredRows:
-    """Read the Gaussians of a ``.sog``; SceneError if it is another file, another version, or
-    damaged.
-    """
+def read_rows(path: Path) -> arrays.StoredRows:
+    """Read the Gaussians of a ``.sog``; SceneError if it is another file, another version, or damaged."""
     size = check_file(path)
     try:
         with read_errors(path), zipfile.ZipFile(path) as archive:
@@ -66,7 +56,7 @@ def read_rows(path: Path) -> StoredRows:
             columns = _read_columns(sog, meta, count)
             keys = [key for key in ("means", "scales", "quats", "sh0", "shN") if meta.get(key)]
             sizes = {key: sum(archive.getinfo(name).compress_size for name in meta[key]["files"]) for key in keys}
-            return to_rows(columns, f".sog version {VERSION}", sizes, mip=mip)
+            return arrays.to_rows(columns, f".sog version {VERSION}", sizes, mip=mip)
     except zipfile.BadZipFile as error:
         raise SceneError(path, f"expected a .sog file, found no complete zip ({error})", "copy it again") from error
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError, EOFError) as error:
@@ -117,7 +107,7 @@ def _webp_size(data: bytes) -> tuple[int, int]:
     raise ValueError("no WebP texture without loss")
 
 
-def _read_columns(sog: _Sog, meta: dict[str, Any], count: int) -> Columns:
+def _read_columns(sog: _Sog, meta: dict[str, Any], count: int) -> arrays.Columns:
     def texture(key: str, index: int = 0) -> np.ndarray:
         return sog.texture(meta[key]["files"][index], count)
 
@@ -128,9 +118,11 @@ def _read_columns(sog: _Sog, meta: dict[str, Any], count: int) -> Columns:
         raise ValueError(f"rotations of mode {quats[:, 3].min()}")
     with np.errstate(all="ignore"):  # what is not finite is set aside later
         logs = low + (high - low) * fixed / 65535
-        return Columns(
+        return arrays.Columns(
             means=np.sign(logs) * np.expm1(np.abs(logs)),
-            quats=from_smallest_three(quats[:, 3].astype(int) - FIRST_MODE, (quats[:, :3] / 255 - 0.5) * np.sqrt(2.0)),
+            quats=arrays.from_smallest_three(
+                quats[:, 3].astype(int) - FIRST_MODE, (quats[:, :3] / 255 - 0.5) * np.sqrt(2.0)
+            ),
             log_scales=_decode_values(meta["scales"], texture("scales")[:, :3]),
             opacities=colors[:, 3] / 255,
             sh0=_decode_values(meta["sh0"], colors[:, :3]),
@@ -164,10 +156,8 @@ def _read_harmonics(sog: _Sog, part: dict[str, Any], count: int) -> np.ndarray:
 
 
 def sog_bytes(gaussians: Gaussians, *, mip: bool = False) -> bytes:
-    """Encode a ``.sog`` along a space-filling curve; ``mip`` marks antialiased Gaussians, NaN is a
-    ValueError.
-    """
-    columns = to_columns(gaussians, MAX_DEGREE).along_curve()
+    """Encode a ``.sog`` along a space-filling curve; ``mip`` marks antialiased Gaussians, NaN is a ValueError."""
+    columns = arrays.to_columns(gaussians, MAX_DEGREE).along_curve()
     count = len(columns)
     meta: dict[str, Any] = {"version": VERSION, "asset": {"generator": "gsmerge"}, "count": count, "antialias": mip}
     if mip:
@@ -185,35 +175,29 @@ def sog_bytes(gaussians: Gaussians, *, mip: bool = False) -> bytes:
     add("means", halves, mins=_shorten(low), maxs=_shorten(high))
     scales, sh0 = fit_codebook(columns.log_scales), fit_codebook(columns.sh0)
     add("scales", {"scales.webp": _texture(nearest_codes(scales, columns.log_scales))}, codebook=_shorten(scales))
-    largest, others = smallest_three(columns.quats)
-    quats = np.concatenate([to_bytes(255 * (others / np.sqrt(2.0) + 0.5)), FIRST_MODE + largest[:, None]], 1)
+    largest, others = arrays.smallest_three(columns.quats)
+    quats = np.concatenate([arrays.to_bytes(255 * (others / np.sqrt(2.0) + 0.5)), FIRST_MODE + largest[:, None]], 1)
     add("quats", {"quats.webp": _texture(quats)})
-    colors = np.concatenate([nearest_codes(sh0, columns.sh0), to_bytes(255 * columns.opacities)[:, None]], 1)
+    colors = np.concatenate([nearest_codes(sh0, columns.sh0), arrays.to_bytes(255 * columns.opacities)[:, None]], 1)
     add("sh0", {"sh0.webp": _texture(colors)}, codebook=_shorten(sh0))
     if columns.harmonics.size:
-        files, numbers = _harmonic_textures(columns)
-        add("shN", files, **numbers)
+        num_higher = columns.harmonics.shape[1]
+        palette, labels = fit_palette(columns.harmonics.reshape(count, -1), PALETTE_BITS)
+        codebook = fit_codebook(palette)
+        rows = -(-len(palette) // PALETTE_COLUMNS)
+        centroids = np.zeros((rows * PALETTE_COLUMNS, num_higher, 3), np.uint8)
+        centroids[: len(palette)] = nearest_codes(codebook, palette).reshape(-1, num_higher, 3)
+        files = {
+            "shN_centroids.webp": _webp(centroids.reshape(rows, PALETTE_COLUMNS * num_higher, 3)),
+            "shN_labels.webp": _texture(np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], 1)),
+        }
+        bands = round((num_higher + 1) ** 0.5) - 1
+        add("shN", files, count=len(palette), bands=bands, codebook=_shorten(codebook))
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
         for name, data in {**textures, "meta.json": json.dumps(meta).encode("ascii")}.items():
             archive.writestr(zipfile.ZipInfo(name), data)  # of 1980: the same bytes at any time
     return content.getvalue()
-
-
-def _harmonic_textures(columns: Columns) -> tuple[dict[str, bytes], dict[str, Any]]:
-    """Make the textures of palette and indices, and their entries in ``meta.json``."""
-    count, num_higher = columns.harmonics.shape[:2]
-    palette, labels = fit_palette(columns.harmonics.reshape(count, -1), PALETTE_BITS)
-    codebook = fit_codebook(palette)
-    rows = -(-len(palette) // PALETTE_COLUMNS)
-    centroids = np.zeros((rows * PALETTE_COLUMNS, num_higher, 3), np.uint8)
-    centroids[: len(palette)] = nearest_codes(codebook, palette).reshape(-1, num_higher, 3)
-    files = {
-        "shN_centroids.webp": _webp(centroids.reshape(rows, PALETTE_COLUMNS * num_higher, 3)),
-        "shN_labels.webp": _texture(np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], 1)),
-    }
-    bands = round((num_higher + 1) ** 0.5) - 1
-    return files, {"count": len(palette), "bands": bands, "codebook": _shorten(codebook)}
 
 
 def _shorten(values: np.ndarray) -> list[float]:
@@ -294,11 +278,10 @@ def nearest_codes(codebook: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def fit_palette(vectors: np.ndarray, max_bits: int) -> tuple[np.ndarray, np.ndarray]:
-    """Choose at most ``2**max_bits`` vectors that represent ``vectors [n,d]``, and the index
-    ``[n]`` of each.
+    """Choose at most ``2**max_bits`` vectors that represent ``vectors [n,d]``, and the index ``[n]`` of each.
 
-    Groups are halved at the median of the coordinate in which they differ most; the means of the
-    last groups are the palette. Where there are few enough vectors, each is its own.
+    Groups are halved at the median of the coordinate in which they differ most; the means of the last groups are the
+    palette. Where there are few enough vectors, each is its own.
     """
     count = len(vectors)
     if count <= 2**max_bits:

@@ -25,15 +25,7 @@ import numpy as np
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry import rgb_to_sh0
 from gsmerge.io.bounds import check_file, read_errors
-from gsmerge.io.formats.arrays import (
-    Columns,
-    StoredRows,
-    from_smallest_three,
-    smallest_three,
-    to_bytes,
-    to_columns,
-    to_rows,
-)
+from gsmerge.io.formats import arrays
 from gsmerge.types import SH_C0, Gaussians
 
 VERSIONS = (3, 4)  # that are written; Spark 2.2 does not read 4
@@ -72,7 +64,7 @@ class _Header:
         return 6 if self.version == 1 else 9, 1, 3, 3, 4 if self.version > 2 else 3, harmonics
 
 
-def read_rows(path: Path) -> StoredRows:
+def read_rows(path: Path) -> arrays.StoredRows:
     """Read the Gaussians of a ``.spz``.
 
     Raises:
@@ -86,7 +78,7 @@ def read_rows(path: Path) -> StoredRows:
     header, parts = read(path, packed)
     sizes = {name: part.size for name, part in zip(ATTRIBUTES, parts, strict=True) if part.size}
     mip = bool(header.flags & MIP_FLAG)
-    return to_rows(_read_columns(parts, header), f".spz version {header.version}", sizes, mip=mip)
+    return arrays.to_rows(_read_columns(parts, header), f".spz version {header.version}", sizes, mip=mip)
 
 
 def _read_header(path: Path, packed: bytes, start: bytes, versions: Sequence[int]) -> _Header:
@@ -149,13 +141,13 @@ def _zstandard_parts(path: Path, packed: bytes) -> tuple[_Header, list[np.ndarra
     return header, [np.frombuffer(column, np.uint8).reshape(header.count, -1) for column in columns]
 
 
-def _read_columns(parts: list[np.ndarray], header: _Header) -> Columns:
+def _read_columns(parts: list[np.ndarray], header: _Header) -> arrays.Columns:
     version, fraction = header.version, header.fraction
     means, opacities, colors, scales, rotations, harmonics = parts
     words = np.zeros((header.count, 3, 4), np.uint8)  # signed numbers of three little-endian bytes
     if version > 1:
         words[..., 1:] = means.reshape(-1, 3, 3)
-    return Columns(
+    return arrays.Columns(
         means=means.view("<f2").astype(float) if version == 1 else (words.view("<i4")[..., 0] >> 8) / 2.0**fraction,
         quats=_read_rotations(rotations, version),
         log_scales=scales / 16 - 10,
@@ -174,14 +166,12 @@ def _read_rotations(stored: np.ndarray, version: int) -> np.ndarray:
     words = stored.view("<u4")[:, 0]  # the top two bits name the largest of xyzw
     parts = np.stack([words >> np.uint32(shift) & np.uint32(1023) for shift in (20, 10, 0)], 1)
     others = np.where(parts & 512, -1.0, 1.0) * (parts & 511) / (511 * np.sqrt(2.0))
-    return np.roll(from_smallest_three((words >> np.uint32(30)).astype(int), others), 1, axis=1)
+    return np.roll(arrays.from_smallest_three((words >> np.uint32(30)).astype(int), others), 1, axis=1)
 
 
 @dataclass(frozen=True)
 class SpzColumns:
-    """The content of a ``.spz`` of n Gaussians, with ``parts [n,bytes]`` uint8 in the order of the
-    file.
-    """
+    """The content of a ``.spz`` of n Gaussians, with ``parts [n,bytes]`` uint8 in the order of the file."""
 
     count: int
     degree: int  # of the harmonics
@@ -201,20 +191,31 @@ class SpzColumns:
 
 
 def spz_columns(gaussians: Gaussians, max_degree: int, *, mip: bool = False, fine: int = FINE) -> SpzColumns:
-    """Quantise Gaussians, positions to ``fine`` bits within the scene; ValueError if there is NaN
-    or inf.
-    """
-    columns = to_columns(gaussians, max_degree)
-    fraction = _fraction_bits(columns.means, fine)
+    """Quantise Gaussians, positions to ``fine`` bits within the scene; ValueError if there is NaN or inf."""
+    columns = arrays.to_columns(gaussians, max_degree)
+    fraction = 0  # bits behind the point, by the scene's size and its farthest Gaussian
+    if len(columns):
+        middle = np.median(columns.means, axis=0)
+        size = np.median(np.abs(columns.means - middle).max(axis=1))
+        enough = np.ceil(fine - np.log2(max(size, 1e-6)))
+        room = np.floor(np.log2(LARGEST / max(np.abs(columns.means).max(), 1e-6)))
+        fraction = int(np.clip(min(enough, room), 0, MAX_FRACTION))
     fixed = np.clip(np.round(columns.means * 2.0**fraction), -LARGEST, LARGEST).astype("<i4")
     steps = np.where(np.arange(columns.harmonics.shape[1]) < 3, 8, 16)[:, None]  # of degree 1, and above
     stepped = (np.round(np.clip(columns.harmonics, -2, 2) * 128) + 128 + steps // 2) // steps * steps
+    # rotations from the top: index of the largest of xyzw, then sign and magnitude of the others
+    largest, others = arrays.smallest_three(np.roll(columns.quats, -1, axis=1))
+    codes = np.minimum(np.floor(511 * np.abs(others) * np.sqrt(2.0) + 0.5), 511).astype(np.uint32)
+    codes |= (others < 0).astype(np.uint32) << np.uint32(9)
+    words = largest.astype(np.uint32) << np.uint32(30)
+    for i, shift in enumerate((20, 10, 0)):
+        words |= codes[:, i] << np.uint32(shift)
     parts = (
         fixed.view(np.uint8).reshape(-1, 3, 4)[..., :3].reshape(-1, 9),  # three little-endian bytes a coordinate
-        to_bytes(255 * columns.opacities)[:, None],
-        to_bytes(255 * (COLOR_SCALE * (columns.colors - 0.5) / SH_C0 + 0.5)),
-        to_bytes(16 * (columns.log_scales + 10)),
-        _rotation_bytes(columns.quats),
+        arrays.to_bytes(255 * columns.opacities)[:, None],
+        arrays.to_bytes(255 * (COLOR_SCALE * (columns.colors - 0.5) / SH_C0 + 0.5)),
+        arrays.to_bytes(16 * (columns.log_scales + 10)),
+        words.astype("<u4")[:, None].view(np.uint8),
         np.clip(stepped, 0, 255).astype(np.uint8).reshape(len(stepped), 3 * stepped.shape[1]),
     )
     degree = round((columns.harmonics.shape[1] + 1) ** 0.5) - 1
@@ -247,26 +248,3 @@ def zstandard() -> ModuleType:
     except ImportError as error:
         raise UsageError(f".spz of version 4: zstandard is not installed; {INSTALL}") from error
     return zstandard
-
-
-def _fraction_bits(means: np.ndarray, fine: int) -> int:
-    """Choose the bits behind the point from the scene's size and its farthest Gaussian."""
-    if len(means) == 0:
-        return 0
-    size = np.median(np.abs(means - np.median(means, axis=0)).max(axis=1))
-    wanted = fine - np.log2(max(size, 1e-6))
-    left = np.log2(LARGEST / max(np.abs(means).max(), 1e-6))
-    return int(np.clip(min(np.ceil(wanted), np.floor(left)), 0, MAX_FRACTION))
-
-
-def _rotation_bytes(quats: np.ndarray) -> np.ndarray:
-    """Pack rotations into ``[n,4]`` bytes: index of the largest of xyzw, then sign and magnitude of
-    the others.
-    """
-    largest, others = smallest_three(np.roll(quats, -1, axis=1))
-    parts = np.minimum(np.floor(511 * np.abs(others) * np.sqrt(2.0) + 0.5), 511).astype(np.uint32)
-    parts |= (others < 0).astype(np.uint32) << np.uint32(9)
-    words = largest.astype(np.uint32) << np.uint32(30)
-    for i, shift in enumerate((20, 10, 0)):
-        words |= parts[:, i] << np.uint32(shift)
-    return words.astype("<u4")[:, None].view(np.uint8)

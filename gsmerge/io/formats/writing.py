@@ -9,19 +9,8 @@ import numpy as np
 
 from gsmerge.errors import UsageError
 from gsmerge.io.atomic import atomic_output
-from gsmerge.io.formats import compressed, glb, sog, splat, spz
-from gsmerge.io.formats.arrays import Columns, to_columns
-from gsmerge.io.formats.ply_file import (
-    BLOCK_BYTES,
-    LOGIT_COMMENT,
-    MAX_LOGIT,
-    MEANS,
-    MIP_COMMENT,
-    NORMALS,
-    QUATS,
-    SCALES,
-    SH0,
-)
+from gsmerge.io.formats import compressed, glb, ply_file, sog, splat, spz
+from gsmerge.io.formats.arrays import to_columns
 from gsmerge.types import Gaussians, StrPath
 
 # File endings, the longest first, and the highest degree of the harmonics that there is room for.
@@ -92,7 +81,7 @@ def write_gaussians(
         write_ply(path, gaussians, overwrite=overwrite, comments=comments, normals=normals)
         return
     _check_comments(comments)
-    mip = MIP_COMMENT in comments
+    mip = ply_file.MIP_COMMENT in comments
     with atomic_output(path, overwrite=overwrite) as temporary:
         if ending == ".compressed.ply":
             content = compressed.compressed_bytes(gaussians, comments)
@@ -136,11 +125,23 @@ def write_ply(
     if not 0 <= degree <= gaussians.sh_degree:
         raise ValueError(f"sh_degree: expected 0 to {gaussians.sh_degree}, got {sh_degree}")
     header, num_columns = _header(len(gaussians), degree, comments, normals=normals)
-    block = max(1, BLOCK_BYTES // (4 * num_columns))
+    block = max(1, ply_file.BLOCK_BYTES // (4 * num_columns))
     with atomic_output(path, overwrite=overwrite) as temporary, temporary.open("wb") as file:
         file.write(header)
         for start in range(0, len(gaussians), block):
-            rows = _ply_rows(to_columns(gaussians[start : start + block], degree, start), normals=normals)
+            columns = to_columns(gaussians[start : start + block], degree, start)
+            with np.errstate(all="ignore"):  # opacities 0 and 1 are clipped, impossible ones become NaN
+                logits = np.log(columns.opacities) - np.log1p(-columns.opacities)
+            parts = [
+                columns.means,
+                np.zeros((len(columns), 3 * normals)),
+                columns.sh0,
+                columns.harmonics.transpose(0, 2, 1).reshape(len(columns), 3 * columns.harmonics.shape[1]),
+                np.clip(logits, -ply_file.MAX_LOGIT, ply_file.MAX_LOGIT)[:, None],
+                columns.log_scales,
+                columns.quats,
+            ]
+            rows = np.concatenate(parts, axis=1, dtype="<f4", casting="same_kind")
             if not np.isfinite(rows).all():
                 raise ValueError(f"expected finite Gaussians, got an opacity outside [0, 1] in the rows from {start}")
             file.write(rows.data)
@@ -154,28 +155,19 @@ def _check_comments(comments: Sequence[str]) -> None:
 def _header(count: int, sh_degree: int, comments: Sequence[str] = (), *, normals: bool = True) -> tuple[bytes, int]:
     """Return the header of a float32 ``.ply`` of ``count`` Gaussians, and its number of columns."""
     num_rest = 3 * ((sh_degree + 1) ** 2 - 1)
-    start = (*MEANS, *NORMALS) if normals else MEANS
-    names = [*start, *SH0, *(f"f_rest_{i}" for i in range(num_rest)), "opacity", *SCALES, *QUATS]
-    lines = ["ply", "format binary_little_endian 1.0", f"comment {LOGIT_COMMENT}"]
+    start = (*ply_file.MEANS, *ply_file.NORMALS) if normals else ply_file.MEANS
+    names = [
+        *start,
+        *ply_file.SH0,
+        *(f"f_rest_{i}" for i in range(num_rest)),
+        "opacity",
+        *ply_file.SCALES,
+        *ply_file.QUATS,
+    ]
+    lines = ["ply", "format binary_little_endian 1.0", f"comment {ply_file.LOGIT_COMMENT}"]
     lines += [*(f"comment {comment}" for comment in comments), f"element vertex {count}"]
     lines += [*(f"property float {name}" for name in names), "end_header", ""]
     return "\n".join(lines).encode("ascii"), len(names)
-
-
-def _ply_rows(columns: Columns, *, normals: bool) -> np.ndarray:
-    """Return ``[m,columns]`` float32 values in the order of the header."""
-    with np.errstate(all="ignore"):  # opacities 0 and 1 are clipped, impossible ones become NaN
-        logits = np.log(columns.opacities) - np.log1p(-columns.opacities)
-    parts = [
-        columns.means,
-        np.zeros((len(columns), 3 * normals)),
-        columns.sh0,
-        columns.harmonics.transpose(0, 2, 1).reshape(len(columns), 3 * columns.harmonics.shape[1]),
-        np.clip(logits, -MAX_LOGIT, MAX_LOGIT)[:, None],
-        columns.log_scales,
-        columns.quats,
-    ]
-    return np.concatenate(parts, axis=1, dtype="<f4", casting="same_kind")
 
 
 def file_bytes(count: int, sh_degree: int) -> int:

@@ -21,9 +21,8 @@ from gsmerge.measure.preview import to_picture
 from gsmerge.render.metrics import psnr
 from gsmerge.stages.segment import SegmentOptions, segment
 from gsmerge.types import Views
-from gsmerge.view import data, splats
-from gsmerge.view.data import ViewData, collect, encode_still, middle_depth, short_names
-from gsmerge.view.splats import pack_splats
+from gsmerge.view import data
+from gsmerge.view.data import ViewData, collect, encode_still, middle_depth, pack_splats, short_names
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +102,7 @@ def test_cameras_and_gaussians_are_in_one_frame(actual: ViewData, half: Gaussian
     """What a view sees in the world it sees in the page's frame."""
     raw = unpacked(actual.sides[1].splats)
     count, _, fraction = struct.unpack_from("<IBB", raw, 8)
-    drawn = half.means[half.opacities >= splats.MIN_OPACITY]
+    drawn = half.means[half.opacities >= data.MIN_OPACITY]
     assert count == len(drawn)
     triples = np.frombuffer(raw, np.uint8, 9 * count, 16).reshape(-1, 3)
     fixed = np.pad(triples, ((0, 0), (0, 1))).view("<i4")[:, 0]
@@ -116,7 +115,7 @@ def test_cameras_and_gaussians_are_in_one_frame(actual: ViewData, half: Gaussian
 
 
 def test_too_many_gaussians_are_left_out(scene: Scene, half: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(splats, "MAX_GAUSSIANS", len(half) + 1)
+    monkeypatch.setattr(data, "MAX_GAUSSIANS", len(half) + 1)
     actual = collect("room", scene, {"half": half}, (2, 1))
     assert actual.sides[0].splats is None
     assert actual.sides[1].splats is not None
@@ -126,7 +125,7 @@ def test_too_many_gaussians_are_left_out(scene: Scene, half: Gaussians, monkeypa
 def test_harmonics_that_do_not_fit_are_left_out(half: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
     curved = replace(half, shN=np.full((len(half), 15, 3), 0.1, np.float32))
     assert pack_splats(curved)[1] == 3
-    monkeypatch.setattr(splats, "MAX_SPZ_BYTES", 45 * len(half))
+    monkeypatch.setattr(data, "MAX_SPZ_BYTES", 45 * len(half))
     content, degree = pack_splats(curved)
     assert degree == 2
     assert len(unpacked(content)) < 45 * len(half)
