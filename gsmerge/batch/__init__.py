@@ -1,4 +1,4 @@
-"""Many scenes: each on its own, recorded as soon as it is done, on this machine or on a cluster."""
+"""Compact many scenes, each on its own and recorded at once, on this machine or on a cluster."""
 
 from gsmerge.batch.batch_options import BatchOptions
 from gsmerge.batch.find import Job, find_jobs

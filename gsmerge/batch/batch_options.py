@@ -39,7 +39,23 @@ class BatchOptions:
     address: str | None = None  # of the Ray cluster; None: one of this machine alone, started for the run
 
     def __post_init__(self) -> None:
-        check_template(self.output)
+        try:
+            names = [name for _, name, _, _ in Formatter().parse(self.output) if name is not None]
+            example = self.output.format(**dict.fromkeys(FIELDS, 1))
+        except (ValueError, LookupError, AttributeError, TypeError):
+            names, example = [""], ""
+        known, endings = ", ".join(f"{{{name}}}" for name in FIELDS), tuple(OUTPUT_FORMATS)
+        is_outside = example.startswith(("/", "~", ".")) or ".." in example.split("/")
+        for is_possible, expected in (
+            (all(name in FIELDS for name in names), f"{known} in braces"),
+            (example.lower().endswith(endings), f"a name that ends in {', '.join(endings)}"),
+            (
+                not is_outside and "\\" not in example and "\0" not in example,
+                "a name inside the output folder, not hidden",
+            ),
+        ):
+            if not is_possible:
+                raise ValueError(f"output: expected {expected}, got {self.output!r}")
         budget = self.settings.budget
         if budget.in_bytes and output_format(self.output) != ".ply":
             raise ValueError(f"budget {budget.budget}: expected an output as .ply, got {self.output}; give a number")
@@ -65,19 +81,3 @@ class BatchOptions:
     def name(self) -> str:
         """Return a digest that is equal for runs that make the same results."""
         return digest({**self.result_settings(), "output": self.output, "cameras": self.cameras, "images": self.images})
-
-
-def check_template(template: str) -> None:
-    """Raise a ValueError if a template has other fields than ``FIELDS``, an unknown ending, or leaves the folder."""
-    try:
-        names = [name for _, name, _, _ in Formatter().parse(template) if name is not None]
-        example = template.format(**dict.fromkeys(FIELDS, 1))
-    except (ValueError, LookupError, AttributeError, TypeError):
-        names, example = [""], ""
-    if any(name not in FIELDS for name in names):
-        known = ", ".join(f"{{{name}}}" for name in FIELDS)
-        raise ValueError(f"output: expected {known} in braces, got {template!r}")
-    if not example.lower().endswith(tuple(OUTPUT_FORMATS)):
-        raise ValueError(f"output: expected a name that ends in {', '.join(OUTPUT_FORMATS)}, got {template!r}")
-    if example.startswith(("/", "~", ".")) or ".." in example.split("/") or "\\" in example or "\0" in example:
-        raise ValueError(f"output: expected a name inside the output folder, not hidden, got {template!r}")

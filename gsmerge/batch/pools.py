@@ -1,8 +1,7 @@
 """Compact the scenes of a batch side by side: in processes on this machine, or on a Ray cluster.
 
-A process takes scene after scene; one that dies affects no other scene. Ray is an extra, imported only for
-``engine="ray"``. It schedules by a scene's threads and memory, and reports lost tasks; retries, records and locks
-are those of any other run. Scenes and output folder must have the same paths on all nodes.
+A process takes scene after scene; one that dies affects no other scene. Ray, an extra, schedules by threads and
+memory; scenes and output folder must have the same paths on all its nodes.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Protocol
+from typing import Any
 
 from gsmerge.batch.batch_options import BatchOptions
 from gsmerge.batch.records import LOST, RecordIndex, record
@@ -37,23 +36,6 @@ LIBRARIES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 EXTRA_TASKS = 2  # submitted beyond those that the cluster has processors for
 CONNECT_TIMEOUT = 10.0  # seconds to reach a cluster
 CLUSTER_SIZE_SECONDS = 5.0  # between two queries of the cluster's size
-
-
-class Pool(Protocol):
-    """A pool that compacts scenes side by side."""
-
-    @property
-    def has_room(self) -> bool:
-        """Whether another scene can be taken."""
-
-    def submit(self, task: Task) -> None:
-        """Take a scene."""
-
-    def wait(self, seconds: float) -> list[tuple[Task, dict[str, Any]]]:
-        """Wait for at most so many seconds; return the scenes that ended, with their records."""
-
-    def close(self) -> None:
-        """End all processes; unfinished scenes are left as they were."""
 
 
 class Worker:
@@ -207,9 +189,7 @@ def require_ray() -> ModuleType:
 
 
 class RayPool:
-    """A pool of ``jobs`` tasks of a Ray cluster, 0: by its processors; UsageError without Ray, SceneError without a
-    cluster.
-    """
+    """A pool of ``jobs`` tasks of a Ray cluster; 0: as many as it has processors for."""
 
     def __init__(self, context: BatchContext, jobs: int) -> None:
         self.ray = require_ray()

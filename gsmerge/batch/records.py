@@ -123,13 +123,6 @@ def record(status: str, scene: str, output: str, **facts: Any) -> dict[str, Any]
     return {**document_head(), "status": status, "scene": scene, "output": output, **blank, **place, **facts}
 
 
-def written_files(folder: Path, names: Sequence[str]) -> list[dict[str, Any]]:
-    """Describe the files of a result for its record."""
-    return [
-        {"path": name, "sha256": file_sha256(folder / name), "bytes": (folder / name).stat().st_size} for name in names
-    ]
-
-
 def check_folder(folder: Path) -> None:
     """Make the output folder; SceneError if records cannot be written to it."""
     try:
@@ -193,7 +186,7 @@ def write_summary(folder: Path) -> Path:
 
 
 def newest_records(folder: Path, keep: Callable[[dict[str, Any]], T]) -> dict[str, T]:
-    """Apply ``keep`` to the newest record of every result; to the finished one before a skipped one."""
+    """Apply ``keep`` to the newest record of every result, but for a skipped one to its finished record."""
     newest: dict[str, T] = {}
     done: dict[str, T] = {}
     for _, record in each_line(folder / RECORDS):

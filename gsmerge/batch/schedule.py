@@ -14,7 +14,7 @@ from typing import Any
 
 from gsmerge.batch.batch_options import BatchOptions
 from gsmerge.batch.find import Job
-from gsmerge.batch.pools import LocalPool, Pool, RayPool, with_whole_paths
+from gsmerge.batch.pools import LocalPool, RayPool, with_whole_paths
 from gsmerge.batch.records import BUSY, LOST, RECORDS, STUCK, RecordIndex, check_folder
 from gsmerge.batch.task import BatchContext, Task, record_failure, run_lock
 from gsmerge.errors import SceneError
@@ -92,15 +92,12 @@ def run_batch(
     index: RecordIndex | None = None,
     schedule: Schedule | None = None,
 ) -> Generator[dict[str, Any], None, None]:
-    """Compact scenes, each on its own; those that are done are skipped.
+    """Compact scenes, each on its own, and skip those that are finished.
 
-    Each is recorded in ``folder/batch.jsonl`` before its record is yielded, in any order, so that a run that ends at
-    any moment can be continued. Runs with the same settings may share a folder: each scene is compacted by one of them.
-    ``index``, the folder's records, and ``schedule`` are made if they are not given.
-
-    Raises:
-        SceneError: If the folder cannot be written.
-        UsageError: If a batch with other settings uses the folder, or the engine is not installed.
+    Each is recorded in ``folder/batch.jsonl`` before its record is yielded, in any order, so that a run that ends
+    at any moment can be continued. Runs with the same settings may share a folder. ``index``, the folder's records,
+    and ``schedule`` are made if they are not given. SceneError if the folder cannot be written, UsageError if a
+    batch with other settings uses it, or the engine is not installed.
     """
     schedule = schedule or make_schedule(jobs, options)
     check_folder(folder)
@@ -110,7 +107,7 @@ def run_batch(
     with ExitStack() as stack:
         stack.enter_context(run_lock(folder, options.name()))
         options = replace(options, settings=replace(options.settings, threads=schedule.threads))
-        pool: Pool
+        pool: LocalPool | RayPool
         if options.engine == "ray":
             context = BatchContext(folder.absolute(), with_whole_paths(options), index.end)
             pool = RayPool(context, schedule.jobs)
@@ -121,7 +118,7 @@ def run_batch(
         yield from dispatch((Task(job, index.known.get(job.output)) for job in jobs), pool, context)
 
 
-def dispatch(tasks: Iterator[Task], pool: Pool, context: BatchContext) -> Iterator[dict[str, Any]]:
+def dispatch(tasks: Iterator[Task], pool: LocalPool | RayPool, context: BatchContext) -> Iterator[dict[str, Any]]:
     """Keep a pool busy until every scene has ended; SceneError if nothing can be recorded."""
     retried: deque[Task] = deque()  # their process died
     busy: deque[tuple[float, Task]] = deque()  # another run works on them; when to try again, and the task

@@ -31,7 +31,6 @@ from gsmerge.batch.records import (
     DoneResult,
     RecordIndex,
     record,
-    written_files,
 )
 from gsmerge.compact_file import compact_files
 from gsmerge.errors import SceneError, UsageError, error_line
@@ -135,7 +134,11 @@ def _compact(task: Task, context: BatchContext, files: SceneFiles, key: str) -> 
             document, written = job.work.run(files, options, out)
     document["notes"] += list(dict.fromkeys(str(warning.message) for warning in caught))
     names = [os.path.relpath(path, context.folder) for path in written]
-    facts = {"key": key, "files": written_files(context.folder, names), "report": finite(document)}
+    described = [
+        {"path": name, "sha256": file_sha256(path), "bytes": path.stat().st_size}
+        for name, path in zip(names, written, strict=True)
+    ]
+    facts = {"key": key, "files": described, "report": finite(document)}
     return record(DONE, job.scene, job.output, attempt=task.attempt, **facts)
 
 

@@ -70,7 +70,16 @@ def _list(name: str, help: str, wording: str) -> Parameter:
 def chart(args: opt.Args) -> None:
     """Run a grid of settings over scenes, resumable, and draw charts and a page of all results in the folder."""
     scenes, out = args.scenes or [], args.output
-    _check_usage(args, scenes, out)
+    if args.draw_only == bool(scenes):
+        raise UsageError("expected scenes to run, or --draw-only without any")
+    if args.draw_only and args.dry_run:
+        raise UsageError("--dry-run: expected something to run, got --draw-only")
+    if os.path.lexists(out) and not out.is_dir():
+        raise UsageError(f"--output: expected a folder, found the file {out}")
+    if not args.dry_run:
+        from gsmerge.research.charts import require_matplotlib
+
+        require_matplotlib()
     if args.draw_only:
         _draw(args, [], 0)
         return
@@ -94,20 +103,6 @@ def chart(args: opt.Args) -> None:
     check_failures(totals, "runs")
 
 
-def _check_usage(args: opt.Args, scenes: Sequence[str], out: Path) -> None:
-    """Refuse wrong usage before anything heavy is loaded."""
-    if args.draw_only == bool(scenes):
-        raise UsageError("expected scenes to run, or --draw-only without any")
-    if args.draw_only and args.dry_run:
-        raise UsageError("--dry-run: expected something to run, got --draw-only")
-    if os.path.lexists(out) and not out.is_dir():
-        raise UsageError(f"--output: expected a folder, found the file {out}")
-    if not args.dry_run:
-        from gsmerge.research.charts import require_matplotlib
-
-        require_matplotlib()
-
-
 def _make_jobs(args: opt.Args, scenes: Sequence[str]) -> tuple[list[Job], BatchOptions, list[str]]:
     """Make the jobs of the grid, the options of their batch, and notes."""
     from gsmerge.batch import BatchOptions
@@ -125,19 +120,15 @@ def _make_jobs(args: opt.Args, scenes: Sequence[str]) -> tuple[list[Job], BatchO
         # one at a time, so that none slows another
         options = BatchOptions(settings, args.opacity, args.hints(), jobs=1, rerun=args.rerun, overwrite=True)
     sources = find_sources(scenes, args.output, args.targets, args.target_images)
-    more: dict[str, Any] = {"seed": settings.seed, "proxy_views": args.proxy_views, "command": _command(args, scenes)}
-    jobs, left_out = make_jobs(sources, grid, measured, **more)
-    return jobs, options, [*notes, *left_out]
-
-
-def _command(args: opt.Args, scenes: Sequence[str]) -> str:
-    """Write the command line that does the same, without options left at their default."""
+    # the command line that does the same, without options at their defaults
     words = ["gsmerge", "chart", *scenes, "--output", str(args.output)]
     names = [*LISTS, "fixed", "grid", "targets", "target_images", "hint", "lpips", "lpips_views", "proxy_views"]
     for name, value in args.given([*names, "seed", "threads"]).items():
         for one in value if isinstance(value, list) else [value]:
             words += [f"--{name.replace('_', '-')}", str(one)]
-    return shlex.join(words)
+    more: dict[str, Any] = {"seed": settings.seed, "proxy_views": args.proxy_views, "command": shlex.join(words)}
+    jobs, left_out = make_jobs(sources, grid, measured, **more)
+    return jobs, options, [*notes, *left_out]
 
 
 def _draw(args: opt.Args, notes: Sequence[str], num_done: int) -> None:

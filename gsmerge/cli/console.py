@@ -124,8 +124,7 @@ def _terminal(*, quiet: bool) -> Any:
 def stage_progress(*, quiet: bool) -> Iterator[Progress]:
     """Show a progress bar per stage on stderr, unless quiet or without a terminal (``FORCE_COLOR`` makes one).
 
-    Yields ``(stage, done, total) -> None``. A stage is done when the next one begins; one of
-    :data:`gsmerge.runtime.record.STAGES` without a detail counts no steps of its own.
+    Yields ``(stage, done, total) -> None``; a stage is done when the next one begins.
     """
     console = _terminal(quiet=quiet)
     if console is None:

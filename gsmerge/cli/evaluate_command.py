@@ -160,19 +160,14 @@ def _write(outputs: Sequence[Path], document: Mapping[str, Any], given: BeforeAf
     from gsmerge.report import to_json
 
     writers = {".json": to_json, ".csv": evaluation_csv, ".md": evaluation_markdown}
-    texts = {}
-    for path in outputs:
-        texts[path] = _page(document, given) if path.suffix == ".html" else writers[path.suffix](document)
+    texts = {path: writers[path.suffix](document) for path in outputs if path.suffix in writers}
+    if len(texts) < len(outputs):
+        from gsmerge.measure.evaluate import near_plane
+        from gsmerge.measure.preview import view_pictures
+        from gsmerge.view.page import report_page
+
+        scene = given.scene
+        parts, near = [("before", scene.file_gaussians), *given.gaussians.items()], near_plane(scene)
+        pictures = view_pictures(parts, scene.cameras, scene.images, max_views=PAGE_VIEWS, near=near)
+        texts |= {path: report_page(document, pictures) for path in outputs if path not in texts}
     write_texts(texts, overwrite=overwrite)
-
-
-def _page(document: Mapping[str, Any], given: BeforeAfter) -> str:
-    """Make the page, with pictures of some views."""
-    from gsmerge.measure.evaluate import near_plane
-    from gsmerge.measure.preview import view_pictures
-    from gsmerge.view.page import report_page
-
-    scene = given.scene
-    parts = [("before", scene.file_gaussians), *given.gaussians.items()]
-    near = near_plane(scene)
-    return report_page(document, view_pictures(parts, scene.cameras, scene.images, max_views=PAGE_VIEWS, near=near))

@@ -63,10 +63,8 @@ class Args(SimpleNamespace):
         return {name: values[name] for name in names if values.get(name) is not None}
 
     def make(self, *kinds: type, **changes: Any) -> list[Any]:
-        """Make settings of each dataclass of ``kinds``, from options of their own and from ``--set``.
-
-        ``changes`` are values that the user cannot choose. UsageError if a name is unknown or given twice, or a
-        value is out of range.
+        """Make settings of the dataclasses ``kinds`` from options, ``--set`` and fixed ``changes``; UsageError if
+        wrong.
         """
         values = self.values(*kinds, but=changes) | changes
         own = [{name: values[name] for name in setting_kinds(kind) if name in values} for kind in kinds]
@@ -138,9 +136,7 @@ def setting_kinds(options: Any) -> dict[str, Any]:
 
 
 def parse_pairs(flag: str, pairs: Iterable[str], kinds: Mapping[str, Any]) -> dict[str, Any]:
-    """Parse the NAME=VALUE of ``--set`` or ``--hint``, as JSON where that fits; UsageError on an unknown name or
-    value.
-    """
+    """Parse the NAME=VALUE of ``--set`` or ``--hint``, as JSON where that fits; UsageError if one is wrong."""
     values: dict[str, Any] = {}
     for pair in pairs:
         name, sign, text = pair.partition("=")
@@ -201,16 +197,10 @@ def argument(name: str, kind: Any, metavar: str, help: str, default: Any = REQUI
 def option(
     name: str, kind: Any, help: str, *flags: str, default: Any = None, wording: str | None = None, **more: Any,
 ) -> Parameter:  # fmt: skip
-    """Declare an option.
+    """Declare an option; ``kind`` bool is a switch, a tuple lists the possible values.
 
-    Args:
-        name: In :class:`Args`, and on the command line with dashes.
-        kind: Its type: bool is a switch, a tuple lists the possible values.
-        help: For the reader.
-        flags: On the command line, where they are not made of the name.
-        default: Value where it is not given.
-        wording: How help words the default, where that is left to the library.
-        more: Passed on to Typer.
+    ``flags`` are needed where they are not made of the name. ``wording`` is the default in help, where the library
+    decides it; ``more`` goes to Typer.
     """
     flags = flags or (f"--{name.replace('_', '-')}",)
     if isinstance(kind, tuple):

@@ -14,7 +14,8 @@ from gsmerge.cli.paths import check_cameras, check_folder, check_outputs, input_
 from gsmerge.errors import SceneError, UsageError
 
 if TYPE_CHECKING:
-    from gsmerge.io import CamerasInScene, SceneFiles
+    from gsmerge.io import SceneFiles
+    from gsmerge.io.scene import SceneViews
     from gsmerge.measure.preview import Picture
     from gsmerge.types import Gaussians
 
@@ -90,9 +91,9 @@ def _plan_panel(args: opt.Args, files: SceneFiles) -> Drawing:
     like = _frame_files(args, files)
     inputs = (*args.scenes, *input_files(files), *input_files(like))
     check_outputs((args.output,), inputs, overwrite=args.overwrite or args.dry_run)
-    scenes, placed = _read(args, files, like, photos=True)
-    used = list(placed.views.used)
-    cameras, photos = placed.views.cameras[used], placed.views.images
+    scenes, views, notes = _read(args, files, like, photos=True)
+    used = list(views.used)
+    cameras, photos = views.cameras[used], views.images
     ids = _choose(args, len(used), PANEL_VIEWS)
 
     def draw(_: int) -> Iterator[Picture]:
@@ -104,7 +105,7 @@ def _plan_panel(args: opt.Args, files: SceneFiles) -> Drawing:
         yield contact_sheet(view_pictures(parts, cameras, own, max_views=len(ids), **how))
 
     counts = {str(path): len(gaussians) for path, gaussians in zip(args.scenes, scenes, strict=True)}
-    return [args.output], {"scenes": counts, "views": ids, "photos": photos is not None, "notes": placed.notes}, draw
+    return [args.output], {"scenes": counts, "views": ids, "photos": photos is not None, "notes": notes}, draw
 
 
 def _plan_views(args: opt.Args, files: SceneFiles) -> Drawing:
@@ -112,9 +113,9 @@ def _plan_views(args: opt.Args, files: SceneFiles) -> Drawing:
     like = _frame_files(args, files)
     inputs = (*input_files(files), *input_files(like))
     check_folder(args.output, inputs, overwrite=args.overwrite or args.dry_run)
-    (gaussians,), placed = _read(args, files, like, photos=False)
-    ids = _choose(args, len(placed.views.cameras))
-    views, stems = placed.views.cameras[ids], picture_stems(placed.views.names)
+    (gaussians,), placed, notes = _read(args, files, like, photos=False)
+    ids = _choose(args, len(placed.cameras))
+    views, stems = placed.cameras[ids], picture_stems(placed.names)
 
     def draw(threads: int) -> Iterator[Picture]:
         from gsmerge.measure.preview import to_picture
@@ -126,7 +127,7 @@ def _plan_views(args: opt.Args, files: SceneFiles) -> Drawing:
             yield from map(to_picture, drawn.images)
 
     facts = {"width": views.width, "height": views.height, "num_gaussians": len(gaussians)}
-    return [args.output / f"{stems[i]}.png" for i in ids], {**facts, "views": ids, "notes": placed.notes}, draw
+    return [args.output / f"{stems[i]}.png" for i in ids], {**facts, "views": ids, "notes": notes}, draw
 
 
 def _plan_superpixels(args: opt.Args, files: SceneFiles) -> Drawing:
@@ -174,7 +175,7 @@ def _frame_files(args: opt.Args, files: SceneFiles) -> SceneFiles:
 
 def _read(
     args: opt.Args, files: SceneFiles, like: SceneFiles, *, photos: bool
-) -> tuple[list[Gaussians], CamerasInScene]:
+) -> tuple[list[Gaussians], SceneViews, list[str]]:
     """Read the scenes, and place the cameras in the frame of ``like``; notes are returned with them."""
     hints = args.hints()
     if not photos and hints.max_side == type(hints)().max_side:
@@ -186,16 +187,16 @@ def _read(
     others = [read_gaussians(path, opacity=args.opacity) for path in args.scenes[1:]]
     own = like.ply == files.ply
     framed = first if own else read_gaussians(like.ply)
-    placed = place_cameras_in_scene(framed, like, hints=hints, photos=photos)
-    scenes = [placed.gaussians if own else first.gaussians, *(ply.gaussians for ply in others)]
-    notes = [*([] if own else ply_notes(first.info)), *placed.notes]
+    gaussians, views, placing = place_cameras_in_scene(framed, like, hints=hints, photos=photos)
+    scenes = [gaussians if own else first.gaussians, *(ply.gaussians for ply in others)]
+    notes = [*([] if own else ply_notes(first.info)), *placing]
     if others:
         names = [str(path) for path in args.scenes]
         notes = [f"{names[0]}: {note}" for note in notes]
         notes += [
             f"{name}: {note}" for name, ply in zip(names[1:], others, strict=True) for note in ply_notes(ply.info)
         ]
-    return scenes, replace(placed, notes=tuple(notes))
+    return scenes, views, notes
 
 
 def picture_stems(names: Sequence[str]) -> list[str]:

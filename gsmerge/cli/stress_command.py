@@ -56,7 +56,7 @@ def stress(args: opt.Args) -> None:
 
 
 def _lines(outcomes: Sequence[StressOutcome]) -> list[str]:
-    """Write one line for each case, and how many held."""
+    """Write one line for each case, and the number of passed cases."""
     marks = {True: "held", False: "FAILED", None: "-"}
     width = max((len(outcome.change) for outcome in outcomes), default=0)
     lines = [f"{marks[o.passed]:<7} {o.change:<{width}}  {o.measured}" for o in outcomes]

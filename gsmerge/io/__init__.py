@@ -1,8 +1,6 @@
 """Files: the only place that knows their formats."""
 
-from gsmerge.io.alignment import Alignment as Alignment
 from gsmerge.io.alignment import Recovery as Recovery
-from gsmerge.io.alignment import check_alignment as check_alignment
 from gsmerge.io.atomic import atomic_output as atomic_output
 from gsmerge.io.atomic import atomic_outputs as atomic_outputs
 from gsmerge.io.bounds import read_json as read_json
@@ -26,7 +24,6 @@ from gsmerge.io.formats.writing import write_ply as write_ply
 from gsmerge.io.held_out import HeldOutViews as HeldOutViews
 from gsmerge.io.held_out import read_held_out as read_held_out
 from gsmerge.io.photo_files import read_images as read_images
-from gsmerge.io.scene import CamerasInScene as CamerasInScene
 from gsmerge.io.scene import SceneLoad as SceneLoad
 from gsmerge.io.scene import align_scene as align_scene
 from gsmerge.io.scene import as_scene as as_scene

@@ -34,18 +34,10 @@ _written: set[str] = set()  # the temporary files of this process
 
 @contextmanager
 def atomic_output(path: StrPath, *, overwrite: bool = False) -> Iterator[Path]:
-    """Yield a temporary file that is renamed to ``path`` when the block succeeds.
+    """Yield an empty file beside ``path``, of the same suffix, that is renamed to it when the block succeeds.
 
-    Args:
-        path: The file to be written. Its folder must exist. A link stays one: the file that it leads to is replaced.
-        overwrite: Replace an existing file; without it one is refused, before the block is entered.
-
-    Yields:
-        An empty file in the same folder with the same suffix, to be written by the block. For a file that such a block
-        yielded, the file itself.
-
-    Raises:
-        SceneError: If the file exists and may not be replaced, or the folder cannot be written.
+    The folder must exist. A link stays one: the file that it leads to is replaced. For a path that came from an outer
+    block, that file itself. SceneError if the file exists and ``overwrite`` is False, or it cannot be written.
     """
     with atomic_outputs(overwrite=overwrite) as add:
         yield add(Path(path))

@@ -58,20 +58,16 @@ Photos = Sequence[np.ndarray] | np.ndarray | PhotoReader  # c of [h,w,3], uint8 
 def read_images(source: ImageSource, names: Sequence[str]) -> np.ndarray:
     """Read the image of every view: ``[c,h,w,3]`` float32, sRGB in [0, 1], in the order of ``names``.
 
-    Args:
-        source: A folder (with its sub-folders), or the image files themselves.
-        names: One per view, as camera files give them: with or without folders and extension. If no name matches but
-            there are as many images as names, the images are taken in order (of their names with numbers counted as
-            numbers, or of the list).
-
-    Raises:
-        SceneError: If an image is missing or cannot be read, or two differ in size.
+    ``source`` is a folder with its sub-folders, or the image files. ``names`` are those of a camera file, with or
+    without folders and extension. If no name matches but there are as many images as names, the images are taken in
+    order (numbers in their names count as numbers). SceneError if an image is missing or cannot be read, or two
+    differ in size.
     """
     return as_floats(decode_images(match_images(source, names)))
 
 
 def decode_images(paths: Sequence[Path]) -> Photos:
-    """Decode image files to ``[h,w,3]`` uint8; many large ones are decoded at each use. SceneError if sizes differ."""
+    """Decode image files of one size to ``[h,w,3]`` uint8 each; many large files are decoded at each use."""
     sizes = [image_size(path) for path in paths]
     for path, (w, h) in zip(paths, sizes, strict=True):
         if (w, h) != sizes[0]:

@@ -312,35 +312,22 @@ def color_notes(scene: Scene) -> list[str]:
     photos = scene.images.reshape(len(scene), -1, 3)[:, ::step].mean(-1)
     valid = scene.stored.reshape(len(scene), -1)[:, ::step]
     views = zip(scene.names, colors, photos, valid, strict=True)
-    odd = [name for name, color, photo, ok in views if _correlation(color[ok], photo[ok]) < _MIN_CORRELATION]
+    odd = []
+    for name, color, photo, ok in views:
+        varies = ok.sum() >= 16 and min(color[ok].std(ddof=1), photo[ok].std(ddof=1)) >= 0.01
+        if varies and np.corrcoef(color[ok], photo[ok])[0, 1] < _MIN_CORRELATION:
+            odd.append(name)
     return [f"{len(odd)} of {len(scene)} images do not look like their Gaussians, for example {odd[0]}"] if odd else []
-
-
-def _correlation(a: np.ndarray, b: np.ndarray) -> float:
-    """Compute Pearson's correlation, 1 where one of the two hardly varies."""
-    if len(a) < 16 or min(a.std(ddof=1), b.std(ddof=1)) < 0.01:
-        return 1.0
-    return float(np.corrcoef(a, b)[0, 1])
-
-
-@dataclass(frozen=True)
-class CamerasInScene:
-    """Gaussians and views in one frame."""
-
-    gaussians: Gaussians  # the file's, with rotations read as the scene has them
-    views: SceneViews  # of the camera file
-    notes: tuple[str, ...]  # what was adapted or looks odd, one sentence each, without a full stop
 
 
 def place_cameras_in_scene(
     ply: PlyScene, files: SceneFiles, *, hints: ReadHints = AUTO, photos: bool = True
-) -> CamerasInScene:
+) -> tuple[Gaussians, SceneViews, tuple[str, ...]]:
     """Move views into the frame of the Gaussians, if pixels or colours show it; otherwise keep their file's.
 
-    ``photos`` that cannot be read are an error; with False they are left out.
-
-    Raises:
-        SceneError: If there are no cameras, or they have no size.
+    Returns the Gaussians with rotations as the scene has them, the views of the camera file, and notes. ``photos``
+    that cannot be read are an error; with False they are left out. SceneError if there are no cameras, or they have
+    no size.
     """
     camera_file = read_scene_cameras(ply, files)
     for with_photos in (True,) if photos else (True, False):
@@ -350,10 +337,10 @@ def place_cameras_in_scene(
             continue
         aligned = load.scene.aligned
         notes = load.notes if aligned else load.notes[:-1]  # except the one that there are no pixels
-        return CamerasInScene(load.scene.file_gaussians, load.views, notes)
+        return load.scene.file_gaussians, load.views, notes
     pictures = stored_photos(files, camera_file) if photos else None
     images = None if pictures is None else as_floats(pictures)
     cameras = to_cameras(camera_file, photo_size(pictures))
     views = SceneViews(cameras, images, camera_file.names, tuple(range(len(cameras))))
     note = "the cameras do not fit the Gaussians and stay as their file has them"
-    return CamerasInScene(ply.gaussians, views, (*ply_notes(ply.info), note))
+    return ply.gaussians, views, (*ply_notes(ply.info), note)

@@ -183,15 +183,9 @@ def find_large_photos(
 ) -> LargePhotos | None:
     """Find the photos at the size of their files, where that is larger than the scene's; None where it is not.
 
-    Files are read again when a photo is asked for; what other files hold inside stays in memory.
-
-    Args:
-        files: Of the scene.
-        camera_file: As it was read, with lenses.
-        photos: The photos as :func:`stored_photos` gave them, undistorted.
-        size: Theirs when they were fitted to the rows.
-        transform: What was done to them then.
-        cameras: Of the scene's grid, in the order of the camera file.
+    Files are read again when a photo is asked for; photos inside other files stay in memory. ``photos`` are those
+    of :func:`stored_photos`, undistorted; ``size`` is theirs when they were fitted to the rows by ``transform``;
+    ``cameras`` are those of the scene's grid, in the order of the camera file.
     """
     paths = _photo_paths(files, camera_file) if photos is not None else None
     stored = photo_size(photos) if paths is None else image_size(paths[0])

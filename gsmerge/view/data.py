@@ -92,16 +92,8 @@ def collect(
 ) -> ViewData:
     """Draw and measure a scene, which has at least one view, and its results in all views.
 
-    Args:
-        title: Name of the scene.
-        scene: With at least one view.
-        results: Gaussians by name, in the scene's world.
-        file_bytes: Sizes of the scene's file and of those of the results.
-        held_out: Views that were no input.
-        cameras: As of :func:`gsmerge.evaluate`; stills and scores are from there, 3D from the scene's own.
-        segmentation: How the input photos are cut into superpixels; None: as by default.
-        threads: Threads to use; None: all processors.
-        progress: As of :func:`gsmerge.evaluate`.
+    ``results`` are Gaussians by name in the scene's world, ``file_bytes`` the sizes of the scene's file and of
+    theirs. Stills and scores are from ``cameras`` (as of :func:`gsmerge.evaluate`), 3D from the scene's own.
     """
     splits = {"context": (scene.cameras.numpy(), scene.images, scene.names)}
     splits |= {} if held_out is None else {"target": (held_out.cameras.numpy(), held_out.images, held_out.names)}

@@ -117,7 +117,8 @@ def align(
 ) -> AlignmentResult:
     """Find the pixel of every row; for rows that belong to none, the poses from which the cameras see them.
 
-    The size of the grid, the frame and the convention of the poses, and what was done to the photos are found too.
+    The size of the grid, the frame and the convention of the poses, and the transform of the photos are searched
+    too.
 
     Args:
         ply: The file's rows.
@@ -188,8 +189,8 @@ def _change_size(
 ) -> AlignmentResult | None:
     """Find the other size that puts the Gaussians nearest to their pixels; None where grids of two sizes do.
 
-    Sizes that only the number of rows suggests may be many, so they are tried in the cameras' own frame first; with
-    ``exact_frames`` all are tried in that frame only.
+    Sizes that only the number of rows suggests are tried in the cameras' own frame first; with ``exact_frames`` all
+    are.
     """
     recoveries: list[tuple[GridFit, Recovery]] = []
     guesses: list[GridFit] = []
@@ -233,7 +234,7 @@ def _change_poses(
     fits = []
     for poses in other_conventions(camera_file.viewmats, camera_file.convention):
         other = replace(camera_file, viewmats=poses.viewmats, convention=poses.convention)
-        result = read(other, poses.note(camera_file.convention))
+        result = read(other, f"{poses.describe(camera_file.convention)}: read so")
         if result is not None and result.recovery is not None:
             fits.append((result.recovery.best.worst_px, poses.description, result))
     fits.sort(key=lambda one: one[0])
@@ -255,8 +256,7 @@ def _read_poses(inputs: AlignmentInput, grid: GridFit, camera_file: CameraFile, 
 def _move_cameras(inputs: AlignmentInput, camera_file: CameraFile, grid: GridFit) -> AlignmentResult | None:
     """Read a file without missing pixels under slightly moved cameras; None where that does not fit.
 
-    None, too, where the poses fit in another convention, or the photos' colours disagree: views in the wrong order
-    look like inexact cameras. SceneError as of :func:`move_cameras`.
+    None, too, where another convention fits or the photos' colours disagree: views in the wrong order look the same.
     """
     if inputs.scale is not None:
         return None

@@ -81,10 +81,6 @@ class Poses:
         """Write that these poses fit, in place of those in the format's ``usual`` convention."""
         return f"the poses fit when read as {self.description}, where this format has {usual[0]} with {usual[1]} axes"
 
-    def note(self, usual: Convention) -> str:
-        """Write that the poses are read in this convention."""
-        return f"{self.describe(usual)}: read so"
-
 
 def other_conventions(viewmats: np.ndarray, convention: Convention) -> list[Poses]:
     """Read poses ``viewmats [c,4,4]`` in all other conventions, without repetitions."""
@@ -193,8 +189,8 @@ def choose_cameras(
     if poses is None:
         return inputs.cameras, camera_file, [note] if note else []
     cameras = replace(inputs.cameras, viewmats=poses.viewmats)
-    notes = [poses.note(camera_file.convention)]
-    return cameras, with_convention(camera_file, poses.convention), notes
+    note = f"{poses.describe(camera_file.convention)}: read so"
+    return cameras, with_convention(camera_file, poses.convention), [note]
 
 
 def estimate_cameras(

@@ -7,7 +7,7 @@ projects to the very centre of a pixel in its own view, and anywhere in a pixel 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -40,6 +40,9 @@ _SAMPLES = 20_000  # rows that the file is judged by
 _CHUNK = 1 << 15  # rows at a time
 _SMALLEST_PX, _SMALLEST_COLOR = 1e-4, 0.005  # units of the distances, at least
 
+# pixels from a centre within which a view may be a row's own; median distance from the centre in the own view, pixels,
+# and of the base colour from the photo there, inf without photos
+Spread = tuple[float, float, float]
 # (rows, view, pixels) -> [r] distances of the rows' base colours from the photo there, 0 to 1
 ColorOf = Callable[[np.ndarray, int, np.ndarray], np.ndarray]
 _ROUNDS = 3  # of a layout and the scale that follows from it
@@ -125,15 +128,6 @@ def _score_unordered(inputs: AlignmentInput, rows: ProjectedRows, frames: list[S
     return next((score for score in scores if score is not None), None)
 
 
-@dataclass(frozen=True)
-class _Spread:
-    """Typical distances of rows from their own pixels."""
-
-    tolerance: float  # pixels from a centre within which a view may be a row's own
-    px: float  # median distance from the centre in the own view, pixels
-    color: float  # median distance of the base colour from the photo in the own view; inf without photos
-
-
 def read_unordered(rows: ProjectedRows, *, color_of: ColorOf | None = None) -> Layout | None:
     """Find the pixel of every row in a file without an order; None unless nearly all are at centres, not by chance.
 
@@ -159,11 +153,10 @@ def read_unordered(rows: ProjectedRows, *, color_of: ColorOf | None = None) -> L
     return rows.layout("unordered", parts, missing=num_views * num_pixels - len(used), note=note)
 
 
-def _measure_spread(rows: ProjectedRows, color_of: ColorOf | None) -> _Spread | None:
+def _measure_spread(rows: ProjectedRows, color_of: ColorOf | None) -> Spread | None:
     """Measure how near rows are to the centres of pixels, on a sample; None where it may be chance.
 
-    Chance is measured at the corners of pixels, where only views that are not their own have rows, and in the
-    second nearest view: cameras side by side share rows of pixels, so it is more than the area.
+    Chance is measured at the corners of pixels, and in the second nearest view, which cameras side by side share.
     """
     if len(rows) < MIN_BLOCK:
         return None
@@ -188,7 +181,7 @@ def _measure_spread(rows: ProjectedRows, color_of: ColorOf | None) -> _Spread | 
         colors = [color_of(some[part], view, pixels[part, view]) for view, part in enumerate(ids)]
         color = float(np.median(np.concatenate(colors)))
     px = float(np.median(ranked[near, 0]))
-    return _Spread(tolerance, max(px, _SMALLEST_PX), max(color, _SMALLEST_COLOR))
+    return tolerance, max(px, _SMALLEST_PX), max(color, _SMALLEST_COLOR)
 
 
 def _distances(rows: ProjectedRows, some: np.ndarray, *, shift: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -204,18 +197,19 @@ def _distances(rows: ProjectedRows, some: np.ndarray, *, shift: float = 0.0) -> 
 
 
 def _choices(
-    rows: ProjectedRows, some: np.ndarray, spread: _Spread, color_of: ColorOf | None
+    rows: ProjectedRows, some: np.ndarray, spread: Spread, color_of: ColorOf | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Choose the best and second best slots ``view·H·W + pixel [r,2]`` of some rows, -1: none; and their costs."""
     distances, pixels = _distances(rows, some)
-    near = distances < spread.tolerance
+    tolerance, px, color = spread
+    near = distances < tolerance
     torn = near.sum(1) > 1
-    cost = distances / np.float32(spread.px)
+    cost = distances / np.float32(px)
     cost[torn[:, None] & ~near] = np.inf
     if color_of is not None:
         for view in range(len(rows.cameras)):
             ids = np.flatnonzero(torn & near[:, view])
-            cost[ids, view] += color_of(some[ids], view, pixels[ids, view]) / spread.color
+            cost[ids, view] += color_of(some[ids], view, pixels[ids, view]) / color
     every, slots, costs = np.arange(len(some)), [], []
     for _ in range(2):
         view = cost.argmin(1)

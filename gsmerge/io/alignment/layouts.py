@@ -165,11 +165,10 @@ def depth_layouts(count: int, depths: np.ndarray) -> list[Layout]:
 
 
 def fill_from_depths(scene: Scene, depths: np.ndarray) -> Scene:
-    """Add a Gaussian for each pixel that the file has no row for.
+    """Add a Gaussian for each pixel that the file has no row for, at the depth of the maps ``depths [v,h,w]``.
 
-    It lies on the pixel's ray at the depth of the map (``depths [v,h,w]``), in units that follow from the other
-    pixels: as depth along z or as distance, whichever fits better. Its colour is the photo's; its opacity, rotation
-    and size in pixels are those of the pixel before it in the same row. The scene is unchanged if it has no photos,
+    Units, and depth along z or distance, follow from the other pixels. The colour is the photo's; opacity, rotation
+    and size in pixels are those of the pixel before it in the row. The scene is unchanged if it has no photos,
     lacks nothing, or its Gaussians do not lie at the maps' depths.
     """
     if scene.images is None or scene.missing is None:
@@ -235,15 +234,13 @@ def spread_step(step: int, width: int) -> int:
 
 @dataclass(frozen=True)
 class GridFit:
-    """One way to bring cameras and photos to the size of the grid.
-
-    Its rank says what suggests it: a size in files (0); the number of rows and the photos' shape (1); the number of
-    rows alone (2); a network's usual sizes (3).
-    """
+    """One way to bring cameras and photos to the size of the grid."""
 
     cameras: Cameras  # at the grid's size
     transform: PhotoTransform | None  # what is done to the photos, if anything
     notes: tuple[str, ...]  # what it is, for people
+    # what suggests it: a size in files (0), the number of rows and the photos' shape (1), the number alone (2), or a
+    # network's usual sizes (3)
     rank: int = 0
 
     @property

@@ -96,10 +96,7 @@ def read_view_major(rows: ProjectedRows) -> Layout | None:
 
 
 def _find_blocks(rows: ProjectedRows) -> list[tuple[int, np.ndarray]] | None:
-    """Find (view, rows) of each block, views increasing; None if the rows do not look like blocks.
-
-    The end of a block shows in any view that is nearly its own; the views are chosen for all blocks together.
-    """
+    """Find (view, rows) of each block, views increasing; None if the rows do not look like blocks."""
     count, views, largest = len(rows), len(rows.cameras), rows.cameras.width * rows.cameras.height
     start, view = 0, -1
     parts: list[np.ndarray] = []
@@ -226,8 +223,8 @@ def rough_scale(rows: ProjectedRows) -> float:
 def finer_scale(rows: ProjectedRows, layout: Layout, rough: float) -> float:
     """Find the scale, up to a quarter off ``rough``, under which rows lie nearest to their assigned pixels.
 
-    A slightly wrong scale moves rows by parts of a pixel, which the assignment hides: so scales are tried in steps
-    that move most rows by a quarter of a pixel at most. The layout's blocks are right, its pixels need not be.
+    The assignment hides small moves: so scales are tried in steps that move most rows by a quarter of a pixel at
+    most.
     """
     chosen = np.unique(np.linspace(0, len(layout.views) - 1, TRIED_BLOCKS).astype(int))
     starts = [max(0, (len(layout.rows[b]) - STRETCH) // 2) for b in chosen]

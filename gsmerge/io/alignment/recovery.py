@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -182,7 +182,7 @@ def possible_layouts(inputs: AlignmentInput) -> list[Layout]:
 
 
 def _score_labellings(inputs: AlignmentInput, layout: Layout, effort: int) -> list[AlignmentScore]:
-    """Score the layout under the best frame for each likely order of the views, or any with effort 2 or views missing."""
+    """Score the layout under the best frame for each likely order of the views; any order with effort 2."""
     out: dict[tuple[int, ...], AlignmentScore] = {}
     labellings = [[labelling[view] for view in layout.views] for labelling in inputs.labellings]
     lacks_views = len(set(layout.views)) < len(inputs.cameras)
@@ -246,7 +246,13 @@ def explain_count(ply: PlyInfo, inputs: AlignmentInput, camera_file: CameraFile)
             rows = inputs.gaussians, cameras, inputs.valid
             alignment = check_alignment(*rows)
             reason = explain_misalignment(*rows, camera_file.convention)
-            if reason or _looks_like_a_grid(*rows, 4 * alignment.limit_px):
+            pairs = sample_pixels(*rows)
+            pairs = pairs.select(pairs.views == 0)
+            pose = None if reason else solve_pose(pairs, 0, cameras.Ks[0])
+            # a pose that takes up most of wrong intrinsics, too, shows that the rows are pixels of some camera
+            posed = None if pose is None else replace(cameras[:1], viewmats=pose[None])
+            is_grid = posed is not None and np.median(pixel_errors(pairs, posed)) < 4 * alignment.limit_px
+            if reason or is_grid:
                 raise misalignment_error(camera_file.path, alignment, reason)
             problem = f"expected one Gaussian per pixel, found {ply.count} rows that are in no known order"
         elif count > views * width * height and count % (width * height) == 0:
@@ -295,56 +301,37 @@ def misalignment_error(path: str, alignment: Alignment, reason: str | None) -> S
 def explain_misalignment(
     gaussians: Gaussians, cameras: Cameras, valid: np.ndarray, convention: Convention
 ) -> str | None:
-    """Name the other reading of cameras or row order under which the scene fits, as in :func:`check_alignment`; or
-    None.
-    """
+    """Name another reading of cameras or row order under which the scene fits; None without one."""
     pairs = sample_pixels(gaussians, cameras, valid)
     given = cameras.viewmats
     frames = candidate_similarities(pairs, cameras, effort=1)
+    others = [(poses.describe(convention), poses.viewmats) for poses in other_conventions(given, convention)]
+    transposed = given.copy()
+    transposed[:, :3, :3] = given[:, :3, :3].transpose(0, 2, 1)
+    transposed[:, :3, 3] = -np.einsum("vij,vj->vi", transposed[:, :3, :3], cameras.centres)
+    others.append(("the cameras fit with their rotations transposed", transposed))
+    flips = (1, "y axis flipped (rows counted from the bottom)"), (0, "x axis flipped (mirrored images)")
+    for axis, words in flips:
+        mirrored = given.copy()
+        mirrored[:, axis] *= -1
+        others.append((f"the cameras fit with the {words}", mirrored))
     scaled = [f for f in frames if f.kind == "scaled"]
-    others = [(f"the cameras fit with their {f.description}", f.move_viewmats(given)) for f in scaled]
-    for reason, viewmats in [*_other_viewmats(cameras, convention), *others]:
+    others += [(f"the cameras fit with their {f.description}", f.move_viewmats(given)) for f in scaled]
+    for reason, viewmats in others:
         if check_pairs(pairs, replace(cameras, viewmats=viewmats)).ok:
             return reason
-    for reason, order in _other_orders(len(cameras), cameras.height, cameras.width):
+    views, height, width = len(cameras), cameras.height, cameras.width
+    rows = np.arange(views * height * width)
+    by_pixel, by_column = rows.reshape(height, width, views), rows.reshape(views, width, height)
+    for reason, order in (
+        ("in the order row, column, view (view fastest)", by_pixel.transpose(2, 0, 1)),
+        ("in the order view, column, row (column-major)", by_column.transpose(0, 2, 1)),
+        ("with the views in reverse order", rows.reshape(views, -1)[::-1]),
+    ):
+        order = order.reshape(-1)
         if check_alignment(gaussians[order], cameras, valid.reshape(-1)[order]).ok:
-            return reason
+            return f"the rows fit {reason}"
     swapped = replace(cameras, width=cameras.height, height=cameras.width)
     if check_alignment(gaussians, swapped, valid).ok:
         return "the cameras fit with width and height swapped"
     return None
-
-
-def _looks_like_a_grid(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray, limit: float) -> bool:
-    """Return whether a pose puts the first view's rows on pixels, to a median of ``limit``: the cameras are wrong
-    then.
-    """
-    pairs = sample_pixels(gaussians, cameras, valid)
-    pairs = pairs.select(pairs.views == 0)
-    pose = solve_pose(pairs, 0, cameras.Ks[0])
-    if pose is None:
-        return False
-    return bool(np.median(pixel_errors(pairs, replace(cameras[:1], viewmats=pose[None]))) < limit)
-
-
-def _other_viewmats(cameras: Cameras, convention: Convention) -> Iterator[tuple[str, np.ndarray]]:
-    given = cameras.viewmats
-    for poses in other_conventions(given, convention):
-        yield poses.describe(convention), poses.viewmats
-    transposed = given.copy()
-    transposed[:, :3, :3] = given[:, :3, :3].transpose(0, 2, 1)
-    transposed[:, :3, 3] = -np.einsum("vij,vj->vi", transposed[:, :3, :3], cameras.centres)
-    yield "the cameras fit with their rotations transposed", transposed
-    for axis, words in ((1, "y axis flipped (rows counted from the bottom)"), (0, "x axis flipped (mirrored images)")):
-        mirrored = given.copy()
-        mirrored[:, axis] *= -1
-        yield f"the cameras fit with the {words}", mirrored
-
-
-def _other_orders(views: int, height: int, width: int) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield permutations that bring rows of another order into view-major, row-major order."""
-    rows = np.arange(views * height * width)
-    by_pixel, by_column = rows.reshape(height, width, views), rows.reshape(views, width, height)
-    yield "the rows fit in the order row, column, view (view fastest)", by_pixel.transpose(2, 0, 1).reshape(-1)
-    yield "the rows fit in the order view, column, row (column-major)", by_column.transpose(0, 2, 1).reshape(-1)
-    yield "the rows fit with the views in reverse order", rows.reshape(views, -1)[::-1].reshape(-1)

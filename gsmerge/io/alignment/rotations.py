@@ -103,9 +103,8 @@ def _is_root(
 ) -> bool:
     """Return whether the roots of the rotations as xyzw follow the surface far better than all other readings.
 
-    The better of two is better by chance as well: so every other reading gets a second rotation, half a turn more
-    about the same axis. ``single`` are the readings ``[t,4]`` of some Gaussians, as stored first, as xyzw next;
-    ``normals`` are rough, for a first, quick comparison.
+    The better of two is better by chance as well: so every other reading gets a second rotation, half a turn more.
+    ``single`` are readings ``[t,4]``, as stored first, as xyzw next; ``normals`` are rough, for a quick comparison.
     """
     others = [square_roots(single[0]), *((one, _half_a_turn_more(one)) for one in single)]
     roots = square_roots(single[1])

@@ -112,7 +112,12 @@ def make_camera_file(
             raise SceneError(path, f"view {view.name}: expected a pose of 3x4 or 4x4 numbers, found {pose.shape}")
         poses[i, :3] = pose[:3]
         check_camera(path, view.name, poses[i], Ks[i])
-        _check_lens(path, view.name, view.lens)
+        lens = view.lens or Lens("", "perspective", ())
+        for key, value in zip(COEFFICIENTS[lens.model], lens.coefficients, strict=False):
+            if not abs(value) <= _MAX_COEFFICIENT:  # NaN, too
+                problem = f"expected a lens coefficient {key} within +-{_MAX_COEFFICIENT:g}, found {value:g}"
+                text = f"view {view.name}: {problem} ({lens.name})"
+                raise SceneError(path, text, "correct it, or undistort the images first")
     for w, h in (view.size for view in views):
         if not (0 <= w <= _MAX_SIDE and 0 <= h <= _MAX_SIDE):
             raise SceneError(path, f"expected a positive image size, found {w:.6g} x {h:.6g}")
@@ -161,16 +166,6 @@ def check_camera(path: StrPath, name: str, pose: np.ndarray, K: np.ndarray) -> N
         raise SceneError(path, f"view {name}: expected positive focal lengths, found {K[0, 0]:g} and {K[1, 1]:g}")
     if np.abs(K[2] - (0, 0, 1)).max() > 1e-3 or abs(K[1, 0]) > 1e-3 * K[0, 0]:
         raise SceneError(path, f"view {name}: expected intrinsics whose last row is 0 0 1, found others")
-
-
-def _check_lens(path: StrPath, name: str, lens: Lens | None) -> None:
-    if lens is None:
-        return
-    keys = COEFFICIENTS[lens.model]
-    for key, value in zip(keys, lens.coefficients, strict=False):
-        if not abs(value) <= _MAX_COEFFICIENT:  # NaN, too
-            problem = f"view {name}: expected a lens coefficient {key} within +-{_MAX_COEFFICIENT:g}, found {value:g}"
-            raise SceneError(path, f"{problem} ({lens.name})", "correct it, or undistort the images first")
 
 
 def check_size(path: StrPath, name: str, K: np.ndarray, size: tuple[int, int]) -> None:
@@ -227,12 +222,10 @@ def sizes_of(camera_file: CameraFile) -> list[tuple[int, int]]:
 
 
 def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> Cameras:
-    """Convert to cameras of one image size (width, height) in pixels; None takes the file's.
+    """Convert to cameras of one image size (width, height) in pixels, None: the file's.
 
-    Intrinsics of another size are scaled to it, each axis by itself.
-
-    Raises:
-        SceneError: If no size is given and the file's cameras have none, or several; or a lens is no pinhole.
+    Intrinsics of another size are scaled, each axis by itself. SceneError if no size is given and the file's
+    cameras have none, or several; or a lens is no pinhole.
     """
     path = camera_file.path
     for name, lens in zip(camera_file.names, camera_file.lenses, strict=False):
@@ -274,8 +267,12 @@ def as_pinholes(camera_file: CameraFile, photos: Photos | None) -> tuple[CameraF
             raise SceneError(camera_file.path, problem, "give the images as they were taken, or undistort them first")
     Ks = to_cameras(pinholes, size).Ks
     for view, K, lens in zip(camera_file.names, Ks, camera_file.lenses, strict=True):
-        share = 1.0 if lens is None else _share_inside(K, lens, size)
-        if lens is not None and share < _MIN_SHARE:
+        if lens is None:
+            continue
+        small = np.diag([_GRID / size[0], _GRID / size[1], 1.0]) @ K
+        maps = _rectify_maps(small, lens, (_GRID, _GRID))
+        share = float(np.all([(m >= -0.5) & (m <= _GRID - 0.5) for m in maps], 0).mean())
+        if share < _MIN_SHARE:
             values = zip(COEFFICIENTS[lens.model], lens.coefficients, strict=False)
             found = ", ".join(f"{key} = {value:g}" for key, value in values if value)
             problem = f"view {view}: expected {lens.name} coefficients of a lens, found {found}, with which"
@@ -309,10 +306,3 @@ def _rectify_maps(K: np.ndarray, lens: Lens, size: Size) -> tuple[np.ndarray, np
     make = cv2.fisheye.initUndistortRectifyMap if lens.model == "fisheye" else cv2.initUndistortRectifyMap
     x, y = make(centred, coefficients.astype(np.float64), np.eye(3), centred, size, cv2.CV_32FC1)
     return x, y
-
-
-def _share_inside(K: np.ndarray, lens: Lens, size: Size) -> float:
-    """Return the share of the undistorted photo's pixels that lie within the photo."""
-    small = np.diag([_GRID / size[0], _GRID / size[1], 1.0]) @ K
-    maps = _rectify_maps(small, lens, (_GRID, _GRID))
-    return float(np.all([(m >= -0.5) & (m <= _GRID - 0.5) for m in maps], 0).mean())

@@ -73,12 +73,11 @@ def _number_errors(path: Path, expected: str) -> Iterator[None]:
 
 
 def read_transforms(path: Path, data: Mapping[str, Any] | list[Any]) -> CameraFile:
-    """Read the cameras of a parsed ``transforms.json``.
+    """Read the cameras of a parsed ``transforms.json``; SceneError if a pose or an intrinsic is missing.
 
     A dictionary with ``frames`` has camera-to-world poses with OpenGL axes; a bare list of frames (as one backbone
-    writes) has camera-to-world poses with OpenCV axes. Intrinsics are global or per frame, in pixels or as field of
-    view. ``applied_transform`` is not applied: poses are as the Gaussians' world has them. SceneError if a pose or an
-    intrinsic is missing, or a lens of an unknown kind.
+    writes) has OpenCV axes. Intrinsics are global or per frame, in pixels or as field of view.
+    ``applied_transform`` is not applied: poses are in the Gaussians' world.
     """
     source, convention = ("frame list", C2W_OPENCV) if isinstance(data, list) else ("transforms.json", C2W_OPENGL)
     common, frames = ({}, data) if isinstance(data, list) else (data, data["frames"])
@@ -213,27 +212,20 @@ def read_long_lrm(path: Path, data: Mapping[str, Any]) -> CameraFile:
     odd = next((i for i in ids if not 0 <= i < len(frames)), None)
     if odd is not None:
         raise SceneError(path.with_name(FRAMES_FILE), f"expected frames 0 to {len(frames) - 1}, found {odd:.6g}")
-    with np.errstate(all="ignore"):  # what overflows is refused with the cameras
-        poses = _moved(path, np.array([frames[i].pose for i in ids]).reshape(-1, 4, 4))
+    poses = np.array([frames[i].pose for i in ids]).reshape(-1, 4, 4)
+    move, scale = _numbers(path.with_name(POSE_FILE)), _numbers(path.with_name(SCALE_FILE))
+    if scale is not None and (scale.size != 1 or not scale[0] > 0):
+        raise SceneError(path.with_name(SCALE_FILE), "expected one positive number")
+    if move is not None and move.size != 16:
+        raise SceneError(path.with_name(POSE_FILE), f"expected 16 numbers, found {move.size}")
+    try:
+        with np.errstate(all="ignore"):  # what overflows is refused with the cameras
+            poses = poses if move is None else poses @ np.linalg.inv(move.reshape(4, 4))  # of X' = s (A X): R inv(A)
+            poses[:, :3, 3] *= 1.0 if scale is None else scale[0]
+    except np.linalg.LinAlgError as error:
+        raise SceneError(path.with_name(POSE_FILE), "expected a matrix that can be inverted") from error
     views = [frames[i]._replace(pose=pose) for i, pose in zip(ids, poses, strict=True)]
     return make_camera_file(path, "Long-LRM", W2C_OPENCV, views)
-
-
-def _moved(path: Path, viewmats: np.ndarray) -> np.ndarray:
-    """Move world-to-camera matrices to the Gaussians' world X' = s (A X): the rotation is R inv(A), the shift s t'."""
-    move, scale = _numbers(path.with_name(POSE_FILE)), _numbers(path.with_name(SCALE_FILE))
-    if move is not None:
-        if move.size != 16:
-            raise SceneError(path.with_name(POSE_FILE), f"expected 16 numbers, found {move.size}")
-        try:
-            viewmats = viewmats @ np.linalg.inv(move.reshape(4, 4))
-        except np.linalg.LinAlgError as error:
-            raise SceneError(path.with_name(POSE_FILE), "expected a matrix that can be inverted") from error
-    if scale is not None:
-        if scale.size != 1 or not scale[0] > 0:
-            raise SceneError(path.with_name(SCALE_FILE), "expected one positive number")
-        viewmats[:, :3, 3] *= scale[0]
-    return viewmats
 
 
 def _numbers(path: Path) -> np.ndarray | None:

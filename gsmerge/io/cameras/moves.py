@@ -1,4 +1,4 @@
-"""How far cameras were moved, for reports and notes."""
+"""Describe how far cameras were moved, for reports and notes."""
 
 from __future__ import annotations
 
@@ -11,9 +11,7 @@ from gsmerge.geometry import pose_changes
 
 
 def list_moves(names: Sequence[str], start: np.ndarray, end: np.ndarray, depth: float) -> list[dict[str, Any]]:
-    """List for each view its name, the degrees it turned, and the shift of its centre.
-
-    The shift is a share of a depth.
+    """List for each view its name, the degrees it turned, and the shift of its centre as a share of ``depth``.
 
     ``start`` and ``end`` are viewmats ``[v,4,4]``; ``depth`` is that of the scene, in their unit.
     """

@@ -32,7 +32,13 @@ def read_re10k(path: Path, scene: str | None = None) -> CameraFile:
     Nothing in it is executed: only tensors and plain containers are read. SceneError if it cannot be read, has no
     scene of that key, or an array has another shape.
     """
-    entry = _choose_scene(path, _load(path), scene)
+    entries = _load(path)
+    named = [entry for entry in entries if isinstance(entry.get("key"), str) and entry["key"] == scene]
+    if 1 not in (len(entries), len(named)):
+        keys = ", ".join(str(entry.get("key"))[:40] for entry in entries[:3])
+        problem = f"expected one scene with the key {scene!r}, found {len(named)} among {len(entries)} ({keys}, ...)"
+        raise SceneError(path, problem, "name the .ply as its scene is named")
+    entry = entries[0] if len(entries) == 1 else named[0]
     rows = _rows(path, entry.get("cameras"))
     names = [f"view {i}" for i in range(len(rows))]
     photos = _photos(path, entry.get("images"), names)
@@ -68,15 +74,6 @@ def _load(path: Path) -> list[Mapping[str, Any]]:
     if not entries or not all(isinstance(entry, Mapping) and "cameras" in entry for entry in entries):
         raise SceneError(path, "expected a list of scenes with 'key', 'cameras' and 'images', found something else")
     return entries
-
-
-def _choose_scene(path: Path, entries: list[Mapping[str, Any]], scene: str | None) -> Mapping[str, Any]:
-    named = [entry for entry in entries if isinstance(entry.get("key"), str) and entry["key"] == scene]
-    if len(entries) == 1 or len(named) == 1:
-        return (named or entries)[0]
-    keys = ", ".join(str(entry.get("key"))[:40] for entry in entries[:3])
-    problem = f"expected one scene with the key {scene!r}, found {len(named)} among {len(entries)} ({keys}, ...)"
-    raise SceneError(path, problem, "name the .ply as its scene is named")
 
 
 def _rows(path: Path, cameras: Any) -> np.ndarray:

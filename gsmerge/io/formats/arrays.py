@@ -54,7 +54,7 @@ class StoredRows:
 
 
 def to_rows(columns: Columns, name: str, sizes: dict[str, int], *, mip: bool = False) -> StoredRows:
-    """Convert columns to rows of a PLY file; ``sizes`` are bytes by attribute, ``mip`` marks antialiased ones."""
+    """Convert columns to rows of a PLY file; ``sizes`` are bytes by attribute, ``mip`` says antialiased."""
     count, num_higher = columns.harmonics.shape[:2]
     names = (*MEANS, *SH0, *(f"f_rest_{i}" for i in range(3 * num_higher)), "opacity", *SCALES, *QUATS)
     harmonics = columns.harmonics.transpose(0, 2, 1).reshape(count, 3 * num_higher)

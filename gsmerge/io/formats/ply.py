@@ -124,12 +124,9 @@ def read_ply(path: StrPath, *, opacity: OpacityChoice = "auto") -> PlyScene:
 def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto") -> PlyScene:
     """Read a file of Gaussians in the format of its ending.
 
-    Endings are ``.spz`` (versions 1 to 4), ``.splat`` and ``.sog`` (version 2). Everything else is
-    read by :func:`read_ply`; ``opacity`` is for those.
-
-    Raises:
-        SceneError: If the file cannot be read, is damaged, or holds no finite Gaussian.
-        ValueError: If ``opacity`` is none of the three.
+    Endings are ``.spz`` (versions 1 to 4), ``.splat`` and ``.sog`` (version 2); everything else is read by
+    :func:`read_ply`, for which ``opacity`` is. SceneError if the file cannot be read, is damaged, or holds no
+    finite Gaussian; ValueError for another ``opacity``.
     """
     read = READERS.get(Path(path).suffix.lower())
     return read_ply(path, opacity=opacity) if read is None else _to_scene(Path(path), read(Path(path)), "auto")
@@ -272,7 +269,7 @@ def _exactly_valid(rows: np.ndarray, num_higher: int) -> np.ndarray:
 
 
 def _normalise(quats: list[np.ndarray], out: np.ndarray) -> np.ndarray:
-    """Write unit quaternions; return the mask of the zero ones, which become the identity."""
+    """Write unit quaternions, the identity for zero; return the mask of zero quaternions."""
     w, x, y, z = quats
     squared = w * w + x * x + y * y + z * z
     inverse = 1 / np.sqrt(squared)

@@ -82,7 +82,14 @@ class _Sog:
     def texture(self, name: str, count: int) -> np.ndarray:
         """Decode ``[count,4]`` pixels RGBA of a texture; alpha is 255 if it has none."""
         data = self.member(name, self.size)
-        width, height = _webp_size(data)
+        kind = data[12:16] if data[:4] == b"RIFF" and data[8:12] == b"WEBP" else b""
+        if kind == b"VP8X" and len(data) >= 30:
+            width, height = (int.from_bytes(data[at : at + 3], "little") + 1 for at in (24, 27))
+        elif kind == b"VP8L" and len(data) >= 25:
+            bits = int.from_bytes(data[21:25], "little")
+            width, height = (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+        else:
+            raise ValueError("no WebP texture without loss")
         if not count <= width * height <= 4 * count + (1 << 16):
             raise ValueError(f"{name} of {width} x {height} pixels for {count}")
         try:
@@ -94,17 +101,6 @@ class _Sog:
         pixels = image.reshape(width * height, -1)[:count]
         colors, alpha = pixels[:, 2::-1], pixels[:, 3:] if pixels.shape[1] == 4 else np.full((count, 1), 255, np.uint8)
         return np.concatenate([colors, alpha], 1)
-
-
-def _webp_size(data: bytes) -> tuple[int, int]:
-    """Return (width, height) of a lossless WebP file; ValueError if it is none."""
-    kind = data[12:16] if data[:4] == b"RIFF" and data[8:12] == b"WEBP" else b""
-    if kind == b"VP8X" and len(data) >= 30:
-        return int.from_bytes(data[24:27], "little") + 1, int.from_bytes(data[27:30], "little") + 1
-    if kind == b"VP8L" and len(data) >= 25:
-        bits = int.from_bytes(data[21:25], "little")
-        return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
-    raise ValueError("no WebP texture without loss")
 
 
 def _read_columns(sog: _Sog, meta: dict[str, Any], count: int) -> arrays.Columns:

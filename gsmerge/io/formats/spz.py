@@ -65,12 +65,7 @@ class _Header:
 
 
 def read_rows(path: Path) -> arrays.StoredRows:
-    """Read the Gaussians of a ``.spz``.
-
-    Raises:
-        SceneError: If it is none, of another version, truncated or damaged.
-        UsageError: If it is of version 4 and ``zstandard`` is not installed.
-    """
+    """Read the Gaussians of a ``.spz``; SceneError if damaged, UsageError without ``zstandard`` for version 4."""
     check_file(path)
     with read_errors(path):
         packed = path.read_bytes()
@@ -225,9 +220,8 @@ def spz_columns(gaussians: Gaussians, max_degree: int, *, mip: bool = False, fin
 def spz_bytes(gaussians: Gaussians, *, mip: bool = False, version: int = 3) -> bytes:
     """Encode a ``.spz`` file; ``mip`` sets the flag of antialiased Gaussians.
 
-    Raises:
-        ValueError: If there is NaN or inf, or the version is not 3 or 4.
-        UsageError: If version 4 is asked for and ``zstandard`` is not installed.
+    ValueError if there is NaN or inf, or the version is not 3 or 4; UsageError if ``zstandard`` is missing for
+    version 4.
     """
     if version not in VERSIONS:
         raise ValueError(f"spz_version: expected 3 or 4, got {version}")

@@ -25,11 +25,7 @@ OUTPUT_FORMATS = {
 
 
 def output_format(path: StrPath, spz_version: int = 3) -> str:
-    """Return the ending of an output's name, by which its format is chosen.
-
-    Raises:
-        UsageError: If it is none of ``OUTPUT_FORMATS``, or a ``.spz`` of that version needs a missing package.
-    """
+    """Return the ending of a name, by which its format is chosen; UsageError if unknown or a package is missing."""
     name = Path(path).name.lower()
     ending = next((ending for ending in OUTPUT_FORMATS if name.endswith(ending)), None)
     if ending is None:
@@ -41,7 +37,7 @@ def output_format(path: StrPath, spz_version: int = 3) -> str:
 
 
 def lost_harmonics(path: StrPath, sh_degree: int, spz_version: int = 3) -> str | None:
-    """Describe the harmonics that a format has no room for; None if it holds all."""
+    """Describe the harmonics that a format has no room for; None if it holds all, UsageError on an unknown one."""
     ending = output_format(path)
     highest = spz.MAX_DEGREES[spz_version] if ending == ".spz" else OUTPUT_FORMATS[ending]
     return None if sh_degree <= highest else f"{ending} has no room for harmonics above degree {highest}: left out"
@@ -177,12 +173,7 @@ def file_bytes(count: int, sh_degree: int) -> int:
 
 
 def count_for_bytes(max_bytes: int, sh_degree: int) -> int:
-    """Return the largest number of Gaussians whose ``.ply`` has at most ``max_bytes``.
-
-    Raises:
-        ValueError: If the degree is not 0 to 4.
-        UsageError: If not even one fits.
-    """
+    """Return the largest number of Gaussians whose ``.ply`` has at most ``max_bytes``; UsageError if none fits."""
     if not 0 <= sh_degree <= 4:
         raise ValueError(f"sh_degree: expected 0 to 4, got {sh_degree}")
     least = file_bytes(1, sh_degree)

@@ -69,6 +69,17 @@ def test_the_root_is_found(tmp_path: Path, noise: float) -> None:
     assert covariance_error(stored, tiny).mean() > 0.3
 
 
+@pytest.mark.parametrize("twice", [False, True])
+def test_huge_positions_raise_no_warning(tmp_path: Path, twice: bool) -> None:
+    tiny = discs(8.0)
+    rows = applied_twice(tiny) if twice else export_rows(tiny)
+    rows["x"][500:3000:500], rows["x"][504:3000:500] = 3e38, -3e38  # the pixels between overflow
+    scene = read_scene(save_export(tmp_path, tiny, rows), quats="xyzw-root" if twice else "auto")
+    stored = np.stack([rows[f"rot_{i}"] for i in range(4)], 1)
+    assert np.isfinite(scene.gaussians.quats).all()
+    assert np.allclose(scene.gaussians.quats, normalize(stored), atol=1e-6) is not twice
+
+
 def test_it_can_be_given(tmp_path: Path) -> None:
     tiny = discs(0.0)
     rows = applied_twice(tiny)
