@@ -36,19 +36,12 @@ NO_PHOTOS = "no photos found, so nothing is fitted and no PSNR measured; name th
 
 @dataclass(frozen=True, eq=False)
 class SceneInput:
-    """A scene that was read, without what only its reading needs.
+    """A scene that was read, without what only its reading needs."""
 
-    Args:
-        scene: The scene.
-        recognised: What the report says about the input.
-        comments: Comments of its header that the result keeps.
-        notes: Of the reader.
-    """
-
-    scene: Scene
-    recognised: dict[str, Any]
-    comments: Sequence[str]
-    notes: Sequence[str]
+    scene: Scene  # The scene
+    recognised: dict[str, Any]  # What the report says about the input
+    comments: Sequence[str]  # Comments of its header that the result keeps
+    notes: Sequence[str]  # Of the reader
 
 
 def compact_files(

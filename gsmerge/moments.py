@@ -20,27 +20,19 @@ ROWS_PER_TASK = 4096
 
 @dataclass(frozen=True)
 class Members:
-    """The scene's Gaussians as the kernels want them: contiguous float32 arrays.
+    """The scene's Gaussians as the kernels want them: contiguous float32 arrays."""
 
-    Args:
-        means: ``[n,3]``.
-        quats: ``[n,4]`` wxyz.
-        scales: ``[n,3]``.
-        opacities: ``[n]``.
-        sh0: ``[n,1,3]``.
-        shN: ``[n,k-1,3]``, apart from the others: of degree 4 it is most of a scene, and only pooling reads it.
-        footprints: ``[n]`` size of one pixel of the own view at the member's depth, world units.
-        pixels: ``[n]`` int64, the pixel (view-major, row-major over all views) that a member belongs to, -1 for none;
-            None: one member per pixel, in order.
-    """
-
-    means: np.ndarray
-    quats: np.ndarray
-    scales: np.ndarray
-    opacities: np.ndarray
-    sh0: np.ndarray
+    means: np.ndarray  # [n,3]
+    quats: np.ndarray  # [n,4] wxyz
+    scales: np.ndarray  # [n,3]
+    opacities: np.ndarray  # [n]
+    sh0: np.ndarray  # [n,1,3]
+    # [n,k-1,3], apart from the others: of degree 4 it is most of a scene, and only pooling reads it
     shN: np.ndarray
+    # [n] size of one pixel of the own view at the member's depth, world units
     footprints: np.ndarray
+    # [n] int64, the pixel (view-major, row-major over all views) that a member belongs to, -1 for
+    # none; None: one member per pixel, in order
     pixels: np.ndarray | None = None
 
 

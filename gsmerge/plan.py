@@ -39,25 +39,16 @@ MOST_STEPS = 2.0  # times as many
 
 @dataclass(frozen=True)
 class Effort:
-    """What an effort means to the stages.
+    """What an effort means to the stages."""
 
-    Args:
-        steps: Of the full fit.
-        rectangles: Of ``rdseg``, see :class:`gsmerge.SegmentOptions`.
-        early_sweeps: The same.
-        merges: Whether Gaussians of different views are merged.
-        networks: Whether ``checkpoint="auto"`` may load networks.
-        prunes: Whether Gaussians that no photo shows are left out where nothing is fitted.
-        large_photos: Whether ``photo_scale="auto"`` may look at larger photos.
-    """
-
-    steps: int
-    rectangles: float
-    early_sweeps: int
-    merges: bool = True
-    networks: bool = True
+    steps: int  # Of the full fit
+    rectangles: float  # Of `rdseg`, see gsmerge.SegmentOptions
+    early_sweeps: int  # The same
+    merges: bool = True  # Whether Gaussians of different views are merged
+    networks: bool = True  # Whether `checkpoint="auto"` may load networks
+    # Whether Gaussians that no photo shows are left out where nothing is fitted
     prunes: bool = True
-    large_photos: bool = True
+    large_photos: bool = True  # Whether `photo_scale="auto"` may look at larger photos
 
 
 EFFORTS = {
@@ -70,43 +61,30 @@ EFFORTS = {
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Everything that was decided before the first superpixel is cut.
+    """Everything that was decided before the first superpixel is cut."""
 
-    Args:
-        superpixels: How each view is cut, and into how many.
-        networks: What corrects the analytic stages: networks, None for nothing, or both in turn where they compete.
-        match: Merging across views.
-        decode: Gaussians per group.
-        fit: Fit to the photos.
-        clean: What is left out of the result.
-        unseen: Canonical Gaussians in place of those that no view sees, which every result gets; None without any.
-        target_psnr: PSNR (dB) that the input photos have to reach; None: none was asked for.
-        max_drop: dB that may be lost against the best of the scene's curve; None: none was asked for.
-        auto_count: Whether the scene's own curve decides the number of Gaussians.
-        levels: Levels of detail.
-        scored_views: Given views that input and result are scored on.
-        backend: Where the fit and the scores run.
-        seed: Everything random depends on it alone.
-        checkpoint: Where the networks come from; None without any.
-        settings: All settings by flat name, for reports.
-    """
-
-    superpixels: SuperpixelPlan
+    superpixels: SuperpixelPlan  # How each view is cut, and into how many
+    # What corrects the analytic stages: networks, None for nothing, or both in turn where they
+    # compete
     networks: tuple[Networks | None, ...]
-    match: MatchOptions
-    decode: DecodeOptions
-    fit: FitOptions
-    clean: CleanOptions
+    match: MatchOptions  # Merging across views
+    decode: DecodeOptions  # Gaussians per group
+    fit: FitOptions  # Fit to the photos
+    clean: CleanOptions  # What is left out of the result
+    # Canonical Gaussians in place of those that no view sees, which every result gets; None without
+    # any
     unseen: Gaussians | None
+    # PSNR (dB) that the input photos have to reach; None: none was asked for
     target_psnr: float | None
+    # dB that may be lost against the best of the scene's curve; None: none was asked for
     max_drop: float | None
-    auto_count: bool
-    levels: int
-    scored_views: tuple[int, ...]
-    backend: FitBackend[Any]
-    seed: int
-    checkpoint: Checkpoint | None
-    settings: dict[str, Any]
+    auto_count: bool  # Whether the scene's own curve decides the number of Gaussians
+    levels: int  # Levels of detail
+    scored_views: tuple[int, ...]  # Given views that input and result are scored on
+    backend: FitBackend[Any]  # Where the fit and the scores run
+    seed: int  # Everything random depends on it alone
+    checkpoint: Checkpoint | None  # Where the networks come from; None without any
+    settings: dict[str, Any]  # All settings by flat name, for reports
 
     @property
     def weakens(self) -> bool:

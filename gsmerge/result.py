@@ -76,23 +76,14 @@ class CompactResult:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """Gaussians of one count, scored.
+    """Gaussians of one count, scored."""
 
-    Args:
-        count: Gaussians that were asked for; None: as many as ``superpixels`` and K give.
-        fitted: What was built, canonical.
-        gaussians: The same in the world, with those that no view sees.
-        cameras: The given views as the Gaussians were made from them, in the world.
-        psnr: Mean PSNR (dB) of the scored views; None without photos.
-        record: Seconds, choices and notes of building and scoring it.
-    """
-
-    count: int | None
-    fitted: Fitted
-    gaussians: Gaussians
-    cameras: Cameras
-    psnr: float | None
-    record: Record
+    count: int | None  # Gaussians that were asked for; None: as many as `superpixels` and K give
+    fitted: Fitted  # What was built, canonical
+    gaussians: Gaussians  # The same in the world, with those that no view sees
+    cameras: Cameras  # The given views as the Gaussians were made from them, in the world
+    psnr: float | None  # Mean PSNR (dB) of the scored views; None without photos
+    record: Record  # Seconds, choices and notes of building and scoring it
 
 
 def score(count: int | None, fitted: Fitted, prepared: Prepared, plan: Plan) -> Candidate:

@@ -55,17 +55,11 @@ class CurvePoint:
 
 @dataclass(eq=False)
 class CountSearch:
-    """The counts to build, one after the other: one alone, or several until a quality is met.
+    """The counts to build, one after the other: one alone, or several until a quality is met."""
 
-    Args:
-        plan: Target and limits.
-        first: The count to begin with; None: as many as ``superpixels`` and K give.
-        candidates: What was built so far.
-    """
-
-    plan: Plan
-    first: int | None
-    candidates: list[Candidate] = field(default_factory=list)
+    plan: Plan  # Target and limits
+    first: int | None  # The count to begin with; None: as many as `superpixels` and K give
+    candidates: list[Candidate] = field(default_factory=list)  # What was built so far
 
     def __iter__(self) -> Iterator[int | None]:
         """Yield counts; each candidate is added before the next one is asked for."""

@@ -60,20 +60,14 @@ class StoredSettings:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StoredScene:
-    """What encoded scenes and states have in common.
+    """What encoded scenes and states have in common."""
 
-    Args:
-        kept: Gaussians that no view sees, canonical, merged already; None without any.
-        frame: From canonical to world.
-        cameras: The views, canonical.
-        settings: What decoding needs to know.
-        about: Where it comes from: version and options, further of each kind. Plain JSON types.
-    """
-
+    # Gaussians that no view sees, canonical, merged already; None without any
     kept: Gaussians | None
-    frame: Frame
-    cameras: Cameras
-    settings: StoredSettings
+    frame: Frame  # From canonical to world
+    cameras: Cameras  # The views, canonical
+    settings: StoredSettings  # What decoding needs to know
+    # Where it comes from: version and options, further of each kind. Plain JSON types
     about: Mapping[str, Any]
 
 

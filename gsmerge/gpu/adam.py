@@ -20,37 +20,22 @@ from gsmerge.types import SH_C0, Gaussians
 
 @dataclass(eq=False)
 class FitState:
-    """Parameters under optimisation, and what they mean to the rasterizer; see :mod:`gsmerge.stages.fit.fit_state`.
+    """Parameters under optimisation, and what they mean to the rasterizer; see :mod:`gsmerge.stages.fit.fit_state`."""
 
-    Args:
-        x: ``[n,14]`` float32: mean, log scale, quaternion, opacity logit, colour; so are the next three.
-        x0: Where each began.
-        m: First moment.
-        v: Second moment.
-        units: ``[n]`` size of each Gaussian when it began.
-        box_shares: ``[n]`` share of the box about the start that each may use.
-        min_sizes: ``[n]`` least log scale of each.
-        shN: ``[n,k-1,3]`` higher harmonics.
-        means: ``[n,3]``.
-        quats: ``[n,4]``.
-        scales: ``[n,3]``.
-        opacities: ``[n]``.
-        colors: ``[n,3]`` base colours.
-    """
-
+    # [n,14] float32: mean, log scale, quaternion, opacity logit, colour; so are the next three
     x: Tensor
-    x0: Tensor
-    m: Tensor
-    v: Tensor
-    units: Tensor
-    box_shares: Tensor
-    min_sizes: Tensor
-    shN: Tensor
-    means: Tensor
-    quats: Tensor
-    scales: Tensor
-    opacities: Tensor
-    colors: Tensor
+    x0: Tensor  # Where each began
+    m: Tensor  # First moment
+    v: Tensor  # Second moment
+    units: Tensor  # [n] size of each Gaussian when it began
+    box_shares: Tensor  # [n] share of the box about the start that each may use
+    min_sizes: Tensor  # [n] least log scale of each
+    shN: Tensor  # [n,k-1,3] higher harmonics
+    means: Tensor  # [n,3]
+    quats: Tensor  # [n,4]
+    scales: Tensor  # [n,3]
+    opacities: Tensor  # [n]
+    colors: Tensor  # [n,3] base colours
 
     def __len__(self) -> int:
         return len(self.x)

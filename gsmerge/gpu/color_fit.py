@@ -53,25 +53,15 @@ def fit_colors(
 
 @dataclass(frozen=True, eq=False)
 class _DeviceSystem:
-    """:class:`gsmerge.stages.fit.color.ColorSystem` of tensors.
+    """:class:`gsmerge.stages.fit.color.ColorSystem` of tensors."""
 
-    Args:
-        gaussians: n Gaussians, whose geometry stays.
-        photos: V photos.
-        options: The solver's settings.
-        images: ``[v,h,w,3]`` renders with the colours as they were.
-        train: ``[v,h,w]`` 0 on the held-out blocks, 1 elsewhere.
-        weights: ``[v,h,w]`` of the pixels.
-        gains: ``[v,3]`` exposures.
-    """
-
-    gaussians: Gaussians
-    photos: DevicePhotos
-    options: FitOptions
-    images: Tensor
-    train: Tensor
-    weights: Tensor
-    gains: Tensor
+    gaussians: Gaussians  # n Gaussians, whose geometry stays
+    photos: DevicePhotos  # V photos
+    options: FitOptions  # The solver's settings
+    images: Tensor  # [v,h,w,3] renders with the colours as they were
+    train: Tensor  # [v,h,w] 0 on the held-out blocks, 1 elsewhere
+    weights: Tensor  # [v,h,w] of the pixels
+    gains: Tensor  # [v,3] exposures
     precision: float = 0.0
 
     def _fitted(self, x: Tensor) -> Tensor:

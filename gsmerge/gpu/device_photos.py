@@ -20,21 +20,13 @@ from gsmerge.types import SH_C0, Array, Gaussians
 
 @dataclass(frozen=True, eq=False)
 class DevicePhotos:
-    """V photos of one size on a device; see :class:`gsmerge.render.photos.Photos`.
+    """V photos of one size on a device; see :class:`gsmerge.render.photos.Photos`."""
 
-    Args:
-        images: ``[v,h,w,3]`` float32.
-        viewmats: ``[v,4,4]`` float32 world to camera.
-        Ks: ``[v,3,3]`` float32.
-        eyes: ``[v,3]`` float32 centres of the cameras.
-        host: The same photos in the computer's memory, whose cameras the kernels read.
-    """
-
-    images: Tensor
-    viewmats: Tensor
-    Ks: Tensor
-    eyes: Tensor
-    host: Photos
+    images: Tensor  # [v,h,w,3] float32
+    viewmats: Tensor  # [v,4,4] float32 world to camera
+    Ks: Tensor  # [v,3,3] float32
+    eyes: Tensor  # [v,3] float32 centres of the cameras
+    host: Photos  # The same photos in the computer's memory, whose cameras the kernels read
 
     def __len__(self) -> int:
         return len(self.images)

@@ -44,19 +44,12 @@ READ_EVERY = 20  # steps; each reading waits for the device
 
 @dataclass(frozen=True, eq=False)
 class PhotoLevel:
-    """The photos of one size, and what a step needs of them.
+    """The photos of one size, and what a step needs of them."""
 
-    Args:
-        photos: The photos.
-        means: ``[v,2,3,h,w]`` of their windows, see :func:`gsmerge.gpu.image_scores.photo_means`.
-        weights: ``[v,h,w]`` of the pixels in a step; of full size ``[1,h,w]``, the same for all views.
-        counts: ``[v]`` sum of each view's weights.
-    """
-
-    photos: DevicePhotos
-    means: Tensor
-    weights: Tensor
-    counts: tuple[float, ...]
+    photos: DevicePhotos  # The photos
+    means: Tensor  # [v,2,3,h,w] of their windows, see gsmerge.gpu.image_scores.photo_means
+    weights: Tensor  # [v,h,w] of the pixels in a step; of full size [1,h,w], the same for all views
+    counts: tuple[float, ...]  # [v] sum of each view's weights
 
     def weight(self, view: int) -> Tensor:
         """Return the weights ``[h,w]`` of a view."""

@@ -62,17 +62,12 @@ def merge_unseen(gaussians: Gaussians, scene: Scene, count: int) -> Gaussians:
 
 @dataclass(frozen=True)
 class Owners:
-    """The superpixel that each of n Gaussians adds most to.
+    """The superpixel that each of n Gaussians adds most to."""
 
-    Args:
-        values: ``[n]`` float32: its blending weights summed over that superpixel, pixels; 0 where nothing is seen.
-        views: ``[n]`` int32, -1 where nothing is seen.
-        labels: ``[n]`` int32 superpixel within the view, -1 where nothing is seen.
-    """
-
+    # [n] float32: its blending weights summed over that superpixel, pixels; 0 where nothing is seen
     values: np.ndarray
-    views: np.ndarray
-    labels: np.ndarray
+    views: np.ndarray  # [n] int32, -1 where nothing is seen
+    labels: np.ndarray  # [n] int32 superpixel within the view, -1 where nothing is seen
 
 
 def find_owners(scene: Scene, groups: Groups, near: float = 0.01) -> Owners:

@@ -113,18 +113,12 @@ def decode(
 
 @dataclass(frozen=True, eq=False)
 class Decoded:
-    """What a fit begins with.
+    """What a fit begins with."""
 
-    Args:
-        gaussians: Canonical Gaussians.
-        count: Number that the fit may grow to.
-        exact: Whether that number is to be met.
-        baseline_start: Gaussians that the fit may beat instead; None: none are compared.
-    """
-
-    gaussians: Gaussians
-    count: int
-    exact: bool
+    gaussians: Gaussians  # Canonical Gaussians
+    count: int  # Number that the fit may grow to
+    exact: bool  # Whether that number is to be met
+    # Gaussians that the fit may beat instead; None: none are compared
     baseline_start: Gaussians | None = None
 
 

@@ -17,24 +17,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class MergedViews:
-    """Feature Gaussians merged across views, and what decoding them takes.
+    """Feature Gaussians merged across views, and what decoding them takes."""
 
-    Args:
-        features: The Feature Gaussians.
-        members: The scene's Gaussians that ``features.members`` points into.
-        segmentation: The superpixels that they come from, and how many Gaussians they are to become.
-        num_groups: Superpixels with Gaussians, before merging.
-        networks: Networks that correct; None: those are not used.
-        unlearned: Feature Gaussians without networks, which the fit may beat instead; None: none are compared.
-        k1_gaussians: What they become at K = 1, where that had to be known to choose them; None elsewhere.
-    """
-
-    features: FeatureGaussians
-    members: Members
+    features: FeatureGaussians  # The Feature Gaussians
+    members: Members  # The scene's Gaussians that `features.members` points into
+    # The superpixels that they come from, and how many Gaussians they are to become
     segmentation: Segmentation
-    num_groups: int
-    networks: NetworkContext | None = None
+    num_groups: int  # Superpixels with Gaussians, before merging
+    networks: NetworkContext | None = None  # Networks that correct; None: those are not used
+    # Feature Gaussians without networks, which the fit may beat instead; None: none are compared
     unlearned: FeatureGaussians | None = None
+    # What they become at K = 1, where that had to be known to choose them; None elsewhere
     k1_gaussians: Gaussians | None = None
 
 

@@ -34,15 +34,10 @@ Unseen = Literal["drop", "keep"]
 
 @dataclass(frozen=True)
 class Frame:
-    """x_canonical = (x_world - origin) / unit.
+    """x_canonical = (x_world - origin) / unit."""
 
-    Args:
-        origin: ``[3]`` float64, world units.
-        unit: Length of the canonical unit in world units, a power of two.
-    """
-
-    origin: np.ndarray
-    unit: float
+    origin: np.ndarray  # [3] float64, world units
+    unit: float  # Length of the canonical unit in world units, a power of two
 
     def enter(self, gaussians: Gaussians) -> Gaussians:
         """Move Gaussians from the world into the frame; means in float32."""
@@ -148,25 +143,19 @@ class PrepareOptions:
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """Facts about a scene, and the scene as the stages work on it.
+    """Facts about a scene, and the scene as the stages work on it."""
 
-    Args:
-        given: The scene as it was given, in its own world frame.
-        scene: The canonical scene: every view once, photos that do not show it replaced; an unaligned one has cameras,
-            pictures and only finite Gaussians that are seen, or all if none is set aside.
-        frame: The canonical frame.
-        photo_views: Views whose photos a fit may use, see :mod:`gsmerge.stages.check_photos`.
-        repeated: Of every given view its place in the scene, or that of the view that it repeats.
-        moved: Whether views were moved to where their photos agree, before a fit or by it.
-        unseen: Canonical Gaussians that no view sees; None where they were not looked for, or there are none.
-    """
-
-    given: Scene
+    given: Scene  # The scene as it was given, in its own world frame
+    # The canonical scene: every view once, photos that do not show it replaced; an unaligned one
+    # has cameras, pictures and only finite Gaussians that are seen, or all if none is set aside
     scene: Scene
-    frame: Frame
+    frame: Frame  # The canonical frame
+    # Views whose photos a fit may use, see gsmerge.stages.check_photos
     photo_views: tuple[int, ...]
+    # Of every given view its place in the scene, or that of the view that it repeats
     repeated: tuple[int, ...]
-    moved: bool
+    moved: bool  # Whether views were moved to where their photos agree, before a fit or by it
+    # Canonical Gaussians that no view sees; None where they were not looked for, or there are none
     unseen: Gaussians | None
 
     def with_cameras(self, cameras: Cameras) -> Prepared:

@@ -30,23 +30,17 @@ KNEE_FLOOR = 3e-4  # squared error per pixel and channel that no count removes (
 
 @dataclass(frozen=True, eq=False)
 class RegionTree:
-    """The merges of the superpixels of all views, from the finest to one per view, and in which order to make them.
+    """The merges of the superpixels of all views, from the finest to one per view, and in which order to make them."""
 
-    Args:
-        groups: The superpixels that it starts from.
-        parents: Per view ``[2·leaves-1]`` int32: the region that a region is merged into, -1 for the whole view.
-        order: ``[m]`` int64, all merges, cheapest first; those of view v are numbered from ``first[v]`` on.
-        first: ``[v+1]`` int64, merges in the views before.
-        distortions: ``[m+1]`` float64, mean squared error per pixel and colour channel after the first i merges.
-        min_regions: Fewest regions before any is larger than ``MAX_EXTENT``.
-    """
-
-    groups: Groups
+    groups: Groups  # The superpixels that it starts from
+    # Per view [2·leaves-1] int32: the region that a region is merged into, -1 for the whole view
     parents: tuple[np.ndarray, ...]
+    # [m] int64, all merges, cheapest first; those of view v are numbered from `first[v]` on
     order: np.ndarray
-    first: np.ndarray
+    first: np.ndarray  # [v+1] int64, merges in the views before
+    # [m+1] float64, mean squared error per pixel and colour channel after the first i merges
     distortions: np.ndarray
-    min_regions: int
+    min_regions: int  # Fewest regions before any is larger than `MAX_EXTENT`
 
     def __len__(self) -> int:
         """Superpixels at the start."""

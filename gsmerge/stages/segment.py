@@ -17,18 +17,13 @@ from gsmerge.types import Scene, Segmentation
 
 @dataclass(frozen=True, eq=False)
 class SuperpixelPlan:
-    """How a scene is cut into superpixels.
+    """How a scene is cut into superpixels."""
 
-    Args:
-        options: Method and number.
-        limits: Of the number of Gaussians.
-        start_share: Share of the Gaussians that the superpixels are cut for; a fit adds the others.
-        tree: All ways to cut the scene into fewer superpixels, where a count is asked for; None elsewhere.
-    """
-
-    options: SegmentOptions
-    limits: CountLimits
+    options: SegmentOptions  # Method and number
+    limits: CountLimits  # Of the number of Gaussians
+    # Share of the Gaussians that the superpixels are cut for; a fit adds the others
     start_share: float
+    # All ways to cut the scene into fewer superpixels, where a count is asked for; None elsewhere
     tree: RegionTree | None
 
 
@@ -83,21 +78,13 @@ def knee_count(scene: Scene, plan: SuperpixelPlan) -> int:
 
 @dataclass(frozen=True)
 class CountLimits:
-    """Numbers of Gaussians that the options leave.
+    """Numbers of Gaussians that the options leave."""
 
-    Args:
-        per_view: Superpixels of each view that the options ask for.
-        default: Gaussians that ``superpixels`` and K ask for.
-        min_count: Fewest Gaussians that the scene can be cut to: one for each view.
-        max_count: Most Gaussians that a budget, a size or a device allows.
-        exact: Gaussians that a budget or a size asks for; None without either.
-    """
-
-    per_view: int
-    default: int
-    min_count: int
-    max_count: int
-    exact: int | None
+    per_view: int  # Superpixels of each view that the options ask for
+    default: int  # Gaussians that `superpixels` and K ask for
+    min_count: int  # Fewest Gaussians that the scene can be cut to: one for each view
+    max_count: int  # Most Gaussians that a budget, a size or a device allows
+    exact: int | None  # Gaussians that a budget or a size asks for; None without either
 
     @property
     def count(self) -> int | None:

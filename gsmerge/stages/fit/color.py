@@ -26,17 +26,11 @@ HOLDOUT = 4  # times the share: the last steps see everything, and a small sampl
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """One set of Gaussians against the photos: per view the blending weights and the render with their own colours.
+    """One set of Gaussians against the photos: per view the blending weights and the render with their own colours."""
 
-    Args:
-        count: Number of Gaussians, n.
-        views: Blending weights of every view.
-        images: ``[h,w,3]`` renders.
-    """
-
-    count: int
-    views: list[ViewWeights]
-    images: list[np.ndarray]
+    count: int  # Number of Gaussians, n
+    views: list[ViewWeights]  # Blending weights of every view
+    images: list[np.ndarray]  # [h,w,3] renders
 
 
 def draw(gaussians: Gaussians, photos: Photos) -> Drawn:
@@ -153,24 +147,15 @@ def add_offsets(sh0: Array, offsets: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _System:
-    """:class:`ColorSystem` of arrays.
+    """:class:`ColorSystem` of arrays."""
 
-    Args:
-        drawn: The Gaussians against the photos.
-        photos: V photos.
-        options: The solver's settings.
-        train: ``[h,w]`` of every view: 0 on the held-out blocks, 1 elsewhere.
-        weights: ``[h,w]`` of the pixels of every view.
-        gains: ``[v,3]`` exposures.
-        precision: ``[n,1]`` diagonal of earlier photos' normal equations, which the present colours solve; or 0.
-    """
-
-    drawn: Drawn
-    photos: Photos
-    options: FitOptions
-    train: list[np.ndarray]
-    weights: list[np.ndarray]
-    gains: np.ndarray
+    drawn: Drawn  # The Gaussians against the photos
+    photos: Photos  # V photos
+    options: FitOptions  # The solver's settings
+    train: list[np.ndarray]  # [h,w] of every view: 0 on the held-out blocks, 1 elsewhere
+    weights: list[np.ndarray]  # [h,w] of the pixels of every view
+    gains: np.ndarray  # [v,3] exposures
+    # [n,1] diagonal of earlier photos' normal equations, which the present colours solve; or 0
     precision: np.ndarray | float
 
     def _image(self, view: int, x: np.ndarray) -> np.ndarray:

@@ -19,29 +19,19 @@ DEPTH = 0.8  # of the halves' optical depth: two narrower ones with 0.7 would co
 
 @dataclass(eq=False)
 class State:
-    """Parameters under optimisation, and the arrays that they mean to the rasterizer.
+    """Parameters under optimisation, and the arrays that they mean to the rasterizer."""
 
-    Args:
-        x: ``[n,14]`` float32: mean, log scale, quaternion, opacity logit, colour.
-        x0: Where each began.
-        m: First moment.
-        v: Second moment.
-        units: ``[n]`` size of each Gaussian: geometric mean of its two largest scales when it began.
-        box_shares: ``[n]`` share of the box about the start that each Gaussian's mean and scales may use.
-        min_sizes: ``[n]`` least log scale of each Gaussian.
-        splats: Means, quaternions, scales and opacities as the rasterizer takes them.
-        colors: ``[n,3]`` base colours.
-    """
-
-    x: np.ndarray
-    x0: np.ndarray
-    m: np.ndarray
-    v: np.ndarray
+    x: np.ndarray  # [n,14] float32: mean, log scale, quaternion, opacity logit, colour
+    x0: np.ndarray  # Where each began
+    m: np.ndarray  # First moment
+    v: np.ndarray  # Second moment
+    # [n] size of each Gaussian: geometric mean of its two largest scales when it began
     units: np.ndarray
+    # [n] share of the box about the start that each Gaussian's mean and scales may use
     box_shares: np.ndarray
-    min_sizes: np.ndarray
-    splats: Splats
-    colors: np.ndarray
+    min_sizes: np.ndarray  # [n] least log scale of each Gaussian
+    splats: Splats  # Means, quaternions, scales and opacities as the rasterizer takes them
+    colors: np.ndarray  # [n,3] base colours
 
     def view_colors(self) -> np.ndarray | None:
         """Colours for the rasterizer: as they are, or None: from the harmonics, which are brought up to date."""

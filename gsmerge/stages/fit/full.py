@@ -56,27 +56,19 @@ EPS = 1e-15  # of Adam
 
 @dataclass(frozen=True)
 class FitPlan:
-    """How a run goes.
+    """How a run goes."""
 
-    Args:
-        photos: At full and at half size, and larger ones where there are any.
-        weights: ``[h,w]`` float32 of each photo at either size: 0 on held-out blocks, ``HIDDEN`` on pixels that
-            neither steps nor scores use, 1 elsewhere.
-        step_weights: The same as a step uses them: 0 on hidden pixels; at full size 1 on held-out blocks, too, and
-            larger photos count everywhere.
-        options: What a step does.
-        dropout: Share of the Gaussians that a step leaves out.
-        half_part: Share of the steps, the first ones, on half-size photos.
-        poses: The motions of the cameras; None where they are fixed.
-    """
-
-    photos: tuple[Photos, ...]
+    photos: tuple[Photos, ...]  # At full and at half size, and larger ones where there are any
+    # [h,w] float32 of each photo at either size: 0 on held-out blocks, `HIDDEN` on pixels that
+    # neither steps nor scores use, 1 elsewhere
     weights: tuple[list[np.ndarray], list[np.ndarray]]
+    # The same as a step uses them: 0 on hidden pixels; at full size 1 on held-out blocks, too, and
+    # larger photos count everywhere
     step_weights: tuple[list[np.ndarray], ...]
-    options: FitOptions
-    dropout: float
-    half_part: float
-    poses: PoseState | None = None
+    options: FitOptions  # What a step does
+    dropout: float  # Share of the Gaussians that a step leaves out
+    half_part: float  # Share of the steps, the first ones, on half-size photos
+    poses: PoseState | None = None  # The motions of the cameras; None where they are fixed
 
     def level_at(self, step: int, progress: float) -> int:
         """Which photos a step looks at: half-size ones first, then full-size ones, and larger ones in between."""
@@ -319,25 +311,18 @@ def affordable_steps(seconds: float, plan: FitPlan) -> int:
 
 @dataclass(eq=False)
 class PoseState:
-    """Motions of the views under optimisation, whose mean is none, so that the scene stays where it is.
+    """Motions of the views under optimisation, whose mean is none, so that the scene stays where it is."""
 
-    Args:
-        start: ``[v,4,4]`` viewmats before the fit.
-        viewmats: ``[v,4,4]`` float64, written by every step; the photos of all sizes share them.
-        x: ``[v,6]`` motion of each, see :func:`gsmerge.geometry.motion_vectors`: about the scene's middle, where turns
-            and shifts of a camera show differently.
-        m: First moment.
-        v: Second moment.
-        counts: ``[v]`` steps of each.
-        pixel: Angle of a pixel, radians, which is also its size at the scene's depth, canonical units.
-    """
-
-    start: np.ndarray
+    start: np.ndarray  # [v,4,4] viewmats before the fit
+    # [v,4,4] float64, written by every step; the photos of all sizes share them
     viewmats: np.ndarray
+    # [v,6] motion of each, see gsmerge.geometry.motion_vectors: about the scene's middle, where
+    # turns and shifts of a camera show differently
     x: np.ndarray
-    m: np.ndarray
-    v: np.ndarray
-    counts: np.ndarray
+    m: np.ndarray  # First moment
+    v: np.ndarray  # Second moment
+    counts: np.ndarray  # [v] steps of each
+    # Angle of a pixel, radians, which is also its size at the scene's depth, canonical units
     pixel: float
 
     def step(self, view: int, gradient: np.ndarray, rates: Tuning, progress: float) -> None:
