@@ -20,7 +20,7 @@ ROWS_PER_TASK = 4096
 
 @dataclass(frozen=True)
 class Members:
-    """The scene's Gaussians as the kernels want them: contiguous float32 arrays."""
+    """Gaussians of a scene as contiguous float32 arrays for the kernels."""
 
     means: np.ndarray  # [n,3]
     quats: np.ndarray  # [n,4] wxyz
@@ -41,7 +41,7 @@ def _array(values: np.ndarray) -> np.ndarray:
 
 
 def scene_members(scene: Scene) -> Members:
-    """The members of a canonical scene, with the pixel footprint of each in its own view."""
+    """Return the members of a canonical aligned scene, with pixel footprints in their own views."""
     g, cameras = scene.gaussians, scene.cameras
     means = _array(g.means)
     footprints = np.empty(len(g), np.float32)
@@ -59,12 +59,9 @@ def scene_members(scene: Scene) -> Members:
 
 
 def unaligned_members(scene: Scene, pixels: np.ndarray) -> Members:
-    """The members of a canonical scene without an order, by the pixel that each belongs to.
+    """Return the members of a canonical unaligned scene, given the pixel ``[n]`` int64 of each, -1 for none.
 
-    Args:
-        scene: n Gaussians and their views.
-        pixels: ``[n]`` int64, see :class:`Members`. What belongs to no pixel is taken to be seen by the nearest
-            camera.
+    Gaussians without a pixel count as seen by the nearest camera.
     """
     means, cameras = _array(scene.gaussians.means), scene.cameras
     focals = np.sqrt(np.abs(cameras.Ks[:, 0, 0] * cameras.Ks[:, 1, 1])).astype(np.float64)
@@ -82,15 +79,17 @@ def unaligned_members(scene: Scene, pixels: np.ndarray) -> Members:
 
 
 def gaussian_members(g: Gaussians, footprints: np.ndarray, pixels: np.ndarray | None = None) -> Members:
-    """Gaussians as arrays, with their footprints and pixels."""
+    """Return Gaussians as members with given footprints and pixels."""
     means, quats, scales, opacities, sh0, shN = map(_array, (g.means, g.quats, g.scales, g.opacities, g.sh0, g.shN))
     return Members(means, quats, scales, opacities, sh0, shN, footprints, pixels)
 
 
 @dataclass(frozen=True)
 class Moments:
-    """Pooled moments of g groups: ``means [g,3]``, ``covars [g,3,3]``, ``weights``, ``masses``, ``extinctions``,
-    ``footprints [g]`` and ``sh [g,k,3]``; numpy, float64 except for float32 sh. See :class:`FeatureGaussians`.
+    """Pooled moments of g groups, float64 except for float32 sh.
+
+    ``means [g,3]``, ``covars [g,3,3]``, ``weights``, ``masses``, ``extinctions``, ``footprints
+    [g]`` and ``sh [g,k,3]``, see :class:`FeatureGaussians`.
     """
 
     means: np.ndarray
@@ -103,15 +102,12 @@ class Moments:
 
 
 def pool_members(members: Members, starts: np.ndarray, ids: np.ndarray, rule: Rule = "depth") -> Moments:
-    """Moments of every group of members: opacity weights, total covariance, winsorised members.
+    """Pool every group of members into its moments: opacity weights, total covariance, winsorised members.
 
-    Args:
-        members: The scene's Gaussians.
-        starts: ``[g+1]`` int64 into ``ids``.
-        ids: ``[m]`` int32 rows of ``members``.
-        rule: ``"depth"``: the members' own covariances are added to the spread of their means, and the optical
-            depth is what they have together. ``"paper"``: the paper's moment matching (eq. teacher_mean,
-            teacher_cov), which states no opacity: the members' mean.
+    ``ids [m]`` int32 are rows of ``members``, ``starts [g+1]`` int64 point into them. ``rule``
+    ``"depth"``: members' own covariances are added to the spread of their means, and their
+    integrated optical depths add. ``"paper"``: the paper's moment matching (eq. teacher_mean,
+    teacher_cov), which states no opacity: the members' mean.
     """
     num_groups = len(starts) - 1
     geometry = np.zeros((num_groups, 13))
@@ -135,7 +131,7 @@ def pool_members(members: Members, starts: np.ndarray, ids: np.ndarray, rule: Ru
 
 
 def principal_axes(covars: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Standard deviations ``[g,3]`` (rising) and unit quaternions ``[g,4]`` of covariances ``[g,3,3]``."""
+    """Return standard deviations ``[g,3]``, rising, and unit quaternions ``[g,4]`` of covariances ``[g,3,3]``."""
     covars = np.ascontiguousarray(covars, dtype=np.float64)
     scales, quats = np.empty((len(covars), 3)), np.empty((len(covars), 4))
 
@@ -148,7 +144,7 @@ def principal_axes(covars: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def to_gaussians(covars: np.ndarray, extinctions: np.ndarray, means: np.ndarray, sh: np.ndarray) -> Gaussians:
-    """Gaussians of given moments; opacity from the conserved optical depth over the disc."""
+    """Return Gaussians of given moments; opacity comes from the conserved optical depth over the disc."""
     scales, quats = principal_axes(covars)
     opacities = 1 - np.exp(-extinctions / (scales[:, 1] * scales[:, 2]))
     return Gaussians(
@@ -162,7 +158,7 @@ def to_gaussians(covars: np.ndarray, extinctions: np.ndarray, means: np.ndarray,
 
 
 def feature_to_gaussians(features: FeatureGaussians) -> Gaussians:
-    """One Gaussian per Feature Gaussian (K = 1)."""
+    """Decode every Feature Gaussian into one Gaussian (K = 1)."""
     return to_gaussians(
         features.covars,
         features.extinctions.astype(np.float64) * features.gains,

@@ -1,7 +1,7 @@
-"""Facts and options -> decisions: the one place that reads "auto", effort, device, budget, recipe and checkpoint names.
+"""The plan of a run: the one place that reads "auto", effort, device, budget, recipe and checkpoint names.
 
-:func:`make_plan` settles every choice once. Each stage is handed its own part of the plan, and no stage knows the
-options of another.
+:func:`make_plan` settles every choice once. Each stage is handed its own part of the plan, and no
+stage knows the options of another.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ MOST_STEPS = 2.0  # times as many
 
 @dataclass(frozen=True)
 class Effort:
-    """What an effort means to the stages."""
+    """Meaning of an effort for the stages."""
 
     steps: int  # Of the full fit
     rectangles: float  # Of `rdseg`, see gsmerge.SegmentOptions
@@ -61,7 +61,7 @@ EFFORTS = {
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Everything that was decided before the first superpixel is cut."""
+    """Decisions that are made before the first superpixel is cut."""
 
     superpixels: SuperpixelPlan  # How each view is cut, and into how many
     # What corrects the analytic stages: networks, None for nothing, or both in turn where they
@@ -88,27 +88,25 @@ class Plan:
 
     @property
     def weakens(self) -> bool:
-        """Whether groups that other views see through begin fainter, as a long fit follows."""
+        """Whether groups that other views see through start fainter, because a long fit follows."""
         return self.superpixels.start_share < 1
 
     @property
     def limits(self) -> CountLimits:
-        """What is known of the number of Gaussians."""
+        """Limits of the number of Gaussians."""
         return self.superpixels.limits
 
     def with_fixed_cameras(self) -> Plan:
-        """Keep the cameras where they are during the fit."""
+        """Return the plan with cameras that the fit does not move."""
         return replace(self, fit=replace(self.fit, move_cameras=False))
 
     def with_fit(self, fit: FitOptions, *, start_share: float = 1.0) -> Plan:
-        """Replace the fit, and the share of the Gaussians that it begins with."""
+        """Return the plan with another fit and another share of the Gaussians to start from."""
         return replace(self, fit=fit, superpixels=replace(self.superpixels, start_share=start_share))
 
 
 def make_plan(prepared: Prepared, options: CompactOptions) -> Plan:
-    """Decide everything that the options leave open.
-
-    Notes say what was chosen for the scene, and what was asked for that it does not have.
+    """Decide everything that the options leave open; notes say what was chosen or is missing.
 
     Raises:
         SceneError: If a checkpoint is required and cannot be used.
@@ -166,14 +164,11 @@ def _check_photos(scene: Scene, options: CompactOptions) -> None:
 
 
 def choose_networks(options: CompactOptions, *, photos: bool, aligned: bool = True) -> str:
-    """Name the checkpoint to load: as asked, or the shipped one where it improves results (docs/internals/networks.md).
+    """Return the name of the checkpoint to load: as asked, or the shipped one where it improves results.
 
-    That is where no fit follows, or a short one; not where time counts most.
-
-    Args:
-        options: All settings.
-        photos: Whether there are any to fit to.
-        aligned: Whether there is one Gaussian per pixel, which is what the shipped networks learnt from.
+    That is where no fit follows, or a short one, on scenes with one Gaussian per pixel
+    (``aligned``), which the shipped networks learnt from (docs/internals/networks.md). ``photos``:
+    whether there are any to fit to.
     """
     if options.checkpoint != "auto":
         return options.checkpoint
@@ -183,13 +178,13 @@ def choose_networks(options: CompactOptions, *, photos: bool, aligned: bool = Tr
 
 
 def resolved_settings(options: CompactOptions, *, photos: bool) -> dict[str, Any]:
-    """Return all settings by flat name, with the checkpoint and the matching that are used where none was asked for."""
+    """Return all settings by flat name, with checkpoint and matching resolved."""
     match = options.match.match or ("overlap" if EFFORTS[options.effort].merges else "none")
     return options.to_dict() | {"checkpoint": choose_networks(options, photos=photos), "match": match}
 
 
 def _load_networks(options: CompactOptions, scene: Scene) -> Checkpoint | None:
-    """Load the checkpoint to use, which gives what the options ask for; None for the analytic stages alone."""
+    """Load the checkpoint to use, and check that it fits the options; None for the analytic stages alone."""
     name = choose_networks(options, photos=scene.images is not None, aligned=scene.aligned)
     if name == "none":  # torch is imported only where there are networks
         return None
@@ -220,7 +215,7 @@ def require_children(name: str, count: int, checkpoint: Checkpoint | None) -> No
 
 
 def _resolve_superpixels(options: SegmentOptions, scene: Scene, effort: Effort) -> SegmentOptions:
-    """Fill in what effort and scene decide; a note says why."""
+    """Fill in the options of superpixels that effort and scene decide; a note says why."""
     if options.superpixels == AUTO_SHARE:
         share, why = measured_share(scene)
         text = SHARE if share is None else f"{100 * share:.2g}%"
@@ -232,7 +227,7 @@ def _resolve_superpixels(options: SegmentOptions, scene: Scene, effort: Effort) 
 
 
 def _resolve_clean(options: CleanOptions, prepared: Prepared) -> CleanOptions:
-    """Keep the sky where no photo is used that could say where it is."""
+    """Return the options of clean-up, without ``drop_sky`` where no photo is used."""
     if options.drop_sky and not prepared.photo_views:
         note("drop_sky: no photo is used that could say where the sky is, so it stays")
         return replace(options, drop_sky=False)
@@ -242,10 +237,10 @@ def _resolve_clean(options: CleanOptions, prepared: Prepared) -> CleanOptions:
 def _merge_unseen(
     prepared: Prepared, options: CompactOptions, segment: SegmentOptions, clean_options: CleanOptions
 ) -> tuple[Gaussians | None, int | None]:
-    """Merge what no view sees at the rate of the rest, and clean it up.
+    """Merge the Gaussians that no view sees at the rate of the rest, and clean them.
 
-    Returns:
-        The Gaussians, None without any; and the number that shares of a budget refer to, None for the scene's own.
+    Returns them, None without any; and the number that shares of a budget refer to, None for the
+    scene's own.
     """
     scene, unseen = prepared.scene, prepared.unseen
     num_input = prepared.given.num_gaussians if len(scene) < len(prepared.given) else None
@@ -263,7 +258,7 @@ def _merge_unseen(
 
 
 def resolve_fit(options: CompactOptions) -> FitOptions:
-    """Fill in what effort decides of a fit: its steps, and whether Gaussians that no photo shows are left out."""
+    """Fill in the steps of the fit by effort, and whether to leave out Gaussians that no photo shows."""
     fit, effort = options.fit, EFFORTS[options.effort]
     steps = effort.steps if fit.fit_steps is None else fit.fit_steps
     prunes = fit.fit != "none" or effort.prunes
@@ -271,7 +266,7 @@ def resolve_fit(options: CompactOptions) -> FitOptions:
 
 
 def steps_for(options: CompactOptions, num_gaussians: int, scene: Scene) -> int:
-    """Return the steps of the full fit: as given, or more for more Gaussians in the pixels of all views.
+    """Return the steps of the full fit: as given, or more for more Gaussians per pixel.
 
     They grow with the square root of the share from ``USUAL_SHARE`` on.
     """
@@ -287,7 +282,7 @@ def steps_for(options: CompactOptions, num_gaussians: int, scene: Scene) -> int:
 def _resolve_fit_to(
     prepared: Prepared, options: CompactOptions, limits: CountLimits, backend: FitBackend[Any]
 ) -> FitOptions:
-    """Fill in what effort, scene and device decide of the fit."""
+    """Fill in the options of the fit that effort, scene and device decide."""
     scene = prepared.scene
     if scene.images is None or not prepared.photo_views:
         options = replace(options, fit=replace(options.fit, fit="none"))
@@ -304,7 +299,7 @@ def _resolve_fit_to(
 
 
 def _choose_scored_views(prepared: Prepared, options: CompactOptions) -> tuple[int, ...]:
-    """Choose given views whose photos show the scene; more of them where a quality is asked for, which they decide."""
+    """Choose views, whose photos show the scene, for scoring; more where they decide a quality search."""
     views = prepared.photo_views or range(len(prepared.scene))
     candidates = [view for view, place in enumerate(prepared.repeated) if place in views]
     choose_some = report_views if options.budget.target_psnr is None else scored_views

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class CompactReport:
-    """What a run did.
+    """Report of a run.
 
     Args:
         num_input: Gaussians in the scene.
@@ -30,8 +30,8 @@ class CompactReport:
         psnr_before: Mean PSNR (dB) of the input views rendered from the input, of many views some, and in a fixed
             quarter of each unless a quality was asked for; None without photos. :func:`gsmerge.evaluate` is exact.
         psnr_after: The same from the result.
-        choices: What the stages decided (count, curve, merge, scores, clusters, fit).
-        notes: Warnings about the input and what was adapted, one sentence each.
+        choices: Decisions of the stages (count, curve, merge, scores, clusters, fit).
+        notes: Warnings about the input and adaptations to it, one sentence each.
         options: All settings by flat name.
         peak_memory_bytes: Largest resident memory of the process so far.
         unmet: Why a target that was asked for is not met, and how far the result got; None if it is.
@@ -67,7 +67,7 @@ class CompactResult:
     coarser: tuple[CompactResult, ...] = ()
 
     def to(self, device: torch.device | str | None) -> CompactResult:
-        """Return the same result with tensors on a device; None: as it is, with NumPy arrays."""
+        """Return the same result with tensors on a device; None leaves NumPy arrays."""
         if device is None:
             return self
         coarser = tuple(one.to(device) for one in self.coarser)
@@ -76,7 +76,7 @@ class CompactResult:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """Gaussians of one count, scored."""
+    """Gaussians built for one count, with their score."""
 
     count: int | None  # Gaussians that were asked for; None: as many as `superpixels` and K give
     fitted: Fitted  # What was built, canonical
@@ -87,7 +87,7 @@ class Candidate:
 
 
 def score(count: int | None, fitted: Fitted, prepared: Prepared, plan: Plan) -> Candidate:
-    """Bring canonical Gaussians into the world, with those that no view sees, and score them on the input photos."""
+    """Move canonical Gaussians into the world, add the unseen, and score them on the input photos."""
     gaussians, prepared = fitted.gaussians, prepared.with_cameras(fitted.cameras)
     if plan.unseen is not None:
         gaussians = Gaussians.concat([gaussians, plan.unseen])
@@ -117,7 +117,7 @@ def _note_moves(prepared: Prepared, cameras: Cameras, plan: Plan) -> None:
 def input_psnr(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> float:
     """Measure the mean PSNR (dB) of the scored input photos, rendered from world-frame Gaussians.
 
-    In a quarter of every photo, or in the whole where a quality was asked for.
+    Only a quarter of every photo is scored, unless a quality was asked for.
     """
     photos, near, quarter = scene_photos(prepared.given), NEAR * prepared.frame.unit, plan.target_psnr is None
 
@@ -134,17 +134,11 @@ def make_result(
     plan: Plan,
     search: Mapping[str, Any],
 ) -> CompactResult:
-    """Report the best candidate and its further levels of detail, with the input's PSNR beside their own.
+    """Report the best candidate and its coarser levels of detail, with the input's PSNR beside their own.
 
-    Args:
-        best: The finest level.
-        levels: Coarser ones.
-        prepared: The scene.
-        plan: What was decided.
-        search: What the search for the finest says for the report, see :meth:`gsmerge.search.CountSearch.facts`.
-
-    The input is scored last, when the kernels are compiled and memory is free again. The seconds, choices and notes of
-    the current record, of what came before the candidates, enter the report.
+    ``search`` are the facts of :meth:`gsmerge.search.CountSearch.facts`. The input is scored last,
+    when the kernels are compiled and memory is free again. The seconds, choices and notes of the
+    current record, which come before those of the candidates, enter the report.
     """
     before, run, seconds = None, current_record(), search["seconds"]
     if prepared.given.images is not None:
