@@ -1,7 +1,7 @@
-"""The parameters under optimisation on a device, and one step on all of them: the kernel ``optimise.adam``.
+"""Parameters under optimisation on a device, and the optimiser step of the kernel ``optimise.adam``.
 
-On CUDA one Triton kernel does all of a step (:mod:`gsmerge.gpu.adam_kernel`), elsewhere torch. Both also write what the
-new parameters mean to the rasterizer, so a step begins with nothing to compute.
+On CUDA one Triton kernel does all of a step (:mod:`gsmerge.gpu.adam_kernel`), elsewhere torch. Both
+also write what the new parameters mean to the rasterizer, so a step begins with nothing to compute.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from gsmerge.types import SH_C0, Gaussians
 
 @dataclass(eq=False)
 class FitState:
-    """Parameters under optimisation, and what they mean to the rasterizer; see :mod:`gsmerge.stages.fit.fit_state`."""
+    """Parameters under optimisation, and their meaning for the rasterizer; see :mod:`gsmerge.stages.fit.fit_state`."""
 
     # [n,14] float32: mean, log scale, quaternion, opacity logit, colour; so are the next three
     x: Tensor
@@ -43,7 +43,7 @@ class FitState:
 
 @dataclass(frozen=True, eq=False)
 class StepGradients:
-    """Gradients of a loss in what the rasterizer is given; shapes as there. ``reached [n]`` bool: drawn in the view."""
+    """Gradients of a loss in the rasterizer's inputs; ``reached [n]`` bool: drawn in the view."""
 
     means: Tensor
     quats: Tensor
@@ -96,14 +96,9 @@ def state_of(x: Tensor, shN: Tensor) -> FitState:
 def adam_step(state: FitState, gradients: StepGradients, options: FitOptions, rates: Tensor, step: int) -> None:
     """Take an Adam step by a view's gradients, in place, within the box about the start.
 
-    Gaussians that the view does not show stay as they are.
-
-    Args:
-        state: n Gaussians.
-        gradients: Of the image loss; the pulls on opacity and size are added here.
-        options: Pulls, decays, limits.
-        rates: ``[14]`` step of each column, see :func:`gsmerge.stages.fit.full.step_sizes`.
-        step: From 1.
+    Gaussians that the view does not show stay unchanged. The pulls on opacity and size are added to
+    the gradients of the image loss here. ``rates [14]``: see
+    :func:`gsmerge.stages.fit.full.step_sizes`; ``step`` counts from 1.
     """
     if state.x.is_cuda and has_triton():
         from gsmerge.gpu.adam_kernel import launch

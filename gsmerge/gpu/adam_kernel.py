@@ -1,4 +1,7 @@
-"""The optimiser step as one Triton kernel. Only imported where Triton is; see :func:`gsmerge.gpu.adam.adam_step`."""
+"""Optimiser step as one Triton kernel, imported only where Triton is.
+
+See :func:`gsmerge.gpu.adam.adam_step`.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""gaussians -> gaussians with fitted colours, on a device: :mod:`gsmerge.stages.fit.color`.
+"""Gaussians -> Gaussians with fitted colours, on a device; see :mod:`gsmerge.stages.fit.color`.
 
-The same conjugate gradients with the same weights. The matrix of a view, applied to colours, is an image, and its
-transpose the gradient of an image: each view is drawn once, and its transpose kept for as long as it is used.
+The same conjugate gradients with the same weights. The matrix of a view, applied to colours, is an
+image, and its transpose the gradient of an image: each view is drawn once, and its transpose kept
+for as long as it is used.
 """
 
 from __future__ import annotations
@@ -32,11 +33,7 @@ def fit_colors(
 ) -> tuple[Gaussians, FitReport]:
     """Fit base colours to the photos, and keep them only if held-out blocks of the photos get better.
 
-    Args:
-        gaussians: Gaussians, whose geometry, opacities and higher harmonics stay as they are.
-        photos: The input views.
-        options: The solver's settings.
-        seed: Chooses the held-out blocks.
+    ``seed`` chooses the held-out blocks. Geometry, opacities and higher harmonics stay.
     """
     device = gaussians.means.device
     train = training_weights(photos.host, min(0.5, HOLDOUT * options.holdout), seed)
@@ -53,7 +50,7 @@ def fit_colors(
 
 @dataclass(frozen=True, eq=False)
 class _DeviceSystem:
-    """:class:`gsmerge.stages.fit.color.ColorSystem` of tensors."""
+    """Colour system of tensors, see :class:`gsmerge.stages.fit.color.ColorSystem`."""
 
     gaussians: Gaussians  # n Gaussians, whose geometry stays
     photos: DevicePhotos  # V photos

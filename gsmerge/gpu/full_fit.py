@@ -1,7 +1,8 @@
-"""gaussians -> fitted gaussians, on a device: the run of :mod:`gsmerge.stages.fit.full`, which says why it is as it is.
+"""Gaussians -> fitted Gaussians, on a device; :mod:`gsmerge.stages.fit.full` explains the method.
 
-Order of the views and backgrounds are those of the CPU's run. What comes back from the device during the run are
-scores at its beginning and at the change of sizes, and the error once in ``READ_EVERY`` steps.
+Order of the views and backgrounds are those of the CPU's run. What comes back from the device
+during the run are scores at its beginning and at the change of sizes, and the error once in
+``READ_EVERY`` steps.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ READ_EVERY = 20  # steps; each reading waits for the device
 
 @dataclass(frozen=True, eq=False)
 class PhotoLevel:
-    """The photos of one size, and what a step needs of them."""
+    """Photos of one size, with weights and window means for the steps."""
 
     photos: DevicePhotos  # The photos
     means: Tensor  # [v,2,3,h,w] of their windows, see gsmerge.gpu.image_scores.photo_means
@@ -184,14 +185,8 @@ def step_gradients(
 ) -> tuple[StepGradients, Tensor]:
     """Differentiate one view's loss, and sum its weighted squared errors.
 
-    Args:
-        state: n Gaussians.
-        level: The photos.
-        view: Of them.
-        background: ``[3]``.
-        kept: ``[n]`` opacities of what is drawn; None: the state's own.
-        options: Of the loss.
-        look: Low-pass, and whether its energy is compensated; see :func:`gsmerge.stages.fit.full.look_of`.
+    ``kept [n]``: opacities of what is drawn, None: the state's own. ``look``: low-pass and
+    antialiasing, see :func:`gsmerge.stages.fit.full.look_of`.
     """
     photos = level.photos
     shape = (state.means, state.quats, state.scales, state.opacities if kept is None else kept)
@@ -253,7 +248,7 @@ def fit_full(
 
 
 class _Run:
-    """The steps of a run, and where it stands."""
+    """State of a run and its steps."""
 
     def __init__(
         self,

@@ -1,7 +1,7 @@
-"""Compare what a device computes with the CPU, on 64 Gaussians, before any work is given to it.
+"""Comparison of a device with the CPU on 64 Gaussians, before any work is given to it.
 
-Drivers, gsplat, Triton and torch each come in versions of their own, and not every combination works.
-What fails or differs is found here in a moment, and the CPU does the work.
+Drivers, gsplat, Triton and torch each come in versions of their own, and not every combination
+works. What fails or differs is found here in a moment, and the CPU does the work.
 """
 
 from __future__ import annotations

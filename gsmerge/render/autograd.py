@@ -1,4 +1,4 @@
-"""Rendering of tensors, which autograd can differentiate."""
+"""Differentiable rendering of tensors."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def _view_gradients(
     pose: bool,
     used: ColorGradients | None,
 ) -> tuple[list[Array], Array | None, ColorGradients]:
-    """Gradients of one view's Gaussians, in the order of the fields, of its view matrix, and those through colours."""
+    """Return the gradients of one view's Gaussians by field, of its view matrix, and through colours."""
     colors = view_colors(plan)
     shape = gradients_of(plan, colors, image, transmittance, grad_image, -grad_alpha, pose)
     shade = color_gradients(plan, shape.colors, colors, used=used)
@@ -39,7 +39,7 @@ def _view_gradients(
 
 
 class _Render(torch.autograd.Function):
-    """Images and alphas (and depths, without gradient) of the tensors of Gaussians and view matrices."""
+    """Images and alphas (and depths, without gradient) from the tensors of Gaussians and view matrices."""
 
     @staticmethod
     def forward(
@@ -94,9 +94,9 @@ class _Render(torch.autograd.Function):
 def render_tensors(
     gaussians: Gaussians, cameras: Cameras, background: Array, *, with_depths: bool, **options: Any
 ) -> Rendering:
-    """:func:`gsmerge.render` of tensors on the CPU, with a backward pass.
+    """Render tensors on the CPU with a backward pass, as :func:`gsmerge.render` does.
 
-    Same arguments, except for the checked ``[3]`` background.
+    The ``[3]`` background is checked already.
     """
     tensors = (*vars(gaussians).values(), cameras.viewmats)
     cameras = replace(cameras, viewmats=cameras.viewmats.detach())
@@ -136,21 +136,17 @@ class _Draw(torch.autograd.Function):
 
 
 def draw_colored(shape: Shape, colors: Tensor, camera: dict[str, Any], background: np.ndarray) -> tuple[Tensor, Tensor]:
-    """Image of one view, by the kernels; on a GPU there is :func:`gsmerge.render.cuda.rasterize`.
+    """Draw one view by the kernels; on a GPU there is :func:`gsmerge.render.cuda.rasterize`.
 
-    Args:
-        shape: Means ``[n,3]``, quaternions ``[n,4]``, scales ``[n,3]`` and opacities ``[n]``, float32.
-        colors: ``[n,3]``, any sign, float32.
-        camera: As :meth:`gsmerge.render.photos.Photos.camera` gives it.
-
-    Returns:
-        ``[h,w,3]``, differentiable in all tensors, and ``[n]`` bool: which Gaussians have a footprint in the view.
+    ``shape`` are means ``[n,3]``, quaternions ``[n,4]``, scales ``[n,3]`` and opacities ``[n]``,
+    ``colors [n,3]`` of any sign, all float32. Returns the image ``[h,w,3]``, differentiable in all
+    of them, and a mask ``[n]`` of the Gaussians with a footprint in the view.
     """
     return _Draw.apply(camera, background, *shape, colors)
 
 
 def seen_colors(means: Tensor, sh0: Tensor, shN: Tensor, viewmat: np.ndarray) -> Tensor:
-    """``[n,3]`` colours that harmonics ``[n,1,3]`` and ``[n,k-1,3]`` show a view, not below 0, without gradient."""
+    """Return the colours ``[n,3]`` of harmonics in a view, not below 0, without gradient."""
     eye = (-viewmat[:3, :3].T @ viewmat[:3, 3]).astype(np.float32)
     count, arrays = len(means), [tensor.detach().contiguous().numpy() for tensor in (means, sh0, shN)]
     colors = np.empty((count, 3), np.float32)

@@ -1,7 +1,7 @@
-"""groups + unaligned gaussians -> members: the pixel that each Gaussian belongs to.
+"""Groups and unaligned Gaussians -> members: the pixel that each Gaussian belongs to.
 
-A Gaussian belongs to the superpixel, of all views, that gets most of its blending weights (paper, supplement
-"Compaction of Non-Pixel-Aligned FF Backbones"). What no view sees is marked.
+A Gaussian belongs to the superpixel, of all views, that gets most of its blending weights (paper,
+supplement "Compaction of Non-Pixel-Aligned FF Backbones"). Gaussians that no view sees are marked.
 """
 
 from __future__ import annotations
@@ -32,10 +32,9 @@ MIN_ALPHA = 0.5  # opacity of a pixel from which it counts when superpixels are 
 
 @stage("members")
 def assign(scene: Scene, groups: Groups) -> Members:
-    """Give every Gaussian of a canonical scene its pixel: its own, or one of the superpixel that it adds most to.
+    """Assign a pixel to every Gaussian of a canonical scene: its own, or one of its dominant superpixel.
 
-    Raises:
-        UsageError: If no view sees any Gaussian.
+    Raises UsageError if no view sees any Gaussian.
     """
     if scene.aligned:
         return scene_members(scene)
@@ -62,7 +61,7 @@ def merge_unseen(gaussians: Gaussians, scene: Scene, count: int) -> Gaussians:
 
 @dataclass(frozen=True)
 class Owners:
-    """The superpixel that each of n Gaussians adds most to."""
+    """Dominant superpixel of each of n Gaussians."""
 
     # [n] float32: its blending weights summed over that superpixel, pixels; 0 where nothing is seen
     values: np.ndarray
@@ -71,15 +70,10 @@ class Owners:
 
 
 def find_owners(scene: Scene, groups: Groups, near: float = 0.01) -> Owners:
-    """The dominant superpixel of every Gaussian, over all views; of equal ones the first view's first.
+    """Find the dominant superpixel of every Gaussian over all views; the first view wins ties.
 
-    Only the best superpixel so far is kept of each Gaussian, and of one row of tiles at a time which Gaussian adds
-    what to which superpixel.
-
-    Args:
-        scene: n Gaussians and V views.
-        groups: The superpixels of the views.
-        near: Nearest depth that is seen.
+    Only the best superpixel so far is kept of each Gaussian, and the pairs of one row of tiles at a
+    time.
     """
     splats, cameras = prepare(scene.gaussians), scene.cameras
     viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
@@ -100,12 +94,7 @@ def find_owners(scene: Scene, groups: Groups, near: float = 0.01) -> Owners:
 
 
 def seen_weights(scene: Scene, near: float = 0.01) -> np.ndarray:
-    """``[n]`` float32: the most blending weight that each Gaussian has in one view, pixels.
-
-    Args:
-        scene: n Gaussians and their views.
-        near: Nearest depth that is seen.
-    """
+    """Measure the largest blending weight ``[n]`` float32 of each Gaussian in one view, pixels."""
     splats, cameras = prepare(scene.gaussians), scene.cameras
     viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
     most, lock = np.zeros(len(splats), np.float32), Lock()
@@ -121,19 +110,14 @@ def seen_weights(scene: Scene, near: float = 0.01) -> np.ndarray:
 
 
 def seen_depths(scene: Scene, near: float = 0.01) -> tuple[np.ndarray, np.ndarray]:
-    """``[v,h,w]`` mean depth of what each pixel shows, and ``[v,h,w]`` whether it mostly shows something.
-
-    Args:
-        scene: The canonical scene.
-        near: Nearest depth that is seen.
-    """
+    """Render the mean depth ``[v,h,w]`` of every pixel, and a mask ``[v,h,w]`` of mostly opaque pixels."""
     drawn = render(scene.gaussians, scene.cameras, near=near, with_depths=True)
     assert drawn.depths is not None
     return drawn.depths[..., 0], drawn.alphas[..., 0] > MIN_ALPHA
 
 
 def each_view(one_view: Callable[[int], None], num_views: int, num_gaussians: int) -> None:
-    """Call for every view, several at once unless the Gaussians are so many that their plans would fill the memory."""
+    """Call a function for every view, in parallel unless the views' plans would fill the memory."""
     if num_gaussians > ONE_AT_A_TIME:
         for view in range(num_views):
             one_view(view)
@@ -142,12 +126,9 @@ def each_view(one_view: Callable[[int], None], num_views: int, num_gaussians: in
 
 
 def view_owners(plan: ViewPlan, labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Contribution ``[m]`` to the dominant superpixel of one view and its label ``[m]``, of the plan's Gaussians.
+    """Find the dominant superpixel of each of a plan's m Gaussians, and their contribution to it.
 
-    Args:
-        plan: The view.
-        labels: ``[h,w]`` int32, 0 to ``count - 1``.
-        count: Superpixels.
+    ``labels [h,w]`` int32 are 0 to ``count - 1``. Returns contributions ``[m]`` and labels ``[m]``.
     """
     labels = np.ascontiguousarray(labels, np.int32)
     num, room = len(plan.ids), max(FIRST_PAIRS, count)
@@ -168,12 +149,7 @@ def view_owners(plan: ViewPlan, labels: np.ndarray, count: int) -> tuple[np.ndar
 
 
 def owner_pixels(owners: Owners, groups: Groups) -> np.ndarray:
-    """The pixel in the middle of each Gaussian's superpixel, ``[n]`` int64 over all views; -1 for unseen ones.
-
-    Args:
-        owners: The dominant superpixels.
-        groups: The superpixels.
-    """
+    """Return the middle pixel of each Gaussian's superpixel, ``[n]`` int64 over all views, -1 if unseen."""
     counts = np.asarray(groups.counts)
     size, first = groups.labels[0].size, np.cumsum(counts) - counts
 
@@ -185,7 +161,7 @@ def owner_pixels(owners: Owners, groups: Groups) -> np.ndarray:
 
 
 def middle_pixels(labels: np.ndarray, count: int) -> np.ndarray:
-    """``[count]`` int64 pixel of each superpixel nearest to its centroid, row-major; 0 where it has no pixel."""
+    """Return the pixel of each superpixel nearest to its centroid, ``[count]`` int64, 0 without pixels."""
     height, width = labels.shape
     flat = labels.reshape(-1)
     y, x = np.divmod(np.arange(height * width), width)

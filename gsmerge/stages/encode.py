@@ -1,4 +1,4 @@
-"""groups -> feature gaussians: one Feature Gaussian per superpixel, analytic, with the networks' encoder on top."""
+"""Groups -> Feature Gaussians: one per superpixel, analytic, corrected by the networks' encoder if any."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def make_context(networks: Networks | None, members: Members, cameras: Cameras, seed: int) -> NetworkContext | None:
-    """Join networks with what they read of a scene; None for none."""
+    """Return networks with the facts of a scene that they read; None without networks."""
     if networks is None:
         return None
     from gsmerge.networks.apply import NetworkContext  # torch, loaded where there are networks
@@ -37,20 +37,12 @@ def encode(
     *,
     weaken: bool = False,
 ) -> FeatureGaussians:
-    """Pool every superpixel into one Feature Gaussian, view by view.
+    """Pool every superpixel into one Feature Gaussian, in order of view and label.
 
-    Args:
-        scene: The canonical scene.
-        members: Its Gaussians as arrays.
-        groups: The superpixels of every view.
-        networks: Networks whose encoder corrects what is pooled; None: none does.
-        rule: ``"depth"``: opacity weights, total covariance of winsorised members, opacity from the conserved optical
-            depth. ``"paper"``: the paper's moment matching (eq. teacher_mean, teacher_cov; mean opacity).
-        weaken: Lower the optical depth of groups that other views see through, where no network corrects them. A long
-            fit closes the holes that this leaves, and moves what stands before other views less.
-
-    Returns:
-        The Feature Gaussians in order of view and label; superpixels without a valid member are left out.
+    Superpixels without a valid member are left out. ``rule``: see
+    :func:`gsmerge.moments.pool_members`. ``weaken``: lower the optical depth of groups that other
+    views see through, where no network corrects them; a long fit closes the holes that this leaves,
+    and moves what stands before other views less.
     """
     starts, ids, views = member_rows(scene, members, groups)
     features = from_moments(pool_members(members, starts, ids, rule), starts, ids, views)
@@ -62,7 +54,7 @@ def encode(
 
 
 def member_rows(scene: Scene, members: Members, groups: Groups) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Members by superpixel: ``starts [g+1]``, ``ids [m]`` int32, ``views [g]``; empty superpixels left out."""
+    """List members by superpixel: ``starts [g+1]``, ``ids [m]`` int32, ``views [g]``, without empty superpixels."""
     if scene.aligned:
         return group_rows(scene, groups)
     assert members.pixels is not None
@@ -76,7 +68,7 @@ def member_rows(scene: Scene, members: Members, groups: Groups) -> tuple[np.ndar
 
 
 def group_rows(scene: Scene, groups: Groups) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows of the scene by superpixel: ``starts [g+1]``, ``ids [m]`` int32, ``views [g]``; empty ones left out."""
+    """List rows of an aligned scene by superpixel, as :func:`member_rows` does."""
     pixels = scene.pixels_per_view
 
     def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
@@ -93,7 +85,7 @@ def group_rows(scene: Scene, groups: Groups) -> tuple[np.ndarray, np.ndarray, np
 
 
 def from_moments(moments: Moments, starts: np.ndarray, ids: np.ndarray, views: np.ndarray) -> FeatureGaussians:
-    """Feature Gaussians of pooled groups, with neutral gains."""
+    """Make Feature Gaussians of pooled groups, with neutral gains."""
     count = len(moments.means)
     return FeatureGaussians(
         means=to_float32(moments.means),

@@ -1,8 +1,8 @@
-"""scene -> prepared scene: facts about it, and the scene in the frame that all arithmetic runs in.
+"""Scene -> prepared scene: facts about it, and the scene in the frame of all arithmetic.
 
-The canonical frame has its origin at the scene's middle and the median depth as its unit, so that float32 keeps its
-precision far from the world's origin and thresholds (near plane, floors) mean the same at every scale. The unit is a
-power of two: scaling there and back changes no bit.
+The canonical frame has its origin at the scene's middle and the median depth as its unit, so that
+float32 keeps its precision far from the world's origin and thresholds (near plane, floors) mean the
+same at every scale. The unit is a power of two: scaling there and back changes no bit.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ Unseen = Literal["drop", "keep"]
 
 @dataclass(frozen=True)
 class Frame:
-    """x_canonical = (x_world - origin) / unit."""
+    """Canonical frame: x_canonical = (x_world - origin) / unit."""
 
     origin: np.ndarray  # [3] float64, world units
     unit: float  # Length of the canonical unit in world units, a power of two
@@ -117,7 +117,7 @@ def canonicalise(scene: Scene, frame: Frame | None = None) -> tuple[Scene, Frame
 
 @dataclass(frozen=True)
 class PrepareOptions:
-    """What is done before anything is merged.
+    """Options of the preparation, before anything is merged.
 
     Args:
         poses: ``"free"``: views of one Gaussian per pixel are moved to where their photos agree, and the full fit moves
@@ -174,15 +174,10 @@ class Prepared:
 
 @stage("prepare")
 def prepare(scene: Scene, options: PrepareOptions | None = None, frame: Frame | None = None) -> Prepared:
-    """Find what is known of a scene before anything is decided; notes say what was missing and what stands in for it.
+    """Collect the facts of a scene before anything is decided; notes say what was missing and replaced.
 
-    Args:
-        scene: As given.
-        options: What may be changed; None: the defaults.
-        frame: Canonical frame; None: the scene's own.
-
-    Raises:
-        ValueError: If there is no finite Gaussian, or there are images without cameras.
+    ``frame``: canonical frame; None: the scene's own. Raises ValueError if there is no finite
+    Gaussian, or there are images without cameras.
     """
     options = options or PrepareOptions()
     views, repeated = distinct_views(scene)

@@ -1,4 +1,4 @@
-"""scene -> groups: the superpixels of every view, evenly many or cut from a region tree."""
+"""Scene -> groups: the superpixels of every view, evenly many or cut from a region tree."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gsmerge.types import Scene, Segmentation
 
 @dataclass(frozen=True, eq=False)
 class SuperpixelPlan:
-    """How a scene is cut into superpixels."""
+    """Method and numbers for cutting a scene into superpixels."""
 
     options: SegmentOptions  # Method and number
     limits: CountLimits  # Of the number of Gaussians
@@ -55,14 +55,7 @@ def segment_scene(scene: Scene, plan: SuperpixelPlan, count: int | None) -> Segm
 
 @stage("segment")
 def scene_tree(scene: Scene, options: SegmentOptions, limits: CountLimits, count: int) -> RegionTree:
-    """Find all ways to cut a scene into fewer superpixels, those of all views merged where that costs least.
-
-    Args:
-        scene: The canonical scene.
-        options: How the finest superpixels are cut.
-        limits: Of the number of Gaussians.
-        count: Most Gaussians that it will be cut to.
-    """
+    """Build the tree of all coarser superpixels of a scene, fine enough for ``count`` Gaussians."""
     pictures = scene_pictures(scene)
     leaves = min(max(limits.per_view, -(-count // len(scene))), scene.pixels_per_view)
     depths, valid = (pixel_depths(scene), scene.valid) if scene.aligned else seen_depths(scene)
@@ -78,7 +71,7 @@ def knee_count(scene: Scene, plan: SuperpixelPlan) -> int:
 
 @dataclass(frozen=True)
 class CountLimits:
-    """Numbers of Gaussians that the options leave."""
+    """Limits that the options set for the number of Gaussians."""
 
     per_view: int  # Superpixels of each view that the options ask for
     default: int  # Gaussians that `superpixels` and K ask for
@@ -88,7 +81,7 @@ class CountLimits:
 
     @property
     def count(self) -> int | None:
-        """The number that a budget, a size or a device sets; None where ``superpixels`` and K decide."""
+        """Number that a budget, a size or a device sets; None where ``superpixels`` and K decide."""
         if self.exact is not None:
             return self.exact
         return self.max_count if self.default > self.max_count else None
@@ -105,16 +98,10 @@ def count_limits(
 ) -> CountLimits:
     """Compute the limits of the number of Gaussians.
 
-    Args:
-        scene: The views and their Gaussians.
-        segment: Superpixels of each view.
-        decode: K.
-        budget: What limits the number.
-        num_input: Gaussians that shares of a budget refer to; None: those of the scene.
-        num_reserved: Gaussians of the result that are settled already, such as those that no view sees.
-
-    Raises:
-        UsageError: If more superpixels are asked for than there are pixels, or fewer Gaussians than views.
+    ``num_input``: Gaussians that shares of a budget refer to; None: the scene's. ``num_reserved``:
+    Gaussians of the result that are settled already, such as those that no view sees. Raises
+    UsageError if more superpixels are asked for than there are pixels, or fewer Gaussians than
+    views.
     """
     degree, own = scene.gaussians.sh_degree, scene.num_gaussians
     exact = exact_count(budget, own if num_input is None else num_input, degree)

@@ -68,7 +68,7 @@ class Tuning:
 
 @dataclass(frozen=True)
 class FitOptions:
-    """What is fitted to the photos.
+    """Options of the fit to the photos.
 
     Args:
         fit: ``"full"``: all parameters; ``"none"``: nothing.
@@ -105,7 +105,7 @@ class FitOptions:
 
     @property
     def steps(self) -> int:
-        """Steps of the full fit."""
+        """Number of steps of the full fit."""
         return STEPS if self.fit_steps is None else self.fit_steps
 
     @property
@@ -122,7 +122,7 @@ class FitOptions:
 
     @property
     def grows(self) -> bool:
-        """Whether the fit begins with fewer Gaussians than are asked for, and adds the rest on the way."""
+        """Whether the fit starts with fewer Gaussians than are asked for, and adds the rest on the way."""
         return self.fit == "full" and self.steps >= GROW_STEPS
 
     def __post_init__(self) -> None:
@@ -146,7 +146,7 @@ class FitOptions:
 
 @dataclass(frozen=True)
 class FitReport:
-    """What a fit did."""
+    """Report of a fit."""
 
     method: str  # `"none"`, `"color"` or `"full"`: what the result comes from
     # Whether the held-out blocks of the photos got better; if not, the Gaussians are as they were
