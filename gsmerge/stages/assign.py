@@ -18,6 +18,7 @@ from gsmerge.kernels.raster.contribution import PAIR, add_row, settle_row
 from gsmerge.kernels.raster.project import TILE
 from gsmerge.moments import Members, pool_members, scene_members, unaligned_members
 from gsmerge.render import ViewPlan, contributions, plan_view, prepare, render
+from gsmerge.render.photos import NEAR
 from gsmerge.render.view_plan import MAX_SIZE
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
@@ -69,19 +70,15 @@ class Owners:
     labels: np.ndarray  # [n] int32 superpixel within the view, -1 where nothing is seen
 
 
-def find_owners(scene: Scene, groups: Groups, near: float = 0.01) -> Owners:
+def find_owners(scene: Scene, groups: Groups) -> Owners:
     """Find the dominant superpixel of every Gaussian over all views; the first view wins ties.
 
-    Only the best superpixel so far is kept of each Gaussian, and the pairs of one row of tiles at a
-    time.
+    Only the best superpixel so far is kept of each Gaussian, and the pairs of one row of tiles at a time.
     """
-    splats, cameras = prepare(scene.gaussians), scene.cameras
-    viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
-    count, lock = len(splats), Lock()
+    count, lock = len(scene.gaussians), Lock()
     best = Owners(np.zeros(count, np.float32), np.full(count, -1, np.int32), np.full(count, -1, np.int32))
 
-    def one_view(view: int) -> None:
-        plan = plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, near=near)
+    def one_view(view: int, plan: ViewPlan) -> None:
         values, labels = view_owners(plan, groups.labels[view], groups.counts[view])
         with lock:
             old, first = best.values[plan.ids], best.views[plan.ids]
@@ -89,40 +86,43 @@ def find_owners(scene: Scene, groups: Groups, near: float = 0.01) -> Owners:
             ids = plan.ids[better]
             best.values[ids], best.views[ids], best.labels[ids] = values[better], view, labels[better]
 
-    each_view(one_view, len(scene), count)
+    _plan_views(scene, one_view)
     return best
 
 
-def seen_weights(scene: Scene, near: float = 0.01) -> np.ndarray:
+def seen_weights(scene: Scene) -> np.ndarray:
     """Measure the largest blending weight ``[n]`` float32 of each Gaussian in one view, pixels."""
-    splats, cameras = prepare(scene.gaussians), scene.cameras
-    viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
-    most, lock = np.zeros(len(splats), np.float32), Lock()
+    most, lock = np.zeros(len(scene.gaussians), np.float32), Lock()
 
-    def one_view(view: int) -> None:
-        plan = plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, near=near)
-        sums, _ = contributions(plan)
+    def one_view(_: int, plan: ViewPlan) -> None:
+        sums, _peaks = contributions(plan)
         with lock:
             np.maximum(most, sums, out=most)
 
-    each_view(one_view, len(scene), len(splats))
+    _plan_views(scene, one_view)
     return most
 
 
-def seen_depths(scene: Scene, near: float = 0.01) -> tuple[np.ndarray, np.ndarray]:
+def _plan_views(scene: Scene, use: Callable[[int, ViewPlan], None]) -> None:
+    """Plan every view and use it, in parallel unless the plans would fill the memory."""
+    splats, cameras = prepare(scene.gaussians), scene.cameras
+    viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
+
+    def one_view(view: int) -> None:
+        use(view, plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, near=NEAR))
+
+    if len(splats) <= ONE_AT_A_TIME:
+        parallel_map(one_view, range(len(scene)))
+        return
+    for view in range(len(scene)):
+        one_view(view)
+
+
+def seen_depths(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Render the mean depth ``[v,h,w]`` of every pixel, and a mask ``[v,h,w]`` of mostly opaque pixels."""
-    drawn = render(scene.gaussians, scene.cameras, near=near, with_depths=True)
+    drawn = render(scene.gaussians, scene.cameras, near=NEAR, with_depths=True)
     assert drawn.depths is not None
     return drawn.depths[..., 0], drawn.alphas[..., 0] > MIN_ALPHA
-
-
-def each_view(one_view: Callable[[int], None], num_views: int, num_gaussians: int) -> None:
-    """Call a function for every view, in parallel unless the views' plans would fill the memory."""
-    if num_gaussians > ONE_AT_A_TIME:
-        for view in range(num_views):
-            one_view(view)
-    else:
-        parallel_map(one_view, range(num_views))
 
 
 def view_owners(plan: ViewPlan, labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:

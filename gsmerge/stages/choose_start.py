@@ -60,7 +60,7 @@ def views_psnr(gaussians: Gaussians, scene: Scene) -> float:
 
     Without photos, the colours of the scene's pixels stand in for them.
     """
-    photos = _photos(scene)
+    photos = scene_photos(replace(scene, images=scene_pictures(scene)), 2)
 
     def score(view: int, image: np.ndarray, _: np.ndarray) -> tuple[float, float]:
         error = ((np.clip(image, 0, 1) - photos.images[view]) ** 2).sum(-1)
@@ -69,13 +69,6 @@ def views_psnr(gaussians: Gaussians, scene: Scene) -> float:
 
     error, count = np.sum(photo_errors(gaussians, photos, score, pick_views(len(photos), MAX_VIEWS)), axis=0)
     return float(-10 * np.log10(max(error / max(3 * count, 1), 1e-12)))
-
-
-def _photos(scene: Scene) -> Photos:
-    """The photos at half size, or the pictures that stand in for them."""
-    if scene.images is None:
-        scene = replace(scene, images=scene_pictures(scene))
-    return scene_photos(scene, 2)
 
 
 def _weight(scene: Scene, view: int, photos: Photos) -> np.ndarray:

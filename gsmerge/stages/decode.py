@@ -228,21 +228,14 @@ def divide(features: FeatureGaussians, members: Members, counts: np.ndarray) -> 
     divided = counts > 1
     gaussians, parents = feature_to_gaussians(features), np.arange(len(features))
     if divided.any():
-        children, of_children = _children(features, members, np.flatnonzero(divided), counts)
+        starts, ids, of_children = halve(features, members, np.flatnonzero(divided), counts)
+        children = pool_children(features, members, starts, ids, of_children)
         whole = np.flatnonzero(~divided)
         parents = np.concatenate([whole, of_children])
         order = np.argsort(parents, kind="stable")
         parents = parents[order]
         gaussians = Gaussians.concat([gaussians[whole], children])[order]
     return gaussians, parents
-
-
-def _children(
-    features: FeatureGaussians, members: Members, groups: np.ndarray, counts: np.ndarray
-) -> tuple[Gaussians, np.ndarray]:
-    """Gaussians of the children of some groups, and the group of each."""
-    starts, ids, parents = halve(features, members, groups, counts)
-    return pool_children(features, members, starts, ids, parents), parents
 
 
 def halve(

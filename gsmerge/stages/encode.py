@@ -9,7 +9,6 @@ import numpy as np
 from gsmerge.kernels.gaussians.pool import group_members
 from gsmerge.moments import Members, Moments, Rule, pool_members
 from gsmerge.runtime.record import stage
-from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.agreement import weaken_contradicted
 from gsmerge.types import Cameras, FeatureGaussians, Groups, Scene, to_float32
 
@@ -55,33 +54,18 @@ def encode(
 
 def member_rows(scene: Scene, members: Members, groups: Groups) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """List members by superpixel: ``starts [g+1]``, ``ids [m]`` int32, ``views [g]``, without empty superpixels."""
-    if scene.aligned:
-        return group_rows(scene, groups)
-    assert members.pixels is not None
     counts = np.asarray(groups.counts)
     first = np.cumsum(counts) - counts
-    labels = groups.labels.reshape(-1)[members.pixels] + first[members.pixels // scene.pixels_per_view]
-    labels = np.where(members.pixels >= 0, labels, -1).astype(np.int32)
-    starts, ids = group_members(labels, int(counts.sum()))
+    if scene.aligned:
+        labels = groups.labels + first.astype(np.int32)[:, None, None]  # as many as Gaussians
+        labels = np.where(scene.valid, labels, -1).reshape(-1)
+    else:
+        assert members.pixels is not None
+        labels = groups.labels.reshape(-1)[members.pixels] + first[members.pixels // scene.pixels_per_view]
+        labels = np.where(members.pixels >= 0, labels, -1)
+    starts, ids = group_members(labels.astype(np.int32, copy=False), int(counts.sum()))
     filled, views = np.diff(starts) > 0, np.repeat(np.arange(len(counts)), counts)
     return np.append(starts[:-1][filled], starts[-1]), ids.astype(np.int32), views[filled]
-
-
-def group_rows(scene: Scene, groups: Groups) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """List rows of an aligned scene by superpixel, as :func:`member_rows` does."""
-    pixels = scene.pixels_per_view
-
-    def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
-        labels = np.where(scene.valid[view], groups.labels[view], -1).reshape(-1).astype(np.int32)
-        starts, ids = group_members(labels, groups.counts[view])
-        return np.diff(starts), (ids + view * pixels).astype(np.int32)
-
-    parts = parallel_map(one_view, range(len(scene)))
-    sizes = np.concatenate([p[0] for p in parts])
-    views = np.repeat(np.arange(len(scene)), groups.counts)
-    filled = sizes > 0
-    starts = np.concatenate([[0], np.cumsum(sizes[filled])])
-    return starts, np.concatenate([p[1] for p in parts]), views[filled]
 
 
 def from_moments(moments: Moments, starts: np.ndarray, ids: np.ndarray, views: np.ndarray) -> FeatureGaussians:

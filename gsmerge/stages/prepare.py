@@ -8,7 +8,6 @@ same at every scale. The unit is a power of two: scaling there and back changes 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -187,17 +186,12 @@ def prepare(scene: Scene, options: PrepareOptions | None = None, frame: Frame | 
         note(f"{len(scene) - len(views)} views repeat others in every pixel and count once")
     canonical, frame = canonicalise(add_views(own), frame)
     checked, photo_views = leave_out_photos(canonical)
-    placed = _move_wrong_views(checked, photo_views, options.poses)
+    placed = checked
+    if checked.aligned and checked.images is not None and options.poses != "fixed":
+        placed = align_views(checked, photo_views, always=options.poses == "free") or checked
     seen, unseen = _split_unseen(placed) if options.unseen == "keep" else (placed, None)
     shown = seen if seen.aligned else add_pictures(seen)  # pixels that are known have colours of their own
     return Prepared(scene, shown, frame, photo_views, tuple(repeated), placed is not checked, unseen)
-
-
-def _move_wrong_views(scene: Scene, views: Sequence[int], poses: Poses) -> Scene:
-    """Move views to where the photos agree; the scene itself where none is wrong or may be moved."""
-    if not scene.aligned or scene.images is None or poses == "fixed":
-        return scene
-    return align_views(scene, views, always=poses == "free") or scene
 
 
 def _split_unseen(scene: Scene) -> tuple[Scene, Gaussians | None]:

@@ -15,6 +15,7 @@ budget, its moves go on to that number, those of the highest Hastings ratio firs
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -131,10 +132,11 @@ def segment(
     rectangles = RECTANGLES if options.rectangles is None else options.rectangles
     early_sweeps = EARLY_SWEEPS if options.early_sweeps is None else options.early_sweeps
 
-    def one_view(image: np.ndarray) -> np.ndarray:
-        return _labels(image, count, options.segmentation, rectangles, early_sweeps, options.compactness, adapt)
-
-    labels = parallel_map(one_view, images)
+    cut = partial(
+        superpixels, count=count, segmentation=options.segmentation, rectangles=rectangles,
+        early_sweeps=early_sweeps, compactness=options.compactness, adapt=adapt,
+    )  # fmt: skip
+    labels = parallel_map(cut, images)
     stacked = np.stack(labels) if labels else np.empty((0, height, width), np.int32)
     return Groups(stacked, tuple(int(one.max()) + 1 for one in labels))
 
@@ -171,22 +173,8 @@ def superpixels(
         >>> superpixels(np.zeros((2, 2, 3)), 1).tolist()
         [[0, 0], [0, 0]]
     """
-    labels = _labels(as_array(image), count, segmentation, rectangles, early_sweeps, compactness, adapt)
-    return like(labels, image)
-
-
-def _labels(
-    image: np.ndarray,
-    count: int,
-    segmentation: str,
-    rectangles: float,
-    early_sweeps: int,
-    compactness: float,
-    adapt: float | None,
-) -> np.ndarray:
-    """:func:`superpixels` of an array."""
     _check(segmentation, rectangles, compactness)
-    pixels = _as_pixels(image)
+    pixels = _as_pixels(as_array(image))
     height, width, _ = pixels.shape
     if count < 1:
         raise ValueError(f"count: expected at least 1 superpixel, got {count}")
@@ -197,12 +185,12 @@ def _labels(
     if segmentation == "rdseg":
         labels = _rdseg(pixels, count, rectangles, early_sweeps, compactness)
     elif segmentation == "grid":
-        return grid_labels(height, width, count)
+        return like(grid_labels(height, width, count), image)
     elif segmentation == "slic":
         labels = _slic(pixels, count, compactness)
     else:
         labels = _bass(pixels, count, segmentation, adapt)
-    return np.ascontiguousarray(labels[1:-1, 1:-1])
+    return like(np.ascontiguousarray(labels[1:-1, 1:-1]), image)
 
 
 def grid_labels(height: int, width: int, count: int) -> np.ndarray:
