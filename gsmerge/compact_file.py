@@ -38,10 +38,10 @@ NO_PHOTOS = "no photos found, so nothing is fitted and no PSNR measured; name th
 class SceneInput:
     """A scene and the facts of its reading that a report needs."""
 
-    scene: Scene  # The scene
-    recognised: dict[str, Any]  # What the report says about the input
-    comments: Sequence[str]  # Comments of its header that the result keeps
-    notes: Sequence[str]  # Of the reader
+    scene: Scene
+    recognised: dict[str, Any]  # Facts about the input for the report
+    comments: Sequence[str]  # Comments of the header that the result keeps
+    notes: Sequence[str]  # Notes of the reader, one sentence each
 
 
 def compact_files(

@@ -27,10 +27,8 @@ class Members:
     scales: np.ndarray  # [n,3]
     opacities: np.ndarray  # [n]
     sh0: np.ndarray  # [n,1,3]
-    # [n,k-1,3], apart from the others: of degree 4 it is most of a scene, and only pooling reads it
-    shN: np.ndarray
-    # [n] size of one pixel of the own view at the member's depth, world units
-    footprints: np.ndarray
+    shN: np.ndarray  # [n,k-1,3], separate: most of a scene of degree 4, read by pooling alone
+    footprints: np.ndarray  # [n] size of the own view's pixel at the member's depth, world units
     # [n] int64, the pixel (view-major, row-major over all views) that a member belongs to, -1 for
     # none; None: one member per pixel, in order
     pixels: np.ndarray | None = None

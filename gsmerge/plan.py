@@ -41,13 +41,12 @@ MOST_STEPS = 2.0  # times as many
 class Effort:
     """Meaning of an effort for the stages."""
 
-    steps: int  # Of the full fit
-    rectangles: float  # Of `rdseg`, see gsmerge.SegmentOptions
-    early_sweeps: int  # The same
+    steps: int  # Steps of the full fit
+    rectangles: float  # Rectangles per superpixel of `rdseg`
+    early_sweeps: int  # Sweeps of `rdseg` before rectangles are merged
     merges: bool = True  # Whether Gaussians of different views are merged
     networks: bool = True  # Whether `checkpoint="auto"` may load networks
-    # Whether Gaussians that no photo shows are left out where nothing is fitted
-    prunes: bool = True
+    prunes: bool = True  # Whether Gaussians in no photo are left out where nothing is fitted
     large_photos: bool = True  # Whether `photo_scale="auto"` may look at larger photos
 
 
@@ -64,20 +63,14 @@ class Plan:
     """Decisions that are made before the first superpixel is cut."""
 
     superpixels: SuperpixelPlan  # How each view is cut, and into how many
-    # What corrects the analytic stages: networks, None for nothing, or both in turn where they
-    # compete
-    networks: tuple[Networks | None, ...]
+    networks: tuple[Networks | None, ...]  # Networks, None for the analytic start, or both
     match: MatchOptions  # Merging across views
     decode: DecodeOptions  # Gaussians per group
     fit: FitOptions  # Fit to the photos
     clean: CleanOptions  # What is left out of the result
-    # Canonical Gaussians in place of those that no view sees, which every result gets; None without
-    # any
-    unseen: Gaussians | None
-    # PSNR (dB) that the input photos have to reach; None: none was asked for
-    target_psnr: float | None
-    # dB that may be lost against the best of the scene's curve; None: none was asked for
-    max_drop: float | None
+    unseen: Gaussians | None  # Merged canonical Gaussians that no view sees; None without any
+    target_psnr: float | None  # PSNR (dB) that the input photos have to reach; None: no target
+    max_drop: float | None  # Allowed loss in dB against the best of the curve; None: no target
     auto_count: bool  # Whether the scene's own curve decides the number of Gaussians
     levels: int  # Levels of detail
     scored_views: tuple[int, ...]  # Given views that input and result are scored on

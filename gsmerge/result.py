@@ -79,7 +79,7 @@ class Candidate:
     """Gaussians built for one count, with their score."""
 
     count: int | None  # Gaussians that were asked for; None: as many as `superpixels` and K give
-    fitted: Fitted  # What was built, canonical
+    fitted: Fitted  # Fitted canonical Gaussians
     gaussians: Gaussians  # The same in the world, with those that no view sees
     cameras: Cameras  # The given views as the Gaussians were made from them, in the world
     psnr: float | None  # Mean PSNR (dB) of the scored views; None without photos

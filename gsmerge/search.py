@@ -59,7 +59,7 @@ class CountSearch:
 
     plan: Plan  # Target and limits
     first: int | None  # The count to begin with; None: as many as `superpixels` and K give
-    candidates: list[Candidate] = field(default_factory=list)  # What was built so far
+    candidates: list[Candidate] = field(default_factory=list)  # Candidates built so far
 
     def __iter__(self) -> Iterator[int | None]:
         """Yield counts; each candidate is added before the next one is asked for."""

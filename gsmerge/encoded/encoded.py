@@ -62,13 +62,11 @@ class StoredSettings:
 class StoredScene:
     """Common fields of encoded scenes and states."""
 
-    # Gaussians that no view sees, canonical, merged already; None without any
-    kept: Gaussians | None
+    kept: Gaussians | None  # Unseen Gaussians, canonical, merged; None without any
     frame: Frame  # From canonical to world
     cameras: Cameras  # The views, canonical
     settings: StoredSettings  # What decoding needs to know
-    # Where it comes from: version and options, further of each kind. Plain JSON types
-    about: Mapping[str, Any]
+    about: Mapping[str, Any]  # Origin as plain JSON types: version, options, more by kind
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

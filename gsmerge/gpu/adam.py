@@ -22,9 +22,8 @@ from gsmerge.types import SH_C0, Gaussians
 class FitState:
     """Parameters under optimisation, and their meaning for the rasterizer; see :mod:`gsmerge.stages.fit.fit_state`."""
 
-    # [n,14] float32: mean, log scale, quaternion, opacity logit, colour; so are the next three
-    x: Tensor
-    x0: Tensor  # Where each began
+    x: Tensor  # [n,14] mean, log scale, quaternion, opacity logit, colour; as the next three
+    x0: Tensor  # Values at the start
     m: Tensor  # First moment
     v: Tensor  # Second moment
     units: Tensor  # [n] size of each Gaussian when it began

@@ -47,9 +47,9 @@ READ_EVERY = 20  # steps; each reading waits for the device
 class PhotoLevel:
     """Photos of one size, with weights and window means for the steps."""
 
-    photos: DevicePhotos  # The photos
-    means: Tensor  # [v,2,3,h,w] of their windows, see gsmerge.gpu.image_scores.photo_means
-    weights: Tensor  # [v,h,w] of the pixels in a step; of full size [1,h,w], the same for all views
+    photos: DevicePhotos
+    means: Tensor  # [v,2,3,h,w] window means, see gsmerge.gpu.image_scores.photo_means
+    weights: Tensor  # [v,h,w] weights of pixels in a step; full size [1,h,w], for all views
     counts: tuple[float, ...]  # [v] sum of each view's weights
 
     def weight(self, view: int) -> Tensor:

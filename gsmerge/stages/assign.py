@@ -64,10 +64,9 @@ def merge_unseen(gaussians: Gaussians, scene: Scene, count: int) -> Gaussians:
 class Owners:
     """Dominant superpixel of each of n Gaussians."""
 
-    # [n] float32: its blending weights summed over that superpixel, pixels; 0 where nothing is seen
-    values: np.ndarray
-    views: np.ndarray  # [n] int32, -1 where nothing is seen
-    labels: np.ndarray  # [n] int32 superpixel within the view, -1 where nothing is seen
+    values: np.ndarray  # [n] float32 blending weights summed over the superpixel, pixels; or 0
+    views: np.ndarray  # [n] int32, -1 if unseen
+    labels: np.ndarray  # [n] int32 superpixel within the view, -1 if unseen
 
 
 def find_owners(scene: Scene, groups: Groups) -> Owners:

@@ -105,10 +105,9 @@ class Decoded:
     """Start of a fit."""
 
     gaussians: Gaussians  # Canonical Gaussians
-    count: int  # Number that the fit may grow to
+    count: int  # Number to which the fit may grow
     exact: bool  # Whether that number is to be met
-    # Gaussians that the fit may beat instead; None: none are compared
-    baseline_start: Gaussians | None = None
+    baseline_start: Gaussians | None = None  # Another start that the fit may beat instead
 
 
 def keep_all(scene: Scene, count: int | None) -> Decoded | None:

@@ -20,15 +20,12 @@ class MergedViews:
     """Feature Gaussians merged across views, with everything that decoding needs."""
 
     features: FeatureGaussians  # The Feature Gaussians
-    members: Members  # The scene's Gaussians that `features.members` points into
-    # The superpixels that they come from, and how many Gaussians they are to become
-    segmentation: Segmentation
+    members: Members  # The scene's Gaussians, indexed by `features.members`
+    segmentation: Segmentation  # The superpixels, and the number of Gaussians to make
     num_groups: int  # Superpixels with Gaussians, before merging
-    networks: NetworkContext | None = None  # Networks that correct; None: those are not used
-    # Feature Gaussians without networks, which the fit may beat instead; None: none are compared
-    unlearned: FeatureGaussians | None = None
-    # What they become at K = 1, where that had to be known to choose them; None elsewhere
-    k1_gaussians: Gaussians | None = None
+    networks: NetworkContext | None = None  # Networks that correct; None without
+    unlearned: FeatureGaussians | None = None  # The same without networks, for comparison
+    k1_gaussians: Gaussians | None = None  # Their Gaussians at K = 1, if known already
 
 
 @stage("match")

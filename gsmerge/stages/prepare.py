@@ -149,13 +149,10 @@ class Prepared:
     # has cameras, pictures and only finite Gaussians that are seen, or all if none is set aside
     scene: Scene
     frame: Frame  # The canonical frame
-    # Views whose photos a fit may use, see gsmerge.stages.check_photos
-    photo_views: tuple[int, ...]
-    # Of every given view its place in the scene, or that of the view that it repeats
-    repeated: tuple[int, ...]
+    photo_views: tuple[int, ...]  # Views whose photos a fit may use
+    repeated: tuple[int, ...]  # Place in the scene of every given view
     moved: bool  # Whether views were moved to where their photos agree, before a fit or by it
-    # Canonical Gaussians that no view sees; None where they were not looked for, or there are none
-    unseen: Gaussians | None
+    unseen: Gaussians | None  # Canonical Gaussians that no view sees, if kept
 
     def with_cameras(self, cameras: Cameras) -> Prepared:
         """Replace the canonical cameras by those of a fit; the scene's own change nothing."""

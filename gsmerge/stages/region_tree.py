@@ -33,13 +33,10 @@ class RegionTree:
     """All merges of the superpixels of all views, from the finest to one per view, and their order."""
 
     groups: Groups  # The superpixels that it starts from
-    # Per view [2·leaves-1] int32: the region that a region is merged into, -1 for the whole view
-    parents: tuple[np.ndarray, ...]
-    # [m] int64, all merges, cheapest first; those of view v are numbered from `first[v]` on
-    order: np.ndarray
+    parents: tuple[np.ndarray, ...]  # Per view [2·leaves-1] int32: union of a region, or -1
+    order: np.ndarray  # [m] int64, all merges, cheapest first; view v's from `first[v]` on
     first: np.ndarray  # [v+1] int64, merges in the views before
-    # [m+1] float64, mean squared error per pixel and colour channel after the first i merges
-    distortions: np.ndarray
+    distortions: np.ndarray  # [m+1] float64 mean squared error after the first i merges
     min_regions: int  # Fewest regions before any is larger than `MAX_EXTENT`
 
     def __len__(self) -> int:

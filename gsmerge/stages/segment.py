@@ -20,11 +20,9 @@ class SuperpixelPlan:
     """Method and numbers for cutting a scene into superpixels."""
 
     options: SegmentOptions  # Method and number
-    limits: CountLimits  # Of the number of Gaussians
-    # Share of the Gaussians that the superpixels are cut for; a fit adds the others
-    start_share: float
-    # All ways to cut the scene into fewer superpixels, where a count is asked for; None elsewhere
-    tree: RegionTree | None
+    limits: CountLimits  # Limits of the number of Gaussians
+    start_share: float  # Share of the Gaussians to start with; a fit adds the others
+    tree: RegionTree | None  # All coarser superpixels, where a count is asked for
 
 
 @stage("segment")

@@ -149,8 +149,7 @@ class _System:
     train: list[np.ndarray]  # [h,w] of every view: 0 on the held-out blocks, 1 elsewhere
     weights: list[np.ndarray]  # [h,w] of the pixels of every view
     gains: np.ndarray  # [v,3] exposures
-    # [n,1] diagonal of earlier photos' normal equations, which the present colours solve; or 0
-    precision: np.ndarray | float
+    precision: np.ndarray | float  # [n,1] diagonal of earlier photos' normal equations; or 0
 
     def _image(self, view: int, x: np.ndarray) -> np.ndarray:
         return self.drawn.images[view] + apply(self.drawn.views[view], x)

@@ -29,15 +29,11 @@ class Tuning:
     quats_lr: float = 0.03  # Step of a quaternion
     opacities_lr: float = 0.3  # Step of an opacity's logit
     colors_lr: float = 0.03  # Step of a colour, sRGB in [0, 1]
-    # First step of a camera where cameras are moved: turns and shifts by so many pixels
-    poses_lr: float = 0.1
-    # Factor on all other steps at the end of the run; runs of more than 300 steps end lower in
-    # proportion
-    decay: float = 0.4
+    poses_lr: float = 0.1  # First step of a moved camera: turns and shifts by so many pixels
+    decay: float = 0.4  # Factor on the other steps at the end; less beyond 300 steps
     beta1: float = 0.5  # Decay of Adam's first moment
     beta2: float = 0.9  # Decay of its second moment
-    # Farthest that a mean may go from its start, in units of the Gaussian's size
-    max_mean_shift: float = 2.0
+    max_mean_shift: float = 2.0  # Largest shift of a mean, in units of the Gaussian's size
     max_scale_change: float = 2.5  # Largest change of a log scale
     max_opacity_change: float = 4.0  # Largest change of an opacity's logit
     # Share of the limits of mean and scales for a Gaussian that one photo alone shows: that photo
@@ -46,8 +42,7 @@ class Tuning:
     # Least scale, in pixels of the photo that a Gaussian is nearest to: thinner ones show as
     # needles when a viewer enlarges them. 0 for none
     min_scale: float = 0.5
-    # Share of the steps, the last ones, over which the parameters are averaged
-    average_share: float = 0.2
+    average_share: float = 0.2  # Share of the last steps that the parameters are averaged over
     ssim_lambda: float = 0.35  # Share of structural similarity in the loss, the rest is L1
     # Weight of the mean opacity in the loss of the full fit (3DGS-MCMC, Kheradmand et al. 2024):
     # what the photos do not need fades, instead of standing in front of other views
@@ -56,10 +51,8 @@ class Tuning:
     # overlap, and a step takes a third less time
     scale_reg: float = 0.01
     iterations: int = 6  # Conjugate-gradient steps of the colour fit
-    # Weight of the unfitted colours, relative to how much of each Gaussian is seen
-    prior_weight: float = 0.03
-    # Colour error beyond which a pixel counts less in the colour fit (moving things, reflections)
-    huber: float = 0.2
+    prior_weight: float = 0.03  # Weight of the unfitted colours, relative to visibility
+    huber: float = 0.2  # Colour error beyond which a pixel counts less in the colour fit
     # Exposure of a view against the mean, as a factor, from which on the colour fit compensates it;
     # smaller differences come from holes and highlights as often as from the camera
     min_gain: float = 1.15
@@ -149,14 +142,12 @@ class FitReport:
     """Report of a fit."""
 
     method: str  # `"none"`, `"color"` or `"full"`: what the result comes from
-    # Whether the held-out blocks of the photos got better; if not, the Gaussians are as they were
-    accepted: bool
+    accepted: bool  # Whether the held-out blocks got better; if not, nothing was changed
     steps: int  # Steps of the full fit, or conjugate-gradient steps
     holdout_before: float  # PSNR (dB) on the held-out blocks before the fit
     holdout_after: float  # The same after it
     stopped: str  # Why it ended
-    # [v,4,4] poses of the photos after the fit; None where they were fixed
-    viewmats: np.ndarray | None = None
+    viewmats: np.ndarray | None = None  # [v,4,4] poses after the fit; None: fixed
     device: str = "cpu"  # Where it ran: `"cpu"` or `"cuda"`
 
 

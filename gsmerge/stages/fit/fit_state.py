@@ -22,13 +22,11 @@ class State:
     """Parameters under optimisation, and the same values as arrays for the rasterizer."""
 
     x: np.ndarray  # [n,14] float32: mean, log scale, quaternion, opacity logit, colour
-    x0: np.ndarray  # Where each began
+    x0: np.ndarray  # Values at the start
     m: np.ndarray  # First moment
     v: np.ndarray  # Second moment
-    # [n] size of each Gaussian: geometric mean of its two largest scales when it began
-    units: np.ndarray
-    # [n] share of the box about the start that each Gaussian's mean and scales may use
-    box_shares: np.ndarray
+    units: np.ndarray  # [n] size: geometric mean of the two largest scales at the start
+    box_shares: np.ndarray  # [n] share of the box about the start for means and scales
     min_sizes: np.ndarray  # [n] least log scale of each Gaussian
     splats: Splats  # Means, quaternions, scales and opacities as the rasterizer takes them
     colors: np.ndarray  # [n,3] base colours

@@ -312,16 +312,14 @@ class PoseState:
     """Motions of the views under optimisation; their mean stays zero, so that the scene stays where it is."""
 
     start: np.ndarray  # [v,4,4] viewmats before the fit
-    # [v,4,4] float64, written by every step; the photos of all sizes share them
-    viewmats: np.ndarray
+    viewmats: np.ndarray  # [v,4,4] float64, updated by steps, shared with all photos
     # [v,6] motion of each, see gsmerge.geometry.motion_vectors: about the scene's middle, where
     # turns and shifts of a camera show differently
     x: np.ndarray
     m: np.ndarray  # First moment
     v: np.ndarray  # Second moment
     counts: np.ndarray  # [v] steps of each
-    # Angle of a pixel, radians, which is also its size at the scene's depth, canonical units
-    pixel: float
+    pixel: float  # Angle of a pixel, radians; also its size at the scene's depth
 
     def step(self, view: int, gradient: np.ndarray, rates: Tuning, progress: float) -> None:
         """Take one Adam step of a view by the gradient ``[4,4]`` of its viewmat; steps fall to zero at the end."""
