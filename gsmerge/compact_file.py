@@ -66,11 +66,8 @@ def compact_files(
     ``hashed``: hash the input for the report. ``seconds_before``: wall time by name of the caller's
     earlier steps. ``cameras_path``, ``saved_cameras``: files for the views, for viewers and as
     ``transforms.json`` with all intrinsics. Returns the report, see
-    :func:`gsmerge.report.report_document`.
-
-    Raises:
-        SceneError: If the scene cannot be read or the result cannot be written.
-        UsageError: If the settings need what the scene does not have, or the name has no known ending.
+    :func:`gsmerge.report.report_document`. Raises SceneError if the scene cannot be read or the
+    result cannot be written, UsageError if the settings need what the scene does not have.
     """
     start, ending = perf_counter(), output_format(out, spz_version)
     with atomic_outputs(overwrite=overwrite) as add:
@@ -115,7 +112,7 @@ def compact_files(
 
 
 def read_input(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = AUTO) -> SceneInput:
-    """Read a scene from its files, and note what is missing or odd."""
+    """Read a scene from its files, and note what is missing or odd; raise SceneError if it cannot be read."""
     loaded = load_files(files, opacity=opacity, hints=hints)
     no_photos = loaded.scene.aligned and loaded.scene.images is None
     notes = (*loaded.notes, *([NO_PHOTOS] if no_photos else []), *compact_notes(loaded))

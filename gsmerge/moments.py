@@ -78,8 +78,7 @@ def unaligned_members(scene: Scene, pixels: np.ndarray) -> Members:
 
 def gaussian_members(g: Gaussians, footprints: np.ndarray, pixels: np.ndarray | None = None) -> Members:
     """Return Gaussians as members with given footprints and pixels."""
-    means, quats, scales, opacities, sh0, shN = map(_array, (g.means, g.quats, g.scales, g.opacities, g.sh0, g.shN))
-    return Members(means, quats, scales, opacities, sh0, shN, footprints, pixels)
+    return Members(**{name: _array(column) for name, column in vars(g).items()}, footprints=footprints, pixels=pixels)
 
 
 @dataclass(frozen=True)

@@ -129,12 +129,9 @@ class CompactOptions:
         return flat
 
     def with_settings(self, settings: Mapping[str, Any]) -> CompactOptions:
-        """Change some settings, by flat name (``k=2, superpixels="1%"``).
+        """Change some settings, by flat name (``k=2, superpixels="1%"``); raise ValueError for unknown names.
 
         A recipe changes all that belongs to it, except for what is set here besides.
-
-        Raises:
-            ValueError: If a name is unknown.
         """
         changes: dict[str, Any] = {}
         settings = {**RECIPES.get(str(settings.get("recipe")), {}), **settings}

@@ -101,9 +101,8 @@ class Plan:
 def make_plan(prepared: Prepared, options: CompactOptions) -> Plan:
     """Decide everything that the options leave open; notes say what was chosen or is missing.
 
-    Raises:
-        SceneError: If a checkpoint is required and cannot be used.
-        UsageError: If the settings ask for what the scene, or the checkpoint, does not have.
+    Raises SceneError if a required checkpoint cannot be used, UsageError if the settings ask for
+    what the scene, or the checkpoint, does not have.
     """
     given, scene, effort = prepared.given, prepared.scene, EFFORTS[options.effort]
     _check_photos(given, options)
@@ -111,7 +110,10 @@ def make_plan(prepared: Prepared, options: CompactOptions) -> Plan:
     with stage("prepare"):
         checkpoint = _load_networks(options, given) if own else None
         segment = _resolve_superpixels(options.segment, scene, effort)
-        clean_options = _resolve_clean(options.clean, prepared)
+        clean_options = options.clean
+        if clean_options.drop_sky and not prepared.photo_views:
+            note("drop_sky: no photo is used that could say where the sky is, so it stays")
+            clean_options = replace(clean_options, drop_sky=False)
         unseen, num_input = _merge_unseen(prepared, options, segment, clean_options)
         limits = count_limits(
             scene, segment, options.decode, options.budget,
@@ -217,14 +219,6 @@ def _resolve_superpixels(options: SegmentOptions, scene: Scene, effort: Effort) 
     rectangles = effort.rectangles if options.rectangles is None else options.rectangles
     sweeps = effort.early_sweeps if options.early_sweeps is None else options.early_sweeps
     return replace(options, rectangles=rectangles, early_sweeps=sweeps)
-
-
-def _resolve_clean(options: CleanOptions, prepared: Prepared) -> CleanOptions:
-    """Return the options of clean-up, without ``drop_sky`` where no photo is used."""
-    if options.drop_sky and not prepared.photo_views:
-        note("drop_sky: no photo is used that could say where the sky is, so it stays")
-        return replace(options, drop_sky=False)
-    return options
 
 
 def _merge_unseen(

@@ -151,7 +151,8 @@ def make_result(
             *counts, dict(seconds), before, one.psnr, record.choices, record.notes, plan.settings, peak_memory()
         )
 
-    seconds = _add_seconds(run.seconds, seconds)
+    names = {**run.seconds, **seconds}
+    seconds = {name: run.seconds.get(name, 0.0) + seconds.get(name, 0.0) for name in names}
     if "input" in seconds:
         seconds["input"] = seconds.pop("input")  # the last stage, after those of the candidates
     main = report(best, seconds)
@@ -159,8 +160,3 @@ def make_result(
     main = replace(main, choices=choices, notes=notes, unmet=search["unmet"])
     coarser = tuple(CompactResult(one.gaussians, report(one, one.record.seconds), one.cameras) for one in levels)
     return CompactResult(best.gaussians, main, best.cameras, coarser)
-
-
-def _add_seconds(first: Mapping[str, float], second: Mapping[str, float]) -> dict[str, float]:
-    """Add two wall times of stages, by name."""
-    return {name: first.get(name, 0.0) + second.get(name, 0.0) for name in {**first, **second}}

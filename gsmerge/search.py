@@ -65,15 +65,12 @@ class CountSearch:
         """Yield counts; each candidate is added before the next one is asked for."""
         yield self.first
         target, limits = self.plan.target_psnr, self.plan.limits
+        most = min(limits.max_count, MAX_FACTOR * limits.default)
         while target is not None and len(self.candidates) < MAX_RUNS:
-            count = next_count(self.tried, target, limits.min_count, self._max_count)
+            count = next_count(self.tried, target, limits.min_count, most)
             if count in self.tried:
                 return
             yield count
-
-    @property
-    def _max_count(self) -> int:
-        return min(self.plan.limits.max_count, MAX_FACTOR * self.plan.limits.default)
 
     @property
     def tried(self) -> dict[int, float]:
@@ -89,7 +86,9 @@ class CountSearch:
         """Candidate with the fewest Gaussians that reaches the target, or the one with the highest PSNR."""
         if self.plan.target_psnr is None:
             return self.candidates[0]
-        chosen = best_count(self.tried, self.plan.target_psnr)
+        tried, target = self.tried, self.plan.target_psnr
+        reached = [count for count, psnr in tried.items() if psnr >= target]
+        chosen = min(reached) if reached else max(tried, key=lambda count: tried[count])
         return next(one for one in self.candidates if one.count == chosen)
 
     @property
@@ -101,27 +100,22 @@ class CountSearch:
         reached = f"the input views reach {psnr:.2f} dB with {count} Gaussians"
         return f"quality: {self.plan.target_psnr:g} dB was asked for, {reached}"
 
-    @property
-    def seconds(self) -> dict[str, float]:
-        """Wall time of all candidates, by stage."""
-        names = dict.fromkeys(name for one in self.candidates for name in one.record.seconds)
-        return {name: sum(one.record.seconds.get(name, 0.0) for one in self.candidates) for name in names}
-
     def facts(self) -> dict[str, Any]:
         """Return the search's part of a report: ``seconds`` of all candidates, ``choices``, ``unmet``."""
+        names = dict.fromkeys(name for one in self.candidates for name in one.record.seconds)
+        seconds = {name: sum(one.record.seconds.get(name, 0.0) for one in self.candidates) for name in names}
         choices: dict[str, Any] = {}
         if self.plan.target_psnr is not None:
             best, tried = self.best, tuple(self.tried.items())
             choices["search"] = {"count": best.count, "psnr": best.psnr, "met": self.unmet is None, "tried": tried}
-        return {"seconds": self.seconds, "choices": choices, "unmet": self.unmet}
+        return {"seconds": seconds, "choices": choices, "unmet": self.unmet}
 
 
 def search_count(prepared: Prepared, plan: Plan, build: Build) -> CountSearch:
     """Start a search for the number of Gaussians; ``build`` builds a scene with a given number."""
+    limits = plan.limits
     if plan.target_psnr is not None:
-        limits = plan.limits
-        most = min(limits.max_count, MAX_FACTOR * limits.default)
-        return CountSearch(plan, min(max(min(limits.default, most), limits.min_count), most))
+        return CountSearch(plan, min(max(limits.default, limits.min_count), limits.max_count))
     return CountSearch(plan, choose_count(prepared, plan, build))
 
 
@@ -232,12 +226,6 @@ def curve_knee(points: Sequence[CurvePoint]) -> int:
         return points[-1].count
     share = (slopes[steep] - KNEE) / (slopes[steep] - slopes[steep + 1])
     return round(2 ** (middles[steep] + share * (middles[steep + 1] - middles[steep])))
-
-
-def best_count(tried: Mapping[int, float], target: float) -> int:
-    """Return the smallest count whose PSNR (dB) reaches the target, or the count of the highest PSNR."""
-    reached = [count for count, psnr in tried.items() if psnr >= target]
-    return min(reached) if reached else max(tried, key=lambda count: tried[count])
 
 
 def next_count(tried: Mapping[int, float], target: float, least: int, most: int) -> int:

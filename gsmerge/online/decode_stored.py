@@ -64,10 +64,8 @@ def decode_stored(
 
     ``k`` and ``budget`` are those of :func:`gsmerge.decode_scene`; a full fit begins with fewer
     Gaussians and grows to the number. ``options`` of the fit: None: the full one at its defaults
-    where there are photos, otherwise none.
-
-    Raises:
-        UsageError: If a fit is asked for and there are no photos, or K or the budget is out of range.
+    where there are photos, otherwise none. Raises UsageError if a fit is asked for and there are no
+    photos, or K or the budget is out of range.
     """
     options = options or default_fit(stored)
     check_fit(stored, options)

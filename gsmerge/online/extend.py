@@ -80,11 +80,8 @@ def extend(
 
     ``state``: what earlier batches left, unchanged; None: this is the first one. ``scene``: the new
     views, in the same world as the earlier ones; tensors become arrays. ``online``: which part of
-    the batch enters the state, and how.
-
-    Raises:
-        ValueError: If a setting is out of range or asks for what a state cannot have, or the degree of the harmonics
-            is not that of the state.
+    the batch enters the state, and how. Raises ValueError if a setting is out of range or asks for
+    what a state cannot have, or the degree of the harmonics is not that of the state.
     """
     options, online = options or CompactOptions().with_settings({"fit": "none"}), online or OnlineOptions()
     max_k = online.max_k if state is None else state.settings.max_k

@@ -42,18 +42,17 @@ def save_state(path: str | PathLike[str], state: OnlineState, *, overwrite: bool
 
 
 def load_state(path: str | PathLike[str]) -> OnlineState:
-    """Read a state from a file; an encoded scene (:func:`gsmerge.save_encoded`) becomes a state.
-
-    Raises:
-        SceneError: If the file is missing or damaged, of another format or a newer schema, lacks an array, or holds
-            numbers out of range.
-    """
+    """Read a state from a file; an encoded scene (:func:`gsmerge.save_encoded`) becomes a state."""
     stored = load_stored(path)
     return from_encoded(stored) if isinstance(stored, Encoded) else stored
 
 
 def load_stored(path: str | PathLike[str]) -> Encoded | OnlineState:
-    """Read an encoded scene or a state, whichever the file holds."""
+    """Read an encoded scene or a state, whichever the file holds.
+
+    Raises SceneError if the file is missing or damaged, of another format or a newer schema, lacks
+    an array, or holds numbers out of range.
+    """
     file = read_gsm(path, ENCODED, STATE)
     if file.kind == ENCODED:
         return read_encoded(file)
@@ -104,11 +103,9 @@ def extend_file(
 
     The file is replaced when all is done, and not at all if anything goes wrong or another process
     has changed it. ``settings``: see :class:`gsmerge.Compactor`; by default the state's own.
-    ``seconds_before``: wall time by name of the caller's earlier steps.
-
-    Raises:
-        SceneError: If the state or the scene cannot be read, or the state cannot be written or was changed meanwhile.
-        UsageError: If a setting is unknown, out of range, or needs what the state or the scene does not have.
+    ``seconds_before``: wall time by name of the caller's earlier steps. Raises SceneError if a file
+    cannot be read or written or was changed meanwhile, UsageError if a setting is unknown, out of
+    range, or needs what the state or the scene does not have.
     """
     start, identity = perf_counter(), _file_identity(path)
     state = None if identity is None else load_state(path)

@@ -20,24 +20,6 @@ from gsmerge.types import Cameras, Gaussians
 Shape = tuple[Tensor, Tensor, Tensor, Tensor]  # means, quaternions, scales, opacities
 
 
-def _view_gradients(
-    plan: ViewPlan,
-    image: Array,
-    transmittance: Array,
-    grad_image: Array,
-    grad_alpha: Array,
-    pose: bool,
-    used: ColorGradients | None,
-) -> tuple[list[Array], Array | None, ColorGradients]:
-    """Return the gradients of one view's Gaussians by field, of its view matrix, and through colours."""
-    colors = view_colors(plan)
-    shape = gradients_of(plan, colors, image, transmittance, grad_image, -grad_alpha, pose)
-    shade = color_gradients(plan, shape.colors, colors, used=used)
-    viewmat = pose_gradient(plan, shape, shade) if pose else None
-    rows = [shape.means + shade.means, shape.quats, shape.scales, shape.opacities, shade.sh0, shade.shN]
-    return rows, viewmat, shade
-
-
 class _Render(torch.autograd.Function):
     """Images and alphas (and depths, without gradient) from the tensors of Gaussians and view matrices."""
 
@@ -77,13 +59,14 @@ class _Render(torch.autograd.Function):
                 np.ascontiguousarray(tensor.numpy())
                 for tensor in (images[view], lefts[view], grad_images[view], grad_alphas[view, ..., 0])
             )
-            rows, pose, shade = _view_gradients(
-                plan, image, left, grad_image, grad_alpha, ctx.needs_input_grad[-1], shade
-            )
+            colors, moves = view_colors(plan), ctx.needs_input_grad[-1]
+            shape = gradients_of(plan, colors, image, left, grad_image, -grad_alpha, moves)
+            shade = color_gradients(plan, shape.colors, colors, used=shade)
+            rows = [shape.means + shade.means, shape.quats, shape.scales, shape.opacities, shade.sh0, shade.shN]
             for total, row in zip(totals, rows, strict=True):
                 add_rows(plan.ids, row.reshape(len(row), total[:1].size), total.reshape(len(total), total[:1].size))
-            if pose is not None:
-                poses[view] = pose
+            if moves:
+                poses[view] = pose_gradient(plan, shape, shade)
         gradients = [
             torch.from_numpy(total).to(tensor.device, tensor.dtype) if needed else None
             for total, tensor, needed in zip([*totals, poses], tensors, ctx.needs_input_grad[4:], strict=True)

@@ -118,23 +118,13 @@ def plan_gradients(
     colors: Array | None = None,
     with_viewmat: bool = False,
 ) -> Gradients:
-    """Gradients of a loss on the image that :func:`gsmerge.render.composite` made of a plan.
+    """Return the gradients of a loss on the image that :func:`gsmerge.render.composite` made of a plan.
 
-    Args:
-        plan: The view, from :func:`gsmerge.render.plan_view`.
-        grad_image: ``[h,w,3]`` gradient with respect to the image.
-        grad_transmittance: ``[h,w]`` gradient with respect to the remaining transmittance; None for none. (The
-            background's part is in the image's gradient already.)
-        image: ``[h,w,3]``, as it was made, background included.
-        transmittance: ``[h,w]``, as it was made.
-        colors: ``[n,3]``, as they were given to ``composite``; None if none were.
-        with_viewmat: Also the gradient with respect to the world-to-camera matrix.
-
-    Returns:
-        The gradients. Zero where alpha is clamped at 0.99, and through what decides which weights are drawn at all.
-
-    Raises:
-        ValueError: If an array has another shape.
+    ``grad_image [h,w,3]`` and ``grad_transmittance [h,w]`` (None: zero) are those of the loss;
+    ``image``, with its background, and ``transmittance`` are what ``composite`` returned,
+    ``colors`` what it was given. ``with_viewmat`` asks for the gradient of the world-to-camera
+    matrix as well. Gradients are zero where alpha is clamped at 0.99, and through what decides
+    which weights are drawn at all. Raises ValueError if an array has another shape.
     """
     size = plan.height, plan.width
     grad_image, image = _expect("grad_image", grad_image, (*size, 3)), _expect("image", image, (*size, 3))

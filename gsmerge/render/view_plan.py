@@ -89,16 +89,8 @@ def prepare(gaussians: Gaussians, origin: ArrayLike | None = None) -> Splats:
     """
     gaussians = gaussians.numpy()
     start = _spread_origin(gaussians.means) if origin is None else np.asarray(origin, np.float64).reshape(3)
-    means = gaussians.means - start if start.any() else gaussians.means
-    return Splats(
-        means=_float32(means),
-        quats=_float32(gaussians.quats),
-        scales=_float32(gaussians.scales),
-        opacities=_float32(gaussians.opacities),
-        sh0=_float32(gaussians.sh0),
-        shN=_float32(gaussians.shN),
-        origin=start,
-    )
+    columns = vars(gaussians) | {"means": gaussians.means - start if start.any() else gaussians.means}
+    return Splats(**{name: _float32(column) for name, column in columns.items()}, origin=start)
 
 
 def num_pieces(count: int, threads: int, least: int = PIECE) -> int:
@@ -231,18 +223,12 @@ def plan_view(
     """Project Gaussians into one view, sort them by depth and bin them into tiles.
 
     ``viewmat [4,4]`` is world to camera, ``K [3,3]`` in pixels without skew; ``near`` and ``far``
-    are exclusive, in world units. The size of the plan goes with what is visible, not with n.
-
-    Args:
-        eps2d: Dilation of the footprints, pixels squared.
-        antialiased: Lower the opacity by what the dilation adds to the footprint (Mip-Splatting's 2D filter).
-        opacities: ``[n]`` in place of the Gaussians' own.
-        keep: ``[n]`` bool or uint8, False leaves a Gaussian out.
-        tiles: ``[lines,columns]`` bool, the tiles of 16 x 16 pixels that have to be complete; others may lack
-            Gaussians. None: all.
-
-    Raises:
-        ValueError: If sizes do not fit together, or a number is outside its range.
+    are exclusive, in world units; ``eps2d`` is the dilation of the footprints, pixels squared.
+    ``antialiased`` lowers the opacity by what the dilation adds to the footprint (Mip-Splatting's
+    2D filter). ``opacities [n]`` replace the Gaussians' own, where ``keep [n]`` is False they are
+    left out, and only ``tiles [lines,columns]`` of 16 x 16 pixels have to be complete. The size of
+    the plan goes with what is visible, not with n. Raises ValueError if a size or a number is out
+    of range.
     """
     viewmat, K = np.asarray(viewmat, np.float64).copy(), np.asarray(K, np.float64)
     _check_view(viewmat, K, width, height)

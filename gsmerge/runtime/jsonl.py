@@ -45,11 +45,8 @@ def _parse(line: bytes) -> dict[str, Any] | None:
 def append_line(path: Path, value: Mapping[str, Any]) -> None:
     """Append one JSON line: on the disk when this returns, and in place of a half-written one.
 
-    A line that does not fit on the disk leaves the file as it was.
-
-    Raises:
-        SceneError: If the file cannot be written.
-        ValueError: If there is NaN or inf among the values.
+    A line that does not fit on the disk leaves the file as it was. Raises SceneError if the file
+    cannot be written, ValueError if there is NaN or inf among the values.
     """
     line = json.dumps(value, separators=(",", ":"), ensure_ascii=True, allow_nan=False).encode("ascii") + b"\n"
     try:

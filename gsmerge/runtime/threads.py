@@ -59,10 +59,7 @@ def _enter_pool() -> None:
 def use_threads(count: int | None = None) -> Iterator[int]:
     """Let :func:`parallel_map` use ``count`` threads (None: all processors) inside the block.
 
-    A block inside another keeps the outer one's threads.
-
-    Raises:
-        ValueError: If ``count`` is below 1.
+    A block inside another keeps the outer one's threads. Raises ValueError if ``count`` is below 1.
     """
     count = available_threads() if count is None else count
     if count < 1:

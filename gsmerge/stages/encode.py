@@ -71,16 +71,12 @@ def member_rows(scene: Scene, members: Members, groups: Groups) -> tuple[np.ndar
 def from_moments(moments: Moments, starts: np.ndarray, ids: np.ndarray, views: np.ndarray) -> FeatureGaussians:
     """Make Feature Gaussians of pooled groups, with neutral gains."""
     count = len(moments.means)
+    names = ("means", "covars", "weights", "masses", "extinctions", "footprints")
     return FeatureGaussians(
-        means=to_float32(moments.means),
-        covars=to_float32(moments.covars),
-        weights=to_float32(moments.weights),
-        masses=to_float32(moments.masses),
-        extinctions=to_float32(moments.extinctions),
+        **{name: to_float32(getattr(moments, name)) for name in names},
         gains=np.ones(count, np.float32),
         sh0=moments.sh[:, :1],
         shN=moments.sh[:, 1:],
-        footprints=to_float32(moments.footprints),
         views=views,
         starts=starts,
         members=ids,

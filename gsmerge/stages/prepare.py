@@ -72,8 +72,7 @@ class Frame:
 def scene_frame(scene: Scene) -> Frame:
     """Choose the canonical frame: median mean (float64) and median depth of the Gaussians that have a pixel, or of all.
 
-    Raises:
-        ValueError: If there is no valid Gaussian, or no view.
+    Raises ValueError if there is no valid Gaussian, or no view.
     """
     if len(scene.gaussians) == 0 or len(scene) == 0:
         raise ValueError(f"expected Gaussians and views, got {len(scene.gaussians)} and {len(scene)}")
@@ -97,11 +96,7 @@ def scene_depth(scene: Scene) -> float:
 
 
 def _sample_rows(scene: Scene) -> np.ndarray:
-    """Choose evenly spread rows among the valid ones.
-
-    Raises:
-        ValueError: If no Gaussian is valid.
-    """
+    """Choose evenly spread rows among the valid ones; raise ValueError if there is none."""
     rows = np.arange(len(scene.gaussians)) if scene.pixel_ids is None else np.flatnonzero(scene.pixel_ids >= 0)
     if len(rows) == 0:
         raise ValueError("expected at least one valid Gaussian, got none")

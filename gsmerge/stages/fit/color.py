@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from gsmerge.geometry import rgb_to_sh0, sh0_to_rgb
-from gsmerge.render import Splats, composite, plan_view, prepare
+from gsmerge.render import composite, plan_view, prepare
 from gsmerge.render.photos import Photos
 from gsmerge.render.weights import ViewWeights, apply, apply_transposed, view_weights
 from gsmerge.runtime.threads import in_turn, parallel_map
@@ -29,21 +29,20 @@ HOLDOUT = 4  # times the share: the last steps see everything, and a small sampl
 class Drawn:
     """Blending weights and renders of one set of Gaussians in every photo."""
 
-    count: int  # Number of Gaussians, n
     views: list[ViewWeights]  # Blending weights of every view
     images: list[np.ndarray]  # [h,w,3] renders
 
 
 def draw(gaussians: Gaussians, photos: Photos) -> Drawn:
     """Render the Gaussians into every photo and keep the blending weights."""
-    splats: Splats = prepare(gaussians)
+    splats = prepare(gaussians)
 
     def one_view(view: int) -> tuple[ViewWeights, np.ndarray]:
         plan = plan_view(splats, **photos.camera(view))
         return view_weights(plan), composite(plan)[0]
 
     views, images = zip(*parallel_map(one_view, range(len(photos))), strict=True)
-    return Drawn(len(gaussians), list(views), list(images))
+    return Drawn(list(views), list(images))
 
 
 def fit_colors(
@@ -63,7 +62,7 @@ def fit_colors(
     train = training_weights(photos, min(0.5, HOLDOUT * options.holdout), seed)
     precision = 0.0 if color_precision is None else color_precision[:, None].astype(np.float64)
     system = _System(drawn, photos, options, train, train, np.ones((len(photos), 3)), precision)
-    offsets, report = solve_colors(system, np.zeros((drawn.count, 3)), options)
+    offsets, report = solve_colors(system, np.zeros((len(gaussians), 3)), options)
     if not report.accepted:
         return gaussians, report
     sh0 = add_offsets(gaussians.sh0.astype(np.float64), offsets[:, None])
