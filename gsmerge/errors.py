@@ -23,11 +23,7 @@ class UsageError(GsmergeError, ValueError):
 
 
 class SceneError(GsmergeError):
-    """A file, a folder or an argument without the expected content.
-
-    ``problem`` and ``remedy`` are one sentence each without a full stop: what was expected and
-    found, and what to do.
-    """
+    """A file, folder or argument without the expected content: ``problem`` and ``remedy`` without full stops."""
 
     exit_code = 3
 

@@ -35,10 +35,7 @@ def normalize(vectors: np.ndarray) -> np.ndarray:
 
 
 def rotmat_to_quat(rotations: np.ndarray) -> np.ndarray:
-    """Return unit quaternions ``[n,4]`` wxyz of rotations ``[n,3,3]``, their largest component positive.
-
-    Of the four ways to write it (Shepperd 1978), the one that divides by the largest component.
-    """
+    """Return unit quaternions ``[n,4]`` wxyz of rotations, the largest component positive (Shepperd 1978)."""
     a, b, c, d, e, f, g, h, i = rotations.reshape(-1, 9).T
     ways = np.stack(
         [

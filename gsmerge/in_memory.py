@@ -178,10 +178,7 @@ def _rows(name: str, values: Any, *tail: int) -> np.ndarray:
 
 
 def _make_gaussians(out: dict[str, np.ndarray]) -> tuple[Gaussians, np.ndarray, list[str]]:
-    """Make Gaussians of columns; return them, a mask of the finite rows, and notes.
-
-    Rows that are not finite become transparent, as those of files.
-    """
+    """Make Gaussians of columns, transparent in rows that are not finite; return them, the finite rows and notes."""
     n = len(out["means"])
     for name, column in out.items():
         if len(column) != n:
@@ -329,10 +326,7 @@ def _image_error(photos: np.ndarray, expected: str) -> SceneError:
 def _check_pixels(
     gaussians: Gaussians, cameras: Cameras, valid: np.ndarray, names: tuple[str, ...]
 ) -> tuple[Cameras, list[str]]:
-    """Check that the Gaussians project into their own pixels; return cameras, moved a little, and notes.
-
-    A convention that would make them do so is named in the error.
-    """
+    """Check that Gaussians project into their own pixels; return cameras, moved a little, and notes."""
     pairs = sample_pixels(gaussians, cameras, valid)
     alignment = check_pairs(pairs, cameras)
     if alignment.ok:

@@ -57,10 +57,7 @@ def scene_members(scene: Scene) -> Members:
 
 
 def unaligned_members(scene: Scene, pixels: np.ndarray) -> Members:
-    """Return the members of a canonical unaligned scene, given the pixel ``[n]`` int64 of each, -1 for none.
-
-    Gaussians without a pixel count as seen by the nearest camera.
-    """
+    """Return the members of an unaligned scene by pixel ``[n]`` int64; without one, the nearest camera counts."""
     means, cameras = _array(scene.gaussians.means), scene.cameras
     focals = np.sqrt(np.abs(cameras.Ks[:, 0, 0] * cameras.Ks[:, 1, 1])).astype(np.float64)
     thirds = cameras.viewmats[:, 2].astype(np.float64)

@@ -99,11 +99,7 @@ class Plan:
 
 
 def make_plan(prepared: Prepared, options: CompactOptions) -> Plan:
-    """Decide everything that the options leave open; notes say what was chosen or is missing.
-
-    Raises SceneError if a required checkpoint cannot be used, UsageError if the settings ask for
-    what the scene, or the checkpoint, does not have.
-    """
+    """Decide everything that the options leave open; raise UsageError if scene or checkpoint cannot do it."""
     given, scene, effort = prepared.given, prepared.scene, EFFORTS[options.effort]
     _check_photos(given, options)
     own = options.method == "gsmerge"  # baselines learn nothing
@@ -224,11 +220,7 @@ def _resolve_superpixels(options: SegmentOptions, scene: Scene, effort: Effort) 
 def _merge_unseen(
     prepared: Prepared, options: CompactOptions, segment: SegmentOptions, clean_options: CleanOptions
 ) -> tuple[Gaussians | None, int | None]:
-    """Merge the Gaussians that no view sees at the rate of the rest, and clean them.
-
-    Returns them, None without any; and the number that shares of a budget refer to, None for the
-    scene's own.
-    """
+    """Merge and clean the unseen Gaussians; return them and the number that shares of a budget refer to, or None."""
     scene, unseen = prepared.scene, prepared.unseen
     num_input = prepared.given.num_gaussians if len(scene) < len(prepared.given) else None
     if unseen is None:
@@ -253,10 +245,7 @@ def resolve_fit(options: CompactOptions) -> FitOptions:
 
 
 def steps_for(options: CompactOptions, num_gaussians: int, scene: Scene) -> int:
-    """Return the steps of the full fit: as given, or more for more Gaussians per pixel.
-
-    They grow with the square root of the share from ``USUAL_SHARE`` on.
-    """
+    """Return the steps of the full fit: as given, or more with the root of the Gaussians per pixel."""
     if options.fit.fit_steps is not None:
         return options.fit.fit_steps
     steps = EFFORTS[options.effort].steps

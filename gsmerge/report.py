@@ -124,10 +124,7 @@ def summary_lines(document: Mapping[str, Any]) -> list[str]:
 
 
 def result_table(document: Mapping[str, Any], next_step: str | None = None) -> list[str]:
-    """Return the closing table of ``compact`` in a terminal, at most 80 columns wide.
-
-    ``next_step``: a command to go on with; None for none.
-    """
+    """Return the closing table of ``compact`` in a terminal, at most 80 columns wide, with a ``next_step`` if any."""
     before, after, psnr = document["input"], document["output"], document["psnr_input_views"]
     ratio = f"{100 * document['ratio']:.2f} %"
     rows = [

@@ -115,10 +115,7 @@ def _note_moves(prepared: Prepared, cameras: Cameras, plan: Plan) -> None:
 
 
 def input_psnr(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> float:
-    """Measure the mean PSNR (dB) of the scored input photos, rendered from world-frame Gaussians.
-
-    Only a quarter of every photo is scored, unless a quality was asked for.
-    """
+    """Measure the mean PSNR (dB) of the scored photos, of a quarter of each unless a quality was asked for."""
     photos, near, quarter = scene_photos(prepared.given), NEAR * prepared.frame.unit, plan.target_psnr is None
 
     def score_on(backend: FitBackend[Any]) -> float:

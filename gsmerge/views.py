@@ -44,11 +44,7 @@ def pick_views(num_views: int, most: int) -> list[int]:
 
 
 def midpoint_views(contexts: Sequence[float], candidates: Sequence[float]) -> list[int]:
-    """Return, for each two consecutive contexts, the candidate nearest the middle between them.
-
-    Both are places along the trajectory. Returns indices of ``candidates``, none twice, in the
-    order of the trajectory; a gap without a candidate gives none.
-    """
+    """Return, for each two consecutive contexts, the index of the candidate nearest the middle between them, if any."""
     chosen = []
     for low, high in pairwise(sorted(contexts)):
         inside = [i for i, place in enumerate(candidates) if low < place < high]
@@ -86,10 +82,7 @@ def _equal_views(scene: Scene, one: int, other: int) -> bool:
 
 
 def subset(scene: Scene, view_ids: Sequence[int]) -> Scene:
-    """Return the scene with only some of its views: their Gaussians, cameras and photos.
-
-    Unaligned Gaussians belong to no view, and all stay.
-    """
+    """Return the scene with only some of its views and their Gaussians; unaligned Gaussians all stay."""
     ids = list(view_ids)
     images = None if scene.images is None else scene.images[ids]
     names = tuple(scene.names[i] for i in ids)

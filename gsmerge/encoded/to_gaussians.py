@@ -112,10 +112,7 @@ def decode_scene(
 
 
 def children_of(encoded: Encoded, counts: np.ndarray) -> tuple[Gaussians, np.ndarray]:
-    """Return at most ``counts [g]`` canonical Gaussians of each group, and the rising group of each.
-
-    Faint Gaussians are among them.
-    """
+    """Return at most ``counts [g]`` canonical Gaussians of each group, also faint, and the rising group of each."""
     features, heads = encoded.features, encoded.heads
     rows, parents = pick_children(encoded.division, counts)
     gaussians = Gaussians.concat([feature_to_gaussians(features), encoded.division.children])[rows]
@@ -169,10 +166,7 @@ def divide_all(features: FeatureGaussians, members: Members, max_k: int) -> Divi
 
 
 def pick_children(division: Division, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Choose the rows of at most ``counts [g]`` Gaussians for each of g groups; return rows and rising groups.
-
-    Rows ``[n]`` are those of the g groups themselves (K = 1) followed by the division's children.
-    """
+    """Choose at most ``counts [g]`` rows of each group, among groups and then children; return rows, groups."""
     splits, slots = division.splits.astype(np.int64), division.slots.astype(np.int64)
     count, uniform = len(splits), division.uniform
     sizes, first = np.minimum(counts, splits + 1), np.cumsum(splits) - splits

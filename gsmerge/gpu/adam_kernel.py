@@ -1,7 +1,4 @@
-"""Optimiser step as one Triton kernel, imported only where Triton is.
-
-See :func:`gsmerge.gpu.adam.adam_step`.
-"""
+"""Optimiser step of :func:`gsmerge.gpu.adam.adam_step` as one Triton kernel, imported only where Triton is."""
 
 from __future__ import annotations
 

@@ -31,10 +31,7 @@ from gsmerge.types import Gaussians
 def fit_colors(
     gaussians: Gaussians, photos: DevicePhotos, options: FitOptions, seed: int
 ) -> tuple[Gaussians, FitReport]:
-    """Fit base colours to the photos, and keep them only if held-out blocks of the photos get better.
-
-    ``seed`` chooses the held-out blocks. Geometry, opacities and higher harmonics stay.
-    """
+    """Fit base colours alone to the photos, and keep them only if held-out blocks, chosen by ``seed``, get better."""
     device = gaussians.means.device
     train = training_weights(photos.host, min(0.5, HOLDOUT * options.holdout), seed)
     weights = torch.from_numpy(np.stack(train)).to(device)

@@ -136,11 +136,7 @@ def draw_and_transpose(shape: Shape, colors: Tensor, photos: DevicePhotos, view:
 
 
 class Transpose:
-    """Transpose of drawing a view as a linear map from colours to images.
-
-    It sums every Gaussian's blending weight times an image over the pixels, which is the gradient
-    in the colours. ``reached`` is ``[n]`` bool: which Gaussians have a footprint in the view.
-    """
+    """Transpose of drawing a view: sums of every Gaussian's blending weight times an image; ``reached [n]`` bool."""
 
     def __init__(self, image: Tensor, colors: Tensor, reached: Tensor):
         self.image, self.colors, self.reached = image, colors, reached

@@ -58,7 +58,7 @@ class PhotoLevel:
 
 
 def make_levels(photos: tuple[DevicePhotos, DevicePhotos], plan: FitPlan) -> tuple[PhotoLevel, PhotoLevel]:
-    """Give both sizes their weights: everything counts at full size, the training pixels at half size."""
+    """Weigh the photos of both sizes: all pixels at full size, the training pixels at half size."""
     full, half = photos
     everywhere = torch.ones((1, full.height, full.width), device=full.images.device)
     trained = torch.from_numpy(np.stack(plan.step_weights[1])).to(half.images.device)
@@ -103,10 +103,7 @@ def holdout_score(state: FitState, photos: DevicePhotos, weights: Tensor, min_ga
 def initial_scores(
     state: FitState, photos: tuple[DevicePhotos, DevicePhotos], weights: Tensor, options: FitOptions
 ) -> tuple[float, Tensor, Tensor]:
-    """Return the PSNR (dB) of the half-size held-out blocks, ``[n]`` box shares, ``[n]`` least log scales.
-
-    See :func:`gsmerge.stages.fit.full.initial_scores`.
-    """
+    """Score the start as :func:`gsmerge.stages.fit.full.initial_scores` does."""
     full, half = photos
     images, shape, rates = [], state_shape(state), options.tuning
     sums, squares = (torch.zeros(len(state), dtype=torch.float64, device=state.x.device) for _ in range(2))
@@ -216,12 +213,9 @@ def fit_full(
     progress: Progress | None,
     baseline_start: Gaussians | None,
 ) -> tuple[Gaussians, FitReport]:
-    """Fit all parameters to the photos; arguments as of :func:`gsmerge.stages.fit.full.fit_full`.
-
-    ``progress`` is called every ``READ_EVERY`` steps and at the end.
-    """
+    """Fit as :func:`gsmerge.stages.fit.full.fit_full` does; report progress every ``READ_EVERY`` steps."""
     plan = plan_run((photos[0].host, photos[1].host), options, seed)
-    run = _Run(start_state(gaussians), make_levels(photos, plan), plan, count, seed, progress)
+    run = _Run(start_state(gaussians), make_levels(photos, plan), plan, seed, progress)
     judged = torch.from_numpy(np.stack(plan.weights[1])).to(gaussians.means.device)
     half = photos[1]
     before, run.state.box_shares, run.state.min_sizes = initial_scores(run.state, photos, judged, options)
@@ -230,7 +224,9 @@ def fit_full(
     run.score, after = before, None
     run.start_clock()
     while run.step < run.steps:
-        run.grow()
+        due = options.grows and run.step / run.steps >= GROWTH
+        if due and len(run.state) < count:
+            run.state = grow_to(run.state, half, count)
         if run.step / run.steps >= plan.half_part and after is None:
             run.score = after = holdout_score(run.state, half, judged, options.tuning.min_gain)
             if after <= before:
@@ -255,12 +251,11 @@ class _Run:
         state: FitState,
         levels: tuple[PhotoLevel, PhotoLevel],
         plan: FitPlan,
-        count: int,
         seed: int,
         progress: Progress | None,
     ):
         device, options = state.x.device, plan.options
-        self.state, self.levels, self.plan, self.count, self.progress = state, levels, plan, count, progress
+        self.state, self.levels, self.plan, self.progress = state, levels, plan, progress
         self.step, self.steps, self.started, self.score = 0, options.steps, 0.0, 0.0
         self.tail, self.error = TailMean(), torch.zeros((), device=device)
         most = max(self.steps, MAX_STEPS) if options.time_budget is not None else self.steps
@@ -279,14 +274,8 @@ class _Run:
         """Start the clock of a time budget, after a step on a copy: loading kernels is not timed."""
         if self.plan.options.time_budget is not None:
             self._move(deepcopy(self.state), None)
-            self.read_error()  # which waits for the device
+            float(self.error)  # waits for the device
             self.started = time.perf_counter()
-
-    def grow(self) -> None:
-        """Add Gaussians, once it is time."""
-        due = self.plan.options.grows and self.step / self.steps >= GROWTH
-        if due and len(self.state) < self.count:
-            self.state = grow_to(self.state, self.levels[1].photos, self.count)
 
     def _move(self, state: FitState, kept: Tensor | None) -> Tensor:
         """Move a state by the present step, and return the mean squared error of the view before it."""
@@ -306,12 +295,8 @@ class _Run:
         if self.step > self.steps * (1 - options.tuning.average_share):
             self.tail.add(self.state.x)
         if options.time_budget is not None and self.step == PROBE:
-            self.read_error()  # which waits for the device
+            float(self.error)  # waits for the device
             self.steps = affordable_steps(time.perf_counter() - self.started, self.plan)
             self.rates = self._all_rates()
         if self.progress and (self.step % READ_EVERY == 0 or self.step == self.steps):
-            self.progress(self.step, self.steps, -10 * np.log10(max(self.read_error(), 1e-12)), self.score)
-
-    def read_error(self) -> float:
-        """Return the mean squared error of the last steps."""
-        return float(self.error)
+            self.progress(self.step, self.steps, -10 * np.log10(max(float(self.error), 1e-12)), self.score)

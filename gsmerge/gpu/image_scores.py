@@ -63,10 +63,7 @@ def _ssim_gradient(x: Tensor, y: Tensor, means: Tensor, weight: Tensor) -> Tenso
 
 
 def holdout_psnr(images: Tensor, photos: Tensor, weights: Tensor, min_gain: float) -> float:
-    """Return the PSNR (dB) of renders ``[v,h,w,3]`` on the held-out blocks, where ``weights [v,h,w]`` are 0.
-
-    Exposure of the photos that differs by a factor of ``min_gain`` or more is compensated.
-    """
+    """Return the PSNR (dB) of held-out blocks; see :func:`gsmerge.stages.fit.photo_sizes.holdout_psnr`."""
     clipped = images.clamp(0, 1)
     gains = exposure_gains(clipped, photos, weights, min_gain)
     mask = weights == 0
@@ -76,10 +73,7 @@ def holdout_psnr(images: Tensor, photos: Tensor, weights: Tensor, min_gain: floa
 
 
 def exposure_gains(images: Tensor, photos: Tensor, weights: Tensor, min_gain: float, max_gain: float = 2.0) -> Tensor:
-    """Find the factors ``[v,3]`` that bring renders to the photos' exposure, with geometric mean one.
-
-    Least squares on the weighted pixels, per view and channel; ones where no view differs by ``min_gain``.
-    """
+    """Return factors ``[v,3]`` to the exposure; see :func:`gsmerge.stages.fit.photo_sizes.exposure_gains`."""
     weighted = weights[..., None] * images
     with_photo, with_image = ((weighted * other).sum((1, 2), dtype=torch.float64) for other in (photos, images))
     gains = (with_photo / with_image.clamp_min(1e-9)).clamp(1 / max_gain, max_gain)

@@ -75,11 +75,7 @@ def _rows(cameras: Cameras) -> list[bytes]:
 def update_replay(
     replay: Replay, batch_photos: BatchPhotos, view_ids: np.ndarray, num_views: int, max_photos: int
 ) -> Replay:
-    """Add new photos to the stored ones, and keep every n-th of all views, n a power of two.
-
-    ``view_ids [s]``: the view of each new photo; of a view that is stored already, the first photo
-    stays.
-    """
+    """Add photos of views ``view_ids [s]`` to the stored ones, and keep every n-th of all views, n a power of two."""
     ids, rows = np.unique(view_ids, return_index=True)
     new = ~np.isin(ids, replay.views)
     views, step = np.concatenate([replay.views, ids[new]]), 1
@@ -146,10 +142,7 @@ def rows_in_view(features: FeatureGaussians, cameras: Cameras) -> np.ndarray:
 
 
 def pixel_errors(gaussians: Gaussians, photos: Photos, height: int, width: int) -> np.ndarray:
-    """Return the mean squared colour error plus squared transmittance of every pixel, ``[v,h,w]`` float32.
-
-    The transmittance counts holes, which a black photo would hide.
-    """
+    """Return squared colour errors of pixels ``[v,h,w]``, plus squared transmittance: black photos would hide holes."""
 
     def score(view: int, image: np.ndarray, transmittance: np.ndarray) -> np.ndarray:
         errors = ((np.clip(image, 0, 1) - photos.images[view]) ** 2).mean(-1) + transmittance**2
@@ -174,10 +167,7 @@ def novel_rows(
     cameras: Cameras,
     options: OnlineOptions,
 ) -> np.ndarray:
-    """Return the rows of a batch's groups that show something which the state shows worse.
-
-    ``there``: the state's Gaussians in view; ``photos``: the batch's, at half the state's size.
-    """
+    """Return the rows of a batch's groups that show half-size photos better than the state's Gaussians ``there``."""
     if options.tolerance == 0:
         return np.arange(len(features))
     size = cameras.height, cameras.width

@@ -166,10 +166,7 @@ def _check(state: OnlineState | None, scene: Scene, options: CompactOptions, max
 def _enter(
     groups: GroupSet, new: GroupSet, prepared: Prepared, plan: Plan, photos: BatchPhotos, rows: np.ndarray, max_k: int
 ) -> tuple[GroupSet, dict[str, int]]:
-    """Merge new groups into the state's, add the rest; return all, and how many merged and how many no view shows.
-
-    ``rows``: the state's groups that the batch's views may see.
-    """
+    """Merge new groups into the state's ``rows`` in view, and add those that a view shows; return groups and counts."""
     partners = find_partners(take(groups.features, rows), new.features, plan.match)
     has_partner = partners >= 0
     joining = select_groups(new, np.flatnonzero(has_partner))

@@ -49,10 +49,7 @@ class OnlineOptions:
 def merge_settings(
     settings: Mapping[str, Any], state: StoredScene | None = None
 ) -> tuple[CompactOptions, OnlineOptions]:
-    """Merge settings: given, else those of the state, else the defaults.
-
-    Nothing but colours is fitted batch by batch; the full fit comes when decoding.
-    """
+    """Merge settings: given, else those of the state, else the defaults, without a full fit."""
     names = OnlineOptions.__dataclass_fields__.keys()
     known = names | CompactOptions().to_dict().keys()
     stored = {} if state is None else state.about["options"]

@@ -77,10 +77,7 @@ class _Render(torch.autograd.Function):
 def render_tensors(
     gaussians: Gaussians, cameras: Cameras, background: Array, *, with_depths: bool, **options: Any
 ) -> Rendering:
-    """Render tensors on the CPU with a backward pass, as :func:`gsmerge.render` does.
-
-    The ``[3]`` background is checked already.
-    """
+    """Render tensors on the CPU with a backward pass, as :func:`gsmerge.render` does with a checked background."""
     tensors = (*vars(gaussians).values(), cameras.viewmats)
     cameras = replace(cameras, viewmats=cameras.viewmats.detach())
     drawn = _Render.apply(cameras, background, options, with_depths, *tensors)

@@ -94,10 +94,7 @@ def splat_adjoint(plan: ViewPlan, image: Array) -> Array:
 
 
 def contributions(plan: ViewPlan) -> tuple[Array, Array]:
-    """Return the sum (pixels) and the maximum over the pixels of every Gaussian's blending weight.
-
-    Both are ``[n]`` float32, 0 for Gaussians that are not seen.
-    """
+    """Return sum (pixels) and maximum of every Gaussian's blending weight, both ``[n]`` float32; 0 if unseen."""
     totals = np.zeros((len(plan.ids), 2), np.float32)
     kernels.contributions(plan.footprints, plan.members, plan.offsets, plan.columns, plan.height, plan.width, totals)
     mass, peak = np.zeros((2, len(plan.splats)), np.float32)

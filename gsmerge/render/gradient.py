@@ -166,11 +166,7 @@ def color_gradients(
 
 
 def pose_gradient(plan: ViewPlan, gradients: Gradients, shade: ColorGradients | None = None) -> Array:
-    """Return the gradient ``[4,4]`` float64 of the world-to-camera matrix, through geometry and colours.
-
-    ``shade``: gradients through the colours, which change with the camera's place; None where they
-    do not.
-    """
+    """Return the gradient ``[4,4]`` float64 of the world-to-camera matrix, through geometry and, if given, colours."""
     assert gradients.viewmat is not None
     viewmat = gradients.viewmat.copy()
     if shade is not None:

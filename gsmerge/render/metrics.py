@@ -32,11 +32,7 @@ def pixel_mask(mask: Array, image: Array) -> Array:
 
 
 def psnr(image: Array, reference: Array, mask: Array | None = None) -> float:
-    """Return the peak signal-to-noise ratio in dB for a data range of 1; infinite for equal images.
-
-    Images are ``[h,w,c]``; ``mask [h,w]``: pixels that count. Raises ValueError if the shapes
-    differ or no pixel counts.
-    """
+    """Return the peak signal-to-noise ratio in dB of images ``[h,w,c]`` in [0, 1], in a mask ``[h,w]`` if given."""
     first, second = image_pair(image, reference)
     if mask is not None:  # first, as float64 of a whole photo is more than all else that is known of it
         chosen = pixel_mask(mask, first)

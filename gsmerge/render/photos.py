@@ -73,10 +73,7 @@ class Photos:
 
 
 def scene_pictures(scene: Scene) -> np.ndarray:
-    """Return the photos ``[v,h,w,3]``, or pictures of the Gaussians' base colours where there are none.
-
-    Raises ValueError if there are no photos and the Gaussians are not one per pixel.
-    """
+    """Return the photos ``[v,h,w,3]``, or base colours of an aligned scene without photos; else raise ValueError."""
     if scene.images is not None:
         return scene.images
     if not scene.aligned:
@@ -147,11 +144,7 @@ def photo_errors(
 def photo_psnr(
     gaussians: Gaussians | Splats, photos: Photos, views: Iterable[int], *, quarter: bool = False, **settings: Any
 ) -> float:
-    """Return the mean over some views of the PSNR (dB) of their photos.
-
-    ``quarter``: of the :func:`scored_tiles` alone, for a quarter to a half of the time.
-    ``settings``: see :func:`photo_errors`.
-    """
+    """Return the mean PSNR (dB) of some photos, or of a ``quarter`` of each; ``settings``: see :func:`photo_errors`."""
 
     def tiles(view: int) -> np.ndarray | None:
         return scored_tiles(view, photos.width, photos.height) if quarter else None
@@ -170,11 +163,7 @@ def view_psnr(image: np.ndarray, photos: Photos, view: int, *, quarter: bool) ->
 
 
 def scored_tiles(view: int, width: int, height: int) -> np.ndarray | None:
-    """Return a mask ``[lines,columns]`` of a quarter of a view's tiles, for scores; None, for all, of small views.
-
-    One of every two by two blocks of 32 pixels, another one from view to view and from place to
-    place.
-    """
+    """Return a mask ``[lines,columns]`` of a quarter of a view's tiles, alternating in blocks; None for small views."""
     lines, columns = -(-height // TILE), -(-width // TILE)
     if min(lines, columns) <= 3 * BLOCK:
         return None

@@ -56,10 +56,7 @@ def fit_of(options: Mapping[str, Any], *, photos: bool) -> str:
 
 
 def memory_bytes(pixels: int, *, photos: bool, num_rest: int = 0) -> int:
-    """Estimate the memory that a scene takes, imports included.
-
-    ``pixels`` as of :func:`work_seconds`; ``num_rest``: columns of higher harmonics.
-    """
+    """Estimate the memory of a run, imports included; ``num_rest``: columns of higher harmonics."""
     return BYTES_FIXED + round((BYTES_PER_GAUSSIAN + BYTES_PER_VALUE * num_rest + BYTES_PER_PIXEL * photos) * pixels)
 
 

@@ -16,11 +16,7 @@ from gsmerge.errors import SceneError
 
 
 def each_line(path: Path, start: int = 0) -> Iterator[tuple[int, dict[str, Any] | None]]:
-    """Read the complete lines of a file from a byte on, one at a time.
-
-    Yields:
-        The byte after the line, and its value; None if it is damaged.
-    """
+    """Yield the byte after each complete line from a byte on, and its value, None if damaged."""
     if not path.exists():
         return
     try:

@@ -21,10 +21,7 @@ MOST, FEWEST, WRONG = 0.08, 0.015, 0.38
 
 
 def measured_share(scene: Scene) -> tuple[float | None, str]:
-    """Choose a share of superpixels per pixel by how well the views' depths agree, and say why.
-
-    The share is None where depths of several views cannot be compared; the reason is a clause.
-    """
+    """Choose superpixels per pixel by the agreement of the views' depths, None if unknown; and say why."""
     if not scene.aligned or len(scene) < 2:
         return None, "depths of several views cannot be compared"
     wrong = contradicted_share(scene, scene_members(scene))

@@ -33,10 +33,7 @@ MIN_ALPHA = 0.5  # opacity of a pixel from which it counts when superpixels are 
 
 @stage("members")
 def assign(scene: Scene, groups: Groups) -> Members:
-    """Assign a pixel to every Gaussian of a canonical scene: its own, or one of its dominant superpixel.
-
-    Raises UsageError if no view sees any Gaussian.
-    """
+    """Assign a pixel to every Gaussian of a canonical scene; raise UsageError if no view sees any."""
     if scene.aligned:
         return scene_members(scene)
     pixels = owner_pixels(find_owners(scene, groups), groups)
@@ -49,10 +46,7 @@ def assign(scene: Scene, groups: Groups) -> Members:
 
 
 def merge_unseen(gaussians: Gaussians, scene: Scene, count: int) -> Gaussians:
-    """Merge n Gaussians that no view of a canonical scene sees into ``count``, 1 to n.
-
-    Runs along a space-filling curve (Morton's) become one Gaussian each.
-    """
+    """Merge n unseen Gaussians of a canonical scene into ``count`` by runs along Morton's curve."""
     order = np.argsort(morton_codes(gaussians.means.astype(np.float64)), kind="stable")
     members = unaligned_members(replace(scene, gaussians=gaussians), np.full(len(gaussians), -1, np.int64))
     starts = np.linspace(0, len(order), count + 1).astype(np.int64)
@@ -70,10 +64,7 @@ class Owners:
 
 
 def find_owners(scene: Scene, groups: Groups) -> Owners:
-    """Find the dominant superpixel of every Gaussian over all views; the first view wins ties.
-
-    Only the best superpixel so far is kept of each Gaussian, and the pairs of one row of tiles at a time.
-    """
+    """Find the dominant superpixel of every Gaussian over all views; the first view wins ties."""
     count, lock = len(scene.gaussians), Lock()
     best = Owners(np.zeros(count, np.float32), np.full(count, -1, np.int32), np.full(count, -1, np.int32))
 
@@ -125,10 +116,7 @@ def seen_depths(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 
 
 def view_owners(plan: ViewPlan, labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Find the dominant superpixel of each of a plan's m Gaussians, and their contribution to it.
-
-    ``labels [h,w]`` int32 are 0 to ``count - 1``. Returns contributions ``[m]`` and labels ``[m]``.
-    """
+    """Find contribution ``[m]`` to, and label ``[m]`` of, the dominant superpixel of each of a plan's Gaussians."""
     labels = np.ascontiguousarray(labels, np.int32)
     num, room = len(plan.ids), max(FIRST_PAIRS, count)
     values, owners = np.zeros(num, np.float32), np.full(num, -1, np.int32)

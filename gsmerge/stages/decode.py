@@ -119,10 +119,7 @@ def keep_all(scene: Scene, count: int | None) -> Decoded | None:
 
 @stage("decode")
 def decode_merged(merged: MergedViews, scene: Scene, options: DecodeOptions, *, grows: bool) -> Decoded:
-    """Decode merged views into the exact number that was asked for, or K for each Feature Gaussian.
-
-    ``grows``: whether the fit that follows adds Gaussians up to an exact count.
-    """
+    """Decode merged views into the exact number asked for, unless the fit ``grows`` to it, or K for each group."""
     asked = merged.segmentation
     if asked.exact and not grows:
         gaussians = _decode_exactly(merged, asked.count, options)
@@ -187,10 +184,7 @@ def deal_visible(
 def mixed_counts(
     features: FeatureGaussians, members: Members, saliency: np.ndarray, options: DecodeOptions
 ) -> np.ndarray:
-    """Choose K = 1, 2 or 4 for every group, ``[g]`` int64, by its rank (paper supplement, per-superpixel K).
-
-    ``saliency [v·h·w]`` is the corner response of every pixel.
-    """
+    """Choose K = 1, 2 or 4 for every group by its rank in ``saliency`` (paper supplement, per-superpixel K)."""
     starts, ids = features.starts, features.members
     pixels = ids if members.pixels is None else members.pixels[ids]
     values = np.where(pixels >= 0, saliency[pixels], 0.0)
@@ -240,10 +234,7 @@ def divide(features: FeatureGaussians, members: Members, counts: np.ndarray) -> 
 def halve(
     features: FeatureGaussians, members: Members, groups: np.ndarray, counts: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Halve the members of some groups into at most ``counts [g]`` children each.
-
-    Returns ``starts [n+1]`` into rows ``[m]`` of members, and the group ``[n]`` of each child.
-    """
+    """Halve groups' members into ``counts [g]`` children: ``starts [n+1]``, member rows ``[m]``, groups ``[n]``."""
     starts, ids = features.starts, features.members
     centres, footprints = features.means.astype(np.float64), features.footprints.astype(np.float64)
 
@@ -290,10 +281,7 @@ def split_counts(features: FeatureGaussians, members: Members, extra: int, max_c
 
 
 def deal_order(features: FeatureGaussians, members: Members, max_children: int = 8) -> np.ndarray:
-    """Return the Feature Gaussian ``[d]`` of each further Gaussian, largest gain first.
-
-    See :func:`split_counts`, which takes the first ones.
-    """
+    """Return the Feature Gaussian ``[d]`` of each further Gaussian, largest gain first; see :func:`split_counts`."""
     if max_children == 1 or len(features) == 0:
         return np.zeros(0, np.int64)
     gains = hull_gains(_child_errors(features, members, max_children))

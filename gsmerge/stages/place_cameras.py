@@ -25,10 +25,7 @@ ENOUGH = 1.0  # pixels of blending weight at which a Gaussian counts as seen
 
 
 def add_views(scene: Scene) -> Scene:
-    """Keep the finite Gaussians, and place cameras where there are none; a note says what was done.
-
-    Raises ValueError if there is no finite Gaussian.
-    """
+    """Keep the finite Gaussians, at least one, and place cameras where there are none; a note says what was done."""
     g = scene.gaussians
     finite = np.isfinite(g.opacities)
     for array in (g.means, g.quats, g.scales, g.sh0, g.shN):

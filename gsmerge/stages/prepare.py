@@ -70,10 +70,7 @@ class Frame:
 
 
 def scene_frame(scene: Scene) -> Frame:
-    """Choose the canonical frame: median mean (float64) and median depth of the Gaussians that have a pixel, or of all.
-
-    Raises ValueError if there is no valid Gaussian, or no view.
-    """
+    """Choose the canonical frame: median mean (float64) and median depth; ValueError without Gaussians or views."""
     if len(scene.gaussians) == 0 or len(scene) == 0:
         raise ValueError(f"expected Gaussians and views, got {len(scene.gaussians)} and {len(scene)}")
     means = scene.gaussians.means[_sample_rows(scene)].astype(np.float64)

@@ -33,10 +33,7 @@ MAX_SAMPLES = 200_000  # Gaussians that depths are taken from
 
 
 def sky(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray) -> np.ndarray:
-    """Return a mask ``[n]`` of the Gaussians that add most of their weight to the sky of the photos.
-
-    Gaussians are finite and canonical, ``photos [v,h,w,3]`` sRGB in [0, 1], of the cameras' size.
-    """
+    """Return a mask ``[n]`` of the canonical Gaussians that add most of their weight to the sky of the photos."""
     regions, mask = sky_regions(gaussians.means, cameras, photos), np.zeros(len(gaussians), bool)
     if not regions:
         return mask
@@ -50,10 +47,7 @@ def sky(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray) -> np.ndarra
 
 
 def sky_regions(means: np.ndarray, cameras: Cameras, photos: np.ndarray) -> dict[int, np.ndarray]:
-    """Return the sky ``[h,w]`` bool of the views that show any, by view; none if too few do.
-
-    ``means [n,3]`` are in the frame of the cameras.
-    """
+    """Return the sky ``[h,w]`` bool of the views that show any, by view; none if too few do."""
     regions = {view: region for view, photo in enumerate(photos) if (region := sky_region(photo)).any()}
     shown = {
         view: region

@@ -103,10 +103,7 @@ def _check(segmentation: str, rectangles: float, compactness: float) -> None:
 
 
 def count_for(options: SegmentOptions, height: int, width: int) -> int:
-    """Return the number of superpixels that the options ask for in a view of this size.
-
-    Raises UsageError if there are more than pixels.
-    """
+    """Return the superpixels that the options ask for in a view; raise UsageError for more than pixels."""
     if options.per_view is not None:
         if options.per_view > height * width:
             limit = f"{height * width}, one per pixel of {width} x {height}"

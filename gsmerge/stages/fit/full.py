@@ -151,10 +151,7 @@ def look_of(step: int, level: int, eps2d: float) -> dict[str, Any]:
 
 
 def step_sizes(rates: Tuning, progress: float, steps: int) -> np.ndarray:
-    """Return the step of each of the fourteen columns at a point of the run, decaying geometrically.
-
-    Longer runs decay farther.
-    """
+    """Return the step of each of the fourteen columns, decaying geometrically, and farther in longer runs."""
     decay = rates.decay * min(1.0, LONG_RUN / steps)
     each = [rates.means_lr, rates.scales_lr, rates.quats_lr, rates.opacities_lr, rates.colors_lr]
     return (np.repeat(each, [3, 3, 4, 1, 3]) * decay**progress).astype(np.float32)

@@ -20,10 +20,7 @@ BLOCK = 32  # pixels, at most
 
 
 def fit_photos(scene: Scene, options: FitOptions, views: Sequence[int] | None = None) -> tuple[Photos, ...]:
-    """Return the photos at full and at half size, and larger ones where ``photo_scale`` is a number above 1.
-
-    Those of ``views``, None: of all. The record gets the choice ``photo_scale`` and a note where there are larger ones.
-    """
+    """Return the photos at full and half size, and larger if ``photo_scale`` is above 1, which is recorded."""
     views = range(len(scene)) if views is None else views
     photos = scene_photos(scene)[views], scene_photos(scene, 2)[views]
     scale = 1.0 if options.photo_scale == "auto" else options.photo_scale
@@ -40,10 +37,7 @@ def fit_photos(scene: Scene, options: FitOptions, views: Sequence[int] | None = 
 
 
 def photo_scale(scene: Scene, options: FitOptions, *, auto: bool) -> tuple[float, str | None]:
-    """Choose the multiple of the views' size, 1 or more, at which a fit looks at photos; and why it is less than asked.
-
-    ``auto``: whether ``photo_scale="auto"`` may be above 1.
-    """
+    """Choose the multiple of the views' size for photos in a fit, 1 or more; say why it is less than asked."""
     wanted, largest = options.photo_scale, largest_scale(scene)
     covered = options.fit == "full" and options.half_res_part < 1
     if wanted == "auto":

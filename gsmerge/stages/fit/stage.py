@@ -51,10 +51,7 @@ class FitBackend(Generic[PhotosT]):
 
 
 def visible_mask(gaussians: Gaussians, photos: Photos, min_weight: float) -> np.ndarray:
-    """Return a mask ``[n]`` of Gaussians with a blending weight of ``min_weight`` at some pixel of some photo.
-
-    Gaussians in no photo's frustum stay, too.
-    """
+    """Return a mask ``[n]`` of Gaussians with a weight of ``min_weight`` in some photo, or in no photo's frustum."""
     splats = prepare(gaussians)
 
     def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
@@ -143,11 +140,7 @@ def fit(
 def fit_scene(
     decoded: Decoded, scene: Scene, views: Sequence[int], options: FitOptions, seed: int, backend: FitBackend[Any]
 ) -> Fitted:
-    """Fit decoded Gaussians to the photos of some views of a canonical scene.
-
-    They stay unchanged where there are no photos, or no fit was asked for. Larger photos are fitted
-    to on the CPU alone.
-    """
+    """Fit decoded Gaussians to the photos of some views of a canonical scene, if there are any and it is asked for."""
     if scene.images is None or not options.needs_photos:
         return Fitted(decoded.gaussians, scene.cameras, None)
     with stage("fit"):
