@@ -23,7 +23,6 @@ from gsmerge.types import Array, Gaussians, Scene
 FitResult = tuple[Gaussians, FitReport]
 PhotosT = TypeVar("PhotosT")  # photos of one size, where a back end has them
 ResultT = TypeVar("ResultT")
-DataT = TypeVar("DataT")  # on the CPU where it is used
 CLOSE = 1.0  # dB that the held-out blocks must gain; after less, the whole photos are compared
 ALWAYS = float("inf")  # where the full fit failed: it may have begun where another one ended
 START = 0.57  # share of the Gaussians that a run which grows begins with
@@ -83,15 +82,11 @@ def photo_error(gaussians: Gaussians, photos: Photos) -> float:
     return float(np.mean(photo_errors(gaussians, photos, score)))
 
 
-def _stay(data: DataT) -> DataT:
-    return data
-
-
 ON_CPU: FitBackend[Photos] = FitBackend(
     device="cpu",
-    upload=_stay,
-    upload_photos=_stay,
-    download=_stay,
+    upload=lambda gaussians: gaussians,
+    upload_photos=lambda photos: photos,
+    download=lambda gaussians: gaussians,
     visible_mask=visible_mask,
     fit_full=fit_full,
     fit_colors=_fit_colors,
