@@ -28,7 +28,7 @@ from gsmerge.types import Cameras
 
 
 def save_state(path: str | PathLike[str], state: OnlineState, *, overwrite: bool = False) -> None:
-    """Write a state, bit for bit as it is in memory."""
+    """Write a state to a file, bit for bit."""
     groups, replay = state.groups, state.replay
     arrays = {
         "children.counts": np.diff(groups.features.starts).astype(np.uint8),

@@ -40,7 +40,7 @@ class RegionTree:
     min_regions: int  # Fewest regions before any is larger than `MAX_EXTENT`
 
     def __len__(self) -> int:
-        """Superpixels at the start."""
+        """Return the number of superpixels at the start."""
         return len(self.groups)
 
     @property
