@@ -1,4 +1,4 @@
-"""How many Gaussians: what a budget, a file size, a device or a quality means."""
+"""Numbers of Gaussians from budgets, file sizes, devices and quality targets."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ AUTO = "auto"
 
 @dataclass(frozen=True)
 class BudgetOptions:
-    """What decides the number of Gaussians, next to the superpixels of each view and K.
+    """Options that decide the number of Gaussians, next to superpixels per view and K.
 
     Args:
         budget: Gaussians in the result: a number, a share of the input as "2%", or the size of the ``.ply`` as "5MB",
@@ -59,19 +59,19 @@ class BudgetOptions:
 
     @property
     def target_psnr(self) -> float | None:
-        """PSNR (dB) that the input photos have to reach; None without such a quality."""
+        """PSNR (dB) that the input photos have to reach; None without this target."""
         quality = None if self.quality is None else parse_quality(self.quality)
         return None if quality is None or self.max_drop is not None else quality
 
     @property
     def max_drop(self) -> float | None:
-        """dB that may be lost against the best; None without such a quality."""
+        """Allowed loss in dB against the best of the scene's curve; None without this target."""
         loss = self.quality is not None and self.quality.strip().startswith("-")
         return -parse_quality(str(self.quality)) if loss else None
 
 
 def exact_count(options: BudgetOptions, num_input: int, sh_degree: int) -> int | None:
-    """The number of Gaussians that a budget or a file size asks for; None without either."""
+    """Return the number of Gaussians that a budget or a file size asks for; None without either."""
     if options.budget in (None, AUTO, *DEVICES):
         return None
     if options.in_bytes:
@@ -80,16 +80,13 @@ def exact_count(options: BudgetOptions, num_input: int, sh_degree: int) -> int |
 
 
 def max_allowed(options: BudgetOptions, num_input: int, sh_degree: int) -> int:
-    """The most Gaussians that budget, size or device leave, at most as many as the input has."""
+    """Return the most Gaussians that a budget, a file size or a device allows, at most the input's."""
     limit = DEVICES.get(str(options.budget), exact_count(options, num_input, sh_degree))
     return num_input if limit is None else min(limit, num_input)
 
 
 def parse_quality(text: str) -> float:
-    """The dB of ``--quality``: a PSNR as "30dB", or below zero a loss as "-0.2dB".
-
-    Raises:
-        ValueError: If it is neither.
+    """Parse the dB of ``--quality``: a PSNR as "30dB", or a loss below zero as "-0.2dB".
 
     Example:
         >>> parse_quality("30dB"), parse_quality("-0.2dB")
@@ -103,11 +100,7 @@ def parse_quality(text: str) -> float:
 
 
 def parse_share(text: str) -> float:
-    """The part of a whole that "4.4%" means: 0.044.
-
-    Raises:
-        ValueError: If it is no share above 0 and up to 100 %.
-    """
+    """Parse a share above 0 and up to 100 %: "4.4%" -> 0.044."""
     match = re.fullmatch(r"(\d*\.?\d+)\s*%", str(text).strip(), re.ASCII)
     share = Fraction(match[1]) / 100 if match else Fraction(0)
     if not 0 < share <= 1:
@@ -116,16 +109,14 @@ def parse_share(text: str) -> float:
 
 
 def share_text(share: float) -> str:
-    """A share as :func:`parse_share` reads it, exactly: 0.044 -> "4.4%"."""
+    """Format a share exactly as :func:`parse_share` reads it: 0.044 -> "4.4%"."""
     if isinstance(share, bool) or not isinstance(share, int | float):
         raise ValueError(f"expected a share as a number, got {share!r}")
     return f"{(Decimal(repr(share)) * 100).normalize():f}%"
 
 
 def parse_budget(budget: str | int | None, num_input: int) -> int:
-    """The number of Gaussians that a budget means: a number, or a share of the input as "2%" (rounded down).
-
-    Never above ``num_input``.
+    """Parse a number of Gaussians, or a share of the input as "2%", rounded down; at most ``num_input``.
 
     Raises:
         ValueError: If it is neither, or more than the input.
@@ -155,10 +146,7 @@ def parse_budget(budget: str | int | None, num_input: int) -> int:
 
 
 def parse_bytes(size: str | int) -> int:
-    """The number of bytes of a size as "5MB", "800 KiB" or "5000000".
-
-    Raises:
-        ValueError: If it is none.
+    """Parse a size in bytes, as "5MB", "800 KiB" or "5000000".
 
     Example:
         >>> parse_bytes("1.5MB")

@@ -36,19 +36,12 @@ NO_PHOTOS = "no photos found, so nothing is fitted and no PSNR measured; name th
 
 @dataclass(frozen=True, eq=False)
 class SceneInput:
-    """A scene that was read, without what only its reading needs.
-
-    Args:
-        scene: The scene.
-        recognised: What the report says about the input.
-        comments: Comments of its header that the result keeps.
-        notes: Of the reader.
-    """
+    """A scene and the facts of its reading that a report needs."""
 
     scene: Scene
-    recognised: dict[str, Any]
-    comments: Sequence[str]
-    notes: Sequence[str]
+    recognised: dict[str, Any]  # Facts about the input for the report
+    comments: Sequence[str]  # Comments of the header that the result keeps
+    notes: Sequence[str]  # Notes of the reader, one sentence each
 
 
 def compact_files(
@@ -68,31 +61,13 @@ def compact_files(
     cameras_path: Path | None = None,
     saved_cameras: Path | None = None,
 ) -> dict[str, Any]:
-    """Read a scene, compact it and write the result, its further levels of detail beside it, its views for viewers,
-    and the report: all of them or none.
+    """Read a scene, compact it, and write result, levels, cameras and report: all files or none.
 
-    Args:
-        files: The scene.
-        settings: Of all stages.
-        out: What to write, in the format that its name asks for; its folder must exist.
-        opacity: How opacities are stored.
-        hints: What is known of the file and need not be recognised.
-        overwrite: Replace files that are there.
-        progress: As of :func:`gsmerge.compact`.
-        hashed: Hash the input for the report.
-        seconds_before: Wall time by name of what the caller did before.
-        report_path: A file for the report; None: none is written.
-        normals: As of :func:`gsmerge.write_gaussians`.
-        spz_version: As of the same.
-        cameras_path: A file for the views, where there are any; None: none is written.
-        saved_cameras: The same as ``transforms.json``, with all intrinsics.
-
-    Returns:
-        The report, see :func:`gsmerge.report.report_document`.
-
-    Raises:
-        SceneError: If the scene cannot be read or the result cannot be written.
-        UsageError: If the settings need what the scene does not have, or the name has no known ending.
+    ``hashed``: hash the input for the report. ``seconds_before``: wall time by name of the caller's
+    earlier steps. ``cameras_path``, ``saved_cameras``: files for the views, for viewers and as
+    ``transforms.json`` with all intrinsics. Returns the report, see
+    :func:`gsmerge.report.report_document`. Raises SceneError if the scene cannot be read or the
+    result cannot be written, UsageError if the settings need what the scene does not have.
     """
     start, ending = perf_counter(), output_format(out, spz_version)
     with atomic_outputs(overwrite=overwrite) as add:
@@ -137,11 +112,7 @@ def compact_files(
 
 
 def read_input(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = AUTO) -> SceneInput:
-    """Read a scene, as of :func:`compact_files`.
-
-    Raises:
-        SceneError: If the scene cannot be read.
-    """
+    """Read a scene from its files, and note what is missing or odd; raise SceneError if it cannot be read."""
     loaded = load_files(files, opacity=opacity, hints=hints)
     no_photos = loaded.scene.aligned and loaded.scene.images is None
     notes = (*loaded.notes, *([NO_PHOTOS] if no_photos else []), *compact_notes(loaded))
@@ -158,7 +129,7 @@ def check_saved_cameras(scene: Scene, path: Path | None) -> None:
 
 
 def compact_notes(loaded: SceneLoad) -> tuple[str, ...]:
-    """A note where a scene is a result of gsmerge: a file of its own with far fewer Gaussians than pixels."""
+    """Return a note if the scene is a result of gsmerge, with far fewer Gaussians than pixels."""
     scene = loaded.scene
     pixels = len(scene) * scene.cameras.height * scene.cameras.width
     if scene.aligned or LOGIT_COMMENT not in loaded.ply.comments or scene.num_gaussians > pixels / 2:
@@ -168,7 +139,7 @@ def compact_notes(loaded: SceneLoad) -> tuple[str, ...]:
 
 
 def recognised_of(loaded: SceneLoad) -> dict[str, Any]:
-    """What the report says about the input."""
+    """Return the facts about the input for the report."""
     names = ("layout", "sh_degree", "opacity_encoding", "num_nonfinite")
     cameras, recovery = loaded.scene.cameras, loaded.recovery
     views: dict[str, Any] = {"num_views": len(cameras), "height": cameras.height, "width": cameras.width}
@@ -178,7 +149,7 @@ def recognised_of(loaded: SceneLoad) -> dict[str, Any]:
 
 
 def level_output(output: Path, level: int) -> Path:
-    """``out.ply`` -> ``out.level1.ply``: where a further level of detail goes, counted from 1."""
+    """Return the path of a further level of detail, counted from 1: ``out.ply`` -> ``out.level1.ply``."""
     compressed = output.name.lower().endswith(".compressed.ply")
     length = len(".compressed.ply" if compressed else output.suffix)
     cut = len(output.name) - length

@@ -1,7 +1,7 @@
-"""What a user can mend, as exceptions that know their exit code.
+"""Exceptions for problems that a user can fix, each with its exit code.
 
-Arguments of the Python API that make no sense raise ``ValueError``. Everything that has to do with files and
-with what is in them raises one of these; the command line prints the message as one line.
+Arguments of the Python API that make no sense raise ``ValueError``. Everything that has to do with
+files and with what is in them raises one of these; the command line prints the message as one line.
 """
 
 from __future__ import annotations
@@ -11,25 +11,19 @@ from os import PathLike
 
 
 class GsmergeError(Exception):
-    """Base of all errors that a user can mend; ``exit_code`` is what the command line ends with."""
+    """Base of all errors that a user can fix; ``exit_code`` is that of the command line."""
 
     exit_code = 1
 
 
 class UsageError(GsmergeError, ValueError):
-    """Options do not go together, or not with this scene."""
+    """Options that do not fit together, or do not fit this scene."""
 
     exit_code = 2
 
 
 class SceneError(GsmergeError):
-    """A file or folder does not hold what is needed.
-
-    Args:
-        path: The file or folder.
-        problem: What was expected and what was found, in one sentence without a full stop.
-        remedy: What to do about it, in one sentence without a full stop.
-    """
+    """A file, folder or argument without the expected content: ``problem`` and ``remedy`` without full stops."""
 
     exit_code = 3
 
@@ -57,7 +51,7 @@ DAMAGED_OPENCV = (
 
 
 def is_opencv_damaged(error: BaseException) -> bool:
-    """Whether an error says that the module ``cv2``, whose folder several packages share, is not whole."""
+    """Return whether an error says that ``cv2``, a folder shared by several packages, is incomplete."""
     return isinstance(error, AttributeError | ImportError) and "cv2" in f"{error} {getattr(error, 'path', '')}"
 
 
@@ -66,7 +60,7 @@ _NO_MEMORY = ("failed to map segment", "annot allocate memory", "can't allocate 
 
 
 def is_out_of_memory(error: BaseException | None) -> bool:
-    """Whether an error, or one behind it, says that there is no more memory: libraries have many words for it."""
+    """Return whether an error, or one of its causes, reports a lack of memory."""
     while error is not None:
         if isinstance(error, MemoryError) or any(text in str(error) for text in _NO_MEMORY):
             return True
@@ -75,7 +69,7 @@ def is_out_of_memory(error: BaseException | None) -> bool:
 
 
 def file_problem(error: BaseException) -> str | None:
-    """What the system says about a file or the disk, as one line; None for another error."""
+    """Describe an error of the file system in one line; None for another error."""
     if not isinstance(error, OSError) or error.strerror is None:
         return None
     if error.filename is not None:
@@ -85,7 +79,7 @@ def file_problem(error: BaseException) -> str | None:
 
 
 def error_line(error: BaseException) -> str:
-    """An error as one line."""
+    """Describe an error in one line."""
     if is_out_of_memory(error):
         return OUT_OF_MEMORY
     if is_opencv_damaged(error):

@@ -13,20 +13,13 @@ MORTON_BITS = 21  # per axis: three fit into 63 bits
 
 
 def quat_to_rotmat(quats: np.ndarray) -> np.ndarray:
-    """Rotation matrices of quaternions.
-
-    Args:
-        quats: ``[...,4]`` wxyz; normalised here.
-
-    Returns:
-        ``[...,3,3]`` rotations, local to world.
-    """
+    """Return the rotation matrices ``[...,3,3]``, local to world, of quaternions ``[...,4]`` wxyz of any length."""
     entries = rotation_entries(*np.moveaxis(normalize(quats), -1, 0))
     return np.stack(entries, -1).reshape(*quats.shape[:-1], 3, 3)
 
 
 def rotation_entries(w: Array, x: Array, y: Array, z: Array) -> list[Array]:
-    """The nine entries, row by row, of the rotations of unit quaternions, arrays or tensors of any one shape."""
+    """Return the nine entries, row by row, of the rotations of unit quaternions, as arrays or tensors."""
     return [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
@@ -35,17 +28,14 @@ def rotation_entries(w: Array, x: Array, y: Array, z: Array) -> list[Array]:
 
 
 def normalize(vectors: np.ndarray) -> np.ndarray:
-    """Vectors ``[...,d]`` of length 1; zero stays zero."""
+    """Return vectors ``[...,d]`` scaled to length 1; zero stays zero."""
     with np.errstate(over="ignore"):  # what is too long becomes zero
         norms = np.sqrt((vectors * vectors).sum(-1, keepdims=True))
     return vectors / np.maximum(norms, norms.dtype.type(1e-12))
 
 
 def rotmat_to_quat(rotations: np.ndarray) -> np.ndarray:
-    """Unit quaternions ``[n,4]`` wxyz of rotation matrices ``[n,3,3]``, the largest component positive.
-
-    Of the four ways to write it (Shepperd 1978), the one that divides by the largest component.
-    """
+    """Return unit quaternions ``[n,4]`` wxyz of rotations, the largest component positive (Shepperd 1978)."""
     a, b, c, d, e, f, g, h, i = rotations.reshape(-1, 9).T
     ways = np.stack(
         [
@@ -61,7 +51,7 @@ def rotmat_to_quat(rotations: np.ndarray) -> np.ndarray:
 
 
 def multiply_quats(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Products of quaternions ``[...,4]`` wxyz: first ``b``, then ``a``."""
+    """Return the products of quaternions ``[...,4]`` wxyz: first ``b``, then ``a``."""
     (aw, ax, ay, az), (bw, bx, by, bz) = np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)
     product = [
         aw * bw - ax * bx - ay * by - az * bz, aw * bx + ax * bw + ay * bz - az * by,
@@ -71,44 +61,26 @@ def multiply_quats(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def covariances(quats: np.ndarray, scales: np.ndarray) -> np.ndarray:
-    """Covariances ``R diag(scales)^2 R^T`` (paper section 3).
-
-    Args:
-        quats: ``[...,4]`` wxyz.
-        scales: ``[...,3]`` standard deviations.
-
-    Returns:
-        ``[...,3,3]``.
-    """
+    """Return ``R diag(scales)^2 R^T [...,3,3]`` of quaternions wxyz and standard deviations (paper section 3)."""
     half = quat_to_rotmat(quats) * scales[..., None, :]
     return half @ half.swapaxes(-1, -2)
 
 
 def project(means: np.ndarray, cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
-    """Pixel positions and depths of points in every camera.
+    """Project points ``[n,3]`` into c cameras, in float64.
 
-    Args:
-        means: ``[n,3]`` world positions.
-        cameras: c cameras.
-
-    Returns:
-        ``[c,n,2]`` positions in pixels (pixel centres at +0.5; meaningless where the depth is not positive)
-        and ``[c,n]`` depths along z, both in float64.
+    Returns ``[c,n,2]`` positions in pixels (pixel centres at +0.5; meaningless where the depth is
+    not positive) and ``[c,n]`` depths along z.
     """
     with np.errstate(divide="ignore", invalid="ignore"):  # behind or on the plane of a camera
         return project_points(*(array.astype(np.float64) for array in (means, cameras.viewmats, cameras.Ks)))
 
 
 def project_points(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """:func:`project` for any leading shape, in their own precision.
+    """Project points ``[...,n,3]`` as :func:`project` does, for any leading shape and in their own precision.
 
-    Args:
-        points: ``[...,n,3]`` world positions.
-        viewmats: ``[...,4,4]`` world to camera.
-        Ks: ``[...,3,3]`` intrinsics, pixels.
-
-    Returns:
-        ``[...,n,2]`` positions in pixels and ``[...,n]`` depths along z.
+    ``viewmats [...,4,4]`` world to camera, ``Ks [...,3,3]`` pixels; returns positions ``[...,n,2]``
+    and depths ``[...,n]``.
     """
     camera = points @ viewmats[..., :3, :3].swapaxes(-1, -2) + viewmats[..., None, :3, 3]
     image = camera @ Ks.swapaxes(-1, -2)
@@ -116,7 +88,7 @@ def project_points(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> 
 
 
 def motion_matrices(vectors: np.ndarray) -> np.ndarray:
-    """``[v,4,4]`` float64 rigid motions of ``[v,6]``: a rotation vector about the origin (radians), and a shift."""
+    """Return rigid motions ``[v,4,4]`` float64 of ``[v,6]``: rotation vectors about the origin (radians), shifts."""
     out = np.tile(np.eye(4), (len(vectors), 1, 1))
     for matrix, vector in zip(out, vectors.astype(np.float64), strict=True):
         matrix[:3, :3], matrix[:3, 3] = cv2.Rodrigues(vector[:3])[0], vector[3:]
@@ -124,32 +96,32 @@ def motion_matrices(vectors: np.ndarray) -> np.ndarray:
 
 
 def motion_vectors(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """``[v,6]`` world motions that lead from viewmats ``[v,4,4]`` to others: ``end = start @ motion_matrices(...)``."""
+    """Return world motions ``[v,6]`` from viewmats to others: ``end = start @ motion_matrices(...)``."""
     motions = np.linalg.inv(start) @ end
     return np.stack([np.concatenate([cv2.Rodrigues(m[:3, :3])[0][:, 0], m[:3, 3]]) for m in motions])
 
 
 def without_common_motion(start: np.ndarray, end: np.ndarray, middle: Callable[..., np.ndarray]) -> np.ndarray:
-    """The viewmats ``end [v,4,4]`` less what all did together since ``start``: the middle motion (mean, median)."""
+    """Return viewmats ``end [v,4,4]`` less the middle (mean, median) of all motions since ``start``."""
     common = middle(motion_vectors(start, end), axis=0)
     return np.asarray(end @ np.linalg.inv(motion_matrices(common[None])))
 
 
 def pose_changes(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How far cameras moved between viewmats ``[v,4,4]``: ``[v]`` degrees, and ``[v]`` distances of the centres."""
+    """Measure how far cameras moved between viewmats ``[v,4,4]``: ``[v]`` degrees, and distances of the centres."""
     chords = np.linalg.norm(end[:, :3, :3] - start[:, :3, :3], axis=(1, 2)) / np.sqrt(8)
     before, after = (-np.einsum("vji,vj->vi", one[:, :3, :3], one[:, :3, 3]) for one in (start, end))
     return np.degrees(2 * np.arcsin(chords.clip(0, 1))), np.linalg.norm(after - before, axis=1)
 
 
 def lower_median(values: np.ndarray) -> np.ndarray:
-    """The median of ``[n,...]`` rows, n at least 1, each column alone; of an even number, the lower middle one."""
+    """Return the median of each column of ``[n,...]`` rows, n >= 1; of an even number, the lower middle value."""
     middle = (len(values) - 1) // 2
     return np.partition(values, middle, axis=0)[middle]
 
 
 def morton_codes(points: np.ndarray) -> np.ndarray:
-    """``[n]`` int64 places along a space-filling curve (Morton's) of points ``[n,3]``: the bits interleaved."""
+    """Return the places ``[n]`` int64 of points ``[n,3]`` along Morton's space-filling curve: interleaved bits."""
     codes = np.zeros(len(points), np.int64)
     if len(points) == 0:
         return codes
@@ -162,10 +134,10 @@ def morton_codes(points: np.ndarray) -> np.ndarray:
 
 
 def sh0_to_rgb(sh0: np.ndarray) -> np.ndarray:
-    """Base colours (sRGB, 0 to 1 where they can be shown) of spherical harmonics of degree 0."""
+    """Return the base colours (sRGB, 0 to 1 where they can be shown) of harmonics of degree 0."""
     return 0.5 + SH_C0 * sh0
 
 
 def rgb_to_sh0(rgb: np.ndarray) -> np.ndarray:
-    """The inverse of :func:`sh0_to_rgb`."""
+    """Return the harmonics of degree 0 of base colours, the inverse of :func:`sh0_to_rgb`."""
     return (rgb - 0.5) / SH_C0

@@ -1,4 +1,4 @@
-"""Compact arrays or tensors in memory, with their conventions checked as those of files are."""
+"""Compaction of arrays and tensors in memory, whose conventions are checked."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ from gsmerge.io.cameras.camera_file import (
     MAX_NORMALISED_FOCAL,
     W2C_OPENCV,
     W2C_OPENGL,
+    Convention,
     check_camera,
     check_size,
 )
@@ -74,11 +75,10 @@ def compact_tensors(
     progress: Progress | None = None,
     **settings: Any,
 ) -> CompactResult:
-    """Compact Gaussians that are in memory, as :func:`gsmerge.compact` does a scene.
+    """Compact Gaussians given as arrays or tensors, as :func:`gsmerge.compact` does a scene.
 
-    Arrays are NumPy's or torch's, on any device; they are copied, without gradients. Further axes in front are taken
-    apart, so ``[1,n,3]`` and ``[V,H,W,3]`` are ``[n,3]``. What is in another convention is refused in one line that
-    says what was found and what to pass instead. Rows with NaN or infinities are set aside.
+    Arrays are NumPy's or torch's, on any device, and are copied without gradients. Leading axes are
+    flattened, so ``[1,n,3]`` and ``[V,H,W,3]`` mean ``[n,3]``. Rows with NaN or infinities are left out.
 
     Args:
         means: ``[n,3]`` centres, world units; row ``(v·H + y)·W + x`` belongs to pixel (x, y) of view v.
@@ -88,35 +88,35 @@ def compact_tensors(
         sh0: ``[n,1,3]`` or ``[n,3]`` harmonics of degree 0; rgb = 0.5 + 0.2821 sh0.
         colors: ``[n,3]`` sRGB in [0, 1], in place of ``sh0``.
         shN: ``[n,k-1,3]`` higher harmonics, basis-major; None: none.
-        images: ``[V,H,W,3]`` photos, sRGB in [0, 1]; None: nothing is fitted and no PSNR measured.
+        images: ``[V,H,W,3]`` photos, sRGB in [0, 1]; None: no fit and no PSNR.
         viewmats: ``[V,4,4]`` or ``[V,3,4]`` world to camera, OpenCV axes.
         Ks: ``[V,3,3]`` intrinsics in pixels; the top-left pixel's centre is (0.5, 0.5).
         shape: Views, height and width; None: those of the images.
-        names: Of the views; None numbers them.
-        order: ``"view-major"``: one Gaussian per pixel, as above; ``"none"``: they belong to no pixels (trained scenes,
-            voxels), and cameras may be missing.
-        check_rotations: Refuse rotations that follow the surface far better in another convention; False for models
-            whose own renderer takes them as they are.
-        progress: As of :func:`gsmerge.compact`.
-        **settings: Those of :func:`gsmerge.compact`: ``budget="4%"``, ``k=2``, ``effort="fast"``.
+        names: Names of the views; None: numbers.
+        order: ``"view-major"``: one Gaussian per pixel, as above; ``"none"``: Gaussians without pixels
+            (trained scenes, voxels), for which cameras are optional.
+        check_rotations: Refuse rotations that follow the surface far better in another convention;
+            False for models whose own renderer takes them unchanged.
+        progress: See :func:`gsmerge.compact`.
+        **settings: Settings of :func:`gsmerge.compact`, such as ``budget="4%"``, ``k=2``.
 
     Returns:
-        The result of :func:`gsmerge.compact`, its Gaussians as tensors on the device of ``means`` if these are a
-        tensor, otherwise as arrays.
+        The result of :func:`gsmerge.compact`; tensors on the device of ``means`` if that is a tensor.
 
     Raises:
-        SceneError: If an array has another shape or convention.
+        SceneError: If an array has another shape or convention; it says what to pass instead.
         ValueError: If a setting is unknown or out of range.
-
-    Example:
-        >>> small = compact_tensors(means=m, quats=q, scales=s, opacities=o, colors=c, images=i, viewmats=w, Ks=K)
-        ... # doctest: +SKIP
     """
     if order not in ORDERS:
         raise ValueError(f"order: expected one of {', '.join(ORDERS)}, got {order!r}")
-    columns = {"means": _rows("means", means, 3), "quats": _rows("quats", quats, 4)}
-    columns |= {"scales": _rows("scales", scales, 3), "opacities": _rows("opacities", opacities)}
-    columns |= {"sh0": _read_base(sh0, colors), "shN": _read_harmonics(shN, len(columns["means"]))}
+    columns = {
+        "means": _rows("means", means, 3),
+        "quats": _rows("quats", quats, 4),
+        "scales": _rows("scales", scales, 3),
+        "opacities": _rows("opacities", opacities),
+        "sh0": _read_base(sh0, colors),
+    }
+    columns["shN"] = _read_harmonics(shN, len(columns["means"]))
     gaussians, valid, notes = _make_gaussians(columns)
     cameras, photos = NO_CAMERAS, None
     if order != "none" or viewmats is not None or images is not None:
@@ -139,10 +139,10 @@ def _make_scene(
     names: Sequence[str] | None,
     order: str,
 ) -> tuple[Scene, list[str]]:
-    """Put Gaussians and views together, if they fit as ``order`` says; with notes, one sentence each."""
-    views = tuple(f"view{view}" for view in range(len(cameras)))
-    if names is not None and len(cameras):
-        views = tuple(map(str, names))
+    """Join Gaussians and views to a scene in the given order; return it and notes."""
+    if names is None or len(cameras) == 0:
+        names = [f"view{view}" for view in range(len(cameras))]
+    views = tuple(map(str, names))
     if len(views) != len(cameras):
         raise SceneError("names", f"expected {len(cameras)} names, one for each view, found {len(views)}")
     if order == "none":
@@ -158,7 +158,7 @@ def _make_scene(
 
 
 def _to_numpy(name: str, values: Any) -> np.ndarray:
-    """Bring an array or tensor on any device into a NumPy array of numbers; SceneError if it is none."""
+    """Return an array or tensor as a NumPy array; raise SceneError if it holds no numbers."""
     if hasattr(values, "detach") and "float" in str(values.dtype):  # NumPy knows no bfloat16
         values = values.detach().double() if str(values.dtype) == "torch.float64" else values.detach().float()
     array = as_array(values)
@@ -168,7 +168,7 @@ def _to_numpy(name: str, values: Any) -> np.ndarray:
 
 
 def _rows(name: str, values: Any, *tail: int) -> np.ndarray:
-    """Copy values ``[...,*tail]`` to ``[n,*tail]``, float32; float64 where the means are."""
+    """Copy values ``[...,*tail]`` to ``[n,*tail]`` float32; means may stay float64."""
     array = _to_numpy(name, values)
     if array.ndim < len(tail) or array.shape[array.ndim - len(tail) :] != tail:
         expected = ", ".join(map(str, ("n", *tail)))
@@ -178,10 +178,7 @@ def _rows(name: str, values: Any, *tail: int) -> np.ndarray:
 
 
 def _make_gaussians(out: dict[str, np.ndarray]) -> tuple[Gaussians, np.ndarray, list[str]]:
-    """Make Gaussians of columns; return all rows, which of them are finite, and notes.
-
-    The others become transparent, as those of files.
-    """
+    """Make Gaussians of columns, transparent in rows that are not finite; return them, the finite rows and notes."""
     n = len(out["means"])
     for name, column in out.items():
         if len(column) != n:
@@ -195,7 +192,9 @@ def _make_gaussians(out: dict[str, np.ndarray]) -> tuple[Gaussians, np.ndarray, 
     num_bad = clear_invalid("means", out | {"valid": valid})
     _check_values(out, valid)
     np.clip(out["opacities"], 0, 1, out=out["opacities"])
-    _normalise_few(out["quats"])
+    off = np.flatnonzero(np.abs(np.linalg.norm(out["quats"], axis=1) - 1) > _EXACT)
+    out["quats"][off] = normalize(out["quats"][off])
+    out["quats"][(out["quats"] == 0).all(1)] = (1, 0, 0, 0)
     notes = [f"{num_bad:,} row(s) with NaN or inf, set aside"] if num_bad else []
     first, last = out["quats"][valid][:, 0], out["quats"][valid][:, 3]
     if last.min() >= 0 > first.min():  # quaternions of matrices usually have no negative w
@@ -204,7 +203,7 @@ def _make_gaussians(out: dict[str, np.ndarray]) -> tuple[Gaussians, np.ndarray, 
 
 
 def _read_base(sh0: Array | None, colors: Array | None) -> np.ndarray:
-    """Read ``sh0 [n,1,3]``, or compute it from colours."""
+    """Return ``sh0 [n,1,3]``, given or computed from colours."""
     if (sh0 is None) == (colors is None):
         found = "neither" if sh0 is None else "both"
         raise SceneError("sh0", f"expected either sh0 or colors, found {found}")
@@ -241,20 +240,13 @@ def _check_values(out: dict[str, np.ndarray], valid: np.ndarray) -> None:
     lengths = np.linalg.norm(out["quats"][valid], axis=1)
     share = float((np.abs(lengths - 1) > _NOT_UNIT).mean())
     if share > _FEW:
-        problem = f"expected unit quaternions wxyz, found {100 * share:.3g} % with lengths of {lengths.min():.3g}"
-        problem += f" to {lengths.max():.3g}"
-        raise SceneError("quats", problem, "pass torch.nn.functional.normalize(quats, dim=-1)")
-
-
-def _normalise_few(quats: np.ndarray) -> None:
-    """Give quaternions of another length that of 1, in place; zero becomes the identity."""
-    rows = np.flatnonzero(np.abs(np.linalg.norm(quats, axis=1) - 1) > _EXACT)
-    quats[rows] = normalize(quats[rows])
-    quats[(quats == 0).all(1)] = (1, 0, 0, 0)
+        sizes = f"{100 * share:.3g} % with lengths of {lengths.min():.3g} to {lengths.max():.3g}"
+        remedy = "pass torch.nn.functional.normalize(quats, dim=-1)"
+        raise SceneError("quats", f"expected unit quaternions wxyz, found {sizes}", remedy)
 
 
 def _expect_unit_range(name: str, values: np.ndarray, slack: float) -> None:
-    """Refuse colours far outside [0, 1]; a SceneError says which range they look to be of."""
+    """Refuse colours far outside [0, 1], and name the range that they seem to have."""
     low, high = float(values.min(initial=0)), float(values.max(initial=0))
     if -slack <= low and high <= 1 + slack:
         return
@@ -269,7 +261,7 @@ def _expect_unit_range(name: str, values: np.ndarray, slack: float) -> None:
 def _read_views(
     viewmats: Array | None, Ks: Array | None, images: Array | None, shape: Sequence[int] | None
 ) -> tuple[Cameras, np.ndarray | None]:
-    """Read the cameras and ``images [v,h,w,3]``, each checked by itself."""
+    """Return the cameras and ``images [v,h,w,3]``, each checked alone."""
     if viewmats is None or Ks is None:
         raise SceneError("viewmats" if viewmats is None else "Ks", "expected one matrix for each view, found none")
     photos = None if images is None else _to_numpy("images", images)
@@ -289,7 +281,15 @@ def _read_views(
         check_camera("Ks", str(view), np.eye(4), K)
         check_size("Ks", str(view), K, (width, height))
     cameras = Cameras(poses, intrinsics, width, height)
-    return cameras, None if photos is None else _read_images(photos, cameras)
+    if photos is None:
+        return cameras, None
+    expected = (views, height, width, 3)
+    if photos.shape[-4:] != expected or photos.size != np.prod(expected):
+        raise _image_error(photos, str(list(expected)))
+    if not np.isfinite(photos).all():
+        raise SceneError("images", "expected finite numbers, found NaN or inf")
+    _expect_unit_range("images", photos, _TOLERANCE)
+    return cameras, to_float32(photos.reshape(expected)).clip(0, 1)
 
 
 def _matrices(name: str, values: Any, shapes: Sequence[tuple[int, int]], views: int) -> np.ndarray:
@@ -310,36 +310,23 @@ def _view_shape(shape: Sequence[int] | None, photos: np.ndarray | None) -> tuple
         raise SceneError("shape", "expected the number of views, their height and width, found neither it nor images")
     else:
         if photos.ndim < 4 or photos.shape[-1] != 3:
-            raise SceneError("images", *_image_problem(photos, "[V, H, W, 3]"))
+            raise _image_error(photos, "[V, H, W, 3]")
         views, height, width = photos.shape[-4:-1]
     check_pixels("shape", width, height)
     return views, height, width
 
 
-def _image_problem(photos: np.ndarray, expected: str) -> tuple[str, str]:
-    """Say what is wrong with the shape of images; with the remedy where channels come first."""
+def _image_error(photos: np.ndarray, expected: str) -> SceneError:
+    """Return the error for images of another shape, with a remedy."""
     first = photos.ndim >= 4 and photos.shape[-3] == 3 != photos.shape[-1]
     remedy = "channels come first: pass images.permute(0, 2, 3, 1)" if first else "resize them to the model's input"
-    return f"expected shape {expected}, found {list(photos.shape)}", remedy
-
-
-def _read_images(photos: np.ndarray, cameras: Cameras) -> np.ndarray:
-    expected = (len(cameras), cameras.height, cameras.width, 3)
-    if photos.shape[-4:] != expected or photos.size != np.prod(expected):
-        raise SceneError("images", *_image_problem(photos, str(list(expected))))
-    if not np.isfinite(photos).all():
-        raise SceneError("images", "expected finite numbers, found NaN or inf")
-    _expect_unit_range("images", photos, _TOLERANCE)
-    return to_float32(photos.reshape(expected)).clip(0, 1)
+    return SceneError("images", f"expected shape {expected}, found {list(photos.shape)}", remedy)
 
 
 def _check_pixels(
     gaussians: Gaussians, cameras: Cameras, valid: np.ndarray, names: tuple[str, ...]
 ) -> tuple[Cameras, list[str]]:
-    """Check that the Gaussians project into their own pixels, or move the cameras a little; with a note.
-
-    Others are refused in the words of what would make them right.
-    """
+    """Check that Gaussians project into their own pixels; return cameras, moved a little, and notes."""
     pairs = sample_pixels(gaussians, cameras, valid)
     alignment = check_pairs(pairs, cameras)
     if alignment.ok:
@@ -349,9 +336,7 @@ def _check_pixels(
         return cameras, [text] if corners else []
     for poses in other_conventions(cameras.viewmats, W2C_OPENCV):
         if check_pairs(pairs, replace(cameras, viewmats=poses.viewmats)).ok:
-            problem = "expected world-to-camera matrices with OpenCV axes, found that the means project into their own"
-            problem += f" pixels when the matrices are read as {poses.description}"
-            raise SceneError("viewmats", problem, _REMEDIES[poses.convention])
+            raise _convention_error(poses.convention, poses.description, "the means project into their own pixels")
     factors = np.array([cameras.width, cameras.height]) / np.maximum(2 * cameras.Ks[0, :2, 2], 1e-6)
     scaled = cameras.Ks * np.array([*factors, 1])[:, None]
     if check_pairs(pairs, replace(cameras, Ks=scaled)).ok:
@@ -366,7 +351,7 @@ def _check_pixels(
 
 
 def _check_rotations(scene: Scene) -> None:
-    """Refuse rotations that follow the surface far better when they are read in another way."""
+    """Refuse rotations that follow the surface far better in another convention."""
     choice, note = choose_rotations(scene)
     if choice == "wxyz":
         return
@@ -376,9 +361,14 @@ def _check_rotations(scene: Scene) -> None:
 
 
 def _check_seen(gaussians: Gaussians, valid: np.ndarray, cameras: Cameras, images: np.ndarray | None) -> list[str]:
-    """Refuse poses under which the cameras see the Gaussians only when read in another way; and notes."""
+    """Refuse poses that see the Gaussians only in another convention; return notes."""
     poses, check, note = choose_poses(gaussians, valid, cameras, images, W2C_OPENCV)
     if poses is not None:
-        problem = f"expected world-to-camera matrices with OpenCV axes, found that {check.description} when the"
-        raise SceneError("viewmats", f"{problem} matrices are read as {poses.description}", _REMEDIES[poses.convention])
+        raise _convention_error(poses.convention, poses.description, check.description)
     return [text for text in (note, None if check.ok else check.description) if text]
+
+
+def _convention_error(convention: Convention, description: str, fact: str) -> SceneError:
+    """Return the error for view matrices of another convention, with a remedy."""
+    problem = f"expected world-to-camera matrices with OpenCV axes, found that {fact} when the matrices are read as"
+    return SceneError("viewmats", f"{problem} {description}", _REMEDIES[convention])

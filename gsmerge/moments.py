@@ -20,27 +20,17 @@ ROWS_PER_TASK = 4096
 
 @dataclass(frozen=True)
 class Members:
-    """The scene's Gaussians as the kernels want them: contiguous float32 arrays.
+    """Gaussians of a scene as contiguous float32 arrays for the kernels."""
 
-    Args:
-        means: ``[n,3]``.
-        quats: ``[n,4]`` wxyz.
-        scales: ``[n,3]``.
-        opacities: ``[n]``.
-        sh0: ``[n,1,3]``.
-        shN: ``[n,k-1,3]``, apart from the others: of degree 4 it is most of a scene, and only pooling reads it.
-        footprints: ``[n]`` size of one pixel of the own view at the member's depth, world units.
-        pixels: ``[n]`` int64, the pixel (view-major, row-major over all views) that a member belongs to, -1 for none;
-            None: one member per pixel, in order.
-    """
-
-    means: np.ndarray
-    quats: np.ndarray
-    scales: np.ndarray
-    opacities: np.ndarray
-    sh0: np.ndarray
-    shN: np.ndarray
-    footprints: np.ndarray
+    means: np.ndarray  # [n,3]
+    quats: np.ndarray  # [n,4] wxyz
+    scales: np.ndarray  # [n,3]
+    opacities: np.ndarray  # [n]
+    sh0: np.ndarray  # [n,1,3]
+    shN: np.ndarray  # [n,k-1,3], separate: most of a scene of degree 4, read by pooling alone
+    footprints: np.ndarray  # [n] size of the own view's pixel at the member's depth, world units
+    # [n] int64, the pixel (view-major, row-major over all views) that a member belongs to, -1 for
+    # none; None: one member per pixel, in order
     pixels: np.ndarray | None = None
 
 
@@ -49,7 +39,7 @@ def _array(values: np.ndarray) -> np.ndarray:
 
 
 def scene_members(scene: Scene) -> Members:
-    """The members of a canonical scene, with the pixel footprint of each in its own view."""
+    """Return the members of a canonical aligned scene, with pixel footprints in their own views."""
     g, cameras = scene.gaussians, scene.cameras
     means = _array(g.means)
     footprints = np.empty(len(g), np.float32)
@@ -67,13 +57,7 @@ def scene_members(scene: Scene) -> Members:
 
 
 def unaligned_members(scene: Scene, pixels: np.ndarray) -> Members:
-    """The members of a canonical scene without an order, by the pixel that each belongs to.
-
-    Args:
-        scene: n Gaussians and their views.
-        pixels: ``[n]`` int64, see :class:`Members`. What belongs to no pixel is taken to be seen by the nearest
-            camera.
-    """
+    """Return the members of an unaligned scene by pixel ``[n]`` int64; without one, the nearest camera counts."""
     means, cameras = _array(scene.gaussians.means), scene.cameras
     focals = np.sqrt(np.abs(cameras.Ks[:, 0, 0] * cameras.Ks[:, 1, 1])).astype(np.float64)
     thirds = cameras.viewmats[:, 2].astype(np.float64)
@@ -90,15 +74,16 @@ def unaligned_members(scene: Scene, pixels: np.ndarray) -> Members:
 
 
 def gaussian_members(g: Gaussians, footprints: np.ndarray, pixels: np.ndarray | None = None) -> Members:
-    """Gaussians as arrays, with their footprints and pixels."""
-    means, quats, scales, opacities, sh0, shN = map(_array, (g.means, g.quats, g.scales, g.opacities, g.sh0, g.shN))
-    return Members(means, quats, scales, opacities, sh0, shN, footprints, pixels)
+    """Return Gaussians as members with given footprints and pixels."""
+    return Members(**{name: _array(column) for name, column in vars(g).items()}, footprints=footprints, pixels=pixels)
 
 
 @dataclass(frozen=True)
 class Moments:
-    """Pooled moments of g groups: ``means [g,3]``, ``covars [g,3,3]``, ``weights``, ``masses``, ``extinctions``,
-    ``footprints [g]`` and ``sh [g,k,3]``; numpy, float64 except for float32 sh. See :class:`FeatureGaussians`.
+    """Pooled moments of g groups, float64 except for float32 sh.
+
+    ``means [g,3]``, ``covars [g,3,3]``, ``weights``, ``masses``, ``extinctions``, ``footprints
+    [g]`` and ``sh [g,k,3]``, see :class:`FeatureGaussians`.
     """
 
     means: np.ndarray
@@ -111,15 +96,12 @@ class Moments:
 
 
 def pool_members(members: Members, starts: np.ndarray, ids: np.ndarray, rule: Rule = "depth") -> Moments:
-    """Moments of every group of members: opacity weights, total covariance, winsorised members.
+    """Pool every group of members into its moments: opacity weights, total covariance, winsorised members.
 
-    Args:
-        members: The scene's Gaussians.
-        starts: ``[g+1]`` int64 into ``ids``.
-        ids: ``[m]`` int32 rows of ``members``.
-        rule: ``"depth"``: the members' own covariances are added to the spread of their means, and the optical
-            depth is what they have together. ``"paper"``: the paper's moment matching (eq. teacher_mean,
-            teacher_cov), which states no opacity: the members' mean.
+    ``ids [m]`` int32 are rows of ``members``, ``starts [g+1]`` int64 point into them. ``rule``
+    ``"depth"``: members' own covariances are added to the spread of their means, and their
+    integrated optical depths add. ``"paper"``: the paper's moment matching (eq. teacher_mean,
+    teacher_cov), which states no opacity: the members' mean.
     """
     num_groups = len(starts) - 1
     geometry = np.zeros((num_groups, 13))
@@ -143,7 +125,7 @@ def pool_members(members: Members, starts: np.ndarray, ids: np.ndarray, rule: Ru
 
 
 def principal_axes(covars: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Standard deviations ``[g,3]`` (rising) and unit quaternions ``[g,4]`` of covariances ``[g,3,3]``."""
+    """Return standard deviations ``[g,3]``, rising, and unit quaternions ``[g,4]`` of covariances ``[g,3,3]``."""
     covars = np.ascontiguousarray(covars, dtype=np.float64)
     scales, quats = np.empty((len(covars), 3)), np.empty((len(covars), 4))
 
@@ -156,7 +138,7 @@ def principal_axes(covars: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def to_gaussians(covars: np.ndarray, extinctions: np.ndarray, means: np.ndarray, sh: np.ndarray) -> Gaussians:
-    """Gaussians of given moments; opacity from the conserved optical depth over the disc."""
+    """Return Gaussians of given moments; opacity comes from the conserved optical depth over the disc."""
     scales, quats = principal_axes(covars)
     opacities = 1 - np.exp(-extinctions / (scales[:, 1] * scales[:, 2]))
     return Gaussians(
@@ -170,7 +152,7 @@ def to_gaussians(covars: np.ndarray, extinctions: np.ndarray, means: np.ndarray,
 
 
 def feature_to_gaussians(features: FeatureGaussians) -> Gaussians:
-    """One Gaussian per Feature Gaussian (K = 1)."""
+    """Decode every Feature Gaussian into one Gaussian (K = 1)."""
     return to_gaussians(
         features.covars,
         features.extinctions.astype(np.float64) * features.gains,

@@ -129,13 +129,7 @@ class CompactOptions:
         return flat
 
     def with_settings(self, settings: Mapping[str, Any]) -> CompactOptions:
-        """Change some settings, by flat name (``k=2, superpixels="1%"``).
-
-        A recipe changes all that belongs to it, except for what is set here besides.
-
-        Raises:
-            ValueError: If a name is unknown.
-        """
+        """Change settings by flat name (``k=2``), on top of a recipe's; raise ValueError for unknown names."""
         changes: dict[str, Any] = {}
         settings = {**RECIPES.get(str(settings.get("recipe")), {}), **settings}
         for f in fields(self):

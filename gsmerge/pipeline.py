@@ -63,13 +63,13 @@ def compact(
 
 @record_part()
 def build_scored(method: Build, prepared: Prepared, plan: Plan, count: int | None) -> Candidate:
-    """Build so many Gaussians, cleaned up if that was asked for, and score them, with a record of their own."""
+    """Build the given number of Gaussians, clean them as asked, and score them, with their own record."""
     fitted = clean_to_count(partial(method, prepared, plan), count, plan.clean, prepared)
     return score(count, fitted, prepared, plan)
 
 
 def build(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
-    """Go from superpixels to ``count`` fitted Gaussians, canonical; None: as many as ``superpixels`` and K give."""
+    """Build ``count`` fitted canonical Gaussians; None: as many as ``superpixels`` and K give."""
     decoded = keep_all(prepared.scene, count)
     if decoded is None:
         merged = merge_views(prepared, plan, count)
@@ -78,7 +78,7 @@ def build(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
 
 
 def merge_views(prepared: Prepared, plan: Plan, count: int | None) -> MergedViews:
-    """Merge superpixels across views: the half of the way that encoding and views in batches share."""
+    """Merge superpixels across views, the half of the pipeline that encoding and views in batches share."""
     scene = prepared.scene
     segmentation = segment_scene(scene, plan.superpixels, count)
     members = assign(scene, segmentation.groups)

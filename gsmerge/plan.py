@@ -1,7 +1,7 @@
-"""Facts and options -> decisions: the one place that reads "auto", effort, device, budget, recipe and checkpoint names.
+"""The plan of a run: the one place that reads "auto", effort, device, budget, recipe and checkpoint names.
 
-:func:`make_plan` settles every choice once. Each stage is handed its own part of the plan, and no stage knows the
-options of another.
+:func:`make_plan` settles every choice once. Each stage is handed its own part of the plan, and no
+stage knows the options of another.
 """
 
 from __future__ import annotations
@@ -39,25 +39,15 @@ MOST_STEPS = 2.0  # times as many
 
 @dataclass(frozen=True)
 class Effort:
-    """What an effort means to the stages.
+    """Meaning of an effort for the stages."""
 
-    Args:
-        steps: Of the full fit.
-        rectangles: Of ``rdseg``, see :class:`gsmerge.SegmentOptions`.
-        early_sweeps: The same.
-        merges: Whether Gaussians of different views are merged.
-        networks: Whether ``checkpoint="auto"`` may load networks.
-        prunes: Whether Gaussians that no photo shows are left out where nothing is fitted.
-        large_photos: Whether ``photo_scale="auto"`` may look at larger photos.
-    """
-
-    steps: int
-    rectangles: float
-    early_sweeps: int
-    merges: bool = True
-    networks: bool = True
-    prunes: bool = True
-    large_photos: bool = True
+    steps: int  # Steps of the full fit
+    rectangles: float  # Rectangles per superpixel of `rdseg`
+    early_sweeps: int  # Sweeps of `rdseg` before rectangles are merged
+    merges: bool = True  # Whether Gaussians of different views are merged
+    networks: bool = True  # Whether `checkpoint="auto"` may load networks
+    prunes: bool = True  # Whether Gaussians in no photo are left out where nothing is fitted
+    large_photos: bool = True  # Whether `photo_scale="auto"` may look at larger photos
 
 
 EFFORTS = {
@@ -70,79 +60,56 @@ EFFORTS = {
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Everything that was decided before the first superpixel is cut.
+    """Decisions that are made before the first superpixel is cut."""
 
-    Args:
-        superpixels: How each view is cut, and into how many.
-        networks: What corrects the analytic stages: networks, None for nothing, or both in turn where they compete.
-        match: Merging across views.
-        decode: Gaussians per group.
-        fit: Fit to the photos.
-        clean: What is left out of the result.
-        unseen: Canonical Gaussians in place of those that no view sees, which every result gets; None without any.
-        target_psnr: PSNR (dB) that the input photos have to reach; None: none was asked for.
-        max_drop: dB that may be lost against the best of the scene's curve; None: none was asked for.
-        auto_count: Whether the scene's own curve decides the number of Gaussians.
-        levels: Levels of detail.
-        scored_views: Given views that input and result are scored on.
-        backend: Where the fit and the scores run.
-        seed: Everything random depends on it alone.
-        checkpoint: Where the networks come from; None without any.
-        settings: All settings by flat name, for reports.
-    """
-
-    superpixels: SuperpixelPlan
-    networks: tuple[Networks | None, ...]
-    match: MatchOptions
-    decode: DecodeOptions
-    fit: FitOptions
-    clean: CleanOptions
-    unseen: Gaussians | None
-    target_psnr: float | None
-    max_drop: float | None
-    auto_count: bool
-    levels: int
-    scored_views: tuple[int, ...]
-    backend: FitBackend[Any]
-    seed: int
-    checkpoint: Checkpoint | None
-    settings: dict[str, Any]
+    superpixels: SuperpixelPlan  # How each view is cut, and into how many
+    networks: tuple[Networks | None, ...]  # Networks, None for the analytic start, or both
+    match: MatchOptions  # Merging across views
+    decode: DecodeOptions  # Gaussians per group
+    fit: FitOptions  # Fit to the photos
+    clean: CleanOptions  # What is left out of the result
+    unseen: Gaussians | None  # Merged canonical Gaussians that no view sees; None without any
+    target_psnr: float | None  # PSNR (dB) that the input photos have to reach; None: no target
+    max_drop: float | None  # Allowed loss in dB against the best of the curve; None: no target
+    auto_count: bool  # Whether the scene's own curve decides the number of Gaussians
+    levels: int  # Levels of detail
+    scored_views: tuple[int, ...]  # Given views that input and result are scored on
+    backend: FitBackend[Any]  # Where the fit and the scores run
+    seed: int  # Everything random depends on it alone
+    checkpoint: Checkpoint | None  # Where the networks come from; None without any
+    settings: dict[str, Any]  # All settings by flat name, for reports
 
     @property
     def weakens(self) -> bool:
-        """Whether groups that other views see through begin fainter, as a long fit follows."""
+        """Whether groups that other views see through start fainter, because a long fit follows."""
         return self.superpixels.start_share < 1
 
     @property
     def limits(self) -> CountLimits:
-        """What is known of the number of Gaussians."""
+        """Limits of the number of Gaussians."""
         return self.superpixels.limits
 
     def with_fixed_cameras(self) -> Plan:
-        """Keep the cameras where they are during the fit."""
+        """Return the plan with cameras that the fit does not move."""
         return replace(self, fit=replace(self.fit, move_cameras=False))
 
     def with_fit(self, fit: FitOptions, *, start_share: float = 1.0) -> Plan:
-        """Replace the fit, and the share of the Gaussians that it begins with."""
+        """Return the plan with another fit and another share of the Gaussians to start from."""
         return replace(self, fit=fit, superpixels=replace(self.superpixels, start_share=start_share))
 
 
 def make_plan(prepared: Prepared, options: CompactOptions) -> Plan:
-    """Decide everything that the options leave open.
-
-    Notes say what was chosen for the scene, and what was asked for that it does not have.
-
-    Raises:
-        SceneError: If a checkpoint is required and cannot be used.
-        UsageError: If the settings ask for what the scene, or the checkpoint, does not have.
-    """
+    """Decide everything that the options leave open; raise UsageError if scene or checkpoint cannot do it."""
     given, scene, effort = prepared.given, prepared.scene, EFFORTS[options.effort]
     _check_photos(given, options)
     own = options.method == "gsmerge"  # baselines learn nothing
     with stage("prepare"):
         checkpoint = _load_networks(options, given) if own else None
         segment = _resolve_superpixels(options.segment, scene, effort)
-        clean_options = _resolve_clean(options.clean, prepared)
+        clean_options = options.clean
+        if clean_options.drop_sky and not prepared.photo_views:
+            note("drop_sky: no photo is used that could say where the sky is, so it stays")
+            clean_options = replace(clean_options, drop_sky=False)
         unseen, num_input = _merge_unseen(prepared, options, segment, clean_options)
         limits = count_limits(
             scene, segment, options.decode, options.budget,
@@ -188,14 +155,11 @@ def _check_photos(scene: Scene, options: CompactOptions) -> None:
 
 
 def choose_networks(options: CompactOptions, *, photos: bool, aligned: bool = True) -> str:
-    """Name the checkpoint to load: as asked, or the shipped one where it improves results (docs/internals/networks.md).
+    """Return the name of the checkpoint to load: as asked, or the shipped one where it improves results.
 
-    That is where no fit follows, or a short one; not where time counts most.
-
-    Args:
-        options: All settings.
-        photos: Whether there are any to fit to.
-        aligned: Whether there is one Gaussian per pixel, which is what the shipped networks learnt from.
+    That is where no fit follows, or a short one, on scenes with one Gaussian per pixel
+    (``aligned``), which the shipped networks learnt from (docs/internals/networks.md). ``photos``:
+    whether there are any to fit to.
     """
     if options.checkpoint != "auto":
         return options.checkpoint
@@ -205,13 +169,13 @@ def choose_networks(options: CompactOptions, *, photos: bool, aligned: bool = Tr
 
 
 def resolved_settings(options: CompactOptions, *, photos: bool) -> dict[str, Any]:
-    """Return all settings by flat name, with the checkpoint and the matching that are used where none was asked for."""
+    """Return all settings by flat name, with checkpoint and matching resolved."""
     match = options.match.match or ("overlap" if EFFORTS[options.effort].merges else "none")
     return options.to_dict() | {"checkpoint": choose_networks(options, photos=photos), "match": match}
 
 
 def _load_networks(options: CompactOptions, scene: Scene) -> Checkpoint | None:
-    """Load the checkpoint to use, which gives what the options ask for; None for the analytic stages alone."""
+    """Load the checkpoint to use, and check that it fits the options; None for the analytic stages alone."""
     name = choose_networks(options, photos=scene.images is not None, aligned=scene.aligned)
     if name == "none":  # torch is imported only where there are networks
         return None
@@ -242,7 +206,7 @@ def require_children(name: str, count: int, checkpoint: Checkpoint | None) -> No
 
 
 def _resolve_superpixels(options: SegmentOptions, scene: Scene, effort: Effort) -> SegmentOptions:
-    """Fill in what effort and scene decide; a note says why."""
+    """Fill in the options of superpixels that effort and scene decide; a note says why."""
     if options.superpixels == AUTO_SHARE:
         share, why = measured_share(scene)
         text = SHARE if share is None else f"{100 * share:.2g}%"
@@ -253,22 +217,10 @@ def _resolve_superpixels(options: SegmentOptions, scene: Scene, effort: Effort) 
     return replace(options, rectangles=rectangles, early_sweeps=sweeps)
 
 
-def _resolve_clean(options: CleanOptions, prepared: Prepared) -> CleanOptions:
-    """Keep the sky where no photo is used that could say where it is."""
-    if options.drop_sky and not prepared.photo_views:
-        note("drop_sky: no photo is used that could say where the sky is, so it stays")
-        return replace(options, drop_sky=False)
-    return options
-
-
 def _merge_unseen(
     prepared: Prepared, options: CompactOptions, segment: SegmentOptions, clean_options: CleanOptions
 ) -> tuple[Gaussians | None, int | None]:
-    """Merge what no view sees at the rate of the rest, and clean it up.
-
-    Returns:
-        The Gaussians, None without any; and the number that shares of a budget refer to, None for the scene's own.
-    """
+    """Merge and clean the unseen Gaussians; return them and the number that shares of a budget refer to, or None."""
     scene, unseen = prepared.scene, prepared.unseen
     num_input = prepared.given.num_gaussians if len(scene) < len(prepared.given) else None
     if unseen is None:
@@ -285,7 +237,7 @@ def _merge_unseen(
 
 
 def resolve_fit(options: CompactOptions) -> FitOptions:
-    """Fill in what effort decides of a fit: its steps, and whether Gaussians that no photo shows are left out."""
+    """Fill in the steps of the fit by effort, and whether to leave out Gaussians that no photo shows."""
     fit, effort = options.fit, EFFORTS[options.effort]
     steps = effort.steps if fit.fit_steps is None else fit.fit_steps
     prunes = fit.fit != "none" or effort.prunes
@@ -293,10 +245,7 @@ def resolve_fit(options: CompactOptions) -> FitOptions:
 
 
 def steps_for(options: CompactOptions, num_gaussians: int, scene: Scene) -> int:
-    """Return the steps of the full fit: as given, or more for more Gaussians in the pixels of all views.
-
-    They grow with the square root of the share from ``USUAL_SHARE`` on.
-    """
+    """Return the steps of the full fit: as given, or more with the root of the Gaussians per pixel."""
     if options.fit.fit_steps is not None:
         return options.fit.fit_steps
     steps = EFFORTS[options.effort].steps
@@ -309,7 +258,7 @@ def steps_for(options: CompactOptions, num_gaussians: int, scene: Scene) -> int:
 def _resolve_fit_to(
     prepared: Prepared, options: CompactOptions, limits: CountLimits, backend: FitBackend[Any]
 ) -> FitOptions:
-    """Fill in what effort, scene and device decide of the fit."""
+    """Fill in the options of the fit that effort, scene and device decide."""
     scene = prepared.scene
     if scene.images is None or not prepared.photo_views:
         options = replace(options, fit=replace(options.fit, fit="none"))
@@ -326,7 +275,7 @@ def _resolve_fit_to(
 
 
 def _choose_scored_views(prepared: Prepared, options: CompactOptions) -> tuple[int, ...]:
-    """Choose given views whose photos show the scene; more of them where a quality is asked for, which they decide."""
+    """Choose views, whose photos show the scene, for scoring; more where they decide a quality search."""
     views = prepared.photo_views or range(len(prepared.scene))
     candidates = [view for view, place in enumerate(prepared.repeated) if place in views]
     choose_some = report_views if options.budget.target_psnr is None else scored_views

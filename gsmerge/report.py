@@ -1,4 +1,4 @@
-"""What a run did, as a JSON document with a stable schema and as lines for people."""
+"""Reports of a run: a JSON document with a stable schema, and lines for people."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SCHEMA_VERSION = 1
 
 
 def file_sha256(path: Path) -> str:
-    """Hexadecimal SHA-256 of a file."""
+    """Return the hexadecimal SHA-256 of a file."""
     digest = hashlib.sha256()
     with open(path, "rb") as file:
         while block := file.read(1 << 20):
@@ -27,7 +27,7 @@ def file_sha256(path: Path) -> str:
 
 
 def document_head() -> dict[str, Any]:
-    """What every JSON document starts with."""
+    """Return the first entries of every JSON document."""
     return {"schema_version": SCHEMA_VERSION, "tool": {"name": "gsmerge", "version": __version__}}
 
 
@@ -45,17 +45,14 @@ def report_document(
     written_at: Mapping[Path, Path] | None = None,
     cameras_path: Path | None = None,
 ) -> dict[str, Any]:
-    """The report of one ``compact`` as plain JSON types.
+    """Return the report of one ``compact`` as plain JSON types.
 
-    Args:
-        seconds_before: Wall time by name of what came before the report's stages (imports, reading).
-        seconds_after: The same for what came after them (writing).
-        coarser: File and :class:`gsmerge.CompactReport` of further levels of detail.
-        recognised: What is known of the input besides path, bytes and count (layout, views, ...).
-        notes: Of the reader; the report's own follow.
-        hashed: Also hash the input, which takes time on large files.
-        written_at: Where files are until they are renamed to their names.
-        cameras_path: The file of the views for viewers; None: none was written.
+    ``seconds_before`` and ``seconds_after``: wall time by name before the report's stages (imports,
+    reading) and after them (writing). ``coarser``: file and report of each further level of detail.
+    ``recognised``: facts about the input besides path, bytes and count. ``notes``: of the reader,
+    before the report's own. ``hashed``: also hash the input, which takes time on large files.
+    ``written_at``: temporary paths of files that are not renamed yet. ``cameras_path``: the file of
+    the views for viewers, if any.
 
     Returns:
         ``schema_version`` 1, within which keys are only ever added. ``unmet``: why a target is not met, or null.
@@ -99,12 +96,12 @@ def _file_facts(path: Path, report: CompactReport, at: Mapping[Path, Path]) -> d
 
 
 def to_json(document: Mapping[str, Any]) -> str:
-    """Strict JSON, indented, with a closing newline; infinities become null."""
+    """Format a document as strict, indented JSON with a closing newline; infinities become null."""
     return json.dumps(finite(document), indent=2, allow_nan=False) + "\n"
 
 
 def finite(value: Any) -> Any:
-    """Plain JSON types with None in place of infinities and NaN."""
+    """Return plain JSON types with None in place of infinities and NaN."""
     if isinstance(value, Mapping):
         return {str(key): finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -115,24 +112,19 @@ def finite(value: Any) -> Any:
 
 
 def csv_cell(value: Any) -> Any:
-    """A value for a table of comma-separated values; text that spreadsheets would run as a formula gets a quote before
-    it. Empty for None.
-    """
+    """Return a value for a CSV table: empty for None, a quote before text that a spreadsheet would run."""
     if value is None:
         return ""
     return f"'{value}" if isinstance(value, str) and value[:1] in ("=", "+", "-", "@", "\t", "\r", "\n") else value
 
 
 def summary_lines(document: Mapping[str, Any]) -> list[str]:
-    """What ``compact`` ends with: a line for the result, one for each further level, and the curve if measured."""
+    """Return the closing lines of ``compact``: the result, each further level, and the curve if measured."""
     return [summary_line(document), *level_lines(document), *curve_lines(document["choices"].get("curve", []))]
 
 
 def result_table(document: Mapping[str, Any], next_step: str | None = None) -> list[str]:
-    """What ``compact`` ends with in a terminal: the same as :func:`summary_lines` as a table of at most 80 columns.
-
-    ``next_step``: a command to go on with; None for none.
-    """
+    """Return the closing table of ``compact`` in a terminal, at most 80 columns wide, with a ``next_step`` if any."""
     before, after, psnr = document["input"], document["output"], document["psnr_input_views"]
     ratio = f"{100 * document['ratio']:.2f} %"
     rows = [
@@ -154,7 +146,7 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None) -> l
 
 
 def level_lines(document: Mapping[str, Any]) -> list[str]:
-    """A line for each further level of detail."""
+    """Return a line for each further level of detail."""
     return [
         f"{level['path']}: {level['num_gaussians']:,} Gaussians, {human_bytes(level['bytes'])}"
         + (f"; input views {level['psnr_input_views']:.2f} dB" if level["psnr_input_views"] is not None else "")
@@ -164,7 +156,7 @@ def level_lines(document: Mapping[str, Any]) -> list[str]:
 
 
 def curve_lines(points: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The scene's curve as a small table: the quality of short fits on held-out parts of the photos."""
+    """Return the scene's curve as a small table: quality of short fits on held-out parts of the photos."""
     if not points:
         return []
     perceptual = points[0]["lpips"] is not None
@@ -177,7 +169,7 @@ def curve_lines(points: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def summary_line(document: Mapping[str, Any]) -> str:
-    """The line of the result: counts, ratio, bytes, PSNR, seconds per stage, the cameras beside it."""
+    """Return the line of the result: counts, ratio, bytes, PSNR, seconds per stage, the cameras beside it."""
     before, after = document["input"], document["output"]
     psnr, path = document["psnr_input_views"], document.get("viewer_cameras")
     cameras = f"; cameras for viewers in {os.path.basename(path)}" if path else ""
@@ -194,12 +186,12 @@ def summary_line(document: Mapping[str, Any]) -> str:
 
 
 def seconds_document(seconds: Mapping[str, float]) -> dict[str, Any]:
-    """Wall time by stage and in all, as every report has it."""
+    """Return wall time by stage and in all, as every report has it."""
     total = round(sum(seconds.values()), 4)
     return {"seconds": {name: round(value, 4) for name, value in seconds.items()}, "total_seconds": total}
 
 
 def seconds_line(document: Mapping[str, Any]) -> str:
-    """``2.3 s (read 0.70, ...)`` of a report."""
+    """Return ``2.3 s (read 0.70, ...)`` of a report."""
     stages = ", ".join(f"{name} {value:.2f}" for name, value in document["seconds"].items())
     return f"{document['total_seconds']:.1f} s ({stages})"

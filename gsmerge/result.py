@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class CompactReport:
-    """What a run did.
+    """Report of a run.
 
     Args:
         num_input: Gaussians in the scene.
@@ -30,8 +30,8 @@ class CompactReport:
         psnr_before: Mean PSNR (dB) of the input views rendered from the input, of many views some, and in a fixed
             quarter of each unless a quality was asked for; None without photos. :func:`gsmerge.evaluate` is exact.
         psnr_after: The same from the result.
-        choices: What the stages decided (count, curve, merge, scores, clusters, fit).
-        notes: Warnings about the input and what was adapted, one sentence each.
+        choices: Decisions of the stages (count, curve, merge, scores, clusters, fit).
+        notes: Warnings about the input and adaptations to it, one sentence each.
         options: All settings by flat name.
         peak_memory_bytes: Largest resident memory of the process so far.
         unmet: Why a target that was asked for is not met, and how far the result got; None if it is.
@@ -67,7 +67,7 @@ class CompactResult:
     coarser: tuple[CompactResult, ...] = ()
 
     def to(self, device: torch.device | str | None) -> CompactResult:
-        """Return the same result with tensors on a device; None: as it is, with NumPy arrays."""
+        """Return the same result with tensors on a device; None leaves NumPy arrays."""
         if device is None:
             return self
         coarser = tuple(one.to(device) for one in self.coarser)
@@ -76,27 +76,18 @@ class CompactResult:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """Gaussians of one count, scored.
+    """Gaussians built for one count, with their score."""
 
-    Args:
-        count: Gaussians that were asked for; None: as many as ``superpixels`` and K give.
-        fitted: What was built, canonical.
-        gaussians: The same in the world, with those that no view sees.
-        cameras: The given views as the Gaussians were made from them, in the world.
-        psnr: Mean PSNR (dB) of the scored views; None without photos.
-        record: Seconds, choices and notes of building and scoring it.
-    """
-
-    count: int | None
-    fitted: Fitted
-    gaussians: Gaussians
-    cameras: Cameras
-    psnr: float | None
-    record: Record
+    count: int | None  # Gaussians that were asked for; None: as many as `superpixels` and K give
+    fitted: Fitted  # Fitted canonical Gaussians
+    gaussians: Gaussians  # The same in the world, with those that no view sees
+    cameras: Cameras  # The given views as the Gaussians were made from them, in the world
+    psnr: float | None  # Mean PSNR (dB) of the scored views; None without photos
+    record: Record  # Seconds, choices and notes of building and scoring it
 
 
 def score(count: int | None, fitted: Fitted, prepared: Prepared, plan: Plan) -> Candidate:
-    """Bring canonical Gaussians into the world, with those that no view sees, and score them on the input photos."""
+    """Move canonical Gaussians into the world, add the unseen, and score them on the input photos."""
     gaussians, prepared = fitted.gaussians, prepared.with_cameras(fitted.cameras)
     if plan.unseen is not None:
         gaussians = Gaussians.concat([gaussians, plan.unseen])
@@ -124,10 +115,7 @@ def _note_moves(prepared: Prepared, cameras: Cameras, plan: Plan) -> None:
 
 
 def input_psnr(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> float:
-    """Measure the mean PSNR (dB) of the scored input photos, rendered from world-frame Gaussians.
-
-    In a quarter of every photo, or in the whole where a quality was asked for.
-    """
+    """Measure the mean PSNR (dB) of the scored photos, of a quarter of each unless a quality was asked for."""
     photos, near, quarter = scene_photos(prepared.given), NEAR * prepared.frame.unit, plan.target_psnr is None
 
     def score_on(backend: FitBackend[Any]) -> float:
@@ -143,17 +131,11 @@ def make_result(
     plan: Plan,
     search: Mapping[str, Any],
 ) -> CompactResult:
-    """Report the best candidate and its further levels of detail, with the input's PSNR beside their own.
+    """Report the best candidate and its coarser levels of detail, with the input's PSNR beside their own.
 
-    Args:
-        best: The finest level.
-        levels: Coarser ones.
-        prepared: The scene.
-        plan: What was decided.
-        search: What the search for the finest says for the report, see :meth:`gsmerge.search.CountSearch.facts`.
-
-    The input is scored last, when the kernels are compiled and memory is free again. The seconds, choices and notes of
-    the current record, of what came before the candidates, enter the report.
+    ``search`` are the facts of :meth:`gsmerge.search.CountSearch.facts`. The input is scored last,
+    when the kernels are compiled and memory is free again. The seconds, choices and notes of the
+    current record, which come before those of the candidates, enter the report.
     """
     before, run, seconds = None, current_record(), search["seconds"]
     if prepared.given.images is not None:
@@ -166,7 +148,8 @@ def make_result(
             *counts, dict(seconds), before, one.psnr, record.choices, record.notes, plan.settings, peak_memory()
         )
 
-    seconds = _add_seconds(run.seconds, seconds)
+    names = {**run.seconds, **seconds}
+    seconds = {name: run.seconds.get(name, 0.0) + seconds.get(name, 0.0) for name in names}
     if "input" in seconds:
         seconds["input"] = seconds.pop("input")  # the last stage, after those of the candidates
     main = report(best, seconds)
@@ -174,8 +157,3 @@ def make_result(
     main = replace(main, choices=choices, notes=notes, unmet=search["unmet"])
     coarser = tuple(CompactResult(one.gaussians, report(one, one.record.seconds), one.cameras) for one in levels)
     return CompactResult(best.gaussians, main, best.cameras, coarser)
-
-
-def _add_seconds(first: Mapping[str, float], second: Mapping[str, float]) -> dict[str, float]:
-    """Add two wall times of stages, by name."""
-    return {name: first.get(name, 0.0) + second.get(name, 0.0) for name in {**first, **second}}

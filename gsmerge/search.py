@@ -1,4 +1,4 @@
-"""How many Gaussians: the knee of the scene's own curve, a quality target, further levels of detail.
+"""Search for the number of Gaussians: the knee of the scene's curve, a quality target, levels of detail.
 
 A curve is measured by short fits, judged by parts of the photos that they left out.
 """
@@ -45,7 +45,7 @@ MAX_FACTOR = 4  # times the usual count is the most that a quality target may ta
 
 @dataclass(frozen=True)
 class CurvePoint:
-    """What a number of Gaussians reaches after a short fit, on parts of the photos that it was not fitted to."""
+    """Quality of a number of Gaussians after a short fit, on parts of the photos that were held out."""
 
     count: int  # Gaussians
     psnr: float  # dB
@@ -55,31 +55,22 @@ class CurvePoint:
 
 @dataclass(eq=False)
 class CountSearch:
-    """The counts to build, one after the other: one alone, or several until a quality is met.
+    """Search for the number of Gaussians: one count, or several until a quality is met."""
 
-    Args:
-        plan: Target and limits.
-        first: The count to begin with; None: as many as ``superpixels`` and K give.
-        candidates: What was built so far.
-    """
-
-    plan: Plan
-    first: int | None
-    candidates: list[Candidate] = field(default_factory=list)
+    plan: Plan  # Target and limits
+    first: int | None  # The count to begin with; None: as many as `superpixels` and K give
+    candidates: list[Candidate] = field(default_factory=list)  # Candidates built so far
 
     def __iter__(self) -> Iterator[int | None]:
         """Yield counts; each candidate is added before the next one is asked for."""
         yield self.first
         target, limits = self.plan.target_psnr, self.plan.limits
+        most = min(limits.max_count, MAX_FACTOR * limits.default)
         while target is not None and len(self.candidates) < MAX_RUNS:
-            count = next_count(self.tried, target, limits.min_count, self._max_count)
+            count = next_count(self.tried, target, limits.min_count, most)
             if count in self.tried:
                 return
             yield count
-
-    @property
-    def _max_count(self) -> int:
-        return min(self.plan.limits.max_count, MAX_FACTOR * self.plan.limits.default)
 
     @property
     def tried(self) -> dict[int, float]:
@@ -87,15 +78,17 @@ class CountSearch:
         return {one.count: one.psnr or 0.0 for one in self.candidates if one.count is not None}
 
     def add(self, candidate: Candidate) -> None:
-        """Take note of what was built for the last count."""
+        """Add the result of the last count."""
         self.candidates.append(candidate)
 
     @property
     def best(self) -> Candidate:
-        """The fewest Gaussians that reach the target; of all, those with the highest PSNR where none does."""
+        """Candidate with the fewest Gaussians that reaches the target, or the one with the highest PSNR."""
         if self.plan.target_psnr is None:
             return self.candidates[0]
-        chosen = best_count(self.tried, self.plan.target_psnr)
+        tried, target = self.tried, self.plan.target_psnr
+        reached = [count for count, psnr in tried.items() if psnr >= target]
+        chosen = min(reached) if reached else max(tried, key=lambda count: tried[count])
         return next(one for one in self.candidates if one.count == chosen)
 
     @property
@@ -107,33 +100,22 @@ class CountSearch:
         reached = f"the input views reach {psnr:.2f} dB with {count} Gaussians"
         return f"quality: {self.plan.target_psnr:g} dB was asked for, {reached}"
 
-    @property
-    def seconds(self) -> dict[str, float]:
-        """Wall time of all candidates, by stage."""
-        names = dict.fromkeys(name for one in self.candidates for name in one.record.seconds)
-        return {name: sum(one.record.seconds.get(name, 0.0) for one in self.candidates) for name in names}
-
     def facts(self) -> dict[str, Any]:
-        """Return what a report says of the search: ``seconds`` of all candidates, ``choices``, ``unmet``."""
+        """Return the search's part of a report: ``seconds`` of all candidates, ``choices``, ``unmet``."""
+        names = dict.fromkeys(name for one in self.candidates for name in one.record.seconds)
+        seconds = {name: sum(one.record.seconds.get(name, 0.0) for one in self.candidates) for name in names}
         choices: dict[str, Any] = {}
         if self.plan.target_psnr is not None:
             best, tried = self.best, tuple(self.tried.items())
             choices["search"] = {"count": best.count, "psnr": best.psnr, "met": self.unmet is None, "tried": tried}
-        return {"seconds": self.seconds, "choices": choices, "unmet": self.unmet}
+        return {"seconds": seconds, "choices": choices, "unmet": self.unmet}
 
 
 def search_count(prepared: Prepared, plan: Plan, build: Build) -> CountSearch:
-    """Begin a search for the number of Gaussians, with the scene's own curve where that decides.
-
-    Args:
-        prepared: The scene.
-        plan: Target and limits.
-        build: Builds a scene with so many Gaussians.
-    """
+    """Start a search for the number of Gaussians; ``build`` builds a scene with a given number."""
+    limits = plan.limits
     if plan.target_psnr is not None:
-        limits = plan.limits
-        most = min(limits.max_count, MAX_FACTOR * limits.default)
-        return CountSearch(plan, min(max(min(limits.default, most), limits.min_count), most))
+        return CountSearch(plan, min(max(limits.default, limits.min_count), limits.max_count))
     return CountSearch(plan, choose_count(prepared, plan, build))
 
 
@@ -186,7 +168,7 @@ def _point(count: int, gaussians: Gaussians, photos: Photos, weights: list[np.nd
 
 
 def _similarity(image: np.ndarray, photo: np.ndarray, mask: np.ndarray) -> float:
-    """SSIM of the held-out windows that lie inside the picture; of the whole where none does, 0 where none can."""
+    """Return SSIM over the held-out windows inside the picture; of the whole without any, 0 if too small."""
     if min(mask.shape) < WINDOW:
         return 0.0
     border = WINDOW // 2
@@ -194,7 +176,7 @@ def _similarity(image: np.ndarray, photo: np.ndarray, mask: np.ndarray) -> float
 
 
 def rungs(shares: Sequence[float], usual: int, least: int, most: int) -> list[int]:
-    """Rising counts at which a scene's curve is measured: shares of the usual one, all between least and most."""
+    """Return rising counts for measuring a curve: shares of the usual count, clipped to least and most."""
     return sorted({min(max(round(usual * share), least), most) for share in shares})
 
 
@@ -205,9 +187,10 @@ def level_counts(finest: int, plan: Plan) -> list[int]:
 
 
 def count_within(points: Sequence[CurvePoint], max_drop: float) -> int:
-    """The fewest Gaussians at which the curve lies at most ``max_drop`` dB below its best.
+    """Return the fewest Gaussians at which the curve lies at most ``max_drop`` dB below its best.
 
-    Between points, which come by rising count, the curve is a straight line over the logarithm of the count.
+    Between points, which come by rising count, the curve is a straight line over the logarithm of
+    the count.
     """
     if not points:
         raise ValueError("points: expected at least one, got none")
@@ -221,10 +204,11 @@ def count_within(points: Sequence[CurvePoint], max_drop: float) -> int:
 
 
 def curve_knee(points: Sequence[CurvePoint]) -> int:
-    """The count beyond which more Gaussians are not worth it, by PSNR and structure together.
+    """Return the count beyond which more Gaussians are not worth it, by PSNR and structure together.
 
-    The quality is PSNR + 40 SSIM, in dB. The knee is the last count up to which it grows by 0.15 dB per doubling, on
-    a straight line between the slopes that lie midway between the points, which come by rising count.
+    The quality is PSNR + 40 SSIM, in dB. The knee is the last count up to which it grows by 0.15 dB
+    per doubling, on a straight line between the slopes that lie midway between the points, which
+    come by rising count.
     """
     if not points:
         raise ValueError("points: expected at least one, got none")
@@ -244,22 +228,11 @@ def curve_knee(points: Sequence[CurvePoint]) -> int:
     return round(2 ** (middles[steep] + share * (middles[steep + 1] - middles[steep])))
 
 
-def best_count(tried: Mapping[int, float], target: float) -> int:
-    """Return the smallest count whose PSNR (dB) reaches the target; that of the highest PSNR where none does."""
-    reached = [count for count, psnr in tried.items() if psnr >= target]
-    return min(reached) if reached else max(tried, key=lambda count: tried[count])
-
-
 def next_count(tried: Mapping[int, float], target: float, least: int, most: int) -> int:
-    """Choose where to look next for the fewest Gaussians that reach a PSNR, within 15 %.
+    """Choose the next count to try for the fewest Gaussians that reach a PSNR, within 15 %.
 
-    A count that was tried already ends the search.
-
-    Args:
-        tried: PSNR (dB) of at least one count, taken to rise with the count.
-        target: PSNR (dB).
-        least: Smallest count.
-        most: Largest count.
+    ``tried`` has the PSNR (dB) of at least one count, taken to rise with the count. A count that
+    was tried already ends the search.
     """
     above = min((c for c, psnr in tried.items() if psnr >= target), default=None)
     below = max((c for c, psnr in tried.items() if psnr < target and (above is None or c < above)), default=None)

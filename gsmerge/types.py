@@ -35,30 +35,30 @@ def _expect(name: str, array: Array, shape: tuple[int | str, ...]) -> None:
 
 
 def as_array(values: Array) -> np.ndarray:
-    """A NumPy array of an array, or of a tensor of any device, without its gradient; without copying where possible."""
+    """Return an array or a tensor of any device as a NumPy array without gradient, copied only if needed."""
     return values.detach().cpu().numpy() if hasattr(values, "detach") else np.asarray(values)
 
 
 def as_tensor(values: Array, device: torch.device | str = "cpu") -> torch.Tensor:
-    """A tensor on a device of an array or a tensor; on the CPU it shares the array's memory."""
+    """Return an array or a tensor as a tensor on a device; on the CPU it shares the array's memory."""
     import torch
 
     return torch.as_tensor(values, device=device)
 
 
 def to_float32(values: np.ndarray) -> np.ndarray:
-    """An array rounded to float32; what is beyond its range becomes infinite."""
+    """Round an array to float32; numbers beyond its range become infinite."""
     with np.errstate(over="ignore"):
         return values.astype(np.float32)
 
 
 def like(values: np.ndarray, given: Array) -> Array:
-    """An array as what was given: an array, or a tensor on the same device."""
+    """Return an array in the kind of another: an array, or a tensor on the same device."""
     return as_tensor(values, given.device) if hasattr(given, "detach") else values
 
 
 def concat_rows(parts: Sequence[Array]) -> Array:
-    """Rows of arrays, or of tensors, one part after the other."""
+    """Concatenate rows of arrays or of tensors."""
     if all(isinstance(part, np.ndarray) for part in parts):
         return np.concatenate(parts)
     import torch
@@ -104,7 +104,7 @@ class Gaussians:
         return self.means.shape[0]
 
     def __getitem__(self, index: Any) -> Gaussians:
-        """The rows that ``index`` (slice, mask or integer array) selects."""
+        """Return the rows that ``index`` (slice, mask or integer array) selects."""
         return Gaussians(*(getattr(self, f.name)[index] for f in fields(self)))
 
     @property
@@ -114,20 +114,20 @@ class Gaussians:
 
     @property
     def device(self) -> torch.device | None:
-        """Where the tensors are; None of NumPy arrays."""
+        """Device of the tensors; None of NumPy arrays."""
         return None if isinstance(self.means, np.ndarray) else self.means.device
 
     def to(self, device: torch.device | str) -> Gaussians:
-        """The same Gaussians as tensors on a device; gradients pass."""
+        """Return the same Gaussians as tensors on a device; gradients pass."""
         return Gaussians(*(as_tensor(getattr(self, f.name), device) for f in fields(self)))
 
     def numpy(self) -> Gaussians:
-        """The same Gaussians as NumPy arrays."""
+        """Return the same Gaussians as NumPy arrays."""
         return Gaussians(*(as_array(getattr(self, f.name)) for f in fields(self)))
 
     @staticmethod
     def concat(parts: Sequence[Gaussians]) -> Gaussians:
-        """Rows of all parts, one part after the other; all must have the same SH degree."""
+        """Concatenate the rows of all parts, which must have the same SH degree."""
         return Gaussians(*(concat_rows([getattr(p, f.name) for p in parts]) for f in fields(Gaussians)))
 
 
@@ -161,15 +161,15 @@ class Cameras:
         return self.viewmats.shape[0]
 
     def __getitem__(self, index: Any) -> Cameras:
-        """The cameras that ``index`` (slice, mask or integer array) selects."""
+        """Return the cameras that ``index`` (slice, mask or integer array) selects."""
         return replace(self, viewmats=self.viewmats[index], Ks=self.Ks[index])
 
     def to(self, device: torch.device | str) -> Cameras:
-        """The same cameras as tensors on a device; gradients pass."""
+        """Return the same cameras as tensors on a device; gradients pass."""
         return replace(self, viewmats=as_tensor(self.viewmats, device), Ks=as_tensor(self.Ks, device))
 
     def numpy(self) -> Cameras:
-        """The same cameras as NumPy arrays."""
+        """Return the same cameras as NumPy arrays."""
         return replace(self, viewmats=as_array(self.viewmats), Ks=as_array(self.Ks))
 
     @property
@@ -190,7 +190,7 @@ class LargePhotos:
     read: Callable[[int], np.ndarray]  # number -> [height,width,3] uint8 sRGB; several threads may call it
 
     def __getitem__(self, views: Sequence[int]) -> LargePhotos:
-        """The photos of some views."""
+        """Return the photos of some views."""
         return replace(self, Ks=self.Ks[list(views)], ids=tuple(self.ids[view] for view in views))
 
 
@@ -222,10 +222,10 @@ class Views:
 class Scene:
     """Gaussians, and the views that they were made from or that see them.
 
-    A scene is aligned where every row's pixel is known, as feed-forward models export one Gaussian per pixel and view:
-    row ``(v·H + y)·W + x`` then belongs to pixel (x, y) of view v. Rows that were not finite in the file are kept, as
-    fully transparent ones, so that the order survives; pixels that the file has no row for are filled up with such
-    ones, or with what a depth map says.
+    A scene is aligned where every row's pixel is known, as feed-forward models export one Gaussian
+    per pixel and view: row ``(v·H + y)·W + x`` then belongs to pixel (x, y) of view v. Rows that
+    were not finite in the file stay, fully transparent, so that the order survives; pixels without
+    a row in the file are filled up in the same way, or from a depth map.
 
     Args:
         gaussians: n rows, in the frame of the cameras; V·H·W of an aligned scene.
@@ -285,12 +285,12 @@ class Scene:
 
     @property
     def num_missing(self) -> int:
-        """Pixels that the file has no row for."""
+        """Number of pixels without a row in the file."""
         return 0 if self.missing is None else int(self.missing.sum())
 
     @property
     def num_gaussians(self) -> int:
-        """Gaussians of the file: what budgets and ratios count."""
+        """Number of Gaussians in the file, to which budgets and ratios refer."""
         return len(self.gaussians) - self.num_missing
 
     @property
@@ -300,17 +300,17 @@ class Scene:
 
     @property
     def file_gaussians(self) -> Gaussians:
-        """The Gaussians of the file, without those that fill it up."""
+        """Gaussians of the file, without those that fill it up."""
         return self.gaussians if self.missing is None else self.gaussians[~self.missing.reshape(-1)]
 
     @property
     def pixels_per_view(self) -> int:
-        """H·W."""
+        """Number of pixels of a view, H·W."""
         return self.cameras.height * self.cameras.width
 
 
 def grid_ids(valid: np.ndarray) -> np.ndarray:
-    """Return the ``pixel_ids [n]`` of an aligned scene whose rows are finite Gaussians where ``valid [v,h,w]`` is."""
+    """Return the ``pixel_ids [n]`` of an aligned scene, given a mask ``[v,h,w]`` of its finite Gaussians."""
     flat = np.asarray(valid).reshape(-1)
     return np.where(flat, np.arange(len(flat), dtype=np.int32), np.int32(-1))
 
@@ -331,7 +331,7 @@ class Groups:
 
 @dataclass(frozen=True)
 class Segmentation:
-    """The superpixels of a scene and the number of Gaussians that they become."""
+    """Superpixels of a scene and the number of Gaussians to make of them."""
 
     groups: Groups  # Superpixels of every view
     count: int  # Gaussians in the end; never more
@@ -348,11 +348,12 @@ class Matches:
 
 @dataclass(frozen=True)
 class FeatureGaussians:
-    """g Gaussians that each stand for a group of members, with what later stages need to know of the group.
+    """g Gaussians that each stand for a group of members, with facts about the group for later stages.
 
-    Everything that describes the group adds up over its members (weights, masses, extinctions) or is an average
-    with the weights, so merging Feature Gaussians is pooling again. Opacity is derived when decoding:
-    ``1 - exp(-gain * extinction / disc area)`` (integrated optical depth is what blending conserves).
+    Everything that describes the group adds up over its members (weights, masses, extinctions) or
+    is an average with the weights, so merging Feature Gaussians is pooling again. Opacity is
+    derived when decoding: ``1 - exp(-gain * extinction / disc area)`` (integrated optical depth is
+    what blending conserves).
     """
 
     means: np.ndarray  # [g,3] float32
@@ -382,7 +383,7 @@ class FeatureGaussians:
 
     @staticmethod
     def concat(parts: Sequence[FeatureGaussians]) -> FeatureGaussians:
-        """All groups, one part after the other."""
+        """Concatenate the groups of all parts."""
         names = [f.name for f in fields(FeatureGaussians) if f.name != "starts"]
         columns = {name: concat_rows([getattr(p, name) for p in parts]) for name in names}
         sizes = np.concatenate([np.diff(p.starts) for p in parts])

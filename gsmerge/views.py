@@ -1,4 +1,4 @@
-"""Which views go in, which are held out (the paper's rule, supplement A, "View sampling"), and which are scored."""
+"""Choice of views: given, held out (the paper's rule, supplement A, "View sampling"), and scored."""
 
 from __future__ import annotations
 
@@ -15,11 +15,7 @@ REPORT_VIEWS = 4  # views that input and result are scored on for the report alo
 
 
 def even_views(num_views: int, count: int) -> list[int]:
-    """``count`` of the views at equal intervals, first and last among them (the middle one for ``count = 1``).
-
-    Raises:
-        ValueError: If there are not as many.
-    """
+    """Return ``count`` view ids at equal intervals, with first and last (the middle one for ``count = 1``)."""
     if not 1 <= count <= num_views:
         raise ValueError(f"views: expected 1 to {num_views}, got {count}")
     if count == 1:
@@ -28,34 +24,27 @@ def even_views(num_views: int, count: int) -> list[int]:
 
 
 def scored_views(num_views: int) -> list[int]:
-    """The views that whole scenes are judged by: all, of many evenly spread ones.
+    """Return view ids for scoring a whole scene: all, or ``MAX_SCORED_VIEWS`` evenly spaced.
 
-    Rendering the unmerged input costs as many views as Gaussians, so with all of many views it would be most of a run.
+    Rendering the unmerged input costs as many views as Gaussians, so with all of many views it
+    would be most of a run.
     """
     return even_views(num_views, min(num_views, MAX_SCORED_VIEWS))
 
 
 def report_views(num_views: int) -> list[int]:
-    """The views that input and result are scored on where nothing but the report needs the numbers."""
+    """Return view ids for scores that only the report needs."""
     return pick_views(num_views, REPORT_VIEWS)
 
 
 def pick_views(num_views: int, most: int) -> list[int]:
-    """At most ``most`` view ids, evenly spread and without the first and last where there are enough."""
+    """Return at most ``most`` view ids, evenly spread, and where possible without first and last."""
     count = min(num_views, most)
     return [int((i + 0.5) * num_views / count) for i in range(count)]
 
 
 def midpoint_views(contexts: Sequence[float], candidates: Sequence[float]) -> list[int]:
-    """For each two consecutive contexts the candidate nearest the middle between them.
-
-    Args:
-        contexts: Places along the trajectory, in any order.
-        candidates: Places of the views that may be targets.
-
-    Returns:
-        Indices of candidates, none twice, in the order of the trajectory; a gap with no candidate gives none.
-    """
+    """Return, for each two consecutive contexts, the index of the candidate nearest the middle between them, if any."""
     chosen = []
     for low, high in pairwise(sorted(contexts)):
         inside = [i for i, place in enumerate(candidates) if low < place < high]
@@ -65,10 +54,10 @@ def midpoint_views(contexts: Sequence[float], candidates: Sequence[float]) -> li
 
 
 def distinct_views(scene: Scene) -> tuple[list[int], list[int]]:
-    """The views without those that repeat an earlier one: the same camera, the same photo, the same Gaussians.
+    """Return the ids of views that repeat no earlier view, and for every view its place among them.
 
-    Returns:
-        Their numbers, and of every view the place of what it repeats among them, or its own.
+    A view repeats another if camera, photo and Gaussians are the same; it then has that view's
+    place.
     """
     cameras = np.concatenate([scene.cameras.viewmats.reshape(-1, 16), scene.cameras.Ks.reshape(-1, 9)], 1)
     _, firsts = np.unique(cameras, axis=0, return_inverse=True)
@@ -82,7 +71,7 @@ def distinct_views(scene: Scene) -> tuple[list[int], list[int]]:
 
 
 def _equal_views(scene: Scene, one: int, other: int) -> bool:
-    """Whether two views of one camera have the same photo and the same Gaussians."""
+    """Return whether two views of one camera have the same photo and the same Gaussians."""
     if scene.images is not None and not np.array_equal(scene.images[one], scene.images[other]):
         return False
     if not scene.aligned:
@@ -93,10 +82,7 @@ def _equal_views(scene: Scene, one: int, other: int) -> bool:
 
 
 def subset(scene: Scene, view_ids: Sequence[int]) -> Scene:
-    """The scene as if only some of its views had been given: their Gaussians, cameras and photos.
-
-    Unaligned Gaussians belong to no view, and all stay.
-    """
+    """Return the scene with only some of its views and their Gaussians; unaligned Gaussians all stay."""
     ids = list(view_ids)
     images = None if scene.images is None else scene.images[ids]
     names = tuple(scene.names[i] for i in ids)

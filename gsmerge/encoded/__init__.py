@@ -1,4 +1,4 @@
-"""Encode once, decode many: the merged Feature Gaussians of a scene, kept in a file that needs no images any more.
+"""Encoded scenes: the merged Feature Gaussians of a scene, in a file that needs no images any more.
 
 Nothing is imported here, so that decoding loads none of the stages before it.
 """

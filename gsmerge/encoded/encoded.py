@@ -1,4 +1,4 @@
-"""What a ``.gsm`` file holds: frozen dataclasses, no behaviour beyond sizes."""
+"""Content of a ``.gsm`` file: frozen dataclasses, no behaviour beyond sizes."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Division:
 
 @dataclass(frozen=True, eq=False)
 class StoredHeads:
-    """Networks whose decoder heads correct the children, and what they know of the groups."""
+    """Networks whose decoder heads correct the children, and the numbers that describe each group to them."""
 
     networks: Networks  # All of a checkpoint's networks
     views: np.ndarray  # [g] int64, the view that each group's frame belongs to
@@ -42,7 +42,7 @@ class StoredHeads:
 
 @dataclass(frozen=True)
 class StoredSettings:
-    """What decoding needs to know of the encoding."""
+    """Settings of the encoding that decoding needs."""
 
     num_input: int  # Gaussians of the scene
     k: int | str  # Gaussians of each group by default, or `"auto"` where the budget was: `target_count` in all
@@ -60,21 +60,13 @@ class StoredSettings:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StoredScene:
-    """What encoded scenes and states have in common.
+    """Common fields of encoded scenes and states."""
 
-    Args:
-        kept: Gaussians that no view sees, canonical, merged already; None without any.
-        frame: From canonical to world.
-        cameras: The views, canonical.
-        settings: What decoding needs to know.
-        about: Where it comes from: version and options, further of each kind. Plain JSON types.
-    """
-
-    kept: Gaussians | None
-    frame: Frame
-    cameras: Cameras
-    settings: StoredSettings
-    about: Mapping[str, Any]
+    kept: Gaussians | None  # Unseen Gaussians, canonical, merged; None without any
+    frame: Frame  # From canonical to world
+    cameras: Cameras  # The views, canonical
+    settings: StoredSettings  # What decoding needs to know
+    about: Mapping[str, Any]  # Origin as plain JSON types: version, options, more by kind
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -103,15 +95,15 @@ class Encoded(StoredScene):
 
     @property
     def num_kept(self) -> int:
-        """Gaussians that no view sees."""
+        """Number of Gaussians that no view sees."""
         return 0 if self.kept is None else len(self.kept)
 
     @property
     def max_gaussians(self) -> int:
-        """Most Gaussians that it decodes to."""
+        """Largest number of Gaussians that the scene decodes to."""
         return len(self) + len(self.division.slots) + self.num_kept
 
 
 def without_members(features: FeatureGaussians) -> FeatureGaussians:
-    """The Feature Gaussians without their members."""
+    """Return the Feature Gaussians without their members."""
     return replace(features, starts=np.zeros(len(features) + 1, np.int64), members=np.zeros(0, np.int64))

@@ -100,7 +100,7 @@ def write_gsm(
 
 
 def _float32(values: Array) -> np.ndarray:
-    """What overflowed as a reader takes it."""
+    """Return float32 numbers within the range that a reader accepts."""
     with np.errstate(over="ignore"):
         numbers = np.nan_to_num(as_array(values).astype(np.float32, copy=False))
     return np.clip(numbers, -MAX_NUMBER, MAX_NUMBER, dtype=np.float32)
@@ -115,7 +115,7 @@ def save_encoded(
         path: The file, ``.gsm`` by convention; complete or not there at all.
         encoded: From :func:`gsmerge.encode_scene`.
         overwrite: Replace an existing file.
-        source: What is known of the file that the scene was read from; plain JSON types.
+        source: Facts about the file of the scene; plain JSON types.
 
     Raises:
         SceneError: If the file exists or cannot be written.
@@ -141,7 +141,7 @@ def save_encoded(
 
 @dataclass(frozen=True, eq=False)
 class GsmFile:
-    """The content of a ``.gsm`` file, checked as it is taken."""
+    """Content of a ``.gsm`` file, each part checked when it is read."""
 
     path: Path
     kind: str  # `ENCODED` or `STATE`
@@ -149,11 +149,11 @@ class GsmFile:
     arrays: Mapping[str, np.ndarray]
 
     def error(self, problem: str) -> SceneError:
-        """That the file is damaged, and what to do."""
+        """Return the error for a damaged file."""
         return SceneError(self.path, problem, REMEDY)
 
     def array(self, key: str, dtype: type[np.generic], *shape: int | None) -> np.ndarray:
-        """An array of a type and shape (None: any size), finite."""
+        """Return an array of a type and shape (None: any size), if it is finite and in range."""
         array = self.arrays.get(key)
         expected = f"{key}: expected {dtype.__name__} {['n' if n is None else n for n in shape]}"
         if array is None:
@@ -172,7 +172,7 @@ class GsmFile:
         return array
 
     def features(self) -> FeatureGaussians:
-        """Feature Gaussians without their members."""
+        """Return the Feature Gaussians without their members."""
         g = len(self.array("features.means", np.float32, None, 3))
         shapes: dict[str, tuple[int | None, ...]] = {
             "means": (3,), "covars": (3, 3), "sh0": (1, 3), "shN": (None, 3), "latents": (None,),
@@ -185,13 +185,13 @@ class GsmFile:
         )
 
     def gaussians(self, prefix: str, count: int | None, num_higher: int) -> Gaussians:
-        """``count`` Gaussians (None: any number) with ``num_higher`` bases of higher harmonics."""
+        """Return ``count`` Gaussians (None: any number) with ``num_higher`` bases of higher harmonics."""
         n = len(self.array(f"{prefix}.means", np.float32, count, 3))
         shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (num_higher, 3)}
         return Gaussians(*(self.array(f"{prefix}.{name}", np.float32, n, *shape) for name, shape in shapes.items()))
 
     def common(self, num_higher: int) -> dict[str, Any]:
-        """Fields that encoded scenes and states share: kept, frame, cameras."""
+        """Return the fields that encoded scenes and states share: kept, frame, cameras."""
         kept = self.gaussians("kept", None, num_higher)
         unit, width, height = (self.header[name] for name in ("unit", "width", "height"))
         origin = self.array("frame.origin", np.float64, 3)
@@ -205,7 +205,7 @@ class GsmFile:
         return {"kept": kept if len(kept) else None, "frame": Frame(origin, unit), "cameras": cameras}
 
     def _cameras(self, viewmats: np.ndarray, Ks: np.ndarray, width: int, height: int) -> Cameras:
-        """Views that cameras can have taken, of a size that the file has the bytes for."""
+        """Return the cameras, if they are plausible and of a size for which the file has the bytes."""
         check_pixels(self.path, width, height)
         most = SMALL_VIEW + PIXELS_PER_BYTE * sum(
             a.nbytes for key, a in self.arrays.items() if not key.startswith("networks.")
@@ -220,7 +220,7 @@ class GsmFile:
         return Cameras(viewmats, Ks, width, height)
 
     def settings(self) -> StoredSettings:
-        """The settings that are known here, each within its range."""
+        """Return the settings that this version knows, each within its range."""
         values: dict[str, Any] = {}
         for f in fields(StoredSettings):
             value, is_share = self.header["settings"].get(f.name), f.name in ("min_opacity", "min_contribution")
@@ -253,7 +253,7 @@ def read_gsm(path: str | PathLike[str], *kinds: str) -> GsmFile:
 
 
 def _read_header(path: Path, text: str, entries: Mapping[str, Any]) -> dict[str, Any]:
-    """The header, of a schema that is known here; ``entries``: the type of each entry that it must have."""
+    """Parse the header of a known schema; ``entries``: the type of each required entry."""
     try:
         header = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -271,7 +271,7 @@ def _read_header(path: Path, text: str, entries: Mapping[str, Any]) -> dict[str,
 
 
 def load_encoded(path: str | PathLike[str]) -> Encoded:
-    """An encoded scene from a file; nothing in it is ever executed.
+    """Read an encoded scene from a file; nothing in it is ever executed.
 
     Raises:
         SceneError: If the file is missing or damaged, of another format or a newer schema, lacks an array, or holds
@@ -281,7 +281,7 @@ def load_encoded(path: str | PathLike[str]) -> Encoded:
 
 
 def read_encoded(file: GsmFile) -> Encoded:
-    """The encoded scene of a file of that kind."""
+    """Return the encoded scene of a file of that kind."""
     features, settings = file.features(), file.settings()
     common = file.common(features.shN.shape[1])
     heads = _read_heads(file, features, len(common["cameras"]))
@@ -296,7 +296,7 @@ def read_encoded(file: GsmFile) -> Encoded:
 
 
 def _read_division(file: GsmFile, features: FeatureGaussians) -> Division:
-    """The children, with every index within its range."""
+    """Return the children, with every index within its range."""
     g = len(features)
     splits, slots = file.array("division.splits", np.uint8, g), file.array("division.slots", np.uint8, None)
     uniform = file.array("division.uniform", np.int32, None)
@@ -317,7 +317,7 @@ def _read_division(file: GsmFile, features: FeatureGaussians) -> Division:
 
 
 def _read_heads(file: GsmFile, features: FeatureGaussians, num_views: int) -> StoredHeads | None:
-    """The networks, if there are any, and what they know of the groups."""
+    """Return the networks and their descriptions of the groups; None without networks."""
     header, prefix = file.header, "networks."
     if header["networks"] is None:
         return None

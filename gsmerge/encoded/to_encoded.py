@@ -1,4 +1,4 @@
-"""scene -> merged feature gaussians and all their children: everything up to decoding, to be stored."""
+"""Scene -> merged Feature Gaussians and all their children, to be stored: everything up to decoding."""
 
 from __future__ import annotations
 
@@ -35,18 +35,19 @@ def encode_scene(
     progress: Progress | None = None,
     **settings: Any,
 ) -> Encoded:
-    """All of :func:`gsmerge.compact` up to decoding, stored: superpixels, merging, matching, networks; never a fit.
+    """Encode a scene: all stages of :func:`gsmerge.compact` up to decoding, without a fit.
 
-    ``decode_scene(encode_scene(scene, **settings))`` is ``compact(scene, fit="none", poses="fixed", **settings)``, bit
-    for bit; so is any other ``k`` at decoding, unless a budget or the size of the input limits the number of
-    superpixels of either, or Gaussians that no view sees are kept: these are merged for one K.
+    ``decode_scene(encode_scene(scene, **settings))`` is ``compact(scene, fit="none", poses="fixed",
+    **settings)``, bit for bit; so is any other ``k`` at decoding, unless a budget or the size of
+    the input limits the number of superpixels of either, or Gaussians that no view sees are kept:
+    these are merged for one K.
 
     Args:
-        scene: As of :func:`gsmerge.compact`; of tensors, too, arrays are made.
+        scene: See :func:`gsmerge.compact`; tensors become arrays.
         options: Settings of all stages; those of the fit do not matter. None: the defaults.
         max_k: Most Gaussians of a group that can be decoded, 1 to 8: more take more space. None: 4, or 8 where ``k``
             is larger or a number of Gaussians is asked for (budgets, unaligned scenes).
-        progress: As of :func:`gsmerge.compact`.
+        progress: See :func:`gsmerge.compact`.
         **settings: Single settings by name, on top of ``options``.
 
     Raises:
@@ -70,7 +71,7 @@ def encode_scene(
 
 
 def _without_fit(options: CompactOptions, settings: dict[str, Any]) -> CompactOptions:
-    """The options without a fit, and with poses as given: batches may be added, which have to fit."""
+    """Return the options without a fit and with fixed poses, so that batches can be added later."""
     fit = [f"fit {options.fit.fit}"] if settings.get("fit", "none") != "none" else []
     for name in (*fit, *options.whole_only):
         raise UsageError(f"{name}: cannot be encoded, as nothing is fitted or searched for; use compact")
@@ -78,7 +79,7 @@ def _without_fit(options: CompactOptions, settings: dict[str, Any]) -> CompactOp
 
 
 def _to_encoded(prepared: Prepared, plan: Plan, merged: MergedViews, max_k: int | None) -> Encoded:
-    """Everything that decoding needs of the merged Feature Gaussians."""
+    """Collect everything that decoding needs of the merged Feature Gaussians."""
     features, networks, exact = merged.features, merged.networks, merged.segmentation.exact
     options, scene = plan.decode, prepared.scene
     count = merged_count(merged, options, grows=plan.fit.grows)
@@ -112,7 +113,7 @@ def _to_encoded(prepared: Prepared, plan: Plan, merged: MergedViews, max_k: int 
 
 
 def _about(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Version, options, choices and notes; nothing that depends on the machine."""
+    """Return version, options, choices and notes; nothing that depends on the machine."""
     settings = {**settings, "checkpoint": Path(settings["checkpoint"]).name}
     del settings["threads"]
     record = current_record()

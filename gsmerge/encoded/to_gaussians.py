@@ -1,4 +1,4 @@
-"""Encoded scene -> gaussians: a choice among what was kept, without images."""
+"""Encoded scene -> Gaussians: a choice among the stored children, without images."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from gsmerge.types import FeatureGaussians, Gaussians
 
 @dataclass(frozen=True, eq=False)
 class DecodePlan:
-    """What a file is decoded to."""
+    """Numbers of Gaussians to decode, by group and in all."""
 
     counts: np.ndarray  # [g] most Gaussians of each group
     min_contribution: float  # See StoredSettings; 0: contributions are not measured
@@ -29,7 +29,7 @@ class DecodePlan:
 
 
 def plan_decode(encoded: Encoded, *, k: int | None = None, budget: int | str | None = None) -> DecodePlan:
-    """How many Gaussians each group becomes, see :func:`decode_scene`."""
+    """Plan how many Gaussians each group becomes, see :func:`decode_scene`."""
     s = encoded.settings
     if budget is not None and k is not None:
         raise UsageError("expected one of k and budget, got both")
@@ -55,7 +55,7 @@ def plan_decode(encoded: Encoded, *, k: int | None = None, budget: int | str | N
 
 
 def _group_budget(encoded: Encoded, budget: int | str) -> int:
-    """Gaussians that a budget leaves for the groups."""
+    """Return the number of Gaussians that a budget leaves for the groups."""
     try:
         count = exact_count(BudgetOptions(budget), encoded.settings.num_input, encoded.sh_degree)
     except ValueError as error:
@@ -71,7 +71,7 @@ def _group_budget(encoded: Encoded, budget: int | str) -> int:
 
 
 def _distribute(encoded: Encoded, total: int) -> DecodePlan:
-    """A number of Gaussians, given to the groups where they help most."""
+    """Distribute a number of Gaussians to the groups where they help most."""
     order, extra = encoded.division.growth_order, max(0, total - len(encoded))
     counts = 1 + np.bincount(order[:extra], minlength=len(encoded))
     if extra <= len(order):
@@ -84,11 +84,11 @@ def _distribute(encoded: Encoded, total: int) -> DecodePlan:
 def decode_scene(
     encoded: Encoded, *, k: int | None = None, budget: int | str | None = None, threads: int | None = None
 ) -> Gaussians:
-    """The Gaussians of an encoded scene, in the scene's own world frame. No fit follows, as there are no photos.
+    """Decode an encoded scene into Gaussians in the scene's own world frame, without a fit.
 
     Args:
         encoded: From :func:`encode_scene` or :func:`load_encoded`.
-        k: Gaussians of each group, 1 to what was encoded. None: as it was encoded.
+        k: Gaussians of each group, 1 to the largest number encoded. None: the encoding's own.
         budget: Gaussians in all instead: a number from one for each group on, a share of the input as "2%", a size as
             "5MB", or ``"auto"``: as many as ``compact`` would take without photos, where they help most.
         threads: Threads to use; None: all processors. The result does not depend on it.
@@ -112,7 +112,7 @@ def decode_scene(
 
 
 def children_of(encoded: Encoded, counts: np.ndarray) -> tuple[Gaussians, np.ndarray]:
-    """At most ``counts [g]`` canonical Gaussians of each group, however faint, and the group of each, rising."""
+    """Return at most ``counts [g]`` canonical Gaussians of each group, also faint, and the rising group of each."""
     features, heads = encoded.features, encoded.heads
     rows, parents = pick_children(encoded.division, counts)
     gaussians = Gaussians.concat([feature_to_gaussians(features), encoded.division.children])[rows]
@@ -128,7 +128,7 @@ def children_of(encoded: Encoded, counts: np.ndarray) -> tuple[Gaussians, np.nda
 
 
 def divide_all(features: FeatureGaussians, members: Members, max_k: int) -> Division:
-    """All children of every group, up to ``max_k`` of each."""
+    """Return all children of every group, up to ``max_k`` of each."""
     count = len(features)
     rows = np.arange(count)
     sizes = np.diff(features.starts)[rows][:, None]
@@ -166,11 +166,7 @@ def divide_all(features: FeatureGaussians, members: Members, max_k: int) -> Divi
 
 
 def pick_children(division: Division, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which Gaussians stand for each of g groups, at most ``counts [g]`` of it, and the rising group of each.
-
-    Returns:
-        ``[n]`` rows of the g groups themselves (K = 1) followed by the division's children, and ``[n]`` groups.
-    """
+    """Choose at most ``counts [g]`` rows of each group, among groups and then children; return rows, groups."""
     splits, slots = division.splits.astype(np.int64), division.slots.astype(np.int64)
     count, uniform = len(splits), division.uniform
     sizes, first = np.minimum(counts, splits + 1), np.cumsum(splits) - splits

@@ -1,7 +1,7 @@
-"""The fit, its growth, colours and scores on a GPU: plain functions on tensors of any device.
+"""Fit, growth, colours and scores on a GPU: plain functions on tensors of any device.
 
-Merging stays on the CPU. torch is loaded only where :func:`choose_backend` is asked for CUDA. On the
-torch CPU device every function gives what the kernels give, which is how it is tested;
+Merging stays on the CPU. torch is loaded only where :func:`choose_backend` is asked for CUDA. On
+the torch CPU device every function gives what the kernels give, which is how it is tested;
 docs/internals/gpu.md says what differs on a GPU.
 """
 
@@ -20,16 +20,10 @@ NO_DEVICE = "torch finds no CUDA device"
 
 
 def choose_backend(device: str, num_pixels: int) -> tuple[FitBackend[Any], str | None]:
-    """Choose where the fit and the scores run.
+    """Choose where the fit and the scores run; a note says why CUDA was asked for and cannot be used.
 
-    Args:
-        device: ``"cpu"``; ``"cuda"``; or ``"auto"``: CUDA where it can be used and ``num_pixels`` are
-            enough.
-        num_pixels: Pixels of all views.
-
-    Returns:
-        The back end; and a note where CUDA was to be used but cannot be, so that it is the CPU's.
-        ``"auto"`` on a computer without a CUDA device is not worth a note.
+    ``"auto"`` takes CUDA where it can be used and ``num_pixels`` of all views are enough; on a
+    computer without a CUDA device it gives no note.
     """
     if device == "cpu" or (device == "auto" and num_pixels < MIN_PIXELS):
         return ON_CPU, None

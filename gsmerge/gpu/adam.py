@@ -1,7 +1,7 @@
-"""The parameters under optimisation on a device, and one step on all of them: the kernel ``optimise.adam``.
+"""Parameters under optimisation on a device, and the optimiser step of the kernel ``optimise.adam``.
 
-On CUDA one Triton kernel does all of a step (:mod:`gsmerge.gpu.adam_kernel`), elsewhere torch. Both also write what the
-new parameters mean to the rasterizer, so a step begins with nothing to compute.
+On CUDA one Triton kernel does all of a step (:mod:`gsmerge.gpu.adam_kernel`), elsewhere torch. Both
+also write what the new parameters mean to the rasterizer, so a step begins with nothing to compute.
 """
 
 from __future__ import annotations
@@ -20,37 +20,21 @@ from gsmerge.types import SH_C0, Gaussians
 
 @dataclass(eq=False)
 class FitState:
-    """Parameters under optimisation, and what they mean to the rasterizer; see :mod:`gsmerge.stages.fit.fit_state`.
+    """Parameters under optimisation, and their meaning for the rasterizer; see :mod:`gsmerge.stages.fit.fit_state`."""
 
-    Args:
-        x: ``[n,14]`` float32: mean, log scale, quaternion, opacity logit, colour; so are the next three.
-        x0: Where each began.
-        m: First moment.
-        v: Second moment.
-        units: ``[n]`` size of each Gaussian when it began.
-        box_shares: ``[n]`` share of the box about the start that each may use.
-        min_sizes: ``[n]`` least log scale of each.
-        shN: ``[n,k-1,3]`` higher harmonics.
-        means: ``[n,3]``.
-        quats: ``[n,4]``.
-        scales: ``[n,3]``.
-        opacities: ``[n]``.
-        colors: ``[n,3]`` base colours.
-    """
-
-    x: Tensor
-    x0: Tensor
-    m: Tensor
-    v: Tensor
-    units: Tensor
-    box_shares: Tensor
-    min_sizes: Tensor
-    shN: Tensor
-    means: Tensor
-    quats: Tensor
-    scales: Tensor
-    opacities: Tensor
-    colors: Tensor
+    x: Tensor  # [n,14] mean, log scale, quaternion, opacity logit, colour; as the next three
+    x0: Tensor  # Values at the start
+    m: Tensor  # First moment
+    v: Tensor  # Second moment
+    units: Tensor  # [n] size of each Gaussian when it began
+    box_shares: Tensor  # [n] share of the box about the start that each may use
+    min_sizes: Tensor  # [n] least log scale of each
+    shN: Tensor  # [n,k-1,3] higher harmonics
+    means: Tensor  # [n,3]
+    quats: Tensor  # [n,4]
+    scales: Tensor  # [n,3]
+    opacities: Tensor  # [n]
+    colors: Tensor  # [n,3] base colours
 
     def __len__(self) -> int:
         return len(self.x)
@@ -58,7 +42,7 @@ class FitState:
 
 @dataclass(frozen=True, eq=False)
 class StepGradients:
-    """Gradients of a loss in what the rasterizer is given; shapes as there. ``reached [n]`` bool: drawn in the view."""
+    """Gradients of a loss in the rasterizer's inputs; ``reached [n]`` bool: drawn in the view."""
 
     means: Tensor
     quats: Tensor
@@ -111,14 +95,9 @@ def state_of(x: Tensor, shN: Tensor) -> FitState:
 def adam_step(state: FitState, gradients: StepGradients, options: FitOptions, rates: Tensor, step: int) -> None:
     """Take an Adam step by a view's gradients, in place, within the box about the start.
 
-    Gaussians that the view does not show stay as they are.
-
-    Args:
-        state: n Gaussians.
-        gradients: Of the image loss; the pulls on opacity and size are added here.
-        options: Pulls, decays, limits.
-        rates: ``[14]`` step of each column, see :func:`gsmerge.stages.fit.full.step_sizes`.
-        step: From 1.
+    Gaussians that the view does not show stay unchanged. The pulls on opacity and size are added to
+    the gradients of the image loss here. ``rates [14]``: see
+    :func:`gsmerge.stages.fit.full.step_sizes`; ``step`` counts from 1.
     """
     if state.x.is_cuda and has_triton():
         from gsmerge.gpu.adam_kernel import launch

@@ -1,4 +1,4 @@
-"""The optimiser step as one Triton kernel. Only imported where Triton is; see :func:`gsmerge.gpu.adam.adam_step`."""
+"""Optimiser step of :func:`gsmerge.gpu.adam.adam_step` as one Triton kernel, imported only where Triton is."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The functions that the fit and the scores are made of, on a device."""
+"""Functions of the fit and the scores on a device."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def make_backend(device: torch.device) -> FitBackend[DevicePhotos]:
 
 
 def visible_mask(gaussians: Gaussians, photos: DevicePhotos, min_weight: float) -> Tensor:
-    """Mask ``[n]`` the Gaussians worth keeping, see :func:`gsmerge.stages.fit.stage.visible_mask`."""
+    """Return a mask ``[n]`` of the Gaussians worth keeping, see :func:`gsmerge.stages.fit.stage.visible_mask`."""
     peak = torch.zeros(len(gaussians), device=gaussians.means.device)
     inside = torch.zeros_like(peak, dtype=torch.bool)
     for view in range(len(photos)):
@@ -79,13 +79,8 @@ def photo_psnr(
 ) -> float:
     """Return the mean over some views of the PSNR (dB) of their photos, rendered on a device.
 
-    Args:
-        gaussians: In any frame, on the host.
-        photos: Of full size, in the same frame; they stay on the host.
-        views: Of the photos.
-        quarter: Score the tiles of :func:`gsmerge.render.photos.scored_tiles` alone.
-        near: Near plane, in the Gaussians' unit.
-        device: Where to draw.
+    Gaussians and full-size photos are on the host, in one frame, whose unit ``near`` is in.
+    ``quarter``: score the tiles of :func:`gsmerge.render.photos.scored_tiles` alone.
     """
     uploaded = upload_gaussians(gaussians, device, dtype=None)  # float32 is too coarse far from the origin
     cameras = Cameras(photos.viewmats, photos.Ks, photos.width, photos.height)

@@ -1,7 +1,8 @@
-"""gaussians -> gaussians with fitted colours, on a device: :mod:`gsmerge.stages.fit.color`.
+"""Gaussians -> Gaussians with fitted colours, on a device; see :mod:`gsmerge.stages.fit.color`.
 
-The same conjugate gradients with the same weights. The matrix of a view, applied to colours, is an image, and its
-transpose the gradient of an image: each view is drawn once, and its transpose kept for as long as it is used.
+The same conjugate gradients with the same weights. The matrix of a view, applied to colours, is an
+image, and its transpose the gradient of an image: each view is drawn once, and its transpose kept
+for as long as it is used.
 """
 
 from __future__ import annotations
@@ -30,14 +31,7 @@ from gsmerge.types import Gaussians
 def fit_colors(
     gaussians: Gaussians, photos: DevicePhotos, options: FitOptions, seed: int
 ) -> tuple[Gaussians, FitReport]:
-    """Fit base colours to the photos, and keep them only if held-out blocks of the photos get better.
-
-    Args:
-        gaussians: Gaussians, whose geometry, opacities and higher harmonics stay as they are.
-        photos: The input views.
-        options: The solver's settings.
-        seed: Chooses the held-out blocks.
-    """
+    """Fit base colours alone to the photos, and keep them only if held-out blocks, chosen by ``seed``, get better."""
     device = gaussians.means.device
     train = training_weights(photos.host, min(0.5, HOLDOUT * options.holdout), seed)
     weights = torch.from_numpy(np.stack(train)).to(device)
@@ -53,25 +47,15 @@ def fit_colors(
 
 @dataclass(frozen=True, eq=False)
 class _DeviceSystem:
-    """:class:`gsmerge.stages.fit.color.ColorSystem` of tensors.
+    """Colour system of tensors, see :class:`gsmerge.stages.fit.color.ColorSystem`."""
 
-    Args:
-        gaussians: n Gaussians, whose geometry stays.
-        photos: V photos.
-        options: The solver's settings.
-        images: ``[v,h,w,3]`` renders with the colours as they were.
-        train: ``[v,h,w]`` 0 on the held-out blocks, 1 elsewhere.
-        weights: ``[v,h,w]`` of the pixels.
-        gains: ``[v,3]`` exposures.
-    """
-
-    gaussians: Gaussians
-    photos: DevicePhotos
-    options: FitOptions
-    images: Tensor
-    train: Tensor
-    weights: Tensor
-    gains: Tensor
+    gaussians: Gaussians  # n Gaussians, whose geometry stays
+    photos: DevicePhotos  # V photos
+    options: FitOptions  # The solver's settings
+    images: Tensor  # [v,h,w,3] renders with the colours as they were
+    train: Tensor  # [v,h,w] 0 on the held-out blocks, 1 elsewhere
+    weights: Tensor  # [v,h,w] of the pixels
+    gains: Tensor  # [v,3] exposures
     precision: float = 0.0
 
     def _fitted(self, x: Tensor) -> Tensor:

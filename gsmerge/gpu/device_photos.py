@@ -1,4 +1,4 @@
-"""Gaussians and photos on a device, and Gaussians drawn into the photos' cameras, with the transposes of that.
+"""Gaussians and photos on a device, drawing into the photos' cameras, and its transpose.
 
 On CUDA gsplat draws, on the CPU the project's own kernels; all other files here work with either.
 """
@@ -20,33 +20,25 @@ from gsmerge.types import SH_C0, Array, Gaussians
 
 @dataclass(frozen=True, eq=False)
 class DevicePhotos:
-    """V photos of one size on a device; see :class:`gsmerge.render.photos.Photos`.
+    """V photos of one size on a device; see :class:`gsmerge.render.photos.Photos`."""
 
-    Args:
-        images: ``[v,h,w,3]`` float32.
-        viewmats: ``[v,4,4]`` float32 world to camera.
-        Ks: ``[v,3,3]`` float32.
-        eyes: ``[v,3]`` float32 centres of the cameras.
-        host: The same photos in the computer's memory, whose cameras the kernels read.
-    """
-
-    images: Tensor
-    viewmats: Tensor
-    Ks: Tensor
-    eyes: Tensor
-    host: Photos
+    images: Tensor  # [v,h,w,3] float32
+    viewmats: Tensor  # [v,4,4] float32 world to camera
+    Ks: Tensor  # [v,3,3] float32
+    eyes: Tensor  # [v,3] float32 centres of the cameras
+    host: Photos  # The same photos in the computer's memory, whose cameras the kernels read
 
     def __len__(self) -> int:
         return len(self.images)
 
     @property
     def height(self) -> int:
-        """Rows."""
+        """Number of rows."""
         return self.images.shape[1]
 
     @property
     def width(self) -> int:
-        """Columns."""
+        """Number of columns."""
         return self.images.shape[2]
 
     def camera(self, view: int) -> tuple[Tensor, Tensor, int, int]:
@@ -88,16 +80,11 @@ def draw(
     eps2d: float | None = None,
     antialiased: bool = False,
 ) -> tuple[Tensor, Tensor]:
-    """Draw Gaussians into one view: image ``[h,w,3]``, and ``[n]`` bool, which of them have a footprint there.
+    """Draw Gaussians into one view; return the image ``[h,w,3]`` and a mask ``[n]`` of footprints there.
 
-    Args:
-        shape: Means ``[n,3]``, quaternions ``[n,4]``, scales ``[n,3]`` and opacities ``[n]``, float32.
-        colors: ``[n,3]``, any sign. The image is differentiable in them and in the shape.
-        photos: Whose cameras.
-        view: Of the photos.
-        background: ``[3]``.
-        eps2d: Low-pass, square pixels; None: that of the photos.
-        antialiased: Lower the opacity by what the low-pass adds to the footprint.
+    ``shape`` are means, quaternions, scales and opacities, float32; ``colors [n,3]`` may have any
+    sign, ``background`` is ``[3]``. The image is differentiable in shape and colours. ``eps2d`` is
+    the low-pass in square pixels, None: that of the photos.
     """
     eps2d = photos.host.eps2d if eps2d is None else eps2d
     if colors.device.type == "cpu":
@@ -112,7 +99,7 @@ def draw(
 
 
 def draw_black(shape: Shape, colors: Tensor, photos: DevicePhotos, view: int) -> Tensor:
-    """:func:`draw` over black, the image ``[h,w,3]`` alone."""
+    """Draw one view ``[h,w,3]`` over black."""
     return draw(shape, colors, photos, view, torch.zeros(3, device=colors.device))[0]
 
 
@@ -149,11 +136,7 @@ def draw_and_transpose(shape: Shape, colors: Tensor, photos: DevicePhotos, view:
 
 
 class Transpose:
-    """Sums over the pixels of a view of every Gaussian's blending weight times an image.
-
-    It is the transpose of drawing as a linear map from colours to images, which is the gradient in the colours.
-    ``reached`` is ``[n]`` bool: which Gaussians have a footprint in the view.
-    """
+    """Transpose of drawing a view: sums of every Gaussian's blending weight times an image; ``reached [n]`` bool."""
 
     def __init__(self, image: Tensor, colors: Tensor, reached: Tensor):
         self.image, self.colors, self.reached = image, colors, reached

@@ -1,7 +1,8 @@
-"""gaussians -> fitted gaussians, on a device: the run of :mod:`gsmerge.stages.fit.full`, which says why it is as it is.
+"""Gaussians -> fitted Gaussians, on a device; :mod:`gsmerge.stages.fit.full` explains the method.
 
-Order of the views and backgrounds are those of the CPU's run. What comes back from the device during the run are
-scores at its beginning and at the change of sizes, and the error once in ``READ_EVERY`` steps.
+Order of the views and backgrounds are those of the CPU's run. What comes back from the device
+during the run are scores at its beginning and at the change of sizes, and the error once in
+``READ_EVERY`` steps.
 """
 
 from __future__ import annotations
@@ -44,19 +45,12 @@ READ_EVERY = 20  # steps; each reading waits for the device
 
 @dataclass(frozen=True, eq=False)
 class PhotoLevel:
-    """The photos of one size, and what a step needs of them.
-
-    Args:
-        photos: The photos.
-        means: ``[v,2,3,h,w]`` of their windows, see :func:`gsmerge.gpu.image_scores.photo_means`.
-        weights: ``[v,h,w]`` of the pixels in a step; of full size ``[1,h,w]``, the same for all views.
-        counts: ``[v]`` sum of each view's weights.
-    """
+    """Photos of one size, with weights and window means for the steps."""
 
     photos: DevicePhotos
-    means: Tensor
-    weights: Tensor
-    counts: tuple[float, ...]
+    means: Tensor  # [v,2,3,h,w] window means, see gsmerge.gpu.image_scores.photo_means
+    weights: Tensor  # [v,h,w] weights of pixels in a step; full size [1,h,w], for all views
+    counts: tuple[float, ...]  # [v] sum of each view's weights
 
     def weight(self, view: int) -> Tensor:
         """Return the weights ``[h,w]`` of a view."""
@@ -64,7 +58,7 @@ class PhotoLevel:
 
 
 def make_levels(photos: tuple[DevicePhotos, DevicePhotos], plan: FitPlan) -> tuple[PhotoLevel, PhotoLevel]:
-    """Give both sizes their weights: everything counts at full size, the training pixels at half size."""
+    """Weigh the photos of both sizes: all pixels at full size, the training pixels at half size."""
     full, half = photos
     everywhere = torch.ones((1, full.height, full.width), device=full.images.device)
     trained = torch.from_numpy(np.stack(plan.step_weights[1])).to(half.images.device)
@@ -109,10 +103,7 @@ def holdout_score(state: FitState, photos: DevicePhotos, weights: Tensor, min_ga
 def initial_scores(
     state: FitState, photos: tuple[DevicePhotos, DevicePhotos], weights: Tensor, options: FitOptions
 ) -> tuple[float, Tensor, Tensor]:
-    """Return the PSNR (dB) of the half-size held-out blocks, ``[n]`` box shares, ``[n]`` least log scales.
-
-    See :func:`gsmerge.stages.fit.full.initial_scores`.
-    """
+    """Score the start as :func:`gsmerge.stages.fit.full.initial_scores` does."""
     full, half = photos
     images, shape, rates = [], state_shape(state), options.tuning
     sums, squares = (torch.zeros(len(state), dtype=torch.float64, device=state.x.device) for _ in range(2))
@@ -191,14 +182,8 @@ def step_gradients(
 ) -> tuple[StepGradients, Tensor]:
     """Differentiate one view's loss, and sum its weighted squared errors.
 
-    Args:
-        state: n Gaussians.
-        level: The photos.
-        view: Of them.
-        background: ``[3]``.
-        kept: ``[n]`` opacities of what is drawn; None: the state's own.
-        options: Of the loss.
-        look: Low-pass, and whether its energy is compensated; see :func:`gsmerge.stages.fit.full.look_of`.
+    ``kept [n]``: opacities of what is drawn, None: the state's own. ``look``: low-pass and
+    antialiasing, see :func:`gsmerge.stages.fit.full.look_of`.
     """
     photos = level.photos
     shape = (state.means, state.quats, state.scales, state.opacities if kept is None else kept)
@@ -228,12 +213,9 @@ def fit_full(
     progress: Progress | None,
     baseline_start: Gaussians | None,
 ) -> tuple[Gaussians, FitReport]:
-    """Fit all parameters to the photos; arguments as of :func:`gsmerge.stages.fit.full.fit_full`.
-
-    ``progress`` is called every ``READ_EVERY`` steps and at the end.
-    """
+    """Fit as :func:`gsmerge.stages.fit.full.fit_full` does; report progress every ``READ_EVERY`` steps."""
     plan = plan_run((photos[0].host, photos[1].host), options, seed)
-    run = _Run(start_state(gaussians), make_levels(photos, plan), plan, count, seed, progress)
+    run = _Run(start_state(gaussians), make_levels(photos, plan), plan, seed, progress)
     judged = torch.from_numpy(np.stack(plan.weights[1])).to(gaussians.means.device)
     half = photos[1]
     before, run.state.box_shares, run.state.min_sizes = initial_scores(run.state, photos, judged, options)
@@ -242,7 +224,9 @@ def fit_full(
     run.score, after = before, None
     run.start_clock()
     while run.step < run.steps:
-        run.grow()
+        due = options.grows and run.step / run.steps >= GROWTH
+        if due and len(run.state) < count:
+            run.state = grow_to(run.state, half, count)
         if run.step / run.steps >= plan.half_part and after is None:
             run.score = after = holdout_score(run.state, half, judged, options.tuning.min_gain)
             if after <= before:
@@ -260,19 +244,18 @@ def fit_full(
 
 
 class _Run:
-    """The steps of a run, and where it stands."""
+    """State of a run and its steps."""
 
     def __init__(
         self,
         state: FitState,
         levels: tuple[PhotoLevel, PhotoLevel],
         plan: FitPlan,
-        count: int,
         seed: int,
         progress: Progress | None,
     ):
         device, options = state.x.device, plan.options
-        self.state, self.levels, self.plan, self.count, self.progress = state, levels, plan, count, progress
+        self.state, self.levels, self.plan, self.progress = state, levels, plan, progress
         self.step, self.steps, self.started, self.score = 0, options.steps, 0.0, 0.0
         self.tail, self.error = TailMean(), torch.zeros((), device=device)
         most = max(self.steps, MAX_STEPS) if options.time_budget is not None else self.steps
@@ -291,14 +274,8 @@ class _Run:
         """Start the clock of a time budget, after a step on a copy: loading kernels is not timed."""
         if self.plan.options.time_budget is not None:
             self._move(deepcopy(self.state), None)
-            self.read_error()  # which waits for the device
+            float(self.error)  # waits for the device
             self.started = time.perf_counter()
-
-    def grow(self) -> None:
-        """Add Gaussians, once it is time."""
-        due = self.plan.options.grows and self.step / self.steps >= GROWTH
-        if due and len(self.state) < self.count:
-            self.state = grow_to(self.state, self.levels[1].photos, self.count)
 
     def _move(self, state: FitState, kept: Tensor | None) -> Tensor:
         """Move a state by the present step, and return the mean squared error of the view before it."""
@@ -318,12 +295,8 @@ class _Run:
         if self.step > self.steps * (1 - options.tuning.average_share):
             self.tail.add(self.state.x)
         if options.time_budget is not None and self.step == PROBE:
-            self.read_error()  # which waits for the device
+            float(self.error)  # waits for the device
             self.steps = affordable_steps(time.perf_counter() - self.started, self.plan)
             self.rates = self._all_rates()
         if self.progress and (self.step % READ_EVERY == 0 or self.step == self.steps):
-            self.progress(self.step, self.steps, -10 * np.log10(max(self.read_error(), 1e-12)), self.score)
-
-    def read_error(self) -> float:
-        """Return the mean squared error of the last steps."""
-        return float(self.error)
+            self.progress(self.step, self.steps, -10 * np.log10(max(float(self.error), 1e-12)), self.score)

@@ -1,7 +1,7 @@
-"""The loss of images on a device and its gradient, their exposures, and the PSNR of held-out blocks.
+"""Image loss with gradient, exposures, and PSNR of held-out blocks on a device.
 
-The gradient is written out, as in the kernel ``image_gradient``: half as many launches as through autograd, and what
-depends on the photo alone is computed once.
+The gradient is written out, as in the kernel ``image_gradient``: half as many launches as through
+autograd, and what depends on the photo alone is computed once.
 """
 
 from __future__ import annotations
@@ -31,17 +31,9 @@ def loss_gradient(
 ) -> tuple[Tensor, Tensor]:
     """Differentiate (1 - l) |image - photo| + l (1 - SSIM), l = ``ssim_lambda``; sum the squared errors.
 
-    SSIM's windows are uniform, of 7 x 7 pixels, with population covariances, K1 = .01, K2 = .03 (Wang et al. 2004).
-
-    Args:
-        image: ``[h,w,3]``.
-        photo: ``[h,w,3]``.
-        means: ``[2,3,h,w]`` of the photo, see :func:`photo_means`.
-        weight: ``[h,w]`` weights of the pixels.
-        ssim_lambda: Share of structural similarity.
-
-    Returns:
-        ``[h,w,3]`` divided by the number of pixels, and a number: the sum over all channels.
+    SSIM's windows are uniform, of 7 x 7 pixels, with population covariances, K1 = .01, K2 = .03
+    (Wang et al. 2004). Images are ``[h,w,3]``, ``means [2,3,h,w]`` those of :func:`photo_means`,
+    ``weight [h,w]`` weighs pixels. The gradient is divided by the number of pixels.
     """
     off = image - photo
     wide, pixels = weight[..., None], weight.numel()
@@ -71,14 +63,7 @@ def _ssim_gradient(x: Tensor, y: Tensor, means: Tensor, weight: Tensor) -> Tenso
 
 
 def holdout_psnr(images: Tensor, photos: Tensor, weights: Tensor, min_gain: float) -> float:
-    """Return the PSNR (dB) of renders on the held-out blocks, exposure of the photos set aside.
-
-    Args:
-        images: ``[v,h,w,3]``.
-        photos: ``[v,h,w,3]``.
-        weights: ``[v,h,w]`` 0 on the held-out blocks, 1 elsewhere.
-        min_gain: Exposure against the mean, as a factor, from which on it is set aside.
-    """
+    """Return the PSNR (dB) of held-out blocks; see :func:`gsmerge.stages.fit.photo_sizes.holdout_psnr`."""
     clipped = images.clamp(0, 1)
     gains = exposure_gains(clipped, photos, weights, min_gain)
     mask = weights == 0
@@ -88,10 +73,7 @@ def holdout_psnr(images: Tensor, photos: Tensor, weights: Tensor, min_gain: floa
 
 
 def exposure_gains(images: Tensor, photos: Tensor, weights: Tensor, min_gain: float, max_gain: float = 2.0) -> Tensor:
-    """Find the factors ``[v,3]`` that bring renders to the photos' exposure, with geometric mean one.
-
-    Least squares on the weighted pixels, per view and channel; ones where no view differs by ``min_gain``.
-    """
+    """Return factors ``[v,3]`` to the exposure; see :func:`gsmerge.stages.fit.photo_sizes.exposure_gains`."""
     weighted = weights[..., None] * images
     with_photo, with_image = ((weighted * other).sum((1, 2), dtype=torch.float64) for other in (photos, images))
     gains = (with_photo / with_image.clamp_min(1e-9)).clamp(1 / max_gain, max_gain)

@@ -1,7 +1,7 @@
-"""Compare what a device computes with the CPU, on 64 Gaussians, before any work is given to it.
+"""Comparison of a device with the CPU on 64 Gaussians, before any work is given to it.
 
-Drivers, gsplat, Triton and torch each come in versions of their own, and not every combination works.
-What fails or differs is found here in a moment, and the CPU does the work.
+Drivers, gsplat, Triton and torch each come in versions of their own, and not every combination
+works. What fails or differs is found here in a moment, and the CPU does the work.
 """
 
 from __future__ import annotations
@@ -69,7 +69,8 @@ def measure_errors(device: torch.device) -> dict[str, float]:
 
     image, gradients = differentiate(draw_placed, placed)
     expected_image, expected = differentiate(draw_on_host, host)
-    shares = [share_off(getattr(gradients, name), getattr(expected, name)) for name in GRADIENTS]
+    pairs = [(getattr(gradients, name).cpu(), getattr(expected, name)) for name in GRADIENTS]
+    shares = [(actual - wanted).norm() / wanted.norm() for actual, wanted in pairs]
     peaks, _ = cuda.peak_weights(shape_of(placed), camera)
     expected_peaks, _ = peak_weights(host, upload_photos(photos, CPU), 0)
     harmonics = torch.cat([placed.sh0, placed.shN], 1)
@@ -133,11 +134,6 @@ def compare_steps(host: Gaussians, placed: Gaussians, gradients: StepGradients) 
     uploaded = StepGradients(*(tensor.to(device) for tensor in vars(gradients).values()))
     adam_step(other, uploaded, options, rates.to(device), 1)
     return largest(other.x, state.x)
-
-
-def share_off(values: Tensor, expected: Tensor) -> Tensor:
-    """Return the norm of a difference from values on the CPU, as a share of their norm."""
-    return (values.cpu() - expected).norm() / expected.norm()
 
 
 def largest(values: Tensor, expected: Tensor) -> float:

@@ -9,7 +9,7 @@ from numba.core import event
 
 
 class _FirstStart(event.Listener):
-    """Calls back at the first compilation, from whichever thread compiles."""
+    """Event listener that calls back at the first compilation, from whichever thread compiles."""
 
     def __init__(self, callback: Callable[[], None]) -> None:
         self.callback: Callable[[], None] | None = callback
@@ -24,7 +24,7 @@ class _FirstStart(event.Listener):
 
 
 def watch_compilation(callback: Callable[[], None]) -> AbstractContextManager[None]:
-    """A block in which ``callback`` is called once, before the first kernel that has to be compiled.
+    """Call ``callback`` once in the block, before the first kernel that has to be compiled.
 
     A kernel that is found in the cache does not count.
     """

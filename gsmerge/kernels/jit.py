@@ -98,7 +98,7 @@ def _temporary_folder() -> Path:
 
 
 def cache_folder() -> Path:
-    """Where this version's compiled kernels are kept."""
+    """Return the folder of this version's compiled kernels."""
     given = os.environ.get("GSMERGE_CACHE_DIR") or os.environ.get("NUMBA_CACHE_DIR")
     places = [Path(given)] if given else [Path(__file__).parent / "__pycache__", *_user_folders()]
     name = f"kernels-{_sources_hash()}"
@@ -221,7 +221,7 @@ def _checked(path: str) -> bytes | None:
 
 
 def _warn(message: str) -> None:
-    """Once for each process and message, on the command line as one line."""
+    """Warn once for each process and message, on the command line in one line."""
     if message not in _warned:
         _warned.add(message)
         warnings.warn(message, RuntimeWarning, stacklevel=2)

@@ -1,1 +1,1 @@
-"""Views that arrive one batch after the other: the same stages, folded into a state of bounded size (paper 4.5)."""
+"""Views in batches: the same stages, folded into a state of bounded size (paper section 4.5)."""

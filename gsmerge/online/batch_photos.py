@@ -1,4 +1,4 @@
-"""The photos of a batch: brought to the state's size, colours fitted to them, some of them stored for later."""
+"""Photos of a batch: resizing to the state, fit of colours, storage of some for later."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MARGIN = 2.0  # pixels that the rasterizer's low-pass adds to that
 
 @dataclass(frozen=True, eq=False)
 class BatchPhotos:
-    """Photos ``images [v,h,w,3]`` float32, sRGB in [0, 1], and their cameras, of the same size."""
+    """Photos ``images [v,h,w,3]`` float32, sRGB in [0, 1], and cameras of the same size."""
 
     images: np.ndarray
     cameras: Cameras
@@ -33,12 +33,12 @@ class BatchPhotos:
         return len(self.images)
 
     def photos(self, level: int = 1) -> Photos:
-        """For rendering against them, each side divided by ``level``."""
+        """Return the photos for rendering against them, each side divided by ``level``."""
         return photos_of(self.images, self.cameras, level)
 
 
 def resize_photos(images: np.ndarray, cameras: Cameras, width: int, height: int) -> BatchPhotos:
-    """Photos brought to another size (area averages)."""
+    """Resize photos by area averages."""
     size = width, height
     if size == (cameras.width, cameras.height):
         return BatchPhotos(images, cameras)
@@ -47,19 +47,19 @@ def resize_photos(images: np.ndarray, cameras: Cameras, width: int, height: int)
 
 
 def resize_cameras(cameras: Cameras, width: int, height: int) -> Cameras:
-    """The same views in pictures of another size."""
+    """Return the same views in pictures of another size."""
     shape = np.array([[width / cameras.width], [height / cameras.height], [1.0]])
     return Cameras(cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64) * shape, width, height)
 
 
 def concat_cameras(first: Cameras, second: Cameras) -> Cameras:
-    """Cameras of one size, one after the other."""
+    """Concatenate cameras of one size."""
     viewmats = np.concatenate([first.viewmats, second.viewmats], dtype=np.float64)
     return Cameras(viewmats, np.concatenate([first.Ks, second.Ks], dtype=np.float64), first.width, first.height)
 
 
 def view_ids(known: Cameras, cameras: Cameras) -> np.ndarray:
-    """``[v]`` index of each view: of the known view with the same camera to the last bit, or a new one."""
+    """Return the index ``[v]`` of each view: of the known view with an identical camera, or a new index."""
     known_ids = {row: i for i, row in reversed(list(enumerate(_rows(known))))}
     ids = np.array([known_ids.get(row, -1) for row in _rows(cameras)], np.int64)
     ids[ids < 0] = len(known) + np.arange(np.count_nonzero(ids < 0))
@@ -67,7 +67,7 @@ def view_ids(known: Cameras, cameras: Cameras) -> np.ndarray:
 
 
 def _rows(cameras: Cameras) -> list[bytes]:
-    """Every camera as bytes."""
+    """Return every camera as bytes."""
     both = zip(cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64), strict=True)
     return [viewmat.tobytes() + K.tobytes() for viewmat, K in both]
 
@@ -75,10 +75,7 @@ def _rows(cameras: Cameras) -> list[bytes]:
 def update_replay(
     replay: Replay, batch_photos: BatchPhotos, view_ids: np.ndarray, num_views: int, max_photos: int
 ) -> Replay:
-    """The stored photos with new ones among them: every n-th of all views, n a power of two.
-
-    ``view_ids [s]``: the view of each new one; of a view that is stored already, the first photo stays.
-    """
+    """Add photos of views ``view_ids [s]`` to the stored ones, and keep every n-th of all views, n a power of two."""
     ids, rows = np.unique(view_ids, return_index=True)
     new = ~np.isin(ids, replay.views)
     views, step = np.concatenate([replay.views, ids[new]]), 1
@@ -116,9 +113,10 @@ def fit_batch_colors(
 
 
 def groups_in_view(features: FeatureGaussians, cameras: Cameras) -> np.ndarray:
-    """``[v,g]`` bool: groups that may show in each view, by their position and size.
+    """Return a mask ``[v,g]`` of groups that may show in each view, by their position and size.
 
-    The only step that goes through all groups: the time of those after it depends on what the views see.
+    The only step that goes through all groups: the time of those after it depends on what the views
+    see.
     """
     means = features.means.astype(np.float64)
     radii = REACH * np.sqrt(np.trace(features.covars, axis1=1, axis2=2, dtype=np.float64))
@@ -139,15 +137,12 @@ def groups_in_view(features: FeatureGaussians, cameras: Cameras) -> np.ndarray:
 
 
 def rows_in_view(features: FeatureGaussians, cameras: Cameras) -> np.ndarray:
-    """Rows, rising, of the groups that may show in some view."""
+    """Return the rising rows of the groups that may show in some view."""
     return np.flatnonzero(groups_in_view(features, cameras).any(0))
 
 
 def pixel_errors(gaussians: Gaussians, photos: Photos, height: int, width: int) -> np.ndarray:
-    """``[v,h,w]`` float32 mean squared colour error of every pixel, plus the squared transmittance.
-
-    The transmittance counts holes, which a black photo would hide.
-    """
+    """Return squared colour errors of pixels ``[v,h,w]``, plus squared transmittance: black photos would hide holes."""
 
     def score(view: int, image: np.ndarray, transmittance: np.ndarray) -> np.ndarray:
         errors = ((np.clip(image, 0, 1) - photos.images[view]) ** 2).mean(-1) + transmittance**2
@@ -157,7 +152,7 @@ def pixel_errors(gaussians: Gaussians, photos: Photos, height: int, width: int) 
 
 
 def group_errors(features: FeatureGaussians, members: Members, errors: np.ndarray) -> np.ndarray:
-    """``[g]`` mean of the pixels' errors ``[v,h,w]`` over each group's members; one without a pixel counts as 1."""
+    """Average the pixels' errors ``[v,h,w]`` over each group's members, ``[g]``; members without a pixel count as 1."""
     starts, rows = features.starts, features.members
     pixels = rows if members.pixels is None else members.pixels[rows]
     each = np.where(pixels >= 0, errors.reshape(-1)[pixels], 1.0)
@@ -172,10 +167,7 @@ def novel_rows(
     cameras: Cameras,
     options: OnlineOptions,
 ) -> np.ndarray:
-    """Rows of a batch's groups that show something which the state does not show as well.
-
-    ``there``: the state's Gaussians in view; ``photos``: the batch's, at half the state's size.
-    """
+    """Return the rows of a batch's groups that show half-size photos better than the state's Gaussians ``there``."""
     if options.tolerance == 0:
         return np.arange(len(features))
     size = cameras.height, cameras.width

@@ -1,4 +1,4 @@
-"""The state and its settings in one object: views in batches, Gaussians at any time."""
+"""State and settings in one object: views in batches, Gaussians at any time."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from gsmerge.types import Gaussians, Scene
 
 
 class Compactor:
-    """Compacts views that arrive in batches of any size (paper section 4.5, "Online reconstruction").
+    """Compactor of views that arrive in batches of any size (paper section 4.5, "Online reconstruction").
 
     Args:
         **settings: Settings by name, those of :class:`gsmerge.CompactOptions` and of
@@ -40,7 +40,7 @@ class Compactor:
 
     @classmethod
     def load(cls, path: str | PathLike[str], **settings: Any) -> Compactor:
-        """A compactor that continues from a saved state, with its settings unless others are given.
+        """Load a saved state, with its settings unless others are given.
 
         Raises:
             SceneError: If the file cannot be read or is damaged.
@@ -53,12 +53,12 @@ class Compactor:
         return compactor
 
     def __len__(self) -> int:
-        """Groups so far."""
+        """Return the number of groups so far."""
         return 0 if self._state is None else len(self._state)
 
     @property
     def state(self) -> OnlineState | None:
-        """The state after all batches so far; None before the first."""
+        """State after all batches so far; None before the first."""
         return self._state
 
     @property
@@ -74,12 +74,12 @@ class Compactor:
     def decode(
         self, *, k: int | None = None, budget: int | str | None = None, progress: Progress | None = None, **fit: Any
     ) -> Gaussians:
-        """The Gaussians so far, see :func:`gsmerge.online.decode_stored.decode_stored`.
+        """Decode the Gaussians so far, see :func:`gsmerge.online.decode_stored.decode_stored`.
 
         Args:
-            k: Gaussians of each group; None: as in the settings.
+            k: Gaussians of each group; None: that of the settings.
             budget: Gaussians in all instead.
-            progress: As of :func:`gsmerge.compact`.
+            progress: See :func:`gsmerge.compact`.
             **fit: Settings of the fit to the stored photos, such as ``fit="none"`` or ``effort="fast"``.
 
         Raises:

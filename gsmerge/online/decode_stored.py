@@ -1,4 +1,4 @@
-"""State -> gaussians: decoded at any K or number, and fitted to the photos that the state has stored."""
+"""State -> Gaussians: decoded at any K or number, and fitted to the stored photos."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from gsmerge.types import Gaussians
 
 @dataclass(frozen=True)
 class DecodeResult:
-    """Gaussians of a state in the world frame, what the fit did (None without one), and notes for the user."""
+    """Gaussians of a state in the world frame, a report of the fit (None without one), and notes."""
 
     gaussians: Gaussians
     fit: FitReport | None
@@ -34,12 +34,12 @@ def decodable(stored: Encoded | OnlineState, *, fitted_colors: bool = True) -> E
 
 
 def num_photos(stored: Encoded | OnlineState) -> int:
-    """Photos that a fit can use."""
+    """Return the number of photos that a fit can use."""
     return 0 if isinstance(stored, Encoded) else len(stored.replay)
 
 
 def default_fit(stored: Encoded | OnlineState) -> FitOptions:
-    """The full fit where there are photos, otherwise none."""
+    """Return the options of the full fit where there are photos, otherwise of none."""
     return FitOptions(fit="full" if num_photos(stored) else "none")
 
 
@@ -60,14 +60,12 @@ def decode_stored(
     device: str = "cpu",
     progress: Progress | None = None,
 ) -> DecodeResult:
-    """A state as Gaussians in the world frame, fitted to its photos; or an encoded scene, which has none.
+    """Decode a state, fitted to its photos, or an encoded scene, into Gaussians in the world frame.
 
-    Args:
-        k, budget: As of :func:`gsmerge.decode_scene`. A full fit begins with fewer and grows to the number.
-        options: Of the fit, with its steps; None: the full one at its defaults where there are photos, otherwise none.
-
-    Raises:
-        UsageError: If a fit is asked for and there are no photos, or K or the budget is out of range.
+    ``k`` and ``budget`` are those of :func:`gsmerge.decode_scene`; a full fit begins with fewer
+    Gaussians and grows to the number. ``options`` of the fit: None: the full one at its defaults
+    where there are photos, otherwise none. Raises UsageError if a fit is asked for and there are no
+    photos, or K or the budget is out of range.
     """
     options = options or default_fit(stored)
     check_fit(stored, options)

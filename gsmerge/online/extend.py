@@ -1,4 +1,4 @@
-"""State + new views -> state: grouped, encoded, matched and merged into what is there, and fitted to their photos."""
+"""State and new views -> state: groups matched and merged into it, and fitted to their photos."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches, Scene
 
 @dataclass(frozen=True)
 class BatchReport:
-    """What became of a batch of views."""
+    """Report of a batch of views: numbers of its groups, and the record of the run."""
 
     num_views: int
     num_input: int  # Gaussians of the batch
@@ -78,19 +78,10 @@ def extend(
 ) -> tuple[OnlineState, BatchReport]:
     """Add a batch of views to a state (paper section 4.5, "Online reconstruction").
 
-    Args:
-        state: What earlier batches left; None: this is the first one.
-        scene: The new views, in the same world as the earlier ones; of tensors, too, the state has arrays.
-        options: Settings of all stages; None: the defaults, without a fit.
-        online: What of the batch enters the state, and how; None: the defaults.
-        progress: As of :func:`gsmerge.compact`.
-
-    Returns:
-        The new state, the old one left as it is, and what was done.
-
-    Raises:
-        ValueError: If a setting is out of range or asks for what a state cannot have, or the degree of the harmonics
-            is not that of the state.
+    ``state``: what earlier batches left, unchanged; None: this is the first one. ``scene``: the new
+    views, in the same world as the earlier ones; tensors become arrays. ``online``: which part of
+    the batch enters the state, and how. Raises ValueError if a setting is out of range or asks for
+    what a state cannot have, or the degree of the harmonics is not that of the state.
     """
     options, online = options or CompactOptions().with_settings({"fit": "none"}), online or OnlineOptions()
     max_k = online.max_k if state is None else state.settings.max_k
@@ -124,7 +115,7 @@ def _add_batch(
     online: OnlineOptions,
     max_k: int,
 ) -> tuple[OnlineState, dict[str, int]]:
-    """The state with a batch in it, and what became of the batch's groups by key of the report."""
+    """Add a batch to the state; return it, and the numbers of the batch's groups by key of the report."""
     scene = prepared.scene
     size = scene.cameras if state is None else state.cameras
     photos = resize_photos(scene_pictures(scene), scene.cameras, size.width, size.height)
@@ -159,7 +150,7 @@ def _add_batch(
 
 
 def _check(state: OnlineState | None, scene: Scene, options: CompactOptions, max_k: int) -> None:
-    """Refuse what no state can have."""
+    """Refuse settings that no state can have, and harmonics of another degree."""
     for name in options.whole_only:
         raise UsageError(f"{name}: goes with a whole scene, not with views that come one after the other; use compact")
     if options.fit.fit == "full":
@@ -175,10 +166,7 @@ def _check(state: OnlineState | None, scene: Scene, options: CompactOptions, max
 def _enter(
     groups: GroupSet, new: GroupSet, prepared: Prepared, plan: Plan, photos: BatchPhotos, rows: np.ndarray, max_k: int
 ) -> tuple[GroupSet, dict[str, int]]:
-    """The state's groups with new ones among them, and how many were merged and how many no view shows.
-
-    ``rows``: the state's groups that the batch's views may see.
-    """
+    """Merge new groups into the state's ``rows`` in view, and add those that a view shows; return groups and counts."""
     partners = find_partners(take(groups.features, rows), new.features, plan.match)
     has_partner = partners >= 0
     joining = select_groups(new, np.flatnonzero(has_partner))
@@ -195,9 +183,10 @@ def _enter(
 
 
 def find_partners(features: FeatureGaussians, new: FeatureGaussians, options: MatchOptions) -> np.ndarray:
-    """``[n]`` int64: the state's group that shows the same surface as each new one, -1 for none; no group gets two.
+    """Return the state's group with the same surface as each new one, ``[n]`` int64, -1 for none.
 
-    Matched as across the views of one batch, the state being one view and the batch another.
+    No group gets two. Matched as across the views of one batch, the state being one view and the
+    batch another.
     """
     both = FeatureGaussians.concat([features, new])
     sides = (np.arange(len(both)) >= len(features)).astype(np.int64)
@@ -222,7 +211,7 @@ def merge_into(groups: GroupSet, new: GroupSet, rows: np.ndarray, max_k: int) ->
 
 
 def _first_state(groups: GroupSet, prepared: Prepared, plan: Plan, max_k: int) -> OnlineState:
-    """The state that a first batch makes."""
+    """Make the state of a first batch."""
     cameras = prepared.scene.cameras
     settings = StoredSettings(
         num_input=prepared.given.num_gaussians,
@@ -245,7 +234,7 @@ def _first_state(groups: GroupSet, prepared: Prepared, plan: Plan, max_k: int) -
 def _grown_state(
     state: OnlineState, groups: GroupSet, prepared: Prepared, plan: Plan, new_cameras: Cameras
 ) -> OnlineState:
-    """The state with other groups, and with the views and the unseen Gaussians of a further batch."""
+    """Return the state with other groups, and with the views and unseen Gaussians of a further batch."""
     kept = [gaussians for gaussians in (state.kept, plan.unseen) if gaussians is not None]
     num_input = state.settings.num_input + prepared.given.num_gaussians
     k = AUTO if plan.auto_count else plan.decode.k

@@ -1,4 +1,4 @@
-"""States in files: save, load, and extend one by the views of a scene's files."""
+"""States in files: save, load, and extend by the views of a scene's files."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from gsmerge.types import Cameras
 
 
 def save_state(path: str | PathLike[str], state: OnlineState, *, overwrite: bool = False) -> None:
-    """Write a state, bit for bit as it is in memory."""
+    """Write a state to a file, bit for bit."""
     groups, replay = state.groups, state.replay
     arrays = {
         "children.counts": np.diff(groups.features.starts).astype(np.uint8),
@@ -42,18 +42,17 @@ def save_state(path: str | PathLike[str], state: OnlineState, *, overwrite: bool
 
 
 def load_state(path: str | PathLike[str]) -> OnlineState:
-    """A state from a file, or an encoded scene (:func:`gsmerge.save_encoded`) as a state.
-
-    Raises:
-        SceneError: If the file is missing or damaged, of another format or a newer schema, lacks an array, or holds
-            numbers out of range.
-    """
+    """Read a state from a file; an encoded scene (:func:`gsmerge.save_encoded`) becomes a state."""
     stored = load_stored(path)
     return from_encoded(stored) if isinstance(stored, Encoded) else stored
 
 
 def load_stored(path: str | PathLike[str]) -> Encoded | OnlineState:
-    """An encoded scene or a state, whichever the file holds."""
+    """Read an encoded scene or a state, whichever the file holds.
+
+    Raises SceneError if the file is missing or damaged, of another format or a newer schema, lacks
+    an array, or holds numbers out of range.
+    """
     file = read_gsm(path, ENCODED, STATE)
     if file.kind == ENCODED:
         return read_encoded(file)
@@ -67,7 +66,7 @@ def load_stored(path: str | PathLike[str]) -> Encoded | OnlineState:
 
 
 def _read_groups(file: GsmFile, max_k: int) -> GroupSet:
-    """The groups, each with at least one child and no more than ``max_k``."""
+    """Return the groups, each with at least one child and no more than ``max_k``."""
     features = file.features()
     g = len(features)
     counts = file.array("children.counts", np.uint8, g).astype(np.int64)
@@ -82,7 +81,7 @@ def _read_groups(file: GsmFile, max_k: int) -> GroupSet:
 
 
 def _read_replay(file: GsmFile, cameras: Cameras) -> Replay:
-    """The stored photos, of views that are there."""
+    """Return the stored photos, if their views are there."""
     views = file.array("replay.views", np.int32, None).astype(np.int64)
     images = file.array("replay.images", np.uint8, len(views), cameras.height, cameras.width, 3)
     if len(views) and not (views[0] >= 0 and views[-1] < len(cameras) and (np.diff(views) > 0).all()):
@@ -100,18 +99,13 @@ def extend_file(
     progress: Progress | None = None,
     seconds_before: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
-    """Add a batch of views to the state in a file, or make the file if there is none -> the report, plain JSON types.
+    """Add a batch of views to the state in a file, made if missing, and return the report as plain JSON types.
 
-    The file is replaced when all is done, and not at all if anything goes wrong or another process has changed it.
-
-    Args:
-        path: The state, or an encoded scene.
-        settings: As of :class:`gsmerge.Compactor`; by default the state's own.
-        seconds_before: Wall time by name of what the caller did before.
-
-    Raises:
-        SceneError: If the state or the scene cannot be read, or the state cannot be written or was changed meanwhile.
-        UsageError: If a setting is unknown, out of range, or needs what the state or the scene does not have.
+    The file is replaced when all is done, and not at all if anything goes wrong or another process
+    has changed it. ``settings``: see :class:`gsmerge.Compactor`; by default the state's own.
+    ``seconds_before``: wall time by name of the caller's earlier steps. Raises SceneError if a file
+    cannot be read or written or was changed meanwhile, UsageError if a setting is unknown, out of
+    range, or needs what the state or the scene does not have.
     """
     start, identity = perf_counter(), _file_identity(path)
     state = None if identity is None else load_state(path)
@@ -144,7 +138,7 @@ def extend_file(
 
 
 def _file_identity(path: Path) -> tuple[int, int, int] | None:
-    """What differs between one file of this name and the next; None where there is none."""
+    """Return numbers that differ between one file of this name and the next; None without a file."""
     try:
         status = os.stat(path)
     except OSError:  # other problems show when it is written

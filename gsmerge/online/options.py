@@ -1,4 +1,4 @@
-"""Settings of how a batch of new views enters a state."""
+"""Settings for adding a batch of new views to a state."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gsmerge.stages.decode import MAX_CHILDREN
 
 @dataclass(frozen=True)
 class OnlineOptions:
-    """How new views enter a state.
+    """Options of the way in which new views enter a state.
 
     Args:
         max_k: Most Gaussians of a group that can be decoded later, 1 to 8; an existing state keeps its own.
@@ -49,10 +49,7 @@ class OnlineOptions:
 def merge_settings(
     settings: Mapping[str, Any], state: StoredScene | None = None
 ) -> tuple[CompactOptions, OnlineOptions]:
-    """All settings: as given, otherwise those that the state was made with, otherwise the defaults.
-
-    Nothing but colours is fitted batch by batch; the full fit comes when decoding.
-    """
+    """Merge settings: given, else those of the state, else the defaults, without a full fit."""
     names = OnlineOptions.__dataclass_fields__.keys()
     known = names | CompactOptions().to_dict().keys()
     stored = {} if state is None else state.about["options"]

@@ -1,4 +1,4 @@
-"""What is stored between two batches of views, and operations on its groups."""
+"""State between two batches of views, and operations on its groups."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CHILD_FOOTPRINT = 1e-3  # of the group's: children need no least size, as it is 
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """Photos of earlier views."""
+    """Stored photos of earlier views."""
 
     images: np.ndarray  # [r,h,w,3] uint8, of the size of the state's cameras
     views: np.ndarray  # [r] int64, rising: which of the state's views they are
@@ -34,7 +34,7 @@ class Replay:
 
 
 def no_photos(cameras: Cameras) -> Replay:
-    """None at all, of the size of some views."""
+    """Return no photos, of the size of some views."""
     return Replay(np.zeros((0, cameras.height, cameras.width, 3), np.uint8), np.zeros(0, np.int64))
 
 
@@ -59,10 +59,10 @@ class GroupSet:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class OnlineState(StoredScene):
-    """Everything that new views are added to. Its size depends on the scene, not on the number of views.
+    """State to which new views are added; its size depends on the scene, not on the number of views.
 
-    The frame is that of the first batch; the cameras are those of all views so far, at the size of the first batch's;
-    ``about`` also has the numbers of every batch.
+    The frame is that of the first batch; the cameras are those of all views so far, at the size of
+    the first batch's; ``about`` also has the numbers of every batch.
     """
 
     groups: GroupSet
@@ -78,7 +78,7 @@ class OnlineState(StoredScene):
 
 
 def bake(features: FeatureGaussians, members: Members, networks: NetworkContext | None, max_k: int) -> GroupSet:
-    """Groups as what they decode to, so that gains, latents and decoder heads are needed no more."""
+    """Decode groups into moments and children, so that gains, latents and decoder heads are needed no more."""
     ones = feature_to_gaussians(features)
     children, parents = ones, np.arange(len(features))
     if max_k > 1:
@@ -92,7 +92,7 @@ def bake(features: FeatureGaussians, members: Members, networks: NetworkContext 
 
 
 def _group_set(features: FeatureGaussians, ones: Gaussians, children: Gaussians, parents: np.ndarray) -> GroupSet:
-    """Groups with the moments of what they decode to (``ones``); ``parents``: the rising group of each child."""
+    """Make groups with the moments of ``ones``, to which they decode; ``parents``: the rising group of each child."""
     count = len(features)
     neutral, no_latents = np.ones(count, np.float32), np.zeros((count, 0), np.float32)
     same = replace(features, gains=neutral, latents=no_latents, **moments_of(ones))
@@ -100,7 +100,7 @@ def _group_set(features: FeatureGaussians, ones: Gaussians, children: Gaussians,
 
 
 def from_encoded(encoded: Encoded) -> OnlineState:
-    """An encoded scene as a state of one batch, without photos."""
+    """Make a state of one batch, without photos, of an encoded scene."""
     ones, _ = children_of(encoded, np.ones(len(encoded), np.int64))
     children, parents = children_of(encoded, np.full(len(encoded), encoded.settings.max_k))
     groups = _group_set(encoded.features, ones, children, parents)
@@ -123,7 +123,7 @@ def from_encoded(encoded: Encoded) -> OnlineState:
 
 
 def moments_of(gaussians: Gaussians) -> dict[str, np.ndarray]:
-    """The fields of Feature Gaussians that decode to given Gaussians, at gains of one."""
+    """Return the fields of Feature Gaussians that decode to given Gaussians, at gains of one."""
     scales = gaussians.scales.astype(np.float64)
     _, middle, largest = np.sort(scales, -1).T
     opacities = gaussians.opacities.astype(np.float64).clip(0, MAX_OPACITY)
@@ -137,19 +137,19 @@ def moments_of(gaussians: Gaussians) -> dict[str, np.ndarray]:
 
 
 def with_child_rows(features: FeatureGaussians, parents: np.ndarray) -> FeatureGaussians:
-    """Feature Gaussians whose members are the rows 0, 1, ... of their children; ``parents`` rising."""
+    """Return Feature Gaussians whose members are the rows 0, 1, ... of their children; ``parents`` rise."""
     starts = np.concatenate([[0], np.bincount(parents, minlength=len(features)).cumsum()])
     return replace(features, starts=starts, members=np.arange(len(parents)))
 
 
 def child_members(groups: GroupSet) -> Members:
-    """The children as members of their groups."""
+    """Return the children as members of their groups."""
     footprints = CHILD_FOOTPRINT * groups.features.footprints.repeat(np.diff(groups.features.starts))
     return gaussian_members(groups.children, footprints)
 
 
 def select_groups(groups: GroupSet, rows: np.ndarray) -> GroupSet:
-    """Some of the groups, with their children."""
+    """Return some of the groups, with their children."""
     features = take(groups.features, rows)
     children = groups.children[features.members]
     members = np.arange(len(children))
@@ -157,7 +157,7 @@ def select_groups(groups: GroupSet, rows: np.ndarray) -> GroupSet:
 
 
 def concat_groups(sets: list[GroupSet]) -> GroupSet:
-    """The groups of all sets, in order."""
+    """Concatenate the groups of all sets."""
     features = FeatureGaussians.concat([groups.features for groups in sets])
     children = Gaussians.concat([groups.children for groups in sets])
     return GroupSet(
@@ -169,7 +169,7 @@ def concat_groups(sets: list[GroupSet]) -> GroupSet:
 
 
 def limit_children(groups: GroupSet, max_k: int) -> GroupSet:
-    """Groups with at most ``max_k`` children each, those of larger ones pooled."""
+    """Pool the children of groups with more than ``max_k`` to this number."""
     rows = np.flatnonzero(np.diff(groups.features.starts) > max_k)
     if len(rows) == 0:
         return groups
@@ -180,14 +180,14 @@ def limit_children(groups: GroupSet, max_k: int) -> GroupSet:
 
 
 def replace_groups(groups: GroupSet, rows: np.ndarray, others: GroupSet) -> GroupSet:
-    """The groups with some replaced by others, one for one and in place."""
+    """Replace some groups by others, one for one, at their rows."""
     index = np.arange(len(groups))
     index[rows] = len(groups) + np.arange(len(rows))
     return select_groups(concat_groups([groups, others]), index)
 
 
 def with_fitted_colors(groups: GroupSet) -> GroupSet:
-    """Groups and children in the colours that fit the photos."""
+    """Return groups and children in the colours that fit the photos."""
     offsets = groups.fitted_sh0 - groups.features.sh0
     sizes = np.diff(groups.features.starts)
     features = replace(groups.features, sh0=groups.fitted_sh0)
@@ -196,7 +196,7 @@ def with_fitted_colors(groups: GroupSet) -> GroupSet:
 
 
 def to_encoded(state: OnlineState, *, fitted_colors: bool = True) -> Encoded:
-    """The state as an encoded scene, in the colours that fit the photos or else in those of the exports."""
+    """Return the state as an encoded scene, in the fitted colours or in those of the exports."""
     groups = with_fitted_colors(state.groups) if fitted_colors else state.groups
     features = groups.features
     return Encoded(

@@ -1,4 +1,4 @@
-"""Rendering of tensors, which autograd can differentiate."""
+"""Differentiable rendering of tensors."""
 
 from __future__ import annotations
 
@@ -20,26 +20,8 @@ from gsmerge.types import Cameras, Gaussians
 Shape = tuple[Tensor, Tensor, Tensor, Tensor]  # means, quaternions, scales, opacities
 
 
-def _view_gradients(
-    plan: ViewPlan,
-    image: Array,
-    transmittance: Array,
-    grad_image: Array,
-    grad_alpha: Array,
-    pose: bool,
-    used: ColorGradients | None,
-) -> tuple[list[Array], Array | None, ColorGradients]:
-    """Gradients of one view's Gaussians, in the order of the fields, of its view matrix, and those through colours."""
-    colors = view_colors(plan)
-    shape = gradients_of(plan, colors, image, transmittance, grad_image, -grad_alpha, pose)
-    shade = color_gradients(plan, shape.colors, colors, used=used)
-    viewmat = pose_gradient(plan, shape, shade) if pose else None
-    rows = [shape.means + shade.means, shape.quats, shape.scales, shape.opacities, shade.sh0, shade.shN]
-    return rows, viewmat, shade
-
-
 class _Render(torch.autograd.Function):
-    """Images and alphas (and depths, without gradient) of the tensors of Gaussians and view matrices."""
+    """Images and alphas (and depths, without gradient) from the tensors of Gaussians and view matrices."""
 
     @staticmethod
     def forward(
@@ -77,13 +59,14 @@ class _Render(torch.autograd.Function):
                 np.ascontiguousarray(tensor.numpy())
                 for tensor in (images[view], lefts[view], grad_images[view], grad_alphas[view, ..., 0])
             )
-            rows, pose, shade = _view_gradients(
-                plan, image, left, grad_image, grad_alpha, ctx.needs_input_grad[-1], shade
-            )
+            colors, moves = view_colors(plan), ctx.needs_input_grad[-1]
+            shape = gradients_of(plan, colors, image, left, grad_image, -grad_alpha, moves)
+            shade = color_gradients(plan, shape.colors, colors, used=shade)
+            rows = [shape.means + shade.means, shape.quats, shape.scales, shape.opacities, shade.sh0, shade.shN]
             for total, row in zip(totals, rows, strict=True):
                 add_rows(plan.ids, row.reshape(len(row), total[:1].size), total.reshape(len(total), total[:1].size))
-            if pose is not None:
-                poses[view] = pose
+            if moves:
+                poses[view] = pose_gradient(plan, shape, shade)
         gradients = [
             torch.from_numpy(total).to(tensor.device, tensor.dtype) if needed else None
             for total, tensor, needed in zip([*totals, poses], tensors, ctx.needs_input_grad[4:], strict=True)
@@ -94,10 +77,7 @@ class _Render(torch.autograd.Function):
 def render_tensors(
     gaussians: Gaussians, cameras: Cameras, background: Array, *, with_depths: bool, **options: Any
 ) -> Rendering:
-    """:func:`gsmerge.render` of tensors on the CPU, with a backward pass.
-
-    Same arguments, except for the checked ``[3]`` background.
-    """
+    """Render tensors on the CPU with a backward pass, as :func:`gsmerge.render` does with a checked background."""
     tensors = (*vars(gaussians).values(), cameras.viewmats)
     cameras = replace(cameras, viewmats=cameras.viewmats.detach())
     drawn = _Render.apply(cameras, background, options, with_depths, *tensors)
@@ -136,21 +116,17 @@ class _Draw(torch.autograd.Function):
 
 
 def draw_colored(shape: Shape, colors: Tensor, camera: dict[str, Any], background: np.ndarray) -> tuple[Tensor, Tensor]:
-    """Image of one view, by the kernels; on a GPU there is :func:`gsmerge.render.cuda.rasterize`.
+    """Draw one view by the kernels; on a GPU there is :func:`gsmerge.render.cuda.rasterize`.
 
-    Args:
-        shape: Means ``[n,3]``, quaternions ``[n,4]``, scales ``[n,3]`` and opacities ``[n]``, float32.
-        colors: ``[n,3]``, any sign, float32.
-        camera: As :meth:`gsmerge.render.photos.Photos.camera` gives it.
-
-    Returns:
-        ``[h,w,3]``, differentiable in all tensors, and ``[n]`` bool: which Gaussians have a footprint in the view.
+    ``shape`` are means ``[n,3]``, quaternions ``[n,4]``, scales ``[n,3]`` and opacities ``[n]``,
+    ``colors [n,3]`` of any sign, all float32. Returns the image ``[h,w,3]``, differentiable in all
+    of them, and a mask ``[n]`` of the Gaussians with a footprint in the view.
     """
     return _Draw.apply(camera, background, *shape, colors)
 
 
 def seen_colors(means: Tensor, sh0: Tensor, shN: Tensor, viewmat: np.ndarray) -> Tensor:
-    """``[n,3]`` colours that harmonics ``[n,1,3]`` and ``[n,k-1,3]`` show a view, not below 0, without gradient."""
+    """Return the colours ``[n,3]`` of harmonics in a view, not below 0, without gradient."""
     eye = (-viewmat[:3, :3].T @ viewmat[:3, 3]).astype(np.float32)
     count, arrays = len(means), [tensor.detach().contiguous().numpy() for tensor in (means, sh0, shN)]
     colors = np.empty((count, 3), np.float32)

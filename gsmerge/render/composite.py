@@ -1,4 +1,4 @@
-"""Blending along a plan, its transpose, and the images of several views."""
+"""Blending along a plan, its transpose, and images of several views."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gsmerge.types import Cameras, Gaussians
 
 
 def background_color(background: ArrayLike) -> Array:
-    """Three numbers from one or three."""
+    """Return three numbers for one or three."""
     try:
         return np.broadcast_to(np.asarray(background, np.float32), (3,)).copy()
     except (TypeError, ValueError):
@@ -25,7 +25,7 @@ def background_color(background: ArrayLike) -> Array:
 
 
 def view_colors(plan: ViewPlan) -> Array:
-    """``[m,3]`` colours of the plan's Gaussians seen from its view, not below 0."""
+    """Return the colours ``[m,3]`` of the plan's Gaussians seen from its view, not below 0."""
     colors, splats = np.empty((len(plan.ids), 3), np.float32), plan.splats
     with use_threads() as threads:
         parallel_map(
@@ -36,7 +36,7 @@ def view_colors(plan: ViewPlan) -> Array:
 
 
 def blend(plan: ViewPlan, colors: Array, background: Array) -> tuple[Array, Array]:
-    """Image and remaining transmittance from the ``[m,3]`` colours of the plan's Gaussians."""
+    """Blend the ``[m,3]`` colours of the plan's Gaussians into an image and its remaining transmittance."""
     image = np.empty((plan.height, plan.width, 3), np.float32)
     transmittance = np.empty((plan.height, plan.width), np.float32)
 
@@ -51,7 +51,7 @@ def blend(plan: ViewPlan, colors: Array, background: Array) -> tuple[Array, Arra
 
 
 def mean_depths(plan: ViewPlan, alphas: Array, least_alpha: float = 0.0) -> Array:
-    """``[h,w]`` mean camera z of what is blended; 0 where ``alphas [h,w]`` are not above ``least_alpha``."""
+    """Return the mean camera z of what is blended, ``[h,w]``; 0 where ``alphas [h,w]`` are at most ``least_alpha``."""
     weighted = blend(plan, np.repeat(plan.depths[:, None], 3, 1), np.zeros(3, np.float32))[0][..., 0]
     return np.divide(weighted, alphas, out=np.zeros_like(weighted), where=alphas > least_alpha)
 
@@ -59,17 +59,9 @@ def mean_depths(plan: ViewPlan, alphas: Array, least_alpha: float = 0.0) -> Arra
 def composite(plan: ViewPlan, colors: Array | None = None, background: ArrayLike = 0.0) -> tuple[Array, Array]:
     """Blend the Gaussians of a view front to back.
 
-    Args:
-        plan: The view.
-        colors: ``[n,3]`` of all Gaussians, any sign, taken as they are. None: their spherical harmonics seen from
-            this view, not below 0.
-        background: What shines through, 1 or 3 numbers.
-
-    Returns:
-        ``[h,w,3]`` image and ``[h,w]`` remaining transmittance, float32.
-
-    Raises:
-        ValueError: If ``colors`` or ``background`` has another shape.
+    ``colors [n,3]`` of all Gaussians may have any sign; None: their spherical harmonics seen from
+    this view, not below 0. ``background``: 1 or 3 numbers. Returns the image ``[h,w,3]`` and the
+    remaining transmittance ``[h,w]``, float32; raises ValueError for other shapes.
     """
     if colors is None:
         return blend(plan, view_colors(plan), background_color(background))
@@ -79,19 +71,11 @@ def composite(plan: ViewPlan, colors: Array | None = None, background: ArrayLike
 
 
 def splat_adjoint(plan: ViewPlan, image: Array) -> Array:
-    """Sum, for every Gaussian, its blending weight times the image over the pixels.
+    """Sum every Gaussian's blending weight times an image ``[h,w,c]`` over the pixels, ``[n,c]`` float32.
 
     The transpose of :func:`composite` (without background) as a linear map from colours to images.
-
-    Args:
-        plan: The view.
-        image: ``[h,w,c]``; four channels cost little more than one.
-
-    Returns:
-        ``[n,c]`` float32.
-
-    Raises:
-        ValueError: If the image has another size than the view.
+    Four channels cost little more than one. Raises ValueError if the image has another size than
+    the view.
     """
     if image.ndim != 3 or image.shape[:2] != (plan.height, plan.width):
         raise ValueError(f"image: expected shape {[plan.height, plan.width, 'c']}, got {list(image.shape)}")
@@ -110,14 +94,7 @@ def splat_adjoint(plan: ViewPlan, image: Array) -> Array:
 
 
 def contributions(plan: ViewPlan) -> tuple[Array, Array]:
-    """Sum and maximum over the pixels of every Gaussian's blending weight.
-
-    Args:
-        plan: The view.
-
-    Returns:
-        ``[n]`` sums (pixels) and ``[n]`` maxima, float32; 0 for Gaussians that are not seen.
-    """
+    """Return sum (pixels) and maximum of every Gaussian's blending weight, both ``[n]`` float32; 0 if unseen."""
     totals = np.zeros((len(plan.ids), 2), np.float32)
     kernels.contributions(plan.footprints, plan.members, plan.offsets, plan.columns, plan.height, plan.width, totals)
     mass, peak = np.zeros((2, len(plan.splats)), np.float32)
@@ -141,7 +118,7 @@ class Rendering:
 
 
 def prepare_views(gaussians: Gaussians, cameras: Cameras) -> tuple[Splats, Array, Array]:
-    """Gaussians around the cameras' own centre, and view matrices and intrinsics in float64.
+    """Return splats around the cameras' own centre, and view matrices and intrinsics in float64.
 
     The centre is taken off in float64, so that scenes in geographic coordinates keep their detail.
     """

@@ -92,23 +92,10 @@ def rasterize(
 ) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
     """Draw Gaussians into one view, by one call of gsplat's ``rasterization``.
 
-    Args:
-        shape: Means ``[n,3]``, quaternions ``[n,4]``, scales ``[n,3]`` and opacities ``[n]``.
-        colors: ``[n,3]``, taken as they are, or with ``sh_degree`` ``[n,k,3]`` spherical harmonics.
-        camera: World-to-camera matrix ``[4,4]``, intrinsics ``[3,3]``, width and height.
-        background: ``[3]``.
-        eps2d: Dilation of the footprints, pixels squared.
-        antialiased: Lower the opacity by what the dilation adds to the footprint.
-        near: Nearest depth drawn, world units.
-        far: Farthest depth drawn.
-        with_depths: Also draw the mean depth.
-
-    Returns:
-        Image ``[h,w,3]``, alpha ``[h,w,1]``, depth ``[h,w,1]`` without gradients or None, and ``[n]``
-        bool: which Gaussians have a footprint in the view.
-
-    Raises:
-        GsmergeError: If gsplat cannot be used.
+    ``colors`` are ``[n,3]``, or with ``sh_degree`` spherical harmonics ``[n,k,3]``; ``background``
+    is ``[3]``. Returns the image ``[h,w,3]``, alpha ``[h,w,1]``, mean depth ``[h,w,1]`` without
+    gradients or None, and a mask ``[n]`` of the Gaussians with a footprint in the view. Raises
+    GsmergeError if gsplat cannot be used.
     """
     means, quats, scales, opacities = (tensor.float() for tensor in shape)
     viewmat, K, width, height = camera
@@ -143,18 +130,10 @@ def _no_zero(quats: Tensor) -> Tensor:
 
 
 def peak_weights(shape: Shape, camera: Camera, *, eps2d: float = EPS2D) -> tuple[Tensor, Tensor]:
-    """Find the largest blending weight of every Gaussian in a view, and which have a footprint there.
+    """Return the largest blending weight ``[n]`` of every Gaussian in a view, and a mask ``[n]`` of footprints.
 
-    gsplat lists the Gaussians of every pixel, nearest first; their weights follow from its footprints.
-    That takes about 150 bytes for each of them.
-
-    Args:
-        shape: As of :func:`rasterize`.
-        camera: As of :func:`rasterize`.
-        eps2d: Dilation of the footprints, pixels squared.
-
-    Returns:
-        ``[n]`` float32 and ``[n]`` bool.
+    gsplat lists the Gaussians of every pixel, nearest first; their weights follow from its
+    footprints. That takes about 150 bytes for each of them.
     """
     means, quats, scales, opacities = (tensor.float() for tensor in shape)
     viewmat, K, width, height = camera
@@ -196,11 +175,12 @@ def render_cuda(
     antialiased: bool,
     with_depths: bool,
 ) -> Rendering:
-    """:func:`gsmerge.render` by gsplat; same arguments, except for the checked ``[3]`` background.
+    """Render CUDA tensors by gsplat, as :func:`gsmerge.render` does; the ``[3]`` background is checked already.
 
-    View by view: in one call of several views gsplat copies all harmonics for each of them, which for
-    84 views of 14 million Gaussians of degree 4 would take 350 GB. Positions are taken relative to the
-    cameras' own centre in float64 first, so that scenes in geographic coordinates keep their detail.
+    View by view: in one call of several views gsplat copies all harmonics for each of them, which
+    for 84 views of 14 million Gaussians of degree 4 would take 350 GB. Positions are taken relative
+    to the cameras' own centre in float64 first, so that scenes in geographic coordinates keep their
+    detail.
     """
     check_range(near, far, EPS2D)
     viewmats = cameras.viewmats.double()

@@ -1,4 +1,4 @@
-"""Gradients of a view: what a loss on the image wants of every Gaussian in it.
+"""Gradients of a loss on the image of a view with respect to its Gaussians.
 
 For training loops, on arrays and without autograd::
 
@@ -7,8 +7,8 @@ For training loops, on arrays and without autograd::
     wanted = plan_gradients(plan, grad_image, image=image, transmittance=transmittance, colors=colors)
     means[wanted.ids] -= rate * wanted.means
 
-:func:`gsmerge.render` is differentiable with the same kernels. Nothing here is compiled or imported before it is
-used. Results do not depend on the number of threads.
+:func:`gsmerge.render` is differentiable with the same kernels. Nothing here is compiled or imported
+before it is used. Results do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Gradients:
 
 @dataclass(frozen=True, eq=False)
 class ColorGradients:
-    """Gradients of a loss through the colours that the Gaussians of a plan show its view."""
+    """Gradients of a loss through the colours of a plan's Gaussians in its view."""
 
     ids: Array  # [m] int32, ascending: the Gaussians that the rows belong to; all others have none
     sh0: Array  # [m,1,3] float32
@@ -56,7 +56,7 @@ def _expect(name: str, array: Array, shape: tuple[int, ...]) -> Array:
 
 
 def _blocks(count: int, threads: int) -> list[tuple[int, int]]:
-    """Ranges of Gaussians, whole blocks of the kernels each."""
+    """Return ranges of Gaussians, each of whole blocks of the kernels."""
     block = project_backward.BLOCK
     num_blocks = -(-count // block)
     num = max(1, min(threads, count // WORTH))
@@ -73,7 +73,7 @@ def gradients_of(
     grad_left: Array,
     with_viewmat: bool,
 ) -> Gradients:
-    """:func:`plan_gradients` of contiguous float32 arrays, unchecked; colours ``[m,3]`` of the plan's Gaussians."""
+    """Return the gradients of :func:`plan_gradients` for unchecked contiguous float32 arrays; colours ``[m,3]``."""
     m, splats = len(plan.ids), plan.splats
     slots = np.empty((len(plan.members), blend_backward.SUMS), np.float32)
     sums = np.zeros((m, blend_backward.SUMS), np.float32)
@@ -118,23 +118,13 @@ def plan_gradients(
     colors: Array | None = None,
     with_viewmat: bool = False,
 ) -> Gradients:
-    """Gradients of a loss on the image that :func:`gsmerge.render.composite` made of a plan.
+    """Return the gradients of a loss on the image that :func:`gsmerge.render.composite` made of a plan.
 
-    Args:
-        plan: The view, from :func:`gsmerge.render.plan_view`.
-        grad_image: ``[h,w,3]`` gradient with respect to the image.
-        grad_transmittance: ``[h,w]`` gradient with respect to the remaining transmittance; None for none. (The
-            background's part is in the image's gradient already.)
-        image: ``[h,w,3]``, as it was made, background included.
-        transmittance: ``[h,w]``, as it was made.
-        colors: ``[n,3]``, as they were given to ``composite``; None if none were.
-        with_viewmat: Also the gradient with respect to the world-to-camera matrix.
-
-    Returns:
-        The gradients. Zero where alpha is clamped at 0.99, and through what decides which weights are drawn at all.
-
-    Raises:
-        ValueError: If an array has another shape.
+    ``grad_image [h,w,3]`` and ``grad_transmittance [h,w]`` (None: zero) are those of the loss;
+    ``image``, with its background, and ``transmittance`` are what ``composite`` returned,
+    ``colors`` what it was given. ``with_viewmat`` asks for the gradient of the world-to-camera
+    matrix as well. Gradients are zero where alpha is clamped at 0.99, and through what decides
+    which weights are drawn at all. Raises ValueError if an array has another shape.
     """
     size = plan.height, plan.width
     grad_image, image = _expect("grad_image", grad_image, (*size, 3)), _expect("image", image, (*size, 3))
@@ -149,21 +139,13 @@ def plan_gradients(
 def color_gradients(
     plan: ViewPlan, grad_colors: Array, colors: Array | None = None, *, used: ColorGradients | None = None
 ) -> ColorGradients:
-    """Gradients of a loss on the colours that the spherical harmonics of a plan's Gaussians give in its view.
+    """Return the gradients of a loss through the spherical harmonics of a plan's Gaussians in its view.
 
-    Args:
-        plan: The view.
-        grad_colors: ``[m,3]``, such as :attr:`Gradients.colors`.
-        colors: ``[m,3]`` float32, the colours themselves, where they are at hand. Where they are cut at 0 no gradient
-            passes.
-        used: An earlier answer of as many coefficients that nobody needs any more: its memory is written again if it
-            is large enough. New memory costs a quarter of the time, and where pages are small several times all of it.
-
-    Returns:
-        The gradients; the one of the eye is minus the sum of those of the means.
-
-    Raises:
-        ValueError: If an array has another shape.
+    ``grad_colors [m,3]`` are such as :attr:`Gradients.colors`. ``colors [m,3]`` float32 are the
+    colours themselves, where they are at hand; no gradient passes where they are cut at 0.
+    ``used``: an earlier answer of as many coefficients that nobody needs any more, whose memory is
+    written again if it is large enough: new memory costs a quarter of the time, and where pages are
+    small several times all of it. The gradient of the eye is minus the sum of those of the means.
     """
     m, splats = len(plan.ids), plan.splats
     grad_colors = _expect("grad_colors", grad_colors, (m, 3))
@@ -184,13 +166,7 @@ def color_gradients(
 
 
 def pose_gradient(plan: ViewPlan, gradients: Gradients, shade: ColorGradients | None = None) -> Array:
-    """``[4,4]`` float64 gradient with respect to the world-to-camera matrix, of geometry and of the colours seen.
-
-    Args:
-        plan: The view.
-        gradients: With that through geometry, as ``with_viewmat`` asks for.
-        shade: Gradients through the colours, which change with the camera's place; None where they do not.
-    """
+    """Return the gradient ``[4,4]`` float64 of the world-to-camera matrix, through geometry and, if given, colours."""
     assert gradients.viewmat is not None
     viewmat = gradients.viewmat.copy()
     if shade is not None:

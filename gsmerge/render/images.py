@@ -1,4 +1,4 @@
-"""Images of Gaussians."""
+"""Rendering of Gaussians into every camera."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def one_device(gaussians: Gaussians, cameras: Cameras) -> torch.device | None:
-    """The device that all tensors are on; None where there are none."""
+    """Return the device of all tensors, None for arrays; refuse several devices."""
     values = (*vars(gaussians).values(), cameras.viewmats, cameras.Ks)
     devices = {value.device for value in values if not isinstance(value, np.ndarray)}
     if len(devices) > 1:
@@ -43,12 +43,13 @@ def render(
 ) -> Rendering:
     """Render Gaussians into every camera.
 
-    Arrays give arrays, tensors give tensors. CUDA tensors are rendered by gsplat (``pip install ".[cuda]"``), and
-    the results are on their device; all others on the CPU. How the two differ: :mod:`gsmerge.render.cuda`.
+    Arrays give arrays, tensors give tensors. CUDA tensors are rendered by gsplat (``pip install
+    ".[cuda]"``), and the results are on their device; all others on the CPU. How the two differ:
+    :mod:`gsmerge.render.cuda`.
 
-    Of tensors, images and alphas are differentiable with respect to every tensor of the Gaussians and the view
-    matrices, where autograd is on and one of them asks for it; depths and intrinsics are not. No gradient passes where
-    alpha is clamped at 0.99 or a colour at 0.
+    Of tensors, images and alphas are differentiable with respect to every tensor of the Gaussians
+    and the view matrices, where autograd is on and one of them asks for it; depths and intrinsics
+    are not. No gradient passes where alpha is clamped at 0.99 or a colour at 0.
 
     Args:
         gaussians: n Gaussians, SH degrees 0 to 4.

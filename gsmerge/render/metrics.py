@@ -12,7 +12,7 @@ C1, C2 = 0.01**2, 0.03**2  # ssim's stabilisers (K1 = .01, K2 = .03) for a data 
 
 
 def image_pair(image: Array, reference: Array) -> tuple[Array, Array]:
-    """Two images ``[h,w,c]`` of one shape as arrays; a ValueError otherwise."""
+    """Return two images ``[h,w,c]`` as arrays; raise ValueError if their shapes differ."""
     first, second = as_array(image), as_array(reference)
     if first.ndim != 3 or first.shape != second.shape:
         raise ValueError(f"expected two images [h,w,c] of one shape, got {list(first.shape)} and {list(second.shape)}")
@@ -20,7 +20,7 @@ def image_pair(image: Array, reference: Array) -> tuple[Array, Array]:
 
 
 def pixel_mask(mask: Array, image: Array) -> Array:
-    """``[h,w]`` bool of an image ``[h,w,c]``, at least one pixel; a ValueError otherwise."""
+    """Return a mask as ``[h,w]`` bool; raise ValueError if its shape differs from the image's or it is empty."""
     chosen = as_array(mask).astype(bool)
     if chosen.ndim == 3 and chosen.shape[2] == 1:
         chosen = chosen[..., 0]
@@ -32,19 +32,7 @@ def pixel_mask(mask: Array, image: Array) -> Array:
 
 
 def psnr(image: Array, reference: Array, mask: Array | None = None) -> float:
-    """Peak signal-to-noise ratio.
-
-    Args:
-        image: ``[h,w,c]``.
-        reference: ``[h,w,c]``.
-        mask: ``[h,w]`` pixels that count; None: all.
-
-    Returns:
-        dB for a data range of 1; infinite for equal images.
-
-    Raises:
-        ValueError: If the shapes differ or no pixel counts.
-    """
+    """Return the peak signal-to-noise ratio in dB of images ``[h,w,c]`` in [0, 1], in a mask ``[h,w]`` if given."""
     first, second = image_pair(image, reference)
     if mask is not None:  # first, as float64 of a whole photo is more than all else that is known of it
         chosen = pixel_mask(mask, first)
@@ -55,23 +43,16 @@ def psnr(image: Array, reference: Array, mask: Array | None = None) -> float:
 
 
 def ssim(image: Array, reference: Array, mask: Array | None = None) -> float:
-    """Structural similarity as in the literature (Wang et al. 2004): Gaussian windows of 11 x 11 pixels.
+    """Return the structural similarity, at most 1, over Gaussian windows of 11 x 11 pixels (Wang et al. 2004).
 
     The mean over channels and over the windows that lie wholly inside the image, as scikit-image's
-    ``structural_similarity(gaussian_weights=True, sigma=1.5, use_sample_covariance=False, channel_axis=-1,
-    data_range=1)`` computes it. For measuring only; the loss of the full fit and of training has a definition of its
-    own, :func:`gsmerge.stages.fit.loss.loss_ssim`.
+    ``structural_similarity(gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
+    channel_axis=-1, data_range=1)`` computes it. For measuring only; the loss of the full fit and
+    of training has a definition of its own, :func:`gsmerge.stages.fit.loss.loss_ssim`.
 
-    Args:
-        image: ``[h,w,c]``, at least 11 x 11 pixels, at most 4 channels.
-        reference: ``[h,w,c]``.
-        mask: ``[h,w]`` centres of the windows that count; None: all. Windows also contain the pixels around.
-
-    Returns:
-        At most 1.
-
-    Raises:
-        ValueError: If the shapes differ, the image is too small or no window counts.
+    Images are ``[h,w,c]`` with at most 4 channels; ``mask [h,w]``: centres of the windows that
+    count, which also contain the pixels around. Raises ValueError if the shapes differ, the image
+    is too small or no window counts.
     """
     first, second = image_pair(image, reference)
     if min(first.shape[:2]) < WINDOW:

@@ -1,4 +1,4 @@
-"""The input photos with their cameras, at full or reduced size, as the stages that render against them want them."""
+"""Input photos with their cameras, at full or reduced size, for rendering against them."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Photos:
         return len(self.images)
 
     def __getitem__(self, views: Sequence[int]) -> Photos:
-        """The photos of some views; of all, in order, without a copy."""
+        """Return the photos of some views; of all views, in order, without a copy."""
         ids = list(views)
         if ids == list(range(len(self))):
             return self
@@ -48,21 +48,21 @@ class Photos:
 
     @property
     def height(self) -> int:
-        """Rows."""
+        """Number of rows."""
         return self.images.shape[1]
 
     @property
     def width(self) -> int:
-        """Columns."""
+        """Number of columns."""
         return self.images.shape[2]
 
     def image(self, view: int) -> np.ndarray:
-        """``[h,w,3]`` photo, sRGB in [0, 1]."""
+        """Return the photo of a view ``[h,w,3]``, sRGB in [0, 1]."""
         image = self.images[view]
         return np.multiply(image, np.float32(1 / 255), dtype=np.float32) if image.dtype == np.uint8 else image
 
     def camera(self, view: int) -> dict[str, Any]:
-        """The arguments that :func:`gsmerge.render.plan_view` needs to render into a photo."""
+        """Return the arguments of :func:`gsmerge.render.plan_view` for rendering into a photo."""
         return {
             "viewmat": self.viewmats[view],
             "K": self.Ks[view],
@@ -73,11 +73,7 @@ class Photos:
 
 
 def scene_pictures(scene: Scene) -> np.ndarray:
-    """``[v,h,w,3]`` photos, or pictures made of the Gaussians' base colours where there are none.
-
-    Raises:
-        ValueError: If there are no photos and the Gaussians are not one per pixel.
-    """
+    """Return the photos ``[v,h,w,3]``, or base colours of an aligned scene without photos; else raise ValueError."""
     if scene.images is not None:
         return scene.images
     if not scene.aligned:
@@ -87,14 +83,14 @@ def scene_pictures(scene: Scene) -> np.ndarray:
 
 
 def scene_photos(scene: Scene, level: float = 1) -> Photos:
-    """The scene's photos, each side divided by ``level`` (area averages)."""
+    """Return the scene's photos, each side divided by ``level`` (area averages)."""
     if scene.images is None:
         raise ValueError("expected a scene with images")
     return photos_of(scene.images, scene.cameras, level)
 
 
 def photos_of(images: np.ndarray, cameras: Cameras, level: float = 1) -> Photos:
-    """Photos ``[v,h,w,3]`` of the cameras' size, each side divided by ``level`` (area averages)."""
+    """Return photos ``[v,h,w,3]`` of the cameras' size, each side divided by ``level`` (area averages)."""
     blank = blank_photos(cameras, level)
     if level == 1:
         return replace(blank, images=images)
@@ -104,7 +100,7 @@ def photos_of(images: np.ndarray, cameras: Cameras, level: float = 1) -> Photos:
 
 
 def blank_photos(cameras: Cameras, level: float = 1) -> Photos:
-    """Black photos, which take no memory, for what only needs the cameras; each side divided by ``level``."""
+    """Return black photos, which take no memory, where only cameras matter; each side divided by ``level``."""
     viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
     w, h = cameras.width, cameras.height
     width, height = max(1, round(w / level)), max(1, round(h / level))
@@ -124,15 +120,13 @@ def photo_errors(
     keep: Callable[[int], np.ndarray] | None = None,
     tiles: Callable[[int], np.ndarray | None] | None = None,
 ) -> list[Score]:
-    """Render some Gaussians into the photos' cameras and score every picture, several views at once.
+    """Render Gaussians into the photos' cameras and score every picture, several views at once.
 
-    Args:
-        score: Called with the view, its render ``[h,w,3]`` float32 (not clipped) and the transmittance ``[h,w]``.
-        views: Of the photos, in the order of the result; None: all.
-        near: Near plane, in the Gaussians' unit.
-        colors: ``[n,3]`` in place of the Gaussians' harmonics.
-        keep: View -> ``[n]`` mask of the Gaussians that are drawn in it; None: all.
-        tiles: View -> ``[lines,columns]`` mask of the tiles that are complete; None, or its result is: all.
+    ``score`` gets the view, its render ``[h,w,3]`` float32 (not clipped) and the transmittance
+    ``[h,w]``. ``views`` of the photos, in the order of the result; None: all. ``near`` is in the
+    Gaussians' unit; ``colors [n,3]`` replace the harmonics. ``keep`` gives a view's mask ``[n]`` of
+    the Gaussians to draw, ``tiles`` its mask ``[lines,columns]`` of the tiles to complete; None is
+    all.
     """
     splats = gaussians if isinstance(gaussians, Splats) else prepare(gaussians)
 
@@ -150,12 +144,7 @@ def photo_errors(
 def photo_psnr(
     gaussians: Gaussians | Splats, photos: Photos, views: Iterable[int], *, quarter: bool = False, **settings: Any
 ) -> float:
-    """Mean over some views of the PSNR (dB) of their photos.
-
-    Args:
-        quarter: Of the :func:`scored_tiles` alone, for a quarter to a half of the time.
-        settings: As of :func:`photo_errors`.
-    """
+    """Return the mean PSNR (dB) of some photos, or of a ``quarter`` of each; ``settings``: see :func:`photo_errors`."""
 
     def tiles(view: int) -> np.ndarray | None:
         return scored_tiles(view, photos.width, photos.height) if quarter else None
@@ -174,10 +163,7 @@ def view_psnr(image: np.ndarray, photos: Photos, view: int, *, quarter: bool) ->
 
 
 def scored_tiles(view: int, width: int, height: int) -> np.ndarray | None:
-    """``[lines,columns]`` bool: the quarter of a view's tiles that scenes are judged by; None: all of small views.
-
-    One of every two by two blocks of 32 pixels, another one from view to view and from place to place.
-    """
+    """Return a mask ``[lines,columns]`` of a quarter of a view's tiles, alternating in blocks; None for small views."""
     lines, columns = -(-height // TILE), -(-width // TILE)
     if min(lines, columns) <= 3 * BLOCK:
         return None
@@ -187,5 +173,5 @@ def scored_tiles(view: int, width: int, height: int) -> np.ndarray | None:
 
 
 def render_photos(gaussians: Gaussians | Splats, photos: Photos, **settings: Any) -> list[np.ndarray]:
-    """``[h,w,3]`` render of every photo, not clipped; ``settings`` as of :func:`photo_errors`."""
+    """Render every photo ``[h,w,3]``, not clipped; ``settings``: see :func:`photo_errors`."""
     return photo_errors(gaussians, photos, lambda _, image, __: image, **settings)

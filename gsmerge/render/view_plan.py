@@ -1,4 +1,4 @@
-"""What is drawn where: projection, depth order and tile lists of one view."""
+"""Plan of a view: projection, depth order and tile lists."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MAX_SIZE = 32767 * projection.TILE  # pixels per side: tile columns and rows are
 
 @dataclass(frozen=True, eq=False)
 class Splats:
-    """Gaussians as the kernels take them: contiguous float32 arrays."""
+    """Gaussians as contiguous float32 arrays for the kernels."""
 
     means: Array  # [n,3] world positions less `origin`
     quats: Array  # [n,4] wxyz
@@ -39,7 +39,7 @@ class Splats:
 
 @dataclass(frozen=True, eq=False)
 class ViewPlan:
-    """What is drawn where in one view."""
+    """Projected Gaussians of one view, in the order of depth, by tile."""
 
     splats: Splats
     ids: Array  # [m] int32, ascending: the Gaussians that may touch the image. (A few at its border may miss it.)
@@ -56,12 +56,12 @@ class ViewPlan:
 
     @property
     def columns(self) -> int:
-        """Tiles per row."""
+        """Number of tiles per row."""
         return -(-self.width // projection.TILE)
 
     @property
     def lines(self) -> int:
-        """Rows of tiles."""
+        """Number of rows of tiles."""
         return -(-self.height // projection.TILE)
 
 
@@ -70,7 +70,7 @@ def _float32(array: Array) -> Array:
 
 
 def _spread_origin(means: Array) -> Array:
-    """Zero, or where the Gaussians are when they are so far from zero that float32 would blur them."""
+    """Return zero, or the middle of Gaussians so far from zero that float32 would blur them."""
     sample = means[:: max(1, len(means) // 4096)].astype(np.float64)
     sample = sample[np.isfinite(sample).all(1)]
     if len(sample) == 0:
@@ -81,40 +81,31 @@ def _spread_origin(means: Array) -> Array:
 
 
 def prepare(gaussians: Gaussians, origin: ArrayLike | None = None) -> Splats:
-    """Gaussians as float32 arrays, without copying what already is.
+    """Return Gaussians as float32 splats, without copying what already is.
 
-    Args:
-        gaussians: n Gaussians; means may be float64, for scenes in geographic coordinates.
-        origin: ``[3]`` world point that becomes the arrays' zero. None: the world's zero, unless the scene is far
-            away from it compared with its size.
+    Means may be float64, for scenes in geographic coordinates: ``origin [3]`` is the world point
+    that becomes the arrays' zero. None: the world's zero, unless the scene is far away from it
+    compared with its size.
     """
     gaussians = gaussians.numpy()
     start = _spread_origin(gaussians.means) if origin is None else np.asarray(origin, np.float64).reshape(3)
-    means = gaussians.means - start if start.any() else gaussians.means
-    return Splats(
-        means=_float32(means),
-        quats=_float32(gaussians.quats),
-        scales=_float32(gaussians.scales),
-        opacities=_float32(gaussians.opacities),
-        sh0=_float32(gaussians.sh0),
-        shN=_float32(gaussians.shN),
-        origin=start,
-    )
+    columns = vars(gaussians) | {"means": gaussians.means - start if start.any() else gaussians.means}
+    return Splats(**{name: _float32(column) for name, column in columns.items()}, origin=start)
 
 
 def num_pieces(count: int, threads: int, least: int = PIECE) -> int:
-    """Pieces of work for the pool, some per thread as they may take unequally long, each of about ``least`` or more."""
+    """Return the number of pieces of work for the pool, several per thread, each of about ``least`` or more."""
     return 1 if threads == 1 else max(1, min(4 * threads, count // least))
 
 
 def pieces(count: int, threads: int) -> list[tuple[int, int]]:
-    """Ranges for the pool; no result depends on where they end."""
+    """Return ranges for the pool; no result depends on where they end."""
     num = num_pieces(count, threads)
     return [(count * i // num, count * (i + 1) // num) for i in range(num)]
 
 
 def tile_ranges(plan: ViewPlan, threads: int, least: int = PIECE) -> list[tuple[int, int]]:
-    """Ranges of tiles with about equally many intersections, at least about ``least``, for the pool."""
+    """Return ranges of tiles with about equally many intersections, at least about ``least``, for the pool."""
     count = len(plan.members)
     num = num_pieces(count, threads, least)
     cuts = np.searchsorted(plan.offsets, count * np.arange(1, num) / num)
@@ -123,7 +114,7 @@ def tile_ranges(plan: ViewPlan, threads: int, least: int = PIECE) -> list[tuple[
 
 
 def _camera(viewmat: Array, K: Array, width: int, height: int, eps2d: float, antialiased: bool) -> Array:
-    """The numbers of a camera in the kernels' order, all but the depth range."""
+    """Return the numbers of a camera in the kernels' order, without the depth range."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     # Directions are clamped 15 % of the image outside it, where the first-order projection breaks down (gsplat).
     spare_x, spare_y = 0.15 * width / fx, 0.15 * height / fy
@@ -139,14 +130,14 @@ def _camera(viewmat: Array, K: Array, width: int, height: int, eps2d: float, ant
 
 
 def _corner_sums(tiles: Array, lines: int, columns: int) -> Array:
-    """``[lines+1,columns+1]`` int32: how many of some tiles lie above and left of each corner."""
+    """Count the tiles above and left of each corner, ``[lines+1,columns+1]`` int32."""
     if tiles.shape != (lines, columns):
         raise ValueError(f"tiles: expected shape {[lines, columns]}, got {list(tiles.shape)}")
     return np.pad(tiles.astype(np.int32).cumsum(0).cumsum(1), ((1, 0), (1, 0))).astype(np.int32)
 
 
 def _visible(splats: Splats, opacities: Array, keep: Array, wanted: Array, camera: Array, threads: int) -> Array:
-    """Ids of the Gaussians that may touch the image, ascending."""
+    """Return the ascending ids of the Gaussians that may touch the image."""
 
     def cull(span: tuple[int, int]) -> Array:
         ids = np.empty(span[1] - span[0] + 1, np.int32)
@@ -156,7 +147,7 @@ def _visible(splats: Splats, opacities: Array, keep: Array, wanted: Array, camer
 
 
 def _aligned_rows(count: int, width: int) -> Array:
-    """``[count,width]`` float32 starting at a cache line, so that no short row lies across two."""
+    """Return ``[count,width]`` float32 starting at a cache line, so that no short row lies across two."""
     line = 16
     buffer = np.empty(count * width + line, np.float32)
     start = -(buffer.ctypes.data // buffer.itemsize) % line
@@ -164,7 +155,7 @@ def _aligned_rows(count: int, width: int) -> Array:
 
 
 def _project(splats: Splats, opacities: Array, ids: Array, camera: Array, threads: int) -> tuple[Array, Array, Array]:
-    """Footprints, depths and tile boxes of the listed Gaussians."""
+    """Return footprints, depths and tile boxes of the listed Gaussians."""
     m = len(ids)
     footprints, depths = _aligned_rows(m, projection.FOOTPRINT), np.empty(m, np.float32)
     boxes = np.empty((m, 4), np.int16)
@@ -182,7 +173,7 @@ def _project(splats: Splats, opacities: Array, ids: Array, camera: Array, thread
 
 
 def _bin(order: Array, boxes: Array, lines: int, columns: int, threads: int) -> tuple[Array, Array]:
-    """Tile lists and their starts."""
+    """Return the tile lists and their starts."""
     # One gather in advance, 8 bytes a box: in the loops below every miss would be paid in full.
     boxes = boxes.view(np.uint64)[order, 0].view(np.int16).reshape(-1, 4)
     spans = pieces(len(order), threads)
@@ -229,28 +220,15 @@ def plan_view(
     keep: Array | None = None,
     tiles: Array | None = None,
 ) -> ViewPlan:
-    """Project, sort by depth and bin into tiles, for one view.
+    """Project Gaussians into one view, sort them by depth and bin them into tiles.
 
-    Args:
-        splats: n Gaussians, from :func:`prepare`.
-        viewmat: ``[4,4]`` world to camera.
-        K: ``[3,3]`` intrinsics, pixels, without skew.
-        width: Image width, pixels.
-        height: Image height, pixels.
-        eps2d: Dilation of the footprints, pixels squared.
-        antialiased: Lower the opacity by what the dilation adds to the footprint (Mip-Splatting's 2D filter).
-        near: Nearest depth drawn (exclusive), world units, above 0.
-        far: Farthest depth drawn (exclusive).
-        opacities: ``[n]`` in place of the Gaussians' own.
-        keep: ``[n]`` bool or uint8, False leaves a Gaussian out.
-        tiles: ``[lines,columns]`` bool, the tiles of 16 x 16 pixels that have to be complete; others may lack
-            Gaussians. None: all.
-
-    Returns:
-        The plan; its size goes with what is visible, not with n.
-
-    Raises:
-        ValueError: If sizes do not fit together, or a number is outside its range.
+    ``viewmat [4,4]`` is world to camera, ``K [3,3]`` in pixels without skew; ``near`` and ``far``
+    are exclusive, in world units; ``eps2d`` is the dilation of the footprints, pixels squared.
+    ``antialiased`` lowers the opacity by what the dilation adds to the footprint (Mip-Splatting's
+    2D filter). ``opacities [n]`` replace the Gaussians' own, where ``keep [n]`` is False they are
+    left out, and only ``tiles [lines,columns]`` of 16 x 16 pixels have to be complete. The size of
+    the plan goes with what is visible, not with n. Raises ValueError if a size or a number is out
+    of range.
     """
     viewmat, K = np.asarray(viewmat, np.float64).copy(), np.asarray(K, np.float64)
     _check_view(viewmat, K, width, height)

@@ -1,7 +1,7 @@
-"""The blending weights of a view as a sparse matrix, for stages that apply one geometry many times.
+"""Blending weights of a view as a sparse matrix, for stages that apply one geometry many times.
 
-Image = W colors, with one row per pixel and one column per Gaussian. Twenty-odd entries per pixel: a product costs a
-small part of walking the tiles again.
+Image = W colors, with one row per pixel and one column per Gaussian. Twenty-odd entries per pixel:
+a product costs a small part of walking the tiles again.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True, eq=False)
 class ViewWeights:
-    """W of one view, stored by tile and Gaussian."""
+    """Matrix W of one view, stored by tile and Gaussian."""
 
     ids: Array  # [m] int32: the Gaussians that may touch the image
     members: Array  # [intersections] int32 rows of `ids`
@@ -44,7 +44,7 @@ def view_weights(plan: ViewPlan) -> ViewWeights:
 
 
 def apply(view: ViewWeights, colors: Array) -> Array:
-    """``W colors``: image ``[h,w,c]`` float32 of ``colors [n,c]``, up to four channels."""
+    """Multiply W with ``colors [n,c]``, up to four channels: image ``[h,w,c]`` float32."""
     channels = colors.shape[1]
     rows = np.zeros((len(view.ids), kernels.LANES), np.float32)
     rows[:, :channels] = colors[view.ids]
@@ -54,7 +54,7 @@ def apply(view: ViewWeights, colors: Array) -> Array:
 
 
 def apply_transposed(view: ViewWeights, image: Array) -> Array:
-    """``W^T image``: sums ``[m,c]`` float64 over ``view.ids`` of ``image [h,w,c]``, up to four channels."""
+    """Multiply the transpose of W with ``image [h,w,c]``, up to four channels: ``[m,c]`` float64 by ``view.ids``."""
     channels = image.shape[2]
     padded = np.zeros((view.height, view.width, kernels.LANES), np.float32)
     padded[..., :channels] = image

@@ -1,1 +1,1 @@
-"""The process: threads, memory, logs, and what a run will take."""
+"""The process: threads, memory, records, and estimates of time and memory."""

@@ -1,4 +1,4 @@
-"""What a run takes, in seconds and bytes, within a factor of about two, once the kernels are compiled."""
+"""Estimates of a run's seconds and bytes, within a factor of about two, once the kernels are compiled."""
 
 from __future__ import annotations
 
@@ -27,14 +27,11 @@ BYTES_PER_PIXEL = 90  # the photo as floats and what segmentation and rendering 
 
 
 def work_seconds(pixels: int, view_pixels: float, options: Mapping[str, Any], *, photos: bool, fit_steps: int) -> float:
-    """Estimate the processor seconds that a scene takes, imports not counted.
+    """Estimate the processor seconds that a scene takes, without imports.
 
-    Args:
-        pixels: Of all views together, or Gaussians where they are more.
-        view_pixels: Of one view.
-        options: All settings by flat name, with the checkpoint that is used.
-        photos: Whether there are any to fit to and to score on.
-        fit_steps: Of the full fit.
+    ``pixels`` of all views together, or Gaussians where they are more; ``view_pixels`` of one view;
+    ``options``: all settings by flat name, with the checkpoint that is used; ``photos``: whether
+    there are any to fit to and to score on.
     """
     method, fits = options["method"], fit_of(options, photos=photos) == "full"
     work = COST_MERGE + COST_SCORE * photos + COST_FIT * fits
@@ -53,21 +50,18 @@ def wall_seconds(
 
 
 def fit_of(options: Mapping[str, Any], *, photos: bool) -> str:
-    """Say what is fitted to the photos: full or none."""
+    """Return the fit to the photos: ``"full"`` or ``"none"``."""
     own = {"gsmerge": options["fit"], "unmerged-fit": "full"}
     return own.get(options["method"], "none") if photos else "none"
 
 
 def memory_bytes(pixels: int, *, photos: bool, num_rest: int = 0) -> int:
-    """Estimate the memory that a scene takes, imports included.
-
-    ``pixels`` as of :func:`work_seconds`; ``num_rest``: columns of higher harmonics.
-    """
+    """Estimate the memory of a run, imports included; ``num_rest``: columns of higher harmonics."""
     return BYTES_FIXED + round((BYTES_PER_GAUSSIAN + BYTES_PER_VALUE * num_rest + BYTES_PER_PIXEL * photos) * pixels)
 
 
 def memory_problem(needed: int) -> str | None:
-    """Say that bytes as of :func:`memory_bytes` are not likely to fit into this machine; None if they are."""
+    """Return why a run of so many bytes is not likely to fit into this machine; None if it is."""
     available = machine_memory()
     if available is None or needed <= available:
         return None

@@ -16,11 +16,7 @@ from gsmerge.errors import SceneError
 
 
 def each_line(path: Path, start: int = 0) -> Iterator[tuple[int, dict[str, Any] | None]]:
-    """Read the complete lines of a file from a byte on, one at a time.
-
-    Yields:
-        The byte after the line, and its value; None if it is damaged.
-    """
+    """Yield the byte after each complete line from a byte on, and its value, None if damaged."""
     if not path.exists():
         return
     try:
@@ -45,11 +41,8 @@ def _parse(line: bytes) -> dict[str, Any] | None:
 def append_line(path: Path, value: Mapping[str, Any]) -> None:
     """Append one JSON line: on the disk when this returns, and in place of a half-written one.
 
-    A line that does not fit on the disk leaves the file as it was.
-
-    Raises:
-        SceneError: If the file cannot be written.
-        ValueError: If there is NaN or inf among the values.
+    A line that does not fit on the disk leaves the file as it was. Raises SceneError if the file
+    cannot be written, ValueError if there is NaN or inf among the values.
     """
     line = json.dumps(value, separators=(",", ":"), ensure_ascii=True, allow_nan=False).encode("ascii") + b"\n"
     try:

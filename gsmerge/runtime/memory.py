@@ -1,4 +1,4 @@
-"""Memory: how much there is, how much the process took, and handing back what is no longer used."""
+"""Memory of the machine and of the process, and release of what is no longer used."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_by
 
 
 def peak_memory() -> int:
-    """Largest resident memory of this process so far, bytes; 0 where the system does not tell."""
+    """Return the largest resident memory of this process so far, bytes; 0 where it is unknown."""
     try:
         import resource
     except ImportError:
@@ -21,7 +21,7 @@ def peak_memory() -> int:
 
 
 def machine_memory() -> int | None:
-    """Bytes that this machine has, or that its control group may take; None where the system does not tell."""
+    """Return the bytes that this machine has, or that its control group may take; None where unknown."""
     limits = []
     with suppress(AttributeError, OSError, ValueError):
         limits.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
@@ -43,7 +43,7 @@ def release_memory() -> None:
 
 
 def human_bytes(count: float) -> str:
-    """``1234567`` -> ``1.2 MB`` (powers of ten)."""
+    """Format bytes with powers of ten: ``1234567`` -> ``1.2 MB``."""
     for unit in ("B", "kB", "MB"):
         if count < 1000:
             return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"

@@ -26,7 +26,7 @@ STAGES = (
 
 @dataclass
 class Record:
-    """What a run did so far."""
+    """Record of a run so far."""
 
     progress: Progress | None = None  # Called with (stage, done, total)
     seconds: dict[str, float] = field(default_factory=dict)  # Wall time of each stage

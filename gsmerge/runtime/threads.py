@@ -26,7 +26,7 @@ AT_ONCE = 12  # results of in_turn that are in memory together
 
 
 class _Local(threading.local):
-    """Each calling thread has its own pool, so two calls at once do not stop each other's."""
+    """Pool of each calling thread, so that two calls at once do not stop each other's."""
 
     pool: ThreadPoolExecutor | None = None
     count = 1
@@ -35,7 +35,7 @@ class _Local(threading.local):
 
 
 class _Libraries:
-    """Threads of torch and OpenCV; their settings are the process's, so all callers share what is remembered."""
+    """Threads of torch and OpenCV; these settings are the process's, so all callers share them."""
 
     lock = threading.Lock()
     pools = 0
@@ -47,7 +47,7 @@ _local, _libraries = _Local(), _Libraries()
 
 
 def available_threads() -> int:
-    """Number of processors that this process may run on."""
+    """Return the number of processors that this process may run on."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -59,10 +59,7 @@ def _enter_pool() -> None:
 def use_threads(count: int | None = None) -> Iterator[int]:
     """Let :func:`parallel_map` use ``count`` threads (None: all processors) inside the block.
 
-    A block inside another keeps the outer one's threads.
-
-    Raises:
-        ValueError: If ``count`` is below 1.
+    A block inside another keeps the outer one's threads. Raises ValueError if ``count`` is below 1.
     """
     count = available_threads() if count is None else count
     if count < 1:
@@ -120,11 +117,11 @@ def _release_libraries() -> None:
 
 
 def parallel_map(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
-    """``[function(item) for item in items]`` on the pool; results in the order of the items.
+    """Return ``[function(item) for item in items]``, computed on the pool, in the order of the items.
 
-    Outside :func:`use_threads` a pool of all processors is made for the call; inside another call the items are
-    worked off one by one. The calling thread takes its share, so that a short call costs one hand-over, not one
-    for each item.
+    Outside :func:`use_threads` a pool of all processors is made for the call; inside another call
+    the items are worked off one by one. The calling thread takes its share, so that a short call
+    costs one hand-over, not one for each item.
     """
     items = list(items)
     with use_threads() as count:
@@ -134,9 +131,10 @@ def parallel_map(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
 
 
 def in_turn(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-    """The results of :func:`parallel_map` one by one, of which few are in memory together.
+    """Yield the results of :func:`parallel_map` in order, a few of them in memory at a time.
 
-    For what is as large as all Gaussians for every view, and only added up: memory does not go with the views.
+    For what is as large as all Gaussians for every view, and only added up: memory does not go with
+    the views.
     """
     items = list(items)
     for first in range(0, len(items), AT_ONCE):

@@ -1,1 +1,1 @@
-"""The stages of a run, one file an arrow; none imports another but through what they share below."""
+"""Stages of a run, one file for each; they share only the lower layers."""

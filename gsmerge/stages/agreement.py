@@ -1,4 +1,4 @@
-"""What the depths of other views say of a view's: how faint its groups begin, and how many superpixels are worth it."""
+"""Agreement of the views' depths: fainter starts for disputed groups, and a share of superpixels."""
 
 from __future__ import annotations
 
@@ -21,11 +21,7 @@ MOST, FEWEST, WRONG = 0.08, 0.015, 0.38
 
 
 def measured_share(scene: Scene) -> tuple[float | None, str]:
-    """Choose a share of superpixels by how well the views' depths agree.
-
-    Returns:
-        Superpixels per pixel, None where depths of several views cannot be compared; and the reason, as a clause.
-    """
+    """Choose superpixels per pixel by the agreement of the views' depths, None if unknown; and say why."""
     if not scene.aligned or len(scene) < 2:
         return None, "depths of several views cannot be compared"
     wrong = contradicted_share(scene, scene_members(scene))
@@ -35,7 +31,7 @@ def measured_share(scene: Scene) -> tuple[float | None, str]:
 
 
 def contradicted_share(scene: Scene, members: Members) -> float:
-    """Share of the valid pixels, of some tens of thousands, that more views see through than have a surface there."""
+    """Return the share of sampled valid pixels that more views see through than have a surface there."""
     rows = np.flatnonzero(scene.valid)
     rows = rows[:: max(1, len(rows) // SAMPLES)]
     views = rows // scene.pixels_per_view
@@ -44,13 +40,7 @@ def contradicted_share(scene: Scene, members: Members) -> float:
 
 
 def weaken_contradicted(features: FeatureGaussians, members: Members, cameras: Cameras) -> FeatureGaussians:
-    """Lower the optical depth of groups that other views see through.
-
-    Args:
-        features: Of single views.
-        members: The scene's Gaussians, one per pixel.
-        cameras: Its views.
-    """
+    """Lower the optical depth of single-view groups that other views see through."""
     factors = agreement_factors(features.means, features.sh0, features.views, members, cameras)
     return replace(features, gains=features.gains * factors)
 
@@ -58,9 +48,10 @@ def weaken_contradicted(features: FeatureGaussians, members: Members, cameras: C
 def agreement_factors(
     means: np.ndarray, sh0: np.ndarray, views: np.ndarray, members: Members, cameras: Cameras
 ) -> np.ndarray:
-    """``[g]`` float32, at most 1: how much of the optical depth of each point stays.
+    """Return the factor ``[g]`` float32, at most 1, on the optical depth of each point.
 
-    Arguments as of :func:`gsmerge.networks.cross_view_stats.cross_view_stats`; of an unaligned scene everything stays.
+    Arguments are those of :func:`gsmerge.networks.cross_view_stats.cross_view_stats`; unaligned
+    scenes get ones.
     """
     _, same, behind, *_ = cross_view_stats(means, sh0, views, members, cameras).T
     disputed = np.where(same > 0, DISPUTED, ALONE)

@@ -1,10 +1,11 @@
-"""scene -> the same with its views where their photos agree: each camera is moved, with the Gaussians of its pixels.
+"""Aligned scene -> the same scene with cameras, and their pixels' Gaussians, moved to where the photos agree.
 
-Poses that a network predicts are wrong by some pixels, and its Gaussians follow them: every view fits itself and none
-of the others. The pixels of a view, at their depths, are looked up in the photos of its neighbours, and all poses are
-moved at once until the greys agree: direct image alignment (Engel et al., "Direct Sparse Odometry", 2018) with the
-depths as they are, by Gauss-Newton steps on small photos first. Scenes whose poses are right are left alone, bit for
-bit, after one step at the smallest size.
+Poses that a network predicts are wrong by some pixels, and its Gaussians follow them: every view
+fits itself and none of the others. The pixels of a view, at their depths, are looked up in the
+photos of its neighbours, and all poses are moved at once until the greys agree: direct image
+alignment (Engel et al., "Direct Sparse Odometry", 2018) with fixed depths, by Gauss-Newton steps on
+small photos first. Scenes whose poses are right are left alone, bit for bit, after one step at the
+smallest size.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ LEAST_GAIN, VIEW_GAIN, MEAN_GAIN = 0.1, 0.3, 0.2
 
 @dataclass(frozen=True, eq=False)
 class _Level:
-    """The photos at one size, what is looked up of each, and where."""
+    """Photos at one size, with the sampled pixels of each view."""
 
     pictures: np.ndarray  # [v,h,w,3] float32: grey, and how it changes to the right and down
     Ks: np.ndarray  # [v,3,3]
@@ -70,7 +71,7 @@ class _Level:
 
 @dataclass(frozen=True, eq=False)
 class _Pair:
-    """What the pixels of one view say of their place in another."""
+    """Evidence from the pixels of one view about its pose relative to another view."""
 
     curvature: np.ndarray  # [6,6] of half the squared differences, by a motion of the second camera; the first's is its
     slope: np.ndarray  # [6]  # opposite, since only where one stands to the other counts
@@ -79,17 +80,11 @@ class _Pair:
 
 
 def align_views(scene: Scene, views: Sequence[int], *, always: bool = False) -> Scene | None:
-    """The scene with every camera, and the Gaussians of its pixels, moved to where the photos agree.
+    """Move every camera, and the Gaussians of its pixels, to where the photos agree.
 
-    What all views would do together is left out: the median of their motions is none.
-
-    Args:
-        scene: Canonical, with photos.
-        views: Those whose photos show the scene; the others stay where they are.
-        always: Also move views that are hardly wrong.
-
-    Returns:
-        The scene; None where no pose is wrong, or the photos do not say.
+    ``views`` are those whose photos show the scene; the others stay. With ``always`` even small
+    errors are corrected. The median motion of the views is taken out. Returns None where no pose is
+    wrong, or the photos cannot tell.
     """
     start = scene.cameras.viewmats.astype(np.float64)
     largest, shortest = (f(scene.cameras.width, scene.cameras.height) for f in (max, min))
@@ -111,9 +106,10 @@ def align_views(scene: Scene, views: Sequence[int], *, always: bool = False) -> 
 
 
 def move_views(scene: Scene, viewmats: np.ndarray) -> Scene:
-    """The scene with other poses ``[v,4,4]``, and each view's Gaussians moved along.
+    """Return the scene with other poses ``[v,4,4]``, and each view's Gaussians moved along.
 
-    Higher harmonics are not turned: poses are off by a degree or two, and colours hardly change with that.
+    Higher harmonics are not turned: poses are off by a degree or two, and colours hardly change
+    with that.
     """
     g, size = scene.gaussians, scene.pixels_per_view
     motions = np.linalg.inv(viewmats) @ scene.cameras.viewmats.astype(np.float64)
@@ -130,7 +126,7 @@ def move_views(scene: Scene, viewmats: np.ndarray) -> Scene:
 
 
 def _choose_pairs(scene: Scene, views: Sequence[int]) -> list[tuple[int, int]]:
-    """Pairs of views, both ways round: of each its neighbours, which see most of it and look where it looks."""
+    """Choose pairs of views, in both orders: each view with the neighbours that see most of it."""
     cameras, means = scene.cameras, scene.gaussians.means.reshape(len(scene), -1, 3)
     step = max(1, scene.pixels_per_view // OVERLAP_SAMPLES)
     size, pairs = np.array([cameras.width, cameras.height]), set()
@@ -147,7 +143,7 @@ def _choose_pairs(scene: Scene, views: Sequence[int]) -> list[tuple[int, int]]:
 
 
 def _level_of(scene: Scene, pairs: list[tuple[int, int]], level: float, samples: int) -> _Level:
-    """The photos with their sides divided by ``level``, and ``samples`` pixels of each where it changes most."""
+    """Shrink the photos by ``level``, and sample pixels of each where it changes most."""
     assert scene.images is not None
     photos = photos_of(scene.images, scene.cameras, level)
     shape = photos.height, photos.width
@@ -177,7 +173,7 @@ def _level_of(scene: Scene, pairs: list[tuple[int, int]], level: float, samples:
 
 
 def _descend(level: _Level, viewmats: np.ndarray, *, check: bool) -> tuple[np.ndarray, list[_Pair], list[_Pair]]:
-    """Poses after Gauss-Newton steps at one size, and what the pairs of views say before and after.
+    """Improve poses by Gauss-Newton steps at one size; return them, and the pairs before and after.
 
     With ``check`` there are few steps, and they end after the first one if it moves no view far.
     """
@@ -205,7 +201,7 @@ def _descend(level: _Level, viewmats: np.ndarray, *, check: bool) -> tuple[np.nd
 
 
 def _compare(level: _Level, viewmats: np.ndarray, pair: tuple[int, int]) -> _Pair:
-    """The pixels of one view looked up in another, under some poses."""
+    """Compare the pixels of one view with another view's photo, under some poses."""
     (a, b), (height, width) = pair, level.pictures.shape[1:3]
     x, y, z, u, v, world = _look_up(level, viewmats, a, b)
     inside = (z > NEAR) & (u > BORDER) & (u < width - BORDER) & (v > BORDER) & (v < height - BORDER)
@@ -231,7 +227,7 @@ def _compare(level: _Level, viewmats: np.ndarray, pair: tuple[int, int]) -> _Pai
 
 
 def _look_up(level: _Level, viewmats: np.ndarray, a: int, b: int) -> tuple[np.ndarray, ...]:
-    """Of the pixels of view ``a`` in ``b``: x and y over depth, depth, pixel (x and y), and ``[n,3]`` in the world."""
+    """Project the pixels of view ``a`` into ``b``: x/z, y/z, z, u, v in pixels, and points ``[n,3]`` in the world."""
     world = (level.points[a] - viewmats[a, :3, 3]) @ viewmats[a, :3, :3]
     x, y, z = (world @ viewmats[b, :3, :3].T + viewmats[b, :3, 3]).T
     z, K = np.maximum(z, NEAR), level.Ks[b]
@@ -239,14 +235,14 @@ def _look_up(level: _Level, viewmats: np.ndarray, a: int, b: int) -> tuple[np.nd
 
 
 def _flows(level: _Level, pairs: list[_Pair]) -> np.ndarray:
-    """``[v]`` how far the pixels of each view moved, pixels: the median over its pairs."""
+    """Return how far the pixels of each view moved, ``[v]`` pixels: the median over its pairs."""
     both = list(zip(level.pairs, pairs, strict=True))
     flows = [[one.flow for pair, one in both if view in pair] for view in range(len(level.start))]
     return np.array([np.median(some) if some else 0.0 for some in flows])
 
 
 def _any_wrong(level: _Level, given: list[_Pair], last: list[_Pair], *, end: bool) -> bool:
-    """Whether some view moved far, and its photo and the others disagree less for it, in the ``end`` much less."""
+    """Return whether a view moved far and now disagrees less with the others, at the ``end`` much less."""
     far = _flows(level, last) > LIMIT_PX
     costs = np.zeros((2, len(far)))  # of each view, given and last
     for i, pairs in enumerate((given, last)):

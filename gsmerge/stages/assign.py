@@ -1,7 +1,7 @@
-"""groups + unaligned gaussians -> members: the pixel that each Gaussian belongs to.
+"""Groups and unaligned Gaussians -> members: the pixel that each Gaussian belongs to.
 
-A Gaussian belongs to the superpixel, of all views, that gets most of its blending weights (paper, supplement
-"Compaction of Non-Pixel-Aligned FF Backbones"). What no view sees is marked.
+A Gaussian belongs to the superpixel, of all views, that gets most of its blending weights (paper,
+supplement "Compaction of Non-Pixel-Aligned FF Backbones"). Gaussians that no view sees are marked.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from gsmerge.kernels.raster.contribution import PAIR, add_row, settle_row
 from gsmerge.kernels.raster.project import TILE
 from gsmerge.moments import Members, pool_members, scene_members, unaligned_members
 from gsmerge.render import ViewPlan, contributions, plan_view, prepare, render
+from gsmerge.render.photos import NEAR
 from gsmerge.render.view_plan import MAX_SIZE
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
@@ -32,11 +33,7 @@ MIN_ALPHA = 0.5  # opacity of a pixel from which it counts when superpixels are 
 
 @stage("members")
 def assign(scene: Scene, groups: Groups) -> Members:
-    """Give every Gaussian of a canonical scene its pixel: its own, or one of the superpixel that it adds most to.
-
-    Raises:
-        UsageError: If no view sees any Gaussian.
-    """
+    """Assign a pixel to every Gaussian of a canonical scene; raise UsageError if no view sees any."""
     if scene.aligned:
         return scene_members(scene)
     pixels = owner_pixels(find_owners(scene, groups), groups)
@@ -49,10 +46,7 @@ def assign(scene: Scene, groups: Groups) -> Members:
 
 
 def merge_unseen(gaussians: Gaussians, scene: Scene, count: int) -> Gaussians:
-    """Merge n Gaussians that no view of a canonical scene sees into ``count``, 1 to n.
-
-    Runs along a space-filling curve (Morton's) become one Gaussian each.
-    """
+    """Merge n unseen Gaussians of a canonical scene into ``count`` by runs along Morton's curve."""
     order = np.argsort(morton_codes(gaussians.means.astype(np.float64)), kind="stable")
     members = unaligned_members(replace(scene, gaussians=gaussians), np.full(len(gaussians), -1, np.int64))
     starts = np.linspace(0, len(order), count + 1).astype(np.int64)
@@ -62,37 +56,19 @@ def merge_unseen(gaussians: Gaussians, scene: Scene, count: int) -> Gaussians:
 
 @dataclass(frozen=True)
 class Owners:
-    """The superpixel that each of n Gaussians adds most to.
+    """Dominant superpixel of each of n Gaussians."""
 
-    Args:
-        values: ``[n]`` float32: its blending weights summed over that superpixel, pixels; 0 where nothing is seen.
-        views: ``[n]`` int32, -1 where nothing is seen.
-        labels: ``[n]`` int32 superpixel within the view, -1 where nothing is seen.
-    """
-
-    values: np.ndarray
-    views: np.ndarray
-    labels: np.ndarray
+    values: np.ndarray  # [n] float32 blending weights summed over the superpixel, pixels; or 0
+    views: np.ndarray  # [n] int32, -1 if unseen
+    labels: np.ndarray  # [n] int32 superpixel within the view, -1 if unseen
 
 
-def find_owners(scene: Scene, groups: Groups, near: float = 0.01) -> Owners:
-    """The dominant superpixel of every Gaussian, over all views; of equal ones the first view's first.
-
-    Only the best superpixel so far is kept of each Gaussian, and of one row of tiles at a time which Gaussian adds
-    what to which superpixel.
-
-    Args:
-        scene: n Gaussians and V views.
-        groups: The superpixels of the views.
-        near: Nearest depth that is seen.
-    """
-    splats, cameras = prepare(scene.gaussians), scene.cameras
-    viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
-    count, lock = len(splats), Lock()
+def find_owners(scene: Scene, groups: Groups) -> Owners:
+    """Find the dominant superpixel of every Gaussian over all views; the first view wins ties."""
+    count, lock = len(scene.gaussians), Lock()
     best = Owners(np.zeros(count, np.float32), np.full(count, -1, np.int32), np.full(count, -1, np.int32))
 
-    def one_view(view: int) -> None:
-        plan = plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, near=near)
+    def one_view(view: int, plan: ViewPlan) -> None:
         values, labels = view_owners(plan, groups.labels[view], groups.counts[view])
         with lock:
             old, first = best.values[plan.ids], best.views[plan.ids]
@@ -100,60 +76,47 @@ def find_owners(scene: Scene, groups: Groups, near: float = 0.01) -> Owners:
             ids = plan.ids[better]
             best.values[ids], best.views[ids], best.labels[ids] = values[better], view, labels[better]
 
-    each_view(one_view, len(scene), count)
+    _plan_views(scene, one_view)
     return best
 
 
-def seen_weights(scene: Scene, near: float = 0.01) -> np.ndarray:
-    """``[n]`` float32: the most blending weight that each Gaussian has in one view, pixels.
+def seen_weights(scene: Scene) -> np.ndarray:
+    """Measure the largest blending weight ``[n]`` float32 of each Gaussian in one view, pixels."""
+    most, lock = np.zeros(len(scene.gaussians), np.float32), Lock()
 
-    Args:
-        scene: n Gaussians and their views.
-        near: Nearest depth that is seen.
-    """
-    splats, cameras = prepare(scene.gaussians), scene.cameras
-    viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
-    most, lock = np.zeros(len(splats), np.float32), Lock()
-
-    def one_view(view: int) -> None:
-        plan = plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, near=near)
-        sums, _ = contributions(plan)
+    def one_view(_: int, plan: ViewPlan) -> None:
+        sums, _peaks = contributions(plan)
         with lock:
             np.maximum(most, sums, out=most)
 
-    each_view(one_view, len(scene), len(splats))
+    _plan_views(scene, one_view)
     return most
 
 
-def seen_depths(scene: Scene, near: float = 0.01) -> tuple[np.ndarray, np.ndarray]:
-    """``[v,h,w]`` mean depth of what each pixel shows, and ``[v,h,w]`` whether it mostly shows something.
+def _plan_views(scene: Scene, use: Callable[[int, ViewPlan], None]) -> None:
+    """Plan every view and use it, in parallel unless the plans would fill the memory."""
+    splats, cameras = prepare(scene.gaussians), scene.cameras
+    viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
 
-    Args:
-        scene: The canonical scene.
-        near: Nearest depth that is seen.
-    """
-    drawn = render(scene.gaussians, scene.cameras, near=near, with_depths=True)
+    def one_view(view: int) -> None:
+        use(view, plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, near=NEAR))
+
+    if len(splats) <= ONE_AT_A_TIME:
+        parallel_map(one_view, range(len(scene)))
+        return
+    for view in range(len(scene)):
+        one_view(view)
+
+
+def seen_depths(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Render the mean depth ``[v,h,w]`` of every pixel, and a mask ``[v,h,w]`` of mostly opaque pixels."""
+    drawn = render(scene.gaussians, scene.cameras, near=NEAR, with_depths=True)
     assert drawn.depths is not None
     return drawn.depths[..., 0], drawn.alphas[..., 0] > MIN_ALPHA
 
 
-def each_view(one_view: Callable[[int], None], num_views: int, num_gaussians: int) -> None:
-    """Call for every view, several at once unless the Gaussians are so many that their plans would fill the memory."""
-    if num_gaussians > ONE_AT_A_TIME:
-        for view in range(num_views):
-            one_view(view)
-    else:
-        parallel_map(one_view, range(num_views))
-
-
 def view_owners(plan: ViewPlan, labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Contribution ``[m]`` to the dominant superpixel of one view and its label ``[m]``, of the plan's Gaussians.
-
-    Args:
-        plan: The view.
-        labels: ``[h,w]`` int32, 0 to ``count - 1``.
-        count: Superpixels.
-    """
+    """Find contribution ``[m]`` to, and label ``[m]`` of, the dominant superpixel of each of a plan's Gaussians."""
     labels = np.ascontiguousarray(labels, np.int32)
     num, room = len(plan.ids), max(FIRST_PAIRS, count)
     values, owners = np.zeros(num, np.float32), np.full(num, -1, np.int32)
@@ -173,12 +136,7 @@ def view_owners(plan: ViewPlan, labels: np.ndarray, count: int) -> tuple[np.ndar
 
 
 def owner_pixels(owners: Owners, groups: Groups) -> np.ndarray:
-    """The pixel in the middle of each Gaussian's superpixel, ``[n]`` int64 over all views; -1 for unseen ones.
-
-    Args:
-        owners: The dominant superpixels.
-        groups: The superpixels.
-    """
+    """Return the middle pixel of each Gaussian's superpixel, ``[n]`` int64 over all views, -1 if unseen."""
     counts = np.asarray(groups.counts)
     size, first = groups.labels[0].size, np.cumsum(counts) - counts
 
@@ -190,7 +148,7 @@ def owner_pixels(owners: Owners, groups: Groups) -> np.ndarray:
 
 
 def middle_pixels(labels: np.ndarray, count: int) -> np.ndarray:
-    """``[count]`` int64 pixel of each superpixel nearest to its centroid, row-major; 0 where it has no pixel."""
+    """Return the pixel of each superpixel nearest to its centroid, ``[count]`` int64, 0 without pixels."""
     height, width = labels.shape
     flat = labels.reshape(-1)
     y, x = np.divmod(np.arange(height * width), width)

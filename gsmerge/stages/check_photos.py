@@ -1,9 +1,10 @@
-"""scene -> the same without the photos that do not show it: black, of another scene, or of another view.
+"""Scene -> the same without photos that do not show it: black, of another scene, or of another view.
 
-A photo is compared with what the Gaussians show from its camera by the correlation of the gradients of small pictures,
-which no exposure changes, and with what they show from the other cameras: a photo that fits another one much better was
-mistaken for it. Of Gaussians that belong to pixels the colours of a view's own are compared, because those show the
-view whatever their depths are; the others are drawn.
+A photo is compared with what the Gaussians show from its camera by the correlation of the gradients
+of small pictures, which no exposure changes, and with what they show from the other cameras: a
+photo that fits another one much better was mistaken for it. Of Gaussians that belong to pixels the
+colours of a view's own are compared, because those show the view whatever their depths are; the
+others are drawn.
 """
 
 from __future__ import annotations
@@ -36,15 +37,10 @@ NAMED = 4  # views that the note names
 
 
 def leave_out_photos(scene: Scene) -> tuple[Scene, tuple[int, ...]]:
-    """Replace photos that do not show the scene by the Gaussians' own colours; leave out all where most do not.
+    """Replace photos that do not show the scene by the Gaussians' own colours, or remove all photos.
 
-    The record gets a note and the choice ``photos_left_out``.
-
-    Args:
-        scene: Canonical.
-
-    Returns:
-        The scene, and the views whose pictures a fit may use: none where there are photos and most do not show it.
+    All are removed where most do not show the canonical scene. Returns the scene, and the views
+    whose pictures a fit may use. The record gets a note and the choice ``photos_left_out``.
     """
     views = tuple(range(len(scene)))
     odd = [] if scene.images is None else odd_photos(scene)
@@ -65,7 +61,7 @@ def leave_out_photos(scene: Scene) -> tuple[Scene, tuple[int, ...]]:
 
 
 def odd_photos(scene: Scene) -> list[int]:
-    """The views of a canonical scene whose photos do not show it, as far as the Gaussians can tell."""
+    """Return the views of a canonical scene whose photos do not show it, judged by the Gaussians."""
     assert scene.images is not None
     least = LEAST if scene.aligned else LEAST_DRAWN
     level = max(scene.cameras.width, scene.cameras.height) / SIDE
@@ -83,14 +79,10 @@ def odd_photos(scene: Scene) -> list[int]:
 
 
 def gradient_correlations(scene: Scene, level: float) -> tuple[np.ndarray, np.ndarray]:
-    """``[v,v]`` float64: how much alike view i, as the Gaussians show it, and photo j are, -1 to 1.
+    """Correlate the gradients of each view's Gaussians with those of every photo: ``[v,v]``, -1 to 1.
 
-    Args:
-        scene: With photos.
-        level: The pictures' sides are divided by it.
-
-    Returns:
-        The correlations, and a mask ``[v]`` of the views that show enough to go by.
+    Sides of the pictures are divided by ``level``. Also returns a mask ``[v]`` of views with enough
+    structure.
     """
     assert scene.images is not None
     photos = photos_of(scene.images, scene.cameras, level)
@@ -118,19 +110,19 @@ def gradient_correlations(scene: Scene, level: float) -> tuple[np.ndarray, np.nd
 
 
 def _gradients(image: np.ndarray) -> np.ndarray:
-    """``[2·(h-1)·(w-1)]`` float64 differences of an image's grey to the right and down."""
+    """Return the differences of an image's grey to the right and down, ``[2·(h-1)·(w-1)]`` float64."""
     grey = image.mean(-1, dtype=np.float64)
     return np.concatenate([np.diff(grey, axis=1)[:-1].ravel(), np.diff(grey, axis=0)[:, :-1].ravel()])
 
 
 def _gradient_weights(weight: np.ndarray) -> np.ndarray:
-    """The weights of :func:`_gradients` from those of pixels ``[h,w]``."""
+    """Return the weights of :func:`_gradients` from pixel weights ``[h,w]``."""
     both = (weight[:-1, :-1] * weight[:-1, 1:] * weight[1:, :-1]).astype(np.float64).ravel()
     return np.concatenate([both, both])
 
 
 def _own_pictures(scene: Scene, views: list[int]) -> np.ndarray:
-    """``[n,h,w,3]`` some views of a scene in the colours of its Gaussians."""
+    """Return some views of a scene in the colours of its Gaussians, ``[n,h,w,3]``."""
     if not scene.aligned:
         return np.asarray(render(scene.gaussians, scene.cameras[views]).images).clip(0, 1)
     return scene_pictures(replace(subset(scene, views), images=None))

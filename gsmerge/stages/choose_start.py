@@ -1,4 +1,4 @@
-"""merged views -> merged views: the start with networks or the one without, whichever shows the views better."""
+"""Starts of a scene, with and without networks -> the start that shows the views better."""
 
 from __future__ import annotations
 
@@ -26,19 +26,12 @@ MAX_VIEWS = 6  # that a start is judged by
 def choose_start(
     starts: Sequence[MergedViews], scene: Scene, options: DecodeOptions, checkpoint: Checkpoint | None
 ) -> MergedViews:
-    """Choose the start, with or without networks, whose Gaussians at K = 1 show the views better; of one, that one.
+    """Choose the start, with or without networks, whose Gaussians at K = 1 show the views better.
 
-    The choice does not depend on K, so what is encoded once is what every K begins with. Networks learn what real
-    exports suffer from; a scene without those errors is better left as it is.
-
-    Args:
-        starts: The learned start, then the analytic one; or one alone.
-        scene: The canonical scene.
-        options: Of decoding; K = 1 is taken.
-        checkpoint: Where the networks come from, for the record.
-
-    Returns:
-        The better start, of equal ones the analytic, with its Gaussians; the record gets the PSNR (dB) of both.
+    The choice does not depend on K, so what is encoded once is what every K begins with. Networks
+    learn what real exports suffer from; a scene without those errors is better left alone.
+    ``starts``: the learned start, then the analytic one, which wins ties; or one alone. The record
+    gets the PSNR (dB) of both.
     """
     best = starts[0] if len(starts) == 1 else _better_start(starts, scene, options)
     choose(groups=best.num_groups, clusters=len(best.features))
@@ -65,11 +58,9 @@ def _better_start(starts: Sequence[MergedViews], scene: Scene, options: DecodeOp
 def views_psnr(gaussians: Gaussians, scene: Scene) -> float:
     """Measure the PSNR (dB) of the views at half size, over the pixels that have a Gaussian of their own.
 
-    Args:
-        gaussians: Canonical Gaussians.
-        scene: The canonical scene; without photos, the colours of its pixels stand in for them.
+    Without photos, the colours of the scene's pixels stand in for them.
     """
-    photos = _photos(scene)
+    photos = scene_photos(replace(scene, images=scene_pictures(scene)), 2)
 
     def score(view: int, image: np.ndarray, _: np.ndarray) -> tuple[float, float]:
         error = ((np.clip(image, 0, 1) - photos.images[view]) ** 2).sum(-1)
@@ -80,15 +71,8 @@ def views_psnr(gaussians: Gaussians, scene: Scene) -> float:
     return float(-10 * np.log10(max(error / max(3 * count, 1), 1e-12)))
 
 
-def _photos(scene: Scene) -> Photos:
-    """The photos at half size, or the pictures that stand in for them."""
-    if scene.images is None:
-        scene = replace(scene, images=scene_pictures(scene))
-    return scene_photos(scene, 2)
-
-
 def _weight(scene: Scene, view: int, photos: Photos) -> np.ndarray:
-    """``[h,w]`` share of each half-size pixel that has Gaussians; ones where Gaussians belong to no pixels."""
+    """Return the share of each half-size pixel that has Gaussians, ``[h,w]``; ones for unaligned scenes."""
     size = photos.width, photos.height
     if not scene.aligned:
         return np.ones(size[::-1], np.float32)

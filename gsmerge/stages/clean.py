@@ -1,7 +1,7 @@
-"""fitted Gaussians -> those that are wanted: cropped to a box or a sphere, without floaters or sky.
+"""Fitted Gaussians -> wanted Gaussians: cropped to a box or a sphere, without floaters or sky.
 
-A budget is met after clean-up: more Gaussians are made than are asked for, and the faintest of what is too many are
-left out (:func:`clean_to_count`).
+A budget is met after clean-up: more Gaussians are made than are asked for, and the faintest of what
+is too many are left out (:func:`clean_to_count`).
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ Counts = dict[str, int]
 
 @dataclass(frozen=True)
 class CleanOptions:
-    """What is left out of the result.
+    """Options of clean-up: what to leave out of the result.
 
     Args:
         crop: Keep the Gaussians whose centre is inside: ``"sphere:x,y,z,radius"`` or ``"box:x0,y0,z0,x1,y1,z1"``, in
@@ -49,7 +49,7 @@ class CleanOptions:
         drop_sky: Leave out Gaussians that are sky in the photos, see :func:`gsmerge.stages.sky.sky`.
 
     Raises:
-        ValueError: If the crop is none, or holds nothing.
+        ValueError: If the crop cannot be parsed, or holds nothing.
     """
 
     crop: str | None = None
@@ -67,10 +67,7 @@ class CleanOptions:
 
 
 def parse_crop(text: str) -> tuple[str, np.ndarray]:
-    """The shape of a crop and its numbers, float64.
-
-    Raises:
-        ValueError: If it is none, or holds nothing.
+    """Parse the shape of a crop and its numbers, float64.
 
     Example:
         >>> parse_crop("sphere:0,0,2,1.5")
@@ -91,7 +88,7 @@ def parse_crop(text: str) -> tuple[str, np.ndarray]:
 
 
 def inside_crop(means: np.ndarray, crop: str) -> np.ndarray:
-    """``[n]`` bool: which world-frame centres ``[n,3]`` a crop keeps; its border belongs to it."""
+    """Return a mask ``[n]`` of the world-frame centres ``[n,3]`` inside a crop or on its border."""
     shape, numbers = parse_crop(crop)
     if shape == "sphere":
         return np.asarray(np.square(means - numbers[:3]).sum(1) <= numbers[3] ** 2)
@@ -99,21 +96,18 @@ def inside_crop(means: np.ndarray, crop: str) -> np.ndarray:
 
 
 def beyond_scene(means: np.ndarray, samples: np.ndarray | None = None) -> np.ndarray:
-    """``[n]`` bool: which centres ``[n,3]`` lie outside ten times the box of 1 % to 99 % of them, or of ``samples``."""
+    """Return a mask ``[n]`` of centres outside ten times the box of 1 % to 99 % of them, or of ``samples``."""
     low, high = np.percentile(means if samples is None else samples, BOX_QUANTILES, axis=0)
     half = np.maximum((high - low) / 2, 1e-3 * max(float(np.linalg.norm(high - low)), 1e-30))
     return np.asarray((np.abs(means - (low + high) / 2) > OUTLIER_BOX * half).any(1))
 
 
 def floaters(gaussians: Gaussians, rows: np.ndarray | None = None) -> np.ndarray:
-    """``[n]`` bool: which finite Gaussians are isolated, or far beyond the scene.
+    """Return a mask ``[n]`` of finite Gaussians that are isolated, or far beyond the scene.
 
-    Isolated: none of the eight nearest is within three times the largest scales of both, and the nearest is more than
-    three times as far as the median Gaussian's. Far beyond: :func:`beyond_scene`.
-
-    Args:
-        gaussians: n of them, in any unit.
-        rows: ``[m]`` of them to ask about; None: all.
+    Isolated: none of the eight nearest is within three times the largest scales of both, and the
+    nearest is more than three times as far as the median Gaussian's. Far beyond:
+    :func:`beyond_scene`. ``rows [m]``: only these.
     """
     rows = np.arange(len(gaussians)) if rows is None else rows
     means, sizes = gaussians.means.astype(np.float64), gaussians.scales.max(1).astype(np.float64)
@@ -130,19 +124,16 @@ def floaters(gaussians: Gaussians, rows: np.ndarray | None = None) -> np.ndarray
 
 
 def floater_share(gaussians: Gaussians) -> float:
-    """Share of finite Gaussians that are :func:`floaters`, of many estimated from some; 0 without any."""
+    """Estimate the share of finite Gaussians that are :func:`floaters`; 0 without any."""
     rows = np.arange(0, len(gaussians), max(1, -(-len(gaussians) // MAX_SAMPLES)))
     return float(floaters(gaussians, rows).mean()) if len(rows) else 0.0
 
 
 def clean(gaussians: Gaussians, options: CleanOptions, scene: Scene, to_world: ToWorld) -> tuple[Gaussians, Counts]:
-    """The Gaussians that are wanted, and how many are left out by reason: ``cropped``, ``sky``, ``floaters``.
+    """Leave unwanted Gaussians out; return the rest and numbers by reason (``cropped``, ``sky``, ``floaters``).
 
-    Args:
-        gaussians: In the canonical frame.
-        options: What is left out.
-        scene: In the same frame; its photos say where the sky is, and without them ``drop_sky`` cannot be asked for.
-        to_world: From that frame to the world's, which a crop is in.
+    Gaussians and scene are canonical; ``to_world`` leads to the frame of the crop. The sky is found
+    in the scene's photos.
     """
     counts = {}
     if options.crop is not None:
@@ -159,16 +150,10 @@ def clean(gaussians: Gaussians, options: CleanOptions, scene: Scene, to_world: T
 
 
 def clean_to_count(make: Make, count: int | None, options: CleanOptions, prepared: Prepared) -> Fitted:
-    """Make Gaussians and clean them up: exactly ``count`` are left, unless the whole scene does not hold so many.
+    """Make Gaussians and clean them, so that exactly ``count`` are left if the scene holds so many.
 
-    Args:
-        make: Makes that many Gaussians before clean-up.
-        count: Gaussians in the result; None: as many as are left.
-        options: What is left out.
-        prepared: The scene, whose own Gaussians say how many a crop is likely to leave.
-
-    Raises:
-        UsageError: If the crop holds none of the scene.
+    ``make`` builds a given number of Gaussians before clean-up. Raises UsageError if the crop holds
+    none of the scene.
     """
     if not options.asked:
         return make(count)
@@ -205,7 +190,7 @@ def clean_to_count(make: Make, count: int | None, options: CleanOptions, prepare
 
 
 def faintest_dropped(gaussians: Gaussians, count: int) -> Gaussians:
-    """The ``count`` Gaussians with the largest opacity times area of the two largest axes, in their order."""
+    """Keep the ``count`` Gaussians with the largest opacity times area of the two largest axes, in order."""
     area = np.sort(gaussians.scales, axis=1)[:, 1:].prod(1)
     return gaussians[np.sort(np.argsort(-gaussians.opacities * area, kind="stable")[:count])]
 

@@ -1,4 +1,4 @@
-"""feature gaussians -> gaussians: K children of every group, analytic, with the networks' heads on top."""
+"""Feature Gaussians -> Gaussians: K children of every group, analytic, corrected by networks if any."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ PLANE_WEIGHT = 1 / 16  # of squared distances from a group's plane; the unit is 
 
 @dataclass(frozen=True)
 class DecodeOptions:
-    """How many Gaussians a Feature Gaussian becomes.
+    """Number of Gaussians that a Feature Gaussian becomes.
 
     Args:
         k: Children of each group, 1 to 8; or ``"mixed"``: 1, 2 or 4 (paper supplement, per-superpixel K).
@@ -65,12 +65,12 @@ class DecodeOptions:
 
     @property
     def mean_k(self) -> float:
-        """Children of a group on average."""
+        """Mean number of children of a group."""
         return float(self.k) if self.k != MIXED else 1 + (100 - self.k_low + 2 * (100 - self.k_high)) / 100
 
     @property
     def max_k(self) -> int:
-        """Most children of a group."""
+        """Largest number of children of a group."""
         return MIXED_COUNTS[-1] if self.k == MIXED else int(self.k)
 
 
@@ -81,23 +81,12 @@ def decode(
     counts: np.ndarray | None = None,
     networks: NetworkContext | None = None,
 ) -> Gaussians:
-    """K Gaussians for each Feature Gaussian, fewer where its members are alike.
+    """Decode each Feature Gaussian into K Gaussians, fewer where its members are alike.
 
-    Children are found by halving the members again and again across their widest direction in colour and
-    position, so that those of K = 2 are unions of those of K = 4.
-
-    Args:
-        features: The Feature Gaussians; at K > 1 their members are looked up again.
-        members: The scene's Gaussians that ``features.members`` points into.
-        options: K and the least opacity.
-        counts: ``[g]`` a K for every group instead, from 1 on. Needed where K is mixed.
-        networks: Networks whose heads correct the children; None: none does.
-
-    Returns:
-        The Gaussians, those of one group next to each other.
-
-    Raises:
-        ValueError: If ``counts`` has the wrong shape or a count below 1.
+    Children are found by halving the members again and again across their widest direction in
+    colour and position, so that those of K = 2 are unions of those of K = 4. ``counts [g]``, from 1
+    on, sets K for each group and is needed where K is mixed. Gaussians of one group are next to
+    each other.
     """
     if counts is None:
         counts = np.full(len(features), options.max_k)
@@ -113,19 +102,12 @@ def decode(
 
 @dataclass(frozen=True, eq=False)
 class Decoded:
-    """What a fit begins with.
+    """Start of a fit."""
 
-    Args:
-        gaussians: Canonical Gaussians.
-        count: Number that the fit may grow to.
-        exact: Whether that number is to be met.
-        baseline_start: Gaussians that the fit may beat instead; None: none are compared.
-    """
-
-    gaussians: Gaussians
-    count: int
-    exact: bool
-    baseline_start: Gaussians | None = None
+    gaussians: Gaussians  # Canonical Gaussians
+    count: int  # Number to which the fit may grow
+    exact: bool  # Whether that number is to be met
+    baseline_start: Gaussians | None = None  # Another start that the fit may beat instead
 
 
 def keep_all(scene: Scene, count: int | None) -> Decoded | None:
@@ -137,14 +119,7 @@ def keep_all(scene: Scene, count: int | None) -> Decoded | None:
 
 @stage("decode")
 def decode_merged(merged: MergedViews, scene: Scene, options: DecodeOptions, *, grows: bool) -> Decoded:
-    """Decode merged views into as many Gaussians as were asked for exactly, or K for each Feature Gaussian.
-
-    Args:
-        merged: The Feature Gaussians.
-        scene: The canonical scene, whose pictures say where K is larger if it is mixed.
-        options: K and the least opacity.
-        grows: Whether the fit that follows adds Gaussians up to an exact count.
-    """
+    """Decode merged views into the exact number asked for, unless the fit ``grows`` to it, or K for each group."""
     asked = merged.segmentation
     if asked.exact and not grows:
         gaussians = _decode_exactly(merged, asked.count, options)
@@ -157,7 +132,7 @@ def decode_merged(merged: MergedViews, scene: Scene, options: DecodeOptions, *, 
 
 
 def _decode_count(merged: MergedViews, scene: Scene, count: int | None, options: DecodeOptions) -> Gaussians:
-    """``count`` Gaussians, spent where they lower distortion most; None: K of each Feature Gaussian."""
+    """Decode ``count`` Gaussians where they lower distortion most; None: K of each Feature Gaussian."""
     if count is None and options.k == 1 and merged.k1_gaussians is not None:
         return merged.k1_gaussians
     features, members, networks = merged.features, merged.members, merged.networks
@@ -171,7 +146,7 @@ def _decode_count(merged: MergedViews, scene: Scene, count: int | None, options:
 
 
 def _decode_exactly(merged: MergedViews, count: int, options: DecodeOptions) -> Gaussians:
-    """``count`` visible Gaussians, spent where they lower distortion most."""
+    """Decode ``count`` visible Gaussians where they lower distortion most."""
     features, members, networks = merged.features, merged.members, merged.networks
     most = MAX_CHILDREN if networks is None else networks.networks.max_children
     every = replace(options, min_opacity=0.0)
@@ -187,14 +162,11 @@ def _decode_exactly(merged: MergedViews, count: int, options: DecodeOptions) -> 
 def deal_visible(
     order: np.ndarray, num_groups: int, total: int, min_opacity: float, make: Callable[[np.ndarray], Gaussians]
 ) -> Gaussians:
-    """``total`` Gaussians: those that are too faint to be seen make way for further ones.
+    """Make ``total`` Gaussians, replacing those below ``min_opacity`` by further children.
 
-    Args:
-        order: ``[d]`` the group that each further Gaussian goes to, see :func:`deal_order`.
-        num_groups: Groups, each of which gets at least one.
-        total: Gaussians in all; fewer where the groups do not divide into as many.
-        min_opacity: What can be seen.
-        make: The Gaussians for the number of each group ``[g]``, however faint.
+    ``order [d]`` are the groups of further Gaussians, see :func:`deal_order`; each group gets at
+    least one. ``make`` makes Gaussians from the number of each group ``[g]``, however faint. There
+    are fewer than ``total`` where the groups do not divide into as many.
     """
     extra = max(0, total - num_groups)
     for _ in range(REFILLS + 1):
@@ -212,17 +184,7 @@ def deal_visible(
 def mixed_counts(
     features: FeatureGaussians, members: Members, saliency: np.ndarray, options: DecodeOptions
 ) -> np.ndarray:
-    """A K of 1, 2 or 4 for every group by its place among all (paper supplement, per-superpixel K).
-
-    Args:
-        features: g Feature Gaussians.
-        members: The scene's Gaussians.
-        saliency: ``[v·h·w]`` corner response of every pixel.
-        options: Percentiles and rule.
-
-    Returns:
-        ``[g]`` int64.
-    """
+    """Choose K = 1, 2 or 4 for every group by its rank in ``saliency`` (paper supplement, per-superpixel K)."""
     starts, ids = features.starts, features.members
     pixels = ids if members.pixels is None else members.pixels[ids]
     values = np.where(pixels >= 0, saliency[pixels], 0.0)
@@ -235,11 +197,11 @@ def mixed_counts(
 
 
 def merged_count(merged: MergedViews, options: DecodeOptions, *, grows: bool) -> int | None:
-    """Gaussians that merged views become; None: K for each Feature Gaussian.
+    """Return the number of Gaussians for merged views; None: K for each Feature Gaussian.
 
-    A number where one is to be met and no fit grows to it; and for unaligned scenes: what a near and a far view both
-    show belongs to the near one, so many superpixels of the far one stay empty, and their Gaussians are spent on the
-    others.
+    A number where one is to be met and no fit grows to it; and for unaligned scenes: what a near
+    and a far view both show belongs to the near one, so many superpixels of the far one stay empty,
+    and their Gaussians are spent on the others.
     """
     segmentation, members = merged.segmentation, merged.members
     if segmentation.exact and not grows:
@@ -255,11 +217,12 @@ def merged_count(merged: MergedViews, options: DecodeOptions, *, grows: bool) ->
 
 
 def divide(features: FeatureGaussians, members: Members, counts: np.ndarray) -> tuple[Gaussians, np.ndarray]:
-    """The analytic children of :func:`decode`, however faint, and the Feature Gaussian ``[n]`` of each, rising."""
+    """Return the analytic children of :func:`decode`, however faint, and the rising group ``[n]`` of each."""
     divided = counts > 1
     gaussians, parents = feature_to_gaussians(features), np.arange(len(features))
     if divided.any():
-        children, of_children = _children(features, members, np.flatnonzero(divided), counts)
+        starts, ids, of_children = halve(features, members, np.flatnonzero(divided), counts)
+        children = pool_children(features, members, starts, ids, of_children)
         whole = np.flatnonzero(~divided)
         parents = np.concatenate([whole, of_children])
         order = np.argsort(parents, kind="stable")
@@ -268,25 +231,10 @@ def divide(features: FeatureGaussians, members: Members, counts: np.ndarray) -> 
     return gaussians, parents
 
 
-def _children(
-    features: FeatureGaussians, members: Members, groups: np.ndarray, counts: np.ndarray
-) -> tuple[Gaussians, np.ndarray]:
-    """Gaussians of the children of some groups, and the group of each."""
-    starts, ids, parents = halve(features, members, groups, counts)
-    return pool_children(features, members, starts, ids, parents), parents
-
-
 def halve(
     features: FeatureGaussians, members: Members, groups: np.ndarray, counts: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Members of the children of some groups: ``starts [n+1]`` into the rows ``[m]``, and the group of each child.
-
-    Args:
-        features: All g Feature Gaussians.
-        members: The scene's Gaussians.
-        groups: The Feature Gaussians to divide.
-        counts: ``[g]`` most children of each.
-    """
+    """Halve groups' members into ``counts [g]`` children: ``starts [n+1]``, member rows ``[m]``, groups ``[n]``."""
     starts, ids = features.starts, features.members
     centres, footprints = features.means.astype(np.float64), features.footprints.astype(np.float64)
 
@@ -310,29 +258,18 @@ def pool_children(
     ids: np.ndarray,
     parents: np.ndarray,
 ) -> Gaussians:
-    """One Gaussian for each run of members, with the gain of the Feature Gaussian that it is a child of."""
+    """Pool each run of members into one Gaussian, with the gain of its Feature Gaussian."""
     moments = pool_members(members, starts, ids)
     extinctions = moments.extinctions * features.gains[parents]
     return to_gaussians(moments.covars, extinctions, moments.means, moments.sh)
 
 
 def split_counts(features: FeatureGaussians, members: Members, extra: int, max_children: int = 8) -> np.ndarray:
-    """Children of every Feature Gaussian when ``extra`` more Gaussians are spent where they lower distortion most.
+    """Spend ``extra`` Gaussians where they lower distortion most; return the children ``[g]`` int64 of each group.
 
-    A step that only pays together with the next one is judged by the two together (the convex hull of the
-    group's distortion), so a larger ``extra`` never takes a child away.
-
-    Args:
-        features: g Feature Gaussians.
-        members: The scene's Gaussians that ``features.members`` points into.
-        extra: Gaussians to add, at least 0.
-        max_children: Most children of one group.
-
-    Returns:
-        ``[g]`` int64, 1 to ``max_children``; their sum is ``g + extra``, or the most that the members give.
-
-    Raises:
-        ValueError: If ``extra`` is negative or ``max_children`` below 1.
+    A step that only pays together with the next one is judged by the two together (the convex hull
+    of the group's distortion), so a larger ``extra`` never takes a child away. The sum is ``g +
+    extra``, or the most that the members give.
     """
     if extra < 0:
         raise ValueError(f"extra: expected at least 0, got {extra}")
@@ -344,10 +281,7 @@ def split_counts(features: FeatureGaussians, members: Members, extra: int, max_c
 
 
 def deal_order(features: FeatureGaussians, members: Members, max_children: int = 8) -> np.ndarray:
-    """The Feature Gaussian ``[d]`` that each further Gaussian goes to, where it lowers distortion most first.
-
-    See :func:`split_counts`, which takes the first ones.
-    """
+    """Return the Feature Gaussian ``[d]`` of each further Gaussian, largest gain first; see :func:`split_counts`."""
     if max_children == 1 or len(features) == 0:
         return np.zeros(0, np.int64)
     gains = hull_gains(_child_errors(features, members, max_children))
@@ -357,7 +291,7 @@ def deal_order(features: FeatureGaussians, members: Members, max_children: int =
 
 
 def _child_errors(features: FeatureGaussians, members: Members, max_children: int) -> np.ndarray:
-    """``[g,max_children]`` distortion of 1, 2, ... children; NaN where members do not give that many."""
+    """Return the distortion ``[g,max_children]`` of 1, 2, ... children; NaN where members give fewer."""
     starts, ids = features.starts, features.members
     centres, footprints = features.means.astype(np.float64), features.footprints.astype(np.float64)
 
@@ -374,9 +308,10 @@ def _child_errors(features: FeatureGaussians, members: Members, max_children: in
 
 
 def hull_gains(errors: np.ndarray) -> np.ndarray:
-    """``[f,c-1]`` gain of each further child along the lower convex hull of the errors; -inf where there is none.
+    """Return the gain ``[f,c-1]`` of each further child along the lower convex hull of the errors.
 
-    Falls from child to child: the mean gain up to the farthest point of steepest descent, again and again.
+    -inf where there is none. Gains fall from child to child: the mean gain up to the farthest point
+    of steepest descent, again and again.
     """
     num_groups, num_children = errors.shape
     gains = np.full((num_groups, num_children - 1), -np.inf)

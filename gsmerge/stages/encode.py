@@ -1,4 +1,4 @@
-"""groups -> feature gaussians: one Feature Gaussian per superpixel, analytic, with the networks' encoder on top."""
+"""Groups -> Feature Gaussians: one per superpixel, analytic, corrected by the networks' encoder if any."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 from gsmerge.kernels.gaussians.pool import group_members
 from gsmerge.moments import Members, Moments, Rule, pool_members
 from gsmerge.runtime.record import stage
-from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.agreement import weaken_contradicted
 from gsmerge.types import Cameras, FeatureGaussians, Groups, Scene, to_float32
 
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def make_context(networks: Networks | None, members: Members, cameras: Cameras, seed: int) -> NetworkContext | None:
-    """Join networks with what they read of a scene; None for none."""
+    """Return networks with the facts of a scene that they read; None without networks."""
     if networks is None:
         return None
     from gsmerge.networks.apply import NetworkContext  # torch, loaded where there are networks
@@ -37,20 +36,12 @@ def encode(
     *,
     weaken: bool = False,
 ) -> FeatureGaussians:
-    """Pool every superpixel into one Feature Gaussian, view by view.
+    """Pool every superpixel into one Feature Gaussian, in order of view and label.
 
-    Args:
-        scene: The canonical scene.
-        members: Its Gaussians as arrays.
-        groups: The superpixels of every view.
-        networks: Networks whose encoder corrects what is pooled; None: none does.
-        rule: ``"depth"``: opacity weights, total covariance of winsorised members, opacity from the conserved optical
-            depth. ``"paper"``: the paper's moment matching (eq. teacher_mean, teacher_cov; mean opacity).
-        weaken: Lower the optical depth of groups that other views see through, where no network corrects them. A long
-            fit closes the holes that this leaves, and moves what stands before other views less.
-
-    Returns:
-        The Feature Gaussians in order of view and label; superpixels without a valid member are left out.
+    Superpixels without a valid member are left out. ``rule``: see
+    :func:`gsmerge.moments.pool_members`. ``weaken``: lower the optical depth of groups that other
+    views see through, where no network corrects them; a long fit closes the holes that this leaves,
+    and moves what stands before other views less.
     """
     starts, ids, views = member_rows(scene, members, groups)
     features = from_moments(pool_members(members, starts, ids, rule), starts, ids, views)
@@ -62,49 +53,30 @@ def encode(
 
 
 def member_rows(scene: Scene, members: Members, groups: Groups) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Members by superpixel: ``starts [g+1]``, ``ids [m]`` int32, ``views [g]``; empty superpixels left out."""
-    if scene.aligned:
-        return group_rows(scene, groups)
-    assert members.pixels is not None
+    """List members by superpixel: ``starts [g+1]``, ``ids [m]`` int32, ``views [g]``, without empty superpixels."""
     counts = np.asarray(groups.counts)
     first = np.cumsum(counts) - counts
-    labels = groups.labels.reshape(-1)[members.pixels] + first[members.pixels // scene.pixels_per_view]
-    labels = np.where(members.pixels >= 0, labels, -1).astype(np.int32)
-    starts, ids = group_members(labels, int(counts.sum()))
+    if scene.aligned:
+        labels = groups.labels + first.astype(np.int32)[:, None, None]  # as many as Gaussians
+        labels = np.where(scene.valid, labels, -1).reshape(-1)
+    else:
+        assert members.pixels is not None
+        labels = groups.labels.reshape(-1)[members.pixels] + first[members.pixels // scene.pixels_per_view]
+        labels = np.where(members.pixels >= 0, labels, -1)
+    starts, ids = group_members(labels.astype(np.int32, copy=False), int(counts.sum()))
     filled, views = np.diff(starts) > 0, np.repeat(np.arange(len(counts)), counts)
     return np.append(starts[:-1][filled], starts[-1]), ids.astype(np.int32), views[filled]
 
 
-def group_rows(scene: Scene, groups: Groups) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows of the scene by superpixel: ``starts [g+1]``, ``ids [m]`` int32, ``views [g]``; empty ones left out."""
-    pixels = scene.pixels_per_view
-
-    def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
-        labels = np.where(scene.valid[view], groups.labels[view], -1).reshape(-1).astype(np.int32)
-        starts, ids = group_members(labels, groups.counts[view])
-        return np.diff(starts), (ids + view * pixels).astype(np.int32)
-
-    parts = parallel_map(one_view, range(len(scene)))
-    sizes = np.concatenate([p[0] for p in parts])
-    views = np.repeat(np.arange(len(scene)), groups.counts)
-    filled = sizes > 0
-    starts = np.concatenate([[0], np.cumsum(sizes[filled])])
-    return starts, np.concatenate([p[1] for p in parts]), views[filled]
-
-
 def from_moments(moments: Moments, starts: np.ndarray, ids: np.ndarray, views: np.ndarray) -> FeatureGaussians:
-    """Feature Gaussians of pooled groups, with neutral gains."""
+    """Make Feature Gaussians of pooled groups, with neutral gains."""
     count = len(moments.means)
+    names = ("means", "covars", "weights", "masses", "extinctions", "footprints")
     return FeatureGaussians(
-        means=to_float32(moments.means),
-        covars=to_float32(moments.covars),
-        weights=to_float32(moments.weights),
-        masses=to_float32(moments.masses),
-        extinctions=to_float32(moments.extinctions),
+        **{name: to_float32(getattr(moments, name)) for name in names},
         gains=np.ones(count, np.float32),
         sh0=moments.sh[:, :1],
         shN=moments.sh[:, 1:],
-        footprints=to_float32(moments.footprints),
         views=views,
         starts=starts,
         members=ids,

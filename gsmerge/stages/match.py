@@ -1,4 +1,4 @@
-"""feature gaussians -> matches: which Feature Gaussians of different views show the same piece of surface."""
+"""Feature Gaussians -> matches: which of them, of different views, show the same piece of surface."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Geometry = Literal["analytic", "decoded"]
 
 @dataclass(frozen=True)
 class MatchOptions:
-    """When two Feature Gaussians are taken for one.
+    """Conditions under which two Feature Gaussians are merged.
 
     Args:
         match: ``"overlap"``: Bhattacharyya coefficient (does not depend on the world's axes), similar colours, and
@@ -69,16 +69,16 @@ class MatchOptions:
 
     @property
     def method(self) -> Method:
-        """How views are merged."""
+        """Method of merging views."""
         return self.match or "overlap"
 
 
 @stage("match")
 def match(features: FeatureGaussians, options: MatchOptions, networks: NetworkContext | None = None) -> Matches:
-    """Clusters of Feature Gaussians of different views.
+    """Cluster Feature Gaussians of different views that show the same piece of surface.
 
-    The result does not depend on the order of the Feature Gaussians: leaders are taken by weight, ties by position.
-    What is fully transparent is left alone.
+    The result does not depend on the order of the Feature Gaussians: leaders are taken by weight,
+    ties by position. Fully transparent Feature Gaussians stay alone.
     """
     if networks is not None and options.geometry == "decoded" and options.method != "none":
         from gsmerge.networks.apply import match_geometry
@@ -97,7 +97,7 @@ def match(features: FeatureGaussians, options: MatchOptions, networks: NetworkCo
 
 
 def _clusters(features: FeatureGaussians, rows: np.ndarray, options: MatchOptions) -> tuple[np.ndarray, int]:
-    """Cluster of each of some rows, and the number of clusters."""
+    """Return the cluster of each of some rows, and the number of clusters."""
     means, views = features.means[rows].astype(np.float64), features.views[rows]
     covars = features.covars[rows].astype(np.float64).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
     colors = SH_C0 * features.sh0[rows, 0].astype(np.float64)

@@ -1,4 +1,4 @@
-"""feature gaussians + matches -> feature gaussians: every cluster pooled into one, then in line with its neighbours."""
+"""Feature Gaussians and matches -> Feature Gaussians: every cluster pooled into one, then refined."""
 
 from __future__ import annotations
 
@@ -17,42 +17,25 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class MergedViews:
-    """Feature Gaussians merged across views, and what decoding them takes.
+    """Feature Gaussians merged across views, with everything that decoding needs."""
 
-    Args:
-        features: The Feature Gaussians.
-        members: The scene's Gaussians that ``features.members`` points into.
-        segmentation: The superpixels that they come from, and how many Gaussians they are to become.
-        num_groups: Superpixels with Gaussians, before merging.
-        networks: Networks that correct; None: those are not used.
-        unlearned: Feature Gaussians without networks, which the fit may beat instead; None: none are compared.
-        k1_gaussians: What they become at K = 1, where that had to be known to choose them; None elsewhere.
-    """
-
-    features: FeatureGaussians
-    members: Members
-    segmentation: Segmentation
-    num_groups: int
-    networks: NetworkContext | None = None
-    unlearned: FeatureGaussians | None = None
-    k1_gaussians: Gaussians | None = None
+    features: FeatureGaussians  # The Feature Gaussians
+    members: Members  # The scene's Gaussians, indexed by `features.members`
+    segmentation: Segmentation  # The superpixels, and the number of Gaussians to make
+    num_groups: int  # Superpixels with Gaussians, before merging
+    networks: NetworkContext | None = None  # Networks that correct; None without
+    unlearned: FeatureGaussians | None = None  # The same without networks, for comparison
+    k1_gaussians: Gaussians | None = None  # Their Gaussians at K = 1, if known already
 
 
 @stage("match")
 def merge(features: FeatureGaussians, matches: Matches, networks: NetworkContext | None = None) -> FeatureGaussians:
-    """One Feature Gaussian per cluster; those that are alone pass unchanged.
+    """Pool each cluster into one Feature Gaussian; those alone come first, unchanged and in order.
 
-    Members are weighted with their opacities times what the photos say of them (gains); masses and integrated
-    optical depths add, so equal ones stacked on each other become 1 - prod(1 - alpha). Sums run in float64 about
-    the cluster's own mean: the result does not depend on the order of the members beyond rounding.
-
-    Args:
-        features: g Feature Gaussians.
-        matches: A cluster for each.
-        networks: Networks whose merger corrects what is pooled; None: none does.
-
-    Returns:
-        ``matches.count`` Feature Gaussians: first those that are alone in their old order, then the merged ones.
+    Members are weighted with their opacities times what the photos say of them (gains); masses and
+    integrated optical depths add, so equal ones stacked on each other become 1 - prod(1 - alpha).
+    Sums run in float64 about the cluster's own mean: the result does not depend on the order of the
+    members beyond rounding.
     """
     alone, order, cuts = cluster_runs(matches)
     if len(order) == 0:
@@ -66,12 +49,7 @@ def merge(features: FeatureGaussians, matches: Matches, networks: NetworkContext
 
 
 def refine(features: FeatureGaussians, networks: NetworkContext | None) -> FeatureGaussians:
-    """Feature Gaussians with the refiner's corrections (paper section 4.5); as they are without networks.
-
-    Args:
-        features: Merged Feature Gaussians of all views.
-        networks: Networks and the scene, or None.
-    """
+    """Apply the refiner's corrections (paper section 4.5); do nothing without networks."""
     if networks is None:
         return features
     from gsmerge.networks.apply import refine_features
@@ -81,7 +59,7 @@ def refine(features: FeatureGaussians, networks: NetworkContext | None) -> Featu
 
 
 def cluster_runs(matches: Matches) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows that are alone in their cluster; the others cluster by cluster; where each cluster begins among them."""
+    """Return rows alone in their cluster, the other rows by cluster, and where each cluster starts among these."""
     clusters = matches.clusters
     alone = np.bincount(clusters, minlength=matches.count)[clusters] == 1
     order = np.flatnonzero(~alone)
@@ -92,14 +70,14 @@ def cluster_runs(matches: Matches) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def take(features: FeatureGaussians, index: np.ndarray) -> FeatureGaussians:
-    """The Feature Gaussians that an integer ``index`` selects, with their members."""
+    """Return the Feature Gaussians that an integer ``index`` selects, with their members."""
     starts, members = _gather(features, index)
     names = [n for n in features.__dataclass_fields__ if n not in ("starts", "members")]
     return FeatureGaussians(starts=starts, members=members, **{n: getattr(features, n)[index] for n in names})
 
 
 def _gather(features: FeatureGaussians, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Members of the indexed Feature Gaussians, one after the other: starts and rows."""
+    """Return the members of the indexed Feature Gaussians, as starts and rows."""
     begin, sizes = features.starts[index], np.diff(features.starts)[index]
     starts = np.concatenate([np.zeros(1, np.int64), sizes.cumsum()])
     places = (begin - starts[:-1]).astype(np.int32).repeat(sizes)
@@ -108,7 +86,7 @@ def _gather(features: FeatureGaussians, index: np.ndarray) -> tuple[np.ndarray, 
 
 
 def pool_runs(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray) -> FeatureGaussians:
-    """One Feature Gaussian for each run of rows in ``order`` that begins at ``cuts``."""
+    """Pool each run of rows in ``order`` that begins at ``cuts`` into one Feature Gaussian."""
 
     def rows(array: np.ndarray) -> np.ndarray:
         return array[order].astype(np.float64)
@@ -145,7 +123,7 @@ def pool_runs(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray) -
 
 
 def _pool_latents(latents: Array, share: np.ndarray, run: np.ndarray, count: int) -> Array:
-    """``[count,d]`` weighted sums of latents ``[m,d]`` over runs; gradients pass."""
+    """Return weighted sums ``[count,d]`` of latents ``[m,d]`` over runs; gradients pass."""
     if latents.shape[1] == 0:
         return np.zeros((count, 0), np.float32)
     import torch

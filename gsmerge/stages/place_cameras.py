@@ -1,4 +1,4 @@
-"""unaligned scene -> the same with views: cameras placed where they show most, pictures rendered from it."""
+"""Unaligned scene -> the same with views: cameras that show most of it, and renders in place of photos."""
 
 from __future__ import annotations
 
@@ -25,11 +25,7 @@ ENOUGH = 1.0  # pixels of blending weight at which a Gaussian counts as seen
 
 
 def add_views(scene: Scene) -> Scene:
-    """The finite Gaussians, and cameras where there are none; a note says what was done.
-
-    Raises:
-        ValueError: If there is no finite Gaussian.
-    """
+    """Keep the finite Gaussians, at least one, and place cameras where there are none; a note says what was done."""
     g = scene.gaussians
     finite = np.isfinite(g.opacities)
     for array in (g.means, g.quats, g.scales, g.sh0, g.shN):
@@ -49,7 +45,7 @@ def add_views(scene: Scene) -> Scene:
 
 
 def add_pictures(scene: Scene) -> Scene:
-    """The canonical scene with renders of its own in place of photos where it has none."""
+    """Add renders of the canonical scene itself in place of photos where it has none."""
     if scene.images is not None:
         return scene
     note("no photos: views rendered from the scene itself stand in for them")
@@ -57,21 +53,13 @@ def add_pictures(scene: Scene) -> Scene:
 
 
 def place_cameras(gaussians: Gaussians, num_views: int = NUM_VIEWS) -> Cameras:
-    """Cameras that see as much of the scene as possible.
+    """Place cameras that see as much of the scene as possible.
 
-    Candidates stand on a sphere around the robust extent, looking in, and on a grid inside it, looking everywhere.
-    They are taken one by one, each time the one that shows most opacity which none has shown so far, in pictures of a
-    sample of the Gaussians.
-
-    Args:
-        gaussians: n finite Gaussians.
-        num_views: Most cameras; fewer where all that can be seen is seen.
-
-    Returns:
-        Cameras of square images, the larger the more Gaussians there are.
-
-    Raises:
-        ValueError: If there is no Gaussian.
+    Candidates stand on a sphere around the robust extent, looking in, and on a grid inside it,
+    looking everywhere. They are taken one by one, each time the one that shows most opacity which
+    none has shown so far, in pictures of a sample of the Gaussians. There are at most
+    ``num_views``, of square images that are larger for more Gaussians. Raises ValueError if there
+    is no Gaussian.
     """
     if len(gaussians) == 0:
         raise ValueError("expected at least one Gaussian, got none")
@@ -89,14 +77,14 @@ def _lens(size: int) -> np.ndarray:
 
 
 def sampled(gaussians: Gaussians, count: int = SAMPLES) -> Gaussians:
-    """Every so many-th Gaussian, at most ``count``, larger so that they cover what all did."""
+    """Return evenly spaced Gaussians, at most ``count``, enlarged so that they cover the same area."""
     step = max(1, -(-len(gaussians) // count))
     few = gaussians[::step]
     return Gaussians(few.means, few.quats, few.scales * step**0.5, few.opacities, few.sh0, few.shN)
 
 
 def _extent(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Middle ``[3]`` and half sides ``[3]`` of the box that most Gaussians are in."""
+    """Return middle ``[3]`` and half sides ``[3]`` of the box of most Gaussians."""
     low, high = np.quantile(means, EXTENT, axis=0)
     half = (high - low) / 2
     widest = float(half.max()) if half.max() > 0 else 1.0
@@ -104,7 +92,7 @@ def _extent(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _sphere(count: int) -> np.ndarray:
-    """``[count,3]`` directions spread evenly over the sphere (golden spiral)."""
+    """Return directions ``[count,3]`` spread evenly over the sphere (golden spiral)."""
     i = np.arange(count) + 0.5
     height, turn = 1 - 2 * i / count, np.pi * (1 + 5**0.5) * i
     ring = np.sqrt(1 - height**2)
@@ -112,7 +100,7 @@ def _sphere(count: int) -> np.ndarray:
 
 
 def _candidates(centre: np.ndarray, half: np.ndarray) -> np.ndarray:
-    """``[c,4,4]`` world to camera."""
+    """Return the world-to-camera matrices ``[c,4,4]`` of all candidates."""
     radius = float(np.linalg.norm(half))
     away = _sphere(AROUND)
     distance = radius * (1 + 2 / FIELD) / 1.5  # the box fills the image
@@ -125,7 +113,7 @@ def _candidates(centre: np.ndarray, half: np.ndarray) -> np.ndarray:
 
 
 def _look(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """World to camera, OpenCV axes."""
+    """Return the world-to-camera matrix, OpenCV axes, of an eye and a viewing direction."""
     up = np.array([0.0, 1.0, 0.0]) if abs(direction[1]) < 0.9 else np.array([0.0, 0.0, 1.0])
     x = np.cross(up, direction)
     x /= np.linalg.norm(x)
@@ -136,7 +124,7 @@ def _look(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
 
 
 def _shares_seen(sample: Gaussians, viewmats: np.ndarray, near: float) -> np.ndarray:
-    """``[c,n]`` float32 how much of each Gaussian's opacity each candidate shows."""
+    """Measure how much of each Gaussian's opacity each candidate shows, ``[c,n]`` float32."""
     splats, K = prepare(sample), _lens(PROBE)
 
     def one_view(viewmat: np.ndarray) -> np.ndarray:
@@ -147,7 +135,7 @@ def _shares_seen(sample: Gaussians, viewmats: np.ndarray, near: float) -> np.nda
 
 
 def _most_seen(shares: np.ndarray, num_views: int) -> list[int]:
-    """Candidates, each the one that adds most to what is seen; at least one."""
+    """Choose candidates one by one, each adding most to what is seen; at least one."""
     seen = np.zeros(shares.shape[1], np.float32)
     chosen: list[int] = []
     for _ in range(num_views):

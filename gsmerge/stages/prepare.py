@@ -1,14 +1,13 @@
-"""scene -> prepared scene: facts about it, and the scene in the frame that all arithmetic runs in.
+"""Scene -> prepared scene: facts about it, and the scene in the frame of all arithmetic.
 
-The canonical frame has its origin at the scene's middle and the median depth as its unit, so that float32 keeps its
-precision far from the world's origin and thresholds (near plane, floors) mean the same at every scale. The unit is a
-power of two: scaling there and back changes no bit.
+The canonical frame has its origin at the scene's middle and the median depth as its unit, so that
+float32 keeps its precision far from the world's origin and thresholds (near plane, floors) mean the
+same at every scale. The unit is a power of two: scaling there and back changes no bit.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -34,15 +33,10 @@ Unseen = Literal["drop", "keep"]
 
 @dataclass(frozen=True)
 class Frame:
-    """x_canonical = (x_world - origin) / unit.
+    """Canonical frame: x_canonical = (x_world - origin) / unit."""
 
-    Args:
-        origin: ``[3]`` float64, world units.
-        unit: Length of the canonical unit in world units, a power of two.
-    """
-
-    origin: np.ndarray
-    unit: float
+    origin: np.ndarray  # [3] float64, world units
+    unit: float  # Length of the canonical unit in world units, a power of two
 
     def enter(self, gaussians: Gaussians) -> Gaussians:
         """Move Gaussians from the world into the frame; means in float32."""
@@ -76,11 +70,7 @@ class Frame:
 
 
 def scene_frame(scene: Scene) -> Frame:
-    """Choose the canonical frame: median mean (float64) and median depth of the Gaussians that have a pixel, or of all.
-
-    Raises:
-        ValueError: If there is no valid Gaussian, or no view.
-    """
+    """Choose the canonical frame: median mean (float64) and median depth; ValueError without Gaussians or views."""
     if len(scene.gaussians) == 0 or len(scene) == 0:
         raise ValueError(f"expected Gaussians and views, got {len(scene.gaussians)} and {len(scene)}")
     means = scene.gaussians.means[_sample_rows(scene)].astype(np.float64)
@@ -103,11 +93,7 @@ def scene_depth(scene: Scene) -> float:
 
 
 def _sample_rows(scene: Scene) -> np.ndarray:
-    """Choose evenly spread rows among the valid ones.
-
-    Raises:
-        ValueError: If no Gaussian is valid.
-    """
+    """Choose evenly spread rows among the valid ones; raise ValueError if there is none."""
     rows = np.arange(len(scene.gaussians)) if scene.pixel_ids is None else np.flatnonzero(scene.pixel_ids >= 0)
     if len(rows) == 0:
         raise ValueError("expected at least one valid Gaussian, got none")
@@ -122,7 +108,7 @@ def canonicalise(scene: Scene, frame: Frame | None = None) -> tuple[Scene, Frame
 
 @dataclass(frozen=True)
 class PrepareOptions:
-    """What is done before anything is merged.
+    """Options of the preparation, before anything is merged.
 
     Args:
         poses: ``"free"``: views of one Gaussian per pixel are moved to where their photos agree, and the full fit moves
@@ -148,26 +134,17 @@ class PrepareOptions:
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """Facts about a scene, and the scene as the stages work on it.
+    """Facts about a scene, and the scene as the stages work on it."""
 
-    Args:
-        given: The scene as it was given, in its own world frame.
-        scene: The canonical scene: every view once, photos that do not show it replaced; an unaligned one has cameras,
-            pictures and only finite Gaussians that are seen, or all if none is set aside.
-        frame: The canonical frame.
-        photo_views: Views whose photos a fit may use, see :mod:`gsmerge.stages.check_photos`.
-        repeated: Of every given view its place in the scene, or that of the view that it repeats.
-        moved: Whether views were moved to where their photos agree, before a fit or by it.
-        unseen: Canonical Gaussians that no view sees; None where they were not looked for, or there are none.
-    """
-
-    given: Scene
+    given: Scene  # The scene as it was given, in its own world frame
+    # The canonical scene: every view once, photos that do not show it replaced; an unaligned one
+    # has cameras, pictures and only finite Gaussians that are seen, or all if none is set aside
     scene: Scene
-    frame: Frame
-    photo_views: tuple[int, ...]
-    repeated: tuple[int, ...]
-    moved: bool
-    unseen: Gaussians | None
+    frame: Frame  # The canonical frame
+    photo_views: tuple[int, ...]  # Views whose photos a fit may use
+    repeated: tuple[int, ...]  # Place in the scene of every given view
+    moved: bool  # Whether views were moved to where their photos agree, before a fit or by it
+    unseen: Gaussians | None  # Canonical Gaussians that no view sees, if kept
 
     def with_cameras(self, cameras: Cameras) -> Prepared:
         """Replace the canonical cameras by those of a fit; the scene's own change nothing."""
@@ -185,15 +162,10 @@ class Prepared:
 
 @stage("prepare")
 def prepare(scene: Scene, options: PrepareOptions | None = None, frame: Frame | None = None) -> Prepared:
-    """Find what is known of a scene before anything is decided; notes say what was missing and what stands in for it.
+    """Collect the facts of a scene before anything is decided; notes say what was missing and replaced.
 
-    Args:
-        scene: As given.
-        options: What may be changed; None: the defaults.
-        frame: Canonical frame; None: the scene's own.
-
-    Raises:
-        ValueError: If there is no finite Gaussian, or there are images without cameras.
+    ``frame``: canonical frame; None: the scene's own. Raises ValueError if there is no finite
+    Gaussian, or there are images without cameras.
     """
     options = options or PrepareOptions()
     views, repeated = distinct_views(scene)
@@ -203,17 +175,12 @@ def prepare(scene: Scene, options: PrepareOptions | None = None, frame: Frame | 
         note(f"{len(scene) - len(views)} views repeat others in every pixel and count once")
     canonical, frame = canonicalise(add_views(own), frame)
     checked, photo_views = leave_out_photos(canonical)
-    placed = _move_wrong_views(checked, photo_views, options.poses)
+    placed = checked
+    if checked.aligned and checked.images is not None and options.poses != "fixed":
+        placed = align_views(checked, photo_views, always=options.poses == "free") or checked
     seen, unseen = _split_unseen(placed) if options.unseen == "keep" else (placed, None)
     shown = seen if seen.aligned else add_pictures(seen)  # pixels that are known have colours of their own
     return Prepared(scene, shown, frame, photo_views, tuple(repeated), placed is not checked, unseen)
-
-
-def _move_wrong_views(scene: Scene, views: Sequence[int], poses: Poses) -> Scene:
-    """Move views to where the photos agree; the scene itself where none is wrong or may be moved."""
-    if not scene.aligned or scene.images is None or poses == "fixed":
-        return scene
-    return align_views(scene, views, always=poses == "free") or scene
 
 
 def _split_unseen(scene: Scene) -> tuple[Scene, Gaussians | None]:

@@ -1,8 +1,8 @@
-"""How many Gaussians to spend, and where: superpixels merged where little is lost, split where much is gained.
+"""Distribution of Gaussians: superpixels merge where little is lost, and split where much is gained.
 
-Distortion lives in image space: squared colour error plus the squared error of the depth relative to a plane, so
-that a flat wall costs nothing from any angle and far things count no less than near ones. All views of a scene
-share one threshold, so every Gaussian buys about the same.
+Distortion lives in image space: squared colour error plus the squared error of the depth relative
+to a plane, so that a flat wall costs nothing from any angle and far things count no less than near
+ones. All views of a scene share one threshold, so every Gaussian buys about the same.
 """
 
 from __future__ import annotations
@@ -30,36 +30,27 @@ KNEE_FLOOR = 3e-4  # squared error per pixel and channel that no count removes (
 
 @dataclass(frozen=True, eq=False)
 class RegionTree:
-    """The merges of the superpixels of all views, from the finest to one per view, and in which order to make them.
+    """All merges of the superpixels of all views, from the finest to one per view, and their order."""
 
-    Args:
-        groups: The superpixels that it starts from.
-        parents: Per view ``[2·leaves-1]`` int32: the region that a region is merged into, -1 for the whole view.
-        order: ``[m]`` int64, all merges, cheapest first; those of view v are numbered from ``first[v]`` on.
-        first: ``[v+1]`` int64, merges in the views before.
-        distortions: ``[m+1]`` float64, mean squared error per pixel and colour channel after the first i merges.
-        min_regions: Fewest regions before any is larger than ``MAX_EXTENT``.
-    """
-
-    groups: Groups
-    parents: tuple[np.ndarray, ...]
-    order: np.ndarray
-    first: np.ndarray
-    distortions: np.ndarray
-    min_regions: int
+    groups: Groups  # The superpixels that it starts from
+    parents: tuple[np.ndarray, ...]  # Per view [2·leaves-1] int32: union of a region, or -1
+    order: np.ndarray  # [m] int64, all merges, cheapest first; view v's from `first[v]` on
+    first: np.ndarray  # [v+1] int64, merges in the views before
+    distortions: np.ndarray  # [m+1] float64 mean squared error after the first i merges
+    min_regions: int  # Fewest regions before any is larger than `MAX_EXTENT`
 
     def __len__(self) -> int:
-        """Superpixels at the start."""
+        """Return the number of superpixels at the start."""
         return len(self.groups)
 
     @property
     def counts(self) -> np.ndarray:
-        """``[m+1]`` regions left after the first i merges."""
+        """Number of regions ``[m+1]`` left after the first i merges."""
         return len(self) - np.arange(len(self.distortions))
 
 
 def pixel_depths(scene: Scene) -> np.ndarray:
-    """``[v,h,w]`` float32 depth of every pixel's Gaussian in its own view, world units."""
+    """Return the depth of every pixel's Gaussian in its own view, ``[v,h,w]`` float32, world units."""
     cameras, means = scene.cameras, scene.gaussians.means
     height, width, pixels = cameras.height, cameras.width, scene.pixels_per_view
 
@@ -72,16 +63,12 @@ def pixel_depths(scene: Scene) -> np.ndarray:
 
 
 def region_tree(images: np.ndarray, depths: np.ndarray, groups: Groups, valid: np.ndarray) -> RegionTree:
-    """Merge neighbouring superpixels in order of the distortion that it adds, each view down to a single region.
+    """Merge neighbouring superpixels by added distortion, each view down to a single region.
 
-    Args:
-        images: ``[v,h,w,3]`` float, sRGB in [0, 1].
-        depths: ``[v,h,w]`` float, depth of each pixel; those of at most 0 count as very near.
-        groups: The superpixels to start from, 4-connected, none empty.
-        valid: ``[v,h,w]`` bool; pixels that do not count. Superpixels without a valid pixel merge first.
-
-    Raises:
-        ValueError: If the shapes do not fit together or a superpixel has no pixel.
+    ``images [v,h,w,3]`` sRGB in [0, 1]; ``depths [v,h,w]``, of which those of at most 0 count as
+    very near; ``groups`` are 4-connected, none empty; pixels outside of ``valid [v,h,w]`` do not
+    count, and superpixels without a valid pixel merge first. Raises ValueError if these do not fit
+    together.
     """
     _check_pictures(images, depths, groups, valid)
     extent = max(1.0, MAX_EXTENT * max(images.shape[1:3]))
@@ -117,7 +104,7 @@ def _check_pictures(images: np.ndarray, depths: np.ndarray, groups: Groups, vali
 
 
 def _usable_depths(depths: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Depths in units of their median, float32; 0 for pixels that do not count."""
+    """Return depths in units of their median, float32; 0 for pixels that do not count."""
     usable = valid & np.isfinite(depths)
     middle = float(np.median(depths[usable & (depths > 0)])) if (usable & (depths > 0)).any() else 1.0
     clipped = np.clip(depths / middle, 1 / DEPTH_RANGE, DEPTH_RANGE)
@@ -125,12 +112,10 @@ def _usable_depths(depths: np.ndarray, valid: np.ndarray) -> np.ndarray:
 
 
 def cut_tree(tree: RegionTree, budget: int) -> Groups:
-    """Exactly ``budget`` regions over all views, at least one in each; the superpixels themselves if there are fewer.
+    """Cut the tree into exactly ``budget`` regions over all views, at least one in each.
 
-    The regions of a smaller budget are unions of those of a larger one.
-
-    Raises:
-        ValueError: If ``budget`` is below the number of views.
+    There are at most as many as superpixels. The regions of a smaller budget are unions of those of
+    a larger one. Raises ValueError if ``budget`` is below the number of views.
     """
     num_views = len(tree.parents)
     if budget < num_views:
@@ -155,17 +140,12 @@ def auto_count(tree: RegionTree) -> int:
 
 
 def knee(counts: np.ndarray, distortions: np.ndarray) -> int:
-    """Find the count beyond which more Gaussians are not worth it.
+    """Return the count beyond which more Gaussians are not worth it.
 
-    Predicted quality is q(N) = -10 log10(floor + D(N)) dB. The knee is the largest count from whose surroundings
-    (a factor of 1.25) q still grows by ``KNEE_SLOPE`` dB per relative increase; the least count if there is none.
-
-    Args:
-        counts: ``[m]`` in any order, all different.
-        distortions: ``[m]`` mean squared error per pixel and channel at each count.
-
-    Raises:
-        ValueError: If there is no count.
+    Predicted quality is q(N) = -10 log10(floor + D(N)) dB. The knee is the largest count from whose
+    surroundings (a factor of 1.25) q still grows by ``KNEE_SLOPE`` dB per relative increase; the
+    least count if there is none. ``counts [m]`` are all different; ``distortions [m]`` are mean
+    squared errors per pixel and channel.
     """
     counts, distortions = np.asarray(counts), np.asarray(distortions, dtype=float)
     if len(counts) == 0 or counts.shape != distortions.shape:

@@ -1,4 +1,4 @@
-"""scene -> groups: the superpixels of every view, evenly many or cut from a region tree."""
+"""Scene -> groups: the superpixels of every view, evenly many or cut from a region tree."""
 
 from __future__ import annotations
 
@@ -17,19 +17,12 @@ from gsmerge.types import Scene, Segmentation
 
 @dataclass(frozen=True, eq=False)
 class SuperpixelPlan:
-    """How a scene is cut into superpixels.
+    """Method and numbers for cutting a scene into superpixels."""
 
-    Args:
-        options: Method and number.
-        limits: Of the number of Gaussians.
-        start_share: Share of the Gaussians that the superpixels are cut for; a fit adds the others.
-        tree: All ways to cut the scene into fewer superpixels, where a count is asked for; None elsewhere.
-    """
-
-    options: SegmentOptions
-    limits: CountLimits
-    start_share: float
-    tree: RegionTree | None
+    options: SegmentOptions  # Method and number
+    limits: CountLimits  # Limits of the number of Gaussians
+    start_share: float  # Share of the Gaussians to start with; a fit adds the others
+    tree: RegionTree | None  # All coarser superpixels, where a count is asked for
 
 
 @stage("segment")
@@ -60,14 +53,7 @@ def segment_scene(scene: Scene, plan: SuperpixelPlan, count: int | None) -> Segm
 
 @stage("segment")
 def scene_tree(scene: Scene, options: SegmentOptions, limits: CountLimits, count: int) -> RegionTree:
-    """Find all ways to cut a scene into fewer superpixels, those of all views merged where that costs least.
-
-    Args:
-        scene: The canonical scene.
-        options: How the finest superpixels are cut.
-        limits: Of the number of Gaussians.
-        count: Most Gaussians that it will be cut to.
-    """
+    """Build the tree of all coarser superpixels of a scene, fine enough for ``count`` Gaussians."""
     pictures = scene_pictures(scene)
     leaves = min(max(limits.per_view, -(-count // len(scene))), scene.pixels_per_view)
     depths, valid = (pixel_depths(scene), scene.valid) if scene.aligned else seen_depths(scene)
@@ -83,25 +69,17 @@ def knee_count(scene: Scene, plan: SuperpixelPlan) -> int:
 
 @dataclass(frozen=True)
 class CountLimits:
-    """Numbers of Gaussians that the options leave.
+    """Limits that the options set for the number of Gaussians."""
 
-    Args:
-        per_view: Superpixels of each view that the options ask for.
-        default: Gaussians that ``superpixels`` and K ask for.
-        min_count: Fewest Gaussians that the scene can be cut to: one for each view.
-        max_count: Most Gaussians that a budget, a size or a device allows.
-        exact: Gaussians that a budget or a size asks for; None without either.
-    """
-
-    per_view: int
-    default: int
-    min_count: int
-    max_count: int
-    exact: int | None
+    per_view: int  # Superpixels of each view that the options ask for
+    default: int  # Gaussians that `superpixels` and K ask for
+    min_count: int  # Fewest Gaussians that the scene can be cut to: one for each view
+    max_count: int  # Most Gaussians that a budget, a size or a device allows
+    exact: int | None  # Gaussians that a budget or a size asks for; None without either
 
     @property
     def count(self) -> int | None:
-        """The number that a budget, a size or a device sets; None where ``superpixels`` and K decide."""
+        """Number that a budget, a size or a device sets; None where ``superpixels`` and K decide."""
         if self.exact is not None:
             return self.exact
         return self.max_count if self.default > self.max_count else None
@@ -118,16 +96,10 @@ def count_limits(
 ) -> CountLimits:
     """Compute the limits of the number of Gaussians.
 
-    Args:
-        scene: The views and their Gaussians.
-        segment: Superpixels of each view.
-        decode: K.
-        budget: What limits the number.
-        num_input: Gaussians that shares of a budget refer to; None: those of the scene.
-        num_reserved: Gaussians of the result that are settled already, such as those that no view sees.
-
-    Raises:
-        UsageError: If more superpixels are asked for than there are pixels, or fewer Gaussians than views.
+    ``num_input``: Gaussians that shares of a budget refer to; None: the scene's. ``num_reserved``:
+    Gaussians of the result that are settled already, such as those that no view sees. Raises
+    UsageError if more superpixels are asked for than there are pixels, or fewer Gaussians than
+    views.
     """
     degree, own = scene.gaussians.sh_degree, scene.num_gaussians
     exact = exact_count(budget, own if num_input is None else num_input, degree)

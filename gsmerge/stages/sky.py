@@ -1,8 +1,9 @@
-"""Which Gaussians are sky, by what the photos show: no network, and nothing that has to be downloaded.
+"""Detection of sky Gaussians by the photos, without a network or a download.
 
-In each photo sky is a smooth region that comes down from the upper border, nowhere warmer than grey, and that pales
-towards the horizon, as air does; without that, as under clouds, it has to be several times as far away as the rest.
-Ceilings and white walls have the first three in common with it, seldom the others, and never in several views.
+In each photo sky is a smooth region that comes down from the upper border, nowhere warmer than
+grey, and that pales towards the horizon, as air does; without that, as under clouds, it has to be
+several times as far away as the rest. Ceilings and white walls have the first three in common with
+it, seldom the others, and never in several views.
 """
 
 from __future__ import annotations
@@ -32,13 +33,7 @@ MAX_SAMPLES = 200_000  # Gaussians that depths are taken from
 
 
 def sky(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray) -> np.ndarray:
-    """``[n]`` bool: which Gaussians are sky, because most of what they add to the photos that show sky lies in it.
-
-    Args:
-        gaussians: n finite ones, in the canonical frame.
-        cameras: v views.
-        photos: ``[v,h,w,3]`` sRGB in [0, 1], of the cameras' size.
-    """
+    """Return a mask ``[n]`` of the canonical Gaussians that add most of their weight to the sky of the photos."""
     regions, mask = sky_regions(gaussians.means, cameras, photos), np.zeros(len(gaussians), bool)
     if not regions:
         return mask
@@ -52,10 +47,7 @@ def sky(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray) -> np.ndarra
 
 
 def sky_regions(means: np.ndarray, cameras: Cameras, photos: np.ndarray) -> dict[int, np.ndarray]:
-    """The sky ``[h,w]`` bool of the views that show any, by their number; none where only few do.
-
-    Arguments as of :func:`sky`; ``means`` are ``[n,3]``, in the frame of the cameras.
-    """
+    """Return the sky ``[h,w]`` bool of the views that show any, by view; none if too few do."""
     regions = {view: region for view, photo in enumerate(photos) if (region := sky_region(photo)).any()}
     shown = {
         view: region
@@ -66,7 +58,7 @@ def sky_regions(means: np.ndarray, cameras: Cameras, photos: np.ndarray) -> dict
 
 
 def _mostly_inside(gaussians: Gaussians, cameras: Cameras, regions: Mapping[int, np.ndarray]) -> np.ndarray:
-    """``[n]`` bool: which Gaussians have most of their blending weights inside regions ``[h,w]`` of some views."""
+    """Return a mask ``[n]`` of Gaussians with most of their blending weights inside regions of some views."""
     splats = prepare(gaussians)
     inside, total = np.zeros(len(splats)), np.zeros(len(splats))
     for view, region in regions.items():
@@ -79,7 +71,7 @@ def _mostly_inside(gaussians: Gaussians, cameras: Cameras, regions: Mapping[int,
 
 
 def _is_far(means: np.ndarray, camera: Cameras, region: np.ndarray) -> bool:
-    """Whether what a region ``[h,w]`` shows lies several times as far away as the rest of the picture."""
+    """Return whether a region ``[h,w]`` shows things several times as far away as the rest of the picture."""
     (pixels,), (depths,) = project(means[:: max(1, -(-len(means) // MAX_SAMPLES))], camera)
     inside = (depths > 0) & ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(1)
     x, y = pixels[inside].astype(int).T
@@ -88,7 +80,7 @@ def _is_far(means: np.ndarray, camera: Cameras, region: np.ndarray) -> bool:
 
 
 def sky_region(photo: np.ndarray) -> np.ndarray:
-    """``[h,w]`` bool: the smooth blue or white regions that begin at a photo's upper border; none if they are small."""
+    """Return the smooth blue or white regions ``[h,w]`` bool that start at a photo's upper border, if large."""
     height, width = photo.shape[:2]
     scale = max(height, width) / SIDE
     soft = cv2.GaussianBlur(photo.astype(np.float32), (0, 0), max(1.5 * scale, 0.5))
@@ -106,7 +98,7 @@ def sky_region(photo: np.ndarray) -> np.ndarray:
 
 
 def _pales_downwards(photo: np.ndarray, region: np.ndarray) -> bool:
-    """Whether the colours of a region lose saturation towards the picture's lower border."""
+    """Return whether the colours of a region lose saturation towards the picture's lower border."""
     colors, rows = photo[region], np.nonzero(region)[0]
     bright = colors.max(1)
     saturation = (bright - colors.min(1)) / np.maximum(bright, 1e-6)

@@ -15,6 +15,7 @@ budget, its moves go on to that number, those of the highest Hastings ratio firs
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -42,7 +43,7 @@ AUTO_SHARE = "auto"
 
 @dataclass(frozen=True)
 class SegmentOptions:
-    """How to cut views into superpixels.
+    """Options of the superpixels of a view.
 
     Args:
         superpixels: Superpixels of each view: a number, or a share of its pixels as "4.4%"; ``"auto"``: 1.5 to 8 %,
@@ -76,13 +77,13 @@ class SegmentOptions:
 
     @property
     def per_view(self) -> int | None:
-        """Superpixels of each view; None where a share of its pixels is asked for."""
+        """Number of superpixels of each view; None where a share of its pixels is asked for."""
         text = str(self.superpixels)
         return int(text) if text.removeprefix("-").isdecimal() else None
 
     @property
     def share(self) -> float:
-        """Superpixels per pixel; the default where a number is asked for, or where the scene has yet to choose."""
+        """Superpixels per pixel; the default where a number is asked for, or the scene decides."""
         given = self.per_view is None and self.superpixels != AUTO_SHARE
         return parse_share(str(self.superpixels) if given else SHARE)
 
@@ -102,11 +103,7 @@ def _check(segmentation: str, rectangles: float, compactness: float) -> None:
 
 
 def count_for(options: SegmentOptions, height: int, width: int) -> int:
-    """Superpixels that ``options`` ask for in a view of this size.
-
-    Raises:
-        UsageError: If there are more than pixels.
-    """
+    """Return the superpixels that the options ask for in a view; raise UsageError for more than pixels."""
     if options.per_view is not None:
         if options.per_view > height * width:
             limit = f"{height * width}, one per pixel of {width} x {height}"
@@ -118,16 +115,11 @@ def count_for(options: SegmentOptions, height: int, width: int) -> int:
 def segment(
     images: np.ndarray, options: SegmentOptions, count: int | None = None, *, adapt: float | None = None
 ) -> Groups:
-    """Cut every view into superpixels, several views at once: the same number in each, unless they adapt.
+    """Cut every view into superpixels: the same number in each, unless they adapt.
 
-    Args:
-        images: ``[v,h,w,3]`` float in [0, 1] or uint8.
-        options: How, and how many.
-        count: Superpixels of each view; None to follow ``options``.
-        adapt: With a number, ``count`` is only where ``bass-adaptive`` starts from; see :func:`superpixels`.
-
-    Raises:
-        ValueError: If the images have the wrong shape or range, or fewer pixels than ``count``.
+    ``images [v,h,w,3]`` are float in [0, 1] or uint8; ``count`` is the number in each view, None:
+    that of the options. With ``adapt`` it is only where ``bass-adaptive`` starts from; see
+    :func:`superpixels`.
     """
     if images.ndim != 4 or images.shape[3] != 3:
         raise ValueError(f"images: expected shape [v, h, w, 3], got {list(images.shape)}")
@@ -137,10 +129,11 @@ def segment(
     rectangles = RECTANGLES if options.rectangles is None else options.rectangles
     early_sweeps = EARLY_SWEEPS if options.early_sweeps is None else options.early_sweeps
 
-    def one_view(image: np.ndarray) -> np.ndarray:
-        return _labels(image, count, options.segmentation, rectangles, early_sweeps, options.compactness, adapt)
-
-    labels = parallel_map(one_view, images)
+    cut = partial(
+        superpixels, count=count, segmentation=options.segmentation, rectangles=rectangles,
+        early_sweeps=early_sweeps, compactness=options.compactness, adapt=adapt,
+    )  # fmt: skip
+    labels = parallel_map(cut, images)
     stacked = np.stack(labels) if labels else np.empty((0, height, width), np.int32)
     return Groups(stacked, tuple(int(one.max()) + 1 for one in labels))
 
@@ -177,22 +170,8 @@ def superpixels(
         >>> superpixels(np.zeros((2, 2, 3)), 1).tolist()
         [[0, 0], [0, 0]]
     """
-    labels = _labels(as_array(image), count, segmentation, rectangles, early_sweeps, compactness, adapt)
-    return like(labels, image)
-
-
-def _labels(
-    image: np.ndarray,
-    count: int,
-    segmentation: str,
-    rectangles: float,
-    early_sweeps: int,
-    compactness: float,
-    adapt: float | None,
-) -> np.ndarray:
-    """:func:`superpixels` of an array."""
     _check(segmentation, rectangles, compactness)
-    pixels = _as_pixels(image)
+    pixels = _as_pixels(as_array(image))
     height, width, _ = pixels.shape
     if count < 1:
         raise ValueError(f"count: expected at least 1 superpixel, got {count}")
@@ -203,22 +182,16 @@ def _labels(
     if segmentation == "rdseg":
         labels = _rdseg(pixels, count, rectangles, early_sweeps, compactness)
     elif segmentation == "grid":
-        return grid_labels(height, width, count)
+        return like(grid_labels(height, width, count), image)
     elif segmentation == "slic":
         labels = _slic(pixels, count, compactness)
     else:
         labels = _bass(pixels, count, segmentation, adapt)
-    return np.ascontiguousarray(labels[1:-1, 1:-1])
+    return like(np.ascontiguousarray(labels[1:-1, 1:-1]), image)
 
 
 def grid_labels(height: int, width: int, count: int) -> np.ndarray:
-    """``[h,w]`` int32: exactly ``count`` rectangles about as high as wide, in rows that differ by at most one.
-
-    Args:
-        height: Rows of pixels.
-        width: Columns of pixels.
-        count: Rectangles, 1 to height x width.
-    """
+    """Return labels ``[h,w]`` int32 of ``count`` rectangles in rows whose lengths differ by at most one."""
     min_rows = -(-count // width)  # rows of blocks that can hold them all
     lines = min(height, count, max(min_rows, round((count * height / width) ** 0.5)))
     first = np.arange(lines + 1) * count // lines  # first label of each row of blocks
@@ -228,7 +201,9 @@ def grid_labels(height: int, width: int, count: int) -> np.ndarray:
 
 
 def saliency(image: Array) -> Array:
-    """Shi-Tomasi corner response: the smaller eigenvalue of the structure tensor of the grey image, 3 x 3 pixels.
+    """Compute the Shi-Tomasi corner response of the grey image, over 3 x 3 pixels.
+
+    It is the smaller eigenvalue of the structure tensor.
 
     Args:
         image: ``[h,w,3]`` sRGB, float in [0, 1] or uint8; an array or a tensor.
@@ -243,7 +218,7 @@ def saliency(image: Array) -> Array:
 
 
 def scene_saliency(images: np.ndarray) -> np.ndarray:
-    """``[v·h·w]`` :func:`saliency` of every pixel of all views ``[v,h,w,3]``."""
+    """Return the :func:`saliency` ``[v·h·w]`` of every pixel of all views ``[v,h,w,3]``."""
     return np.concatenate(parallel_map(lambda image: _corner_response(_as_pixels(image)).reshape(-1), images))
 
 
@@ -253,7 +228,7 @@ def _corner_response(pixels: np.ndarray) -> np.ndarray:
 
 
 def _as_pixels(array: np.ndarray) -> np.ndarray:
-    """``[h,w,3]`` float32 in [0, 1], contiguous."""
+    """Return an image as float32 ``[h,w,3]`` in [0, 1], contiguous; raise ValueError for other content."""
     if array.ndim != 3 or array.shape[2] != 3 or array.size == 0:
         raise ValueError(f"image: expected shape [h, w, 3], got {list(array.shape)}")
     if array.dtype == np.uint8:
@@ -267,12 +242,12 @@ def _as_pixels(array: np.ndarray) -> np.ndarray:
 
 
 def _every_pixel(height: int, width: int) -> np.ndarray:
-    """Padded labels in which every pixel is its own region."""
+    """Return padded labels in which every pixel is its own region."""
     return pad_labels(np.arange(height * width, dtype=np.int32).reshape(height, width))
 
 
 def _rdseg(pixels: np.ndarray, count: int, rectangles: float, early_sweeps: int, compactness: float) -> np.ndarray:
-    """Over-split, merge to the exact number, move border pixels; padded labels."""
+    """Split into rectangles, merge to the exact number, move border pixels; return padded labels."""
     height, width, _ = pixels.shape
     spread = np.float32(compactness**0.5)
     num_rectangles = int(rectangles * count)
@@ -286,7 +261,7 @@ def _rdseg(pixels: np.ndarray, count: int, rectangles: float, early_sweeps: int,
 
 
 def _bass(pixels: np.ndarray, count: int, segmentation: str, adapt: float | None) -> np.ndarray:
-    """BASS from hexagonal or from saliency seeds; padded labels."""
+    """Run BASS from hexagonal or from saliency seeds; return padded labels."""
     from gsmerge.kernels.superpixels.bass import adapt_labels, infer_labels  # compiled only when used
     from gsmerge.kernels.superpixels.seeds import hexagonal_seeds, seed_density, seeds_from_density, voronoi
 
@@ -303,7 +278,7 @@ def _bass(pixels: np.ndarray, count: int, segmentation: str, adapt: float | None
 
 
 def _slic(pixels: np.ndarray, count: int, compactness: float) -> np.ndarray:
-    """scikit-image's SLIC, its pieces merged with Ward's rule to the exact number; padded labels."""
+    """Run scikit-image's SLIC, merge its pieces with Ward's rule to the exact number; return padded labels."""
     from skimage.measure import label
     from skimage.segmentation import slic
 

@@ -80,7 +80,7 @@ def edge_scores(neighbors, means, covars, colors, latents, views, max_color, sim
 
 @kernel
 def leader_clusters(order, neighbors, scores, views, threshold, max_size):
-    """Stars: each Gaussian in ``order`` that is still free leads its free neighbours that overlap it enough.
+    """Cluster Gaussians in stars: each in ``order`` that is still free leads its free neighbours that overlap enough.
 
     At most ``max_size`` to a cluster and one of each view, the best overlaps first; no member is reached through
     another, so clusters cannot chain. Returns the cluster of each Gaussian and the number of clusters.
@@ -122,7 +122,7 @@ def _best_left(scores, tried, threshold):
 
 @kernel
 def _view_taken(candidates, clusters, cluster, views, view):
-    """Does the cluster hold one of a view already? Views below 0 are of none."""
+    """Return whether the cluster has a member of a view already; views below 0 are of none."""
     for j in candidates:
         if j >= 0 and view >= 0 and clusters[j] == cluster and views[j] == view:
             return True

@@ -26,7 +26,7 @@ def _gather(row, unit, k, g_means, g_quats, g_scales, g_opacities, g_colors, sca
 
 @kernel
 def _confine(x, x0, unit, share, least, limits):
-    """Box trust region about the start, least size, colours no farther out than the start, unit quaternion."""
+    """Confine parameters to the box about the start, with least size, colours in range and a unit quaternion."""
     grown = share * limits[1]
     d0, d1, d2 = x[0] - x0[0], x[1] - x0[1], x[2] - x0[2]
     far, reach = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2), share * limits[0] * unit

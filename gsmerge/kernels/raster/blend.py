@@ -36,7 +36,7 @@ SPARE = f4(0.02)  # rows beside those in which a Gaussian shows, for rounding
 
 @kernel(part=True)
 def new_batch():
-    """A batch of Gaussians of no effect: lanes that are not filled are calculated with too."""
+    """Return a batch of Gaussians without effect: lanes that are not filled are calculated with, too."""
     batch = np.empty(PLANES * BATCH, np.float32)
     for i in range(batch.shape[0]):
         batch[i] = f4(1.0)
@@ -45,7 +45,7 @@ def new_batch():
 
 @kernel
 def _into_tile(x):
-    """A column clamped to those of a tile."""
+    """Clamp a column to those of a tile."""
     x = x if x < f4(TILE - 1) else f4(TILE - 1)
     return x if x > f4(0.0) else f4(0.0)
 
@@ -126,7 +126,7 @@ def tile_box(tile, columns, height, width):
 
 @kernel(part=True)
 def open_tile(state, columns, lines):
-    """All light passes, the other planes are zero; lanes outside the image have stopped."""
+    """Reset the planes of a tile: all light passes, the others are zero; lanes outside the image have stopped."""
     for i in range(PLANE, state.shape[0]):
         state[i] = f4(0.0)
     for y in range(TILE):

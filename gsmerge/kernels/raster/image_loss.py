@@ -31,7 +31,7 @@ def sum_rows(padded, rings, slot):
 
 @kernel(part=True)
 def sum_columns(rings, slot, sums):
-    """Sums over the seven rows of rings, the newest of which is in ``slot``."""
+    """Sum over the seven rows of rings, the newest of which is in ``slot``."""
     for q in range(rings.shape[0]):
         ring, out = rings[q], sums[q]
         a, b, c, d = ring[(slot + 1) % SIDE], ring[(slot + 2) % SIDE], ring[(slot + 3) % SIDE], ring[(slot + 4) % SIDE]

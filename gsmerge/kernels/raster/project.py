@@ -83,7 +83,7 @@ def cull_block(block, camera):
 
 @kernel(part=True)
 def touches(block, lane, wanted):
-    """Whether the box of a Gaussian holds one of the tiles that are ``wanted``, see :func:`cull`."""
+    """Return whether the box of a Gaussian contains one of the tiles that are ``wanted``, see :func:`cull`."""
     j = np.uint64(lane)
     last_x, last_y = wanted.shape[1] - 1, wanted.shape[0] - 1
     x0, x1 = int(block[j + P1]) // TILE, min(int(block[j + P2]) // TILE + 1, last_x)

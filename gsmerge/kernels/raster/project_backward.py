@@ -38,7 +38,7 @@ def dot(u, v):
 
 @kernel(part=True)
 def mix(x, u, y, v):
-    """x u + y v."""
+    """Return x u + y v."""
     return x * u[0] + y * v[0], x * u[1] + y * v[1], x * u[2] + y * v[2]
 
 
@@ -49,13 +49,13 @@ def scaled(u, s):
 
 @kernel(part=True)
 def times(m, u):
-    """Rows m times u."""
+    """Return the product of rows m and u."""
     return dot(m[0], u), dot(m[1], u), dot(m[2], u)
 
 
 @kernel(part=True)
 def transposed(m, u):
-    """Columns of rows m times u."""
+    """Return the product of the transpose of rows m and u."""
     return (
         m[0][0] * u[0] + m[1][0] * u[1] + m[2][0] * u[2],
         m[0][1] * u[0] + m[1][1] * u[1] + m[2][1] * u[2],

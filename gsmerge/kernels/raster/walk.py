@@ -32,7 +32,7 @@ E3, E4, E5 = f4(3.2416797e-4), f4(9.7100983e-6), f4(1.7842896e-7)
 
 
 class Share(NamedTuple):
-    """What a Gaussian takes of sixteen pixels."""
+    """Part of the light of sixteen pixels that a Gaussian takes."""
 
     alpha: Lanes
     weight: Lanes  # alpha times the transmittance; 0 where the pixel stops
@@ -42,7 +42,7 @@ class Share(NamedTuple):
 
 
 def take_share(t: Lanes, p: Lanes) -> Share:
-    """What a Gaussian with exponents ``p`` takes of transmittances ``t``; any p <= 0 is safe, far ones are cut."""
+    """Compute the part that a Gaussian with exponents ``p`` takes of transmittances ``t``; any p <= 0 is safe."""
     e = E0 + p * (E1 + p * (E2 + p * (E3 + p * (E4 + p * E5))))
     e = e * e
     e = e * e
@@ -72,11 +72,11 @@ class Walk:
         return self.context.get_constant(types.intp, number)
 
     def whole(self, position: int) -> Any:
-        """An argument as an index."""
+        """Return an argument as an index."""
         return self.context.cast(self.builder, self.arguments[position], self.signature.args[position], types.intp)
 
     def address(self, position: int, *indices: Any) -> Any:
-        """Where an element of an array among the arguments is."""
+        """Return the address of an element of an array among the arguments."""
         kind = self.signature.args[position]
         array = self.context.make_array(kind)(self.context, self.builder, self.arguments[position])
         return cgutils.get_item_pointer(self.context, self.builder, kind, array, indices, wraparound=False)

@@ -36,7 +36,7 @@ def integral_image(pixels):
 
 @kernel(inline=True)
 def cut_gain(integral, near, far, step, side, num_pixels, compactness):
-    """Where to cut a rectangle across one of its sides, and by how much that lowers its squared error.
+    """Find the best cut of a rectangle across one of its sides, and how much it lowers the squared error.
 
     A rectangle of n pixels with colour sum t, whose side of length S is cut at c into parts with sums s and t - s,
     loses ``|S s - c t|² / (n c (S - c))`` of colour error and ``n c (S - c) / 4`` of position error.

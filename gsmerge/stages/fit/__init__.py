@@ -1,4 +1,4 @@
-"""gaussians -> fitted gaussians: colours alone, or all parameters, against the input photos."""
+"""Gaussians -> fitted Gaussians: all parameters, or colours alone, against the input photos."""
 
 from gsmerge.stages.fit.fit_options import Fit, FitOptions, FitReport, Fitted, Tuning, record_fit, report_steps
 from gsmerge.stages.fit.photo_sizes import fit_photos, photo_scale

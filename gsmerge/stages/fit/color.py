@@ -1,7 +1,8 @@
-"""gaussians -> fitted gaussians: colours that reproduce the input photos best.
+"""Gaussians -> fitted Gaussians: colours that reproduce the input photos best.
 
-With geometry, opacity and order fixed, every pixel is linear in the colours, so the best ones solve a sparse
-linear system whose matrix is one splat and one transposed splat; a few preconditioned conjugate-gradient steps do.
+With geometry, opacity and order fixed, every pixel is linear in the colours, so the best ones solve
+a sparse linear system whose matrix is one splat and one transposed splat; a few preconditioned
+conjugate-gradient steps do.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from gsmerge.geometry import rgb_to_sh0, sh0_to_rgb
-from gsmerge.render import Splats, composite, plan_view, prepare
+from gsmerge.render import composite, plan_view, prepare
 from gsmerge.render.photos import Photos
 from gsmerge.render.weights import ViewWeights, apply, apply_transposed, view_weights
 from gsmerge.runtime.threads import in_turn, parallel_map
@@ -26,29 +27,22 @@ HOLDOUT = 4  # times the share: the last steps see everything, and a small sampl
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """One set of Gaussians against the photos: per view the blending weights and the render with their own colours.
+    """Blending weights and renders of one set of Gaussians in every photo."""
 
-    Args:
-        count: Number of Gaussians, n.
-        views: Blending weights of every view.
-        images: ``[h,w,3]`` renders.
-    """
-
-    count: int
-    views: list[ViewWeights]
-    images: list[np.ndarray]
+    views: list[ViewWeights]  # Blending weights of every view
+    images: list[np.ndarray]  # [h,w,3] renders
 
 
 def draw(gaussians: Gaussians, photos: Photos) -> Drawn:
     """Render the Gaussians into every photo and keep the blending weights."""
-    splats: Splats = prepare(gaussians)
+    splats = prepare(gaussians)
 
     def one_view(view: int) -> tuple[ViewWeights, np.ndarray]:
         plan = plan_view(splats, **photos.camera(view))
         return view_weights(plan), composite(plan)[0]
 
     views, images = zip(*parallel_map(one_view, range(len(photos))), strict=True)
-    return Drawn(len(gaussians), list(views), list(images))
+    return Drawn(list(views), list(images))
 
 
 def fit_colors(
@@ -59,23 +53,16 @@ def fit_colors(
     seed: int = 0,
     color_precision: np.ndarray | None = None,
 ) -> tuple[Gaussians, FitReport]:
-    """Base colours fitted to the photos, kept only if held-out blocks of the photos get better.
+    """Fit base colours to the photos, and keep them only if held-out blocks get better.
 
-    Args:
-        gaussians: Geometry and opacities stay as they are; higher SH stay too.
-        drawn: The same Gaussians against the photos, see :func:`draw`.
-        photos: The input views.
-        options: The solver's settings.
-        seed: Chooses the held-out blocks.
-        color_precision: ``[n]`` pixels of photos that are gone which each colour was fitted to; None: of none.
-
-    Returns:
-        The Gaussians with new sh0 (or the old ones, where the fit was not accepted), and the report.
+    ``drawn`` are the same Gaussians in the photos, see :func:`draw`; ``seed`` chooses the held-out
+    blocks; ``color_precision [n]`` counts pixels of photos that are gone which each colour was
+    fitted to. Geometry, opacities and higher harmonics stay.
     """
     train = training_weights(photos, min(0.5, HOLDOUT * options.holdout), seed)
     precision = 0.0 if color_precision is None else color_precision[:, None].astype(np.float64)
     system = _System(drawn, photos, options, train, train, np.ones((len(photos), 3)), precision)
-    offsets, report = solve_colors(system, np.zeros((drawn.count, 3)), options)
+    offsets, report = solve_colors(system, np.zeros((len(gaussians), 3)), options)
     if not report.accepted:
         return gaussians, report
     sh0 = add_offsets(gaussians.sh0.astype(np.float64), offsets[:, None])
@@ -83,30 +70,30 @@ def fit_colors(
 
 
 class ColorSystem(Protocol):
-    """Least squares in the colours of n Gaussians, of arrays or of tensors; ``x [n,3]`` are offsets, float64."""
+    """Least-squares system in the colours of n Gaussians, of arrays or tensors; ``x [n,3]`` are offsets, float64."""
 
     @property
     def precision(self) -> Array:
-        """``[n,1]``, or a number: what is added to the diagonal, with 0 as its solution."""
+        """Addition ``[n,1]``, or a number, to the diagonal, with 0 as its solution."""
 
     def score(self, x: Array = None) -> float:
-        """PSNR (dB) of the held-out blocks; None: with the colours as they were."""
+        """Return the PSNR (dB) of the held-out blocks; None: with the colours before the fit."""
 
     def residual(self, x: Array) -> tuple[Array, Array]:
-        """Diagonal scale ``[n,3]`` and negative gradient ``[n,3]`` of the data term."""
+        """Return the diagonal scale ``[n,3]`` and the negative gradient ``[n,3]`` of the data term."""
 
     def normal(self, x: Array) -> Array:
-        """``[n,3]`` normal matrix of the data term times ``x``."""
+        """Return the normal matrix of the data term times ``x``, ``[n,3]``."""
 
     def reweigh(self, x: Array, *, everywhere: bool = False) -> ColorSystem:
-        """With Huber weights of the residuals, on the training pixels or on all, and exposure gains."""
+        """Return the system with Huber weights and exposure gains, on the training pixels or on all."""
 
 
 def solve_colors(system: ColorSystem, start: Array, options: FitOptions) -> tuple[Array, FitReport]:
-    """Offsets ``[n,3]`` of the base colours, from ``start`` on, and the report; the start where held-out blocks lost.
+    """Solve for offsets ``[n,3]`` of the base colours; return ``start`` where the held-out blocks got worse.
 
-    A third of the steps with plain weights; then pixels that still fit badly count less, exposure is compensated,
-    and another third follows. The last ones are on all pixels.
+    A third of the steps with plain weights; then pixels that still fit badly count less, exposure
+    is compensated, and another third follows. The last ones are on all pixels.
     """
     steps = options.tuning.iterations
     third = steps // 3
@@ -125,7 +112,7 @@ def solve_colors(system: ColorSystem, start: Array, options: FitOptions) -> tupl
 
 
 def conjugate_gradients(system: ColorSystem, x: Array, iterations: int, prior_weight: float) -> Array:
-    """Jacobi-preconditioned conjugate gradients (Hestenes and Stiefel 1952) from ``x [n,3]`` on.
+    """Run Jacobi-preconditioned conjugate gradients (Hestenes and Stiefel 1952) from ``x [n,3]`` on.
 
     They minimise sum |gain (prior + W x) - photo|^2 + (prior_weight mass + precision) |x|^2.
     """
@@ -146,32 +133,22 @@ def conjugate_gradients(system: ColorSystem, x: Array, iterations: int, prior_we
 
 
 def add_offsets(sh0: Array, offsets: Array) -> Array:
-    """``sh0``, float64, with offsets of its colours: in [-0.05, 1.05], or no farther outside than they were."""
+    """Add offsets to base colours; keep them in [-0.05, 1.05], or no farther outside than before."""
     before = sh0_to_rgb(sh0)
     return rgb_to_sh0((before + offsets).clip(before.clip(None, -0.05), before.clip(1.05)))
 
 
 @dataclass(frozen=True, eq=False)
 class _System:
-    """:class:`ColorSystem` of arrays.
+    """Colour system of arrays, see :class:`ColorSystem`."""
 
-    Args:
-        drawn: The Gaussians against the photos.
-        photos: V photos.
-        options: The solver's settings.
-        train: ``[h,w]`` of every view: 0 on the held-out blocks, 1 elsewhere.
-        weights: ``[h,w]`` of the pixels of every view.
-        gains: ``[v,3]`` exposures.
-        precision: ``[n,1]`` diagonal of earlier photos' normal equations, which the present colours solve; or 0.
-    """
-
-    drawn: Drawn
-    photos: Photos
-    options: FitOptions
-    train: list[np.ndarray]
-    weights: list[np.ndarray]
-    gains: np.ndarray
-    precision: np.ndarray | float
+    drawn: Drawn  # The Gaussians against the photos
+    photos: Photos  # V photos
+    options: FitOptions  # The solver's settings
+    train: list[np.ndarray]  # [h,w] of every view: 0 on the held-out blocks, 1 elsewhere
+    weights: list[np.ndarray]  # [h,w] of the pixels of every view
+    gains: np.ndarray  # [v,3] exposures
+    precision: np.ndarray | float  # [n,1] diagonal of earlier photos' normal equations; or 0
 
     def _image(self, view: int, x: np.ndarray) -> np.ndarray:
         return self.drawn.images[view] + apply(self.drawn.views[view], x)

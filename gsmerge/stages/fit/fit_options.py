@@ -22,67 +22,46 @@ NOT_A_SETTING = {"setting": False}  # of fields that a user does not set by name
 
 @dataclass(frozen=True)
 class Tuning:
-    """Constants of the fit, chosen on training scenes; tests and research change them.
+    """Constants of the fit, chosen on training scenes; tests and research change them."""
 
-    Args:
-        means_lr: Step of a mean, in units of the Gaussian's size.
-        scales_lr: Step of a log scale.
-        quats_lr: Step of a quaternion.
-        opacities_lr: Step of an opacity's logit.
-        colors_lr: Step of a colour, sRGB in [0, 1].
-        poses_lr: First step of a camera where cameras are moved: turns and shifts by so many pixels.
-        decay: Factor on all other steps at the end of the run; runs of more than 300 steps end lower in proportion.
-        beta1: Decay of Adam's first moment.
-        beta2: Decay of its second moment.
-        max_mean_shift: Farthest that a mean may go from its start, in units of the Gaussian's size.
-        max_scale_change: Largest change of a log scale.
-        max_opacity_change: Largest change of an opacity's logit.
-        single_view_share: Share of the limits of mean and scales for a Gaussian that one photo alone shows: that photo
-            says what it looks like, not where it is. From two photos on the limits are whole.
-        min_scale: Least scale, in pixels of the photo that a Gaussian is nearest to: thinner ones show as needles
-            when a viewer enlarges them. 0 for none.
-        average_share: Share of the steps, the last ones, over which the parameters are averaged.
-        ssim_lambda: Share of structural similarity in the loss, the rest is L1.
-        opacity_reg: Weight of the mean opacity in the loss of the full fit (3DGS-MCMC, Kheradmand et al. 2024): what
-            the photos do not need fades, instead of standing in front of other views.
-        scale_reg: The same of the mean size, in units of each Gaussian's own at its start: fewer of them overlap, and
-            a step takes a third less time.
-        iterations: Conjugate-gradient steps of the colour fit.
-        prior_weight: Weight of the unfitted colours, relative to how much of each Gaussian is seen.
-        huber: Colour error beyond which a pixel counts less in the colour fit (moving things, reflections).
-        min_gain: Exposure of a view against the mean, as a factor, from which on the colour fit compensates it;
-            smaller differences come from holes and highlights as often as from the camera.
-        max_gain: Largest exposure factor that is believed.
-    """
-
-    means_lr: float = 0.1
-    scales_lr: float = 0.2
-    quats_lr: float = 0.03
-    opacities_lr: float = 0.3
-    colors_lr: float = 0.03
-    poses_lr: float = 0.1
-    decay: float = 0.4
-    beta1: float = 0.5
-    beta2: float = 0.9
-    max_mean_shift: float = 2.0
-    max_scale_change: float = 2.5
-    max_opacity_change: float = 4.0
+    means_lr: float = 0.1  # Step of a mean, in units of the Gaussian's size
+    scales_lr: float = 0.2  # Step of a log scale
+    quats_lr: float = 0.03  # Step of a quaternion
+    opacities_lr: float = 0.3  # Step of an opacity's logit
+    colors_lr: float = 0.03  # Step of a colour, sRGB in [0, 1]
+    poses_lr: float = 0.1  # First step of a moved camera: turns and shifts by so many pixels
+    decay: float = 0.4  # Factor on the other steps at the end; less beyond 300 steps
+    beta1: float = 0.5  # Decay of Adam's first moment
+    beta2: float = 0.9  # Decay of its second moment
+    max_mean_shift: float = 2.0  # Largest shift of a mean, in units of the Gaussian's size
+    max_scale_change: float = 2.5  # Largest change of a log scale
+    max_opacity_change: float = 4.0  # Largest change of an opacity's logit
+    # Share of the limits of mean and scales for a Gaussian that one photo alone shows: that photo
+    # says what it looks like, not where it is. From two photos on the limits are whole
     single_view_share: float = 0.3
+    # Least scale, in pixels of the photo that a Gaussian is nearest to: thinner ones show as
+    # needles when a viewer enlarges them. 0 for none
     min_scale: float = 0.5
-    average_share: float = 0.2
-    ssim_lambda: float = 0.35
+    average_share: float = 0.2  # Share of the last steps that the parameters are averaged over
+    ssim_lambda: float = 0.35  # Share of structural similarity in the loss, the rest is L1
+    # Weight of the mean opacity in the loss of the full fit (3DGS-MCMC, Kheradmand et al. 2024):
+    # what the photos do not need fades, instead of standing in front of other views
     opacity_reg: float = 0.03
+    # The same of the mean size, in units of each Gaussian's own at its start: fewer of them
+    # overlap, and a step takes a third less time
     scale_reg: float = 0.01
-    iterations: int = 6
-    prior_weight: float = 0.03
-    huber: float = 0.2
+    iterations: int = 6  # Conjugate-gradient steps of the colour fit
+    prior_weight: float = 0.03  # Weight of the unfitted colours, relative to visibility
+    huber: float = 0.2  # Colour error beyond which a pixel counts less in the colour fit
+    # Exposure of a view against the mean, as a factor, from which on the colour fit compensates it;
+    # smaller differences come from holes and highlights as often as from the camera
     min_gain: float = 1.15
-    max_gain: float = 2.0
+    max_gain: float = 2.0  # Largest exposure factor that is believed
 
 
 @dataclass(frozen=True)
 class FitOptions:
-    """What is fitted to the photos.
+    """Options of the fit to the photos.
 
     Args:
         fit: ``"full"``: all parameters; ``"none"``: nothing.
@@ -119,7 +98,7 @@ class FitOptions:
 
     @property
     def steps(self) -> int:
-        """Steps of the full fit."""
+        """Number of steps of the full fit."""
         return STEPS if self.fit_steps is None else self.fit_steps
 
     @property
@@ -136,7 +115,7 @@ class FitOptions:
 
     @property
     def grows(self) -> bool:
-        """Whether the fit begins with fewer Gaussians than are asked for, and adds the rest on the way."""
+        """Whether the fit starts with fewer Gaussians than are asked for, and adds the rest on the way."""
         return self.fit == "full" and self.steps >= GROW_STEPS
 
     def __post_init__(self) -> None:
@@ -160,42 +139,25 @@ class FitOptions:
 
 @dataclass(frozen=True)
 class FitReport:
-    """What a fit did.
+    """Report of a fit."""
 
-    Args:
-        method: ``"none"``, ``"color"`` or ``"full"``: what the result comes from.
-        accepted: Whether the held-out blocks of the photos got better; if not, the Gaussians are as they were.
-        steps: Steps of the full fit, or conjugate-gradient steps.
-        holdout_before: PSNR (dB) on the held-out blocks before the fit.
-        holdout_after: The same after it.
-        stopped: Why it ended.
-        viewmats: ``[v,4,4]`` poses of the photos after the fit; None where they were fixed.
-        device: Where it ran: ``"cpu"`` or ``"cuda"``.
-    """
-
-    method: str
-    accepted: bool
-    steps: int
-    holdout_before: float
-    holdout_after: float
-    stopped: str
-    viewmats: np.ndarray | None = None
-    device: str = "cpu"
+    method: str  # `"none"`, `"color"` or `"full"`: what the result comes from
+    accepted: bool  # Whether the held-out blocks got better; if not, nothing was changed
+    steps: int  # Steps of the full fit, or conjugate-gradient steps
+    holdout_before: float  # PSNR (dB) on the held-out blocks before the fit
+    holdout_after: float  # The same after it
+    stopped: str  # Why it ended
+    viewmats: np.ndarray | None = None  # [v,4,4] poses after the fit; None: fixed
+    device: str = "cpu"  # Where it ran: `"cpu"` or `"cuda"`
 
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """Gaussians after the fit.
+    """Gaussians after the fit."""
 
-    Args:
-        gaussians: Canonical Gaussians.
-        cameras: The scene's cameras, canonical, moved where the fit moved them.
-        report: What the fit did; None where nothing was fitted.
-    """
-
-    gaussians: Gaussians
-    cameras: Cameras
-    report: FitReport | None
+    gaussians: Gaussians  # Canonical Gaussians
+    cameras: Cameras  # The scene's cameras, canonical, moved where the fit moved them
+    report: FitReport | None  # What the fit did; None where nothing was fitted
 
 
 def record_fit(report: FitReport | None) -> None:

@@ -1,4 +1,4 @@
-"""The optimiser's view of some Gaussians."""
+"""Parameters of Gaussians under optimisation, and their growth."""
 
 from __future__ import annotations
 
@@ -19,32 +19,20 @@ DEPTH = 0.8  # of the halves' optical depth: two narrower ones with 0.7 would co
 
 @dataclass(eq=False)
 class State:
-    """Parameters under optimisation, and the arrays that they mean to the rasterizer.
+    """Parameters under optimisation, and the same values as arrays for the rasterizer."""
 
-    Args:
-        x: ``[n,14]`` float32: mean, log scale, quaternion, opacity logit, colour.
-        x0: Where each began.
-        m: First moment.
-        v: Second moment.
-        units: ``[n]`` size of each Gaussian: geometric mean of its two largest scales when it began.
-        box_shares: ``[n]`` share of the box about the start that each Gaussian's mean and scales may use.
-        min_sizes: ``[n]`` least log scale of each Gaussian.
-        splats: Means, quaternions, scales and opacities as the rasterizer takes them.
-        colors: ``[n,3]`` base colours.
-    """
-
-    x: np.ndarray
-    x0: np.ndarray
-    m: np.ndarray
-    v: np.ndarray
-    units: np.ndarray
-    box_shares: np.ndarray
-    min_sizes: np.ndarray
-    splats: Splats
-    colors: np.ndarray
+    x: np.ndarray  # [n,14] float32: mean, log scale, quaternion, opacity logit, colour
+    x0: np.ndarray  # Values at the start
+    m: np.ndarray  # First moment
+    v: np.ndarray  # Second moment
+    units: np.ndarray  # [n] size: geometric mean of the two largest scales at the start
+    box_shares: np.ndarray  # [n] share of the box about the start for means and scales
+    min_sizes: np.ndarray  # [n] least log scale of each Gaussian
+    splats: Splats  # Means, quaternions, scales and opacities as the rasterizer takes them
+    colors: np.ndarray  # [n,3] base colours
 
     def view_colors(self) -> np.ndarray | None:
-        """Colours for the rasterizer: as they are, or None: from the harmonics, which are brought up to date."""
+        """Return the colours for the rasterizer; None after updating the harmonics that it shall use instead."""
         if self.splats.shN.shape[1] == 0:
             return self.colors
         np.divide(self.colors[:, None] - np.float32(0.5), np.float32(SH_C0), out=self.splats.sh0)
@@ -52,7 +40,7 @@ class State:
 
 
 def start_state(gaussians: Gaussians) -> State:
-    """A fresh state at some Gaussians."""
+    """Return a fresh state at some Gaussians."""
     x = np.empty((len(gaussians), COLUMNS), np.float32)
     opacities = gaussians.opacities.astype(np.float64).clip(0.004, 0.999)
     x[:, :3] = gaussians.means
@@ -64,7 +52,7 @@ def start_state(gaussians: Gaussians) -> State:
 
 
 def state_of(x: np.ndarray, shN: np.ndarray) -> State:
-    """A fresh state at parameters ``[n,14]`` and higher harmonics ``[n,k-1,3]``."""
+    """Return a fresh state at parameters ``[n,14]`` and higher harmonics ``[n,k-1,3]``."""
     sizes = np.sort(x[:, SIZE:QUAT], 1)
     colors = np.ascontiguousarray(x[:, COLOR:])
     splats = Splats(
@@ -82,7 +70,7 @@ def state_of(x: np.ndarray, shN: np.ndarray) -> State:
 
 
 def gaussians_of(x: np.ndarray, shN: np.ndarray) -> Gaussians:
-    """The Gaussians that parameters ``[n,14]`` stand for."""
+    """Return the Gaussians of parameters ``[n,14]`` and higher harmonics ``[n,k-1,3]``."""
     return Gaussians(
         means=x[:, :3].copy(),
         quats=x[:, QUAT:LOGIT].copy(),
@@ -94,7 +82,7 @@ def gaussians_of(x: np.ndarray, shN: np.ndarray) -> Gaussians:
 
 
 def error_masses(state: State, photos: Photos) -> np.ndarray:
-    """``[n]`` sum over all photos of every Gaussian's blending weight times the absolute error of the pixel."""
+    """Sum every Gaussian's blending weight times the absolute error of the pixel over all photos, ``[n]``."""
 
     def one_view(view: int) -> np.ndarray:
         plan = plan_view(state.splats, **photos.camera(view))
@@ -108,7 +96,7 @@ def error_masses(state: State, photos: Photos) -> np.ndarray:
 
 
 def grow_to(state: State, photos: Photos, count: int) -> State:
-    """:func:`grow` again and again, until there are ``count`` or nothing that the photos show is left to halve."""
+    """Call :func:`grow` until there are ``count`` Gaussians or nothing that the photos show is left to halve."""
     before = 0
     while before < len(state.x) < count:
         before, state = len(state.x), grow(state, photos, count)
@@ -118,14 +106,9 @@ def grow_to(state: State, photos: Photos, count: int) -> State:
 def grow(state: State, photos: Photos, count: int) -> State:
     """Halve the Gaussians with the largest error masses across their longest axis, until there are ``count``.
 
-    Each is halved at most once, so the number at most doubles, and what no photo shows is left alone. The halves
-    start with their parent's momentum, share of the box and least size; the old ones come first and in order, the
-    second halves after them.
-
-    Args:
-        state: n Gaussians under optimisation.
-        photos: What they are to look like.
-        count: Wanted number, not below n.
+    Each is halved at most once, so the number at most doubles, and what no photo shows is left
+    alone. The halves start with their parent's momentum, share of the box and least size; the old
+    ones come first and in order, the second halves after them.
     """
     masses = error_masses(state, photos)
     num = min(count - len(state.x), int((masses > 0).sum()))

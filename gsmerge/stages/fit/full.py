@@ -1,8 +1,8 @@
-"""gaussians -> fitted gaussians: all parameters moved onto the input photos by a short, confined optimisation.
+"""Gaussians -> fitted Gaussians: a short optimisation of all parameters, confined to a box about the start.
 
-One view per step: L1 and structural similarity on a random background, half-size photos first, Adam with rates in
-units of each Gaussian's own size, a box about the start. Longer runs begin with fewer Gaussians than they may have
-and spend the rest where the error is.
+One view per step: L1 and structural similarity on a random background, half-size photos first, Adam
+with rates in units of each Gaussian's own size. Longer runs begin with fewer Gaussians than they
+may have and spend the rest where the error is.
 """
 
 from __future__ import annotations
@@ -56,37 +56,29 @@ EPS = 1e-15  # of Adam
 
 @dataclass(frozen=True)
 class FitPlan:
-    """How a run goes.
+    """Plan of a full fit: photos, weights, shares of the steps."""
 
-    Args:
-        photos: At full and at half size, and larger ones where there are any.
-        weights: ``[h,w]`` float32 of each photo at either size: 0 on held-out blocks, ``HIDDEN`` on pixels that
-            neither steps nor scores use, 1 elsewhere.
-        step_weights: The same as a step uses them: 0 on hidden pixels; at full size 1 on held-out blocks, too, and
-            larger photos count everywhere.
-        options: What a step does.
-        dropout: Share of the Gaussians that a step leaves out.
-        half_part: Share of the steps, the first ones, on half-size photos.
-        poses: The motions of the cameras; None where they are fixed.
-    """
-
-    photos: tuple[Photos, ...]
+    photos: tuple[Photos, ...]  # At full and at half size, and larger ones where there are any
+    # [h,w] float32 of each photo at either size: 0 on held-out blocks, `HIDDEN` on pixels that
+    # neither steps nor scores use, 1 elsewhere
     weights: tuple[list[np.ndarray], list[np.ndarray]]
+    # The same as a step uses them: 0 on hidden pixels; at full size 1 on held-out blocks, too, and
+    # larger photos count everywhere
     step_weights: tuple[list[np.ndarray], ...]
-    options: FitOptions
-    dropout: float
-    half_part: float
-    poses: PoseState | None = None
+    options: FitOptions  # What a step does
+    dropout: float  # Share of the Gaussians that a step leaves out
+    half_part: float  # Share of the steps, the first ones, on half-size photos
+    poses: PoseState | None = None  # The motions of the cameras; None where they are fixed
 
     def level_at(self, step: int, progress: float) -> int:
-        """Which photos a step looks at: half-size ones first, then full-size ones, and larger ones in between."""
+        """Return the size of photos of a step: 1 half-size, which come first; 0 full-size; 2 larger, in between."""
         if progress < self.half_part:
             return 1
         return 2 if len(self.photos) > 2 and step % 5 in LARGE_STEPS else 0
 
 
 def plan_run(photos: tuple[Photos, ...], options: FitOptions, seed: int, masks: Masks | None = None) -> FitPlan:
-    """Held-out blocks, hidden pixels, and dropout where there are few views."""
+    """Plan a fit: held-out blocks, hidden pixels, and dropout where there are few views."""
     full = training_weights(photos[0], options.holdout, seed)
     few = len(photos[0]) <= FEW_VIEWS and options.steps >= MANY_STEPS
     default = DROPOUT if few else LONG_DROPOUT if options.steps >= LONG_STEPS else 0.0
@@ -107,12 +99,12 @@ def plan_run(photos: tuple[Photos, ...], options: FitOptions, seed: int, masks: 
 
 
 def _hidden(weights: list[np.ndarray], masks: np.ndarray) -> list[np.ndarray]:
-    """Training weights where the masks are."""
+    """Return the training weights inside the masks, and ``HIDDEN`` outside."""
     return [np.where(mask, weight, HIDDEN) for weight, mask in zip(weights, masks, strict=True)]
 
 
 def fit_step(state: State, plan: FitPlan, view: int, step: int, progress: float, rng: np.random.Generator) -> float:
-    """One Adam step on one view -> mean squared error of its training pixels."""
+    """Take one Adam step on one view; return the mean squared error of its training pixels."""
     level = plan.level_at(step, progress)
     photos = plan.photos[level]
     weight = plan.step_weights[level][view]
@@ -148,31 +140,30 @@ def fit_step(state: State, plan: FitPlan, view: int, step: int, progress: float,
 
 
 def look_of(step: int, level: int, eps2d: float) -> dict[str, Any]:
-    """The arguments of :func:`gsmerge.render.plan_view` that say how a step draws.
+    """Return the arguments of :func:`gsmerge.render.plan_view` for low-pass and antialiasing of a step.
 
-    Args:
-        step: From 1.
-        level: 0 for full-size photos. Half-size ones (1) and larger ones (2) are all drawn one way: the first are
-            coarse, the others what an enlarged view shows.
-        eps2d: Low-pass of the photos, square pixels.
+    Full-size photos (level 0) are drawn in turn in the ways of viewers. Half-size ones (1) and
+    larger ones (2) are all drawn one way: the first are coarse, the others what an enlarged view
+    shows.
     """
     share, antialiased = (1.0, False) if level else LOOKS[step % len(LOOKS)]
     return {"eps2d": share * eps2d, "antialiased": antialiased}
 
 
 def step_sizes(rates: Tuning, progress: float, steps: int) -> np.ndarray:
-    """Step of each of the fourteen columns at a point of the run, decaying geometrically; farther in longer runs."""
+    """Return the step of each of the fourteen columns, decaying geometrically, and farther in longer runs."""
     decay = rates.decay * min(1.0, LONG_RUN / steps)
     each = [rates.means_lr, rates.scales_lr, rates.quats_lr, rates.opacities_lr, rates.colors_lr]
     return (np.repeat(each, [3, 3, 4, 1, 3]) * decay**progress).astype(np.float32)
 
 
 def initial_scores(state: State, plan: FitPlan) -> tuple[float, np.ndarray, np.ndarray]:
-    """PSNR (dB) of the half-size held-out blocks; ``[n]`` box shares and ``[n]`` least log scales, both float32.
+    """Score the start: PSNR (dB) of the held-out half-size blocks, ``[n]`` box shares, ``[n]`` least log scales.
 
-    The share of its box that a Gaussian may use is ``single_view_share`` to 1, by how many photos show it: the
-    effective number of them, (sum w)^2 / sum w^2 of its blending weights w in them. Its least scale is ``min_scale``
-    pixels of the largest photo that it is nearest to (the 3D filter of Mip-Splatting); none where no photo shows it.
+    The share of its box that a Gaussian may use is ``single_view_share`` to 1, by how many photos
+    show it: the effective number of them, (sum w)^2 / sum w^2 of its blending weights w in them.
+    Its least scale is ``min_scale`` pixels of the largest photo that it is nearest to (the 3D
+    filter of Mip-Splatting); none where no photo shows it.
     """
     photos, colors, rates = plan.photos[1], state.view_colors(), plan.options.tuning
     everywhere = np.ones((photos.height, photos.width, 1), np.float32)
@@ -198,36 +189,36 @@ def initial_scores(state: State, plan: FitPlan) -> tuple[float, np.ndarray, np.n
 
 
 def holdout_score(state: State, plan: FitPlan) -> float:
-    """PSNR (dB) of the half-size held-out blocks."""
+    """Return the PSNR (dB) of the half-size held-out blocks."""
     images = render_photos(state.splats, plan.photos[1], colors=state.view_colors())
     return holdout_psnr(images, plan.photos[1], plan.weights[1], plan.options.tuning.min_gain)
 
 
 def score_to_beat(own: float, baseline_start: Gaussians | None, plan: FitPlan) -> float:
-    """PSNR (dB) of the held-out blocks that a fit has to beat: of its start, or of a worse baseline start.
+    """Return the PSNR (dB) of the held-out blocks that a fit has to beat: of its start, or of a worse baseline.
 
-    Networks learn to show whole photos. A fit to the other blocks then makes the held-out ones worse and new views
-    better, so it is compared with the start without networks.
+    Networks learn to show whole photos. A fit to the other blocks then makes the held-out ones
+    worse and new views better, so it is compared with the start without networks.
     """
     return own if baseline_start is None else min(own, holdout_score(start_state(baseline_start), plan))
 
 
 @dataclass
 class TailMean:
-    """Mean of parameters ``[n,14]``, an array or a tensor, over the last steps; one step's noise moves it less."""
+    """Mean of parameters ``[n,14]``, an array or a tensor, over the last steps, which are noisy one by one."""
 
     mean: Array = None
     count: int = 0
 
     def add(self, x: Array) -> None:
-        """One more step; the first one after Gaussians were added begins anew."""
+        """Add one more step; the first one after Gaussians were added starts anew."""
         if self.mean is None or len(self.mean) != len(x):
             self.mean, self.count = 0 * x, 0
         self.count += 1
         self.mean += (x - self.mean) / self.count
 
     def of(self, x: Array) -> Array:
-        """The mean with unit quaternions; ``x`` itself where no step of as many Gaussians was added."""
+        """Return the mean with unit quaternions; ``x`` itself without a step of as many Gaussians."""
         if self.mean is None or len(self.mean) != len(x):
             return x
         quats = self.mean[:, QUAT:LOGIT]
@@ -245,20 +236,16 @@ def fit_full(
     masks: Masks | None = None,
     baseline_start: Gaussians | None = None,
 ) -> tuple[Gaussians, FitReport]:
-    """All parameters fitted to the photos.
+    """Fit all parameters to the photos.
 
-    Two states can be returned, judged by blocks of the photos that the half-size steps leave out: the start, or
-    the end if the blocks were better after those steps. The full-size steps then use every block.
+    Two states can be returned, judged by blocks of the photos that the half-size steps leave out:
+    the start, or the end if the blocks were better after those steps. The full-size steps then use
+    every block.
 
-    Args:
-        gaussians: Canonical Gaussians.
-        photos: The input views at full and at half size, and larger where their photos are and the fit is to see them.
-        options: Steps, rates, limits.
-        count: Number of Gaussians to grow to, where the run is long enough; at least as many as there are.
-        seed: Order of the views, backgrounds, dropout, held-out blocks.
-        progress: Called after every step.
-        masks: Pixels that count; None: all. Where no Gaussian is, none should be drawn to.
-        baseline_start: Another start that the fit may beat instead, see :func:`score_to_beat`.
+    ``photos`` come at full and at half size, and larger if the fit is to see them. ``count``:
+    number of Gaussians to grow to, where the run is long enough. ``masks``: pixels that count;
+    where no Gaussian is, none should be drawn to. ``baseline_start``: another start that the fit
+    may beat instead, see :func:`score_to_beat`. ``progress`` is called after every step.
     """
     rng, state, plan = np.random.default_rng(seed), start_state(gaussians), plan_run(photos, options, seed, masks)
     tail = TailMean()
@@ -306,7 +293,7 @@ def start_clock(state: State, plan: FitPlan) -> float:
 
 
 def affordable_steps(seconds: float, plan: FitPlan) -> int:
-    """Steps that fit into the time budget, from the time of the first PROBE ones at half size.
+    """Return the steps that fit into the time budget, from the time of the first PROBE steps at half size.
 
     A step at full size costs up to three times as much, one on larger photos more by their pixels.
     """
@@ -319,29 +306,20 @@ def affordable_steps(seconds: float, plan: FitPlan) -> int:
 
 @dataclass(eq=False)
 class PoseState:
-    """Motions of the views under optimisation, whose mean is none, so that the scene stays where it is.
+    """Motions of the views under optimisation; their mean stays zero, so that the scene stays where it is."""
 
-    Args:
-        start: ``[v,4,4]`` viewmats before the fit.
-        viewmats: ``[v,4,4]`` float64, written by every step; the photos of all sizes share them.
-        x: ``[v,6]`` motion of each, see :func:`gsmerge.geometry.motion_vectors`: about the scene's middle, where turns
-            and shifts of a camera show differently.
-        m: First moment.
-        v: Second moment.
-        counts: ``[v]`` steps of each.
-        pixel: Angle of a pixel, radians, which is also its size at the scene's depth, canonical units.
-    """
-
-    start: np.ndarray
-    viewmats: np.ndarray
+    start: np.ndarray  # [v,4,4] viewmats before the fit
+    viewmats: np.ndarray  # [v,4,4] float64, updated by steps, shared with all photos
+    # [v,6] motion of each, see gsmerge.geometry.motion_vectors: about the scene's middle, where
+    # turns and shifts of a camera show differently
     x: np.ndarray
-    m: np.ndarray
-    v: np.ndarray
-    counts: np.ndarray
-    pixel: float
+    m: np.ndarray  # First moment
+    v: np.ndarray  # Second moment
+    counts: np.ndarray  # [v] steps of each
+    pixel: float  # Angle of a pixel, radians; also its size at the scene's depth
 
     def step(self, view: int, gradient: np.ndarray, rates: Tuning, progress: float) -> None:
-        """One Adam step of a view by the gradient ``[4,4]`` of its viewmat; steps fall to nothing at the end."""
+        """Take one Adam step of a view by the gradient ``[4,4]`` of its viewmat; steps fall to zero at the end."""
         turns = self.viewmats[view, :3, :3].T @ gradient[:3]
         (_, ab, ac), (ba, _, bc), (ca, cb, _) = turns[:, :3]
         slope = np.array([cb - bc, ac - ca, ba - ab, *turns[:, 3]])
@@ -356,7 +334,7 @@ class PoseState:
 
 
 def start_poses(photos: tuple[Photos, ...]) -> tuple[PoseState, tuple[Photos, ...]]:
-    """Motions at the poses of some photos, and the photos with viewmats that they share with it."""
+    """Return zero motions at the poses of some photos, and the photos with viewmats shared with them."""
     start = photos[0].viewmats.astype(np.float64)
     zero, shared = np.zeros((len(start), 6)), start.copy()
     pixel = 1 / float(photos[0].Ks[:, [0, 1], [0, 1]].mean())

@@ -23,9 +23,10 @@ LOSS_WINDOW = image_loss.SIDE  # pixels per side of the windows of loss_ssim
 
 
 def loss_ssim(image: Tensor, photo: Tensor) -> Tensor:
-    """``[h,w,3]`` structural similarity of the loss about every pixel of images ``[h,w,3]``, differentiable.
+    """Return the differentiable structural similarity ``[h,w,3]`` of the loss about every pixel.
 
-    Uniform windows of 7 x 7 pixels, zero beyond the border, population covariances, K1 = .01, K2 = .03.
+    Uniform windows of 7 x 7 pixels, zero beyond the border, population covariances, K1 = .01, K2 =
+    .03.
     """
     import torch
     from torch.nn.functional import avg_pool2d
@@ -40,17 +41,11 @@ def loss_ssim(image: Tensor, photo: Tensor) -> Tensor:
 def image_gradient(
     image: np.ndarray, photo: np.ndarray, weight: np.ndarray, ssim_lambda: float
 ) -> tuple[np.ndarray, float]:
-    """Gradient of the loss (1 - l) |image - photo| + l (1 - SSIM), l = ``ssim_lambda``, per pixel of the image.
+    """Return the gradient of (1 - l) |image - photo| + l (1 - SSIM), l = ``ssim_lambda``, and the squared error.
 
-    Args:
-        image: ``[h,w,3]`` float32.
-        photo: ``[h,w,3]`` float32.
-        weight: ``[h,w]`` float32 weights of the pixels.
-        ssim_lambda: Share of structural similarity, see :func:`loss_ssim`.
-
-    Returns:
-        ``[h,w,3]`` float32, divided by the number of pixels, so that it means the same at every size; and the
-        weighted sum of the squared errors of all channels.
+    Images are ``[h,w,3]`` float32, pixels weigh ``weight [h,w]`` float32. The gradient ``[h,w,3]``
+    is divided by the number of pixels, so that it means the same at every size; the squared errors
+    are summed over all channels.
     """
     height, width = weight.shape
     gradient, errors = np.empty((height, 3 * width), np.float32), np.empty(height, np.float32)

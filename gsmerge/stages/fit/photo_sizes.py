@@ -1,4 +1,4 @@
-"""scene -> the photos that a fit looks at: at full and at half size, and larger where its photos are larger."""
+"""Scene -> photos for a fit: at full and at half size, and larger where its photos are larger."""
 
 from __future__ import annotations
 
@@ -20,10 +20,7 @@ BLOCK = 32  # pixels, at most
 
 
 def fit_photos(scene: Scene, options: FitOptions, views: Sequence[int] | None = None) -> tuple[Photos, ...]:
-    """Return the photos at full and at half size, and larger ones where ``photo_scale`` is a number above 1.
-
-    Those of ``views``, None: of all. The record gets the choice ``photo_scale`` and a note where there are larger ones.
-    """
+    """Return the photos at full and half size, and larger if ``photo_scale`` is above 1, which is recorded."""
     views = range(len(scene)) if views is None else views
     photos = scene_photos(scene)[views], scene_photos(scene, 2)[views]
     scale = 1.0 if options.photo_scale == "auto" else options.photo_scale
@@ -40,10 +37,7 @@ def fit_photos(scene: Scene, options: FitOptions, views: Sequence[int] | None = 
 
 
 def photo_scale(scene: Scene, options: FitOptions, *, auto: bool) -> tuple[float, str | None]:
-    """Choose the multiple of the views' size, 1 or more, at which a fit looks at photos; and why it is less than asked.
-
-    ``auto``: whether ``photo_scale="auto"`` may be above 1.
-    """
+    """Choose the multiple of the views' size for photos in a fit, 1 or more; say why it is less than asked."""
     wanted, largest = options.photo_scale, largest_scale(scene)
     covered = options.fit == "full" and options.half_res_part < 1
     if wanted == "auto":
@@ -59,7 +53,7 @@ def photo_scale(scene: Scene, options: FitOptions, *, auto: bool) -> tuple[float
 
 
 def largest_scale(scene: Scene) -> float:
-    """Times the views' size that the photos have along either side, at least 1."""
+    """Return how many times the views' size the photos have, at least 1."""
     large = scene.large_photos
     if large is None or scene.images is None or len(scene) == 0:
         return 1.0
@@ -68,13 +62,11 @@ def largest_scale(scene: Scene) -> float:
 
 
 def large_photos(scene: Scene, scale: float) -> Photos:
-    """The photos at ``scale`` times the views' size, at most :func:`largest_scale`, read one by one.
+    """Read the photos at ``scale`` times the views' size, at most :func:`largest_scale`, one by one.
 
-    As uint8, because they may be as large as the scene. Their low-pass is that of a viewer of this size: the views' own
-    size is seen with its own in the steps between.
-
-    Raises:
-        ValueError: If the scene has no larger photos.
+    As uint8, because they may be as large as the scene. Their low-pass is that of a viewer of this
+    size: the views' own size is seen with its own in the steps between. Raises ValueError if the
+    scene has no larger photos.
     """
     large, cameras = scene.large_photos, scene.cameras
     if large is None:
@@ -91,7 +83,7 @@ def large_photos(scene: Scene, scale: float) -> Photos:
 
 
 def training_weights(photos: Photos, share: float, seed: int) -> list[np.ndarray]:
-    """Per view ``[h,w]`` float32: 0 on the held-out blocks, 1 elsewhere; every view holds out at least one block."""
+    """Return weights ``[h,w]`` float32 per view: 0 on the held-out blocks, at least one a view, 1 elsewhere."""
     size = max(1, min(BLOCK, min(photos.height, photos.width) // 4))
 
     def one_view(view: int) -> np.ndarray:
@@ -107,18 +99,14 @@ def training_weights(photos: Photos, share: float, seed: int) -> list[np.ndarray
 
 
 def reduced(weights: list[np.ndarray], photos: Photos) -> list[np.ndarray]:
-    """The weights of full-size photos for the same photos at half size."""
+    """Reduce weights of full-size photos to half size."""
     return [np.ascontiguousarray(weight[::2, ::2][: photos.height, : photos.width]) for weight in weights]
 
 
 def holdout_psnr(images: list[np.ndarray], photos: Photos, weights: list[np.ndarray], min_gain: float) -> float:
-    """PSNR (dB) of renders on the held-out blocks, exposure of the photos set aside.
+    """Return the PSNR (dB) of renders on the held-out blocks, where ``weights [h,w]`` are 0.
 
-    Args:
-        images: ``[h,w,3]`` render of every photo.
-        photos: The photos.
-        weights: ``[h,w]`` 0 on the held-out blocks of each view, 1 elsewhere.
-        min_gain: Exposure against the mean, as a factor, from which on it is set aside.
+    Exposure of the photos that differs by a factor of ``min_gain`` or more is compensated.
     """
     views = range(len(photos))
     clipped = parallel_map(lambda view: np.clip(images[view], 0, 1), views)
@@ -140,9 +128,10 @@ def exposure_gains(
     min_gain: float,
     max_gain: float = 2.0,
 ) -> np.ndarray:
-    """``[v,3]`` float32 factors that bring renders to the photos' exposure, with geometric mean one.
+    """Return factors ``[v,3]`` float32 from renders to the photos' exposure, with geometric mean one.
 
-    Least squares on the weighted pixels, per view and channel; ones where no view differs by ``min_gain``.
+    Least squares on the weighted pixels, per view and channel; ones where no view differs by
+    ``min_gain``.
     """
 
     def one_view(view: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The stage: which Gaussians stay, and what of them is fitted."""
+"""The stage of the fit: which Gaussians stay, and which parameters are fitted."""
 
 from __future__ import annotations
 
@@ -23,7 +23,6 @@ from gsmerge.types import Array, Gaussians, Scene
 FitResult = tuple[Gaussians, FitReport]
 PhotosT = TypeVar("PhotosT")  # photos of one size, where a back end has them
 ResultT = TypeVar("ResultT")
-DataT = TypeVar("DataT")  # on the CPU where it is used
 CLOSE = 1.0  # dB that the held-out blocks must gain; after less, the whole photos are compared
 ALWAYS = float("inf")  # where the full fit failed: it may have begun where another one ended
 START = 0.57  # share of the Gaussians that a run which grows begins with
@@ -31,7 +30,7 @@ START = 0.57  # share of the Gaussians that a run which grows begins with
 
 @dataclass(frozen=True)
 class FitBackend(Generic[PhotosT]):
-    """The functions that the fit and the scores are made of, on the CPU (``ON_CPU``) or on a GPU.
+    """Functions of the fit and the scores, on the CPU (``ON_CPU``) or on a GPU.
 
     ``photo_psnr`` takes Gaussians and photos as a caller has them, all others as ``upload`` and
     ``upload_photos`` return them.
@@ -51,13 +50,7 @@ class FitBackend(Generic[PhotosT]):
 
 
 def visible_mask(gaussians: Gaussians, photos: Photos, min_weight: float) -> np.ndarray:
-    """``[n]`` mask of the Gaussians worth keeping.
-
-    Args:
-        gaussians: n Gaussians.
-        photos: The views that they may show in.
-        min_weight: Least blending weight at some pixel. What lies in no photo's frustum stays.
-    """
+    """Return a mask ``[n]`` of Gaussians with a weight of ``min_weight`` in some photo, or in no photo's frustum."""
     splats = prepare(gaussians)
 
     def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
@@ -81,7 +74,7 @@ def _grow(gaussians: Gaussians, photos: Photos, count: int) -> Gaussians:
 
 
 def photo_error(gaussians: Gaussians, photos: Photos) -> float:
-    """Mean squared error of all photos."""
+    """Return the mean squared error of all photos."""
 
     def score(view: int, image: np.ndarray, _: np.ndarray) -> float:
         return float(((np.clip(image, 0, 1) - photos.images[view]) ** 2).mean(dtype=np.float64))
@@ -89,15 +82,11 @@ def photo_error(gaussians: Gaussians, photos: Photos) -> float:
     return float(np.mean(photo_errors(gaussians, photos, score)))
 
 
-def _stay(data: DataT) -> DataT:
-    return data
-
-
 ON_CPU: FitBackend[Photos] = FitBackend(
     device="cpu",
-    upload=_stay,
-    upload_photos=_stay,
-    download=_stay,
+    upload=lambda gaussians: gaussians,
+    upload_photos=lambda photos: photos,
+    download=lambda gaussians: gaussians,
     visible_mask=visible_mask,
     fit_full=fit_full,
     fit_colors=_fit_colors,
@@ -122,21 +111,11 @@ def fit(
     """Leave out what no photo shows, and fit the rest to the photos; a draft without a fit leaves out nothing.
 
     Where the full fit does not make held-out parts of the photos better, the colour fit is tried.
-
-    Args:
-        gaussians: Canonical Gaussians.
-        photos: The input views, see :func:`gsmerge.stages.fit.photo_sizes`. Larger ones are fitted to on the CPU alone.
-        options: What to fit.
-        count: Number of Gaussians that the full fit may grow to.
-        seed: Everything random.
-        progress: Called after every step of the full fit, or on a GPU every few steps.
-        baseline_start: Another start that the full fit may beat instead, see
-            :func:`gsmerge.stages.fit.full.score_to_beat`.
-        exact: Whether ``count`` is to be met: where nothing grows to it, nothing is left out either.
-        backend: Where it runs, see :func:`gsmerge.gpu.choose_backend`.
-
-    Returns:
-        The Gaussians that stay, fitted, and what was done; None if nothing was asked for.
+    ``photos``: see :func:`gsmerge.stages.fit.photo_sizes.fit_photos`; larger ones are fitted to on
+    the CPU alone. ``count``: number of Gaussians that the full fit may grow to; if it is ``exact``
+    and nothing grows, nothing is left out either. ``baseline_start``: another start that the full
+    fit may beat instead, see :func:`gsmerge.stages.fit.full.score_to_beat`. The report is None if
+    nothing was asked for.
     """
     if exact and not options.grows:
         options = replace(options, min_contribution=0.0)
@@ -156,16 +135,7 @@ def fit(
 def fit_scene(
     decoded: Decoded, scene: Scene, views: Sequence[int], options: FitOptions, seed: int, backend: FitBackend[Any]
 ) -> Fitted:
-    """Fit decoded Gaussians to the photos of some views; as they are where there are none, or nothing was asked for.
-
-    Args:
-        decoded: Where to begin, and the number of Gaussians to grow to.
-        scene: Canonical.
-        views: Of the scene, whose photos are used.
-        options: What to fit.
-        seed: Everything random.
-        backend: Where to fit. Larger photos are fitted to on the CPU alone.
-    """
+    """Fit decoded Gaussians to the photos of some views of a canonical scene, if there are any and it is asked for."""
     if scene.images is None or not options.needs_photos:
         return Fitted(decoded.gaussians, scene.cameras, None)
     with stage("fit"):
@@ -185,7 +155,7 @@ def fit_scene(
 
 
 def run_on(backend: FitBackend[Any], name: str, work: Callable[[FitBackend[Any]], ResultT]) -> ResultT:
-    """Do some work on a back end; if its memory does not suffice, on the CPU, with a note."""
+    """Do some work on a back end, or on the CPU with a note if the back end's memory does not suffice."""
     try:
         return work(backend)
     except backend.memory_errors:
@@ -203,7 +173,7 @@ def _choose_fit(
     progress: Progress | None,
     baseline_start: Gaussians | None,
 ) -> tuple[Gaussians, FitReport | None]:
-    """:func:`fit` on a back end, of Gaussians and photos that are its own."""
+    """Run :func:`fit` on a back end, with Gaussians and photos of its own."""
     full, half = photos[:2]
     keep = backend.visible_mask(gaussians, half, options.min_contribution)
     kept = gaussians[keep]
@@ -223,10 +193,10 @@ def _choose_fit(
 def _better_of(
     backend: FitBackend[PhotosT], photos: PhotosT, before: Gaussians, after: Gaussians, report: FitReport, close: float
 ) -> FitResult:
-    """The fitted Gaussians; their start if the held-out blocks hardly gained and the photos as a whole lost.
+    """Return the fitted Gaussians, or their start if held-out blocks hardly gained and whole photos lost.
 
-    Gaussians that were fitted already are where steps of the default size only scatter. After a gain of ``close`` dB or
-    more the photos are not compared.
+    Gaussians that were fitted already are where steps of the default size only scatter. After a
+    gain of ``close`` dB or more the photos are not compared.
     """
     if not report.accepted or report.holdout_after - report.holdout_before >= close:
         return after, report
@@ -238,5 +208,5 @@ def _better_of(
 
 
 def start_share(options: FitOptions) -> float:
-    """Share of the Gaussians asked for that the stages before the fit should leave for it to begin with."""
+    """Return the share of the requested Gaussians with which the fit starts."""
     return START if options.grows else 1.0

@@ -20,7 +20,7 @@ from gsmerge.stages.assign import (
     owner_pixels,
     seen_depths,
 )
-from gsmerge.stages.encode import encode, group_rows, member_rows
+from gsmerge.stages.encode import encode, member_rows
 from gsmerge.stages.place_cameras import add_views
 from gsmerge.stages.prepare import canonicalise, prepare, scene_frame
 from gsmerge.stages.segment import superpixels_per_view
@@ -72,7 +72,8 @@ def test_rows_by_pixel_are_those_of_the_grid(room: Scene, groups: Groups) -> Non
     """Members that know their pixels are grouped as those of a scene in order."""
     scene, pixels = unaligned_scenes.loosened(room), np.arange(len(room.gaussians))
     members = unaligned_members(scene, pixels)
-    for actual, expected in zip(member_rows(scene, members, groups), group_rows(room, groups), strict=True):
+    in_order = member_rows(room, scene_members(room), groups)
+    for actual, expected in zip(member_rows(scene, members, groups), in_order, strict=True):
         assert (actual == expected).all()
     np.testing.assert_allclose(members.footprints, scene_members(room).footprints, rtol=1e-5)
     one, other = (
@@ -136,7 +137,7 @@ def test_unknown_cameras_are_placed(room: Scene) -> None:
 def test_placed_cameras_see_most(room: Scene) -> None:
     blind = add_views(Scene(room.gaussians, unaligned_scenes.NO_CAMERAS, None, None, ()))
     groups = Groups(np.zeros((len(blind), blind.cameras.height, blind.cameras.width), np.int32), (1,) * len(blind))
-    owners = find_owners(blind, groups, near=1e-3)
+    owners = find_owners(blind, groups)
     assert (owners.values > 0).mean() > 0.8
 
 

@@ -8,7 +8,7 @@ import scenes
 
 from gsmerge import Scene
 from gsmerge.moments import feature_to_gaussians, scene_members
-from gsmerge.stages.encode import encode, group_rows
+from gsmerge.stages.encode import encode, member_rows
 from gsmerge.types import FeatureGaussians, Groups, grid_ids
 
 WIDTH, HEIGHT = 12, 8
@@ -32,7 +32,7 @@ def encoded(scene: Scene, groups: Groups, rule: str = "depth") -> FeatureGaussia
 
 
 def test_rows_of_the_groups(scene: Scene, groups: Groups) -> None:
-    starts, ids, views = group_rows(scene, groups)
+    starts, ids, views = member_rows(scene, scene_members(scene), groups)
     assert np.diff(starts).tolist() == [16] * 12
     assert views.tolist() == [0] * 6 + [1] * 6
     labels = groups.labels.reshape(-1)
@@ -46,7 +46,8 @@ def test_invalid_pixels_are_left_out(scene: Scene, groups: Groups) -> None:
     valid = scene.valid.copy()
     valid[0, :4, :4] = False  # a whole superpixel
     valid[1, 0, 0] = False
-    starts, ids, views = group_rows(replace(scene, pixel_ids=grid_ids(valid)), groups)
+    partial = replace(scene, pixel_ids=grid_ids(valid))
+    starts, ids, views = member_rows(partial, scene_members(partial), groups)
     assert np.diff(starts).tolist() == [16] * 5 + [15] + [16] * 5
     assert views.tolist() == [0] * 5 + [1] * 6
     assert valid.reshape(-1)[ids].all()
@@ -63,7 +64,7 @@ def test_no_valid_pixel(scene: Scene, groups: Groups, rule: str) -> None:
 def test_views_may_have_different_counts(scene: Scene, groups: Groups) -> None:
     labels = groups.labels.copy()
     labels[1] = 0
-    _, _, views = group_rows(scene, Groups(labels, (6, 1)))
+    _, _, views = member_rows(scene, scene_members(scene), Groups(labels, (6, 1)))
     assert views.tolist() == [0] * 6 + [1]
 
 
@@ -84,7 +85,7 @@ def test_sums_add_up(scene: Scene, groups: Groups) -> None:
 def test_paper_rule_is_moment_matching_with_the_mean_opacity(scene: Scene, groups: Groups) -> None:
     features = encoded(scene, groups, "paper")
     gaussians = feature_to_gaussians(features)
-    rows = group_rows(scene, groups)[1].reshape(12, 16)
+    rows = member_rows(scene, scene_members(scene), groups)[1].reshape(12, 16)
     members = scene.gaussians
     for g, own in enumerate(rows):
         weights = members.opacities[own].astype(np.float64) / members.opacities[own].astype(np.float64).sum()
