@@ -17,6 +17,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from gsmerge import integrations as integrations
     from gsmerge.encoded.encoded import Encoded as Encoded
     from gsmerge.encoded.gsm_file import load_encoded as load_encoded
     from gsmerge.encoded.gsm_file import save_encoded as save_encoded
@@ -86,6 +87,8 @@ class _Package(ModuleType):
 
 
 def __getattr__(name: str) -> Any:
+    if name == "integrations":
+        return import_module(f"{__name__}.{name}")
     if name not in _EXPORTS:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(import_module(f"{__name__}.{_EXPORTS[name]}"), name)

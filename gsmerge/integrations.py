@@ -1,0 +1,167 @@
+"""Turn what other libraries return into the arguments of :func:`gsmerge.compact_tensors`, by the names of fields.
+
+None of the libraries is imported. Each function returns keyword arguments, so that any of them can be changed:
+
+    gsmerge.compact_tensors(**gsmerge.integrations.depth_anything_3(prediction), budget="4%")
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from gsmerge.errors import SceneError
+from gsmerge.geometry import rotmat_to_quat
+from gsmerge.types import Array, as_array, like
+
+_OTHER_SIZE = 0.1  # share by which a principal point is farther from the middle than one of this size ever is
+_BYTES = 255.0  # largest value of an image of bytes
+
+
+def depth_anything_3(prediction: Any, *, sh_degree: int = 0) -> dict[str, Any]:
+    """Take all Gaussians, one per pixel, of a ``Prediction`` of Depth Anything 3, made with ``infer_gs=True``.
+
+    Its files lack those at borders and far away. The nested models' poses are brought to the scale of the Gaussians.
+
+    Args:
+        prediction: Has ``gaussians`` (``means``, ``scales``, ``rotations``, ``harmonics``, ``opacities``),
+            ``extrinsics`` world to camera, ``intrinsics`` in pixels, ``processed_images`` and ``scale_factor``.
+        sh_degree: Harmonics above this degree are left out, as in its files.
+
+    Raises:
+        SceneError: If a field is missing, or it holds several scenes.
+    """
+    gaussians = _field("prediction", prediction, "gaussians")
+    photos = as_array(_field("prediction", prediction, "processed_images"))
+    viewmats = as_array(_field("prediction", prediction, "extrinsics")).astype(np.float64)
+    scale = getattr(prediction, "scale_factor", None)
+    if scale is not None and getattr(prediction, "is_metric", False):
+        viewmats[..., :3, 3] /= float(scale)
+    return {
+        **_gaussians(gaussians, sh_degree),
+        "scales": _one("scales", gaussians.scales, 2),
+        "quats": _one("rotations", gaussians.rotations, 2),
+        "images": _as_floats(photos),
+        "viewmats": viewmats,
+        "Ks": _in_pixels_of(photos, as_array(_field("prediction", prediction, "intrinsics"))),
+        "check_rotations": False,  # its own renderer takes them as they are
+    }
+
+
+def anysplat(gaussians: Any, poses: Mapping[str, Array], images: Array, *, sh_degree: int = 0) -> dict[str, Any]:
+    """Take what AnySplat's ``model.inference`` returns: Gaussians of voxels, which belong to no pixels, and cameras.
+
+    Its files have no cameras.
+
+    Args:
+        gaussians: Has ``means``, ``scales``, ``rotations`` xyzw (its files have w first), ``harmonics [1,n,3,k]`` and
+            ``opacities``.
+        poses: ``extrinsic [1,V,4,4]`` camera to world, ``intrinsic [1,V,3,3]`` divided by the image's size.
+        images: ``[1,V,3,H,W]`` as the model got them, in [0, 1].
+        sh_degree: Harmonics above this degree are left out, as in its files.
+
+    Raises:
+        SceneError: If a field is missing, or it holds several scenes.
+    """
+    return {
+        **_gaussians(gaussians, sh_degree),
+        "scales": _one("scales", gaussians.scales, 2),
+        "quats": _one("rotations", gaussians.rotations, 2)[:, [3, 0, 1, 2]],
+        **_family_views(poses, "extrinsic", "intrinsic", images),
+        "order": "none",
+    }
+
+
+def depthsplat(output: Any, context: Mapping[str, Array], *, sh_degree: int = 0) -> dict[str, Any]:
+    """Take what DepthSplat's encoder returns, one Gaussian per pixel; MVSplat and pixelSplat (with one) have the same.
+
+    Its files lack the pixels at borders. Scales and rotations come from the covariances, because the rotations it
+    keeps beside them are the cameras'.
+
+    Args:
+        output: The encoder's: Gaussians with ``means``, ``covariances``, ``harmonics [1,n,3,k]`` and ``opacities``, or
+            a dictionary that has them as ``gaussians``.
+        context: The batch's context: ``extrinsics [1,V,4,4]`` camera to world, ``intrinsics [1,V,3,3]`` divided by the
+            image's size, ``image [1,V,3,H,W]`` in [0, 1].
+        sh_degree: Harmonics above this degree are left out, as in its files.
+
+    Raises:
+        SceneError: If a field is missing, or it holds several scenes.
+    """
+    gaussians = output["gaussians"] if isinstance(output, Mapping) else output
+    covariances = _one("covariances", _field("gaussians", gaussians, "covariances"), 3)
+    scales, quats = _axes(as_array(covariances).astype(np.float64))
+    return {
+        **_gaussians(gaussians, sh_degree),
+        "scales": like(scales, covariances),
+        "quats": like(quats, covariances),
+        **_family_views(context, "extrinsics", "intrinsics", context["image"]),
+    }
+
+
+def _field(owner: str, value: Any, name: str) -> Any:
+    content = getattr(value, name, None)
+    if content is None:
+        remedy = "run the model with infer_gs=True" if name == "gaussians" else ""
+        raise SceneError(owner, f"expected a field {name}, found none", remedy)
+    return content
+
+
+def _item(owner: str, values: Mapping[str, Array], name: str) -> Array:
+    if name not in values:
+        raise SceneError(owner, f"expected an entry {name!r}, found {', '.join(map(repr, values.keys()))}")
+    return values[name]
+
+
+def _one(name: str, values: Array, num_axes: int) -> Array:
+    """Remove the axis of a batch of one."""
+    if values.ndim == num_axes:
+        return values
+    if values.ndim != num_axes + 1 or values.shape[0] != 1:
+        raise SceneError(name, f"expected a batch of one scene, found shape {list(values.shape)}", "pass one scene")
+    return values[0]
+
+
+def _gaussians(gaussians: Any, sh_degree: int) -> dict[str, Array]:
+    """Take means, opacities and harmonics, which these models keep channel-major."""
+    harmonics = _one("harmonics", _field("gaussians", gaussians, "harmonics"), 3)
+    rows = harmonics.swapaxes(1, 2)[:, : (sh_degree + 1) ** 2]
+    opacities = _field("gaussians", gaussians, "opacities")
+    means = _one("means", _field("gaussians", gaussians, "means"), 2)
+    return {"means": means, "opacities": opacities, "sh0": rows[:, :1], "shN": rows[:, 1:]}
+
+
+def _family_views(poses: Mapping[str, Array], extrinsics: str, intrinsics: str, images: Array) -> dict[str, np.ndarray]:
+    """Convert views of the pixelSplat family: camera to world, intrinsics over the image's size, channels first."""
+    c2w = as_array(_one(extrinsics, _item("poses", poses, extrinsics), 3)).astype(np.float64)
+    photos = as_array(_one("images", images, 4)).transpose(0, 2, 3, 1)
+    sizes = np.array([photos.shape[2], photos.shape[1], 1.0])
+    Ks = as_array(_one(intrinsics, _item("poses", poses, intrinsics), 3)).astype(np.float64) * sizes[:, None]
+    return {"images": _as_floats(photos), "viewmats": np.linalg.inv(c2w), "Ks": Ks}
+
+
+def _as_floats(photos: np.ndarray) -> np.ndarray:
+    """Bring photos of bytes to [0, 1]; leave others as they are."""
+    return photos / np.float32(_BYTES) if photos.dtype == np.uint8 else photos
+
+
+def _in_pixels_of(photos: np.ndarray, Ks: np.ndarray) -> np.ndarray:
+    """Bring intrinsics to the photos' size: writing COLMAP files leaves Depth Anything 3's at the original photos'.
+
+    Its principal point is in the middle of whichever size they are of.
+    """
+    factors = np.array([photos.shape[-2], photos.shape[-3]]) / (2 * Ks[:, (0, 1), 2])
+    scaled = np.abs(factors - 1).min() > _OTHER_SIZE
+    return Ks * np.concatenate([factors, np.ones((len(Ks), 1))], 1)[:, :, None] if scaled else Ks
+
+
+def _axes(covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Split covariances ``[n,3,3]`` into standard deviations ``[n,3]`` and rotations ``[n,4]`` wxyz."""
+    finite = np.isfinite(covariances).all((1, 2))
+    squares, axes = np.linalg.eigh(np.where(finite[:, None, None], covariances, np.eye(3)))
+    axes[:, :, 0] = np.cross(axes[:, :, 1], axes[:, :, 2])  # a rotation, no mirror
+    scales = np.sqrt(np.maximum(squares, 0))
+    scales[~finite] = np.nan
+    return scales.astype(np.float32), rotmat_to_quat(axes).astype(np.float32)

@@ -1,0 +1,134 @@
+"""Adapters of other libraries, on stand-ins that have the fields of what these return."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from scenes import arc, make_scene, move, room
+
+from gsmerge import Gaussians, Scene, SceneError, compact_tensors, integrations
+from gsmerge.geometry import covariances
+from gsmerge.types import as_array
+
+FAST: dict[str, Any] = {"effort": "draft", "superpixels": "10%", "fit": "none"}
+SIZES = np.array([48, 36, 1.0])[:, None]
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    turn, _ = cv2.Rodrigues(np.array([0.4, -0.7, 0.5]))
+    return move(make_scene(room(), arc(3), degree=0), turn, 1.0, np.array([0.3, -0.2, 0.1]))
+
+
+def photos_of(scene: Scene) -> np.ndarray:
+    assert scene.images is not None
+    return scene.images
+
+
+def batch(values: np.ndarray) -> torch.Tensor:
+    return torch.tensor(np.asarray(values, np.float32))[None]
+
+
+def family(scene: Scene) -> SimpleNamespace:
+    """Gaussians as the pixelSplat family, AnySplat and Depth Anything 3 keep them, with harmonics of degree 1."""
+    gaussians = scene.gaussians
+    harmonics = np.concatenate([gaussians.sh0, np.full((len(gaussians), 3, 3), 0.01)], 1).transpose(0, 2, 1)
+    return SimpleNamespace(
+        means=batch(gaussians.means), scales=batch(gaussians.scales), rotations=batch(gaussians.quats),
+        harmonics=batch(harmonics), opacities=batch(gaussians.opacities),
+        covariances=batch(covariances(gaussians.quats.astype(np.float64), gaussians.scales.astype(np.float64))),
+    )  # fmt: skip
+
+
+def poses_of(scene: Scene, extrinsics: str, intrinsics: str) -> dict[str, torch.Tensor]:
+    return {extrinsics: batch(np.linalg.inv(scene.cameras.viewmats)), intrinsics: batch(scene.cameras.Ks / SIZES)}
+
+
+def prediction_of(scene: Scene, **more: Any) -> SimpleNamespace:
+    fields: dict[str, Any] = {
+        "gaussians": family(scene), "extrinsics": scene.cameras.viewmats[:, :3].astype(np.float32),
+        "intrinsics": scene.cameras.Ks.astype(np.float32), "depth": np.ones((3, 36, 48), np.float32), "is_metric": 0,
+        "processed_images": np.round(255 * photos_of(scene)).astype(np.uint8), "scale_factor": None,
+    }  # fmt: skip
+    return SimpleNamespace(**fields | more)
+
+
+def assert_holds(given: dict[str, Any], scene: Scene, *, quats: bool = True) -> None:
+    """What an adapter gives is the scene, and is taken."""
+    gaussians = scene.gaussians
+    n = len(gaussians)
+    for name in ("means", "opacities", "sh0"):
+        np.testing.assert_allclose(
+            as_array(given[name]).reshape(n, -1), getattr(gaussians, name).reshape(n, -1), atol=2e-6
+        )
+    if quats:
+        got = covariances(as_array(given["quats"]).astype(np.float64), as_array(given["scales"]).astype(np.float64))
+        want = covariances(gaussians.quats.astype(np.float64), gaussians.scales.astype(np.float64))
+        np.testing.assert_allclose(got, want, atol=1e-6)
+    np.testing.assert_allclose(as_array(given["viewmats"])[:, :3], scene.cameras.viewmats[:, :3], atol=1e-5)
+    np.testing.assert_allclose(as_array(given["Ks"]), scene.cameras.Ks, atol=1e-4)
+    np.testing.assert_allclose(as_array(given["images"]), photos_of(scene), atol=0.003)
+    small = compact_tensors(**given, **FAST)
+    assert isinstance(small.gaussians.means, torch.Tensor)
+    assert 0 < len(small.gaussians) < 0.3 * n
+    assert small.report.psnr_after is not None
+    assert small.report.psnr_after > 15
+
+
+def test_depth_anything_3(scene: Scene) -> None:
+    given = integrations.depth_anything_3(prediction_of(scene))
+    assert_holds(given, scene)
+    assert (given["shN"].shape[1], given["check_rotations"]) == (0, False)
+    assert integrations.depth_anything_3(prediction_of(scene), sh_degree=1)["shN"].shape == (len(scene.gaussians), 3, 3)
+
+
+def test_depth_anything_3_in_metres_and_after_writing_colmap(scene: Scene) -> None:
+    """The nested models scale the poses alone; its COLMAP writer leaves intrinsics at the original photos' size."""
+    metric, original = scene.cameras.viewmats[:, :3].copy(), scene.cameras.Ks * np.array([2.5, 2.4, 1])[:, None]
+    metric[:, :, 3] *= 4
+    prediction = prediction_of(scene, extrinsics=metric, is_metric=1, scale_factor=4.0, intrinsics=original)
+    assert_holds(integrations.depth_anything_3(prediction), scene)
+    np.testing.assert_array_equal(prediction.extrinsics, metric)
+
+
+def test_depth_anything_3_without_gaussians(scene: Scene) -> None:
+    with pytest.raises(SceneError, match=r"prediction: expected a field gaussians, found none; .*infer_gs=True"):
+        integrations.depth_anything_3(prediction_of(scene, gaussians=None))
+
+
+def test_anysplat(scene: Scene) -> None:
+    """Voxels: fewer Gaussians than pixels, in another order."""
+    rows = np.random.default_rng(0).permutation(len(scene.gaussians))[:-50]
+    fewer = replace_gaussians(scene, scene.gaussians[rows])
+    images, gaussians = batch(photos_of(scene).transpose(0, 3, 1, 2)), family(fewer)
+    gaussians.rotations = gaussians.rotations[..., [1, 2, 3, 0]]  # w last, which its writer of files reorders
+    given = integrations.anysplat(gaussians, poses_of(scene, "extrinsic", "intrinsic"), images)
+    assert_holds(given, fewer)
+    assert given["order"] == "none"
+    two = family(fewer)
+    two.means = two.means.repeat(2, 1, 1)
+    with pytest.raises(SceneError, match="means: expected a batch of one scene, found shape"):
+        integrations.anysplat(two, poses_of(scene, "extrinsic", "intrinsic"), images)
+
+
+def replace_gaussians(scene: Scene, gaussians: Gaussians) -> Any:
+    """A stand-in for a scene with any number of Gaussians."""
+    return SimpleNamespace(gaussians=gaussians, cameras=scene.cameras, images=scene.images)
+
+
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_depthsplat(scene: Scene, wrapped: bool) -> None:
+    """Rotations beside the covariances are the cameras', and are not read."""
+    gaussians = family(scene)
+    del gaussians.rotations, gaussians.scales
+    context = poses_of(scene, "extrinsics", "intrinsics")
+    context["image"] = batch(photos_of(scene).transpose(0, 3, 1, 2))
+    output = {"gaussians": gaussians, "depths": None} if wrapped else gaussians
+    given = integrations.depthsplat(output, context)
+    assert_holds(given, scene)
+    np.testing.assert_allclose(torch.linalg.norm(given["quats"], dim=-1), 1, atol=1e-5)
