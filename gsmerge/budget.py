@@ -119,7 +119,7 @@ def parse_budget(budget: str | int | None, num_input: int) -> int:
     """Parse a number of Gaussians, or a share of the input as "2%", rounded down; at most ``num_input``.
 
     Raises:
-        ValueError: If it is neither, or more than the input.
+        ValueError: If it is neither.
         UsageError: If it is not at least one Gaussian.
 
     Example:

@@ -111,8 +111,8 @@ def fit(
     """Leave out what no photo shows, and fit the rest to the photos; a draft without a fit leaves out nothing.
 
     Where the full fit does not make held-out parts of the photos better, the colour fit is tried.
-    ``photos``: see :func:`gsmerge.stages.fit.photo_sizes.fit_photos`; larger ones are fitted to on
-    the CPU alone. ``count``: number of Gaussians that the full fit may grow to; if it is ``exact``
+    ``photos``: see :func:`gsmerge.stages.fit.photo_sizes.fit_photos`; the CPU alone fits to
+    larger ones, and moves cameras. ``count``: number of Gaussians that the full fit may grow to; if it is ``exact``
     and nothing grows, nothing is left out either. ``baseline_start``: another start that the full
     fit may beat instead, see :func:`gsmerge.stages.fit.full.score_to_beat`. The report is None if
     nothing was asked for.
@@ -129,7 +129,8 @@ def fit(
         fitted, report = _choose_fit(chosen, start, sizes, options, count, seed, progress, other)
         return chosen.download(fitted), report and replace(report, device=chosen.device)
 
-    return run_on(backend if len(photos) == 2 else ON_CPU, "fit", fit_on)
+    on_cpu = len(photos) > 2 or options.move_cameras  # what only the CPU's fit can do
+    return run_on(ON_CPU if on_cpu else backend, "fit", fit_on)
 
 
 def fit_scene(

@@ -50,6 +50,14 @@ def test_larger_photos_are_fitted_to_on_the_cpu(start: Gaussians, photos: Pair) 
     assert len(fitted) == len(start)
 
 
+def test_cameras_are_moved_by_the_cpu(start: Gaussians, photos: Pair) -> None:
+    failing = replace(ON_TORCH, fit_full=None)
+    _, report = fit(start, photos, replace(QUICK, move_cameras=True), backend=failing)
+    assert report is not None
+    assert report.device == "cpu"
+    assert report.viewmats is not None
+
+
 def test_what_no_photo_shows_is_left_out(start: Gaussians, photos: Pair) -> None:
     opacities = start.opacities.copy()
     opacities[::5] = 0.0045
