@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from gsmerge.io.cameras.moves import describe_moves, list_moves
+from gsmerge.io.cameras.camera_file import describe_moves, list_moves
 from gsmerge.plan import Plan
 from gsmerge.render.photos import NEAR, scene_photos
 from gsmerge.runtime.memory import peak_memory

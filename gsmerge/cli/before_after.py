@@ -73,8 +73,8 @@ def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras]
     """Read the moved cameras that ``compact`` wrote beside results, by result; with notes."""
     import numpy as np
 
+    from gsmerge.io.cameras.camera_file import describe_moves, list_moves
     from gsmerge.io.cameras.json_files import viewer_cameras_path
-    from gsmerge.io.cameras.moves import describe_moves, list_moves
     from gsmerge.io.cameras.read import read_cameras
     from gsmerge.stages.prepare import scene_depth
 

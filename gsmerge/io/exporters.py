@@ -7,17 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal
+
+from gsmerge.io.alignment import MAY_BE_UNALIGNED, ORDERS, QUATS, Layout, Order, QuatChoice, Similarity
 
 if TYPE_CHECKING:
-    from gsmerge.io.alignment import Layout, Similarity
     from gsmerge.io.formats.ply import PlyInfo
 
-Order = Literal["auto", "view-major", "view-fastest", "layer-major", "column-major", "unordered", "none"]
-ORDERS: tuple[str, ...] = get_args(Order)
-MAY_BE_UNALIGNED: tuple[str, ...] = ("unordered", "none")  # orders of files whose rows need not belong to pixels
-QuatChoice = Literal["auto", "wxyz", "xyzw", "xyzw-root", "camera"]
-QUATS: tuple[str, ...] = get_args(QuatChoice)
 FrameKind = Literal["same", "scaled", "shifted", "first", "middle", "upright", "other"]
 
 

@@ -179,7 +179,7 @@ def align_scene(
     limited, smaller = limit_photo_size(pictures, len(ply.gaussians), hints.max_side, unaligned=order == "none")
 
     def read_frames() -> list[Similarity]:
-        path = find_dataparser(files)
+        path = find_dataparser(files.ply, files.cameras)
         frames = [] if path is None else read_dataparser(path, files.cameras)
         return [replace(frame, description=f"moved into the Gaussians' frame by {DATAPARSER}") for frame in frames]
 

@@ -23,12 +23,18 @@ from gsmerge.io.alignment.cameras import choose_poses as choose_poses
 from gsmerge.io.alignment.cameras import estimate_cameras as estimate_cameras
 from gsmerge.io.alignment.cameras import move_cameras as move_cameras
 from gsmerge.io.alignment.cameras import other_conventions as other_conventions
-from gsmerge.io.alignment.layouts import GridFit, Layout, other_grids, photo_grid, small_photos_error, subsample
+from gsmerge.io.alignment.layouts import MAY_BE_UNALIGNED as MAY_BE_UNALIGNED
+from gsmerge.io.alignment.layouts import ORDERS as ORDERS
+from gsmerge.io.alignment.layouts import GridFit, other_grids, photo_grid, small_photos_error, subsample
+from gsmerge.io.alignment.layouts import Layout as Layout
+from gsmerge.io.alignment.layouts import Order as Order
 from gsmerge.io.alignment.layouts import fill_from_depths as fill_from_depths
 from gsmerge.io.alignment.recovery import Recovery as Recovery
 from gsmerge.io.alignment.recovery import explain_count, possible_layouts, recover
 from gsmerge.io.alignment.recovery import explain_misalignment as explain_misalignment
 from gsmerge.io.alignment.recovery import misalignment_error as misalignment_error
+from gsmerge.io.alignment.rotations import QUATS as QUATS
+from gsmerge.io.alignment.rotations import QuatChoice as QuatChoice
 from gsmerge.io.alignment.rotations import choose_rotations as choose_rotations
 from gsmerge.io.alignment.rotations import read_rotations as read_rotations
 from gsmerge.io.alignment.score import IDENTITY as IDENTITY
@@ -39,7 +45,6 @@ from gsmerge.io.alignment.score import check_alignment as check_alignment
 from gsmerge.io.alignment.score import check_pairs as check_pairs
 from gsmerge.io.alignment.score import sample_pixels as sample_pixels
 from gsmerge.io.cameras.camera_file import CameraFile
-from gsmerge.io.exporters import MAY_BE_UNALIGNED
 from gsmerge.io.formats.ply import PlyScene
 from gsmerge.io.photo_files import Photos, PhotoTransform, as_floats, natural_key, photo_size
 from gsmerge.types import Cameras

@@ -37,13 +37,14 @@ from gsmerge.io.cameras.camera_file import (
     CameraFile,
     Convention,
     View,
+    describe_moves,
     from_viewmats,
+    list_moves,
     make_camera_file,
     make_pinhole,
     to_viewmats,
     with_convention,
 )
-from gsmerge.io.cameras.moves import describe_moves, list_moves
 from gsmerge.types import Cameras, Gaussians
 
 _SEEN_AS_MUCH = 0.98  # of the score of what the cameras see: no difference

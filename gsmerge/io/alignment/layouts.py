@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -14,6 +15,9 @@ from gsmerge.io.formats.ply import PlyInfo
 from gsmerge.io.photo_files import ASPECT_TOLERANCE, PhotoTransform, Size, resize_and_crop, resize_to, same_shape
 from gsmerge.types import Cameras, Gaussians, Scene, grid_ids
 
+Order = Literal["auto", "view-major", "view-fastest", "layer-major", "column-major", "unordered", "none"]
+ORDERS: tuple[str, ...] = get_args(Order)
+MAY_BE_UNALIGNED: tuple[str, ...] = ("unordered", "none")  # orders of files whose rows need not belong to pixels
 TRIM = 8  # pixels that DepthSplat and its relatives cut off at every side
 PER_PIXEL = (1, 2, 3, 4, 16)  # Gaussians per pixel that backbones write
 DEPTH_SHARE = 0.9  # of each view's pixels, the nearest ones, that Depth Anything 3 keeps

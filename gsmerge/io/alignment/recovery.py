@@ -11,7 +11,7 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.io.alignment.cameras import other_conventions
 from gsmerge.io.alignment.incomplete import score_incomplete
-from gsmerge.io.alignment.layouts import Layout, depth_layouts, exact_layouts, plain_layout, subsample
+from gsmerge.io.alignment.layouts import MAY_BE_UNALIGNED, Layout, depth_layouts, exact_layouts, plain_layout, subsample
 from gsmerge.io.alignment.score import (
     IDENTITY,
     MARGIN,
@@ -33,7 +33,6 @@ from gsmerge.io.alignment.score import (
     solve_pose,
 )
 from gsmerge.io.cameras.camera_file import CameraFile, Convention
-from gsmerge.io.exporters import MAY_BE_UNALIGNED
 from gsmerge.io.formats.ply import PlyInfo
 from gsmerge.io.photo_files import ASPECT_TOLERANCE
 from gsmerge.types import Cameras, Gaussians

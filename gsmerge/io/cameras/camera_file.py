@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
 
 from gsmerge.errors import SceneError
+from gsmerge.geometry import pose_changes
 from gsmerge.io.bounds import MAX_VIEWS, check_pixels
 from gsmerge.io.photo_files import Photos, Size, change_photos, photo_size, same_shape
 from gsmerge.types import Cameras, StrPath
@@ -306,3 +307,23 @@ def _rectify_maps(K: np.ndarray, lens: Lens, size: Size) -> tuple[np.ndarray, np
     make = cv2.fisheye.initUndistortRectifyMap if lens.model == "fisheye" else cv2.initUndistortRectifyMap
     x, y = make(centred, coefficients.astype(np.float64), np.eye(3), centred, size, cv2.CV_32FC1)
     return x, y
+
+
+def list_moves(names: Sequence[str], start: np.ndarray, end: np.ndarray, depth: float) -> list[dict[str, Any]]:
+    """List for each view its name, the degrees it turned, and the shift of its centre as a share of ``depth``.
+
+    ``start`` and ``end`` are viewmats ``[v,4,4]``; ``depth`` is that of the scene, in their unit.
+    """
+    degrees, distances = pose_changes(start, end)
+    shifts = distances / depth if depth > 0 else distances
+    return [
+        {"view": name, "degrees": round(turn, 4), "shift": round(shift, 6)}
+        for name, turn, shift in zip(names, degrees.tolist(), shifts.tolist(), strict=True)
+    ]
+
+
+def describe_moves(moves: Sequence[dict[str, Any]]) -> str:
+    """Describe the mean and the largest of some moves."""
+    turns, shifts = ([move[key] for move in moves] for key in ("degrees", "shift"))
+    mean, most = (f"{f(turns):.2g} degrees and {100 * f(shifts):.2g} % of the depth" for f in (np.mean, max))
+    return f"{mean} on average, {most} at most"

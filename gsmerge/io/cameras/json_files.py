@@ -32,7 +32,7 @@ from gsmerge.io.photo_files import find_image, image_size
 from gsmerge.types import Cameras
 
 if TYPE_CHECKING:
-    from gsmerge.io.scene_files import SceneFiles
+    pass
 
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # the order of "distortion_params"
 _DISTORTED = {"OPENCV", "RADIAL", "SIMPLE_RADIAL"}
@@ -278,9 +278,9 @@ def write_viewer_cameras(path: Path, cameras: Cameras, names: Sequence[str]) -> 
     path.write_text(json.dumps(entries) + "\n", encoding="utf-8")
 
 
-def find_dataparser(files: SceneFiles) -> Path | None:
+def find_dataparser(ply: Path, cameras: Path | None) -> Path | None:
     """Find the file in which nerfstudio writes how it moved cameras, next to the ``.ply`` or the cameras."""
-    folders = [files.ply.parent] + ([] if files.cameras is None else [files.cameras.parent])
+    folders = [ply.parent] + ([] if cameras is None else [cameras.parent])
     return next((folder / DATAPARSER for folder in folders if (folder / DATAPARSER).is_file()), None)
 
 

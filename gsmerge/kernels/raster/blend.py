@@ -10,7 +10,7 @@ import numpy as np
 from numpy import float32 as f4
 
 from gsmerge.kernels.jit import kernel
-from gsmerge.kernels.raster.prefetch import prefetch_row
+from gsmerge.kernels.raster.lanes import prefetch_row
 from gsmerge.kernels.raster.project import LN_CUT, TILE
 from gsmerge.kernels.raster.walk import (
     BATCH,

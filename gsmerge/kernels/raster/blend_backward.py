@@ -31,8 +31,7 @@ from gsmerge.kernels.raster.blend import (
     open_tile,
     tile_box,
 )
-from gsmerge.kernels.raster.lanes import LANES, VECTOR, Lanes, load, store, total, totals, vector
-from gsmerge.kernels.raster.prefetch import prefetch_row
+from gsmerge.kernels.raster.lanes import LANES, VECTOR, Lanes, load, prefetch_row, store, total, totals, vector
 from gsmerge.kernels.raster.project import TILE
 from gsmerge.kernels.raster.walk import BATCH, PLANE, Walk, take_share
 
