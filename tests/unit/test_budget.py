@@ -8,7 +8,7 @@ import pytest
 import scenes
 
 from gsmerge import write_ply
-from gsmerge.budget import DEVICES, parse_budget, parse_bytes
+from gsmerge.budget import parse_budget, parse_bytes
 from gsmerge.io.formats.writing import count_for_bytes, file_bytes
 
 
@@ -85,7 +85,3 @@ def test_count_for_bytes_out_of_range() -> None:
         count_for_bytes(100, 0)
     with pytest.raises(ValueError, match="sh_degree: expected 0 to 4, got 5"):
         count_for_bytes(10**6, 5)
-
-
-def test_devices_rise() -> None:
-    assert DEVICES["quest3"] < DEVICES["mobile"] < DEVICES["desktop"]

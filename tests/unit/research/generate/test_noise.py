@@ -173,7 +173,7 @@ def test_what_is_drawn_lies_in_the_ranges() -> None:
         (lambda: GenerateOptions(noise=-1.0), "noise: expected 0 to 10"),
     ],
 )
-def test_settings_that_make_no_sense_are_refused(options, message: str) -> None:  # type: ignore[no-untyped-def]
+def test_settings_that_make_no_sense_are_refused(options, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         options()
 

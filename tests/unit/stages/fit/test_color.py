@@ -114,14 +114,6 @@ def test_pull_holds_the_colours(gaussians: Gaussians, photos: Photos) -> None:
     assert moves[2] < 0.005
 
 
-def test_seed_repeats(gaussians: Gaussians, photos: Photos) -> None:
-    start = recolored(gaussians, 0.1)
-    drawn = draw(start, photos)
-    one, two = (fit_colors(start, drawn, photos, FEW, seed=5) for _ in range(2))
-    assert np.array_equal(one[0].sh0, two[0].sh0)
-    assert one[1] == two[1]
-
-
 @pytest.mark.parametrize("size", [(8, 6), (32, 24), (40, 40)])
 def test_small_photos_still_have_a_held_out_part(size: tuple[int, int]) -> None:
     """Whatever the seed draws, acceptance must rest on some pixel."""
@@ -133,10 +125,3 @@ def test_small_photos_still_have_a_held_out_part(size: tuple[int, int]) -> None:
         _, report = fit_colors(spoilt, drawn, photos, FitOptions(), seed)
         assert report.accepted
         assert report.holdout_before < 40
-
-
-def test_nothing_to_fit(photos: Photos, gaussians: Gaussians) -> None:
-    none = gaussians[:0]
-    drawn = draw(none, photos)
-    result, _ = fit_colors(none, drawn, photos, FEW)
-    assert len(result) == 0

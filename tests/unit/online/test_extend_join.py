@@ -7,12 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
-from view_batches import FAST, fed, group, parts_of, room, same_group, state_of
+from view_batches import fed, group, parts_of, room, same_group, state_of
 
-from gsmerge.encoded.to_gaussians import divide_all
 from gsmerge.online.extend import find_partners, merge_into
-from gsmerge.online.state import GroupSet, child_members, limit_children, select_groups
-from gsmerge.stages.decode import DecodeOptions
+from gsmerge.online.state import GroupSet, limit_children, select_groups
 from gsmerge.stages.match import MatchOptions
 
 
@@ -122,17 +120,3 @@ def test_colours_that_photos_held_stay(sides: tuple[GroupSet, GroupSet], actual:
     np.testing.assert_array_equal(after.color_precision, color_precision)
     np.testing.assert_array_equal(after.fitted_sh0[rows[::2]], before.fitted_sh0[rows[::2]])
     np.testing.assert_array_equal(after.fitted_sh0[rows[1::2]], after.features.sh0[rows[1::2]])
-
-
-def test_nothing_to_absorb_changes_nothing(sides: tuple[GroupSet, GroupSet]) -> None:
-    none = np.zeros(0, np.int64)
-    assert merge_into(sides[0], select_groups(sides[1], none), none, 4) is sides[0]
-
-
-def test_all_groups_can_be_divided_afterwards(sides: tuple[GroupSet, GroupSet], actual: np.ndarray) -> None:
-    new, rows = joined_pairs(sides, actual)
-    after = merge_into(sides[0], new, rows, 4)
-    division = divide_all(after.features, child_members(after), 4)
-    assert np.isfinite(division.children.sh0).all()
-    assert DecodeOptions().k == 1
-    assert FAST["superpixels"] == "10%"

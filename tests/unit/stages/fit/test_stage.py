@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -41,7 +40,6 @@ def test_stage_falls_back_to_colours(truth: Gaussians, photos: Pair) -> None:
     backend = replace(stage.ON_CPU, fit_full=lambda gaussians, *_, **__: (gaussians, refused))
     start = replace(truth, sh0=truth.sh0 + 0.2 / SH_C0)
     result, report = fit(start, photos, QUICK, backend=backend)
-    assert report is not None
     assert (report.method, report.accepted) == ("color", True)
     colored, _ = fit_colors(start, draw(start, photos[1]), photos[1], QUICK)
     assert scenes.identical(result, colored[visible_mask(start, photos[1], QUICK.min_contribution)])
@@ -53,7 +51,6 @@ def test_stage_refuses_both_on_noise(truth: Gaussians, noise: Pair) -> None:
     grey = replace(truth, sh0=np.zeros_like(truth.sh0))
     options = scenes.tuned(LONG, prior_weight=1e-6, iterations=60, huber=10.0)
     result, report = fit(grey, noise, options, count=2 * len(grey))
-    assert report is not None
     assert not report.accepted
     assert scenes.identical(result, grey)
 
@@ -82,22 +79,8 @@ def test_stage_prunes_before_it_fits(truth: Gaussians, photos: Pair) -> None:
 
 @pytest.mark.parametrize("method", ["none", "full"])
 def test_nothing_to_fit(truth: Gaussians, photos: Pair, method: str) -> None:
-    result, _ = fit(truth[:0], photos, replace(QUICK, fit=method))  # type: ignore[arg-type]
+    result, _ = fit(truth[:0], photos, replace(QUICK, fit=method))
     assert len(result) == 0
-
-
-@pytest.mark.parametrize(
-    "setting",
-    [
-        {"fit": "best"}, {"fit_steps": 0}, {"time_budget": 0.0}, {"time_budget": -1.0}, {"dropout": 1.0},
-        {"dropout": -0.1}, {"holdout": 0.0},
-    ],
-    ids=str,
-)  # fmt: skip
-def test_settings_out_of_range_are_refused(setting: dict[str, Any]) -> None:
-    (name,) = setting
-    with pytest.raises(ValueError, match=name):
-        FitOptions(**setting)
 
 
 def test_shown(photos: Pair) -> None:

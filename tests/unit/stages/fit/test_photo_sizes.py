@@ -26,7 +26,6 @@ LONG = FitOptions(fit_steps=160, holdout=0.2)
 
 def with_large(scene: Scene, scale: float, read: list[int] | None = None) -> Scene:
     """The scene with enlarged photos of its own; ``read`` gets the number of every photo that is read."""
-    assert scene.images is not None
     width, height = (round(scale * side) for side in (scene.cameras.width, scene.cameras.height))
     images = [cv2.resize(image, (width, height), interpolation=cv2.INTER_CUBIC) for image in scene.images]
     stored = [np.rint(255 * image.clip(0, 1)).astype(np.uint8) for image in images]
@@ -73,7 +72,6 @@ def test_less_than_asked_for_is_said(
 ) -> None:
     actual, problem = photo_scale(with_large(scene, larger), FitOptions(**settings), auto=True)
     assert actual == pytest.approx(expected, rel=0.02)
-    assert problem is not None
     assert problem.startswith(reason)
 
 
@@ -115,7 +113,6 @@ def test_photos_are_read_once_at_their_scale(scene: Scene) -> None:
     assert (photos.width, photos.height) == (2 * scene.cameras.width, 2 * scene.cameras.height)
     np.testing.assert_allclose(photos.Ks, scene.cameras.Ks * [[2], [2], [1]])
     assert photos.eps2d == EPS2D  # of a viewer at this size
-    assert large.large_photos is not None
     small = cv2.resize(large.large_photos.read(1), (photos.width, photos.height), interpolation=cv2.INTER_AREA)
     assert photos.image(1).dtype == np.float32
     np.testing.assert_allclose(photos.image(1), small / 255, atol=1e-6)
@@ -134,7 +131,6 @@ def test_some_views_have_their_own_photos(scene: Scene) -> None:
     large_photos(subset(with_large(scene, 2, read), [2, 0]), 2)
     assert sorted(read) == [0, 2]
     three = subset(with_large(scene, 2), [0, 1, 2])
-    assert three.large_photos is not None
     two = three.large_photos[[0, 1]]
     with pytest.raises(ValueError, match="expected 3 large photos, got 2"):
         replace(three, large_photos=two)

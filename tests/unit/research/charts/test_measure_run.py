@@ -125,7 +125,6 @@ def test_units_change_no_picture(factor: float, tmp_path: Path) -> None:
 
 def test_superpixels_alone_are_measured_on_photos(made_scene: Path, tmp_path: Path) -> None:
     images = gsmerge.read_scene(made_scene).images
-    assert images is not None
     coarse, fine = (proxy_psnr(images[0], count, "rdseg") for count in (20, 600))
     assert 10 < coarse < fine - 3
     run = ChartRun(

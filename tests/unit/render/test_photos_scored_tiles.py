@@ -46,7 +46,6 @@ def test_four_views_score_every_place_once() -> None:
 def test_odd_sizes_have_about_a_quarter(width: int, height: int) -> None:
     for view in range(4):
         tiles = scored_tiles(view, width, height)
-        assert tiles is not None
         assert tiles.shape == (-(-height // 16), -(-width // 16))
         assert tiles.mean() == pytest.approx(0.25, abs=0.1)
 
