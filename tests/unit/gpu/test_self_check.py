@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from fake_gsplat import fake_gsplat, install  # noqa: F401 - one is a fixture
+from fake_gsplat import install
 from gpu_runs import CPU, gpu
 from torch import Tensor
 
@@ -19,7 +19,7 @@ from gsmerge.gpu.self_check import MAX_ERRORS, find_difference, make_scene, meas
 from gsmerge.render import contributions, plan_view, prepare
 
 
-def test_right_results_pass(fake_gsplat: Any) -> None:  # noqa: F811
+def test_right_results_pass(fake_gsplat: Any) -> None:
     """With a wide margin: it is for the last digits of other hardware."""
     assert find_difference(CPU) is None
     errors = measure_errors(CPU)
@@ -27,7 +27,7 @@ def test_right_results_pass(fake_gsplat: Any) -> None:  # noqa: F811
     assert all(errors[name] < 0.2 * most for name, most in MAX_ERRORS.items()), errors
 
 
-def test_margins_hold_weights_beside_the_cut(fake_gsplat: Any, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
+def test_margins_hold_weights_beside_the_cut(fake_gsplat: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Opacities off by a thousandth move many more weights over the cut than a fast exponential does (2e-6)."""
     draw = sys.modules["gsplat"].rasterization
 
@@ -98,10 +98,7 @@ def without_some(details: dict[str, Any]) -> dict[str, Any]:
     ],
 )
 def test_wrong_results_are_told(
-    part: str,
-    spoilt: Callable[[Any], dict[str, Any]],
-    fake_gsplat: Any,  # noqa: F811
-    monkeypatch: pytest.MonkeyPatch,
+    part: str, spoilt: Callable[[Any], dict[str, Any]], fake_gsplat: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, function in spoilt(sys.modules["gsplat"]).items():
         monkeypatch.setattr(sys.modules["gsplat"], name, function)
@@ -116,7 +113,7 @@ def nan_at(images: Tensor) -> Tensor:
     return images + pixel
 
 
-def test_wrong_steps_are_told(fake_gsplat: Any, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
+def test_wrong_steps_are_told(fake_gsplat: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     def step_otherwise(state: Any, gradients: Any, options: Any, rates: Tensor, step: int) -> None:
         self_check.step_in_torch(
             state, gradients, replace(options, tuning=replace(options.tuning, opacity_reg=1.0)), 1.1 * rates, step
@@ -141,10 +138,7 @@ def test_wrong_steps_are_told(fake_gsplat: Any, monkeypatch: pytest.MonkeyPatch)
     ids=lambda value: type(value).__name__,
 )
 def test_exceptions_are_told_in_one_line(
-    error: Exception,
-    text: str,
-    fake_gsplat: Any,  # noqa: F811
-    monkeypatch: pytest.MonkeyPatch,
+    error: Exception, text: str, fake_gsplat: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: Any, **__: Any) -> Any:
         raise error

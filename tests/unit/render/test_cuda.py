@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from fake_gsplat import fake_gsplat, forget, install  # noqa: F401 - one is a fixture
+from fake_gsplat import forget, install
 from slow_renderer import BACKGROUND, NAMES, assert_close, leaves, pixel_gradients, random_gaussians
 from slow_renderer import turned_cameras as cameras_of
 from torch import Tensor
@@ -57,7 +57,7 @@ def assert_same(actual: Rendering, expected: Rendering, least: float = 80.0) -> 
 
 
 @pytest.mark.parametrize("degree", range(5))
-def test_images_are_the_cpu_s(degree: int, fake_gsplat: Calls) -> None:  # noqa: F811
+def test_images_are_the_cpu_s(degree: int, fake_gsplat: Calls) -> None:
     gaussians, cameras = random_gaussians(40, degree, degree), cameras_of()
     assert_same(by_adapter(gaussians, cameras), render(gaussians, cameras, BACKGROUND))
     assert len(fake_gsplat) == len(cameras)  # view by view: all at once would copy the harmonics for each
@@ -68,7 +68,7 @@ def test_images_are_the_cpu_s(degree: int, fake_gsplat: Calls) -> None:  # noqa:
     [{"antialiased": True}, {"near": 2.9}, {"far": 3.1}, {"with_depths": True}, {"near": 2.0, "with_depths": True}],
     ids=str,
 )
-def test_options_mean_the_same(options: dict[str, Any], fake_gsplat: Calls) -> None:  # noqa: F811
+def test_options_mean_the_same(options: dict[str, Any], fake_gsplat: Calls) -> None:
     gaussians, cameras = random_gaussians(40, 1), cameras_of()
     expected = render(gaussians, cameras, BACKGROUND, **options)
     assert_same(by_adapter(gaussians, cameras, **options), expected)
@@ -76,7 +76,7 @@ def test_options_mean_the_same(options: dict[str, Any], fake_gsplat: Calls) -> N
         assert psnr(expected.images, render(gaussians, cameras, BACKGROUND).images) < 60  # the option matters here
 
 
-def test_what_gsplat_is_told(fake_gsplat: Calls) -> None:  # noqa: F811
+def test_what_gsplat_is_told(fake_gsplat: Calls) -> None:
     gaussians, cameras = random_gaussians(9, 2), cameras_of(3)
     by_adapter(gaussians, cameras, antialiased=True, near=0.5, far=7.0, with_depths=True)
     by_adapter(gaussians, cameras)
@@ -94,7 +94,7 @@ def test_what_gsplat_is_told(fake_gsplat: Calls) -> None:  # noqa: F811
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-def test_gradients_are_the_cpu_s(degree: int, fake_gsplat: Calls) -> None:  # noqa: F811
+def test_gradients_are_the_cpu_s(degree: int, fake_gsplat: Calls) -> None:
     gaussians, cameras = random_gaussians(40, degree, 1), cameras_of()
     actual, expected = (gradients(draw, gaussians, cameras) for draw in (by_adapter, on_cpu))
     assert_close(actual, [one.double() for one in expected])
@@ -102,7 +102,7 @@ def test_gradients_are_the_cpu_s(degree: int, fake_gsplat: Calls) -> None:  # no
 
 
 @pytest.mark.parametrize("eps2d", [0.3, 0.075])
-def test_peaks_are_the_cpu_s(eps2d: float, fake_gsplat: Calls) -> None:  # noqa: F811
+def test_peaks_are_the_cpu_s(eps2d: float, fake_gsplat: Calls) -> None:
     gaussians, cameras = random_gaussians(40), cameras_of(1)
     shape = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities
     camera = cameras.viewmats[0], cameras.Ks[0], cameras.width, cameras.height
@@ -115,7 +115,7 @@ def test_peaks_are_the_cpu_s(eps2d: float, fake_gsplat: Calls) -> None:  # noqa:
     assert len(adapter.peak_weights(tuple(tensor[:0] for tensor in shape), camera)[0]) == 0
 
 
-def test_peaks_have_gsplat_s_clamp(fake_gsplat: Calls) -> None:  # noqa: F811
+def test_peaks_have_gsplat_s_clamp(fake_gsplat: Calls) -> None:
     """Of an opaque Gaussian whose centre is that of a pixel; in the image, too, so that the two agree."""
     shape = torch.tensor([[0.0, 0, 2]]), torch.eye(4)[:1], torch.ones(1, 3), torch.ones(1)
     camera = torch.eye(4), torch.tensor([[8.0, 0, 4.5], [0, 8, 4.5], [0, 0, 1]]), 9, 9
@@ -124,7 +124,7 @@ def test_peaks_have_gsplat_s_clamp(fake_gsplat: Calls) -> None:  # noqa: F811
     assert float(image.max()) == pytest.approx(adapter.MAX_ALPHA)
 
 
-def test_nothing_to_list(fake_gsplat: Calls) -> None:  # noqa: F811
+def test_nothing_to_list(fake_gsplat: Calls) -> None:
     """Behind the camera: no pixel has an entry."""
     gaussians, cameras = random_gaussians(5), cameras_of(1)
     behind = gaussians.means - torch.tensor([0.0, 0, 9])
@@ -135,7 +135,7 @@ def test_nothing_to_list(fake_gsplat: Calls) -> None:  # noqa: F811
     assert not reached.any()
 
 
-def test_geographic_coordinates_keep_their_detail(fake_gsplat: Calls) -> None:  # noqa: F811
+def test_geographic_coordinates_keep_their_detail(fake_gsplat: Calls) -> None:
     """The adapter moves the scene in float64, and its gradients come back to where it was."""
     near, cameras = random_gaussians(30), cameras_of()
     place = torch.tensor([4.2e6, -1.7e5, 4.8e6], dtype=torch.float64)
@@ -148,21 +148,21 @@ def test_geographic_coordinates_keep_their_detail(fake_gsplat: Calls) -> None:  
     assert_close(actual, [one.double() for one in expected], most=1e-2)
 
 
-def test_depths_have_no_gradient(fake_gsplat: Calls) -> None:  # noqa: F811
+def test_depths_have_no_gradient(fake_gsplat: Calls) -> None:
     *tensors, viewmats = leaves(random_gaussians(9), cameras_of())
     drawn = by_adapter(Gaussians(*tensors), replace(cameras_of(), viewmats=viewmats), with_depths=True)
     assert drawn.images.requires_grad
     assert not drawn.depths.requires_grad
 
 
-def test_zero_quaternions_are_no_rotation(fake_gsplat: Calls) -> None:  # noqa: F811
+def test_zero_quaternions_are_no_rotation(fake_gsplat: Calls) -> None:
     gaussians, cameras = random_gaussians(12), cameras_of()
     gaussians = replace(gaussians, quats=gaussians.quats * (torch.arange(12) % 3 > 0)[:, None])
     assert_same(by_adapter(gaussians, cameras), render(gaussians, cameras, BACKGROUND))
 
 
 @pytest.mark.parametrize("with_depths", [False, True])
-def test_nothing_to_draw(with_depths: bool, fake_gsplat: Calls) -> None:  # noqa: F811
+def test_nothing_to_draw(with_depths: bool, fake_gsplat: Calls) -> None:
     """Background, still differentiable, and gsplat is not asked."""
     gaussians, cameras = random_gaussians(9, 1), cameras_of()
     for some, seen in ((gaussians[:0], cameras), (gaussians, cameras[:0])):
@@ -175,12 +175,12 @@ def test_nothing_to_draw(with_depths: bool, fake_gsplat: Calls) -> None:  # noqa
 
 
 @pytest.mark.parametrize("options", [{"near": 0.0}, {"near": 3.0, "far": 2.0}], ids=str)
-def test_depth_range_is_checked(options: dict[str, Any], fake_gsplat: Calls) -> None:  # noqa: F811
+def test_depth_range_is_checked(options: dict[str, Any], fake_gsplat: Calls) -> None:
     with pytest.raises(ValueError, match="0 < near < far"):
         by_adapter(random_gaussians(3), cameras_of(), **options)
 
 
-def test_given_colours_and_dilation_pass(fake_gsplat: Calls) -> None:  # noqa: F811
+def test_given_colours_and_dilation_pass(fake_gsplat: Calls) -> None:
     """What the fit draws: colours of any sign, a dilation of its own, against the kernels and their gradients."""
     gaussians, cameras = random_gaussians(40), cameras_of(1)
     colors = torch.randn(40, 3, generator=torch.Generator().manual_seed(3))
@@ -208,7 +208,7 @@ def test_given_colours_and_dilation_pass(fake_gsplat: Calls) -> None:  # noqa: F
 
 
 @pytest.mark.parametrize("degree", [1, 4])
-def test_seen_colours(degree: int, fake_gsplat: Calls) -> None:  # noqa: F811
+def test_seen_colours(degree: int, fake_gsplat: Calls) -> None:
     gaussians, cameras = random_gaussians(20, degree), cameras_of(1)
     harmonics = torch.cat([gaussians.sh0, gaussians.shN], 1)
     actual = harmonic_colors(gaussians.means, harmonics, cameras.centres[0].float())
