@@ -1,14 +1,18 @@
-"""Ways to damage a ``.gsm`` file, of an encoded scene or of a state."""
+"""Ways to damage a file in the safetensors format: an encoded scene, a state, networks."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+import pickle
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from safetensors.numpy import load_file, save_file
+
+from gsmerge.errors import SceneError
 
 Spoil = Callable[[Path], Any]
 
@@ -89,3 +93,63 @@ WILD_NUMBERS: dict[str, Spoil] = {
     "views of more pixels than bytes": with_header(width=8000, height=8000),
     "infinity in features.means": with_array("features.means", filled(float("inf"))),
 }
+
+
+# What is wrong with any file
+UNREADABLE: dict[str, Spoil] = {
+    "missing": Path.unlink,
+    "empty": lambda path: path.write_bytes(b""),
+    "a few bytes": cut(0.0001),
+    "half": cut(0.5),
+    "all but the end": cut(0.999),
+    "a byte too many": lambda path: path.write_bytes(path.read_bytes() + b"x"),
+    "a PLY file": lambda path: path.write_text("ply\nformat ascii 1.0\nend_header\n"),
+    "a pickle": lambda path: path.write_bytes(pickle.dumps({"a": 1}) * 9),
+    "a huge header": lambda path: path.write_bytes(b"\xff" * 8 + path.read_bytes()[8:]),
+    "no header": lambda path: save_file(load_file(path), path),
+    "no JSON": with_text("{"),
+    "a list": with_text("[]"),
+    "deep JSON": with_text("[" * 100_000),
+}
+# What is wrong with the header of an encoded scene or a state
+GSM_HEADERS: dict[str, Spoil] = {
+    "networks": with_text("{}", "gsmerge-networks"),
+    "no schema": without("schema"),
+    "an older schema": with_header(schema=0),
+    "a newer schema": with_header(schema=2, gsmerge="9.9"),
+    "no settings": without("settings"),
+    "settings in a list": with_header(settings=[]),
+    "no unit": without("unit"),
+    "a unit of zero": with_header(unit=0.0),
+    "a unit that is none": with_header(unit=float("nan")),
+    "no width": without("width"),
+    "views without pixels": with_header(width=0),
+    "k of nine": with_settings(k=9),
+    "k of words": with_settings(k="many"),
+    "most of none": with_settings(max_k=0),
+    "an opacity of two": with_settings(min_opacity=2.0),
+    "a share that is none": with_settings(min_contribution=float("nan")),
+}
+
+
+def of_arrays(arrays: Iterable[str], floats: Iterable[str]) -> dict[str, Spoil]:
+    """Each array missing, of another type and of another shape; those of numbers with a NaN."""
+    damages: dict[str, Spoil] = {}
+    for name in arrays:
+        damages[f"no {name}"] = with_array(name, None)
+        damages[f"{name} of doubles"] = with_array(
+            name, lambda a: a.astype(np.float32 if a.dtype == np.float64 else np.float64)
+        )
+        damages[f"{name} of another shape"] = with_array(name, lambda a: a[None])
+    return damages | {f"NaN in {name}": with_array(name, filled(float("nan"))) for name in floats}
+
+
+def assert_refused_in_one_line(load: Callable[[Path], object], path: Path) -> str:
+    """The line, which begins with the name of the file."""
+    with pytest.raises(SceneError) as said:
+        load(path)
+    text = str(said.value)
+    assert text.startswith(f"{path}: ")
+    assert "\n" not in text
+    assert len(text) < 400 + len(str(path))
+    return text

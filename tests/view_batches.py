@@ -40,7 +40,6 @@ def fed(batches: Iterable[Scene], **settings: Any) -> Compactor:
 
 def state_of(compactor: Compactor) -> OnlineState:
     """The state, which must be there."""
-    assert compactor.state is not None
     return compactor.state
 
 

@@ -1,5 +1,5 @@
 """Numba loops: arrays in, arrays out, no torch, no files, no options.
 
 Every kernel is single-threaded, releases the GIL and is deterministic; callers run several at once on different
-views (:mod:`gsmerge.runtime.threads`). Each has a slow, obvious twin in ``tests/reference``.
+views (:mod:`gsmerge.runtime.threads`). Each has a slow, obvious twin in ``tests/kernels``.
 """

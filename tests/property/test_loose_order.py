@@ -16,7 +16,6 @@ from scipy.spatial import cKDTree
 
 from gsmerge import Scene, compact
 from gsmerge.moments import unaligned_members
-from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.assign import Owners, find_owners, owner_pixels
 from gsmerge.stages.encode import member_rows
 from gsmerge.stages.segment import SegmentOptions, segment
@@ -29,7 +28,6 @@ TURNED = scenes.make_scene(scenes.room(), scenes.arc(4, 40, 30), noise=0.02, opa
 
 @cache
 def groups(count: int) -> Groups:
-    assert ROOM.images is not None
     return segment(ROOM.images, SegmentOptions(), count)
 
 
@@ -74,15 +72,6 @@ def test_permuted_gaussians_merge_alike(seed: int, options: dict) -> None:
     )
     assert abs(len(one) - len(other)) <= 2
     assert abs(scenes.psnr_of(one, ROOM) - scenes.psnr_of(other, ROOM)) < 0.1
-
-
-@pytest.mark.parametrize("count", [1, 25, 300])
-def test_threads_change_no_owner(count: int) -> None:
-    actual = []
-    for threads in (1, 2, 8):
-        with use_threads(threads):
-            actual.append(find_owners(unaligned_scenes.loosened(TURNED), groups(count)))
-    assert all(owners_equal(a, b) for a, b in itertools.pairwise(actual))
 
 
 @pytest.mark.parametrize("options", [{"fit_steps": 12, "budget": 150}, {"budget": "auto"}], ids=str)

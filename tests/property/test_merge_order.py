@@ -88,7 +88,7 @@ def as_sets(actual: Matches, names: np.ndarray) -> set[frozenset[int]]:
 @given(seeds, st.integers(1, 80), st.sampled_from(["overlap", "aabb"]))
 def test_order_of_features(seed: int, count: int, method: str) -> None:
     rng = np.random.default_rng(seed)
-    features, options = random_features(rng, count), MatchOptions(match=method, overlap=0.3)  # type: ignore[arg-type]
+    features, options = random_features(rng, count), MatchOptions(match=method, overlap=0.3)
     order = rng.permutation(count)
     shuffled = take(features, order)
     one, other = match(features, options), match(shuffled, options)

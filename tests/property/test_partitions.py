@@ -103,10 +103,3 @@ def test_any_size(height: int, width: int, share: float, colours: int, kind: tup
     image = np.random.default_rng(seed).integers(0, colours, (height, width, 3)) / max(colours - 1, 1)
     count = 1 + int(share * (height * width - 1))
     assert_partition(superpixels(image, count, kind[0], **kind[1]), height, width, count)
-
-
-@pytest.mark.parametrize(("segmentation", "rounds"), [*SEGMENTATIONS, ("slic", {})])
-def test_a_run_repeats(segmentation: str, rounds: dict[str, Any]) -> None:
-    image = PICTURES["noise"]
-    first = superpixels(image, 80, segmentation, **rounds)
-    assert np.array_equal(first, superpixels(image.copy(), 80, segmentation, **rounds))

@@ -11,8 +11,6 @@ from hypothesis.extra import numpy as hnp
 from gsmerge.io import read_ply, write_ply
 from gsmerge.types import Gaussians
 
-FIELDS = ("means", "quats", "scales", "opacities", "sh0", "shN")
-
 
 def floats(low: float, high: float) -> st.SearchStrategy[float]:
     # subnormal numbers are excluded: some processors flush them to zero
@@ -56,12 +54,3 @@ def test_what_is_written_is_read_back(before: Gaussians) -> None:
     length = np.linalg.norm(before.quats.astype(np.float64), axis=1, keepdims=True)
     unit = np.where(length > 0, before.quats / np.maximum(length, 1e-300), (1.0, 0, 0, 0))
     assert np.allclose(after.quats, unit, rtol=0, atol=1e-6)
-
-
-@given(gaussians())
-@settings(max_examples=30, deadline=None)
-def test_a_second_round_trip_changes_nothing_more(before: Gaussians) -> None:
-    once = round_trip(before)
-    twice = round_trip(once)
-    for name in FIELDS:
-        assert np.allclose(getattr(twice, name), getattr(once, name), rtol=5e-6, atol=5e-7), name

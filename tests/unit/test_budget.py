@@ -8,7 +8,7 @@ import pytest
 import scenes
 
 from gsmerge import write_ply
-from gsmerge.budget import DEVICES, parse_budget, parse_bytes
+from gsmerge.budget import parse_budget, parse_bytes
 from gsmerge.io.formats.writing import count_for_bytes, file_bytes
 
 
@@ -31,21 +31,22 @@ def test_budget(text: str | int, count: int) -> None:
     assert parse_budget(text, 1_000_000) == count
 
 
-@pytest.mark.parametrize("text", ["", "many", "-5", "2.5", "5%%", "1e4", "%", "4٤", "nan", "inf%"])
-def test_budgets_that_are_none(text: str) -> None:
-    with pytest.raises(ValueError, match='expected a number of Gaussians as "40000", a share as "2%"'):
-        parse_budget(text, 1000)
+NO_BUDGET = 'expected a number of Gaussians as "40000", a share as "2%"'
 
 
-@pytest.mark.parametrize("text", ["0", "0%", "0.01%"])
-def test_budgets_of_nothing(text: str) -> None:
-    with pytest.raises(ValueError, match="at least one Gaussian"):
-        parse_budget(text, 1000)
-
-
-def test_budget_above_everything() -> None:
-    with pytest.raises(ValueError, match="at most 100%, got '101%'"):
-        parse_budget("101%", 1000)
+@pytest.mark.parametrize(
+    ("texts", "words"),
+    [
+        (["", "many", "-5", "2.5", "5%%", "1e4", "%", "4٤", "nan", "inf%"], NO_BUDGET),
+        (["0", "0%", "0.01%"], "at least one Gaussian"),
+        (["101%"], "at most 100%, got '101%'"),
+    ],
+    ids=["none", "nothing", "above everything"],
+)
+def test_budgets_that_are_refused(texts: list[str], words: str) -> None:
+    for text in texts:
+        with pytest.raises(ValueError, match=words):
+            parse_budget(text, 1000)
 
 
 @pytest.mark.parametrize(
@@ -85,7 +86,3 @@ def test_count_for_bytes_out_of_range() -> None:
         count_for_bytes(100, 0)
     with pytest.raises(ValueError, match="sh_degree: expected 0 to 4, got 5"):
         count_for_bytes(10**6, 5)
-
-
-def test_devices_rise() -> None:
-    assert DEVICES["quest3"] < DEVICES["mobile"] < DEVICES["desktop"]

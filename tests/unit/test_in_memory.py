@@ -160,7 +160,7 @@ def test_wrong_sizes_are_named(scene: Scene) -> None:
     with pytest.raises(SceneError, match=r"^images: expected shape \[3, 35, 48, 3\], found \[3, 36, 48, 3\]"):
         compact_tensors(**tensors_of(scene), shape=(3, 35, 48), **FAST)
     with pytest.raises(SceneError, match=r"^shape: expected views, height and width, found \[36, 48\]"):
-        compact_tensors(**tensors_of(scene), shape=(36, 48), **FAST)  # type: ignore[arg-type]
+        compact_tensors(**tensors_of(scene), shape=(36, 48), **FAST)
     with pytest.raises(SceneError, match=r"^viewmats: expected one matrix for each view, found none"):
         compact_tensors(**tensors_of(scene, viewmats=None, Ks=None), order="none", **FAST)
     with pytest.raises(SceneError, match=r"^names: expected 3 names"):

@@ -50,17 +50,6 @@ def test_one_member_is_itself_but_for_the_floor(seed: int) -> None:
     assert float(result.opacities[0]) == pytest.approx(one.opacities[0], rel=0.05)
 
 
-@pytest.mark.parametrize("count", [2, 3, 7])
-@pytest.mark.parametrize("opacity", [0.1, 0.5])
-def test_stacked_members_add_up_like_layers(count: int, opacity: float) -> None:
-    one = members(1, opacity=opacity)
-    one.footprints[:] = 1e-6  # no floor
-    result = merged(copies(one, count))
-    assert float(result.opacities[0]) == pytest.approx(1 - (1 - opacity) ** count, rel=1e-5)
-    covar = covariances(result.quats.astype(np.float64), result.scales.astype(np.float64))[0]
-    np.testing.assert_allclose(covar, own_covariance(one), rtol=1e-5, atol=1e-9)
-
-
 def test_many_opaque_layers_stay_finite() -> None:
     result = merged(copies(members(1, opacity=1.0), 1000))
     assert float(result.opacities[0]) == pytest.approx(MAX_OPACITY)
@@ -98,14 +87,6 @@ def test_tiles_of_a_sheet_keep_it_closed() -> None:
     assert peak == pytest.approx(mean_depth * 12 / (2 * np.pi), rel=0.01)
 
 
-def test_uniform_weights_without_opacity() -> None:
-    two = members(2)
-    two.opacities[:] = 0
-    result = merged(two)
-    np.testing.assert_allclose(result.means[0], two.means.mean(0), atol=1e-6)
-    assert result.opacities.tolist() == [0]
-
-
 def test_many_groups_match_one_by_one() -> None:
     """More groups than one task takes."""
     of = members(9000)
@@ -130,26 +111,9 @@ def test_paper_rule_by_hand() -> None:
     assert float(made.opacities[0]) == pytest.approx(0.8 / 3, rel=1e-5)
 
 
-@pytest.mark.parametrize("opacity", [0.01, 0.5, 0.9, 0.999])
-def test_paper_rule_keeps_an_opacity_that_all_have(opacity: float) -> None:
-    """The own rule makes layers of them."""
-    of, groups = members(30, opacity=opacity), (np.array([0, 10, 11, 30]), np.arange(30))
-    m = pool_members(of, *groups, "paper")
-    made = to_gaussians(m.covars, m.extinctions, m.means, m.sh)
-    np.testing.assert_allclose(made.opacities, opacity, rtol=1e-4)
-
-
-@pytest.mark.parametrize("rule", ["depth", "paper"])
-def test_rules_agree_on_sums_and_means(rule: str) -> None:
-    of, groups = members(40, coefficients=4), (np.array([0, 1, 15, 40]), np.arange(40))
-    m, other = pool_members(of, *groups, rule), pool_members(of, *groups)  # type: ignore[arg-type]
-    for name in ("means", "weights", "footprints", "sh"):
-        np.testing.assert_allclose(getattr(m, name), getattr(other, name), rtol=1e-6, atol=1e-9, err_msg=name)
-
-
 @pytest.mark.parametrize("rule", ["depth", "paper"])
 def test_no_groups(rule: str) -> None:
-    m = pool_members(members(3), np.array([0]), np.zeros(0, np.int64), rule)  # type: ignore[arg-type]
+    m = pool_members(members(3), np.array([0]), np.zeros(0, np.int64), rule)
     assert m.means.shape == (0, 3)
     assert principal_axes(np.zeros((0, 3, 3)))[0].shape == (0, 3)
 

@@ -49,7 +49,7 @@ def make_plan(
     ],
 )
 def test_limits(settings: dict[str, object], exact: int | None, most: int) -> None:
-    options = BudgetOptions(**settings)  # type: ignore[arg-type]
+    options = BudgetOptions(**settings)
     assert exact_count(options, 50_000_000, 0) == exact
     assert max_allowed(options, 50_000_000, 0) == most
 
@@ -63,19 +63,17 @@ def test_a_small_scene_is_its_own_limit() -> None:
     ("settings", "message"),
     [
         ({"budget": "phone"}, "budget: expected .* auto or quest3, mobile, desktop, got 'phone'"),
-        ({"budget": "MB"}, 'budget: expected a size as "5MB"'),
         ({"budget": 0}, "budget: expected at least one Gaussian"),
         ({"quality": "0dB"}, 'quality: expected a PSNR as "30dB" or a loss as "-0.2dB"'),
         ({"quality": "30"}, "quality: expected a PSNR"),
         ({"quality": "nandB"}, "quality: expected a PSNR"),
         ({"levels": 0}, "levels: expected 1 to 8"),
         ({"levels": 9}, "levels: expected 1 to 8"),
-        ({"budget": "lots"}, "budget: expected"),
     ],
 )
 def test_refused(settings: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        BudgetOptions(**settings)  # type: ignore[arg-type]
+        BudgetOptions(**settings)
 
 
 def test_qualities() -> None:
@@ -149,8 +147,7 @@ def search(curve: Callable[[int], float], target: float, start: int, least: int,
     """Run a search on a curve that is known, instead of building scenes."""
     counts = CountSearch(make_plan(target_psnr=target, least=least, most=most), start)
     for count in counts:
-        assert count is not None
-        counts.add(SimpleNamespace(count=count, psnr=curve(count), gaussians=range(count)))  # type: ignore[arg-type]
+        counts.add(SimpleNamespace(count=count, psnr=curve(count), gaussians=range(count)))
     return counts
 
 
@@ -161,7 +158,6 @@ def test_search_finds_the_fewest(start: int, target: float) -> None:
     fewest = 1000 * 2 ** ((target - 20) / 2)
     best = actual.best
     assert actual.unmet is None
-    assert best.count is not None
     assert best.psnr == rises(best.count) >= target
     assert best.count <= max(2.5 * fewest, 10)
     assert len(actual.tried) <= MAX_RUNS
@@ -169,7 +165,6 @@ def test_search_finds_the_fewest(start: int, target: float) -> None:
 
 def test_search_near_the_answer_ends_close_to_it() -> None:
     count = search(rises, 24.0, 3000, 10, 100_000).best.count
-    assert count is not None
     assert 4000 <= count <= 4000 * 1.3
 
 

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from dataclasses import FrozenInstanceError, fields, replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -41,25 +41,6 @@ def features(sizes: list[int]) -> FeatureGaussians:
     )  # fmt: skip
 
 
-def test_gaussians_are_indexed_by_row() -> None:
-    g = gaussians(5, 3)
-    assert len(g) == 5
-    assert g[1:3].means[:, 0].tolist() == [1, 2]
-    assert g[np.array([4, 0])].opacities.tolist() == [4, 0]
-    assert g[g.opacities > 2].shN.shape == (2, 3, 3)
-    assert len(g[:0]) == 0
-
-
-def test_gaussians_are_frozen() -> None:
-    with pytest.raises(FrozenInstanceError):
-        gaussians(1).means = np.zeros((1, 3))  # type: ignore[misc]
-
-
-@pytest.mark.parametrize(("coefficients", "degree"), [(0, 0), (3, 1), (8, 2), (15, 3), (24, 4)])
-def test_degree(coefficients: int, degree: int) -> None:
-    assert gaussians(2, coefficients).sh_degree == degree
-
-
 def test_concat_keeps_the_order() -> None:
     both = Gaussians.concat([gaussians(2, 3), gaussians(3, 3, start=2)])
     for f in fields(Gaussians):
@@ -94,7 +75,6 @@ def test_gradients_pass_to_a_device_and_end_in_arrays() -> None:
     means = torch.ones(2, 3, dtype=torch.float64, requires_grad=True)
     tensors = replace(gaussians(2).to("cpu"), means=means)
     tensors.to("cpu").means.sum().backward()
-    assert means.grad is not None
     viewmats = torch.eye(4)[None].requires_grad_()
     assert Cameras(viewmats, torch.eye(3)[None], 4, 3).to("cpu").viewmats.requires_grad
     assert tensors.numpy().means.tolist() == [[1, 1, 1]] * 2
@@ -175,12 +155,6 @@ def test_wrong_cameras_are_refused(change: dict, message: str) -> None:
 def scene() -> Scene:
     images, valid = np.zeros((2, 3, 4, 3), np.float32), np.ones((2, 3, 4), bool)
     return Scene(gaussians(24), cameras(), images, grid_ids(valid), ("a", "b"))
-
-
-def test_scene() -> None:
-    assert len(scene()) == 2
-    assert scene().pixels_per_view == 12
-    assert replace(scene(), images=None).images is None
 
 
 def test_what_the_file_has() -> None:

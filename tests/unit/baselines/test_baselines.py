@@ -124,21 +124,6 @@ def test_the_others_do_without_photos(scene: Scene, method: str) -> None:
     assert len(result.gaussians) > COUNT / 2
 
 
-@pytest.mark.parametrize(
-    ("settings", "what"),
-    [({"budget": "auto"}, "budget auto"), ({"levels": 2}, "levels"), ({"quality": "20dB"}, "quality 20dB"),
-     ({"quality": "-0.2dB"}, "quality -0.2dB")],
-)  # fmt: skip
-def test_a_count_has_to_be_settled(settings: dict[str, Any], what: str) -> None:
-    with pytest.raises(ValueError, match=f"method voxel: expected a budget or superpixels, got {what}"):
-        CompactOptions().with_settings({"method": "voxel", **settings})
-
-
-def test_unknown_methods_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"method: expected one of gsmerge, unmerged, .*, got 'magic'"):
-        CompactOptions(method="magic")
-
-
 def test_settings_without_effect_are_told(scene: Scene) -> None:
     assert made(scene, "voxel", seed=3, threads=1).report.notes == []
     assert made(scene, "voxel", effort="best", match="none").report.notes == ["method voxel does not use match, effort"]

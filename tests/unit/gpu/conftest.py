@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import pytest
 import scenes
+from fake_gsplat import fake_gsplat
 
 from gsmerge import Gaussians, Scene
 from gsmerge.render.photos import Photos
+
+__all__ = ["fake_gsplat", "photos", "scene", "start"]
 
 
 @pytest.fixture(scope="module")

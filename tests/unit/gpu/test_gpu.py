@@ -72,7 +72,7 @@ def test_options_only_name_a_device() -> None:
     """Whether there is one is asked when it is used."""
     assert [CompactOptions(device=name).device for name in ("cpu", "cuda", "auto")] == ["cpu", "cuda", "auto"]
     with pytest.raises(ValueError, match="device: expected one of cpu, cuda, auto, got 'gpu'"):
-        CompactOptions(device="gpu")  # type: ignore[arg-type]
+        CompactOptions(device="gpu")
 
 
 def test_compact_runs_on_the_cpu_and_says_why(scene: Scene, checks: list[str | None]) -> None:

@@ -21,7 +21,6 @@ from gsmerge.networks.apply import (
     run_heads,
 )
 from gsmerge.networks.modules import NetworkOptions, Networks
-from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.decode import DecodeOptions, decode, divide
 from gsmerge.stages.match import MatchOptions, match
 from gsmerge.stages.merge import merge, refine, take
@@ -185,19 +184,6 @@ def test_nearest_by_hand(scene: Made) -> None:
     assert find_neighbors(take(features, np.array([0])), 2).tolist() == [[-1, -1]]
 
 
-def test_one_thread_and_many_give_the_same_bits(scene: Made) -> None:
-    context = scene.networks(noisy(replace(SMALL, width=32)))
-
-    def run() -> FeatureGaussians:
-        encoded = encode_features(scene.features, context)
-        return refine(merge(encoded, match(encoded, MatchOptions(overlap=0.3), context), context), context)
-
-    with use_threads(1):
-        one = run()
-    with use_threads(4):
-        assert_close(run(), one)
-
-
 def test_the_seed_chooses_the_sample_of_large_groups(scene: Made) -> None:
     networks = noisy()
     a, b = (encode_features(scene.features, scene.networks(networks, seed)).latents for seed in (0, 1))
@@ -257,19 +243,10 @@ def test_gradients_reach_every_parameter(scene: Made) -> None:
         assert unused or bool(parameter.grad.any()), name
 
 
-def test_decode_gaussians_takes_the_frame_of_the_parent(scene: Made) -> None:
-    context = scene.networks(noisy())
-    encoded = encode_features(scene.features, context)
-    base = feature_to_gaussians(encoded)
-    moved = decode_gaussians(base, np.arange(len(base)), encoded, context)
-    assert not np.array_equal(moved.means, base.means)
-    np.testing.assert_allclose(np.linalg.norm(moved.quats, axis=1), 1, atol=1e-5)
-
-
 def test_sizes_are_checked() -> None:
     for wrong in ({"width": 50}, {"heads": 0}, {"members": 10**9}, {"latent": 1.5}, {"blocks": True}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
-            NetworkOptions(**wrong)  # type: ignore[arg-type]
+            NetworkOptions(**wrong)
     assert 150_000 <= Networks().num_parameters <= 300_000
 
 
@@ -320,7 +297,7 @@ def parents_of(features: FeatureGaussians, scene: Made, k: int) -> np.ndarray:
 @pytest.mark.parametrize("name", ["encoder", "merger", "refiner"])
 def test_a_network_that_is_left_out_has_no_weights_and_corrects_nothing(scene: Made, name: str) -> None:
     """As the whole with this network silent: its stage is the analytic one."""
-    whole, without = noisy(), noisy(replace(SMALL, **{name: False}))  # type: ignore[arg-type]
+    whole, without = noisy(), noisy(replace(SMALL, **{name: False}))
     assert getattr(without, name) is None
     assert without.num_parameters < whole.num_parameters
     without.load_state_dict({key: value for key, value in whole.state_dict().items() if not key.startswith(name)})

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import scenes
-from network_fixtures import noisy, written
 from unaligned_scenes import NO_CAMERAS, far_behind, loosened, shuffled
 from view_batches import FAST, counts, fed, parts_of, room, same_groups, same_state, state_of
 
@@ -56,14 +55,6 @@ def test_a_first_batch_is_an_encoded_scene(k: int, scene: Scene) -> None:
     scenes.assert_same_set(actual, expected, atol=5e-3, unit=0.05)
 
 
-def test_a_first_batch_with_networks(scene: Scene, tmp_path: Any) -> None:
-    checkpoint = str(written(tmp_path / "a.safetensors", noisy()))
-    for k in (1, 4):
-        actual = fed([scene], fit_colors=False, checkpoint=checkpoint).decode(k=k, fit="none")
-        expected = decode_scene(encode_scene(scene, **FAST | {"checkpoint": checkpoint}), k=k)
-        scenes.assert_same_set(actual, expected, atol=5e-3, unit=0.05)
-
-
 def test_shipped_networks_compete_in_every_batch(pairs: list[Scene]) -> None:
     """Unless a checkpoint is named."""
     compactor = Compactor(superpixels="10%")
@@ -76,7 +67,6 @@ def test_a_first_batch_keeps_its_frame_and_views(scene: Scene) -> None:
     assert (len(state.cameras), state.cameras.width, state.cameras.height) == (6, 36, 24)
     assert state.settings.num_input == scene.num_gaussians
     assert state.replay.views.tolist() == list(range(6))
-    assert scene.images is not None
     np.testing.assert_allclose(state.replay.images / 255, scene.images, atol=0.5 / 255 + 1e-6)
 
 
@@ -109,14 +99,6 @@ def test_reports_add_up(pairs: list[Scene]) -> None:
     assert len(state_of(compactor).cameras) == 6
 
 
-def test_stages_are_told(pairs: list[Scene]) -> None:
-    said: list[str] = []
-    compactor = Compactor(**FAST)
-    for batch in pairs[:2]:
-        compactor.extend(batch, progress=lambda stage, done, total: said.append(stage))
-    assert {"prepare", "segment", "encode", "match", "cover", "join", "fit"} <= {name.split(":")[0] for name in said}
-
-
 def test_the_old_state_is_left_as_it_is(pairs: list[Scene], first: OnlineState) -> None:
     before = state_of(fed(pairs[:1]))
     after, _ = extend(first, pairs[1], options())
@@ -130,13 +112,6 @@ def test_tensors_too(scene: Scene) -> None:
     same_state(state_of(fed([given])), state_of(fed([scene])))
 
 
-def test_the_same_batch_twice_adds_nothing(scene: Scene) -> None:
-    once, twice = fed([scene]), fed([scene, scene])
-    assert len(twice) <= 1.02 * len(once)
-    one, other = (scenes.psnr_of(c.decode(fit="none"), scene) for c in (once, twice))
-    assert abs(one - other) < 0.2
-
-
 @pytest.mark.parametrize("settings", [{}, {"k": 2}, {"checkpoint": "auto"}], ids=str)
 def test_the_threads_do_not_matter(settings: dict[str, Any], pairs: list[Scene]) -> None:
     states, actual = [], []
@@ -147,13 +122,6 @@ def test_the_threads_do_not_matter(settings: dict[str, Any], pairs: list[Scene])
     for one, gaussians in zip(states[1:], actual[1:], strict=True):
         same_state(replace(one, about={}), replace(states[0], about={}))
         assert scenes.identical(gaussians, actual[0])
-
-
-def test_the_same_seed_gives_the_same(pairs: list[Scene]) -> None:
-    one, other = fed(pairs, seed=3), fed(pairs, seed=3)
-    same_state(state_of(one), state_of(other))
-    fits = [c.decode(fit="full", fit_steps=4) for c in (one, other)]
-    assert scenes.identical(*fits)
 
 
 def test_the_settings_of_each_batch_are_its_own(pairs: list[Scene], first: OnlineState) -> None:
@@ -206,7 +174,7 @@ def test_photos_of_some_batches(bare: int, pairs: list[Scene]) -> None:
 def test_gaussians_in_no_order(change: Change, pairs: list[Scene], floor: Callable[..., None]) -> None:
     choices = ([change(pairs[0]), pairs[1]], [pairs[0], change(pairs[1])], [change(pair) for pair in pairs[:2]])
     for number, batches in enumerate(choices):
-        compactor = fed(batches)  # type: ignore[arg-type]
+        compactor = fed(batches)
         assert compactor.batches[1]["num_covered"] + compactor.batches[1]["num_joined"] > 0
         both = scenes.take_views(room(), range(4))
         floor(scenes.psnr_of(compactor.decode(fit="none"), both), str(number))
@@ -215,7 +183,7 @@ def test_gaussians_in_no_order(change: Change, pairs: list[Scene], floor: Callab
 def test_gaussians_without_photos_in_no_order(pairs: list[Scene]) -> None:
     """Pictures are rendered of the Gaussians, and count for as long as it takes to make room for them."""
     bare = [replace(loosened(pair), images=None) for pair in pairs[:2]]
-    compactor = fed(bare)  # type: ignore[arg-type]
+    compactor = fed(bare)
     assert len(state_of(compactor).replay) == 0
     assert len(compactor.decode()) > 50
 
@@ -224,7 +192,7 @@ def test_gaussians_without_photos_in_no_order(pairs: list[Scene]) -> None:
 def test_gaussians_without_cameras(first: bool, pairs: list[Scene], floor: Callable[..., None]) -> None:
     """Views are placed for them."""
     bare = Scene(pairs[0].gaussians, NO_CAMERAS, None, None, ())
-    compactor = fed([bare, pairs[1]] if first else [pairs[1], bare])  # type: ignore[list-item]
+    compactor = fed([bare, pairs[1]] if first else [pairs[1], bare])
     assert compactor.batches[1]["num_covered"] > 0
     assert len(state_of(compactor).replay) == 2
     floor(scenes.psnr_of(compactor.decode(fit="none"), pairs[1]))
@@ -236,9 +204,8 @@ def test_what_no_view_sees_is_kept(pairs: list[Scene]) -> None:
         loose = loosened(pair)
         hidden = far_behind(loose.gaussians, 300)
         batches.append(replace(loose, gaussians=Gaussians.concat([loose.gaussians, hidden])))
-    compactor = fed(batches, unseen="keep")  # type: ignore[arg-type]
+    compactor = fed(batches, unseen="keep")
     kept = state_of(compactor).kept
-    assert kept is not None
     num = len(kept)
     for wish in ({"fit": "none"}, {"fit": "full", "fit_steps": 30}):
         actual = compactor.decode(**wish)
@@ -271,11 +238,6 @@ def test_a_batch_without_a_valid_gaussian(pairs: list[Scene], first: OnlineState
         Compactor(**FAST).extend(nothing)
 
 
-def test_one_view(scene: Scene) -> None:
-    compactor = fed(parts_of(scenes.take_views(scene, [0, 1]), 1))
-    assert len(state_of(compactor).cameras) == 2
-
-
 def test_an_encoded_scene_is_extended(pairs: list[Scene]) -> None:
     encoded = encode_scene(pairs[0], **FAST)
     state, report = extend(from_encoded(encoded), pairs[1], options())
@@ -291,11 +253,6 @@ def test_everything_counts_without_a_tolerance(pairs: list[Scene]) -> None:
     compactor = fed(pairs, tolerance=0)
     assert [batch["num_covered"] for batch in compactor.batches] == [0, 0, 0]
     assert len(compactor) > len(fed(pairs))
-
-
-def test_higher_harmonics_of_the_same_degree() -> None:
-    compactor = fed(parts_of(room(2, degree=2), 1))
-    assert compactor.decode(fit="none").sh_degree == 2
 
 
 # decoding
@@ -345,7 +302,6 @@ def test_a_fit_in_vain_leaves_the_solved_colours(pairs: list[Scene], monkeypatch
     monkeypatch.setattr(decode_module, "fit", refused)
     compactor = fed(pairs)
     actual = decode_stored(state_of(compactor), k=1, options=FitOptions(fit_steps=4))
-    assert actual.fit is not None
     assert not actual.fit.accepted
     assert [note for note in actual.notes if "the fit was not accepted" in note]
     assert scenes.identical(actual.gaussians, compactor.decode(k=1, fit="none"))
@@ -389,11 +345,6 @@ def test_what_a_state_cannot_have(settings: dict[str, Any], words: str, pairs: l
     with pytest.raises(UsageError, match=words):
         compactor.extend(pairs[0])
     assert compactor.state is None
-
-
-def test_harmonics_of_another_degree(first: OnlineState) -> None:
-    with pytest.raises(UsageError, match="expected Gaussians with harmonics of degree 0 as the state's, got degree 1"):
-        extend(first, room(2, degree=1), options())
 
 
 def test_more_gaussians_of_a_group_than_are_kept(pairs: list[Scene], first: OnlineState) -> None:

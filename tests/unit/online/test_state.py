@@ -20,14 +20,11 @@ from gsmerge.online.state import (
     GroupSet,
     bake,
     child_members,
-    concat_groups,
     from_encoded,
     limit_children,
     moments_of,
-    replace_groups,
     select_groups,
     to_encoded,
-    with_child_rows,
     with_fitted_colors,
 )
 from gsmerge.stages.decode import DecodeOptions, decode
@@ -104,20 +101,6 @@ def test_heads_are_in_what_is_baked(some: Made) -> None:
     assert not np.array_equal(plain.children.sh0, actual.children.sh0)
 
 
-def test_baked_groups_are_plain(groups: GroupSet, uneven: FeatureGaussians) -> None:
-    f = groups.features
-    assert bool((f.gains == 1).all())
-    np.testing.assert_array_equal(f.members, np.arange(len(groups.children)))
-    for name in ("weights", "masses", "footprints", "views"):
-        np.testing.assert_array_equal(getattr(f, name), getattr(uneven, name), name)
-
-
-def test_nothing_is_held_to_begin_with(some: Made, uneven: FeatureGaussians) -> None:
-    actual = bake(uneven, some.members, None, 2)
-    assert not actual.color_precision.any()
-    np.testing.assert_array_equal(actual.fitted_sh0, actual.features.sh0)
-
-
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_moments_are_what_is_decoded_from_them(degree: int) -> None:
     gaussians = random_gaussians(60, 3, degree=degree)
@@ -132,13 +115,6 @@ def test_moments_of_the_faintest_and_the_most_solid() -> None:
     np.testing.assert_allclose(actual, [0, 1e-6, 0.999, 0.999], atol=1e-6)
 
 
-def test_moments_of_none() -> None:
-    gaussians = random_gaussians(0, 0)
-    assert {name: len(column) for name, column in moments_of(gaussians).items()} == dict.fromkeys(
-        ("means", "covars", "extinctions", "sh0", "shN"), 0
-    )
-
-
 def test_pick_takes_groups_with_their_children(groups: GroupSet) -> None:
     rows = np.array([5, 0, 17, 5])
     actual = select_groups(groups, rows)
@@ -146,28 +122,6 @@ def test_pick_takes_groups_with_their_children(groups: GroupSet) -> None:
     for place, row in enumerate(rows.tolist()):
         assert same_group(actual, place, groups, row)
     np.testing.assert_array_equal(actual.features.members, np.arange(len(actual.children)))
-
-
-def test_pick_of_all_and_of_none(groups: GroupSet) -> None:
-    same_groups(select_groups(groups, np.arange(len(groups))), groups)
-    none = select_groups(groups, np.zeros(0, np.int64))
-    assert (len(none), len(none.children)) == (0, 0)
-
-
-def test_joined_keeps_all_in_order(groups: GroupSet) -> None:
-    rows = np.arange(len(groups))
-    halves = [select_groups(groups, rows[:7]), select_groups(groups, rows[7:7]), select_groups(groups, rows[7:])]
-    same_groups(concat_groups(halves), groups)
-
-
-def test_swapped_groups_take_the_places_of_others(groups: GroupSet) -> None:
-    rows = np.array([8, 2])
-    others = select_groups(groups, np.array([20, 21]))
-    actual = replace_groups(groups, rows, others)
-    assert len(actual) == len(groups)
-    for row in range(len(groups)):
-        expected = {8: 20, 2: 21}.get(row, row)
-        assert same_group(actual, row, groups, expected)
 
 
 def test_thinned_pools_the_children_of_crowded_groups(groups: GroupSet) -> None:
@@ -187,10 +141,6 @@ def test_thinned_pools_the_children_of_crowded_groups(groups: GroupSet) -> None:
         assert all(np.array_equal(columns[name], own[name]) for name in columns)
 
 
-def test_nothing_is_thinned_where_none_is_crowded(groups: GroupSet) -> None:
-    assert limit_children(groups, 4) is groups
-
-
 def test_children_of_one_member_each_are_left_as_they_are(groups: GroupSet) -> None:
     """Members of their own: asked for as many as there are, each is what it was."""
     actual = decode(groups.features, child_members(groups), replace(ALL, k=4))
@@ -206,17 +156,6 @@ def test_solved_colours_move_groups_and_children_alike(groups: GroupSet) -> None
     np.testing.assert_allclose(actual.children.sh0, expected, atol=1e-6)
     same = replace(actual, features=groups.features, children=replace(actual.children, sh0=groups.children.sh0))
     same_groups(same, groups)
-
-
-def test_owning_counts_children_of_groups_without_any(some: Made) -> None:
-    few = with_child_rows(pick_features(some.features, 3), np.array([0, 0, 2]))
-    assert few.starts.tolist() == [0, 2, 2, 3]
-    assert few.members.tolist() == [0, 1, 2]
-
-
-def pick_features(features: FeatureGaussians, count: int) -> FeatureGaussians:
-    """The first few."""
-    return scenes.make_features(features.means[:count])
 
 
 def test_part_members_know_the_footprint_of_their_group(groups: GroupSet) -> None:
@@ -282,19 +221,8 @@ def test_scenes_in_no_order_and_what_no_view_sees(pixels: Scene) -> None:
     both = replace(loose, gaussians=Gaussians.concat([loose.gaussians, hidden]))
     encoded = encode_scene(both, superpixels="10%", unseen="keep")
     state = from_encoded(encoded)
-    assert state.kept is not None
-    assert scenes.identical(state.kept, encoded.kept)  # type: ignore[arg-type]
+    assert scenes.identical(state.kept, encoded.kept)
     assert to_encoded(state).num_kept == encoded.num_kept > 0
-
-
-def test_what_is_told_of_an_encoded_scene(pixels: Scene) -> None:
-    encoded = encode_scene(pixels, superpixels="5%", checkpoint="none")
-    about = from_encoded(encoded).about
-    assert about["options"]["superpixels"] == "5%"
-    assert "fit" not in about["options"]
-    assert [one["num_groups"] for one in about["batches"]] == [len(encoded)]
-    assert about["batches"][0]["num_views"] == 3
-    assert about["batches"][0]["num_input"] == pixels.num_gaussians
 
 
 def test_unsolved_colours_are_there_too(groups: GroupSet, pixels: Scene) -> None:

@@ -9,7 +9,7 @@ import cv2
 import pytest
 import torch
 
-from gsmerge.runtime.threads import available_threads, in_turn, parallel_map, use_threads
+from gsmerge.runtime.threads import in_turn, parallel_map, use_threads
 
 
 @pytest.fixture(autouse=True)
@@ -89,10 +89,6 @@ def test_errors_come_through_and_leave_the_pool_usable() -> None:
         parallel_map(fail, range(4))
 
 
-def test_without_a_block_a_pool_is_made_for_the_call() -> None:
-    assert parallel_map(abs, [-1, -2, -3]) == [1, 2, 3]
-
-
 def test_two_callers_do_not_stop_each_other() -> None:
     actual: dict[int, list[int]] = {}
 
@@ -136,10 +132,6 @@ def test_overlapping_blocks_give_the_libraries_their_threads_back() -> None:
 def test_no_threads_are_refused(count: int) -> None:
     with pytest.raises(ValueError, match=f"expected at least 1 thread, got {count}"), use_threads(count):
         pass
-
-
-def test_available_threads() -> None:
-    assert available_threads() >= 1
 
 
 @pytest.mark.parametrize("at_once", [1, 4, 100])

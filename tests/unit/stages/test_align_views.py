@@ -58,7 +58,6 @@ def test_views_are_moved_to_where_they_agree(views: slice, scene: Scene) -> None
     wrong = motions.disagreeing(scene, views=views)
     before = worst_error(wrong, scene)
     found = align_views(wrong, VIEWS)
-    assert found is not None
     degrees, distance = worst_error(found, scene)
     assert degrees < 0.25 * before[0]
     assert distance < 0.25 * before[1]
@@ -69,7 +68,6 @@ def test_views_are_moved_to_where_they_agree(views: slice, scene: Scene) -> None
 def test_views_that_are_left_out_stay(scene: Scene) -> None:
     wrong = motions.disagreeing(scene)
     found = align_views(wrong, range(4))
-    assert found is not None
     last = slice(4 * scene.pixels_per_view, None)
     np.testing.assert_allclose(found.cameras.viewmats[4], wrong.cameras.viewmats[4], atol=1e-12)
     np.testing.assert_allclose(found.gaussians.means[last], wrong.gaussians.means[last], atol=1e-6)
@@ -121,8 +119,6 @@ def test_the_same_with_one_thread(scene: Scene) -> None:
     for threads in (1, 2):
         with use_threads(threads):
             found.append(align_views(wrong, VIEWS))
-    assert found[0] is not None
-    assert found[1] is not None
     np.testing.assert_array_equal(found[0].cameras.viewmats, found[1].cameras.viewmats)
     np.testing.assert_array_equal(found[0].gaussians.means, found[1].gaussians.means)
 

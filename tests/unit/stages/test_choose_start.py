@@ -44,7 +44,6 @@ def test_all_pixels_of_the_half_size_views_count(scene: Scene, gaussians: Gaussi
 def test_pixels_without_a_gaussian_do_not_count(scene: Scene, gaussians: Gaussians) -> None:
     valid = np.ones_like(scene.valid)
     valid[:, :, :12] = False
-    assert scene.images is not None
     spoilt = np.where(valid[..., None], scene.images, 1 - scene.images)
     some = replace(scene, pixel_ids=grid_ids(valid))
     assert views_psnr(gaussians, replace(some, images=spoilt)) == views_psnr(gaussians, some)
@@ -101,7 +100,6 @@ def test_the_better_start_is_kept(some: Made, better: str) -> None:
     assert max(scores, key=scores.__getitem__) == better
     assert record.choices["groups"] == expected.num_groups
     ones = decode(expected.features, some.members, replace(options, k=1), networks=expected.networks)
-    assert chosen.k1_gaussians is not None
     assert scenes.identical(chosen.k1_gaussians, ones)
     assert scores[better] == views_psnr(ones, some.scene)
 

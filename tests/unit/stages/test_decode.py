@@ -12,9 +12,8 @@ from gsmerge.geometry import covariances
 from gsmerge.moments import Members, feature_to_gaussians, scene_members
 from gsmerge.stages.decode import DecodeOptions, deal_visible, decode, mixed_counts, split_counts
 from gsmerge.stages.encode import encode
-from gsmerge.stages.merge import merge
 from gsmerge.stages.segment import SegmentOptions, segment
-from gsmerge.types import FeatureGaussians, Groups, Matches
+from gsmerge.types import FeatureGaussians, Groups
 
 COUNT = 8  # so that no superpixel has fewer than 8 pixels
 
@@ -31,7 +30,6 @@ def members(scene: Scene) -> Members:
 
 @pytest.fixture(scope="module")
 def features(scene: Scene, members: Members) -> FeatureGaussians:
-    assert scene.images is not None
     groups = segment(scene.images, SegmentOptions(), COUNT)
     return encode(scene, members, groups)
 
@@ -45,11 +43,6 @@ def assert_alike(a: Gaussians, b: Gaussians) -> None:
 
 def test_one_child_is_the_feature(features: FeatureGaussians, members: Members) -> None:
     assert_alike(decode(features, members, DecodeOptions(k=1)), feature_to_gaussians(features))
-
-
-@pytest.mark.parametrize("k", [2, 3, 4, 8])
-def test_k_children(features: FeatureGaussians, members: Members, k: int) -> None:
-    assert len(decode(features, members, DecodeOptions(k=k))) == 2 * COUNT * k
 
 
 @pytest.mark.parametrize("k", [2, 4])
@@ -120,26 +113,12 @@ def test_gains_reach_the_children(features: FeatureGaussians, members: Members) 
     np.testing.assert_allclose(changed.opacities, expected.clip(max=0.999), rtol=1e-4)
 
 
-def test_merged_features_are_split_again(features: FeatureGaussians, members: Members) -> None:
-    clusters = np.arange(2 * COUNT) % COUNT  # each of view 0 with one of view 1
-    merged = merge(features, Matches(clusters, COUNT))
-    children = decode(merged, members, DecodeOptions(k=2, min_opacity=0))
-    assert len(children) == 2 * COUNT
-
-
-@pytest.mark.parametrize("k", [1, 2])
-def test_nothing(members: Members, k: int) -> None:
-    none = scenes.make_features(np.zeros((0, 3)), degree=1)
-    assert len(decode(none, members, DecodeOptions(k=k))) == 0
-
-
 @pytest.mark.parametrize("k", [1, 4])
 def test_faint_ones_are_left_out(scene: Scene, k: int) -> None:
     opacities = scene.gaussians.opacities.copy()
     opacities[: scene.pixels_per_view] = 0
     half = replace(scene, gaussians=replace(scene.gaussians, opacities=opacities))
     own = scene_members(half)
-    assert half.images is not None
     features = encode(half, own, segment(half.images, SegmentOptions(), COUNT))
     assert len(features) == 2 * COUNT
     actual = decode(features, own, DecodeOptions(k=k))

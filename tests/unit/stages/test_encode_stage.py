@@ -7,7 +7,7 @@ import pytest
 import scenes
 
 from gsmerge import Scene
-from gsmerge.moments import feature_to_gaussians, scene_members
+from gsmerge.moments import scene_members
 from gsmerge.stages.encode import encode, member_rows
 from gsmerge.types import FeatureGaussians, Groups, grid_ids
 
@@ -28,7 +28,7 @@ def groups() -> Groups:
 
 
 def encoded(scene: Scene, groups: Groups, rule: str = "depth") -> FeatureGaussians:
-    return encode(scene, scene_members(scene), groups, rule=rule)  # type: ignore[arg-type]
+    return encode(scene, scene_members(scene), groups, rule=rule)
 
 
 def test_rows_of_the_groups(scene: Scene, groups: Groups) -> None:
@@ -80,19 +80,3 @@ def test_sums_add_up(scene: Scene, groups: Groups) -> None:
     assert float(features.extinctions.sum()) == pytest.approx(float(extinction), rel=1e-4)
     assert (features.gains == 1).all()
     assert features.shN.shape == (12, 3, 3)
-
-
-def test_paper_rule_is_moment_matching_with_the_mean_opacity(scene: Scene, groups: Groups) -> None:
-    features = encoded(scene, groups, "paper")
-    gaussians = feature_to_gaussians(features)
-    rows = member_rows(scene, scene_members(scene), groups)[1].reshape(12, 16)
-    members = scene.gaussians
-    for g, own in enumerate(rows):
-        weights = members.opacities[own].astype(np.float64) / members.opacities[own].astype(np.float64).sum()
-        mean = (weights[:, None] * members.means[own].astype(np.float64)).sum(0)
-        delta = members.means[own].astype(np.float64) - mean
-        covar = (weights[:, None, None] * delta[:, :, None] * delta[:, None]).sum(0)
-        floor = (0.1 * features.footprints[g].astype(np.float64)) ** 2 * np.eye(3)
-        np.testing.assert_allclose(features.means[g], mean, atol=1e-5)
-        np.testing.assert_allclose(features.covars[g], covar + floor, rtol=1e-3, atol=1e-7)
-        assert float(gaussians.opacities[g]) == pytest.approx(float(members.opacities[own].mean()), rel=1e-4)

@@ -8,7 +8,7 @@ import scenes
 
 from gsmerge import Scene
 from gsmerge.geometry import project
-from gsmerge.stages.prepare import Frame, canonicalise, scene_frame
+from gsmerge.stages.prepare import canonicalise, scene_frame
 from gsmerge.types import grid_ids
 
 
@@ -88,11 +88,3 @@ def test_gaussians_in_the_cameras_plane_have_a_unit() -> None:
     flat = scenes.make_scene(scenes.wall(), scenes.arc(1, 8, 6))
     still = replace(flat, gaussians=replace(flat.gaussians, means=flat.cameras.centres.repeat(48, 0)))
     assert scene_frame(still).unit == 1.0
-
-
-def test_frame_by_hand(scene: Scene) -> None:
-    frame = Frame(np.array([1.0, 2.0, 3.0]), 4.0)
-    one = replace(scene.gaussians[:1], means=np.array([[5.0, 2.0, -1.0]]), scales=np.array([[4.0, 2.0, 1.0]]))
-    entered = frame.enter(one)
-    assert entered.means.tolist() == [[1, 0, -1]]
-    assert entered.scales.tolist() == [[1, 0.5, 0.25]]

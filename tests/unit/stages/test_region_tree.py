@@ -23,7 +23,7 @@ from gsmerge.stages.region_tree import (
     region_tree,
 )
 from gsmerge.stages.segment import SegmentOptions, segment
-from gsmerge.types import SH_C0, FeatureGaussians, Groups
+from gsmerge.types import FeatureGaussians, Groups
 
 HEIGHT, WIDTH = 40, 60
 
@@ -134,12 +134,6 @@ def test_strange_depths_do_no_harm() -> None:
     assert len(cut_tree(tree, 100)) == 100
 
 
-def test_a_single_superpixel_cannot_be_merged() -> None:
-    tree = tree_of(noise(2), slanted(2), 1)
-    assert cut_tree(tree, 2).counts == (1, 1)
-    assert len(tree.distortions) == 1
-
-
 def test_pixel_depths() -> None:
     scene = scenes.make_scene(scenes.wall(), scenes.arc(2, 8, 6))
     depths = pixel_depths(scene)
@@ -162,7 +156,7 @@ def test_pixel_depths() -> None:
 def test_arguments_that_do_not_fit(change: dict[str, object], message: str) -> None:
     good = {"images": grey(), "depths": slanted(), "groups": cut(grey(), 5), "valid": slanted() > 0}
     with pytest.raises(ValueError, match=message):
-        region_tree(**{**good, **change})  # type: ignore[arg-type]
+        region_tree(**{**good, **change})
 
 
 def test_budget_below_the_number_of_views() -> None:
@@ -200,15 +194,6 @@ def test_knee_is_where_the_slope_is_the_one_that_is_worth_it(monkeypatch: pytest
         assert 10 / np.log(10) * share == pytest.approx(2.0, rel=0.02)
 
 
-def test_knee_does_not_rise_with_the_slope(monkeypatch: pytest.MonkeyPatch) -> None:
-    tree, actual = tree_of(noise(), slanted()), []
-    for slope in (0.1, 0.5, 1, 2, 4, 50):
-        monkeypatch.setattr(module, "KNEE_SLOPE", slope)
-        actual.append(knee(tree.counts, tree.distortions))
-    assert actual == sorted(actual, reverse=True)
-    assert actual[-1] == 1
-
-
 def test_knee_of_nothing() -> None:
     with pytest.raises(ValueError, match="as many distortions as counts"):
         knee(np.array([], int), np.array([]))
@@ -229,15 +214,7 @@ def members(scene: Scene) -> Members:
 
 @pytest.fixture(scope="module")
 def features(scene: Scene, members: Members) -> FeatureGaussians:
-    assert scene.images is not None
     return encode(scene, members, cut(scene.images, 12))
-
-
-@pytest.mark.parametrize("extra", [0, 1, 7, 40, 100, 24 * 7])
-def test_splits_give_the_count_asked_for(features: FeatureGaussians, members: Members, extra: int) -> None:
-    counts = split_counts(features, members, extra)
-    assert counts.sum() == len(features) + extra
-    assert len(decode(features, members, DecodeOptions(min_opacity=0), counts)) == len(features) + extra
 
 
 def test_splits_stop_where_members_give_no_more(features: FeatureGaussians, members: Members) -> None:
@@ -261,10 +238,6 @@ def test_a_first_step_that_only_pays_with_the_second() -> None:
 
     gains = hull_gains(np.array([[10.0, 9.0, 0.0], [4.0, 0.0, 0.0], [3.0, 1.0, np.nan], [1.0, np.nan, np.nan]]))
     assert gains.tolist() == [[5, 5], [4, 0], [2, -np.inf], [-np.inf, -np.inf]]
-
-
-def test_splits_of_nothing(members: Members) -> None:
-    assert split_counts(scenes.make_features(np.zeros((0, 3))), members, 5).tolist() == []
 
 
 def test_splits_out_of_range(features: FeatureGaussians, members: Members) -> None:
@@ -304,16 +277,3 @@ def test_most_important_keeps_the_most_important() -> None:
     assert most_important(importance, 0).tolist() == []
     with pytest.raises(ValueError, match="count: expected at least 0, got -1"):
         most_important(importance, -1)
-
-
-def test_colours_of_sh_and_of_photos_weigh_the_same() -> None:
-    """A group of two flat colours: its error is the squared distance from their mean, in sRGB."""
-    from gsmerge.stages.decode import _child_errors
-
-    same = Members(
-        np.zeros((4, 3), np.float32), np.zeros((4, 4), np.float32), np.ones((4, 3), np.float32),
-        np.ones(4, np.float32), np.array([0, 0, 1, 1], np.float32)[:, None, None] * np.full(3, 0.2 / SH_C0, np.float32),
-        np.zeros((4, 0, 3), np.float32), np.ones(4, np.float32),
-    )  # fmt: skip
-    one = replace(scenes.make_features(np.zeros((1, 3))), starts=np.array([0, 4]), members=np.arange(4))
-    np.testing.assert_allclose(_child_errors(one, same, 3), [[0.12, 0, np.nan]], atol=1e-7)

@@ -28,7 +28,6 @@ def planned(scene: Scene, **settings: object) -> tuple[Scene, SuperpixelPlan]:
 
 
 def test_gaussians_follow_the_number_of_superpixels(scene: Scene) -> None:
-    assert scene.images is not None
     images = scene.images.copy()
     images[1] = 0.5  # needs fewer superpixels than the others
     sh0 = scene.gaussians.sh0.copy()
@@ -77,9 +76,3 @@ def test_largest_count(scene: Scene) -> None:
     assert largest(**ADAPTIVE) == 4 * 3 * 38
     assert largest(**ADAPTIVE | {"superpixels": "90%"}) == 3 * 32 * 24
     assert largest(**ADAPTIVE | {"superpixels": 38}) == 3 * 38
-
-
-def test_a_whole_run(scene: Scene) -> None:
-    result = scenes.compacted(scene, **ADAPTIVE)
-    assert len(result.gaussians) <= 4 * 3 * 38
-    assert scenes.identical(result.gaussians, scenes.compacted(scene, **ADAPTIVE, threads=1).gaussians)

@@ -24,7 +24,6 @@ OVERCAST, CEILING = np.array([0.85, 0.86, 0.88]), np.array([0.85, 0.83, 0.78])
 def painted(top: np.ndarray, bottom: np.ndarray, depth: float = 1.0) -> tuple[Scene, np.ndarray]:
     """A room whose upper part is painted over, from one colour to another, at so many times its depth; and where."""
     scene = scenes.make_scene(scenes.room(), scenes.arc(4, WIDTH, HEIGHT))
-    assert scene.images is not None
     images, colors = scene.images.copy(), scene.gaussians.sh0.copy()
     shade = np.linspace(0, 1, HORIZON)[:, None, None]
     images[:, :HORIZON] = (1 - shade) * top + shade * bottom
@@ -45,7 +44,6 @@ def painted(top: np.ndarray, bottom: np.ndarray, depth: float = 1.0) -> tuple[Sc
 )
 def test_sky_is_found(top: np.ndarray, bottom: np.ndarray, depth: float) -> None:
     scene, rows = painted(top, bottom, depth)
-    assert scene.images is not None
     found = sky(scene.gaussians, scene.cameras, scene.images)
     assert found[rows].mean() > 0.8
     assert found[~rows].mean() < 0.02
@@ -55,21 +53,12 @@ def test_sky_is_found(top: np.ndarray, bottom: np.ndarray, depth: float) -> None
 def test_ceilings_and_walls_are_not(top: np.ndarray, bottom: np.ndarray) -> None:
     """Warm white, cold white as near as the rest, and blue that grows paler upwards."""
     scene, _ = painted(top, bottom)
-    assert scene.images is not None
-    assert not sky(scene.gaussians, scene.cameras, scene.images).any()
-
-
-def test_a_room_has_none() -> None:
-    scene = scenes.make_scene(scenes.room(), scenes.arc(4, WIDTH, HEIGHT))
-    assert scene.images is not None
     assert not sky(scene.gaussians, scene.cameras, scene.images).any()
 
 
 def test_one_view_may_be_mistaken() -> None:
     scene, _ = painted(ZENITH, HAZE)
     indoors = scenes.make_scene(scenes.room(), scenes.arc(4, WIDTH, HEIGHT)).images
-    assert scene.images is not None
-    assert indoors is not None
     photos = np.concatenate([scene.images[:1], indoors[1:]])
     assert not sky(scene.gaussians, scene.cameras, photos).any()
 
@@ -113,7 +102,6 @@ def test_views_that_show_it_are_counted() -> None:
     """For ``inspect``."""
     indoors = scenes.make_scene(scenes.room(), scenes.arc(4, WIDTH, HEIGHT))
     for scene, views in ((painted(ZENITH, HAZE)[0], [0, 1, 2, 3]), (indoors, [])):
-        assert scene.images is not None
         assert list(sky_regions(scene.gaussians.means, scene.cameras, scene.images)) == views
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsmerge.kernels.superpixels.seeds import hexagonal_seeds, seed_density, seeds_from_density
+from gsmerge.kernels.superpixels.seeds import seed_density, seeds_from_density
 from gsmerge.stages.segment import SegmentOptions, count_for, segment
 from gsmerge.stages.superpixels import SEGMENTATIONS, saliency, superpixels
 
@@ -28,11 +28,6 @@ def test_detail_gets_the_superpixels() -> None:
     for segmentation in ("rdseg", "bass-st"):
         labels = superpixels(image, 200, segmentation)
         assert len(np.unique(labels[:, 34:])) > 2 * len(np.unique(labels[:, :30])), segmentation
-
-
-def test_as_many_superpixels_as_pixels() -> None:
-    labels = superpixels(random_image(4, 5), 20)
-    assert sorted(labels.reshape(-1).tolist()) == list(range(20))
 
 
 def test_bytes_and_floats_are_the_same_picture() -> None:
@@ -147,33 +142,6 @@ def test_flat_pictures_get_even_seeds(value: float) -> None:
     seeds = seeds_from_density(density, 240)
     quarters = np.histogram2d(seeds[:, 0], seeds[:, 1], bins=2, range=[[0, 40], [0, 60]])[0]
     assert quarters == pytest.approx(np.full((2, 2), 60), abs=6)
-
-
-def test_density_is_at_most_one_and_sums_to_the_count() -> None:
-    response = np.zeros((10, 10), np.float32)
-    response[3:5] = 100
-    for count in (1, 20, 50, 99, 100):
-        density = seed_density(response, count)
-        assert density.max() <= 1
-        assert density.min() >= 0
-        assert density.sum() == pytest.approx(count)
-
-
-def test_hexagonal_seeds_are_distinct_pixels() -> None:
-    for height, width in ((1, 9), (9, 1), (3, 3), (7, 12), (30, 8)):
-        for count in {1, 2, height * width // 3, height * width - 1, height * width}:
-            seeds = hexagonal_seeds(height, width, count)
-            assert len({(y, x) for y, x in seeds.tolist()}) == count
-            assert (seeds >= 0).all()
-            assert (seeds < [height, width]).all()
-
-
-def test_hexagonal_rows_are_shifted() -> None:
-    seeds = hexagonal_seeds(26, 30, 30)  # rows of hexagons of 26 pixels are 4.75 apart
-    rows = [seeds[seeds[:, 0] == y][:, 1] for y in np.unique(seeds[:, 0])]
-    assert len(rows) == 5
-    assert np.diff(rows[0]) == pytest.approx(5)
-    assert rows[1][0] - rows[0][0] == pytest.approx(2.5, abs=0.6)
 
 
 def patchwork(height: int, width: int) -> np.ndarray:

@@ -19,7 +19,7 @@ from gsmerge.research.generate.photograph import (
     screen_boxes,
     trace,
 )
-from gsmerge.research.generate.shapes import LYING, Material, Shape, ball, blob, box, column, pack, place, quad, rod
+from gsmerge.research.generate.shapes import LYING, Material, Shape, blob, box, column, pack, place, quad, rod
 from gsmerge.research.generate.synthetic_scene import PATHS, is_usable, look_at
 from gsmerge.research.generate.textures import KINDS, Palette
 
@@ -31,19 +31,6 @@ DOWN = Light(np.array([0.0, -1.0, 0.0]), None, np.ones(3), 0.2 * np.ones(3), 0.0
 
 def stage(*shapes: Shape) -> Stage:
     return Stage(shapes, (WHITE,), DOWN, np.zeros(3), (1, 2), (1, 2), 30)
-
-
-def test_a_wall_has_its_own_depth_everywhere() -> None:
-    hits = trace(pack([quad((0, 0, 2.5), (9, 9), LOOK)]), np.eye(4), LENS, 1)
-    np.testing.assert_allclose(hits.depth, 2.5)
-    np.testing.assert_allclose(hits.normals, np.broadcast_to([0, 0, -1], hits.normals.shape), atol=1e-6)
-
-
-def test_a_ball_is_as_near_as_its_front_and_as_wide_as_its_cone() -> None:
-    hits = trace(pack([ball((0, 0, 4), (1, 1, 1), LOOK)]), np.eye(4), Pinhole(401, 301, 300.0), 1)
-    assert hits.depth.min() == pytest.approx(3, abs=1e-4)
-    radius = np.sqrt((hits.ids == 0).sum() / np.pi)
-    assert radius == pytest.approx(300 / np.sqrt(15), rel=0.01)  # tangent of the cone that touches the ball
 
 
 def test_a_column_stands_on_its_foot() -> None:

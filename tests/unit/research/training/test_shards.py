@@ -48,7 +48,7 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 def assert_same(one: object, other: object) -> None:
     """Two dataclasses of arrays, bit for bit."""
-    for f in fields(one):  # type: ignore[arg-type]
+    for f in fields(one):
         a, b = getattr(one, f.name), getattr(other, f.name)
         if isinstance(a, np.ndarray):
             assert a.dtype == b.dtype
@@ -97,13 +97,13 @@ def test_preparing_goes_on_where_it_was(scenes: list[Path], tmp_path: Path, monk
         pass
 
     def watch(*arguments: object) -> Iterator[object]:
-        for label, make in make_each(*arguments):  # type: ignore[arg-type]
+        for label, make in make_each(*arguments):
 
             def counted(label: str = label, make: object = make) -> Example:
                 if len(made) == stop:
                     raise StoppedError
                 made.append(label)
-                return make()  # type: ignore[operator]
+                return make()
 
             yield label, counted
 
@@ -175,7 +175,7 @@ def test_few_examples_are_in_memory_and_draws_are_spread(monkeypatch: pytest.Mon
             streams.move_to(step)
             assert len(streams.examples) <= 2 * (options.buffer + 1)
             for crop in (0, 1):
-                drawn[int(streams.draw(step, crop, rng))] += 1  # type: ignore[call-overload]
+                drawn[int(streams.draw(step, crop, rng))] += 1
     assert len(drawn) > 75
     assert max(reads.values()) <= 2
     reads.clear()

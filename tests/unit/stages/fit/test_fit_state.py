@@ -77,28 +77,6 @@ def test_state_and_back(degree: int) -> None:
         assert getattr(actual, name).dtype == np.float32
 
 
-@pytest.mark.parametrize("degree", [0, 3])
-def test_state_is_drawn_like_its_gaussians(degree: int) -> None:
-    scene, gaussians = make(degree)
-    state = start_state(gaussians)
-    images = scenes.images_of(gaussians, scene.cameras)[0]
-    again = scenes.images_of(gaussians_of(state.x, state.splats.shN), scene.cameras)[0]
-    np.testing.assert_allclose(again, images, atol=2e-4)
-
-
-def test_unit_is_the_mean_of_the_two_largest_scales(gaussians: Gaussians) -> None:
-    expected = np.sort(gaussians.scales, 1)[:, 1:].prod(1) ** 0.5
-    np.testing.assert_allclose(start_state(gaussians).units, expected, rtol=1e-5)
-
-
-def test_state_does_not_share_memory_with_the_gaussians(gaussians: Gaussians) -> None:
-    before = [getattr(gaussians, name).copy() for name in scenes.FIELDS]
-    state = start_state(gaussians)
-    for array in (state.x, state.colors, state.splats.means, state.splats.scales, state.splats.opacities):
-        array += 1
-    assert all(np.array_equal(getattr(gaussians, n), b) for n, b in zip(scenes.FIELDS, before, strict=True))
-
-
 def test_ends_of_the_range_stay_finite(gaussians: Gaussians) -> None:
     opacities, scales = np.array([0.0, 1.0, 1e-9, 0.5], np.float32), np.array([[0.0, 1e-30, 1e6]] * 4, np.float32)
     hard = replace(gaussians[:4], opacities=opacities, scales=scales)
@@ -115,12 +93,6 @@ def test_view_colors_bring_the_harmonics_up_to_date() -> None:
     shiny.colors[:] = 0.5
     assert shiny.view_colors() is None
     np.testing.assert_array_equal(shiny.splats.sh0, 0)
-
-
-def test_empty_state() -> None:
-    none = make(0)[1][:0]
-    state = start_state(none)
-    assert len(gaussians_of(state.x, state.splats.shN)) == 0
 
 
 # growing
@@ -211,12 +183,6 @@ def test_growing_happens_where_the_error_is(scene: Scene, gaussians: Gaussians) 
         centres = grown.x[n:, :3] @ spoilt.viewmats[view, :3, :3].T + spoilt.viewmats[view, :3, 3]
         pixels = centres @ spoilt.Ks[view].T
         assert (pixels[:, :2] / pixels[:, 2:] < [20, 16]).all()
-
-
-def test_growing_repeats(gaussians: Gaussians, photos: Photos) -> None:
-    one, two = (grow(used(gaussians), photos, len(gaussians) + 13) for _ in range(2))
-    for name in ("x", "x0", "m", "v", "units", "box_shares", "min_sizes"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
 
 
 def test_unseen_ones_have_no_error_and_are_the_last_to_be_halved(gaussians: Gaussians, photos: Photos) -> None:

@@ -1,0 +1,175 @@
+"""Overlaps and clusters against slow, obvious numpy in float64."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.sparse import coo_matrix, csgraph
+
+from gsmerge.kernels.gaussians.cluster import (
+    bhattacharyya,
+    box_overlap,
+    connected_components,
+    edge_scores,
+    leader_clusters,
+)
+
+Gaussian = tuple[np.ndarray, np.ndarray]
+
+
+def random_gaussians(count: int, seed: int, spread: float = 0.5) -> list[Gaussian]:
+    rng = np.random.default_rng(seed)
+    halves = rng.normal(size=(count, 3, 3))
+    return [(rng.normal(size=3) * spread, half @ half.T + 0.05 * np.eye(3)) for half in halves]
+
+
+def upper(covar: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(covar[np.triu_indices(3)])
+
+
+def overlap(a: Gaussian, b: Gaussian) -> float:
+    return bhattacharyya(a[0], upper(a[1]), b[0], upper(b[1]), np.empty(6))
+
+
+def overlap_reference(a: Gaussian, b: Gaussian) -> float:
+    """exp(-D_B), Bhattacharyya 1943."""
+    middle, delta = (a[1] + b[1]) / 2, b[0] - a[0]
+    distance = delta @ np.linalg.solve(middle, delta) / 8
+    dets = [np.linalg.det(c) for c in (middle, a[1], b[1])]
+    return float(np.exp(-distance - 0.5 * np.log(dets[0] / np.sqrt(dets[1] * dets[2]))))
+
+
+def box_reference(a: Gaussian, b: Gaussian) -> float:
+    sides = [np.sqrt(np.diag(c)) for c in (a[1], b[1])]
+    low = np.maximum(a[0] - sides[0], b[0] - sides[1])
+    high = np.minimum(a[0] + sides[0], b[0] + sides[1])
+    shared = np.prod(np.maximum(high - low, 0))
+    return float(shared / (np.prod(2 * sides[0]) + np.prod(2 * sides[1]) - shared))
+
+
+def test_overlaps_match() -> None:
+    gaussians = random_gaussians(40, 0)
+    for a in gaussians[:20]:
+        for b in gaussians[20:]:
+            assert overlap(a, b) == pytest.approx(overlap_reference(a, b), rel=1e-9)
+            assert overlap(a, b) == pytest.approx(overlap(b, a), rel=1e-12)
+            box = box_overlap(a[0], upper(a[1]), b[0], upper(b[1]))
+            assert box == pytest.approx(box_reference(a, b), rel=1e-9)
+
+
+def test_overlap_is_an_integral() -> None:
+    """The coefficient is the integral of the root of the product; by Monte Carlo over the first Gaussian."""
+    a, b = random_gaussians(2, 3)
+    rng = np.random.default_rng(0)
+    points = rng.multivariate_normal(a[0], a[1], 200_000)
+
+    def log_density(x: np.ndarray, g: Gaussian) -> np.ndarray:
+        delta = x - g[0]
+        return -0.5 * (np.einsum("ni,ij,nj->n", delta, np.linalg.inv(g[1]), delta) + np.log(np.linalg.det(g[1])))
+
+    estimate = np.exp(0.5 * (log_density(points, b) - log_density(points, a))).mean()
+    assert overlap(a, b) == pytest.approx(estimate, rel=0.03)
+
+
+def test_overlap_of_equal_and_of_far_ones() -> None:
+    a = random_gaussians(1, 1)[0]
+    far = (a[0] + 1e4, a[1])
+    assert overlap(a, a) == pytest.approx(1)
+    assert overlap(a, far) == 0
+    assert box_overlap(a[0], upper(a[1]), a[0], upper(a[1])) == pytest.approx(1)
+    assert box_overlap(a[0], upper(a[1]), far[0], upper(a[1])) == 0
+
+
+def test_overlap_of_flat_ones() -> None:
+    """Singular covariances overlap with nothing rather than with everything."""
+    zero = (np.zeros(3), np.zeros((3, 3)))
+    assert overlap(zero, zero) == 0
+    assert box_overlap(zero[0], upper(zero[1]), zero[0], upper(zero[1])) == 0
+    sheet = (np.zeros(3), np.diag([1.0, 1.0, 0.0]))
+    assert overlap(sheet, sheet) == 0
+
+
+@pytest.mark.parametrize("width", [0, 3])
+@pytest.mark.parametrize("boxes", [True, False])
+def test_edge_scores_match(boxes: bool, width: int) -> None:
+    gaussians = random_gaussians(30, 5, 0.2)
+    rng = np.random.default_rng(0)
+    neighbors = rng.integers(-1, 30, (30, 6))
+    colors, views = rng.uniform(0, 0.3, (30, 3)), rng.integers(-1, 3, 30)
+    means, covars = np.stack([g[0] for g in gaussians]), np.stack([upper(g[1]) for g in gaussians])
+    latents = rng.normal(size=(30, width)).astype(np.float32)
+    latents /= np.maximum(np.linalg.norm(latents, axis=1, keepdims=True), 1e-9)
+    scores = np.empty(neighbors.shape)
+    edge_scores(neighbors, means, covars, colors, latents, views, 0.2, 0.3, boxes, scores)
+    score = box_reference if boxes else overlap_reference
+    for i, row in enumerate(neighbors):
+        for k, j in enumerate(row):
+            own = views[i] >= 0 and views[i] == views[j]
+            unlike = latents[i] @ latents[j] < 0.3 if width else np.linalg.norm(colors[i] - colors[j]) > 0.2
+            if j < 0 or own or unlike:
+                assert scores[i, k] == -1
+            else:
+                assert scores[i, k] == pytest.approx(score(gaussians[i], gaussians[j]), rel=1e-9)
+
+
+def leaders_reference(
+    order: np.ndarray, neighbors: np.ndarray, scores: np.ndarray, views: np.ndarray, threshold: float, most: int
+) -> list[set[int]]:
+    free, clusters = set(range(len(order))), []
+    for leader in order.tolist():
+        if leader not in free:
+            continue
+        cluster = [leader]
+        free.remove(leader)
+        candidates = sorted(zip(-scores[leader], neighbors[leader].tolist(), strict=True), key=lambda pair: pair[0])
+        for score, j in candidates:
+            taken = views[j] >= 0 and views[j] in [views[m] for m in cluster[1:]]
+            if -score >= threshold and j in free and not taken and len(cluster) < most:
+                cluster.append(j)
+                free.remove(j)
+        clusters.append(set(cluster))
+    return clusters
+
+
+def as_sets(clusters: np.ndarray, count: int) -> list[set[int]]:
+    assert sorted(set(clusters.tolist())) == list(range(count))
+    return [set(np.nonzero(clusters == c)[0].tolist()) for c in range(count)]
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("most", [1, 2, 4, 9])
+def test_leader_clusters_match(seed: int, most: int) -> None:
+    rng = np.random.default_rng(seed)
+    n, k = 60, 8
+    neighbors = np.stack([rng.permutation([j for j in range(n) if j != i])[:k] for i in range(n)])
+    views = rng.integers(0, 5, n)
+    scores = rng.uniform(0, 1, (n, k))
+    scores[views[:, None] == views[neighbors]] = -1
+    order = rng.permutation(n)
+    actual = as_sets(*leader_clusters(order, neighbors, scores, views, 0.4, most))
+    assert actual == leaders_reference(order, neighbors, scores, views, 0.4, most)
+    for cluster in actual:
+        assert len(cluster) <= most
+        assert len({views[i] for i in cluster}) == len(cluster)
+
+
+def test_leaders_do_not_chain() -> None:
+    """a - b - c with no edge a - c: led by a, c stays alone; led by b, all three are one."""
+    neighbors = np.array([[1, -1], [0, 2], [1, -1]])
+    scores, views = np.where(neighbors >= 0, 0.9, -1.0), np.arange(3)
+    assert as_sets(*leader_clusters(np.array([0, 1, 2]), neighbors, scores, views, 0.5, 4)) == [{0, 1}, {2}]
+    assert as_sets(*leader_clusters(np.array([1, 0, 2]), neighbors, scores, views, 0.5, 4)) == [{0, 1, 2}]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_connected_components_match(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n, k = 80, 3
+    neighbors, scores = rng.integers(-1, n, (n, k)), rng.uniform(0, 1, (n, k))
+    scores[neighbors < 0] = -1
+    actual, count = connected_components(neighbors, scores, 0.7)
+    rows, columns = np.nonzero(scores >= 0.7)
+    edges = coo_matrix((np.ones(len(rows)), (rows, neighbors[rows, columns])), shape=(n, n))
+    wanted_count, expected = csgraph.connected_components(edges, directed=False)
+    assert count == wanted_count
+    assert len(set(zip(actual.tolist(), expected.tolist(), strict=True))) == count

@@ -1,0 +1,79 @@
+"""What other views say of points, against one point and one view at a time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import arc, make_scene, room
+
+from gsmerge.geometry import project
+from gsmerge.moments import Members, scene_members
+from gsmerge.networks.cross_view_stats import FAR, MIN_OPACITY, NEAR, cross_view_stats
+from gsmerge.runtime.threads import use_threads
+from gsmerge.types import SH_C0, Cameras, Scene
+
+
+def slowly(means: np.ndarray, sh0: np.ndarray, views: np.ndarray, members: Members, cameras: Cameras) -> np.ndarray:
+    """``[g,7]``: a loop over points and views."""
+    places, depths = project(means, cameras)
+    actual = np.zeros((len(means), 7))
+    actual[:, 6] = np.log(len(cameras)) / 4
+    for i in range(len(means)):
+        seen, kinds, color, ratios = 0, [0, 0, 0], 0.0, 0.0
+        for v in range(len(cameras)):
+            x, y = (int(np.floor(float(c))) for c in places[v, i]) if depths[v, i] > 0 else (-1, -1)
+            if v == int(views[i]) or not (0 <= x < cameras.width and 0 <= y < cameras.height):
+                continue
+            j = (v * cameras.height + y) * cameras.width + x
+            there = project(members.means[j : j + 1], cameras)[1][v, 0]
+            if not (there > 0 and members.opacities[j] > MIN_OPACITY):
+                continue
+            ratio, seen = float(np.log(depths[v, i] / there)), seen + 1
+            kinds[0 if abs(ratio) < NEAR else 1 if ratio < 0 else 2] += 1
+            if abs(ratio) < NEAR:
+                color += float(np.abs(SH_C0 * (sh0[i, 0] - members.sh0[j, 0])).mean())
+            ratios += float(np.clip(ratio, -FAR, FAR))
+        shares = [kind / max(seen, 1) for kind in kinds]
+        actual[i, :6] = [np.log1p(seen) / 3, *shares, color / max(kinds[0], 1), ratios / max(seen, 1) / FAR]
+    return actual
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return make_scene(room(), arc(4, 24, 18))
+
+
+def test_every_point_and_view(scene: Scene) -> None:
+    """Points on surfaces, before and behind them, behind cameras, and of no view."""
+    rng = np.random.default_rng(0)
+    rows = rng.permutation(len(scene.gaussians))[:160]
+    means = scene.gaussians.means[rows] * (1 + 0.1 * rng.normal(size=(160, 1)).astype(np.float32))
+    means[:8] = -means[:8]
+    views = rows // scene.pixels_per_view
+    views[8:16] = -1
+    members = scene_members(scene)
+    members.opacities[::7] = 0
+    with use_threads(2):
+        actual = cross_view_stats(means, scene.gaussians.sh0[rows], views, members, scene.cameras)
+    expected = slowly(means, scene.gaussians.sh0[rows], views, members, scene.cameras)
+    assert len(np.unique(actual[:, 0])) > 3
+    assert (expected[:, 1:4].max(0) > 0).all()
+    np.testing.assert_allclose(actual, expected, atol=1e-5)
+
+
+def test_unaligned_scenes_and_transparent_pixels_have_none() -> None:
+    scene = make_scene(room(), arc(2))
+    members, g = scene_members(scene), scene.gaussians
+    views = np.zeros(len(g), np.int64)
+    unaligned = replace(members, pixels=np.arange(len(g)))
+    clear = replace(members, opacities=np.zeros_like(members.opacities))
+    for unknown in (unaligned, clear):
+        stats = cross_view_stats(g.means, g.sh0, views, unknown, scene.cameras)
+        assert not stats[:, :6].any()
+    alone = make_scene(room(), arc(1, 24, 18))
+    own = alone.gaussians
+    stats = cross_view_stats(own.means, own.sh0, views[: len(own)], scene_members(alone), alone.cameras)
+    assert not stats.any()  # one view knows nothing
+    assert cross_view_stats(g.means[:0], g.sh0[:0], views[:0], members, scene.cameras).shape == (0, 7)

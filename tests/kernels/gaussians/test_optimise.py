@@ -1,0 +1,213 @@
+"""The optimiser's step against a slow, obvious twin in float64."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from gsmerge.kernels.gaussians.optimise import COLOR, COLUMNS, LOGIT, MAX_LOGIT, MIN_LOGIT, QUAT, SIZE, adam
+
+RATES = np.array([0.1] * 3 + [0.2] * 3 + [0.03] * 4 + [0.3] + [0.03] * 3)
+LIMITS, BETAS = np.array([2.0, 2.5, 4.0]), np.array([0.7, 0.99])
+MEAN, TURN = slice(0, SIZE), slice(QUAT, LOGIT)
+
+
+@dataclass
+class Run:
+    """All that a step reads and writes, n rows."""
+
+    x: np.ndarray
+    x0: np.ndarray
+    m: np.ndarray
+    v: np.ndarray
+    units: np.ndarray
+    box_shares: np.ndarray
+    min_sizes: np.ndarray
+    means: np.ndarray
+    quats: np.ndarray
+    scales: np.ndarray
+    opacities: np.ndarray
+    colors: np.ndarray
+
+    def copy(self) -> Run:
+        return Run(*(getattr(self, f.name).copy() for f in fields(self)))
+
+
+@dataclass
+class Wanted:
+    """Gradients of some rows, as the rasterizer gives them: of linear scales and opacities."""
+
+    ids: np.ndarray
+    means: np.ndarray
+    quats: np.ndarray
+    scales: np.ndarray
+    opacities: np.ndarray
+    colors: np.ndarray
+
+
+def make_run(count: int, seed: int = 0) -> Run:
+    rng = np.random.default_rng(seed)
+    x = rng.normal(size=(count, COLUMNS)).astype(np.float32)
+    x[:, SIZE:QUAT] -= 3
+    x[:, TURN] /= np.linalg.norm(x[:, TURN], axis=1, keepdims=True)
+    x[:, COLOR:] = rng.uniform(0, 1, (count, 3))
+    zeros = np.zeros_like(x)
+    units = rng.uniform(0.02, 0.2, count).astype(np.float32)
+    box_shares = rng.uniform(0.2, 1, count).astype(np.float32)
+    opacities = 1 / (1 + np.exp(-x[:, LOGIT]))
+    min_sizes = np.full(count, -np.inf, np.float32)
+    return Run(
+        x, x.copy(), zeros, zeros.copy(), units, box_shares, min_sizes, x[:, MEAN].copy(), x[:, TURN].copy(),
+        np.exp(x[:, SIZE:QUAT]), opacities, x[:, COLOR:].copy(),
+    )  # fmt: skip
+
+
+def gradients(count: int, seed: int, share: float = 0.6, size: float = 1.0) -> Wanted:
+    """Of a part of the rows."""
+    rng = np.random.default_rng(seed)
+    ids = np.flatnonzero(rng.random(count) < share).astype(np.int32)
+
+    def normal(*width: int) -> np.ndarray:
+        return (size * rng.normal(size=(len(ids), *width))).astype(np.float32)
+
+    return Wanted(ids, normal(3), normal(4), normal(3), normal(), normal(3))
+
+
+def step_kernel(run: Run, g: Wanted, step: int, pieces: list[int] | None = None, rates: np.ndarray = RATES) -> None:
+    edges = pieces or [0, len(g.ids)]
+    for first, last in pairwise(edges):
+        adam(
+            run.x, run.x0, run.m, run.v, run.units, run.box_shares, run.min_sizes,
+            g.ids, g.means, g.quats, g.scales, g.opacities, g.colors,
+            rates.astype(np.float32), LIMITS.astype(np.float32), BETAS.astype(np.float32), step, first, last,
+            run.means, run.quats, run.scales, run.opacities, run.colors,
+        )  # fmt: skip
+
+
+def step_slowly(run: Run, g: Wanted, step: int) -> None:
+    """The textbook, row by row and in float64 (Kingma and Ba, 2015), with what is said in the kernel's docstring."""
+    for k, i in enumerate(g.ids):
+        alpha = run.opacities[i]
+        row = np.concatenate([
+            g.means[k] * run.units[i], g.scales[k] * run.scales[i], g.quats[k],
+            [g.opacities[k] * alpha * (1 - alpha)], g.colors[k],
+        ])  # fmt: skip
+        energy = row**2
+        energy[MEAN], energy[TURN] = energy[MEAN].mean(), energy[TURN].sum() / 3  # a rotation has three freedoms
+        run.m[i] = BETAS[0] * run.m[i] + (1 - BETAS[0]) * row
+        run.v[i] = BETAS[1] * run.v[i] + (1 - BETAS[1]) * energy
+        first, second = run.m[i] / (1 - BETAS[0] ** step), run.v[i] / (1 - BETAS[1] ** step)
+        move = RATES * first / (np.sqrt(second) + 1e-15)
+        move[MEAN] *= run.units[i]
+        x, x0 = run.x[i] - move, run.x0[i]
+        way = x[MEAN] - x0[MEAN]
+        x[MEAN] = x0[MEAN] + way * min(
+            1, run.box_shares[i] * LIMITS[0] * run.units[i] / max(np.linalg.norm(way), 1e-30)
+        )
+        reach = run.box_shares[i] * LIMITS[1]
+        size = np.clip(x[SIZE:QUAT], x0[SIZE:QUAT] - reach, x0[SIZE:QUAT] + reach)
+        x[SIZE:QUAT] = np.maximum(size, run.min_sizes[i])
+        logit = np.clip(x[LOGIT], x0[LOGIT] - LIMITS[2], x0[LOGIT] + LIMITS[2])
+        x[LOGIT] = np.clip(logit, MIN_LOGIT, MAX_LOGIT)
+        x[COLOR:] = np.clip(x[COLOR:], np.minimum(x0[COLOR:], -0.05), np.maximum(x0[COLOR:], 1.05))
+        x[TURN] /= np.linalg.norm(x[TURN])
+        run.x[i] = x
+        run.means[i], run.quats[i], run.colors[i] = x[MEAN], x[TURN], x[COLOR:]
+        run.scales[i], run.opacities[i] = np.exp(x[SIZE:QUAT]), 1 / (1 + np.exp(-x[LOGIT]))
+
+
+def doubled(run: Run) -> Run:
+    return Run(*(getattr(run, f.name).astype(np.float64) for f in fields(run)))
+
+
+def test_steps_match_the_slow_twin() -> None:
+    """Thirty steps, each with gradients of other rows; long enough for many to reach the box."""
+    run = make_run(40)
+    slow = doubled(run)
+    for step in range(1, 31):
+        g = gradients(40, seed=step)
+        step_kernel(run, g, step)
+        step_slowly(slow, g, step)
+    for name in ("m", "v", "x", "means", "quats", "scales", "opacities", "colors"):
+        np.testing.assert_allclose(getattr(run, name), getattr(slow, name), rtol=2e-4, atol=2e-5, err_msg=name)
+
+
+def test_box_holds() -> None:
+    """Pulled the same way for a hundred steps."""
+    run, g = make_run(25), gradients(25, seed=1, share=1.1)
+    for step in range(1, 101):
+        step_kernel(run, g, step)
+    far = np.linalg.norm(run.x[:, MEAN] - run.x0[:, MEAN], axis=1)
+    np.testing.assert_allclose(far, 2 * run.box_shares * run.units, rtol=1e-3)
+    grown = np.abs(run.x - run.x0)[:, SIZE:QUAT]
+    np.testing.assert_allclose(grown, np.tile(2.5 * run.box_shares[:, None], 3), rtol=1e-4)
+    assert np.abs(run.x[:, LOGIT] - run.x0[:, LOGIT]).max() <= 4.0001
+    assert run.x[:, LOGIT].min() >= MIN_LOGIT
+    assert run.x[:, LOGIT].max() <= MAX_LOGIT
+    expected = np.where(g.colors > 0, np.float32(-0.05), np.float32(1.05))
+    np.testing.assert_allclose(run.x[:, COLOR:], expected, atol=1e-6)
+
+
+def test_colours_that_begin_outside_the_range_may_stay_there() -> None:
+    run = make_run(4)
+    run.x[:, COLOR:] = run.x0[:, COLOR:] = [[-0.5, 1.5, 0.5]] * 4
+    g = gradients(4, seed=0, share=1.1)
+    g.colors[:] = [[1, -1, 0]] * 4
+    step_kernel(run, g, 1)
+    np.testing.assert_array_equal(run.x[:, COLOR:], run.x0[:, COLOR:])
+    g.colors[:] = [[-1, 1, 0]] * 4
+    for step in range(2, 6):
+        step_kernel(run, g, step)
+    assert (run.x[:, COLOR] > -0.5).all()
+    assert (run.x[:, COLOR + 1] < 1.5).all()
+
+
+def test_those_without_a_gradient_stay_as_they_are() -> None:
+    """With their moments, so that the next step goes on from there."""
+    run = make_run(30)
+    for step in range(1, 10):
+        g, before = gradients(30, seed=step, share=0.5), run.copy()
+        step_kernel(run, g, step)
+        rest = np.setdiff1d(np.arange(30), g.ids)
+        assert 5 < len(rest) < 25
+        for f in fields(Run):
+            np.testing.assert_array_equal(getattr(run, f.name)[rest], getattr(before, f.name)[rest], err_msg=f.name)
+        assert (run.x[g.ids] != before.x[g.ids]).any(1).all()
+
+
+def test_least_size_holds_within_the_box_and_beyond() -> None:
+    """Pulled smaller for thirty steps: half of them may not shrink at all, one begins below what is allowed."""
+    run, g = make_run(20), gradients(20, seed=1, share=1.1)
+    g.scales[:] = 1
+    run.min_sizes[::2] = run.x[::2, SIZE:QUAT].min(1)
+    run.min_sizes[1] = run.x[1, SIZE:QUAT].max() + 5
+    for step in range(1, 31):
+        step_kernel(run, g, step)
+    assert (run.x[:, SIZE:QUAT] >= run.min_sizes[:, None]).all()
+    np.testing.assert_array_equal(run.x[::2, SIZE:QUAT].min(1), run.min_sizes[::2])
+    np.testing.assert_array_equal(run.x[1, SIZE:QUAT], run.min_sizes[1])
+    assert (run.x[3::2, SIZE:QUAT] < run.x0[3::2, SIZE:QUAT]).all()
+    np.testing.assert_allclose(run.scales, np.exp(run.x[:, SIZE:QUAT]), rtol=1e-5)
+
+
+@pytest.mark.parametrize("pieces", [[0, 1, 33], [0, 16, 33], [0, 5, 6, 6, 20, 33]])
+def test_rows_may_be_split_anywhere(pieces: list[int]) -> None:
+    whole, split = make_run(33), make_run(33)
+    for step in range(1, 8):
+        g = gradients(33, seed=step, share=1.1)
+        step_kernel(whole, g, step)
+        step_kernel(split, g, step, pieces)
+    for f in fields(Run):
+        np.testing.assert_array_equal(getattr(split, f.name), getattr(whole, f.name), err_msg=f.name)
+
+
+def test_zero_quaternion_stays_finite() -> None:
+    run = make_run(3)
+    run.x[0, TURN] = run.quats[0] = 0
+    g = gradients(3, seed=0, share=1.1)
+    g.quats[0] = 0
+    step_kernel(run, g, 1)
+    assert np.isfinite(run.x).all()

@@ -1,0 +1,189 @@
+"""Pooling and decomposition against slow, obvious numpy in float64."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gsmerge.kernels.gaussians.pool import decompose, group_members, pool
+
+
+def rotation(quat: np.ndarray) -> np.ndarray:
+    w, x, y, z = quat / np.linalg.norm(quat) if np.linalg.norm(quat) > 0 else np.array([1.0, 0, 0, 0])
+    axis = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + 2 * w * axis + 2 * axis @ axis
+
+
+def pool_reference(members: dict[str, np.ndarray], rows: list[int], own: bool) -> tuple[np.ndarray, np.ndarray]:
+    """The 13 numbers and the harmonics of one group, from the formulas in docs of the kernel."""
+    means, scales = members["means"][rows].astype(float), members["scales"][rows].astype(float)
+    opacities = np.minimum(members["opacities"][rows].astype(float), 0.995)
+    footprints = members["footprints"][rows].astype(float)
+    weights = opacities if opacities.sum() > 0 else np.ones(len(rows))
+    if own:
+        extents = scales.max(1) / footprints
+        limit = 3 * np.sort(extents)[(len(rows) - 1) // 2]
+        scales = scales * np.minimum(1, limit / np.maximum(extents, 1e-300))[:, None]
+    mean = np.average(means, axis=0, weights=weights)
+    covar = np.zeros((3, 3))
+    for m, s, q, w in zip(means, scales, members["quats"][rows].astype(float), weights / weights.sum(), strict=True):
+        half = rotation(q) * s
+        covar += w * np.outer(m - mean, m - mean) + (w * half @ half.T if own else 0)
+    footprint = np.average(footprints, weights=weights)
+    covar += np.eye(3) * (0.1 * footprint) ** 2
+    mass = (opacities * scales.prod(1)).sum() * (2 * np.pi) ** 1.5
+    largest = np.sort(scales, 1)[:, 1:].prod(1)
+    extinction = (-np.log(1 - opacities) * largest).sum()
+    upper = covar[np.triu_indices(3)]
+    return (
+        np.concatenate([mean, upper, [opacities.sum(), mass, extinction, footprint]]),
+        np.average(harmonics(members)[rows].astype(float), axis=0, weights=weights),
+    )
+
+
+def harmonics(members: dict[str, np.ndarray]) -> np.ndarray:
+    return np.concatenate([members["sh0"], members["shN"]], 1)
+
+
+def random_members(count: int, seed: int, coefficients: int = 4) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    columns = {
+        "means": rng.normal(size=(count, 3)),
+        "quats": rng.normal(size=(count, 4)) * rng.uniform(0.1, 5, (count, 1)),
+        "scales": np.exp(rng.normal(size=(count, 3)) - 3),
+        "opacities": rng.uniform(0, 1, count),
+        "sh0": rng.normal(size=(count, 1, 3)),
+        "shN": rng.normal(size=(count, coefficients - 1, 3)),
+        "footprints": rng.uniform(0.01, 0.03, count),
+    }
+    return {name: values.astype(np.float32) for name, values in columns.items()}
+
+
+def pooled(members: dict[str, np.ndarray], groups: list[list[int]], own: bool = True) -> tuple[np.ndarray, np.ndarray]:
+    starts = np.concatenate([[0], np.cumsum([len(g) for g in groups])])
+    ids = np.array([i for g in groups for i in g], np.int64)
+    geometry = np.zeros((len(groups), 13))
+    sh = np.zeros((len(groups), harmonics(members).shape[1], 3), np.float32)
+    pool(starts, ids, *members.values(), own, geometry, sh)
+    return geometry, sh
+
+
+@pytest.mark.parametrize("own", [True, False])
+@pytest.mark.parametrize("seed", range(3))
+def test_pool_matches(own: bool, seed: int) -> None:
+    members = random_members(200, seed)
+    rng = np.random.default_rng(seed)
+    groups = [sorted(rng.choice(200, size, replace=False).tolist()) for size in (1, 2, 3, 30, 160)]
+    geometry, sh = pooled(members, groups, own)
+    for g, rows in enumerate(groups):
+        expected, wanted_sh = pool_reference(members, rows, own)
+        np.testing.assert_allclose(geometry[g], expected, rtol=2e-6, atol=1e-10)
+        np.testing.assert_allclose(sh[g], wanted_sh, atol=2e-6)
+
+
+@pytest.mark.parametrize("own", [True, False])
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("opacities", 0.0), ("opacities", 1.0), ("scales", 0.02), ("quats", 0.0)],
+)
+def test_pool_matches_at_the_ends(field: str, value: float, own: bool) -> None:
+    """Transparent groups take the plain mean, opaque ones have a finite depth."""
+    members = random_members(50, 2)
+    members[field][:] = value
+    geometry, sh = pooled(members, [list(range(50)), [7]], own)
+    for g, rows in enumerate((list(range(50)), [7])):
+        expected, wanted_sh = pool_reference(members, rows, own)
+        np.testing.assert_allclose(geometry[g], expected, rtol=2e-6, atol=1e-10)
+        np.testing.assert_allclose(sh[g], wanted_sh, atol=2e-6)
+
+
+def test_members_of_a_slanted_surface_are_compared_in_footprints() -> None:
+    """They grow with depth; that is no reason to shrink the far ones."""
+    members = random_members(10, 1)
+    members["footprints"][:] = np.geomspace(0.01, 1, 10)
+    members["scales"][:] = 0.6 * members["footprints"][:, None]
+    expected, _ = pool_reference(members, list(range(10)), True)
+    np.testing.assert_allclose(pooled(members, [list(range(10))])[0][0], expected, rtol=2e-6)
+
+
+def test_far_from_the_origin_nothing_cancels() -> None:
+    members = random_members(50, 4)
+    members["means"] = (members["means"] * 0.05 + 1e4).astype(np.float32)
+    geometry, _ = pooled(members, [list(range(50))], False)
+    expected, _ = pool_reference(members, list(range(50)), False)
+    np.testing.assert_allclose(geometry[0, 3:9], expected[3:9], rtol=1e-6, atol=1e-9)
+
+
+def test_empty_groups_stay_zero() -> None:
+    geometry, sh = pooled(random_members(4, 5), [[0, 1], [], [2, 3]])
+    assert not geometry[1].any()
+    assert not sh[1].any()
+    assert geometry[2].any()
+
+
+def test_group_members_matches() -> None:
+    rng = np.random.default_rng(0)
+    labels = rng.integers(-1, 12, 500).astype(np.int32)
+    labels[labels == 7] = 3  # a label without a member
+    starts, ids = group_members(labels, 13)
+    assert starts[0] == 0
+    assert starts[-1] == len(ids) == (labels >= 0).sum()
+    for label in range(13):
+        np.testing.assert_array_equal(ids[starts[label] : starts[label + 1]], np.nonzero(labels == label)[0])
+
+
+def rebuilt(covars: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    scales, quats = np.empty((len(covars), 3)), np.empty((len(covars), 4))
+    decompose(covars, scales, quats)
+    halves = np.stack([rotation(q) for q in quats]) * scales[:, None]
+    return scales, quats, halves @ halves.transpose(0, 2, 1)
+
+
+def random_covars(seed: int, count: int = 200) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    axes = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
+    values = np.exp(rng.uniform(-12, 2, (count, 3)))
+    return np.ascontiguousarray((axes * values[:, None]) @ axes.transpose(0, 2, 1))
+
+
+def test_decompose_matches_eigh() -> None:
+    covars = random_covars(0)
+    covars = 0.5 * (covars + covars.transpose(0, 2, 1))
+    scales, quats, again = rebuilt(covars)
+    size = np.trace(covars, axis1=1, axis2=2)[:, None, None]
+    np.testing.assert_allclose(again / size, covars / size, atol=1e-13)
+    expected = np.linalg.eigvalsh(covars)
+    np.testing.assert_allclose(scales**2, expected, atol=1e-13, rtol=1e-6)
+    assert (np.diff(scales, axis=1) >= 0).all()
+    np.testing.assert_allclose(np.linalg.norm(quats, axis=1), 1, atol=1e-14)
+    assert (quats[:, 0] >= 0).all()
+
+
+@pytest.mark.parametrize(
+    "covar",
+    [
+        np.eye(3),
+        np.zeros((3, 3)),
+        np.diag([3.0, 1.0, 2.0]),
+        np.diag([1.0, 1.0, 4.0]),
+        np.outer([1.0, 2, 3], [1, 2, 3]),
+        np.ones((3, 3)) * 1e-20,
+        np.diag([1e12, 1e-12, 1.0]) + 1e-3,
+        -1e-18 * np.eye(3),
+    ],
+    ids=["equal", "zero", "unsorted", "pair", "rank one", "tiny", "wide range", "below zero by rounding"],
+)
+def test_decompose_special_cases(covar: np.ndarray) -> None:
+    scales, quats, again = rebuilt(np.ascontiguousarray(covar[None], dtype=float))
+    assert (scales >= 0).all()
+    assert np.isfinite(quats).all()
+    np.testing.assert_allclose(np.linalg.norm(quats), 1)
+    np.testing.assert_allclose(again[0], covar, atol=1e-12 * max(np.abs(covar).max(), 1e-6))
+
+
+def test_decompose_is_continuous_in_the_covariance() -> None:
+    """Axes may jump under a small change where eigenvalues meet; covariances must not."""
+    covars = np.repeat(np.diag([1.0, 1.0, 1.0 + 1e-9])[None], 50, 0)
+    nudges = np.random.default_rng(0).normal(size=(50, 3, 3)) * 1e-7
+    nudged = covars + nudges + nudges.transpose(0, 2, 1)
+    np.testing.assert_allclose(rebuilt(nudged)[2], nudged, atol=1e-12)

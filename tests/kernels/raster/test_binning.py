@@ -1,0 +1,52 @@
+"""Depth order and tile lists against sorting and loops."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gsmerge.kernels.raster import binning
+
+RNG = np.random.default_rng(0)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        np.empty(0),
+        np.ones(1),
+        np.ones(100),
+        RNG.uniform(0.01, 100, 5000),
+        RNG.lognormal(0, 20, 5000),
+        RNG.choice([0.5, 0.5000001, 2.0, 1e30], 1000),
+        np.array([1e-38, 3e38, 1.0]),
+    ],
+    ids=["none", "one", "equal", "usual", "wide", "ties", "extremes"],
+)
+def test_depth_order_is_a_stable_sort(values: np.ndarray) -> None:
+    depths = values.astype(np.float32)
+    np.testing.assert_array_equal(binning.depth_order(depths.view(np.uint32)), np.argsort(depths, kind="stable"))
+
+
+def random_boxes(count: int, lines: int, columns: int) -> np.ndarray:
+    """First and exclusive last column and row; every fifth one empty."""
+    x, y = np.sort(RNG.integers(0, columns + 1, (count, 2)), 1), np.sort(RNG.integers(0, lines + 1, (count, 2)), 1)
+    boxes = np.concatenate([x, y], 1).astype(np.int16)
+    boxes[(boxes[:, 1] == boxes[:, 0]) | (boxes[:, 3] == boxes[:, 2])] = 0
+    boxes[::5] = 0
+    return boxes
+
+
+@pytest.mark.parametrize(("lines", "columns"), [(1, 1), (1, 9), (9, 1), (5, 7)])
+def test_tile_lists(lines: int, columns: int) -> None:
+    boxes, order = random_boxes(200, lines, columns), RNG.permutation(200).astype(np.int32)
+    expected: list[list[int]] = [[] for _ in range(lines * columns)]
+    for k, (x0, x1, y0, y1) in zip(order.tolist(), boxes[order].tolist(), strict=True):
+        for y in range(y0, y1):
+            for x in range(x0, x1):
+                expected[y * columns + x].append(k)
+    counts = binning.count_tiles(boxes, lines, columns)
+    assert counts.tolist() == [len(tile) for tile in expected]
+    members, starts = np.full(counts.sum(), -1, np.int32), np.cumsum(counts) - counts
+    binning.deal_tiles(order, boxes[order], columns, starts.copy(), members)
+    assert members.tolist() == [k for tile in expected for k in tile]

@@ -1,0 +1,168 @@
+"""The array interface: against autograd through the slow renderer, finite differences, threads, hostile input."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from plan_gradients_of import assert_near, full, normal, plan_of
+from slow_renderer import BACKGROUND, HEIGHT, WIDTH, random_gaussians, render_reference, turned_cameras
+
+from gsmerge import Gaussians
+from gsmerge.render import ViewPlan, composite, plan_view, prepare
+from gsmerge.render.gradient import (
+    Gradients,
+    color_gradients,
+    plan_gradients,
+)
+from gsmerge.runtime.threads import use_threads
+
+FIELDS = ("means", "quats", "scales", "opacities", "colors")
+
+
+def gradients_of_plan(plan: ViewPlan, colors: np.ndarray, grad_left: np.ndarray | None) -> Gradients:
+    image, transmittance = composite(plan, colors, BACKGROUND)
+    return plan_gradients(
+        plan, normal(HEIGHT, WIDTH, 3), grad_left,
+        image=image, transmittance=transmittance, colors=colors, with_viewmat=True,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("eps2d", [0.075, 0.3, 1.0])
+@pytest.mark.parametrize("with_left", [False, True])
+def test_any_colours_dilations_and_transmittances(eps2d: float, with_left: bool) -> None:
+    gaussians, cameras, colors = random_gaussians(40, 0, 1), turned_cameras(1), normal(40, 3, seed=2)
+    grad_left = normal(HEIGHT, WIDTH, seed=3) if with_left else None
+    actual = gradients_of_plan(plan_of(gaussians, eps2d=eps2d), colors, grad_left)
+    names = ("means", "quats", "scales", "opacities")
+    inputs = [getattr(gaussians, name).double() for name in names] + [torch.from_numpy(colors).double()]
+    inputs = [tensor.requires_grad_() for tensor in [*inputs, cameras.viewmats[0].clone()]]
+    drawn = render_reference(*inputs, cameras.Ks[0], WIDTH, HEIGHT, background=BACKGROUND, eps2d=eps2d)
+    loss = (drawn.image * torch.from_numpy(normal(HEIGHT, WIDTH, 3))).sum()
+    if grad_left is not None:
+        loss = loss + (drawn.transmittance * torch.from_numpy(grad_left)).sum()
+    loss.backward()
+    for name, tensor in zip(FIELDS, inputs, strict=False):
+        assert_near(full(actual, name, 40), tensor.grad.numpy())
+    assert_near(actual.viewmat, inputs[-1].grad.numpy())
+
+
+def test_opacities_in_place_of_the_gaussians_own() -> None:
+    """Dropped Gaussians have no rows' worth of gradient, the others that of their given opacity."""
+    gaussians, colors = random_gaussians(40, 0, 4).numpy(), normal(40, 3)
+    keep = np.arange(40) % 4 > 0
+    given = gaussians.opacities * 0.7
+    actual = gradients_of_plan(plan_of(gaussians, opacities=given, keep=keep), colors, None)
+    assert keep[actual.ids].all()
+    kept = replace(gaussians, opacities=np.where(keep, given, 0))
+    expected = gradients_of_plan(plan_of(kept), colors, None)
+    for name in FIELDS:
+        np.testing.assert_array_equal(full(actual, name, 40), full(expected, name, 40))
+
+
+def test_finite_differences() -> None:
+    """Along the gradient, with Gaussians so wide that no weight crosses a threshold."""
+    n, grad_image, grad_left = 12, normal(HEIGHT, WIDTH, 3).astype(float), normal(HEIGHT, WIDTH, seed=1).astype(float)
+    start, middle = random_gaussians(n, 0, 9).numpy(), np.array([0, 0, 3], np.float32)
+    means = middle + 0.3 * (start.means - middle)
+    start = replace(start, means=means, scales=1.5 + 2 * start.scales, opacities=0.1 + 0.3 * start.opacities)
+    colors = normal(n, 3, seed=4)
+
+    def loss(name: str, step: np.ndarray) -> float:
+        moved, tints = start, colors
+        if name == "colors":
+            tints = colors + step.astype(np.float32)
+        else:
+            moved = replace(start, **{name: getattr(start, name) + step.astype(np.float32)})
+        image, left = composite(plan_of(moved), tints, BACKGROUND)
+        return float((image * grad_image).sum() + (left * grad_left).sum())
+
+    plan = plan_of(start)
+    image, left = composite(plan, colors, BACKGROUND)
+    actual = plan_gradients(
+        plan, grad_image.astype(np.float32), grad_left.astype(np.float32),
+        image=image, transmittance=left, colors=colors,
+    )  # fmt: skip
+    for name in FIELDS:
+        gradient = full(actual, name, n)
+        step = gradient / np.abs(gradient).max()
+        size = 5e-3
+        change = (loss(name, size * step) - loss(name, -size * step)) / (2 * size)
+        assert change == pytest.approx((gradient * step).sum(), rel=5e-3), name
+
+
+@pytest.mark.parametrize("threads", [2, 8])
+def test_threads_change_nothing(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys.modules["gsmerge.render.view_plan"], "PIECE", 200)
+    monkeypatch.setattr(sys.modules["gsmerge.render.gradient"], "WORTH", 200)
+    gaussians, cameras = random_gaussians(2000, 3, 10).numpy(), turned_cameras(1).numpy()
+    gaussians = replace(gaussians, scales=gaussians.scales * 0.3)
+    K, size = cameras.Ks[0] * [[4.0], [4.0], [1.0]], (4 * HEIGHT, 4 * WIDTH)
+    grads = normal(*size, 4)
+
+    def run(count: int) -> list[np.ndarray]:
+        with use_threads(count):
+            plan = plan_view(prepare(gaussians), cameras.viewmats[0], K, size[1], size[0])
+            assert len(plan.members) > 2000
+            image, left = composite(plan)
+            shape = plan_gradients(
+                plan, grads[..., :3], grads[..., 3], image=image, transmittance=left, with_viewmat=True
+            )
+            return [*vars(shape).values(), *vars(color_gradients(plan, shape.colors)).values()]
+
+    for one, other in zip(run(1), run(threads), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+CHANGES: dict[str, Callable[[Gaussians], dict[str, np.ndarray]]] = {
+    "huge": lambda g: {"scales": g.scales * 1e12},
+    "no extent": lambda g: {"scales": np.zeros_like(g.scales)},
+    "no rotation": lambda g: {"quats": np.zeros_like(g.quats)},
+    "long quats": lambda g: {"quats": g.quats * 1e9},
+    "too opaque": lambda g: {"opacities": np.full_like(g.opacities, 3.0)},
+    "at the camera": lambda g: {
+        "means": turned_cameras(1).numpy().centres[0].astype(np.float32) + 1e-2 * g.means,
+    },
+    "in one place": lambda g: {"means": np.array([[0.1, 0.2, 3.0]], np.float32).repeat(len(g), 0)},
+}
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("eps2d", [0.0, 0.3])
+@pytest.mark.parametrize("change", CHANGES)
+def test_finite_input_gives_finite_gradients(change: str, eps2d: float, antialiased: bool) -> None:
+    gaussians = random_gaussians(60, 2, 11).numpy()
+    gaussians = replace(gaussians, **CHANGES[change](gaussians))
+    plan = plan_of(gaussians, eps2d=eps2d, antialiased=antialiased)
+    actual = gradients_of_plan(plan, normal(60, 3), normal(HEIGHT, WIDTH))
+    for name in (*FIELDS, "viewmat"):
+        assert np.isfinite(getattr(actual, name)).all(), name
+    for array in vars(color_gradients(plan, actual.colors)).values():
+        assert np.isfinite(array).all()
+
+
+def test_a_view_of_nothing() -> None:
+    gaussians = random_gaussians(5).numpy()
+    plan = plan_of(replace(gaussians, means=gaussians.means - 100))
+    actual = gradients_of_plan(plan, normal(5, 3), None)
+    assert len(actual.ids) == len(actual.means) == len(actual.colors) == 0
+    assert (actual.viewmat == 0).all()
+
+
+@pytest.mark.parametrize("name", ["grad_image", "grad_transmittance", "image", "transmittance", "colors"])
+def test_other_shapes_are_refused(name: str) -> None:
+    plan = plan_of(random_gaussians(5))
+    arrays = {
+        "grad_image": normal(HEIGHT, WIDTH, 3),
+        "grad_transmittance": normal(HEIGHT, WIDTH),
+        "image": normal(HEIGHT, WIDTH, 3),
+        "transmittance": normal(HEIGHT, WIDTH),
+        "colors": normal(5, 3),
+    }
+    arrays[name] = arrays[name][:-1]
+    with pytest.raises(ValueError, match=rf"{name}: expected shape \[.*\], got \[.*\]"):
+        plan_gradients(plan, **arrays)

@@ -1,0 +1,117 @@
+"""The written-out blending weights against the renderer and against a dense matrix."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_gaussians import random_gaussians
+from numpy.testing import assert_allclose
+from slow_renderer import render_arrays
+
+from gsmerge.geometry import quat_to_rotmat
+from gsmerge.render import ViewPlan, composite, plan_view, prepare, splat_adjoint
+from gsmerge.render.weights import ViewWeights, apply, apply_transposed, view_weights
+from gsmerge.types import Gaussians
+
+WIDTH, HEIGHT = 45, 37  # not multiples of a tile
+K = np.array([[40.0, 0, 21.3], [0, 42.0, 19.1], [0, 0, 1]])
+
+
+def of_case(case: tuple[int, int, float]) -> Gaussians:
+    return random_gaussians(case[0], case[1], opacity=case[2])
+
+
+def planned(gaussians: Gaussians) -> tuple[ViewPlan, ViewWeights]:
+    plan = plan_view(prepare(gaussians), np.eye(4), K, WIDTH, HEIGHT)
+    return plan, view_weights(plan)
+
+
+def entry_pixels(weights: ViewWeights) -> np.ndarray:
+    """Row-major pixel of the image of every entry."""
+    tiles = np.repeat(np.arange(len(weights.offsets) - 1), np.diff(weights.offsets))
+    tiles = np.repeat(tiles, np.diff(weights.starts))
+    y = tiles // weights.columns * 16 + weights.lanes // 16
+    x = tiles % weights.columns * 16 + weights.lanes % 16
+    assert (x < WIDTH).all()
+    assert (y < HEIGHT).all()
+    return y * WIDTH + x
+
+
+def dense(weights: ViewWeights, count: int) -> np.ndarray:
+    """``[pixels,n]``."""
+    matrix, pixels = np.zeros((HEIGHT * WIDTH, count)), entry_pixels(weights)
+    for i, member in enumerate(weights.members):
+        entries = slice(weights.starts[i], weights.starts[i + 1])
+        np.add.at(matrix, (pixels[entries], weights.ids[member]), weights.weights[entries])
+    return matrix
+
+
+# many faint ones exceed the first buffer; opaque ones stop pixels early
+CASES = [(200, 0, 0.5), (3000, 1, 0.05), (3000, 2, 3.0), (1, 3, 0.5)]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_entries_are_sound(case: tuple[int, int, float]) -> None:
+    plan, weights = planned(of_case(case))
+    assert len(weights.starts) == len(plan.members) + 1
+    assert weights.starts[0] == 0
+    assert (np.diff(weights.starts) >= 0).all()
+    assert weights.starts[-1] == len(weights.lanes) == len(weights.weights)
+    assert (weights.weights > 0).all()
+    owners = weights.ids[np.repeat(weights.members, np.diff(weights.starts))].astype(np.int64)
+    assert len(np.unique(owners * HEIGHT * WIDTH + entry_pixels(weights))) == len(owners)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_apply_matches_composite_and_the_dense_matrix(case: tuple[int, int, float]) -> None:
+    gaussians = of_case(case)
+    plan, weights = planned(gaussians)
+    colors = np.random.default_rng(0).normal(size=(len(gaussians), 3))
+    image = apply(weights, colors)
+    assert_allclose(image, composite(plan, colors)[0], atol=2e-5)
+    assert_allclose(image, (dense(weights, len(gaussians)) @ colors).reshape(HEIGHT, WIDTH, 3), atol=2e-5)
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_transposed_matches_the_adjoint_and_the_dense_matrix(channels: int) -> None:
+    gaussians = random_gaussians(400, 5)
+    plan, weights = planned(gaussians)
+    image = np.random.default_rng(1).normal(size=(HEIGHT, WIDTH, channels))
+    sums = apply_transposed(weights, image)
+    assert sums.shape == (len(plan.ids), channels)
+    assert_allclose(sums, splat_adjoint(plan, image)[plan.ids], atol=2e-4)
+    expected = dense(weights, 400).T @ image.reshape(-1, channels)
+    assert_allclose(sums, expected[plan.ids], atol=2e-4)
+    left_out = np.setdiff1d(np.arange(400), plan.ids)
+    assert not expected[left_out].any()
+
+
+def test_weights_match_the_slow_renderer() -> None:
+    gaussians = random_gaussians(200, 7)
+    _, weights = planned(gaussians)
+    expected = render_arrays(gaussians, np.eye(4), K, WIDTH, HEIGHT).weights
+    error = np.abs(dense(weights, 200).T - expected.reshape(200, -1))
+    assert np.quantile(error, 0.999) < 1e-5
+    assert error.max() < 0.02  # single pixels where a threshold falls the other way
+
+
+def test_needles_lose_no_pixel() -> None:
+    """Columns are cut to what a thin slanted Gaussian can touch; nothing that blends may fall outside."""
+    gaussians = random_gaussians(300, 8)
+    needles = replace(gaussians, scales=np.array([[0.7, 1e-4, 1e-4]], np.float32).repeat(300, 0))
+    slanted = np.abs(quat_to_rotmat(needles.quats)[:, :2, 0]).min(1)
+    assert (slanted > 0.1).sum() > 100
+    plan, weights = planned(needles)
+    colors = np.random.default_rng(0).normal(size=(300, 3))
+    assert_allclose(apply(weights, colors), composite(plan, colors)[0], atol=2e-5)
+
+
+@pytest.mark.parametrize("count", [0, 5])
+def test_nothing_in_view(count: int) -> None:
+    gaussians = random_gaussians(5, 9)[:count]
+    _, weights = planned(replace(gaussians, means=gaussians.means - 10))
+    assert len(weights.lanes) == 0
+    assert not apply(weights, np.ones((count, 3))).any()
+    assert apply_transposed(weights, np.ones((HEIGHT, WIDTH, 3))).shape == (0, 3)

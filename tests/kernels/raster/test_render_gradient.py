@@ -1,0 +1,167 @@
+"""``render`` as autograd sees it, against autograd through the slow float64 renderer."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from slow_renderer import (
+    BACKGROUND,
+    NAMES,
+    assert_close,
+    leaves,
+    pixel_gradients,
+    random_gaussians,
+    reference_gradients,
+    turned_cameras,
+)
+from torch import Tensor
+
+from gsmerge import Cameras, Gaussians, render
+
+
+def gradients(
+    gaussians: Gaussians, cameras: Cameras, background: object = BACKGROUND, seed: int = 0, **options: bool
+) -> list[Tensor]:
+    *tensors, viewmats = leaves(gaussians, cameras)
+    drawn = render(Gaussians(*tensors), replace(cameras, viewmats=viewmats), background, **options)
+    grad_images, grad_alphas = pixel_gradients(cameras, seed)
+    ((drawn.images * grad_images).sum() + (drawn.alphas * grad_alphas).sum()).backward()
+    actual = [tensor.grad for tensor in (*tensors, viewmats)]
+    assert all(one is not None for one in actual)
+    return actual
+
+
+@pytest.mark.parametrize("degree", range(5))
+@pytest.mark.parametrize("seed", range(2))
+def test_every_parameter_and_degree(degree: int, seed: int) -> None:
+    gaussians, cameras = random_gaussians(40, degree, 10 * degree + seed), turned_cameras()
+    actual, expected = gradients(gaussians, cameras, seed=seed), reference_gradients(gaussians, cameras, seed=seed)
+    assert_close(actual, expected)
+    for name, one in zip(NAMES, expected, strict=True):
+        assert float(one.norm()) > 0 or (name == "shN" and degree == 0)
+
+
+@pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (-2.0, 0.3, 5.0)])
+def test_backgrounds(background: tuple[float, float, float]) -> None:
+    gaussians, cameras = random_gaussians(40), turned_cameras(1)
+    assert_close(gradients(gaussians, cameras, background), reference_gradients(gaussians, cameras, background))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_antialiased(seed: int) -> None:
+    gaussians, cameras = random_gaussians(40, 1, seed), turned_cameras()
+    gaussians = replace(gaussians, scales=gaussians.scales * 0.3)
+    assert_close(
+        gradients(gaussians, cameras, antialiased=True), reference_gradients(gaussians, cameras, antialiased=True)
+    )
+
+
+def border(g: Gaussians) -> Gaussians:
+    """Their centres beyond the clamp of the viewing direction, reaching into the image."""
+    side = torch.tensor([1.0, -1.0]).repeat(len(g) // 2)
+    means = g.means.clone()
+    means[::4, 0], means[1::4, 0] = 0.75 * means[::4, 2].abs() * side[::4], -0.9 * means[1::4, 2].abs()
+    means[2::4, 1], means[3::4, 1] = 0.8 * means[2::4, 2].abs(), -0.7 * means[3::4, 2].abs()
+    return replace(g, means=means, scales=g.scales * 5)
+
+
+DEGENERATE: dict[str, Callable[[Gaussians], Gaussians]] = {
+    "flat": lambda g: replace(g, scales=g.scales * torch.tensor([1.0, 1.0, 1e-5])),
+    "needles": lambda g: replace(g, scales=g.scales * torch.tensor([4.0, 1e-4, 1e-5])),
+    "border": border,
+    # clamped at 0.99 around their centres, and deep behind each other
+    "opaque": lambda g: replace(
+        g, opacities=torch.tensor([0.995, 1, 1]).repeat(len(g))[: len(g)], scales=g.scales * 1.5
+    ),
+    "nearly clamped": lambda g: replace(g, opacities=torch.full((len(g),), 0.989)),
+    "subpixel": lambda g: replace(g, scales=g.scales * 1e-5),
+    "wide": lambda g: replace(g, scales=g.scales * 50, opacities=g.opacities * 0.2),
+    "faint": lambda g: replace(g, opacities=torch.full((len(g),), 0.02)),
+    "dark": lambda g: replace(g, sh0=g.sh0 - 2.0),  # most colours are cut at 0
+}
+
+
+@pytest.mark.parametrize("change", DEGENERATE)
+def test_degenerate_gaussians(change: str) -> None:
+    gaussians, cameras = DEGENERATE[change](random_gaussians(40, 1, 5)), turned_cameras()
+    assert_close(gradients(gaussians, cameras), reference_gradients(gaussians, cameras))
+
+
+def test_what_is_not_drawn_has_no_gradient() -> None:
+    gaussians, cameras = random_gaussians(40, 2, 6), turned_cameras(1)
+    means, opacities = gaussians.means.clone(), gaussians.opacities.clone()
+    means[:10, 2], opacities[10:20] = -3.0, 0.0
+    actual = gradients(replace(gaussians, means=means, opacities=opacities), cameras)
+    for name, one in zip(NAMES[:-1], actual, strict=False):
+        assert (one[:20] == 0).all(), name
+        assert (one[20:] != 0).any(), name
+
+
+def test_empty_scenes_have_empty_gradients() -> None:
+    gaussians, cameras = random_gaussians(3)[:0], turned_cameras()
+    actual = gradients(gaussians, cameras)
+    assert [one.shape[0] for one in actual] == [0, 0, 0, 0, 0, 0, 2]
+    assert (actual[-1] == 0).all()
+
+
+def test_gradients_keep_types_and_only_those_asked_for_are_made() -> None:
+    gaussians, cameras = random_gaussians(30), turned_cameras(1)
+    means = gaussians.means.double().requires_grad_()
+    scales = gaussians.scales.clone().requires_grad_()
+    drawn = render(replace(gaussians, means=means, scales=scales), cameras)
+    assert drawn.images.requires_grad
+    assert drawn.alphas.requires_grad
+    drawn.images.sum().backward()
+    assert means.grad.dtype == torch.float64
+    assert scales.grad.dtype == torch.float32
+    assert gaussians.opacities.grad is None
+
+
+def test_images_are_those_without_gradients() -> None:
+    gaussians, cameras = random_gaussians(40, 1), turned_cameras()
+    plain = render(gaussians, cameras, BACKGROUND, with_depths=True)
+    *tensors, viewmats = leaves(gaussians, cameras)
+    drawn = render(Gaussians(*tensors), replace(cameras, viewmats=viewmats), BACKGROUND, with_depths=True)
+    assert torch.equal(drawn.images, plain.images)
+    assert torch.equal(drawn.alphas, plain.alphas)
+    assert torch.equal(drawn.depths, plain.depths)
+    assert not drawn.depths.requires_grad
+    with torch.no_grad():
+        assert not render(Gaussians(*tensors), cameras).images.requires_grad
+
+
+def test_overwritten_inputs_are_noticed() -> None:
+    gaussians, cameras = random_gaussians(30), turned_cameras(1)
+    scales = gaussians.scales.clone().requires_grad_()
+    drawn = render(replace(gaussians, scales=scales), cameras)
+    with torch.no_grad():
+        scales *= 2
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        drawn.images.sum().backward()
+
+
+def test_far_away_scenes_keep_their_gradients() -> None:
+    """Around a geographic position, in float64, gradients are those around zero."""
+    gaussians, cameras = random_gaussians(40, 1, 7), turned_cameras()
+    shift = torch.tensor([4.2e6, -1.3e5, 4.8e6], dtype=torch.float64)
+    viewmats = cameras.viewmats.clone()
+    viewmats[:, :3, 3] -= viewmats[:, :3, :3] @ shift
+    moved = gradients(replace(gaussians, means=gaussians.means.double() + shift), replace(cameras, viewmats=viewmats))
+    assert_close(moved[:-1], [one.double() for one in gradients(gaussians, cameras)[:-1]])
+
+
+def test_nothing_is_loaded_before_it_is_used() -> None:
+    code = (
+        "import sys, torch, gsmerge\n"
+        "g = gsmerge.Gaussians(torch.ones(1, 3), torch.ones(1, 4), torch.ones(1, 3), torch.ones(1), "
+        "torch.ones(1, 1, 3), torch.ones(1, 0, 3))\n"
+        "c = gsmerge.Cameras(torch.eye(4)[None], torch.eye(3)[None], 2, 2)\n"
+        "gsmerge.render(g, c)\n"
+        "assert not [m for m in sys.modules if m.startswith('gsmerge') and ('backward' in m or 'autograd' in m)]\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

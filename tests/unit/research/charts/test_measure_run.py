@@ -1,0 +1,139 @@
+"""Runs: records that come back whatever is beside them, measurements, pictures and superpixels alone."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import scenes
+from experiments import make_record
+
+import gsmerge
+from gsmerge.batch import BatchOptions
+from gsmerge.batch.records import DONE, FAILED, RECORDS, SKIPPED, record
+from gsmerge.io import find_scene_files
+from gsmerge.measure.evaluate import EvaluateOptions
+from gsmerge.options import CompactOptions
+from gsmerge.research.charts.measure_run import (
+    SEGMENTATIONS,
+    SHARES,
+    ChartRun,
+    RunRecord,
+    keep_pictures,
+    proxy_psnr,
+    read_runs,
+)
+from gsmerge.runtime.jsonl import append_line
+
+
+def line(run: RunRecord, **changes: Any) -> dict[str, Any]:
+    """The record of a batch that a run ends as."""
+    report = {
+        "input": {"num_gaussians": 1, "bytes": 1}, "output": {"num_gaussians": 1, "bytes": 1}, "levels": [],
+        "ratio": run.ratio, "psnr_input_views": {"before": None, "after": None}, "total_seconds": 1.0,
+        "peak_memory_bytes": 1, "unmet": None, "notes": [], "run": asdict(run),
+    }  # fmt: skip
+    return record(DONE, run.scene, run.output, key="k", files=[], report=report) | changes
+
+
+def store(folder: Path, *runs: RunRecord) -> None:
+    for run in runs:
+        append_line(folder / RECORDS, line(run))
+
+
+FERN, FOX = make_record("fern", "gsmerge", {"k": 2}, notes=("odd \u2028 line\n",)), make_record("fox", "voxel")
+
+
+def test_records_come_back_as_they_were(tmp_path: Path) -> None:
+    store(tmp_path, FERN, FOX)
+    assert read_runs(tmp_path) == ([FERN, FOX], [])
+
+
+def test_the_newest_run_counts(tmp_path: Path) -> None:
+    again = replace(FERN, seconds=1.5)
+    store(tmp_path, FERN, FOX, again)
+    assert read_runs(tmp_path) == ([FOX, again], [])
+
+
+def test_a_run_that_failed_stays_until_it_is_done(tmp_path: Path) -> None:
+    store(tmp_path, FERN)
+    append_line(tmp_path / RECORDS, record(FAILED, "fern", FERN.output, error="out of memory"))
+    (failed,), _ = read_runs(tmp_path)
+    assert (failed.scene, failed.label, failed.error) == ("fern", FERN.label, "out of memory")
+    append_line(tmp_path / RECORDS, record(SKIPPED, "fern", FERN.output))
+    assert read_runs(tmp_path)[0] == [FERN]
+
+
+def test_runs_of_other_files_under_the_same_name_are_left_out(tmp_path: Path) -> None:
+    changed = make_record("fern", "voxel", scene_sha256="ff" * 32)
+    store(tmp_path, FERN, FOX, changed)
+    records, notes = read_runs(tmp_path)
+    assert records == [FOX, changed]
+    assert notes == ["1 run(s) left out, which read other files than the last one of their scene"]
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [{"pictures": None}, {"settings": "k"}, {"settings": {"k": [1]}}, {"stages": {"fit": "long"}}, {"count": True},
+     {"scene": 3}, {"notes": [1]}, {"scores": {"psnr_target": float("inf")}}, {"seconds": 10**400}],
+    ids=str,
+)  # fmt: skip
+def test_records_of_other_kinds_of_values_are_passed_over(odd: dict[str, object], tmp_path: Path) -> None:
+    store(tmp_path, FOX)
+    other = line(FERN)
+    other["report"]["run"] |= odd
+    with (tmp_path / RECORDS).open("a") as file:
+        file.write(json.dumps(other) + "\n")
+    records, notes = read_runs(tmp_path)
+    assert records == [FOX]
+    assert "1 record(s) of another version or kind" in notes[0]
+
+
+@pytest.mark.parametrize("run", [None, [], "run", {}, asdict(FERN) | {"record_version": 99}], ids=str)
+def test_records_of_another_version_are_passed_over(run: object, tmp_path: Path) -> None:
+    store(tmp_path, FOX)
+    other = line(FERN)
+    other["report"]["run"] = run
+    append_line(tmp_path / RECORDS, other)
+    records, notes = read_runs(tmp_path)
+    assert records == [FOX]
+    assert "1 record(s) of another version or kind" in notes[0]
+
+
+def test_scores_have_names() -> None:
+    assert FERN.value("psnr_context") == FERN.scores["psnr_context"]
+    assert FERN.value("lpips_alex_target") is None
+    assert FERN.value("count") == 528
+    assert FERN.value("percent") == pytest.approx(4.4)
+
+
+@pytest.mark.parametrize("factor", [1e-4, 1e4])
+def test_units_change_no_picture(factor: float, tmp_path: Path) -> None:
+    scene = scenes.make_scene(scenes.room(), scenes.arc(2))
+    moved = scenes.move(scene, np.eye(3), factor, np.zeros(3))
+    pictures = [keep_pictures(tmp_path / name, one.gaussians, one, None) for name, one in (("a", scene), ("b", moved))]
+    assert [names for _, names in pictures] == [scene.names] * 2
+    usual, other = (cv2.imread(str(paths[0])) for paths, _ in pictures)
+    assert usual.mean() > 20
+    assert np.abs(usual.astype(int) - other).mean() < 1
+
+
+def test_superpixels_alone_are_measured_on_photos(made_scene: Path, tmp_path: Path) -> None:
+    images = gsmerge.read_scene(made_scene).images
+    coarse, fine = (proxy_psnr(images[0], count, "rdseg") for count in (20, 600))
+    assert 10 < coarse < fine - 3
+    run = ChartRun(
+        RunRecord("room", "superpixels", method="superpixels", views_asked=1), CompactOptions(), EvaluateOptions()
+    )
+    report, pictures = run.run(find_scene_files(made_scene), BatchOptions(), tmp_path / "superpixels")
+    scores = report["run"]["scores"]
+    assert len(scores) == len(SEGMENTATIONS) * len(SHARES)
+    assert scores["rdseg 0.01"] > scores["slic 0.01"]
+    assert scores["rdseg 0.1"] > scores["rdseg 0.01"]
+    assert [path.name for path in pictures] == ["superpixels.0.render.jpg"]
+    assert pictures[0].stat().st_size > 100

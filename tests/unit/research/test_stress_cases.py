@@ -1,0 +1,186 @@
+"""Stress cases: changes do what they say, and a property that does not hold is noticed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scenes
+
+from gsmerge.errors import SceneError
+from gsmerge.geometry import project
+from gsmerge.io import load_scene, read_held_out
+from gsmerge.io.scene import SceneLoad
+from gsmerge.options import CompactOptions
+from gsmerge.research.stress import CASES, cases, check, stress
+from gsmerge.research.stress.cases import StressScene
+from gsmerge.types import Scene, Views
+
+FAST = CompactOptions().with_settings({"fit": "none"})
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return scenes.make_scene(scenes.room(), scenes.arc(3))
+
+
+@pytest.fixture(scope="module")
+def load(made_scene: Path) -> SceneLoad:
+    return load_scene(made_scene)
+
+
+def offsets(scene: Scene) -> float:
+    """Largest distance (pixels) of a Gaussian from its pixel."""
+    pixels, _ = project(scene.gaussians.means, scene.cameras)
+    v, h, w = scene.valid.shape
+    own = pixels.reshape(v, v, h * w, 2)[np.arange(v), np.arange(v)].reshape(v, h, w, 2)
+    y, x = np.mgrid[:h, :w] + 0.5
+    return float(np.abs(own - np.stack([x, y], -1)).max())
+
+
+def pixel_scene(judged: StressScene) -> Scene:
+    return judged.scene
+
+
+@pytest.mark.parametrize("degrees", [0.2, 5.0])
+def test_wrong_poses_keep_every_gaussian_on_its_pixel(degrees: float, scene: Scene) -> None:
+    turned = pixel_scene(cases.perturb_poses(StressScene(scene, None), degrees))
+    assert offsets(turned) < 1e-3
+    for old, new in zip(scene.cameras.viewmats, turned.cameras.viewmats, strict=True):
+        cosine = (np.trace(new[:3, :3] @ old[:3, :3].T) - 1) / 2
+        assert np.rad2deg(np.arccos(cosine)) == pytest.approx(degrees, rel=1e-3)
+        np.testing.assert_allclose(np.linalg.inv(old)[:3, 3], np.linalg.inv(new)[:3, 3], rtol=1e-5, atol=1e-9)
+
+
+@pytest.mark.parametrize(("factor", "shift"), [(1e-4, (0, 0, 0)), (1e4, (0, 0, 0)), (1.0, (4e5, 5e6, 100))])
+def test_moved_scenes_move_their_judges(factor: float, shift: tuple[float, ...], scene: Scene) -> None:
+    views = Views(scene.cameras, scene.images, scene.names)
+    move = cases.move(StressScene(scene, views), factor, shift)
+    assert offsets(pixel_scene(move)) < 1e-2
+    np.testing.assert_allclose(move.views.cameras.viewmats, move.scene.cameras.viewmats)
+
+
+def test_exposure_changes_photos_and_colours_alike(scene: Scene) -> None:
+    changed = pixel_scene(cases.change_exposure(StressScene(scene, None), 0.2))
+    np.testing.assert_allclose(changed.images[0], 0.8 * scene.images[0], rtol=1e-5)
+    colors = (0.5 + 0.28209479 * changed.gaussians.sh0[:, 0]).reshape(changed.images.shape)
+    np.testing.assert_allclose(colors[1].clip(0, 1), changed.images[1], rtol=1e-5, atol=1e-5)
+
+
+def test_rows_that_are_spoilt(scene: Scene) -> None:
+    scene_in, n = StressScene(scene, None), len(scene.gaussians)
+    broken = pixel_scene(cases.break_rows(scene_in))
+    assert int((~broken.valid).sum()) == round(0.01 * n)
+    assert broken.gaussians.opacities[~broken.valid.reshape(-1)].max() == 0
+    large = cases.enlarge(scene_in).scene.gaussians.scales / scene.gaussians.scales
+    assert sorted(set(large[:, 0].round().tolist())) == [1.0, 8.0]
+    away = (cases.throw_away(scene_in).scene.gaussians.means != scene.gaussians.means).any(1)
+    assert int(away.sum()) == 1
+    loose = Scene(scene.gaussians, scene.cameras, scene.images, None, scene.names)
+    assert len(cases.break_rows(StressScene(loose, None)).scene.gaussians) == n - round(0.01 * n)
+
+
+def test_views_are_taken_away_shuffled_and_repeated(scene: Scene) -> None:
+    scene_in = StressScene(scene, None)
+    names = {}
+    for case in ("views-half", "views-3", "views-1", "order", "twice"):
+        change = CASES[case].change
+        assert change is not None
+        names[case] = change(scene_in).scene.names
+    assert [len(names[case]) for case in ("views-half", "views-3", "views-1")] == [1, 3, 1]
+    assert sorted(names["order"]) == sorted(scene.names)
+    assert names["twice"] == scene.names * 2
+
+
+@pytest.mark.slow
+def test_every_case_on_a_scene_with_held_out_views(load: SceneLoad, made_scene: Path) -> None:
+    read = read_held_out(load, made_scene / "targets")
+    steps: list[tuple[str, int, int]] = []
+    actual = stress(
+        load,
+        CompactOptions().with_settings({"fit_steps": 30, "superpixels": "10%"}),
+        targets=Views(read.cameras, read.images, read.names),
+        progress=lambda *step: steps.append(step),
+    )
+    assert [outcome.case for outcome in actual] == list(CASES)
+    failed = {o.case: o.measured for o in actual if o.passed is False}
+    assert failed == {}
+    assert [o.case for o in actual if o.passed is None] == ["c2w-opengl"]
+    assert steps[-1] == ("done", len(CASES), len(CASES))
+
+
+def test_a_scene_in_no_order_skips_what_needs_pixels(load: SceneLoad) -> None:
+    loose = Scene(load.scene.gaussians, load.scene.cameras, load.scene.images, None, load.scene.names)
+    actual = stress(replace(load, scene=loose, cameras=None), FAST, cases=["order", "views-3", "large", "c2w-opencv"])
+    assert [outcome.passed for outcome in actual] == [None, None, True, None]
+
+
+def test_without_photos(load: SceneLoad) -> None:
+    bare = replace(load, scene=replace(load.scene, images=None))
+    actual = stress(bare, FAST, cases=["unchanged", "exposure", "utm"])
+    assert [outcome.passed for outcome in actual] == [True, None, True]
+    assert "renders of the input" in actual[0].measured
+
+
+def spoilt(monkeypatch: pytest.MonkeyPatch, change: Any) -> None:
+    """Every run after the first one goes wrong in some way."""
+    genuine, runs = check.compact, []
+
+    def compact(scene: Any, options: CompactOptions) -> Any:
+        runs.append(scene)
+        result = genuine(scene, options)
+        return result if len(runs) == 1 else replace(result, gaussians=change(result.gaussians))
+
+    monkeypatch.setattr(check, "compact", compact)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda g: replace(g, sh0=g.sh0 + 0.5), "unchanged"),
+        (lambda g: g[::2], "unchanged"),
+        (lambda g: replace(g, scales=-g.scales), "not positive"),
+        (lambda g: replace(g, means=g.means * np.nan), "not finite"),
+        (lambda g: replace(g, quats=2 * g.quats), "unit quaternions"),
+        (lambda g: replace(g, opacities=g.opacities * 0), "outside of 0 to 1"),
+    ],
+)
+def test_what_does_not_hold_is_noticed(
+    change: Any, words: str, load: SceneLoad, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spoilt(monkeypatch, change)
+    outcome = stress(load, FAST, cases=["large"])[0]
+    assert outcome.passed is False
+    assert words in outcome.measured
+
+
+def test_threads_that_change_a_bit_are_noticed(load: SceneLoad, monkeypatch: pytest.MonkeyPatch) -> None:
+    spoilt(monkeypatch, lambda g: replace(g, opacities=g.opacities * (1 - 1e-6)))
+    assert stress(load, FAST, cases=["threads"])[0].passed is False
+
+
+def test_an_error_is_an_outcome(load: SceneLoad, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: Any) -> None:
+        raise SceneError("scene.ply", "expected mercy")
+
+    spoilt(monkeypatch, broken)
+    outcome = stress(load, FAST, cases=["views-3"])[0]
+    assert (outcome.passed, outcome.measured) == (False, "ended with: scene.ply: expected mercy")
+
+
+def test_wrong_conventions_that_are_believed_are_noticed(load: SceneLoad, monkeypatch: pytest.MonkeyPatch) -> None:
+    wrong = replace(load, scene=replace(load.scene, cameras=load.scene.cameras[[1, 0, 2, 3, 4]]))
+    monkeypatch.setattr(check, "align_scene", lambda *_, **__: wrong)
+    outcome = stress(load, FAST, cases=["w2c-opencv"])[0]
+    assert (outcome.passed, outcome.measured) == (False, "taken for something else")
+
+
+def test_bad_arguments(load: SceneLoad) -> None:
+    with pytest.raises(ValueError, match="cases: expected some of unchanged"):
+        stress(load, FAST, cases=["nonsense"])
+    bare = Scene(load.scene.gaussians, load.scene.cameras[[]], None, None, ())
+    with pytest.raises(ValueError, match="a scene with views"):
+        stress(replace(load, scene=bare), FAST)
