@@ -28,12 +28,6 @@ def test_json_and_quiet(scene_copy: Path, run: Run) -> None:
     assert (outcome.out, outcome.err) == ("", "")
 
 
-def test_an_unknown_case(scene_copy: Path, run: Run) -> None:
-    outcome = run("stress", scene_copy, "--cases", "hail")
-    assert outcome.code == 2
-    assert "expected some of unchanged" in outcome.err
-
-
 def test_a_case_that_fails_is_a_target_not_met(scene_copy: Path, run: Run) -> None:
     poor = ("--set", "fit=none", "--set", "superpixels=1%")
     outcome = run("stress", scene_copy, *poor, "--cases", "order,views-1,unchanged")

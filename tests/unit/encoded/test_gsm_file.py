@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scenes
-from damaged_files import (
+from hostile.gsm_files import (
     WILD_NUMBERS,
     Spoil,
     cut,

@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from tiny_scene import FLIP, Tiny, make_tiny, rotation
+from tiny_scene import FLIP, Tiny, edited_json, make_tiny, rotation
 
 from gsmerge.errors import SceneError
 from gsmerge.io import load_scene, read_cameras, read_held_out, scene_files
@@ -100,10 +100,9 @@ def test_poses_in_the_convention_that_the_scene_s_own_are_in(all_views: bool, ti
 
 def flip_poses(path: Path) -> None:
     """Write poses with OpenCV axes in place of the format's."""
-    document = json.loads(path.read_text())
-    for frame in document["frames"]:
-        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ FLIP).tolist()
-    path.write_text(json.dumps(document))
+    with edited_json(path) as document:
+        for frame in document["frames"]:
+            frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ FLIP).tolist()
 
 
 def assert_between(viewmat: np.ndarray, tiny: Tiny) -> None:

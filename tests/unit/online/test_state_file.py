@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from damaged_files import (
+from hostile.gsm_files import (
     WILD_NUMBERS,
     Spoil,
     cut,

@@ -10,6 +10,7 @@ import pytest
 import scenes
 from tiny_scene import (
     Tiny,
+    edited_json,
     write_colmap_text,
     write_inria,
     write_transforms,
@@ -101,9 +102,8 @@ def test_long_lrm_s_world_is_the_gaussians(tmp_path: Path, truth: tuple[np.ndarr
 def broken(kind: str, folder: Path, viewmats: np.ndarray, Ks: np.ndarray) -> Path:
     if kind == "another camera":
         path = world_mirror(folder, viewmats, Ks)
-        document = json.loads(path.read_text())
-        document["intrinsics"][0]["camera_id"] = "elsewhere"
-        path.write_text(json.dumps(document))
+        with edited_json(path) as document:
+            document["intrinsics"][0]["camera_id"] = "elsewhere"
     elif kind == "no matrix":
         path = world_mirror(folder, viewmats, Ks)
         path.write_text(json.dumps({"extrinsics": [{"camera_id": 1}], "intrinsics": []}))

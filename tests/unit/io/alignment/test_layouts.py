@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from exports import export_rows, save_export, smooth_scene
-from tiny_scene import Tiny, frames_of, write_colmap_text, write_npz
+from tiny_scene import Tiny, edited_json, frames_of, write_colmap_text, write_npz
 
 from gsmerge.errors import SceneError
 from gsmerge.io import load_scene, read_cameras, to_cameras
@@ -105,10 +105,9 @@ def test_photos_of_another_size_and_poses_read_in_another_way(
     write_cameras(tmp_path, SMOOTH, K, size)
     if mapping is not None:
         write_photos(tmp_path, SMOOTH, photos)
-    data = json.loads((tmp_path / "transforms.json").read_text())
-    for frame, pose in zip(data["frames"], from_viewmats(SMOOTH.w2c, true), strict=True):
-        frame["transform_matrix"] = pose.tolist()
-    (tmp_path / "transforms.json").write_text(json.dumps(data))
+    with edited_json(tmp_path / "transforms.json") as data:
+        for frame, pose in zip(data["frames"], from_viewmats(SMOOTH.w2c, true), strict=True):
+            frame["transform_matrix"] = pose.tolist()
     loaded = load_scene(tmp_path)
     scene = loaded.pixel_scene()
     assert np.allclose(scene.cameras.viewmats, SMOOTH.w2c)

@@ -1,8 +1,9 @@
-"""What a hostile file is: something done to a small scene, and what may come of it."""
+"""A hostile input: something done to a small scene, and what may come of it."""
 
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,16 +23,18 @@ class Case:
 
     Args:
         spoil: Changes a scene's folder; returns the arguments of the command where they are others than the folder.
-        codes: The exit codes of ``compact --dry-run`` that are right.
-        named: What the error line has to hold, if there is one.
+        codes: The exit codes of ``compact`` that are right.
+        named: The file that an error line has to name.
+        says: Further parts of the error line. A case that has some is in the default run.
     """
 
     spoil: Spoil
     codes: tuple[int, ...] = (3,)
     named: str = ""
+    says: tuple[str, ...] = ()
 
 
-READ, REFUSED, EITHER = (0,), (3,), (0, 3)
+READ, USAGE, REFUSED, EITHER = (0,), (2,), (3,), (0, 3)
 
 NUMBERS: dict[str, Any] = {
     "NaN": float("nan"), "inf": float("inf"), "-inf": float("-inf"), "1e300": 1e300, "-1": -1, "zero": 0,
@@ -80,5 +83,23 @@ def edit_json(name: str, change: Callable[[Any], Any]) -> Spoil:
 def write(name: str, content: bytes | str) -> Spoil:
     def spoil(folder: Path) -> None:
         (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
+
+    return spoil
+
+
+def remove(name: str) -> Spoil:
+    def spoil(folder: Path) -> None:
+        path = folder / name
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+    return spoil
+
+
+def both(*spoils: Spoil) -> Spoil:
+    """Several changes, one after the other."""
+
+    def spoil(folder: Path) -> None:
+        for one in spoils:
+            one(folder)
 
     return spoil

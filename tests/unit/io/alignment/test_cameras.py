@@ -39,7 +39,7 @@ def off(tiny: Tiny, degrees: float, shift: float) -> np.ndarray:
     return np.asarray(motions.random_motions(3, degrees, shift) @ tiny.w2c)
 
 
-def test_a_known_motion_is_found(large: Tiny) -> None:
+def test_a_known_motion_is_measured(large: Tiny) -> None:
     wrong = cameras_of(large, off(large, 0.7, 0.02))
     pairs = sample_pixels(large.gaussians, wrong, np.ones(len(large.gaussians), bool))
     moved = move_cameras(pairs, wrong, NAMES)

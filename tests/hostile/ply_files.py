@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .case import EITHER, HEIGHT, READ, REFUSED, VIEWS, WIDTH, Case, Spoil, sparse
+from .case import EITHER, HEIGHT, READ, REFUSED, VIEWS, WIDTH, Case, Spoil, sparse, write
 
 COUNT = VIEWS * HEIGHT * WIDTH
 COLUMNS = (
@@ -121,7 +121,16 @@ def _truncations() -> dict[str, Case]:
     sizes = {"no rows": 0, "one byte": 1, "one column": 4, "one row less a byte": ROW - 1, "one row": ROW}
     sizes |= {"all rows but one": (COUNT - 1) * ROW, "all but a byte": COUNT * ROW - 1, "one view": COUNT // 3 * ROW}
     cases |= {f"body cut to {words}": Case(cut(start + size)) for words, size in sizes.items()}
-    return cases | {"empty file": Case(cut(0)), "three bytes": Case(cut(3))}
+    counts = {"a third": COUNT // 3, "nearly all": COUNT - 1, "nothing": 0}
+    cases |= {
+        f"body cut within row {rows}": Case(cut(start + rows * ROW + 9), says=("truncated", f"found {rows} whole ones"))
+        for rows in counts.values()
+    }
+    cases["header cut"] = Case(cut(100), says=("expected a PLY header, found early end of file",))
+    contents = (b"", b"p", b"ply", b"notes, not Gaussians\n" * 100, b"\x89PNG\r\n\x1a\n", b"plywood\n")
+    for content in contents:
+        cases[f"file of {content[:8]!r}"] = Case(write("scene.ply", content), says=("scene.ply", "PLY"))
+    return cases
 
 
 def _counts() -> dict[str, Case]:
@@ -129,6 +138,7 @@ def _counts() -> dict[str, Case]:
     wrong = [-1, 0, -(2**31), COUNT + 1, 2**31 - 1, 2**31, 2**32, 2**63, 10**18, 10**30, "9" * 5000, "1e3", "0x10",
              "12.5", "nan", "", "1 2"]  # fmt: skip
     cases = {f"count {str(count)[:20]}": Case(swap(line, f"element vertex {count}")) for count in wrong}
+    cases["count 0"] = Case(swap(line, "element vertex 0"), says=("expected at least one Gaussian, found 0",))
     cases["count one less"] = Case(swap(line, f"element vertex {COUNT - 1}"), EITHER)
     for count in (-1, 2**31, 2**62):
         words = [f"element vertex {count}" if x == line else x for x in LINES]
@@ -176,6 +186,13 @@ def _headers() -> dict[str, Case]:
         "f_rest of 3000 columns": insert(last, *(f"property float f_rest_{i}" for i in range(3000))),
     }
     out = {name: Case(spoil) for name, spoil in cases.items()}
+    lacking = {"rot_3": last, "scale_1": "property float scale_1"}
+    renamed = header(lambda x: [f"property float other_{i}" if y in lacking.values() else y for i, y in enumerate(x)])
+    out["two columns missing"] = Case(renamed, says=tuple(lacking))
+    out["no vertices"] = Case(swap(vertex, f"element points {COUNT}"), says=("element 'vertex', found 'points'",))
+    out["points without a look"] = Case(
+        header(lambda x: [*x[:6], "end_header"]), says=("f_dc_0", "opacity", "scale_0", "rot_0", "rot_3")
+    )
     out["100,000 comments"] = Case(insert(vertex, *(["comment nothing"] * 100_000)))
     out["1000 comments"] = Case(insert(vertex, *(["comment nothing"] * 1000)), READ)
     out["comment that is not ascii"] = Case(insert(vertex, "comment \xff\xfe"), READ)
@@ -194,7 +211,7 @@ def _values() -> dict[str, Case]:
     every = slice(None)
     means, colors, opacity, scales, quats = slice(0, 3), slice(6, 9), slice(9, 10), slice(10, 13), slice(13, 17)
     cases = {
-        "all NaN": Case(fill(every, np.nan)),
+        "all NaN": Case(fill(every, np.nan), says=("scene.ply", "found NaN or inf in all", str(COUNT))),
         "all inf": Case(fill(every, np.inf)),
         "positions 1e38": Case(fill(means, 1e38)),
         "positions 1e-38": Case(fill(means, 1e-38), EITHER),
@@ -232,6 +249,7 @@ def _texts() -> dict[str, Case]:
         "a number missing": (lambda x: [x[0].rsplit(" ", 1)[0], *x[1:]], REFUSED),
         "a number more": (lambda x: [x[0] + " 1", *x[1:]], REFUSED),
         "a line missing": (lambda x: x[:-1], REFUSED),
+        "three lines missing": (lambda x: x[:-3], REFUSED),
         "no lines": (lambda _: [], REFUSED),
         "numbers beyond float32": (lambda x: [" ".join(["1e999"] * 17), *x[1:]], READ),
         "hexadecimal numbers": (lambda x: [" ".join(["0x1p3"] * 17), *x[1:]], REFUSED),

@@ -8,8 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
+from tiny_scene import wxyz_of
 
 from .camera_files import set_first
 from .case import EITHER, HEIGHT, NUMBERS, READ, WIDTH, Case, Spoil, names, sparse, without_transforms
@@ -109,17 +109,10 @@ def _beside_long_lrm() -> dict[str, Case]:
     }
 
 
-def wxyz(rotation: np.ndarray) -> np.ndarray:
-    vector = cv2.Rodrigues(rotation)[0][:, 0]
-    angle = float(np.linalg.norm(vector))
-    axis = vector / angle if angle > 1e-12 else np.zeros(3)
-    return np.array([np.cos(angle / 2), *(np.sin(angle / 2) * axis)])
-
-
 def colmap(c2w: np.ndarray, K: np.ndarray, *, text: bool) -> tuple[bytes, bytes]:
     """The two files of a model, as text or binary."""
     params = (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
-    poses = [np.array([*wxyz(pose[:3, :3]), *pose[:3, 3]]) for pose in np.linalg.inv(c2w)]
+    poses = [np.array([*wxyz_of(pose[None, :3, :3])[0], *pose[:3, 3]]) for pose in np.linalg.inv(c2w)]
     if text:
         lines = [
             f"{i} {' '.join(map(repr, pose.tolist()))} 1 {name}.png\n\n"

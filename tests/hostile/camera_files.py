@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .case import EITHER, NUMBERS, READ, Case, Spoil, edit_json, sparse, write
+from .case import EITHER, HEIGHT, NUMBERS, READ, VIEWS, WIDTH, Case, Spoil, both, edit_json, remove, sparse, write
 
 
 def set_first(key: str, value: Any) -> Callable[[Any], None]:
@@ -64,8 +65,19 @@ def _transforms() -> dict[str, Case]:
     cases |= {f"pose of {w}": Case(edit_json(name, set_first("transform_matrix", v))) for w, v in poses.items()}
     cases |= {f"with {word}": Case(write(name, json.dumps(data))) for word, data in contents.items()}
     cases |= {f"path {w}, no images": Case(without_images(all_places(v)), EITHER) for w, v in places.items()}
+    wrong_lens = edit_json(name, set_key("camera_model", "EQUIRECTANGULAR"))
+    cases["unknown lens"] = Case(wrong_lens, says=("EQUIRECTANGULAR", "undistort"))
+    a_third = f"{VIEWS * HEIGHT * WIDTH}", f"{2 * HEIGHT * WIDTH}", "3 views"
     cases["path with line breaks and no pose"] = Case(edit_json(name, no_pose("a\nb\r\n\x1b[2Jc")))
-    return {f"transforms: {word}": Case(c.spoil, c.codes, name) for word, c in cases.items()} | _raw_json(name)
+    lost = both(remove(name), remove("images"))
+    return {
+        **{f"transforms: {word}": replace(case, named=name) for word, case in cases.items()},
+        **_raw_json(name),
+        "transforms: a frame missing": Case(
+            edit_json(name, lambda data: data["frames"].pop() and None), named="scene.ply", says=a_third
+        ),
+        "transforms: none, no images": Case(lost, named="scene.ply", says=("no cameras", "--cameras")),
+    }
 
 
 def set_key(key: str, value: Any) -> Callable[[Any], None]:
@@ -104,13 +116,14 @@ def without_images(change: Callable[[Any], None]) -> Spoil:
 def _raw_json(name: str) -> dict[str, Case]:
     frame = b'{"frames": [{"transform_matrix": '
     contents = {
-        "nothing": b"", "zero bytes": b"\0" * 1000, "half an object": b'{"frames": [', "not UTF-8": b'{"\xff": 1}',
+        "nothing": b"", "zero bytes": b"\0" * 1000, "half an object": b"{", "not UTF-8": b'{"\xff": 1}',
         "UTF-16": '{"frames": []}'.encode("utf-16"), "100,000 brackets": b"[" * 100_000,
         "100,000 nested lists": b"[" * 100_000 + b"]" * 100_000, "100,000 nested objects": b'{"a":' * 100_000,
         "a nested pose": frame + b"[" * 900 + b"]" * 900 + b"}]}", "a number of 10,000 digits": b"9" * 10_000,
         "a key twice": b'{"frames": 1, "frames": 2}',
     }  # fmt: skip
-    cases = {f"{name}: {word}": Case(write(name, data), named=name) for word, data in contents.items()}
+    says = {"half an object": ("expected JSON",)}
+    cases = {f"{name}: {w}": Case(write(name, data), (3,), name, says.get(w, ())) for w, data in contents.items()}
     cases[f"{name}: 4 GB of zeros"] = Case(lambda folder: sparse(folder / name, 2**32), named=name)
     cases[f"{name}: cut in the middle"] = Case(halved(name), named=name)
     cases[f"{name}: with a byte order mark"] = Case(marked(name), READ)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from exports import smooth_scene
-from tiny_scene import Tiny, make_tiny
+from tiny_scene import Tiny, edited_json, make_tiny
 
 from gsmerge.errors import SceneError
 from gsmerge.io import load_scene
@@ -21,11 +20,9 @@ SMOOTH = smooth_scene(40, 30)
 
 
 def rewrite_poses(folder: Path, tiny: Tiny, convention: tuple[str, str]) -> None:
-    path = folder / "transforms.json"
-    data = json.loads(path.read_text())
-    for frame, pose in zip(data["frames"], from_viewmats(tiny.w2c, convention), strict=True):
-        frame["transform_matrix"] = pose.tolist()
-    path.write_text(json.dumps(data))
+    with edited_json(folder / "transforms.json") as data:
+        for frame, pose in zip(data["frames"], from_viewmats(tiny.w2c, convention), strict=True):
+            frame["transform_matrix"] = pose.tolist()
 
 
 def some_rows(tiny: Tiny) -> Tiny:

@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from .case import EITHER, READ, Case, Spoil
+from .case import EITHER, READ, USAGE, Case, Spoil, remove
 
 
 def renamed(name: str) -> Spoil:
@@ -130,6 +130,27 @@ CASES |= {
     "an endless folder beside the images": Case(given(make=lambda folder: endless(folder / "images" / "more")), READ),
     "a path of 2000 letters": Case(deep, READ),
     "500 empty images": Case(given(make=many_images), READ),
+    "nothing where the scene was": Case(given(make=remove("scene.ply")), says=("scene",)),
+    "an image missing": Case(
+        given(make=remove("images/view_001.png")), says=("images", "expected 3", "found 2", "view_001")
+    ),
+    "no such ply": Case(lambda folder: [folder / "nothing.ply"], says=("nothing.ply: no such file",)),
+    "no such cameras": Case(given("--cameras", "nowhere.json"), says=("nowhere.json", "no such file")),
+    "no such images": Case(given("--images", "nowhere"), says=("nowhere", "no such file")),
+    "output in no folder": Case(given("-o", "{}/nowhere/a.ply"), says=("a.ply", "nowhere")),
+    "output below a file": Case(given("-o", "{}/transforms.json/a.ply"), says=("a.ply",)),
+    "output is a folder": Case(given("-o", "{}/images"), USAGE, says=("images", "found a folder")),
+    "output is the input": Case(
+        given("-o", "{}/scene.ply", "--overwrite"), USAGE, says=("scene.ply", "other than the input")
+    ),
+    "output is the input by another name": Case(
+        given("-o", "{}/images/../scene.ply", "--overwrite"), USAGE, says=("other than the input",)
+    ),
+    "output exists": Case(
+        given(make=lambda folder: (folder / "scene.compact.ply").touch()), USAGE,
+        says=("scene.compact.ply", "--overwrite"),
+    ),
+    "report is the output": Case(given("-o", "{}/a.ply", "--report", "{}/a.ply"), USAGE, says=("a.ply",)),
     "a device as the scene": Case(lambda folder: ["/dev/zero"]),
     "nothing as the scene": Case(lambda folder: ["/dev/null"]),
     "a device as cameras": Case(given("--cameras", "/dev/zero")),
@@ -138,4 +159,4 @@ CASES |= {
     "the ply as cameras": Case(given("--cameras", "{}/scene.ply")),
     "the ply as images": Case(given("--images", "{}/scene.ply")),
     "a name of 5000 letters": Case(lambda folder: [folder / ("x" * 5000)]),
-}
+}  # fmt: skip

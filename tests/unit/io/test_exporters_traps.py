@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from exports import (
     Smooth,
-    depth_map_mask,
+    da3_rows,
     export_rows,
+    home,
     save_export,
     smooth_scene,
     turned,
@@ -20,27 +21,16 @@ from exports import (
     with_surface_rotations,
 )
 from plyfile import PlyData, PlyElement
-from tiny_scene import Tiny, rotation, write_colmap_text, write_inria, write_npz
+from tiny_scene import rotation, write_colmap_text, write_inria, write_npz
 
 from gsmerge.io import load_scene, read_ply, read_scene
-from gsmerge.types import SH_C0, Scene
+from gsmerge.types import SH_C0
 
 SMOOTH = smooth_scene(48, 36)
 
 
 UNIT = 0.01  # of the maps in the Gaussians' world: six decimals are a ten thousandth of a depth, then
 ROWS = np.arange(3 * 36 * 48).reshape(3, 36, 48)
-
-
-def home(scene: Scene, tiny: Tiny) -> float:
-    """Share of the valid pixels whose Gaussian is the one made for them, recognised by its opacity."""
-    same = np.abs(scene.gaussians.opacities - tiny.gaussians.opacities) < 1e-5
-    return float(same[scene.valid.reshape(-1)].mean())
-
-
-def da3_rows(tiny: Smooth, depths: np.ndarray | None = None) -> np.ndarray:
-    maps = tiny.depths if depths is None else depths
-    return np.concatenate([np.flatnonzero(depth_map_mask(d)) + i * d.size for i, d in enumerate(maps)])
 
 
 def along_the_rays(tiny: Smooth) -> Smooth:
@@ -254,6 +244,7 @@ def sharp_file(folder: Path, extrinsic: np.ndarray, intrinsic: np.ndarray, size:
     one = np.arange(36 * 36)
     rows = turned(export_rows(square, np.concatenate([one, one]), normals=""), square.w2c[0, :3, :3],
                   shift=square.w2c[0, :3, 3])  # fmt: skip
+    rows["opacity"][36 * 36 :] = -2
     parts = {
         "extrinsic": ("f4", extrinsic), "intrinsic": ("f4", intrinsic), "image_size": ("u4", size),
         "frame": ("i4", (1, len(rows))), "disparity": ("f4", (0.1, 0.9)), "color_space": ("u1", (0,)),
@@ -269,6 +260,8 @@ def sharp_file(folder: Path, extrinsic: np.ndarray, intrinsic: np.ndarray, size:
 @pytest.mark.parametrize("legacy", [False, True])
 def test_all_elements_of_sharp(tmp_path: Path, legacy: bool) -> None:
     size = (48, 36)
+    (tmp_path / "images").mkdir()
+    cv2.imwrite(str(tmp_path / "images" / "photo.png"), cv2.resize(smooth_scene(36, 36).images[0], size)[..., ::-1])
     K = smooth_scene(36, 36).K * np.array([[size[0] / 36], [size[1] / 36], [1.0]])
     intrinsic = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]) if legacy else K.reshape(-1)
     extrinsic = np.eye(4)[:3].reshape(-1) if legacy else np.eye(4).reshape(-1)
@@ -279,6 +272,9 @@ def test_all_elements_of_sharp(tmp_path: Path, legacy: bool) -> None:
     assert np.allclose(scene.cameras.Ks[0], square.K, atol=1e-4)
     assert set(loaded.ply.extra_elements) >= {"frame", "disparity", "color_space", "version"}
     assert "version" not in loaded.ply.columns
+    assert [d.name for d in loaded.exporters] == ["sharp"]
+    assert scene.images.shape == (2, 36, 36, 3)
+    assert np.allclose(scene.gaussians.opacities[36 * 36 :], 1 / (1 + np.exp(2)))
 
 
 # Cameras

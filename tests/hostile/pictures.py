@@ -99,6 +99,9 @@ def _spoiled() -> dict[str, Case]:
     cases["8 GB after a PNG"] = Case(
         lambda f: sparse(f / "images" / "view_000.png", 2**33, (f / "images" / "view_000.png").read_bytes())
     )
+    cases["no picture"] = Case(first(lambda data: b"no picture"), says=("view_000.png: expected an image",))
+    small = recoded(".png", mode=lambda image: cv2.resize(image, (12, 8)))
+    cases["smaller than the grid"] = Case(small, says=("24 x 16", "12 x 8"))
     cases["a bomb"] = Case(first(bomb))
     cases["three bombs"] = Case(every(bomb))
     cases["script"] = Case(first(lambda data: b"#!/bin/sh\ntouch executed\n"))

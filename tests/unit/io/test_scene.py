@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from exports import export_rows, save_export, smooth_scene
 from tiny_scene import (
     Tiny,
+    edited_json,
     frames_of,
     write_colmap_binary,
     write_colmap_text,
@@ -25,9 +27,8 @@ from gsmerge.runtime.threads import use_threads
 
 
 def rewrite(path: Path, change: Callable[[dict], None]) -> None:
-    data = json.loads(path.read_text())
-    change(data)
-    path.write_text(json.dumps(data))
+    with edited_json(path) as data:
+        change(data)
 
 
 def test_a_plain_scene(tiny_folder: Path, tiny: Tiny) -> None:
@@ -91,7 +92,11 @@ def test_rows_with_nan_keep_the_order(tmp_path: Path, tiny: Tiny) -> None:
     for row in (0, 301):
         data[start + 68 * row : start + 68 * row + 4] = np.float32(np.nan).tobytes()
     (folder / "scene.ply").write_bytes(data)
+    before = read_scene(tiny.save(tmp_path / "whole")).gaussians
     scene = read_scene(folder)
+    good = scene.valid.reshape(-1)
+    for name, column in vars(before).items():
+        assert np.array_equal(getattr(scene.gaussians, name)[good], column[good]), name
     assert scene.valid.sum() == 3 * 14 * 20 - 2
     assert not scene.valid[0, 0, 0]
     assert not scene.valid[1, 1, 1]  # 301 = 280 + 20 + 1
@@ -192,3 +197,19 @@ def test_cameras_of_another_scene_are_refused_with_what_was_measured(tiny_folder
     write_transforms(tiny_folder / "transforms.json", replace(tiny, c2w=strange))
     with pytest.raises(SceneError, match=r"found a median of up to [0-9.]+ px and 100 % .*no other convention fits"):
         read_scene(tiny_folder)
+    rewrite(tiny_folder / "transforms.json", lambda data: data.update(frames_of(tiny), cx=data["cx"] + 5))
+    with pytest.raises(SceneError, match=r"found a median of up to [45]\.[0-9] px and 100 % in front"):
+        read_scene(tiny_folder)
+
+
+def test_rows_that_only_fill_a_file_up_are_left_out(tmp_path: Path) -> None:
+    """As VolSplat writes them: at the origin, all alike."""
+    smooth = smooth_scene(24, 16)
+    rows = export_rows(smooth)
+    rows[-40:] = rows[0]
+    for name, value in (("x", 0), ("y", 0), ("z", 0), ("f_dc_0", 0.1), ("opacity", -4.6)):
+        rows[name][-40:] = value
+    rows["f_dc_1"][-1] = 0.7  # another one at the origin
+    loaded = load_scene(save_export(tmp_path, smooth, rows), order="none")
+    assert len(loaded.scene.gaussians) == len(rows) - 39
+    assert "39 rows that only fill the file up are left out" in loaded.notes

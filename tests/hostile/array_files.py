@@ -8,12 +8,13 @@ import pickle
 import struct
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .case import EITHER, HEIGHT, READ, VIEWS, WIDTH, Case, Spoil, names, sparse, without_transforms
+from .case import EITHER, HEIGHT, READ, VIEWS, WIDTH, Case, Spoil, cameras_of, names, sparse, without_transforms
 
 MARKER = "executed"
 Arrays = dict[str, Any]
@@ -32,7 +33,7 @@ class Payload:
 def arrays_of(folder: Path, kind: str) -> Arrays:
     import cv2
 
-    c2w, K = without_transforms(folder)
+    c2w, K = cameras_of(folder)
     images = np.stack([cv2.imread(str(folder / "images" / f"{name}.png"))[..., ::-1] for name in names()])
     Ks = np.tile(K, (VIEWS, 1, 1))
     if kind == "views.npz":
@@ -48,6 +49,7 @@ def arrays_of(folder: Path, kind: str) -> Arrays:
 def saved(kind: str, change: Callable[[Arrays, Path], Any]) -> Spoil:
     def spoil(folder: Path) -> None:
         arrays = arrays_of(folder, kind)
+        (folder / "transforms.json").unlink()
         change(arrays, folder)
         np.savez(folder / kind, **{name: value for name, value in arrays.items() if value is not None})
 
@@ -70,6 +72,7 @@ def zipped(kind: str, name: str, make: Callable[[Any], bytes], method: int = zip
 
     def spoil(folder: Path) -> None:
         arrays = arrays_of(folder, kind)
+        (folder / "transforms.json").unlink()
         with zipfile.ZipFile(folder / kind, "w", method) as file:
             for key, value in arrays.items():
                 file.writestr(f"{key}.npy", make(value) if key == name else member(value))
@@ -147,7 +150,7 @@ def _of_kind(kind: str, poses: str, Ks: str, images: str) -> dict[str, Case]:
     cases["a bomb of poses"] = Case(zipped(kind, poses, bomb(2**27, (2**27,))))
     for method in ("ZIP_BZIP2", "ZIP_LZMA"):
         cases[method] = Case(zipped(kind, images, member, getattr(zipfile, method)), EITHER)
-    return {f"{kind}: {word}": Case(case.spoil, case.codes, kind) for word, case in cases.items()}
+    return {f"{kind}: {word}": replace(case, named=kind) for word, case in cases.items()}
 
 
 def brackets(depth: int) -> bytes:
@@ -162,12 +165,13 @@ def _archives(kind: str) -> dict[str, Case]:
 
     def method(number: int) -> Callable[[bytes], bytes]:
         """Another method of compression in the directory."""
-        return lambda data: data.replace(b"PK\x01\x02", b"PK\x01\x02", 1) if not number else _with_method(data, number)
+        return lambda data: patched(data, 8, 10, lambda _: number)
 
     cases = {
         "nothing": lambda _: b"", "text": lambda _: b"text", "half": lambda data: data[: len(data) // 2],
         "all but the last byte": lambda data: data[:-1], "damaged in the middle": damage,
-        "an unknown compression": method(99), "deflate that is none": method(8), "encrypted": _encrypted,
+        "an unknown compression": method(99), "deflate that is none": method(8),
+        "encrypted": lambda data: patched(data, 6, 8, lambda flags: flags | 1),
         "the directory alone": lambda data: data[data.index(b"PK\x01\x02") :],
         "a single array": lambda _: member(np.zeros(3)),
     }  # fmt: skip
@@ -181,22 +185,13 @@ def _zeros(folder: Path, kind: str) -> None:
     sparse(folder / kind, 2**33)
 
 
-def _with_method(data: bytes, number: int) -> bytes:
+def patched(data: bytes, in_member: int, in_directory: int, change: Callable[[int], int]) -> bytes:
+    """Another number of 16 bits at these places of every member's head and of its line in the directory."""
     out = bytearray(data)
-    for mark, offset in ((b"PK\x03\x04", 8), (b"PK\x01\x02", 10)):
+    for mark, offset in ((b"PK\x03\x04", in_member), (b"PK\x01\x02", in_directory)):
         at = data.find(mark)
         while at >= 0:
-            out[at + offset : at + offset + 2] = struct.pack("<H", number)
-            at = data.find(mark, at + 4)
-    return bytes(out)
-
-
-def _encrypted(data: bytes) -> bytes:
-    out = bytearray(data)
-    for mark, offset in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
-        at = data.find(mark)
-        while at >= 0:
-            out[at + offset] |= 1
+            struct.pack_into("<H", out, at + offset, change(*struct.unpack_from("<H", out, at + offset)))
             at = data.find(mark, at + 4)
     return bytes(out)
 
