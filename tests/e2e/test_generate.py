@@ -10,9 +10,8 @@ import pytest
 
 from gsmerge.cli import main
 
-from .conftest import Run, assert_refused, listing
+from .conftest import COMPILING, Run, assert_refused, listing
 
-COMPILING = "compiling kernels for their first use, up to 30 s\n"
 SMALL = ("--scenes", 2, "--views", "3", "--size", "48x36")
 
 

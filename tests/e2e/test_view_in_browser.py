@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import shutil
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -19,11 +18,8 @@ from gsmerge.measure.evaluate import near_plane
 from gsmerge.render.metrics import psnr
 from gsmerge.view.data import middle_depth
 
-from .browser import Browser, browser
+from .browser import CHROMIUM, Browser, browser
 
-CHROMIUM = next(
-    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
-)
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium installed")
 SIZE = WIDTH, HEIGHT = 192, 128
 PATIENCE = 120.0  # seconds: 3D on a processor that other tests use as well

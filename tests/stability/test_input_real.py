@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+from conftest import load_script
 
 from gsmerge.io import load_scene
 
@@ -21,12 +21,7 @@ def exporter(root: Path) -> ModuleType:
     path = shared_folder(root) / "tools" / "ff_export.py"
     if not path.is_file():
         pytest.skip("no measuring data (GSMERGE_SHARED)")
-    spec = importlib.util.spec_from_file_location("ff_export", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_script(path)
 
 
 def test_a_plain_export_lines_up(exporter: ModuleType, root: Path, tmp_path: Path) -> None:
