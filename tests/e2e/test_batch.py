@@ -128,7 +128,7 @@ def test_names_by_template_and_cameras_by_template(rooms: Path, tmp_path: Path, 
     assert sorted(results(tmp_path / "out")) == ["in/0-room0.k1.ply", "in/1-room1.k1.ply"]
 
 
-def test_a_target_that_is_missed_is_told_and_the_result_kept(rooms: Path, tmp_path: Path, run: Run) -> None:
+def test_a_missed_target_ends_with_4_and_keeps_the_result(rooms: Path, tmp_path: Path, run: Run) -> None:
     arguments = ("--effort", "draft", "--quality", "90dB", "--superpixels", "1%", "--jobs", 1)
     outcome = run("batch", rooms / "room0", "--output", tmp_path, *arguments, code=4)
     assert "1 of 1 results miss the target" in outcome.err

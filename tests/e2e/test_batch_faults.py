@@ -144,7 +144,7 @@ def limited(limit: int, *arguments: object) -> tuple[int, str]:
 
 
 @pytest.mark.slow
-def test_a_full_disk_is_told_and_nothing_is_lost(rooms: Path, tmp_path: Path, undisturbed: dict[str, str]) -> None:
+def test_a_full_disk_is_one_line_and_nothing_is_lost(rooms: Path, tmp_path: Path, undisturbed: dict[str, str]) -> None:
     """Results do not fit and records do; then records do not either."""
     said = (rooms, "--output", tmp_path, *FAST, "--jobs", 1, "-q")
     code, errors = limited(30_000, *said)

@@ -66,7 +66,7 @@ def test_a_lost_node_is_survived(rooms: Path, tmp_path: Path, root: Path, undist
 
 
 @needs_ray
-def test_no_cluster_at_the_address_is_told(rooms: Path, tmp_path: Path) -> None:
+def test_no_cluster_at_the_address_is_one_line(rooms: Path, tmp_path: Path) -> None:
     process = start(rooms, "--output", tmp_path / "out", *FAST, "--engine", "ray", "--address", "127.0.0.1:1", "-q")
     errors = process.communicate()[1]
     assert process.returncode == 3

@@ -149,7 +149,7 @@ def test_another_scene_another_setting_and_rerun_do_run(copied: Path, merges: li
     assert plan["num_pending"] == 3
 
 
-def test_what_is_told_of_the_file_counts_for_all_scenes(copied: Path, run: Run) -> None:
+def test_hints_count_for_all_scenes(copied: Path, run: Run) -> None:
     (copied / "room" / "transforms.json").unlink()  # no pixels can be found, and views have to be placed
     shutil.rmtree(copied / "room" / "images")
     said = ("--hint", "order=none", "--fit", "none", "--budgets", "2%", "--proxy-views", "0", "--lpips", "none")
@@ -238,7 +238,7 @@ def test_a_grid_from_a_file(copied: Path, merges: list[CompactOptions], run: Run
     assert json.loads(outcome.out)["num_done"] == 1
 
 
-def test_missing_matplotlib_is_told_before_anything_is_run(
+def test_missing_matplotlib_is_one_line_before_anything_is_run(
     copied: Path, merges: list[CompactOptions], run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gsmerge.research.charts.find_spec", lambda name: None)

@@ -11,7 +11,7 @@ import pytest
 
 import gsmerge
 
-from .conftest import Run, listing
+from .conftest import Run
 
 SMALL = ("--superpixels", 120)
 
@@ -91,14 +91,6 @@ def test_no_folder_of_this_machine_is_in_the_file(encoded: Path, made_scene: Pat
     assert str(made_scene.parent).encode() not in encoded.read_bytes()
 
 
-@pytest.mark.parametrize("content", [b"", b"ply\nformat ascii 1.0\n", b"\x10\x00\x00\x00\x00\x00\x00\x00{}"])
-def test_other_files_are_refused_in_one_line(content: bytes, tmp_path: Path, run: Run) -> None:
-    (tmp_path / "scene.gsm").write_bytes(content)
-    outcome = run("decode", tmp_path / "scene.gsm")
-    assert (outcome.code, outcome.err.count("\n")) == (3, 1)
-    assert list(listing(tmp_path)) == ["scene.gsm"]
-
-
 def test_half_a_file_is_refused_and_nothing_is_lost(encoded: Path, tmp_path: Path, run: Run) -> None:
     (tmp_path / "scene.gsm").write_bytes(encoded.read_bytes()[:-100])
     (tmp_path / "out.ply").write_text("precious")
@@ -146,10 +138,3 @@ def test_no_normals(encoded: Path, tmp_path: Path, run: Run) -> None:
     assert sizes[0].bytes_by_attribute["normals"] == 12 * sizes[0].count
     assert "normals" not in sizes[1].bytes_by_attribute
     assert sizes[1].count == sizes[0].count
-
-
-def test_levels_in_other_formats(made_scene: Path, tmp_path: Path, run: Run) -> None:
-    out = tmp_path / "a.compressed.ply"
-    assert run("compact", made_scene, *SMALL, "--fit", "none", "--levels", 2, "-o", out).code == 0
-    assert sorted(listing(tmp_path)) == ["a.cameras.json", "a.compressed.ply", "a.level1.compressed.ply"]
-    assert len(gsmerge.read_ply(tmp_path / "a.level1.compressed.ply").gaussians) > 10

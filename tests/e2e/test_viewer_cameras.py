@@ -65,16 +65,6 @@ def test_they_are_replaced_on_request_alone(scene_copy: Path, run: Run) -> None:
     assert len(json.loads((scene_copy / "small.cameras.json").read_text())) == len(gsmerge.read_scene(scene_copy))
 
 
-def test_a_run_that_fails_leaves_neither(scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: Any, **__: Any) -> None:
-        raise gsmerge.SceneError("disk", "is full")
-
-    monkeypatch.setattr("gsmerge.compact_file.report_document", fail)
-    before = sorted(path.name for path in scene_copy.iterdir())
-    assert run("compact", scene_copy, "-o", scene_copy / "small.ply", *QUICK).code == 3
-    assert sorted(path.name for path in scene_copy.iterdir()) == before
-
-
 @pytest.mark.parametrize(
     ("output", "expected"),
     [

@@ -67,16 +67,23 @@ def _transforms() -> dict[str, Case]:
     cases |= {f"path {w}, no images": Case(without_images(all_places(v)), EITHER) for w, v in places.items()}
     wrong_lens = edit_json(name, set_key("camera_model", "EQUIRECTANGULAR"))
     cases["unknown lens"] = Case(wrong_lens, says=("EQUIRECTANGULAR", "undistort"))
-    a_third = f"{VIEWS * HEIGHT * WIDTH}", f"{2 * HEIGHT * WIDTH}", "3 views"
+    a_third = (
+        f"expected one Gaussian per pixel, 2 x {HEIGHT} x {WIDTH} = {2 * HEIGHT * WIDTH} (views x height x width), "
+        f"found {VIEWS * HEIGHT * WIDTH}; that is 3 views of this size: give the cameras of just those"
+    )
     cases["path with line breaks and no pose"] = Case(edit_json(name, no_pose("a\nb\r\n\x1b[2Jc")))
     lost = both(remove(name), remove("images"))
     return {
         **{f"transforms: {word}": replace(case, named=name) for word, case in cases.items()},
         **_raw_json(name),
         "transforms: a frame missing": Case(
-            edit_json(name, lambda data: data["frames"].pop() and None), named="scene.ply", says=a_third
+            edit_json(name, lambda data: data["frames"].pop() and None), named="scene.ply", says=(a_third,)
         ),
-        "transforms: none, no images": Case(lost, named="scene.ply", says=("no cameras", "--cameras")),
+        "transforms: none, no images": Case(
+            lost,
+            named="scene.ply",
+            says=("no cameras found next to it (looked for views.npz, transforms.json", "--cameras"),
+        ),
     }
 
 

@@ -96,7 +96,7 @@ def novel_psnr(gaussians: Gaussians) -> float:
 
 @pytest.mark.parametrize("aligned", [True, False], ids=["aligned", "unaligned"])
 @pytest.mark.parametrize(("change", "odd"), SPOILT, ids=lambda case: getattr(case, "__name__", None))
-def test_they_are_found(room: Scene, change: Callable[[Photos], Photos], odd: list[int], aligned: bool) -> None:
+def test_odd_photos_are_recognised(room: Scene, change: Callable[[Photos], Photos], odd: list[int], aligned: bool) -> None:
     assert odd_photos(with_photos(room, change, aligned=aligned)) == odd
 
 

@@ -61,7 +61,7 @@ def test_where_neither_decides_nothing_is_taken(twins: Smooth) -> None:
     assert recover(clues_of(twins, strange, SWAPPED)) is None
 
 
-def test_what_differs_in_nothing_need_not_be_told_apart(twins: Smooth) -> None:
+def test_readings_that_differ_in_nothing_need_no_decision(twins: Smooth) -> None:
     """No photos; photos that are alike."""
     alike = twins.images.copy()
     alike[1] = alike[0]

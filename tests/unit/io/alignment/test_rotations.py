@@ -57,7 +57,7 @@ def covariance_error(actual: np.ndarray, tiny: Tiny) -> np.ndarray:
 
 
 @pytest.mark.parametrize("noise", [0.0, 8.0])
-def test_the_root_is_found(tmp_path: Path, noise: float) -> None:
+def test_rotations_applied_twice_are_undone(tmp_path: Path, noise: float) -> None:
     tiny = discs(noise)
     loaded = load_scene(save_export(tmp_path, tiny, applied_twice(tiny)))
     assert any("stored with w last and each applied twice" in note for note in loaded.notes)

@@ -261,10 +261,3 @@ def test_impossible_values_are_refused(tmp_path: Path, tiny: Tiny) -> None:
         with pytest.raises(ValueError, match="expected finite Gaussians"):
             write_ply(tmp_path / "a.ply", replace(tiny.gaussians, **{field: values}))
         assert list(tmp_path.iterdir()) == []
-
-
-def test_no_gaussians_make_a_file_that_says_so(tmp_path: Path, tiny: Tiny) -> None:
-    write_ply(tmp_path / "a.ply", tiny.gaussians[:0])
-    assert PlyData.read(str(tmp_path / "a.ply"))["vertex"].count == 0
-    with pytest.raises(SceneError, match="found 0 vertices"):
-        read_ply(tmp_path / "a.ply")
