@@ -129,7 +129,6 @@ def test_settings_without_an_option_say_how_to_give_them(
 
 
 def test_the_package_names_only_options_that_exist(root: Path) -> None:
-    """In messages, notes and docstrings."""
     others = {"--help", "--version", "--debug", "--no-deps", "--force-reinstall", "--head"}
     known = others | {flag for name in COMMANDS for flag in flags_of(name)}
     files = sorted((root / "gsmerge").rglob("*.py"))

@@ -61,7 +61,6 @@ def state(states: list[Path], tmp_path: Path) -> Path:
 
 
 def digests(folder: Path) -> dict[str, str]:
-    """SHA-256 of every file."""
     return {str(p): hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
@@ -237,7 +236,6 @@ def test_a_broken_first_batch_makes_no_file(scene_copy: Path, tmp_path: Path, ru
 def test_a_state_that_another_process_changes_meanwhile(
     state: Path, states: list[Path], walks: list[Path], run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is left as the other one made it."""
     import gsmerge.online.file as files
 
     extended = files.extend

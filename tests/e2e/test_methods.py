@@ -29,7 +29,6 @@ Path(made).write_bytes("\\n".join([*lines, "end_header", ""]).encode() + rows[: 
 
 
 def program(folder: Path, text: str) -> Path:
-    """An executable script."""
     path = folder / "splat-transform"
     path.write_text(text.format(python=sys.executable))
     path.chmod(0o755)

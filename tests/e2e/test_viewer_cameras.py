@@ -31,7 +31,6 @@ def test_the_views_are_written_and_named(scene_copy: Path, run: Run) -> None:
 
 
 def test_they_are_in_the_frame_of_the_gaussians(scene_copy: Path, run: Run) -> None:
-    """Where the cameras' file is in another unit."""
     path = scene_copy / "transforms.json"
     with edited_json(path) as content:
         for frame in content["frames"]:

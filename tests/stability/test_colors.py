@@ -16,7 +16,6 @@ from gsmerge.types import SH_C0
 
 
 def novel_psnr(gaussians: Gaussians, surfaces: list[scenes.Surface], start: float = -0.25) -> float:
-    """PSNR (dB) from a place between the views."""
     camera = scenes.arc(1, start=start)
     truth = scenes.trace(surfaces, camera)[2].reshape(36, 48, 3)
     image = np.clip(scenes.images_of(gaussians, camera)[0][0], 0, 1)
@@ -53,7 +52,6 @@ def test_exposure_that_changes_between_views(room: Scene) -> None:
 
 
 def test_exposure_of_photos_and_gaussians(room: Scene) -> None:
-    """The whole command: the fit never hurts, and mostly helps."""
     assert room.images is not None
     factors = np.array([0.8, 1.2, 1 / 1.2, 1.25], np.float32)[:, None, None, None]
     scene = painted(room, 0.8 * room.images * factors)

@@ -41,7 +41,6 @@ def test_the_smallest_budget(room: Scene, settings: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("settings", [PLAIN, {"fit": "none"}, {"fit_steps": 20}], ids=str)
 def test_a_budget_of_everything(room: Scene, settings: dict[str, Any]) -> None:
-    """Every pixel its own: as many as the input, and as good."""
     result = scenes.compacted(room, superpixels="auto", budget="100%", match="none", **settings)
     assert len(result.gaussians) == room.num_gaussians
     assert scenes.psnr_of(result.gaussians, room) > scenes.psnr_of(room.gaussians, room) - 0.1
@@ -76,7 +75,6 @@ def test_four_hundred_tiny_views(settings: dict[str, Any]) -> None:
 @pytest.mark.parametrize("size", [(4096, 16), (16, 4096), (4096, 1)])
 @pytest.mark.parametrize("settings", [PLAIN, {"fit_steps": 10}], ids=str)
 def test_long_views(size: tuple[int, int], settings: dict[str, Any]) -> None:
-    """Superpixels follow the long side: neither end is lost."""
     width, height = size
     cameras = scenes.arc(2, *size)
     if height > width:

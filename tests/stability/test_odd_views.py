@@ -98,7 +98,6 @@ def test_order_of_views_does_not_matter_to_the_choice_of_start(room: Scene) -> N
 
 
 def test_order_of_views_hardly_matters_to_the_fit(room: Scene) -> None:
-    """Other blocks are held out, and the fit looks at the views in another order."""
     one, other = (scenes.compacted(s) for s in (room, scenes.take_views(room, [2, 0, 1])))
     assert len(one.gaussians) == len(other.gaussians)
     assert scenes.psnr_of(one.gaussians, room) == pytest.approx(scenes.psnr_of(other.gaussians, room), abs=0.7)
@@ -127,7 +126,6 @@ DEGREES = (0.0, 0.2, 1.0, 5.0, 20.0)
 
 
 def test_wrong_poses_degrade_step_by_step(room: Scene) -> None:
-    """Where they stay. Where photos move them they are no worse, and much better where they were worst."""
     wrong = [misplaced(room, degrees) for degrees in DEGREES[:4]]
     fixed, auto = (
         np.array([scenes.compacted(scene, poses=poses).report.psnr_after for scene in wrong], float)

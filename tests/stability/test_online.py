@@ -35,7 +35,6 @@ def forward(made: list[Scene]) -> list[Compactor]:
 
 @pytest.fixture(scope="module")
 def whole(made: list[Scene]) -> list[Compactor]:
-    """All views at once."""
     return [fed([scene]) for scene in made]
 
 
@@ -43,7 +42,6 @@ def whole(made: list[Scene]) -> list[Compactor]:
 
 
 def test_a_batch_fed_twice(made: list[Scene], whole: list[Compactor]) -> None:
-    """Count within 2 %, quality within 0.2 dB in every scene."""
     twice = [fed([scene, scene]) for scene in made]
     for one, two in zip(whole, twice, strict=True):
         assert len(one) <= len(two) <= 1.02 * len(one)

@@ -156,7 +156,6 @@ def test_what_is_not_finite_or_faint_is_left_out(half: Gaussians) -> None:
 
 
 def test_outlines_are_the_borders_of_superpixels(actual: ViewData, scene: Scene) -> None:
-    """Of the input photos alone, as compact cuts them."""
     assert actual.num_superpixels == (int(0.044 * 160 * 120),) * 2
     assert [view.outlines is None for view in actual.views] == [view.held_out for view in actual.views]
     assert scene.images is not None

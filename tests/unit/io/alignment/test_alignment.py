@@ -79,14 +79,12 @@ def test_a_tie_is_said() -> None:
 
 
 def test_one_pose_without_turn_has_fewer_readings() -> None:
-    """At the origin without a turn, both directions are the same."""
     assert [p.description for p in other_conventions(np.eye(4)[None], W2C_OPENCV)] == [
         "world-to-camera matrices with OpenGL axes"
     ]
 
 
 def test_two_readings_that_fit_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Both other directions fit equally well: nobody can tell."""
     folder = SMOOTH.save(tmp_path / "scene")
     rewrite_poses(folder, SMOOTH, W2C_OPENCV)
     true = other_conventions(SMOOTH.w2c, C2W_OPENGL)[0]

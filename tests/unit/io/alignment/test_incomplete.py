@@ -104,7 +104,6 @@ def test_colours_decide_between_near_views() -> None:
 
 
 def test_a_turned_world(tmp_path: Path) -> None:
-    """The first camera's axes: a frame that needs no pixels to be known."""
     tiny = scene_on_rays(3)
     kept = by_opacity(tiny, 0.3)
     loaded = load_scene(save_export(tmp_path, tiny, turned(export_rows(tiny, kept), tiny.w2c[0, :3, :3])))
@@ -157,7 +156,6 @@ def test_rows_without_finite_positions(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("names", [("a", "b"), ("b", "a")])  # in the order of the file, and not
 def test_two_views_of_one_pose(tmp_path: Path, names: tuple[str, str]) -> None:
-    """Nothing tells them apart, and nothing has to."""
     one = scene_on_rays(1)
     twice = replace(
         one,

@@ -56,13 +56,11 @@ def test_colours_tell_views_from_one_place_apart(twins: Smooth, true: list[int])
 
 
 def test_where_neither_decides_nothing_is_taken(twins: Smooth) -> None:
-    """Photos of something else."""
     strange = np.random.default_rng(7).integers(0, 256, twins.images.shape, np.uint8)
     assert recover(clues_of(twins, strange, SWAPPED)) is None
 
 
 def test_readings_that_differ_in_nothing_need_no_decision(twins: Smooth) -> None:
-    """No photos; photos that are alike."""
     alike = twins.images.copy()
     alike[1] = alike[0]
     for images in (None, alike, np.full_like(alike, 99)):

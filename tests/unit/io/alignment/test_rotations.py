@@ -105,7 +105,6 @@ def test_files_that_store_rotations_once(tmp_path: Path, noise: float, last: boo
 @pytest.mark.parametrize("spread", [0.0, 0.3])
 @pytest.mark.parametrize("turns", ["random", "squared"])
 def test_round_gaussians_say_nothing(tmp_path: Path, spread: float, turns: str) -> None:
-    """As round as can be, or thinner along any axis by chance."""
     tiny, rng = discs(0.0), np.random.default_rng(9)
     n = len(tiny.gaussians)
     scales = 0.03 * np.exp(spread * rng.normal(size=(n, 3))).astype(np.float32)

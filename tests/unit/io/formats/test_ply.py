@@ -296,7 +296,6 @@ def test_a_filter_of_their_own_is_passed_on(ending: str, gaussians: Gaussians, t
 
 
 def test_noise_in_a_file_is_no_traceback(tmp_path: Path) -> None:
-    """Bytes changed at random either still give Gaussians, or one of our errors."""
     rng, path, refused = np.random.default_rng(0), tmp_path, 0
     for content, ending in ((spz_bytes(corners()), ".spz"), (sog_bytes(corners()), ".sog")):
         path = tmp_path / f"a{ending}"
