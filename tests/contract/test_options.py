@@ -42,7 +42,6 @@ def expected(make: Callable[..., Any], *arguments: Any, **settings: Any) -> set[
     with pytest.raises(ValueError, match=r"expected .*, got") as error:
         make(*arguments, **settings)
     listed = re.search(r"expected (?:one of )?(.*?), (?:or \w+, )?got", str(error.value))
-    assert listed is not None
     return set(re.findall(r"[\w-]+", listed[1])) - {"or"}
 
 

@@ -44,7 +44,6 @@ def opened(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterato
     gsmerge.write_ply(wide := scene / "wide.ply", results[1])
     targets = ["--targets", str(scene / "targets")]
     assert main(["view", str(scene), str(small), str(wide), *targets, "-o", str(page), "--no-open", "-q"]) == 0
-    assert CHROMIUM is not None
     with browser(CHROMIUM, folder / "profile", "--enable-unsafe-swiftshader") as tab:
         tab.open(page)
         wait(tab, "solid !== null")
@@ -79,7 +78,6 @@ def picture(tab: Browser) -> np.ndarray:
     clip = {"x": box["x"], "y": box["y"], "width": WIDTH, "height": HEIGHT, "scale": 1}
     data = tab.call("Page.captureScreenshot", format="png", clip=clip)["data"]
     image = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
-    assert image is not None
     return np.asarray(image[..., ::-1], np.float32) / 255
 
 

@@ -157,7 +157,6 @@ def _kinds() -> dict[str, Case]:
 
 def _decoded(data: bytes) -> np.ndarray:
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    assert image is not None
     return image
 
 

@@ -220,7 +220,6 @@ def test_sky_and_foreground_stay_apart(settings: dict) -> None:
     depths = project(actual.means, scene.cameras)[1][0]
     sky_from = 7e5 if settings.get("fit") == "none" else 1e5  # a fit moves what is so far away and so large
     assert ((depths < 3) | (depths > sky_from)).all()
-    assert scene.images is not None
     far = scenes.trace(sky, scene.cameras)[1].reshape(scene.valid.shape) > 1e5
 
     def sky_psnr(gaussians: Gaussians) -> float:

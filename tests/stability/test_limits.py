@@ -32,7 +32,6 @@ def test_the_smallest_budget(room: Scene, settings: dict[str, Any]) -> None:
     assert len(result.gaussians) == VIEWS
     image, alpha = scenes.images_of(result.gaussians, room.cameras)
     assert alpha.mean() > 0.3
-    assert room.images is not None
     shown = (image * alpha[..., None]).sum((0, 1, 2)) / alpha.sum()
     assert np.abs(shown - room.images.mean((0, 1, 2))).max() < 0.25
     with pytest.raises(UsageError, match="budget"):
@@ -84,7 +83,6 @@ def test_long_views(size: tuple[int, int], settings: dict[str, Any]) -> None:
     scene = scenes.make_scene(scenes.wall(), cameras)
     result = scenes.compacted(scene, superpixels="2%", **settings)
     assert len(result.gaussians) <= 0.04 * scene.num_gaussians
-    assert scene.images is not None
     _, alpha = scenes.images_of(result.gaussians, scene.cameras)
     along = alpha.mean((0, 1)) if width > height else alpha.mean((0, 2))
     assert along[: len(along) // 16].mean() > 0.5

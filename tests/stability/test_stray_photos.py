@@ -46,7 +46,6 @@ def moved_on(photos: Photos) -> Photos:
 
 def another_scene(photos: Photos) -> Photos:
     other = scenes.make_scene(scenes.wall(9), scenes.arc(VIEWS, 96, 72)).images
-    assert other is not None
     return other
 
 
@@ -81,7 +80,6 @@ def unspoilt(room: Scene) -> CompactResult:
 
 
 def with_photos(room: Scene, change: Callable[[Photos], Photos], *, aligned: bool = True) -> Any:
-    assert room.images is not None
     scene = replace(room, images=change(room.images))
     return scene if aligned else Scene(scene.gaussians, scene.cameras, scene.images, None, scene.names)
 
@@ -199,7 +197,6 @@ def test_no_note_on_good_photos(unspoilt: CompactResult) -> None:
 
 def test_the_views_of_a_fit(room: Scene) -> None:
     full, half = fit_photos(room, FitOptions(), (0, 2, 5))
-    assert room.images is not None
     np.testing.assert_array_equal(full.images, room.images[[0, 2, 5]])
     assert len(half) == 3
     np.testing.assert_array_equal(half.viewmats, room.cameras.viewmats[[0, 2, 5]])

@@ -51,7 +51,6 @@ def enlarge(document: dict[str, float]) -> None:
 
 def shift_between(scene: Scene, scale: float) -> tuple[float, float]:
     """Where a larger photo, brought to the grid by the two cameras, fits the grid's own best, in the grid's pixels."""
-    assert scene.images is not None
     photos = large_photos(scene, scale)
     image = cv2.GaussianBlur(photos.image(1), (0, 0), 0.35 * scale)
     to_large = photos.Ks[1] @ np.linalg.inv(scene.cameras.Ks[1])
@@ -81,7 +80,6 @@ def test_cameras_may_have_the_photos_size(folder: Path) -> None:
     change_cameras(folder, enlarge)
     scene = gsmerge.read_scene(folder)
     assert (scene.cameras.width, largest_scale(scene)) == (WIDTH, pytest.approx(SCALE))
-    assert scene.large_photos is not None
     np.testing.assert_allclose(scene.large_photos.Ks, scene.cameras.Ks * [[SCALE], [SCALE], [1]])
 
 
@@ -91,7 +89,6 @@ def test_cropped_and_distorted_photos(folder: Path, k1: float) -> None:
     side = 31
     for path in sorted((folder / "images").iterdir()):
         image = cv2.imread(str(path))
-        assert image is not None
         cv2.imwrite(str(path), cv2.copyMakeBorder(image, 0, 0, side, side + 1, cv2.BORDER_REFLECT))
 
     def widen(document: dict[str, float]) -> None:
@@ -103,7 +100,6 @@ def test_cropped_and_distorted_photos(folder: Path, k1: float) -> None:
     change_cameras(folder, widen)
     scene = gsmerge.read_scene(folder)
     assert scene.aligned
-    assert scene.large_photos is not None
     assert (scene.cameras.width, scene.cameras.height) == (WIDTH, HEIGHT)
     assert WIDTH * SCALE <= scene.large_photos.width <= WIDTH * SCALE + 2
     assert scene.large_photos.read(0).shape == (scene.large_photos.height, scene.large_photos.width, 3)
@@ -113,7 +109,6 @@ def test_cropped_and_distorted_photos(folder: Path, k1: float) -> None:
 def test_photos_of_the_grids_size_are_not_large(folder: Path) -> None:
     for path in (folder / "images").iterdir():
         image = cv2.imread(str(path))
-        assert image is not None
         cv2.imwrite(str(path), cv2.resize(image, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA))
     assert gsmerge.read_scene(folder).large_photos is None
 
@@ -123,13 +118,11 @@ def test_views_of_an_unaligned_scene_are_reduced_but_not_their_photos(folder: Pa
     scene = gsmerge.read_scene(folder, order="none", max_side=WIDTH)
     assert not scene.aligned
     assert (scene.cameras.width, largest_scale(scene)) == (WIDTH, pytest.approx(SCALE))
-    assert scene.large_photos is not None
     np.testing.assert_allclose(scene.large_photos.Ks, scene.cameras.Ks * [[SCALE], [SCALE], [1]])
 
 
 def test_photos_inside_another_file(folder: Path) -> None:
     scene = gsmerge.read_scene(folder)
-    assert scene.large_photos is not None
     photos = np.stack([scene.large_photos.read(view) for view in range(len(scene))])
     camera_file = gsmerge.read_cameras(folder)
     shutil.rmtree(folder / "images")
@@ -171,7 +164,6 @@ def test_views_of_unaligned_scenes_are_resized(tmp_path: Path, order: str) -> No
     scene = loaded.scene
     assert not scene.aligned
     assert NOTE in loaded.notes
-    assert scene.images is not None
     assert scene.images.shape == (3, 72, 96, 3)
     assert (scene.cameras.width, scene.cameras.height) == (96, 72)
     assert np.allclose(scene.cameras.Ks, SMOOTH.K * np.array([[2.0], [2], [1]]))

@@ -74,7 +74,6 @@ def test_rows_sorted_by_opacity_come_to_their_pixels(tmp_path: Path, views: int,
         (folder / "images").rmdir()
     loaded = load_scene(folder)
     assert share_at_home(loaded, tiny, kept) >= 0.99
-    assert loaded.recovery is not None
     assert loaded.recovery.best.layout.order == "unordered"
     assert [d.name for d in loaded.exporters] == ["vicasplat"]
     assert any("in no order" in note for note in loaded.notes)
@@ -94,7 +93,6 @@ def test_colours_decide_between_near_views() -> None:
     wrong = []
     for color_of in (None, lambda rows, view, pixels: np.abs(base[rows] - photos[view, pixels]).mean(1)):
         layout = read_unordered(projected, color_of=color_of)
-        assert layout is not None
         at = np.full(len(kept), -1)
         for view, rows, pixels in zip(layout.views, layout.rows, layout.pixels, strict=True):
             at[rows] = view * tiny.width * tiny.height + pixels
@@ -107,7 +105,6 @@ def test_a_turned_world(tmp_path: Path) -> None:
     tiny = scene_on_rays(3)
     kept = by_opacity(tiny, 0.3)
     loaded = load_scene(save_export(tmp_path, tiny, turned(export_rows(tiny, kept), tiny.w2c[0, :3, :3])))
-    assert loaded.recovery is not None
     assert loaded.recovery.best.frame.kind == "first"
     assert share_at_home(loaded, tiny, kept) >= 0.99
 
@@ -138,7 +135,6 @@ def test_the_given_order_and_exporter(tmp_path: Path) -> None:
         loaded = load_scene(folder, **hints)
         assert share_at_home(loaded, tiny, kept) >= 0.99
         assert [d.name for d in loaded.exporters] == ["longlrm-sorted"]
-    assert loaded.recovery is not None
     assert loaded.recovery.best.frame.scale == IDENTITY.scale
     assert not load_scene(folder, order="view-major").scene.aligned
 
@@ -188,7 +184,6 @@ def test_nearly_every_row_comes_to_its_pixel(tmp_path: Path, smooth: Smooth, dro
     kept = view_fastest(smooth, dropped)
     loaded = load_scene(save_export(tmp_path, smooth, export_rows(smooth, kept)))
     scene = loaded.pixel_scene()
-    assert loaded.recovery is not None
     assert loaded.recovery.best.layout.order == "view-fastest"
     actual = np.flatnonzero(scene.valid.reshape(-1))
     wrong = np.setxor1d(actual, kept)
@@ -219,7 +214,6 @@ def test_dropped_pixels(tmp_path: Path, nested: float, dropped: float | str, siz
     c2w = tiny.c2w.copy()
     c2w[:, :3, 3] *= nested
     loaded = load_scene(save_export(tmp_path, replace(tiny, c2w=c2w), export_rows(tiny, kept)))
-    assert loaded.recovery is not None
     assert loaded.recovery.best.layout.kind == "pruned"
     assert loaded.recovery.best.frame.scale == pytest.approx(1 / nested, rel=2e-3)
     scene = loaded.pixel_scene()

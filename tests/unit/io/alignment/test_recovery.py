@@ -49,7 +49,6 @@ def test_colours_tell_views_from_one_place_apart(twins: Smooth, true: list[int])
     assert isinstance(actual, Recovery)
     assert list(actual.best.layout.views) == true
     assert actual.margin == pytest.approx(1, abs=0.1)
-    assert actual.color_margin is not None
     assert actual.color_margin > COLOR_MARGIN
     assert "which fits the pixels as well" in actual.description
     assert actual.confirmed
@@ -87,7 +86,6 @@ def test_colours_do_not_overrule_pixels() -> None:
     """Photos in the wrong order: the reading stands, and it is said that the photos do not confirm it."""
     tiny = replace(smooth_scene(48, 36), images=make_tiny(48, 36).images)
     actual = recover(clues_of(tiny, tiny.images))
-    assert actual is not None
     assert actual.confirmed is False
     assert actual.description.endswith("the photos' colours do not confirm it")
 
@@ -98,7 +96,6 @@ def test_photos_that_agree_or_cannot_tell() -> None:
     grey = replace(tiny, gaussians=replace(tiny.gaussians, sh0=np.zeros_like(tiny.gaussians.sh0)))
     for scene, images, confirmed in ((tiny, tiny.images, True), (tiny, None, None), (grey, flat, None)):
         actual = recover(clues_of(scene, images))
-        assert actual is not None
         assert actual.confirmed is confirmed
         assert "confirm" not in actual.description
 

@@ -55,7 +55,6 @@ def test_the_scene_is_picked_by_the_name_of_the_ply(tmp_path: Path) -> None:
     loaded = load_scene(tmp_path)
     scene = loaded.pixel_scene()
     assert scene.valid.all()
-    assert loaded.cameras is not None
     assert loaded.cameras.source == "re10k chunk"
     assert np.allclose(scene.cameras.Ks, SMOOTH.K, atol=1e-4)
     assert np.allclose(scene.cameras.viewmats, SMOOTH.w2c, atol=1e-6)
@@ -86,7 +85,6 @@ def test_photos_that_were_cropped(tmp_path: Path) -> None:
     rows = turned(export_rows(tiny, inner.T.reshape(-1)), tiny.w2c[0, :3, :3])
     save(tmp_path, entry(whole, "scene"))
     loaded = load_scene(save_export(tmp_path, tiny, rows, cameras=False))
-    assert loaded.alignment is not None
     assert loaded.alignment.worst_px < 0.5
     assert np.allclose(loaded.scene.cameras.Ks, tiny.K, atol=1e-3)
     assert [d.name for d in loaded.exporters] == ["depthsplat"]
