@@ -156,8 +156,7 @@ def _kinds() -> dict[str, Case]:
 
 
 def _decoded(data: bytes) -> np.ndarray:
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    return image
+    return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
 
 
 def progressive(data: bytes) -> bytes:

@@ -45,8 +45,7 @@ def moved_on(photos: Photos) -> Photos:
 
 
 def another_scene(photos: Photos) -> Photos:
-    other = scenes.make_scene(scenes.wall(9), scenes.arc(VIEWS, 96, 72)).images
-    return other
+    return scenes.make_scene(scenes.wall(9), scenes.arc(VIEWS, 96, 72)).images
 
 
 def one_of_noise(photos: Photos) -> Photos:
