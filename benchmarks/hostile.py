@@ -1,13 +1,14 @@
-"""Generated hostile inputs through the whole command: a result or one clear line, whatever a file holds.
+"""Hostile inputs through the whole command: a result or one clear line, whatever a file holds.
 
 python benchmarks/hostile.py                          # 1,000 inputs over all readers; about twenty minutes
+python benchmarks/hostile.py --table                  # those of the table in tests/hostile, which tests plan only
 python benchmarks/hostile.py --only sog "gsm, state" --count 100
 python benchmarks/hostile.py --only sog --case 17 --keep DIR    # one of them again, its files kept
 
-Each input is a sound file of its kind with something changed: bytes, words of a header, numbers, entries of a document,
-also inside what is compressed. Each runs in a process of its own with limits of memory and time, forked from one that
-has imported everything. Checked are exit code, errors, output folder, input, and the peak of memory: that of the sound
-file's run, and three times the input.
+Each generated input is a sound file of its kind with something changed: bytes, words of a header, numbers, entries of a
+document, also inside what is compressed. Each runs in a process of its own with limits of memory and processor time,
+forked from one that has imported everything. Checked are exit code, errors, output folder, input, and the peak of
+memory: that of the sound file's run, and three times the input.
 """
 
 from __future__ import annotations
@@ -22,10 +23,8 @@ import re
 import resource
 import shutil
 import signal
-import struct
 import sys
 import tempfile
-import time
 import traceback
 from collections import Counter, defaultdict
 from collections.abc import Callable
@@ -34,9 +33,14 @@ from pathlib import Path
 
 os.environ |= dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
-import cv2
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
 import numpy as np
-from hostile_changes import (
+from hostile import CASES, MARKER, array_files, camera_models, ply_files
+from hostile.case import cameras_of
+from hostile.changes import (
     Mutate,
     another_picture,
     any_of,
@@ -57,7 +61,7 @@ from gsmerge.cli import main as command
 
 ROOT = Path(__file__).resolve().parent.parent
 COUNT = 1000
-SECONDS, MEMORY = 60, 3 << 30  # limits of a process
+SECONDS, MEMORY = 100, 3 << 30  # limits of a process: of processor time; address space, bytes
 TIMES_INPUT, SLACK = 3, 32 << 20  # memory beyond the sound run's: times the input, and what differs by chance
 CODES = (0, 2, 3, 4, 5)
 FAST = ("--effort", "draft", "--set", "fit_steps=4", "--threads", "1", "--set", "checkpoint=none")
@@ -123,11 +127,15 @@ STARTED_FROM = {
 }  # kinds that are in the output folder themselves
 
 
-def make_inputs(folder: Path) -> Path:
-    """A sound file of every kind."""
-    sys.path.insert(0, str(ROOT / "examples"))
+def make_scene(folder: Path) -> Path:
     importlib.import_module("01_make_scene").make_scene(folder, num_views=3, width=24, height=16, seed=0)
     shutil.rmtree(folder / "targets")
+    return folder
+
+
+def make_inputs(folder: Path) -> Path:
+    """A sound file of every kind."""
+    make_scene(folder)
     gaussians = gsmerge.read_ply(folder / "scene.ply").gaussians
     for name in ("a.spz", "a.splat", "a.sog", "a.compressed.ply"):
         gsmerge.write_gaussians(folder / name, gaussians)
@@ -148,50 +156,21 @@ def make_inputs(folder: Path) -> Path:
 
 
 def _write_ascii(folder: Path) -> None:
-    head, body = (folder / "scene.ply").read_bytes().split(b"end_header\n", 1)
-    rows = np.frombuffer(body, "<f4").reshape(-1, head.count(b"property"))
-    text = "".join(" ".join(f"{value:.6g}" for value in row) + "\n" for row in rows)
-    head = head.replace(b"binary_little_endian", b"ascii")
-    (folder / "ascii.ply").write_bytes(head + b"end_header\n" + text.encode())
+    sound = (folder / "scene.ply").read_bytes()
+    ply_files.text(lambda rows: rows)(folder)
+    (folder / "scene.ply").rename(folder / "ascii.ply")
+    (folder / "scene.ply").write_bytes(sound)
 
 
 def _write_cameras(folder: Path) -> None:
-    (folder / "cameras").mkdir()
-    data = json.loads((folder / "transforms.json").read_text())
-    flip = np.diag([1.0, -1.0, -1.0, 1.0])
-    c2w = np.array([frame["transform_matrix"] for frame in data["frames"]]) @ flip
-    focal, centre, size = (data["fl_x"], data["fl_y"]), (data["cx"], data["cy"]), (data["w"], data["h"])
-    K = np.array([[focal[0], 0, centre[0]], [0, focal[1], centre[1]], [0, 0, 1.0]])
-    names = [Path(frame["file_path"]).name for frame in data["frames"]]
-    images = np.stack([cv2.imread(str(folder / "images" / name))[..., ::-1] for name in names])
-    np.savez(folder / "cameras" / "views.npz", c2w=c2w, K=np.tile(K, (3, 1, 1)), images=images)
-    cameras = [
-        {"id": i, "img_name": names[i], "width": size[0], "height": size[1], "position": pose[:3, 3].tolist(),
-         "rotation": pose[:3, :3].tolist(), "fx": focal[0], "fy": focal[1]}
-        for i, pose in enumerate(c2w)
-    ]  # fmt: skip
-    (folder / "cameras" / "cameras.json").write_text(json.dumps(cameras))
-    text, binary = [], struct.pack("<Q", len(names))
-    for i, pose in enumerate(np.linalg.inv(c2w), 1):
-        quat, shift = _quaternion(pose[:3, :3]), pose[:3, 3]
-        numbers = " ".join(repr(float(value)) for value in (*quat, *shift))
-        text += [f"{i} {numbers} 1 {names[i - 1]}", ""]
-        binary += struct.pack("<i7di", i, *quat, *shift, 1) + names[i - 1].encode() + b"\0" + struct.pack("<Q", 0)
-    for name in ("text", "binary"):
-        (folder / "cameras" / name).mkdir()
-    line = f"1 PINHOLE {size[0]} {size[1]} {focal[0]} {focal[1]} {centre[0]} {centre[1]}\n"
-    (folder / "cameras" / "text" / "cameras.txt").write_text(line)
-    (folder / "cameras" / "text" / "images.txt").write_text("\n".join(text) + "\n")
-    camera = struct.pack("<QiiQQ4d", 1, 1, 1, *size, *focal, *centre)
-    (folder / "cameras" / "binary" / "cameras.bin").write_bytes(camera)
-    (folder / "cameras" / "binary" / "images.bin").write_bytes(binary)
-
-
-def _quaternion(rotation: np.ndarray) -> np.ndarray:
-    """wxyz of a rotation that is not by half a turn."""
-    w = np.sqrt(max(1 + np.trace(rotation), 1e-12)) / 2
-    r = rotation
-    return np.array([w, *(np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]]) / (4 * w))])
+    (c2w, K), place = cameras_of(folder), folder / "cameras"
+    place.mkdir()
+    np.savez(place / "views.npz", **array_files.arrays_of(folder, "views.npz"))
+    (place / "cameras.json").write_text(json.dumps(camera_models.inria(c2w, K)))
+    for name, suffix in (("text", "txt"), ("binary", "bin")):
+        (place / name).mkdir()
+        for part, data in zip(("cameras", "images"), camera_models.colmap(c2w, K, text=name == "text"), strict=True):
+            (place / name / f"{part}.{suffix}").write_bytes(data)
 
 
 @dataclass(frozen=True)
@@ -201,12 +180,12 @@ class Outcome:
     code: int  # exit code, or minus the signal that ended it
     err: str
     peak: int  # bytes beyond those of the process that it was forked from
-    seconds: float
+    seconds: float  # of processor time
 
 
 def run_forked(words: list[str], place: Path) -> Outcome:
     """The command in a child of this process, in limits."""
-    start, base = time.perf_counter(), _memory()[1]
+    base = _memory()[1]
     pid = os.fork()
     if pid == 0:
         code = 99
@@ -222,7 +201,7 @@ def run_forked(words: list[str], place: Path) -> Outcome:
     _, status, usage = os.wait4(pid, 0)
     err = (place / "err").read_text(errors="backslashreplace")
     peak = (usage.ru_maxrss << 10) - base
-    return Outcome(os.waitstatus_to_exitcode(status), err, peak, time.perf_counter() - start)
+    return Outcome(os.waitstatus_to_exitcode(status), err, peak, usage.ru_utime + usage.ru_stime)
 
 
 def _limit(place: Path) -> None:
@@ -230,7 +209,7 @@ def _limit(place: Path) -> None:
         descriptor = os.open(place / name, os.O_CREAT | os.O_WRONLY | os.O_TRUNC, 0o666)
         os.dup2(descriptor, number)
     resource.setrlimit(resource.RLIMIT_AS, (_memory()[0] + MEMORY,) * 2)
-    signal.setitimer(signal.ITIMER_REAL, SECONDS)
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)
 
 
 def _memory() -> list[int]:
@@ -261,6 +240,34 @@ def try_kind(name: str, inputs: Path, place: Path, rng: random.Random | None) ->
         faults.append("the input has changed")
     faults += _check_outputs(name, outcome.code, out, earlier)
     return outcome, faults, sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+def try_case(name: str, scene: Path, place: Path) -> list[str]:
+    """Faults of an input of the table that is compacted for real."""
+    shutil.rmtree(place, ignore_errors=True)
+    folder, case = Path(shutil.copytree(scene, place / "in" / "scene")), CASES[name]
+    words = [str(word) for word in case.spoil(folder) or [folder]]
+    before = contents(folder.parent)
+    outcome = run_forked(["compact", *FAST, *(["--"] if words[0].startswith("-") else []), *words], place)
+    faults = _check_end(outcome) + ([f"exit code {outcome.code}"] if outcome.code not in case.codes else [])
+    if outcome.code and contents(folder.parent) != before:
+        faults.append("something was written")
+    if list(place.rglob(MARKER)):
+        faults.append("something was executed")
+    return [f"{fault}: {outcome.err.strip()[-300:]!r}" for fault in faults]
+
+
+def run_table(folder: Path) -> int:
+    """Number of inputs of the table with faults, which are printed."""
+    scene = make_scene(folder / "sound")
+    words = ["compact", str(scene), "-o", str(folder / "a.ply"), *FAST]
+    if command(words):
+        raise SystemExit("the sound scene failed")
+    faulty = {name: faults for name in CASES if (faults := try_case(name, scene, folder / "place"))}
+    for name, faults in faulty.items():
+        print(f"{name}: {'; '.join(faults)}", flush=True)
+    print(f"{len(CASES)} inputs of the table, {len(faulty)} with faults")
+    return len(faulty)
 
 
 def _check_end(outcome: Outcome) -> list[str]:
@@ -321,8 +328,12 @@ def main() -> None:
     parser.add_argument("--case", type=int, help="this one of each kind alone")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--keep", type=Path, help="folder for the files of the last input")
+    parser.add_argument("--table", action="store_true", help="the inputs of tests/hostile in place of generated ones")
     args = parser.parse_args()
     bad = 0
+    if args.table:
+        with tempfile.TemporaryDirectory() as folder:
+            sys.exit(1 if run_table(Path(folder)) else 0)
     with tempfile.TemporaryDirectory() as folder:
         inputs, place = make_inputs(Path(folder) / "inputs"), args.keep or Path(folder) / "place"
         peaks, shares = warm(inputs, Path(folder) / "warm"), sum(KINDS[name].share for name in args.only)

@@ -7,6 +7,8 @@ import hashlib
 import json
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from gsmerge.batch.task import BatchContext, Task, run_task
 from gsmerge.options import CompactOptions
 
 NAMES = [f"room{number}.ply" for number in range(4)]  # results of the fixture ``rooms``
+PATIENCE = 180  # seconds, on a machine that is busy with other things
 FAST = ("--effort", "draft", "--fit", "none")
 QUICK = BatchOptions(CompactOptions().with_settings({"effort": "draft", "fit": "none", "threads": 1}))
 
@@ -57,6 +60,17 @@ def finish(*arguments: object) -> int:
     process = start(*arguments)
     process.communicate()
     return process.returncode
+
+
+def until(condition: Callable[[], Any], process: subprocess.Popen[str]) -> Any:
+    """Wait for a condition; returns what it comes to, or None if the process ended before."""
+    deadline = time.monotonic() + PATIENCE
+    while not (actual := condition()):
+        if process.poll() is not None:
+            return None
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+    return actual
 
 
 def holders(folder: Path) -> list[int]:

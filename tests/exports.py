@@ -9,10 +9,10 @@ from typing import Any
 import cv2
 import numpy as np
 from plyfile import PlyData, PlyElement
-from tiny_scene import Tiny, make_tiny, rotation, write_images, write_transforms
+from tiny_scene import Tiny, make_tiny, rotation, write_images, write_transforms, wxyz_of
 
 from gsmerge.geometry import quat_to_rotmat
-from gsmerge.types import SH_C0
+from gsmerge.types import SH_C0, Scene
 
 
 @dataclass(frozen=True)
@@ -109,17 +109,6 @@ def turned(
     return out
 
 
-def wxyz_of(matrices: np.ndarray) -> np.ndarray:
-    """``[n,3,3]`` rotations -> ``[n,4]``, one after the other."""
-    quats = []
-    for matrix in matrices:
-        vector = cv2.Rodrigues(np.ascontiguousarray(matrix))[0][:, 0]
-        angle = float(np.linalg.norm(vector))
-        axis = vector / angle if angle > 1e-12 else np.zeros(3)
-        quats.append([np.cos(angle / 2), *(np.sin(angle / 2) * axis)])
-    return np.array(quats)
-
-
 def with_surface_rotations(tiny: Tiny, *, relative_to_camera: bool = False) -> Tiny:
     """Discs that lie in the surface, with rotations to the world or to each view's camera."""
     h, w = tiny.height, tiny.width
@@ -147,3 +136,15 @@ def save_export(folder: Path, tiny: Tiny, rows: np.ndarray, *, cameras: bool = T
         write_transforms(folder / "transforms.json", tiny)
         write_images(folder / "images", tiny)
     return folder
+
+
+def home(scene: Scene, tiny: Tiny, kept: np.ndarray | None = None) -> float:
+    """Share of the valid (or of the kept) pixels whose Gaussian is the one made for them, known by its opacity."""
+    same = np.abs(scene.gaussians.opacities - tiny.gaussians.opacities) < 1e-5
+    return float(same[scene.valid.reshape(-1) if kept is None else kept].mean())
+
+
+def da3_rows(tiny: Smooth, depths: np.ndarray | None = None) -> np.ndarray:
+    """Rows of the pixels that Depth Anything 3 keeps, by these or the scene's own depth maps."""
+    maps = tiny.depths if depths is None else depths
+    return np.concatenate([np.flatnonzero(depth_map_mask(d)) + i * d.size for i, d in enumerate(maps)])

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -95,11 +98,15 @@ def write_transforms(path: Path, tiny: Tiny) -> None:
     path.write_text(json.dumps(frames_of(tiny)))
 
 
-def wxyz_of(matrix: np.ndarray) -> np.ndarray:
-    vector, _ = cv2.Rodrigues(matrix)
-    angle = np.linalg.norm(vector)
-    axis = vector[:, 0] / angle
-    return np.array([np.cos(angle / 2), *(np.sin(angle / 2) * axis)])
+def wxyz_of(matrices: np.ndarray) -> np.ndarray:
+    """``[n,3,3]`` rotations -> ``[n,4]``, one after the other."""
+    quats = []
+    for matrix in matrices:
+        vector = cv2.Rodrigues(np.ascontiguousarray(matrix))[0][:, 0]
+        angle = float(np.linalg.norm(vector))
+        axis = vector / angle if angle > 1e-12 else np.zeros(3)
+        quats.append([np.cos(angle / 2), *(np.sin(angle / 2) * axis)])
+    return np.array(quats)
 
 
 def write_colmap_text(folder: Path, tiny: Tiny, model: str = "PINHOLE", extra: str = "") -> None:
@@ -109,7 +116,7 @@ def write_colmap_text(folder: Path, tiny: Tiny, model: str = "PINHOLE", extra: s
     (folder / "cameras.txt").write_text(f"# comment\n7 {model} {tiny.width} {tiny.height} {params}{extra}\n")
     lines = ["# Image list with two lines of data per image:", ""]
     for i, (name, pose) in enumerate(zip(tiny.names, tiny.w2c, strict=True)):
-        numbers = " ".join(repr(float(v)) for v in (*wxyz_of(pose[:3, :3]), *pose[:3, 3]))
+        numbers = " ".join(repr(float(v)) for v in (*wxyz_of(pose[None, :3, :3])[0], *pose[:3, 3]))
         lines += [f"{i + 4} {numbers} 7 {name}", "" if i == 0 else "10.5 3.5 -1 4.0 4.0 12 " * 3]
     (folder / "images.txt").write_text("\n".join(lines) + "\n")
     (folder / "points3D.txt").write_text("")
@@ -123,7 +130,7 @@ def write_colmap_binary(folder: Path, tiny: Tiny, model: int = 1, extra: tuple[f
     (folder / "cameras.bin").write_bytes(head + struct.pack(f"<{len(params)}d", *params))
     data = struct.pack("<Q", len(tiny.names))
     for i, (name, pose) in enumerate(zip(tiny.names, tiny.w2c, strict=True)):
-        data += struct.pack("<i7di", i + 4, *wxyz_of(pose[:3, :3]), *pose[:3, 3], 7)
+        data += struct.pack("<i7di", i + 4, *wxyz_of(pose[None, :3, :3])[0], *pose[:3, 3], 7)
         data += name.encode() + b"\0" + struct.pack("<Q", i) + struct.pack("<ddq", 1.0, 2.0, -1) * i
     (folder / "images.bin").write_bytes(data)
     (folder / "rigs.bin").write_bytes(b"rigs")
@@ -171,3 +178,11 @@ def assert_same(actual: CameraFile, tiny: Tiny, *, K: np.ndarray | None = None, 
 def save_json(path: Path, data: object) -> Path:
     path.write_text(json.dumps(data))
     return path
+
+
+@contextmanager
+def edited_json(path: Path) -> Iterator[Any]:
+    """The content of a file, which is written again after the block."""
+    data = json.loads(path.read_text())
+    yield data
+    path.write_text(json.dumps(data))

@@ -64,10 +64,6 @@ def test_type_checkers_see_what_is_exported(root: Path) -> None:
     assert [name for name in PUBLIC if f" {name} as {name}\n" not in text] == []
 
 
-def test_the_package_is_typed(root: Path) -> None:
-    assert (root / "gsmerge" / "py.typed").exists()
-
-
 @pytest.mark.parametrize("path", sorted((Path(gsmerge.__file__).parent).rglob("*.py")), ids=lambda p: p.stem)
 def test_files_stay_short(path: Path) -> None:
     assert len(path.read_text().splitlines()) <= 400

@@ -50,7 +50,6 @@ def project(root: Path) -> dict[str, Any]:
 
 
 def packed(source: Path) -> set[str]:
-    """Every file of the package."""
     return {str(path.relative_to(source)) for path in (source / "gsmerge").rglob("*") if path.is_file()}
 
 

@@ -45,7 +45,6 @@ OTHER_OPTIONS = {
 
 
 def options(command: Any) -> set[str]:
-    """Long names of a command's options."""
     names = {name for p in command.params for name in (*p.opts, *p.secondary_opts)}
     return {name for name in names if name.startswith("--")} - {"--help", "--help-all"}
 
@@ -67,7 +66,6 @@ def test_commands_are_the_documented_ones() -> None:
 
 
 def test_generated_pages_are_up_to_date() -> None:
-    """The reference of the commands says what their help says."""
     done = subprocess.run(
         [sys.executable, str(ROOT / "docs" / "generate_reference.py"), "--check"],
         capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": str(ROOT)},
@@ -109,7 +107,6 @@ def test_python_uses_public_names(page: str) -> None:
 
 @pytest.mark.parametrize("page", PAGES)
 def test_links_lead_somewhere(page: str) -> None:
-    """Files and pictures exist, and sections have the headings that links name."""
     for target in re.findall(r"\]\(([^)\s]+)\)", re.sub(r"```.*?```", "", read(page), flags=re.DOTALL)):
         if "://" in target:
             continue
@@ -129,7 +126,6 @@ def test_index_links_every_page() -> None:
 
 
 def test_readme_is_a_front_page() -> None:
-    """At most 8 KB, and a picture below 300 KB."""
     assert len((ROOT / "README.md").read_bytes()) <= 8192
     (picture,) = re.findall(r"!\[[^\]]+\]\(([^)]+)\)", read("README.md"))
     assert (ROOT / picture).stat().st_size < 300_000
@@ -157,7 +153,6 @@ def test_every_method_is_described() -> None:
 
 
 def test_every_option_is_a_field_of_the_api() -> None:
-    """Options of the command line carry the API's names."""
     fields = set(gsmerge.CompactOptions().to_dict())
     own = {
         "cameras",

@@ -8,8 +8,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 
 def run_example(root: Path, name: str, *arguments: object) -> str:
     script = root / "examples" / name
@@ -55,13 +53,3 @@ def test_the_same_seed_makes_the_same_scene(make_scene, tmp_path: Path) -> None:
     )
     assert first == again
     assert first != other
-
-
-@pytest.mark.parametrize("name", ["transforms.json", "targets/transforms.json"])
-def test_the_made_scene_has_cameras_for_its_photos(name: str, made_scene: Path) -> None:
-    import gsmerge
-
-    camera_file = gsmerge.read_cameras(made_scene / name)
-    folder = (made_scene / name).parent
-    assert len(camera_file) == (5 if name == "transforms.json" else 4)
-    assert all((folder / image).exists() for image in camera_file.names)

@@ -38,7 +38,6 @@ def test_the_pipeline_fits_on_a_screen() -> None:
 
 
 def test_no_stage_knows_the_options_of_another() -> None:
-    """Each is handed its own part of the plan."""
     paths = sorted((PACKAGE / "stages").rglob("*.py"))
     assert len(paths) > 15
     assert [path.name for path in paths if "CompactOptions" in path.read_text(encoding="utf-8")] == []
@@ -67,7 +66,6 @@ def test_the_record_is_in_no_signature() -> None:
 
 
 def test_scenes_are_of_one_kind() -> None:
-    """Whether the pixels are known is asked of the scene, and only readers ask what they were given."""
     for path in sorted(PACKAGE.rglob("*.py")):
         if PACKAGE / "io" in path.parents:
             continue

@@ -42,7 +42,6 @@ def expected(make: Callable[..., Any], *arguments: Any, **settings: Any) -> set[
     with pytest.raises(ValueError, match=r"expected .*, got") as error:
         make(*arguments, **settings)
     listed = re.search(r"expected (?:one of )?(.*?), (?:or \w+, )?got", str(error.value))
-    assert listed is not None
     return set(re.findall(r"[\w-]+", listed[1])) - {"or"}
 
 
@@ -129,7 +128,6 @@ def test_settings_without_an_option_say_how_to_give_them(
 
 
 def test_the_package_names_only_options_that_exist(root: Path) -> None:
-    """In messages, notes and docstrings."""
     others = {"--help", "--version", "--debug", "--no-deps", "--force-reinstall", "--head"}
     known = others | {flag for name in COMMANDS for flag in flags_of(name)}
     files = sorted((root / "gsmerge").rglob("*.py"))

@@ -72,16 +72,6 @@ def test_naming_a_device_loads_no_torch() -> None:
     assert "torch" not in loaded_after(code)
 
 
-def test_missing_file_is_one_line() -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "gsmerge", "compact", "nowhere.ply"], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 3
-    assert done.stdout == ""
-    assert done.stderr.count("\n") == 1
-    assert "nowhere.ply" in done.stderr
-
-
 def test_submodule_imports_do_not_hide_functions() -> None:
     """The modules render and inspect share their names with the functions that they hold."""
     print_kinds = "print(type(gsmerge.render).__name__, type(gsmerge.inspect).__name__)"

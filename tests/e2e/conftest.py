@@ -12,6 +12,8 @@ from batches import FAST, NAMES, finish, results
 
 from gsmerge.cli import main
 
+COMPILING = "compiling kernels for their first use, up to 30 s\n"
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -27,13 +29,14 @@ Run = Callable[..., Outcome]
 
 @pytest.fixture
 def run(capsys: pytest.CaptureFixture[str]) -> Run:
-    """``run("compact", path, "--k", 2)``: exit code, stdout and stderr."""
+    """``run("compact", path, "--k", 2, code=0)``: exit code, which is checked where one is given, stdout, stderr."""
 
-    def call(*arguments: object) -> Outcome:
+    def call(*arguments: object, code: int | None = None) -> Outcome:
         capsys.readouterr()
-        code = main([str(argument) for argument in arguments])
+        actual = main([str(argument) for argument in arguments])
         captured = capsys.readouterr()
-        return Outcome(code, captured.out, captured.err)
+        assert code in (None, actual), f"{actual}: {captured.err}"
+        return Outcome(actual, captured.out, captured.err)
 
     return call
 
@@ -59,3 +62,11 @@ def undisturbed(rooms: Path) -> dict[str, str]:
 def listing(folder: Path) -> dict[str, int]:
     """Every file below a folder with its size, hidden ones too."""
     return {str(p.relative_to(folder)): p.stat().st_size for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def assert_refused(outcome: Outcome, code: int, *words: str) -> None:
+    """One line on stderr with these words, and nothing else."""
+    err = outcome.err.replace(COMPILING, "")
+    assert (outcome.code, outcome.out, err.count("\n")) == (code, "", 1), err
+    assert err.startswith("gsmerge: error: ")
+    assert [part for part in words if part not in err] == []

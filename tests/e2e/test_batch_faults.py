@@ -10,26 +10,12 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
-from batches import FAST, NAMES, finish, holders, records, results, start, statuses
+from batches import FAST, NAMES, PATIENCE, finish, holders, records, results, start, statuses, until
 
 pytestmark = pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc to see processes")
-PATIENCE = 120  # seconds, on a machine that is busy with other things
-
-
-def until(condition: Callable[[], Any], process: subprocess.Popen[str]) -> Any:
-    """What a condition comes to once it holds; None if the process ended before."""
-    deadline = time.monotonic() + PATIENCE
-    while not (actual := condition()):
-        if process.poll() is not None:
-            return None
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
-    return actual
 
 
 def outlive(pids: list[int]) -> bool:
@@ -158,7 +144,7 @@ def limited(limit: int, *arguments: object) -> tuple[int, str]:
 
 
 @pytest.mark.slow
-def test_a_full_disk_is_told_and_nothing_is_lost(rooms: Path, tmp_path: Path, undisturbed: dict[str, str]) -> None:
+def test_a_full_disk_is_one_line_and_nothing_is_lost(rooms: Path, tmp_path: Path, undisturbed: dict[str, str]) -> None:
     """Results do not fit and records do; then records do not either."""
     said = (rooms, "--output", tmp_path, *FAST, "--jobs", 1, "-q")
     code, errors = limited(30_000, *said)

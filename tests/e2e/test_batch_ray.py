@@ -7,25 +7,19 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
-from batches import FAST, NAMES, holders, records, results, start, statuses
+from batches import FAST, NAMES, holders, records, results, start, statuses, until
 
 needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs gsmerge[ray]")
-PATIENCE = 180  # seconds, on a machine that is busy with other things
 
 
 @needs_ray
 def test_a_killed_process_is_survived(rooms: Path, tmp_path: Path, undisturbed: dict[str, str]) -> None:
     process = start(rooms, "--output", tmp_path, *FAST, "--engine", "ray", "-q")
-    deadline = time.monotonic() + PATIENCE
-    while not (actual := holders(tmp_path)):
-        assert process.poll() is None
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
-    os.kill(actual[0], signal.SIGKILL)
+    workers = until(lambda: holders(tmp_path), process)
+    os.kill(workers[0], signal.SIGKILL)
     assert (process.communicate()[0], process.returncode) == ("", 0)
     assert results(tmp_path) == undisturbed
     assert statuses(tmp_path) == {name: ["done"] for name in NAMES}
@@ -72,7 +66,7 @@ def test_a_lost_node_is_survived(rooms: Path, tmp_path: Path, root: Path, undist
 
 
 @needs_ray
-def test_no_cluster_at_the_address_is_told(rooms: Path, tmp_path: Path) -> None:
+def test_no_cluster_at_the_address_is_one_line(rooms: Path, tmp_path: Path) -> None:
     process = start(rooms, "--output", tmp_path / "out", *FAST, "--engine", "ray", "--address", "127.0.0.1:1", "-q")
     errors = process.communicate()[1]
     assert process.returncode == 3

@@ -21,8 +21,7 @@ SMALL = ("--superpixels", 200)
 
 
 def test_compact_writes_beside_the_input_and_says_what_it_did(scene_copy: Path, run: Run) -> None:
-    outcome = run("compact", scene_copy / "scene.ply", "--k", 2, *SMALL)
-    assert outcome.code == 0, outcome.err
+    outcome = run("compact", scene_copy / "scene.ply", "--k", 2, *SMALL, code=0)
     out = scene_copy / "scene.compact.ply"
     count = len(gsmerge.read_ply(out).gaussians)
     assert 0 < count <= VIEWS * 200 * 2
@@ -38,19 +37,9 @@ def test_compact_of_a_folder_does_not_take_its_own_output_for_the_input(scene_co
     assert run("compact", scene_copy, *SMALL, "--quiet", "--overwrite").code == 0
 
 
-def test_overwrite_is_needed_and_works(scene_copy: Path, run: Run) -> None:
-    out = scene_copy / "small.ply"
-    out.write_bytes(b"precious")
-    assert run("compact", scene_copy, "-o", out, *SMALL).code == 2
-    assert out.read_bytes() == b"precious"
-    assert run("compact", scene_copy, "-o", out, *SMALL, "--overwrite").code == 0
-    assert out.read_bytes().startswith(b"ply")
-
-
 def test_json_report(scene_copy: Path, run: Run) -> None:
     out, report = scene_copy / "small.ply", scene_copy / "report.json"
-    outcome = run("compact", scene_copy, "-o", out, *SMALL, "--k", 2, "--seed", 3, "--json", "--report", report)
-    assert outcome.code == 0
+    outcome = run("compact", scene_copy, "-o", out, *SMALL, "--k", 2, "--seed", 3, "--json", "--report", report, code=0)
     assert outcome.err == ""
     document = json.loads(outcome.out)
     assert document == json.loads(report.read_text())
@@ -72,19 +61,13 @@ def test_json_report(scene_copy: Path, run: Run) -> None:
     assert document["peak_memory_bytes"] > 1e7
 
 
-def test_quiet_says_nothing(scene_copy: Path, run: Run) -> None:
-    outcome = run("compact", scene_copy, *SMALL, "--quiet")
-    assert (outcome.code, outcome.out, outcome.err) == (0, "", "")
-
-
-def test_a_scene_too_large_for_the_machine_is_told_before_it_is_read(
+def test_a_scene_too_large_for_the_machine_is_noted_before_it_is_read(
     scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     said = "this machine has 0.1 GB: use fewer views"
     assert said not in run("inspect", scene_copy).out
     monkeypatch.setattr("gsmerge.runtime.estimate.machine_memory", lambda: 10**8)
-    outcome = run("compact", scene_copy, *SMALL, "--fit", "none", "--effort", "draft", "--overwrite")
-    assert outcome.code == 0
+    outcome = run("compact", scene_copy, *SMALL, "--fit", "none", "--effort", "draft", "--overwrite", code=0)
     assert [line for line in outcome.err.splitlines() if said in line] == outcome.err.splitlines()[:1]
     assert said in run("inspect", scene_copy).out
     assert said in run("compact", scene_copy, "--dry-run", "--overwrite", *SMALL).out
@@ -94,8 +77,7 @@ def test_a_scene_too_large_for_the_machine_is_told_before_it_is_read(
 
 def test_dry_run_writes_nothing(scene_copy: Path, run: Run) -> None:
     before = listing(scene_copy)
-    outcome = run("compact", scene_copy, "--dry-run", "--k", 2, *SMALL)
-    assert outcome.code == 0, outcome.err
+    outcome = run("compact", scene_copy, "--dry-run", "--k", 2, *SMALL, code=0)
     assert "at most 2,000 Gaussians" in outcome.out
     document = json.loads(run("compact", scene_copy, "--dry-run", "--json", *SMALL).out)
     assert document["dry_run"] is True
@@ -118,46 +100,10 @@ def test_progress_only_when_a_terminal_is_there(scene_copy: Path, run: Run, monk
 def test_without_photos_it_still_compacts(scene_copy: Path, run: Run) -> None:
     for path in (scene_copy / "images").iterdir():
         path.unlink()
-    outcome = run("compact", scene_copy, *SMALL, "--json")
-    assert outcome.code == 0, outcome.err
+    outcome = run("compact", scene_copy, *SMALL, "--json", code=0)
     document = json.loads(outcome.out)
     assert document["psnr_input_views"] == {"before": None, "after": None}
     assert [note for note in document["notes"] if note.startswith("no photos found")] == [NO_PHOTOS]
-
-
-@pytest.mark.parametrize(
-    ("option", "message"),
-    [
-        (("--budget", "5B"), "budget: expected at least 502 bytes for one Gaussian, got 5"),
-        (("--budget", "0.001%"), "budget: expected at least one Gaussian, got '0.001%'"),
-        (("--effort", "slow"), "'--effort': 'slow' is not one of 'draft', 'fast', 'default', 'best'"),
-    ],
-)
-def test_what_asks_for_nothing_is_wrong_usage(
-    option: tuple[str, str], message: str, made_scene: Path, tmp_path: Path, run: Run
-) -> None:
-    outcome = run("compact", made_scene, "-o", tmp_path / "small.ply", *option)
-    assert (outcome.code, outcome.out, outcome.err.count("\n")) == (2, "", 1)
-    assert message in outcome.err
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("--as", "panel", "-o", "sheet.jpg"), "expected a name that ends in .png"),
-        (("scene.ply", "-o", "views"), "--as views: expected one scene, got 2"),
-        (("-o", "sheet.png", "--superpixels", "100"), "expected --as superpixels"),
-    ],
-)
-def test_pictures_that_make_no_sense(
-    arguments: tuple[str, ...], message: str, made_scene: Path, tmp_path: Path, run: Run,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
-    monkeypatch.chdir(tmp_path)
-    outcome = run("render", made_scene / "scene.ply", *arguments)
-    assert (outcome.code, outcome.err.count("\n")) == (2, 1)
-    assert message in outcome.err
-    assert listing(tmp_path) == {}
 
 
 def test_a_plan_tells_what_is_used(made_scene: Path, run: Run) -> None:
@@ -177,8 +123,7 @@ def test_threads_and_repetition_do_not_change_the_file(scene_copy: Path, run: Ru
 
 
 def test_inspect(made_scene: Path, run: Run) -> None:
-    outcome = run("inspect", made_scene)
-    assert outcome.code == 0
+    outcome = run("inspect", made_scene, code=0)
     assert "17-column" in outcome.out
     assert "30,720" in outcome.out
     assert f"{VIEWS} x {HEIGHT} x {WIDTH}" in outcome.out
@@ -192,40 +137,14 @@ def test_inspect(made_scene: Path, run: Run) -> None:
     assert document["compact"] == planned["compact"]
 
 
-def test_photos_as_they_were_taken_and_poses_in_another_convention(scene_copy: Path, run: Run) -> None:
-    """Photos of twice the grid's size; poses world-to-camera: found, told, and as good as the usual ones."""
-    path = scene_copy / "transforms.json"
-    data = json.loads(path.read_text())
-    for frame in data["frames"]:
-        frame["transform_matrix"] = np.linalg.inv(np.array(frame["transform_matrix"])).tolist()
-        frame.update({key: 2 * frame[key] for key in ("fl_x", "fl_y", "cx", "cy", "w", "h") if key in frame})
-    data.update({key: 2 * data[key] for key in ("fl_x", "fl_y", "cx", "cy", "w", "h") if key in data})
-    path.write_text(json.dumps(data))
-    outcome = run("compact", scene_copy, *SMALL, "-o", scene_copy / "a.ply")
-    assert outcome.code == 0, outcome.err
-    assert "the poses fit when read as world-to-camera matrices with OpenGL axes" in outcome.err
-    for photo in (scene_copy / "images").iterdir():
-        cv2.imwrite(str(photo), cv2.resize(cv2.imread(str(photo)), (2 * WIDTH, 2 * HEIGHT)))
-    for frame in data["frames"]:
-        frame["transform_matrix"] = np.linalg.inv(np.array(frame["transform_matrix"])).tolist()
-    path.write_text(json.dumps(data))
-    outcome = run("compact", scene_copy, *SMALL, "-o", scene_copy / "b.ply")
-    assert outcome.code == 0, outcome.err
-    assert f"are resized to {WIDTH} x {HEIGHT}, the Gaussian grid's size" in outcome.err
-    counts = [len(gsmerge.read_ply(scene_copy / name).gaussians) for name in ("a.ply", "b.ply")]
-    assert abs(counts[0] - counts[1]) < 0.1 * counts[0]
-
-
 def test_inspect_of_an_unaligned_file_is_no_error(scene_copy: Path, run: Run) -> None:
     assert run("compact", scene_copy, *SMALL, "--quiet").code == 0
-    outcome = run("inspect", scene_copy / "scene.compact.ply")
-    assert outcome.code == 0
+    outcome = run("inspect", scene_copy / "scene.compact.ply", code=0)
     assert "not one Gaussian per pixel" in outcome.out
 
 
 def test_superpixels(made_scene: Path, tmp_path: Path, run: Run) -> None:
-    outcome = run("render", made_scene, "--as", "superpixels", "-o", tmp_path / "overlays", *SMALL)
-    assert outcome.code == 0, outcome.err
+    outcome = run("render", made_scene, "--as", "superpixels", "-o", tmp_path / "overlays", *SMALL, code=0)
     assert "200 to 200 superpixels" in outcome.err
     pictures = sorted((tmp_path / "overlays").iterdir())
     assert len(pictures) == 3 * VIEWS
@@ -237,8 +156,7 @@ def test_superpixels(made_scene: Path, tmp_path: Path, run: Run) -> None:
 
 def test_views(made_scene: Path, tmp_path: Path, run: Run) -> None:
     cameras = made_scene / "transforms.json"
-    outcome = run("render", made_scene / "scene.ply", "--cameras", cameras, "-o", tmp_path / "frames")
-    assert outcome.code == 0, outcome.err
+    run("render", made_scene / "scene.ply", "--cameras", cameras, "-o", tmp_path / "frames", code=0)
     names = sorted(path.name for path in (tmp_path / "frames").iterdir())
     assert names == [f"view_{i:03d}.png" for i in range(VIEWS)]
     photos = [cv2.imread(str(made_scene / "images" / name)).astype(float) for name in names]
@@ -254,8 +172,7 @@ def test_views(made_scene: Path, tmp_path: Path, run: Run) -> None:
 def test_panel(scene_copy: Path, run: Run) -> None:
     assert run("compact", scene_copy, *SMALL, "--quiet").code == 0
     out = scene_copy / "preview.png"
-    outcome = run("render", scene_copy / "scene.ply", scene_copy / "scene.compact.ply", "-o", out)
-    assert outcome.code == 0, outcome.err
+    run("render", scene_copy / "scene.ply", scene_copy / "scene.compact.ply", "-o", out, code=0)
     sheet = cv2.imread(str(out))
     assert sheet.shape[1] >= 3 * WIDTH  # photo, before, after
     assert sheet.shape[0] >= 4 * HEIGHT
@@ -279,15 +196,3 @@ def test_shell_completion(
         main([])
     assert end.value.code == 0
     assert capsys.readouterr().out.split() == [offered]
-
-
-def test_notes_about_the_input_are_told(scene_copy: Path, run: Run) -> None:
-    """Photos of twice the grid's size in the camera file: intrinsics are scaled, and that is said."""
-    path = scene_copy / "transforms.json"
-    data = json.loads(path.read_text())
-    data |= {key: 2 * data[key] for key in ("fl_x", "fl_y", "cx", "cy", "w", "h")}
-    path.write_text(json.dumps(data))
-    outcome = run("compact", scene_copy, *SMALL, "--json", "--report", scene_copy / "report.json")
-    assert outcome.code == 0
-    assert any("scaled from 192 x 128" in note for note in json.loads(outcome.out)["notes"])
-    assert "scaled from 192 x 128" in run("compact", scene_copy, *SMALL, "--overwrite").err

@@ -7,20 +7,22 @@ import errno
 import itertools
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+import gsmerge
 from gsmerge import gpu
 from gsmerge.errors import OUT_OF_MEMORY, SceneError
 
-from .conftest import Run, listing
+from .conftest import Run, assert_refused, listing
 
 
 class Broken:
@@ -55,10 +57,27 @@ def test_failures_inside_the_work(
     assert listing(scene_copy) == before
 
 
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="the superuser may write anywhere")
+def test_a_folder_without_permission(scene_copy: Path, run: Run) -> None:
+    locked = scene_copy / "locked"
+    locked.mkdir(mode=0o500)
+    assert_refused(run("compact", scene_copy, "-o", locked / "small.ply"), 3, "cannot be written")
+    assert list(locked.iterdir()) == []
+
+
+def test_a_scene_of_points_without_size_leaves_no_file(scene_copy: Path, run: Run) -> None:
+    gaussians = gsmerge.read_ply(scene_copy / "scene.ply").gaussians
+    points = replace(gaussians, scales=np.full_like(gaussians.scales, 1e-30))
+    gsmerge.write_ply(scene_copy / "scene.ply", points, overwrite=True)
+    before = listing(scene_copy)
+    outcome = run("compact", scene_copy, "--fit", "none")
+    assert (outcome.code, "found none that is left" in outcome.err) == (3, True)
+    assert listing(scene_copy) == before
+
+
 def test_debug_shows_the_traceback(scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gsmerge.compact_file.compact", Broken(KeyError("lost")))
-    outcome = run("compact", scene_copy, "--quiet", "--debug")
-    assert outcome.code == 1
+    outcome = run("compact", scene_copy, "--quiet", "--debug", code=1)
     assert outcome.err.startswith("Traceback (most recent call last):")
     assert "Traceback" not in run("compact", scene_copy, "--quiet").err  # and is forgotten by the next call
 
@@ -81,38 +100,11 @@ def test_failures_while_writing_leave_nothing(
     monkeypatch.setattr("gsmerge.encoded.gsm_file.save_encoded", half)
     before = listing(scene_copy)
     more = {"compact": (*quick, "--fit", "none"), "encode": quick, "decode": ()}[command]
-    outcome = run(command, given, "--quiet", *more)
-    assert outcome.code == 3
+    outcome = run(command, given, "--quiet", *more, code=3)
     assert outcome.err.count("\n") == 1
     assert {"compact": "scene.compact.ply", "encode": "scene.gsm", "decode": "kept.compact.ply"}[command] in outcome.err
     assert "No space left" in outcome.err
     assert listing(scene_copy) == before
-
-
-@pytest.mark.parametrize("more", [(), ("--dry-run",)])
-def test_cameras_that_are_not_there_cannot_be_saved(
-    more: tuple[str, ...], made_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Told before any work."""
-    monkeypatch.setattr("gsmerge.compact_file.compact", Broken(KeyError("lost")))
-    shutil.copy(made_scene / "scene.ply", tmp_path / "alone.ply")
-    outcome = run(
-        "compact", tmp_path / "alone.ply", "--hint", "order=none", "--save-cameras", tmp_path / "saved.json", *more
-    )
-    assert (outcome.code, outcome.err.count("\n")) == (2, 1), outcome.err
-    assert "saved.json: expected a scene with cameras, got none" in outcome.err
-    assert list(listing(tmp_path)) == ["alone.ply"]
-
-
-def test_more_superpixels_than_pixels_are_refused_before_the_page_is_made(
-    scene_copy: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("gsmerge.view.data.evaluate", Broken(KeyError("lost")))
-    call = ("view", scene_copy, scene_copy / "scene.ply", "-o", tmp_path / "a.html", "--set", "superpixels=999999")
-    for more in ((), ("--dry-run",)):
-        outcome = run(*call, *more)
-        assert (outcome.code, outcome.err.count("\n")) == (2, 1), outcome.err
-        assert "superpixels: expected at most 6144, one per pixel of 96 x 64, got 999999" in outcome.err
 
 
 def test_gpu_that_is_not_there_is_noted(
@@ -123,13 +115,11 @@ def test_gpu_that_is_not_there_is_noted(
     monkeypatch.setattr(gpu, "cuda_problem", gpu.cuda_problem.__wrapped__)
     note = "the fit and the scores run on the CPU, not on a GPU: torch finds no CUDA device"
     for device, is_noted in (("cuda", True), ("auto", False)):
-        plan = run("compact", scene_copy, "--device", device, "--dry-run", "--json")
-        assert plan.code == 0
+        plan = run("compact", scene_copy, "--device", device, "--dry-run", "--json", code=0)
         assert json.loads(plan.out)["options"]["device"] == "cpu"
         assert (note in json.loads(plan.out)["notes"]) == is_noted
     call = ("compact", scene_copy, "-o", tmp_path / "a.ply", "--device", "cuda", "--effort", "draft", "--json")
-    outcome = run(*call)
-    assert outcome.code == 0
+    outcome = run(*call, code=0)
     assert note in json.loads(outcome.out)["notes"]
 
 
@@ -190,8 +180,7 @@ def test_a_signal_in_a_callback_is_not_lost(
             time.sleep(0.001)
 
     monkeypatch.setattr("gsmerge.compact_file.compact", busy)
-    outcome = run("compact", scene_copy)
-    assert outcome.code == code
+    outcome = run("compact", scene_copy, code=code)
     assert outcome.err == f"gsmerge: error: {'interrupted' if code == 130 else f'ended by {name}'}\n"
     assert not (scene_copy / "scene.compact.ply").exists()
 
@@ -232,8 +221,7 @@ def test_a_signal_that_a_library_makes_an_error_of(
             raise error from interrupt
 
     monkeypatch.setattr("gsmerge.compact_file.compact", compact)
-    outcome = run("compact", scene_copy)
-    assert outcome.code == code
+    outcome = run("compact", scene_copy, code=code)
     assert outcome.err == f"gsmerge: error: {'interrupted' if code == 130 else f'ended by {name}'}\n"
 
 

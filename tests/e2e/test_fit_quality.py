@@ -59,7 +59,6 @@ def test_short_fits_reach_the_floor(
 def test_full_fit_beats_the_merge_alone(
     seed: int, compacted: Callable[..., tuple[CompactResult, float]], floor: Callable[..., None]
 ) -> None:
-    """By far, on views that nobody has seen."""
     none, full = (compacted(superpixels=256, fit=fit, seed=seed, checkpoint="none")[1] for fit in ("none", "full"))
     floor(full - none)
 
@@ -88,5 +87,4 @@ def test_photos_help(
     target_psnr: Measure,
     floor: Callable[..., None],
 ) -> None:
-    """With the photos the compact scene beats its input by far on views that nobody has seen."""
     floor(compacted(superpixels=256)[1] - target_psnr(made_scene / "targets", made_scene / "scene.ply"))

@@ -36,31 +36,6 @@ def test_floor(settings: dict, made: Path, tmp_path: Path, target_psnr: Measure,
     floor(target_psnr(made / "targets", out))
 
 
-def test_a_grid_without_its_order(made_scene: Path, tmp_path: Path, target_psnr: Measure) -> None:
-    """About as good as with it."""
-    scene = gsmerge.read_scene(made_scene)
-    actual = []
-    for name, one in (("grid", scene), ("loose", unaligned_scenes.shuffled(scene))):
-        gsmerge.write_ply(tmp_path / f"{name}.ply", gsmerge.compact(one).gaussians)
-        actual.append(target_psnr(made_scene / "targets", tmp_path / f"{name}.ply"))
-    assert actual[1] > actual[0] - 1.0
-
-
-def test_only_a_ply(made: Path, tmp_path: Path, target_psnr: Measure) -> None:
-    """Neither cameras nor photos: the result looks like the input."""
-    alone = tmp_path / "alone"
-    alone.mkdir()
-    shutil.copy(made / "scene.ply", alone)
-    scene = read_scene(alone, order="none")
-    assert len(scene.cameras) == 0
-    assert scene.images is None
-    result = gsmerge.compact(scene, superpixels="10%")
-    assert len(result.report.notes) >= 2
-    gsmerge.write_ply(tmp_path / "small.ply", result.gaussians)
-    before, after = (target_psnr(made / "targets", ply) for ply in (alone / "scene.ply", tmp_path / "small.ply"))
-    assert after > before - 2
-
-
 def test_reading_leaves_out_what_is_not_finite(made: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(made, tmp_path / "spoilt"))
     ply = PlyData.read(folder / "scene.ply", mmap=False)

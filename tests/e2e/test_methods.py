@@ -29,7 +29,6 @@ Path(made).write_bytes("\\n".join([*lines, "end_header", ""]).encode() + rows[: 
 
 
 def program(folder: Path, text: str) -> Path:
-    """An executable script."""
     path = folder / "splat-transform"
     path.write_text(text.format(python=sys.executable))
     path.chmod(0o755)
@@ -42,8 +41,7 @@ def test_every_method_writes_a_ply(
 ) -> None:
     monkeypatch.setenv("GSMERGE_SPLAT_TRANSFORM", str(program(tmp_path, FAKE)))
     out, settings = tmp_path / "small.ply", ["--set", "fit_steps=8"] if method == "unmerged-fit" else []
-    said = run("compact", made_scene, "-o", out, "--method", method, "--budget", 400, *settings, "--json")
-    assert said.code == 0, said.err
+    said = run("compact", made_scene, "-o", out, "--method", method, "--budget", 400, *settings, "--json", code=0)
     document, total = json.loads(said.out), 5 * 96 * 64
     count = len(read_ply(out).gaussians)
     assert document["options"]["method"] == method
@@ -60,20 +58,19 @@ def test_every_method_writes_a_ply(
     assert document["notes"] == ([f"method {method} does not use budget"] if method.startswith("unmerged") else [])
 
 
-def test_the_program_is_found_on_the_path(
+def test_the_program_may_be_on_the_path(
     made_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("GSMERGE_SPLAT_TRANSFORM", raising=False)
     monkeypatch.setenv("PATH", str(program(tmp_path, FAKE).parent))
     out = tmp_path / "small.ply"
-    said = run("compact", made_scene, "-o", out, "--method", "splat-transform", "--budget", 50, "--json")
-    assert said.code == 0, said.err
+    said = run("compact", made_scene, "-o", out, "--method", "splat-transform", "--budget", 50, "--json", code=0)
     assert len(read_ply(out).gaussians) == 50
     assert "reduce" in json.loads(said.out)["seconds"]
 
 
 @pytest.mark.parametrize("named", [None, "no/such/program"])
-def test_a_missing_program_is_told(
+def test_a_missing_program_is_one_line(
     named: str | None, scene_copy: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
@@ -93,7 +90,7 @@ def test_a_missing_program_is_told(
         ("#!{python}\n", "it ended with code 0: without output"),
     ],
 )
-def test_a_failing_program_is_told(
+def test_a_failing_program_is_one_line(
     text: str, words: str, scene_copy: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("GSMERGE_SPLAT_TRANSFORM", str(program(tmp_path, text)))
@@ -104,29 +101,7 @@ def test_a_failing_program_is_told(
     assert listing(scene_copy) == before
 
 
-@pytest.mark.parametrize(
-    ("arguments", "fragments"),
-    [
-        (["--method", "magic"], ["--method", "voxel"]),
-        (["--method", "voxel", "--budget", "auto"], ["method voxel", "budget auto"]),
-        (["--method", "voxel", "--levels", 2], ["method voxel", "levels"]),
-        (["--method", "voxel", "--quality", "20dB"], ["method voxel", "quality 20dB"]),
-        (["--method", "voxel", "--quality", "-1dB"], ["method voxel", "quality -1dB"]),
-        (["--method", "blocks", "--hint", "order=none"], ["method blocks", "one Gaussian per pixel"]),
-    ],
-    ids=str,
-)
-def test_what_does_not_go_together_is_told(
-    arguments: list[object], fragments: list[str], scene_copy: Path, run: Run
-) -> None:
-    for rest in ([], ["--dry-run"]):
-        said = run("compact", scene_copy, *arguments, "--quiet", *rest)
-        assert (said.code, said.out, said.err.count("\n")) == (2, "", 1), said.err
-        assert [part for part in fragments if part not in said.err] == []
-    assert not (scene_copy / "scene.compact.ply").exists()
-
-
-def test_missing_photos_are_told(scene_copy: Path, run: Run) -> None:
+def test_missing_photos_are_one_line(scene_copy: Path, run: Run) -> None:
     shutil.rmtree(scene_copy / "images")
     said = run("compact", scene_copy, "--method", "unmerged-fit", "--quiet")
     assert (said.code, said.out, said.err.count("\n")) == (2, "", 1)
@@ -138,8 +113,7 @@ def test_a_plan_names_the_method(
     method: str, made_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("GSMERGE_SPLAT_TRANSFORM", str(program(tmp_path, FAKE)))
-    said = run("compact", made_scene, "--method", method, "--dry-run", "--budget", 400)
-    assert said.code == 0, said.err
+    said = run("compact", made_scene, "--method", method, "--dry-run", "--budget", 400, code=0)
     assert (f"method     {method}; fit" in said.out) == (method != "gsmerge")
     assert ("merging across views" in said.out) == (method == "gsmerge")
     document = json.loads(run("compact", made_scene, "--method", method, "--dry-run", "--json").out)

@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from tiny_scene import edited_json
 
 from .conftest import Run
 
@@ -18,12 +19,10 @@ SCALE = 1.8
 @pytest.fixture
 def moved_scene(scene_copy: Path) -> Path:
     """The made scene with the camera centres in larger units, and none of the targets."""
-    path = scene_copy / "transforms.json"
-    data = json.loads(path.read_text())
-    for frame in data["frames"]:
-        for row in frame["transform_matrix"][:3]:
-            row[3] *= SCALE
-    path.write_text(json.dumps(data))
+    with edited_json(scene_copy / "transforms.json") as data:
+        for frame in data["frames"]:
+            for row in frame["transform_matrix"][:3]:
+                row[3] *= SCALE
     return scene_copy
 
 
@@ -36,13 +35,11 @@ def psnr(folder: Path, photos: Path) -> float:
 
 
 def test_render_moves_the_cameras(moved_scene: Path, tmp_path: Path, run: Run) -> None:
-    outcome = run("compact", moved_scene, "--fit", "none", "--json")
-    assert outcome.code == 0, outcome.err
+    outcome = run("compact", moved_scene, "--fit", "none", "--json", code=0)
     expected = json.loads(outcome.out)["psnr_input_views"]
     photos = moved_scene / "images"
     for name, key in (("scene.ply", "before"), ("scene.compact.ply", "after")):
-        outcome = run("render", moved_scene / name, "-o", tmp_path / name, "--json")
-        assert outcome.code == 0, outcome.err
+        outcome = run("render", moved_scene / name, "-o", tmp_path / name, "--json", code=0)
         assert any("read as: " in note for note in json.loads(outcome.out)["notes"])
         assert psnr(tmp_path / name, photos) == pytest.approx(expected[key], abs=0.2)
 
@@ -53,8 +50,7 @@ def test_the_frame_of_another_file(moved_scene: Path, tmp_path: Path, run: Run) 
     assert run("compact", moved_scene, "--fit", "none", "-o", elsewhere, "--quiet").code == 0
     actual = {}
     for name, more in (("own", ("--cameras", moved_scene / "transforms.json")), ("like", ("--frame-of", moved_scene))):
-        outcome = run("render", elsewhere, "-o", tmp_path / name, *more)
-        assert outcome.code == 0, outcome.err
+        run("render", elsewhere, "-o", tmp_path / name, *more, code=0)
         actual[name] = psnr(tmp_path / name, moved_scene / "images")
     assert actual["like"] > actual["own"] + 3
 
@@ -67,20 +63,16 @@ def test_preview_and_render_agree_with_photos_that_are_broken(
     (moved_scene / "images").mkdir()
     for path in photos.iterdir():
         (moved_scene / "images" / path.name).write_bytes(path.read_bytes()[:100])
-    outcome = run("render", moved_scene, "-o", tmp_path / "out")
-    assert outcome.code == 0, outcome.err
+    run("render", moved_scene, "-o", tmp_path / "out", code=0)
     floor(psnr(tmp_path / "out", photos))
     assert run("render", moved_scene / "scene.ply", "-o", tmp_path / "sheet.png").code == 3
 
 
 def test_cameras_that_do_not_fit_are_said(scene_copy: Path, tmp_path: Path, run: Run) -> None:
-    path = scene_copy / "transforms.json"
-    data = json.loads(path.read_text())
-    turn = np.eye(4)
-    turn[:3, :3] = cv2.Rodrigues(np.array([0.0, 0.2, 0.0]))[0]
-    for frame in data["frames"]:
-        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ turn).tolist()
-    path.write_text(json.dumps(data))
-    outcome = run("render", scene_copy, "-o", tmp_path / "out")
-    assert outcome.code == 0, outcome.err
+    with edited_json(scene_copy / "transforms.json") as data:
+        turn = np.eye(4)
+        turn[:3, :3] = cv2.Rodrigues(np.array([0.0, 0.2, 0.0]))[0]
+        for frame in data["frames"]:
+            frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ turn).tolist()
+    outcome = run("render", scene_copy, "-o", tmp_path / "out", code=0)
     assert "the cameras do not fit the Gaussians and stay as their file has them" in outcome.err

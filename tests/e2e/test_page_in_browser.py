@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
-from .browser import Browser, browser
+from .browser import CHROMIUM, Browser, browser
 
-CHROMIUM = next(
-    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
-)
 pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="no Chromium installed"),
     pytest.mark.skipif("GSMERGE_BROWSER" not in os.environ, reason="GSMERGE_BROWSER is not set"),
@@ -29,7 +25,6 @@ def shown(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator
     scene = make_scene(folder / "room", num_views=3, width=64, height=48)
     options = ["--budgets", "2%", "--fit", "none,color", "--proxy-views", "1", "--lpips", "none", "--quiet"]
     assert main(["chart", str(scene), "--output", str(folder / "out"), *options]) == 0
-    assert CHROMIUM is not None
     with browser(CHROMIUM, folder / "profile") as opened:
         opened.open(folder / "out" / "index.html")
         yield opened

@@ -114,8 +114,7 @@ def test_lines_are_wrapped_below_their_first_value() -> None:
 def test_a_dry_run_replaces_nothing_and_refuses_nothing(scene_copy: Path, tmp_path: Path, run: Run) -> None:
     out = tmp_path / "small.ply"
     out.write_text("mine")
-    said = run("compact", scene_copy, "-o", out, "--dry-run")
-    assert said.code == 0
+    said = run("compact", scene_copy, "-o", out, "--dry-run", code=0)
     assert f"note       {out} exists already: --overwrite would replace it" in said.out
     assert "exists" not in run("compact", scene_copy, "-o", out, "--dry-run", "--overwrite").out
     assert out.read_text() == "mine"
@@ -127,8 +126,7 @@ def test_a_compact_scene_is_known_again(scene_copy: Path, tmp_path: Path, run: R
     first = run("compact", scene_copy, "-o", out, *words)
     assert "compact already" not in first.err
     views = ("--cameras", scene_copy / "transforms.json", "--images", scene_copy / "images")
-    second = run("compact", out, "-o", again, *words, *views)
-    assert second.code == 0
+    second = run("compact", out, "-o", again, *words, *views, code=0)
     assert second.err.count("note: the scene is compact already (") == 1
     scored = run("evaluate", scene_copy, out, "--views", 2, "--lpips", "none")
     assert "small.ply: " in scored.err

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import shutil
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -19,11 +18,8 @@ from gsmerge.measure.evaluate import near_plane
 from gsmerge.render.metrics import psnr
 from gsmerge.view.data import middle_depth
 
-from .browser import Browser, browser
+from .browser import CHROMIUM, Browser, browser
 
-CHROMIUM = next(
-    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
-)
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium installed")
 SIZE = WIDTH, HEIGHT = 192, 128
 PATIENCE = 120.0  # seconds: 3D on a processor that other tests use as well
@@ -48,7 +44,6 @@ def opened(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterato
     gsmerge.write_ply(wide := scene / "wide.ply", results[1])
     targets = ["--targets", str(scene / "targets")]
     assert main(["view", str(scene), str(small), str(wide), *targets, "-o", str(page), "--no-open", "-q"]) == 0
-    assert CHROMIUM is not None
     with browser(CHROMIUM, folder / "profile", "--enable-unsafe-swiftshader") as tab:
         tab.open(page)
         wait(tab, "solid !== null")
@@ -83,7 +78,6 @@ def picture(tab: Browser) -> np.ndarray:
     clip = {"x": box["x"], "y": box["y"], "width": WIDTH, "height": HEIGHT, "scale": 1}
     data = tab.call("Page.captureScreenshot", format="png", clip=clip)["data"]
     image = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
-    assert image is not None
     return np.asarray(image[..., ::-1], np.float32) / 255
 
 

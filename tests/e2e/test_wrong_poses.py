@@ -12,6 +12,7 @@ import cv2
 import motions
 import numpy as np
 import pytest
+from tiny_scene import edited_json
 
 from gsmerge.geometry import pose_changes
 from gsmerge.io import load_scene, write_gaussians
@@ -32,14 +33,13 @@ def exact(make_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFact
 def turn_cameras(folder: Path, degrees: float, only: int | None = None) -> None:
     """The cameras of a scene, or one of them, turned about their centres."""
     path, rng = folder / "transforms.json", np.random.default_rng(0)
-    data = json.loads(path.read_text())
-    for i, frame in enumerate(data["frames"]):
-        axis = rng.normal(size=3)
-        if only in (None, i):
-            turn = np.eye(4)
-            turn[:3, :3] = cv2.Rodrigues(np.deg2rad(degrees) * axis / np.linalg.norm(axis))[0]
-            frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ turn).tolist()
-    path.write_text(json.dumps(data))
+    with edited_json(path) as data:
+        for i, frame in enumerate(data["frames"]):
+            axis = rng.normal(size=3)
+            if only in (None, i):
+                turn = np.eye(4)
+                turn[:3, :3] = cv2.Rodrigues(np.deg2rad(degrees) * axis / np.linalg.norm(axis))[0]
+                frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ turn).tolist()
 
 
 @pytest.fixture
@@ -52,8 +52,7 @@ def wrong(exact: Path, tmp_path: Path) -> Path:
 def test_cameras_that_are_a_little_off(exact: Path, wrong: Path, tmp_path: Path, run: Run) -> None:
     psnr: dict[str, Any] = {}
     for folder in (exact, wrong):
-        outcome = run("compact", folder, *FAST, "-o", tmp_path / f"{folder.name}.ply", "--overwrite")
-        assert outcome.code == 0, outcome.err
+        outcome = run("compact", folder, *FAST, "-o", tmp_path / f"{folder.name}.ply", "--overwrite", code=0)
         document = json.loads(outcome.out)
         psnr[folder.name] = document["psnr_input_views"]
         notes = [note for note in document["notes"] if "the cameras are off by a median of" in note]
@@ -65,8 +64,7 @@ def test_cameras_that_are_a_little_off(exact: Path, wrong: Path, tmp_path: Path,
 
 def test_the_cameras_as_used_are_written(exact: Path, wrong: Path, tmp_path: Path, run: Run) -> None:
     saved = tmp_path / "saved.json"
-    outcome = run("compact", wrong, *FAST, "-o", tmp_path / "a.ply", "--save-cameras", saved)
-    assert outcome.code == 0, outcome.err
+    run("compact", wrong, *FAST, "-o", tmp_path / "a.ply", "--save-cameras", saved, code=0)
     truth, cameras = read_cameras(exact / "transforms.json"), read_cameras(saved)
     assert pose_changes(truth.viewmats, cameras.viewmats)[0].max() < 0.1
     np.testing.assert_allclose(cameras.Ks, truth.Ks)
@@ -88,8 +86,7 @@ def test_results_are_measured_from_where_they_were_made(exact: Path, tmp_path: P
     document = json.loads(run("compact", folder, *FAST, "-o", out).out)
     assert document["choices"]["poses"]
     shutil.copy(out, other)  # without its cameras
-    outcome = run("evaluate", folder, out, other, "--lpips", "none", "--json")
-    assert outcome.code == 0, outcome.err
+    outcome = run("evaluate", folder, out, other, "--lpips", "none", "--json", code=0)
     found = json.loads(outcome.out)
     _, own, given = (one["mean"]["context"]["psnr"] for one in found["results"])
     assert own == pytest.approx(document["psnr_input_views"]["after"], abs=0.6)  # of a quarter of each photo
@@ -100,8 +97,7 @@ def test_results_are_measured_from_where_they_were_made(exact: Path, tmp_path: P
 def test_cameras_that_are_far_off(exact: Path, tmp_path: Path, run: Run) -> None:
     folder = Path(shutil.copytree(exact, tmp_path / "far"))
     turn_cameras(folder, 15, only=2)
-    outcome = run("compact", folder, *FAST, "-o", tmp_path / "a.ply")
-    assert outcome.code == 3
+    outcome = run("compact", folder, *FAST, "-o", tmp_path / "a.ply", code=3)
     assert outcome.err.count("\n") == 1
     assert "px of their own pixels, found a median of up to" in outcome.err
     assert not (tmp_path / "a.ply").exists()

@@ -71,7 +71,7 @@ def test_every_result_says_which_networks_it_is_from(tmp_path: Path, settings: d
     assert any("checkpoint" in note for note in rival.report.notes)
 
 
-def test_a_checkpoint_that_cannot_be_used_is_told(tmp_path: Path) -> None:
+def test_a_checkpoint_that_cannot_be_used_is_noted(tmp_path: Path) -> None:
     scene = make_scene(room(), arc(2))
     path = tmp_path / "a.safetensors"
     plain = gsmerge.compact(scene, **PLAIN, checkpoint="none")

@@ -16,7 +16,6 @@ from gsmerge.types import SH_C0
 
 
 def novel_psnr(gaussians: Gaussians, surfaces: list[scenes.Surface], start: float = -0.25) -> float:
-    """PSNR (dB) from a place between the views."""
     camera = scenes.arc(1, start=start)
     truth = scenes.trace(surfaces, camera)[2].reshape(36, 48, 3)
     image = np.clip(scenes.images_of(gaussians, camera)[0][0], 0, 1)
@@ -39,7 +38,6 @@ def room() -> Scene:
 
 def test_exposure_that_changes_between_views(room: Scene) -> None:
     """The fit compensates; factors with geometric mean one, one merge for both."""
-    assert room.images is not None
     factors = np.array([0.8, 1.2, 1 / 1.2, 1.25], np.float32)[:, None, None, None]
     merged = scenes.compacted(painted(room, 0.8 * room.images), fit="none").gaussians
     actual = []
@@ -53,8 +51,6 @@ def test_exposure_that_changes_between_views(room: Scene) -> None:
 
 
 def test_exposure_of_photos_and_gaussians(room: Scene) -> None:
-    """The whole command: the fit never hurts, and mostly helps."""
-    assert room.images is not None
     factors = np.array([0.8, 1.2, 1 / 1.2, 1.25], np.float32)[:, None, None, None]
     scene = painted(room, 0.8 * room.images * factors)
     surfaces = [scenes.Surface(s.shape, lambda p, s=s: 0.8 * s.texture(p)) for s in scenes.room()]
@@ -70,7 +66,6 @@ def test_exposure_of_photos_and_gaussians(room: Scene) -> None:
 @pytest.mark.parametrize("grey", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize("segmentation", ["rdseg", "bass-st"])
 def test_flat_pictures(room: Scene, grey: float, segmentation: str) -> None:
-    assert room.images is not None
     flat = painted(room, np.full_like(room.images, grey))
     result = scenes.compacted(flat, segmentation=segmentation, superpixels=60)
     assert 1 <= len(result.gaussians) <= 4 * 60
@@ -79,7 +74,6 @@ def test_flat_pictures(room: Scene, grey: float, segmentation: str) -> None:
 
 @pytest.mark.parametrize("segmentation", ["rdseg", "bass-st"])
 def test_noise_does_not_explode(room: Scene, segmentation: str) -> None:
-    assert room.images is not None
     noise = np.random.default_rng(0).random(room.images.shape, np.float32)
     result = scenes.compacted(painted(room, noise), segmentation=segmentation, superpixels=60)
     assert len(result.gaussians) <= 4 * 60
@@ -133,7 +127,6 @@ def test_base_colours_outside_the_range_are_kept(room: Scene) -> None:
 
 def test_passer_by_in_one_view_does_not_haunt_the_others(room: Scene) -> None:
     """A red patch in the photo of view 1 and on its Gaussians."""
-    assert room.images is not None
     images = room.images.copy()
     images[1, 10:24, 14:28] = [1.0, 0.0, 0.0]
     haunted, clean = (scenes.compacted(scene).gaussians for scene in (painted(room, images), room))

@@ -57,7 +57,6 @@ def test_more_superpixels_show_more(scene: Scene, settings: dict) -> None:
 
 @pytest.mark.parametrize("settings", [{}, {"k": 4}, {"match": "none"}], ids=str)
 def test_photos_keep_coverage_and_brightness(scene: Scene, settings: dict) -> None:
-    """The full fit, within a hundredth."""
     before = coverage(scene.gaussians, scene)
     after = coverage(scenes.compacted(scene, superpixels="4.4%", **settings).gaussians, scene)
     assert after[0] == pytest.approx(before[0], abs=0.01)

@@ -176,7 +176,6 @@ def test_zero_quaternions_mean_no_rotation(room: Scene) -> None:
 
 
 def test_tiny_changes_make_tiny_changes(room: Scene) -> None:
-    """Axes may flip, covariances must not."""
     nudge = np.random.default_rng(0).normal(0, 1e-7, room.gaussians.means.shape)
     moved = changed(room, means=room.gaussians.means + nudge)
     actual = [feature_to_gaussians(one_group_per_view(scene)) for scene in (room, moved)]
@@ -188,7 +187,6 @@ def test_tiny_changes_make_tiny_changes(room: Scene) -> None:
 
 
 def test_huge_gaussian_in_front_of_one_camera(room: Scene) -> None:
-    """In the corner of view 0; the others must not notice."""
     means, scales = room.gaussians.means.copy(), room.gaussians.scales.copy()
     eye = room.cameras.centres[0]
     means[0] = eye + 0.02 * (means[0] - eye)
@@ -202,7 +200,6 @@ def test_huge_gaussian_in_front_of_one_camera(room: Scene) -> None:
 @pytest.mark.parametrize("where", ["at", "behind"])
 @pytest.mark.parametrize("settings", [{}, {"fit": "none"}, {"fit": "none", "k": 4}], ids=str)
 def test_pixels_at_and_behind_their_own_eye(room: Scene, where: str, settings: dict) -> None:
-    """A tenth of every view, superpixels as a whole among them."""
     means = room.gaussians.means.copy().reshape(3, 36, 48, 3)
     eyes = room.cameras.centres[:, None, None]
     part = means[:, :8, :24]
@@ -223,7 +220,6 @@ def test_sky_and_foreground_stay_apart(settings: dict) -> None:
     depths = project(actual.means, scene.cameras)[1][0]
     sky_from = 7e5 if settings.get("fit") == "none" else 1e5  # a fit moves what is so far away and so large
     assert ((depths < 3) | (depths > sky_from)).all()
-    assert scene.images is not None
     far = scenes.trace(sky, scene.cameras)[1].reshape(scene.valid.shape) > 1e5
 
     def sky_psnr(gaussians: Gaussians) -> float:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+from conftest import load_script
 
 from gsmerge.io import load_scene
 
@@ -21,12 +21,7 @@ def exporter(root: Path) -> ModuleType:
     path = shared_folder(root) / "tools" / "ff_export.py"
     if not path.is_file():
         pytest.skip("no measuring data (GSMERGE_SHARED)")
-    spec = importlib.util.spec_from_file_location("ff_export", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_script(path)
 
 
 def test_a_plain_export_lines_up(exporter: ModuleType, root: Path, tmp_path: Path) -> None:
@@ -44,9 +39,7 @@ def test_a_pruned_export_is_put_back(exporter: ModuleType, root: Path, tmp_path:
     scene = shared_folder(root) / "scenes" / "eval" / "lightfield"
     ply = exporter.export(scene, tmp_path, "da3", max_views=2, nested_scale=1.7)
     loaded = load_scene(ply)
-    assert loaded.alignment is not None
     assert loaded.alignment.share_within_1px > 0.999
-    assert loaded.recovery is not None
     assert loaded.recovery.best.layout.kind == "box+depth"
     assert loaded.recovery.best.frame.scale == pytest.approx(1 / 1.7, rel=1e-3)
     actual = loaded.pixel_scene()

@@ -32,7 +32,6 @@ def test_the_smallest_budget(room: Scene, settings: dict[str, Any]) -> None:
     assert len(result.gaussians) == VIEWS
     image, alpha = scenes.images_of(result.gaussians, room.cameras)
     assert alpha.mean() > 0.3
-    assert room.images is not None
     shown = (image * alpha[..., None]).sum((0, 1, 2)) / alpha.sum()
     assert np.abs(shown - room.images.mean((0, 1, 2))).max() < 0.25
     with pytest.raises(UsageError, match="budget"):
@@ -41,7 +40,6 @@ def test_the_smallest_budget(room: Scene, settings: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("settings", [PLAIN, {"fit": "none"}, {"fit_steps": 20}], ids=str)
 def test_a_budget_of_everything(room: Scene, settings: dict[str, Any]) -> None:
-    """Every pixel its own: as many as the input, and as good."""
     result = scenes.compacted(room, superpixels="auto", budget="100%", match="none", **settings)
     assert len(result.gaussians) == room.num_gaussians
     assert scenes.psnr_of(result.gaussians, room) > scenes.psnr_of(room.gaussians, room) - 0.1
@@ -76,7 +74,6 @@ def test_four_hundred_tiny_views(settings: dict[str, Any]) -> None:
 @pytest.mark.parametrize("size", [(4096, 16), (16, 4096), (4096, 1)])
 @pytest.mark.parametrize("settings", [PLAIN, {"fit_steps": 10}], ids=str)
 def test_long_views(size: tuple[int, int], settings: dict[str, Any]) -> None:
-    """Superpixels follow the long side: neither end is lost."""
     width, height = size
     cameras = scenes.arc(2, *size)
     if height > width:
@@ -86,7 +83,6 @@ def test_long_views(size: tuple[int, int], settings: dict[str, Any]) -> None:
     scene = scenes.make_scene(scenes.wall(), cameras)
     result = scenes.compacted(scene, superpixels="2%", **settings)
     assert len(result.gaussians) <= 0.04 * scene.num_gaussians
-    assert scene.images is not None
     _, alpha = scenes.images_of(result.gaussians, scene.cameras)
     along = alpha.mean((0, 1)) if width > height else alpha.mean((0, 2))
     assert along[: len(along) // 16].mean() > 0.5

@@ -94,7 +94,6 @@ def test_one_gaussian(room: Scene) -> None:
 
 
 def test_without_images(room: Scene, floor: Callable[..., None]) -> None:
-    """The result looks like the scene itself."""
     blind = replace(unaligned_scenes.shuffled(room), images=None)
     result = compacted(blind, fit_steps=60)
     assert any("no photos" in note for note in result.report.notes)

@@ -28,7 +28,6 @@ def test_threads_do_not_matter(segmentation: str) -> None:
 
 
 def test_positions_stay_exact_in_wide_pictures() -> None:
-    """A superpixel far from the origin is as well placed as one near it."""
     width, spread = 9000, np.float32(1e-5**0.5)
     labels = np.repeat(np.arange(3), 3000)[None].repeat(2, 0)
     rows = region_rows(pad_labels(labels), np.zeros((2, width, 3), np.float32), 3, 3, spread)
@@ -68,7 +67,6 @@ def test_methods_rank_as_published() -> None:
 
 
 def test_splits_and_merges_pay() -> None:
-    """At the same number, BASS with the moves describes a photo better than without, in either form."""
     image = photos()["coffee"]
     for density in (5_000, 12_000):
         for adapt in (1.0, None):

@@ -45,9 +45,7 @@ def moved_on(photos: Photos) -> Photos:
 
 
 def another_scene(photos: Photos) -> Photos:
-    other = scenes.make_scene(scenes.wall(9), scenes.arc(VIEWS, 96, 72)).images
-    assert other is not None
-    return other
+    return scenes.make_scene(scenes.wall(9), scenes.arc(VIEWS, 96, 72)).images
 
 
 def one_of_noise(photos: Photos) -> Photos:
@@ -81,13 +79,11 @@ def unspoilt(room: Scene) -> CompactResult:
 
 
 def with_photos(room: Scene, change: Callable[[Photos], Photos], *, aligned: bool = True) -> Any:
-    assert room.images is not None
     scene = replace(room, images=change(room.images))
     return scene if aligned else Scene(scene.gaussians, scene.cameras, scene.images, None, scene.names)
 
 
 def novel_psnr(gaussians: Gaussians) -> float:
-    """PSNR (dB) between the views."""
     camera = scenes.arc(1, 96, 72, start=-0.2)
     truth = scenes.trace(scenes.room(), camera)[2].reshape(72, 96, 3)
     image = np.clip(scenes.images_of(gaussians, camera)[0][0], 0, 1)
@@ -96,7 +92,9 @@ def novel_psnr(gaussians: Gaussians) -> float:
 
 @pytest.mark.parametrize("aligned", [True, False], ids=["aligned", "unaligned"])
 @pytest.mark.parametrize(("change", "odd"), SPOILT, ids=lambda case: getattr(case, "__name__", None))
-def test_they_are_found(room: Scene, change: Callable[[Photos], Photos], odd: list[int], aligned: bool) -> None:
+def test_odd_photos_are_recognised(
+    room: Scene, change: Callable[[Photos], Photos], odd: list[int], aligned: bool
+) -> None:
     assert odd_photos(with_photos(room, change, aligned=aligned)) == odd
 
 
@@ -154,7 +152,6 @@ def test_the_fit_does_without_some(room: Scene, unspoilt: CompactResult, change:
 @pytest.mark.parametrize("change", [all_black, all_noise, moved_on, another_scene])
 @pytest.mark.parametrize("settings", [{}, {"budget": 500}, {"budget": "auto"}], ids=str)
 def test_no_fit_where_most_are_wrong(room: Scene, change: Callable[[Photos], Photos], settings: dict[str, Any]) -> None:
-    """As where there are no photos."""
     wanted = {**FIT, **settings}
     result, without = (compact(one, **wanted) for one in (with_photos(room, change), replace(room, images=None)))
     note = f"{VIEWS} of {VIEWS} photos do not show what the Gaussians show, so none is used and nothing is fitted"
@@ -167,7 +164,6 @@ def test_no_fit_where_most_are_wrong(room: Scene, change: Callable[[Photos], Pho
 
 
 def test_unaligned_gaussians_without_a_fit(room: Scene) -> None:
-    """As where there are no photos and no fit is asked for."""
     scene = with_photos(room, all_black, aligned=False)
     result, without = compact(scene, **FIT), compact(replace(scene, images=None), **FIT, fit="none")
     assert "fit" not in result.report.choices
@@ -200,7 +196,6 @@ def test_no_note_on_good_photos(unspoilt: CompactResult) -> None:
 
 def test_the_views_of_a_fit(room: Scene) -> None:
     full, half = fit_photos(room, FitOptions(), (0, 2, 5))
-    assert room.images is not None
     np.testing.assert_array_equal(full.images, room.images[[0, 2, 5]])
     assert len(half) == 3
     np.testing.assert_array_equal(half.viewmats, room.cameras.viewmats[[0, 2, 5]])

@@ -97,7 +97,7 @@ def test_links_in_a_circle_end() -> None:
         ("binary.bin", "no text"),
     ],
 )
-def test_what_holds_no_scene_is_told(given: str, said: str) -> None:
+def test_places_without_a_scene_are_refused(given: str, said: str) -> None:
     Path("empty").mkdir()
     Path("blank.txt").write_text("\n# nothing\n")
     Path("binary.bin").write_bytes(b"a\0b")

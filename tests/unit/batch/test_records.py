@@ -182,7 +182,7 @@ def test_totals_do_not_grow_with_the_number_of_scenes(tmp_path: Path) -> None:
     assert summary_lines(Totals(0), None) == ["0 scenes: 0 done"]
 
 
-def test_a_folder_that_cannot_be_written_is_told_before_anything_is_done(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_written_is_refused_before_the_work(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(SceneError, match=r"cannot be written .*--output"):
         check_folder(tmp_path / "file" / "out")

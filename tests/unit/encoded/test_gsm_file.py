@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scenes
-from damaged_files import (
+from hostile.gsm_files import (
     GSM_HEADERS,
     UNREADABLE,
     WILD_NUMBERS,

@@ -61,7 +61,7 @@ def test_colours_without_pixels_or_contrast() -> None:
 
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize(("degrees", "shift"), [(1.0, 0.0), (0.0, 0.06), (1.0, 0.06)])  # 0.06: 2 % of the depth
-def test_a_moved_camera_is_found_back(
+def test_a_moved_camera_is_moved_back(
     known: tuple[Gaussians, Cameras, np.ndarray], degrees: float, shift: float, antialiased: bool
 ) -> None:
     gaussians, camera, _ = known

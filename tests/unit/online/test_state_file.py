@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from damaged_files import (
+from hostile.gsm_files import (
     GSM_HEADERS,
     UNREADABLE,
     WILD_NUMBERS,

@@ -38,7 +38,6 @@ def half(scene: Scene) -> Gaussians:
 @pytest.fixture(scope="module")
 def held_out() -> Views:
     other = scenes.make_scene(scenes.room(), scenes.arc(2, 180, 108))
-    assert other.images is not None
     return Views(other.cameras, other.images, ("x/a.png", "x/b.png"))
 
 
@@ -48,15 +47,12 @@ def actual(scene: Scene, half: Gaussians, held_out: Views) -> ViewData:
 
 
 def decoded(still: bytes | None) -> np.ndarray:
-    assert still is not None
     image = cv2.imdecode(np.frombuffer(still, np.uint8), cv2.IMREAD_COLOR)
-    assert image is not None
     return np.asarray(image[..., ::-1], np.float32) / 255
 
 
 def unpacked(packed: bytes | None) -> bytes:
     """The uncompressed .spz of what the page holds: sums down every column."""
-    assert packed is not None
     raw = gzip.decompress(packed)
     count, degree = struct.unpack_from("<IB", raw, 8)
     columns, at = [], 20
@@ -89,7 +85,6 @@ def test_the_worst_view_comes_first(actual: ViewData) -> None:
 def test_stills_are_our_renders(actual: ViewData, scene: Scene, half: Gaussians, held_out: Views) -> None:
     for view in actual.views:
         split, i = (held_out, view.place - 3) if view.held_out else (scene, view.place)
-        assert split.images is not None
         renders = [
             render(some, split.cameras[[i]], near=near_plane(scene)).images[0].clip(0, 1)
             for some in (scene.gaussians, half)
@@ -142,7 +137,6 @@ def test_harmonics_of_zeros_are_left_out(scene: Scene, half: Gaussians) -> None:
 
 def test_pixels_in_order_take_less_than_their_spz(scene: Scene) -> None:
     packed, _ = pack_splats(scene.gaussians)
-    assert packed is not None
     assert len(packed) < 0.8 * len(spz_bytes(scene.gaussians))
 
 
@@ -156,14 +150,11 @@ def test_what_is_not_finite_or_faint_is_left_out(half: Gaussians) -> None:
 
 
 def test_outlines_are_the_borders_of_superpixels(actual: ViewData, scene: Scene) -> None:
-    """Of the input photos alone, as compact cuts them."""
     assert actual.num_superpixels == (int(0.044 * 160 * 120),) * 2
     assert [view.outlines is None for view in actual.views] == [view.held_out for view in actual.views]
-    assert scene.images is not None
     view = next(view for view in actual.views if view.place == 1)
     labels = segment(scene.images, SegmentOptions()).labels[1]
     picture = cv2.imdecode(np.frombuffer(view.outlines or b"", np.uint8), cv2.IMREAD_UNCHANGED)
-    assert picture is not None
     factor = 1280 // 160
     assert picture.shape == (120 * factor, 160 * factor, 4)
     lines = picture[..., 3] > 0

@@ -13,9 +13,11 @@ from importlib.resources import files
 import pytest
 import scenes
 
-from gsmerge.measure.evaluate import Quality
+from gsmerge.measure.evaluate import EvaluateOptions, Quality, evaluate
+from gsmerge.measure.preview import view_pictures
+from gsmerge.measure.scores import evaluation_document
 from gsmerge.view.data import ViewData, collect
-from gsmerge.view.page import headline, view_page
+from gsmerge.view.page import headline, report_page, view_page
 
 EVIL = '</script><b onload="x">&{{ 7 * 7 }}'
 NAMES = ("images/<i>0</i>.png", "images/1.png", EVIL)
@@ -34,7 +36,6 @@ def page(data: ViewData) -> str:
 
 def block(page: str, name: str) -> str:
     found = re.search(rf'<script type="[a-z/]+" id="{name}">(.*?)</script>', page, re.DOTALL)
-    assert found is not None
     return found[1]
 
 
@@ -137,3 +138,41 @@ def test_the_renderer_is_the_one_that_was_vendored() -> None:
     assert set(sources["packages"]) >= {"@sparkjsdev/spark", "three"}
     for package in ("spark", "three", "fflate"):
         assert "MIT" in vendor.joinpath(f"LICENSE.{package}").read_text()
+
+
+NAME = "a|b<i>"
+
+
+@pytest.fixture(scope="module")
+def report() -> str:
+    scene = scenes.make_scene(scenes.room(), scenes.arc(3))
+    half = scene.gaussians[::2]
+    sizes = {"input": {"path": "in.ply", "bytes": 2000}, NAME: {"path": "out.ply", "bytes": 1000}}
+    evaluation = evaluate(scene, {NAME: half}, None, EvaluateOptions(lpips=()))
+    pictures = view_pictures([("in", scene.gaussians), (NAME, half)], scene.cameras, scene.images, max_views=2)
+    return report_page(evaluation_document(evaluation, sizes, ["first <note>"]), pictures)
+
+
+def test_a_report_loads_nothing_and_escapes_names(report: str) -> None:
+    assert "a|b&lt;i&gt;" in report
+    assert "first &lt;note&gt;" in report
+    assert re.findall("<i>|<note>|https?:", report) == []
+    addresses = re.findall(r"""(?:src|href)=["']?([^"'> ]*)""", report)
+    assert len(addresses) >= 6
+    assert all(address.startswith("data:") for address in addresses)
+
+
+def test_in_a_report_the_headline_comes_first_then_pictures(report: str) -> None:
+    places = [
+        report.index(words) for words in ("50.0\u00a0% of the Gaussians", "2.0 kB", "data:image/webp", "<h2>Size</h2>")
+    ]
+    assert places == sorted(places)
+    assert report.count('class="compare"') == 2
+    assert report.count("<img") == 2 * 3
+
+
+def test_columns_of_a_report_without_a_figure_are_left_out(report: str) -> None:
+    assert "LPIPS" not in report
+    assert "earned back after" not in report
+    assert "PSNR (dB)" in report
+    assert "2.0 x" in report

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import zipfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -57,7 +55,6 @@ def test_the_scene_is_picked_by_the_name_of_the_ply(tmp_path: Path) -> None:
     loaded = load_scene(tmp_path)
     scene = loaded.pixel_scene()
     assert scene.valid.all()
-    assert loaded.cameras is not None
     assert loaded.cameras.source == "re10k chunk"
     assert np.allclose(scene.cameras.Ks, SMOOTH.K, atol=1e-4)
     assert np.allclose(scene.cameras.viewmats, SMOOTH.w2c, atol=1e-6)
@@ -88,7 +85,6 @@ def test_photos_that_were_cropped(tmp_path: Path) -> None:
     rows = turned(export_rows(tiny, inner.T.reshape(-1)), tiny.w2c[0, :3, :3])
     save(tmp_path, entry(whole, "scene"))
     loaded = load_scene(save_export(tmp_path, tiny, rows, cameras=False))
-    assert loaded.alignment is not None
     assert loaded.alignment.worst_px < 0.5
     assert np.allclose(loaded.scene.cameras.Ks, tiny.K, atol=1e-3)
     assert [d.name for d in loaded.exporters] == ["depthsplat"]
@@ -119,87 +115,8 @@ def test_without_photos(tmp_path: Path) -> None:
     assert load_scene(tmp_path, images=tmp_path / "photos").pixel_scene().valid.all()
 
 
-class Payload:
-    """Makes a folder when it is unpickled."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = str(path)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return os.mkdir, (self.path,)
-
-
-def test_nothing_is_executed(tmp_path: Path) -> None:
-    for data in (Payload(tmp_path / "ran"), [{"key": "a", "cameras": Payload(tmp_path / "ran"), "images": []}]):
-        torch.save(data, tmp_path / "a.torch")
-        with pytest.raises(SceneError, match="a damaged one, or objects, which are not read"):
-            read_cameras(tmp_path / "a.torch")
-    torch.save([entry(SMOOTH, "a")], tmp_path / "a.torch", _use_new_zipfile_serialization=False)
-    with pytest.raises(SceneError, match="found something else"):
-        read_cameras(tmp_path / "a.torch")
-    assert not (tmp_path / "ran").exists()
-
-
-@pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.99])
-def test_truncated(tmp_path: Path, share: float) -> None:
-    path = save(tmp_path, entry(SMOOTH, "a"))
-    data = path.read_bytes()
-    path.write_bytes(data[: int(share * len(data))])
-    with pytest.raises(SceneError, match="expected a chunk written by torch"):
-        read_cameras(path)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"cameras": torch.zeros(3, 17)}, r"expected cameras \[v,18\], found \[3, 17\]"),
-        ({"cameras": torch.zeros(18)}, r"expected cameras \[v,18\], found \[18\]"),
-        ({"cameras": "many"}, r"expected cameras \[v,18\], found str"),
-        ({"cameras": torch.zeros(0, 18)}, "expected 1 to 10000 cameras, found 0"),
-        ({"cameras": torch.zeros(1, 18).expand(2**40, 18)}, "expected 1 to 10000 cameras"),
-        ({"cameras": torch.zeros(3, 18, dtype=torch.int32)}, "expected cameras of numbers"),
-        ({"cameras": torch.zeros(3, 18).to_sparse()}, "expected cameras of numbers"),
-        ({"cameras": torch.full((3, 18), torch.nan)}, "expected finite numbers"),
-        ({"cameras": torch.zeros(3, 18)}, "axes are not orthonormal"),
-        ({"images": [torch.zeros(4, dtype=torch.uint8)]}, "expected 3 images, one per camera, found 1"),
-        ({"images": "abc"}, "expected 3 images, one per camera, found str"),
-        ({"images": [torch.zeros(4)] * 3}, "expected images as tensors"),
-        ({"images": [torch.zeros(1, dtype=torch.uint8).expand(2**40)] * 3}, "expected images as tensors"),
-        ({"images": [torch.zeros(0, dtype=torch.uint8)] * 3}, "cannot be decoded"),
-        ({"images": [jpeg(SMOOTH.images[0])[:200]] * 3}, "cannot be decoded|as its header says"),
-        ({"images": [jpeg(SMOOTH.images[i][: 20 + i]) for i in range(3)]}, "view 1: expected images of one size"),
-    ],
-)
-def test_wrong_shapes(tmp_path: Path, change: dict[str, Any], message: str) -> None:
-    path = save(tmp_path, entry(SMOOTH, "a") | change)
-    with pytest.raises(SceneError, match=message):
-        read_cameras(path)
-
-
-def test_tensors_that_want_gradients_or_have_no_numbers(tmp_path: Path) -> None:
+def test_tensors_that_want_gradients(tmp_path: Path) -> None:
     given = entry(SMOOTH, "a")
     expected = read_cameras(save(tmp_path, given)).viewmats
     actual = read_cameras(save(tmp_path, given | {"cameras": rows_of(SMOOTH).requires_grad_()}))
     assert np.array_equal(actual.viewmats, expected)
-    empty = torch.empty(len(SMOOTH.names), 18, device="meta")
-    with pytest.raises(SceneError, match="expected cameras of numbers"):
-        read_cameras(save(tmp_path, given | {"cameras": empty}))
-    images = [torch.empty(9, dtype=torch.uint8, device="meta") for _ in SMOOTH.names]
-    with pytest.raises(SceneError, match="expected images as tensors"):
-        read_cameras(save(tmp_path, given | {"images": images}))
-
-
-def test_what_is_no_list_of_scenes(tmp_path: Path) -> None:
-    for data in ([], [1, 2], {"a": 1}, 5, torch.zeros(3), [entry(SMOOTH, "a"), {"key": "b"}]):
-        torch.save(data, tmp_path / "a.torch")
-        with pytest.raises(SceneError, match="expected a list of scenes"):
-            read_cameras(tmp_path / "a.torch")
-
-
-def test_packed_members_are_not_unpacked(tmp_path: Path) -> None:
-    path = save(tmp_path, entry(SMOOTH, "a"))
-    with zipfile.ZipFile(path) as source, zipfile.ZipFile(tmp_path / "b.torch", "w", zipfile.ZIP_DEFLATED) as target:
-        for member in source.infolist():
-            target.writestr(member.filename, source.read(member))
-    with pytest.raises(SceneError, match="found packed members"):
-        read_cameras(tmp_path / "b.torch")

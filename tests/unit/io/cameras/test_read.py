@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import scenes
+from hostile.camera_models import long_lrm, world_mirror
+from hostile.case import HEIGHT, VIEWS, WIDTH
 from tiny_scene import (
     Tiny,
+    edited_json,
+    save_json,
     write_colmap_text,
     write_inria,
     write_transforms,
@@ -18,72 +22,45 @@ from tiny_scene import (
 from gsmerge.errors import SceneError
 from gsmerge.io import read_cameras
 
-VIEWS = 3
+C2W = np.linalg.inv(scenes.arc(VIEWS, WIDTH, HEIGHT).viewmats.astype(np.float64))
+K = scenes.arc(1, WIDTH, HEIGHT).Ks[0].astype(np.float64)
 
 
-@pytest.fixture(scope="module")
-def truth() -> tuple[np.ndarray, np.ndarray]:
-    """World-to-camera matrices and intrinsics."""
-    cameras = scenes.arc(VIEWS, 28, 14)
-    return cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
+def write_world_mirror(folder: Path) -> Path:
+    return save_json(folder / "camera_params.json", world_mirror(C2W, K))
 
 
-def assert_equal(path: Path, viewmats: np.ndarray, Ks: np.ndarray) -> None:
-    actual = read_cameras(path)
-    np.testing.assert_allclose(actual.viewmats, viewmats, atol=1e-9)
-    np.testing.assert_allclose(actual.Ks, Ks, atol=1e-9)
+def write_long_lrm(folder: Path) -> Path:
+    return save_json(folder / "scene.json", long_lrm(C2W, K))
 
 
-def entries(matrices: np.ndarray) -> list[dict[str, object]]:
-    return [{"camera_id": f"image_{i:04d}", "matrix": m.tolist()} for i, m in enumerate(matrices)]
-
-
-def world_mirror(folder: Path, viewmats: np.ndarray, Ks: np.ndarray) -> Path:
-    path = folder / "camera_params.json"
-    document = {"num_cameras": VIEWS, "extrinsics": entries(np.linalg.inv(viewmats)), "intrinsics": entries(Ks)}
-    path.write_text(json.dumps(document))
-    return path
-
-
-def long_lrm(folder: Path, viewmats: np.ndarray, Ks: np.ndarray) -> Path:
-    path = folder / "scene.json"
-    frames = [
-        {"file_path": f"{i}.png", "w2c": m.tolist(), "fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2],
-         "w": 28, "h": 14}
-        for i, (m, K) in enumerate(zip(viewmats, Ks, strict=True))
-    ]  # fmt: skip
-    path.write_text(json.dumps({"frames": frames}))
-    return path
-
-
-def trajectory(folder: Path, viewmats: np.ndarray, Ks: np.ndarray, *, columns: int = 16) -> Path:
+def write_trajectory(folder: Path, columns: int = 16) -> Path:
     path = folder / "camera_poses.txt"
-    rows = [" ".join(map(repr, map(float, m.reshape(-1)[:columns]))) for m in np.linalg.inv(viewmats)]
-    path.write_text("\n".join(rows) + "\n")
-    K = Ks[0]
+    path.write_text("".join(" ".join(map(repr, m.reshape(-1)[:columns].tolist())) + "\n" for m in C2W))
     (folder / "intrinsic.txt").write_text(f"{K[0, 0]} {K[1, 1]} {K[0, 2]} {K[1, 2]}\n")
     return path
 
 
-@pytest.mark.parametrize("write", [world_mirror, long_lrm, trajectory])
-def test_poses_and_intrinsics_are_read(tmp_path: Path, truth: tuple[np.ndarray, np.ndarray], write) -> None:  # type: ignore[no-untyped-def]
-    assert_equal(write(tmp_path, *truth), *truth)
+def write_trajectory_of_12(folder: Path) -> Path:
+    return write_trajectory(folder, 12)
 
 
-@pytest.mark.parametrize("name", ["camera_params.json", "camera_poses.txt"])
-def test_they_are_found_in_a_folder(tmp_path: Path, truth: tuple[np.ndarray, np.ndarray], name: str) -> None:
-    (world_mirror if name.endswith("json") else trajectory)(tmp_path, *truth)
-    assert read_cameras(tmp_path).path.endswith(name)
+@pytest.mark.parametrize("write", [write_world_mirror, write_long_lrm, write_trajectory, write_trajectory_of_12])
+def test_poses_and_intrinsics_are_read(tmp_path: Path, write: Callable[[Path], Path]) -> None:
+    actual = read_cameras(write(tmp_path))
+    np.testing.assert_allclose(actual.viewmats, np.linalg.inv(C2W), atol=1e-9)
+    np.testing.assert_allclose(actual.Ks, np.stack([K] * VIEWS), atol=1e-9)
 
 
-def test_twelve_numbers_a_line(tmp_path: Path, truth: tuple[np.ndarray, np.ndarray]) -> None:
-    assert_equal(trajectory(tmp_path, *truth, columns=12), *truth)
+@pytest.mark.parametrize("write", [write_world_mirror, write_trajectory])
+def test_they_are_recognised_in_a_folder(tmp_path: Path, write: Callable[[Path], Path]) -> None:
+    path = write(tmp_path)
+    assert read_cameras(tmp_path).path == str(path)
 
 
-def test_long_lrm_s_world_is_the_gaussians(tmp_path: Path, truth: tuple[np.ndarray, np.ndarray]) -> None:
+def test_long_lrm_s_world_is_the_gaussians(tmp_path: Path) -> None:
     """A point of the cameras' world and its image in the Gaussians' are seen in the same direction."""
-    viewmats, Ks = truth
-    path = long_lrm(tmp_path, viewmats, Ks)
+    path = write_long_lrm(tmp_path)
     move = np.eye(4)
     move[:3, :3], move[:3, 3] = scenes.random_rotation(3), (0.3, -1.0, 2.0)
     (tmp_path / "pos_avg_inv.txt").write_text("\n".join(" ".join(map(str, row)) for row in move))
@@ -93,49 +70,46 @@ def test_long_lrm_s_world_is_the_gaussians(tmp_path: Path, truth: tuple[np.ndarr
     point = np.array([0.2, -0.1, 3.0, 1.0])
     moved = np.append(1.35 * (move @ point)[:3], 1.0)
     for view, viewmat in zip((2, 0), actual.viewmats, strict=True):
-        seen, truly = (viewmat @ moved)[:3], (viewmats[view] @ point)[:3]
+        seen, truly = (viewmat @ moved)[:3], (np.linalg.inv(C2W)[view] @ point)[:3]
         np.testing.assert_allclose(seen, 1.35 * truly, atol=1e-9)
-    assert actual.names == ("2.png", "0.png")
+    assert actual.names == ("view_002", "view_000")
 
 
-def broken(kind: str, folder: Path, viewmats: np.ndarray, Ks: np.ndarray) -> Path:
-    if kind == "another camera":
-        path = world_mirror(folder, viewmats, Ks)
-        document = json.loads(path.read_text())
+def other_intrinsics(path: Path) -> None:
+    with edited_json(path) as document:
         document["intrinsics"][0]["camera_id"] = "elsewhere"
-        path.write_text(json.dumps(document))
-    elif kind == "no matrix":
-        path = world_mirror(folder, viewmats, Ks)
-        path.write_text(json.dumps({"extrinsics": [{"camera_id": 1}], "intrinsics": []}))
-    elif kind == "ragged":
-        path = trajectory(folder, viewmats, Ks)
-        path.write_text(path.read_text() + "1 2 3\n")
-    elif kind == "no intrinsics":
-        path = trajectory(folder, viewmats, Ks)
-        (folder / "intrinsic.txt").unlink()
-    elif kind == "no focal":
-        path = long_lrm(folder, viewmats, Ks)
-        path.write_text(path.read_text().replace('"fx"', '"f"'))
-    else:
-        path = long_lrm(folder, viewmats, Ks)
-        (folder / "input_frame_idx.txt").write_text("0 7")
-    return path
+
+
+def replace_text(old: str, new: str) -> Callable[[Path], object]:
+    return lambda path: path.write_text(path.read_text().replace(old, new, 1))
 
 
 @pytest.mark.parametrize(
-    ("kind", "message"),
+    ("write", "spoil", "message"),
     [
-        ("another camera", "the same cameras, found only one for elsewhere"),
-        ("no matrix", "expected entries of 'camera_id' and 'matrix'"),
-        ("ragged", "line 4: expected 12 or 16 numbers, found 3"),
-        ("no intrinsics", "expected the intrinsics next to it in intrinsic.txt"),
-        ("no focal", "expected w2c, fx, fy, cx, cy, w, h as numbers"),
-        ("a frame too many", "expected frames 0 to 2, found 7"),
+        (write_world_mirror, other_intrinsics, "the same cameras, found only one for elsewhere"),
+        (write_world_mirror, replace_text("matrix", "m"), "expected entries of 'camera_id' and 'matrix'"),
+        (
+            write_trajectory,
+            lambda path: path.write_text(path.read_text() + "1 2 3\n"),
+            "line 4: expected 12 or 16 numbers, found 3",
+        ),
+        (write_trajectory, lambda path: path.with_name("intrinsic.txt").unlink(), "intrinsics next to it in intrinsic"),
+        (write_long_lrm, replace_text('"fx"', '"f"'), "expected w2c, fx, fy, cx, cy, w, h as numbers"),
+        (
+            write_long_lrm,
+            lambda path: path.with_name("input_frame_idx.txt").write_text("0 7"),
+            "expected frames 0 to 2, found 7",
+        ),
     ],
 )
-def test_what_is_wrong_is_named(tmp_path: Path, truth: tuple[np.ndarray, np.ndarray], kind: str, message: str) -> None:
+def test_what_is_wrong_is_named(
+    tmp_path: Path, write: Callable[[Path], Path], spoil: Callable[[Path], object], message: str
+) -> None:
+    path = write(tmp_path)
+    spoil(path)
     with pytest.raises(SceneError, match=message):
-        read_cameras(broken(kind, tmp_path, *truth))
+        read_cameras(path)
 
 
 def test_what_is_no_camera_file(tmp_path: Path) -> None:

@@ -206,14 +206,14 @@ def test_extreme_scales_are_clipped_and_counted(tmp_path: Path) -> None:
 
 
 def test_zero_and_extreme_quaternions(tmp_path: Path) -> None:
-    rows = columns(4)
+    rows = columns(5)
     for name in ("rot_0", "rot_1", "rot_2", "rot_3"):
-        rows[name] = (0, 1e-30, 1e30, 2)
+        rows[name] = (0, 1e-30, 1e30, 2, -7)
     actual = read_ply(save(tmp_path / "a.ply", rows))
     assert actual.info.num_zero_quats == 1
     assert actual.gaussians.quats[0].tolist() == [1, 0, 0, 0]
-    for i in (1, 2, 3):
-        assert actual.gaussians.quats[i].tolist() == pytest.approx([0.5] * 4, abs=1e-6)
+    for i, sign in enumerate((1, 1, 1, -1), 1):
+        assert actual.gaussians.quats[i].tolist() == pytest.approx([0.5 * sign] * 4, abs=1e-6)
 
 
 def test_many_blocks_and_any_number_of_threads_give_the_same(tmp_path: Path) -> None:
@@ -296,7 +296,6 @@ def test_a_filter_of_their_own_is_passed_on(ending: str, gaussians: Gaussians, t
 
 
 def test_noise_in_a_file_is_no_traceback(tmp_path: Path) -> None:
-    """Bytes changed at random either still give Gaussians, or one of our errors."""
     rng, path, refused = np.random.default_rng(0), tmp_path, 0
     for content, ending in ((spz_bytes(corners()), ".spz"), (sog_bytes(corners()), ".sog")):
         path = tmp_path / f"a{ending}"

@@ -1,0 +1,142 @@
+"""``gsmerge evaluate`` as users call it."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import pytest
+from tiny_scene import edited_json
+
+from .conftest import Run
+
+
+@pytest.fixture
+def small(scene_copy: Path, run: Run) -> Path:
+    out = scene_copy / "small.ply"
+    assert run("compact", scene_copy, "-o", out, "-q", "--report", scene_copy / "run.json").code == 0
+    return out
+
+
+def test_table_and_files(scene_copy: Path, small: Path, run: Run, floor: Callable[..., None]) -> None:
+    table, report = scene_copy / "a.csv", scene_copy / "a.json"
+    outcome = run(
+        "evaluate", scene_copy / "scene.ply", small, "--targets", scene_copy / "targets", "--lpips", "none",
+        "-o", table, "-o", report,
+    )  # fmt: skip
+    assert (outcome.code, outcome.err) == (0, "")
+    assert "small.ply" in outcome.out
+    document = json.loads(report.read_text())
+    before, after = document["results"]
+    assert after["bytes"] == small.stat().st_size
+    assert sum(after["bytes_by_attribute"].values()) < after["bytes"]
+    floor(after["mean"]["target"]["psnr_visible"] - before["mean"]["target"]["psnr_visible"])
+    assert document["num_views"] == {"context": 5, "target": 4}
+    with table.open() as file:
+        assert len(list(csv.DictReader(file))) == 2 * 9
+
+
+def test_other_sizes(scene_copy: Path, run: Run) -> None:
+    call = ("evaluate", scene_copy, "--targets", scene_copy / "targets", "--no-context", "--lpips", "none")
+    outcome = run(*call, "--zoom", ".5,1,2", "--antialiased", "--json")
+    document = json.loads(outcome.out)
+    sizes = document["results"][0]["mean"]["target"]["zooms"]
+    assert [one["zoom"] for one in sizes] == [0.5, 1, 2]
+    assert sizes[1]["psnr"] == document["results"][0]["mean"]["target"]["psnr"]
+    assert "PSNR 0.5x" in run(*call, "--zoom", ".5").out
+
+
+def test_alignment(scene_copy: Path, run: Run) -> None:
+    """Of held-out photos taken with another exposure and from a place that is not quite theirs."""
+    targets = scene_copy / "targets" / "transforms.json"
+    with edited_json(targets) as document:
+        for frame in document["frames"]:
+            frame["transform_matrix"][0][3] += 0.03
+            photo = targets.parent / frame["file_path"]
+            cv2.imwrite(str(photo), cv2.convertScaleAbs(cv2.imread(str(photo)), alpha=0.7, beta=10))
+    call = ("evaluate", scene_copy, "--targets", targets, "--no-context", "--lpips", "none", "--align", "color,pose")
+    mean = json.loads(run(*call, "--json").out)["results"][0]["mean"]["target"]
+    aligned = {name: scores["psnr_visible"] for name, scores in mean["aligned"].items()}
+    assert mean["psnr_visible"] + 2 < aligned["color"] < aligned["both"]
+    assert mean["pose_change"]["shift"] > 0
+    assert "cameras moved by" in run(*call).out
+
+
+def test_agrees_with_the_measuring_example(scene_copy: Path, small: Path, run: Run, target_psnr) -> None:
+    outcome = run("evaluate", scene_copy, small, "--targets", scene_copy / "targets", "--lpips", "none", "--json")
+    mean = json.loads(outcome.out)["results"][1]["mean"]["target"]
+    assert mean["psnr"] == pytest.approx(target_psnr(scene_copy / "targets", small), abs=1e-4)
+
+
+def test_fewer_views(scene_copy: Path, run: Run) -> None:
+    outcome = run("evaluate", scene_copy, "--views", "3", "--lpips", "none", "--json")
+    assert json.loads(outcome.out)["num_views"] == {"context": 3}
+
+
+def test_a_trajectory_with_both_kinds_of_views(scene_copy: Path, run: Run) -> None:
+    context = json.loads((scene_copy / "transforms.json").read_text())
+    targets = json.loads((scene_copy / "targets" / "transforms.json").read_text())
+    frames = []
+    for i, frame in enumerate(context["frames"]):
+        frames.append(frame)
+        if i < len(targets["frames"]):
+            own = targets["frames"][i]
+            frames.append(own | {"file_path": "targets/" + own["file_path"]})
+    for frame in frames[1::2]:  # names of their own
+        new = frame["file_path"].replace("view", "held")
+        (scene_copy / frame["file_path"]).rename(scene_copy / new)
+        frame["file_path"] = new
+    trajectory = scene_copy / "all.json"
+    trajectory.write_text(json.dumps(context | {"frames": frames}))
+    outcome = run("evaluate", scene_copy, "--targets", trajectory, "--views", "3", "--lpips", "none", "--json")
+    document = json.loads(outcome.out)
+    assert document["num_views"] == {"context": 3, "target": 2}
+    held = [view["view"] for view in document["results"][0]["views"] if view["split"] == "target"]
+    assert [Path(name).stem for name in held] == [Path(frames[i]["file_path"]).stem for i in (1, 5)]
+
+
+def test_networks_that_are_not_installed(scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gsmerge.measure.lpips.lpips_available", lambda net: False)
+    outcome = run("evaluate", scene_copy, scene_copy / "scene.ply", "--lpips", "vgg", code=2)
+    assert "weights are not installed" in outcome.err
+
+
+def test_costs_and_files_of_every_kind(scene_copy: Path, small: Path, run: Run) -> None:
+    outputs = {suffix: scene_copy / f"page.{suffix}" for suffix in ("json", "csv", "md", "html")}
+    flags = [part for path in outputs.values() for part in ("-o", path)]
+    call = ("evaluate", scene_copy / "scene.ply", small, "--lpips", "none")
+    outcome = run(*call, *flags, "--zoom", "1,.5", "--merge-seconds", scene_copy / "run.json", code=0)
+    document = json.loads(outputs["json"].read_text())
+    before, after = document["results"]
+    assert [speed["width"] for speed in before["speeds"][:2]] == [96, 48]
+    assert 1 < after["overdraw"] < before["overdraw"]
+    assert after["merge_seconds"] == json.loads((scene_copy / "run.json").read_text())["total_seconds"]
+    assert "| small.ply |" in outputs["md"].read_text()
+    assert "data:image/webp;base64," in outputs["html"].read_text()
+    assert "Render time" in outcome.out
+    assert "overdraw" not in run(*call).out
+    again = run(*call, "-o", outputs["md"])
+    assert (again.code, "--overwrite" in again.err) == (2, True)
+
+
+def test_views_are_placed_in_a_scene_without_cameras(scene_copy: Path, small: Path, run: Run) -> None:
+    (scene_copy / "transforms.json").unlink()
+    small.with_name("small.cameras.json").unlink()
+    outcome = run(
+        "evaluate", scene_copy / "scene.ply", small, "--hint", "order=none", "--lpips", "none", "--json", code=0
+    )
+    document = json.loads(outcome.out)
+    assert document["reference"] == "renders of the input"
+    assert any("placed" in note for note in document["notes"])
+
+
+def test_names_that_are_no_text(scene_copy: Path, small: Path, run: Run) -> None:
+    odd = small.rename(scene_copy / "odd\udcff\x1b[31m.ply")
+    outputs = [scene_copy / f"page.{suffix}" for suffix in ("md", "html", "json", "csv")]
+    flags = [part for path in outputs for part in ("-o", path)]
+    outcome = run("evaluate", scene_copy, odd, "--lpips", "none", *flags, code=0)
+    assert all("odd" in path.read_text(encoding="utf-8") for path in outputs)
+    assert r"odd\udcff\x1b[31m.ply" in outcome.out

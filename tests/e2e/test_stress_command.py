@@ -1,0 +1,37 @@
+"""``gsmerge stress`` as users call it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from .conftest import Run
+
+FAST = ("--set", "fit=none", "--cases", "order, threads,w2c-opengl")
+
+
+def test_table(scene_copy: Path, run: Run) -> None:
+    outcome = run("stress", scene_copy, *FAST, "--report", scene_copy / "stress.json")
+    assert (outcome.code, outcome.err) == (0, "")
+    lines = outcome.out.splitlines()
+    assert [line.split()[0] for line in lines[:3]] == ["held", "held", "held"]
+    assert lines[-1] == "3 of 3 held"
+    document = json.loads((scene_copy / "stress.json").read_text())
+    assert (document["held"], document["failed"]) == (3, 0)
+    assert document["cases"][0]["wanted"].startswith("as many Gaussians within 0.5 %, not more than 0.2 dB below")
+
+
+def test_json_and_quiet(scene_copy: Path, run: Run) -> None:
+    document = json.loads(run("stress", scene_copy, *FAST, "--json").out)
+    assert [case["case"] for case in document["cases"]] == ["order", "threads", "w2c-opengl"]
+    outcome = run("stress", scene_copy, *FAST, "--quiet")
+    assert (outcome.out, outcome.err) == ("", "")
+
+
+def test_a_case_that_fails_is_a_target_not_met(scene_copy: Path, run: Run) -> None:
+    poor = ("--set", "fit=none", "--set", "superpixels=1%")
+    outcome = run("stress", scene_copy, *poor, "--cases", "order,views-1,unchanged")
+    failed = [line for line in outcome.out.splitlines() if line.startswith("FAILED")]
+    assert failed, "so few Gaussians without a fit must be worse than the input somewhere"
+    assert outcome.code == 4
+    assert f"{len(failed)} of 3 cases failed" in outcome.err

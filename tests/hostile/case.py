@@ -1,0 +1,105 @@
+"""A hostile input: something done to a small scene, and what may come of it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+VIEWS, WIDTH, HEIGHT = 3, 24, 16
+
+Spoil = Callable[[Path], Sequence[object] | None]
+
+
+@dataclass(frozen=True)
+class Case:
+    """One hostile input.
+
+    Args:
+        spoil: Changes a scene's folder; returns the arguments of the command where they are others than the folder.
+        codes: The exit codes of ``compact`` that are right.
+        named: The file that an error line has to name.
+        says: Further parts of the error line. A case that has some is in the default run.
+    """
+
+    spoil: Spoil
+    codes: tuple[int, ...] = (3,)
+    named: str = ""
+    says: tuple[str, ...] = ()
+
+
+READ, USAGE, REFUSED, EITHER = (0,), (2,), (3,), (0, 3)
+
+NUMBERS: dict[str, Any] = {
+    "NaN": float("nan"), "inf": float("inf"), "-inf": float("-inf"), "1e300": 1e300, "-1": -1, "zero": 0,
+    "a huge integer": 10**400, "a word": "wide", "null": None, "a list": [1, 2], "an object": {"a": 1},
+}  # fmt: skip
+
+
+def cameras_of(folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Camera-to-world poses ``[v,4,4]`` with OpenCV axes and intrinsics ``[3,3]`` of the unspoiled scene."""
+    data = json.loads((folder / "transforms.json").read_text())
+    c2w = np.array([frame["transform_matrix"] for frame in data["frames"]]) @ FLIP
+    K = np.array([[data["fl_x"], 0, data["cx"]], [0, data["fl_y"], data["cy"]], [0, 0, 1.0]])
+    return c2w, K
+
+
+def without_transforms(folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    """:func:`cameras_of`; the file is removed, so that another kind takes its place."""
+    actual = cameras_of(folder)
+    (folder / "transforms.json").unlink()
+    return actual
+
+
+def names() -> list[str]:
+    return [f"view_{view:03d}" for view in range(VIEWS)]
+
+
+def sparse(path: Path, size: int, start: bytes = b"") -> None:
+    """A file of that many bytes, of which only the start takes room on the disk."""
+    with path.open("wb") as file:
+        file.write(start)
+        file.truncate(size)
+
+
+def edit_json(name: str, change: Callable[[Any], Any]) -> Spoil:
+    """A change to the parsed content of a file; what the change returns replaces it, unless None."""
+
+    def spoil(folder: Path) -> None:
+        path = folder / name
+        data = json.loads(path.read_text())
+        changed = change(data)
+        path.write_text(json.dumps(data if changed is None else changed))
+
+    return spoil
+
+
+def write(name: str, content: bytes | str) -> Spoil:
+    def spoil(folder: Path) -> None:
+        (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
+
+    return spoil
+
+
+def remove(name: str) -> Spoil:
+    def spoil(folder: Path) -> None:
+        path = folder / name
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+    return spoil
+
+
+def both(*spoils: Spoil) -> Spoil:
+    """Several changes, one after the other."""
+
+    def spoil(folder: Path) -> None:
+        for one in spoils:
+            one(folder)
+
+    return spoil

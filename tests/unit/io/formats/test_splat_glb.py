@@ -1,0 +1,73 @@
+"""Damaged ``.splat`` files are refused; whole ones are read in ``test_ply.py``."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scenes
+
+from gsmerge import Scene
+from gsmerge.errors import SceneError
+from gsmerge.io import read_gaussians, write_gaussians
+
+from .slow_readers import drawn
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [(b"", "found 0 bytes"), (bytes(33), "found 33 bytes"), (np.full(8, np.nan, "<f4").tobytes(), "NaN or inf")],
+)
+def test_damage_is_refused(content: bytes, message: str, tmp_path: Path) -> None:
+    (tmp_path / "a.splat").write_bytes(content)
+    with pytest.raises(SceneError, match=message):
+        read_gaussians(tmp_path / "a.splat")
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return scenes.make_scene(scenes.room(), scenes.arc(3, 96, 72))
+
+
+def read_glb(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """The document of a binary glTF, and the attributes of its only primitive."""
+    data = path.read_bytes()
+    magic, version, size, length, kind = struct.unpack_from("<4sII I4s", data)
+    assert (magic, version, size, kind, length % 4) == (b"glTF", 2, len(data), b"JSON", 0)
+    document, content = json.loads(data[20 : 20 + length]), data[28 + length :]
+    (primitive,) = document["meshes"][0]["primitives"]
+    assert (primitive["mode"], primitive["extensions"]["KHR_gaussian_splatting"]["kernel"]) == (0, "ellipse")
+    attributes = {}
+    for name, index in primitive["attributes"].items():
+        accessor = document["accessors"][index]
+        view = document["bufferViews"][accessor["bufferView"]]
+        dtype = {5126: "<f4", 5121: "u1"}[accessor["componentType"]]
+        values = np.frombuffer(content[view["byteOffset"] :][: view["byteLength"]], dtype)
+        attributes[name] = values.reshape(accessor["count"], {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]])
+        assert view["byteOffset"] % 4 == 0
+    return document, attributes
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_glb_holds_everything(degree: int, scene: Scene, tmp_path: Path) -> None:
+    gaussians = drawn(scene, degree)
+    write_gaussians(tmp_path / "a.glb", gaussians)
+    document, actual = read_glb(tmp_path / "a.glb")
+    prefix, n = "KHR_gaussian_splatting:", len(gaussians)
+    np.testing.assert_array_equal(actual["POSITION"], gaussians.means)
+    np.testing.assert_allclose(actual[f"{prefix}ROTATION"][:, [3, 0, 1, 2]], gaussians.quats, atol=1e-6)
+    np.testing.assert_allclose(actual[f"{prefix}SCALE"], gaussians.scales, rtol=1e-5)
+    np.testing.assert_allclose(actual[f"{prefix}OPACITY"][:, 0], gaussians.opacities)
+    np.testing.assert_array_equal(actual[f"{prefix}SH_DEGREE_0_COEF_0"], gaussians.sh0[:, 0])
+    places = [(d, i) for d in range(1, degree + 1) for i in range(2 * d + 1)]
+    harmonics = [actual[f"{prefix}SH_DEGREE_{d}_COEF_{i}"] for d, i in places]
+    np.testing.assert_array_equal(np.stack([np.zeros((n, 3)), *harmonics], 1)[:, 1:], gaussians.shN)
+    assert len(actual) == 6 + len(places)
+    assert actual["COLOR_0"].shape == (n, 4)
+    low = document["accessors"][document["meshes"][0]["primitives"][0]["attributes"]["POSITION"]]["min"]
+    np.testing.assert_array_equal(low, gaussians.means.min(0))
+    assert document["nodes"][0]["rotation"] == [0, 0, 1, 0]  # y up

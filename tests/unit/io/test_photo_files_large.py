@@ -1,0 +1,220 @@
+"""Photos with more pixels than the grid: found, read late, and showing what the grid shows."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from exports import export_rows, save_export, smooth_scene
+from tiny_scene import Tiny, edited_json
+
+import gsmerge
+from gsmerge import Scene
+from gsmerge.errors import SceneError
+from gsmerge.io import load_scene
+from gsmerge.render.metrics import psnr
+from gsmerge.research.generate import GenerateOptions, generate_scene
+from gsmerge.stages.fit.photo_sizes import large_photos, largest_scale
+
+WIDTH, HEIGHT, SCALE = 72, 48, 3
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scene whose photos are three times as large as its grid. Read only."""
+    options = GenerateOptions(
+        views=(3, 3), width=WIDTH, height=HEIGHT, style="room", path="arc", noise=0.3, photo_scale=SCALE
+    )
+    return generate_scene(tmp_path_factory.mktemp("large") / "scene", options, seed=2)
+
+
+@pytest.fixture
+def folder(made: Path, tmp_path: Path) -> Path:
+    """A copy that a test may change."""
+    return Path(shutil.copytree(made, tmp_path / "scene"))
+
+
+def change_cameras(folder: Path, change: Callable[[dict[str, float]], None]) -> None:
+    with edited_json(folder / "transforms.json") as document:
+        change(document)
+
+
+def enlarge(document: dict[str, float]) -> None:
+    for name in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
+        document[name] *= SCALE
+
+
+def shift_between(scene: Scene, scale: float) -> tuple[float, float]:
+    """Where a larger photo, brought to the grid by the two cameras, fits the grid's own best, in the grid's pixels."""
+    photos = large_photos(scene, scale)
+    image = cv2.GaussianBlur(photos.image(1), (0, 0), 0.35 * scale)
+    to_large = photos.Ks[1] @ np.linalg.inv(scene.cameras.Ks[1])
+    to_large[:2, 2] += 0.5 * np.diag(to_large)[:2] - 0.5  # OpenCV has the top-left pixel's centre at (0, 0)
+
+    def fits(x: float, y: float) -> float:
+        moved = to_large.copy()
+        moved[:2, 2] += scale * np.array([x, y])
+        small = cv2.warpAffine(
+            image, moved[:2], (scene.cameras.width, scene.cameras.height), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        )
+        return psnr(small[3:-3, 3:-3], scene.images[1, 3:-3, 3:-3])  # type: ignore[index]
+
+    offsets = [(x, y) for x in (-0.25, 0.0, 0.25) for y in (-0.25, 0.0, 0.25)]
+    return max(offsets, key=lambda offset: fits(*offset))
+
+
+@pytest.mark.parametrize("scale", [1.5, 2, 3])
+def test_larger_photos_show_what_the_grid_shows(made: Path, scale: float) -> None:
+    scene = gsmerge.read_scene(made)
+    assert scene.aligned
+    assert largest_scale(scene) == pytest.approx(SCALE)
+    assert shift_between(scene, scale) == (0, 0)
+
+
+def test_cameras_may_have_the_photos_size(folder: Path) -> None:
+    change_cameras(folder, enlarge)
+    scene = gsmerge.read_scene(folder)
+    assert (scene.cameras.width, largest_scale(scene)) == (WIDTH, pytest.approx(SCALE))
+    np.testing.assert_allclose(scene.large_photos.Ks, scene.cameras.Ks * [[SCALE], [SCALE], [1]])
+
+
+@pytest.mark.parametrize("k1", [0.0, -0.05])
+def test_cropped_and_distorted_photos(folder: Path, k1: float) -> None:
+    """The grid is the middle of wider photos, which a lens has bent."""
+    side = 31
+    for path in sorted((folder / "images").iterdir()):
+        image = cv2.imread(str(path))
+        cv2.imwrite(str(path), cv2.copyMakeBorder(image, 0, 0, side, side + 1, cv2.BORDER_REFLECT))
+
+    def widen(document: dict[str, float]) -> None:
+        enlarge(document)
+        document["w"] += 2 * side + 1
+        document["cx"] += side
+        document.update({"camera_model": "OPENCV", "k1": k1, "k2": 0.0, "p1": 0.0, "p2": 0.0})  # type: ignore[dict-item]
+
+    change_cameras(folder, widen)
+    scene = gsmerge.read_scene(folder)
+    assert scene.aligned
+    assert (scene.cameras.width, scene.cameras.height) == (WIDTH, HEIGHT)
+    assert WIDTH * SCALE <= scene.large_photos.width <= WIDTH * SCALE + 2
+    assert scene.large_photos.read(0).shape == (scene.large_photos.height, scene.large_photos.width, 3)
+    assert shift_between(scene, 2) == (0, 0)
+
+
+def test_photos_of_the_grids_size_are_not_large(folder: Path) -> None:
+    for path in (folder / "images").iterdir():
+        image = cv2.imread(str(path))
+        cv2.imwrite(str(path), cv2.resize(image, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA))
+    assert gsmerge.read_scene(folder).large_photos is None
+
+
+def test_views_of_an_unaligned_scene_are_reduced_but_not_their_photos(folder: Path) -> None:
+    change_cameras(folder, enlarge)
+    scene = gsmerge.read_scene(folder, order="none", max_side=WIDTH)
+    assert not scene.aligned
+    assert (scene.cameras.width, largest_scale(scene)) == (WIDTH, pytest.approx(SCALE))
+    np.testing.assert_allclose(scene.large_photos.Ks, scene.cameras.Ks * [[SCALE], [SCALE], [1]])
+
+
+def test_photos_inside_another_file(folder: Path) -> None:
+    scene = gsmerge.read_scene(folder)
+    photos = np.stack([scene.large_photos.read(view) for view in range(len(scene))])
+    camera_file = gsmerge.read_cameras(folder)
+    shutil.rmtree(folder / "images")
+    (folder / "transforms.json").unlink()
+    extrinsics = camera_file.viewmats[:, :3]
+    np.savez(folder / "results.npz", extrinsics=extrinsics, intrinsics=scene.cameras.Ks, image=photos)
+    inside = gsmerge.read_scene(folder)
+    if inside.large_photos is None:
+        pytest.fail("expected the photos of the file")
+    np.testing.assert_array_equal(inside.large_photos.read(1), photos[1])
+
+
+def test_a_photo_that_is_gone_when_it_is_needed(folder: Path) -> None:
+    scene = gsmerge.read_scene(folder)
+    (folder / "images" / "view_001.png").unlink()
+    with pytest.raises(SceneError, match=r"view_001\.png: cannot be read"):
+        large_photos(scene, 2)
+
+
+SMOOTH = smooth_scene(48, 36)
+LARGE = replace(
+    SMOOTH,
+    K=SMOOTH.K * np.array([[4.0], [4], [1]]),
+    width=192,
+    height=144,
+    images=np.stack([cv2.resize(image, (192, 144), interpolation=cv2.INTER_CUBIC) for image in SMOOTH.images]),
+)
+NOTE = "views of 192 x 144 are worked on at 96 x 72: no side is longer than 96 pixels (max_side)"
+
+
+def save(folder: Path, *, shuffled: bool = True, tiny: Tiny = LARGE) -> Path:
+    order = np.random.default_rng(0).permutation(3 * 36 * 48)[:3000] if shuffled else None
+    return save_export(folder, tiny, export_rows(SMOOTH, order))
+
+
+@pytest.mark.parametrize("order", ["auto", "none"])
+def test_views_of_unaligned_scenes_are_resized(tmp_path: Path, order: str) -> None:
+    loaded = load_scene(save(tmp_path), order=order, max_side=96)
+    scene = loaded.scene
+    assert not scene.aligned
+    assert NOTE in loaded.notes
+    assert scene.images.shape == (3, 72, 96, 3)
+    assert (scene.cameras.width, scene.cameras.height) == (96, 72)
+    assert np.allclose(scene.cameras.Ks, SMOOTH.K * np.array([[2.0], [2], [1]]))
+    small = np.stack([cv2.resize(image, (96, 72), interpolation=cv2.INTER_AREA) for image in LARGE.images])
+    assert np.abs(scene.images * 255 - small).max() < 0.6
+
+
+def test_small_enough_views_stay(tmp_path: Path) -> None:
+    loaded = load_scene(save(tmp_path), max_side=192)
+    assert loaded.scene.cameras.width == 192
+    assert not any("max_side" in note for note in loaded.notes)
+    assert load_scene(tmp_path).scene.cameras.width == 192
+
+
+def test_cameras_without_photos_are_resized_too(tmp_path: Path) -> None:
+    folder = save(tmp_path)
+    for path in (folder / "images").rglob("*.png"):
+        path.unlink()
+    loaded = load_scene(folder, max_side=96)
+    assert loaded.scene.images is None
+    assert (loaded.scene.cameras.width, loaded.scene.cameras.height) == (96, 72)
+    assert NOTE in loaded.notes
+
+
+def test_scenes_with_pixels_keep_their_grid(tmp_path: Path) -> None:
+    loaded = load_scene(save(tmp_path, shuffled=False), max_side=16)
+    assert loaded.scene.aligned
+    assert loaded.scene.cameras.width == 48
+
+
+@pytest.mark.parametrize("shuffled", [False, True])
+def test_memory_is_bounded_before_pixels_are_known(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shuffled: bool
+) -> None:
+    """More photos than fit are resized first; a grid that they were resized to is found all the same."""
+    monkeypatch.setattr("gsmerge.io.scene_files._MAX_BYTES", 3 * 100 * 75 * 12)
+    loaded = load_scene(save(tmp_path, shuffled=shuffled), max_side=96)
+    assert NOTE in loaded.notes
+    assert loaded.scene.aligned != shuffled
+    size = (96, 72) if shuffled else (48, 36)
+    assert (loaded.scene.cameras.width, loaded.scene.cameras.height) == size
+
+
+def test_photos_that_may_be_the_grid_are_never_resized(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gsmerge.io.scene_files._MAX_BYTES", 0)
+    loaded = load_scene(save(tmp_path, shuffled=False, tiny=SMOOTH), max_side=16)
+    assert loaded.pixel_scene().valid.all()
+    assert loaded.notes == ()
+
+
+@pytest.mark.parametrize("value", [0, 15, -3, 99.5, True, "many"])
+def test_sizes_that_make_no_sense(tmp_path: Path, value: object) -> None:
+    with pytest.raises(ValueError, match="max_side: expected a whole number of at least 16"):
+        load_scene(tmp_path, max_side=value)

@@ -1,0 +1,247 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from exports import depth_map_mask, export_rows, save_export, smooth_scene
+from plyfile import PlyData, PlyElement
+from tiny_scene import Tiny, make_tiny, write_npz
+
+from gsmerge import compact, read_scene
+from gsmerge.io import read_ply, write_ply
+from gsmerge.measure.inspect import extents, inspect, inspection_lines
+
+
+@pytest.fixture
+def tiny() -> Tiny:
+    return make_tiny()
+
+
+@pytest.fixture
+def tiny_folder(tmp_path: Path, tiny: Tiny) -> Path:
+    return tiny.save(tmp_path / "scene")
+
+
+def test_a_scene_that_fits(tiny_folder: Path, tiny: Tiny) -> None:
+    actual = inspect(tiny_folder)
+    assert actual["count"] == 840
+    assert actual["bytes"] == (tiny_folder / "scene.ply").stat().st_size
+    assert sum(actual["bytes_by_attribute"].values()) == 840 * 68
+    assert (actual["num_views"], actual["width"], actual["height"]) == (3, 20, 14)
+    assert actual["camera_format"] == "transforms.json"
+    assert actual["images"] == str(tiny_folder / "images")
+    assert actual["alignment"]["ok"]
+    assert actual["alignment_problem"] is None
+    assert actual["notes"] == []
+    low, high = (np.quantile(tiny.gaussians.means, q, axis=0).tolist() for q in (0.01, 0.99))
+    assert actual["extents"]["box_low"] == pytest.approx(low, abs=1e-4)
+    assert actual["extents"]["box_high"] == pytest.approx(high, abs=1e-4)
+
+
+def test_it_is_plain_json(tiny_folder: Path) -> None:
+    actual = inspect(tiny_folder)
+    assert json.loads(json.dumps(actual, allow_nan=False)) == actual
+
+
+def test_a_ply_without_cameras(tmp_path: Path, tiny: Tiny) -> None:
+    actual = inspect(tiny.save(tmp_path, cameras=False, images=False) / "scene.ply")
+    assert (actual["num_views"], actual["cameras"], actual["camera_format"], actual["images"]) == (0, None, None, None)
+    assert actual["alignment"] is None
+    assert "no cameras found" in actual["alignment_problem"]
+
+
+def test_cameras_that_do_not_fit_are_reported(tiny_folder: Path, tiny: Tiny) -> None:
+    some = np.random.default_rng(0).permutation(840)[:700]
+    write_ply(tiny_folder / "scene.ply", tiny.gaussians[some], overwrite=True)
+    actual = inspect(tiny_folder)
+    assert actual["num_views"] == 3
+    assert actual["alignment"] is None
+    assert "expected one Gaussian per pixel" in str(actual["alignment_problem"])
+    (tiny_folder / "transforms.json").write_text("nonsense")
+    actual = inspect(tiny_folder)
+    assert actual["num_views"] == 0
+    assert "expected JSON" in str(actual["alignment_problem"])
+
+
+def test_odd_values_are_counted(tiny_folder: Path, tiny: Tiny) -> None:
+    opacities, quats, scales = (getattr(tiny.gaussians, f).copy() for f in ("opacities", "quats", "scales"))
+    opacities[:4], opacities[4:9] = 1, 0
+    scales[3] = 1e14
+    odd = replace(tiny.gaussians, opacities=opacities, quats=quats, scales=scales)
+    write_ply(tiny_folder / "scene.ply", odd, overwrite=True)
+    data = bytearray((tiny_folder / "scene.ply").read_bytes())
+    start = data.index(b"end_header\n") + 11
+    data[start : start + 4] = b"\x00\x00\xc0\x7f"  # NaN
+    data[start + 2 * 68 - 16 : start + 2 * 68] = bytes(16)  # the quaternion of row 1
+    scale = start + 5 * 68 + 40
+    data[scale : scale + 4] = b"\x00\x00\x20\x42"  # a log scale of 40
+    (tiny_folder / "scene.ply").write_bytes(data)
+    actual = inspect(tiny_folder)
+    assert (actual["num_nonfinite"], actual["num_zero_quats"], actual["num_clipped_scales"]) == (1, 1, 1)
+    assert (actual["num_opaque"], actual["num_transparent"]) == (3, 5)
+    assert len(actual["notes"]) == 3
+    assert actual["alignment"] is not None
+
+
+def test_outliers_and_large_scales_are_shares(tiny_folder: Path, tiny: Tiny) -> None:
+    means, scales = tiny.gaussians.means.copy(), tiny.gaussians.scales.copy()
+    means[:7] += 1000
+    scales[:21, 1] = 50
+    write_ply(tiny_folder / "scene.ply", replace(tiny.gaussians, means=means, scales=scales), overwrite=True)
+    actual = inspect(tiny_folder)["extents"]
+    assert actual["share_outliers"] == pytest.approx(7 / 840)
+    assert actual["share_huge"] == pytest.approx(21 / 840)
+    assert actual["scale_max"] == pytest.approx(50)
+    assert 0.01 < actual["scale_median"] < 0.11
+    low, high = (np.array(side) for side in (actual["box_low"], actual["box_high"]))
+    assert actual["diagonal"] == pytest.approx(float(np.linalg.norm(high - low)))
+
+
+def test_an_empty_or_single_point_has_extents(tiny: Tiny) -> None:
+    assert extents(tiny.gaussians[:0])["share_outliers"] == 0
+    one = extents(tiny.gaussians[:1])
+    assert one["diagonal"] == 0
+    assert one["share_outliers"] == 0
+
+
+def test_coverage_per_view(tiny_folder: Path, tiny: Tiny) -> None:
+    opacities = tiny.gaussians.opacities.copy()
+    opacities[280:350] = 0
+    write_ply(tiny_folder / "scene.ply", replace(tiny.gaussians, opacities=opacities), overwrite=True)
+    actual = inspect(tiny_folder)
+    assert [view["share_of_pixels"] for view in actual["coverage"]] == [1, 0.75, 1]
+    assert [view["name"] for view in actual["coverage"]] == [f"images/{name}" for name in tiny.names]
+    for view, w2c in zip(actual["coverage"], tiny.w2c, strict=True):
+        image = (tiny.gaussians.means.astype(np.float64) @ w2c[:3, :3].T + w2c[:3, 3]) @ tiny.K.T
+        xy = image[:, :2] / image[:, 2:]
+        inside = (image[:, 2] > 0) & (xy >= 0).all(1) & (xy < (20, 14)).all(1)
+        assert view["share_of_gaussians"] == pytest.approx(inside.mean())
+    assert actual["alignment"]["share_within_1px"] == 1
+    assert actual["num_saturated"] == 70
+    assert actual["sight"]["share_seen"] == 1
+
+
+def test_what_compact_would_give(tiny_folder: Path, tmp_path: Path, tiny: Tiny) -> None:
+    actual = inspect(tiny_folder)
+    result = compact(read_scene(tiny_folder), fit="none")
+    assert actual["compact"]["num_gaussians"] == pytest.approx(len(result.gaussians), abs=3)
+    write_ply(tmp_path / "small.ply", result.gaussians)
+    assert actual["compact"]["bytes"] == pytest.approx((tmp_path / "small.ply").stat().st_size, abs=3 * 68)
+    assert actual["compact"]["ratio"] == actual["compact"]["num_gaussians"] / 840
+    assert actual["compact"]["seconds"] > 0
+    assert actual["compact"]["memory_bytes"] > 1e8
+
+
+def test_a_scene_without_pixels_or_without_views(tmp_path: Path) -> None:
+    smooth = smooth_scene(40, 30)
+    some = np.random.default_rng(0).permutation(3600)[:2400]
+    folder = replace(smooth, gaussians=smooth.gaussians[some]).save(tmp_path / "scene")
+    actual = inspect(folder)
+    assert actual["alignment"] is None
+    assert actual["sight"]["ok"]
+    assert [view["share_of_pixels"] for view in actual["coverage"]] == [None] * 3
+    assert min(view["share_of_gaussians"] for view in actual["coverage"]) > 0.2
+    assert actual["compact"] is not None
+    lines = "\n".join(inspection_lines(actual))
+    assert "of the Gaussians per view, least in images/" in lines
+    assert "compact    at most" in lines
+    alone = inspect(folder / "scene.ply", cameras=folder / "transforms.json", order="none")
+    assert alone["compact"] is not None
+    (folder / "transforms.json").unlink()
+    alone = inspect(folder, order="none")
+    assert alone["coverage"] == []
+    assert alone["sight"] is None
+    assert alone["compact"] is not None
+    assert "coverage" not in "\n".join(inspection_lines(alone))
+    none = inspect(folder)
+    assert none["compact"] is None
+    lines = "\n".join(inspection_lines(none))
+    assert "alignment  not measured: " in lines
+    assert "compact    would refuse the scene as it is" in lines
+
+
+SMOOTH = smooth_scene(48, 36)
+PIXELS = np.arange(3 * 36 * 48).reshape(3, 36 * 48)
+
+
+def said(path: Path) -> dict[str, str]:
+    """The lines by their first word; notes and all lines of one word joined."""
+    actual: dict[str, str] = {}
+    for line in inspection_lines(inspect(path)):
+        word, rest = line[:11].strip(), line[11:]
+        actual[word] = f"{actual[word]}; {rest}" if word in actual else rest
+    return actual
+
+
+def test_a_plain_export(tmp_path: Path) -> None:
+    lines = said(save_export(tmp_path, SMOOTH, export_rows(SMOOTH)))
+    assert lines["rows"].startswith("every pixel, view-major: median 0.")
+    assert lines["alignment"].startswith("one Gaussian per pixel, 3 x 36 x 48 (views x height x width); median")
+    assert lines["coverage"].startswith("100 % of the pixels in every view; ")
+    assert "note" not in lines
+
+
+def test_several_gaussians_per_pixel(tmp_path: Path) -> None:
+    rows = export_rows(SMOOTH, np.repeat(PIXELS[:, :, None], 3, 2).reshape(-1))
+    lines = said(save_export(tmp_path, SMOOTH, rows))
+    assert lines["cameras"].endswith("transforms.json: 3 (transforms.json)")
+    assert lines["alignment"].startswith("3 Gaussians per pixel, 3 x 36 x 48 ")
+
+
+def test_dropped_pixels(tmp_path: Path) -> None:
+    kept = np.concatenate([np.flatnonzero(depth_map_mask(d)) + i * d.size for i, d in enumerate(SMOOTH.depths)])
+    save_export(tmp_path / "gs_ply", SMOOTH, export_rows(SMOOTH, kept), cameras=False, name="0000.ply")
+    write_npz(tmp_path / "exports/npz/results.npz", SMOOTH, depth=SMOOTH.depths.astype(np.float32))
+    lines = said(tmp_path)
+    missing = PIXELS.size - len(kept)
+    assert f"none for {missing:,} of them; " in lines["alignment"]
+    assert lines["note"] == f"{missing:,} pixels that the exporter dropped are put back from the depth maps"
+    assert not lines["coverage"].startswith("100 %")
+    actual = inspect(tmp_path)
+    assert (actual["num_missing"], actual["per_pixel"]) == (missing, 1)
+
+
+def test_the_camera_inside_the_file(tmp_path: Path) -> None:
+    square = smooth_scene(36, 36)
+    one = export_rows(square, np.tile(np.arange(36 * 36), 2))
+    parts = {
+        "extrinsic": square.w2c[0].reshape(-1),
+        "intrinsic": square.K.reshape(-1),
+        "image_size": np.array([36, 36]),
+    }
+    elements = [PlyElement.describe(one, "vertex")]
+    elements += [PlyElement.describe(np.array([(v,) for v in values], [(name, "f4")]), name)
+                 for name, values in (parts | {"version": np.array([1, 5, 0])}).items()]  # fmt: skip
+    PlyData(elements, byte_order="<").write(str(tmp_path / "photo.ply"))
+    lines = said(tmp_path)
+    assert lines["cameras"] == "inside the .ply: 1 (SHARP)"
+    assert lines["ignored"] == "element version"
+    assert lines["alignment"].startswith("2 Gaussians per pixel, 1 x 36 x 36 ")
+
+
+def test_rows_in_no_order(tmp_path: Path) -> None:
+    some = np.random.default_rng(0).permutation(PIXELS.size)[:3000]
+    lines = said(save_export(tmp_path, SMOOTH, export_rows(SMOOTH, some)))
+    assert lines["alignment"] == ("not one Gaussian per pixel: 3 x 36 x 48 = 5184 (views x height x width), found 3000")
+    assert "note" not in lines
+    assert "rows" not in lines
+
+
+@pytest.mark.parametrize("cameras", [False, True])
+def test_what_compact_would_refuse(tmp_path: Path, cameras: bool) -> None:
+    save_export(tmp_path, SMOOTH, export_rows(SMOOTH), cameras=cameras)
+    if cameras:
+        (tmp_path / "transforms.json").write_text("nonsense")
+    lines = said(tmp_path)
+    assert lines["alignment"].startswith("not measured: ")
+    assert lines["compact"] == "would refuse the scene as it is"
+    assert lines["exporter"] == "not known before the cameras fit"
+
+
+def test_our_own_files(tmp_path: Path) -> None:
+    save_export(tmp_path, SMOOTH, export_rows(SMOOTH))
+    write_ply(tmp_path / "own.ply", read_ply(tmp_path / "scene.ply").gaussians[::7])
+    assert said(tmp_path / "own.ply")["exporter"] == "gsmerge"
