@@ -6,7 +6,7 @@ import signal
 from pathlib import Path
 
 import pytest
-from conftest import load_script
+from scripts import load_script
 
 pytestmark = [
     pytest.mark.slow,

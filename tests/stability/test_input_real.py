@@ -7,7 +7,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
-from conftest import load_script
+from scripts import load_script
 
 from gsmerge.io import load_scene
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import load_script
 from exports import (
     da3_rows,
     depth_map_mask,
@@ -21,6 +20,7 @@ from exports import (
     with_surface_rotations,
 )
 from plyfile import PlyData, PlyElement
+from scripts import load_script
 from tiny_scene import Tiny, make_tiny, write_npz
 
 from gsmerge.errors import SceneError

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from damaged_files import (
+from hostile.gsm_files import (
     UNREADABLE,
     Spoil,
     assert_refused_in_one_line,
