@@ -219,12 +219,14 @@ def run_lock(folder: Path, name: str) -> Iterator[None]:
     own = f"{PREFIX}{name[:32]}.{secrets.token_hex(4)}.{os.getpid()}.{socket.gethostname()}.run"
     with _lock(folder / own, RUN_TIMEOUT):  # before others are looked for: of two, one sees the other
         for path in folder.glob(f"{PREFIX}*.run"):
-            if path.name == own or path.name.startswith(f"{PREFIX}{name[:32]}."):
+            if path.name == own:
                 continue
             try:
-                with _lock(path):
+                with _lock(path):  # which removes what a killed run left
                     continue
             except BusyError:
+                if path.name.startswith(f"{PREFIX}{name[:32]}."):
+                    continue
                 *_, process, host = path.stem.removeprefix(PREFIX).split(".", 3)
                 raise UsageError(
                     f"{folder}: a batch with other settings is at work there (process {process} on {host}); wait for"
