@@ -9,6 +9,7 @@ import numpy as np
 from gsmerge.kernels.gaussians.pool import group_members
 from gsmerge.moments import Members, Moments, Rule, pool_members
 from gsmerge.runtime.record import stage
+from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.agreement import weaken_contradicted
 from gsmerge.types import Cameras, FeatureGaussians, Groups, Scene, to_float32
 
@@ -54,18 +55,30 @@ def encode(
 
 def member_rows(scene: Scene, members: Members, groups: Groups) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """List members by superpixel: ``starts [g+1]``, ``ids [m]`` int32, ``views [g]``, without empty superpixels."""
-    counts = np.asarray(groups.counts)
-    first = np.cumsum(counts) - counts
     if scene.aligned:
-        labels = groups.labels + first.astype(np.int32)[:, None, None]  # as many as Gaussians
-        labels = np.where(scene.valid, labels, -1).reshape(-1)
+        sizes, ids = _rows_by_view(scene, groups)
     else:
         assert members.pixels is not None
+        counts = np.asarray(groups.counts)
+        first = np.cumsum(counts) - counts
         labels = groups.labels.reshape(-1)[members.pixels] + first[members.pixels // scene.pixels_per_view]
         labels = np.where(members.pixels >= 0, labels, -1)
-    starts, ids = group_members(labels.astype(np.int32, copy=False), int(counts.sum()))
-    filled, views = np.diff(starts) > 0, np.repeat(np.arange(len(counts)), counts)
-    return np.append(starts[:-1][filled], starts[-1]), ids.astype(np.int32), views[filled]
+        starts, ids = group_members(labels.astype(np.int32), int(counts.sum()))
+        sizes = np.diff(starts)
+    filled, views = sizes > 0, np.repeat(np.arange(len(scene)), groups.counts)
+    return np.concatenate([[0], np.cumsum(sizes[filled])]), ids.astype(np.int32, copy=False), views[filled]
+
+
+def _rows_by_view(scene: Scene, groups: Groups) -> tuple[np.ndarray, np.ndarray]:
+    """Sort the pixels of each view by superpixel on its own, which needs memory for one view at a time."""
+
+    def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
+        labels = np.where(scene.valid[view], groups.labels[view], -1).reshape(-1).astype(np.int32)
+        starts, ids = group_members(labels, groups.counts[view])
+        return np.diff(starts), (ids + view * scene.pixels_per_view).astype(np.int32)
+
+    parts = parallel_map(one_view, range(len(scene)))
+    return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
 
 
 def from_moments(moments: Moments, starts: np.ndarray, ids: np.ndarray, views: np.ndarray) -> FeatureGaussians:
