@@ -70,11 +70,11 @@ def build_scored(method: Build, prepared: Prepared, plan: Plan, count: int | Non
 
 def build(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
     """Build ``count`` fitted canonical Gaussians; None: as many as ``superpixels`` and K give."""
-    decoded = keep_all(prepared.scene, count)
-    if decoded is None:
-        merged = merge_views(prepared, plan, count)
-        decoded = decode_merged(merged, prepared.scene, plan.decode, grows=plan.fit.grows)
-    return fit_scene(decoded, prepared.scene, prepared.photo_views, plan.fit, plan.seed, plan.backend)
+    scene, decode = prepared.scene, plan.decode
+    decoded = keep_all(scene, count)
+    if decoded is None:  # no name for the merged views: they are freed before the fit
+        decoded = decode_merged(merge_views(prepared, plan, count), scene, decode, grows=plan.fit.grows)
+    return fit_scene(decoded, scene, prepared.photo_views, plan.fit, plan.seed, plan.backend)
 
 
 def merge_views(prepared: Prepared, plan: Plan, count: int | None) -> MergedViews:
