@@ -8,21 +8,11 @@ import numpy as np
 import pytest
 from exports import depth_map_mask, export_rows, save_export, smooth_scene
 from plyfile import PlyData, PlyElement
-from tiny_scene import Tiny, make_tiny, write_npz
+from tiny_scene import Tiny, write_npz
 
 from gsmerge import compact, read_scene
 from gsmerge.io import read_ply, write_ply
 from gsmerge.measure.inspect import extents, inspect, inspection_lines
-
-
-@pytest.fixture
-def tiny() -> Tiny:
-    return make_tiny()
-
-
-@pytest.fixture
-def tiny_folder(tmp_path: Path, tiny: Tiny) -> Path:
-    return tiny.save(tmp_path / "scene")
 
 
 def test_a_scene_that_fits(tiny_folder: Path, tiny: Tiny) -> None:

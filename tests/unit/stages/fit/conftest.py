@@ -22,3 +22,8 @@ def truth() -> Gaussians:
 @pytest.fixture(scope="module")
 def photos(scene: Scene) -> tuple[Photos, Photos]:
     return scenes.pair_of(scene)
+
+
+@pytest.fixture(scope="module")
+def noise(photos: tuple[Photos, Photos]) -> tuple[Photos, Photos]:
+    return scenes.noise_for(photos)

@@ -32,11 +32,6 @@ QUICK = FitOptions(fit_steps=30, holdout=0.2)
 LONG = FitOptions(fit_steps=160, holdout=0.2)
 
 
-@pytest.fixture(scope="module")
-def noise(photos: Pair) -> Pair:
-    return scenes.noise_for(photos)
-
-
 # what it reaches
 
 

@@ -21,11 +21,6 @@ QUICK = FitOptions(fit_steps=30, holdout=0.2)
 LONG = FitOptions(fit_steps=160, holdout=0.2)
 
 
-@pytest.fixture(scope="module")
-def noise(photos: Pair) -> Pair:
-    return scenes.noise_for(photos)
-
-
 def test_stage_takes_the_full_fit(truth: Gaussians, photos: Pair) -> None:
     start = scenes.spoil(truth)
     result, report = fit(start, photos, QUICK, seed=4)
