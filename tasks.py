@@ -11,6 +11,7 @@ from pathlib import Path
 
 ROOT, TOOLS = Path(__file__).parent, Path(sys.executable).parent
 TASKS = {
+    "native": (("python", "gsmerge/native/build.py"),),
     "tests": (("python", "-m", "pytest"),),
     "sweeps": (("python", "-m", "pytest", "-m", "slow"),),
     "lint": (("ruff", "check", "."), ("ruff", "format", "--check", ".")),

@@ -1,0 +1,85 @@
+// Depth order and tile lists.
+#include "native.h"
+
+enum { DIGIT = 11, PASSES = 3 };  // bits sorted per pass at most: 2048 counters and their streams stay in the first caches
+
+// A least-significant-digit radix sort. Only the bits in which the range of values differs are sorted, in as few and as
+// even passes as possible.
+API void sort_bits(const uint32_t *bits, int32_t *order, uint64_t *keys, uint64_t *spare, int64_t m) {
+  int64_t counts[PASSES][1 << DIGIT];
+  if (m == 0) return;
+  uint32_t low = bits[0], high = bits[0];
+  for (int64_t i = 0; i < m; i++) {
+    low = bits[i] < low ? bits[i] : low;
+    high = bits[i] > high ? bits[i] : high;
+  }
+  int width = 1;
+  while ((uint64_t)(high - low) >> width) width++;
+  int passes = (width + DIGIT - 1) / DIGIT, digit = (width + passes - 1) / passes;
+  uint32_t mask = (1u << digit) - 1;
+  for (int p = 0; p < passes; p++)
+    for (uint32_t j = 0; j <= mask; j++) counts[p][j] = 0;
+  for (int64_t i = 0; i < m; i++) {
+    uint32_t key = bits[i] - low;
+    keys[i] = (uint64_t)key << 32 | (uint64_t)i;
+    for (int p = 0; p < passes; p++) counts[p][(key >> (p * digit)) & mask]++;
+  }
+  for (int p = 0; p < passes; p++) {
+    int64_t sum = 0;
+    for (uint32_t j = 0; j <= mask; j++) {
+      int64_t count = counts[p][j];
+      counts[p][j] = sum;
+      sum += count;
+    }
+    for (int64_t i = 0; i < m; i++) spare[counts[p][(keys[i] >> (32 + p * digit)) & mask]++] = keys[i];
+    uint64_t *done = spare;
+    spare = keys;
+    keys = done;
+  }
+  for (int64_t i = 0; i < m; i++) order[i] = (int32_t)keys[i];
+}
+
+// Differences at the boxes' corners, then running sums: no loop over tiles, so nothing to mispredict.
+API int32_t count_boxes(const int16_t *boxes, int64_t lines, int64_t columns, int64_t *corners, int64_t *counts,
+                        int64_t m, int64_t num_corners, int64_t tiles) {
+  int64_t stride = columns + 1;
+  if (num_corners != (lines + 1) * stride || tiles != lines * columns) return OUTSIDE;
+  for (int64_t i = 0; i < m; i++) {
+    int64_t x0 = boxes[4 * i], x1 = boxes[4 * i + 1], y0 = boxes[4 * i + 2], y1 = boxes[4 * i + 3];
+    if (x0 < 0 || y0 < 0 || x0 > x1 || y0 > y1 || x1 > columns || y1 > lines) return OUTSIDE;
+    corners[y0 * stride + x0]++;
+    corners[y0 * stride + x1]--;
+    corners[y1 * stride + x0]--;
+    corners[y1 * stride + x1]++;
+  }
+  for (int64_t line = 0; line < lines; line++) {
+    int64_t run = 0;
+    for (int64_t column = 0; column < columns; column++) {
+      int64_t tile = line * columns + column;
+      run += corners[line * stride + column];
+      counts[tile] = run + (line > 0 ? counts[tile - columns] : 0);
+    }
+  }
+  return 0;
+}
+
+API int32_t deal_tiles(const int32_t *order, const int16_t *boxes, int64_t columns, int64_t *cursors, int32_t *members,
+                       int64_t m, int64_t tiles, int64_t intersections) {
+  for (int64_t i = 0; i < m; i++) {
+    int64_t x0 = boxes[4 * i], y0 = boxes[4 * i + 2], width = boxes[4 * i + 1] - x0, height = boxes[4 * i + 3] - y0;
+    if (x0 < 0 || y0 < 0 || width <= 0 || height <= 0) continue;
+    if (x0 + width > columns || (y0 + height) * columns > tiles) return OUTSIDE;
+    int64_t tile = y0 * columns + x0, column = 0;
+    // One loop for both axes: most boxes hold a tile or two, and the end of a loop is mispredicted.
+    for (int64_t n = width * height; n > 0; n--) {
+      uint64_t slot = (uint64_t)cursors[tile]++;
+      if (slot >= (uint64_t)intersections) return OUTSIDE;
+      members[slot] = order[i];
+      column++;
+      bool wrap = column == width;
+      tile += wrap ? columns - width + 1 : 1;
+      column = wrap ? 0 : column;
+    }
+  }
+  return 0;
+}

@@ -1,0 +1,66 @@
+import numpy as np
+import pytest
+
+from gsmerge.kernels.raster.binning import count_boxes, deal_tiles, sort_bits
+
+
+def arrays(m=3):
+    return [np.arange(m, dtype=np.uint32), np.empty(m, np.int32), np.empty(m, np.uint64), np.empty(m, np.uint64)]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        pytest.param(lambda a: a.astype(np.int64), id="type"),
+        pytest.param(lambda a: a[:-1], id="length"),
+        pytest.param(lambda a: a[None], id="axes"),
+        pytest.param(lambda a: np.repeat(a, 2)[::2], id="strides"),
+        pytest.param(lambda a: a.tolist(), id="list"),
+        pytest.param(lambda a: None, id="none"),
+        pytest.param(lambda a: a.astype(a.dtype.newbyteorder()), id="byte order"),
+    ],
+)
+@pytest.mark.parametrize("position", range(4))
+def test_arrays_of_another_kind_are_refused(position, change):
+    values = arrays()
+    values[position] = change(values[position])
+    with pytest.raises(ValueError, match="sort_bits: "):
+        sort_bits(*values)
+
+
+def test_unaligned_arrays_are_refused():
+    values = arrays()
+    values[1] = np.empty(4 * 3 + 1, np.uint8)[1:].view(np.int32)
+    with pytest.raises(ValueError, match="aligned"):
+        sort_bits(*values)
+
+
+def test_arrays_that_cannot_be_written_are_refused():
+    values = arrays()
+    values[1].flags.writeable = False
+    with pytest.raises(ValueError, match="order: expected an aligned writable array"):
+        sort_bits(*values)
+
+
+def test_arguments_may_be_named():
+    bits, order, keys, spare = arrays()
+    sort_bits(bits, order, spare=spare, keys=keys)
+    assert order.tolist() == [0, 1, 2]
+
+
+def test_scalars_have_ranges():
+    with pytest.raises(ValueError, match="lines: expected values from 0 on, found -1"):
+        count_boxes(np.zeros((0, 4), np.int16), -1, 1, np.zeros(0, np.int64), np.zeros(0, np.int64))
+
+
+@pytest.mark.parametrize("box", [(0, 3, 0, 1), (0, 1, 0, 3), (-1, 1, 0, 1), (2, 1, 0, 1), (0, 1, 2, 1)])
+def test_indices_outside_their_arrays_are_refused(box):
+    with pytest.raises(ValueError, match="count_boxes: expected indices inside"):
+        count_boxes(np.array([box], np.int16), 2, 2, np.zeros(9, np.int64), np.zeros(4, np.int64))
+
+
+@pytest.mark.parametrize("cursor", [-1, 1, 1 << 62])
+def test_a_cursor_outside_the_list_is_refused(cursor):
+    cursors, members = np.full(4, cursor), np.zeros(1, np.int32)
+    with pytest.raises(ValueError, match="deal_tiles: expected indices inside"):
+        deal_tiles(np.zeros(1, np.int32), np.array([[0, 1, 0, 1]], np.int16), 2, cursors, members)
