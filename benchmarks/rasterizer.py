@@ -105,11 +105,11 @@ def measure(scene: dict[str, Any], degree: int, sketch: ModuleType, repeats: int
         clock("adjoint", lambda plan=plan: splat_adjoint(plan, gradient))
         clock("contributions", lambda plan=plan: contributions(plan))
     (image, left), colors = composite(plan), view_colors(plan)
-    none, shade = np.empty((0, 0), np.float32), None
+    shade = None
     for _ in range(repeats + 1):
         clock("sketch backward", lambda: raster.sums(gradient))
         clock("raster backward", lambda: walk_back(plan, image, left, gradient, colors))
-        expected = clock("gradients", lambda: gradients_of(plan, colors, image, left, gradient, none, False))
+        expected = clock("gradients", lambda: gradients_of(plan, colors, image, left, gradient, None, False))
         shade = clock(
             "color gradients",
             lambda expected=expected, shade=shade: color_gradients(plan, expected.colors, colors, used=shade),

@@ -21,7 +21,7 @@ from gsmerge.gpu.adam import FitState, StepGradients, adam_step, gaussians_of, s
 from gsmerge.gpu.device_photos import DevicePhotos, draw, draw_and_transpose, draw_black, harmonic_colors
 from gsmerge.gpu.image_scores import holdout_psnr, loss_gradient, photo_means
 from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT, SIZE
-from gsmerge.kernels.raster.walk import MAX_ALPHA
+from gsmerge.kernels.raster.blend import MAX_ALPHA
 from gsmerge.networks.residuals import quat_to_rotmat
 from gsmerge.render.autograd import Shape
 from gsmerge.stages.fit.fit_options import FitOptions, FitReport

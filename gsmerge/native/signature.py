@@ -26,7 +26,7 @@ _CODES = {
     "u4": ("uint32_t", ctypes.c_uint32), "i4": ("int32_t", ctypes.c_int32), "u8": ("uint64_t", ctypes.c_uint64),
     "i8": ("int64_t", ctypes.c_int64), "f4": ("float", ctypes.c_float), "f8": ("double", ctypes.c_double),
 }  # fmt: skip
-Size = int | str  # a number, or the name of a size or of a scalar argument before
+Size = int | str  # a number, or the name of a size or of an integer argument
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Argument:
         shape: Sizes of the array's axes: numbers, or names that stand for the same size everywhere.
         least: Smallest value, None for any.
         below: What all values are below, None for any.
-        most: Largest value, None for any. Rules may name sizes and integers before them.
+        most: Largest value, None for any. Rules may name sizes and integers.
         ascending: No value is below the one before it.
         out: The array is written.
         optional: None is allowed and becomes a null pointer; its names must appear elsewhere.
@@ -59,6 +59,11 @@ class Argument:
         name = _CODES[self.code][0]
         return name if not self.shape else f"{name} *" if self.out else f"const {name} *"
 
+    @property
+    def has_rules(self) -> bool:
+        """Whether values are checked, not only type and shape."""
+        return self.ascending or not (self.least is self.below is self.most is None)
+
     def __str__(self) -> str:
         return f"{np.dtype(self.code)} [{','.join(map(str, self.shape))}]"
 
@@ -75,7 +80,7 @@ STATUS = i4()  # what a function returns that checks indices on its way: 0, or a
 
 
 def native(returns: Argument | None = None, /, **arguments: Argument) -> Callable[[Callable[..., Any]], Any]:
-    """Replace a function by the one of the same name in the native library.
+    """Replace a function by the one of the same name, without an underscore in front, in the native library.
 
     The arguments are checked at every call: ValueError says which has another type, shape or range.
 
@@ -86,7 +91,7 @@ def native(returns: Argument | None = None, /, **arguments: Argument) -> Callabl
     """
 
     def wrap(function: Callable[..., Any]) -> Any:
-        name, signature = function.__name__, inspect.signature(function)
+        name, signature = function.__name__.lstrip("_"), inspect.signature(function)
         if list(signature.parameters) != list(arguments):
             raise TypeError(f"{name}: expected declarations of {list(signature.parameters)}, got {list(arguments)}")
         entry: list[Any] = []  # the function in the library, once it is loaded
@@ -99,6 +104,8 @@ def native(returns: Argument | None = None, /, **arguments: Argument) -> Callabl
                 values = bound.args
             sizes: dict[str, int] = {}
             passed = [_pass(name, key, kind, value, sizes) for (key, kind), value in zip(kinds, values, strict=True)]
+            for place, key, kind in ruled:
+                _check_values(name, key, kind, values[place], sizes)
             if not entry:
                 entry.append(_entry(name, returns, arguments))
             result = entry[0](*passed, *[sizes.get(key, 0) for key in names])
@@ -107,6 +114,7 @@ def native(returns: Argument | None = None, /, **arguments: Argument) -> Callabl
             return None if returns is STATUS else result
 
         kinds, names = list(arguments.items()), size_names(arguments)
+        ruled = [(place, key, kind) for place, (key, kind) in enumerate(kinds) if kind.has_rules]
         call.prototype = _prototype(name, returns, arguments)  # type: ignore[attr-defined]
         return call
 
@@ -141,8 +149,6 @@ def _pass(name: str, key: str, kind: Argument, value: Any, sizes: dict[str, int]
             value = int(value)
             if sizes.setdefault(key, value) != value:
                 raise ValueError(f"{name}: {key}: expected {sizes[key]}, as arrays have it, got {value}")
-        if kind.least is not None or kind.below is not None or kind.most is not None:
-            _check_range(name, key, kind, value, value, sizes)
         return value
     if value is None and kind.optional:
         return None
@@ -155,15 +161,14 @@ def _pass(name: str, key: str, kind: Argument, value: Any, sizes: dict[str, int]
     flags = value.flags
     if not flags.c_contiguous or not flags.aligned or (kind.out and not flags.writeable):
         raise ValueError(f"{name}: {key}: expected an aligned{' writable' * kind.out} array in C order")
-    if value.size:
-        if kind.least is not None or kind.below is not None or kind.most is not None:
-            _check_range(name, key, kind, value.min(), value.max(), sizes)
-        if kind.ascending and (value[1:] < value[:-1]).any():
-            raise ValueError(f"{name}: {key}: expected values in rising order")
     return value.ctypes.data
 
 
-def _check_range(name: str, key: str, kind: Argument, low: Any, high: Any, sizes: dict[str, int]) -> None:
+def _check_values(name: str, key: str, kind: Argument, value: Any, sizes: dict[str, int]) -> None:
+    """Check the values of an argument whose type and shape are sound."""
+    if value is None or (kind.shape and not value.size):
+        return
+    low, high = (value.min(), value.max()) if kind.shape else (value, value)
     least, below, most = (
         sizes[rule] if isinstance(rule, str) else rule for rule in (kind.least, kind.below, kind.most)
     )
@@ -173,6 +178,8 @@ def _check_range(name: str, key: str, kind: Argument, low: Any, high: Any, sizes
         raise ValueError(f"{name}: {key}: expected values below {below}, found {high}")
     if most is not None and not high <= most:
         raise ValueError(f"{name}: {key}: expected values up to {most}, found {high}")
+    if kind.ascending and (value[1:] < value[:-1]).any():
+        raise ValueError(f"{name}: {key}: expected values in rising order")
 
 
 def _describe(value: Any) -> str:

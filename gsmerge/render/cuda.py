@@ -35,7 +35,7 @@ from gsmerge.render.view_plan import EPS2D, Array, check_range
 from gsmerge.types import Cameras, Gaussians
 
 # Where gsplat 1.5 clamps alpha, as RasterizeToPixels3DGSFwd.cu, RasterizeToPixels3DGSBwd.cu and
-# RasterizeToIndices3DGS.cu have it. The CPU clamps at gsmerge.kernels.raster.walk.MAX_ALPHA.
+# RasterizeToIndices3DGS.cu have it. The CPU clamps at gsmerge.kernels.raster.blend.MAX_ALPHA.
 MAX_ALPHA = 0.999
 EVERY_BATCH = 1 << 24  # past the last batch of 256 Gaussians of any tile
 INSTALL = 'pip install "gsplat>=1.5,<1.6"'  # as the extra cuda asks for; works beside a wheel and in a checkout

@@ -70,7 +70,7 @@ def gradients_of(
     image: Array,
     transmittance: Array,
     grad_image: Array,
-    grad_left: Array,
+    grad_left: Array | None,
     with_viewmat: bool,
 ) -> Gradients:
     """Return the gradients of :func:`plan_gradients` for unchecked contiguous float32 arrays; colours ``[m,3]``."""
@@ -129,9 +129,7 @@ def plan_gradients(
     size = plan.height, plan.width
     grad_image, image = _expect("grad_image", grad_image, (*size, 3)), _expect("image", image, (*size, 3))
     transmittance = _expect("transmittance", transmittance, size)
-    left = np.empty((0, 0), np.float32)
-    if grad_transmittance is not None:
-        left = _expect("grad_transmittance", grad_transmittance, size)
+    left = None if grad_transmittance is None else _expect("grad_transmittance", grad_transmittance, size)
     drawn = view_colors(plan) if colors is None else _expect("colors", colors, (len(plan.splats), 3))[plan.ids]
     return gradients_of(plan, drawn, image, transmittance, grad_image, left, with_viewmat)
 

@@ -14,12 +14,10 @@ import numpy as np
 
 from gsmerge.errors import UsageError
 from gsmerge.geometry import morton_codes
-from gsmerge.kernels.raster.contribution import PAIR, add_row, settle_row
-from gsmerge.kernels.raster.project import TILE
+from gsmerge.kernels.raster.contribution import dominant_labels
 from gsmerge.moments import Members, pool_members, scene_members, unaligned_members
 from gsmerge.render import ViewPlan, contributions, plan_view, prepare, render
 from gsmerge.render.photos import NEAR
-from gsmerge.render.view_plan import MAX_SIZE
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.decode import DecodeOptions, decode
@@ -27,7 +25,6 @@ from gsmerge.stages.encode import from_moments
 from gsmerge.types import Gaussians, Groups, Scene
 
 ONE_AT_A_TIME = 4_000_000  # Gaussians; the plan of a view is as large as they are
-FIRST_PAIRS = 1 << 16  # room for pairs of Gaussian and superpixel to begin with
 MIN_ALPHA = 0.5  # opacity of a pixel from which it counts when superpixels are merged
 
 
@@ -118,21 +115,7 @@ def seen_depths(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 def view_owners(plan: ViewPlan, labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Find contribution ``[m]`` to, and label ``[m]`` of, the dominant superpixel of each of a plan's Gaussians."""
     labels = np.ascontiguousarray(labels, np.int32)
-    num, room = len(plan.ids), max(FIRST_PAIRS, count)
-    values, owners = np.zeros(num, np.float32), np.full(num, -1, np.int32)
-    stamps, totals, seen = np.full(count, -1, np.int32), np.zeros(count), np.empty(count, np.int32)
-    heads, active = np.full(num, -1, np.int32), np.empty(num + 1, np.int32)
-    pairs, num_pairs, num_active = np.empty((room, PAIR)), 0, 0
-    for line in range(plan.lines):
-        pairs, num_pairs, num_active = add_row(
-            plan.footprints, plan.members, plan.offsets, plan.columns, line, labels,
-            heads, pairs, num_pairs, active, num_active, stamps,
-        )  # fmt: skip
-        bottom = (line + 1) * TILE if line < plan.lines - 1 else MAX_SIZE
-        pairs, num_pairs, num_active = settle_row(
-            bottom, plan.footprints, heads, pairs, room, active, num_active, totals, seen, values, owners
-        )
-    return values, owners
+    return dominant_labels(plan.footprints, plan.members, plan.offsets, plan.columns, labels, count)
 
 
 def owner_pixels(owners: Owners, groups: Groups) -> np.ndarray:

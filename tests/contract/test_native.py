@@ -15,7 +15,7 @@ def functions():
         for value in vars(module).values():
             prototype = getattr(value, "prototype", None)
             if prototype is not None:
-                yield value.__name__, prototype
+                yield value.__name__.lstrip("_"), prototype
 
 
 def walk():

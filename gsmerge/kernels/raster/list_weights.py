@@ -3,115 +3,55 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy import float32 as f4
 
-from gsmerge.kernels.jit import kernel
-from gsmerge.kernels.raster.blend import P1, batch_rows, gather, live_rows, new_batch, open_tile, tile_box
-from gsmerge.kernels.raster.project import LN_CUT, TILE
-from gsmerge.kernels.raster.walk import BATCH, DECAY, LNOP, PLANE, RATE, SLOPE, weigh_rows
+from gsmerge.kernels.raster import blend
+from gsmerge.native.signature import f4, f8, i4, i8, native, u1
 
-LANES = 4  # channels of an image row: one vector register
+LANES = 4  # channels of an image row
+FIRST_ENTRIES = 40  # entries for each pixel that there is room for to begin with
+BATCH_ENTRIES = 32 * 256  # most that a batch of Gaussians can have in a tile
 
-
-@kernel(part=True)
-def batch_columns(batch, j, width):
-    """First and last column of the tile that a Gaussian of the batch can touch."""
-    i = np.uint64(j)
-    mx, rate, slope, decay, lnop = batch[i], batch[i + RATE], batch[i + SLOPE], batch[i + DECAY], batch[i + LNOP]
-    reach = np.sqrt(max(lnop - LN_CUT, f4(0.0)) * (f4(1.0) / (rate * rate) + slope * slope / decay)) + f4(0.01)
-    return int(max(mx - reach, f4(0.0))), int(min(mx + reach, f4(width - 1)))
-
-
-@kernel
-def _grown(lanes, weights, count):
-    """Buffers of twice the size with the same entries."""
-    more_lanes, more_weights = np.empty(2 * lanes.shape[0], np.uint8), np.empty(2 * lanes.shape[0], np.float32)
-    more_lanes[:count], more_weights[:count] = lanes[:count], weights[:count]
-    return more_lanes, more_weights
+ENTRIES = {
+    "starts": i8("more", least=0, most="entries", ascending=True),
+    "lanes": u1("entries"),
+    "weights": f4("entries"),
+    "members": i4("n", least=0, below="m"),
+    "offsets": i8("ends", least=0, most="n", ascending=True),
+    "columns": i8(least=1),
+}
 
 
-@kernel
+@native(
+    **blend.LISTS, height=i8(least=1), width=i8(least=1), starts=i8("more", out=True), lanes=u1("room", out=True),
+    weights=f4("room", out=True), progress=i8(2, least=0, out=True),
+)  # fmt: skip
+def _list_weights(footprints, members, offsets, columns, height, width, starts, lanes, weights, progress):
+    """Write entries of tiles from ``progress[0]`` on behind ``progress[1]`` entries, as far as there is room."""
+
+
 def list_weights(footprints, members, offsets, columns, height, width):
-    """All weights of a view that are not zero.
+    """List all weights of a view that are not zero.
 
     Returns:
         ``starts [intersections + 1]`` int64, ``lanes`` uint8 (pixel within its tile, row-major), ``weights`` float32.
     """
-    starts = np.zeros(members.shape[0] + 1, np.int64)
-    lanes = np.empty(max(BATCH * PLANE, 40 * height * width), np.uint8)
-    weights = np.empty(lanes.shape[0], np.float32)
-    state, batch = np.empty(2 * PLANE, np.float32), new_batch()
-    count = 0
-    for tile in range(offsets.shape[0] - 1):
-        left, top, num_x, num_y = tile_box(tile, columns, height, width)
-        open_tile(state, num_x, num_y)
-        y_low, y_high = 0, num_y - 1
-        start, end = offsets[tile], offsets[tile + 1]
-        while start < end and y_low <= y_high:
-            stop = min(end, start + BATCH)
-            gather(footprints, members, start, stop, end, left, top, batch)
-            if count + BATCH * PLANE > lanes.shape[0]:
-                lanes, weights = _grown(lanes, weights, count)
-            for j in range(stop - start):
-                y0, y1 = batch_rows(batch, j, y_low, y_high)
-                weigh_rows(state, batch, j, y0, y1)
-                x0, x1 = batch_columns(batch, j, num_x)
-                for y in range(y0, y1 + 1):
-                    for x in range(x0, x1 + 1):
-                        lane = np.uint64(y * TILE + x)
-                        w = state[lane + P1]
-                        lanes[np.uint64(count)] = lane
-                        weights[np.uint64(count)] = w
-                        count += 1 if w > f4(0.0) else 0
-                starts[start + j + 1] = count
-            start = stop
-            y_low, y_high = live_rows(state, y_low, y_high)
-        starts[start + 1 : end + 1] = count
-    return starts, lanes[:count].copy(), weights[:count].copy()
+    starts, progress = np.zeros(len(members) + 1, np.int64), np.zeros(2, np.int64)
+    lanes, weights = (
+        np.empty(max(BATCH_ENTRIES, FIRST_ENTRIES * height * width), dtype) for dtype in (np.uint8, np.float32)
+    )
+    while True:
+        _list_weights(footprints, members, offsets, columns, height, width, starts, lanes, weights, progress)
+        tile, count = progress
+        if tile == len(offsets) - 1:
+            return starts, lanes[:count].copy(), weights[:count].copy()
+        lanes, weights = (np.concatenate([array, np.empty_like(array)]) for array in (lanes, weights))
 
 
-@kernel
+@native(**ENTRIES, colors=f4("m", LANES), image=f4("h", "w", LANES, out=True))
 def spread(starts, lanes, weights, members, offsets, columns, colors, image):
     """Sums of weights times ``colors [m,LANES]`` -> ``image [h,w,LANES]``, every pixel of it."""
-    height, width = image.shape[:2]
-    state = np.empty((PLANE, LANES), np.float32)
-    for tile in range(offsets.shape[0] - 1):
-        state[:] = f4(0.0)
-        for i in range(offsets[tile], offsets[tile + 1]):
-            k = np.uint64(members[i])
-            a, b, c, d = colors[k, 0], colors[k, 1], colors[k, 2], colors[k, 3]
-            for e in range(starts[i], starts[i + 1]):
-                p, w = np.uint64(lanes[e]), weights[e]
-                state[p, 0] += w * a
-                state[p, 1] += w * b
-                state[p, 2] += w * c
-                state[p, 3] += w * d
-        left, top, num_x, num_y = tile_box(tile, columns, height, width)
-        for y in range(num_y):
-            for x in range(num_x):
-                image[top + y, left + x] = state[y * TILE + x]
 
 
-@kernel
+@native(**ENTRIES, image=f4("h", "w", LANES), sums=f8("m", LANES, out=True))
 def collect(starts, lanes, weights, members, offsets, columns, image, sums):
     """Add weights times ``image [h,w,LANES]`` to ``sums [m,LANES]`` float64."""
-    height, width = image.shape[:2]
-    state = np.zeros((PLANE, LANES), np.float32)
-    for tile in range(offsets.shape[0] - 1):
-        left, top, num_x, num_y = tile_box(tile, columns, height, width)
-        for y in range(num_y):
-            for x in range(num_x):
-                state[y * TILE + x] = image[top + y, left + x]
-        for i in range(offsets[tile], offsets[tile + 1]):
-            a, b, c, d = f4(0.0), f4(0.0), f4(0.0), f4(0.0)
-            for e in range(starts[i], starts[i + 1]):
-                p, w = np.uint64(lanes[e]), weights[e]
-                a += w * state[p, 0]
-                b += w * state[p, 1]
-                c += w * state[p, 2]
-                d += w * state[p, 3]
-            k = members[i]
-            sums[k, 0] += a
-            sums[k, 1] += b
-            sums[k, 2] += c
-            sums[k, 3] += d

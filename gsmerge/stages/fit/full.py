@@ -18,7 +18,7 @@ import numpy as np
 from gsmerge.geometry import motion_matrices
 from gsmerge.kernels.gaussians import optimise as kernels
 from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT
-from gsmerge.kernels.raster.walk import MAX_ALPHA
+from gsmerge.kernels.raster.blend import MAX_ALPHA
 from gsmerge.render import composite, plan_view, splat_adjoint
 from gsmerge.render.composite import blend, view_colors
 from gsmerge.render.gradient import gradients_of
@@ -47,7 +47,6 @@ LOOKS = (
     (1.0, True), (1.0, False), (0.25, False), (1.0, False), (1.0, False), (1.0, False), (0.25, False), (1.0, False),
 )  # fmt: skip
 
-NO_LOSS = np.empty((0, 0), np.float32)  # on the transmittance
 HIDDEN = np.float32(1e-9)  # a weight that is neither that of a held-out pixel nor one that counts
 Masks = tuple[np.ndarray, np.ndarray]  # of the photos at full and at half size, [v,h,w] bool
 Progress = Callable[[int, int, float, float], None]  # step, steps, PSNR of the photos and of their held-out blocks
@@ -117,7 +116,7 @@ def fit_step(state: State, plan: FitPlan, view: int, step: int, progress: float,
     colors = view_colors(drawn) if all_colors is None else all_colors.take(drawn.ids, 0)
     image, transmittance = blend(drawn, colors, background)
     gradient, error = image_gradient(image, photos.image(view), weight, plan.options.tuning.ssim_lambda)
-    g = gradients_of(drawn, colors, image, transmittance, gradient, NO_LOSS, with_viewmat=plan.poses is not None)
+    g = gradients_of(drawn, colors, image, transmittance, gradient, None, with_viewmat=plan.poses is not None)
     if plan.poses is not None and g.viewmat is not None:  # that harmonics change with the camera is left out
         plan.poses.step(view, g.viewmat, plan.options.tuning, progress)
     rates, s, count = plan.options.tuning, state.splats, max(len(state.x), 1)

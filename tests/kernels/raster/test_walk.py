@@ -5,11 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsmerge.kernels.raster.blend import batch_rows, gather, new_batch
+from gsmerge.kernels.raster.blend import rows_in_tile
 from gsmerge.kernels.raster.project import LN_CUT, TILE
-from gsmerge.kernels.raster.walk import BATCH, DECAY, LNOP, MY, RATE, SLOPE
 
+BATCH = 32  # Gaussians that the kernels take at once
 LEFT, TOP = 32, 48  # the tile's first pixel
+
+
+def rows_of(footprints: np.ndarray) -> np.ndarray:
+    rows = np.empty((len(footprints), 2), np.int32)
+    rows_in_tile(footprints, np.arange(len(footprints), dtype=np.int32), LEFT, TOP, rows)
+    return rows
 
 
 def footprints_of(kind: str, rng: np.random.Generator) -> np.ndarray:
@@ -30,17 +36,16 @@ def footprints_of(kind: str, rng: np.random.Generator) -> np.ndarray:
 @pytest.mark.parametrize("seed", range(20))
 def test_rows_are_those_that_reach_the_cut(kind: str, seed: int) -> None:
     """None that shows is left out, and at most one beside them is kept."""
-    footprints, batch = footprints_of(kind, np.random.default_rng(seed)), new_batch()
-    gather(footprints, np.arange(BATCH, dtype=np.int32), 0, BATCH, BATCH, LEFT, TOP, batch)
-    i = np.arange(BATCH)
-    mx, my, rate = (batch[i + int(plane)].astype(np.float64)[:, None, None] for plane in (0, MY, RATE))
-    slope, decay, lnop = (batch[i + int(plane)].astype(np.float64)[:, None, None] for plane in (SLOPE, DECAY, LNOP))
+    footprints = footprints_of(kind, np.random.default_rng(seed))
+    rows = rows_of(footprints)
+    mx, my, rate, slope, decay, lnop = footprints.T[:6].astype(np.float64)[..., None, None]
+    mx, my = mx - LEFT - 0.5, my - TOP - 0.5
     y, x = np.mgrid[:TILE, :TILE].astype(np.float64)
     exponents = lnop - (rate * (x - mx - slope * (y - my))) ** 2 - decay * (y - my) ** 2
     # along a row without pixels between: what the bounds are of
     line = np.linspace(0, TILE - 1, 4096)
     for j in range(BATCH):
-        first, last = batch_rows(batch, j, 0, TILE - 1)
+        first, last = rows[j]
         shows = np.flatnonzero((exponents[j] >= LN_CUT + 1e-5).any(1))
         if len(shows):
             assert first <= shows[0]
@@ -56,8 +61,7 @@ def test_rows_are_those_that_reach_the_cut(kind: str, seed: int) -> None:
 
 
 def test_a_gaussian_that_misses_the_tile_has_no_rows() -> None:
-    footprints, batch = np.zeros((1, 8), np.float32), new_batch()
+    footprints = np.zeros((1, 8), np.float32)
     footprints[0] = LEFT + 60, TOP + 8, 1, 0, 1, 0, 0, 1000
-    gather(footprints, np.zeros(1, np.int32), 0, 1, 1, LEFT, TOP, batch)
-    first, last = batch_rows(batch, 0, 0, TILE - 1)
+    first, last = rows_of(footprints)[0]
     assert first > last

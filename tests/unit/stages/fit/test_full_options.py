@@ -18,7 +18,7 @@ from gsmerge.stages.fit import FitOptions
 from gsmerge.stages.fit import full as full_module
 from gsmerge.stages.fit.fit_options import LONG_STEPS, Tuning
 from gsmerge.stages.fit.fit_state import start_state
-from gsmerge.stages.fit.full import NO_LOSS, fit_full, plan_run, start_poses
+from gsmerge.stages.fit.full import fit_full, plan_run, start_poses
 
 
 @pytest.mark.parametrize("coarse", [0.5, 1.0])
@@ -91,7 +91,7 @@ def squared_error(truth: Gaussians, photos: Photos, view: int) -> tuple[float, n
     colors = view_colors(drawn)
     image, left = blend(drawn, colors, np.zeros(3, np.float32))
     residual = image - photos.images[view]
-    wanted = gradients_of(drawn, colors, image, left, 2 * residual, NO_LOSS, with_viewmat=True).viewmat
+    wanted = gradients_of(drawn, colors, image, left, 2 * residual, None, with_viewmat=True).viewmat
     return float((residual**2).sum()), wanted
 
 

@@ -1,0 +1,150 @@
+// Front-to-back blending of one view, tile by tile, and sums over its blending weights.
+//
+// All kernels walk the same lists with the same weights. Gaussians are gathered 32 at a time into a small local batch,
+// with the rows of the tile in which they show.
+#include "walk.h"
+
+enum { CHANNELS = 4 };  // channels that one walk of weighted_sums adds up
+
+static inline void blend_rows(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1) {
+  Curve curve = curve_of(b, (int)j);
+  float red = b->red[j], green = b->green[j], blue = b->blue[j];
+  for (int32_t y = y0; y <= y1; y++) {
+    float *row = state + y * TILE;
+    Share s = take_share(load(row), exponents(&curve, (float)y - curve.my));
+    store(row, s.left);
+    store(row + PLANE, load(row + PLANE) + s.weight * red);
+    store(row + 2 * PLANE, load(row + 2 * PLANE) + s.weight * green);
+    store(row + 3 * PLANE, load(row + 3 * PLANE) + s.weight * blue);
+  }
+}
+
+API void blend(const float *restrict footprints, const float *restrict colors, const int32_t *restrict members,
+               const int64_t *restrict offsets, int64_t columns, int64_t first, int64_t last,
+               const float *restrict background, float *restrict image, float *restrict transmittance, int64_t m,
+               int64_t n, int64_t ends, int64_t h, int64_t w) {
+  (void)m, (void)n, (void)ends;
+  float state[4 * PLANE] __attribute__((aligned(64)));
+  Batch batch;
+  clear_batch(&batch);
+  for (int64_t tile = first; tile < last; tile++) {
+    Tile t = open_tile(state, 4, tile, columns, h, w);
+    int64_t end = offsets[tile + 1];
+    for (int64_t start = offsets[tile]; start < end && t.y_low <= t.y_high; start += BATCH) {
+      int64_t stop = mini(end, start + BATCH);
+      gather(&batch, &t, footprints, members, start, stop, end);
+      gather_colors(&batch, colors, members, start, stop, end);
+      for (int64_t j = 0; j < stop - start; j++)
+        blend_rows(state, &batch, j, first_row(&t, &batch, j), last_row(&t, &batch, j));
+      narrow_tile(&t, state);
+    }
+    for (int y = 0; y < t.num_y; y++)
+      for (int x = 0; x < t.num_x; x++) {
+        int64_t pixel = (t.top + y) * w + t.left + x;
+        const float *lane = state + y * TILE + x;
+        float rest = absf4(lane[0]);
+        for (int c = 0; c < 3; c++) image[3 * pixel + c] = lane[(c + 1) * PLANE] + rest * background[c];
+        transmittance[pixel] = rest;
+      }
+  }
+}
+
+// Weights of Gaussian j times planes 2 to 5, summed over the tile.
+static inline void sum_weights(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1, float *slot) {
+  v16f sums[CHANNELS] = {{0}};
+  Curve curve = curve_of(b, (int)j);
+  for (int32_t y = y0; y <= y1; y++) {
+    float *row = state + y * TILE;
+    Share s = take_share(load(row), exponents(&curve, (float)y - curve.my));
+    store(row, s.left);
+    for (int c = 0; c < CHANNELS; c++) sums[c] += s.weight * load(row + (c + 1) * PLANE);
+  }
+  for (int c = 0; c < CHANNELS; c++) slot[c] = total(sums[c]);
+}
+
+API void weighted_sums(const float *restrict footprints, const int32_t *restrict members,
+                       const int64_t *restrict offsets, int64_t columns, int64_t first, int64_t last,
+                       const float *restrict image, float *restrict slots, int64_t m, int64_t n, int64_t ends,
+                       int64_t h, int64_t w, int64_t channels) {
+  (void)m, (void)n, (void)ends;
+  float state[(CHANNELS + 1) * PLANE] __attribute__((aligned(64)));
+  Batch batch;
+  clear_batch(&batch);
+  for (int64_t tile = first; tile < last; tile++) {
+    Tile t = open_tile(state, CHANNELS + 1, tile, columns, h, w);
+    for (int y = 0; y < t.num_y; y++)
+      for (int x = 0; x < t.num_x; x++)
+        for (int64_t c = 0; c < channels && c < CHANNELS; c++)
+          state[(c + 1) * PLANE + y * TILE + x] = image[((t.top + y) * w + t.left + x) * channels + c];
+    int64_t start = offsets[tile], end = offsets[tile + 1];
+    for (; start < end && t.y_low <= t.y_high; start += BATCH) {
+      int64_t stop = mini(end, start + BATCH);
+      gather(&batch, &t, footprints, members, start, stop, end);
+      for (int64_t j = 0; j < stop - start; j++)
+        sum_weights(state, &batch, j, first_row(&t, &batch, j), last_row(&t, &batch, j), slots + CHANNELS * (start + j));
+      narrow_tile(&t, state);
+    }
+    for (int64_t i = CHANNELS * start; i < CHANNELS * end; i++) slots[i] = 0.f;
+  }
+}
+
+API void add_slots(const int32_t *restrict members, const float *restrict slots, const int32_t *restrict ids,
+                   int64_t first, float *restrict sums, int64_t n, int64_t m, int64_t gaussians, int64_t channels) {
+  (void)m, (void)gaussians;
+  int64_t count = mini(CHANNELS, channels - first);
+  for (int64_t i = 0; i < n; i++) {
+    __builtin_prefetch(sums + channels * ids[members[mini(i + BATCH, n - 1)]]);
+    float *sum = sums + channels * ids[members[i]] + first;
+    for (int64_t c = 0; c < count; c++) sum[c] += slots[CHANNELS * i + c];
+  }
+}
+
+API void contributions(const float *restrict footprints, const int32_t *restrict members,
+                       const int64_t *restrict offsets, int64_t columns, int64_t height, int64_t width,
+                       float *restrict totals, int64_t m, int64_t n, int64_t ends) {
+  (void)m, (void)n;
+  float state[PLANE] __attribute__((aligned(64)));
+  Batch batch;
+  clear_batch(&batch);
+  for (int64_t tile = 0; tile < ends - 1; tile++) {
+    Tile t = open_tile(state, 1, tile, columns, height, width);
+    int64_t end = offsets[tile + 1];
+    for (int64_t start = offsets[tile]; start < end && t.y_low <= t.y_high; start += BATCH) {
+      int64_t stop = mini(end, start + BATCH);
+      gather(&batch, &t, footprints, members, start, stop, end);
+      for (int64_t i = start; i < stop; i++) __builtin_prefetch(totals + 2 * (int64_t)members[i]);
+      for (int64_t j = 0; j < stop - start; j++) {
+        Curve curve = curve_of(&batch, (int)j);
+        v16f sum = {0}, peak = {0};
+        for (int32_t y = first_row(&t, &batch, j); y <= last_row(&t, &batch, j); y++) {
+          Share s = take_share(load(state + y * TILE), exponents(&curve, (float)y - curve.my));
+          store(state + y * TILE, s.left);
+          sum += s.weight;
+          peak = sel(s.weight > peak, s.weight, peak);
+        }
+        float *own = totals + 2 * (int64_t)members[start + j], most = 0.f;
+        for (int x = 0; x < LANES; x++) most = maxf(peak[x], most);
+        own[0] += total(sum);
+        own[1] = maxf(own[1], most);
+      }
+      narrow_tile(&t, state);
+    }
+  }
+}
+
+// The rows of one tile in which the members of a list show, as the walks take them: first and last of each.
+API void rows_in_tile(const float *footprints, const int32_t *members, int64_t left, int64_t top, int32_t *rows,
+                      int64_t m, int64_t n) {
+  (void)m;
+  Batch batch;
+  clear_batch(&batch);
+  Tile t = {left, top, TILE, TILE, 0, TILE - 1};
+  for (int64_t start = 0; start < n; start += BATCH) {
+    int64_t stop = mini(n, start + BATCH);
+    gather(&batch, &t, footprints, members, start, stop, n);
+    for (int64_t j = 0; j < stop - start; j++) {
+      rows[2 * (start + j)] = batch.y0[j];
+      rows[2 * (start + j) + 1] = batch.y1[j];
+    }
+  }
+}

@@ -1,0 +1,115 @@
+// The backward pass of blending: what a loss wants of every Gaussian's footprint and colour.
+//
+// The tiles are walked front to back again, with the weights of blend.c. With g the gradient of a pixel's colour and h
+// that of its transmittance, a pixel starts with the whole rest = g.C + h T (C its final colour, T its final
+// transmittance); every Gaussian takes its w (g.c) away, so what is left is what lies behind it, and
+//
+//     d loss / d ln alpha = w (g.c) - alpha / (1 - alpha) rest
+//
+// needs no list of what was blended and no division of transmittances.
+#include "walk.h"
+
+enum { SUMS = 9 };
+
+// 1 / x within two units of the last place for x in [0.01, 1]: Newton's steps from a first guess by the exponent.
+static inline v16f reciprocal(v16f x) {
+  v16f y = (v16f)(0x7ef311c3 - (v16i)x);
+  y = y * (2.f - x * y);
+  y = y * (2.f - x * y);
+  return y * (2.f - x * y);
+}
+
+// The two halves of every group of lanes added; the second vector's follow the first's per block.
+#define LOW(a, b, ...) __builtin_shufflevector(a, b, __VA_ARGS__)
+static inline v16f halves8(v16f a, v16f b) {
+  return LOW(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23)
+      + LOW(a, b, 8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30, 31);
+}
+static inline v16f halves4(v16f a, v16f b) {
+  return LOW(a, b, 0, 1, 2, 3, 8, 9, 10, 11, 16, 17, 18, 19, 24, 25, 26, 27)
+      + LOW(a, b, 4, 5, 6, 7, 12, 13, 14, 15, 20, 21, 22, 23, 28, 29, 30, 31);
+}
+static inline v16f halves2(v16f a, v16f b) {
+  return LOW(a, b, 0, 1, 4, 5, 8, 9, 12, 13, 16, 17, 20, 21, 24, 25, 28, 29)
+      + LOW(a, b, 2, 3, 6, 7, 10, 11, 14, 15, 18, 19, 22, 23, 26, 27, 30, 31);
+}
+static inline void write_totals(const v16f v[8], float *out) {
+  v16f a = halves4(halves8(v[0], v[1]), halves8(v[2], v[3])), b = halves4(halves8(v[4], v[5]), halves8(v[6], v[7]));
+  v16f sums = halves2(a, b);
+  for (int i = 0; i < 8; i++) out[i] = sums[2 * i] + sums[2 * i + 1];
+}
+
+// Take Gaussian j of a batch off the pixels of rows y0 to y1 and write what they want of it.
+static inline void walk_back(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1, float *slot) {
+  Curve curve = curve_of(b, (int)j);
+  float red = b->red[j], green = b->green[j], blue = b->blue[j];
+  v16f sr = {0}, sg = {0}, sb = {0}, sv = {0}, sy = {0}, syy = {0};
+  for (int32_t y = y0; y <= y1; y++) {
+    float *row = state + y * TILE, dy = (float)y - curve.my;
+    Share s = take_share(load(row), exponents(&curve, dy));
+    v16f g0 = load(row + 2 * PLANE), g1 = load(row + 3 * PLANE), g2 = load(row + 4 * PLANE);
+    v16f own = s.weight * (red * g0 + green * g1 + blue * g2);
+    v16f rest = load(row + PLANE) - own;
+    v16f v = own - s.alpha * rest * reciprocal(1.f - s.alpha);
+    v = sel(s.goes & s.unclamped, v, splat(0.f));
+    store(row, s.left);
+    store(row + PLANE, rest);
+    v16f vy = v * dy;
+    sr += s.weight * g0;
+    sg += s.weight * g1;
+    sb += s.weight * g2;
+    sv += v;
+    sy += vy;
+    syy += vy * dy;
+  }
+  // x is the same in all rows of a lane, so its moments wait until here
+  v16f dx = COLUMNS - curve.mx, vx = sv * dx;
+  write_totals((v16f[8]){sr, sg, sb, sv, vx, sy, vx * dx, sy * dx}, slot);
+  slot[8] = total(syy);
+}
+
+API void blend_backward(const float *restrict footprints, const float *restrict colors, const int32_t *restrict members,
+                        const int64_t *restrict offsets, int64_t columns, int64_t first, int64_t last,
+                        const float *restrict image, const float *restrict transmittance,
+                        const float *restrict grad_image, const float *restrict grad_left, float *restrict slots,
+                        int64_t m, int64_t n, int64_t ends, int64_t h, int64_t w) {
+  (void)m, (void)n, (void)ends;
+  float state[5 * PLANE] __attribute__((aligned(64)));
+  Batch batch;
+  clear_batch(&batch);
+  for (int64_t tile = first; tile < last; tile++) {
+    Tile t = open_tile(state, 5, tile, columns, h, w);
+    for (int y = 0; y < t.num_y; y++)
+      for (int x = 0; x < t.num_x; x++) {
+        int64_t pixel = (t.top + y) * w + t.left + x;
+        float *lane = state + y * TILE + x, rest = grad_left ? grad_left[pixel] * transmittance[pixel] : 0.f;
+        for (int c = 0; c < 3; c++) {
+          float g = grad_image[3 * pixel + c];
+          lane[(2 + c) * PLANE] = g;
+          rest += g * image[3 * pixel + c];
+        }
+        lane[PLANE] = rest;
+      }
+    int64_t start = offsets[tile], end = offsets[tile + 1];
+    for (; start < end && t.y_low <= t.y_high; start += BATCH) {
+      int64_t stop = mini(end, start + BATCH);
+      gather(&batch, &t, footprints, members, start, stop, end);
+      gather_colors(&batch, colors, members, start, stop, end);
+      for (int64_t j = 0; j < stop - start; j++)
+        walk_back(state, &batch, j, first_row(&t, &batch, j), last_row(&t, &batch, j), slots + SUMS * (start + j));
+      narrow_tile(&t, state);
+    }
+    for (int64_t i = SUMS * start; i < SUMS * end; i++) slots[i] = 0.f;
+  }
+}
+
+API void gather_slots(const int32_t *restrict members, const float *restrict slots, int64_t first, int64_t last,
+                      float *restrict sums, int64_t n, int64_t m) {
+  (void)m;
+  for (int64_t i = 0; i < n; i++) {
+    int64_t k = members[i];
+    __builtin_prefetch(sums + SUMS * (int64_t)members[mini(i + BATCH, n - 1)]);
+    if (k < first || k >= last) continue;
+    for (int c = 0; c < SUMS; c++) sums[SUMS * k + c] += slots[SUMS * i + c];
+  }
+}

@@ -1,0 +1,87 @@
+// The blending weights of one view, written out: one (pixel, weight) entry after the other.
+#include "walk.h"
+
+enum { CHANNELS = 4 };  // of an image row
+
+// Write the weights of tiles from progress[0] on behind the progress[1] entries that are there, and advance both. A tile
+// whose entries may not fit is not begun in earnest: it is left for a call with more room.
+API void list_weights(const float *restrict footprints, const int32_t *restrict members,
+                      const int64_t *restrict offsets, int64_t columns, int64_t height, int64_t width,
+                      int64_t *restrict starts, uint8_t *restrict lanes, float *restrict weights,
+                      int64_t *restrict progress, int64_t m, int64_t n, int64_t ends, int64_t more, int64_t room) {
+  (void)m, (void)n, (void)more;
+  float state[2 * PLANE] __attribute__((aligned(64)));
+  Batch batch;
+  clear_batch(&batch);
+  for (int64_t tile = progress[0]; tile < ends - 1; tile++) {
+    Tile t = open_tile(state, 2, tile, columns, height, width);
+    int64_t start = offsets[tile], end = offsets[tile + 1], count = progress[1];
+    for (; start < end && t.y_low <= t.y_high; start += BATCH) {
+      int64_t stop = mini(end, start + BATCH);
+      if (count + BATCH * PLANE > room) return;
+      gather(&batch, &t, footprints, members, start, stop, end);
+      for (int64_t j = 0; j < stop - start; j++) {
+        int32_t y0 = first_row(&t, &batch, j), y1 = last_row(&t, &batch, j), x0, x1;
+        weigh_rows(state, &batch, j, y0, y1);
+        columns_of(&batch, j, t.num_x, &x0, &x1);
+        for (int32_t y = y0; y <= y1; y++)
+          for (int32_t x = x0; x <= x1; x++) {
+            float w = state[PLANE + y * TILE + x];
+            lanes[count] = (uint8_t)(y * TILE + x);
+            weights[count] = w;
+            count += w > 0.f;  // no branch: half of them would be mispredicted
+          }
+        starts[start + j + 1] = count;
+      }
+      narrow_tile(&t, state);
+    }
+    for (int64_t i = start; i < end; i++) starts[i + 1] = count;
+    progress[0] = tile + 1;
+    progress[1] = count;
+  }
+}
+
+API void spread(const int64_t *restrict starts, const uint8_t *restrict lanes, const float *restrict weights,
+                const int32_t *restrict members, const int64_t *restrict offsets, int64_t columns,
+                const float *restrict colors, float *restrict image, int64_t more, int64_t entries, int64_t n,
+                int64_t ends, int64_t m, int64_t h, int64_t w) {
+  (void)more, (void)entries, (void)n, (void)m;
+  float state[PLANE][CHANNELS] __attribute__((aligned(64)));
+  for (int64_t tile = 0; tile < ends - 1; tile++) {
+    for (int i = 0; i < PLANE; i++)
+      for (int c = 0; c < CHANNELS; c++) state[i][c] = 0.f;
+    for (int64_t i = offsets[tile]; i < offsets[tile + 1]; i++) {
+      const float *color = colors + CHANNELS * (int64_t)members[i];
+      for (int64_t e = starts[i]; e < starts[i + 1]; e++)
+        for (int c = 0; c < CHANNELS; c++) state[lanes[e]][c] += weights[e] * color[c];
+    }
+    int64_t left = tile % columns * TILE, top = tile / columns * TILE;
+    for (int64_t y = 0; y < mini(TILE, h - top); y++)
+      for (int64_t x = 0; x < mini(TILE, w - left); x++)
+        for (int c = 0; c < CHANNELS; c++)
+          image[((top + y) * w + left + x) * CHANNELS + c] = state[y * TILE + x][c];
+  }
+}
+
+API void collect(const int64_t *restrict starts, const uint8_t *restrict lanes, const float *restrict weights,
+                 const int32_t *restrict members, const int64_t *restrict offsets, int64_t columns,
+                 const float *restrict image, double *restrict sums, int64_t more, int64_t entries, int64_t n,
+                 int64_t ends, int64_t h, int64_t w, int64_t m) {
+  (void)more, (void)entries, (void)n, (void)m;
+  float state[PLANE][CHANNELS] __attribute__((aligned(64)));
+  for (int i = 0; i < PLANE; i++)
+    for (int c = 0; c < CHANNELS; c++) state[i][c] = 0.f;
+  for (int64_t tile = 0; tile < ends - 1; tile++) {
+    int64_t left = tile % columns * TILE, top = tile / columns * TILE;
+    for (int64_t y = 0; y < mini(TILE, h - top); y++)
+      for (int64_t x = 0; x < mini(TILE, w - left); x++)
+        for (int c = 0; c < CHANNELS; c++)
+          state[y * TILE + x][c] = image[((top + y) * w + left + x) * CHANNELS + c];
+    for (int64_t i = offsets[tile]; i < offsets[tile + 1]; i++) {
+      float own[CHANNELS] = {0};
+      for (int64_t e = starts[i]; e < starts[i + 1]; e++)
+        for (int c = 0; c < CHANNELS; c++) own[c] += weights[e] * state[lanes[e]][c];
+      for (int c = 0; c < CHANNELS; c++) sums[CHANNELS * (int64_t)members[i] + c] += own[c];
+    }
+  }
+}
