@@ -95,6 +95,7 @@ USAGE = {
     "evaluate room --lpips none -o room/scene.ply": "ends in .json, .csv, .md, .html",
     "evaluate room --lpips none -o room/transforms.json": "other than the input",
     "evaluate room --lpips none --merge-seconds 1": "that of each of 0 AFTER, got 1",
+    "evaluate room alone.ply --lpips none --merge-seconds run.json -o run.json --overwrite": "other than the input",
     "evaluate room --lpips none --align=color": "expected held-out views",
     "evaluate room --lpips none --align=colour --targets room/targets": "color or pose",
     "evaluate room --lpips none --zoom=a,2": "sizes such as .5,1,2,4",
@@ -165,6 +166,7 @@ def prepared(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     folder = tmp_path_factory.mktemp("prepared") / "work"
     shutil.copytree(small_scene, folder / "room")
     shutil.copy(small_scene / "scene.ply", folder / "alone.ply")
+    (folder / "run.json").write_text('{"total_seconds": 2}')
     (folder / "occupied").mkdir()
     (folder / "occupied" / "mine.txt").write_text("precious")
     small = ["--superpixels", "60", "--checkpoint", "none", "--quiet"]
