@@ -142,6 +142,7 @@ PLACES = {
     "evaluate room alone.ply --lpips none --merge-seconds room/transforms.json": "total_seconds",
     "evaluate room alone.ply --lpips none --merge-seconds alone.ply": "cannot be read as text",
     "evaluate alone.ply --hint order=none --targets room/targets": "alone.ply: expected cameras to measure from",
+    "evaluate alone.ply --hint order=none --views 2": "alone.ply: expected cameras to measure from*with --cameras",
     "stress alone.ply --hint order=none --targets room/targets": "alone.ply: expected cameras to measure from",
     "chart -o out nowhere": "nowhere",
     "chart -o out room --targets {{scene}}/none.json": "expected cameras of held-out views",
