@@ -270,8 +270,9 @@ def _resolve_fit_to(
     scale, problem = photo_scale(scene, fit, auto=auto)
     if problem is not None:
         note(problem)
-    moves = options.prepare.poses == "free" or (options.prepare.poses == "auto" and prepared.moved)
-    return replace(fit, photo_scale=scale, move_cameras=moves and prepared.given.images is not None)
+    free = options.prepare.poses == "free" or (options.prepare.poses == "auto" and prepared.moved)
+    moves = free and fit.fit == "full" and prepared.given.images is not None  # which only the CPU can do
+    return replace(fit, photo_scale=scale, move_cameras=moves)
 
 
 def _choose_scored_views(prepared: Prepared, options: CompactOptions) -> tuple[int, ...]:

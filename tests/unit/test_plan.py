@@ -158,6 +158,9 @@ def test_cameras_move_where_it_is_asked_for(scene: Scene) -> None:
     assert free.fit.move_cameras
     assert not free.with_fixed_cameras().fit.move_cameras
     assert not plan_of(scene, poses="fixed").fit.move_cameras
+    unfitted = plan_of(scene, poses="free", fit="none").fit
+    assert unfitted.needs_photos
+    assert not unfitted.move_cameras  # would keep the GPU from finding what no photo shows
 
 
 def test_more_views_are_scored_for_a_quality(scene: Scene) -> None:
