@@ -20,7 +20,7 @@ from gsmerge.stages.assign import merge_unseen
 from gsmerge.stages.clean import CleanOptions, clean
 from gsmerge.stages.decode import DecodeOptions
 from gsmerge.stages.fit import FitBackend, FitOptions, photo_scale, start_share
-from gsmerge.stages.match import MatchOptions
+from gsmerge.stages.match import MatchOptions, Method
 from gsmerge.stages.prepare import Prepared
 from gsmerge.stages.segment import CountLimits, SuperpixelPlan, count_limits, scene_tree
 from gsmerge.stages.superpixels import AUTO_SHARE, SHARE, SegmentOptions
@@ -119,7 +119,7 @@ def make_plan(prepared: Prepared, options: CompactOptions) -> Plan:
         if problem is not None:
             note(problem)
         fit = _resolve_fit_to(prepared, options, limits, backend)
-    superpixels, tree = SuperpixelPlan(segment, limits, start_share(fit), None), None
+    tree = None
     searches = options.budget.quality is not None or options.budget.auto or options.budget.levels > 1
     if own and (searches or limits.count is not None):
         tree = scene_tree(scene, segment, limits, limits.exact or limits.default)
@@ -127,9 +127,9 @@ def make_plan(prepared: Prepared, options: CompactOptions) -> Plan:
     if checkpoint is not None:
         networks = (checkpoint.networks, None) if options.checkpoint == "auto" else (checkpoint.networks,)
     return Plan(
-        superpixels=replace(superpixels, tree=tree),
+        superpixels=SuperpixelPlan(segment, limits, start_share(fit), tree),
         networks=networks,
-        match=replace(options.match, match=options.match.match or ("overlap" if effort.merges else "none")),
+        match=replace(options.match, match=_match_method(options)),
         decode=options.decode,
         fit=fit,
         clean=clean_options,
@@ -170,8 +170,12 @@ def choose_networks(options: CompactOptions, *, photos: bool, aligned: bool = Tr
 
 def resolved_settings(options: CompactOptions, *, photos: bool) -> dict[str, Any]:
     """Return all settings by flat name, with checkpoint and matching resolved."""
-    match = options.match.match or ("overlap" if EFFORTS[options.effort].merges else "none")
-    return options.to_dict() | {"checkpoint": choose_networks(options, photos=photos), "match": match}
+    return options.to_dict() | {"checkpoint": choose_networks(options, photos=photos), "match": _match_method(options)}
+
+
+def _match_method(options: CompactOptions) -> Method:
+    """Return the method of merging views: as asked, or by effort."""
+    return options.match.match or ("overlap" if EFFORTS[options.effort].merges else "none")
 
 
 def _load_networks(options: CompactOptions, scene: Scene) -> Checkpoint | None:

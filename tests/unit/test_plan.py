@@ -42,7 +42,7 @@ def test_every_effort_has_a_meaning() -> None:
 def test_effort_decides_what_is_left_open(effort: str, scene: Scene) -> None:
     plan, own = plan_of(scene, effort=effort), EFFORTS[effort]
     assert plan.fit.steps == own.steps
-    assert plan.match.method == ("overlap" if own.merges else "none")
+    assert plan.match.match == ("overlap" if own.merges else "none")
     assert plan.superpixels.options.rectangles == own.rectangles
     assert plan.superpixels.options.early_sweeps == own.early_sweeps
 
@@ -50,7 +50,7 @@ def test_effort_decides_what_is_left_open(effort: str, scene: Scene) -> None:
 def test_what_is_given_goes_before_effort(scene: Scene) -> None:
     plan = plan_of(scene, effort="draft", fit_steps=7, match="aabb", rectangles=1.5, early_sweeps=2)
     assert plan.fit.steps == 7
-    assert plan.match.method == "aabb"
+    assert plan.match.match == "aabb"
     assert (plan.superpixels.options.rectangles, plan.superpixels.options.early_sweeps) == (1.5, 2)
 
 
