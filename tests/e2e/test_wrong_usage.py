@@ -68,6 +68,7 @@ USAGE = {
     "decode room.gsm -o room.gsm --overwrite": "other than the input",
     "decode room.gsm -o alone.ply": "alone.ply*--overwrite",
     "decode room.gsm -o a.ply --set spz_version=4": "spz_version 4: expected an output as .spz, got .ply",
+    "decode room.gsm --set viewer_cameras=true": "--set viewer_cameras: unknown",
     "decode room.gsm --fit full": "fit full: expected a state with photos, found none",
     "decode state.gsm --k 8": "k: expected 1 to 4",
     "decode state.gsm --k 2 --budget 900": "expected one of k and budget",
