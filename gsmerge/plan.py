@@ -104,7 +104,7 @@ def make_plan(prepared: Prepared, options: CompactOptions) -> Plan:
     _check_photos(given, options)
     own = options.method == "gsmerge"  # baselines learn nothing
     with stage("prepare"):
-        checkpoint = _load_networks(options, given) if own else None
+        checkpoint = load_networks(options, given) if own else None
         segment = _resolve_superpixels(options.segment, scene, effort)
         clean_options = options.clean
         if clean_options.drop_sky and not prepared.photo_views:
@@ -178,8 +178,11 @@ def _match_method(options: CompactOptions) -> Method:
     return options.match.match or ("overlap" if EFFORTS[options.effort].merges else "none")
 
 
-def _load_networks(options: CompactOptions, scene: Scene) -> Checkpoint | None:
-    """Load the checkpoint to use, and check that it fits the options; None for the analytic stages alone."""
+def load_networks(options: CompactOptions, scene: Scene) -> Checkpoint | None:
+    """Load the checkpoint to use, and check that it fits the options; None for the analytic stages alone.
+
+    SceneError if it is required and cannot be used, UsageError if it does not fit.
+    """
     name = choose_networks(options, photos=scene.images is not None, aligned=scene.aligned)
     if name == "none":  # torch is imported only where there are networks
         return None
