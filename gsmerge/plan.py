@@ -20,7 +20,7 @@ from gsmerge.stages.assign import merge_unseen
 from gsmerge.stages.clean import CleanOptions, clean
 from gsmerge.stages.decode import DecodeOptions
 from gsmerge.stages.fit import FitBackend, FitOptions, photo_scale, start_share
-from gsmerge.stages.match import MatchOptions
+from gsmerge.stages.match import MatchOptions, Method
 from gsmerge.stages.prepare import Prepared
 from gsmerge.stages.segment import CountLimits, SuperpixelPlan, count_limits, scene_tree
 from gsmerge.stages.superpixels import AUTO_SHARE, SHARE, SegmentOptions
@@ -104,7 +104,7 @@ def make_plan(prepared: Prepared, options: CompactOptions) -> Plan:
     _check_photos(given, options)
     own = options.method == "gsmerge"  # baselines learn nothing
     with stage("prepare"):
-        checkpoint = _load_networks(options, given) if own else None
+        checkpoint = load_networks(options, given) if own else None
         segment = _resolve_superpixels(options.segment, scene, effort)
         clean_options = options.clean
         if clean_options.drop_sky and not prepared.photo_views:
@@ -119,7 +119,7 @@ def make_plan(prepared: Prepared, options: CompactOptions) -> Plan:
         if problem is not None:
             note(problem)
         fit = _resolve_fit_to(prepared, options, limits, backend)
-    superpixels, tree = SuperpixelPlan(segment, limits, start_share(fit), None), None
+    tree = None
     searches = options.budget.quality is not None or options.budget.auto or options.budget.levels > 1
     if own and (searches or limits.count is not None):
         tree = scene_tree(scene, segment, limits, limits.exact or limits.default)
@@ -127,9 +127,9 @@ def make_plan(prepared: Prepared, options: CompactOptions) -> Plan:
     if checkpoint is not None:
         networks = (checkpoint.networks, None) if options.checkpoint == "auto" else (checkpoint.networks,)
     return Plan(
-        superpixels=replace(superpixels, tree=tree),
+        superpixels=SuperpixelPlan(segment, limits, start_share(fit), tree),
         networks=networks,
-        match=replace(options.match, match=options.match.match or ("overlap" if effort.merges else "none")),
+        match=replace(options.match, match=_match_method(options)),
         decode=options.decode,
         fit=fit,
         clean=clean_options,
@@ -170,12 +170,19 @@ def choose_networks(options: CompactOptions, *, photos: bool, aligned: bool = Tr
 
 def resolved_settings(options: CompactOptions, *, photos: bool) -> dict[str, Any]:
     """Return all settings by flat name, with checkpoint and matching resolved."""
-    match = options.match.match or ("overlap" if EFFORTS[options.effort].merges else "none")
-    return options.to_dict() | {"checkpoint": choose_networks(options, photos=photos), "match": match}
+    return options.to_dict() | {"checkpoint": choose_networks(options, photos=photos), "match": _match_method(options)}
 
 
-def _load_networks(options: CompactOptions, scene: Scene) -> Checkpoint | None:
-    """Load the checkpoint to use, and check that it fits the options; None for the analytic stages alone."""
+def _match_method(options: CompactOptions) -> Method:
+    """Return the method of merging views: as asked, or by effort."""
+    return options.match.match or ("overlap" if EFFORTS[options.effort].merges else "none")
+
+
+def load_networks(options: CompactOptions, scene: Scene) -> Checkpoint | None:
+    """Load the checkpoint to use, and check that it fits the options; None for the analytic stages alone.
+
+    SceneError if it is required and cannot be used, UsageError if it does not fit.
+    """
     name = choose_networks(options, photos=scene.images is not None, aligned=scene.aligned)
     if name == "none":  # torch is imported only where there are networks
         return None
@@ -270,8 +277,9 @@ def _resolve_fit_to(
     scale, problem = photo_scale(scene, fit, auto=auto)
     if problem is not None:
         note(problem)
-    moves = options.prepare.poses == "free" or (options.prepare.poses == "auto" and prepared.moved)
-    return replace(fit, photo_scale=scale, move_cameras=moves and prepared.given.images is not None)
+    free = options.prepare.poses == "free" or (options.prepare.poses == "auto" and prepared.moved)
+    moves = free and fit.fit == "full" and prepared.given.images is not None  # which only the CPU can do
+    return replace(fit, photo_scale=scale, move_cameras=moves)
 
 
 def _choose_scored_views(prepared: Prepared, options: CompactOptions) -> tuple[int, ...]:

@@ -20,6 +20,7 @@ from gsmerge.batch.task import BatchContext, Task, record_failure, run_lock
 from gsmerge.errors import SceneError
 from gsmerge.io import find_scene_files
 from gsmerge.io.content_hash import cameras_of
+from gsmerge.options import CompactOptions
 from gsmerge.plan import resolve_fit, resolved_settings
 from gsmerge.runtime.estimate import IMPORT_SECONDS, work_seconds
 from gsmerge.runtime.memory import human_bytes, machine_memory
@@ -70,15 +71,18 @@ def free_memory() -> int | None:
 
 def estimate_seconds(jobs: Sequence[Job], options: BatchOptions, schedule: Schedule) -> float:
     """Estimate the wall time of scenes, within a factor of about two."""
-    total = 0.0
+
+    def resolve(own: CompactOptions) -> tuple[dict[str, Any], int]:
+        return resolved_settings(own, photos=True), resolve_fit(own).steps
+
+    total, usual = 0.0, resolve(options.settings)
     for job in jobs:
         views = 1  # where cameras cannot be read
         with suppress(SceneError):
             files = find_scene_files(Path(job.scene))
             cameras = None if files.cameras is None else cameras_of(files.cameras, files.ply.stem)
             views = max(1, len(cameras or ()))
-        own = options.settings if job.work is None else job.work.settings
-        settings, steps = resolved_settings(own, photos=True), resolve_fit(own).steps
+        settings, steps = usual if job.work is None else resolve(job.work.settings)
         seconds = work_seconds(job.num_gaussians, job.num_gaussians / views, settings, photos=True, fit_steps=steps)
         total += seconds / min(schedule.threads, views)
     return IMPORT_SECONDS * bool(jobs) + total / max(1, min(schedule.jobs, len(jobs)))

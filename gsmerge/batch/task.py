@@ -10,7 +10,7 @@ import os
 import secrets
 import socket
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -105,9 +105,7 @@ def _process(task: Task, context: BatchContext, new_records: RecordIndex, begun:
     before, since = task.known, new_records.known.get(job.output)
     for known in (since, None if options.rerun else before):
         if known is not None and known.holds(context.folder, key):
-            sizes = {name: (context.folder / name).stat().st_size for name, _ in known.files}
-            written = [{"path": name, "sha256": sha256, "bytes": sizes[name]} for name, sha256 in known.files]
-            return record(SKIPPED, job.scene, job.output, key=key, files=written)
+            return record(SKIPPED, job.scene, job.output, key=key, files=_describe(context.folder, known.files))
     own = {name for known in (before, since) if known is not None for name, _ in known.files}
     names = [name for name in result_names(job.output, options) if os.path.lexists(context.folder / name)]
     foreign = [] if begun.exists() else [name for name in names if name not in own]
@@ -133,13 +131,14 @@ def _compact(task: Task, context: BatchContext, files: SceneFiles, key: str) -> 
         else:
             document, written = job.work.run(files, options, out)
     document["notes"] += list(dict.fromkeys(str(warning.message) for warning in caught))
-    names = [os.path.relpath(path, context.folder) for path in written]
-    described = [
-        {"path": name, "sha256": file_sha256(path), "bytes": path.stat().st_size}
-        for name, path in zip(names, written, strict=True)
-    ]
-    facts = {"key": key, "files": described, "report": finite(document)}
+    hashes = [(os.path.relpath(path, context.folder), file_sha256(path)) for path in written]
+    facts = {"key": key, "files": _describe(context.folder, hashes), "report": finite(document)}
     return record(DONE, job.scene, job.output, attempt=task.attempt, **facts)
+
+
+def _describe(folder: Path, hashes: Iterable[tuple[str, str]]) -> list[dict[str, Any]]:
+    """Return name, hash and size of files, as records have them, from names in a folder and hashes."""
+    return [{"path": name, "sha256": sha256, "bytes": (folder / name).stat().st_size} for name, sha256 in hashes]
 
 
 def _files_of(job: Job, options: BatchOptions) -> SceneFiles:

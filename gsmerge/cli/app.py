@@ -91,18 +91,20 @@ def _usage_message(error: Any) -> str:
 
 def _suggest(option: str, parameters: Sequence[Any]) -> str | None:
     """Write how to give a command a setting or a hint for which it has no option; None where it is neither."""
-    from gsmerge.cli.paths import FileOptions
-    from gsmerge.options import CompactOptions
-
     name = option.lstrip("-").replace("-", "_")
     names = {parameter.name for parameter in parameters}
     if name in names:
         return None
     if name in HINTS and "hint" in names:
         return f"{option} is no option: use --hint {name}=VALUE"
+    if "set" not in names:
+        return None
+    from gsmerge.cli.paths import FileOptions
+    from gsmerge.options import CompactOptions
+
     known = {**CompactOptions().to_dict(), **vars(FileOptions())}
     positive = name.removeprefix("no_")
-    if positive not in known or "set" not in names:
+    if positive not in known:
         return None
     value = str(not known[positive]).lower() if isinstance(known[positive], bool) else "VALUE"
     return f"{option} is no option: use --set {positive}={value}"

@@ -56,9 +56,9 @@ def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
     from gsmerge.stages.place_cameras import add_views
 
     load, notes = args.load(files), list[str]()
-    if args.targets is not None:
-        require_views(load)
     views = vars(args).get("views")
+    if args.targets is not None or views is not None:
+        require_views(load)
     scene, held_out, adapted = held_out_views(load, args.targets, args.target_images, views)
     if not scene.aligned:
         with record_run() as record:

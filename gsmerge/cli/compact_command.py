@@ -99,7 +99,9 @@ def print_plan(args: opt.Args, files: SceneFiles, settings: CompactOptions, out:
     from gsmerge.compact_file import check_saved_cameras, read_input
     from gsmerge.gpu import choose_backend
     from gsmerge.measure.inspect import estimate, estimate_lines
+    from gsmerge.plan import load_networks
     from gsmerge.report import document_head
+    from gsmerge.runtime.record import record_run
 
     given = read_input(files, opacity=args.opacity, hints=hints)
     scene, paths = given.scene, {name: path and str(path) for name, path in vars(files).items()}
@@ -110,8 +112,11 @@ def print_plan(args: opt.Args, files: SceneFiles, settings: CompactOptions, out:
     notes = [*given.notes, *unused, *([] if problem is None else [problem])]
     if os.path.lexists(out) and not args.overwrite:
         notes.append(f"{out} exists already: --overwrite would replace it")
-    with opt.usage_errors():
+    with opt.usage_errors(), record_run() as record:
+        if settings.method == "gsmerge" and settings.checkpoint != "auto":  # which the run may refuse
+            load_networks(settings, scene)
         run = estimate(scene, settings)
+    notes += record.notes
     document = {
         **document_head(),
         "dry_run": True,

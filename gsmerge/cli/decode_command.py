@@ -41,7 +41,7 @@ def decode(args: opt.Args) -> None:
     from gsmerge.report import document_head, seconds_document
     from gsmerge.stages.fit import FitOptions
 
-    wanted, writing = args.make(FitOptions, FileOptions)
+    wanted, writing = args.make(FitOptions, FileOptions, viewer_cameras=False)  # a .gsm has no names of views
     check_format(out, writing)
     run = args.given(("effort", "device", "seed", "threads"))
     with opt.usage_errors():

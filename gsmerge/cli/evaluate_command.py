@@ -82,9 +82,9 @@ def evaluate(args: opt.Args) -> None:
     for path in outputs:
         if path.suffix not in SUFFIXES:
             raise UsageError(f"{path}: expected a name that ends in {', '.join(SUFFIXES)}")
-    inputs = (*input_files(files), *args.after, args.targets, args.target_images)
-    check_outputs(outputs, inputs, overwrite=args.overwrite)
     makings = args.merge_seconds or []
+    inputs = (*input_files(files), *args.after, args.targets, args.target_images, *map(Path, makings))
+    check_outputs(outputs, inputs, overwrite=args.overwrite)
     if makings and len(makings) != len(args.after):
         raise UsageError(f"--merge-seconds: expected that of each of {len(args.after)} AFTER, got {len(makings)}")
     seconds = [_seconds_of(text) for text in makings]

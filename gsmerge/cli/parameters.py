@@ -96,15 +96,15 @@ class Args(SimpleNamespace):
         choice: OpacityChoice = self._parse_hints().get("opacity", "auto")
         return choice
 
-    def hints(self) -> ReadHints:
-        """Make the hints on how to read the scene; UsageError if a name or a value is unknown."""
+    def hints(self, **defaults: Any) -> ReadHints:
+        """Make the hints on how to read the scene, on top of ``defaults``; UsageError for an unknown name or value."""
         from gsmerge.io import ReadHints
         from gsmerge.io.exporters import find_exporter
 
         values = {name: value for name, value in self._parse_hints().items() if name != "opacity"}
         with usage_errors():
             find_exporter(values.get("exporter", "auto"))
-            return ReadHints(**values)
+            return ReadHints(**{**defaults, **values})
 
     def _parse_hints(self) -> dict[str, Any]:
         from gsmerge.io import ReadHints

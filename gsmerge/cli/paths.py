@@ -25,7 +25,7 @@ class FileOptions:
             Gaussian; a ``budget`` in bytes counts them.
         spz_version: Version of a ``.spz``: 3, which most programs read, or 4, with room for harmonics of degree 4;
             it needs ``gsmerge[spz4]``.
-        viewer_cameras: Write the input views beside the result, as ``NAME.cameras.json`` for viewers.
+        viewer_cameras: Write the input views beside the result of ``compact``, as ``NAME.cameras.json`` for viewers.
 
     Raises:
         ValueError: If the version is unknown.

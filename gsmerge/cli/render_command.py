@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -146,7 +145,8 @@ def _plan_superpixels(args: opt.Args, files: SceneFiles) -> Drawing:
         from gsmerge.render.photos import scene_pictures
         from gsmerge.stages.superpixels import saliency, segment
 
-        images = scene_pictures(scene)[ids]
+        images = scene_pictures(scene)
+        images = images[ids] if len(ids) < len(images) else images  # all of them without a copy
         groups = segment(images, options)
         counts[:] = groups.counts
         for image, labels in zip(images, groups.labels, strict=True):
@@ -177,9 +177,7 @@ def _read(
     args: opt.Args, files: SceneFiles, like: SceneFiles, *, photos: bool
 ) -> tuple[list[Gaussians], SceneViews, list[str]]:
     """Read the scenes, and place the cameras in the frame of ``like``; notes are returned with them."""
-    hints = args.hints()
-    if not photos and hints.max_side == type(hints)().max_side:
-        hints = replace(hints, max_side=MAX_SIDE)
+    hints = args.hints() if photos else args.hints(max_side=MAX_SIDE)
     from gsmerge.io import place_cameras_in_scene, ply_notes, read_gaussians, read_ply_with_hints
 
     check_cameras(like)
@@ -218,15 +216,11 @@ def picture_stems(names: Sequence[str]) -> list[str]:
 
 
 def write_picture(path: Path, picture: Picture, *, overwrite: bool) -> None:
-    """Write an 8 bit RGB picture as PNG, atomically; make its folder if it is not there."""
-    import cv2
+    """Write a picture; make its folder if it is not there."""
+    from gsmerge.measure.preview import save_picture
 
-    from gsmerge.io import atomic_output
-
-    _, data = cv2.imencode(".png", picture[..., ::-1])
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise SceneError(path.parent, f"cannot be made ({error.strerror})", "name another with --output") from error
-    with atomic_output(path, overwrite=overwrite) as temporary:
-        temporary.write_bytes(data.tobytes())
+    save_picture(path, picture, overwrite=overwrite)

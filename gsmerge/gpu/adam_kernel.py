@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import triton
 import triton.language as tl
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from gsmerge.gpu.adam import FitState, StepGradients
+    from gsmerge.stages.fit.fit_options import Tuning
 
 BLOCK = 128  # Gaussians to a program
 TINY = tl.constexpr(1e-15)  # beside the root of the second moment
@@ -119,7 +125,7 @@ def _step(
         tl.store(colors + 3 * i + c, new, mask)
 
 
-def launch(state: Any, gradients: Any, limits: Any, rates: Any, step: int) -> None:
+def launch(state: FitState, gradients: StepGradients, limits: Tuning, rates: Tensor, step: int) -> None:
     """Take one step on tensors of one device, in place; :func:`gsmerge.gpu.adam.adam_step` says what they are."""
     count, g = len(state), gradients
     if count == 0:

@@ -10,7 +10,6 @@ from gsmerge.io.cameras.read import read_cameras as read_cameras
 from gsmerge.io.exporters import AUTO as AUTO
 from gsmerge.io.exporters import ReadHints as ReadHints
 from gsmerge.io.formats.ply import SCENE_SUFFIXES as SCENE_SUFFIXES
-from gsmerge.io.formats.ply import PlyInfo as PlyInfo
 from gsmerge.io.formats.ply import PlyScene as PlyScene
 from gsmerge.io.formats.ply import kept_comments as kept_comments
 from gsmerge.io.formats.ply import ply_notes as ply_notes

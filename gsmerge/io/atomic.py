@@ -57,7 +57,7 @@ def atomic_outputs(*, overwrite: bool = False) -> Iterator[Callable[[Path], Path
             return path
         _refuse(path, overwrite)
         target = Path(os.path.realpath(path)) if path.is_symlink() else path
-        remove_stale(target.parent)
+        _remove_stale_once(target.parent.absolute())
         temporary = temporary_path(target)
         made[str(temporary)] = path, target
         _written.add(str(temporary))
@@ -141,6 +141,9 @@ def remove_stale(folder: Path) -> None:
                     shutil.rmtree(entry.path, ignore_errors=True)
                 else:
                     os.unlink(entry.path)
+
+
+_remove_stale_once = cache(remove_stale)  # by folder and process: with many files in one, a look costs more than a file
 
 
 def _is_stale(entry: os.DirEntry[str], place: str, pid: int) -> bool:

@@ -207,7 +207,7 @@ def _make_load(
     files: SceneFiles,
     hints: ReadHints,
     result: AlignmentResult,
-    notes: Sequence[str] = (),
+    notes: Sequence[str],
     large: LargePhotos | None = None,
 ) -> SceneLoad:
     """Make the scene of rows, their pixels and the views, with notes on how it was read."""

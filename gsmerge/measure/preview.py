@@ -27,10 +27,10 @@ def to_picture(image: np.ndarray) -> Picture:
     return (image.clip(0, 1) * 255).round().astype(np.uint8)
 
 
-def save_picture(path: Path, picture: Picture, *settings: int) -> None:
-    """Write a picture in place of an existing file, with settings of :func:`cv2.imencode`."""
+def save_picture(path: Path, picture: Picture, *settings: int, overwrite: bool = True) -> None:
+    """Write a picture in the format of the name, with settings of :func:`cv2.imencode`."""
     _, data = cv2.imencode(path.suffix, picture[..., ::-1], settings)
-    with atomic_output(path, overwrite=True) as temporary:
+    with atomic_output(path, overwrite=overwrite) as temporary:
         temporary.write_bytes(data.tobytes())
 
 

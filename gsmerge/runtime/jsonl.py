@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import json
 import mmap
 import os
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from io import FileIO
 from pathlib import Path
 from typing import Any
@@ -48,7 +48,7 @@ def append_line(path: Path, value: Mapping[str, Any]) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with FileIO(path, "a+b") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)  # until the file is closed
+            _lock(file)
             end = _end_of_lines(file)
             file.truncate(end)
             if file.write(line) != len(line):  # a full disk takes the first part without an error
@@ -57,6 +57,14 @@ def append_line(path: Path, value: Mapping[str, Any]) -> None:
             os.fsync(file.fileno())
     except OSError as error:
         raise SceneError(path, f"cannot be written ({error.strerror})", "name another folder with --output") from error
+
+
+def _lock(file: FileIO) -> None:
+    """Keep other processes from appending until the file is closed, where the system has such locks."""
+    with suppress(ImportError):  # Windows has none
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX)
 
 
 def _end_of_lines(file: FileIO) -> int:

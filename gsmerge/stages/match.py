@@ -67,11 +67,6 @@ class MatchOptions:
         if self.cluster_size is not None and self.cluster_size < 1:
             raise ValueError(f"cluster_size: expected at least 1, got {self.cluster_size}")
 
-    @property
-    def method(self) -> Method:
-        """Method of merging views."""
-        return self.match or "overlap"
-
 
 @stage("match")
 def match(features: FeatureGaussians, options: MatchOptions, networks: NetworkContext | None = None) -> Matches:
@@ -80,14 +75,14 @@ def match(features: FeatureGaussians, options: MatchOptions, networks: NetworkCo
     The result does not depend on the order of the Feature Gaussians: leaders are taken by weight,
     ties by position. Fully transparent Feature Gaussians stay alone.
     """
-    if networks is not None and options.geometry == "decoded" and options.method != "none":
+    if networks is not None and options.geometry == "decoded" and options.match != "none":
         from gsmerge.networks.apply import match_geometry
 
         features = match_geometry(features, networks)
     count = len(features)
     clusters = np.full(count, -1, np.int64)
     num_clusters = 0
-    if options.method != "none" and len(np.unique(features.views)) > 1:
+    if options.match != "none" and len(np.unique(features.views)) > 1:
         solid = np.flatnonzero(features.extinctions > 0)
         if len(solid) > 1:
             clusters[solid], num_clusters = _clusters(features, solid, options)
@@ -101,7 +96,7 @@ def _clusters(features: FeatureGaussians, rows: np.ndarray, options: MatchOption
     means, views = features.means[rows].astype(np.float64), features.views[rows]
     covars = features.covars[rows].astype(np.float64).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
     colors = SH_C0 * features.sh0[rows, 0].astype(np.float64)
-    neighbors, boxes = nearest_of_other_views(means, views, options.neighbors), options.method == "aabb"
+    neighbors, boxes = nearest_of_other_views(means, views, options.neighbors), options.match == "aabb"
     latents = as_array(features.latents)
     known = boxes and bool(latents.any())  # networks without an encoder leave them zero
     latents = normalize(latents[rows] if known else latents[rows, :0])

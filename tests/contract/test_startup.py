@@ -43,6 +43,11 @@ def test_a_command_loads_no_other() -> None:
     }
 
 
+def test_a_mistyped_option_loads_nothing_heavy() -> None:
+    code = "from gsmerge.cli import main\nassert main(['generate', '-o', 'out', '--magic']) == 2"
+    assert loaded_after(code) == set()
+
+
 def test_import_loads_nothing_heavy() -> None:
     assert loaded_after("import gsmerge") == set()
 

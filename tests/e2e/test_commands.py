@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from tiny_scene import edited_json
 
 import gsmerge
 from gsmerge.cli import main
@@ -167,6 +168,19 @@ def test_views(made_scene: Path, tmp_path: Path, run: Run) -> None:
         assert errors[i] < 20
     assert run("render", made_scene, "-o", tmp_path / "some", "--views", 2).code == 0
     assert list(listing(tmp_path / "some")) == ["view_001.png", "view_003.png"]
+
+
+@pytest.mark.parametrize(("hint", "width"), [((), 1920), (("--hint", "max_side=1200"), 1200)])
+def test_pictures_of_views_are_as_large_as_asked(
+    hint: tuple[str, ...], width: int, scene_copy: Path, tmp_path: Path, run: Run
+) -> None:
+    """The cameras' own size, unless a hint names one, its default too."""
+    (scene_copy / "images").rename(tmp_path / "images")  # whose size would count
+    with edited_json(scene_copy / "transforms.json") as document:
+        for name in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
+            document[name] *= 20
+    call = ("render", scene_copy / "scene.ply", "-o", tmp_path / "out", "--hint", "order=none", *hint)
+    assert json.loads(run(*call, "--dry-run", "--json", code=0).out)["width"] == width
 
 
 def test_panel(scene_copy: Path, run: Run) -> None:

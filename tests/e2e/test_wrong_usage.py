@@ -68,6 +68,7 @@ USAGE = {
     "decode room.gsm -o room.gsm --overwrite": "other than the input",
     "decode room.gsm -o alone.ply": "alone.ply*--overwrite",
     "decode room.gsm -o a.ply --set spz_version=4": "spz_version 4: expected an output as .spz, got .ply",
+    "decode room.gsm --set viewer_cameras=true": "--set viewer_cameras: unknown",
     "decode room.gsm --fit full": "fit full: expected a state with photos, found none",
     "decode state.gsm --k 8": "k: expected 1 to 4",
     "decode state.gsm --k 2 --budget 900": "expected one of k and budget",
@@ -95,6 +96,7 @@ USAGE = {
     "evaluate room --lpips none -o room/scene.ply": "ends in .json, .csv, .md, .html",
     "evaluate room --lpips none -o room/transforms.json": "other than the input",
     "evaluate room --lpips none --merge-seconds 1": "that of each of 0 AFTER, got 1",
+    "evaluate room alone.ply --lpips none --merge-seconds run.json -o run.json --overwrite": "other than the input",
     "evaluate room --lpips none --align=color": "expected held-out views",
     "evaluate room --lpips none --align=colour --targets room/targets": "color or pose",
     "evaluate room --lpips none --zoom=a,2": "sizes such as .5,1,2,4",
@@ -141,6 +143,7 @@ PLACES = {
     "evaluate room alone.ply --lpips none --merge-seconds room/transforms.json": "total_seconds",
     "evaluate room alone.ply --lpips none --merge-seconds alone.ply": "cannot be read as text",
     "evaluate alone.ply --hint order=none --targets room/targets": "alone.ply: expected cameras to measure from",
+    "evaluate alone.ply --hint order=none --views 2": "alone.ply: expected cameras to measure from*with --cameras",
     "stress alone.ply --hint order=none --targets room/targets": "alone.ply: expected cameras to measure from",
     "chart -o out nowhere": "nowhere",
     "chart -o out room --targets {{scene}}/none.json": "expected cameras of held-out views",
@@ -165,6 +168,7 @@ def prepared(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     folder = tmp_path_factory.mktemp("prepared") / "work"
     shutil.copytree(small_scene, folder / "room")
     shutil.copy(small_scene / "scene.ply", folder / "alone.ply")
+    (folder / "run.json").write_text('{"total_seconds": 2}')
     (folder / "occupied").mkdir()
     (folder / "occupied" / "mine.txt").write_text("precious")
     small = ["--superpixels", "60", "--checkpoint", "none", "--quiet"]
@@ -186,7 +190,7 @@ def test_wrong_usage_is_one_line_and_writes_nothing(
     before = listing(prepared)
     groups = len(gsmerge.load_encoded("room.gsm")) if "{groups}" in USAGE.get(words, "") else 0
     parts = (USAGE | PLACES)[words].format(groups=groups).split("*")
-    planned = words in USAGE and words.startswith("compact")
+    planned = words.startswith("compact")
     for more in ([], ["--dry-run"]) if planned else ([],):
         assert_refused(run(*shlex.split(words.format()), *more), 2 if words in USAGE else 3, *parts)
     assert listing(prepared) == before

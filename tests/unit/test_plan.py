@@ -42,7 +42,7 @@ def test_every_effort_has_a_meaning() -> None:
 def test_effort_decides_what_is_left_open(effort: str, scene: Scene) -> None:
     plan, own = plan_of(scene, effort=effort), EFFORTS[effort]
     assert plan.fit.steps == own.steps
-    assert plan.match.method == ("overlap" if own.merges else "none")
+    assert plan.match.match == ("overlap" if own.merges else "none")
     assert plan.superpixels.options.rectangles == own.rectangles
     assert plan.superpixels.options.early_sweeps == own.early_sweeps
 
@@ -50,7 +50,7 @@ def test_effort_decides_what_is_left_open(effort: str, scene: Scene) -> None:
 def test_what_is_given_goes_before_effort(scene: Scene) -> None:
     plan = plan_of(scene, effort="draft", fit_steps=7, match="aabb", rectangles=1.5, early_sweeps=2)
     assert plan.fit.steps == 7
-    assert plan.match.method == "aabb"
+    assert plan.match.match == "aabb"
     assert (plan.superpixels.options.rectangles, plan.superpixels.options.early_sweeps) == (1.5, 2)
 
 
@@ -158,6 +158,9 @@ def test_cameras_move_where_it_is_asked_for(scene: Scene) -> None:
     assert free.fit.move_cameras
     assert not free.with_fixed_cameras().fit.move_cameras
     assert not plan_of(scene, poses="fixed").fit.move_cameras
+    unfitted = plan_of(scene, poses="free", fit="none").fit
+    assert unfitted.needs_photos
+    assert not unfitted.move_cameras  # would keep the GPU from finding what no photo shows
 
 
 def test_more_views_are_scored_for_a_quality(scene: Scene) -> None:

@@ -17,7 +17,6 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.alignment.cameras import ESTIMATED, choose_cameras, max_pixels
-from gsmerge.io.alignment.cameras import CameraCheck as CameraCheck
 from gsmerge.io.alignment.cameras import check_cameras as check_cameras
 from gsmerge.io.alignment.cameras import choose_poses as choose_poses
 from gsmerge.io.alignment.cameras import estimate_cameras as estimate_cameras

@@ -8,7 +8,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -30,9 +30,6 @@ from gsmerge.io.cameras.camera_file import (
 )
 from gsmerge.io.photo_files import find_image, image_size
 from gsmerge.types import Cameras
-
-if TYPE_CHECKING:
-    pass
 
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # the order of "distortion_params"
 _DISTORTED = {"OPENCV", "RADIAL", "SIMPLE_RADIAL"}

@@ -29,6 +29,7 @@ CAMERA_PLACES = (
     "results.npz", "camera_poses.txt", "0", ".",
 )  # fmt: skip
 INTRINSICS = ("intrinsic.txt", "intrinsics.txt")
+_POSE_COLUMNS = (12, 16)  # numbers of a pose in a line
 SHARP = "SHARP"
 _SHARP_ELEMENTS = ("extrinsic", "intrinsic", "image_size")
 SHARP_LAYERS = 2  # Gaussians per cell: a front and a back layer
@@ -71,9 +72,11 @@ def read_cameras(path: StrPath, *, scene: str | None = None) -> CameraFile:
         return read_colmap(path)
     check_file(path)
     if path.suffix in (".bin", ".txt"):
-        with suppress(OSError, ValueError), path.open(encoding="utf-8") as file:
-            if len(_numbers(file.readline(4096))) in (12, 16):
-                return read_trajectory(path)
+        columns = 0
+        with suppress(OSError, ValueError), path.open(encoding="utf-8-sig") as file:
+            columns = len(_numbers(file.readline(4096)))
+        if columns in _POSE_COLUMNS:
+            return read_trajectory(path)
         if not is_colmap(path.parent):
             raise SceneError(path, "expected a COLMAP model with cameras and images files, found no pair of them")
         return read_colmap(path.parent)
@@ -93,7 +96,7 @@ def read_trajectory(path: Path) -> CameraFile:
     ``intrinsics.txt``) with fx, fy, cx, cy in pixels, one line for all views or one for each; the images have the
     size. SceneError if a line has another number of numbers, or there are no intrinsics.
     """
-    poses = _rows(path, (12, 16))
+    poses = _rows(path, _POSE_COLUMNS)
     intrinsics = next((path.with_name(name) for name in INTRINSICS if path.with_name(name).is_file()), None)
     if intrinsics is None:
         problem = f"expected the intrinsics next to it in {INTRINSICS[0]}, found none"

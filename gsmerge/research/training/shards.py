@@ -32,7 +32,7 @@ from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches
 
 Report = Callable[[str, int, int], None]  # what is done, step, steps
-LAYOUT = 3  # version of the files
+LAYOUT = 4  # version of the files and of what is in them
 FORMAT = "gsmerge-example"
 REMEDY = "remove it; the next call makes it again"
 # Settings that an example depends on; fit_steps and levels only with a fit.
@@ -100,8 +100,8 @@ def scene_key(scene: Path, options: TrainOptions) -> str:
     head |= {name: getattr(options, name) for name in names}
     files = find_scene_files(scene)
     targets = files.ply.parent / "targets"
-    read = [*read_files(files), *([targets] if targets.is_dir() else [])]
-    return digest({**head, "content": content_hash(read)})
+    held_out = content_hash([targets]) if targets.is_dir() else None  # apart: names are relative to their folders
+    return digest({**head, "content": content_hash(read_files(files)), "held_out": held_out})
 
 
 def _read_record(path: Path) -> dict[str, str] | None:

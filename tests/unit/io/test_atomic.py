@@ -215,6 +215,24 @@ os.kill(os.getpid(), signal.SIGKILL)
     assert contents(tmp_path) == ["new"] * call + ["old", "old", None][call:]
 
 
+def test_a_folder_is_searched_for_the_rest_of_killed_processes_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "far").mkdir()
+    dead = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, check=True)
+    name = temporary_path(tmp_path / "a.txt").name.replace(f"-{os.getpid()}-", f"-{int(dead.stdout)}-")
+    for folder in (tmp_path, tmp_path / "far"):
+        (folder / name).touch()
+    searched, scan = [], os.scandir
+    monkeypatch.setattr(os, "scandir", lambda folder: searched.append(Path(folder)) or scan(folder))
+    monkeypatch.chdir(tmp_path)
+    for path in ("a.txt", tmp_path / "b.txt", "far/c.txt", "far/d.txt"):
+        with atomic_output(path):
+            pass
+    assert searched == [tmp_path, tmp_path / "far"]
+    assert not any((folder / name).exists() for folder in searched)
+
+
 def test_a_writer_inside_writes_the_same_file(tmp_path: Path) -> None:
     with atomic_output(tmp_path / "a.txt") as outer, atomic_output(outer, overwrite=True) as inner:
         assert inner == outer

@@ -16,6 +16,7 @@ from gsmerge import Gaussians, Scene, decode_scene, encode_scene
 from gsmerge.geometry import covariances
 from gsmerge.moments import feature_to_gaussians, gaussian_members
 from gsmerge.networks.apply import encode_features
+from gsmerge.online.options import merge_settings
 from gsmerge.online.state import (
     GroupSet,
     bake,
@@ -200,6 +201,14 @@ def test_settings_of_an_encoded_scene(settings: dict[str, object], pixels: Scene
     assert len(decode_scene(actual, k=1)) <= len(encoded)
     for k in (1, encoded.settings.max_k):
         assert_same_children(decode_scene(actual, k=k), decode_scene(encoded, k=k))
+
+
+def test_the_device_of_another_machine_is_not_asked_for(pixels: Scene) -> None:
+    encoded = encode_scene(pixels, superpixels="5%", checkpoint="none")
+    options = encoded.about["options"] | {"device": "cuda"}
+    state = from_encoded(replace(encoded, about=encoded.about | {"options": options}))
+    settings, _ = merge_settings({}, state)
+    assert (settings.device, settings.segment.superpixels) == ("cpu", "5%")
 
 
 def test_division_between_one_and_most_is_about_as_good(pixels: Scene) -> None:

@@ -8,7 +8,7 @@ import scenes
 
 from gsmerge import Scene
 from gsmerge.geometry import project
-from gsmerge.stages.prepare import canonicalise, scene_frame
+from gsmerge.stages.prepare import canonicalise, prepare, scene_frame
 from gsmerge.types import grid_ids
 
 
@@ -88,3 +88,10 @@ def test_gaussians_in_the_cameras_plane_have_a_unit() -> None:
     flat = scenes.make_scene(scenes.wall(), scenes.arc(1, 8, 6))
     still = replace(flat, gaussians=replace(flat.gaussians, means=flat.cameras.centres.repeat(48, 0)))
     assert scene_frame(still).unit == 1.0
+
+
+def test_renders_stand_in_for_photos_where_no_pixels_are_known_alone(scene: Scene) -> None:
+    """A fit to renders of one Gaussian per pixel would keep its errors."""
+    bare = replace(scene, images=None)
+    assert prepare(bare).scene.images is None
+    assert prepare(replace(bare, pixel_ids=None)).scene.images is not None

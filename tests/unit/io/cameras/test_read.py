@@ -45,7 +45,17 @@ def write_trajectory_of_12(folder: Path) -> Path:
     return write_trajectory(folder, 12)
 
 
-@pytest.mark.parametrize("write", [write_world_mirror, write_long_lrm, write_trajectory, write_trajectory_of_12])
+def write_trajectory_with_mark(folder: Path) -> Path:
+    """A byte order mark first, as some editors of Windows write it."""
+    path = write_trajectory(folder)
+    path.write_text(path.read_text(), encoding="utf-8-sig")
+    return path
+
+
+WRITERS = [write_world_mirror, write_long_lrm, write_trajectory, write_trajectory_of_12, write_trajectory_with_mark]
+
+
+@pytest.mark.parametrize("write", WRITERS)
 def test_poses_and_intrinsics_are_read(tmp_path: Path, write: Callable[[Path], Path]) -> None:
     actual = read_cameras(write(tmp_path))
     np.testing.assert_allclose(actual.viewmats, np.linalg.inv(C2W), atol=1e-9)

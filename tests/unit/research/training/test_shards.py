@@ -26,7 +26,7 @@ from gsmerge.research.training import (
     train,
 )
 from gsmerge.research.training.examples import make_examples as make_each
-from gsmerge.research.training.shards import read_targets
+from gsmerge.research.training.shards import read_targets, scene_key
 from gsmerge.research.training.stream import ExampleStreams, open_streams
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -137,6 +137,19 @@ def test_a_scene_s_shards_depend_on_its_files(scenes: list[Path], tmp_path: Path
     assert other.sha256 != first.sha256
     with pytest.raises(SceneError):
         prepare_shards([tmp_path / "nowhere"], PAPER, tmp_path / "out")
+
+
+def test_a_photo_that_is_held_out_makes_other_shards(scenes: list[Path], tmp_path: Path) -> None:
+    """Also where photos are hashed as a folder alone, because the cameras do not name files in it."""
+    copy = copytree(scenes[0], tmp_path / "copy")
+    cameras = copy / "transforms.json"
+    cameras.write_text(cameras.read_text().replace("images/", ""))
+    (copy / "targets").rename(copy / "old")
+    (copy / "targets").mkdir()
+    before = scene_key(copy, OPTIONS)
+    last = max((copy / "images").iterdir())
+    last.rename(copy / "targets" / last.name)
+    assert scene_key(copy, OPTIONS) != before
 
 
 def shard_numbers(streams: ExampleStreams, steps: int) -> dict[int, list[int]]:
