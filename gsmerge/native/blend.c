@@ -49,17 +49,18 @@ API void blend(const float *restrict footprints, const float *restrict colors, c
   }
 }
 
-// Weights of Gaussian j times planes 2 to 5, summed over the tile.
-static inline void sum_weights(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1, float *slot) {
+// Weights of Gaussian j times the planes of some channels, summed over the tile.
+static inline void sum_weights(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1, int channels,
+                               float *slot) {
   v16f sums[CHANNELS] = {{0}};
   Curve curve = curve_of(b, (int)j);
   for (int32_t y = y0; y <= y1; y++) {
     float *row = state + y * TILE;
     Share s = take_share(load(row), exponents(&curve, (float)y - curve.my));
     store(row, s.left);
-    for (int c = 0; c < CHANNELS; c++) sums[c] += s.weight * load(row + (c + 1) * PLANE);
+    for (int c = 0; c < channels; c++) sums[c] += s.weight * load(row + (c + 1) * PLANE);
   }
-  for (int c = 0; c < CHANNELS; c++) slot[c] = total(sums[c]);
+  for (int c = 0; c < CHANNELS; c++) slot[c] = c < channels ? total(sums[c]) : 0.f;
 }
 
 API void weighted_sums(const float *restrict footprints, const int32_t *restrict members,
@@ -80,8 +81,14 @@ API void weighted_sums(const float *restrict footprints, const int32_t *restrict
     for (; start < end && t.y_low <= t.y_high; start += BATCH) {
       int64_t stop = mini(end, start + BATCH);
       gather(&batch, &t, footprints, members, start, stop, end);
-      for (int64_t j = 0; j < stop - start; j++)
-        sum_weights(state, &batch, j, first_row(&t, &batch, j), last_row(&t, &batch, j), slots + CHANNELS * (start + j));
+      for (int64_t j = 0; j < stop - start; j++) {
+        int32_t y0 = first_row(&t, &batch, j), y1 = last_row(&t, &batch, j);
+        float *slot = slots + CHANNELS * (start + j);
+        if (channels == 1)  // the count as a constant, so that each has a loop of its own
+          sum_weights(state, &batch, j, y0, y1, 1, slot);
+        else
+          sum_weights(state, &batch, j, y0, y1, CHANNELS, slot);
+      }
       narrow_tile(&t, state);
     }
     for (int64_t i = CHANNELS * start; i < CHANNELS * end; i++) slots[i] = 0.f;
@@ -97,6 +104,15 @@ API void add_slots(const int32_t *restrict members, const float *restrict slots,
     float *sum = sums + channels * ids[members[i]] + first;
     for (int64_t c = 0; c < count; c++) sum[c] += slots[CHANNELS * i + c];
   }
+}
+
+static inline v4f max4(v4f a, v4f b) { return (v4f)(((a > b) & (v4i)a) | (~(a > b) & (v4i)b)); }
+
+// The largest of sixteen lanes.
+static inline float highest(v16f v) {
+  v4f a = max4(PICK(v, v, 0, 1, 2, 3), PICK(v, v, 4, 5, 6, 7));
+  v4f b = max4(a, max4(PICK(v, v, 8, 9, 10, 11), PICK(v, v, 12, 13, 14, 15)));
+  return maxf(maxf(b[0], b[1]), maxf(b[2], b[3]));
 }
 
 API void contributions(const float *restrict footprints, const int32_t *restrict members,
@@ -122,10 +138,9 @@ API void contributions(const float *restrict footprints, const int32_t *restrict
           sum += s.weight;
           peak = sel(s.weight > peak, s.weight, peak);
         }
-        float *own = totals + 2 * (int64_t)members[start + j], most = 0.f;
-        for (int x = 0; x < LANES; x++) most = maxf(peak[x], most);
+        float *own = totals + 2 * (int64_t)members[start + j];
         own[0] += total(sum);
-        own[1] = maxf(own[1], most);
+        own[1] = maxf(own[1], highest(peak));
       }
       narrow_tile(&t, state);
     }

@@ -11,36 +11,12 @@
 
 enum { SUMS = 9 };
 
-// 1 / x within two units of the last place for x in [0.01, 1]: Newton's steps from a first guess by the exponent.
-static inline v16f reciprocal(v16f x) {
-  v16f y = (v16f)(0x7ef311c3 - (v16i)x);
-  y = y * (2.f - x * y);
-  y = y * (2.f - x * y);
-  return y * (2.f - x * y);
-}
-
-// The two halves of every group of lanes added; the second vector's follow the first's per block.
-#define LOW(a, b, ...) __builtin_shufflevector(a, b, __VA_ARGS__)
-static inline v16f halves8(v16f a, v16f b) {
-  return LOW(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23)
-      + LOW(a, b, 8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30, 31);
-}
-static inline v16f halves4(v16f a, v16f b) {
-  return LOW(a, b, 0, 1, 2, 3, 8, 9, 10, 11, 16, 17, 18, 19, 24, 25, 26, 27)
-      + LOW(a, b, 4, 5, 6, 7, 12, 13, 14, 15, 20, 21, 22, 23, 28, 29, 30, 31);
-}
-static inline v16f halves2(v16f a, v16f b) {
-  return LOW(a, b, 0, 1, 4, 5, 8, 9, 12, 13, 16, 17, 20, 21, 24, 25, 28, 29)
-      + LOW(a, b, 2, 3, 6, 7, 10, 11, 14, 15, 18, 19, 22, 23, 26, 27, 30, 31);
-}
-static inline void write_totals(const v16f v[8], float *out) {
-  v16f a = halves4(halves8(v[0], v[1]), halves8(v[2], v[3])), b = halves4(halves8(v[4], v[5]), halves8(v[6], v[7]));
-  v16f sums = halves2(a, b);
-  for (int i = 0; i < 8; i++) out[i] = sums[2 * i] + sums[2 * i + 1];
-}
-
 // Take Gaussian j of a batch off the pixels of rows y0 to y1 and write what they want of it.
 static inline void walk_back(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1, float *slot) {
+  if (y1 < y0) {
+    for (int c = 0; c < SUMS; c++) slot[c] = 0.f;
+    return;
+  }
   Curve curve = curve_of(b, (int)j);
   float red = b->red[j], green = b->green[j], blue = b->blue[j];
   v16f sr = {0}, sg = {0}, sb = {0}, sv = {0}, sy = {0}, syy = {0};
@@ -50,7 +26,7 @@ static inline void walk_back(float *state, const Batch *b, int64_t j, int32_t y0
     v16f g0 = load(row + 2 * PLANE), g1 = load(row + 3 * PLANE), g2 = load(row + 4 * PLANE);
     v16f own = s.weight * (red * g0 + green * g1 + blue * g2);
     v16f rest = load(row + PLANE) - own;
-    v16f v = own - s.alpha * rest * reciprocal(1.f - s.alpha);
+    v16f v = own - s.alpha * rest / (1.f - s.alpha);
     v = sel(s.goes & s.unclamped, v, splat(0.f));
     store(row, s.left);
     store(row + PLANE, rest);
@@ -64,7 +40,7 @@ static inline void walk_back(float *state, const Batch *b, int64_t j, int32_t y0
   }
   // x is the same in all rows of a lane, so its moments wait until here
   v16f dx = COLUMNS - curve.mx, vx = sv * dx;
-  write_totals((v16f[8]){sr, sg, sb, sv, vx, sy, vx * dx, sy * dx}, slot);
+  store8(slot, totals((v16f[8]){sr, sg, sb, sv, vx, sy, vx * dx, sy * dx}));
   slot[8] = total(syy);
 }
 

@@ -14,6 +14,10 @@
 enum { LANES = 16 };
 enum { OUTSIDE = 1 };  // status of a function that met an index outside its array; 0 otherwise
 typedef float v16f __attribute__((vector_size(64), aligned(4)));
+typedef float v8f __attribute__((vector_size(32), aligned(4)));
+typedef float v4f __attribute__((vector_size(16), aligned(4)));
+typedef float v2f __attribute__((vector_size(8), aligned(4)));
+typedef int32_t v4i __attribute__((vector_size(16), aligned(4)));
 typedef int32_t v16i __attribute__((vector_size(64), aligned(4)));
 
 static inline v16f splat(float x) { return x - (v16f){0}; }
@@ -26,14 +30,38 @@ static inline v16f sel(v16i mask, v16f a, v16f b) {
 static inline v16f load(const float *p) { return *(const v16f *)p; }
 static inline void store(float *p, v16f v) { *(v16f *)p = v; }
 
+#define PICK __builtin_shufflevector
+
 // The sum of sixteen lanes, halves first.
 static inline float total(v16f v) {
-  float s[8];
-  for (int i = 0; i < 8; i++) s[i] = v[i] + v[i + 8];
-  for (int half = 4; half; half >>= 1)
-    for (int i = 0; i < half; i++) s[i] += s[i + half];
-  return s[0];
+  v8f a = PICK(v, v, 0, 1, 2, 3, 4, 5, 6, 7) + PICK(v, v, 8, 9, 10, 11, 12, 13, 14, 15);
+  v4f b = PICK(a, a, 0, 1, 2, 3) + PICK(a, a, 4, 5, 6, 7);
+  v2f c = PICK(b, b, 0, 1) + PICK(b, b, 2, 3);
+  return c[0] + c[1];
 }
+
+// The two halves of every group of eight, four or two lanes added; the second vector's follow the first's per block.
+static inline v16f add_halves8(v16f a, v16f b) {
+  return PICK(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23)
+      + PICK(a, b, 8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30, 31);
+}
+static inline v16f add_halves4(v16f a, v16f b) {
+  return PICK(a, b, 0, 1, 2, 3, 8, 9, 10, 11, 16, 17, 18, 19, 24, 25, 26, 27)
+      + PICK(a, b, 4, 5, 6, 7, 12, 13, 14, 15, 20, 21, 22, 23, 28, 29, 30, 31);
+}
+static inline v16f add_halves2(v16f a, v16f b) {
+  return PICK(a, b, 0, 1, 4, 5, 8, 9, 12, 13, 16, 17, 20, 21, 24, 25, 28, 29)
+      + PICK(a, b, 2, 3, 6, 7, 10, 11, 14, 15, 18, 19, 22, 23, 26, 27, 30, 31);
+}
+
+// The sums over the lanes of eight vectors, in the order of total(), as a tree that halves all at once.
+static inline v8f totals(const v16f v[8]) {
+  v16f a = add_halves4(add_halves8(v[0], v[1]), add_halves8(v[2], v[3]));
+  v16f b = add_halves4(add_halves8(v[4], v[5]), add_halves8(v[6], v[7])), c = add_halves2(a, b);
+  return PICK(c, c, 0, 2, 4, 6, 8, 10, 12, 14) + PICK(c, c, 1, 3, 5, 7, 9, 11, 13, 15);
+}
+
+static inline void store8(float *p, v8f v) { *(v8f *)p = v; }
 
 static inline float minf(float a, float b) { return a < b ? a : b; }
 static inline float maxf(float a, float b) { return a > b ? a : b; }
