@@ -19,6 +19,7 @@ TASKS = {
     "imports": (("lint-imports",),),
     "docs": (("python", "docs/generate_reference.py", "--check"),),
     "reference": (("python", "docs/generate_reference.py"),),
+    "sanitize": (("python", "tools/sanitize.py"),),
     "small": (("python", "tools/small_modules.py"),),
 }
 CHECKS = ("lint", "types", "imports", "docs", "tests", "sweeps")

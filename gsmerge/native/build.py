@@ -108,7 +108,9 @@ def compiler() -> list[str]:
     return [str(Path(ziglang.__path__[0]) / ("zig.exe" if os.name == "nt" else "zig")), "cc"]
 
 
-def build_target(target: Target, folder: Path, platform: Platform, extra: tuple[str, ...] = ()) -> Path:
+def build_target(
+    target: Target, folder: Path, platform: Platform, extra: tuple[str, ...] = (), link: tuple[str, ...] = LINK
+) -> Path:
     """Build one target's library into a folder; OSError with the compiler's words if that fails."""
     command, path = compiler(), folder / platform.library_name(target)
     is_zig = Path(command[0]).stem == "zig"
@@ -117,7 +119,7 @@ def build_target(target: Target, folder: Path, platform: Platform, extra: tuple[
         whole = Path(cache) / path.name
         caches = {"ZIG_GLOBAL_CACHE_DIR": f"{cache}/global", "ZIG_LOCAL_CACHE_DIR": f"{cache}/local"}
         call = [
-            *command, *options, *FLAGS, f'-DSOURCES_HASH="{hash_sources()}"', *extra, *LINK,
+            *command, *options, *FLAGS, f'-DSOURCES_HASH="{hash_sources()}"', *extra, *link,
             *map(str, FOLDER.glob("*.c")), "-o", str(whole),
         ]  # fmt: skip
         run = subprocess.run(call, env={**os.environ, **caches}, capture_output=True, text=True, check=False)
@@ -129,11 +131,20 @@ def build_target(target: Target, folder: Path, platform: Platform, extra: tuple[
     return path
 
 
-def build(folder: Path = FOLDER, extra: tuple[str, ...] = (), platform: str | None = None) -> list[Path]:
-    """Build the libraries of all targets into a folder; ``platform`` is a wheel's tag, None: this machine's."""
+def build(
+    folder: Path = FOLDER, extra: tuple[str, ...] = (), platform: str | None = None, link: tuple[str, ...] = LINK
+) -> list[Path]:
+    """Build the libraries of all targets into a folder.
+
+    Args:
+        folder: Where they go.
+        extra: Further options of the compiler.
+        platform: Tag of a wheel; None: this machine's.
+        link: Options that make a library of the objects.
+    """
     where = find_platform(platform)
     with ThreadPoolExecutor() as pool:
-        return list(pool.map(lambda target: build_target(target, folder, where, extra), where.targets))
+        return list(pool.map(lambda target: build_target(target, folder, where, extra, link), where.targets))
 
 
 if __name__ == "__main__":
