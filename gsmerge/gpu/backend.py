@@ -32,7 +32,7 @@ def make_backend(device: torch.device) -> FitBackend[DevicePhotos]:
         upload=partial(upload_gaussians, device=device),
         upload_photos=partial(upload_photos, device=device),
         download=Gaussians.numpy,
-        visible_mask=visible_mask,
+        look_at=look_at,
         fit_full=fit_full,
         fit_colors=fit_colors,
         grow=grow,
@@ -40,6 +40,11 @@ def make_backend(device: torch.device) -> FitBackend[DevicePhotos]:
         photo_psnr=partial(photo_psnr, device=device),
         memory_errors=(torch.cuda.OutOfMemoryError,),
     )
+
+
+def look_at(gaussians: Gaussians, photos: tuple[DevicePhotos, ...], min_weight: float) -> tuple[Tensor, None]:
+    """Return a mask ``[n]`` of the Gaussians worth keeping; the full fit looks again by itself."""
+    return visible_mask(gaussians, photos[1], min_weight), None
 
 
 def visible_mask(gaussians: Gaussians, photos: DevicePhotos, min_weight: float) -> Tensor:

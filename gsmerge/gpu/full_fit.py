@@ -212,6 +212,7 @@ def fit_full(
     seed: int,
     progress: Progress | None,
     baseline_start: Gaussians | None,
+    look: None = None,  # what the CPU's fit takes over from the look before
 ) -> tuple[Gaussians, FitReport]:
     """Fit as :func:`gsmerge.stages.fit.full.fit_full` does; report progress every ``READ_EVERY`` steps."""
     plan = plan_run((photos[0].host, photos[1].host), options, seed)

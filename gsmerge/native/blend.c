@@ -6,8 +6,28 @@
 
 enum { CHANNELS = 4 };  // channels that one walk of weighted_sums adds up
 
-static inline void blend_rows(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1) {
+// Sum and largest of the weights of one Gaussian, by column.
+typedef struct { v16f sum, peak; } Weights;
+
+static inline Weights add_weights(Weights w, v16f weight) {
+  return (Weights){w.sum + weight, sel(weight > w.peak, weight, w.peak)};
+}
+
+static inline v4f max4(v4f a, v4f b) { return (v4f)(((a > b) & (v4i)a) | (~(a > b) & (v4i)b)); }
+
+// Add a sum to own[0]; raise own[1] to the peak.
+static inline void add_total(float *own, Weights w) {
+  v16f p = w.peak;
+  v4f a = max4(PICK(p, p, 0, 1, 2, 3), PICK(p, p, 4, 5, 6, 7));
+  v4f b = max4(a, max4(PICK(p, p, 8, 9, 10, 11), PICK(p, p, 12, 13, 14, 15)));
+  own[0] += total(w.sum);
+  own[1] = maxf(own[1], maxf(maxf(b[0], b[1]), maxf(b[2], b[3])));
+}
+
+// Blend Gaussian j of a batch over rows y0 to y1; planes 1 to 3 collect the colour -> its weights, if anybody asks.
+static inline Weights blend_rows(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1) {
   Curve curve = curve_of(b, (int)j);
+  Weights weights = {{0}, {0}};
   float red = b->red[j], green = b->green[j], blue = b->blue[j];
   for (int32_t y = y0; y <= y1; y++) {
     float *row = state + y * TILE;
@@ -16,7 +36,9 @@ static inline void blend_rows(float *state, const Batch *b, int64_t j, int32_t y
     store(row + PLANE, load(row + PLANE) + s.weight * red);
     store(row + 2 * PLANE, load(row + 2 * PLANE) + s.weight * green);
     store(row + 3 * PLANE, load(row + 3 * PLANE) + s.weight * blue);
+    weights = add_weights(weights, s.weight);
   }
+  return weights;
 }
 
 API void blend(const float *restrict footprints, const float *restrict colors, const int32_t *restrict members,
@@ -106,13 +128,31 @@ API void add_slots(const int32_t *restrict members, const float *restrict slots,
   }
 }
 
-static inline v4f max4(v4f a, v4f b) { return (v4f)(((a > b) & (v4i)a) | (~(a > b) & (v4i)b)); }
-
-// The largest of sixteen lanes.
-static inline float highest(v16f v) {
-  v4f a = max4(PICK(v, v, 0, 1, 2, 3), PICK(v, v, 4, 5, 6, 7));
-  v4f b = max4(a, max4(PICK(v, v, 8, 9, 10, 11), PICK(v, v, 12, 13, 14, 15)));
-  return maxf(maxf(b[0], b[1]), maxf(b[2], b[3]));
+// Blend the whole image, black behind it, and gather mass and peak of every Gaussian's weights on the way.
+API void survey(const float *restrict footprints, const float *restrict colors, const int32_t *restrict members,
+                const int64_t *restrict offsets, int64_t columns, float *restrict image, float *restrict totals,
+                int64_t m, int64_t n, int64_t ends, int64_t h, int64_t w) {
+  (void)m, (void)n;
+  float state[4 * PLANE] __attribute__((aligned(64)));
+  Batch batch;
+  clear_batch(&batch);
+  for (int64_t tile = 0; tile < ends - 1; tile++) {
+    Tile t = open_tile(state, 4, tile, columns, h, w);
+    int64_t end = offsets[tile + 1];
+    for (int64_t start = offsets[tile]; start < end && t.y_low <= t.y_high; start += BATCH) {
+      int64_t stop = mini(end, start + BATCH);
+      gather(&batch, &t, footprints, members, start, stop, end);
+      gather_colors(&batch, colors, members, start, stop, end);
+      for (int64_t j = 0; j < stop - start; j++)
+        add_total(totals + 2 * (int64_t)members[start + j],
+                  blend_rows(state, &batch, j, first_row(&t, &batch, j), last_row(&t, &batch, j)));
+      narrow_tile(&t, state);
+    }
+    for (int y = 0; y < t.num_y; y++)
+      for (int x = 0; x < t.num_x; x++)
+        for (int c = 0; c < 3; c++)
+          image[3 * ((t.top + y) * w + t.left + x) + c] = state[(c + 1) * PLANE + y * TILE + x];
+  }
 }
 
 API void contributions(const float *restrict footprints, const int32_t *restrict members,
@@ -131,16 +171,13 @@ API void contributions(const float *restrict footprints, const int32_t *restrict
       for (int64_t i = start; i < stop; i++) __builtin_prefetch(totals + 2 * (int64_t)members[i]);
       for (int64_t j = 0; j < stop - start; j++) {
         Curve curve = curve_of(&batch, (int)j);
-        v16f sum = {0}, peak = {0};
+        Weights weights = {{0}, {0}};
         for (int32_t y = first_row(&t, &batch, j); y <= last_row(&t, &batch, j); y++) {
           Share s = take_share(load(state + y * TILE), exponents(&curve, (float)y - curve.my));
           store(state + y * TILE, s.left);
-          sum += s.weight;
-          peak = sel(s.weight > peak, s.weight, peak);
+          weights = add_weights(weights, s.weight);
         }
-        float *own = totals + 2 * (int64_t)members[start + j];
-        own[0] += total(sum);
-        own[1] = maxf(own[1], highest(peak));
+        add_total(totals + 2 * (int64_t)members[start + j], weights);
       }
       narrow_tile(&t, state);
     }

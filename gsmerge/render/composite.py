@@ -93,6 +93,14 @@ def splat_adjoint(plan: ViewPlan, image: Array) -> Array:
     return sums
 
 
+def survey(plan: ViewPlan, colors: Array | None = None) -> tuple[Array, Array, Array]:
+    """Return the image of :func:`composite` over black, and sums and maxima of :func:`contributions`, ``[m]`` each."""
+    drawn = view_colors(plan) if colors is None else np.ascontiguousarray(colors.take(plan.ids, 0), np.float32)
+    image, totals = np.empty((plan.height, plan.width, 3), np.float32), np.zeros((len(plan.ids), 2), np.float32)
+    kernels.survey(plan.footprints, drawn, plan.members, plan.offsets, plan.columns, image, totals)
+    return image, totals[:, 0], totals[:, 1]
+
+
 def contributions(plan: ViewPlan) -> tuple[Array, Array]:
     """Return sum (pixels) and maximum of every Gaussian's blending weight, both ``[n]`` float32; 0 if unseen."""
     totals = np.zeros((len(plan.ids), 2), np.float32)

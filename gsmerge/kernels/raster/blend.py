@@ -49,6 +49,14 @@ def add_slots(members, slots, ids, first, sums):
     """
 
 
+@native(
+    footprints=LISTS["footprints"], colors=f4("m", 3), members=LISTS["members"], offsets=LISTS["offsets"],
+    columns=LISTS["columns"], image=f4("h", "w", 3, out=True), totals=f4("m", 2, out=True),
+)  # fmt: skip
+def survey(footprints, colors, members, offsets, columns, image, totals):
+    """Do the work of :func:`blend`, of all tiles over black, and of :func:`contributions` in one walk."""
+
+
 @native(**LISTS, height=i8(least=1), width=i8(least=1), totals=f4("m", 2, out=True))
 def contributions(footprints, members, offsets, columns, height, width, totals):
     """Add every Gaussian's weights over the pixels to ``totals[:, 0]``; raise ``totals[:, 1]`` to the largest of them.

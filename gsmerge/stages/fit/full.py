@@ -19,15 +19,16 @@ from gsmerge.geometry import motion_matrices
 from gsmerge.kernels.gaussians import optimise as kernels
 from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT
 from gsmerge.kernels.raster.blend import MAX_ALPHA
-from gsmerge.render import composite, plan_view, splat_adjoint
+from gsmerge.render import plan_view
 from gsmerge.render.composite import blend, view_colors
 from gsmerge.render.gradient import gradients_of
 from gsmerge.render.photos import Photos, render_photos
-from gsmerge.runtime.threads import in_turn, parallel_map
+from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.fit.fit_options import EARLIER, LONG_STEPS, FitOptions, FitReport, Tuning
 from gsmerge.stages.fit.fit_state import State, gaussians_of, grow_to, start_state
 from gsmerge.stages.fit.loss import image_gradient
 from gsmerge.stages.fit.photo_sizes import holdout_psnr, reduced, training_weights
+from gsmerge.stages.fit.survey import Survey, survey_photos
 from gsmerge.types import Array, Gaussians
 
 ROWS = 16384  # Gaussians per piece of an optimiser step
@@ -156,7 +157,7 @@ def step_sizes(rates: Tuning, progress: float, steps: int) -> np.ndarray:
     return (np.repeat(each, [3, 3, 4, 1, 3]) * decay**progress).astype(np.float32)
 
 
-def initial_scores(state: State, plan: FitPlan) -> tuple[float, np.ndarray, np.ndarray]:
+def initial_scores(look: Survey, plan: FitPlan) -> tuple[float, np.ndarray, np.ndarray]:
     """Score the start: PSNR (dB) of the held-out half-size blocks, ``[n]`` box shares, ``[n]`` least log scales.
 
     The share of its box that a Gaussian may use is ``single_view_share`` to 1, by how many photos
@@ -164,27 +165,13 @@ def initial_scores(state: State, plan: FitPlan) -> tuple[float, np.ndarray, np.n
     Its least scale is ``min_scale`` pixels of the largest photo that it is nearest to (the 3D
     filter of Mip-Splatting); none where no photo shows it.
     """
-    photos, colors, rates = plan.photos[1], state.view_colors(), plan.options.tuning
-    everywhere = np.ones((photos.height, photos.width, 1), np.float32)
-
-    def one_view(view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        drawn = plan_view(state.splats, **photos.camera(view))
-        focal = max(sized.Ks[view][[0, 1], [0, 1]].max() for sized in plan.photos)
-        return composite(drawn, colors)[0], splat_adjoint(drawn, everywhere)[:, 0], drawn.ids, drawn.depths / focal
-
-    images, sums, squares = [], np.zeros(len(state.x)), np.zeros(len(state.x))
-    pixels = np.full(len(state.x), np.inf, np.float32)  # size of the finest one
-    for image, each, ids, sizes in in_turn(one_view, range(len(photos))):
-        weights = each.astype(np.float64)
-        images.append(image)
-        sums += weights
-        squares += weights**2
-        pixels[ids] = np.minimum(pixels[ids], sizes)
-    photos_each = sums**2 / np.maximum(squares, 1e-12)
+    rates = plan.options.tuning
+    photos_each = look.sums**2 / np.maximum(look.squares, 1e-12)
     box_shares = np.clip(photos_each - 1, rates.single_view_share, 1).astype(np.float32)
+    pixels = np.where(np.isfinite(look.pixels), look.pixels, 0)
     with np.errstate(divide="ignore"):
-        min_sizes = np.log(rates.min_scale * np.where(np.isfinite(pixels), pixels, 0)).astype(np.float32)
-    return holdout_psnr(images, photos, plan.weights[1], plan.options.tuning.min_gain), box_shares, min_sizes
+        min_sizes = np.log(rates.min_scale * pixels).astype(np.float32)
+    return holdout_psnr(look.images, plan.photos[1], plan.weights[1], rates.min_gain), box_shares, min_sizes
 
 
 def holdout_score(state: State, plan: FitPlan) -> float:
@@ -234,6 +221,7 @@ def fit_full(
     progress: Progress | None = None,
     masks: Masks | None = None,
     baseline_start: Gaussians | None = None,
+    look: Survey | None = None,
 ) -> tuple[Gaussians, FitReport]:
     """Fit all parameters to the photos.
 
@@ -244,11 +232,13 @@ def fit_full(
     ``photos`` come at full and at half size, and larger if the fit is to see them. ``count``:
     number of Gaussians to grow to, where the run is long enough. ``masks``: pixels that count;
     where no Gaussian is, none should be drawn to. ``baseline_start``: another start that the fit
-    may beat instead, see :func:`score_to_beat`. ``progress`` is called after every step.
+    may beat instead, see :func:`score_to_beat`. ``look``: a survey of the Gaussians, where there is
+    one already. ``progress`` is called after every step.
     """
     rng, state, plan = np.random.default_rng(seed), start_state(gaussians), plan_run(photos, options, seed, masks)
     tail = TailMean()
-    own, state.box_shares[:], state.min_sizes[:] = initial_scores(state, plan)
+    look = survey_photos(gaussians, photos) if look is None else look
+    own, state.box_shares[:], state.min_sizes[:] = initial_scores(look, plan)
     after = before = score_to_beat(own, baseline_start, plan)
     queue: list[int] = []
     grows, step, steps, error, judged = options.grows, 0, options.steps, 0.0, False

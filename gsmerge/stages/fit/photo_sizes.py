@@ -103,7 +103,7 @@ def reduced(weights: list[np.ndarray], photos: Photos) -> list[np.ndarray]:
     return [np.ascontiguousarray(weight[::2, ::2][: photos.height, : photos.width]) for weight in weights]
 
 
-def holdout_psnr(images: list[np.ndarray], photos: Photos, weights: list[np.ndarray], min_gain: float) -> float:
+def holdout_psnr(images: Sequence[np.ndarray], photos: Photos, weights: list[np.ndarray], min_gain: float) -> float:
     """Return the PSNR (dB) of renders on the held-out blocks, where ``weights [h,w]`` are 0.
 
     Exposure of the photos that differs by a factor of ``min_gain`` or more is compensated.

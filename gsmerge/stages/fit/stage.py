@@ -18,6 +18,7 @@ from gsmerge.stages.fit.fit_options import FitOptions, FitReport, Fitted, record
 from gsmerge.stages.fit.fit_state import gaussians_of, grow_to, start_state
 from gsmerge.stages.fit.full import Progress, fit_full
 from gsmerge.stages.fit.photo_sizes import fit_photos
+from gsmerge.stages.fit.survey import Survey, survey_photos
 from gsmerge.types import Array, Gaussians, Scene
 
 FitResult = tuple[Gaussians, FitReport]
@@ -40,7 +41,8 @@ class FitBackend(Generic[PhotosT]):
     upload: Callable[[Gaussians], Gaussians]
     upload_photos: Callable[[Photos], PhotosT]
     download: Callable[[Gaussians], Gaussians]
-    visible_mask: Callable[[Gaussians, PhotosT, float], Array]  # see visible_mask
+    # photos of all sizes and a least weight -> which Gaussians stay, and what the full fit can use of the look
+    look_at: Callable[[Gaussians, tuple[PhotosT, ...], float], tuple[Array, Survey | None]]
     fit_full: Callable[..., FitResult]  # see gsmerge.stages.fit.full.fit_full; without masks
     fit_colors: Callable[[Gaussians, PhotosT, FitOptions, int], FitResult]  # the last: a seed
     grow: Callable[[Gaussians, PhotosT, int], Gaussians]  # to a number, see gsmerge.stages.fit.fit_state.grow_to
@@ -62,6 +64,12 @@ def visible_mask(gaussians: Gaussians, photos: Photos, min_weight: float) -> np.
         inside[ids] = True
         np.maximum(peak, peaks, out=peak)
     return ~inside | (peak >= min_weight)
+
+
+def _look_at(gaussians: Gaussians, photos: tuple[Photos, ...], min_weight: float) -> tuple[Array, Survey]:
+    look = survey_photos(gaussians, photos)
+    keep = look.visible(min_weight)
+    return keep, look[keep]
 
 
 def _fit_colors(gaussians: Gaussians, photos: Photos, options: FitOptions, seed: int) -> FitResult:
@@ -87,7 +95,7 @@ ON_CPU: FitBackend[Photos] = FitBackend(
     upload=lambda gaussians: gaussians,
     upload_photos=lambda photos: photos,
     download=lambda gaussians: gaussians,
-    visible_mask=visible_mask,
+    look_at=_look_at,
     fit_full=fit_full,
     fit_colors=_fit_colors,
     grow=_grow,
@@ -176,11 +184,13 @@ def _choose_fit(
 ) -> tuple[Gaussians, FitReport | None]:
     """Run :func:`fit` on a back end, with Gaussians and photos of its own."""
     full, half = photos[:2]
-    keep = backend.visible_mask(gaussians, half, options.min_contribution)
+    keep, look = backend.look_at(gaussians, photos, options.min_contribution)
     kept = gaussians[keep]
     if options.fit == "none":
         return kept, None
-    fitted, report = backend.fit_full(kept, photos, options, count, seed, progress, baseline_start=baseline_start)
+    fitted, report = backend.fit_full(
+        kept, photos, options, count, seed, progress, baseline_start=baseline_start, look=look
+    )
     fitted, report = _better_of(backend, full, kept, fitted, report, CLOSE)
     if report.accepted:
         return fitted, report

@@ -112,7 +112,7 @@ def test_other_errors_are_not_hidden(start: Gaussians, photos: Pair) -> None:
     def fail(*_: Any) -> Any:
         raise RuntimeError("a mistake of ours")
 
-    for backend in (replace(ON_TORCH, visible_mask=fail), replace(stage.ON_CPU, visible_mask=fail)):
+    for backend in (replace(ON_TORCH, look_at=fail), replace(stage.ON_CPU, look_at=fail)):
         with pytest.raises(RuntimeError, match="a mistake of ours"):
             fit(start, photos, QUICK, backend=backend)
 

@@ -25,6 +25,7 @@ from gsmerge.stages.fit.full import (
     plan_run,
     step_sizes,
 )
+from gsmerge.stages.fit.survey import survey_photos
 from gsmerge.types import SH_C0
 
 Pair = tuple[Photos, Photos]
@@ -62,7 +63,7 @@ def test_what_one_photo_shows_has_a_smaller_box(truth: Gaussians, photos: Pair) 
 
     def shares_of(some: Pair) -> np.ndarray:
         plan = plan_run(some, QUICK, 0)
-        psnr, actual, _ = initial_scores(state, plan)
+        psnr, actual, _ = initial_scores(survey_photos(truth, some), plan)
         assert psnr == holdout_score(state, plan)
         return actual
 
@@ -83,7 +84,7 @@ def test_nothing_becomes_thinner_than_half_a_pixel(truth: Gaussians, photos: Pai
     """Of the photo that it is nearest to, whatever the box says."""
     start = scenes.spoil(truth)
     thin = replace(start, scales=start.scales * np.array([0.02, 1, 1], np.float32))
-    _, _, min_sizes = initial_scores(start_state(thin), plan_run(photos, QUICK, 0))
+    _, _, min_sizes = initial_scores(survey_photos(thin, photos), plan_run(photos, QUICK, 0))
     views = photos[0].viewmats
     depths = start.means @ views[:, 2, :3].T + views[:, 2, 3]
     np.testing.assert_allclose(np.exp(min_sizes), 0.5 * depths.min(1) / photos[0].Ks[0, 0, 0], rtol=1e-4)

@@ -9,11 +9,14 @@ import pytest
 import scenes
 
 from gsmerge import Gaussians
+from gsmerge.render import composite, contributions, plan_view
 from gsmerge.render.photos import Photos
 from gsmerge.stages.fit import FitOptions, FitReport, fit, stage
 from gsmerge.stages.fit.color import draw, fit_colors
+from gsmerge.stages.fit.fit_state import start_state
 from gsmerge.stages.fit.full import fit_full
 from gsmerge.stages.fit.stage import visible_mask
+from gsmerge.stages.fit.survey import survey_photos
 from gsmerge.types import SH_C0
 
 Pair = tuple[Photos, Photos]
@@ -76,6 +79,21 @@ def test_stage_prunes_before_it_fits(truth: Gaussians, photos: Pair) -> None:
 def test_nothing_to_fit(truth: Gaussians, photos: Pair, method: str) -> None:
     result, _ = fit(truth[:0], photos, replace(QUICK, fit=method))
     assert len(result) == 0
+
+
+def test_a_survey_is_what_its_parts_are(truth: Gaussians, photos: Pair) -> None:
+    look, half, state = survey_photos(truth, photos), photos[1], start_state(truth)
+    np.testing.assert_array_equal(look.visible(1 / 255), visible_mask(truth, half, 1 / 255))
+    sums = np.zeros((len(half), len(truth)))
+    for view in range(len(half)):
+        plan = plan_view(state.splats, **half.camera(view))
+        image, _ = composite(plan, state.colors)
+        np.testing.assert_array_equal(look.images[view], image)
+        sums[view] = contributions(plan)[0]
+    np.testing.assert_array_equal(look.sums, sums.sum(0))
+    np.testing.assert_array_equal(look.squares, (sums**2).sum(0))
+    rows = np.arange(0, len(truth), 3)
+    np.testing.assert_array_equal(look[rows].peaks, look.peaks[rows])
 
 
 def test_shown(photos: Pair) -> None:
