@@ -19,7 +19,7 @@ static inline float exp4(float x) {
   p = p * r + 5.0000001201e-1f;
   p = p * (r * r) + r + 1.f;
   int32_t power = shifted.i - 0x4b400000, half = power >> 1;
-  bits4 low = {.i = (half + 127) << 23}, high = {.i = (power - half + 127) << 23};
+  bits4 low = {.u = (uint32_t)(half + 127) << 23}, high = {.u = (uint32_t)(power - half + 127) << 23};
   return p * low.f * high.f;
 }
 
@@ -27,7 +27,7 @@ static inline float exp4(float x) {
 static inline float log4(float x) {
   bool tiny = x < 1.17549435e-38f;
   bits4 whole = {.f = tiny ? x * 8388608.f : x};
-  int32_t shifted = whole.i - 0x3f3504f3;  // so that the mantissa lies between sqrt(1/2) and sqrt(2)
+  int32_t shifted = (int32_t)(whole.u - 0x3f3504f3u);  // so that the mantissa lies between sqrt(1/2) and sqrt(2)
   float n = (float)((shifted >> 23) - (tiny ? 23 : 0));
   bits4 mantissa = {.i = (shifted & 0x7fffff) + 0x3f3504f3};
   float r = mantissa.f - 1.f, z = r * r;
@@ -78,7 +78,7 @@ static inline double exp8(double x) {
 static inline double log8(double x) {
   bool tiny = x < 2.2250738585072014e-308;
   bits8 whole = {.f = tiny ? x * 18014398509481984.0 : x};
-  int64_t shifted = whole.i - 0x3fe6a09e667f3bcd;
+  int64_t shifted = (int64_t)(whole.u - 0x3fe6a09e667f3bcdu);
   double n = (double)((shifted >> 52) - (tiny ? 54 : 0));
   bits8 mantissa = {.i = (shifted & 0xfffffffffffff) + 0x3fe6a09e667f3bcd};
   double f = mantissa.f - 1.0, s = f / (2.0 + f), z = s * s, w = z * z;

@@ -76,6 +76,13 @@ static inline int32_t whole(float x, float low, float high) {
   return (int32_t)(x < high ? x : high);
 }
 
+// Whether one of m indices is outside an array of n.
+static inline bool any_outside(const int32_t *ids, int64_t m, int64_t n) {
+  uint32_t most = 0;  // negative ones are above all others
+  for (int64_t i = 0; i < m; i++) most = (uint32_t)ids[i] > most ? (uint32_t)ids[i] : most;
+  return m > 0 && most >= mini(n, INT64_C(1) << 31);
+}
+
 #define sqrtf4 __builtin_sqrtf
 #define sqrtf8 __builtin_sqrt
 #define floorf4 __builtin_floorf

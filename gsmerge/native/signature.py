@@ -94,7 +94,7 @@ def native(returns: Argument | None = None, /, **arguments: Argument) -> Callabl
         name, signature = function.__name__.lstrip("_"), inspect.signature(function)
         if list(signature.parameters) != list(arguments):
             raise TypeError(f"{name}: expected declarations of {list(signature.parameters)}, got {list(arguments)}")
-        entry: list[Any] = []  # the function in the library, once it is loaded
+        entries: dict[ctypes.CDLL, Any] = {}  # the function in each library that was loaded: tests load several
 
         @wraps(function)
         def call(*values: Any, **named: Any) -> Any:
@@ -106,9 +106,10 @@ def native(returns: Argument | None = None, /, **arguments: Argument) -> Callabl
             passed = [_pass(name, key, kind, value, sizes) for (key, kind), value in zip(kinds, values, strict=True)]
             for place, key, kind in ruled:
                 _check_values(name, key, kind, values[place], sizes)
-            if not entry:
-                entry.append(_entry(name, returns, arguments))
-            result = entry[0](*passed, *[sizes.get(key, 0) for key in names])
+            library = load_library()
+            if library not in entries:
+                entries[library] = _entry(library, name, returns, arguments)
+            result = entries[library](*passed, *[sizes.get(key, 0) for key in names])
             if returns is STATUS and result:
                 raise ValueError(f"{name}: expected indices inside their arrays, found one outside")
             return None if returns is STATUS else result
@@ -134,8 +135,8 @@ def _prototype(name: str, returns: Argument | None, arguments: dict[str, Argumen
     return f"{returns.c if returns else 'void'} {name}({', '.join(parts)})"
 
 
-def _entry(name: str, returns: Argument | None, arguments: dict[str, Argument]) -> Any:
-    function = getattr(load_library(), name)
+def _entry(library: ctypes.CDLL, name: str, returns: Argument | None, arguments: dict[str, Argument]) -> Any:
+    function = getattr(library, name)
     kinds = [ctypes.c_void_p if kind.shape else _CODES[kind.code][1] for kind in arguments.values()]
     function.argtypes = [*kinds, *[ctypes.c_int64] * len(size_names(arguments))]
     function.restype = _CODES[returns.code][1] if returns else None
@@ -161,7 +162,14 @@ def _pass(name: str, key: str, kind: Argument, value: Any, sizes: dict[str, int]
     flags = value.flags
     if not flags.c_contiguous or not flags.aligned or (kind.out and not flags.writeable):
         raise ValueError(f"{name}: {key}: expected an aligned{' writable' * kind.out} array in C order")
-    return value.ctypes.data
+    return _address(value)
+
+
+def _address(array: np.ndarray[Any, Any]) -> int:
+    """Return where an array's values lie; through the buffer where that can be, a fifth of the time."""
+    if array.flags.writeable and array.size:
+        return ctypes.addressof(ctypes.c_char.from_buffer(array))  # type: ignore[arg-type]
+    return int(array.ctypes.data)
 
 
 def _check_values(name: str, key: str, kind: Argument, value: Any, sizes: dict[str, int]) -> None:

@@ -80,7 +80,7 @@ def gradients_of(
     means, quats, scales, tints = (np.empty((m, size), np.float32) for size in (3, 4, 3, 3))
     opacities = np.empty(m, np.float32)
     num_blocks = -(-m // project_backward.BLOCK)
-    poses = np.empty((num_blocks if with_viewmat else 0, project_backward.POSE), np.float32)
+    poses = np.empty((num_blocks, project_backward.POSE), np.float32) if with_viewmat else None
 
     def tiles(span: tuple[int, int]) -> None:
         blend_backward.blend_backward(
@@ -100,7 +100,7 @@ def gradients_of(
         parallel_map(tiles, tile_ranges(plan, threads, WORTH))
         parallel_map(project, _blocks(m, threads))
     viewmat = None
-    if with_viewmat:
+    if poses is not None:
         pose = poses.sum(0, dtype=np.float64)
         viewmat = np.zeros((4, 4))
         viewmat[:3, 3] = pose[9:]

@@ -136,12 +136,18 @@ def _corner_sums(tiles: Array, lines: int, columns: int) -> Array:
     return np.pad(tiles.astype(np.int32).cumsum(0).cumsum(1), ((1, 0), (1, 0))).astype(np.int32)
 
 
-def _visible(splats: Splats, opacities: Array, keep: Array, wanted: Array, camera: Array, threads: int) -> Array:
+def _visible(
+    splats: Splats, opacities: Array, keep: Array | None, wanted: Array | None, camera: Array, threads: int
+) -> Array:
     """Return the ascending ids of the Gaussians that may touch the image."""
 
     def cull(span: tuple[int, int]) -> Array:
-        ids = np.empty(span[1] - span[0] + 1, np.int32)
-        return ids[: projection.cull(splats.means, splats.scales, opacities, keep, wanted, camera, *span, ids)].copy()
+        part, ids = slice(*span), np.empty(span[1] - span[0], np.int32)
+        kept = None if keep is None else keep[part]
+        count = projection.cull(
+            splats.means[part], splats.scales[part], opacities[part], kept, wanted, camera, span[0], ids
+        )
+        return ids[:count].copy()
 
     return np.concatenate(parallel_map(cull, pieces(len(splats), threads)))
 
@@ -162,9 +168,8 @@ def _project(splats: Splats, opacities: Array, ids: Array, camera: Array, thread
 
     def project(span: tuple[int, int]) -> None:
         part = slice(*span)
-        lnops = np.log(np.minimum(opacities[ids[part]], np.float32(1)))
         projection.project(
-            splats.means, splats.quats, splats.scales, lnops, ids[part], camera,
+            splats.means, splats.quats, splats.scales, opacities, ids[part], camera,
             footprints[part], depths[part], boxes[part],
         )  # fmt: skip
 
@@ -234,16 +239,17 @@ def plan_view(
     _check_view(viewmat, K, width, height)
     check_range(near, far, eps2d)
     opacities = splats.opacities if opacities is None else np.ascontiguousarray(opacities, np.float32)
-    keep = np.empty(0, np.uint8) if keep is None else np.ascontiguousarray(keep, bool).view(np.uint8)
-    if opacities.shape != (len(splats),) or len(keep) not in (0, len(splats)):
-        raise ValueError(f"expected {len(splats)} opacities and keep flags, got {len(opacities)} and {len(keep)}")
+    keep = None if keep is None else np.ascontiguousarray(keep, bool).view(np.uint8)
+    num_flags = len(splats) if keep is None else len(keep)
+    if opacities.shape != (len(splats),) or num_flags != len(splats):
+        raise ValueError(f"expected {len(splats)} opacities and keep flags, got {len(opacities)} and {num_flags}")
 
     local = viewmat.copy()
     local[:3, 3] += local[:3, :3] @ splats.origin
     camera = _camera(local, K, width, height, eps2d, antialiased)
     camera[projection.NEAR], camera[projection.FAR] = near, far
     columns, lines = -(-width // projection.TILE), -(-height // projection.TILE)
-    wanted = np.zeros((0, 0), np.int32) if tiles is None else _corner_sums(tiles, lines, columns)
+    wanted = None if tiles is None else _corner_sums(tiles, lines, columns)
     with use_threads() as threads:
         ids = _visible(splats, opacities, keep, wanted, camera, threads)
         footprints, depths, boxes = _project(splats, opacities, ids, camera, threads)

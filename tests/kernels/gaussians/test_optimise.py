@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -211,3 +212,40 @@ def test_zero_quaternion_stays_finite() -> None:
     g.quats[0] = 0
     step_kernel(run, g, 1)
     assert np.isfinite(run.x).all()
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 15, 16, 17, 50])
+@pytest.mark.parametrize("hostile", [False, True])
+def test_bits_are_the_same_on_every_processor(each_target: Any, count: int, hostile: bool) -> None:
+    """Every row is listed, the last one too; what is not finite stays in its own."""
+    start, steps = make_run(count), [gradients(count, seed=step, share=1.1) for step in range(1, 4)]
+    for g in steps if hostile else ():
+        g.means[1::5], g.quats[::7], g.scales[1::6], g.opacities[2::9] = np.nan, np.inf, 3e38, -np.inf
+
+    def run() -> list[np.ndarray]:
+        result = start.copy()
+        for step, g in enumerate(steps, 1):
+            step_kernel(result, g, step)
+        return [np.nan_to_num(getattr(result, f.name)) for f in fields(Run)]
+
+    each_target(run)
+
+
+def test_rows_that_are_not_finite_leave_their_neighbours_alone() -> None:
+    run, bad, g = make_run(20), make_run(20), gradients(20, seed=0, share=1.1)
+    bad.x[7] = bad.v[7] = np.nan
+    step_kernel(run, g, 1)
+    step_kernel(bad, g, 1)
+    for f in fields(Run):
+        one, two = (np.delete(getattr(each, f.name), 7, 0) for each in (run, bad))
+        np.testing.assert_array_equal(one, two, err_msg=f.name)
+
+
+@pytest.mark.parametrize("wrong", [-1, 20, 2**31 - 1])
+def test_rows_outside_are_refused(wrong: int) -> None:
+    run, g = make_run(20), gradients(20, seed=0, share=1.1)
+    before = run.copy()
+    g.ids[10] = wrong
+    with pytest.raises(ValueError, match="expected indices inside their arrays"):
+        step_kernel(run, g, 1)
+    np.testing.assert_array_equal(run.x, before.x)
