@@ -92,3 +92,21 @@ static inline double log8(double x) {
   result = x == 0.0 ? -__builtin_inf() : result;
   return x >= 0.0 ? result : __builtin_nan("");
 }
+
+// log Γ(x) in float64 for x from 0 on, within 1e-14 near its zeros at 1 and 2. Stirling's series from 12 on, below that
+// Γ(x) = Γ(x + 1) / x.
+static inline double lgamma8(double x) {
+  if (!(x >= 0.0)) return __builtin_nan("");
+  if (x > 1e305) return __builtin_inf();
+  double product = 1.0;
+  for (; x < 12.0; x += 1.0) product *= x;
+  double s = 1.0 / (x * x);
+  double p = 691.0 / 360360.0 - s * (1.0 / 156.0);
+  p = 1.0 / 1188.0 - s * p;
+  p = 1.0 / 1680.0 - s * p;
+  p = 1.0 / 1260.0 - s * p;
+  p = 1.0 / 360.0 - s * p;
+  p = 1.0 / 12.0 - s * p;
+  double stirling = (x - 0.5) * log8(x) - x + 0.91893853320467274178 + p / x;
+  return product == 1.0 ? stirling : stirling - log8(product);
+}

@@ -77,6 +77,7 @@ u1, i1, i2, u4, i4, u8, i8, f4, f8 = (
 )
 
 STATUS = i4()  # what a function returns that checks indices on its way: 0, or another number for one outside its array
+COUNT = i8()  # the same of a function that counts: a number from 0 on, or a negative one for an index outside
 
 
 def native(returns: Argument | None = None, /, **arguments: Argument) -> Callable[[Callable[..., Any]], Any]:
@@ -86,7 +87,7 @@ def native(returns: Argument | None = None, /, **arguments: Argument) -> Callabl
 
     Args:
         returns: Scalar that the function returns; None for nothing. STATUS: nothing, or ValueError for an index that
-            points outside its array.
+            points outside its array. COUNT: a number, or ValueError.
         arguments: What each argument is, in their order.
     """
 
@@ -110,7 +111,7 @@ def native(returns: Argument | None = None, /, **arguments: Argument) -> Callabl
             if library not in entries:
                 entries[library] = _entry(library, name, returns, arguments)
             result = entries[library](*passed, *[sizes.get(key, 0) for key in names])
-            if returns is STATUS and result:
+            if (returns is STATUS and result) or (returns is COUNT and result < 0):
                 raise ValueError(f"{name}: expected indices inside their arrays, found one outside")
             return None if returns is STATUS else result
 

@@ -7,11 +7,20 @@ ones. All views of a scene share one threshold, so every Gaussian buys about the
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from gsmerge.kernels.superpixels.merge_tree import OVERSIZE, PLANE_ERROR, ROW, cut_labels, merge_order, region_sums
+from gsmerge.kernels.superpixels.merge_tree import (
+    OVERSIZE,
+    PLANE_ERROR,
+    ROW,
+    cut_labels,
+    merge_order,
+    natural_logs,
+    region_sums,
+)
 from gsmerge.kernels.superpixels.regions import pad_labels
 from gsmerge.kernels.superpixels.ward import adjacent_pairs
 from gsmerge.runtime.threads import parallel_map
@@ -56,7 +65,10 @@ def pixel_depths(scene: Scene) -> np.ndarray:
 
     def one_view(view: int) -> np.ndarray:
         third = cameras.viewmats[view, 2].astype(means.dtype)
-        depths = means[view * pixels : (view + 1) * pixels] @ third[:3] + third[3]
+        x, y, z = means[
+            view * pixels : (view + 1) * pixels
+        ].T  # no product of matrices: its bits depend on the processor
+        depths = x * third[0] + y * third[1] + z * third[2] + third[3]
         return depths.astype(np.float32).reshape(height, width)
 
     return np.stack(parallel_map(one_view, range(len(scene))))
@@ -108,7 +120,7 @@ def _usable_depths(depths: np.ndarray, valid: np.ndarray) -> np.ndarray:
     usable = valid & np.isfinite(depths)
     middle = float(np.median(depths[usable & (depths > 0)])) if (usable & (depths > 0)).any() else 1.0
     clipped = np.clip(depths / middle, 1 / DEPTH_RANGE, DEPTH_RANGE)
-    return np.where(usable, clipped, 0).astype(np.float32)
+    return np.ascontiguousarray(np.where(usable, clipped, 0), np.float32)
 
 
 def cut_tree(tree: RegionTree, budget: int) -> Groups:
@@ -151,8 +163,8 @@ def knee(counts: np.ndarray, distortions: np.ndarray) -> int:
     if len(counts) == 0 or counts.shape != distortions.shape:
         raise ValueError(f"expected as many distortions as counts, got {distortions.shape} for {counts.shape}")
     order = np.argsort(counts)
-    scale, error = np.log(counts[order].astype(float)), np.maximum.accumulate(distortions[order][::-1])[::-1]
-    quality = -10 * np.log10(KNEE_FLOOR + np.maximum(error, 0))
-    before = np.interp(scale - np.log(KNEE_STEP), scale, quality)
-    steep = (quality - before) / np.log(KNEE_STEP) >= KNEE_SLOPE
+    scale, error = natural_logs(counts[order].astype(float)), np.maximum.accumulate(distortions[order][::-1])[::-1]
+    quality = -10 / math.log(10) * natural_logs(KNEE_FLOOR + np.maximum(error, 0))
+    before = np.interp(scale - math.log(KNEE_STEP), scale, quality)
+    steep = (quality - before) / math.log(KNEE_STEP) >= KNEE_SLOPE
     return int(counts[order][np.flatnonzero(steep)[-1] if steep.any() else 0])

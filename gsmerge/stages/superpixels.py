@@ -22,8 +22,16 @@ import numpy as np
 
 from gsmerge.budget import parse_share
 from gsmerge.errors import UsageError
+from gsmerge.kernels.superpixels.bass import adapt_labels, infer_labels
 from gsmerge.kernels.superpixels.kd import split_rectangles
 from gsmerge.kernels.superpixels.regions import pad_labels
+from gsmerge.kernels.superpixels.seeds import (
+    corner_response,
+    hexagonal_seeds,
+    seed_density,
+    seeds_from_density,
+    voronoi,
+)
 from gsmerge.kernels.superpixels.sweeps import refine
 from gsmerge.kernels.superpixels.ward import merge_regions
 from gsmerge.runtime.threads import parallel_map
@@ -35,6 +43,7 @@ NUM_SWEEPS = 2
 BLOCK = 32  # side of the squares that the cutting starts from, pixels
 PIXEL_START = 0.45  # above this many rectangles per pixel, merging starts from the pixels themselves
 RANGE_SLACK = 1e-3  # colours may leave [0, 1] by this much, as resampled pictures do
+SLIC_COMPACTNESS = 10  # scikit-image's default
 MAX_FACTOR = 4  # most times more or fewer superpixels than bass-adaptive starts with
 
 SHARE = "4.4%"  # superpixels per pixel by default
@@ -214,17 +223,12 @@ def saliency(image: Array) -> Array:
     Raises:
         ValueError: If the image has the wrong shape or range.
     """
-    return like(_corner_response(_as_pixels(as_array(image))), image)
+    return like(corner_response(_as_pixels(as_array(image))), image)
 
 
 def scene_saliency(images: np.ndarray) -> np.ndarray:
     """Return the :func:`saliency` ``[v·h·w]`` of every pixel of all views ``[v,h,w,3]``."""
-    return np.concatenate(parallel_map(lambda image: _corner_response(_as_pixels(image)).reshape(-1), images))
-
-
-def _corner_response(pixels: np.ndarray) -> np.ndarray:
-    grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
-    return np.maximum(cv2.cornerMinEigenVal(grey, 3, ksize=3), 0)
+    return np.concatenate(parallel_map(lambda image: corner_response(_as_pixels(image)).reshape(-1), images))
 
 
 def _as_pixels(array: np.ndarray) -> np.ndarray:
@@ -260,17 +264,19 @@ def _rdseg(pixels: np.ndarray, count: int, rectangles: float, early_sweeps: int,
     return refine(labels, pixels, count, NUM_SWEEPS, spread)
 
 
+def _lab_colours(pixels: np.ndarray) -> np.ndarray:
+    """Return CIELAB / 100; OpenCV reads it from tables, with the same bits on every processor."""
+    return np.ascontiguousarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2Lab) / np.float32(100))
+
+
 def _bass(pixels: np.ndarray, count: int, segmentation: str, adapt: float | None) -> np.ndarray:
     """Run BASS from hexagonal or from saliency seeds; return padded labels."""
-    from gsmerge.kernels.superpixels.bass import adapt_labels, infer_labels  # compiled only when used
-    from gsmerge.kernels.superpixels.seeds import hexagonal_seeds, seed_density, seeds_from_density, voronoi
-
     height, width, _ = pixels.shape
     if segmentation == "bass":
         seeds = hexagonal_seeds(height, width, count)
     else:
-        seeds = seeds_from_density(seed_density(_corner_response(pixels), count), count)
-    colours = np.ascontiguousarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2Lab) / np.float32(100))
+        seeds = seeds_from_density(seed_density(corner_response(pixels), count), count)
+    colours = _lab_colours(pixels)
     labels = pad_labels(voronoi(seeds, height, width))
     if segmentation == "bass-adaptive":
         return adapt_labels(labels, colours, count, MAX_FACTOR, adapt)[0]
@@ -278,14 +284,20 @@ def _bass(pixels: np.ndarray, count: int, segmentation: str, adapt: float | None
 
 
 def _slic(pixels: np.ndarray, count: int, compactness: float) -> np.ndarray:
-    """Run scikit-image's SLIC, merge its pieces with Ward's rule to the exact number; return padded labels."""
+    """Run scikit-image's SLIC, merge its pieces with Ward's rule to the exact number; return padded labels.
+
+    It is given CIELAB of channels that span [0, 1], as it would make it: its own depends on the processor.
+    """
     from skimage.measure import label
     from skimage.segmentation import slic
 
     height, width, _ = pixels.shape
+    span = pixels.max() - pixels.min()
+    colours = _lab_colours((pixels - pixels.min()) / (span or 1))
+    weight = SLIC_COMPACTNESS / (100 * float(np.ptp(colours)) or 1)  # the colours, too, are made to span [0, 1]
     asked = count
     while asked < height * width:
-        pieces = slic(pixels, n_segments=asked, compactness=10, start_label=0, channel_axis=-1)
+        pieces = slic(colours, n_segments=asked, compactness=weight, start_label=0, channel_axis=-1, convert2lab=False)
         pieces, num_pieces = label(pieces, background=-1, return_num=True, connectivity=1)
         if num_pieces >= count:
             break

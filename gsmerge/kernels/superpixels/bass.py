@@ -7,22 +7,21 @@ picture's edge take part, and no region can run empty. The adaptive form splits 
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from gsmerge.kernels.jit import kernel
 from gsmerge.kernels.superpixels.split_merge import merge, split
-from gsmerge.kernels.superpixels.sweeps import ring_mask
+from gsmerge.native.signature import COUNT, STATUS, f4, f8, i4, native, u1
 
 COLOUR_DEVIATION = 0.018 / 2  # CIELAB / 100
-POTTS = 0.5
-PRIOR_WEIGHT = 50  # pseudo-observations of the shape prior per pixel of a superpixel's expected area
 NUM_PASSES = 4  # label passes per update of the parameters
 NUM_ROUNDS = 12  # of the adaptive form: splits and merges in turn
 # Prior of the moves. The concentration, at the lower end of the authors' 0.01 to 100. Pseudo-observations of a colour's
 # variance, so many that it is all but fixed, as in the label passes (with 1e4 a superpixel of much variance would
 # rather keep it than pay for it twice, at up to 0.2 dB). The deviation of mean colours in a picture, CIELAB / 100.
 ALPHA, PRIOR_SHAPE, MEAN_DEVIATION = 0.01, 1e6, 0.5
-XX, XY, YY, LOG_DET, ROW = 5, 6, 7, 8, 9  # columns after the mean (three colours, x, y)
+ROW = 9  # columns of a region's parameters
 
 
 def simple_point_table():
@@ -36,88 +35,34 @@ def simple_point_table():
     return ((changes == 2) & (edges > 0) & (edges < 4)).astype(np.uint8)
 
 
-@kernel
+@native(
+    STATUS, labels=i4("padded_height", "padded_width"), colours=f4("height", "width", 3), areas=f8("count"),
+    sums=f8("count", 9, out=True), rows=f4("count", ROW, out=True),
+)  # fmt: skip
+def _fit_regions(labels, colours, areas, sums, rows):
+    """Write what :func:`fit_regions` returns; ``sums`` are zero before."""
+
+
 def fit_regions(labels, colours, areas):
     """``[count,9]`` float32 parameters of every region: means, inverse covariance and its determinant's logarithm.
 
     The covariance is ``(A² I + S) / (n + 50 A - 3)`` with the scatter S of n positions and the area A of ``areas``
     ``[count]`` float64 that the region is expected to have, pixels.
     """
-    height, width, _ = colours.shape
-    count = len(areas)
-    sums = np.zeros((count, 9))
-    for y in range(height):
-        for x in range(width):
-            label = labels[y + 1, x + 1]
-            for i in range(3):
-                sums[label, i] += colours[y, x, i]
-            sums[label, 3] += x
-            sums[label, 4] += y
-            sums[label, XX] += x * x
-            sums[label, XY] += x * y
-            sums[label, YY] += y * y
-            sums[label, 8] += 1.0
-    rows = np.empty((count, ROW), np.float32)
-    for label in range(count):
-        n, area = sums[label, 8], areas[label]
-        for i in range(5):
-            rows[label, i] = sums[label, i] / n
-        mean_x, mean_y = sums[label, 3] / n, sums[label, 4] / n
-        weight = 1 / max(n + PRIOR_WEIGHT * area - 3, 1.0)
-        xx = (area * area + sums[label, XX] - n * mean_x * mean_x) * weight
-        xy = (sums[label, XY] - n * mean_x * mean_y) * weight
-        yy = (area * area + sums[label, YY] - n * mean_y * mean_y) * weight
-        det = xx * yy - xy * xy
-        rows[label, XX], rows[label, XY], rows[label, YY] = yy / det, -2 * xy / det, xx / det
-        rows[label, LOG_DET] = np.log(det)
+    rows = np.empty((len(areas), ROW), np.float32)
+    _fit_regions(labels, colours, areas, np.zeros((len(areas), 9)), rows)
     return rows
 
 
-@kernel(part=True)
-def log_posterior(rows, label, c0, c1, c2, x, y, num_foreign, precision):
-    """Twice the logarithm of the posterior of a label for a pixel, up to a constant."""
-    d0, d1, d2 = c0 - rows[label, 0], c1 - rows[label, 1], c2 - rows[label, 2]
-    dx, dy = x - rows[label, 3], y - rows[label, 4]
-    shape = rows[label, XX] * dx * dx + rows[label, XY] * dx * dy + rows[label, YY] * dy * dy
-    colour = precision * (d0 * d0 + d1 * d1 + d2 * d2)
-    return -(colour + shape + rows[label, LOG_DET] + np.float32(POTTS) * num_foreign)
-
-
-@kernel
+@native(
+    COUNT, labels=i4("padded_height", "padded_width", out=True), colours=f4("height", "width", 3),
+    rows=f4("count", ROW), table=u1(256), foreign=f4(256), precision=f4(),
+)  # fmt: skip
 def label_pass(labels, colours, rows, table, foreign, precision):
     """One pass over all border pixels, in four grids of pixels that do not touch; returns how many changed.
 
     No two pixels of a grid are neighbours, so their order does not matter.
     """
-    height, width, _ = colours.shape
-    num_changed = 0
-    for grid in range(4):
-        for y in range(1 + grid // 2, height + 1, 2):
-            for x in range(1 + grid % 2, width + 1, 2):
-                own = labels[y, x]
-                north, east, south, west = labels[y - 1, x], labels[y, x + 1], labels[y + 1, x], labels[y, x - 1]
-                if (north == own) & (east == own) & (south == own) & (west == own):
-                    continue
-                mask = ring_mask(labels, y, x, own)
-                if table[mask] == 0:
-                    continue
-                c0, c1, c2 = colours[y - 1, x - 1, 0], colours[y - 1, x - 1, 1], colours[y - 1, x - 1, 2]
-                across, down, label = np.float32(x - 1), np.float32(y - 1), own
-                best = log_posterior(rows, own, c0, c1, c2, across, down, foreign[mask], precision)
-                for other in (north, east, south, west):
-                    if other < 0 or other == own or other == label:  # noqa: SIM109 - faster
-                        continue
-                    mask = ring_mask(labels, y, x, other)
-                    if table[mask] == 0:
-                        label = own
-                        break
-                    score = log_posterior(rows, other, c0, c1, c2, across, down, foreign[mask], precision)
-                    if score > best:
-                        best, label = score, other
-                if label != own:
-                    labels[y, x] = label
-                    num_changed += 1
-    return num_changed
 
 
 def infer_labels(labels, colours, count):
@@ -146,7 +91,7 @@ def improve_labels(labels, colours, areas):
 def move_prior():
     """``[4]`` float64 log α, a, b and v of the moves, whose colours deviate as much as those of the label passes."""
     variance = COLOUR_DEVIATION**2
-    return np.array([np.log(ALPHA), PRIOR_SHAPE, PRIOR_SHAPE * variance, MEAN_DEVIATION**2 / variance])
+    return np.array([math.log(ALPHA), PRIOR_SHAPE, PRIOR_SHAPE * variance, MEAN_DEVIATION**2 / variance])
 
 
 def adapt_labels(labels, colours, count, factor, share):

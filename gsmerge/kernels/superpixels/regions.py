@@ -10,36 +10,29 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.kernels.jit import kernel
+from gsmerge.native.signature import STATUS, f4, f8, i4, native
 
 NUM_PIXELS, ROW = 5, 8  # column after the five of the mean, and the length of a row
 
 
 def pad_labels(labels):
     """A label picture ``[h,w]`` with the frame that the kernels expect."""
-    return np.pad(labels.astype(np.int32, copy=False), 1, constant_values=-1)
+    return np.pad(np.ascontiguousarray(labels, np.int32), 1, constant_values=-1)
 
 
-@kernel
+@native(
+    STATUS, labels=i4("padded_height", "padded_width"), pixels=f4("height", "width", 3), spread=f4(),
+    sums=f8("count", 6, out=True), rows=f4("capacity", ROW, out=True),
+)  # fmt: skip
+def _region_rows(labels, pixels, spread, sums, rows):
+    """Write the first ``count`` rows of a padded label picture; ``sums`` are zero before."""
+
+
 def region_rows(labels, pixels, count, capacity, spread):
-    """``[capacity,8]`` float32, of which the first ``count`` rows are filled; sums are float64."""
-    height, width, _ = pixels.shape
-    sums = np.zeros((count, 6))
-    for y in range(height):
-        for x in range(width):
-            label = labels[y + 1, x + 1]
-            sums[label, 0] += pixels[y, x, 0]
-            sums[label, 1] += pixels[y, x, 1]
-            sums[label, 2] += pixels[y, x, 2]
-            sums[label, 3] += y
-            sums[label, 4] += x
-            sums[label, 5] += 1.0
+    """``[capacity,8]`` float32, of which the first ``count`` rows are filled; sums are float64.
+
+    Raises ValueError where padded labels are not from 0 to ``count - 1``.
+    """
     rows = np.zeros((capacity, ROW), np.float32)
-    for label in range(count):
-        num_pixels = sums[label, 5]
-        for i in range(3):
-            rows[label, i] = sums[label, i] / num_pixels
-        rows[label, 3] = spread * sums[label, 3] / num_pixels
-        rows[label, 4] = spread * sums[label, 4] / num_pixels
-        rows[label, NUM_PIXELS] = num_pixels
+    _region_rows(labels, pixels, spread, np.zeros((count, 6)), rows)
     return rows

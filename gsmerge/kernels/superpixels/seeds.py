@@ -1,4 +1,4 @@
-"""Seeds for superpixels, and the regions that grow from them."""
+"""Corners of a picture, seeds for superpixels, and the regions that grow from them."""
 
 from __future__ import annotations
 
@@ -6,10 +6,30 @@ import math
 
 import numpy as np
 
-from gsmerge.kernels.jit import kernel
+from gsmerge.native.signature import STATUS, f4, f8, i4, i8, native, u1
 
 DENSITY_FLOOR = 0.3  # share of the seeds that is spread evenly
 JITTER = 0.3  # width of the noise on the dithering threshold, against worm patterns
+
+
+@native(
+    STATUS, pixels=f4("height", "width", 3), planes=f4(4, "height", "stride", out=True),
+    response=f4("height", "width", out=True),
+)  # fmt: skip
+def _corner_response(pixels, planes, response):
+    """Write what :func:`corner_response` returns; ``planes`` are overwritten."""
+
+
+def corner_response(pixels):
+    """``[h,w]`` float32, at least 0: the smaller eigenvalue of the grey picture's structure tensor (Shi and Tomasi).
+
+    Of Sobel's derivatives, over 3 x 3 pixels, mirrored at the border, in OpenCV's scale, whose
+    last bits depend on the processor. ``pixels [h,w,3]`` float32.
+    """
+    height, width, _ = pixels.shape
+    response = np.empty((height, width), np.float32)
+    _corner_response(pixels, np.empty((4, height, width + 2), np.float32), response)
+    return response
 
 
 def hexagonal_seeds(height, width, count):
@@ -37,29 +57,20 @@ def seed_density(saliency, count):
     return density
 
 
-@kernel(exact=True)
+@native(
+    STATUS, density=f8("height", "width"), jitter=f8(), errors=f8(2, "columns", out=True),
+    seeds=u1("height", "width", out=True),
+)  # fmt: skip
+def _dither(density, jitter, errors, seeds):
+    """Write what :func:`dither` returns; ``errors`` are zero before."""
+
+
 def dither(density):
     """Serpentine Floyd-Steinberg dithering with a jittered threshold: ``[h,w]`` bool, True at a seed."""
     height, width = density.shape
-    seeds = np.zeros((height, width), np.bool_)
-    errors = np.zeros((2, width + 2))
-    noise = np.uint32(1)
-    for y in range(height):
-        here, below = errors[y % 2], errors[(y + 1) % 2]
-        below[:] = 0
-        ahead = 1 if y % 2 == 0 else -1
-        for step in range(width):
-            x = step if ahead == 1 else width - 1 - step
-            noise = np.uint32(noise * np.uint32(1664525) + np.uint32(1013904223))
-            threshold = 0.5 + JITTER * ((noise >> np.uint32(8)) / 16777216.0 - 0.5)
-            share = density[y, x] + here[x + 1]
-            seeds[y, x] = share > threshold
-            error = share - (1.0 if seeds[y, x] else 0.0)
-            here[x + 1 + ahead] += error * 0.4375
-            below[x + 1 - ahead] += error * 0.1875
-            below[x + 1] += error * 0.3125
-            below[x + 1 + ahead] += error * 0.0625
-    return seeds
+    seeds = np.empty((height, width), np.uint8)
+    _dither(density, JITTER, np.zeros((2, width + 2)), seeds)
+    return seeds.view(np.bool_)
 
 
 def _spread_picks(weights, count):
@@ -85,23 +96,16 @@ def seeds_from_density(density, count):
     return np.stack(np.unravel_index(np.flatnonzero(seeds), density.shape), 1)
 
 
-@kernel
+@native(STATUS, seeds=i8("count", 2), queue=i4("places", 2, out=True), labels=i4("height", "width", out=True))
+def _voronoi(seeds, queue, labels):
+    """Write what :func:`voronoi` returns; ``queue`` is overwritten."""
+
+
 def voronoi(seeds, height, width):
-    """``[h,w]`` int32: the seed nearest to each pixel, counted in steps to 4-neighbours; every region is connected."""
-    labels = np.full((height, width), -1, np.int32)
-    queue = np.empty((height * width, 2), np.int64)
-    tail = len(seeds)
-    for label in range(tail):
-        y, x = seeds[label, 0], seeds[label, 1]
-        labels[y, x] = label
-        queue[label, 0], queue[label, 1] = y, x
-    head = 0
-    while head < tail:
-        y, x = queue[head, 0], queue[head, 1]
-        head += 1
-        for next_y, next_x in ((y - 1, x), (y + 1, x), (y, x - 1), (y, x + 1)):
-            if 0 <= next_y < height and 0 <= next_x < width and labels[next_y, next_x] < 0:
-                labels[next_y, next_x] = labels[y, x]
-                queue[tail, 0], queue[tail, 1] = next_y, next_x
-                tail += 1
+    """``[h,w]`` int32: the seed nearest to each pixel, counted in steps to 4-neighbours; every region is connected.
+
+    ``seeds [count,2]`` int64 are y and x of pixels; ValueError for one outside of the picture.
+    """
+    labels = np.empty((height, width), np.int32)
+    _voronoi(seeds, np.empty((height * width + len(seeds), 2), np.int32), labels)
     return labels

@@ -12,18 +12,22 @@ is lost), sets b_0 to a_0 times a deviation instead of a variance, and accepts l
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
-from gsmerge.kernels.jit import kernel
-from gsmerge.kernels.superpixels.ward import adjacent_pairs, pair_tie
+from gsmerge.kernels.superpixels.ward import adjacent_pairs
+from gsmerge.native.signature import STATUS, f4, f8, i4, i8, native, u1
 
 SUMS = 7  # columns of a region's sums: pixels, colours (3), squared colours (3)
-LOG_ALPHA, SHAPE, SCALE, SPREAD = 0, 1, 2, 3  # of a prior: log α, a and b of the inverse gamma, v
 
 
-@kernel
+@native(
+    STATUS, labels=i4("padded_height", "padded_width"), colours=f4("height", "width", 3), marks=u1("height", "width"),
+    sums=f8("count", SUMS, out=True),
+)  # fmt: skip
+def _sum_regions(labels, colours, marks, sums):
+    """Add the marked pixels to the sums of their regions."""
+
+
 def sum_regions(labels, colours, marks, count):
     """``[count,7]`` float64 sums over the marked pixels of every region.
 
@@ -33,21 +37,12 @@ def sum_regions(labels, colours, marks, count):
         marks: ``[h,w]`` bool.
         count: Number of regions.
     """
-    height, width, _ = colours.shape
     sums = np.zeros((count, SUMS))
-    for y in range(height):
-        for x in range(width):
-            if marks[y, x]:
-                label = labels[y + 1, x + 1]
-                sums[label, 0] += 1.0
-                for i in range(3):
-                    colour = np.float64(colours[y, x, i])
-                    sums[label, 1 + i] += colour
-                    sums[label, 4 + i] += colour * colour
+    _sum_regions(labels, colours, marks.view(np.uint8), sums)
     return sums
 
 
-@kernel(part=True)
+@native(f8(), sums=f8(SUMS), prior=f8(4))
 def log_evidence(sums, prior):
     """Logarithm of ``Γ(n) f`` of a region's ``[7]`` sums.
 
@@ -55,49 +50,17 @@ def log_evidence(sums, prior):
     (1 + n v)^(-1/2) Γ(a_n) / Γ(a) b^a / b_n^(a_n)``, where ``a_n = a + n / 2`` and ``b_n = b + (Σ c² - (Σ c)² v /
     (1 + n v)) / 2`` (Murphy 2007, section 3).
     """
-    n, a, b, v = sums[0], prior[SHAPE], prior[SCALE], prior[SPREAD]
-    shape = a + 0.5 * n
-    value = math.lgamma(n) - n * np.log(n)
-    value += 3.0 * (math.lgamma(shape) - math.lgamma(a) - 0.5 * np.log(1.0 + n * v) - 0.5 * n * np.log(2.0 * np.pi * b))
-    for i in range(3):
-        error = sums[4 + i] - sums[1 + i] * sums[1 + i] * v / (1.0 + n * v)
-        value -= shape * np.log(1.0 + 0.5 * max(error, 0.0) / b)
-    return value
 
 
-@kernel
-def _region_ends(labels, count, across):
-    """``[count,4]`` y and x of a first and a last pixel of every region, different ones where it has two.
-
-    They are in the region's first and last row, or where ``across`` column, next to the middle of its pixels. A region
-    of one row or column is taken along it.
-    """
-    height, width = labels.shape[0] - 2, labels.shape[1] - 2
-    boxes, sums = np.empty((count, 4), np.int64), np.zeros((count, 3))
-    boxes[:, :2], boxes[:, 2:] = height + width, -1
-    for y in range(height):
-        for x in range(width):
-            label = labels[y + 1, x + 1]
-            boxes[label, 0], boxes[label, 2] = min(boxes[label, 0], y), max(boxes[label, 2], y)
-            boxes[label, 1], boxes[label, 3] = min(boxes[label, 1], x), max(boxes[label, 3], x)
-            sums[label, 0] += y
-            sums[label, 1] += x
-            sums[label, 2] += 1.0
-    ends, offsets = np.empty((count, 4), np.int64), np.full((count, 2), np.inf)
-    for y in range(height):
-        for x in range(width):
-            label = labels[y + 1, x + 1]
-            sideways = boxes[label, 1] < boxes[label, 3] and (across or boxes[label, 0] == boxes[label, 2])
-            place, other, axis = (x, y, 1) if sideways else (y, x, 0)
-            offset = abs(other - sums[label, 1 - axis] / sums[label, 2])
-            for end in range(2):
-                if place == boxes[label, 2 * end + axis] and offset < offsets[label, end]:
-                    offsets[label, end] = offset
-                    ends[label, 2 * end], ends[label, 2 * end + 1] = y, x
-    return ends
+@native(
+    STATUS, labels=i4("padded_height", "padded_width"), across=i4(), boxes=i8("count", 4, out=True),
+    sums=f8("count", 3, out=True), offsets=f8("count", 2, out=True), ends=i8("count", 2, out=True),
+    queue=i4("places", 2, out=True), halves=u1("height", "width", out=True),
+)  # fmt: skip
+def _mark_halves(labels, across, boxes, sums, offsets, ends, queue, halves):
+    """Write what :func:`mark_halves` returns; ``sums`` are zero before, the other buffers are overwritten."""
 
 
-@kernel
 def mark_halves(labels, count, across):
     """``[h,w]`` bool: the second half of every region, both halves 4-connected; none of a region of one pixel.
 
@@ -105,30 +68,17 @@ def mark_halves(labels, count, across):
     ``across`` of its left and right.
     """
     height, width = labels.shape[0] - 2, labels.shape[1] - 2
-    ends = _region_ends(labels, count, across)
-    side = np.full((height, width), 2, np.uint8)
-    queue = np.empty((height * width + count, 2), np.int64)
-    tail = 0
-    for label in range(count):
-        for end in range(2):
-            y, x = ends[label, 2 * end], ends[label, 2 * end + 1]
-            if side[y, x] == 2:
-                side[y, x] = end
-                queue[tail, 0], queue[tail, 1] = y, x
-                tail += 1
-    head = 0
-    while head < tail:
-        y, x = queue[head, 0], queue[head, 1]
-        head += 1
-        for next_y, next_x in ((y - 1, x), (y + 1, x), (y, x - 1), (y, x + 1)):
-            if labels[next_y + 1, next_x + 1] == labels[y + 1, x + 1] and side[next_y, next_x] == 2:
-                side[next_y, next_x] = side[y, x]
-                queue[tail, 0], queue[tail, 1] = next_y, next_x
-                tail += 1
-    return side == 1
+    halves, queue = np.empty((height, width), np.uint8), np.empty((height * width, 2), np.int32)
+    boxes, ends = np.empty((count, 4), np.int64), np.empty((count, 2), np.int64)
+    _mark_halves(labels, across, boxes, np.zeros((count, 3)), np.empty((count, 2)), ends, queue, halves)
+    return halves == 1
 
 
-@kernel
+@native(whole=f8("count", SUMS), second=f8("count", SUMS), prior=f8(4), ratios=f8("count", out=True))
+def _weigh_splits(whole, second, prior, ratios):
+    """Write what :func:`weigh_splits` returns, but leave alone where there is nothing to split."""
+
+
 def weigh_splits(whole, second, prior):
     """``[count]`` log H of splitting every region; -inf where there is nothing to split.
 
@@ -138,26 +88,23 @@ def weigh_splits(whole, second, prior):
         prior: ``[4]`` float64, log α, a, b and v.
     """
     ratios = np.full(len(whole), -np.inf)
-    for label in range(len(whole)):
-        if second[label, 0] > 0:
-            parts = log_evidence(whole[label] - second[label], prior) + log_evidence(second[label], prior)
-            ratios[label] = prior[LOG_ALPHA] + parts - log_evidence(whole[label], prior)
+    _weigh_splits(whole, second, prior, ratios)
     return ratios
 
 
-@kernel
+@native(
+    sums=f8("count", SUMS), pairs=i4("num_pairs", 2, least=0, below="count"), prior=f8(4), own=f8("count", out=True),
+    partners=i4("count", out=True), ratios=f8("count", out=True),
+)  # fmt: skip
+def _choose_merges(sums, pairs, prior, own, partners, ratios):
+    """Write what :func:`choose_merges` returns over -1 and -inf; ``own`` is overwritten."""
+
+
 def choose_merges(pairs, sums, prior):
     """Every region's best neighbour ``[count]`` (-1: none) and log H ``[count]`` of merging with it."""
     count = len(sums)
-    partners, ratios, own = np.full(count, -1, np.int32), np.full(count, -np.inf), np.empty(count)
-    for label in range(count):
-        own[label] = log_evidence(sums[label], prior)
-    for e in range(len(pairs)):
-        u, v = min(pairs[e, 0], pairs[e, 1]), max(pairs[e, 0], pairs[e, 1])
-        ratio = log_evidence(sums[u] + sums[v], prior) - own[u] - own[v] - prior[LOG_ALPHA] + pair_tie(u, v)
-        for label, other in ((u, v), (v, u)):
-            if ratio > ratios[label] or (ratio == ratios[label] and other < partners[label]):
-                ratios[label], partners[label] = ratio, other
+    partners, ratios = np.full(count, -1, np.int32), np.full(count, -np.inf)
+    _choose_merges(sums, pairs, prior, np.empty(count), partners, ratios)
     return partners, ratios
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.kernels.jit import kernel
-from gsmerge.kernels.superpixels.regions import NUM_PIXELS, region_rows
+from gsmerge.kernels.superpixels.regions import NUM_PIXELS, ROW, region_rows
+from gsmerge.native.signature import COUNT, f4, i4, i8, native, u1
 
 LEAVE, JOIN = 6, 7  # columns of a region's row: n / (n - 1) for a pixel that leaves, n / (n + 1) for one that joins
 
@@ -23,80 +23,32 @@ def connectivity_table() -> np.ndarray:
     return ((edges.sum(1) - joined.sum(1) == 1) | cells.all(1)).astype(np.uint8)
 
 
-@kernel(inline=True)
+@native(COUNT, labels=i4("rows", "columns"), y=i8(), x=i8(), label=i4())
 def ring_mask(labels, y, x, label):
     """Bits of the eight neighbours (N, NE, E, SE, S, SW, W, NW) that have ``label``."""
-    return (
-        (labels[y - 1, x] == label)
-        | (labels[y - 1, x + 1] == label) << 1
-        | (labels[y, x + 1] == label) << 2
-        | (labels[y + 1, x + 1] == label) << 3
-        | (labels[y + 1, x] == label) << 4
-        | (labels[y + 1, x - 1] == label) << 5
-        | (labels[y, x - 1] == label) << 6
-        | (labels[y - 1, x - 1] == label) << 7
-    )
 
 
-@kernel(part=True)
-def distance(rows, label, f0, f1, f2, f3, f4):
-    """Squared distance of a pixel's feature to a region's mean."""
-    d0, d1, d2 = f0 - rows[label, 0], f1 - rows[label, 1], f2 - rows[label, 2]
-    d3, d4 = f3 - rows[label, 3], f4 - rows[label, 4]
-    return d0 * d0 + d1 * d1 + d2 * d2 + d3 * d3 + d4 * d4
-
-
-@kernel
-def _shift(rows, label, sign, f0, f1, f2, f3, f4):
-    """Add (sign 1) or take away (sign -1) one pixel."""
-    one = np.float32(1)
-    num_pixels = rows[label, NUM_PIXELS] + sign
-    step = sign / num_pixels
-    rows[label, NUM_PIXELS] = num_pixels
-    rows[label, LEAVE], rows[label, JOIN] = num_pixels / (num_pixels - one), num_pixels / (num_pixels + one)
-    rows[label, 0] += step * (f0 - rows[label, 0])
-    rows[label, 1] += step * (f1 - rows[label, 1])
-    rows[label, 2] += step * (f2 - rows[label, 2])
-    rows[label, 3] += step * (f3 - rows[label, 3])
-    rows[label, 4] += step * (f4 - rows[label, 4])
-
-
-@kernel
+@native(
+    COUNT, labels=i4("padded_height", "padded_width", out=True), pixels=f4("height", "width", 3),
+    rows=f4("count", ROW, out=True), table=u1(256), spread=f4(), backward=i4(),
+)  # fmt: skip
 def sweep(labels, pixels, rows, table, spread, backward):
     """One raster pass of border moves: each lowers the total squared error, and the means follow at once.
 
     A pixel goes from region A to a 4-neighbour's region B if ``n_A/(n_A-1)·d_A² > n_B/(n_B+1)·d_B²`` and A stays
     connected without it. It needs a neighbour of its own label, so that no region can run empty.
+
+    Args:
+        labels: Padded labels 0 to ``count - 1``, changed.
+        pixels: ``[h,w,3]`` float32.
+        rows: ``[count,8]`` float32 rows of the regions with their last two columns, changed.
+        table: From :func:`connectivity_table`.
+        spread: Square root of the weight of squared pixels against squared colours.
+        backward: Whether the pass goes from the last pixel to the first.
+
+    Returns:
+        How many pixels moved.
     """
-    height, width, _ = pixels.shape
-    one = np.float32(1)
-    num_moved = 0
-    for step_y in range(1, height + 1):
-        y = height + 1 - step_y if backward else step_y
-        f3 = spread * np.float32(y - 1)
-        for step_x in range(1, width + 1):
-            x = width + 1 - step_x if backward else step_x
-            own = labels[y, x]
-            north, east, south, west = labels[y - 1, x], labels[y, x + 1], labels[y + 1, x], labels[y, x - 1]
-            if (north == own) & (east == own) & (south == own) & (west == own):
-                continue
-            if table[ring_mask(labels, y, x, own)] == 0:
-                continue
-            f0, f1, f2 = pixels[y - 1, x - 1, 0], pixels[y - 1, x - 1, 1], pixels[y - 1, x - 1, 2]
-            f4 = spread * np.float32(x - 1)
-            best, best_label = distance(rows, own, f0, f1, f2, f3, f4) * rows[own, LEAVE], own
-            for label in (north, east, south, west):
-                if label < 0 or label == own or label == best_label:  # noqa: SIM109 - faster
-                    continue
-                cost = distance(rows, label, f0, f1, f2, f3, f4) * rows[label, JOIN]
-                if cost < best:
-                    best, best_label = cost, label
-            if best_label != own:
-                labels[y, x] = best_label
-                _shift(rows, own, -one, f0, f1, f2, f3, f4)
-                _shift(rows, best_label, one, f0, f1, f2, f3, f4)
-                num_moved += 1
-    return num_moved
 
 
 CONNECTIVITY = connectivity_table()
