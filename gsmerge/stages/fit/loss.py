@@ -49,7 +49,7 @@ def image_gradient(
     """
     height, width = weight.shape
     gradient, errors = np.empty((height, 3 * width), np.float32), np.empty(height, np.float32)
-    flat, goal = (np.ascontiguousarray(a).reshape(height, -1) for a in (image, photo))
+    flat, goal = (np.ascontiguousarray(a, np.float32).reshape(height, -1) for a in (image, photo))
     with use_threads() as threads:
         cuts = [height * i // threads for i in range(threads + 1)]
         parallel_map(
