@@ -14,7 +14,7 @@ FAR = 50.0  # cost of any longer step forward: a stretch that was dropped costs 
     STATUS, pixels=i4("n", "v", least=-1, below=(1 << 31) - 1), came_from=i1("n", "v", out=True),
     views=i8("n", out=True), back=i8(1, out=True),
 )  # fmt: skip
-def find_path(pixels, came_from, views, back):
+def _find_path(pixels, came_from, views, back):
     """Do what :func:`cheapest_views` does; ``back`` becomes its result."""
 
 
@@ -25,5 +25,5 @@ def cheapest_views(pixels, came_from, views):
     int8, the best view of the row before. There are 1 to 127 views.
     """
     back = np.empty(1, np.int64)
-    find_path(pixels, came_from, views, back)
+    _find_path(pixels, came_from, views, back)
     return int(back[0])

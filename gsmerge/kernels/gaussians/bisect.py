@@ -15,7 +15,7 @@ from gsmerge.native.signature import STATUS, f4, f8, i4, i8, native
     child_starts=i8("slots", out=True), child_ids=i4("own", out=True), parents=i8("children", out=True),
     num_children=i8(1, out=True), errors=f8("groups", "width", out=True),
 )  # fmt: skip
-def split_groups(
+def _split_groups(
     starts, ids, means, sh0, opacities, centres, footprints, counts, plane_weight, features, weights, order, cuts, room,
     child_starts, child_ids, parents, num_children, errors,
 ):  # fmt: skip
@@ -66,7 +66,7 @@ def _split(starts, ids, means, sh0, opacities, centres, footprints, counts, erro
     longest, most, total = int(sizes.max(initial=0)), int(counts.max(initial=1)), int(counts.sum())
     child_starts, parents = np.empty(total + 1, np.int64), np.empty(total, np.int64)
     child_ids, made = np.empty(starts[-1] - starts[0], np.int32), np.empty(1, np.int64)
-    split_groups(
+    _split_groups(
         starts, np.asarray(ids, np.int32), means, sh0, opacities, centres, footprints, counts, plane_weight,
         np.empty((longest, 8)), np.empty(longest), np.empty((2, longest), np.int64), np.empty(most + 1, np.int64),
         np.empty((most, 18)), child_starts, child_ids, parents, made, errors,

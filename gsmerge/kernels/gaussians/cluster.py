@@ -43,7 +43,7 @@ def edge_scores(neighbors, means, covars, colors, latents, views, max_color, sim
     threshold=f8(), max_size=i8(), left=f8("k", out=True), clusters=i8("n", out=True),
     num_clusters=i8(1, out=True),
 )  # fmt: skip
-def find_stars(neighbors, scores, views, order, threshold, max_size, left, clusters, num_clusters):
+def _find_stars(neighbors, scores, views, order, threshold, max_size, left, clusters, num_clusters):
     """Write the results of :func:`leader_clusters`; ``left`` is overwritten."""
 
 
@@ -63,7 +63,7 @@ def leader_clusters(order, neighbors, scores, views, threshold, max_size):
     """
     n, k = neighbors.shape
     clusters, count = np.empty(n, np.int64), np.zeros(1, np.int64)
-    find_stars(neighbors, scores, views, order, threshold, max_size, np.empty(k), clusters, count)
+    _find_stars(neighbors, scores, views, order, threshold, max_size, np.empty(k), clusters, count)
     return clusters, int(count[0])
 
 
@@ -71,7 +71,7 @@ def leader_clusters(order, neighbors, scores, views, threshold, max_size):
     STATUS, neighbors=i8("n", "k"), scores=f8("n", "k"), threshold=f8(), parents=i8("n", out=True),
     clusters=i8("n", out=True), num_clusters=i8(1, out=True),
 )  # fmt: skip
-def find_components(neighbors, scores, threshold, parents, clusters, num_clusters):
+def _find_components(neighbors, scores, threshold, parents, clusters, num_clusters):
     """Write the results of :func:`connected_components`; ``parents`` is overwritten."""
 
 
@@ -83,5 +83,5 @@ def connected_components(neighbors, scores, threshold):
     """
     parents, clusters = np.empty((2, len(neighbors)), np.int64)
     count = np.zeros(1, np.int64)
-    find_components(neighbors, scores, threshold, parents, clusters, count)
+    _find_components(neighbors, scores, threshold, parents, clusters, count)
     return clusters, int(count[0])

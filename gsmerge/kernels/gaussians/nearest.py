@@ -31,7 +31,7 @@ def build_tree(points, order, axes, splits):
     STATUS, points=f8("n", 3), views=i8("n"), order=i8("m"), axes=i1("nodes"), splits=f8("nodes"), first=i8(least=0),
     last=i8(), most=i8(), distances=f8("k", out=True), out=i8("n", "k", out=True),
 )  # fmt: skip
-def search_tree(points, views, order, axes, splits, first, last, most, distances, out):
+def _search_tree(points, views, order, axes, splits, first, last, most, distances, out):
     """Do what :func:`nearest_of_others` does; ``distances`` is overwritten."""
 
 
@@ -47,4 +47,4 @@ def nearest_of_others(points, views, order, axes, splits, first, last, most, out
         most: Points that are looked at for each, whole leaves of the tree.
         out: ``[n,k]`` int64: nearest first, -1 where there are fewer.
     """
-    search_tree(points, views, order, axes, splits, first, last, most, np.empty(out.shape[1]), out)
+    _search_tree(points, views, order, axes, splits, first, last, most, np.empty(out.shape[1]), out)

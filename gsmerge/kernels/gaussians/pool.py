@@ -8,7 +8,7 @@ from gsmerge.native.signature import STATUS, f4, f8, i4, i8, native
 
 
 @native(STATUS, labels=i4("n"), starts=i8("ends", out=True), ids=i4("n", out=True))
-def sort_labels(labels, starts, ids):
+def _sort_labels(labels, starts, ids):
     """Write where each label's members begin and, to the front of ``ids``, the members."""
 
 
@@ -20,7 +20,7 @@ def group_members(labels, count):
         count: Number of labels.
     """
     starts, ids = np.empty(count + 1, np.int64), np.empty(len(labels), np.int32)
-    sort_labels(labels, starts, ids)
+    _sort_labels(labels, starts, ids)
     return starts, ids[: starts[-1]]
 
 
@@ -30,7 +30,7 @@ def group_members(labels, count):
     own_covariance=i4(), caps=f8("longest", out=True), order=i8("longest", out=True),
     out_geometry=f8("groups", 13, out=True), out_sh=f4("groups", "bases", 3, out=True),
 )  # fmt: skip
-def pool_groups(
+def _pool_groups(
     starts, ids, means, quats, scales, opacities, sh0, shN, footprints, own_covariance, caps, order, out_geometry,
     out_sh,
 ):  # fmt: skip
@@ -58,7 +58,7 @@ def pool(starts, ids, means, quats, scales, opacities, sh0, shN, footprints, own
         out_sh: ``[g,k,3]`` float32, zero before.
     """
     longest = int(np.diff(starts).max(initial=0))
-    pool_groups(
+    _pool_groups(
         starts, np.asarray(ids, np.int32), means, quats, scales, opacities, sh0, shN, footprints, own_covariance,
         np.empty(longest), np.empty(longest, np.int64), out_geometry, out_sh,
     )  # fmt: skip
