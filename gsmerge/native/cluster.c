@@ -1,9 +1,6 @@
 // Overlap of neighbouring Gaussians, and clusters of those that overlap.
 #include "exp_log.h"
 
-typedef float v8f __attribute__((vector_size(32), aligned(4)));
-typedef float v4f __attribute__((vector_size(16)));
-
 // Determinant of a symmetric 3 x 3 given as xx xy xz yy yz zz.
 static inline double find_det(const double *a) {
   return a[0] * (a[3] * a[5] - a[4] * a[4]) - a[1] * (a[1] * a[5] - a[4] * a[2])
@@ -56,8 +53,7 @@ static inline double find_cosine(const float *a, const float *b, int64_t d) {
   for (; c + 8 <= d; c += 8) sum += *(const v8f *)(a + c) * *(const v8f *)(b + c);
   float rest = 0.f;
   for (; c < d; c++) rest += a[c] * b[c];
-  v4f half = __builtin_shufflevector(sum, sum, 0, 1, 2, 3)
-      + __builtin_shufflevector(sum, sum, 4, 5, 6, 7);
+  v4f half = PICK(sum, sum, 0, 1, 2, 3) + PICK(sum, sum, 4, 5, 6, 7);
   return (half[0] + half[2]) + (half[1] + half[3]) + rest;
 }
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsmerge.research.generate.cast import BLOB, BOX, CONE, ELLIPSOID, add_light, cast
+from gsmerge.kernels.cast import BLOB, BOX, CONE, ELLIPSOID, add_light, cast
 from gsmerge.research.generate.shapes import Array, Shape, ShapeArrays, bounds, pack
 from gsmerge.research.generate.textures import Picture, pyramid
 

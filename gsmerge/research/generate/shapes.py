@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from gsmerge.research.generate.cast import BLOB, BOX, CONE, ELLIPSOID, LEAF, QUAD
+from gsmerge.kernels.cast import BLOB, BOX, CONE, ELLIPSOID, LEAF, QUAD
 
 Array: TypeAlias = NDArray[Any]
 Vector: TypeAlias = Sequence[float] | Array  # of length 3
@@ -30,7 +30,7 @@ class Material:
 
 @dataclass(frozen=True)
 class Shape:
-    """One shape, see :mod:`gsmerge.research.generate.cast` for the kinds."""
+    """One shape, see :mod:`gsmerge.kernels.cast` for the kinds."""
 
     kind: int
     size: tuple[float, float, float, float]  # half sizes along its axes, and the taper of a cone
