@@ -56,3 +56,29 @@ static inline double acos8(double x) {
                          : 2.0 * arc;
   return small ? inner : outer;
 }
+
+// Arc tangent of y / x in the quadrant of (x, y), -pi to pi, as Cephes: 0 for the origin, NaN for
+// NaN.
+static inline double atan28(double y, double x) {
+  double a = absf8(x), b = absf8(y);
+  bool steep = b > a;
+  double low = steep ? a : b, high = steep ? b : a;
+  double t = high > 0.0 ? low / high : low + high;
+  t = low == high && high > 0.0 ? 1.0 : t;  // also for inf
+  bool far = t > 0.66;
+  double u = far ? (t - 1.0) / (t + 1.0) : t, z = u * u;
+  double p = -8.750608600031904122785e-01 * z - 1.615753718733365076637e+01;
+  p = p * z - 7.500855792314704667340e+01;
+  p = p * z - 1.228866684490136173410e+02;
+  p = p * z - 6.485021904942025371773e+01;
+  double q = z + 2.485846490142306297962e+01;
+  q = q * z + 1.650270098316988542046e+02;
+  q = q * z + 4.328810604912902668951e+02;
+  q = q * z + 4.853903996359136964868e+02;
+  q = q * z + 1.945506571482613964425e+02;
+  double arc = u + u * (z * p / q);
+  arc = far ? 7.85398163397448309616e-01 + (arc + 3.06161699786838301793e-17) : arc;
+  arc = steep ? 1.57079632679489661923e+00 - (arc - 6.12323399573676603587e-17) : arc;
+  arc = x < 0.0 ? 3.14159265358979311600e+00 - (arc - 1.22464679914735317723e-16) : arc;
+  return y < 0.0 ? -arc : arc;
+}
