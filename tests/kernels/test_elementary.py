@@ -42,6 +42,12 @@ def test_shapes_and_types_are_kept(function: Callable[[np.ndarray], np.ndarray])
     np.testing.assert_allclose(function(values[:, ::2]), function(values)[:, ::2], rtol=0)
 
 
+def test_numbers_are_float64() -> None:
+    assert exp(1.0) == pytest.approx(np.e, rel=1e-15)
+    assert arctan2(1.0, 1.0) == pytest.approx(np.pi / 4, rel=1e-15)
+    assert power(np.float32([2]), 0.5).dtype == np.float32
+
+
 def test_powers() -> None:
     values = np.array([0.0, 0.25, 1.0, 4.0])
     np.testing.assert_allclose(power(values, 0.5), [0, 0.5, 1, 2], rtol=1e-15)
