@@ -31,9 +31,9 @@ def _apply(function, *arrays):
     """Call a function of flat float64 arrays; the result is float32 where all arrays are, numbers aside."""
     kinds = [a.dtype for a in arrays if isinstance(a, np.ndarray)]
     kind = np.result_type(*kinds, np.float32) if kinds else np.float64
-    wide = np.broadcast_arrays(*(np.asarray(a, np.float64) for a in arrays))
-    out = np.empty(wide[0].shape)
-    function(*(np.ascontiguousarray(a).reshape(-1) for a in wide), out.reshape(-1))
+    wide = [np.asarray(a, np.float64) for a in arrays]
+    out = np.empty(np.broadcast_shapes(*(a.shape for a in wide)))
+    function(*(np.ascontiguousarray(np.broadcast_to(a, out.shape)).reshape(-1) for a in wide), out.reshape(-1))
     return out.astype(kind, copy=False)
 
 
