@@ -63,8 +63,8 @@ static void cap_members(const members *m, const int32_t *ids, int64_t n, double 
   for (int64_t j = 0; j < n; j++) caps[j] = caps[j] > limit ? limit / caps[j] : 1.0;
 }
 
-// Adds w R diag(s)^2 R^T to a covariance xx xy xz yy yz zz, with the rotation R of a quaternion wxyz
-// of any length; the zero quaternion stands for no rotation.
+// Adds w R diag(s)^2 R^T to a covariance xx xy xz yy yz zz, with the rotation R of a quaternion
+// wxyz of any length; the zero quaternion stands for no rotation.
 static inline void add_covariance(const float *quat, const double *s, double weight, double *c) {
   double w = quat[0], x = quat[1], y = quat[2], z = quat[3];
   double n = w * w + x * x + y * y + z * z, f = n > 0.0 ? 2.0 / n : 0.0;
@@ -80,21 +80,30 @@ static inline void add_covariance(const float *quat, const double *s, double wei
       c[k] += v[0] * r[i][0] * r[j][0] + v[1] * r[i][1] * r[j][1] + v[2] * r[i][2] * r[j][2];
 }
 
+// Weighted sums over a group: of weights, means and footprints.
+static inline void sum_means(const members *m, const int32_t *ids, int64_t n, bool uniform,
+                             double *sums) {
+  for (int k = 0; k < 5; k++) sums[k] = 0.0;
+  for (int64_t j = 0; j < n; j++) {
+    int64_t i = ids[j];
+    double w = uniform ? 1.0 : mind(m->opacities[i], MAX_OPACITY);
+    sums[0] += w;
+    for (int k = 0; k < 3; k++) sums[1 + k] += w * m->means[3 * i + k];
+    sums[4] += w * m->footprints[i];
+  }
+}
+
 // Moments of one group; see pool.py. The weights of a fully transparent group are equal: it still
 // has a place.
 static void pool_group(const members *m, const int32_t *ids, int64_t n, const double *caps,
                        bool own, double *out, float *out_sh) {
-  double total = 0.0;
-  for (int64_t j = 0; j < n; j++) total += mind(m->opacities[ids[j]], MAX_OPACITY);
+  double sums[5], mean[3], c[6] = {0}, mass = 0.0, extinction = 0.0;
+  sum_means(m, ids, n, false, sums);
+  double total = sums[0];
   bool uniform = total <= 0.0;
-  double norm = uniform ? 1.0 / (double)n : 1.0 / total;
-  double mean[3] = {0}, footprint = 0.0, c[6] = {0}, mass = 0.0, extinction = 0.0;
-  for (int64_t j = 0; j < n; j++) {
-    int64_t i = ids[j];
-    double w = uniform ? norm : mind(m->opacities[i], MAX_OPACITY) * norm;
-    for (int k = 0; k < 3; k++) mean[k] += w * m->means[3 * i + k];
-    footprint += w * m->footprints[i];
-  }
+  if (uniform) sum_means(m, ids, n, true, sums);
+  double norm = 1.0 / sums[0], footprint = sums[4] * norm;
+  for (int k = 0; k < 3; k++) mean[k] = sums[1 + k] * norm;
   for (int64_t j = 0; j < n; j++) {
     int64_t i = ids[j];
     double a = mind(m->opacities[i], MAX_OPACITY), w = uniform ? norm : a * norm;
