@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.gaussians.pool import decompose, pool
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import FeatureGaussians, Gaussians, Scene, to_float32
@@ -49,7 +50,7 @@ def scene_members(scene: Scene) -> Members:
         rows = slice(view * pixels, (view + 1) * pixels)
         third = cameras.viewmats[view, 2].astype(np.float32)
         focal = float(np.sqrt(abs(cameras.Ks[view, 0, 0] * cameras.Ks[view, 1, 1])))
-        depths = np.abs(means[rows] @ third[:3] + third[3])
+        depths = np.abs(np.einsum("nd,d->n", means[rows], third[:3]) + third[3])
         footprints[rows] = np.maximum(depths, 1e-6) / focal
 
     parallel_map(fill, range(len(scene)))
@@ -120,7 +121,7 @@ def pool_members(members: Members, starts: np.ndarray, ids: np.ndarray, rule: Ru
     if rule == "paper" and num_groups:
         scales, _ = principal_axes(covars)
         mean = np.add.reduceat(members.opacities[ids].astype(np.float64), starts[:-1]) / np.diff(starts)
-        extinctions = -np.log1p(-np.clip(mean, 1e-4, MAX_OPACITY)) * scales[:, 1] * scales[:, 2]
+        extinctions = -log(1 - np.clip(mean, 1e-4, MAX_OPACITY)) * scales[:, 1] * scales[:, 2]
     return Moments(geometry[:, :3], covars, geometry[:, 9], geometry[:, 10], extinctions, geometry[:, 12], sh)
 
 
@@ -140,7 +141,7 @@ def principal_axes(covars: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def to_gaussians(covars: np.ndarray, extinctions: np.ndarray, means: np.ndarray, sh: np.ndarray) -> Gaussians:
     """Return Gaussians of given moments; opacity comes from the conserved optical depth over the disc."""
     scales, quats = principal_axes(covars)
-    opacities = 1 - np.exp(-extinctions / (scales[:, 1] * scales[:, 2]))
+    opacities = 1 - exp(-extinctions / (scales[:, 1] * scales[:, 2]))
     return Gaussians(
         means=to_float32(means),
         quats=to_float32(quats),

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
+from gsmerge.kernels.elementary import log
 from gsmerge.kernels.gaussians.cross_view import COLUMNS, sum_cross_view
 from gsmerge.kernels.gaussians.nearest import LEAF, build_tree, nearest_of_others
 from gsmerge.moments import Members
@@ -30,7 +33,7 @@ def cross_view_stats(
     the logarithm of the number of views. For an unaligned scene the first six are zero.
     """
     stats = np.zeros((len(means), NUM_STATS), np.float32)
-    stats[:, 6] = np.log(len(cameras)) / 4
+    stats[:, 6] = math.log(len(cameras)) / 4
     if members.pixels is not None or len(means) == 0:
         return stats
     points, colors = np.ascontiguousarray(means, np.float64), np.ascontiguousarray(SH_C0 * sh0[:, 0])
@@ -47,7 +50,7 @@ def cross_view_stats(
     parallel_map(add, range(0, len(points), ROWS))
     num_seen, num_same = np.maximum(sums[:, 0], 1), np.maximum(sums[:, 1], 1)
     shares = [sums[:, 1] / num_seen, sums[:, 2] / num_seen, sums[:, 3] / num_seen, sums[:, 4] / num_same]
-    stats[:, :6] = np.stack([np.log1p(sums[:, 0]) / 3, *shares, sums[:, 5] / num_seen / FAR], 1)
+    stats[:, :6] = np.stack([log(1 + sums[:, 0]) / 3, *shares, sums[:, 5] / num_seen / FAR], 1)
     return stats
 
 

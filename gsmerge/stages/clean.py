@@ -98,7 +98,7 @@ def inside_crop(means: np.ndarray, crop: str) -> np.ndarray:
 def beyond_scene(means: np.ndarray, samples: np.ndarray | None = None) -> np.ndarray:
     """Return a mask ``[n]`` of centres outside ten times the box of 1 % to 99 % of them, or of ``samples``."""
     low, high = np.percentile(means if samples is None else samples, BOX_QUANTILES, axis=0)
-    half = np.maximum((high - low) / 2, 1e-3 * max(float(np.linalg.norm(high - low)), 1e-30))
+    half = np.maximum((high - low) / 2, 1e-3 * max(float(np.sqrt(((high - low) ** 2).sum())), 1e-30))
     return np.asarray((np.abs(means - (low + high) / 2) > OUTLIER_BOX * half).any(1))
 
 

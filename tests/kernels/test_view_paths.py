@@ -52,3 +52,32 @@ def test_the_true_path_is_found() -> None:
     chosen, back = run(pixels)
     assert back == 0
     assert (chosen == view).mean() > 0.97
+
+
+@pytest.mark.parametrize("views", [1, 2, 16, 17, 127])
+def test_the_path_is_the_same_on_every_processor(each_target, views: int) -> None:  # type: ignore[no-untyped-def]
+    rng = np.random.default_rng(views)
+    pixels = rng.integers(-1, 90, (40, views)).astype(np.int32)
+    pixels[20] = 2**31 - 2
+
+    def path() -> tuple[np.ndarray, ...]:
+        came_from, chosen = np.zeros(pixels.shape, np.int8), np.empty(40, np.int64)
+        return came_from, chosen, np.array(cheapest_views(pixels, came_from, chosen))
+
+    _, chosen, back = each_target(path)
+    steps = [
+        slow_cost(int(pixels[i, chosen[i]]), chosen[i], int(pixels[i + 1, chosen[i + 1]]), chosen[i + 1])
+        for i in range(39)
+    ]
+    assert back == sum(cost == BACK for cost in steps)
+
+
+def test_few_rows_and_views() -> None:
+    assert run(np.empty((0, 3), np.int32))[1] == 0
+    assert [part.tolist() for part in map(np.asarray, run(np.array([[-1, 5]], np.int32)))] == [[1], 0]
+    for views in (0, 128):
+        with pytest.raises(ValueError, match="find_path: expected indices inside"):
+            run(np.zeros((3, views), np.int32))
+    for pixel in (-2, 2**31 - 1):
+        with pytest.raises(ValueError, match="pixels: expected values"):
+            run(np.full((3, 2), pixel, np.int32))

@@ -2,36 +2,17 @@
 
 from __future__ import annotations
 
-from gsmerge.kernels.jit import kernel
+from gsmerge.native.signature import STATUS, f8, i8, native
 
 
-@kernel(part=True)
+@native(STATUS, values=f8("n"), order=i8("m", out=True, least=0, below="n"), low=i8(least=0), high=i8(), place=i8())
 def partition(values, order, low, high, place):
     """Reorder a run of an order so that one place holds the value that sorting would put there.
 
-    No value before the place is above it, and none after it below. (Numba's own sort compiles for a second.)
+    No value before the place is above it, and none after it below.
 
     Args:
-        values: ``[n]`` numbers, left as they are.
+        values: ``[n]`` float64 numbers, left as they are.
         order: ``[m]`` int64 places in ``values``; those from ``low`` to before ``high`` are reordered.
         place: In ``order``, from ``low`` to before ``high``.
     """
-    last = high - 1
-    while low < last:
-        pivot = values[order[(low + last) // 2]]
-        i, j = low, last
-        while i <= j:
-            while values[order[i]] < pivot:
-                i += 1
-            while values[order[j]] > pivot:
-                j -= 1
-            if i <= j:
-                order[i], order[j] = order[j], order[i]
-                i += 1
-                j -= 1
-        if place <= j:
-            last = j
-        elif place >= i:
-            low = i
-        else:
-            break

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields, make_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -11,9 +12,10 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import read_table
+from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.raster.harmonics import view_colors
 from gsmerge.research.generate.photograph import Float, Pinhole
-from gsmerge.research.generate.shapes import Array
+from gsmerge.research.generate.shapes import Array, rotate
 from gsmerge.research.generate.textures import enlarge
 from gsmerge.types import SH_C0, Gaussians
 
@@ -109,8 +111,9 @@ def draw_noise(options: NoiseOptions, rng: np.random.Generator, factor: float = 
     """Draw values for one scene, all errors but no habits times ``factor``; shares and ``bleed`` are at most 1."""
     drawn: dict[str, float] = {}
     for name in RANGES:
-        bounds = getattr(options, name)
-        drawn[name] = float(np.exp(rng.uniform(*np.log(bounds))) if name in SPREAD else rng.uniform(*bounds))
+        low, high = getattr(options, name)
+        spread = name in SPREAD
+        drawn[name] = math.exp(rng.uniform(math.log(low), math.log(high))) if spread else rng.uniform(low, high)
     for name in ERRORS:
         drawn[name] *= factor
     for name in ("bleed", "patches", "floaters", "oversized"):
@@ -142,7 +145,7 @@ def edge_mask(depth: Array) -> Float:
     """Rate pixels ``[h,w]`` from 0 on smooth surfaces to 1 where depth jumps by a tenth or more between neighbours."""
     inverse = (1 / depth).astype(np.float32)
     square = np.ones((3, 3), np.uint8)
-    jump = np.log(cv2.dilate(inverse, square) / cv2.erode(inverse, square))
+    jump = log(cv2.dilate(inverse, square) / cv2.erode(inverse, square))
     middle = cv2.GaussianBlur(inverse, (0, 0), 1.0)  # slanted planes are smooth in inverse depth
     bend = np.abs(middle / inverse - 1)
     return np.clip((np.minimum(jump / 2, 4 * bend) - 0.01) / 0.09, 0, 1).astype(np.float32)
@@ -178,7 +181,7 @@ def predict_depth(seen: TrueView, noise: Noise, rng: np.random.Generator) -> tup
     patch = np.clip((field - limit) / 0.3, 0, 1) if noise.patches > 0 else np.zeros_like(field)
     wrong = patch * noise.patch_error * smooth_noise(rng, height, width, 8)
     grain = noise.grain * rng.normal(0, 1, depth.shape)
-    out = bled * np.exp(noise.view_bias * rng.normal() + worse * (drift + grain) + wrong)
+    out = bled * exp(noise.view_bias * rng.normal() + worse * (drift + grain) + wrong)
     floating = rng.random(depth.shape) < noise.floaters * (1 + 10 * edge)
     out = np.where(floating, out * rng.uniform(0.4, 0.95, depth.shape), out)
     doubt = 0.8 * near_edge + 0.5 * blank * noise.blank / 3 + 0.7 * patch * rng.uniform(0, 1) + 0.6 * beyond
@@ -214,11 +217,11 @@ def pixel_gaussians(seen: TrueView, lens: Pinhole, noise: Noise, rng: np.random.
     depth, confidence = (a.reshape(-1).astype(np.float64) for a in predict_depth(seen, noise, rng))
     v, u = np.mgrid[:height, :width].reshape(2, -1) + 0.5 + rng.uniform(-noise.offset, noise.offset, (2, n))
     rays = np.stack([(u - width / 2) / lens.focal, (v - height / 2) / lens.focal, np.ones(n)], 1)
-    means = (rays * depth[:, None]) @ seen.c2w[:3, :3].T + seen.c2w[:3, 3]
+    means = rotate(rays * depth[:, None], seen.c2w[:3, :3]) + seen.c2w[:3, 3]
     normals = seen.normals.reshape(-1, 3) + rng.normal(0, noise.tilt, (n, 3))
     normals = np.where(np.linalg.norm(normals, axis=1, keepdims=True) < 1e-6, rays, normals)
     quats = quats_facing(normals / np.linalg.norm(normals, axis=1, keepdims=True))
-    shape = np.array([1.0, 1.0, noise.flatness]) * np.exp(rng.normal(0, noise.scale_jitter, (n, 3)))
+    shape = np.array([1.0, 1.0, noise.flatness]) * exp(rng.normal(0, noise.scale_jitter, (n, 3)))
     scales = noise.scale * (depth / lens.focal)[:, None] * shape
     oversized = rng.random(n) < noise.oversized
     scales[oversized] *= rng.uniform(2, max(2.0, noise.oversize), (int(oversized.sum()), 1))

@@ -20,6 +20,7 @@ from gsmerge.research.generate.shapes import (
     box,
     column,
     leaf,
+    norm,
     place,
     quad,
     rod,
@@ -171,9 +172,13 @@ def plant(pal: Palette, height: float, leaves: int) -> Shapes:
 
 def random_rotation(rng: np.random.Generator) -> Array:
     """Draw a random rotation ``[3,3]``."""
-    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
-    q *= np.sign(np.diag(r))
-    return q if np.linalg.det(q) > 0 else -q
+    first, second, third = rng.normal(size=(3, 3)).T  # Gram and Schmidt's
+    x = first / norm(first)
+    y = second - (x * second).sum() * x
+    y /= norm(y)
+    z = np.cross(x, y)
+    sign = 1.0 if (z * third).sum() > 0 else -1.0  # a left-handed set is turned over
+    return np.stack([sign * x, sign * y, z], 1)
 
 
 def bush(pal: Palette, radius: float, leaves: int) -> Shapes:
@@ -184,7 +189,7 @@ def bush(pal: Palette, radius: float, leaves: int) -> Shapes:
     flower = pal.material("foliage")
     for _ in range(leaves):
         away = rng.normal(size=3)
-        away *= radii * rng.uniform(0.8, 1.1) / np.linalg.norm(away)
+        away *= radii * rng.uniform(0.8, 1.1) / norm(away)
         size = radius * rng.uniform(0.08, 0.22)
         material = flower if rng.random() < 0.15 else green
         out.append(leaf(away - np.array([0, 0.8 * radii[1], 0]), (0.42 * size, size), material, random_rotation(rng)))
@@ -269,7 +274,7 @@ def light(rng: np.random.Generator, lamp_at: Array | None) -> Light:
     towards = np.array([np.sin(side), -up, -np.cos(side)])
     key = rng.uniform(0.8, 4.0) * (1 + (0.4 * color(rng, strength=(0, 0.4), light=(0.9, 1)) - 0.4))
     ambient = rng.uniform(0.5, 1.1) * (1 + (0.3 * color(rng, hue=(0.5, 0.7), strength=(0, 0.3), light=(0.9, 1)) - 0.3))
-    return Light(towards / np.linalg.norm(towards), lamp_at, key, ambient, rng.uniform(0.02, 0.2))
+    return Light(towards / norm(towards), lamp_at, key, ambient, rng.uniform(0.02, 0.2))
 
 
 def _walls(pal: Palette, width: float, depth: float, height: float) -> Shapes:

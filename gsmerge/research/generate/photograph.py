@@ -10,8 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsmerge.research.generate.cast import BLOB, BOX, CONE, ELLIPSOID, add_light, cast
-from gsmerge.research.generate.shapes import Array, Shape, ShapeArrays, bounds, pack
+from gsmerge.kernels.cast import BLOB, BOX, CONE, ELLIPSOID, add_light, cast
+from gsmerge.kernels.elementary import arctan2, power
+from gsmerge.research.generate.shapes import Array, Shape, ShapeArrays, bounds, norm, pack, rotate
 from gsmerge.research.generate.textures import Picture, pyramid
 
 FAR = 1e6  # depth of pixels without a surface
@@ -94,7 +95,7 @@ def screen_boxes(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -
     half = bounds(shapes)
     signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), -1).reshape(-1, 3)
     corners = np.einsum("mij,mcj->mci", shapes.rotations, half[:, None] * signs) + shapes.centres[:, None]
-    local = (corners - c2w[:3, 3]) @ c2w[:3, :3]
+    local = np.einsum("mci,ij->mcj", corners - c2w[:3, 3], c2w[:3, :3])
     edges = np.array([(i, i | bit) for bit in (1, 2, 4) for i in range(8) if not i & bit])
     a, b = local[:, edges[:, 0]], local[:, edges[:, 1]]
     with np.errstate(divide="ignore", invalid="ignore"):  # where an edge passes the near plane
@@ -124,9 +125,9 @@ def trace(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -> Hits:
 
 def _axes(towards: Array) -> Array:
     """Compute the rows right, down, forward ``[3,3]`` of light that comes from a direction."""
-    forward = -towards / np.linalg.norm(towards)
+    forward = -towards / norm(towards)
     right = np.cross([0.3, 1.0, 0.2], forward)
-    right /= np.linalg.norm(right)
+    right /= norm(right)
     return np.stack([right, np.cross(forward, right), forward])
 
 
@@ -144,7 +145,7 @@ def light_stage(stage: Stage) -> LitStage:
     extent = bounds(opaque)
     reach = np.linalg.norm(extent, axis=1)
     low, high = (opaque.centres - reach[:, None]).min(0), (opaque.centres + reach[:, None]).max(0)
-    middle, radius = (low + high) / 2, float(np.linalg.norm(high - low) / 2)
+    middle, radius = (low + high) / 2, norm(high - low) / 2
     rng = np.random.default_rng(0)
     key = [stage.light.towards + stage.light.softness * rng.normal(0, 0.6, 3) for _ in range(KEY_MAPS)]
     rotations = np.arange(AMBIENT_MAPS) + 0.5  # evenly over the sphere (Fibonacci)
@@ -174,7 +175,7 @@ def coordinates(shapes: ShapeArrays, ids: NDArray[np.int32], points: Float) -> t
     girth = np.maximum(half[:, 0], half[:, 2])
     side = (kinds == BOX) & (a >= b) & (a >= c)
     top = ((kinds == BOX) & (b > a) & (b >= c)) | ((kinds == CONE) & ~turned)
-    around = np.arctan2(x, z).astype(np.float32)
+    around = arctan2(x, z)
     u = np.where(turned, around * girth, np.where(side, z, x))
     v = np.where(top, z, y)
     wide = np.where(turned, np.pi * girth, np.where(side, half[:, 2], half[:, 0]))
@@ -193,7 +194,7 @@ def paint(view: LitStage, ids: NDArray[np.int32], points: Float, spread: Float) 
     uv, repeat = coordinates(view.shapes, ids, points)
     textures = np.array([s.material.texture for s in view.shapes.shapes])[ids]
     size = len(view.mips[0][0])
-    levels = np.log2(np.maximum(spread * repeat * size, 1)).round().astype(int)
+    levels = np.frexp(np.maximum(spread * repeat * size, 1) * 2**0.5)[1] - 1  # the nearest power of two
     levels = np.minimum(levels, len(view.mips[0]) - 1)
     group = textures * len(view.mips[0]) + levels
     order = np.argsort(group, kind="stable")
@@ -226,12 +227,12 @@ def radiance(view: LitStage, c2w: Array, lens: Pinhole, samples: int) -> tuple[F
     normals, depth = hits.normals.reshape(-1, 3)[seen], hits.depth.reshape(-1)[seen]
     y, x = np.divmod(np.flatnonzero(seen), w)
     rays = np.stack([(x + 0.5) / samples - lens.width / 2, (y + 0.5) / samples - lens.height / 2], 1) / lens.focal
-    rays = np.concatenate([rays, np.ones((len(rays), 1))], 1) @ c2w[:3, :3].T
+    rays = rotate(np.concatenate([rays, np.ones((len(rays), 1))], 1), c2w[:3, :3])
     world = (c2w[:3, 3] + rays * depth[:, None]).astype(np.float32)
     rays = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
     cosine = np.maximum(-(normals * rays).sum(1), 0.1)
     spread = (depth / (lens.focal * samples)).astype(np.float32) / np.sqrt(cosine)
-    albedo = paint(view, ids, points, spread) ** 2.2
+    albedo = power(paint(view, ids, points, spread), 2.2)
     out = np.zeros((h * w, 3), np.float32)
     out[seen] = _shade(view, ids, albedo, world, normals, rays)
     return out.reshape(h, w, 3).reshape(lens.height, samples, lens.width, samples, 3).mean((1, 3)), hits
@@ -249,12 +250,13 @@ def _shade(view: LitStage, ids: NDArray[np.int32], albedo: Float, world: Float, 
     add_light(world, normals, *around, indirect)
     if light.lamp is not None:
         away = np.linalg.norm(world - light.lamp.astype(np.float32), axis=1)
-        direct *= 2.5 / (1 + (away / np.linalg.norm(light.lamp - view.stage.focus)) ** 2 * 1.5)
+        direct *= 2.5 / (1 + (away / norm(light.lamp - view.stage.focus)) ** 2 * 1.5)
     gloss = np.array([s.material.gloss for s in shapes], np.float32)[ids]
     half = light.towards.astype(np.float32) - rays
     half /= np.linalg.norm(half, axis=1, keepdims=True)
-    shine = gloss * direct * np.clip((normals * half).sum(1), 0, 1) ** (8 + 120 * gloss)
-    rim = 0.25 * gloss * (1 + (normals * rays).sum(1)).clip(0, 1) ** 4  # grazing views reflect more (Schlick 1994)
+    shine = gloss * direct * power(np.clip((normals * half).sum(1), 0, 1), 8 + 120 * gloss)
+    grazing = (1 + (normals * rays).sum(1)).clip(0, 1)
+    rim = 0.25 * gloss * (grazing * grazing) ** 2  # grazing views reflect more (Schlick 1994)
     key, ambient = light.key.astype(np.float32), light.ambient.astype(np.float32)
     out = albedo * (key * direct[:, None] + ambient * indirect[:, None])
     out += shine[:, None] * key + rim[:, None] * ambient
@@ -276,4 +278,4 @@ def find_exposure(pictures: Sequence[Float], brightness: float) -> float:
 def develop(linear: Float) -> Float:
     """Convert linear light to sRGB in [0, 1]: a film curve (Narkowicz 2015), then gamma."""
     x = 0.6 * linear
-    return np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0, 1) ** (1 / 2.2)
+    return power(np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0, 1), 1 / 2.2)

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from gsmerge.research.generate.cast import BLOB, BOX, CONE, ELLIPSOID, LEAF, QUAD
+from gsmerge.kernels.cast import BLOB, BOX, CONE, ELLIPSOID, LEAF, QUAD
 
 Array: TypeAlias = NDArray[Any]
 Vector: TypeAlias = Sequence[float] | Array  # of length 3
@@ -30,7 +30,7 @@ class Material:
 
 @dataclass(frozen=True)
 class Shape:
-    """One shape, see :mod:`gsmerge.research.generate.cast` for the kinds."""
+    """One shape, see :mod:`gsmerge.kernels.cast` for the kinds."""
 
     kind: int
     size: tuple[float, float, float, float]  # half sizes along its axes, and the taper of a cone
@@ -40,6 +40,29 @@ class Shape:
     waves: Array = field(default_factory=lambda: NO_WAVES)  # [4,5] relief
     shell: bool = False  # encloses the scene and casts no shadow
     glow: bool = False  # as bright as its texture, whatever the light (sky, screens, lamps)
+
+
+def norm(vector: Array) -> float:
+    """Compute the length of a vector, by a sum whose order does not depend on the processor."""
+    return float(np.sqrt((vector * vector).sum()))
+
+
+def rotate(points: Array, rotation: Array) -> Array:
+    """Rotate points ``[n,3]``, by sums whose order does not depend on the processor."""
+    return np.einsum("nk,ik->ni", points, rotation)
+
+
+def compose(a: Array, b: Array) -> Array:
+    """Multiply two small matrices, by sums whose order does not depend on the processor."""
+    return np.einsum("ik,kj->ij", a, b)
+
+
+def invert(motion: Array) -> Array:
+    """Invert a rigid motion ``[4,4]``."""
+    out = np.eye(4)
+    out[:3, :3] = motion[:3, :3].T
+    out[:3, 3] = -(motion[:3, :3] * motion[:3, 3:]).sum(0)
+    return out
 
 
 def axis_rotation(axis: int, angle: float) -> Array:
@@ -81,10 +104,10 @@ def column(foot: Vector, height: float, radius: float, material: Material, *, to
 def rod(start: Vector, end: Vector, radius: float, material: Material) -> Shape:
     """Make a cylinder between two points."""
     a, b = np.asarray(start, float), np.asarray(end, float)
-    length = float(np.linalg.norm(b - a))
+    length = norm(b - a)
     y = (b - a) / length
     x = np.cross(y, [0.0, 0.0, 1.0] if abs(y[2]) < 0.9 else [1.0, 0.0, 0.0])
-    x /= np.linalg.norm(x)
+    x /= norm(x)
     return Shape(CONE, (radius, length / 2, radius, 1.0), material, (a + b) / 2, np.stack([x, y, np.cross(x, y)], 1))
 
 
@@ -106,7 +129,9 @@ def place(
     """Rotate shapes about the origin, about y by ``yaw`` or by ``rotation``, then move them to ``at``."""
     rotation = axis_rotation(1, yaw) if rotation is None else rotation
     offset = np.asarray(at, float)
-    return [replace(s, centre=rotation @ s.centre + offset, rotation=rotation @ s.rotation) for s in shapes]
+    return [
+        replace(s, centre=(rotation * s.centre).sum(1) + offset, rotation=compose(rotation, s.rotation)) for s in shapes
+    ]
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -11,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from gsmerge.kernels.elementary import exp
 from gsmerge.research.generate.noise import Noise, NoiseOptions, TrueView, draw_noise, pixel_gaussians
 from gsmerge.research.generate.objects import STYLES
 from gsmerge.research.generate.photograph import (
@@ -27,7 +29,7 @@ from gsmerge.research.generate.photograph import (
     radiance,
     trace,
 )
-from gsmerge.research.generate.shapes import Array
+from gsmerge.research.generate.shapes import Array, compose, invert, norm
 from gsmerge.research.generate.textures import Palette
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians
@@ -43,9 +45,9 @@ Path = Callable[[Stage, np.random.Generator, int], Pose]
 
 def look_at(eye: Array, target: Array, roll: float = 0.0) -> Array:
     """Compute camera to world ``[4,4]``, OpenCV axes, the image's down near +y, rotated by ``roll`` radians."""
-    forward = (target - eye) / np.linalg.norm(target - eye)
+    forward = (target - eye) / norm(target - eye)
     right = np.cross([0.0, 1.0, 0.0], forward)
-    right /= np.linalg.norm(right)
+    right /= norm(right)
     down = np.cross(forward, right)
     out = np.eye(4)
     out[:3, 0] = np.cos(roll) * right + np.sin(roll) * down
@@ -186,7 +188,7 @@ def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScen
     seeds = rng.integers(0, 2**63, len(poses))
     photo = partial(_photo, view, lens, large, noise, gain)
     photos = parallel_map(photo, list(zip(poses, seeds, strict=True)))
-    world = np.linalg.inv(poses[0]) if rng.random() < 0.5 else np.eye(4)  # that of many exporters is the first camera
+    world = invert(poses[0]) if rng.random() < 0.5 else np.eye(4)  # that of many exporters is the first camera
     moved = [_move_pose(pose, world, noise.unit) for pose in poses]
     seen = []
     for (image, depth, normals), true_pose in zip(photos[::2], moved[::2], strict=True):
@@ -194,7 +196,7 @@ def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScen
             image = cv2.resize(image, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
         depth = np.minimum(depth, FAR) * noise.unit
         estimate = _perturb_pose(true_pose, noise, float(np.median(depth)), rng)
-        rotated = (normals @ world[:3, :3].T).astype(np.float32)
+        rotated = np.einsum("hwk,ik->hwi", normals, world[:3, :3]).astype(np.float32)
         seen.append((TrueView(image, depth, rotated, estimate), int(rng.integers(2**63))))
     parts = parallel_map(lambda given: pixel_gaussians(given[0], lens, noise, np.random.default_rng(given[1])), seen)
     return SyntheticScene(
@@ -217,7 +219,7 @@ def _find_stage(
     rng: np.random.Generator, style: str, path: str, lens: Pinhole, num_views: int
 ) -> tuple[LitStage, Pose]:
     """Draw a stage and a path through it with usable views only, or the last try."""
-    size = 1 << int(np.clip(np.log2(1.6 * max(lens.width, lens.height)), 7, 10))
+    size = 1 << min(max(int(math.log2(1.6 * max(lens.width, lens.height))), 7), 10)
     for _ in range(STAGE_TRIES):
         view = light_stage(STYLES[style](Palette(rng, size)))
         for _ in range(PATH_TRIES):
@@ -235,7 +237,7 @@ def _photo(
     pose, seed = given
     rng = np.random.default_rng(seed)
     linear, _ = radiance(view, pose, lens, SAMPLES)
-    gains = gain * np.exp(noise.exposure * rng.normal() + noise.tint * rng.normal(0, 1, 3))
+    gains = gain * exp(noise.exposure * rng.normal() + noise.tint * rng.normal(0, 1, 3))
     y, x = np.mgrid[: lens.height, : lens.width] + 0.5
     away = np.hypot(x - lens.width / 2, y - lens.height / 2) / np.hypot(lens.width, lens.height)
     linear = linear * gains.astype(np.float32) * (1 - 0.3 * away**2)[..., None].astype(np.float32)
@@ -249,18 +251,18 @@ def _perturb_pose(pose: Array, noise: Noise, depth: float, rng: np.random.Genera
     """Add the network's error to a pose."""
     turn, _ = cv2.Rodrigues(np.deg2rad(noise.turn) * rng.normal(0, 1, 3) / 3**0.5)
     out = pose.copy()
-    out[:3, :3] = pose[:3, :3] @ turn
+    out[:3, :3] = compose(pose[:3, :3], turn)
     out[:3, 3] += noise.shift * depth * rng.normal(0, 1, 3) / 3**0.5
     return out
 
 
 def _move_pose(pose: Array, world: Array, unit: float) -> Array:
     """Move a pose into the world of the exporter, in its units."""
-    out = world @ pose
+    out = compose(world, pose)
     out[:3, 3] *= unit
     return out
 
 
 def _cameras(poses: Sequence[Array], lens: Pinhole) -> Cameras:
-    viewmats = np.stack([np.linalg.inv(pose) for pose in poses])
+    viewmats = np.stack([invert(pose) for pose in poses])
     return Cameras(viewmats, np.repeat(lens.intrinsics[None], len(poses), 0), lens.width, lens.height)

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsmerge.kernels.elementary import power
 from gsmerge.research.generate.shapes import Material
 
 Picture: TypeAlias = NDArray[Any]  # float32
@@ -169,7 +170,7 @@ def marble(rng: np.random.Generator, size: int) -> Picture:
     low, high = shades(rng, color(rng, strength=(0, 0.3), light=(0.4, 0.9)), 0.5)
     bend = noise(rng, size, fade=0.55)
     x, y = grid(size)
-    veins = np.abs(np.sin(np.pi * (2 * x + 2 * y + 3 * bend))) ** 0.4
+    veins = power(np.abs(np.sin(np.pi * (2 * x + 2 * y + 3 * bend))), 0.4)
     return mix(low, high, 0.8 * veins + 0.2 * noise(rng, size, first=16, fade=0.8))
 
 
@@ -333,7 +334,7 @@ def spines(rng: np.random.Generator, size: int) -> Picture:
         if book.shape[1] > size // 40:
             line = text_line(rng, letters, book.shape[1], size)
             book += (color(rng, strength=(0, 0.3), light=(0.8, 1)) - book) * line.T[:, : book.shape[1], None] * 0.8
-        book *= np.sin(np.linspace(0.5, 2.6, book.shape[1]))[None, :, None] ** 0.5
+        book *= np.sqrt(np.sin(np.linspace(0.5, 2.6, book.shape[1])))[None, :, None]
         book[: int(rng.uniform(0, 0.2) * size)] *= 0.12
         x += width
     return page

@@ -172,3 +172,47 @@ def test_errors_are_those_of_the_children(seed: int) -> None:
 def test_own_counts_give_the_same_children_as_one_for_all(seed: int) -> None:
     case, counts = Case(seed), np.array([3, 1, 2, 5, 4])
     assert case.children(counts) == [case.children(int(count))[g] for g, count in enumerate(counts)]
+
+
+def test_the_bits_are_the_same_on_every_processor(each_target) -> None:  # type: ignore[no-untyped-def]
+    case = Case(3, (1, 2, 3, 17, 60, 30, 30, 30))
+    for i, value in enumerate((np.nan, np.inf, 1e30)):
+        case.means[case.groups[5 + i][3], i] = value
+    case.opacities[case.groups[4][5]] = np.nan
+
+    def split() -> tuple[np.ndarray, ...]:
+        with np.errstate(all="ignore"):
+            return *bisect(*case.arrays(), 5), split_errors(*case.arrays(), 5, 0.7)
+
+    starts, ids, _, errors = each_target(split)
+    assert sorted(ids.tolist()) == sorted(case.ids.tolist())
+    assert (np.diff(starts) > 0).all()
+    assert np.isfinite(errors[:5, 0]).all()
+
+
+def test_no_groups_have_no_children() -> None:
+    case = Case(0, (1, 2))
+    arrays = [np.zeros(1, np.int64), case.ids, case.means, case.sh, case.opacities, np.empty((0, 3)), np.empty(0)]
+    starts, ids, parents = bisect(*arrays, 4)
+    assert [starts.tolist(), ids.tolist(), parents.tolist()] == [[0], [], []]
+    assert split_errors(*arrays, 4, 0.7).shape == (0, 4)
+
+
+@pytest.mark.parametrize("row", [-1, 3, 2**31 - 1])
+def test_members_that_are_none_are_refused(row: int) -> None:
+    case = Case(0, (1, 2))
+    case.ids[1] = row
+    with pytest.raises(ValueError, match="split_groups: expected indices inside"):
+        bisect(*case.arrays(), 2)
+
+
+@pytest.mark.parametrize("starts", [[0, 1, 4], [-1, 1, 3], [2, 1, 3]])
+def test_groups_beyond_the_members_are_refused(starts: list[int]) -> None:
+    _, *arrays = Case(0, (1, 2)).arrays()
+    with pytest.raises(ValueError, match="split_groups: "):
+        bisect(np.array(starts), *arrays, 2)
+
+
+def test_no_children_are_refused() -> None:
+    with pytest.raises(ValueError, match="counts: expected values from 1 on"):
+        bisect(*Case(0).arrays(), 0)

@@ -28,7 +28,7 @@ def upper(covar: np.ndarray) -> np.ndarray:
 
 
 def overlap(a: Gaussian, b: Gaussian) -> float:
-    return bhattacharyya(a[0], upper(a[1]), b[0], upper(b[1]), np.empty(6))
+    return bhattacharyya(a[0], upper(a[1]), b[0], upper(b[1]))
 
 
 def overlap_reference(a: Gaussian, b: Gaussian) -> float:
@@ -173,3 +173,51 @@ def test_connected_components_match(seed: int) -> None:
     wanted_count, expected = csgraph.connected_components(edges, directed=False)
     assert count == wanted_count
     assert len(set(zip(actual.tolist(), expected.tolist(), strict=True))) == count
+
+
+@pytest.mark.parametrize("width", [0, 3, 40])
+def test_the_bits_are_the_same_on_every_processor(each_target, width: int) -> None:  # type: ignore[no-untyped-def]
+    rng = np.random.default_rng(0)
+    gaussians = random_gaussians(60, 5, 0.2)
+    means, covars = np.stack([g[0] for g in gaussians]), np.stack([upper(g[1]) for g in gaussians])
+    means[:3, 0], covars[3:6] = (np.nan, np.inf, 1e300), [[np.nan], [np.inf], [0.0]]
+    neighbors, views, order = rng.integers(-1, 60, (60, 9)), rng.integers(-1, 4, 60), rng.permutation(60)
+    latents = rng.normal(size=(60, width)).astype(np.float32)
+
+    def clusters() -> list[np.ndarray]:
+        scores = [np.empty(neighbors.shape) for _ in range(2)]
+        for boxes in (False, True):
+            edge_scores(neighbors, means, covars, means, latents, views, 1.0, 0.1, boxes, scores[boxes])
+        stars = leader_clusters(order, neighbors, scores[0], views, 0.3, 4)
+        return [*scores, *map(np.asarray, stars), *map(np.asarray, connected_components(neighbors, scores[1], 0.2))]
+
+    results = each_target(clusters)
+    assert 1 < results[3] < 60
+    assert 1 < results[5] < 60
+
+
+def test_nothing_has_no_clusters() -> None:
+    none, scores, views = np.empty((0, 4), np.int64), np.empty((0, 4)), np.empty(0, np.int64)
+    assert [
+        len(leader_clusters(views, none, scores, views, 0.5, 3)[0]),
+        connected_components(none, scores, 0.5)[1],
+    ] == [0, 0]
+    alone = np.full((1, 4), -1)
+    assert leader_clusters(views[:0], alone, np.ones((1, 4)), np.zeros(1, np.int64), 0.5, 3)[1] == 0
+    assert leader_clusters(np.zeros(1, np.int64), alone, np.ones((1, 4)), np.zeros(1, np.int64), 0.5, 3)[1] == 1
+    assert connected_components(alone, np.ones((1, 4)), 0.5)[1] == 1
+
+
+@pytest.mark.parametrize("neighbor", [2, 2**62])
+def test_neighbours_that_are_none_are_refused(neighbor: int) -> None:
+    neighbors, ones, views = np.array([[1], [neighbor]]), np.ones((2, 3)), np.array([0, 1])
+    scores, order = np.ones((2, 1)), np.array([0, 1])
+    latents, covars = np.empty((2, 0), np.float32), np.ones((2, 6))
+    with pytest.raises(ValueError, match="edge_scores: expected indices inside"):
+        edge_scores(neighbors, ones, covars, ones, latents, views, 1.0, 0.0, True, np.empty_like(scores))
+    with pytest.raises(ValueError, match="find_components: expected indices inside"):
+        connected_components(neighbors, scores, 0.5)
+    with pytest.raises(ValueError, match="find_stars: expected indices inside"):
+        leader_clusters(order[::-1].copy(), neighbors, scores, views, 0.5, 3)
+    with pytest.raises(ValueError, match="order: expected values below 2"):
+        leader_clusters(order + 1, neighbors, scores, views, 0.5, 3)

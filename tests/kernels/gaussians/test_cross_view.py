@@ -9,6 +9,7 @@ import pytest
 from scenes import arc, make_scene, room
 
 from gsmerge.geometry import project
+from gsmerge.kernels.gaussians.cross_view import sum_cross_view
 from gsmerge.moments import Members, scene_members
 from gsmerge.networks.cross_view_stats import FAR, MIN_OPACITY, NEAR, cross_view_stats
 from gsmerge.runtime.threads import use_threads
@@ -77,3 +78,32 @@ def test_unaligned_scenes_and_transparent_pixels_have_none() -> None:
     stats = cross_view_stats(own.means, own.sh0, views[: len(own)], scene_members(alone), alone.cameras)
     assert not stats.any()  # one view knows nothing
     assert cross_view_stats(g.means[:0], g.sh0[:0], views[:0], members, scene.cameras).shape == (0, 7)
+
+
+def random_sums(num: int, pixels: int, first: int = 0, last: int | None = None) -> np.ndarray:
+    """What three views of 6 x 4 pixels say of random points, some of them no numbers."""
+    rng = np.random.default_rng(0)
+    points, means = rng.normal(size=(num, 3)), rng.normal(size=(pixels, 3)).astype(np.float32)
+    points[:3], means[:9:3] = np.array([[np.nan], [np.inf], [-np.inf]])[:num], np.nan
+    points[:, 2] += 3
+    means[:, 2] += 3
+    viewmats, Ks = np.tile(np.eye(4), (3, 1, 1)), np.tile([[5.0, 0, 3], [0, 5, 2], [0, 0, 1]], (3, 1, 1))
+    colors, sh0 = (rng.normal(size=shape).astype(np.float32) for shape in ((num, 3), (pixels, 1, 3)))
+    opacities, own = rng.uniform(0, 1, pixels).astype(np.float32), rng.integers(-1, 3, num)
+    out = np.zeros((num, 6))
+    last = num if last is None else last
+    sum_cross_view(points, colors, own, viewmats, Ks, 6, 4, means, opacities, sh0, 0.3, 0.5, 2.0, 0.1, first, last, out)
+    return out
+
+
+def test_the_bits_are_the_same_on_every_processor(each_target) -> None:  # type: ignore[no-untyped-def]
+    (sums,) = each_target(lambda: (random_sums(500, 72),))
+    assert (sums.max(0)[:4] > 0).all()
+    assert not sums[:3].any()
+
+
+def test_pixels_and_points_outside_are_refused() -> None:
+    assert random_sums(0, 72).shape == (0, 6)
+    for arguments in ((5, 71), (5, 72, 0, 6), (5, 72, -1, 5)):
+        with pytest.raises(ValueError, match="sum_cross_view: "):
+            random_sums(*arguments)

@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gsmerge.kernels.gaussians.nearest import build_tree, nearest_of_others
 from gsmerge.networks.cross_view_stats import nearest_of_other_views
 from gsmerge.runtime.threads import use_threads
 
@@ -41,3 +42,34 @@ def test_what_lies_behind_thousands_of_the_own_view_is_not_looked_for() -> None:
     assert (neighbors[:5000] == -1).mean() > 0.9
     nearest = np.argsort(np.linalg.norm(crowd - [50, 0, 0], axis=1))[:4]
     assert neighbors[5000].tolist() == nearest.tolist()
+
+
+def test_the_bits_are_the_same_on_every_processor(each_target) -> None:  # type: ignore[no-untyped-def]
+    generator = np.random.default_rng(0)
+    means, owners = generator.normal(size=(2000, 3)), generator.integers(-1, 3, 2000)
+    means[:3] = np.array([[np.nan], [np.inf], [-np.inf]])  # what is not finite must do no harm
+    each_target(lambda: (nearest_of_other_views(means, owners, 7),))
+
+
+@pytest.mark.parametrize(("num", "count"), [(0, 4), (1, 4), (1, 0), (40, 0)])
+def test_few_have_few_neighbours(num: int, count: int) -> None:
+    neighbors = nearest_of_other_views(np.ones((num, 3)), np.zeros(num, np.int64), count)
+    assert neighbors.tolist() == [[-1] * count] * num
+
+
+def test_trees_that_are_none_are_refused() -> None:
+    points, views, order = np.random.default_rng(0).normal(size=(40, 3)), np.arange(40), np.arange(40)
+    axes, splits, out = np.empty(16, np.int8), np.empty(16), np.empty((40, 4), np.int64)
+    with pytest.raises(ValueError, match="build_tree: expected indices inside"):
+        build_tree(points, order, axes[:1], splits[:1])
+    with pytest.raises(ValueError, match="order: expected values below 40"):
+        build_tree(points, order + 1, axes, splits)
+    build_tree(points, order, axes, splits)
+    bad_axes, bad_order = axes.copy(), order.copy()
+    bad_axes[0], bad_order[7] = 3, 40
+    for tree in ((order, bad_axes, splits), (bad_order, axes, splits), (order, axes[:2], splits[:2])):
+        with pytest.raises(ValueError, match="search_tree: expected indices inside"):
+            nearest_of_others(points, views, *tree, 0, 40, 256, out)
+    for rows in ((0, 41), (-1, 3)):
+        with pytest.raises(ValueError, match="search_tree: "):
+            nearest_of_others(points, views, order, axes, splits, *rows, 256, out)

@@ -187,3 +187,52 @@ def test_decompose_is_continuous_in_the_covariance() -> None:
     nudges = np.random.default_rng(0).normal(size=(50, 3, 3)) * 1e-7
     nudged = covars + nudges + nudges.transpose(0, 2, 1)
     np.testing.assert_allclose(rebuilt(nudged)[2], nudged, atol=1e-12)
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_the_bits_are_the_same_on_every_processor(each_target, own: bool) -> None:  # type: ignore[no-untyped-def]
+    members = random_members(300, 6, coefficients=9)
+    members["opacities"][:20] = [0.0, 1.0] * 10
+    members["scales"][200] = np.inf
+    members["means"][210], members["quats"][220], members["opacities"][230] = np.nan, np.nan, np.nan
+    rng = np.random.default_rng(0)
+    groups = [sorted(rng.choice(300, size, replace=False).tolist()) for size in (1, 2, 3, 30, 250)]
+    with np.errstate(all="ignore"):
+        geometry = each_target(lambda: pooled(members, groups, own))[0]
+    assert np.isfinite(geometry[:, 3:9]).all(1).any()
+    covars = np.concatenate([random_covars(1), np.full((1, 3, 3), np.nan), np.full((1, 3, 3), np.inf)])
+    scales, quats = np.empty((len(covars), 3)), np.empty((len(covars), 4))
+
+    def axes() -> tuple[np.ndarray, np.ndarray]:
+        decompose(covars, scales, quats)
+        return scales.copy(), quats.copy()
+
+    each_target(axes)
+
+
+def test_nothing_is_pooled_into_nothing() -> None:
+    assert [len(part) for part in group_members(np.empty(0, np.int32), 0)] == [1, 0]
+    none = np.zeros(1, np.int64), np.empty(0, np.int64)
+    pool(*none, *random_members(0, 0).values(), True, np.empty((0, 13)), np.empty((0, 4, 3), np.float32))
+    decompose(np.empty((0, 3, 3)), np.empty((0, 3)), np.empty((0, 4)))
+
+
+@pytest.mark.parametrize("row", [-1, 4, 2**31 - 1])
+def test_members_that_are_none_are_refused(row: int) -> None:
+    with pytest.raises(ValueError, match="pool_groups: expected indices inside"):
+        pooled(random_members(4, 0), [[0, row]])
+
+
+@pytest.mark.parametrize("starts", [[0, 5], [0, -1], [-1, 2], [3, 2]])
+def test_groups_beyond_the_members_are_refused(starts: list[int]) -> None:
+    members = random_members(4, 0)
+    with pytest.raises(ValueError, match="pool_groups: "):
+        pool(
+            np.array(starts), np.arange(4), *members.values(), True, np.zeros((1, 13)), np.zeros((1, 4, 3), np.float32)
+        )
+
+
+@pytest.mark.parametrize("label", [2, 2**31 - 1])
+def test_labels_beyond_the_count_are_refused(label: int) -> None:
+    with pytest.raises(ValueError, match="sort_labels: expected indices inside"):
+        group_members(np.array([0, label], np.int32), 2)

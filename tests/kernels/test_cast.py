@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsmerge.research.generate.cast import BLOB, BOX, CONE, ELLIPSOID, LEAF, QUAD, add_light, cast
+from gsmerge.kernels.cast import BLOB, BOX, CONE, ELLIPSOID, LEAF, QUAD, add_light, cast
 from gsmerge.research.generate.shapes import NO_WAVES, Material, Shape, ShapeArrays, pack
 
 FAR, STEPS = 12.0, 60_000
@@ -142,3 +142,41 @@ def test_light_reaches_what_nothing_is_before() -> None:
         slow += weights[k] * np.maximum(0, -(normals @ axes[k][2])) * reached
     assert (slow == 0).any()
     np.testing.assert_allclose(out, slow, atol=1e-5)
+
+
+def test_the_bits_are_the_same_on_every_processor(each_target) -> None:  # type: ignore[no-untyped-def]
+    rng = np.random.default_rng(3)
+    shapes = pack([random_shape(kind, rng) for kind in (BOX, ELLIPSOID, CONE, BLOB, BLOB, LEAF, QUAD)])
+    shapes.centres[1, 0], shapes.sizes[2, 1], shapes.waves[4, 0, 0] = np.nan, np.inf, np.nan
+    axes, maps = np.stack([rotation(rng) for _ in range(3)]), rng.normal(size=(3, 8, 8)).astype(np.float32)
+
+    def light() -> tuple[np.ndarray, ...]:
+        depth, ids, points, normals = run(shapes, 24, 18, 20.0)
+        out = np.zeros(depth.size, np.float32)
+        lit = points.reshape(-1, 3), normals.reshape(-1, 3), axes, np.zeros(3), 1.1, maps, 0.02, np.ones(3), out
+        add_light(*lit)
+        return depth, ids, points, normals, out
+
+    _, ids, _, _, lit = each_target(light)
+    assert len(np.unique(ids)) > 3
+    assert (lit > 0).any()
+
+
+def test_no_shapes_and_no_points() -> None:
+    shapes = pack([random_shape(BOX, np.random.default_rng(0))])
+    assert run(shapes, 0, 0, 1.0)[0].shape == (0, 0)
+    empty = np.empty((0, 3), np.float32), np.empty((0, 3), np.float32), np.empty((0, 3, 3)), np.zeros(3), 1.0
+    add_light(*empty, np.empty((0, 0, 0), np.float32), 0.1, np.empty(0), np.empty(0, np.float32))
+
+
+@pytest.mark.parametrize("rect", [(-1, 0, 2, 2), (0, -1, 2, 2), (0, 0, 4, 2), (0, 0, 2, 3)])
+def test_samples_outside_the_picture_are_refused(rect: tuple[int, ...]) -> None:
+    shapes = pack([random_shape(BOX, np.random.default_rng(0))])
+    table = shapes.kinds, shapes.rotations, shapes.centres, shapes.sizes, shapes.waves
+    pictures = np.full((2, 3), 1e6), np.full((2, 3), -1, np.int32), *np.zeros((2, 2, 3, 3), np.float32)
+    with pytest.raises(ValueError, match="cast: expected indices inside"):
+        cast(np.zeros(3), np.eye(3), np.ones(4), 1.0, *table, np.array([rect], np.int32), *pictures)
+    with pytest.raises(ValueError, match="kinds: expected values below 6"):
+        cast(
+            np.zeros(3), np.eye(3), np.ones(4), 1.0, shapes.kinds + 6, *table[1:], np.zeros((1, 4), np.int32), *pictures
+        )

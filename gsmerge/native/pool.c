@@ -1,0 +1,227 @@
+// Groups of members, their moments, and principal axes.
+#include "exp_log.h"
+#include "select.h"
+
+enum { FEW = 64, SWEEPS = 8 };  // members whose median counting finds; most Jacobi sweeps
+static const double MAX_OPACITY = 0.995;  // optical depth is -ln(1 - opacity): 1 would be infinite
+static const double CAP = 3.0;  // members are shrunk to this many times the group's median extent
+static const double FLOOR = 0.1;  // smallest standard deviation of a group, in pixel footprints
+static const double VOLUME = 15.749609945722419;  // (2 pi)^(3/2)
+
+typedef struct {
+  const float *means, *quats, *scales, *opacities, *sh0, *shN, *footprints;
+  int64_t rest;  // coefficients of shN
+} members;
+
+// Counting sort: member ids by label, in rising order, and where each label's begin; labels below 0
+// are left out.
+API int32_t sort_labels(const int32_t *restrict labels, int64_t *restrict starts,
+                        int32_t *restrict ids, int64_t n, int64_t ends) {
+  if (n > INT32_MAX || ends < 1) return OUTSIDE;
+  for (int64_t g = 0; g < ends; g++) starts[g] = 0;
+  for (int64_t i = 0; i < n; i++) {
+    int64_t g = labels[i];
+    if (g < 0) continue;
+    if (g + 1 >= ends) return OUTSIDE;
+    starts[g + 1]++;
+  }
+  for (int64_t g = 1; g < ends; g++) starts[g] += starts[g - 1];
+  for (int64_t i = 0; i < n; i++)
+    if (labels[i] >= 0) ids[starts[labels[i]]++] = (int32_t)i;
+  // each start has moved to its list's end
+  for (int64_t g = ends - 1; g > 0; g--) starts[g] = starts[g - 1];
+  starts[0] = 0;
+  return 0;
+}
+
+static inline double largest(const float *s) { return maxf(maxf(s[0], s[1]), s[2]); }
+
+// The median, of two the smaller one. Counting costs few members less than what quickselect
+// mispredicts.
+static double find_median(const double *values, int64_t *order, int64_t n) {
+  int64_t middle = (n - 1) / 2;
+  for (int64_t j = 0; j < n && n <= FEW; j++) {
+    int64_t below = 0, upto = 0;
+    for (int64_t i = 0; i < n; i++) {
+      below += values[i] < values[j];
+      upto += values[i] <= values[j];
+    }
+    if (below <= middle && middle < upto) return values[j];
+  }
+  for (int64_t j = 0; j < n; j++) order[j] = j;
+  partition_run(values, 1, order, 0, n, middle);
+  return values[order[middle]];
+}
+
+// Shrink factor of each member: at most CAP times the median extent of the group, extents in
+// footprints.
+static void cap_members(const members *m, const int32_t *ids, int64_t n, double *caps,
+                        int64_t *order) {
+  for (int64_t j = 0; j < n; j++)
+    caps[j] = largest(m->scales + 3 * (int64_t)ids[j]) / m->footprints[ids[j]];
+  double limit = CAP * find_median(caps, order, n);
+  for (int64_t j = 0; j < n; j++) caps[j] = caps[j] > limit ? limit / caps[j] : 1.0;
+}
+
+// Adds w R diag(s)^2 R^T to a covariance xx xy xz yy yz zz, with the rotation R of a quaternion
+// wxyz of any length; the zero quaternion stands for no rotation.
+static inline void add_covariance(const float *quat, const double *s, double weight, double *c) {
+  double w = quat[0], x = quat[1], y = quat[2], z = quat[3];
+  double n = w * w + x * x + y * y + z * z, f = n > 0.0 ? 2.0 / n : 0.0;
+  double xx = f * x * x, xy = f * x * y, xz = f * x * z;
+  double yy = f * y * y, yz = f * y * z, zz = f * z * z;
+  double wx = f * w * x, wy = f * w * y, wz = f * w * z;
+  double r[3][3] = {{1.0 - yy - zz, xy - wz, xz + wy},
+                    {xy + wz, 1.0 - xx - zz, yz - wx},
+                    {xz - wy, yz + wx, 1.0 - xx - yy}};
+  double v[3] = {weight * s[0] * s[0], weight * s[1] * s[1], weight * s[2] * s[2]};
+  for (int i = 0, k = 0; i < 3; i++)
+    for (int j = i; j < 3; j++, k++)
+      c[k] += v[0] * r[i][0] * r[j][0] + v[1] * r[i][1] * r[j][1] + v[2] * r[i][2] * r[j][2];
+}
+
+// Weighted sums over a group: of weights, means and footprints.
+static inline void sum_means(const members *m, const int32_t *ids, int64_t n, bool uniform,
+                             double *sums) {
+  for (int k = 0; k < 5; k++) sums[k] = 0.0;
+  for (int64_t j = 0; j < n; j++) {
+    int64_t i = ids[j];
+    double w = uniform ? 1.0 : mind(m->opacities[i], MAX_OPACITY);
+    sums[0] += w;
+    for (int k = 0; k < 3; k++) sums[1 + k] += w * m->means[3 * i + k];
+    sums[4] += w * m->footprints[i];
+  }
+}
+
+// Moments of one group; see pool.py. The weights of a fully transparent group are equal: it still
+// has a place.
+static void pool_group(const members *m, const int32_t *ids, int64_t n, const double *caps,
+                       bool own, double *out, float *out_sh) {
+  double sums[5], mean[3], c[6] = {0}, mass = 0.0, extinction = 0.0;
+  sum_means(m, ids, n, false, sums);
+  double total = sums[0];
+  bool uniform = total <= 0.0;
+  if (uniform) sum_means(m, ids, n, true, sums);
+  double norm = 1.0 / sums[0], footprint = sums[4] * norm;
+  for (int k = 0; k < 3; k++) mean[k] = sums[1 + k] * norm;
+  for (int64_t j = 0; j < n; j++) {
+    int64_t i = ids[j];
+    double a = mind(m->opacities[i], MAX_OPACITY), w = uniform ? norm : a * norm;
+    double d[3], s[3];
+    for (int k = 0; k < 3; k++) {
+      d[k] = m->means[3 * i + k] - mean[k];
+      s[k] = own ? caps[j] * m->scales[3 * i + k] : m->scales[3 * i + k];
+    }
+    for (int p = 0, k = 0; p < 3; p++)
+      for (int q = p; q < 3; q++, k++) c[k] += w * d[p] * d[q];
+    if (own) add_covariance(m->quats + 4 * i, s, w, c);
+    mass += a * s[0] * s[1] * s[2];
+    extinction -= log8(1.0 - a) * maxd(maxd(s[0] * s[1], s[0] * s[2]), s[1] * s[2]);
+    float share = (float)w;
+    for (int k = 0; k < 3; k++) out_sh[k] += share * m->sh0[3 * i + k];
+    const float *rest = m->shN + 3 * m->rest * i;
+    for (int64_t k = 0; k < 3 * m->rest; k++) out_sh[3 + k] += share * rest[k];
+  }
+  double floor = FLOOR * footprint * (FLOOR * footprint);
+  for (int k = 0; k < 3; k++) out[k] = mean[k];
+  for (int k = 0; k < 6; k++) out[3 + k] = k == 0 || k == 3 || k == 5 ? c[k] + floor : c[k];
+  out[9] = total, out[10] = mass * VOLUME, out[11] = extinction, out[12] = footprint;
+}
+
+API int32_t pool_groups(const int64_t *restrict starts, const int32_t *restrict ids,
+                        const float *restrict means, const float *restrict quats,
+                        const float *restrict scales, const float *restrict opacities,
+                        const float *restrict sh0, const float *restrict shN,
+                        const float *restrict footprints, int32_t own_covariance,
+                        double *restrict caps, int64_t *restrict order,
+                        double *restrict out_geometry, float *restrict out_sh, int64_t ends,
+                        int64_t m, int64_t n, int64_t rest, int64_t longest, int64_t groups,
+                        int64_t bases) {
+  if (ends != groups + 1 || bases != rest + 1) return OUTSIDE;
+  members all = {means, quats, scales, opacities, sh0, shN, footprints, rest};
+  for (int64_t g = 0; g < groups; g++) {
+    const int32_t *own = ids + starts[g];
+    int64_t count = starts[g + 1] - starts[g];
+    if (count > longest || starts[g + 1] > m) return OUTSIDE;
+    if (count == 0) continue;
+    for (int64_t j = 0; j < count; j++)
+      if (own[j] < 0 || own[j] >= n) return OUTSIDE;
+    if (own_covariance) cap_members(&all, own, count, caps, order);
+    pool_group(&all, own, count, caps, own_covariance, out_geometry + 13 * g,
+               out_sh + 3 * bases * g);
+  }
+  return 0;
+}
+
+// One Jacobi rotation of the symmetric a that zeroes a[p][q]; u collects the eigenvectors.
+static inline void rotate_pair(double a[3][3], double u[3][3], int p, int q) {
+  if (!(absf8(a[p][q]) > 1e-300)) return;
+  double theta = (a[q][q] - a[p][p]) / (2.0 * a[p][q]);
+  double t = 1.0 / (absf8(theta) + sqrtf8(theta * theta + 1.0));
+  t = theta < 0.0 ? -t : t;
+  double c = 1.0 / sqrtf8(t * t + 1.0), s = t * c;
+  for (int k = 0; k < 3; k++) {
+    double x = a[k][p], y = a[k][q];
+    a[k][p] = c * x - s * y;
+    a[k][q] = s * x + c * y;
+  }
+  for (int k = 0; k < 3; k++) {
+    double x = a[p][k], y = a[q][k];
+    a[p][k] = c * x - s * y;
+    a[q][k] = s * x + c * y;
+    x = u[k][p], y = u[k][q];
+    u[k][p] = c * x - s * y;
+    u[k][q] = s * x + c * y;
+  }
+}
+
+// Unit quaternion wxyz, w >= 0, of orthonormal axes; a left-handed set has its first axis turned
+// round.
+static inline void right_handed_quat(double r[3][3], double *out) {
+  double det = r[0][0] * (r[1][1] * r[2][2] - r[1][2] * r[2][1])
+      - r[0][1] * (r[1][0] * r[2][2] - r[1][2] * r[2][0])
+      + r[0][2] * (r[1][0] * r[2][1] - r[1][1] * r[2][0]);
+  if (det < 0.0)
+    for (int i = 0; i < 3; i++) r[i][0] = -r[i][0];
+  // 4 q q^T has these four diagonals; the largest is the safe one to divide by
+  double q[4] = {1 + r[0][0] + r[1][1] + r[2][2], 1 + r[0][0] - r[1][1] - r[2][2],
+                 1 - r[0][0] + r[1][1] - r[2][2], 1 - r[0][0] - r[1][1] + r[2][2]};
+  int best = 0;
+  for (int i = 1; i < 4; i++) best = q[i] > q[best] ? i : best;
+  double root = sqrtf8(q[best]), f = 0.5 / root;
+  double a = r[2][1] - r[1][2], b = r[0][2] - r[2][0], c = r[1][0] - r[0][1];
+  double d = r[1][0] + r[0][1], e = r[0][2] + r[2][0], h = r[2][1] + r[1][2];
+  const double rows[4][4] = {{0, a, b, c}, {a, 0, d, e}, {b, d, 0, h}, {c, e, h, 0}};
+  for (int i = 0; i < 4; i++) q[i] = i == best ? 0.5 * root : rows[best][i] * f;
+  double norm = (q[0] < 0.0 ? -1.0 : 1.0)
+      / sqrtf8(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
+  for (int i = 0; i < 4; i++) out[i] = q[i] * norm;
+}
+
+API void decompose(const double *restrict covars, double *restrict out_scales,
+                   double *restrict out_quats, int64_t g) {
+  for (int64_t n = 0; n < g; n++) {
+    double a[3][3], u[3][3] = {{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}, r[3][3];
+    for (int i = 0; i < 3; i++)
+      for (int j = 0; j < 3; j++) a[i][j] = covars[9 * n + 3 * i + j];
+    for (int sweep = 0; sweep < SWEEPS; sweep++) {
+      double off = a[0][1] * a[0][1] + a[0][2] * a[0][2] + a[1][2] * a[1][2];
+      if (off <= 1e-28 * (a[0][0] * a[0][0] + a[1][1] * a[1][1] + a[2][2] * a[2][2])) break;
+      rotate_pair(a, u, 0, 1);
+      rotate_pair(a, u, 0, 2);
+      rotate_pair(a, u, 1, 2);
+    }
+    // rising order of the diagonal: the middle one is what the other two leave
+    int low = 0, high = 0;
+    for (int k = 1; k < 3; k++) {
+      low = a[k][k] < a[low][low] ? k : low;
+      high = a[k][k] >= a[high][high] ? k : high;
+    }
+    int order[3] = {low, 3 - low - high < 2 ? 3 - low - high : 2, high};  // NaN compares to nothing
+    for (int k = 0; k < 3; k++) {
+      out_scales[3 * n + k] = sqrtf8(maxd(a[order[k]][order[k]], 0.0));
+      for (int i = 0; i < 3; i++) r[i][k] = u[i][order[k]];
+    }
+    right_handed_quat(r, out_quats + 4 * n);
+  }
+}
