@@ -262,7 +262,7 @@ def _rdseg(pixels: np.ndarray, count: int, rectangles: float, early_sweeps: int,
 
 def _bass(pixels: np.ndarray, count: int, segmentation: str, adapt: float | None) -> np.ndarray:
     """Run BASS from hexagonal or from saliency seeds; return padded labels."""
-    from gsmerge.kernels.superpixels.bass import adapt_labels, infer_labels  # compiled only when used
+    from gsmerge.kernels.superpixels.bass import adapt_labels, infer_labels
     from gsmerge.kernels.superpixels.seeds import hexagonal_seeds, seed_density, seeds_from_density, voronoi
 
     height, width, _ = pixels.shape
