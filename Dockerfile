@@ -2,15 +2,13 @@
 FROM python:3.11-slim-bookworm
 
 WORKDIR /opt/gsmerge
-COPY pyproject.toml constraints.txt README.md LICENSE ./
+COPY pyproject.toml setup.py constraints.txt README.md LICENSE ./
 COPY gsmerge gsmerge
 # torch without CUDA, of the version that the tests run with; then everything else
 RUN torch=$(grep -E '^torch==' constraints.txt) \
     && pip install --no-cache-dir --index-url https://download.pytorch.org/whl/cpu "$torch" \
     && pip install --no-cache-dir -c constraints.txt .
 
-# compiled kernels go where any user of the container may write
-ENV GSMERGE_CACHE_DIR=/tmp/gsmerge
 WORKDIR /data
 ENTRYPOINT ["gsmerge"]
 CMD ["--help"]

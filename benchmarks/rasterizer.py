@@ -19,7 +19,6 @@ import argparse
 import importlib.util
 import os
 import sys
-import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable
@@ -56,8 +55,8 @@ def load(path: Path) -> ModuleType:
 
 def load_sketch() -> ModuleType:
     folder = SHARED / "prototypes"
-    if not os.access(folder, os.W_OK):  # its compiled code needs a place
-        os.environ.setdefault("NUMBA_CACHE_DIR", str(Path(tempfile.gettempdir()) / "gsmerge-benchmark-kernels"))
+    if importlib.util.find_spec("numba") is None:
+        raise SystemExit("expected numba, which the sketch is written in; run pip install numba")
     import numba
 
     numba.set_num_threads(1)

@@ -24,15 +24,11 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Processes beside one another share processors, and compile no kernel twice."""
+    """Processes beside one another share processors."""
     if hasattr(config, "workerinput"):
         import torch
 
         torch.set_num_threads(max(1, torch.get_num_threads() // config.workerinput["workercount"]))
-        if os.name == "posix":
-            from one_compiler import compile_once
-
-            compile_once()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

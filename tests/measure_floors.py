@@ -20,11 +20,10 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 import floors  # noqa: E402
 
-# The libraries' own ways to use older vectors than the processor has: numba, torch, numpy and its BLAS, OpenCV.
+# The libraries' own ways to use older vectors than the processor has: ours, torch, numpy and its BLAS, OpenCV.
 PROCESSORS = {
     "128 bits": {
-        "NUMBA_CPU_NAME": "generic",
-        "NUMBA_CPU_FEATURES": "",
+        "GSMERGE_TARGET": "v3",
         "ATEN_CPU_CAPABILITY": "default",
         "NPY_DISABLE_CPU_FEATURES": "X86_V3 X86_V4",
         "OPENBLAS_CORETYPE": "Nehalem",

@@ -21,7 +21,6 @@ def main(args: Sequence[str] | None = None) -> int:
         129 ended by SIGHUP, 130 interrupted, 143 ended by SIGTERM.
     """
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # we report damaged images ourselves
-    os.environ.setdefault("GSMERGE_COMMAND", "1")  # see gsmerge.kernels.jit
     _open_streams()
     from gsmerge.cli.app import run
 
@@ -41,8 +40,8 @@ def _open_streams() -> None:
 def program() -> NoReturn:
     """Run :func:`main` as the installed program, and end the process.
 
-    Exit handlers run and output is flushed, but the interpreter is not taken apart: with hundreds of compiled kernels
-    and gigabytes of arrays that took 0.3 s.
+    Exit handlers run and output is flushed, but the interpreter is not taken apart, which takes time with gigabytes of
+    arrays.
     """
     code = main()
     atexit._run_exitfuncs()

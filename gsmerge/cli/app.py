@@ -126,10 +126,6 @@ def _orderly_stop(signals: list[signal.Signals]) -> Iterator[None]:
         timer.start()
 
     def stop(number: int, _: object) -> None:
-        numba = sys.modules.get("numba.core.compiler_lock")
-        if numba is not None and numba.global_compiler_lock.is_locked():  # it would keep its lock, others wait for it
-            again(number)
-            return
         if number != signal.SIGINT:
             signals.append(signal.Signals(number))
         raise KeyboardInterrupt

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.batch_command import check_failures, pending_jobs, print_plan, run_jobs
 from gsmerge.cli.before_after import lpips_networks
-from gsmerge.cli.console import announce_compilation, print_document, say_notes
+from gsmerge.cli.console import print_document, say_notes
 from gsmerge.cli.paths import write_texts
 from gsmerge.errors import UsageError
 
@@ -97,8 +97,7 @@ def chart(args: opt.Args) -> None:
     pending = pending_jobs(jobs, out, options, index)
     totals = Totals(len(pending), "output")
     if pending:
-        with announce_compilation(quiet=args.silent):
-            run_jobs(args, totals, pending, options, index, schedule)
+        run_jobs(args, totals, pending, options, index, schedule)
     _draw(args, notes, len(pending))
     check_failures(totals, "runs")
 

@@ -10,7 +10,7 @@ from time import perf_counter
 from typing import TYPE_CHECKING
 
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.console import announce_compilation, print_document, say, say_notes, stage_progress
+from gsmerge.cli.console import print_document, say, say_notes, stage_progress
 from gsmerge.cli.paths import FileOptions, check_format, check_outputs, checkpoint_files, default_output, input_files
 from gsmerge.errors import TargetError
 
@@ -54,19 +54,9 @@ def compact(args: opt.Args) -> None:
     from gsmerge.report import result_table, summary_lines
 
     seconds_before = {"import": perf_counter() - start}
-    needs_fit = settings.method == "unmerged-fit" or (settings.method == "gsmerge" and settings.fit.fit == "full")
-    with (
-        announce_compilation(quiet=args.silent, share=needs_fit) as finish,
-        stage_progress(quiet=args.silent) as progress,
-    ):
-
-        def move(stage: str, done: int, total: int) -> None:
-            if stage == "fit":
-                finish()
-            progress(stage, done, total)
-
+    with stage_progress(quiet=args.silent) as progress:
         document = compact_files(
-            files, settings, out, opacity=args.opacity, hints=hints, overwrite=args.overwrite, progress=move,
+            files, settings, out, opacity=args.opacity, hints=hints, overwrite=args.overwrite, progress=progress,
             hashed=args.json or args.report is not None, seconds_before=seconds_before, report_path=args.report,
             normals=writing.normals, spz_version=writing.spz_version, cameras_path=cameras,
             saved_cameras=args.save_cameras,

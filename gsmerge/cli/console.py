@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
-import subprocess
 import sys
 import textwrap
 import warnings
@@ -76,37 +74,6 @@ def plain_warnings() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.showwarning = show
         yield
-
-
-@contextmanager
-def announce_compilation(*, quiet: bool, share: bool = False) -> Iterator[Callable[[], None]]:
-    """Print a line, once in a block, when a kernel has to be compiled (in the first run after installation).
-
-    With ``share`` a second process compiles the kernels of the fit in the meantime. Yields a function that waits
-    for it, to be called before the fit.
-    """
-    from gsmerge.kernels.compilation import watch_compilation
-
-    second: list[subprocess.Popen[bytes]] = []
-
-    def begin() -> None:
-        say("compiling kernels for their first use, up to 30 s", quiet=quiet)
-        if share and (os.cpu_count() or 1) > 1:
-            silent = subprocess.DEVNULL
-            command = [sys.executable, "-m", "gsmerge.stages.fit.warm"]
-            second.append(subprocess.Popen(command, stdin=silent, stdout=silent, stderr=silent))
-
-    def finish() -> None:
-        for process in second:
-            process.wait()
-
-    with watch_compilation(begin):
-        try:
-            yield finish
-        finally:
-            for process in second:
-                process.terminate()
-                process.wait()
 
 
 def _terminal(*, quiet: bool) -> Any:

@@ -9,7 +9,7 @@ from time import perf_counter
 from typing import Any
 
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.console import announce_compilation, print_document, say_notes, stage_progress
+from gsmerge.cli.console import print_document, say_notes, stage_progress
 from gsmerge.cli.paths import FileOptions, check_format, check_outputs, default_output
 from gsmerge.errors import SceneError
 
@@ -71,7 +71,7 @@ def decode(args: opt.Args) -> None:
         print_document(document, f"would write  {out}: at most {most:,} Gaussians", as_json=args.json)
         return
     with atomic_output(out, overwrite=args.overwrite) as temporary:
-        with announce_compilation(quiet=args.silent), stage_progress(quiet=args.silent) as progress:
+        with stage_progress(quiet=args.silent) as progress:
             decoded = decode_stored(
                 stored, **count, options=fit, seed=settings.seed, threads=settings.threads, device=settings.device,
                 progress=progress,

@@ -7,7 +7,7 @@ from time import perf_counter
 from typing import Any
 
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.console import announce_compilation, print_document, say_notes, stage_progress
+from gsmerge.cli.console import print_document, say_notes, stage_progress
 from gsmerge.cli.paths import check_outputs, checkpoint_files, input_files
 
 
@@ -40,7 +40,7 @@ def encode(args: opt.Args) -> None:
     with atomic_output(out, overwrite=args.overwrite) as temporary:
         given = read_input(files, opacity=args.opacity, hints=hints)
         read = perf_counter()
-        with announce_compilation(quiet=args.silent), stage_progress(quiet=args.silent) as progress:
+        with stage_progress(quiet=args.silent) as progress:
             encoded = encode_scene(given.scene, settings, max_k=args.max_k, progress=progress)
         done = perf_counter()
         hashed: dict[str, Any] = {"sha256": file_sha256(files.ply), "bytes": files.ply.stat().st_size}

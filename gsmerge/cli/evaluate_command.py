@@ -10,7 +10,7 @@ import typer
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.before_after import BeforeAfter, lpips_networks, read_before_after
-from gsmerge.cli.console import announce_compilation, print_document, say_notes, stage_progress
+from gsmerge.cli.console import print_document, say_notes, stage_progress
 from gsmerge.cli.paths import check_outputs, input_files, write_texts
 from gsmerge.errors import SceneError, UsageError
 
@@ -99,7 +99,7 @@ def evaluate(args: opt.Args) -> None:
     if len(given.scene) < len(given.load.scene):
         notes += [_more_views(name, ply, given.scene.cameras) for name, ply in given.plys.items()]
     say_notes(notes, quiet=args.silent)
-    with announce_compilation(quiet=args.silent), stage_progress(quiet=args.silent) as progress:
+    with stage_progress(quiet=args.silent) as progress:
         evaluation = evaluate_scene(
             given.scene, given.gaussians, given.held_out, options, cameras=given.cameras, progress=progress
         )

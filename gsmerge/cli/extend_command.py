@@ -9,7 +9,7 @@ from time import perf_counter
 from typing import Any
 
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.console import announce_compilation, one_line, say_notes, stage_progress
+from gsmerge.cli.console import one_line, say_notes, stage_progress
 from gsmerge.cli.paths import input_files
 from gsmerge.errors import UsageError
 
@@ -39,18 +39,17 @@ def extend(args: opt.Args) -> None:
         if any(path.resolve() == args.state.resolve() for path in input_files(files)):
             raise UsageError(f"{args.state}: expected a state other than the input; name another file")
     documents: list[dict[str, Any]] = []
-    with announce_compilation(quiet=args.silent):
-        for files in batches:
-            before = {"import": perf_counter() - start} if not documents else {}
-            with stage_progress(quiet=args.silent) as progress:
-                document = extend_file(
-                    args.state, files, settings, opacity=args.opacity, hints=hints, progress=progress,
-                    seconds_before=before,
-                )  # fmt: skip
-            documents.append(document)
-            say_notes(document["notes"], quiet=args.silent)
-            if not args.silent:
-                print(one_line(_summary(document)))
+    for files in batches:
+        before = {"import": perf_counter() - start} if not documents else {}
+        with stage_progress(quiet=args.silent) as progress:
+            document = extend_file(
+                args.state, files, settings, opacity=args.opacity, hints=hints, progress=progress,
+                seconds_before=before,
+            )  # fmt: skip
+        documents.append(document)
+        say_notes(document["notes"], quiet=args.silent)
+        if not args.silent:
+            print(one_line(_summary(document)))
     if args.json:
         from gsmerge.report import to_json
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.console import announce_compilation, print_document, stage_progress
+from gsmerge.cli.console import print_document, stage_progress
 from gsmerge.errors import SceneError, UsageError
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def generate(args: opt.Args) -> None:
     if args.dry_run:
         scenes = plan(out, args.scenes, options, **where)
     else:
-        with announce_compilation(quiet=args.silent), stage_progress(quiet=args.silent) as progress:
+        with stage_progress(quiet=args.silent) as progress:
             move = partial(progress, "generate")
             scenes = generate_scenes(out, args.scenes, options, **where, threads=args.threads, progress=move)
     document = {**document_head(), "options": options.to_dict(), "seed": seed, "dry_run": args.dry_run, "notes": []}

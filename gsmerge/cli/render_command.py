@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.console import announce_compilation, print_document, say, say_notes, stage_progress
+from gsmerge.cli.console import print_document, say, say_notes, stage_progress
 from gsmerge.cli.paths import check_cameras, check_folder, check_outputs, input_files, source_of
 from gsmerge.errors import SceneError, UsageError
 
@@ -68,7 +68,6 @@ def render(args: opt.Args) -> None:
     if not args.dry_run:
         with (
             use_threads(args.threads) as threads,
-            announce_compilation(quiet=args.silent),
             stage_progress(quiet=args.silent) as progress,
         ):
             for i, (path, picture) in enumerate(zip(paths, draw(threads), strict=True), 1):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.before_after import held_out_views, require_views
-from gsmerge.cli.console import announce_compilation, print_document, say_notes, stage_progress
+from gsmerge.cli.console import print_document, say_notes, stage_progress
 from gsmerge.cli.paths import check_outputs, input_files, write_texts
 from gsmerge.errors import TargetError
 
@@ -36,7 +36,7 @@ def stress(args: opt.Args) -> None:
     notes = [*load.notes, *adapted]
     say_notes(notes, quiet=args.silent)
     names = None if args.cases is None else [name.strip() for name in args.cases.split(",")]
-    with announce_compilation(quiet=args.silent), stage_progress(quiet=args.silent) as progress:
+    with stage_progress(quiet=args.silent) as progress:
         outcomes = stress_scene(load, settings, targets=held_out, cases=names, hints=hints, progress=progress)
     document = {
         **document_head(),

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.console import announce_compilation, print_document, say_notes, stage_progress
+from gsmerge.cli.console import print_document, say_notes, stage_progress
 
 
 @opt.command(
@@ -57,7 +57,7 @@ def train(args: opt.Args) -> None:
         scenes = find_training_scenes(args.data, out, apart)
         notes = [] if apart else ["without --validation, other crops of the same scenes choose the best checkpoint"]
         say_notes(notes, quiet=silent)
-        with announce_compilation(quiet=silent), stage_progress(quiet=silent) as progress, use_threads(threads):
+        with stage_progress(quiet=silent) as progress, use_threads(threads):
             cache = args.cache or out / "examples"
             shards, validation = (prepare_shards(part, options, cache, processes, progress) for part in (scenes, apart))
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.before_after import read_before_after
-from gsmerge.cli.console import announce_compilation, print_document, say, say_notes, stage_progress
+from gsmerge.cli.console import print_document, say, say_notes, stage_progress
 from gsmerge.cli.paths import check_outputs, input_files, write_texts
 from gsmerge.errors import UsageError
 
@@ -47,7 +47,7 @@ def view(args: opt.Args) -> None:
     from gsmerge.view.page import headline, view_page
 
     sizes = [given.load.ply.file_bytes, *(ply.info.file_bytes for ply in given.plys.values())]
-    with announce_compilation(quiet=args.silent), stage_progress(quiet=args.silent) as progress:
+    with stage_progress(quiet=args.silent) as progress:
         title = files.ply.parent.absolute().name if files.ply.stem == "scene" else files.ply.stem
         data = collect(
             title, given.scene, given.gaussians, sizes, given.held_out, cameras=given.cameras,

@@ -199,7 +199,7 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
         ``num_gaussians``: the most that the result can have; ``ratio`` to the input, ``bytes`` as a ``.ply``;
         ``method``, ``superpixels_per_view`` (None where a budget distributes them), ``k``, ``match``, ``checkpoint``
         and ``fit`` as they are used; ``seconds`` and ``memory_bytes``, to two digits and right within a factor of
-        about two once the kernels are compiled; ``memory_problem``, None where this machine has enough.
+        about two; ``memory_problem``, None where this machine has enough.
     """
     photos, settings = scene.images is not None, resolved_settings(options, photos=scene.images is not None)
     limits = count_limits(scene, options.segment, options.decode, options.budget)

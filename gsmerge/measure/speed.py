@@ -74,7 +74,7 @@ def measure_costs(
 def _time_in_turns(scenes: Mapping[str, Gaussians], views: Cameras, near: float) -> dict[str, float]:
     """Time each scene's views, one scene after the other and again; return seconds per view."""
     shortest = {name: np.full(len(views), np.inf) for name in scenes}
-    for gaussians in scenes.values():  # compiles, and fills caches
+    for gaussians in scenes.values():  # fills caches
         time_render(gaussians, views[[0]], near)
     for turn in range(REPEATS):
         for name, gaussians in scenes.items():

@@ -8,7 +8,7 @@ transmittance would reach 1e-4, pixel centres at +0.5.
 
 :func:`render` can be differentiated, and hands CUDA tensors to gsplat (:mod:`gsmerge.render.cuda`);
 all else is the CPU's. Training loops that need no autograd take gradients from
-:mod:`gsmerge.render.gradient`, whose kernels are compiled when they are first used.
+:mod:`gsmerge.render.gradient`.
 
 Results do not depend on the number of threads: every Gaussian is projected and every tile blended
 alone, and what is summed over tiles is summed in the order of the tiles.

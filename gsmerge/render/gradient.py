@@ -7,8 +7,7 @@ For training loops, on arrays and without autograd::
     wanted = plan_gradients(plan, grad_image, image=image, transmittance=transmittance, colors=colors)
     means[wanted.ids] -= rate * wanted.means
 
-:func:`gsmerge.render` is differentiable with the same kernels. Nothing here is compiled or imported
-before it is used. Results do not depend on the number of threads.
+:func:`gsmerge.render` is differentiable with the same kernels. Results do not depend on the number of threads.
 """
 
 from __future__ import annotations

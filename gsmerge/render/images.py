@@ -77,7 +77,7 @@ def render(
 
             return render_cuda(gaussians, cameras, under, with_depths=with_depths, **options)
         if _needs_gradient(gaussians, cameras):
-            from gsmerge.render.autograd import render_tensors  # compiled only for those who train
+            from gsmerge.render.autograd import render_tensors  # only for those who train
 
             return render_tensors(gaussians, cameras, under, with_depths=with_depths, **options)
     splats, viewmats, Ks = prepare_views(gaussians, cameras)

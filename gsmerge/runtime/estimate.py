@@ -1,4 +1,4 @@
-"""Estimates of a run's seconds and bytes, within a factor of about two, once the kernels are compiled."""
+"""Estimates of a run's seconds and bytes, within a factor of about two."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ COST_SLOW = {"bass-adaptive": 6.0, "slic": 4.5, "greedy": 25.0, "splat-transform
 COST_STEP = 0.2  # of the fit
 
 # Memory, in bytes
-BYTES_FIXED = 250_000_000  # interpreter, numba and kernels
+BYTES_FIXED = 250_000_000  # interpreter and libraries
 BYTES_PER_GAUSSIAN = 150
 BYTES_PER_VALUE = 4.5  # of higher harmonics, per Gaussian: those of the scene, and of some of its groups
 BYTES_PER_PIXEL = 90  # the photo as floats and what segmentation and rendering hold of it

@@ -1,6 +1,6 @@
 """One thread pool for the whole package.
 
-Numba kernels are compiled single-threaded and release the GIL; parallelism is over views (or bands of an image)
+Kernels run on one thread and release the GIL; parallelism is over views (or bands of an image)
 and lives here. So there is one barrier per pass over the views instead of one per loop, nothing spins, and a
 result cannot depend on the number of threads: every item is computed alone, and results come back in order.
 OpenCV and torch are held to one thread each while a pool is in use, so that the three do not fight for the cores;

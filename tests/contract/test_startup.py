@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-HEAVY = ("torch", "numba", "cv2", "numpy", "plyfile", "skimage", "matplotlib", "jinja2")
+HEAVY = ("torch", "cv2", "numpy", "plyfile", "skimage", "matplotlib", "jinja2")
 COMMANDS = (
     "compact", "batch", "encode", "decode", "extend", "inspect", "view", "render", "evaluate", "stress", "chart",
     "generate", "train",
@@ -53,7 +53,7 @@ def test_import_loads_nothing_heavy() -> None:
 
 
 def test_compacting_loads_neither_torch_nor_scipy(made_scene: Path, tmp_path: Path) -> None:
-    """Which take longer to load than a small scene takes to merge; numba asks whether scipy is there."""
+    """Which take longer to load than a small scene takes to merge."""
     arguments = ["compact", str(made_scene), "-o", str(tmp_path / "small.ply")]
     code = f"from gsmerge.cli import main\nassert main({arguments!r}) == 0\nimport sys\n"
     modules = set(run_python(f"{code}print(*sys.modules)").splitlines()[-1].split())

@@ -186,30 +186,6 @@ def test_a_signal_in_a_callback_is_not_lost(
 
 
 @pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGINT", 130)])
-def test_a_signal_waits_for_the_lock_of_the_compiler(
-    name: str, code: int, scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Between taking it and being about to give it back: the pool's threads would wait for it for ever."""
-    from numba.core.compiler_lock import global_compiler_lock
-
-    events = []
-
-    def compile_something(*_: object, **__: object) -> None:
-        global_compiler_lock.acquire()
-        signal.raise_signal(signal.Signals[name])
-        events.append("compiled")
-        global_compiler_lock.release()
-        deadline = time.monotonic() + 60
-        while time.monotonic() < deadline:
-            time.sleep(0.001)
-
-    monkeypatch.setattr("gsmerge.compact_file.compact", compile_something)
-    assert run("compact", scene_copy).code == code
-    assert events == ["compiled"]
-    assert not global_compiler_lock.is_locked()
-
-
-@pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGINT", 130)])
 @pytest.mark.parametrize("error", [SystemError("returned a result with an exception set"), SceneError("a.ply", "odd")])
 def test_a_signal_that_a_library_makes_an_error_of(
     name: str, code: int, error: Exception, scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
@@ -277,19 +253,6 @@ def test_odd_places_to_write_to_and_run_in(case: str, scene_copy: Path, root: Pa
     if line:
         assert done.stderr.startswith("gsmerge: error: ")
         assert done.stderr.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    "value", ["NUMBA_NUM_THREADS=abc", "NUMBA_NUM_THREADS=0", "NUMBA_DISABLE_JIT=1", "NUMBA_OPT=x"]
-)
-def test_variables_that_numba_cannot_use_are_wrong_usage(value: str, scene_copy: Path, root: Path) -> None:
-    name, _, content = value.partition("=")
-    done = in_shell(f"$G compact . -o a.ply {QUICK}", scene_copy, root, **{name: content})
-    assert done.returncode == 2
-    assert name in done.stderr
-    assert done.stderr.startswith("gsmerge: error: ")
-    assert done.stderr.endswith("; unset it\n")
-    assert done.stderr.count("\n") == 1
 
 
 def test_names_that_the_terminal_cannot_show(scene_copy: Path, root: Path) -> None:

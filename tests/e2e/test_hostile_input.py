@@ -18,7 +18,7 @@ from hostile import CASES, MARKER, Case
 
 from .conftest import Run, listing
 
-SECONDS = 100  # of processor time, some of which may be compiling; what never ends takes more
+SECONDS = 100  # of processor time; what never ends takes more
 BYTES = 2**30
 
 COMPACTED = ("one position 1e30", "half of the positions NaN", "colours 1e38", "opacities 1e38", "scales 1e38",

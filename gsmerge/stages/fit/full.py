@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -242,7 +241,7 @@ def fit_full(
     after = before = score_to_beat(own, baseline_start, plan)
     queue: list[int] = []
     grows, step, steps, error, judged = options.grows, 0, options.steps, 0.0, False
-    started = start_clock(state, plan)
+    started = time.perf_counter()
     while step < steps:
         part = step / steps
         if grows and part >= GROWTH and len(state.x) < count:
@@ -271,14 +270,6 @@ def fit_full(
     viewmats = None if plan.poses is None else plan.poses.viewmats
     fitted = gaussians_of(tail.of(state.x), state.splats.shN)
     return fitted, FitReport("full", True, step, before, after, why, viewmats)
-
-
-def start_clock(state: State, plan: FitPlan) -> float:
-    """Return the present time; for a time budget after a step on copies, which loads the kernels."""
-    if plan.options.time_budget is not None:
-        apart = replace(plan, poses=deepcopy(plan.poses))
-        fit_step(deepcopy(state), apart, 0, 1, 0.0, np.random.default_rng(0))
-    return time.perf_counter()
 
 
 def affordable_steps(seconds: float, plan: FitPlan) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -241,25 +240,6 @@ def test_time_budget_ends_the_run(truth: Gaussians, photos: Pair) -> None:
     if report.accepted:
         assert report.stopped == "time budget spent"
         assert len(result) == len(truth)
-
-
-def test_clock_of_a_budget_starts_after_a_step_on_copies(
-    truth: Gaussians, photos: Pair, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """So that compiling does not count as time of steps; neither Gaussians nor cameras have moved when it starts."""
-    steps: list[tuple[object, ...]] = []
-    step = full_module.fit_step
-    monkeypatch.setattr(full_module, "fit_step", lambda *args: steps.append(args) or step(*args))
-    for budget, expected in ((None, 0), (1.0, 1)):
-        steps.clear()
-        state = start_state(scenes.spoil(truth))
-        plan = plan_run(photos, replace(QUICK, time_budget=budget, move_cameras=True), 0)
-        before = state.x.copy(), plan.photos[0].viewmats.copy()
-        assert full_module.start_clock(state, plan) <= time.perf_counter()
-        assert len(steps) == expected
-        np.testing.assert_array_equal(state.x, before[0])
-        np.testing.assert_array_equal(plan.photos[0].viewmats, before[1])
-    assert not plan.poses.x.any()
 
 
 def test_steps_follow_the_time_budget(photos: Pair) -> None:
