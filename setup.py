@@ -4,7 +4,7 @@ import importlib.util
 import sys
 from pathlib import Path
 
-from setuptools import Command, setup
+from setuptools import Command, Distribution, setup
 from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build import build
 
@@ -52,12 +52,15 @@ class Build(build):
 class BuildWheel(bdist_wheel):
     """A wheel of a platform, for any version of Python: the library does not know Python."""
 
-    def finalize_options(self):
-        super().finalize_options()
-        self.root_is_pure = False
-
     def get_tag(self):
         return "py3", "none", super().get_tag()[2]
 
 
-setup(cmdclass={"build": Build, "build_native": BuildNative, "bdist_wheel": BuildWheel})
+class NativeDistribution(Distribution):
+    """A package with machine code in it."""
+
+    def has_ext_modules(self):
+        return True
+
+
+setup(distclass=NativeDistribution, cmdclass={"build": Build, "build_native": BuildNative, "bdist_wheel": BuildWheel})
