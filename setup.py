@@ -29,6 +29,8 @@ class BuildNative(Command):
 
     def run(self):
         folder = native_build.FOLDER if self.editable_mode else Path(self.build_lib, "gsmerge", "native")
+        for path in folder.glob("kernels-*"):  # of an earlier build, maybe for another platform
+            path.unlink()
         wheel = self.distribution.command_obj.get("bdist_wheel")
         for path in native_build.build(folder, platform=wheel.plat_name if wheel else None):
             self.announce(f"built {path}", level=2)

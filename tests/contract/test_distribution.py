@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+import sysconfig
 import tarfile
 import zipfile
 from email.message import Message
@@ -18,12 +19,13 @@ import tomllib
 
 import gsmerge
 from gsmerge.io.formats import spz
+from gsmerge.native.build import find_platform
 from gsmerge.render.cuda import INSTALL
 from gsmerge.research.charts import INSTALL_HINT
 
 pytest.importorskip("setuptools", minversion="77")
 BUILD = "import sys; from setuptools import build_meta as b; to = sys.argv[1]; b.build_wheel(to); b.build_sdist(to)"
-SOURCES = ("gsmerge", "pyproject.toml", "README.md", "LICENSE")
+SOURCES = ("gsmerge", "setup.py", "pyproject.toml", "README.md", "LICENSE")
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +34,7 @@ def built(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("distribution")
     for name in SOURCES:
         if (root / name).is_dir():
-            ignored = shutil.ignore_patterns("__pycache__", "*.nb?")
+            ignored = shutil.ignore_patterns("__pycache__", "kernels-*")
             shutil.copytree(root / name, folder / "source" / name, ignore=ignored)
         else:
             shutil.copy(root / name, folder / "source" / name)
@@ -71,12 +73,25 @@ def test_the_wheel_holds_every_file_of_the_package(built: Path) -> None:
     ] == []
 
 
+def test_the_wheel_holds_the_library_of_its_platform(built: Path) -> None:
+    """For any version of Python; the source archive holds none."""
+    (wheel,) = (built / "dist").glob("*.whl")
+    tag = sysconfig.get_platform().replace("-", "_").replace(".", "_")
+    assert wheel.name == f"gsmerge-{gsmerge.__version__}-py3-none-{tag}.whl"
+    here = find_platform()
+    libraries = {name for name in zipfile.ZipFile(wheel).namelist() if "/kernels-" in name}
+    assert libraries == {f"gsmerge/native/{here.library_name(target)}" for target in here.targets}
+    (archive,) = (built / "dist").glob("*.tar.gz")
+    with tarfile.open(archive) as file:
+        assert [name for name in file.getnames() if "/kernels-" in name] == []
+
+
 def test_the_source_archive_can_be_built_again(built: Path) -> None:
     (archive,) = (built / "dist").glob("*.tar.gz")
     with tarfile.open(archive) as file:
         names = {name.split("/", 1)[1] for name in file.getnames() if "/" in name}
     assert packed(built / "source") - names == set()
-    assert {"pyproject.toml", "README.md", "LICENSE"} <= names
+    assert {"setup.py", "pyproject.toml", "README.md", "LICENSE"} <= names
 
 
 def test_metadata(built: Path, root: Path, project: dict[str, Any]) -> None:
