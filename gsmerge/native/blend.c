@@ -41,11 +41,12 @@ static inline Weights blend_rows(float *state, const Batch *b, int64_t j, int32_
   return weights;
 }
 
-API void blend(const float *restrict footprints, const float *restrict colors, const int32_t *restrict members,
+API int32_t blend(const float *restrict footprints, const float *restrict colors, const int32_t *restrict members,
                const int64_t *restrict offsets, int64_t columns, int64_t first, int64_t last,
                const float *restrict background, float *restrict image, float *restrict transmittance, int64_t m,
-               int64_t n, int64_t ends, int64_t h, int64_t w) {
-  (void)m, (void)n, (void)ends;
+                  int64_t n, int64_t ends, int64_t h, int64_t w) {
+  Lists lists = {footprints, members, offsets, columns, m, n, ends};
+  if (!lists_are_sound(&lists, first, last)) return OUTSIDE;
   float state[4 * PLANE] __attribute__((aligned(64)));
   Batch batch;
   clear_batch(&batch);
@@ -54,7 +55,7 @@ API void blend(const float *restrict footprints, const float *restrict colors, c
     int64_t end = offsets[tile + 1];
     for (int64_t start = offsets[tile]; start < end && t.y_low <= t.y_high; start += BATCH) {
       int64_t stop = mini(end, start + BATCH);
-      gather(&batch, &t, footprints, members, start, stop, end);
+      if (!gather(&batch, &t, &lists, start, stop, end)) return OUTSIDE;
       gather_colors(&batch, colors, members, start, stop, end);
       for (int64_t j = 0; j < stop - start; j++)
         blend_rows(state, &batch, j, first_row(&t, &batch, j), last_row(&t, &batch, j));
@@ -69,6 +70,7 @@ API void blend(const float *restrict footprints, const float *restrict colors, c
         transmittance[pixel] = rest;
       }
   }
+  return 0;
 }
 
 // Weights of Gaussian j times the planes of some channels, summed over the tile.
@@ -85,11 +87,12 @@ static inline void sum_weights(float *state, const Batch *b, int64_t j, int32_t 
   for (int c = 0; c < CHANNELS; c++) slot[c] = c < channels ? total(sums[c]) : 0.f;
 }
 
-API void weighted_sums(const float *restrict footprints, const int32_t *restrict members,
+API int32_t weighted_sums(const float *restrict footprints, const int32_t *restrict members,
                        const int64_t *restrict offsets, int64_t columns, int64_t first, int64_t last,
                        const float *restrict image, float *restrict slots, int64_t m, int64_t n, int64_t ends,
-                       int64_t h, int64_t w, int64_t channels) {
-  (void)m, (void)n, (void)ends;
+                          int64_t h, int64_t w, int64_t channels) {
+  Lists lists = {footprints, members, offsets, columns, m, n, ends};
+  if (!lists_are_sound(&lists, first, last)) return OUTSIDE;
   float state[(CHANNELS + 1) * PLANE] __attribute__((aligned(64)));
   Batch batch;
   clear_batch(&batch);
@@ -102,7 +105,7 @@ API void weighted_sums(const float *restrict footprints, const int32_t *restrict
     int64_t start = offsets[tile], end = offsets[tile + 1];
     for (; start < end && t.y_low <= t.y_high; start += BATCH) {
       int64_t stop = mini(end, start + BATCH);
-      gather(&batch, &t, footprints, members, start, stop, end);
+      if (!gather(&batch, &t, &lists, start, stop, end)) return OUTSIDE;
       for (int64_t j = 0; j < stop - start; j++) {
         int32_t y0 = first_row(&t, &batch, j), y1 = last_row(&t, &batch, j);
         float *slot = slots + CHANNELS * (start + j);
@@ -115,24 +118,29 @@ API void weighted_sums(const float *restrict footprints, const int32_t *restrict
     }
     for (int64_t i = CHANNELS * start; i < CHANNELS * end; i++) slots[i] = 0.f;
   }
+  return 0;
 }
 
-API void add_slots(const int32_t *restrict members, const float *restrict slots, const int32_t *restrict ids,
+API int32_t add_slots(const int32_t *restrict members, const float *restrict slots, const int32_t *restrict ids,
                    int64_t first, float *restrict sums, int64_t n, int64_t m, int64_t gaussians, int64_t channels) {
-  (void)m, (void)gaussians;
   int64_t count = mini(CHANNELS, channels - first);
+  for (int64_t i = 0; i < n; i++)
+    if ((uint64_t)(int64_t)members[i] >= (uint64_t)m || (uint64_t)(int64_t)ids[members[i]] >= (uint64_t)gaussians)
+      return OUTSIDE;
   for (int64_t i = 0; i < n; i++) {
     __builtin_prefetch(sums + channels * ids[members[mini(i + BATCH, n - 1)]]);
     float *sum = sums + channels * ids[members[i]] + first;
     for (int64_t c = 0; c < count; c++) sum[c] += slots[CHANNELS * i + c];
   }
+  return 0;
 }
 
 // Blend the whole image, black behind it, and gather mass and peak of every Gaussian's weights on the way.
-API void survey(const float *restrict footprints, const float *restrict colors, const int32_t *restrict members,
+API int32_t survey(const float *restrict footprints, const float *restrict colors, const int32_t *restrict members,
                 const int64_t *restrict offsets, int64_t columns, float *restrict image, float *restrict totals,
-                int64_t m, int64_t n, int64_t ends, int64_t h, int64_t w) {
-  (void)m, (void)n;
+                   int64_t m, int64_t n, int64_t ends, int64_t h, int64_t w) {
+  Lists lists = {footprints, members, offsets, columns, m, n, ends};
+  if (!lists_are_sound(&lists, 0, ends - 1)) return OUTSIDE;
   float state[4 * PLANE] __attribute__((aligned(64)));
   Batch batch;
   clear_batch(&batch);
@@ -141,7 +149,7 @@ API void survey(const float *restrict footprints, const float *restrict colors, 
     int64_t end = offsets[tile + 1];
     for (int64_t start = offsets[tile]; start < end && t.y_low <= t.y_high; start += BATCH) {
       int64_t stop = mini(end, start + BATCH);
-      gather(&batch, &t, footprints, members, start, stop, end);
+      if (!gather(&batch, &t, &lists, start, stop, end)) return OUTSIDE;
       gather_colors(&batch, colors, members, start, stop, end);
       for (int64_t j = 0; j < stop - start; j++)
         add_total(totals + 2 * (int64_t)members[start + j],
@@ -153,12 +161,14 @@ API void survey(const float *restrict footprints, const float *restrict colors, 
         for (int c = 0; c < 3; c++)
           image[3 * ((t.top + y) * w + t.left + x) + c] = state[(c + 1) * PLANE + y * TILE + x];
   }
+  return 0;
 }
 
-API void contributions(const float *restrict footprints, const int32_t *restrict members,
+API int32_t contributions(const float *restrict footprints, const int32_t *restrict members,
                        const int64_t *restrict offsets, int64_t columns, int64_t height, int64_t width,
-                       float *restrict totals, int64_t m, int64_t n, int64_t ends) {
-  (void)m, (void)n;
+                          float *restrict totals, int64_t m, int64_t n, int64_t ends) {
+  Lists lists = {footprints, members, offsets, columns, m, n, ends};
+  if (!lists_are_sound(&lists, 0, ends - 1)) return OUTSIDE;
   float state[PLANE] __attribute__((aligned(64)));
   Batch batch;
   clear_batch(&batch);
@@ -167,7 +177,7 @@ API void contributions(const float *restrict footprints, const int32_t *restrict
     int64_t end = offsets[tile + 1];
     for (int64_t start = offsets[tile]; start < end && t.y_low <= t.y_high; start += BATCH) {
       int64_t stop = mini(end, start + BATCH);
-      gather(&batch, &t, footprints, members, start, stop, end);
+      if (!gather(&batch, &t, &lists, start, stop, end)) return OUTSIDE;
       for (int64_t i = start; i < stop; i++) __builtin_prefetch(totals + 2 * (int64_t)members[i]);
       for (int64_t j = 0; j < stop - start; j++) {
         Curve curve = curve_of(&batch, (int)j);
@@ -182,21 +192,23 @@ API void contributions(const float *restrict footprints, const int32_t *restrict
       narrow_tile(&t, state);
     }
   }
+  return 0;
 }
 
 // The rows of one tile in which the members of a list show, as the walks take them: first and last of each.
-API void rows_in_tile(const float *footprints, const int32_t *members, int64_t left, int64_t top, int32_t *rows,
-                      int64_t m, int64_t n) {
-  (void)m;
+API int32_t rows_in_tile(const float *footprints, const int32_t *members, int64_t left, int64_t top, int32_t *rows,
+                         int64_t m, int64_t n) {
+  Lists lists = {footprints, members, 0, 1, m, n, 0};
   Batch batch;
   clear_batch(&batch);
   Tile t = {left, top, TILE, TILE, 0, TILE - 1};
   for (int64_t start = 0; start < n; start += BATCH) {
     int64_t stop = mini(n, start + BATCH);
-    gather(&batch, &t, footprints, members, start, stop, n);
+    if (!gather(&batch, &t, &lists, start, stop, n)) return OUTSIDE;
     for (int64_t j = 0; j < stop - start; j++) {
       rows[2 * (start + j)] = batch.y0[j];
       rows[2 * (start + j) + 1] = batch.y1[j];
     }
   }
+  return 0;
 }

@@ -44,12 +44,13 @@ static inline void walk_back(float *state, const Batch *b, int64_t j, int32_t y0
   slot[8] = total(syy);
 }
 
-API void blend_backward(const float *restrict footprints, const float *restrict colors, const int32_t *restrict members,
+API int32_t blend_backward(const float *restrict footprints, const float *restrict colors, const int32_t *restrict members,
                         const int64_t *restrict offsets, int64_t columns, int64_t first, int64_t last,
                         const float *restrict image, const float *restrict transmittance,
                         const float *restrict grad_image, const float *restrict grad_left, float *restrict slots,
-                        int64_t m, int64_t n, int64_t ends, int64_t h, int64_t w) {
-  (void)m, (void)n, (void)ends;
+                           int64_t m, int64_t n, int64_t ends, int64_t h, int64_t w) {
+  Lists lists = {footprints, members, offsets, columns, m, n, ends};
+  if (!lists_are_sound(&lists, first, last)) return OUTSIDE;
   float state[5 * PLANE] __attribute__((aligned(64)));
   Batch batch;
   clear_batch(&batch);
@@ -69,7 +70,7 @@ API void blend_backward(const float *restrict footprints, const float *restrict 
     int64_t start = offsets[tile], end = offsets[tile + 1];
     for (; start < end && t.y_low <= t.y_high; start += BATCH) {
       int64_t stop = mini(end, start + BATCH);
-      gather(&batch, &t, footprints, members, start, stop, end);
+      if (!gather(&batch, &t, &lists, start, stop, end)) return OUTSIDE;
       gather_colors(&batch, colors, members, start, stop, end);
       for (int64_t j = 0; j < stop - start; j++)
         walk_back(state, &batch, j, first_row(&t, &batch, j), last_row(&t, &batch, j), slots + SUMS * (start + j));
@@ -77,15 +78,17 @@ API void blend_backward(const float *restrict footprints, const float *restrict 
     }
     for (int64_t i = SUMS * start; i < SUMS * end; i++) slots[i] = 0.f;
   }
+  return 0;
 }
 
-API void gather_slots(const int32_t *restrict members, const float *restrict slots, int64_t first, int64_t last,
+API int32_t gather_slots(const int32_t *restrict members, const float *restrict slots, int64_t first, int64_t last,
                       float *restrict sums, int64_t n, int64_t m) {
-  (void)m;
+  if (first < 0 || last > m) return OUTSIDE;
   for (int64_t i = 0; i < n; i++) {
     int64_t k = members[i];
     __builtin_prefetch(sums + SUMS * (int64_t)members[mini(i + BATCH, n - 1)]);
     if (k < first || k >= last) continue;
     for (int c = 0; c < SUMS; c++) sums[SUMS * k + c] += slots[SUMS * i + c];
   }
+  return 0;
 }

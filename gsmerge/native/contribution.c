@@ -58,10 +58,12 @@ API int32_t add_row(const float *restrict footprints, const int32_t *restrict me
                  double *restrict pairs, int32_t *restrict active, int32_t *restrict stamps, int64_t *restrict counts,
                  int64_t m, int64_t n, int64_t ends, int64_t h, int64_t w, int64_t room, int64_t slots,
                  int64_t num_labels) {
-  (void)n, (void)num_labels;
+  (void)num_labels;
   if (line < 0 || (line + 1) * columns >= ends || slots <= m || counts[NUM_ACTIVE] < 0 || counts[NUM_ACTIVE] > m ||
       counts[NUM_PAIRS] < 0 || counts[NUM_PAIRS] > room)
     return OUTSIDE;
+  Lists lists = {footprints, members, offsets, columns, m, n, ends};
+  if (!lists_are_sound(&lists, line * columns, (line + 1) * columns)) return OUTSIDE;
   float state[2 * PLANE] __attribute__((aligned(64))), sums[PLANE] = {0};
   int32_t lanes[PLANE] = {0}, names[PLANE], touched[PLANE + 1];
   Batch batch;
@@ -74,7 +76,7 @@ API int32_t add_row(const float *restrict footprints, const int32_t *restrict me
     if (num_pairs + (end - start) * number_labels(labels, &t, w, stamps, lanes, names) > room) return 0;
     for (; start < end && t.y_low <= t.y_high; start += BATCH) {
       int64_t stop = mini(end, start + BATCH);
-      gather(&batch, &t, footprints, members, start, stop, end);
+      if (!gather(&batch, &t, &lists, start, stop, end)) return OUTSIDE;
       for (int64_t j = 0; j < stop - start; j++) {
         int32_t y0 = first_row(&t, &batch, j), y1 = last_row(&t, &batch, j), k = members[start + j];
         weigh_rows(state, &batch, j, y0, y1);

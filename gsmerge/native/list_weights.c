@@ -5,11 +5,13 @@ enum { CHANNELS = 4 };  // of an image row
 
 // Write the weights of tiles from progress[0] on behind the progress[1] entries that are there, and advance both. A tile
 // whose entries may not fit is not begun in earnest: it is left for a call with more room.
-API void list_weights(const float *restrict footprints, const int32_t *restrict members,
+API int32_t list_weights(const float *restrict footprints, const int32_t *restrict members,
                       const int64_t *restrict offsets, int64_t columns, int64_t height, int64_t width,
                       int64_t *restrict starts, uint8_t *restrict lanes, float *restrict weights,
                       int64_t *restrict progress, int64_t m, int64_t n, int64_t ends, int64_t more, int64_t room) {
-  (void)m, (void)n, (void)more;
+  if (more != n + 1 || progress[0] < 0 || progress[1] < 0) return OUTSIDE;
+  Lists lists = {footprints, members, offsets, columns, m, n, ends};
+  if (!lists_are_sound(&lists, progress[0], ends - 1)) return OUTSIDE;
   float state[2 * PLANE] __attribute__((aligned(64)));
   Batch batch;
   clear_batch(&batch);
@@ -18,8 +20,8 @@ API void list_weights(const float *restrict footprints, const int32_t *restrict 
     int64_t start = offsets[tile], end = offsets[tile + 1], count = progress[1];
     for (; start < end && t.y_low <= t.y_high; start += BATCH) {
       int64_t stop = mini(end, start + BATCH);
-      if (count + BATCH * PLANE > room) return;
-      gather(&batch, &t, footprints, members, start, stop, end);
+      if (count + BATCH * PLANE > room) return 0;
+      if (!gather(&batch, &t, &lists, start, stop, end)) return OUTSIDE;
       for (int64_t j = 0; j < stop - start; j++) {
         int32_t y0 = first_row(&t, &batch, j), y1 = last_row(&t, &batch, j), x0, x1;
         weigh_rows(state, &batch, j, y0, y1);
@@ -39,6 +41,7 @@ API void list_weights(const float *restrict footprints, const int32_t *restrict 
     progress[0] = tile + 1;
     progress[1] = count;
   }
+  return 0;
 }
 
 API void spread(const int64_t *restrict starts, const uint8_t *restrict lanes, const float *restrict weights,

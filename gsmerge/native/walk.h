@@ -103,11 +103,30 @@ static inline void clear_batch(Batch *b) {
   for (int i = 0; i < 11 * BATCH; i++) numbers[i] = 1.f;
 }
 
-// Copy the footprints of members start to stop into the batch, and call for those of the next batch.
-static inline void gather(Batch *b, const Tile *tile, const float *footprints, const int32_t *members, int64_t start,
-                          int64_t stop, int64_t end) {
+// The lists of all tiles: rows of footprints, tile after tile.
+typedef struct {
+  const float *footprints;
+  const int32_t *members;
+  const int64_t *offsets;
+  int64_t columns, m, n, ends;  // tiles per row; footprints, members and offsets that there are
+} Lists;
+
+// Whether there is such a range of tiles, and their lists lie among the members.
+static inline bool lists_are_sound(const Lists *l, int64_t first, int64_t last) {
+  if (l->columns < 1 || first < 0 || last >= l->ends) return false;
+  for (int64_t tile = first; tile < last; tile++)
+    if (l->offsets[tile] < 0 || l->offsets[tile] > l->offsets[tile + 1] || l->offsets[tile + 1] > l->n) return false;
+  return true;
+}
+
+// Copy the footprints of members start to stop into the batch, and call for those of the next batch -> whether there
+// are such footprints.
+static inline bool gather(Batch *b, const Tile *tile, const Lists *l, int64_t start, int64_t stop, int64_t end) {
   float left = (float)tile->left + 0.5f, top = (float)tile->top + 0.5f;
+  const float *footprints = l->footprints;
+  const int32_t *members = l->members;
   for (int64_t i = start; i < stop; i++) {
+    if ((uint64_t)(int64_t)members[i] >= (uint64_t)l->m) return false;
     const float *f = footprints + FOOTPRINT * (int64_t)members[i];
     int64_t j = i - start;
     b->mx[j] = f[0] - left;
@@ -122,6 +141,7 @@ static inline void gather(Batch *b, const Tile *tile, const float *footprints, c
   narrow_rows(b);
   for (int64_t i = stop; i < end && i < stop + BATCH; i++)
     __builtin_prefetch(footprints + FOOTPRINT * (int64_t)members[i]);
+  return true;
 }
 
 // Copy the colours of members start to stop into the batch, and call for those of the next batch.

@@ -6,23 +6,23 @@ All kernels here walk the same lists with the same weights, see ``gsmerge/native
 from __future__ import annotations
 
 from gsmerge.kernels.raster.project import FOOTPRINT
-from gsmerge.native.signature import f4, i4, i8, native
+from gsmerge.native.signature import STATUS, f4, i4, i8, native
 
 CHANNELS = 4  # channels that one walk of weighted_sums adds up
 MAX_ALPHA = 0.99  # largest share of the light that one Gaussian takes (gsplat)
 
-# Arguments of every walk, see the package.
+# Arguments of every walk, see the package; the library checks indices on its way.
 LISTS = {
     "footprints": f4("m", FOOTPRINT),
-    "members": i4("n", least=0, below="m"),
-    "offsets": i8("ends", least=0, most="n", ascending=True),
-    "columns": i8(least=1),
+    "members": i4("n"),
+    "offsets": i8("ends"),
+    "columns": i8(),
 }
-TILES = {"first": i8(least=0), "last": i8(below="ends")}
+TILES = {"first": i8(), "last": i8()}
 
 
 @native(
-    footprints=LISTS["footprints"], colors=f4("m", 3), members=LISTS["members"], offsets=LISTS["offsets"],
+    STATUS, footprints=LISTS["footprints"], colors=f4("m", 3), members=LISTS["members"], offsets=LISTS["offsets"],
     columns=LISTS["columns"], **TILES, background=f4(3), image=f4("h", "w", 3, out=True),
     transmittance=f4("h", "w", out=True),
 )  # fmt: skip
@@ -30,7 +30,7 @@ def blend(footprints, colors, members, offsets, columns, first, last, background
     """Blend a range of tiles over ``background [3]`` into ``image [h,w,3]`` and ``transmittance [h,w]``."""
 
 
-@native(**LISTS, **TILES, image=f4("h", "w", "channels"), slots=f4("n", CHANNELS, out=True))
+@native(STATUS, **LISTS, **TILES, image=f4("h", "w", "channels"), slots=f4("n", CHANNELS, out=True))
 def weighted_sums(footprints, members, offsets, columns, first, last, image, slots):
     """Per intersection of a range of tiles: the weights times up to four channels of an image, summed.
 
@@ -39,7 +39,7 @@ def weighted_sums(footprints, members, offsets, columns, first, last, image, slo
 
 
 @native(
-    members=i4("n", least=0, below="m"), slots=f4("n", CHANNELS), ids=i4("m", least=0, below="gaussians"),
+    STATUS, members=i4("n"), slots=f4("n", CHANNELS), ids=i4("m"),
     first=i8(least=0, below="channels"), sums=f4("gaussians", "channels", out=True),
 )  # fmt: skip
 def add_slots(members, slots, ids, first, sums):
@@ -50,14 +50,14 @@ def add_slots(members, slots, ids, first, sums):
 
 
 @native(
-    footprints=LISTS["footprints"], colors=f4("m", 3), members=LISTS["members"], offsets=LISTS["offsets"],
+    STATUS, footprints=LISTS["footprints"], colors=f4("m", 3), members=LISTS["members"], offsets=LISTS["offsets"],
     columns=LISTS["columns"], image=f4("h", "w", 3, out=True), totals=f4("m", 2, out=True),
 )  # fmt: skip
 def survey(footprints, colors, members, offsets, columns, image, totals):
     """Do the work of :func:`blend`, of all tiles over black, and of :func:`contributions` in one walk."""
 
 
-@native(**LISTS, height=i8(least=1), width=i8(least=1), totals=f4("m", 2, out=True))
+@native(STATUS, **LISTS, height=i8(least=1), width=i8(least=1), totals=f4("m", 2, out=True))
 def contributions(footprints, members, offsets, columns, height, width, totals):
     """Add every Gaussian's weights over the pixels to ``totals[:, 0]``; raise ``totals[:, 1]`` to the largest of them.
 
@@ -66,7 +66,7 @@ def contributions(footprints, members, offsets, columns, height, width, totals):
 
 
 @native(
-    footprints=LISTS["footprints"], members=LISTS["members"], left=i8(), top=i8(), rows=i4("n", 2, out=True),
+    STATUS, footprints=LISTS["footprints"], members=LISTS["members"], left=i8(), top=i8(), rows=i4("n", 2, out=True),
 )  # fmt: skip
 def rows_in_tile(footprints, members, left, top, rows):
     """Write first and last row ``[n,2]`` in which members show in the tile at a pixel, as all walks take them."""

@@ -7,7 +7,7 @@ between threads, and no result depends on them. The formula is in ``gsmerge/nati
 from __future__ import annotations
 
 from gsmerge.kernels.raster.blend import LISTS, TILES
-from gsmerge.native.signature import f4, i4, i8, native
+from gsmerge.native.signature import STATUS, f4, i4, i8, native
 
 # Numbers per Gaussian: the sums of w g (3), of v = d loss / d exponent, and of v times x, y, xx, xy, yy, where x, y
 # is the pixel less the Gaussian's mean.
@@ -15,7 +15,7 @@ SUMS = 9
 
 
 @native(
-    footprints=LISTS["footprints"], colors=f4("m", 3), members=LISTS["members"], offsets=LISTS["offsets"],
+    STATUS, footprints=LISTS["footprints"], colors=f4("m", 3), members=LISTS["members"], offsets=LISTS["offsets"],
     columns=LISTS["columns"], **TILES, image=f4("h", "w", 3), transmittance=f4("h", "w"),
     grad_image=f4("h", "w", 3), grad_left=f4("h", "w", optional=True), slots=f4("n", SUMS, out=True),
 )  # fmt: skip
@@ -34,7 +34,7 @@ def blend_backward(
 
 
 @native(
-    members=i4("n", least=0, below="m"), slots=f4("n", SUMS), first=i8(least=0), last=i8(),
+    STATUS, members=i4("n"), slots=f4("n", SUMS), first=i8(), last=i8(),
     sums=f4("m", SUMS, out=True),
 )  # fmt: skip
 def gather_slots(members, slots, first, last, sums):
