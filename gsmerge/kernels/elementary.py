@@ -87,9 +87,10 @@ def _apply(function: Callable[..., None], *arrays: ArrayLike, narrow: Callable[.
     inner = np.dtype(np.float64)
     if narrow is not None and kind == np.float32:
         function, inner = narrow, kind
-    wide = np.broadcast_arrays(*(np.asarray(a, inner) for a in arrays))
-    flat = [np.ascontiguousarray(a).reshape(-1) for a in wide]
-    out = np.empty(wide[0].shape, inner)
+    typed = [np.asarray(a, inner) for a in arrays]
+    shape = np.broadcast_shapes(*(a.shape for a in typed))
+    flat = [np.ascontiguousarray(a if a.shape == shape else np.broadcast_to(a, shape)).reshape(-1) for a in typed]
+    out = np.empty(shape, inner)
     function(*flat, out.reshape(-1))
     return out.astype(kind, copy=False)[()]
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from gsmerge.kernels.elementary import exp
 from gsmerge.native.signature import STATUS, f4, native
 
 SLOPE, SMOOTH = np.array([-1, 0, 1], np.float32), np.array([1, 2, 1], np.float32)  # Sobel's filters
+Picture = np.ndarray[Any, Any]
 CUBIC = -0.75  # slope parameter of the cubic convolution (Keys 1981), OpenCV's
 
 
@@ -27,12 +30,12 @@ def _sample_picture(picture, x, y, out):
     """Write what :func:`sample_bilinear` returns."""
 
 
-def convolve(picture: np.ndarray, across: np.ndarray, down: np.ndarray) -> np.ndarray:
+def convolve(picture: Picture, across: np.ndarray, down: np.ndarray) -> Picture:
     """Convolve a picture ``[h,w]`` or ``[h,w,c]`` with two filters of odd lengths, mirrored at its borders; float32.
 
     ``across`` goes along the rows and ``down`` along the columns; the borders themselves are not repeated.
     """
-    source: np.ndarray = np.ascontiguousarray(picture, np.float32)
+    source: Picture = np.ascontiguousarray(picture, np.float32)
     layers = source.reshape(source.shape if source.ndim == 3 else (*source.shape, 1))
     height, width, channels = layers.shape
     taps = [np.ascontiguousarray(one, np.float32) for one in (across, down)]
@@ -42,7 +45,7 @@ def convolve(picture: np.ndarray, across: np.ndarray, down: np.ndarray) -> np.nd
     return out.reshape(source.shape)
 
 
-def blur(picture: np.ndarray, sigma: float, size: int | None = None) -> np.ndarray:
+def blur(picture: Picture, sigma: float, size: int | None = None) -> Picture:
     """Blur a picture ``[h,w]`` or ``[h,w,c]`` by a Gaussian of ``sigma`` pixels; float32.
 
     ``size`` is the odd number of pixels that its filter has, by default what lies within four ``sigma``.
@@ -54,17 +57,17 @@ def blur(picture: np.ndarray, sigma: float, size: int | None = None) -> np.ndarr
     return convolve(picture, taps, taps)
 
 
-def sobel(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def sobel(picture: Picture) -> tuple[Picture, Picture]:
     """Compute Sobel's derivatives of a picture, to the right and down: float32, eight times those per pixel."""
     return convolve(picture, SLOPE, SMOOTH), convolve(picture, SMOOTH, SLOPE)
 
 
-def sample_bilinear(picture: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def sample_bilinear(picture: Picture, x: np.ndarray, y: np.ndarray) -> Picture:
     """Look up places of a picture ``[h,w]`` or ``[h,w,c]``, bilinear: float32 of the places' shape ``[...,c]``.
 
     ``x`` and ``y`` are in pixels, the top-left pixel's centre at (0, 0); the borders are repeated outside.
     """
-    source: np.ndarray = np.ascontiguousarray(picture, np.float32)
+    source: Picture = np.ascontiguousarray(picture, np.float32)
     layers = source.reshape(source.shape if source.ndim == 3 else (*source.shape, 1))
     places = [np.ascontiguousarray(one, np.float32) for one in (x, y)]
     out = np.empty((places[0].size, layers.shape[2]), np.float32)
@@ -72,9 +75,9 @@ def sample_bilinear(picture: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.nda
     return out.reshape(*places[0].shape, *source.shape[2:])
 
 
-def enlarge(picture: np.ndarray, width: int, height: int) -> np.ndarray:
+def enlarge(picture: Picture, width: int, height: int) -> Picture:
     """Resize a picture ``[h,w]`` or ``[h,w,c]`` to a larger size in pixels by cubic convolution; float32."""
-    out: np.ndarray = np.asarray(picture, np.float32)
+    out: Picture = np.asarray(picture, np.float32)
     for axis, size in ((0, height), (1, width)):
         ids, weights = _cubic_taps(out.shape[axis], size)
         shape = [-1 if i == axis else 1 for i in range(out.ndim)]
@@ -83,7 +86,7 @@ def enlarge(picture: np.ndarray, width: int, height: int) -> np.ndarray:
     return out
 
 
-def _cubic_taps(old: int, new: int) -> tuple[np.ndarray, np.ndarray]:
+def _cubic_taps(old: int, new: int) -> tuple[Picture, Picture]:
     """Return which four of ``old`` pixels, and how much of each, make ``new`` ones: ``[4,new]`` ids and weights."""
     places = (np.arange(new) + 0.5) * (old / new) - 0.5
     first = np.floor(places).astype(np.int64)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsmerge.kernels.matrices import eigh, invert, matmul, solve, solve_symmetric
+from gsmerge.kernels.matrices import closest_rotation, determinant, eigh, invert, matmul, solve, solve_symmetric
 
 RNG = np.random.default_rng(0)
 
@@ -92,3 +92,29 @@ def test_least_squares_are_numpys(each_target, rank):
     (actual,) = each_target(lambda: (solve_symmetric(a, b),))
     np.testing.assert_allclose(actual, np.linalg.lstsq(a, b, rcond=1e-12)[0], atol=1e-9)
     np.testing.assert_allclose(solve_symmetric(a, b[:, 0]), actual[:, 0], atol=1e-12)
+
+
+def test_determinants_are_numpys():
+    a = RNG.normal(size=(4, 5, 3, 3))
+    np.testing.assert_allclose(determinant(a), np.linalg.det(a), rtol=1e-10)
+
+
+@pytest.mark.parametrize("rank", [1, 2, 3])
+def test_the_closest_rotation_is_that_of_singular_values(rank):
+    for _ in range(20):
+        a = RNG.normal(size=(3, rank)) @ RNG.normal(size=(rank, 3))
+        u, _, vt = np.linalg.svd(a)
+        slow = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+        actual = closest_rotation(a)
+        np.testing.assert_allclose(actual @ actual.T, np.eye(3), atol=1e-14)
+        assert determinant(actual) == pytest.approx(1)
+        assert (actual * a).sum() == pytest.approx((slow * a).sum())
+        if rank > 1:
+            np.testing.assert_allclose(actual, slow, atol=1e-6)
+
+
+def test_float32_stays_float32():
+    a = RNG.normal(size=(2, 3, 3)).astype(np.float32)
+    results = matmul(a, a), solve(a, a), invert(a), eigh(a + a.swapaxes(1, 2))[1]
+    assert {one.dtype for one in results} == {np.dtype(np.float32)}
+    assert matmul(a, a.astype(float)).dtype == np.float64
