@@ -137,6 +137,12 @@ def lower_median(values: np.ndarray) -> np.ndarray:
     return np.partition(values, middle, axis=0)[middle]
 
 
+def correlation(a: np.ndarray, b: np.ndarray) -> float:
+    """Return Pearson's correlation of two rows of numbers ``[n]``."""
+    a, b = (one - one.mean() for one in (a.astype(np.float64), b.astype(np.float64)))
+    return float((a * b).sum() / np.sqrt((a * a).sum() * (b * b).sum()))
+
+
 def morton_codes(points: np.ndarray) -> np.ndarray:
     """Return the places ``[n]`` int64 of points ``[n,3]`` along Morton's space-filling curve: interleaved bits."""
     codes = np.zeros(len(points), np.int64)

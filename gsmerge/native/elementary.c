@@ -87,11 +87,12 @@ API void arctan2_each(const double *restrict y, const double *restrict x, double
   for (int64_t i = 0; i < n; i++) out[i] = atan28(y[i], x[i]);
 }
 
-// Bases from 0 on; x^0 = 1 for all x.
+// Bases from 0 on; x^0 = 1 for all x, and x^1 is x itself.
 API void power_each(const double *restrict bases, const double *restrict exponents,
                     double *restrict out, int64_t n) {
   for (int64_t i = 0; i < n; i++) {
     double e = exponents[i], power = exp8(e * log8(bases[i]));
+    power = e == 1.0 && bases[i] > 0.0 ? bases[i] : power;
     out[i] = e == 0.0 ? 1.0 : power;
   }
 }
