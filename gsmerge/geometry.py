@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import cv2
 import numpy as np
 
+from gsmerge.kernels.elementary import arctan2, cos, sin
+from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.types import SH_C0, Array, Cameras
 
 MORTON_BITS = 21  # per axis: three fit into 63 bits
@@ -63,7 +64,7 @@ def multiply_quats(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def covariances(quats: np.ndarray, scales: np.ndarray) -> np.ndarray:
     """Return ``R diag(scales)^2 R^T [...,3,3]`` of quaternions wxyz and standard deviations (paper section 3)."""
     half = quat_to_rotmat(quats) * scales[..., None, :]
-    return half @ half.swapaxes(-1, -2)
+    return matmul(half, half.swapaxes(-1, -2))
 
 
 def project(means: np.ndarray, cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
@@ -82,42 +83,64 @@ def project_points(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> 
     ``viewmats [...,4,4]`` world to camera, ``Ks [...,3,3]`` pixels; returns positions ``[...,n,2]``
     and depths ``[...,n]``.
     """
-    camera = points @ viewmats[..., :3, :3].swapaxes(-1, -2) + viewmats[..., None, :3, 3]
-    image = camera @ Ks.swapaxes(-1, -2)
+    camera = matmul(points, viewmats[..., :3, :3].swapaxes(-1, -2)) + viewmats[..., None, :3, 3]
+    image = matmul(camera, Ks.swapaxes(-1, -2))
     return image[..., :2] / image[..., 2:], camera[..., 2]
 
 
 def motion_matrices(vectors: np.ndarray) -> np.ndarray:
     """Return rigid motions ``[v,4,4]`` float64 of ``[v,6]``: rotation vectors about the origin (radians), shifts."""
+    vectors = vectors.astype(np.float64)
+    angles = _lengths(vectors[:, :3])
+    shares = np.where(angles > 0, sin(angles / 2) / np.where(angles > 0, angles, 1), 0.5)
     out = np.tile(np.eye(4), (len(vectors), 1, 1))
-    for matrix, vector in zip(out, vectors.astype(np.float64), strict=True):
-        matrix[:3, :3], matrix[:3, 3] = cv2.Rodrigues(vector[:3])[0], vector[3:]
+    out[:, :3, :3] = quat_to_rotmat(np.concatenate([cos(angles / 2), shares * vectors[:, :3]], 1))
+    out[:, :3, 3] = vectors[:, 3:]
     return out
 
 
 def motion_vectors(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Return world motions ``[v,6]`` from viewmats to others: ``end = start @ motion_matrices(...)``."""
-    motions = np.linalg.inv(start) @ end
-    return np.stack([np.concatenate([cv2.Rodrigues(m[:3, :3])[0][:, 0], m[:3, 3]]) for m in motions])
+    motions = matmul(invert(start), end)
+    quats = rotmat_to_quat(motions[:, :3, :3])
+    quats *= np.where(quats[:, :1] < 0, -1, 1)  # the angle is at most half a turn
+    sines = _lengths(quats[:, 1:])
+    stretch = np.where(sines > 0, 2 * arctan2(sines, quats[:, :1]) / np.where(sines > 0, sines, 1), 2)
+    return np.concatenate([stretch * quats[:, 1:], motions[:, :3, 3]], 1)
 
 
 def without_common_motion(start: np.ndarray, end: np.ndarray, middle: Callable[..., np.ndarray]) -> np.ndarray:
     """Return viewmats ``end [v,4,4]`` less the middle (mean, median) of all motions since ``start``."""
     common = middle(motion_vectors(start, end), axis=0)
-    return np.asarray(end @ np.linalg.inv(motion_matrices(common[None])))
+    return matmul(end, invert(motion_matrices(common[None])))
+
+
+def camera_centres(viewmats: np.ndarray) -> np.ndarray:
+    """Return the centres ``[...,3]`` of cameras in the world, of rigid viewmats ``[...,4,4]``."""
+    return -(viewmats[..., :3, :3] * viewmats[..., :3, 3:]).sum(-2)
 
 
 def pose_changes(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Measure how far cameras moved between viewmats ``[v,4,4]``: ``[v]`` degrees, and distances of the centres."""
-    chords = np.linalg.norm(end[:, :3, :3] - start[:, :3, :3], axis=(1, 2)) / np.sqrt(8)
-    before, after = (-np.einsum("vji,vj->vi", one[:, :3, :3], one[:, :3, 3]) for one in (start, end))
-    return np.degrees(2 * np.arcsin(chords.clip(0, 1))), np.linalg.norm(after - before, axis=1)
+    chords = (np.linalg.norm(end[:, :3, :3] - start[:, :3, :3], axis=(1, 2)) / np.sqrt(8)).clip(0, 1)
+    distances = _lengths(camera_centres(end) - camera_centres(start))[:, 0]
+    return np.degrees(2 * arctan2(chords, np.sqrt((1 - chords) * (1 + chords)))), distances
+
+
+def _lengths(vectors: np.ndarray) -> np.ndarray:
+    return np.sqrt((vectors * vectors).sum(-1, keepdims=True))
 
 
 def lower_median(values: np.ndarray) -> np.ndarray:
     """Return the median of each column of ``[n,...]`` rows, n >= 1; of an even number, the lower middle value."""
     middle = (len(values) - 1) // 2
     return np.partition(values, middle, axis=0)[middle]
+
+
+def correlation(a: np.ndarray, b: np.ndarray) -> float:
+    """Return Pearson's correlation of two rows of numbers ``[n]``."""
+    a, b = (one - one.mean() for one in (a.astype(np.float64), b.astype(np.float64)))
+    return float((a * b).sum() / np.sqrt((a * a).sum() * (b * b).sum()))
 
 
 def morton_codes(points: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import rotmat_to_quat
+from gsmerge.kernels.matrices import eigh, invert
 from gsmerge.types import Array, as_array, like
 
 _OTHER_SIZE = 0.1  # share by which a principal point is farther from the middle than one of this size ever is
@@ -139,7 +140,7 @@ def _family_views(poses: Mapping[str, Array], extrinsics: str, intrinsics: str, 
     photos = as_array(_one("images", images, 4)).transpose(0, 2, 3, 1)
     sizes = np.array([photos.shape[2], photos.shape[1], 1.0])
     Ks = as_array(_one(intrinsics, _item("poses", poses, intrinsics), 3)).astype(np.float64) * sizes[:, None]
-    return {"images": _as_floats(photos), "viewmats": np.linalg.inv(c2w), "Ks": Ks}
+    return {"images": _as_floats(photos), "viewmats": invert(c2w), "Ks": Ks}
 
 
 def _as_floats(photos: np.ndarray) -> np.ndarray:
@@ -160,7 +161,7 @@ def _in_pixels_of(photos: np.ndarray, Ks: np.ndarray) -> np.ndarray:
 def _axes(covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Split covariances ``[n,3,3]`` into standard deviations ``[n,3]`` and rotations ``[n,4]`` wxyz."""
     finite = np.isfinite(covariances).all((1, 2))
-    squares, axes = np.linalg.eigh(np.where(finite[:, None, None], covariances, np.eye(3)))
+    squares, axes = eigh(np.where(finite[:, None, None], covariances, np.eye(3)))
     axes[:, :, 0] = np.cross(axes[:, :, 1], axes[:, :, 2])  # a rotation, no mirror
     scales = np.sqrt(np.maximum(squares, 0))
     scales[~finite] = np.nan

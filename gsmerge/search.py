@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from gsmerge.kernels.elementary import exp, log, power
 from gsmerge.plan import Plan
 from gsmerge.render.metrics import WINDOW, ssim
 from gsmerge.render.photos import Photos, render_photos, scene_photos
@@ -200,7 +201,7 @@ def count_within(points: Sequence[CurvePoint], max_drop: float) -> int:
         return points[0].count
     below, above = points[first - 1], points[first]
     share = (wanted - below.psnr) / (above.psnr - below.psnr)
-    return math.ceil(below.count * (above.count / below.count) ** share)
+    return math.ceil(below.count * float(power(above.count / below.count, share)))
 
 
 def curve_knee(points: Sequence[CurvePoint]) -> int:
@@ -214,7 +215,7 @@ def curve_knee(points: Sequence[CurvePoint]) -> int:
         raise ValueError("points: expected at least one, got none")
     if len(points) == 1:
         return points[0].count
-    scale = [math.log2(p.count) for p in points]
+    scale = [float(log(p.count) / log(2)) for p in points]
     quality = [p.psnr + SSIM_DB * p.ssim for p in points]
     pairs = list(pairwise(range(len(points))))
     middles = [(scale[a] + scale[b]) / 2 for a, b in pairs]
@@ -225,7 +226,7 @@ def curve_knee(points: Sequence[CurvePoint]) -> int:
     if steep == len(slopes) - 1:
         return points[-1].count
     share = (slopes[steep] - KNEE) / (slopes[steep] - slopes[steep + 1])
-    return round(2 ** (middles[steep] + share * (middles[steep + 1] - middles[steep])))
+    return round(float(power(2, middles[steep] + share * (middles[steep + 1] - middles[steep]))))
 
 
 def next_count(tried: Mapping[int, float], target: float, least: int, most: int) -> int:
@@ -239,13 +240,13 @@ def next_count(tried: Mapping[int, float], target: float, least: int, most: int)
     if above is not None and below is not None:
         if above <= below * CLOSE:
             return above
-        slope = (tried[above] - tried[below]) / math.log(above / below)
-        step = (target - tried[below]) / slope if slope > 0 else math.log(above / below) / 2
-        inner = math.log(above / below)
-        return round(below * math.exp(min(max(step + 0.1 * inner, 0.15 * inner), 0.85 * inner)))
+        inner = float(log(above / below))
+        slope = (tried[above] - tried[below]) / inner
+        step = (target - tried[below]) / slope if slope > 0 else inner / 2
+        return round(below * float(exp(min(max(step + 0.1 * inner, 0.15 * inner), 0.85 * inner))))
     edge = below if above is None else above
     assert edge is not None  # one count has been tried
     doublings = (target - tried[edge]) / SLOPE
     if above is None:
-        return min(most, round(edge * 2 ** min(max(doublings, 0.5), 3.0)))
-    return max(least, round(edge * 2 ** max(min(doublings, -0.5), -3.0)))
+        return min(most, round(edge * float(power(2, min(max(doublings, 0.5), 3.0)))))
+    return max(least, round(edge * float(power(2, max(min(doublings, -0.5), -3.0)))))

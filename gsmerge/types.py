@@ -175,8 +175,7 @@ class Cameras:
     @property
     def centres(self) -> Array:
         """``[c,3]`` camera centres in the world."""
-        rotation, shift = self.viewmats[:, :3, :3], self.viewmats[:, :3, 3]
-        return -(rotation.swapaxes(1, 2) @ shift[:, :, None])[:, :, 0]
+        return -(self.viewmats[:, :3, :3] * self.viewmats[:, :3, 3:]).sum(1)
 
 
 @dataclass(frozen=True, eq=False)

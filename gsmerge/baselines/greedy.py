@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from gsmerge.baselines.baseline import own_gaussians
 from gsmerge.geometry import covariances
+from gsmerge.kernels.elementary import log, power
 from gsmerge.moments import MAX_OPACITY, principal_axes
 from gsmerge.plan import Plan
 from gsmerge.runtime.record import stage
@@ -51,15 +52,15 @@ class Cloud:
 
 def area(scales: Floats) -> Floats:
     """Compute the surfaces ``[n]`` of ellipsoids with half axes ``[n,3]``, within 1 % (Knud Thomsen's formula)."""
-    a, b, c = (scales**AREA_EXPONENT).T
-    return 4 * np.pi * ((a * b + a * c + b * c) / 3) ** (1 / AREA_EXPONENT)
+    a, b, c = power(scales, AREA_EXPONENT).T
+    return np.asarray(4 * np.pi * power((a * b + a * c + b * c) / 3, 1 / AREA_EXPONENT))
 
 
 def log_determinants(covars: Floats) -> Floats:
     """Compute the logarithms ``[n]`` of the determinants of upper triangles ``[n,6]``."""
     xx, xy, xz, yy, yz, zz = covars.T
     values = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
-    return np.log(np.maximum(values, 1e-300))
+    return np.asarray(log(np.maximum(values, 1e-300)))
 
 
 def cloud_of(gaussians: Gaussians) -> Cloud:

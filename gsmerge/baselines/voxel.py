@@ -7,12 +7,13 @@ voxels, so the count is met from below.
 
 from __future__ import annotations
 
-import math
 from dataclasses import fields
 
 import numpy as np
 
 from gsmerge.baselines.baseline import own_gaussians
+from gsmerge.kernels.elementary import exp, log, power
+from gsmerge.kernels.matrices import eigh
 from gsmerge.plan import Plan
 from gsmerge.runtime.record import choose, stage
 from gsmerge.stages.prepare import Prepared
@@ -35,17 +36,17 @@ def voxel_size(means: np.ndarray, count: int) -> float:
     """Find the smallest size, within a ten-thousandth octave, that leaves at most ``count`` voxels occupied."""
 
     def occupied(octave: float) -> int:
-        keys = np.sort(voxel_keys(means, 2.0**octave))
+        keys = np.sort(voxel_keys(means, power(2, octave)))
         return 1 + int((keys[1:] != keys[:-1]).sum())
 
     extent = float(np.abs(means).max(initial=0))
-    fine, coarse = FINEST, max(FINEST, math.log2(4 * extent)) if extent > 0 else FINEST  # coarse: all in one
+    fine, coarse = FINEST, max(FINEST, float(log(4 * extent) / log(2))) if extent > 0 else FINEST  # coarse: all in one
     if occupied(fine) <= count:
-        return 2.0**fine
+        return float(power(2, fine))
     while coarse - fine > PRECISION:
         middle = (fine + coarse) / 2
         fine, coarse = (fine, middle) if occupied(middle) <= count else (middle, coarse)
-    return 2.0**coarse
+    return float(power(2, coarse))
 
 
 def fuse(gaussians: Gaussians, keys: np.ndarray) -> Gaussians:
@@ -57,7 +58,7 @@ def fuse(gaussians: Gaussians, keys: np.ndarray) -> Gaussians:
     means, quats, scales, opacities, sh0, shN = (
         getattr(gaussians, f.name).astype(np.float64) for f in fields(Gaussians)
     )
-    weights = np.exp(opacities)
+    weights = exp(opacities)
     count = int(cells.max(initial=-1)) + 1
     total = np.bincount(cells, weights, count)
 
@@ -67,12 +68,12 @@ def fuse(gaussians: Gaussians, keys: np.ndarray) -> Gaussians:
         return np.stack(columns, 1).reshape(count, *values.shape[1:]) if columns else values[:count]
 
     bounded = opacities.clip(MIN_OPACITY, 1 - MIN_OPACITY)
-    _, axes = np.linalg.eigh(mean(quats[:, :, None] * quats[:, None]))
+    _, axes = eigh(mean(quats[:, :, None] * quats[:, None]))
     arrays = (
         mean(means),
         axes[:, :, -1],
-        np.exp(mean(np.log(scales.clip(MIN_SCALE)))),
-        1 / (1 + np.exp(-mean(np.log(bounded / (1 - bounded))))),
+        exp(mean(log(scales.clip(MIN_SCALE)))),
+        1 / (1 + exp(-mean(log(bounded / (1 - bounded))))),
         mean(sh0),
         mean(shN),
     )

@@ -8,6 +8,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from gsmerge.errors import SceneError
+from gsmerge.geometry import camera_centres
 from gsmerge.io.alignment import IDENTITY, Similarity
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views, to_cameras, with_convention
 from gsmerge.io.cameras.read import read_cameras
@@ -15,6 +16,8 @@ from gsmerge.io.exporters import AUTO
 from gsmerge.io.photo_files import as_floats, find_image, photo_size
 from gsmerge.io.scene import SceneLoad
 from gsmerge.io.scene_files import IMAGE_PLACES, SceneFiles, limit_photo_size, stored_photos
+from gsmerge.kernels.elementary import arccos
+from gsmerge.kernels.matrices import closest_rotation, matmul
 from gsmerge.types import Scene, StrPath, Views
 
 _MAX_ANGLE = 0.2  # degrees that a view's two poses may differ by, once one frame is moved to the other
@@ -108,11 +111,11 @@ def _find_world(camera_file: CameraFile, named: dict[int, int], load: SceneLoad)
     ours = load.scene.cameras.viewmats[list(named.values())]
     frames = [stored] + [fit_similarity(theirs, ours, stored.scale)] * (len(named) >= _MIN_SHARED)
     for frame in frames:
-        moved, centres = frame.move_viewmats(theirs), _centres(ours)
-        cosines = (np.einsum("nij,nij->n", moved[:, :3, :3], ours[:, :3, :3]) - 1) / 2
-        distance = np.linalg.norm(_centres(moved) - centres, axis=1).max()
-        spread = float(np.linalg.norm(np.ptp(centres, axis=0))) or 1.0
-        angle = np.degrees(np.arccos(cosines.clip(-1, 1))).max()
+        moved, centres = frame.move_viewmats(theirs), camera_centres(ours)
+        cosines = ((moved[:, :3, :3] * ours[:, :3, :3]).sum((1, 2)) - 1) / 2
+        distance = np.linalg.norm(camera_centres(moved) - centres, axis=1).max()
+        spread = float(np.linalg.norm(np.ptp(centres, axis=0), axis=0)) or 1.0
+        angle = np.degrees(arccos(cosines.clip(-1, 1))).max()
         if angle <= _MAX_ANGLE and distance / spread <= _MAX_SHIFT:
             return frame, dict(named)
     return stored, {}
@@ -123,19 +126,13 @@ def fit_similarity(theirs: np.ndarray, ours: np.ndarray, scale: float = 1.0) -> 
 
     By least squares; with the given scale where all stand in one place and do not determine it.
     """
-    rotations = np.einsum("nji,njk->ik", ours[:, :3, :3], theirs[:, :3, :3])
-    u, _, vt = np.linalg.svd(rotations)
-    rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    a, b = _centres(theirs) @ rotation.T, _centres(ours)
+    rotation = closest_rotation(matmul(ours[:, :3, :3].swapaxes(1, 2), theirs[:, :3, :3]).sum(0))
+    a, b = matmul(camera_centres(theirs), rotation.T), camera_centres(ours)
     a0, b0 = a - a.mean(0), b - b.mean(0)
     spread = float((a0**2).sum())
     if spread > 1e-12 * max(float((a**2).sum()), 1e-300) and len(ours) > 1:
         scale = float((a0 * b0).sum()) / spread
     return Similarity(rotation, scale, b.mean(0) - scale * a.mean(0))
-
-
-def _centres(viewmats: np.ndarray) -> np.ndarray:
-    return -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
 
 
 def _repeated(moved: np.ndarray, scene: Scene) -> dict[int, int]:
@@ -144,7 +141,7 @@ def _repeated(moved: np.ndarray, scene: Scene) -> dict[int, int]:
         return {}
     ours, middle = scene.cameras.viewmats, np.median(scene.gaussians.means, 0)
     # what is seen lies as far away as the views may be apart, or farther; one view has nothing else to measure by
-    limit = _SAME_POSE * float(np.linalg.norm(_centres(ours) - middle, axis=1).max())
-    near = np.linalg.norm(_centres(moved)[:, None] - _centres(ours), axis=2) <= limit
+    limit = _SAME_POSE * float(np.linalg.norm(camera_centres(ours) - middle, axis=1).max())
+    near = np.linalg.norm(camera_centres(moved)[:, None] - camera_centres(ours), axis=2) <= limit
     alike = np.abs(moved[:, None, :3, :3] - ours[None, :, :3, :3]).max((2, 3)) <= _SAME_POSE
     return {int(i): int(view) for i, view in zip(*np.nonzero(near & alike), strict=True)}

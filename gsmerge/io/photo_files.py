@@ -19,6 +19,7 @@ from PIL import Image
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import MAX_PIXELS, check_file, check_pixels, read_errors, walk_files
+from gsmerge.kernels.matrices import matmul
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, StrPath
 
@@ -310,7 +311,7 @@ class PhotoTransform:
     def cameras(self, cameras: Cameras) -> Cameras:
         """Return the cameras of the transformed photos, with intrinsics in float64."""
         matrix = [[self.scale_x, 0.0, -self.left], [0.0, self.scale_y, -self.top], [0.0, 0.0, 1.0]]
-        return replace(cameras, Ks=np.array(matrix) @ cameras.Ks, width=self.width, height=self.height)
+        return replace(cameras, Ks=matmul(matrix, cameras.Ks), width=self.width, height=self.height)
 
     def photos(self, images: Photos) -> Photos:
         """Transform c uint8 photos ``[h,w,3]``."""

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import lower_median
+from gsmerge.geometry import correlation, lower_median
 from gsmerge.io.alignment import (
     Alignment,
     AlignmentResult,
@@ -315,7 +315,7 @@ def color_notes(scene: Scene) -> list[str]:
     odd = []
     for name, color, photo, ok in views:
         varies = ok.sum() >= 16 and min(color[ok].std(ddof=1), photo[ok].std(ddof=1)) >= 0.01
-        if varies and np.corrcoef(color[ok], photo[ok])[0, 1] < _MIN_CORRELATION:
+        if varies and correlation(color[ok], photo[ok]) < _MIN_CORRELATION:
             odd.append(name)
     return [f"{len(odd)} of {len(scene)} images do not look like their Gaussians, for example {odd[0]}"] if odd else []
 

@@ -31,6 +31,7 @@ from gsmerge.io.photo_files import (
     photo_size,
     resize_to,
 )
+from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Cameras, LargePhotos, StrPath
 
 # The first that exists wins; then the folder's only .ply.
@@ -213,7 +214,7 @@ def find_large_photos(
 
     photos_inside = photos if paths is None else ()
     width, height = (int(side) for side in last - first)
-    return LargePhotos(to_file @ cameras.Ks, width, height, tuple(range(len(cameras))), read)
+    return LargePhotos(matmul(to_file, cameras.Ks), width, height, tuple(range(len(cameras))), read)
 
 
 def limit_photo_size(

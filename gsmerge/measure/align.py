@@ -10,11 +10,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsmerge.geometry import pose_changes
+from gsmerge.geometry import motion_matrices, pose_changes
+from gsmerge.kernels.elementary import log1p
+from gsmerge.kernels.matrices import matmul, solve, solve_symmetric
 from gsmerge.measure.visibility import resize_mask
 from gsmerge.render import Splats, ViewPlan, composite, plan_view
 from gsmerge.render.composite import mean_depths
@@ -49,8 +50,8 @@ def fit_colors(image: np.ndarray, photo: np.ndarray, mask: NDArray[np.bool_]) ->
     if not mask.any():
         return image
     colors = np.concatenate([image[mask], np.ones((int(mask.sum()), 1))], 1, dtype=np.float64)
-    affine = np.linalg.lstsq(colors.T @ colors, colors.T @ photo[mask].astype(np.float64), rcond=1e-12)[0]
-    return np.asarray((image @ affine[:3] + affine[3]).clip(0, 1), np.float32)
+    affine = solve_symmetric(matmul(colors.T, colors), matmul(colors.T, photo[mask].astype(np.float64)))
+    return np.asarray((matmul(image, affine[:3]) + affine[3]).clip(0, 1), np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +96,7 @@ class _Trial:
 
     def error(self, doubt: float) -> float:
         """Sum a robust error (Cauchy's), which grows as the squares do up to ``doubt`` and slowly beyond."""
-        return doubt * float(np.log1p(self.squares / doubt).sum(dtype=np.float64))
+        return doubt * float(log1p(self.squares / doubt).sum(dtype=np.float64))
 
     def weights(self, doubt: float) -> np.ndarray:
         """Compute the derivatives ``[h,w]`` of that error with respect to the squares."""
@@ -154,8 +155,8 @@ def _descend(target: _Target, best: _Trial, unit: float, doubt: float) -> _Trial
     slope, curvature = _slope(target, best, unit, doubt), _curvature(target, best, unit, doubt)
     for _ in range(STEPS):
         scale = damping * np.diag(curvature) + 1e-9 * curvature.trace() + 1e-30
-        step = -np.linalg.solve(curvature + np.diag(scale), slope)
-        length = float(np.linalg.norm(step))
+        step = -solve(curvature + np.diag(scale), slope)
+        length = float(np.sqrt((step * step).sum()))
         if not np.isfinite(length):
             break
         step *= min(1.0, MAX_STEP / max(length, MAX_STEP))
@@ -183,7 +184,7 @@ def _slope(target: _Target, trial: _Trial, unit: float, doubt: float) -> np.ndar
     shade = color_gradients(plan, gradients.colors) if plan.splats.shN.shape[1] else None
     grad = pose_gradient(plan, gradients, shade)
     rotation, shift = trial.viewmat[:3, :3], trial.viewmat[:3, 3]
-    turns = grad[:3, :3] @ rotation.T + np.outer(grad[:3, 3], shift - _in_camera(target.centre, trial.viewmat))
+    turns = matmul(grad[:3, :3], rotation.T) + np.outer(grad[:3, 3], shift - _in_camera(target.centre, trial.viewmat))
     turn = [turns[2, 1] - turns[1, 2], turns[0, 2] - turns[2, 0], turns[1, 0] - turns[0, 1]]
     return np.concatenate([turn, unit * grad[:3, 3]])
 
@@ -204,17 +205,17 @@ def _curvature(target: _Target, trial: _Trial, unit: float, doubt: float) -> np.
     right, down = right * (fx / z)[:, None], down * (fy / z)[:, None]  # pixels
     weights = 2 * trial.weights(doubt)[y, x].astype(np.float64)[:, None]
     xx, xy, yy = (weights * (one * other).sum(1)[:, None] for one, other in ((dx, dx), (dx, dy), (dy, dy)))
-    return np.asarray(right.T @ (xx * right + xy * down) + down.T @ (xy * right + yy * down))
+    return matmul(right.T, xx * right + xy * down) + matmul(down.T, xy * right + yy * down)
 
 
 def _in_camera(point: np.ndarray, viewmat: np.ndarray) -> np.ndarray:
-    return np.asarray(viewmat[:3, :3] @ point + viewmat[:3, 3])
+    return np.asarray(matmul(viewmat[:3, :3], point) + viewmat[:3, 3])
 
 
 def _moved(viewmat: np.ndarray, step: np.ndarray, target: _Target, unit: float) -> np.ndarray:
     """Turn a view matrix about the centre by ``step[:3]`` radians, and shift it by ``step[3:]`` in ``unit``."""
-    turn, centre = cv2.Rodrigues(step[:3])[0], _in_camera(target.centre, viewmat)
+    turn, centre = motion_matrices(step[None])[0, :3, :3], _in_camera(target.centre, viewmat)
     moved = np.eye(4)
-    moved[:3, :3] = turn @ viewmat[:3, :3]
-    moved[:3, 3] = turn @ (viewmat[:3, 3] - centre) + centre + unit * step[3:]
+    moved[:3, :3] = matmul(turn, viewmat[:3, :3])
+    moved[:3, 3] = matmul(turn, viewmat[:3, 3] - centre) + centre + unit * step[3:]
     return moved

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsmerge.geometry import project
+from gsmerge.kernels.matrices import invert, matmul
+from gsmerge.kernels.pictures import enlarge
 from gsmerge.render import render
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, Scene
@@ -35,9 +37,9 @@ def _rendered_points(gaussians: Gaussians, camera: Cameras, near: float) -> Poin
     assert drawn.depths is not None
     depth, solid = drawn.depths[0].astype(np.float64), drawn.alphas[0] > _OPAQUE
     y, x = np.nonzero(solid.reshape(depth.shape[:2]))
-    rays = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1) @ np.linalg.inv(camera.Ks[0].astype(np.float64)).T
-    pose = np.linalg.inv(camera.viewmats[0].astype(np.float64))
-    return np.asarray((rays * depth.reshape(solid.shape[0], -1)[y, x, None]) @ pose[:3, :3].T + pose[:3, 3])
+    rays = matmul(np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1), invert(camera.Ks[0].astype(np.float64)).T)
+    pose = invert(camera.viewmats[0].astype(np.float64))
+    return matmul(rays * depth.reshape(solid.shape[0], -1)[y, x, None], pose[:3, :3].T) + pose[:3, 3]
 
 
 def visible_pixels(points: Points, cameras: Cameras, near: float, sources: Cameras | None = None) -> NDArray[np.bool_]:
@@ -53,7 +55,7 @@ def visible_pixels(points: Points, cameras: Cameras, near: float, sources: Camer
         hit = np.zeros((cameras.height, cameras.width), np.uint8)
         for first in range(0, len(points), _CHUNK):
             some = points[first : first + _CHUNK]
-            image = (some @ viewmats[view, :3, :3].T + viewmats[view, :3, 3]) @ Ks[view].T
+            image = matmul(matmul(some, viewmats[view, :3, :3].T) + viewmats[view, :3, 3], Ks[view].T)
             image = image[image[:, 2] > near]
             pixels = np.floor(image[:, :2] / image[:, 2:])
             pixels = pixels[((pixels >= 0) & (pixels < size)).all(1)].astype(np.int64)
@@ -90,9 +92,11 @@ def inside_views(points: np.ndarray, cameras: Cameras) -> Iterator[np.ndarray]:
 
 def resize_photo(photo: np.ndarray, width: int, height: int) -> np.ndarray:
     """Resize a photo ``[h,w,3]`` to a size in pixels: area averages where it is smaller, cubic where it is larger."""
-    smaller = width * height < photo.shape[0] * photo.shape[1]
-    way = cv2.INTER_AREA if smaller else cv2.INTER_CUBIC
-    return np.asarray(cv2.resize(photo, (width, height), interpolation=way)).clip(0, 1)
+    if width * height < photo.shape[0] * photo.shape[1]:
+        resized = cv2.resize(photo, (width, height), interpolation=cv2.INTER_AREA)
+    else:
+        resized = enlarge(photo, width, height)
+    return np.asarray(resized).clip(0, 1)
 
 
 def resize_mask(mask: NDArray[np.bool_], width: int, height: int) -> NDArray[np.bool_]:

@@ -6,8 +6,80 @@ API void exp_each(const double *restrict values, double *restrict out, int64_t n
   for (int64_t i = 0; i < n; i++) out[i] = exp8(values[i]);
 }
 
+API void exp_floats(const float *restrict values, float *restrict out, int64_t n) {
+  for (int64_t i = 0; i < n; i++) out[i] = exp4(values[i]);
+}
+
 API void log_each(const double *restrict values, double *restrict out, int64_t n) {
   for (int64_t i = 0; i < n; i++) out[i] = log8(values[i]);
+}
+
+API void log_floats(const float *restrict values, float *restrict out, int64_t n) {
+  for (int64_t i = 0; i < n; i++) out[i] = log4(values[i]);
+}
+
+API void log10_each(const double *restrict values, double *restrict out, int64_t n) {
+  for (int64_t i = 0; i < n; i++) {
+    double x = log8(values[i]);
+    out[i] = x * 4.34294481903251816668e-01 + x * 1.09831965021676508e-17;  // 1 / ln 10 in two parts
+  }
+}
+
+// log(1 + x) = log(u) + (x - (u - 1)) / u with u = 1 + x as it is rounded: what that loses is added.
+static inline double log1p8(double x) {
+  double u = 1.0 + x, lost = (x - (u - 1.0)) / u;
+  bool plain = u > 0.0 && u <= 1.7976931348623157e308;
+  double result = log8(u) + (plain ? lost : 0.0);
+  return x == 0.0 ? x : result;
+}
+
+API void log1p_each(const double *restrict values, double *restrict out, int64_t n) {
+  for (int64_t i = 0; i < n; i++) out[i] = log1p8(values[i]);
+}
+
+// e^x - 1 = 2^k (e^r - 1) + (2^k - 1) with x = k ln 2 + r: e^r - 1 is Taylor's series, nothing cancels.
+static inline double expm18(double x) {
+  double n = x * 1.4426950408889634;
+  n = n < -60.0 ? -60.0 : n;
+  n = n > 1023.0 ? 1023.0 : n;
+  const double magic = 6755399441055744.0;  // 1.5 * 2^52: adding it rounds to whole numbers
+  bits8 shifted = {.f = n + magic};
+  n = shifted.f - magic;
+  double high = x - n * 6.93147180369123816490e-01, r = high - n * 1.90821492927058770002e-10;
+  double p = 1.0 / 6227020800.0;
+  p = p * r + 1.0 / 479001600.0;
+  p = p * r + 1.0 / 39916800.0;
+  p = p * r + 1.0 / 3628800.0;
+  p = p * r + 1.0 / 362880.0;
+  p = p * r + 1.0 / 40320.0;
+  p = p * r + 1.0 / 5040.0;
+  p = p * r + 1.0 / 720.0;
+  p = p * r + 1.0 / 120.0;
+  p = p * r + 1.0 / 24.0;
+  p = p * r + 1.0 / 6.0;
+  p = p * r + 0.5;
+  p = p * (r * r) + r;
+  bits8 power = {.u = (shifted.u - 0x4338000000000000u + 1023u) << 52};
+  double result = p * power.f + (power.f - 1.0);
+  result = x < -40.0 ? -1.0 : result;
+  result = x > 709.0 ? exp8(x) : result;  // where 2^k - 1 is 2^k
+  return x == 0.0 ? x : result;
+}
+
+API void expm1_each(const double *restrict values, double *restrict out, int64_t n) {
+  for (int64_t i = 0; i < n; i++) out[i] = expm18(values[i]);
+}
+
+API void sin_each(const double *restrict values, double *restrict out, int64_t n) {
+  for (int64_t i = 0; i < n; i++) out[i] = sin8(values[i]);
+}
+
+API void cos_each(const double *restrict values, double *restrict out, int64_t n) {
+  for (int64_t i = 0; i < n; i++) out[i] = cos8(values[i]);
+}
+
+API void arccos_each(const double *restrict values, double *restrict out, int64_t n) {
+  for (int64_t i = 0; i < n; i++) out[i] = acos8(values[i]);
 }
 
 API void arctan2_each(const double *restrict y, const double *restrict x, double *restrict out,
@@ -15,11 +87,12 @@ API void arctan2_each(const double *restrict y, const double *restrict x, double
   for (int64_t i = 0; i < n; i++) out[i] = atan28(y[i], x[i]);
 }
 
-// Bases from 0 on; x^0 = 1 for all x.
+// Bases from 0 on; x^0 = 1 for all x, and x^1 is x itself.
 API void power_each(const double *restrict bases, const double *restrict exponents,
                     double *restrict out, int64_t n) {
   for (int64_t i = 0; i < n; i++) {
     double e = exponents[i], power = exp8(e * log8(bases[i]));
+    power = e == 1.0 && bases[i] > 0.0 ? bases[i] : power;
     out[i] = e == 0.0 ? 1.0 : power;
   }
 }

@@ -18,7 +18,7 @@ static inline float exp4(float x) {
   p = p * r + 1.6666665459e-1f;
   p = p * r + 5.0000001201e-1f;
   p = p * (r * r) + r + 1.f;
-  int32_t power = shifted.i - 0x4b400000, half = power >> 1;
+  int32_t power = (int32_t)(shifted.u - 0x4b400000u), half = power >> 1;  // anything for NaN
   bits4 low = {.u = (uint32_t)(half + 127) << 23}, high = {.u = (uint32_t)(power - half + 127) << 23};
   return p * low.f * high.f;
 }
@@ -68,9 +68,8 @@ static inline double exp8(double x) {
   p = p * r + 1.0 / 6.0;
   p = p * r + 0.5;
   p = p * (r * r) + r + 1.0;
-  int64_t power = shifted.i - 0x4338000000000000, half = power >> 1;
-  bits8 low = {.i = (int64_t)((uint64_t)(half + 1023) << 52)};
-  bits8 high = {.i = (int64_t)((uint64_t)(power - half + 1023) << 52)};
+  int64_t power = (int64_t)(shifted.u - 0x4338000000000000u), half = power >> 1;
+  bits8 low = {.u = (uint64_t)(half + 1023) << 52}, high = {.u = (uint64_t)(power - half + 1023) << 52};
   return p * low.f * high.f;
 }
 

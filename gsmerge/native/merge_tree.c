@@ -1,5 +1,4 @@
 // Merging of the regions of a view one pair after the other, cheapest first.
-#include "exp_log.h"
 #include "labels.h"
 
 // Columns of a region's row after its mean (three colours, y, x); the nine from PLANE on are sums
@@ -258,8 +257,4 @@ API int32_t cut_labels(const int32_t *parents, const uint8_t *keep, int32_t *top
     labels[leaf] = *name;
   }
   return 0;
-}
-
-API void natural_logs(const double *values, double *logs, int64_t count) {
-  for (int64_t i = 0; i < count; i++) logs[i] = log8(values[i]);
 }

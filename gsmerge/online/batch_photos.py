@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from gsmerge.geometry import normalize
+from gsmerge.kernels.matrices import matmul
 from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.online.options import OnlineOptions
 from gsmerge.online.state import GroupSet, Replay, replace_groups, select_groups
@@ -124,13 +126,13 @@ def groups_in_view(features: FeatureGaussians, cameras: Cameras) -> np.ndarray:
 
     def one_view(view: int) -> np.ndarray:
         viewmat, K = viewmats[view], Ks[view]
-        points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
+        points = matmul(means, viewmat[:3, :3].T) + viewmat[:3, 3]
         inside: np.ndarray = points[:, 2] > -radii
         for axis, size in ((0, cameras.width), (1, cameras.height)):
             for edge, sign in ((-MARGIN, 1), (size + MARGIN, -1)):
                 normal = np.zeros(3)  # of the plane through the camera and an edge of the image, inward
                 normal[axis], normal[2] = sign * K[axis, axis], sign * (K[axis, 2] - edge)
-                inside &= points @ (normal / np.linalg.norm(normal)) > -radii
+                inside &= matmul(points, normalize(normal)) > -radii
         return inside
 
     return np.stack(parallel_map(one_view, range(len(cameras))))

@@ -11,6 +11,7 @@ from gsmerge import __version__
 from gsmerge.encoded.encoded import Encoded, StoredScene, without_members
 from gsmerge.encoded.to_gaussians import children_of, divide_all
 from gsmerge.geometry import covariances
+from gsmerge.kernels.elementary import log1p
 from gsmerge.moments import MAX_OPACITY, Members, feature_to_gaussians, gaussian_members
 from gsmerge.stages.decode import divide
 from gsmerge.stages.merge import take
@@ -131,7 +132,7 @@ def moments_of(gaussians: Gaussians) -> dict[str, np.ndarray]:
     return {
         "means": gaussians.means,
         "covars": to_float32(covariances(gaussians.quats.astype(np.float64), scales)),
-        "extinctions": to_float32(-np.log1p(-opacities) * middle * largest),
+        "extinctions": to_float32(-log1p(-opacities) * middle * largest),
         "sh0": gaussians.sh0,
         "shN": gaussians.shN,
     }

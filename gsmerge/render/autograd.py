@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from gsmerge.geometry import camera_centres
 from gsmerge.kernels.raster import harmonics
 from gsmerge.kernels.raster.project_backward import add_rows
 from gsmerge.render.composite import Rendering, composite, draw_views, prepare_views, view_colors
@@ -127,7 +128,7 @@ def draw_colored(shape: Shape, colors: Tensor, camera: dict[str, Any], backgroun
 
 def seen_colors(means: Tensor, sh0: Tensor, shN: Tensor, viewmat: np.ndarray) -> Tensor:
     """Return the colours ``[n,3]`` of harmonics in a view, not below 0, without gradient."""
-    eye = (-viewmat[:3, :3].T @ viewmat[:3, 3]).astype(np.float32)
+    eye = camera_centres(viewmat).astype(np.float32)
     count, arrays = len(means), [tensor.detach().contiguous().numpy() for tensor in (means, sh0, shN)]
     colors = np.empty((count, 3), np.float32)
     harmonics.view_colors(*arrays, np.arange(count, dtype=np.int32), eye, 0, count, colors)

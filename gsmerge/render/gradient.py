@@ -17,6 +17,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.raster import blend_backward, harmonics, project_backward
 from gsmerge.render.composite import view_colors
 from gsmerge.render.view_plan import Array, ViewPlan, pieces, tile_ranges
@@ -170,5 +171,5 @@ def pose_gradient(plan: ViewPlan, gradients: Gradients, shade: ColorGradients | 
         # the eye is -R^T t, and moves against the means
         eye = -shade.means.sum(0, dtype=np.float64)
         viewmat[:3, :3] -= np.outer(plan.viewmat[:3, 3], eye)
-        viewmat[:3, 3] -= plan.viewmat[:3, :3] @ eye
+        viewmat[:3, 3] -= matmul(plan.viewmat[:3, :3], eye)
     return viewmat

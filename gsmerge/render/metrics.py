@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
+from gsmerge.kernels.elementary import log10
+from gsmerge.kernels.pictures import blur
 from gsmerge.types import Array, as_array
 
 WINDOW, SIGMA = 11, 1.5  # pixels per side of ssim's windows, and their standard deviation in pixels
@@ -39,7 +40,12 @@ def psnr(image: Array, reference: Array, mask: Array | None = None) -> float:
         first, second = first[chosen], second[chosen]
     errors = np.subtract(first, second, dtype=np.float64)
     error = float(np.square(errors, out=errors).mean())
-    return -10 * float(np.log10(error)) if error > 0 else float("inf")
+    return -10 * float(log10(error)) if error > 0 else float("inf")
+
+
+def decibels(error: float) -> float:
+    """Return the peak signal-to-noise ratio, dB, of a mean squared error of values in [0, 1]; at most 120."""
+    return -10 * float(log10(max(error, 1e-12)))
 
 
 def ssim(image: Array, reference: Array, mask: Array | None = None) -> float:
@@ -64,7 +70,7 @@ def ssim(image: Array, reference: Array, mask: Array | None = None) -> float:
     x, y = first.astype(np.float32) - np.float32(0.5), second.astype(np.float32) - np.float32(0.5)
 
     def mean(values: Array) -> Array:
-        return cv2.GaussianBlur(values, (WINDOW, WINDOW), SIGMA).reshape(values.shape)[inner]
+        return blur(values, SIGMA, WINDOW)[inner]
 
     ux, uy = mean(x), mean(y)
     variances, covariance = mean(x * x + y * y) - ux * ux - uy * uy, mean(x * y) - ux * uy

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gsmerge.geometry import camera_centres
+from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.raster import binning
 from gsmerge.kernels.raster import project as projection
 from gsmerge.runtime.threads import parallel_map, use_threads
@@ -245,7 +247,7 @@ def plan_view(
         raise ValueError(f"expected {len(splats)} opacities and keep flags, got {len(opacities)} and {num_flags}")
 
     local = viewmat.copy()
-    local[:3, 3] += local[:3, :3] @ splats.origin
+    local[:3, 3] += matmul(local[:3, :3], splats.origin)
     camera = _camera(local, K, width, height, eps2d, antialiased)
     camera[projection.NEAR], camera[projection.FAR] = near, far
     columns, lines = -(-width // projection.TILE), -(-height // projection.TILE)
@@ -255,7 +257,7 @@ def plan_view(
         footprints, depths, boxes = _project(splats, opacities, ids, camera, threads)
         order = binning.depth_order(depths.view(np.uint32))
         members, offsets = _bin(order, boxes, lines, columns, threads)
-    eye = (-local[:3, :3].T @ local[:3, 3]).astype(np.float32)
+    eye = camera_centres(local).astype(np.float32)
     return ViewPlan(
         splats, ids, footprints, depths, members, offsets, eye, opacities, camera, viewmat, width, height
     )  # fmt: skip

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
-import cv2
 import numpy as np
 
 from gsmerge.geometry import (
@@ -25,6 +24,9 @@ from gsmerge.geometry import (
     rotmat_to_quat,
     without_common_motion,
 )
+from gsmerge.kernels.elementary import log, log1p
+from gsmerge.kernels.matrices import invert, matmul, solve
+from gsmerge.kernels.pictures import blur, sample_bilinear
 from gsmerge.render.photos import NEAR, photos_of
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Scene
@@ -112,12 +114,12 @@ def move_views(scene: Scene, viewmats: np.ndarray) -> Scene:
     with that.
     """
     g, size = scene.gaussians, scene.pixels_per_view
-    motions = np.linalg.inv(viewmats) @ scene.cameras.viewmats.astype(np.float64)
+    motions = matmul(invert(viewmats), scene.cameras.viewmats.astype(np.float64))
     turns, (means, quats) = rotmat_to_quat(motions[:, :3, :3]), (np.empty_like(a) for a in (g.means, g.quats))
 
     def move(view: int) -> None:
         rows = slice(view * size, (view + 1) * size)
-        means[rows] = g.means[rows] @ motions[view, :3, :3].T + motions[view, :3, 3]
+        means[rows] = matmul(g.means[rows], motions[view, :3, :3].T) + motions[view, :3, 3]
         quats[rows] = multiply_quats(turns[view], g.quats[rows])
 
     parallel_map(move, range(len(scene)))
@@ -134,7 +136,7 @@ def _choose_pairs(scene: Scene, views: Sequence[int]) -> list[tuple[int, int]]:
         some = means[view, ::step][scene.valid[view].reshape(-1)[::step]]
         pixels, z = project(some, cameras)
         seen = ((z > NEAR) & (pixels > 0).all(-1) & (pixels < size).all(-1)).mean(1) if len(some) else np.zeros(len(z))
-        overlap = seen * (cameras.viewmats[:, 2, :3] @ cameras.viewmats[view, 2, :3]).clip(0)
+        overlap = seen * matmul(cameras.viewmats[:, 2, :3], cameras.viewmats[view, 2, :3]).clip(0)
         ranked = [int(one) for one in np.argsort(-overlap, kind="stable") if one != view and one in views]
         for one in ranked[:NEIGHBOURS]:
             if overlap[one] > MIN_OVERLAP:
@@ -154,17 +156,17 @@ def _level_of(scene: Scene, pairs: list[tuple[int, int]], level: float, samples:
     spread[:BORDER] = spread[-BORDER:] = spread[:, :BORDER] = spread[:, -BORDER:] = 0
 
     def one_view(view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        grey = cv2.GaussianBlur(photos.images[view].mean(-1, dtype=np.float32), (0, 0), BLUR)
+        grey = blur(photos.images[view].mean(-1, dtype=np.float32), BLUR)
         down, right = np.gradient(grey)
         axis = scene.cameras.viewmats[view, 2]
-        depth = means[view][near] @ axis[:3] + axis[3]
+        depth = matmul(means[view][near], axis[:3]) + axis[3]
         depth = np.where(scene.valid[view][near] & (depth > NEAR), depth, np.nan)
-        score = np.where(np.isfinite(depth), np.hypot(right, down) * spread, 0).ravel()
+        score = np.where(np.isfinite(depth), np.sqrt(right * right + down * down) * spread, 0).ravel()
         chosen = np.argsort(-score, kind="stable")[:samples]
         chosen = chosen[score[chosen] > 0]
         y, x = np.divmod(chosen, photos.width)
         pixels = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1)
-        points = pixels @ np.linalg.inv(photos.Ks[view]).T * depth.ravel()[chosen, None]
+        points = matmul(pixels, invert(photos.Ks[view]).T) * depth.ravel()[chosen, None]
         return np.stack([grey, right, down], -1), points, grey.ravel()[chosen], depth
 
     pictures, points, greys, depths = zip(*parallel_map(one_view, range(len(scene))), strict=True)
@@ -193,8 +195,8 @@ def _descend(level: _Level, viewmats: np.ndarray, *, check: bool) -> tuple[np.nd
             slope[rows] -= one.slope
             slope[columns] += one.slope
         curvature[np.diag_indices(len(curvature))] *= 1 + DAMPING
-        change = -np.linalg.solve(curvature, slope).reshape(-1, 6)
-        viewmats = viewmats @ motion_matrices(change)
+        change = -solve(curvature, slope).reshape(-1, 6)
+        viewmats = matmul(viewmats, motion_matrices(change))
         if np.abs(change).max() < ENOUGH:
             break
     return viewmats, first, now
@@ -206,30 +208,29 @@ def _compare(level: _Level, viewmats: np.ndarray, pair: tuple[int, int]) -> _Pai
     x, y, z, u, v, world = _look_up(level, viewmats, a, b)
     inside = (z > NEAR) & (u > BORDER) & (u < width - BORDER) & (v > BORDER) & (v < height - BORDER)
     rows, columns = v.clip(0, height - 1).astype(int), u.clip(0, width - 1).astype(int)
-    inside &= np.abs(np.log(level.depths[b, rows, columns] / z)) < SAME_DEPTH  # not where there is none
+    inside &= np.abs(log(level.depths[b, rows, columns] / z)) < SAME_DEPTH  # not where there is none
     if inside.sum() < MIN_SEEN:
         return _Pair(np.zeros((6, 6)), np.zeros(6), 0.0, 0.0)
     first = _look_up(level, level.start, a, b)
-    flow = level.scale * float(np.median(np.hypot(u - first[3], v - first[4])[inside]))
+    flow = level.scale * float(np.median(np.sqrt((u - first[3]) ** 2 + (v - first[4]) ** 2)[inside]))
     x, y, z, u, v, world = (values[inside] for values in (x, y, z, u, v, world))
-    across, along = ((places[:, None] - 0.5).astype(np.float32) for places in (u, v))
-    grey, right, down = cv2.remap(level.pictures[b], across, along, cv2.INTER_LINEAR)[:, 0].T.astype(np.float64)
+    grey, right, down = sample_bilinear(level.pictures[b], u - 0.5, v - 0.5).T.astype(np.float64)
     residual = grey - level.greys[a][inside]
     residual -= np.median(residual)  # exposure
     doubt = max(MIN_DOUBT, DOUBT * float(np.median(np.abs(residual))))
     weights = 1 / (doubt**2 + residual**2)
     right, down = right * level.Ks[b, 0, 0] / z, down * level.Ks[b, 1, 1] / z
-    slopes = np.stack([right, down, -(right * x + down * y)], 1) @ viewmats[b, :3, :3]  # by the world's axes
+    slopes = matmul(np.stack([right, down, -(right * x + down * y)], 1), viewmats[b, :3, :3])  # by the world's axes
     columns = np.concatenate([np.cross(world, slopes), slopes], 1)
     weighted = columns * weights[:, None]
-    cost = float(np.log1p((residual / CLEAR) ** 2).mean())
-    return _Pair(weighted.T @ columns, weighted.T @ residual, cost, flow)
+    cost = float(log1p((residual / CLEAR) ** 2).mean())
+    return _Pair(matmul(weighted.T, columns), matmul(weighted.T, residual), cost, flow)
 
 
 def _look_up(level: _Level, viewmats: np.ndarray, a: int, b: int) -> tuple[np.ndarray, ...]:
     """Project the pixels of view ``a`` into ``b``: x/z, y/z, z, u, v in pixels, and points ``[n,3]`` in the world."""
-    world = (level.points[a] - viewmats[a, :3, 3]) @ viewmats[a, :3, :3]
-    x, y, z = (world @ viewmats[b, :3, :3].T + viewmats[b, :3, 3]).T
+    world = matmul(level.points[a] - viewmats[a, :3, 3], viewmats[a, :3, :3])
+    x, y, z = (matmul(world, viewmats[b, :3, :3].T) + viewmats[b, :3, 3]).T
     z, K = np.maximum(z, NEAR), level.Ks[b]
     return x / z, y / z, z, K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2], world
 

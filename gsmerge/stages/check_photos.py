@@ -15,6 +15,8 @@ import cv2
 import numpy as np
 
 from gsmerge.geometry import sh0_to_rgb
+from gsmerge.kernels.elementary import log
+from gsmerge.kernels.matrices import matmul
 from gsmerge.render import render
 from gsmerge.render.photos import photo_errors, photos_of, scene_pictures
 from gsmerge.runtime.record import choose, note
@@ -68,7 +70,8 @@ def odd_photos(scene: Scene) -> list[int]:
     if min(scene.images.shape[1:3]) < 2 or scene.pixels_per_view / max(level, 1) ** 2 < MIN_PIXELS:
         return []
     scores, judged = gradient_correlations(scene, max(level, 1.0))
-    own, others = np.diag(scores).copy(), np.arctanh(scores.clip(-CLOSEST, CLOSEST))
+    own, near = np.diag(scores).copy(), scores.clip(-CLOSEST, CLOSEST)
+    others = 0.5 * log((1 + near) / (1 - near))  # inverse hyperbolic tangents
     fits = np.diag(others).copy()
     np.fill_diagonal(others, -np.inf)
     others[~judged] = -np.inf
@@ -104,8 +107,8 @@ def gradient_correlations(scene: Scene, level: float) -> tuple[np.ndarray, np.nd
     b = np.stack([_gradients(image) for image in photos.images])
     w = np.stack([_gradient_weights(weight) for _, weight in shown])
     weighted, squares = w * a, (w * a * a).sum(1)
-    sizes = squares[:, None] * (w @ (b * b).T)
-    scores = np.divide(weighted @ b.T, np.sqrt(sizes), out=np.zeros_like(sizes), where=sizes > 0)
+    sizes = squares[:, None] * matmul(w, (b * b).T)
+    scores = np.divide(matmul(weighted, b.T), np.sqrt(sizes), out=np.zeros_like(sizes), where=sizes > 0)
     return scores, squares > FLAT**2 * w.sum(1).clip(1e-9)
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
+from gsmerge.render.metrics import decibels
 from gsmerge.render.photos import Photos, photo_errors, scene_photos, scene_pictures
 from gsmerge.runtime.memory import release_memory
 from gsmerge.runtime.record import choose, stage
@@ -68,7 +69,7 @@ def views_psnr(gaussians: Gaussians, scene: Scene) -> float:
         return float((error * weight).sum(dtype=np.float64)), float(weight.sum(dtype=np.float64))
 
     error, count = np.sum(photo_errors(gaussians, photos, score, pick_views(len(photos), MAX_VIEWS)), axis=0)
-    return float(-10 * np.log10(max(error / max(3 * count, 1), 1e-12)))
+    return decibels(error / max(3 * count, 1))
 
 
 def _weight(scene: Scene, view: int, photos: Photos) -> np.ndarray:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 
+from gsmerge.kernels.elementary import cos, sin
+from gsmerge.kernels.matrices import matmul
 from gsmerge.render import contributions, plan_view, prepare, render
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import parallel_map
@@ -66,9 +69,9 @@ def place_cameras(gaussians: Gaussians, num_views: int = NUM_VIEWS) -> Cameras:
     sample = sampled(gaussians)
     centre, half = _extent(sample.means.astype(np.float64))
     viewmats = _candidates(centre, half)
-    shares = _shares_seen(sample, viewmats, CLEAR * float(np.linalg.norm(half)))
+    shares = _shares_seen(sample, viewmats, CLEAR * float(np.sqrt((half * half).sum())))
     chosen = _most_seen(shares, num_views)
-    size = int(np.clip(round(len(gaussians) ** 0.5), SMALLEST, LARGEST))
+    size = int(np.clip(round(math.sqrt(len(gaussians))), SMALLEST, LARGEST))
     return Cameras(viewmats[chosen], np.repeat(_lens(size)[None], len(chosen), 0), size, size)
 
 
@@ -80,7 +83,7 @@ def sampled(gaussians: Gaussians, count: int = SAMPLES) -> Gaussians:
     """Return evenly spaced Gaussians, at most ``count``, enlarged so that they cover the same area."""
     step = max(1, -(-len(gaussians) // count))
     few = gaussians[::step]
-    return Gaussians(few.means, few.quats, few.scales * step**0.5, few.opacities, few.sh0, few.shN)
+    return Gaussians(few.means, few.quats, few.scales * math.sqrt(step), few.opacities, few.sh0, few.shN)
 
 
 def _extent(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -94,14 +97,14 @@ def _extent(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _sphere(count: int) -> np.ndarray:
     """Return directions ``[count,3]`` spread evenly over the sphere (golden spiral)."""
     i = np.arange(count) + 0.5
-    height, turn = 1 - 2 * i / count, np.pi * (1 + 5**0.5) * i
+    height, turn = 1 - 2 * i / count, np.pi * (1 + math.sqrt(5)) * i
     ring = np.sqrt(1 - height**2)
-    return np.stack([ring * np.cos(turn), height, ring * np.sin(turn)], 1)
+    return np.stack([ring * cos(turn), height, ring * sin(turn)], 1)
 
 
 def _candidates(centre: np.ndarray, half: np.ndarray) -> np.ndarray:
     """Return the world-to-camera matrices ``[c,4,4]`` of all candidates."""
-    radius = float(np.linalg.norm(half))
+    radius = float(np.sqrt((half * half).sum()))
     away = _sphere(AROUND)
     distance = radius * (1 + 2 / FIELD) / 1.5  # the box fills the image
     eyes, looks = [centre + distance * away], [-away]
@@ -116,10 +119,10 @@ def _look(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
     """Return the world-to-camera matrix, OpenCV axes, of an eye and a viewing direction."""
     up = np.array([0.0, 1.0, 0.0]) if abs(direction[1]) < 0.9 else np.array([0.0, 0.0, 1.0])
     x = np.cross(up, direction)
-    x /= np.linalg.norm(x)
+    x /= np.sqrt((x * x).sum())
     viewmat = np.eye(4)
     viewmat[:3, :3] = np.stack([x, np.cross(direction, x), direction])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+    viewmat[:3, 3] = -matmul(viewmat[:3, :3], eye)
     return viewmat
 
 

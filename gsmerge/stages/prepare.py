@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 
 from gsmerge.geometry import lower_median, project
+from gsmerge.kernels.matrices import matmul
 from gsmerge.runtime.record import note, stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.align_views import align_views
@@ -58,13 +59,13 @@ class Frame:
     def leave_cameras(self, cameras: Cameras) -> Cameras:
         """Move cameras from the frame into the world."""
         viewmats = cameras.viewmats.astype(np.float64)
-        viewmats[:, :3, 3] = self.unit * viewmats[:, :3, 3] - viewmats[:, :3, :3] @ self.origin
+        viewmats[:, :3, 3] = self.unit * viewmats[:, :3, 3] - matmul(viewmats[:, :3, :3], self.origin)
         return replace(cameras, viewmats=viewmats)
 
     def enter_cameras(self, cameras: Cameras) -> Cameras:
         """Move cameras from the world into the frame."""
         viewmats = cameras.viewmats.astype(np.float64)
-        shift = viewmats[:, :3, 3] + viewmats[:, :3, :3] @ self.origin
+        shift = viewmats[:, :3, 3] + matmul(viewmats[:, :3, :3], self.origin)
         viewmats[:, :3, 3] = shift / self.unit
         return replace(cameras, viewmats=viewmats)
 
@@ -75,8 +76,8 @@ def scene_frame(scene: Scene) -> Frame:
         raise ValueError(f"expected Gaussians and views, got {len(scene.gaussians)} and {len(scene)}")
     means = scene.gaussians.means[_sample_rows(scene)].astype(np.float64)
     depth = scene_depth(scene)
-    unit = 2.0 ** round(math.log2(depth)) if depth > 0 and math.isfinite(depth) else 1.0
-    return Frame(lower_median(means), unit)
+    mantissa, exponent = math.frexp(depth if depth > 0 and math.isfinite(depth) else 1.0)
+    return Frame(lower_median(means), math.ldexp(1.0, exponent - (mantissa < math.sqrt(0.5))))
 
 
 def scene_depth(scene: Scene) -> float:

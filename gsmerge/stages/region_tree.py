@@ -7,18 +7,17 @@ ones. All views of a scene share one threshold, so every Gaussian buys about the
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
+from gsmerge.kernels.elementary import log, log10
 from gsmerge.kernels.superpixels.merge_tree import (
     OVERSIZE,
     PLANE_ERROR,
     ROW,
     cut_labels,
     merge_order,
-    natural_logs,
     region_sums,
 )
 from gsmerge.kernels.superpixels.regions import pad_labels
@@ -163,8 +162,8 @@ def knee(counts: np.ndarray, distortions: np.ndarray) -> int:
     if len(counts) == 0 or counts.shape != distortions.shape:
         raise ValueError(f"expected as many distortions as counts, got {distortions.shape} for {counts.shape}")
     order = np.argsort(counts)
-    scale, error = natural_logs(counts[order].astype(float)), np.maximum.accumulate(distortions[order][::-1])[::-1]
-    quality = -10 / math.log(10) * natural_logs(KNEE_FLOOR + np.maximum(error, 0))
-    before = np.interp(scale - math.log(KNEE_STEP), scale, quality)
-    steep = (quality - before) / math.log(KNEE_STEP) >= KNEE_SLOPE
+    scale, error = log(counts[order].astype(float)), np.maximum.accumulate(distortions[order][::-1])[::-1]
+    quality = -10 * log10(KNEE_FLOOR + np.maximum(error, 0))
+    before = np.interp(scale - log(KNEE_STEP), scale, quality)
+    steep = (quality - before) / log(KNEE_STEP) >= KNEE_SLOPE
     return int(counts[order][np.flatnonzero(steep)[-1] if steep.any() else 0])

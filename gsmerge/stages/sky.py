@@ -13,7 +13,8 @@ from collections.abc import Mapping
 import cv2
 import numpy as np
 
-from gsmerge.geometry import project
+from gsmerge.geometry import correlation, project
+from gsmerge.kernels.pictures import blur, sobel
 from gsmerge.render import plan_view, prepare
 from gsmerge.render.photos import NEAR
 from gsmerge.render.weights import apply_transposed, view_weights
@@ -83,13 +84,13 @@ def sky_region(photo: np.ndarray) -> np.ndarray:
     """Return the smooth blue or white regions ``[h,w]`` bool that start at a photo's upper border, if large."""
     height, width = photo.shape[:2]
     scale = max(height, width) / SIDE
-    soft = cv2.GaussianBlur(photo.astype(np.float32), (0, 0), max(1.5 * scale, 0.5))
-    slopes = [np.abs(cv2.Sobel(soft, cv2.CV_32F, *way, ksize=3)).max(2) / 8 for way in ((1, 0), (0, 1))]
+    soft = blur(photo, max(1.5 * scale, 0.5))
+    right, down = (np.abs(slope).max(2) / 8 for slope in sobel(soft))
     red, green, blue = np.moveaxis(soft, 2, 0)
     bright = soft.max(2)
     is_blue = (blue >= red) & (blue >= green - 0.02) & (bright > DARK)
     is_white = (bright > WHITE) & (bright - soft.min(2) < GREY)
-    candidates = (np.hypot(*slopes) * scale < SMOOTH) & (is_blue | is_white)
+    candidates = (np.sqrt(right * right + down * down) * scale < SMOOTH) & (is_blue | is_white)
     _, labels = cv2.connectedComponents(candidates.astype(np.uint8), connectivity=4)
     region = np.isin(labels, np.setdiff1d(labels[0], 0))
     small = region.mean() < LEAST_AREA or region[0].mean() < LEAST_TOP
@@ -105,4 +106,4 @@ def _pales_downwards(photo: np.ndarray, region: np.ndarray) -> bool:
     low, high = np.percentile(saturation, (10, 90))
     if high - low < PALER_RANGE or np.ptp(rows) == 0:
         return False
-    return bool(np.corrcoef(rows, saturation)[0, 1] <= PALER)
+    return bool(correlation(rows, saturation) <= PALER)

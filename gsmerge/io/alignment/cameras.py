@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import project_points, sh0_to_rgb
 from gsmerge.io.alignment.layouts import Layout, exact_layouts, subsample
+from gsmerge.io.alignment.resection import projection_errors, refine_poses, start_pose
 from gsmerge.io.alignment.score import (
     IDENTITY,
     MARGIN,
@@ -45,6 +45,7 @@ from gsmerge.io.cameras.camera_file import (
     to_viewmats,
     with_convention,
 )
+from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Cameras, Gaussians
 
 _SEEN_AS_MUCH = 0.98  # of the score of what the cameras see: no difference
@@ -57,8 +58,6 @@ _SAME_COLORS = 0.01  # mean distance of the colours from random pixels below whi
 ESTIMATED = "estimated from the grid"  # source of estimated cameras
 _GRID_SAMPLES = 300  # Gaussians per view that cameras are estimated from
 _CALIBRATIONS = 2  # each time without the Gaussians that lie far from their pixels
-_NO_DISTORTION = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
-_ONE_FOCAL = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO
 
 MAX_PX, MAX_SHARE = 12.0, 0.05  # pixels, and share of a small image's side, that cameras may be off
 NEAR_PX = 0.5  # cameras that are nearer stay where they are
@@ -225,26 +224,22 @@ def _calibrate(means: np.ndarray, valid: np.ndarray, layout: Layout) -> tuple[fl
     focal = 1.2 * max(layout.width, layout.height)
     K = make_pinhole(focal, focal, layout.width / 2, layout.height / 2)
     kept = [np.ones(len(p), bool) for p in points]
-    try:
-        for _ in range(_CALIBRATIONS):
-            near = [p[k].astype(np.float32) for p, k in zip(points, kept, strict=True)]
-            where = [p[k].astype(np.float32) for p, k in zip(pixels, kept, strict=True)]
-            _, K, _, rotations, shifts = cv2.calibrateCamera(
-                near, where, (layout.width, layout.height), K, np.zeros(5), flags=_ONE_FOCAL | _NO_DISTORTION
-            )
-            errors = [
-                np.linalg.norm(cv2.projectPoints(p, r, t, K, None)[0][:, 0] - q, axis=1)
-                for p, q, r, t in zip(points, pixels, rotations, shifts, strict=True)
-            ]
-            kept = [e <= max(1.0, 3 * float(np.median(e))) for e in errors]
-    except cv2.error:
+    starts = [start_pose(p, q, K) for p, q in zip(points, pixels, strict=True)]
+    found = [pose for pose in starts if pose is not None]
+    if len(found) < len(starts):
         return math.inf, 0.0, []
-    poses = []
-    for vector, shift in zip(rotations, shifts, strict=True):
-        R = cv2.Rodrigues(vector)[0]
-        poses.append(np.concatenate([R, unit * shift.reshape(3, 1) - R @ middle[:, None]], 1))
+    poses = np.stack(found)
+    for _ in range(_CALIBRATIONS):
+        near, where = ([p[k] for p, k in zip(some, kept, strict=True)] for some in (points, pixels))
+        try:
+            K, poses = refine_poses(near, where, K, poses, focal=True)
+        except np.linalg.LinAlgError:
+            return math.inf, 0.0, []
+        errors = [projection_errors(p, q, K, pose) for p, q, pose in zip(points, pixels, poses, strict=True)]
+        kept = [e <= max(1.0, 3 * float(np.median(e))) for e in errors]
+    poses[:, :3, 3] = unit * poses[:, :3, 3] - matmul(poses[:, :3, :3], middle)
     worst = max(float(np.median(e)) for e in errors)
-    return (worst if np.isfinite(worst) else math.inf), float(K[0, 0]), poses
+    return (worst if np.isfinite(worst) else math.inf), float(K[0, 0]), list(poses[:, :3])
 
 
 @dataclass(frozen=True)
@@ -296,6 +291,14 @@ def move_cameras(
     return MovedCameras(moved, before.worst_px, list_moves(names, cameras.viewmats, viewmats, depth))
 
 
+def _fit_line(x: np.ndarray, y: np.ndarray, weights: np.ndarray) -> tuple[float, float]:
+    """Fit a line to points by weighted least squares; return its slope, and its height at 0."""
+    total = weights.sum()
+    left, right = (weights * x).sum() / total, (weights * y).sum() / total
+    slope = float((weights * (x - left) * (y - right)).sum() / (weights * (x - left) ** 2).sum())
+    return slope, float(right - slope * left)
+
+
 def _check_intrinsics(pairs: Correspondences, cameras: Cameras, before_px: float, moved_px: float, source: str) -> None:
     """Raise a SceneError where one change of all Ks fits the Gaussians as well as moved poses."""
     if len(np.unique(pairs.views)) < 2:  # in one view a turn and a shift of the picture are one
@@ -308,7 +311,7 @@ def _check_intrinsics(pairs: Correspondences, cameras: Cameras, before_px: float
         before, wanted = places[good, 0, axis], pairs.pixels[good, axis]
         weights = np.ones(len(before))
         for _ in range(_LINE_ROUNDS):
-            factors[axis], shifts[axis] = np.polyfit(before, wanted, 1, w=weights)
+            factors[axis], shifts[axis] = _fit_line(before, wanted, weights**2)
             error = np.abs(factors[axis] * before + shifts[axis] - wanted)
             weights = 1 / np.hypot(1, error / (3 * np.median(error) + 1e-9))
     Ks = cameras.Ks * np.array([*factors, 1])[:, None]

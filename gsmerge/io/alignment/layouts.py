@@ -13,6 +13,7 @@ from gsmerge.geometry import rgb_to_sh0
 from gsmerge.io.cameras.camera_file import CameraFile, sizes_of, to_cameras
 from gsmerge.io.formats.ply import PlyInfo
 from gsmerge.io.photo_files import ASPECT_TOLERANCE, PhotoTransform, Size, resize_and_crop, resize_to, same_shape
+from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.types import Cameras, Gaussians, Scene, grid_ids
 
 Order = Literal["auto", "view-major", "view-fastest", "layer-major", "column-major", "unordered", "none"]
@@ -183,8 +184,8 @@ def fill_from_depths(scene: Scene, depths: np.ndarray) -> Scene:
     means = g.means.astype(np.float64).reshape(views, -1, 3)
     y, x = np.mgrid[:height, :width].reshape(2, -1) + 0.5
     pixels = np.stack([x, y, np.ones(x.size)], 1)
-    rays = pixels @ np.linalg.inv(scene.cameras.Ks).transpose(0, 2, 1)  # [v,p,3] in the camera, z = 1
-    z = np.einsum("vi,vpi->vp", V[:, 2, :3], means) + V[:, 2, 3, None]
+    rays = matmul(pixels, invert(scene.cameras.Ks).transpose(0, 2, 1))  # [v,p,3] in the camera, z = 1
+    z = matmul(means, V[:, 2, :3, None])[..., 0] + V[:, 2, 3, None]
     length = np.linalg.norm(rays, axis=2)
     maps = depths.reshape(views, -1).astype(np.float64)
     usable = valid & (maps > 0) & np.isfinite(maps) & (z > 0)
@@ -205,7 +206,7 @@ def fill_from_depths(scene: Scene, depths: np.ndarray) -> Scene:
     rows = np.flatnonzero(~valid & (maps > 0) & np.isfinite(maps))
     view = rows // (height * width)
     local = rays.reshape(-1, 3)[rows] * new_z.reshape(-1)[rows, None]
-    world = np.einsum("tji,tj->ti", V[view, :3, :3], local - V[view, :3, 3])
+    world = (V[view, :3, :3] * (local - V[view, :3, 3])[:, :, None]).sum(1)
     source = before[rows]
     full = Gaussians(**{field.name: getattr(g, field.name).copy() for field in fields(g)})
     full.means[rows] = world

@@ -14,6 +14,7 @@ import numpy as np
 from gsmerge.geometry import project_points
 from gsmerge.io.alignment.layouts import Layout
 from gsmerge.io.alignment.score import Similarity, scale_by
+from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.view_paths import cheapest_views
 from gsmerge.types import Cameras
 
@@ -247,10 +248,10 @@ def finer_scale(rows: ProjectedRows, layout: Layout, rough: float) -> float:
     speed = float(np.nanquantile(moved, 0.9)) if np.isfinite(moved).any() else 0.0
     if speed <= 0:
         return rough
-    step = max(0.25 / speed, 2 * np.log(SPAN) / MAX_SCALES)
+    step = max(0.25 / speed, 2 * log(SPAN) / MAX_SCALES)
     best = rough
-    for reach in (max(step, np.log(SPAN)), step, step / 8):
-        near = best * np.exp(np.linspace(-reach, reach, 2 * max(1, int(np.ceil(reach / step))) + 1))
+    for reach in (max(step, log(SPAN)), step, step / 8):
+        near = best * exp(np.linspace(-reach, reach, 2 * max(1, int(np.ceil(reach / step))) + 1))
         best = float(min(near, key=cost))
         step = min(step, reach) / 8
     return best

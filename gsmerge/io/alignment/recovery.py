@@ -35,6 +35,7 @@ from gsmerge.io.alignment.score import (
 from gsmerge.io.cameras.camera_file import CameraFile, Convention
 from gsmerge.io.formats.ply import PlyInfo
 from gsmerge.io.photo_files import ASPECT_TOLERANCE
+from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Cameras, Gaussians
 
 SHUFFLED_MARGIN = 5.0  # and by which it must beat shuffled pixels
@@ -307,7 +308,7 @@ def explain_misalignment(
     others = [(poses.describe(convention), poses.viewmats) for poses in other_conventions(given, convention)]
     transposed = given.copy()
     transposed[:, :3, :3] = given[:, :3, :3].transpose(0, 2, 1)
-    transposed[:, :3, 3] = -np.einsum("vij,vj->vi", transposed[:, :3, :3], cameras.centres)
+    transposed[:, :3, 3] = -matmul(transposed[:, :3, :3], cameras.centres[:, :, None])[..., 0]
     others.append(("the cameras fit with their rotations transposed", transposed))
     flips = (1, "y axis flipped (rows counted from the bottom)"), (0, "x axis flipped (mirrored images)")
     for axis, words in flips:

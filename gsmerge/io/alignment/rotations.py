@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Literal, get_args
 
-import cv2
 import numpy as np
 
 from gsmerge.geometry import multiply_quats, normalize, quat_to_rotmat, rotmat_to_quat
 from gsmerge.io.alignment.layouts import spread_step
+from gsmerge.kernels.pictures import convolve
 from gsmerge.types import Scene
 
 QuatChoice = Literal["auto", "wxyz", "xyzw", "xyzw-root", "camera"]
@@ -140,7 +140,7 @@ def _smooth_normals(scene: Scene) -> np.ndarray:
     middle = means.mean((0, 1, 2), np.float64, where=weights > 0).astype(means.dtype)
     with np.errstate(over="ignore"):
         both = np.concatenate([np.where(weights > 0, means - middle, 0).astype(np.float32), weights], 3)
-    around = np.stack([cv2.blur(view, (_AROUND, _AROUND), borderType=cv2.BORDER_CONSTANT) for view in both])
+    around = np.stack([_average_around(view) for view in both])
     grid = around[..., :3] / np.maximum(around[..., 3:], np.float32(1e-6))
     x, y = np.arange(w), np.arange(h)
     with np.errstate(all="ignore"):  # means as large as 1e38 overflow
@@ -148,6 +148,13 @@ def _smooth_normals(scene: Scene) -> np.ndarray:
         down = grid[:, np.minimum(y + _STEP, h - 1)] - grid[:, np.maximum(y - _STEP, 0)]
         normals = normalize(np.cross(across, down).reshape(-1, 3))
     return np.where(np.isfinite(normals).all(1, keepdims=True), normals, 0)
+
+
+def _average_around(picture: np.ndarray) -> np.ndarray:
+    """Average a picture ``[h,w,c]`` over squares of ``_AROUND`` pixels a side, zero outside."""
+    half = _AROUND // 2
+    taps = np.full(_AROUND, 1 / _AROUND)
+    return convolve(np.pad(picture, ((half, half), (half, half), (0, 0))), taps, taps)[half:-half, half:-half]
 
 
 def _normals(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

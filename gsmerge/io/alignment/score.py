@@ -10,11 +10,13 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
-from gsmerge.geometry import project_points, sh0_to_rgb
+from gsmerge.geometry import camera_centres, project_points, sh0_to_rgb
 from gsmerge.io.alignment.layouts import Layout, plain_layout, subsample
+from gsmerge.io.alignment.resection import projection_errors, refine_poses, start_pose
+from gsmerge.kernels.elementary import arccos, log
+from gsmerge.kernels.matrices import closest_rotation, eigh, invert, matmul, solve_symmetric
 from gsmerge.types import Cameras, Gaussians
 
 MARGIN = 2.0  # by which the best reading must beat the next one
@@ -41,8 +43,8 @@ class Similarity:
     def move_viewmats(self, viewmats: np.ndarray) -> np.ndarray:
         """Move world-to-camera matrices ``[c,4,4]`` into the frame of the Gaussians."""
         out = viewmats.copy()
-        out[:, :3, :3] = viewmats[:, :3, :3] @ self.rotation.T
-        out[:, :3, 3] = self.scale * viewmats[:, :3, 3] - out[:, :3, :3] @ self.shift
+        out[:, :3, :3] = matmul(viewmats[:, :3, :3], self.rotation.T)
+        out[:, :3, 3] = self.scale * viewmats[:, :3, 3] - matmul(out[:, :3, :3], self.shift)
         return out
 
     def move(self, cameras: Cameras) -> Cameras:
@@ -52,8 +54,8 @@ class Similarity:
 
 IDENTITY = Similarity(np.eye(3), 1.0, np.zeros(3))
 _HALF = np.sqrt(0.5)
-_TURN = np.array([[_HALF, _HALF, 0], [-_HALF, _HALF, 0], [0, 0, 1]])
-_UPRIGHT = _TURN @ np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])  # as the pixelSplat family turns its world
+# As the pixelSplat family turns its world: axes swapped, then an eighth of a turn about the last one.
+_UPRIGHT = np.array([[-_HALF, 0, _HALF], [-_HALF, 0, -_HALF], [0, -1, 0]])
 
 
 def scale_by(scale: float, note: str = "") -> Similarity:
@@ -93,12 +95,15 @@ def pixel_errors(pairs: Correspondences, cameras: Cameras) -> np.ndarray:
 def _ray_directions(pairs: Correspondences, cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
     """Compute unit directions ``[t,3]`` and origins ``[t,3]`` of the pixels' rays in the cameras' world."""
     ones = np.ones((len(pairs.pixels), 1))
-    inverse = np.linalg.inv(cameras.Ks)
-    local = np.einsum("tij,tj->ti", inverse[pairs.views], np.concatenate([pairs.pixels, ones], 1))
-    rotations = cameras.viewmats[:, :3, :3]
-    rays = np.einsum("tji,tj->ti", rotations[pairs.views], local)
-    centres = -np.einsum("vji,vj->vi", rotations, cameras.viewmats[:, :3, 3])
-    return rays / np.linalg.norm(rays, axis=1, keepdims=True), centres[pairs.views]
+    inverse = invert(cameras.Ks)[pairs.views]
+    local = _apply(inverse, np.concatenate([pairs.pixels, ones], 1))
+    rays = _apply(cameras.viewmats[pairs.views, :3, :3].swapaxes(1, 2), local)
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True), camera_centres(cameras.viewmats)[pairs.views]
+
+
+def _apply(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Apply matrices ``[t,3,3]``, one each, to vectors ``[t,3]``."""
+    return matmul(matrices, vectors[:, :, None])[..., 0]
 
 
 def candidate_similarities(
@@ -118,7 +123,7 @@ def candidate_similarities(
         (np.eye(3), "", ""),
         (first, "rotated into the first camera", "first"),
         (middle, "rotated into the middle camera", "middle"),
-        (_UPRIGHT @ first, "rotated upright from the first camera", "upright"),
+        (matmul(_UPRIGHT, first), "rotated upright from the first camera", "upright"),
     )
     for rotation, name, kind in known:
         if name:
@@ -136,8 +141,8 @@ def candidate_similarities(
     free = _mean_rotation(_solve_poses(pairs, cameras.Ks), cameras.viewmats)
     frame = None if free is None else _solve(pairs.points, rays, free, shifted=True)
     if frame is not None:
-        angle = np.degrees(np.arccos(np.clip((np.trace(frame.rotation) - 1) / 2, -1, 1)))
-        if angle < _SMALL_ROTATION and abs(np.log(frame.scale)) < _SMALL_SCALE:
+        angle = np.degrees(arccos(np.clip((np.trace(frame.rotation) - 1) / 2, -1, 1)))
+        if angle < _SMALL_ROTATION and abs(log(frame.scale)) < _SMALL_SCALE:
             return  # no exporter does so: the cameras are inexact, and a rotation hides it
         text = f"rotated by {angle:.1f} degrees, positions scaled by {frame.scale:.4g} and shifted"
         yield replace(frame, description=text, kind="other")
@@ -147,22 +152,22 @@ def _solve(
     points: np.ndarray, rays_and_centres: tuple[np.ndarray, np.ndarray], rotation: np.ndarray, *, shifted: bool
 ) -> Similarity | None:
     """Solve robustly for the scale (None if not positive) and shift that bring rotated points nearest to their rays."""
-    rays, centres = (part @ rotation.T for part in rays_and_centres)
+    rays, centres = (matmul(part, rotation.T) for part in rays_and_centres)
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-    columns = [np.einsum("tij,tj->ti", across, centres)[:, :, None]] + ([across] if shifted else [])
-    A, b = np.concatenate(columns, 2), np.einsum("tij,tj->ti", across, points)
+    columns = [_apply(across, centres)[:, :, None]] + ([across] if shifted else [])
+    A, b = np.concatenate(columns, 2), _apply(across, points)
     weights, solution = np.ones(len(points)), np.zeros(A.shape[2])
     for _ in range(_ROUNDS):
         heavy = (A * weights[:, None, None]).reshape(-1, A.shape[2])
-        left, right = heavy.T @ A.reshape(-1, A.shape[2]), heavy.T @ b.reshape(-1)
+        left, right = matmul(heavy.T, A.reshape(-1, A.shape[2])), matmul(heavy.T, b.reshape(-1))
         unit = np.sqrt(np.maximum(np.diag(left), 1e-300))
-        solution = np.linalg.lstsq(left / np.outer(unit, unit), right / unit, rcond=1e-12)[0] / unit
+        solution = solve_symmetric(left / np.outer(unit, unit), right / unit) / unit
         if not np.isfinite(solution).all() or solution[0] <= 0:
             return None
         shift = solution[1:] if shifted else np.zeros(3)
         away = points - solution[0] * centres - shift
         depth = np.abs((away * rays).sum(1)) + 1e-12
-        angle = np.linalg.norm(np.einsum("tij,tj->ti", across, away), axis=1) / depth
+        angle = np.linalg.norm(_apply(across, away), axis=1) / depth
         spread = 3 * np.median(angle) + 1e-12
         weights = 1 / (depth**2 * (1 + (angle / spread) ** 2))
     return Similarity(rotation, float(solution[0]), shift)
@@ -178,11 +183,11 @@ def _mean_rotation(poses: dict[int, np.ndarray], viewmats: np.ndarray) -> np.nda
     """Average the rotations between the two frames; None where the views disagree."""
     if not poses:
         return None
-    rotations = [pose[:3, :3].T @ viewmats[view, :3, :3] for view, pose in poses.items()]
-    u, size, vt = np.linalg.svd(np.mean(rotations, 0))
-    if size[-1] < 0.9:  # rotations that agree have a mean that is nearly one
+    mean = np.mean([matmul(pose[:3, :3].T, viewmats[view, :3, :3]) for view, pose in poses.items()], 0)
+    squares, _ = eigh(matmul(mean.T, mean))
+    if squares[0] < 0.9**2:  # rotations that agree have a mean that is nearly one
         return None
-    return np.asarray(u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt)
+    return closest_rotation(mean)
 
 
 def fits_all_cameras(frame: Similarity, pairs: Correspondences, cameras: Cameras) -> bool:
@@ -202,21 +207,20 @@ def solve_pose(pairs: Correspondences, view: int, K: np.ndarray) -> np.ndarray |
         return None
     points, pixels = pairs.points[rows], pairs.pixels[rows]
     middle, unit = np.median(points, 0), float(np.median(np.abs(points - np.median(points, 0)))) or 1.0
-    near = (points - middle) / unit
+    near, K = (points - middle) / unit, K.astype(np.float64)
+    for _ in range(2):
+        start = start_pose(near, pixels, K)
+        if start is None:
+            return None
+        pose = start
+        error = projection_errors(near, pixels, K, pose)
+        good = error <= max(1.0, 3 * float(np.median(error)))
+        near, pixels = near[good], pixels[good]
     try:
-        for _ in range(2):
-            solved, rotation, shift = cv2.solvePnP(near, pixels, K, None, flags=cv2.SOLVEPNP_SQPNP)
-            if not solved:
-                return None
-            error = np.linalg.norm(cv2.projectPoints(near, rotation, shift, K, None)[0][:, 0] - pixels, axis=1)
-            good = error <= max(1.0, 3 * float(np.median(error)))
-            near, pixels = near[good], pixels[good]
-        rotation, shift = cv2.solvePnPRefineLM(near, pixels, K, None, rotation, shift)
-    except cv2.error:  # points in one place
+        _, (pose,) = refine_poses([near], [pixels], K, pose[None])
+    except np.linalg.LinAlgError:  # points in one place
         return None
-    pose = np.eye(4)
-    pose[:3, :3] = cv2.Rodrigues(rotation)[0]
-    pose[:3, 3] = unit * shift[:, 0] - pose[:3, :3] @ middle
+    pose[:3, 3] = unit * pose[:3, 3] - matmul(pose[:3, :3], middle)
     return pose if np.isfinite(pose).all() else None
 
 

@@ -13,6 +13,7 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry import pose_changes
 from gsmerge.io.bounds import MAX_VIEWS, check_pixels
 from gsmerge.io.photo_files import Photos, Size, change_photos, photo_size, same_shape
+from gsmerge.kernels.matrices import determinant, invert, matmul
 from gsmerge.types import Cameras, StrPath
 
 MAX_NUMBER, _MAX_SIDE, _MIN_FOCAL = 1e12, 1e6, 1e-6  # beyond them no camera is, and numbers would overflow later
@@ -158,9 +159,9 @@ def check_camera(path: StrPath, name: str, pose: np.ndarray, K: np.ndarray) -> N
     if largest > MAX_NUMBER:
         raise SceneError(path, f"view {name}: expected numbers up to {MAX_NUMBER:g}, found {largest:g}")
     rotation = pose[:3, :3]
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > _MAX_ROTATION_ERROR:
+    if np.abs(matmul(rotation, rotation.T) - np.eye(3)).max() > _MAX_ROTATION_ERROR:
         raise SceneError(path, f"view {name}: expected a rotation matrix, found one whose axes are not orthonormal")
-    if np.linalg.det(rotation) < 0:
+    if determinant(rotation) < 0:
         problem = f"view {name}: expected a rotation, found a mirrored (left-handed) one"
         raise SceneError(path, problem, "negate one axis")
     if K[0, 0] < _MIN_FOCAL or K[1, 1] < _MIN_FOCAL:
@@ -186,15 +187,15 @@ def to_viewmats(poses: np.ndarray, convention: Convention) -> np.ndarray:
     """Convert poses ``[c,4,4]`` of a convention to world-to-camera matrices with OpenCV axes."""
     direction, axes = convention
     if direction == "camera-to-world":
-        poses = np.linalg.inv(poses)
-    return FLIP @ poses if axes == "OpenGL" else poses
+        poses = invert(poses)
+    return matmul(FLIP, poses) if axes == "OpenGL" else poses
 
 
 def from_viewmats(viewmats: np.ndarray, convention: Convention) -> np.ndarray:
     """Invert :func:`to_viewmats`: return poses in the convention of a file."""
     direction, axes = convention
-    poses = FLIP @ viewmats if axes == "OpenGL" else viewmats
-    return np.linalg.inv(poses) if direction == "camera-to-world" else poses
+    poses = matmul(FLIP, viewmats) if axes == "OpenGL" else viewmats
+    return invert(poses) if direction == "camera-to-world" else poses
 
 
 def with_convention(camera_file: CameraFile, convention: Convention) -> CameraFile:
@@ -270,7 +271,7 @@ def as_pinholes(camera_file: CameraFile, photos: Photos | None) -> tuple[CameraF
     for view, K, lens in zip(camera_file.names, Ks, camera_file.lenses, strict=True):
         if lens is None:
             continue
-        small = np.diag([_GRID / size[0], _GRID / size[1], 1.0]) @ K
+        small = K * np.array([_GRID / size[0], _GRID / size[1], 1.0])[:, None]
         maps = _rectify_maps(small, lens, (_GRID, _GRID))
         share = float(np.all([(m >= -0.5) & (m <= _GRID - 0.5) for m in maps], 0).mean())
         if share < _MIN_SHARE:

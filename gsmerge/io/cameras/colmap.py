@@ -75,7 +75,7 @@ def _pose(numbers: list[float]) -> np.ndarray:
     if not np.isfinite(numbers).all():
         raise ValueError("a pose that is not finite")
     quat = np.array(numbers[:4]) / max(1e-12, *map(abs, numbers[:4]))
-    entries = rotation_entries(*quat / max(float(np.linalg.norm(quat)), 1e-12))
+    entries = rotation_entries(*quat / max(float(np.linalg.norm(quat, axis=0)), 1e-12))
     rotation = np.reshape(entries, (3, 3))
     return np.concatenate([rotation, np.array(numbers[4:7])[:, None]], 1)
 

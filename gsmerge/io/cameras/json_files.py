@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -29,6 +28,8 @@ from gsmerge.io.cameras.camera_file import (
     make_pinhole,
 )
 from gsmerge.io.photo_files import find_image, image_size
+from gsmerge.kernels.elementary import cos, sin
+from gsmerge.kernels.matrices import determinant, invert, matmul
 from gsmerge.types import Cameras
 
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # the order of "distortion_params"
@@ -116,7 +117,8 @@ def _focal(values: Mapping[str, Any], axis: str, size: float) -> float:
     if f"fl_{axis}" in values:
         return float(values[f"fl_{axis}"])
     if f"camera_angle_{axis}" in values:
-        return 0.5 * size / math.tan(0.5 * float(values[f"camera_angle_{axis}"]))
+        half = 0.5 * float(values[f"camera_angle_{axis}"])
+        return float(0.5 * size * cos(half) / sin(half))
     return 0.0
 
 
@@ -217,7 +219,7 @@ def read_long_lrm(path: Path, data: Mapping[str, Any]) -> CameraFile:
         raise SceneError(path.with_name(POSE_FILE), f"expected 16 numbers, found {move.size}")
     try:
         with np.errstate(all="ignore"):  # what overflows is refused with the cameras
-            poses = poses if move is None else poses @ np.linalg.inv(move.reshape(4, 4))  # of X' = s (A X): R inv(A)
+            poses = poses if move is None else matmul(poses, invert(move.reshape(4, 4)))  # of X' = s (A X): R inv(A)
             poses[:, :3, 3] *= 1.0 if scale is None else scale[0]
     except np.linalg.LinAlgError as error:
         raise SceneError(path.with_name(POSE_FILE), "expected a matrix that can be inverted") from error
@@ -297,7 +299,7 @@ def read_dataparser(path: Path, cameras: Path | None) -> list[Similarity]:
     if isinstance(camera_data, dict) and "applied_transform" in camera_data:
         with _number_errors(cameras or path, "expected 'applied_transform' of 3x4 numbers"):
             applied, factor = _square(camera_data["applied_transform"]), float(camera_data.get("applied_scale") or 1)
-            frames.append(_similarity(path, moved @ np.linalg.inv(applied), scale / factor))
+            frames.append(_similarity(path, matmul(moved, invert(applied)), scale / factor))
     return frames
 
 
@@ -310,6 +312,10 @@ def _square(values: Any) -> np.ndarray:
 
 def _similarity(path: Path, matrix: np.ndarray, scale: float) -> Similarity:
     R = matrix[:3, :3]
-    if np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE or np.linalg.det(R) < 0 or not 0 < scale < MAX_NUMBER:
+    if (
+        np.abs(matmul(R, R.T) - np.eye(3)).max() > _ROTATION_TOLERANCE
+        or determinant(R) < 0
+        or not 0 < scale < MAX_NUMBER
+    ):
         raise SceneError(path, "expected 'transform' to rotate and shift and 'scale' to be positive, found another map")
     return Similarity(R, scale, scale * matrix[:3, 3], "moved as nerfstudio does", "other")

@@ -8,6 +8,7 @@ import numpy as np
 
 from gsmerge.geometry import morton_codes, sh0_to_rgb
 from gsmerge.io.formats.ply_file import MAX_LOG_SCALE, MEANS, MIP_COMMENT, QUATS, SCALES, SH0
+from gsmerge.kernels.elementary import log
 from gsmerge.types import Array, Gaussians, as_array
 
 
@@ -88,8 +89,8 @@ def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Col
     quats = array(gaussians.quats)
     length = np.linalg.norm(quats, axis=1, keepdims=True)
     quats = np.where(length == 0, (1.0, 0.0, 0.0, 0.0), quats) / np.where(length == 0, 1, length)
-    with np.errstate(all="ignore"):  # scales of 0 are clipped, negative ones refused
-        log_scales = np.clip(np.log(array(gaussians.scales)), -MAX_LOG_SCALE, MAX_LOG_SCALE)
+    # scales of 0 are clipped, negative ones refused
+    log_scales = np.clip(log(array(gaussians.scales)), -MAX_LOG_SCALE, MAX_LOG_SCALE)
     return Columns(
         means=array(gaussians.means),
         quats=quats,

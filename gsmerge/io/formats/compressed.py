@@ -16,6 +16,7 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry import rgb_to_sh0
 from gsmerge.io.formats.arrays import from_smallest_three, smallest_three, to_bytes, to_columns
 from gsmerge.io.formats.ply_file import MEANS, QUATS, REQUIRED, SCALES, SH0
+from gsmerge.kernels.elementary import log, log1p
 from gsmerge.types import Gaussians
 
 CHUNK = 256  # Gaussians that share a range
@@ -57,7 +58,7 @@ def unpack(path: Path, data: PlyData) -> np.ndarray:
         _fill_between(rows, SCALES, _shares(words["packed_scale"], (11, 10, 11)), chunk, RANGES[6:])
         *colors, alpha = _shares(words["packed_color"], (8, 8, 8, 8))
         _fill_between(rows, SH0, colors, chunk, COLORS)
-        rows["opacity"] = np.log(alpha) - np.log1p(-alpha)  # infinite for 0 and 1, which the reader takes as such
+        rows["opacity"] = log(alpha) - log1p(-alpha)  # infinite for 0 and 1, which the reader takes as such
     largest = (words["packed_rotation"] >> np.uint32(30)).astype(np.int64)  # of wxyz
     others = np.stack(_shares(words["packed_rotation"], (10, 10, 10)), 1) - 0.5  # within +-sqrt(1/2)
     quats = from_smallest_three(largest, others * np.sqrt(2.0))

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.io.formats.arrays import to_bytes, to_columns
+from gsmerge.kernels.elementary import exp
 from gsmerge.types import Gaussians
 
 MAX_DEGREE = 3
@@ -27,7 +28,7 @@ def glb_bytes(gaussians: Gaussians) -> bytes:
     values = {
         "POSITION": columns.means,
         f"{NAME}:ROTATION": np.roll(columns.quats, -1, axis=1),  # xyzw
-        f"{NAME}:SCALE": np.exp(columns.log_scales),
+        f"{NAME}:SCALE": exp(columns.log_scales),
         f"{NAME}:OPACITY": columns.opacities,
         f"{NAME}:SH_DEGREE_0_COEF_0": columns.sh0,
     }

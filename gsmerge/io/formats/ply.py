@@ -15,6 +15,7 @@ from gsmerge.geometry import rgb_to_sh0
 from gsmerge.io.formats import ply_file, sog, splat, spz
 from gsmerge.io.formats.arrays import StoredRows
 from gsmerge.io.formats.compressed import is_compressed, unpack
+from gsmerge.kernels.elementary import exp
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Gaussians, StrPath
 
@@ -245,7 +246,7 @@ def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int, int]:
             column = take(name)
             clipped |= np.abs(column) > ply_file.MAX_LOG_SCALE
             np.clip(column, -ply_file.MAX_LOG_SCALE, ply_file.MAX_LOG_SCALE, out=column)
-            out["scales"][:, j] = np.exp(column, out=column)
+            out["scales"][:, j] = exp(column)
         quats = [take(name) for name in ply_file.QUATS]
         zero = _normalise(quats, out["quats"])
         out["opacities"][:] = take("opacity")
@@ -301,7 +302,7 @@ def _activate(opacities: np.ndarray, valid: np.ndarray, known: str | None) -> st
         np.clip(opacities, 0, 1, out=opacities)
         return known
     with np.errstate(all="ignore"):
-        np.exp(np.negative(opacities, out=opacities), out=opacities)
+        opacities[:] = exp(np.negative(opacities, out=opacities))
         np.add(opacities, 1, out=opacities)
         np.reciprocal(opacities, out=opacities)
     return known

@@ -23,6 +23,7 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file, read_errors
 from gsmerge.io.formats import arrays
+from gsmerge.kernels.elementary import expm1, log1p
 from gsmerge.types import Gaussians
 
 MAX_DEGREE = 3
@@ -115,7 +116,7 @@ def _read_columns(sog: _Sog, meta: dict[str, Any], count: int) -> arrays.Columns
     with np.errstate(all="ignore"):  # what is not finite is set aside later
         logs = low + (high - low) * fixed / 65535
         return arrays.Columns(
-            means=np.sign(logs) * np.expm1(np.abs(logs)),
+            means=np.sign(logs) * expm1(np.abs(logs)),
             quats=arrays.from_smallest_three(
                 quats[:, 3].astype(int) - FIRST_MODE, (quats[:, :3] / 255 - 0.5) * np.sqrt(2.0)
             ),
@@ -164,7 +165,7 @@ def sog_bytes(gaussians: Gaussians, *, mip: bool = False) -> bytes:
         meta[key] = {**numbers, "files": list(files)}
         textures.update(files)
 
-    logs = np.sign(columns.means) * np.log1p(np.abs(columns.means))
+    logs = np.sign(columns.means) * log1p(np.abs(columns.means))
     low, high = (end(logs, axis=0) if count else np.zeros(3) for end in (np.min, np.max))
     fixed = np.round((logs - low) / np.where(high > low, high - low, 1) * 65535).astype(int)
     halves = {"means_l.webp": _texture(fixed & 255), "means_u.webp": _texture(fixed >> 8)}

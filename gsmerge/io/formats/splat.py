@@ -13,6 +13,7 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry import rgb_to_sh0
 from gsmerge.io.bounds import check_file, read_errors
 from gsmerge.io.formats.arrays import Columns, StoredRows, to_bytes, to_columns, to_rows
+from gsmerge.kernels.elementary import exp, log
 from gsmerge.types import Gaussians
 
 MAX_DEGREE = 0
@@ -23,7 +24,7 @@ def splat_bytes(gaussians: Gaussians) -> bytes:
     """Encode a ``.splat`` file; ValueError if there is NaN or inf."""
     columns = to_columns(gaussians, MAX_DEGREE)
     rows = np.empty(len(columns), ROW)
-    rows["means"], rows["scales"] = columns.means, np.exp(columns.log_scales)
+    rows["means"], rows["scales"] = columns.means, exp(columns.log_scales)
     rows["colors"] = to_bytes(255 * np.concatenate([columns.colors, columns.opacities[:, None]], 1))
     rows["quats"] = to_bytes(128 * columns.quats + 128)
     return rows.tobytes()
@@ -42,7 +43,7 @@ def read_rows(path: Path) -> StoredRows:
         columns = Columns(
             means=rows["means"],
             quats=(rows["quats"] - 128.0) / 128,
-            log_scales=np.log(rows["scales"]),
+            log_scales=log(rows["scales"]),
             opacities=colors[:, 3],
             sh0=rgb_to_sh0(colors[:, :3]),
             harmonics=np.zeros((len(rows), 0, 3)),

@@ -12,6 +12,7 @@ keep those of the ``.ply`` instead, and so does this: the file shows what the ``
 from __future__ import annotations
 
 import gzip
+import math
 import struct
 import zlib
 from collections.abc import Sequence
@@ -185,6 +186,11 @@ class SpzColumns:
         return [part.tobytes() for part in self.parts if part.shape[1]]
 
 
+def _octave(size: float) -> int:
+    """Return the exponent of the largest power of two up to a positive number."""
+    return math.frexp(size)[1] - 1
+
+
 def spz_columns(gaussians: Gaussians, max_degree: int, *, mip: bool = False, fine: int = FINE) -> SpzColumns:
     """Quantise Gaussians, positions to ``fine`` bits within the scene; ValueError if there is NaN or inf."""
     columns = arrays.to_columns(gaussians, max_degree)
@@ -192,8 +198,8 @@ def spz_columns(gaussians: Gaussians, max_degree: int, *, mip: bool = False, fin
     if len(columns):
         middle = np.median(columns.means, axis=0)
         size = np.median(np.abs(columns.means - middle).max(axis=1))
-        enough = np.ceil(fine - np.log2(max(size, 1e-6)))
-        room = np.floor(np.log2(LARGEST / max(np.abs(columns.means).max(), 1e-6)))
+        enough = fine - _octave(max(size, 1e-6))
+        room = _octave(LARGEST / max(np.abs(columns.means).max(), 1e-6))
         fraction = int(np.clip(min(enough, room), 0, MAX_FRACTION))
     fixed = np.clip(np.round(columns.means * 2.0**fraction), -LARGEST, LARGEST).astype("<i4")
     steps = np.where(np.arange(columns.harmonics.shape[1]) < 3, 8, 16)[:, None]  # of degree 1, and above

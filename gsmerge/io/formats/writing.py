@@ -11,6 +11,7 @@ from gsmerge.errors import UsageError
 from gsmerge.io.atomic import atomic_output
 from gsmerge.io.formats import compressed, glb, ply_file, sog, splat, spz
 from gsmerge.io.formats.arrays import to_columns
+from gsmerge.kernels.elementary import log, log1p
 from gsmerge.types import Gaussians, StrPath
 
 # File endings, the longest first, and the highest degree of the harmonics that there is room for.
@@ -126,8 +127,7 @@ def write_ply(
         file.write(header)
         for start in range(0, len(gaussians), block):
             columns = to_columns(gaussians[start : start + block], degree, start)
-            with np.errstate(all="ignore"):  # opacities 0 and 1 are clipped, impossible ones become NaN
-                logits = np.log(columns.opacities) - np.log1p(-columns.opacities)
+            logits = log(columns.opacities) - log1p(-columns.opacities)  # 0 and 1 are clipped, impossible ones NaN
             parts = [
                 columns.means,
                 np.zeros((len(columns), 3 * normals)),

@@ -104,15 +104,3 @@ def cut_labels(parents, keep, num_leaves):
     labels, tops, names = np.empty(num_leaves, np.int32), np.empty_like(parents), np.empty_like(parents)
     _cut_labels(parents, keep.view(np.uint8), tops, names, labels)
     return labels
-
-
-@native(values=f8("count"), logs=f8("count", out=True))
-def _natural_logs(values, logs):
-    """Write what :func:`natural_logs` returns."""
-
-
-def natural_logs(values):
-    """Natural logarithms ``[n]`` of float64 values; the last bit of NumPy's depends on the processor."""
-    logs = np.empty_like(values)
-    _natural_logs(values, logs)
-    return logs

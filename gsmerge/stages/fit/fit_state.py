@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmerge.geometry import quat_to_rotmat
+from gsmerge.kernels.elementary import exp, log, power
 from gsmerge.kernels.gaussians.optimise import COLOR, COLUMNS, LOGIT, QUAT, SIZE
 from gsmerge.render import Splats, composite, plan_view, splat_adjoint
 from gsmerge.render.photos import Photos
@@ -44,9 +45,9 @@ def start_state(gaussians: Gaussians) -> State:
     x = np.empty((len(gaussians), COLUMNS), np.float32)
     opacities = gaussians.opacities.astype(np.float64).clip(0.004, 0.999)
     x[:, :3] = gaussians.means
-    x[:, SIZE:QUAT] = np.log(gaussians.scales.clip(1e-9))
+    x[:, SIZE:QUAT] = log(gaussians.scales.clip(1e-9))
     x[:, QUAT:LOGIT] = gaussians.quats
-    x[:, LOGIT] = np.log(opacities / (1 - opacities))
+    x[:, LOGIT] = log(opacities / (1 - opacities))
     x[:, COLOR:] = 0.5 + SH_C0 * gaussians.sh0[:, 0]
     return state_of(x, gaussians.shN)
 
@@ -58,13 +59,13 @@ def state_of(x: np.ndarray, shN: np.ndarray) -> State:
     splats = Splats(
         means=np.ascontiguousarray(x[:, :3]),
         quats=np.ascontiguousarray(x[:, QUAT:LOGIT]),
-        scales=np.exp(x[:, SIZE:QUAT]),
-        opacities=1 / (1 + np.exp(-x[:, LOGIT])),
+        scales=exp(x[:, SIZE:QUAT]),
+        opacities=1 / (1 + exp(-x[:, LOGIT])),
         sh0=(colors[:, None] - np.float32(0.5)) / np.float32(SH_C0),
         shN=shN,
         origin=np.zeros(3),
     )
-    units = np.exp((sizes[:, 1] + sizes[:, 2]) / 2)
+    units = exp((sizes[:, 1] + sizes[:, 2]) / 2)
     shares, least = np.ones_like(units), np.full_like(units, -np.inf)
     return State(x, x.copy(), np.zeros_like(x), np.zeros_like(x), units, shares, least, splats, colors)
 
@@ -74,8 +75,8 @@ def gaussians_of(x: np.ndarray, shN: np.ndarray) -> Gaussians:
     return Gaussians(
         means=x[:, :3].copy(),
         quats=x[:, QUAT:LOGIT].copy(),
-        scales=np.exp(x[:, SIZE:QUAT]),
-        opacities=1 / (1 + np.exp(-x[:, LOGIT])),
+        scales=exp(x[:, SIZE:QUAT]),
+        opacities=1 / (1 + exp(-x[:, LOGIT])),
         sh0=((x[:, COLOR:] - 0.5) / SH_C0)[:, None],
         shN=shN.copy(),
     )
@@ -117,13 +118,13 @@ def grow(state: State, photos: Photos, count: int) -> State:
     picked = np.sort(np.argsort(-masses, kind="stable")[:num])
     parents, rows = state.x[picked], np.arange(num)
     longest = parents[:, SIZE:QUAT].argmax(1)
-    reach = OFFSET * np.exp(parents[rows, SIZE + longest])
+    reach = OFFSET * exp(parents[rows, SIZE + longest])
     rotations = quat_to_rotmat(parents[:, QUAT:LOGIT])
     shift = rotations[rows, :, longest] * reach[:, None]
     halves = parents.copy()
-    halves[rows, SIZE + longest] += 0.5 * np.log(1 - OFFSET**2)
-    clear = 1 / (1 + np.exp(halves[:, LOGIT].astype(np.float64)))  # 1 - opacity
-    halves[:, LOGIT] = np.log(1 / clear**DEPTH - 1)
+    halves[rows, SIZE + longest] += 0.5 * log(1 - OFFSET**2)
+    clear = 1 / (1 + exp(halves[:, LOGIT].astype(np.float64)))  # 1 - opacity
+    halves[:, LOGIT] = log(1 / power(clear, DEPTH) - 1)
     x = np.concatenate([state.x, halves])
     x[picked] = halves
     x[picked, :3] -= shift

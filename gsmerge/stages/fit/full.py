@@ -15,12 +15,15 @@ from typing import Any
 import numpy as np
 
 from gsmerge.geometry import motion_matrices
+from gsmerge.kernels.elementary import log, power
 from gsmerge.kernels.gaussians import optimise as kernels
 from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT
+from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.raster.blend import MAX_ALPHA
 from gsmerge.render import plan_view
 from gsmerge.render.composite import blend, view_colors
 from gsmerge.render.gradient import gradients_of
+from gsmerge.render.metrics import decibels
 from gsmerge.render.photos import Photos, render_photos
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.fit.fit_options import EARLIER, LONG_STEPS, FitOptions, FitReport, Tuning
@@ -153,7 +156,7 @@ def step_sizes(rates: Tuning, progress: float, steps: int) -> np.ndarray:
     """Return the step of each of the fourteen columns, decaying geometrically, and farther in longer runs."""
     decay = rates.decay * min(1.0, LONG_RUN / steps)
     each = [rates.means_lr, rates.scales_lr, rates.quats_lr, rates.opacities_lr, rates.colors_lr]
-    return (np.repeat(each, [3, 3, 4, 1, 3]) * decay**progress).astype(np.float32)
+    return (np.repeat(each, [3, 3, 4, 1, 3]) * power(decay, progress)).astype(np.float32)
 
 
 def initial_scores(look: Survey, plan: FitPlan) -> tuple[float, np.ndarray, np.ndarray]:
@@ -168,8 +171,7 @@ def initial_scores(look: Survey, plan: FitPlan) -> tuple[float, np.ndarray, np.n
     photos_each = look.sums**2 / np.maximum(look.squares, 1e-12)
     box_shares = np.clip(photos_each - 1, rates.single_view_share, 1).astype(np.float32)
     pixels = np.where(np.isfinite(look.pixels), look.pixels, 0)
-    with np.errstate(divide="ignore"):
-        min_sizes = np.log(rates.min_scale * pixels).astype(np.float32)
+    min_sizes = log(rates.min_scale * pixels).astype(np.float32)
     return holdout_psnr(look.images, plan.photos[1], plan.weights[1], rates.min_gain), box_shares, min_sizes
 
 
@@ -259,7 +261,7 @@ def fit_full(
         if options.time_budget is not None and step == PROBE:
             steps = affordable_steps(time.perf_counter() - started, plan)
         if progress:
-            progress(step, steps, -10 * np.log10(max(error, 1e-12)), after)
+            progress(step, steps, decibels(error), after)
     after = after if judged else holdout_score(state, plan)
     if after <= before:
         why = f"held-out parts of the photos were no better after {step} steps"
@@ -300,17 +302,17 @@ class PoseState:
 
     def step(self, view: int, gradient: np.ndarray, rates: Tuning, progress: float) -> None:
         """Take one Adam step of a view by the gradient ``[4,4]`` of its viewmat; steps fall to zero at the end."""
-        turns = self.viewmats[view, :3, :3].T @ gradient[:3]
+        turns = matmul(self.viewmats[view, :3, :3].T, gradient[:3])
         (_, ab, ac), (ba, _, bc), (ca, cb, _) = turns[:, :3]
         slope = np.array([cb - bc, ac - ca, ba - ab, *turns[:, 3]])
         self.counts[view] += 1
         for moment, beta, value in ((self.m, rates.beta1, slope), (self.v, rates.beta2, slope**2)):
             moment[view] += (1 - beta) * (value - moment[view])
-        first = self.m[view] / (1 - rates.beta1 ** self.counts[view])
-        second = self.v[view] / (1 - rates.beta2 ** self.counts[view])
+        first_left, second_left = power([rates.beta1, rates.beta2], self.counts[view])
+        first, second = self.m[view] / (1 - first_left), self.v[view] / (1 - second_left)
         self.x[view] -= rates.poses_lr * self.pixel * (1 - progress) * first / (np.sqrt(second) + EPS)
         self.x -= self.x.mean(0)
-        self.viewmats[:] = self.start @ motion_matrices(self.x)
+        self.viewmats[:] = matmul(self.start, motion_matrices(self.x))
 
 
 def start_poses(photos: tuple[Photos, ...]) -> tuple[PoseState, tuple[Photos, ...]]:

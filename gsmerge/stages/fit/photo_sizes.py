@@ -7,6 +7,8 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from gsmerge.kernels.elementary import exp, log
+from gsmerge.render.metrics import decibels
 from gsmerge.render.photos import EPS2D, Photos, scene_photos
 from gsmerge.runtime.record import choose, note
 from gsmerge.runtime.threads import parallel_map
@@ -118,7 +120,7 @@ def holdout_psnr(images: Sequence[np.ndarray], photos: Photos, weights: list[np.
         return float(error[mask].sum(dtype=np.float64)), float(mask.sum())
 
     error, count = np.sum(parallel_map(one_view, views), axis=0)
-    return float(-10 * np.log10(max(error / max(3 * count, 1), 1e-12)))
+    return decibels(error / max(3 * count, 1))
 
 
 def exposure_gains(
@@ -142,7 +144,7 @@ def exposure_gains(
         return np.clip(with_photo / np.maximum(with_image, 1e-9), 1 / max_gain, max_gain)
 
     gains = np.stack(parallel_map(one_view, range(len(photos))))
-    gains /= np.exp(np.log(gains).mean(0))
-    if np.abs(np.log(gains)).max() < np.log(min_gain):
+    gains /= exp(log(gains).mean(0))
+    if np.abs(log(gains)).max() < log(min_gain):
         gains[:] = 1
     return gains.astype(np.float32)

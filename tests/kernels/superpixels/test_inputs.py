@@ -42,11 +42,10 @@ def all_of_them(height: int, width: int) -> list[np.ndarray]:
     halves = split_merge.sum_regions(found, pixels, split_merge.mark_halves(found, count, True), count)
     ratios = split_merge.weigh_splits(sums, halves, PRIOR)
     best = split_merge.choose_merges(ward.adjacent_pairs(found), sums, PRIOR)
-    logs = merge_tree.natural_logs(np.abs(rows[:count].reshape(-1)))
     fitted = bass.fit_regions(found, pixels, np.full(count, 16.0))
     return [
         response, labels, merged, refined, rows[: 2 * count - 1], np.array(error), *tree, cut, places, grown,
-        found, adapted, np.array(number), sums, halves, ratios, *best, logs, fitted,
+        found, adapted, np.array(number), sums, halves, ratios, *best, fitted,
     ]  # fmt: skip
 
 
@@ -174,10 +173,3 @@ def test_log_gamma(n: float) -> None:
     actual = split_merge.log_evidence(np.array([n, 0, 0, 0, 0, 0, 0.0]), prior)
     expected = math.lgamma(n) - n * math.log(n) + 3 * math.lgamma(1 + 0.5 * n)
     assert actual == pytest.approx(expected, rel=1e-14, abs=1e-13)
-
-
-def test_natural_logs() -> None:
-    values = np.concatenate([np.random.default_rng(0).lognormal(0, 30, 999), [1e-310, 1.0, 2.0]])
-    assert merge_tree.natural_logs(values) == pytest.approx(np.log(values), rel=4e-16, abs=0)
-    assert merge_tree.natural_logs(np.array([0.0, np.inf])).tolist() == [-np.inf, np.inf]
-    assert np.isnan(merge_tree.natural_logs(np.array([-1.0, np.nan]))).all()

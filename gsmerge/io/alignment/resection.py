@@ -1,0 +1,103 @@
+"""Solve for the poses of cameras, and for a focal length, from points and the pixels that show them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from gsmerge.geometry import motion_matrices
+from gsmerge.kernels.matrices import matmul, solve
+
+STEPS = 30  # most Levenberg-Marquardt steps
+FIRST_DAMPING, EASE, BRAKE, MAX_DAMPING = 1e-3, 0.1, 10.0, 1e8  # of the curvature: after a step that helps, or does not
+MIN_GAIN = 1e-10  # share of the squared error that a step must take away for another one to follow
+MAX_STRETCH = 0.5  # of the focal length, in a step
+
+
+def start_pose(points: np.ndarray, pixels: np.ndarray, K: np.ndarray) -> np.ndarray | None:
+    """Solve for the motion ``[4,4]`` into the camera of points ``[n,3]`` shown at ``pixels [n,2]``; None if it fails.
+
+    By SQPnP (Terzakis and Lourakis 2020), near the best; the points must be at least three and lie near zero.
+    """
+    try:
+        solved, rotation, shift = cv2.solvePnP(points, pixels, K, None, flags=cv2.SOLVEPNP_SQPNP)
+    except cv2.error:  # points in one place
+        return None
+    return motion_matrices(np.concatenate([rotation, shift]).T)[0] if solved else None
+
+
+def projection_errors(points: np.ndarray, pixels: np.ndarray, K: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Measure the distances ``[n]`` of projected points ``[n,3]`` from their ``pixels [n,2]``, pixels."""
+    places = matmul(matmul(points, pose[:3, :3].T) + pose[:3, 3], K.T)
+    with np.errstate(all="ignore"):
+        return np.asarray(np.linalg.norm(places[:, :2] / places[:, 2:] - pixels, axis=1))
+
+
+def refine_poses(
+    points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], K: np.ndarray, poses: np.ndarray, *, focal: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """Move cameras to where their points ``[n,3]`` project nearest to their ``pixels [n,2]``, by least squares.
+
+    With ``focal`` the common focal length of the views is solved for as well. Returns intrinsics ``[3,3]`` and poses
+    ``[v,4,4]``; numpy.linalg.LinAlgError where the points do not determine them.
+    """
+    damping = FIRST_DAMPING
+    curvature, slope, error = _linearise(points, pixels, K, poses)
+    for _ in range(STEPS):
+        stretch, motions = _step(curvature, slope, damping, focal=focal)
+        near_K = np.concatenate([K[:2, :2] * stretch, K[:2, 2:]], 1)
+        near_K = np.concatenate([near_K, K[2:]])
+        near = matmul(motion_matrices(motions), poses)
+        trial = _linearise(points, pixels, near_K, near)
+        if not trial[2] < error:
+            damping *= BRAKE
+            if damping > MAX_DAMPING:
+                break
+            continue
+        gain = 1 - trial[2] / error
+        K, poses, (curvature, slope, error), damping = near_K, near, trial, damping * EASE
+        if gain < MIN_GAIN:
+            break
+    return K, poses
+
+
+def _linearise(
+    points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], K: np.ndarray, poses: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return Gauss-Newton's curvature ``[v,7,7]`` and slope ``[v,7]`` of the squared error, and the error.
+
+    By the turn and the shift of each camera, and by the logarithm of the focal length.
+    """
+    curvature, slope, error = np.empty((len(poses), 7, 7)), np.empty((len(poses), 7)), 0.0
+    fx, fy, (cx, cy) = K[0, 0], K[1, 1], K[:2, 2]
+    for view, pose in enumerate(poses):
+        camera = matmul(points[view], pose[:3, :3].T) + pose[:3, 3]
+        with np.errstate(all="ignore"):  # points in the camera's plane
+            x, y, inverse = camera[:, 0] / camera[:, 2], camera[:, 1] / camera[:, 2], 1 / camera[:, 2]
+            zero = np.zeros_like(x)
+            right = np.stack([fx * inverse, zero, -fx * x * inverse], 1)
+            down = np.stack([zero, fy * inverse, -fy * y * inverse], 1)
+            columns = [
+                np.concatenate([np.cross(camera, way), way, along[:, None]], 1)
+                for way, along in ((right, fx * x), (down, fy * y))
+            ]
+            residual = np.concatenate([fx * x + cx - pixels[view][:, 0], fy * y + cy - pixels[view][:, 1]])
+            jacobian = np.concatenate(columns)
+            curvature[view], slope[view] = matmul(jacobian.T, jacobian), matmul(jacobian.T, residual)
+            error += float((residual * residual).sum())
+    return curvature, slope, error
+
+
+def _step(curvature: np.ndarray, slope: np.ndarray, damping: float, *, focal: bool) -> tuple[float, np.ndarray]:
+    """Return a factor on the focal length, 1 where it is fixed, and motions ``[v,6]`` of the cameras."""
+    damped = curvature + damping * np.eye(7) * curvature
+    across, down = damped[:, :6, 6], slope[:, :6]
+    if not focal:
+        return 1.0, -solve(damped[:, :6, :6], down[..., None])[..., 0]
+    solved = solve(damped[:, :6, :6], np.stack([down, across], 2))  # the cameras' unknowns are eliminated
+    left = damped[:, 6, 6].sum() - (across * solved[..., 1]).sum()
+    stretch = -(slope[:, 6].sum() - (across * solved[..., 0]).sum()) / left
+    stretch = float(np.clip(stretch, -MAX_STRETCH, MAX_STRETCH))
+    return 1 + stretch, -solved[..., 0] - stretch * solved[..., 1]

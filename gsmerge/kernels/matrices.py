@@ -1,0 +1,135 @@
+"""Linear algebra of small float64 matrices whose bits are the same on every processor: those of BLAS are not.
+
+Sums are taken in float64; results are float32 where all arrays are, otherwise float64.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gsmerge.native.signature import STATUS, f8, i4, native
+
+Array = np.ndarray[Any, Any]
+
+
+@native(STATUS, a=f8("n", "i", "j"), b=f8("m", "j", "k"), out=f8("n", "i", "k", out=True))
+def _multiply_matrices(a, b, out):
+    """Write the products of matrices; ``b`` may be one for all."""
+
+
+@native(i4(), a=f8("n", "d", "d", out=True), b=f8("n", "d", "k", out=True))
+def _solve_equations(a, b):
+    """Replace ``b`` by the solutions, overwriting ``a``, and return 0; 1 where a matrix is singular."""
+
+
+@native(a=f8("n", "d", "d", out=True), v=f8("n", "d", "d", out=True))
+def _diagonalise(a, v):
+    """Replace symmetric matrices by their eigenvalues on the diagonal; write their eigenvectors to the columns."""
+
+
+def _wide(*arrays: ArrayLike) -> tuple[list[Array], np.dtype[Any]]:
+    """Return arrays in float64, and the type that a result of them has."""
+    kinds = [np.asarray(one).dtype for one in arrays]
+    kind = np.dtype(np.float32 if all(one == np.float32 for one in kinds) else np.float64)
+    return [np.asarray(one, np.float64) for one in arrays], kind
+
+
+def matmul(a: ArrayLike, b: ArrayLike) -> Array:
+    """Multiply matrices ``[...,i,j]`` and ``[...,j,k]``, or vectors ``[j]``, as ``a @ b`` does."""
+    (left, right), kind = _wide(a, b)
+    rows, columns = left.ndim == 1, right.ndim == 1
+    left, right = left[None] if rows else left, right[:, None] if columns else right
+    if right.ndim == 2:  # one for all: all rows of the left are those of one matrix
+        lead = left.shape[:-2]
+        first, second = left.reshape(1, math.prod(left.shape[:-1]), left.shape[-1]), right[None]
+    else:
+        lead = np.broadcast_shapes(left.shape[:-2], right.shape[:-2])
+        first, second = (
+            np.broadcast_to(one, lead + one.shape[-2:]).reshape(math.prod(lead), *one.shape[-2:])
+            for one in (left, right)
+        )
+    out = np.empty((*first.shape[:2], second.shape[2]))
+    _multiply_matrices(np.ascontiguousarray(first), np.ascontiguousarray(second), out)
+    out = out.reshape(*lead, left.shape[-2], right.shape[-1])
+    out = out[..., 0, :] if rows else out
+    return (out[..., 0] if columns else out).astype(kind, copy=False)
+
+
+def solve(a: ArrayLike, b: ArrayLike) -> Array:
+    """Solve ``a x = b`` for matrices ``[...,d,d]`` and right sides ``[...,d,k]``, or one ``[d]``.
+
+    Raises numpy.linalg.LinAlgError where a matrix is singular.
+    """
+    (left, right), kind = _wide(a, b)
+    if right.ndim == 1:
+        return solve(a, np.asarray(b)[:, None])[..., 0]
+    lead, size = np.broadcast_shapes(left.shape[:-2], right.shape[:-2]), left.shape[-1]
+    work = np.broadcast_to(left, (*lead, size, size)).reshape(math.prod(lead), size, size).copy()
+    solution = np.broadcast_to(right, (*lead, *right.shape[-2:])).reshape(math.prod(lead), *right.shape[-2:]).copy()
+    if _solve_equations(work, solution):
+        raise np.linalg.LinAlgError("Singular matrix")
+    return solution.reshape(*lead, *right.shape[-2:]).astype(kind, copy=False)
+
+
+def invert(matrices: ArrayLike) -> Array:
+    """Invert matrices ``[...,d,d]``; numpy.linalg.LinAlgError where one is singular."""
+    matrices = np.asarray(matrices)
+    return solve(matrices, np.eye(matrices.shape[-1], dtype=matrices.dtype))
+
+
+def eigh(matrices: ArrayLike) -> tuple[Array, Array]:
+    """Return eigenvalues ``[...,d]``, ascending, and in columns eigenvectors ``[...,d,d]`` of symmetric matrices."""
+    (wide,), kind = _wide(matrices)
+    size = wide.shape[-1]
+    work = wide.reshape(math.prod(wide.shape[:-2]), size, size).copy()
+    vectors = np.empty_like(work)
+    _diagonalise(work, vectors)
+    values = np.diagonal(work, axis1=1, axis2=2)
+    order = np.argsort(values, axis=1, kind="stable")
+    values = np.take_along_axis(values, order, 1)
+    vectors = np.take_along_axis(vectors, order[:, None], 2)
+    return values.reshape(wide.shape[:-1]).astype(kind), vectors.reshape(wide.shape).astype(kind)
+
+
+def solve_symmetric(a: ArrayLike, b: ArrayLike, rcond: float = 1e-12) -> Array:
+    """Solve ``a x = b`` for a matrix ``[d,d]`` of normal equations and ``b [d]`` or ``[d,k]``, by the shortest x.
+
+    Eigenvalues of at most ``rcond`` times the largest count as zero.
+    """
+    values, vectors = eigh(a)
+    used = values > rcond * values.max(initial=0)
+    parts = matmul(vectors.T, b)
+    scaled = np.where(used, 1 / np.where(used, values, 1), 0)
+    return matmul(vectors, parts * (scaled if parts.ndim == 1 else scaled[:, None]))
+
+
+def determinant(matrices: ArrayLike) -> Array:
+    """Return the determinants ``[...]`` of matrices ``[...,3,3]``."""
+    first, second, third = np.moveaxis(np.asarray(matrices), -2, 0)
+    return np.asarray((np.cross(first, second) * third).sum(-1))
+
+
+def closest_rotation(matrix: ArrayLike) -> Array:
+    """Return the rotation R ``[3,3]`` with the largest trace of ``R^T matrix``: the nearest one, by least squares.
+
+    By the eigenvector of a matrix of quaternions (Horn 1987), so that no reflection comes up.
+    """
+    (a, b, c), (d, e, f), (g, h, i) = np.asarray(matrix, np.float64)
+    quaternions = np.array(
+        [
+            [a + e + i, h - f, c - g, d - b], [h - f, a - e - i, b + d, c + g],
+            [c - g, b + d, e - a - i, f + h], [d - b, c + g, f + h, i - a - e],
+        ]
+    )  # fmt: skip
+    w, x, y, z = eigh(quaternions)[1][:, -1]
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

@@ -1,0 +1,98 @@
+"""Filters and lookups in pictures whose bits are the same on every processor: those of OpenCV are not, for these."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from gsmerge.kernels.elementary import exp
+from gsmerge.native.signature import STATUS, f4, native
+
+SLOPE, SMOOTH = np.array([-1, 0, 1], np.float32), np.array([1, 2, 1], np.float32)  # Sobel's filters
+Picture = np.ndarray[Any, Any]
+CUBIC = -0.75  # slope parameter of the cubic convolution (Keys 1981), OpenCV's
+
+
+@native(
+    STATUS, picture=f4("height", "width", "channels"), across=f4("taps_across"), down=f4("taps_down"),
+    padded=f4("room", out=True), rows=f4("padded_height", "width", "channels", out=True),
+    out=f4("height", "width", "channels", out=True),
+)  # fmt: skip
+def _filter_picture(picture, across, down, padded, rows, out):
+    """Write what :func:`convolve` returns; ``padded`` and ``rows`` are overwritten."""
+
+
+@native(
+    STATUS, picture=f4("height", "width", "channels"), x=f4("n"), y=f4("n"), out=f4("n", "channels", out=True),
+)  # fmt: skip
+def _sample_picture(picture, x, y, out):
+    """Write what :func:`sample_bilinear` returns."""
+
+
+def convolve(picture: Picture, across: np.ndarray, down: np.ndarray) -> Picture:
+    """Convolve a picture ``[h,w]`` or ``[h,w,c]`` with two filters of odd lengths, mirrored at its borders; float32.
+
+    ``across`` goes along the rows and ``down`` along the columns; the borders themselves are not repeated.
+    """
+    source: Picture = np.ascontiguousarray(picture, np.float32)
+    layers = source.reshape(source.shape if source.ndim == 3 else (*source.shape, 1))
+    height, width, channels = layers.shape
+    taps = [np.ascontiguousarray(one, np.float32) for one in (across, down)]
+    padded = np.empty((width + len(taps[0]) - 1) * channels, np.float32)
+    rows, out = np.empty((height + len(taps[1]) - 1, width, channels), np.float32), np.empty_like(layers)
+    _filter_picture(layers, *taps, padded, rows, out)
+    return out.reshape(source.shape)
+
+
+def blur(picture: Picture, sigma: float, size: int | None = None) -> Picture:
+    """Blur a picture ``[h,w]`` or ``[h,w,c]`` by a Gaussian of ``sigma`` pixels; float32.
+
+    ``size`` is the odd number of pixels that its filter has, by default what lies within four ``sigma``.
+    """
+    size = round(8 * sigma + 1) | 1 if size is None else size
+    places = np.arange(size) - size // 2
+    weights = exp(places**2 * (-0.5 / sigma**2))
+    taps = weights / weights.sum()
+    return convolve(picture, taps, taps)
+
+
+def sobel(picture: Picture) -> tuple[Picture, Picture]:
+    """Compute Sobel's derivatives of a picture, to the right and down: float32, eight times those per pixel."""
+    return convolve(picture, SLOPE, SMOOTH), convolve(picture, SMOOTH, SLOPE)
+
+
+def sample_bilinear(picture: Picture, x: np.ndarray, y: np.ndarray) -> Picture:
+    """Look up places of a picture ``[h,w]`` or ``[h,w,c]``, bilinear: float32 of the places' shape ``[...,c]``.
+
+    ``x`` and ``y`` are in pixels, the top-left pixel's centre at (0, 0); the borders are repeated outside.
+    """
+    source: Picture = np.ascontiguousarray(picture, np.float32)
+    layers = source.reshape(source.shape if source.ndim == 3 else (*source.shape, 1))
+    places = [np.ascontiguousarray(one, np.float32) for one in (x, y)]
+    out = np.empty((places[0].size, layers.shape[2]), np.float32)
+    _sample_picture(layers, *(one.reshape(-1) for one in places), out)
+    return out.reshape(*places[0].shape, *source.shape[2:])
+
+
+def enlarge(picture: Picture, width: int, height: int) -> Picture:
+    """Resize a picture ``[h,w]`` or ``[h,w,c]`` to a larger size in pixels by cubic convolution; float32."""
+    out: Picture = np.asarray(picture, np.float32)
+    for axis, size in ((0, height), (1, width)):
+        ids, weights = _cubic_taps(out.shape[axis], size)
+        shape = [-1 if i == axis else 1 for i in range(out.ndim)]
+        terms = [out.take(some, axis) * share.reshape(shape) for some, share in zip(ids, weights, strict=True)]
+        out = terms[0] + terms[1] + terms[2] + terms[3]
+    return out
+
+
+def _cubic_taps(old: int, new: int) -> tuple[Picture, Picture]:
+    """Return which four of ``old`` pixels, and how much of each, make ``new`` ones: ``[4,new]`` ids and weights."""
+    places = (np.arange(new) + 0.5) * (old / new) - 0.5
+    first = np.floor(places).astype(np.int64)
+    away = np.abs(places - first - np.arange(-1, 3)[:, None])
+    a = CUBIC
+    near = ((a + 2) * away - (a + 3)) * away * away + 1
+    far = ((a * away - 5 * a) * away + 8 * a) * away - 4 * a
+    ids = (first + np.arange(-1, 3)[:, None]).clip(0, old - 1)
+    return ids, np.where(away <= 1, near, far).astype(np.float32)

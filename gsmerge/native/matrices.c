@@ -1,0 +1,125 @@
+// Products, linear equations and symmetric eigenvalues of float64 matrices, in one written order.
+//
+// Every element of a product is the sum of its terms in their order, fused; a loop over the columns
+// of a row vectorises and changes no bit.
+#include "native.h"
+
+enum { PANEL = 16 };   // columns that are eliminated together, so that large matrices stay in the caches
+enum { SWEEPS = 50 };  // of Jacobi's method at most; it needs about six
+static const double TINY = 1e-300;
+
+// out[n,i,k] = a[n,i,j] b[m,j,k] with m = n, or one matrix for all.
+API int32_t multiply_matrices(const double *restrict a, const double *restrict b,
+                              double *restrict out, int64_t n, int64_t i, int64_t j, int64_t m,
+                              int64_t k) {
+  if (m != n && m != 1) return OUTSIDE;
+  for (int64_t row = 0; row < n * i; row++) {
+    const double *right = m == 1 ? b : b + row / i * (j * k);
+    double *to = out + row * k;
+    for (int64_t c = 0; c < k; c++) to[c] = 0.0;
+    for (int64_t t = 0; t < j; t++) {
+      double factor = a[row * j + t];
+      for (int64_t c = 0; c < k; c++) to[c] += factor * right[t * k + c];
+    }
+  }
+  return 0;
+}
+
+static void swap_rows(double *restrict a, double *restrict b, int64_t n) {
+  for (int64_t c = 0; c < n; c++) {
+    double kept = a[c];
+    a[c] = b[c];
+    b[c] = kept;
+  }
+}
+
+// a -= factor b
+static inline void take_off(double *restrict a, const double *restrict b, double factor, int64_t n) {
+  if (factor == 0.0) return;  // many are, where unknowns have few neighbours
+  for (int64_t c = 0; c < n; c++) a[c] -= factor * b[c];
+}
+
+// Replaces the columns first..last of a by those of L and U, with the rows below and of b in the
+// order of the pivots; false where a pivot is zero.
+static bool factor_panel(double *a, double *b, int64_t d, int64_t k, int64_t first, int64_t last) {
+  for (int64_t c = first; c < last; c++) {
+    int64_t best = c;
+    for (int64_t r = c + 1; r < d; r++) {
+      double size = absf8(a[r * d + c]);
+      best = size > absf8(a[best * d + c]) || size != size ? r : best;
+    }
+    if (best != c) {
+      swap_rows(a + c * d, a + best * d, d);
+      swap_rows(b + c * k, b + best * k, k);
+    }
+    double pivot = a[c * d + c];
+    if (pivot == 0.0) return false;
+    for (int64_t r = c + 1; r < d; r++) {
+      double *row = a + r * d;
+      row[c] /= pivot;
+      take_off(row + c + 1, a + c * d + c + 1, row[c], last - c - 1);
+    }
+  }
+  return true;
+}
+
+// Solves a x = b for n matrices of d rows by elimination with pivots chosen by columns; a is
+// overwritten, b becomes x. 1: some matrix is singular.
+API int32_t solve_equations(double *a, double *b, int64_t n, int64_t d, int64_t k) {
+  for (int64_t i = 0; i < n; i++, a += d * d, b += d * k) {
+    for (int64_t first = 0; first < d; first += PANEL) {
+      int64_t last = mini(first + PANEL, d);
+      if (!factor_panel(a, b, d, k, first, last)) return 1;
+      for (int64_t r = first + 1; r < d; r++)
+        for (int64_t c = first; c < mini(r, last); c++)
+          take_off(a + r * d + last, a + c * d + last, a[r * d + c], d - last);
+    }
+    for (int64_t r = 0; r < d; r++)
+      for (int64_t c = 0; c < r; c++) take_off(b + r * k, b + c * k, a[r * d + c], k);
+    for (int64_t r = d - 1; r >= 0; r--) {
+      for (int64_t c = r + 1; c < d; c++) take_off(b + r * k, b + c * k, a[r * d + c], k);
+      for (int64_t c = 0; c < k; c++) b[r * k + c] /= a[r * d + r];
+    }
+  }
+  return 0;
+}
+
+// One rotation of the symmetric a that zeroes a[p][q]; the columns of v turn with it.
+static void rotate_pair(double *a, double *v, int64_t d, int64_t p, int64_t q) {
+  double off = a[p * d + q];
+  if (!(absf8(off) > TINY)) return;
+  double theta = (a[q * d + q] - a[p * d + p]) / (2.0 * off);
+  double t = 1.0 / (absf8(theta) + sqrtf8(theta * theta + 1.0));
+  t = theta < 0.0 ? -t : t;
+  double c = 1.0 / sqrtf8(t * t + 1.0), s = t * c;
+  for (int64_t k = 0; k < d; k++) {
+    double x = a[k * d + p], y = a[k * d + q];
+    a[k * d + p] = c * x - s * y;
+    a[k * d + q] = s * x + c * y;
+  }
+  for (int64_t k = 0; k < d; k++) {
+    double x = a[p * d + k], y = a[q * d + k];
+    a[p * d + k] = c * x - s * y;
+    a[q * d + k] = s * x + c * y;
+    x = v[k * d + p], y = v[k * d + q];
+    v[k * d + p] = c * x - s * y;
+    v[k * d + q] = s * x + c * y;
+  }
+}
+
+// Jacobi's method: n symmetric matrices a become diagonal, the columns of v their eigenvectors.
+API void diagonalise(double *restrict a, double *restrict v, int64_t n, int64_t d) {
+  for (int64_t i = 0; i < n; i++, a += d * d, v += d * d) {
+    for (int64_t k = 0; k < d * d; k++) v[k] = k % (d + 1) == 0 ? 1.0 : 0.0;
+    for (int64_t sweep = 0; sweep < SWEEPS; sweep++) {
+      double off = 0.0, on = 0.0;
+      for (int64_t p = 0; p < d; p++) {
+        on += a[p * d + p] * a[p * d + p];
+        for (int64_t q = p + 1; q < d; q++) off += a[p * d + q] * a[p * d + q];
+      }
+      if (!(off > 1e-31 * on)) break;
+      for (int64_t p = 0; p < d; p++)
+        for (int64_t q = p + 1; q < d; q++) rotate_pair(a, v, d, p, q);
+    }
+  }
+}

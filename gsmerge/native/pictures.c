@@ -1,0 +1,92 @@
+// Filters and lookups in pictures of float32, channels last.
+#include "native.h"
+
+// Place of index i in a row of n that is mirrored at both ends without repeating them.
+static inline int64_t mirrored(int64_t i, int64_t n) {
+  while (i < 0 || i >= n) {
+    i = i < 0 ? -i : 2 * (n - 1) - i;
+    if (n == 1) return 0;
+  }
+  return i;
+}
+
+// to[i] = sum of taps[t] from[i + t stride], thirty-two values at a time: sums stay in registers.
+static void weigh(const float *restrict from, const float *restrict taps, int64_t count,
+                  int64_t stride, float *restrict to, int64_t n) {
+  int64_t i = 0;
+  for (; i + 2 * LANES <= n; i += 2 * LANES) {
+    v16f a = taps[0] * load(from + i), b = taps[0] * load(from + i + LANES);
+    for (int64_t t = 1; t < count; t++) {
+      a += taps[t] * load(from + i + t * stride);
+      b += taps[t] * load(from + i + LANES + t * stride);
+    }
+    store(to + i, a);
+    store(to + i + LANES, b);
+  }
+  for (; i < n; i++) {
+    float a = taps[0] * from[i];
+    for (int64_t t = 1; t < count; t++) a += taps[t] * from[i + t * stride];
+    to[i] = a;
+  }
+}
+
+// Convolves a picture [height,width,channels] with one odd filter along its rows and another down
+// its columns. `padded` is a row with its mirrored ends; `rows` is what the first filter gives, with
+// the mirrored rows above and below.
+API int32_t filter_picture(const float *restrict picture, const float *restrict across,
+                           const float *restrict down, float *restrict padded,
+                           float *restrict rows, float *restrict out, int64_t height,
+                           int64_t width, int64_t channels, int64_t taps_across, int64_t taps_down,
+                           int64_t room, int64_t padded_height) {
+  int64_t half = taps_across / 2, row = width * channels, middle = taps_down / 2;
+  if (taps_across % 2 == 0 || taps_down % 2 == 0 || room < row + 2 * half * channels
+      || padded_height != height + 2 * middle)
+    return OUTSIDE;
+  if (height == 0 || row == 0) return 0;
+  for (int64_t y = -middle; y < height + middle; y++) {
+    const float *from = picture + mirrored(y, height) * row;
+    for (int64_t x = 0; x < half; x++)
+      for (int64_t c = 0; c < channels; c++) {
+        padded[x * channels + c] = from[mirrored(x - half, width) * channels + c];
+        padded[(half + width + x) * channels + c] = from[mirrored(width + x, width) * channels + c];
+      }
+    for (int64_t i = 0; i < row; i++) padded[half * channels + i] = from[i];
+    weigh(padded, across, taps_across, channels, rows + (y + middle) * row, row);
+  }
+  for (int64_t y = 0; y < height; y++)
+    weigh(rows + y * row, down, taps_down, row, out + y * row, row);
+  return 0;
+}
+
+// Places in a row and the share of the second for x in pixels, with its ends repeated outside.
+typedef struct {
+  int64_t first, second;
+  float share;
+} between;
+
+static inline between neighbours(float x, int64_t n) {
+  float last = (float)(n - 1);
+  x = x > 0.f ? x : 0.f;  // also for NaN
+  x = x < last ? x : last;
+  int64_t first = mini((int64_t)x, n - 1);
+  return (between){first, mini(first + 1, n - 1), x - (float)first};
+}
+
+// Looks up a picture at places (x, y) in pixels, whole ones in their middles; bilinear.
+API int32_t sample_picture(const float *restrict picture, const float *restrict x,
+                           const float *restrict y, float *restrict out, int64_t height,
+                           int64_t width, int64_t channels, int64_t n) {
+  if (height == 0 || width == 0) return n == 0 ? 0 : OUTSIDE;
+  for (int64_t i = 0; i < n; i++) {
+    between h = neighbours(x[i], width), v = neighbours(y[i], height);
+    const float *top = picture + v.first * width * channels;
+    const float *bottom = picture + v.second * width * channels;
+    for (int64_t c = 0; c < channels; c++) {
+      float a = top[h.first * channels + c], b = top[h.second * channels + c];
+      float d = bottom[h.first * channels + c], e = bottom[h.second * channels + c];
+      float above = a + h.share * (b - a), below = d + h.share * (e - d);
+      out[i * channels + c] = above + v.share * (below - above);
+    }
+  }
+  return 0;
+}
