@@ -40,6 +40,7 @@ typedef struct {
   v16f rates;  // made up for first moments that began at zero
   float beta1, beta2, second;  // decays of the moments, and what makes up for the second ones
   float mean_limit, size_limit, logit_limit;
+  float opacity_reg, scale_reg;  // gradients of the weights of opacity, and of scales in sizes
 } Step;
 
 static inline double power(double base, int64_t exponent) {
@@ -101,13 +102,14 @@ static inline v16f confine(const Block *b, int64_t j, Step s, v16f x0, float lea
 
 // The gradients as the rasterizer gives them, in the optimiser's parameters: means in units of the
 // Gaussian's size, log, logit.
-static inline void gather(Block *b, int64_t j, float scale[3], float opacity, const float *mean,
-                          const float *quat, const float *grad_scale, float grad_opacity,
-                          const float *color) {
+static inline void gather(Block *b, int64_t j, Step s, const float *scale, float opacity,
+                          const float *mean, const float *quat, const float *grad_scale,
+                          float grad_opacity, const float *color) {
+  float scale_reg = s.scale_reg / b->unit[j];
   for (int c = 0; c < 3; c++) b->rows[j][MEAN + c] = mean[c] * b->unit[j];
-  for (int c = 0; c < 3; c++) b->rows[j][SIZE + c] = grad_scale[c] * scale[c];
+  for (int c = 0; c < 3; c++) b->rows[j][SIZE + c] = (grad_scale[c] + scale_reg) * scale[c];
   for (int c = 0; c < 4; c++) b->rows[j][QUAT + c] = quat[c];
-  b->rows[j][LOGIT] = grad_opacity * opacity * (1.f - opacity);
+  b->rows[j][LOGIT] = (grad_opacity + s.opacity_reg) * opacity * (1.f - opacity);
   for (int c = 0; c < 3; c++) b->rows[j][COLOR + c] = color[c];
 }
 
@@ -117,8 +119,9 @@ API int32_t adam(float *restrict x, const float *restrict x0, float *restrict m,
                  const float *restrict g_means, const float *restrict g_quats,
                  const float *restrict g_scales, const float *restrict g_opacities,
                  const float *restrict g_colors, const float *restrict rates,
-                 const float *restrict limits, const float *restrict betas, int64_t step,
-                 int64_t first, int64_t last, float *restrict means, float *restrict quats,
+                 const float *restrict limits, const float *restrict betas,
+                 const float *restrict regs, int64_t step, int64_t first, int64_t last,
+                 float *restrict means, float *restrict quats,
                  float *restrict scales, float *restrict opacities, float *restrict colors,
                  int64_t n, int64_t k) {
   if (any_outside(ids + first, last - first, n)) return OUTSIDE;
@@ -131,7 +134,9 @@ API int32_t adam(float *restrict x, const float *restrict x0, float *restrict m,
             .second = 1.f / second_share,
             .mean_limit = limits[0],
             .size_limit = limits[1],
-            .logit_limit = limits[2]};
+            .logit_limit = limits[2],
+            .opacity_reg = regs[0],
+            .scale_reg = regs[1]};
   Block b = {0};
   for (int64_t start = first; start < last; start += BLOCK) {
     int64_t size = mini(BLOCK, last - start);
@@ -140,7 +145,7 @@ API int32_t adam(float *restrict x, const float *restrict x0, float *restrict m,
       int64_t i = rows[j], g = start + j;
       b.unit[j] = units[i];
       b.share[j] = box_shares[i];
-      gather(&b, j, scales + 3 * i, opacities[i], g_means + 3 * g, g_quats + 4 * g,
+      gather(&b, j, s, scales + 3 * i, opacities[i], g_means + 3 * g, g_quats + 4 * g,
              g_scales + 3 * g, g_opacities[g], g_colors + 3 * g);
     }
     for (int64_t j = 0; j < size; j++) {

@@ -15,13 +15,13 @@ MAX_LOGIT, MIN_LOGIT = np.float32(6.9), np.float32(-5.5)
     STATUS, x=f4("n", COLUMNS, out=True), x0=f4("n", COLUMNS), m=f4("n", COLUMNS, out=True),
     v=f4("n", COLUMNS, out=True), units=f4("n"), box_shares=f4("n"), min_sizes=f4("n"), ids=i4("k"),
     g_means=f4("k", 3), g_quats=f4("k", 4), g_scales=f4("k", 3), g_opacities=f4("k"), g_colors=f4("k", 3),
-    rates=f4(COLUMNS), limits=f4(3), betas=f4(2), step=i8(least=1), first=i8(least=0, most="k"),
+    rates=f4(COLUMNS), limits=f4(3), betas=f4(2), regs=f4(2), step=i8(least=1), first=i8(least=0, most="k"),
     last=i8(least="first", most="k"), means=f4("n", 3, out=True), quats=f4("n", 4, out=True),
     scales=f4("n", 3, out=True), opacities=f4("n", out=True), colors=f4("n", 3, out=True),
 )  # fmt: skip
 def adam(
     x, x0, m, v, units, box_shares, min_sizes, ids, g_means, g_quats, g_scales, g_opacities, g_colors, rates, limits,
-    betas, step, first, last, means, quats, scales, opacities, colors,
+    betas, regs, step, first, last, means, quats, scales, opacities, colors,
 ):  # fmt: skip
     """Adam on the rows ``ids[first]`` to ``ids[last - 1]`` of the state ``x [n,COLUMNS]``, then the box about ``x0``.
 
@@ -35,6 +35,7 @@ def adam(
         rates: Of mean (in units of each Gaussian's size), log scale, quaternion, logit, colour.
         limits: Of the mean (in sizes), log scale, logit.
         betas: Decay of the first and second moment.
+        regs: Added to the gradients of the opacity, and of scales in units of the Gaussian's size.
         step: From 1.
         means, quats, scales, opacities, colors: What the new state means to the rasterizer, written.
     """

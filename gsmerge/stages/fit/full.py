@@ -123,17 +123,16 @@ def fit_step(state: State, plan: FitPlan, view: int, step: int, progress: float,
     if plan.poses is not None and g.viewmat is not None:  # that harmonics change with the camera is left out
         plan.poses.step(view, g.viewmat, plan.options.tuning, progress)
     rates, s, count = plan.options.tuning, state.splats, max(len(state.x), 1)
-    g.opacities[:] += np.float32(plan.options.tuning.opacity_reg / count)
-    g.scales[:] += np.float32(plan.options.tuning.scale_reg / count) / state.units[g.ids, None]
     steps = step_sizes(rates, progress, plan.options.steps)
     limits = np.array([rates.max_mean_shift, rates.max_scale_change, rates.max_opacity_change], np.float32)
     betas = np.array([rates.beta1, rates.beta2], np.float32)
+    regs = np.array([rates.opacity_reg / count, rates.scale_reg / count], np.float32)
 
     def update(first: int) -> None:
         last = min(first + ROWS, len(g.ids))
         kernels.adam(
             state.x, state.x0, state.m, state.v, state.units, state.box_shares, state.min_sizes, g.ids,
-            g.means, g.quats, g.scales, g.opacities, g.colors, steps, limits, betas, step,
+            g.means, g.quats, g.scales, g.opacities, g.colors, steps, limits, betas, regs, step,
             first, last, s.means, s.quats, s.scales, s.opacities, state.colors,
         )  # fmt: skip
 
@@ -194,23 +193,24 @@ def score_to_beat(own: float, baseline_start: Gaussians | None, plan: FitPlan) -
 class TailMean:
     """Mean of parameters ``[n,14]``, an array or a tensor, over the last steps, which are noisy one by one."""
 
-    mean: Array = None
+    total: Array = None
     count: int = 0
 
     def add(self, x: Array) -> None:
         """Add one more step; the first one after Gaussians were added starts anew."""
-        if self.mean is None or len(self.mean) != len(x):
-            self.mean, self.count = 0 * x, 0
+        if self.total is None or len(self.total) != len(x):
+            self.total, self.count = 0 * x, 0
         self.count += 1
-        self.mean += (x - self.mean) / self.count
+        self.total += x
 
     def of(self, x: Array) -> Array:
         """Return the mean with unit quaternions; ``x`` itself without a step of as many Gaussians."""
-        if self.mean is None or len(self.mean) != len(x):
+        if self.total is None or len(self.total) != len(x):
             return x
-        quats = self.mean[:, QUAT:LOGIT]
+        mean = self.total / self.count
+        quats = mean[:, QUAT:LOGIT]
         quats /= (quats * quats).sum(1)[:, None] ** 0.5
-        return self.mean
+        return mean
 
 
 def fit_full(

@@ -13,6 +13,7 @@ from gsmerge.kernels.gaussians.optimise import COLOR, COLUMNS, LOGIT, MAX_LOGIT,
 
 RATES = np.array([0.1] * 3 + [0.2] * 3 + [0.03] * 4 + [0.3] + [0.03] * 3)
 LIMITS, BETAS = np.array([2.0, 2.5, 4.0]), np.array([0.7, 0.99])
+REGS = np.array([0.02, 0.03], np.float32)
 MEAN, TURN = slice(0, SIZE), slice(QUAT, LOGIT)
 
 
@@ -83,7 +84,7 @@ def step_kernel(run: Run, g: Wanted, step: int, pieces: list[int] | None = None,
         adam(
             run.x, run.x0, run.m, run.v, run.units, run.box_shares, run.min_sizes,
             g.ids, g.means, g.quats, g.scales, g.opacities, g.colors,
-            rates.astype(np.float32), LIMITS.astype(np.float32), BETAS.astype(np.float32), step, first, last,
+            rates.astype(np.float32), LIMITS.astype(np.float32), BETAS.astype(np.float32), REGS, step, first, last,
             run.means, run.quats, run.scales, run.opacities, run.colors,
         )  # fmt: skip
 
@@ -93,8 +94,8 @@ def step_slowly(run: Run, g: Wanted, step: int) -> None:
     for k, i in enumerate(g.ids):
         alpha = run.opacities[i]
         row = np.concatenate([
-            g.means[k] * run.units[i], g.scales[k] * run.scales[i], g.quats[k],
-            [g.opacities[k] * alpha * (1 - alpha)], g.colors[k],
+            g.means[k] * run.units[i], (g.scales[k] + REGS[1] / run.units[i]) * run.scales[i], g.quats[k],
+            [(g.opacities[k] + REGS[0]) * alpha * (1 - alpha)], g.colors[k],
         ])  # fmt: skip
         energy = row**2
         energy[MEAN], energy[TURN] = energy[MEAN].mean(), energy[TURN].sum() / 3  # a rotation has three freedoms

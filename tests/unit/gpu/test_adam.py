@@ -31,15 +31,14 @@ def test_step_is_the_kernels(step: int) -> None:
     ]
     ids = np.flatnonzero(gradients.reached.numpy()).astype(np.int32)
     g = [getattr(gradients, name).numpy()[ids] for name in ("means", "quats", "scales", "opacities", "colors")]
-    g[3] += np.float32(options.tuning.opacity_reg / 300)
-    g[2] += np.float32(options.tuning.scale_reg / 300) / arrays[4][ids, None]
+    regs = np.array([options.tuning.opacity_reg, options.tuning.scale_reg], np.float32) / np.float32(300)
     rates = step_sizes(options.tuning, 0.3, 8)
     limits = options.tuning.max_mean_shift, options.tuning.max_scale_change, options.tuning.max_opacity_change
     names = ("means", "quats", "scales", "opacities", "colors")
     shown = [getattr(state, name).clone().numpy() for name in names]
     optimise.adam(
         *arrays, ids, *g, rates, np.array(limits, np.float32),
-        np.array([options.tuning.beta1, options.tuning.beta2], np.float32), step, 0, len(ids), *shown,
+        np.array([options.tuning.beta1, options.tuning.beta2], np.float32), regs, step, 0, len(ids), *shown,
     )  # fmt: skip
     adam_step(state, gradients, options, torch.from_numpy(rates), step)
     assert (np.abs(arrays[0] - arrays[1]) > 0.01).any(1)[ids].mean() > 0.9
