@@ -30,7 +30,7 @@ from gsmerge.stages.segment import segment_scene
 from gsmerge.types import Scene, Segmentation, StrPath
 
 if TYPE_CHECKING:
-    from gsmerge.networks.modules import Networks
+    from gsmerge.networks.weights import NetworkWeights
 
 
 def compact(
@@ -87,7 +87,7 @@ def merge_views(prepared: Prepared, plan: Plan, count: int | None) -> MergedView
 
 
 def merge_features(
-    scene: Scene, members: Members, segmentation: Segmentation, plan: Plan, networks: Networks | None
+    scene: Scene, members: Members, segmentation: Segmentation, plan: Plan, networks: NetworkWeights | None
 ) -> MergedViews:
     """Encode superpixels as Feature Gaussians, merge those that match, and refine them, with networks or with none."""
     context = make_context(networks, members, scene.cameras, plan.seed)

@@ -29,7 +29,7 @@ from gsmerge.views import report_views, scored_views
 
 if TYPE_CHECKING:
     from gsmerge.networks.checkpoint import Checkpoint
-    from gsmerge.networks.modules import Networks
+    from gsmerge.networks.weights import NetworkWeights
 
 AUTO_STEPS = 2  # times the usual steps with budget auto: fewer Gaussians cost less, and need them for detail
 SHORT_STEPS = 60  # of a fit that a better start still matters to
@@ -63,7 +63,7 @@ class Plan:
     """Decisions that are made before the first superpixel is cut."""
 
     superpixels: SuperpixelPlan  # How each view is cut, and into how many
-    networks: tuple[Networks | None, ...]  # Networks, None for the analytic start, or both
+    networks: tuple[NetworkWeights | None, ...]  # Networks, None for the analytic start, or both
     match: MatchOptions  # Merging across views
     decode: DecodeOptions  # Gaussians per group
     fit: FitOptions  # Fit to the photos
@@ -123,7 +123,7 @@ def make_plan(prepared: Prepared, options: CompactOptions) -> Plan:
     searches = options.budget.quality is not None or options.budget.auto or options.budget.levels > 1
     if own and (searches or limits.count is not None):
         tree = scene_tree(scene, segment, limits, limits.exact or limits.default)
-    networks: tuple[Networks | None, ...] = (None,)
+    networks: tuple[NetworkWeights | None, ...] = (None,)
     if checkpoint is not None:
         networks = (checkpoint.networks, None) if options.checkpoint == "auto" else (checkpoint.networks,)
     return Plan(
@@ -184,7 +184,7 @@ def load_networks(options: CompactOptions, scene: Scene) -> Checkpoint | None:
     SceneError if it is required and cannot be used, UsageError if it does not fit.
     """
     name = choose_networks(options, photos=scene.images is not None, aligned=scene.aligned)
-    if name == "none":  # torch is imported only where there are networks
+    if name == "none":
         return None
     from gsmerge.networks.checkpoint import find_checkpoint
 
@@ -205,9 +205,9 @@ def load_networks(options: CompactOptions, scene: Scene) -> Checkpoint | None:
 
 def require_children(name: str, count: int, checkpoint: Checkpoint | None) -> None:
     """Raise UsageError where the heads of a checkpoint know fewer children than option ``name`` asks for."""
-    if checkpoint is not None and count > checkpoint.networks.max_children:
+    if checkpoint is not None and count > checkpoint.networks.options.max_children:
         raise UsageError(
-            f"{name}: expected at most {checkpoint.networks.max_children} with the absolute outputs of"
+            f"{name}: expected at most {checkpoint.networks.options.max_children} with the absolute outputs of"
             f" {checkpoint.path}, got {count}"
         )
 

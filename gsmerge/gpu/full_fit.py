@@ -22,7 +22,7 @@ from gsmerge.gpu.device_photos import DevicePhotos, draw, draw_and_transpose, dr
 from gsmerge.gpu.image_scores import holdout_psnr, loss_gradient, photo_means
 from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT, SIZE
 from gsmerge.kernels.raster.blend import MAX_ALPHA
-from gsmerge.networks.residuals import quat_to_rotmat
+from gsmerge.networks.tensors import quat_to_rotmat
 from gsmerge.render.autograd import Shape
 from gsmerge.stages.fit.fit_options import FitOptions, FitReport
 from gsmerge.stages.fit.fit_state import DEPTH, OFFSET

@@ -15,14 +15,16 @@ from gsmerge.types import Cameras, FeatureGaussians, Groups, Scene, to_float32
 
 if TYPE_CHECKING:
     from gsmerge.networks.apply import NetworkContext
-    from gsmerge.networks.modules import Networks
+    from gsmerge.networks.weights import NetworkWeights
 
 
-def make_context(networks: Networks | None, members: Members, cameras: Cameras, seed: int) -> NetworkContext | None:
+def make_context(
+    networks: NetworkWeights | None, members: Members, cameras: Cameras, seed: int
+) -> NetworkContext | None:
     """Return networks with the facts of a scene that they read; None without networks."""
     if networks is None:
         return None
-    from gsmerge.networks.apply import NetworkContext  # torch, loaded where there are networks
+    from gsmerge.networks.apply import NetworkContext
 
     return NetworkContext(networks, members, cameras, seed)
 
