@@ -45,7 +45,7 @@ class Effort:
     rectangles: float  # Rectangles per superpixel of `rdseg`
     early_sweeps: int  # Sweeps of `rdseg` before rectangles are merged
     merges: bool = True  # Whether Gaussians of different views are merged
-    networks: bool = True  # Whether `checkpoint="auto"` may load networks
+    networks: bool = True  # Whether `checkpoint="auto"` may run networks before a fit, and without one more than heads
     prunes: bool = True  # Whether Gaussians in no photo are left out where nothing is fitted
     large_photos: bool = True  # Whether `photo_scale="auto"` may look at larger photos
 
@@ -157,15 +157,16 @@ def _check_photos(scene: Scene, options: CompactOptions) -> None:
 def choose_networks(options: CompactOptions, *, photos: bool, aligned: bool = True) -> str:
     """Return the name of the checkpoint to load: as asked, or the shipped one where it improves results.
 
-    That is where no fit follows, or a short one, on scenes with one Gaussian per pixel
-    (``aligned``), which the shipped networks learnt from (docs/internals/networks.md). ``photos``:
-    whether there are any to fit to.
+    That is where no fit follows, or a short one of an effort that has the time for both, on scenes
+    with one Gaussian per pixel (``aligned``), which the shipped networks learnt from
+    (docs/internals/networks.md). ``photos``: whether there are any to fit to.
     """
     if options.checkpoint != "auto":
         return options.checkpoint
     steps = resolve_fit(options).steps * (AUTO_STEPS if options.budget.auto and options.fit.fit_steps is None else 1)
-    short = not photos or options.fit.fit == "none" or steps <= SHORT_STEPS
-    return "shipped" if aligned and short and EFFORTS[options.effort].networks else "none"
+    short = EFFORTS[options.effort].networks and steps <= SHORT_STEPS
+    bare = not photos or options.fit.fit == "none"
+    return "shipped" if aligned and (bare or short) else "none"
 
 
 def resolved_settings(options: CompactOptions, *, photos: bool) -> dict[str, Any]:
@@ -193,6 +194,8 @@ def load_networks(options: CompactOptions, scene: Scene) -> Checkpoint | None:
         note(text)
     if checkpoint is None:
         return None
+    if options.checkpoint == "auto" and not EFFORTS[options.effort].networks:
+        checkpoint = replace(checkpoint, networks=checkpoint.networks.heads_alone())
     outputs = checkpoint.networks.options.outputs
     if options.recipe == "paper" and outputs != "absolute":
         raise UsageError(
