@@ -16,16 +16,16 @@ import json
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import torch
 from shared_scenes import LEFT_OUT, export, read_held_out, scene_folders
 
 import gsmerge
 from gsmerge.measure.evaluate import EvaluateOptions, evaluate
 from gsmerge.networks.checkpoint import SHIPPED, load_checkpoint, save_checkpoint
+from gsmerge.networks.options import SLOTS
 from gsmerge.research.charts.lines import Interval, mean_interval, paired_difference
 from gsmerge.types import Views
 from gsmerge.views import even_views, subset
@@ -108,27 +108,23 @@ def silenced(checkpoint: Path, names: str, folder: Path) -> Path:
     """The checkpoint with the last layers of some networks at zero: they change nothing."""
     out = folder / f"without-{names.replace(',', '-')}.safetensors"
     networks = load_checkpoint(checkpoint).networks
-    width = networks.options.latent
+    width, arrays = networks.options.latent, {name: array.copy() for name, array in networks.arrays.items()}
     for name in names.split(","):
         if name in ("latent", "latents"):
-            silence = [] if networks.encoder is None else [*networks.encoder.latent.parameters()]
-            later = [part for part in (networks.merger, networks.refiner) if part is not None and name == "latents"]
-            silence += [parameter[-width:] for part in later for parameter in part.out.parameters()]
-        elif name == "heads":
-            silence = [parameter for head in networks.heads.values() for parameter in head.out.parameters()]
+            last = ["encoder.latent."] + ["merger.out.", "refiner.out."] * (name == "latents")
         else:
-            silence = [*getattr(networks, name).out.parameters()]
-        for parameter in silence:
-            torch.nn.init.zeros_(parameter)
-    save_checkpoint(out, networks, {})
+            last = [f"heads.{slots}.out." for slots in SLOTS] if name == "heads" else [f"{name}.out."]
+        for layer in (array for key, array in arrays.items() if key.startswith(tuple(last))):
+            layer[-width if name in ("latent", "latents") else 0 :] = 0
+    save_checkpoint(out, replace(networks, arrays=arrays), {})
     return out
 
 
 def applies(condition: Condition, checkpoint: Path) -> bool:
     """Whether the checkpoint has the networks that a condition silences."""
-    networks = load_checkpoint(checkpoint).networks
+    options = load_checkpoint(checkpoint).networks.options
     names = (condition.silent or "").replace("latents", "refiner").replace("latent", "encoder").split(",")
-    return all(not name or getattr(networks, name) is not None for name in names)
+    return all(name in ("", "heads") or getattr(options, name) for name in names)
 
 
 def measured(folder: Path, condition: Condition, checkpoint: str, cache: Path, lpips: bool) -> dict[str, Any]:

@@ -58,7 +58,7 @@ class CompactOptions:
         checkpoint: Trained networks that correct what the analytic stages make: a file, or ``"shipped"``, those that
             come with the package; ``"paper"``: those with absolute outputs; ``"none"``: the analytic stages alone;
             ``"auto"``: the shipped ones where no fit follows or a short one, unless the analytic start shows the views
-            better.
+            better; of these, a draft or a fast run without a fit takes the decoder heads alone, one with a fit none.
         recipe: Name of settings that belong together, which :meth:`with_settings` sets: ``"paper"``, the paper's own
             method, with networks of absolute outputs; None: none.
         require_checkpoint: A checkpoint that cannot be used is an error, instead of a note and the analytic stages.

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 from gsmerge.baselines import choose_method
 from gsmerge.io import as_scene
-from gsmerge.moments import Members
 from gsmerge.options import CompactOptions
 from gsmerge.plan import Plan, make_plan
 from gsmerge.result import Candidate, CompactResult, make_result, score
@@ -21,16 +20,16 @@ from gsmerge.stages.assign import assign
 from gsmerge.stages.choose_start import choose_start
 from gsmerge.stages.clean import clean_to_count
 from gsmerge.stages.decode import decode_merged, keep_all
-from gsmerge.stages.encode import encode, make_context
+from gsmerge.stages.encode import correct, encode, make_context
 from gsmerge.stages.fit import Fitted, fit_scene
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import MergedViews, merge, refine
 from gsmerge.stages.prepare import Prepared, prepare
 from gsmerge.stages.segment import segment_scene
-from gsmerge.types import Scene, Segmentation, StrPath
+from gsmerge.types import Scene, StrPath
 
 if TYPE_CHECKING:
-    from gsmerge.networks.modules import Networks
+    pass
 
 
 def compact(
@@ -82,16 +81,16 @@ def merge_views(prepared: Prepared, plan: Plan, count: int | None) -> MergedView
     scene = prepared.scene
     segmentation = segment_scene(scene, plan.superpixels, count)
     members = assign(scene, segmentation.groups)
-    starts = [merge_features(scene, members, segmentation, plan, networks) for networks in plan.networks]
+    pooled, matches = encode(scene, members, segmentation.groups), None
+    starts = list[MergedViews]()
+    for networks in plan.networks:
+        context = make_context(networks, members, scene.cameras, plan.seed)
+        features = correct(pooled, members, scene.cameras, context, weaken=plan.weakens)
+        if matches is None:
+            matches = match(features, plan.match, context)
+        merged = refine(merge(features, matches, context), context)
+        unlearned = None if context is None or plan.fit.fit == "none" else pooled
+        starts.append(MergedViews(merged, members, segmentation, len(features), context, unlearned))
+        if context is not None and (context.options.encoder or plan.match.geometry == "decoded"):
+            matches = None  # they are of what networks made of the geometry
     return choose_start(starts, scene, plan.decode, plan.checkpoint)  # of one: that one
-
-
-def merge_features(
-    scene: Scene, members: Members, segmentation: Segmentation, plan: Plan, networks: Networks | None
-) -> MergedViews:
-    """Encode superpixels as Feature Gaussians, merge those that match, and refine them, with networks or with none."""
-    context = make_context(networks, members, scene.cameras, plan.seed)
-    features = encode(scene, members, segmentation.groups, context, weaken=plan.weakens)
-    merged = refine(merge(features, match(features, plan.match, context), context), context)
-    start = None if context is None or plan.fit.fit == "none" else encode(scene, members, segmentation.groups)
-    return MergedViews(merged, members, segmentation, len(features), context, start)

@@ -29,7 +29,7 @@ from gsmerge.views import report_views, scored_views
 
 if TYPE_CHECKING:
     from gsmerge.networks.checkpoint import Checkpoint
-    from gsmerge.networks.modules import Networks
+    from gsmerge.networks.weights import NetworkWeights
 
 AUTO_STEPS = 2  # times the usual steps with budget auto: fewer Gaussians cost less, and need them for detail
 SHORT_STEPS = 60  # of a fit that a better start still matters to
@@ -45,7 +45,7 @@ class Effort:
     rectangles: float  # Rectangles per superpixel of `rdseg`
     early_sweeps: int  # Sweeps of `rdseg` before rectangles are merged
     merges: bool = True  # Whether Gaussians of different views are merged
-    networks: bool = True  # Whether `checkpoint="auto"` may load networks
+    networks: bool = True  # Whether `checkpoint="auto"` may run networks before a fit, and without one more than heads
     prunes: bool = True  # Whether Gaussians in no photo are left out where nothing is fitted
     large_photos: bool = True  # Whether `photo_scale="auto"` may look at larger photos
 
@@ -63,7 +63,7 @@ class Plan:
     """Decisions that are made before the first superpixel is cut."""
 
     superpixels: SuperpixelPlan  # How each view is cut, and into how many
-    networks: tuple[Networks | None, ...]  # Networks, None for the analytic start, or both
+    networks: tuple[NetworkWeights | None, ...]  # Networks, None for the analytic start, or both
     match: MatchOptions  # Merging across views
     decode: DecodeOptions  # Gaussians per group
     fit: FitOptions  # Fit to the photos
@@ -123,7 +123,7 @@ def make_plan(prepared: Prepared, options: CompactOptions) -> Plan:
     searches = options.budget.quality is not None or options.budget.auto or options.budget.levels > 1
     if own and (searches or limits.count is not None):
         tree = scene_tree(scene, segment, limits, limits.exact or limits.default)
-    networks: tuple[Networks | None, ...] = (None,)
+    networks: tuple[NetworkWeights | None, ...] = (None,)
     if checkpoint is not None:
         networks = (checkpoint.networks, None) if options.checkpoint == "auto" else (checkpoint.networks,)
     return Plan(
@@ -157,15 +157,16 @@ def _check_photos(scene: Scene, options: CompactOptions) -> None:
 def choose_networks(options: CompactOptions, *, photos: bool, aligned: bool = True) -> str:
     """Return the name of the checkpoint to load: as asked, or the shipped one where it improves results.
 
-    That is where no fit follows, or a short one, on scenes with one Gaussian per pixel
-    (``aligned``), which the shipped networks learnt from (docs/internals/networks.md). ``photos``:
-    whether there are any to fit to.
+    That is where no fit follows, or a short one of an effort that has the time for both, on scenes
+    with one Gaussian per pixel (``aligned``), which the shipped networks learnt from
+    (docs/internals/networks.md). ``photos``: whether there are any to fit to.
     """
     if options.checkpoint != "auto":
         return options.checkpoint
     steps = resolve_fit(options).steps * (AUTO_STEPS if options.budget.auto and options.fit.fit_steps is None else 1)
-    short = not photos or options.fit.fit == "none" or steps <= SHORT_STEPS
-    return "shipped" if aligned and short and EFFORTS[options.effort].networks else "none"
+    short = EFFORTS[options.effort].networks and steps <= SHORT_STEPS
+    bare = not photos or options.fit.fit == "none"
+    return "shipped" if aligned and (bare or short) else "none"
 
 
 def resolved_settings(options: CompactOptions, *, photos: bool) -> dict[str, Any]:
@@ -184,7 +185,7 @@ def load_networks(options: CompactOptions, scene: Scene) -> Checkpoint | None:
     SceneError if it is required and cannot be used, UsageError if it does not fit.
     """
     name = choose_networks(options, photos=scene.images is not None, aligned=scene.aligned)
-    if name == "none":  # torch is imported only where there are networks
+    if name == "none":
         return None
     from gsmerge.networks.checkpoint import find_checkpoint
 
@@ -193,6 +194,8 @@ def load_networks(options: CompactOptions, scene: Scene) -> Checkpoint | None:
         note(text)
     if checkpoint is None:
         return None
+    if options.checkpoint == "auto" and not EFFORTS[options.effort].networks:
+        checkpoint = replace(checkpoint, networks=checkpoint.networks.heads_alone())
     outputs = checkpoint.networks.options.outputs
     if options.recipe == "paper" and outputs != "absolute":
         raise UsageError(
@@ -205,9 +208,9 @@ def load_networks(options: CompactOptions, scene: Scene) -> Checkpoint | None:
 
 def require_children(name: str, count: int, checkpoint: Checkpoint | None) -> None:
     """Raise UsageError where the heads of a checkpoint know fewer children than option ``name`` asks for."""
-    if checkpoint is not None and count > checkpoint.networks.max_children:
+    if checkpoint is not None and count > checkpoint.networks.options.max_children:
         raise UsageError(
-            f"{name}: expected at most {checkpoint.networks.max_children} with the absolute outputs of"
+            f"{name}: expected at most {checkpoint.networks.options.max_children} with the absolute outputs of"
             f" {checkpoint.path}, got {count}"
         )
 

@@ -66,6 +66,15 @@ def concat_rows(parts: Sequence[Array]) -> Array:
     return torch.cat([torch.as_tensor(part) for part in parts])
 
 
+def concat_columns(parts: Sequence[Array]) -> Array:
+    """Put the columns of arrays or of tensors side by side."""
+    if all(isinstance(part, np.ndarray) for part in parts):
+        return np.concatenate(parts, 1)
+    import torch
+
+    return torch.cat([torch.as_tensor(part) for part in parts], 1)
+
+
 @dataclass(frozen=True)
 class Gaussians:
     """n Gaussians in the world frame.
@@ -367,7 +376,7 @@ class FeatureGaussians:
     views: np.ndarray  # [g] int64, the view of the group, -1 when it was merged from several
     starts: np.ndarray  # [g+1] int64 into `members`
     members: np.ndarray  # [m] int32 rows of the scene's Gaussians, group by group: as many as they are, in every copy
-    latents: Array  # [g,d] what the networks remember of the group (paper section 4.2), a tensor; without: d = 0
+    latents: Array  # [g,d] what the networks remember (paper section 4.2), a tensor in training; without them: d = 0
 
     def __post_init__(self) -> None:
         g = self.means.shape[0]

@@ -12,7 +12,8 @@ from scenes import arc, make_scene, room
 from gsmerge.moments import Members, scene_members
 from gsmerge.networks.apply import NetworkContext
 from gsmerge.networks.checkpoint import save_checkpoint
-from gsmerge.networks.modules import NetworkOptions, Networks
+from gsmerge.networks.modules import Networks
+from gsmerge.networks.options import NetworkOptions
 from gsmerge.stages.encode import encode
 from gsmerge.types import FeatureGaussians, Groups, Scene
 
@@ -39,7 +40,7 @@ def scaled(networks: Networks, factor: float) -> Networks:
 
 def written(path: Path, networks: Networks) -> Path:
     """A checkpoint of the networks."""
-    save_checkpoint(path, networks, {"steps": 0})
+    save_checkpoint(path, networks.weights(), {"steps": 0})
     return path
 
 
@@ -52,8 +53,8 @@ class Made:
     features: FeatureGaussians
 
     def networks(self, networks: Networks, seed: int = 0) -> NetworkContext:
-        """The networks for this scene."""
-        return NetworkContext(networks, self.members, self.scene.cameras, seed)
+        """The networks for this scene, as they are applied: without torch."""
+        return NetworkContext(networks.weights(), self.members, self.scene.cameras, seed)
 
 
 def made(num_views: int = 2) -> Made:

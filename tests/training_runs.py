@@ -6,7 +6,7 @@ import hashlib
 from dataclasses import replace
 from pathlib import Path
 
-from gsmerge.networks.modules import NetworkOptions
+from gsmerge.networks.options import NetworkOptions
 from gsmerge.research.training import Example, Shard, TrainOptions, write_shard
 
 TINY = NetworkOptions(width=16, heads=2, latent=8, members=8, neighbors=4)

@@ -12,7 +12,7 @@ from gsmerge.stages.prepare import Frame
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
 
 if TYPE_CHECKING:
-    from gsmerge.networks.modules import Networks
+    from gsmerge.networks.weights import NetworkWeights
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class Division:
 class StoredHeads:
     """Networks whose decoder heads correct the children, and the numbers that describe each group to them."""
 
-    networks: Networks  # All of a checkpoint's networks
+    networks: NetworkWeights  # All of a checkpoint's networks
     views: np.ndarray  # [g] int64, the view that each group's frame belongs to
     group: np.ndarray  # [g,n] the numbers that describe each group
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from gsmerge.io.cameras.camera_file import MAX_NUMBER as MAX_LENGTH
 from gsmerge.io.cameras.camera_file import check_camera, check_size
 from gsmerge.stages.decode import MAX_CHILDREN
 from gsmerge.stages.prepare import Frame
-from gsmerge.types import Array, Cameras, FeatureGaussians, Gaussians, as_array, as_tensor
+from gsmerge.types import Array, Cameras, FeatureGaussians, Gaussians, as_array
 
 SCHEMA, MINOR = 1, 0  # files of a larger schema cannot be read; minor: what was added since the schema's first files
 SUFFIX = ".gsm"
@@ -134,7 +134,7 @@ def save_encoded(
     }
     if heads is not None:
         arrays |= {"heads.views": heads.views.astype(np.int32), "heads.group": _float32(heads.group)}
-        arrays |= {f"networks.{name}": as_array(tensor) for name, tensor in heads.networks.state_dict().items()}
+        arrays |= {f"networks.{name}": array for name, array in heads.networks.arrays.items()}
     children = "division", division.children
     write_gsm(path, ENCODED, encoded, encoded.features, children, entries, arrays, overwrite=overwrite)
 
@@ -286,7 +286,7 @@ def read_encoded(file: GsmFile) -> Encoded:
     common = file.common(features.shN.shape[1])
     heads = _read_heads(file, features, len(common["cameras"]))
     return Encoded(
-        features=features if heads is None else replace(features, latents=as_tensor(features.latents)),
+        features=features,
         division=_read_division(file, features),
         settings=settings,
         heads=heads,
@@ -322,11 +322,10 @@ def _read_heads(file: GsmFile, features: FeatureGaussians, num_views: int) -> St
     if header["networks"] is None:
         return None
     from gsmerge.networks.checkpoint import build_networks
-    from gsmerge.networks.tokens import GROUP
+    from gsmerge.networks.options import GROUP
 
     arrays = {name.removeprefix(prefix): array for name, array in file.arrays.items() if name.startswith(prefix)}
-    weights = {name: as_tensor(array) for name, array in arrays.items()}
-    networks = build_networks(file.path, header["networks"], weights, REMEDY)
+    networks = build_networks(file.path, header["networks"], arrays, REMEDY)
     views = file.array("heads.views", np.int32, len(features)).astype(np.int64)
     if len(views) and not 0 <= int(views.min()) <= int(views.max()) < num_views:
         raise file.error("heads.views: expected views of the scene, found others")

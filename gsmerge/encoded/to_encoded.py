@@ -22,7 +22,7 @@ from gsmerge.stages.decode import MAX_CHILDREN, keep_all, merged_count
 from gsmerge.stages.merge import MergedViews
 from gsmerge.stages.prepare import Prepared, prepare
 from gsmerge.stages.segment import knee_count
-from gsmerge.types import Scene, as_array
+from gsmerge.types import Scene
 
 DEFAULT_MAX_K = 4  # children that are stored of a group, unless a number of Gaussians is asked for
 
@@ -85,7 +85,7 @@ def _to_encoded(prepared: Prepared, plan: Plan, merged: MergedViews, max_k: int 
     count = merged_count(merged, options, grows=plan.fit.grows)
     max_k = max_k or (DEFAULT_MAX_K if count is None and options.max_k <= DEFAULT_MAX_K else MAX_CHILDREN)
     if networks is not None:
-        max_k = min(max_k, networks.networks.max_children)
+        max_k = min(max_k, networks.options.max_children)
     settings = StoredSettings(
         num_input=prepared.given.num_gaussians,
         k=AUTO if plan.auto_count else options.k,
@@ -97,9 +97,9 @@ def _to_encoded(prepared: Prepared, plan: Plan, merged: MergedViews, max_k: int 
         knee_count=knee_count(scene, plan.superpixels),
     )
     heads = None
-    if networks is not None:
+    if networks is not None and plan.checkpoint is not None:
         group_features = networks.describe(features)
-        heads = StoredHeads(networks.networks, as_array(group_features.views), as_array(group_features.group))
+        heads = StoredHeads(plan.checkpoint.networks, group_features.views, group_features.group)
     return Encoded(
         features=without_members(features),
         division=divide_all(features, merged.members, max_k),

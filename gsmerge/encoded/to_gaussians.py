@@ -122,8 +122,8 @@ def children_of(encoded: Encoded, counts: np.ndarray) -> tuple[Gaussians, np.nda
 
         group_features = make_group_features(features, heads.views, heads.group, encoded.cameras)
         nothing = gaussian_members(gaussians[:0], np.zeros(0, np.float32))
-        networks, children = NetworkContext(heads.networks, nothing, encoded.cameras), gaussians.to("cpu")
-        gaussians = decode_with_group_features(children, parents, group_features, networks).numpy()
+        networks = NetworkContext(heads.networks, nothing, encoded.cameras)
+        gaussians = decode_with_group_features(gaussians, parents, group_features, networks)
     return gaussians, parents
 
 

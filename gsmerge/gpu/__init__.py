@@ -1,12 +1,14 @@
 """Fit, growth, colours and scores on a GPU: plain functions on tensors of any device.
 
-Merging stays on the CPU. torch is loaded only where :func:`choose_backend` is asked for CUDA. On
-the torch CPU device every function gives what the kernels give, which is how it is tested;
+Merging stays on the CPU. torch is loaded only where :func:`choose_backend` may take CUDA. On the
+torch CPU device every function gives what the kernels give, which is how it is tested;
 docs/internals/gpu.md says what differs on a GPU.
 """
 
 from __future__ import annotations
 
+import ctypes
+import os
 from functools import cache
 from typing import Any
 
@@ -23,9 +25,9 @@ def choose_backend(device: str, num_pixels: int) -> tuple[FitBackend[Any], str |
     """Choose where the fit and the scores run; a note says why CUDA was asked for and cannot be used.
 
     ``"auto"`` takes CUDA where it can be used and ``num_pixels`` of all views are enough; on a
-    computer without a CUDA device it gives no note.
+    computer without a CUDA device it gives no note, and without a CUDA driver torch is not loaded.
     """
-    if device == "cpu" or (device == "auto" and num_pixels < MIN_PIXELS):
+    if device == "cpu" or (device == "auto" and (num_pixels < MIN_PIXELS or not has_driver())):
         return ON_CPU, None
     problem = cuda_problem()
     if problem is not None:
@@ -36,6 +38,16 @@ def choose_backend(device: str, num_pixels: int) -> tuple[FitBackend[Any], str |
     from gsmerge.gpu.backend import make_backend
 
     return make_backend(torch.device("cuda")), None
+
+
+@cache
+def has_driver() -> bool:
+    """Return whether the computer has a CUDA driver; asking torch would take half a second to load it."""
+    try:
+        ctypes.CDLL("nvcuda.dll" if os.name == "nt" else "libcuda.so.1")
+    except OSError:
+        return False
+    return True
 
 
 @cache

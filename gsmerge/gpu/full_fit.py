@@ -11,6 +11,7 @@ import math
 import time
 from copy import deepcopy
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from gsmerge.gpu.device_photos import DevicePhotos, draw, draw_and_transpose, dr
 from gsmerge.gpu.image_scores import holdout_psnr, loss_gradient, photo_means
 from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT, SIZE
 from gsmerge.kernels.raster.blend import MAX_ALPHA
-from gsmerge.networks.residuals import quat_to_rotmat
+from gsmerge.networks.tensors import quat_to_rotmat
 from gsmerge.render.autograd import Shape
 from gsmerge.stages.fit.fit_options import FitOptions, FitReport
 from gsmerge.stages.fit.fit_state import DEPTH, OFFSET
@@ -219,21 +220,29 @@ def fit_full(
     run = _Run(start_state(gaussians), make_levels(photos, plan), plan, seed, progress)
     judged = torch.from_numpy(np.stack(plan.weights[1])).to(gaussians.means.device)
     half = photos[1]
-    before, run.state.box_shares, run.state.min_sizes = initial_scores(run.state, photos, judged, options)
-    if baseline_start is not None:
-        before = min(before, holdout_score(start_state(baseline_start), half, judged, options.tuning.min_gain))
-    run.score, after = before, None
+    own, run.state.box_shares, run.state.min_sizes = initial_scores(run.state, photos, judged, options)
+
+    def judge() -> tuple[float, float]:
+        score = partial(holdout_score, photos=half, weights=judged, min_gain=options.tuning.min_gain)
+        after = score(run.state)
+        if baseline_start is None or after > own:
+            return own, after
+        return min(own, score(start_state(baseline_start))), after
+
+    run.score, before, after = own, own, None
     run.start_clock()
     while run.step < run.steps:
         due = options.grows and run.step / run.steps >= GROWTH
         if due and len(run.state) < count:
             run.state = grow_to(run.state, half, count)
         if run.step / run.steps >= plan.half_part and after is None:
-            run.score = after = holdout_score(run.state, half, judged, options.tuning.min_gain)
+            before, after = judge()
+            run.score = after
             if after <= before:
                 break
         run.take_step()
-    after = holdout_score(run.state, half, judged, options.tuning.min_gain) if after is None else after
+    if after is None:
+        before, after = judge()
     if after <= before:
         why = f"held-out parts of the photos were no better after {run.step} steps"
         return gaussians, FitReport("none", False, run.step, before, after, why)

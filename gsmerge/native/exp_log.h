@@ -1,5 +1,5 @@
-// exp and log within two units of the last place, of plain arithmetic: loops over them vectorise and give the same bits
-// on every processor.
+// exp, log and the like within two units of the last place, of plain arithmetic: loops over them vectorise and give the
+// same bits on every processor.
 #pragma once
 #include "native.h"
 
@@ -108,4 +108,38 @@ static inline double lgamma8(double x) {
   p = 1.0 / 12.0 - s * p;
   double stirling = (x - 0.5) * log8(x) - x + 0.91893853320467274178 + p / x;
   return product == 1.0 ? stirling : stirling - log8(product);
+}
+
+// The error function in float32: an odd polynomial below .95, above it 1 - exp(-p(|x|)); both are minimax fits.
+static inline float erf4(float x) {
+  float t = absf4(x), z = t * t;
+  float p = -5.8621011e-4f * z + 4.9675116e-3f;
+  p = p * z - 2.6748870e-2f;
+  p = p * z + 1.1281321e-1f;
+  p = p * z - 3.7612447e-1f;
+  p = p * z + 1.2837914e-1f;
+  p = p * t + t;
+  float u = t < 4.f ? t : 4.f;  // where it is 1 in float32
+  float q = -1.9242520e-4f * u + 3.0085293e-3f;
+  q = q * u - 2.2087612e-2f;
+  q = q * u + 1.0364027e-1f;
+  q = q * u + 6.3751709e-1f;
+  q = q * u + 1.1274749f;
+  q = q * u + 2.4472171e-4f;
+  float size = t < 0.95f ? p : 1.f - exp4(-q);
+  size = x == x ? size : x;
+  return x < 0.f ? -size : size;
+}
+
+// The hyperbolic tangent in float32: an odd minimax polynomial below .625, above it 1 - 2 / (e^(2 |x|) + 1).
+static inline float tanh4(float x) {
+  float t = absf4(x), z = t * t;
+  float p = -5.7049850e-3f * z + 2.0639086e-2f;
+  p = p * z - 5.3739715e-2f;
+  p = p * z + 1.3331442e-1f;
+  p = p * z - 3.3333281e-1f;
+  p = p * (z * t) + t;
+  float size = t < 0.625f ? p : 1.f - 2.f / (exp4(2.f * t) + 1.f);
+  size = x == x ? size : x;
+  return x < 0.f ? -size : size;
 }

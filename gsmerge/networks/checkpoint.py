@@ -9,15 +9,15 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-import torch
+import numpy as np
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
-from torch import Tensor
+from safetensors.numpy import save
 
 from gsmerge import __version__
 from gsmerge.errors import SceneError
 from gsmerge.io.atomic import atomic_output
-from gsmerge.networks.modules import NetworkOptions, Networks
+from gsmerge.networks.options import NetworkOptions, weight_shapes
+from gsmerge.networks.weights import NetworkWeights
 
 SCHEMA = 1  # version of the tensors' names and of the tokens that they were trained on
 FORMAT = "gsmerge-networks"
@@ -30,7 +30,7 @@ IN_PACKAGE = {"shipped": SHIPPED, "paper": Path(__file__).with_name("paper.safet
 class Checkpoint:
     """Networks from a file."""
 
-    networks: Networks  # ready for use, without gradients
+    networks: NetworkWeights
     path: Path  # the file
     version: str  # the gsmerge that wrote it
     training: Mapping[str, Any]  # facts about the training, as the trainer wrote them
@@ -43,12 +43,13 @@ class Checkpoint:
         return head | sizes | {"training": dict(self.training)}
 
 
-def save_checkpoint(path: str | PathLike[str], networks: Networks, training: Mapping[str, Any]) -> None:
+def save_checkpoint(path: str | PathLike[str], networks: NetworkWeights, training: Mapping[str, Any]) -> None:
     """Write networks and facts about their training in place of an existing file; a SceneError if that fails."""
     header = {"schema": SCHEMA, "gsmerge": __version__, "options": asdict(networks.options), "training": dict(training)}
-    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in networks.state_dict().items()}
     with atomic_output(path, overwrite=True) as temporary:
-        temporary.write_bytes(save(tensors, {FORMAT: json.dumps(header)}))  # one entry: several have no fixed order
+        temporary.write_bytes(
+            save(dict(networks.arrays), {FORMAT: json.dumps(header)})
+        )  # one entry: several have no fixed order
 
 
 def load_checkpoint(path: str | PathLike[str]) -> Checkpoint:
@@ -62,10 +63,10 @@ def load_checkpoint(path: str | PathLike[str]) -> Checkpoint:
     if not path.is_file():
         raise SceneError(path, "expected a checkpoint, found no such file", REMEDY)
     try:
-        with safe_open(path, "pt") as file:
+        with safe_open(path, "np") as file:
             header = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
-    except (SafetensorError, OSError, ValueError) as error:
+    except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as error:  # the last two: types of torch
         reason = str(error).splitlines()[0]
         raise SceneError(path, f"expected a safetensors file, could not read it ({reason})", REMEDY) from error
     options, training, version = _header(path, header)
@@ -73,28 +74,27 @@ def load_checkpoint(path: str | PathLike[str]) -> Checkpoint:
 
 
 def build_networks(
-    path: Path, options: Mapping[str, Any], tensors: Mapping[str, Tensor], remedy: str = REMEDY
-) -> Networks:
+    path: Path, options: Mapping[str, Any], arrays: Mapping[str, np.ndarray], remedy: str = REMEDY
+) -> NetworkWeights:
     """Build networks from sizes, see ``NetworkOptions.from_dict``, and weights by name.
 
     A SceneError with ``path`` and ``remedy`` if the sizes are out of range, or the weights do not fit them.
     """
     try:
-        networks = Networks(NetworkOptions.from_dict(options))
+        sizes = NetworkOptions.from_dict(options)
     except (ValueError, TypeError) as error:
         raise _header_error(path, error, remedy) from error
-    expected = networks.state_dict()
-    for name in sorted(tensors.keys() ^ expected.keys()):
-        difference = "a tensor too many" if name in tensors else "none"
+    expected = weight_shapes(sizes)
+    for name in sorted(arrays.keys() ^ expected.keys()):
+        difference = "a tensor too many" if name in arrays else "none"
         raise SceneError(path, f"expected the tensors of its networks, found {difference}: {name}", remedy)
-    for name, tensor in tensors.items():
-        if tensor.shape != expected[name].shape or tensor.dtype != torch.float32:
-            have, want = list(tensor.shape), list(expected[name].shape)
-            raise SceneError(path, f"{name}: expected float32 {want}, found {tensor.dtype} {have}", remedy)
-        if not bool(torch.isfinite(tensor).all()):
+    for name, array in arrays.items():
+        if array.shape != expected[name] or array.dtype != np.float32:
+            have, want = list(array.shape), list(expected[name])
+            raise SceneError(path, f"{name}: expected float32 {want}, found {array.dtype} {have}", remedy)
+        if not np.isfinite(array).all():
             raise SceneError(path, f"{name}: expected finite numbers, found others", remedy)
-    networks.load_state_dict(dict(tensors))
-    return networks.eval().requires_grad_(False)
+    return NetworkWeights(sizes, {name: np.ascontiguousarray(array) for name, array in arrays.items()})
 
 
 def _header(path: Path, header: Mapping[str, str]) -> tuple[dict[str, Any], dict[str, Any], str]:

@@ -1,7 +1,7 @@
-"""Encoder, decoder heads, merger and refiner (paper sections 4.2 to 4.5, fig. architecture).
+"""Encoder, decoder heads, merger and refiner as modules of torch, for training (paper sections 4.2 to 4.5).
 
-All of them take tokens and return raw corrections, which :mod:`gsmerge.networks.residuals` bounds and applies to the
-results of the analytic stages. The last layers start at zero, so untrained networks change nothing.
+All of them take tokens and return raw corrections of the results of the analytic stages (fig. architecture). The last
+layers start at zero, so untrained networks change nothing.
 
 They are built from the blocks of the Set Transformer (Lee et al. 2019). Sets are padded; ``mask`` is True where a token
 is one of the set's own. Padded tokens are never attended to.
@@ -9,20 +9,16 @@ is one of the set's own. Padded tokens are never attended to.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
 from itertools import pairwise
-from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import scaled_dot_product_attention
 
-from gsmerge.networks.residuals import RESIDUAL, WIDE, Bounds
-from gsmerge.networks.tokens import GROUP, MEMBER, PART
-
-SLOTS = (1, 2, 4)  # numbers of children that have a decoder head
-OUTPUTS = ("residual", "absolute")
+from gsmerge.networks.options import GROUP, MEMBER, PART, RESIDUAL, SLOTS, NetworkOptions
+from gsmerge.networks.weights import NetworkWeights
+from gsmerge.types import Array, as_array, as_tensor
 
 
 def mlp(*widths: int) -> nn.Sequential:
@@ -188,80 +184,17 @@ class Networks(nn.Module):
         self.refiner = Refiner(chosen) if chosen.refiner else None
         self.heads = nn.ModuleDict({str(slots): Head(slots, chosen) for slots in SLOTS})
 
-    @property
-    def max_children(self) -> int:
-        """Largest number of children that the heads correct; five or more in two halves, not for absolute outputs."""
-        return SLOTS[-1] if self.options.outputs == "absolute" else 2 * SLOTS[-1]
+    in_parallel = False  # gradients of one group after the other
 
-    @property
-    def num_parameters(self) -> int:
-        """Number of weights in the checkpoint."""
-        return sum(p.numel() for p in self.parameters())
+    def run(self, name: str, *inputs: Array) -> Tensor:
+        """Run a module as :meth:`NetworkWeights.run` does, on its own device, with gradients."""
+        module = self.get_submodule(name)
+        device = next(module.parameters()).device
+        outputs = module(*(as_tensor(values, device) for values in inputs))
+        raw = torch.cat(outputs, 1) if isinstance(outputs, tuple) else outputs
+        return torch.tanh(raw.nan_to_num()).flatten(1).cpu()
 
-
-@dataclass(frozen=True)
-class NetworkOptions:
-    """Sizes of the networks, and the kind of their heads' output.
-
-    Args:
-        width: Width of the tokens, a multiple of ``heads``.
-        heads: Attention heads.
-        blocks: Set attention blocks of the encoder and of the merger.
-        refine_blocks: Attention blocks of the refiner.
-        latent: Width of a Feature Gaussian's latent.
-        members: Largest number of members that the encoder reads; larger groups are sampled.
-        neighbors: Neighbours that the refiner reads.
-        bounds: Largest corrections.
-        outputs: ``"residual"``: the heads correct the analytic children. ``"absolute"``, as in the paper: they do not
-            read these, and correct a round Gaussian of the group's mean and base colour, within wide bounds.
-        encoder: Whether there is one; without it all latents are zero.
-        merger: Whether there is one; without it clusters are pooled, and no more.
-        refiner: Whether there is one.
-
-    Raises:
-        ValueError: If a size is out of range or they do not go together.
-    """
-
-    width: int = 48
-    heads: int = 4
-    blocks: int = 1
-    refine_blocks: int = 2
-    latent: int = 32
-    members: int = 16
-    neighbors: int = 8
-    bounds: Bounds = field(default_factory=Bounds)
-    outputs: str = "residual"
-    encoder: bool = True
-    merger: bool = True
-    refiner: bool = True
-
-    @property
-    def head_bounds(self) -> Bounds:
-        """Largest corrections of the heads."""
-        return WIDE if self.outputs == "absolute" else self.bounds
-
-    def __post_init__(self) -> None:
-        if self.outputs not in OUTPUTS:
-            raise ValueError(f"outputs: expected {' or '.join(OUTPUTS)}, got {self.outputs!r}")
-        limits = {"width": 512, "heads": 16, "blocks": 8, "refine_blocks": 8, "latent": 256, "members": 256}
-        for name, limit in (limits | {"neighbors": 64}).items():
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= limit:
-                raise ValueError(f"{name}: expected a whole number from 1 to {limit}, got {value!r}")
-        for name in ("encoder", "merger", "refiner"):
-            if not isinstance(getattr(self, name), bool):
-                raise ValueError(f"{name}: expected true or false, got {getattr(self, name)!r}")
-        if self.width % self.heads:
-            raise ValueError(f"width: expected a multiple of {self.heads} heads, got {self.width}")
-
-    @staticmethod
-    def from_dict(values: Mapping[str, Any]) -> NetworkOptions:
-        """Read options from what ``dataclasses.asdict`` gave; a ValueError if a name or a value is impossible."""
-        unknown = sorted(values.keys() - {f.name for f in fields(NetworkOptions)})
-        bounds = values.get("bounds", {})
-        if not isinstance(bounds, Mapping):
-            raise ValueError(f"bounds: expected a table, got {bounds!r}")
-        unknown += sorted(bounds.keys() - {f.name for f in fields(Bounds)})
-        if unknown:
-            raise ValueError(f"unknown setting {unknown[0]!r}")
-        return NetworkOptions(**{**values, "bounds": Bounds(**bounds)})
+    def weights(self) -> NetworkWeights:
+        """Return the weights as arrays, ready for use without torch."""
+        arrays = {name: np.ascontiguousarray(as_array(tensor)) for name, tensor in self.state_dict().items()}
+        return NetworkWeights(self.options, arrays)

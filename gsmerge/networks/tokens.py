@@ -11,77 +11,66 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
-from torch import Tensor
 
+from gsmerge.kernels.networks.tokens import describe_groups, describe_parts, place_frames
 from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.networks.cross_view_stats import NUM_STATS, cross_view_stats
-from gsmerge.networks.residuals import gaussian_sizes, quat_to_rotmat
-from gsmerge.types import SH_C0, Array, Cameras, FeatureGaussians, Gaussians, as_tensor
+from gsmerge.networks.options import GROUP, MEMBER, PART
+from gsmerge.types import Cameras, FeatureGaussians, Gaussians, as_array
 
-PART = 13  # columns of a Gaussian relative to another one: position, log scales, opacity, colour, normal
-MEMBER = PART + 6  # and its position in footprints and its colour
-GROUP = 19 + NUM_STATS  # columns of a whole group
-TINY = 1e-12  # world units; lengths are clamped to it before a division or logarithm
 TOKENS = 4096  # tokens of one table: a megabyte of activations, which stay in a processor's cache
 
 
 @dataclass(frozen=True, eq=False)
 class GroupFeatures:
-    """Feature Gaussians as tensors that the networks read."""
+    """Feature Gaussians as the networks read them, float32."""
 
     features: FeatureGaussians  # g of them
     base: Gaussians  # g Gaussians without corrections
-    frames: Tensor  # [g,3,3] axes (right, down, away) as columns, world
-    sizes: Tensor  # [g] geometric mean of the two largest scales, world units
-    footprints: Tensor  # [g] size of one pixel, world units
-    views: Tensor  # [g] int64 view that the frame belongs to
-    group: Tensor  # [g,GROUP] numbers that describe the whole group
+    frames: np.ndarray  # [g,3,3] axes (right, down, away) as columns, world
+    sizes: np.ndarray  # [g] geometric mean of the two largest scales, world units
+    footprints: np.ndarray  # [g] size of one pixel, world units
+    views: np.ndarray  # [g] int64 view that the frame belongs to
+    group: np.ndarray  # [g,GROUP] numbers that describe the whole group
 
 
 def compute_group_features(features: FeatureGaussians, members: Members, cameras: Cameras) -> GroupFeatures:
     """Compute the networks' inputs for Feature Gaussians."""
     views = _choose_views(features, members, cameras)
-    bare = make_group_features(features, views, np.zeros((len(features), 0), np.float32), cameras)
-    viewmats = cameras.to("cpu").viewmats.float()[bare.views]
-    places = (viewmats[:, :3, :3] @ bare.base.means[:, :, None])[:, :, 0] + viewmats[:, :3, 3]
-    tangents = (places[:, :2] / places[:, 2:].clamp_min(1e-6)).clamp(-3, 3)  # of the angles to the view's axis
-    stats = as_tensor(cross_view_stats(features.means, features.sh0, views, members, cameras))
-    return replace(bare, group=torch.cat([_group_numbers(bare), tangents, stats], 1).nan_to_num())
+    bare = make_group_features(features, views, np.zeros((len(features), GROUP), np.float32), cameras)
+    base, group = bare.base, np.empty((len(features), GROUP), np.float32)
+    sums = (in_order(getattr(features, name)) for name in ("covars", "masses", "extinctions", "weights"))
+    describe_groups(
+        base.means, base.scales, base.opacities, base.sh0, *sums, np.diff(features.starts), bare.footprints,
+        bare.frames, bare.sizes, _viewmats(cameras), views, group,
+    )  # fmt: skip
+    stats = cross_view_stats(features.means, features.sh0, views, members, cameras)
+    group[:, GROUP - NUM_STATS :] = np.nan_to_num(stats)
+    return replace(bare, group=group)
 
 
-def make_group_features(features: FeatureGaussians, views: Array, group: Array, cameras: Cameras) -> GroupFeatures:
+def make_group_features(
+    features: FeatureGaussians, views: np.ndarray, group: np.ndarray, cameras: Cameras
+) -> GroupFeatures:
     """Make the networks' inputs from known ``views [g]`` and numbers ``group [g,GROUP]``, without the members."""
-    base, views = feature_to_gaussians(features).to("cpu"), as_tensor(views)
-    sizes = gaussian_sizes(base.scales).clamp_min(TINY)
-    footprints = as_tensor(features.footprints).clamp_min(TINY)
-    frames = _ray_frames(base.means, views, cameras.to("cpu"))
-    return GroupFeatures(features, base, frames, sizes, footprints, views, as_tensor(group))
+    base = contiguous(feature_to_gaussians(features))
+    frames, sizes = np.empty((len(features), 3, 3), np.float32), np.empty(len(features), np.float32)
+    place_frames(base.means, base.scales, _viewmats(cameras), views, frames, sizes)
+    return GroupFeatures(features, base, frames, sizes, in_order(features.footprints), views, group)
 
 
-def _group_numbers(bare: GroupFeatures) -> Tensor:
-    """Describe groups by ``[g,17]`` scales, opacity, mass, optical depth, members, colour and covariance."""
-    features, base, frames, sizes, footprints = bare.features, bare.base, bare.frames, bare.sizes, bare.footprints
-    names = ("covars", "masses", "extinctions", "weights")
-    covars, masses, extinctions, weights = (as_tensor(getattr(features, name)) for name in names)
-    num_members = as_tensor(np.diff(features.starts)).float()
-    local = frames.transpose(1, 2) @ (covars / sizes[:, None, None] ** 2) @ frames
-    columns = [
-        torch.log(base.scales.clamp_min(TINY) / footprints[:, None]).clamp(-12, 12) / 4,
-        _logits(base.opacities)[:, None],
-        torch.log(masses.clamp_min(1e-30) / footprints**3)[:, None].clamp(-30, 30) / 10,
-        torch.log(extinctions.clamp_min(1e-30) / footprints**2)[:, None].clamp(-30, 30) / 10,
-        torch.log(num_members)[:, None] / 4,
-        (weights / num_members)[:, None],
-        SH_C0 * base.sh0[:, 0],
-        torch.asinh(local.flatten(1)[:, [0, 1, 2, 4, 5, 8]]),
-    ]
-    return torch.cat(columns, 1)
+def contiguous(gaussians: Gaussians) -> Gaussians:
+    """Return Gaussians as float32 arrays in C order, as the kernels read them."""
+    return Gaussians(*(in_order(column) for column in vars(gaussians).values()))
 
 
-def _logits(opacities: Tensor) -> Tensor:
-    """Compute logits of opacities, clamped to finite bounds, divided by 3."""
-    return torch.logit(opacities.clamp(1e-4, 1 - 1e-4)) / 3
+def in_order(values: np.ndarray) -> np.ndarray:
+    """Return an array as float32 in C order."""
+    return np.ascontiguousarray(values, np.float32)
+
+
+def _viewmats(cameras: Cameras) -> np.ndarray:
+    return np.ascontiguousarray(as_array(cameras.viewmats), np.float64)
 
 
 def _choose_views(features: FeatureGaussians, members: Members, cameras: Cameras) -> np.ndarray:
@@ -99,43 +88,19 @@ def _choose_views(features: FeatureGaussians, members: Members, cameras: Cameras
     return views
 
 
-def _ray_frames(means: Tensor, views: Tensor, cameras: Cameras) -> Tensor:
-    """Compute frames ``[n,3,3]`` of points in ``views [n]``: image right, image down and the ray as columns."""
-    rotations, centres = cameras.viewmats[:, :3, :3].float()[views], cameras.centres.float()[views]
-    normalize = torch.nn.functional.normalize
-    away = means - centres
-    away = normalize(torch.where(away.norm(dim=1, keepdim=True) > TINY, away, rotations[:, 2]), dim=1)
-    right, ahead = (axis - (axis * away).sum(1, keepdim=True) * away for axis in (rotations[:, 0], rotations[:, 2]))
-    right = normalize(torch.where(right.norm(dim=1, keepdim=True) > 1e-3, right, ahead), dim=1)
-    return torch.stack([right, torch.linalg.cross(away, right), away], 2)
+def part_tokens(
+    parts: Gaussians | Members, ids: np.ndarray, owners: np.ndarray, group_features: GroupFeatures, columns: int = PART
+) -> np.ndarray:
+    """Describe Gaussians ``ids [n]`` of some relative to the Feature Gaussians ``owners [n]`` that they belong to.
 
-
-def part_tokens(parts: Gaussians, group_features: GroupFeatures, owners: Tensor) -> Tensor:
-    """Describe n Gaussians relative to the Feature Gaussians ``owners [n]`` that they belong to, ``[n,PART]``."""
-    g = group_features
-    frames = g.frames[owners].transpose(1, 2)
-    normals = quat_to_rotmat(parts.quats)[torch.arange(len(parts)), :, parts.scales.argmin(1)]
-    axes = frames @ torch.stack([parts.means - g.base.means[owners], normals], 2)
-    scales = parts.scales.sort(1).values.clamp_min(TINY)
-    flat = 1 - scales[:, :1] / scales[:, 1:2]  # a round Gaussian has no normal, so that rounding cannot choose one
-    normals = -flat * axes[:, :, 1] * torch.sign(axes[:, 2:, 1])  # towards the camera
-    columns = [
-        torch.asinh(axes[:, :, 0] / g.sizes[owners, None]),
-        torch.log(scales / g.footprints[owners, None]).clamp(-12, 12) / 4,
-        _logits(parts.opacities)[:, None],
-        SH_C0 * (parts.sh0[:, 0] - g.base.sh0[owners, 0]),
-        normals,
-    ]
-    return torch.cat(columns, 1).nan_to_num()
-
-
-def member_tokens(members: Members, ids: np.ndarray, group_features: GroupFeatures, owners: Tensor) -> Tensor:
-    """Describe members ``ids [n]`` relative to their Feature Gaussians ``owners [n]``, ``[n,MEMBER]``."""
-    columns = (members.means, members.quats, members.scales, members.opacities, members.sh0, members.shN[:, :0])
-    picked = Gaussians(*(torch.from_numpy(column[ids]) for column in columns))
-    tokens = part_tokens(picked, group_features, owners)
-    places = group_features.sizes[owners, None] / group_features.footprints[owners, None] * torch.sinh(tokens[:, :3])
-    return torch.cat([tokens, torch.asinh(places), SH_C0 * picked.sh0[:, 0]], 1)
+    Returned are ``[n,columns]``; of the columns after the first PART ones, MEMBER describes members, others are zero.
+    """
+    g, out = group_features, np.zeros((len(ids), columns), np.float32)
+    describe_parts(
+        parts.means, parts.quats, parts.scales, parts.opacities, parts.sh0, g.base.means, g.base.sh0, g.frames,
+        g.sizes, g.footprints, ids.astype(np.int64, copy=False), owners, columns == MEMBER, out,
+    )  # fmt: skip
+    return out
 
 
 def split_tables(sizes: np.ndarray, max_width: int) -> Iterator[tuple[np.ndarray, int]]:
@@ -143,7 +108,8 @@ def split_tables(sizes: np.ndarray, max_width: int) -> Iterator[tuple[np.ndarray
 
     Which groups share a table depends only on the sizes. Groups larger than ``max_width`` are sampled.
     """
-    widths = np.minimum(1 << np.ceil(np.log2(np.maximum(sizes, 1))).astype(np.int64), max_width)
+    bits = np.frexp(np.maximum(sizes, 1) - 0.5)[1].astype(np.int64)  # of the next power of two
+    widths = np.minimum(1 << bits, max_width)
     for width in np.unique(widths):
         rows = np.flatnonzero(widths == width)
         step = max(1, TOKENS // int(width))

@@ -138,7 +138,7 @@ def _decode_count(merged: MergedViews, scene: Scene, count: int | None, options:
     features, members, networks = merged.features, merged.members, merged.networks
     children = None
     if count is not None:
-        most = MAX_CHILDREN if networks is None else networks.networks.max_children
+        most = MAX_CHILDREN if networks is None else networks.options.max_children
         children = split_counts(features, members, max(0, count - len(features)), most)
     elif options.k == MIXED:
         children = mixed_counts(features, members, scene_saliency(scene_pictures(scene)), options)
@@ -148,7 +148,7 @@ def _decode_count(merged: MergedViews, scene: Scene, count: int | None, options:
 def _decode_exactly(merged: MergedViews, count: int, options: DecodeOptions) -> Gaussians:
     """Decode ``count`` visible Gaussians where they lower distortion most."""
     features, members, networks = merged.features, merged.members, merged.networks
-    most = MAX_CHILDREN if networks is None else networks.networks.max_children
+    most = MAX_CHILDREN if networks is None else networks.options.max_children
     every = replace(options, min_opacity=0.0)
     return deal_visible(
         deal_order(features, members, most),

@@ -15,39 +15,42 @@ from gsmerge.types import Cameras, FeatureGaussians, Groups, Scene, to_float32
 
 if TYPE_CHECKING:
     from gsmerge.networks.apply import NetworkContext
-    from gsmerge.networks.modules import Networks
+    from gsmerge.networks.weights import NetworkWeights
 
 
-def make_context(networks: Networks | None, members: Members, cameras: Cameras, seed: int) -> NetworkContext | None:
+def make_context(
+    networks: NetworkWeights | None, members: Members, cameras: Cameras, seed: int
+) -> NetworkContext | None:
     """Return networks with the facts of a scene that they read; None without networks."""
     if networks is None:
         return None
-    from gsmerge.networks.apply import NetworkContext  # torch, loaded where there are networks
+    from gsmerge.networks.apply import NetworkContext
 
     return NetworkContext(networks, members, cameras, seed)
 
 
 @stage("encode")
-def encode(
-    scene: Scene,
-    members: Members,
-    groups: Groups,
-    networks: NetworkContext | None = None,
-    rule: Rule = "depth",
-    *,
-    weaken: bool = False,
-) -> FeatureGaussians:
+def encode(scene: Scene, members: Members, groups: Groups, rule: Rule = "depth") -> FeatureGaussians:
     """Pool every superpixel into one Feature Gaussian, in order of view and label.
 
     Superpixels without a valid member are left out. ``rule``: see
-    :func:`gsmerge.moments.pool_members`. ``weaken``: lower the optical depth of groups that other
-    views see through, where no network corrects them; a long fit closes the holes that this leaves,
-    and moves what stands before other views less.
+    :func:`gsmerge.moments.pool_members`.
     """
     starts, ids, views = member_rows(scene, members, groups)
-    features = from_moments(pool_members(members, starts, ids, rule), starts, ids, views)
+    return from_moments(pool_members(members, starts, ids, rule), starts, ids, views)
+
+
+@stage("encode")
+def correct(
+    features: FeatureGaussians, members: Members, cameras: Cameras, networks: NetworkContext | None, *, weaken: bool
+) -> FeatureGaussians:
+    """Correct pooled Feature Gaussians by the encoder, which adds their latents, too.
+
+    ``weaken``: without networks, lower the optical depth of groups that other views see through; a
+    long fit closes the holes that this leaves, and moves what stands before other views less.
+    """
     if networks is None:
-        return weaken_contradicted(features, members, scene.cameras) if weaken else features
+        return weaken_contradicted(features, members, cameras) if weaken else features
     from gsmerge.networks.apply import encode_features
 
     return encode_features(features, networks)

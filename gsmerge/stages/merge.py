@@ -123,10 +123,11 @@ def pool_runs(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray) -
 
 
 def _pool_latents(latents: Array, share: np.ndarray, run: np.ndarray, count: int) -> Array:
-    """Return weighted sums ``[count,d]`` of latents ``[m,d]`` over runs; gradients pass."""
-    if latents.shape[1] == 0:
-        return np.zeros((count, 0), np.float32)
+    """Return weighted sums ``[count,d]`` of latents ``[m,d]`` over runs; gradients pass, where they are tensors."""
+    if isinstance(latents, np.ndarray):
+        sums = np.zeros((count, latents.shape[1]), np.float32)
+        np.add.at(sums, run, latents * share[:, None])
+        return sums
     import torch
 
-    weighted = as_tensor(latents) * as_tensor(share)[:, None]
-    return torch.zeros(count, latents.shape[1]).index_add(0, as_tensor(run), weighted)
+    return torch.zeros(count, latents.shape[1]).index_add(0, as_tensor(run), latents * as_tensor(share)[:, None])

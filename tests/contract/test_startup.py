@@ -52,21 +52,29 @@ def test_import_loads_nothing_heavy() -> None:
     assert loaded_after("import gsmerge") == set()
 
 
-def test_compacting_loads_neither_torch_nor_scipy(made_scene: Path, tmp_path: Path) -> None:
-    """Which take longer to load than a small scene takes to merge."""
-    arguments = ["compact", str(made_scene), "-o", str(tmp_path / "small.ply")]
-    code = f"from gsmerge.cli import main\nassert main({arguments!r}) == 0\nimport sys\n"
+@pytest.mark.parametrize(
+    "settings", [[], ["--fit", "none"], ["--effort", "draft"], ["--recipe", "paper"]], ids=" ".join
+)
+def test_compacting_loads_neither_torch_nor_scipy(settings: list[str], made_scene: Path, tmp_path: Path) -> None:
+    """Which take longer to load than a small scene takes to merge.
+
+    The scene counts as a large one, for which a GPU would be taken.
+    """
+    arguments = ["compact", str(made_scene), "-o", str(tmp_path / "small.ply"), *settings]
+    large = "import gsmerge.gpu\ngsmerge.gpu.MIN_PIXELS, gsmerge.gpu.has_driver = 0, lambda: False\n"
+    code = f"{large}from gsmerge.cli import main\nassert main({arguments!r}) == 0\nimport sys\n"
     modules = set(run_python(f"{code}print(*sys.modules)").splitlines()[-1].split())
     heavy = ("linalg", "ndimage", "optimize", "spatial", "sparse")
     assert modules.isdisjoint({"torch", "skimage", *(f"scipy.{name}" for name in heavy)})
 
 
-def test_compacting_needs_neither_torch_nor_scipy(made_scene: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("settings", [[], ["--fit", "none"]], ids=" ".join)
+def test_compacting_needs_neither_torch_nor_scipy(settings: list[str], made_scene: Path, tmp_path: Path) -> None:
     """As if they were not installed; the result is the same to the last bit."""
     outputs = [tmp_path / "with.ply", tmp_path / "without.ply"]
     for output, missing in zip(outputs, ((), ("torch", "scipy", "skimage")), strict=True):
         hide = f"import sys\nsys.modules.update(dict.fromkeys({missing!r}))\n"
-        arguments = ["compact", str(made_scene), "-o", str(output)]
+        arguments = ["compact", str(made_scene), "-o", str(output), *settings]
         run_python(f"{hide}from gsmerge.cli import main\nassert main({arguments!r}) == 0")
     assert outputs[0].read_bytes() == outputs[1].read_bytes()
 

@@ -52,7 +52,7 @@ def test_the_paper_s_training_then_compact(scene_copy: Path, run: Run) -> None:
     assert (options.outputs, options.width, options.bounds.mean) == ("absolute", 16, 0.5)
     assert (training["photo_loss"], training["segmentation"], training["random_views"]) == ("mse", "bass-st", [1, 12])
     assert trained.training["figures"]["matched"] > 0.05
-    assert bool(trained.networks.merger.out.weight.any())
+    assert trained.networks.arrays["merger.out.weight"].any()
     again = json.loads(run(*call, "--validation", scene_copy, "--json").out)
     assert (again["step"], again["resumed"], again["notes"], again["validation_loss"]) == (6, 6, [], None)
     small = scene_copy / "small.ply"

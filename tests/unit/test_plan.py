@@ -73,7 +73,8 @@ def test_a_draft_without_a_fit_leaves_out_nothing() -> None:
     [
         ({}, True, True, "none"), ({}, False, True, "shipped"), ({"fit": "none"}, True, True, "shipped"),
         ({"fit_steps": 60}, True, True, "shipped"), ({"fit_steps": 61}, True, True, "none"),
-        ({"effort": "fast", "fit": "none"}, True, True, "none"), ({"fit": "none"}, True, False, "none"),
+        ({"effort": "fast", "fit": "none"}, True, True, "shipped"), ({"fit": "none"}, True, False, "none"),
+        ({"effort": "fast"}, True, True, "none"), ({"effort": "draft"}, False, True, "shipped"),
         ({"checkpoint": "own.safetensors"}, True, True, "own.safetensors"),
         ({"checkpoint": "none"}, False, True, "none"),
     ],
@@ -87,6 +88,19 @@ def test_networks_compete_unless_they_are_named(scene: Scene) -> None:
     assert [one is None for one in plan_of(blind).networks] == [False, True]
     assert [one is None for one in plan_of(blind, checkpoint="shipped").networks] == [False]
     assert plan_of(blind, checkpoint="none").networks == (None,)
+
+
+def test_quick_efforts_run_the_heads_alone(scene: Scene) -> None:
+    """Unless the networks are named: the refiner takes ten times as long."""
+    blind = replace(scene, images=None)
+    for settings, refines in (
+        ({}, True), ({"effort": "fast"}, False), ({"effort": "draft"}, False),
+        ({"effort": "draft", "checkpoint": "shipped"}, True),
+    ):  # fmt: skip
+        networks = plan_of(blind, **settings).networks[0]
+        assert networks.options.refiner is refines
+        assert any(name.startswith("heads.4") for name in networks.arrays)
+        assert any(name.startswith("refiner") for name in networks.arrays) is refines
 
 
 def test_a_missing_checkpoint_is_noted(scene: Scene) -> None:

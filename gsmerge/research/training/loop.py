@@ -26,8 +26,8 @@ from torch.nn import Parameter
 from gsmerge.errors import SceneError
 from gsmerge.io.atomic import atomic_output
 from gsmerge.networks.checkpoint import save_checkpoint
+from gsmerge.networks.corrections import LOGIT
 from gsmerge.networks.modules import Head, Networks
-from gsmerge.networks.residuals import LOGIT
 from gsmerge.research.training.examples import Example, draw_views
 from gsmerge.research.training.losses import correction_loss, scaled_corrections, target_scales, window_loss
 from gsmerge.research.training.predict import predict
@@ -180,8 +180,8 @@ def _save(out: Path, state: TrainingState, rows: Sequence[Row], head: Mapping[st
             assert isinstance(module, Head)
             module.out.bias[LOGIT] += options.opacity_shift
     if is_best(rows, options):
-        save_checkpoint(out / "best.safetensors", networks, training)
-    save_checkpoint(out / "last.safetensors", networks, training)
+        save_checkpoint(out / "best.safetensors", networks.weights(), training)
+    save_checkpoint(out / "last.safetensors", networks.weights(), training)
     lines = [",".join(rows[0]), *(",".join(f"{value:.8g}" for value in row.values()) for row in rows)]
     with atomic_output(out / "losses.csv", overwrite=True) as temporary:
         temporary.write_text("\n".join(lines) + "\n")

@@ -16,8 +16,10 @@ from torch import Tensor
 
 from gsmerge.measure.lpips import lpips_loss
 from gsmerge.moments import Members, pool_members, principal_axes
+from gsmerge.networks.corrections import ROTATION, residual_limits
 from gsmerge.networks.modules import Networks
-from gsmerge.networks.residuals import RESIDUAL, ROTATION, gaussian_sizes, quat_to_rotmat, residual_limits
+from gsmerge.networks.options import RESIDUAL
+from gsmerge.networks.tensors import gaussian_sizes, quat_to_rotmat
 from gsmerge.render.autograd import render_tensors
 from gsmerge.render.photos import NEAR
 from gsmerge.research.training.predict import Prediction, analytic_gaussians, crop_targets, predict
@@ -50,7 +52,7 @@ def scaled_corrections(
     Targets are clamped to the bounds of the networks, and to a few standard deviations.
     """
     targets, scored = crop_targets(crop)
-    limits = 2 * residual_limits(options.network.bounds)  # of all stages together
+    limits = 2 * torch.from_numpy(residual_limits(options.network.bounds))  # of all stages together
     clamped = targets[scored].clamp(-limits, limits) / scales[crop.k]
     return corrections[scored] / scales[crop.k], clamped.clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS)
 

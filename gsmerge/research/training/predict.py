@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from gsmerge.networks.apply import NetworkContext, prepare_children, run_encoder, run_heads, run_merger, run_refiner
+from gsmerge.networks.corrections import MEAN
 from gsmerge.networks.modules import Networks
-from gsmerge.networks.residuals import MEAN, move_gaussians, rotate_vectors
+from gsmerge.networks.tensors import move_tensors, rotate_vectors
 from gsmerge.networks.tokens import GroupFeatures
 from gsmerge.research.training.targets import corrections_between
 from gsmerge.research.training.train_options import TrainOptions
@@ -18,7 +19,7 @@ from gsmerge.research.training.windows import Crop
 from gsmerge.stages.decode import divide
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import cluster_runs, merge, pool_runs, take
-from gsmerge.types import FeatureGaussians, Gaussians, Matches
+from gsmerge.types import FeatureGaussians, Gaussians, Matches, as_tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,23 +48,22 @@ def predict(crop: Crop, networks: Networks, options: TrainOptions, seed: int) ->
     group_features = context.describe(parts)
     encoded, shifts = run_encoder(group_features, context)
     matches = match_crop(crop, encoded, options, context)
-    merged, before = _merged(encoded, group_features, shifts, matches, context)
+    merged, before = _merged(encoded, group_features, as_tensor(shifts), matches, context)
     refined, residuals = run_refiner(context.describe(merged), context)
     group_features = context.describe(refined)
     children, parents = divide(refined, example.members, np.full(len(refined), crop.k))
-    children = prepare_children(children.to("cpu"), parents, group_features, networks)
-    heads = run_heads(children, parents, group_features, context)
-    before = before + residuals if crop.k == 1 else torch.zeros_like(heads)
+    children = prepare_children(children, parents, group_features, networks.options)
+    heads = as_tensor(run_heads(children, parents, group_features, context))
+    before = before + as_tensor(residuals) if crop.k == 1 else torch.zeros_like(heads)
     last = heads + (before - before.detach())  # adds the gradient of earlier corrections, which the base has already
-    own = torch.from_numpy(parents)
-    frames = group_features.frames[own]
-    gaussians, corrections = move_gaussians(children, last, frames), before + heads
+    frames = torch.from_numpy(group_features.frames[parents])
+    gaussians, corrections = move_tensors(children.to("cpu"), last, frames), before + heads
     if example.targets and networks.options.outputs == "absolute":
         analytic, _ = divide(merge(parts, matches), example.members, np.full(len(refined), crop.k))
         corrections = corrections_between(analytic.to("cpu"), gaussians, frames)
     sizes = np.bincount(matches.clusters, minlength=matches.count)
     matched = float(sizes[sizes > 1].sum()) / max(1, len(matches.clusters))
-    return Prediction(gaussians, own, refined, corrections, matched)
+    return Prediction(gaussians, torch.from_numpy(parents), refined, corrections, matched)
 
 
 def analytic_gaussians(crop: Crop, options: TrainOptions) -> Gaussians:
@@ -117,13 +117,16 @@ def _merged(
         return parts, shifts
     pooled = pool_runs(parts, order, cuts)
     of_pooled = context.describe(pooled)
-    moved = rotate_vectors(group_features.frames, shifts[:, MEAN] * group_features.sizes[:, None])[order]
+    frames, sizes = torch.from_numpy(group_features.frames), torch.from_numpy(group_features.sizes)
+    moved = rotate_vectors(frames, shifts[:, MEAN] * sizes[:, None])[order]
     run = torch.from_numpy(np.repeat(np.arange(len(cuts)), np.diff(np.append(cuts, len(order)))))
     weights = torch.from_numpy(parts.weights[order])
     share = weights / torch.zeros(len(cuts)).index_add(0, run, weights)[run].clamp_min(1e-12)
     world = torch.zeros(len(cuts), 3).index_add(0, run, share[:, None] * moved)
-    local = rotate_vectors(of_pooled.frames.transpose(1, 2), world) / of_pooled.sizes[:, None]
-    pooled, residuals = run_merger(of_pooled, parts, order, cuts, context)
+    back, sizes = torch.from_numpy(of_pooled.frames).transpose(1, 2), torch.from_numpy(of_pooled.sizes)
+    local = rotate_vectors(back, world) / sizes[:, None]
+    pooled, raw = run_merger(of_pooled, parts, order, cuts, context)
+    residuals = as_tensor(raw)
     from_encoder = torch.cat([local, torch.zeros(len(cuts), residuals.shape[1] - 3)], 1)
     merged = FeatureGaussians.concat([take(parts, alone), pooled])
     return merged, torch.cat([shifts[alone], residuals + from_encoder])

@@ -14,7 +14,9 @@ import torch
 from torch import Tensor
 
 from gsmerge.errors import SceneError
-from gsmerge.networks.residuals import COLOR, LOGIT, MEAN, RESIDUAL, ROTATION, SIZE, gaussian_sizes, quat_to_rotmat
+from gsmerge.networks.corrections import COLOR, LOGIT, MEAN, ROTATION, SIZE
+from gsmerge.networks.options import RESIDUAL
+from gsmerge.networks.tensors import gaussian_sizes, quat_to_rotmat
 from gsmerge.networks.tokens import compute_group_features
 from gsmerge.render.photos import Photos
 from gsmerge.research.training.scenes import TrainingScene, coverage, covered_pixels, reduced_masks
@@ -23,7 +25,7 @@ from gsmerge.stages.decode import DecodeOptions, divide
 from gsmerge.stages.fit.fit_options import FitOptions
 from gsmerge.stages.fit.full import Masks, fit_full
 from gsmerge.stages.fit.stage import visible_mask
-from gsmerge.types import SH_C0, FeatureGaussians, Gaussians
+from gsmerge.types import SH_C0, FeatureGaussians, Gaussians, as_tensor
 
 Progress = Callable[[int, int], None]  # step, steps
 
@@ -52,7 +54,7 @@ def fit_targets(
     photos, masks = (training.photos(), training.photos(2)), covered_pixels(coverage(training))
     masks[: len(training.scene)] = True  # of the other photos, only what the scene covers counts
     sized = masks, reduced_masks(masks, photos[1])
-    frames = compute_group_features(merged, training.members, training.scene.cameras).frames
+    frames = as_tensor(compute_group_features(merged, training.members, training.scene.cameras).frames)
     targets = {}
     for number, k in enumerate(options.levels):
 

@@ -11,7 +11,7 @@ from typing import Any
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import read_table
 from gsmerge.measure.lpips import require_lpips
-from gsmerge.networks.modules import SLOTS, NetworkOptions
+from gsmerge.networks.options import SLOTS, NetworkOptions
 from gsmerge.stages.fit.loss import LOSS_WINDOW
 from gsmerge.stages.match import MatchOptions
 from gsmerge.stages.superpixels import SegmentOptions

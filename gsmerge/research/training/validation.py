@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from gsmerge.measure.preview import save_picture, to_picture
+from gsmerge.networks.corrections import COLOR, LOGIT, MEAN, ROTATION, SIZE
 from gsmerge.networks.modules import Networks
-from gsmerge.networks.residuals import COLOR, LOGIT, MEAN, ROTATION, SIZE
 from gsmerge.research.training.examples import Example, draw_views
 from gsmerge.research.training.losses import correction_loss, render_window, scaled_corrections, window_psnr
 from gsmerge.research.training.predict import predict

@@ -180,13 +180,19 @@ def holdout_score(state: State, plan: FitPlan) -> float:
     return holdout_psnr(images, plan.photos[1], plan.weights[1], plan.options.tuning.min_gain)
 
 
-def score_to_beat(own: float, baseline_start: Gaussians | None, plan: FitPlan) -> float:
-    """Return the PSNR (dB) of the held-out blocks that a fit has to beat: of its start, or of a worse baseline.
+def judge(
+    state: State, own: float, baseline_start: Gaussians | None, photos: tuple[Photos, ...], plan: FitPlan
+) -> tuple[float, float]:
+    """Return the PSNR (dB) of the held-out blocks that a fit has to beat, and its own.
 
-    Networks learn to show whole photos. A fit to the other blocks then makes the held-out ones
-    worse and new views better, so it is compared with the start without networks.
+    To beat are ``own``, of its start, or a worse baseline: networks learn to show whole photos, and a
+    fit to the other blocks then makes the held-out ones worse and new views better. The baseline is
+    looked at only where the fit does not beat its start, with the cameras of ``photos``.
     """
-    return own if baseline_start is None else min(own, holdout_score(start_state(baseline_start), plan))
+    after = holdout_score(state, plan)
+    if baseline_start is None or after > own:
+        return own, after
+    return min(own, holdout_score(start_state(baseline_start), replace(plan, photos=photos))), after
 
 
 @dataclass
@@ -233,14 +239,14 @@ def fit_full(
     ``photos`` come at full and at half size, and larger if the fit is to see them. ``count``:
     number of Gaussians to grow to, where the run is long enough. ``masks``: pixels that count;
     where no Gaussian is, none should be drawn to. ``baseline_start``: another start that the fit
-    may beat instead, see :func:`score_to_beat`. ``look``: a survey of the Gaussians, where there is
+    may beat instead, see :func:`judge`. ``look``: a survey of the Gaussians, where there is
     one already. ``progress`` is called after every step.
     """
     rng, state, plan = np.random.default_rng(seed), start_state(gaussians), plan_run(photos, options, seed, masks)
     tail = TailMean()
     look = survey_photos(gaussians, photos) if look is None else look
     own, state.box_shares[:], state.min_sizes[:] = initial_scores(look, plan)
-    after = before = score_to_beat(own, baseline_start, plan)
+    before = after = own
     queue: list[int] = []
     grows, step, steps, error, judged = options.grows, 0, options.steps, 0.0, False
     started = time.perf_counter()
@@ -249,7 +255,7 @@ def fit_full(
         if grows and part >= GROWTH and len(state.x) < count:
             state = grow_to(state, plan.photos[1], count)
         if part >= plan.half_part and not judged:
-            after, judged = holdout_score(state, plan), True
+            (before, after), judged = judge(state, own, baseline_start, photos, plan), True
             if after <= before:
                 break
         if not queue:
@@ -262,7 +268,8 @@ def fit_full(
             steps = affordable_steps(time.perf_counter() - started, plan)
         if progress:
             progress(step, steps, decibels(error), after)
-    after = after if judged else holdout_score(state, plan)
+    if not judged:
+        before, after = judge(state, own, baseline_start, photos, plan)
     if after <= before:
         why = f"held-out parts of the photos were no better after {step} steps"
         return gaussians, FitReport("none", False, step, before, after, why)

@@ -122,7 +122,7 @@ def fit(
     ``photos``: see :func:`gsmerge.stages.fit.photo_sizes.fit_photos`; the CPU alone fits to
     larger ones, and moves cameras. ``count``: number of Gaussians that the full fit may grow to; if it is ``exact``
     and nothing grows, nothing is left out either. ``baseline_start``: another start that the full
-    fit may beat instead, see :func:`gsmerge.stages.fit.full.score_to_beat`. The report is None if
+    fit may beat instead, see :func:`gsmerge.stages.fit.full.judge`. The report is None if
     nothing was asked for.
     """
     if exact and not options.grows:

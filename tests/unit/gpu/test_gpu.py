@@ -29,6 +29,7 @@ def _fresh() -> Iterator[None]:
 def checks(monkeypatch: pytest.MonkeyPatch) -> list[str | None]:
     """A CUDA device and gsplat; gives what the self-checks of these tests say, the next one last."""
     results: list[str | None] = []
+    monkeypatch.setattr(package, "has_driver", lambda: True)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(cuda, "gsplat_problem", lambda: None)
     monkeypatch.setattr(self_check, "find_difference", lambda device: results.pop())
@@ -63,7 +64,9 @@ def test_gsplat_that_cannot_be_used_is_noted(
 
 def test_computer_without_cuda_is_noted_only_where_cuda_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert choose_backend("auto", MIN_PIXELS) == (ON_CPU, None)
+    for driver in (False, True):
+        monkeypatch.setattr(package, "has_driver", lambda driver=driver: driver)
+        assert choose_backend("auto", MIN_PIXELS) == (ON_CPU, None)
     note = "the fit and the scores run on the CPU, not on a GPU: torch finds no CUDA device"
     assert choose_backend("cuda", MIN_PIXELS) == (ON_CPU, note)
 

@@ -14,7 +14,8 @@ from gsmerge import Scene
 from gsmerge.encoded.to_encoded import encode_scene
 from gsmerge.errors import UsageError
 from gsmerge.networks.checkpoint import save_checkpoint
-from gsmerge.networks.modules import NetworkOptions, Networks
+from gsmerge.networks.modules import Networks
+from gsmerge.networks.options import NetworkOptions
 from gsmerge.online.extend import extend
 from gsmerge.online.options import OnlineOptions
 from gsmerge.options import CompactOptions
@@ -35,7 +36,7 @@ def absolute(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for parameter in networks.parameters():
         parameter.data += 0.05 * torch.randn_like(parameter)
     path = tmp_path_factory.mktemp("networks") / "absolute.safetensors"
-    save_checkpoint(path, networks, {})
+    save_checkpoint(path, networks.weights(), {})
     return path
 
 
@@ -76,7 +77,7 @@ def test_it_needs_networks(checkpoint: str) -> None:
 
 def test_other_networks_are_refused(scene: Scene, tmp_path: Path) -> None:
     path = tmp_path / "residual.safetensors"
-    save_checkpoint(path, Networks(replace(SMALL, outputs="residual")), {})
+    save_checkpoint(path, Networks(replace(SMALL, outputs="residual")).weights(), {})
     for checkpoint in (str(path), "shipped"):
         with pytest.raises(UsageError, match=r"expected networks with absolute outputs, .* has residual ones"):
             scenes.compacted(scene, recipe="paper", checkpoint=checkpoint)

@@ -15,8 +15,10 @@ from training_runs import OPTIONS, TINY, written
 from gsmerge.errors import SceneError
 from gsmerge.networks.apply import NetworkContext, encode_features, refine_features, run_heads
 from gsmerge.networks.checkpoint import load_checkpoint
-from gsmerge.networks.modules import Bounds, NetworkOptions, Networks
-from gsmerge.networks.residuals import LOGIT, MEAN, SIZE, bound_residuals, move_gaussians
+from gsmerge.networks.corrections import LOGIT, MEAN, SIZE, residual_limits
+from gsmerge.networks.modules import Networks
+from gsmerge.networks.options import Bounds, NetworkOptions
+from gsmerge.networks.tensors import move_tensors
 from gsmerge.research.training import (
     Example,
     Shard,
@@ -83,8 +85,8 @@ def test_differences_undo_corrections(example: Example) -> None:
     raw = torch.randn(len(start), 13, generator=torch.Generator().manual_seed(0))
     frames = torch.linalg.qr(torch.randn(len(start), 3, 3, generator=torch.Generator().manual_seed(1)))[0]
     frames = frames * torch.linalg.det(frames)[:, None, None]
-    expected = bound_residuals(raw, TINY.bounds, 0.5)
-    actual = corrections_between(start, move_gaussians(start, expected, frames), frames)
+    expected = 0.5 * torch.from_numpy(residual_limits(TINY.bounds)) * raw.tanh()
+    actual = corrections_between(start, move_tensors(start, expected, frames), frames)
     torch.testing.assert_close(actual, expected, atol=2e-4, rtol=1e-3)
 
 
@@ -113,20 +115,20 @@ def test_crops_hold_whole_clusters_and_their_targets(example: Example) -> None:
 def test_what_is_trained_is_what_runs(example: Example) -> None:
     """The corrections of a crop that holds everything are those that the stages make."""
     networks = noisy(TINY)
-    learned = NetworkContext(networks, example.members, example.cameras, 5)
+    learned = NetworkContext(networks.weights(), example.members, example.cameras, 5)
     encoded = encode_features(example.features, learned)
     refined = refine_features(merge(encoded, example.matches, learned), learned)
     with torch.no_grad():
         real = predict(everything(example, 2), networks, OPTIONS, 5).corrections
     group_features = learned.describe(refined)
     children, parents = divide(refined, example.members, np.full(len(refined), 2))
-    expected = run_heads(children.to("cpu"), parents, group_features, learned)
-    torch.testing.assert_close(real, expected, atol=1e-5, rtol=1e-5)
+    expected = run_heads(children, parents, group_features, learned)
+    torch.testing.assert_close(real, torch.from_numpy(expected), atol=1e-5, rtol=1e-5)
     with torch.no_grad():
         total = predict(everything(example, 1), networks, OPTIONS, 5).corrections
     final = decode(refined, example.members, DecodeOptions(min_opacity=0), networks=learned)
     start = analytic_gaussians(everything(example, 1), OPTIONS)
-    frames = learned.describe(merge(example.features, example.matches)).frames
+    frames = torch.from_numpy(learned.describe(merge(example.features, example.matches)).frames)
     made = corrections_between(start.to("cpu"), final.to("cpu"), frames)
     for columns in (MEAN, SIZE, slice(LOGIT, LOGIT + 1)):  # later stages stand in other frames and sizes
         pair = torch.stack([total[:, columns].reshape(-1), made[:, columns].reshape(-1)])
@@ -236,15 +238,15 @@ def test_checkpoints_show_more_than_the_networks_in_training(shard: Shard, tmp_p
     weights = []
     for shift in (0.0, 0.25):
         done = train([shard], [], tmp_path / str(shift), replace(OPTIONS, steps=4, opacity_shift=shift))
-        weights.append(load_checkpoint(done.last).networks.state_dict())
+        weights.append(load_checkpoint(done.last).networks.arrays)
         rows = (tmp_path / str(shift) / "losses.csv").read_text()
     before, after = weights
     for name in before:
         difference = after[name] - before[name]
         if name in {f"heads.{slots}.out.bias" for slots in (1, 2, 4)}:
-            torch.testing.assert_close(difference, 0.25 * (torch.arange(13) == LOGIT))
+            np.testing.assert_allclose(difference, 0.25 * (np.arange(13) == LOGIT), rtol=1e-5)
         else:
-            assert not bool(difference.any())
+            assert not difference.any()
     assert rows == (tmp_path / "0.0" / "losses.csv").read_text()
 
 

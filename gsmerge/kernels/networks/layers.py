@@ -1,0 +1,64 @@
+"""Layers of the networks on tables of tokens, in float32; every row is computed alone."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsmerge.native.signature import STATUS, f4, i8, native, u1
+
+LANES = 16  # floats of a vector; weights are filled up to whole ones
+PLAIN, GELU, TANH = range(3)  # activations of dense layers
+
+
+@native(
+    STATUS, x=f4("rows", "inputs"), weight=f4("blocks", "inputs", LANES), bias=f4("blocks", LANES),
+    residual=f4("rows", "outputs", optional=True), activation=i8(least=0, most=2), out=f4("rows", "outputs", out=True),
+)  # fmt: skip
+def dense(x, weight, bias, residual, activation, out):
+    """Write ``activation(x W + b + residual)``; weights and bias are those of :func:`pack`.
+
+    ``activation``: PLAIN, GELU, or TANH, which is 0 for NaN. ``residual``: None for zero.
+    """
+
+
+@native(x=f4("rows", "width"), gains=f4("width"), shifts=f4("width"), out=f4("rows", "width", out=True))
+def normalise(x, gains, shifts, out):
+    """Write the rows of ``x`` with mean 0 and variance 1, times ``gains``, plus ``shifts``."""
+
+
+@native(
+    STATUS, query=f4("sets", "queries", "width"), pairs=f4("sets", "tokens", "columns"), mask=u1("sets", "tokens"),
+    heads=i8(least=1), scratch=f4("space", out=True), out=f4("sets", "queries", "mixed", out=True),
+)  # fmt: skip
+def attend(query, pairs, mask, heads, scratch, out):
+    """Write the values of each set's tokens, mixed for each query by its likeness to their keys.
+
+    Args:
+        query: ``[sets,queries,width]``, head by head.
+        pairs: ``[sets,tokens,columns]``: the keys as wide as the queries, then the values, each head of these padded
+            to :func:`padded` columns.
+        mask: ``[sets,tokens]`` uint8, 0 for tokens that do not count.
+        heads: Heads.
+        scratch: Room for the keys of a set, see :func:`scratch_size`.
+        out: ``[sets,queries,mixed]``, written: the mixed values, each head padded.
+    """
+
+
+def padded(count: int) -> int:
+    """Return a number of columns filled up to whole vectors."""
+    return -(-count // LANES) * LANES
+
+
+def scratch_size(tokens: int, width: int) -> int:
+    """Return the floats of scratch that :func:`attend` needs for sets of ``tokens`` with keys of ``width``."""
+    return (width + 2) * padded(tokens)
+
+
+def pack(weight: np.ndarray, bias: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return weights ``[outputs,inputs]`` and bias ``[outputs]`` in blocks of sixteen outputs, the last with zeros."""
+    outputs, inputs = weight.shape
+    full, shift = np.zeros((padded(outputs), inputs), np.float32), np.zeros(padded(outputs), np.float32)
+    full[:outputs], shift[:outputs] = weight, bias
+    return np.ascontiguousarray(full.reshape(-(-outputs // LANES), LANES, inputs).swapaxes(1, 2)), shift.reshape(
+        -1, LANES
+    )

@@ -1,0 +1,48 @@
+"""What the networks read of Gaussians and groups, in a frame of each group; arrays are float32, ids int64."""
+
+from __future__ import annotations
+
+from gsmerge.native.signature import STATUS, f4, f8, i8, native
+
+
+@native(
+    means=f4("g", 3), scales=f4("g", 3), viewmats=f8("v", 4, 4), views=i8("g", least=0, below="v"),
+    frames=f4("g", 3, 3, out=True), sizes=f4("g", out=True),
+)  # fmt: skip
+def place_frames(means, scales, viewmats, views, frames, sizes):
+    """Write the frames of points in their views, and the geometric means of their two largest scales.
+
+    A frame's columns are the image's right, the image's down and the ray, in the world.
+    """
+
+
+@native(
+    STATUS, means=f4("g", 3), scales=f4("g", 3), opacities=f4("g"), sh0=f4("g", 1, 3), covars=f4("g", 3, 3),
+    masses=f4("g"), extinctions=f4("g"), weights=f4("g"), counts=i8("g"), footprints=f4("g"), frames=f4("g", 3, 3),
+    sizes=f4("g"), viewmats=f8("v", 4, 4), views=i8("g", least=0, below="v"), out=f4("g", "columns", out=True),
+)  # fmt: skip
+def describe_groups(
+    means, scales, opacities, sh0, covars, masses, extinctions, weights, counts, footprints, frames, sizes, viewmats,
+    views, out,
+):  # fmt: skip
+    """Write the first 19 columns that describe groups.
+
+    Three log scales, logit of the opacity, mass, optical depth, number of members ``counts`` and their mean opacity,
+    three colours, six entries of the covariance, and two tangents of the angles to the view's axis.
+    """
+
+
+@native(
+    STATUS, means=f4("parts", 3), quats=f4("parts", 4), scales=f4("parts", 3), opacities=f4("parts"),
+    sh0=f4("parts", 1, 3), group_means=f4("g", 3), group_sh0=f4("g", 1, 3), frames=f4("g", 3, 3), sizes=f4("g"),
+    footprints=f4("g"), ids=i8("n", least=0, below="parts"), owners=i8("n", least=0, below="g"),
+    members=i8(least=0, most=1), out=f4("n", "columns", out=True),
+)  # fmt: skip
+def describe_parts(
+    means, quats, scales, opacities, sh0, group_means, group_sh0, frames, sizes, footprints, ids, owners, members, out
+):
+    """Write the first 13 columns that describe the parts ``ids`` relative to the groups ``owners``.
+
+    Three of the position, three log scales, logit of the opacity, three of the colour and three of the normal. With
+    ``members`` six more: the position in pixels, and the colour itself.
+    """

@@ -1,0 +1,185 @@
+"""Sizes of the networks, the bounds of their corrections, and the names and shapes of their weights."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from itertools import pairwise
+from typing import Any
+
+from gsmerge.networks.cross_view_stats import NUM_STATS
+
+SLOTS = (1, 2, 4)  # numbers of children that have a decoder head
+OUTPUTS = ("residual", "absolute")
+PART = 13  # columns of a Gaussian relative to another one: position, log scales, opacity, colour, normal
+MEMBER = PART + 6  # and its position in footprints and its colour
+GROUP = 19 + NUM_STATS  # columns of a whole group
+RESIDUAL = 13  # columns of a correction, see gsmerge.networks.corrections
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Largest correction that the decoder may make, 0: none; merger, refiner and encoder may each make half of it.
+
+    Args:
+        mean: Shift along each axis of the group's frame, in units of the Gaussian's size.
+        size: Change of each log scale.
+        turn: Rotation about each axis of the group's frame, radians.
+        logit: Change of the opacity's logit; of Feature Gaussians, of the logarithm of the optical depth.
+        color: Change of each channel of the base colour, sRGB in [0, 1].
+
+    Raises:
+        ValueError: If one is below 0, or too large to bound anything.
+    """
+
+    mean: float = 1.0
+    size: float = 1.1
+    turn: float = 0.5
+    logit: float = 3.0
+    color: float = 0.25
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= 8:
+                raise ValueError(f"{f.name}: expected a number from 0 to 8, got {value!r}")
+
+
+WIDE = Bounds(mean=4.0, size=6.0, turn=3.2, logit=8.0, color=0.75)  # of absolute outputs
+
+
+@dataclass(frozen=True)
+class NetworkOptions:
+    """Sizes of the networks, and the kind of their heads' output.
+
+    Args:
+        width: Width of the tokens, a multiple of ``heads``.
+        heads: Attention heads.
+        blocks: Set attention blocks of the encoder and of the merger.
+        refine_blocks: Attention blocks of the refiner.
+        latent: Width of a Feature Gaussian's latent.
+        members: Largest number of members that the encoder reads; larger groups are sampled.
+        neighbors: Neighbours that the refiner reads.
+        bounds: Largest corrections.
+        outputs: ``"residual"``: the heads correct the analytic children. ``"absolute"``, as in the paper: they do not
+            read these, and correct a round Gaussian of the group's mean and base colour, within wide bounds.
+        encoder: Whether there is one; without it all latents are zero.
+        merger: Whether there is one; without it clusters are pooled, and no more.
+        refiner: Whether there is one.
+
+    Raises:
+        ValueError: If a size is out of range or they do not go together.
+    """
+
+    width: int = 48
+    heads: int = 4
+    blocks: int = 1
+    refine_blocks: int = 2
+    latent: int = 32
+    members: int = 16
+    neighbors: int = 8
+    bounds: Bounds = field(default_factory=Bounds)
+    outputs: str = "residual"
+    encoder: bool = True
+    merger: bool = True
+    refiner: bool = True
+
+    @property
+    def max_children(self) -> int:
+        """Largest number of children that the heads correct; five or more in two halves, not for absolute outputs."""
+        return SLOTS[-1] if self.outputs == "absolute" else 2 * SLOTS[-1]
+
+    @property
+    def head_bounds(self) -> Bounds:
+        """Largest corrections of the heads."""
+        return WIDE if self.outputs == "absolute" else self.bounds
+
+    def __post_init__(self) -> None:
+        if self.outputs not in OUTPUTS:
+            raise ValueError(f"outputs: expected {' or '.join(OUTPUTS)}, got {self.outputs!r}")
+        limits = {"width": 512, "heads": 16, "blocks": 8, "refine_blocks": 8, "latent": 256, "members": 256}
+        for name, limit in (limits | {"neighbors": 64}).items():
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= limit:
+                raise ValueError(f"{name}: expected a whole number from 1 to {limit}, got {value!r}")
+        for name in ("encoder", "merger", "refiner"):
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"{name}: expected true or false, got {getattr(self, name)!r}")
+        if self.width % self.heads:
+            raise ValueError(f"width: expected a multiple of {self.heads} heads, got {self.width}")
+
+    @staticmethod
+    def from_dict(values: Mapping[str, Any]) -> NetworkOptions:
+        """Read options from what ``dataclasses.asdict`` gave; a ValueError if a name or a value is impossible."""
+        unknown = sorted(values.keys() - {f.name for f in fields(NetworkOptions)})
+        bounds = values.get("bounds", {})
+        if not isinstance(bounds, Mapping):
+            raise ValueError(f"bounds: expected a table, got {bounds!r}")
+        unknown += sorted(bounds.keys() - {f.name for f in fields(Bounds)})
+        if unknown:
+            raise ValueError(f"unknown setting {unknown[0]!r}")
+        return NetworkOptions(**{**values, "bounds": Bounds(**bounds)})
+
+
+def weight_shapes(options: NetworkOptions) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of all weights of the networks by name."""
+    width, latent = options.width, options.latent
+    shapes = dict[str, tuple[int, ...]]()
+    if options.encoder:
+        shapes |= _set_network("encoder.set", MEMBER, options)
+        shapes |= {**_linear("encoder.latent", width, latent), **_linear("encoder.shift", width, 3)}
+    if options.merger:
+        shapes |= _set_network("merger.set", PART + latent, options)
+        shapes |= _linear("merger.out", width, RESIDUAL + latent)
+    if options.refiner:
+        shapes |= _mlp("refiner.embed", PART + 1 + latent, width, width)
+        for i in range(options.refine_blocks):
+            shapes |= _block(f"refiner.blocks.{i}", width)
+        shapes |= {**_norm("refiner.norm", width), **_mlp("refiner.join", width + GROUP, 2 * width, width)}
+        shapes |= _linear("refiner.out", width, RESIDUAL + latent)
+    for slots in SLOTS:
+        head = f"heads.{slots}"
+        shapes |= {
+            **_mlp(f"{head}.seeds", latent + GROUP, width, slots * width),
+            **_linear(f"{head}.child", PART, width),
+        }
+        shapes |= {**_block(f"{head}.block", width), **_norm(f"{head}.norm", width)}
+        shapes |= _linear(f"{head}.out", width, RESIDUAL)
+    return shapes
+
+
+def _set_network(name: str, token: int, options: NetworkOptions) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the part that encoder and merger share."""
+    width = options.width
+    shapes = _mlp(f"{name}.embed", token, width, width)
+    for i in range(options.blocks):
+        shapes |= _block(f"{name}.blocks.{i}", width)
+    shapes |= {f"{name}.pool.seed": (1, 1, width), **_block(f"{name}.pool", width)}
+    return shapes | _mlp(f"{name}.join", width + GROUP, 2 * width, width)
+
+
+def _block(name: str, width: int) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of attention and MLP with their norms."""
+    attention = f"{name}.attention"
+    return {
+        **_norm(f"{name}.before", width),
+        **_norm(f"{name}.between", width),
+        **_linear(f"{attention}.query", width, width),
+        **_linear(f"{attention}.pair", width, 2 * width),
+        **_linear(f"{attention}.out", width, width),
+        **_mlp(f"{name}.mlp", width, 2 * width, width),
+    }
+
+
+def _mlp(name: str, *widths: int) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of linear layers, whose numbers are even: those between are their activations."""
+    layers = (_linear(f"{name}.{2 * i}", *pair) for i, pair in enumerate(pairwise(widths)))
+    return {key: shape for layer in layers for key, shape in layer.items()}
+
+
+def _linear(name: str, inputs: int, outputs: int) -> dict[str, tuple[int, ...]]:
+    return {f"{name}.weight": (outputs, inputs), f"{name}.bias": (outputs,)}
+
+
+def _norm(name: str, width: int) -> dict[str, tuple[int, ...]]:
+    return {f"{name}.weight": (width,), f"{name}.bias": (width,)}

@@ -1,0 +1,55 @@
+"""Corrections of Gaussians as tensors, differentiable, for training; :mod:`gsmerge.networks.corrections` on arrays."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from gsmerge.geometry import rotation_entries
+from gsmerge.networks.corrections import COLOR, LOGIT, MEAN, ROTATION, SIZE
+from gsmerge.types import SH_C0, Gaussians
+
+
+def gaussian_sizes(scales: Tensor) -> Tensor:
+    """Compute the sizes ``[n]`` of Gaussians: geometric mean of the two largest of ``scales [n,3]``."""
+    top = scales.sort(-1).values
+    return (top[..., 1] * top[..., 2]).sqrt()
+
+
+def quat_to_rotmat(quats: Tensor) -> Tensor:
+    """Convert quaternions ``[...,4]`` to rotations ``[...,3,3]``, differentiable."""
+    entries = rotation_entries(*normalize(quats, dim=-1).unbind(-1))
+    return torch.stack(entries, -1).reshape(*quats.shape[:-1], 3, 3)
+
+
+def rotate_quats(vectors: Tensor, quats: Tensor) -> Tensor:
+    """Rotate quaternions ``[n,4]`` by rotation vectors ``[n,3]`` in the world."""
+    half = vectors.norm(dim=-1, keepdim=True).clamp_min(1e-12) / 2
+    w, (x, y, z) = half.cos()[:, 0], (half.sin() / (2 * half) * vectors).unbind(-1)
+    a, b, c, d = quats.unbind(-1)
+    return torch.stack(
+        [w * a - x * b - y * c - z * d, w * b + x * a + y * d - z * c,
+         w * c - x * d + y * a + z * b, w * d + x * c - y * b + z * a], -1,
+    )  # fmt: skip
+
+
+def rotate_vectors(frames: Tensor, vectors: Tensor) -> Tensor:
+    """Convert vectors ``[n,3]`` from frames ``[n,3,3]`` to the world."""
+    return (frames @ vectors[:, :, None])[:, :, 0]
+
+
+def move_tensors(gaussians: Gaussians, residuals: Tensor, frames: Tensor) -> Gaussians:
+    """Apply corrections ``[n,13]`` to n Gaussians, tensors, in frames ``[n,3,3]`` with axes as columns, world."""
+    g = gaussians
+    odds, factor = g.opacities, torch.exp(residuals[:, LOGIT])
+    return replace(
+        g,
+        means=g.means + rotate_vectors(frames, residuals[:, MEAN] * gaussian_sizes(g.scales)[:, None]),
+        quats=rotate_quats(rotate_vectors(frames, residuals[:, ROTATION]), g.quats),
+        scales=g.scales * torch.exp(residuals[:, SIZE]),
+        opacities=(odds * factor / (1 + odds * (factor - 1))).clamp(0, 1),  # the logit plus the correction
+        sh0=g.sh0 + residuals[:, None, COLOR] / SH_C0,
+    )

@@ -1,0 +1,147 @@
+"""The networks as arrays of weights, and their forward pass through the native library.
+
+It is the arithmetic of :mod:`gsmerge.networks.modules`, which training needs, to rounding, without torch. Every group
+is computed alone: results depend neither on the table that it shares with others nor on the number of threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from gsmerge.kernels.networks.layers import GELU, PLAIN, TANH, attend, dense, normalise, pack, padded, scratch_size
+from gsmerge.networks.options import NetworkOptions
+
+Layer = tuple[np.ndarray, np.ndarray, int]  # packed weights, packed bias, outputs
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkWeights:
+    """The networks of a checkpoint: their sizes, and their weights by name, float32."""
+
+    options: NetworkOptions
+    arrays: Mapping[str, np.ndarray]
+
+    in_parallel = True  # tables of groups may run in several threads
+
+    @property
+    def num_parameters(self) -> int:
+        """Number of weights in the checkpoint."""
+        return sum(array.size for array in self.arrays.values())
+
+    def heads_alone(self) -> NetworkWeights:
+        """Return the decoder heads without the other networks, which take ten times as long."""
+        options = replace(self.options, encoder=False, merger=False, refiner=False)
+        return NetworkWeights(
+            options, {name: array for name, array in self.arrays.items() if name.startswith("heads.")}
+        )
+
+    def run(self, name: str, *inputs: np.ndarray) -> np.ndarray:
+        """Run ``"encoder"``, ``"merger"``, ``"refiner"`` or ``"heads.K"`` on a table of b groups.
+
+        Inputs are those of the module of the same name. Returned are its outputs side by side, ``[b,columns]``, through
+        tanh, 0 for NaN; those of a head are ``[b,K * 13]``.
+        """
+        if name.startswith("heads."):
+            return self._run_head(name, *inputs)
+        return self._run_refiner(*inputs) if name == "refiner" else self._run_set_network(name, *inputs)
+
+    def _run_set_network(self, name: str, tokens: np.ndarray, mask: np.ndarray, group: np.ndarray) -> np.ndarray:
+        part = f"{name}.set"
+        x = self._mlp(f"{part}.embed", tokens)
+        for i in range(self.options.blocks):
+            x = self._block(f"{part}.blocks.{i}", x, mask)
+        pooled = self._pool(f"{part}.pool", x, mask)
+        hidden = self._mlp(f"{part}.join", np.concatenate([pooled, group], 1), GELU)
+        outs = ("latent", "shift") if name == "encoder" else ("out",)
+        return np.concatenate([self._dense(f"{name}.{out}", hidden, TANH) for out in outs], 1)
+
+    def _run_refiner(self, tokens: np.ndarray, mask: np.ndarray, group: np.ndarray) -> np.ndarray:
+        x = self._mlp("refiner.embed", tokens)
+        last = self.options.refine_blocks - 1
+        for i in range(last + 1):
+            x = self._block(f"refiner.blocks.{i}", x, mask, first=i == last)
+        own = self._norm("refiner.norm", x[:, 0])
+        hidden = self._mlp("refiner.join", np.concatenate([own, group], 1), GELU)
+        return self._dense("refiner.out", hidden, TANH)
+
+    def _run_head(
+        self, name: str, latents: np.ndarray, group: np.ndarray, children: np.ndarray, mask: np.ndarray
+    ) -> np.ndarray:
+        seeds = self._mlp(f"{name}.seeds", np.concatenate([latents, group], 1))
+        x = self._dense(f"{name}.child", children, residual=seeds.reshape(*children.shape[:2], self.options.width))
+        x = self._norm(f"{name}.norm", self._block(f"{name}.block", x, mask))
+        return self._dense(f"{name}.out", x, TANH).reshape(len(children), -1)
+
+    def _block(self, name: str, x: np.ndarray, mask: np.ndarray, *, first: bool = False) -> np.ndarray:
+        """Run attention and an MLP; ``first``: for the first token alone."""
+        context = self._norm(f"{name}.before", x)
+        x, query = (x[:, :1], context[:, :1]) if first else (x, context)
+        x = self._attention(f"{name}.attention", query, context, mask, x)
+        return self._mlp(f"{name}.mlp", self._norm(f"{name}.between", x), residual=x)
+
+    def _pool(self, name: str, x: np.ndarray, mask: np.ndarray) -> np.ndarray:
+        """Reduce sets ``[b,n,w]`` to one token each, ``[b,w]``."""
+        query = np.repeat(self.arrays[f"{name}.seed"], len(x), 0)
+        pooled = self._attention(f"{name}.attention", query, self._norm(f"{name}.before", x), mask, query)
+        return self._mlp(f"{name}.mlp", self._norm(f"{name}.between", pooled), residual=pooled)[:, 0]
+
+    def _attention(
+        self, name: str, query: np.ndarray, context: np.ndarray, mask: np.ndarray, residual: np.ndarray
+    ) -> np.ndarray:
+        """Mix the values of ``context [b,n,w]`` for ``query [b,q,w]``, and add that to ``residual [b,q,w]``."""
+        (sets, queries, width), heads = query.shape, self.options.heads
+        query, pairs = self._dense(f"{name}.query", query), self._dense(f"{name}.pair", context)
+        mixed = np.empty((sets, queries, heads * padded(width // heads)), np.float32)
+        scratch = np.empty(scratch_size(context.shape[1], width), np.float32)
+        attend(query, pairs, np.ascontiguousarray(mask).view(np.uint8), heads, scratch, mixed)
+        return self._dense(f"{name}.out", mixed, residual=residual)
+
+    def _mlp(self, name: str, x: np.ndarray, activation: int = PLAIN, residual: np.ndarray | None = None) -> np.ndarray:
+        """Run two linear layers with GELU between them."""
+        return self._dense(f"{name}.2", self._dense(f"{name}.0", x, GELU), activation, residual)
+
+    def _dense(
+        self, name: str, x: np.ndarray, activation: int = PLAIN, residual: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Run a linear layer on the last axis."""
+        weight, bias, outputs = self._layers[name]
+        rows = np.ascontiguousarray(x, np.float32).reshape(-1, x.shape[-1])
+        out = np.empty((len(rows), outputs), np.float32)
+        added = None if residual is None else np.ascontiguousarray(residual).reshape(-1, outputs)
+        dense(rows, weight, bias, added, activation, out)
+        return out.reshape(*x.shape[:-1], outputs)
+
+    def _norm(self, name: str, x: np.ndarray) -> np.ndarray:
+        """Normalise the last axis."""
+        rows = np.ascontiguousarray(x).reshape(-1, x.shape[-1])
+        out = np.empty_like(rows)
+        normalise(rows, self.arrays[f"{name}.weight"], self.arrays[f"{name}.bias"], out)
+        return out.reshape(x.shape)
+
+    @cached_property
+    def _layers(self) -> dict[str, Layer]:
+        """The linear layers as the library reads them, by name."""
+        names = [name.removesuffix(".weight") for name, array in self.arrays.items() if array.ndim == 2]
+        return {name: self._layer(name) for name in names}
+
+    def _layer(self, name: str) -> Layer:
+        """Pack a linear layer; the heads' values are padded where attention makes them, and where they are read."""
+        weight, bias = self.arrays[f"{name}.weight"], self.arrays[f"{name}.bias"]
+        width, heads = self.options.width, self.options.heads
+        size = width // heads
+        places = np.arange(width) // size * padded(size) + np.arange(width) % size
+        if name.endswith("attention.pair"):
+            places = np.concatenate([np.arange(width), width + places])
+            columns = width + heads * padded(size)
+            wide, shift = np.zeros((columns, width), np.float32), np.zeros(columns, np.float32)
+            wide[places], shift[places] = weight, bias
+            weight, bias = wide, shift
+        elif name.endswith("attention.out"):
+            wide = np.zeros((width, heads * padded(size)), np.float32)
+            wide[:, places] = weight
+            weight = wide
+        return *pack(weight, bias), len(bias)

@@ -1,0 +1,157 @@
+from __future__ import annotations
+
+import math
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+from scenes import make_features
+
+from gsmerge import geometry
+from gsmerge.geometry import covariances, quat_to_rotmat
+from gsmerge.moments import feature_to_gaussians
+from gsmerge.networks import tensors
+from gsmerge.networks.corrections import (
+    COLOR,
+    LOGIT,
+    MEAN,
+    ROTATION,
+    SIZE,
+    move_features,
+    move_gaussians,
+    residual_limits,
+)
+from gsmerge.networks.options import RESIDUAL, Bounds
+from gsmerge.types import SH_C0, FeatureGaussians, Gaussians
+
+EACH = np.arange(20)  # its own group
+
+
+def some(count: int = 20) -> FeatureGaussians:
+    rng = np.random.default_rng(0)
+    features = make_features(rng.normal(size=(count, 3)), opacities=0.6)
+    half = rng.normal(size=(count, 3, 3)).astype(np.float32)
+    covars = half @ half.swapaxes(1, 2)
+    scales = np.sqrt(np.linalg.eigvalsh(covars).clip(1e-6))
+    return replace(features, covars=covars, extinctions=-math.log(0.4) * scales[:, 1] * scales[:, 2])
+
+
+def base_of(features: FeatureGaussians) -> Gaussians:
+    """The Gaussian of each, in C order."""
+    return Gaussians(*(np.ascontiguousarray(column) for column in vars(feature_to_gaussians(features)).values()))
+
+
+def frames(count: int = 20, seed: int = 1) -> np.ndarray:
+    return quat_to_rotmat(np.random.default_rng(seed).normal(size=(count, 4))).astype(np.float32)
+
+
+def noise(count: int = 20, seed: int = 5) -> np.ndarray:
+    return 0.3 * np.random.default_rng(seed).normal(size=(count, RESIDUAL)).astype(np.float32)
+
+
+def zeros() -> np.ndarray:
+    return np.zeros((20, RESIDUAL), np.float32)
+
+
+def test_zero_changes_no_bit() -> None:
+    features = some()
+    base = base_of(features)
+    for before, after in (
+        (base, move_gaussians(base, zeros(), EACH, frames())),
+        (features, move_features(features, base, zeros(), frames())),
+    ):
+        for f in fields(before):
+            assert np.array_equal(getattr(before, f.name), getattr(after, f.name)), f.name
+
+
+@pytest.mark.parametrize("rows", [1, 7, 20])
+def test_any_number_of_rows_at_once_gives_the_same_bits(rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    features, base = some(), base_of(some())
+
+    def moved() -> list[Gaussians | FeatureGaussians]:
+        own = EACH[::-1].copy()
+        return [move_features(features, base, noise(), frames()), move_gaussians(base, noise(), own, frames())]
+
+    whole = moved()
+    monkeypatch.setattr("gsmerge.networks.corrections.ROWS", rows)
+    for one, other in zip(whole, moved(), strict=True):
+        for f in fields(one):
+            assert np.array_equal(getattr(one, f.name), getattr(other, f.name)), f.name
+    none = make_features(np.zeros((0, 3)))
+    assert len(move_features(none, base_of(none), noise()[:0], frames()[:0])) == 0
+    assert len(move_gaussians(base[:0], noise()[:0], EACH[:0], frames())) == 0
+
+
+def test_gaussians_move_as_told() -> None:
+    base, residuals = base_of(some()), zeros()
+    residuals[:, MEAN], residuals[:, SIZE] = [1.0, 0, 0], [0.1, 0.2, -0.3]
+    residuals[:, LOGIT], residuals[:, COLOR] = 0.7, [0.1, -0.1, 0.2]
+    moved = move_gaussians(base, residuals, EACH, frames())
+    sizes = np.sqrt(np.sort(base.scales, 1)[:, 1:].prod(1))
+    np.testing.assert_allclose(moved.means, base.means + frames()[:, :, 0] * sizes[:, None], atol=1e-6)
+    np.testing.assert_allclose(np.log(moved.scales) - np.log(base.scales), residuals[:, SIZE], atol=1e-5)
+    logits = [np.log(g.opacities / (1 - g.opacities)) for g in (base, moved)]
+    np.testing.assert_allclose(logits[1] - logits[0], residuals[:, LOGIT], atol=1e-5)
+    np.testing.assert_allclose(SH_C0 * (moved.sh0 - base.sh0)[:, 0], residuals[:, COLOR], atol=1e-6)
+
+
+def test_tensors_move_in_the_same_way() -> None:
+    """Training's Gaussians, through which gradients flow, are those of use."""
+    base, own = base_of(some()), np.random.default_rng(2).integers(0, 20, 20)
+    actual = move_gaussians(base, noise(), own, frames())
+    expected = tensors.move_tensors(base.to("cpu"), torch.from_numpy(noise()), torch.from_numpy(frames()[own])).numpy()
+    for f in fields(actual):
+        one, other = getattr(actual, f.name), getattr(expected, f.name)
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6, err_msg=f.name)
+
+
+@pytest.mark.parametrize("opacity", [0.0, 1e-6, 1.0])
+def test_opacities_at_the_ends_stay_within_them(opacity: float) -> None:
+    base = replace(base_of(some()), opacities=np.full(20, opacity, np.float32))
+    for logit in (-3.0, 3.0):
+        residuals = zeros()
+        residuals[:, LOGIT] = logit
+        moved = move_gaussians(base, residuals, EACH, frames()).opacities
+        assert ((moved >= 0) & (moved <= 1)).all()
+
+
+def test_rotations_agree_with_each_other() -> None:
+    """A quaternion and a covariance turn alike, also by more than a whole turn."""
+    features, residuals = some(), zeros()
+    residuals[:, ROTATION] = 3 * np.random.default_rng(3).normal(size=(20, 3))
+    base = base_of(features)
+    turned, one = move_features(features, base, residuals, frames()), move_gaussians(base, residuals, EACH, frames())
+    np.testing.assert_allclose(turned.covars, covariances(one.quats, one.scales), atol=1e-4, rtol=1e-4)
+    quarter = zeros()
+    quarter[:, ROTATION] = [0, 0, np.pi / 2]
+    same = np.tile(np.eye(3, dtype=np.float32), (20, 1, 1))
+    round_ones = replace(base, quats=np.tile(np.float32([1, 0, 0, 0]), (20, 1)))
+    quats = move_gaussians(round_ones, quarter, EACH, same).quats
+    np.testing.assert_allclose(geometry.quat_to_rotmat(quats) @ [1.0, 0, 0], [[0.0, 1, 0]] * 20, atol=1e-6)
+    np.testing.assert_allclose(
+        tensors.quat_to_rotmat(torch.from_numpy(quats)), geometry.quat_to_rotmat(quats), atol=1e-6
+    )
+
+
+def test_feature_gaussians_move_like_gaussians() -> None:
+    """Means, covariances and colours alike; opacity stays with scales and follows its own column."""
+    features = some()
+    base, residuals = base_of(features), noise()
+    residuals[:, LOGIT] = 0
+    residuals[:, SIZE] = np.sort(residuals[:, SIZE], 1) * 0.1  # scales still rise
+    moved = move_features(features, base, residuals, frames())
+    one = move_gaussians(base, residuals, EACH, frames())
+    np.testing.assert_allclose(moved.means, one.means, atol=1e-5, rtol=1e-5)
+    np.testing.assert_allclose(moved.covars, covariances(one.quats, one.scales), atol=1e-4, rtol=1e-4)
+    decoded = base_of(moved)
+    np.testing.assert_allclose(decoded.opacities, base.opacities, atol=1e-4)
+    residuals = zeros()
+    residuals[:, LOGIT] = np.log(2)
+    doubled = base_of(move_features(features, base, residuals, frames()))
+    np.testing.assert_allclose(doubled.opacities, 1 - (1 - base.opacities) ** 2, atol=1e-4)
+
+
+def test_limits_are_those_of_the_bounds() -> None:
+    limits = residual_limits(Bounds(mean=0.5, turn=0.2))
+    assert limits.tolist() == np.float32([0.5] * 3 + [1.1] * 3 + [0.2] * 3 + [3.0] + [0.25] * 3).tolist()
