@@ -88,6 +88,12 @@ def project_points(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> 
     return image[..., :2] / image[..., 2:], camera[..., 2]
 
 
+def camera_depths(points: np.ndarray, viewmats: np.ndarray) -> np.ndarray:
+    """Return the depths ``[...]`` along z of points ``[...,3]`` in cameras ``[...,4,4]``, world to camera."""
+    (x, y, z), (a, b, c, d) = np.moveaxis(points, -1, 0), np.moveaxis(viewmats[..., 2, :], -1, 0)
+    return x * a + y * b + z * c + d
+
+
 def motion_matrices(vectors: np.ndarray) -> np.ndarray:
     """Return rigid motions ``[v,4,4]`` float64 of ``[v,6]``: rotation vectors about the origin (radians), shifts."""
     vectors = vectors.astype(np.float64)

@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+from gsmerge.geometry import camera_depths
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.gaussians.pool import decompose, pool
 from gsmerge.runtime.threads import parallel_map
@@ -48,9 +49,8 @@ def scene_members(scene: Scene) -> Members:
 
     def fill(view: int) -> None:
         rows = slice(view * pixels, (view + 1) * pixels)
-        third = cameras.viewmats[view, 2].astype(np.float32)
         focal = float(np.sqrt(abs(cameras.Ks[view, 0, 0] * cameras.Ks[view, 1, 1])))
-        depths = np.abs(np.einsum("nd,d->n", means[rows], third[:3]) + third[3])
+        depths = np.abs(camera_depths(means[rows], cameras.viewmats[view].astype(np.float32)))
         footprints[rows] = np.maximum(depths, 1e-6) / focal
 
     parallel_map(fill, range(len(scene)))
@@ -61,9 +61,8 @@ def unaligned_members(scene: Scene, pixels: np.ndarray) -> Members:
     """Return the members of an unaligned scene by pixel ``[n]`` int64; without one, the nearest camera counts."""
     means, cameras = _array(scene.gaussians.means), scene.cameras
     focals = np.sqrt(np.abs(cameras.Ks[:, 0, 0] * cameras.Ks[:, 1, 1])).astype(np.float64)
-    thirds = cameras.viewmats[:, 2].astype(np.float64)
     views = pixels // scene.pixels_per_view
-    depths = np.abs(np.einsum("nd,nd->n", means, thirds[views, :3]) + thirds[views, 3])
+    depths = np.abs(camera_depths(means, cameras.viewmats.astype(np.float64)[views]))
     footprints = np.maximum(depths, 1e-6) / focals[views]
     alone = np.flatnonzero(pixels < 0)
     if len(alone):

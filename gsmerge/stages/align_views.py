@@ -17,6 +17,7 @@ from functools import partial
 import numpy as np
 
 from gsmerge.geometry import (
+    camera_depths,
     motion_matrices,
     motion_vectors,
     multiply_quats,
@@ -158,8 +159,7 @@ def _level_of(scene: Scene, pairs: list[tuple[int, int]], level: float, samples:
     def one_view(view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         grey = blur(photos.images[view].mean(-1, dtype=np.float32), BLUR)
         down, right = np.gradient(grey)
-        axis = scene.cameras.viewmats[view, 2]
-        depth = matmul(means[view][near], axis[:3]) + axis[3]
+        depth = camera_depths(means[view][near], scene.cameras.viewmats[view])
         depth = np.where(scene.valid[view][near] & (depth > NEAR), depth, np.nan)
         score = np.where(np.isfinite(depth), np.sqrt(right * right + down * down) * spread, 0).ravel()
         chosen = np.argsort(-score, kind="stable")[:samples]

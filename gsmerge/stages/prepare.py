@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from gsmerge.geometry import lower_median, project
+from gsmerge.geometry import camera_depths, lower_median, project
 from gsmerge.kernels.matrices import matmul
 from gsmerge.runtime.record import note, stage
 from gsmerge.runtime.threads import parallel_map
@@ -85,8 +85,8 @@ def scene_depth(scene: Scene) -> float:
     rows = _sample_rows(scene)
     means = scene.gaussians.means[rows].astype(np.float64)
     if scene.aligned:
-        thirds = scene.cameras.viewmats[rows // scene.pixels_per_view, 2]
-        return float(lower_median(np.abs((thirds[:, :3] * means).sum(1) + thirds[:, 3])))
+        viewmats = scene.cameras.viewmats[rows // scene.pixels_per_view]
+        return float(lower_median(np.abs(camera_depths(means, viewmats))))
     views = scene.cameras[:: max(1, len(scene) // MAX_VIEWS)]
     pixels, depths = project(means, views)
     seen = (depths > 0) & ((pixels > 0) & (pixels < (views.width, views.height))).all(-1)

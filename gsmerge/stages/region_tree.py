@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsmerge.geometry import camera_depths
 from gsmerge.kernels.elementary import log, log10
 from gsmerge.kernels.superpixels.merge_tree import (
     OVERSIZE,
@@ -63,11 +64,8 @@ def pixel_depths(scene: Scene) -> np.ndarray:
     height, width, pixels = cameras.height, cameras.width, scene.pixels_per_view
 
     def one_view(view: int) -> np.ndarray:
-        third = cameras.viewmats[view, 2].astype(means.dtype)
-        x, y, z = means[
-            view * pixels : (view + 1) * pixels
-        ].T  # no product of matrices: its bits depend on the processor
-        depths = x * third[0] + y * third[1] + z * third[2] + third[3]
+        own = means[view * pixels : (view + 1) * pixels]
+        depths = camera_depths(own, cameras.viewmats[view].astype(means.dtype))
         return depths.astype(np.float32).reshape(height, width)
 
     return np.stack(parallel_map(one_view, range(len(scene))))

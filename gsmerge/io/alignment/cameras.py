@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import project_points, sh0_to_rgb
+from gsmerge.geometry import camera_depths, project_points, sh0_to_rgb
 from gsmerge.io.alignment.layouts import Layout, exact_layouts, subsample
 from gsmerge.io.alignment.resection import projection_errors, refine_poses, start_pose
 from gsmerge.io.alignment.score import (
@@ -286,8 +286,7 @@ def move_cameras(
     if not after.ok:
         return None
     _check_intrinsics(pairs, cameras, before.worst_px, after.worst_px, source)
-    axes = viewmats[pairs.views, 2]
-    depth = float(np.median((axes[:, :3] * pairs.points).sum(1) + axes[:, 3]))
+    depth = float(np.median(camera_depths(pairs.points, viewmats[pairs.views])))
     return MovedCameras(moved, before.worst_px, list_moves(names, cameras.viewmats, viewmats, depth))
 
 
@@ -313,7 +312,7 @@ def _check_intrinsics(pairs: Correspondences, cameras: Cameras, before_px: float
         for _ in range(_LINE_ROUNDS):
             factors[axis], shifts[axis] = _fit_line(before, wanted, weights**2)
             error = np.abs(factors[axis] * before + shifts[axis] - wanted)
-            weights = 1 / np.hypot(1, error / (3 * np.median(error) + 1e-9))
+            weights = 1 / np.sqrt(1 + (error / (3 * np.median(error) + 1e-9)) ** 2)
     Ks = cameras.Ks * np.array([*factors, 1])[:, None]
     Ks[:, :2, 2] += shifts
     other = check_pairs(pairs, replace(cameras, Ks=Ks))
