@@ -53,7 +53,7 @@ class Effort:
 EFFORTS = {
     "draft": Effort(30, 1.0, 0, merges=False, networks=False, prunes=False, large_photos=False),
     "fast": Effort(55, 1.0, 0, networks=False, large_photos=False),
-    "default": Effort(240, 2.0, 0),
+    "default": Effort(320, 2.0, 0),
     "best": Effort(1000, 3.0, 1),
 }
 

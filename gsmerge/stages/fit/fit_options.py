@@ -12,7 +12,7 @@ from gsmerge.runtime.record import choose, note, report_progress
 from gsmerge.types import Cameras, Gaussians
 
 Fit = Literal["none", "full"]
-STEPS = 240  # of the full fit
+STEPS = 320  # of the full fit
 LONG_STEPS = 600  # from here on full-size photos and a little dropout pay
 EARLIER = 0.1  # share of the steps by which half-size photos end sooner where larger ones follow
 HASTY_STEPS = 20  # shorter runs have no time for full-size photos
@@ -65,7 +65,7 @@ class FitOptions:
 
     Args:
         fit: ``"full"``: all parameters; ``"none"``: nothing.
-        fit_steps: Steps of the full fit, one view each; None: 240, and by effort and number of Gaussians.
+        fit_steps: Steps of the full fit, one view each; None: 320, and by effort and number of Gaussians.
         time_budget: Seconds after which the full fit stops, None for no limit. The steps are then chosen from the
             measured time of the first ones, and the result is no longer the same on every machine.
         photo_scale: Times the views' size at which two of every five steps after those on half-size photos look at
