@@ -1,10 +1,9 @@
-"""Least values of what depends on rounding: means over runs on several machines less three standard deviations.
+"""Least values of what depends on rounding: means over ten runs less three standard deviations.
 
-The last bits of a result depend on the processor, and a fit of hundreds of steps makes tenths of a dB of them. So a
-floor is no figure that somebody once saw, but one that ``python tests/measure_floors.py`` measured: runs on this
-machine's processor and on a simulated one with vectors of 128 bits, ten on each, each of the ten from slightly other
-Gaussians. The number of runs, their mean, their standard deviation and the floor are in ``floors.csv``, under the names
-of the tests.
+Results are the same bytes on every processor, but any change of the code may round elsewhere, and a fit of hundreds of
+steps makes tenths of a dB of that. So a floor is no figure that somebody once saw, but one that ``python
+tests/measure_floors.py`` measured: ten runs, each from slightly other Gaussians. The number of runs, their mean, their
+standard deviation and the floor are in ``floors.csv``, under the names of the tests.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ COLUMNS = ("test", "n", "mean", "sd", "floor")
 RECORD = "GSMERGE_FLOORS_RECORD"  # a file: values are written there instead of being compared
 NUDGE = "GSMERGE_FLOORS_NUDGE"  # which of the runs
 NUDGE_SIZE = 1e-3  # of a Gaussian's size: far below every error, far above rounding
-LEAST_SD = 0.05  # what the runs may not show of a third processor; dB for most
+LEAST_SD = 0.02  # what ten runs may not show of the spread; dB for most
 
 
 def nudged(gaussians: Gaussians) -> Gaussians:
