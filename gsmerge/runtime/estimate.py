@@ -8,16 +8,16 @@ from typing import Any
 from gsmerge.runtime.memory import machine_memory
 
 # Processor seconds, measured on 7 views of 480 x 352 and 12 of 480 x 256 pixels
-IMPORT_SECONDS = 0.8
+IMPORT_SECONDS = 0.4
 # Per million pixels of all views together, or per million Gaussians, which is the same number:
-COST_MERGE = 1.3  # reading, superpixels and merging
+COST_MERGE = 1.0  # reading, superpixels and merging
 COST_SCORE = 0.3  # of input and result against the photos
-COST_NETWORKS = 4.0  # loading torch included
+COST_NETWORKS = 1.4
 COST_FIT = 0.5  # besides the steps
 COST_UNMERGED_STEP = 0.15  # of a step of the fit of an input that was not merged
 COST_SLOW = {"bass-adaptive": 6.0, "slic": 4.5, "greedy": 25.0, "splat-transform": 60.0}  # more than usual
 # Per million pixels of one view:
-COST_STEP = 0.2  # of the fit
+COST_STEP = 0.14  # of the fit
 
 # Memory, in bytes
 BYTES_FIXED = 250_000_000  # interpreter and libraries
