@@ -46,16 +46,9 @@ static inline float log4(float x) {
   return x >= 0.f ? result : __builtin_nanf("");
 }
 
-// e^x in float64; 0 below -746, inf above 710.
-static inline double exp8(double x) {
-  const double magic = 6755399441055744.0;  // 1.5 * 2^52
-  x = x < -746.0 ? -746.0 : x;
-  x = x > 710.0 ? 710.0 : x;
-  bits8 shifted = {.f = x * 1.4426950408889634 + magic};
-  double n = shifted.f - magic;
-  double r = x - n * 6.93147180369123816490e-01;
-  r = r - n * 1.90821492927058770002e-10;
-  double p = 1.0 / 6227020800.0;  // Taylor's series to r^13 / 13!: |r| is at most ln(2) / 2
+// (e^r - 1 - r) / r^2 of Taylor's series to r^13 / 13!, for |r| up to ln(2) / 2.
+static inline double exp_series(double r) {
+  double p = 1.0 / 6227020800.0;
   p = p * r + 1.0 / 479001600.0;
   p = p * r + 1.0 / 39916800.0;
   p = p * r + 1.0 / 3628800.0;
@@ -66,8 +59,19 @@ static inline double exp8(double x) {
   p = p * r + 1.0 / 120.0;
   p = p * r + 1.0 / 24.0;
   p = p * r + 1.0 / 6.0;
-  p = p * r + 0.5;
-  p = p * (r * r) + r + 1.0;
+  return p * r + 0.5;
+}
+
+// e^x in float64; 0 below -746, inf above 710.
+static inline double exp8(double x) {
+  const double magic = 6755399441055744.0;  // 1.5 * 2^52
+  x = x < -746.0 ? -746.0 : x;
+  x = x > 710.0 ? 710.0 : x;
+  bits8 shifted = {.f = x * 1.4426950408889634 + magic};
+  double n = shifted.f - magic;
+  double r = x - n * 6.93147180369123816490e-01;
+  r = r - n * 1.90821492927058770002e-10;
+  double p = exp_series(r) * (r * r) + r + 1.0;
   int64_t power = (int64_t)(shifted.u - 0x4338000000000000u), half = power >> 1;
   bits8 low = {.u = (uint64_t)(half + 1023) << 52}, high = {.u = (uint64_t)(power - half + 1023) << 52};
   return p * low.f * high.f;
