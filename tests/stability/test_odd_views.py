@@ -98,9 +98,14 @@ def test_order_of_views_does_not_matter_to_the_choice_of_start(room: Scene) -> N
 
 
 def test_order_of_views_hardly_matters_to_the_fit(room: Scene) -> None:
-    one, other = (scenes.compacted(s) for s in (room, scenes.take_views(room, [2, 0, 1])))
-    assert len(one.gaussians) == len(other.gaussians)
-    assert scenes.psnr_of(one.gaussians, room) == pytest.approx(scenes.psnr_of(other.gaussians, room), abs=0.7)
+    """Means of five seeds: which blocks are held out depends on the order, and a run of one seed scatters by 0.5 dB."""
+    one, other = (
+        [scenes.compacted(s, seed=seed).gaussians for seed in range(5)]
+        for s in (room, scenes.take_views(room, [2, 0, 1]))
+    )
+    assert len({len(gaussians) for gaussians in (*one, *other)}) == 1
+    means = [np.mean([scenes.psnr_of(gaussians, room) for gaussians in runs]) for runs in (one, other)]
+    assert means[0] == pytest.approx(means[1], abs=0.7)
 
 
 # 27: wrong poses
