@@ -14,6 +14,7 @@ import shutil
 import socket
 import stat
 import time
+import uuid
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -27,6 +28,7 @@ from gsmerge.types import StrPath
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS}
 _MAX_SUFFIX = 32  # bytes of an ending that a temporary name keeps: names end at 255
 _STALE_SECONDS = 7 * 86400  # age at which a file of another machine, whose processes nobody here sees, is stale
+_BOOT = "/proc/sys/kernel/random/boot_id"
 _TEMPORARY = re.compile(r"\.gsmerge-(?P<place>[0-9a-f]{8})-(?P<pid>\d+)-[0-9a-f]{8}(\.[^.]*)?", re.DOTALL)
 
 _written: set[str] = set()  # the temporary files of this process
@@ -124,10 +126,14 @@ def temporary_path(path: Path) -> Path:
 
 @cache
 def _place() -> str:
-    """Return a hash of the machine and the container, within which process numbers are unique."""
-    names = socket.gethostname()
+    """Return a hash of the machine and the container, within which process numbers are unique.
+
+    Host names repeat among containers, and so do the numbers of their name spaces: Linux's number of this boot is
+    random.
+    """
+    names = f"{socket.gethostname()} {uuid.getnode()}"
     with suppress(OSError):
-        names += os.readlink("/proc/self/ns/pid")
+        names = f"{Path(_BOOT).read_text(encoding='ascii')} {os.readlink('/proc/self/ns/pid')}"
     return f"{zlib.crc32(names.encode()):08x}"
 
 
@@ -155,7 +161,11 @@ def _is_stale(entry: os.DirEntry[str], place: str, pid: int) -> bool:
         return True
     except (OSError, OverflowError):  # another user's
         return False
-    return False
+    try:  # of a killed run, nobody may have asked yet how its processes ended
+        status = Path(f"/proc/{pid}/stat").read_bytes()
+        return status.rpartition(b") ")[2][:1] in (b"Z", b"X")
+    except OSError:
+        return False
 
 
 def _refuse(path: Path, overwrite: bool) -> None:

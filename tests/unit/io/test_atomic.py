@@ -120,6 +120,16 @@ def test_what_dead_processes_left_is_removed_and_what_others_write_is_not(tmp_pa
     assert sorted(tmp_path.iterdir()) == sorted([*kept, recent, tmp_path / "out.ply"])
 
 
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="states of processes as Linux shows them")
+def test_what_a_process_left_is_removed_before_its_parent_knows_of_its_end(tmp_path: Path) -> None:
+    with subprocess.Popen([sys.executable, "-c", ""]) as process:
+        os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+        left = left_by(process.pid, tmp_path / "out.ply")
+        left.touch()
+        remove_stale(tmp_path)
+        assert not left.exists()
+
+
 def write_both(folder: Path, second: str, *, fail: bool = False) -> None:
     with atomic_outputs(overwrite=True) as add:
         add(folder / "a.txt").write_text("new")
