@@ -32,7 +32,7 @@ from gsmerge.io.cameras.camera_file import (
     check_size,
 )
 from gsmerge.io.formats.ply import clear_invalid
-from gsmerge.io.scene import NO_CAMERAS, color_notes
+from gsmerge.io.scene import NO_CAMERAS
 from gsmerge.pipeline import compact
 from gsmerge.result import CompactResult
 from gsmerge.runtime.record import Progress
@@ -122,10 +122,8 @@ def compact_tensors(
     if order != "none" or viewmats is not None or images is not None:
         cameras, photos = _read_views(viewmats, Ks, images, shape)
     scene, more = _make_scene(gaussians, valid, cameras, photos, names, order)
-    if scene.aligned:
-        if check_rotations:
-            _check_rotations(scene)
-        more += color_notes(scene)
+    if scene.aligned and check_rotations:
+        _check_rotations(scene)
     result = compact(scene, progress=progress, **settings)
     result.report.notes[:0] = notes + more
     return result.to(means.device if hasattr(means, "detach") else None)

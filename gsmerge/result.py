@@ -13,7 +13,7 @@ from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.record import Record, choose, current_record, note, stage
 from gsmerge.stages.fit import FitBackend, Fitted, run_on
 from gsmerge.stages.prepare import Prepared, scene_depth
-from gsmerge.types import Cameras, Gaussians
+from gsmerge.types import Cameras, Gaussians, Scene
 
 if TYPE_CHECKING:
     import torch
@@ -98,7 +98,7 @@ def score(count: int | None, fitted: Fitted, prepared: Prepared, plan: Plan) -> 
     psnr = None
     if prepared.given.images is not None:
         with stage("score"):
-            psnr = input_psnr(gaussians, prepared, plan)
+            psnr = measure_psnr(gaussians, prepared.result_views(), prepared, plan)
         choose(scored_views=len(plan.scored_views))
     return Candidate(count, fitted, gaussians, cameras, psnr, current_record())
 
@@ -114,9 +114,9 @@ def _note_moves(prepared: Prepared, cameras: Cameras, plan: Plan) -> None:
     note(f"{cause}: cameras were moved by {describe_moves(moves)}")
 
 
-def input_psnr(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> float:
+def measure_psnr(gaussians: Gaussians, views: Scene, prepared: Prepared, plan: Plan) -> float:
     """Measure the mean PSNR (dB) of the scored photos, of a quarter of each unless a quality was asked for."""
-    photos, near, quarter = scene_photos(prepared.given), NEAR * prepared.frame.unit, plan.target_psnr is None
+    photos, near, quarter = scene_photos(views), NEAR * prepared.frame.unit, plan.target_psnr is None
 
     def score_on(backend: FitBackend[Any]) -> float:
         return backend.photo_psnr(gaussians, photos, plan.scored_views, quarter=quarter, near=near)
@@ -140,7 +140,7 @@ def make_result(
     before, run, seconds = None, current_record(), search["seconds"]
     if prepared.given.images is not None:
         with stage("input"):
-            before = input_psnr(prepared.given.file_gaussians, prepared, plan)
+            before = measure_psnr(prepared.given.file_gaussians, prepared.given, prepared, plan)
 
     def report(one: Candidate, seconds: Mapping[str, float]) -> CompactReport:
         counts, record = (prepared.given.num_gaussians, len(one.gaussians)), one.record

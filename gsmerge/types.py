@@ -230,10 +230,9 @@ class Views:
 class Scene:
     """Gaussians, and the views that they were made from or that see them.
 
-    A scene is aligned where every row's pixel is known, as feed-forward models export one Gaussian
-    per pixel and view: row ``(v·H + y)·W + x`` then belongs to pixel (x, y) of view v. Rows that
-    were not finite in the file stay, fully transparent, so that the order survives; pixels without
-    a row in the file are filled up in the same way, or from a depth map.
+    A scene is aligned where every row's pixel is known, as feed-forward models export one Gaussian per pixel and view:
+    row ``(v·H + y)·W + x`` then belongs to pixel (x, y) of view v. Rows that were not finite in the file stay, fully
+    transparent, so that the order survives; pixels without a row are filled up like that, or from a depth map.
 
     Args:
         gaussians: n rows, in the frame of the cameras; V·H·W of an aligned scene.
@@ -244,6 +243,7 @@ class Scene:
         names: The views' names (image file names where known).
         missing: ``[v,h,w]`` bool, True where the file has no row for the pixel; None: nowhere.
         large_photos: The photos with more pixels than the views; None where they have no more.
+        masks: ``[v,h,w]`` bool, True where a photo counts; None: everywhere.
 
     Raises:
         ValueError: If the sizes do not fit together.
@@ -256,6 +256,7 @@ class Scene:
     names: tuple[str, ...]
     missing: np.ndarray | None = None
     large_photos: LargePhotos | None = None
+    masks: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         v, h, w = len(self.cameras), self.cameras.height, self.cameras.width
@@ -263,10 +264,9 @@ class Scene:
             if len(self.gaussians) != v * h * w:
                 raise ValueError(f"expected {v} x {h} x {w} = {v * h * w} Gaussians, got {len(self.gaussians)}")
             _expect("pixel_ids", self.pixel_ids, (v * h * w,))
-        if self.missing is not None:
-            _expect("missing", self.missing, (v, h, w))
-        if self.images is not None:
-            _expect("images", self.images, (v, h, w, 3))
+        for name, shape in (("missing", (v, h, w)), ("masks", (v, h, w)), ("images", (v, h, w, 3))):
+            if getattr(self, name) is not None:
+                _expect(name, getattr(self, name), shape)
         for what, some in (("view names", self.names), ("large photos", getattr(self.large_photos, "ids", None))):
             if some is not None and len(some) != v:
                 raise ValueError(f"expected {v} {what}, got {len(some)}")
@@ -276,7 +276,7 @@ class Scene:
 
     def numpy(self) -> Scene:
         """Return the same scene with NumPy arrays in place of tensors."""
-        names = [name for name in ("images", "pixel_ids", "missing") if getattr(self, name) is not None]
+        names = [name for name in ("images", "pixel_ids", "missing", "masks") if getattr(self, name) is not None]
         arrays: dict[str, Any] = {name: as_array(getattr(self, name)) for name in names}
         return replace(self, gaussians=self.gaussians.numpy(), cameras=self.cameras.numpy(), **arrays)
 

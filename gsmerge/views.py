@@ -87,8 +87,9 @@ def subset(scene: Scene, view_ids: Sequence[int]) -> Scene:
     images = None if scene.images is None else scene.images[ids]
     names = tuple(scene.names[i] for i in ids)
     large = None if scene.large_photos is None else scene.large_photos[ids]
+    masks = None if scene.masks is None else scene.masks[ids]
     if not scene.aligned:
-        return replace(scene, cameras=scene.cameras[ids], images=images, names=names, large_photos=large)
+        return replace(scene, cameras=scene.cameras[ids], images=images, names=names, large_photos=large, masks=masks)
     size = scene.pixels_per_view
     rows = (np.asarray(ids, np.int64)[:, None] * size + np.arange(size)).reshape(-1)
     return replace(
@@ -100,4 +101,5 @@ def subset(scene: Scene, view_ids: Sequence[int]) -> Scene:
         names=names,
         missing=None if scene.missing is None else scene.missing[ids],
         large_photos=large,
+        masks=masks,
     )

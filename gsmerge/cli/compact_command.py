@@ -23,10 +23,11 @@ if TYPE_CHECKING:
 
 @opt.command(
     opt.SCENE,
-    f"{opt.READING} k superpixels budget quality levels effort fit device method recipe checkpoint set crop",
+    f"{opt.READING} masks k superpixels budget quality levels",
+    "effort fit exposure device method recipe checkpoint set crop",
     opt.output(opt.COMPACT_SCENE, "SCENE.compact.ply"),
     f"overwrite report save_cameras dry_run {opt.RUN}",
-    rare=f"hint levels fit method recipe checkpoint crop save_cameras json quiet {opt.RUN}",
+    rare=f"hint masks levels fit exposure method recipe checkpoint crop save_cameras json quiet {opt.RUN}",
 )
 def compact(args: opt.Args) -> None:
     """Write a compact scene that renders like the given one, or better, with 1 to 10 % of its Gaussians."""

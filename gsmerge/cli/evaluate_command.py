@@ -41,7 +41,7 @@ def parse_align(text: str) -> tuple[str, ...]:
     opt.BEFORE,
     opt.argument("after", list[Path] | None, "[AFTER]...", "Compact files of that scene: .ply, .spz, .sog or .splat.",
                  default=None),
-    f"{opt.READING} {opt.TARGETS}",
+    f"{opt.READING} masks {opt.TARGETS}",
     *opt.panel(
         opt.MEASURING,
         opt.option("views", int, "Use so many of the input views, at equal intervals, as the context, and the held-out "

@@ -116,7 +116,8 @@ class Args(SimpleNamespace):
         """Find the scene's .ply, its cameras and its photos: the named ones, or those beside it."""
         from gsmerge.io import find_scene_files
 
-        return find_scene_files(scene, cameras=self.cameras, images=vars(self).get("images"))
+        images, masks = (vars(self).get(name) for name in ("images", "masks"))
+        return find_scene_files(scene, cameras=self.cameras, images=images, masks=masks)
 
     def load(self, files: SceneFiles) -> SceneLoad:
         """Read the scene of these files."""
@@ -294,6 +295,8 @@ _TABLE = (
         option("cameras", Path, "Camera file or COLMAP folder: transforms.json, cameras.json, results.npz, ... "
                "Default: beside the .ply."),
         option("images", Path, "Folder of the input photos. Default: beside the .ply."),
+        option("masks", Path, "Folder of images named as the photos, dark where a photo does not count. Default: masks "
+               "beside the photos, and where these are transparent."),
         option("hint", list[str], "How to read the file, where it is recognised wrongly: opacity, exporter, quats, "
                "order, scene_scale or max_side, such as order=none; may be repeated.", metavar="NAME=VALUE"),
         option("targets", Path, "Cameras of held-out photos, in any camera file; views that the scene was made of are "
@@ -322,6 +325,8 @@ _TABLE = (
         option("effort", ("draft", "fast", "default", "best"), "How much work goes into superpixels and fit.",
                wording="default"),
         option("fit", ("full", "none"), "What is fitted to the photos.", wording="full"),
+        option("exposure", ("auto", "fixed", "per-photo"), "Bring photos that differ in exposure or white balance to "
+               "their mean: where they differ at random, never, or always.", wording="auto"),
         option("device", ("cpu", "cuda", "auto"), "Where the fit and the scores run; cuda needs gsmerge[cuda]. auto: "
                "a GPU where there is one and the scene is large enough.", wording="cpu"),
         option("method", (

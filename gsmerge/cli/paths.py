@@ -102,7 +102,7 @@ def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
 
 def input_files(files: SceneFiles) -> tuple[Path, ...]:
     """List the files of Gaussians, cameras and photos that are read."""
-    return tuple(path for path in (files.ply, files.cameras, files.images) if path is not None)
+    return tuple(path for path in (files.ply, files.cameras, files.images, files.masks) if path is not None)
 
 
 def checkpoint_files(checkpoint: str) -> tuple[Path, ...]:

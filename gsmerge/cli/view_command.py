@@ -16,7 +16,7 @@ from gsmerge.errors import UsageError
 @opt.command(
     opt.BEFORE,
     opt.AFTER,
-    f"{opt.READING} {opt.TARGETS}",
+    f"{opt.READING} masks {opt.TARGETS}",
     opt.changed("set", help="How the outlined superpixels are cut, where results were made with another than the "
                 "default, such as superpixels=2%; may be repeated."),
     opt.output("The page, .html.", wording="AFTER.compare.html, beside it"),

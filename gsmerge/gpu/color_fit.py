@@ -90,7 +90,7 @@ class _DeviceSystem:
 
     def reweigh(self, x: Tensor, *, everywhere: bool = False) -> _DeviceSystem:
         images, photos, tuning = self._fitted(x), self.photos.images, self.options.tuning
-        base = torch.ones_like(self.train) if everywhere else self.train
+        base = torch.where(self.train == 0, 1.0, self.train) if everywhere else self.train
         error = ((photos - images) ** 2).mean(-1).sqrt()
         robust = base * (tuning.huber / error.clamp_min(1e-6)).clamp_max(1)
         calm = base * (error < 2 * tuning.huber)

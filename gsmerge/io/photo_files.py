@@ -27,6 +27,8 @@ IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".
 _FORMATS = ("JPEG", "WEBP", "BMP", "TIFF", "PPM")  # besides PNG, whose header is read here
 _WIDTH_TAG, _HEIGHT_TAG = 256, 257  # of TIFF: Pillow's own size follows the orientation tag
 _MAX_PIXEL_BYTES, _MAX_EXTRA = 16, 16 << 20  # of any file: four floats a pixel, and profiles or thumbnails
+_OPAQUE_SUFFIXES = frozenset({".jpg", ".jpeg", ".ppm"})
+_HALF_OPAQUE = 127
 ASPECT_TOLERANCE = 0.04  # of width over height: backbones round each side to a multiple of 14 by itself
 _PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
 _PNG_CHUNKS = frozenset({b"IHDR", b"PLTE", b"tRNS", b"IDAT"})
@@ -167,6 +169,56 @@ def _lookup(root: Path, by_ending: dict[str, list[Path]], name: str) -> Path | N
     if len(matches) > 1:
         raise SceneError(root, f"expected one image named {name}, found {matches[0].name} and {matches[1].name}")
     return matches[0] if matches else None
+
+
+def match_masks(folder: Path, names: Sequence[str]) -> list[Path | None]:
+    """Find the mask of every view by the name of its photo, with or without the photo's extension; None without one.
+
+    SceneError if the folder has no mask of any view, or two of one.
+    """
+    files = list_images(folder)
+    by_ending: dict[str, list[Path]] = {}
+    for file in files:
+        for ending in _endings(file.relative_to(folder)):
+            by_ending.setdefault(ending, []).append(file)
+    masks = [_lookup(folder, by_ending, name) for name in names]
+    if not any(masks):
+        problem = f"expected masks named as the photos, such as {PurePath(names[0]).name}.png, found none of them"
+        raise SceneError(folder, problem, "rename them, or name another folder with --masks")
+    return masks
+
+
+def decode_mask(path: Path) -> np.ndarray:
+    """Decode a mask to ``[h,w]`` bool, True where the photo counts: brighter than half of its brightest pixel."""
+    grey = _decode_channel(path, lambda image: image.convert("L"))
+    assert grey is not None
+    return np.asarray(grey > grey.max(initial=0) / 2)
+
+
+def decode_alpha(path: Path) -> np.ndarray | None:
+    """Decode where a photo is opaque, ``[h,w]`` bool; None where it is everywhere."""
+    if path.suffix.lower() in _OPAQUE_SUFFIXES:
+        return None
+
+    def alpha(image: Image.Image) -> Image.Image | None:
+        has_any = "A" in image.getbands() or "transparency" in image.info
+        return image.convert("RGBA").getchannel("A") if has_any else None
+
+    values = _decode_channel(path, alpha)
+    return None if values is None or values.min() > _HALF_OPAQUE else values > _HALF_OPAQUE
+
+
+def _decode_channel(path: Path, choose: Callable[[Image.Image], Image.Image | None]) -> np.ndarray | None:
+    """Decode what ``choose`` makes of an image; SceneError if it cannot be decoded."""
+    image_size(path)  # refuses what is no image, or too large
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with Image.open(path, formats=("PNG", *_FORMATS)) as image:
+                channel = choose(image)
+                return None if channel is None else np.asarray(channel)
+    except Exception as error:  # whatever damage makes the library raise
+        raise SceneError(path, "expected an image, found a file that cannot be decoded", "replace it") from error
 
 
 def list_images(folder: Path) -> list[Path]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import correlation, lower_median
+from gsmerge.geometry import lower_median
 from gsmerge.io.alignment import (
     Alignment,
     AlignmentResult,
@@ -31,7 +31,9 @@ from gsmerge.io.formats.ply import OpacityChoice, PlyInfo, PlyScene, ply_notes, 
 from gsmerge.io.photo_files import as_floats, photo_size
 from gsmerge.io.scene_files import (
     SceneFiles,
+    cut_bars,
     find_large_photos,
+    find_masks,
     find_scene_files,
     limit_photo_size,
     limit_view_size,
@@ -42,8 +44,6 @@ from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import Cameras, Gaussians, LargePhotos, Scene, StrPath, grid_ids
 
-_MIN_CORRELATION = 0.5  # of a view's base colours with its photo
-_COLOR_SAMPLES = 5000  # pixels per view that it is computed from
 _MIN_PADDING = 16  # equal rows at the origin: fewer may be Gaussians
 NO_CAMERAS = Cameras(np.empty((0, 4, 4)), np.empty((0, 3, 3)), 1, 1)
 _NO_ALIGNMENT = AlignmentResult(
@@ -93,6 +93,7 @@ def read_scene(
     *,
     cameras: StrPath | None = None,
     images: StrPath | None = None,
+    masks: StrPath | None = None,
     opacity: OpacityChoice = "auto",
     **hints: Any,
 ) -> Scene:
@@ -104,6 +105,8 @@ def read_scene(
         path: The ``.ply``, or a folder that has it.
         cameras: Camera file or folder; None looks next to the ``.ply``.
         images: Folder of images, or an ``.npz`` that holds them; None looks next to the ``.ply``.
+        masks: Folder of masks, images named as the photos, dark where a photo does not count; None: ``masks`` beside
+            the photos. Where a photo is transparent, it does not count either.
         opacity: How opacities are stored; see :func:`gsmerge.io.read_gaussians`.
         **hints: Fields of :class:`gsmerge.io.ReadHints`: ``exporter``, ``quats``, ``order``, ``scene_scale``,
             ``max_side``.
@@ -118,7 +121,7 @@ def read_scene(
     Example:
         >>> scene = read_scene("scene.ply")  # doctest: +SKIP
     """
-    return load_scene(path, cameras=cameras, images=images, opacity=opacity, **hints).scene
+    return load_scene(path, cameras=cameras, images=images, masks=masks, opacity=opacity, **hints).scene
 
 
 def as_scene(scene: Scene | StrPath) -> Scene:
@@ -136,12 +139,14 @@ def load_scene(
     *,
     cameras: StrPath | None = None,
     images: StrPath | None = None,
+    masks: StrPath | None = None,
     opacity: OpacityChoice = "auto",
     **hints: Any,
 ) -> SceneLoad:
     """Read a scene as :func:`read_scene` does, with all facts about its files."""
     read_hints = make_hints(hints)
-    return load_files(find_scene_files(path, cameras=cameras, images=images), opacity=opacity, hints=read_hints)
+    files = find_scene_files(path, cameras=cameras, images=images, masks=masks)
+    return load_files(files, opacity=opacity, hints=read_hints)
 
 
 def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = AUTO) -> SceneLoad:
@@ -176,6 +181,7 @@ def align_scene(
     known = camera_file.order if exporter is None else exporter.order
     order = known if hints.order == "auto" else hints.order
     pinholes, pictures, notes = as_pinholes(camera_file, stored_photos(files, camera_file) if photos else None)
+    whole, (pictures, cut) = pictures, cut_bars(pictures, camera_file)
     limited, smaller = limit_photo_size(pictures, len(ply.gaussians), hints.max_side, unaligned=order == "none")
 
     def read_frames() -> list[Similarity]:
@@ -192,14 +198,16 @@ def align_scene(
         depths=partial(read_depths, Path(camera_file.path)),
         frames=read_frames,
     )
-    notes += [*smaller, *result.notes]
+    notes += [*cut, *smaller, *result.notes]
     if result.pixel_ids is None:
         cameras, images, smaller = limit_view_size(result.cameras, result.images, hints.max_side)
         result = replace(result, cameras=cameras, images=images)
         notes += smaller
     size = photo_size(limited)
-    large = find_large_photos(files, camera_file, pictures, size, result.transform, result.cameras)
-    return _make_load(ply, files, hints, result, notes, large)
+    if pictures is not whole:  # files with bars are not read again
+        return _make_load(ply, files, hints, result, notes)
+    photo_facts = files, camera_file, pictures, size, result.transform, result.cameras
+    return _make_load(ply, files, hints, result, notes, find_large_photos(*photo_facts), find_masks(*photo_facts))
 
 
 def _make_load(
@@ -209,6 +217,7 @@ def _make_load(
     result: AlignmentResult,
     notes: Sequence[str],
     large: LargePhotos | None = None,
+    masks: np.ndarray | None = None,
 ) -> SceneLoad:
     """Make the scene of rows, their pixels and the views, with notes on how it was read."""
     camera_file, layout, views = result.camera_file, result.layout, list(result.views)
@@ -218,7 +227,9 @@ def _make_load(
     if views != list(range(len(cameras))):
         cameras, images = cameras[views], None if images is None else images[views]
     large = None if large is None else large[views]
-    scene = Scene(gaussians, cameras, images, pixel_ids, tuple(names[view] for view in views), missing, large)
+    masks = None if masks is None else masks[views]
+    more += [] if masks is None else [_describe_masks(masks)]
+    scene = Scene(gaussians, cameras, images, pixel_ids, tuple(names[view] for view in views), missing, large, masks)
     if camera_file is not None and layout is not None:
         depths = read_depths(Path(camera_file.path)) if layout.kind == "box+depth" else None
         if depths is not None:
@@ -233,9 +244,7 @@ def _make_load(
     exporters = choose_exporters(hints.exporter, ply.info, layout, frame, source)
     scene, turned = _with_rotations(scene, hints, exporters)
     more += turned
-    if scene.aligned:
-        more += color_notes(scene)
-    elif camera_file is not None:
+    if not scene.aligned and camera_file is not None:
         more.append("the rows belong to no pixels that could be found: unaligned")
         if hints.exporter != "auto":
             more[-1] += f"; only the layouts of {hints.exporter} were tried, as given; --hint exporter=auto tries all"
@@ -252,6 +261,12 @@ def _make_load(
         problem=result.problem,
         moves=result.moves,
     )
+
+
+def _describe_masks(masks: np.ndarray) -> str:
+    """Say how much of the photos masks leave out."""
+    share = 100 * (1 - masks.mean())
+    return f"masks leave out {share:.0f} % of the photos: {(~masks.all((1, 2))).sum()} of {len(masks)} have one"
 
 
 def _place_rows(
@@ -301,23 +316,6 @@ def _with_rotations(scene: Scene, hints: ReadHints, exporters: Sequence[Exporter
         return scene, []
     choice, note = choose_rotations(scene)
     return read_rotations(scene, choice), [note] if note else []
-
-
-def color_notes(scene: Scene) -> list[str]:
-    """Note if the images do not look like the Gaussians: likely in another order, or of another scene."""
-    if scene.images is None:
-        return []
-    step = max(1, scene.pixels_per_view // _COLOR_SAMPLES)
-    colors = scene.gaussians.sh0.reshape(len(scene), -1, 3)[:, ::step].mean(-1)
-    photos = scene.images.reshape(len(scene), -1, 3)[:, ::step].mean(-1)
-    valid = scene.stored.reshape(len(scene), -1)[:, ::step]
-    views = zip(scene.names, colors, photos, valid, strict=True)
-    odd = []
-    for name, color, photo, ok in views:
-        varies = ok.sum() >= 16 and min(color[ok].std(ddof=1), photo[ok].std(ddof=1)) >= 0.01
-        if varies and correlation(color[ok], photo[ok]) < _MIN_CORRELATION:
-            odd.append(name)
-    return [f"{len(odd)} of {len(scene)} images do not look like their Gaussians, for example {odd[0]}"] if odd else []
 
 
 def place_cameras_in_scene(

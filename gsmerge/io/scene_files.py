@@ -7,12 +7,13 @@ import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.alignment import estimate_cameras
 from gsmerge.io.bounds import check_file
-from gsmerge.io.cameras.camera_file import CameraFile, to_cameras, undistort_photos
+from gsmerge.io.cameras.camera_file import CameraFile, sizes_of, to_cameras, undistort_photos
 from gsmerge.io.cameras.npz_files import holds_images
 from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
 from gsmerge.io.cameras.read import CAMERA_PLACES, SHARP, find_cameras, read_cameras, read_sharp
@@ -21,27 +22,37 @@ from gsmerge.io.photo_files import (
     Photos,
     PhotoTransform,
     Size,
+    change_photos,
+    decode_alpha,
     decode_image,
     decode_images,
+    decode_mask,
     find_image,
     image_size,
     keep_photos,
     list_images,
     match_images,
+    match_masks,
     photo_size,
     resize_to,
+    same_shape,
 )
 from gsmerge.kernels.matrices import matmul
+from gsmerge.kernels.pictures import count_bars
+from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, LargePhotos, StrPath
 
 # The first that exists wins; then the folder's only .ply.
 PLY_PLACES = ("scene.ply", "gaussians.ply", "gs_ply/0000.ply", "point_cloud.ply")
 IMAGE_PLACES = ("images", "input", "context", "rgb", "input_images")
+MASK_PLACES = ("masks",)
 _POINT_CLOUDS = {"input.ply", "points3D.ply", "points.ply", "sparse_pc.ply"}  # of other programs
 _RESULT = re.compile(r"\.compact(\.level\d+)?(\.compressed)?\.ply$")
 _MAX_BYTES = 2 << 30  # of all photos as floats, before it is known whether the Gaussians belong to pixels
 _FLOAT_PIXEL = 12  # bytes
+_BAR_SPREAD = 8  # of 255, range of a bar's colours
 _ROUNDING = 1e-6  # pixels
+_MASK_LEVEL = 191  # of 255: a pixel of a view counts if three quarters of its pixels in the file do
 
 
 @dataclass(frozen=True)
@@ -51,6 +62,7 @@ class SceneFiles:
     ply: Path
     cameras: Path | None
     images: Path | None
+    masks: Path | None = None  # a folder
 
 
 def find_scene_files(
@@ -58,13 +70,14 @@ def find_scene_files(
     *,
     cameras: StrPath | None = None,
     images: StrPath | None = None,
+    masks: StrPath | None = None,
 ) -> SceneFiles:
-    """Find a scene's files; cameras and images that the user names are used instead of searching.
+    """Find a scene's files; those that the user names are used instead of searching.
 
     The given folder is searched, then the ``.ply``'s own, then the one above it for ``gs_ply/`` and two above it
-    for ``point_cloud/iteration_n/``; in each the places of ``PLY_PLACES``, ``CAMERA_PLACES`` and ``IMAGE_PLACES``
-    in their order. Images inside the cameras' ``.npz`` or ``.torch`` go before a folder, because they are those
-    that the model saw.
+    for ``point_cloud/iteration_n/``; in each the places of ``PLY_PLACES``, ``CAMERA_PLACES``, ``IMAGE_PLACES`` and
+    ``MASK_PLACES`` in their order. Images inside the cameras' ``.npz`` or ``.torch`` go before a folder, because they
+    are those that the model saw.
 
     Raises:
         SceneError: If there is no ``.ply``, several to choose from, or a named file does not exist.
@@ -86,7 +99,14 @@ def find_scene_files(
     if image_path is None:
         folders = (root / place for root in roots for place in IMAGE_PLACES)
         image_path = next((f for f in folders if f.is_dir() and list_images(f)), None)
-    return SceneFiles(ply, camera_path, image_path)
+    mask_path = _named(masks)
+    if mask_path is not None and not mask_path.is_dir():
+        raise SceneError(mask_path, "expected a folder of masks, found a file")
+    if mask_path is None:
+        beside = [] if image_path is None else [image_path.parent]
+        folders = (root / place for root in (*beside, *roots) for place in MASK_PLACES)
+        mask_path = next((f for f in folders if f.is_dir() and list_images(f)), None)
+    return SceneFiles(ply, camera_path, image_path, mask_path)
 
 
 def _named(path: StrPath | None) -> Path | None:
@@ -192,29 +212,104 @@ def find_large_photos(
     stored = photo_size(photos) if paths is None else image_size(paths[0])
     if photos is None or stored is None or size is None:
         return None
-    fitted = transform or resize_to(size, size)
-    scale = np.array([fitted.scale_x, fitted.scale_y]) * size / np.array(stored)
-    cut, grid = np.array([fitted.left, fitted.top]), np.array([fitted.width, fitted.height])
-    shown = np.array([cameras.width, cameras.height]) / grid  # of unaligned scenes, whose views may be reduced again
-    if (scale * shown).max() >= 1:
+    window = _file_window(stored, size, transform, cameras)
+    if not window.is_larger:
         return None
-    first = np.floor(cut / scale).astype(int)
-    last = np.minimum(np.ceil((cut + grid) / scale - _ROUNDING).astype(int), stored)
-    to_file = np.eye(3)
-    to_file[(0, 1), (0, 1)] = 1 / (scale * shown)
-    to_file[:2, 2] = cut / scale - first
-    rows, columns = slice(first[1], last[1]), slice(first[0], last[0])
     Ks = to_cameras(replace(camera_file, lenses=()), stored).Ks if camera_file.lenses else None
 
     def read(view: int) -> np.ndarray:
         photo = photos_inside[view] if paths is None else decode_image(paths[view], stored)
         if paths is not None and Ks is not None:
             photo = undistort_photos([photo], Ks[view : view + 1], camera_file.lenses[view : view + 1])[0]
-        return photo[rows, columns]
+        return photo[window.rows, window.columns]
 
     photos_inside = photos if paths is None else ()
-    width, height = (int(side) for side in last - first)
-    return LargePhotos(matmul(to_file, cameras.Ks), width, height, tuple(range(len(cameras))), read)
+    width, height = (part.stop - part.start for part in (window.columns, window.rows))
+    return LargePhotos(matmul(window.to_file, cameras.Ks), width, height, tuple(range(len(cameras))), read)
+
+
+def find_masks(
+    files: SceneFiles,
+    camera_file: CameraFile,
+    photos: Photos | None,
+    size: Size | None,
+    transform: PhotoTransform | None,
+    cameras: Cameras,
+) -> np.ndarray | None:
+    """Read where the photos count, ``[c,h,w]`` bool, from masks and transparency; None where all of them does.
+
+    The arguments are those of :func:`find_large_photos`. A photo without a mask counts wholly.
+    """
+    paths = _photo_paths(files, camera_file) if photos is not None else None
+    stored = photo_size(photos) if paths is None else image_size(paths[0])
+    if photos is None or stored is None or size is None:
+        return None
+    named = [None] * len(camera_file) if files.masks is None else match_masks(files.masks, camera_file.names)
+    Ks = to_cameras(replace(camera_file, lenses=()), stored).Ks if camera_file.lenses else None
+    window = _file_window(stored, size, transform, cameras)
+
+    def read(view: int) -> np.ndarray | None:
+        parts = [None if paths is None else decode_alpha(paths[view])]
+        parts += [None if path is None else decode_mask(path) for path in (named[view],)]
+        mask = np.full((cameras.height, cameras.width), True)
+        for part in (part for part in parts if part is not None):
+            whole = cv2.resize(part.astype(np.uint8) * 255, stored, interpolation=cv2.INTER_NEAREST)
+            if Ks is not None:
+                bent = whole[..., None].repeat(3, -1), Ks[view : view + 1], camera_file.lenses[view : view + 1]
+                whole = undistort_photos([bent[0]], *bent[1:])[0][..., 0]
+            seen = np.ascontiguousarray(whole[window.rows, window.columns])
+            mask &= cv2.resize(seen, mask.shape[::-1], interpolation=cv2.INTER_AREA) > _MASK_LEVEL
+        return None if mask.all() else mask
+
+    masks = parallel_map(read, range(len(camera_file)))
+    if all(mask is None for mask in masks):
+        return None
+    whole = np.full((cameras.height, cameras.width), True)
+    return np.stack([whole if mask is None else mask for mask in masks])
+
+
+@dataclass(frozen=True)
+class _Window:
+    """The part of a photo's file that a view of the grid shows."""
+
+    rows: slice
+    columns: slice
+    to_file: np.ndarray  # [3,3] from pixels of the grid to those of the part
+    is_larger: bool  # whether it has more pixels than the view on both sides
+
+
+def _file_window(stored: Size, size: Size, transform: PhotoTransform | None, cameras: Cameras) -> _Window:
+    """Find the part of files of the size ``stored`` that the grid shows; see :func:`find_large_photos`."""
+    fitted = transform or resize_to(size, size)
+    scale = np.array([fitted.scale_x, fitted.scale_y]) * size / np.array(stored)
+    cut, grid = np.array([fitted.left, fitted.top]), np.array([fitted.width, fitted.height])
+    shown = np.array([cameras.width, cameras.height]) / grid  # of unaligned scenes, whose views may be reduced again
+    first = np.floor(cut / scale).astype(int)
+    last = np.minimum(np.ceil((cut + grid) / scale - _ROUNDING).astype(int), stored)
+    to_file = np.eye(3)
+    to_file[(0, 1), (0, 1)] = 1 / (scale * shown)
+    to_file[:2, 2] = cut / scale - first
+    (left, top), (right, bottom) = first.tolist(), last.tolist()
+    return _Window(slice(top, bottom), slice(left, right), to_file, bool((scale * shown).max() < 1))
+
+
+def cut_bars(photos: Photos | None, camera_file: CameraFile) -> tuple[Photos | None, list[str]]:
+    """Cut off the bars around photos that have the cameras' shape without them, with a note; or return them as is."""
+    size = photo_size(photos)
+    shapes = sizes_of(camera_file)
+    if photos is None or size is None or not shapes or any(same_shape(one, size) for one in shapes):
+        return photos, []
+    counts = [count_bars(photos[view], _BAR_SPREAD) for view in range(len(photos))]
+    above, below, left, right = (int(count) for count in np.median(counts, 0))
+    inner = size[0] - left - right, size[1] - above - below
+    if inner == size or not any(same_shape(one, inner) for one in shapes):
+        return photos, []
+
+    def cut(_: int, photo: np.ndarray) -> np.ndarray:
+        return np.ascontiguousarray(photo[above : size[1] - below, left : size[0] - right])
+
+    note = f"the photos of {size[0]} x {size[1]} have bars around pictures of {inner[0]} x {inner[1]}: they are cut off"
+    return keep_photos(change_photos(photos, inner, cut)), [note]
 
 
 def limit_photo_size(

@@ -96,3 +96,21 @@ def _cubic_taps(old: int, new: int) -> tuple[Picture, Picture]:
     far = ((a * away - 5 * a) * away + 8 * a) * away - 4 * a
     ids = (first + np.arange(-1, 3)[:, None]).clip(0, old - 1)
     return ids, np.where(away <= 1, near, far).astype(np.float32)
+
+
+def count_bars(image: np.ndarray, spread: float) -> tuple[int, int, int, int]:
+    """Count the lines of one colour at each border of a picture ``[h,w,c]``: above, below, left, right.
+
+    All values of a bar lie within ``spread``, and it ends before the picture's middle; otherwise it is none.
+    """
+    counts = []
+    for lines in (image, image[::-1], image.swapaxes(0, 1), image.swapaxes(0, 1)[::-1]):
+        low, high, count, most = np.inf, -np.inf, 0, len(lines) // 2
+        for line in lines[:most]:
+            low, high = min(low, float(line.min())), max(high, float(line.max()))
+            if high - low > spread:
+                break
+            count += 1
+        counts.append(count if count < most else 0)
+    above, below, left, right = counts
+    return above, below, left, right

@@ -265,8 +265,9 @@ def _splits(scene: Scene, own: Gaussians, targets: Views | None, renderer: _Rend
     """Split the views into input and held-out views, with photos or the input's renders, and visible pixels."""
     points = context_points(scene, renderer.near)
 
-    def split(views: Views, drawn: Gaussians | None) -> _Split:
-        return _Split(views, visible_pixels(points, views.cameras, renderer.near, scene.cameras), drawn)
+    def split(views: Views, drawn: Gaussians | None, masks: np.ndarray | None = None) -> _Split:
+        visible = visible_pixels(points, views.cameras, renderer.near, scene.cameras)
+        return _Split(views, visible if masks is None else visible & masks, drawn)
 
     target = {} if targets is None else {"target": split(targets, None)}
     if targets is not None and not renderer.options.context:
@@ -274,7 +275,7 @@ def _splits(scene: Scene, own: Gaussians, targets: Views | None, renderer: _Rend
     images, drawn = scene.images, own if scene.images is None else None
     if images is None:
         images = np.stack([renderer.image(own, scene.cameras, view) for view in range(len(scene))])
-    return {"context": split(Views(scene.cameras, images, scene.names), drawn), **target}
+    return {"context": split(Views(scene.cameras, images, scene.names), drawn, scene.masks), **target}
 
 
 def _score_result(

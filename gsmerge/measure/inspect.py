@@ -29,8 +29,11 @@ from gsmerge.options import CompactOptions
 from gsmerge.plan import resolved_settings, steps_for
 from gsmerge.report import finite, human_bytes
 from gsmerge.runtime.estimate import fit_of, memory_bytes, memory_problem, wall_seconds
+from gsmerge.runtime.record import record_part
 from gsmerge.runtime.threads import available_threads, use_threads
 from gsmerge.stages.clean import BOX_QUANTILES, beyond_scene, floater_share
+from gsmerge.stages.compare_photos import compare_photos
+from gsmerge.stages.prepare import canonicalise
 from gsmerge.stages.segment import count_limits, largest_count
 from gsmerge.stages.sky import sky_regions
 from gsmerge.types import Gaussians, Scene, StrPath
@@ -53,6 +56,7 @@ def inspect(
     *,
     cameras: StrPath | None = None,
     images: StrPath | None = None,
+    masks: StrPath | None = None,
     opacity: OpacityChoice = "auto",
     **hints: Any,
 ) -> dict[str, Any]:
@@ -62,6 +66,7 @@ def inspect(
         path: The scene.
         cameras: A file or a folder; None: searched next to the ``.ply``, and so are the images.
         images: A folder or an ``.npz``.
+        masks: A folder of images named as the photos, dark where a photo does not count.
         opacity: As of :func:`gsmerge.io.read_ply`.
         hints: Fields of :class:`gsmerge.io.ReadHints`: ``exporter``, ``quats``, ``order``, ``scene_scale``,
             ``max_side``.
@@ -83,7 +88,7 @@ def inspect(
             fit are reported instead.
     """
     read_hints = make_hints(hints)
-    files = find_scene_files(path, cameras=cameras, images=images)
+    files = find_scene_files(path, cameras=cameras, images=images, masks=masks)
     with use_threads():
         ply = read_ply_with_hints(files.ply, opacity=opacity, hints=read_hints)
         document: dict[str, Any] = finite(_describe_file(ply) | _describe_views(ply, files, read_hints))
@@ -100,6 +105,14 @@ def _describe_file(ply: PlyScene) -> dict[str, Any]:
         "num_transparent": int((opacities < _TRANSPARENT).sum()),
         "num_saturated": int(((opacities <= _SATURATED) | (opacities >= 1 - _SATURATED)).sum()),
     }
+
+
+def _photo_notes(scene: Scene) -> list[str]:
+    """Say which photos do not look as their Gaussians, as a run would."""
+    with record_part(silent=True) as record:
+        if scene.images is not None and len(scene) and len(scene.gaussians):
+            compare_photos(canonicalise(scene)[0])
+    return record.notes
 
 
 def _describe_views(ply: PlyScene, files: SceneFiles, hints: ReadHints) -> dict[str, Any]:
@@ -129,7 +142,7 @@ def _describe_views(ply: PlyScene, files: SceneFiles, hints: ReadHints) -> dict[
         if scene.images is not None:
             means = gaussians.means[stored & np.isfinite(gaussians.means).all(1)]
             num_sky_views = len(sky_regions(means, scene.cameras, scene.images))
-    facts |= {"notes": load.notes, "num_views": len(load.views.used)}
+    facts |= {"notes": [*load.notes, *_photo_notes(scene)], "num_views": len(load.views.used)}
     facts |= {"camera_format": load.cameras and load.cameras.source}
     facts |= {"coverage": coverage(scene), "sight": sight and asdict(sight)}
     facts |= {"num_sky_views": num_sky_views, "compact": estimate(scene, CompactOptions())}

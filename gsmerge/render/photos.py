@@ -22,6 +22,7 @@ Score = TypeVar("Score")
 NEAR = 0.01  # near plane of every render that is scored, in canonical units
 ONE_AT_A_TIME = 400_000  # Gaussians; the plan of a view is as large as they are, so threads share one view instead
 BLOCK = 2  # tiles per side of the blocks that scored_tiles chooses among
+MASKED = np.float32(0.1)  # weight of pixels outside masks, which show the Gaussians' colours: none would let them drift
 EPS2D = 0.3  # low-pass of the rasterizer, square pixels of the full-size image
 
 
@@ -35,6 +36,7 @@ class Photos:
     # Low-pass variance in square pixels of this size: it stays that of the full-size image, so that scales are judged
     # against the filter that they will be rendered with
     eps2d: float
+    weights: np.ndarray | None = None  # [v,h,w] float32 of the pixels, in [0, 1]; None: all 1
 
     def __len__(self) -> int:
         return len(self.images)
@@ -44,7 +46,8 @@ class Photos:
         ids = list(views)
         if ids == list(range(len(self))):
             return self
-        return replace(self, images=self.images[ids], viewmats=self.viewmats[ids], Ks=self.Ks[ids])
+        weights = None if self.weights is None else self.weights[ids]
+        return Photos(self.images[ids], self.viewmats[ids], self.Ks[ids], self.eps2d, weights)
 
     @property
     def height(self) -> int:
@@ -86,7 +89,17 @@ def scene_photos(scene: Scene, level: float = 1) -> Photos:
     """Return the scene's photos, each side divided by ``level`` (area averages)."""
     if scene.images is None:
         raise ValueError("expected a scene with images")
-    return photos_of(scene.images, scene.cameras, level)
+    photos = photos_of(scene.images, scene.cameras, level)
+    return replace(photos, weights=pixel_weights(scene.masks, photos.width, photos.height))
+
+
+def pixel_weights(masks: np.ndarray | None, width: int, height: int) -> np.ndarray | None:
+    """Return weights ``[v,height,width]`` float32 of photos with masks ``[v,h,w]``: 1 inside, little outside."""
+    if masks is None:
+        return None
+    size = width, height
+    levels = [cv2.resize(mask.astype(np.uint8) * 255, size, interpolation=cv2.INTER_AREA) for mask in masks]
+    return np.where(np.stack(levels) == 255, np.float32(1), MASKED)
 
 
 def photos_of(images: np.ndarray, cameras: Cameras, level: float = 1) -> Photos:
@@ -159,6 +172,10 @@ def view_psnr(image: np.ndarray, photos: Photos, view: int, *, quarter: bool) ->
     """Return the PSNR (dB) of a photo, or a quarter of it, and its render ``[h,w,3]``, clipped in place."""
     tiles = scored_tiles(view, photos.width, photos.height) if quarter else None
     mask = None if tiles is None else tiles.repeat(TILE, 0).repeat(TILE, 1)[: photos.height, : photos.width]
+    if photos.weights is not None:
+        counts = photos.weights[view] == 1
+        both = counts if mask is None or not (mask & counts).any() else mask & counts
+        mask = both if both.any() else mask
     return psnr(np.clip(image, 0, 1, out=image), photos.images[view], mask)
 
 

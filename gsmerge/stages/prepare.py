@@ -8,6 +8,7 @@ same at every scale. The unit is a power of two: scaling there and back changes 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -19,7 +20,8 @@ from gsmerge.runtime.record import note, stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.align_views import align_views
 from gsmerge.stages.assign import seen_weights
-from gsmerge.stages.check_photos import leave_out_photos
+from gsmerge.stages.compare_photos import compare_photos
+from gsmerge.stages.exposure import Exposure, equalise_exposure
 from gsmerge.stages.place_cameras import add_pictures, add_views
 from gsmerge.types import Cameras, Gaussians, Scene
 from gsmerge.views import distinct_views, subset
@@ -116,6 +118,9 @@ class PrepareOptions:
             the cameras on (on the CPU); ``"fixed"``: cameras stay where they are; ``"auto"``: free where some view is
             more than 1.5 pixels off and its photo and the others agree clearly better elsewhere
             (:mod:`gsmerge.stages.align_views` says by how much); fixed elsewhere, and without photos.
+        exposure: ``"auto"``: exposures and white balances of the photos, and of the Gaussians of their pixels, are
+            brought to their mean where they differ at random (:mod:`gsmerge.stages.exposure` says when);
+            ``"per-photo"``: wherever they differ; ``"fixed"``: never.
         unseen: ``"drop"``: Gaussians without a pixel that no view sees are left out. ``"keep"``: they are merged among
             their neighbours in space, at the rate of the others, and added to the result.
 
@@ -124,11 +129,14 @@ class PrepareOptions:
     """
 
     poses: Poses = "auto"
+    exposure: Exposure = "auto"
     unseen: Unseen = "drop"
 
     def __post_init__(self) -> None:
         if self.poses not in ("auto", "fixed", "free"):
             raise ValueError(f'poses: expected "auto", "fixed" or "free", got {self.poses!r}')
+        if self.exposure not in ("auto", "fixed", "per-photo"):
+            raise ValueError(f'exposure: expected "auto", "fixed" or "per-photo", got {self.exposure!r}')
         if self.unseen not in ("drop", "keep"):
             raise ValueError(f'unseen: expected "drop" or "keep", got {self.unseen!r}')
 
@@ -137,7 +145,7 @@ class PrepareOptions:
 class Prepared:
     """Facts about a scene, and the scene as the stages work on it."""
 
-    given: Scene  # The scene as it was given, in its own world frame
+    given: Scene  # The scene as it was given, in its own world frame, with photos that look as its Gaussians
     # The canonical scene: every view once, photos that do not show it replaced; an unaligned one
     # has cameras, pictures and only finite Gaussians that are seen, or all if none is set aside
     scene: Scene
@@ -152,6 +160,10 @@ class Prepared:
         if cameras is self.scene.cameras:
             return self
         return replace(self, scene=replace(self.scene, cameras=cameras), moved=True)
+
+    def result_views(self) -> Scene:
+        """Return the given scene with the photos as a result is to show them: in one exposure, if they were changed."""
+        return _with_photos(self.given, self.scene, self.repeated)
 
     def final_cameras(self) -> Cameras:
         """Return the given views' cameras as the result was made from them, in the world."""
@@ -175,13 +187,23 @@ def prepare(scene: Scene, options: PrepareOptions | None = None, frame: Frame | 
         own = subset(scene, views)
         note(f"{len(scene) - len(views)} views repeat others in every pixel and count once")
     canonical, frame = canonicalise(add_views(own), frame)
-    checked, photo_views = leave_out_photos(canonical)
+    compared, photo_views = compare_photos(canonical)
+    given = _with_photos(scene, compared, repeated)
+    checked = equalise_exposure(compared, photo_views, options.exposure)
     placed = checked
     if checked.aligned and checked.images is not None and options.poses != "fixed":
         placed = align_views(checked, photo_views, always=options.poses == "free") or checked
     seen, unseen = _split_unseen(placed) if options.unseen == "keep" else (placed, None)
     shown = seen if seen.aligned else add_pictures(seen)  # pixels that are known have colours of their own
-    return Prepared(scene, shown, frame, photo_views, tuple(repeated), placed is not checked, unseen)
+    return Prepared(given, shown, frame, photo_views, tuple(repeated), placed is not checked, unseen)
+
+
+def _with_photos(given: Scene, own: Scene, repeated: Sequence[int]) -> Scene:
+    """Return the given scene with the photos and masks of its distinct views; itself where they are its own."""
+    if own.images is None or given.images is None or (own.images is given.images and own.masks is given.masks):
+        return given
+    images, masks = (None if some is None else some[list(repeated)] for some in (own.images, own.masks))
+    return replace(given, images=images, masks=masks)
 
 
 def _split_unseen(scene: Scene) -> tuple[Scene, Gaussians | None]:

@@ -157,6 +157,7 @@ def test_every_option_is_a_field_of_the_api() -> None:
     own = {
         "cameras",
         "images",
+        "masks",
         "hint",
         "set",
         "output",

@@ -7,7 +7,7 @@ networks correct. Gaussians that no photo shows have no target.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -23,7 +23,7 @@ from gsmerge.research.training.scenes import TrainingScene, coverage, covered_pi
 from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.stages.decode import DecodeOptions, divide
 from gsmerge.stages.fit.fit_options import FitOptions
-from gsmerge.stages.fit.full import Masks, fit_full
+from gsmerge.stages.fit.full import fit_full
 from gsmerge.stages.fit.stage import visible_mask
 from gsmerge.types import SH_C0, FeatureGaussians, Gaussians, as_tensor
 
@@ -51,9 +51,10 @@ def fit_targets(
     ``name`` is the scene's, for errors; ``progress`` is called with (step, steps) of the fits. A SceneError if the fit
     does not improve held-out parts of the photos.
     """
-    photos, masks = (training.photos(), training.photos(2)), covered_pixels(coverage(training))
+    masks, (full, half) = covered_pixels(coverage(training)), (training.photos(), training.photos(2))
     masks[: len(training.scene)] = True  # of the other photos, only what the scene covers counts
-    sized = masks, reduced_masks(masks, photos[1])
+    weights = masks.astype(np.float32), reduced_masks(masks, half).astype(np.float32)
+    photos = replace(full, weights=weights[0]), replace(half, weights=weights[1])
     frames = as_tensor(compute_group_features(merged, training.members, training.scene.cameras).frames)
     targets = {}
     for number, k in enumerate(options.levels):
@@ -63,7 +64,7 @@ def fit_targets(
                 progress(number * steps + step, len(options.levels) * steps)
 
         children, parents = divide(merged, training.members, np.full(len(merged), k))
-        fitted, mask = _fit_level(name, photos, sized, children, options, report)
+        fitted, mask = _fit_level(name, photos, children, options, report)
         corrections = np.zeros((len(children), RESIDUAL), np.float32)
         start, end = children[mask].to("cpu"), fitted.to("cpu")
         corrections[mask] = corrections_between(start, end, frames[torch.from_numpy(parents[mask])])
@@ -74,7 +75,6 @@ def fit_targets(
 def _fit_level(
     name: str,
     photos: tuple[Photos, Photos],
-    masks: Masks,
     start: Gaussians,
     options: TrainOptions,
     progress: Callable[[int, int, float, float], None],
@@ -83,7 +83,7 @@ def _fit_level(
     fit = FitOptions(fit_steps=options.fit_steps)
     mask = start.opacities >= DecodeOptions().min_opacity
     mask[mask.copy()] = visible_mask(start[mask], photos[1], fit.min_contribution)
-    fitted, report = fit_full(start[mask], photos, fit, seed=options.seed, progress=progress, masks=masks)
+    fitted, report = fit_full(start[mask], photos, fit, seed=options.seed, progress=progress)
     if not report.accepted:
         problem = f"expected a scene that the fit makes better ({report.stopped})"
         raise SceneError(name, problem, "leave it out")

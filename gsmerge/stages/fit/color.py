@@ -188,7 +188,8 @@ class _System:
         images, options = self._images(x), self.options
 
         def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
-            base = np.ones_like(self.train[view]) if everywhere else self.train[view]
+            train = self.train[view]
+            base = np.where(train == 0, np.float32(1), train) if everywhere else train
             error = np.sqrt(((self.photos.images[view] - images[view]) ** 2).mean(-1))
             robust = base * np.minimum(1, options.tuning.huber / np.maximum(error, 1e-6)).astype(np.float32)
             return robust, base * (error < 2 * options.tuning.huber)

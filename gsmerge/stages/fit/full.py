@@ -29,7 +29,7 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.fit.fit_options import EARLIER, LONG_STEPS, FitOptions, FitReport, Tuning
 from gsmerge.stages.fit.fit_state import State, gaussians_of, grow_to, start_state
 from gsmerge.stages.fit.loss import image_gradient
-from gsmerge.stages.fit.photo_sizes import holdout_psnr, reduced, training_weights
+from gsmerge.stages.fit.photo_sizes import HIDDEN, holdout_psnr, reduced, training_weights
 from gsmerge.stages.fit.survey import Survey, survey_photos
 from gsmerge.types import Array, Gaussians
 
@@ -50,8 +50,6 @@ LOOKS = (
     (1.0, True), (1.0, False), (0.25, False), (1.0, False), (1.0, False), (1.0, False), (0.25, False), (1.0, False),
 )  # fmt: skip
 
-HIDDEN = np.float32(1e-9)  # a weight that is neither that of a held-out pixel nor one that counts
-Masks = tuple[np.ndarray, np.ndarray]  # of the photos at full and at half size, [v,h,w] bool
 Progress = Callable[[int, int, float, float], None]  # step, steps, PSNR of the photos and of their held-out blocks
 EPS = 1e-15  # of Adam
 
@@ -79,30 +77,29 @@ class FitPlan:
         return 2 if len(self.photos) > 2 and step % 5 in LARGE_STEPS else 0
 
 
-def plan_run(photos: tuple[Photos, ...], options: FitOptions, seed: int, masks: Masks | None = None) -> FitPlan:
-    """Plan a fit: held-out blocks, hidden pixels, and dropout where there are few views."""
+def plan_run(photos: tuple[Photos, ...], options: FitOptions, seed: int) -> FitPlan:
+    """Plan a fit: held-out blocks, pixels outside masks, and dropout where there are few views."""
     full = training_weights(photos[0], options.holdout, seed)
     few = len(photos[0]) <= FEW_VIEWS and options.steps >= MANY_STEPS
     default = DROPOUT if few else LONG_DROPOUT if options.steps >= LONG_STEPS else 0.0
     dropout = default if options.dropout is None else options.dropout
     weights = full, reduced(full, photos[1])
-    if masks is not None:
-        weights = _hidden(weights[0], masks[0]), _hidden(weights[1], masks[1])
-    everywhere = [np.where(weight == HIDDEN, np.float32(0), np.float32(1)) for weight in weights[0]]
+    everywhere, *larger = (_weights_of(one) for one in (photos[0], *photos[2:]))
     trained = [np.where(weight == HIDDEN, np.float32(0), weight) for weight in weights[1]]
-    ones = [[np.ones((p.height, p.width), np.float32)] * len(p) for p in photos[2:]]
     half_part = options.half_res_part
     if len(photos) > 2 and options.half_res_share is None:
         half_part -= EARLIER
     poses = None
     if options.move_cameras:
         poses, photos = start_poses(photos)
-    return FitPlan(photos, weights, (everywhere, trained, *ones), options, dropout, half_part, poses)
+    return FitPlan(photos, weights, (everywhere, trained, *larger), options, dropout, half_part, poses)
 
 
-def _hidden(weights: list[np.ndarray], masks: np.ndarray) -> list[np.ndarray]:
-    """Return the training weights inside the masks, and ``HIDDEN`` outside."""
-    return [np.where(mask, weight, HIDDEN) for weight, mask in zip(weights, masks, strict=True)]
+def _weights_of(photos: Photos) -> list[np.ndarray]:
+    """Return the weights ``[h,w]`` of all pixels of each photo."""
+    if photos.weights is None:
+        return [np.ones((photos.height, photos.width), np.float32)] * len(photos)
+    return list(photos.weights)
 
 
 def fit_step(state: State, plan: FitPlan, view: int, step: int, progress: float, rng: np.random.Generator) -> float:
@@ -226,7 +223,6 @@ def fit_full(
     count: int = 0,
     seed: int = 0,
     progress: Progress | None = None,
-    masks: Masks | None = None,
     baseline_start: Gaussians | None = None,
     look: Survey | None = None,
 ) -> tuple[Gaussians, FitReport]:
@@ -237,12 +233,11 @@ def fit_full(
     every block.
 
     ``photos`` come at full and at half size, and larger if the fit is to see them. ``count``:
-    number of Gaussians to grow to, where the run is long enough. ``masks``: pixels that count;
-    where no Gaussian is, none should be drawn to. ``baseline_start``: another start that the fit
+    number of Gaussians to grow to, where the run is long enough. ``baseline_start``: another start that the fit
     may beat instead, see :func:`judge`. ``look``: a survey of the Gaussians, where there is
     one already. ``progress`` is called after every step.
     """
-    rng, state, plan = np.random.default_rng(seed), start_state(gaussians), plan_run(photos, options, seed, masks)
+    rng, state, plan = np.random.default_rng(seed), start_state(gaussians), plan_run(photos, options, seed)
     tail = TailMean()
     look = survey_photos(gaussians, photos) if look is None else look
     own, state.box_shares[:], state.min_sizes[:] = initial_scores(look, plan)

@@ -9,7 +9,7 @@ import numpy as np
 
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.render.metrics import decibels
-from gsmerge.render.photos import EPS2D, Photos, scene_photos
+from gsmerge.render.photos import EPS2D, Photos, pixel_weights, scene_photos
 from gsmerge.runtime.record import choose, note
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.fit.fit_options import FitOptions
@@ -19,6 +19,7 @@ AUTO_SCALE = 2.0  # most that "auto" looks at: steps cost as many pixels, and ph
 MIN_AUTO_SCALE = 1.25  # below it "auto" leaves it at the views' size
 ALIKE = 0.01  # of the scale: the rounding of sizes
 BLOCK = 32  # pixels, at most
+HIDDEN = np.float32(1e-9)  # a weight that is neither that of a held-out pixel nor one that counts
 
 
 def fit_photos(scene: Scene, options: FitOptions, views: Sequence[int] | None = None) -> tuple[Photos, ...]:
@@ -81,11 +82,15 @@ def large_photos(scene: Scene, scale: float) -> Photos:
         return np.asarray(cv2.resize(large.read(photo), (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
     Ks = large.Ks * np.array([[width / large.width], [height / large.height], [1.0]])
-    return Photos(np.stack(parallel_map(read, large.ids)), cameras.viewmats.astype(np.float64), Ks, EPS2D)
+    weights = pixel_weights(scene.masks, width, height)
+    return Photos(np.stack(parallel_map(read, large.ids)), cameras.viewmats.astype(np.float64), Ks, EPS2D, weights)
 
 
 def training_weights(photos: Photos, share: float, seed: int) -> list[np.ndarray]:
-    """Return weights ``[h,w]`` float32 per view: 0 on the held-out blocks, at least one a view, 1 elsewhere."""
+    """Return weights ``[h,w]`` float32 per view: 0 on held-out blocks, at least one a view, the photos' elsewhere.
+
+    Pixels that count less are not held out; those that do not count at all have the weight ``HIDDEN``.
+    """
     size = max(1, min(BLOCK, min(photos.height, photos.width) // 4))
 
     def one_view(view: int) -> np.ndarray:
@@ -95,7 +100,10 @@ def training_weights(photos: Photos, share: float, seed: int) -> list[np.ndarray
         if not blocks.any():
             blocks[random.integers(rows), random.integers(columns)] = rows * columns > 1
         full = np.repeat(np.repeat(~blocks, size, 0), size, 1)[: photos.height, : photos.width]
-        return full.astype(np.float32)
+        if photos.weights is None:
+            return full.astype(np.float32)
+        own = photos.weights[view]
+        return np.where(own == 1, full.astype(np.float32), np.maximum(own, HIDDEN))
 
     return [one_view(view) for view in range(len(photos))]
 

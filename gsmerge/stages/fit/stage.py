@@ -43,7 +43,7 @@ class FitBackend(Generic[PhotosT]):
     download: Callable[[Gaussians], Gaussians]
     # photos of all sizes and a least weight -> which Gaussians stay, and what the full fit can use of the look
     look_at: Callable[[Gaussians, tuple[PhotosT, ...], float], tuple[Array, Survey | None]]
-    fit_full: Callable[..., FitResult]  # see gsmerge.stages.fit.full.fit_full; without masks
+    fit_full: Callable[..., FitResult]  # see gsmerge.stages.fit.full.fit_full
     fit_colors: Callable[[Gaussians, PhotosT, FitOptions, int], FitResult]  # the last: a seed
     grow: Callable[[Gaussians, PhotosT, int], Gaussians]  # to a number, see gsmerge.stages.fit.fit_state.grow_to
     photo_error: Callable[[Gaussians, PhotosT], float]  # mean squared error of all photos

@@ -38,8 +38,13 @@ def test_steps_do_not_look_where_the_mask_is_not(coarse: float) -> None:
     for mask in masks:
         mask[:, :, : mask.shape[2] // 3] = False
     whole, _ = fit_full(start, rubbish, options)
-    masked, report = fit_full(start, rubbish, options, masks=masks)
-    again, _ = fit_full(start, rubbish, options, masks=tuple(np.ones_like(mask) for mask in masks))
+    pairs = list(zip(rubbish, masks, strict=True))
+    masked, report = fit_full(
+        start, tuple(replace(photos, weights=mask.astype(np.float32)) for photos, mask in pairs), options
+    )
+    again, _ = fit_full(
+        start, tuple(replace(photos, weights=np.ones(mask.shape, np.float32)) for photos, mask in pairs), options
+    )
     assert report.accepted
     assert scenes.psnr_of(masked, scene) > scenes.psnr_of(whole, scene) + 2
     assert np.array_equal(again.means, whole.means)

@@ -1,0 +1,227 @@
+"""Photos as people have them: held-out PSNR after bands, masks, bars, other tones and exposures.
+
+python benchmarks/photos.py fern,fox                          # a third of the size, five views
+python benchmarks/photos.py fern --cases "half exposure" bgr
+python benchmarks/photos.py fern --shrink 2 --cases "gain .5 to 2 in both"
+python benchmarks/photos.py eval --cases sound --shrink 1 --views 0   # what is found where nothing is wrong
+
+Visible pixels; inside and outside an ellipse; after the colours of each held-out photo were aligned.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from shared_scenes import Targets, exporter, read_held_out, scene_folders
+
+import gsmerge
+from gsmerge.measure.align import fit_colors
+from gsmerge.render.metrics import psnr
+from gsmerge.types import Gaussians
+
+BAND = 0.3  # of the height
+SETTINGS: dict[str, Any] = {}
+Change = Callable[[int, np.ndarray], np.ndarray]  # number, photo [h,w,3] in [0, 1] -> photo as it is written
+
+
+def ellipse(height: int, width: int) -> np.ndarray:
+    """The pixels of an ellipse in a picture."""
+    y, x = (np.arange(height) + 0.5) / height * 2 - 1, (np.arange(width) + 0.5) / width * 2 - 1
+    return y[:, None] ** 2 / 0.72 + x**2 / 0.72 < 1
+
+
+def band(number: int, photo: np.ndarray) -> np.ndarray:
+    """A flat band over the lower part of three of five photos."""
+    out = photo.copy()
+    if number % 2 == 0:
+        out[round((1 - BAND) * len(photo)) :] = (0.85, 0.8, 0.1)
+    return out
+
+
+def mask_black(_: int, photo: np.ndarray) -> np.ndarray:
+    return photo * ellipse(*photo.shape[:2])[..., None]
+
+
+def alpha(_: int, photo: np.ndarray) -> np.ndarray:
+    inside = ellipse(*photo.shape[:2])[..., None]
+    return np.concatenate([photo * inside, inside], -1)
+
+
+def letterbox(_: int, photo: np.ndarray) -> np.ndarray:
+    """The picture, smaller, between black bars in a frame of the same size."""
+    height, width = photo.shape[:2]
+    bar = round(0.14 * height)
+    out = np.zeros_like(photo)
+    out[bar : height - bar] = cv2.resize(photo, (width, height - 2 * bar), interpolation=cv2.INTER_AREA)
+    return out
+
+
+def bars(_: int, photo: np.ndarray) -> np.ndarray:
+    """Black bars over the picture."""
+    height, out = len(photo), photo.copy()
+    bar = round(0.14 * height)
+    out[:bar] = out[height - bar :] = 0
+    return out
+
+
+def padded(_: int, photo: np.ndarray) -> np.ndarray:
+    """Black bars above and below, in a taller frame."""
+    bar = round(0.14 * len(photo))
+    return np.pad(photo, ((bar, bar), (0, 0), (0, 0)))
+
+
+def linear(_: int, photo: np.ndarray) -> np.ndarray:
+    return np.where(photo <= 0.04045, photo / 12.92, ((photo + 0.055) / 1.055) ** 2.4)
+
+
+def gains(low: float, high: float, channels: int) -> Change:
+    """Factors for every photo, evenly many brighter and darker."""
+
+    def change(number: int, photo: np.ndarray) -> np.ndarray:
+        random = np.random.default_rng([7, number])
+        return np.clip(photo * np.exp(random.uniform(np.log(low), np.log(high), channels)), 0, 1)
+
+    return change
+
+
+@dataclass(frozen=True)
+class Case:
+    change: Change
+    gaussians_too: bool = False  # whether the model saw the photos so
+    masks: bool = False  # whether masks lie beside the photos
+
+
+CASES = {
+    "sound": Case(lambda _, photo: photo),
+    "band": Case(band),
+    "ellipse": Case(mask_black),
+    "alpha": Case(alpha),
+    "masks": Case(mask_black, masks=True),
+    "letterbox": Case(letterbox),
+    "bars": Case(bars),
+    "padded": Case(padded),
+    "linear": Case(linear),
+    "half exposure": Case(lambda _, photo: 0.5 * photo),
+    "gamma 1.8": Case(lambda _, photo: photo**1.8),
+    "bgr": Case(lambda _, photo: photo[..., ::-1]),
+    "gain .5 to 2 in both": Case(gains(0.5, 2, 1), gaussians_too=True),
+    "gain .8 to 1.25 in both": Case(gains(0.8, 1.25, 1), gaussians_too=True),
+    "white balance .8 to 1.25 in both": Case(gains(0.8, 1.25, 3), gaussians_too=True),
+    "gain .8 to 1.25 in photos": Case(gains(0.8, 1.25, 1)),
+}
+
+
+def shrink_scene(scene: Path, out: Path, by: int, change: Change | None) -> Path:
+    """A scene's folder with photos, depths and confidence ``by`` times smaller; context photos changed."""
+    shutil.rmtree(out, ignore_errors=True)
+    document = json.loads((scene / "transforms.json").read_text())
+    context = 0
+    for frame in document["frames"]:
+        for name in ("file_path", "depth_path", "confidence_path"):
+            if name not in frame:
+                continue
+            image = cv2.imread(str(scene / frame[name]), cv2.IMREAD_UNCHANGED)
+            size = frame["w"] // by, frame["h"] // by
+            kind = cv2.INTER_AREA if name == "file_path" else cv2.INTER_NEAREST
+            image = cv2.resize(image, size, interpolation=kind) if by > 1 else image
+            path = (out / frame[name]).with_suffix(".png")
+            if name == "file_path" and frame["role"] == "context" and change is not None:
+                changed = change(context, image[..., ::-1].astype(np.float64) / 255)
+                image = np.round(changed[..., ::-1] * 255).astype(np.uint8)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(path), image)
+            frame[name] = str(path.relative_to(out))
+        context += frame["role"] == "context"
+        for key, side in (("fl_x", "w"), ("cx", "w"), ("fl_y", "h"), ("cy", "h")):
+            frame[key] *= (frame[side] // by) / frame[side]
+        frame["w"], frame["h"] = frame["w"] // by, frame["h"] // by
+    (out / "transforms.json").write_text(json.dumps(document))
+    return out
+
+
+def export_case(scene: Path, case: Case, out: Path, by: int, views: int) -> tuple[Path, Targets]:
+    """The export of a scene whose photos were changed, and its held-out photos, which were not."""
+    shutil.rmtree(out, ignore_errors=True)
+    small = shrink_scene(scene, out / "small", by, case.change if case.gaussians_too else None)
+    path = Path(exporter().export(small, out / "export", "plain", views or None))
+    photos = sorted((out / "export" / "images").iterdir(), key=lambda file: _order(out / "export", file.name))
+    for number, file in enumerate(photos):
+        photo = cv2.imread(str(file))[..., ::-1].astype(np.float64) / 255
+        if case.masks:
+            (out / "export" / "masks").mkdir(exist_ok=True)
+            mask = ellipse(*photo.shape[:2]).astype(np.uint8) * 255
+            cv2.imwrite(str(out / "export" / "masks" / f"{file.name}.png"), mask)
+        if not case.gaussians_too:
+            changed = case.change(number, photo)
+            order = [2, 1, 0, 3] if changed.shape[-1] == 4 else [2, 1, 0]
+            cv2.imwrite(str(file), np.round(changed[..., order] * 255).astype(np.uint8))
+    return path, read_held_out(small)
+
+
+def _order(folder: Path, name: str) -> int:
+    frames = json.loads((folder / "transforms.json").read_text())["frames"]
+    return [Path(frame["file_path"]).name for frame in frames].index(name)
+
+
+def measure(gaussians: Gaussians, targets: Targets) -> dict[str, float]:
+    """Mean PSNR over the visible pixels; inside and outside the ellipse; with colours aligned."""
+    images = gsmerge.render(gaussians, targets.cameras).images.clip(0, 1)
+    inside = ellipse(*images.shape[1:3])
+    rows = []
+    for image, photo, mask in zip(images, targets.images, targets.masks, strict=True):
+        aligned = fit_colors(image, photo, mask)
+        parts = [psnr(image, photo, some) for some in (mask, mask & inside, mask & ~inside)]
+        rows.append([*parts, psnr(aligned, photo, mask)])
+    return dict(zip(("all", "inside", "outside", "aligned"), np.mean(rows, 0).tolist(), strict=True))
+
+
+def run(scene: Path, names: Sequence[str], cache: Path, args: argparse.Namespace) -> None:
+    """Print a row for each case, and for the input."""
+    shown = False
+    for name in names:
+        folder = cache / f"{scene.name}-{name.replace(' ', '-')}"
+        path, targets = export_case(scene, CASES[name], folder, args.shrink, args.views)
+        try:
+            given = gsmerge.read_scene(path)
+        except gsmerge.GsmergeError as error:
+            print(f"{scene.name:10} {name:40} {error}", flush=True)
+            continue
+        if not shown or CASES[name].gaussians_too:
+            _print(scene.name, f"input, {name}", measure(given.gaussians, targets), ())
+            shown = True
+        result = gsmerge.compact(replace(given), **SETTINGS)
+        _print(scene.name, name, measure(result.gaussians, targets), result.report.notes)
+
+
+def _print(scene: str, name: str, values: dict[str, float], notes: Sequence[str]) -> None:
+    figures = "  ".join(f"{key} {value:6.2f}" for key, value in values.items())
+    print(f"{scene:10} {name:40} {figures}", flush=True)
+    for text in notes:
+        print(f"{'':12}{text}", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("scenes", help="train, eval, or names with commas between")
+    parser.add_argument("--cases", nargs="*", choices=list(CASES), default=list(CASES))
+    parser.add_argument("--shrink", type=int, default=3, help="photos so many times smaller")
+    parser.add_argument("--views", type=int, default=5, help="context views; 0: all")
+    parser.add_argument("--set", nargs="*", default=[], help="settings, as name=value")
+    parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-photos")
+    args = parser.parse_args()
+    SETTINGS.update(text.split("=", 1) for text in args.set)
+    for scene in scene_folders(args.scenes):
+        run(scene, args.cases, args.cache, args)
+
+
+if __name__ == "__main__":
+    main()

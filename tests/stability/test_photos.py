@@ -1,0 +1,174 @@
+"""Photos as people have them: covered, masked, in bars, in another tone or exposure (method reference, case 29)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+
+from gsmerge import CompactResult, Gaussians, Scene, compact
+from gsmerge.geometry import rgb_to_sh0, sh0_to_rgb
+from gsmerge.stages.prepare import PrepareOptions, prepare
+
+Photos = np.ndarray
+Change = Callable[[Photos], Photos]
+VIEWS, WIDTH, HEIGHT = 6, 96, 72
+FIT = {"budget": 300, "fit_steps": 60, "checkpoint": "none"}
+
+
+@pytest.fixture(scope="module")
+def room() -> Scene:
+    return scenes.make_scene(scenes.room(), scenes.arc(VIEWS, WIDTH, HEIGHT), noise=0.005)
+
+
+@pytest.fixture(scope="module")
+def sound(room: Scene) -> CompactResult:
+    return compact(room, **FIT)
+
+
+def novel_psnr(gaussians: Gaussians, *, aligned: bool = False) -> float:
+    """PSNR of a view between the photos; ``aligned``: after one factor for its brightness."""
+    camera = scenes.arc(1, WIDTH, HEIGHT, start=-0.2)
+    truth = scenes.trace(scenes.room(), camera)[2].reshape(HEIGHT, WIDTH, 3)
+    image = np.clip(scenes.images_of(gaussians, camera)[0][0], 0, 1)
+    if aligned:
+        image = image * (image * truth).sum((0, 1)) / (image * image).sum((0, 1))
+    return float(-10 * np.log10(((image - truth) ** 2).mean()))
+
+
+def band(photos: Photos) -> Photos:
+    out = photos.copy()
+    out[::2, 50:] = (0.9, 0.8, 0.1)
+    return out
+
+
+def ellipse() -> np.ndarray:
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    return ((y - 35.5) / 30) ** 2 + ((x - 47.5) / 40) ** 2 < 1
+
+
+def masked(photos: Photos) -> Photos:
+    return photos * ellipse()[..., None]
+
+
+def bars(photos: Photos) -> Photos:
+    out = photos.copy()
+    out[:, :10] = out[:, -10:] = 0
+    return out
+
+
+def letterbox(photos: Photos) -> Photos:
+    """Every second row, between bars."""
+    out = np.zeros_like(photos)
+    out[:, 18:54] = photos.reshape(VIEWS, 36, 2, WIDTH, 3).mean(2)
+    return out
+
+
+def linear(photos: Photos) -> Photos:
+    return np.where(photos <= 0.04045, photos / 12.92, ((photos + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def half(photos: Photos) -> Photos:
+    return photos * np.float32(0.5)
+
+
+def gamma(photos: Photos) -> Photos:
+    return photos ** np.float32(1.8)
+
+
+def bgr(photos: Photos) -> Photos:
+    return photos[..., ::-1].copy()
+
+
+CASES = [
+    (band, 0.5, "3 of 6 photos show in part what the Gaussians do not"),
+    (masked, 0.5, "6 of 6 photos show in part what the Gaussians do not"),
+    (bars, 0.5, "6 of 6 photos show in part what the Gaussians do not"),
+    (letterbox, 4.0, "the photos have bars around the pictures (25 % above, 25 % below)"),  # half of its rows are gone
+    (linear, 0.5, "6 of 6 photos have another tone than their Gaussians"),
+    (half, 0.5, "6 of 6 photos have another tone than their Gaussians"),
+    (gamma, 0.5, "6 of 6 photos have another tone than their Gaussians"),
+    (bgr, 0.1, "red and blue are in the wrong order in the photos"),
+]
+
+
+@pytest.mark.parametrize(("change", "loss", "note"), CASES, ids=lambda case: getattr(case, "__name__", None))
+def test_photos_are_mended(room: Scene, sound: CompactResult, change: Change, loss: float, note: str) -> None:
+    result = compact(replace(room, images=change(room.images)), **FIT)
+    assert any(one.startswith(note) for one in result.report.notes)
+    assert novel_psnr(result.gaussians) > novel_psnr(sound.gaussians) - loss
+    assert result.report.choices["photos_changed"]
+
+
+@pytest.mark.parametrize("change", [bgr, half, linear])
+def test_photos_of_gaussians_without_pixels_are_mended(room: Scene, change: Change) -> None:
+    loose = Scene(room.gaussians, room.cameras, room.images, None, room.names)
+    right, mended = (compact(replace(loose, images=images), **FIT) for images in (room.images, change(room.images)))
+    assert novel_psnr(mended.gaussians) > novel_psnr(right.gaussians) - 1
+    assert "photos_changed" in mended.report.choices
+    assert "photos_changed" not in right.report.choices
+
+
+def test_sound_photos_stay_as_they_are(room: Scene, sound: CompactResult) -> None:
+    prepared = prepare(room)
+    assert prepared.scene.images is room.images
+    assert prepared.scene.masks is None
+    assert sound.report.notes == []
+
+
+def exposed(room: Scene, gains: np.ndarray) -> Scene:
+    """The scene as a model exports it from photos of several exposures ``[v,3]``."""
+    g, each = room.gaussians, gains.astype(np.float32).repeat(room.pixels_per_view, 0)[:, None]
+    gaussians = replace(g, sh0=rgb_to_sh0(sh0_to_rgb(g.sh0) * each).astype(np.float32))
+    return replace(room, gaussians=gaussians, images=(room.images * gains[:, None, None]).clip(0, 1).astype(np.float32))
+
+
+def random_gains(channels: int) -> np.ndarray:
+    rng = np.random.default_rng(3)
+    return np.exp(rng.uniform(np.log(0.6), np.log(1.5), (VIEWS, channels))) * np.ones(3)
+
+
+@pytest.mark.parametrize("channels", [1, 3], ids=["exposure", "white balance"])
+def test_exposures_are_brought_to_their_mean(room: Scene, sound: CompactResult, channels: int) -> None:
+    scene = exposed(room, random_gains(channels))
+    result, fixed = compact(scene, **FIT), compact(scene, **FIT, exposure="fixed")
+    best = novel_psnr(sound.gaussians, aligned=True)
+    assert novel_psnr(result.gaussians, aligned=True) > best - 1
+    assert novel_psnr(result.gaussians, aligned=True) > novel_psnr(fixed.gaussians, aligned=True) + 1
+    assert any(one.startswith("the photos differ in exposure by factors of") for one in result.report.notes)
+    assert "exposure" not in fixed.report.choices
+    given = np.array(result.report.choices["exposure"])
+    expected = random_gains(channels)
+    np.testing.assert_allclose(given / given[0], expected / expected[0], rtol=0.05)
+    assert result.report.psnr_after > fixed.report.psnr_after  # in the exposure that the result has
+
+
+def test_exposure_that_drifts_stays_unless_asked(room: Scene) -> None:
+    drift = np.linspace(0.94, 1.06, VIEWS)[:, None] * np.ones(3)
+    scene = exposed(room, drift)
+    assert prepare(scene).scene.images is scene.images
+    moved = prepare(scene, PrepareOptions(exposure="per-photo")).scene
+    assert moved.images is not scene.images
+
+
+def test_masks_weigh_the_fit_and_the_scores(room: Scene, sound: CompactResult) -> None:
+    """Rubbish outside the masks, in photos and Gaussians alike, in every second view."""
+    inside = np.full((VIEWS, HEIGHT, WIDTH), True)
+    inside[::2, 50:] = False
+    images = np.where(inside[..., None], room.images, np.float32([0.9, 0.1, 0.9])).astype(np.float32)
+    sh0 = rgb_to_sh0(images.reshape(-1, 1, 3)).astype(np.float32)
+    spoilt = replace(room, images=images, gaussians=replace(room.gaussians, sh0=sh0))
+    with_masks, without = compact(replace(spoilt, masks=inside), **FIT), compact(spoilt, **FIT)
+    assert novel_psnr(with_masks.gaussians) > novel_psnr(without.gaussians) + 1
+    assert with_masks.report.psnr_after > sound.report.psnr_after - 3
+
+
+def test_a_black_photo_under_masks_is_left_out(room: Scene) -> None:
+    images = room.images.copy()
+    images[2] = 0
+    masks = np.broadcast_to(ellipse(), (VIEWS, HEIGHT, WIDTH)).copy()
+    result = compact(replace(room, images=images, masks=masks), **FIT)
+    assert result.report.choices["photos_left_out"] == [room.names[2]]
