@@ -4,10 +4,7 @@ FROM python:3.11-slim-bookworm
 WORKDIR /opt/gsmerge
 COPY pyproject.toml setup.py constraints.txt README.md LICENSE ./
 COPY gsmerge gsmerge
-# torch without CUDA, of the version that the tests run with; then everything else
-RUN torch=$(grep -E '^torch==' constraints.txt) \
-    && pip install --no-cache-dir --index-url https://download.pytorch.org/whl/cpu "$torch" \
-    && pip install --no-cache-dir -c constraints.txt .
+RUN pip install --no-cache-dir -c constraints.txt .
 
 WORKDIR /data
 ENTRYPOINT ["gsmerge"]

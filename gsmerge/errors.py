@@ -7,6 +7,8 @@ files and with what is in them raises one of these; the command line prints the 
 from __future__ import annotations
 
 import errno
+from collections.abc import Iterator
+from contextlib import contextmanager
 from os import PathLike
 
 
@@ -55,6 +57,26 @@ def is_opencv_damaged(error: BaseException) -> bool:
     return isinstance(error, AttributeError | ImportError) and "cv2" in f"{error} {getattr(error, 'path', '')}"
 
 
+TORCH_INSTALL = 'pip install "torch>=2.4,<3" --extra-index-url https://download.pytorch.org/whl/cpu'
+NO_TORCH = f"this needs torch, which is not installed; its build for CPUs: {TORCH_INSTALL}"
+
+
+def is_torch_missing(error: BaseException) -> bool:
+    """Return whether an error says that the package torch is not installed."""
+    return isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] == "torch"
+
+
+@contextmanager
+def refuse_without_torch() -> Iterator[None]:
+    """Raise a UsageError that says how to install torch where a block does not find it."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if is_torch_missing(error):
+            raise UsageError(NO_TORCH) from error
+        raise
+
+
 OUT_OF_MEMORY = "out of memory; use fewer --threads or --jobs, or a smaller scene"
 _NO_MEMORY = ("failed to map segment", "annot allocate memory", "can't allocate memory", "can't start new thread")
 
@@ -84,6 +106,8 @@ def error_line(error: BaseException) -> str:
         return OUT_OF_MEMORY
     if is_opencv_damaged(error):
         return DAMAGED_OPENCV
+    if is_torch_missing(error):
+        return NO_TORCH
     if not isinstance(error, GsmergeError) and (problem := file_problem(error)) is not None:
         return problem
     text = str(error) if isinstance(error, GsmergeError) else f"{type(error).__name__}: {error}"

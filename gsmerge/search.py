@@ -159,7 +159,7 @@ def _point(count: int, gaussians: Gaussians, photos: Photos, weights: list[np.nd
     similar = parallel_map(lambda v: _similarity(images[v], photos.images[v], weights[v] == 0), views)
     perceptual = None
     if min(photos.height, photos.width) >= PERCEPTUAL_SIDE:
-        from gsmerge.measure.lpips import lpips, lpips_available  # which needs torch
+        from gsmerge.measure.lpips import lpips, lpips_available
 
         if lpips_available(NET):
             some = np.linspace(0, len(photos) - 1, min(PERCEPTUAL_VIEWS, len(photos))).round().astype(int)

@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gsmerge.errors import refuse_without_torch
+
 if TYPE_CHECKING:
     import torch
 
@@ -41,7 +43,8 @@ def as_array(values: Array) -> np.ndarray:
 
 def as_tensor(values: Array, device: torch.device | str = "cpu") -> torch.Tensor:
     """Return an array or a tensor as a tensor on a device; on the CPU it shares the array's memory."""
-    import torch
+    with refuse_without_torch():
+        import torch
 
     return torch.as_tensor(values, device=device)
 
@@ -57,22 +60,18 @@ def like(values: np.ndarray, given: Array) -> Array:
     return as_tensor(values, given.device) if hasattr(given, "detach") else values
 
 
-def concat_rows(parts: Sequence[Array]) -> Array:
-    """Concatenate rows of arrays or of tensors."""
+def concat_rows(parts: Sequence[Array], axis: int = 0) -> Array:
+    """Concatenate rows, or what another axis counts, of arrays or of tensors."""
     if all(isinstance(part, np.ndarray) for part in parts):
-        return np.concatenate(parts)
+        return np.concatenate(parts, axis)
     import torch
 
-    return torch.cat([torch.as_tensor(part) for part in parts])
+    return torch.cat([torch.as_tensor(part) for part in parts], axis)
 
 
 def concat_columns(parts: Sequence[Array]) -> Array:
     """Put the columns of arrays or of tensors side by side."""
-    if all(isinstance(part, np.ndarray) for part in parts):
-        return np.concatenate(parts, 1)
-    import torch
-
-    return torch.cat([torch.as_tensor(part) for part in parts], 1)
+    return concat_rows(parts, 1)
 
 
 @dataclass(frozen=True)

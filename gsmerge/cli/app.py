@@ -19,12 +19,15 @@ from gsmerge.cli.console import plain_warnings, say
 from gsmerge.cli.parameters import HINTS
 from gsmerge.errors import (
     DAMAGED_OPENCV,
+    NO_TORCH,
     GsmergeError,
     SceneError,
+    UsageError,
     error_line,
     file_problem,
     is_opencv_damaged,
     is_out_of_memory,
+    is_torch_missing,
 )
 
 PROGRAM = "gsmerge"
@@ -199,6 +202,8 @@ def run(args: Sequence[str] | None = None) -> int:
             return fail(error_line(error), SceneError.exit_code)
         if is_opencv_damaged(error):
             return fail(DAMAGED_OPENCV, 1)
+        if is_torch_missing(error):
+            return fail(NO_TORCH, UsageError.exit_code)
         first = f"{type(error).__name__}: {error}".splitlines()[0]
         return fail(f"unexpected error: {first}; run again with --debug", 1)
 

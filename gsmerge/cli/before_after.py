@@ -49,13 +49,16 @@ class BeforeAfter:
         return {name: ply.gaussians for name, ply in self.plys.items()}
 
 
-def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
-    """Read the scenes that BEFORE (``files``) and AFTER name, and the views of ``--targets``."""
+def read_before_after(args: Args, files: SceneFiles, *, alone: bool = False) -> BeforeAfter:
+    """Read the scenes that BEFORE (``files``) and AFTER name, and the views of ``--targets``.
+
+    A scene that is looked at ``alone`` needs no cameras: views are placed about it.
+    """
     from gsmerge.io import read_gaussians
     from gsmerge.runtime.record import record_run
     from gsmerge.stages.place_cameras import add_views
 
-    load, notes = args.load(files), list[str]()
+    load, notes = _load(args, files, alone), list[str]()
     views = vars(args).get("views")
     if args.targets is not None or views is not None:
         require_views(load)
@@ -67,6 +70,16 @@ def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
     plys = {name: read_gaussians(path) for name, path in zip(file_names(args.after), args.after, strict=True)}
     cameras, moved = own_cameras(args.after, scene)
     return BeforeAfter(load, scene, held_out, plys, cameras, [*load.notes, *adapted, *notes, *moved])
+
+
+def _load(args: Args, files: SceneFiles, alone: bool) -> SceneLoad:
+    """Read the scene, without cameras where there are none and it is looked at alone."""
+    try:
+        return args.load(files)
+    except SceneError:
+        if not alone or files.cameras or files.images:
+            raise
+    return args.load(files, order="none")
 
 
 def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras], list[str]]:

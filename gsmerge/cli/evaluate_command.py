@@ -39,8 +39,7 @@ def parse_align(text: str) -> tuple[str, ...]:
 
 @opt.command(
     opt.BEFORE,
-    opt.argument("after", list[Path] | None, "[AFTER]...", "Compact files of that scene: .ply, .spz, .sog or .splat.",
-                 default=None),
+    opt.AFTER,
     f"{opt.READING} masks {opt.TARGETS}",
     *opt.panel(
         opt.MEASURING,

@@ -119,11 +119,11 @@ class Args(SimpleNamespace):
         images, masks = (vars(self).get(name) for name in ("images", "masks"))
         return find_scene_files(scene, cameras=self.cameras, images=images, masks=masks)
 
-    def load(self, files: SceneFiles) -> SceneLoad:
-        """Read the scene of these files."""
+    def load(self, files: SceneFiles, **defaults: Any) -> SceneLoad:
+        """Read the scene of these files; ``defaults`` are hints that the user may override."""
         from gsmerge.io import load_files
 
-        return load_files(files, opacity=self.opacity, hints=self.hints())
+        return load_files(files, opacity=self.opacity, hints=self.hints(**defaults))
 
 
 def setting_kinds(options: Any) -> dict[str, Any]:
@@ -280,7 +280,9 @@ def number_or_text(text: str) -> int | str:
 
 
 BEFORE = argument("before", Path, "BEFORE", "The scene: a .ply or its folder.")
-AFTER = argument("after", list[Path], "AFTER...", "Compact files of that scene: .ply, .spz, .sog or .splat.")
+AFTER = argument(
+    "after", list[Path] | None, "[AFTER]...", "Compact files of that scene: .ply, .spz, .sog or .splat.", default=None
+)
 SCENE = argument("scene", Path, "SCENE", "A .ply with one Gaussian per pixel and view, or the folder it is in.")
 
 # What commands share: a text, and names of options

@@ -19,23 +19,25 @@ from gsmerge.errors import UsageError
     f"{opt.READING} masks {opt.TARGETS}",
     opt.changed("set", help="How the outlined superpixels are cut, where results were made with another than the "
                 "default, such as superpixels=2%; may be repeated."),
-    opt.output("The page, .html.", wording="AFTER.compare.html, beside it"),
+    opt.output("The page, .html.", wording="AFTER.compare.html, or BEFORE.view.html, beside it"),
     *opt.panel(opt.OUTPUT, opt.option("open", bool, "Open the page in the browser.", "--open/--no-open", default=True)),
     "overwrite dry_run threads",
 )  # fmt: skip
 def view(args: opt.Args) -> None:
-    """Compare a scene with its compact versions in the browser: one file with photos, stills, 3D and scores."""
+    """Show a scene, alone or beside its compact versions, in the browser: photos, stills, 3D, scores in one file."""
     from gsmerge.report import document_head
     from gsmerge.stages.superpixels import SegmentOptions, count_for
 
     (segmentation,) = args.make(SegmentOptions)
+    args.after = args.after or []
     files, after = args.files(args.before), args.after
-    output = args.output or after[0].with_name(f"{after[0].stem}.compare.html")
+    beside = after[0].with_name(f"{after[0].stem}.compare.html") if after else files.ply.with_suffix(".view.html")
+    output = args.output or beside
     inputs = (*input_files(files), *after, args.targets, args.target_images)
     check_outputs((output,), inputs, overwrite=args.overwrite or args.dry_run)
     if output.suffix.lower() not in (".html", ".htm"):
         raise UsageError(f"{output}: expected a name that ends in .html")
-    given = read_before_after(args, files)
+    given = read_before_after(args, files, alone=not after)
     if given.scene.images is not None:
         count_for(segmentation, *given.scene.images.shape[1:3])  # refuses more than pixels, before anything is measured
     say_notes(given.notes, quiet=args.silent)

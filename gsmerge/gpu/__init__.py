@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes
 import os
 from functools import cache
+from importlib.util import find_spec
 from typing import Any
 
 from gsmerge.stages.fit.stage import ON_CPU, FitBackend
@@ -19,20 +20,22 @@ from gsmerge.stages.fit.stage import ON_CPU, FitBackend
 # end to end.
 MIN_PIXELS = 400_000
 NO_DEVICE = "torch finds no CUDA device"
+NO_TORCH = 'torch is not installed; pip install "torch>=2.4,<3" "gsplat>=1.5,<1.6"'  # as the extra cuda asks for
 
 
 def choose_backend(device: str, num_pixels: int) -> tuple[FitBackend[Any], str | None]:
     """Choose where the fit and the scores run; a note says why CUDA was asked for and cannot be used.
 
     ``"auto"`` takes CUDA where it can be used and ``num_pixels`` of all views are enough; on a
-    computer without a CUDA device it gives no note, and without a CUDA driver torch is not loaded.
+    computer without torch or a CUDA device it gives no note, and without a CUDA driver torch is not
+    loaded.
     """
     if device == "cpu" or (device == "auto" and (num_pixels < MIN_PIXELS or not has_driver())):
         return ON_CPU, None
     problem = cuda_problem()
     if problem is not None:
         note = f"the fit and the scores run on the CPU, not on a GPU: {problem}"
-        return ON_CPU, None if device == "auto" and problem == NO_DEVICE else note
+        return ON_CPU, None if device == "auto" and problem in (NO_DEVICE, NO_TORCH) else note
     import torch
 
     from gsmerge.gpu.backend import make_backend
@@ -57,6 +60,8 @@ def cuda_problem() -> str | None:
     The first call of a process loads gsplat and compares what the device computes with the CPU, see
     :mod:`gsmerge.gpu.self_check`.
     """
+    if find_spec("torch") is None:
+        return NO_TORCH
     import torch
 
     if not torch.cuda.is_available():

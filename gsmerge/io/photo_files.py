@@ -330,12 +330,12 @@ def _png_pixels(data: np.ndarray) -> np.ndarray | None:
     return None
 
 
-def encode_mask(mask: np.ndarray, color: Sequence[int]) -> bytes:
-    """Encode ``mask [h,w]`` as a PNG of one bit a pixel: ``color`` (sRGB, 0 to 255) where True, else transparent."""
-    image = Image.fromarray(mask.astype(np.uint8)).convert("P")
-    image.putpalette([0, 0, 0, *color])
+def encode_indexed(indices: np.ndarray, colors: np.ndarray) -> bytes:
+    """Encode ``indices [h,w]`` uint8 of ``colors [n,3]`` uint8, sRGB, as a PNG; index 0 is transparent."""
+    image = Image.fromarray(indices).convert("P")
+    image.putpalette(colors.tobytes())
     content = io.BytesIO()
-    image.save(content, "PNG", bits=1, transparency=0, optimize=True)
+    image.save(content, "PNG", transparency=0, optimize=True)
     return content.getvalue()
 
 

@@ -358,7 +358,7 @@ def _quality(image: np.ndarray, photo: np.ndarray, mask: NDArray[np.bool_] | Non
     with suppress(ValueError):  # no window lies inside the image
         similarity = ssim(image, photo, mask)
     if nets:
-        from gsmerge.measure.lpips import lpips, min_size  # loads torch
+        from gsmerge.measure.lpips import lpips, min_size
 
         side = min(image.shape[:2])
         distances = {f"lpips_{net}": lpips(image, photo, net, mask) for net in nets if side >= min_size(net)}

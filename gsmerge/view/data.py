@@ -13,9 +13,9 @@ import numpy as np
 
 from gsmerge.geometry import project
 from gsmerge.io.formats import spz
-from gsmerge.io.photo_files import encode_mask
+from gsmerge.io.photo_files import encode_indexed
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Progress, Quality, ResultScores, evaluate
-from gsmerge.measure.preview import BORDER_COLOR, Picture, borders, to_picture
+from gsmerge.measure.preview import Picture, borders, mean_colors, to_picture
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.prepare import scene_frame
 from gsmerge.stages.superpixels import SegmentOptions, segment
@@ -25,6 +25,8 @@ from gsmerge.views import even_views
 MAX_VIEWS = 32  # of more, some at equal intervals: each takes up to 300 kB
 WEBP_QUALITY = 90  # stills are within 1 dB of the scores of lossless ones
 OUTLINE_SIDE = 1280  # pixels of the longer side of superpixels' outlines, at most
+OUTLINE_LEVELS = 6  # of each channel in their colours: with the transparent one they fit a byte
+OUTLINE_SHIFT = 0.35  # by which an outline is lighter than its superpixel, or darker where that is light
 MAX_GAUSSIANS = 2_000_000  # more take a browser too long to load and a page too many bytes: their stills alone
 MAX_SPZ_BYTES = 40_000_000  # before compression: 2 million without harmonics, fewer with them
 MIN_OPACITY = 1 / 255  # what is fainter is not drawn
@@ -66,11 +68,21 @@ class ViewData:
 
     title: str  # name of the scene
     sides: tuple[Side, ...]  # the scene itself, then its results
-    views: tuple[PageView, ...]  # the worst of the first result first
+    views: tuple[PageView, ...]  # the worst of the first result first, of the scene without one
     num_views: int  # views that were measured, which may be more
     reference: str  # words for the pictures that scores compare with
     notes: tuple[str, ...]  # warnings and limits, one sentence each
     num_superpixels: tuple[int, int] | None = None  # least and most of a photo; None without outlines
+
+    @property
+    def start(self) -> int:
+        """Number of the view that the page opens on: the one of the middle score."""
+        return (len(self.views) - 1) // 2 if self.scored else 0
+
+    @property
+    def scored(self) -> bool:
+        """Whether there is something to compare with: a scene alone has nothing without photos."""
+        return len(self.sides) > 1 or any(view.photo is not None for view in self.views)
 
     @property
     def held_out(self) -> bool:
@@ -90,7 +102,7 @@ def collect(
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> ViewData:
-    """Draw and measure a scene, which has at least one view, and its results in all views.
+    """Draw and measure a scene, which has at least one view, and its results, if any, in all views.
 
     ``results`` are Gaussians by name in the scene's world, ``file_bytes`` the sizes of the scene's file and of
     theirs. Stills and scores are from ``cameras`` (as of :func:`gsmerge.evaluate`), 3D from the scene's own.
@@ -110,7 +122,7 @@ def collect(
         _side(one, frame.enter(named[one.name]), size, "context" if held_out is None else "target")
         for one, size in zip(evaluation.results, file_bytes, strict=True)
     ]
-    means = frame.enter(named[evaluation.results[1].name]).means
+    means = frame.enter(named[evaluation.results[:2][-1].name]).means
     views: list[PageView] = []
     for split, (places, photos, names) in splits.items():
         for i, name in enumerate(short_names(names)):
@@ -127,7 +139,8 @@ def collect(
             ))  # fmt: skip
     with use_threads(threads):
         shown, num_superpixels = with_outlines(_shown(views), scene.images, segmentation or SegmentOptions())
-    notes = (*evaluation.notes, *_limits(sides, len(shown), len(views)))
+    measured = evaluation.notes if results else ()  # which are about what was fitted
+    notes = (*measured, *_limits(sides, len(shown), len(views)))
     return ViewData(title, tuple(sides), shown, len(views), evaluation.reference, notes, num_superpixels)
 
 
@@ -138,10 +151,11 @@ def with_outlines(
     places = [i for i, view in enumerate(views) if not view.held_out]
     if photos is None or not places:
         return tuple(views), None
-    groups = segment(photos[[views[i].place for i in places]], options)
+    pictures = photos[[views[i].place for i in places]]
+    groups = segment(pictures, options)
     made = list(views)
-    for i, labels in zip(places, groups.labels, strict=True):
-        made[i] = replace(views[i], outlines=encode_outlines(labels))
+    for i, picture, labels in zip(places, pictures, groups.labels, strict=True):
+        made[i] = replace(views[i], outlines=encode_outlines(picture, labels))
     return tuple(made), (min(groups.counts), max(groups.counts))
 
 
@@ -157,10 +171,23 @@ def encode_still(picture: Picture) -> bytes:
     return bytes(data.tobytes())
 
 
-def encode_outlines(labels: np.ndarray) -> bytes:
-    """Encode the borders of superpixels ``[h,w]`` as a transparent PNG several times as large."""
+def encode_outlines(photo: np.ndarray, labels: np.ndarray) -> bytes:
+    """Encode the borders of superpixels ``[h,w]`` as a transparent PNG several times as large.
+
+    Each is in the mean colour that its superpixel has in ``photo [h,w,3]``, a little lighter or,
+    where that is light, darker.
+    """
     factor = max(1, OUTLINE_SIDE // max(labels.shape))
-    return encode_mask(borders(labels.repeat(factor, 0).repeat(factor, 1)), BORDER_COLOR)
+    enlarged = labels.repeat(factor, 0).repeat(factor, 1)
+    means = mean_colors(photo, labels)
+    light = means.mean(1, keepdims=True) > 0.5
+    shifted = means + OUTLINE_SHIFT * (np.where(light, 0.0, 1.0) - means)
+    levels = np.round((OUTLINE_LEVELS - 1) * shifted).astype(np.uint8)
+    steps = np.array([OUTLINE_LEVELS**2, OUTLINE_LEVELS, 1], np.uint8)
+    ids = 1 + (levels * steps).sum(1, dtype=np.uint8)
+    every = np.indices((OUTLINE_LEVELS,) * 3).reshape(3, -1).T * (255 // (OUTLINE_LEVELS - 1))
+    colors = np.concatenate([np.zeros((1, 3)), every]).astype(np.uint8)
+    return encode_indexed(np.where(borders(enlarged), ids[enlarged], 0).astype(np.uint8), colors)
 
 
 def middle_depth(means: np.ndarray, camera: Cameras) -> float:
@@ -181,7 +208,7 @@ def _shown(views: Sequence[PageView]) -> tuple[PageView, ...]:
     """Choose at most ``MAX_VIEWS`` views and the worst, sorted from the worst of the first result."""
 
     def quality(view: PageView) -> float:
-        score = view.scores[1].psnr
+        score = view.scores[:2][-1].psnr
         return np.inf if score is None else score
 
     ids = set(even_views(len(views), min(len(views), MAX_VIEWS)))

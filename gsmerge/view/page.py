@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import base64
+import hashlib
+import html
 import json
+import re
 from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib.resources import files
@@ -20,27 +23,31 @@ from gsmerge.view.data import PageView, Side, ViewData, encode_still
 if TYPE_CHECKING:
     import jinja2
 
-PICTURES = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+# What a page may load and run: its own scripts and styles, which the policy names by their hashes
+PICTURES = "default-src 'none'; img-src data:; style-src {style}; script-src {script}"
 # Spark decodes in WebAssembly, sorts in a worker, and has both as data: addresses in its own text
 SOLID = f"{PICTURES} blob: 'wasm-unsafe-eval'; worker-src data: blob:; connect-src data: blob:"
+POLICY = "{policy}"  # stands for it in the templates until the hashes are known
 ENGINE = "vendor/spark-three.js.gz"
 
 
 def view_page(data: ViewData) -> str:
-    """Make the page of a scene before and after, as HTML."""
+    """Make the page of a scene, before and after where it has results, as HTML."""
     photos = any(view.photo is not None for view in data.views)
     sources: list[dict[str, Any]] = [{"name": "photo", "splats": None, "count": 0}] if photos else []
     sources += [
         {"name": side.name, "splats": None if side.splats is None else f"splats-{i}", "count": side.num_gaussians}
         for i, side in enumerate(data.sides)
     ]
-    left, right = int(photos), int(photos) + 1
+    right = min(int(photos) + 1, len(sources) - 1)
+    left = max(right - 1, 0)
     stills = [
         [None if still is None else data_uri(still, "image/webp") for still in (view.photo, *view.stills)[not photos :]]
         for view in data.views
     ]
-    first = {side: stills[0][side] for side in (left, right)}  # in the page itself, to be seen at once
-    stills[0][left] = stills[0][right] = None
+    opened = stills[data.start]
+    first = {side: opened[side] for side in (left, right)}  # in the page itself, to be seen at once
+    opened[left] = opened[right] = None
     splats = {f"splats-{i}": base64_text(side.splats) for i, side in enumerate(data.sides) if side.splats is not None}
     engine = files("gsmerge.view").joinpath(ENGINE).read_bytes() if splats else None
     return render_template(
@@ -52,7 +59,12 @@ def view_page(data: ViewData) -> str:
         left=left,
         right=right,
         first=first,
-        json_data={"sources": sources, "photos": photos, "views": [_view(view) for view in data.views]},
+        json_data={
+            "sources": sources,
+            "photos": photos,
+            "start": data.start,
+            "views": [_view(view) for view in data.views],
+        },
         stills=stills,
         outlines=[view.outlines and data_uri(view.outlines, "image/png") for view in data.views],
         splats=splats,
@@ -90,8 +102,12 @@ def report_page(document: Mapping[str, Any], pictures: Sequence[Sequence[tuple[s
     )  # fmt: skip
 
 
-def headline(before: Side, after: Side) -> str:
-    """Write the share of Gaussians and the change of quality in one line."""
+def headline(before: Side, after: Side | None = None) -> str:
+    """Write the share of Gaussians and the change of quality in one line; of one scene what it has."""
+    if after is None:
+        quality = before.mean.psnr
+        known = quality is not None and np.isfinite(quality)
+        return f"{before.num_gaussians:,} Gaussians" + (f", {quality:.1f} dB" if known else "")
     return headline_of(before.num_gaussians, after.num_gaussians, before.mean.psnr, after.mean.psnr)
 
 
@@ -136,10 +152,26 @@ def base64_text(content: bytes) -> str:
     return base64.b64encode(content).decode("ascii")
 
 
-def render_template(name: str, **values: Any) -> str:
-    """Fill a template with values, which are escaped unless it says otherwise."""
+def render_template(name: str, policy: str, **values: Any) -> str:
+    """Fill a template with values, which are escaped unless it says otherwise.
+
+    ``policy`` is what the page may load; hashes of its elements take the places of ``{script}`` and
+    ``{style}``.
+    """
     text = _environment().get_template(name).render(version=__version__, **values)
-    return text.encode("utf-8", "replace").decode("utf-8")  # names of files may hold halves of characters
+    text = text.encode("utf-8", "replace").decode("utf-8")  # names of files may hold halves of characters
+    hashes = {kind: " ".join(_hashes(text, kind)) for kind in ("script", "style")}
+    return text.replace(POLICY, html.escape(policy.format(**hashes)), 1)
+
+
+def _hashes(page: str, kind: str) -> list[str]:
+    """Return the hashes of a page's own scripts or styles, as a content security policy names them.
+
+    Elements of another type are data, which a browser does not run.
+    """
+    contents = re.findall(f"<{kind}>(.*?)</{kind}>", page, re.DOTALL)
+    digests = [hashlib.sha256(content.encode()).digest() for content in contents]
+    return [f"'sha256-{base64_text(digest)}'" for digest in dict.fromkeys(digests)]
 
 
 @cache

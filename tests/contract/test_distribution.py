@@ -126,11 +126,6 @@ def test_the_image_has_the_pinned_versions(root: Path) -> None:
 
 
 def test_what_the_image_runs(root: Path, project: dict[str, Any]) -> None:
-    """Its shell's own words, where they need no network; and the program."""
     steps = (root / "Dockerfile").read_text()
-    search = re.findall(r"torch=\$\((.+)\)", steps)
-    found = subprocess.run(["sh", "-c", search[0]], cwd=root, capture_output=True, text=True, check=True).stdout
-    assert re.fullmatch(r"torch==\d+\.\d+\.\d+\n", found)
-    assert 'pip install --no-cache-dir --index-url https://download.pytorch.org/whl/cpu "$torch"' in steps
     (entry,) = re.findall(r'^ENTRYPOINT \["(.+)"\]$', steps, re.MULTILINE)
     assert entry in project["scripts"]

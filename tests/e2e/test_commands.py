@@ -15,7 +15,7 @@ import gsmerge
 from gsmerge.cli import main
 from gsmerge.compact_file import NO_PHOTOS
 
-from .conftest import Run, listing
+from .conftest import Run, assert_refused, listing
 
 VIEWS, HEIGHT, WIDTH = 5, 64, 96
 SMALL = ("--superpixels", 200)
@@ -193,6 +193,24 @@ def test_panel(scene_copy: Path, run: Run) -> None:
     alone = scene_copy / "alone.png"  # in the frame, and with the photos, of what it was compacted from
     assert run("render", scene_copy / "scene.compact.ply", "-o", alone, "--views", 1).code == 0
     assert 2 * WIDTH <= cv2.imread(str(alone)).shape[1] < sheet.shape[1]
+
+
+def test_a_view_of_one_scene(scene_copy: Path, run: Run) -> None:
+    """Of a folder, of a compact scene beside its cameras, and of a file that has none."""
+    outcome = run("view", scene_copy, "--no-open", code=0)
+    page = scene_copy / "scene.view.html"
+    assert outcome.out.startswith(f"{page}: 30,720 Gaussians, ")
+    assert "note" not in outcome.err
+    run("compact", scene_copy, *SMALL, "--quiet", code=0)
+    run("view", scene_copy / "scene.compact.ply", "--no-open", code=0)
+    assert "<title>scene.compact</title>" in (scene_copy / "scene.compact.view.html").read_text()
+    bare = scene_copy / "away" / "bare.ply"
+    bare.parent.mkdir()
+    (scene_copy / "scene.ply").rename(bare)
+    outcome = run("view", bare, "--no-open", code=0)
+    assert "no cameras: " in outcome.err
+    assert outcome.out.endswith("bare.view.html: 30,720 Gaussians\n")
+    assert_refused(run("view", bare, bare.with_name("x.ply"), "--no-open"), 3, "no cameras found")
 
 
 def test_version(run: Run) -> None:

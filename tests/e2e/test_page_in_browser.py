@@ -23,7 +23,7 @@ def shown(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator
 
     folder = tmp_path_factory.mktemp("page")
     scene = make_scene(folder / "room", num_views=3, width=64, height=48)
-    options = ["--budgets", "2%", "--fit", "none,color", "--proxy-views", "1", "--lpips", "none", "--quiet"]
+    options = ["--budgets", "2%", "--fit", "none,full", "--proxy-views", "1", "--lpips", "none", "--quiet"]
     assert main(["chart", str(scene), "--output", str(folder / "out"), *options]) == 0
     with browser(CHROMIUM, folder / "profile") as opened:
         opened.open(folder / "out" / "index.html")

@@ -83,6 +83,18 @@ def bare_pickle(folder: Path) -> None:
     (folder / NAME).write_bytes(pickle.dumps(Payload(folder / MARKER)))
 
 
+def renamed(_: Path, content: bytes) -> bytes:
+    """A structure that sets the fields of a tensor."""
+    end = content.index(b"tq\x0fR") + 4
+    return content[:end] + b"}X\x04\0\0\0pathX\x01\0\0\0/sb" + content[end:]
+
+
+def moved(_: Path, content: bytes) -> bytes:
+    """A structure whose first tensor begins behind its storage."""
+    assert b"K\0K\x03K\x12\x86" in content
+    return content.replace(b"K\0K\x03K\x12\x86", b"J\xff\xff\xff\0K\x03K\x12\x86")
+
+
 def two_sizes(entry: dict[str, Any], _: Path) -> None:
     lower = cv2.imencode(".jpg", np.zeros((HEIGHT - 2, WIDTH, 3), np.uint8))[1]
     entry["images"][1] = torch.from_numpy(lower.reshape(-1).copy())
@@ -91,6 +103,7 @@ def two_sizes(entry: dict[str, Any], _: Path) -> None:
 def _shapes() -> dict[str, Case]:
     zeros, byte, shape = torch.zeros(VIEWS, 18), torch.zeros(1, dtype=torch.uint8), "expected cameras [v,18], found"
     no_numbers, no_tensors = "expected cameras of numbers", "expected images as tensors"
+    objects = "or objects, which are not read"
     cameras: dict[str, tuple[Any, str]] = {
         "17 columns": (zeros[:, :17].clone(), f"{shape} [3, 17]"),
         "one row": (torch.zeros(18), f"{shape} [18]"),
@@ -101,9 +114,10 @@ def _shapes() -> dict[str, Case]:
         "2^40 rows": (torch.zeros(1, 18).expand(2**40, 18), "expected 1 to 10000 cameras"),
         "integers": (zeros.int(), no_numbers),
         "bool": (zeros.bool(), no_numbers),
+        "bfloat16": (zeros.bfloat16(), no_numbers),
         "complex": (zeros.to(torch.complex64), no_numbers),
-        "sparse": (zeros.to_sparse(), no_numbers),
-        "no values": (torch.empty(VIEWS, 18, device="meta"), no_numbers),
+        "sparse": (zeros.to_sparse(), objects),
+        "no values": (torch.empty(VIEWS, 18, device="meta"), objects),
         "NaN": (torch.full((VIEWS, 18), torch.nan), "expected finite numbers"),
         "1e38": (torch.full((VIEWS, 18), 1e38), ""),
         "zeros": (zeros, "axes are not orthonormal"),
@@ -114,7 +128,7 @@ def _shapes() -> dict[str, Case]:
         "empty": ([byte[:0].clone()] * VIEWS, "cannot be decoded"),
         "2^40 bytes": ([byte.expand(2**40)] * VIEWS, no_tensors),
         "floats": ([torch.zeros(9)] * VIEWS, no_tensors),
-        "no values": ([torch.empty(9, dtype=torch.uint8, device="meta")] * VIEWS, no_tensors),
+        "no values": ([torch.empty(9, dtype=torch.uint8, device="meta")] * VIEWS, objects),
         "numbers": ([1] * VIEWS, no_tensors),
         "zeros": ([byte.repeat(99)] * VIEWS, "cannot be decoded"),
     }
@@ -158,6 +172,8 @@ def _bytes() -> dict[str, Case]:
         "a structure of half": Case(with_pickle(lambda _, content: content[: len(content) // 2])),
         "a structure of 20 MB": Case(with_pickle(lambda _, content: content + bytes(20 << 20))),
         "a structure of nested lists": Case(with_pickle(lambda *_: b"\x80\x02" + b"]" * 99_999 + b"a" * 99_998 + b".")),
+        "a structure that names another file": Case(with_pickle(renamed), says=objects),
+        "a tensor past its numbers": Case(with_pickle(moved), says=("found a damaged one",)),
         "2^40 bytes asked for": Case(with_pickle(lambda *_: GREEDY)),
     }
 

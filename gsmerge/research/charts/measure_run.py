@@ -348,7 +348,7 @@ def environment(threads: int | None) -> dict[str, str]:
     with suppress(OSError), open("/proc/cpuinfo", encoding="utf-8") as file:  # only Linux has it
         models = (line.split(":", 1)[1].strip() for line in file if line.startswith("model name"))
         processor = next(models, processor)
-    versions = {name: sys.modules[name].__version__ for name in PACKAGES if name in sys.modules}
+    versions = {name: sys.modules[name].__version__ for name in PACKAGES if sys.modules.get(name)}
     return {
         "gsmerge": __version__,
         "processor": f"{processor}, {os.cpu_count() or 1} processors",

@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsmerge.measure.lpips import lpips_loss
 from gsmerge.moments import Members, pool_members, principal_axes
 from gsmerge.networks.corrections import ROTATION, residual_limits
 from gsmerge.networks.modules import Networks
@@ -22,6 +21,7 @@ from gsmerge.networks.options import RESIDUAL
 from gsmerge.networks.tensors import gaussian_sizes, quat_to_rotmat
 from gsmerge.render.autograd import render_tensors
 from gsmerge.render.photos import NEAR
+from gsmerge.research.training.perceptual import lpips_loss
 from gsmerge.research.training.predict import Prediction, analytic_gaussians, crop_targets, predict
 from gsmerge.research.training.targets import Targets
 from gsmerge.research.training.train_options import TrainOptions

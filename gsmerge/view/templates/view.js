@@ -5,14 +5,15 @@ const id = (name) => document.getElementById(name);
 const data = JSON.parse(id("data").textContent);
 const stage = id("stage");
 const state = {
-  view: 0, mode: "swipe", at: 0.5, solid: "", shape: "splats", frustums: "", background: "#000000", pixels: "screen",
+  view: data.start, mode: data.sources.length > 1 ? "swipe" : "blink", at: 0.5, solid: "", shape: "splats", frustums: "", background: "#000000", pixels: "screen",
   order: "worst", overlay: 0, outlines: "", other: false, atCamera: true, left: 0, right: 0,
 };
 const KEYS = { 1: "swipe", 2: "side", 3: "blink", 4: "difference" };
 const BLINK = 700; // milliseconds
 const SOFTWARE_MOST = 150000; // Gaussians: 2 seconds a frame on a processor
+const [LOW, HIGH, FULL] = ["62vh", "max(62vh, 100vh - 12rem)", "100vh - 3.6rem"]; // most height: wide, upright, full screen
 const NARROW = 640; // pixels of the stage, below which sides go one above the other
-let stills = null; // per view the pictures of every source; those of the first view are in the page itself
+let stills = null; // per view the pictures of every source; those that are seen first are in the page itself
 let outlines = []; // per view the borders of its superpixels, where there are any
 let solid = null; // the 3D view, once it is there
 let blinking = 0; // the timer
@@ -63,7 +64,8 @@ function fitStage() {
   const stacked = stage.classList.contains("stacked");
   const ratio = ((side && !stacked ? 2 : 1) * width) / ((stacked ? 2 : 1) * height);
   stage.style.aspectRatio = String(ratio);
-  stage.style.maxWidth = `${(62 * ratio).toFixed(2)}vh`;
+  const most = document.fullscreenElement ? FULL : ratio < 1 ? HIGH : LOW;
+  stage.style.maxWidth = `calc((${most}) * ${ratio.toFixed(4)})`;
 }
 
 function show() {
@@ -100,14 +102,31 @@ function show() {
   const outline = outlines[state.view];
   id("outlines").hidden = !outline || !state.atCamera || !state.outlines;
   if (!id("outlines").hidden) id("outlines").style.backgroundImage = `url("${outline}")`;
-  if (id("overlay-share")) id("overlay-share").disabled = !state.atCamera;
   for (const button of document.querySelectorAll("[data-set]")) {
     button.setAttribute("aria-pressed", String(String(state[button.dataset.set]) === button.dataset.value));
-    if (["shape", "frustums", "background", "pixels"].includes(button.dataset.set)) button.disabled = !state.solid;
-    if (button.dataset.set === "solid" && button.dataset.value) button.disabled = !solid;
-    if (button.dataset.set === "outlines") button.disabled = !outline || !state.atCamera;
   }
+  showLimits();
   if (solid && state.solid) solid.request();
+}
+
+// Greys out what has no effect now, and says why.
+function showLimits() {
+  const away = state.atCamera ? "" : "From the photo's camera only: press R";
+  const none = solid ? "" : id("status").textContent || "3D is not there yet";
+  const flat = state.solid ? "" : none || "In 3D only";
+  const bare = outlines[state.view] ? "" : view().held_out ? "Held-out photos have no superpixels" : "Not there yet";
+  const reasons = { shape: flat, frustums: flat, background: flat, pixels: flat, outlines: bare || away };
+  for (const button of document.querySelectorAll("[data-set]")) {
+    const { set: name, value } = button.dataset;
+    grey(button, name === "solid" && value ? none : reasons[name]);
+  }
+  if (id("overlay-share")) grey(id("overlay-share"), away);
+  grey(id("full"), document.fullscreenEnabled ? "" : "This browser has no full screen");
+}
+
+function grey(control, reason) {
+  control.disabled = Boolean(reason);
+  control.title = reason || "";
 }
 
 function showNumbers() {
@@ -175,16 +194,21 @@ function swipeTo(share) {
   show();
 }
 
+function toggleFull() {
+  if (document.fullscreenElement) document.exitFullscreen();
+  else if (document.fullscreenEnabled) stage.parentElement.requestFullscreen().catch((error) => say(error.message));
+}
+
 function onKey(event) {
   if (event.ctrlKey || event.metaKey || event.altKey || ["SELECT", "INPUT"].includes(event.target.tagName)) return;
   const key = event.key.toLowerCase();
   const actions = {
     arrowleft: () => swipeTo(state.at - 0.02), arrowright: () => swipeTo(state.at + 0.02),
     home: () => swipeTo(0), end: () => swipeTo(1), arrowup: () => step(-1), arrowdown: () => step(1),
-    o: () => set("outlines", state.outlines ? "" : "1"), s: () => toggle("solid"), p: () => toggle("shape"), c: () => toggle("frustums"), r: () => jump(state.view),
+    f: toggleFull, o: () => set("outlines", state.outlines ? "" : "1"), s: () => toggle("solid"), p: () => toggle("shape"), c: () => toggle("frustums"), r: () => jump(state.view),
     " ": () => { state.other = true; show(); },
   };
-  if (KEYS[key]) set("mode", KEYS[key]);
+  if (KEYS[key] && data.sources.length > 1) set("mode", KEYS[key]);
   else if (actions[key] && !(key === " " && event.target.tagName === "BUTTON")) actions[key]();
   else return;
   event.preventDefault();
@@ -204,6 +228,11 @@ function listen() {
   for (const side of ["left", "right"]) id(`${side}-source`).addEventListener("input", (event) => set(side, Number(event.target.value)));
   if (id("overlay-share")) id("overlay-share").addEventListener("input", (event) => set("overlay", event.target.value / 100));
   id("back").addEventListener("click", () => jump(state.view));
+  id("full").addEventListener("click", toggleFull);
+  document.addEventListener("fullscreenchange", () => {
+    id("full").textContent = document.fullscreenElement ? "Leave full screen" : "Full screen";
+    show();
+  });
   window.addEventListener("resize", show);
   const still = window.matchMedia("(prefers-reduced-motion: reduce)");
   blinking = setInterval(() => {
@@ -258,17 +287,18 @@ function drag(last, event, other) {
 function startStrip() {
   stills = JSON.parse(id("stills").textContent);
   outlines = JSON.parse(id("outline-pictures").textContent);
-  stills[0] = stills[0].map((still, source) => still || inPage.get(source) || null);
-  const shown = Number(!data.photos); // without photos the result: the scene itself is its own reference
+  stills[data.start] = stills[data.start].map((still, source) => still || inPage.get(source) || null);
+  const shown = Number(!data.photos && data.sources.length > 1); // without photos the result, not its reference
   for (const card of id("strip").children) {
     const still = stills[card.dataset.view].find((one, i) => one && i >= shown);
     if (still) card.querySelector("img").src = still;
   }
-  jump(0);
+  jump(data.start);
 }
 
 function say(words) {
   id("status").textContent = words;
+  showLimits();
 }
 
 // Takes in what the sides show; without a GPU nothing that would take minutes for a frame.

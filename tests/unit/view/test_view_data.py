@@ -76,6 +76,23 @@ def test_numbers_are_those_of_evaluate(actual: ViewData, scene: Scene, half: Gau
     assert [view.held_out for view in by_place] == [False, False, False, True, True]
 
 
+def test_a_page_opens_on_the_middle_view(actual: ViewData) -> None:
+    values = [view.scores[1].psnr or 0 for view in actual.views]
+    assert values[actual.start] == np.median(values)
+    assert replace(actual, views=actual.views[:4]).start == 1
+    assert replace(actual, views=actual.views[:1]).start == 0
+
+
+def test_one_scene_alone(scene: Scene) -> None:
+    alone = collect("room", scene, {}, (300,))
+    assert [side.name for side in alone.sides] == ["input"]
+    assert alone.notes == ()
+    values = [view.scores[0].psnr or 0 for view in alone.views]
+    assert values == sorted(values)
+    assert alone.scored
+    assert not collect("room", replace(scene, images=None), {}, (300,)).scored
+
+
 def test_the_worst_view_comes_first(actual: ViewData) -> None:
     values = [view.scores[1].psnr for view in actual.views]
     assert len(values) == actual.num_views == 5
@@ -158,7 +175,12 @@ def test_outlines_are_the_borders_of_superpixels(actual: ViewData, scene: Scene)
     factor = 1280 // 160
     assert picture.shape == (120 * factor, 160 * factor, 4)
     lines = picture[..., 3] > 0
-    assert {tuple(color) for color in picture[lines]} == {(40, 230, 255, 255)}
+    enlarged = labels.repeat(factor, 0).repeat(factor, 1)[lines]
+    counts = np.bincount(labels.reshape(-1))[:, None]
+    sums = [np.bincount(labels.reshape(-1), channel) for channel in scene.images[1].reshape(-1, 3).T]
+    away = picture[lines][:, 2::-1] / 255 - (np.stack(sums, 1) / counts)[enlarged]
+    assert np.abs(away).max() < 0.5  # a third of the way to black or white, in steps of a fifth
+    assert 0.1 < np.abs(away).mean() < 0.35
     right, below = lines[factor // 2 :: factor, ::factor], lines[::factor, factor // 2 :: factor]
     np.testing.assert_array_equal(right[:, 1:], labels[:, 1:] != labels[:, :-1])
     np.testing.assert_array_equal(below[1:], labels[1:] != labels[:-1])

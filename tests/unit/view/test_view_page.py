@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import gzip
 import hashlib
+import html
 import json
 import re
 from dataclasses import replace
@@ -20,6 +21,7 @@ from gsmerge.view.data import ViewData, collect
 from gsmerge.view.page import headline, report_page, view_page
 
 EVIL = '</script><b onload="x">&{{ 7 * 7 }}'
+WEBP = "data:image/webp;base64,"
 NAMES = ("images/<i>0</i>.png", "images/1.png", EVIL)
 
 
@@ -45,7 +47,29 @@ def test_it_loads_nothing(page: str) -> None:
     assert all(one.startswith(("data:", '"${')) for pair in addresses for one in pair if one)
     assert re.findall(r"https?:|[\"']//", _written(page)) == []
     assert "Content-Security-Policy" in page
-    assert "default-src &#39;none&#39;" in page
+    assert "default-src &#x27;none&#x27;" in page
+
+
+@pytest.mark.parametrize("name", ["page", "report"])
+def test_its_own_scripts_and_styles_alone_may_run(name: str, request: pytest.FixtureRequest) -> None:
+    """The policy names them by their hashes, and nothing needs more: no attribute holds a style or a script."""
+    text: str = request.getfixturevalue(name)
+    check_policy(text)
+
+
+def check_policy(page: str) -> None:
+    policy = html.unescape(re.findall(r'http-equiv="Content-Security-Policy" content="([^"]*)"', page)[0])
+    rules = {words.split()[0]: words.split()[1:] for words in policy.split(";")}
+    for kind in ("script", "style"):
+        contents = re.findall(f"<{kind}>(.*?)</{kind}>", page, re.DOTALL)
+        digests = [hashlib.sha256(content.encode()).digest() for content in contents]
+        expected = {f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests}
+        assert expected
+        assert expected == {word for word in rules[f"{kind}-src"] if word.startswith("'sha256-")}
+    assert "unsafe-inline" not in policy
+    assert "{" not in policy
+    tags = re.findall("<[a-z][^>]*>", re.sub("<(script|style)[^>]*>.*?</", "", page, flags=re.DOTALL))
+    assert [tag for tag in tags if re.search(r'\s(style|on\w+)="', tag)] == []
 
 
 def _written(page: str) -> str:
@@ -69,9 +93,13 @@ def test_what_the_script_reads(page: str, data: ViewData) -> None:
     assert len(first["viewmat"]) == 16
     assert (first["width"], first["height"]) == (data.views[0].camera.width, data.views[0].camera.height)
     stills = json.loads(block(page, "stills"))
-    assert stills[0][1:] == [None, None]  # those are in the page itself
-    address = stills[1][2]
-    assert base64.b64decode(address.removeprefix("data:image/webp;base64,")) == data.views[1].stills[1]
+    assert read["start"] == data.start == 1
+    assert stills[1][1:] == [None, None]  # those are in the page itself
+    assert all(None not in stills[view] for view in (0, 2))
+    shown = re.findall(r'<img id="(?:left|right)"[^>]* src="([^"]*)"', page)
+    for address, still in ((shown[0], 1), (shown[1], 0)):
+        assert base64.b64decode(address.removeprefix(WEBP)) == data.views[1].stills[still]
+    assert base64.b64decode(stills[0][2].removeprefix(WEBP)) == data.views[0].stills[1]
     outlines = json.loads(block(page, "outline-pictures"))
     assert [one and base64.b64decode(one.removeprefix("data:image/png;base64,")) for one in outlines] == [
         view.outlines for view in data.views
@@ -107,6 +135,40 @@ def test_views_may_differ_in_superpixels(data: ViewData, counts: tuple[int, int]
     assert f"Superpixels: {words} input photo" in view_page(replace(data, num_superpixels=counts))
 
 
+@pytest.fixture(scope="module")
+def alone() -> ViewData:
+    scene = scenes.make_scene(scenes.room(), scenes.arc(3))
+    return collect("room", scene, {}, (2_000_000,))
+
+
+def test_one_scene_is_compared_with_its_photos(alone: ViewData) -> None:
+    page = view_page(alone)
+    read = json.loads(block(page, "data"))
+    assert [source["name"] for source in read["sources"]] == ["photo", "input"]
+    assert headline(*alone.sides).replace(" dB", "\u00a0dB") in page
+    assert re.findall('<option value="(.)" selected>(.*?)<', page) == [("0", "photo"), ("1", "input")]
+    assert "<span>→" not in page
+    check_policy(page)
+
+
+def test_one_scene_without_photos_is_compared_with_nothing(alone: ViewData) -> None:
+    views = tuple(replace(view, photo=None, outlines=None) for view in alone.views)
+    data = replace(alone, views=views, num_superpixels=None)
+    page = view_page(data)
+    assert (data.scored, data.start) == (False, 0)
+    assert json.loads(block(page, "stills"))[0] == [None]
+    seen = re.sub("<script.*?</script>", "", page, flags=re.DOTALL)
+    assert [words for words in ("PSNR</small>", 'data-set="mode"', "Worst first", "PSNR and") if words in seen] == []
+    assert view_page(alone).count('data-set="mode"') == 4
+
+
+def test_what_is_grey_says_why() -> None:
+    """Controls are disabled in one place, which gives the reason."""
+    script = files("gsmerge.view").joinpath("templates", "view.js").read_text()
+    assert script.count(".disabled") == 1
+    assert re.search(r"control\.disabled = .*\n  control\.title = reason", script)
+
+
 def test_halves_of_characters_become_question_marks(data: ViewData) -> None:
     assert "odd?" in view_page(replace(data, title="odd\udcff"))
 
@@ -124,6 +186,7 @@ def test_halves_of_characters_become_question_marks(data: ViewData) -> None:
 def test_headline(before: float | None, after: float | None, words: str, data: ViewData) -> None:
     sides = [replace(side, mean=Quality(psnr)) for side, psnr in zip(data.sides, (before, after), strict=True)]
     line = headline(*sides)
+    assert headline(sides[0]).startswith(f"{sides[0].num_gaussians:,} Gaussians")
     assert line.endswith(words)
     assert line.startswith("50.0 % of the Gaussians")
 

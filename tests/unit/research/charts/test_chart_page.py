@@ -81,7 +81,10 @@ def test_the_page_fetches_nothing(page: str) -> None:
     assert "://" not in page
     assert "url(" not in page
     assert "@import" not in page
-    assert "default-src &#39;none&#39;" in page
+    assert "default-src &#x27;none&#x27;" in page
+    assert "script-src &#x27;sha256-" in page
+    assert "unsafe-inline" not in page
+    assert ' style="' not in page
 
 
 def test_every_reference_inside_the_page_is_there(page: str) -> None:

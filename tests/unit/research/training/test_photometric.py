@@ -14,7 +14,7 @@ from scipy.ndimage import uniform_filter
 from training_runs import OPTIONS, TINY, written
 
 from gsmerge.errors import GsmergeError
-from gsmerge.measure.lpips import lpips, lpips_available, lpips_loss
+from gsmerge.measure.lpips import lpips, lpips_available
 from gsmerge.networks.apply import NetworkContext, encode_features, refine_features
 from gsmerge.networks.modules import Networks
 from gsmerge.render import render
@@ -30,6 +30,7 @@ from gsmerge.research.training.losses import (
     window_loss,
     window_psnr,
 )
+from gsmerge.research.training.perceptual import lpips_loss
 from gsmerge.research.training.predict import analytic_gaussians, predict
 from gsmerge.research.training.scenes import coverage, covered_pixels, reduced_masks, view_subsets
 from gsmerge.research.training.windows import Box, Window, sample_window, whole_photo
