@@ -17,6 +17,7 @@ from gsmerge.io.bounds import read_json, read_text
 from gsmerge.io.cameras.camera_file import (
     C2W_OPENCV,
     C2W_OPENGL,
+    MAX_NORMALISED_FOCAL,
     MAX_NUMBER,
     W2C_OPENCV,
     CameraFile,
@@ -40,6 +41,7 @@ _INRIA_KEYS = ("position", "rotation", "fx", "fy", "width", "height")
 # Next to the dataset file of Long-LRM: which frames it took, and how it moved the world.
 FRAMES_FILE, POSE_FILE, SCALE_FILE = "input_frame_idx.txt", "pos_avg_inv.txt", "scene_scale.txt"
 DATAPARSER = "dataparser_transforms.json"
+_CENTRED = 1e-3  # pixels by which twice a principal point in the middle may differ from the image's size
 _ROTATION_TOLERANCE = 0.02  # of a rotation's columns, as for poses
 
 
@@ -166,16 +168,26 @@ def read_world_mirror(path: Path, data: Mapping[str, Any]) -> CameraFile:
     """Read the cameras of a parsed ``camera_params.json``.
 
     ``extrinsics`` and ``intrinsics`` are lists of ``{camera_id, matrix}``; poses are camera-to-world with OpenCV
-    axes, intrinsics in pixels of the processed size, which only the images have. ``camera_id`` is the stem of the
-    image's name, or its number, by which the cameras are then sorted. SceneError if the lists differ in cameras, or
-    a matrix is damaged.
+    axes, intrinsics in pixels of the processed size, which is twice the principal point. ``camera_id`` is the stem of
+    the image's name, or its number, by which the cameras are then sorted. SceneError if the lists differ in cameras,
+    or a matrix is damaged.
     """
     poses, Ks = (_matrices(path, data, key, side) for key, side in (("extrinsics", 4), ("intrinsics", 3)))
     if poses.keys() != Ks.keys():
         odd = sorted(poses.keys() ^ Ks.keys())[0]
         raise SceneError(path, f"expected extrinsics and intrinsics of the same cameras, found only one for {odd}")
     names = sorted(poses, key=int) if all(name.isdecimal() for name in poses) else list(poses)
-    return make_camera_file(path, "camera_params.json", C2W_OPENCV, [View(n, poses[n], Ks[n]) for n in names])
+    size = _centred_size([Ks[name] for name in names])
+    return make_camera_file(path, "camera_params.json", C2W_OPENCV, [View(n, poses[n], Ks[n], size) for n in names])
+
+
+def _centred_size(Ks: Sequence[np.ndarray]) -> tuple[int, int]:
+    """Return the (width, height) whose middle is the principal point of all intrinsics; (0, 0) where none is."""
+    sides = 2 * np.array([K[:2, 2] for K in Ks]).reshape(-1, 2)
+    whole = np.abs(sides[:1]).clip(0, MAX_NUMBER).round()
+    if not len(sides) or not (np.abs(sides - whole) <= _CENTRED).all() or not (whole > MAX_NORMALISED_FOCAL).all():
+        return 0, 0
+    return int(whole[0, 0]), int(whole[0, 1])
 
 
 def _matrices(path: Path, data: Mapping[str, Any], key: str, side: int) -> dict[str, np.ndarray]:

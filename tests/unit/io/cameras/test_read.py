@@ -68,6 +68,23 @@ def test_they_are_recognised_in_a_folder(tmp_path: Path, write: Callable[[Path],
     assert read_cameras(tmp_path).path == str(path)
 
 
+@pytest.mark.parametrize(
+    ("cx", "cy", "size"), [(24, 18, (48, 36)), (24.3, 18, (0, 0)), (-24, 18, (0, 0)), (float("nan"), 18, None)]
+)
+def test_world_mirror_s_size_is_twice_the_principal_point(
+    tmp_path: Path, cx: float, cy: float, size: tuple[int, int] | None
+) -> None:
+    centred = K.copy()
+    centred[:2, 2] = cx, cy
+    path = save_json(tmp_path / "camera_params.json", world_mirror(C2W, centred))
+    if size is None:
+        with pytest.raises(SceneError, match="finite"):
+            read_cameras(path)
+        return
+    actual = read_cameras(path)
+    assert set(zip(actual.widths.tolist(), actual.heights.tolist(), strict=True)) == {size}
+
+
 def test_long_lrm_s_world_is_the_gaussians(tmp_path: Path) -> None:
     """A point of the cameras' world and its image in the Gaussians' are seen in the same direction."""
     path = write_long_lrm(tmp_path)
