@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import SceneError
+from gsmerge.geometry import normalize
 from gsmerge.io.alignment import Similarity
 from gsmerge.io.bounds import read_json, read_text
 from gsmerge.io.cameras.camera_file import (
@@ -40,18 +41,22 @@ _MAX_NAME = 255  # bytes of a file's name
 _INRIA_KEYS = ("position", "rotation", "fx", "fy", "width", "height")
 # Next to the dataset file of Long-LRM: which frames it took, and how it moved the world.
 FRAMES_FILE, POSE_FILE, SCALE_FILE = "input_frame_idx.txt", "pos_avg_inv.txt", "scene_scale.txt"
+VIEWER_CAMERAS = ".cameras.json"  # ending of the cameras for viewers beside a result
 DATAPARSER = "dataparser_transforms.json"
 _CENTRED = 1e-3  # pixels by which twice a principal point in the middle may differ from the image's size
 _ROTATION_TOLERANCE = 0.02  # of a rotation's columns, as for poses
 
 
-def read_json_cameras(path: Path) -> CameraFile:
-    """Read the cameras of any known JSON file; SceneError if it is none of them, or damaged."""
+def read_json_cameras(path: Path, folder: Path | None = None) -> CameraFile:
+    """Read the cameras of any known JSON file; SceneError if it is none of them, or damaged.
+
+    ``folder`` is that of the Gaussians, for :func:`read_long_lrm`.
+    """
     data = read_json(path)
     if isinstance(data, dict) and "frames" in data:
         frames = data["frames"]
         if isinstance(frames, list) and frames and all(isinstance(f, dict) and "w2c" in f for f in frames):
-            return read_long_lrm(path, data)
+            return read_long_lrm(path, data, folder)
         return read_transforms(path, data)
     if isinstance(data, list) and data and all(isinstance(entry, dict) for entry in data):
         if "transform_matrix" in data[0]:
@@ -204,12 +209,13 @@ def _matrices(path: Path, data: Mapping[str, Any], key: str, side: int) -> dict[
     return matrices
 
 
-def read_long_lrm(path: Path, data: Mapping[str, Any]) -> CameraFile:
+def read_long_lrm(path: Path, data: Mapping[str, Any], folder: Path | None = None) -> CameraFile:
     """Read the cameras of a parsed dataset file: ``frames`` of ``fx fy cx cy w h`` and ``w2c``.
 
-    Next to it Long-LRM writes which frames it took (``input_frame_idx.txt``) and how the Gaussians' world lies in
-    the cameras': X = scene_scale (pos_avg_inv X_cameras). The cameras are moved into the Gaussians' world.
-    SceneError if an entry is missing or no number, or a frame does not exist.
+    Next to its Gaussians (in ``folder``, or copied next to the dataset file) Long-LRM writes which frames it took
+    (``input_frame_idx.txt``) and how the Gaussians' world lies in the cameras': X = scene_scale (pos_avg_inv
+    X_cameras); some versions write the frames alone, from which the rest follows. The cameras are moved into the
+    Gaussians' world. SceneError if an entry is missing or no number, or a frame does not exist.
     """
     frames = []
     for i, frame in enumerate(data["frames"]):
@@ -218,25 +224,45 @@ def read_long_lrm(path: Path, data: Mapping[str, Any]) -> CameraFile:
             pose = np.array(frame["w2c"], np.float64).reshape(4, 4)
             K = make_pinhole(*(float(frame[key]) for key in ("fx", "fy", "cx", "cy")))
             frames.append(View(name, pose, K, (round(float(frame["w"])), round(float(frame["h"])))))
-    frame_ids = _numbers(path.with_name(FRAMES_FILE))
+    places = [place for place in (path.parent, folder) if place is not None and (place / FRAMES_FILE).is_file()]
+    frames_path, pose_path, scale_path = (
+        (places[0] if places else path.parent) / name for name in (FRAMES_FILE, POSE_FILE, SCALE_FILE)
+    )
+    frame_ids = _numbers(frames_path)
     ids = range(len(frames)) if frame_ids is None else [round(value) for value in frame_ids]
     odd = next((i for i in ids if not 0 <= i < len(frames)), None)
     if odd is not None:
-        raise SceneError(path.with_name(FRAMES_FILE), f"expected frames 0 to {len(frames) - 1}, found {odd:.6g}")
+        raise SceneError(frames_path, f"expected frames 0 to {len(frames) - 1}, found {odd:.6g}")
     poses = np.array([frames[i].pose for i in ids]).reshape(-1, 4, 4)
-    move, scale = _numbers(path.with_name(POSE_FILE)), _numbers(path.with_name(SCALE_FILE))
+    move, scale = _numbers(pose_path), _numbers(scale_path)
+    if frame_ids is not None and len(poses) and move is None and scale is None:
+        with _number_errors(path, "expected poses that can be inverted"), np.errstate(all="ignore"):
+            move, scale = _average_frame(invert(poses))
     if scale is not None and (scale.size != 1 or not scale[0] > 0):
-        raise SceneError(path.with_name(SCALE_FILE), "expected one positive number")
+        raise SceneError(scale_path, "expected one positive number")
     if move is not None and move.size != 16:
-        raise SceneError(path.with_name(POSE_FILE), f"expected 16 numbers, found {move.size}")
+        raise SceneError(pose_path, f"expected 16 numbers, found {move.size}")
     try:
         with np.errstate(all="ignore"):  # what overflows is refused with the cameras
             poses = poses if move is None else matmul(poses, invert(move.reshape(4, 4)))  # of X' = s (A X): R inv(A)
             poses[:, :3, 3] *= 1.0 if scale is None else scale[0]
     except np.linalg.LinAlgError as error:
-        raise SceneError(path.with_name(POSE_FILE), "expected a matrix that can be inverted") from error
+        raise SceneError(pose_path, "expected a matrix that can be inverted") from error
     views = [frames[i]._replace(pose=pose) for i, pose in zip(ids, poses, strict=True)]
     return make_camera_file(path, "Long-LRM", W2C_OPENCV, views)
+
+
+def _average_frame(c2w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the map ``[16]`` into the mean pose of cameras, and the scale ``[1]`` that brings them within +-1."""
+    mean = np.eye(4)
+    forward, down = c2w[:, :3, 2].mean(0), c2w[:, :3, 1].mean(0)
+    mean[:3, 2] = normalize(forward)
+    mean[:3, 1] = normalize(down - (down * mean[:3, 2]).sum() * mean[:3, 2])
+    mean[:3, 0] = np.cross(mean[:3, 1], mean[:3, 2])
+    mean[:3, 3] = c2w[:, :3, 3].mean(0)
+    move = invert(mean)
+    farthest = float(np.abs(matmul(move, c2w)[:, :3, 3]).max())
+    return move.reshape(-1), np.array([1 / farthest if farthest > 0 else 1.0])
 
 
 def _numbers(path: Path) -> np.ndarray | None:
@@ -254,8 +280,8 @@ def viewer_cameras_path(output: Path) -> Path:
     """Return the path of the cameras for viewers: ``out.ply`` -> ``out.cameras.json``."""
     name = output.name
     stem = name[: -len(".compressed.ply")] if name.lower().endswith(".compressed.ply") else output.stem
-    ending = ".cameras.json"
-    return output.with_name(os.fsencode(stem)[: _MAX_NAME - len(ending)].decode("utf-8", "ignore") + ending)
+    stem = os.fsencode(stem)[: _MAX_NAME - len(VIEWER_CAMERAS)].decode("utf-8", "ignore")
+    return output.with_name(stem + VIEWER_CAMERAS)
 
 
 def write_transforms(path: Path, cameras: Cameras, names: Sequence[str]) -> None:

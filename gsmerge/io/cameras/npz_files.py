@@ -22,7 +22,7 @@ from gsmerge.io.alignment import ORDERS
 from gsmerge.io.bounds import check_file, check_pixels
 from gsmerge.io.cameras.camera_file import C2W_OPENCV, W2C_OPENCV, CameraFile, View, make_camera_file
 
-_EXTRINSICS, _INTRINSICS = ("extrinsics", "exts"), ("intrinsics", "ixts")
+_EXTRINSICS, _INTRINSICS = ("extrinsics", "exts", "extrinsic"), ("intrinsics", "ixts", "intrinsic")
 _IMAGES, _DEPTHS = ("image", "images"), ("depth", "depths")
 _MAX_INTRINSIC, _SMALL = 1e12, 1e-9
 _FREE_BYTES = 64 << 20  # an array of that size is read however well it is compressed
@@ -34,13 +34,16 @@ def read_da3(path: Path) -> CameraFile:
     """Read the cameras (and images, if stored) of an npz: world-to-camera 3x4 or 4x4, intrinsics in pixels.
 
     Intrinsics of another image size than the depth maps' (a COLMAP export in the same call writes those), or
-    normalised ones, are scaled to it. SceneError if the file cannot be read or lacks an array.
+    normalised ones, are scaled to it. What VGGT (``extrinsic``, world to camera) and AnySplat (the same, camera to
+    world, normalised, in a batch of one) return is read as well. SceneError if the file cannot be read or lacks an
+    array.
     """
     sizes = () if holds_images(path) else _DEPTHS  # of depths only the shape counts, the confidence is never read
     arrays = read_arrays(path, {*_EXTRINSICS, *_INTRINSICS, *_IMAGES, *sizes})
     poses, Ks, images, depths = (_first(arrays, names) for names in (_EXTRINSICS, _INTRINSICS, _IMAGES, _DEPTHS))
     if poses is None or Ks is None:
         raise _missing(path, [n for n, a in (("extrinsics", poses), ("intrinsics", Ks)) if a is None], arrays)
+    poses, Ks = (array[0] if array.ndim == 4 and len(array) == 1 else array for array in (poses, Ks))
     _check_poses(path, poses, Ks, ("extrinsics [c,3,4]", "intrinsics [c,3,3]"))
     images = None if images is None else _as_images(path, images, len(poses))
     grid = images if images is not None else depths
@@ -50,7 +53,10 @@ def read_da3(path: Path) -> CameraFile:
         Ks = _at_size(Ks, width, height)
     else:
         width, height = round(2 * Ks[0, 0, 2]), round(2 * Ks[0, 1, 2])
-    return make_camera_file(path, "DA3 npz", W2C_OPENCV, _views(poses, Ks, (width, height)), images)
+    if _EXTRINSICS[0] in arrays or _EXTRINSICS[1] in arrays:
+        return make_camera_file(path, "DA3 npz", W2C_OPENCV, _views(poses, Ks, (width, height)), images)
+    size, convention = ((width, height), W2C_OPENCV) if width > 1 else ((0, 0), C2W_OPENCV)
+    return make_camera_file(path, "npz of poses", convention, _views(poses, Ks, size), images)
 
 
 def read_dump(path: Path) -> CameraFile:
@@ -72,6 +78,12 @@ def read_dump(path: Path) -> CameraFile:
 def holds_images(path: Path) -> bool:
     """Return whether an npz has the images themselves; False if it cannot be read."""
     return not array_names(path).isdisjoint(_IMAGES)
+
+
+def holds_poses(path: Path) -> bool:
+    """Return whether an npz has poses and intrinsics; False if it cannot be read."""
+    names = array_names(path)
+    return {"c2w", "K"} <= names or not (names.isdisjoint(_EXTRINSICS) or names.isdisjoint(_INTRINSICS))
 
 
 def read_depths(path: Path) -> np.ndarray | None:
