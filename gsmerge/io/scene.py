@@ -176,6 +176,7 @@ def align_scene(
     known = camera_file.order if exporter is None else exporter.order
     order = known if hints.order == "auto" else hints.order
     pinholes, pictures, notes = as_pinholes(camera_file, stored_photos(files, camera_file) if photos else None)
+    notes += [camera_file.focal] if camera_file.focal else []
     limited, smaller = limit_photo_size(pictures, len(ply.gaussians), hints.max_side, unaligned=order == "none")
 
     def read_frames() -> list[Similarity]:

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.io.alignment import estimate_cameras
+from gsmerge.io.alignment import estimate_cameras, estimate_focal
 from gsmerge.io.bounds import check_file
-from gsmerge.io.cameras.camera_file import CameraFile, to_cameras, undistort_photos
+from gsmerge.io.cameras.camera_file import CameraFile, missing_intrinsics, to_cameras, undistort_photos
 from gsmerge.io.cameras.npz_files import holds_images
 from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
 from gsmerge.io.cameras.read import (
@@ -139,9 +139,20 @@ def other_plys(folder: Path) -> list[Path]:
 
 
 def read_scene_cameras(ply: PlyScene, files: SceneFiles) -> CameraFile:
-    """Read the cameras from their file or the ``.ply``, or estimate them for the images; SceneError if all fail."""
+    """Read the cameras from their file or the ``.ply``, or estimate them for the images; SceneError if all fail.
+
+    Where a file has poses alone, the focal length is estimated.
+    """
     if files.cameras is not None:
-        return read_cameras(files.cameras, scene=files.ply.stem, folder=files.ply.parent)
+        stored = read_cameras(files.cameras, scene=files.ply.stem, folder=files.ply.parent)
+        if stored.focal is not None:
+            return stored
+        photos = stored_photos(files, stored)
+        estimated = estimate_focal(ply, stored, photos)
+        if estimated is None:
+            reason = "no focal length fits the Gaussians" if photos is not None else "no photos that show them"
+            raise missing_intrinsics(stored.path, f", and {reason}")
+        return estimated
     cameras = read_sharp(files.ply)
     if cameras is None and files.images is not None and files.images.is_dir():
         paths = list_images(files.images)

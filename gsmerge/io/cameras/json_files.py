@@ -37,6 +37,7 @@ from gsmerge.types import Cameras
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # the order of "distortion_params"
 _DISTORTED = {"OPENCV", "RADIAL", "SIMPLE_RADIAL"}
 _PERSPECTIVE = {"PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", *_DISTORTED}
+_FOCAL_KEYS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
 _MAX_NAME = 255  # bytes of a file's name
 _INRIA_KEYS = ("position", "rotation", "fx", "fy", "width", "height")
 # Next to the dataset file of Long-LRM: which frames it took, and how it moved the world.
@@ -81,7 +82,7 @@ def read_transforms(path: Path, data: Mapping[str, Any] | list[Any]) -> CameraFi
     """Read the cameras of a parsed ``transforms.json``; SceneError if a pose or an intrinsic is missing.
 
     A dictionary with ``frames`` has camera-to-world poses with OpenGL axes; a bare list of frames (as one backbone
-    writes) has OpenCV axes. Intrinsics are global or per frame, in pixels or as field of view.
+    writes) has OpenCV axes. Intrinsics are global or per frame, in pixels or as field of view; no frame need have any.
     ``applied_transform`` is not applied: poses are in the Gaussians' world.
     """
     source, convention = ("frame list", C2W_OPENCV) if isinstance(data, list) else ("transforms.json", C2W_OPENGL)
@@ -89,6 +90,7 @@ def read_transforms(path: Path, data: Mapping[str, Any] | list[Any]) -> CameraFi
     if not isinstance(frames, list) or not all(isinstance(f, dict) for f in frames):
         raise SceneError(path, "expected 'frames' to be a list of objects, found something else")
     views = []
+    bare = not any(key in {**common, **frame} for frame in frames for key in _FOCAL_KEYS)
     for i, frame in enumerate(frames):
         name = str(frame.get("file_path") or frame.get("image_path") or frame.get("name") or f"view {i}")
         if "transform_matrix" not in frame:
@@ -97,13 +99,19 @@ def read_transforms(path: Path, data: Mapping[str, Any] | list[Any]) -> CameraFi
         with _number_errors(path, f"view {name}: expected numbers"):
             pose = np.array(frame["transform_matrix"], np.float64)
             lens = _lens(path, name, values)
-            views.append(View(name, pose, *_intrinsics(path, name, values), lens))
+            K, size = (None, _stored_size(values)) if bare else _intrinsics(path, name, values)
+            views.append(View(name, pose, K, size, lens))
     return make_camera_file(path, source, convention, views)
+
+
+def _stored_size(values: Mapping[str, Any]) -> tuple[int, int]:
+    """Return (width, height) of a frame; 0 where the file has none."""
+    return round(float(values.get("w") or 0)), round(float(values.get("h") or 0))
 
 
 def _intrinsics(path: Path, name: str, values: Mapping[str, Any]) -> tuple[np.ndarray, tuple[int, int]]:
     """Return intrinsics ``[3,3]`` and (width, height) of a frame, from its own values or those of all frames."""
-    if not any(key in values for key in ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")):
+    if not any(key in values for key in _FOCAL_KEYS):
         missing = ", ".join(key for key in ("fl_x", "w", "h") if key not in values)
         problem = f"expected intrinsics (fl_x, fl_y, cx, cy, w, h), found none of {missing} for view {name}"
         raise SceneError(path, problem, "add them in pixels, for all frames or for each")

@@ -112,14 +112,14 @@ def read_trajectory(path: Path) -> CameraFile:
     """Read the cameras of a text file with one pose per line, as KITTI and DA3 write it.
 
     A line has 12 or 16 numbers: camera-to-world, OpenCV axes, row by row. Next to the file is ``intrinsic.txt`` (or
-    ``intrinsics.txt``) with fx, fy, cx, cy in pixels, one line for all views or one for each; the images have the
-    size. SceneError if a line has another number of numbers, or there are no intrinsics.
+    ``intrinsics.txt``) with fx, fy, cx, cy in pixels, one line for all views or one for each, or nothing; the images
+    have the size. SceneError if a line has another number of numbers.
     """
     poses = _rows(path, _POSE_COLUMNS)
     intrinsics = next((path.with_name(name) for name in INTRINSICS if path.with_name(name).is_file()), None)
     if intrinsics is None:
-        problem = f"expected the intrinsics next to it in {INTRINSICS[0]}, found none"
-        raise SceneError(path, problem, "write fx fy cx cy")
+        views = [View(f"{i:06d}", pose.reshape(-1, 4), None) for i, pose in enumerate(poses)]
+        return make_camera_file(path, "pose list", C2W_OPENCV, views)
     values = _rows(intrinsics, (4,))
     if len(values) not in (1, len(poses)):
         raise SceneError(intrinsics, f"expected one line, or one for each of {len(poses)} views, found {len(values)}")

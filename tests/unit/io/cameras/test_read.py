@@ -102,6 +102,14 @@ def test_long_lrm_s_world_is_the_gaussians(tmp_path: Path) -> None:
     assert actual.names == ("view_002", "view_000")
 
 
+def test_a_list_of_poses_alone(tmp_path: Path) -> None:
+    path = write_trajectory(tmp_path)
+    path.with_name("intrinsic.txt").unlink()
+    actual = read_cameras(path)
+    np.testing.assert_allclose(actual.viewmats, np.linalg.inv(C2W), atol=1e-9)
+    assert actual.focal is None
+
+
 def other_intrinsics(path: Path) -> None:
     with edited_json(path) as document:
         document["intrinsics"][0]["camera_id"] = "elsewhere"
@@ -121,7 +129,6 @@ def replace_text(old: str, new: str) -> Callable[[Path], object]:
             lambda path: path.write_text(path.read_text() + "1 2 3\n"),
             "line 4: expected 12 or 16 numbers, found 3",
         ),
-        (write_trajectory, lambda path: path.with_name("intrinsic.txt").unlink(), "intrinsics next to it in intrinsic"),
         (write_long_lrm, replace_text('"fx"', '"f"'), "expected w2c, fx, fy, cx, cy, w, h as numbers"),
         (
             write_long_lrm,
