@@ -153,7 +153,9 @@ def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: Rea
 def read_ply_with_hints(path: Path, *, opacity: OpacityChoice, hints: ReadHints) -> PlyScene:
     """Read the rows of a file, with opacities as given, or as the given exporter stores them."""
     exporter = find_exporter(hints.exporter)
-    return read_gaussians(path, opacity=opacity if exporter is None or opacity != "auto" else exporter.opacity)
+    if exporter is not None and exporter.opacity == "logit" and opacity == "auto":
+        opacity = "logit"  # activated ones show themselves, and some versions write logits in their place
+    return read_gaussians(path, opacity=opacity)
 
 
 def align_scene(
