@@ -202,8 +202,8 @@ def _photo_paths(files: SceneFiles, camera_file: CameraFile) -> list[Path] | Non
 
 def images_beside(ply: Path) -> list[Path]:
     """List the images in the folder of a ``.ply``, without those below it, in the order of :func:`list_images`."""
-    images = (path for path in ply.parent.glob("*") if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file())
-    return sorted((path for path in images if path.name[0] != "."), key=lambda path: natural_key(path.name))
+    named = (path for path in ply.parent.glob("[!.]*") if path.suffix.lower() in IMAGE_SUFFIXES)
+    return sorted((path for path in named if path.is_file()), key=lambda path: natural_key(path.name))
 
 
 def find_large_photos(

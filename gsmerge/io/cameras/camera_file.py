@@ -112,7 +112,8 @@ def make_camera_file(
         raise SceneError(path, f"expected at most {MAX_VIEWS} cameras, found {len(views)}")
     missing = all(view.K is None for view in views)
     if missing:  # a place holder, until the focal length is estimated
-        views = [view._replace(K=np.diag([max(view.size) or 1.0, max(view.size) or 1.0, 1.0])) for view in views]
+        sides = [float(max(view.size)) or 1.0 for view in views]
+        views = [view._replace(K=make_pinhole(f, f, 0, 0)) for view, f in zip(views, sides, strict=True)]
     poses, Ks = np.tile(np.eye(4), (len(views), 1, 1)), np.array([view.K for view in views], np.float64)
     for i, view in enumerate(views):
         pose = np.asarray(view.pose, np.float64)

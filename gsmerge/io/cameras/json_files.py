@@ -191,14 +191,16 @@ def read_world_mirror(path: Path, data: Mapping[str, Any]) -> CameraFile:
         raise SceneError(path, f"expected extrinsics and intrinsics of the same cameras, found only one for {odd}")
     names = sorted(poses, key=int) if all(name.isdecimal() for name in poses) else list(poses)
     size = _centred_size([Ks[name] for name in names])
-    return make_camera_file(path, "camera_params.json", C2W_OPENCV, [View(n, poses[n], Ks[n], size) for n in names])
+    views = [View(name, poses[name], Ks[name], size) for name in names]
+    return make_camera_file(path, "camera_params.json", C2W_OPENCV, views)
 
 
 def _centred_size(Ks: Sequence[np.ndarray]) -> tuple[int, int]:
-    """Return the (width, height) whose middle is the principal point of all intrinsics; (0, 0) where none is."""
+    """Return the (width, height) in whose middle all principal points are; (0, 0) without one."""
     sides = 2 * np.array([K[:2, 2] for K in Ks]).reshape(-1, 2)
     whole = np.abs(sides[:1]).clip(0, MAX_NUMBER).round()
-    if not len(sides) or not (np.abs(sides - whole) <= _CENTRED).all() or not (whole > MAX_NORMALISED_FOCAL).all():
+    centred = len(sides) > 0 and bool((np.abs(sides - whole) <= _CENTRED).all())
+    if not centred or not (whole > MAX_NORMALISED_FOCAL).all():
         return 0, 0
     return int(whole[0, 0]), int(whole[0, 1])
 
@@ -232,10 +234,10 @@ def read_long_lrm(path: Path, data: Mapping[str, Any], folder: Path | None = Non
             pose = np.array(frame["w2c"], np.float64).reshape(4, 4)
             K = make_pinhole(*(float(frame[key]) for key in ("fx", "fy", "cx", "cy")))
             frames.append(View(name, pose, K, (round(float(frame["w"])), round(float(frame["h"])))))
-    places = [place for place in (path.parent, folder) if place is not None and (place / FRAMES_FILE).is_file()]
-    frames_path, pose_path, scale_path = (
-        (places[0] if places else path.parent) / name for name in (FRAMES_FILE, POSE_FILE, SCALE_FILE)
-    )
+    beside = path.parent
+    if folder is not None and not (beside / FRAMES_FILE).is_file() and (folder / FRAMES_FILE).is_file():
+        beside = folder
+    frames_path, pose_path, scale_path = beside / FRAMES_FILE, beside / POSE_FILE, beside / SCALE_FILE
     frame_ids = _numbers(frames_path)
     ids = range(len(frames)) if frame_ids is None else [round(value) for value in frame_ids]
     odd = next((i for i in ids if not 0 <= i < len(frames)), None)

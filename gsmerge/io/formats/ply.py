@@ -29,10 +29,12 @@ READERS: dict[str, Callable[[Path], StoredRows]] = {
 }
 SCENE_SUFFIXES = (".ply", *READERS)
 
-_MIN_JUDGED, _SCALE_SAMPLES = 100, 20_000  # Gaussians whose scales say something; of them, how many are looked at
-# Share of the scene's width from which on standard deviations are wrong. Those of sound files are 0.3 to 2 times the
-# width over the root of the number of Gaussians, and linear ones that are taken for logarithms 10 to 1,000 times.
-_MAX_WIDTH, _MAX_SPACINGS = 0.25, 6.0
+_MIN_JUDGED = 100  # Gaussians whose scales say something
+_SCALE_SAMPLES = 20_000  # of them that are looked at
+_MAX_WIDTH = 0.25  # share of the scene's width from which on standard deviations are wrong
+# The same in units of the width over the root of the number of Gaussians: sound files have 0.3 to
+# 2, linear scales that are taken for logarithms 10 to 1,000.
+_MAX_SPACINGS = 6.0
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,8 @@ class PlyInfo:
     num_nonfinite: int  # rows with NaN or inf, set aside
     num_clipped_scales: int  # Gaussians with a log scale beyond +-30 or a harmonic beyond +-1e6, clipped
     num_zero_quats: int  # Gaussians without a rotation, read as the identity
-    odd_scales: str = ""  # why the scales are likely wrong, one sentence without a full stop; empty where they are not
+    # why the scales are likely wrong, one sentence without a full stop; empty where they are not
+    odd_scales: str = ""
 
 
 @dataclass(frozen=True)
@@ -323,12 +326,18 @@ def _describe_odd_scales(means: np.ndarray, scales: np.ndarray, valid: np.ndarra
         return ""
     some = rows[:: max(1, len(rows) // _SCALE_SAMPLES)]
     low, high = np.quantile(means[some].astype(np.float64), (0.05, 0.95), axis=0)
-    width, size = float((high - low).max()), float(np.median(scales[some].max(1)))
-    text = f"half of the Gaussians have a standard deviation above {size:.3g} in a scene of a width of {width:.3g}"
-    most, linear = _MAX_SPACINGS * width / float(np.sqrt(len(rows))), float(log(size))
+    width = float((high - low).max())
+    size = float(np.median(scales[some].max(1)))
+    text = f"half of the Gaussians have a standard deviation above {size:.3g}"
+    text += f" in a scene of a width of {width:.3g}"
+    most = _MAX_SPACINGS * width / float(np.sqrt(len(rows)))
+    linear = float(log(size))
     if linear <= most < size and scales.min(where=valid[:, None], initial=np.inf) >= 1:
-        return f"no stored scale is negative (median {linear:.3g}), as if linear: {text}; logarithms are expected"
-    return f"{text}: the scales, which are logarithms, are too large" if size > _MAX_WIDTH * width else ""
+        start = f"no stored scale is negative (median {linear:.3g}), as if linear"
+        return f"{start}: {text}; logarithms are expected"
+    if size > _MAX_WIDTH * width:
+        return f"{text}: the scales, which are logarithms, are too large"
+    return ""
 
 
 def clear_invalid(path: str | Path, out: dict[str, np.ndarray]) -> int:
