@@ -124,6 +124,7 @@ def compact_tensors(
     scene, more = _make_scene(gaussians, valid, cameras, photos, names, order)
     if scene.aligned and check_rotations:
         _check_rotations(scene)
+    more += _rotation_notes(scene, check_rotations=check_rotations)
     result = compact(scene, progress=progress, **settings)
     result.report.notes[:0] = notes + more
     return result.to(means.device if hasattr(means, "detach") else None)
@@ -194,9 +195,6 @@ def _make_gaussians(out: dict[str, np.ndarray]) -> tuple[Gaussians, np.ndarray, 
     out["quats"][off] = normalize(out["quats"][off])
     out["quats"][(out["quats"] == 0).all(1)] = (1, 0, 0, 0)
     notes = [f"{num_bad:,} row(s) with NaN or inf, set aside"] if num_bad else []
-    first, last = out["quats"][valid][:, 0], out["quats"][valid][:, 3]
-    if last.min() >= 0 > first.min():  # quaternions of matrices usually have no negative w
-        notes.append("the last column of quats is never negative: if w comes last, pass quats[:, [3, 0, 1, 2]]")
     return Gaussians(**out), valid, notes
 
 
@@ -356,6 +354,19 @@ def _check_rotations(scene: Scene) -> None:
     facts = note.partition(";")[0]
     remedy = f"{_ROTATION_REMEDIES[choice]}; pass check_rotations=False if they are right as they are"
     raise SceneError("quats", f"expected unit quaternions wxyz, local to world, found that {facts}", remedy)
+
+
+def _rotation_notes(scene: Scene, *, check_rotations: bool) -> list[str]:
+    """Note quaternions whose w may come last: those of matrices usually have no negative w.
+
+    Depth Anything 3 writes w first and takes the sign from the last column: where the pixels are known, the surface
+    decides, otherwise the caller.
+    """
+    first, last = scene.file_gaussians.quats[:, 0], scene.file_gaussians.quats[:, 3]
+    if not last.min() >= 0 > first.min():
+        return []
+    last_w = choose_rotations(scene)[0] == "xyzw" if scene.aligned else check_rotations
+    return ["the last column of quats is never negative: if w comes last, pass quats[:, [3, 0, 1, 2]]"] * last_w
 
 
 def _check_seen(gaussians: Gaussians, valid: np.ndarray, cameras: Cameras, images: np.ndarray | None) -> list[str]:

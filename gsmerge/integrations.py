@@ -35,6 +35,7 @@ def depth_anything_3(prediction: Any, *, sh_degree: int = 0) -> dict[str, Any]:
         SceneError: If a field is missing, or it holds several scenes.
     """
     gaussians = _field("prediction", prediction, "gaussians")
+    rotations = _one("rotations", gaussians.rotations, 2)
     photos = as_array(_field("prediction", prediction, "processed_images"))
     viewmats = as_array(_field("prediction", prediction, "extrinsics")).astype(np.float64)
     scale = getattr(prediction, "scale_factor", None)
@@ -43,7 +44,8 @@ def depth_anything_3(prediction: Any, *, sh_degree: int = 0) -> dict[str, Any]:
     return {
         **_gaussians(gaussians, sh_degree),
         "scales": _one("scales", gaussians.scales, 2),
-        "quats": _one("rotations", gaussians.rotations, 2),
+        # the same rotations: its z is never negative, by which they would look as if w came last
+        "quats": rotations * (1 - 2 * (rotations[:, :1] < 0)),
         "images": _as_floats(photos),
         "viewmats": viewmats,
         "Ks": _in_pixels_of(photos, as_array(_field("prediction", prediction, "intrinsics"))),

@@ -13,7 +13,7 @@ from gsmerge.io import SCENE_SUFFIXES, CameraFile, SceneFiles, read_cameras
 from gsmerge.io.bounds import read_errors, walk_files
 from gsmerge.io.cameras.json_files import DATAPARSER, FRAMES_FILE, POSE_FILE, SCALE_FILE
 from gsmerge.io.cameras.read import INTRINSICS
-from gsmerge.io.scene_files import IMAGE_PLACES
+from gsmerge.io.scene_files import IMAGE_PLACES, images_beside
 
 EXTRA_FILES = (DATAPARSER, *INTRINSICS, FRAMES_FILE, POSE_FILE, SCALE_FILE)  # read with some camera files
 
@@ -43,8 +43,9 @@ def read_files(files: SceneFiles) -> list[Path]:
     paths = [path for path in (files.ply, files.cameras, files.images, files.masks) if path is not None]
     if files.cameras is not None:
         root = files.cameras if files.cameras.is_dir() else files.cameras.parent
-        paths += [root / name for name in EXTRA_FILES if (root / name).is_file()]
-        paths += photos_of(files.cameras)
+        folders = (root, files.ply.parent)
+        paths += [place / name for place in folders for name in EXTRA_FILES if (place / name).is_file()]
+        paths += photos_of(files.cameras) or ([] if files.images else images_beside(files.ply))
     return list(dict.fromkeys(paths))
 
 

@@ -158,7 +158,9 @@ def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: Rea
 def read_ply_with_hints(path: Path, *, opacity: OpacityChoice, hints: ReadHints) -> PlyScene:
     """Read the rows of a file, with opacities as given, or as the given exporter stores them."""
     exporter = find_exporter(hints.exporter)
-    return read_gaussians(path, opacity=opacity if exporter is None or opacity != "auto" else exporter.opacity)
+    if exporter is not None and exporter.opacity == "logit" and opacity == "auto":
+        opacity = "logit"  # activated ones show themselves, and some versions write logits in their place
+    return read_gaussians(path, opacity=opacity)
 
 
 def align_scene(
@@ -181,6 +183,7 @@ def align_scene(
     known = camera_file.order if exporter is None else exporter.order
     order = known if hints.order == "auto" else hints.order
     pinholes, pictures, notes = as_pinholes(camera_file, stored_photos(files, camera_file) if photos else None)
+    notes += [camera_file.focal] if camera_file.focal else []
     whole, (pictures, cut) = pictures, cut_bars(pictures, camera_file)
     limited, smaller = limit_photo_size(pictures, len(ply.gaussians), hints.max_side, unaligned=order == "none")
 

@@ -11,14 +11,28 @@ import cv2
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.io.alignment import estimate_cameras
+from gsmerge.io.alignment import estimate_cameras, estimate_focal
 from gsmerge.io.bounds import check_file
-from gsmerge.io.cameras.camera_file import CameraFile, sizes_of, to_cameras, undistort_photos
+from gsmerge.io.cameras.camera_file import (
+    CameraFile,
+    missing_intrinsics,
+    sizes_of,
+    to_cameras,
+    undistort_photos,
+)
 from gsmerge.io.cameras.npz_files import holds_images
 from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
-from gsmerge.io.cameras.read import CAMERA_PLACES, SHARP, find_cameras, read_cameras, read_sharp
+from gsmerge.io.cameras.read import (
+    CAMERA_PLACES,
+    SHARP,
+    find_cameras,
+    find_other_cameras,
+    read_cameras,
+    read_sharp,
+)
 from gsmerge.io.formats.ply import PlyScene
 from gsmerge.io.photo_files import (
+    IMAGE_SUFFIXES,
     Photos,
     PhotoTransform,
     Size,
@@ -33,6 +47,7 @@ from gsmerge.io.photo_files import (
     list_images,
     match_images,
     match_masks,
+    natural_key,
     photo_size,
     resize_to,
     same_shape,
@@ -44,6 +59,7 @@ from gsmerge.types import Cameras, LargePhotos, StrPath
 
 # The first that exists wins; then the folder's only .ply.
 PLY_PLACES = ("scene.ply", "gaussians.ply", "gs_ply/0000.ply", "point_cloud.ply")
+SCENES_PLACE = "gaussians"  # where DepthSplat and its relatives write NAME.ply, with the photos in images/NAME
 IMAGE_PLACES = ("images", "input", "context", "rgb", "input_images")
 MASK_PLACES = ("masks",)
 _POINT_CLOUDS = {"input.ply", "points3D.ply", "points.ply", "sparse_pc.ply"}  # of other programs
@@ -74,10 +90,11 @@ def find_scene_files(
 ) -> SceneFiles:
     """Find a scene's files; those that the user names are used instead of searching.
 
-    The given folder is searched, then the ``.ply``'s own, then the one above it for ``gs_ply/`` and two above it
-    for ``point_cloud/iteration_n/``; in each the places of ``PLY_PLACES``, ``CAMERA_PLACES``, ``IMAGE_PLACES`` and
-    ``MASK_PLACES`` in their order. Images inside the cameras' ``.npz`` or ``.torch`` go before a folder, because they
-    are those that the model saw.
+    The given folder is searched, then the ``.ply``'s own, then the one above it for ``gs_ply/`` and ``gaussians/``,
+    and two above it for ``point_cloud/iteration_n/``; in each the places of ``PLY_PLACES``, ``CAMERA_PLACES``,
+    ``IMAGE_PLACES`` and ``MASK_PLACES`` in their order. Without any of these cameras the only file of any name that
+    holds some will do. Images inside the cameras' ``.npz`` or ``.torch`` go before a folder, because they are those
+    that the model saw.
 
     Raises:
         SceneError: If there is no ``.ply``, several to choose from, or a named file does not exist.
@@ -87,25 +104,28 @@ def find_scene_files(
     check_file(ply)
     given = path if ply != path else ply.parent
     folder = Path(os.path.realpath(ply.parent))
-    above = [folder.parent] * (folder.name == "gs_ply")
+    above = [folder.parent] * (folder.name in ("gs_ply", SCENES_PLACE))
     if folder.name.startswith("iteration_") and folder.parent.name == "point_cloud":
         above = [folder.parent.parent]
     roots = list(dict.fromkeys((Path(os.path.realpath(given)), folder, *above)))
-    camera_path = _named(cameras) or next((c for c in map(find_cameras, roots) if c is not None), None)
+    places = (find(root) for find in (find_cameras, find_other_cameras) for root in roots)
+    camera_path = _named(cameras) or next((place for place in places if place is not None), None)
     image_path = _named(images)
     if image_path is None and camera_path is not None:
         has_images = camera_path.suffix == CHUNK or (camera_path.suffix == ".npz" and holds_images(camera_path))
         image_path = camera_path if has_images else None
     if image_path is None:
-        folders = (root / place for root in roots for place in IMAGE_PLACES)
+        folders = [root / place for root in roots for place in IMAGE_PLACES]
+        if folder.name == SCENES_PLACE:
+            folders = [place / ply.stem for place in folders] + folders
         image_path = next((f for f in folders if f.is_dir() and list_images(f)), None)
     mask_path = _named(masks)
     if mask_path is not None and not mask_path.is_dir():
         raise SceneError(mask_path, "expected a folder of masks, found a file")
     if mask_path is None:
         beside = [] if image_path is None else [image_path.parent]
-        folders = (root / place for root in (*beside, *roots) for place in MASK_PLACES)
-        mask_path = next((f for f in folders if f.is_dir() and list_images(f)), None)
+        candidates = (root / place for root in (*beside, *roots) for place in MASK_PLACES)
+        mask_path = next((f for f in candidates if f.is_dir() and list_images(f)), None)
     return SceneFiles(ply, camera_path, image_path, mask_path)
 
 
@@ -121,7 +141,7 @@ def _named(path: StrPath | None) -> Path | None:
 
 def _find_ply(folder: Path) -> Path:
     named = named_ply(folder)
-    plys = other_plys(folder) if named is None else [named]
+    plys = other_plys(folder) or other_plys(folder / SCENES_PLACE) if named is None else [named]
     if len(plys) == 1:
         return plys[0]
     if not plys:
@@ -146,9 +166,20 @@ def other_plys(folder: Path) -> list[Path]:
 
 
 def read_scene_cameras(ply: PlyScene, files: SceneFiles) -> CameraFile:
-    """Read the cameras from their file or the ``.ply``, or estimate them for the images; SceneError if all fail."""
+    """Read the cameras from their file or the ``.ply``, or estimate them for the images; SceneError if all fail.
+
+    Where a file has poses alone, the focal length is estimated.
+    """
     if files.cameras is not None:
-        return read_cameras(files.cameras, scene=files.ply.stem)
+        stored = read_cameras(files.cameras, scene=files.ply.stem, folder=files.ply.parent)
+        if stored.focal is not None:
+            return stored
+        photos = stored_photos(files, stored)
+        estimated = estimate_focal(ply, stored, photos)
+        if estimated is None:
+            reason = "no focal length fits the Gaussians" if photos is not None else "no photos that show them"
+            raise missing_intrinsics(stored.path, f", and {reason}")
+        return estimated
     cameras = read_sharp(files.ply)
     if cameras is None and files.images is not None and files.images.is_dir():
         paths = list_images(files.images)
@@ -190,8 +221,16 @@ def _photo_paths(files: SceneFiles, camera_file: CameraFile) -> list[Path] | Non
     if files.images is None:
         folder = Path(camera_file.path).parent
         paths = [path for path in (find_image(folder, name) for name in camera_file.names) if path is not None]
+        if not paths and all(name.removeprefix("view ").isdecimal() for name in camera_file.names):
+            paths = images_beside(files.ply)  # the format has no names; AnySplat writes its Gaussians among the photos
         return paths if len(paths) == len(camera_file) else None
     return None if files.images.suffix in (".npz", CHUNK) else match_images(files.images, camera_file.names)
+
+
+def images_beside(ply: Path) -> list[Path]:
+    """List the images in the folder of a ``.ply``, without those below it, in the order of :func:`list_images`."""
+    named = (path for path in ply.parent.glob("[!.]*") if path.suffix.lower() in IMAGE_SUFFIXES)
+    return sorted((path for path in named if path.is_file()), key=lambda path: natural_key(path.name))
 
 
 def find_large_photos(

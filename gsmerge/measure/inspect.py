@@ -16,7 +16,6 @@ from gsmerge.io import (
     align_scene,
     find_scene_files,
     ply_notes,
-    read_cameras,
     read_ply_with_hints,
 )
 from gsmerge.io.alignment import check_cameras
@@ -24,6 +23,7 @@ from gsmerge.io.exporters import exporter_names, make_hints
 from gsmerge.io.formats.ply import OpacityChoice
 from gsmerge.io.formats.ply_file import LOGIT_COMMENT
 from gsmerge.io.formats.writing import file_bytes
+from gsmerge.io.scene_files import read_scene_cameras
 from gsmerge.measure.visibility import MAX_SAMPLES, inside_views
 from gsmerge.options import CompactOptions
 from gsmerge.plan import resolved_settings, steps_for
@@ -129,7 +129,7 @@ def _describe_views(ply: PlyScene, files: SceneFiles, hints: ReadHints) -> dict[
     camera_file = None
     try:
         if files.cameras is not None:
-            camera_file = read_cameras(files.cameras, scene=files.ply.stem)
+            camera_file = read_scene_cameras(ply, files)
             facts |= {"num_views": len(camera_file), "camera_format": camera_file.source}
         load = align_scene(ply, files, camera_file, hints=hints)
     except SceneError as error:

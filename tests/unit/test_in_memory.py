@@ -183,6 +183,15 @@ def test_rotations_may_be_left_unchecked(scene: Scene) -> None:
     ]  # fmt: skip
 
 
+def test_w_first_with_a_last_column_that_is_never_negative_gets_no_note(scene: Scene) -> None:
+    """As Depth Anything 3 has it; without pixels it takes the caller's word."""
+    signed = changed(scene, "quats", lambda q: q * np.where(q[:, 3:] < 0, -1, 1))
+    assert signed["quats"][:, 0].min() < 0
+    given = [(True, {}), (False, {}), (False, {"order": "none"}), (True, {"order": "none"})]
+    notes = [compact_tensors(**signed, check_rotations=check, **more, **FAST).report.notes for check, more in given]
+    assert [any("if w comes last" in note for note in some) for some in notes] == [False, False, False, True]
+
+
 def test_centres_at_corners_get_a_note(scene: Scene) -> None:
     shifted = changed(scene, "Ks", lambda K: K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]))
     notes = compact_tensors(**shifted, **FAST).report.notes

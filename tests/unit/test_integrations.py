@@ -12,7 +12,7 @@ import torch
 from scenes import arc, make_scene, move, room
 
 from gsmerge import Gaussians, Scene, SceneError, compact_tensors, integrations
-from gsmerge.geometry import covariances
+from gsmerge.geometry import covariances, multiply_quats, rotmat_to_quat
 from gsmerge.types import as_array
 
 FAST: dict[str, Any] = {"effort": "draft", "superpixels": "10%", "fit": "none"}
@@ -83,6 +83,21 @@ def test_depth_anything_3(scene: Scene) -> None:
     assert_holds(given, scene)
     assert (given["shN"].shape[1], given["check_rotations"]) == (0, False)
     assert integrations.depth_anything_3(prediction_of(scene), sh_degree=1)["shN"].shape == (len(scene.gaussians), 3, 3)
+
+
+def test_rotations_of_depth_anything_3_get_no_note(scene: Scene) -> None:
+    """It takes a camera's rotations wxyz for xyzw, turns them so into the world, and makes the last entry positive."""
+    camera_quats = rotmat_to_quat(scene.cameras.viewmats[:, :3, :3].swapaxes(1, 2)).repeat(scene.pixels_per_view, 0)
+    wxyz = multiply_quats(camera_quats * (1, -1, -1, -1), scene.gaussians.quats.astype(np.float64))
+    turned = multiply_quats(camera_quats, wxyz[:, [3, 0, 1, 2]])[:, [1, 2, 3, 0]]
+    turned *= np.where(turned[:, 3:] < 0, -1, 1)
+    gaussians = family(scene)
+    gaussians.rotations = batch(turned)
+    notes = compact_tensors(
+        **integrations.depth_anything_3(prediction_of(scene, gaussians=gaussians)), **FAST
+    ).report.notes
+    assert turned[:, 0].min() < 0
+    assert not [note for note in notes if "w comes last" in note]
 
 
 def test_depth_anything_3_in_metres_and_after_writing_colmap(scene: Scene) -> None:

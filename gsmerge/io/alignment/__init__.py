@@ -1,8 +1,8 @@
 """Find the pixel that each row of a file belongs to; :func:`align` is the door, and the modules here are private.
 
 ``layouts`` lists possible orders, ``ordered_rows`` and ``incomplete`` search files that lack pixels, ``score``
-measures, ``recovery`` decides or explains, ``cameras`` reads, moves or estimates poses, ``rotations`` reads
-quaternions.
+measures, ``recovery`` decides or explains, ``cameras`` reads, moves or estimates poses, ``focal`` estimates
+focal lengths, ``rotations`` reads quaternions.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from gsmerge.io.alignment.cameras import choose_poses as choose_poses
 from gsmerge.io.alignment.cameras import estimate_cameras as estimate_cameras
 from gsmerge.io.alignment.cameras import move_cameras as move_cameras
 from gsmerge.io.alignment.cameras import other_conventions as other_conventions
+from gsmerge.io.alignment.focal import estimate_focal as estimate_focal
 from gsmerge.io.alignment.layouts import MAY_BE_UNALIGNED as MAY_BE_UNALIGNED
 from gsmerge.io.alignment.layouts import ORDERS as ORDERS
 from gsmerge.io.alignment.layouts import GridFit, other_grids, photo_grid, small_photos_error, subsample

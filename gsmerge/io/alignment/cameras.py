@@ -290,7 +290,7 @@ def move_cameras(
     return MovedCameras(moved, before.worst_px, list_moves(names, cameras.viewmats, viewmats, depth))
 
 
-def _fit_line(x: np.ndarray, y: np.ndarray, weights: np.ndarray) -> tuple[float, float]:
+def fit_line(x: np.ndarray, y: np.ndarray, weights: np.ndarray) -> tuple[float, float]:
     """Fit a line to points by weighted least squares; return its slope, and its height at 0."""
     total = weights.sum()
     left, right = (weights * x).sum() / total, (weights * y).sum() / total
@@ -310,7 +310,7 @@ def _check_intrinsics(pairs: Correspondences, cameras: Cameras, before_px: float
         before, wanted = places[good, 0, axis], pairs.pixels[good, axis]
         weights = np.ones(len(before))
         for _ in range(_LINE_ROUNDS):
-            factors[axis], shifts[axis] = _fit_line(before, wanted, weights**2)
+            factors[axis], shifts[axis] = fit_line(before, wanted, weights**2)
             error = np.abs(factors[axis] * before + shifts[axis] - wanted)
             weights = 1 / np.sqrt(1 + (error / (3 * np.median(error) + 1e-9)) ** 2)
     Ks = cameras.Ks * np.array([*factors, 1])[:, None]

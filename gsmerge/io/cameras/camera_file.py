@@ -71,6 +71,8 @@ class CameraFile:
     images: np.ndarray | None = None  # ``[c,h,w,3]`` uint8 sRGB where the file holds the images themselves
     order: str = "auto"  # order of the Gaussians' rows where the file names it, otherwise "auto"
     lenses: tuple[Lens | None, ...] = ()  # of each camera where one of them is no pinhole; empty where all are
+    # how a focal length was estimated that the file lacks, one sentence; "" where it has one, None where that is to do
+    focal: str | None = ""
 
     def __len__(self) -> int:
         return len(self.names)
@@ -81,7 +83,8 @@ class View(NamedTuple):
 
     name: str  # of its image
     pose: np.ndarray  # 3x4 or 4x4, in the file's convention
-    K: np.ndarray  # ``[3,3]`` intrinsics, pixels, or divided by the image's size in all views of the file
+    # ``[3,3]`` intrinsics, pixels, or divided by the image's size in all views of the file; None in all without any
+    K: np.ndarray | None
     size: tuple[int, int] = (0, 0)  # (width, height), pixels; 0 where unknown
     lens: Lens | None = None  # None for a pinhole
 
@@ -107,6 +110,10 @@ def make_camera_file(
         raise SceneError(path, "expected at least one camera, found none")
     if len(views) > MAX_VIEWS:
         raise SceneError(path, f"expected at most {MAX_VIEWS} cameras, found {len(views)}")
+    missing = all(view.K is None for view in views)
+    if missing:  # a place holder, until the focal length is estimated
+        sides = [float(max(view.size)) or 1.0 for view in views]
+        views = [view._replace(K=make_pinhole(f, f, 0, 0)) for view, f in zip(views, sides, strict=True)]
     poses, Ks = np.tile(np.eye(4), (len(views), 1, 1)), np.array([view.K for view in views], np.float64)
     for i, view in enumerate(views):
         pose = np.asarray(view.pose, np.float64)
@@ -138,7 +145,14 @@ def make_camera_file(
         convention=convention,
         images=images,
         lenses=lenses if any(lenses) else (),
+        focal=None if missing else "",
     )
+
+
+def missing_intrinsics(path: StrPath, reason: str = "") -> SceneError:
+    """Make the SceneError of cameras without a focal length; ``reason`` says why none was estimated."""
+    problem = f"expected intrinsics of the cameras (fx, fy, cx, cy), found none{reason}"
+    return SceneError(path, problem, "add them in pixels, for all views or for each")
 
 
 def _in_pixels(Ks: np.ndarray, sizes: list[tuple[int, int]]) -> tuple[np.ndarray, list[tuple[int, int]]]:
@@ -230,6 +244,8 @@ def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> 
     cameras have none, or several; or a lens is no pinhole.
     """
     path = camera_file.path
+    if camera_file.focal is None:
+        raise missing_intrinsics(path)
     for name, lens in zip(camera_file.names, camera_file.lenses, strict=False):
         if lens is not None:
             problem = f"view {name}: expected a pinhole camera, found {lens.name} with lens distortion"

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import mmap
+import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -29,6 +30,9 @@ _PERSPECTIVE = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"
 
 MAX_NAME = 1 << 16  # bytes of an image's name
 
+_WHOLE = re.compile(r"[+-]?[0-9]{1,18}([.]0*)?")
+_NOT_UNIT = 0.05  # difference of its length from 1 by which four numbers are no rotation
+
 _Image = tuple[str, int, np.ndarray]  # name, camera id, pose [3,4]
 
 
@@ -50,7 +54,7 @@ def read_colmap(folder: Path) -> CameraFile:
                 images = _binary_images(data)
         else:
             cameras = _text_cameras(camera_path, read_text(camera_path))
-            images = _text_images(read_text(image_path, MAX_MODEL_BYTES))
+            images = _text_images(read_text(image_path, MAX_MODEL_BYTES), cameras)
         unknown = next((name for name, camera, _ in images if camera not in cameras), None)
         if unknown is not None:
             raise SceneError(image_path, f"view {unknown}: its camera is not in cameras{suffix}")
@@ -139,16 +143,31 @@ def _text_cameras(path: Path, text: str) -> dict[int, View]:
     return cameras
 
 
-def _text_images(text: str) -> list[_Image]:
-    """Parse two lines per image: pose and name (maybe with spaces), then its points, if any."""
-    lines = iter(text.splitlines())
-    images = []
-    for line in lines:
-        if not _says_something(line):
+def _text_images(text: str, cameras: Mapping[int, View]) -> list[_Image]:
+    """Parse the lines of the images: pose and name (maybe with spaces); each is followed by its points, or is not.
+
+    Programs that rewrite ``images.txt`` leave out the lines of points, or only the empty ones.
+    """
+    images: list[_Image] = []
+    after_image = False
+    for line in filter(_says_something, text.splitlines()):
+        if after_image and _lists_points(line, cameras):
+            after_image = False
             continue
         _, *numbers, camera, name = line.split(maxsplit=9)
         if len(numbers) != 7:
             raise ValueError("expected a rotation and a position")
         images.append((name.strip(), int(camera), _pose([float(x) for x in numbers])))
-        next(lines, None)
+        after_image = True
     return images
+
+
+def _lists_points(line: str, cameras: Mapping[int, View]) -> bool:
+    """Return whether a line after an image's lists its points, x y id each, and is no other image's."""
+    start = line.split(maxsplit=9)
+    if len(start) < 3 or not all(_WHOLE.fullmatch(number) for number in start[2:9:3]):
+        return False
+    if len(start) < 10 or not _WHOLE.fullmatch(start[0]) or int(float(start[8])) not in cameras:
+        return True
+    quat = np.array(start[1:5], np.float64)
+    return bool(abs(np.sqrt((quat * quat).sum()) - 1) > _NOT_UNIT)

@@ -12,11 +12,13 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import SceneError
+from gsmerge.geometry import normalize
 from gsmerge.io.alignment import Similarity
 from gsmerge.io.bounds import read_json, read_text
 from gsmerge.io.cameras.camera_file import (
     C2W_OPENCV,
     C2W_OPENGL,
+    MAX_NORMALISED_FOCAL,
     MAX_NUMBER,
     W2C_OPENCV,
     CameraFile,
@@ -35,21 +37,27 @@ from gsmerge.types import Cameras
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # the order of "distortion_params"
 _DISTORTED = {"OPENCV", "RADIAL", "SIMPLE_RADIAL"}
 _PERSPECTIVE = {"PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", *_DISTORTED}
+_FOCAL_KEYS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
 _MAX_NAME = 255  # bytes of a file's name
 _INRIA_KEYS = ("position", "rotation", "fx", "fy", "width", "height")
 # Next to the dataset file of Long-LRM: which frames it took, and how it moved the world.
 FRAMES_FILE, POSE_FILE, SCALE_FILE = "input_frame_idx.txt", "pos_avg_inv.txt", "scene_scale.txt"
+VIEWER_CAMERAS = ".cameras.json"  # ending of the cameras for viewers beside a result
 DATAPARSER = "dataparser_transforms.json"
+_CENTRED = 1e-3  # pixels by which twice a principal point in the middle may differ from the image's size
 _ROTATION_TOLERANCE = 0.02  # of a rotation's columns, as for poses
 
 
-def read_json_cameras(path: Path) -> CameraFile:
-    """Read the cameras of any known JSON file; SceneError if it is none of them, or damaged."""
+def read_json_cameras(path: Path, folder: Path | None = None) -> CameraFile:
+    """Read the cameras of any known JSON file; SceneError if it is none of them, or damaged.
+
+    ``folder`` is that of the Gaussians, for :func:`read_long_lrm`.
+    """
     data = read_json(path)
     if isinstance(data, dict) and "frames" in data:
         frames = data["frames"]
         if isinstance(frames, list) and frames and all(isinstance(f, dict) and "w2c" in f for f in frames):
-            return read_long_lrm(path, data)
+            return read_long_lrm(path, data, folder)
         return read_transforms(path, data)
     if isinstance(data, list) and data and all(isinstance(entry, dict) for entry in data):
         if "transform_matrix" in data[0]:
@@ -74,7 +82,7 @@ def read_transforms(path: Path, data: Mapping[str, Any] | list[Any]) -> CameraFi
     """Read the cameras of a parsed ``transforms.json``; SceneError if a pose or an intrinsic is missing.
 
     A dictionary with ``frames`` has camera-to-world poses with OpenGL axes; a bare list of frames (as one backbone
-    writes) has OpenCV axes. Intrinsics are global or per frame, in pixels or as field of view.
+    writes) has OpenCV axes. Intrinsics are global or per frame, in pixels or as field of view; no frame need have any.
     ``applied_transform`` is not applied: poses are in the Gaussians' world.
     """
     source, convention = ("frame list", C2W_OPENCV) if isinstance(data, list) else ("transforms.json", C2W_OPENGL)
@@ -82,6 +90,7 @@ def read_transforms(path: Path, data: Mapping[str, Any] | list[Any]) -> CameraFi
     if not isinstance(frames, list) or not all(isinstance(f, dict) for f in frames):
         raise SceneError(path, "expected 'frames' to be a list of objects, found something else")
     views = []
+    bare = not any(key in {**common, **frame} for frame in frames for key in _FOCAL_KEYS)
     for i, frame in enumerate(frames):
         name = str(frame.get("file_path") or frame.get("image_path") or frame.get("name") or f"view {i}")
         if "transform_matrix" not in frame:
@@ -90,13 +99,19 @@ def read_transforms(path: Path, data: Mapping[str, Any] | list[Any]) -> CameraFi
         with _number_errors(path, f"view {name}: expected numbers"):
             pose = np.array(frame["transform_matrix"], np.float64)
             lens = _lens(path, name, values)
-            views.append(View(name, pose, *_intrinsics(path, name, values), lens))
+            K, size = (None, _stored_size(values)) if bare else _intrinsics(path, name, values)
+            views.append(View(name, pose, K, size, lens))
     return make_camera_file(path, source, convention, views)
+
+
+def _stored_size(values: Mapping[str, Any]) -> tuple[int, int]:
+    """Return (width, height) of a frame; 0 where the file has none."""
+    return round(float(values.get("w") or 0)), round(float(values.get("h") or 0))
 
 
 def _intrinsics(path: Path, name: str, values: Mapping[str, Any]) -> tuple[np.ndarray, tuple[int, int]]:
     """Return intrinsics ``[3,3]`` and (width, height) of a frame, from its own values or those of all frames."""
-    if not any(key in values for key in ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")):
+    if not any(key in values for key in _FOCAL_KEYS):
         missing = ", ".join(key for key in ("fl_x", "w", "h") if key not in values)
         problem = f"expected intrinsics (fl_x, fl_y, cx, cy, w, h), found none of {missing} for view {name}"
         raise SceneError(path, problem, "add them in pixels, for all frames or for each")
@@ -166,16 +181,28 @@ def read_world_mirror(path: Path, data: Mapping[str, Any]) -> CameraFile:
     """Read the cameras of a parsed ``camera_params.json``.
 
     ``extrinsics`` and ``intrinsics`` are lists of ``{camera_id, matrix}``; poses are camera-to-world with OpenCV
-    axes, intrinsics in pixels of the processed size, which only the images have. ``camera_id`` is the stem of the
-    image's name, or its number, by which the cameras are then sorted. SceneError if the lists differ in cameras, or
-    a matrix is damaged.
+    axes, intrinsics in pixels of the processed size, which is twice the principal point. ``camera_id`` is the stem of
+    the image's name, or its number, by which the cameras are then sorted. SceneError if the lists differ in cameras,
+    or a matrix is damaged.
     """
     poses, Ks = (_matrices(path, data, key, side) for key, side in (("extrinsics", 4), ("intrinsics", 3)))
     if poses.keys() != Ks.keys():
         odd = sorted(poses.keys() ^ Ks.keys())[0]
         raise SceneError(path, f"expected extrinsics and intrinsics of the same cameras, found only one for {odd}")
     names = sorted(poses, key=int) if all(name.isdecimal() for name in poses) else list(poses)
-    return make_camera_file(path, "camera_params.json", C2W_OPENCV, [View(n, poses[n], Ks[n]) for n in names])
+    size = _centred_size([Ks[name] for name in names])
+    views = [View(name, poses[name], Ks[name], size) for name in names]
+    return make_camera_file(path, "camera_params.json", C2W_OPENCV, views)
+
+
+def _centred_size(Ks: Sequence[np.ndarray]) -> tuple[int, int]:
+    """Return the (width, height) in whose middle all principal points are; (0, 0) without one."""
+    sides = 2 * np.array([K[:2, 2] for K in Ks]).reshape(-1, 2)
+    whole = np.abs(sides[:1]).clip(0, MAX_NUMBER).round()
+    centred = len(sides) > 0 and bool((np.abs(sides - whole) <= _CENTRED).all())
+    if not centred or not (whole > MAX_NORMALISED_FOCAL).all():
+        return 0, 0
+    return int(whole[0, 0]), int(whole[0, 1])
 
 
 def _matrices(path: Path, data: Mapping[str, Any], key: str, side: int) -> dict[str, np.ndarray]:
@@ -192,12 +219,13 @@ def _matrices(path: Path, data: Mapping[str, Any], key: str, side: int) -> dict[
     return matrices
 
 
-def read_long_lrm(path: Path, data: Mapping[str, Any]) -> CameraFile:
+def read_long_lrm(path: Path, data: Mapping[str, Any], folder: Path | None = None) -> CameraFile:
     """Read the cameras of a parsed dataset file: ``frames`` of ``fx fy cx cy w h`` and ``w2c``.
 
-    Next to it Long-LRM writes which frames it took (``input_frame_idx.txt``) and how the Gaussians' world lies in
-    the cameras': X = scene_scale (pos_avg_inv X_cameras). The cameras are moved into the Gaussians' world.
-    SceneError if an entry is missing or no number, or a frame does not exist.
+    Next to its Gaussians (in ``folder``, or copied next to the dataset file) Long-LRM writes which frames it took
+    (``input_frame_idx.txt``) and how the Gaussians' world lies in the cameras': X = scene_scale (pos_avg_inv
+    X_cameras); some versions write the frames alone, from which the rest follows. The cameras are moved into the
+    Gaussians' world. SceneError if an entry is missing or no number, or a frame does not exist.
     """
     frames = []
     for i, frame in enumerate(data["frames"]):
@@ -206,25 +234,45 @@ def read_long_lrm(path: Path, data: Mapping[str, Any]) -> CameraFile:
             pose = np.array(frame["w2c"], np.float64).reshape(4, 4)
             K = make_pinhole(*(float(frame[key]) for key in ("fx", "fy", "cx", "cy")))
             frames.append(View(name, pose, K, (round(float(frame["w"])), round(float(frame["h"])))))
-    frame_ids = _numbers(path.with_name(FRAMES_FILE))
+    beside = path.parent
+    if folder is not None and not (beside / FRAMES_FILE).is_file() and (folder / FRAMES_FILE).is_file():
+        beside = folder
+    frames_path, pose_path, scale_path = beside / FRAMES_FILE, beside / POSE_FILE, beside / SCALE_FILE
+    frame_ids = _numbers(frames_path)
     ids = range(len(frames)) if frame_ids is None else [round(value) for value in frame_ids]
     odd = next((i for i in ids if not 0 <= i < len(frames)), None)
     if odd is not None:
-        raise SceneError(path.with_name(FRAMES_FILE), f"expected frames 0 to {len(frames) - 1}, found {odd:.6g}")
+        raise SceneError(frames_path, f"expected frames 0 to {len(frames) - 1}, found {odd:.6g}")
     poses = np.array([frames[i].pose for i in ids]).reshape(-1, 4, 4)
-    move, scale = _numbers(path.with_name(POSE_FILE)), _numbers(path.with_name(SCALE_FILE))
+    move, scale = _numbers(pose_path), _numbers(scale_path)
+    if frame_ids is not None and len(poses) and move is None and scale is None:
+        with _number_errors(path, "expected poses that can be inverted"), np.errstate(all="ignore"):
+            move, scale = _average_frame(invert(poses))
     if scale is not None and (scale.size != 1 or not scale[0] > 0):
-        raise SceneError(path.with_name(SCALE_FILE), "expected one positive number")
+        raise SceneError(scale_path, "expected one positive number")
     if move is not None and move.size != 16:
-        raise SceneError(path.with_name(POSE_FILE), f"expected 16 numbers, found {move.size}")
+        raise SceneError(pose_path, f"expected 16 numbers, found {move.size}")
     try:
         with np.errstate(all="ignore"):  # what overflows is refused with the cameras
             poses = poses if move is None else matmul(poses, invert(move.reshape(4, 4)))  # of X' = s (A X): R inv(A)
             poses[:, :3, 3] *= 1.0 if scale is None else scale[0]
     except np.linalg.LinAlgError as error:
-        raise SceneError(path.with_name(POSE_FILE), "expected a matrix that can be inverted") from error
+        raise SceneError(pose_path, "expected a matrix that can be inverted") from error
     views = [frames[i]._replace(pose=pose) for i, pose in zip(ids, poses, strict=True)]
     return make_camera_file(path, "Long-LRM", W2C_OPENCV, views)
+
+
+def _average_frame(c2w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the map ``[16]`` into the mean pose of cameras, and the scale ``[1]`` that brings them within +-1."""
+    mean = np.eye(4)
+    forward, down = c2w[:, :3, 2].mean(0), c2w[:, :3, 1].mean(0)
+    mean[:3, 2] = normalize(forward)
+    mean[:3, 1] = normalize(down - (down * mean[:3, 2]).sum() * mean[:3, 2])
+    mean[:3, 0] = np.cross(mean[:3, 1], mean[:3, 2])
+    mean[:3, 3] = c2w[:, :3, 3].mean(0)
+    move = invert(mean)
+    farthest = float(np.abs(matmul(move, c2w)[:, :3, 3]).max())
+    return move.reshape(-1), np.array([1 / farthest if farthest > 0 else 1.0])
 
 
 def _numbers(path: Path) -> np.ndarray | None:
@@ -242,8 +290,8 @@ def viewer_cameras_path(output: Path) -> Path:
     """Return the path of the cameras for viewers: ``out.ply`` -> ``out.cameras.json``."""
     name = output.name
     stem = name[: -len(".compressed.ply")] if name.lower().endswith(".compressed.ply") else output.stem
-    ending = ".cameras.json"
-    return output.with_name(os.fsencode(stem)[: _MAX_NAME - len(ending)].decode("utf-8", "ignore") + ending)
+    stem = os.fsencode(stem)[: _MAX_NAME - len(VIEWER_CAMERAS)].decode("utf-8", "ignore")
+    return output.with_name(stem + VIEWER_CAMERAS)
 
 
 def write_transforms(path: Path, cameras: Cameras, names: Sequence[str]) -> None:

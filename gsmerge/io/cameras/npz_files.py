@@ -22,7 +22,7 @@ from gsmerge.io.alignment import ORDERS
 from gsmerge.io.bounds import check_file, check_pixels
 from gsmerge.io.cameras.camera_file import C2W_OPENCV, W2C_OPENCV, CameraFile, View, make_camera_file
 
-_EXTRINSICS, _INTRINSICS = ("extrinsics", "exts"), ("intrinsics", "ixts")
+_EXTRINSICS, _INTRINSICS = ("extrinsics", "exts", "extrinsic"), ("intrinsics", "ixts", "intrinsic")
 _IMAGES, _DEPTHS = ("image", "images"), ("depth", "depths")
 _MAX_INTRINSIC, _SMALL = 1e12, 1e-9
 _FREE_BYTES = 64 << 20  # an array of that size is read however well it is compressed
@@ -34,32 +34,41 @@ def read_da3(path: Path) -> CameraFile:
     """Read the cameras (and images, if stored) of an npz: world-to-camera 3x4 or 4x4, intrinsics in pixels.
 
     Intrinsics of another image size than the depth maps' (a COLMAP export in the same call writes those), or
-    normalised ones, are scaled to it. SceneError if the file cannot be read or lacks an array.
+    normalised ones, are scaled to it. What VGGT (``extrinsic``, world to camera) and AnySplat (the same, camera to
+    world, normalised, in a batch of one) return is read as well. SceneError if the file cannot be read or lacks an
+    array.
     """
     sizes = () if holds_images(path) else _DEPTHS  # of depths only the shape counts, the confidence is never read
     arrays = read_arrays(path, {*_EXTRINSICS, *_INTRINSICS, *_IMAGES, *sizes})
     poses, Ks, images, depths = (_first(arrays, names) for names in (_EXTRINSICS, _INTRINSICS, _IMAGES, _DEPTHS))
-    if poses is None or Ks is None:
+    if poses is None:
         raise _missing(path, [n for n, a in (("extrinsics", poses), ("intrinsics", Ks)) if a is None], arrays)
+    poses = poses[0] if poses.ndim == 4 and len(poses) == 1 else poses
+    Ks = Ks[0] if Ks is not None and Ks.ndim == 4 and len(Ks) == 1 else Ks
     _check_poses(path, poses, Ks, ("extrinsics [c,3,4]", "intrinsics [c,3,3]"))
     images = None if images is None else _as_images(path, images, len(poses))
     grid = images if images is not None else depths
-    Ks = Ks.astype(np.float64)
+    Ks = None if Ks is None else Ks.astype(np.float64)
+    width = height = 0
     if grid is not None and grid.ndim >= 3 and min(grid.shape[1:3]) > 0:
         height, width = grid.shape[1:3]
-        Ks = _at_size(Ks, width, height)
-    else:
+        Ks = None if Ks is None else _at_size(Ks, width, height)
+    elif Ks is not None:
         width, height = round(2 * Ks[0, 0, 2]), round(2 * Ks[0, 1, 2])
-    return make_camera_file(path, "DA3 npz", W2C_OPENCV, _views(poses, Ks, (width, height)), images)
+    if _EXTRINSICS[0] in arrays or _EXTRINSICS[1] in arrays:
+        return make_camera_file(path, "DA3 npz", W2C_OPENCV, _views(poses, Ks, (width, height)), images)
+    normalised = width <= 1 and Ks is not None
+    size, convention = ((0, 0), C2W_OPENCV) if normalised else ((width, height), W2C_OPENCV)
+    return make_camera_file(path, "npz of poses", convention, _views(poses, Ks, size), images)
 
 
 def read_dump(path: Path) -> CameraFile:
-    """Read the cameras and images of a ``views.npz``; SceneError if an array is missing or of another shape."""
+    """Read the cameras and images of a ``views.npz``, which may lack ``K``; SceneError if another array is missing."""
     arrays = read_arrays(path, ("c2w", "K", "images", "order"))
-    missing = [name for name in ("c2w", "K", "images") if name not in arrays]
+    missing = [name for name in ("c2w", "images") if name not in arrays]
     if missing:
         raise _missing(path, missing, arrays)
-    poses, Ks = arrays["c2w"], arrays["K"]
+    poses, Ks = arrays["c2w"], arrays.get("K")
     _check_poses(path, poses, Ks, ("c2w [v,4,4]", "K [v,3,3]"))
     images = _as_images(path, arrays["images"], len(poses))
     order = str(arrays.get("order", "auto"))
@@ -72,6 +81,12 @@ def read_dump(path: Path) -> CameraFile:
 def holds_images(path: Path) -> bool:
     """Return whether an npz has the images themselves; False if it cannot be read."""
     return not array_names(path).isdisjoint(_IMAGES)
+
+
+def holds_poses(path: Path) -> bool:
+    """Return whether an npz has poses and intrinsics; False if it cannot be read."""
+    names = array_names(path)
+    return {"c2w", "K"} <= names or not (names.isdisjoint(_EXTRINSICS) or names.isdisjoint(_INTRINSICS))
 
 
 def read_depths(path: Path) -> np.ndarray | None:
@@ -92,12 +107,13 @@ def _missing(path: Path, missing: list[str], arrays: dict[str, np.ndarray]) -> S
     return SceneError(path, f"missing array{'s' * (len(missing) > 1)} {', '.join(missing)}, found {list(arrays)}")
 
 
-def _views(poses: np.ndarray, Ks: np.ndarray, size: tuple[int, int]) -> list[View]:
-    return [View(f"view {i}", pose, K, size) for i, (pose, K) in enumerate(zip(poses, Ks, strict=True))]
+def _views(poses: np.ndarray, Ks: np.ndarray | None, size: tuple[int, int]) -> list[View]:
+    return [View(f"view {i}", pose, None if Ks is None else Ks[i], size) for i, pose in enumerate(poses)]
 
 
-def _check_poses(path: Path, poses: np.ndarray, Ks: np.ndarray, names: tuple[str, str]) -> None:
+def _check_poses(path: Path, poses: np.ndarray, Ks: np.ndarray | None, names: tuple[str, str]) -> None:
     """Refuse arrays other than c poses and ``[c,3,3]`` intrinsics of finite numbers; ``names`` are for messages."""
+    Ks = np.zeros((*poses.shape[:1], 3, 3)) if Ks is None else Ks
     for name, array in zip(names, (poses, Ks), strict=True):
         if array.dtype.kind not in "fiu":
             raise SceneError(path, f"expected numbers in {name}, found {array.dtype}")

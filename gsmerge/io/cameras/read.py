@@ -13,8 +13,8 @@ from gsmerge.errors import SceneError
 from gsmerge.io.bounds import MAX_VIEWS, check_file, read_text
 from gsmerge.io.cameras.camera_file import C2W_OPENCV, W2C_OPENCV, CameraFile, View, make_camera_file, make_pinhole
 from gsmerge.io.cameras.colmap import is_colmap, read_colmap
-from gsmerge.io.cameras.json_files import read_json_cameras
-from gsmerge.io.cameras.npz_files import array_names, read_da3, read_dump
+from gsmerge.io.cameras.json_files import VIEWER_CAMERAS, read_json_cameras
+from gsmerge.io.cameras.npz_files import array_names, holds_poses, read_da3, read_dump
 from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
 from gsmerge.io.cameras.re10k import read_re10k
 from gsmerge.io.formats.ply import READERS
@@ -30,6 +30,7 @@ CAMERA_PLACES = (
 )  # fmt: skip
 INTRINSICS = ("intrinsic.txt", "intrinsics.txt")
 _POSE_COLUMNS = (12, 16)  # numbers of a pose in a line
+_MAX_OTHERS = 16  # files in a folder that are looked into for cameras
 SHARP = "SHARP"
 _SHARP_ELEMENTS = ("extrinsic", "intrinsic", "image_size")
 SHARP_LAYERS = 2  # Gaussians per cell: a front and a back layer
@@ -45,7 +46,24 @@ def find_cameras(folder: Path) -> Path | None:
     return chunks[0] if len(chunks) == 1 else None
 
 
-def read_cameras(path: StrPath, *, scene: str | None = None) -> CameraFile:
+def find_other_cameras(folder: Path) -> Path | None:
+    """Find the only ``.json`` or ``.npz`` in a folder that holds cameras, whatever its name; None without one."""
+    files = sorted(path for path in folder.glob("[!.]*") if path.suffix in (".json", ".npz"))
+    files = [path for path in files if path.is_file() and not path.name.endswith(VIEWER_CAMERAS)]
+    found = [path for path in files[:_MAX_OTHERS] if _holds_cameras(path)]
+    return found[0] if len(found) == 1 else None
+
+
+def _holds_cameras(path: Path) -> bool:
+    if path.suffix == ".npz":
+        return holds_poses(path)
+    try:
+        return len(read_json_cameras(path)) > 0
+    except SceneError:
+        return False
+
+
+def read_cameras(path: StrPath, *, scene: str | None = None, folder: Path | None = None) -> CameraFile:
     """Read cameras from a file, or from a folder that holds one of the known kinds.
 
     ``transforms.json`` (nerfstudio, instant-ngp), COLMAP text and binary models, INRIA's ``cameras.json``,
@@ -56,6 +74,7 @@ def read_cameras(path: StrPath, *, scene: str | None = None) -> CameraFile:
     Args:
         path: The file, a COLMAP folder, or a folder that has the cameras in one of the usual places.
         scene: Which scene, where a file holds several (``.torch`` chunks); usually the name of the ``.ply``.
+        folder: Of the Gaussians, where Long-LRM writes how it moved the cameras; None: that of the cameras.
 
     Raises:
         SceneError: If there are no cameras, a file is damaged or incomplete, or a lens of an unknown kind.
@@ -64,7 +83,7 @@ def read_cameras(path: StrPath, *, scene: str | None = None) -> CameraFile:
     if not os.path.exists(path):
         raise SceneError(path, "no such file or folder")
     if path.is_dir():
-        inside = path if is_colmap(path) else find_cameras(path)
+        inside = path if is_colmap(path) else find_cameras(path) or find_other_cameras(path)
         if inside is None:
             raise SceneError(path, "expected transforms.json, cameras.json, a COLMAP model or results.npz, found none")
         path = inside
@@ -85,7 +104,7 @@ def read_cameras(path: StrPath, *, scene: str | None = None) -> CameraFile:
     if path.suffix == CHUNK:
         return read_re10k(path, scene)
     if path.suffix == ".json":
-        return read_json_cameras(path)
+        return read_json_cameras(path, folder)
     raise SceneError(path, "expected cameras as .json, .npz, .torch or a COLMAP folder, found another kind of file")
 
 
@@ -93,14 +112,14 @@ def read_trajectory(path: Path) -> CameraFile:
     """Read the cameras of a text file with one pose per line, as KITTI and DA3 write it.
 
     A line has 12 or 16 numbers: camera-to-world, OpenCV axes, row by row. Next to the file is ``intrinsic.txt`` (or
-    ``intrinsics.txt``) with fx, fy, cx, cy in pixels, one line for all views or one for each; the images have the
-    size. SceneError if a line has another number of numbers, or there are no intrinsics.
+    ``intrinsics.txt``) with fx, fy, cx, cy in pixels, one line for all views or one for each, or nothing; the images
+    have the size. SceneError if a line has another number of numbers.
     """
     poses = _rows(path, _POSE_COLUMNS)
     intrinsics = next((path.with_name(name) for name in INTRINSICS if path.with_name(name).is_file()), None)
     if intrinsics is None:
-        problem = f"expected the intrinsics next to it in {INTRINSICS[0]}, found none"
-        raise SceneError(path, problem, "write fx fy cx cy")
+        views = [View(f"{i:06d}", pose.reshape(-1, 4), None) for i, pose in enumerate(poses)]
+        return make_camera_file(path, "pose list", C2W_OPENCV, views)
     values = _rows(intrinsics, (4,))
     if len(values) not in (1, len(poses)):
         raise SceneError(intrinsics, f"expected one line, or one for each of {len(poses)} views, found {len(values)}")

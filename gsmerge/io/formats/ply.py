@@ -15,7 +15,7 @@ from gsmerge.geometry import rgb_to_sh0
 from gsmerge.io.formats import ply_file, sog, splat, spz
 from gsmerge.io.formats.arrays import StoredRows
 from gsmerge.io.formats.compressed import is_compressed, unpack
-from gsmerge.kernels.elementary import exp
+from gsmerge.kernels.elementary import exp, log
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Gaussians, StrPath
 
@@ -28,6 +28,13 @@ READERS: dict[str, Callable[[Path], StoredRows]] = {
     ".sog": sog.read_rows,
 }
 SCENE_SUFFIXES = (".ply", *READERS)
+
+_MIN_JUDGED = 100  # Gaussians whose scales say something
+_SCALE_SAMPLES = 20_000  # of them that are looked at
+_MAX_WIDTH = 0.25  # share of the scene's width from which on standard deviations are wrong
+# The same in units of the width over the root of the number of Gaussians: sound files have 0.3 to
+# 2, linear scales that are taken for logarithms 10 to 1,000.
+_MAX_SPACINGS = 6.0
 
 
 @dataclass(frozen=True)
@@ -55,6 +62,8 @@ class PlyInfo:
     num_nonfinite: int  # rows with NaN or inf, set aside
     num_clipped_scales: int  # Gaussians with a log scale beyond +-30 or a harmonic beyond +-1e6, clipped
     num_zero_quats: int  # Gaussians without a rotation, read as the identity
+    # why the scales are likely wrong, one sentence without a full stop; empty where they are not
+    odd_scales: str = ""
 
 
 @dataclass(frozen=True)
@@ -85,7 +94,8 @@ def ply_notes(info: PlyInfo) -> tuple[str, ...]:
     }
     raw = ("all opacities lie in [0, 1]: taken as activated, not as logits; opacity 'logit' says otherwise",)
     notes = raw if info.opacity_encoding == "raw" and info.opacity_guessed else ()
-    return (*notes, *(f"{count:,} {what}" for what, count in counted.items() if count))
+    odd = (info.odd_scales,) if info.odd_scales else ()
+    return (*notes, *odd, *(f"{count:,} {what}" for what, count in counted.items() if count))
 
 
 def read_ply(path: StrPath, *, opacity: OpacityChoice = "auto") -> PlyScene:
@@ -175,6 +185,7 @@ def _to_scene(path: Path, stored: StoredRows, opacity: OpacityChoice) -> PlyScen
         num_nonfinite=num_bad,
         num_clipped_scales=num_clipped,
         num_zero_quats=num_zero_quats,
+        odd_scales=_describe_odd_scales(out["means"], out["scales"], out["valid"]),
     )
     return PlyScene(valid=out.pop("valid"), gaussians=Gaussians(**out), info=info)
 
@@ -306,6 +317,27 @@ def _activate(opacities: np.ndarray, valid: np.ndarray, known: str | None) -> st
         np.add(opacities, 1, out=opacities)
         np.reciprocal(opacities, out=opacities)
     return known
+
+
+def _describe_odd_scales(means: np.ndarray, scales: np.ndarray, valid: np.ndarray) -> str:
+    """Explain why ``scales [n,3]`` are likely wrong for ``means [n,3]``; "" where they are not."""
+    rows = np.flatnonzero(valid)
+    if len(rows) < _MIN_JUDGED:
+        return ""
+    some = rows[:: max(1, len(rows) // _SCALE_SAMPLES)]
+    low, high = np.quantile(means[some].astype(np.float64), (0.05, 0.95), axis=0)
+    width = float((high - low).max())
+    size = float(np.median(scales[some].max(1)))
+    text = f"half of the Gaussians have a standard deviation above {size:.3g}"
+    text += f" in a scene of a width of {width:.3g}"
+    most = _MAX_SPACINGS * width / float(np.sqrt(len(rows)))
+    linear = float(log(size))
+    if linear <= most < size and scales.min(where=valid[:, None], initial=np.inf) >= 1:
+        start = f"no stored scale is negative (median {linear:.3g}), as if linear"
+        return f"{start}: {text}; logarithms are expected"
+    if size > _MAX_WIDTH * width:
+        return f"{text}: the scales, which are logarithms, are too large"
+    return ""
 
 
 def clear_invalid(path: str | Path, out: dict[str, np.ndarray]) -> int:

@@ -195,6 +195,13 @@ def test_raw_opacities(tmp_path: Path, smooth: Tiny) -> None:
     assert np.allclose(logit, 1 / (1 + np.exp(-smooth.gaussians.opacities)), atol=1e-5)
 
 
+def test_logits_under_the_name_of_an_exporter_of_raw_opacities(tmp_path: Path, smooth: Tiny) -> None:
+    """Versions differ: a later AnySplat writes logits."""
+    path = save_export(tmp_path, smooth, export_rows(smooth))
+    read = read_scene(path, exporter="noposplat").gaussians.opacities
+    assert np.allclose(read, smooth.gaussians.opacities, atol=1e-5)
+
+
 def test_infinite_opacities_and_nan_scales(tmp_path: Path, smooth: Tiny) -> None:
     h, w = smooth.height, smooth.width
     rows = export_rows(smooth, np.arange(3 * h * w).reshape(3, h, w)[:, 8:-8, 8:-8].transpose(1, 2, 0).reshape(-1))

@@ -334,3 +334,29 @@ def test_cameras_of_world_mirror_by_number_or_stem(tmp_path: Path, ids: tuple) -
     assert np.array_equal((scene.images * 255).round(), named.images[order])
     assert np.allclose(scene.cameras.viewmats, named.w2c[order])
     assert (scene.cameras.width, scene.cameras.height) == (48, 36)
+
+
+@pytest.mark.parametrize("factor", [0, 1, 2, 3])
+def test_photos_of_another_size_than_world_mirror_s(tmp_path: Path, factor: int) -> None:
+    """Its intrinsics are of the processed size, its principal point in the middle of that; 0: no photos."""
+    named = replace(SMOOTH, names=tuple(f"image_{i:04d}.png" for i in range(3)))
+    centred = with_intrinsics(named, np.array([[52.8, 0, 24], [0, 54, 18], [0, 0, 1]]))
+    some = np.random.default_rng(0).permutation(ROWS.size)[:3000]
+    save_export(tmp_path, centred, export_rows(centred, some))
+    (tmp_path / "transforms.json").unlink()
+    for name in centred.names:
+        path = tmp_path / "images" / name
+        if factor == 0:
+            path.unlink()
+        else:
+            photo = cv2.imread(str(path))
+            assert cv2.imwrite(str(path), cv2.resize(photo, None, fx=factor, fy=factor))
+    document = {
+        "extrinsics": [{"camera_id": i, "matrix": m.tolist()} for i, m in enumerate(centred.c2w)],
+        "intrinsics": [{"camera_id": i, "matrix": centred.K.tolist()} for i in range(3)],
+    }
+    (tmp_path / "camera_params.json").write_text(json.dumps(document))
+    cameras = load_scene(tmp_path).scene.cameras
+    times = max(1, factor)
+    assert (cameras.width, cameras.height) == (48 * times, 36 * times)
+    assert np.allclose(cameras.Ks, centred.K * np.array([[times], [times], [1]]))

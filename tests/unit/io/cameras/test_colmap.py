@@ -63,6 +63,36 @@ def test_truncated_colmap_files_are_named(tmp_path: Path, tiny: Tiny, name: str)
             read_cameras(tmp_path)
 
 
+@pytest.mark.parametrize("kept", ["none", "all but empty ones", "the empty ones"])
+def test_colmap_text_without_the_lines_of_points(tmp_path: Path, tiny: Tiny, kept: str) -> None:
+    write_colmap_text(tmp_path, tiny)
+    lines = (tmp_path / "images.txt").read_text().splitlines()
+    if kept != "all but empty ones":
+        lines = [line for line in lines if not line.startswith("10.5")]
+    if kept != "the empty ones":
+        lines = [line for line in lines if line]
+    (tmp_path / "images.txt").write_text("\n".join(lines))
+    actual = read_cameras(tmp_path)
+    assert_same(actual, tiny)
+    assert actual.names == tiny.names
+
+
+def test_whole_numbers_of_points_are_no_image(tmp_path: Path, tiny: Tiny) -> None:
+    write_colmap_text(tmp_path, tiny)
+    lines = (tmp_path / "images.txt").read_text().replace("10.5 3.5 -1 4.0 4.0 12 ", "10 3 7 4 4 7 5 6 7 1 1 7 ")
+    (tmp_path / "images.txt").write_text(lines)
+    assert read_cameras(tmp_path).names == tiny.names
+
+
+def test_a_stripped_list_with_a_line_that_is_no_image_is_refused(tmp_path: Path, tiny: Tiny) -> None:
+    write_colmap_text(tmp_path, tiny)
+    lines = [line for line in (tmp_path / "images.txt").read_text().splitlines() if line and line[:4] != "10.5"]
+    for odd in (lines[2].rsplit(maxsplit=2)[0], lines[2].replace(" 7 ", " 8 ")):
+        (tmp_path / "images.txt").write_text("\n".join([*lines[:2], odd, *lines[3:]]))
+        with pytest.raises(SceneError, match=r"damaged cameras or images\.txt|its camera is not in"):
+            read_cameras(tmp_path)
+
+
 def test_damaged_colmap_text(tmp_path: Path, tiny: Tiny) -> None:
     write_colmap_text(tmp_path, tiny)
     (tmp_path / "images.txt").write_text("1 0.5 0.5 nonsense\n\n")

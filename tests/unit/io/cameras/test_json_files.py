@@ -80,10 +80,16 @@ def test_applied_transform_is_not_applied(tmp_path: Path, tiny: Tiny) -> None:
     assert_same(read_cameras(save_json(tmp_path / "transforms.json", data)), tiny)
 
 
-def test_a_bare_list_is_opencv_and_lacks_intrinsics(tmp_path: Path, tiny: Tiny) -> None:
+def test_a_bare_list_is_opencv_and_may_lack_intrinsics(tmp_path: Path, tiny: Tiny) -> None:
     frames = [{"file_path": n, "transform_matrix": m} for n, m in zip(tiny.names, tiny.c2w.tolist(), strict=True)]
-    with pytest.raises(SceneError, match=r"expected intrinsics .*found none of fl_x, w, h for view a b/2\.png; add"):
-        read_cameras(save_json(tmp_path / "transforms.json", frames))
+    bare = read_cameras(save_json(tmp_path / "transforms.json", frames))
+    assert np.allclose(bare.viewmats, tiny.w2c)
+    assert bare.focal is None
+    with pytest.raises(SceneError, match=r"transforms\.json: expected intrinsics .*found none; add them in pixels"):
+        to_cameras(bare, (20, 14))
+    one = [frames[0] | {"fl_x": 22}, *frames[1:]]
+    with pytest.raises(SceneError, match=r"view a b/2\.png: expected 'w' and 'h'|found none of fl_x, w, h for view"):
+        read_cameras(save_json(tmp_path / "transforms.json", one))
     common = {k: v for k, v in frames_of(tiny).items() if k != "frames"}
     actual = read_cameras(save_json(tmp_path / "transforms.json", [f | common for f in frames]))
     assert_same(actual, tiny)

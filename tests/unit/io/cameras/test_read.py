@@ -68,6 +68,23 @@ def test_they_are_recognised_in_a_folder(tmp_path: Path, write: Callable[[Path],
     assert read_cameras(tmp_path).path == str(path)
 
 
+@pytest.mark.parametrize(
+    ("cx", "cy", "size"), [(24, 18, (48, 36)), (24.3, 18, (0, 0)), (-24, 18, (0, 0)), (float("nan"), 18, None)]
+)
+def test_world_mirror_s_size_is_twice_the_principal_point(
+    tmp_path: Path, cx: float, cy: float, size: tuple[int, int] | None
+) -> None:
+    centred = K.copy()
+    centred[:2, 2] = cx, cy
+    path = save_json(tmp_path / "camera_params.json", world_mirror(C2W, centred))
+    if size is None:
+        with pytest.raises(SceneError, match="finite"):
+            read_cameras(path)
+        return
+    actual = read_cameras(path)
+    assert set(zip(actual.widths.tolist(), actual.heights.tolist(), strict=True)) == {size}
+
+
 def test_long_lrm_s_world_is_the_gaussians(tmp_path: Path) -> None:
     """A point of the cameras' world and its image in the Gaussians' are seen in the same direction."""
     path = write_long_lrm(tmp_path)
@@ -83,6 +100,14 @@ def test_long_lrm_s_world_is_the_gaussians(tmp_path: Path) -> None:
         seen, truly = (viewmat @ moved)[:3], (np.linalg.inv(C2W)[view] @ point)[:3]
         np.testing.assert_allclose(seen, 1.35 * truly, atol=1e-9)
     assert actual.names == ("view_002", "view_000")
+
+
+def test_a_list_of_poses_alone(tmp_path: Path) -> None:
+    path = write_trajectory(tmp_path)
+    path.with_name("intrinsic.txt").unlink()
+    actual = read_cameras(path)
+    np.testing.assert_allclose(actual.viewmats, np.linalg.inv(C2W), atol=1e-9)
+    assert actual.focal is None
 
 
 def other_intrinsics(path: Path) -> None:
@@ -104,7 +129,6 @@ def replace_text(old: str, new: str) -> Callable[[Path], object]:
             lambda path: path.write_text(path.read_text() + "1 2 3\n"),
             "line 4: expected 12 or 16 numbers, found 3",
         ),
-        (write_trajectory, lambda path: path.with_name("intrinsic.txt").unlink(), "intrinsics next to it in intrinsic"),
         (write_long_lrm, replace_text('"fx"', '"f"'), "expected w2c, fx, fy, cx, cy, w, h as numbers"),
         (
             write_long_lrm,

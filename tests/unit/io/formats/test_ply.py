@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from plyfile import PlyData, PlyElement
 
 from gsmerge.errors import SceneError
 from gsmerge.io import kept_comments, read_gaussians, read_ply, write_gaussians, write_ply
+from gsmerge.io.formats.ply import ply_notes
 from gsmerge.io.formats.sog import sog_bytes
 from gsmerge.io.formats.spz import spz_bytes
 from gsmerge.runtime.threads import use_threads
@@ -203,6 +205,29 @@ def test_extreme_scales_are_clipped_and_counted(tmp_path: Path) -> None:
     assert np.isfinite(actual.gaussians.scales).all()
     assert (actual.gaussians.scales**2 > 0).all()
     assert actual.gaussians.scales[1, 0].item() == pytest.approx(np.exp(-30.0), rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("factor", "stored", "part"),
+    [
+        (1.0, np.log, ""),
+        (500.0, np.log, ""),  # millimetres: no logarithm is negative
+        (100.0, np.positive, "as if linear"),
+        (1.0, np.positive, "as if linear"),
+        (1.0, lambda scales: np.log(1000 * scales), "too large"),
+    ],
+)
+def test_scales_that_are_no_logarithms_or_too_large_are_noted(
+    tmp_path: Path, factor: float, stored: Callable[[np.ndarray], np.ndarray], part: str
+) -> None:
+    rng = np.random.default_rng(0)
+    rows = columns(1152)
+    for name in ("x", "y", "z"):
+        rows[name] = factor * rng.uniform(-1, 1, len(rows))
+    for axis in range(3):
+        rows[f"scale_{axis}"] = stored(factor * rng.uniform(0.01, 0.09, len(rows)))
+    notes = [note for note in ply_notes(read_ply(save(tmp_path / "a.ply", rows)).info) if "scale" in note]
+    assert [part in note for note in notes] == [True] * bool(part)
 
 
 def test_zero_and_extreme_quaternions(tmp_path: Path) -> None:
