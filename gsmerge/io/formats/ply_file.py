@@ -133,9 +133,10 @@ def open_rows(path: Path, rows: np.ndarray) -> Iterator[Callable[[slice], np.nda
 def header_counts(path: Path) -> tuple[int, int]:
     """Return the numbers of Gaussians and of ``f_rest`` columns in a PLY file's header; zeros if unreadable."""
     try:
+        check_file(path)  # a pipe would never end
         with path.open("rb") as file:
             header = file.read(1 << 16).partition(b"end_header")[0]
-    except OSError:
+    except (OSError, SceneError):
         return 0, 0
     match = re.search(rb"^element vertex (\d{1,12})\s*$", header, re.MULTILINE)
     return int(match[1]) if match else 0, len(re.findall(rb"^property \S+ f_rest_\d+\s*$", header, re.MULTILINE))
