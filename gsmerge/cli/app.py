@@ -196,7 +196,7 @@ def run(args: Sequence[str] | None = None) -> int:
         if isinstance(error, _UsageErrors):
             return fail(_usage_message(error), 2)
         if is_out_of_memory(error) or file_problem(error) is not None:
-            return fail(error_line(error), SceneError.exit_code)
+            return fail(error_line(error, "what was printed"), SceneError.exit_code)
         if is_opencv_damaged(error):
             return fail(DAMAGED_OPENCV, 1)
         first = f"{type(error).__name__}: {error}".splitlines()[0]

@@ -66,7 +66,7 @@ def _load(path: Path) -> list[Mapping[str, Any]]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             data = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except SceneError:
+    except (SceneError, MemoryError):
         raise
     except Exception as error:  # whatever a damaged archive makes the libraries raise
         raise SceneError(path, f"{problem} a damaged one, or objects, which are not read") from error

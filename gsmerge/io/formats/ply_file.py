@@ -73,7 +73,7 @@ def open_ply(path: Path) -> PlyData:
         element, row = error.element, error.row
         promise = f"element '{element.name}' with {element.count} rows" if element is not None else "more data"
         raise _truncated(path, promise, row or 0, error.message) from error
-    except (PlyParseError, ValueError, ArithmeticError, MemoryError) as error:
+    except (PlyParseError, ValueError, ArithmeticError) as error:
         raise SceneError(path, f"expected a readable PLY file, found a damaged one ({error})") from error
 
 

@@ -45,6 +45,8 @@ COLOR_SCALE = 0.15  # of sh0: colours somewhat outside [0, 1] survive
 ATTRIBUTES = ("means", "opacities", "sh0", "scales", "quats", "shN")  # in the order of the file
 MAX_READ_DEGREE = 4  # which some write as version 3, too
 MAX_RATIO = 1032  # of gzip: no stream unpacks to more; nor do the columns of version 4 together, of any scene
+MAX_PER_BYTE = 1  # Gaussians: no real file has more than a fifth of one, and unpacked each takes 140 bytes of memory
+FREE_COUNT = 1_000_000  # Gaussians that are read however well they are compressed
 FOUND_EARLY_END = "expected a .spz file, found an early end of file"
 AGAIN = "copy or export it again"
 
@@ -88,6 +90,10 @@ def _read_header(path: Path, packed: bytes, start: bytes, versions: Sequence[int
         raise SceneError(path, f"expected .spz of version 1 to 4 and SH degree 0 to {MAX_READ_DEGREE}, found {found}")
     if header.count == 0 or header.count * sum(header.widths) > MAX_RATIO * len(packed):
         raise SceneError(path, f"expected Gaussians in {len(packed)} bytes, found {header.count} promised")
+    most = max(FREE_COUNT, MAX_PER_BYTE * len(packed))
+    if header.count > most:
+        problem = f"expected at most {most:,} Gaussians in {len(packed):,} bytes, found {header.count:,} promised"
+        raise SceneError(path, problem, "no scene is compressed so well: export it again")
     return header
 
 
