@@ -37,6 +37,7 @@ OTHER_WORDS = {
     "compact": ("compress", "merge", "simplify", "reduce", "decimate", "optimize", "optimise", "run", "convert"),
     "inspect": ("info", "stats", "describe", "show"),
     "evaluate": ("eval", "measure", "metrics", "score", "report"),
+    "check": ("validate", "verify", "lint", "test"),
     "render": ("preview", "segment"),
     "view": ("viewer", "compare"),
 }
@@ -49,7 +50,7 @@ BUDGET_WORDS = (
 COMMANDS = {
     "Compact": ("compact",),
     "Many scenes, and encoding once": ("batch", "encode", "decode", "extend"),
-    "Look and measure": ("inspect", "view", "render", "evaluate"),
+    "Look and measure": ("inspect", "check", "view", "render", "evaluate"),
     "Research": ("stress", "chart", "generate", "train"),
 }
 

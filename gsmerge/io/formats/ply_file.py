@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from plyfile import PlyData, PlyElementParseError, PlyParseError
+from plyfile import PlyData, PlyElementParseError, PlyListProperty, PlyParseError
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file
@@ -128,6 +128,16 @@ def open_rows(path: Path, rows: np.ndarray) -> Iterator[Callable[[slice], np.nda
             return out
 
         yield read
+
+
+def bytes_after_rows(path: Path) -> int:
+    """Count the bytes of a binary PLY file after its last row; 0 where rows are text or have lists."""
+    data = open_ply(path)
+    if data.text or any(isinstance(p, PlyListProperty) for element in data.elements for p in element.properties):
+        return 0
+    with path.open("rb") as file:
+        end, _ = _check_header(path, file.read(MAX_HEADER_BYTES), size := check_file(path))
+    return size - end - sum(element.data.nbytes for element in data.elements)
 
 
 def header_counts(path: Path) -> tuple[int, int]:

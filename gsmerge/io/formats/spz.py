@@ -36,6 +36,7 @@ HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fraction
 TABLE_START = struct.Struct("<I12x")  # where the table of version 4 begins, in bytes from the file's start
 TABLE_ROW = struct.Struct("<QQ")  # bytes of a stream: compressed, uncompressed
 MIP_FLAG = 1  # the Gaussians want to be rendered with a filter of their own
+GZIP_MAGIC = b"\x1f\x8b"
 FINE = 14  # bits of a position within the scene: a sixteenth of a pixel where it fills a thousand
 MAX_FRACTION = 23
 ZSTD_LEVEL = 12
@@ -110,6 +111,27 @@ def _gzip_parts(path: Path, packed: bytes) -> tuple[_Header, list[np.ndarray]]:
         raise SceneError(path, problem, AGAIN)
     parts = [np.frombuffer(data, np.uint8, end - at, at).reshape(header.count, -1) for at, end in pairwise(ends)]
     return header, parts
+
+
+def problem_at_end(path: Path) -> str | None:
+    """Describe what is wrong after the columns of a ``.spz``, which readers do not look at; None if nothing is.
+
+    That is the checksum of its stream, and bytes that its header does not promise, as under a wrong version. Version 4
+    has neither.
+    """
+    packed = path.read_bytes()
+    if packed[:2] != GZIP_MAGIC:
+        return None
+    try:
+        with gzip.open(path) as file:
+            header = _read_header(path, packed, file.read(HEADER.size), (1, 2, 3))
+            size = sum(iter(lambda: len(file.read(1 << 20)), 0))
+    except (OSError, EOFError, zlib.error) as error:
+        return f"its gzip stream is damaged or cut at the end ({error})"
+    extra = size - header.count * sum(header.widths)
+    if not extra or header.flags & ~MIP_FLAG:
+        return None
+    return f"{extra:,} bytes more than {header.count:,} Gaussians of version {header.version} have"
 
 
 def _zstandard_parts(path: Path, packed: bytes) -> tuple[_Header, list[np.ndarray]]:
