@@ -27,7 +27,8 @@ class FileCheck:
     """What a file holds, and what is wrong with it."""
 
     path: str
-    kind: str  # "Gaussians", "cameras", "networks", "encoded scene" or "state"; "" where it cannot be read
+    # "Gaussians", "cameras", "networks", "encoded scene" or "state"; "" where it cannot be read
+    kind: str
     count: int = 0  # Gaussians, views, parameters or groups
     layout: str = ""  # of the columns or of the cameras' file
     file_bytes: int = 0
@@ -39,16 +40,18 @@ class FileCheck:
         """The result in one line for people."""
         if self.problems:
             return f"wrong  {self.path}: {'; '.join(self.problems)}"
-        unit = {"Gaussians": "Gaussians", "cameras": "cameras", "networks": "parameters"}.get(self.kind)
+        units = {"Gaussians": "Gaussians", "cameras": "cameras", "networks": "parameters"}
+        unit = units.get(self.kind)
         size = f", {human_bytes(self.file_bytes)}" if self.file_bytes else ""
         layout = f", {self.layout}" if self.layout else ""
         return f"ok     {self.path}: {self.count:,} {unit or f'groups, {self.kind}'}{layout}{size}"
 
 
 def check_content(path: Path) -> FileCheck:
-    """Read a file of Gaussians, cameras, networks or of ``encode`` and ``extend`` to its end, and check its content.
+    """Read a file of Gaussians, cameras or networks, or a ``.gsm``, to its end, and check its content.
 
-    The ending says which it is; a folder has the cameras of a COLMAP model. UsageError if a package is missing.
+    The ending says which it is; a folder has the cameras of a COLMAP model. UsageError if a package
+    is missing.
     """
     try:
         found = _read(path)
@@ -56,8 +59,9 @@ def check_content(path: Path) -> FileCheck:
         problem = str(error).removeprefix(f"{path}: ")
         return FileCheck(str(path), "", problems=(problem,))
     damaged = _damaged_member(path) if path.suffix.lower() in ARCHIVES else None
+    problems = (*found.problems, *([damaged] if damaged else []))
     size = 0 if path.is_dir() else path.stat().st_size
-    return replace(found, file_bytes=size, problems=(*found.problems, *([damaged] if damaged else [])))
+    return replace(found, file_bytes=size, problems=problems)
 
 
 def _read(path: Path) -> FileCheck:
@@ -76,16 +80,19 @@ def _read(path: Path) -> FileCheck:
     elif suffix == ".ply":
         read_sharp(path)
         left = ply_file.bytes_after_rows(path)
-        problems += [f"{left:,} bytes after the last of {info.count:,} rows, which nothing reads"] if left else []
-    notes = tuple(note for note in ply_notes(info) if "opacit" in note)
-    return FileCheck(str(path), "Gaussians", info.count, info.layout, problems=tuple(problems), notes=notes)
+        behind = f"{left:,} bytes after the last of {info.count:,} rows, which nothing reads"
+        problems += [behind] if left else []
+    notes = [note for note in ply_notes(info) if "opacit" in note]
+    facts = (str(path), "Gaussians", info.count, info.layout)
+    return FileCheck(*facts, problems=tuple(problems), notes=tuple(notes))
 
 
 def _problems(info: PlyInfo) -> list[str]:
     """Describe the rows that a reader sets aside or changes."""
+    extreme = "Gaussian(s) with a log scale beyond +-30 or a harmonic beyond +-1e6"
     counted = {
         "row(s) with NaN or inf": info.num_nonfinite,
-        "Gaussian(s) with a log scale beyond +-30 or a harmonic beyond +-1e6": info.num_clipped_scales,
+        extreme: info.num_clipped_scales,
         "Gaussian(s) with a rotation of length 0": info.num_zero_quats,
     }
     return [f"{count:,} of {info.count:,} {what}" for what, count in counted.items() if count]

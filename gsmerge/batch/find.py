@@ -121,12 +121,16 @@ def output_name(options: BatchOptions, scene: Path, index: int) -> str:
         raise UsageError(f"--name: {options.output!r} does not fit {values}: {error}") from error
 
 
-def find_scenes(given: Sequence[str], out: Path, unreadable: list[SceneError] | None = None) -> Iterator[Path]:
+def find_scenes(
+    given: Sequence[str],
+    out: Path,
+    unreadable: list[SceneError] | None = None,
+) -> Iterator[Path]:
     """Yield the scenes of the arguments, in their order and sorted within each; some may come twice.
 
-    ``unreadable`` receives the errors of folders inside the arguments that cannot be read; without it, the first of
-    them is raised. SceneError if an argument does not exist, has no scene or too many folders without one, UsageError
-    if it is the output folder.
+    ``unreadable`` receives the errors of folders inside the arguments that cannot be read; without
+    it, the first of them is raised. SceneError if an argument does not exist, has no scene or too
+    many folders without one, UsageError if it is the output folder.
     """
     skip = os.path.realpath(out)
     for argument in given:
@@ -182,7 +186,10 @@ class _Search:
             yield from scenes
 
     def folders(self, first: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
-        """Yield a folder and those below it, with the names in each and, to be changed, those of its folders."""
+        """Yield a folder and those below it, with the names in each, and a list of its folders' names.
+
+        The caller may remove names from that list: those folders are not entered.
+        """
         stack = [(first, os.path.realpath(first))]
         while stack:
             folder, real = stack.pop()
@@ -196,16 +203,17 @@ class _Search:
                 raise SceneError(folder, problem, "name the folders of the scenes, or a list of them")
             try:
                 with os.scandir(folder) as opened:
-                    entries = {entry.name: entry for entry in sorted(opened, key=lambda entry: entry.name)}
+                    entries = {entry.name: entry for entry in opened}
             except OSError as error:
                 if str(folder) not in {known.path for known in self.unreadable}:
                     self.unreadable.append(SceneError(folder, f"cannot be read ({error.strerror})"))
                 continue
-            inside = [name for name, entry in entries.items() if not name.startswith(".") and _is_folder(entry)]
+            names = sorted(name for name in entries if not name.startswith("."))
+            inside = [name for name in names if _is_folder(entries[name])]
             yield folder, list(entries), inside
             for name in reversed(inside):
-                real_path = os.path.join(real, name)
-                stack.append((folder / name, os.path.realpath(real_path) if entries[name].is_symlink() else real_path))
+                below = os.path.join(real, name)
+                stack.append((folder / name, os.path.realpath(below) if entries[name].is_symlink() else below))
 
 
 def _is_folder(entry: os.DirEntry[str]) -> bool:
@@ -233,7 +241,7 @@ def _matches(pattern: str, search: _Search) -> Iterator[Path]:
 
 
 def _expand(pattern: str, search: _Search) -> Iterator[str]:
-    """Yield the files and folders that match a pattern; ``**`` enters each folder once, whatever links lead to it."""
+    """Yield the files and folders that match a pattern; ``**`` enters each folder once, despite links."""
     parts = Path(pattern).parts
     if "**" not in parts:
         yield from glob.iglob(pattern)
@@ -256,7 +264,8 @@ def _listed(file: Path, search: _Search) -> Iterator[Path]:
         raise SceneError(file, "expected a text file with one path per line, found no text")
     lines = dict.fromkeys(line.strip() for line in text.splitlines())
     if len(lines) > MAX_LISTED:
-        raise SceneError(file, f"expected at most {MAX_LISTED:,} scenes in a list, found more", "split it")
+        problem = f"expected at most {MAX_LISTED:,} scenes in a list, found more"
+        raise SceneError(file, problem, "split it")
     for entry in lines:
         if not entry or entry.startswith("#"):
             continue

@@ -100,9 +100,10 @@ def _usage_message(error: Any) -> str:
     place = PROGRAM if error.ctx is None else error.ctx.command_path
     message = error.format_message().replace("Value error, ", "", 1).rstrip(".")  # a prefix of checks inside Typer
     parameters = [] if error.ctx is None else error.ctx.command.params
+    has_output = any(one.name == "output" for one in parameters)
     if hasattr(error, "option_name"):
         message = _suggest(error.option_name, parameters) or message
-    elif message.startswith("Got unexpected extra argument") and any(one.name == "output" for one in parameters):
+    elif message.startswith("Got unexpected extra argument") and has_output:
         message += "; name what is written with -o"
     elif match := re.match(r"No such command '(\w+)'", message):
         near = next((name for name, words in OTHER_WORDS.items() if match[1] in words), None)
@@ -117,7 +118,8 @@ def _suggest(option: str, parameters: Sequence[Any]) -> str | None:
     if name in names:
         return None
     if name in BUDGET_WORDS and "budget" in names:
-        return f"{option} is no option: use --budget, such as 2%, 40000 or 5MB" + (", or --k" if "k" in names else "")
+        more = ", or --k" if "k" in names else ""
+        return f"{option} is no option: use --budget, such as 2%, 40000 or 5MB{more}"
     if name in HINTS and "hint" in names:
         return f"{option} is no option: use --hint {name}=VALUE"
     if "set" not in names:

@@ -11,11 +11,12 @@ from gsmerge.errors import SceneError
 
 
 @opt.command(
-    opt.argument("paths", list[Path], "FILE...", "Files of Gaussians (.ply, .spz, .sog, .splat), cameras (.json, .npz, "
-                 "..., a COLMAP folder), .gsm files, and networks (.safetensors)."),
+    opt.argument("paths", list[Path], "FILE...", "Files of Gaussians (.ply, .spz, .sog, .splat), "
+                 "cameras (.json, .npz, ..., a COLMAP folder), .gsm files, and networks "
+                 "(.safetensors)."),
 )  # fmt: skip
 def check(args: opt.Args) -> None:
-    """Read files to their ends and say what is wrong: counts, NaN, ranges, checksums. Exit code 3 if anything is."""
+    """Read files to their ends and say what is wrong: counts, NaN, ranges, checksums."""
     from gsmerge.file_checks import check_content
     from gsmerge.report import document_head
 
@@ -32,4 +33,5 @@ def check(args: opt.Args) -> None:
     print_document(document, [one.line for one in checks], as_json=args.json, quiet=args.quiet)
     if wrong:
         problem = "; ".join(wrong[0].problems)
-        raise SceneError(wrong[0].path, problem, f"wrong files: {len(wrong)} of {len(checks)}" * (len(checks) > 1))
+        more = f"wrong files: {len(wrong)} of {len(checks)}" if len(checks) > 1 else ""
+        raise SceneError(wrong[0].path, problem, more)

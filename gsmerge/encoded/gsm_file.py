@@ -103,13 +103,16 @@ def write_gsm(
 
 def _checksums(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> dict[str, int]:
     """Return CRC-32 of the header without its checksums, and of each array."""
-    plain = json.loads(json.dumps({name: value for name, value in header.items() if name != "checksums"}))
-    sums = {name: zlib.crc32(np.ascontiguousarray(array).tobytes()) for name, array in sorted(arrays.items())}
-    return {"header": zlib.crc32(json.dumps(plain, sort_keys=True).encode("utf-8", "replace")), **sums}
+    plain = {name: value for name, value in header.items() if name != "checksums"}
+    text = json.dumps(json.loads(json.dumps(plain)), sort_keys=True)  # keys as they are read
+    sums = {"header": zlib.crc32(text.encode("utf-8", "replace"))}
+    for name, array in sorted(arrays.items()):
+        sums[name] = zlib.crc32(np.ascontiguousarray(array).tobytes())
+    return sums
 
 
 def wrong_checksums(file: GsmFile) -> list[str] | None:
-    """List the arrays, or the header, that are not what was written; None where a file has no checksums."""
+    """List the arrays, or the header, that are not what was written; None without checksums."""
     stored = file.header.get("checksums")
     if not isinstance(stored, dict):
         return None

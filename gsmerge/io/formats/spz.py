@@ -46,7 +46,7 @@ COLOR_SCALE = 0.15  # of sh0: colours somewhat outside [0, 1] survive
 ATTRIBUTES = ("means", "opacities", "sh0", "scales", "quats", "shN")  # in the order of the file
 MAX_READ_DEGREE = 4  # which some write as version 3, too
 MAX_RATIO = 1032  # of gzip: no stream unpacks to more; nor do the columns of version 4 together, of any scene
-MAX_PER_BYTE = 1  # Gaussians: no real file has more than a fifth of one, and unpacked each takes 140 bytes of memory
+MAX_PER_BYTE = 1  # Gaussians: no real file has more than a fifth of one; each takes 140 bytes of memory
 FREE_COUNT = 1_000_000  # Gaussians that are read however well they are compressed
 FOUND_EARLY_END = "expected a .spz file, found an early end of file"
 AGAIN = "copy or export it again"
@@ -114,10 +114,10 @@ def _gzip_parts(path: Path, packed: bytes) -> tuple[_Header, list[np.ndarray]]:
 
 
 def problem_at_end(path: Path) -> str | None:
-    """Describe what is wrong after the columns of a ``.spz``, which readers do not look at; None if nothing is.
+    """Describe what is wrong after the columns of a ``.spz``, which readers do not look at.
 
-    That is the checksum of its stream, and bytes that its header does not promise, as under a wrong version. Version 4
-    has neither.
+    That is the checksum of its stream, and bytes that its header does not promise, as under a wrong
+    version; None if both are right, and for version 4, which has neither.
     """
     packed = path.read_bytes()
     if packed[:2] != GZIP_MAGIC:
