@@ -86,6 +86,17 @@ def compact_with(cameras: str) -> Callable[[Path, Path], list[str]]:
     return lambda folder, out: compact("scene.ply", "--cameras", str(folder / cameras))(folder, out)
 
 
+def change_any(rng: random.Random, data: bytes) -> bytes:
+    """Bytes or words of any file, or of what is compressed in it."""
+    inside = {b"\x1f\x8b": inside_gzip(change_words), b"PK": inside_zip(member)}.get(data[:2], change_words)
+    return any_of(change_bytes, change_words, inside)(rng, data)
+
+
+CHECKED = (
+    "scene.ply", "ascii.ply", "a.compressed.ply", "a.spz", "a.splat", "a.sog", "a.gsm", "state.gsm", "transforms.json",
+    "cameras/views.npz", "cameras/cameras.json", "cameras/text/cameras.txt", "cameras/binary/images.bin",
+    "checkpoint.safetensors",
+)  # fmt: skip
 KINDS = {
     "ply": Kind(120, ("scene.ply",), any_of(change_bytes, change_words, change_ply_head), compact()),
     "ply, ascii": Kind(80, ("ascii.ply",), any_of(change_bytes, change_text, change_ply_head), compact("ascii.ply")),
@@ -117,6 +128,13 @@ KINDS = {
                                              "--overwrite", *FAST], ("scene.ply", "batch.jsonl", "summary.csv")),
     "batch.jsonl of runs": Kind(20, ("charts/batch.jsonl",), change_lines,
                        lambda folder, out: ["chart", "--draw-only", "-o", str(out)], ("index.html",)),
+    "list of scenes": Kind(20, ("list.txt",), any_of(change_text, change_bytes),
+                           lambda folder, out: ["batch", str(folder / "list.txt"), "-o", str(out), "--jobs", "1",
+                                                "--name", "{index}.ply", *FAST], ("batch.jsonl", "summary.csv")),
+    "check": Kind(60, CHECKED, change_any,
+                  lambda folder, out: ["check", *(str(folder / name) for name in CHECKED)], ()),
+    "check, gsm": Kind(30, ("a.gsm", "state.gsm", "checkpoint.safetensors"), in_safetensors,
+                       lambda folder, out: ["check", *(str(folder / name) for name in CHECKED)], ()),
     "checkpoint": Kind(20, ("checkpoint.safetensors",), any_of(change_bytes, in_safetensors, in_safetensors),
                        lambda folder, out: [*compact()(folder, out)[:-1],
                                             f"checkpoint={folder}/checkpoint.safetensors"]),
@@ -141,6 +159,7 @@ def make_inputs(folder: Path) -> Path:
         gsmerge.write_gaussians(folder / name, gaussians)
     _write_ascii(folder)
     _write_cameras(folder)
+    (folder / "list.txt").write_text("# scenes\nscene.ply\na.spz\nascii.ply\nscene.ply\n")
     quick = ["--effort", "draft", "--threads", "1", "--quiet"]
     for words in (
         ["encode", folder / "scene.ply", "-o", folder / "a.gsm", "--checkpoint", "none", *quick],

@@ -129,9 +129,11 @@ def parse_budget(budget: str | int | None, num_input: int) -> int:
     text = str(budget).strip()
     match = re.fullmatch(r"(\d[\d_]*|\d*\.?\d+\s*%)", text, re.ASCII)
     if not match:
+        number = re.fullmatch(r"\d*\.\d+", text, re.ASCII)
+        percent = float(text) * (100 if float(text) < 1 else 1) if number else 0.0
         raise ValueError(
             f'budget: expected a number of Gaussians as "40000", a share as "2%", a size as "5MB", auto or'
-            f" {', '.join(DEVICES)}, got {text!r}"
+            f" {', '.join(DEVICES)}, got {text!r}" + (f'; perhaps "{percent:g}%"' if 0 < percent <= 100 else "")
         )
     if text.endswith("%"):
         share = Fraction(text[:-1].strip())

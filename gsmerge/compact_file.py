@@ -21,7 +21,8 @@ from gsmerge.io import (
     output_format,
     write_gaussians,
 )
-from gsmerge.io.cameras.json_files import write_transforms, write_viewer_cameras
+from gsmerge.io.cameras.json_files import viewer_cameras, write_transforms
+from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.formats.ply import OpacityChoice
 from gsmerge.io.formats.ply_file import LOGIT_COMMENT
 from gsmerge.options import CompactOptions
@@ -65,7 +66,8 @@ def compact_files(
 
     ``hashed``: hash the input for the report. ``seconds_before``: wall time by name of the caller's
     earlier steps. ``cameras_path``, ``saved_cameras``: files for the views, for viewers and as
-    ``transforms.json`` with all intrinsics. Returns the report, see
+    ``transforms.json`` with all intrinsics; the former may be there with the same content, beside
+    a result in another format. Returns the report, see
     :func:`gsmerge.report.report_document`. Raises SceneError if the scene cannot be read or the
     result cannot be written, UsageError if the settings need what the scene does not have.
     """
@@ -74,6 +76,9 @@ def compact_files(
         at = {path: add(path) for path in (out, report_path, saved_cameras) if path is not None}
         given = read_input(files, opacity=opacity, hints=hints)
         check_saved_cameras(given.scene, saved_cameras)
+        shared = None if cameras_path is None or overwrite or not cameras_path.exists() else cameras_path
+        if shared is not None and read_cameras(shared).names != given.scene.names:
+            raise _other_cameras(shared)
         read = perf_counter()
         result = compact(given.scene, settings, progress=progress)
         if len(result.gaussians) == 0:
@@ -89,7 +94,11 @@ def compact_files(
             )  # fmt: skip
         cameras_path = cameras_path if len(given.scene) else None
         if cameras_path is not None:
-            write_viewer_cameras(add(cameras_path), result.cameras, given.scene.names)
+            text = viewer_cameras(result.cameras, given.scene.names)
+            if shared is None:
+                add(cameras_path).write_text(text, encoding="utf-8")
+            elif shared.read_text(encoding="utf-8", errors="replace") != text:
+                raise _other_cameras(shared)
         if saved_cameras is not None:
             write_transforms(at[saved_cameras], result.cameras, given.scene.names)
         lost = lost_harmonics(out, result.gaussians.sh_degree, spz_version)
@@ -109,6 +118,12 @@ def compact_files(
         if report_path is not None:
             at[report_path].write_text(to_json(document), encoding="utf-8", errors="replace")
     return document
+
+
+def _other_cameras(path: Path) -> UsageError:
+    """Make the error of a file of cameras for viewers that belongs to another result."""
+    remedy = "pass --overwrite to replace it, or name another with --output"
+    return UsageError(f"{path}: exists already, with other cameras than this result's; {remedy}")
 
 
 def read_input(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = AUTO) -> SceneInput:

@@ -90,25 +90,28 @@ def is_out_of_memory(error: BaseException | None) -> bool:
     return False
 
 
-def file_problem(error: BaseException) -> str | None:
-    """Describe an error of the file system in one line; None for another error."""
+def file_problem(error: BaseException, unnamed: str = "a file") -> str | None:
+    """Describe an error of the file system in one line; None for another error.
+
+    ``unnamed`` says what was written where the error does not name it.
+    """
     if not isinstance(error, OSError) or error.strerror is None:
         return None
     if error.filename is not None:
         return f"{error.filename}: cannot be read or written ({error.strerror})"
     disk = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
-    return f"what was printed could not be written ({error.strerror}); send it elsewhere" if disk else None
+    return f"{unnamed} could not be written ({error.strerror}); free some space, or write elsewhere" if disk else None
 
 
-def error_line(error: BaseException) -> str:
-    """Describe an error in one line."""
+def error_line(error: BaseException, unnamed: str = "a file") -> str:
+    """Describe an error in one line; ``unnamed`` as of :func:`file_problem`."""
     if is_out_of_memory(error):
         return OUT_OF_MEMORY
     if is_opencv_damaged(error):
         return DAMAGED_OPENCV
     if is_torch_missing(error):
         return NO_TORCH
-    if not isinstance(error, GsmergeError) and (problem := file_problem(error)) is not None:
+    if not isinstance(error, GsmergeError) and (problem := file_problem(error, unnamed)) is not None:
         return problem
     text = str(error) if isinstance(error, GsmergeError) else f"{type(error).__name__}: {error}"
     return " ".join(text.split())

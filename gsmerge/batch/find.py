@@ -5,7 +5,7 @@ from __future__ import annotations
 import glob
 import os
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -20,7 +20,11 @@ from gsmerge.io.scene_files import IMAGE_PLACES, PLY_PLACES, named_ply, other_pl
 from gsmerge.options import CompactOptions
 from gsmerge.runtime.estimate import memory_bytes
 
-SCENE_PARTS = {Path(place).parts[0] for place in PLY_PLACES} | {"point_cloud", *IMAGE_PLACES}
+MAX_FOLDERS = 100_000  # without a scene; a link to a system's folders leads to more
+FOLDERS_PER_SCENE = 5  # that are not counted for it
+MAX_LISTED = 1_000_000  # lines of a list
+SCENE_NAMES = {Path(place).parts[0] for place in PLY_PLACES} | {"point_cloud"}
+SCENE_PARTS = SCENE_NAMES | set(IMAGE_PLACES)
 
 
 class Work(Protocol):
@@ -54,17 +58,25 @@ class Job:
         return memory_bytes(self.num_gaussians, photos=True, num_rest=self.num_rest)
 
 
-def find_jobs(given: Sequence[str], out: Path, options: BatchOptions, own: Collection[str] = ()) -> list[Job]:
+def find_jobs(
+    given: Sequence[str],
+    out: Path,
+    options: BatchOptions,
+    own: Collection[str] = (),
+    unreadable: list[SceneError] | None = None,
+) -> list[Job]:
     """List all scenes, each once, and where their results go in the output folder.
 
     ``given`` are folders, which are searched except for ``out``; patterns; ``.ply`` files; text files with one of
-    these per line. ``own`` has the real paths of former results, which are no scenes. SceneError if something does
-    not exist or has no scene, UsageError if two scenes would be written to one file, or one over another.
+    these per line. ``own`` has the real paths of former results, which are no scenes. ``unreadable`` receives the
+    errors of folders inside the given ones that cannot be read. SceneError if something does not exist, has no scene
+    or, without ``unreadable``, cannot be read; UsageError if two scenes would be written to one file, or one over
+    another.
     """
     jobs: list[Job] = []
     owners: dict[str, str] = {}
     inputs: set[str] = set()
-    for scene in find_scenes(given, out):
+    for scene in find_scenes(given, out, unreadable):
         ply = main_file(scene)
         real = os.path.realpath(ply)
         if real in inputs or real in own:
@@ -92,7 +104,7 @@ def result_names(output: str, options: BatchOptions) -> list[str]:
 
 def main_file(scene: Path) -> Path:
     """Find the file that identifies a scene; the folder itself where several files could."""
-    if not scene.is_dir():
+    if not os.path.isdir(scene):
         return scene
     plys = other_plys(scene)
     return named_ply(scene) or (plys[0] if len(plys) == 1 else scene)
@@ -109,75 +121,162 @@ def output_name(options: BatchOptions, scene: Path, index: int) -> str:
         raise UsageError(f"--name: {options.output!r} does not fit {values}: {error}") from error
 
 
-def find_scenes(given: Sequence[str], out: Path) -> Iterator[Path]:
+def find_scenes(
+    given: Sequence[str],
+    out: Path,
+    unreadable: list[SceneError] | None = None,
+) -> Iterator[Path]:
     """Yield the scenes of the arguments, in their order and sorted within each; some may come twice.
 
-    SceneError if an argument does not exist or has no scene, UsageError if it is the output folder.
+    ``unreadable`` receives the errors of folders inside the arguments that cannot be read; without
+    it, the first of them is raised. SceneError if an argument does not exist, has no scene or too
+    many folders without one, UsageError if it is the output folder.
     """
     skip = os.path.realpath(out)
     for argument in given:
-        path = Path(argument)
+        path, search = Path(argument), _Search(skip)
         if path.is_dir():
             if os.path.realpath(path) == skip:
                 raise UsageError(f"{out}: expected another folder for the results than that of the scenes; name one")
-            yield from _require_some(_walk(path, skip), argument, "in the folder")
+            yield from _require_some(search.walk(path), search, argument, "in the folder")
         elif path.suffix in SCENE_SUFFIXES and path.is_file():
             yield path
         elif glob.has_magic(argument) and not path.exists():
-            yield from _require_some(_matches(argument, skip), argument, "that match")
+            yield from _require_some(_matches(argument, search), search, argument, "that match")
         elif path.is_file():
-            yield from _require_some(_listed(path, skip), argument, "in the list")
+            yield from _require_some(_listed(path, search), search, argument, "in the list")
         else:
             raise SceneError(path, "no such file or folder", "name a folder, a pattern, a .ply, or a list of them")
+        if search.unreadable and unreadable is None:
+            raise search.unreadable[0]
+        if unreadable is not None:
+            unreadable += search.unreadable
 
 
-def _require_some(scenes: Iterator[Path], argument: str, where: str) -> Iterator[Path]:
+def _require_some(scenes: Iterator[Path], search: _Search, argument: str, where: str) -> Iterator[Path]:
     """Yield the scenes; SceneError if there are none."""
     first = next(scenes, None)
+    if first is None and search.unreadable:
+        raise search.unreadable[0]
     if first is None:
         raise SceneError(argument, f"expected scenes {where}, found none")
     yield first
     yield from scenes
 
 
-def _walk(folder: Path, skip: str, above: tuple[str, ...] = ()) -> Iterator[Path]:
-    """Yield the scenes in a folder, which is one itself if it has a file of a usual name."""
-    real = os.path.realpath(folder)
-    if real == skip or real in above:  # a link to a folder above would never end
-        return
-    is_scene = named_ply(folder) is not None
-    files = [] if is_scene else other_plys(folder)
-    yield from [folder] if is_scene else files
+@dataclass
+class _Search:
+    """The folders of one argument: each is searched once, whatever links lead to it."""
+
+    skip: str  # real path of the folder for the results
+    unreadable: list[SceneError] = field(default_factory=list)
+    seen: set[str] = field(default_factory=set)  # real paths
+    repeats: int = 0  # how often a folder was met again
+    num_empty: int = 0  # folders without a scene
+
+    def walk(self, folder: Path) -> Iterator[Path]:
+        """Yield the scenes in a folder, which is one itself if it has a file of a usual name."""
+        for inside, names, folders in self.folders(folder):
+            if _is_scene(inside, names):
+                folders[:] = [name for name in folders if name not in SCENE_PARTS]
+                scenes = [inside]
+            else:
+                scenes = other_plys(inside) if any(name.endswith(".ply") for name in names) else []
+            self.num_empty = max(0, self.num_empty - FOLDERS_PER_SCENE * len(scenes))
+            yield from scenes
+
+    def folders(self, first: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
+        """Yield a folder and those below it, with the names in each, and a list of its folders' names.
+
+        The caller may remove names from that list: those folders are not entered.
+        """
+        stack = [(first, os.path.realpath(first))]
+        while stack:
+            folder, real = stack.pop()
+            if real == self.skip or real in self.seen:
+                self.repeats += real != self.skip
+                continue
+            self.seen.add(real)
+            self.num_empty += 1
+            if self.num_empty > MAX_FOLDERS:
+                problem = f"expected scenes, found more than {MAX_FOLDERS:,} folders without one"
+                raise SceneError(folder, problem, "name the folders of the scenes, or a list of them")
+            try:
+                with os.scandir(folder) as opened:
+                    entries = {entry.name: entry for entry in opened}
+            except OSError as error:
+                if str(folder) not in {known.path for known in self.unreadable}:
+                    self.unreadable.append(SceneError(folder, f"cannot be read ({error.strerror})"))
+                continue
+            names = sorted(name for name in entries if not name.startswith("."))
+            inside = [name for name in names if _is_folder(entries[name])]
+            yield folder, list(entries), inside
+            for name in reversed(inside):
+                below = os.path.join(real, name)
+                stack.append((folder / name, os.path.realpath(below) if entries[name].is_symlink() else below))
+
+
+def _is_folder(entry: os.DirEntry[str]) -> bool:
     try:
-        with os.scandir(folder) as entries:
-            inside = sorted(entry.name for entry in entries if entry.is_dir() and not entry.name.startswith("."))
-    except OSError as error:
-        raise SceneError(folder, f"cannot be read ({error.strerror})") from error
-    for name in inside:
-        if not (is_scene and name in SCENE_PARTS):
-            yield from _walk(folder / name, skip, (*above, real))
+        return entry.is_dir()
+    except OSError:  # a link to itself, or into a folder that cannot be read
+        return False
 
 
-def _matches(pattern: str, skip: str) -> Iterator[Path]:
-    for name in sorted(glob.iglob(pattern, recursive=True)):
+def _is_scene(folder: Path, names: list[str]) -> bool:
+    """Return whether a folder with these names in it is a scene."""
+    try:
+        return not SCENE_NAMES.isdisjoint(names) and named_ply(folder) is not None
+    except OSError:  # its names can be read, and nothing else
+        return False
+
+
+def _matches(pattern: str, search: _Search) -> Iterator[Path]:
+    for name in dict.fromkeys(sorted(_expand(pattern, search))):
         path = Path(name)
-        if path.is_dir():
-            yield from _walk(path, skip)
+        if os.path.isdir(path):
+            yield from search.walk(path)
         elif path.suffix in SCENE_SUFFIXES:
             yield path
 
 
-def _listed(file: Path, skip: str) -> Iterator[Path]:
+def _expand(pattern: str, search: _Search) -> Iterator[str]:
+    """Yield the files and folders that match a pattern; ``**`` enters each folder once, despite links."""
+    parts = Path(pattern).parts
+    if "**" not in parts:
+        yield from glob.iglob(pattern)
+        return
+    at = parts.index("**")
+    rest = parts[at + 1 :]
+    own = _Search(search.skip, search.unreadable)
+    for base in glob.iglob(os.path.join(*parts[:at])) if at else (os.curdir,):
+        for folder, _, _ in own.folders(Path(base)):
+            names = [] if rest else [str(folder)]
+            names += _expand(os.path.join(glob.escape(str(folder)), *(rest or ("*",))), search)
+            own.num_empty = max(0, own.num_empty - FOLDERS_PER_SCENE * len(names))
+            yield from names
+
+
+def _listed(file: Path, search: _Search) -> Iterator[Path]:
     """Yield the scenes of a list, relative to its folder; a missing one fails when it is read."""
     text = read_text(file)
     if "\0" in text:
         raise SceneError(file, "expected a text file with one path per line, found no text")
-    for line in text.splitlines():
-        entry = line.strip()
+    lines = dict.fromkeys(line.strip() for line in text.splitlines())
+    if len(lines) > MAX_LISTED:
+        problem = f"expected at most {MAX_LISTED:,} scenes in a list, found more"
+        raise SceneError(file, problem, "split it")
+    for entry in lines:
         if not entry or entry.startswith("#"):
             continue
         path = file.parent / entry
-        if path.is_dir() and os.path.realpath(path) != skip:
-            yield from list(_walk(path, skip)) or [path]
-        else:
+        if not os.path.isdir(path) or os.path.realpath(path) == search.skip:
+            yield path
+            continue
+        before = search.repeats, len(search.unreadable)
+        first = next(scenes := search.walk(path), None)
+        if first is not None:
+            yield first
+            yield from scenes
+        elif before == (search.repeats, len(search.unreadable)):
             yield path

@@ -113,7 +113,10 @@ def _process(task: Task, context: BatchContext, new_records: RecordIndex, begun:
         problem = "exists already, and no batch wrote it; pass --overwrite to replace it"
         raise UsageError(f"{context.folder / foreign[0]}: {problem}")
     if not foreign:
-        begun.write_text(f"{os.getpid()} {socket.gethostname()}", encoding="utf-8")
+        try:
+            begun.write_text(f"{os.getpid()} {socket.gethostname()}", encoding="utf-8")
+        except OSError as error:
+            raise SceneError(context.folder, f"could not be written to ({error.strerror})") from error
     return _compact(task, context, files, key)
 
 

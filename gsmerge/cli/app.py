@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import sys
 import threading
@@ -34,11 +35,25 @@ PROGRAM = "gsmerge"
 INTERRUPTED = 130
 DEBUG = "--debug"
 
+# What other programs call a command, and the number of Gaussians
+OTHER_WORDS = {
+    "compact": ("compress", "merge", "simplify", "reduce", "decimate", "optimize", "optimise", "run", "convert"),
+    "inspect": ("info", "stats", "describe", "show"),
+    "evaluate": ("eval", "measure", "metrics", "score", "report"),
+    "check": ("validate", "verify", "lint", "test"),
+    "render": ("preview", "segment"),
+    "view": ("viewer", "compare"),
+}
+BUDGET_WORDS = (
+    "ratio", "percent", "percentage", "share", "fraction", "factor", "keep", "count", "num", "number", "gaussians",
+    "num_gaussians", "max_gaussians", "num_points", "target_count", "size", "max_size",
+)  # fmt: skip
+
 # Panel of the help -> commands, each the function of its name in the module of its name
 COMMANDS = {
     "Compact": ("compact",),
     "Many scenes, and encoding once": ("batch", "encode", "decode", "extend"),
-    "Look and measure": ("inspect", "view", "render", "evaluate"),
+    "Look and measure": ("inspect", "check", "view", "render", "evaluate"),
     "Research": ("stress", "chart", "generate", "train"),
 }
 
@@ -84,11 +99,18 @@ def root(
 
 
 def _usage_message(error: Any) -> str:
-    """Describe wrong usage in one line, with the way to give a setting that has no option of its own."""
+    """Describe wrong usage in one line, with the way to say what was meant."""
     place = PROGRAM if error.ctx is None else error.ctx.command_path
     message = error.format_message().replace("Value error, ", "", 1).rstrip(".")  # a prefix of checks inside Typer
-    if hasattr(error, "option_name") and error.ctx is not None:
-        message = _suggest(error.option_name, error.ctx.command.params) or message
+    parameters = [] if error.ctx is None else error.ctx.command.params
+    has_output = any(one.name == "output" for one in parameters)
+    if hasattr(error, "option_name"):
+        message = _suggest(error.option_name, parameters) or message
+    elif message.startswith("Got unexpected extra argument") and has_output:
+        message += "; name what is written with -o"
+    elif match := re.match(r"No such command '(\w+)'", message):
+        near = next((name for name, words in OTHER_WORDS.items() if match[1] in words), None)
+        message = message if near is None else f"{match[0]}. Did you mean '{near}'?"
     return f"{message}; see '{place} --help'"
 
 
@@ -98,6 +120,9 @@ def _suggest(option: str, parameters: Sequence[Any]) -> str | None:
     names = {parameter.name for parameter in parameters}
     if name in names:
         return None
+    if name in BUDGET_WORDS and "budget" in names:
+        more = ", or --k" if "k" in names else ""
+        return f"{option} is no option: use --budget, such as 2%, 40000 or 5MB{more}"
     if name in HINTS and "hint" in names:
         return f"{option} is no option: use --hint {name}=VALUE"
     if "set" not in names:
@@ -199,7 +224,7 @@ def run(args: Sequence[str] | None = None) -> int:
         if isinstance(error, _UsageErrors):
             return fail(_usage_message(error), 2)
         if is_out_of_memory(error) or file_problem(error) is not None:
-            return fail(error_line(error), SceneError.exit_code)
+            return fail(error_line(error, "what was printed"), SceneError.exit_code)
         if is_opencv_damaged(error):
             return fail(DAMAGED_OPENCV, 1)
         if is_torch_missing(error):

@@ -13,7 +13,7 @@ import typer
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import duration, one_line, print_document, say, say_notes, total_progress
-from gsmerge.errors import BatchError, TargetError, UsageError
+from gsmerge.errors import BatchError, SceneError, TargetError, UsageError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -77,7 +77,7 @@ def batch(args: opt.Args) -> None:
         raise UsageError(f"--output: expected a folder, found the file {out}")
     hints = args.hints()
     from gsmerge.batch import BatchOptions, find_jobs
-    from gsmerge.batch.records import RecordIndex
+    from gsmerge.batch.records import MAX_LISTED, RecordIndex
     from gsmerge.batch.schedule import make_schedule
 
     with opt.usage_errors():
@@ -92,15 +92,18 @@ def batch(args: opt.Args) -> None:
         require_ray()
     index = RecordIndex(out)
     index.read_on()
-    jobs = find_jobs(args.scenes, out, options, index.result_paths())
+    unreadable: list[SceneError] = []
+    jobs = find_jobs(args.scenes, out, options, index.result_paths(), unreadable)
     schedule = make_schedule(jobs, options)
     damaged = [f"{index.damaged} damaged line(s) of the records were ignored"] if index.damaged else []
-    notes = [*damaged, *schedule.notes]
+    notes = [*damaged, *schedule.notes, *(f"passed by: {error}" for error in unreadable[:MAX_LISTED])]
     if args.dry_run:
         print_plan(args, jobs, options, index, schedule, notes)
         return
     say_notes(notes, quiet=args.silent)
     _run(args, jobs, options, index, schedule)
+    if unreadable:
+        raise BatchError(f"{len(unreadable)} folder(s) were passed by; the first: {unreadable[0]}")
 
 
 def _bytes(text: str | None) -> int | None:

@@ -11,7 +11,15 @@ from typing import TYPE_CHECKING
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say, say_notes, stage_progress
-from gsmerge.cli.paths import FileOptions, check_format, check_outputs, checkpoint_files, default_output, input_files
+from gsmerge.cli.paths import (
+    FileOptions,
+    check_format,
+    check_outputs,
+    checkpoint_files,
+    default_output,
+    holds_cameras,
+    input_files,
+)
 from gsmerge.errors import TargetError
 
 if TYPE_CHECKING:
@@ -43,8 +51,9 @@ def compact(args: opt.Args) -> None:
     levels = [level_output(out, level) for level in range(1, settings.budget.levels)]
     cameras = viewer_cameras_path(out) if writing.viewer_cameras else None
     inputs = (*input_files(files), *checkpoint_files(settings.checkpoint))
+    beside = None if cameras is None or (not args.overwrite and holds_cameras(cameras)) else cameras
     check_outputs(
-        (out, *levels, args.report, cameras, args.save_cameras), inputs, overwrite=args.overwrite or args.dry_run
+        (out, *levels, args.report, beside, args.save_cameras), inputs, overwrite=args.overwrite or args.dry_run
     )
     check_format(out, writing, settings.budget)
     if args.dry_run:

@@ -100,6 +100,16 @@ def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
         raise SceneError(output, f"expected a folder to write to, found no {output.parent}", "make it first")
 
 
+def holds_cameras(path: Path) -> bool:
+    """Return whether a file has cameras, as the one beside a result in another format has."""
+    from gsmerge.io.cameras.read import read_cameras
+
+    try:
+        return len(read_cameras(path)) > 0
+    except SceneError:
+        return False
+
+
 def input_files(files: SceneFiles) -> tuple[Path, ...]:
     """List the files of Gaussians, cameras and photos that are read."""
     return tuple(path for path in (files.ply, files.cameras, files.images, files.masks) if path is not None)

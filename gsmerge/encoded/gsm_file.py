@@ -8,6 +8,7 @@ arrays and entries are only ever added, and unknown ones are ignored. Keys are t
 from __future__ import annotations
 
 import json
+import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from os import PathLike
@@ -29,7 +30,7 @@ from gsmerge.stages.decode import MAX_CHILDREN
 from gsmerge.stages.prepare import Frame
 from gsmerge.types import Array, Cameras, FeatureGaussians, Gaussians, as_array
 
-SCHEMA, MINOR = 1, 0  # files of a larger schema cannot be read; minor: what was added since the schema's first files
+SCHEMA, MINOR = 1, 1  # files of a larger schema cannot be read; minor: what was added since the schema's first files
 SUFFIX = ".gsm"
 ENCODED, STATE = "gsmerge-encoded", "gsmerge-state"  # names of the metadata entry
 REMEDY = "copy it again, or encode the scene again"
@@ -96,7 +97,28 @@ def write_gsm(
         content |= {f"{prefix}.{f.name}": _float32(getattr(gaussians, f.name)) for f in fields(Gaussians)}
     data = {name: np.ascontiguousarray(array) for name, array in (content | dict(arrays)).items()}
     with atomic_output(path, overwrite=overwrite) as temporary:
+        header["checksums"] = _checksums(header, data)
         temporary.write_bytes(save(data, {kind: json.dumps(header)}))  # one entry: the order of several is not fixed
+
+
+def _checksums(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> dict[str, int]:
+    """Return CRC-32 of the header without its checksums, and of each array."""
+    plain = {name: value for name, value in header.items() if name != "checksums"}
+    text = json.dumps(json.loads(json.dumps(plain)), sort_keys=True)  # keys as they are read
+    sums = {"header": zlib.crc32(text.encode("utf-8", "replace"))}
+    for name, array in sorted(arrays.items()):
+        sums[name] = zlib.crc32(np.ascontiguousarray(array).tobytes())
+    return sums
+
+
+def wrong_checksums(file: GsmFile) -> list[str] | None:
+    """List the arrays, or the header, that are not what was written; None without checksums."""
+    stored = file.header.get("checksums")
+    if not isinstance(stored, dict):
+        return None
+    found = _checksums(file.header, file.arrays)
+    missing = [name for name in stored if name not in found and name.startswith(PREFIXES)]
+    return [name for name, value in found.items() if stored.get(name) != value] + missing
 
 
 def _float32(values: Array) -> np.ndarray:

@@ -167,7 +167,9 @@ def _lookup(root: Path, by_ending: dict[str, list[Path]], name: str) -> Path | N
     parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in ("/", "//", "..")]
     matches = next((by_ending[ending] for ending in _endings(PurePosixPath(*parts)) if ending in by_ending), [])
     if len(matches) > 1:
-        raise SceneError(root, f"expected one image named {name}, found {matches[0].name} and {matches[1].name}")
+        first, second = (os.path.relpath(path, root) for path in matches[:2])
+        problem = f"expected one image named {name}, found {first} and {second}"
+        raise SceneError(root, problem, "name the folder that has one of them with --images")
     return matches[0] if matches else None
 
 

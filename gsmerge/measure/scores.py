@@ -7,6 +7,7 @@ import html
 import io
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, fields
+from pathlib import Path
 from typing import Any
 
 from gsmerge.measure.align import PoseChange
@@ -230,14 +231,25 @@ def evaluation_markdown(document: Mapping[str, Any]) -> str:
     lines = [f"# {_plain(page_title(document))}", ""]
     for title, head, rows in filled_tables(document):
         lines += [f"## {title}", "", _line(head), _line(["---", *["---:"] * (len(head) - 1)]), *map(_line, rows), ""]
-    lines += [f"- {_plain(note)}" for note in document["notes"]]
+    lines += [f"- {_plain(note)}" for note in page_notes(document)]
     return "\n".join(lines).rstrip() + "\n"
 
 
 def page_title(document: Mapping[str, Any]) -> str:
     """Name the scene of an evaluation, and the results that it is compared with."""
     first, *others = document["results"]
-    return f"{first.get('path', first['name'])}" + (": before and after" if others else "")
+    path = Path(first.get("path", first["name"]))
+    return "/".join(path.parts[-2:]) + (": before and after" if others else "")
+
+
+def page_notes(document: Mapping[str, Any]) -> list[str]:
+    """Return the notes without the folders above those of the files: a page is for others to read."""
+    paths = [Path(result["path"]).absolute() for result in document["results"] if "path" in result]
+    above = {f"{path.parent.parent}/" for path in paths} - {"/"}
+    notes = document["notes"]
+    for folder in sorted(above, key=len, reverse=True):
+        notes = [note.replace(folder, "") for note in notes]
+    return list(notes)
 
 
 def _line(cells: Row) -> str:

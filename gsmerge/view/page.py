@@ -16,7 +16,7 @@ import numpy as np
 
 from gsmerge import __version__
 from gsmerge.measure.preview import to_picture
-from gsmerge.measure.scores import filled_tables, page_title
+from gsmerge.measure.scores import filled_tables, page_notes, page_title
 from gsmerge.report import human_bytes
 from gsmerge.view.data import PageView, Side, ViewData, encode_still
 
@@ -98,7 +98,7 @@ def report_page(document: Mapping[str, Any], pictures: Sequence[Sequence[tuple[s
     ]
     return render_template(
         "report.html", policy=PICTURES, title=title, views=views, headline=headline, tiles=tiles,
-        tables=list(filled_tables(document)), notes=document["notes"],
+        tables=list(filled_tables(document)), notes=page_notes(document),
     )  # fmt: skip
 
 

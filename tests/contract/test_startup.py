@@ -11,8 +11,8 @@ import pytest
 
 HEAVY = ("torch", "cv2", "numpy", "plyfile", "skimage", "matplotlib", "jinja2")
 COMMANDS = (
-    "compact", "batch", "encode", "decode", "extend", "inspect", "view", "render", "evaluate", "stress", "chart",
-    "generate", "train",
+    "compact", "batch", "encode", "decode", "extend", "inspect", "check", "view", "render", "evaluate", "stress",
+    "chart", "generate", "train",
 )  # fmt: skip
 
 

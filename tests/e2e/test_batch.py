@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -144,3 +145,24 @@ def test_what_compact_has_besides_is_set_by_name() -> None:
     own = {"--cameras", "--images", "-o", "--output", "--threads", "--overwrite", "--json"}  # of many scenes in batch
     for name in options["compact"].keys() & options["batch"].keys() - own:
         assert options["compact"][name].help == options["batch"][name].help
+
+
+def test_a_folder_that_cannot_be_read_stops_no_scene(
+    rooms: Path, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scenes, out, scandir = tmp_path / "all", tmp_path / "out", os.scandir
+    shutil.copytree(rooms / "room0", scenes / "room0")
+    (scenes / "locked").mkdir()
+
+    def refuse(path: Any) -> Any:  # permissions mean nothing to root, which tests may run as
+        if Path(path).name == "locked":
+            raise PermissionError(13, "Permission denied", str(path))
+        return scandir(path)
+
+    monkeypatch.setattr(os, "scandir", refuse)
+    outcome = batch(run, scenes, out)
+    assert (outcome.code, statuses(out)) == (5, {"room0.ply": ["done"]})
+    error = f"{scenes / 'locked'}: cannot be read (Permission denied)"
+    assert f"note: passed by: {error}\n" in outcome.err
+    assert outcome.err.splitlines()[-1] == f"gsmerge: error: 1 folder(s) were passed by; the first: {error}"
+    assert f"note: passed by: {error}" in batch(run, scenes, out, "--dry-run").out

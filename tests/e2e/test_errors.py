@@ -21,6 +21,7 @@ import pytest
 import gsmerge
 from gsmerge import gpu
 from gsmerge.errors import OUT_OF_MEMORY, SceneError
+from gsmerge.io import write_gaussians
 
 from .conftest import Run, assert_refused, listing
 
@@ -63,6 +64,29 @@ def test_a_folder_without_permission(scene_copy: Path, run: Run) -> None:
     locked.mkdir(mode=0o500)
     assert_refused(run("compact", scene_copy, "-o", locked / "small.ply"), 3, "cannot be written")
     assert list(locked.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("file", "reader"),
+    [
+        ("scene.ply", "gsmerge.io.formats.ply_file.PlyData.read"),
+        ("scene.sog", "gsmerge.io.formats.sog._read_columns"),
+        ("scene.spz", "gsmerge.io.formats.spz._read_columns"),
+        ("views.npz", "numpy.lib.format.read_array"),
+    ],
+)
+def test_a_lack_of_memory_is_no_damage(
+    file: str, reader: str, scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = scene_copy / file
+    if path.suffix == ".npz":
+        np.savez(path, extrinsics=np.eye(4)[None], intrinsics=np.eye(3)[None])
+        words: tuple[object, ...] = ("inspect", scene_copy / "scene.ply", "--cameras", path)
+    else:
+        write_gaussians(path, gsmerge.read_ply(scene_copy / "scene.ply").gaussians, overwrite=True)
+        words = ("inspect", path)
+    monkeypatch.setattr(reader, Broken(MemoryError("Unable to allocate 9 GiB")))
+    assert_refused(run(*words), 3, OUT_OF_MEMORY)
 
 
 def test_a_scene_of_points_without_size_leaves_no_file(scene_copy: Path, run: Run) -> None:

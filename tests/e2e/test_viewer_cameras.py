@@ -64,6 +64,26 @@ def test_they_are_replaced_on_request_alone(scene_copy: Path, run: Run) -> None:
     assert len(json.loads((scene_copy / "small.cameras.json").read_text())) == len(gsmerge.read_scene(scene_copy))
 
 
+def test_a_second_format_shares_them(scene_copy: Path, run: Run, tmp_path: Path) -> None:
+    """They are there, with the same content; those of other views are no result's own."""
+    out = tmp_path / "out"
+    out.mkdir()
+    run("compact", scene_copy, "-o", out / "a.ply", *QUICK, "-q", code=0)
+    before = (out / "a.cameras.json").read_bytes()
+    done = run("compact", scene_copy, "-o", out / "a.spz", *QUICK, code=0)
+    assert done.out.splitlines()[-1].endswith("; cameras for viewers in a.cameras.json")
+    assert (out / "a.cameras.json").read_bytes() == before
+    run("compact", scene_copy, "-o", out / "a.cameras.json", *QUICK, code=2)
+    entries = json.loads(before)
+    for change in ({"img_name": "other"}, {"fx": 1.0 + entries[0]["fx"]}):
+        (out / "a.cameras.json").write_text(json.dumps([entries[0] | change, *entries[1:]]))
+        done = run("compact", scene_copy, "-o", out / "a.sog", *QUICK, code=2)
+        assert "a.cameras.json: exists already, with other cameras than this result's; pass --overwrite" in done.err
+    assert sorted(path.name for path in out.iterdir()) == ["a.cameras.json", "a.ply", "a.spz"]
+    run("compact", scene_copy, "-o", out / "a.sog", "--overwrite", *QUICK, "-q", code=0)
+    assert (out / "a.cameras.json").read_bytes() == before
+
+
 @pytest.mark.parametrize(
     ("output", "expected"),
     [

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gzip
 import os
 import shutil
+import struct
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -94,6 +96,21 @@ def in_images(make: Callable[[Path], object]) -> Spoil:
     return lambda folder: make(folder / "images" / "view_000.png")  # type: ignore[func-returns-value]
 
 
+def in_two_folders(folder: Path) -> None:
+    for name in ("a", "b"):
+        shutil.copytree(folder / "images", folder.parent / "copy" / name)
+    shutil.rmtree(folder / "images")
+    (folder.parent / "copy").rename(folder / "images")
+
+
+def equal_points(folder: Path) -> Sequence[object]:
+    """A file of 20 kB that unpacks to 20 MB, and to seven times that in memory."""
+    count = 1_000_001
+    header = struct.pack("<3I4B", 0x5053474E, 3, count, 0, 12, 0, 0)
+    (folder / "a.spz").write_bytes(gzip.compress(header + bytes(20 * count), 1))
+    return [folder / "a.spz"]
+
+
 def many_images(folder: Path) -> None:
     for i in range(500):
         (folder / "images" / f"other_{i}.png").write_bytes(b"")
@@ -134,6 +151,10 @@ CASES |= {
     "an image missing": Case(
         given(make=remove("images/view_001.png")), says=("images", "expected 3", "found 2", "view_001")
     ),
+    "images of one name in two folders": Case(
+        given(make=in_two_folders), says=("images", "found a/view_000.png and b/view_000.png", "--images")
+    ),
+    "a spz of a million equal points and one": Case(equal_points, says=("a.spz", "found 1,000,001 promised")),
     "no such ply": Case(lambda folder: [folder / "nothing.ply"], says=("nothing.ply: no such file",)),
     "no such cameras": Case(given("--cameras", "nowhere.json"), says=("nowhere.json", "no such file")),
     "no such images": Case(given("--images", "nowhere"), says=("nowhere", "no such file")),

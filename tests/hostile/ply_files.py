@@ -211,12 +211,14 @@ def _values() -> dict[str, Case]:
     every = slice(None)
     means, colors, opacity, scales, quats = slice(0, 3), slice(6, 9), slice(9, 10), slice(10, 13), slice(13, 17)
     cases = {
-        "all NaN": Case(fill(every, np.nan), says=("scene.ply", "found NaN or inf in all", str(COUNT))),
+        "all NaN": Case(fill(every, np.nan), says=("scene.ply", "found NaN or inf in all", f"{COUNT:,} rows")),
         "all inf": Case(fill(every, np.inf)),
         "positions 1e38": Case(fill(means, 1e38)),
         "positions 1e-38": Case(fill(means, 1e-38), EITHER),
         "positions all one": Case(fill(means, 1.0), EITHER),
-        "one finite row": Case(fill(every, np.nan, slice(1, None))),
+        "one finite row": Case(
+            fill(every, np.nan, slice(1, None)), says=("scene.ply", f"NaN or inf in {COUNT - 1:,} of {COUNT:,} rows")
+        ),
         "half of the positions NaN": Case(fill(means, np.nan, slice(0, None, 2)), EITHER),
         "one view NaN": Case(fill(means, np.nan, slice(0, COUNT // 3)), EITHER),
         "one position 1e30": Case(fill(means, 1e30, slice(5, 6)), READ),

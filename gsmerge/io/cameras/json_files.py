@@ -308,10 +308,10 @@ def write_transforms(path: Path, cameras: Cameras, names: Sequence[str]) -> None
     path.write_text(json.dumps({"camera_model": "PINHOLE", "frames": frames}, indent=1) + "\n", encoding="utf-8")
 
 
-def write_viewer_cameras(path: Path, cameras: Cameras, names: Sequence[str]) -> None:
-    """Write cameras as INRIA's ``cameras.json``, for SuperSplat and other viewers; :func:`read_inria` reads it.
+def viewer_cameras(cameras: Cameras, names: Sequence[str]) -> str:
+    """Return the text of cameras as INRIA's ``cameras.json``, for SuperSplat and other viewers.
 
-    It has no principal point: cameras are written as if theirs were in the middle.
+    :func:`read_inria` reads it. It has no principal point: cameras are written as if theirs were in the middle.
     """
     rotations, centres = cameras.viewmats[:, :3, :3].transpose(0, 2, 1), cameras.centres
     entries = [
@@ -322,7 +322,7 @@ def write_viewer_cameras(path: Path, cameras: Cameras, names: Sequence[str]) -> 
         }
         for i, name in enumerate(names)
     ]  # fmt: skip
-    path.write_text(json.dumps(entries) + "\n", encoding="utf-8")
+    return json.dumps(entries) + "\n"
 
 
 def find_dataparser(ply: Path, cameras: Path | None) -> Path | None:

@@ -177,7 +177,7 @@ def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
             warnings.simplefilter("ignore")  # of headers in old styles
             members = _members(archive)
             return {name: _read_array(path, archive, info) for name, info in members.items() if name in names}
-    except SceneError:
+    except (SceneError, MemoryError):
         raise
     except Exception as error:  # whatever a damaged archive makes the libraries raise
         raise SceneError(path, f"expected a readable .npz file, found a damaged one ({error})") from error

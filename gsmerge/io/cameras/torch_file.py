@@ -91,7 +91,7 @@ def read_torch_file(path: Path) -> Any:
             content = archive.read(name)
         folder = name.removesuffix("data.pkl")
         return _Structure(path, folder, members, content).load()
-    except SceneError:
+    except (SceneError, MemoryError):
         raise
     except Exception as error:  # whatever a damaged archive makes the libraries raise
         problem = f"{problem} a damaged one, or objects, which are not read"

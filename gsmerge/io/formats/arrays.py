@@ -60,7 +60,7 @@ def to_rows(columns: Columns, name: str, sizes: dict[str, int], *, mip: bool = F
     names = (*MEANS, *SH0, *(f"f_rest_{i}" for i in range(3 * num_higher)), "opacity", *SCALES, *QUATS)
     harmonics = columns.harmonics.transpose(0, 2, 1).reshape(count, 3 * num_higher)
     parts = (columns.means, columns.sh0, harmonics, columns.opacities[:, None], columns.log_scales, columns.quats)
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is set aside later
         table = np.concatenate(parts, axis=1, dtype=np.float32, casting="same_kind")
     return StoredRows(
         rows=table.view([(column, np.float32) for column in names])[:, 0],

@@ -19,6 +19,7 @@ from gsmerge.kernels.elementary import exp, log
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Gaussians, StrPath
 
+MIN_FINITE = 0.002  # of the rows: the rest of a file tells nothing about the scene
 OpacityChoice = Literal["auto", "logit", "raw"]
 
 # What reads a file of Gaussians, by its ending; all other files are taken for PLY
@@ -109,7 +110,7 @@ def read_ply(path: StrPath, *, opacity: OpacityChoice = "auto") -> PlyScene:
             as logits. Infinite logits are opacities of 0 and 1.
 
     Raises:
-        SceneError: If the file cannot be read, lacks columns, or holds no finite Gaussian.
+        SceneError: If the file cannot be read, lacks columns, or hardly has a finite Gaussian: 2 in 1,000 rows.
         ValueError: If ``opacity`` is none of the three.
     """
     if opacity not in ("auto", "logit", "raw"):
@@ -347,8 +348,10 @@ def clear_invalid(path: str | Path, out: dict[str, np.ndarray]) -> int:
     if len(bad) == 0:
         return 0
     good = np.flatnonzero(valid)
-    if len(good) == 0:
-        raise SceneError(path, f"expected finite Gaussians, found NaN or inf in all {len(valid)} rows")
+    if len(good) < MIN_FINITE * len(valid):
+        number = f"{len(bad):,} of" if len(good) else "all"
+        problem = f"expected finite Gaussians, found NaN or inf in {number} {len(valid):,} rows"
+        raise SceneError(path, problem, "export it again" if len(good) else "")
     before = good[np.maximum(np.searchsorted(good, bad) - 1, 0)]
     for name in ("means", "scales"):
         out[name][bad] = out[name][before]

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from plyfile import PlyData, PlyElementParseError, PlyParseError
+from plyfile import PlyData, PlyElementParseError, PlyListProperty, PlyParseError
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file
@@ -73,7 +73,7 @@ def open_ply(path: Path) -> PlyData:
         element, row = error.element, error.row
         promise = f"element '{element.name}' with {element.count} rows" if element is not None else "more data"
         raise _truncated(path, promise, row or 0, error.message) from error
-    except (PlyParseError, ValueError, ArithmeticError, MemoryError) as error:
+    except (PlyParseError, ValueError, ArithmeticError) as error:
         raise SceneError(path, f"expected a readable PLY file, found a damaged one ({error})") from error
 
 
@@ -130,12 +130,23 @@ def open_rows(path: Path, rows: np.ndarray) -> Iterator[Callable[[slice], np.nda
         yield read
 
 
+def bytes_after_rows(path: Path) -> int:
+    """Count the bytes of a binary PLY file after its last row; 0 where rows are text or have lists."""
+    data = open_ply(path)
+    if data.text or any(isinstance(p, PlyListProperty) for element in data.elements for p in element.properties):
+        return 0
+    with path.open("rb") as file:
+        end, _ = _check_header(path, file.read(MAX_HEADER_BYTES), size := check_file(path))
+    return size - end - sum(element.data.nbytes for element in data.elements)
+
+
 def header_counts(path: Path) -> tuple[int, int]:
     """Return the numbers of Gaussians and of ``f_rest`` columns in a PLY file's header; zeros if unreadable."""
     try:
+        check_file(path)  # a pipe would never end
         with path.open("rb") as file:
             header = file.read(1 << 16).partition(b"end_header")[0]
-    except OSError:
+    except (OSError, SceneError):
         return 0, 0
     match = re.search(rb"^element vertex (\d{1,12})\s*$", header, re.MULTILINE)
     return int(match[1]) if match else 0, len(re.findall(rb"^property \S+ f_rest_\d+\s*$", header, re.MULTILINE))

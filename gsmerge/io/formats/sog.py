@@ -63,7 +63,7 @@ def read_rows(path: Path) -> arrays.StoredRows:
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError, EOFError) as error:
         problem = f"expected meta.json and textures of .sog version {VERSION}, found others ({error})"
         raise SceneError(path, " ".join(problem.split()), "export it again") from error
-    except (zlib.error, MemoryError) as error:
+    except zlib.error as error:
         raise SceneError(path, f"expected a readable .sog file, found a damaged one ({error})") from error
 
 

@@ -36,6 +36,7 @@ HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fraction
 TABLE_START = struct.Struct("<I12x")  # where the table of version 4 begins, in bytes from the file's start
 TABLE_ROW = struct.Struct("<QQ")  # bytes of a stream: compressed, uncompressed
 MIP_FLAG = 1  # the Gaussians want to be rendered with a filter of their own
+GZIP_MAGIC = b"\x1f\x8b"
 FINE = 14  # bits of a position within the scene: a sixteenth of a pixel where it fills a thousand
 MAX_FRACTION = 23
 ZSTD_LEVEL = 12
@@ -45,6 +46,8 @@ COLOR_SCALE = 0.15  # of sh0: colours somewhat outside [0, 1] survive
 ATTRIBUTES = ("means", "opacities", "sh0", "scales", "quats", "shN")  # in the order of the file
 MAX_READ_DEGREE = 4  # which some write as version 3, too
 MAX_RATIO = 1032  # of gzip: no stream unpacks to more; nor do the columns of version 4 together, of any scene
+MAX_PER_BYTE = 1  # Gaussians: no real file has more than a fifth of one; each takes 140 bytes of memory
+FREE_COUNT = 1_000_000  # Gaussians that are read however well they are compressed
 FOUND_EARLY_END = "expected a .spz file, found an early end of file"
 AGAIN = "copy or export it again"
 
@@ -88,6 +91,10 @@ def _read_header(path: Path, packed: bytes, start: bytes, versions: Sequence[int
         raise SceneError(path, f"expected .spz of version 1 to 4 and SH degree 0 to {MAX_READ_DEGREE}, found {found}")
     if header.count == 0 or header.count * sum(header.widths) > MAX_RATIO * len(packed):
         raise SceneError(path, f"expected Gaussians in {len(packed)} bytes, found {header.count} promised")
+    most = max(FREE_COUNT, MAX_PER_BYTE * len(packed))
+    if header.count > most:
+        problem = f"expected at most {most:,} Gaussians in {len(packed):,} bytes, found {header.count:,} promised"
+        raise SceneError(path, problem, "no scene is compressed so well: export it again")
     return header
 
 
@@ -104,6 +111,27 @@ def _gzip_parts(path: Path, packed: bytes) -> tuple[_Header, list[np.ndarray]]:
         raise SceneError(path, problem, AGAIN)
     parts = [np.frombuffer(data, np.uint8, end - at, at).reshape(header.count, -1) for at, end in pairwise(ends)]
     return header, parts
+
+
+def problem_at_end(path: Path) -> str | None:
+    """Describe what is wrong after the columns of a ``.spz``, which readers do not look at.
+
+    That is the checksum of its stream, and bytes that its header does not promise, as under a wrong
+    version; None if both are right, and for version 4, which has neither.
+    """
+    packed = path.read_bytes()
+    if packed[:2] != GZIP_MAGIC:
+        return None
+    try:
+        with gzip.open(path) as file:
+            header = _read_header(path, packed, file.read(HEADER.size), (1, 2, 3))
+            size = sum(iter(lambda: len(file.read(1 << 20)), 0))
+    except (OSError, EOFError, zlib.error) as error:
+        return f"its gzip stream is damaged or cut at the end ({error})"
+    extra = size - header.count * sum(header.widths)
+    if not extra or header.flags & ~MIP_FLAG:
+        return None
+    return f"{extra:,} bytes more than {header.count:,} Gaussians of version {header.version} have"
 
 
 def _zstandard_parts(path: Path, packed: bytes) -> tuple[_Header, list[np.ndarray]]:

@@ -86,6 +86,77 @@ def test_links_in_a_circle_end() -> None:
     assert len(outputs("all")) == 1
 
 
+def link(path: str, target: str) -> None:
+    Path(path).symlink_to(target, target_is_directory=True)
+
+
+def test_folders_are_entered_once_whatever_links_lead_to_them() -> None:
+    folder = "all"
+    for _ in range(16):  # 65,536 paths
+        Path(folder).mkdir()
+        link(f"{folder}/b", "a")
+        folder += "/a"
+    touch(f"{folder}/x.ply")
+    assert actual("all") == [f"{folder}/x.ply"]
+    assert actual("all/**/*.ply") == [f"{folder}/x.ply"]
+
+
+def test_a_pattern_enters_folders_of_every_depth() -> None:
+    touch("s/scene.ply", "s/gs_ply/0000.ply", "s/a/b/c.ply", "s/a/b/.hidden/d.ply", "s/out/e.ply")
+    assert actual("s/**/*.ply", out=Path("s/out")) == ["s/a/b/c.ply", "s/gs_ply/0000.ply", "s/scene.ply"]
+    assert actual("s/**/b/*", "**/c.ply", out=Path("s/out")) == ["s/a/b/c.ply", "s/a/b/c.ply"]
+    assert actual("s/a/**") == ["s/a/b/c.ply", "s/a/b/c.ply"]
+
+
+def test_a_link_to_itself_is_passed_by() -> None:
+    touch("all/a.ply")
+    link("all/itself", "itself")
+    assert actual("all") == ["all/a.ply"]
+
+
+def test_a_folder_of_too_many_others_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gsmerge.batch.find.MAX_FOLDERS", 3)
+    touch("system/1/2/3/4.txt", "all/a.ply", *(f"many/{i}/scene.ply" for i in range(9)))
+    assert len(actual("many")) == 9
+    link("all/link", "../system")
+    with pytest.raises(SceneError, match="all/link/1/2/3: expected scenes, found more than 3 folders without one"):
+        actual("all")
+
+
+def test_a_list_may_name_a_scene_again_and_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    touch("s/a/scene.ply", "s/b.ply")
+    Path("list").write_text("s/a\ns/b.ply\n" * 100_000 + "./s/a\ns\n")
+    assert actual("list") == ["s/a", "s/b.ply", "s/b.ply"]
+    monkeypatch.setattr("gsmerge.batch.find.MAX_LISTED", 3)
+    with pytest.raises(SceneError, match="at most 3 scenes in a list"):
+        actual("list")
+
+
+@pytest.fixture
+def locked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Folders named locked cannot be read; permissions mean nothing to root, which tests may run as."""
+    scandir = os.scandir
+
+    def refuse(path: str | Path) -> object:
+        if Path(path).name == "locked":
+            raise PermissionError(13, "Permission denied", str(path))
+        return scandir(path)
+
+    monkeypatch.setattr(os, "scandir", refuse)
+
+
+@pytest.mark.usefixtures("locked")
+def test_a_folder_that_cannot_be_read_is_passed_by() -> None:
+    touch("all/a.ply", "all/locked/b.ply", "all/z/c.ply")
+    errors: list[SceneError] = []
+    jobs = find_jobs(["all", "all/*"], OUT, BatchOptions(), unreadable=errors)
+    assert [job.scene for job in jobs] == ["all/a.ply", "all/z/c.ply"]
+    assert {str(error) for error in errors} == {"all/locked: cannot be read (Permission denied)"}
+    for given in (["all/locked"], ["all"], ["all/locked/**/*.ply"]):
+        with pytest.raises(SceneError, match="all/locked: cannot be read"):
+            list(find_scenes(given, OUT))
+
+
 @pytest.mark.parametrize(
     ("given", "said"),
     [

@@ -44,6 +44,23 @@ def test_a_lock_is_of_one_process_and_leaves_nothing(tmp_path: Path) -> None:
         assert again == begun
 
 
+def test_a_full_disk_is_named(small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever is written first; an error of the system in the middle of writing names no file."""
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    for name in ("pathlib.Path.write_text", "gsmerge.batch.task.compact_files"):
+        out = tmp_path / name
+
+        def fail(*_: object, **__: object) -> None:
+            raise full
+
+        with monkeypatch.context() as patch:
+            patch.setattr(name, fail)
+            outcome = run_task(*one_task(small_scene, out))
+        assert outcome["status"] == FAILED
+        place = f"{out}: could not be written to" if "write_text" in name else "a file could not be written"
+        assert outcome["error"].startswith(f"{place} (No space left on device)")
+
+
 TAKE_TURNS = """
 import os, pathlib, sys
 from gsmerge.batch.task import BusyError, scene_lock

@@ -55,7 +55,9 @@ def test_the_longest_path_decides(tmp_path: Path) -> None:
     touch(tmp_path, "left/1.png", "right/1.png")
     actual = match_images(tmp_path, ["right/1", "left/1.png"])
     assert [p.parent.name for p in actual] == ["right", "left"]
-    with pytest.raises(SceneError, match=r"expected one image named 1\.png, found 1\.png and 1\.png"):
+    with pytest.raises(
+        SceneError, match=r"expected one image named 1\.png, found left/1\.png and right/1\.png; name the folder"
+    ):
         match_images(tmp_path, ["1.png", "left/1.png"])
 
 

@@ -210,10 +210,10 @@ NAME = "a|b<i>"
 def report() -> str:
     scene = scenes.make_scene(scenes.room(), scenes.arc(3))
     half = scene.gaussians[::2]
-    sizes = {"input": {"path": "in.ply", "bytes": 2000}, NAME: {"path": "out.ply", "bytes": 1000}}
+    sizes = {"input": {"path": "/home/me/rooms/in.ply", "bytes": 2000}, NAME: {"path": "out.ply", "bytes": 1000}}
     evaluation = evaluate(scene, {NAME: half}, None, EvaluateOptions(lpips=()))
     pictures = view_pictures([("in", scene.gaussians), (NAME, half)], scene.cameras, scene.images, max_views=2)
-    return report_page(evaluation_document(evaluation, sizes, ["first <note>"]), pictures)
+    return report_page(evaluation_document(evaluation, sizes, ["first <note>", "/home/me/rooms/a.json: odd"]), pictures)
 
 
 def test_a_report_loads_nothing_and_escapes_names(report: str) -> None:
@@ -223,6 +223,12 @@ def test_a_report_loads_nothing_and_escapes_names(report: str) -> None:
     addresses = re.findall(r"""(?:src|href)=["']?([^"'> ]*)""", report)
     assert len(addresses) >= 6
     assert all(address.startswith("data:") for address in addresses)
+
+
+def test_a_report_shows_no_folders_of_the_machine(report: str) -> None:
+    assert "/home" not in report
+    assert "rooms/in.ply: before and after" in report
+    assert "rooms/a.json: odd" in report
 
 
 def test_in_a_report_the_headline_comes_first_then_pictures(report: str) -> None:

@@ -103,3 +103,6 @@ def test_what_a_header_promises(tmp_path: Path) -> None:
     (tmp_path / "d.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nend_header\nelement vertex 5\n")
     assert header_counts(tmp_path / "d.ply") == (0, 0)
     assert header_counts(tmp_path / "none.ply") == (0, 0)
+    if hasattr(os, "mkfifo"):
+        os.mkfifo(tmp_path / "pipe.ply")  # which nobody writes to
+        assert header_counts(tmp_path / "pipe.ply") == (0, 0)

@@ -12,8 +12,9 @@ import pytest
 
 from gsmerge import Gaussians
 from gsmerge.cli import main
-from gsmerge.errors import UsageError
+from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import kept_comments, lost_harmonics, read_gaussians, write_gaussians
+from gsmerge.io.formats import spz
 from gsmerge.io.formats.spz import spz_bytes
 
 from .slow_readers import assert_damage_is_one_line, corners
@@ -167,6 +168,30 @@ DAMAGED = OLDER | {
 @pytest.mark.parametrize("name", DAMAGED)
 def test_damage_is_one_line(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert_damage_is_one_line(tmp_path / f"{name}.spz", DAMAGED[name], capsys)
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_more_gaussians_than_its_bytes_can_describe(version: int, tmp_path: Path) -> None:
+    """Equal ones are packed a thousandfold: they would take more memory than the file says."""
+    count = spz.FREE_COUNT + 1
+    header = struct.pack("<3I4B", 0x5053474E, version, count, 0, 12, 0, 5 if version == 4 else 0)
+    columns = [bytes(width * count) for width in (9, 1, 3, 3, 4)]
+    content = gzip.compress(header + b"".join(columns), 1)
+    if version == 4:
+        packed = [zstandard.compress(column) for column in columns]
+        sizes = b"".join(struct.pack("<QQ", len(part), len(c)) for part, c in zip(packed, columns, strict=True))
+        content = header + struct.pack("<I12x", 32) + sizes + b"".join(packed)
+        content += bytes(20 * count // 1000)  # so that it is not refused for its ratio alone
+    path = tmp_path / "a.spz"
+    path.write_bytes(content)
+    with pytest.raises(SceneError, match=r"at most 1,000,000 Gaussians in .* bytes, found 1,000,001 promised"):
+        read_gaussians(path)
+
+
+def test_a_wrong_version_leaks_no_warning(tmp_path: Path) -> None:
+    data = gzip.decompress(spz_bytes(some(0, 2000)))
+    (tmp_path / "a.spz").write_bytes(gzip.compress(data[:4] + struct.pack("<I", 1) + data[8:]))
+    assert 0 < read_gaussians(tmp_path / "a.spz").info.num_nonfinite < 2000  # warnings are errors in tests
 
 
 def test_another_version_is_refused() -> None:

@@ -1,0 +1,37 @@
+"""``gsmerge check``: whether files are sound."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+from gsmerge.cli import parameters as opt
+from gsmerge.cli.console import print_document, say_notes
+from gsmerge.errors import SceneError
+
+
+@opt.command(
+    opt.argument("paths", list[Path], "FILE...", "Files of Gaussians (.ply, .spz, .sog, .splat), "
+                 "cameras (.json, .npz, ..., a COLMAP folder), .gsm files, and networks "
+                 "(.safetensors)."),
+)  # fmt: skip
+def check(args: opt.Args) -> None:
+    """Read files to their ends and say what is wrong: counts, NaN, ranges, checksums."""
+    from gsmerge.file_checks import check_content
+    from gsmerge.report import document_head
+
+    checks = [check_content(path) for path in args.paths]
+    wrong = [one for one in checks if one.problems]
+    notes = [f"{one.path}: {note}" for one in checks for note in one.notes]
+    say_notes(notes, quiet=args.silent)
+    document = {
+        **document_head(),
+        "files": [asdict(one) for one in checks],
+        "num_wrong": len(wrong),
+        "notes": notes,
+    }
+    print_document(document, [one.line for one in checks], as_json=args.json, quiet=args.quiet)
+    if wrong:
+        problem = "; ".join(wrong[0].problems)
+        more = f"wrong files: {len(wrong)} of {len(checks)}" if len(checks) > 1 else ""
+        raise SceneError(wrong[0].path, problem, more)

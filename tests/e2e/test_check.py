@@ -1,0 +1,167 @@
+"""``gsmerge check``: sound files of every format, and every kind of fault by its cause."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import shutil
+import struct
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hostile.gsm_files import entry, filled, with_array, with_text
+from safetensors.numpy import load_file
+
+import gsmerge
+from gsmerge.cli import main
+from gsmerge.io import write_gaussians
+from gsmerge.networks.checkpoint import IN_PACKAGE
+
+from .conftest import Run, assert_refused, listing
+
+FORMATS = ("scene.ply", "a.compressed.ply", "a.spz", "a.splat", "a.sog")
+OTHERS = ("room.gsm", "state.gsm", "networks.safetensors", "transforms.json", "views.npz")
+Spoil = Callable[[Path], object]
+
+
+@pytest.fixture(scope="module")
+def sound(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a sound file of every kind. Read only."""
+    folder = Path(shutil.copytree(small_scene, tmp_path_factory.mktemp("sound") / "room"))
+    for name in FORMATS[1:]:
+        write_gaussians(folder / name, gsmerge.read_ply(folder / "scene.ply").gaussians)
+    shutil.copy(IN_PACKAGE["shipped"], folder / "networks.safetensors")
+    cameras = gsmerge.read_cameras(folder / "transforms.json")
+    np.savez(folder / "views.npz", extrinsics=cameras.viewmats[:, :3], intrinsics=cameras.Ks)
+    small = ["--superpixels", "60", "--checkpoint", "none", "--quiet"]
+    assert main(["encode", str(small_scene), "-o", str(folder / "room.gsm"), *small]) == 0
+    assert main(["extend", str(folder / "state.gsm"), str(small_scene), *small]) == 0
+    return folder
+
+
+def test_sound_files(sound: Path, run: Run) -> None:
+    before = listing(sound)
+    done = run("check", *(sound / name for name in (*FORMATS, *OTHERS)), code=0)
+    assert [line.split(": ")[0] for line in done.out.splitlines()] == [
+        f"ok     {sound / name}" for name in (*FORMATS, *OTHERS)
+    ]
+    assert "scene.ply: 7,680 Gaussians, 17-column export" in done.out
+    assert "groups, encoded scene, " in done.out
+    assert "groups, state, " in done.out
+    assert "views.npz: 5 cameras" in done.out
+    assert run("check", sound / "a.spz", "-q", code=0).out == ""
+    assert listing(sound) == before
+
+
+def test_a_document_of_all(sound: Path, run: Run, tmp_path: Path) -> None:
+    done = run("check", sound / "scene.ply", tmp_path / "none.spz", "--json")
+    assert done.code == 3
+    document = json.loads(done.out)
+    first, second = document["files"]
+    assert (first["kind"], first["count"], first["problems"]) == ("Gaussians", 7680, [])
+    assert first["file_bytes"] == (sound / "scene.ply").stat().st_size
+    assert (second["kind"], second["problems"], document["num_wrong"]) == ("", ["no such file"], 1)
+    assert done.err == f"gsmerge: error: {tmp_path / 'none.spz'}: no such file; wrong files: 1 of 2\n"
+
+
+def fill(value: float, row: int, column: int) -> Spoil:
+    def spoil(path: Path) -> None:
+        head, body = path.read_bytes().split(b"end_header\n", 1)
+        rows = np.frombuffer(body, "<f4").reshape(-1, 17).copy()
+        rows[row, column : column + 4] = value
+        path.write_bytes(head + b"end_header\n" + rows.tobytes())
+
+    return spoil
+
+
+def flip(place: int) -> Spoil:
+    """One bit of the byte at a place, from the end where it is negative."""
+
+    def spoil(path: Path) -> None:
+        data = bytearray(path.read_bytes())
+        data[place] ^= 1
+        path.write_bytes(data)
+
+    return spoil
+
+
+def version(number: int) -> Spoil:
+    def spoil(path: Path) -> None:
+        data = gzip.decompress(path.read_bytes())
+        path.write_bytes(gzip.compress(data[:4] + struct.pack("<I", number) + data[8:]))
+
+    return spoil
+
+
+def member_bit(path: Path) -> None:
+    """One bit in a file of an archive."""
+    with zipfile.ZipFile(path) as archive:
+        info = archive.infolist()[-1]
+    flip(info.header_offset + 30 + len(info.filename) + info.compress_size // 2)(path)
+
+
+def halve(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def append(path: Path) -> None:
+    path.write_bytes(path.read_bytes() + bytes(100))
+
+
+def without_key(path: Path) -> None:
+    data = json.loads(path.read_text())
+    del data["frames"][2]["transform_matrix"]
+    path.write_text(json.dumps(data))
+
+
+def one_number(path: Path) -> None:
+    with_array("features.means", lambda array: array * np.float32(1.5))(path)
+
+
+def infinite(path: Path) -> None:
+    with_array(min(load_file(path)), filled(np.inf))(path)
+
+
+WRONG: dict[str, tuple[str, Spoil, str]] = {
+    "NaN": ("scene.ply", fill(float("nan"), 3, 0), "1 of 7,680 row(s) with NaN or inf"),
+    "a huge scale": ("scene.ply", fill(40, 3, 10), "1 of 7,680 Gaussian(s) with a log scale beyond +-30"),
+    "no rotation": ("scene.ply", fill(0, 3, 13), "1 of 7,680 Gaussian(s) with a rotation of length 0"),
+    "fewer rows": ("scene.ply", halve, "truncated or damaged: expected element 'vertex' with 7680 rows"),
+    "more bytes": ("scene.ply", append, "100 bytes after the last of 7,680 rows"),
+    "more bytes, compressed": ("a.compressed.ply", append, "100 bytes after the last of 7,680 rows"),
+    "the stream's checksum": ("a.spz", flip(-6), "expected a gzip stream of .spz, found another or damaged file"),
+    "the stream's end": ("a.spz", lambda path: path.write_bytes(path.read_bytes()[:-4]), "cut at the end (Compressed"),
+    "a wrong version": ("a.spz", version(2), "7,680 bytes more than 7,680 Gaussians of version 2 have"),
+    "half a spz": ("a.spz", halve, "truncated or damaged"),
+    "half a splat": ("a.splat", lambda path: path.write_bytes(path.read_bytes()[:-5]), "32 bytes per Gaussian"),
+    "a bit of a sog": ("a.sog", member_bit, "Bad CRC-32"),
+    "a bit of an npz": ("views.npz", member_bit, "Bad CRC-32"),
+    "a bit of a gsm": ("room.gsm", flip(-9), "not what was written, by the checksums"),
+    "an array of a gsm": ("state.gsm", one_number, "features.means: not what was written, by the checksums"),
+    "NaN in a gsm": ("room.gsm", with_array("features.covars", filled(np.nan)), "features.covars: expected finite"),
+    "half a gsm": ("state.gsm", halve, "expected a .gsm file, could not read it"),
+    "inf in networks": ("networks.safetensors", infinite, "expected finite numbers"),
+    "a view without a pose": ("transforms.json", without_key, "transform_matrix"),
+    "no file": ("scene.ply", Path.unlink, "no such file"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_files(case: str, sound: Path, tmp_path: Path, run: Run) -> None:
+    name, spoil, said = WRONG[case]
+    path = Path(shutil.copy(sound / name, tmp_path / name))
+    spoil(path)
+    assert_refused(run("check", path, "-q"), 3, f"{path}: ", said)
+    assert run("check", path).out.startswith(f"wrong  {path}: ")
+
+
+def test_older_files_have_no_checksums(sound: Path, tmp_path: Path, run: Run) -> None:
+    path = Path(shutil.copy(sound / "room.gsm", tmp_path))
+    header = entry(path)[1]
+    del header["checksums"]
+    with_text(json.dumps(header))(path)
+    done = run("check", path, code=0)
+    assert done.err == f"note: {path}: no checksums: an older gsmerge wrote it\n"
