@@ -29,6 +29,7 @@ from gsmerge.io.cameras.npz_files import read_depths
 from gsmerge.io.exporters import AUTO, Exporter, ReadHints, choose_exporters, find_exporter, make_hints
 from gsmerge.io.formats.ply import OpacityChoice, PlyInfo, PlyScene, ply_notes, read_gaussians
 from gsmerge.io.photo_files import as_floats, photo_size
+from gsmerge.io.registration.join import join_scenes
 from gsmerge.io.scene_files import (
     SceneFiles,
     find_large_photos,
@@ -80,6 +81,7 @@ class SceneLoad:
     problem: str | None = None  # why the scene is unaligned, in one sentence; None where it is not
     # how far each camera was moved to its Gaussians; empty where none was
     moves: Sequence[dict[str, Any]] = ()
+    joined: Sequence[dict[str, Any]] = ()  # where each of several scenes lies; empty where there is one
 
     def pixel_scene(self) -> Scene:
         """Return the scene if it has one Gaussian per pixel; otherwise raise a SceneError with the reason."""
@@ -90,7 +92,7 @@ class SceneLoad:
 
 def read_scene(
     path: StrPath,
-    *,
+    *more: StrPath,
     cameras: StrPath | None = None,
     images: StrPath | None = None,
     opacity: OpacityChoice = "auto",
@@ -102,6 +104,8 @@ def read_scene(
 
     Args:
         path: The ``.ply``, or a folder that has it.
+        *more: Other scenes of the same place, each in a frame of its own, which are joined with it in its frame
+            (docs/guide/sharp.md).
         cameras: Camera file or folder; None looks next to the ``.ply``.
         images: Folder of images, or an ``.npz`` that holds them; None looks next to the ``.ply``.
         opacity: How opacities are stored; see :func:`gsmerge.io.read_gaussians`.
@@ -118,7 +122,7 @@ def read_scene(
     Example:
         >>> scene = read_scene("scene.ply")  # doctest: +SKIP
     """
-    return load_scene(path, cameras=cameras, images=images, opacity=opacity, **hints).scene
+    return load_scene(path, *more, cameras=cameras, images=images, opacity=opacity, **hints).scene
 
 
 def as_scene(scene: Scene | StrPath) -> Scene:
@@ -133,7 +137,7 @@ def as_scene(scene: Scene | StrPath) -> Scene:
 
 def load_scene(
     path: StrPath,
-    *,
+    *more: StrPath,
     cameras: StrPath | None = None,
     images: StrPath | None = None,
     opacity: OpacityChoice = "auto",
@@ -141,13 +145,37 @@ def load_scene(
 ) -> SceneLoad:
     """Read a scene as :func:`read_scene` does, with all facts about its files."""
     read_hints = make_hints(hints)
-    return load_files(find_scene_files(path, cameras=cameras, images=images), opacity=opacity, hints=read_hints)
+    first, *others = (find_scene_files(one, cameras=cameras, images=images) for one in (path, *more))
+    return load_files(replace(first, more=tuple(others)), opacity=opacity, hints=read_hints)
 
 
 def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = AUTO) -> SceneLoad:
     """Read the scene of given files as :func:`load_scene` does."""
     with use_threads():
-        return align_scene(read_ply_with_hints(files.ply, opacity=opacity, hints=hints), files, hints=hints)
+        own = [replace(files, more=()), *files.more]
+        loads = [
+            align_scene(read_ply_with_hints(one.ply, opacity=opacity, hints=hints), one, hints=hints) for one in own
+        ]
+    return loads[0] if len(loads) == 1 else _join_loads(loads, files)
+
+
+def _join_loads(loads: Sequence[SceneLoad], files: SceneFiles) -> SceneLoad:
+    """Make one scene of several of the same place, with the notes of all."""
+    joined = join_scenes([load.scene for load in loads], [load.files.ply for load in loads])
+    used, scene = [loads[i] for i in joined.used], joined.scene
+    notes = [f"{name}: {text}" for name, load in zip(joined.names, loads, strict=True) for text in load.notes]
+    return replace(
+        used[0],
+        scene=scene,
+        ply=replace(used[0].ply, num_nonfinite=sum(load.ply.num_nonfinite for load in used)),
+        files=files,
+        views=SceneViews(scene.cameras, scene.images, scene.names, tuple(range(len(scene)))),
+        exporters=tuple(dict.fromkeys(exporter for load in used for exporter in load.exporters)),
+        notes=(*notes, *joined.notes),
+        alignment=check_alignment(scene.gaussians, scene.cameras, scene.stored),
+        moves=[move for load in used for move in load.moves],
+        joined=joined.facts,
+    )
 
 
 def read_ply_with_hints(path: Path, *, opacity: OpacityChoice, hints: ReadHints) -> PlyScene:

@@ -21,6 +21,7 @@ from gsmerge.io.photo_files import (
     Photos,
     PhotoTransform,
     Size,
+    change_photos,
     decode_image,
     decode_images,
     find_image,
@@ -29,6 +30,7 @@ from gsmerge.io.photo_files import (
     list_images,
     match_images,
     photo_size,
+    quarter_turns,
     resize_to,
 )
 from gsmerge.kernels.matrices import matmul
@@ -51,6 +53,7 @@ class SceneFiles:
     ply: Path
     cameras: Path | None
     images: Path | None
+    more: tuple[SceneFiles, ...] = ()  # other scenes of the same place, each in a frame of its own
 
 
 def find_scene_files(
@@ -145,6 +148,7 @@ def read_scene_cameras(ply: PlyScene, files: SceneFiles) -> CameraFile:
 def stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos | None:
     """Read the photos of the cameras from a folder, a file that holds them, or where the camera file says; or None."""
     photos = _stored_photos(files, camera_file)
+    photos = photos if photos is None else _turn_photos(photos, _photo_turns(files, camera_file))
     old, size = photo_size(photos), (int(camera_file.widths[0]), int(camera_file.heights[0]))
     if photos is None or old is None or camera_file.source != SHARP or old == size:
         return photos
@@ -163,6 +167,28 @@ def _stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos | None:
         count = 0 if stored is None else len(stored)
         raise SceneError(files.images, f"expected {len(camera_file)} images, one per camera, found {count}")
     return stored
+
+
+def _photo_turns(files: SceneFiles, camera_file: CameraFile) -> int:
+    """Return the quarter turns that SHARP, alone among the models, made as the photo's orientation tag says."""
+    paths = _photo_paths(files, camera_file) if camera_file.source == SHARP else None
+    turns = quarter_turns(paths[0]) if paths else 0
+    if turns % 2 == 0 or not paths:
+        return turns
+    width, height = image_size(paths[0])
+    K = camera_file.Ks[0]
+    aspect = K[1, 1] / K[0, 0]  # of the photo as it was read, whose pixels are square
+    turned, stored = (max(shape / aspect, aspect / shape) for shape in (height / width, width / height))
+    return turns if turned < stored else 0
+
+
+def _turn_photos(photos: Photos, turns: int) -> Photos:
+    """Turn photos by quarter turns, counterclockwise."""
+    if turns == 0:
+        return photos
+    size = photo_size(photos)
+    turned = size[::-1] if turns % 2 else size
+    return change_photos(photos, turned, lambda _, photo: np.ascontiguousarray(np.rot90(photo, turns)))
 
 
 def _photo_paths(files: SceneFiles, camera_file: CameraFile) -> list[Path] | None:
@@ -189,8 +215,10 @@ def find_large_photos(
     ``cameras`` are those of the scene's grid, in the order of the camera file.
     """
     paths = _photo_paths(files, camera_file) if photos is not None else None
-    stored = photo_size(photos) if paths is None else image_size(paths[0])
-    if photos is None or stored is None or size is None:
+    own = photo_size(photos) if paths is None else image_size(paths[0])
+    turns = 0 if paths is None else _photo_turns(files, camera_file)
+    stored = own[::-1] if own is not None and turns % 2 else own
+    if photos is None or own is None or stored is None or size is None:
         return None
     fitted = transform or resize_to(size, size)
     scale = np.array([fitted.scale_x, fitted.scale_y]) * size / np.array(stored)
@@ -207,10 +235,10 @@ def find_large_photos(
     Ks = to_cameras(replace(camera_file, lenses=()), stored).Ks if camera_file.lenses else None
 
     def read(view: int) -> np.ndarray:
-        photo = photos_inside[view] if paths is None else decode_image(paths[view], stored)
+        photo = photos_inside[view] if paths is None else np.rot90(decode_image(paths[view], own), turns)
         if paths is not None and Ks is not None:
             photo = undistort_photos([photo], Ks[view : view + 1], camera_file.lenses[view : view + 1])[0]
-        return photo[rows, columns]
+        return np.ascontiguousarray(photo[rows, columns])
 
     photos_inside = photos if paths is None else ()
     width, height = (int(side) for side in last - first)
