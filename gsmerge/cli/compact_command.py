@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 
 @opt.command(
-    opt.argument("scenes", list[Path], "SCENE...", "A .ply with one Gaussian per pixel and view, or the folder it is "
-                 "in; several of one place, as SHARP writes them, are joined."),
+    opt.argument("scenes", list[Path], "SCENE...", "A .ply with one Gaussian per pixel and view, "
+                 "or the folder it is in; several of one place, as SHARP writes them, are joined."),
     f"{opt.READING} k superpixels budget quality levels effort fit device method recipe checkpoint set crop",
     opt.output(opt.COMPACT_SCENE, "SCENE.compact.ply"),
     f"overwrite report save_cameras dry_run {opt.RUN}",
@@ -74,16 +74,18 @@ def compact(args: opt.Args) -> None:
 
 
 def _check_scenes(args: opt.Args) -> None:
-    """Refuse several scenes that cannot be joined: cameras of all, a missing file, one that is named twice."""
+    """Refuse several scenes with cameras for all, one that is missing, or is named twice."""
     if len(args.scenes) == 1:
         return
     if args.cameras is not None:
-        raise UsageError("--cameras: expected one scene with it, got several, which have cameras beside or inside them")
+        problem = "--cameras: expected one scene with it, got several"
+        raise UsageError(f"{problem}, whose cameras are beside or inside them")
     for place, scene in enumerate(args.scenes):
         if not os.path.lexists(scene):
             raise UsageError(f"{scene}: no such scene; name the output with -o")
         if any(os.path.realpath(scene) == os.path.realpath(other) for other in args.scenes[:place]):
-            raise UsageError(f"{scene}: expected each scene once, got it twice; name the output with -o")
+            remedy = "name the output with -o"
+            raise UsageError(f"{scene}: expected each scene once, got it twice; {remedy}")
 
 
 def _warn_of_memory(files: SceneFiles, *, quiet: bool) -> None:

@@ -113,11 +113,14 @@ class Args(SimpleNamespace):
         return parse_pairs("--hint", self.hint or (), setting_kinds(ReadHints) | {"opacity": OpacityChoice})
 
     def files(self, scene: Path, *more: Path) -> SceneFiles:
-        """Find the .ply, cameras and photos of a scene, and of others to join: the named ones, or those beside each."""
+        """Find the .ply, cameras and photos of a scene, and of others to join with it.
+
+        Cameras and photos are the named ones, or those beside each.
+        """
         from gsmerge.io import find_scene_files
 
-        images = vars(self).get("images")
-        first, *others = (find_scene_files(one, cameras=self.cameras, images=images) for one in (scene, *more))
+        places = {"cameras": self.cameras, "images": vars(self).get("images")}
+        first, *others = (find_scene_files(one, **places) for one in (scene, *more))
         return replace(first, more=tuple(others))
 
     def load(self, files: SceneFiles) -> SceneLoad:

@@ -26,7 +26,8 @@ from gsmerge.types import Cameras, StrPath
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".ppm"})
 _FORMATS = ("JPEG", "WEBP", "BMP", "TIFF", "PPM")  # besides PNG, whose header is read here
 _WIDTH_TAG, _HEIGHT_TAG = 256, 257  # of TIFF: Pillow's own size follows the orientation tag
-_ORIENTATION_TAG, _TURNS = 274, {3: 2, 6: 3, 8: 1}  # quarter turns, counterclockwise; mirrored photos stay
+_ORIENTATION_TAG = 274
+_TURNS = {3: 2, 6: 3, 8: 1}  # quarter turns, counterclockwise, of a tag; mirrored photos stay
 _MAX_PIXEL_BYTES, _MAX_EXTRA = 16, 16 << 20  # of any file: four floats a pixel, and profiles or thumbnails
 ASPECT_TOLERANCE = 0.04  # of width over height: backbones round each side to a multiple of 14 by itself
 _PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
@@ -203,13 +204,13 @@ def image_size(path: Path) -> Size:
 
 
 def quarter_turns(path: Path) -> int:
-    """Return by how many quarter turns, counterclockwise, a photo's orientation tag turns it: 0 to 3."""
+    """Return by how many quarter turns, counterclockwise, a photo's orientation tag turns it."""
     with read_errors(path), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
             with Image.open(path, formats=(*_FORMATS, "PNG")) as image:
                 return _TURNS.get(image.getexif().get(_ORIENTATION_TAG, 0), 0)
-        except Exception:  # whatever a damaged tag makes the library raise: the pixels are checked elsewhere
+        except Exception:  # whatever a damaged tag makes the library raise; pixels are checked later
             return 0
 
 

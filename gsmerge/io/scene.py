@@ -81,7 +81,7 @@ class SceneLoad:
     problem: str | None = None  # why the scene is unaligned, in one sentence; None where it is not
     # how far each camera was moved to its Gaussians; empty where none was
     moves: Sequence[dict[str, Any]] = ()
-    joined: Sequence[dict[str, Any]] = ()  # where each of several scenes lies; empty where there is one
+    joined: Sequence[dict[str, Any]] = ()  # where each of several scenes lies; empty for one
 
     def pixel_scene(self) -> Scene:
         """Return the scene if it has one Gaussian per pixel; otherwise raise a SceneError with the reason."""
@@ -104,8 +104,8 @@ def read_scene(
 
     Args:
         path: The ``.ply``, or a folder that has it.
-        *more: Other scenes of the same place, each in a frame of its own, which are joined with it in its frame
-            (docs/guide/sharp.md).
+        *more: Other scenes of the same place, each in a frame of its own, which are joined with it
+            in its frame (docs/guide/sharp.md).
         cameras: Camera file or folder; None looks next to the ``.ply``.
         images: Folder of images, or an ``.npz`` that holds them; None looks next to the ``.ply``.
         opacity: How opacities are stored; see :func:`gsmerge.io.read_gaussians`.
@@ -145,25 +145,30 @@ def load_scene(
 ) -> SceneLoad:
     """Read a scene as :func:`read_scene` does, with all facts about its files."""
     read_hints = make_hints(hints)
-    first, *others = (find_scene_files(one, cameras=cameras, images=images) for one in (path, *more))
+    named = {"cameras": cameras, "images": images}
+    first, *others = (find_scene_files(one, **named) for one in (path, *more))
     return load_files(replace(first, more=tuple(others)), opacity=opacity, hints=read_hints)
 
 
 def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = AUTO) -> SceneLoad:
     """Read the scene of given files as :func:`load_scene` does."""
     with use_threads():
-        own = [replace(files, more=()), *files.more]
-        loads = [
-            align_scene(read_ply_with_hints(one.ply, opacity=opacity, hints=hints), one, hints=hints) for one in own
-        ]
+        loads = [_load_one(one, opacity, hints) for one in (replace(files, more=()), *files.more)]
     return loads[0] if len(loads) == 1 else _join_loads(loads, files)
+
+
+def _load_one(files: SceneFiles, opacity: OpacityChoice, hints: ReadHints) -> SceneLoad:
+    ply = read_ply_with_hints(files.ply, opacity=opacity, hints=hints)
+    return align_scene(ply, files, hints=hints)
 
 
 def _join_loads(loads: Sequence[SceneLoad], files: SceneFiles) -> SceneLoad:
     """Make one scene of several of the same place, with the notes of all."""
     joined = join_scenes([load.scene for load in loads], [load.files.ply for load in loads])
-    used, scene = [loads[i] for i in joined.used], joined.scene
-    notes = [f"{name}: {text}" for name, load in zip(joined.names, loads, strict=True) for text in load.notes]
+    used = [loads[i] for i in joined.used]
+    scene = joined.scene
+    named = zip(joined.names, loads, strict=True)
+    notes = [f"{name}: {text}" for name, load in named for text in load.notes]
     return replace(
         used[0],
         scene=scene,

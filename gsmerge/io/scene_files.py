@@ -170,7 +170,7 @@ def _stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos | None:
 
 
 def _photo_turns(files: SceneFiles, camera_file: CameraFile) -> int:
-    """Return the quarter turns that SHARP, alone among the models, made as the photo's orientation tag says."""
+    """Return the quarter turns that SHARP, alone among the models, makes by the orientation tag."""
     paths = _photo_paths(files, camera_file) if camera_file.source == SHARP else None
     turns = quarter_turns(paths[0]) if paths else 0
     if turns % 2 == 0 or not paths:
@@ -178,8 +178,9 @@ def _photo_turns(files: SceneFiles, camera_file: CameraFile) -> int:
     width, height = image_size(paths[0])
     K = camera_file.Ks[0]
     aspect = K[1, 1] / K[0, 0]  # of the photo as it was read, whose pixels are square
-    turned, stored = (max(shape / aspect, aspect / shape) for shape in (height / width, width / height))
-    return turns if turned < stored else 0
+    as_turned = height / width / aspect
+    as_stored = width / height / aspect
+    return turns if max(as_turned, 1 / as_turned) < max(as_stored, 1 / as_stored) else 0
 
 
 def _turn_photos(photos: Photos, turns: int) -> Photos:
@@ -188,7 +189,11 @@ def _turn_photos(photos: Photos, turns: int) -> Photos:
         return photos
     size = photo_size(photos)
     turned = size[::-1] if turns % 2 else size
-    return change_photos(photos, turned, lambda _, photo: np.ascontiguousarray(np.rot90(photo, turns)))
+
+    def turn(_: int, photo: np.ndarray) -> np.ndarray:
+        return np.ascontiguousarray(np.rot90(photo, turns))
+
+    return change_photos(photos, turned, turn)
 
 
 def _photo_paths(files: SceneFiles, camera_file: CameraFile) -> list[Path] | None:
@@ -235,10 +240,10 @@ def find_large_photos(
     Ks = to_cameras(replace(camera_file, lenses=()), stored).Ks if camera_file.lenses else None
 
     def read(view: int) -> np.ndarray:
-        photo = photos_inside[view] if paths is None else np.rot90(decode_image(paths[view], own), turns)
+        photo = photos_inside[view] if paths is None else decode_image(paths[view], own)
         if paths is not None and Ks is not None:
             photo = undistort_photos([photo], Ks[view : view + 1], camera_file.lenses[view : view + 1])[0]
-        return np.ascontiguousarray(photo[rows, columns])
+        return np.ascontiguousarray(np.rot90(photo, turns)[rows, columns])
 
     photos_inside = photos if paths is None else ()
     width, height = (int(side) for side in last - first)

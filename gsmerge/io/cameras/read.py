@@ -144,9 +144,10 @@ def read_sharp(path: Path) -> CameraFile | None:
     for element in (data[name] for name in present):
         if element.count > 16 or len(element.properties) != 1 or isinstance(element.properties[0], PlyListProperty):
             return None
-    numbers = {name: np.asarray([row[0] for row in data[name].data], np.float64) for name in present}
+    rows = {name: [row[0] for row in data[name].data] for name in present}
+    numbers = {name: np.asarray(values, np.float64) for name, values in rows.items()}
     extrinsic, intrinsic = numbers["extrinsic"], numbers["intrinsic"]
-    if len(intrinsic) == 4 and "image_size" not in numbers:  # its first versions: focal lengths, width and height
+    if len(intrinsic) == 4 and "image_size" not in numbers:  # first versions: focal lengths and size
         numbers["image_size"] = intrinsic[2:]
         intrinsic = make_pinhole(*intrinsic[:2], *(intrinsic[2:] / 2)).reshape(-1)
     size = numbers.get("image_size", np.zeros(0))

@@ -13,14 +13,15 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.geometry import multiply_quats, normalize, rotmat_to_quat
 from gsmerge.io.alignment import Similarity
-from gsmerge.io.registration.register import move_points, register
+from gsmerge.io.registration.register import register
+from gsmerge.io.registration.similarities import move_points
 from gsmerge.kernels.elementary import arccos
 from gsmerge.kernels.matrices import matmul, solve
 from gsmerge.kernels.raster.harmonics import view_colors
 from gsmerge.types import Cameras, Gaussians, LargePhotos, Scene, grid_ids
 
 DIRECTIONS = 96  # in which harmonics are compared before and after a turn
-BRIGHT = np.float32(20.0)  # harmonic of degree 0 with which no colour falls below 0, where it would be cut off
+BRIGHT = np.float32(20.0)  # harmonic of degree 0 with which no colour is cut off below 0
 
 
 @dataclass(frozen=True)
@@ -31,39 +32,38 @@ class JoinedScene:
     used: tuple[int, ...]  # which of the given scenes are in it
     names: tuple[str, ...]  # of the given scenes, for people
     notes: tuple[str, ...]
-    # for each given scene its path, whether it was `joined`, and then the keypoints that say where it lies, the degrees
-    # that it was turned, its `scale` and the shift of its origin
+    # for each given scene its path, whether it was joined, and then the keypoints that say where it
+    # lies, the degrees that it was turned, its scale and the shift of its origin
     facts: tuple[dict[str, Any], ...]
 
 
 def join_scenes(scenes: Sequence[Scene], paths: Sequence[Path]) -> JoinedScene:
     """Put aligned scenes of one place, each in a frame and a scale of its own, into one.
 
-    ``paths`` are their files, for messages. SceneError if one has no pixels, two differ in the size of their views or
-    in their harmonics, or no two show the same surfaces.
+    ``paths`` are their files, for messages. SceneError if one has no pixels, two differ in the size
+    of their views or in their harmonics, or no two show the same surfaces.
     """
     _check(scenes, paths)
     found = register(scenes)
-    used = tuple(i for i, place in enumerate(found.places) if place is not None)
+    names = _names(paths)
+    used = [i for i, place in enumerate(found.places) if place is not None]
     if len(used) < 2:
-        problem = f"expected files that show one place, found no two of {len(paths)} whose photos share enough of it"
-        remedy = "give photos that overlap by half, name their folder with --images, or compact each file by itself"
-        raise SceneError(paths[0], problem, remedy)
+        problem = f"expected files that show one place, found no two of {len(paths)}"
+        remedy = "give photos that overlap by half, name their folder with --images"
+        remedy += ", or compact each file by itself"
+        raise SceneError(paths[0], f"{problem} whose photos share enough of it", remedy)
     moved = [move_scene(scenes[i], place) for i in used if (place := found.places[i]) is not None]
-    counts, names = [found.matches[i] for i in used], _names(paths)
-    notes = [
-        f"{len(used)} of {len(scenes)} files are joined in the frame of {names[used[0]]}, by {min(counts)} to"
-        f" {max(counts)} keypoints each"
-    ]
-    notes += [
-        f"{name} is left out: too little of what its photo shows is found in the others"
-        for name, place in zip(names, found.places, strict=True)
-        if place is None
-    ]
-    if any(scene.images is None for scene in moved) and any(scene.images is not None for scene in moved):
-        notes.append("some files have no photos, so none are used; name the folder of all with --images")
+    counts = [found.matches[i] for i in used]
+    joined = f"{len(used)} of {len(scenes)} files are joined in the frame of {names[used[0]]}"
+    notes = [f"{joined}, by {min(counts)} to {max(counts)} keypoints each"]
+    left_out = "is left out: too little of what its photo shows is found in the others"
+    notes += [f"{name} {left_out}" for i, name in enumerate(names) if i not in used]
+    if len({scene.images is None for scene in moved}) > 1:
+        notes.append(
+            "some files have no photos, so none are used; name the folder of all with --images"
+        )  # fmt: skip
     facts = [_facts(*one) for one in zip(paths, found.places, found.matches, strict=True)]
-    return JoinedScene(_concat(moved), used, tuple(names), tuple(notes), tuple(facts))
+    return JoinedScene(_concat(moved), tuple(used), tuple(names), tuple(notes), tuple(facts))
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
@@ -74,17 +74,20 @@ def _names(paths: Sequence[Path]) -> list[str]:
 
 def _check(scenes: Sequence[Scene], paths: Sequence[Path]) -> None:
     first = scenes[0]
-    size, degree = (first.cameras.width, first.cameras.height), first.gaussians.sh_degree
+    size = first.cameras.width, first.cameras.height
+    degree = first.gaussians.sh_degree
     for scene, path in zip(scenes, paths, strict=True):
-        other = (scene.cameras.width, scene.cameras.height)
+        other = scene.cameras.width, scene.cameras.height
+        own = scene.gaussians.sh_degree
         if not scene.aligned:
-            problem = "expected one Gaussian per pixel and a camera, to be joined with other files, found none"
+            problem = "expected one Gaussian per pixel and a camera, to be joined, found none"
             raise SceneError(path, problem, "compact it by itself; a result is named with -o")
         if other != size:
-            problem = f"expected views of {size[0]} x {size[1]} as in {paths[0].name}, found {other[0]} x {other[1]}"
+            problem = f"expected views of {size[0]} x {size[1]} as in {paths[0].name}"
+            problem += f", found {other[0]} x {other[1]}"
             raise SceneError(path, problem, "export all at one size")
-        if scene.gaussians.sh_degree != degree:
-            problem = f"expected harmonics of degree {degree} as in {paths[0].name}, found {scene.gaussians.sh_degree}"
+        if own != degree:
+            problem = f"expected harmonics of degree {degree} as in {paths[0].name}, found {own}"
             raise SceneError(path, problem, "export all with one degree")
 
 
@@ -94,7 +97,8 @@ def _facts(path: Path, place: Similarity | None, matches: int) -> dict[str, Any]
         return facts
     half = np.abs(rotmat_to_quat(place.rotation[None])[0, :1]).clip(0, 1)
     degrees = round(float(np.degrees(2 * arccos(half))[0]), 4)
-    return facts | {"matches": matches, "degrees": degrees, "scale": place.scale, "shift": place.shift.tolist()}
+    facts |= {"matches": matches, "degrees": degrees}
+    return facts | {"scale": place.scale, "shift": place.shift.tolist()}
 
 
 def move_scene(scene: Scene, place: Similarity) -> Scene:
@@ -117,7 +121,7 @@ def move_scene(scene: Scene, place: Similarity) -> Scene:
 def turn_harmonics(shN: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """Turn spherical harmonics ``[n,k-1,3]`` with their Gaussians, by ``rotation [3,3]``.
 
-    They are fitted to the same colours in turned directions, which harmonics of a degree can show exactly.
+    They are fitted to the same colours in turned directions, which those of a degree show exactly.
     """
     num = shN.shape[1]
     if num == 0 or len(shN) == 0:
@@ -132,9 +136,12 @@ def turn_harmonics(shN: np.ndarray, rotation: np.ndarray) -> np.ndarray:
 
 def _basis(directions: np.ndarray, num: int) -> np.ndarray:
     """Evaluate the higher harmonics in directions ``[d,3]``: ``[d,num]`` float64."""
-    means, count = directions.astype(np.float32), len(directions)
-    sh0, ids = np.full((count, 1, 3), BRIGHT), np.arange(count, dtype=np.int32)
-    plain, colors = np.empty((2, count, 3), np.float32)
+    means = directions.astype(np.float32)
+    count = len(means)
+    sh0 = np.full((count, 1, 3), BRIGHT)
+    ids = np.arange(count, dtype=np.int32)
+    plain = np.empty((count, 3), np.float32)
+    colors = np.empty((count, 3), np.float32)
     eye = np.zeros(3, np.float32)
     view_colors(means, sh0, np.zeros((count, num, 3), np.float32), ids, eye, 0, count, plain)
     columns = []
@@ -155,20 +162,25 @@ def _concat(scenes: Sequence[Scene]) -> Scene:
         scenes[0].cameras.height,
     )
     images = [scene.images for scene in scenes if scene.images is not None]
-    absent = [np.zeros(scene.valid.shape, bool) if scene.missing is None else scene.missing for scene in scenes]
+    gaps = [scene.missing for scene in scenes]
+    incomplete = any(one is not None for one in gaps)
+    filled = [
+        np.zeros_like(scene.valid) if one is None else one
+        for scene, one in zip(scenes, gaps, strict=True)
+    ]  # fmt: skip
     return Scene(
         gaussians=Gaussians.concat([scene.gaussians for scene in scenes]),
         cameras=cameras,
         images=np.concatenate(images) if len(images) == len(scenes) else None,
         pixel_ids=grid_ids(np.concatenate([scene.valid for scene in scenes])),
         names=tuple(name for scene in scenes for name in scene.names),
-        missing=np.concatenate(absent) if any(scene.missing is not None for scene in scenes) else None,
+        missing=np.concatenate(filled) if incomplete else None,
         large_photos=_concat_large([scene.large_photos for scene in scenes]),
     )
 
 
 def _concat_large(photos: Sequence[LargePhotos | None]) -> LargePhotos | None:
-    """Put large photos one after the other; None where some are missing, or they have several sizes."""
+    """Put large photos one after the other; None where some are missing or sizes differ."""
     given = [one for one in photos if one is not None]
     if len(given) < len(photos) or len({(one.width, one.height) for one in given}) > 1:
         return None

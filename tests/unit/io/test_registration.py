@@ -17,7 +17,8 @@ from gsmerge.geometry import camera_centres
 from gsmerge.io.alignment import Similarity
 from gsmerge.io.registration import keypoints
 from gsmerge.io.registration.join import join_scenes, move_scene, turn_harmonics
-from gsmerge.io.registration.register import DIGITS, fit_similarities, register
+from gsmerge.io.registration.register import register
+from gsmerge.io.registration.similarities import DIGITS, fit_similarities
 from gsmerge.research.generate import GenerateOptions, NoiseOptions, make_scene
 from gsmerge.types import grid_ids
 
