@@ -21,6 +21,7 @@ from gsmerge.io.registration.register import register
 from gsmerge.io.registration.similarities import DIGITS, fit_similarities
 from gsmerge.research.generate import GenerateOptions, NoiseOptions, make_scene
 from gsmerge.types import grid_ids
+from gsmerge.views import subset
 
 VIEWS = 6
 SCALES = (1.1, 0.8, 1.25, 0.93, 1.0, 0.87)
@@ -83,6 +84,17 @@ def test_a_view_of_another_place_is_left_out(parts: list[Scene]) -> None:
     assert joined.notes[1].startswith("a.ply is left out")
     with pytest.raises(SceneError, match="no two of 2 whose photos share enough of it; give photos that overlap"):
         join_scenes([stranger, parts[0]], PATHS[:2])
+
+
+def test_files_of_several_views(place: Scene) -> None:
+    """Each with frame and unit of its own: two exports of one room."""
+    turn, shift = rotation(0.5, -1.0, 2.2), np.array([4.0, -3, 2])
+    other = move_scene(subset(place, [1, 3, 5]), Similarity(turn, 1.6, shift))
+    joined = join_scenes([subset(place, [0, 2, 4]), other], PATHS[:2])
+    true = place.cameras.viewmats[[0, 2, 4, 1, 3, 5]]
+    assert abs(joined.facts[1]["scale"] * 1.6 - 1) < 0.01
+    apart = camera_centres(joined.scene.cameras.viewmats) - camera_centres(true)
+    assert np.linalg.norm(apart, axis=1).max() < 0.03
 
 
 def test_without_photos_base_colours_are_compared(parts: list[Scene]) -> None:
