@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -160,6 +161,9 @@ def recognised_of(loaded: SceneLoad) -> dict[str, Any]:
     views: dict[str, Any] = {"num_views": len(cameras), "height": cameras.height, "width": cameras.width}
     views |= {"exporters": [exporter.name for exporter in loaded.exporters], "rows": recovery and recovery.description}
     views["moved_cameras"] = list(loaded.moves)
+    if loaded.joined:
+        num_bytes = sum(os.stat(one["path"]).st_size for one in loaded.joined if one["joined"])
+        views |= {"files": list(loaded.joined), "bytes": num_bytes}
     return views | {name: getattr(loaded.ply, name) for name in names}
 
 

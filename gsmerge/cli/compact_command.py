@@ -6,6 +6,7 @@ import os
 import shlex
 import sys
 from dataclasses import replace
+from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING
 
@@ -20,23 +21,22 @@ from gsmerge.cli.paths import (
     holds_cameras,
     input_files,
 )
-from gsmerge.errors import TargetError
+from gsmerge.errors import TargetError, UsageError
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from gsmerge.io import ReadHints, SceneFiles
     from gsmerge.options import CompactOptions
 
 
 @opt.command(
-    opt.SCENE,
+    opt.argument("scenes", list[Path], "SCENE...", "A .ply with one Gaussian per pixel and view, "
+                 "or the folder it is in; several of one place, as SHARP writes them, are joined."),
     f"{opt.READING} masks k superpixels budget quality levels",
     "effort fit exposure device method recipe checkpoint set crop",
     opt.output(opt.COMPACT_SCENE, "SCENE.compact.ply"),
     f"overwrite report save_cameras dry_run {opt.RUN}",
     rare=f"hint masks levels fit exposure method recipe checkpoint crop save_cameras json quiet {opt.RUN}",
-)
+)  # fmt: skip
 def compact(args: opt.Args) -> None:
     """Write a compact scene that renders like the given one, or better, with 1 to 10 % of its Gaussians."""
     start = perf_counter()
@@ -46,7 +46,8 @@ def compact(args: opt.Args) -> None:
     from gsmerge.options import CompactOptions
 
     settings, writing = args.make(CompactOptions, FileOptions)
-    files = args.files(args.scene)
+    _check_scenes(args)
+    files = args.files(*args.scenes)
     out = args.output or default_output(files.ply)
     levels = [level_output(out, level) for level in range(1, settings.budget.levels)]
     cameras = viewer_cameras_path(out) if writing.viewer_cameras else None
@@ -75,11 +76,26 @@ def compact(args: opt.Args) -> None:
     say_notes(document["notes"], quiet=args.silent)
     lines = summary_lines(document)
     if sys.stdout.isatty():
-        view = shlex.join(["gsmerge", "view", str(args.scene), str(out)])
+        view = shlex.join(["gsmerge", "view", str(args.scenes[0]), str(out)])
         lines = result_table(document, view if out.suffix.lower() == ".ply" else None)
     print_document(document, lines, as_json=args.json, quiet=args.quiet)
     if document["unmet"]:
         raise TargetError(document["unmet"])
+
+
+def _check_scenes(args: opt.Args) -> None:
+    """Refuse several scenes with cameras for all, one that is missing, or is named twice."""
+    if len(args.scenes) == 1:
+        return
+    if args.cameras is not None:
+        problem = "--cameras: expected one scene with it, got several"
+        raise UsageError(f"{problem}, whose cameras are beside or inside them")
+    for place, scene in enumerate(args.scenes):
+        if not os.path.lexists(scene):
+            raise UsageError(f"{scene}: no such scene; name the output with -o")
+        if any(os.path.realpath(scene) == os.path.realpath(other) for other in args.scenes[:place]):
+            remedy = "name the output with -o"
+            raise UsageError(f"{scene}: expected each scene once, got it twice; {remedy}")
 
 
 def _warn_of_memory(files: SceneFiles, *, quiet: bool) -> None:
@@ -87,7 +103,8 @@ def _warn_of_memory(files: SceneFiles, *, quiet: bool) -> None:
     from gsmerge.io.formats.ply_file import header_counts
     from gsmerge.runtime.estimate import memory_bytes, memory_problem
 
-    count, num_rest = header_counts(files.ply)
+    counts = [header_counts(one.ply) for one in (files, *files.more)]
+    count, num_rest = sum(count for count, _ in counts), max(rest for _, rest in counts)
     problem = memory_problem(memory_bytes(count, photos=True, num_rest=num_rest))
     if problem is not None:
         say(f"gsmerge: warning: {problem}", quiet=quiet)
@@ -104,7 +121,8 @@ def print_plan(args: opt.Args, files: SceneFiles, settings: CompactOptions, out:
     from gsmerge.runtime.record import record_run
 
     given = read_input(files, opacity=args.opacity, hints=hints)
-    scene, paths = given.scene, {name: path and str(path) for name, path in vars(files).items()}
+    scene = given.scene
+    paths = {name: path and str(path) for name, path in vars(files).items() if name != "more"}
     check_saved_cameras(scene, vars(args).get("save_cameras"))
     _, unused = choose_baseline(settings, scene)
     backend, problem = choose_backend(settings.device, scene.num_gaussians)

@@ -13,7 +13,7 @@ import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from copy import copy
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from difflib import get_close_matches
 from enum import Enum
 from functools import wraps
@@ -112,12 +112,16 @@ class Args(SimpleNamespace):
 
         return parse_pairs("--hint", self.hint or (), setting_kinds(ReadHints) | {"opacity": OpacityChoice})
 
-    def files(self, scene: Path) -> SceneFiles:
-        """Find the scene's .ply, its cameras and its photos: the named ones, or those beside it."""
+    def files(self, scene: Path, *more: Path) -> SceneFiles:
+        """Find the .ply, cameras and photos of a scene, and of others to join with it.
+
+        Cameras and photos are the named ones, or those beside each.
+        """
         from gsmerge.io import find_scene_files
 
-        images, masks = (vars(self).get(name) for name in ("images", "masks"))
-        return find_scene_files(scene, cameras=self.cameras, images=images, masks=masks)
+        places = {"cameras": self.cameras, **{name: vars(self).get(name) for name in ("images", "masks")}}
+        first, *others = (find_scene_files(one, **places) for one in (scene, *more))
+        return replace(first, more=tuple(others))
 
     def load(self, files: SceneFiles, **defaults: Any) -> SceneLoad:
         """Read the scene of these files; ``defaults`` are hints that the user may override."""

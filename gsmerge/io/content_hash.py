@@ -13,7 +13,8 @@ from gsmerge.io import SCENE_SUFFIXES, CameraFile, SceneFiles, read_cameras
 from gsmerge.io.bounds import read_errors, walk_files
 from gsmerge.io.cameras.json_files import DATAPARSER, FRAMES_FILE, POSE_FILE, SCALE_FILE
 from gsmerge.io.cameras.read import INTRINSICS
-from gsmerge.io.scene_files import IMAGE_PLACES, images_beside
+from gsmerge.io.scene_files import IMAGE_PLACES
+from gsmerge.io.scene_views import images_beside
 
 EXTRA_FILES = (DATAPARSER, *INTRINSICS, FRAMES_FILE, POSE_FILE, SCALE_FILE)  # read with some camera files
 

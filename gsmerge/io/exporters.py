@@ -136,7 +136,7 @@ _EXPORTERS = (
     # Models of one image, or of a few of one object.
     Exporter(
         "sharp", "SHARP", "logit", "layer-major", ("full",), per_pixel=(2,), normals=False,
-        elements=("extrinsic", "intrinsic", "image_size"),
+        elements=("extrinsic", "intrinsic"),
     ),
     Exporter(
         "splatter-image", "Splatter Image", "logit", "view-major", ("pruned", "full"), ("same", "scaled", "other"),

@@ -15,7 +15,8 @@ from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.exporters import AUTO
 from gsmerge.io.photo_files import as_floats, find_image, photo_size
 from gsmerge.io.scene import SceneLoad
-from gsmerge.io.scene_files import IMAGE_PLACES, SceneFiles, limit_photo_size, stored_photos
+from gsmerge.io.scene_files import IMAGE_PLACES, SceneFiles
+from gsmerge.io.scene_views import limit_photo_size, stored_photos
 from gsmerge.kernels.elementary import arccos
 from gsmerge.kernels.matrices import closest_rotation, matmul
 from gsmerge.types import Scene, StrPath, Views

@@ -26,6 +26,8 @@ from gsmerge.types import Cameras, StrPath
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".ppm"})
 _FORMATS = ("JPEG", "WEBP", "BMP", "TIFF", "PPM")  # besides PNG, whose header is read here
 _WIDTH_TAG, _HEIGHT_TAG = 256, 257  # of TIFF: Pillow's own size follows the orientation tag
+_ORIENTATION_TAG = 274
+_TURNS = {3: 2, 6: 3, 8: 1}  # quarter turns, counterclockwise, of a tag; mirrored photos stay
 _MAX_PIXEL_BYTES, _MAX_EXTRA = 16, 16 << 20  # of any file: four floats a pixel, and profiles or thumbnails
 _OPAQUE_SUFFIXES = frozenset({".jpg", ".jpeg", ".ppm"})
 _HALF_OPAQUE = 127
@@ -253,6 +255,17 @@ def image_size(path: Path) -> Size:
     if num_bytes > _MAX_PIXEL_BYTES * width * height + _MAX_EXTRA:
         raise SceneError(path, f"expected an image of {width} x {height}, found {num_bytes >> 20} MiB for it")
     return width, height
+
+
+def quarter_turns(path: Path) -> int:
+    """Return by how many quarter turns, counterclockwise, a photo's orientation tag turns it."""
+    with read_errors(path), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            with Image.open(path, formats=(*_FORMATS, "PNG")) as image:
+                return _TURNS.get(image.getexif().get(_ORIENTATION_TAG, 0), 0)
+        except Exception:  # whatever a damaged tag makes the library raise; pixels are checked later
+            return 0
 
 
 def _header_size(path: Path, file: BinaryIO) -> Size:

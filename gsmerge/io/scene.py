@@ -29,12 +29,12 @@ from gsmerge.io.cameras.npz_files import read_depths
 from gsmerge.io.exporters import AUTO, Exporter, ReadHints, choose_exporters, find_exporter, make_hints
 from gsmerge.io.formats.ply import OpacityChoice, PlyInfo, PlyScene, ply_notes, read_gaussians
 from gsmerge.io.photo_files import as_floats, photo_size
-from gsmerge.io.scene_files import (
-    SceneFiles,
+from gsmerge.io.registration.join import join_scenes
+from gsmerge.io.scene_files import SceneFiles, find_scene_files
+from gsmerge.io.scene_views import (
     cut_bars,
     find_large_photos,
     find_masks,
-    find_scene_files,
     limit_photo_size,
     limit_view_size,
     read_scene_cameras,
@@ -80,6 +80,7 @@ class SceneLoad:
     problem: str | None = None  # why the scene is unaligned, in one sentence; None where it is not
     # how far each camera was moved to its Gaussians; empty where none was
     moves: Sequence[dict[str, Any]] = ()
+    joined: Sequence[dict[str, Any]] = ()  # where each of several scenes lies; empty for one
 
     def pixel_scene(self) -> Scene:
         """Return the scene if it has one Gaussian per pixel; otherwise raise a SceneError with the reason."""
@@ -90,7 +91,7 @@ class SceneLoad:
 
 def read_scene(
     path: StrPath,
-    *,
+    *more: StrPath,
     cameras: StrPath | None = None,
     images: StrPath | None = None,
     masks: StrPath | None = None,
@@ -103,6 +104,8 @@ def read_scene(
 
     Args:
         path: The ``.ply``, or a folder that has it.
+        *more: Other scenes of the same place, each in a frame of its own, which are joined with it
+            in its frame (docs/guide/sharp.md).
         cameras: Camera file or folder; None looks next to the ``.ply``.
         images: Folder of images, or an ``.npz`` that holds them; None looks next to the ``.ply``.
         masks: Folder of masks, images named as the photos, dark where a photo does not count; None: ``masks`` beside
@@ -121,7 +124,7 @@ def read_scene(
     Example:
         >>> scene = read_scene("scene.ply")  # doctest: +SKIP
     """
-    return load_scene(path, cameras=cameras, images=images, masks=masks, opacity=opacity, **hints).scene
+    return load_scene(path, *more, cameras=cameras, images=images, masks=masks, opacity=opacity, **hints).scene
 
 
 def as_scene(scene: Scene | StrPath) -> Scene:
@@ -136,7 +139,7 @@ def as_scene(scene: Scene | StrPath) -> Scene:
 
 def load_scene(
     path: StrPath,
-    *,
+    *more: StrPath,
     cameras: StrPath | None = None,
     images: StrPath | None = None,
     masks: StrPath | None = None,
@@ -145,14 +148,42 @@ def load_scene(
 ) -> SceneLoad:
     """Read a scene as :func:`read_scene` does, with all facts about its files."""
     read_hints = make_hints(hints)
-    files = find_scene_files(path, cameras=cameras, images=images, masks=masks)
-    return load_files(files, opacity=opacity, hints=read_hints)
+    named = {"cameras": cameras, "images": images, "masks": masks}
+    first, *others = (find_scene_files(one, **named) for one in (path, *more))
+    return load_files(replace(first, more=tuple(others)), opacity=opacity, hints=read_hints)
 
 
 def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = AUTO) -> SceneLoad:
     """Read the scene of given files as :func:`load_scene` does."""
     with use_threads():
-        return align_scene(read_ply_with_hints(files.ply, opacity=opacity, hints=hints), files, hints=hints)
+        loads = [_load_one(one, opacity, hints) for one in (replace(files, more=()), *files.more)]
+    return loads[0] if len(loads) == 1 else _join_loads(loads, files)
+
+
+def _load_one(files: SceneFiles, opacity: OpacityChoice, hints: ReadHints) -> SceneLoad:
+    ply = read_ply_with_hints(files.ply, opacity=opacity, hints=hints)
+    return align_scene(ply, files, hints=hints)
+
+
+def _join_loads(loads: Sequence[SceneLoad], files: SceneFiles) -> SceneLoad:
+    """Make one scene of several of the same place, with the notes of all."""
+    joined = join_scenes([load.scene for load in loads], [load.files.ply for load in loads])
+    used = [loads[i] for i in joined.used]
+    scene = joined.scene
+    named = zip(joined.names, loads, strict=True)
+    notes = [f"{name}: {text}" for name, load in named for text in load.notes]
+    return replace(
+        used[0],
+        scene=scene,
+        ply=replace(used[0].ply, num_nonfinite=sum(load.ply.num_nonfinite for load in used)),
+        files=files,
+        views=SceneViews(scene.cameras, scene.images, scene.names, tuple(range(len(scene)))),
+        exporters=tuple(dict.fromkeys(exporter for load in used for exporter in load.exporters)),
+        notes=(*notes, *joined.notes),
+        alignment=check_alignment(scene.gaussians, scene.cameras, scene.stored),
+        moves=[move for load in used for move in load.moves],
+        joined=joined.facts,
+    )
 
 
 def read_ply_with_hints(path: Path, *, opacity: OpacityChoice, hints: ReadHints) -> PlyScene:

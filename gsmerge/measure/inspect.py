@@ -23,7 +23,7 @@ from gsmerge.io.exporters import exporter_names, make_hints
 from gsmerge.io.formats.ply import OpacityChoice
 from gsmerge.io.formats.ply_file import LOGIT_COMMENT
 from gsmerge.io.formats.writing import file_bytes
-from gsmerge.io.scene_files import read_scene_cameras
+from gsmerge.io.scene_views import read_scene_cameras
 from gsmerge.measure.visibility import MAX_SAMPLES, inside_views
 from gsmerge.options import CompactOptions
 from gsmerge.plan import resolved_settings, steps_for

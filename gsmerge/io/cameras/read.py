@@ -32,7 +32,7 @@ INTRINSICS = ("intrinsic.txt", "intrinsics.txt")
 _POSE_COLUMNS = (12, 16)  # numbers of a pose in a line
 _MAX_OTHERS = 16  # files in a folder that are looked into for cameras
 SHARP = "SHARP"
-_SHARP_ELEMENTS = ("extrinsic", "intrinsic", "image_size")
+_SHARP_ELEMENTS = ("extrinsic", "intrinsic", "image_size")  # the last not in its first versions
 SHARP_LAYERS = 2  # Gaussians per cell: a front and a back layer
 
 
@@ -157,20 +157,27 @@ def read_sharp(path: Path) -> CameraFile | None:
     if path.suffix.lower() in READERS:
         return None
     data = open_ply(path)
-    if "vertex" not in data or not all(name in data for name in _SHARP_ELEMENTS):
+    present = [name for name in _SHARP_ELEMENTS if name in data]
+    if "vertex" not in data or not {"extrinsic", "intrinsic"}.issubset(present):
         return None
-    for element in (data[name] for name in _SHARP_ELEMENTS):
+    for element in (data[name] for name in present):
         if element.count > 16 or len(element.properties) != 1 or isinstance(element.properties[0], PlyListProperty):
             return None
-    extrinsic, intrinsic, size = (
-        np.asarray([row[0] for row in data[name].data], np.float64) for name in _SHARP_ELEMENTS
-    )
+    rows = {name: [row[0] for row in data[name].data] for name in present}
+    numbers = {name: np.asarray(values, np.float64) for name, values in rows.items()}
+    extrinsic, intrinsic = numbers["extrinsic"], numbers["intrinsic"]
+    if len(intrinsic) == 4 and "image_size" not in numbers:  # first versions: focal lengths and size
+        numbers["image_size"] = intrinsic[2:]
+        intrinsic = make_pinhole(*intrinsic[:2], *(intrinsic[2:] / 2)).reshape(-1)
+    size = numbers.get("image_size", np.zeros(0))
     side = round((data["vertex"].count / SHARP_LAYERS) ** 0.5)
     if SHARP_LAYERS * side * side != data["vertex"].count or len(size) != 2 or not (size > 0).all():
         return None
-    if len(extrinsic) not in (12, 16) or len(intrinsic) not in (4, 9):
+    if len(extrinsic) not in (12, 16) or len(intrinsic) != 9:
         raise SceneError(path, f"expected 16 and 9 numbers of a camera, found {len(extrinsic)} and {len(intrinsic)}")
-    K = make_pinhole(*intrinsic) if len(intrinsic) == 4 else intrinsic.reshape(3, 3)
+    pose, K = extrinsic.reshape(-1, 4).copy(), intrinsic.reshape(3, 3)
+    if len(extrinsic) == 12:  # its first versions: the rotation column by column
+        pose[:, :3] = pose[:, :3].T.copy()
     K = K * np.array([[side / size[0]], [side / size[1]], [1.0]])
-    view = View(path.stem, extrinsic.reshape(-1, 4), K, (side, side))
+    view = View(path.stem, pose, K, (side, side))
     return make_camera_file(path, SHARP, W2C_OPENCV, [view])

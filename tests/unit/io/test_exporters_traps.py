@@ -20,7 +20,9 @@ from exports import (
     with_intrinsics,
     with_surface_rotations,
 )
-from plyfile import PlyData, PlyElement
+from PIL import Image
+from plyfile import PlyData
+from sharp_files import write_elements
 from tiny_scene import rotation, write_colmap_text, write_inria, write_npz
 
 from gsmerge.io import load_scene, read_ply, read_scene
@@ -236,43 +238,65 @@ def test_the_header_of_nerfstudio(tmp_path: Path) -> None:
 # SHARP
 
 
-def sharp_file(folder: Path, extrinsic: np.ndarray, intrinsic: np.ndarray, size: tuple[int, int]) -> Smooth:
-    """Two layers seen by a camera at the origin, with all of SHARP's elements."""
-    square = smooth_scene(36, 36)
+def sharp_rows(square: Smooth) -> np.ndarray:
+    """Two layers seen by a camera at the origin."""
     one = np.arange(36 * 36)
     rows = turned(export_rows(square, np.concatenate([one, one]), normals=""), square.w2c[0, :3, :3],
                   shift=square.w2c[0, :3, 3])  # fmt: skip
     rows["opacity"][36 * 36 :] = -2
-    parts = {
-        "extrinsic": ("f4", extrinsic), "intrinsic": ("f4", intrinsic), "image_size": ("u4", size),
-        "frame": ("i4", (1, len(rows))), "disparity": ("f4", (0.1, 0.9)), "color_space": ("u1", (0,)),
-        "version": ("u1", (1, 5, 0)),
-    }  # fmt: skip
-    elements = [PlyElement.describe(rows, "vertex")]
-    elements += [PlyElement.describe(np.array([(v,) for v in values], [(name, kind)]), name)
-                 for name, (kind, values) in parts.items()]  # fmt: skip
-    PlyData(elements, byte_order="<").write(str(folder / "photo.ply"))
-    return square
+    return rows
 
 
 @pytest.mark.parametrize("legacy", [False, True])
 def test_all_elements_of_sharp(tmp_path: Path, legacy: bool) -> None:
     size = (48, 36)
     (tmp_path / "images").mkdir()
-    cv2.imwrite(str(tmp_path / "images" / "photo.png"), cv2.resize(smooth_scene(36, 36).images[0], size)[..., ::-1])
-    K = smooth_scene(36, 36).K * np.array([[size[0] / 36], [size[1] / 36], [1.0]])
-    intrinsic = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]) if legacy else K.reshape(-1)
-    extrinsic = np.eye(4)[:3].reshape(-1) if legacy else np.eye(4).reshape(-1)
-    square = sharp_file(tmp_path, extrinsic, intrinsic, size)
+    square = with_intrinsics(smooth_scene(36, 36), np.array([[39.6, 0, 18], [0, 54, 18], [0, 0, 1]]))
+    cv2.imwrite(str(tmp_path / "images" / "photo.png"), cv2.resize(square.images[0], size)[..., ::-1])
+    K = square.K * np.array([[size[0] / 36], [size[1] / 36], [1.0]])
+    rows = sharp_rows(square)
+    pose = square.w2c[1]
+    rows = turned(rows, pose[:3, :3].T, shift=-pose[:3, :3].T @ pose[:3, 3])
+    if legacy:
+        numbers = np.concatenate([pose[:3, :3].T, pose[:3, 3:]], 1).reshape(-1)
+        write_elements(tmp_path / "photo.ply", rows, numbers, [K[0, 0], K[1, 1], *size], None)
+    else:
+        write_elements(tmp_path / "photo.ply", rows, pose.reshape(-1), K.reshape(-1), size)
     loaded = load_scene(tmp_path / "photo.ply")
     scene = loaded.pixel_scene()
     assert scene.valid.shape == (2, 36, 36)
     assert np.allclose(scene.cameras.Ks[0], square.K, atol=1e-4)
+    assert np.allclose(scene.cameras.viewmats, pose, atol=1e-6)
     assert set(loaded.ply.extra_elements) >= {"frame", "disparity", "color_space", "version"}
     assert "version" not in loaded.ply.columns
     assert [d.name for d in loaded.exporters] == ["sharp"]
     assert scene.images.shape == (2, 36, 36, 3)
     assert np.allclose(scene.gaussians.opacities[36 * 36 :], 1 / (1 + np.exp(2)))
+
+
+@pytest.mark.parametrize("tag", [1, 3, 6, 8])
+def test_sharp_turns_photos_upright(tmp_path: Path, tag: int) -> None:
+    """As their orientation tag says, as no other model does; its camera is that of the upright photo."""
+    size = (48, 64)
+    square = with_intrinsics(smooth_scene(36, 36), np.array([[60.0, 0, 18], [0, 45, 18], [0, 0, 1]]))
+    K = square.K * np.array([[size[0] / 36], [size[1] / 36], [1.0]])
+    write_elements(tmp_path / "photo.ply", sharp_rows(square), np.eye(4).reshape(-1), K.reshape(-1), size)
+    upright = cv2.resize(square.images[0], size)
+    turns = {1: 0, 3: 2, 6: 1, 8: 3}[tag]  # of the pixels, which the tag undoes
+    exif = Image.Exif()
+    exif[274] = tag
+    Image.fromarray(np.rot90(upright, turns).copy()).save(tmp_path / "photo.jpg", quality=100, subsampling=0, exif=exif)
+    scene = load_scene(tmp_path / "photo.ply").pixel_scene()
+    small = cv2.resize(upright, (36, 36), interpolation=cv2.INTER_AREA)
+    assert np.abs(scene.images[0] * 255 - small).mean() < 1.5
+    large = scene.large_photos
+    assert (large.width, large.height) == size
+    assert np.abs(large.read(large.ids[0]).astype(int) - upright).mean() < 1.5
+    # a photo that was turned already, whose tag was left as it was
+    if tag in (6, 8):
+        Image.fromarray(upright).save(tmp_path / "photo.jpg", quality=100, subsampling=0, exif=exif)
+        again = load_scene(tmp_path / "photo.ply").pixel_scene()
+        assert np.abs(again.images[0] * 255 - small).mean() < 1.5
 
 
 # Cameras

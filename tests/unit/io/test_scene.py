@@ -20,7 +20,7 @@ from tiny_scene import (
 from gsmerge.errors import SceneError
 from gsmerge.io import find_scene_files, load_scene, read_scene
 from gsmerge.io.cameras.read import read_cameras
-from gsmerge.io.scene_files import stored_photos
+from gsmerge.io.scene_views import stored_photos
 from gsmerge.measure.inspect import inspect
 
 

@@ -1,0 +1,207 @@
+"""Find keypoints of photos with the scene's points under them, and match those of two scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields, replace
+
+import cv2
+import numpy as np
+
+from gsmerge.geometry import camera_depths, lower_median, sh0_to_rgb
+from gsmerge.kernels.matrices import invert, matmul
+from gsmerge.types import Scene
+
+SIDE = 1600  # longest side of a photo that keypoints are looked for in, pixels
+MIN_SIDE = 8  # least side of it, pixels
+KEYPOINTS = 4000  # most of a photo
+CONTRAST = 0.02  # of a keypoint; OpenCV's default finds too few on plain walls
+GREY = np.array([77, 150, 29], np.int32)  # red, green and blue of a grey value, 256ths
+RATIO = 0.8  # distance of the best match to that of the second best (Lowe 2004)
+OPAQUE = 0.5  # share of a pixel's largest opacity from which the nearest Gaussian is its surface
+SAME_DEPTH = 0.15  # share by which depths around a keypoint may differ on one surface
+PIXEL_SPREAD = 0.003  # standard deviation of a keypoint, share of the picture's diagonal
+
+
+@dataclass(frozen=True, eq=False)
+class Photo:
+    """The keypoints of one photo, and the scene's points under them."""
+
+    pixels: np.ndarray  # [n,2] of the scene's grid
+    points: np.ndarray  # [n,3] float64, in the scene's frame
+    descriptors: np.ndarray  # [n,128] float32, whole numbers up to 255
+    viewmat: np.ndarray  # [4,4] float64, of its camera in the scene's frame
+    K: np.ndarray  # [3,3]
+
+
+@dataclass(frozen=True, eq=False)
+class End:
+    """One scene's side of m matches."""
+
+    points: np.ndarray  # [m,3] in the scene's frame
+    pixels: np.ndarray  # [m,2] of the scene's grid
+    viewmats: np.ndarray  # [m,4,4] cameras that see them
+    Ks: np.ndarray  # [m,3,3]
+
+    def select(self, some: np.ndarray) -> End:
+        """Select matches by a mask."""
+        return End(*(getattr(self, field.name)[some] for field in fields(self)))
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """Keypoints of two scenes that look alike, row by row."""
+
+    scenes: tuple[int, int]
+    ends: tuple[End, End]
+    spread: float  # standard deviation of a keypoint, pixels
+
+    def __len__(self) -> int:
+        return len(self.ends[0].points)
+
+    def select(self, some: np.ndarray) -> Matches:
+        """Select matches by a mask."""
+        first, second = self.ends
+        return replace(self, ends=(first.select(some), second.select(some)))
+
+
+def find_keypoints(scene: Scene) -> list[Photo]:
+    """Find the keypoints of every camera of an aligned scene that lie on one surface.
+
+    Views with one camera are layers of one photo.
+    """
+    cameras = scene.cameras.numpy()
+    poses = cameras.viewmats.reshape(len(scene), -1)
+    keys = np.concatenate([poses, cameras.Ks.reshape(len(scene), -1)], 1)
+    firsts = [int((keys == key).all(1).argmax()) for key in keys]
+    photos = []
+    for view in sorted(set(firsts)):
+        layers = [i for i, first in enumerate(firsts) if first == view]
+        K = cameras.Ks[view].astype(np.float64)
+        viewmat = cameras.viewmats[view].astype(np.float64)
+        picture, shown = _picture(scene, view, K)
+        places, descriptors = _describe(picture, shown[1, 1] / shown[0, 0])
+        zoom = K[0, 0] / shown[0, 0], K[1, 1] / shown[1, 1]
+        pixels = (places - shown[:2, 2]) * zoom + K[:2, 2]
+        z, ok = _depths_at(_surface(scene, layers, viewmat), pixels)
+        rays = matmul(np.concatenate([pixels, np.ones((len(pixels), 1))], 1), invert(K).T)
+        points = matmul(rays[ok] * z[ok, None] - viewmat[:3, 3], viewmat[:3, :3])
+        photos.append(Photo(pixels[ok], points, descriptors[ok], viewmat, K))
+    return photos
+
+
+def _picture(scene: Scene, view: int, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return what a view shows, ``[h,w,3]`` uint8, and the intrinsics of that picture.
+
+    The largest photo that there is, up to SIDE, or the Gaussians' base colours.
+    """
+    if scene.large_photos is not None:
+        large = scene.large_photos
+        photo = large.read(large.ids[view])
+        share = min(1.0, SIDE / max(large.width, large.height))
+        size = max(1, round(large.width * share)), max(1, round(large.height * share))
+        scale = np.array([[size[0] / large.width], [size[1] / large.height], [1.0]])
+        small = cv2.resize(photo, size, interpolation=cv2.INTER_AREA) if share < 1 else photo
+        return small, large.Ks[view].astype(np.float64) * scale
+    if scene.images is None:
+        grid = len(scene), scene.cameras.height, scene.cameras.width, 3
+        colors = sh0_to_rgb(scene.gaussians.sh0.reshape(grid)[view])
+    else:
+        colors = scene.images[view]
+    return (colors.clip(0, 1) * 255).round().astype(np.uint8), K
+
+
+def _describe(picture: np.ndarray, stretch: float) -> tuple[np.ndarray, np.ndarray]:
+    """Find keypoints of a picture ``[h,w,3]`` uint8: places ``[n,2]``, descriptors ``[n,128]``.
+
+    ``stretch``: width over height of what a pixel shows; pixels are made square.
+    """
+    height, width = picture.shape[:2]
+    wide = max(MIN_SIDE, round(width * max(stretch, 1)))
+    high = max(MIN_SIDE, round(height / min(stretch, 1)))
+    grey = ((picture.astype(np.int32) * GREY).sum(-1) >> 8).astype(np.uint8)
+    finder = cv2.SIFT.create(KEYPOINTS, contrastThreshold=CONTRAST)
+    with _any_processor():
+        square = cv2.resize(grey, (wide, high), interpolation=cv2.INTER_LINEAR)
+        keypoints, descriptors = finder.detectAndCompute(square, None)
+    if descriptors is None:
+        return np.empty((0, 2)), np.empty((0, 128), np.float32)
+    places = np.array([keypoint.pt for keypoint in keypoints], np.float64) + 0.5
+    return places * (width / wide, height / high), descriptors
+
+
+@contextmanager
+def _any_processor() -> Iterator[None]:
+    """Have OpenCV use only what all processors have, so that keypoints are the same on each."""
+    before = cv2.useOptimized()
+    cv2.setUseOptimized(False)
+    try:
+        yield
+    finally:
+        cv2.setUseOptimized(before)
+
+
+def _surface(scene: Scene, layers: Sequence[int], viewmat: np.ndarray) -> np.ndarray:
+    """Return the depths ``[h,w]`` of what a camera sees, of the nearest opaque layer.
+
+    ``layers`` are the views that have the camera. Infinite where there is nothing.
+    """
+    views = list(layers)
+    shape = len(scene), scene.cameras.height, scene.cameras.width
+    means = scene.gaussians.means.reshape(*shape, 3)[views].astype(np.float64)
+    opacities = scene.gaussians.opacities.reshape(shape)[views] * scene.stored[views]
+    depths = camera_depths(means, viewmat)
+    seen = (depths > 0) & (opacities > 0) & (opacities >= OPAQUE * opacities.max(0))
+    return np.asarray(np.where(seen, depths, np.inf).min(0))
+
+
+def _depths_at(depths: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Look up the median depth around places ``[n,2]``, and whether they lie on one surface."""
+    padded = np.pad(depths, 1, mode="edge")
+    height, width = depths.shape
+    x = np.floor(pixels[:, 0]).astype(int).clip(0, width - 1)
+    y = np.floor(pixels[:, 1]).astype(int).clip(0, height - 1)
+    nine = np.array([padded[y + down, x + right] for down in range(3) for right in range(3)])
+    even = np.isfinite(nine).all(0) & (nine.max(0) < nine.min(0) * (1 + SAME_DEPTH))
+    return lower_median(nine), even
+
+
+def match_photos(
+    scenes: tuple[int, int],
+    one: Sequence[Photo],
+    other: Sequence[Photo],
+    size: tuple[int, int],
+) -> Matches:
+    """Match the keypoints of all photos of two scenes, whose grids have a ``size``."""
+    pairs = [(a, b) for a in one for b in other]
+    rows = [_match(a.descriptors, b.descriptors) for a, b in pairs]
+    first = _make_end([a for a, _ in pairs], [some for some, _ in rows])
+    second = _make_end([b for _, b in pairs], [some for _, some in rows])
+    diagonal = float(np.sqrt(size[0] ** 2 + size[1] ** 2))
+    return Matches(scenes, (first, second), PIXEL_SPREAD * diagonal)
+
+
+def _make_end(photos: Sequence[Photo], rows: Sequence[np.ndarray]) -> End:
+    """Collect the keypoints of these rows of each photo."""
+    chosen = list(zip(photos, rows, strict=True))
+    counts = [len(some) for some in rows]
+    return End(
+        points=np.concatenate([photo.points[some] for photo, some in chosen]),
+        pixels=np.concatenate([photo.pixels[some] for photo, some in chosen]),
+        viewmats=np.repeat([photo.viewmat for photo in photos], counts, 0),
+        Ks=np.repeat([photo.K for photo in photos], counts, 0),
+    )
+
+
+def _match(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rows that are each other's best match, and clearly better than the second."""
+    if min(len(a), len(b)) < 2:
+        return np.empty(0, int), np.empty(0, int)
+    # whole numbers below 2^24: float32 has them exactly, in any order of summation
+    distances = (a * a).sum(1)[:, None] + (b * b).sum(1) - 2 * (a @ b.T)
+    best = distances.argmin(1)
+    two = np.partition(distances, 1, axis=1)[:, :2].astype(np.float64)
+    clear = two[:, 0] < RATIO**2 * two[:, 1]
+    good = clear & (distances.argmin(0)[best] == np.arange(len(a)))
+    return np.flatnonzero(good), best[good]

@@ -1,0 +1,89 @@
+"""Files of SHARP as it leaves them: one with its photo, and several of one place as one scene."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from sharp_files import split_views, write_sharp
+
+from gsmerge import read_scene
+
+from .conftest import Run, assert_refused
+
+NAMES = ("IMG_0001", "IMG_0002", "IMG_0003")
+FIT = ("--set", "fit_steps=60", "--budget", "3000", "--threads", 1)
+
+
+@pytest.fixture(scope="module")
+def sharp(make_scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """``out/`` with three files, ``photos/`` with what they were made of, and a file of another place. Read only."""
+    folder = tmp_path_factory.mktemp("sharp")
+    for name in ("out", "photos", "other"):
+        (folder / name).mkdir()
+    made = make_scene(folder / "made", num_views=6, width=200, height=150, seed=2)
+    parts = split_views(read_scene(made), (1.1, 0.85, 1.0, 0.9, 1.0, 1.0))
+    for name, view in zip(NAMES, parts, strict=False):
+        write_sharp(folder / "out" / f"{name}.ply", view, (400, 300), folder / "photos" / f"{name}.jpg")
+    other = make_scene(folder / "elsewhere", num_views=2, width=200, height=150, seed=5)
+    view = split_views(read_scene(other), (1.0, 1.0))[0]
+    write_sharp(folder / "other" / "IMG_0009.ply", view, (400, 300), folder / "photos" / "IMG_0009.jpg")
+    return folder
+
+
+def test_one_file_with_its_photo(run: Run, sharp: Path, tmp_path: Path) -> None:
+    out = tmp_path / "small.ply"
+    done = run(
+        "compact", sharp / "out/IMG_0001.ply", "--images", sharp / "photos", "-o", out, *FIT, "--json", code=0
+    )  # fmt: skip
+    report = json.loads(done.out)
+    assert report["input"]["exporters"] == ["sharp"]
+    assert report["input"]["num_gaussians"] == 2 * 150 * 150
+    assert report["output"]["num_gaussians"] == 3000
+    assert report["psnr_input_views"]["after"] > report["psnr_input_views"]["before"]
+    assert any("2 Gaussians per pixel, layer-major" in note for note in report["notes"])
+
+
+def test_several_files_become_one_scene(run: Run, sharp: Path, tmp_path: Path) -> None:
+    out, files = tmp_path / "place.ply", [sharp / "out" / f"{name}.ply" for name in NAMES]
+    stranger = sharp / "other/IMG_0009.ply"
+    words = ("compact", *files, stranger, "--images", sharp / "photos")
+    report = json.loads(run(*words, "-o", out, *FIT, "--json", code=0).out)
+    joined = report["input"]["files"]
+    assert [Path(file["path"]).name for file in joined] == [*(f"{name}.ply" for name in NAMES), "IMG_0009.ply"]
+    assert [file["joined"] for file in joined] == [True, True, True, False]
+    assert joined[0]["scale"] == 1
+    assert abs(joined[1]["scale"] * 0.85 / 1.1 - 1) < 0.02
+    assert report["input"]["num_gaussians"] == 3 * 2 * 150 * 150
+    assert report["input"]["bytes"] == sum(file.stat().st_size for file in files)
+    assert any(note.startswith("3 of 4 files are joined in the frame of IMG_0001.ply") for note in report["notes"])
+    assert any(note.startswith("IMG_0009.ply is left out") for note in report["notes"])
+    assert report["psnr_input_views"]["after"] > report["psnr_input_views"]["before"] + 2
+    assert len(json.loads((tmp_path / "place.cameras.json").read_text())) == 6
+    # the frame is that of the first file, which the result is compared with as any other
+    one = read_scene(files[0], images=sharp / "photos")
+    both = read_scene(files[0], files[1], images=sharp / "photos")
+    assert (both.cameras.viewmats[:2] == one.cameras.viewmats).all()
+    again = tmp_path / "again.ply"
+    run(*words[:-2], "--images", sharp / "photos", "-o", again, *FIT[:-1], 2, "-q", code=0)
+    assert again.read_bytes() == out.read_bytes()
+
+
+def test_a_plan_counts_all_files(run: Run, sharp: Path) -> None:
+    files = [sharp / "out" / f"{name}.ply" for name in NAMES[:2]]
+    plan = json.loads(run("compact", *files, "--images", sharp / "photos", "--dry-run", "--json", code=0).out)
+    assert plan["input"]["num_gaussians"] == 2 * 2 * 150 * 150
+
+
+def test_what_cannot_be_joined(run: Run, sharp: Path, tmp_path: Path) -> None:
+    first, second = (sharp / "out" / f"{name}.ply" for name in NAMES[:2])
+    stranger, out = sharp / "other/IMG_0009.ply", tmp_path / "a.ply"
+    photos = ("--images", sharp / "photos")
+    refused = run("compact", first, stranger, *photos, "-o", out, "-q")
+    assert_refused(refused, 3, "no two of 2 whose photos share enough", "give photos that overlap by half")
+    assert_refused(run("compact", first, tmp_path / "small.ply"), 2, "no such scene; name the output with -o")
+    assert_refused(run("compact", first, second, first, "-o", out), 2, "expected each scene once, got it twice")
+    assert_refused(run("compact", first, second, "--cameras", sharp / "made"), 2, "--cameras: expected one scene")
+    assert_refused(run("compact", first, second, "-o", second, "--overwrite"), 2, "other than the input")
+    assert not out.exists()
