@@ -90,6 +90,8 @@ def plan_run(photos: tuple[Photos, ...], options: FitOptions, seed: int, masks: 
         weights = _hidden(weights[0], masks[0]), _hidden(weights[1], masks[1])
     everywhere = [np.where(weight == HIDDEN, np.float32(0), np.float32(1)) for weight in weights[0]]
     trained = [np.where(weight == HIDDEN, np.float32(0), weight) for weight in weights[1]]
+    if len(photos[0]) == 1:  # no other photo shows what is held out: the fit is judged by all that it sees
+        weights = weights[0], [np.where(weight == HIDDEN, HIDDEN, np.float32(0)) for weight in weights[1]]
     ones = [[np.ones((p.height, p.width), np.float32)] * len(p) for p in photos[2:]]
     half_part = options.half_res_part
     if len(photos) > 2 and options.half_res_share is None:
