@@ -10,7 +10,7 @@ from time import perf_counter
 from typing import TYPE_CHECKING
 
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.console import print_document, say, say_notes, stage_progress
+from gsmerge.cli.console import print_document, say, say_notes, say_warning, stage_progress
 from gsmerge.cli.paths import FileOptions, check_format, check_outputs, checkpoint_files, default_output, input_files
 from gsmerge.errors import TargetError
 
@@ -21,12 +21,15 @@ if TYPE_CHECKING:
     from gsmerge.options import CompactOptions
 
 
+MORE = "more Gaussians (--k, --budget) or a longer fit (--effort) show them better"
+
+
 @opt.command(
     opt.SCENE,
     f"{opt.READING} k superpixels budget quality levels effort fit device method recipe checkpoint set crop",
     opt.output(opt.COMPACT_SCENE, "SCENE.compact.ply"),
-    f"overwrite report save_cameras dry_run {opt.RUN}",
-    rare=f"hint levels fit method recipe checkpoint crop save_cameras json quiet {opt.RUN}",
+    f"overwrite strict report save_cameras dry_run {opt.RUN}",
+    rare=f"hint levels fit method recipe checkpoint crop strict save_cameras json quiet {opt.RUN}",
 )
 def compact(args: opt.Args) -> None:
     """Write a compact scene that renders like the given one, or better, with 1 to 10 % of its Gaussians."""
@@ -62,14 +65,17 @@ def compact(args: opt.Args) -> None:
             saved_cameras=args.save_cameras,
         )  # fmt: skip
 
-    say_notes(document["notes"], quiet=args.silent)
+    say_notes([note for note in document["notes"] if note != document["worse"]], quiet=args.silent)
     lines = summary_lines(document)
     if sys.stdout.isatty():
         view = shlex.join(["gsmerge", "view", str(args.scene), str(out)])
         lines = result_table(document, view if out.suffix.lower() == ".ply" else None)
     print_document(document, lines, as_json=args.json, quiet=args.quiet)
-    if document["unmet"]:
-        raise TargetError(document["unmet"])
+    problems = [document["unmet"], document["worse"] if args.strict else None]
+    if document["worse"] and not args.strict:
+        say_warning(f"{document['worse']}; {MORE}", quiet=args.silent)
+    if any(problems):
+        raise TargetError("; ".join(filter(None, problems)))
 
 
 def _warn_of_memory(files: SceneFiles, *, quiet: bool) -> None:

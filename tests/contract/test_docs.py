@@ -163,6 +163,7 @@ def test_every_option_is_a_field_of_the_api() -> None:
         "overwrite",
         "report",
         "save-cameras",
+        "strict",
         "dry-run",
         "json",
         "quiet",
