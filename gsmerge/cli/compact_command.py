@@ -11,7 +11,15 @@ from typing import TYPE_CHECKING
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say, say_notes, say_warning, stage_progress
-from gsmerge.cli.paths import FileOptions, check_format, check_outputs, checkpoint_files, default_output, input_files
+from gsmerge.cli.paths import (
+    FileOptions,
+    check_embedding,
+    check_format,
+    check_outputs,
+    checkpoint_files,
+    default_output,
+    input_files,
+)
 from gsmerge.errors import TargetError
 
 if TYPE_CHECKING:
@@ -28,8 +36,8 @@ MORE = "more Gaussians (--k, --budget) or a longer fit (--effort) show them bett
     opt.SCENE,
     f"{opt.READING} k superpixels budget quality levels effort fit device method recipe checkpoint set crop",
     opt.output(opt.COMPACT_SCENE, "SCENE.compact.ply"),
-    f"overwrite strict report save_cameras dry_run {opt.RUN}",
-    rare=f"hint levels fit method recipe checkpoint crop strict save_cameras json quiet {opt.RUN}",
+    f"overwrite strict report save_cameras embed_cameras dry_run {opt.RUN}",
+    rare=f"hint levels fit method recipe checkpoint crop strict save_cameras embed_cameras json quiet {opt.RUN}",
 )
 def compact(args: opt.Args) -> None:
     """Write a compact scene that renders like the given one, or better, with 1 to 10 % of its Gaussians."""
@@ -49,6 +57,8 @@ def compact(args: opt.Args) -> None:
         (out, *levels, args.report, cameras, args.save_cameras), inputs, overwrite=args.overwrite or args.dry_run
     )
     check_format(out, writing, settings.budget)
+    if args.embed_cameras:
+        check_embedding(out, settings.budget)
     if args.dry_run:
         print_plan(args, files, settings, out, hints)
         return
@@ -62,7 +72,7 @@ def compact(args: opt.Args) -> None:
             files, settings, out, opacity=args.opacity, hints=hints, overwrite=args.overwrite, progress=progress,
             hashed=args.json or args.report is not None, seconds_before=seconds_before, report_path=args.report,
             normals=writing.normals, spz_version=writing.spz_version, cameras_path=cameras,
-            saved_cameras=args.save_cameras,
+            saved_cameras=args.save_cameras, embed_cameras=args.embed_cameras,
         )  # fmt: skip
 
     say_notes([note for note in document["notes"] if note != document["worse"]], quiet=args.silent)
@@ -101,7 +111,7 @@ def print_plan(args: opt.Args, files: SceneFiles, settings: CompactOptions, out:
 
     given = read_input(files, opacity=args.opacity, hints=hints)
     scene, paths = given.scene, {name: path and str(path) for name, path in vars(files).items()}
-    check_saved_cameras(scene, vars(args).get("save_cameras"))
+    check_saved_cameras(scene, vars(args).get("save_cameras"), embed=bool(vars(args).get("embed_cameras")))
     _, unused = choose_baseline(settings, scene)
     backend, problem = choose_backend(settings.device, scene.num_gaussians)
     settings = replace(settings, device=backend.device)

@@ -353,6 +353,7 @@ _TABLE = (
                "than the input does, by more than .5 dB."),
         option("report", Path, "Write the JSON report to this file."),
         option("save_cameras", Path, "Write the cameras as used, moved where they were wrong, as transforms.json."),
+        switch("embed_cameras", "Write the cameras as used into the .ply, too, as comments that other programs skip."),
         switch("dry_run", "Print what would be done; write nothing."),
         switch("json", "Print JSON on stdout."),
     ),

@@ -59,6 +59,16 @@ def check_format(output: Path, options: FileOptions, budget: BudgetOptions | Non
         raise UsageError(f"--budget {budget.budget}: expected an output as .ply, got {ending}; give a number")
 
 
+def check_embedding(output: Path, budget: BudgetOptions) -> None:
+    """Refuse cameras in a format without comments, or on top of a size in bytes."""
+    if output.suffix.lower() != ".ply":
+        raise UsageError(f"--embed-cameras: expected an output as .ply, got {output.name}; use --save-cameras FILE")
+    if budget.in_bytes:
+        raise UsageError(
+            f"--embed-cameras: expected a --budget without cameras inside, got {budget.budget}; give a number"
+        )
+
+
 def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None], *, overwrite: bool) -> None:
     """Refuse an output file that is an input, exists without ``overwrite``, is named twice, or has no folder.
 

@@ -13,6 +13,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io.alignment import estimate_cameras
 from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.camera_file import CameraFile, to_cameras, undistort_photos
+from gsmerge.io.cameras.embedded import holds_cameras
 from gsmerge.io.cameras.npz_files import holds_images
 from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
 from gsmerge.io.cameras.read import CAMERA_PLACES, SHARP, find_cameras, read_cameras, read_sharp
@@ -46,7 +47,11 @@ _ROUNDING = 1e-6  # pixels
 
 @dataclass(frozen=True)
 class SceneFiles:
-    """The files of a scene; cameras may be a COLMAP folder, images the ``.npz`` or ``.torch`` that holds them."""
+    """The files of a scene.
+
+    Cameras may be a COLMAP folder or the ``.ply`` that holds its own, images the ``.npz`` or ``.torch`` that holds
+    them.
+    """
 
     ply: Path
     cameras: Path | None
@@ -60,6 +65,8 @@ def find_scene_files(
     images: StrPath | None = None,
 ) -> SceneFiles:
     """Find a scene's files; cameras and images that the user names are used instead of searching.
+
+    Cameras inside the ``.ply`` go before others beside it.
 
     The given folder is searched, then the ``.ply``'s own, then the one above it for ``gs_ply/`` and two above it
     for ``point_cloud/iteration_n/``; in each the places of ``PLY_PLACES``, ``CAMERA_PLACES`` and ``IMAGE_PLACES``
@@ -78,7 +85,8 @@ def find_scene_files(
     if folder.name.startswith("iteration_") and folder.parent.name == "point_cloud":
         above = [folder.parent.parent]
     roots = list(dict.fromkeys((Path(os.path.realpath(given)), folder, *above)))
-    camera_path = _named(cameras) or next((c for c in map(find_cameras, roots) if c is not None), None)
+    camera_path = _named(cameras) or (ply if holds_cameras(ply) else None)
+    camera_path = camera_path or next((c for c in map(find_cameras, roots) if c is not None), None)
     image_path = _named(images)
     if image_path is None and camera_path is not None:
         has_images = camera_path.suffix == CHUNK or (camera_path.suffix == ".npz" and holds_images(camera_path))

@@ -164,6 +164,7 @@ def test_every_option_is_a_field_of_the_api() -> None:
         "report",
         "save-cameras",
         "strict",
+        "embed-cameras",
         "dry-run",
         "json",
         "quiet",
