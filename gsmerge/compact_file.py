@@ -22,6 +22,7 @@ from gsmerge.io import (
     output_format,
     write_gaussians,
 )
+from gsmerge.io.cameras.embedded import camera_comments
 from gsmerge.io.cameras.json_files import viewer_cameras, write_transforms
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.formats.ply import OpacityChoice
@@ -62,21 +63,23 @@ def compact_files(
     spz_version: int = 3,
     cameras_path: Path | None = None,
     saved_cameras: Path | None = None,
+    embed_cameras: bool = False,
 ) -> dict[str, Any]:
     """Read a scene, compact it, and write result, levels, cameras and report: all files or none.
 
     ``hashed``: hash the input for the report. ``seconds_before``: wall time by name of the caller's
     earlier steps. ``cameras_path``, ``saved_cameras``: files for the views, for viewers and as
     ``transforms.json`` with all intrinsics; the former may be there with the same content, beside
-    a result in another format. Returns the report, see
-    :func:`gsmerge.report.report_document`. Raises SceneError if the scene cannot be read or the
-    result cannot be written, UsageError if the settings need what the scene does not have.
+    a result in another format. ``embed_cameras``: also write them into the header of a ``.ply``.
+    Returns the report, see :func:`gsmerge.report.report_document`. Raises SceneError if the scene
+    cannot be read or the result cannot be written, UsageError if the settings need what the scene
+    does not have.
     """
     start, ending = perf_counter(), output_format(out, spz_version)
     with atomic_outputs(overwrite=overwrite) as add:
         at = {path: add(path) for path in (out, report_path, saved_cameras) if path is not None}
         given = read_input(files, opacity=opacity, hints=hints)
-        check_saved_cameras(given.scene, saved_cameras)
+        check_saved_cameras(given.scene, saved_cameras, embed=embed_cameras)
         shared = None if cameras_path is None or overwrite or not cameras_path.exists() else cameras_path
         if shared is not None and read_cameras(shared).names != given.scene.names:
             raise _other_cameras(shared)
@@ -89,9 +92,10 @@ def compact_files(
         coarser = [(level_output(out, i), level) for i, level in enumerate(result.coarser, 1)]
         at |= {path: add(path) for path, _ in coarser}
         for path, one in ((out, result), *coarser):
+            inside = camera_comments(one.cameras, given.scene.names) if embed_cameras else []
             write_gaussians(
-                at[path], one.gaussians, overwrite=True, comments=given.comments, ending=ending, normals=normals,
-                spz_version=spz_version,
+                at[path], one.gaussians, overwrite=True, comments=[*given.comments, *inside], ending=ending,
+                normals=normals, spz_version=spz_version,
             )  # fmt: skip
         cameras_path = cameras_path if len(given.scene) else None
         if cameras_path is not None:
@@ -138,10 +142,13 @@ def read_input(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: Rea
     return scene_input
 
 
-def check_saved_cameras(scene: Scene, path: Path | None) -> None:
-    """Refuse a file for the cameras of a scene without any."""
-    if path is not None and len(scene) == 0:
-        raise UsageError(f"--save-cameras {path}: expected a scene with cameras, got none")
+def check_saved_cameras(scene: Scene, path: Path | None, *, embed: bool = False) -> None:
+    """Refuse a file for the cameras of a scene without any, or to embed them."""
+    if len(scene) == 0 and (path is not None or embed):
+        option = "--embed-cameras" if path is None else f"--save-cameras {path}"
+        raise UsageError(f"{option}: expected a scene with cameras, got none")
+    if embed:
+        camera_comments(scene.cameras, scene.names)  # refuses too many before the work
 
 
 def compact_notes(loaded: SceneLoad) -> tuple[str, ...]:

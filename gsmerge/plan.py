@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from gsmerge.budget import exact_count
+from gsmerge.budget import AUTO, BudgetOptions, exact_count
 from gsmerge.errors import UsageError
 from gsmerge.gpu import choose_backend
 from gsmerge.options import CompactOptions
@@ -18,14 +18,14 @@ from gsmerge.runtime.record import note, stage
 from gsmerge.stages.agreement import measured_share
 from gsmerge.stages.assign import merge_unseen
 from gsmerge.stages.clean import CleanOptions, clean
-from gsmerge.stages.decode import DecodeOptions
+from gsmerge.stages.decode import USUAL_K, DecodeOptions
 from gsmerge.stages.fit import FitBackend, FitOptions, photo_scale, start_share
 from gsmerge.stages.match import MatchOptions, Method
 from gsmerge.stages.prepare import Prepared
 from gsmerge.stages.segment import CountLimits, SuperpixelPlan, count_limits, scene_tree
 from gsmerge.stages.superpixels import AUTO_SHARE, SHARE, SegmentOptions
 from gsmerge.types import Gaussians, Scene
-from gsmerge.views import report_views, scored_views
+from gsmerge.views import camera_kinds, report_views, scored_views
 
 if TYPE_CHECKING:
     from gsmerge.networks.checkpoint import Checkpoint
@@ -35,6 +35,7 @@ AUTO_STEPS = 2  # times the usual steps with budget auto: fewer Gaussians cost l
 SHORT_STEPS = 60  # of a fit that a better start still matters to
 USUAL_SHARE = 0.044  # of Gaussians in the pixels that the steps of an effort are for; more need more steps, up to
 MOST_STEPS = 2.0  # times as many
+LONE_K = 4  # where all views have one camera: no other adds Gaussians of its own to a surface
 
 
 @dataclass(frozen=True)
@@ -110,6 +111,10 @@ def make_plan(prepared: Prepared, options: CompactOptions) -> Plan:
         if clean_options.drop_sky and not prepared.photo_views:
             note("drop_sky: no photo is used that could say where the sky is, so it stays")
             clean_options = replace(clean_options, drop_sky=False)
+        decode = resolve_decode(options, scene, photos=bool(scene.images is not None and prepared.photo_views))
+        if decode.k != options.decode.k and decode.max_k > USUAL_K:
+            note(f"k: {decode.k}, because one camera shows the scene, and no long fit follows")
+        options = replace(options, decode=decode)
         unseen, num_input = _merge_unseen(prepared, options, segment, clean_options)
         limits = count_limits(
             scene, segment, options.decode, options.budget,
@@ -244,6 +249,22 @@ def _merge_unseen(
         return None, num_input
     merged = merge_unseen(visible, scene, count)
     return (clean(merged, clean_options, scene, prepared.frame.leave)[0] if clean_options.asked else merged), num_input
+
+
+def resolve_decode(options: CompactOptions, scene: Scene, *, photos: bool) -> DecodeOptions:
+    """Fill in K: more where one camera sees a surface once, and no fit or a short one follows.
+
+    With K = 1, 4.4 % of the pixels of one photo are too few to show it; of more views each has
+    Gaussians of its own. ``photos``: whether there are any to fit to.
+    """
+    decode, budget, segment = options.decode, options.budget, options.segment
+    if decode.k != AUTO:
+        return decode
+    asked = budget != BudgetOptions() or segment.superpixels != SHARE
+    other = options.method != "gsmerge" or options.recipe is not None or options.checkpoint not in ("auto", "none")
+    fits = photos and options.fit.fit != "none" and resolve_fit(options).steps > SHORT_STEPS
+    lone = scene.aligned and len(scene) > 0 and camera_kinds(scene.cameras).max() == 0
+    return replace(decode, k=LONE_K if lone and not (asked or other or fits) else USUAL_K)
 
 
 def resolve_fit(options: CompactOptions) -> FitOptions:

@@ -56,6 +56,7 @@ def report_document(
 
     Returns:
         ``schema_version`` 1, within which keys are only ever added. ``unmet``: why a target is not met, or null.
+        ``worse``: that the result, or the first level that does, shows the photos worse than the input, or null.
     """
     numbers, at = asdict(report), written_at or {}
     return {
@@ -88,6 +89,7 @@ def report_document(
         "peak_memory_bytes": numbers["peak_memory_bytes"],
         "notes": [*notes, *numbers["notes"]],
         "unmet": numbers["unmet"],
+        "worse": next((one.worse for one in (report, *(level for _, level in coarser)) if one.worse), None),
     }
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from gsmerge.io.cameras.camera_file import describe_moves, list_moves
 from gsmerge.plan import Plan
+from gsmerge.render.metrics import describe_loss
 from gsmerge.render.photos import NEAR, scene_photos
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.record import Record, choose, current_record, note, stage
@@ -35,6 +36,8 @@ class CompactReport:
         options: All settings by flat name.
         peak_memory_bytes: Largest resident memory of the process so far.
         unmet: Why a target that was asked for is not met, and how far the result got; None if it is.
+        worse: That the result shows the scene's own photos by more than .5 dB worse than the input does, a sentence
+            that is among the notes, too; None where it does not, or photos cannot say it: none, odd ones, or a crop.
     """
 
     num_input: int
@@ -47,6 +50,7 @@ class CompactReport:
     options: dict[str, Any]
     peak_memory_bytes: int
     unmet: str | None = None
+    worse: str | None = None
 
 
 @dataclass(frozen=True)
@@ -142,18 +146,25 @@ def make_result(
         with stage("input"):
             before = measure_psnr(prepared.given.file_gaussians, prepared.given, prepared, plan)
 
-    def report(one: Candidate, seconds: Mapping[str, float]) -> CompactReport:
+    comparable = prepared.photo_views and not plan.clean.hides  # or photos show something else
+
+    def report(one: Candidate, seconds: Mapping[str, float], name: str) -> CompactReport:
         counts, record = (prepared.given.num_gaussians, len(one.gaussians)), one.record
-        return CompactReport(
+        made = CompactReport(
             *counts, dict(seconds), before, one.psnr, record.choices, record.notes, plan.settings, peak_memory()
         )
+        worse = describe_loss(name, before, one.psnr) if comparable else None
+        return made if worse is None else replace(made, notes=[*made.notes, worse], worse=worse)
 
     names = {**run.seconds, **seconds}
     seconds = {name: run.seconds.get(name, 0.0) + seconds.get(name, 0.0) for name in names}
     if "input" in seconds:
         seconds["input"] = seconds.pop("input")  # the last stage, after those of the candidates
-    main = report(best, seconds)
+    main = report(best, seconds, "the result")
     choices, notes = run.choices | main.choices | search["choices"], [*run.notes, *main.notes]
     main = replace(main, choices=choices, notes=notes, unmet=search["unmet"])
-    coarser = tuple(CompactResult(one.gaussians, report(one, one.record.seconds), one.cameras) for one in levels)
+    coarser = tuple(
+        CompactResult(one.gaussians, report(one, one.record.seconds, f"level {i}"), one.cameras)
+        for i, one in enumerate(levels, 1)
+    )
     return CompactResult(best.gaussians, main, best.cameras, coarser)

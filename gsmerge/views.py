@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from gsmerge.types import Scene, grid_ids
+from gsmerge.types import Cameras, Scene, grid_ids
 
 MAX_SCORED_VIEWS = 24  # views by which whole scenes are judged where something depends on it
 REPORT_VIEWS = 4  # views that input and result are scored on for the report alone
@@ -53,17 +53,22 @@ def midpoint_views(contexts: Sequence[float], candidates: Sequence[float]) -> li
     return chosen
 
 
+def camera_kinds(cameras: Cameras) -> np.ndarray:
+    """Number the cameras from 0, ``[c]``: the same number for equal poses and intrinsics."""
+    rows = np.concatenate([cameras.viewmats.reshape(-1, 16), cameras.Ks.reshape(-1, 9)], 1)
+    return np.unique(rows, axis=0, return_inverse=True)[1].reshape(-1)
+
+
 def distinct_views(scene: Scene) -> tuple[list[int], list[int]]:
     """Return the ids of views that repeat no earlier view, and for every view its place among them.
 
     A view repeats another if camera, photo and Gaussians are the same; it then has that view's
     place.
     """
-    cameras = np.concatenate([scene.cameras.viewmats.reshape(-1, 16), scene.cameras.Ks.reshape(-1, 9)], 1)
-    _, firsts = np.unique(cameras, axis=0, return_inverse=True)
+    kinds = camera_kinds(scene.cameras)
     kept, places = list[int](), list[int]()
-    for view, kind in enumerate(firsts.reshape(-1)):
-        equal = (i for i, one in enumerate(kept) if firsts.reshape(-1)[one] == kind and _equal_views(scene, one, view))
+    for view, kind in enumerate(kinds):
+        equal = (i for i, one in enumerate(kept) if kinds[one] == kind and _equal_views(scene, one, view))
         places.append(next(equal, len(kept)))
         if places[-1] == len(kept):
             kept.append(view)

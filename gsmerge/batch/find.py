@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from gsmerge.batch.batch_options import BatchOptions
+from gsmerge.budget import AUTO
 from gsmerge.compact_file import level_output
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import SCENE_SUFFIXES, SceneFiles
@@ -114,7 +115,8 @@ def output_name(options: BatchOptions, scene: Path, index: int) -> str:
     """Return the name of a scene's result in the output folder."""
     whole = Path(os.path.abspath(scene))
     stem = stem_of(whole).removesuffix(".compressed")  # which is the scene's format, not its result's
-    values = {"stem": stem, "parent": whole.parent.name, "index": index, "k": options.settings.decode.k}
+    own = options.settings.decode
+    values = {"stem": stem, "parent": whole.parent.name, "index": index, "k": own.k if own.k != AUTO else own.max_k}
     try:
         return os.path.normpath(options.output.format(**values))
     except ValueError as error:  # a format that fits numbers only

@@ -21,7 +21,7 @@ DONE, FAILED, SKIPPED = "done", "failed", "skipped"  # of records
 BUSY, LOST, STUCK = "busy", "lost", "stuck"
 COLUMNS = (
     "scene", "output", "status", "num_input", "num_output", "ratio", "bytes_input", "bytes_output", "psnr_before",
-    "psnr_after", "seconds", "peak_memory_bytes", "attempt", "unmet", "error",
+    "psnr_after", "seconds", "peak_memory_bytes", "attempt", "unmet", "worse", "error",
 )  # fmt: skip
 T = TypeVar("T")
 MAX_LISTED = 20  # scenes in the table, and failures below it
@@ -34,6 +34,7 @@ class DoneResult:
     key: str  # of the scene's content, the settings and the version
     files: tuple[tuple[str, str], ...]  # name in the output folder and SHA-256 of each file
     failed_since: bool = False  # whether the scene failed when it was compacted again
+    worse: str | None = None  # that it shows its photos worse than its input
 
     def holds(self, folder: Path, key: str) -> bool:
         """Return whether content and settings are the same, and every file is unchanged."""
@@ -65,7 +66,7 @@ class RecordIndex:
             output = value["output"]
             if value["status"] == DONE:
                 files = tuple((file["path"], file["sha256"]) for file in value["files"])
-                self.known[output] = DoneResult(value["key"], files)
+                self.known[output] = DoneResult(value["key"], files, worse=row_of(value)["worse"])
             elif value["status"] == FAILED and output in self.known:
                 self.known[output] = replace(self.known[output], failed_since=True)
 
@@ -113,6 +114,7 @@ def row_of(record: Mapping[str, Any]) -> dict[str, Any]:
         "seconds": report["total_seconds"],
         "peak_memory_bytes": report["peak_memory_bytes"],
         "unmet": report["unmet"],
+        "worse": report.get("worse"),  # records of former versions lack it
     }
 
 
@@ -146,6 +148,8 @@ class Totals:
     bytes_input: int = 0  # bytes of the same
     bytes_output: int = 0  # bytes of the same
     unmet: int = 0  # results that miss their target
+    num_worse: int = 0  # results, of this run or skipped, that show their photos worse than their input
+    worse: list[tuple[str, str]] = field(default_factory=list)  # the first of them, and what their reports say
     rows: list[dict[str, Any]] = field(default_factory=list)  # the first ones done, as in the CSV file
     failures: list[tuple[str, str]] = field(default_factory=list)  # the first scenes that failed, and why
 
@@ -153,6 +157,10 @@ class Totals:
         """Count a scene."""
         self.counts[record["status"]] += 1
         row = row_of(record)
+        worse = row["worse"] or record.get("worse")
+        if worse:
+            self.num_worse += 1
+            self.worse += [(str(record[self.name]), str(worse))] if len(self.worse) < MAX_LISTED else []
         if record["status"] == DONE:
             self.num_input += row["num_input"]
             self.num_output += row["num_output"]
@@ -205,6 +213,9 @@ def summary_lines(totals: Totals, path: Path | None) -> list[str]:
     lines = _table(totals.rows)
     more = totals.counts[DONE] - len(totals.rows)
     lines += [f"... and {more:,} more"] if more > 0 else []
+    lines += [f"worse: {scene}: {why}" for scene, why in totals.worse]
+    more = totals.num_worse - len(totals.worse)
+    lines += [f"... and {more:,} more worse"] if more > 0 else []
     lines += [f"failed: {scene}: {error}" for scene, error in totals.failures]
     more = totals.counts[FAILED] - len(totals.failures)
     lines += [f"... and {more:,} more failed"] if more > 0 else []
@@ -218,6 +229,7 @@ def summary_lines(totals: Totals, path: Path | None) -> list[str]:
             f" {human_bytes(totals.bytes_input)} -> {human_bytes(totals.bytes_output)}"
         )
     line += f"; {totals.unmet:,} missed the target" if totals.unmet else ""
+    line += f"; {totals.num_worse:,} worse than the input" if totals.num_worse else ""
     return [*lines, line + (f"; all in {path}" if path is not None else "")]
 
 

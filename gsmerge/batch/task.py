@@ -105,7 +105,8 @@ def _process(task: Task, context: BatchContext, new_records: RecordIndex, begun:
     before, since = task.known, new_records.known.get(job.output)
     for known in (since, None if options.rerun else before):
         if known is not None and known.holds(context.folder, key):
-            return record(SKIPPED, job.scene, job.output, key=key, files=_describe(context.folder, known.files))
+            files_of = _describe(context.folder, known.files)
+            return record(SKIPPED, job.scene, job.output, key=key, files=files_of, worse=known.worse)
     own = {name for known in (before, since) if known is not None for name, _ in known.files}
     names = [name for name in result_names(job.output, options) if os.path.lexists(context.folder / name)]
     foreign = [] if begun.exists() else [name for name in names if name not in own]

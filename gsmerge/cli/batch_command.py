@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, TextIO
 import typer
 
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.console import duration, one_line, print_document, say, say_notes, total_progress
+from gsmerge.cli.console import duration, one_line, print_document, say, say_notes, say_warning, total_progress
 from gsmerge.errors import BatchError, SceneError, TargetError, UsageError
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def parse_jobs(text: str) -> int:
                    wording="--resume"),
     ),
     opt.changed("overwrite", False, help="Replace files in the folder that no batch wrote."),
-    "dry_run seed",
+    "strict dry_run seed",
     opt.changed("threads", help="Threads of each scene.", show_default="processors by jobs"),
     opt.changed("json", False, help="Print one line of JSON per scene on stdout."),
     rare="hint fit seed threads quiet",
@@ -133,9 +133,18 @@ def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, index: Reco
             path = write_summary(out)
             if not args.silent:
                 print("\n".join(map(one_line, summary_lines(totals, path))))
+    worse = ""
+    if totals.worse:
+        scene, why = totals.worse[0]
+        worse = f"{totals.num_worse} of {totals.total} results show their photos worse than the input; the first:"
+        worse = f"{worse} {scene}: {why}"
+    if worse and not args.strict:
+        say_warning(worse, quiet=args.silent)
     check_failures(totals, "scenes")
     if totals.unmet:
         raise TargetError(f"{totals.unmet} of {totals.total} results miss the target")
+    if worse and args.strict:
+        raise TargetError(worse)
 
 
 def run_jobs(

@@ -55,9 +55,12 @@ def read_before_after(args: Args, files: SceneFiles, *, alone: bool = False) -> 
     A scene that is looked at ``alone`` needs no cameras: views are placed about it.
     """
     from gsmerge.io import read_gaussians
+    from gsmerge.io.cameras.embedded import holds_cameras
     from gsmerge.runtime.record import record_run
     from gsmerge.stages.place_cameras import add_views
 
+    if files.cameras is None:  # a result may know those that its scene has lost
+        files = replace(files, cameras=next(filter(holds_cameras, args.after), None))
     load, notes = _load(args, files, alone), list[str]()
     views = vars(args).get("views")
     if args.targets is not None or views is not None:
@@ -83,10 +86,11 @@ def _load(args: Args, files: SceneFiles, alone: bool) -> SceneLoad:
 
 
 def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras], list[str]]:
-    """Read the moved cameras that ``compact`` wrote beside results, by result; with notes."""
+    """Read the moved cameras that ``compact`` wrote into results or beside them, by result; with notes."""
     import numpy as np
 
     from gsmerge.io.cameras.camera_file import describe_moves, list_moves
+    from gsmerge.io.cameras.embedded import holds_cameras
     from gsmerge.io.cameras.json_files import viewer_cameras_path
     from gsmerge.io.cameras.read import read_cameras
     from gsmerge.stages.prepare import scene_depth
@@ -94,15 +98,15 @@ def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras]
     own: dict[str, Cameras] = {}
     notes, start = list[str](), scene.cameras.viewmats
     for name, path in zip(file_names(paths), paths, strict=True):
-        beside, read = viewer_cameras_path(path), None
-        if scene.images is not None and beside.is_file():
+        holder, read = path if holds_cameras(path) else viewer_cameras_path(path), None
+        if scene.images is not None and holder.is_file():
             with suppress(SceneError):  # whose ever it is, results can be measured without it
-                read = read_cameras(beside)
+                read = read_cameras(holder)
         if read is None or read.names != scene.names or np.allclose(read.viewmats, start, rtol=SAME, atol=SAME):
             continue
         own[name] = replace(scene.cameras, viewmats=read.viewmats)
         moves = describe_moves(list_moves(scene.names, start, read.viewmats, scene_depth(scene)))
-        notes.append(f"{name}: its input views are seen from the cameras in {beside.name}, moved by {moves}")
+        notes.append(f"{name}: its input views are seen from the cameras in {holder.name}, moved by {moves}")
     return own, notes
 
 

@@ -11,15 +11,16 @@ from time import perf_counter
 from typing import TYPE_CHECKING
 
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.console import print_document, say, say_notes, stage_progress
+from gsmerge.cli.console import print_document, say, say_notes, say_warning, stage_progress
 from gsmerge.cli.paths import (
     FileOptions,
+    check_embedding,
     check_format,
     check_outputs,
     checkpoint_files,
     default_output,
-    holds_cameras,
     input_files,
+    is_camera_file,
 )
 from gsmerge.errors import TargetError, UsageError
 
@@ -28,14 +29,18 @@ if TYPE_CHECKING:
     from gsmerge.options import CompactOptions
 
 
+MORE = "more Gaussians (--k, --budget) or a longer fit (--effort) show them better"
+
+
 @opt.command(
     opt.argument("scenes", list[Path], "SCENE...", "A .ply with one Gaussian per pixel and view, "
                  "or the folder it is in; several of one place, as SHARP writes them, are joined."),
     f"{opt.READING} masks k superpixels budget quality levels",
     "effort fit exposure device method recipe checkpoint set crop",
     opt.output(opt.COMPACT_SCENE, "SCENE.compact.ply"),
-    f"overwrite report save_cameras dry_run {opt.RUN}",
-    rare=f"hint masks levels fit exposure method recipe checkpoint crop save_cameras json quiet {opt.RUN}",
+    f"overwrite strict report save_cameras embed_cameras dry_run {opt.RUN}",
+    rare="hint masks levels fit exposure method recipe checkpoint crop strict save_cameras embed_cameras json quiet"
+         f" {opt.RUN}",
 )  # fmt: skip
 def compact(args: opt.Args) -> None:
     """Write a compact scene that renders like the given one, or better, with 1 to 10 % of its Gaussians."""
@@ -52,11 +57,13 @@ def compact(args: opt.Args) -> None:
     levels = [level_output(out, level) for level in range(1, settings.budget.levels)]
     cameras = viewer_cameras_path(out) if writing.viewer_cameras else None
     inputs = (*input_files(files), *checkpoint_files(settings.checkpoint))
-    beside = None if cameras is None or (not args.overwrite and holds_cameras(cameras)) else cameras
+    beside = None if cameras is None or (not args.overwrite and is_camera_file(cameras)) else cameras
     check_outputs(
         (out, *levels, args.report, beside, args.save_cameras), inputs, overwrite=args.overwrite or args.dry_run
     )
     check_format(out, writing, settings.budget)
+    if args.embed_cameras:
+        check_embedding(out, settings.budget)
     if args.dry_run:
         print_plan(args, files, settings, out, hints)
         return
@@ -70,17 +77,20 @@ def compact(args: opt.Args) -> None:
             files, settings, out, opacity=args.opacity, hints=hints, overwrite=args.overwrite, progress=progress,
             hashed=args.json or args.report is not None, seconds_before=seconds_before, report_path=args.report,
             normals=writing.normals, spz_version=writing.spz_version, cameras_path=cameras,
-            saved_cameras=args.save_cameras,
+            saved_cameras=args.save_cameras, embed_cameras=args.embed_cameras,
         )  # fmt: skip
 
-    say_notes(document["notes"], quiet=args.silent)
+    say_notes([note for note in document["notes"] if note != document["worse"]], quiet=args.silent)
     lines = summary_lines(document)
     if sys.stdout.isatty():
         view = shlex.join(["gsmerge", "view", str(args.scenes[0]), str(out)])
         lines = result_table(document, view if out.suffix.lower() == ".ply" else None)
     print_document(document, lines, as_json=args.json, quiet=args.quiet)
-    if document["unmet"]:
-        raise TargetError(document["unmet"])
+    problems = [document["unmet"], document["worse"] if args.strict else None]
+    if document["worse"] and not args.strict:
+        say_warning(f"{document['worse']}; {MORE}", quiet=args.silent)
+    if any(problems):
+        raise TargetError("; ".join(filter(None, problems)))
 
 
 def _check_scenes(args: opt.Args) -> None:
@@ -123,7 +133,7 @@ def print_plan(args: opt.Args, files: SceneFiles, settings: CompactOptions, out:
     given = read_input(files, opacity=args.opacity, hints=hints)
     scene = given.scene
     paths = {name: path and str(path) for name, path in vars(files).items() if name != "more"}
-    check_saved_cameras(scene, vars(args).get("save_cameras"))
+    check_saved_cameras(scene, vars(args).get("save_cameras"), embed=bool(vars(args).get("embed_cameras")))
     _, unused = choose_baseline(settings, scene)
     backend, problem = choose_backend(settings.device, scene.num_gaussians)
     settings = replace(settings, device=backend.device)

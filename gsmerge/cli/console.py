@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import sys
@@ -34,6 +35,19 @@ def say_notes(notes: Sequence[str], *, quiet: bool = False) -> None:
     for note in notes:
         for line in wrap_line(f"note: {one_line(note)}", _columns(sys.stderr)):
             say(line, quiet=quiet)
+
+
+def say_warning(text: str, *, quiet: bool = False) -> None:
+    """Print a warning on stderr unless ``quiet``, in red where it is a terminal with colours."""
+    start, end = ("\033[31m", "\033[0m") if _has_colors(sys.stderr) else ("", "")
+    if not quiet:
+        with suppress(OSError):
+            print(f"{start}gsmerge: warning: {one_line(text)}{end}", file=sys.stderr, flush=True)
+
+
+def _has_colors(stream: Any) -> bool:
+    """Return whether to use colours: on terminals, or with ``FORCE_COLOR``, unless there is ``NO_COLOR``."""
+    return not os.environ.get("NO_COLOR") and bool(stream.isatty() or os.environ.get("FORCE_COLOR"))
 
 
 def _columns(stream: Any) -> int | None:

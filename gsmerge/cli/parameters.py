@@ -311,8 +311,8 @@ _TABLE = (
     ),
     panel(
         COUNT,
-        option("k", str, "Gaussians per superpixel: finer with more; mixed: 1, 2 or 4 by its saliency.", wording="1",
-               parser=number_or_text, metavar="1-8|mixed"),
+        option("k", str, "Gaussians per superpixel: finer with more; mixed: 1, 2 or 4 by its saliency; auto: 1, and 4 "
+               "for one photo without a long fit.", wording="auto", parser=number_or_text, metavar="1-8|mixed|auto"),
         option("superpixels", str, "Superpixels per view: a number such as 3000, a share of its pixels, or auto: 1.5 "
                "to 8 %, the more the better the depths of the views agree.", wording="4.4%", parser=number_or_text,
                metavar="NUMBER|SHARE|auto"),
@@ -360,8 +360,11 @@ _TABLE = (
         switch("antialiased", "Lower the opacity of small Gaussians by what the low-pass adds to them, as some viewers "
                "do (Mip-Splatting)."),
         switch("overwrite", "Replace the output if it exists."),
+        switch("strict", "Exit with code 4, once all is written, where a result shows the scene's own photos worse "
+               "than the input does, by more than .5 dB."),
         option("report", Path, "Write the JSON report to this file."),
         option("save_cameras", Path, "Write the cameras as used, moved where they were wrong, as transforms.json."),
+        switch("embed_cameras", "Write the cameras as used into the .ply, too, as comments that other programs skip."),
         switch("dry_run", "Print what would be done; write nothing."),
         switch("json", "Print JSON on stdout."),
     ),

@@ -59,6 +59,16 @@ def check_format(output: Path, options: FileOptions, budget: BudgetOptions | Non
         raise UsageError(f"--budget {budget.budget}: expected an output as .ply, got {ending}; give a number")
 
 
+def check_embedding(output: Path, budget: BudgetOptions) -> None:
+    """Refuse cameras in a format without comments, or on top of a size in bytes."""
+    if output.suffix.lower() != ".ply":
+        raise UsageError(f"--embed-cameras: expected an output as .ply, got {output.name}; use --save-cameras FILE")
+    if budget.in_bytes:
+        raise UsageError(
+            f"--embed-cameras: expected a --budget without cameras inside, got {budget.budget}; give a number"
+        )
+
+
 def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None], *, overwrite: bool) -> None:
     """Refuse an output file that is an input, exists without ``overwrite``, is named twice, or has no folder.
 
@@ -79,7 +89,7 @@ def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None],
 
 
 def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
-    from gsmerge.io.photo_files import IMAGE_SUFFIXES
+    from gsmerge.io.image_names import IMAGE_SUFFIXES
 
     try:
         os.lstat(output)
@@ -100,7 +110,7 @@ def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
         raise SceneError(output, f"expected a folder to write to, found no {output.parent}", "make it first")
 
 
-def holds_cameras(path: Path) -> bool:
+def is_camera_file(path: Path) -> bool:
     """Return whether a file has cameras, as the one beside a result in another format has."""
     from gsmerge.io.cameras.read import read_cameras
 

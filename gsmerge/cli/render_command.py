@@ -198,7 +198,7 @@ def _read(
 
 def picture_stems(names: Sequence[str]) -> list[str]:
     """Choose a different file name per view: the image's name, its path joined by ``_``, or the view's number."""
-    from gsmerge.io.photo_files import IMAGE_SUFFIXES
+    from gsmerge.io.image_names import IMAGE_SUFFIXES
 
     paths = []
     for name in names:

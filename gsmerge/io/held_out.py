@@ -13,7 +13,8 @@ from gsmerge.io.alignment import IDENTITY, Similarity
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views, to_cameras, with_convention
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.exporters import AUTO
-from gsmerge.io.photo_files import as_floats, find_image, photo_size
+from gsmerge.io.image_names import find_image
+from gsmerge.io.photo_files import as_floats, photo_size
 from gsmerge.io.scene import SceneLoad
 from gsmerge.io.scene_files import IMAGE_PLACES, SceneFiles
 from gsmerge.io.scene_views import limit_photo_size, stored_photos

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import io
-import os
-import re
 import struct
 import warnings
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePath, PurePosixPath
+from pathlib import Path
 from typing import BinaryIO, overload
 
 import cv2
@@ -18,12 +16,12 @@ import numpy as np
 from PIL import Image
 
 from gsmerge.errors import SceneError
-from gsmerge.io.bounds import MAX_PIXELS, check_file, check_pixels, read_errors, walk_files
+from gsmerge.io.bounds import MAX_PIXELS, check_file, check_pixels, read_errors
+from gsmerge.io.image_names import ImageSource, match_images
 from gsmerge.kernels.matrices import matmul
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import Cameras, StrPath
+from gsmerge.types import Cameras
 
-IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".ppm"})
 _FORMATS = ("JPEG", "WEBP", "BMP", "TIFF", "PPM")  # besides PNG, whose header is read here
 _WIDTH_TAG, _HEIGHT_TAG = 256, 257  # of TIFF: Pillow's own size follows the orientation tag
 _ORIENTATION_TAG = 274
@@ -35,7 +33,6 @@ ASPECT_TOLERANCE = 0.04  # of width over height: backbones round each side to a 
 _PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
 _PNG_CHUNKS = frozenset({b"IHDR", b"PLTE", b"tRNS", b"IDAT"})
 
-ImageSource = StrPath | Sequence[StrPath]
 Size = tuple[int, int]  # width, height, pixels
 _AT_ONCE = 128 << 20  # bytes of decoded photos; more are decoded one by one, when they are used
 
@@ -130,68 +127,6 @@ def same_shape(one: Size, other: Size) -> bool:
     return abs(one[0] * other[1] / (one[1] * other[0]) - 1) <= ASPECT_TOLERANCE
 
 
-def match_images(source: ImageSource, names: Sequence[str]) -> list[Path]:
-    """Find the image file of every view; see :func:`read_images`."""
-    if isinstance(source, str | os.PathLike):
-        root = Path(source)
-        if not root.is_dir():
-            problem = "expected a folder of images, found a file" if root.exists() else "no such folder"
-            raise SceneError(root, problem)
-        files = list_images(root)
-    else:
-        files = [Path(p) for p in source]
-        root = files[0].parent if files else Path()
-    by_ending: dict[str, list[Path]] = {}
-    for file in files:
-        for ending in _endings(file.relative_to(root) if file.is_relative_to(root) else file):
-            by_ending.setdefault(ending, []).append(file)
-    matched = [_lookup(root, by_ending, name) for name in names]
-    paths = [path for path in matched if path is not None]
-    if not paths and len(files) == len(names):
-        return files
-    if len(paths) < len(names):
-        missing = names[matched.index(None)]
-        problem = f"expected {len(names)} images, one per camera, found {len(files)} and none for {missing}"
-        raise SceneError(root, problem, "add what is missing, or name the right folder with --images")
-    if len(set(paths)) < len(paths):
-        twice = next(path for path in paths if paths.count(path) > 1)
-        raise SceneError(root, f"expected an image of its own for each camera, found {twice.name} for two of them")
-    return paths
-
-
-def _endings(path: PurePath) -> list[str]:
-    """List every ending of a path, the longest first, with and without its extension."""
-    endings = [PurePosixPath(*path.parts[i:]) for i in range(len(path.parts))]
-    return list(dict.fromkeys(str(some) for ending in endings for some in (ending, ending.with_suffix(""))))
-
-
-def _lookup(root: Path, by_ending: dict[str, list[Path]], name: str) -> Path | None:
-    parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in ("/", "//", "..")]
-    matches = next((by_ending[ending] for ending in _endings(PurePosixPath(*parts)) if ending in by_ending), [])
-    if len(matches) > 1:
-        first, second = (os.path.relpath(path, root) for path in matches[:2])
-        problem = f"expected one image named {name}, found {first} and {second}"
-        raise SceneError(root, problem, "name the folder that has one of them with --images")
-    return matches[0] if matches else None
-
-
-def match_masks(folder: Path, names: Sequence[str]) -> list[Path | None]:
-    """Find the mask of every view by the name of its photo, with or without the photo's extension; None without one.
-
-    SceneError if the folder has no mask of any view, or two of one.
-    """
-    files = list_images(folder)
-    by_ending: dict[str, list[Path]] = {}
-    for file in files:
-        for ending in _endings(file.relative_to(folder)):
-            by_ending.setdefault(ending, []).append(file)
-    masks = [_lookup(folder, by_ending, name) for name in names]
-    if not any(masks):
-        problem = f"expected masks named as the photos, such as {PurePath(names[0]).name}.png, found none of them"
-        raise SceneError(folder, problem, "rename them, or name another folder with --masks")
-    return masks
-
-
 def decode_mask(path: Path) -> np.ndarray:
     """Decode a mask to ``[h,w]`` bool, True where the photo counts: brighter than half of its brightest pixel."""
     grey = _decode_channel(path, lambda image: image.convert("L"))
@@ -223,25 +158,6 @@ def _decode_channel(path: Path, choose: Callable[[Image.Image], Image.Image | No
                 return None if channel is None else np.asarray(channel)
     except Exception as error:  # whatever damage makes the library raise
         raise SceneError(path, "expected an image, found a file that cannot be decoded", "replace it") from error
-
-
-def list_images(folder: Path) -> list[Path]:
-    """List all images below a folder, sorted with numbers in names as numbers; SceneError if too many files."""
-    images = [f for f in walk_files(folder) if f.suffix.lower() in IMAGE_SUFFIXES and not f.name.startswith(".")]
-    return sorted(images, key=lambda f: natural_key(f.relative_to(folder).as_posix()))
-
-
-def natural_key(name: str) -> list[tuple[int, int, str]]:
-    """Make a sort key that puts "view 2" before "view 10"."""
-    parts = [(p, p.lstrip("0")) for p in re.split(r"([0-9]+)", name) if p]
-    return [(0, len(digits), digits) if p[0] in "0123456789" else (1, 0, p) for p, digits in parts]
-
-
-def find_image(folder: Path, name: str) -> Path | None:
-    """Find the image that a camera file in the folder names, with or without extension; None without one."""
-    path = os.path.join(folder, name)
-    candidates = [path, *(path + suffix for suffix in sorted(IMAGE_SUFFIXES))]
-    return next((Path(c) for c in candidates if os.path.isfile(c)), None)
 
 
 def image_size(path: Path) -> Size:

@@ -9,15 +9,14 @@ from pathlib import Path
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file
+from gsmerge.io.cameras.embedded import holds_cameras
 from gsmerge.io.cameras.npz_files import holds_images
 from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
 from gsmerge.io.cameras.read import (
     find_cameras,
     find_other_cameras,
 )
-from gsmerge.io.photo_files import (
-    list_images,
-)
+from gsmerge.io.image_names import list_images
 from gsmerge.types import StrPath
 
 # The first that exists wins; then the folder's only .ply.
@@ -31,7 +30,11 @@ _RESULT = re.compile(r"\.compact(\.level\d+)?(\.compressed)?\.ply$")
 
 @dataclass(frozen=True)
 class SceneFiles:
-    """The files of a scene; cameras may be a COLMAP folder, images the ``.npz`` or ``.torch`` that holds them."""
+    """The files of a scene.
+
+    Cameras may be a COLMAP folder or the ``.ply`` that holds its own, images the ``.npz`` or ``.torch`` that holds
+    them.
+    """
 
     ply: Path
     cameras: Path | None
@@ -48,6 +51,8 @@ def find_scene_files(
     masks: StrPath | None = None,
 ) -> SceneFiles:
     """Find a scene's files; those that the user names are used instead of searching.
+
+    Cameras inside the ``.ply`` go before others beside it.
 
     The given folder is searched, then the ``.ply``'s own, then the one above it for ``gs_ply/`` and ``gaussians/``,
     and two above it for ``point_cloud/iteration_n/``; in each the places of ``PLY_PLACES``, ``CAMERA_PLACES``,
@@ -68,7 +73,8 @@ def find_scene_files(
         above = [folder.parent.parent]
     roots = list(dict.fromkeys((Path(os.path.realpath(given)), folder, *above)))
     places = (find(root) for find in (find_cameras, find_other_cameras) for root in roots)
-    camera_path = _named(cameras) or next((place for place in places if place is not None), None)
+    camera_path = _named(cameras) or (ply if holds_cameras(ply) else None)
+    camera_path = camera_path or next((place for place in places if place is not None), None)
     image_path = _named(images)
     if image_path is None and camera_path is not None:
         has_images = camera_path.suffix == CHUNK or (camera_path.suffix == ".npz" and holds_images(camera_path))

@@ -15,8 +15,15 @@ from gsmerge.io.cameras.camera_file import CameraFile, missing_intrinsics, sizes
 from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
 from gsmerge.io.cameras.read import CAMERA_PLACES, SHARP, read_cameras, read_sharp
 from gsmerge.io.formats.ply import PlyScene
-from gsmerge.io.photo_files import (
+from gsmerge.io.image_names import (
     IMAGE_SUFFIXES,
+    find_image,
+    list_images,
+    match_images,
+    match_masks,
+    natural_key,
+)
+from gsmerge.io.photo_files import (
     Photos,
     PhotoTransform,
     Size,
@@ -25,13 +32,8 @@ from gsmerge.io.photo_files import (
     decode_image,
     decode_images,
     decode_mask,
-    find_image,
     image_size,
     keep_photos,
-    list_images,
-    match_images,
-    match_masks,
-    natural_key,
     photo_size,
     quarter_turns,
     resize_to,

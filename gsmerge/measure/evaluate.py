@@ -15,7 +15,7 @@ from gsmerge.measure.align import PoseChange, fit_colors, refine_pose
 from gsmerge.measure.speed import zoom_cameras
 from gsmerge.measure.visibility import context_points, resize_mask, resize_photo, visible_pixels
 from gsmerge.render import prepare, render
-from gsmerge.render.metrics import psnr, ssim
+from gsmerge.render.metrics import describe_loss, psnr, ssim
 from gsmerge.render.photos import NEAR
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.prepare import scene_frame
@@ -244,12 +244,20 @@ def evaluate(
         reference = (
             "photos, and renders of the input in its own views" if "target" in counts else "renders of the input"
         )
-    return Evaluation(tuple(scores), reference, counts, _notes(splits), options)
+    losses = _losses(scores) if scene.images is not None and options.own and options.context else []
+    return Evaluation(tuple(scores), reference, counts, (*losses, *_notes(splits)), options)
 
 
 def near_plane(scene: Scene) -> float:
     """Choose the near plane for comparing a scene and its results, world units; there must be a Gaussian and a view."""
     return NEAR * scene_frame(scene).unit
+
+
+def _losses(scores: Sequence[ResultScores]) -> list[str]:
+    """Name the results that show the input views' photos worse than the first of the scores."""
+    before, *after = [(one.name, one.mean("context")[0].psnr) for one in scores]
+    losses = [describe_loss(name, before[1], psnr) for name, psnr in after]
+    return [loss for loss in losses if loss is not None]
 
 
 def _notes(splits: Mapping[str, _Split]) -> tuple[str, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -26,7 +26,7 @@ from gsmerge.io.formats.writing import file_bytes
 from gsmerge.io.scene_views import read_scene_cameras
 from gsmerge.measure.visibility import MAX_SAMPLES, inside_views
 from gsmerge.options import CompactOptions
-from gsmerge.plan import resolved_settings, steps_for
+from gsmerge.plan import resolve_decode, resolved_settings, steps_for
 from gsmerge.report import finite, human_bytes
 from gsmerge.runtime.estimate import fit_of, memory_bytes, memory_problem, wall_seconds
 from gsmerge.runtime.record import record_part
@@ -214,7 +214,9 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
         and ``fit`` as they are used; ``seconds`` and ``memory_bytes``, to two digits and right within a factor of
         about two; ``memory_problem``, None where this machine has enough.
     """
-    photos, settings = scene.images is not None, resolved_settings(options, photos=scene.images is not None)
+    photos = scene.images is not None
+    options = replace(options, decode=resolve_decode(options, scene, photos=photos))
+    settings = resolved_settings(options, photos=photos)
     limits = count_limits(scene, options.segment, options.decode, options.budget)
     pixels = max(len(scene) * scene.pixels_per_view, scene.num_gaussians)
     most = pixels if options.method.startswith("unmerged") else largest_count(limits, options.segment)

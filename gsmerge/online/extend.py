@@ -43,7 +43,7 @@ from gsmerge.render.photos import scene_pictures
 from gsmerge.runtime.record import Progress, choose, record_run, stage
 from gsmerge.runtime.threads import use_threads
 from gsmerge.search import choose_count
-from gsmerge.stages.decode import keep_all
+from gsmerge.stages.decode import USUAL_K, keep_all
 from gsmerge.stages.fit import visible_mask
 from gsmerge.stages.match import MatchOptions, match
 from gsmerge.stages.merge import MergedViews, merge, take
@@ -84,6 +84,8 @@ def extend(
     what a state cannot have, or the degree of the harmonics is not that of the state.
     """
     options, online = options or CompactOptions().with_settings({"fit": "none"}), online or OnlineOptions()
+    if options.decode.k == AUTO:
+        options = replace(options, decode=replace(options.decode, k=USUAL_K))  # whatever the first batch is like
     max_k = online.max_k if state is None else state.settings.max_k
     _check(state, scene, options, max_k)
     with use_threads(options.threads), record_run(progress) as record:

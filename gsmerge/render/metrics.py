@@ -10,6 +10,7 @@ from gsmerge.types import Array, as_array
 
 WINDOW, SIGMA = 11, 1.5  # pixels per side of ssim's windows, and their standard deviation in pixels
 C1, C2 = 0.01**2, 0.03**2  # ssim's stabilisers (K1 = .01, K2 = .03) for a data range of 1
+MAX_LOSS = 0.5  # dB that a result may show the photos worse than its input without a word about it
 
 
 def image_pair(image: Array, reference: Array) -> tuple[Array, Array]:
@@ -46,6 +47,18 @@ def psnr(image: Array, reference: Array, mask: Array | None = None) -> float:
 def decibels(error: float) -> float:
     """Return the peak signal-to-noise ratio, dB, of a mean squared error of values in [0, 1]; at most 120."""
     return -10 * float(log10(max(error, 1e-12)))
+
+
+def describe_loss(name: str, before: float | None, after: float | None) -> str | None:
+    """Say that a result shows its scene's own photos worse than the input; None up to ``MAX_LOSS``.
+
+    ``before``, ``after``: PSNR (dB) of the photos from the input and from the result; None without
+    photos.
+    """
+    if before is None or after is None or not before - after > MAX_LOSS:  # the difference of infinities is NaN
+        return None
+    loss = f"{after:.2f} dB, {before:.2f} dB before"
+    return f"{name} shows the scene's own photos worse than the input does: {loss}"
 
 
 def ssim(image: Array, reference: Array, mask: Array | None = None) -> float:

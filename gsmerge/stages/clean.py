@@ -65,6 +65,11 @@ class CleanOptions:
         """Whether anything is to be left out."""
         return self.crop is not None or self.drop_floaters or self.drop_sky
 
+    @property
+    def hides(self) -> bool:
+        """Whether what photos show is left out on purpose."""
+        return self.crop is not None or self.drop_sky
+
 
 def parse_crop(text: str) -> tuple[str, np.ndarray]:
     """Parse the shape of a crop and its numbers, float64.

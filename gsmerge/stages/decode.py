@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gsmerge.budget import AUTO
 from gsmerge.kernels.gaussians.bisect import bisect, gather_groups, split_errors
 from gsmerge.moments import Members, feature_to_gaussians, pool_members, to_gaussians
 from gsmerge.render.photos import scene_pictures
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
 MAX_CHILDREN = 8
 MIXED, MIXED_COUNTS = "mixed", (1, 2, 4)  # the K of groups of their own, and its values
+USUAL_K = 1  # what "auto" is unless there are reasons for more
 K_RULES = ("saliency", "distortion")
 GROUPS_PER_TASK = 8192
 REFILLS = 3  # times that Gaussians too faint to be seen are replaced by others, of which a few are faint again
@@ -33,7 +35,9 @@ class DecodeOptions:
     """Number of Gaussians that a Feature Gaussian becomes.
 
     Args:
-        k: Children of each group, 1 to 8; or ``"mixed"``: 1, 2 or 4 (paper supplement, per-superpixel K).
+        k: Children of each group, 1 to 8; or ``"mixed"``: 1, 2 or 4 (paper supplement, per-superpixel K); or
+            ``"auto"``: 4 where all views have one camera, nothing else says how many Gaussians there are to be, and no
+            fit follows or one of at most 60 steps; otherwise 1.
         k_low: Percentile of ``"mixed"`` up to which groups become one Gaussian. The paper's percentiles are 33.3 and
             66.7, which give more Gaussians than K = 2 everywhere.
         k_high: Percentile above which they become four.
@@ -45,15 +49,15 @@ class DecodeOptions:
         ValueError: If a setting is unknown or out of range.
     """
 
-    k: int | str = 1
+    k: int | str = AUTO
     k_low: float = 50.0
     k_high: float = 85.0
     k_rule: str = "saliency"
     min_opacity: float = 1 / 255
 
     def __post_init__(self) -> None:
-        if self.k != MIXED and not (isinstance(self.k, int) and 1 <= self.k <= MAX_CHILDREN):
-            raise ValueError(f"k: expected 1 to {MAX_CHILDREN} or {MIXED}, got {self.k!r}")
+        if self.k not in (MIXED, AUTO) and not (isinstance(self.k, int) and 1 <= self.k <= MAX_CHILDREN):
+            raise ValueError(f"k: expected 1 to {MAX_CHILDREN}, {MIXED} or {AUTO}, got {self.k!r}")
         if not 0 <= self.k_low <= 100:
             raise ValueError(f"k_low: expected 0 to 100, got {self.k_low}")
         if not self.k_low <= self.k_high <= 100:
@@ -66,12 +70,13 @@ class DecodeOptions:
     @property
     def mean_k(self) -> float:
         """Mean number of children of a group."""
-        return float(self.k) if self.k != MIXED else 1 + (100 - self.k_low + 2 * (100 - self.k_high)) / 100
+        mixed = 1 + (100 - self.k_low + 2 * (100 - self.k_high)) / 100
+        return mixed if self.k == MIXED else float(self.max_k)
 
     @property
     def max_k(self) -> int:
         """Largest number of children of a group."""
-        return MIXED_COUNTS[-1] if self.k == MIXED else int(self.k)
+        return {MIXED: MIXED_COUNTS[-1], AUTO: USUAL_K}.get(str(self.k)) or int(self.k)
 
 
 def decode(
@@ -133,7 +138,7 @@ def decode_merged(merged: MergedViews, scene: Scene, options: DecodeOptions, *, 
 
 def _decode_count(merged: MergedViews, scene: Scene, count: int | None, options: DecodeOptions) -> Gaussians:
     """Decode ``count`` Gaussians where they lower distortion most; None: K of each Feature Gaussian."""
-    if count is None and options.k == 1 and merged.k1_gaussians is not None:
+    if count is None and options.max_k == 1 and merged.k1_gaussians is not None:
         return merged.k1_gaussians
     features, members, networks = merged.features, merged.members, merged.networks
     children = None

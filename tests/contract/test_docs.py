@@ -164,6 +164,8 @@ def test_every_option_is_a_field_of_the_api() -> None:
         "overwrite",
         "report",
         "save-cameras",
+        "strict",
+        "embed-cameras",
         "dry-run",
         "json",
         "quiet",

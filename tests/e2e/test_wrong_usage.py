@@ -16,8 +16,8 @@ from .conftest import Run, assert_refused, listing
 # Words after ``gsmerge``, run in a folder with the scene ``room`` of 5 views of 48 x 32, what it is encoded to, and a
 # state of it: parts of the error line, with * between them
 USAGE = {
-    "compact room --k 0": "k: expected 1 to 8 or mixed, got 0",
-    "compact room --k 9": "k: expected 1 to 8 or mixed, got 9",
+    "compact room --k 0": "k: expected 1 to 8, mixed or auto, got 0",
+    "compact room --k 9": "k: expected 1 to 8, mixed or auto, got 9",
     "compact room --superpixels 1537": "1536*1537",
     "compact room --superpixels 0": "superpixels",
     "compact room --superpixels 0%": "superpixels",

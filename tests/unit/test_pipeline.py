@@ -185,7 +185,7 @@ def test_wrong_settings_are_refused(scene: Scene, settings: dict, message: str) 
 
 def test_wrong_settings_are_refused_before_any_stage(scene: Scene) -> None:
     calls: list[str] = []
-    with pytest.raises(ValueError, match="k: expected 1 to 8 or mixed, got 0"):
+    with pytest.raises(ValueError, match="k: expected 1 to 8, mixed or auto, got 0"):
         compact(scene, k=0, progress=lambda name, *_: calls.append(name))
     assert calls == []
 

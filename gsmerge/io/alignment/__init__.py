@@ -46,7 +46,13 @@ from gsmerge.io.alignment.score import check_pairs as check_pairs
 from gsmerge.io.alignment.score import sample_pixels as sample_pixels
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.ply import PlyScene
-from gsmerge.io.photo_files import Photos, PhotoTransform, as_floats, natural_key, photo_size
+from gsmerge.io.image_names import natural_key
+from gsmerge.io.photo_files import (
+    Photos,
+    PhotoTransform,
+    as_floats,
+    photo_size,
+)
 from gsmerge.types import Cameras
 
 _LARGE = 2  # times as many pixels as rows: likely photos of another size than the grid's

@@ -27,7 +27,14 @@ from gsmerge.io.alignment.layouts import exact_layouts, grids_of_count, subsampl
 from gsmerge.io.alignment.score import MARGIN, Correspondences, find_correspondences, pixel_limit
 from gsmerge.io.cameras.camera_file import CameraFile, make_pinhole
 from gsmerge.io.formats.ply import PlyScene
-from gsmerge.io.photo_files import Photos, Size, as_floats, natural_key, photo_size, resize_to
+from gsmerge.io.image_names import natural_key
+from gsmerge.io.photo_files import (
+    Photos,
+    Size,
+    as_floats,
+    photo_size,
+    resize_to,
+)
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.pictures import sample_bilinear
 from gsmerge.types import Cameras, Gaussians

@@ -12,7 +12,14 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry import rgb_to_sh0
 from gsmerge.io.cameras.camera_file import CameraFile, sizes_of, to_cameras
 from gsmerge.io.formats.ply import PlyInfo
-from gsmerge.io.photo_files import ASPECT_TOLERANCE, PhotoTransform, Size, resize_and_crop, resize_to, same_shape
+from gsmerge.io.photo_files import (
+    ASPECT_TOLERANCE,
+    PhotoTransform,
+    Size,
+    resize_and_crop,
+    resize_to,
+    same_shape,
+)
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.types import Cameras, Gaussians, Scene, grid_ids
 

@@ -12,7 +12,13 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.geometry import pose_changes
 from gsmerge.io.bounds import MAX_VIEWS, check_pixels
-from gsmerge.io.photo_files import Photos, Size, change_photos, photo_size, same_shape
+from gsmerge.io.photo_files import (
+    Photos,
+    Size,
+    change_photos,
+    photo_size,
+    same_shape,
+)
 from gsmerge.kernels.matrices import determinant, invert, matmul
 from gsmerge.types import Cameras, StrPath
 

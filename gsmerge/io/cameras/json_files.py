@@ -29,7 +29,8 @@ from gsmerge.io.cameras.camera_file import (
     make_lens,
     make_pinhole,
 )
-from gsmerge.io.photo_files import find_image, image_size
+from gsmerge.io.image_names import find_image
+from gsmerge.io.photo_files import image_size
 from gsmerge.kernels.elementary import cos, sin
 from gsmerge.kernels.matrices import determinant, invert, matmul
 from gsmerge.types import Cameras
@@ -294,18 +295,27 @@ def viewer_cameras_path(output: Path) -> Path:
     return output.with_name(stem + VIEWER_CAMERAS)
 
 
-def write_transforms(path: Path, cameras: Cameras, names: Sequence[str]) -> None:
-    """Write cameras as nerfstudio's ``transforms.json``, with all intrinsics; :func:`read_transforms` reads it."""
+def transforms_document(cameras: Cameras, names: Sequence[str], *, digits: int = 17) -> dict[str, Any]:
+    """Make nerfstudio's ``transforms.json`` with all intrinsics, its numbers rounded to so many digits."""
+
+    def rounded(value: float) -> float:
+        return float(f"{value:.{digits}g}")
+
     poses = from_viewmats(cameras.viewmats.astype(np.float64), C2W_OPENGL)
     frames = [
         {
             "file_path": name, "w": cameras.width, "h": cameras.height,
-            "fl_x": float(K[0, 0]), "fl_y": float(K[1, 1]), "cx": float(K[0, 2]), "cy": float(K[1, 2]),
-            "transform_matrix": pose.tolist(),
+            "fl_x": rounded(K[0, 0]), "fl_y": rounded(K[1, 1]), "cx": rounded(K[0, 2]), "cy": rounded(K[1, 2]),
+            "transform_matrix": [[rounded(value) for value in row] for row in pose],
         }
         for name, K, pose in zip(names, cameras.Ks, poses, strict=True)
     ]  # fmt: skip
-    path.write_text(json.dumps({"camera_model": "PINHOLE", "frames": frames}, indent=1) + "\n", encoding="utf-8")
+    return {"camera_model": "PINHOLE", "frames": frames}
+
+
+def write_transforms(path: Path, cameras: Cameras, names: Sequence[str]) -> None:
+    """Write cameras as nerfstudio's ``transforms.json``, with all intrinsics; :func:`read_transforms` reads it."""
+    path.write_text(json.dumps(transforms_document(cameras, names), indent=1) + "\n", encoding="utf-8")
 
 
 def viewer_cameras(cameras: Cameras, names: Sequence[str]) -> str:

@@ -13,6 +13,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io.bounds import MAX_VIEWS, check_file, read_text
 from gsmerge.io.cameras.camera_file import C2W_OPENCV, W2C_OPENCV, CameraFile, View, make_camera_file, make_pinhole
 from gsmerge.io.cameras.colmap import is_colmap, read_colmap
+from gsmerge.io.cameras.embedded import read_embedded
 from gsmerge.io.cameras.json_files import VIEWER_CAMERAS, read_json_cameras
 from gsmerge.io.cameras.npz_files import array_names, holds_poses, read_da3, read_dump
 from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
@@ -68,8 +69,8 @@ def read_cameras(path: StrPath, *, scene: str | None = None, folder: Path | None
 
     ``transforms.json`` (nerfstudio, instant-ngp), COLMAP text and binary models, INRIA's ``cameras.json``,
     ``results.npz`` of Depth Anything 3, ``views.npz`` dumped from a running model, ``camera_params.json`` of
-    WorldMirror, the dataset file of Long-LRM, ``.torch`` chunks of re10k, and text files with one pose per line. Poses
-    become world-to-camera with OpenCV axes.
+    WorldMirror, the dataset file of Long-LRM, ``.torch`` chunks of re10k, text files with one pose per line, and a
+    ``.ply`` of gsmerge that holds its own. Poses become world-to-camera with OpenCV axes.
 
     Args:
         path: The file, a COLMAP folder, or a folder that has the cameras in one of the usual places.
@@ -105,6 +106,8 @@ def read_cameras(path: StrPath, *, scene: str | None = None, folder: Path | None
         return read_re10k(path, scene)
     if path.suffix == ".json":
         return read_json_cameras(path, folder)
+    if path.suffix.lower() == ".ply":
+        return read_embedded(path)
     raise SceneError(path, "expected cameras as .json, .npz, .torch or a COLMAP folder, found another kind of file")
 
 

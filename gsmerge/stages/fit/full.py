@@ -86,6 +86,8 @@ def plan_run(photos: tuple[Photos, ...], options: FitOptions, seed: int) -> FitP
     weights = full, reduced(full, photos[1])
     everywhere, *larger = (_weights_of(one) for one in (photos[0], *photos[2:]))
     trained = [np.where(weight == HIDDEN, np.float32(0), weight) for weight in weights[1]]
+    if len(photos[0]) == 1:  # no other photo shows what is held out: the fit is judged by all that it sees
+        weights = weights[0], [np.where(weight == 1, np.float32(0), weight) for weight in weights[1]]
     half_part = options.half_res_part
     if len(photos) > 2 and options.half_res_share is None:
         half_part -= EARLIER

@@ -12,7 +12,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io import bounds
 from gsmerge.io.bounds import check_file, check_pixels, read_table, read_text
 from gsmerge.io.content_hash import content_hash
-from gsmerge.io.photo_files import list_images
+from gsmerge.io.image_names import list_images
 
 
 def test_images_beyond_all_use_are_refused(tmp_path: Path) -> None:

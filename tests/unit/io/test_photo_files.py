@@ -15,7 +15,8 @@ from tiny_scene import Tiny, write_images
 from gsmerge.errors import SceneError
 from gsmerge.io import photo_files as photos
 from gsmerge.io import read_images
-from gsmerge.io.photo_files import image_size, match_images, natural_key
+from gsmerge.io.image_names import match_images, natural_key
+from gsmerge.io.photo_files import image_size
 from gsmerge.runtime.threads import use_threads
 
 

@@ -1,0 +1,96 @@
+"""Image files by the names of views: in folders and their sub-folders, with or without extension."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path, PurePath, PurePosixPath
+
+from gsmerge.errors import SceneError
+from gsmerge.io.bounds import walk_files
+from gsmerge.types import StrPath
+
+IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".ppm"})
+ImageSource = StrPath | Sequence[StrPath]
+
+
+def match_images(source: ImageSource, names: Sequence[str]) -> list[Path]:
+    """Find the image file of every view; see :func:`read_images`."""
+    if isinstance(source, str | os.PathLike):
+        root = Path(source)
+        if not root.is_dir():
+            problem = "expected a folder of images, found a file" if root.exists() else "no such folder"
+            raise SceneError(root, problem)
+        files = list_images(root)
+    else:
+        files = [Path(p) for p in source]
+        root = files[0].parent if files else Path()
+    by_ending: dict[str, list[Path]] = {}
+    for file in files:
+        for ending in _endings(file.relative_to(root) if file.is_relative_to(root) else file):
+            by_ending.setdefault(ending, []).append(file)
+    matched = [_lookup(root, by_ending, name) for name in names]
+    paths = [path for path in matched if path is not None]
+    if not paths and len(files) == len(names):
+        return files
+    if len(paths) < len(names):
+        missing = names[matched.index(None)]
+        problem = f"expected {len(names)} images, one per camera, found {len(files)} and none for {missing}"
+        raise SceneError(root, problem, "add what is missing, or name the right folder with --images")
+    if len(set(paths)) < len(paths):
+        twice = next(path for path in paths if paths.count(path) > 1)
+        raise SceneError(root, f"expected an image of its own for each camera, found {twice.name} for two of them")
+    return paths
+
+
+def _endings(path: PurePath) -> list[str]:
+    """List every ending of a path, the longest first, with and without its extension."""
+    endings = [PurePosixPath(*path.parts[i:]) for i in range(len(path.parts))]
+    return list(dict.fromkeys(str(some) for ending in endings for some in (ending, ending.with_suffix(""))))
+
+
+def _lookup(root: Path, by_ending: dict[str, list[Path]], name: str) -> Path | None:
+    parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in ("/", "//", "..")]
+    matches = next((by_ending[ending] for ending in _endings(PurePosixPath(*parts)) if ending in by_ending), [])
+    if len(matches) > 1:
+        first, second = (os.path.relpath(path, root) for path in matches[:2])
+        problem = f"expected one image named {name}, found {first} and {second}"
+        raise SceneError(root, problem, "name the folder that has one of them with --images")
+    return matches[0] if matches else None
+
+
+def match_masks(folder: Path, names: Sequence[str]) -> list[Path | None]:
+    """Find the mask of every view by the name of its photo, with or without the photo's extension; None without one.
+
+    SceneError if the folder has no mask of any view, or two of one.
+    """
+    files = list_images(folder)
+    by_ending: dict[str, list[Path]] = {}
+    for file in files:
+        for ending in _endings(file.relative_to(folder)):
+            by_ending.setdefault(ending, []).append(file)
+    masks = [_lookup(folder, by_ending, name) for name in names]
+    if not any(masks):
+        problem = f"expected masks named as the photos, such as {PurePath(names[0]).name}.png, found none of them"
+        raise SceneError(folder, problem, "rename them, or name another folder with --masks")
+    return masks
+
+
+def list_images(folder: Path) -> list[Path]:
+    """List all images below a folder, sorted with numbers in names as numbers; SceneError if too many files."""
+    images = [f for f in walk_files(folder) if f.suffix.lower() in IMAGE_SUFFIXES and not f.name.startswith(".")]
+    return sorted(images, key=lambda f: natural_key(f.relative_to(folder).as_posix()))
+
+
+def natural_key(name: str) -> list[tuple[int, int, str]]:
+    """Make a sort key that puts "view 2" before "view 10"."""
+    parts = [(p, p.lstrip("0")) for p in re.split(r"([0-9]+)", name) if p]
+    return [(0, len(digits), digits) if p[0] in "0123456789" else (1, 0, p) for p, digits in parts]
+
+
+def find_image(folder: Path, name: str) -> Path | None:
+    """Find the image that a camera file in the folder names, with or without extension; None without one."""
+    path = os.path.join(folder, name)
+    candidates = [path, *(path + suffix for suffix in sorted(IMAGE_SUFFIXES))]
+    return next((Path(c) for c in candidates if os.path.isfile(c)), None)

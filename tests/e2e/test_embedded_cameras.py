@@ -1,0 +1,105 @@
+"""``compact --embed-cameras``: a result that needs no other file to be looked at, measured, compacted or extended."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import gsmerge
+from gsmerge.io import load_scene, read_cameras
+
+from .conftest import Run
+
+FAST = ("--effort", "draft", "--set", "fit_steps=5", "--threads", 1)
+
+
+@pytest.fixture(scope="module")
+def alone(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a result that holds its cameras, and the photos; read only."""
+    from gsmerge.cli import main
+
+    folder = tmp_path_factory.mktemp("alone")
+    call = ["compact", small_scene, "-o", folder / "small.ply", *FAST, "--embed-cameras", "--levels", 2]
+    assert main([str(word) for word in [*call, "--set", "viewer_cameras=false", "--superpixels", 200, "-q"]]) == 0
+    shutil.copytree(small_scene / "images", folder / "images")
+    return folder
+
+
+def test_the_cameras_are_those_of_the_scene(alone: Path, small_scene: Path) -> None:
+    expected = gsmerge.read_scene(small_scene)
+    for name in ("small.ply", "small.level1.ply"):
+        actual = load_scene(alone / name)
+        assert actual.scene.names == expected.names
+        np.testing.assert_allclose(actual.scene.cameras.viewmats, expected.cameras.viewmats, atol=1e-6)
+        np.testing.assert_allclose(actual.scene.cameras.Ks, expected.cameras.Ks, rtol=1e-6)
+        assert np.array_equal(actual.scene.images, expected.images)
+
+
+def test_the_rows_are_the_same_with_and_without(alone: Path, small_scene: Path, tmp_path: Path, run: Run) -> None:
+    out = tmp_path / "small.ply"
+    run("compact", small_scene, "-o", out, *FAST, "--levels", 2, "--superpixels", 200, code=0)
+    one, other = ((path / "small.ply").read_bytes() for path in (tmp_path, alone))
+    assert one.partition(b"end_header")[2] == other.partition(b"end_header")[2]
+    assert b"gsmerge cameras" not in one
+
+
+@pytest.mark.parametrize("command", ["compact", "evaluate", "view", "extend", "inspect", "render"])
+def test_commands_read_them(alone: Path, tmp_path: Path, run: Run, command: str) -> None:
+    small, state = alone / "small.ply", tmp_path / "room.gsm"
+    calls = {
+        "compact": (small, "-o", tmp_path / "x.ply", *FAST, "--budget", 100),
+        "evaluate": (small, alone / "small.level1.ply", "--lpips", "none"),
+        "view": (small, alone / "small.level1.ply", "-o", tmp_path / "x.html", "--no-open"),
+        "extend": (state, small, "--effort", "draft", "--checkpoint", "none", "--threads", 1),
+        "inspect": (small,),
+        "render": (small, "-o", tmp_path / "x.png"),
+    }
+    said = run(command, *calls[command], code=0)
+    if command == "inspect":
+        assert "5 (inside the .ply)" in said.out
+    if command == "extend":
+        assert "5 views" in said.out
+
+
+def test_a_result_lends_its_cameras_to_a_scene_without(
+    alone: Path, small_scene: Path, tmp_path: Path, run: Run
+) -> None:
+    shutil.copy(small_scene / "scene.ply", tmp_path / "bare.ply")
+    said = run("evaluate", tmp_path / "bare.ply", alone / "small.ply", "--lpips", "none", "--images", alone / "images",
+               "--json", code=0)  # fmt: skip
+    document = json.loads(said.out)
+    assert document["num_views"] == {"context": 5}
+    assert document["reference"] == "photos"
+    assert document["results"][0]["mean"]["context"]["psnr"] > 15
+
+
+def test_named_cameras_go_before(alone: Path, small_scene: Path, run: Run) -> None:
+    said = run("inspect", alone / "small.ply", "--cameras", small_scene / "transforms.json", code=0)
+    assert "transforms.json" in said.out
+    assert len(read_cameras(alone / "small.ply")) == 5
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("-o", "x.spz"), "--embed-cameras: expected an output as .ply"),
+        (("-o", "x.ply", "--budget", "20KB"), "--embed-cameras: expected a --budget without cameras inside"),
+    ],
+    ids=["spz", "bytes"],
+)
+def test_where_they_have_no_place_they_are_refused(
+    small_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...], said: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert said in run("compact", small_scene, *options, "--embed-cameras", code=2).err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_scene_without_cameras_has_none_to_embed(small_scene: Path, tmp_path: Path, run: Run) -> None:
+    shutil.copy(small_scene / "scene.ply", tmp_path / "bare.ply")
+    call = ("compact", tmp_path / "bare.ply", "--hint", "order=none", "--embed-cameras")
+    assert "--embed-cameras: expected a scene with cameras" in run(*call, code=2).err

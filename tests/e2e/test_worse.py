@@ -1,0 +1,168 @@
+"""Results that show the scene's own photos worse than the input: never without a word about it."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from batches import InlinePool, records
+from scenes import psnr_of
+
+import gsmerge
+from gsmerge import Scene
+from gsmerge.render.metrics import MAX_LOSS
+from gsmerge.views import subset
+
+from .conftest import Run
+
+FEW = ("--budget", 30, "--fit", "none", "--effort", "draft", "--threads", 1)  # Gaussians, too few to show anything
+SAID = "shows the scene's own photos worse than the input does: "
+
+
+@pytest.fixture(scope="module")
+def three_photos(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    """Three views with depth errors like those of a network."""
+    folder = make_scene(tmp_path_factory.mktemp("three") / "scene", num_views=3, width=96, height=64)
+    return gsmerge.read_scene(folder)
+
+
+@pytest.fixture(scope="module")
+def one_photo(three_photos: Scene) -> Scene:
+    """The second of them alone."""
+    return subset(three_photos, [1])
+
+
+@pytest.mark.parametrize("effort", ["draft", "fast"])
+def test_without_photos_networks_keep_what_the_views_show(three_photos: Scene, effort: str) -> None:
+    """Judged by the photos that the run did not get."""
+    bare = replace(three_photos, images=None, large_photos=None)
+    before = psnr_of(three_photos.gaussians, three_photos)
+    after, alone = (
+        psnr_of(gsmerge.compact(bare, effort=effort, checkpoint=name, threads=1).gaussians, three_photos)
+        for name in ("auto", "none")
+    )
+    assert after > before - MAX_LOSS
+    assert after > alone
+
+
+@pytest.mark.parametrize("effort", ["draft", "fast"])
+def test_one_photo_is_fitted_though_no_other_shows_what_is_held_out(one_photo: Scene, effort: str) -> None:
+    report = gsmerge.compact(one_photo, effort=effort, k=4, threads=1).report
+    assert report.choices["fit"]["method"] == "full"
+    assert report.psnr_after > report.psnr_before
+    assert report.worse is None
+
+
+@pytest.mark.parametrize("settings", [{"effort": "fast"}, {"fit": "none"}], ids=str)
+def test_one_photo_without_a_long_fit_gets_more_gaussians(one_photo: Scene, settings: dict[str, Any]) -> None:
+    actual = gsmerge.compact(one_photo, threads=1, **settings)
+    assert actual.report.options["k"] == 4
+    assert any(note.startswith("k: 4, because") for note in actual.report.notes)
+    fewer = gsmerge.compact(one_photo, threads=1, k=1, **settings)
+    assert 2 * len(fewer.gaussians) < len(actual.gaussians) < 6 * len(fewer.gaussians)
+    assert actual.report.psnr_after > fewer.report.psnr_after
+
+
+@pytest.mark.parametrize(
+    "settings", [{"fit_steps": 100}, {"effort": "fast", "budget": 200}, {"fit": "none", "superpixels": 100}], ids=str
+)
+def test_a_long_fit_or_a_number_that_is_asked_for_changes_no_k(one_photo: Scene, settings: dict[str, Any]) -> None:
+    assert gsmerge.compact(one_photo, threads=1, **settings).report.options["k"] == 1
+
+
+def test_several_cameras_change_no_k(small_scene: Path) -> None:
+    assert gsmerge.compact(gsmerge.read_scene(small_scene), fit="none", threads=1).report.options["k"] == 1
+
+
+def test_a_worse_result_is_named(made_scene: Path, tmp_path: Path, run: Run) -> None:
+    out = tmp_path / "few.ply"
+    said = run("compact", made_scene, "-o", out, *FEW, "--report", tmp_path / "report.json", code=0)
+    document = json.loads((tmp_path / "report.json").read_text())
+    psnr = document["psnr_input_views"]
+    assert psnr["after"] < psnr["before"] - 0.5
+    assert document["worse"] == f"the result {SAID}{psnr['after']:.2f} dB, {psnr['before']:.2f} dB before"
+    assert document["worse"] in document["notes"]
+    (line,) = [line for line in said.err.splitlines() if SAID in line]
+    assert line.startswith(f"gsmerge: warning: {document['worse']}; ")
+    for option in ("--quiet", "--json"):
+        assert run("compact", made_scene, "-o", out, *FEW, "--overwrite", option, code=0).err == ""
+
+
+def test_strict_ends_with_code_4_and_writes_the_result(made_scene: Path, tmp_path: Path, run: Run) -> None:
+    out = tmp_path / "few.ply"
+    said = run("compact", made_scene, "-o", out, *FEW, "--strict", code=4)
+    assert said.err.count(SAID) == 1
+    assert len(gsmerge.read_ply(out).gaussians) == 30
+    better = ("--set", "fit_steps=60", "--threads", 1)
+    assert "warning" not in run("compact", made_scene, "-o", tmp_path / "x.ply", *better, "--strict", code=0).err
+
+
+def test_levels_are_compared_as_well(made_scene: Path, tmp_path: Path, run: Run) -> None:
+    usual = ("--set", "fit_steps=60", "--threads", 1, "--budget", 120, "--levels", 3, "--json")
+    said = run("compact", made_scene, "-o", tmp_path / "x.ply", *usual, code=0)
+    document = json.loads(said.out)
+    assert not any(SAID in note for note in document["notes"])
+    assert document["worse"].startswith("level ")
+    assert any(document["worse"] in level["notes"] for level in document["levels"])
+
+
+def test_what_is_left_out_on_purpose_is_no_loss(made_scene: Path) -> None:
+    scene = gsmerge.read_scene(made_scene)
+    x, y, z = scene.gaussians.means[len(scene.gaussians) // 2]
+    report = gsmerge.compact(scene, crop=f"sphere:{x},{y},{z},.3", fit_steps=20, threads=1).report
+    assert report.psnr_after < report.psnr_before
+    assert report.worse is None
+
+
+@pytest.mark.parametrize(("colors", "red"), [({"FORCE_COLOR": "1"}, True), ({"NO_COLOR": "1"}, False)], ids=str)
+def test_the_warning_is_red(
+    made_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch, colors: dict[str, str], red: bool
+) -> None:
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    for name, value in colors.items():
+        monkeypatch.setenv(name, value)
+    said = run("compact", made_scene, "-o", tmp_path / "few.ply", *FEW, code=0)
+    (line,) = [line for line in said.err.splitlines() if SAID in line]
+    before, _, after = line.partition("gsmerge: warning: ")
+    assert (before.endswith("\033[31m"), after.endswith("\033[0m")) == (red, red)
+
+
+def test_a_batch_names_worse_results(
+    small_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gsmerge.batch.schedule.LocalPool", InlinePool)
+    out = tmp_path / "out"
+    call = ("batch", small_scene, "-o", out, "--jobs", 1, *FEW)
+    said = run(*call, code=0)
+    assert f"worse: {small_scene}: the result {SAID}" in said.out
+    assert said.out.splitlines()[-1].count("; 1 worse than the input") == 1
+    assert "gsmerge: warning: 1 of 1 results show their photos worse than the input" in said.err
+    (record,) = records(out)
+    assert SAID in record["report"]["worse"]
+    with (out / "summary.csv").open(newline="") as file:
+        (row,) = csv.DictReader(file)
+    assert row["worse"] == record["report"]["worse"]
+    again = run(*call, "--strict", code=4)
+    assert "1 skipped" in again.out
+    assert SAID in again.err
+
+
+def test_pages_and_documents_of_comparisons_name_worse_results(made_scene: Path, tmp_path: Path, run: Run) -> None:
+    small = tmp_path / "few.ply"
+    run("compact", made_scene, "-o", small, *FEW, "-q", code=0)
+    pages = [tmp_path / name for name in ("report.html", "report.json", "report.md")]
+    said = run(
+        "evaluate", made_scene, small, "--lpips", "none", *(part for page in pages for part in ("-o", page)), code=0
+    )
+    assert f"note: few.ply {SAID}" in said.err
+    (note,) = [note for note in json.loads(pages[1].read_text())["notes"] if SAID in note]
+    for page in (pages[0], pages[2]):
+        assert note.split("'")[1].removeprefix("s ") in page.read_text()
+    page = tmp_path / "view.html"
+    said = run("view", made_scene, small, "-o", page, "--no-open", code=0)
+    assert f"note: few.ply {SAID}" in said.err
+    assert "own photos worse than the input does" in page.read_text()
