@@ -167,7 +167,7 @@ def test_wrong_sizes_are_named(scene: Scene) -> None:
         compact_tensors(**tensors_of(scene), names=["a"], **FAST)
     with pytest.raises(SceneError, match=r"^quats: expected an array or tensor of numbers, found str"):
         compact_tensors(**tensors_of(scene, quats="wxyz"), **FAST)
-    with pytest.raises(SceneError, match=r"^means: expected finite Gaussians, .* in all 5184 rows"):
+    with pytest.raises(SceneError, match=r"^means: expected finite Gaussians, .* in all 5,184 rows"):
         compact_tensors(**changed(scene, "scales", lambda s: s * np.nan), **FAST)
     with pytest.raises(ValueError, match="order: expected one of"):
         compact_tensors(**tensors_of(scene), order="layers", **FAST)

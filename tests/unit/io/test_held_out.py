@@ -177,7 +177,7 @@ def test_photos_beyond_all_memory_are_made_smaller(tiny: Tiny, tmp_path: Path, m
     load = load_scene(tiny.save(tmp_path / "scene"))
     cameras = write_views(tmp_path / "held", {"q": between(tiny)}, tiny, (1600, 1200))
     assert read_held_out(load, cameras).images.shape[2] == 1600
-    monkeypatch.setattr(scene_files, "_MAX_BYTES", 1 << 20)
+    monkeypatch.setattr(scene_views, "_MAX_BYTES", 1 << 20)
     targets = read_held_out(load, cameras)
     assert targets.images.shape[2] == targets.cameras.width == 1200
     assert np.allclose(targets.cameras.Ks[0][:2], 1200 / tiny.width * tiny.K[:2])

@@ -199,7 +199,7 @@ def test_memory_is_bounded_before_pixels_are_known(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shuffled: bool
 ) -> None:
     """More photos than fit are resized first; a grid that they were resized to is found all the same."""
-    monkeypatch.setattr("gsmerge.io.scene_files._MAX_BYTES", 3 * 100 * 75 * 12)
+    monkeypatch.setattr("gsmerge.io.scene_views._MAX_BYTES", 3 * 100 * 75 * 12)
     loaded = load_scene(save(tmp_path, shuffled=shuffled), max_side=96)
     assert NOTE in loaded.notes
     assert loaded.scene.aligned != shuffled
@@ -208,7 +208,7 @@ def test_memory_is_bounded_before_pixels_are_known(
 
 
 def test_photos_that_may_be_the_grid_are_never_resized(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gsmerge.io.scene_files._MAX_BYTES", 0)
+    monkeypatch.setattr("gsmerge.io.scene_views._MAX_BYTES", 0)
     loaded = load_scene(save(tmp_path, shuffled=False, tiny=SMOOTH), max_side=16)
     assert loaded.pixel_scene().valid.all()
     assert loaded.notes == ()
