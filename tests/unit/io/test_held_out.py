@@ -13,7 +13,7 @@ import pytest
 from tiny_scene import FLIP, Tiny, edited_json, make_tiny, rotation
 
 from gsmerge.errors import SceneError
-from gsmerge.io import load_scene, read_held_out, scene_files
+from gsmerge.io import load_scene, read_held_out, scene_views
 from gsmerge.io.held_out import fit_similarity
 from gsmerge.types import Scene
 
