@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import lower_median
 from gsmerge.io.alignment import (
     Alignment,
     AlignmentResult,
@@ -21,6 +20,7 @@ from gsmerge.io.alignment import (
     check_alignment,
     choose_rotations,
     fill_from_depths,
+    find_padding,
     read_rotations,
 )
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views, to_cameras
@@ -44,7 +44,6 @@ from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import Cameras, Gaussians, LargePhotos, Scene, StrPath, grid_ids
 
-_MIN_PADDING = 16  # equal rows at the origin: fewer may be Gaussians
 NO_CAMERAS = Cameras(np.empty((0, 4, 4)), np.empty((0, 3, 3)), 1, 1)
 _NO_ALIGNMENT = AlignmentResult(
     None, NO_CAMERAS, None, None, problem="expected one Gaussian per pixel, found no cameras that have any"
@@ -312,12 +311,8 @@ def _place_rows(
     padding.
     """
     if result.pixel_ids is None:
-        gaussians, padding = ply.gaussians, np.zeros(len(ply.valid), bool)
-        rows = np.flatnonzero((gaussians.means == 0).all(1))
-        if len(rows) >= _MIN_PADDING:  # equal rows at the origin, with which VolSplat pads its files
-            shape = np.concatenate([gaussians.scales, gaussians.opacities[:, None], gaussians.sh0[:, 0]], 1)[rows]
-            padding[rows[(shape == lower_median(shape)).all(1)]] = True
-        keep = ply.valid & ~padding
+        gaussians = ply.gaussians
+        keep = ply.valid & ~find_padding(gaussians)
         count = int(ply.valid.sum()) - int(keep.sum())
         notes = [f"{count:,} rows that only fill the file up are left out"] if count else []
         return ply.gaussians[keep], None, None, notes

@@ -47,6 +47,7 @@ Spread = tuple[float, float, float]
 ColorOf = Callable[[np.ndarray, int, np.ndarray], np.ndarray]
 _ROUNDS = 3  # of a layout and the scale that follows from it
 _CERTAIN_PX = 0.3  # median distance that a search does not reach in a wrong frame
+_FAR_PX, _FAR = 10.0, 0.1  # pixels, and share of the shorter side, beyond which no finer scale helps
 _AS_GOOD = 1.05  # of that distance: no worse, where the scale is solved from more rows
 _BETTER = 2.0  # times nearer to the pixels: another scale, where the same fits as well
 
@@ -99,8 +100,9 @@ def _score_view_major(inputs: AlignmentInput, rows: ProjectedRows, frame: Simila
 def _score_scaled(inputs: AlignmentInput, rows: ProjectedRows) -> AlignmentScore | None:
     """Search for scale and pixels in turn, until neither changes."""
     scale = rough_scale(rows)
-    best = _score(inputs, rows, read_view_major, scale_by(scale))
-    if best is None:
+    best = None if scale is None else _score(inputs, rows, read_view_major, scale_by(scale))
+    far = max(_FAR_PX, _FAR * min(rows.cameras.width, rows.cameras.height))
+    if scale is None or best is None or best.worst_px > far:
         return None
     every = replace(rows, points=inputs.gaussians.means.astype(np.float64))
     frame = scale_by(finer_scale(every, best.layout, scale))

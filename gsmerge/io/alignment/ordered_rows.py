@@ -201,8 +201,11 @@ def _never_falling(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return np.asarray(isotonic_regression(values, weights=weights).x)
 
 
-def rough_scale(rows: ProjectedRows) -> float:
-    """Find the scale of the cameras' positions under which rows step by single pixels; no pixel is known yet."""
+def rough_scale(rows: ProjectedRows) -> float | None:
+    """Find the scale of the cameras' positions under which rows step by single pixels; no pixel is known yet.
+
+    None where they do in no view at any scale.
+    """
     views = len(rows.cameras)
     middles = (np.arange(views) + 0.5) / views * len(rows)
     windows = [
@@ -216,6 +219,8 @@ def rough_scale(rows: ProjectedRows) -> float:
         return float(np.mean([min(pixels, _MAX_UNEVENNESS) for pixels in uneven]))
 
     best = float(min(SCALES, key=cost))
+    if cost(best) >= _MAX_UNEVENNESS:
+        return None
     for width_of_search in (1.08, 1.02, 1.005):
         best = float(min(best * np.geomspace(1 / width_of_search, width_of_search, 9), key=cost))
     return best
