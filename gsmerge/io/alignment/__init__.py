@@ -27,6 +27,8 @@ from gsmerge.io.alignment.layouts import GridFit, other_grids, photo_grid, small
 from gsmerge.io.alignment.layouts import Layout as Layout
 from gsmerge.io.alignment.layouts import Order as Order
 from gsmerge.io.alignment.layouts import fill_from_depths as fill_from_depths
+from gsmerge.io.alignment.photos_alone import WITH_PHOTOS as WITH_PHOTOS
+from gsmerge.io.alignment.photos_alone import estimate_with_photos as estimate_with_photos
 from gsmerge.io.alignment.recovery import Recovery as Recovery
 from gsmerge.io.alignment.recovery import explain_count, is_seen, possible_layouts, recover
 from gsmerge.io.alignment.recovery import explain_misalignment as explain_misalignment
@@ -314,8 +316,9 @@ def _with_pixels(
     if recovery is None:
         return None
     frame, layout, count = recovery.best.frame, recovery.best.layout, len(inputs.cameras)
-    if camera_file.source == ESTIMATED:
-        text = "no cameras were given: poses and focal length are estimated from the Gaussians' own grid"
+    if camera_file.source in (ESTIMATED, WITH_PHOTOS):
+        from_what = "own grid" if camera_file.source == ESTIMATED else "order and the photos' colours"
+        text = f"no cameras were given: poses and focal length are estimated from the Gaussians' {from_what}"
         notes = (*notes, text)
     in_order = layout.is_plain and frame is IDENTITY and len(layout.views) == count
     if in_order and layout.views == tuple(inputs.labellings[0]):

@@ -94,7 +94,7 @@ def estimate_cameras(
     """
     layouts = exact_layouts(len(gaussians), len(names), width, height)
     possible = [layout for layout in layouts if layout.per_pixel == 1 and len(layout.views) == len(names)]
-    fits = [_calibrate(gaussians.means, valid, subsample(layout, _GRID_SAMPLES)) for layout in possible]
+    fits = [calibrate(gaussians.means, valid, subsample(layout, _GRID_SAMPLES)) for layout in possible]
     fits.sort(key=lambda fit: fit[0])
     limit = pixel_limit(width, height)
     if not fits or fits[0][0] > limit or (len(fits) > 1 and fits[1][0] < MARGIN * fits[0][0]):
@@ -105,15 +105,20 @@ def estimate_cameras(
     return make_camera_file(path, ESTIMATED, W2C_OPENCV, views)
 
 
-def _calibrate(means: np.ndarray, valid: np.ndarray, layout: Layout) -> tuple[float, float, list[np.ndarray]]:
-    """Solve for (largest median distance in pixels, focal length, poses) of one order of the rows; inf on failure."""
+def calibrate(
+    means: np.ndarray, valid: np.ndarray, layout: Layout, aspect: float = 1.0
+) -> tuple[float, float, list[np.ndarray]]:
+    """Solve for (largest median distance in pixels, focal length, poses) of one order of the rows; inf on failure.
+
+    The vertical focal length is ``aspect`` times the horizontal one; the principal point is the middle.
+    """
     pairs = find_correspondences(means, valid, layout)
     middle = np.median(pairs.points, 0)
     unit = float(np.median(np.abs(pairs.points - middle))) or 1.0
     points = pairs.split((pairs.points - middle) / unit, len(layout.views))
     pixels = pairs.split(pairs.pixels, len(layout.views))
     focal = 1.2 * max(layout.width, layout.height)
-    K = make_pinhole(focal, focal, layout.width / 2, layout.height / 2)
+    K = make_pinhole(focal, aspect * focal, layout.width / 2, layout.height / 2)
     kept = [np.ones(len(p), bool) for p in points]
     starts = [start_pose(p, q, K) for p, q in zip(points, pixels, strict=True)]
     found = [pose for pose in starts if pose is not None]
