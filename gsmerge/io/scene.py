@@ -12,8 +12,10 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.alignment import (
+    WITH_PHOTOS,
     Alignment,
     AlignmentResult,
+    Layout,
     Recovery,
     Similarity,
     align,
@@ -21,6 +23,7 @@ from gsmerge.io.alignment import (
     choose_rotations,
     fill_from_depths,
     find_padding,
+    guess_depths,
     read_rotations,
 )
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views, to_cameras
@@ -264,12 +267,8 @@ def _make_load(
     more += [] if masks is None else [_describe_masks(masks)]
     scene = Scene(gaussians, cameras, images, pixel_ids, tuple(names[view] for view in views), missing, large, masks)
     if camera_file is not None and layout is not None:
-        depths = read_depths(Path(camera_file.path)) if layout.kind == "box+depth" else None
-        if depths is not None:
-            full = fill_from_depths(scene, depths[views])
-            count = int(full.valid.sum()) - int(scene.valid.sum())
-            scene = full
-            more += [f"{count:,} pixels that the exporter dropped are put back from the depth maps"] * (count > 0)
+        scene, note = _put_back(scene, camera_file, layout, views)
+        more += note
         if layout.per_pixel == 1:
             camera_file = select_views(camera_file, views)
     frame = None if result.recovery is None else result.recovery.best.frame
@@ -300,6 +299,22 @@ def _describe_masks(masks: np.ndarray) -> str:
     """Say how much of the photos masks leave out."""
     share = 100 * (1 - masks.mean())
     return f"masks leave out {share:.0f} % of the photos: {(~masks.all((1, 2))).sum()} of {len(masks)} have one"
+
+
+def _put_back(scene: Scene, camera_file: CameraFile, layout: Layout, views: Sequence[int]) -> tuple[Scene, list[str]]:
+    """Put pixels back that the exporter dropped, where their depths are known or can be guessed; with a note."""
+    depths = read_depths(Path(camera_file.path)) if layout.kind == "box+depth" else None
+    source = "from the depth maps"
+    if depths is not None:
+        full = fill_from_depths(scene, depths[views])
+    elif camera_file.source == WITH_PHOTOS and scene.missing is not None:
+        full = fill_from_depths(scene, guess_depths(scene))
+        source = "at depths where the photos agree"
+    else:
+        return scene, []
+    count = int(full.valid.sum()) - int(scene.valid.sum())
+    note = f"{count:,} pixels that the exporter dropped are put back {source}"
+    return full, [note] * (count > 0)
 
 
 def _place_rows(

@@ -20,6 +20,7 @@ from gsmerge.io.alignment.cameras import ESTIMATED, max_pixels
 from gsmerge.io.alignment.cameras import estimate_cameras as estimate_cameras
 from gsmerge.io.alignment.cameras import move_cameras as move_cameras
 from gsmerge.io.alignment.cameras import other_conventions as other_conventions
+from gsmerge.io.alignment.dropped_depths import guess_depths as guess_depths
 from gsmerge.io.alignment.focal import estimate_focal as estimate_focal
 from gsmerge.io.alignment.layouts import MAY_BE_UNALIGNED as MAY_BE_UNALIGNED
 from gsmerge.io.alignment.layouts import ORDERS as ORDERS

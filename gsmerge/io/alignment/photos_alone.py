@@ -1,7 +1,8 @@
-"""Estimate the cameras of a file that lacks unknown pixels from the photos alone, as Depth Anything 3 leaves them.
+"""Estimate cameras from photos alone, for files of which Depth Anything 3 dropped unknown pixels.
 
-Rows come view by view and row by row, so that every stretch of them without a gap shows the colours of a stretch of
-the photo. Where that is, says which pixels some rows are; they give poses and a focal length, and these all others.
+Rows come view by view and row by row, so every stretch of them without a gap shows the colours of a
+stretch of the photo. Its place there says which pixels these rows are; they give the cameras, the
+cameras all others.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ _OUTSIDE = 999  # a colour that no pixel has
 
 @dataclass(frozen=True)
 class _Grid:
-    """A size of the pictures that the model may have seen, and the views that it may have written."""
+    """A size of the pictures that the model may have seen, and the views it may have written."""
 
     transform: PhotoTransform
     views: tuple[int, ...]
@@ -62,7 +63,7 @@ class _Grid:
 
     @property
     def bounds(self) -> tuple[int, int]:
-        """Fewest and most rows that a view has: the farthest pixels lie inside the box, or on its border."""
+        """Fewest and most rows that a view has, by whether the farthest pixels lie in the box."""
         pixels, box = self.transform.width * self.transform.height, len(self.inside)
         return box - (pixels - int(DEPTH_SHARE * (pixels - 1)) - 1), box
 
@@ -87,8 +88,8 @@ def estimate_with_photos(
 ) -> CameraFile | None:
     """Estimate the cameras of a file that lacks unknown pixels, from the colours of its photos.
 
-    ``names`` are those of the photos, which have one ``size``; ``valid [n]`` bool; ``path`` is for messages.
-    None where colours and rows do not agree.
+    ``names`` are those of the photos, which have one ``size``; ``valid [n]`` bool; ``path`` is for
+    messages. None where colours and rows do not agree.
     """
     grids = list(_possible_grids(len(gaussians), len(names), size))
     if not grids:
@@ -111,7 +112,7 @@ def estimate_with_photos(
 
 
 def _match_colors(colors: np.ndarray, grid: _Grid, photos: Photos) -> Layout | None:
-    """Find the pixels of some rows of each view by their ``colors [3,n]``; None where a view has too few."""
+    """Find pixels of some rows of each view by their ``colors [3,n]``, or None if they are too few."""
     inside, (fewest, _) = grid.inside, grid.bounds
     dropped = len(inside) - fewest  # pixels of a view, at most
     length = min(_STRETCH, grid.transform.width)
@@ -143,9 +144,9 @@ def _match_colors(colors: np.ndarray, grid: _Grid, photos: Photos) -> Layout | N
 
 
 def _place(shown: np.ndarray, wanted: np.ndarray, low: int, high: int) -> tuple[int, int, int]:
-    """Find where the colours ``wanted [3,l]`` lie in ``shown [3,m]``, by the sum of absolute differences.
+    """Find where the colours ``wanted [3,l]`` lie in ``shown [3,m]``, by absolute differences.
 
-    Returns the place, from ``low`` on and below ``high``, its sum, and the sum of the next best place.
+    Returns the place, from ``low`` on and below ``high``, its sum, and that of the next best place.
     """
     sums, difference = np.zeros(high - low, np.int32), np.empty(high - low, np.int16)
     for offset in range(0, wanted.shape[1], _STEP):
@@ -160,12 +161,15 @@ def _place(shown: np.ndarray, wanted: np.ndarray, low: int, high: int) -> tuple[
 
 
 def _agreeing(found: np.ndarray) -> np.ndarray:
-    """Choose the stretches ``[s,4]`` (row, place, sum, next sum) that are unique and in order; none if few are."""
+    """Choose the stretches ``[s,4]`` that are unique and in order; none if few are.
+
+    Their columns are row, place, sum and the next best sum.
+    """
     if not len(found):
         return found
     near = found[:, 2] <= _MAX_COST * max(1.0, float(np.quantile(found[:, 2], 0.25)))
     found = found[near & (found[:, 3] > _UNIQUE * found[:, 2])]
-    gaps = found[:, 1] - found[:, 0]  # pixels dropped so far, from view to view another one added: never fewer
+    gaps = found[:, 1] - found[:, 0]  # pixels dropped so far and a constant: never fewer
     longest, before = np.ones(len(found), int), np.full(len(found), -1)
     for i in range(len(found)):
         earlier = np.flatnonzero(gaps[:i] <= gaps[i] + _BACK)
@@ -198,8 +202,8 @@ def _calibrate(
 ) -> tuple[float, Cameras | None]:
     """Solve for the cameras of some rows, with one focal length.
 
-    With ``alone`` each view gets its own where that is clearly better. Returns the largest median distance
-    in pixels as well, inf where there are no cameras.
+    With ``alone`` each view gets its own where that is clearly better. Returns the largest median
+    distance in pixels as well, inf where there are no cameras.
     """
     worst, focal, poses = calibrate(gaussians.means, valid, layout, aspect)
     focals = [focal] * len(poses)
@@ -220,7 +224,7 @@ def _calibrate(
 
 
 def _stretch(pairs: Correspondences, cameras: Cameras) -> float:
-    """Measure how much more the pictures must be stretched vertically than horizontally to fit the rows."""
+    """Measure how much taller the pixels of pictures must be to fit the rows."""
     viewmats, Ks = cameras.viewmats[pairs.views], cameras.Ks[pairs.views]
     with np.errstate(all="ignore"):  # rows in a camera's plane, which are left out
         xy, _ = project_points(pairs.points[:, None], viewmats, Ks)
