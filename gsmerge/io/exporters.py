@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, Literal
 
-from gsmerge.io.alignment import MAY_BE_UNALIGNED, ORDERS, QUATS, Layout, Order, QuatChoice, Similarity
+from gsmerge.io.alignment import MAY_BE_UNALIGNED, ORDERS, QUATS, WITH_PHOTOS, Layout, Order, QuatChoice, Similarity
 
 if TYPE_CHECKING:
     from gsmerge.io.formats.ply import PlyInfo
@@ -111,7 +111,7 @@ _EXPORTERS = (
     # as they are stored, so they are never read in another way.
     Exporter(
         "da3", "Depth Anything 3", "logit", "view-major", ("box+depth", "box", "pruned"), _ANY, check_rotations=False,
-        cameras=("DA3 npz", "COLMAP binary", "COLMAP text"),
+        cameras=("DA3 npz", "COLMAP binary", "COLMAP text", WITH_PHOTOS),
     ),
     Exporter("pixelsplat", "pixelSplat", "raw", "view-major", ("full",), _UPRIGHT, per_pixel=(1, 2, 3), quats="camera"),
     Exporter(

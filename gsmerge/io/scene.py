@@ -11,16 +11,19 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import lower_median
 from gsmerge.io.alignment import (
+    WITH_PHOTOS,
     Alignment,
     AlignmentResult,
+    Layout,
     Recovery,
     Similarity,
     align,
     check_alignment,
     choose_rotations,
     fill_from_depths,
+    find_padding,
+    guess_depths,
     read_rotations,
 )
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views, to_cameras
@@ -44,7 +47,6 @@ from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import Cameras, Gaussians, LargePhotos, Scene, StrPath, grid_ids
 
-_MIN_PADDING = 16  # equal rows at the origin: fewer may be Gaussians
 NO_CAMERAS = Cameras(np.empty((0, 4, 4)), np.empty((0, 3, 3)), 1, 1)
 _NO_ALIGNMENT = AlignmentResult(
     None, NO_CAMERAS, None, None, problem="expected one Gaussian per pixel, found no cameras that have any"
@@ -265,12 +267,8 @@ def _make_load(
     more += [] if masks is None else [_describe_masks(masks)]
     scene = Scene(gaussians, cameras, images, pixel_ids, tuple(names[view] for view in views), missing, large, masks)
     if camera_file is not None and layout is not None:
-        depths = read_depths(Path(camera_file.path)) if layout.kind == "box+depth" else None
-        if depths is not None:
-            full = fill_from_depths(scene, depths[views])
-            count = int(full.valid.sum()) - int(scene.valid.sum())
-            scene = full
-            more += [f"{count:,} pixels that the exporter dropped are put back from the depth maps"] * (count > 0)
+        scene, note = _put_back(scene, camera_file, layout, views)
+        more += note
         if layout.per_pixel == 1:
             camera_file = select_views(camera_file, views)
     frame = None if result.recovery is None else result.recovery.best.frame
@@ -303,6 +301,22 @@ def _describe_masks(masks: np.ndarray) -> str:
     return f"masks leave out {share:.0f} % of the photos: {(~masks.all((1, 2))).sum()} of {len(masks)} have one"
 
 
+def _put_back(scene: Scene, camera_file: CameraFile, layout: Layout, views: Sequence[int]) -> tuple[Scene, list[str]]:
+    """Put pixels back that the exporter dropped, where their depths are known or can be guessed; with a note."""
+    depths = read_depths(Path(camera_file.path)) if layout.kind == "box+depth" else None
+    source = "from the depth maps"
+    if depths is not None:
+        full = fill_from_depths(scene, depths[views])
+    elif camera_file.source == WITH_PHOTOS and scene.missing is not None:
+        full = fill_from_depths(scene, guess_depths(scene))
+        source = "at depths where the photos agree"
+    else:
+        return scene, []
+    count = int(full.valid.sum()) - int(scene.valid.sum())
+    note = f"{count:,} pixels that the exporter dropped are put back {source}"
+    return full, [note] * (count > 0)
+
+
 def _place_rows(
     ply: PlyScene, result: AlignmentResult
 ) -> tuple[Gaussians, np.ndarray | None, np.ndarray | None, list[str]]:
@@ -312,12 +326,8 @@ def _place_rows(
     padding.
     """
     if result.pixel_ids is None:
-        gaussians, padding = ply.gaussians, np.zeros(len(ply.valid), bool)
-        rows = np.flatnonzero((gaussians.means == 0).all(1))
-        if len(rows) >= _MIN_PADDING:  # equal rows at the origin, with which VolSplat pads its files
-            shape = np.concatenate([gaussians.scales, gaussians.opacities[:, None], gaussians.sh0[:, 0]], 1)[rows]
-            padding[rows[(shape == lower_median(shape)).all(1)]] = True
-        keep = ply.valid & ~padding
+        gaussians = ply.gaussians
+        keep = ply.valid & ~find_padding(gaussians)
         count = int(ply.valid.sum()) - int(keep.sum())
         notes = [f"{count:,} rows that only fill the file up are left out"] if count else []
         return ply.gaussians[keep], None, None, notes

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.io.alignment import estimate_cameras, estimate_focal
+from gsmerge.io.alignment import estimate_cameras, estimate_focal, estimate_with_photos
 from gsmerge.io.cameras.camera_file import CameraFile, missing_intrinsics, sizes_of, to_cameras, undistort_photos
 from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
 from gsmerge.io.cameras.read import CAMERA_PLACES, SHARP, read_cameras, read_sharp
@@ -72,11 +73,19 @@ def read_scene_cameras(ply: PlyScene, files: SceneFiles) -> CameraFile:
         paths = list_images(files.images)
         width, height = image_size(paths[0]) if paths else (0, 0)
         names = [path.relative_to(files.images).as_posix() for path in paths]
-        cameras = estimate_cameras(files.ply, ply.gaussians, ply.valid, names, width, height)
+        rows = ply.gaussians, ply.valid
+        cameras = estimate_cameras(files.ply, *rows, names, width, height)
+        if cameras is None:
+            size, read = (width, height), partial(decode_images, paths)
+            cameras = estimate_with_photos(files.ply, *rows, names, size, read)
     if cameras is None:
         places = ", ".join(place for place in CAMERA_PLACES if len(place) > 1)
         problem = f"no cameras found next to it (looked for {places}, one .torch chunk)"
-        raise SceneError(files.ply, problem, "name them with --cameras, or have views placed with --hint order=none")
+        remedy = "name them with --cameras, or have views placed with --hint order=none"
+        if files.ply.parent.name == "gs_ply" or files.ply.name == "0000.ply":
+            formats = 'export_format="npz-gs_ply" or "mini_npz-gs_ply" in Depth Anything 3'
+            remedy = f"export them as well, by {formats}, {remedy}"
+        raise SceneError(files.ply, problem, remedy)
     return cameras
 
 

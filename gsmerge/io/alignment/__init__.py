@@ -1,27 +1,26 @@
 """Find the pixel that each row of a file belongs to; :func:`align` is the door, and the modules here are private.
 
 ``layouts`` lists possible orders, ``ordered_rows`` and ``incomplete`` search files that lack pixels, ``score``
-measures, ``recovery`` decides or explains, ``cameras`` reads, moves or estimates poses, ``focal`` estimates
-focal lengths, ``rotations`` reads quaternions.
+measures, ``recovery`` decides or explains, ``cameras`` reads, moves or estimates poses, ``unaligned`` chooses those
+of rows without pixels, ``focal`` estimates focal lengths, ``rotations`` reads quaternions.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from typing import Any
 
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.io.alignment.cameras import ESTIMATED, choose_cameras, max_pixels
-from gsmerge.io.alignment.cameras import check_cameras as check_cameras
-from gsmerge.io.alignment.cameras import choose_poses as choose_poses
+from gsmerge.io.alignment.cameras import ESTIMATED, max_pixels
 from gsmerge.io.alignment.cameras import estimate_cameras as estimate_cameras
 from gsmerge.io.alignment.cameras import move_cameras as move_cameras
 from gsmerge.io.alignment.cameras import other_conventions as other_conventions
+from gsmerge.io.alignment.dropped_depths import guess_depths as guess_depths
 from gsmerge.io.alignment.focal import estimate_focal as estimate_focal
 from gsmerge.io.alignment.layouts import MAY_BE_UNALIGNED as MAY_BE_UNALIGNED
 from gsmerge.io.alignment.layouts import ORDERS as ORDERS
@@ -29,8 +28,10 @@ from gsmerge.io.alignment.layouts import GridFit, other_grids, photo_grid, small
 from gsmerge.io.alignment.layouts import Layout as Layout
 from gsmerge.io.alignment.layouts import Order as Order
 from gsmerge.io.alignment.layouts import fill_from_depths as fill_from_depths
+from gsmerge.io.alignment.photos_alone import WITH_PHOTOS as WITH_PHOTOS
+from gsmerge.io.alignment.photos_alone import estimate_with_photos as estimate_with_photos
 from gsmerge.io.alignment.recovery import Recovery as Recovery
-from gsmerge.io.alignment.recovery import explain_count, possible_layouts, recover
+from gsmerge.io.alignment.recovery import explain_count, is_seen, possible_layouts, recover
 from gsmerge.io.alignment.recovery import explain_misalignment as explain_misalignment
 from gsmerge.io.alignment.recovery import misalignment_error as misalignment_error
 from gsmerge.io.alignment.rotations import QUATS as QUATS
@@ -44,15 +45,14 @@ from gsmerge.io.alignment.score import Similarity as Similarity
 from gsmerge.io.alignment.score import check_alignment as check_alignment
 from gsmerge.io.alignment.score import check_pairs as check_pairs
 from gsmerge.io.alignment.score import sample_pixels as sample_pixels
+from gsmerge.io.alignment.unaligned import check_cameras as check_cameras
+from gsmerge.io.alignment.unaligned import choose_cameras
+from gsmerge.io.alignment.unaligned import choose_poses as choose_poses
+from gsmerge.io.alignment.unaligned import find_padding as find_padding
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.ply import PlyScene
 from gsmerge.io.image_names import natural_key
-from gsmerge.io.photo_files import (
-    Photos,
-    PhotoTransform,
-    as_floats,
-    photo_size,
-)
+from gsmerge.io.photo_files import Photos, PhotoTransform, Size, as_floats, photo_size
 from gsmerge.types import Cameras
 
 _LARGE = 2  # times as many pixels as rows: likely photos of another size than the grid's
@@ -97,6 +97,15 @@ class _Source:
     order: str
     scale: float | None
     depths: Callable[[], np.ndarray | None]
+    seen: dict[tuple[Size, int], bool] = field(default_factory=dict)  # what is known of :meth:`may_be`
+
+    def may_be(self, camera_file: CameraFile, grid: GridFit) -> bool:
+        """Return whether any cameras could show the rows as the pixels of a grid; remembered for each size."""
+        key = grid.size, len(grid.cameras)
+        if key not in self.seen:
+            inputs = self.inputs(camera_file, grid, photos=False)
+            self.seen[key] = is_seen(inputs, possible_layouts(inputs))
+        return self.seen[key]
 
     def inputs(self, camera_file: CameraFile, grid: GridFit, *, photos: bool = True) -> AlignmentInput:
         """Put rows, cameras and photos at the size of a grid together; without photos where only positions matter."""
@@ -214,6 +223,8 @@ def _change_size(
     for grid in other_grids(source.ply.info, camera_file, photo_size(source.photos)):
         if recoveries and grid.rank > recoveries[0][0].rank:
             break
+        if grid.guessed and not source.may_be(camera_file, grid):
+            continue
         if grid.guessed:
             guesses.append(grid)
         try_grid(grid, exact_frames=grid.guessed or exact_frames)
@@ -306,8 +317,9 @@ def _with_pixels(
     if recovery is None:
         return None
     frame, layout, count = recovery.best.frame, recovery.best.layout, len(inputs.cameras)
-    if camera_file.source == ESTIMATED:
-        text = "no cameras were given: poses and focal length are estimated from the Gaussians' own grid"
+    if camera_file.source in (ESTIMATED, WITH_PHOTOS):
+        from_what = "own grid" if camera_file.source == ESTIMATED else "order and the photos' colours"
+        text = f"no cameras were given: poses and focal length are estimated from the Gaussians' {from_what}"
         notes = (*notes, text)
     in_order = layout.is_plain and frame is IDENTITY and len(layout.views) == count
     if in_order and layout.views == tuple(inputs.labellings[0]):

@@ -16,15 +16,12 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import camera_depths, project_points, sh0_to_rgb
+from gsmerge.geometry import camera_depths, project_points
 from gsmerge.io.alignment.layouts import Layout, exact_layouts, subsample
 from gsmerge.io.alignment.resection import projection_errors, refine_poses, start_pose
 from gsmerge.io.alignment.score import (
-    IDENTITY,
     MARGIN,
-    AlignmentInput,
     Correspondences,
-    Similarity,
     check_pairs,
     find_correspondences,
     pixel_errors,
@@ -43,17 +40,11 @@ from gsmerge.io.cameras.camera_file import (
     make_camera_file,
     make_pinhole,
     to_viewmats,
-    with_convention,
 )
 from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Cameras, Gaussians
 
-_SEEN_AS_MUCH = 0.98  # of the score of what the cameras see: no difference
 _SAME = 1e-6  # of the cameras' distances: no difference
-_SEEN_SAMPLES = 20_000  # Gaussians that are projected to see whether cameras see them
-_MIN_SEEN = 0.5  # share of them that some camera sees
-_MAX_COLOR_RATIO = 0.85  # of their colours' distance from the photos, over that from random pixels
-_SAME_COLORS = 0.01  # mean distance of the colours from random pixels below which photos say nothing
 
 ESTIMATED = "estimated from the grid"  # source of estimated cameras
 _GRID_SAMPLES = 300  # Gaussians per view that cameras are estimated from
@@ -93,106 +84,6 @@ def other_conventions(viewmats: np.ndarray, convention: Convention) -> list[Pose
     return readings[1:]
 
 
-@dataclass(frozen=True)
-class CameraCheck:
-    """Measures of how well cameras see some Gaussians."""
-
-    share_seen: float  # share of the Gaussians inside at least one picture
-    # distance of their colours from the photos where they are seen, over the distance from the same pixels shuffled;
-    # NaN without photos, or where the colours hardly vary
-    color_ratio: float
-    ok: bool  # whether these are likely the cameras of these Gaussians
-
-    @property
-    def score(self) -> float:
-        """0 to 1, to rank cameras by: the share that is seen, reduced where colours fit little better than random."""
-        return self.share_seen * (1.0 if np.isnan(self.color_ratio) else max(0.0, 1 - self.color_ratio))
-
-    @property
-    def description(self) -> str:
-        """The figures in one sentence."""
-        seen = f"the cameras see {100 * self.share_seen:.0f} % of the Gaussians"
-        if np.isnan(self.color_ratio):
-            return seen
-        return f"{seen}, whose colours are {self.color_ratio:.2f} times as far from the photos as any others"
-
-
-def check_cameras(gaussians: Gaussians, valid: np.ndarray, cameras: Cameras, images: np.ndarray | None) -> CameraCheck:
-    """Project some valid Gaussians into all views, and compare their colours with ``images [c,h,w,3]``, if any."""
-    rows = np.flatnonzero(valid)
-    rows = rows[:: max(1, len(rows) // _SEEN_SAMPLES)]
-    points = gaussians.means[rows].astype(np.float64)
-    colors = sh0_to_rgb(gaussians.sh0[rows, 0]).clip(0, 1)
-    visible, errors, others = np.zeros(len(rows), bool), [], []
-    rng = np.random.default_rng(0)
-    for view in range(len(cameras)):
-        with np.errstate(all="ignore"):
-            xy, depth = project_points(points, cameras.viewmats[view], cameras.Ks[view])
-            xy = np.floor(xy)
-        inside = (depth > 0) & (xy >= 0).all(1) & (xy < (cameras.width, cameras.height)).all(1)
-        visible |= inside
-        if images is not None and inside.any():
-            x, y = xy[inside].astype(np.int64).T
-            photo = images[view, y, x]
-            errors.append(np.abs(colors[inside] - photo).mean(1))
-            others.append(np.abs(colors[inside] - rng.permutation(photo)).mean(1))
-    share, ratio = float(visible.mean()), np.nan
-    if errors and (other := float(np.concatenate(others).mean())) > _SAME_COLORS:
-        ratio = float(np.concatenate(errors).mean()) / other
-    return CameraCheck(share, ratio, share >= _MIN_SEEN and not ratio > _MAX_COLOR_RATIO)
-
-
-def choose_poses(
-    gaussians: Gaussians, valid: np.ndarray, cameras: Cameras, images: np.ndarray | None, convention: Convention
-) -> tuple[Poses | None, CameraCheck, str | None]:
-    """Choose the convention of the poses that sees most unaligned Gaussians, with colours nearest to the photos.
-
-    Arguments are as for :func:`check_cameras`, with the cameras under the usual convention. Returns the poses if
-    they are clearly better than the usual ones and all others, otherwise None; the check of the chosen ones; and a
-    note where others see as much as the usual ones.
-    """
-    usual = check_cameras(gaussians, valid, cameras, images)
-    others = [
-        (poses, check_cameras(gaussians, valid, replace(cameras, viewmats=poses.viewmats), images))
-        for poses in other_conventions(cameras.viewmats, convention)
-    ]
-    ranked = sorted(others, key=lambda one: -one[1].score)
-    if not ranked or not ranked[0][1].ok:
-        return None, usual, None
-    poses, best = ranked[0]
-    scores = [check.score for check in (usual, *(check for _, check in ranked[1:2])) if check.ok]
-    if best.score >= MARGIN * max(scores, default=0.0):
-        return poses, best, None
-    as_good = usual.ok and best.score >= _SEEN_AS_MUCH * usual.score
-    note = f"the poses fit as well when read as {poses.description}; they are read as the format has them"
-    return None, usual, note if as_good else None
-
-
-def choose_cameras(
-    inputs: AlignmentInput, camera_file: CameraFile, frames: Sequence[Similarity], why: SceneError
-) -> tuple[Cameras, CameraFile, list[str]]:
-    """Choose cameras that see the Gaussians: as given, in another frame, or in another convention; with notes.
-
-    SceneError if none of these does, with the reason ``why`` there are no pixels.
-    """
-    rows = inputs.gaussians, inputs.valid
-    moved = [(frame, frame.move(inputs.cameras)) for frame in (IDENTITY, *frames)]
-    if frames:
-        stay, *checks = (check_cameras(*rows, cameras, inputs.images) for _, cameras in moved)
-        best = max(checks, key=lambda check: check.score)
-        if best.ok and best.score > stay.score:
-            frame, cameras = moved[1 + checks.index(best)]
-            return cameras, replace(camera_file, viewmats=cameras.viewmats), [f"the cameras are {frame.description}"]
-    poses, check, note = choose_poses(*rows, inputs.cameras, inputs.images, camera_file.convention)
-    if not check.ok:
-        raise SceneError(why.path, f"{why.problem}; {check.description}", why.remedy)
-    if poses is None:
-        return inputs.cameras, camera_file, [note] if note else []
-    cameras = replace(inputs.cameras, viewmats=poses.viewmats)
-    note = f"{poses.describe(camera_file.convention)}: read so"
-    return cameras, with_convention(camera_file, poses.convention), [note]
-
-
 def estimate_cameras(
     path: Path, gaussians: Gaussians, valid: np.ndarray, names: Sequence[str], width: int, height: int
 ) -> CameraFile | None:
@@ -203,7 +94,7 @@ def estimate_cameras(
     """
     layouts = exact_layouts(len(gaussians), len(names), width, height)
     possible = [layout for layout in layouts if layout.per_pixel == 1 and len(layout.views) == len(names)]
-    fits = [_calibrate(gaussians.means, valid, subsample(layout, _GRID_SAMPLES)) for layout in possible]
+    fits = [calibrate(gaussians.means, valid, subsample(layout, _GRID_SAMPLES)) for layout in possible]
     fits.sort(key=lambda fit: fit[0])
     limit = pixel_limit(width, height)
     if not fits or fits[0][0] > limit or (len(fits) > 1 and fits[1][0] < MARGIN * fits[0][0]):
@@ -214,15 +105,20 @@ def estimate_cameras(
     return make_camera_file(path, ESTIMATED, W2C_OPENCV, views)
 
 
-def _calibrate(means: np.ndarray, valid: np.ndarray, layout: Layout) -> tuple[float, float, list[np.ndarray]]:
-    """Solve for (largest median distance in pixels, focal length, poses) of one order of the rows; inf on failure."""
+def calibrate(
+    means: np.ndarray, valid: np.ndarray, layout: Layout, aspect: float = 1.0
+) -> tuple[float, float, list[np.ndarray]]:
+    """Solve for (largest median distance in pixels, focal length, poses) of one order of the rows; inf on failure.
+
+    The vertical focal length is ``aspect`` times the horizontal one; the principal point is the middle.
+    """
     pairs = find_correspondences(means, valid, layout)
     middle = np.median(pairs.points, 0)
     unit = float(np.median(np.abs(pairs.points - middle))) or 1.0
     points = pairs.split((pairs.points - middle) / unit, len(layout.views))
     pixels = pairs.split(pairs.pixels, len(layout.views))
     focal = 1.2 * max(layout.width, layout.height)
-    K = make_pinhole(focal, focal, layout.width / 2, layout.height / 2)
+    K = make_pinhole(focal, aspect * focal, layout.width / 2, layout.height / 2)
     kept = [np.ones(len(p), bool) for p in points]
     starts = [start_pose(p, q, K) for p, q in zip(points, pixels, strict=True)]
     found = [pose for pose in starts if pose is not None]

@@ -16,15 +16,10 @@ from pathlib import Path
 import numpy as np
 
 from gsmerge.geometry import project_points, sh0_to_rgb
-from gsmerge.io.alignment.cameras import (
-    CameraCheck,
-    check_cameras,
-    estimate_cameras,
-    fit_line,
-    other_conventions,
-)
+from gsmerge.io.alignment.cameras import estimate_cameras, fit_line, other_conventions
 from gsmerge.io.alignment.layouts import exact_layouts, grids_of_count, subsample
 from gsmerge.io.alignment.score import MARGIN, Correspondences, find_correspondences, pixel_limit
+from gsmerge.io.alignment.unaligned import CameraCheck, check_cameras
 from gsmerge.io.cameras.camera_file import CameraFile, make_pinhole
 from gsmerge.io.formats.ply import PlyScene
 from gsmerge.io.image_names import natural_key

@@ -15,6 +15,8 @@ import numpy as np
 from gsmerge.geometry import sh0_to_rgb
 from gsmerge.io.alignment.layouts import Layout
 from gsmerge.io.alignment.ordered_rows import (
+    FAR,
+    FAR_PX,
     MIN_BLOCK,
     ProjectedRows,
     finer_scale,
@@ -37,6 +39,7 @@ TOLERANCES = (0.05, 0.02, 0.01, 0.005, 0.002)  # pixels from a centre that count
 MIN_SHARE = 0.9  # of the rows at the centre of a pixel of some view, and of those that come to a pixel in the end
 MAX_CHANCE = 0.2  # of that share: as many at a second view's centre, or at the corners of pixels, are chance
 _SAMPLES = 20_000  # rows that the file is judged by
+_FEW, _MIN_FEW = 10, 0.5  # every how many of them are tried first, and share at centres without which none are
 _CHUNK = 1 << 15  # rows at a time
 _SMALLEST_PX, _SMALLEST_COLOR = 1e-4, 0.005  # units of the distances, at least
 
@@ -99,8 +102,9 @@ def _score_view_major(inputs: AlignmentInput, rows: ProjectedRows, frame: Simila
 def _score_scaled(inputs: AlignmentInput, rows: ProjectedRows) -> AlignmentScore | None:
     """Search for scale and pixels in turn, until neither changes."""
     scale = rough_scale(rows)
-    best = _score(inputs, rows, read_view_major, scale_by(scale))
-    if best is None:
+    best = None if scale is None else _score(inputs, rows, read_view_major, scale_by(scale))
+    far = max(FAR_PX, FAR * min(rows.cameras.width, rows.cameras.height))
+    if scale is None or best is None or best.worst_px > far:
         return None
     every = replace(rows, points=inputs.gaussians.means.astype(np.float64))
     frame = scale_by(finer_scale(every, best.layout, scale))
@@ -161,6 +165,9 @@ def _measure_spread(rows: ProjectedRows, color_of: ColorOf | None) -> Spread | N
     if len(rows) < MIN_BLOCK:
         return None
     some = np.unique(np.linspace(0, len(rows) - 1, _SAMPLES).astype(np.int64))
+    few, _ = _distances(rows, some[::_FEW])
+    if (few.min(1) < TOLERANCES[0]).mean() < _MIN_FEW:
+        return None
     centre, pixels = _distances(rows, some)
     corner, _ = _distances(rows, some, shift=0.5)
     ranked = np.sort(centre, axis=1)

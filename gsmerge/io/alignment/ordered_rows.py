@@ -28,6 +28,7 @@ MAX_SCALES = 400  # that are tried
 TRIED_BLOCKS, STRETCH = 4, 2000  # blocks, and rows of each in a row, that a scale is tried on
 _SMALL = 1e-6  # weight of a point that says nothing
 _MAX_UNEVENNESS = 10.0  # of one block, so that no single one decides
+FAR_PX, FAR = 10.0, 0.1  # pixels, and share of the shorter side, beyond which no finer scale helps
 MAX_BACK = 0.01  # share of the steps that may go back; of rows in no such order a quarter or more do
 MIN_CHANGES = 0.3  # share of the steps that change the view: fewer are views one after the other
 PROBES, PROBE = 5, 4000  # pieces of a file that are tried first, and the rows of each
@@ -92,8 +93,21 @@ def read_view_major(rows: ProjectedRows) -> Layout | None:
     if blocks is None:
         return None
     width, height = rows.cameras.width, rows.cameras.height
-    parts = [(view, some, assign_pixels(*rows.project(some, view), width, height)) for view, some in blocks]
+    parts = []
+    for view, some in blocks:
+        u, v = rows.project(some, view)
+        pixels = assign_pixels(u, v, width, height)
+        if not _distance(u, v, pixels, width) <= max(FAR_PX, FAR * min(width, height)):
+            return None
+        parts.append((view, some, pixels))
     return rows.layout("view-major", parts, missing=len(blocks) * width * height - len(rows))
+
+
+def _distance(u: np.ndarray, v: np.ndarray, pixels: np.ndarray, width: int) -> float:
+    """Measure the median distance of projected rows from their pixels, those behind the camera as ``width``."""
+    y, x = np.divmod(pixels, width)
+    away = np.hypot(u - x - 0.5, v - y - 0.5)
+    return float(np.median(np.where(np.isfinite(away), away, width)))
 
 
 def _find_blocks(rows: ProjectedRows) -> list[tuple[int, np.ndarray]] | None:
@@ -173,8 +187,6 @@ def assign_pixels(u: np.ndarray, v: np.ndarray, width: int, height: int) -> np.n
     the row known, ``pixel - rank`` never decreases: isotonic regression finds it, and averages the jitter between
     gaps.
     """
-    from scipy.ndimage import median
-
     count, known = len(u), np.isfinite(u) & np.isfinite(v)
     u, v = np.where(known, u, 0.0), np.where(known, v, 0.0)
     du = np.diff(u)
@@ -184,7 +196,10 @@ def assign_pixels(u: np.ndarray, v: np.ndarray, width: int, height: int) -> np.n
     counts = np.bincount(scanline[known], minlength=scanline[-1] + 1)
     medians, some = np.zeros(len(counts)), np.flatnonzero(counts)
     if len(some):
-        medians[some] = median(v[known], scanline[known], some)
+        ordered = v[known][np.lexsort((v[known], scanline[known]))]
+        first = np.cumsum(counts)[some] - counts[some]
+        lower, upper = first + (counts[some] - 1) // 2, first + counts[some] // 2
+        medians[some] = (ordered[lower] + ordered[upper]) / 2
     rows = _never_falling(medians, np.maximum(counts, _SMALL))
     row = np.clip(np.floor(rows), 0, height - 1)[scanline]
     rank = np.arange(count)
@@ -201,8 +216,11 @@ def _never_falling(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return np.asarray(isotonic_regression(values, weights=weights).x)
 
 
-def rough_scale(rows: ProjectedRows) -> float:
-    """Find the scale of the cameras' positions under which rows step by single pixels; no pixel is known yet."""
+def rough_scale(rows: ProjectedRows) -> float | None:
+    """Find the scale of the cameras' positions under which rows step by single pixels; no pixel is known yet.
+
+    None where they do in no view at any scale.
+    """
     views = len(rows.cameras)
     middles = (np.arange(views) + 0.5) / views * len(rows)
     windows = [
@@ -216,6 +234,8 @@ def rough_scale(rows: ProjectedRows) -> float:
         return float(np.mean([min(pixels, _MAX_UNEVENNESS) for pixels in uneven]))
 
     best = float(min(SCALES, key=cost))
+    if cost(best) >= _MAX_UNEVENNESS:
+        return None
     for width_of_search in (1.08, 1.02, 1.005):
         best = float(min(best * np.geomspace(1 / width_of_search, width_of_search, 9), key=cost))
     return best
@@ -236,9 +256,7 @@ def finer_scale(rows: ProjectedRows, layout: Layout, rough: float) -> float:
         return [there.project(some, view) for view, some in parts]
 
     def distance(u: np.ndarray, v: np.ndarray) -> float:
-        y, x = np.divmod(assign_pixels(u, v, layout.width, layout.height), layout.width)
-        away = np.hypot(u - x - 0.5, v - y - 0.5)
-        return float(np.median(np.where(np.isfinite(away), away, layout.width)))
+        return _distance(u, v, assign_pixels(u, v, layout.width, layout.height), layout.width)
 
     def cost(scale: float) -> float:
         return float(np.mean([distance(u, v) for u, v in projected(scale)]))

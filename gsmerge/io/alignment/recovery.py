@@ -12,6 +12,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io.alignment.cameras import other_conventions
 from gsmerge.io.alignment.incomplete import score_incomplete
 from gsmerge.io.alignment.layouts import MAY_BE_UNALIGNED, Layout, depth_layouts, exact_layouts, plain_layout, subsample
+from gsmerge.io.alignment.resection import projective_error
 from gsmerge.io.alignment.score import (
     IDENTITY,
     MARGIN,
@@ -26,6 +27,7 @@ from gsmerge.io.alignment.score import (
     color_error,
     fits_all_cameras,
     pixel_errors,
+    pixel_limit,
     sample_layout,
     sample_pixels,
     score_layout,
@@ -46,6 +48,9 @@ _VARIES = 0.01  # mean distance of colours from shuffled pixels below which phot
 _SIMPLER = 1.15  # a simpler frame wins unless it is worse than this factor ...
 _SIMPLER_PX = 0.02  # ... and this many pixels
 _PLAIN_PX = 0.5  # a file whose rows are the grid as they are is not searched if it is this near to its pixels
+# pixels from which no camera sees the rows of a layout: times the limit, and share of the shorter side
+_SEEN_LIMITS, _SEEN_SHARE = 2.0, 0.03
+_SEEN_SAMPLES = 200  # Gaussians of a view that it is judged by
 _SMALLEST_PX = 1e-3  # distances are compared as if none were smaller, pixels
 
 
@@ -91,7 +96,8 @@ def recover(inputs: AlignmentInput, *, exact_frames: bool = False) -> Recovery |
         return plain
     scores: list[AlignmentScore] = []
     layouts = possible_layouts(inputs)
-    for effort in (0,) if exact_frames else (0, 1, 2):
+    searched = (0,) if exact_frames or not is_seen(inputs, layouts) else (0, 1, 2)
+    for effort in searched:
         if not any(score.ok for score in scores):
             scores += [score for layout in layouts for score in _score_labellings(inputs, layout, effort)]
     if not (exact_frames or any(score.ok for score in scores)):
@@ -107,6 +113,22 @@ def recover(inputs: AlignmentInput, *, exact_frames: bool = False) -> Recovery |
         return _choose_by_colors(inputs, [first, *close])
     runner_up = min(others, key=lambda e: e.worst_px, default=None)
     return _accept(inputs, best, runner_up)
+
+
+def is_seen(inputs: AlignmentInput, layouts: Sequence[Layout]) -> bool:
+    """Return whether any camera at all, in any frame, could show the rows of one of the layouts in their pixels."""
+    return any(_is_seen(inputs, layout) for layout in layouts)
+
+
+def _is_seen(inputs: AlignmentInput, layout: Layout) -> bool:
+    limit = max(_SEEN_LIMITS * pixel_limit(layout.width, layout.height), _SEEN_SHARE * min(layout.width, layout.height))
+    count = len(layout.views)
+    for block in sorted({0, count // 2, count - 1}):
+        one = replace(layout, views=(0,), rows=layout.rows[block : block + 1], pixels=layout.pixels[block : block + 1])
+        pairs = inputs.pairs(subsample(one, _SEEN_SAMPLES))
+        if projective_error(pairs.points, pairs.pixels) <= limit:
+            return True
+    return False
 
 
 def _without_same_labellings(inputs: AlignmentInput) -> AlignmentInput:

@@ -8,12 +8,16 @@ import cv2
 import numpy as np
 
 from gsmerge.geometry import motion_matrices
-from gsmerge.kernels.matrices import matmul, solve
+from gsmerge.kernels.matrices import eigh, matmul, solve
 
 STEPS = 30  # most Levenberg-Marquardt steps
 FIRST_DAMPING, EASE, BRAKE, MAX_DAMPING = 1e-3, 0.1, 10.0, 1e8  # of the curvature: after a step that helps, or does not
 MIN_GAIN = 1e-10  # share of the squared error that a step must take away for another one to follow
 MAX_STRETCH = 0.5  # of the focal length, in a step
+_MIN_POINTS = 24  # fewer fit any camera
+_FLAT = 1e-10  # of the largest second moment: an axis along which points do not differ
+_PROJECTIVE_ROUNDS = 8  # of reweighted least squares
+_SMALLEST_ERROR = 1e-6  # of the pixels' spread
 
 
 def start_pose(points: np.ndarray, pixels: np.ndarray, K: np.ndarray) -> np.ndarray | None:
@@ -101,3 +105,37 @@ def _step(curvature: np.ndarray, slope: np.ndarray, damping: float, *, focal: bo
     stretch = -(slope[:, 6].sum() - (across * solved[..., 0]).sum()) / left
     stretch = float(np.clip(stretch, -MAX_STRETCH, MAX_STRETCH))
     return 1 + stretch, -solved[..., 0] - stretch * solved[..., 1]
+
+
+def projective_error(points: np.ndarray, pixels: np.ndarray) -> float:
+    """Measure the median distance of points ``[n,3]`` from their ``pixels [n,2]`` under the best projective camera.
+
+    Any 3 x 4 matrix is such a camera, with any intrinsics, in any frame. It is solved by the direct linear transform
+    with reweighting (Hartley and Zisserman 2004, section 7.1). 0 where there are too few points to decide.
+    """
+    if len(points) < _MIN_POINTS:
+        return 0.0
+    middle = np.median(points, 0)
+    unit = float(np.median(np.abs(points - middle))) or 1.0
+    near = np.concatenate([(points - middle) / unit, np.ones((len(points), 1))], 1)
+    near /= np.linalg.norm(near, axis=1, keepdims=True)
+    values, axes = eigh(matmul(near.T, near))
+    used = values > _FLAT * values[-1]  # of points in a plane or in a line, other axes say nothing
+    near = matmul(near, axes[:, used] / np.sqrt(values[used]))
+    centre, size = pixels.mean(0), float(pixels.std()) or 1.0
+    wanted = (pixels - centre) / size
+    zero = np.zeros_like(near)
+    across = np.concatenate([near, zero, -wanted[:, :1] * near], 1)
+    down = np.concatenate([zero, near, -wanted[:, 1:] * near], 1)
+    weights = np.ones(len(points))
+    error = np.full(len(points), np.inf)
+    for _ in range(_PROJECTIVE_ROUNDS):
+        heavy = np.concatenate([across * weights[:, None], down * weights[:, None]])
+        camera = eigh(matmul(heavy.T, heavy))[1][:, 0].reshape(3, -1)
+        places = matmul(near, camera.T)
+        with np.errstate(all="ignore"):
+            error = np.linalg.norm(places[:, :2] / places[:, 2:] - wanted, axis=1)
+            error = np.where(np.isfinite(error), error, np.inf)
+            spread = 2 * float(np.median(error)) + _SMALLEST_ERROR
+            weights = 1 / ((np.abs(places[:, 2]) + _SMALLEST_ERROR) * np.sqrt(1 + (error / spread) ** 2))
+    return size * float(np.median(error))

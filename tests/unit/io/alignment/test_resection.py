@@ -7,7 +7,12 @@ import numpy as np
 import pytest
 
 from gsmerge.geometry import motion_matrices
-from gsmerge.io.alignment.resection import projection_errors, refine_poses, start_pose
+from gsmerge.io.alignment.resection import (
+    projection_errors,
+    projective_error,
+    refine_poses,
+    start_pose,
+)
 
 K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
 TRUE = motion_matrices(np.array([[0.1, 0.2, -0.1, 0.1, 0, 6], [-0.2, 0.1, 0.4, 0.5, 0.3, 7], [0, 0, 0, 0, 0, 5.0]]))
@@ -84,3 +89,32 @@ def test_a_start_behind_the_points_ends():
     near_K, poses = refine_poses(points, pixels, K, behind, focal=True)
     assert np.isfinite(near_K).all()
     assert np.isfinite(poses).all()
+
+
+@pytest.mark.parametrize("flat", [False, True])
+@pytest.mark.parametrize("wrong", [0.0, 0.25])
+def test_some_camera_shows_the_points(flat: bool, wrong: float):
+    points, pixels = shown(0.3)
+    rng = np.random.default_rng(1)
+    for one, where in zip(points, pixels, strict=True):
+        if flat:
+            one[:, 2] = 0.2 * one[:, 0] - 0.5
+            places = (one @ TRUE[0][:3, :3].T + TRUE[0][:3, 3]) @ K.T
+            where[:] = places[:, :2] / places[:, 2:]
+        some = rng.random(len(one)) < wrong
+        where[some] = rng.permutation(where[some])
+        assert projective_error(one, where) < 1
+        assert projective_error(1e4 * one + 50, where) < 1
+
+
+def test_no_camera_shows_points_in_other_pixels():
+    rng = np.random.default_rng(1)
+    points, pixels = shown(0.0)
+    assert min(projective_error(p, rng.permutation(q)) for p, q in zip(points, pixels, strict=True)) > 20
+
+
+def test_a_few_points_or_one_place_fit_any_camera():
+    rng = np.random.default_rng(1)
+    assert projective_error(rng.normal(size=(10, 3)), rng.uniform(0, 100, (10, 2))) == 0
+    error = projective_error(np.ones((50, 3)), rng.uniform(0, 100, (50, 2)))
+    assert not error < 10
