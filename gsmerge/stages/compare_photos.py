@@ -55,6 +55,7 @@ BORDER, MIN_BAR = 8 / 255, 0.02  # range of a bar's colours; share of a side tha
 SWAPPED, MIN_SWAP = 0.75, 0.01  # difference with channels reversed, of that without; and by how much it is less
 LEVELS = 33  # quantiles that a tone curve joins
 MIN_TONE, MIN_TONE_DRAWN = 0.03, 0.08  # median change of the colours from which on a tone is compensated
+CLEAR_TONE = 0.05  # the same of one photo at least, where Gaussians have pixels
 EXPLAINED, EXPLAINED_DRAWN = 0.5, 0.6  # most of the difference that the curve may leave
 DARK = 3 / 255  # brightest pixel of a black region
 SAME = 2.5 / 255  # range of a flat region's colours
@@ -103,16 +104,15 @@ def find_changes(scene: Scene, shown: Shown) -> list[PhotoChange]:
         note("red and blue are in the wrong order in the photos (BGR): they change places")
         changes = [replace(change, reversed=True) for change in changes]
         small = _change_small(shown, changes)
-    pooled = _find_tones(small, views) if small.drawn else None
     flat = parallel_map(lambda view: _flat_regions(small, view), views)
+    curves = _find_tones(small, flat)
     drawing: np.ndarray | None = None
     clear = small.clear
     for view in views:
-        tones = pooled if small.drawn else _find_tones(small, [view], ~flat[view])
-        change = replace(changes[view], tones=tones)
+        change = replace(changes[view], tones=curves[view])
         own, photo = small.own[view], change(shown.photos[view], None)
         cover = _covered(own, photo, clear[view], flat[view], drawn=small.drawn)
-        if (tones is None and cover is None) or (cover is not None and cover.mean() > MAX_COVER):
+        if (curves[view] is None and cover is None) or (cover is not None and cover.mean() > MAX_COVER):
             continue
         if drawing is None:
             drawing = small.own if small.drawn else _draw(scene, SMALL_SIDE)[0]
@@ -199,8 +199,7 @@ def _difference(one: np.ndarray, other: np.ndarray, mask: np.ndarray | None = No
 
 def _over_channels(combine: np.ufunc, image: np.ndarray) -> np.ndarray:
     """Combine the three channels ``[...,3]`` of a picture, faster than a reduction over so short an axis."""
-    combined: np.ndarray = combine(combine(image[..., 0], image[..., 1]), image[..., 2])
-    return combined
+    return np.asarray(combine(combine(image[..., 0], image[..., 1]), image[..., 2]))
 
 
 def _find_bars(scene: Scene, shown: Shown) -> tuple[float, float, float, float]:
@@ -236,25 +235,37 @@ def _is_reversed(shown: Shown) -> bool:
     return swapped < SWAPPED * as_given and as_given - swapped > MIN_SWAP
 
 
-def _find_tones(shown: Shown, views: Sequence[int], mask: np.ndarray | None = None) -> np.ndarray | None:
-    """Find the curves ``[3,256]`` that bring some photos to the Gaussians' tone; None where it is theirs.
+def _find_tones(shown: Shown, flat: Sequence[np.ndarray]) -> list[np.ndarray | None]:
+    """Find the curves ``[3,256]`` that bring each photo to the Gaussians' tone; None where it is theirs.
 
-    They join the quantiles of both, which neither wrong depth nor noise moves far.
+    Drawings have one for all photos. Small changes count only where some photo needs a clear one: models have a tone
+    of their own.
     """
-    counts = shown.clear[views]
-    if mask is not None:
-        counts &= mask
+    views = range(len(shown.photos))
+    if shown.drawn:
+        return [_find_curves(shown, views, shown.clear)[0]] * len(views)
+    each = parallel_map(lambda view: _find_curves(shown, [view], shown.clear[[view]] & ~flat[view]), views)
+    is_clear = any(change >= CLEAR_TONE for _, change in each)
+    return [curves if is_clear else None for curves, _ in each]
+
+
+def _find_curves(shown: Shown, views: Sequence[int], counts: np.ndarray) -> tuple[np.ndarray | None, float]:
+    """Find the curves of some photos together, and the median change by them; None and 0 where none is needed.
+
+    They join the quantiles of both pictures, which neither wrong depth nor noise moves far.
+    """
     if counts.sum() < MIN_PIXELS:
-        return None
-    photos, own = shown.photos[views][counts], shown.own[views][counts]
+        return None, 0.0
+    photos, own = shown.photos[list(views)][counts], shown.own[list(views)][counts]
     least, most = (MIN_TONE_DRAWN, EXPLAINED_DRAWN) if shown.drawn else (MIN_TONE, EXPLAINED)
     before = _difference(photos, own)
     if before < least / 2:  # no curve could change so much and explain it
-        return None
+        return None, 0.0
     tones = np.stack([_curve(photos[:, channel], own[:, channel]) for channel in range(3)])
     after = look_up(tones, photos)
-    is_needed = _difference(after, photos) >= least
-    return tones if is_needed and _difference(after, own) <= most * before else None
+    change = _difference(after, photos)
+    is_explained = change >= least and _difference(after, own) <= most * before
+    return (tones, change) if is_explained else (None, 0.0)
 
 
 def _curve(levels: np.ndarray, tones: np.ndarray) -> np.ndarray:
@@ -286,8 +297,7 @@ def _large_parts(mask: np.ndarray, share: float, marked: np.ndarray | None = Non
     if marked is not None:
         keep &= np.bincount(labels.ravel(), marked.ravel(), count) >= 0.5 * sizes
     keep[0] = False
-    kept: np.ndarray = keep[labels]
-    return kept
+    return np.asarray(keep[labels])
 
 
 def _covered(
@@ -308,8 +318,7 @@ def _covered(
         parts |= _large_parts(flat, MIN_COVER, away > FLAT_COVER)
     if not parts.any():
         return None
-    wide = cv2.dilate(parts.astype(np.uint8), np.ones((PATCH, PATCH), np.uint8)) > 0
-    return np.asarray(wide)
+    return np.asarray(cv2.dilate(parts.astype(np.uint8), np.ones((PATCH, PATCH), np.uint8)) > 0)
 
 
 def _box_means(image: np.ndarray) -> np.ndarray:

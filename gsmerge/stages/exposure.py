@@ -99,7 +99,7 @@ def _measure_pairs(scene: Scene, views: Sequence[int]) -> list[_Pair]:
                 pairs.append(_Pair(view, other, ratios, int(clear.sum())))
         return pairs
 
-    return [pair for found in parallel_map(measure, views) for pair in found]
+    return [pair for pairs in parallel_map(measure, views) for pair in pairs]
 
 
 def _solve_gains(pairs: Sequence[_Pair], num_views: int) -> np.ndarray | None:
