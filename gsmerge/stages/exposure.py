@@ -35,7 +35,7 @@ MIN_PAIRS = 60  # pixels that two views must share
 # Logarithmic gains between nearest neighbours, root mean square; what pairs disagree by, as a share; and the step
 # above which gains are taken out all the same. 15 captures have steps up to 0.165 with shares from 0.07 on; random
 # gains of 0.8 to 1.25 have steps of 0.1 to 0.25 with shares below 0.04, or up to 0.25 with five views far apart.
-DIFFERENT, CONSISTENT, LARGE = 0.05, 0.05, 0.18
+DIFFERENT, CONSISTENT, LARGE = 0.08, 0.05, 0.18
 CLIPPED, BRIGHT = 0.985, 1.15  # level from which on a photo with more than that gain says nothing
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -210,6 +211,7 @@ def test_a_view_of_one_scene(scene_copy: Path, run: Run) -> None:
     outcome = run("view", bare, "--no-open", code=0)
     assert "no cameras: " in outcome.err
     assert outcome.out.endswith("bare.view.html: 30,720 Gaussians\n")
+    shutil.copy(bare, bare.with_name("x.ply"))
     assert_refused(run("view", bare, bare.with_name("x.ply"), "--no-open"), 3, "no cameras found")
 
 

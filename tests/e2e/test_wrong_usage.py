@@ -52,7 +52,7 @@ USAGE = {
     "compact room --budget 2.5": "got '2.5'; perhaps \"2.5%\"",
     "compact room --ratio 0.1": "--ratio is no option: use --budget, such as 2%, 40000 or 5MB, or --k;",
     "evaluate room --ratio 0.1": "No such option: --ratio",
-    "compact room out.ply": "unexpected extra argument*(out.ply); name what is written with -o;",
+    "compact room out.ply": "out.ply: no such scene; name the output with -o",
     "inspect room out.ply": "unexpected extra argument*(out.ply); see",
     "compress room": "No such command 'compress'. Did you mean 'compact'?",
     "metrics room": "Did you mean 'evaluate'?",
