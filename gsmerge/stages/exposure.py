@@ -28,14 +28,14 @@ from gsmerge.stages.mend_photos import PhotoChange, change_large
 from gsmerge.types import Scene
 
 Exposure = Literal["auto", "fixed", "per-photo"]
-SAMPLES = 3000  # pixels of a view that are looked up in the others
+SAMPLES = 2000  # pixels of a view that are looked up in the others
 SAME_DEPTH = 0.05  # logarithm of depths that are of one surface
 LOW, HIGH = 0.05, 0.95  # colours in between are neither noise nor clipped
 MIN_PAIRS = 60  # pixels that two views must share
 # Logarithmic gains between nearest neighbours, root mean square; what pairs disagree by, as a share; and the step
-# above which gains are taken out all the same. 15 captures have steps up to 0.165 with shares from 0.07 on; random
+# above which gains are taken out all the same. 15 captures have steps up to 0.176 with shares from 0.07 on; random
 # gains of 0.8 to 1.25 have steps of 0.1 to 0.25 with shares below 0.04, or up to 0.25 with five views far apart.
-DIFFERENT, CONSISTENT, LARGE = 0.08, 0.05, 0.18
+DIFFERENT, CONSISTENT, LARGE = 0.08, 0.05, 0.19
 CLIPPED, BRIGHT = 0.985, 1.15  # level from which on a photo with more than that gain says nothing
 
 
@@ -78,7 +78,6 @@ def _measure_pairs(scene: Scene, views: Sequence[int]) -> list[_Pair]:
     photos, valid = scene.images.reshape(len(scene), size, 3), scene.valid.reshape(len(scene), size)
     if scene.masks is not None:
         valid = valid & scene.masks.reshape(len(scene), size)
-    depths = [camera_depths(means[view], scene.cameras.viewmats[view]) for view in range(len(scene))]
     some = np.random.default_rng(0).permutation(size)[:SAMPLES]
 
     def measure(view: int) -> list[_Pair]:
@@ -89,10 +88,11 @@ def _measure_pairs(scene: Scene, views: Sequence[int]) -> list[_Pair]:
             x, y = np.floor(np.nan_to_num(pixels[other], nan=-1.0).clip(-1, max(width, height))).astype(np.int64).T
             inside = (z[other] > NEAR) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
             places = np.where(inside, y * width + x, 0)
-            inside &= valid[other, places]
-            ratio = np.maximum(z[other], NEAR) / np.maximum(depths[other][places], NEAR)
-            inside &= np.abs(log(ratio)) < SAME_DEPTH
-            here, there = photos[view, rows[inside]], photos[other, places[inside]]
+            both = np.flatnonzero(inside & valid[other, places])
+            depths = camera_depths(means[other, places[both]], scene.cameras.viewmats[other])
+            same = np.abs(log(np.maximum(z[other, both], NEAR) / np.maximum(depths, NEAR))) < SAME_DEPTH
+            both = both[same]
+            here, there = photos[view, rows[both]], photos[other, places[both]]
             clear = ((here > LOW) & (here < HIGH) & (there > LOW) & (there < HIGH)).all(1)
             if clear.sum() >= MIN_PAIRS:
                 ratios = np.median(log(there[clear].astype(np.float64) / here[clear]), 0)
