@@ -301,7 +301,9 @@ def _check_end(outcome: Outcome) -> list[str]:
     faults = []
     if outcome.code not in CODES:
         faults.append(f"exit code {outcome.code}")
-    if "Traceback" in outcome.err or re.search("unexpected error|gsmerge: warning|Warning:", outcome.err):
+    if "Traceback" in outcome.err or re.search(
+        "unexpected error|gsmerge: warning(?!: the result shows)|Warning:", outcome.err
+    ):
         faults.append("traceback, unexpected error or warning")
     if (outcome.code != 0) != (len(lines) == 1) or not all(line.isprintable() for line in outcome.err.splitlines()):
         faults.append(f"{len(lines)} lines of error")

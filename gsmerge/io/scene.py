@@ -36,8 +36,7 @@ from gsmerge.io.registration.join import join_scenes
 from gsmerge.io.scene_files import SceneFiles, find_scene_files
 from gsmerge.io.scene_views import (
     cut_bars,
-    find_large_photos,
-    find_masks,
+    find_larger_and_masks,
     limit_photo_size,
     limit_view_size,
     read_scene_cameras,
@@ -242,8 +241,8 @@ def align_scene(
     size = photo_size(limited)
     if pictures is not whole:  # files with bars are not read again
         return _make_load(ply, files, hints, result, notes)
-    photo_facts = files, camera_file, pictures, size, result.transform, result.cameras
-    return _make_load(ply, files, hints, result, notes, find_large_photos(*photo_facts), find_masks(*photo_facts))
+    large, masks = find_larger_and_masks(files, camera_file, pictures, size, result.transform, result.cameras)
+    return _make_load(ply, files, hints, result, notes, large, masks)
 
 
 def _make_load(

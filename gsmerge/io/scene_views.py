@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -157,80 +158,72 @@ def images_beside(ply: Path) -> list[Path]:
     return sorted((path for path in named if path.is_file()), key=lambda path: natural_key(path.name))
 
 
-def find_large_photos(
+def find_larger_and_masks(
     files: SceneFiles,
     camera_file: CameraFile,
     photos: Photos | None,
     size: Size | None,
     transform: PhotoTransform | None,
     cameras: Cameras,
-) -> LargePhotos | None:
-    """Find the photos at the size of their files, where that is larger than the scene's; None where it is not.
+) -> tuple[LargePhotos | None, np.ndarray | None]:
+    """Find the photos at the size of their files, where that is larger than the scene's, and where they count.
 
     Files are read again when a photo is asked for; photos inside other files stay in memory. ``photos`` are those
     of :func:`stored_photos`, undistorted; ``size`` is theirs when they were fitted to the rows by ``transform``;
-    ``cameras`` are those of the scene's grid, in the order of the camera file.
+    ``cameras`` are those of the scene's grid, in the order of the camera file. The masks ``[c,h,w]`` bool come from
+    files and from transparency; None where all photos count wholly.
     """
-    paths = _photo_paths(files, camera_file) if photos is not None else None
+    if photos is None or size is None:
+        return None, None
+    paths = _photo_paths(files, camera_file)
     own = photo_size(photos) if paths is None else image_size(paths[0])
     turns = 0 if paths is None else _photo_turns(files, camera_file)
-    stored = own[::-1] if own is not None and turns % 2 else own
-    if photos is None or own is None or stored is None or size is None:
-        return None
+    stored = own[::-1] if turns % 2 else own
     window = _file_window(stored, size, transform, cameras)
-    if not window.is_larger:
-        return None
-    Ks = to_cameras(replace(camera_file, lenses=()), stored).Ks if camera_file.lenses else None
+    lenses = () if paths is None else camera_file.lenses
+    Ks = to_cameras(replace(camera_file, lenses=()), stored).Ks if lenses else None
+
+    def cut(view: int, picture: np.ndarray) -> np.ndarray:
+        """Undistort and turn a picture as it is in a photo's file, and cut out what the view shows."""
+        if Ks is not None:
+            picture = undistort_photos([picture], Ks[view : view + 1], lenses[view : view + 1])[0]
+        return np.ascontiguousarray(np.rot90(picture, turns)[window.rows, window.columns])
 
     def read(view: int) -> np.ndarray:
-        photo = photos_inside[view] if paths is None else decode_image(paths[view], own)
-        if paths is not None and Ks is not None:
-            photo = undistort_photos([photo], Ks[view : view + 1], camera_file.lenses[view : view + 1])[0]
-        return np.ascontiguousarray(np.rot90(photo, turns)[window.rows, window.columns])
+        return cut(view, photos[view] if paths is None else decode_image(paths[view], own))
 
-    photos_inside = photos if paths is None else ()
-    width, height = (part.stop - part.start for part in (window.columns, window.rows))
-    return LargePhotos(matmul(window.to_file, cameras.Ks), width, height, tuple(range(len(cameras))), read)
+    large = None
+    if window.is_larger:
+        width, height = (part.stop - part.start for part in (window.columns, window.rows))
+        large = LargePhotos(matmul(window.to_file, cameras.Ks), width, height, tuple(range(len(cameras))), read)
+    return large, _read_masks(files, camera_file.names, paths, own, cameras, cut)
 
 
-def find_masks(
+def _read_masks(
     files: SceneFiles,
-    camera_file: CameraFile,
-    photos: Photos | None,
-    size: Size | None,
-    transform: PhotoTransform | None,
+    names: Sequence[str],
+    paths: Sequence[Path] | None,
+    size: Size,
     cameras: Cameras,
+    cut: Callable[[int, np.ndarray], np.ndarray],
 ) -> np.ndarray | None:
-    """Read where the photos count, ``[c,h,w]`` bool, from masks and transparency; None where all of them does.
-
-    The arguments are those of :func:`find_large_photos`. A photo without a mask counts wholly.
-    """
-    paths = _photo_paths(files, camera_file) if photos is not None else None
-    stored = photo_size(photos) if paths is None else image_size(paths[0])
-    if photos is None or stored is None or size is None:
-        return None
-    named = [None] * len(camera_file) if files.masks is None else match_masks(files.masks, camera_file.names)
-    Ks = to_cameras(replace(camera_file, lenses=()), stored).Ks if camera_file.lenses else None
-    window = _file_window(stored, size, transform, cameras)
+    """Read where the photos, of ``size`` in their files, count; ``cut`` brings their pictures to the views' part."""
+    shape = cameras.height, cameras.width
+    named = [None] * len(names) if files.masks is None else match_masks(files.masks, names)
 
     def read(view: int) -> np.ndarray | None:
-        parts = [None if paths is None else decode_alpha(paths[view])]
-        parts += [None if path is None else decode_mask(path) for path in (named[view],)]
-        mask = np.full((cameras.height, cameras.width), True)
+        path, mask = named[view], np.full(shape, True)
+        parts = [None if paths is None else decode_alpha(paths[view]), None if path is None else decode_mask(path)]
         for part in (part for part in parts if part is not None):
-            whole = cv2.resize(part.astype(np.uint8) * 255, stored, interpolation=cv2.INTER_NEAREST)
-            if Ks is not None:
-                bent = whole[..., None].repeat(3, -1), Ks[view : view + 1], camera_file.lenses[view : view + 1]
-                whole = undistort_photos([bent[0]], *bent[1:])[0][..., 0]
-            seen = np.ascontiguousarray(whole[window.rows, window.columns])
-            mask &= cv2.resize(seen, mask.shape[::-1], interpolation=cv2.INTER_AREA) > _MASK_LEVEL
+            whole = cv2.resize(part.astype(np.uint8) * 255, size, interpolation=cv2.INTER_NEAREST)
+            seen = cut(view, whole[..., None].repeat(3, -1))[..., 0]
+            mask &= cv2.resize(seen, shape[::-1], interpolation=cv2.INTER_AREA) > _MASK_LEVEL
         return None if mask.all() else mask
 
-    masks = parallel_map(read, range(len(camera_file)))
+    masks = parallel_map(read, range(len(names)))
     if all(mask is None for mask in masks):
         return None
-    whole = np.full((cameras.height, cameras.width), True)
-    return np.stack([whole if mask is None else mask for mask in masks])
+    return np.stack([np.full(shape, True) if mask is None else mask for mask in masks])
 
 
 @dataclass(frozen=True)
@@ -244,7 +237,7 @@ class _Window:
 
 
 def _file_window(stored: Size, size: Size, transform: PhotoTransform | None, cameras: Cameras) -> _Window:
-    """Find the part of files of the size ``stored`` that the grid shows; see :func:`find_large_photos`."""
+    """Find the part of files of the size ``stored`` that the grid shows; see :func:`find_larger_and_masks`."""
     fitted = transform or resize_to(size, size)
     scale = np.array([fitted.scale_x, fitted.scale_y]) * size / np.array(stored)
     cut, grid = np.array([fitted.left, fitted.top]), np.array([fitted.width, fitted.height])
