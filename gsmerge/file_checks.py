@@ -10,9 +10,10 @@ from gsmerge.encoded.encoded import Encoded
 from gsmerge.encoded.gsm_file import ENCODED, STATE, SUFFIX, read_gsm, wrong_checksums
 from gsmerge.errors import SceneError
 from gsmerge.io import ply_notes, read_cameras, read_gaussians
-from gsmerge.io.cameras.read import read_sharp
+from gsmerge.io.cameras.read import find_cameras, read_sharp
 from gsmerge.io.formats import ply_file, spz
-from gsmerge.io.formats.ply import PlyInfo
+from gsmerge.io.formats.ply import SCENE_SUFFIXES, PlyInfo
+from gsmerge.io.scene_files import named_ply, other_plys
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.online.file import load_stored
 from gsmerge.report import human_bytes
@@ -70,9 +71,18 @@ def _read(path: Path) -> FileCheck:
         return _read_gsm(path)
     if suffix == NETWORKS:
         return FileCheck(str(path), "networks", load_checkpoint(path).networks.num_parameters)
+    ply = named_ply(path) or next(iter(other_plys(path)), None) if path.is_dir() else None
+    if ply is not None:  # a scene
+        cameras_path = find_cameras(path)
+        if cameras_path is not None:
+            read_cameras(cameras_path, scene=ply.stem)
+        return replace(_read(ply), path=str(path))
     if path.is_dir() or suffix in CAMERAS:
         cameras = read_cameras(path)
         return FileCheck(str(path), "cameras", len(cameras), cameras.source)
+    if suffix not in SCENE_SUFFIXES:
+        known = ", ".join((*SCENE_SUFFIXES, *CAMERAS, SUFFIX, NETWORKS))
+        raise SceneError(path, f"expected one of {known}, found another kind of file", "it is not checked")
     info = read_gaussians(path).info
     problems = _problems(info)
     if suffix == ".spz":

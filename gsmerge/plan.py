@@ -105,13 +105,14 @@ def make_plan(prepared: Prepared, options: CompactOptions) -> Plan:
     _check_photos(given, options)
     own = options.method == "gsmerge"  # baselines learn nothing
     with stage("prepare"):
-        checkpoint = load_networks(options, given) if own else None
+        has_photos = scene.images is not None and bool(prepared.photo_views)
+        checkpoint = load_networks(options, given, photos=has_photos) if own else None
         segment = _resolve_superpixels(options.segment, scene, effort)
         clean_options = options.clean
         if clean_options.drop_sky and not prepared.photo_views:
             note("drop_sky: no photo is used that could say where the sky is, so it stays")
             clean_options = replace(clean_options, drop_sky=False)
-        decode = resolve_decode(options, scene, photos=bool(scene.images is not None and prepared.photo_views))
+        decode = resolve_decode(options, scene, photos=has_photos)
         if decode.k != options.decode.k and decode.max_k > USUAL_K:
             note(f"k: {decode.k}, because one camera shows the scene, and no long fit follows")
         options = replace(options, decode=decode)
@@ -184,12 +185,13 @@ def _match_method(options: CompactOptions) -> Method:
     return options.match.match or ("overlap" if EFFORTS[options.effort].merges else "none")
 
 
-def load_networks(options: CompactOptions, scene: Scene) -> Checkpoint | None:
+def load_networks(options: CompactOptions, scene: Scene, *, photos: bool) -> Checkpoint | None:
     """Load the checkpoint to use, and check that it fits the options; None for the analytic stages alone.
 
-    SceneError if it is required and cannot be used, UsageError if it does not fit.
+    ``photos``: whether there are any to fit to. SceneError if it is required and cannot be used,
+    UsageError if it does not fit.
     """
-    name = choose_networks(options, photos=scene.images is not None, aligned=scene.aligned)
+    name = choose_networks(options, photos=photos, aligned=scene.aligned)
     if name == "none":
         return None
     from gsmerge.networks.checkpoint import find_checkpoint

@@ -100,7 +100,7 @@ def score(count: int | None, fitted: Fitted, prepared: Prepared, plan: Plan) -> 
         _note_moves(prepared, cameras, plan)
         prepared = replace(prepared, given=replace(prepared.given, cameras=cameras))
     psnr = None
-    if prepared.given.images is not None:
+    if prepared.given.images is not None and prepared.photo_views:
         with stage("score"):
             psnr = measure_psnr(gaussians, prepared.result_views(), prepared, plan)
         choose(scored_views=len(plan.scored_views))
@@ -142,7 +142,7 @@ def make_result(
     current record, which come before those of the candidates, enter the report.
     """
     before, run, seconds = None, current_record(), search["seconds"]
-    if prepared.given.images is not None:
+    if prepared.given.images is not None and prepared.photo_views:
         with stage("input"):
             before = measure_psnr(prepared.given.file_gaussians, prepared.given, prepared, plan)
 

@@ -76,9 +76,10 @@ def distinct_views(scene: Scene) -> tuple[list[int], list[int]]:
 
 
 def _equal_views(scene: Scene, one: int, other: int) -> bool:
-    """Return whether two views of one camera have the same photo and the same Gaussians."""
-    if scene.images is not None and not np.array_equal(scene.images[one], scene.images[other]):
-        return False
+    """Return whether two views of one camera have the same photo, mask and Gaussians."""
+    for pictures in (scene.images, scene.masks):
+        if pictures is not None and not np.array_equal(pictures[one], pictures[other]):
+            return False
     if not scene.aligned:
         return True
     size = scene.pixels_per_view

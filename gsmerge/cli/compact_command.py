@@ -86,6 +86,8 @@ def compact(args: opt.Args) -> None:
         view = shlex.join(["gsmerge", "view", str(args.scenes[0]), str(out)])
         lines = result_table(document, view if out.suffix.lower() == ".ply" else None)
     print_document(document, lines, as_json=args.json, quiet=args.quiet)
+    if args.strict and document["psnr_input_views"]["before"] is None:
+        say_notes(["--strict: there is no photo to compare with, so nothing was checked"], quiet=args.silent)
     problems = [document["unmet"], document["worse"] if args.strict else None]
     if document["worse"] and not args.strict:
         say_warning(f"{document['worse']}; {MORE}", quiet=args.silent)
@@ -142,7 +144,7 @@ def print_plan(args: opt.Args, files: SceneFiles, settings: CompactOptions, out:
         notes.append(f"{out} exists already: --overwrite would replace it")
     with opt.usage_errors(), record_run() as record:
         if settings.method == "gsmerge" and settings.checkpoint != "auto":  # which the run may refuse
-            load_networks(settings, scene)
+            load_networks(settings, scene, photos=scene.images is not None)
         run = estimate(scene, settings)
     notes += record.notes
     document = {

@@ -50,7 +50,7 @@ class PhotoLevel:
 
     photos: DevicePhotos
     means: Tensor  # [v,2,3,h,w] window means, see gsmerge.gpu.image_scores.photo_means
-    weights: Tensor  # [v,h,w] weights of pixels in a step; full size [1,h,w], for all views
+    weights: Tensor  # [v,h,w] weights of pixels in a step, or [1,h,w] for all views
     counts: tuple[float, ...]  # [v] sum of each view's weights
 
     def weight(self, view: int) -> Tensor:
@@ -62,10 +62,14 @@ def make_levels(photos: tuple[DevicePhotos, DevicePhotos], plan: FitPlan) -> tup
     """Weigh the photos of both sizes: all pixels at full size, the training pixels at half size."""
     full, half = photos
     everywhere = torch.ones((1, full.height, full.width), device=full.images.device)
+    whole = (float(full.height * full.width),) * len(full)
+    if full.host.weights is not None:
+        everywhere = torch.from_numpy(np.stack(plan.step_weights[0])).to(full.images.device)
+        whole = tuple(float(weight.sum()) for weight in plan.step_weights[0])
     trained = torch.from_numpy(np.stack(plan.step_weights[1])).to(half.images.device)
     counts = tuple(float(weight.sum()) for weight in plan.step_weights[1])
     return (
-        PhotoLevel(full, photo_means(full.images), everywhere, (float(full.height * full.width),) * len(full)),
+        PhotoLevel(full, photo_means(full.images), everywhere, whole),
         PhotoLevel(half, photo_means(half.images), trained, counts),
     )
 

@@ -38,7 +38,7 @@ def match_images(source: ImageSource, names: Sequence[str]) -> list[Path]:
         missing = names[matched.index(None)]
         problem = f"expected {len(names)} images, one per camera, found {len(files)} and none for {missing}"
         raise SceneError(root, problem, "add what is missing, or name the right folder with --images")
-    if len(set(paths)) < len(paths):
+    if len(set(paths)) < len(set(names)):  # layers of one view have its name
         twice = next(path for path in paths if paths.count(path) > 1)
         raise SceneError(root, f"expected an image of its own for each camera, found {twice.name} for two of them")
     return paths
@@ -50,13 +50,13 @@ def _endings(path: PurePath) -> list[str]:
     return list(dict.fromkeys(str(some) for ending in endings for some in (ending, ending.with_suffix(""))))
 
 
-def _lookup(root: Path, by_ending: dict[str, list[Path]], name: str) -> Path | None:
+def _lookup(root: Path, by_ending: dict[str, list[Path]], name: str, option: str = "--images") -> Path | None:
     parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in ("/", "//", "..")]
     matches = next((by_ending[ending] for ending in _endings(PurePosixPath(*parts)) if ending in by_ending), [])
     if len(matches) > 1:
         first, second = (os.path.relpath(path, root) for path in matches[:2])
         problem = f"expected one image named {name}, found {first} and {second}"
-        raise SceneError(root, problem, "name the folder that has one of them with --images")
+        raise SceneError(root, problem, f"name the folder that has one of them with {option}")
     return matches[0] if matches else None
 
 
@@ -70,9 +70,9 @@ def match_masks(folder: Path, names: Sequence[str]) -> list[Path | None]:
     for file in files:
         for ending in _endings(file.relative_to(folder)):
             by_ending.setdefault(ending, []).append(file)
-    masks = [_lookup(folder, by_ending, name) for name in names]
+    masks = [_lookup(folder, by_ending, name, "--masks") for name in names]
     if not any(masks):
-        problem = f"expected masks named as the photos, such as {PurePath(names[0]).name}.png, found none of them"
+        problem = f"expected masks named as the photos, such as {PurePath(names[0]).stem}.png, found none of them"
         raise SceneError(folder, problem, "rename them, or name another folder with --masks")
     return masks
 

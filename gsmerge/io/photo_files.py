@@ -129,7 +129,14 @@ def same_shape(one: Size, other: Size) -> bool:
 
 def decode_mask(path: Path) -> np.ndarray:
     """Decode a mask to ``[h,w]`` bool, True where the photo counts: brighter than half of its brightest pixel."""
-    grey = _decode_channel(path, lambda image: image.convert("L"))
+
+    def brightness(image: Image.Image) -> np.ndarray:
+        if image.mode[0] in "IF":  # more than 8 bits
+            return np.asarray(image)
+        grey = np.asarray(image.convert("L"), np.float32)
+        return grey * np.asarray(image.getchannel("A")) if "A" in image.getbands() else grey
+
+    grey = _decode_channel(path, brightness)
     assert grey is not None
     return np.asarray(grey > grey.max(initial=0) / 2)
 
@@ -147,7 +154,7 @@ def decode_alpha(path: Path) -> np.ndarray | None:
     return None if values is None or values.min() > _HALF_OPAQUE else values > _HALF_OPAQUE
 
 
-def _decode_channel(path: Path, choose: Callable[[Image.Image], Image.Image | None]) -> np.ndarray | None:
+def _decode_channel(path: Path, choose: Callable[[Image.Image], Image.Image | np.ndarray | None]) -> np.ndarray | None:
     """Decode what ``choose`` makes of an image; SceneError if it cannot be decoded."""
     image_size(path)  # refuses what is no image, or too large
     try:

@@ -46,6 +46,7 @@ from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import Cameras, Gaussians, LargePhotos, Scene, StrPath, grid_ids
 
+_MAX_MASKED = 0.98  # share of the pixels of photos that masks may leave out
 NO_CAMERAS = Cameras(np.empty((0, 4, 4)), np.empty((0, 3, 3)), 1, 1)
 _NO_ALIGNMENT = AlignmentResult(
     None, NO_CAMERAS, None, None, problem="expected one Gaussian per pixel, found no cameras that have any"
@@ -239,10 +240,12 @@ def align_scene(
         result = replace(result, cameras=cameras, images=images)
         notes += smaller
     size = photo_size(limited)
+    if files.masks is not None and (pictures is None or pictures is not whole):
+        notes.append(f"masks are not used: {'there are no photos' if pictures is None else 'the photos have bars'}")
     if pictures is not whole:  # files with bars are not read again
         return _make_load(ply, files, hints, result, notes)
-    large, masks = find_larger_and_masks(files, camera_file, pictures, size, result.transform, result.cameras)
-    return _make_load(ply, files, hints, result, notes, large, masks)
+    large, masks, more = find_larger_and_masks(files, camera_file, pictures, size, result.transform, result.cameras)
+    return _make_load(ply, files, hints, result, [*notes, *more], large, masks)
 
 
 def _make_load(
@@ -263,7 +266,8 @@ def _make_load(
         cameras, images = cameras[views], None if images is None else images[views]
     large = None if large is None else large[views]
     masks = None if masks is None else masks[views]
-    more += [] if masks is None else [_describe_masks(masks)]
+    masks, described = _check_masks(masks, files)
+    more += described
     scene = Scene(gaussians, cameras, images, pixel_ids, tuple(names[view] for view in views), missing, large, masks)
     if camera_file is not None and layout is not None:
         scene, note = _put_back(scene, camera_file, layout, views)
@@ -294,10 +298,18 @@ def _make_load(
     )
 
 
-def _describe_masks(masks: np.ndarray) -> str:
-    """Say how much of the photos masks leave out."""
-    share = 100 * (1 - masks.mean())
-    return f"masks leave out {share:.0f} % of the photos: {(~masks.all((1, 2))).sum()} of {len(masks)} have one"
+def _check_masks(masks: np.ndarray | None, files: SceneFiles) -> tuple[np.ndarray | None, list[str]]:
+    """Say how much of the photos masks leave out; SceneError if that is nearly all, which transparency may not be."""
+    if masks is None:
+        return None, []
+    share = float(1 - masks.mean())
+    if share < _MAX_MASKED:
+        count = int((~masks.all((1, 2))).sum())
+        return masks, [f"masks leave out {100 * share:.0f} % of the photos; of {len(masks)}, {count} have one"]
+    if files.masks is None:
+        return None, ["the photos are transparent nearly everywhere, which is not taken for masks"]
+    problem = f"expected masks that are bright where photos count, found {100 * share:.0f} % dark"
+    raise SceneError(files.masks, problem, "invert them, or name another folder with --masks")
 
 
 def _put_back(scene: Scene, camera_file: CameraFile, layout: Layout, views: Sequence[int]) -> tuple[Scene, list[str]]:

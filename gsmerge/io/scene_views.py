@@ -41,7 +41,7 @@ from gsmerge.io.photo_files import (
     resize_to,
     same_shape,
 )
-from gsmerge.io.scene_files import SceneFiles
+from gsmerge.io.scene_files import MASK_PLACES, SceneFiles
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.pictures import count_bars
 from gsmerge.runtime.threads import parallel_map
@@ -165,16 +165,16 @@ def find_larger_and_masks(
     size: Size | None,
     transform: PhotoTransform | None,
     cameras: Cameras,
-) -> tuple[LargePhotos | None, np.ndarray | None]:
+) -> tuple[LargePhotos | None, np.ndarray | None, list[str]]:
     """Find the photos at the size of their files, where that is larger than the scene's, and where they count.
 
     Files are read again when a photo is asked for; photos inside other files stay in memory. ``photos`` are those
     of :func:`stored_photos`, undistorted; ``size`` is theirs when they were fitted to the rows by ``transform``;
     ``cameras`` are those of the scene's grid, in the order of the camera file. The masks ``[c,h,w]`` bool come from
-    files and from transparency; None where all photos count wholly.
+    files and from transparency; None where all photos count wholly. With notes.
     """
     if photos is None or size is None:
-        return None, None
+        return None, None, []
     paths = _photo_paths(files, camera_file)
     own = photo_size(photos) if paths is None else image_size(paths[0])
     turns = 0 if paths is None else _photo_turns(files, camera_file)
@@ -196,31 +196,51 @@ def find_larger_and_masks(
     if window.is_larger:
         width, height = (part.stop - part.start for part in (window.columns, window.rows))
         large = LargePhotos(matmul(window.to_file, cameras.Ks), width, height, tuple(range(len(cameras))), read)
-    return large, _read_masks(files, camera_file.names, paths, own, cameras, cut)
+    names = camera_file.names if paths is None else [path.as_posix() for path in paths]
+    named, notes = _match_masks(files.masks, names)
+    alphas = [None] * len(names) if paths is None else paths
+
+    def read_parts(view: int) -> list[np.ndarray]:
+        """Read what a mask, upright, and the photo's transparency, as it is stored, say."""
+        mask, photo = named[view], alphas[view]
+        parts = [None if photo is None else decode_alpha(photo)]
+        parts += [None if mask is None else np.rot90(decode_mask(mask), -turns)]
+        return [part for part in parts if part is not None]
+
+    return large, _read_masks(read_parts, len(names), own, cameras, cut), notes
+
+
+def _match_masks(folder: Path | None, names: Sequence[str]) -> tuple[Sequence[Path | None], list[str]]:
+    """Find the masks of photos; of a folder that was not named, only where their names tell, with a note."""
+    if folder is None:
+        return [None] * len(names), []
+    try:
+        return match_masks(folder, names), []
+    except SceneError as error:
+        if folder.name not in MASK_PLACES:
+            raise
+        return [None] * len(names), [f"masks are not used: {error.path}: {error.problem}"]
 
 
 def _read_masks(
-    files: SceneFiles,
-    names: Sequence[str],
-    paths: Sequence[Path] | None,
+    read_parts: Callable[[int], list[np.ndarray]],
+    count: int,
     size: Size,
     cameras: Cameras,
     cut: Callable[[int, np.ndarray], np.ndarray],
 ) -> np.ndarray | None:
-    """Read where the photos, of ``size`` in their files, count; ``cut`` brings their pictures to the views' part."""
+    """Read where photos, of ``size`` in their files, count; ``cut`` brings their pictures to the views' part."""
     shape = cameras.height, cameras.width
-    named = [None] * len(names) if files.masks is None else match_masks(files.masks, names)
 
     def read(view: int) -> np.ndarray | None:
-        path, mask = named[view], np.full(shape, True)
-        parts = [None if paths is None else decode_alpha(paths[view]), None if path is None else decode_mask(path)]
-        for part in (part for part in parts if part is not None):
+        mask = np.full(shape, True)
+        for part in read_parts(view):
             whole = cv2.resize(part.astype(np.uint8) * 255, size, interpolation=cv2.INTER_NEAREST)
             seen = cut(view, whole[..., None].repeat(3, -1))[..., 0]
             mask &= cv2.resize(seen, shape[::-1], interpolation=cv2.INTER_AREA) > _MASK_LEVEL
         return None if mask.all() else mask
 
-    masks = parallel_map(read, range(len(names)))
+    masks = parallel_map(read, range(count))
     if all(mask is None for mask in masks):
         return None
     return np.stack([np.full(shape, True) if mask is None else mask for mask in masks])

@@ -18,12 +18,16 @@ from gsmerge.render import prepare, render
 from gsmerge.render.metrics import describe_loss, psnr, ssim
 from gsmerge.render.photos import NEAR
 from gsmerge.runtime.threads import use_threads
-from gsmerge.stages.prepare import scene_frame
+from gsmerge.stages.prepare import photos_count_as_they_are, scene_frame
 from gsmerge.types import Cameras, Gaussians, Scene, Views, as_array
 from gsmerge.views import pick_views
 
 NETS = ("vgg", "alex")
 ALIGNMENTS = ("color", "pose")
+MENDED = (
+    "the photos of the input views differ from their Gaussians or each other in tone, exposure or by what covers them,"
+    " which compact mends: their scores here are of the photos as they are"
+)
 MIN_SEEN_SHARE = 0.1  # of the held-out pixels, seen by input views; less suggests another world frame
 INPUT = "input"  # name of the scene itself among the results
 MAX_ZOOM = 16.0  # and its inverse the least: beyond, pictures have no pixels left or fill the memory
@@ -244,8 +248,12 @@ def evaluate(
         reference = (
             "photos, and renders of the input in its own views" if "target" in counts else "renders of the input"
         )
-    losses = _losses(scores) if scene.images is not None and options.own and options.context else []
-    return Evaluation(tuple(scores), reference, counts, (*losses, *_notes(splits)), options)
+    notes = list(_notes(splits))
+    if scene.images is not None and "context" in counts and not photos_count_as_they_are(scene):
+        notes.append(MENDED)
+    elif scene.images is not None and options.own and options.context:
+        notes[:0] = _losses(scores)
+    return Evaluation(tuple(scores), reference, counts, tuple(notes), options)
 
 
 def near_plane(scene: Scene) -> float:

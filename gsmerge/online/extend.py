@@ -89,7 +89,7 @@ def extend(
     max_k = online.max_k if state is None else state.settings.max_k
     _check(state, scene, options, max_k)
     with use_threads(options.threads), record_run(progress) as record:
-        fixed = replace(options.prepare, poses="fixed")  # batches have to stay where the others are
+        fixed = replace(options.prepare, poses="fixed", exposure="fixed")  # as all other batches
         prepared = prepare(scene.numpy(), fixed, None if state is None else state.frame)
         plan = make_plan(prepared, options)
         plan = plan.with_fit(replace(plan.fit, min_contribution=options.fit.min_contribution))  # in drafts, too

@@ -22,7 +22,7 @@ from gsmerge.geometry import sh0_to_rgb
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.pictures import count_bars
-from gsmerge.render.photos import blank_photos, photo_errors, photos_of
+from gsmerge.render.photos import blank_photos, photo_errors, photos_of, pixel_weights
 from gsmerge.runtime.record import choose, note
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.mend_photos import (
@@ -57,6 +57,7 @@ LEVELS = 33  # quantiles that a tone curve joins
 MIN_TONE, MIN_TONE_DRAWN = 0.03, 0.08  # median change of the colours from which on a tone is compensated
 CLEAR_TONE = 0.05  # the same of one photo at least, where Gaussians have pixels
 EXPLAINED, EXPLAINED_DRAWN = 0.5, 0.6  # most of the difference that the curve may leave
+CLIPPED = 0.985  # brightest level of a pixel that says how bright it is
 DARK = 3 / 255  # brightest pixel of a black region
 SAME = 2.5 / 255  # range of a flat region's colours
 COVERED, DOUBT = 0.12, 4.0  # difference from which on a region is covered; times that of three quarters of the pixels
@@ -143,8 +144,9 @@ def show_photos(scene: Scene) -> Shown:
         own, weights = _shrink_colors(scene, (photos.width, photos.height))
     else:
         own, weights = _draw(scene, side)
-    if scene.masks is not None:
-        weights = weights * np.stack([_resize(mask, weights.shape[1:]) for mask in scene.masks])
+    inside = pixel_weights(scene.masks, photos.width, photos.height)
+    if inside is not None:
+        weights = weights * (inside == 1)
     return Shown(photos.images, own, weights, not scene.aligned)
 
 
@@ -156,7 +158,7 @@ def _shrink_colors(scene: Scene, size: tuple[int, int]) -> tuple[np.ndarray, np.
 
     def shrink(view: int) -> tuple[np.ndarray, np.ndarray]:
         color, weight = (np.ascontiguousarray(some[view], np.float32) for some in (colors, opacities))
-        small = cv2.resize(sh0_to_rgb(color), size, interpolation=cv2.INTER_AREA)
+        small = cv2.resize(sh0_to_rgb(color).clip(0, 1), size, interpolation=cv2.INTER_AREA)
         return small, cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
 
     own, weights = zip(*parallel_map(shrink, range(len(scene))), strict=True)
@@ -170,12 +172,6 @@ def _draw(scene: Scene, side: int) -> tuple[np.ndarray, np.ndarray]:
     drawn = photo_errors(few, blank, lambda _, image, left: (image.clip(0, 1), 1 - left))
     own, weights = zip(*drawn, strict=True)
     return np.stack(own), np.stack(weights)
-
-
-def _resize(mask: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Resize a mask to ``[h,w]`` float32; pixels that are not wholly inside become 0."""
-    small = cv2.resize(mask.astype(np.float32), shape[::-1], interpolation=cv2.INTER_AREA)
-    return (small >= 1).astype(np.float32)
 
 
 def _change_small(shown: Shown, changes: Sequence[PhotoChange]) -> Shown:
@@ -304,7 +300,8 @@ def _covered(
     own: np.ndarray, photo: np.ndarray, clear: np.ndarray, flat: np.ndarray, *, drawn: bool
 ) -> np.ndarray | None:
     """Return a mask ``[h,w]`` of what covers the scene in a photo; None where nothing does."""
-    seen = clear.astype(np.float32)
+    clipped = _over_channels(np.maximum, photo) > CLIPPED
+    seen = (clear & (flat | ~clipped)).astype(np.float32)
     share = _box_means(seen[..., None])[..., 0]
     away = np.abs(_box_means((photo - own) * seen[..., None]))
     away = _over_channels(np.add, away) / (3 * np.maximum(share, 0.1))

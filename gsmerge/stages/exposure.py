@@ -147,4 +147,5 @@ def _divide(scene: Scene, gains: np.ndarray) -> Scene:
     gaussians = replace(g, sh0=rgb_to_sh0(sh0_to_rgb(g.sh0) * each).astype(np.float32), shN=g.shN * each)
     large = scene.large_photos
     large = None if large is None else change_large(large, changes, {})
-    return replace(scene, images=images, gaussians=gaussians, masks=masks, large_photos=large)
+    counting = scene.masks if masks.all() else masks
+    return replace(scene, images=images, gaussians=gaussians, masks=counting, large_photos=large)

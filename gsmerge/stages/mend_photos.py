@@ -28,13 +28,9 @@ class PhotoChange:
 
     def __call__(self, photo: np.ndarray, own: np.ndarray | None) -> np.ndarray:
         """Mend a photo ``[h,w,3]`` in [0, 1] of any size; ``own [h,w,3]`` is what replaces covered pixels."""
-        height, width = photo.shape[:2]
-        if any(self.bars):
-            top, bottom, left, right = self.bars
-            rows = slice(round(top * height), height - round(bottom * height))
-            photo = photo[rows, round(left * width) : width - round(right * width)]
-            levels = np.rint(255 * photo).astype(np.uint8)  # which OpenCV resizes alike on every processor
-            photo = cv2.resize(levels, (width, height), interpolation=cv2.INTER_LINEAR) / np.float32(255)
+        if any(self.bars):  # as whole numbers, which OpenCV resizes alike on every processor
+            levels = np.rint(255 * photo.clip(0, 1)).astype(np.uint8)
+            photo = self.without_bars(levels, cv2.INTER_LINEAR) / np.float32(255)
         if self.reversed:
             photo = photo[..., ::-1]
         if self.tones is not None:
@@ -42,6 +38,14 @@ class PhotoChange:
         if self.cover is not None and own is not None:
             photo = np.where(_enlarge(self.cover, photo.shape)[..., None], own, photo)
         return np.ascontiguousarray(photo, np.float32)
+
+    def without_bars(self, picture: np.ndarray, interpolation: int) -> np.ndarray:
+        """Cut the bars off a picture ``[h,w]`` or ``[h,w,c]`` of uint8, and enlarge the rest to its size."""
+        height, width = picture.shape[:2]
+        top, bottom, left, right = self.bars
+        rows = slice(round(top * height), height - round(bottom * height))
+        inner = picture[rows, round(left * width) : width - round(right * width)]
+        return np.asarray(cv2.resize(inner, (width, height), interpolation=interpolation))
 
 
 UNCHANGED = PhotoChange()
@@ -69,9 +73,13 @@ def _enlarge(mask: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 def mend_photos(scene: Scene, changes: Sequence[PhotoChange]) -> Scene:
     """Mend the photos of a scene at both of their sizes; pixels outside masks get the Gaussians' colours."""
     assert scene.images is not None
-    masks = np.full(len(scene), True)[:, None, None] if scene.masks is None else scene.masks
+    masks = scene.masks
+    if masks is not None and any(changes[0].bars):  # which all photos have alike
+        cut = [changes[0].without_bars(mask.astype(np.uint8), cv2.INTER_NEAREST) for mask in masks]
+        masks = np.stack(cut) > 0
+    inside = np.full(len(scene), True)[:, None, None] if masks is None else masks
     changed = [view for view, change in enumerate(changes) if is_change(change)]
-    filled = [view for view in range(len(scene)) if changes[view].cover is not None or not masks[view].all()]
+    filled = [view for view in range(len(scene)) if changes[view].cover is not None or not inside[view].all()]
     if not changed and not filled:
         return scene
     _note_changes(changes, scene.names)
@@ -79,12 +87,12 @@ def mend_photos(scene: Scene, changes: Sequence[PhotoChange]) -> Scene:
     images = scene.images.copy()
     for view in sorted({*changed, *filled}):
         images[view] = changes[view](images[view], own.get(view))
-        if not masks[view].all():
-            images[view] = np.where(masks[view][..., None], images[view], own[view])
+        if not inside[view].all():
+            images[view] = np.where(inside[view][..., None], images[view], own[view])
     large = scene.large_photos
     if large is not None and changed:
         large = change_large(large, changes, own)
-    return replace(scene, images=images, large_photos=large)
+    return replace(scene, images=images, large_photos=large, masks=masks)
 
 
 def change_large(large: LargePhotos, changes: Sequence[PhotoChange], own: dict[int, np.ndarray]) -> LargePhotos:
@@ -95,7 +103,9 @@ def change_large(large: LargePhotos, changes: Sequence[PhotoChange], own: dict[i
         if not is_change(changes[view]):
             return photo
         cover = own.get(view)
-        cover = None if cover is None else cv2.resize(cover, photo.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+        if cover is not None:  # as whole numbers, which OpenCV resizes alike on every processor
+            levels = np.rint(255 * cover.clip(0, 1)).astype(np.uint8)
+            cover = cv2.resize(levels, photo.shape[1::-1], interpolation=cv2.INTER_LINEAR) / np.float32(255)
         mended = changes[view](photo / np.float32(255), cover)
         return np.asarray(np.rint(255 * mended.clip(0, 1)), np.uint8)
 
@@ -134,4 +144,19 @@ def own_pictures(scene: Scene, views: list[int]) -> np.ndarray:
     """Return some views of a scene in the colours of its Gaussians, ``[n,h,w,3]``."""
     if not scene.aligned:
         return np.asarray(render(scene.gaussians, scene.cameras[views]).images).clip(0, 1)
-    return scene_pictures(replace(subset(scene, views), images=None))
+    some = subset(scene, views)
+    pictures = scene_pictures(replace(some, images=None))
+    known = some.stored if some.missing is not None else some.valid
+    return np.stack([_fill_gaps(*pair) for pair in zip(pictures, known, strict=True)])
+
+
+def _fill_gaps(picture: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Give pixels ``[h,w]`` that are not known the colour of the nearest one that is."""
+    if known.all() or not known.any():
+        return picture
+    _, labels = cv2.distanceTransformWithLabels(
+        (~known).astype(np.uint8), cv2.DIST_L1, 3, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    nearest = np.zeros(int(labels.max()) + 1, np.int64)
+    nearest[labels[known]] = np.flatnonzero(known)
+    return np.asarray(picture.reshape(-1, 3)[nearest[labels]])

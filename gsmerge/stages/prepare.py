@@ -16,7 +16,7 @@ import numpy as np
 
 from gsmerge.geometry import camera_depths, lower_median, project
 from gsmerge.kernels.matrices import matmul
-from gsmerge.runtime.record import note, stage
+from gsmerge.runtime.record import note, record_part, stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.align_views import align_views
 from gsmerge.stages.assign import seen_weights
@@ -196,6 +196,16 @@ def prepare(scene: Scene, options: PrepareOptions | None = None, frame: Frame | 
     seen, unseen = _split_unseen(placed) if options.unseen == "keep" else (placed, None)
     shown = seen if seen.aligned else add_pictures(seen)  # pixels that are known have colours of their own
     return Prepared(given, shown, frame, photo_views, tuple(repeated), placed is not checked, unseen)
+
+
+def photos_count_as_they_are(scene: Scene) -> bool:
+    """Return whether :func:`prepare` would leave the photos of a scene and their exposure as they are."""
+    if scene.images is None or len(scene) == 0 or len(scene.gaussians) == 0:
+        return True
+    with record_part(silent=True):
+        canonical, _ = canonicalise(add_views(scene))
+        compared, views = compare_photos(canonical)
+        return equalise_exposure(compared, views, "auto").images is canonical.images
 
 
 def _with_photos(given: Scene, own: Scene, repeated: Sequence[int]) -> Scene:

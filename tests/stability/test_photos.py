@@ -11,6 +11,7 @@ import scenes
 
 from gsmerge import CompactResult, Gaussians, Scene, compact
 from gsmerge.geometry import rgb_to_sh0, sh0_to_rgb
+from gsmerge.online.extend import extend
 from gsmerge.stages.prepare import PrepareOptions, prepare
 
 Photos = np.ndarray
@@ -172,3 +173,28 @@ def test_a_black_photo_under_masks_is_left_out(room: Scene) -> None:
     masks = np.broadcast_to(ellipse(), (VIEWS, HEIGHT, WIDTH)).copy()
     result = compact(replace(room, images=images, masks=masks), **FIT)
     assert result.report.choices["photos_left_out"] == [room.names[2]]
+
+
+def test_masks_follow_pictures_that_bars_are_cut_from(room: Scene) -> None:
+    masks = np.zeros((VIEWS, HEIGHT, WIDTH), bool)
+    masks[:, 18:54] = True
+    prepared = prepare(replace(room, images=letterbox(room.images), masks=masks))
+    assert prepared.scene.masks is not None
+    assert prepared.scene.masks.all()
+
+
+def test_covered_pixels_without_a_gaussian_get_the_nearest_colour(room: Scene) -> None:
+    missing = np.zeros((VIEWS, HEIGHT, WIDTH), bool)
+    missing[:, 66:] = True
+    ids = np.where(missing.reshape(-1), -1, room.pixel_ids).astype(np.int32)
+    sh0 = np.where(missing.reshape(-1, 1, 1), np.float32(0), room.gaussians.sh0)
+    scene = replace(room, gaussians=replace(room.gaussians, sh0=sh0), pixel_ids=ids, missing=missing)
+    mended = prepare(replace(scene, images=band(room.images))).scene.images
+    assert mended is not None
+    assert np.abs(mended[::2, 66:] - room.images[::2, 66:]).mean() < 0.1
+    assert not (mended[::2, 66:] == 0.5).all(-1).any()
+
+
+def test_batches_of_views_keep_the_exposure_of_the_photos(room: Scene) -> None:
+    _, report = extend(None, exposed(room, random_gains(1)))
+    assert "exposure" not in report.choices

@@ -176,7 +176,15 @@ def _concat(scenes: Sequence[Scene]) -> Scene:
         names=tuple(name for scene in scenes for name in scene.names),
         missing=np.concatenate(filled) if incomplete else None,
         large_photos=_concat_large([scene.large_photos for scene in scenes]),
+        masks=_concat_masks(scenes) if len(images) == len(scenes) else None,
     )
+
+
+def _concat_masks(scenes: Sequence[Scene]) -> np.ndarray | None:
+    """Put masks one after the other, whole ones where a scene has none; None without any."""
+    if all(scene.masks is None for scene in scenes):
+        return None
+    return np.concatenate([np.full(s.valid.shape, True) if s.masks is None else s.masks for s in scenes])
 
 
 def _concat_large(photos: Sequence[LargePhotos | None]) -> LargePhotos | None:

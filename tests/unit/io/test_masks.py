@@ -42,7 +42,7 @@ def test_masks_beside_the_photos_by_their_names(tiny_folder: Path, tiny: Tiny, n
     assert load.scene.masks is not None
     assert np.array_equal(load.scene.masks[1], half(tiny))
     assert load.scene.masks[[0, 2]].all()  # they have none
-    assert "masks leave out 17 % of the photos: 1 of 3 have one" in load.notes
+    assert "masks leave out 17 % of the photos; of 3, 1 have one" in load.notes
 
 
 def test_a_folder_of_masks_that_is_named(tiny_folder: Path, tiny: Tiny, tmp_path: Path) -> None:
@@ -59,7 +59,7 @@ def test_a_folder_of_masks_that_is_named(tiny_folder: Path, tiny: Tiny, tmp_path
     shutil.copytree(tmp_path / "other" / "a b", tmp_path / "wrong")
     for number, path in enumerate(sorted((tmp_path / "wrong").iterdir())):
         path.rename(path.with_name(f"x{number}.bmp"))
-    with pytest.raises(SceneError, match=r"expected masks named as the photos, such as 2\.png\.png, found none"):
+    with pytest.raises(SceneError, match=r"expected masks named as the photos, such as 2\.png, found none"):
         read_scene(tiny_folder, masks=tmp_path / "wrong")
 
 
@@ -91,3 +91,25 @@ def test_bars_around_photos_are_cut_off(tiny_folder: Path, tiny: Tiny) -> None:
     load = load_scene(tiny_folder)
     assert np.array_equal((load.scene.images * 255).round(), tiny.images)
     assert "the photos of 20 x 21 have bars around pictures of 20 x 14: they are cut off" in load.notes
+
+
+def test_masks_of_many_bits_and_of_transparency(tmp_path: Path) -> None:
+    levels = np.array([[0, 256, 65535, 40000]], np.uint16)
+    write(tmp_path / "deep.png", levels)
+    assert decode_mask(tmp_path / "deep.png").tolist() == [[False, False, True, True]]
+    clear = np.dstack([np.full((1, 4, 3), 255, np.uint8), np.array([[0, 0, 255, 255]], np.uint8)])
+    write(tmp_path / "clear.png", clear)
+    assert decode_mask(tmp_path / "clear.png").tolist() == [[False, False, True, True]]
+
+
+def test_a_folder_of_other_masks_beside_the_photos_is_not_used(tiny_folder: Path, tiny: Tiny) -> None:
+    write(tiny_folder / "masks" / "object_0.png", half(tiny).astype(np.uint8) * 255)
+    load = load_scene(tiny_folder)
+    assert load.scene.masks is None
+    assert any(note.startswith("masks are not used: ") and "found none of them" in note for note in load.notes)
+
+
+def test_masks_without_photos_are_noted(tiny_folder: Path, tiny: Tiny) -> None:
+    write(tiny_folder / "masks" / tiny.names[0], half(tiny).astype(np.uint8) * 255)
+    shutil.rmtree(tiny_folder / "images")
+    assert "masks are not used: there are no photos" in load_scene(tiny_folder).notes
