@@ -81,7 +81,9 @@ def compact_files(
         given = read_input(files, opacity=opacity, hints=hints)
         check_saved_cameras(given.scene, saved_cameras, embed=embed_cameras)
         shared = None if cameras_path is None or overwrite or not cameras_path.exists() else cameras_path
-        if shared is not None and read_cameras(shared).names != given.scene.names:
+        views = _views_once(given.scene)
+        names = [given.scene.names[view] for view in views]
+        if shared is not None and list(read_cameras(shared).names) != names:
             raise _other_cameras(shared)
         read = perf_counter()
         result = compact(given.scene, settings, progress=progress)
@@ -92,20 +94,20 @@ def compact_files(
         coarser = [(level_output(out, i), level) for i, level in enumerate(result.coarser, 1)]
         at |= {path: add(path) for path, _ in coarser}
         for path, one in ((out, result), *coarser):
-            inside = camera_comments(one.cameras, given.scene.names) if embed_cameras else []
+            inside = camera_comments(one.cameras[views], names) if embed_cameras else []
             write_gaussians(
                 at[path], one.gaussians, overwrite=True, comments=[*given.comments, *inside], ending=ending,
                 normals=normals, spz_version=spz_version,
             )  # fmt: skip
         cameras_path = cameras_path if len(given.scene) else None
         if cameras_path is not None:
-            text = viewer_cameras(result.cameras, given.scene.names)
+            text = viewer_cameras(result.cameras[views], names)
             if shared is None:
                 add(cameras_path).write_text(text, encoding="utf-8")
             elif shared.read_text(encoding="utf-8", errors="replace") != text:
                 raise _other_cameras(shared)
         if saved_cameras is not None:
-            write_transforms(at[saved_cameras], result.cameras, given.scene.names)
+            write_transforms(at[saved_cameras], result.cameras[views], names)
         lost = lost_harmonics(out, result.gaussians.sh_degree, spz_version)
         document = report_document(
             result.report,
@@ -123,6 +125,13 @@ def compact_files(
         if report_path is not None:
             at[report_path].write_text(to_json(document), encoding="utf-8", errors="replace")
     return document
+
+
+def _views_once(scene: Scene) -> list[int]:
+    """Return the views without further layers of a view, which have its name and camera."""
+    cameras = zip(scene.names, scene.cameras.viewmats, scene.cameras.Ks, strict=True)
+    keys = [(name, viewmat.tobytes(), K.tobytes()) for name, viewmat, K in cameras]
+    return [view for view, key in enumerate(keys) if key not in keys[:view]]
 
 
 def _other_cameras(path: Path) -> UsageError:

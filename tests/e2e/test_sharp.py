@@ -60,7 +60,12 @@ def test_several_files_become_one_scene(run: Run, sharp: Path, tmp_path: Path) -
     assert any(note.startswith("3 of 4 files are joined in the frame of IMG_0001.ply") for note in report["notes"])
     assert any(note.startswith("IMG_0009.ply is left out") for note in report["notes"])
     assert report["psnr_input_views"]["after"] > report["psnr_input_views"]["before"] + 2
-    assert len(json.loads((tmp_path / "place.cameras.json").read_text())) == 6
+    assert len(json.loads((tmp_path / "place.cameras.json").read_text())) == 3  # one for both layers of a view
+    inside = tmp_path / "inside" / "place.ply"
+    inside.parent.mkdir()
+    run(*words, "-o", inside, "--embed-cameras", "--set", "viewer_cameras=false", *FIT, "-q", code=0)
+    scores = json.loads(run("evaluate", inside, "--images", sharp / "photos", "--json", "--lpips", "none", code=0).out)
+    assert scores["num_views"] == {"context": 3}
     # the frame is that of the first file, which the result is compared with as any other
     one = read_scene(files[0], images=sharp / "photos")
     both = read_scene(files[0], files[1], images=sharp / "photos")

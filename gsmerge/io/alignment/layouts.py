@@ -272,7 +272,7 @@ def photo_grid(camera_file: CameraFile, size: Size | None) -> GridFit:
         return GridFit(to_cameras(camera_file), None, ())
     width, height = size
     for w, h in sizes_of(camera_file):
-        if not same_shape((w, h), size):
+        if not same_shape((w, h), size) and not _are_stretched(camera_file, size):
             problem = f"expected cameras of the images' size {width} x {height} or a multiple of it, found {w} x {h}"
             swapped = (w, h) == (height, width)
             remedy = "width and height are swapped" if swapped else "crop cameras and images alike"
@@ -280,6 +280,16 @@ def photo_grid(camera_file: CameraFile, size: Size | None) -> GridFit:
     other = [s for s in sizes_of(camera_file) if s != size]
     notes = tuple(f"intrinsics scaled from {w} x {h} to the images' {width} x {height}" for w, h in other)
     return GridFit(to_cameras(camera_file, size), None, notes)
+
+
+def _are_stretched(camera_file: CameraFile, size: Size) -> bool:
+    """Return whether cameras of oblong pixels have square ones at the photos' size, which a model has stretched."""
+    if camera_file.focal is None:
+        return False
+    focals = camera_file.Ks[:, (0, 1), (0, 1)]
+    sides = np.stack([camera_file.widths, camera_file.heights], 1)
+    ratios = np.divide(*(focals * size / np.maximum(sides, 1)).T)
+    return bool((np.abs(ratios - 1) <= ASPECT_TOLERANCE).all())
 
 
 def other_grids(ply: PlyInfo, camera_file: CameraFile, size: Size | None) -> Iterator[GridFit]:
