@@ -157,7 +157,8 @@ def check_saved_cameras(scene: Scene, path: Path | None, *, embed: bool = False)
         option = "--embed-cameras" if path is None else f"--save-cameras {path}"
         raise UsageError(f"{option}: expected a scene with cameras, got none")
     if embed:
-        camera_comments(scene.cameras, scene.names)  # refuses too many before the work
+        views = _views_once(scene)
+        camera_comments(scene.cameras[views], [scene.names[view] for view in views])  # refuses too many before the work
 
 
 def compact_notes(loaded: SceneLoad) -> tuple[str, ...]:

@@ -1,8 +1,10 @@
-"""Quaternions, covariances, projection, motions of cameras and medians, on batches of arrays."""
+"""Quaternions, covariances, projection, motions of cameras, medians, on batches of arrays; descent by damped steps."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -10,6 +12,7 @@ from gsmerge.kernels.elementary import arctan2, cos, sin
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.types import SH_C0, Array, Cameras
 
+State = TypeVar("State")  # what a descent moves
 MORTON_BITS = 21  # per axis: three fit into 63 bits
 
 
@@ -170,3 +173,42 @@ def sh0_to_rgb(sh0: np.ndarray) -> np.ndarray:
 def rgb_to_sh0(rgb: np.ndarray) -> np.ndarray:
     """Return the harmonics of degree 0 of base colours, the inverse of :func:`sh0_to_rgb`."""
     return (rgb - 0.5) / SH_C0
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Steps of :func:`descend`, and how their damping changes."""
+
+    steps: int  # at most
+    first: float  # damping, a share of the curvature
+    ease: float  # factor on it after a step that helps
+    brake: float  # factor on it after one that does not
+    most: float  # damping beyond which no step is tried
+    min_gain: float  # share of the error that a step must take away for another one to follow
+
+
+def descend(
+    start: State, error: Callable[[State], float], step: Callable[[State, float], State | None], schedule: Schedule
+) -> State:
+    """Take damped steps that each lower the error, by Levenberg and Marquardt's rule, and return the last state.
+
+    ``step`` moves a state with a damping; None where it cannot.
+    """
+    state, damping = start, schedule.first
+    least = error(state)
+    for _ in range(schedule.steps):
+        trial = step(state, damping)
+        if trial is None:
+            break
+        trial_error = error(trial)
+        if not trial_error < least:
+            damping *= schedule.brake
+            if damping > schedule.most:
+                break
+            continue
+        gain = 1 - trial_error / least
+        state, least = trial, trial_error
+        if gain < schedule.min_gain:
+            break
+        damping *= schedule.ease
+    return state

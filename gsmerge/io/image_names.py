@@ -26,10 +26,7 @@ def match_images(source: ImageSource, names: Sequence[str]) -> list[Path]:
     else:
         files = [Path(p) for p in source]
         root = files[0].parent if files else Path()
-    by_ending: dict[str, list[Path]] = {}
-    for file in files:
-        for ending in _endings(file.relative_to(root) if file.is_relative_to(root) else file):
-            by_ending.setdefault(ending, []).append(file)
+    by_ending = _by_ending(root, files)
     matched = [_lookup(root, by_ending, name) for name in names]
     paths = [path for path in matched if path is not None]
     if not paths and len(files) == len(names):
@@ -42,6 +39,15 @@ def match_images(source: ImageSource, names: Sequence[str]) -> list[Path]:
         twice = next(path for path in paths if paths.count(path) > 1)
         raise SceneError(root, f"expected an image of its own for each camera, found {twice.name} for two of them")
     return paths
+
+
+def _by_ending(root: Path, files: Sequence[Path]) -> dict[str, list[Path]]:
+    """List the files below a folder by every ending of their paths."""
+    by_ending: dict[str, list[Path]] = {}
+    for file in files:
+        for ending in _endings(file.relative_to(root) if file.is_relative_to(root) else file):
+            by_ending.setdefault(ending, []).append(file)
+    return by_ending
 
 
 def _endings(path: PurePath) -> list[str]:
@@ -65,11 +71,7 @@ def match_masks(folder: Path, names: Sequence[str]) -> list[Path | None]:
 
     SceneError if the folder has no mask of any view, or two of one.
     """
-    files = list_images(folder)
-    by_ending: dict[str, list[Path]] = {}
-    for file in files:
-        for ending in _endings(file.relative_to(folder)):
-            by_ending.setdefault(ending, []).append(file)
+    by_ending = _by_ending(folder, list_images(folder))
     masks = [_lookup(folder, by_ending, name, "--masks") for name in names]
     if not any(masks):
         problem = f"expected masks named as the photos, such as {PurePath(names[0]).stem}.png, found none of them"

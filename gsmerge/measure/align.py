@@ -9,11 +9,12 @@ curvature comes from how the picture would move, given its depth.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gsmerge.geometry import motion_matrices, pose_changes
+from gsmerge.geometry import Schedule, descend, motion_matrices, pose_changes
 from gsmerge.kernels.elementary import log1p
 from gsmerge.kernels.matrices import matmul, solve, solve_symmetric
 from gsmerge.measure.visibility import resize_mask
@@ -25,10 +26,8 @@ from gsmerge.types import Cameras
 
 LEVELS = (4, 2, 1)  # what the sides of the photo are divided by, one after the other
 MIN_SIDE = 32  # pixels of a photo's shorter side below which it says little about a pose
-STEPS = 20  # most steps at each of these sizes
-FIRST_DAMPING, EASE, BRAKE, MAX_DAMPING = 1e-3, 0.25, 5.0, 1e4  # of the curvature: after a step that helps, or does not
+SCHEDULE = Schedule(steps=20, first=1e-3, ease=0.25, brake=5.0, most=1e4, min_gain=1e-5)  # at each of these sizes
 MAX_STEP = 0.2  # radians and median depths
-MIN_GAIN = 1e-5  # share of the error that a step must take away for another one to follow
 DOUBT = 3.0  # times the median residual at the given pose: beyond, a pixel is taken for something else than the pose
 MIN_RESIDUAL = 0.01  # the least that this median is taken for, sRGB in [0, 1]
 OPAQUE = 0.5  # alpha from which a rendered depth is that of a surface
@@ -151,28 +150,22 @@ def refine_pose(
 
 def _descend(target: _Target, best: _Trial, unit: float, doubt: float) -> _Trial:
     """Take steps that each lower the error, and return the pose; lengths are in ``unit`` world units."""
-    damping, error = FIRST_DAMPING, best.error(doubt)
-    slope, curvature = _slope(target, best, unit, doubt), _curvature(target, best, unit, doubt)
-    for _ in range(STEPS):
+
+    @lru_cache(maxsize=1)  # of a pose from which several steps are tried
+    def equations(state: _Trial) -> tuple[np.ndarray, np.ndarray]:
+        return _slope(target, state, unit, doubt), _curvature(target, state, unit, doubt)
+
+    def step(state: _Trial, damping: float) -> _Trial | None:
+        slope, curvature = equations(state)
         scale = damping * np.diag(curvature) + 1e-9 * curvature.trace() + 1e-30
-        step = -solve(curvature + np.diag(scale), slope)
-        length = float(np.sqrt((step * step).sum()))
+        motion = -solve(curvature + np.diag(scale), slope)
+        length = float(np.sqrt((motion * motion).sum()))
         if not np.isfinite(length):
-            break
-        step *= min(1.0, MAX_STEP / max(length, MAX_STEP))
-        trial = target.try_pose(_moved(best.viewmat, step, target, unit))
-        trial_error = trial.error(doubt)
-        if trial_error >= error:
-            damping *= BRAKE
-            if damping > MAX_DAMPING:
-                break
-            continue
-        best, gain, error = trial, 1 - trial_error / error, trial_error
-        if gain < MIN_GAIN:
-            break
-        damping *= EASE
-        slope, curvature = _slope(target, best, unit, doubt), _curvature(target, best, unit, doubt)
-    return best
+            return None
+        motion *= min(1.0, MAX_STEP / max(length, MAX_STEP))
+        return target.try_pose(_moved(state.viewmat, motion, target, unit))
+
+    return descend(best, lambda state: state.error(doubt), step, SCHEDULE)
 
 
 def _slope(target: _Target, trial: _Trial, unit: float, doubt: float) -> np.ndarray:

@@ -26,6 +26,7 @@ from gsmerge.render.photos import blank_photos, photo_errors, photos_of, pixel_w
 from gsmerge.runtime.record import choose, note
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.mend_photos import (
+    CLIPPED,
     UNCHANGED,
     PhotoChange,
     is_change,
@@ -57,7 +58,6 @@ LEVELS = 33  # quantiles that a tone curve joins
 MIN_TONE, MIN_TONE_DRAWN = 0.03, 0.08  # median change of the colours from which on a tone is compensated
 CLEAR_TONE = 0.05  # the same of one photo at least, where Gaussians have pixels
 EXPLAINED, EXPLAINED_DRAWN = 0.5, 0.6  # most of the difference that the curve may leave
-CLIPPED = 0.985  # brightest level of a pixel that says how bright it is
 DARK = 3 / 255  # brightest pixel of a black region
 SAME = 2.5 / 255  # range of a flat region's colours
 COVERED, DOUBT = 0.12, 4.0  # difference from which on a region is covered; times that of three quarters of the pixels
@@ -207,12 +207,11 @@ def _find_bars(scene: Scene, shown: Shown) -> tuple[float, float, float, float]:
     bars = (sides[0] / height, sides[1] / height, sides[2] / width, sides[3] / width)
     if max(bars[0] + bars[1], bars[2] + bars[3]) < MIN_BAR:
         return none
-    cropped = _change_small(shown, [PhotoChange(bars=bars)] * len(scene))
+    change = PhotoChange(bars=bars)
+    cropped = _change_small(shown, [change] * len(scene))
     rows, columns = shown.weights.shape[1:]
     inside = np.zeros((rows, columns), bool)
-    top, bottom, left, right = bars
-    across = slice(round(left * columns), columns - round(right * columns))
-    inside[round(top * rows) : rows - round(bottom * rows), across] = True
+    inside[change.inside(rows, columns)] = True
     as_cover = replace(shown, weights=shown.weights * inside)
     own = [float(np.median(np.diag(gradient_correlations(some)[0]))) for some in (cropped, as_cover, shown)]
     least = LEAST_DRAWN if shown.drawn else LEAST

@@ -24,7 +24,7 @@ from gsmerge.kernels.matrices import solve_symmetric
 from gsmerge.render.photos import NEAR
 from gsmerge.runtime.record import choose, note
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.stages.mend_photos import PhotoChange, change_large
+from gsmerge.stages.mend_photos import CLIPPED, PhotoChange, change_large
 from gsmerge.types import Scene
 
 Exposure = Literal["auto", "fixed", "per-photo"]
@@ -36,7 +36,7 @@ MIN_PAIRS = 60  # pixels that two views must share
 # above which gains are taken out all the same. 15 captures have steps up to 0.176 with shares from 0.07 on; random
 # gains of 0.8 to 1.25 have steps of 0.1 to 0.25 with shares below 0.04, or up to 0.25 with five views far apart.
 DIFFERENT, CONSISTENT, LARGE = 0.08, 0.05, 0.19
-CLIPPED, BRIGHT = 0.985, 1.15  # level from which on a photo with more than that gain says nothing
+BRIGHT = 1.15  # gain from which on clipped pixels no longer count
 
 
 @dataclass(frozen=True)

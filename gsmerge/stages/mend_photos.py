@@ -14,6 +14,7 @@ from gsmerge.runtime.record import choose, note
 from gsmerge.types import LargePhotos, Scene
 from gsmerge.views import subset
 
+CLIPPED = 0.985  # level from which on a pixel does not say how bright it is
 NAMED = 4  # views that a note names
 
 
@@ -42,10 +43,14 @@ class PhotoChange:
     def without_bars(self, picture: np.ndarray, interpolation: int) -> np.ndarray:
         """Cut the bars off a picture ``[h,w]`` or ``[h,w,c]`` of uint8, and enlarge the rest to its size."""
         height, width = picture.shape[:2]
+        inner = picture[self.inside(height, width)]
+        return np.asarray(cv2.resize(inner, (width, height), interpolation=interpolation))
+
+    def inside(self, height: int, width: int) -> tuple[slice, slice]:
+        """Return the rows and columns between the bars, of a picture of that size."""
         top, bottom, left, right = self.bars
         rows = slice(round(top * height), height - round(bottom * height))
-        inner = picture[rows, round(left * width) : width - round(right * width)]
-        return np.asarray(cv2.resize(inner, (width, height), interpolation=interpolation))
+        return rows, slice(round(left * width), width - round(right * width))
 
 
 UNCHANGED = PhotoChange()

@@ -7,13 +7,12 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from gsmerge.geometry import motion_matrices
+from gsmerge.geometry import Schedule, descend, motion_matrices
 from gsmerge.kernels.matrices import eigh, matmul, solve
 
-STEPS = 30  # most Levenberg-Marquardt steps
-FIRST_DAMPING, EASE, BRAKE, MAX_DAMPING = 1e-3, 0.1, 10.0, 1e8  # of the curvature: after a step that helps, or does not
-MIN_GAIN = 1e-10  # share of the squared error that a step must take away for another one to follow
+SCHEDULE = Schedule(steps=30, first=1e-3, ease=0.1, brake=10.0, most=1e8, min_gain=1e-10)
 MAX_STRETCH = 0.5  # of the focal length, in a step
+_Fit = tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray, float]]  # intrinsics, poses, equations
 _MIN_POINTS = 24  # fewer fit any camera
 _FLAT = 1e-10  # of the largest second moment: an axis along which points do not differ
 _PROJECTIVE_ROUNDS = 8  # of reweighted least squares
@@ -47,23 +46,17 @@ def refine_poses(
     With ``focal`` the common focal length of the views is solved for as well. Returns intrinsics ``[3,3]`` and poses
     ``[v,4,4]``; numpy.linalg.LinAlgError where the points do not determine them.
     """
-    damping = FIRST_DAMPING
-    curvature, slope, error = _linearise(points, pixels, K, poses)
-    for _ in range(STEPS):
+
+    def fit(near_K: np.ndarray, near: np.ndarray) -> _Fit:
+        return near_K, near, _linearise(points, pixels, near_K, near)
+
+    def step(state: _Fit, damping: float) -> _Fit:
+        own_K, own, (curvature, slope, _) = state
         stretch, motions = _step(curvature, slope, damping, focal=focal)
-        near_K = np.concatenate([K[:2, :2] * stretch, K[:2, 2:]], 1)
-        near_K = np.concatenate([near_K, K[2:]])
-        near = matmul(motion_matrices(motions), poses)
-        trial = _linearise(points, pixels, near_K, near)
-        if not trial[2] < error:
-            damping *= BRAKE
-            if damping > MAX_DAMPING:
-                break
-            continue
-        gain = 1 - trial[2] / error
-        K, poses, (curvature, slope, error), damping = near_K, near, trial, damping * EASE
-        if gain < MIN_GAIN:
-            break
+        near_K = np.concatenate([own_K[:2, :2] * stretch, own_K[:2, 2:]], 1)
+        return fit(np.concatenate([near_K, own_K[2:]]), matmul(motion_matrices(motions), own))
+
+    K, poses, _ = descend(fit(K, poses), lambda state: state[2][2], step, SCHEDULE)
     return K, poses
 
 

@@ -15,7 +15,7 @@ from itertools import combinations
 
 import numpy as np
 
-from gsmerge.geometry import camera_depths, lower_median, motion_matrices
+from gsmerge.geometry import Schedule, camera_depths, descend, lower_median, motion_matrices
 from gsmerge.io.alignment import IDENTITY, Similarity
 from gsmerge.io.registration.keypoints import End, Matches, Photo, find_keypoints, match_photos
 from gsmerge.io.registration.similarities import (
@@ -45,12 +45,11 @@ DOUBT = 4.0  # squared residual from which on a match counts less
 MIN_MATCHES = 16  # that agree where two scenes are connected; of unrelated photos up to 5 do
 MIN_SHARE = 0.15  # of the matches
 ROUNDS = 3  # of choosing the matches of a pair that agree, and moving it by them
-STEPS = 40  # most Gauss-Newton steps
-FIRST_DAMPING, EASE, BRAKE, MAX_DAMPING = 1e-4, 0.1, 10.0, 1e6  # of the curvature
-MIN_GAIN = 1e-9  # share of the cost that a step must take away for another one to follow
+SCHEDULE = Schedule(steps=40, first=1e-4, ease=0.1, brake=10.0, most=1e6, min_gain=1e-9)
 SIZE = 7  # numbers of a step: turn, shift, logarithm of the scale
 
 Places = Sequence[Similarity | None]
+_Fit = tuple[Places, tuple[float, np.ndarray, np.ndarray]]  # with the cost there, its curvature and its slope
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,29 +274,22 @@ def _refine(
     """
     placed = [i for i, place in enumerate(places) if place is not None]
     free = [i for i in placed if i != (placed[0] if fixed is None else fixed)]
-    damping = FIRST_DAMPING
-    cost, curvature, slope = _normal_equations(places, matches, spread, free)
-    for _ in range(STEPS):
+
+    def fit(near: Places) -> _Fit:
+        return near, _normal_equations(near, matches, spread, free)
+
+    def step(state: _Fit, damping: float) -> _Fit | None:
+        own, (_, curvature, slope) = state
         scale = damping * np.diag(curvature) + 1e-12 * curvature.trace() + 1e-30
-        step = -solve(curvature + np.diag(scale), slope).reshape(-1, SIZE)
-        if not np.isfinite(step).all():
-            break
-        moved = list(places)
-        for i, vector in zip(free, step, strict=True):
-            moved[i] = apply_after(places[i] or IDENTITY, _make_step(vector))
-        trial = _normal_equations(moved, matches, spread, free)
-        if not trial[0] < cost:
-            damping *= BRAKE
-            if damping > MAX_DAMPING:
-                break
-            continue
-        gain = 1 - trial[0] / cost
-        places = moved
-        damping *= EASE
-        cost, curvature, slope = trial
-        if gain < MIN_GAIN:
-            break
-    return places
+        steps = -solve(curvature + np.diag(scale), slope).reshape(-1, SIZE)
+        if not np.isfinite(steps).all():
+            return None
+        moved = list(own)
+        for i, vector in zip(free, steps, strict=True):
+            moved[i] = apply_after(own[i] or IDENTITY, _make_step(vector))
+        return fit(moved)
+
+    return descend(fit(places), lambda state: state[1][0], step, SCHEDULE)[0]
 
 
 def _make_step(step: np.ndarray) -> Similarity:
