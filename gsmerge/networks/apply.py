@@ -134,8 +134,8 @@ def merge_features(
 ) -> FeatureGaussians:
     """Correct c merged Feature Gaussians by the merger (paper section 4.4).
 
-    Cluster i was pooled from the rows ``order[cuts[i] : cuts[i + 1]]`` of the n Feature Gaussians ``parts``. The paper's
-    merger corrects the first of these rows instead; members and weights are the whole cluster's.
+    Cluster i was pooled from the rows ``order[cuts[i] : cuts[i + 1]]`` of the n Feature Gaussians ``parts``. The
+    paper's merger corrects the first of these rows instead; members and weights are the whole cluster's.
     """
     options = context.options
     if not options.merger:

@@ -141,7 +141,7 @@ class Head(nn.Module):
 
 
 class Merger(nn.Module):
-    """Network from the Feature Gaussians of a cluster to corrections of the one that it starts from, with its latent."""
+    """Network from the Feature Gaussians of a cluster to corrections of its start, and of that one's latent."""
 
     def __init__(self, options: NetworkOptions) -> None:
         super().__init__()

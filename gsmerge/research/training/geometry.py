@@ -1,8 +1,8 @@
 """Geometry of the stages as tensors, so that gradients pass from a stage's results to what earlier ones made of them.
 
 The formulas are those of the kernels that the stages use (:mod:`gsmerge.networks.tokens`, :mod:`gsmerge.moments`,
-:mod:`gsmerge.networks.corrections`). Choices have no gradient: members, neighbours, clusters, order of axes, views and what
-these say of a group.
+:mod:`gsmerge.networks.corrections`). Choices have no gradient: members, neighbours, clusters, order of axes, views and
+what these say of a group.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ MIN_GAP = 1e-3  # least difference of two squared scales that turns axes, as a s
 
 def features_to_tensors(features: FeatureGaussians) -> FeatureGaussians:
     """Return Feature Gaussians whose columns that networks change are tensors."""
-    return replace(features, **{name: as_tensor(getattr(features, name)) for name in TENSORS})
+    columns: dict[str, Array] = {name: as_tensor(getattr(features, name)) for name in TENSORS}
+    return replace(features, **columns)
 
 
 def features_to_arrays(features: FeatureGaussians) -> FeatureGaussians:
@@ -40,8 +41,8 @@ def features_to_arrays(features: FeatureGaussians) -> FeatureGaussians:
 def differentiate_axes(covars: Tensor) -> tuple[Tensor, Tensor]:
     """Compute scales ``[g,3]``, rising, and quaternions ``[g,4]`` of covariances ``[g,3,3]``, differentiable.
 
-    Values are those of :func:`gsmerge.moments.principal_axes`; gradients are of first-order perturbation theory. Axes of
-    nearly equal scales have no direction, so their turn is held back.
+    Values are those of :func:`gsmerge.moments.principal_axes`; gradients are of first-order perturbation theory. Axes
+    of nearly equal scales have no direction, so their turn is held back.
     """
     scales, quats = (torch.from_numpy(axes).float() for axes in principal_axes(as_array(covars)))
     if not covars.requires_grad:
@@ -88,7 +89,7 @@ def differentiate_groups(features: FeatureGaussians, known: GroupFeatures, viewm
 
 
 def _differentiate_frames(means: Tensor, viewmats: Tensor, known: np.ndarray) -> Tensor:
-    """Compute the frames of points in their views ``[g,4,4]``, differentiable where the ray is not the image's right."""
+    """Compute the frames of points in views ``[g,4,4]``, differentiable where the ray is not the image's right."""
     frames = torch.from_numpy(known)
     if not means.requires_grad:
         return frames
@@ -100,8 +101,10 @@ def _differentiate_frames(means: Tensor, viewmats: Tensor, known: np.ndarray) ->
     return torch.where((across.norm(dim=1) > 1e-3)[:, None, None], frames + turned - turned.detach(), frames)
 
 
-def differentiate_tokens(parts: Gaussians, ids: np.ndarray, owners: np.ndarray, group_features: GroupFeatures) -> Tensor:
-    """Describe Gaussians relative to groups as :func:`gsmerge.networks.tokens.part_tokens`, ``[n,13]``, differentiable."""
+def differentiate_tokens(
+    parts: Gaussians, ids: np.ndarray, owners: np.ndarray, group_features: GroupFeatures
+) -> Tensor:
+    """Describe Gaussians relative to groups, ``[n,13]``, as :func:`gsmerge.networks.tokens.part_tokens` does."""
     g, own = group_features, torch.from_numpy(owners)
     chosen = parts[torch.from_numpy(ids)]
     back = g.frames[own].transpose(1, 2)
@@ -174,7 +177,7 @@ def pool_tensors(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray
     means = average(features.means[order])
     offsets = features.means[order] - means[run]
     spread = features.covars[order] + offsets[:, :, None] * offsets[:, None]
-    columns = {"means": means, "covars": average(spread), "sh0": average(features.sh0[order])}
+    columns: dict[str, Array] = {"means": means, "covars": average(spread), "sh0": average(features.sh0[order])}
     columns |= {name: total(getattr(features, name)[order]) for name in ("masses", "extinctions")}
     return replace(pooled, **columns, latents=average(features.latents[order]))
 

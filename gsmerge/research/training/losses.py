@@ -199,9 +199,9 @@ GEOMETRY, OPACITY = 0.75, 0.25  # weights of the two terms of the diversificatio
 def diversity_loss(gaussians: Gaussians, parents: Tensor, sizes: Tensor, unit: float | None = None) -> Tensor:
     """Penalise siblings that overlap too much or too little, or differ in opacity (paper supplement D).
 
-    ``parents [n]`` are those of n children, ascending. Pairs are weighted by their volumes. The paper gives these in the
-    world's units; with the scene's ``unit`` of length the weights of a million small Gaussians leave nothing of the
-    loss. None: in the ``sizes [n]`` of their groups, which start near 1, without a gradient: small siblings are no goal.
+    ``parents [n]`` are those of n children, ascending. Pairs are weighted by their volumes, in the paper in the world's
+    units; in a scene's ``unit`` of length, those of a million small Gaussians leave nothing of the loss. None: in the
+    ``sizes [n]`` of their groups, which start near 1, and without a gradient: small siblings are no goal.
     """
     one, other = sibling_pairs(parents)
     if len(one) == 0:

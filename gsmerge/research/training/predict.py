@@ -88,8 +88,8 @@ class Prediction:
 def predict(crop: Crop, networks: Networks, options: TrainOptions, seed: int) -> Prediction:
     """Run a crop through all networks; each stage reads the results of those before it, and passes gradients on.
 
-    Analytic children of K > 1 are pooled again from the members, so earlier stages reach those of residual heads through
-    what the heads read alone.
+    Analytic children of K > 1 are pooled again from the members, so earlier stages reach those of residual heads
+    through what the heads read alone.
     """
     example = crop.example
     context = TrainingContext(networks, example.members, example.cameras, seed)
@@ -147,7 +147,8 @@ def match_crop(
     if known is not None:
         ids, local = np.unique(known.clusters[crop.rows], return_inverse=True)
         return Matches(local, len(ids))
-    context = networks and NetworkContext(networks, crop.example.members, crop.example.cameras, seed)
+    example = crop.example
+    context = None if networks is None else NetworkContext(networks, example.members, example.cameras, seed)
     with torch.no_grad():
         return match(parts, options.match_options(), context)
 

@@ -139,8 +139,8 @@ def measure(crop: Crop, networks: Networks) -> torch.Tensor:
     prediction = predict(crop, networks, PAPER, 0)
     g, generator = prediction.gaussians, torch.Generator().manual_seed(3)
     half = quat_to_rotmat(g.quats) * (g.scales / SIZE_OF_ROOM)[:, None]
-    columns = [g.means / SIZE_OF_ROOM, (half @ half.transpose(1, 2)).flatten(1), 4 * g.opacities[:, None], 4 * g.sh0[:, 0]]
-    values = torch.cat(columns, 1).double()
+    covars = (half @ half.transpose(1, 2)).flatten(1)
+    values = torch.cat([g.means / SIZE_OF_ROOM, covars, 4 * g.opacities[:, None], 4 * g.sh0[:, 0]], 1).double()
     weights = 0.3 + torch.rand(values.shape, generator=generator, dtype=torch.float64)
     return (weights * torch.tanh(values)).sum()
 

@@ -13,9 +13,8 @@ from scenes import arc, make_scene, room
 from training_runs import OPTIONS, TINY, written
 
 from gsmerge.errors import SceneError
-from gsmerge.networks.apply import NetworkContext, encode_features, refine_features, run_heads
 from gsmerge.networks.checkpoint import load_checkpoint
-from gsmerge.networks.corrections import LOGIT, MEAN, SIZE, residual_limits
+from gsmerge.networks.corrections import LOGIT, residual_limits
 from gsmerge.networks.modules import Networks
 from gsmerge.networks.options import Bounds, NetworkOptions
 from gsmerge.networks.tensors import move_tensors
@@ -33,7 +32,6 @@ from gsmerge.research.training.predict import analytic_gaussians, crop_targets, 
 from gsmerge.research.training.scenes import TrainingScene, make_training_scene
 from gsmerge.research.training.targets import corrections_between
 from gsmerge.research.training.windows import Crop, sample_crop
-from gsmerge.stages.decode import DecodeOptions, decode, divide
 from gsmerge.stages.merge import merge
 from gsmerge.types import Scene
 
@@ -72,7 +70,8 @@ def files(out: Path) -> dict[str, bytes]:
 def test_targets_lead_from_the_start_to_the_fit(example: Example) -> None:
     """Each analytic child has one, in the order that children come in."""
     for k, targets in example.targets.items():
-        assert len(analytic_gaussians(everything(example, k), example.matches)) == len(targets.parents) == len(targets.mask)
+        analytic = analytic_gaussians(everything(example, k), example.matches)
+        assert len(analytic) == len(targets.parents) == len(targets.mask)
         assert targets.mask.any()
         assert targets.corrections[targets.mask].any(1).all()
         assert not targets.corrections[~targets.mask].any()
@@ -237,7 +236,8 @@ def test_presets_are_settings_that_a_file_can_change(tmp_path: Path) -> None:
     config.write_text(json.dumps({"steps": 10, "network": {"width": 16, "bounds": {"mean": 0.5}}}))
     network = NetworkOptions(width=16, outputs="absolute", merger_start="first", bounds=Bounds(mean=0.5))
     assert read_config(config, paper) == replace(paper, steps=10, network=network)
-    assert read_config(config) == replace(TrainOptions(), steps=10, network=replace(network, outputs="residual", merger_start="pooled"))
+    ours = replace(network, outputs="residual", merger_start="pooled")
+    assert read_config(config) == replace(TrainOptions(), steps=10, network=ours)
     assert not paper.uses_fit
     assert paper.photo_level(952, 100) == 2
     assert paper.photo_level(320, 240) == 1
