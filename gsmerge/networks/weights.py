@@ -71,8 +71,11 @@ class NetworkWeights:
     def _run_head(
         self, name: str, latents: np.ndarray, group: np.ndarray, children: np.ndarray, mask: np.ndarray
     ) -> np.ndarray:
-        seeds = self._mlp(f"{name}.seeds", np.concatenate([latents, group], 1))
-        x = self._dense(f"{name}.child", children, residual=seeds.reshape(*children.shape[:2], self.options.width))
+        numbers = group[:, list(self.options.head_numbers)]
+        x = self._mlp(f"{name}.seeds", np.concatenate([latents, numbers], 1))
+        x = x.reshape(*children.shape[:2], self.options.width)
+        if self.options.reads_children:
+            x = self._dense(f"{name}.child", children, residual=x)
         x = self._norm(f"{name}.norm", self._block(f"{name}.block", x, mask))
         return self._dense(f"{name}.out", x, TANH).reshape(len(children), -1)
 

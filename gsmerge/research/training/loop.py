@@ -29,7 +29,13 @@ from gsmerge.networks.checkpoint import save_checkpoint
 from gsmerge.networks.corrections import LOGIT
 from gsmerge.networks.modules import Head, Networks
 from gsmerge.research.training.examples import Example, draw_views
-from gsmerge.research.training.losses import correction_loss, scaled_corrections, target_scales, window_loss
+from gsmerge.research.training.losses import (
+    WindowLoss,
+    correction_loss,
+    scaled_corrections,
+    target_scales,
+    window_loss,
+)
 from gsmerge.research.training.predict import predict
 from gsmerge.research.training.processes import ALONE, Processes
 from gsmerge.research.training.shards import Shard, read_targets
@@ -153,14 +159,16 @@ def _train(
     resumed = step
     with open_streams(shards, options, processes.share(range(options.crops))) as streams:
         while step < options.steps:
-            losses.append(_step(state, streams, run, step))
+            loss, share = _step(state, streams, run, step)
+            losses.append(loss)
             step += 1
             if progress:
                 progress(step, options.steps, float(losses[-1]))
             if step % options.save_every == 0 or step == options.steps:
                 scores = validate(state.smooth, validation, run, out)
                 mean = float(torch.stack(losses).mean())
-                rows.append({"step": step, "rate": options.rate_at(step - 1), "loss": mean, **scores})
+                head_row = {"step": step, "rate": options.rate_at(step - 1), "loss": mean}
+                rows.append({**head_row, **({"diversity_share": share} if options.diversity_weight else {}), **scores})
                 losses = []
                 if processes.rank == 0:
                     _save(out, state, rows, head, options)
@@ -209,23 +217,35 @@ def _resume(out: Path, state: TrainingState, expected: dict[str, Any]) -> tuple[
     return int(facts["step"]), list(facts["rows"])
 
 
-def _step(state: TrainingState, streams: ExampleStreams, run: TrainingRun, step: int) -> Tensor:
-    """Do one step, and return its loss."""
+def _step(state: TrainingState, streams: ExampleStreams, run: TrainingRun, step: int) -> tuple[Tensor, float]:
+    """Do one step, and return its loss, and the share of the gradient that holds siblings apart.
+
+    The share is measured in the steps that are validated; 0 in others.
+    """
     options, parameters = run.options, list(state.networks.parameters())
+    shares = (step + 1) % options.save_every == 0 or step + 1 == options.steps
     streams.move_to(step)
+
+    def differentiate(loss: Tensor, *, more: bool) -> list[Tensor]:
+        if not loss.requires_grad:
+            return [torch.zeros_like(parameter).flatten() for parameter in parameters]
+        parts = torch.autograd.grad(loss, parameters, materialize_grads=True, retain_graph=more)
+        return [part.flatten() for part in parts]
 
     def work(crop: int) -> Tensor:
         rng = np.random.default_rng([options.seed, step, crop])
         example = streams.draw(step, crop, rng)
         with torch.enable_grad():
             loss = _loss(state.networks, example, run, step, rng)
-            parts = torch.autograd.grad(loss, parameters, materialize_grads=True)
-        return torch.cat([part.flatten() for part in (*parts, loss.detach().to(parts[0]))])  # which may be on a GPU
+            apart = differentiate(loss.diversity, more=True) if shares else []
+            parts = differentiate(loss.total, more=False)
+        return torch.cat([*parts, loss.total.detach().to(parts[0])[None], *apart])  # which may be on a GPU
 
     rows = run.processes.gather_rows(torch.stack(parallel_map(work, streams.crops)))
     mean = rows.sum(0) / options.crops
-    gradients = mean[:-1].split([parameter.numel() for parameter in parameters])
-    for parameter, gradient in zip(parameters, gradients, strict=True):
+    sizes = [parameter.numel() for parameter in parameters]
+    own, loss, apart = mean.split([sum(sizes), 1, len(mean) - sum(sizes) - 1])
+    for parameter, gradient in zip(parameters, own.split(sizes), strict=True):
         parameter.grad = gradient.view_as(parameter)
     torch.nn.utils.clip_grad_norm_(parameters, options.clip)
     for group in state.optimizer.param_groups:
@@ -235,16 +255,17 @@ def _step(state: TrainingState, streams: ExampleStreams, run: TrainingRun, step:
     with torch.no_grad():
         for _, parameter, smooth in state.pairs():
             smooth.lerp_(parameter, 1 - share)
-    return mean[-1].cpu()
+    return loss[0].cpu(), float(apart.norm() / own.norm().clamp_min(1e-30)) if shares else 0.0
 
 
-def _loss(networks: Networks, example: Example, run: TrainingRun, step: int, rng: np.random.Generator) -> Tensor:
+def _loss(networks: Networks, example: Example, run: TrainingRun, step: int, rng: np.random.Generator) -> WindowLoss:
     """Compute the loss of a random crop or window of an example."""
     options = run.options
     if step < options.photo_step:
         crop = sample_crop(example, options.levels, options.crop, options.inner, rng)
-        corrections = predict(crop, networks, options, step).corrections
-        return correction_loss(*scaled_corrections(crop, corrections, run.scales, options), options)
+        prediction = predict(crop, networks, options, step)
+        loss = correction_loss(*scaled_corrections(crop, prediction, run.scales, options), options)
+        return WindowLoss(loss, torch.zeros(()))
     views = draw_views(example, options, rng)
     window = sample_window(views, options.levels, options.window, options.most, options.novel, rng)
     return window_loss(networks, window, run.scales, options, step, rng)

@@ -8,7 +8,7 @@ early training near the moments of the groups, which are the paper's teacher, an
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from itertools import permutations, product
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -22,11 +22,12 @@ from gsmerge.networks.tensors import gaussian_sizes, quat_to_rotmat
 from gsmerge.render.autograd import render_tensors
 from gsmerge.render.photos import NEAR
 from gsmerge.research.training.perceptual import lpips_loss
-from gsmerge.research.training.predict import Prediction, analytic_gaussians, crop_targets, predict
-from gsmerge.research.training.targets import Targets
+from gsmerge.research.training.predict import Prediction, analytic_gaussians, crop_targets, match_crop, predict
+from gsmerge.research.training.targets import Targets, corrections_between, nearest_axes
 from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.research.training.windows import Crop, Window
 from gsmerge.stages.fit.loss import loss_ssim
+from gsmerge.stages.merge import take
 from gsmerge.types import Gaussians
 
 MAX_DEVIATIONS = 4.0  # standard deviations that targets are clamped to
@@ -45,14 +46,17 @@ def target_scales(every: Iterable[Mapping[int, Targets]]) -> dict[int, Tensor]:
 
 
 def scaled_corrections(
-    crop: Crop, corrections: Tensor, scales: Mapping[int, Tensor], options: TrainOptions
+    crop: Crop, prediction: Prediction, scales: Mapping[int, Tensor], options: TrainOptions
 ) -> tuple[Tensor, Tensor]:
     """Compute corrections and targets of the scored children, both ``[j,13]``, in standard deviations of the targets.
 
-    Targets are clamped to the bounds of the networks, and to a few standard deviations.
+    Corrections are those of all stages together, from the analytic children. Targets are clamped to the bounds of the
+    networks, and to a few standard deviations.
     """
     targets, scored = crop_targets(crop)
-    limits = 2 * torch.from_numpy(residual_limits(options.network.bounds))  # of all stages together
+    analytic = analytic_gaussians(crop, prediction.matches).to("cpu")
+    corrections = corrections_between(analytic, prediction.gaussians, prediction.frames)
+    limits = 2 * torch.from_numpy(residual_limits(options.network.bounds))[:RESIDUAL]  # of all stages together
     clamped = targets[scored].clamp(-limits, limits) / scales[crop.k]
     return corrections[scored] / scales[crop.k], clamped.clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS)
 
@@ -65,6 +69,14 @@ def correction_loss(corrections: Tensor, targets: Tensor, options: TrainOptions)
     return losses.sum() / (weights.sum() * max(1, len(targets)))
 
 
+@dataclass(frozen=True, eq=False)
+class WindowLoss:
+    """The loss of a window, and the part of it that holds siblings apart, each with its weight."""
+
+    total: Tensor
+    diversity: Tensor
+
+
 def window_loss(
     networks: Networks,
     window: Window,
@@ -72,7 +84,7 @@ def window_loss(
     options: TrainOptions,
     step: int,
     rng: np.random.Generator,
-) -> Tensor:
+) -> WindowLoss:
     """Compute the loss of a window of a photo: its render on a random background, and the regularizers.
 
     ``scales`` are the standard deviations of the targets of each K, see :func:`target_scales`.
@@ -83,13 +95,15 @@ def window_loss(
     loss = photometric_loss(image, window, options, step)
     regression, teacher, diversity = options.regularizer_weights(step)
     if regression:
-        scaled = scaled_corrections(crop, prediction.corrections, scales, options)
+        scaled = scaled_corrections(crop, prediction, scales, options)
         loss = loss + regression * correction_loss(*scaled, options)
     if teacher:
         loss = loss + teacher * teacher_loss(prediction, crop.example.members)
+    apart = torch.zeros(())
     if diversity and crop.k > 1:
-        loss = loss + diversity * diversity_loss(prediction.gaussians, prediction.parents, crop.example.unit)
-    return loss
+        unit = crop.example.unit if options.diversity_unit == "scene" else None
+        apart = diversity * diversity_loss(prediction.gaussians, prediction.parents, prediction.sizes, unit)
+    return WindowLoss(loss + apart, apart)
 
 
 MAX_DB = 100.0  # PSNR of windows without an error
@@ -132,7 +146,9 @@ def render_window(window: Window, networks: Networks | None, options: TrainOptio
     """
     with torch.no_grad():
         if networks is None:
-            gaussians, matched = analytic_gaussians(window.crop, options).to("cpu"), 0.0
+            features = take(window.crop.example.features, window.crop.rows)
+            matches = match_crop(window.crop, features, options)
+            gaussians, matched = analytic_gaussians(window.crop, matches).to("cpu"), 0.0
         else:
             prediction = predict(window.crop, networks, options, 0)
             gaussians, matched = prediction.gaussians, prediction.matched
@@ -158,43 +174,40 @@ def teacher_loss(prediction: Prediction, members: Members) -> Tensor:
         return g.means.new_zeros(())
     moments = pool_members(members, merged.starts, merged.members, "paper")
     scales, quats = (torch.from_numpy(axes).float()[prediction.parents] for axes in principal_axes(moments.covars))
-    scales, turns = _nearest_axes(scales, quats, g.quats)
+    orders = nearest_axes(quats, g.quats)
+    scales = (scales[:, None] @ orders.abs())[:, 0]
+    turns = _turn_angles(quat_to_rotmat(g.quats).transpose(1, 2) @ quat_to_rotmat(quats) @ orders)
     sizes = gaussian_sizes(scales)
     means = torch.from_numpy(moments.means).float()[prediction.parents]
     distances = (g.means - means).abs() / sizes[:, None]
     return turns.mean() + distances.mean() + (torch.log(g.scales) - torch.log(scales)).abs().mean()
 
 
-def _nearest_axes(scales: Tensor, quats: Tensor, predicted: Tensor) -> tuple[Tensor, Tensor]:
-    """Order axes by nearness to predicted rotations ``[n,4]``, and return scales ``[n,3]`` and the angles ``[n]``."""
-    signed = torch.stack([torch.diag(torch.tensor(signs)) for signs in product((1.0, -1.0), repeat=3)])
-    orders = torch.stack([torch.eye(3)[list(order)] for order in permutations(range(3))])
-    proper = (signed[:, None] @ orders).reshape(-1, 3, 3)
-    proper = proper[torch.linalg.det(proper) > 0]  # [24,3,3]
-    between = quat_to_rotmat(predicted).transpose(1, 2) @ quat_to_rotmat(quats)
-    best = torch.einsum("nij,pji->np", between.detach(), proper).argmax(1)
-    chosen = proper[best]
-    turn = between @ chosen
-    skew = torch.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], 1)
-    cosine = (turn.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
-    sine = (skew.square().sum(1) / 4 + 1e-12).sqrt()  # has a gradient at no angle too
-    return (scales[:, None] @ chosen.abs())[:, 0], torch.atan2(sine, cosine)
+def _turn_angles(turns: Tensor) -> Tensor:
+    """Compute the angles ``[n]`` of rotations ``[n,3,3]``, with a gradient at no angle, too."""
+    skew = torch.stack(
+        [turns[:, 2, 1] - turns[:, 1, 2], turns[:, 0, 2] - turns[:, 2, 0], turns[:, 1, 0] - turns[:, 0, 1]], 1
+    )
+    cosines = (turns.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
+    return torch.atan2((skew.square().sum(1) / 4 + 1e-12).sqrt(), cosines)
 
 
 GOAL = 0.5  # overlap of the boxes of two children that has no loss
 GEOMETRY, OPACITY = 0.75, 0.25  # weights of the two terms of the diversification
 
 
-def diversity_loss(gaussians: Gaussians, parents: Tensor, unit: float) -> Tensor:
+def diversity_loss(gaussians: Gaussians, parents: Tensor, sizes: Tensor, unit: float | None = None) -> Tensor:
     """Penalise siblings that overlap too much or too little, or differ in opacity (paper supplement D).
 
-    ``parents [n]`` are those of n children, ascending. Pairs are weighted by their volumes in the scene's ``unit`` of
-    length, so that the loss does not depend on the scale of the world.
+    ``parents [n]`` are those of n children, ascending. Pairs are weighted by their volumes, in the paper in the world's
+    units; in a scene's ``unit`` of length, those of a million small Gaussians leave nothing of the loss. None: in the
+    ``sizes [n]`` of their groups, which start near 1, and without a gradient: small siblings are no goal.
     """
     one, other = sibling_pairs(parents)
     if len(one) == 0:
         return gaussians.means.new_zeros(())
-    volumes = (gaussians.scales / unit).prod(1)
+    scales = gaussians.scales.detach() / sizes.detach()[:, None] if unit is None else gaussians.scales / unit
+    volumes = scales.prod(1)
     weights = (volumes[one] * volumes[other]).clamp_min(1e-30).sqrt()
     profile = overlap_profile(gaussians, one, other)
     opacity = (gaussians.opacities[one] - gaussians.opacities[other]).square()

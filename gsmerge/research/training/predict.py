@@ -1,25 +1,75 @@
-"""Predictions of all networks for crops of examples, with gradients: the sum of the corrections of all stages."""
+"""Predictions of all networks for crops of examples, with gradients through every stage."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gsmerge.networks.apply import NetworkContext, prepare_children, run_encoder, run_heads, run_merger, run_refiner
-from gsmerge.networks.corrections import MEAN
+from gsmerge.moments import Members
+from gsmerge.networks.apply import (
+    NetworkContext,
+    encode_features,
+    merge_features,
+    prepare_children,
+    refine_features,
+    run_heads,
+)
 from gsmerge.networks.modules import Networks
-from gsmerge.networks.tensors import move_tensors, rotate_vectors
+from gsmerge.networks.options import PART
+from gsmerge.networks.tensors import move_tensors
 from gsmerge.networks.tokens import GroupFeatures
-from gsmerge.research.training.targets import corrections_between
+from gsmerge.research.training.geometry import (
+    differentiate_base,
+    differentiate_groups,
+    differentiate_tokens,
+    features_to_arrays,
+    features_to_tensors,
+    make_round_tensors,
+    move_feature_tensors,
+    pool_tensors,
+)
 from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.research.training.windows import Crop
 from gsmerge.stages.decode import divide
 from gsmerge.stages.match import match
-from gsmerge.stages.merge import cluster_runs, merge, pool_runs, take
-from gsmerge.types import FeatureGaussians, Gaussians, Matches, as_tensor
+from gsmerge.stages.merge import cluster_runs, merge, take
+from gsmerge.types import Array, FeatureGaussians, Gaussians, Matches, as_array, as_tensor
+
+
+class TrainingContext(NetworkContext):
+    """The networks and their inputs, with the stages' formulas on tensors."""
+
+    def make_base(self, features: FeatureGaussians) -> Gaussians:
+        """Decode every Feature Gaussian into one Gaussian of tensors."""
+        return differentiate_base(features)
+
+    def describe(self, features: FeatureGaussians) -> GroupFeatures:
+        """Compute the networks' inputs as tensors."""
+        known = super().describe(features_to_arrays(features))
+        return differentiate_groups(features, known, np.asarray(self.cameras.viewmats))
+
+    def make_tokens(
+        self,
+        parts: Gaussians | Members,
+        ids: np.ndarray,
+        owners: np.ndarray,
+        group_features: GroupFeatures,
+        columns: int = PART,
+    ) -> Array:
+        """Describe Gaussians as tensors; members as arrays, since no network comes before the encoder."""
+        if isinstance(parts, Gaussians):
+            return differentiate_tokens(parts, ids, owners, group_features)
+        g = group_features
+        base = Gaussians(*map(as_array, vars(g.base).values()))
+        arrays = replace(g, base=base, frames=as_array(g.frames), sizes=as_array(g.sizes))
+        return super().make_tokens(parts, ids, owners, arrays, columns)
+
+    def correct_features(self, group_features: GroupFeatures, residuals: Array) -> FeatureGaussians:
+        """Apply corrections ``[g,14]`` to Feature Gaussians of tensors."""
+        return move_feature_tensors(group_features, residuals)
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,59 +78,77 @@ class Prediction:
 
     gaussians: Gaussians  # n corrected children, tensors with gradients
     parents: Tensor  # [n] int64, the merged Feature Gaussian of each, ascending
-    merged: FeatureGaussians  # the crop's, merged and refined
-    corrections: Tensor  # [n,13] of all stages together, from the analytic children as the targets
+    merged: FeatureGaussians  # the crop's, merged and refined, without gradients
+    frames: Tensor  # [n,3,3] axes of each one's group as columns, world
+    sizes: Tensor  # [n] size of each one's group, world units
+    matches: Matches  # the crop's clusters
     matched: float  # share of the crop's Feature Gaussians that were merged with others
 
 
 def predict(crop: Crop, networks: Networks, options: TrainOptions, seed: int) -> Prediction:
-    """Run a crop through all networks.
+    """Run a crop through all networks; each stage reads the results of those before it, and passes gradients on.
 
-    Each stage reads the results of those before it; gradients go through the latents and the corrections. At K = 1 the
-    corrections of all stages add up; the children of a larger K are pooled again from the members, so the stages before
-    their head reach them through the latent alone.
-
-    The Gaussians of K = 1 are the results of the stages, one after the other; their gradient is that of the sum.
+    Analytic children of K > 1 are pooled again from the members, so earlier stages reach those of residual heads
+    through what the heads read alone.
     """
     example = crop.example
-    context = NetworkContext(networks, example.members, example.cameras, seed)
-    parts = take(example.features, crop.rows)
-    group_features = context.describe(parts)
-    encoded, shifts = run_encoder(group_features, context)
-    matches = match_crop(crop, encoded, options, context)
-    merged, before = _merged(encoded, group_features, as_tensor(shifts), matches, context)
-    refined, residuals = run_refiner(context.describe(merged), context)
-    group_features = context.describe(refined)
-    children, parents = divide(refined, example.members, np.full(len(refined), crop.k))
-    children = prepare_children(children, parents, group_features, networks.options)
-    heads = as_tensor(run_heads(children, parents, group_features, context))
-    before = before + as_tensor(residuals) if crop.k == 1 else torch.zeros_like(heads)
-    last = heads + (before - before.detach())  # adds the gradient of earlier corrections, which the base has already
-    frames = torch.from_numpy(group_features.frames[parents])
-    gaussians, corrections = move_tensors(children.to("cpu"), last, frames), before + heads
-    if example.targets and networks.options.outputs == "absolute":
-        analytic, _ = divide(merge(parts, matches), example.members, np.full(len(refined), crop.k))
-        corrections = corrections_between(analytic.to("cpu"), gaussians, frames)
-    sizes = np.bincount(matches.clusters, minlength=matches.count)
-    matched = float(sizes[sizes > 1].sum()) / max(1, len(matches.clusters))
-    return Prediction(gaussians, torch.from_numpy(parents), refined, corrections, matched)
+    context = TrainingContext(networks, example.members, example.cameras, seed)
+    encoded = encode_features(features_to_tensors(take(example.features, crop.rows)), context)
+    encoded = replace(encoded, latents=as_tensor(encoded.latents))
+    matches = match_crop(crop, features_to_arrays(encoded), options, networks, seed)
+    refined = refine_features(_merge(encoded, matches, context), context)
+    group_features, arrays = context.describe(refined), features_to_arrays(refined)
+    children, parents = _make_children(crop, arrays, group_features, networks)
+    corrections = as_tensor(run_heads(children, parents, group_features, context))
+    own = torch.from_numpy(parents)
+    frames, sizes = group_features.frames[own], group_features.sizes[own]
+    gaussians = move_tensors(children, corrections, frames)
+    counts = np.bincount(matches.clusters, minlength=matches.count)
+    matched = float(counts[counts > 1].sum()) / max(1, len(matches.clusters))
+    return Prediction(gaussians, own, arrays, frames, sizes, matches, matched)
 
 
-def analytic_gaussians(crop: Crop, options: TrainOptions) -> Gaussians:
+def _merge(encoded: FeatureGaussians, matches: Matches, context: TrainingContext) -> FeatureGaussians:
+    """Merge Feature Gaussians of tensors as :func:`gsmerge.stages.merge.merge` does."""
+    alone, order, cuts = cluster_runs(matches)
+    if len(order) == 0:
+        return encoded
+    pooled = merge_features(pool_tensors(encoded, order, cuts), encoded, order, cuts, context)
+    return FeatureGaussians.concat([take(encoded, alone), pooled])
+
+
+def _make_children(
+    crop: Crop, arrays: FeatureGaussians, group_features: GroupFeatures, networks: Networks
+) -> tuple[Gaussians, np.ndarray]:
+    """Make the Gaussians that the heads correct, tensors, and the rising row ``[n]`` of the group of each."""
+    if networks.options.outputs == "residual" and crop.k == 1:
+        return group_features.base, np.arange(len(arrays))
+    children, parents = divide(arrays, crop.example.members, np.full(len(arrays), crop.k))
+    if networks.options.outputs == "residual":
+        return children.to("cpu"), parents
+    frames, sizes = as_array(group_features.frames), as_array(group_features.sizes)
+    base = Gaussians(*map(as_array, vars(group_features.base).values()))
+    known = replace(group_features, base=base, frames=frames, sizes=sizes)
+    round_ones = prepare_children(children, parents, known, networks.options)
+    return make_round_tensors(parents, group_features, round_ones), parents
+
+
+def analytic_gaussians(crop: Crop, matches: Matches) -> Gaussians:
     """Decode a crop's children without networks."""
-    parts = take(crop.example.features, crop.rows)
-    merged = merge(parts, match_crop(crop, parts, options))
+    merged = merge(take(crop.example.features, crop.rows), matches)
     return divide(merged, crop.example.members, np.full(len(merged), crop.k))[0]
 
 
 def match_crop(
-    crop: Crop, parts: FeatureGaussians, options: TrainOptions, context: NetworkContext | None = None
+    crop: Crop, parts: FeatureGaussians, options: TrainOptions, networks: Networks | None = None, seed: int = 0
 ) -> Matches:
     """Match the r Feature Gaussians ``parts`` of a crop, unless its clusters were fitted and so are known."""
     known = crop.example.matches
     if known is not None:
         ids, local = np.unique(known.clusters[crop.rows], return_inverse=True)
         return Matches(local, len(ids))
+    example = crop.example
+    context = None if networks is None else NetworkContext(networks, example.members, example.cameras, seed)
     with torch.no_grad():
         return match(parts, options.match_options(), context)
 
@@ -106,27 +174,3 @@ def merged_rows(matches: Matches) -> np.ndarray:
     first[cuts] = 1
     rows[order] = len(alone) + first.cumsum() - 1
     return rows
-
-
-def _merged(
-    parts: FeatureGaussians, group_features: GroupFeatures, shifts: Tensor, matches: Matches, context: NetworkContext
-) -> tuple[FeatureGaussians, Tensor]:
-    """Merge Feature Gaussians, and return them with the corrections of each by encoder and merger."""
-    alone, order, cuts = cluster_runs(matches)
-    if len(order) == 0:
-        return parts, shifts
-    pooled = pool_runs(parts, order, cuts)
-    of_pooled = context.describe(pooled)
-    frames, sizes = torch.from_numpy(group_features.frames), torch.from_numpy(group_features.sizes)
-    moved = rotate_vectors(frames, shifts[:, MEAN] * sizes[:, None])[order]
-    run = torch.from_numpy(np.repeat(np.arange(len(cuts)), np.diff(np.append(cuts, len(order)))))
-    weights = torch.from_numpy(parts.weights[order])
-    share = weights / torch.zeros(len(cuts)).index_add(0, run, weights)[run].clamp_min(1e-12)
-    world = torch.zeros(len(cuts), 3).index_add(0, run, share[:, None] * moved)
-    back, sizes = torch.from_numpy(of_pooled.frames).transpose(1, 2), torch.from_numpy(of_pooled.sizes)
-    local = rotate_vectors(back, world) / sizes[:, None]
-    pooled, raw = run_merger(of_pooled, parts, order, cuts, context)
-    residuals = as_tensor(raw)
-    from_encoder = torch.cat([local, torch.zeros(len(cuts), residuals.shape[1] - 3)], 1)
-    merged = FeatureGaussians.concat([take(parts, alone), pooled])
-    return merged, torch.cat([shifts[alone], residuals + from_encoder])

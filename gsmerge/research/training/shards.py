@@ -32,7 +32,7 @@ from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches
 
 Report = Callable[[str, int, int], None]  # what is done, step, steps
-LAYOUT = 4  # version of the files and of what is in them
+LAYOUT = 5  # version of the files and of what is in them
 FORMAT = "gsmerge-example"
 REMEDY = "remove it; the next call makes it again"
 # Settings that an example depends on; fit_steps and levels only with a fit.

@@ -8,15 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import permutations, product
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from gsmerge.errors import SceneError
-from gsmerge.networks.corrections import COLOR, LOGIT, MEAN, ROTATION, SIZE
 from gsmerge.networks.options import RESIDUAL
-from gsmerge.networks.tensors import gaussian_sizes, quat_to_rotmat
+from gsmerge.networks.tensors import gaussian_sizes, quat_to_rotmat, rotate_vectors
 from gsmerge.networks.tokens import compute_group_features
 from gsmerge.render.photos import Photos
 from gsmerge.research.training.scenes import TrainingScene, coverage, covered_pixels, reduced_masks
@@ -91,22 +91,42 @@ def _fit_level(
 
 
 def corrections_between(start: Gaussians, end: Gaussians, frames: Tensor) -> Tensor:
-    """Compute the corrections ``[n,13]`` in frames ``[n,3,3]`` that turn ``start`` into ``end``, all tensors."""
+    """Compute the corrections ``[n,13]`` in frames ``[n,3,3]`` that turn ``start`` into ``end``, all tensors.
+
+    Of the equal pairs of rotation and scales of ``end``, the one nearest to ``start`` counts.
+    """
     back, sizes = frames.transpose(1, 2), gaussian_sizes(start.scales).clamp_min(1e-12)
-    residuals = torch.zeros(len(start), RESIDUAL)
-    residuals[:, MEAN] = (back @ (end.means - start.means)[:, :, None])[:, :, 0] / sizes[:, None]
-    residuals[:, SIZE] = torch.log(end.scales.clamp_min(1e-12) / start.scales.clamp_min(1e-12))
-    rotations = quat_to_rotmat(end.quats) @ quat_to_rotmat(start.quats).transpose(1, 2)
-    residuals[:, ROTATION] = (back @ rotation_vectors(rotations)[:, :, None])[:, :, 0]
-    ends = [torch.logit(g.opacities.clamp(0.004, 0.999)) for g in (start, end)]  # clamped as in the fit
-    residuals[:, LOGIT] = ends[1] - ends[0]
-    residuals[:, COLOR] = SH_C0 * (end.sh0 - start.sh0)[:, 0]
-    return residuals.nan_to_num()
+    orders = nearest_axes(end.quats, start.quats)
+    scales = (end.scales[:, None] @ orders.abs())[:, 0]
+    rotations = quat_to_rotmat(end.quats) @ orders @ quat_to_rotmat(start.quats).transpose(1, 2)
+    logits = [torch.logit(g.opacities.clamp(0.004, 0.999)) for g in (start, end)]  # clamped as in the fit
+    columns = [  # in the order of gsmerge.networks.corrections
+        rotate_vectors(back, end.means - start.means) / sizes[:, None],
+        torch.log(scales.clamp_min(1e-12) / start.scales.clamp_min(1e-12)),
+        rotate_vectors(back, rotation_vectors(rotations)),
+        (logits[1] - logits[0])[:, None],
+        SH_C0 * (end.sh0 - start.sh0)[:, 0],
+    ]
+    return torch.cat(columns, 1).nan_to_num()
+
+
+def nearest_axes(quats: Tensor, reference: Tensor) -> Tensor:
+    """Return the order and signs ``[n,3,3]`` of the axes of ``quats [n,4]`` that are nearest to those of a reference.
+
+    A Gaussian has 24 equal pairs of rotation and scales: rotations times the result, and scales in that order.
+    """
+    signed = torch.stack([torch.diag(torch.tensor(signs)) for signs in product((1.0, -1.0), repeat=3)])
+    orders = torch.stack([torch.eye(3)[list(order)] for order in permutations(range(3))])
+    proper = (signed[:, None] @ orders).reshape(-1, 3, 3)
+    proper = proper[torch.linalg.det(proper) > 0]  # [24,3,3]
+    with torch.no_grad():
+        between = quat_to_rotmat(reference).transpose(1, 2) @ quat_to_rotmat(quats)
+        return proper[torch.einsum("nij,pji->np", between, proper).argmax(1)]
 
 
 def rotation_vectors(rotations: Tensor) -> Tensor:
     """Convert rotations ``[n,3,3]`` well below half a turn to rotation vectors ``[n,3]``."""
     skew = rotations - rotations.transpose(1, 2)
     axis = torch.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], 1) / 2
-    sine, cosine = axis.norm(dim=1), (rotations.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
+    sine, cosine = (axis.square().sum(1) + 1e-14).sqrt(), (rotations.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
     return axis * (torch.atan2(sine, cosine) / sine.clamp_min(1e-12))[:, None]

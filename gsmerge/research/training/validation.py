@@ -80,7 +80,7 @@ def _score(networks: Networks, shards: Sequence[Shard], number: int, run: Traini
     def score_crop(crop: Crop) -> tuple[float, Tensor, Tensor]:
         with torch.no_grad():
             prediction = predict(crop, networks, options, 0)
-            corrections, targets = scaled_corrections(crop, prediction.corrections, run.scales, options)
+            corrections, targets = scaled_corrections(crop, prediction, run.scales, options)
             loss = float(correction_loss(corrections, targets, options))
             return loss, (corrections - targets).square().sum(0), targets.square().sum(0)
 

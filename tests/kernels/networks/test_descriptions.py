@@ -12,7 +12,7 @@ from network_fixtures import Made, made
 from gsmerge.geometry import quat_to_rotmat
 from gsmerge.moments import feature_to_gaussians
 from gsmerge.networks.corrections import move_features, move_gaussians
-from gsmerge.networks.options import MEMBER, PART, RESIDUAL
+from gsmerge.networks.options import FEATURE, MEMBER, PART, RESIDUAL
 from gsmerge.networks.tokens import GroupFeatures, compute_group_features, contiguous, part_tokens
 from gsmerge.stages.merge import take
 from gsmerge.types import SH_C0, Gaussians
@@ -150,14 +150,14 @@ def test_ids_outside_are_refused(some: Made) -> None:
 
 def test_corrections_have_the_same_bits(some: Made, each_target: Each) -> None:
     features = described(some)
-    residuals = np.random.default_rng(0).normal(size=(len(some.features), RESIDUAL)).astype(np.float32)
+    residuals = np.random.default_rng(0).normal(size=(len(some.features), FEATURE)).astype(np.float32)
     residuals[::7] *= 30
     residuals[3] = np.nan
     own = np.arange(len(residuals))
 
     def run() -> list[np.ndarray]:
         moved = move_features(some.features, features.base, residuals, features.frames)
-        gaussians = move_gaussians(features.base, residuals, own, features.frames)
+        gaussians = move_gaussians(features.base, residuals[:, :RESIDUAL].copy(), own, features.frames)
         return [moved.means, moved.covars, moved.masses, moved.extinctions, *vars(gaussians).values()]
 
     with np.errstate(all="ignore"):

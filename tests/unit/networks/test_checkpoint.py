@@ -30,7 +30,7 @@ DAMAGED: dict[str, Spoil] = {
     **UNREADABLE,
     "a torch file": lambda path: torch.save({"a": torch.ones(2)}, path),
     "another program's": with_text("{}", "networks"),
-    "another schema": with_header(schema=2),
+    "another schema": with_header(schema=1),
     "no version": with_header(gsmerge=None),
     "no options": with_header(options=None),
     "unknown options": with_header(options={"depth": 3}),

@@ -15,6 +15,7 @@ from gsmerge.networks import tensors
 from gsmerge.networks.corrections import (
     COLOR,
     LOGIT,
+    MASS,
     MEAN,
     ROTATION,
     SIZE,
@@ -22,7 +23,7 @@ from gsmerge.networks.corrections import (
     move_gaussians,
     residual_limits,
 )
-from gsmerge.networks.options import RESIDUAL, Bounds
+from gsmerge.networks.options import FEATURE, RESIDUAL, Bounds
 from gsmerge.types import SH_C0, FeatureGaussians, Gaussians
 
 EACH = np.arange(20)  # its own group
@@ -37,6 +38,11 @@ def some(count: int = 20) -> FeatureGaussians:
     return replace(features, covars=covars, extinctions=-math.log(0.4) * scales[:, 1] * scales[:, 2])
 
 
+def move(gaussians: Gaussians, residuals: np.ndarray, owners: np.ndarray, axes: np.ndarray) -> Gaussians:
+    """Move Gaussians by the corrections of Feature Gaussians, without their last column."""
+    return move_gaussians(gaussians, residuals[:, :RESIDUAL].copy(), owners, axes)
+
+
 def base_of(features: FeatureGaussians) -> Gaussians:
     """The Gaussian of each, in C order."""
     return Gaussians(*(np.ascontiguousarray(column) for column in vars(feature_to_gaussians(features)).values()))
@@ -47,18 +53,18 @@ def frames(count: int = 20, seed: int = 1) -> np.ndarray:
 
 
 def noise(count: int = 20, seed: int = 5) -> np.ndarray:
-    return 0.3 * np.random.default_rng(seed).normal(size=(count, RESIDUAL)).astype(np.float32)
+    return 0.3 * np.random.default_rng(seed).normal(size=(count, FEATURE)).astype(np.float32)
 
 
 def zeros() -> np.ndarray:
-    return np.zeros((20, RESIDUAL), np.float32)
+    return np.zeros((20, FEATURE), np.float32)
 
 
 def test_zero_changes_no_bit() -> None:
     features = some()
     base = base_of(features)
     for before, after in (
-        (base, move_gaussians(base, zeros(), EACH, frames())),
+        (base, move(base, zeros(), EACH, frames())),
         (features, move_features(features, base, zeros(), frames())),
     ):
         for f in fields(before):
@@ -71,7 +77,7 @@ def test_any_number_of_rows_at_once_gives_the_same_bits(rows: int, monkeypatch: 
 
     def moved() -> list[Gaussians | FeatureGaussians]:
         own = EACH[::-1].copy()
-        return [move_features(features, base, noise(), frames()), move_gaussians(base, noise(), own, frames())]
+        return [move_features(features, base, noise(), frames()), move(base, noise(), own, frames())]
 
     whole = moved()
     monkeypatch.setattr("gsmerge.networks.corrections.ROWS", rows)
@@ -80,14 +86,14 @@ def test_any_number_of_rows_at_once_gives_the_same_bits(rows: int, monkeypatch: 
             assert np.array_equal(getattr(one, f.name), getattr(other, f.name)), f.name
     none = make_features(np.zeros((0, 3)))
     assert len(move_features(none, base_of(none), noise()[:0], frames()[:0])) == 0
-    assert len(move_gaussians(base[:0], noise()[:0], EACH[:0], frames())) == 0
+    assert len(move(base[:0], noise()[:0], EACH[:0], frames())) == 0
 
 
 def test_gaussians_move_as_told() -> None:
     base, residuals = base_of(some()), zeros()
     residuals[:, MEAN], residuals[:, SIZE] = [1.0, 0, 0], [0.1, 0.2, -0.3]
     residuals[:, LOGIT], residuals[:, COLOR] = 0.7, [0.1, -0.1, 0.2]
-    moved = move_gaussians(base, residuals, EACH, frames())
+    moved = move(base, residuals, EACH, frames())
     sizes = np.sqrt(np.sort(base.scales, 1)[:, 1:].prod(1))
     np.testing.assert_allclose(moved.means, base.means + frames()[:, :, 0] * sizes[:, None], atol=1e-6)
     np.testing.assert_allclose(np.log(moved.scales) - np.log(base.scales), residuals[:, SIZE], atol=1e-5)
@@ -99,7 +105,7 @@ def test_gaussians_move_as_told() -> None:
 def test_tensors_move_in_the_same_way() -> None:
     """Training's Gaussians, through which gradients flow, are those of use."""
     base, own = base_of(some()), np.random.default_rng(2).integers(0, 20, 20)
-    actual = move_gaussians(base, noise(), own, frames())
+    actual = move(base, noise(), own, frames())
     expected = tensors.move_tensors(base.to("cpu"), torch.from_numpy(noise()), torch.from_numpy(frames()[own])).numpy()
     for f in fields(actual):
         one, other = getattr(actual, f.name), getattr(expected, f.name)
@@ -112,7 +118,7 @@ def test_opacities_at_the_ends_stay_within_them(opacity: float) -> None:
     for logit in (-3.0, 3.0):
         residuals = zeros()
         residuals[:, LOGIT] = logit
-        moved = move_gaussians(base, residuals, EACH, frames()).opacities
+        moved = move(base, residuals, EACH, frames()).opacities
         assert ((moved >= 0) & (moved <= 1)).all()
 
 
@@ -121,13 +127,13 @@ def test_rotations_agree_with_each_other() -> None:
     features, residuals = some(), zeros()
     residuals[:, ROTATION] = 3 * np.random.default_rng(3).normal(size=(20, 3))
     base = base_of(features)
-    turned, one = move_features(features, base, residuals, frames()), move_gaussians(base, residuals, EACH, frames())
+    turned, one = move_features(features, base, residuals, frames()), move(base, residuals, EACH, frames())
     np.testing.assert_allclose(turned.covars, covariances(one.quats, one.scales), atol=1e-4, rtol=1e-4)
     quarter = zeros()
     quarter[:, ROTATION] = [0, 0, np.pi / 2]
     same = np.tile(np.eye(3, dtype=np.float32), (20, 1, 1))
     round_ones = replace(base, quats=np.tile(np.float32([1, 0, 0, 0]), (20, 1)))
-    quats = move_gaussians(round_ones, quarter, EACH, same).quats
+    quats = move(round_ones, quarter, EACH, same).quats
     np.testing.assert_allclose(geometry.quat_to_rotmat(quats) @ [1.0, 0, 0], [[0.0, 1, 0]] * 20, atol=1e-6)
     np.testing.assert_allclose(
         tensors.quat_to_rotmat(torch.from_numpy(quats)), geometry.quat_to_rotmat(quats), atol=1e-6
@@ -141,7 +147,7 @@ def test_feature_gaussians_move_like_gaussians() -> None:
     residuals[:, LOGIT] = 0
     residuals[:, SIZE] = np.sort(residuals[:, SIZE], 1) * 0.1  # scales still rise
     moved = move_features(features, base, residuals, frames())
-    one = move_gaussians(base, residuals, EACH, frames())
+    one = move(base, residuals, EACH, frames())
     np.testing.assert_allclose(moved.means, one.means, atol=1e-5, rtol=1e-5)
     np.testing.assert_allclose(moved.covars, covariances(one.quats, one.scales), atol=1e-4, rtol=1e-4)
     decoded = base_of(moved)
@@ -150,8 +156,11 @@ def test_feature_gaussians_move_like_gaussians() -> None:
     residuals[:, LOGIT] = np.log(2)
     doubled = base_of(move_features(features, base, residuals, frames()))
     np.testing.assert_allclose(doubled.opacities, 1 - (1 - base.opacities) ** 2, atol=1e-4)
+    residuals[:, MASS] = np.log(3)
+    heavier = move_features(features, base, residuals, frames())
+    np.testing.assert_allclose(heavier.masses, 6 * features.masses, rtol=1e-5)
 
 
 def test_limits_are_those_of_the_bounds() -> None:
     limits = residual_limits(Bounds(mean=0.5, turn=0.2))
-    assert limits.tolist() == np.float32([0.5] * 3 + [1.1] * 3 + [0.2] * 3 + [3.0] + [0.25] * 3).tolist()
+    assert limits.tolist() == np.float32([0.5] * 3 + [1.1] * 3 + [0.2] * 3 + [3.0] + [0.25] * 3 + [3.0]).tolist()

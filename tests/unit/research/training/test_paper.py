@@ -23,7 +23,7 @@ from gsmerge.research.training.losses import teacher_loss, window_loss
 from gsmerge.research.training.predict import Prediction, match_crop, predict
 from gsmerge.research.training.windows import Window, sample_window, whole_photo
 from gsmerge.stages.merge import merge
-from gsmerge.types import Gaussians
+from gsmerge.types import Gaussians, Matches
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -105,7 +105,7 @@ def test_every_network_gets_a_gradient(example: Example) -> None:
     networks = noisy(replace(TINY, outputs="absolute")).requires_grad_(True)
     sums: Counter[str] = Counter()
     for window in windows(example, 12):
-        loss = window_loss(networks, window, {}, PAPER, 0, np.random.default_rng(0))
+        loss = window_loss(networks, window, {}, PAPER, 0, np.random.default_rng(0)).total
         names, parameters = zip(*networks.named_parameters(), strict=True)
         for name, part in zip(names, torch.autograd.grad(loss, parameters, allow_unused=True), strict=True):
             if part is not None:
@@ -128,7 +128,7 @@ def test_training_moves_every_layer_of_the_merger(example: Example, tmp_path: Pa
     assert np.abs(after.arrays["merger.out.weight"]).max() > 1e-4
     assert done.validation_loss is None
     header = (tmp_path / "run" / "losses.csv").read_text().splitlines()[0]
-    assert header == "step,rate,loss,psnr_analytic,psnr_learned,matched"
+    assert header == "step,rate,loss,diversity_share,psnr_analytic,psnr_learned,matched"
 
 
 def teacher_of(example: Example) -> Prediction:
@@ -151,7 +151,8 @@ def teacher_of(example: Example) -> Prediction:
         *(torch.from_numpy(column).float() for column in columns),
         torch.full((count,), 0.5), torch.zeros(count, 1, 3), torch.zeros(count, 0, 3),
     )  # fmt: skip
-    return Prediction(gaussians, torch.arange(count), merged, torch.zeros(count, 13), 0.0)
+    frames, sizes = torch.eye(3).expand(count, 3, 3), torch.ones(count)
+    return Prediction(gaussians, torch.arange(count), merged, frames, sizes, Matches(np.arange(count), count), 0.0)
 
 
 def test_the_teacher_is_the_paper_s_two_equations(example: Example) -> None:

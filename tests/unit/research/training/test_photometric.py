@@ -31,7 +31,7 @@ from gsmerge.research.training.losses import (
     window_psnr,
 )
 from gsmerge.research.training.perceptual import lpips_loss
-from gsmerge.research.training.predict import analytic_gaussians, predict
+from gsmerge.research.training.predict import analytic_gaussians, match_crop, predict
 from gsmerge.research.training.scenes import coverage, covered_pixels, reduced_masks, view_subsets
 from gsmerge.research.training.windows import Box, Window, sample_window, whole_photo
 from gsmerge.stages.decode import DecodeOptions, decode
@@ -127,7 +127,7 @@ def test_windows_lie_in_the_photo_and_hold_what_can_be_seen(example: Example) ->
         assert window.image.shape == (box.height, box.width, 3)
         whole = whole_photo(example, window.photo, window.crop.k)
         camera = Cameras(whole.camera.viewmats, whole.camera.Ks, WIDTH // 2, HEIGHT // 2)
-        parts = [analytic_gaussians(crop, PHOTO) for crop in (window.crop, whole.crop)]
+        parts = [analytic_gaussians(crop, match_crop(crop, None, PHOTO)) for crop in (window.crop, whole.crop)]
         drawn = [render(part, camera, near=0.01).images[0] for part in parts]
         inside = [image[box.top : box.top + box.height, box.left : box.left + box.width] for image in drawn]
         np.testing.assert_allclose(inside[0], inside[1], atol=1e-5)
@@ -214,7 +214,8 @@ def test_gradients_of_the_last_layers_are_those_of_finite_differences(example: E
 
     The mean squared error has no kink, and a step in a random direction moves all weights of a layer at once.
     """
-    options = replace(PHOTO, photo_loss="mse", regression_weight=0.3, teacher_weight=0.1, diversity_weight=0.2)
+    weights = {"regression_weight": 0.3, "teacher_weight": 0.1, "diversity_weight": 0.2}
+    options = replace(PHOTO, photo_loss="mse", diversity_unit="scene", **weights)  # whose weights have a gradient, too
     networks = noisy(TINY).requires_grad_(True)
     scales = target_scales([example.targets])
     generator = torch.Generator().manual_seed(1)
@@ -223,7 +224,7 @@ def test_gradients_of_the_last_layers_are_those_of_finite_differences(example: E
         parameters = [layer.weight, layer.bias]
 
         def loss(window: Window = window) -> torch.Tensor:
-            return window_loss(networks, window, scales, options, 0, np.random.default_rng(0))
+            return window_loss(networks, window, scales, options, 0, np.random.default_rng(0)).total
 
         actual = torch.autograd.grad(loss(), parameters)
         directions = [torch.randn(p.shape, generator=generator) for p in parameters]
@@ -286,17 +287,24 @@ def test_diversification_is_the_formula_of_the_paper() -> None:
     attraction = 0.5 * ((0.5 - overlap) / 0.5) ** 3
     weight = (1 * 0.5**3) ** 0.5  # the root of both volumes, as printed
     expected_loss = weight * (0.75 * attraction + 0.25 * 0.16)
-    assert float(diversity_loss(pair, together, 1.0)) == pytest.approx(expected_loss, rel=1e-5)
-    assert float(diversity_loss(pair, torch.arange(2), 1.0)) == 0
+    assert float(diversity_loss(pair, together, torch.ones(2), 1.0)) == pytest.approx(expected_loss, rel=1e-5)
+    assert float(diversity_loss(pair, torch.arange(2), torch.ones(2))) == 0
 
 
-def test_diversification_does_not_depend_on_the_unit_of_the_world() -> None:
-    parents = torch.tensor([0, 0, 1, 1])
+@pytest.mark.parametrize("unit", [None, 2.0])
+def test_diversification_does_not_depend_on_the_unit_of_the_world(unit: float | None) -> None:
+    parents, sizes = torch.tensor([0, 0, 1, 1]), torch.tensor([2.0, 2.0, 0.2, 0.2])
     gaussians = boxes([[0.0, 0, 0], [0.2, 0, 0], [9.0, 0, 0], [9.1, 0, 0]], [1.0, 1.0, 0.1, 0.1], [0.5] * 4)
-    loss = float(diversity_loss(gaussians, parents, 2.0))
-    assert float(diversity_loss(gaussians, parents, 1.0)) == pytest.approx(8 * loss, rel=1e-5)
+    loss = float(diversity_loss(gaussians, parents, sizes, unit))
     larger = replace(gaussians, means=gaussians.means * 5, scales=gaussians.scales * 5)
-    assert float(diversity_loss(larger, parents, 10.0)) == pytest.approx(loss, rel=1e-4)
+    assert float(diversity_loss(larger, parents, sizes * 5, unit and unit * 5)) == pytest.approx(loss, rel=1e-4)
+
+
+def test_small_groups_count_as_much_as_large_ones() -> None:
+    """In the sizes of their groups; in the scene's unit only large ones do."""
+    parents, small = torch.tensor([0, 0]), boxes([[0.0, 0, 0], [0, 0, 0]], [0.01, 0.01], [0.5, 0.5])
+    assert float(diversity_loss(small, parents, torch.full((2,), 0.01))) == pytest.approx(0.75)
+    assert float(diversity_loss(small, parents, torch.full((2,), 0.01), 1.0)) == pytest.approx(0.75e-6)
 
 
 @pytest.mark.slow

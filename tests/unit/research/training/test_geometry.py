@@ -1,0 +1,180 @@
+"""The stages' geometry as tensors: values as the kernels', gradients as central differences of everything after."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+from network_fixtures import SMALL, Made, made, noisy
+from scenes import arc, make_scene, room
+from training_runs import PAPER, TINY
+
+from gsmerge.moments import feature_to_gaussians
+from gsmerge.networks import apply, tokens
+from gsmerge.networks.apply import NetworkContext, encode_features, merge_features, refine_features
+from gsmerge.networks.corrections import COLOR, LOGIT, MASS, MEAN, ROTATION, SIZE
+from gsmerge.networks.modules import Networks
+from gsmerge.networks.options import FEATURE
+from gsmerge.networks.tensors import quat_to_rotmat
+from gsmerge.research.training import Example, make_example, make_training_scene
+from gsmerge.research.training.geometry import (
+    differentiate_axes,
+    features_to_arrays,
+    features_to_tensors,
+    pool_tensors,
+)
+from gsmerge.research.training.predict import TrainingContext, match_crop, predict
+from gsmerge.research.training.windows import Crop, whole_photo
+from gsmerge.stages.merge import cluster_runs, pool_runs
+from gsmerge.types import FeatureGaussians, Matches, as_array
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+COLUMNS = {"mean": MEAN, "size": SIZE, "turn": ROTATION, "logit": slice(LOGIT, LOGIT + 1), "color": COLOR}
+SIZE_OF_ROOM = 0.1  # world units, of what a superpixel shows
+OF_FEATURES = COLUMNS | {"mass": slice(MASS, MASS + 1), "latent": slice(FEATURE, FEATURE + TINY.latent)}
+
+
+@pytest.fixture(scope="module")
+def scene() -> Made:
+    return made(3)
+
+
+def pairs(features: FeatureGaussians) -> Matches:
+    """The rows of the first view with those of the second; the others alone."""
+    clusters = np.arange(len(features))
+    second = np.flatnonzero(features.views == 1)
+    clusters[second] = np.flatnonzero(features.views == 0)[: len(second)]
+    ids, local = np.unique(clusters, return_inverse=True)
+    return Matches(local, len(ids))
+
+
+def contexts(scene: Made, networks: Networks) -> tuple[NetworkContext, TrainingContext]:
+    place = scene.members, scene.scene.cameras
+    return NetworkContext(networks.weights(), *place), TrainingContext(networks, *place)
+
+
+@pytest.mark.parametrize("start", ["pooled", "first"])
+def test_every_stage_has_the_values_of_its_kernels(scene: Made, start: str) -> None:
+    networks = noisy(replace(SMALL, merger_start=start))
+    plain, training = contexts(scene, networks)
+    _, order, cuts = cluster_runs(pairs(scene.features))
+    expected = encode_features(scene.features, plain)
+    actual = encode_features(features_to_tensors(scene.features), training)
+    same(actual, expected)
+    pooled = pool_runs(expected, order, cuts)
+    same(pool_tensors(actual, order, cuts), pooled)
+    expected = merge_features(pooled, expected, order, cuts, plain)
+    actual = merge_features(pool_tensors(actual, order, cuts), actual, order, cuts, training)
+    same(actual, expected)
+    expected, actual = refine_features(expected, plain), refine_features(actual, training)
+    same(actual, expected)
+    base, other = plain.describe(expected), training.describe(actual)
+    for name in ("frames", "sizes", "group"):
+        np.testing.assert_allclose(as_array(getattr(other, name)), getattr(base, name), atol=2e-3, rtol=2e-3)
+    for name, column in vars(feature_to_gaussians(expected)).items():
+        if name != "quats":  # whose axes may have other signs
+            np.testing.assert_allclose(as_array(getattr(other.base, name)), column, atol=2e-4, rtol=2e-3)
+
+
+def same(actual: FeatureGaussians, expected: FeatureGaussians) -> None:
+    arrays = features_to_arrays(actual)
+    for f in fields(expected):
+        one, other = getattr(arrays, f.name), getattr(expected, f.name)
+        scale = float(np.abs(other).max()) if other.size else 1.0
+        np.testing.assert_allclose(one, other, atol=1e-4 * scale, rtol=1e-3, err_msg=f.name)
+
+
+def test_axes_turn_with_their_covariance() -> None:
+    """Scales and rotations of a changed covariance, to first order."""
+    generator = torch.Generator().manual_seed(0)
+    turns = torch.linalg.qr(torch.randn(30, 3, 3, generator=generator))[0]
+    covars = (turns * torch.tensor([0.2, 1.0, 3.0]).square()) @ turns.transpose(1, 2)
+    weights = torch.randn(30, 3, 3, generator=generator)
+    change = torch.randn(30, 3, 3, generator=generator)
+    change = change + change.transpose(1, 2)
+
+    def measure(values: torch.Tensor) -> torch.Tensor:
+        scales, quats = differentiate_axes(values)
+        axes = quat_to_rotmat(quats)  # outer products, since signs are arbitrary
+        outer = (axes * scales[:, None].log()) @ axes.transpose(1, 2)
+        return (outer * weights).sum()
+
+    values = covars.clone().requires_grad_(True)
+    (gradient,) = torch.autograd.grad(measure(values), values)
+    step = 1e-3
+    difference = (measure(covars + step * change) - measure(covars - step * change)) / (2 * step)
+    assert float((gradient * change).sum()) == pytest.approx(float(difference), rel=1e-2)
+
+
+@pytest.fixture(scope="module")
+def example() -> Example:
+    """Two views in which every cluster is known, so that no step changes a choice."""
+    whole = make_example(make_training_scene(make_scene(room(), arc(2, 40, 30)), range(2)), PAPER, 0.1, "room")
+    matches = match_crop(whole_photo(whole, 0).crop, whole.features, replace(PAPER, geometry="analytic"))
+    assert matches.count < len(whole.features)
+    return replace(whole, matches=matches)
+
+
+@pytest.fixture
+def fixed_choices(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neighbours, and what other views say of a group, stay as they were first: they jump, and have no gradient."""
+
+    def keep(module: object, name: str) -> None:
+        first, function = dict[int, np.ndarray](), getattr(module, name)
+
+        def kept(means: np.ndarray, *rest: object) -> np.ndarray:
+            return first.setdefault(len(means), function(means, *rest)).copy()
+
+        monkeypatch.setattr(module, name, kept)
+
+    keep(apply, "find_neighbors")
+    keep(tokens, "cross_view_stats")
+
+
+def measure(crop: Crop, networks: Networks) -> torch.Tensor:
+    """A smooth number that depends on every column of the children."""
+    prediction = predict(crop, networks, PAPER, 0)
+    g, generator = prediction.gaussians, torch.Generator().manual_seed(3)
+    half = quat_to_rotmat(g.quats) * (g.scales / SIZE_OF_ROOM)[:, None]
+    covars = (half @ half.transpose(1, 2)).flatten(1)
+    values = torch.cat([g.means / SIZE_OF_ROOM, covars, 4 * g.opacities[:, None], 4 * g.sh0[:, 0]], 1).double()
+    weights = 0.3 + torch.rand(values.shape, generator=generator, dtype=torch.float64)
+    return (weights * torch.tanh(values)).sum()
+
+
+@pytest.mark.usefixtures("fixed_choices")
+@pytest.mark.parametrize(("outputs", "start"), [("absolute", "first"), ("residual", "pooled")])
+@pytest.mark.parametrize("k", [1, 2, 4])
+def test_gradients_are_central_differences(example: Example, outputs: str, start: str, k: int) -> None:
+    """For every column that a network makes: each reaches the children, through all stages after its own."""
+    options = replace(TINY, outputs=outputs, merger_start=start)
+    networks = noisy(options, scale=0.15).requires_grad_(True)
+    crop = whole_photo(example, 0, k).crop
+    rows = {"encoder.shift": {"shift": slice(0, 3)}, "encoder.latent": {"latent": slice(0, TINY.latent)}}
+    rows |= {"merger.out": OF_FEATURES, "refiner.out": OF_FEATURES, f"heads.{k}.out": COLUMNS}
+    for name, groups in rows.items():
+        bias = networks.get_submodule(name).bias
+        (actual,) = torch.autograd.grad(measure(crop, networks), [bias])
+        differences = central_differences(lambda: measure(crop, networks), bias)
+        size = differences.norm()
+        for group, columns in groups.items():
+            one, other = actual[columns], differences[columns]
+            if other.norm() > 1e-3 * size:  # less than rounding otherwise
+                assert float(torch.cosine_similarity(one, other, 0)) > 0.9, (name, group, one, other)
+                assert float(one.norm() / other.norm()) == pytest.approx(1, abs=0.2), (name, group)
+
+
+def central_differences(function: Callable[[], torch.Tensor], values: torch.Tensor, step: float = 1e-3) -> torch.Tensor:
+    slopes = []
+    with torch.no_grad():
+        for place in range(len(values)):
+            start, ends = values[place].item(), []
+            for sign in (1, -1):
+                values[place] = start + sign * step
+                ends.append(float(function()))
+            values[place] = start
+            slopes.append((ends[0] - ends[1]) / (2 * step))
+    return torch.tensor(slopes)
