@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 Method = Literal["overlap", "aabb", "none"]
 Geometry = Literal["analytic", "decoded"]
 
+NEIGHBORS = {"overlap": 16, "aabb": 1}  # Nearest neighbours that are compared; docs/internals/notebook.md has figures
+
 
 @dataclass(frozen=True)
 class MatchOptions:
@@ -35,7 +37,8 @@ class MatchOptions:
         similarity: Least cosine of the latents of ``"aabb"``, -1 to 1 (tau_f). Without an encoder there are no
             latents, and colours are compared in their place.
         max_color: Largest difference of base colours (Euclidean, sRGB in [0, 1]).
-        neighbors: Nearest neighbours of other views in 3D that are compared (k).
+        neighbors: Nearest neighbours of other views in 3D that are compared (k, which the paper leaves open); None: 16
+            with ``"overlap"``, 1 with ``"aabb"``, whose components chain and leave holes with more.
         cluster_size: Most Feature Gaussians in a star cluster; None: as many as there are views (a cluster holds
             one of each view at most).
 
@@ -49,7 +52,7 @@ class MatchOptions:
     iou: float = 0.2
     similarity: float = 0.8
     max_color: float = 0.12
-    neighbors: int = 16
+    neighbors: int | None = None
     cluster_size: int | None = None
 
     def __post_init__(self) -> None:
@@ -62,10 +65,15 @@ class MatchOptions:
                 raise ValueError(f"{name}: expected {low} to 1, got {getattr(self, name)}")
         if not self.max_color >= 0:
             raise ValueError(f"max_color: expected at least 0, got {self.max_color}")
-        if self.neighbors < 1:
+        if self.neighbors is not None and self.neighbors < 1:
             raise ValueError(f"neighbors: expected at least 1, got {self.neighbors}")
         if self.cluster_size is not None and self.cluster_size < 1:
             raise ValueError(f"cluster_size: expected at least 1, got {self.cluster_size}")
+
+    @property
+    def num_neighbors(self) -> int:
+        """Nearest neighbours of other views that are compared."""
+        return self.neighbors or NEIGHBORS["aabb" if self.match == "aabb" else "overlap"]
 
 
 @stage("match")
@@ -96,7 +104,8 @@ def _clusters(features: FeatureGaussians, rows: np.ndarray, options: MatchOption
     means, views = features.means[rows].astype(np.float64), features.views[rows]
     covars = features.covars[rows].astype(np.float64).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
     colors = SH_C0 * features.sh0[rows, 0].astype(np.float64)
-    neighbors, boxes = nearest_of_other_views(means, views, options.neighbors), options.match == "aabb"
+    neighbors = nearest_of_other_views(means, views, options.num_neighbors)
+    boxes = options.match == "aabb"
     latents = as_array(features.latents)
     known = boxes and bool(latents.any())  # networks without an encoder leave them zero
     latents = normalize(latents[rows] if known else latents[rows, :0])

@@ -38,6 +38,17 @@ def test_chain_of_a_thousand_does_not_collapse(apart: float) -> None:
         assert len(actual) >= 1000 / most
 
 
+def test_chain_of_boxes_does_not_collapse() -> None:
+    """Components of boxes have no limit: only that each is compared with its nearest keeps them apart."""
+    steps = np.random.default_rng(0).uniform(0.4, 1.2, 1000)
+    means = np.stack([SIZE * np.cumsum(steps), np.zeros(1000), np.full(1000, 3.0)], 1)
+    features = scenes.make_features(means, sizes=SIZE, views=np.arange(1000) % 7)
+    assert match(features, MatchOptions(match="aabb", neighbors=16)).count == 1
+    actual = diameters(features, match="aabb")
+    assert len(actual) > 200
+    assert actual.max() < 10
+
+
 def test_chained_wall_stays_covered() -> None:
     """A closed wall of Feature Gaussians, each matching its neighbours, before and after merging."""
     n = 32

@@ -56,6 +56,19 @@ def test_threshold_is_the_box_overlap() -> None:
     assert len(sets(pair, match="aabb", iou=1 / 3 + 1e-3)) == 2
 
 
+def test_boxes_are_compared_with_the_nearest_alone() -> None:
+    """Two pairs whose gap is a little wider than they are: more neighbours chain them."""
+    row = make_features([[x, 0, 0] for x in (0, 0.01, 0.022, 0.032)], views=[0, 1, 0, 1])
+    assert sets(row, match="aabb") == {frozenset([0, 1]), frozenset([2, 3])}
+    assert sets(row, match="aabb", neighbors=2) == {frozenset([0, 1, 2, 3])}
+
+
+def test_neighbours_depend_on_the_method_unless_set() -> None:
+    boxes = MatchOptions(match="aabb")
+    actual = [options.num_neighbors for options in (MatchOptions(), boxes, replace(boxes, neighbors=5))]
+    assert actual == [16, 1, 5]
+
+
 def test_threshold_is_the_cosine_of_the_latents() -> None:
     """With latents these decide in place of the colours, for boxes alone."""
     colors = np.array([[0.2, 0.2, 0.2], [0.9, 0.9, 0.9]])
