@@ -6,6 +6,8 @@ python benchmarks/networks.py fox,fern --checkpoint FILE
 python benchmarks/networks.py eval --only paper --no-lpips --checkpoint gsmerge/networks/paper.safetensors
 
 Plain exports, held-out views, pixels that the context views see; LPIPS (VGG) of two held-out views of each scene.
+Nothing has a budget: without a fit, superpixels are then cut for it, and K does not matter. Networks that raise
+opacities leave out fewer Gaussians as too faint, so of two runs that are compared the larger one loses its faintest.
 """
 
 from __future__ import annotations
@@ -15,8 +17,8 @@ import hashlib
 import json
 import tempfile
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +29,7 @@ from gsmerge.measure.evaluate import EvaluateOptions, evaluate
 from gsmerge.networks.checkpoint import SHIPPED, load_checkpoint, save_checkpoint
 from gsmerge.networks.options import SLOTS
 from gsmerge.research.charts.lines import Interval, mean_interval, paired_difference
+from gsmerge.stages.clean import faintest_dropped
 from gsmerge.types import Views
 from gsmerge.views import even_views, subset
 
@@ -43,36 +46,35 @@ class Condition:
     views: int | None = None
     silent: str | None = None  # networks whose last layers are set to zero
     learned: tuple[bool, ...] = (False, True)
+    like_whole: bool = False  # whether its budget is the count of the whole recipe
 
 
 PLAIN = {"fit": "none"}
-BUDGET = {1: "4.4%", 2: "8.8%", 4: "17.6%"}
-ONE = {"budget": BUDGET[1]}
 GAIN = (
-    Condition("no fit", {**ONE, **PLAIN}),
-    Condition("12 steps", {**ONE, "fit_steps": 12}),
-    Condition("default fit", ONE),
-    Condition("no fit, 3 views", {**ONE, **PLAIN}, 3),
-    Condition("default fit, 3 views", ONE, 3),
+    Condition("no fit", PLAIN),
+    Condition("12 steps", {"fit_steps": 12}),
+    Condition("default fit", {}),
+    Condition("no fit, 3 views", PLAIN, 3),
+    Condition("default fit, 3 views", {}, 3),
 )
-MANY = tuple(Condition(f"K = {k}, no fit", {"k": k, "budget": BUDGET[k], **PLAIN}) for k in (2, 4))
+MANY = tuple(Condition(f"K = {k}, no fit", {"k": k, **PLAIN}) for k in (2, 4))
 ABLATION = (
-    Condition("without the refiner", {**ONE, **PLAIN}, silent="refiner", learned=(True,)),
-    Condition("without the merger", {**ONE, **PLAIN}, silent="merger", learned=(True,)),
-    Condition("without both", {**ONE, **PLAIN}, silent="refiner,merger", learned=(True,)),
-    Condition("the encoder's latent zero", {**ONE, **PLAIN}, silent="latent", learned=(True,)),
-    Condition("all latents zero", {**ONE, **PLAIN}, silent="latents", learned=(True,)),
-    Condition("without the heads", {**ONE, **PLAIN}, silent="heads", learned=(True,)),
-    Condition("no merging across views", {**ONE, **PLAIN, "match": "none"}),
-    Condition("matching by the K = 1 head", {**ONE, **PLAIN, "geometry": "decoded"}, learned=(True,)),
-    Condition("larger superpixels", {"budget": "2%", **PLAIN}),
-    Condition("smaller superpixels", {"budget": "8.7%", **PLAIN}),
+    Condition("without the refiner", PLAIN, silent="refiner", learned=(True,)),
+    Condition("without the merger", PLAIN, silent="merger", learned=(True,)),
+    Condition("without both", PLAIN, silent="refiner,merger", learned=(True,)),
+    Condition("the encoder's latent zero", PLAIN, silent="latent", learned=(True,)),
+    Condition("all latents zero", PLAIN, silent="latents", learned=(True,)),
+    Condition("without the heads", PLAIN, silent="heads", learned=(True,)),
+    Condition("no merging across views", {**PLAIN, "match": "none"}),
+    Condition("matching by the K = 1 head", {**PLAIN, "geometry": "decoded"}, learned=(True,)),
+    Condition("larger superpixels", {"superpixels": "2%", **PLAIN}),
+    Condition("smaller superpixels", {"superpixels": "8.7%", **PLAIN}),
 )
-OWN = {"recipe": "paper", **ONE}
+OWN = {"recipe": "paper"}
 PAPER = (
     Condition("the whole, K = 1", OWN, learned=(True,)),
-    Condition("moment matching", {"method": "moment-matching", **ONE}, learned=(False,)),
-    *(Condition(f"K = {k}", {"recipe": "paper", "k": k, "budget": BUDGET[k]}, learned=(True,)) for k in (2, 4)),
+    Condition("moment matching", {"method": "moment-matching"}, learned=(False,), like_whole=True),
+    *(Condition(f"K = {k}", {**OWN, "k": k}, learned=(True,)) for k in (2, 4)),
     Condition("no merging across views", {**OWN, "match": "none"}, learned=(True,)),
     *(Condition(f"without the {name}", OWN, silent=name, learned=(True,)) for name in ("merger", "refiner", "heads")),
     Condition("the encoder's latents zero", OWN, silent="latent", learned=(True,)),
@@ -127,105 +129,116 @@ def applies(condition: Condition, checkpoint: Path) -> bool:
     return all(name in ("", "heads") or getattr(options, name) for name in names)
 
 
-def measured(folder: Path, condition: Condition, checkpoint: str, cache: Path, lpips: bool) -> dict[str, Any]:
-    """One run on one scene, judged by its held-out views."""
-    scene, targets = gsmerge.read_scene(export(folder, cache)), read_held_out(folder)
-    if condition.views is not None:
-        scene = subset(scene, even_views(len(scene), min(condition.views, len(scene))))
+@lru_cache(maxsize=2)  # of a pair, the larger of which is scored again
+def compacted(
+    ply: Path, views: int | None, settings: tuple[tuple[str, Any], ...]
+) -> tuple[gsmerge.Scene, gsmerge.CompactResult, float]:
+    """Some views of a scene, their result, and the seconds that it took."""
+    scene = gsmerge.read_scene(ply)
+    if views is not None:
+        scene = subset(scene, even_views(len(scene), min(views, len(scene))))
     start = time.perf_counter()
+    result = gsmerge.compact(scene, **dict(settings))
+    return scene, result, time.perf_counter() - start
+
+
+def measured(
+    folder: Path, condition: Condition, checkpoint: str, args: argparse.Namespace, count: int | None
+) -> dict[str, Any]:
+    """One run on one scene, judged by its held-out views; of more than ``count`` Gaussians the faintest go."""
     chosen = {"checkpoint": checkpoint, "require_checkpoint": checkpoint != "none"}
-    result = gsmerge.compact(scene, **condition.settings, **chosen)
-    seconds = time.perf_counter() - start
+    settings = tuple((condition.settings | chosen).items())
+    scene, result, seconds = compacted(export(folder, args.cache), condition.views, settings)
+    targets = read_held_out(folder)
+    gaussians = result.gaussians if count is None else faintest_dropped(result.gaussians, count)
     views = Views(targets.cameras, targets.images, tuple(map(str, range(len(targets.images)))))
-    options = EvaluateOptions(lpips=("vgg",) if lpips else (), lpips_views=2, context=False, own=False)
-    scores = evaluate(scene, {"it": result.gaussians}, views, options).results[0].scores
+    options = EvaluateOptions(lpips=("vgg",) if args.lpips else (), lpips_views=2, context=False, own=False)
+    scored = evaluate(scene, {"it": gaussians}, views, options).results[0]
     means: dict[str, float] = {}
     for name in MEASURES:
-        values = [value for s in scores if (value := getattr(s.masked, name)) is not None]
+        values = [value for s in scored.scores if (value := getattr(s.masked, name)) is not None]
         if values:
             means[name] = sum(values) / len(values)
     stages = {name: result.report.seconds[name] for name in STAGES if name in result.report.seconds}
     choices = result.report.choices
     kept = choices["clusters"] / choices["groups"] if "clusters" in choices else 1.0
-    return {"count": len(result.gaussians), "seconds": seconds, "stages": stages, "kept": kept, **means}
+    facts = {"count": len(gaussians), "ratio": scored.ratio, "seconds": seconds, "stages": stages, "kept": kept}
+    return {**facts, **means}
 
 
-def runs_of(folders: list[Path], conditions: tuple[Condition, ...], args: argparse.Namespace) -> Iterator[None]:
-    """Run what is not done yet."""
-    digest = hashlib.sha256(args.checkpoint.read_bytes()).hexdigest()[:16]
-    with tempfile.TemporaryDirectory() as place:
-        for folder in folders:
-            for condition in conditions:
-                for learned in condition.learned:
-                    key = key_of(folder, condition, digest if learned else "none", args.lpips)
-                    if key in args.store.runs:
-                        continue
-                    checkpoint = "none"
-                    if learned:
-                        quiet = condition.silent
-                        checkpoint = str(silenced(args.checkpoint, quiet, Path(place)) if quiet else args.checkpoint)
-                    run = measured(folder, condition, checkpoint, args.cache, args.lpips)
-                    args.store.add(
-                        {"key": key, "scene": folder.name, "name": condition.name, "learned": learned, **run}
-                    )
-                    print(
-                        json.dumps({"scene": folder.name, "name": condition.name, "learned": learned, **run}),
-                        flush=True,
-                    )
-                    yield
+def run(
+    folder: Path, condition: Condition, args: argparse.Namespace, *, learned: bool, count: int | None = None
+) -> dict[str, Any]:
+    """The run of a condition on a scene: a finished one, or a new one, which is kept."""
+    digest = hashlib.sha256(args.checkpoint.read_bytes()).hexdigest()[:16] if learned else "none"
+    what = [folder.name, condition.settings, condition.views, condition.silent, digest, args.lpips, count]
+    key = hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()[:24]
+    if key not in args.store.runs:
+        with tempfile.TemporaryDirectory() as place:
+            checkpoint = "none"
+            if learned:
+                quiet = condition.silent
+                checkpoint = str(silenced(args.checkpoint, quiet, Path(place)) if quiet else args.checkpoint)
+            figures = measured(folder, condition, checkpoint, args, count)
+        one = {"scene": folder.name, "name": condition.name, "learned": learned, **figures}
+        print(json.dumps(one), flush=True)
+        args.store.add({"key": key, **one})
+    return args.store.runs[key]
 
 
-def key_of(folder: Path, condition: Condition, checkpoint: str, lpips: bool) -> str:
-    what = [folder.name, condition.settings, condition.views, condition.silent, checkpoint, lpips]
-    return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()[:24]
+def at_equal_count(folder: Path, condition: Condition, args: argparse.Namespace) -> tuple[dict[str, Any], ...]:
+    """Runs of one count: without and with networks, or, of a condition with networks alone, the whole and that."""
+    first = (condition, False) if False in condition.learned else (GAIN[0], True)
+    both = [(one, learned, run(folder, one, args, learned=learned)) for one, learned in (first, (condition, True))]
+    count = min(done["count"] for *_, done in both)
+    return tuple(
+        done if done["count"] == count else run(folder, one, args, learned=learned, count=count)
+        for one, learned, done in both
+    )
 
 
 def table(folders: list[Path], conditions: tuple[Condition, ...], args: argparse.Namespace) -> str:
     """Markdown: means over the scenes, and the paired difference with its 95 % interval."""
-    digest = hashlib.sha256(args.checkpoint.read_bytes()).hexdigest()[:16]
     rows = [
-        "| | analytic | learned | PSNR, learned less analytic (95 %) | worst scene | LPIPS, likewise |",
-        "|---|" + "---|" * 5,
+        "| | Gaussians | analytic | learned | PSNR, learned less analytic (95 %) | worst scene | LPIPS, likewise |",
+        "|---|" + "---|" * 6,
     ]
-    base = {learned: scores(folders, GAIN[0], digest if learned else "none", args) for learned in (False, True)}
     for condition in conditions:
-        both = {
-            learned: scores(folders, condition, digest if learned else "none", args) for learned in condition.learned
-        }
-        before, after = both.get(False, base[True] if condition.learned == (True,) else {}), both.get(True, {})
-        if len(after) < len(folders):
-            continue
+        pairs = {folder.name: at_equal_count(folder, condition, args) for folder in folders}
+        before, after = ({scene: pair[i] for scene, pair in pairs.items()} for i in (0, 1))
         gain = paired_difference(pick(after, "psnr"), pick(before, "psnr"))
         worst = min(after[s]["psnr"] - before[s]["psnr"] for s in after)
         lpips = [run["lpips_vgg"] - before[s]["lpips_vgg"] for s, run in after.items() if "lpips_vgg" in run]
         lpips_gain = "" if not lpips else f"{mean_interval(lpips).mean:+.3f}"
         first = summary(before) if False in condition.learned else "(whole, no fit) " + summary(before)
-        rows.append(f"| {condition.name} | {first} | {summary(after)} | {words(gain)} | {worst:+.2f} | {lpips_gain} |")
+        cells = [condition.name, share(after), first, summary(after), words(gain), f"{worst:+.2f}", lpips_gain]
+        rows.append(f"| {' | '.join(cells)} |")
     return "\n".join(rows)
 
 
 def paper_table(folders: list[Path], conditions: tuple[Condition, ...], args: argparse.Namespace) -> str:
     """Markdown: means over the scenes, against the whole recipe."""
-    digest = hashlib.sha256(args.checkpoint.read_bytes()).hexdigest()[:16]
-    rows = ["| | groups kept across views | PSNR / SSIM | against the whole (95 %) |", "|---|---|---|---|"]
-    whole = scores(folders, conditions[0], digest, args)
+    head = ["", "groups kept across views", "Gaussians", "PSNR / SSIM", "against the whole (95 %)"]
+    rows = [f"| {' | '.join(head)} |", "|---|" + "---|" * (len(head) - 1)]
+    whole = {folder.name: run(folder, conditions[0], args, learned=True) for folder in folders}
     for condition in conditions:
-        runs = scores(folders, condition, digest if condition.learned == (True,) else "none", args)
+        runs = {}
+        for folder in folders:
+            budget = {"budget": whole[folder.name]["count"]} if condition.like_whole else {}
+            own = replace(condition, settings={**condition.settings, **budget})
+            runs[folder.name] = run(folder, own, args, learned=condition.learned == (True,))
         kept = sum(run["kept"] for run in runs.values()) / len(runs)
-        gain = words(paired_difference(pick(runs, "psnr"), pick(whole, "psnr"))) if runs is not whole else ""
-        rows.append(f"| {condition.name} | {100 * kept:.0f} % | {summary(runs)} | {gain} |")
+        gain = words(paired_difference(pick(runs, "psnr"), pick(whole, "psnr"))) if runs != whole else ""
+        rows.append(f"| {condition.name} | {100 * kept:.0f} % | {share(runs)} | {summary(runs)} | {gain} |")
     return "\n".join(rows)
-
-
-def scores(
-    folders: list[Path], condition: Condition, digest: str, args: argparse.Namespace
-) -> dict[str, dict[str, Any]]:
-    keys = {folder.name: key_of(folder, condition, digest, args.lpips) for folder in folders}
-    return {name: args.store.runs[key] for name, key in keys.items() if key in args.store.runs}
 
 
 def pick(runs: dict[str, dict[str, Any]], name: str) -> dict[str, float]:
     return {scene: run[name] for scene, run in runs.items()}
+
+
+def share(runs: dict[str, dict[str, Any]]) -> str:
+    return f"{100 * sum(run['ratio'] for run in runs.values()) / len(runs):.1f} %"
 
 
 def summary(runs: dict[str, dict[str, Any]]) -> str:
@@ -254,8 +267,6 @@ def main() -> None:
     folders = [folder for folder in scene_folders(args.scenes) if folder.name not in LEFT_OUT]
     for part in args.only:
         conditions = tuple(condition for condition in PARTS[part] if applies(condition, args.checkpoint))
-        for _ in runs_of(folders, conditions, args):
-            pass
         names = ", ".join(folder.name for folder in folders)
         rows = (paper_table if part == "paper" else table)(folders, conditions, args)
         print(f"\n{part}: {names}\n\n{rows}\n", flush=True)

@@ -15,8 +15,7 @@ import numpy as np
 from shared_scenes import LEFT_OUT, Targets, exporter, read_held_out, scene_folders
 
 import gsmerge
-from gsmerge.measure.speed import zoom_cameras
-from gsmerge.measure.visibility import resize_mask, resize_photo
+from gsmerge.measure.sizes import resize_mask, resize_photo, zoom_cameras
 from gsmerge.render.metrics import psnr, ssim
 from gsmerge.types import Cameras, LargePhotos
 

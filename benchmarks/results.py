@@ -20,7 +20,7 @@ from pathlib import Path
 
 from defaults import NAME as DEFAULTS
 from defaults import read_defaults
-from result_tables import page_of
+from result_tables import SHARE, page_of
 from shared_scenes import exporter, scene_folders, shared_folder
 
 from gsmerge.cli import main as gsmerge
@@ -74,8 +74,8 @@ PARTS = (
         "plain",
         (
             ("--matches", "overlap,none", *NO_PROXIES),
-            ("--fit", "none", "--fixed", "checkpoint=none", *NO_PROXIES),
-            ("--fit", "none", "--fixed", "checkpoint=shipped", *NO_PROXIES),
+            ("--budgets", SHARE, "--fit", "none", "--fixed", "checkpoint=none", *NO_PROXIES),
+            ("--budgets", SHARE, "--fit", "none", "--fixed", "checkpoint=shipped", *NO_PROXIES),
             ("--superpixels", "2%,8.7%", *NO_PROXIES),
             ("--segmentations", "bass-st,slic", *NO_PROXIES),
             ("--k", "2,4", *NO_PROXIES),

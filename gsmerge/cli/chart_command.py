@@ -54,7 +54,7 @@ def _list(name: str, help: str, wording: str) -> Parameter:
                    "scene in it."),
         opt.option("target_images", str, "Folder of those photos, in the same way."),
     ),
-    "lpips",
+    "photo_side lpips",
     opt.changed("lpips_views", 2, show_default=True),
     *opt.panel(
         opt.MEASURING, opt.option("proxy_views", int, "Photos per scene to measure superpixels on.", default=2, min=0)
@@ -114,14 +114,15 @@ def _make_jobs(args: opt.Args, scenes: Sequence[str]) -> tuple[list[Job], BatchO
     base = replace(base, fixed=tuple(args.fixed)) if args.fixed else base
     grid = parse_grid({name: getattr(args, name) for name in LISTS}, base)
     with opt.usage_errors():
-        measured = EvaluateOptions(nets, args.lpips_views)
+        measured = EvaluateOptions(nets, args.lpips_views, **args.given(("photo_side",)))
         settings = CompactOptions().with_settings(args.given(("seed", "threads")))
         # one at a time, so that none slows another
         options = BatchOptions(settings, args.opacity, args.hints(), jobs=1, rerun=args.rerun, overwrite=True)
     sources = find_sources(scenes, args.output, args.targets, args.target_images)
     # the command line that does the same, without options at their defaults
     words = ["gsmerge", "chart", *scenes, "--output", str(args.output)]
-    names = [*LISTS, "fixed", "grid", "targets", "target_images", "hint", "lpips", "lpips_views", "proxy_views"]
+    names = [*LISTS, "fixed", "grid", "targets", "target_images", "hint"]
+    names += ["photo_side", "lpips", "lpips_views", "proxy_views"]
     for name, value in args.given([*names, "seed", "threads"]).items():
         for one in value if isinstance(value, list) else [value]:
             words += [f"--{name.replace('_', '-')}", str(one)]

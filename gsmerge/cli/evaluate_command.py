@@ -46,6 +46,10 @@ def parse_align(text: str) -> tuple[str, ...]:
         opt.option("views", int, "Use so many of the input views, at equal intervals, as the context, and the held-out "
                    "ones midway between them as targets.", wording="all", min=1),
         opt.option("context", bool, "Also measure the input views.", "--context/--no-context", default=True),
+    ),
+    "photo_side",
+    *opt.panel(
+        opt.MEASURING,
         opt.option("zoom", str, "Also measure PSNR and SSIM at other sizes: rendered at these multiples of the photos' "
                    "pixels per side.", wording="1", metavar="LIST", parser=parse_zoom),
         opt.option("align", str, "Also score held-out views after alignment with their photos: of the renders' colours "
@@ -91,7 +95,7 @@ def evaluate(args: opt.Args) -> None:
     with opt.usage_errors():
         options = EvaluateOptions(
             nets, args.lpips_views, args.context, threads=args.threads, antialiased=args.antialiased,
-            **args.given(("zoom", "align")),
+            **args.given(("photo_side", "zoom", "align")),
         )  # fmt: skip
     given = read_before_after(args, files)
     notes = [*given.notes, *missing]
@@ -112,6 +116,7 @@ def evaluate(args: opt.Args) -> None:
 def _facts(args: opt.Args, given: BeforeAfter, seconds: Mapping[str, float]) -> dict[str, dict[str, Any]]:
     """Collect the facts of each file by name, with the costs of drawing it where they are asked for."""
     from gsmerge.measure.evaluate import INPUT, near_plane
+    from gsmerge.measure.sizes import shrink_cameras
     from gsmerge.measure.speed import measure_costs
 
     infos = {INPUT: given.load.ply, **{name: ply.info for name, ply in given.plys.items()}}
@@ -121,8 +126,9 @@ def _facts(args: opt.Args, given: BeforeAfter, seconds: Mapping[str, float]) -> 
     }
     if args.speed or args.merge_seconds:
         scenes = {INPUT: given.scene.file_gaussians, **given.gaussians}
+        cameras = shrink_cameras(given.scene.cameras, args.photo_side or 0)
         zooms, near = args.zoom or SPEED_ZOOMS, near_plane(given.scene)
-        costs = measure_costs(scenes, given.scene.cameras, zooms, near, merge_seconds=seconds, threads=args.threads)
+        costs = measure_costs(scenes, cameras, zooms, near, merge_seconds=seconds, threads=args.threads)
         facts = {name: facts[name] | costs[name] for name in facts}
     return facts
 

@@ -348,6 +348,8 @@ _TABLE = (
     ),
     panel(
         MEASURING,
+        option("photo_side", int, "Resize larger photos and their cameras to so many pixels on the longer side; the "
+               "paper measures at 476.", wording="as they are", min=0),
         option("lpips", ("both", "vgg", "alex", "none"), "Networks of the perceptual distance; none is much faster.",
                wording="both, where installed"),
         option("lpips_views", int, "Measure LPIPS on at most so many views of each split.", wording="all", min=1),

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from gsmerge.geometry import Schedule, descend, motion_matrices, pose_changes
 from gsmerge.kernels.elementary import log1p
 from gsmerge.kernels.matrices import matmul, solve, solve_symmetric
-from gsmerge.measure.visibility import resize_mask
+from gsmerge.measure.sizes import resize_mask
 from gsmerge.render import Splats, ViewPlan, composite, plan_view
 from gsmerge.render.composite import mean_depths
 from gsmerge.render.gradient import color_gradients, plan_gradients, pose_gradient

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from gsmerge.errors import UsageError
 from gsmerge.measure.align import PoseChange, fit_colors, refine_pose
-from gsmerge.measure.speed import zoom_cameras
-from gsmerge.measure.visibility import context_points, resize_mask, resize_photo, visible_pixels
+from gsmerge.measure.sizes import resize_mask, resize_photo, shrink_cameras, shrink_views, zoom_cameras
+from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.render import prepare, render
 from gsmerge.render.metrics import describe_loss, psnr, ssim
 from gsmerge.render.photos import NEAR
@@ -45,6 +45,8 @@ class EvaluateOptions:
         context: Also measure the input views.
         own: Also measure the input itself.
         threads: Threads to use; None: all processors. The figures do not depend on it.
+        photo_side: Longer side, in pixels, that photos are resized to together with their cameras where it is longer,
+            before anything is measured; 476 in the paper; 0: they stay as they are.
         zoom: Sizes, in units of the photos' own pixels per side, at which PSNR and SSIM are also measured: the
             Gaussians are rendered at that size and compared with the photo resized to it.
         antialiased: Render with the opacity lowered by what the rasterizer's low-pass adds to small Gaussians, as some
@@ -63,6 +65,7 @@ class EvaluateOptions:
     context: bool = True
     own: bool = True
     threads: int | None = None
+    photo_side: int = 0
     zoom: tuple[float, ...] = (1,)
     antialiased: bool = False
     align: tuple[str, ...] = ()
@@ -73,6 +76,8 @@ class EvaluateOptions:
             raise ValueError(f"lpips: expected {' or '.join(NETS)}, got {unknown!r}")
         if self.lpips_views is not None and self.lpips_views < 1:
             raise ValueError(f"lpips_views: expected at least 1, got {self.lpips_views}")
+        if not isinstance(self.photo_side, int) or self.photo_side < 0:
+            raise ValueError(f"photo_side: expected a number of pixels, or 0 for all, got {self.photo_side}")
         if not all(1 / MAX_ZOOM <= zoom <= MAX_ZOOM for zoom in self.zoom) or not self.zoom:
             raise ValueError(f"zoom: expected numbers from 1/{MAX_ZOOM:g} to {MAX_ZOOM:g}, got {_listed(self.zoom)}")
         if len(set(self.zoom)) < len(self.zoom):
@@ -181,7 +186,7 @@ class _Split:
 
     def under(self, cameras: Cameras | None) -> _Split:
         """Move the views to a result's own cameras; renders of the input are shown from the given cameras."""
-        own = self.views.cameras if cameras is None or self.drawn is not None else cameras.numpy()
+        own = self.views.cameras if cameras is None or self.drawn is not None else cameras
         return replace(self, views=replace(self.views, cameras=own))
 
 
@@ -231,6 +236,8 @@ def evaluate(
     own, results = scene.file_gaussians, {name: gaussians.numpy() for name, gaussians in results.items()}
     if targets is not None:
         targets = replace(targets, cameras=targets.cameras.numpy(), images=as_array(targets.images))
+        targets = shrink_views(targets, options.photo_side)
+    cameras = {name: shrink_cameras(one.numpy(), options.photo_side) for name, one in cameras.items()}
     with use_threads(options.threads):
         frame = scene_frame(scene)
         renderer = _Renderer(NEAR * frame.unit, frame.origin, options)
@@ -279,19 +286,25 @@ def _notes(splits: Mapping[str, _Split]) -> tuple[str, ...]:
 
 def _splits(scene: Scene, own: Gaussians, targets: Views | None, renderer: _Renderer) -> dict[str, _Split]:
     """Split the views into input and held-out views, with photos or the input's renders, and visible pixels."""
-    points = context_points(scene, renderer.near)
+    side = renderer.options.photo_side
+    cameras = shrink_cameras(scene.cameras, side)
+    sources = scene.cameras if scene.aligned else cameras  # whose pixels the points come from
+    points = context_points(scene, renderer.near, sources)
 
     def split(views: Views, drawn: Gaussians | None, masks: np.ndarray | None = None) -> _Split:
-        visible = visible_pixels(points, views.cameras, renderer.near, scene.cameras)
-        return _Split(views, visible if masks is None else visible & masks, drawn)
+        visible = visible_pixels(points, views.cameras, renderer.near, sources)
+        if masks is not None:
+            visible &= [resize_mask(mask, cameras.width, cameras.height) for mask in masks]
+        return _Split(views, visible, drawn)
 
     target = {} if targets is None else {"target": split(targets, None)}
     if targets is not None and not renderer.options.context:
         return target
-    images, drawn = scene.images, own if scene.images is None else None
-    if images is None:
-        images = np.stack([renderer.image(own, scene.cameras, view) for view in range(len(scene))])
-    return {"context": split(Views(scene.cameras, images, scene.names), drawn, scene.masks), **target}
+    if scene.images is not None:
+        views = shrink_views(Views(scene.cameras, scene.images, scene.names), side)
+    else:
+        views = Views(cameras, np.stack([renderer.image(own, cameras, i) for i in range(len(scene))]), scene.names)
+    return {"context": split(views, own if scene.images is None else None, scene.masks), **target}
 
 
 def _score_result(

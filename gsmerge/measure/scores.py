@@ -34,12 +34,13 @@ def evaluation_document(
 
     ``schema_version`` 1: tool, reference, views, results (facts, count, ratio, render seconds, means by split, a score
     for each view), notes. Means and scores have ``zooms`` where other sizes than the photos' own were asked for,
-    those of held-out views ``aligned`` and ``pose_change`` where that was, and ``antialiased`` is there where it is
-    true. Keys are only ever added within one schema version.
+    those of held-out views ``aligned`` and ``pose_change`` where that was; ``photo_side`` is there where it is not 0,
+    ``antialiased`` where it is true. Keys are only ever added within one schema version.
     """
     return {
         **document_head(),
         "reference": evaluation.reference,
+        **({"photo_side": evaluation.options.photo_side} if evaluation.options.photo_side else {}),
         **({"antialiased": True} if evaluation.options.antialiased else {}),
         "num_views": dict(evaluation.num_views),
         "results": [_result(one, evaluation, facts.get(one.name, {})) for one in evaluation.results],
@@ -141,6 +142,7 @@ def evaluation_tables(document: Mapping[str, Any]) -> Iterator[Table]:
         [_size_row(result, results[0]) for result in results],
     )
     how = ", rendered antialiased" if document.get("antialiased") else ""
+    how += f", of photos with at most {document['photo_side']} pixels per side" if "photo_side" in document else ""
     seen = f"against {document['reference']}, over the pixels that the input views have seen{how}"
     means = [(result["name"], split, mean) for result in results for split, mean in result["mean"].items()]
     yield (

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from gsmerge.measure.sizes import zoom_cameras
 from gsmerge.render import plan_view, prepare, render
 from gsmerge.render.weights import view_weights
 from gsmerge.runtime.threads import use_threads
@@ -17,15 +17,6 @@ from gsmerge.views import pick_views
 
 NUM_VIEWS, REPEATS = 3, 3  # evenly spread views that are rendered, each so many times
 MAX_REPEATED_SECONDS = 2.0  # what takes longer is rendered once
-
-
-def zoom_cameras(cameras: Cameras, zoom: float) -> Cameras:
-    """Resize the cameras' images to ``zoom`` times as many pixels per side, with intrinsics of that size."""
-    long_side = max(cameras.width, cameras.height)
-    factor = max(1, round(zoom * long_side)) / long_side
-    size = max(1, round(cameras.width * factor)), max(1, round(cameras.height * factor))
-    scale = np.array([size[0] / cameras.width, size[1] / cameras.height, 1.0], cameras.Ks.dtype)
-    return replace(cameras, Ks=cameras.Ks * scale[:, None], width=size[0], height=size[1])
 
 
 def measure_costs(

@@ -1,4 +1,4 @@
-"""Pixels of a view that show what the input views have seen (supplement A), and photos and masks at other sizes."""
+"""Pixels of a view that show what the input views have seen (supplement A)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from gsmerge.geometry import project
 from gsmerge.kernels.matrices import invert, matmul
-from gsmerge.kernels.pictures import enlarge
 from gsmerge.render import render
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, Scene
@@ -22,14 +21,16 @@ _CHUNK = 1 << 18  # points at a time: all of them, in every thread, would take t
 _DILATION = 3  # pixels of the input views per side of the square that every sample marks
 
 
-def context_points(scene: Scene, near: float) -> Points:
+def context_points(scene: Scene, near: float, cameras: Cameras | None = None) -> Points:
     """Find a point in the world for every pixel of the input views, ``[n,3]``: their depth samples.
 
-    Of a scene with pixels the Gaussians are the samples; otherwise depth beyond ``near``, world units, is rendered.
+    Of a scene with pixels the Gaussians are the samples; otherwise depth beyond ``near``, world units, is rendered
+    into the ``cameras``; None: those of the scene.
     """
     if scene.aligned:
         return scene.gaussians.means[scene.valid.reshape(-1)].astype(np.float64)
-    return np.concatenate([_rendered_points(scene.gaussians, scene.cameras[[i]], near) for i in range(len(scene))])
+    cameras = scene.cameras if cameras is None else cameras
+    return np.concatenate([_rendered_points(scene.gaussians, cameras[[i]], near) for i in range(len(cameras))])
 
 
 def _rendered_points(gaussians: Gaussians, camera: Cameras, near: float) -> Points:
@@ -88,28 +89,3 @@ def inside_views(points: np.ndarray, cameras: Cameras) -> Iterator[np.ndarray]:
     for view in range(len(cameras)):
         (pixels,), (depths,) = project(points, cameras[[view]])
         yield (depths > 0) & ((pixels >= 0) & (pixels < (cameras.width, cameras.height))).all(1)
-
-
-def resize_photo(photo: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Resize a photo ``[h,w,3]`` to a size in pixels: area averages where it is smaller, cubic where it is larger."""
-    if width * height < photo.shape[0] * photo.shape[1]:
-        resized = cv2.resize(photo, (width, height), interpolation=cv2.INTER_AREA)
-    else:
-        resized = enlarge(photo, width, height)
-    return np.asarray(resized).clip(0, 1)
-
-
-def resize_mask(mask: NDArray[np.bool_], width: int, height: int) -> NDArray[np.bool_]:
-    """Resize a mask ``[h,w]``: ``[height,width]``, of which every part of a pixel lies in the mask."""
-    holes = np.pad(np.cumsum(np.cumsum(~mask, 0, dtype=np.int64), 1), ((1, 0), (1, 0)))
-    (top, bottom), (left, right) = (
-        _covered(old, new) for old, new in zip(mask.shape, (height, width), strict=True)
-    )  # fmt: skip
-    inside = holes[bottom][:, right] - holes[top][:, right] - holes[bottom][:, left] + holes[top][:, left]
-    return np.asarray(inside == 0)
-
-
-def _covered(old: int, new: int) -> tuple[np.ndarray, np.ndarray]:
-    """Find the first pixel, and the one after the last, of ``old`` in a row that each of ``new`` pixels overlaps."""
-    pixel = np.arange(new)
-    return pixel * old // new, -(-(pixel + 1) * old // new)

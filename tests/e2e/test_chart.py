@@ -149,6 +149,19 @@ def test_another_scene_another_setting_and_rerun_do_run(copied: Path, merges: li
     assert plan["num_pending"] == 3
 
 
+def test_photos_of_a_given_size_are_measured_anew(copied: Path, run: Run) -> None:
+    before = runs(copied / "out")["input"]
+    assert again(run, copied, "--budgets", "2%", "--photo-side", 48).code == 0
+    after = runs(copied / "out")["input"]
+    assert after.value("psnr_target_visible") != before.value("psnr_target_visible")
+    assert "--photo-side 48" in after.command
+    scene = gsmerge.io.load_scene(copied / "room")
+    targets = gsmerge.io.read_held_out(scene, copied / "room" / "targets")
+    options = gsmerge.EvaluateOptions(lpips=(), photo_side=48)
+    expected = gsmerge.evaluate(scene.scene, {}, targets, options).results[0].mean("target")[1].psnr
+    assert after.value("psnr_target_visible") == expected
+
+
 def test_hints_count_for_all_scenes(copied: Path, run: Run) -> None:
     (copied / "room" / "transforms.json").unlink()  # no pixels can be found, and views have to be placed
     shutil.rmtree(copied / "room" / "images")

@@ -49,6 +49,17 @@ def test_other_sizes(scene_copy: Path, run: Run) -> None:
     assert "PSNR 0.5x" in run(*call, "--zoom", ".5").out
 
 
+def test_photos_of_a_given_size(scene_copy: Path, small: Path, run: Run) -> None:
+    call = ("evaluate", scene_copy, small, "--targets", scene_copy / "targets", "--lpips", "none")
+    document = json.loads(run(*call, "--photo-side", "48", "--speed", "--zoom", "1", "--json").out)
+    assert document["photo_side"] == 48
+    assert [speed["width"] for speed in document["results"][1]["speeds"]] == [48]
+    usual, as_they_are = (json.loads(run(*call, *more, "--json").out) for more in ((), ("--photo-side", "0")))
+    assert "photo_side" not in usual
+    means = [one["results"][1]["mean"] for one in (document, usual, as_they_are)]
+    assert means[1] == means[2] != means[0]
+
+
 def test_alignment(scene_copy: Path, run: Run) -> None:
     """Of held-out photos taken with another exposure and from a place that is not quite theirs."""
     targets = scene_copy / "targets" / "transforms.json"

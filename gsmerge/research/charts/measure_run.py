@@ -28,6 +28,7 @@ from gsmerge.io.formats.ply import OpacityChoice
 from gsmerge.io.formats.writing import file_bytes
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, evaluate, near_plane
 from gsmerge.measure.preview import Picture, draw_means, heat_map, save_picture, to_picture
+from gsmerge.measure.sizes import shrink_cameras
 from gsmerge.measure.speed import time_render
 from gsmerge.options import CompactOptions
 from gsmerge.pipeline import compact
@@ -229,6 +230,7 @@ class ChartRun:
             facts = {"seconds": merge, "stages": dict(seconds), "notes": tuple(done.report.notes)}
         measured = replace(self.measured, threads=threads)
         cameras, near = part.cameras if targets is None else targets.cameras, near_plane(part)
+        cameras = shrink_cameras(cameras, measured.photo_side)
         timed = pick_views(len(cameras), MAX_TIMED)
         pictures, names = keep_pictures(out, gaussians, scene, held_out)
         facts |= {

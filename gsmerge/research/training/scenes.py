@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from gsmerge.measure.visibility import context_points, resize_photo, visible_pixels
+from gsmerge.measure.sizes import resize_photo
+from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.moments import Members, scene_members
 from gsmerge.render import composite, plan_view, prepare
 from gsmerge.render.photos import NEAR, Photos, scene_photos

@@ -164,6 +164,77 @@ def test_zooms_are_renders_at_that_size(scene: Scene, half: Gaussians) -> None:
     assert result.mean("target", zoom=2)[1].ssim == pytest.approx(mean)
 
 
+def halved(views: Views) -> Views:
+    """Half as many pixels per side, made by hand."""
+    cameras, (v, h, w, _) = views.cameras, views.images.shape
+    Ks = cameras.Ks * np.array([[0.5], [0.5], [1]])
+    images = views.images.reshape(v, h // 2, 2, w // 2, 2, 3).mean((2, 4))
+    return Views(replace(cameras, Ks=Ks, width=w // 2, height=h // 2), images, views.names)
+
+
+def figures(evaluation: Evaluation) -> np.ndarray:
+    """PSNR and SSIM of every result in every view, over all pixels and the visible ones, at all sizes."""
+    scores = [score for result in evaluation.results for score in result.scores]
+    pairs = [pair for score in scores for pair in ((score.full, score.masked), *score.zooms.values())]
+    return np.array([(quality.psnr, quality.ssim) for pair in pairs for quality in pair], float)
+
+
+def expect_equal(actual: Evaluation, expected: Evaluation) -> None:
+    """The same figures, over the same pixels."""
+    np.testing.assert_allclose(figures(actual), figures(expected), atol=2e-4)
+    seen = [[score.visible for result in one.results for score in result.scores] for one in (actual, expected)]
+    assert seen[0] == seen[1]
+
+
+def test_a_photo_side_is_what_hand_resized_photos_and_cameras_give(scene: Scene, half: Gaussians) -> None:
+    options = replace(PLAIN, zoom=(1, 2))
+    loose = Scene(scene.gaussians, scene.cameras, scene.images, None, scene.names)
+    masks = np.ones(scene.images.shape[:3], bool)
+    masks[:, :, :9] = False
+    small = halved(Views(scene.cameras, scene.images, scene.names))
+    by_hand = Scene(scene.gaussians, small.cameras, small.images, None, scene.names)
+    own = {"half": scene.cameras[[1, 2, 0]]}  # of a result that moved them
+    actual = evaluate(
+        replace(loose, masks=masks), {"half": half}, held_out(), replace(options, photo_side=24), cameras=own
+    )
+    expected = evaluate(
+        replace(by_hand, masks=~(np.arange(24) < 5) & np.ones((3, 18, 1), bool)), {"half": half}, halved(held_out()),
+        options, cameras={"half": small.cameras[[1, 2, 0]]},
+    )  # fmt: skip
+    expect_equal(actual, expected)
+    assert actual.results[0].scores[0].visible < 0.9  # without what the masks leave out, in part too
+    usual = evaluate(loose, {"half": half}, held_out(), options)
+    assert actual.results[0].mean("target") != usual.results[0].mean("target")
+
+
+def test_a_photo_side_of_a_scene_with_pixels(scene: Scene, half: Gaussians) -> None:
+    """Every Gaussian stays a sample of what the input views see."""
+    options = replace(PLAIN, context=False)
+    actual = evaluate(scene, {"half": half}, held_out(), replace(options, photo_side=24))
+    expect_equal(actual, evaluate(scene, {"half": half}, halved(held_out()), options))
+
+
+@pytest.mark.parametrize("side", [0, 48, 476])
+def test_a_photo_side_enlarges_nothing(side: int, scene: Scene, half: Gaussians, actual: Evaluation) -> None:
+    again = evaluate(scene, {"half": half}, held_out(), replace(PLAIN, photo_side=side))
+    assert [r.scores for r in again.results] == [r.scores for r in actual.results]
+
+
+def test_a_photo_side_without_photos(scene: Scene, half: Gaussians) -> None:
+    actual = evaluate(replace(scene, images=None), {"half": half}, None, replace(PLAIN, photo_side=24))
+    assert all(math.isinf(s.full.psnr or 0) for s in actual.results[0].scores)
+    document = evaluation_document(actual, {})
+    assert document["photo_side"] == 24
+    assert "at most 24 pixels per side" in "".join(evaluation_lines(document))
+    assert "photo_side" not in evaluation_document(replace(actual, options=PLAIN), {})
+
+
+@pytest.mark.parametrize("side", [-1, 476.5])
+def test_bad_photo_sides(side: float) -> None:
+    with pytest.raises(ValueError, match="photo_side: expected a number of pixels"):
+        EvaluateOptions(photo_side=side)  # type: ignore[arg-type]
+
+
 def test_the_input_s_renders_are_the_reference_at_every_size(scene: Scene, half: Gaussians) -> None:
     options = replace(PLAIN, zoom=(0.5, 2), antialiased=True)
     actual = evaluate(replace(scene, images=None), {"half": half}, None, options)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scenes
 
-from gsmerge.measure.speed import break_even, measure_costs, overdraw, zoom_cameras
+from gsmerge.measure.speed import break_even, measure_costs, overdraw
 from gsmerge.render import plan_view, prepare
 from gsmerge.render.weights import view_weights
 from gsmerge.types import Scene
@@ -15,17 +15,6 @@ from gsmerge.types import Scene
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(3))
-
-
-def test_intrinsics_go_with_the_size() -> None:
-    cameras = scenes.arc(2, 48, 36)
-    twice = zoom_cameras(cameras, 2)
-    assert (twice.width, twice.height) == (96, 72)
-    np.testing.assert_allclose(twice.Ks[:, :2], 2 * cameras.Ks[:, :2])
-    np.testing.assert_allclose(twice.Ks[:, 2], cameras.Ks[:, 2])
-    odd = zoom_cameras(cameras, 7 / 48)
-    assert (odd.width, odd.height) == (7, 5)
-    assert zoom_cameras(scenes.arc(1, 48, 2), 1 / 16).height == 1
 
 
 def test_overdraw_counts_what_is_blended(scene: Scene) -> None:

@@ -1,4 +1,4 @@
-"""The paper's visibility mask, against one loop over all samples; masks and photos at other sizes."""
+"""The paper's visibility mask, against one loop over all samples."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import pytest
 import scenes
 
 from gsmerge.measure import visibility
-from gsmerge.measure.speed import zoom_cameras
-from gsmerge.measure.visibility import context_points, resize_mask, resize_photo, visible_pixels
+from gsmerge.measure.sizes import zoom_cameras
+from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.types import Cameras, Scene, grid_ids
 from gsmerge.views import subset
 
@@ -88,23 +88,3 @@ def test_far_scenes_are_seen_as_well() -> None:
     masks = [visible_pixels(context_points(subset(s, [0]), 0.01), s.cameras, 0.01) for s in (here, there)]
     assert (masks[0] == masks[1]).mean() > 0.999
     assert 0.2 < masks[0][2].mean() < 0.98
-
-
-@pytest.mark.parametrize("size", [(24, 18), (96, 72), (31, 40), (48, 36), (1, 1)])
-def test_a_pixel_counts_where_all_of_it_is_visible(size: tuple[int, int]) -> None:
-    mask = np.random.default_rng(0).random((36, 48)) > 0.1
-    width, height = size
-    actual = resize_mask(mask, width, height)
-    for y in range(height):
-        for x in range(width):
-            rows = slice(y * 36 // height, -(-(y + 1) * 36 // height))
-            columns = slice(x * 48 // width, -(-(x + 1) * 48 // width))
-            assert actual[y, x] == mask[rows, columns].all()
-
-
-def test_photos_keep_their_range_and_mean() -> None:
-    photo = np.random.default_rng(0).random((36, 48, 3)).astype(np.float32).round()
-    large, small = resize_photo(photo, 96, 72), resize_photo(photo, 24, 18)
-    assert (large.shape, small.shape) == ((72, 96, 3), (18, 24, 3))
-    assert 0 <= large.min() <= large.max() <= 1
-    np.testing.assert_allclose(small, photo.reshape(18, 2, 24, 2, 3).mean((1, 3)), atol=1e-6)

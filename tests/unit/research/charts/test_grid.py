@@ -244,7 +244,8 @@ def test_keys_depend_on_what_changes_measurements(made_scene: Path) -> None:
     assert key() == key(BatchOptions(jobs=2), command="another")
     others = [key(measured=EvaluateOptions(("vgg",))), key(BatchOptions(opacity="raw")), key(seed=1)]
     others += [key(BatchOptions(hints=ReadHints(order="none"))), key(grid=Grid(budgets=("1%",)))]
-    assert len({key(), *others}) == 6
+    others += [key(measured=EvaluateOptions((), photo_side=476))]
+    assert len({key(), *others}) == 7
 
 
 def estimate(scene: Path, grid: Grid | None = None) -> float:

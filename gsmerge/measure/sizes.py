@@ -1,0 +1,66 @@
+"""Cameras, photos and masks at other sizes: what is compared is rendered at the size that its photo is resized to."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gsmerge.kernels.pictures import enlarge
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.types import Cameras, Views
+
+SomeViews = TypeVar("SomeViews", bound=Views)
+
+
+def zoom_cameras(cameras: Cameras, zoom: float) -> Cameras:
+    """Resize the cameras' images to ``zoom`` times as many pixels per side, with intrinsics of that size."""
+    long_side = max(cameras.width, cameras.height)
+    factor = max(1, round(zoom * long_side)) / long_side
+    size = max(1, round(cameras.width * factor)), max(1, round(cameras.height * factor))
+    scale = np.array([size[0] / cameras.width, size[1] / cameras.height, 1.0], cameras.Ks.dtype)
+    return replace(cameras, Ks=cameras.Ks * scale[:, None], width=size[0], height=size[1])
+
+
+def shrink_cameras(cameras: Cameras, side: int) -> Cameras:
+    """Resize the cameras' images to ``side`` pixels on the longer side where they have more; 0: leave them."""
+    long_side = max(cameras.width, cameras.height)
+    return zoom_cameras(cameras, side / long_side) if 0 < side < long_side else cameras
+
+
+def shrink_views(views: SomeViews, side: int) -> SomeViews:
+    """Resize photos and cameras together to ``side`` pixels on the longer side where they have more; 0: leave them."""
+    cameras = shrink_cameras(views.cameras, side)
+    if cameras is views.cameras:
+        return views
+    size = cameras.width, cameras.height
+    images = np.stack(parallel_map(lambda photo: resize_photo(photo, *size), views.images))
+    return replace(views, cameras=cameras, images=images)
+
+
+def resize_photo(photo: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Resize a photo ``[h,w,3]`` to a size in pixels: area averages where it is smaller, cubic where it is larger."""
+    if width * height < photo.shape[0] * photo.shape[1]:
+        resized = cv2.resize(photo, (width, height), interpolation=cv2.INTER_AREA)
+    else:
+        resized = enlarge(photo, width, height)
+    return np.asarray(resized).clip(0, 1)
+
+
+def resize_mask(mask: NDArray[np.bool_], width: int, height: int) -> NDArray[np.bool_]:
+    """Resize a mask ``[h,w]``: ``[height,width]``, of which every part of a pixel lies in the mask."""
+    holes = np.pad(np.cumsum(np.cumsum(~mask, 0, dtype=np.int64), 1), ((1, 0), (1, 0)))
+    (top, bottom), (left, right) = (
+        _covered(old, new) for old, new in zip(mask.shape, (height, width), strict=True)
+    )  # fmt: skip
+    inside = holes[bottom][:, right] - holes[top][:, right] - holes[bottom][:, left] + holes[top][:, left]
+    return np.asarray(inside == 0)
+
+
+def _covered(old: int, new: int) -> tuple[np.ndarray, np.ndarray]:
+    """Find the first pixel, and the one after the last, of ``old`` in a row that each of ``new`` pixels overlaps."""
+    pixel = np.arange(new)
+    return pixel * old // new, -(-(pixel + 1) * old // new)

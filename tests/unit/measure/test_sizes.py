@@ -1,0 +1,68 @@
+"""Cameras, photos and masks at other sizes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scenes
+
+from gsmerge.measure.sizes import resize_mask, resize_photo, shrink_cameras, shrink_views, zoom_cameras
+from gsmerge.types import Views
+
+
+def test_intrinsics_go_with_the_size() -> None:
+    cameras = scenes.arc(2, 48, 36)
+    twice = zoom_cameras(cameras, 2)
+    assert (twice.width, twice.height) == (96, 72)
+    np.testing.assert_allclose(twice.Ks[:, :2], 2 * cameras.Ks[:, :2])
+    np.testing.assert_allclose(twice.Ks[:, 2], cameras.Ks[:, 2])
+    odd = zoom_cameras(cameras, 7 / 48)
+    assert (odd.width, odd.height) == (7, 5)
+    assert zoom_cameras(scenes.arc(1, 48, 2), 1 / 16).height == 1
+
+
+@pytest.mark.parametrize("size", [(24, 18), (96, 72), (31, 40), (48, 36), (1, 1)])
+def test_a_pixel_counts_where_all_of_it_is_visible(size: tuple[int, int]) -> None:
+    mask = np.random.default_rng(0).random((36, 48)) > 0.1
+    width, height = size
+    actual = resize_mask(mask, width, height)
+    for y in range(height):
+        for x in range(width):
+            rows = slice(y * 36 // height, -(-(y + 1) * 36 // height))
+            columns = slice(x * 48 // width, -(-(x + 1) * 48 // width))
+            assert actual[y, x] == mask[rows, columns].all()
+
+
+def test_photos_keep_their_range_and_mean() -> None:
+    photo = np.random.default_rng(0).random((36, 48, 3)).astype(np.float32).round()
+    large, small = resize_photo(photo, 96, 72), resize_photo(photo, 24, 18)
+    assert (large.shape, small.shape) == ((72, 96, 3), (18, 24, 3))
+    assert 0 <= large.min() <= large.max() <= 1
+    np.testing.assert_allclose(small, photo.reshape(18, 2, 24, 2, 3).mean((1, 3)), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "side", "expected"),
+    [
+        (48, 36, 24, (24, 18)),
+        (504, 378, 476, (476, 357)),
+        (256, 480, 476, (254, 476)),  # upright
+        (480, 2, 16, (16, 1)),
+        (48, 36, 48, (48, 36)),
+        (48, 36, 476, (48, 36)),  # never larger
+        (48, 36, 0, (48, 36)),
+    ],
+)
+def test_photos_and_cameras_shrink_together(width: int, height: int, side: int, expected: tuple[int, int]) -> None:
+    cameras = scenes.arc(2, width, height)
+    photos = np.random.default_rng(0).random((2, height, width, 3)).astype(np.float32)
+    small = shrink_views(Views(cameras, photos, ("a", "b")), side)
+    assert (small.cameras.width, small.cameras.height) == expected
+    assert small.images.shape == (2, expected[1], expected[0], 3)
+    assert small.names == ("a", "b")
+    assert np.array_equal(small.cameras.Ks, shrink_cameras(cameras, side).Ks)
+    assert np.array_equal(small.cameras.viewmats, cameras.viewmats)
+    corner = cameras.Ks @ np.array([0.3, -0.2, 1])  # where a ray meets the picture, as a share of its sides
+    moved = small.cameras.Ks @ np.array([0.3, -0.2, 1])
+    np.testing.assert_allclose(moved[:, :2] / expected, corner[:, :2] / (width, height), rtol=1e-6)
+    assert small.images.mean() == pytest.approx(photos.mean(), abs=1e-5)
