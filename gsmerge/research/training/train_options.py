@@ -316,6 +316,8 @@ SHIPPED: Mapping[str, Any] = {
     "lpips_weight": 0.06,
     "lpips_start": 0.8,
     "opacity_shift": 0.3,
+    "photo_scale": 1,  # children of K = 4 are smaller than pixels of photos at half the size
+    "window": 128,
     "save_every": 100,
     "validation_crops": 4,
     "validation_windows": 6,
