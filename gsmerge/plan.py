@@ -99,14 +99,18 @@ class Plan:
         return replace(self, fit=fit, superpixels=replace(self.superpixels, start_share=start_share))
 
 
-def make_plan(prepared: Prepared, options: CompactOptions) -> Plan:
-    """Decide everything that the options leave open; raise UsageError if scene or checkpoint cannot do it."""
+def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoint | None = None) -> Plan:
+    """Decide everything that the options leave open; raise UsageError if scene or checkpoint cannot do it.
+
+    ``checkpoint``: in the place of the one that the options name.
+    """
     given, scene, effort = prepared.given, prepared.scene, EFFORTS[options.effort]
     _check_photos(given, options)
-    own = options.method == "gsmerge"  # baselines learn nothing
+    own = options.method == "gsmerge"
     with stage("prepare"):
         has_photos = scene.images is not None and bool(prepared.photo_views)
-        checkpoint = load_networks(options, given, photos=has_photos) if own else None
+        if checkpoint is None and own:  # baselines learn nothing
+            checkpoint = load_networks(options, given, photos=has_photos)
         segment = _resolve_superpixels(options.segment, scene, effort)
         clean_options = options.clean
         if clean_options.drop_sky and not prepared.photo_views:

@@ -12,7 +12,7 @@ import scenes
 from gsmerge import Compactor, Scene
 from gsmerge.online.state import GroupSet, OnlineState
 from gsmerge.stages.merge import take
-from gsmerge.types import SH_C0, Gaussians
+from gsmerge.types import SH_C0, FeatureGaussians, Gaussians
 
 FAST: dict[str, Any] = {"superpixels": "10%", "checkpoint": "none"}
 
@@ -58,17 +58,34 @@ def same_state(one: OnlineState, other: OnlineState) -> None:
     np.testing.assert_array_equal(one.replay.views, other.replay.views)
     assert asdict(one.settings) == asdict(other.settings)
     assert one.about == other.about
+    assert (one.networks is None) == (other.networks is None)
+    if one.networks is not None:
+        for name in ("means", "opacities", "sh0"):
+            np.testing.assert_array_equal(getattr(one.networks.samples, name), getattr(other.networks.samples, name))
+        assert one.networks.weights.options == other.networks.weights.options
+        arrays = one.networks.weights.arrays
+        assert all(np.array_equal(array, other.networks.weights.arrays[name]) for name, array in arrays.items())
 
 
 def same_groups(one: GroupSet, other: GroupSet) -> None:
     """To the last bit, types included."""
-    for f in fields(one.features):
-        a, b = getattr(one.features, f.name), getattr(other.features, f.name)
-        assert a.dtype == b.dtype, f.name
-        np.testing.assert_array_equal(a, b, f.name)
+    same_features(one.features, other.features)
+    assert (one.learned is None) == (other.learned is None)
+    if one.learned is not None:
+        same_features(one.learned.refined, other.learned.refined)
+        np.testing.assert_array_equal(one.learned.views, other.learned.views)
+        np.testing.assert_array_equal(one.learned.num_members, other.learned.num_members)
     assert scenes.identical(one.children, other.children)
     np.testing.assert_array_equal(one.fitted_sh0, other.fitted_sh0)
     np.testing.assert_array_equal(one.color_precision, other.color_precision)
+
+
+def same_features(one: FeatureGaussians, other: FeatureGaussians) -> None:
+    """To the last bit, types included."""
+    for f in fields(one):
+        a, b = getattr(one, f.name), getattr(other, f.name)
+        assert a.dtype == b.dtype, f.name
+        np.testing.assert_array_equal(a, b, f.name)
 
 
 def group(groups: GroupSet, row: int) -> tuple[dict[str, np.ndarray], Gaussians]:

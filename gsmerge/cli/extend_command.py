@@ -17,10 +17,10 @@ from gsmerge.errors import UsageError
 @opt.command(
     opt.argument("state", Path, "STATE", "A .gsm file: of gsmerge extend or encode, or made by the first batch."),
     opt.argument("scenes", list[Path], "SCENE", "Batches of new views, in order: each a scene as of compact."),
-    f"{opt.READING} k superpixels budget",
+    f"{opt.READING} k superpixels",
     opt.changed("max_k", help="Most Gaussians per superpixel that can be decoded later: fixed by the first batch.",
                 show_default="4"),
-    "effort checkpoint set",
+    "effort recipe checkpoint set",
     opt.RUN,
 )  # fmt: skip
 def extend(args: opt.Args) -> None:

@@ -23,12 +23,24 @@ class Division:
     K - 1 with one of them replaced by its halves. A third of the members' bytes, and nothing to pool when decoding.
     """
 
-    splits: np.ndarray  # [g] uint8, times that each group is split
+    # [g] uint8, times that each group is split. Where heads make the children of nothing, that is all there is, and
+    # the three arrays after it are empty.
+    splits: np.ndarray
     slots: np.ndarray  # [s] uint8, which child, counted in order from 0, each split replaces; group by group
     # [w] int64, rising: the groups whose members are all alike. Asked for more, they give one child.
     uniform: np.ndarray
     children: Gaussians  # 2s + w Gaussians, canonical: two for each split, then one for each of `uniform`
     growth_order: np.ndarray  # [d] int64, the group that each further Gaussian goes to, where it helps most first
+
+    @property
+    def by_heads(self) -> bool:
+        """Whether heads make the children of nothing."""
+        return len(self.slots) < self.num_splits
+
+    @property
+    def num_splits(self) -> int:
+        """Number of further Gaussians that all groups give together."""
+        return int(self.splits.sum(dtype=np.int64))
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +113,7 @@ class Encoded(StoredScene):
     @property
     def max_gaussians(self) -> int:
         """Largest number of Gaussians that the scene decodes to."""
-        return len(self) + len(self.division.slots) + self.num_kept
+        return len(self) + self.division.num_splits + self.num_kept
 
 
 def without_members(features: FeatureGaussians) -> FeatureGaussians:

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
@@ -29,6 +29,9 @@ from gsmerge.io.cameras.camera_file import check_camera, check_size
 from gsmerge.stages.decode import MAX_CHILDREN
 from gsmerge.stages.prepare import Frame
 from gsmerge.types import Array, Cameras, FeatureGaussians, Gaussians, as_array
+
+if TYPE_CHECKING:
+    from gsmerge.networks.weights import NetworkWeights
 
 SCHEMA, MINOR = 1, 1  # files of a larger schema cannot be read; minor: what was added since the schema's first files
 SUFFIX = ".gsm"
@@ -57,7 +60,8 @@ ENTRIES: dict[str, dict[str, Any]] = {  # types of the header's entries, by kind
     STATE: COMMON_ENTRIES,
 }
 PREFIXES = (
-    "features.", "division.", "children.", "kept.", "cameras.", "frame.", "heads.", "networks.", "replay.",
+    "features.", "division.", "children.", "kept.", "cameras.", "frame.", "heads.", "networks.", "replay.", "refined.",
+    "samples.",
 )  # fmt: skip
 FEATURE_COLUMNS = tuple(f.name for f in fields(FeatureGaussians) if f.name not in ("starts", "members", "views"))
 
@@ -241,6 +245,18 @@ class GsmFile:
             check_size(self.path, f"{i}", K, (width, height))
         return Cameras(viewmats, Ks, width, height)
 
+    def networks(self) -> NetworkWeights | None:
+        """Return the networks; None without any."""
+        options, prefix = self.header.get("networks"), "networks."
+        if options is None:
+            return None
+        from gsmerge.networks.checkpoint import build_networks
+
+        if not isinstance(options, dict):
+            raise self.error(f"expected networks in the header, found {options!r:.40}")
+        arrays = {name.removeprefix(prefix): array for name, array in self.arrays.items() if name.startswith(prefix)}
+        return build_networks(self.path, options, arrays, REMEDY)
+
     def settings(self) -> StoredSettings:
         """Return the settings that this version knows, each within its range."""
         values: dict[str, Any] = {}
@@ -340,14 +356,11 @@ def _read_division(file: GsmFile, features: FeatureGaussians) -> Division:
 
 def _read_heads(file: GsmFile, features: FeatureGaussians, num_views: int) -> StoredHeads | None:
     """Return the networks and their descriptions of the groups; None without networks."""
-    header, prefix = file.header, "networks."
-    if header["networks"] is None:
+    networks = file.networks()
+    if networks is None:
         return None
-    from gsmerge.networks.checkpoint import build_networks
     from gsmerge.networks.options import GROUP
 
-    arrays = {name.removeprefix(prefix): array for name, array in file.arrays.items() if name.startswith(prefix)}
-    networks = build_networks(file.path, header["networks"], arrays, REMEDY)
     views = file.array("heads.views", np.int32, len(features)).astype(np.int64)
     if len(views) and not 0 <= int(views.min()) <= int(views.max()) < num_views:
         raise file.error("heads.views: expected views of the scene, found others")

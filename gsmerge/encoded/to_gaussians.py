@@ -113,9 +113,14 @@ def decode_scene(
 
 def children_of(encoded: Encoded, counts: np.ndarray) -> tuple[Gaussians, np.ndarray]:
     """Return at most ``counts [g]`` canonical Gaussians of each group, also faint, and the rising group of each."""
-    features, heads = encoded.features, encoded.heads
-    rows, parents = pick_children(encoded.division, counts)
-    gaussians = Gaussians.concat([feature_to_gaussians(features), encoded.division.children])[rows]
+    features, heads, division = encoded.features, encoded.heads, encoded.division
+    if division.by_heads:
+        sizes = np.minimum(counts, division.splits.astype(np.int64) + 1)
+        parents = np.repeat(np.arange(len(features)), sizes)
+        gaussians = feature_to_gaussians(features)[parents]
+    else:
+        rows, parents = pick_children(division, counts)
+        gaussians = Gaussians.concat([feature_to_gaussians(features), division.children])[rows]
     if heads is not None:
         from gsmerge.networks.apply import NetworkContext, decode_with_group_features
         from gsmerge.networks.tokens import make_group_features
@@ -162,6 +167,24 @@ def divide_all(features: FeatureGaussians, members: Members, max_k: int) -> Divi
         uniform=uniform,
         children=Gaussians.concat([halves, uniform_children]),
         growth_order=deal_order(features, members, max_k),
+    )
+
+
+def divide_by_heads(features: FeatureGaussians, num_members: np.ndarray, max_k: int) -> Division:
+    """Return up to ``max_k`` children of every group that heads with absolute outputs make, no more than its members.
+
+    Further Gaussians go where each stands for the most pixels, by the opacity of the groups' members.
+    """
+    splits = np.minimum(num_members, max_k) - 1
+    steps = np.arange(1, max_k)
+    shares = np.where(steps <= splits[:, None], features.weights[:, None] / steps, -np.inf)
+    order = np.argsort(-shares.reshape(-1), kind="stable")[: int(splits.sum())]
+    return Division(
+        splits=splits.astype(np.uint8),
+        slots=np.zeros(0, np.uint8),
+        uniform=np.zeros(0, np.int64),
+        children=feature_to_gaussians(features)[:0],
+        growth_order=order // max(1, max_k - 1),
     )
 
 

@@ -36,15 +36,25 @@ class GroupFeatures:
 
 def compute_group_features(features: FeatureGaussians, members: Members, cameras: Cameras) -> GroupFeatures:
     """Compute the networks' inputs for Feature Gaussians."""
-    views = _choose_views(features, members, cameras)
+    views = choose_views(features, members, cameras)
+    stats = cross_view_stats(features.means, features.sh0, views, members, cameras)
+    return describe_features(features, views, np.diff(features.starts), stats, cameras)
+
+
+def describe_features(
+    features: FeatureGaussians, views: np.ndarray, num_members: np.ndarray, stats: np.ndarray, cameras: Cameras
+) -> GroupFeatures:
+    """Compute the networks' inputs from what the Feature Gaussians do not have themselves.
+
+    These are their ``views [g]``, ``num_members [g]`` and the agreement ``stats [g,7]`` of other views.
+    """
     bare = make_group_features(features, views, np.zeros((len(features), GROUP), np.float32), cameras)
     base, group = bare.base, np.empty((len(features), GROUP), np.float32)
     sums = (in_order(getattr(features, name)) for name in ("covars", "masses", "extinctions", "weights"))
     describe_groups(
-        base.means, base.scales, base.opacities, base.sh0, *sums, np.diff(features.starts), bare.footprints,
+        base.means, base.scales, base.opacities, base.sh0, *sums, num_members, bare.footprints,
         bare.frames, bare.sizes, _viewmats(cameras), views, group,
     )  # fmt: skip
-    stats = cross_view_stats(features.means, features.sh0, views, members, cameras)
     group[:, GROUP - NUM_STATS :] = np.nan_to_num(stats)
     return replace(bare, group=group)
 
@@ -73,7 +83,7 @@ def _viewmats(cameras: Cameras) -> np.ndarray:
     return np.ascontiguousarray(as_array(cameras.viewmats), np.float64)
 
 
-def _choose_views(features: FeatureGaussians, members: Members, cameras: Cameras) -> np.ndarray:
+def choose_views(features: FeatureGaussians, members: Members, cameras: Cameras) -> np.ndarray:
     """Choose the view of each Feature Gaussian, ``[g]`` int64: its own, or if merged the one with most opacity."""
     views = features.views.copy()
     merged = np.flatnonzero(views < 0)

@@ -11,14 +11,14 @@ from gsmerge.geometry import normalize
 from gsmerge.kernels.matrices import matmul
 from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.online.options import OnlineOptions
-from gsmerge.online.state import GroupSet, Replay, replace_groups, select_groups
-from gsmerge.render.photos import Photos, photo_errors, photos_of
+from gsmerge.online.state import GroupSet, Replay, replace_groups, resize_cameras, select_groups
+from gsmerge.render.photos import Photos, photo_errors, photos_of, scene_pictures
 from gsmerge.render.weights import apply_transposed
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.fit import FitReport
 from gsmerge.stages.fit.color import draw, fit_colors
 from gsmerge.stages.fit.fit_options import FitOptions
-from gsmerge.types import Cameras, FeatureGaussians, Gaussians
+from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Scene
 
 REACH = 3.34  # standard deviations to where an opaque Gaussian adds 1/255
 MARGIN = 2.0  # pixels that the rasterizer's low-pass adds to that
@@ -48,16 +48,15 @@ def resize_photos(images: np.ndarray, cameras: Cameras, width: int, height: int)
     return BatchPhotos(np.stack(small), resize_cameras(cameras, width, height))
 
 
-def resize_cameras(cameras: Cameras, width: int, height: int) -> Cameras:
-    """Return the same views in pictures of another size."""
-    shape = np.array([[width / cameras.width], [height / cameras.height], [1.0]])
-    return Cameras(cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64) * shape, width, height)
+def photos_of_batch(scene: Scene, known: Cameras | None) -> tuple[BatchPhotos, np.ndarray]:
+    """Return a scene's photos at the size of the ``known`` views, and which of all views they are, ``[v]``.
 
-
-def concat_cameras(first: Cameras, second: Cameras) -> Cameras:
-    """Concatenate cameras of one size."""
-    viewmats = np.concatenate([first.viewmats, second.viewmats], dtype=np.float64)
-    return Cameras(viewmats, np.concatenate([first.Ks, second.Ks], dtype=np.float64), first.width, first.height)
+    Without photos, the colours of the Gaussians stand in for them; without known views, the scene's are the first.
+    """
+    cameras = scene.cameras
+    size = cameras if known is None else known
+    photos = resize_photos(scene_pictures(scene), cameras, size.width, size.height)
+    return photos, np.arange(len(photos)) if known is None else view_ids(known, photos.cameras)
 
 
 def view_ids(known: Cameras, cameras: Cameras) -> np.ndarray:
@@ -114,14 +113,16 @@ def fit_batch_colors(
     return replace_groups(groups, rows, refitted), report
 
 
-def groups_in_view(features: FeatureGaussians, cameras: Cameras) -> np.ndarray:
+def groups_in_view(features: FeatureGaussians, cameras: Cameras, reach: float = REACH) -> np.ndarray:
     """Return a mask ``[v,g]`` of groups that may show in each view, by their position and size.
+
+    ``reach``: how far a group shows, in standard deviations of all its axes together.
 
     The only step that goes through all groups: the time of those after it depends on what the views
     see.
     """
     means = features.means.astype(np.float64)
-    radii = REACH * np.sqrt(np.trace(features.covars, axis1=1, axis2=2, dtype=np.float64))
+    radii = reach * np.sqrt(np.trace(features.covars, axis1=1, axis2=2, dtype=np.float64))
     viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
 
     def one_view(view: int) -> np.ndarray:
@@ -138,9 +139,9 @@ def groups_in_view(features: FeatureGaussians, cameras: Cameras) -> np.ndarray:
     return np.stack(parallel_map(one_view, range(len(cameras))))
 
 
-def rows_in_view(features: FeatureGaussians, cameras: Cameras) -> np.ndarray:
-    """Return the rising rows of the groups that may show in some view."""
-    return np.flatnonzero(groups_in_view(features, cameras).any(0))
+def rows_in_view(features: FeatureGaussians, cameras: Cameras, reach: float = REACH) -> np.ndarray:
+    """Return the rising rows of the groups that may show in some view, see :func:`groups_in_view`."""
+    return np.flatnonzero(groups_in_view(features, cameras, reach).any(0))
 
 
 def pixel_errors(gaussians: Gaussians, photos: Photos, height: int, width: int) -> np.ndarray:
@@ -163,17 +164,21 @@ def group_errors(features: FeatureGaussians, members: Members, errors: np.ndarra
 
 def novel_rows(
     there: Gaussians,
+    own: Gaussians,
     features: FeatureGaussians,
     members: Members,
     photos: Photos,
     cameras: Cameras,
     options: OnlineOptions,
 ) -> np.ndarray:
-    """Return the rows of a batch's groups that show half-size photos better than the state's Gaussians ``there``."""
+    """Return the rows of a batch's groups whose ``own`` Gaussians show half-size photos better than ``there``.
+
+    These are the Gaussians of the state.
+    """
     if options.tolerance == 0:
         return np.arange(len(features))
     size = cameras.height, cameras.width
     errors = group_errors(features, members, pixel_errors(there, photos, *size))
-    own_errors = group_errors(features, members, pixel_errors(feature_to_gaussians(features), photos, *size))
+    own_errors = group_errors(features, members, pixel_errors(own, photos, *size))
     limit = np.maximum(options.tolerance**2, options.margin**2 * own_errors)
     return np.flatnonzero(errors > limit)

@@ -10,28 +10,26 @@ import numpy as np
 
 from gsmerge import __version__
 from gsmerge.budget import AUTO
-from gsmerge.encoded.encoded import StoredSettings
 from gsmerge.errors import UsageError
 from gsmerge.moments import feature_to_gaussians
 from gsmerge.online.batch_photos import (
     BatchPhotos,
-    concat_cameras,
     fit_batch_colors,
     novel_rows,
-    resize_cameras,
-    resize_photos,
+    photos_of_batch,
     rows_in_view,
     update_replay,
-    view_ids,
 )
+from gsmerge.online.extend_features import add_features, keeps_features, own_checkpoint
 from gsmerge.online.options import OnlineOptions
 from gsmerge.online.state import (
     GroupSet,
     OnlineState,
     bake,
     concat_groups,
+    first_state,
+    grown_state,
     limit_children,
-    no_photos,
     replace_groups,
     select_groups,
     with_fitted_colors,
@@ -39,8 +37,7 @@ from gsmerge.online.state import (
 from gsmerge.options import CompactOptions
 from gsmerge.pipeline import build, merge_views
 from gsmerge.plan import Plan, make_plan, require_children
-from gsmerge.render.photos import scene_pictures
-from gsmerge.runtime.record import Progress, choose, record_run, stage
+from gsmerge.runtime.record import Progress, choose, note, record_run, stage
 from gsmerge.runtime.threads import use_threads
 from gsmerge.search import choose_count
 from gsmerge.stages.decode import USUAL_K, keep_all
@@ -48,7 +45,7 @@ from gsmerge.stages.fit import visible_mask
 from gsmerge.stages.match import MatchOptions, match
 from gsmerge.stages.merge import MergedViews, merge, take
 from gsmerge.stages.prepare import Prepared, prepare
-from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches, Scene
+from gsmerge.types import FeatureGaussians, Gaussians, Matches, Scene
 
 
 @dataclass(frozen=True)
@@ -57,7 +54,7 @@ class BatchReport:
 
     num_views: int
     num_input: int  # Gaussians of the batch
-    num_new: int  # Groups that it became, merged across its own views
+    num_new: int  # Groups that it became, merged across its own views; with networks kept, before that
     num_covered: int  # Of these, left out because the state shows their pixels as well
     num_joined: int  # Of the rest, those that were merged into groups of the state
     num_hidden: int  # Of the rest, left out because none of the batch's views shows them
@@ -91,14 +88,19 @@ def extend(
     with use_threads(options.threads), record_run(progress) as record:
         fixed = replace(options.prepare, poses="fixed", exposure="fixed")  # as all other batches
         prepared = prepare(scene.numpy(), fixed, None if state is None else state.frame)
-        plan = make_plan(prepared, options)
+        plan = make_plan(prepared, options, None if state is None else own_checkpoint(state, options))
         plan = plan.with_fit(replace(plan.fit, min_contribution=options.fit.min_contribution))  # in drafts, too
         require_children("max k", max_k, plan.checkpoint)
         count = choose_count(prepared, plan, build)
         if keep_all(prepared.scene, count) is not None:
             raise UsageError(f"budget: {count} keeps every Gaussian, which needs no state; use compact")
-        merged = merge_views(prepared, plan, count)
-        state, counts = _add_batch(state, prepared, plan, merged, online, max_k)
+        if keeps_features(plan) if state is None else state.networks is not None:
+            state, counts = add_features(state, prepared, plan, count, online, max_k)
+        else:
+            if state is not None and keeps_features(plan):
+                note("the state holds no latents: groups of this batch are decoded when they enter")
+            merged = merge_views(prepared, plan, count)
+            state, counts = _add_batch(state, prepared, plan, merged, online, max_k)
     numbers = {"num_views": len(prepared.scene), "num_input": scene.num_gaussians, **counts, "num_groups": len(state)}
     settings = options.to_dict() | asdict(online)
     stored = {name: value for name, value in settings.items() if name != "threads"}  # which depend on the machine
@@ -119,26 +121,25 @@ def _add_batch(
 ) -> tuple[OnlineState, dict[str, int]]:
     """Add a batch to the state; return it, and the numbers of the batch's groups by key of the report."""
     scene = prepared.scene
-    size = scene.cameras if state is None else state.cameras
-    photos = resize_photos(scene_pictures(scene), scene.cameras, size.width, size.height)
+    photos, ids = photos_of_batch(scene, None if state is None else state.cameras)
     counts = {"num_new": len(merged.features), "num_covered": 0, "num_joined": 0, "num_hidden": 0}
     features, rows = merged.features, np.zeros(0, np.int64)
     if state is not None:
         with stage("cover"):
             rows = rows_in_view(state.groups.features, photos.cameras)
             there = feature_to_gaussians(with_fitted_colors(select_groups(state.groups, rows)).features)
-            novel = novel_rows(there, features, merged.members, photos.photos(2), scene.cameras, online)
+            own = feature_to_gaussians(features)
+            novel = novel_rows(there, own, features, merged.members, photos.photos(2), scene.cameras, online)
             counts["num_covered"] = len(features) - len(novel)
             features = take(features, novel)
     with stage("decode"):
         new = bake(features, merged.members, merged.networks, max_k)
-    ids = np.arange(len(photos)) if state is None else view_ids(state.cameras, photos.cameras)
     with stage("join"):
         if state is None:
-            state = _first_state(new, prepared, plan, max_k)
+            state = first_state(new, prepared, plan, max_k)
         else:
             groups, entered = _enter(state.groups, new, prepared, plan, photos, rows, max_k)
-            state = _grown_state(state, groups, prepared, plan, photos.cameras[ids >= len(state.cameras)])
+            state = grown_state(state, groups, prepared, plan, photos.cameras[ids >= len(state.cameras)])
             counts |= entered
     if prepared.given.images is None:
         return state, counts
@@ -210,40 +211,3 @@ def merge_into(groups: GroupSet, new: GroupSet, rows: np.ndarray, max_k: int) ->
     fitted_sh0 = np.where((old.color_precision > 0)[:, None, None], old.fitted_sh0, features.sh0)
     merged = GroupSet(replace(features, members=np.arange(len(children))), children, fitted_sh0, old.color_precision)
     return replace_groups(groups, rows, limit_children(merged, max_k))
-
-
-def _first_state(groups: GroupSet, prepared: Prepared, plan: Plan, max_k: int) -> OnlineState:
-    """Make the state of a first batch."""
-    cameras = prepared.scene.cameras
-    settings = StoredSettings(
-        num_input=prepared.given.num_gaussians,
-        k=AUTO if plan.auto_count else plan.decode.k,
-        max_k=max_k,
-        min_opacity=plan.decode.min_opacity,
-        min_contribution=plan.fit.min_contribution if prepared.given.images is not None else 0.0,
-    )
-    return OnlineState(
-        groups=groups,
-        kept=plan.unseen,
-        frame=prepared.frame,
-        cameras=resize_cameras(cameras, cameras.width, cameras.height),
-        replay=no_photos(cameras),
-        settings=settings,
-        about={},
-    )
-
-
-def _grown_state(
-    state: OnlineState, groups: GroupSet, prepared: Prepared, plan: Plan, new_cameras: Cameras
-) -> OnlineState:
-    """Return the state with other groups, and with the views and unseen Gaussians of a further batch."""
-    kept = [gaussians for gaussians in (state.kept, plan.unseen) if gaussians is not None]
-    num_input = state.settings.num_input + prepared.given.num_gaussians
-    k = AUTO if plan.auto_count else plan.decode.k
-    return replace(
-        state,
-        groups=groups,
-        kept=Gaussians.concat(kept) if kept else None,
-        cameras=concat_cameras(state.cameras, new_cameras),
-        settings=replace(state.settings, num_input=num_input, k=k),
-    )

@@ -4,27 +4,42 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, fields, replace
 from os import PathLike
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from gsmerge.compact_file import read_input
-from gsmerge.encoded.encoded import Encoded
-from gsmerge.encoded.gsm_file import ENCODED, STATE, GsmFile, read_encoded, read_gsm, write_gsm
+from gsmerge.encoded.encoded import Encoded, without_members
+from gsmerge.encoded.gsm_file import ENCODED, MINOR, STATE, GsmFile, read_encoded, read_gsm, write_gsm
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import AUTO, ReadHints, SceneFiles, atomic_output
 from gsmerge.io.formats.ply import OpacityChoice
 from gsmerge.online.extend import extend
 from gsmerge.online.options import merge_settings
-from gsmerge.online.state import GroupSet, OnlineState, Replay, from_encoded, with_child_rows
+from gsmerge.online.state import (
+    GroupSet,
+    Learned,
+    OnlineState,
+    Replay,
+    StateNetworks,
+    ViewSamples,
+    from_encoded,
+    with_child_rows,
+)
 from gsmerge.report import document_head, seconds_document
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.record import Progress
-from gsmerge.types import Cameras
+from gsmerge.types import Cameras, FeatureGaussians
+
+if TYPE_CHECKING:
+    from gsmerge.networks.weights import NetworkWeights
+
+REFINED = ("means", "covars", "masses", "extinctions", "sh0", "latents")  # columns that the refiner changes
+HEAD_COUNTS = ("views", "num_members")
 
 
 def save_state(path: str | PathLike[str], state: OnlineState, *, overwrite: bool = False) -> None:
@@ -38,7 +53,20 @@ def save_state(path: str | PathLike[str], state: OnlineState, *, overwrite: bool
         "replay.views": replay.views.astype(np.int32),
     }
     entries, children = {"about": dict(state.about)}, ("children", groups.children)
+    if state.networks is not None and groups.learned is not None:
+        more_entries, more_arrays = _learned_parts(state.networks, groups.learned)
+        entries, arrays = entries | more_entries, arrays | more_arrays
     write_gsm(path, STATE, state, groups.features, children, entries, arrays, overwrite=overwrite)
+
+
+def _learned_parts(networks: StateNetworks, learned: Learned) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Return header entries and arrays of what a state with networks has more."""
+    weights, samples = networks.weights, networks.samples
+    arrays = {f"refined.{name}": getattr(learned.refined, name) for name in REFINED}
+    arrays |= {f"heads.{name}": getattr(learned, name).astype(np.int32) for name in HEAD_COUNTS}
+    arrays |= {f"samples.{f.name}": getattr(samples, f.name) for f in fields(ViewSamples)}
+    arrays |= {f"networks.{name}": array for name, array in weights.arrays.items()}
+    return {"networks": asdict(weights.options), "minor": MINOR + 1}, arrays
 
 
 def load_state(path: str | PathLike[str]) -> OnlineState:
@@ -59,25 +87,59 @@ def load_stored(path: str | PathLike[str]) -> Encoded | OnlineState:
     about, settings = file.header["about"], file.settings()
     if not (isinstance(about.get("options"), dict) and isinstance(about.get("batches"), list)):
         raise file.error("about: expected options and batches in the header, found none")
-    groups = _read_groups(file, settings.max_k)
+    weights = file.networks()
+    groups = _read_groups(file, settings.max_k, weights)
     common = file.common(groups.children.shN.shape[1])
+    networks = None
+    if weights is not None:
+        num_views = len(common["cameras"])
+        groups = replace(groups, learned=_read_learned(file, groups.features, weights, num_views))
+        networks = StateNetworks(weights, _read_samples(file, num_views))
     replay = _read_replay(file, common["cameras"])
-    return OnlineState(groups=groups, replay=replay, settings=settings, about=about, **common)
+    return OnlineState(groups=groups, replay=replay, settings=settings, about=about, networks=networks, **common)
 
 
-def _read_groups(file: GsmFile, max_k: int) -> GroupSet:
-    """Return the groups, each with at least one child and no more than ``max_k``."""
+def _read_groups(file: GsmFile, max_k: int, weights: NetworkWeights | None) -> GroupSet:
+    """Return the groups, each with 1 to ``max_k`` children, or without any where heads make them."""
     features = file.features()
     g = len(features)
+    least, most = (0, 0) if weights is not None and weights.options.outputs == "absolute" else (1, max_k)
     counts = file.array("children.counts", np.uint8, g).astype(np.int64)
-    if g and not 1 <= int(counts.min()) <= int(counts.max()) <= max_k:
-        raise file.error(f"children.counts: expected 1 to {max_k}, found others")
+    if g and not least <= int(counts.min()) <= int(counts.max()) <= most:
+        raise file.error(f"children.counts: expected {least} to {most}, found others")
     return GroupSet(
         features=with_child_rows(features, np.arange(g).repeat(counts)),
         children=file.gaussians("children", int(counts.sum()), features.shN.shape[1]),
         fitted_sh0=file.array("features.fitted_sh0", np.float32, g, 1, 3),
         color_precision=file.array("features.color_precision", np.float32, g),
     )
+
+
+def _read_learned(file: GsmFile, features: FeatureGaussians, weights: NetworkWeights, num_views: int) -> Learned:
+    """Return what a state with networks has more of its groups, with every view and number in its range."""
+    g, latent = len(features), weights.options.latent
+    if features.latents.shape[1] != latent:
+        expected = f"features.latents: expected {latent} numbers, as of its networks"
+        raise file.error(f"{expected}, found {features.latents.shape[1]}")
+    shapes: dict[str, tuple[int, ...]] = {"means": (3,), "covars": (3, 3), "sh0": (1, 3), "latents": (latent,)}
+    columns = {name: file.array(f"refined.{name}", np.float32, g, *shapes.get(name, ())) for name in REFINED}
+    counts = {name: file.array(f"heads.{name}", np.int32, g).astype(np.int64) for name in HEAD_COUNTS}
+    views, sizes = counts["views"], counts["num_members"]
+    if g and not 0 <= int(views.min()) <= int(views.max()) < num_views:
+        raise file.error("heads.views: expected views of the state, found others")
+    if g and int(sizes.min()) < 1:
+        raise file.error(f"heads.num_members: expected at least 1, found {sizes.min()}")
+    return Learned(replace(without_members(features), **columns), **counts)
+
+
+def _read_samples(file: GsmFile, num_views: int) -> ViewSamples:
+    """Return the Gaussians of some pixels of every view, which are as many of each."""
+    opacities = file.array("samples.opacities", np.float32, num_views, None, None)
+    shape = *opacities.shape, 3
+    if 0 in shape[1:]:
+        raise file.error(f"samples.opacities: expected pixels of every view, found {list(opacities.shape)}")
+    means, sh0 = (file.array(f"samples.{name}", np.float32, *shape) for name in ("means", "sh0"))
+    return ViewSamples(means, opacities, sh0)
 
 
 def _read_replay(file: GsmFile, cameras: Cameras) -> Replay:

@@ -10,6 +10,9 @@ from gsmerge.encoded.encoded import StoredScene
 from gsmerge.options import CompactOptions
 from gsmerge.stages.decode import MAX_CHILDREN
 
+# Settings of this module under the name of a recipe, see gsmerge.options.RECIPES
+RECIPES: Mapping[str, Mapping[str, Any]] = {"paper": {"tolerance": 0.0, "replay": 0}}
+
 
 @dataclass(frozen=True)
 class OnlineOptions:
@@ -19,11 +22,12 @@ class OnlineOptions:
         max_k: Most Gaussians of a group that can be decoded later, 1 to 8; an existing state keeps its own.
         tolerance: A new group is left out where the state shows its pixels with a colour error (root mean square,
             sRGB in [0, 1], holes counted) below this, or no larger than ``margin`` times that of the new views' own
-            Gaussians. 0: nothing is left out.
+            Gaussians. 0: nothing is left out, which is what the recipe ``"paper"`` sets.
         margin: See ``tolerance``.
         replay: Most photos that are stored, spread evenly over all views, for a full fit when decoding. Colours are
-            fitted batch by batch and need none.
-        fit_colors: Fit the base colours to the photos of each batch.
+            fitted batch by batch and need none. The recipe ``"paper"`` sets 0: it has no fit.
+        fit_colors: Fit the base colours to the photos of each batch; not of groups that keep their latents, whose
+            colours are those of the heads.
 
     Raises:
         ValueError: If a setting is out of range.
@@ -54,6 +58,7 @@ def merge_settings(
     known = names | CompactOptions().to_dict().keys()
     stored = {} if state is None else state.about["options"]
     before = {name: value for name, value in stored.items() if name in known}
-    merged = {"fit": "none"} | before | dict(settings)
+    recipe = settings.get("recipe", before.get("recipe"))
+    merged = {"fit": "none"} | dict(RECIPES.get(str(recipe), {})) | before | dict(settings)
     online = OnlineOptions(**{name: merged.pop(name) for name in names if name in merged})
     return CompactOptions().with_settings(merged), online

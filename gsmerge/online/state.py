@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from gsmerge import __version__
-from gsmerge.encoded.encoded import Encoded, StoredScene, without_members
-from gsmerge.encoded.to_gaussians import children_of, divide_all
+from gsmerge.budget import AUTO
+from gsmerge.encoded.encoded import Encoded, StoredHeads, StoredScene, StoredSettings, without_members
+from gsmerge.encoded.to_gaussians import children_of, divide_all, divide_by_heads
 from gsmerge.geometry import covariances
 from gsmerge.kernels.elementary import log1p
 from gsmerge.moments import MAX_OPACITY, Members, feature_to_gaussians, gaussian_members
@@ -19,6 +20,10 @@ from gsmerge.types import Cameras, FeatureGaussians, Gaussians, to_float32
 
 if TYPE_CHECKING:
     from gsmerge.networks.apply import NetworkContext
+    from gsmerge.networks.tokens import GroupFeatures
+    from gsmerge.networks.weights import NetworkWeights
+    from gsmerge.plan import Plan
+    from gsmerge.stages.prepare import Prepared
 
 CHILD_FOOTPRINT = 1e-3  # of the group's: children need no least size, as it is in their own
 
@@ -40,22 +45,110 @@ def no_photos(cameras: Cameras) -> Replay:
 
 
 @dataclass(frozen=True, eq=False)
+class ViewSamples:
+    """Gaussians of some pixels of every view, on a grid: what the views say of groups of other views."""
+
+    means: np.ndarray  # [v,h,w,3] float32, canonical
+    opacities: np.ndarray  # [v,h,w] float32, 0 where the pixel has no Gaussian
+    sh0: np.ndarray  # [v,h,w,3] float32
+
+    @staticmethod
+    def concat(parts: list[ViewSamples]) -> ViewSamples:
+        """Concatenate the views of all parts."""
+        names = [f.name for f in fields(ViewSamples)]
+        return ViewSamples(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+    def describe(
+        self, features: FeatureGaussians, views: np.ndarray, num_members: np.ndarray, cameras: Cameras
+    ) -> GroupFeatures:
+        """Compute the networks' inputs for Feature Gaussians of ``views [g]`` among all ``cameras``."""
+        from gsmerge.networks.cross_view_stats import cross_view_stats
+        from gsmerge.networks.tokens import describe_features
+
+        height, width = self.opacities.shape[1:]
+        nothing = np.zeros((0, 0), np.float32)  # which statistics do not read
+        members = Members(
+            means=self.means.reshape(-1, 3),
+            quats=nothing,
+            scales=nothing,
+            opacities=self.opacities.reshape(-1),
+            sh0=self.sh0.reshape(-1, 1, 3),
+            shN=nothing,
+            footprints=nothing,
+        )
+        grid = resize_cameras(cameras, width, height)
+        stats = cross_view_stats(features.means, features.sh0, views, members, grid)
+        return describe_features(features, views, num_members, stats, cameras)
+
+
+def sample_views(members: Members, cameras: Cameras, shape: tuple[int, int]) -> ViewSamples:
+    """Take the Gaussians of the pixels in the middles of a grid of ``shape``; of an unaligned scene there are none."""
+    (height, width), num_views = shape, len(cameras)
+    rows = ((2 * np.arange(height) + 1) * cameras.height) // (2 * height)
+    columns = ((2 * np.arange(width) + 1) * cameras.width) // (2 * width)
+    pixels = (rows[:, None] * cameras.width + columns).reshape(-1)
+    ids = (np.arange(num_views)[:, None] * (cameras.width * cameras.height) + pixels).reshape(-1)
+    if members.pixels is not None:
+        nothing = np.zeros((num_views, height, width, 3), np.float32)
+        return ViewSamples(nothing, nothing[..., 0], nothing)
+    means, sh0 = members.means[ids], members.sh0[ids, 0]
+    usable = np.isfinite(means).all(1) & np.isfinite(sh0).all(1) & np.isfinite(members.opacities[ids])
+    grid = num_views, height, width
+    return ViewSamples(
+        np.where(usable[:, None], means, 0).astype(np.float32).reshape(*grid, 3),
+        np.where(usable, members.opacities[ids], 0).astype(np.float32).reshape(grid),
+        np.where(usable[:, None], sh0, 0).astype(np.float32).reshape(*grid, 3),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Learned:
+    """What the networks made of g groups, and what they need to go on with them."""
+
+    refined: FeatureGaussians  # The groups after the refiner, without members: what the heads read
+    views: np.ndarray  # [g] int64, the view that each group's frame belongs to
+    num_members: np.ndarray  # [g] int64, Gaussians that became the group
+
+    def __getitem__(self, rows: np.ndarray) -> Learned:
+        """Return that of some groups."""
+        return Learned(take(self.refined, rows), self.views[rows], self.num_members[rows])
+
+    @staticmethod
+    def concat(parts: list[Learned]) -> Learned:
+        """Concatenate that of all parts."""
+        refined = FeatureGaussians.concat([part.refined for part in parts])
+        views, num_members = ([getattr(part, name) for part in parts] for name in ("views", "num_members"))
+        return Learned(refined, np.concatenate(views), np.concatenate(num_members))
+
+
+@dataclass(frozen=True, eq=False)
 class GroupSet:
     """Groups with the Gaussians that they divide into."""
 
-    # g Feature Gaussians, canonical, with gains of one and without latents: what gains and networks did to them
-    # is in their moments. Their members are rows of `children`.
+    # g Feature Gaussians, canonical. Their members are rows of `children`. Of states with networks, as encoder and
+    # merger left them, with latents. Otherwise with gains of one and without latents: what gains and networks did to
+    # them is in their moments.
     features: FeatureGaussians
-    children: Gaussians  # The Gaussians of the finest division, group by group
+    # The Gaussians of the finest division, group by group; none where heads with absolute outputs make them
+    children: Gaussians
     # [g,1,3] base colours (sh0) that fit the photos so far. `features.sh0` stays as exported, for the full fit to
     # start from.
     fitted_sh0: np.ndarray
     # [g] how much earlier photos say about each fitted colour: the diagonal of their normal equations, which is the
     # sum of the squares of the group's blending weights over their half-size pixels
     color_precision: np.ndarray
+    learned: Learned | None = None  # Of states with networks
 
     def __len__(self) -> int:
         return len(self.features)
+
+
+@dataclass(frozen=True, eq=False)
+class StateNetworks:
+    """The networks of a state whose groups are as these left them."""
+
+    weights: NetworkWeights  # All networks of a checkpoint
+    samples: ViewSamples  # Of all views
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -68,6 +161,7 @@ class OnlineState(StoredScene):
 
     groups: GroupSet
     replay: Replay  # Photos of some of the views
+    networks: StateNetworks | None = None  # None where the groups are decoded already
 
     def __len__(self) -> int:
         return len(self.groups)
@@ -155,18 +249,22 @@ def select_groups(groups: GroupSet, rows: np.ndarray) -> GroupSet:
     features = take(groups.features, rows)
     children = groups.children[features.members]
     members = np.arange(len(children))
-    return GroupSet(replace(features, members=members), children, groups.fitted_sh0[rows], groups.color_precision[rows])
+    learned = None if groups.learned is None else groups.learned[rows]
+    colors = groups.fitted_sh0[rows], groups.color_precision[rows]
+    return GroupSet(replace(features, members=members), children, *colors, learned)
 
 
 def concat_groups(sets: list[GroupSet]) -> GroupSet:
     """Concatenate the groups of all sets."""
     features = FeatureGaussians.concat([groups.features for groups in sets])
     children = Gaussians.concat([groups.children for groups in sets])
+    learned = [groups.learned for groups in sets if groups.learned is not None]
     return GroupSet(
         replace(features, members=np.arange(len(children))),
         children,
         np.concatenate([groups.fitted_sh0 for groups in sets]),
         np.concatenate([groups.color_precision for groups in sets]),
+        Learned.concat(learned) if learned else None,
     )
 
 
@@ -197,17 +295,86 @@ def with_fitted_colors(groups: GroupSet) -> GroupSet:
     return replace(groups, features=features, children=children)
 
 
+def _stored_heads(networks: StateNetworks, learned: Learned, cameras: Cameras) -> StoredHeads:
+    """Return the networks of a state with the numbers that describe its groups."""
+    described = networks.samples.describe(learned.refined, learned.views, learned.num_members, cameras)
+    return StoredHeads(networks.weights, learned.views, described.group)
+
+
 def to_encoded(state: OnlineState, *, fitted_colors: bool = True) -> Encoded:
-    """Return the state as an encoded scene, in the fitted colours or in those of the exports."""
-    groups = with_fitted_colors(state.groups) if fitted_colors else state.groups
-    features = groups.features
+    """Return the state as an encoded scene, in the fitted colours or in those of the exports.
+
+    With networks, the colours are those of the heads.
+    """
+    groups, heads, max_k = state.groups, None, state.settings.max_k
+    if fitted_colors and state.networks is None:
+        groups = with_fitted_colors(groups)
+    features, members = groups.features, child_members(groups)
+    if state.networks is None or groups.learned is None:
+        division = divide_all(features, members, max_k)
+    else:
+        features, heads = groups.learned.refined, _stored_heads(state.networks, groups.learned, state.cameras)
+        if heads.networks.options.outputs == "absolute":
+            division = divide_by_heads(features, groups.learned.num_members, max_k)
+        else:
+            rows = {"starts": groups.features.starts, "members": groups.features.members}
+            division = divide_all(replace(features, **rows), members, max_k)
     return Encoded(
         features=without_members(features),
-        division=divide_all(features, child_members(groups), state.settings.max_k),
+        division=division,
         kept=state.kept,
         frame=state.frame,
         cameras=state.cameras,
         settings=replace(state.settings, knee_count=len(features)),
-        heads=None,
+        heads=heads,
         about=state.about,
     )
+
+
+def first_state(groups: GroupSet, prepared: Prepared, plan: Plan, max_k: int) -> OnlineState:
+    """Make the state of a first batch."""
+    cameras = prepared.scene.cameras
+    settings = StoredSettings(
+        num_input=prepared.given.num_gaussians,
+        k=AUTO if plan.auto_count else plan.decode.k,
+        max_k=max_k,
+        min_opacity=plan.decode.min_opacity,
+        min_contribution=plan.fit.min_contribution if prepared.given.images is not None else 0.0,
+    )
+    return OnlineState(
+        groups=groups,
+        kept=plan.unseen,
+        frame=prepared.frame,
+        cameras=resize_cameras(cameras, cameras.width, cameras.height),
+        replay=no_photos(cameras),
+        settings=settings,
+        about={},
+    )
+
+
+def grown_state(
+    state: OnlineState, groups: GroupSet, prepared: Prepared, plan: Plan, new_cameras: Cameras
+) -> OnlineState:
+    """Return the state with other groups, and with the views and unseen Gaussians of a further batch."""
+    kept = [gaussians for gaussians in (state.kept, plan.unseen) if gaussians is not None]
+    num_input = state.settings.num_input + prepared.given.num_gaussians
+    k = AUTO if plan.auto_count else plan.decode.k
+    return replace(
+        state,
+        groups=groups,
+        kept=Gaussians.concat(kept) if kept else None,
+        cameras=concat_cameras(state.cameras, new_cameras),
+        settings=replace(state.settings, num_input=num_input, k=k),
+    )
+
+
+def resize_cameras(cameras: Cameras, width: int, height: int) -> Cameras:
+    """Return the same views in pictures of another size."""
+    shape = np.array([[width / cameras.width], [height / cameras.height], [1.0]])
+    return Cameras(cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64) * shape, width, height)
+
+
+def concat_cameras(first: Cameras, second: Cameras) -> Cameras:
+    """Concatenate cameras of one size."""
+    viewmats = np.concatenate([first.viewmats, second.viewmats], dtype=np.float64)
+    return Cameras(viewmats, np.concatenate([first.Ks, second.Ks], dtype=np.float64), first.width, first.height)

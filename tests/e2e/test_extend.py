@@ -176,6 +176,38 @@ def test_a_dry_run_of_decode_knows_the_most(states: list[Path], tmp_path: Path, 
     assert len(gsmerge.read_ply(tmp_path / "a.ply").gaussians) <= most["output"]["num_gaussians_at_most"]
 
 
+# groups that keep their latents
+
+
+@pytest.fixture(scope="session")
+def latents(walks: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The state after two batches with the paper's networks. Read only."""
+    path = tmp_path_factory.mktemp("latents") / "state.gsm"
+    assert main(["extend", str(path), str(walks[0]), "--recipe", "paper", "--superpixels", "60", "--quiet"]) == 0
+    assert main(["extend", str(path), str(walks[1]), "--quiet"]) == 0
+    return path
+
+
+def test_the_heads_run_when_they_are_asked(latents: Path, tmp_path: Path, run: Run) -> None:
+    state, counts = load_state(latents), []
+    assert state.networks is not None
+    assert len(state.about["batches"]) == 2
+    for k in (1, 2, 4):
+        outcome = run("decode", latents, "--k", k, "-o", tmp_path / f"{k}.ply", "--json", code=0)
+        assert json.loads(outcome.out)["fit"] is None  # no photos are stored
+        counts.append(len(gsmerge.read_ply(tmp_path / f"{k}.ply").gaussians))
+    assert counts[0] < counts[1] < counts[2] <= 4 * len(state)
+    assert run("check", latents, code=0).out.startswith("ok ")
+
+
+def test_networks_of_another_state(latents: Path, walks: list[Path], tmp_path: Path, run: Run) -> None:
+    state = Path(shutil.copy(latents, tmp_path / "state.gsm"))
+    words = "checkpoint shipped: expected the networks that made the state (paper), whose latents it holds"
+    outcome = run("extend", state, walks[0], "--checkpoint", "shipped")
+    assert_refused(outcome, 2, words, "leave the checkpoint out, or begin a new state")
+    assert state.read_bytes() == latents.read_bytes()
+
+
 # wrong usage
 
 
