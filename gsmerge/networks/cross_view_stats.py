@@ -19,7 +19,8 @@ NEAR = 0.03  # largest difference of the logarithms of two depths on the same su
 FAR = 0.3  # larger differences of the logarithms of depths are clipped to this
 MIN_OPACITY = 1 / 255  # more transparent Gaussians show no surface
 ROWS = 8192  # points per task
-MOST = 64  # points that are looked at for each neighbour that is asked for
+MOST = 64  # points that are looked at for each neighbour that is asked for, and at least for FEW
+FEW = 16
 
 
 def cross_view_stats(
@@ -57,18 +58,18 @@ def cross_view_stats(
 def nearest_of_other_views(means: np.ndarray, views: np.ndarray, count: int) -> np.ndarray:
     """Find the nearest points of other views, ``[g,count]`` int64, nearest first (paper section 4.4).
 
-    -1 where there are fewer, or where ``MOST`` times as many points, most of them of the own view, are nearer: what
-    lies behind those overlaps nothing. Points are ``means [g,3]`` float64, finite; a view below 0 counts as another.
+    -1 where there are fewer, or where ``MOST`` times as many points, at least 1,024, most of them of the own view, are
+    nearer: what lies behind those overlaps nothing. Points are ``means [g,3]`` float64, finite; a view below 0 counts as another.
     """
     num = len(means)
     num_nodes = 4 << (num // LEAF).bit_length()
     order, neighbors = np.arange(num), np.empty((num, count), np.int64)
     axes, splits = np.empty(num_nodes, np.int8), np.empty(num_nodes)
-    means = np.ascontiguousarray(means)
+    means, most = np.ascontiguousarray(means), MOST * max(count, FEW)
     build_tree(means, order, axes, splits)
     with use_threads() as threads:
         parallel_map(
-            lambda span: nearest_of_others(means, views, order, axes, splits, *span, MOST * count, neighbors),
+            lambda span: nearest_of_others(means, views, order, axes, splits, *span, most, neighbors),
             pieces(num, threads),
         )
     return neighbors
