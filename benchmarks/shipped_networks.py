@@ -19,7 +19,7 @@ from gsmerge.cli import main as gsmerge
 
 CAPTURES = "beercan,flower,lund_door,redkitchen,sceaux,stitch,xuzhy"
 CHOSEN_ON = "desk,carton"
-MADE = ("--scenes", "8", "--views", "4-8", "--seed", "11")
+MADE = ("--scenes", "40", "--views", "3-12", "--seed", "11")
 
 
 def main() -> None:
@@ -29,7 +29,7 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the run")
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-benchmarks")
     args = parser.parse_args()
-    made = args.cache / "made"
+    made = args.cache / "made-40"
     if not made.exists() and (code := gsmerge(["generate", "-o", str(made), *MADE])):
         raise SystemExit(code)
     data = [export(folder, args.cache) for folder in scene_folders(CAPTURES)]

@@ -19,6 +19,7 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry import lower_median
 from gsmerge.io import load_scene, read_held_out
 from gsmerge.moments import Members, feature_to_gaussians
+from gsmerge.networks.corrections import COLOR
 from gsmerge.options import CompactOptions
 from gsmerge.render.photos import Photos, blank_photos, scene_pictures
 from gsmerge.research.training.scenes import (
@@ -34,7 +35,25 @@ from gsmerge.stages.encode import encode
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge, take
 from gsmerge.stages.superpixels import segment
-from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches
+from gsmerge.types import SH_C0, Cameras, FeatureGaussians, Gaussians, Matches
+
+
+@dataclass(frozen=True)
+class ColorMap:
+    """A change of all colours of a scene and of its photos, under which renders change as photos do."""
+
+    order: tuple[int, ...] = (0, 1, 2)  # channel that each channel takes
+    gain: float = 1.0  # below 0: the negative
+    offset: float = 0.0  # sRGB in [0, 1]
+
+    def change(self, colors: np.ndarray) -> np.ndarray:
+        """Change colours ``[...,3]``, sRGB in [0, 1]."""
+        return colors.take(self.order, -1) * np.float32(self.gain) + np.float32(self.offset)
+
+    def change_sh0(self, sh0: np.ndarray) -> np.ndarray:
+        """Change base colours ``[...,3]``, coefficients of harmonics."""
+        shift = (self.gain / 2 + self.offset - 0.5) / SH_C0
+        return sh0.take(self.order, -1) * np.float32(self.gain) + np.float32(shift)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +71,7 @@ class Example:
     covers: np.ndarray  # [v,p,h,w] uint8: what the Gaussians of each view cover, see scenes.coverage
     matches: Matches | None  # the clusters that were fitted; None: matched in every step
     targets: Mapping[int, Targets]  # of the fit, by number of children K; empty without a fit
+    colors: ColorMap = ColorMap()  # of the photos, whose bytes stay as they are
 
     def mask(self, photo: int) -> np.ndarray:
         """Mark the pixels ``[h,w]`` of a photo that the views cover."""
@@ -154,3 +174,20 @@ def draw_views(example: Example, options: TrainOptions, rng: np.random.Generator
     least, most = (min(count, len(example.cameras)) for count in options.random_views)
     count = int(rng.integers(least, most + 1))
     return select_views(example, sorted(rng.choice(len(example.cameras), count, replace=False).tolist()))
+
+
+def recolor(example: Example, rng: np.random.Generator) -> Example:
+    """Draw other colours for a scene and its photos: channels in any order, less contrast, or the negative."""
+    gain = float(rng.uniform(0.6, 1))
+    low, inverted = float(rng.uniform(0, 1 - gain)), bool(rng.random() < 0.5)
+    colors = ColorMap(tuple(rng.permutation(3).tolist()), -gain if inverted else gain, low + gain * inverted)
+    changed = {"members": example.members, "features": example.features, "base": example.base}
+    for name, part in changed.items():
+        shN = part.shN.take(colors.order, -1) * np.float32(colors.gain)
+        changed[name] = replace(part, sh0=colors.change_sh0(part.sh0), shN=shN)
+    targets = {}
+    for k, one in example.targets.items():
+        corrections = one.corrections.copy()
+        corrections[:, COLOR] = corrections[:, COLOR][:, colors.order] * colors.gain
+        targets[k] = replace(one, corrections=corrections)
+    return replace(example, **changed, targets=targets, colors=colors)

@@ -28,7 +28,7 @@ from gsmerge.io.atomic import atomic_output
 from gsmerge.networks.checkpoint import save_checkpoint
 from gsmerge.networks.corrections import LOGIT
 from gsmerge.networks.modules import Head, Networks
-from gsmerge.research.training.examples import Example, draw_views
+from gsmerge.research.training.examples import Example, draw_views, recolor
 from gsmerge.research.training.losses import (
     WindowLoss,
     correction_loss,
@@ -261,13 +261,16 @@ def _step(state: TrainingState, streams: ExampleStreams, run: TrainingRun, step:
 def _loss(networks: Networks, example: Example, run: TrainingRun, step: int, rng: np.random.Generator) -> WindowLoss:
     """Compute the loss of a random crop or window of an example."""
     options = run.options
+    if step >= options.photo_step:
+        example = draw_views(example, options, rng)
+    if options.recolor:
+        example = recolor(example, rng)
     if step < options.photo_step:
         crop = sample_crop(example, options.levels, options.crop, options.inner, rng)
         prediction = predict(crop, networks, options, step)
         loss = correction_loss(*scaled_corrections(crop, prediction, run.scales, options), options)
         return WindowLoss(loss, torch.zeros(()))
-    views = draw_views(example, options, rng)
-    window = sample_window(views, options.levels, options.window, options.most, options.novel, rng)
+    window = sample_window(example, options.levels, options.window, options.most, options.novel, rng)
     return window_loss(networks, window, run.scales, options, step, rng)
 
 

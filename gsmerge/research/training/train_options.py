@@ -46,6 +46,8 @@ class TrainOptions:
         random_views: Least and most views of a subset that is drawn anew for every window, as ``[1, 12]`` in the
             paper, in place of ``views``; empty: those. Not with a loss that uses the fit, whose result is that of one
             subset.
+        recolor: Whether every window has colours of its own: channels in any order, less contrast, negatives. Few
+            scenes have few colours, and networks learn these.
         densities: Superpixels per pixel; a scene gives an example for each. Two by default, since the full fit starts
             with 57 % of the usual number.
         segmentation: Superpixel method.
@@ -109,6 +111,7 @@ class TrainOptions:
     network: NetworkOptions = field(default_factory=NetworkOptions)
     views: tuple[int, ...] = (3, 6, 0)
     random_views: tuple[int, ...] = ()
+    recolor: bool = False
     densities: tuple[float, ...] = (0.025, 0.044)
     segmentation: str = "rdseg"
     match: str = "overlap"
@@ -176,6 +179,8 @@ class TrainOptions:
             raise ValueError("random_views: expected regression_weight 0 and photo_start 0, got a loss that uses a fit")
         if self.diversity_unit not in ("group", "scene"):
             raise ValueError(f'diversity_unit: expected "group" or "scene", got {self.diversity_unit!r}')
+        if not isinstance(self.recolor, bool):
+            raise ValueError(f"recolor: expected true or false, got {self.recolor!r}")
         if self.photo_loss not in ("l1", "mse"):
             raise ValueError(f'photo_loss: expected "l1" or "mse", got {self.photo_loss!r}')
         if not self.levels or len(set(self.levels)) < len(self.levels) or not set(self.levels) <= set(SLOTS):
@@ -310,6 +315,7 @@ PAPER: Mapping[str, Any] = {
 # learnt the exposure of the training photos. docs/internals/networks.md has the figures.
 SHIPPED: Mapping[str, Any] = {
     "network": {"encoder": False, "merger": False, "bounds": {"color": 0.0}},
+    "recolor": True,
     "views": (3, 0),
     "fit_steps": 100,
     "steps": 2_600,
@@ -325,6 +331,7 @@ SHIPPED: Mapping[str, Any] = {
 # The paper's training, shortened to what two processor cores do in an hour and a half.
 PAPER_SHIPPED: Mapping[str, Any] = {
     **PAPER,
+    "recolor": True,
     "iou": 0.35,  # at 0.2 clusters that grow and Gaussians that grow feed each other at this rate
     "steps": 2_600,
     "warmup": 80,

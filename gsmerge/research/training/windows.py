@@ -63,7 +63,8 @@ class Window:
     @property
     def image(self) -> Tensor:
         """Part of the photo, ``[h,w,3]`` sRGB in [0, 1]."""
-        return torch.from_numpy(self._part(self.crop.example.images[self.photo])).float() / 255
+        example = self.crop.example
+        return torch.from_numpy(example.colors.change(self._part(example.images[self.photo]) / np.float32(255)))
 
     @property
     def mask(self) -> Tensor:

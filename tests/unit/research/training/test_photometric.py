@@ -19,10 +19,12 @@ from gsmerge.networks.apply import NetworkContext, encode_features, refine_featu
 from gsmerge.networks.modules import Networks
 from gsmerge.render import render
 from gsmerge.research.training import Example, TrainOptions, make_example, make_training_scene, train
+from gsmerge.research.training.examples import recolor
 from gsmerge.research.training.loop import is_best
 from gsmerge.research.training.losses import (
     color_loss,
     diversity_loss,
+    draw_window,
     masked_ssim,
     overlap_profile,
     render_window,
@@ -305,6 +307,29 @@ def test_small_groups_count_as_much_as_large_ones() -> None:
     parents, small = torch.tensor([0, 0]), boxes([[0.0, 0, 0], [0, 0, 0]], [0.01, 0.01], [0.5, 0.5])
     assert float(diversity_loss(small, parents, torch.full((2,), 0.01))) == pytest.approx(0.75)
     assert float(diversity_loss(small, parents, torch.full((2,), 0.01), 1.0)) == pytest.approx(0.75e-6)
+
+
+def test_renders_change_colours_as_photos_do(example: Example) -> None:
+    """Of the scene in other colours, on a background in these: the render in other colours.
+
+    At K = 1: which members become which child depends on the contrast.
+    """
+    for seed in range(4):
+        changed = recolor(example, np.random.default_rng(seed))
+        assert changed.colors != example.colors
+        for window in (whole_photo(example, 0), whole_photo(example, 2)):
+            crop = replace(window.crop, example=changed)
+            other = replace(window, crop=crop)
+            torch.testing.assert_close(other.image, torch.from_numpy(changed.colors.change(window.image.numpy())))
+            assert 0 <= float(other.image.min()) <= float(other.image.max()) <= 1
+            gray = np.full(3, 0.3, np.float32)
+            drawn = [
+                draw_window(analytic_gaussians(one.crop, match_crop(one.crop, None, PHOTO)).to("cpu"), one, background)
+                for one, background in ((window, gray), (other, changed.colors.change(gray)))
+            ]
+            torch.testing.assert_close(
+                drawn[1], torch.from_numpy(changed.colors.change(drawn[0].numpy())), atol=2e-3, rtol=0
+            )
 
 
 @pytest.mark.slow
