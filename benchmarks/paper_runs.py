@@ -15,17 +15,18 @@ from typing import Any
 
 import numpy as np
 from networks import Store, silenced
-from shared_scenes import export, read_held_out
+from shared_scenes import export
 
 import gsmerge
+from gsmerge.io import HeldOutViews, find_scene_files, load_files, read_held_out
 from gsmerge.io.formats.writing import file_bytes
 from gsmerge.measure.evaluate import EvaluateOptions, evaluate, near_plane
 from gsmerge.measure.lpips import lpips
 from gsmerge.measure.sizes import shrink_cameras, shrink_views
 from gsmerge.measure.visibility import context_points, visible_pixels
-from gsmerge.research.charts.measure_run import SCORING
+from gsmerge.research.charts.measure_run import SCORING, choose_views
 from gsmerge.types import Cameras, Gaussians, Views
-from gsmerge.views import even_views, pick_views, subset
+from gsmerge.views import pick_views
 
 PHOTO_SIDE = 476  # pixels on the longer side, as in the paper
 LPIPS_VIEWS = 2
@@ -143,8 +144,8 @@ class Bench:
     ) -> dict[str, Any]:
         """Make a result and score it; ``own``: in its input views, too."""
         ply = export(folder, self.cache, case.style)
-        scene = read_case(ply, None if case.views == num_views(folder) else case.views)
-        targets, images = held_out(folder), dict[tuple[str, int], np.ndarray]()
+        scene, targets = read_case(folder, ply, case.views)
+        images = dict[tuple[str, int], np.ndarray]()
         gaussians, facts = scene.file_gaussians, dict[str, Any]()
         if settings is not None:
             gaussians, facts = self.compact(scene, way, settings)
@@ -198,19 +199,19 @@ def num_views(folder: Path) -> int:
     return sum(frame["role"] == "context" for frame in frames)
 
 
-@lru_cache(maxsize=2)
-def read_case(ply: Path, views: int | None) -> gsmerge.Scene:
-    """A scene, or some of its views."""
-    scene = gsmerge.read_scene(ply)
-    return scene if views is None else subset(scene, even_views(len(scene), views))
-
-
 @lru_cache(maxsize=1)
-def held_out(folder: Path) -> Views:
-    """The held-out views at the paper's size."""
-    targets = read_held_out(folder)
-    names = tuple(map(str, range(len(targets.images))))
-    return shrink_views(Views(targets.cameras, targets.images, names), PHOTO_SIDE)
+def load_case(folder: Path, ply: Path) -> tuple[gsmerge.Scene, HeldOutViews]:
+    """A scene, and its held-out views in the world of the export."""
+    load = load_files(find_scene_files(ply))
+    return load.scene, read_held_out(load, folder / "transforms.json")
+
+
+@lru_cache(maxsize=2)
+def read_case(folder: Path, ply: Path, views: int | None) -> tuple[gsmerge.Scene, Views]:
+    """Some views of a scene, and the held-out ones between them at the paper's size."""
+    scene, targets = choose_views(*load_case(folder, ply), views)
+    assert targets is not None
+    return scene, shrink_views(targets, PHOTO_SIDE)
 
 
 def distances(
@@ -229,11 +230,11 @@ def distances(
 
     values = {"seen": mean("target", chosen, targets.images[chosen], masks)}
     if own:
-        values["all"] = mean("target", chosen, targets.images[chosen], (None, None))
+        values["all"] = mean("target", chosen, targets.images[chosen], [None] * len(chosen))
         ids = pick_views(len(scene), LPIPS_VIEWS)
         part = Views(scene.cameras[ids], scene.images[ids], tuple(scene.names[i] for i in ids))
         photos = shrink_views(part, PHOTO_SIDE).images
-        values["inputs"] = mean("context", ids, photos, (None, None))
+        values["inputs"] = mean("context", ids, photos, [None] * len(ids))
     return values
 
 

@@ -113,8 +113,8 @@ def views_section(bench: Bench) -> str:
     first = make_table(head, order(rows))
     names = ("held-out views, seen pixels", "held-out views, all pixels", "input views")
     second = make_table(("", "data", *names), order(sides))
-    text = """Evenly spread input views. Mean: of each capture over the numbers of views that it has, then over the
-    captures. Then the same means by what is compared."""
+    text = """Evenly spread input views, held-out views midway between them. Mean: of each capture over the numbers of
+    views that it has, then over the captures. Then the same means by what is compared."""
     return section("By number of views", text, first, second)
 
 
