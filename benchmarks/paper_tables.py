@@ -233,12 +233,13 @@ def head_section(bench: Bench) -> str:
     training = load_checkpoint(bench.files["paper"]).training
     steps, scenes = training["step"], len(training["data"])
     names = ", ".join(f"{folder.name} ({num_views(folder)} views)" for folder in bench.folders)
-    how = f"""`--recipe paper`: BASS superpixels, encoder, geometry decoded by the head for K = 1, matching
-    by latents and boxes, merger, refiner, heads, pruning by opacity, no fit and no budget: superpixels are 4.4 % of the
-    pixels unless a table says otherwise. `moment-matching` and gsmerge's own settings have as many Gaussians as the
-    recipe with K = 1. Cells are means over the captures of PSNR / SSIM / LPIPS, photos at {PHOTO_SIDE} pixels, held-out
-    views, pixels that the input views see, unless a table says otherwise; intervals are 95 % t intervals of differences
-    that are paired by capture. `python benchmarks/paper_tables.py --page docs/results.md` writes this section."""
+    how = f"""`--recipe paper`: BASS superpixels, encoder, geometry decoded by the head for K = 1, matching by
+    latents and boxes, merger, refiner, heads, pruning by opacity, no fit and no budget: superpixels are
+    4.4 % of the pixels unless a table says otherwise. `moment-matching` and gsmerge's own settings have
+    at most as many Gaussians as the recipe with K = 1. Cells are means over the captures of PSNR / SSIM
+    / LPIPS, photos at {PHOTO_SIDE} pixels, held-out views, pixels that the input views see, unless a
+    table says otherwise; intervals are 95 % t intervals of differences that are paired by capture.
+    `python benchmarks/paper_tables.py --page docs/results.md` writes this section."""
     data = f"""Captures: {names}, with the depth of a multi-view-stereo network, and
     [networks](internals/networks.md) trained for {steps:,} steps on {scenes} scenes. Printed: the paper's own figures,
     of DL3DV-Bench, MipNeRF360 and Tanks and Temples together, with the backbone that is named, and networks trained for
@@ -258,7 +259,7 @@ def filled(text: str) -> str:
 ONLINE = """### The paper's method view by view
 
 `gsmerge extend --recipe paper` matches and merges batches by their latents, and decodes on demand:
-[guide](guide/views-in-batches.md)."""
+[guide](guide/views-in-batches.md), [figures](#views-in-batches-with-the-papers-networks)."""
 
 
 def replace_section(page: Path, section: str) -> None:
