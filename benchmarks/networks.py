@@ -3,11 +3,11 @@
 python benchmarks/networks.py eval                      # the tables of docs/internals/networks.md; what is done is kept
 python benchmarks/networks.py train --only gain
 python benchmarks/networks.py fox,fern --checkpoint FILE
-python benchmarks/networks.py eval --only paper --no-lpips --checkpoint gsmerge/networks/paper.safetensors
 
 Plain exports, held-out views, pixels that the context views see; LPIPS (VGG) of two held-out views of each scene.
 Nothing has a budget: without a fit, superpixels are then cut for it, and K does not matter. Networks that raise
 opacities leave out fewer Gaussians as too faint, so of two runs that are compared the larger one loses its faintest.
+The paper's own method: paper_tables.py.
 """
 
 from __future__ import annotations
@@ -46,7 +46,6 @@ class Condition:
     views: int | None = None
     silent: str | None = None  # networks whose last layers are set to zero
     learned: tuple[bool, ...] = (False, True)
-    like_whole: bool = False  # whether its budget is the count of the whole recipe
 
 
 PLAIN = {"fit": "none"}
@@ -70,21 +69,7 @@ ABLATION = (
     Condition("larger superpixels", {"superpixels": "2%", **PLAIN}),
     Condition("smaller superpixels", {"superpixels": "8.7%", **PLAIN}),
 )
-OWN = {"recipe": "paper"}
-PAPER = (
-    Condition("the whole, K = 1", OWN, learned=(True,)),
-    Condition("moment matching", {"method": "moment-matching"}, learned=(False,), like_whole=True),
-    *(Condition(f"K = {k}", {**OWN, "k": k}, learned=(True,)) for k in (2, 4)),
-    Condition("no merging across views", {**OWN, "match": "none"}, learned=(True,)),
-    *(Condition(f"without the {name}", OWN, silent=name, learned=(True,)) for name in ("merger", "refiner", "heads")),
-    Condition("the encoder's latents zero", OWN, silent="latent", learned=(True,)),
-    Condition("geometry of the moments for matching", {**OWN, "geometry": "analytic"}, learned=(True,)),
-    *(
-        Condition(f"cosine of at least {cosine}", {**OWN, "similarity": cosine}, learned=(True,))
-        for cosine in (0.9, 0.95, 0.98)
-    ),
-)
-PARTS = {"gain": GAIN, "children": MANY, "ablation": ABLATION, "paper": PAPER}
+PARTS = {"gain": GAIN, "children": MANY, "ablation": ABLATION}
 
 
 @dataclass
@@ -160,9 +145,7 @@ def measured(
         if values:
             means[name] = sum(values) / len(values)
     stages = {name: result.report.seconds[name] for name in STAGES if name in result.report.seconds}
-    choices = result.report.choices
-    kept = choices["clusters"] / choices["groups"] if "clusters" in choices else 1.0
-    facts = {"count": len(gaussians), "ratio": scored.ratio, "seconds": seconds, "stages": stages, "kept": kept}
+    facts = {"count": len(gaussians), "ratio": scored.ratio, "seconds": seconds, "stages": stages}
     return {**facts, **means}
 
 
@@ -216,23 +199,6 @@ def table(folders: list[Path], conditions: tuple[Condition, ...], args: argparse
     return "\n".join(rows)
 
 
-def paper_table(folders: list[Path], conditions: tuple[Condition, ...], args: argparse.Namespace) -> str:
-    """Markdown: means over the scenes, against the whole recipe."""
-    head = ["", "groups kept across views", "Gaussians", "PSNR / SSIM", "against the whole (95 %)"]
-    rows = [f"| {' | '.join(head)} |", "|---|" + "---|" * (len(head) - 1)]
-    whole = {folder.name: run(folder, conditions[0], args, learned=True) for folder in folders}
-    for condition in conditions:
-        runs = {}
-        for folder in folders:
-            budget = {"budget": whole[folder.name]["count"]} if condition.like_whole else {}
-            own = replace(condition, settings={**condition.settings, **budget})
-            runs[folder.name] = run(folder, own, args, learned=condition.learned == (True,))
-        kept = sum(run["kept"] for run in runs.values()) / len(runs)
-        gain = words(paired_difference(pick(runs, "psnr"), pick(whole, "psnr"))) if runs != whole else ""
-        rows.append(f"| {condition.name} | {100 * kept:.0f} % | {share(runs)} | {summary(runs)} | {gain} |")
-    return "\n".join(rows)
-
-
 def pick(runs: dict[str, dict[str, Any]], name: str) -> dict[str, float]:
     return {scene: run[name] for scene, run in runs.items()}
 
@@ -257,7 +223,7 @@ def words(interval: Interval) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("scenes", help="train, eval, or names with commas between")
-    parser.add_argument("--only", nargs="*", default=list(PARTS)[:3], choices=list(PARTS))
+    parser.add_argument("--only", nargs="*", default=list(PARTS), choices=list(PARTS))
     parser.add_argument("--checkpoint", type=Path, default=SHIPPED)
     parser.add_argument("--no-lpips", dest="lpips", action="store_false")
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-benchmarks")
@@ -268,8 +234,7 @@ def main() -> None:
     for part in args.only:
         conditions = tuple(condition for condition in PARTS[part] if applies(condition, args.checkpoint))
         names = ", ".join(folder.name for folder in folders)
-        rows = (paper_table if part == "paper" else table)(folders, conditions, args)
-        print(f"\n{part}: {names}\n\n{rows}\n", flush=True)
+        print(f"\n{part}: {names}\n\n{table(folders, conditions, args)}\n", flush=True)
 
 
 if __name__ == "__main__":

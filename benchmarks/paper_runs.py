@@ -1,0 +1,248 @@
+"""Results of the superpixel merging paper's method and of what it is compared with, made once and scored once."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from networks import Store, silenced
+from shared_scenes import export
+
+import gsmerge
+from gsmerge.io import HeldOutViews, find_scene_files, load_files, read_held_out
+from gsmerge.io.formats.writing import file_bytes
+from gsmerge.measure.evaluate import EvaluateOptions, evaluate, near_plane
+from gsmerge.measure.lpips import lpips
+from gsmerge.measure.sizes import shrink_cameras, shrink_views
+from gsmerge.measure.visibility import context_points, visible_pixels
+from gsmerge.research.charts.measure_run import SCORING, choose_views
+from gsmerge.types import Cameras, Gaussians, Views
+from gsmerge.views import pick_views
+
+PHOTO_SIDE = 476  # pixels on the longer side, as in the paper
+LPIPS_VIEWS = 2
+COUNTS = (3, 6, 9, 12)
+SIZES = ("0.5%", "2%", "4.4%", "8.7%", "20%")
+USUAL = "4.4%"
+Runs = dict[str, dict[str, Any]]  # by scene
+
+
+@dataclass(frozen=True)
+class Way:
+    """A way to make a result.
+
+    Args:
+        name: In the tables.
+        settings: Of ``compact``; None: the input as it is.
+        key: Of the paper's printed figures.
+        networks: The file that it depends on: "paper", "undiversified", "shipped", or "" for none.
+        silent: Networks whose last layers are set to zero.
+        equal: Whether it has as many Gaussians as ``--recipe paper`` with K = 1.
+    """
+
+    name: str
+    settings: dict[str, Any] | None
+    key: str = ""
+    networks: str = ""
+    silent: str | None = None
+    equal: bool = False
+
+
+@dataclass(frozen=True)
+class Case:
+    """What a result is made of: an exporter's style, number of views (None: all), superpixels."""
+
+    style: str = "plain"
+    views: int | None = None
+    size: str = USUAL
+
+
+def recipe(name: str, key: str = "", silent: str | None = None, **settings: Any) -> Way:
+    """The paper's method with some settings."""
+    return Way(name, {"recipe": "paper", **settings}, key, "paper", silent)
+
+
+INPUT = Way("the input", None, "input")
+WHOLE = recipe("`--recipe paper`, K = 1", "k1", k=1)
+CHILDREN = tuple(recipe(f"K = {k}", f"k{k}", k=k) for k in (2, 4))
+MIXED = recipe("mixed K, by thirds", "mixed", k="mixed")
+MOMENTS = Way("`moment-matching`", {"method": "moment-matching"}, "moments", equal=True)
+LEARNED = Way(
+    "`--fit none`, with networks", {"fit": "none", "k": 1, "checkpoint": "shipped"}, "", "shipped", equal=True
+)
+DRAFT = Way("`--effort draft`", {"effort": "draft"}, "", "shipped", equal=True)
+FIT = Way("the defaults", {}, equal=True)
+OURS = (LEARNED, DRAFT, FIT)
+VARIANTS = (
+    recipe("no merging across views", k=1, match="none"),
+    *(recipe(f"IoU of at least {iou}", k=1, iou=iou) for iou in (0.1, 0.4)),
+    *(recipe(f"cosine of at least {cosine}", k=1, similarity=cosine) for cosine in (0.6, 0.95)),
+    recipe("geometry of the moments for matching", k=1, geometry="analytic"),
+    recipe("the encoder's latents zero", silent="latent", k=1),
+    *(recipe(f"without the {name}", silent=name, k=1) for name in ("merger", "refiner", "heads")),
+)
+RESIZED = {"2%": "larger superpixels", "8.7%": "smaller superpixels"}
+PLAIN, STYLES = Case(), ("da3", "depthsplat", "anysplat")
+VIEW_WAYS = (INPUT, MOMENTS, WHOLE, *CHILDREN, MIXED, *OURS)
+STYLE_WAYS = (INPUT, MOMENTS, WHOLE, *CHILDREN, FIT)
+
+
+@dataclass
+class Bench:
+    """All scenes, and where their runs are kept."""
+
+    folders: list[Path]
+    store: Store
+    cache: Path
+    files: dict[str, Path]  # of networks
+    lpips: bool
+    spent: float = 0.0  # processor seconds of this process
+    digests: dict[str, str] = field(default_factory=dict)
+
+    def run(self, folder: Path, way: Way, case: Case) -> dict[str, Any]:
+        """The run of a way on a scene: a finished one, or a new one, which is kept."""
+        settings = None if way.settings is None else dict(way.settings)
+        if settings is not None and way.equal:
+            settings["budget"] = self.run(folder, WHOLE, case)["count"]
+        elif settings is not None and case.size != USUAL:
+            settings["superpixels"] = case.size
+        count = case.views or num_views(folder)
+        whole = case.style == "plain" and case.size == USUAL and count in COUNTS
+        own = whole and way in VIEW_WAYS
+        what = [folder.name, case.style, count, own, settings, way.silent]
+        what += [self.digest(way.networks), self.lpips]
+        key = hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()[:24]
+        if key not in self.store.runs:
+            start = time.process_time()
+            figures = self.measure(folder, way, case, settings, own=own)
+            spent = time.process_time() - start
+            self.spent += spent
+            head = {"scene": folder.name, "name": way.name, "case": [case.style, count, case.size]}
+            one = {"key": key, **head, "settings": settings, **figures, "processor": spent}
+            print(json.dumps(one), file=sys.stderr, flush=True)
+            self.store.add(one)
+        return self.store.runs[key]
+
+    def digest(self, networks: str) -> str:
+        """The hash of a file of networks; empty for none."""
+        if networks and networks not in self.digests:
+            content = self.files[networks].read_bytes()
+            self.digests[networks] = hashlib.sha256(content).hexdigest()[:16]
+        return self.digests.get(networks, "")
+
+    def measure(
+        self, folder: Path, way: Way, case: Case, settings: dict[str, Any] | None, *, own: bool
+    ) -> dict[str, Any]:
+        """Make a result and score it; ``own``: in its input views, too."""
+        ply = export(folder, self.cache, case.style)
+        scene, targets = read_case(folder, ply, case.views)
+        images = dict[tuple[str, int], np.ndarray]()
+        gaussians, facts = scene.file_gaussians, dict[str, Any]()
+        if settings is not None:
+            gaussians, facts = self.compact(scene, way, settings)
+        options = EvaluateOptions((), context=own, own=False, photo_side=PHOTO_SIDE)
+        scores = evaluate(
+            scene, {"it": gaussians}, targets, options,
+            on_image=lambda _, split, view, image: images.update({(split, view): image}),
+        ).results[0]  # fmt: skip
+        everywhere, visible = scores.mean("target")
+        facts |= {"seen": [visible.psnr, visible.ssim]}
+        if own:
+            inputs = scores.mean("context")[0]
+            facts |= {"all": [everywhere.psnr, everywhere.ssim], "inputs": [inputs.psnr, inputs.ssim]}
+        if self.lpips:
+            for name, value in distances(scene, targets, images, own=own).items():
+                facts[name].append(value)
+        if own and way in (INPUT, WHOLE):
+            facts["frame"] = frame_seconds(gaussians, scene.cameras)
+        size = file_bytes(len(gaussians), gaussians.sh_degree)
+        return {"count": len(gaussians), "ratio": scores.ratio, "bytes": size, **facts}
+
+    def compact(self, scene: gsmerge.Scene, way: Way, settings: dict[str, Any]) -> tuple[Gaussians, dict[str, Any]]:
+        """A way's Gaussians, and the processor seconds and matches that they took."""
+        with tempfile.TemporaryDirectory() as place:
+            if way.networks in ("paper", "undiversified"):
+                file = self.files[way.networks]
+                file = silenced(file, way.silent, Path(place)) if way.silent else file
+                settings = {**settings, "checkpoint": str(file)}
+            start = time.process_time()
+            result = gsmerge.compact(scene, **settings)
+            spent = time.process_time() - start
+        seconds, choices = result.report.seconds, result.report.choices
+        scoring = sum(seconds.get(name, 0.0) for name in SCORING) / sum(seconds.values())
+        matched = choices["clusters"] / choices["groups"] if "clusters" in choices else 1.0
+        return result.gaussians, {"seconds": spent * (1 - scoring), "matched": matched}
+
+    @property
+    def counts(self) -> list[int]:
+        """The numbers of views that any scene has."""
+        return [count for count in COUNTS if any(num_views(folder) >= count for folder in self.folders)]
+
+    def runs(self, way: Way, case: Case) -> Runs:
+        """The runs of the scenes that have so many views."""
+        folders = [folder for folder in self.folders if num_views(folder) >= (case.views or 0)]
+        return {folder.name: self.run(folder, way, case) for folder in folders}
+
+
+@cache
+def num_views(folder: Path) -> int:
+    frames = json.loads((folder / "transforms.json").read_text())["frames"]
+    return sum(frame["role"] == "context" for frame in frames)
+
+
+@lru_cache(maxsize=1)
+def load_case(folder: Path, ply: Path) -> tuple[gsmerge.Scene, HeldOutViews]:
+    """A scene, and its held-out views in the world of the export."""
+    load = load_files(find_scene_files(ply))
+    return load.scene, read_held_out(load, folder / "transforms.json")
+
+
+@lru_cache(maxsize=2)
+def read_case(folder: Path, ply: Path, views: int | None) -> tuple[gsmerge.Scene, Views]:
+    """Some views of a scene, and the held-out ones between them at the paper's size."""
+    scene, targets = choose_views(*load_case(folder, ply), views)
+    assert targets is not None
+    return scene, shrink_views(targets, PHOTO_SIDE)
+
+
+def distances(
+    scene: gsmerge.Scene, targets: Views, images: Mapping[tuple[str, int], np.ndarray], *, own: bool
+) -> dict[str, float]:
+    """LPIPS of two views by what is compared; ``evaluate`` takes twice as long, as it has more of them."""
+    near, cameras = near_plane(scene), shrink_cameras(scene.cameras, PHOTO_SIDE)
+    chosen = pick_views(len(targets.names), LPIPS_VIEWS)
+    few = targets.cameras[chosen]
+    sources = scene.cameras if scene.aligned else cameras
+    masks = visible_pixels(context_points(scene, near, sources), few, near, sources)
+
+    def mean(split: str, ids: Sequence[int], photos: np.ndarray, masks: Sequence[Any]) -> float:
+        pairs = zip(ids, photos, masks, strict=True)
+        return float(np.mean([lpips(images[split, i], photo, "vgg", mask) for i, photo, mask in pairs]))
+
+    values = {"seen": mean("target", chosen, targets.images[chosen], masks)}
+    if own:
+        values["all"] = mean("target", chosen, targets.images[chosen], [None] * len(chosen))
+        ids = pick_views(len(scene), LPIPS_VIEWS)
+        part = Views(scene.cameras[ids], scene.images[ids], tuple(scene.names[i] for i in ids))
+        photos = shrink_views(part, PHOTO_SIDE).images
+        values["inputs"] = mean("context", ids, photos, [None] * len(ids))
+    return values
+
+
+def frame_seconds(gaussians: Gaussians, cameras: Cameras) -> float:
+    """Processor seconds of a frame, the least of three turns."""
+    few, spent = cameras[pick_views(len(cameras), 3)], []
+    for _ in range(3):
+        start = time.process_time()
+        gsmerge.render(gaussians, few)
+        spent.append(time.process_time() - start)
+    return min(spent) / len(few)

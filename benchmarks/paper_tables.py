@@ -1,0 +1,307 @@
+"""The superpixel merging paper's tables with ``--recipe paper``: its section of docs/results.md, as Markdown.
+
+python benchmarks/paper_tables.py                                 # finished runs are kept, so it can be stopped
+python benchmarks/paper_tables.py --page docs/results.md          # and the section there is replaced
+python benchmarks/paper_tables.py fox,fern --only views sizes --no-lpips
+python benchmarks/paper_tables.py --undiversified FILE            # networks trained without diversification, too
+
+The recipe has no budget, so K counts; what it is compared with has as many Gaussians as K = 1. Every result is made
+once and scored once: held-out photos, visible and all pixels, and input views where a table shows them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+import tempfile
+import textwrap
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import printed_figures as printed
+from networks import Store, applies, words
+from paper_runs import (
+    CHILDREN,
+    COUNTS,
+    INPUT,
+    MOMENTS,
+    OURS,
+    PHOTO_SIDE,
+    PLAIN,
+    RESIZED,
+    SIZES,
+    STYLE_WAYS,
+    STYLES,
+    VARIANTS,
+    VIEW_WAYS,
+    WHOLE,
+    Bench,
+    Case,
+    Runs,
+    Way,
+    num_views,
+)  # fmt: skip
+from result_cells import make_table
+from shared_scenes import scene_folders
+
+from gsmerge.measure.lpips import INSTALL, lpips_available
+from gsmerge.measure.speed import break_even
+from gsmerge.networks.checkpoint import IN_PACKAGE, load_checkpoint
+from gsmerge.research.charts.lines import Interval, paired_difference
+
+TITLE = "## The paper's own method"
+
+
+def mean_cell(runs: Runs, part: str = "seen") -> str:
+    """Means of PSNR / SSIM / LPIPS over the scenes."""
+    means = np.mean([run[part] for run in runs.values()], 0)
+    return " / ".join(f"{value:.{3 if i else 2}f}" for i, value in enumerate(means))
+
+
+def share(runs: Runs) -> str:
+    return f"{100 * np.mean([run['ratio'] for run in runs.values()]):.1f} %"
+
+
+def compared(runs: Runs, whole: Runs) -> str:
+    """A way's figures, and its PSNR less that of the recipe."""
+    return mean_cell(runs) + (f" ({plus_minus(difference(runs, whole))})" if runs is not whole else "")
+
+
+def difference(runs: Runs, whole: Runs) -> Interval:
+    """PSNR of some runs less that of others, paired by scene."""
+    mine, theirs = ({scene: run["seen"][0] for scene, run in some.items()} for some in (runs, whole))
+    return paired_difference(mine, theirs)
+
+
+def plus_minus(interval: Interval) -> str:
+    return f"{interval.mean:+.2f} ± {interval.high - interval.mean:.2f}"
+
+
+def over_counts(bench: Bench, way: Way) -> Runs:
+    """Each scene's means over the numbers of views that it has, as the paper averages."""
+    by_count = [bench.runs(way, Case(views=count)) for count in bench.counts]
+    means: Runs = {}
+    for scene in by_count[0]:
+        some = [runs[scene] for runs in by_count if scene in runs]
+        parts = {name: np.mean([run[name] for run in some], 0) for name in ("seen", "all", "inputs")}
+        means[scene] = {"ratio": np.mean([run["ratio"] for run in some]), **parts}
+    return means
+
+
+def views_section(bench: Bench) -> str:
+    """Numbers of views, and what the figures are of."""
+    rows, sides, whole = [], [], over_counts(bench, WHOLE)
+    ours = f"{len(bench.folders)} captures"
+    for way in VIEW_WAYS:
+        runs = whole if way is WHOLE else over_counts(bench, way)
+        cells = [mean_cell(bench.runs(way, Case(views=count))) for count in bench.counts]
+        gain = "" if way is WHOLE else words(difference(runs, whole))
+        rows.append((way.name, ours, share(runs), *cells, mean_cell(runs), gain))
+        sides.append((way.name, ours, *(mean_cell(runs, part) for part in ("seen", "all", "inputs"))))
+        if way.key in printed.VIEWS:
+            kept, *cells, mean = printed.VIEWS[way.key]
+            cells = [cell for count, cell in zip(COUNTS, cells, strict=True) if count in bench.counts]
+            rows.append((way.name, printed.DATA, kept, *cells, mean, ""))
+        if way.key in printed.SIDES:
+            sides.append((way.name, printed.DATA, *printed.SIDES[way.key]))
+    names = [f"{count} views ({len(bench.runs(WHOLE, Case(views=count)))} captures)" for count in bench.counts]
+    head = ("", "data", "kept", *names, "mean", "PSNR less K = 1 (95 %)")
+    first = make_table(head, order(rows))
+    names = ("held-out views, seen pixels", "held-out views, all pixels", "input views")
+    second = make_table(("", "data", *names), order(sides))
+    text = """Evenly spread input views, held-out views midway between them. Mean: of each capture over the numbers of
+    views that it has, then over the captures. Then the same means by what is compared."""
+    return section("By number of views", text, first, second)
+
+
+def order(rows: Sequence[Sequence[str]]) -> list[Sequence[str]]:
+    """Ours first, then what the paper prints."""
+    return sorted(rows, key=lambda row: row[1] == printed.DATA)
+
+
+def sizes_section(bench: Bench) -> str:
+    rows = []
+    for size in SIZES:
+        case = Case(size=size)
+        whole = bench.runs(WHOLE, case)
+        cells = [compared(bench.runs(way, case), whole) for way in (MOMENTS, *OURS)]
+        rows.append((size, share(whole), mean_cell(whole), *cells, printed.SIZES.get(size, "")))
+    others = [way.name for way in (MOMENTS, *OURS)]
+    head = ("`--superpixels`", "kept", "`--recipe paper`", *others, "printed: AnySplat")
+    text = """All views, K = 1; the columns after `--recipe paper` have as many Gaussians. In brackets their
+    PSNR less that of the recipe, with the 95 % interval. Then the row of 4.4 % by capture."""
+    ways = (INPUT, MOMENTS, WHOLE, *OURS)
+    columns = [bench.runs(way, PLAIN) for way in ways]
+    one = [(name, *(mean_cell({name: runs[name]}) for runs in columns)) for name in columns[0]]
+    return section("By size", text, make_table(head, rows), make_table(("", *(way.name for way in ways)), one))
+
+
+def backbones_section(bench: Bench) -> str:
+    rows, before = [], bench.runs(INPUT, PLAIN)
+    cases = [PLAIN, *(Case(style) for style in STYLES)]
+    wholes = [bench.runs(WHOLE, case) for case in cases]
+    for way in STYLE_WAYS:
+        cells = []
+        for case, whole in zip(cases, wholes, strict=True):
+            runs = whole if way is WHOLE else bench.runs(way, case)
+            kept = np.mean([run["count"] / before[scene]["count"] for scene, run in runs.items()])
+            cells.append(f"{100 * kept:.1f} %: {compared(runs, whole)}")
+        rows.append((way.name, *cells, *printed.BACKBONES.get(way.key, ("",) * 3)))
+    names = ("DA3", "DepthSplat", "AnySplat, voxels")
+    head = ("", "plain", *STYLES[:2], "anysplat, voxels", *(f"printed: {name}" for name in names))
+    text = """All views. The first four columns are of one depth network, written as four programs write their files,
+    the last of them merged into voxels. Percentages are of one Gaussian per pixel; in brackets PSNR less that of K = 1,
+    with the 95 % interval."""
+    return section("By backbone, and of voxels", text, make_table(head, rows))
+
+
+def ablation_section(bench: Bench) -> str:
+    whole = bench.runs(WHOLE, PLAIN)
+    known: list[tuple[str, Runs, Runs]] = [("the whole", whole, whole)]
+    checkpoint = bench.files["paper"]
+    known += [(way.name, bench.runs(way, PLAIN), whole) for way in VARIANTS if applies(way, checkpoint)]
+    known += [(name, bench.runs(WHOLE, Case(size=size)), whole) for size, name in RESIZED.items()]
+    for way in CHILDREN if "undiversified" in bench.files else ():
+        other = replace(way, networks="undiversified")
+        known.append((f"{way.name}, trained without diversification", bench.runs(other, PLAIN), bench.runs(way, PLAIN)))
+    rows = []
+    for name, runs, base in known:
+        kept = f"{100 * np.mean([run['matched'] for run in runs.values()]):.0f} %"
+        gain = "" if runs is base else words(difference(runs, base))
+        rows.append((name, kept, share(runs), mean_cell(runs), gain, printed.ABLATION.get(name, "")))
+    names = ("groups kept across views", "kept", "`--recipe paper`", "PSNR less the whole (95 %)")
+    text = "All views, K = 1; what was trained without diversification is compared with the same K."
+    return section("Without a part", text, make_table(("", *names, "printed: AnySplat"), rows))
+
+
+def storage_section(bench: Bench) -> str:
+    rows = []
+    for count in bench.counts:
+        before, after = ([*bench.runs(way, Case(views=count)).values()] for way in (INPUT, WHOLE))
+        many, large, slow = (mean_value(before, name) for name in ("count", "bytes", "frame"))
+        few, small, fast = (mean_value(after, name) for name in ("count", "bytes", "frame"))
+        merge = mean_value(after, "seconds")
+        even = break_even(merge, slow, fast)
+        cells = [f"{many / 1e6:.2f} to {few / 1e6:.3f} M", f"{large / 1e6:.0f} to {small / 1e6:.1f}"]
+        cells += [f"{large / small:.1f} x", f"{1e3 * slow:.0f} to {1e3 * fast:.0f} ms", f"{slow / fast:.1f} x"]
+        cells += [f"{merge:.1f} s", "-" if even is None else f"{even:.0f}"]
+        rows.append((str(count), f"{len(before)} captures", *cells))
+    rows += [(count, "printed: DA3, MipNeRF360, B200 GPU", *cells) for count, cells in printed.STORAGE.items()]
+    head = ("views", "data", "Gaussians", "MB", "smaller", "a frame", "faster", "merging", "frames to break even")
+    text = "K = 1. Times of the captures are processor seconds: those that all cores spent together."
+    return section("Storage, rendering and break-even", text, make_table(head, rows))
+
+
+def mean_value(runs: Sequence[dict[str, Any]], name: str) -> float:
+    return float(np.mean([run[name] for run in runs]))
+
+
+SECTIONS: dict[str, Callable[[Bench], str]] = {
+    "views": views_section,
+    "sizes": sizes_section,
+    "backbones": backbones_section,
+    "ablation": ablation_section,
+    "storage": storage_section,
+}
+
+
+def planned(parts: Sequence[str], bench: Bench) -> Iterator[tuple[Way, Case]]:
+    """What the sections need, so that each scene is read once."""
+    if "views" in parts:
+        yield from ((way, Case(views=count)) for count in bench.counts for way in VIEW_WAYS)
+    if "storage" in parts:
+        yield from ((way, Case(views=count)) for count in bench.counts for way in (INPUT, WHOLE))
+    if "sizes" in parts:
+        yield INPUT, PLAIN
+        yield from ((way, Case(size=size)) for size in SIZES for way in (WHOLE, MOMENTS, *OURS))
+    if "ablation" in parts:
+        yield from ((way, PLAIN) for way in (WHOLE, *VARIANTS) if applies(way, bench.files["paper"]))
+        yield from ((WHOLE, Case(size=size)) for size in RESIZED)
+        others = ("paper", "undiversified") if "undiversified" in bench.files else ()
+        yield from ((replace(way, networks=name), PLAIN) for name in others for way in CHILDREN)
+    if "backbones" in parts:
+        yield from ((way, PLAIN) for way in STYLE_WAYS)
+        yield from ((way, Case(style)) for style in STYLES for way in STYLE_WAYS)
+
+
+def head_section(bench: Bench) -> str:
+    """What the figures are of, and how the paper's differ."""
+    training = load_checkpoint(bench.files["paper"]).training
+    steps, scenes = training["step"], len(training["data"])
+    names = ", ".join(f"{folder.name} ({num_views(folder)} views)" for folder in bench.folders)
+    how = f"""`--recipe paper`: BASS superpixels, encoder, geometry decoded by the head for K = 1, matching by
+    latents and boxes, merger, refiner, heads, pruning by opacity, no fit and no budget: superpixels are
+    4.4 % of the pixels unless a table says otherwise. `moment-matching` and gsmerge's own settings have
+    at most as many Gaussians as the recipe with K = 1. Cells are means over the captures of PSNR / SSIM
+    / LPIPS, photos at {PHOTO_SIDE} pixels, held-out views, pixels that the input views see, unless a
+    table says otherwise; intervals are 95 % t intervals of differences that are paired by capture.
+    `python benchmarks/paper_tables.py --page docs/results.md` writes this section."""
+    data = f"""Captures: {names}, with the depth of a multi-view-stereo network, and
+    [networks](internals/networks.md) trained for {steps:,} steps on {scenes} scenes. Printed: the paper's own figures,
+    of DL3DV-Bench, MipNeRF360 and Tanks and Temples together, with the backbone that is named, and networks trained for
+    300,000 steps on DL3DV-10K. The two compare only in order and differences."""
+    return "\n\n".join((TITLE, filled(how), filled(data)))
+
+
+def section(title: str, text: str, *tables: str) -> str:
+    return "\n\n".join((f"### {title}", filled(text), *tables))
+
+
+def filled(text: str) -> str:
+    """A paragraph in lines of the pages' length."""
+    return textwrap.fill(" ".join(text.split()), 120, break_long_words=False, break_on_hyphens=False)
+
+
+ONLINE = """### The paper's method view by view
+
+`gsmerge extend --recipe paper` matches and merges batches by their latents, and decodes on demand:
+[guide](guide/views-in-batches.md), [figures](#views-in-batches-with-the-papers-networks)."""
+
+
+def replace_section(page: Path, section: str) -> None:
+    """Put the section in the place of the one with its title."""
+    text = page.read_text(encoding="utf-8")
+    pattern = re.compile(rf"^{re.escape(TITLE)}\n.*?(?=^## |\Z)", re.DOTALL | re.MULTILINE)
+    if not pattern.search(text):
+        raise SystemExit(f"{page}: expected a section {TITLE!r}, found none")
+    page.write_text(pattern.sub(lambda _: f"{section}\n\n", text), encoding="utf-8")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("scenes", nargs="?", default="eval", help="train, eval, or names with commas between")
+    parser.add_argument("--only", nargs="*", default=list(SECTIONS), choices=list(SECTIONS))
+    parser.add_argument("--no-lpips", dest="lpips", action="store_false")
+    parser.add_argument("--checkpoint", type=Path, default=IN_PACKAGE["paper"], help="networks of the recipe")
+    parser.add_argument("--undiversified", type=Path, help="the same trained without diversification")
+    parser.add_argument("--page", type=Path, help="replace the section of this page")
+    parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-benchmarks")
+    args = parser.parse_args()
+    if args.lpips and not lpips_available("vgg"):
+        parser.error(f"LPIPS needs weights: {INSTALL}; or give --no-lpips")
+    if args.page and len(args.only) < len(SECTIONS):
+        parser.error("--page: expected all parts, of which a page's section consists")
+    args.cache.mkdir(parents=True, exist_ok=True)
+    files = {"paper": args.checkpoint, "shipped": IN_PACKAGE["shipped"]}
+    if args.undiversified:
+        files["undiversified"] = args.undiversified
+    store = Store(args.cache / "paper_tables.jsonl")
+    bench = Bench(scene_folders(args.scenes), store, args.cache, files, args.lpips)
+    for folder in bench.folders:
+        for way, case in planned(args.only, bench):
+            if num_views(folder) >= (case.views or 0):
+                bench.run(folder, way, case)
+    sections = [head_section(bench), *(SECTIONS[name](bench) for name in args.only), ONLINE]
+    text = "\n\n".join(sections)
+    print(text)
+    print(f"{bench.spent / 60:.1f} processor minutes", file=sys.stderr)
+    if args.page:
+        replace_section(args.page, text)
+
+
+if __name__ == "__main__":
+    main()
