@@ -59,7 +59,8 @@ def nearest_of_other_views(means: np.ndarray, views: np.ndarray, count: int) -> 
     """Find the nearest points of other views, ``[g,count]`` int64, nearest first (paper section 4.4).
 
     -1 where there are fewer, or where ``MOST`` times as many points, at least 1,024, most of them of the own view, are
-    nearer: what lies behind those overlaps nothing. Points are ``means [g,3]`` float64, finite; a view below 0 counts as another.
+    nearer: what lies behind those overlaps nothing. Points are ``means [g,3]`` float64, finite; a view below 0 counts
+    as another.
     """
     num = len(means)
     num_nodes = 4 << (num // LEAF).bit_length()
