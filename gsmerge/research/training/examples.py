@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -181,8 +182,9 @@ def recolor(example: Example, rng: np.random.Generator) -> Example:
     gain = float(rng.uniform(0.6, 1))
     low, inverted = float(rng.uniform(0, 1 - gain)), bool(rng.random() < 0.5)
     colors = ColorMap(tuple(rng.permutation(3).tolist()), -gain if inverted else gain, low + gain * inverted)
-    changed = {"members": example.members, "features": example.features, "base": example.base}
-    for name, part in changed.items():
+    changed: dict[str, Any] = {}
+    for name in ("members", "features", "base"):
+        part = getattr(example, name)
         shN = part.shN.take(colors.order, -1) * np.float32(colors.gain)
         changed[name] = replace(part, sh0=colors.change_sh0(part.sh0), shN=shN)
     targets = {}
