@@ -188,15 +188,19 @@ def _enter(
 def find_partners(features: FeatureGaussians, new: FeatureGaussians, options: MatchOptions) -> np.ndarray:
     """Return the state's group with the same surface as each new one, ``[n]`` int64, -1 for none.
 
-    No group gets two. Matched as across the views of one batch, the state being one view and the
-    batch another.
+    No group gets two: of several in a cluster by boxes, the first. Matched as across the views of one batch, the state
+    being one view and the batch another.
     """
     both = FeatureGaussians.concat([features, new])
     sides = (np.arange(len(both)) >= len(features)).astype(np.int64)
     matches = match(replace(both, views=sides), replace(options, cluster_size=2))
     owner = np.full(matches.count, -1)
     owner[matches.clusters[: len(features)]] = np.arange(len(features))
-    return owner[matches.clusters[len(features) :]]
+    partners = owner[matches.clusters[len(features) :]]
+    again = np.ones(len(partners), bool)
+    again[np.unique(partners, return_index=True)[1]] = False
+    partners[again] = -1
+    return partners
 
 
 def merge_into(groups: GroupSet, new: GroupSet, rows: np.ndarray, max_k: int) -> GroupSet:

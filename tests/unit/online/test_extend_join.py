@@ -38,14 +38,15 @@ def test_partners_show_the_same_surface(sides: tuple[GroupSet, GroupSet], actual
     assert float(np.median(gaps / sizes)) < 1
 
 
-def test_groups_of_one_side_are_never_partners() -> None:
+@pytest.mark.parametrize("method", ["overlap", "aabb"])
+def test_groups_of_one_side_are_never_partners(method: str) -> None:
     """All in one place: each new one gets one, and what is left over none."""
     same = scenes.make_features(np.tile([[0.0, 0, 3]], (3, 1)), sizes=0.1)
     many = scenes.make_features(np.tile([[0.0, 0, 3]], (5, 1)), sizes=0.1)
-    actual = find_partners(same, many, MatchOptions())
-    concat_groups = actual[actual >= 0].tolist()
-    assert len(concat_groups) == len(set(concat_groups)) <= 3
-    assert len(concat_groups) >= 1
+    actual = find_partners(same, many, MatchOptions(match=method))
+    partners = actual[actual >= 0].tolist()
+    assert len(partners) == len(set(partners)) <= 3
+    assert len(partners) >= 1
 
 
 def test_no_partners_without_anything_there(sides: tuple[GroupSet, GroupSet]) -> None:
