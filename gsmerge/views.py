@@ -1,4 +1,4 @@
-"""Choice of views: given, held out (the paper's rule, supplement A, "View sampling"), and scored."""
+"""Choice of views: given, held out (the paper's rule, supplement A, "View sampling"), and scored; their cameras."""
 
 from __future__ import annotations
 
@@ -109,3 +109,20 @@ def subset(scene: Scene, view_ids: Sequence[int]) -> Scene:
         large_photos=large,
         masks=masks,
     )
+
+
+def in_float64(cameras: Cameras) -> Cameras:
+    """Return cameras with matrices in float64."""
+    return replace(cameras, viewmats=cameras.viewmats.astype(np.float64), Ks=cameras.Ks.astype(np.float64))
+
+
+def resize_cameras(cameras: Cameras, width: int, height: int) -> Cameras:
+    """Return the same views in pictures of another size, with intrinsics of that size."""
+    scale = np.array([width / cameras.width, height / cameras.height, 1.0], cameras.Ks.dtype)
+    return replace(cameras, Ks=cameras.Ks * scale[:, None], width=width, height=height)
+
+
+def concat_cameras(first: Cameras, second: Cameras) -> Cameras:
+    """Concatenate cameras of one size, in float64."""
+    viewmats = np.concatenate([first.viewmats, second.viewmats], dtype=np.float64)
+    return replace(first, viewmats=viewmats, Ks=np.concatenate([first.Ks, second.Ks], dtype=np.float64))

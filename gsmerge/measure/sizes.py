@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from gsmerge.kernels.pictures import enlarge
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Views
+from gsmerge.views import resize_cameras
 
 SomeViews = TypeVar("SomeViews", bound=Views)
 
@@ -20,9 +21,7 @@ def zoom_cameras(cameras: Cameras, zoom: float) -> Cameras:
     """Resize the cameras' images to ``zoom`` times as many pixels per side, with intrinsics of that size."""
     long_side = max(cameras.width, cameras.height)
     factor = max(1, round(zoom * long_side)) / long_side
-    size = max(1, round(cameras.width * factor)), max(1, round(cameras.height * factor))
-    scale = np.array([size[0] / cameras.width, size[1] / cameras.height, 1.0], cameras.Ks.dtype)
-    return replace(cameras, Ks=cameras.Ks * scale[:, None], width=size[0], height=size[1])
+    return resize_cameras(cameras, max(1, round(cameras.width * factor)), max(1, round(cameras.height * factor)))
 
 
 def shrink_cameras(cameras: Cameras, side: int) -> Cameras:

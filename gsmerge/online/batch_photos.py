@@ -11,7 +11,7 @@ from gsmerge.geometry import normalize
 from gsmerge.kernels.matrices import matmul
 from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.online.options import OnlineOptions
-from gsmerge.online.state import GroupSet, Replay, replace_groups, resize_cameras, select_groups
+from gsmerge.online.state import GroupSet, Replay, replace_groups, select_groups
 from gsmerge.render.photos import Photos, photo_errors, photos_of, scene_pictures
 from gsmerge.render.weights import apply_transposed
 from gsmerge.runtime.threads import parallel_map
@@ -19,6 +19,7 @@ from gsmerge.stages.fit import FitReport
 from gsmerge.stages.fit.color import draw, fit_colors
 from gsmerge.stages.fit.fit_options import FitOptions
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Scene
+from gsmerge.views import in_float64, resize_cameras
 
 REACH = 3.34  # standard deviations to where an opaque Gaussian adds 1/255
 MARGIN = 2.0  # pixels that the rasterizer's low-pass adds to that
@@ -45,7 +46,7 @@ def resize_photos(images: np.ndarray, cameras: Cameras, width: int, height: int)
     if size == (cameras.width, cameras.height):
         return BatchPhotos(images, cameras)
     small = parallel_map(lambda image: cv2.resize(image, size, interpolation=cv2.INTER_AREA), images)
-    return BatchPhotos(np.stack(small), resize_cameras(cameras, width, height))
+    return BatchPhotos(np.stack(small), resize_cameras(in_float64(cameras), width, height))
 
 
 def photos_of_batch(scene: Scene, known: Cameras | None) -> tuple[BatchPhotos, np.ndarray]:

@@ -33,7 +33,6 @@ from gsmerge.online.state import (
     OnlineState,
     StateNetworks,
     ViewSamples,
-    concat_cameras,
     concat_groups,
     first_state,
     grown_state,
@@ -54,6 +53,7 @@ from gsmerge.stages.merge import merge, refine, take
 from gsmerge.stages.prepare import Prepared
 from gsmerge.stages.segment import segment_scene
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches
+from gsmerge.views import concat_cameras
 
 WIDE = 3 * REACH  # standard deviations about what a view sees, in which the refiner finds the neighbours of its border
 SAMPLE_STEP = 8  # pixels between the samples of a view along each axis

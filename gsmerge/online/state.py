@@ -17,6 +17,7 @@ from gsmerge.moments import MAX_OPACITY, Members, feature_to_gaussians, gaussian
 from gsmerge.stages.decode import divide
 from gsmerge.stages.merge import take
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, to_float32
+from gsmerge.views import concat_cameras, in_float64, resize_cameras
 
 if TYPE_CHECKING:
     from gsmerge.networks.apply import NetworkContext
@@ -345,7 +346,7 @@ def first_state(groups: GroupSet, prepared: Prepared, plan: Plan, max_k: int) ->
         groups=groups,
         kept=plan.unseen,
         frame=prepared.frame,
-        cameras=resize_cameras(cameras, cameras.width, cameras.height),
+        cameras=in_float64(cameras),
         replay=no_photos(cameras),
         settings=settings,
         about={},
@@ -366,15 +367,3 @@ def grown_state(
         cameras=concat_cameras(state.cameras, new_cameras),
         settings=replace(state.settings, num_input=num_input, k=k),
     )
-
-
-def resize_cameras(cameras: Cameras, width: int, height: int) -> Cameras:
-    """Return the same views in pictures of another size."""
-    shape = np.array([[width / cameras.width], [height / cameras.height], [1.0]])
-    return Cameras(cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64) * shape, width, height)
-
-
-def concat_cameras(first: Cameras, second: Cameras) -> Cameras:
-    """Concatenate cameras of one size."""
-    viewmats = np.concatenate([first.viewmats, second.viewmats], dtype=np.float64)
-    return Cameras(viewmats, np.concatenate([first.Ks, second.Ks], dtype=np.float64), first.width, first.height)

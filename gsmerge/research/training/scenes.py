@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -16,7 +16,7 @@ from gsmerge.render.photos import NEAR, Photos, scene_photos
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.prepare import canonicalise
 from gsmerge.types import Cameras, Scene, Views
-from gsmerge.views import even_views, subset
+from gsmerge.views import concat_cameras, even_views, resize_cameras, subset
 
 OPAQUE = 0.5  # alpha from which the Gaussians cover a pixel
 
@@ -56,12 +56,7 @@ def make_training_scene(scene: Scene, ids: Sequence[int], held_out: Views | None
     cameras, images = scene.cameras[order], scene.images[order]
     if held_out is not None:
         width, height = cameras.width, cameras.height
-        ratio = np.array([width / held_out.cameras.width, height / held_out.cameras.height, 1.0])
-        cameras = replace(
-            cameras,
-            viewmats=np.concatenate([cameras.viewmats, held_out.cameras.viewmats]).astype(np.float64),
-            Ks=np.concatenate([cameras.Ks, held_out.cameras.Ks * ratio[:, None]]).astype(np.float64),
-        )
+        cameras = concat_cameras(cameras, resize_cameras(held_out.cameras, width, height))
         resized = [resize_photo(image, width, height) for image in held_out.images]
         images = np.concatenate([images, np.stack(resized)])
     return TrainingScene(canonical, scene_members(canonical), frame.enter_cameras(cameras), images)
