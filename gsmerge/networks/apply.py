@@ -16,7 +16,7 @@ from gsmerge.geometry import covariances, rotation_entries, rotmat_to_quat
 from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.networks.corrections import HALF, move_features, move_gaussians, scale_outputs
 from gsmerge.networks.cross_view_stats import nearest_of_other_views
-from gsmerge.networks.options import FEATURE, MEMBER, PART, RESIDUAL, SLOTS, NetworkOptions
+from gsmerge.networks.options import CORRECTED, FEATURE, MEMBER, PART, RESIDUAL, SLOTS, NetworkOptions
 from gsmerge.networks.tokens import (
     GroupFeatures,
     compute_group_features,
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from gsmerge.networks.modules import Networks
 
 # What a Feature Gaussian says of itself; its members, their weights and its view are those of its cluster.
-OWN = ("means", "covars", "masses", "extinctions", "gains", "sh0", "shN", "footprints", "latents")
+OWN = (*CORRECTED, "gains", "shN", "footprints")
 RunTable = Callable[[np.ndarray, int], Array]  # rows and width of a table -> [rows, columns]
 
 
@@ -62,15 +62,10 @@ class NetworkContext:
         return compute_group_features(features, self.members, self.cameras)
 
     def make_tokens(
-        self,
-        parts: Gaussians | Members,
-        ids: np.ndarray,
-        owners: np.ndarray,
-        group_features: GroupFeatures,
-        columns: int = PART,
+        self, parts: Gaussians | Members, ids: np.ndarray, owners: np.ndarray, group_features: GroupFeatures
     ) -> Array:
         """Describe Gaussians relative to Feature Gaussians, see :func:`gsmerge.networks.tokens.part_tokens`."""
-        return part_tokens(parts, ids, owners, group_features, columns)
+        return part_tokens(parts, ids, owners, group_features, MEMBER if isinstance(parts, Members) else PART)
 
     def correct_features(self, group_features: GroupFeatures, residuals: Array) -> FeatureGaussians:
         """Apply corrections ``[g,14]`` to Feature Gaussians."""
@@ -108,7 +103,7 @@ def encode_features(features: FeatureGaussians, context: NetworkContext) -> Feat
         keys = (offsets * axes[rows[owners]]).sum(1)
         sample, mask = sample_members(keys, sizes[rows], width, seeds[rows])
         chosen = ids[positions][sample.reshape(-1)]
-        tokens = context.make_tokens(context.members, chosen, np.repeat(rows, width), group_features, MEMBER)
+        tokens = context.make_tokens(context.members, chosen, np.repeat(rows, width), group_features)
         table = tokens.reshape(*mask.shape, MEMBER)
         return context.networks.run("encoder", table, mask, group_features.group[rows])
 

@@ -17,6 +17,7 @@ MEMBER = PART + 6  # and its position in footprints and its colour
 GROUP = 19 + NUM_STATS  # columns of a whole group
 RESIDUAL = 13  # columns of a correction, see gsmerge.networks.corrections
 FEATURE = RESIDUAL + 1  # of a correction of a Feature Gaussian, whose last column is the mass
+CORRECTED = ("means", "covars", "masses", "extinctions", "sh0", "latents")  # of a Feature Gaussian, by networks
 PAPER_NUMBERS = (4, 8, 9, 10)  # columns of a group that the paper's decoder reads: mass and base colour
 
 

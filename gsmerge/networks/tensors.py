@@ -41,6 +41,12 @@ def rotate_vectors(frames: Tensor, vectors: Tensor) -> Tensor:
     return (frames @ vectors[:, :, None])[:, :, 0]
 
 
+def skew_vectors(matrices: Tensor) -> Tensor:
+    """Return the vectors ``[n,3]`` whose cross product the skew part of matrices ``[n,3,3]`` is."""
+    skew = (matrices - matrices.transpose(1, 2)) / 2
+    return torch.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], 1)
+
+
 def move_tensors(gaussians: Gaussians, residuals: Tensor, frames: Tensor) -> Gaussians:
     """Apply corrections ``[n,13]`` to n Gaussians, tensors, in frames ``[n,3,3]`` with axes as columns, world."""
     g = gaussians

@@ -18,6 +18,7 @@ from gsmerge.encoded.gsm_file import ENCODED, MINOR, STATE, GsmFile, read_encode
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import AUTO, ReadHints, SceneFiles, atomic_output
 from gsmerge.io.formats.ply import OpacityChoice
+from gsmerge.networks.options import CORRECTED
 from gsmerge.online.extend import extend
 from gsmerge.online.options import merge_settings
 from gsmerge.online.state import (
@@ -38,7 +39,6 @@ from gsmerge.types import Cameras, FeatureGaussians
 if TYPE_CHECKING:
     from gsmerge.networks.weights import NetworkWeights
 
-REFINED = ("means", "covars", "masses", "extinctions", "sh0", "latents")  # columns that the refiner changes
 HEAD_COUNTS = ("views", "num_members")
 
 
@@ -62,7 +62,7 @@ def save_state(path: str | PathLike[str], state: OnlineState, *, overwrite: bool
 def _learned_parts(networks: StateNetworks, learned: Learned) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Return header entries and arrays of what a state with networks has more."""
     weights, samples = networks.weights, networks.samples
-    arrays = {f"refined.{name}": getattr(learned.refined, name) for name in REFINED}
+    arrays = {f"refined.{name}": getattr(learned.refined, name) for name in CORRECTED}
     arrays |= {f"heads.{name}": getattr(learned, name).astype(np.int32) for name in HEAD_COUNTS}
     arrays |= {f"samples.{f.name}": getattr(samples, f.name) for f in fields(ViewSamples)}
     arrays |= {f"networks.{name}": array for name, array in weights.arrays.items()}
@@ -122,7 +122,7 @@ def _read_learned(file: GsmFile, features: FeatureGaussians, weights: NetworkWei
         expected = f"features.latents: expected {latent} numbers, as of its networks"
         raise file.error(f"{expected}, found {features.latents.shape[1]}")
     shapes: dict[str, tuple[int, ...]] = {"means": (3,), "covars": (3, 3), "sh0": (1, 3), "latents": (latent,)}
-    columns = {name: file.array(f"refined.{name}", np.float32, g, *shapes.get(name, ())) for name in REFINED}
+    columns = {name: file.array(f"refined.{name}", np.float32, g, *shapes.get(name, ())) for name in CORRECTED}
     counts = {name: file.array(f"heads.{name}", np.int32, g).astype(np.int64) for name in HEAD_COUNTS}
     views, sizes = counts["views"], counts["num_members"]
     if g and not 0 <= int(views.min()) <= int(views.max()) < num_views:

@@ -16,26 +16,31 @@ from torch.nn.functional import normalize
 
 from gsmerge.moments import MAX_OPACITY, principal_axes
 from gsmerge.networks.corrections import COLOR, LOGIT, MASS, MEAN, ROTATION, SIZE
-from gsmerge.networks.options import PART
-from gsmerge.networks.tensors import gaussian_sizes, quat_to_rotmat, rotate_quats, rotate_vectors
+from gsmerge.networks.options import CORRECTED, PART
+from gsmerge.networks.tensors import gaussian_sizes, quat_to_rotmat, rotate_quats, rotate_vectors, skew_vectors
 from gsmerge.networks.tokens import GroupFeatures
 from gsmerge.stages.merge import pool_runs
 from gsmerge.types import SH_C0, Array, FeatureGaussians, Gaussians, as_array, as_tensor
 
-TENSORS = ("means", "covars", "masses", "extinctions", "sh0", "latents")  # columns that networks change
 TINY = 1e-12  # world units
 MIN_GAP = 1e-3  # least difference of two squared scales that turns axes, as a share of the largest
 
 
 def features_to_tensors(features: FeatureGaussians) -> FeatureGaussians:
     """Return Feature Gaussians whose columns that networks change are tensors."""
-    columns: dict[str, Array] = {name: as_tensor(getattr(features, name)) for name in TENSORS}
+    columns: dict[str, Array] = {name: as_tensor(getattr(features, name)) for name in CORRECTED}
     return replace(features, **columns)
 
 
 def features_to_arrays(features: FeatureGaussians) -> FeatureGaussians:
     """Return Feature Gaussians without gradients."""
-    return replace(features, **{name: as_array(getattr(features, name)) for name in TENSORS})
+    return replace(features, **{name: as_array(getattr(features, name)) for name in CORRECTED})
+
+
+def groups_to_arrays(groups: GroupFeatures) -> GroupFeatures:
+    """Return what networks read of groups without gradients."""
+    numbers = {name: as_array(getattr(groups, name)) for name in ("frames", "sizes", "group")}
+    return replace(groups, features=features_to_arrays(groups.features), base=groups.base.numpy(), **numbers)
 
 
 def differentiate_axes(covars: Tensor) -> tuple[Tensor, Tensor]:
@@ -53,9 +58,8 @@ def differentiate_axes(covars: Tensor) -> tuple[Tensor, Tensor]:
     gaps = squares[:, None] - squares[:, :, None]  # [i,j]: square of j less that of i
     least = (MIN_GAP * squares[:, 2])[:, None, None]
     spins = change * gaps / (gaps.square() + least.square()).clamp_min(1e-37)
-    local = torch.stack([spins[:, 2, 1], spins[:, 0, 2], spins[:, 1, 0]], 1)
     grown = scales + change.diagonal(dim1=1, dim2=2) / (2 * scales)
-    return grown, rotate_quats(rotate_vectors(axes, local), quats)
+    return grown, rotate_quats(rotate_vectors(axes, skew_vectors(spins)), quats)
 
 
 def differentiate_base(features: FeatureGaussians) -> Gaussians:
@@ -182,18 +186,18 @@ def pool_tensors(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray
     return replace(pooled, **columns, latents=average(features.latents[order]))
 
 
-def make_round_tensors(parents: np.ndarray, group_features: GroupFeatures, like: Array) -> Gaussians:
+def make_round_tensors(parents: np.ndarray, group_features: GroupFeatures, known: Gaussians) -> Gaussians:
     """Make the Gaussians that absolute heads correct, see :func:`gsmerge.networks.apply.prepare_children`.
 
-    ``like`` are the same ``n`` Gaussians as arrays.
+    ``known`` are the same ``n`` Gaussians as arrays.
     """
-    own, base, same = torch.from_numpy(parents), group_features.base, like.to("cpu")
+    own, base, same = torch.from_numpy(parents), group_features.base, known.to("cpu")
     frames = group_features.frames[own]
     turns = (frames - frames.detach()) @ frames.detach().transpose(1, 2)  # zero, with a gradient
     return replace(
         same,
         means=base.means[own],
-        quats=rotate_quats(torch.stack([turns[:, 2, 1], turns[:, 0, 2], turns[:, 1, 0]], 1), same.quats),
+        quats=rotate_quats(skew_vectors(turns), same.quats),
         scales=group_features.sizes[own, None].expand(-1, 3),
         sh0=base.sh0[own],
     )

@@ -18,7 +18,7 @@ from gsmerge.moments import Members, pool_members, principal_axes
 from gsmerge.networks.corrections import ROTATION, residual_limits
 from gsmerge.networks.modules import Networks
 from gsmerge.networks.options import RESIDUAL
-from gsmerge.networks.tensors import gaussian_sizes, quat_to_rotmat
+from gsmerge.networks.tensors import gaussian_sizes, quat_to_rotmat, skew_vectors
 from gsmerge.render.autograd import render_tensors
 from gsmerge.render.photos import NEAR
 from gsmerge.research.training.perceptual import lpips_loss
@@ -185,11 +185,8 @@ def teacher_loss(prediction: Prediction, members: Members) -> Tensor:
 
 def _turn_angles(turns: Tensor) -> Tensor:
     """Compute the angles ``[n]`` of rotations ``[n,3,3]``, with a gradient at no angle, too."""
-    skew = torch.stack(
-        [turns[:, 2, 1] - turns[:, 1, 2], turns[:, 0, 2] - turns[:, 2, 0], turns[:, 1, 0] - turns[:, 0, 1]], 1
-    )
     cosines = (turns.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
-    return torch.atan2((skew.square().sum(1) / 4 + 1e-12).sqrt(), cosines)
+    return torch.atan2((skew_vectors(turns).square().sum(1) + 1e-12).sqrt(), cosines)
 
 
 GOAL = 0.5  # overlap of the boxes of two children that has no loss

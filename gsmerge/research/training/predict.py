@@ -18,7 +18,6 @@ from gsmerge.networks.apply import (
     run_heads,
 )
 from gsmerge.networks.modules import Networks
-from gsmerge.networks.options import PART
 from gsmerge.networks.tensors import move_tensors
 from gsmerge.networks.tokens import GroupFeatures
 from gsmerge.research.training.geometry import (
@@ -27,6 +26,7 @@ from gsmerge.research.training.geometry import (
     differentiate_tokens,
     features_to_arrays,
     features_to_tensors,
+    groups_to_arrays,
     make_round_tensors,
     move_feature_tensors,
     pool_tensors,
@@ -36,7 +36,7 @@ from gsmerge.research.training.windows import Crop
 from gsmerge.stages.decode import divide
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import cluster_runs, merge, take
-from gsmerge.types import Array, FeatureGaussians, Gaussians, Matches, as_array, as_tensor
+from gsmerge.types import Array, FeatureGaussians, Gaussians, Matches, as_tensor
 
 
 class TrainingContext(NetworkContext):
@@ -52,20 +52,12 @@ class TrainingContext(NetworkContext):
         return differentiate_groups(features, known, np.asarray(self.cameras.viewmats))
 
     def make_tokens(
-        self,
-        parts: Gaussians | Members,
-        ids: np.ndarray,
-        owners: np.ndarray,
-        group_features: GroupFeatures,
-        columns: int = PART,
+        self, parts: Gaussians | Members, ids: np.ndarray, owners: np.ndarray, group_features: GroupFeatures
     ) -> Array:
         """Describe Gaussians as tensors; members as arrays, since no network comes before the encoder."""
         if isinstance(parts, Gaussians):
             return differentiate_tokens(parts, ids, owners, group_features)
-        g = group_features
-        base = Gaussians(*map(as_array, vars(g.base).values()))
-        arrays = replace(g, base=base, frames=as_array(g.frames), sizes=as_array(g.sizes))
-        return super().make_tokens(parts, ids, owners, arrays, columns)
+        return super().make_tokens(parts, ids, owners, groups_to_arrays(group_features))
 
     def correct_features(self, group_features: GroupFeatures, residuals: Array) -> FeatureGaussians:
         """Apply corrections ``[g,14]`` to Feature Gaussians of tensors."""
@@ -126,10 +118,7 @@ def _make_children(
     children, parents = divide(arrays, crop.example.members, np.full(len(arrays), crop.k))
     if networks.options.outputs == "residual":
         return children.to("cpu"), parents
-    frames, sizes = as_array(group_features.frames), as_array(group_features.sizes)
-    base = Gaussians(*map(as_array, vars(group_features.base).values()))
-    known = replace(group_features, base=base, frames=frames, sizes=sizes)
-    round_ones = prepare_children(children, parents, known, networks.options)
+    round_ones = prepare_children(children, parents, groups_to_arrays(group_features), networks.options)
     return make_round_tensors(parents, group_features, round_ones), parents
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gsmerge.errors import SceneError
 from gsmerge.networks.options import RESIDUAL
-from gsmerge.networks.tensors import gaussian_sizes, quat_to_rotmat, rotate_vectors
+from gsmerge.networks.tensors import gaussian_sizes, quat_to_rotmat, rotate_vectors, skew_vectors
 from gsmerge.networks.tokens import compute_group_features
 from gsmerge.render.photos import Photos
 from gsmerge.research.training.scenes import TrainingScene, coverage, covered_pixels, reduced_masks
@@ -126,7 +126,6 @@ def nearest_axes(quats: Tensor, reference: Tensor) -> Tensor:
 
 def rotation_vectors(rotations: Tensor) -> Tensor:
     """Convert rotations ``[n,3,3]`` well below half a turn to rotation vectors ``[n,3]``."""
-    skew = rotations - rotations.transpose(1, 2)
-    axis = torch.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], 1) / 2
+    axis = skew_vectors(rotations)
     sine, cosine = (axis.square().sum(1) + 1e-14).sqrt(), (rotations.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
     return axis * (torch.atan2(sine, cosine) / sine.clamp_min(1e-12))[:, None]
