@@ -117,12 +117,10 @@ def _plan_views(args: opt.Args, files: SceneFiles) -> Drawing:
 
     def draw(threads: int) -> Iterator[Picture]:
         from gsmerge.measure.preview import to_picture
-        from gsmerge.render import render as render_views
+        from gsmerge.render import render_in_turn
 
-        for first in range(0, len(views), threads):  # as many views at once as threads, which keeps the memory low
-            some = views[first : first + threads]
-            drawn = render_views(gaussians, some, background=args.background, antialiased=args.antialiased)
-            yield from map(to_picture, drawn.images)
+        how = {"background": args.background, "antialiased": args.antialiased}
+        yield from map(to_picture, render_in_turn(gaussians, views, at_once=threads, **how))
 
     facts = {"width": views.width, "height": views.height, "num_gaussians": len(gaussians)}
     return [args.output / f"{stems[i]}.png" for i in ids], {**facts, "views": ids, "notes": notes}, draw
