@@ -48,14 +48,8 @@ def read_held_out(load: SceneLoad, cameras: StrPath, images: StrPath | None = No
     path = Path(cameras)
     if not path.exists():
         raise SceneError(path, "expected cameras of held-out views, found nothing")
-    stored, own = read_cameras(path, scene=load.files.ply.stem), load.cameras
-    readings = [stored]
-    if own is not None and own.source == stored.source and own.convention != stored.convention:
-        readings.insert(0, with_convention(stored, own.convention))  # as the scene's own had to be read
-    worlds = [(one, *_find_world(one, _shared_views(one, load.scene.names), load)) for one in readings]
-    camera_file, world, shared = next((one for one in worlds if one[2]), worlds[0])
-    moved = world.move_viewmats(camera_file.viewmats)
-    shared |= _repeated(moved, load.scene)
+    camera_file, shared = place_camera_file(load, path)
+    shared |= _repeated(camera_file.viewmats, load.scene)
     places = [i for i in range(len(camera_file)) if i not in shared]
     if not places:
         raise SceneError(path, "expected views that the scene was not made of, found none")
@@ -71,13 +65,27 @@ def read_held_out(load: SceneLoad, cameras: StrPath, images: StrPath | None = No
     inverse = {view: place for place, view in shared.items()}
     complete = 0 < len(inverse) == len(load.scene)
     return HeldOutViews(
-        cameras=replace(to_cameras(pinholes, photo_size(photos)), viewmats=moved[places]),
+        cameras=to_cameras(pinholes, photo_size(photos)),
         images=as_floats(photos),
         names=chosen.names,
         places=tuple(places),
         context_places=tuple(inverse[view] for view in range(len(load.scene))) if complete else None,
         notes=tuple(notes),
     )
+
+
+def place_camera_file(load: SceneLoad, path: Path) -> tuple[CameraFile, dict[int, int]]:
+    """Read cameras into the frame of a scene's Gaussians; also map those of the scene, if any, to its views.
+
+    Which frame they are in, and in which convention, is decided as :func:`read_held_out` says.
+    """
+    stored, own = read_cameras(path, scene=load.files.ply.stem), load.cameras
+    readings = [stored]
+    if own is not None and own.source == stored.source and own.convention != stored.convention:
+        readings.insert(0, with_convention(stored, own.convention))  # as the scene's own had to be read
+    worlds = [(one, *_find_world(one, _shared_views(one, load.scene.names), load)) for one in readings]
+    camera_file, world, shared = next((one for one in worlds if one[2]), worlds[0])
+    return replace(camera_file, viewmats=world.move_viewmats(camera_file.viewmats)), shared
 
 
 def _folder(path: Path, cameras: CameraFile, images: StrPath | None) -> Path | None:
