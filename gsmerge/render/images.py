@@ -94,10 +94,11 @@ def render_in_turn(
     *,
     at_once: int,
     antialiased: bool = False,
+    near: float = 0.01,
 ) -> Iterator[np.ndarray]:
     """Yield the images ``[h,w,3]`` that :func:`render` makes of arrays, to the bit, with ``at_once`` in memory."""
     under = background_color(background)
-    plan_one = _planner(gaussians, cameras, {"antialiased": antialiased})
+    plan_one = _planner(gaussians, cameras, {"antialiased": antialiased, "near": near})
     for first in range(0, len(cameras), at_once):
         count = min(at_once, len(cameras) - first)
         shape = count, cameras.height, cameras.width
