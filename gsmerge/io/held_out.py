@@ -114,7 +114,7 @@ def _shared_views(camera_file: CameraFile, names: tuple[str, ...]) -> dict[int, 
 
 def _find_world(camera_file: CameraFile, named: dict[int, int], load: SceneLoad) -> tuple[Similarity, dict[int, int]]:
     """Find the similarity from the file's world to that of the Gaussians, and the views that the scene has too."""
-    stored = IDENTITY if load.recovery is None else load.recovery.best.frame
+    stored = _stored_world(load)
     if not named:
         return stored, {}
     theirs = camera_file.viewmats[list(named)]
@@ -129,6 +129,20 @@ def _find_world(camera_file: CameraFile, named: dict[int, int], load: SceneLoad)
         if angle <= _MAX_ANGLE and distance / spread <= _MAX_SHIFT:
             return frame, dict(named)
     return stored, {}
+
+
+def _stored_world(load: SceneLoad) -> Similarity:
+    """Find the similarity from the world of the scene's own camera file to that of its Gaussians."""
+    if load.recovery is not None:
+        return load.recovery.best.frame
+    if load.cameras is None or load.files.cameras is None:
+        return IDENTITY
+    own = read_cameras(load.files.cameras, scene=load.files.ply.stem, folder=load.files.ply.parent)
+    if (own.names, own.convention) != (load.cameras.names, load.cameras.convention):
+        return IDENTITY
+    if np.array_equal(own.viewmats, load.cameras.viewmats):
+        return IDENTITY  # to the bit
+    return fit_similarity(own.viewmats, load.cameras.viewmats)
 
 
 def fit_similarity(theirs: np.ndarray, ours: np.ndarray, scale: float = 1.0) -> Similarity:
