@@ -1,27 +1,35 @@
-"""``gsmerge render``: pictures of scenes from their cameras, and of superpixels."""
+"""``gsmerge render``: pictures of scenes from their cameras, videos along paths, and pictures of superpixels."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.console import print_document, say, say_notes, stage_progress
+from gsmerge.cli.console import Progress, print_document, say, say_notes, stage_progress
 from gsmerge.cli.paths import check_cameras, check_folder, check_outputs, input_files, source_of
 from gsmerge.errors import SceneError, UsageError
 
 if TYPE_CHECKING:
-    from gsmerge.io import SceneFiles
+    import numpy as np
+
+    from gsmerge.io import ReadHints, SceneFiles, SceneLoad
     from gsmerge.io.scene import SceneViews
     from gsmerge.measure.preview import Picture
-    from gsmerge.types import Gaussians
+    from gsmerge.types import Cameras, Gaussians
 
     Drawing = tuple[list[Path], dict[str, Any], Callable[[int], Iterator[Picture]]]  # files, facts, and what draws them
 
 MAX_SIDE = 1 << 20  # pixels: pictures have the cameras' own size
 PANEL_VIEWS = 4  # rows of a panel
+PATH_FRAMES = 120  # of a path, at least
+VIEW_FRAMES = 4  # for each view of a spline, at least
+FPS = 30  # frames per second
+# Endings by which a name means a file that cannot be written along a path, and no folder for the frames
+NO_FOLDER = (".avi", ".gif", ".jpeg", ".jpg", ".m4v", ".mkv", ".mov", ".mpg", ".ogv", ".png", ".webp")
 KINDS = ("borders", "means", "saliency")  # pictures of the superpixels of a view
 
 
@@ -39,9 +47,16 @@ KINDS = ("borders", "means", "saliency")  # pictures of the superpixels of a vie
                    "picture for each camera; superpixels: the borders, mean colours and saliency of each photo.",
                    "--as", wording="panel for a .png, views for a folder"),
     ),
-    opt.output("The picture of a panel, .png, or a folder for pictures.", default=opt.REQUIRED),
+    opt.output("The picture of a panel, .png, a video, .mp4 or .webm, or a folder for pictures.",
+               default=opt.REQUIRED),
     *opt.panel(
         opt.OUTPUT,
+        opt.option("path", str, "A video, or its frames in a folder. orbit: around the middle view and back to the "
+                   "start; spline: through all views in their order; or the cameras of a file, one for each frame.",
+                   metavar="orbit|spline|FILE"),
+        opt.option("frames", int, "Frames along an orbit or a spline.",
+                   wording="120, for a spline at least 4 for each view", min=2, max=100_000),
+        opt.option("fps", int, "Frames of a video per second.", wording="30", min=1, max=120),
         opt.option("views", int, "Views at most, at equal intervals.", wording="4 on a panel, else all", min=1),
         opt.option("background", float, "Grey level behind the scene.", default=0.0, min=0.0, max=1.0),
     ),
@@ -51,15 +66,8 @@ KINDS = ("borders", "means", "saliency")  # pictures of the superpixels of a vie
     "overwrite dry_run threads",
 )  # fmt: skip
 def render(args: opt.Args) -> None:
-    """Draw scenes from the same cameras, side by side with the photos or one picture each, or draw superpixels."""
-    kind = args.kind or ("panel" if args.output.suffix.lower() == ".png" else "views")
-    if kind == "panel" and args.output.suffix.lower() != ".png":
-        raise UsageError(f"{args.output}: expected a name that ends in .png")
-    if kind != "panel" and len(args.scenes) > 1:
-        raise UsageError(f"--as {kind}: expected one scene, got {len(args.scenes)}; a panel shows several, as a .png")
-    if kind != "superpixels" and (args.superpixels or args.set):
-        raise UsageError("--superpixels and --set: expected --as superpixels with them")
-    plan = {"panel": _plan_panel, "views": _plan_views, "superpixels": _plan_superpixels}[kind]
+    """Draw scenes: side by side with their photos, a picture for each camera, a video along a path, or superpixels."""
+    plan = _choose_plan(args)
     paths, facts, draw = plan(args, args.files(args.scenes[0]))
     from gsmerge.report import document_head
     from gsmerge.runtime.threads import use_threads
@@ -70,18 +78,80 @@ def render(args: opt.Args) -> None:
             use_threads(args.threads) as threads,
             stage_progress(quiet=args.silent) as progress,
         ):
-            for i, (path, picture) in enumerate(zip(paths, draw(threads), strict=True), 1):
-                write_picture(path, picture, overwrite=args.overwrite)
-                progress("render", i, len(paths))
+            pictures = _count(draw(threads), facts.get("frames", len(paths)), progress)
+            if "fps" in facts:
+                from gsmerge.measure.video import write_video
+
+                facts["encoding"] = write_video(args.output, pictures, facts["fps"], overwrite=args.overwrite)
+            else:
+                for path, picture in zip(paths, pictures, strict=True):
+                    write_picture(path, picture, overwrite=args.overwrite)
     head = {**document_head(), "dry_run": args.dry_run, "output": str(args.output)}
     document = {**head, "pictures": [str(path) for path in paths], **facts}
-    line = f"{len(paths)} picture(s) of {len(facts['views'])} views"
-    if "superpixels" in facts:
-        line += f", {min(facts['superpixels'])} to {max(facts['superpixels'])} superpixels per view"
+    line = _describe(len(paths), facts)
     if args.json or args.dry_run:
         print_document(document, f"would write {args.output}: {line}", as_json=args.json)
     else:
         say(f"{args.output}: {line}", quiet=args.quiet)
+
+
+def _choose_plan(args: opt.Args) -> Callable[[opt.Args, SceneFiles], Drawing]:
+    """Choose what is drawn by ``--path``, ``--as`` and the name of the output; UsageError if they do not fit."""
+    suffix = args.output.suffix.lower()
+    kind = args.kind or ("panel" if suffix == ".png" else "views")
+    if kind != "superpixels" and (args.superpixels or args.set):
+        raise UsageError("--superpixels and --set: expected --as superpixels with them")
+    if args.path is not None:
+        _check_path(args)
+        return _plan_path
+    from gsmerge.measure.video import is_video
+
+    if args.frames or args.fps or is_video(args.output):
+        what = f"{args.output}" if is_video(args.output) else "--frames and --fps"
+        raise UsageError(f"{what}: expected the path of a video with it, --path orbit, spline or a file of cameras")
+    if kind == "panel" and suffix != ".png":
+        raise UsageError(f"{args.output}: expected a name that ends in .png")
+    if kind != "panel" and len(args.scenes) > 1:
+        raise UsageError(f"--as {kind}: expected one scene, got {len(args.scenes)}; a panel shows several, as a .png")
+    return {"panel": _plan_panel, "views": _plan_views, "superpixels": _plan_superpixels}[kind]
+
+
+def _check_path(args: opt.Args) -> None:
+    """Refuse an unknown path, and options and outputs that do not go with one."""
+    from gsmerge.measure.camera_path import PATHS
+    from gsmerge.measure.video import is_video
+
+    if args.kind is not None:
+        raise UsageError(f"--path: expected no --as with it, got --as {args.kind}")
+    if args.output.suffix.lower() in NO_FOLDER:
+        raise UsageError(f"{args.output}: expected a video, .mp4 or .webm, or a folder for the frames of --path")
+    if args.fps is not None and not is_video(args.output):
+        raise UsageError(f"--fps: expected a video, .mp4 or .webm, got the folder {args.output}")
+    if args.path in PATHS:
+        return
+    if not Path(args.path).exists():
+        raise UsageError(f"--path {args.path}: expected orbit, spline or a file of cameras, found no such file")
+    if args.frames is not None:
+        raise UsageError("--frames: expected an orbit or a spline; of a file, --views chooses some of the cameras")
+
+
+def _count(pictures: Iterator[Picture], total: int, progress: Progress) -> Iterator[Picture]:
+    """Yield pictures, and show after each how many are done."""
+    for done, picture in enumerate(pictures, 1):
+        yield picture
+        progress("render", done, total)
+
+
+def _describe(num_files: int, facts: dict[str, Any]) -> str:
+    """Write in a line what was drawn."""
+    if "frames" in facts:
+        line = f"{facts['frames']} frames of {facts['width']} x {facts['height']}"
+        line += f", {facts['frames'] / facts['fps']:.1f} s" if "fps" in facts else ""
+        return f"{line}, {facts['encoding']}" if "encoding" in facts else line
+    line = f"{num_files} picture(s) of {len(facts['views'])} views"
+    if "superpixels" in facts:
+        line += f", {min(facts['superpixels'])} to {max(facts['superpixels'])} superpixels per view"
+    return line
 
 
 def _plan_panel(args: opt.Args, files: SceneFiles) -> Drawing:
@@ -89,7 +159,7 @@ def _plan_panel(args: opt.Args, files: SceneFiles) -> Drawing:
     like = _frame_files(args, files)
     inputs = (*args.scenes, *input_files(files), *input_files(like))
     check_outputs((args.output,), inputs, overwrite=args.overwrite or args.dry_run)
-    scenes, views, notes = _read(args, files, like, photos=True)
+    scenes, views, notes, _ = _read(args, files, like, args.hints(), photos=True)
     used = list(views.used)
     cameras, photos = views.cameras[used], views.images
     ids = _choose(args, len(used), PANEL_VIEWS)
@@ -102,8 +172,12 @@ def _plan_panel(args: opt.Args, files: SceneFiles) -> Drawing:
         how = {"background": args.background, "antialiased": args.antialiased}
         yield contact_sheet(view_pictures(parts, cameras, own, max_views=len(ids), **how))
 
-    counts = {str(path): len(gaussians) for path, gaussians in zip(args.scenes, scenes, strict=True)}
-    return [args.output], {"scenes": counts, "views": ids, "photos": photos is not None, "notes": notes}, draw
+    facts = {"scenes": _counts(args, scenes), "views": ids, "photos": photos is not None, "notes": notes}
+    return [args.output], facts, draw
+
+
+def _counts(args: opt.Args, scenes: Sequence[Gaussians]) -> dict[str, int]:
+    return {str(path): len(gaussians) for path, gaussians in zip(args.scenes, scenes, strict=True)}
 
 
 def _plan_views(args: opt.Args, files: SceneFiles) -> Drawing:
@@ -111,21 +185,103 @@ def _plan_views(args: opt.Args, files: SceneFiles) -> Drawing:
     like = _frame_files(args, files)
     inputs = (*input_files(files), *input_files(like))
     check_folder(args.output, inputs, overwrite=args.overwrite or args.dry_run)
-    (gaussians,), placed, notes = _read(args, files, like, photos=False)
+    scenes, placed, notes, _ = _read(args, files, like, args.hints(max_side=MAX_SIDE), photos=False)
     ids = _choose(args, len(placed.cameras))
     views, stems = placed.cameras[ids], picture_stems(placed.names)
 
     def draw(threads: int) -> Iterator[Picture]:
         from gsmerge.measure.preview import to_picture
-        from gsmerge.render import render as render_views
 
-        for first in range(0, len(views), threads):  # as many views at once as threads, which keeps the memory low
-            some = views[first : first + threads]
-            drawn = render_views(gaussians, some, background=args.background, antialiased=args.antialiased)
-            yield from map(to_picture, drawn.images)
+        for (image,) in _draw_views(args, scenes, views, threads):
+            yield to_picture(image)
 
-    facts = {"width": views.width, "height": views.height, "num_gaussians": len(gaussians)}
+    facts = {"width": views.width, "height": views.height, "num_gaussians": len(scenes[0])}
     return [args.output / f"{stems[i]}.png" for i in ids], {**facts, "views": ids, "notes": notes}, draw
+
+
+def _draw_views(
+    args: opt.Args, scenes: Sequence[Gaussians], views: Cameras, threads: int, near: float = 0.01
+) -> Iterator[tuple[np.ndarray, ...]]:
+    """Yield the pictures ``[h,w,3]`` of all scenes from each camera, with as many views in memory as threads."""
+    from gsmerge.render import render_in_turn
+
+    drawn = (
+        render_in_turn(gaussians, views, args.background, at_once=threads, antialiased=args.antialiased, near=near)
+        for gaussians in scenes
+    )
+    return zip(*drawn, strict=True)
+
+
+def _plan_path(args: opt.Args, files: SceneFiles) -> Drawing:
+    """Plan a video, or its frames as pictures, of the scenes side by side along a path."""
+    from gsmerge.measure.video import is_video
+
+    like, named = _frame_files(args, files), Path(args.path)
+    inputs = (*args.scenes, *input_files(files), *input_files(like), named)
+    overwrite = args.overwrite or args.dry_run
+    if is_video(args.output):
+        check_outputs((args.output,), inputs, overwrite=overwrite)
+    else:
+        check_folder(args.output, inputs, overwrite=overwrite)
+    scenes, cameras, near, facts = _path_cameras(args, files, like)
+    labels = [f"{path.name}: {len(one):,}" for path, one in zip(args.scenes, scenes, strict=True)]
+
+    def draw(threads: int) -> Iterator[Picture]:
+        from gsmerge.measure.preview import contact_sheet, to_picture
+
+        for images in _draw_views(args, scenes, cameras, threads, near=near):
+            yield contact_sheet([list(zip(labels, images, strict=True))]) if len(images) > 1 else to_picture(images[0])
+
+    paths = [args.output]
+    facts |= {
+        "scenes": _counts(args, scenes),
+        "path": args.path,
+        "frames": len(cameras),
+        "width": cameras.width,
+        "height": cameras.height,
+    }
+    if is_video(args.output):
+        facts["fps"] = args.fps or FPS
+    else:
+        paths = [args.output / f"frame_{i:05d}.png" for i in range(len(cameras))]
+    return paths, facts, draw
+
+
+def _path_cameras(
+    args: opt.Args, files: SceneFiles, like: SceneFiles
+) -> tuple[list[Gaussians], Cameras, float, dict[str, Any]]:
+    """Read the scenes and make the cameras of the path; also return its near plane, and facts."""
+    from gsmerge.measure.camera_path import PATHS, plan_path, viewing_depth
+    from gsmerge.render.photos import NEAR
+
+    file, own = None if args.path in PATHS else Path(args.path), True
+    try:
+        check_cameras(like)
+    except SceneError:
+        if file is None:
+            raise
+        like, own = replace(like, cameras=file), False
+    scenes, placed, notes, load = _read(args, files, like, args.hints(), photos=False)
+    cameras = placed.cameras if file is None or not own else _place_file(file, placed.cameras, load)
+    ids = _choose(args, len(cameras))
+    cameras = cameras[ids]
+    depth = viewing_depth(cameras if file is None else placed.cameras, scenes[0].means)
+    if file is None:
+        least = VIEW_FRAMES * len(ids) if args.path == "spline" else 0
+        with opt.usage_errors():
+            cameras = plan_path(args.path, cameras, depth, args.frames or max(PATH_FRAMES, least))
+    return scenes, cameras, NEAR * depth, {"views": ids, "notes": notes}
+
+
+def _place_file(file: Path, cameras: Cameras, load: SceneLoad | None) -> Cameras:
+    """Read the cameras of a path into the frame of a scene, with the size of the scene's where they have none."""
+    from gsmerge.io import read_cameras, to_cameras
+    from gsmerge.io.cameras.camera_file import sizes_of
+    from gsmerge.io.held_out import place_camera_file
+
+    stored = read_cameras(file) if load is None else place_camera_file(load, file)[0]
+    size = None if sizes_of(stored) else (cameras.width, cameras.height)
+    return to_cameras(replace(stored, lenses=()), size)
 
 
 def _plan_superpixels(args: opt.Args, files: SceneFiles) -> Drawing:
@@ -173,10 +329,9 @@ def _frame_files(args: opt.Args, files: SceneFiles) -> SceneFiles:
 
 
 def _read(
-    args: opt.Args, files: SceneFiles, like: SceneFiles, *, photos: bool
-) -> tuple[list[Gaussians], SceneViews, list[str]]:
-    """Read the scenes, and place the cameras in the frame of ``like``; notes are returned with them."""
-    hints = args.hints() if photos else args.hints(max_side=MAX_SIDE)
+    args: opt.Args, files: SceneFiles, like: SceneFiles, hints: ReadHints, *, photos: bool
+) -> tuple[list[Gaussians], SceneViews, list[str], SceneLoad | None]:
+    """Read the scenes, and place the cameras in the frame of ``like``; also return notes, and ``like`` if it fits."""
     from gsmerge.io import place_cameras_in_scene, ply_notes, read_gaussians, read_ply_with_hints
 
     check_cameras(like)
@@ -184,7 +339,7 @@ def _read(
     others = [read_gaussians(path, opacity=args.opacity) for path in args.scenes[1:]]
     own = like.ply == files.ply
     framed = first if own else read_gaussians(like.ply)
-    gaussians, views, placing = place_cameras_in_scene(framed, like, hints=hints, photos=photos)
+    gaussians, views, placing, load = place_cameras_in_scene(framed, like, hints=hints, photos=photos)
     scenes = [gaussians if own else first.gaussians, *(ply.gaussians for ply in others)]
     notes = [*([] if own else ply_notes(first.info)), *placing]
     if others:
@@ -193,7 +348,7 @@ def _read(
         notes += [
             f"{name}: {note}" for name, ply in zip(names[1:], others, strict=True) for note in ply_notes(ply.info)
         ]
-    return scenes, views, notes
+    return scenes, views, notes, load
 
 
 def picture_stems(names: Sequence[str]) -> list[str]:

@@ -48,14 +48,8 @@ def read_held_out(load: SceneLoad, cameras: StrPath, images: StrPath | None = No
     path = Path(cameras)
     if not path.exists():
         raise SceneError(path, "expected cameras of held-out views, found nothing")
-    stored, own = read_cameras(path, scene=load.files.ply.stem), load.cameras
-    readings = [stored]
-    if own is not None and own.source == stored.source and own.convention != stored.convention:
-        readings.insert(0, with_convention(stored, own.convention))  # as the scene's own had to be read
-    worlds = [(one, *_find_world(one, _shared_views(one, load.scene.names), load)) for one in readings]
-    camera_file, world, shared = next((one for one in worlds if one[2]), worlds[0])
-    moved = world.move_viewmats(camera_file.viewmats)
-    shared |= _repeated(moved, load.scene)
+    camera_file, shared = place_camera_file(load, path)
+    shared |= _repeated(camera_file.viewmats, load.scene)
     places = [i for i in range(len(camera_file)) if i not in shared]
     if not places:
         raise SceneError(path, "expected views that the scene was not made of, found none")
@@ -71,13 +65,27 @@ def read_held_out(load: SceneLoad, cameras: StrPath, images: StrPath | None = No
     inverse = {view: place for place, view in shared.items()}
     complete = 0 < len(inverse) == len(load.scene)
     return HeldOutViews(
-        cameras=replace(to_cameras(pinholes, photo_size(photos)), viewmats=moved[places]),
+        cameras=to_cameras(pinholes, photo_size(photos)),
         images=as_floats(photos),
         names=chosen.names,
         places=tuple(places),
         context_places=tuple(inverse[view] for view in range(len(load.scene))) if complete else None,
         notes=tuple(notes),
     )
+
+
+def place_camera_file(load: SceneLoad, path: Path) -> tuple[CameraFile, dict[int, int]]:
+    """Read cameras into the frame of a scene's Gaussians; also map those of the scene, if any, to its views.
+
+    Which frame they are in, and in which convention, is decided as :func:`read_held_out` says.
+    """
+    stored, own = read_cameras(path, scene=load.files.ply.stem), load.cameras
+    readings = [stored]
+    if own is not None and own.source == stored.source and own.convention != stored.convention:
+        readings.insert(0, with_convention(stored, own.convention))  # as the scene's own had to be read
+    worlds = [(one, *_find_world(one, _shared_views(one, load.scene.names), load)) for one in readings]
+    camera_file, world, shared = next((one for one in worlds if one[2]), worlds[0])
+    return replace(camera_file, viewmats=world.move_viewmats(camera_file.viewmats)), shared
 
 
 def _folder(path: Path, cameras: CameraFile, images: StrPath | None) -> Path | None:
@@ -106,7 +114,7 @@ def _shared_views(camera_file: CameraFile, names: tuple[str, ...]) -> dict[int, 
 
 def _find_world(camera_file: CameraFile, named: dict[int, int], load: SceneLoad) -> tuple[Similarity, dict[int, int]]:
     """Find the similarity from the file's world to that of the Gaussians, and the views that the scene has too."""
-    stored = IDENTITY if load.recovery is None else load.recovery.best.frame
+    stored = _stored_world(load)
     if not named:
         return stored, {}
     theirs = camera_file.viewmats[list(named)]
@@ -121,6 +129,20 @@ def _find_world(camera_file: CameraFile, named: dict[int, int], load: SceneLoad)
         if angle <= _MAX_ANGLE and distance / spread <= _MAX_SHIFT:
             return frame, dict(named)
     return stored, {}
+
+
+def _stored_world(load: SceneLoad) -> Similarity:
+    """Find the similarity from the world of the scene's own camera file to that of its Gaussians."""
+    if load.recovery is not None:
+        return load.recovery.best.frame
+    if load.cameras is None or load.files.cameras is None:
+        return IDENTITY
+    own = read_cameras(load.files.cameras, scene=load.files.ply.stem, folder=load.files.ply.parent)
+    if (own.names, own.convention) != (load.cameras.names, load.cameras.convention):
+        return IDENTITY
+    if np.array_equal(own.viewmats, load.cameras.viewmats):
+        return IDENTITY  # to the bit
+    return fit_similarity(own.viewmats, load.cameras.viewmats)
 
 
 def fit_similarity(theirs: np.ndarray, ours: np.ndarray, scale: float = 1.0) -> Similarity:

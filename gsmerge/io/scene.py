@@ -375,12 +375,12 @@ def _with_rotations(scene: Scene, hints: ReadHints, exporters: Sequence[Exporter
 
 def place_cameras_in_scene(
     ply: PlyScene, files: SceneFiles, *, hints: ReadHints = AUTO, photos: bool = True
-) -> tuple[Gaussians, SceneViews, tuple[str, ...]]:
+) -> tuple[Gaussians, SceneViews, tuple[str, ...], SceneLoad | None]:
     """Move views into the frame of the Gaussians, if pixels or colours show it; otherwise keep their file's.
 
-    Returns the Gaussians with rotations as the scene has them, the views of the camera file, and notes. ``photos``
-    that cannot be read are an error; with False they are left out. SceneError if there are no cameras, or they have
-    no size.
+    Returns the Gaussians with rotations as the scene has them, the views of the camera file, notes, and the scene,
+    None where the views do not fit. ``photos`` that cannot be read are an error; with False they are left out.
+    SceneError if there are no cameras, or they have no size.
     """
     camera_file = read_scene_cameras(ply, files)
     for with_photos in (True,) if photos else (True, False):
@@ -390,10 +390,10 @@ def place_cameras_in_scene(
             continue
         aligned = load.scene.aligned
         notes = load.notes if aligned else load.notes[:-1]  # except the one that there are no pixels
-        return load.scene.file_gaussians, load.views, notes
+        return load.scene.file_gaussians, load.views, notes, load
     pictures = stored_photos(files, camera_file) if photos else None
     images = None if pictures is None else as_floats(pictures)
     cameras = to_cameras(camera_file, photo_size(pictures))
     views = SceneViews(cameras, images, camera_file.names, tuple(range(len(cameras))))
     note = "the cameras do not fit the Gaussians and stay as their file has them"
-    return ply.gaussians, views, (*ply_notes(ply.info), note)
+    return ply.gaussians, views, (*ply_notes(ply.info), note), None

@@ -136,14 +136,21 @@ def prepare_views(gaussians: Gaussians, cameras: Cameras) -> tuple[Splats, Array
 
 
 def draw_views(
-    plan_one: Callable[[int], ViewPlan], shape: tuple[int, int, int], background: AnyArray, with_depths: bool
+    plan_one: Callable[[int], ViewPlan],
+    shape: tuple[int, int, int],
+    background: AnyArray,
+    with_depths: bool,
+    first: int = 0,
 ) -> Rendering:
-    """Draw the plans, one for the number of each view, of images of ``shape`` (views, height, width)."""
+    """Draw the plans, one for the number of each view, of images of ``shape`` (views, height, width).
+
+    The views' numbers begin with ``first``.
+    """
     images, alphas = np.empty((*shape, 3), np.float32), np.empty((*shape, 1), np.float32)
     depths = np.empty((*shape, 1), np.float32) if with_depths else None
 
     def one(view: int) -> None:
-        plan = plan_one(view)
+        plan = plan_one(first + view)
         images[view], transmittance = blend(plan, view_colors(plan), background)
         alphas[view, ..., 0] = 1 - transmittance
         if depths is not None:

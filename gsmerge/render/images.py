@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -80,12 +80,36 @@ def render(
             from gsmerge.render.autograd import render_tensors  # only for those who train
 
             return render_tensors(gaussians, cameras, under, with_depths=with_depths, **options)
+    plan_one = _planner(gaussians, cameras, options)
+    drawn = draw_views(plan_one, (len(cameras), cameras.height, cameras.width), under, with_depths)
+    if device is None:
+        return drawn
+    return Rendering(*(None if part is None else as_tensor(part) for part in vars(drawn).values()))
+
+
+def render_in_turn(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    background: float | Sequence[float] = 0.0,
+    *,
+    at_once: int,
+    antialiased: bool = False,
+    near: float = 0.01,
+) -> Iterator[np.ndarray]:
+    """Yield the images ``[h,w,3]`` that :func:`render` makes of arrays, to the bit, with ``at_once`` in memory."""
+    under = background_color(background)
+    plan_one = _planner(gaussians, cameras, {"antialiased": antialiased, "near": near})
+    for first in range(0, len(cameras), at_once):
+        count = min(at_once, len(cameras) - first)
+        shape = count, cameras.height, cameras.width
+        yield from draw_views(plan_one, shape, under, with_depths=False, first=first).images
+
+
+def _planner(gaussians: Gaussians, cameras: Cameras, options: Mapping[str, Any]) -> Callable[[int], ViewPlan]:
+    """Prepare the Gaussians for cameras, and return what plans the drawing of each view by its number."""
     splats, viewmats, Ks = prepare_views(gaussians, cameras)
 
     def plan_one(view: int) -> ViewPlan:
         return plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, **options)
 
-    drawn = draw_views(plan_one, (len(cameras), cameras.height, cameras.width), under, with_depths)
-    if device is None:
-        return drawn
-    return Rendering(*(None if part is None else as_tensor(part) for part in vars(drawn).values()))
+    return plan_one

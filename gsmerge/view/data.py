@@ -11,9 +11,9 @@ from pathlib import PurePosixPath
 import cv2
 import numpy as np
 
-from gsmerge.geometry import project
 from gsmerge.io.formats import spz
 from gsmerge.io.photo_files import encode_indexed
+from gsmerge.measure.camera_path import middle_depth
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Progress, Quality, ResultScores, evaluate
 from gsmerge.measure.preview import Picture, borders, mean_colors, to_picture
 from gsmerge.runtime.threads import use_threads
@@ -31,7 +31,6 @@ MAX_GAUSSIANS = 2_000_000  # more take a browser too long to load and a page too
 MAX_SPZ_BYTES = 40_000_000  # before compression: 2 million without harmonics, fewer with them
 MIN_OPACITY = 1 / 255  # what is fainter is not drawn
 FINE = 11  # bits of a position within the scene: the browser keeps 10 and the sign
-DEPTH_SAMPLE = 50_000  # Gaussians that say how far away the middle of a view lies
 
 
 @dataclass(frozen=True)
@@ -188,14 +187,6 @@ def encode_outlines(photo: np.ndarray, labels: np.ndarray) -> bytes:
     every = np.indices((OUTLINE_LEVELS,) * 3).reshape(3, -1).T * (255 // (OUTLINE_LEVELS - 1))
     colors = np.concatenate([np.zeros((1, 3)), every]).astype(np.uint8)
     return encode_indexed(np.where(borders(enlarged), ids[enlarged], 0).astype(np.uint8), colors)
-
-
-def middle_depth(means: np.ndarray, camera: Cameras) -> float:
-    """Measure the median depth of the points ``[n,3]`` that one camera has in its picture; 1 without any."""
-    points = means[:: max(1, len(means) // DEPTH_SAMPLE)]
-    (pixels,), (depths,) = project(points, camera)
-    inside = (depths > 0) & ((pixels >= 0) & (pixels <= (camera.width, camera.height))).all(1)
-    return float(np.median(depths[inside])) if inside.any() else 1.0
 
 
 def _side(result: ResultScores, gaussians: Gaussians, file_bytes: int, split: str) -> Side:

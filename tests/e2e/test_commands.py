@@ -167,6 +167,10 @@ def test_views(made_scene: Path, tmp_path: Path, run: Run) -> None:
         errors = [np.abs(photo - render).mean() for photo in photos]
         assert int(np.argmin(errors)) == i
         assert errors[i] < 20
+    run("render", made_scene, "-o", tmp_path / "alone", "--threads", 1, code=0)
+    run("render", made_scene, "-o", tmp_path / "two", "--threads", 2, code=0)
+    for path in (tmp_path / "alone").iterdir():
+        assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes()
     assert run("render", made_scene, "-o", tmp_path / "some", "--views", 2).code == 0
     assert list(listing(tmp_path / "some")) == ["view_001.png", "view_003.png"]
 

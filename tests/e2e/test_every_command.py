@@ -23,6 +23,8 @@ WRITERS: dict[str, tuple[str, ...]] = {
     "render --as superpixels": ("overlays", "--superpixels", "100"),
     "render --as views": ("renders",),
     "render --as panel": ("sheet.png", "--views", "1"),
+    "render --path orbit": ("walk.mp4", "--frames", "2"),
+    "render --path spline": ("walk", "--frames", "3"),
     "view": ("page.html", "--no-open"),
 }
 OTHERS: dict[str, tuple[str, ...]] = {  # that take no scene, or several
@@ -31,7 +33,13 @@ OTHERS: dict[str, tuple[str, ...]] = {  # that take no scene, or several
     "generate": ("made", "--scenes", "1", "--views", "3", "--size", "48x36"),
 }
 COMMANDS = ("inspect", "evaluate", *WRITERS)
-PICTURES = ("render --as superpixels", "render --as views", "render --as panel")
+PICTURES = {  # with their number
+    "render --as superpixels": 3 * VIEWS,
+    "render --as views": VIEWS,
+    "render --as panel": 1,
+    "render --path orbit": 1,
+    "render --path spline": 3,
+}
 
 
 def call(command: str, scene: Path) -> list[object]:
@@ -79,7 +87,7 @@ def test_json_names_the_pictures(command: str, scene_copy: Path, run: Run) -> No
     document = json.loads(run(*call(command, scene_copy), "--json").out)
     written = sorted(str(scene_copy / name) for name in set(listing(scene_copy)) - set(before))
     assert sorted(document["pictures"]) == written
-    assert len(written) == dict(zip(PICTURES, (3 * VIEWS, VIEWS, 1), strict=True))[command]
+    assert len(written) == PICTURES[command]
 
 
 @pytest.mark.parametrize("command", [*COMMANDS, *OTHERS])
@@ -159,6 +167,7 @@ def test_odd_rows_reach_the_scene_s_notes_and_the_report(scene_copy: Path, run: 
         ("render", "images/view_000.png"),
         ("render --as views", "images"),
         ("render --as superpixels", "images"),
+        ("render --path orbit", "images"),
         ("view", "transforms.json"),
     ],
 )
@@ -171,7 +180,7 @@ def test_inputs_are_not_replaced(command: str, output: str, scene_copy: Path, ru
     assert listing(scene_copy) == before
 
 
-@pytest.mark.parametrize("command", PICTURES[:2])
+@pytest.mark.parametrize("command", list(PICTURES)[:2])
 def test_images_of_one_name_in_several_folders(command: str, scene_copy: Path, run: Run) -> None:
     with edited_json(scene_copy / "transforms.json") as data:
         for i, frame in enumerate(data["frames"]):

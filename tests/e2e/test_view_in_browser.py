@@ -14,9 +14,9 @@ import pytest
 
 import gsmerge
 from gsmerge.geometry import rotmat_to_quat
+from gsmerge.measure.camera_path import middle_depth
 from gsmerge.measure.evaluate import near_plane
 from gsmerge.render.metrics import psnr
-from gsmerge.view.data import middle_depth
 
 from .browser import CHROMIUM, Browser, browser
 

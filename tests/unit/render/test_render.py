@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gsmerge import Cameras, Gaussians
-from gsmerge.render import composite, contributions, plan_view, prepare, render, splat_adjoint
+from gsmerge.render import composite, contributions, plan_view, prepare, render, render_in_turn, splat_adjoint
 from gsmerge.types import SH_C0
 
 FOCAL = 100.0
@@ -194,3 +194,15 @@ def test_messages() -> None:
         composite(plan, np.ones((2, 3)))
     with pytest.raises(ValueError, match="image: expected shape"):
         splat_adjoint(plan, np.ones((11, 20, 3)))
+
+
+@pytest.mark.parametrize("at_once", [1, 2, 3, 8])
+def test_many_views_are_drawn_in_turn_as_they_are_together(at_once: int) -> None:
+    rng = np.random.default_rng(4)
+    rows = np.concatenate(
+        [rng.uniform(-1, 1, (300, 2)), rng.uniform(1, 4, (300, 1)), rng.uniform(0.01, 0.9, (300, 3))], 1
+    )
+    gaussians, cameras = balls(*map(tuple, rows)), camera(41, 31, 5)
+    cameras.viewmats[:, 0, 3] = np.linspace(-0.3, 0.37, 5)
+    images = list(render_in_turn(gaussians, cameras, 0.3, at_once=at_once, antialiased=True))
+    np.testing.assert_array_equal(images, render(gaussians, cameras, 0.3, antialiased=True).images)

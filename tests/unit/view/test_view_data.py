@@ -22,7 +22,7 @@ from gsmerge.render.metrics import psnr
 from gsmerge.stages.segment import SegmentOptions, segment
 from gsmerge.types import Views
 from gsmerge.view import data
-from gsmerge.view.data import ViewData, collect, encode_still, middle_depth, pack_splats, short_names
+from gsmerge.view.data import ViewData, collect, encode_still, pack_splats, short_names
 
 
 @pytest.fixture(scope="module")
@@ -221,15 +221,6 @@ def test_without_photos_results_are_compared_with_the_input(scene: Scene, half: 
 )
 def test_short_names(names: tuple[str, ...], short: list[str]) -> None:
     assert short_names(names) == short
-
-
-def test_depth_of_nothing() -> None:
-    camera = scenes.arc(1)
-    assert middle_depth(np.zeros((0, 3)), camera) == 1
-    behind = camera.centres[0] - 5 * camera.viewmats[0, 2, :3]
-    assert middle_depth(behind[None], camera) == 1
-    ahead = camera.centres[0] + 5 * camera.viewmats[0, 2, :3]
-    assert middle_depth(ahead[None], camera) == pytest.approx(5)
 
 
 def test_a_still_keeps_red_red() -> None:

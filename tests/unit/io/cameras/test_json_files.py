@@ -24,6 +24,7 @@ from tiny_scene import (
 
 from gsmerge.errors import SceneError
 from gsmerge.io import load_scene, read_cameras, to_cameras
+from gsmerge.io.held_out import place_camera_file
 
 
 def test_transforms_with_global_intrinsics(tmp_path: Path, tiny: Tiny) -> None:
@@ -180,6 +181,20 @@ def test_cameras_of_the_capture_are_moved(tmp_path: Path) -> None:
     trained(tmp_path)
     write_colmap_text(tmp_path / "sparse", SMOOTH)
     assert_moved(tmp_path)
+
+
+def test_other_cameras_of_the_capture_are_moved_with_them(tmp_path: Path) -> None:
+    """Held-out views, or those of a path, are in the capture's world and share no view with the scene."""
+    trained(tmp_path)
+    write_colmap_text(tmp_path / "sparse", SMOOTH)
+    write_transforms(tmp_path / "path.json", replace(SMOOTH, names=("x.png", "y.png", "z.png")))
+    placed, shared = place_camera_file(load_scene(tmp_path), tmp_path / "path.json")
+    assert shared == {}
+    expected = SMOOTH.w2c
+    expected[:, :3, :3] = expected[:, :3, :3] @ TURN.T
+    centres = SCALE * (SMOOTH.c2w[:, :3, 3] @ TURN.T + SHIFT)
+    expected[:, :3, 3] = -(expected[:, :3, :3] * centres[:, None]).sum(-1)
+    np.testing.assert_allclose(placed.viewmats, expected, atol=1e-6)
 
 
 def test_poses_that_are_moved_already(tmp_path: Path) -> None:

@@ -1,0 +1,167 @@
+"""Paths through a scene for videos: the cameras of its views -> the cameras of the frames, in float64."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from gsmerge.geometry import camera_centres, lower_median, normalize, project, quat_to_rotmat, rotmat_to_quat
+from gsmerge.kernels.elementary import cos, sin
+from gsmerge.kernels.matrices import matmul
+from gsmerge.types import Cameras
+
+PATHS = ("orbit", "spline")
+DEPTH_SAMPLE = 50_000  # Gaussians that say how far away the middle of a view lies
+FINE = 64  # straight pieces of a curve from camera to camera by which its length is measured
+TURN = 6 * FINE  # the same for a whole orbit
+# Half axes of an orbit, shares of the distance of its middle: as far as half of the cameras are apart within these.
+# The least is what one photo bears, the most turns the view by 14 degrees to each side.
+ACROSS, UPRIGHT = (0.06, 0.25), (0.03, 0.125)
+SAME = 1e-9  # of a path's length: cameras that are no farther apart are one
+
+
+def plan_path(kind: str, cameras: Cameras, depth: float, count: int) -> Cameras:
+    """Make the ``count`` cameras of an orbit or a spline through the cameras of a scene.
+
+    Args:
+        kind: One of ``PATHS``.
+        cameras: c >= 1 cameras of the scene, for a spline in the order in which it passes them.
+        depth: How far away what they show lies, see :func:`viewing_depth`.
+        count: Frames.
+
+    Raises:
+        ValueError: If a spline has fewer than two different cameras, or there are fewer than two frames.
+    """
+    if count < 2:
+        raise ValueError(f"frames: expected at least 2, got {count}")
+    if kind == "orbit":
+        return orbit(cameras, depth, count)
+    return spline(cameras, depth, count)
+
+
+def viewing_depth(cameras: Cameras, means: np.ndarray) -> float:
+    """Measure how far away what the middle camera shows of points ``[n,3]`` lies: the median depth, world units."""
+    return middle_depth(means, cameras[[median_camera(cameras)]])
+
+
+def median_camera(cameras: Cameras) -> int:
+    """Return the index of the camera nearest to the middle of all, in place and direction."""
+    centres = camera_centres(cameras.viewmats)
+    forward = cameras.viewmats[:, 2, :3]
+    away = _lengths(centres - lower_median(centres))
+    turned = _lengths(forward - normalize(forward.mean(0)))
+    return int((away / (away.mean() or 1.0) + turned).argmin())
+
+
+def middle_depth(means: np.ndarray, camera: Cameras) -> float:
+    """Measure the median depth of the points ``[n,3]`` that one camera has in its picture; 1 without any."""
+    points = means[:: max(1, len(means) // DEPTH_SAMPLE)]
+    (pixels,), (depths,) = project(points, camera)
+    inside = (depths > 0) & ((pixels >= 0) & (pixels <= (camera.width, camera.height))).all(1)
+    return float(np.median(depths[inside])) if inside.any() else 1.0
+
+
+def orbit(cameras: Cameras, depth: float, count: int) -> Cameras:
+    """Move around the middle camera on an ellipse in its picture's plane, towards the point ``depth`` in front of it.
+
+    Frames are equally far apart, and the one after the last is the first. The picture's vertical stays that of the
+    middle camera. The ellipse has no larger half axes than half of the cameras are away from that one, within
+    ``ACROSS`` and ``UPRIGHT`` of the depth.
+    """
+    middle = median_camera(cameras)
+    viewmat = cameras.viewmats[middle].astype(np.float64)
+    axes = viewmat[:3, :3]
+    centre = camera_centres(viewmat)
+    offsets = np.abs(matmul(camera_centres(cameras.viewmats) - centre, axes.T))
+    wide, high, _ = lower_median(offsets)
+    wide = np.clip(wide, ACROSS[0] * depth, ACROSS[1] * depth)
+    high = np.clip(high, UPRIGHT[0] * depth, UPRIGHT[1] * depth)
+
+    def shifts(angles: np.ndarray) -> np.ndarray:
+        return wide * sin(angles)[:, None] * axes[0] + high * cos(angles)[:, None] * axes[1]
+
+    angles = np.linspace(0, 2 * np.pi, TURN + 1)
+    even = _at_equal_steps(shifts(angles), angles, np.arange(count) / count)
+    eyes = shifts(even)
+    looks = normalize(depth * axes[2] - eyes)
+    right = normalize(np.cross(axes[1], looks))
+    turned = np.stack([right, np.cross(looks, right), looks], 1)
+    Ks = np.repeat(cameras.Ks[middle][None].astype(np.float64), count, 0)
+    return replace(cameras, viewmats=_viewmats(turned, centre + eyes), Ks=Ks)
+
+
+def spline(cameras: Cameras, depth: float, count: int) -> Cameras:
+    """Pass through all cameras in their order on a smooth curve, from the first to the last.
+
+    Frames are equally far apart, where a turn counts as far as it moves what lies ``depth`` away. The curve is a
+    centripetal Catmull-Rom spline (Barry and Goldman 1988) of places and quaternions, in its form by tangents;
+    intrinsics change linearly. ValueError if there are no two different cameras.
+    """
+    rows, kept = _pose_rows(cameras, depth)
+    origin, rows, Ks = rows[0, :3].copy(), rows[kept], cameras.Ks[kept].astype(np.float64)
+    if len(rows) < 2:
+        raise ValueError("spline: expected at least 2 different cameras, got 1; an orbit needs one")
+    rows[:, :3] -= origin
+    knots = np.concatenate([np.zeros(1), np.sqrt(_lengths(np.diff(rows, axis=0))).cumsum()])
+    fine = np.interp(np.arange(FINE * (len(rows) - 1) + 1) / FINE, np.arange(len(rows)), knots)
+    times = _at_equal_steps(_curve(rows, knots, fine, depth), fine, np.arange(count) / (count - 1))
+    poses = _curve(rows, knots, times, depth)
+    turned = quat_to_rotmat(poses[:, 3:]).swapaxes(1, 2)
+    pieces, shares = _pieces(knots, times)
+    shares = shares[:, None, None]
+    between = (1 - shares) * Ks[pieces] + shares * Ks[pieces + 1]
+    return replace(cameras, viewmats=_viewmats(turned, origin + poses[:, :3]), Ks=between)
+
+
+def _pose_rows(cameras: Cameras, depth: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return poses as rows ``[c,7]`` whose distances are those of poses, and which differ from the one before.
+
+    A row has the camera's place and its quaternion, near that of the row before, times twice the depth: a small turn
+    changes it by the angle times the depth.
+    """
+    quats = rotmat_to_quat(cameras.viewmats[:, :3, :3].astype(np.float64).swapaxes(1, 2))
+    opposite = (quats[1:] * quats[:-1]).sum(1) < 0
+    quats[1:] *= np.where(opposite, -1, 1).cumprod()[:, None]
+    rows = np.concatenate([camera_centres(cameras.viewmats), 2 * depth * quats], 1)
+    steps = _lengths(np.diff(rows, axis=0))
+    return rows, np.concatenate([[True], steps > SAME * max(steps.sum(), depth)])
+
+
+def _curve(rows: np.ndarray, knots: np.ndarray, times: np.ndarray, depth: float) -> np.ndarray:
+    """Return the poses ``[m,7]`` of the spline through ``rows`` at ``knots``, at the given times."""
+    steps = np.diff(knots)[:, None]
+    slopes = np.diff(rows, axis=0) / steps
+    inner = (steps[1:] * slopes[:-1] + steps[:-1] * slopes[1:]) / (steps[1:] + steps[:-1])
+    tangents = np.concatenate([slopes[:1], inner, slopes[-1:]])
+    pieces, shares = _pieces(knots, times)
+    s = shares[:, None]
+    out = (1 + 2 * s) * (1 - s) ** 2 * rows[pieces] + s * s * (3 - 2 * s) * rows[pieces + 1]
+    out += s * (1 - s) * steps[pieces] * ((1 - s) * tangents[pieces] - s * tangents[pieces + 1])
+    out[:, 3:] = 2 * depth * normalize(out[:, 3:])
+    return out
+
+
+def _pieces(knots: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the piece ``[m]`` of a spline that each time lies in, and the share of it that has passed."""
+    pieces = np.searchsorted(knots, times, side="right") - 1
+    pieces = pieces.clip(0, len(knots) - 2)
+    return pieces, (times - knots[pieces]) / np.diff(knots)[pieces]
+
+
+def _at_equal_steps(points: np.ndarray, times: np.ndarray, shares: np.ndarray) -> np.ndarray:
+    """Return the times at which shares of the length of a curve of ``points [m,d]`` have passed."""
+    passed = np.concatenate([np.zeros(1), _lengths(np.diff(points, axis=0)).cumsum()])
+    return np.interp(shares * passed[-1], passed, times)
+
+
+def _lengths(vectors: np.ndarray) -> np.ndarray:
+    return np.sqrt((vectors * vectors).sum(-1))
+
+
+def _viewmats(rotations: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    """Make world-to-camera matrices ``[n,4,4]`` of rotations to camera axes and centres in the world."""
+    out = np.tile(np.eye(4), (len(centres), 1, 1))
+    out[:, :3, :3] = rotations
+    out[:, :3, 3] = -(rotations * centres[:, None]).sum(-1)
+    return out

@@ -1,0 +1,159 @@
+"""Paths through a scene: where the cameras of the frames stand, and how they look."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gsmerge.geometry import camera_centres, motion_matrices, project
+from gsmerge.measure.camera_path import (
+    ACROSS,
+    UPRIGHT,
+    median_camera,
+    middle_depth,
+    orbit,
+    plan_path,
+    spline,
+    viewing_depth,
+)
+from gsmerge.types import Cameras
+
+DEPTH = 3.0
+
+
+def make_cameras(centres: Sequence[Sequence[float]], turns: Sequence[Sequence[float]]) -> Cameras:
+    """Cameras at places in the world, turned by rotation vectors (radians)."""
+    viewmats = motion_matrices(-np.concatenate([turns, np.zeros((len(turns), 3))], 1))
+    viewmats[:, :3, 3] = -(viewmats[:, :3, :3] * np.asarray(centres)[:, None]).sum(-1)
+    K = np.array([[40.0, 0, 16], [0, 40, 12], [0, 0, 1]])
+    return Cameras(viewmats, np.tile(K, (len(centres), 1, 1)), 32, 24)
+
+
+@pytest.fixture
+def walk() -> Cameras:
+    """Six cameras at uneven distances on a winding way, which turn by more than half a turn."""
+    places = [[0, 0, 0], [0.2, 0.1, 0.5], [1, 0, 1], [2.5, -0.1, 1.1], [3, 0, 2], [3, 0.2, 2.3]]
+    turns = [[0, 0, 0], [0, 0.4, 0], [0.1, 1.2, 0], [0, 1.8, 0.1], [0, 2.7, 0], [0, 3.6, 0]]
+    return make_cameras(places, turns)
+
+
+def angles_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Angles (radians) between rotations ``[n,4,4]``."""
+    cosines = ((a[:, :3, :3] * b[:, :3, :3]).sum((1, 2)) - 1) / 2
+    return np.arccos(cosines.clip(-1, 1))
+
+
+def pose_steps(path: Cameras) -> np.ndarray:
+    """How far each camera is from the one before, turns by what they move at the depth."""
+    shifts = np.linalg.norm(np.diff(camera_centres(path.viewmats), axis=0), axis=1)
+    turns = angles_between(path.viewmats[1:], path.viewmats[:-1])
+    return np.hypot(shifts, DEPTH * turns)
+
+
+def test_a_spline_passes_through_all_cameras_at_even_speed(walk: Cameras) -> None:
+    path = spline(walk, DEPTH, 400)
+    np.testing.assert_allclose(path.viewmats[[0, -1]], walk.viewmats[[0, -1]], atol=1e-12)
+    steps = pose_steps(path)
+    assert steps.max() / steps.min() < 1.03
+    for viewmat in walk.viewmats:
+        away = np.linalg.norm(camera_centres(path.viewmats) - camera_centres(viewmat), axis=1)
+        turned = angles_between(path.viewmats, np.broadcast_to(viewmat, path.viewmats.shape))
+        assert np.hypot(away, DEPTH * turned).min() <= 0.6 * steps.max()
+
+
+def test_a_spline_has_no_corners(walk: Cameras) -> None:
+    steps = np.diff(camera_centres(spline(walk, DEPTH, 1000).viewmats), axis=0)
+    steps /= np.linalg.norm(steps, axis=1, keepdims=True)
+    assert (steps[1:] * steps[:-1]).sum(1).min() > 0.995
+    straight = np.diff(camera_centres(walk.viewmats), axis=0)
+    straight /= np.linalg.norm(straight, axis=1, keepdims=True)
+    assert (straight[1:] * straight[:-1]).sum(1).min() < 0.8  # while the way itself has some
+
+
+def test_cameras_that_only_turn_are_turned_evenly() -> None:
+    turns = [[0, 0.0, 0], [0, 0.3, 0], [0, 1.5, 0], [0, 1.7, 0]]
+    path = spline(make_cameras(np.tile([1.0, 2, 3], (4, 1)).tolist(), turns), DEPTH, 35)
+    np.testing.assert_allclose(camera_centres(path.viewmats), np.tile([1, 2, 3], (35, 1)), atol=1e-12)
+    np.testing.assert_allclose(angles_between(path.viewmats[1:], path.viewmats[:-1]), 1.7 / 34, rtol=0.01)
+    assert np.allclose(path.viewmats[:, 1, :3], [0, 1, 0])  # upright between upright ones
+
+
+def test_repeated_cameras_count_once(walk: Cameras) -> None:
+    path = spline(walk[[0, 0, 1, 2, 3, 3, 3, 4, 5]], DEPTH, 50)
+    np.testing.assert_allclose(path.viewmats, spline(walk, DEPTH, 50).viewmats, atol=1e-12)
+    with pytest.raises(ValueError, match="expected at least 2 different cameras, got 1"):
+        spline(walk[[2, 2, 2]], DEPTH, 50)
+
+
+def test_two_cameras_make_a_straight_way_and_intrinsics_follow(walk: Cameras) -> None:
+    two = walk[[0, 2]]
+    two.Ks[1, 0, 0] = 80
+    path = spline(two, DEPTH, 5)
+    line = np.linspace([0, 0, 0], [1, 0, 1], 5)
+    np.testing.assert_allclose(camera_centres(path.viewmats), line, atol=0.01)
+    np.testing.assert_allclose(path.Ks[:, 0, 0], np.linspace(40, 80, 5), atol=0.3)
+    assert (path.width, path.height) == (32, 24)
+
+
+def test_a_spline_far_from_the_origin_is_the_same(walk: Cameras) -> None:
+    shift = np.array([3e6, -5e6, 100.0])
+    far = replace(walk, viewmats=walk.viewmats.copy())
+    far.viewmats[:, :3, 3] -= (far.viewmats[:, :3, :3] * shift).sum(-1)
+    moved = camera_centres(spline(far, DEPTH, 40).viewmats) - shift
+    np.testing.assert_allclose(moved, camera_centres(spline(walk, DEPTH, 40).viewmats), atol=1e-6)
+
+
+@pytest.mark.parametrize("count", [2, 7, 60])
+def test_an_orbit_is_closed_even_upright_and_looks_at_its_middle(walk: Cameras, count: int) -> None:
+    path = orbit(walk, DEPTH, count)
+    centres = camera_centres(path.viewmats)
+    home = walk.viewmats[median_camera(walk)]
+    focus = camera_centres(home) + DEPTH * home[2, :3]
+    pixels, depths = project(focus[None], path)
+    np.testing.assert_allclose(pixels[:, 0], np.tile([16.0, 12], (count, 1)), atol=1e-9)
+    assert (depths > 0.9 * DEPTH).all()
+    np.testing.assert_allclose((path.viewmats[:, 0, :3] * home[1, :3]).sum(1), 0, atol=1e-12)
+    assert ((path.viewmats[:, 1, :3] * home[1, :3]).sum(1) > 0.9).all()
+    assert np.linalg.det(path.viewmats[:, :3, :3]) == pytest.approx(1)
+    if count > 2:
+        steps = np.linalg.norm(centres - np.roll(centres, 1, 0), axis=1)
+        assert steps.max() / steps.min() < (1.01 if count > 50 else 1.2)
+
+
+@pytest.mark.parametrize(("apart", "radius"), [(0.0, ACROSS[0] * DEPTH), (0.5, 0.5), (9.0, ACROSS[1] * DEPTH)])
+def test_an_orbit_is_as_wide_as_the_cameras_stand_within_limits(apart: float, radius: float) -> None:
+    places = [[-apart, 0, 0], [0, 0, 0], [apart, 0, 0]]
+    cameras = make_cameras(places, np.zeros((3, 3)).tolist())
+    centres = camera_centres(orbit(cameras, DEPTH, 100).viewmats)
+    assert median_camera(cameras) == (1 if apart else 0)
+    assert np.abs(centres).max(0) == pytest.approx([radius, UPRIGHT[0] * DEPTH, 0], rel=0.01, abs=1e-12)
+
+
+def test_the_middle_camera_is_none_that_looks_elsewhere() -> None:
+    places = [[0, 0, 0], [1, 0, 0], [2, 0, 0], [1.1, 0, 0]]
+    turns = [[0, 0, 0], [0, 3, 0], [0, 0.1, 0], [0, 0.1, 0]]
+    assert median_camera(make_cameras(places, turns)) == 3
+
+
+@pytest.mark.parametrize("kind", ["orbit", "spline"])
+def test_a_path_moves_with_its_scene(kind: str, walk: Cameras) -> None:
+    means = np.random.default_rng(1).uniform(-4, 4, (500, 3))
+    motion = motion_matrices(np.array([[0.3, -1.1, 0.7, 4, -2, 1]]))[0]
+    moved = replace(walk, viewmats=walk.viewmats @ np.linalg.inv(motion))
+    path = plan_path(kind, walk, viewing_depth(walk, means), 30)
+    depth = viewing_depth(moved, means @ motion[:3, :3].T + motion[:3, 3])
+    other = plan_path(kind, moved, depth, 30)
+    np.testing.assert_allclose(other.viewmats @ motion, path.viewmats, atol=1e-9)
+
+
+def test_a_path_has_two_frames_at_least(walk: Cameras) -> None:
+    with pytest.raises(ValueError, match="frames: expected at least 2, got 1"):
+        plan_path("orbit", walk, DEPTH, 1)
+
+
+def test_middle_depth(walk: Cameras) -> None:
+    ahead, behind = np.array([[0.0, 0, 5]]), np.array([[0.0, 0, -5]])
+    assert [middle_depth(points, walk[[0]]) for points in (ahead, behind, ahead[:0])] == [pytest.approx(5), 1, 1]
