@@ -78,12 +78,12 @@ def _check_frames(path: Path, temporary: Path, count: int) -> None:
     """Raise a SceneError if a video has not all frames, since the encoders do not say when a disk is full."""
     with _silent_stderr():
         reader = cv2.VideoCapture(str(temporary), cv2.CAP_FFMPEG)
-        found = 0
+        readable = 0
         while reader.grab():
-            found += 1
+            readable += 1
         reader.release()
-    if found != count:
-        problem = f"could not be written whole: {found} of {count} frames can be read"
+    if readable != count:
+        problem = f"could not be written whole: {readable} of {count} frames can be read"
         raise SceneError(path, problem, "free some space, or write elsewhere")
 
 
