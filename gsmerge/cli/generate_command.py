@@ -24,7 +24,8 @@ if TYPE_CHECKING:
                    metavar="N|N-M"),
         opt.option("size", str, "Size of the views, pixels.", default="320x240", metavar="WxH"),
         opt.option("style", str, "room, garden, mixed: these two in turn, or building: many rooms.", default="mixed"),
-        opt.option("path", str, "Cameras: arc, forward, walk, orbit, wide, or mixed: any; in a building a walk.", default="mixed"),
+        opt.option("path", str, "Cameras: arc, forward, walk, orbit, wide, or mixed: any; a walk in a building.",
+                   default="mixed"),
     ),
     *opt.panel(
         "Errors",

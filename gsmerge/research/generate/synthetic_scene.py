@@ -203,28 +203,33 @@ def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScen
     metered = poses[:: 2 * -(-num_views // METERED)]
     gain = find_exposure([radiance(scene, p, _shrink(lens), 1) for p in metered], rng.uniform(0.22, 0.62))
     seeds = rng.integers(0, 2**63, len(poses))
-    held_out = _held_out(num_views, MAX_TARGETS.get(style, num_views))
-    taken = sorted([*range(0, len(poses), 2), *held_out])
     world = invert(poses[0]) if rng.random() < 0.5 else np.eye(4)  # that of many exporters is the first camera
-    photo = partial(_photo, scene, lens, large, noise, gain)
-    photos = dict(zip(taken, parallel_map(photo, [(poses[i], seeds[i]) for i in taken]), strict=True))
     moved = [_move_pose(pose, world, noise.unit) for pose in poses]
-    seen = []
-    for i in range(0, len(poses), 2):
-        image, depth, normals = photos[i]
-        if large != lens:
-            image = cv2.resize(image, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
-        depth = np.minimum(depth, FAR) * noise.unit
-        estimate = _perturb_pose(moved[i], noise, float(np.median(depth)), rng)
-        rotated = np.einsum("hwk,ik->hwi", normals, world[:3, :3]).astype(np.float32)
-        seen.append((TrueView(image, depth, rotated, estimate), int(rng.integers(2**63))))
-    parts = parallel_map(lambda given: pixel_gaussians(given[0], lens, noise, np.random.default_rng(given[1])), seen)
+    views = range(0, len(poses), 2)
+    errors = {i: (rng.normal(0, 1, (2, 3)), int(rng.integers(2**63))) for i in views}
+
+    def take(i: int) -> tuple[Float, Array, Gaussians | None]:
+        """Take the photo at a place; at views, estimate its pose and predict Gaussians from it."""
+        image = _photo(scene, poses[i], large, noise, gain, seeds[i])
+        if i not in errors:
+            return image, moved[i], None
+        deviation, seed = errors[i]
+        hits, _ = trace_scene(scene, poses[i], lens, 1)
+        depth = np.minimum(hits.depth, FAR) * noise.unit
+        estimate = _perturb_pose(moved[i], noise, float(np.median(depth)), deviation)
+        normals = np.einsum("hwk,ik->hwi", hits.normals, world[:3, :3]).astype(np.float32)
+        seen = image if large == lens else cv2.resize(image, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
+        predicted = pixel_gaussians(TrueView(seen, depth, normals, estimate), lens, noise, np.random.default_rng(seed))
+        return image, estimate, predicted
+
+    held_out = _held_out(num_views, MAX_TARGETS.get(style, num_views))
+    shots = parallel_map(take, [*views, *held_out])
     return SyntheticScene(
-        gaussians=Gaussians.concat(parts),
-        cameras=_cameras([view.c2w for view, _ in seen], lens),
-        images=tuple(photos[i][0] for i in range(0, len(poses), 2)),
-        targets=_cameras([moved[i] for i in held_out], large),
-        target_images=tuple(photos[i][0] for i in held_out),
+        gaussians=Gaussians.concat([gaussians for _, _, gaussians in shots if gaussians is not None]),
+        cameras=_cameras([pose for _, pose, _ in shots[:num_views]], lens),
+        images=tuple(image for image, _, _ in shots[:num_views]),
+        targets=_cameras([pose for _, pose, _ in shots[num_views:]], large),
+        target_images=tuple(image for image, _, _ in shots[num_views:]),
         style=style,
         path=path,
         noise=noise,
@@ -275,11 +280,8 @@ def _find_building(rng: np.random.Generator, lens: Pinhole, num_views: int) -> t
     return LitScene(tuple(stages), tuple(zones), tuple(portals)), pose
 
 
-def _photo(
-    scene: LitScene, grid: Pinhole, lens: Pinhole, noise: Noise, gain: float, given: tuple[Array, int]
-) -> tuple[Float, Array, Float]:
-    """Take a photo with the errors of lens, sensor and exposure, and exact depth and normals of the grid."""
-    pose, seed = given
+def _photo(scene: LitScene, pose: Array, lens: Pinhole, noise: Noise, gain: float, seed: int) -> Float:
+    """Take a photo with the errors of lens, sensor and exposure."""
     rng = np.random.default_rng(seed)
     linear = radiance(scene, pose, lens, SAMPLES)
     gains = gain * exp(noise.exposure * rng.normal() + noise.tint * rng.normal(0, 1, 3))
@@ -288,16 +290,15 @@ def _photo(
     linear = linear * gains.astype(np.float32) * (1 - 0.3 * away**2)[..., None].astype(np.float32)
     image = cv2.GaussianBlur(develop(linear), (0, 0), noise.blur)
     image = np.clip(image + rng.normal(0, 0.004, image.shape), 0, 1).astype(np.float32)
-    hits, _ = trace_scene(scene, pose, grid, 1)
-    return np.round(image * 255) / np.float32(255), hits.depth, hits.normals
+    return np.round(image * 255) / np.float32(255)
 
 
-def _perturb_pose(pose: Array, noise: Noise, depth: float, rng: np.random.Generator) -> Array:
-    """Add the network's error to a pose."""
-    turn, _ = cv2.Rodrigues(np.deg2rad(noise.turn) * rng.normal(0, 1, 3) / 3**0.5)
+def _perturb_pose(pose: Array, noise: Noise, depth: float, deviation: Array) -> Array:
+    """Add the network's error to a pose: ``deviation`` ``[2,3]`` of rotation and position, in their strengths."""
+    turn, _ = cv2.Rodrigues(np.deg2rad(noise.turn) * deviation[0] / 3**0.5)
     out = pose.copy()
     out[:3, :3] = compose(pose[:3, :3], turn)
-    out[:3, 3] += noise.shift * depth * rng.normal(0, 1, 3) / 3**0.5
+    out[:3, 3] += noise.shift * depth * deviation[1] / 3**0.5
     return out
 
 
