@@ -105,13 +105,13 @@ def _panel(x: tuple[float, float], y: tuple[float, float], paper: Material) -> S
     return replace(quad(centre, half, replace(paper, shift=shift)), shell=True)
 
 
-def _wall(wall: Wall, height: float, paper: Material, skirting: Material) -> Shapes:
-    """Build a wall with its openings and its skirting."""
+def _wall(wall: Wall, height: float, paper: Material, skirting: Material | None) -> Shapes:
+    """Build a wall with its openings, and its skirting unless it stands on another wall."""
     out, x = [], -wall.half
     for left, right, top in (*sorted(wall.openings), (wall.half, wall.half, height)):
         if left > x:
             out.append(_panel((x, left), (0, height), paper))
-            out.append(box((x, -0.09, -0.015), (left, 0, 0), skirting))
+            out += [box((x, -0.09, -0.015), (left, 0, 0), skirting)] if skirting is not None else []
         if top < height:
             out.append(_panel((left, right), (top, height), paper))
         x = right
@@ -263,10 +263,9 @@ def _stairs(pal: Palette, plan: FloorPlan) -> Zone:
         walls += [Wall(np.array([end, foot_y, 0]), 1, half, outside=True)]
         walls += [Wall(np.array([middle, foot_y, s * half]), k, STAIR_LENGTH / 2) for k, s in ((0, 1), (2, -1))]
         for wall in walls:
-            shapes += _wall(wall, height, paper, rail)
+            shapes += _wall(wall, height, paper, None if foot_y else rail)
             shapes += _hang(pal, wall, height) if wall.turn != 1 and foot_y else []
-    pane = window(pal, 1.5, 1.7, pal.material("sky", "crown"), glow=True)
-    shapes += place(pane, (end, -2.1, 0), rotation=TURNS[1])
+    shapes += place(picture(pal, 1.5, 1.2), (end, -2.3, 0), rotation=TURNS[1])  # before the landing
     rise, run, top = STOREY / 2 / TREADS, FLIGHT / TREADS, foot + FLIGHT
     for k in range(TREADS):
         y, x = -rise * (k + 1), foot + run * k
