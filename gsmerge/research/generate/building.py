@@ -265,8 +265,10 @@ def _stairs(pal: Palette, plan: FloorPlan) -> Zone:
         for wall in walls:
             shapes += _wall(wall, height, paper, None if foot_y else rail)
             shapes += _hang(pal, wall, height) if wall.turn != 1 and foot_y else []
-    shapes += place(picture(pal, 1.5, 1.2), (end, -2.3, 0), rotation=TURNS[1])  # before the landing
     rise, run, top = STOREY / 2 / TREADS, FLIGHT / TREADS, foot + FLIGHT
+    for x, y, turn in ((foot + 0.9, -1.5, 0), (end, -2.3, 1), (top - 0.1, -2.3, 2)):  # along the flights
+        at = (x, y, half * (1, 0, -1)[turn])
+        shapes += place(picture(pal, 1.2, rng.uniform(0.9, 1.2)), at, rotation=TURNS[turn])
     for k in range(TREADS):
         y, x = -rise * (k + 1), foot + run * k
         shapes.append(box((x, y, 0.08), (x + run + 0.02, min(0.0, y + 0.36), half), tread))
