@@ -23,8 +23,9 @@ if TYPE_CHECKING:
         opt.option("views", str, "Views of a scene, or a range to draw their number from.", default="6",
                    metavar="N|N-M"),
         opt.option("size", str, "Size of the views, pixels.", default="320x240", metavar="WxH"),
-        opt.option("style", str, "room, garden, or mixed: both in turn.", default="mixed"),
-        opt.option("path", str, "Cameras: arc, forward, walk, orbit, wide, or mixed: any.", default="mixed"),
+        opt.option("style", str, "room, garden, mixed: these two in turn, or building: many rooms.", default="mixed"),
+        opt.option("path", str, "Cameras: arc, forward, walk, orbit, wide, or mixed: any; a walk in a building.",
+                   default="mixed"),
     ),
     *opt.panel(
         "Errors",

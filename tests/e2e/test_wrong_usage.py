@@ -143,11 +143,12 @@ USAGE = {
     "chart -o room/scene.ply room": "expected a folder, found the file",
     "chart -o room room": "expected another folder for the results",
     "generate -o out --views many": "--views: expected a number such as 6",
-    "generate -o out --views 1": "views: expected 2 to 200",
+    "generate -o out --views 1": "views: expected 2 to 2000",
     "generate -o out --size large": "--size: expected width and height such as 320x240",
     "generate -o out --size 9x9": "width: expected 16 to 2048",
     "generate -o out --style castle": "style: expected mixed, room",
     "generate -o out --path spiral": "path: expected mixed, arc",
+    "generate -o out --style building --path orbit": "path: expected walk or mixed in a building, got 'orbit'",
     "train -o out": "--data",
 }
 PLACES = {

@@ -167,9 +167,9 @@ def _folder(folder: Path) -> Iterator[Path]:
 def _write_views(folder: Path, cameras: Cameras, images: Sequence[Float]) -> None:
     """Write ``images/`` and ``transforms.json`` (nerfstudio: camera to world, OpenGL axes)."""
     (folder / "images").mkdir(parents=True)
-    frames = []
+    frames, digits = [], max(3, len(str(len(images) - 1)))
     for i, image in enumerate(images):
-        name = f"images/view_{i:03d}.png"
+        name = f"images/view_{i:0{digits}d}.png"
         _, data = cv2.imencode(".png", np.round(image[..., ::-1] * 255).astype(np.uint8))
         (folder / name).write_bytes(data.tobytes())
         c2w = compose(invert(cameras.viewmats[i]), FLIP)

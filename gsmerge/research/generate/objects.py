@@ -337,15 +337,20 @@ def room(pal: Palette) -> Stage:
     return Stage(tuple(shapes), tuple(pal.textures), light(rng, lamp_at), focus, (0.6 * reach, reach), (0.9, 1.8), 35)
 
 
+def sofa(pal: Palette) -> Shapes:
+    """Build a sofa with two pillows, its back towards +z."""
+    soft = pal.material("cloth", "carpet", repeat=0.9)
+    seat = [box((-0.9, -0.42, -0.4), (0.9, 0, 0.4), soft), box((-0.9, -0.85, 0.25), (0.9, 0, 0.45), soft)]
+    pillow = pal.material("cloth", "carpet", "label")
+    return seat + [ball((x, -0.55, 0.1), (0.22, 0.18, 0.12), pillow) for x in pal.rng.uniform(-0.7, 0.7, 2)]
+
+
 def _furniture(pal: Palette) -> Shapes:
     rng, kind = pal.rng, pal.rng.integers(0, 4)
     if kind == 0:
         return chair(pal)
     if kind == 1:
-        soft = pal.material("cloth", "carpet", repeat=0.9)
-        seat = [box((-0.9, -0.42, -0.4), (0.9, 0, 0.4), soft), box((-0.9, -0.85, 0.25), (0.9, 0, 0.45), soft)]
-        pillow = pal.material("cloth", "carpet", "label")
-        return seat + [ball((x, -0.55, 0.1), (0.22, 0.18, 0.12), pillow) for x in rng.uniform(-0.7, 0.7, 2)]
+        return sofa(pal)
     width, depth, height = rng.uniform(0.7, 1.5), rng.uniform(0.5, 0.9), rng.uniform(0.4, 0.8)
     top = clutter(pal, int(rng.integers(2, 7)), (0.3 * width, 0.3 * depth), height)
     out = table(pal, width, depth, height) + top

@@ -12,7 +12,18 @@ from numpy.typing import NDArray
 
 from gsmerge.kernels.cast import BLOB, BOX, CONE, ELLIPSOID, add_light, cast
 from gsmerge.kernels.elementary import arctan2, power
-from gsmerge.research.generate.shapes import Array, Shape, ShapeArrays, bounds, norm, pack, rotate
+from gsmerge.research.generate.shapes import (
+    Array,
+    Material,
+    Shape,
+    ShapeArrays,
+    bounds,
+    box,
+    concat,
+    norm,
+    pack,
+    rotate,
+)
 from gsmerge.research.generate.textures import Picture, pyramid
 
 FAR = 1e6  # depth of pixels without a surface
@@ -46,9 +57,27 @@ class Stage:
     textures: tuple[Picture, ...]  # indexed by the shapes' materials
     light: Light
     focus: Array  # [3] point at which cameras are aimed
-    distance: tuple[float, float]  # range of the distance of cameras from the focus
-    height: tuple[float, float]  # range of the height of cameras above the ground
-    swing: float  # largest angle of cameras to either side of -z, seen from the focus, degrees
+    distance: tuple[float, float] = (1.0, 1.0)  # range of the distance of cameras from the focus
+    height: tuple[float, float] = (1.0, 1.0)  # range of the height of cameras above the ground
+    swing: float = 0.0  # largest angle of cameras to either side of -z, seen from the focus, degrees
+
+
+@dataclass(frozen=True)
+class Zone:
+    """A part of a scene that has lights of its own, in a box whose walls hide the rest."""
+
+    stage: Stage
+    low: Array  # [3] lowest corner of the box
+    high: Array  # [3] highest corner
+
+
+@dataclass(frozen=True)
+class Portal:
+    """An opening between two zones."""
+
+    zones: tuple[int, int]
+    low: Array  # [3] lowest corner of a box around it
+    high: Array  # [3] highest corner
 
 
 @dataclass(frozen=True)
@@ -90,6 +119,15 @@ class LitStage:
     weights: Array  # [k] of the ambient maps
 
 
+@dataclass(frozen=True)
+class LitScene:
+    """Stages that are photographed together: zones of a building, or one alone."""
+
+    stages: tuple[LitStage, ...]
+    zones: tuple[Zone, ...] = ()  # none where there is one stage
+    portals: tuple[Portal, ...] = ()
+
+
 def screen_boxes(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -> NDArray[np.int32]:
     """Compute x0, y0, x1, y1 ``[m,4]`` of the samples that may see each shape."""
     half = bounds(shapes)
@@ -110,8 +148,13 @@ def screen_boxes(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -
     return np.concatenate([np.clip(low, 0, limits), np.clip(high, 0, limits)], 1).astype(np.int32)
 
 
-def trace(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -> Hits:
-    """Cast ``samples`` x ``samples`` rays for each pixel."""
+def trace(
+    shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int, windows: NDArray[np.int32] | None = None
+) -> Hits:
+    """Cast ``samples`` x ``samples`` rays for each pixel.
+
+    ``windows`` ``[m,4]``: x0, y0, x1, y1 of the samples to which each shape is confined.
+    """
     h, w = lens.height * samples, lens.width * samples
     hits = Hits(np.full((h, w), FAR), np.full((h, w), -1, np.int32), *np.zeros((2, h, w, 3), np.float32))
     intrinsics = np.array([lens.focal, lens.focal, lens.width / 2, lens.height / 2])
@@ -119,8 +162,54 @@ def trace(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -> Hits:
     eye, axes = c2w[:3, 3].copy(), c2w[:3, :3].copy()
     table = shapes.kinds, shapes.rotations, shapes.centres, shapes.sizes, shapes.waves
     rects = screen_boxes(shapes, c2w, lens, samples)
+    if windows is not None:
+        rects = _overlap(rects, windows)
     cast(eye, axes, intrinsics, 1.0 / samples, *table, rects, hits.depth, hits.ids, hits.points, hits.normals)
     return hits
+
+
+def _overlap(a: NDArray[np.int32], b: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Compute the common part of rectangles ``[...,4]``."""
+    return np.concatenate([np.maximum(a[..., :2], b[..., :2]), np.minimum(a[..., 2:], b[..., 2:])], -1)
+
+
+def find_windows(scene: LitScene, c2w: Array, lens: Pinhole, samples: int) -> dict[int, NDArray[np.int32]]:
+    """Find the stages that a view may see, and x0, y0, x1, y1 ``[4]`` of the samples in which it may.
+
+    A straight line enters and leaves a zone, which is a box, through portals and no more than once.
+    """
+    whole = np.array([0, 0, lens.width * samples, lens.height * samples], np.int32)
+    if not scene.portals:
+        return dict.fromkeys(range(len(scene.stages)), whole)
+    eye = c2w[:3, 3]
+    thick = max(float((portal.high - portal.low).min()) for portal in scene.portals)
+    rects = screen_boxes(pack([box(p.low, p.high, Material(0)) for p in scene.portals]), c2w, lens, samples)
+    out: dict[int, NDArray[np.int32]] = {}
+
+    def enter(zone: int, window: NDArray[np.int32], way: tuple[int, ...]) -> None:
+        known = out.get(zone, window)
+        out[zone] = np.concatenate([np.minimum(known[:2], window[:2]), np.maximum(known[2:], window[2:])])
+        for portal, rect in zip(scene.portals, rects, strict=True):
+            if zone in portal.zones:
+                beyond = sum(portal.zones) - zone
+                part = _overlap(window, rect)
+                if beyond not in way and (part[:2] < part[2:]).all():
+                    enter(beyond, part, (*way, beyond))
+
+    for zone, space in enumerate(scene.zones):
+        if (eye > space.low - thick).all() and (eye < space.high + thick).all():  # two in a doorway
+            enter(zone, whole, (zone,))
+    return dict(sorted(out.items())) or dict.fromkeys(range(len(scene.stages)), whole)
+
+
+def trace_scene(scene: LitScene, c2w: Array, lens: Pinhole, samples: int) -> tuple[Hits, dict[int, int]]:
+    """Cast rays as :func:`trace` does against the stages that a view may see; and the first id of each of these."""
+    windows = find_windows(scene, c2w, lens, samples)
+    parts = [scene.stages[zone].shapes for zone in windows]
+    counts = [len(part.kinds) for part in parts]
+    limits = np.repeat(np.stack(list(windows.values())), counts, axis=0)
+    hits = trace(concat(parts), c2w, lens, samples, limits)
+    return hits, dict(zip(windows, np.cumsum([0, *counts[:-1]]).tolist(), strict=True))
 
 
 def _axes(towards: Array) -> Array:
@@ -139,8 +228,8 @@ def _shadow_map(shapes: ShapeArrays, axes: Array, middle: Array, radius: float, 
     return (hits.depth - BEHIND * radius).astype(np.float32)
 
 
-def light_stage(stage: Stage) -> LitStage:
-    """Prepare a stage: its arrays, smaller textures, and shadow maps."""
+def light_stage(stage: Stage, mips: tuple[list[Picture], ...] | None = None) -> LitStage:
+    """Prepare a stage: its arrays, smaller textures (``mips`` where they are known), and shadow maps."""
     opaque = pack([s for s in stage.shapes if not s.shell and not s.glow] or stage.shapes[:1])
     extent = bounds(opaque)
     reach = np.linalg.norm(extent, axis=1)
@@ -156,7 +245,7 @@ def light_stage(stage: Stage) -> LitStage:
     return LitStage(
         stage,
         pack(stage.shapes),
-        tuple(pyramid(texture) for texture in stage.textures),
+        tuple(pyramid(texture) for texture in stage.textures) if mips is None else mips,
         axes,
         middle,
         radius,
@@ -218,14 +307,27 @@ def _lookup(texture: Picture, uv: Float) -> Float:
     return colors.reshape(-1, 3)[: len(uv)]
 
 
-def radiance(view: LitStage, c2w: Array, lens: Pinhole, samples: int) -> tuple[Float, Hits]:
-    """Compute the linear light ``[h,w,3]`` of every pixel, and the hits of all samples."""
-    hits = trace(view.shapes, c2w, lens, samples)
+def radiance(scene: LitScene, c2w: Array, lens: Pinhole, samples: int) -> Float:
+    """Compute the linear light ``[h,w,3]`` of every pixel."""
+    hits, firsts = trace_scene(scene, c2w, lens, samples)
     h, w = hits.depth.shape
-    seen = hits.ids.reshape(-1) >= 0
-    ids, points = hits.ids.reshape(-1)[seen], hits.points.reshape(-1, 3)[seen]
-    normals, depth = hits.normals.reshape(-1, 3)[seen], hits.depth.reshape(-1)[seen]
-    y, x = np.divmod(np.flatnonzero(seen), w)
+    out = np.zeros((h * w, 3), np.float32)
+    ids = hits.ids.reshape(-1)
+    for zone, first in firsts.items():
+        view = scene.stages[zone]
+        seen = (ids >= first) & (ids < first + len(view.shapes.kinds))
+        if seen.any():
+            out[seen] = _reflect(view, ids[seen] - np.int32(first), hits, seen, c2w, lens, samples)
+    return out.reshape(h, w, 3).reshape(lens.height, samples, lens.width, samples, 3).mean((1, 3))
+
+
+def _reflect(
+    view: LitStage, ids: NDArray[np.int32], hits: Hits, seen: Array, c2w: Array, lens: Pinhole, samples: int
+) -> Float:
+    """Compute the linear light ``[n,3]`` that comes from the samples that see a stage's shapes."""
+    points, normals = hits.points.reshape(-1, 3)[seen], hits.normals.reshape(-1, 3)[seen]
+    depth = hits.depth.reshape(-1)[seen]
+    y, x = np.divmod(np.flatnonzero(seen), hits.depth.shape[1])
     rays = np.stack([(x + 0.5) / samples - lens.width / 2, (y + 0.5) / samples - lens.height / 2], 1) / lens.focal
     rays = rotate(np.concatenate([rays, np.ones((len(rays), 1))], 1), c2w[:3, :3])
     world = (c2w[:3, 3] + rays * depth[:, None]).astype(np.float32)
@@ -233,9 +335,7 @@ def radiance(view: LitStage, c2w: Array, lens: Pinhole, samples: int) -> tuple[F
     cosine = np.maximum(-(normals * rays).sum(1), 0.1)
     spread = (depth / (lens.focal * samples)).astype(np.float32) / np.sqrt(cosine)
     albedo = power(paint(view, ids, points, spread), 2.2)
-    out = np.zeros((h * w, 3), np.float32)
-    out[seen] = _shade(view, ids, albedo, world, normals, rays)
-    return out.reshape(h, w, 3).reshape(lens.height, samples, lens.width, samples, 3).mean((1, 3)), hits
+    return _shade(view, ids, albedo, world, normals, rays)
 
 
 def _shade(view: LitStage, ids: NDArray[np.int32], albedo: Float, world: Float, normals: Float, rays: Float) -> Float:

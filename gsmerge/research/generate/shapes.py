@@ -158,6 +158,14 @@ def pack(shapes: Sequence[Shape]) -> ShapeArrays:
     )
 
 
+def concat(parts: Sequence[ShapeArrays]) -> ShapeArrays:
+    """Put arrays of shapes together."""
+    if len(parts) == 1:
+        return parts[0]
+    columns = zip(*((a.kinds, a.rotations, a.centres, a.sizes, a.waves) for a in parts), strict=True)
+    return ShapeArrays(tuple(s for a in parts for s in a.shapes), *(np.concatenate(column) for column in columns))
+
+
 def bounds(given: ShapeArrays) -> Array:
     """Compute half sizes ``[m,3]`` of the shapes' bounding boxes, in their frames."""
     half = given.sizes[:, :3].copy()

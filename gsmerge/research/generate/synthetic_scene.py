@@ -13,6 +13,8 @@ import cv2
 import numpy as np
 
 from gsmerge.kernels.elementary import exp
+from gsmerge.research.generate.building import build_building
+from gsmerge.research.generate.floor_plan import draw_plan, draw_walk
 from gsmerge.research.generate.noise import Noise, NoiseOptions, TrueView, draw_noise, pixel_gaussians
 from gsmerge.research.generate.objects import STYLES
 from gsmerge.research.generate.photograph import (
@@ -20,23 +22,29 @@ from gsmerge.research.generate.photograph import (
     SAMPLES,
     Float,
     Hits,
-    LitStage,
+    LitScene,
     Pinhole,
     Stage,
     develop,
     find_exposure,
     light_stage,
     radiance,
-    trace,
+    trace_scene,
 )
 from gsmerge.research.generate.shapes import Array, compose, invert, norm
-from gsmerge.research.generate.textures import Palette
+from gsmerge.research.generate.textures import Palette, pyramid
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians
 
 PATH_TRIES, STAGE_TRIES = 6, 6  # paths per stage, and stages, until all views are usable
 SMALL = 8  # views are checked, and exposures computed, at this fraction of the size
 MIXED = "mixed"
+BUILDING = "building"  # a style with a walk of its own, which "mixed" leaves out
+FOCAL = {BUILDING: (0.55, 0.8)}  # range of the focal length, in the longer sides of the photo
+METERED = 200  # views that the exposure is set by
+MAX_TARGETS = {BUILDING: 50}  # held-out views of a scene
+MAX_VIEWS = 2000
+MAX_TEXTURE = 512  # side of a building's textures, pixels, of which there are a dozen for every room
 MIN_NEAR = 0.22  # first percentile of the depths, as a share of their median
 MAX_TURN = 50  # degrees between neighbouring views
 Pose = Callable[[float], Array]  # camera to world at 0, the start of a path, to 1
@@ -128,27 +136,30 @@ def is_usable(hits: Hits) -> bool:
 class GenerateOptions:
     """Settings of synthetic scenes; a ValueError if one is out of range."""
 
-    views: tuple[int, int] = (6, 6)  # range of their number in a scene; one target is between any two neighbours
+    views: tuple[int, int] = (6, 6)  # range of their number in a scene; one target is between any two neighbours,
+    # or, in a building, at most 50 of these, evenly spread
     width: int = 320  # of the views, pixels: 16 to 2048
     height: int = 240  # the same
     photo_scale: int = 1  # times the views' size that the photos have, 1 to 8; the network sees the views' own
-    style: str = MIXED  # one of STYLES, or "mixed": each in turn
+    style: str = MIXED  # one of STYLES, or "mixed": each in turn; or BUILDING
     path: str = MIXED  # one of PATHS, or "mixed": any
     noise: float = 1.0  # factor on the errors: 0 to 10
     ranges: NoiseOptions = field(default_factory=NoiseOptions)  # the errors and habits
 
     def __post_init__(self) -> None:
         low, high = self.views
-        if not 2 <= low <= high <= 200:
-            raise ValueError(f"views: expected 2 to 200, got {low} to {high}")
+        if not 2 <= low <= high <= MAX_VIEWS:
+            raise ValueError(f"views: expected 2 to {MAX_VIEWS}, got {low} to {high}")
         for name in ("width", "height"):
             if not 16 <= getattr(self, name) <= 2048:
                 raise ValueError(f"{name}: expected 16 to 2048 pixels, got {getattr(self, name)}")
         if not 1 <= self.photo_scale <= 8:
             raise ValueError(f"photo_scale: expected 1 to 8, got {self.photo_scale}")
-        for name, known in (("style", STYLES), ("path", PATHS)):
+        for name, known in (("style", (*STYLES, BUILDING)), ("path", tuple(PATHS))):
             if getattr(self, name) not in (MIXED, *known):
                 raise ValueError(f"{name}: expected {', '.join((MIXED, *known))}, got {getattr(self, name)!r}")
+        if self.style == BUILDING and self.path not in (MIXED, "walk"):
+            raise ValueError(f"path: expected walk or mixed in a building, got {self.path!r}")
         if not 0 <= self.noise <= 10:
             raise ValueError(f"noise: expected 0 to 10, got {self.noise:g}")
 
@@ -164,7 +175,7 @@ class SyntheticScene:
     gaussians: Gaussians  # one for each pixel, view-major and row-major
     cameras: Cameras  # as the network estimates them
     images: tuple[Float, ...]  # the photos, [h,w,3] sRGB in [0, 1] each; larger than the views with a photo_scale
-    targets: Cameras  # true cameras half-way between the views, of the photos' size
+    targets: Cameras  # true cameras half-way between neighbouring views, of the photos' size
     target_images: tuple[Float, ...]  # their photos
     style: str
     path: str
@@ -177,82 +188,117 @@ def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScen
     num_views = int(rng.integers(options.views[0], options.views[1] + 1))
     style = options.style if options.style != MIXED else list(STYLES)[(seed + index) % len(STYLES)]
     path = options.path if options.path != MIXED else list(PATHS)[rng.integers(len(PATHS))]
+    path = "walk" if style == BUILDING else path
     noise = draw_noise(options.ranges, rng, options.noise)
-    lens = Pinhole(options.width, options.height, max(options.width, options.height) * rng.uniform(0.58, 1.75))
+    focal = max(options.width, options.height) * rng.uniform(*FOCAL.get(style, (0.58, 1.75)))
+    lens = Pinhole(options.width, options.height, focal)
     scale = options.photo_scale
     large = Pinhole(scale * lens.width, scale * lens.height, scale * lens.focal)  # of the photos
-    view, pose = _find_stage(rng, style, path, large, num_views)
+    if style == BUILDING:
+        scene, pose = _find_building(rng, large, num_views)
+    else:
+        scene, pose = _find_stage(rng, style, path, large, num_views)
     places = np.linspace(0, 1, 2 * num_views - 1)
     poses = [pose(s) for s in places]
-    gain = find_exposure([radiance(view, p, _shrink(lens), 1)[0] for p in poses[::2]], rng.uniform(0.22, 0.62))
+    metered = poses[:: 2 * -(-num_views // METERED)]
+    gain = find_exposure([radiance(scene, p, _shrink(lens), 1) for p in metered], rng.uniform(0.22, 0.62))
     seeds = rng.integers(0, 2**63, len(poses))
-    photo = partial(_photo, view, lens, large, noise, gain)
-    photos = parallel_map(photo, list(zip(poses, seeds, strict=True)))
     world = invert(poses[0]) if rng.random() < 0.5 else np.eye(4)  # that of many exporters is the first camera
     moved = [_move_pose(pose, world, noise.unit) for pose in poses]
-    seen = []
-    for (image, depth, normals), true_pose in zip(photos[::2], moved[::2], strict=True):
-        if large != lens:
-            image = cv2.resize(image, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
-        depth = np.minimum(depth, FAR) * noise.unit
-        estimate = _perturb_pose(true_pose, noise, float(np.median(depth)), rng)
-        rotated = np.einsum("hwk,ik->hwi", normals, world[:3, :3]).astype(np.float32)
-        seen.append((TrueView(image, depth, rotated, estimate), int(rng.integers(2**63))))
-    parts = parallel_map(lambda given: pixel_gaussians(given[0], lens, noise, np.random.default_rng(given[1])), seen)
+    views = range(0, len(poses), 2)
+    errors = {i: (rng.normal(0, 1, (2, 3)), int(rng.integers(2**63))) for i in views}
+
+    def take(i: int) -> tuple[Float, Array, Gaussians | None]:
+        """Take the photo at a place; at views, estimate its pose and predict Gaussians from it."""
+        image = _photo(scene, poses[i], large, noise, gain, seeds[i])
+        if i not in errors:
+            return image, moved[i], None
+        deviation, seed = errors[i]
+        hits, _ = trace_scene(scene, poses[i], lens, 1)
+        depth = np.minimum(hits.depth, FAR) * noise.unit
+        estimate = _perturb_pose(moved[i], noise, float(np.median(depth)), deviation)
+        normals = np.einsum("hwk,ik->hwi", hits.normals, world[:3, :3]).astype(np.float32)
+        seen = image if large == lens else cv2.resize(image, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
+        predicted = pixel_gaussians(TrueView(seen, depth, normals, estimate), lens, noise, np.random.default_rng(seed))
+        return image, estimate, predicted
+
+    held_out = _held_out(num_views, MAX_TARGETS.get(style, num_views))
+    shots = parallel_map(take, [*views, *held_out])
     return SyntheticScene(
-        gaussians=Gaussians.concat(parts),
-        cameras=_cameras([view.c2w for view, _ in seen], lens),
-        images=tuple(image for image, _, _ in photos[::2]),
-        targets=_cameras(moved[1::2], large),
-        target_images=tuple(image for image, _, _ in photos[1::2]),
+        gaussians=Gaussians.concat([gaussians for _, _, gaussians in shots if gaussians is not None]),
+        cameras=_cameras([pose for _, pose, _ in shots[:num_views]], lens),
+        images=tuple(image for image, _, _ in shots[:num_views]),
+        targets=_cameras([pose for _, pose, _ in shots[num_views:]], large),
+        target_images=tuple(image for image, _, _ in shots[num_views:]),
         style=style,
         path=path,
         noise=noise,
     )
 
 
+def _held_out(num_views: int, most: int) -> list[int]:
+    """List places half-way between neighbouring views, which are the even ones: all, or ``most``, evenly spread."""
+    count = min(num_views - 1, most)
+    return [2 * ((2 * k + 1) * (num_views - 1) // (2 * count)) + 1 for k in range(count)]
+
+
 def _shrink(lens: Pinhole) -> Pinhole:
     return Pinhole(max(8, lens.width // SMALL), max(8, lens.height // SMALL), lens.focal / SMALL)
 
 
+def _texture_size(lens: Pinhole) -> int:
+    return 1 << min(max(int(math.log2(1.6 * max(lens.width, lens.height))), 7), 10)
+
+
 def _find_stage(
     rng: np.random.Generator, style: str, path: str, lens: Pinhole, num_views: int
-) -> tuple[LitStage, Pose]:
+) -> tuple[LitScene, Pose]:
     """Draw a stage and a path through it with usable views only, or the last try."""
-    size = 1 << min(max(int(math.log2(1.6 * max(lens.width, lens.height))), 7), 10)
     for _ in range(STAGE_TRIES):
-        view = light_stage(STYLES[style](Palette(rng, size)))
+        scene = LitScene((light_stage(STYLES[style](Palette(rng, _texture_size(lens)))),))
         for _ in range(PATH_TRIES):
-            pose = PATHS[path](view.stage, rng, num_views)
-            views = (trace(view.shapes, pose(s), _shrink(lens), 1) for s in np.linspace(0, 1, 2 * num_views - 1))
-            if all(is_usable(hits) for hits in views):
-                return view, pose
-    return view, pose
+            pose = PATHS[path](scene.stages[0].stage, rng, num_views)
+            poses = (pose(s) for s in np.linspace(0, 1, 2 * num_views - 1))
+            if all(is_usable(trace_scene(scene, at, _shrink(lens), 1)[0]) for at in poses):
+                return scene, pose
+    return scene, pose
 
 
-def _photo(
-    view: LitStage, grid: Pinhole, lens: Pinhole, noise: Noise, gain: float, given: tuple[Array, int]
-) -> tuple[Float, Array, Float]:
-    """Take a photo with the errors of lens, sensor and exposure, and exact depth and normals of the grid."""
-    pose, seed = given
+def _find_building(rng: np.random.Generator, lens: Pinhole, num_views: int) -> tuple[LitScene, Pose]:
+    """Draw a building and a walk through it, which keeps clear of all things."""
+    plan = draw_plan(rng, num_views)
+    zones, portals = build_building(rng, min(_texture_size(lens), MAX_TEXTURE), plan)
+    walk = draw_walk(rng, plan, num_views)
+    mips = tuple(pyramid(texture) for texture in zones[0].stage.textures)
+    stages = parallel_map(lambda zone: light_stage(zone.stage, mips), zones)
+    phase = rng.uniform(0, 6.28)
+
+    def pose(s: float) -> Array:
+        place, gaze = walk(s)
+        return look_at(place, place + gaze, 0.03 * np.sin(0.7 * num_views * s + phase))
+
+    return LitScene(tuple(stages), tuple(zones), tuple(portals)), pose
+
+
+def _photo(scene: LitScene, pose: Array, lens: Pinhole, noise: Noise, gain: float, seed: int) -> Float:
+    """Take a photo with the errors of lens, sensor and exposure."""
     rng = np.random.default_rng(seed)
-    linear, _ = radiance(view, pose, lens, SAMPLES)
+    linear = radiance(scene, pose, lens, SAMPLES)
     gains = gain * exp(noise.exposure * rng.normal() + noise.tint * rng.normal(0, 1, 3))
     y, x = np.mgrid[: lens.height, : lens.width] + 0.5
     away = np.hypot(x - lens.width / 2, y - lens.height / 2) / np.hypot(lens.width, lens.height)
     linear = linear * gains.astype(np.float32) * (1 - 0.3 * away**2)[..., None].astype(np.float32)
     image = cv2.GaussianBlur(develop(linear), (0, 0), noise.blur)
     image = np.clip(image + rng.normal(0, 0.004, image.shape), 0, 1).astype(np.float32)
-    hits = trace(view.shapes, pose, grid, 1)
-    return np.round(image * 255) / np.float32(255), hits.depth, hits.normals
+    return np.round(image * 255) / np.float32(255)
 
 
-def _perturb_pose(pose: Array, noise: Noise, depth: float, rng: np.random.Generator) -> Array:
-    """Add the network's error to a pose."""
-    turn, _ = cv2.Rodrigues(np.deg2rad(noise.turn) * rng.normal(0, 1, 3) / 3**0.5)
+def _perturb_pose(pose: Array, noise: Noise, depth: float, deviation: Array) -> Array:
+    """Add the network's error to a pose: ``deviation`` ``[2,3]`` of rotation and position, in their strengths."""
+    turn, _ = cv2.Rodrigues(np.deg2rad(noise.turn) * deviation[0] / 3**0.5)
     out = pose.copy()
     out[:3, :3] = compose(pose[:3, :3], turn)
-    out[:3, 3] += noise.shift * depth * rng.normal(0, 1, 3) / 3**0.5
+    out[:3, 3] += noise.shift * depth * deviation[1] / 3**0.5
     return out
 
 

@@ -1,0 +1,171 @@
+"""Floor plan of a synthetic building, and the walk through it: rooms on both sides of a corridor, one or two storeys.
+
+The corridor lies along x at z = 0, storeys above one another, their stairs at the far end. A room's own frame has its
+door's wall at z = 0 and the room beyond it at z > 0, the floor at y = 0.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmerge.kernels.elementary import cos, sin
+from gsmerge.research.generate.shapes import Array, norm
+
+# Sizes are in metres.
+STOREY, CEILING = 3.0, 2.6  # from floor to floor, and from floor to ceiling
+WALL = 0.16  # thickness of the walls between rooms
+HALF_CORRIDOR = 1.0
+DOOR_WIDTH, DOOR_HEIGHT = 1.0, 2.05
+LANDING, FLIGHT, TREADS = 1.0, 2.24, 8  # depth of the landings, run and treads of each of the two flights
+STAIR_HALF = 1.3  # half the width of the stairs
+STAIR_LENGTH = LANDING + FLIGHT + 1.25
+LANE = 0.7  # of the walk from the middle of the stairs
+ASIDE = 1.35  # distance of the walk round a room from the walls
+VIEWS_PER_ROOM = 28
+TWO_STOREYS = 4  # rooms from which on there are two
+EYE = 1.5  # height of the cameras
+STEP, TURN = 0.7, 0.5  # metres, and radians, that make one step of the walk
+LONGEST = 1.3  # steps from one view to the next, at most
+SPACING, WINDOW, GAZE_WINDOW = 0.05, 10, 16  # of the points on the walk; points on either side that smooth it
+INTO = np.diag([1.0, 1.0, 1.0]), np.diag([-1.0, 1.0, -1.0])  # rotations of rooms beyond the corridor and before it
+
+
+@dataclass(frozen=True)
+class RoomPlan:
+    """One room."""
+
+    storey: int
+    width: float
+    depth: float
+    door: float  # x of the door's middle in the room's frame
+    at: Array  # [3] world position of its frame
+    rotation: Array  # [3,3] of its frame
+
+    def to_world(self, points: Array) -> Array:
+        """Move points ``[n,3]`` from the room's frame into the world."""
+        return points * np.diag(self.rotation) + self.at
+
+
+@dataclass(frozen=True)
+class FloorPlan:
+    """A building."""
+
+    rooms: tuple[RoomPlan, ...]  # in the order of the walk
+    storeys: int
+    length: float  # of the corridors
+
+
+def draw_plan(rng: np.random.Generator, num_views: int) -> FloorPlan:
+    """Draw a building with one room for every 28 views."""
+    count = max(1, num_views // VIEWS_PER_ROOM)
+    storeys = 2 if count >= TWO_STOREYS else 1
+    rooms, length = [], 7.0
+    for storey in range(storeys):
+        ends = rng.uniform(0.0, 2.5, 2)  # of what is built on either side
+        of_storey = []
+        for _ in range((count + storeys - 1 - storey) // storeys):
+            side = int(np.argmin(ends))
+            width, depth = rng.uniform(5.0, 6.4, 2)
+            door = rng.uniform(-0.5, 0.5) * (width - 3.0)
+            at = np.array([ends[side] + width / 2, -STOREY * storey, (1 - 2 * side) * (HALF_CORRIDOR + WALL)])
+            of_storey.append(RoomPlan(storey, width, depth, door, at, INTO[side]))
+            ends[side] += width + WALL
+        rooms += sorted(
+            of_storey, key=lambda room: room.to_world(np.array([[room.door, 0, 0]]))[0, 0] * (1 - 2 * storey)
+        )
+        length = max(length, *ends)
+    return FloorPlan(tuple(rooms), storeys, length)
+
+
+def room_loop(room: RoomPlan) -> Array:
+    """List points ``[n,3]`` of the walk inside a room, in its frame: in, round the middle, and out again."""
+    half_x, half_z, middle = room.width / 2 - ASIDE, room.depth / 2 - ASIDE, room.depth / 2
+    first = np.clip(room.door / half_x, -0.9, 0.9)  # the sine of the angle at which it begins
+    way = -1.0 if first > 0 else 1.0  # the longer way comes first
+    angles = np.linspace(0, 2 * np.pi, 33)
+    start = np.array([first, -np.sqrt(1 - first * first)])
+    x = start[0] * cos(angles) - way * start[1] * sin(angles)
+    z = start[1] * cos(angles) + way * start[0] * sin(angles)
+    ring = np.stack([half_x * x, np.zeros_like(x), middle + half_z * z], 1)
+    door = np.array([[room.door, 0, 0.0], [room.door, 0, 0.6]])
+    return np.concatenate([door, ring, door[::-1]])
+
+
+def _stairs(length: float) -> Array:
+    """List points ``[n,3]`` of the walk from the lower corridor's end to that of the upper one."""
+    foot, top = length + WALL + LANDING, length + WALL + LANDING + FLIGHT
+    turn = np.linspace(0, np.pi, 9)
+    landing = np.stack([top + 0.55 * sin(turn), np.full(9, -STOREY / 2), LANE * cos(turn)], 1)
+    start, arrival = (foot - 0.5, 0, LANE), (foot - 0.5, -STOREY, -LANE)
+    points = [(length - 0.8, 0, 0), start, (foot, 0, LANE), *landing, (foot, -STOREY, -LANE), arrival]
+    return np.array([*points, (length - 0.8, -STOREY, 0)])
+
+
+def _way_points(plan: FloorPlan) -> tuple[Array, Array]:
+    """List the walk's points ``[n,3]`` on the floor, and for each the middle of its room, or nan."""
+    first = plan.rooms[0]
+    door = first.to_world(np.array([[first.door, 0, 0]]))[0]
+    parts, middles = [np.array([[max(door[0] - 1.8, 0.6), 0.0, 0.0]])], [np.full((1, 3), np.nan)]
+    for i, room in enumerate(plan.rooms):
+        if room.storey > plan.rooms[i - 1].storey and i:
+            parts.append(_stairs(plan.length))
+            middles.append(np.full((len(parts[-1]), 3), np.nan))
+        loop = room.to_world(room_loop(room))
+        outside = np.array([[loop[0, 0], loop[0, 1], 0.0]])
+        inside = np.full((len(loop), 3), np.nan)
+        inside[3:-2] = room.to_world(np.array([[0, 0, room.depth / 2]]))
+        last = i == len(plan.rooms) - 1
+        parts += [outside, loop[:-2] if last else loop, *([] if last else [outside])]
+        middles += [np.full((1, 3), np.nan), inside[:-2] if last else inside, *([] if last else [inside[:1]])]
+    return np.concatenate(parts), np.concatenate(middles)
+
+
+def _smooth(values: Array, window: int) -> Array:
+    """Average ``[n,3]`` over ``window`` neighbours on either side."""
+    padded = np.pad(values, ((window, window), (0, 0)), mode="edge")
+    return np.stack([padded[i : i + len(values)] for i in range(2 * window + 1)]).mean(0)
+
+
+def _unit(vectors: Array) -> Array:
+    return vectors / np.sqrt((vectors * vectors).sum(1, keepdims=True))
+
+
+def _along(at: Array, known: Array, values: Array) -> Array:
+    return np.stack([np.interp(at, known, column) for column in values.T], 1)
+
+
+def draw_walk(rng: np.random.Generator, plan: FloorPlan, num_views: int) -> Callable[[float], tuple[Array, Array]]:
+    """Draw a walk through every room, as far as so many views reach: position and direction of view at 0 to 1."""
+    points, middles = _way_points(plan)
+    lengths = np.concatenate([[0.0], np.cumsum([norm(b - a) for a, b in itertools.pairwise(points)])])
+    at = np.arange(0.0, lengths[-1], SPACING)
+    floor = _along(at, lengths, points)
+    middle = middles[np.searchsorted(lengths, at, side="right") - 1]
+    sway = 0.06 * sin(at / 1.7 + rng.uniform(0, 6.28))
+    place = _smooth(floor, WINDOW) - np.array([0, EYE + rng.uniform(-0.1, 0.1), 0])
+    place[:, 1] += sway * 0.5
+    ahead = np.gradient(_smooth(place, WINDOW), axis=0)
+    ahead[:, 1] *= 0.6  # the stairs are steep
+    ahead = _unit(ahead)
+    across = np.stack([-ahead[:, 2], np.zeros(len(at)), ahead[:, 0]], 1)
+    glance = 0.3 * sin(at / 2.5 + rng.uniform(0, 6.28))
+    inside = ~np.isnan(middle[:, 0])
+    inward = _unit(np.where(inside[:, None], middle - floor, 1.0)) * inside[:, None]
+    strength = 0.9 + 0.3 * sin(at / 2.5 + rng.uniform(0, 6.28))
+    gaze = ahead + across * (glance * ~inside)[:, None] + inward * strength[:, None]
+    gaze[:, 1] += 0.16 + 0.06 * sin(at / 2.0 + rng.uniform(0, 6.28))
+    gaze = _unit(_smooth(_unit(gaze), GAZE_WINDOW))
+    moved, turned = np.diff(place, axis=0) / STEP, np.diff(gaze, axis=0) / TURN
+    moves = np.sqrt((moved * moved + turned * turned).sum(1))
+    steps = np.concatenate([[0.0], np.cumsum(moves)])
+    reach = min(float(steps[-1]), LONGEST * (num_views - 1))
+
+    def walk(s: float) -> tuple[Array, Array]:
+        now = np.array([s * reach])
+        return _along(now, steps, place)[0], _unit(_along(now, steps, gaze))[0]
+
+    return walk
