@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from gsmerge.io import read_scene as read_scene
     from gsmerge.io import to_cameras as to_cameras
     from gsmerge.io import write_gaussians as write_gaussians
+    from gsmerge.io import write_levels as write_levels
     from gsmerge.io import write_ply as write_ply
     from gsmerge.measure.evaluate import EvaluateOptions as EvaluateOptions
     from gsmerge.measure.evaluate import Evaluation as Evaluation
@@ -59,7 +60,7 @@ _PUBLIC = {
     "measure.evaluate": ("EvaluateOptions", "Evaluation", "evaluate"),
     "measure.inspect": ("inspect",),
     "io": ("read_cameras", "read_gaussians", "read_ply", "read_scene", "to_cameras"),
-    "io.formats.writing": ("write_gaussians", "write_ply"),
+    "io.formats.writing": ("write_gaussians", "write_levels", "write_ply"),
     "online.compactor": ("Compactor",),
     "options": ("CompactOptions",),
     "pipeline": ("compact",),

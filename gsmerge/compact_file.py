@@ -22,14 +22,18 @@ from gsmerge.io import (
     output_format,
     write_gaussians,
 )
+from gsmerge.io.atomic import AddOutput
 from gsmerge.io.cameras.embedded import camera_comments
 from gsmerge.io.cameras.json_files import viewer_cameras, write_transforms
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.formats.ply import OpacityChoice
 from gsmerge.io.formats.ply_file import LOGIT_COMMENT
+from gsmerge.io.formats.streamed import INDEX, remove_unused_chunks
+from gsmerge.io.formats.writing import add_levels
 from gsmerge.options import CompactOptions
 from gsmerge.pipeline import compact
 from gsmerge.report import report_document, to_json
+from gsmerge.result import CompactResult
 from gsmerge.runtime.memory import release_memory
 from gsmerge.runtime.record import Progress
 from gsmerge.types import Scene
@@ -67,6 +71,7 @@ def compact_files(
 ) -> dict[str, Any]:
     """Read a scene, compact it, and write result, levels, cameras and report: all files or none.
 
+    ``out``: its name chooses the format; a ``lod-meta.json`` has all levels, in chunks beside it.
     ``hashed``: hash the input for the report. ``seconds_before``: wall time by name of the caller's
     earlier steps. ``cameras_path``, ``saved_cameras``: files for the views, for viewers and as
     ``transforms.json`` with all intrinsics; the former may be there with the same content, beside
@@ -75,9 +80,11 @@ def compact_files(
     cannot be read or the result cannot be written, UsageError if the settings need what the scene
     does not have.
     """
-    start, ending = perf_counter(), output_format(out, spz_version)
+    start = perf_counter()
+    streamed = output_format(out, spz_version, levels=True) == INDEX
     with atomic_outputs(overwrite=overwrite) as add:
-        at = {path: add(path) for path in (out, report_path, saved_cameras) if path is not None}
+        at = {out: add(out, make_folder=streamed)}
+        at |= {path: add(path) for path in (report_path, saved_cameras) if path is not None}
         given = read_input(files, opacity=opacity, hints=hints)
         check_saved_cameras(given.scene, saved_cameras, embed=embed_cameras)
         shared = None if cameras_path is None or overwrite or not cameras_path.exists() else cameras_path
@@ -91,14 +98,12 @@ def compact_files(
             problem = "expected Gaussians that show something, found none that is left once they are merged"
             raise SceneError(files.ply, problem, "look at its scales and opacities with gsmerge inspect")
         compacted = perf_counter()
-        coarser = [(level_output(out, i), level) for i, level in enumerate(result.coarser, 1)]
-        at |= {path: add(path) for path, _ in coarser}
-        for path, one in ((out, result), *coarser):
-            inside = camera_comments(one.cameras[views], names) if embed_cameras else []
-            write_gaussians(
-                at[path], one.gaussians, overwrite=True, comments=[*given.comments, *inside], ending=ending,
-                normals=normals, spz_version=spz_version,
-            )  # fmt: skip
+        results = (result, *result.coarser)
+        embedded = [camera_comments(one.cameras[views], names) if embed_cameras else [] for one in results]
+        written = _write_results(
+            add, out, at[out], results, [[*given.comments, *lines] for lines in embedded],
+            spz_version=spz_version, normals=normals,
+        )  # fmt: skip
         cameras_path = cameras_path if len(given.scene) else None
         if cameras_path is not None:
             text = viewer_cameras(result.cameras[views], names)
@@ -115,16 +120,48 @@ def compact_files(
             output_path=out,
             seconds_before={**(seconds_before or {}), "read": read - start},
             seconds_after={"write": perf_counter() - compacted},
-            coarser=[(path, level.report) for path, level in coarser],
+            coarser=[(path, one.report) for path, one in zip([*written][1:], result.coarser, strict=True)],
             recognised=given.recognised,
             notes=[*given.notes, *([lost] if lost else [])],
             hashed=hashed,
-            written_at=at,
+            written_at=written,
             cameras_path=cameras_path,
         )
         if report_path is not None:
             at[report_path].write_text(to_json(document), encoding="utf-8", errors="replace")
+    if streamed:
+        remove_unused_chunks(out)
     return document
+
+
+def _write_results(
+    add: AddOutput,
+    out: Path,
+    first: Path,
+    results: Sequence[CompactResult],
+    comments: Sequence[Sequence[str]],
+    *,
+    normals: bool,
+    spz_version: int,
+) -> dict[Path, list[Path]]:
+    """Write a result, whose file is ``first`` now, and its coarser levels, each with its lines of the header.
+
+    Returns the path of each, in their order, with its files as they are before they are renamed.
+    """
+    ending = output_format(out, spz_version, levels=True)
+    if ending == INDEX:
+        (_, finest), *rest = add_levels(add, out, first, [one.gaussians for one in results], comments[0])
+        return {out: [first, *finest], **dict(rest)}
+    written = {out: [first]}
+    for level in range(1, len(results)):
+        path = level_output(out, level)
+        written[path] = [add(path)]
+    for (file,), one, lines in zip(written.values(), results, comments, strict=True):
+        write_gaussians(
+            file, one.gaussians, overwrite=True, comments=lines, ending=ending, normals=normals,
+            spz_version=spz_version,
+        )  # fmt: skip
+    return written
 
 
 def _views_once(scene: Scene) -> list[int]:

@@ -11,8 +11,8 @@ from gsmerge.encoded.gsm_file import ENCODED, STATE, SUFFIX, read_gsm, wrong_che
 from gsmerge.errors import SceneError
 from gsmerge.io import ply_notes, read_cameras, read_gaussians
 from gsmerge.io.cameras.read import find_cameras, read_sharp
-from gsmerge.io.formats import ply_file, spz
-from gsmerge.io.formats.ply import SCENE_SUFFIXES, PlyInfo
+from gsmerge.io.formats import ply_file, spz, streamed
+from gsmerge.io.formats.ply import SCENE_SUFFIXES, PlyInfo, read_level
 from gsmerge.io.scene_files import named_ply, other_plys
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.online.file import load_stored
@@ -62,13 +62,15 @@ def check_content(path: Path) -> FileCheck:
     damaged = _damaged_member(path) if path.suffix.lower() in ARCHIVES else None
     problems = (*found.problems, *([damaged] if damaged else []))
     size = 0 if path.is_dir() else path.stat().st_size
-    return replace(found, file_bytes=size, problems=problems)
+    return replace(found, file_bytes=found.file_bytes or size, problems=problems)
 
 
 def _read(path: Path) -> FileCheck:
     suffix = path.suffix.lower()
     if suffix == SUFFIX:
         return _read_gsm(path)
+    if path.name == streamed.INDEX:
+        return _read_levels(path)
     if suffix == NETWORKS:
         return FileCheck(str(path), "networks", load_checkpoint(path).networks.num_parameters)
     ply = named_ply(path) or next(iter(other_plys(path)), None) if path.is_dir() else None
@@ -81,7 +83,7 @@ def _read(path: Path) -> FileCheck:
         cameras = read_cameras(path)
         return FileCheck(str(path), "cameras", len(cameras), cameras.source)
     if suffix not in SCENE_SUFFIXES:
-        known = ", ".join((*SCENE_SUFFIXES, *CAMERAS, SUFFIX, NETWORKS))
+        known = ", ".join((*SCENE_SUFFIXES, *CAMERAS, SUFFIX, NETWORKS, streamed.INDEX))
         raise SceneError(path, f"expected one of {known}, found another kind of file", "it is not checked")
     info = read_gaussians(path).info
     problems = _problems(info)
@@ -95,6 +97,14 @@ def _read(path: Path) -> FileCheck:
     notes = [note for note in ply_notes(info) if "opacit" in note]
     facts = (str(path), "Gaussians", info.count, info.layout)
     return FileCheck(*facts, problems=tuple(problems), notes=tuple(notes))
+
+
+def _read_levels(path: Path) -> FileCheck:
+    """Read all levels of an index, one after the other."""
+    infos = [read_level(path, level).info for level in range(len(streamed.read_index(path).levels))]
+    problems = [f"level {level}: {one}" for level, info in enumerate(infos) for one in _problems(info)]
+    beside = sum(info.file_bytes for info in infos) - (len(infos) - 1) * path.stat().st_size
+    return FileCheck(str(path), "Gaussians", infos[0].count, infos[0].layout, beside, tuple(problems))
 
 
 def _problems(info: PlyInfo) -> list[str]:

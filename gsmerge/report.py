@@ -42,7 +42,7 @@ def report_document(
     recognised: Mapping[str, Any] | None = None,
     notes: Sequence[str] = (),
     hashed: bool = True,
-    written_at: Mapping[Path, Path] | None = None,
+    written_at: Mapping[Path, Sequence[Path]] | None = None,
     cameras_path: Path | None = None,
 ) -> dict[str, Any]:
     """Return the report of one ``compact`` as plain JSON types.
@@ -51,7 +51,7 @@ def report_document(
     reading) and after them (writing). ``coarser``: file and report of each further level of detail.
     ``recognised``: facts about the input besides path, bytes and count. ``notes``: of the reader,
     before the report's own. ``hashed``: also hash the input, which takes time on large files.
-    ``written_at``: temporary paths of files that are not renamed yet. ``cameras_path``: the file of
+    ``written_at``: the files of an output, as they are before they are renamed. ``cameras_path``: the file of
     the views for viewers, if any.
 
     Returns:
@@ -93,8 +93,9 @@ def report_document(
     }
 
 
-def _file_facts(path: Path, report: CompactReport, at: Mapping[Path, Path]) -> dict[str, Any]:
-    return {"path": os.fspath(path), "bytes": at.get(path, path).stat().st_size, "num_gaussians": report.num_output}
+def _file_facts(path: Path, report: CompactReport, at: Mapping[Path, Sequence[Path]]) -> dict[str, Any]:
+    num_bytes = sum(file.stat().st_size for file in at.get(path, [path]))
+    return {"path": os.fspath(path), "bytes": num_bytes, "num_gaussians": report.num_output}
 
 
 def to_json(document: Mapping[str, Any]) -> str:

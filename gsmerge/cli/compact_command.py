@@ -21,6 +21,7 @@ from gsmerge.cli.paths import (
     default_output,
     input_files,
     is_camera_file,
+    is_index,
 )
 from gsmerge.errors import TargetError, UsageError
 
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from gsmerge.options import CompactOptions
 
 
+STREAMED_LEVELS = 3  # of a lod-meta.json: the coarsest, a sixteenth, is there at once
 MORE = "more Gaussians (--k, --budget) or a longer fit (--effort) show them better"
 
 
@@ -37,7 +39,7 @@ MORE = "more Gaussians (--k, --budget) or a longer fit (--effort) show them bett
                  "or the folder it is in; several of one place, as SHARP writes them, are joined."),
     f"{opt.READING} masks k superpixels budget quality levels",
     "effort fit exposure device method recipe checkpoint set crop",
-    opt.output(opt.COMPACT_SCENE, "SCENE.compact.ply"),
+    opt.output(f"{opt.COMPACT_SCENE} lod-meta.json: levels that stream, in chunks beside it.", "SCENE.compact.ply"),
     f"overwrite strict report save_cameras embed_cameras dry_run {opt.RUN}",
     rare="hint masks levels fit exposure method recipe checkpoint crop strict save_cameras embed_cameras json quiet"
          f" {opt.RUN}",
@@ -54,14 +56,18 @@ def compact(args: opt.Args) -> None:
     _check_scenes(args)
     files = args.files(*args.scenes)
     out = args.output or default_output(files.ply)
-    levels = [level_output(out, level) for level in range(1, settings.budget.levels)]
+    streamed = is_index(out)
+    if streamed and settings.method == "gsmerge" and "levels" not in args.values(CompactOptions):
+        settings = settings.with_settings({"levels": STREAMED_LEVELS})
+    levels = [] if streamed else [level_output(out, level) for level in range(1, settings.budget.levels)]
     cameras = viewer_cameras_path(out) if writing.viewer_cameras else None
     inputs = (*input_files(files), *checkpoint_files(settings.checkpoint))
     beside = None if cameras is None or (not args.overwrite and is_camera_file(cameras)) else cameras
     check_outputs(
-        (out, *levels, args.report, beside, args.save_cameras), inputs, overwrite=args.overwrite or args.dry_run
-    )
-    check_format(out, writing, settings.budget)
+        (out, *levels, args.report, beside, args.save_cameras), inputs, overwrite=args.overwrite or args.dry_run,
+        made=out.parent if streamed else None,
+    )  # fmt: skip
+    check_format(out, writing, settings.budget, levels=True)
     if args.embed_cameras:
         check_embedding(out, settings.budget)
     if args.dry_run:
@@ -158,7 +164,8 @@ def print_plan(args: opt.Args, files: SceneFiles, settings: CompactOptions, out:
     }
     lines = [
         f"would read {files.ply}: {len(scene)} views of {scene.cameras.width} x {scene.cameras.height}",
-        f"would write {out}",
+        f"would write {out}"
+        + (f", and {settings.budget.levels} level(s) in chunks beside it" if is_index(out) else ""),
         *estimate_lines(run),
         *(f"note       {note}" for note in notes),
     ]

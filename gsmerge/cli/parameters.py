@@ -321,8 +321,8 @@ _TABLE = (
                "needs.", metavar="40000|2%|5MB|DEVICE|auto"),
         option("quality", str, "Fewest Gaussians that render the input photos at a PSNR such as 30dB, or that lose at "
                "most so much against the best, such as -0.2dB.", metavar="30dB|-0.2dB"),
-        option("levels", int, "Levels of detail, each in a file of its own, with a quarter of the Gaussians of the "
-               "one before.", wording="1", min=1, max=8),
+        option("levels", int, "Levels of detail, each in a file of its own or all in a lod-meta.json, with a quarter "
+               "of the Gaussians of the one before.", wording="1, or 3 in a lod-meta.json", min=1, max=8),
         option("max_k", int, "Most Gaussians per superpixel that can be decoded later: more take more space.",
                wording="4, or 8 with a --budget", min=1, max=8),
     ),

@@ -45,14 +45,24 @@ def default_output(ply: Path) -> Path:
     return ply.with_name(f"{ply.stem}.compact.ply")
 
 
-def check_format(output: Path, options: FileOptions, budget: BudgetOptions | None = None) -> None:
+def is_index(output: Path) -> bool:
+    """Return whether an output is the index of levels that stream, whose folder is made for it."""
+    from gsmerge.io.formats.streamed import INDEX
+
+    return output.name == INDEX
+
+
+def check_format(
+    output: Path, options: FileOptions, budget: BudgetOptions | None = None, *, levels: bool = False
+) -> None:
     """Refuse an output in a format that cannot be written, or that the options or a budget in bytes do not fit.
 
-    UsageError for an unknown ending, a missing package, a version of ``.spz`` or a size in bytes for another format.
+    ``levels``: it may be an index of levels. UsageError for an unknown ending, a missing package, a version of
+    ``.spz`` or a size in bytes for another format.
     """
     from gsmerge.io import output_format
 
-    ending = output_format(output, options.spz_version)
+    ending = output_format(output, options.spz_version, levels=levels)
     if options.spz_version != 3 and ending != ".spz":
         raise UsageError(f"spz_version {options.spz_version}: expected an output as .spz, got {ending}")
     if budget is not None and budget.in_bytes and ending != ".ply":
@@ -69,10 +79,13 @@ def check_embedding(output: Path, budget: BudgetOptions) -> None:
         )
 
 
-def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None], *, overwrite: bool) -> None:
+def check_outputs(
+    outputs: Sequence[Path | None], inputs: Sequence[Path | None], *, overwrite: bool, made: Path | None = None
+) -> None:
     """Refuse an output file that is an input, exists without ``overwrite``, is named twice, or has no folder.
 
-    ``inputs`` are files that are read, and folders of photos: no photo is replaced.
+    ``inputs`` are files that are read, and folders of photos: no photo is replaced. ``made``: a folder that is made
+    for the outputs if it is missing.
     """
     from gsmerge.io.cameras.read import find_cameras
 
@@ -82,13 +95,13 @@ def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None],
     for output in outputs:
         if output is None:
             continue
-        _check_output(output, known, overwrite=overwrite)
+        _check_output(output, known, overwrite=overwrite, made=made)
         if os.path.realpath(output) in seen:
             raise UsageError(f"{output}: expected a file of its own for each output, got it twice")
         seen.add(os.path.realpath(output))
 
 
-def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
+def _check_output(output: Path, inputs: set[str], *, overwrite: bool, made: Path | None) -> None:
     from gsmerge.io.image_names import IMAGE_SUFFIXES
 
     try:
@@ -106,8 +119,9 @@ def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
         raise UsageError(f"{output}: expected an output other than the input; name another file with --output")
     if os.path.lexists(output) and not overwrite:
         raise UsageError(f"{output}: exists already; pass --overwrite to replace it, or name another with --output")
-    if not output.parent.is_dir():
-        raise SceneError(output, f"expected a folder to write to, found no {output.parent}", "make it first")
+    folder = output.parent.parent if output.parent == made and not os.path.lexists(made) else output.parent
+    if not folder.is_dir():
+        raise SceneError(output, f"expected a folder to write to, found no {folder}", "make it first")
 
 
 def is_camera_file(path: Path) -> bool:

@@ -19,6 +19,7 @@ from gsmerge.io.formats.writing import OUTPUT_FORMATS as OUTPUT_FORMATS
 from gsmerge.io.formats.writing import lost_harmonics as lost_harmonics
 from gsmerge.io.formats.writing import output_format as output_format
 from gsmerge.io.formats.writing import write_gaussians as write_gaussians
+from gsmerge.io.formats.writing import write_levels as write_levels
 from gsmerge.io.formats.writing import write_ply as write_ply
 from gsmerge.io.held_out import HeldOutViews as HeldOutViews
 from gsmerge.io.held_out import read_held_out as read_held_out

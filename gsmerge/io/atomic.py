@@ -16,10 +16,11 @@ import stat
 import time
 import uuid
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
+from typing import Protocol
 
 from gsmerge.errors import SceneError
 from gsmerge.types import StrPath
@@ -45,18 +46,29 @@ def atomic_output(path: StrPath, *, overwrite: bool = False) -> Iterator[Path]:
         yield add(Path(path))
 
 
+class AddOutput(Protocol):
+    """Make a file of :func:`atomic_outputs`, and its folder where ``make_folder`` asks for it."""
+
+    def __call__(self, path: Path, *, make_folder: bool = False) -> Path:
+        """Return the temporary file to write."""
+
+
 @contextmanager
-def atomic_outputs(*, overwrite: bool = False) -> Iterator[Callable[[Path], Path]]:
+def atomic_outputs(*, overwrite: bool = False) -> Iterator[AddOutput]:
     """Write several files and then rename all; a block that fails leaves none of them.
 
     Yields a function that makes each file, as :func:`atomic_output`. A process that is killed between two renames,
-    or a disk that fails there, leaves each file whole, old or new.
+    or a disk that fails there, leaves each file whole, old or new. Files in deeper folders are renamed first, so that
+    an index above them never names one that is not there.
     """
     made: dict[str, tuple[Path, Path]] = {}  # temporary file -> as it was asked for, where it goes
+    folders: list[Path] = []
 
-    def add(path: Path) -> Path:
+    def add(path: Path, *, make_folder: bool = False) -> Path:
         if str(path) in _written:
             return path
+        if make_folder and _make_folder(path.parent):
+            folders.append(path.parent)
         _refuse(path, overwrite)
         target = Path(os.path.realpath(path)) if path.is_symlink() else path
         _remove_stale_once(target.parent.absolute())
@@ -75,7 +87,8 @@ def atomic_outputs(*, overwrite: bool = False) -> Iterator[Callable[[Path], Path
             _refuse(path, overwrite)  # somebody else may have been quicker
         for temporary in made:
             _flush(temporary)
-        _rename_all([(temporary, target) for temporary, (_, target) in made.items()])
+        deepest_first = sorted(made.items(), key=lambda item: -len(item[1][0].parts))
+        _rename_all([(temporary, target) for temporary, (_, target) in deepest_first])
         for folder in {target.parent for _, target in made.values()}:
             with suppress(OSError):  # not every system can
                 _flush(folder)
@@ -93,7 +106,21 @@ def atomic_outputs(*, overwrite: bool = False) -> Iterator[Callable[[Path], Path
         for temporary in made:
             with suppress(OSError):
                 os.unlink(temporary)
+        for folder in reversed(folders):
+            with suppress(OSError):  # it holds what was written
+                os.rmdir(folder)
         _written.difference_update(made)
+
+
+def _make_folder(folder: Path) -> bool:
+    """Make a folder, and return whether it was missing."""
+    try:
+        os.mkdir(folder)
+    except FileExistsError:
+        return False
+    except OSError as error:
+        raise SceneError(folder, f"cannot be made ({error.strerror})", "choose another folder") from error
+    return True
 
 
 def _rename_all(files: Sequence[tuple[str, Path]]) -> None:

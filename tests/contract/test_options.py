@@ -27,7 +27,7 @@ from gsmerge.research.training import preset_options
 COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 SETTINGS = gsmerge.CompactOptions().to_dict()
 # Defaults that help describes, because they depend on other settings or on the machine
-WORDED = {"threads": "all processors"}
+WORDED = {"threads": "all processors", "levels": "1, or 3 in a lod-meta.json"}
 
 
 def choices(parameter: Parameter) -> tuple[str, ...]:

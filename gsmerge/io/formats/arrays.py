@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -37,8 +38,22 @@ class Columns:
 
     def along_curve(self) -> Columns:
         """Sort the rows along a space-filling curve, so that neighbours are close in the file."""
-        order = np.argsort(morton_codes(self.means), kind="stable")
-        return Columns(*(column[order] for column in vars(self).values()))
+        return self.take(np.argsort(morton_codes(self.means), kind="stable"))
+
+    def take(self, rows: np.ndarray) -> Columns:
+        """Return the rows of these indices, in their order."""
+        return Columns(*(column[rows] for column in vars(self).values()))
+
+
+def concatenate(parts: Sequence[Columns]) -> Columns:
+    """Join rows; those of a lower degree of harmonics have zeros above it."""
+    most = max(part.harmonics.shape[1] for part in parts)
+
+    def widen(harmonics: np.ndarray) -> np.ndarray:
+        return np.pad(harmonics, ((0, 0), (0, most - harmonics.shape[1]), (0, 0)))
+
+    even = [replace(part, harmonics=widen(part.harmonics)) for part in parts]
+    return Columns(*(np.concatenate([vars(part)[f.name] for part in even]) for f in fields(Columns)))
 
 
 @dataclass(frozen=True)
@@ -52,6 +67,7 @@ class StoredRows:
     sizes: dict[str, int] | None = None  # bytes by attribute; None: those of the rows
     comments: tuple[str, ...] = ()
     extra_elements: tuple[str, ...] = ()
+    bytes_beside: int = 0  # of other files that the rows are in
 
 
 def to_rows(columns: Columns, name: str, sizes: dict[str, int], *, mip: bool = False) -> StoredRows:

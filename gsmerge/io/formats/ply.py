@@ -12,7 +12,7 @@ from plyfile import PlyData, PlyElement
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import rgb_to_sh0
-from gsmerge.io.formats import ply_file, sog, splat, spz
+from gsmerge.io.formats import ply_file, sog, splat, spz, streamed
 from gsmerge.io.formats.arrays import StoredRows
 from gsmerge.io.formats.compressed import is_compressed, unpack
 from gsmerge.kernels.elementary import exp, log
@@ -22,7 +22,7 @@ from gsmerge.types import Gaussians, StrPath
 MIN_FINITE = 0.002  # of the rows: the rest of a file tells nothing about the scene
 OpacityChoice = Literal["auto", "logit", "raw"]
 
-# What reads a file of Gaussians, by its ending; all other files are taken for PLY
+# What reads a file of Gaussians, by its ending; all others but the index of levels are taken for PLY
 READERS: dict[str, Callable[[Path], StoredRows]] = {
     ".spz": spz.read_rows,
     ".splat": splat.read_rows,
@@ -46,7 +46,7 @@ class PlyInfo:
     layout: str  # name of the column layout, as "17-column export" or "INRIA, SH degree 3"
     format: str  # "ascii", "binary little-endian" or "binary big-endian"
     count: int  # Gaussians, the unusable ones included
-    file_bytes: int
+    file_bytes: int  # of an index, with those of its level's chunks
     # bytes of the rows by attribute (means, normals, sh0, shN, opacities, scales, quats, extra); of the values' binary
     # types for an ascii file; before gzip for .spz, and of the textures for .sog, where sh0 includes the opacities
     bytes_by_attribute: dict[str, int]
@@ -136,12 +136,22 @@ def read_ply(path: StrPath, *, opacity: OpacityChoice = "auto") -> PlyScene:
 def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto") -> PlyScene:
     """Read a file of Gaussians in the format of its ending.
 
-    Endings are ``.spz`` (versions 1 to 4), ``.splat`` and ``.sog`` (version 2); everything else is read by
-    :func:`read_ply`, for which ``opacity`` is. SceneError if the file cannot be read, is damaged, or holds no
-    finite Gaussian; ValueError for another ``opacity``.
+    Endings are ``.spz`` (versions 1 to 4), ``.splat`` and ``.sog`` (version 2); of a ``lod-meta.json``, it is
+    the finest level. Everything else is read by :func:`read_ply`, for which ``opacity`` is. SceneError if the file
+    cannot be read, is damaged, or holds no finite Gaussian; ValueError for another ``opacity``.
     """
-    read = READERS.get(Path(path).suffix.lower())
+    read = find_reader(Path(path))
     return read_ply(path, opacity=opacity) if read is None else _to_scene(Path(path), read(Path(path)), "auto")
+
+
+def find_reader(path: Path) -> Callable[[Path], StoredRows] | None:
+    """Return what reads a file of this name; None for a PLY file."""
+    return streamed.read_rows if path.name == streamed.INDEX else READERS.get(path.suffix.lower())
+
+
+def read_level(path: Path, level: int) -> PlyScene:
+    """Read one level of detail of a ``lod-meta.json``, 0 the finest; SceneError as of :func:`read_gaussians`."""
+    return _to_scene(path, streamed.read_rows(path, level), "auto")
 
 
 def _to_scene(path: Path, stored: StoredRows, opacity: OpacityChoice) -> PlyScene:
@@ -173,7 +183,7 @@ def _to_scene(path: Path, stored: StoredRows, opacity: OpacityChoice) -> PlyScen
         layout=stored.layout,
         format=stored.format,
         count=n,
-        file_bytes=path.stat().st_size,
+        file_bytes=path.stat().st_size + stored.bytes_beside,
         bytes_by_attribute=stored.sizes or ply_file.bytes_by_attribute(rows, extra),
         columns=names,
         extra_columns=extra,

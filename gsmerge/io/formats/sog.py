@@ -1,4 +1,4 @@
-"""``.sog`` version 2 (developer.playcanvas.com, "The SOG format"): lossless WebP textures in a zip.
+"""``.sog`` version 2 (developer.playcanvas.com, "The SOG format"): lossless WebP textures in a zip or a folder.
 
 A pixel is a Gaussian. Positions are 16 bits of their signed logarithms, rotations their three
 smaller components at 8 bits, log scales, colours and harmonics codes of codebooks of 256; all
@@ -11,11 +11,14 @@ import heapq
 import io
 import json
 import math
+import os
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -28,6 +31,13 @@ from gsmerge.types import Gaussians
 
 MAX_DEGREE = 3
 VERSION = 2
+META = "meta.json"
+GENERATOR = "gsmerge"
+# All that a writer makes
+FILES = (
+    "means_l.webp", "means_u.webp", "scales.webp", "quats.webp", "sh0.webp", "shN_centroids.webp", "shN_labels.webp",
+    META,
+)  # fmt: skip
 FIRST_MODE = 252  # alpha of a rotation whose largest component is the first
 PALETTE_BITS = 16
 PALETTE_COLUMNS = 64  # sets of harmonics side by side in the texture of the palette
@@ -39,40 +49,29 @@ _CELLS = 1 << 11  # as many of equal width, and of equally many values
 _MAX_STEPS = 200
 
 
-def read_rows(path: Path) -> arrays.StoredRows:
-    """Read the Gaussians of a ``.sog``; SceneError if it is another file, another version, or damaged."""
-    size = check_file(path)
-    try:
-        with read_errors(path), zipfile.ZipFile(path) as archive:
-            sog = _Sog(archive, size)
-            meta = json.loads(sog.member("meta.json", MAX_META_BYTES))
-            version = meta.get("version", 1) if isinstance(meta, dict) else "none"
-            if version != VERSION:
-                problem = f"expected .sog version {VERSION}, found {version}"
-                raise SceneError(path, problem, "export it with a newer program")
-            count = int(meta["count"])
-            if not 0 < count <= MAX_PER_BYTE * size:
-                raise SceneError(path, f"expected Gaussians in {size} bytes, found {count} promised")
-            mip = meta.get("antialias") is True or meta.get("model") == "antialiased"
-            columns = _read_columns(sog, meta, count)
-            keys = [key for key in ("means", "scales", "quats", "sh0", "shN") if meta.get(key)]
-            sizes = {key: sum(archive.getinfo(name).compress_size for name in meta[key]["files"]) for key in keys}
-            return arrays.to_rows(columns, f".sog version {VERSION}", sizes, mip=mip)
-    except zipfile.BadZipFile as error:
-        raise SceneError(path, f"expected a .sog file, found no complete zip ({error})", "copy it again") from error
-    except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError, EOFError) as error:
-        problem = f"expected meta.json and textures of .sog version {VERSION}, found others ({error})"
-        raise SceneError(path, " ".join(problem.split()), "export it again") from error
-    except zlib.error as error:
-        raise SceneError(path, f"expected a readable .sog file, found a damaged one ({error})") from error
+class _Files(Protocol):
+    """The files of one ``.sog`` by their names, of which nothing is read that is larger than all may be."""
+
+    @property
+    def size(self) -> int:
+        """Bytes of all files as they are stored."""
+
+    def num_bytes(self, name: str) -> int:
+        """Return the bytes that a file takes."""
+
+    def member(self, name: str, limit: int) -> bytes:
+        """Read a file; ValueError if it has more bytes than ``limit``."""
 
 
 @dataclass(frozen=True)
-class _Sog:
-    """An archive of which nothing is read that is larger than its size allows."""
+class _Bundle:
+    """The files in a zip."""
 
     archive: zipfile.ZipFile
     size: int
+
+    def num_bytes(self, name: str) -> int:
+        return self.archive.getinfo(name).compress_size
 
     def member(self, name: str, limit: int) -> bytes:
         info = self.archive.getinfo(name)
@@ -80,33 +79,116 @@ class _Sog:
             raise ValueError(f"{name} of {info.file_size} bytes")
         return self.archive.read(info)
 
-    def texture(self, name: str, count: int) -> np.ndarray:
-        """Decode ``[count,4]`` pixels RGBA of a texture; alpha is 255 if it has none."""
-        data = self.member(name, self.size)
-        kind = data[12:16] if data[:4] == b"RIFF" and data[8:12] == b"WEBP" else b""
-        if kind == b"VP8X" and len(data) >= 30:
-            width, height = (int.from_bytes(data[at : at + 3], "little") + 1 for at in (24, 27))
-        elif kind == b"VP8L" and len(data) >= 25:
-            bits = int.from_bytes(data[21:25], "little")
-            width, height = (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
-        else:
-            raise ValueError("no WebP texture without loss")
-        if not count <= width * height <= 4 * count + (1 << 16):
-            raise ValueError(f"{name} of {width} x {height} pixels for {count}")
-        try:
-            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        except cv2.error as error:
-            raise ValueError(f"{name} is damaged") from error
-        if image is None or image.shape[:2] != (height, width) or image.ndim != 3:
-            raise ValueError(f"{name} is damaged")
-        pixels = image.reshape(width * height, -1)[:count]
-        colors, alpha = pixels[:, 2::-1], pixels[:, 3:] if pixels.shape[1] == 4 else np.full((count, 1), 255, np.uint8)
-        return np.concatenate([colors, alpha], 1)
+
+@dataclass(frozen=True)
+class _Folder:
+    """The files in a folder, and in no other."""
+
+    folder: Path
+
+    @property
+    def size(self) -> int:
+        return sum(entry.stat().st_size for entry in os.scandir(self.folder))
+
+    def num_bytes(self, name: str) -> int:
+        path = self.folder / name
+        inside = Path(os.path.realpath(path)).parent == Path(os.path.realpath(self.folder))
+        if path.name != name or "\\" in name or not inside:
+            raise ValueError(f"{name!r}, which leads out of the folder")
+        return check_file(path)
+
+    def member(self, name: str, limit: int) -> bytes:
+        size = self.num_bytes(name)
+        if size > limit:
+            raise ValueError(f"{name} of {size} bytes")
+        return (self.folder / name).read_bytes()
 
 
-def _read_columns(sog: _Sog, meta: dict[str, Any], count: int) -> arrays.Columns:
+@dataclass(frozen=True)
+class SogContent:
+    """What one ``.sog`` holds."""
+
+    columns: arrays.Columns
+    sizes: dict[str, int]  # bytes of the textures by attribute
+    mip: bool  # whether its Gaussians are antialiased
+    num_bytes: int  # of all files
+
+
+def read_rows(path: Path) -> arrays.StoredRows:
+    """Read the Gaussians of a ``.sog``; SceneError if it is another file, another version, or damaged."""
+    size = check_file(path)
+    with _damage(path), zipfile.ZipFile(path) as archive:
+        content = _read_content(path, _Bundle(archive, size))
+    return arrays.to_rows(content.columns, f".sog version {VERSION}", content.sizes, mip=content.mip)
+
+
+def read_unbundled(path: Path) -> SogContent:
+    """Read the Gaussians of a ``meta.json`` and the textures beside it; SceneError as of :func:`read_rows`."""
+    check_file(path)
+    with _damage(path):
+        return _read_content(path, _Folder(path.parent))
+
+
+@contextmanager
+def _damage(path: Path) -> Iterator[None]:
+    """Turn whatever damaged files make a reader raise into a SceneError."""
+    try:
+        with read_errors(path):
+            yield
+    except zipfile.BadZipFile as error:
+        raise SceneError(path, f"expected a .sog file, found no complete zip ({error})", "copy it again") from error
+    except SceneError:
+        raise
+    except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError, EOFError) as error:
+        problem = f"expected meta.json and textures of .sog version {VERSION}, found others ({error})"
+        raise SceneError(path, " ".join(problem.split()), "export it again") from error
+    except zlib.error as error:
+        raise SceneError(path, f"expected a readable .sog file, found a damaged one ({error})") from error
+
+
+def _read_content(path: Path, files: _Files) -> SogContent:
+    meta = json.loads(files.member(META, MAX_META_BYTES))
+    version = meta.get("version", 1) if isinstance(meta, dict) else "none"
+    if version != VERSION:
+        problem = f"expected .sog version {VERSION}, found {version}"
+        raise SceneError(path, problem, "export it with a newer program")
+    count, size = int(meta["count"]), files.size
+    if not 0 < count <= MAX_PER_BYTE * size:
+        raise SceneError(path, f"expected Gaussians in {size} bytes, found {count} promised")
+    mip = meta.get("antialias") is True or meta.get("model") == "antialiased"
+    columns = _read_columns(files, meta, count)
+    keys = [key for key in ("means", "scales", "quats", "sh0", "shN") if meta.get(key)]
+    sizes = {key: sum(files.num_bytes(name) for name in meta[key]["files"]) for key in keys}
+    return SogContent(columns, sizes, mip, size)
+
+
+def _read_texture(files: _Files, name: str, count: int) -> np.ndarray:
+    """Decode ``[count,4]`` pixels RGBA of a texture; alpha is 255 if it has none."""
+    data = files.member(name, files.size)
+    kind = data[12:16] if data[:4] == b"RIFF" and data[8:12] == b"WEBP" else b""
+    if kind == b"VP8X" and len(data) >= 30:
+        width, height = (int.from_bytes(data[at : at + 3], "little") + 1 for at in (24, 27))
+    elif kind == b"VP8L" and len(data) >= 25:
+        bits = int.from_bytes(data[21:25], "little")
+        width, height = (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    else:
+        raise ValueError("no WebP texture without loss")
+    if not count <= width * height <= 4 * count + (1 << 16):
+        raise ValueError(f"{name} of {width} x {height} pixels for {count}")
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise ValueError(f"{name} is damaged") from error
+    if image is None or image.shape[:2] != (height, width) or image.ndim != 3:
+        raise ValueError(f"{name} is damaged")
+    pixels = image.reshape(width * height, -1)[:count]
+    colors, alpha = pixels[:, 2::-1], pixels[:, 3:] if pixels.shape[1] == 4 else np.full((count, 1), 255, np.uint8)
+    return np.concatenate([colors, alpha], 1)
+
+
+def _read_columns(files: _Files, meta: dict[str, Any], count: int) -> arrays.Columns:
     def texture(key: str, index: int = 0) -> np.ndarray:
-        return sog.texture(meta[key]["files"][index], count)
+        return _read_texture(files, meta[key]["files"][index], count)
 
     low, high = (_check_numbers(meta["means"][key], 3) for key in ("mins", "maxs"))
     fixed = texture("means", 0)[:, :3] + 256.0 * texture("means", 1)[:, :3]
@@ -123,7 +205,7 @@ def _read_columns(sog: _Sog, meta: dict[str, Any], count: int) -> arrays.Columns
             log_scales=_decode_values(meta["scales"], texture("scales")[:, :3]),
             opacities=colors[:, 3] / 255,
             sh0=_decode_values(meta["sh0"], colors[:, :3]),
-            harmonics=_read_harmonics(sog, meta["shN"], count) if meta.get("shN") else np.zeros((count, 0, 3)),
+            harmonics=_read_harmonics(files, meta["shN"], count) if meta.get("shN") else np.zeros((count, 0, 3)),
         )
 
 
@@ -139,24 +221,33 @@ def _decode_values(part: dict[str, Any], codes: np.ndarray) -> np.ndarray:
     return _check_numbers(part["codebook"], 256)[codes]
 
 
-def _read_harmonics(sog: _Sog, part: dict[str, Any], count: int) -> np.ndarray:
+def _read_harmonics(files: _Files, part: dict[str, Any], count: int) -> np.ndarray:
     size, bands = int(part["count"]), int(part["bands"])
     if not (1 <= bands <= MAX_DEGREE and 1 <= size <= 2**PALETTE_BITS):
         raise ValueError(f"{size} harmonics of degree {bands}")
     num_higher = (bands + 1) ** 2 - 1
     name, labels_name = part["files"]
-    low, high = sog.texture(labels_name, count)[:, :2].T.astype(int)
+    low, high = _read_texture(files, labels_name, count)[:, :2].T.astype(int)
     labels = low + 256 * high
     rows = max(-(-size // PALETTE_COLUMNS), labels.max() // PALETTE_COLUMNS + 1)
-    centroids = sog.texture(name, rows * PALETTE_COLUMNS * num_higher)[:, :3]
+    centroids = _read_texture(files, name, rows * PALETTE_COLUMNS * num_higher)[:, :3]
     return _decode_values(part, centroids.reshape(-1, num_higher, 3)[labels])
 
 
 def sog_bytes(gaussians: Gaussians, *, mip: bool = False) -> bytes:
     """Encode a ``.sog`` along a space-filling curve; ``mip`` marks antialiased Gaussians, NaN is a ValueError."""
     columns = arrays.to_columns(gaussians, MAX_DEGREE).along_curve()
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as archive:
+        for name, data in sog_files(columns, mip=mip).items():
+            archive.writestr(zipfile.ZipInfo(name), data)  # of 1980: the same bytes at any time
+    return content.getvalue()
+
+
+def sog_files(columns: arrays.Columns, *, mip: bool = False) -> dict[str, bytes]:
+    """Encode the files of a ``.sog`` by their names: textures of the rows in their order, then ``meta.json``."""
     count = len(columns)
-    meta: dict[str, Any] = {"version": VERSION, "asset": {"generator": "gsmerge"}, "count": count, "antialias": mip}
+    meta: dict[str, Any] = {"version": VERSION, "asset": {"generator": GENERATOR}, "count": count, "antialias": mip}
     if mip:
         meta["model"] = "antialiased"  # as splat-transform says it
     textures: dict[str, bytes] = {}
@@ -190,11 +281,7 @@ def sog_bytes(gaussians: Gaussians, *, mip: bool = False) -> bytes:
         }
         bands = round((num_higher + 1) ** 0.5) - 1
         add("shN", files, count=len(palette), bands=bands, codebook=_shorten(codebook))
-    content = io.BytesIO()
-    with zipfile.ZipFile(content, "w") as archive:
-        for name, data in {**textures, "meta.json": json.dumps(meta).encode("ascii")}.items():
-            archive.writestr(zipfile.ZipInfo(name), data)  # of 1980: the same bytes at any time
-    return content.getvalue()
+    return {**textures, META: json.dumps(meta).encode("ascii")}
 
 
 def _shorten(values: np.ndarray) -> list[float]:

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from gsmerge.errors import UsageError
-from gsmerge.io.atomic import atomic_output
-from gsmerge.io.formats import compressed, glb, ply_file, sog, splat, spz
+from gsmerge.io.atomic import AddOutput, atomic_output, atomic_outputs
+from gsmerge.io.formats import compressed, glb, ply_file, sog, splat, spz, streamed
 from gsmerge.io.formats.arrays import to_columns
 from gsmerge.kernels.elementary import log, log1p
 from gsmerge.types import Gaussians, StrPath
@@ -25,13 +25,19 @@ OUTPUT_FORMATS = {
 }
 
 
-def output_format(path: StrPath, spz_version: int = 3) -> str:
-    """Return the ending of a name, by which its format is chosen; UsageError if unknown or a package is missing."""
+def output_format(path: StrPath, spz_version: int = 3, *, levels: bool = False) -> str:
+    """Return the ending of a name, by which its format is chosen; UsageError if unknown or a package is missing.
+
+    ``levels``: the name may be that of an index of levels of detail, which is returned.
+    """
+    if levels and Path(path).name == streamed.INDEX:
+        return streamed.INDEX
     name = Path(path).name.lower()
     ending = next((ending for ending in OUTPUT_FORMATS if name.endswith(ending)), None)
     if ending is None:
         *first, last = OUTPUT_FORMATS
-        raise UsageError(f"{path}: expected a name that ends in {', '.join(first)} or {last}")
+        index = f", or the name {streamed.INDEX}" if levels else ""
+        raise UsageError(f"{path}: expected a name that ends in {', '.join(first)} or {last}{index}")
     if ending == ".spz" and spz_version == 4:
         spz.zstandard()
     return ending
@@ -39,8 +45,9 @@ def output_format(path: StrPath, spz_version: int = 3) -> str:
 
 def lost_harmonics(path: StrPath, sh_degree: int, spz_version: int = 3) -> str | None:
     """Describe the harmonics that a format has no room for; None if it holds all, UsageError on an unknown one."""
-    ending = output_format(path)
-    highest = spz.MAX_DEGREES[spz_version] if ending == ".spz" else OUTPUT_FORMATS[ending]
+    ending = output_format(path, levels=True)
+    room = {**OUTPUT_FORMATS, ".spz": spz.MAX_DEGREES[spz_version], streamed.INDEX: streamed.MAX_DEGREE}
+    highest = room[ending]
     return None if sh_degree <= highest else f"{ending} has no room for harmonics above degree {highest}: left out"
 
 
@@ -89,6 +96,57 @@ def write_gaussians(
         else:
             content = splat.splat_bytes(gaussians) if ending == ".splat" else glb.glb_bytes(gaussians)
         temporary.write_bytes(content)
+
+
+def write_levels(
+    path: StrPath, levels: Sequence[Gaussians], *, overwrite: bool = False, comments: Sequence[str] = ()
+) -> None:
+    """Write levels of detail as Streamed SOG: an index, and chunks in folders beside it.
+
+    A viewer loads the chunks that it sees, at the level that fits. All files are written, or none; the chunks of
+    an index that is replaced are removed.
+
+    Args:
+        path: The index, a ``lod-meta.json``; its folder is made if it is missing.
+        levels: Finite values, the finest level first.
+        overwrite: Replace an existing index.
+        comments: Lines as of :func:`write_gaussians`, of which "SplatRenderMode: mip" is kept.
+
+    Raises:
+        UsageError: If the name is another one.
+        SceneError: If the file exists or cannot be written.
+        ValueError: If there is NaN or inf, no Gaussian at some level, or a comment is no line of ASCII.
+    """
+    path = Path(path)
+    if path.name != streamed.INDEX:
+        raise UsageError(f"{path}: expected the name {streamed.INDEX}, by which viewers recognise the format")
+    with atomic_outputs(overwrite=overwrite) as add:
+        add_levels(add, path, add(path, make_folder=True), levels, comments)
+    streamed.remove_unused_chunks(path)
+
+
+def add_levels(
+    add: AddOutput, path: Path, index: Path, levels: Sequence[Gaussians], comments: Sequence[str] = ()
+) -> list[tuple[Path, list[Path]]]:
+    """Write levels of detail as some of several outputs, ``index`` in place of ``path``.
+
+    Returns of each level the ``meta.json`` of its first chunk, as it will be named, and all files as they are now.
+    """
+    _check_comments(comments)
+    firsts: dict[str, Path] = {}
+    written: dict[str, list[Path]] = {}
+    for name, data in streamed.streamed_files(levels, mip=ply_file.MIP_COMMENT in comments).items():
+        if name == streamed.INDEX:
+            index.write_bytes(data)
+            continue
+        target, level = path.parent / name, name.partition("_")[0]
+        same = target.is_file() and target.read_bytes() == data  # its name has a hash of its content
+        written.setdefault(level, []).append(target if same else add(target, make_folder=True))
+        if not same:
+            written[level][-1].write_bytes(data)
+        if target.name == sog.META:
+            firsts.setdefault(level, target)
+    return [(firsts[level], files) for level, files in written.items()]
 
 
 def write_ply(

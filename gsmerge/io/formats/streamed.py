@@ -1,0 +1,289 @@
+"""Streamed SOG version 1 (developer.playcanvas.com, "The Streamed SOG Format"): levels of detail that viewers load.
+
+``lod-meta.json`` is a tree of boxes. For each level, a leaf names a run of rows in a chunk: an
+unbundled ``.sog`` in a folder of its own. A viewer loads what it sees, at the level that fits.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from gsmerge.errors import SceneError
+from gsmerge.geometry import morton_codes, quat_to_rotmat
+from gsmerge.io.atomic import remove_stale
+from gsmerge.io.bounds import MAX_FILES, read_json
+from gsmerge.io.formats import arrays, sog
+from gsmerge.kernels.elementary import exp, log1p
+from gsmerge.types import Gaussians
+
+INDEX = "lod-meta.json"  # the name by which loaders recognise the format
+VERSION = 1
+MAX_DEGREE = sog.MAX_DEGREE
+# Gaussians in a chunk: all of them have harmonics of their own in its palette, and its .85 MB are one download
+CHUNK_SIZE = 2**sog.PALETTE_BITS
+# Gaussians of all levels in a leaf, for which a viewer chooses one level: a quarter of a chunk, so that
+# the few hundred thousand of a room are some twenty places with levels of their own
+LEAF_SIZE = CHUNK_SIZE // 4
+MAX_LEVELS = 64  # no real file has more than a dozen
+_CHUNK = re.compile(r"\d+_\d+-[0-9a-f]{8}")
+
+
+@dataclass
+class _Leaf:
+    """A place and its Gaussians at each level."""
+
+    node: dict[str, Any]  # its part of the index
+    rows: list[np.ndarray]  # of each level
+
+
+def streamed_files(levels: Sequence[Gaussians], *, mip: bool = False) -> dict[str, bytes]:
+    """Encode levels of detail, the finest first, as files by their paths below one folder; the index is the last.
+
+    A chunk's folder has its level, its number and a hash of its content in its name, so that chunks of
+    two results are never mixed: neither where one replaces the other, nor in a browser's cache. ``mip``
+    marks antialiased Gaussians. ValueError if a level is empty or not finite.
+    """
+    if not levels or not all(len(level) for level in levels):
+        raise ValueError("levels: expected Gaussians in each, got none")
+    columns = [arrays.to_columns(level, MAX_DEGREE) for level in levels]
+    leaves: list[_Leaf] = []
+    tree = _Boxes(columns).split(leaves)
+    files: dict[str, bytes] = {}
+    names: list[str] = []
+    for level, own in enumerate(columns):
+        for number, members in enumerate(_pack([len(leaf.rows[level]) for leaf in leaves])):
+            parts = [_along_curve(own.means, leaves[i].rows[level]) for i in members]
+            offsets = np.cumsum([0, *map(len, parts)])
+            for i, part, offset in zip(members, parts, offsets, strict=False):
+                run = {"file": len(names), "offset": int(offset), "count": len(part)}
+                leaves[i].node["lods"][str(level)] = run
+            chunk = sog.sog_files(own.take(np.concatenate(parts)), mip=mip)
+            folder = f"{level}_{number}-{_hash(chunk)}"
+            files |= {f"{folder}/{name}": data for name, data in chunk.items()}
+            names.append(f"{folder}/{sog.META}")
+    counts = [len(one) for one in columns]
+    index = {"version": VERSION, "asset": {"generator": sog.GENERATOR}, "count": sum(counts), "counts": counts}
+    index |= {"lodLevels": len(counts), "filenames": names, "tree": tree}
+    return files | {INDEX: json.dumps(index).encode("ascii")}
+
+
+class _Boxes:
+    """The centres of all levels, and the boxes of what they show."""
+
+    def __init__(self, columns: Sequence[arrays.Columns]) -> None:
+        self.means = np.concatenate([one.means for one in columns])
+        self.starts = np.cumsum([0, *map(len, columns)])  # first row of each level
+        rotations = quat_to_rotmat(np.concatenate([one.quats for one in columns]))
+        scales = exp(np.concatenate([one.log_scales for one in columns]))
+        widths = (np.abs(rotations) * scales[:, None]).sum(-1)  # of the box about the turned ellipsoid
+        logs = log1p(np.abs(self.means).max(0))
+        rounding = (1 + np.abs(self.means)) * 2 * logs / 65535  # as far as a .sog moves a centre
+        self.low = self.means - widths - rounding
+        self.high = self.means + widths + rounding
+
+    def split(self, leaves: list[_Leaf], rows: np.ndarray | None = None) -> dict[str, Any]:
+        """Halve rows along their longest side until they are few; return the node, and add its leaves."""
+        rows = np.arange(len(self.means)) if rows is None else rows
+        inside = self.means[rows]
+        extent = np.ptp(inside, axis=0)
+        node: dict[str, Any] = {
+            "bound": {
+                "min": [float(f"{value:.8g}") for value in self.low[rows].min(0)],
+                "max": [float(f"{value:.8g}") for value in self.high[rows].max(0)],
+            }
+        }
+        if len(rows) <= LEAF_SIZE or not extent.max() > 0:
+            ends = np.searchsorted(rows, self.starts)
+            own = [rows[a:b] - start for a, b, start in zip(ends, ends[1:], self.starts, strict=False)]
+            leaves.append(_Leaf(node | {"lods": {}}, own))
+            return leaves[-1].node
+        places = inside[:, int(extent.argmax())]
+        middle = np.partition(places, len(rows) // 2)[len(rows) // 2]
+        first = places < middle if places.min() < middle else places <= middle
+        return node | {"children": [self.split(leaves, rows[first]), self.split(leaves, rows[~first])]}
+
+
+def _pack(sizes: Sequence[int]) -> Iterator[list[int]]:
+    """Yield the indices of neighbouring leaves that share a chunk; empty ones are in none."""
+    members: list[int] = []
+    total = 0
+    for i, size in enumerate(sizes):
+        if members and total + size > CHUNK_SIZE:
+            yield members
+            members, total = [], 0
+        if size:
+            members.append(i)
+            total += size
+    if members:
+        yield members
+
+
+def _along_curve(means: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    return rows[np.argsort(morton_codes(means[rows]), kind="stable")]
+
+
+def _hash(files: dict[str, bytes]) -> str:
+    digest = hashlib.sha256()
+    for name, data in files.items():
+        digest.update(f"{name}:{len(data)}:".encode())
+        digest.update(data)
+    return digest.hexdigest()[:8]
+
+
+@dataclass(frozen=True)
+class StreamedIndex:
+    """What an index says: the chunks of each level, each with its number of Gaussians."""
+
+    levels: tuple[dict[Path, int], ...]
+    environment: Path | None  # the ``meta.json`` of what is shown with every level
+
+    @property
+    def counts(self) -> list[int]:
+        """Gaussians of each level."""
+        return [sum(chunks.values()) for chunks in self.levels]
+
+
+def read_index(path: Path) -> StreamedIndex:
+    """Read a ``lod-meta.json``, and check that its parts agree; SceneError if they do not."""
+    document = read_json(path)
+    try:
+        return _check_index(path, document)
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
+        problem = f"expected the index of a Streamed SOG, found another file ({error})"
+        raise SceneError(path, " ".join(problem.split()), "export it again") from error
+
+
+def _check_index(path: Path, document: dict[str, Any]) -> StreamedIndex:
+    version = document.get("version", VERSION)
+    if version != VERSION:
+        problem = f"expected Streamed SOG version {VERSION}, found {version}"
+        raise SceneError(path, problem, "export it as that version")
+    names = document["filenames"]
+    num_levels = _whole(document["lodLevels"], "lodLevels", 1, MAX_LEVELS)
+    if not isinstance(names, list) or not 1 <= len(names) <= MAX_FILES:
+        raise ValueError(f"filenames: expected a list of 1 to {MAX_FILES} paths")
+    chunks = [_inside(path, name) for name in names]
+    runs: list[list[tuple[int, int, int]]] = [[] for _ in range(num_levels)]
+    for level, run in _walk_runs(document["tree"]):
+        file = _whole(run["file"], "file", 0, len(chunks) - 1)
+        most = 2**53  # the largest whole number that JSON keeps everywhere
+        offset, count = (_whole(run[key], key, least, most) for key, least in (("offset", 0), ("count", 0)))
+        if count:
+            runs[_whole(level, "level", 0, num_levels - 1)].append((file, offset, count))
+    levels = tuple(_cover(chunks, level) for level in runs)
+    if len({chunk for level in levels for chunk in level}) != sum(map(len, levels)):
+        raise ValueError("a chunk is that of two levels")
+    environment = document.get("environment")
+    index = StreamedIndex(levels, None if environment is None else _inside(path, environment))
+    counts = index.counts
+    for name, found in {"counts": counts, "count": sum(counts)}.items():
+        if document.get(name, found) != found:  # older files have neither
+            raise ValueError(f"{name}: the tree has {found}, not {document[name]}")
+    return index
+
+
+def _whole(value: Any, name: str, least: int, most: int) -> int:
+    if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
+        raise ValueError(f"{name}: expected a whole number from {least} to {most}, not {value!r:.40}")
+    return value
+
+
+def _inside(index: Path, name: Any) -> Path:
+    """Return the path of a chunk; ValueError if it leads out of the folder of the index."""
+    place = PurePosixPath(str(name))
+    path = index.parent / place
+    root = os.path.realpath(index.parent)
+    outside = place.is_absolute() or ".." in place.parts or "\\" in str(name) or "\0" in str(name)
+    if outside or place.name != sog.META or os.path.commonpath([root, os.path.realpath(path)]) != root:
+        raise ValueError(f"{name!r:.80}: expected the path of a {sog.META} inside the folder")
+    return path
+
+
+def _walk_runs(tree: dict[str, Any]) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Yield level and run of all leaves in their order; ValueError for a node that is none."""
+    nodes = [tree]
+    while nodes:
+        node = nodes.pop()
+        low, high = (np.array(node["bound"][key], np.float64) for key in ("min", "max"))
+        if low.shape != (3,) or high.shape != (3,) or not (low <= high).all():
+            raise ValueError("bound: expected three numbers at each end, the lower ones first")
+        if ("lods" in node) == ("children" in node):
+            raise ValueError("a node has to have either children or lods")
+        if "children" in node:
+            nodes += reversed(node["children"])
+        else:
+            yield from ((int(level), run) for level, run in node["lods"].items())
+
+
+def _cover(chunks: Sequence[Path], runs: Sequence[tuple[int, int, int]]) -> dict[Path, int]:
+    """Return the number of Gaussians of each chunk; ValueError where runs leave a gap or overlap."""
+    counts: dict[Path, int] = {}
+    for file, offset, count in sorted(runs):
+        known = counts.get(chunks[file], 0)
+        if offset != known:
+            raise ValueError(f"runs of file {file}: expected one from {known} on, found one from {offset}")
+        counts[chunks[file]] = known + count
+    return counts
+
+
+def read_rows(path: Path, level: int = 0) -> arrays.StoredRows:
+    """Read the Gaussians of a level; of the finest, which is 0, with those of the environment.
+
+    SceneError if the index or a chunk cannot be read, or they do not agree.
+    """
+    index = read_index(path)
+    chunks: dict[Path, int | None] = {**index.levels[level]}
+    if index.environment is not None and level == 0:
+        chunks[index.environment] = None
+    if not chunks:
+        raise SceneError(path, f"expected Gaussians at level {level}, found none")
+    contents = []
+    for chunk, count in chunks.items():
+        contents.append(sog.read_unbundled(chunk))
+        if count not in (None, len(contents[-1].columns)):
+            problem = f"expected {count:,} Gaussians as {INDEX} says, found {len(contents[-1].columns):,}"
+            raise SceneError(chunk, problem, "export it again")
+    sizes: dict[str, int] = {}
+    for content in contents:
+        for name, size in content.sizes.items():
+            sizes[name] = sizes.get(name, 0) + size
+    counts = " + ".join(f"{count:,}" for count in index.counts)
+    name = f"Streamed SOG version {VERSION}, {counts} Gaussians at {len(index.levels)} level(s)"
+    columns = arrays.concatenate([content.columns for content in contents])
+    rows = arrays.to_rows(columns, name, sizes, mip=contents[0].mip)
+    return replace(rows, bytes_beside=sum(content.num_bytes for content in contents))
+
+
+def remove_unused_chunks(path: Path) -> None:
+    """Remove the chunks beside an index that it does not name: those that :func:`streamed_files` made before.
+
+    Files of other names in their folders stay, and so do these; what cannot be removed stays, too.
+    """
+    used = {chunk.parent.name for level in read_index(path).levels for chunk in level}
+    with suppress(OSError), os.scandir(path.parent) as entries:
+        for entry in list(entries):
+            if _CHUNK.fullmatch(entry.name) and entry.name not in used and entry.is_dir(follow_symlinks=False):
+                folder = Path(entry.path)
+                remove_stale(folder)
+                for name in sog.FILES if _is_ours(folder) else ():
+                    with suppress(OSError):
+                        os.unlink(folder / name)
+                with suppress(OSError):
+                    os.rmdir(folder)
+
+
+def _is_ours(folder: Path) -> bool:
+    try:
+        return bool(read_json(folder / sog.META)["asset"]["generator"] == sog.GENERATOR)
+    except (SceneError, LookupError, TypeError):
+        return False
