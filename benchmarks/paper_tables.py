@@ -16,7 +16,7 @@ import re
 import sys
 import tempfile
 import textwrap
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence, Sized
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -95,7 +95,7 @@ def over_counts(bench: Bench, way: Way) -> Runs:
 def views_section(bench: Bench) -> str:
     """Numbers of views, and what the figures are of."""
     rows, sides, whole = [], [], over_counts(bench, WHOLE)
-    ours = f"{len(bench.folders)} captures"
+    ours = captures(bench.folders)
     for way in VIEW_WAYS:
         runs = whole if way is WHOLE else over_counts(bench, way)
         cells = [mean_cell(bench.runs(way, Case(views=count))) for count in bench.counts]
@@ -108,7 +108,7 @@ def views_section(bench: Bench) -> str:
             rows.append((way.name, printed.DATA, kept, *cells, mean, ""))
         if way.key in printed.SIDES:
             sides.append((way.name, printed.DATA, *printed.SIDES[way.key]))
-    names = [f"{count} views ({len(bench.runs(WHOLE, Case(views=count)))} captures)" for count in bench.counts]
+    names = [f"{count} views ({captures(bench.runs(WHOLE, Case(views=count)))})" for count in bench.counts]
     head = ("", "data", "kept", *names, "mean", "PSNR less K = 1 (95 %)")
     first = make_table(head, order(rows))
     names = ("held-out views, seen pixels", "held-out views, all pixels", "input views")
@@ -189,11 +189,15 @@ def storage_section(bench: Bench) -> str:
         cells = [f"{many / 1e6:.2f} to {few / 1e6:.3f} M", f"{large / 1e6:.0f} to {small / 1e6:.1f}"]
         cells += [f"{large / small:.1f} x", f"{1e3 * slow:.0f} to {1e3 * fast:.0f} ms", f"{slow / fast:.1f} x"]
         cells += [f"{merge:.1f} s", "-" if even is None else f"{even:.0f}"]
-        rows.append((str(count), f"{len(before)} captures", *cells))
+        rows.append((str(count), captures(before), *cells))
     rows += [(count, "printed: DA3, MipNeRF360, B200 GPU", *cells) for count, cells in printed.STORAGE.items()]
     head = ("views", "data", "Gaussians", "MB", "smaller", "a frame", "faster", "merging", "frames to break even")
     text = "K = 1. Times of the captures are processor seconds: those that all cores spent together."
     return section("Storage, rendering and break-even", text, make_table(head, rows))
+
+
+def captures(some: Sized) -> str:
+    return "1 capture" if len(some) == 1 else f"{len(some)} captures"
 
 
 def mean_value(runs: Sequence[dict[str, Any]], name: str) -> float:
