@@ -11,6 +11,7 @@ from gsmerge.stages.clean import CleanOptions
 from gsmerge.stages.decode import MIXED, DecodeOptions
 from gsmerge.stages.fit import FitOptions
 from gsmerge.stages.match import MatchOptions
+from gsmerge.stages.partition import BlockOptions
 from gsmerge.stages.prepare import PrepareOptions
 from gsmerge.stages.superpixels import SegmentOptions
 
@@ -48,6 +49,7 @@ class CompactOptions:
         fit: Fit to the photos.
         clean: What is left out of the result.
         budget: What decides the number of Gaussians.
+        blocks: Parts in which scenes of many views are compacted.
         method: ``"gsmerge"``: the stages above. Any other: a baseline, see :mod:`gsmerge.baselines`, for which
             the number of Gaussians has to be settled beforehand.
         effort: ``"draft"``, ``"fast"``, ``"default"`` or ``"best"``: how much work goes into superpixels, merging and
@@ -77,6 +79,7 @@ class CompactOptions:
     fit: FitOptions = field(default_factory=FitOptions)
     clean: CleanOptions = field(default_factory=CleanOptions)
     budget: BudgetOptions = field(default_factory=BudgetOptions)
+    blocks: BlockOptions = field(default_factory=BlockOptions)
     method: str = "gsmerge"
     effort: str = "default"
     device: str = "cpu"
@@ -116,7 +119,7 @@ class CompactOptions:
         asked = {f"method {self.method}": self.method != "gsmerge", "levels": budget.levels > 1}
         asked |= {f"quality {budget.quality}": budget.quality is not None, "k mixed": self.decode.k == MIXED}
         asked |= {"crop": self.clean.crop is not None, "drop_floaters": self.clean.drop_floaters}
-        asked |= {"drop_sky": self.clean.drop_sky}
+        asked |= {"drop_sky": self.clean.drop_sky, f"blocks {self.blocks.blocks}": isinstance(self.blocks.blocks, int)}
         return [name for name, wanted in asked.items() if wanted]
 
     def to_dict(self) -> dict[str, Any]:

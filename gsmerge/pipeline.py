@@ -1,17 +1,15 @@
-"""Compact a scene: scene -> groups -> feature gaussians -> merged -> refined -> decoded -> fitted -> result.
-
-:func:`build` goes the whole way; encoding and views in batches share its first half, :func:`merge_views`.
-"""
+"""Compact a scene: scene -> groups -> feature gaussians -> merged -> refined -> decoded -> fitted -> result."""
 
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gsmerge.baselines import choose_method
+from gsmerge.blocks import compact_in_blocks
 from gsmerge.io import as_scene
 from gsmerge.options import CompactOptions
-from gsmerge.plan import Plan, make_plan
+from gsmerge.plan import Plan, choose_blocks, make_plan
 from gsmerge.result import Candidate, CompactResult, make_result, score
 from gsmerge.runtime.record import Progress, record_part, record_run
 from gsmerge.runtime.threads import use_threads
@@ -19,7 +17,7 @@ from gsmerge.search import Build, level_counts, search_count
 from gsmerge.stages.assign import assign
 from gsmerge.stages.choose_start import choose_start
 from gsmerge.stages.clean import clean_to_count
-from gsmerge.stages.decode import decode_merged, keep_all
+from gsmerge.stages.decode import Decoded, decode_merged, keep_all
 from gsmerge.stages.encode import correct, encode, make_context
 from gsmerge.stages.fit import Fitted, fit_scene
 from gsmerge.stages.match import match
@@ -27,9 +25,6 @@ from gsmerge.stages.merge import MergedViews, merge, refine
 from gsmerge.stages.prepare import Prepared, prepare
 from gsmerge.stages.segment import segment_scene
 from gsmerge.types import Scene, StrPath
-
-if TYPE_CHECKING:
-    pass
 
 
 def compact(
@@ -48,16 +43,21 @@ def compact(
     options = (options or CompactOptions()).with_settings(settings)
     with use_threads(options.threads), record_run(progress):
         given = as_scene(scene)
-        method = choose_method(options, given, build)  # ours, or a baseline
-        prepared = prepare(given.numpy(), options.prepare)  # facts: frame, photos, poses, unseen
-        plan = make_plan(prepared, options)  # every "auto" is decided once; options end here
-        search = search_count(prepared, plan, build)  # one count, or counts until a quality is met
-        for count in search:
-            search.add(build_scored(method, prepared, plan, count))
-        best = search.best
-        fixed = prepared.with_cameras(best.fitted.cameras), plan.with_fixed_cameras()
-        levels = [build_scored(method, *fixed, count) for count in level_counts(len(best.gaussians), plan)]
-        return make_result(best, levels, prepared, plan, search.facts()).to(given.gaussians.device)
+        blocks = choose_blocks(given, options)  # 1: one piece
+        return compact_in_blocks(given, options, blocks, start) if blocks > 1 else compact_piece(given, options)
+
+
+def compact_piece(given: Scene, options: CompactOptions) -> CompactResult:
+    """Compact a scene as a whole."""
+    method = choose_method(options, given, build)  # ours, or a baseline
+    prepared = prepare(given.numpy(), options.prepare)  # facts: frame, photos, poses, unseen
+    plan = make_plan(prepared, options)  # every "auto" is decided once; options end here
+    search = search_count(prepared, plan, build)  # one count, or counts until a quality is met
+    for count in search:
+        search.add(build_scored(method, prepared, plan, count))
+    fixed = prepared.with_cameras(search.best.fitted.cameras), plan.with_fixed_cameras()
+    levels = [build_scored(method, *fixed, count) for count in level_counts(len(search.best.gaussians), plan)]
+    return make_result(search.best, levels, prepared, plan, search.facts()).to(given.gaussians.device)
 
 
 @record_part()
@@ -69,11 +69,15 @@ def build_scored(method: Build, prepared: Prepared, plan: Plan, count: int | Non
 
 def build(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
     """Build ``count`` fitted canonical Gaussians; None: as many as ``superpixels`` and K give."""
+    decoded = start(prepared, plan, count)
+    return fit_scene(decoded, prepared.scene, prepared.photo_views, plan.fit, plan.seed, plan.backend)
+
+
+def start(prepared: Prepared, plan: Plan, count: int | None) -> Decoded:
+    """Build the canonical Gaussians that a fit starts with."""
     scene, decode = prepared.scene, plan.decode
-    decoded = keep_all(scene, count)
-    if decoded is None:  # no name for the merged views: they are freed before the fit
-        decoded = decode_merged(merge_views(prepared, plan, count), scene, decode, grows=plan.fit.grows)
-    return fit_scene(decoded, scene, prepared.photo_views, plan.fit, plan.seed, plan.backend)
+    kept = keep_all(scene, count)
+    return kept or decode_merged(merge_views(prepared, plan, count), scene, decode, grows=plan.fit.grows)
 
 
 def merge_views(prepared: Prepared, plan: Plan, count: int | None) -> MergedViews:

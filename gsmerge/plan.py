@@ -21,6 +21,7 @@ from gsmerge.stages.clean import CleanOptions, clean
 from gsmerge.stages.decode import USUAL_K, DecodeOptions
 from gsmerge.stages.fit import FitBackend, FitOptions, photo_scale, start_share
 from gsmerge.stages.match import MatchOptions, Method
+from gsmerge.stages.partition import BLOCK_GAUSSIANS, WHOLE_GAUSSIANS
 from gsmerge.stages.prepare import Prepared
 from gsmerge.stages.segment import CountLimits, SuperpixelPlan, count_limits, scene_tree
 from gsmerge.stages.superpixels import AUTO_SHARE, SHARE, SegmentOptions
@@ -154,6 +155,29 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         checkpoint=checkpoint,
         settings=options.to_dict() | {"fit_steps": fit.steps, "device": backend.device},
     )
+
+
+def choose_blocks(scene: Scene, options: CompactOptions) -> int:
+    """Return the number of blocks in which a scene is compacted; UsageError where it cannot be in as many as asked."""
+    asked, budget = options.blocks.blocks, options.budget
+    whole = {f"method {options.method}": options.method != "gsmerge", f"levels {budget.levels}": budget.levels > 1}
+    whole |= {"budget auto": budget.auto, f"quality {budget.quality}": budget.quality is not None}
+    whole |= {
+        "poses free": options.prepare.poses == "free",
+        "exposure per-photo": options.prepare.exposure == "per-photo",
+    }
+    whole |= {"a scene without one Gaussian per pixel": not scene.aligned}
+    problems = [name for name, holds in whole.items() if holds]
+    if asked == "none" or asked == 1:
+        return 1
+    if asked == "auto":
+        small = len(scene.gaussians) <= WHOLE_GAUSSIANS
+        return 1 if problems or small else min(len(scene), -(-len(scene.gaussians) // BLOCK_GAUSSIANS))
+    if problems:
+        raise UsageError(f"blocks {asked}: expected one piece (--blocks none) with {problems[0]}")
+    if int(asked) > len(scene):
+        raise UsageError(f"blocks {asked}: expected at most one for each of {len(scene)} views")
+    return int(asked)
 
 
 def _check_photos(scene: Scene, options: CompactOptions) -> None:

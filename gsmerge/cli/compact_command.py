@@ -37,12 +37,12 @@ MORE = "more Gaussians (--k, --budget) or a longer fit (--effort) show them bett
 @opt.command(
     opt.argument("scenes", list[Path], "SCENE...", "A .ply with one Gaussian per pixel and view, "
                  "or the folder it is in; several of one place, as SHARP writes them, are joined."),
-    f"{opt.READING} masks k superpixels budget quality levels",
+    f"{opt.READING} masks k superpixels budget quality levels blocks",
     "effort fit exposure device method recipe checkpoint set crop",
     opt.output(f"{opt.COMPACT_SCENE} lod-meta.json: levels that stream, in chunks beside it.", "SCENE.compact.ply"),
     f"overwrite strict report save_cameras embed_cameras dry_run {opt.RUN}",
-    rare="hint masks levels fit exposure method recipe checkpoint crop strict save_cameras embed_cameras json quiet"
-         f" {opt.RUN}",
+    rare="hint masks levels blocks fit exposure method recipe checkpoint crop strict save_cameras embed_cameras"
+         f" json quiet {opt.RUN}",
 )  # fmt: skip
 def compact(args: opt.Args) -> None:
     """Write a compact scene that renders like the given one, or better, with 1 to 10 % of its Gaussians."""
@@ -73,7 +73,7 @@ def compact(args: opt.Args) -> None:
     if args.dry_run:
         print_plan(args, files, settings, out, hints)
         return
-    _warn_of_memory(files, quiet=args.silent)
+    _warn_of_memory(files, settings, quiet=args.silent)
     from gsmerge.compact_file import compact_files
     from gsmerge.report import result_table, summary_lines
 
@@ -116,13 +116,16 @@ def _check_scenes(args: opt.Args) -> None:
             raise UsageError(f"{scene}: expected each scene once, got it twice; {remedy}")
 
 
-def _warn_of_memory(files: SceneFiles, *, quiet: bool) -> None:
-    """Warn before anything is read if the scene is not likely to fit into memory."""
+def _warn_of_memory(files: SceneFiles, settings: CompactOptions, *, quiet: bool) -> None:
+    """Warn before anything is read if the scene is not likely to fit into memory; in blocks it does."""
     from gsmerge.io.formats.ply_file import header_counts
     from gsmerge.runtime.estimate import memory_bytes, memory_problem
+    from gsmerge.stages.partition import WHOLE_GAUSSIANS
 
     counts = [header_counts(one.ply) for one in (files, *files.more)]
     count, num_rest = sum(count for count, _ in counts), max(rest for _, rest in counts)
+    if settings.blocks.blocks != "none":
+        count = min(count, WHOLE_GAUSSIANS)
     problem = memory_problem(memory_bytes(count, photos=True, num_rest=num_rest))
     if problem is not None:
         say(f"gsmerge: warning: {problem}", quiet=quiet)

@@ -323,6 +323,9 @@ _TABLE = (
                "most so much against the best, such as -0.2dB.", metavar="30dB|-0.2dB"),
         option("levels", int, "Levels of detail, each in a file of its own or all in a lod-meta.json, with a quarter "
                "of the Gaussians of the one before.", wording="1, or 3 in a lod-meta.json", min=1, max=8),
+        option("blocks", str, "Blocks of views that are compacted one by one, for scenes of hundreds of views; auto: "
+               "from 20 million Gaussians on, one for every 8 million.", wording="auto", parser=number_or_text,
+               metavar="auto|none|NUMBER"),
         option("max_k", int, "Most Gaussians per superpixel that can be decoded later: more take more space.",
                wording="4, or 8 with a --budget", min=1, max=8),
     ),

@@ -29,6 +29,7 @@ class FitState:
     units: Tensor  # [n] size of each Gaussian when it began
     box_shares: Tensor  # [n] share of the box about the start that each may use
     min_sizes: Tensor  # [n] least log scale of each
+    origins: Tensor  # [n] row of the start that each comes from
     shN: Tensor  # [n,k-1,3] higher harmonics
     means: Tensor  # [n,3]
     quats: Tensor  # [n,4]
@@ -86,8 +87,9 @@ def state_of(x: Tensor, shN: Tensor) -> FitState:
     units = ((sizes[:, 1] + sizes[:, 2]) / 2).exp()
     shown = (x[:, :SIZE], x[:, QUAT:LOGIT], x[:, SIZE:QUAT].exp(), x[:, LOGIT].sigmoid(), x[:, COLOR:])
     shares, least = torch.ones_like(units), torch.full_like(units, -torch.inf)
+    rows = torch.arange(len(x), device=x.device)
     return FitState(
-        x, x.clone(), torch.zeros_like(x), torch.zeros_like(x), units, shares, least, shN,
+        x, x.clone(), torch.zeros_like(x), torch.zeros_like(x), units, shares, least, rows, shN,
         *(tensor.clone(memory_format=torch.contiguous_format) for tensor in shown),
     )  # fmt: skip
 

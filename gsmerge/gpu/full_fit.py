@@ -171,7 +171,7 @@ def grow(state: FitState, photos: DevicePhotos, count: int) -> FitState:
     old[picked] = False
     rows = torch.nonzero(old)[:, 0]
     grown.x0[rows], grown.units[rows] = state.x0[rows], state.units[rows]
-    for name in ("m", "v", "box_shares", "min_sizes"):
+    for name in ("m", "v", "box_shares", "min_sizes", "origins"):
         setattr(grown, name, getattr(state, name)[source])
     return grown
 
@@ -218,6 +218,7 @@ def fit_full(
     progress: Progress | None,
     baseline_start: Gaussians | None,
     look: None = None,  # what the CPU's fit takes over from the look before
+    fixed: None = None,  # Gaussians that stay as they are, which only the CPU can do
 ) -> tuple[Gaussians, FitReport]:
     """Fit as :func:`gsmerge.stages.fit.full.fit_full` does; report progress every ``READ_EVERY`` steps."""
     plan = plan_run((photos[0].host, photos[1].host), options, seed)
@@ -249,12 +250,14 @@ def fit_full(
         before, after = judge()
     if after <= before:
         why = f"held-out parts of the photos were no better after {run.step} steps"
-        return gaussians, FitReport("none", False, run.step, before, after, why)
+        rows = np.arange(len(gaussians))
+        return gaussians, FitReport("none", False, run.step, before, after, why, origins=rows)
     if options.grows:  # a time budget may end before the growth
         run.state = grow_to(run.state, half, count)
     why = "time budget spent" if options.time_budget is not None else "all steps done"
     fitted = gaussians_of(run.tail.of(run.state.x), run.state.shN)
-    return fitted, FitReport("full", True, run.step, before, after, why)
+    rows = run.state.origins.cpu().numpy()
+    return fitted, FitReport("full", True, run.step, before, after, why, origins=rows)
 
 
 class _Run:

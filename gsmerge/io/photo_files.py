@@ -19,6 +19,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io.bounds import MAX_PIXELS, check_file, check_pixels, read_errors
 from gsmerge.io.image_names import ImageSource, match_images
 from gsmerge.kernels.matrices import matmul
+from gsmerge.runtime.memory import free_pages, make_array
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras
 
@@ -102,8 +103,13 @@ def decode_image(path: Path, size: Size) -> np.ndarray:
 def as_floats(images: Photos) -> np.ndarray:
     """Convert c uint8 images of one size to ``[c,h,w,3]`` float32 in [0, 1]."""
     width, height = photo_size(images)
-    out = np.empty((len(images), height, width, 3), np.float32)
-    parallel_map(lambda i: np.multiply(images[i], np.float32(1 / 255), out=out[i]), range(len(images)))
+    out = make_array((len(images), height, width, 3), np.float32)
+
+    def convert(i: int) -> None:
+        np.multiply(images[i], np.float32(1 / 255), out=out[i])
+        free_pages([out])
+
+    parallel_map(convert, range(len(images)))
     return out
 
 

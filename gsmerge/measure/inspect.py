@@ -26,13 +26,14 @@ from gsmerge.io.formats.writing import file_bytes
 from gsmerge.io.scene_views import read_scene_cameras
 from gsmerge.measure.visibility import MAX_SAMPLES, inside_views
 from gsmerge.options import CompactOptions
-from gsmerge.plan import resolve_decode, resolved_settings, steps_for
+from gsmerge.plan import choose_blocks, resolve_decode, resolved_settings, steps_for
 from gsmerge.report import finite, human_bytes
 from gsmerge.runtime.estimate import fit_of, memory_bytes, memory_problem, wall_seconds
 from gsmerge.runtime.record import record_part
 from gsmerge.runtime.threads import available_threads, use_threads
 from gsmerge.stages.clean import BOX_QUANTILES, beyond_scene, floater_share
 from gsmerge.stages.compare_photos import compare_photos
+from gsmerge.stages.partition import SHARED
 from gsmerge.stages.prepare import canonicalise
 from gsmerge.stages.segment import count_limits, largest_count
 from gsmerge.stages.sky import sky_regions
@@ -210,9 +211,9 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
 
     Returns:
         ``num_gaussians``: the most that the result can have; ``ratio`` to the input, ``bytes`` as a ``.ply``;
-        ``method``, ``superpixels_per_view`` (None where a budget distributes them), ``k``, ``match``, ``checkpoint``
-        and ``fit`` as they are used; ``seconds`` and ``memory_bytes``, to two digits and right within a factor of
-        about two; ``memory_problem``, None where this machine has enough.
+        ``blocks``, ``method``, ``superpixels_per_view`` (None where a budget distributes them), ``k``, ``match``,
+        ``checkpoint`` and ``fit`` as they are used; ``seconds`` and ``memory_bytes``, to two digits and right
+        within a factor of about two; ``memory_problem``, None where this machine has enough.
     """
     photos = scene.images is not None
     options = replace(options, decode=resolve_decode(options, scene, photos=photos))
@@ -225,12 +226,15 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
         pixels, len(scene), settings, photos=photos, threads=options.threads or available_threads(),
         fit_steps=steps_for(options, limits.count or limits.default, scene),
     )  # fmt: skip
-    memory = memory_bytes(pixels, photos=photos, num_rest=3 * scene.gaussians.shN.shape[1])
+    blocks = choose_blocks(scene, options)
+    in_memory = pixels if blocks == 1 else round(pixels * (1 + SHARED) / blocks)
+    memory = memory_bytes(in_memory, photos=photos, num_rest=3 * scene.gaussians.shN.shape[1])
     distributed = limits.count is not None or options.budget.auto
     return {
         "num_gaussians": count,
         "ratio": count / max(1, scene.num_gaussians),
         "bytes": file_bytes(count, scene.gaussians.sh_degree),
+        "blocks": blocks,
         "method": options.method,
         "superpixels_per_view": None if distributed else limits.per_view,
         **{name: settings[name] for name in ("k", "match", "checkpoint")},
@@ -251,7 +255,7 @@ def estimate_lines(run: Mapping[str, Any]) -> list[str]:
     return [
         f"compact    at most {run['num_gaussians']:,} Gaussians ({100 * run['ratio']:.1f} %),"
         f" {human_bytes(run['bytes'])} as .ply, in about {run['seconds']:g} s with {run['memory_bytes'] / 1e9:g} GB of"
-        " memory",
+        " memory" + (f", in {run['blocks']} blocks" if run["blocks"] > 1 else ""),
         f"method     {own if run['method'] == 'gsmerge' else run['method']}; fit: {run['fit']}",
         *([f"memory     {run['memory_problem']}"] if run["memory_problem"] else []),
     ]

@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import ctypes
+import mmap
 import os
 import sys
+import tempfile
+from collections.abc import Iterable
 from contextlib import suppress
+from math import prod
 from pathlib import Path
 
+import numpy as np
+
 LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")  # of versions 2 and 1
+MAPPED_BYTES = 1 << 28  # from which on an array is in a file
 
 
 def peak_memory() -> int:
@@ -40,6 +47,31 @@ def release_memory() -> None:
     if sys.platform == "linux":
         with suppress(OSError, AttributeError):
             ctypes.CDLL(None).malloc_trim(0)
+
+
+def make_array(shape: tuple[int, ...], dtype: type[np.generic]) -> np.ndarray:
+    """Make an array whose values are not set; a large one in a file without a name, where there is room for it.
+
+    What is in a file takes memory only where it is in use, and after :func:`free_pages` not even there. The file is in
+    the system's folder for temporary ones (``TMPDIR``), and goes with the array.
+    """
+    size = prod(shape) * np.dtype(dtype).itemsize
+    if size >= MAPPED_BYTES and hasattr(os, "posix_fallocate"):
+        with suppress(OSError), tempfile.TemporaryFile() as file:
+            os.posix_fallocate(file.fileno(), 0, size)  # a page without room on the disk would end the process
+            return np.frombuffer(mmap.mmap(file.fileno(), size), dtype).reshape(shape)
+    return np.empty(shape, dtype)
+
+
+def free_pages(arrays: Iterable[np.ndarray]) -> None:
+    """Take the pages of arrays that are in files out of memory; their values stay."""
+    for array in arrays:
+        base = array
+        while isinstance(base, np.ndarray) and base.base is not None:
+            base = base.base
+        pages = base.obj if isinstance(base, memoryview) else base
+        if isinstance(pages, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
+            pages.madvise(mmap.MADV_DONTNEED)
 
 
 def human_bytes(count: float) -> str:

@@ -19,7 +19,7 @@ Progress = Callable[[str, int, int], None]
 # stages that leave much behind that was freed in other threads
 RELEASED = ("prepare", "segment", "encode", "match", "refine", "choose", "fit")
 STAGES = (
-    "prepare", "segment", "curve", "reduce", "members", "encode", "match", "refine",
+    "partition", "prepare", "segment", "curve", "reduce", "members", "encode", "match", "refine",
     "cover", "decode", "choose", "join", "fit", "score", "input",
 )  # fmt: skip
 
@@ -52,11 +52,21 @@ def current_record() -> Record:
 
 
 @contextmanager
-def record_part(*, silent: bool = False) -> Iterator[Record]:
-    """Begin a record of its own for a part of the current run; ``silent``: without its progress."""
+def record_part(*, silent: bool = False, title: str | None = None) -> Iterator[Record]:
+    """Begin a record of its own for a part of the current run; ``silent``: without its progress.
+
+    With a ``title`` all its stages are steps of one, which has it as its name.
+    """
     outer = _current.get()
-    with _write_to(Record(None if silent or outer is None else outer.progress)) as record:
+    progress = None if silent or outer is None else outer.progress
+    if progress is not None and title is not None:
+        progress = _titled(progress, title)
+    with _write_to(Record(progress)) as record:
         yield record
+
+
+def _titled(progress: Progress, title: str) -> Progress:
+    return lambda text, done, total: progress(f"{title}: {text}", done, total)
 
 
 @contextmanager

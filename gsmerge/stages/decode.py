@@ -113,6 +113,7 @@ class Decoded:
     count: int  # Number to which the fit may grow
     exact: bool  # Whether that number is to be met
     baseline_start: Gaussians | None = None  # Another start that the fit may beat instead
+    fixed: np.ndarray | None = None  # [n] bool, Gaussians that the fit leaves as they are; None: none
 
 
 def keep_all(scene: Scene, count: int | None) -> Decoded | None:

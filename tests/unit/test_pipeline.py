@@ -11,7 +11,8 @@ from gsmerge import CompactOptions, Scene, compact
 from gsmerge.runtime.record import STAGES
 from gsmerge.stages.superpixels import SEGMENTATIONS
 
-USUAL = [stage for stage in STAGES if stage not in ("curve", "reduce", "refine", "cover", "choose", "join")]
+UNUSUAL = ("partition", "curve", "reduce", "refine", "cover", "choose", "join")
+USUAL = [stage for stage in STAGES if stage not in UNUSUAL]
 UNFITTED = {"fit": "none", "checkpoint": "none"}
 
 

@@ -16,6 +16,7 @@ from gsmerge.io.formats import ply_file, sog, splat, spz, streamed
 from gsmerge.io.formats.arrays import StoredRows
 from gsmerge.io.formats.compressed import is_compressed, unpack
 from gsmerge.kernels.elementary import exp, log
+from gsmerge.runtime.memory import free_pages, make_array
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Gaussians, StrPath
 
@@ -30,6 +31,7 @@ READERS: dict[str, Callable[[Path], StoredRows]] = {
 }
 SCENE_SUFFIXES = (".ply", *READERS)
 
+FREED_ROWS = 1 << 20  # after which the pages of large columns leave memory
 _MIN_JUDGED = 100  # Gaussians whose scales say something
 _SCALE_SAMPLES = 20_000  # of them that are looked at
 _MAX_WIDTH = 0.25  # share of the scene's width from which on standard deviations are wrong
@@ -161,13 +163,16 @@ def _to_scene(path: Path, stored: StoredRows, opacity: OpacityChoice) -> PlyScen
     n, size = len(rows), max(1, ply_file.BLOCK_BYTES // rows.dtype.itemsize)
     wide = any(rows.dtype[name].kind == "f" and rows.dtype[name].itemsize == 8 for name in ply_file.MEANS)
     shapes = {"quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh0": (n, 1, 3), "shN": (n, num_rest // 3, 3)}
-    out = {"means": np.empty((n, 3), np.float64 if wide else np.float32), "valid": np.empty(n, np.bool_)}
-    out |= {name: np.empty(shape, np.float32) for name, shape in shapes.items()}
+    out = {"means": make_array((n, 3), np.float64 if wide else np.float32), "valid": np.empty(n, np.bool_)}
+    out |= {name: make_array(shape, np.float32) for name, shape in shapes.items()}
     with ply_file.open_rows(path, stored.rows) as read:
 
         def convert(start: int) -> tuple[int, int]:
             block = slice(start, min(start + size, n))
-            return _convert(read(block), {name: column[block] for name, column in out.items()})
+            counts = _convert(read(block), {name: column[block] for name, column in out.items()})
+            if start % FREED_ROWS < size:
+                free_pages(out.values())
+            return counts
 
         num_clipped, num_zero_quats = map(sum, zip(*parallel_map(convert, range(0, n, size)), strict=True))
     known = opacity if opacity != "auto" else stored.encoding

@@ -78,6 +78,7 @@ class FitOptions:
         holdout: Share of the photos' blocks that decides whether a fit is accepted.
         min_contribution: Least blending weight at some pixel of some photo; Gaussians below it in all photos that they
             lie in are left out.
+        judged: Whether the result has to show held-out blocks better than its start; not where the start has seen them.
         move_cameras: Whether the full fit moves the cameras on; a plan decides it by ``poses``.
         tuning: Constants.
 
@@ -93,6 +94,7 @@ class FitOptions:
     half_res_share: float | None = None
     holdout: float = 0.05
     min_contribution: float = 1 / 255
+    judged: bool = field(default=True, metadata=NOT_A_SETTING)
     move_cameras: bool = field(default=False, metadata=NOT_A_SETTING)
     tuning: Tuning = field(default_factory=Tuning, metadata=NOT_A_SETTING)
 
@@ -149,6 +151,8 @@ class FitReport:
     stopped: str  # Why it ended
     viewmats: np.ndarray | None = None  # [v,4,4] poses after the fit; None: fixed
     device: str = "cpu"  # Where it ran: `"cpu"` or `"cuda"`
+    # [n] row of the start that each Gaussian comes from; None: not known
+    origins: np.ndarray | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +169,7 @@ def record_fit(report: FitReport | None) -> None:
     if report is None:
         return
     numbers = asdict(report)
-    del numbers["viewmats"]
+    del numbers["viewmats"], numbers["origins"]
     choose(fit=numbers)
     if not report.accepted:
         note("the fit was not accepted: held-out parts of the photos did not get better")

@@ -29,6 +29,7 @@ class State:
     units: np.ndarray  # [n] size: geometric mean of the two largest scales at the start
     box_shares: np.ndarray  # [n] share of the box about the start for means and scales
     min_sizes: np.ndarray  # [n] least log scale of each Gaussian
+    origins: np.ndarray  # [n] row of the start that each comes from
     splats: Splats  # Means, quaternions, scales and opacities as the rasterizer takes them
     colors: np.ndarray  # [n,3] base colours
 
@@ -67,7 +68,8 @@ def state_of(x: np.ndarray, shN: np.ndarray) -> State:
     )
     units = exp((sizes[:, 1] + sizes[:, 2]) / 2)
     shares, least = np.ones_like(units), np.full_like(units, -np.inf)
-    return State(x, x.copy(), np.zeros_like(x), np.zeros_like(x), units, shares, least, splats, colors)
+    zero, rows = np.zeros_like(x), np.arange(len(x))
+    return State(x, x.copy(), zero, zero.copy(), units, shares, least, rows, splats, colors)
 
 
 def gaussians_of(x: np.ndarray, shN: np.ndarray) -> Gaussians:
@@ -134,6 +136,6 @@ def grow(state: State, photos: Photos, count: int) -> State:
     old = np.ones(len(x), bool)
     old[picked] = old[len(state.x) :] = False
     grown.x0[old], grown.units[old] = state.x0[old[: len(state.x)]], state.units[old[: len(state.x)]]
-    for name in ("m", "v", "box_shares", "min_sizes"):
+    for name in ("m", "v", "box_shares", "min_sizes", "origins"):
         getattr(grown, name)[:] = getattr(state, name)[source]
     return grown

@@ -22,7 +22,7 @@ from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.raster.blend import MAX_ALPHA
 from gsmerge.render import plan_view
 from gsmerge.render.composite import blend, view_colors
-from gsmerge.render.gradient import gradients_of
+from gsmerge.render.gradient import Gradients, gradients_of
 from gsmerge.render.metrics import decibels
 from gsmerge.render.photos import Photos, render_photos
 from gsmerge.runtime.threads import parallel_map
@@ -69,6 +69,7 @@ class FitPlan:
     dropout: float  # Share of the Gaussians that a step leaves out
     half_part: float  # Share of the steps, the first ones, on half-size photos
     poses: PoseState | None = None  # The motions of the cameras; None where they are fixed
+    fixed: np.ndarray | None = None  # [n] bool, Gaussians that stay as they are; None: none
 
     def level_at(self, step: int, progress: float) -> int:
         """Return the size of photos of a step: 1 half-size, which come first; 0 full-size; 2 larger, in between."""
@@ -121,6 +122,8 @@ def fit_step(state: State, plan: FitPlan, view: int, step: int, progress: float,
     g = gradients_of(drawn, colors, image, transmittance, gradient, None, with_viewmat=plan.poses is not None)
     if plan.poses is not None and g.viewmat is not None:  # that harmonics change with the camera is left out
         plan.poses.step(view, g.viewmat, plan.options.tuning, progress)
+    if plan.fixed is not None:
+        g = _take(g, ~plan.fixed[g.ids])
     rates, s, count = plan.options.tuning, state.splats, max(len(state.x), 1)
     steps = step_sizes(rates, progress, plan.options.steps)
     limits = np.array([rates.max_mean_shift, rates.max_scale_change, rates.max_opacity_change], np.float32)
@@ -137,6 +140,11 @@ def fit_step(state: State, plan: FitPlan, view: int, step: int, progress: float,
 
     parallel_map(update, range(0, len(g.ids), ROWS))
     return error / max(3 * float(weight.sum()), 1)
+
+
+def _take(g: Gradients, rows: np.ndarray) -> Gradients:
+    names = ("ids", "means", "quats", "scales", "opacities", "colors")
+    return replace(g, **{name: np.ascontiguousarray(getattr(g, name)[rows]) for name in names})
 
 
 def look_of(step: int, level: int, eps2d: float) -> dict[str, Any]:
@@ -227,6 +235,7 @@ def fit_full(
     progress: Progress | None = None,
     baseline_start: Gaussians | None = None,
     look: Survey | None = None,
+    fixed: np.ndarray | None = None,
 ) -> tuple[Gaussians, FitReport]:
     """Fit all parameters to the photos.
 
@@ -240,12 +249,13 @@ def fit_full(
     one already. ``progress`` is called after every step.
     """
     rng, state, plan = np.random.default_rng(seed), start_state(gaussians), plan_run(photos, options, seed)
+    plan = replace(plan, fixed=fixed)
     tail = TailMean()
     look = survey_photos(gaussians, photos) if look is None else look
     own, state.box_shares[:], state.min_sizes[:] = initial_scores(look, plan)
     before = after = own
     queue: list[int] = []
-    grows, step, steps, error, judged = options.grows, 0, options.steps, 0.0, False
+    grows, step, steps, error, judged = options.grows, 0, options.steps, 0.0, not options.judged
     started = time.perf_counter()
     while step < steps:
         part = step / steps
@@ -267,15 +277,15 @@ def fit_full(
             progress(step, steps, decibels(error), after)
     if not judged:
         before, after = judge(state, own, baseline_start, photos, plan)
-    if after <= before:
+    if options.judged and after <= before:
         why = f"held-out parts of the photos were no better after {step} steps"
-        return gaussians, FitReport("none", False, step, before, after, why)
+        return gaussians, FitReport("none", False, step, before, after, why, origins=np.arange(len(gaussians)))
     if grows:  # a time budget may end before the growth
         state = grow_to(state, plan.photos[1], count)
     why = "time budget spent" if options.time_budget is not None else "all steps done"
     viewmats = None if plan.poses is None else plan.poses.viewmats
     fitted = gaussians_of(tail.of(state.x), state.splats.shN)
-    return fitted, FitReport("full", True, step, before, after, why, viewmats)
+    return fitted, FitReport("full", True, step, before, after, why, viewmats, origins=state.origins)
 
 
 def affordable_steps(seconds: float, plan: FitPlan) -> int:

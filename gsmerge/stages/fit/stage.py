@@ -19,7 +19,7 @@ from gsmerge.stages.fit.fit_state import gaussians_of, grow_to, start_state
 from gsmerge.stages.fit.full import Progress, fit_full
 from gsmerge.stages.fit.photo_sizes import fit_photos
 from gsmerge.stages.fit.survey import Survey, survey_photos
-from gsmerge.types import Array, Gaussians, Scene
+from gsmerge.types import Array, Gaussians, Scene, as_array
 
 FitResult = tuple[Gaussians, FitReport]
 PhotosT = TypeVar("PhotosT")  # photos of one size, where a back end has them
@@ -114,16 +114,17 @@ def fit(
     baseline_start: Gaussians | None = None,
     *,
     exact: bool = False,
+    fixed: np.ndarray | None = None,
     backend: FitBackend[Any] = ON_CPU,
 ) -> tuple[Gaussians, FitReport | None]:
     """Leave out what no photo shows, and fit the rest to the photos; a draft without a fit leaves out nothing.
 
     Where the full fit does not make held-out parts of the photos better, the colour fit is tried.
-    ``photos``: see :func:`gsmerge.stages.fit.photo_sizes.fit_photos`; the CPU alone fits to
-    larger ones, and moves cameras. ``count``: number of Gaussians that the full fit may grow to; if it is ``exact``
-    and nothing grows, nothing is left out either. ``baseline_start``: another start that the full
-    fit may beat instead, see :func:`gsmerge.stages.fit.full.judge`. The report is None if
-    nothing was asked for.
+    ``photos``: see :func:`gsmerge.stages.fit.photo_sizes.fit_photos`; the CPU alone fits to larger
+    ones, moves cameras, and leaves Gaussians that are ``fixed [n]`` as they are. ``count``: number
+    of Gaussians that the full fit may grow to; if it is ``exact`` and nothing grows, nothing is left
+    out either. ``baseline_start``: another start that the full fit may beat instead, see
+    :func:`gsmerge.stages.fit.full.judge`. The report is None if nothing was asked for.
     """
     if exact and not options.grows:
         options = replace(options, min_contribution=0.0)
@@ -134,10 +135,10 @@ def fit(
         start = chosen.upload(gaussians)
         other = None if baseline_start is None else chosen.upload(baseline_start)
         sizes = tuple(chosen.upload_photos(one_size) for one_size in photos)
-        fitted, report = _choose_fit(chosen, start, sizes, options, count, seed, progress, other)
+        fitted, report = _choose_fit(chosen, start, sizes, options, count, seed, progress, other, fixed)
         return chosen.download(fitted), report and replace(report, device=chosen.device)
 
-    on_cpu = len(photos) > 2 or options.move_cameras  # what only the CPU's fit can do
+    on_cpu = len(photos) > 2 or options.move_cameras or fixed is not None  # what only the CPU's fit can do
     return run_on(ON_CPU if on_cpu else backend, "fit", fit_on)
 
 
@@ -152,7 +153,7 @@ def fit_scene(
         choose(start_count=len(decoded.gaussians))
         gaussians, report = fit(
             decoded.gaussians, photos, options, decoded.count, seed, report_steps, decoded.baseline_start,
-            exact=decoded.exact, backend=backend,
+            exact=decoded.exact, fixed=decoded.fixed, backend=backend,
         )  # fmt: skip
         record_fit(report)
     cameras = scene.cameras
@@ -181,24 +182,32 @@ def _choose_fit(
     seed: int,
     progress: Progress | None,
     baseline_start: Gaussians | None,
+    fixed: np.ndarray | None,
 ) -> tuple[Gaussians, FitReport | None]:
     """Run :func:`fit` on a back end, with Gaussians and photos of its own."""
     full, half = photos[:2]
     keep, look = backend.look_at(gaussians, photos, options.min_contribution)
-    kept = gaussians[keep]
+    kept, rows = gaussians[keep], np.flatnonzero(as_array(keep))
     if options.fit == "none":
         return kept, None
     fitted, report = backend.fit_full(
-        kept, photos, options, count, seed, progress, baseline_start=baseline_start, look=look
-    )
+        kept, photos, options, count, seed, progress, baseline_start=baseline_start, look=look,
+        fixed=None if fixed is None else fixed[rows],
+    )  # fmt: skip
     fitted, report = _better_of(backend, full, kept, fitted, report, CLOSE)
     if report.accepted:
-        return fitted, report
+        assert report.origins is not None
+        return fitted, replace(report, origins=rows[report.origins])
+    if not options.judged:
+        return kept, replace(report, origins=rows)
     if options.grows:  # the stages before left room for a growth that did not happen
         fitted, report = backend.fit_colors(backend.grow(kept, half, count), half, options, seed)
-        return _better_of(backend, full, kept, fitted, report, ALWAYS) if report.accepted else (kept, report)
+        if report.accepted:
+            return _better_of(backend, full, kept, fitted, report, ALWAYS)
+        return kept, replace(report, origins=rows)
     fitted, report = backend.fit_colors(gaussians, half, options, seed)
-    return _better_of(backend, full, kept, fitted[keep], report, ALWAYS)
+    fitted, report = _better_of(backend, full, kept, fitted[keep], report, ALWAYS)
+    return fitted, replace(report, origins=rows)
 
 
 def _better_of(

@@ -1,0 +1,215 @@
+"""Aligned scene -> blocks of views that see the same surfaces, each with some views of its neighbours.
+
+Views are nodes of a graph whose edges say how much of one view another one sees. Blocks grow from its rim, each time
+by the view that shares most with those in it, and then exchange views while that cuts less.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gsmerge.geometry import camera_centres, project
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.types import Cameras, Scene
+
+GRID = 24  # cells along the longer side of a view's depth map
+SAMPLES = 120  # cells of a view that are looked up in all others, at most
+SAME_DEPTH = 0.15  # share by which a point may lie behind the depth of a cell that shows it
+SHARED = 0.25  # views of neighbours that a block takes in addition, a share of its own
+SLACK = 0.2  # share by which blocks may differ from equal sizes
+SWEEPS = 8  # exchanges of views between blocks, at most
+POINTS = 65536  # per task
+BLOCK_GAUSSIANS = 8_000_000  # of a block's own views, of an automatic number of blocks
+WHOLE_GAUSSIANS = 20_000_000  # up to which a scene is in one piece
+
+
+@dataclass(frozen=True)
+class BlockOptions:
+    """Options of scenes with many views.
+
+    Args:
+        blocks: Number of blocks of views that are compacted one by one, so memory is that of one block. ``"auto"``:
+            one for every 8 million Gaussians of scenes with more than 20 million, one for each pixel; ``"none"``: one
+            piece.
+
+    Raises:
+        ValueError: If a setting is out of range.
+    """
+
+    blocks: int | str = "auto"
+
+    def __post_init__(self) -> None:
+        whole = isinstance(self.blocks, int) and not isinstance(self.blocks, bool) and self.blocks >= 1
+        if not whole and self.blocks not in ("auto", "none"):
+            raise ValueError(f'blocks: expected a number from 1, "auto" or "none", got {self.blocks!r}')
+
+
+@dataclass(frozen=True)
+class Block:
+    """Some views of a scene that are compacted together."""
+
+    own: tuple[int, ...]  # its views, ascending
+    shared: tuple[int, ...]  # views of other blocks that see the same surfaces, ascending
+
+    @property
+    def views(self) -> list[int]:
+        """All views of the block, ascending."""
+        return sorted((*self.own, *self.shared))
+
+
+@dataclass(frozen=True, eq=False)
+class Covisibility:
+    """What each of v views sees of the others, from coarse depth maps."""
+
+    cameras: Cameras
+    depths: np.ndarray  # [v,h,w] float64 depths of a coarse grid of each view, infinite where nothing is
+    shares: np.ndarray = field(repr=False)  # [v,v] share of the samples of one view (row) that another one sees
+    samples: np.ndarray = field(repr=False)  # [n,3] float64 some means of all views
+    sample_views: np.ndarray = field(repr=False)  # [n] the view of each
+
+    @property
+    def weights(self) -> np.ndarray:
+        """Weights ``[v,v]`` of the edges between views, the same in both directions."""
+        both = self.shares + self.shares.T
+        np.fill_diagonal(both, 0)
+        return both
+
+
+def measure_covisibility(scene: Scene) -> Covisibility:
+    """Measure how much of every view of an aligned scene each other one sees, hidden surfaces left out."""
+    cameras, step = scene.cameras, max(1, -(-max(scene.cameras.height, scene.cameras.width) // GRID))
+    rows, columns = (np.arange(step // 2, side, step) for side in (cameras.height, cameras.width))
+    picked = (rows[:, None] * cameras.width + columns).reshape(-1)
+    ids = np.arange(len(scene))[:, None] * scene.pixels_per_view + picked
+    means = scene.gaussians.means[ids].astype(np.float64)
+    valid = scene.valid.reshape(len(scene), -1)[:, picked]
+
+    def one_depth(view: int) -> np.ndarray:
+        z = project(means[view], cameras[[view]])[1][0]
+        return np.where(valid[view] & (z > 0), z, np.inf)
+
+    depths = np.stack(parallel_map(one_depth, range(len(scene)))).reshape(-1, len(rows), len(columns))
+    some = slice(None, None, max(1, len(picked) // SAMPLES))
+    samples = [means[view, some][valid[view, some]] for view in range(len(scene))]
+
+    def one_view(points: np.ndarray) -> np.ndarray:
+        return see(points, cameras, depths)[0].mean(1) if len(points) else np.zeros(len(scene))
+
+    shares = np.stack(parallel_map(one_view, samples))
+    numbers = np.repeat(np.arange(len(scene)), [len(points) for points in samples])
+    return Covisibility(cameras, depths, shares, np.concatenate(samples), numbers)
+
+
+def see(points: np.ndarray, cameras: Cameras, depths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return which of n points ``[n,3]`` are seen in each of c cameras, ``[c,n]``, and which lie in its frustum.
+
+    ``depths [c,h,w]`` are those of surfaces on a coarse grid: what lies behind them is not seen.
+    """
+    pixels, z = project(points, cameras)
+    inside = (z > 0) & (pixels > 0).all(-1) & (pixels < (cameras.width, cameras.height)).all(-1)
+    height, width = depths.shape[1:]
+    scale = np.array([width / cameras.width, height / cameras.height])
+    cells = np.where(inside[..., None], pixels * scale, 0).astype(np.int64)
+    nearest = depths[np.arange(len(depths))[:, None], cells[..., 1], cells[..., 0]]
+    return inside & (z <= (1 + SAME_DEPTH) * nearest), inside
+
+
+def count_factors(blocks: Sequence[Block], covisibility: Covisibility) -> np.ndarray:
+    """Return for each block by how much more Gaussians it needs than its views have, so that the parts are as dense.
+
+    What belongs to a block is seen by other blocks' views, too, whose Gaussians are left out.
+    """
+    views = range(len(covisibility.cameras))
+    owners = owning_views(covisibility.samples, covisibility, views)
+    factors = np.ones(len(blocks))
+    for i, block in enumerate(blocks):
+        inside = np.isin(owners, block.own)
+        used = np.isin(covisibility.sample_views, block.views)
+        kept = int((inside & used).sum())
+        if kept:
+            factors[i] = max(1.0, int(inside.sum()) / kept)
+    return factors
+
+
+def partition_views(weights: np.ndarray, count: int, shared: float = SHARED) -> list[Block]:
+    """Cluster v views into ``count`` blocks of similar size that share little, with some views of the neighbours.
+
+    ``weights [v,v]`` are symmetric, at least 0. Every view is in one block; a block's further views are those of the
+    others that share most with it, a share ``shared`` of its own, as far as they share anything.
+    """
+    labels = exchange(weights, grow_blocks(weights, count))
+    blocks = []
+    for label in range(count):
+        own = np.flatnonzero(labels == label)
+        seen = np.where(labels == label, 0, weights[own].sum(0))
+        nearest = np.argsort(-seen, kind="stable")[: round(shared * len(own))]
+        blocks.append(Block(tuple(own.tolist()), tuple(sorted(nearest[seen[nearest] > 0].tolist()))))
+    return blocks
+
+
+def grow_blocks(weights: np.ndarray, count: int) -> np.ndarray:
+    """Label v views ``[v]`` with 0 to ``count - 1``: blocks that grow one after the other from the rim of what is left.
+
+    The first view of a block shares least with those that no block has, the next ones most with the block.
+    """
+    num_views = len(weights)
+    labels, left = np.full(num_views, -1), np.ones(num_views, bool)
+    for label in range(count):
+        size = round(left.sum() / (count - label))
+        degrees = np.where(left, weights[:, left].sum(1), np.inf)
+        gain = np.where(left, 0.0, -np.inf)
+        view = int(degrees.argmin())
+        for _ in range(size):
+            labels[view], left[view] = label, False
+            gain += weights[view]
+            gain[view] = -np.inf
+            # of equals the one that leaves the fewest edges behind, so that no view is left alone
+            behind = weights[:, left].sum(1)
+            score = gain - 0.5 * np.where(left, behind, 0)
+            view = int(score.argmax())
+    return labels
+
+
+def exchange(weights: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """Move views ``[v]`` between blocks while less is cut, and sizes stay within ``SLACK`` of equal ones."""
+    labels, count = labels.copy(), int(labels.max()) + 1
+    mean = len(labels) / count
+    least, most = int(np.floor((1 - SLACK) * mean)), int(np.ceil((1 + SLACK) * mean))
+    for _ in range(SWEEPS):
+        moved = False
+        for view in range(len(labels)):
+            ties = np.bincount(labels, weights[view], count)
+            sizes, own = np.bincount(labels, minlength=count), labels[view]
+            free = (sizes < most) & (ties > ties[own])
+            if sizes[own] > max(1, least) and free.any():
+                labels[view] = int(np.where(free, ties, -np.inf).argmax())
+                moved = True
+        if not moved:
+            break
+    return labels
+
+
+def owning_views(points: np.ndarray, covisibility: Covisibility, views: Sequence[int]) -> np.ndarray:
+    """Return for n points ``[n,3]`` the one of the ``views`` that each belongs to: the nearest that sees it.
+
+    Where none does, the nearest with the point in its picture counts, and where there is none either, the nearest.
+    """
+    cameras, depths = covisibility.cameras[list(views)], covisibility.depths[list(views)]
+    centres = camera_centres(cameras.viewmats.astype(np.float64))
+
+    def some(first: int) -> np.ndarray:
+        part = points[first : first + POINTS].astype(np.float64)
+        best = np.zeros(len(part), np.int64)
+        kinds, nearest = np.full(len(part), 3), np.full(len(part), np.inf)
+        for view in range(len(views)):
+            seen, inside = (rows[0] for rows in see(part, cameras[[view]], depths[[view]]))
+            kind, squares = 2 - inside - 1 * seen, np.square(part - centres[view]).sum(1)
+            nearer = (kind < kinds) | ((kind == kinds) & (squares < nearest))
+            best[nearer], kinds[nearer], nearest[nearer] = view, kind[nearer], squares[nearer]
+        return best
+
+    best = np.concatenate([np.zeros(0, np.int64), *parallel_map(some, range(0, len(points), POINTS))])
+    return np.asarray(views)[best]
