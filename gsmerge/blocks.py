@@ -129,12 +129,14 @@ def without_gaussians(prepared: Prepared) -> Prepared:
 def fit_part(part: Part, joined: Gaussians, owners: np.ndarray, own: int, growth: float) -> Gaussians:
     """Fit the canonical Gaussians that a block's views may see, and return those of block ``own``."""
     scene, plan = part.prepared.scene, part.plan
-    rows = np.flatnonzero((owners == own) | shown_in_views(joined, scene))
+    fits = plan.fit.fit != "none" and scene.images is not None
+    rows = np.flatnonzero((owners == own) | shown_in_views(joined, scene) if fits else owners == own)
     decoded = Decoded(joined[rows], round(growth * len(rows)), exact=False)
     fitted = fit_scene(decoded, scene, part.prepared.photo_views, plan.fit, plan.seed, plan.backend)
-    origins = np.arange(len(rows)) if fitted.report is None else fitted.report.origins
-    assert origins is not None
-    return fitted.gaussians[owners[rows[origins]] == own]
+    if fitted.report is None:  # nothing was fitted, and what no photo shows is left out
+        return fitted.gaussians
+    assert fitted.report.origins is not None
+    return fitted.gaussians[owners[rows[fitted.report.origins]] == own]
 
 
 def score_part(part: Part, gaussians: Gaussians) -> None:

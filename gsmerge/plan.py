@@ -166,6 +166,8 @@ def choose_blocks(scene: Scene, options: CompactOptions) -> int:
         "poses free": options.prepare.poses == "free",
         "exposure per-photo": options.prepare.exposure == "per-photo",
     }
+    whole |= {"crop": options.clean.crop is not None, "drop_floaters": options.clean.drop_floaters}
+    whole |= {"drop_sky": options.clean.drop_sky}
     whole |= {"a scene without one Gaussian per pixel": not scene.aligned}
     problems = [name for name, holds in whole.items() if holds]
     if asked == "none" or asked == 1:

@@ -65,6 +65,25 @@ def test_without_photos(scene: Scene) -> None:
     assert len(result.gaussians)
 
 
+@pytest.mark.parametrize("checkpoint", ["none", "shipped"])
+def test_without_a_fit(scene: Scene, checkpoint: str) -> None:
+    """Each Gaussian is in one block, and they show the photos as those of one piece do."""
+    settings = {**SETTINGS, "checkpoint": checkpoint, "fit": "none"}
+    whole, result = (compact(scene, blocks=blocks, **settings) for blocks in ("none", 2))
+    scenes.assert_invariants(result.gaussians, scene)
+    assert scenes.psnr_of(result.gaussians, scene) > scenes.psnr_of(whole.gaussians, scene) - 1
+    assert len(np.unique(result.gaussians.means, axis=0)) == len(result.gaussians)
+
+
+def test_a_block_without_photos_that_show_it(scene: Scene) -> None:
+    """It is merged, and its neighbour is fitted."""
+    images = scene.images.copy()
+    images[:4] = np.random.default_rng(0).random(images[:4].shape, np.float32)
+    result = compact(replace(scene, images=images), blocks=2, **SETTINGS)
+    scenes.assert_invariants(result.gaussians, scene)
+    assert any("photo" in note for note in result.report.notes)
+
+
 def test_small_scenes_stay_in_one_piece(scene: Scene) -> None:
     assert choose_blocks(scene, CompactOptions()) == 1
     assert choose_blocks(scene, CompactOptions().with_settings({"blocks": 4})) == 4
@@ -82,7 +101,8 @@ def test_large_scenes_are_cut(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> 
     ("settings", "problem"),
     [
         ({"quality": "30dB"}, "quality 30dB"), ({"budget": "auto"}, "budget auto"), ({"levels": 2}, "levels"),
-        ({"method": "voxel"}, "method voxel"), ({"poses": "free"}, "poses free"),
+        ({"method": "voxel"}, "method voxel"), ({"poses": "free"}, "poses free"), ({"drop_sky": True}, "drop_sky"),
+        ({"crop": "sphere:0,0,3,2"}, "crop"), ({"drop_floaters": True}, "drop_floaters"),
     ],
 )  # fmt: skip
 def test_what_needs_one_piece(scene: Scene, settings: dict[str, Any], problem: str) -> None:
