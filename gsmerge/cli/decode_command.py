@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -94,7 +94,7 @@ def decode(args: opt.Args) -> None:
     document |= {
         "output": {"path": str(out), "bytes": out.stat().st_size, "num_gaussians": len(decoded.gaussians)},
         "ratio": len(decoded.gaussians) / max(stored.settings.num_input, 1),
-        "fit": decoded.fit and asdict(decoded.fit),
+        "fit": decoded.fit and decoded.fit.to_dict(),
         **seconds_document(seconds),
         "notes": [*decoded.notes, *notes],
     }

@@ -147,7 +147,7 @@ def _add_batch(
     if online.fit_colors:
         with stage("fit"):
             groups, report = fit_batch_colors(groups, photos, plan.fit, plan.seed)
-            choose(fit=asdict(report))
+            choose(fit=report.to_dict())
     replay = update_replay(state.replay, photos, ids, len(state.cameras), online.replay)
     return replace(state, groups=groups, replay=replay), counts
 

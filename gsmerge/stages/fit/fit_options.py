@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 import numpy as np
 
@@ -154,6 +154,10 @@ class FitReport:
     # [n] row of the start that each Gaussian comes from; None: not known
     origins: np.ndarray | None = field(default=None, compare=False)
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return all but the arrays, as plain values."""
+        return {name: value for name, value in vars(self).items() if name not in ("viewmats", "origins")}
+
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
@@ -168,9 +172,7 @@ def record_fit(report: FitReport | None) -> None:
     """Add what a fit did to the current record; None: nothing was fitted."""
     if report is None:
         return
-    numbers = asdict(report)
-    del numbers["viewmats"], numbers["origins"]
-    choose(fit=numbers)
+    choose(fit=report.to_dict())
     if not report.accepted:
         note("the fit was not accepted: held-out parts of the photos did not get better")
 
