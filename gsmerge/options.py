@@ -114,13 +114,18 @@ class CompactOptions:
 
     @property
     def whole_only(self) -> list[str]:
-        """Names of the settings in use that ``encode`` and ``extend`` cannot honour."""
+        """Names of the settings in use that need a scene in one piece."""
         budget = self.budget
         asked = {f"method {self.method}": self.method != "gsmerge", "levels": budget.levels > 1}
-        asked |= {f"quality {budget.quality}": budget.quality is not None, "k mixed": self.decode.k == MIXED}
-        asked |= {"crop": self.clean.crop is not None, "drop_floaters": self.clean.drop_floaters}
-        asked |= {"drop_sky": self.clean.drop_sky, f"blocks {self.blocks.blocks}": isinstance(self.blocks.blocks, int)}
+        asked |= {f"quality {budget.quality}": budget.quality is not None, "crop": self.clean.crop is not None}
+        asked |= {"drop_floaters": self.clean.drop_floaters, "drop_sky": self.clean.drop_sky}
         return [name for name, wanted in asked.items() if wanted]
+
+    @property
+    def compact_only(self) -> list[str]:
+        """Names of the settings in use that ``encode`` and ``extend`` cannot honour."""
+        asked = {"k mixed": self.decode.k == MIXED, f"blocks {self.blocks.blocks}": isinstance(self.blocks.blocks, int)}
+        return [*self.whole_only, *(name for name, wanted in asked.items() if wanted)]
 
     def to_dict(self) -> dict[str, Any]:
         """Return all settings by their flat names, as plain values."""

@@ -21,7 +21,7 @@ from gsmerge.stages.clean import CleanOptions, clean
 from gsmerge.stages.decode import USUAL_K, DecodeOptions
 from gsmerge.stages.fit import FitBackend, FitOptions, photo_scale, start_share
 from gsmerge.stages.match import MatchOptions, Method
-from gsmerge.stages.partition import BLOCK_GAUSSIANS, WHOLE_GAUSSIANS
+from gsmerge.stages.partition import usual_blocks
 from gsmerge.stages.prepare import Prepared
 from gsmerge.stages.segment import CountLimits, SuperpixelPlan, count_limits, scene_tree
 from gsmerge.stages.superpixels import AUTO_SHARE, SHARE, SegmentOptions
@@ -159,22 +159,20 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
 
 def choose_blocks(scene: Scene, options: CompactOptions) -> int:
     """Return the number of blocks in which a scene is compacted; UsageError where it cannot be in as many as asked."""
-    asked, budget = options.blocks.blocks, options.budget
-    whole = {f"method {options.method}": options.method != "gsmerge", f"levels {budget.levels}": budget.levels > 1}
-    whole |= {"budget auto": budget.auto, f"quality {budget.quality}": budget.quality is not None}
-    whole |= {
+    asked = options.blocks.blocks
+    whole = {
+        "budget auto": options.budget.auto,
         "poses free": options.prepare.poses == "free",
         "exposure per-photo": options.prepare.exposure == "per-photo",
+        "a scene without one Gaussian per pixel": not scene.aligned,
     }
-    whole |= {"crop": options.clean.crop is not None, "drop_floaters": options.clean.drop_floaters}
-    whole |= {"drop_sky": options.clean.drop_sky}
-    whole |= {"a scene without one Gaussian per pixel": not scene.aligned}
-    problems = [name for name, holds in whole.items() if holds]
-    if asked == "none" or asked == 1:
-        return 1
+    problems = [*options.whole_only, *(name for name, holds in whole.items() if holds)]
     if asked == "auto":
-        small = len(scene.gaussians) <= WHOLE_GAUSSIANS
-        return 1 if problems or small else min(len(scene), -(-len(scene.gaussians) // BLOCK_GAUSSIANS))
+        asked = 1 if problems else min(len(scene), usual_blocks(len(scene.gaussians)))
+    if asked in (1, "none"):
+        if options.blocks.engine.name != "local":
+            note("engine ray: the scene is compacted in one piece, on this machine; --blocks NUMBER makes several")
+        return 1
     if problems:
         raise UsageError(f"blocks {asked}: expected one piece (--blocks none) with {problems[0]}")
     if int(asked) > len(scene):

@@ -10,9 +10,9 @@ from gsmerge.io import AUTO, OUTPUT_FORMATS, ReadHints, output_format
 from gsmerge.io.content_hash import digest
 from gsmerge.io.formats.ply import OpacityChoice
 from gsmerge.options import CompactOptions
+from gsmerge.runtime.cluster import Engine
 
 FIELDS = ("stem", "parent", "index", "k")
-ENGINES = ("local", "ray")
 
 
 @dataclass(frozen=True)
@@ -59,14 +59,13 @@ class BatchOptions:
         budget = self.settings.budget
         if budget.in_bytes and output_format(self.output) != ".ply":
             raise ValueError(f"budget {budget.budget}: expected an output as .ply, got {self.output}; give a number")
-        is_ray, memory = self.engine == "ray", self.max_memory
+        is_ray = Engine(self.engine, self.address).name == "ray"
+        memory = self.max_memory
         for is_possible, problem in (
             (self.jobs is None or self.jobs >= 1, f"jobs: expected at least 1, got {self.jobs}"),
             (memory is None or memory >= 1, f"max memory: expected at least 1 byte, got {memory}"),
             (self.timeout is None or self.timeout > 0, f"timeout: expected more than 0 s, got {self.timeout}"),
             (self.retries >= 0, f"retries: expected at least 0, got {self.retries}"),
-            (self.engine in ENGINES, f"engine: expected one of {', '.join(ENGINES)}, got {self.engine!r}"),
-            (self.address is None or is_ray, f"address: expected engine ray, got {self.engine}"),
             (memory is None or not is_ray, "max memory: expected engine local; Ray knows the memory of its nodes"),
         ):
             if not is_possible:

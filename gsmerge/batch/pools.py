@@ -8,11 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import faulthandler
-import logging
 import multiprocessing
 import os
 import signal
-import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -21,20 +19,18 @@ from functools import lru_cache
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 from gsmerge.batch.batch_options import BatchOptions
 from gsmerge.batch.records import LOST, RecordIndex, record
 from gsmerge.batch.task import BatchContext, Task, clean_up, run_task
-from gsmerge.errors import SceneError, UsageError
 from gsmerge.options import CHECKPOINTS
+from gsmerge.runtime.cluster import SMALL_STORE, Cluster
 
 SCENES_PER_PROCESS = 200  # then it is replaced by a new one, so that what libraries leave in memory cannot add up
 STARTED = "begun"  # what a process sends when it takes a scene
 LIBRARIES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 EXTRA_TASKS = 2  # submitted beyond those that the cluster has processors for
-CONNECT_TIMEOUT = 10.0  # seconds to reach a cluster
 CLUSTER_SIZE_SECONDS = 5.0  # between two queries of the cluster's size
 
 
@@ -179,22 +175,13 @@ def run_worker(pipe: Connection, context: BatchContext) -> None:
             pipe.send(run_task(task, context, new_records))
 
 
-def require_ray() -> ModuleType:
-    """Import Ray; UsageError if it is not installed."""
-    try:
-        import ray
-    except ImportError as error:
-        raise UsageError("engine ray: Ray is not installed; pip install 'ray>=2.9,<3'") from error
-    return ray
-
-
 class RayPool:
     """A pool of ``jobs`` tasks of a Ray cluster; 0: as many as it has processors for."""
 
     def __init__(self, context: BatchContext, jobs: int) -> None:
-        self.ray = require_ray()
+        self.cluster = Cluster(context.options.address, store_bytes=SMALL_STORE)
+        self.ray = self.cluster.ray
         self.context, self.jobs = context, jobs
-        _join(self.ray, context.options)
         self.shared = self.ray.put(context)
         self.function = self.ray.remote(max_retries=0, max_calls=SCENES_PER_PROCESS)(run_remote)
         self.tasks: dict[Any, Task] = {}
@@ -206,24 +193,17 @@ class RayPool:
         if self.jobs:
             return len(self.tasks) < self.jobs
         if time.monotonic() > self.counted + CLUSTER_SIZE_SECONDS:
-            processors = self.ray.cluster_resources().get("CPU", 1.0)
-            self.capacity = max(1, int(processors // self._threads())) + EXTRA_TASKS
+            self.capacity = max(1, self.cluster.processors // self._threads()) + EXTRA_TASKS
             self.counted = time.monotonic()
         return len(self.tasks) < self.capacity
 
     def _threads(self) -> int:
         return self.context.options.settings.threads or 1
 
-    def _largest(self, resource: str) -> float:
-        """Return the most of a resource that a node has; a task that needs more waits forever."""
-        nodes = [node["Resources"] for node in self.ray.nodes() if node["Alive"]]
-        return max((node.get(resource, 0.0) for node in nodes), default=0.0)
-
     def submit(self, task: Task) -> None:
         """Take a scene."""
-        memory = min(task.job.memory, int(self._largest("memory")))
-        processors = min(self._threads(), max(1.0, self._largest("CPU")))
-        ref = self.function.options(num_cpus=processors, memory=memory).remote(task, self.shared)
+        needs = self.cluster.needs(self._threads(), task.job.memory)
+        ref = self.function.options(**needs).remote(task, self.shared)
         self.tasks[ref] = task
 
     def wait(self, seconds: float) -> list[tuple[Task, dict[str, Any]]]:
@@ -248,25 +228,7 @@ class RayPool:
         for ref in self.tasks:
             with contextlib.suppress(self.ray.exceptions.RayError, ValueError):
                 self.ray.cancel(ref, force=True)
-        self.ray.shutdown()
-
-
-def _join(ray: ModuleType, options: BatchOptions) -> None:
-    """Connect to the cluster, or start one of this machine alone."""
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-    quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
-    if options.address is None:
-        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-        ray.init(address="local", include_dashboard=False, object_store_memory=100 << 20, **quiet)
-        return
-    try:
-        host, _, port = options.address.removeprefix("ray://").rpartition(":")
-        if host and port.isdecimal():  # where nothing listens, Ray itself would wait for minutes
-            socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_TIMEOUT).close()
-        ray.init(address=options.address, **quiet)
-    except (OSError, ValueError, RuntimeError) as error:
-        problem = f"no Ray cluster answers there ({' '.join(str(error).split())[:200]})"
-        raise SceneError(options.address, problem, "start one with ray start --head") from error
+        self.cluster.close()
 
 
 def run_remote(task: Task, context: BatchContext) -> dict[str, Any]:

@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager, redirect_stdout
+from collections.abc import Sequence
+from contextlib import closing
 from typing import TYPE_CHECKING, TextIO
 
 import typer
 
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.console import duration, one_line, print_document, say, say_notes, say_warning, total_progress
+from gsmerge.cli.console import (
+    duration,
+    one_line,
+    print_document,
+    say,
+    say_notes,
+    say_warning,
+    separate_stdout,
+    total_progress,
+)
 from gsmerge.errors import BatchError, SceneError, TargetError, UsageError
 
 if TYPE_CHECKING:
@@ -51,11 +59,8 @@ def parse_jobs(text: str) -> int:
         opt.option("timeout", float, "Seconds that a scene may take.", min=0.001),
         opt.option("retries", int, "How often a scene is tried again whose process died or took too long.", default=1,
                    min=0),
-        opt.option("engine", ("local", "ray"), "local: processes on this machine; ray: a Ray cluster, gsmerge[ray].",
-                   default="local"),
-        opt.option("address", str, "Address of the Ray cluster, such as auto or HOST:PORT.",
-                   wording="one of this machine"),
     ),
+    "engine address",
     opt.output("Folder for the results; scenes whose result it holds are skipped.", default=opt.REQUIRED),
     *opt.panel(
         opt.OUTPUT,
@@ -87,7 +92,7 @@ def batch(args: opt.Args) -> None:
             engine=args.engine, address=args.address,
         )  # fmt: skip
     if options.engine == "ray" and not args.dry_run:
-        from gsmerge.batch.pools import require_ray
+        from gsmerge.runtime.cluster import require_ray
 
         require_ray()
     index = RecordIndex(out)
@@ -160,7 +165,7 @@ def run_jobs(
     from gsmerge.batch import run_batch
 
     with (
-        _separate_stdout(options, quiet=args.silent),
+        separate_stdout(options.engine, quiet=args.silent),
         closing(run_batch(jobs, args.output, options, index=index, schedule=schedule)) as records,
         total_progress(totals.total, quiet=args.silent) as progress,
     ):
@@ -179,16 +184,6 @@ def check_failures(totals: Totals, unit: str) -> None:
     if num_failed:
         scene, why = totals.failures[0]
         raise BatchError(f"{num_failed} of {totals.total} {unit} failed; the first: {scene}: {why}")
-
-
-@contextmanager
-def _separate_stdout(options: BatchOptions, *, quiet: bool) -> Iterator[None]:
-    """Keep Ray's own lines on stdout, about processes that were lost, apart from our lines in a block."""
-    if options.engine != "ray":
-        yield
-        return
-    with open(os.devnull, "w", encoding="utf-8") as nowhere, redirect_stdout(nowhere if quiet else sys.stderr):
-        yield
 
 
 def pending_jobs(jobs: Sequence[Job], out: Path, options: BatchOptions, index: RecordIndex) -> list[Job]:

@@ -11,7 +11,7 @@ from time import perf_counter
 from typing import TYPE_CHECKING
 
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.console import print_document, say, say_notes, say_warning, stage_progress
+from gsmerge.cli.console import print_document, say, say_notes, say_warning, separate_stdout, stage_progress
 from gsmerge.cli.paths import (
     FileOptions,
     check_embedding,
@@ -40,9 +40,9 @@ MORE = "more Gaussians (--k, --budget) or a longer fit (--effort) show them bett
     f"{opt.READING} masks k superpixels budget quality levels blocks",
     "effort fit exposure device method recipe checkpoint set crop",
     opt.output(f"{opt.COMPACT_SCENE} lod-meta.json: levels that stream, in chunks beside it.", "SCENE.compact.ply"),
-    f"overwrite strict report save_cameras embed_cameras dry_run {opt.RUN}",
+    f"overwrite strict report save_cameras embed_cameras dry_run engine address {opt.RUN}",
     rare="hint masks levels blocks fit exposure method recipe checkpoint crop strict save_cameras embed_cameras"
-         f" json quiet {opt.RUN}",
+         f" engine address json quiet {opt.RUN}",
 )  # fmt: skip
 def compact(args: opt.Args) -> None:
     """Write a compact scene that renders like the given one, or better, with 1 to 10 % of its Gaussians."""
@@ -53,6 +53,7 @@ def compact(args: opt.Args) -> None:
     from gsmerge.options import CompactOptions
 
     settings, writing = args.make(CompactOptions, FileOptions)
+    settings = _with_engine(settings, args)
     _check_scenes(args)
     files = args.files(*args.scenes)
     out = args.output or default_output(files.ply)
@@ -78,7 +79,7 @@ def compact(args: opt.Args) -> None:
     from gsmerge.report import result_table, summary_lines
 
     seconds_before = {"import": perf_counter() - start}
-    with stage_progress(quiet=args.silent) as progress:
+    with separate_stdout(args.engine, quiet=args.silent), stage_progress(quiet=args.silent) as progress:
         document = compact_files(
             files, settings, out, opacity=args.opacity, hints=hints, overwrite=args.overwrite, progress=progress,
             hashed=args.json or args.report is not None, seconds_before=seconds_before, report_path=args.report,
@@ -101,6 +102,17 @@ def compact(args: opt.Args) -> None:
         raise TargetError("; ".join(filter(None, problems)))
 
 
+def _with_engine(settings: CompactOptions, args: opt.Args) -> CompactOptions:
+    """Return the settings with the engine that was asked for; UsageError where it is not installed."""
+    from gsmerge.runtime.cluster import Engine, require_ray
+
+    with opt.usage_errors():
+        engine = Engine(args.engine, args.address)
+    if engine.name == "ray" and not args.dry_run:
+        require_ray()
+    return replace(settings, blocks=replace(settings.blocks, engine=engine))
+
+
 def _check_scenes(args: opt.Args) -> None:
     """Refuse several scenes with cameras for all, one that is missing, or is named twice."""
     if len(args.scenes) == 1:
@@ -120,13 +132,13 @@ def _warn_of_memory(files: SceneFiles, settings: CompactOptions, *, quiet: bool)
     """Warn before anything is read if the scene is not likely to fit into memory; in blocks it does."""
     from gsmerge.io.formats.ply_file import header_counts
     from gsmerge.runtime.estimate import memory_bytes, memory_problem
-    from gsmerge.stages.partition import WHOLE_GAUSSIANS
+    from gsmerge.stages.partition import gaussians_at_once, usual_blocks
 
     counts = [header_counts(one.ply) for one in (files, *files.more)]
     count, num_rest = sum(count for count, _ in counts), max(rest for _, rest in counts)
-    if settings.blocks.blocks != "none":
-        count = min(count, WHOLE_GAUSSIANS)
-    problem = memory_problem(memory_bytes(count, photos=True, num_rest=num_rest))
+    asked = settings.blocks.blocks
+    blocks = asked if isinstance(asked, int) else usual_blocks(count) if asked == "auto" else 1
+    problem = memory_problem(memory_bytes(gaussians_at_once(count, blocks), photos=True, num_rest=num_rest))
     if problem is not None:
         say(f"gsmerge: warning: {problem}", quiet=quiet)
 

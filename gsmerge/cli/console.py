@@ -9,7 +9,7 @@ import sys
 import textwrap
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, redirect_stdout, suppress
 from typing import Any
 
 Progress = Callable[[str, int, int], None]
@@ -143,6 +143,16 @@ def stage_progress(*, quiet: bool) -> Iterator[Progress]:
                 bars.update(tasks[name], completed=done, total=total, count=f"{done}/{total}", detail=detail)
 
         yield move
+
+
+@contextmanager
+def separate_stdout(engine: str, *, quiet: bool) -> Iterator[None]:
+    """Keep Ray's own lines on stdout, about processes that were lost, apart from our lines in a block."""
+    if engine != "ray":
+        yield
+        return
+    with open(os.devnull, "w", encoding="utf-8") as nowhere, redirect_stdout(nowhere if quiet else sys.stderr):
+        yield
 
 
 @contextmanager

@@ -374,6 +374,13 @@ _TABLE = (
         switch("json", "Print JSON on stdout."),
     ),
     panel(
+        "Running",
+        option("engine", ("local", "ray"), "Where scenes, or the blocks of one, are compacted. local: on this machine; "
+               "ray: a Ray cluster, gsmerge[ray].", default="local"),
+        option("address", str, "Address of the Ray cluster, such as auto or HOST:PORT.",
+               wording="one of this machine"),
+    ),
+    panel(
         GENERAL,
         option("seed", int, "Seed of all random numbers.", wording="0", min=0),
         option("threads", int, "Threads; the result does not depend on their number.", wording="all processors",

@@ -73,7 +73,7 @@ def encode_scene(
 def _without_fit(options: CompactOptions, settings: dict[str, Any]) -> CompactOptions:
     """Return the options without a fit and with fixed poses, so that batches can be added later."""
     fit = [f"fit {options.fit.fit}"] if settings.get("fit", "none") != "none" else []
-    for name in (*fit, *options.whole_only):
+    for name in (*fit, *options.compact_only):
         raise UsageError(f"{name}: cannot be encoded, as nothing is fitted or searched for; use compact")
     return replace(options, fit=replace(options.fit, fit="none"), prepare=replace(options.prepare, poses="fixed"))
 

@@ -33,7 +33,7 @@ from gsmerge.runtime.record import record_part
 from gsmerge.runtime.threads import available_threads, use_threads
 from gsmerge.stages.clean import BOX_QUANTILES, beyond_scene, floater_share
 from gsmerge.stages.compare_photos import compare_photos
-from gsmerge.stages.partition import SHARED
+from gsmerge.stages.partition import gaussians_at_once
 from gsmerge.stages.prepare import canonicalise
 from gsmerge.stages.segment import count_limits, largest_count
 from gsmerge.stages.sky import sky_regions
@@ -227,8 +227,7 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
         fit_steps=steps_for(options, limits.count or limits.default, scene),
     )  # fmt: skip
     blocks = choose_blocks(scene, options)
-    in_memory = pixels if blocks == 1 else round(pixels * (1 + SHARED) / blocks)
-    memory = memory_bytes(in_memory, photos=photos, num_rest=3 * scene.gaussians.shN.shape[1])
+    memory = memory_bytes(gaussians_at_once(pixels, blocks), photos=photos, num_rest=3 * scene.gaussians.shN.shape[1])
     distributed = limits.count is not None or options.budget.auto
     return {
         "num_gaussians": count,

@@ -154,7 +154,7 @@ def _add_batch(
 
 def _check(state: OnlineState | None, scene: Scene, options: CompactOptions, max_k: int) -> None:
     """Refuse settings that no state can have, and harmonics of another degree."""
-    for name in options.whole_only:
+    for name in options.compact_only:
         raise UsageError(f"{name}: goes with a whole scene, not with views that come one after the other; use compact")
     if options.fit.fit == "full":
         raise UsageError("fit full: goes with all photos together; expected none, and the full fit at decoding")

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gsmerge.geometry import camera_centres, project
+from gsmerge.runtime.cluster import Engine
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Scene
 
@@ -34,17 +35,29 @@ class BlockOptions:
         blocks: Number of blocks of views that are compacted one by one, so memory is that of one block. ``"auto"``:
             one for every 8 million Gaussians of scenes with more than 20 million, one for each pixel; ``"none"``: one
             piece.
+        engine: Where they are compacted: here, one after the other, or side by side on a Ray cluster.
 
     Raises:
         ValueError: If a setting is out of range.
     """
 
     blocks: int | str = "auto"
+    engine: Engine = field(default_factory=Engine, metadata={"setting": False})
 
     def __post_init__(self) -> None:
         whole = isinstance(self.blocks, int) and not isinstance(self.blocks, bool) and self.blocks >= 1
         if not whole and self.blocks not in ("auto", "none"):
             raise ValueError(f'blocks: expected a number from 1, "auto" or "none", got {self.blocks!r}')
+
+
+def usual_blocks(num_gaussians: int) -> int:
+    """Return the number of blocks for an aligned scene of so many Gaussians."""
+    return 1 if num_gaussians <= WHOLE_GAUSSIANS else -(-num_gaussians // BLOCK_GAUSSIANS)
+
+
+def gaussians_at_once(num_gaussians: int, blocks: int) -> int:
+    """Return how many Gaussians of a scene are in memory at once when it is compacted in so many blocks."""
+    return num_gaussians if blocks == 1 else round(num_gaussians * (1 + SHARED) / blocks)
 
 
 @dataclass(frozen=True)

@@ -166,6 +166,8 @@ def test_every_option_is_a_field_of_the_api() -> None:
         "save-cameras",
         "strict",
         "embed-cameras",
+        "engine",
+        "address",
         "dry-run",
         "json",
         "quiet",

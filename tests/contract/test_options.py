@@ -14,7 +14,6 @@ import typer.main
 
 import gsmerge
 from gsmerge.batch import BatchOptions
-from gsmerge.batch.batch_options import ENGINES
 from gsmerge.cli import main
 from gsmerge.cli.app import app
 from gsmerge.cli.parameters import HINTS, OPTIONS, setting_kinds
@@ -23,6 +22,7 @@ from gsmerge.measure.evaluate import NETS
 from gsmerge.online.options import OnlineOptions
 from gsmerge.research.generate import GenerateOptions
 from gsmerge.research.training import preset_options
+from gsmerge.runtime.cluster import ENGINES
 
 COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 SETTINGS = gsmerge.CompactOptions().to_dict()
@@ -51,7 +51,7 @@ def test_choices_are_the_library_s(name: str) -> None:
     if name in SETTINGS:
         known = expected(gsmerge.CompactOptions().with_settings, {name: "?"})
     else:
-        known = {"lpips": {*NETS, "both", "none"}}[name]
+        known = {"lpips": {*NETS, "both", "none"}, "engine": {*ENGINES}}[name]
     assert set(given) == known
 
 
@@ -87,8 +87,8 @@ def test_defaults_of_single_commands_are_the_library_s() -> None:
 
 
 def test_there_are_few_options() -> None:
-    """401 before settings and hints were given by name; three are a video's path and length, one is blocks."""
-    assert sum(len(command.params) for command in COMMANDS.values()) <= 246
+    """401 before settings and hints were given by name; of the last six three are a video's, three are of blocks."""
+    assert sum(len(command.params) for command in COMMANDS.values()) <= 248
     assert sum(not getattr(p, "hidden", False) for p in COMMANDS["compact"].params) <= 15
 
 

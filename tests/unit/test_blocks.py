@@ -10,6 +10,7 @@ import pytest
 import scenes
 
 from gsmerge import CompactOptions, compact
+from gsmerge.budget import DEVICES
 from gsmerge.errors import UsageError
 from gsmerge.plan import choose_blocks
 from gsmerge.stages.fit import FitOptions, fit
@@ -54,6 +55,15 @@ def test_a_budget_is_met_exactly(scene: Scene) -> None:
     assert len(result.gaussians) == 700
 
 
+def test_a_device_limits_the_whole(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As many as it draws in all, not in each block; fewer where superpixels ask for fewer."""
+    monkeypatch.setitem(DEVICES, "quest3", 600)
+    assert len(compact(scene, blocks=2, budget="quest3", **SETTINGS).gaussians) == 600
+    free = compact(scene, blocks=2, **SETTINGS)
+    monkeypatch.setitem(DEVICES, "quest3", 5000)
+    assert scenes.identical(compact(scene, blocks=2, budget="quest3", **SETTINGS).gaussians, free.gaussians)
+
+
 def test_threads_do_not_change_a_bit(scene: Scene) -> None:
     one, two = (compact(scene, blocks=2, **{**SETTINGS, "threads": threads}) for threads in (1, 2))
     assert scenes.identical(one.gaussians, two.gaussians)
@@ -91,8 +101,8 @@ def test_small_scenes_stay_in_one_piece(scene: Scene) -> None:
 
 
 def test_large_scenes_are_cut(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gsmerge.plan.WHOLE_GAUSSIANS", 5000)
-    monkeypatch.setattr("gsmerge.plan.BLOCK_GAUSSIANS", 4000)
+    monkeypatch.setattr("gsmerge.stages.partition.WHOLE_GAUSSIANS", 5000)
+    monkeypatch.setattr("gsmerge.stages.partition.BLOCK_GAUSSIANS", 4000)
     assert choose_blocks(scene, CompactOptions()) == 3
     assert choose_blocks(scene, CompactOptions().with_settings({"levels": 2})) == 1
 

@@ -2,9 +2,9 @@
 
 from gsmerge.stages.fit.fit_options import Fit, FitOptions, FitReport, Fitted, Tuning, record_fit, report_steps
 from gsmerge.stages.fit.photo_sizes import fit_photos, photo_scale
-from gsmerge.stages.fit.stage import ON_CPU, FitBackend, fit, fit_scene, run_on, start_share, visible_mask
+from gsmerge.stages.fit.stage import ON_CPU, FitBackend, fit, fit_scene, peak_weights, run_on, start_share, visible_mask
 
 __all__ = [
     "ON_CPU", "Fit", "FitBackend", "FitOptions", "FitReport", "Fitted", "Tuning", "fit", "fit_photos",
-    "fit_scene", "photo_scale", "record_fit", "report_steps", "run_on", "start_share", "visible_mask",
+    "fit_scene", "peak_weights", "photo_scale", "record_fit", "report_steps", "run_on", "start_share", "visible_mask",
 ]  # fmt: skip

@@ -53,6 +53,12 @@ class FitBackend(Generic[PhotosT]):
 
 def visible_mask(gaussians: Gaussians, photos: Photos, min_weight: float) -> np.ndarray:
     """Return a mask ``[n]`` of Gaussians with a weight of ``min_weight`` in some photo, or in no photo's frustum."""
+    peaks, inside = peak_weights(gaussians, photos)
+    return ~inside | (peaks >= min_weight)
+
+
+def peak_weights(gaussians: Gaussians, photos: Photos) -> tuple[np.ndarray, np.ndarray]:
+    """Return the largest blending weights of n Gaussians in some photos, ``[n]``, and which lie in some frustum."""
     splats = prepare(gaussians)
 
     def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
@@ -63,7 +69,7 @@ def visible_mask(gaussians: Gaussians, photos: Photos, min_weight: float) -> np.
     for ids, peaks in in_turn(one_view, range(len(photos))):
         inside[ids] = True
         np.maximum(peak, peaks, out=peak)
-    return ~inside | (peak >= min_weight)
+    return peak, inside
 
 
 def _look_at(gaussians: Gaussians, photos: tuple[Photos, ...], min_weight: float) -> tuple[Array, Survey]:
