@@ -91,7 +91,7 @@ def row(scene: Path, views: int, degree: int, settings: str, out: Path) -> str:
     plan = subprocess.run(
         [sys.executable, "-m", "gsmerge", *words, "--overwrite"], check=True, capture_output=True, text=True
     )
-    guess = json.loads(plan.stdout)["estimate"]
+    guess = json.loads(plan.stdout)["compact"]
     count, peak = report["input"]["num_gaussians"], report["peak_memory_bytes"]
     stages = sorted(report["seconds"].items(), key=lambda item: -item[1])
     longest = ", ".join(f"{name} {seconds:.0f}" for name, seconds in stages if name != "total" and seconds >= 1)

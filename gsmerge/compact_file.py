@@ -116,7 +116,7 @@ def compact_files(
         lost = lost_harmonics(out, result.gaussians.sh_degree, spz_version)
         document = report_document(
             result.report,
-            input_path=files.ply,
+            input_paths=files.plys,
             output_path=out,
             seconds_before={**(seconds_before or {}), "read": read - start},
             seconds_after={"write": perf_counter() - compacted},
@@ -215,6 +215,8 @@ def recognised_of(loaded: SceneLoad) -> dict[str, Any]:
     views: dict[str, Any] = {"num_views": len(cameras), "height": cameras.height, "width": cameras.width}
     views |= {"exporters": [exporter.name for exporter in loaded.exporters], "rows": recovery and recovery.description}
     views["moved_cameras"] = list(loaded.moves)
+    if loaded.files.parts:
+        views["parts"] = [str(path) for path in loaded.files.parts]
     if loaded.joined:
         num_bytes = sum(os.stat(one["path"]).st_size for one in loaded.joined if one["joined"])
         views |= {"files": list(loaded.joined), "bytes": num_bytes}

@@ -17,12 +17,13 @@ from gsmerge.runtime.memory import human_bytes
 SCHEMA_VERSION = 1
 
 
-def file_sha256(path: Path) -> str:
-    """Return the hexadecimal SHA-256 of a file."""
+def file_sha256(*paths: Path) -> str:
+    """Return the hexadecimal SHA-256 of a file, or of several, one after the other."""
     digest = hashlib.sha256()
-    with open(path, "rb") as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
+    for path in paths:
+        with open(path, "rb") as file:
+            while block := file.read(1 << 20):
+                digest.update(block)
     return digest.hexdigest()
 
 
@@ -34,7 +35,7 @@ def document_head() -> dict[str, Any]:
 def report_document(
     report: CompactReport,
     *,
-    input_path: Path,
+    input_paths: Sequence[Path],
     output_path: Path,
     seconds_before: Mapping[str, float],
     seconds_after: Mapping[str, float],
@@ -62,9 +63,9 @@ def report_document(
     return {
         **document_head(),
         "input": {
-            "path": os.fspath(input_path),
-            "sha256": file_sha256(input_path) if hashed else None,
-            "bytes": input_path.stat().st_size,
+            "path": os.fspath(input_paths[0]),
+            "sha256": file_sha256(*input_paths) if hashed else None,
+            "bytes": sum(path.stat().st_size for path in input_paths),
             "num_gaussians": numbers["num_input"],
             **(recognised or {}),
         },

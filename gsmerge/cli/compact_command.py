@@ -56,7 +56,7 @@ def compact(args: opt.Args) -> None:
     settings = _with_engine(settings, args)
     _check_scenes(args)
     files = args.files(*args.scenes)
-    out = args.output or default_output(files.ply)
+    out = args.output or default_output(files.ply.with_name("scene.ply") if files.parts else files.ply)
     streamed = is_index(out)
     if streamed and settings.method == "gsmerge" and "levels" not in args.values(CompactOptions):
         settings = settings.with_settings({"levels": STREAMED_LEVELS})
@@ -134,7 +134,7 @@ def _warn_of_memory(files: SceneFiles, settings: CompactOptions, *, quiet: bool)
     from gsmerge.runtime.estimate import memory_bytes, memory_problem
     from gsmerge.stages.partition import gaussians_at_once, usual_blocks
 
-    counts = [header_counts(one.ply) for one in (files, *files.more)]
+    counts = [header_counts(ply) for one in (files, *files.more) for ply in one.plys]
     count, num_rest = sum(count for count, _ in counts), max(rest for _, rest in counts)
     asked = settings.blocks.blocks
     blocks = asked if isinstance(asked, int) else usual_blocks(count) if asked == "auto" else 1

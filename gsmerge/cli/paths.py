@@ -136,7 +136,7 @@ def is_camera_file(path: Path) -> bool:
 
 def input_files(files: SceneFiles) -> tuple[Path, ...]:
     """List the files of Gaussians, cameras and photos that are read."""
-    own = tuple(path for path in (files.ply, files.cameras, files.images, files.masks) if path is not None)
+    own = tuple(path for path in (*files.plys, files.cameras, files.images, files.masks) if path is not None)
     return (*own, *(path for one in files.more for path in input_files(one)))
 
 

@@ -335,7 +335,7 @@ def _read(
     from gsmerge.io import place_cameras_in_scene, ply_notes, read_gaussians, read_ply_with_hints
 
     check_cameras(like)
-    first = read_ply_with_hints(files.ply, opacity=args.opacity, hints=hints)
+    first = read_ply_with_hints(files, opacity=args.opacity, hints=hints)
     others = [read_gaussians(path, opacity=args.opacity) for path in args.scenes[1:]]
     own = like.ply == files.ply
     framed = first if own else read_gaussians(like.ply)

@@ -41,7 +41,7 @@ def content_hash(files: Sequence[Path]) -> str:
 
 def read_files(files: SceneFiles) -> list[Path]:
     """List everything that is read of a scene, each once: files, and folders that are read as a whole."""
-    paths = [path for path in (files.ply, files.cameras, files.images, files.masks) if path is not None]
+    paths = [path for path in (*files.plys, files.cameras, files.images, files.masks) if path is not None]
     if files.cameras is not None:
         root = files.cameras if files.cameras.is_dir() else files.cameras.parent
         folders = (root, files.ply.parent)

@@ -30,7 +30,7 @@ from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views
 from gsmerge.io.cameras.json_files import DATAPARSER, find_dataparser, read_dataparser
 from gsmerge.io.cameras.npz_files import read_depths
 from gsmerge.io.exporters import AUTO, Exporter, ReadHints, choose_exporters, find_exporter, make_hints
-from gsmerge.io.formats.ply import OpacityChoice, PlyInfo, PlyScene, ply_notes, read_gaussians
+from gsmerge.io.formats.ply import OpacityChoice, PlyInfo, PlyScene, ply_notes, read_gaussians, read_parts
 from gsmerge.io.photo_files import as_floats, photo_size
 from gsmerge.io.registration.join import join_scenes
 from gsmerge.io.scene_files import SceneFiles, find_scene_files
@@ -163,8 +163,8 @@ def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: Rea
 
 
 def _load_one(files: SceneFiles, opacity: OpacityChoice, hints: ReadHints) -> SceneLoad:
-    ply = read_ply_with_hints(files.ply, opacity=opacity, hints=hints)
-    return align_scene(ply, files, hints=hints)
+    load = align_scene(read_ply_with_hints(files, opacity=opacity, hints=hints), files, hints=hints)
+    return replace(load, notes=(*files.notes, *load.notes))
 
 
 def _join_loads(loads: Sequence[SceneLoad], files: SceneFiles) -> SceneLoad:
@@ -188,12 +188,12 @@ def _join_loads(loads: Sequence[SceneLoad], files: SceneFiles) -> SceneLoad:
     )
 
 
-def read_ply_with_hints(path: Path, *, opacity: OpacityChoice, hints: ReadHints) -> PlyScene:
-    """Read the rows of a file, with opacities as given, or as the given exporter stores them."""
+def read_ply_with_hints(files: SceneFiles, *, opacity: OpacityChoice, hints: ReadHints) -> PlyScene:
+    """Read the rows of a scene's files, with opacities as given, or as the given exporter stores them."""
     exporter = find_exporter(hints.exporter)
     if exporter is not None and exporter.opacity == "logit" and opacity == "auto":
         opacity = "logit"  # activated ones show themselves, and some versions write logits in their place
-    return read_gaussians(path, opacity=opacity)
+    return read_parts(files.parts, opacity=opacity) if files.parts else read_gaussians(files.ply, opacity=opacity)
 
 
 def align_scene(

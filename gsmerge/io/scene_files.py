@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,10 +13,7 @@ from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.embedded import holds_cameras
 from gsmerge.io.cameras.npz_files import holds_images
 from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
-from gsmerge.io.cameras.read import (
-    find_cameras,
-    find_other_cameras,
-)
+from gsmerge.io.cameras.read import find_cameras, find_other_cameras, read_cameras, read_sharp
 from gsmerge.io.image_names import list_images
 from gsmerge.types import StrPath
 
@@ -25,6 +23,9 @@ SCENES_PLACE = "gaussians"  # where DepthSplat and its relatives write NAME.ply,
 IMAGE_PLACES = ("images", "input", "context", "rgb", "input_images")
 MASK_PLACES = ("masks",)
 _POINT_CLOUDS = {"input.ply", "points3D.ply", "points.ply", "sparse_pc.ply"}  # of other programs
+_NUMBERED = re.compile(r"(.*?)[-_. ]?(\d+)\.ply")
+# what files are called that have a view or a part each
+_PARTS = {"view", "chunk", "part", "block", "tile"}
 _RESULT = re.compile(r"\.compact(\.level\d+)?(\.compressed)?\.ply$")
 
 
@@ -41,6 +42,19 @@ class SceneFiles:
     images: Path | None
     masks: Path | None = None  # a folder
     more: tuple[SceneFiles, ...] = ()  # other scenes of the same place, each in a frame of its own
+    parts: tuple[Path, ...] = ()  # all files whose rows the scene has, ``ply`` first; empty for one
+
+    @property
+    def plys(self) -> tuple[Path, ...]:
+        """Files of Gaussians, in the order of their rows."""
+        return self.parts or (self.ply,)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """That several files are read as one scene."""
+        if not self.parts:
+            return ()
+        return (f"{len(self.parts)} files are read as one scene: {self.ply.name} to {self.parts[-1].name}",)
 
 
 def find_scene_files(
@@ -61,11 +75,14 @@ def find_scene_files(
     that the model saw.
 
     Raises:
-        SceneError: If there is no ``.ply``, several to choose from, or a named file does not exist.
+        SceneError: If there is no ``.ply``, several to choose from, or a named file does not exist. Several are one
+            scene if they are numbered views or parts, see ``docs/guide/formats.md``.
     """
     path = Path(path)
-    ply = _find_ply(path) if os.path.isdir(path) else path
-    check_file(ply)
+    plys = _find_plys(path, _named(cameras)) if os.path.isdir(path) else [path]
+    ply = plys[0]
+    for one in plys:
+        check_file(one)
     given = path if ply != path else ply.parent
     folder = Path(os.path.realpath(ply.parent))
     above = [folder.parent] * (folder.name in ("gs_ply", SCENES_PLACE))
@@ -91,7 +108,7 @@ def find_scene_files(
         beside = [] if image_path is None else [image_path.parent]
         candidates = (root / place for root in (*beside, *roots) for place in MASK_PLACES)
         mask_path = next((f for f in candidates if f.is_dir() and list_images(f)), None)
-    return SceneFiles(ply, camera_path, image_path, mask_path)
+    return SceneFiles(ply, camera_path, image_path, mask_path, parts=tuple(plys) if len(plys) > 1 else ())
 
 
 def _named(path: StrPath | None) -> Path | None:
@@ -104,15 +121,41 @@ def _named(path: StrPath | None) -> Path | None:
     return Path(path)
 
 
-def _find_ply(folder: Path) -> Path:
+def _find_plys(folder: Path, cameras: Path | None) -> list[Path]:
     named = named_ply(folder)
     plys = other_plys(folder) or other_plys(folder / SCENES_PLACE) if named is None else [named]
     if len(plys) == 1:
-        return plys[0]
+        return plys
     if not plys:
         raise SceneError(folder, "expected a .ply file in the folder, found none")
-    names = ", ".join(p.name for p in plys[:4])
-    raise SceneError(folder, f"expected one .ply file in the folder, found {len(plys)} ({names})", "name one")
+    parts = _order_parts(folder, plys, cameras or find_cameras(folder))
+    if parts is None:
+        names = ", ".join(p.name for p in plys[:4])
+        raise SceneError(folder, f"expected one .ply file in the folder, found {len(plys)} ({names})", "name one")
+    return parts
+
+
+def _order_parts(folder: Path, plys: Sequence[Path], cameras: Path | None) -> list[Path] | None:
+    """Return files that have a view or a part of one scene each by their numbers; None where they are several scenes.
+
+    They are parts if their names say so, or if there are as many as cameras of all. A file with a camera of its own
+    is in a frame of its own.
+    """
+    matches = [_NUMBERED.fullmatch(path.name) for path in plys]
+    names = {match[1].lower() if match else "" for match in matches}
+    numbers = {int(match[2]): path for match, path in zip(matches, plys, strict=True) if match}
+    if len(names) > 1 or len(numbers) < len(plys) or holds_cameras(plys[0]) or read_sharp(plys[0]) is not None:
+        return None
+    ordered = sorted(numbers)
+    if re.split(r"[-_. ]", names.pop())[-1] in _PARTS:
+        missing = sorted(set(range(ordered[0], ordered[-1])) - set(ordered))
+        if missing:
+            first, last = (numbers[ordered[place]].name for place in (0, -1))
+            problem = f"expected all parts from {first} to {last}, found none with number {missing[0]}"
+            raise SceneError(folder, problem, "add it, or name one of the files")
+    elif cameras is None or len(read_cameras(cameras)) != len(plys):
+        return None
+    return [numbers[number] for number in ordered]
 
 
 def named_ply(folder: Path) -> Path | None:

@@ -91,7 +91,7 @@ def inspect(
     read_hints = make_hints(hints)
     files = find_scene_files(path, cameras=cameras, images=images, masks=masks)
     with use_threads():
-        ply = read_ply_with_hints(files.ply, opacity=opacity, hints=read_hints)
+        ply = read_ply_with_hints(files, opacity=opacity, hints=read_hints)
         document: dict[str, Any] = finite(_describe_file(ply) | _describe_views(ply, files, read_hints))
     return document
 

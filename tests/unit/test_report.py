@@ -34,7 +34,7 @@ def make_document(files: tuple[Path, Path], **changes: Any) -> dict[str, Any]:
     }
     return report.report_document(
         CompactReport(**{**numbers, **changes}),
-        input_path=files[0],
+        input_paths=[files[0]],
         output_path=files[1],
         seconds_before={"read": 0.25},
         seconds_after={"write": 0.125},

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -115,16 +115,29 @@ def read_ply(path: StrPath, *, opacity: OpacityChoice = "auto") -> PlyScene:
         SceneError: If the file cannot be read, lacks columns, or hardly has a finite Gaussian: 2 in 1,000 rows.
         ValueError: If ``opacity`` is none of the three.
     """
+    return read_parts([Path(path)], opacity=opacity)
+
+
+def read_parts(paths: Sequence[Path], *, opacity: OpacityChoice = "auto") -> PlyScene:
+    """Read one PLY file, or several with the same columns as if they were one, in their order, see :func:`read_ply`."""
     if opacity not in ("auto", "logit", "raw"):
         raise ValueError(f"opacity: expected 'auto', 'logit' or 'raw', got {opacity!r}")
-    path = Path(path)
+    parts = [_open_rows(path) for path in paths]
+    for path, part in zip(paths, parts, strict=True):
+        if np.asarray(part.rows).dtype.names != np.asarray(parts[0].rows).dtype.names:
+            problem = f"expected the columns of {paths[0].name}, found others, so they are no parts of one scene"
+            raise SceneError(path, problem, "name one of the files")
+    return _to_scene(paths, parts, opacity)
+
+
+def _open_rows(path: Path) -> StoredRows:
     data = ply_file.open_ply(path)
     compressed = is_compressed(data)
     rows = unpack(path, data) if compressed else _vertex(path, data).data
     names = tuple(np.asarray(rows).dtype.names or ())
     num_rest = _num_rest(path, names)
     comments = (*data.comments, *(c for e in data.elements for c in e.comments))
-    stored = StoredRows(
+    return StoredRows(
         rows=rows,
         layout=ply_file.layout_name(names, num_rest, compressed=compressed),
         format="ascii" if data.text else "binary big-endian" if data.byte_order == ">" else "binary little-endian",
@@ -132,7 +145,6 @@ def read_ply(path: StrPath, *, opacity: OpacityChoice = "auto") -> PlyScene:
         comments=comments,
         extra_elements=tuple(e.name for e in data.elements if e.name != "vertex"),
     )
-    return _to_scene(path, stored, opacity)
 
 
 def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto") -> PlyScene:
@@ -143,7 +155,7 @@ def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto") -> PlyScen
     cannot be read, is damaged, or holds no finite Gaussian; ValueError for another ``opacity``.
     """
     read = find_reader(Path(path))
-    return read_ply(path, opacity=opacity) if read is None else _to_scene(Path(path), read(Path(path)), "auto")
+    return read_ply(path, opacity=opacity) if read is None else _to_scene([Path(path)], [read(Path(path))], "auto")
 
 
 def find_reader(path: Path) -> Callable[[Path], StoredRows] | None:
@@ -153,28 +165,24 @@ def find_reader(path: Path) -> Callable[[Path], StoredRows] | None:
 
 def read_level(path: Path, level: int) -> PlyScene:
     """Read one level of detail of a ``lod-meta.json``, 0 the finest; SceneError as of :func:`read_gaussians`."""
-    return _to_scene(path, streamed.read_rows(path, level), "auto")
+    return _to_scene([path], [streamed.read_rows(path, level)], "auto")
 
 
-def _to_scene(path: Path, stored: StoredRows, opacity: OpacityChoice) -> PlyScene:
-    rows = np.asarray(stored.rows)
+def _to_scene(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: OpacityChoice) -> PlyScene:
+    """Convert the rows of files, one after the other; facts that are not sums are those of the first."""
+    path, stored, rows = paths[0], parts[0], np.asarray(parts[0].rows)
     names = tuple(rows.dtype.names or ())
     num_rest = _num_rest(path, names)
-    n, size = len(rows), max(1, ply_file.BLOCK_BYTES // rows.dtype.itemsize)
+    n = sum(len(part.rows) for part in parts)
     wide = any(rows.dtype[name].kind == "f" and rows.dtype[name].itemsize == 8 for name in ply_file.MEANS)
     shapes = {"quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh0": (n, 1, 3), "shN": (n, num_rest // 3, 3)}
     out = {"means": make_array((n, 3), np.float64 if wide else np.float32), "valid": np.empty(n, np.bool_)}
     out |= {name: make_array(shape, np.float32) for name, shape in shapes.items()}
-    with ply_file.open_rows(path, stored.rows) as read:
-
-        def convert(start: int) -> tuple[int, int]:
-            block = slice(start, min(start + size, n))
-            counts = _convert(read(block), {name: column[block] for name, column in out.items()})
-            if start % FREED_ROWS < size:
-                free_pages(out.values())
-            return counts
-
-        num_clipped, num_zero_quats = map(sum, zip(*parallel_map(convert, range(0, n, size)), strict=True))
+    num_clipped = num_zero_quats = first = 0
+    for name, part in zip(paths, parts, strict=True):
+        some = slice(first, first + len(part.rows))
+        clipped, zero = _convert_file(name, part, {key: column[some] for key, column in out.items()})
+        num_clipped, num_zero_quats, first = num_clipped + clipped, num_zero_quats + zero, some.stop
     known = opacity if opacity != "auto" else stored.encoding
     encoding = _activate(out["opacities"], out["valid"], known)
     num_bad = clear_invalid(path, out)
@@ -188,8 +196,8 @@ def _to_scene(path: Path, stored: StoredRows, opacity: OpacityChoice) -> PlyScen
         layout=stored.layout,
         format=stored.format,
         count=n,
-        file_bytes=path.stat().st_size + stored.bytes_beside,
-        bytes_by_attribute=stored.sizes or ply_file.bytes_by_attribute(rows, extra),
+        file_bytes=sum(path.stat().st_size + part.bytes_beside for path, part in zip(paths, parts, strict=True)),
+        bytes_by_attribute=stored.sizes or ply_file.bytes_by_attribute(rows.dtype, n, extra),
         columns=names,
         extra_columns=extra,
         extra_elements=stored.extra_elements,
@@ -227,6 +235,22 @@ def _vertex(path: Path, data: PlyData) -> PlyElement:
     if vertex.count == 0:
         raise SceneError(path, "expected at least one Gaussian, found 0 vertices")
     return vertex
+
+
+def _convert_file(path: Path, stored: StoredRows, out: dict[str, np.ndarray]) -> tuple[int, int]:
+    """Fill arrays with the rows of a file, and count what was clipped and what had no rotation."""
+    n, size = len(stored.rows), max(1, ply_file.BLOCK_BYTES // np.asarray(stored.rows).dtype.itemsize)
+    with ply_file.open_rows(path, stored.rows) as read:
+
+        def convert(start: int) -> tuple[int, int]:
+            block = slice(start, min(start + size, n))
+            counts = _convert(read(block), {name: column[block] for name, column in out.items()})
+            if start % FREED_ROWS < size:
+                free_pages(out.values())
+            return counts
+
+        num_clipped, num_zero = map(sum, zip(*parallel_map(convert, range(0, n, size)), strict=True))
+    return num_clipped, num_zero
 
 
 def _num_rest(path: Path, columns: tuple[str, ...]) -> int:

@@ -232,12 +232,12 @@ def layout_name(names: tuple[str, ...], num_rest: int, *, compressed: bool) -> s
     return f"INRIA, SH degree {sh_degree(num_rest)}" + ("" if normals else " (no normals)")
 
 
-def bytes_by_attribute(rows: np.ndarray, extra: tuple[str, ...]) -> dict[str, int]:
-    """Count the bytes of all rows by attribute; ``extra`` columns are ignored by readers."""
-    groups = {"means": MEANS, "normals": NORMALS, "sh0": color_columns(rows.dtype.names), "opacities": ("opacity",)}
+def bytes_by_attribute(row: np.dtype[Any], count: int, extra: tuple[str, ...]) -> dict[str, int]:
+    """Count the bytes of ``count`` rows by attribute; ``extra`` columns are ignored by readers."""
+    groups = {"means": MEANS, "normals": NORMALS, "sh0": color_columns(row.names), "opacities": ("opacity",)}
     groups |= {"scales": SCALES, "quats": QUATS, "extra": extra}
     kinds = {name: kind for kind, names in groups.items() for name in names}
     sizes: Counter[str] = Counter()
-    for name in rows.dtype.names or ():
-        sizes[kinds.get(name, "shN")] += rows.dtype[name].itemsize * len(rows)
+    for name in row.names or ():
+        sizes[kinds.get(name, "shN")] += row[name].itemsize * count
     return dict(sizes)

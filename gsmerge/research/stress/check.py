@@ -213,9 +213,7 @@ def _check_cameras(case: Case, load: SceneLoad, hints: ReadHints) -> tuple[bool,
 def _read_again(load: SceneLoad, cameras: CameraFile, hints: ReadHints) -> SceneLoad:
     """Read the scene's own file with other cameras."""
     opacity: OpacityChoice = "raw" if load.ply.opacity_encoding == "raw" else "logit"
-    return align_scene(
-        read_ply_with_hints(load.files.ply, opacity=opacity, hints=hints), load.files, cameras, hints=hints
-    )
+    return align_scene(read_ply_with_hints(load.files, opacity=opacity, hints=hints), load.files, cameras, hints=hints)
 
 
 def _find_defect(gaussians: Gaussians, scene: Scene) -> str | None:
