@@ -11,7 +11,7 @@ import numpy as np
 
 from gsmerge.budget import parse_share, share_text
 from gsmerge.options import CompactOptions
-from gsmerge.plan import Plan, make_plan, resolve_decode
+from gsmerge.plan import Plan, make_plan, resolve_decode, steps_for
 from gsmerge.render import contributions, plan_view
 from gsmerge.render import prepare as prepare_splats
 from gsmerge.render.metrics import describe_loss
@@ -34,7 +34,7 @@ from gsmerge.stages.partition import (
     partition_views,
 )
 from gsmerge.stages.prepare import Frame, Prepared, prepare, scene_frame
-from gsmerge.stages.segment import count_limits
+from gsmerge.stages.segment import CountLimits, count_limits
 from gsmerge.stages.superpixels import AUTO_SHARE, SHARE
 from gsmerge.types import Gaussians, Scene
 from gsmerge.views import concat_cameras, subset
@@ -43,7 +43,10 @@ T = TypeVar("T")
 Start = Callable[[Prepared, Plan, int | None], Decoded]
 FOREIGN = 0.1  # share of a Gaussian's weights in other blocks' views from which on it is at a seam
 SEAM_SHARE = 0.1  # of a view's weights that such Gaussians have from which on it is fitted to
-SEAM_STEPS = 100
+SEAM_STEPS = 100  # at least
+SEAM_LOOKS = 2  # at each view, at least
+SEAM_RATE = 0.6  # times the usual first steps: what is there is fitted, but not beside its neighbours as they are now
+SEAM_DECAY = 0.1  # factor on the steps at the end
 SURPLUS = 1.03  # times an exact number of Gaussians: the faintest of what is too many are left out
 
 
@@ -59,7 +62,8 @@ def compact_in_blocks(given: Scene, options: CompactOptions, count: int, start: 
         covisibility = measure_covisibility(given)
         blocks = partition_views(covisibility.weights, count)
         factors = count_factors(blocks, covisibility).tolist()
-        frame, most = scene_frame(given), whole_count(given, options)
+        frame, whole = scene_frame(given), whole_limits(given, options)
+        options = with_whole_steps(options, given, whole)
     size = gaussians_at_once(given.num_gaussians, count)
     memory = memory_bytes(size, photos=given.images is not None, num_rest=3 * given.gaussians.shN.shape[1])
     with options.blocks.engine.start(threads=options.threads, memory=memory) as work:
@@ -68,7 +72,7 @@ def compact_in_blocks(given: Scene, options: CompactOptions, count: int, start: 
         def pieces() -> Iterator[tuple[Any, ...]]:
             for block, factor in zip(blocks, factors, strict=True):
                 free_scene(given)
-                own = block_options(options, given, block, factor, most)
+                own = block_options(options, given, block, factor, whole.count)
                 yield subset(given, block.views), block, seen, own, frame, start
 
         parts = [part for part, _ in adopt_records(work.run("merge", start_part, count, pieces()))]
@@ -82,8 +86,8 @@ def compact_in_blocks(given: Scene, options: CompactOptions, count: int, start: 
         joined = Gaussians.concat([gaussians for gaussians, _ in fitted])
         owners = np.repeat(np.arange(count), [len(gaussians) for gaussians, _ in fitted])
         result = frame.leave(fit_seams(joined, owners, parts, options.seed))
-        if most is not None and most < len(result):
-            result = faintest_dropped(result, most)
+        if whole.count is not None and whole.count < len(result):
+            result = faintest_dropped(result, whole.count)
         everything = work.share(result)
         views = ((part, everything) for part in parts)
         scores = [psnr for psnr, _ in adopt_records(work.run("score", score_part, count, views))]
@@ -186,9 +190,10 @@ def fit_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[Part], seed
         return joined
     scene = concat_scenes(scenes)
     rows = np.flatnonzero(peak_weights(joined, blank_photos(scene.cameras, 2))[0] >= plan.fit.min_contribution)
+    tuning = replace(plan.fit.tuning.scaled(SEAM_RATE), decay=SEAM_DECAY)
     options = replace(
-        plan.fit, fit_steps=SEAM_STEPS, photo_scale=1.0, judged=False, dropout=0.0, half_res_share=0.0,
-        min_contribution=0.0,
+        plan.fit, fit_steps=max(SEAM_STEPS, SEAM_LOOKS * len(scene)), photo_scale=1.0, judged=False, dropout=0.0,
+        half_res_share=0.0, min_contribution=0.0, tuning=tuning,
     )  # fmt: skip
     decoded = Decoded(joined[rows], len(rows), exact=True, fixed=~at_seam[rows])
     with record_part(title="seams") as record:
@@ -244,12 +249,17 @@ def free_scene(scene: Scene) -> None:
     free_pages([*arrays, *([] if scene.images is None else [scene.images])])
 
 
-def whole_count(given: Scene, options: CompactOptions) -> int | None:
-    """Return the Gaussians that a budget, a size or a device sets for all blocks together; None without any."""
+def whole_limits(given: Scene, options: CompactOptions) -> CountLimits:
+    """Compute the limits of the number of Gaussians of all blocks together."""
     segment, decode = options.segment, resolve_decode(options, given, photos=given.images is not None)
     if segment.superpixels == AUTO_SHARE:  # which each block decides
         segment = replace(segment, superpixels=SHARE)
-    return count_limits(given, segment, decode, options.budget).count
+    return count_limits(given, segment, decode, options.budget)
+
+
+def with_whole_steps(options: CompactOptions, given: Scene, whole: CountLimits) -> CompactOptions:
+    """Return the options with the steps of a fit of the whole, which blocks share by their views."""
+    return options.with_settings({"fit_steps": steps_for(options, whole.count or whole.default, given)})
 
 
 def block_options(
@@ -257,9 +267,13 @@ def block_options(
 ) -> CompactOptions:
     """Return the options of a block: cameras and exposures stay, and ``factor`` times its share of the Gaussians.
 
-    ``most``: Gaussians of all blocks together, see :func:`whole_count`.
+    It has a share of the steps, too, so that each view is looked at as often as in one piece, and as many of them on
+    half-size photos. ``most``: Gaussians of all blocks together, see :func:`whole_limits`; None: as many as
+    ``superpixels`` and K give.
     """
     settings: dict[str, Any] = {"poses": "fixed", "exposure": "fixed", "blocks": "none", "budget": None}
+    settings["fit_steps"] = max(1, round(options.fit.steps * len(block.views) / len(given)))
+    settings["half_res_share"] = options.fit.half_res_part
     superpixels = options.segment.superpixels
     if most is not None:
         settings["budget"] = max(1, round(SURPLUS * factor * most * len(block.views) / len(given)))

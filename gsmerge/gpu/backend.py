@@ -58,10 +58,10 @@ def visible_mask(gaussians: Gaussians, photos: DevicePhotos, min_weight: float) 
     return ~inside | (peak >= min_weight)
 
 
-def grow(gaussians: Gaussians, photos: DevicePhotos, count: int) -> Gaussians:
-    """Halve Gaussians where the photos are shown worst, until there are ``count``."""
+def grow(gaussians: Gaussians, photos: DevicePhotos, count: int) -> tuple[Gaussians, np.ndarray]:
+    """Halve Gaussians where the photos are shown worst, until there are ``count``; also the row of each one's start."""
     state = grow_to(start_state(gaussians), photos, count)
-    return gaussians_of(state.x, state.shN)
+    return gaussians_of(state.x, state.shN), state.origins.cpu().numpy()
 
 
 def photo_error(gaussians: Gaussians, photos: DevicePhotos) -> float:

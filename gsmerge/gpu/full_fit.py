@@ -237,14 +237,14 @@ def fit_full(
     run.score, before, after = own, own, None
     run.start_clock()
     while run.step < run.steps:
-        due = options.grows and run.step / run.steps >= GROWTH
-        if due and len(run.state) < count:
-            run.state = grow_to(run.state, half, count)
         if run.step / run.steps >= plan.half_part and after is None:
             before, after = judge()
             run.score = after
             if after <= before:
                 break
+        due = options.grows and run.step / run.steps >= GROWTH
+        if due and len(run.state) < count:
+            run.state = grow_to(run.state, half, count)
         run.take_step()
     if after is None:
         before, after = judge()

@@ -38,7 +38,7 @@ def along(places: np.ndarray) -> Scene:
 def test_blocks_are_as_good_as_one_piece() -> None:
     places = np.linspace(0, 1, 36)
     scene, between = along(places), along((places[1:] + places[:-1]) / 2)
-    whole, parts = (compact(scene, blocks=blocks, **{**SETTINGS, "fit_steps": 160}) for blocks in ("none", 3))
+    whole, parts = (compact(scene, blocks=blocks, **{**SETTINGS, "fit_steps": 600}) for blocks in ("none", 3))
     assert len(parts.gaussians) == pytest.approx(len(whole.gaussians), rel=0.1)
     one, other = (scenes.psnr_of(result.gaussians, between) for result in (whole, parts))
     assert other > one - 0.3

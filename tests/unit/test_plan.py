@@ -62,6 +62,17 @@ def test_steps_grow_with_the_root_of_the_share(scene: Scene) -> None:
     assert steps_for(options_of(budget="auto"), 10, scene) == 2 * usual
 
 
+def test_steps_grow_with_the_views() -> None:
+    """By a power below one, so that a view of many never gets more steps than one of twelve."""
+    counts = (3, 12, 24, 48)
+    scenes_of = [scenes.make_scene(scenes.wall(), scenes.arc(count, 8, 6)) for count in counts]
+    steps = [steps_for(options_of(), 1, one) for one in scenes_of]
+    usual = EFFORTS["default"].steps
+    assert steps == [usual, usual, round(2**0.6 * usual), round(4**0.6 * usual)]
+    assert steps_for(options_of(effort="fast"), 1, scenes_of[3]) == round(4**0.6 * EFFORTS["fast"].steps)
+    assert steps_for(options_of(fit_steps=9), 1, scenes_of[3]) == 9
+
+
 def test_a_draft_without_a_fit_leaves_out_nothing() -> None:
     assert not resolve_fit(options_of(effort="draft", fit="none")).needs_photos
     assert resolve_fit(options_of(effort="draft")).needs_photos

@@ -53,6 +53,7 @@ from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.ply import PlyScene
 from gsmerge.io.image_names import natural_key
 from gsmerge.io.photo_files import Photos, PhotoTransform, Size, as_floats, photo_size
+from gsmerge.runtime.memory import free_pages
 from gsmerge.types import Cameras
 
 _LARGE = 2  # times as many pixels as rows: likely photos of another size than the grid's
@@ -164,6 +165,7 @@ def align(
     inputs = cache(partial(source.inputs, camera_file, grid))
     result = next(filter(None, _readings(source, camera_file, grid, inputs)), None)
     if result is not None:
+        free_pages(vars(ply.gaussians).values())
         return result
     small = small_photos_error(ply.info, camera_file, photo_size(photos)) if order not in MAY_BE_UNALIGNED else None
     if small is not None:

@@ -10,6 +10,7 @@ import numpy as np
 from gsmerge.geometry import multiply_quats, normalize, quat_to_rotmat, rotmat_to_quat
 from gsmerge.io.alignment.layouts import spread_step
 from gsmerge.kernels.pictures import convolve
+from gsmerge.runtime.memory import free_pages
 from gsmerge.types import Scene
 
 QuatChoice = Literal["auto", "wxyz", "xyzw", "xyzw-root", "camera"]
@@ -68,12 +69,14 @@ def choose_rotations(scene: Scene) -> tuple[QuatChoice, str]:
     """Choose the reading whose thinnest axes follow the surface's normals, with a note; "wxyz" and "" in doubt."""
     normals, rows, views = _normals(scene)
     scales = scene.gaussians.scales[rows]
+    free_pages(vars(scene.gaussians).values())
     ordered = np.sort(scales, 1)
     flat = ordered[:, 0] < _FLAT * ordered[:, 1]
     normals, rows, views = normals[flat], rows[flat], views[flat]
     if len(rows) < _MIN_TESTED:
         return "wxyz", ""
-    thinnest, quats = scene.gaussians.scales[rows].argmin(1), scene.gaussians.quats[rows]
+    thinnest, quats = scales[flat].argmin(1), scene.gaussians.quats[rows]
+    free_pages([scene.gaussians.quats])
     as_xyzw = from_xyzw(quats)
     single = [quats, as_xyzw, multiply_quats(_camera_quats(scene)[views], quats)]
     means = (float(_cosines(read, thinnest, normals).mean()) for read in single)
@@ -160,9 +163,9 @@ def _average_around(picture: np.ndarray) -> np.ndarray:
 def _normals(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compute normals ``[t,3]`` of some pixels' surface; also return their rows and views."""
     v, h, w = scene.valid.shape
-    inner = np.arange(v * h * w).reshape(v, h, w)[:, _STEP:-_STEP, _STEP:-_STEP].reshape(v, -1)
-    step = spread_step(inner.shape[1] // _SAMPLES, w - 2 * _STEP)
-    rows = inner[:, ::step].reshape(-1)
+    inner = np.arange(h * w).reshape(h, w)[_STEP:-_STEP, _STEP:-_STEP].reshape(-1)
+    step = spread_step(len(inner) // _SAMPLES, w - 2 * _STEP)
+    rows = (h * w * np.arange(v)[:, None] + inner[::step]).reshape(-1)
     valid, means = scene.valid.reshape(-1), scene.gaussians.means
     good = valid[rows]
     for offset in (_STEP, -_STEP, _STEP * w, -_STEP * w):

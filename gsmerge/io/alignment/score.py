@@ -17,6 +17,7 @@ from gsmerge.io.alignment.layouts import Layout, plain_layout, subsample
 from gsmerge.io.alignment.resection import projection_errors, refine_poses, start_pose
 from gsmerge.kernels.elementary import arccos, log
 from gsmerge.kernels.matrices import closest_rotation, eigh, invert, matmul, solve_symmetric
+from gsmerge.runtime.memory import free_pages
 from gsmerge.types import Cameras, Gaussians
 
 MARGIN = 2.0  # by which the best reading must beat the next one
@@ -338,6 +339,7 @@ def check_alignment(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray) -
     ``gaussians`` are V·H·W rows, assumed to be in view-major, row-major order; rows that are False in ``valid
     [V·H·W]`` (or ``[V,H,W]``) are left out. ValueError for another number of rows.
     """
+    free_pages(vars(gaussians).values())
     return check_pairs(sample_pixels(gaussians, cameras, valid), cameras)
 
 

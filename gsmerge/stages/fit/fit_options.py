@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -57,6 +57,11 @@ class Tuning:
     # smaller differences come from holes and highlights as often as from the camera
     min_gain: float = 1.15
     max_gain: float = 2.0  # Largest exposure factor that is believed
+
+    def scaled(self, factor: float) -> Tuning:
+        """Return the same constants with all steps of Gaussians ``factor`` times as large."""
+        names = ("means_lr", "scales_lr", "quats_lr", "opacities_lr", "colors_lr")
+        return replace(self, **{name: factor * getattr(self, name) for name in names})
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,8 @@ GROWTH = 0.5  # part of the run after which Gaussians are added
 FEW_VIEWS = 5  # views up to which a run of MANY_STEPS memorises the photos, unless Gaussians are dropped
 MANY_STEPS = 150
 DROPOUT = 0.1  # share of the Gaussians that a step leaves out with few views
-LONG_DROPOUT = 0.05  # the same in runs of LONG_STEPS, whatever the views
+LONG_DROPOUT = 0.05  # the same in runs of LONG_STEPS that look at each view often
+LONG_LOOKS = 30
 LARGE_STEPS = (0, 2)  # of every five, look at larger photos; with more of them the views' own size gets worse
 PROBE = 6  # steps that are timed to plan a time budget
 MAX_STEPS = 2000
@@ -82,7 +83,8 @@ def plan_run(photos: tuple[Photos, ...], options: FitOptions, seed: int) -> FitP
     """Plan a fit: held-out blocks, pixels outside masks, and dropout where there are few views."""
     full = training_weights(photos[0], options.holdout, seed)
     few = len(photos[0]) <= FEW_VIEWS and options.steps >= MANY_STEPS
-    default = DROPOUT if few else LONG_DROPOUT if options.steps >= LONG_STEPS else 0.0
+    long = options.steps >= max(LONG_STEPS, LONG_LOOKS * len(photos[0]))
+    default = DROPOUT if few else LONG_DROPOUT if long else 0.0
     dropout = default if options.dropout is None else options.dropout
     weights = full, reduced(full, photos[1])
     everywhere, *larger = (_weights_of(one) for one in (photos[0], *photos[2:]))
@@ -259,12 +261,12 @@ def fit_full(
     started = time.perf_counter()
     while step < steps:
         part = step / steps
-        if grows and part >= GROWTH and len(state.x) < count:
-            state = grow_to(state, plan.photos[1], count)
-        if part >= plan.half_part and not judged:
+        if part >= plan.half_part and not judged:  # before growth: halves that were never fitted show less
             (before, after), judged = judge(state, own, baseline_start, photos, plan), True
             if after <= before:
                 break
+        if grows and part >= GROWTH and len(state.x) < count:
+            state = grow_to(state, plan.photos[1], count)
         if not queue:
             queue = rng.permutation(len(photos[0])).tolist()
         error += (fit_step(state, plan, queue.pop(), step + 1, part, rng) - error) / min(step + 1, 10)

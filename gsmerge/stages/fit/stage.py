@@ -45,7 +45,8 @@ class FitBackend(Generic[PhotosT]):
     look_at: Callable[[Gaussians, tuple[PhotosT, ...], float], tuple[Array, Survey | None]]
     fit_full: Callable[..., FitResult]  # see gsmerge.stages.fit.full.fit_full
     fit_colors: Callable[[Gaussians, PhotosT, FitOptions, int], FitResult]  # the last: a seed
-    grow: Callable[[Gaussians, PhotosT, int], Gaussians]  # to a number, see gsmerge.stages.fit.fit_state.grow_to
+    # to a number, see gsmerge.stages.fit.fit_state.grow_to; with the row that each comes from
+    grow: Callable[[Gaussians, PhotosT, int], tuple[Gaussians, np.ndarray]]
     photo_error: Callable[[Gaussians, PhotosT], float]  # mean squared error of all photos
     photo_psnr: Callable[..., float]  # see gsmerge.render.photos.photo_psnr
     memory_errors: tuple[type[Exception], ...] = ()  # of a device whose memory does not suffice
@@ -82,9 +83,9 @@ def _fit_colors(gaussians: Gaussians, photos: Photos, options: FitOptions, seed:
     return fit_colors(gaussians, draw(gaussians, photos), photos, options, seed)
 
 
-def _grow(gaussians: Gaussians, photos: Photos, count: int) -> Gaussians:
+def _grow(gaussians: Gaussians, photos: Photos, count: int) -> tuple[Gaussians, np.ndarray]:
     state = grow_to(start_state(gaussians), photos, count)
-    return gaussians_of(state.x, state.splats.shN)
+    return gaussians_of(state.x, state.splats.shN), state.origins
 
 
 def photo_error(gaussians: Gaussians, photos: Photos) -> float:
@@ -207,9 +208,12 @@ def _choose_fit(
     if not options.judged:
         return kept, replace(report, origins=rows)
     if options.grows:  # the stages before left room for a growth that did not happen
-        fitted, report = backend.fit_colors(backend.grow(kept, half, count), half, options, seed)
+        grown, sources = backend.grow(kept, half, count)
+        fitted, report = backend.fit_colors(grown, half, options, seed)
         if report.accepted:
-            return _better_of(backend, full, kept, fitted, report, ALWAYS)
+            fitted, report = _better_of(backend, full, kept, fitted, report, ALWAYS)
+        if report.accepted:
+            return fitted, replace(report, origins=rows[sources])
         return kept, replace(report, origins=rows)
     fitted, report = backend.fit_colors(gaussians, half, options, seed)
     fitted, report = _better_of(backend, full, kept, fitted[keep], report, ALWAYS)

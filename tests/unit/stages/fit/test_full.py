@@ -124,6 +124,21 @@ def test_count_asked_for_is_met(truth: Gaussians, photos: Pair, extra: int) -> N
     assert len(result) == len(start) + extra
 
 
+def test_a_fit_is_judged_before_it_grows(truth: Gaussians, photos: Pair) -> None:
+    """Halves that were never fitted show less than their parents, and would have the fit refused."""
+    start = truth[::8]
+    options = replace(LONG, half_res_share=0.5, dropout=0.0)
+    (_, grown), (_, same) = (fit_full(start, photos, options, count=count) for count in (8 * len(start), 0))
+    assert grown.accepted
+    assert grown.holdout_after == same.holdout_after
+
+
+@pytest.mark.parametrize(("views", "dropout"), [(20, 0.05), (21, 0.0)])
+def test_dropout_needs_many_looks_at_each_view(photos: Pair, views: int, dropout: float) -> None:
+    many = tuple(one[[view % len(one) for view in range(views)]] for one in photos)
+    assert plan_run(many, FitOptions(fit_steps=600), 0).dropout == dropout
+
+
 def test_more_than_double_is_grown_in_turns(truth: Gaussians, photos: Pair) -> None:
     start = truth[::4]
     result, report = fit_full(start, photos, LONG, count=3 * len(start) + 5)

@@ -45,6 +45,16 @@ def test_stage_falls_back_to_colours(truth: Gaussians, photos: Pair) -> None:
     assert not np.array_equal(result.sh0, start.sh0)
 
 
+def test_colours_after_a_growth_know_where_each_comes_from(truth: Gaussians, photos: Pair) -> None:
+    refused = FitReport("none", False, 7, 20.0, 19.0, "worse")
+    backend = replace(stage.ON_CPU, fit_full=lambda gaussians, *_, **__: (gaussians, refused))
+    start = replace(truth, sh0=truth.sh0 + 0.2 / SH_C0)
+    result, report = fit(start, photos, LONG, count=len(start) + 20, backend=backend)
+    assert (report.method, report.accepted, len(result)) == ("color", True, len(start) + 20)
+    near = np.linalg.norm(result.means - start.means[report.origins], axis=1) <= 2 * start.scales[report.origins].max(1)
+    assert near.all()
+
+
 def test_stage_refuses_both_on_noise(truth: Gaussians, noise: Pair) -> None:
     grey = replace(truth, sh0=np.zeros_like(truth.sh0))
     options = scenes.tuned(LONG, prior_weight=1e-6, iterations=60, huber=10.0)
