@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import reduce
@@ -11,7 +12,7 @@ import numpy as np
 
 from gsmerge.budget import parse_share, share_text
 from gsmerge.options import CompactOptions
-from gsmerge.plan import Plan, make_plan, resolve_decode, steps_for
+from gsmerge.plan import Plan, choose_networks, make_plan, resolve_decode, steps_for
 from gsmerge.render import contributions, plan_view
 from gsmerge.render import prepare as prepare_splats
 from gsmerge.render.metrics import describe_loss
@@ -47,6 +48,7 @@ SEAM_STEPS = 100  # at least
 SEAM_LOOKS = 2  # at each view, at least
 SEAM_RATE = 0.6  # times the usual first steps: what is there is fitted, but not beside its neighbours as they are now
 SEAM_DECAY = 0.1  # factor on the steps at the end
+MOST_DENSITY = 2.0  # times the superpixels of one piece, where a scene's views see so much of each other's
 SURPLUS = 1.03  # times an exact number of Gaussians: the faintest of what is too many are left out
 
 
@@ -63,7 +65,7 @@ def compact_in_blocks(given: Scene, options: CompactOptions, count: int, start: 
         blocks = partition_views(covisibility.weights, count)
         factors = count_factors(blocks, covisibility).tolist()
         frame, whole = scene_frame(given), whole_limits(given, options)
-        options = with_whole_steps(options, given, whole)
+        options = with_whole_choices(options, given, whole)
     size = gaussians_at_once(given.num_gaussians, count)
     memory = memory_bytes(size, photos=given.images is not None, num_rest=3 * given.gaussians.shN.shape[1])
     with options.blocks.engine.start(threads=options.threads, memory=memory) as work:
@@ -212,7 +214,8 @@ def find_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[Part]) -> 
     splats = prepare_splats(joined)
     for number, part in enumerate(parts):
         own = set(part.block.own)
-        places = [place for place, view in enumerate(part.block.views) if view in own]
+        repeated = part.prepared.repeated
+        places = sorted({repeated[place] for place, view in enumerate(part.block.views) if view in own})
         photos = blank_photos(part.prepared.scene.cameras[places], 2)
 
         def weights_of(view: int, photos: Photos = photos) -> np.ndarray:
@@ -257,9 +260,14 @@ def whole_limits(given: Scene, options: CompactOptions) -> CountLimits:
     return count_limits(given, segment, decode, options.budget)
 
 
-def with_whole_steps(options: CompactOptions, given: Scene, whole: CountLimits) -> CompactOptions:
-    """Return the options with the steps of a fit of the whole, which blocks share by their views."""
-    return options.with_settings({"fit_steps": steps_for(options, whole.count or whole.default, given)})
+def with_whole_choices(options: CompactOptions, given: Scene, whole: CountLimits) -> CompactOptions:
+    """Return the options with the steps of a fit of the whole, which blocks share by their views, and its networks."""
+    steps = steps_for(options, whole.count or whole.default, given)
+    networks = choose_networks(options, photos=given.images is not None)
+    settings: dict[str, Any] = {"fit_steps": steps, "checkpoint": options.checkpoint if networks != "none" else "none"}
+    if options.blocks.engine.name != "local" and os.path.isfile(options.checkpoint):
+        settings["require_checkpoint"] = True  # a node without it would make other bytes
+    return options.with_settings(settings)
 
 
 def block_options(
@@ -273,14 +281,16 @@ def block_options(
     """
     settings: dict[str, Any] = {"poses": "fixed", "exposure": "fixed", "blocks": "none", "budget": None}
     settings["fit_steps"] = max(1, round(options.fit.steps * len(block.views) / len(given)))
-    settings["half_res_share"] = options.fit.half_res_part
+    if replace(options.fit, fit_steps=settings["fit_steps"]).half_res_part != options.fit.half_res_part:
+        settings["half_res_share"] = options.fit.half_res_part
     superpixels = options.segment.superpixels
     if most is not None:
         settings["budget"] = max(1, round(SURPLUS * factor * most * len(block.views) / len(given)))
     elif isinstance(superpixels, str) and superpixels.endswith("%"):
-        settings["superpixels"] = share_text(round(min(1.0, factor * parse_share(superpixels)), 6))
+        share = min(1.0, min(factor, MOST_DENSITY) * parse_share(superpixels))
+        settings["superpixels"] = share_text(round(share, 6))
     elif superpixels != AUTO_SHARE:
-        settings["superpixels"] = round(factor * int(superpixels))
+        settings["superpixels"] = round(min(factor, MOST_DENSITY) * int(superpixels))
     return options.with_settings(settings)
 
 

@@ -33,6 +33,10 @@ class SceneError(GsmergeError):
         self.path, self.problem, self.remedy = str(path), problem, remedy
         super().__init__(f"{self.path}: {problem}" + (f"; {remedy}" if remedy else ""))
 
+    def __reduce__(self) -> tuple[type[SceneError], tuple[str, str, str]]:
+        """Pickle the arguments, for processes of a cluster."""
+        return type(self), (self.path, self.problem, self.remedy)
+
 
 class TargetError(GsmergeError):
     """A quality or size target that was asked for could not be met."""

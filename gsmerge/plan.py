@@ -36,8 +36,7 @@ AUTO_STEPS = 2  # times the usual steps with budget auto: fewer Gaussians cost l
 SHORT_STEPS = 60  # of a fit that a better start still matters to
 USUAL_SHARE = 0.044  # of Gaussians in the pixels that the steps of an effort are for; more need more steps, up to
 MOST_STEPS = 2.0  # times as many
-USUAL_VIEWS = 12  # that the steps of an effort are for; more need more steps, by this power
-VIEWS_POWER = 0.6
+USUAL_VIEWS = 12  # that the steps of an effort are for; more need more
 LONE_K = 4  # where all views have one camera: no other adds Gaussians of its own to a surface
 
 
@@ -173,7 +172,8 @@ def choose_blocks(scene: Scene, options: CompactOptions) -> int:
         asked = 1 if problems else min(len(scene), usual_blocks(len(scene.gaussians)))
     if asked in (1, "none"):
         if options.blocks.engine.name != "local":
-            note("engine ray: the scene is compacted in one piece, on this machine; --blocks NUMBER makes several")
+            remedy = f"which {problems[0]} needs" if problems else "--blocks NUMBER makes several"
+            note(f"engine ray: the scene is compacted in one piece, on this machine; {remedy}")
         return 1
     if problems:
         raise UsageError(f"blocks {asked}: expected one piece (--blocks none) with {problems[0]}")
@@ -308,13 +308,13 @@ def resolve_fit(options: CompactOptions) -> FitOptions:
 
 
 def steps_for(options: CompactOptions, num_gaussians: int, scene: Scene) -> int:
-    """Return the steps of the full fit: as given, or more with the views, and the root of the Gaussians per pixel.
+    """Return the steps of the full fit: as given, or more with the roots of the views and of the Gaussians per pixel.
 
     A step looks at one view; docs/internals/large-scenes.md has the measurements.
     """
     if options.fit.fit_steps is not None:
         return options.fit.fit_steps
-    steps = EFFORTS[options.effort].steps * max(1.0, len(scene) / USUAL_VIEWS) ** VIEWS_POWER
+    steps = EFFORTS[options.effort].steps * math.sqrt(max(1.0, len(scene) / USUAL_VIEWS))
     if options.budget.auto:
         return round(AUTO_STEPS * steps)
     share = num_gaussians / max(1, len(scene) * scene.pixels_per_view)

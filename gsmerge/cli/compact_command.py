@@ -56,7 +56,7 @@ def compact(args: opt.Args) -> None:
     settings = _with_engine(settings, args)
     _check_scenes(args)
     files = args.files(*args.scenes)
-    out = args.output or default_output(files.ply.with_name("scene.ply") if files.parts else files.ply)
+    out = args.output or default_output(files.base)
     streamed = is_index(out)
     if streamed and settings.method == "gsmerge" and "levels" not in args.values(CompactOptions):
         settings = settings.with_settings({"levels": STREAMED_LEVELS})
@@ -138,6 +138,8 @@ def _warn_of_memory(files: SceneFiles, settings: CompactOptions, *, quiet: bool)
     count, num_rest = sum(count for count, _ in counts), max(rest for _, rest in counts)
     asked = settings.blocks.blocks
     blocks = asked if isinstance(asked, int) else usual_blocks(count) if asked == "auto" else 1
+    if settings.whole_only:
+        blocks = 1
     problem = memory_problem(memory_bytes(gaussians_at_once(count, blocks), photos=True, num_rest=num_rest))
     if problem is not None:
         say(f"gsmerge: warning: {problem}", quiet=quiet)

@@ -22,7 +22,7 @@ def encode(args: opt.Args) -> None:
     start = perf_counter()
     hints, settings = args.hints(), args.settings(fit="none")
     files = args.files(args.scene)
-    out = args.output or files.ply.with_suffix(".gsm")
+    out = args.output or files.base.with_suffix(".gsm")
     inputs = (*input_files(files), *checkpoint_files(settings.checkpoint))
     check_outputs((out,), inputs, overwrite=args.overwrite or args.dry_run)
     if args.dry_run:
@@ -43,7 +43,8 @@ def encode(args: opt.Args) -> None:
         with stage_progress(quiet=args.silent) as progress:
             encoded = encode_scene(given.scene, settings, max_k=args.max_k, progress=progress)
         done = perf_counter()
-        hashed: dict[str, Any] = {"sha256": file_sha256(files.ply), "bytes": files.ply.stat().st_size}
+        hashed: dict[str, Any] = {"sha256": file_sha256(*files.plys)}
+        hashed["bytes"] = sum(path.stat().st_size for path in files.plys)
         texts = {"comments": list(given.comments), "notes": list(given.notes)}
         save_encoded(temporary, encoded, overwrite=True, source={"name": files.ply.name, **hashed, **texts})
     seconds = {"import": imported - start, "read": read - imported, "encode": done - read}

@@ -332,13 +332,13 @@ def _read(
     args: opt.Args, files: SceneFiles, like: SceneFiles, hints: ReadHints, *, photos: bool
 ) -> tuple[list[Gaussians], SceneViews, list[str], SceneLoad | None]:
     """Read the scenes, and place the cameras in the frame of ``like``; also return notes, and ``like`` if it fits."""
-    from gsmerge.io import place_cameras_in_scene, ply_notes, read_gaussians, read_ply_with_hints
+    from gsmerge.io import AUTO, place_cameras_in_scene, ply_notes, read_gaussians, read_ply_with_hints
 
     check_cameras(like)
     first = read_ply_with_hints(files, opacity=args.opacity, hints=hints)
     others = [read_gaussians(path, opacity=args.opacity) for path in args.scenes[1:]]
     own = like.ply == files.ply
-    framed = first if own else read_gaussians(like.ply)
+    framed = first if own else read_ply_with_hints(like, opacity="auto", hints=AUTO)
     gaussians, views, placing, load = place_cameras_in_scene(framed, like, hints=hints, photos=photos)
     scenes = [gaussians if own else first.gaussians, *(ply.gaussians for ply in others)]
     notes = [*([] if own else ply_notes(first.info)), *placing]

@@ -31,7 +31,7 @@ def view(args: opt.Args) -> None:
     (segmentation,) = args.make(SegmentOptions)
     args.after = args.after or []
     files, after = args.files(args.before), args.after
-    beside = after[0].with_name(f"{after[0].stem}.compare.html") if after else files.ply.with_suffix(".view.html")
+    beside = after[0].with_name(f"{after[0].stem}.compare.html") if after else files.base.with_suffix(".view.html")
     output = args.output or beside
     inputs = (*input_files(files), *after, args.targets, args.target_images)
     check_outputs((output,), inputs, overwrite=args.overwrite or args.dry_run)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 from gsmerge.errors import SceneError
@@ -14,6 +16,7 @@ from gsmerge.io.cameras.embedded import holds_cameras
 from gsmerge.io.cameras.npz_files import holds_images
 from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
 from gsmerge.io.cameras.read import find_cameras, find_other_cameras, read_cameras, read_sharp
+from gsmerge.io.formats.ply_file import header_counts
 from gsmerge.io.image_names import list_images
 from gsmerge.types import StrPath
 
@@ -48,6 +51,11 @@ class SceneFiles:
     def plys(self) -> tuple[Path, ...]:
         """Files of Gaussians, in the order of their rows."""
         return self.parts or (self.ply,)
+
+    @property
+    def base(self) -> Path:
+        """Path that results are named after: the file, or ``scene.ply`` in the folder of parts."""
+        return self.ply.with_name("scene.ply") if self.parts else self.ply
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -144,18 +152,30 @@ def _order_parts(folder: Path, plys: Sequence[Path], cameras: Path | None) -> li
     matches = [_NUMBERED.fullmatch(path.name) for path in plys]
     names = {match[1].lower() if match else "" for match in matches}
     numbers = {int(match[2]): path for match, path in zip(matches, plys, strict=True) if match}
-    if len(names) > 1 or len(numbers) < len(plys) or holds_cameras(plys[0]) or read_sharp(plys[0]) is not None:
+    if len(names) > 1 or len(numbers) < len(plys):
         return None
     ordered = sorted(numbers)
     if re.split(r"[-_. ]", names.pop())[-1] in _PARTS:
-        missing = sorted(set(range(ordered[0], ordered[-1])) - set(ordered))
-        if missing:
+        missing = next((low + 1 for low, high in pairwise(ordered) if high > low + 1), None)
+        if missing is not None:
             first, last = (numbers[ordered[place]].name for place in (0, -1))
-            problem = f"expected all parts from {first} to {last}, found none with number {missing[0]}"
+            problem = f"expected all parts from {first} to {last}, found none with number {missing}"
             raise SceneError(folder, problem, "add it, or name one of the files")
-    elif cameras is None or len(read_cameras(cameras)) != len(plys):
+    elif plys[0].parent.name == SCENES_PLACE or not _has_camera_each(plys, cameras):
         return None
-    return [numbers[number] for number in ordered]
+    with suppress(SceneError):
+        if not any(holds_cameras(path) or read_sharp(path) is not None for path in plys):
+            return [numbers[number] for number in ordered]
+    return None
+
+
+def _has_camera_each(plys: Sequence[Path], cameras: Path | None) -> bool:
+    """Return whether files have as many Gaussians each, and there are as many cameras of all."""
+    if cameras is None or len({header_counts(path) for path in plys}) > 1:
+        return False
+    with suppress(SceneError):
+        return len(read_cameras(cameras)) == len(plys)
+    return False
 
 
 def named_ply(folder: Path) -> Path | None:

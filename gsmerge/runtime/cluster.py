@@ -101,15 +101,16 @@ class Cluster:
         """Processors of all nodes."""
         return int(self.ray.cluster_resources().get("CPU", 1.0))
 
-    def largest(self, resource: str) -> float:
-        """Return the most of a resource that a node has; a task that needs more waits forever."""
-        nodes = [node["Resources"] for node in self.ray.nodes() if node["Alive"]]
-        return max((node.get(resource, 0.0) for node in nodes), default=0.0)
-
     def needs(self, threads: int, memory: int) -> dict[str, float]:
-        """Return what a task asks for, at most what a node has."""
-        processors = min(threads, max(1.0, self.largest("CPU")))
-        return {"num_cpus": processors, "memory": min(memory, int(self.largest("memory")))}
+        """Return what a task asks for, at most what some node has; UsageError if none has a processor.
+
+        A task that needs more waits forever.
+        """
+        nodes = [node["Resources"] for node in self.ray.nodes() if node["Alive"] and node["Resources"].get("CPU")]
+        if not nodes:
+            raise UsageError("engine ray: expected nodes with processors, found none in the cluster")
+        largest = max(nodes, key=lambda node: (min(memory, node.get("memory", 0.0)), node["CPU"]))
+        return {"num_cpus": min(threads, largest["CPU"]), "memory": min(memory, int(largest.get("memory", 0.0)))}
 
     def close(self) -> None:
         """Disconnect."""
@@ -129,23 +130,24 @@ class ClusterWork:
         processors = self.cluster.processors
         needs = self.cluster.needs(self.threads or max(1, processors // count), self.memory)
         threads = int(needs["num_cpus"])
-        remote = self.ray.remote(max_retries=RETRIES, **needs)(_call)
+        remote, folder = self.ray.remote(max_retries=RETRIES, **needs)(_call), os.getcwd()
         refs, pending = list[Any](), list[Any]()
 
         def wait() -> None:
-            pending[:] = self.ray.wait(pending, num_returns=1)[1]
+            (ready, *_), pending[:] = self.ray.wait(pending, num_returns=1)
+            self._result(ready, title)  # an error ends the run at once
             done = len(refs) - len(pending)
             report_progress(f"{title}: {done} of {count} blocks", done, count)
 
         for arguments in calls:
             while len(pending) >= max(1, processors // threads):
                 wait()
-            refs.append(remote.remote(threads, function, *arguments))
+            refs.append(remote.remote(threads, folder, function, *arguments))
             pending.append(refs[-1])
         while pending:
             wait()
-        for place, ref in enumerate(refs, 1):
-            yield self._result(ref, f"block {place} of {count}: {title}")
+        for ref in refs:
+            yield self._result(ref, title)
 
     def share(self, value: Any) -> Any:
         """Put a value where all nodes reach it."""
@@ -155,14 +157,17 @@ class ClusterWork:
         try:
             return self.ray.get(ref)
         except self.ray.exceptions.RayTaskError as error:
-            raise error.cause from None
+            raise error.cause if isinstance(error.cause, Exception) else error from None
         except self.ray.exceptions.RayError as error:
-            problem = f"its process or node was lost {RETRIES + 1} times ({type(error).__name__})"
-            raise UsageError(f"{title}: {problem}; perhaps out of memory, more blocks help") from error
+            text = " ".join(str(error).split())[:200]
+            problem = f"its process or node was lost {RETRIES + 1} times ({type(error).__name__}: {text})"
+            raise UsageError(f"engine ray: {title}: {problem}; perhaps out of memory, more blocks help") from error
 
 
-def _call(threads: int, function: Callable[..., T], *arguments: Any) -> tuple[T, Record]:
-    """Make a call in a process of the cluster."""
+def _call(threads: int, folder: str, function: Callable[..., T], *arguments: Any) -> tuple[T, Record]:
+    """Make a call in a process of the cluster, in the folder that relative paths of the caller's files refer to."""
+    with contextlib.suppress(OSError):
+        os.chdir(folder)
     with use_threads(threads), record_part() as record:
         value = function(*arguments)
     return value, replace(record, progress=None)
@@ -180,7 +185,10 @@ def require_ray() -> ModuleType:
 def _join(ray: ModuleType, address: str | None, store_bytes: int | None) -> None:
     """Connect to the cluster, or start one of this machine alone."""
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    os.environ.setdefault("RAY_task_oom_retries", str(RETRIES))  # of processes that Ray itself ends
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
+    if ray.is_initialized():
+        raise UsageError("engine ray: expected a process without a connection to Ray; call ray.shutdown() before")
     if address is None:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         ray.init(address="local", include_dashboard=False, object_store_memory=store_bytes, **quiet)

@@ -11,11 +11,13 @@ from collections.abc import Iterable
 from contextlib import suppress
 from math import prod
 from pathlib import Path
+from weakref import WeakSet
 
 import numpy as np
 
 LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")  # of versions 2 and 1
 MAPPED_BYTES = 1 << 28  # from which on an array is in a file
+_own_pages: WeakSet[mmap.mmap] = WeakSet()  # pages of others may be private, and would lose their values
 
 
 def peak_memory() -> int:
@@ -59,18 +61,20 @@ def make_array(shape: tuple[int, ...], dtype: type[np.generic]) -> np.ndarray:
     if size >= MAPPED_BYTES and hasattr(os, "posix_fallocate"):
         with suppress(OSError), tempfile.TemporaryFile() as file:
             os.posix_fallocate(file.fileno(), 0, size)  # a page without room on the disk would end the process
-            return np.frombuffer(mmap.mmap(file.fileno(), size), dtype).reshape(shape)
+            pages = mmap.mmap(file.fileno(), size)
+            _own_pages.add(pages)
+            return np.frombuffer(pages, dtype).reshape(shape)
     return np.empty(shape, dtype)
 
 
 def free_pages(arrays: Iterable[np.ndarray]) -> None:
-    """Take the pages of arrays that are in files out of memory; their values stay."""
+    """Take the pages of arrays that :func:`make_array` put into files out of memory; their values stay."""
     for array in arrays:
         base = array
         while isinstance(base, np.ndarray) and base.base is not None:
             base = base.base
         pages = base.obj if isinstance(base, memoryview) else base
-        if isinstance(pages, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
+        if isinstance(pages, mmap.mmap) and pages in _own_pages and hasattr(mmap, "MADV_DONTNEED"):
             pages.madvise(mmap.MADV_DONTNEED)
 
 

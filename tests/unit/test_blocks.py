@@ -17,6 +17,7 @@ from gsmerge.stages.fit import FitOptions, fit
 from gsmerge.stages.fit.photo_sizes import fit_photos
 from gsmerge.stages.prepare import canonicalise
 from gsmerge.types import Cameras, Scene
+from gsmerge.views import subset
 
 SETTINGS: dict[str, Any] = {"checkpoint": "none", "superpixels": "10%", "fit_steps": 40, "threads": 1}
 
@@ -92,6 +93,14 @@ def test_a_block_without_photos_that_show_it(scene: Scene) -> None:
     result = compact(replace(scene, images=images), blocks=2, **SETTINGS)
     scenes.assert_invariants(result.gaussians, scene)
     assert any("photo" in note for note in result.report.notes)
+
+
+def test_views_that_repeat_others(scene: Scene) -> None:
+    """They count once, wherever they are."""
+    again = subset(scene, [0, 0, 1, 2, 3, 3, 4, 5, 6, 7, 7])
+    result = compact(again, blocks=2, **SETTINGS)
+    scenes.assert_invariants(result.gaussians, scene)
+    assert result.report.choices["seams"]["views"] <= len(scene)
 
 
 def test_small_scenes_stay_in_one_piece(scene: Scene) -> None:

@@ -63,13 +63,13 @@ def test_steps_grow_with_the_root_of_the_share(scene: Scene) -> None:
 
 
 def test_steps_grow_with_the_views() -> None:
-    """By a power below one, so that a view of many never gets more steps than one of twelve."""
+    """By their root, so that a view of many never gets more steps than one of twelve."""
     counts = (3, 12, 24, 48)
     scenes_of = [scenes.make_scene(scenes.wall(), scenes.arc(count, 8, 6)) for count in counts]
     steps = [steps_for(options_of(), 1, one) for one in scenes_of]
     usual = EFFORTS["default"].steps
-    assert steps == [usual, usual, round(2**0.6 * usual), round(4**0.6 * usual)]
-    assert steps_for(options_of(effort="fast"), 1, scenes_of[3]) == round(4**0.6 * EFFORTS["fast"].steps)
+    assert steps == [usual, usual, round(2**0.5 * usual), 2 * usual]
+    assert steps_for(options_of(effort="fast"), 1, scenes_of[3]) == 2 * EFFORTS["fast"].steps
     assert steps_for(options_of(fit_steps=9), 1, scenes_of[3]) == 9
 
 

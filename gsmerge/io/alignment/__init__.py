@@ -165,7 +165,6 @@ def align(
     inputs = cache(partial(source.inputs, camera_file, grid))
     result = next(filter(None, _readings(source, camera_file, grid, inputs)), None)
     if result is not None:
-        free_pages(vars(ply.gaussians).values())
         return result
     small = small_photos_error(ply.info, camera_file, photo_size(photos)) if order not in MAY_BE_UNALIGNED else None
     if small is not None:
@@ -318,6 +317,7 @@ def _with_pixels(
     """Make the result of rows that are pixels, with the cameras in the frame of the Gaussians; None if they are not."""
     if recovery is None:
         return None
+    free_pages(vars(inputs.gaussians).values())  # the search has looked at all rows
     frame, layout, count = recovery.best.frame, recovery.best.layout, len(inputs.cameras)
     if camera_file.source in (ESTIMATED, WITH_PHOTOS):
         from_what = "own grid" if camera_file.source == ESTIMATED else "order and the photos' colours"

@@ -124,7 +124,7 @@ def read_parts(paths: Sequence[Path], *, opacity: OpacityChoice = "auto") -> Ply
         raise ValueError(f"opacity: expected 'auto', 'logit' or 'raw', got {opacity!r}")
     parts = [_open_rows(path) for path in paths]
     for path, part in zip(paths, parts, strict=True):
-        if np.asarray(part.rows).dtype.names != np.asarray(parts[0].rows).dtype.names:
+        if np.asarray(part.rows).dtype != np.asarray(parts[0].rows).dtype:
             problem = f"expected the columns of {paths[0].name}, found others, so they are no parts of one scene"
             raise SceneError(path, problem, "name one of the files")
     return _to_scene(paths, parts, opacity)

@@ -70,14 +70,15 @@ class FitOptions:
 
     Args:
         fit: ``"full"``: all parameters; ``"none"``: nothing.
-        fit_steps: Steps of the full fit, one view each; None: 320, and by effort and number of Gaussians.
+        fit_steps: Steps of the full fit, one view each; None: 320, and by effort and numbers of views and Gaussians.
         time_budget: Seconds after which the full fit stops, None for no limit. The steps are then chosen from the
             measured time of the first ones, and the result is no longer the same on every machine.
         photo_scale: Times the views' size at which two of every five steps after those on half-size photos look at
             larger photos, as far as the photos are that large. ``"auto"``: up to 2 with effort ``"default"`` and
             ``"best"`` where the photos are at least 1.25 times as large, on the CPU; 1 otherwise.
         dropout: Share of the Gaussians that a step leaves out; None: 0.1 for five views or fewer and 150 steps or
-            more, where the fit would memorise the photos, otherwise 0.05 from 600 steps on and 0 below.
+            more, where the fit would memorise the photos, otherwise 0.05 from 600 steps and 30 looks at
+            each view on, and 0 below.
         half_res_share: Share of the steps on half-size photos; None: 0.7, from 600 steps on 0.5, below 20 all; 0.1 less
             where ``photo_scale`` is above 1.
         holdout: Share of the photos' blocks that decides whether a fit is accepted.

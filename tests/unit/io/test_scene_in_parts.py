@@ -10,6 +10,7 @@ import pytest
 from tiny_scene import Tiny
 
 import gsmerge
+from gsmerge.cli import main
 from gsmerge.compact_file import compact_files
 from gsmerge.errors import SceneError
 from gsmerge.io import find_scene_files, load_scene, read_scene, write_ply
@@ -67,6 +68,34 @@ def test_numbered_files_may_be_several_scenes(tmp_path: Path, tiny: Tiny) -> Non
     folder = split(tmp_path, tiny, ["0.ply", "1.ply"], [420])
     with pytest.raises(SceneError, match=r"expected one .ply file in the folder, found 2 \(0.ply, 1.ply\); name one"):
         find_scene_files(folder)
+
+
+@pytest.mark.parametrize("names", [["0.ply", "1.ply", "2.ply"], ["step_7000.ply", "step_30000.ply", "step_3.ply"]])
+def test_files_of_different_sizes_are_different_scenes(tmp_path: Path, tiny: Tiny, names: list[str]) -> None:
+    """Even if there are as many as cameras."""
+    folder = split(tmp_path, tiny, names, [100, 560])
+    with pytest.raises(SceneError, match=r"expected one .ply file in the folder, found 3"):
+        find_scene_files(folder)
+
+
+def test_a_large_gap_in_the_numbers(tmp_path: Path, tiny: Tiny) -> None:
+    folder = split(tmp_path, tiny, ["view_1.ply", "view_20241122101500.ply"], [280])
+    with pytest.raises(SceneError, match="found none with number 2"):
+        find_scene_files(folder)
+
+
+def test_scenes_of_one_backbone_stay_apart(tmp_path: Path, tiny: Tiny) -> None:
+    """One file for each scene in a folder gaussians, as DepthSplat writes them."""
+    folder = split(tmp_path / "gaussians", tiny, ["0.ply", "1.ply", "2.ply"], [280, 560])
+    with pytest.raises(SceneError, match=r"expected one .ply file in the folder, found 3"):
+        find_scene_files(folder)
+
+
+def test_encode_reads_all_parts(tmp_path: Path, tiny: Tiny) -> None:
+    folder = split(tmp_path, tiny, ["view_0.ply", "view_1.ply", "view_2.ply"], [280, 560])
+    assert main(["encode", str(folder), "--superpixels", "20%", "-q"]) == 0
+    source = gsmerge.load_encoded(folder / "scene.gsm").about["source"]
+    assert source["bytes"] == sum(path.stat().st_size for path in find_scene_files(folder).plys)
 
 
 def test_the_report_has_all_parts(tmp_path: Path, tiny: Tiny) -> None:

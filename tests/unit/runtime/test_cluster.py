@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from gsmerge.errors import UsageError
-from gsmerge.runtime.cluster import Engine
+from gsmerge.runtime.cluster import Cluster, ClusterWork, Engine
 from gsmerge.runtime.record import note, record_run, stage
 
 
@@ -32,7 +35,7 @@ def test_calls_are_made_one_by_one() -> None:
     """What they take is made when it is their turn, so that one of them is in memory at once."""
     events = list[str]()
 
-    def calls() -> object:
+    def calls() -> Iterator[tuple[int]]:
         for number in (1, 2):
             events.append(f"take {number}")
             yield (number,)
@@ -56,3 +59,101 @@ def test_without_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(UsageError, match="Ray is not installed"), Engine("ray").start(threads=1, memory=0):
         pass
+
+
+class FakeRay:
+    """In place of Ray: calls are made when they are submitted, and end in the order of submission."""
+
+    class exceptions:  # noqa: N801  # a module of Ray's
+        class RayError(Exception):
+            pass
+
+        class RayTaskError(RayError):
+            cause: object = None
+
+    def __init__(self, nodes: list[dict[str, float]]) -> None:
+        self.given, self.running, self.most, self.options = nodes, 0, 0, list[dict[str, Any]]()
+
+    def nodes(self) -> list[dict[str, Any]]:
+        return [{"Alive": True, "Resources": node} for node in self.given]
+
+    def cluster_resources(self) -> dict[str, float]:
+        return {"CPU": sum(node.get("CPU", 0) for node in self.given)}
+
+    def remote(self, **options: Any) -> Any:
+        self.options.append(options)
+
+        def decorate(function: Callable[..., Any]) -> Any:
+            def submit(*arguments: Any) -> list[Any]:
+                self.running += 1
+                self.most = max(self.most, self.running)
+                try:
+                    return [function(*arguments)]
+                except ZeroDivisionError as error:
+                    failed = self.exceptions.RayTaskError("traceback")
+                    failed.cause = error
+                    return [failed]
+                except KeyError:
+                    return [self.exceptions.RayError("worker died")]
+
+            return SimpleNamespace(remote=submit)
+
+        return decorate
+
+    def wait(self, refs: list[Any], num_returns: int) -> tuple[list[Any], list[Any]]:
+        self.running -= num_returns
+        return refs[:num_returns], refs[num_returns:]
+
+    def get(self, ref: list[Any]) -> Any:
+        if isinstance(ref[0], Exception):
+            raise ref[0]
+        return ref[0]
+
+
+def work_of(nodes: list[dict[str, float]], threads: int | None = None, memory: int = 8) -> tuple[ClusterWork, FakeRay]:
+    cluster, ray = Cluster.__new__(Cluster), FakeRay(nodes)
+    cluster.ray = ray  # type: ignore[assignment]
+    return ClusterWork(cluster, threads, memory), ray
+
+
+TWO = [{"CPU": 1.0, "memory": 100.0}, {"CPU": 2.0, "memory": 100.0}]
+
+
+def test_a_cluster_has_as_many_calls_at_once_as_processors() -> None:
+    work, ray = work_of(TWO)
+    made = list(work.run("halve", halve, 7, ((number,) for number in range(7))))
+    assert [value for value, _ in made] == [number / 2 for number in range(7)]
+    assert [record.notes for _, record in made] == [[f"half of {number}"] for number in range(7)]
+    assert ray.most == 3
+    assert ray.options[0]["num_cpus"] == 1
+
+
+def test_what_a_call_raises_comes_at_once() -> None:
+    taken = []
+
+    def calls() -> Iterator[tuple[int]]:
+        for number in range(9):
+            taken.append(number)
+            yield (number - 1,)
+
+    work, _ = work_of(TWO)
+    with pytest.raises(ZeroDivisionError):
+        list(work.run("divide", lambda number: 1 / number, 9, calls()))
+    assert len(taken) < 9
+
+
+def test_lost_processes_are_one_line() -> None:
+    work, _ = work_of(TWO)
+    with pytest.raises(UsageError, match=r"engine ray: find: its process or node was lost 6 times .*worker died"):
+        list(work.run("find", lambda key: {}[key], 1, [("a",)]))
+
+
+def test_a_task_asks_for_what_one_node_has() -> None:
+    nodes = [{"CPU": 64.0, "memory": 16.0}, {"CPU": 8.0, "memory": 512.0}, {"memory": 900.0}]
+    work, _ = work_of(nodes)
+    assert work.cluster.needs(32, 100) == {"num_cpus": 8.0, "memory": 100}
+    assert work.cluster.needs(32, 10) == {"num_cpus": 32, "memory": 10}
+    assert work.cluster.needs(2, 10_000) == {"num_cpus": 2, "memory": 512}
+    empty, _ = work_of([{"memory": 9.0}])
+    with pytest.raises(UsageError, match="expected nodes with processors"):
+        empty.cluster.needs(1, 1)
