@@ -129,7 +129,7 @@ class ClusterWork:
         """Make the calls, see :class:`Work`: as many at once as there are processors."""
         processors = self.cluster.processors
         needs = self.cluster.needs(self.threads or max(1, processors // count), self.memory)
-        threads = int(needs["num_cpus"])
+        threads = max(1, int(needs["num_cpus"]))
         remote, folder = self.ray.remote(max_retries=RETRIES, **needs)(_call), os.getcwd()
         refs, pending = list[Any](), list[Any]()
 
