@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import reduce
 from typing import Any, TypeVar
 
 import numpy as np
 
 from gsmerge.budget import parse_share, share_text
+from gsmerge.io.registration.join import concat_scenes
 from gsmerge.options import CompactOptions
 from gsmerge.plan import Plan, choose_networks, make_plan, resolve_decode, steps_for
 from gsmerge.render import contributions, plan_view
@@ -38,7 +38,7 @@ from gsmerge.stages.prepare import Frame, Prepared, prepare, scene_frame
 from gsmerge.stages.segment import CountLimits, count_limits
 from gsmerge.stages.superpixels import AUTO_SHARE, SHARE
 from gsmerge.types import Gaussians, Scene
-from gsmerge.views import concat_cameras, subset
+from gsmerge.views import in_float64, subset
 
 T = TypeVar("T")
 Start = Callable[[Prepared, Plan, int | None], Decoded]
@@ -133,10 +133,7 @@ def start_part(
     plan = make_plan(prepared, options)
     decoded = start(prepared, plan, plan.limits.count)
     own = belongs_to_block(frame.leave(decoded.gaussians).means, block, covisibility)
-    before = None
-    if prepared.given.images is not None and prepared.photo_views:
-        with stage("input"):
-            before = measure_psnr(prepared.given.file_gaussians, prepared.given, prepared, plan)
+    before = measure_psnr("input", prepared.given.file_gaussians, prepared.given, prepared, plan)
     share = own.sum() / max(1, len(own))
     return Part(block, decoded.gaussians[own], round(share * decoded.count), without_gaussians(prepared), plan, before)
 
@@ -170,11 +167,7 @@ def fit_part(part: Part, everything: tuple[Gaussians, np.ndarray], own: int, gro
 
 def score_part(part: Part, gaussians: Gaussians) -> float | None:
     """Measure the PSNR of some of a block's photos from the whole result; None without photos."""
-    prepared, plan = part.prepared, part.plan
-    if prepared.scene.images is None or not prepared.photo_views:
-        return None
-    with stage("score"):
-        return measure_psnr(gaussians, prepared.result_views(), prepared, plan)
+    return measure_psnr("score", gaussians, part.prepared.result_views(), part.prepared, part.plan)
 
 
 def fit_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[Part], seed: int) -> Gaussians:
@@ -191,6 +184,7 @@ def fit_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[Part], seed
     if not scenes:
         return joined
     scene = concat_scenes(scenes)
+    scene = replace(scene, cameras=in_float64(scene.cameras))
     rows = np.flatnonzero(peak_weights(joined, blank_photos(scene.cameras, 2))[0] >= plan.fit.min_contribution)
     tuning = replace(plan.fit.tuning.scaled(SEAM_RATE), decay=SEAM_DECAY)
     options = replace(
@@ -203,8 +197,9 @@ def fit_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[Part], seed
     add_seconds(record.seconds)
     choose(seams={"views": len(scene), "num_gaussians": int(at_seam.sum())})
     columns = {f.name: np.array(getattr(joined, f.name)) for f in fields(Gaussians)}
+    moved = at_seam[rows]  # what was fixed comes back rounded
     for name, column in columns.items():
-        column[rows] = getattr(fitted.gaussians, name)
+        column[rows[moved]] = getattr(fitted.gaussians, name)[moved]
     return Gaussians(**columns)
 
 
@@ -223,8 +218,8 @@ def find_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[Part]) -> 
 
         for place, weights in zip(places, in_turn(weights_of, range(len(photos))), strict=True):
             rows = np.flatnonzero(weights)
-            total += weights
-            foreign += np.where(owners == number, 0, weights)
+            total[rows] += weights[rows]
+            foreign[rows] += np.where(owners[rows] == number, 0, weights[rows])
             seen.append((number, place, rows, weights[rows]))
     at_seam = foreign > FOREIGN * total
     views: list[list[int]] = [[] for _ in parts]
@@ -234,22 +229,9 @@ def find_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[Part]) -> 
     return at_seam, views
 
 
-def concat_scenes(scenes: Sequence[Scene]) -> Scene:
-    """Join the views of scenes with photos of one size, without Gaussians."""
-    masks = None
-    images = [scene.images for scene in scenes if scene.images is not None]
-    if any(scene.masks is not None for scene in scenes):
-        whole = [np.ones(some.shape[:3], bool) for some in images]
-        masks = np.concatenate([w if s.masks is None else s.masks for s, w in zip(scenes, whole, strict=True)])
-    cameras = reduce(concat_cameras, (scene.cameras for scene in scenes))
-    names = tuple(name for scene in scenes for name in scene.names)
-    return Scene(scenes[0].gaussians, cameras, np.concatenate(images), None, names, masks=masks)
-
-
 def free_scene(scene: Scene) -> None:
     """Take what is in files of a scene's arrays out of memory."""
-    arrays = [getattr(scene.gaussians, f.name) for f in fields(Gaussians)]
-    free_pages([*arrays, *([] if scene.images is None else [scene.images])])
+    free_pages([*vars(scene.gaussians).values(), *([] if scene.images is None else [scene.images])])
 
 
 def whole_limits(given: Scene, options: CompactOptions) -> CountLimits:

@@ -160,26 +160,40 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
 
 def choose_blocks(scene: Scene, options: CompactOptions) -> int:
     """Return the number of blocks in which a scene is compacted; UsageError where it cannot be in as many as asked."""
-    asked = options.blocks.blocks
-    whole = {
-        "budget auto": options.budget.auto,
-        "poses free": options.prepare.poses == "free",
-        "exposure per-photo": options.prepare.exposure == "per-photo",
-        "a scene without one Gaussian per pixel": not scene.aligned,
-    }
-    problems = [*options.whole_only, *(name for name, holds in whole.items() if holds)]
-    if asked == "auto":
-        asked = 1 if problems else min(len(scene), usual_blocks(len(scene.gaussians)))
-    if asked in (1, "none"):
+    problems = _whole_needed(options)
+    if not scene.aligned:
+        problems.append("a scene without one Gaussian per pixel")
+    asked = wanted_blocks(options, len(scene.gaussians) if scene.aligned else 0)
+    if options.blocks.blocks == "auto":
+        asked = min(len(scene), asked)
+    if asked <= 1:
         if options.blocks.engine.name != "local":
             remedy = f"which {problems[0]} needs" if problems else "--blocks NUMBER makes several"
             note(f"engine ray: the scene is compacted in one piece, on this machine; {remedy}")
         return 1
     if problems:
         raise UsageError(f"blocks {asked}: expected one piece (--blocks none) with {problems[0]}")
-    if int(asked) > len(scene):
+    if asked > len(scene):
         raise UsageError(f"blocks {asked}: expected at most one for each of {len(scene)} views")
-    return int(asked)
+    return asked
+
+
+def wanted_blocks(options: CompactOptions, num_gaussians: int) -> int:
+    """Return the number of blocks that options want for an aligned scene of so many Gaussians, 1 for one piece."""
+    asked = options.blocks.blocks
+    if asked == "auto":
+        return 1 if _whole_needed(options) else usual_blocks(num_gaussians)
+    return 1 if asked == "none" else int(asked)
+
+
+def _whole_needed(options: CompactOptions) -> list[str]:
+    """Name the settings in use with which a scene is not cut into blocks."""
+    whole = {
+        "budget auto": options.budget.auto,
+        "poses free": options.prepare.poses == "free",
+        "exposure per-photo": options.prepare.exposure == "per-photo",
+    }
+    return [*options.whole_only, *(name for name, holds in whole.items() if holds)]
 
 
 def _check_photos(scene: Scene, options: CompactOptions) -> None:

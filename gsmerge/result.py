@@ -99,10 +99,8 @@ def score(count: int | None, fitted: Fitted, prepared: Prepared, plan: Plan) -> 
     if cameras is not prepared.given.cameras:
         _note_moves(prepared, cameras, plan)
         prepared = replace(prepared, given=replace(prepared.given, cameras=cameras))
-    psnr = None
-    if prepared.given.images is not None and prepared.photo_views:
-        with stage("score"):
-            psnr = measure_psnr(gaussians, prepared.result_views(), prepared, plan)
+    psnr = measure_psnr("score", gaussians, prepared.result_views(), prepared, plan)
+    if psnr is not None:
         choose(scored_views=len(plan.scored_views))
     return Candidate(count, fitted, gaussians, cameras, psnr, current_record())
 
@@ -118,14 +116,20 @@ def _note_moves(prepared: Prepared, cameras: Cameras, plan: Plan) -> None:
     note(f"{cause}: cameras were moved by {describe_moves(moves)}")
 
 
-def measure_psnr(gaussians: Gaussians, views: Scene, prepared: Prepared, plan: Plan) -> float:
-    """Measure the mean PSNR (dB) of the scored photos, of a quarter of each unless a quality was asked for."""
-    photos, near, quarter = scene_photos(views), NEAR * prepared.frame.unit, plan.target_psnr is None
+def measure_psnr(name: str, gaussians: Gaussians, views: Scene, prepared: Prepared, plan: Plan) -> float | None:
+    """Measure the mean PSNR (dB) of the scored photos, of a quarter of each unless a quality was asked for.
 
-    def score_on(backend: FitBackend[Any]) -> float:
-        return backend.photo_psnr(gaussians, photos, plan.scored_views, quarter=quarter, near=near)
+    None where there are no photos that show the scene. ``name``: of the stage that this is.
+    """
+    if views.images is None or not prepared.photo_views:
+        return None
+    with stage(name):
+        photos, near, quarter = scene_photos(views), NEAR * prepared.frame.unit, plan.target_psnr is None
 
-    return run_on(plan.backend, "scores", score_on)
+        def score_on(backend: FitBackend[Any]) -> float:
+            return backend.photo_psnr(gaussians, photos, plan.scored_views, quarter=quarter, near=near)
+
+        return run_on(plan.backend, "scores", score_on)
 
 
 def make_result(
@@ -141,11 +145,8 @@ def make_result(
     when the kernels are compiled and memory is free again. The seconds, choices and notes of the
     current record, which come before those of the candidates, enter the report.
     """
-    before, run, seconds = None, current_record(), search["seconds"]
-    if prepared.given.images is not None and prepared.photo_views:
-        with stage("input"):
-            before = measure_psnr(prepared.given.file_gaussians, prepared.given, prepared, plan)
-
+    run, seconds = current_record(), search["seconds"]
+    before = measure_psnr("input", prepared.given.file_gaussians, prepared.given, prepared, plan)
     comparable = prepared.photo_views and not plan.clean.hides  # or photos show something else
 
     def report(one: Candidate, seconds: Mapping[str, float], name: str) -> CompactReport:

@@ -131,16 +131,14 @@ def _check_scenes(args: opt.Args) -> None:
 def _warn_of_memory(files: SceneFiles, settings: CompactOptions, *, quiet: bool) -> None:
     """Warn before anything is read if the scene is not likely to fit into memory; in blocks it does."""
     from gsmerge.io.formats.ply_file import header_counts
+    from gsmerge.plan import wanted_blocks
     from gsmerge.runtime.estimate import memory_bytes, memory_problem
-    from gsmerge.stages.partition import gaussians_at_once, usual_blocks
+    from gsmerge.stages.partition import gaussians_at_once
 
     counts = [header_counts(ply) for one in (files, *files.more) for ply in one.plys]
     count, num_rest = sum(count for count, _ in counts), max(rest for _, rest in counts)
-    asked = settings.blocks.blocks
-    blocks = asked if isinstance(asked, int) else usual_blocks(count) if asked == "auto" else 1
-    if settings.whole_only:
-        blocks = 1
-    problem = memory_problem(memory_bytes(gaussians_at_once(count, blocks), photos=True, num_rest=num_rest))
+    at_once = gaussians_at_once(count, wanted_blocks(settings, count))
+    problem = memory_problem(memory_bytes(at_once, photos=True, num_rest=num_rest))
     if problem is not None:
         say(f"gsmerge: warning: {problem}", quiet=quiet)
 

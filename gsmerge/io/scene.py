@@ -163,8 +163,7 @@ def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: Rea
 
 
 def _load_one(files: SceneFiles, opacity: OpacityChoice, hints: ReadHints) -> SceneLoad:
-    load = align_scene(read_ply_with_hints(files, opacity=opacity, hints=hints), files, hints=hints)
-    return replace(load, notes=(*files.notes, *load.notes))
+    return align_scene(read_ply_with_hints(files, opacity=opacity, hints=hints), files, hints=hints)
 
 
 def _join_loads(loads: Sequence[SceneLoad], files: SceneFiles) -> SceneLoad:
@@ -290,7 +289,7 @@ def _make_load(
         cameras=camera_file,
         views=SceneViews(result.cameras, result.images, names, tuple(dict.fromkeys(views))),
         exporters=exporters,
-        notes=(*ply_notes(ply.info), *notes, *more),
+        notes=(*files.notes, *ply_notes(ply.info), *notes, *more),
         alignment=check_alignment(scene.gaussians, scene.cameras, scene.stored) if scene.aligned else None,
         recovery=result.recovery,
         problem=result.problem,

@@ -131,23 +131,21 @@ class ClusterWork:
         needs = self.cluster.needs(self.threads or max(1, processors // count), self.memory)
         threads = max(1, int(needs["num_cpus"]))
         remote, folder = self.ray.remote(max_retries=RETRIES, **needs)(_call), os.getcwd()
-        refs, pending = list[Any](), list[Any]()
+        places, results = dict[Any, int](), dict[int, Any]()
 
         def wait() -> None:
-            (ready, *_), pending[:] = self.ray.wait(pending, num_returns=1)
-            self._result(ready, title)  # an error ends the run at once
-            done = len(refs) - len(pending)
-            report_progress(f"{title}: {done} of {count} blocks", done, count)
+            (ready, *_), _ = self.ray.wait(list(places), num_returns=1)
+            results[places.pop(ready)] = self._result(ready, title)  # an error ends the run at once
+            report_progress(f"{title}: {len(results)} of {count} blocks", len(results), count)
 
-        for arguments in calls:
-            while len(pending) >= max(1, processors // threads):
+        for place, arguments in enumerate(calls):
+            while len(places) >= max(1, processors // threads):
                 wait()
-            refs.append(remote.remote(threads, folder, function, *arguments))
-            pending.append(refs[-1])
-        while pending:
+            places[remote.remote(threads, folder, function, *arguments)] = place
+        while places:
             wait()
-        for ref in refs:
-            yield self._result(ref, title)
+        for place in range(len(results)):
+            yield results.pop(place)
 
     def share(self, value: Any) -> Any:
         """Put a value where all nodes reach it."""

@@ -63,7 +63,7 @@ def join_scenes(scenes: Sequence[Scene], paths: Sequence[Path]) -> JoinedScene:
             "some files have no photos, so none are used; name the folder of all with --images"
         )  # fmt: skip
     facts = [_facts(*one) for one in zip(paths, found.places, found.matches, strict=True)]
-    return JoinedScene(_concat(moved), tuple(used), tuple(names), tuple(notes), tuple(facts))
+    return JoinedScene(concat_scenes(moved), tuple(used), tuple(names), tuple(notes), tuple(facts))
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
@@ -153,8 +153,8 @@ def _basis(directions: np.ndarray, num: int) -> np.ndarray:
     return np.stack(columns, 1)
 
 
-def _concat(scenes: Sequence[Scene]) -> Scene:
-    """Put the views of aligned scenes, of one size and in one frame, one after the other."""
+def concat_scenes(scenes: Sequence[Scene]) -> Scene:
+    """Put the views of scenes of one size and in one frame one after the other; all are aligned, or none is."""
     cameras = Cameras(
         np.concatenate([scene.cameras.viewmats for scene in scenes]),
         np.concatenate([scene.cameras.Ks for scene in scenes]),
@@ -165,14 +165,15 @@ def _concat(scenes: Sequence[Scene]) -> Scene:
     gaps = [scene.missing for scene in scenes]
     incomplete = any(one is not None for one in gaps)
     filled = [
-        np.zeros_like(scene.valid) if one is None else one
+        np.zeros(_grid(scene), bool) if one is None else one
         for scene, one in zip(scenes, gaps, strict=True)
     ]  # fmt: skip
+    aligned = all(scene.aligned for scene in scenes)
     return Scene(
         gaussians=Gaussians.concat([scene.gaussians for scene in scenes]),
         cameras=cameras,
         images=np.concatenate(images) if len(images) == len(scenes) else None,
-        pixel_ids=grid_ids(np.concatenate([scene.valid for scene in scenes])),
+        pixel_ids=grid_ids(np.concatenate([scene.valid for scene in scenes])) if aligned else None,
         names=tuple(name for scene in scenes for name in scene.names),
         missing=np.concatenate(filled) if incomplete else None,
         large_photos=_concat_large([scene.large_photos for scene in scenes]),
@@ -184,7 +185,11 @@ def _concat_masks(scenes: Sequence[Scene]) -> np.ndarray | None:
     """Put masks one after the other, whole ones where a scene has none; None without any."""
     if all(scene.masks is None for scene in scenes):
         return None
-    return np.concatenate([np.full(s.valid.shape, True) if s.masks is None else s.masks for s in scenes])
+    return np.concatenate([np.full(_grid(s), True) if s.masks is None else s.masks for s in scenes])
+
+
+def _grid(scene: Scene) -> tuple[int, int, int]:
+    return len(scene), scene.cameras.height, scene.cameras.width
 
 
 def _concat_large(photos: Sequence[LargePhotos | None]) -> LargePhotos | None:

@@ -193,7 +193,7 @@ class ChartRun:
                 facts, pictures = self._measure(scene, held_out, out, threads)
         facts["notes"] = (*notes, *facts.get("notes", ()))
         record = replace(self.record, environment=environment(threads), **facts)
-        size = files.ply.stat().st_size
+        size = sum(path.stat().st_size for path in files.plys)
         report = {
             **document_head(),
             "input": {"path": os.fspath(files.ply), "bytes": size, "num_gaussians": record.num_input or 0},

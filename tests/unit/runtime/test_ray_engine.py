@@ -61,6 +61,13 @@ def test_without_ray(monkeypatch: pytest.MonkeyPatch) -> None:
         pass
 
 
+class Ref:
+    """A result, or the error in its place."""
+
+    def __init__(self, value: Any) -> None:
+        self.value = value
+
+
 class FakeRay:
     """In place of Ray: calls are made when they are submitted, and end in the order of submission."""
 
@@ -84,17 +91,17 @@ class FakeRay:
         self.options.append(options)
 
         def decorate(function: Callable[..., Any]) -> Any:
-            def submit(*arguments: Any) -> list[Any]:
+            def submit(*arguments: Any) -> Ref:
                 self.running += 1
                 self.most = max(self.most, self.running)
                 try:
-                    return [function(*arguments)]
+                    return Ref(function(*arguments))
                 except ZeroDivisionError as error:
                     failed = self.exceptions.RayTaskError("traceback")
                     failed.cause = error
-                    return [failed]
+                    return Ref(failed)
                 except KeyError:
-                    return [self.exceptions.RayError("worker died")]
+                    return Ref(self.exceptions.RayError("worker died"))
 
             return SimpleNamespace(remote=submit)
 
@@ -104,10 +111,10 @@ class FakeRay:
         self.running -= num_returns
         return refs[:num_returns], refs[num_returns:]
 
-    def get(self, ref: list[Any]) -> Any:
-        if isinstance(ref[0], Exception):
-            raise ref[0]
-        return ref[0]
+    def get(self, ref: Ref) -> Any:
+        if isinstance(ref.value, Exception):
+            raise ref.value
+        return ref.value
 
 
 def work_of(nodes: list[dict[str, float]], threads: int | None = None, memory: int = 8) -> tuple[ClusterWork, FakeRay]:
