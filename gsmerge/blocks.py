@@ -244,7 +244,7 @@ def whole_limits(given: Scene, options: CompactOptions) -> CountLimits:
 
 def with_whole_choices(options: CompactOptions, given: Scene, whole: CountLimits) -> CompactOptions:
     """Return the options with the steps of a fit of the whole, which blocks share by their views, and its networks."""
-    steps = steps_for(options, whole.count or whole.default, given)
+    steps = steps_for(options, len(given), whole.share)
     networks = choose_networks(options, photos=given.images is not None)
     settings: dict[str, Any] = {"fit_steps": steps, "checkpoint": options.checkpoint if networks != "none" else "none"}
     if options.blocks.engine.name != "local" and os.path.isfile(options.checkpoint):

@@ -321,17 +321,17 @@ def resolve_fit(options: CompactOptions) -> FitOptions:
     return replace(fit, fit_steps=steps, min_contribution=fit.min_contribution if prunes else 0.0)
 
 
-def steps_for(options: CompactOptions, num_gaussians: int, scene: Scene) -> int:
-    """Return the steps of the full fit: as given, or more with the roots of the views and of the Gaussians per pixel.
+def steps_for(options: CompactOptions, num_views: int, share: float = USUAL_SHARE) -> int:
+    """Return the steps of the full fit: as given, or by effort and more with the roots of views and ``share``.
 
-    A step looks at one view; docs/internals/large-scenes.md has the measurements.
+    ``share``: Gaussians of the result for each pixel. A step looks at one view. Measurements are in
+    docs/internals/large-scenes.md.
     """
     if options.fit.fit_steps is not None:
         return options.fit.fit_steps
-    steps = EFFORTS[options.effort].steps * math.sqrt(max(1.0, len(scene) / USUAL_VIEWS))
+    steps = EFFORTS[options.effort].steps * math.sqrt(max(1.0, num_views / USUAL_VIEWS))
     if options.budget.auto:
         return round(AUTO_STEPS * steps)
-    share = num_gaussians / max(1, len(scene) * scene.pixels_per_view)
     return round(min(max(1.0, math.sqrt(share / USUAL_SHARE)), MOST_STEPS) * steps)
 
 
@@ -343,7 +343,7 @@ def _resolve_fit_to(
     if scene.images is None or not prepared.photo_views:
         options = replace(options, fit=replace(options.fit, fit="none"))
     fit = resolve_fit(options)
-    fit = replace(fit, fit_steps=steps_for(options, limits.count or limits.default, scene))
+    fit = replace(fit, fit_steps=steps_for(options, len(scene), limits.share))
     if scene.images is None or not fit.needs_photos:
         return replace(fit, photo_scale=1.0)
     auto = EFFORTS[options.effort].large_photos and backend.device == "cpu"

@@ -20,8 +20,7 @@ from gsmerge.batch.task import BatchContext, Task, record_failure, run_lock
 from gsmerge.errors import SceneError
 from gsmerge.io import find_scene_files
 from gsmerge.io.content_hash import cameras_of
-from gsmerge.options import CompactOptions
-from gsmerge.plan import resolve_fit, resolved_settings
+from gsmerge.plan import resolved_settings, steps_for
 from gsmerge.runtime.estimate import IMPORT_SECONDS, work_seconds
 from gsmerge.runtime.memory import human_bytes, machine_memory
 from gsmerge.runtime.threads import available_threads
@@ -72,18 +71,17 @@ def free_memory() -> int | None:
 def estimate_seconds(jobs: Sequence[Job], options: BatchOptions, schedule: Schedule) -> float:
     """Estimate the wall time of scenes, within a factor of about two."""
 
-    def resolve(own: CompactOptions) -> tuple[dict[str, Any], int]:
-        return resolved_settings(own, photos=True), resolve_fit(own).steps
-
-    total, usual = 0.0, resolve(options.settings)
+    total, usual = 0.0, resolved_settings(options.settings, photos=True)
     for job in jobs:
         views = 1  # where cameras cannot be read
         with suppress(SceneError):
             files = find_scene_files(Path(job.scene))
             cameras = None if files.cameras is None else cameras_of(files.cameras, files.ply.stem)
             views = max(1, len(cameras or ()))
-        settings, steps = usual if job.work is None else resolve(job.work.settings)
-        seconds = work_seconds(job.num_gaussians, job.num_gaussians / views, settings, photos=True, fit_steps=steps)
+        own = options.settings if job.work is None else job.work.settings
+        settings = usual if job.work is None else resolved_settings(own, photos=True)
+        each, steps = job.num_gaussians / views, steps_for(own, views)
+        seconds = work_seconds(job.num_gaussians, each, settings, photos=True, fit_steps=steps)
         total += seconds / min(schedule.threads, views)
     return IMPORT_SECONDS * bool(jobs) + total / max(1, min(schedule.jobs, len(jobs)))
 

@@ -138,7 +138,8 @@ def _warn_of_memory(files: SceneFiles, settings: CompactOptions, *, quiet: bool)
     counts = [header_counts(ply) for one in (files, *files.more) for ply in one.plys]
     count, num_rest = sum(count for count, _ in counts), max(rest for _, rest in counts)
     at_once = gaussians_at_once(count, wanted_blocks(settings, count))
-    problem = memory_problem(memory_bytes(at_once, photos=True, num_rest=num_rest))
+    needed = memory_bytes(at_once, photos=True, num_rest=num_rest, num_elsewhere=count - at_once)
+    problem = memory_problem(needed)
     if problem is not None:
         say(f"gsmerge: warning: {problem}", quiet=quiet)
 

@@ -40,6 +40,7 @@ from gsmerge.stages.sky import sky_regions
 from gsmerge.types import Gaussians, Scene, StrPath
 
 HUGE_SCALE_SHARE = 0.1  # of the box's diagonal: larger scales show no detail
+MAX_DRAWN_SAMPLES = 10_000  # Gaussians of which an estimate asks how many lie in a view
 _TRANSPARENT, _OPAQUE = 1 / 255, 0.995  # opacities: one step of an 8-bit image; where optical depth is capped
 _SATURATED = 1e-6  # of an opacity's distance to 0 or 1: its logit changes in float32
 _OWN = "gsmerge"  # the exporter's name of files that gsmerge wrote
@@ -219,15 +220,17 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     options = replace(options, decode=resolve_decode(options, scene, photos=photos))
     settings = resolved_settings(options, photos=photos)
     limits = count_limits(scene, options.segment, options.decode, options.budget)
-    pixels = max(len(scene) * scene.pixels_per_view, scene.num_gaussians)
+    pixels = max(limits.num_pixels, scene.num_gaussians)
     most = pixels if options.method.startswith("unmerged") else largest_count(limits, options.segment)
     count = min(scene.num_gaussians or pixels, most)
-    seconds = wall_seconds(
-        pixels, len(scene), settings, photos=photos, threads=options.threads or available_threads(),
-        fit_steps=steps_for(options, limits.count or limits.default, scene),
-    )  # fmt: skip
     blocks = choose_blocks(scene, options)
-    memory = memory_bytes(gaussians_at_once(pixels, blocks), photos=photos, num_rest=3 * scene.gaussians.shN.shape[1])
+    at_once, num_rest = gaussians_at_once(pixels, blocks), 3 * scene.gaussians.shN.shape[1]
+    seconds = wall_seconds(
+        at_once * blocks, len(scene), settings, threads=options.threads or available_threads(), photos=photos,
+        fit_steps=steps_for(options, len(scene), limits.share),
+        num_drawn=(pixels if options.method == "unmerged-fit" else count) * _share_inside(scene),
+    )  # fmt: skip
+    memory = memory_bytes(at_once, photos=photos, num_rest=num_rest, num_elsewhere=pixels - at_once)
     distributed = limits.count is not None or options.budget.auto
     return {
         "num_gaussians": count,
@@ -242,6 +245,13 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
         "memory_bytes": int(float(f"{memory:.2g}")),
         "memory_problem": memory_problem(memory),
     }
+
+
+def _share_inside(scene: Scene) -> float:
+    """Measure the share of the Gaussians whose centres lie in a view, on average."""
+    points = scene.gaussians.means[:: -(-max(1, len(scene.gaussians)) // MAX_DRAWN_SAMPLES)]
+    inside = inside_views(points.astype(np.float64), scene.cameras)
+    return float(np.mean([row.mean() for row in inside])) if len(scene) and len(points) else 1.0
 
 
 def estimate_lines(run: Mapping[str, Any]) -> list[str]:

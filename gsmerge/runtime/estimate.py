@@ -14,38 +14,49 @@ COST_MERGE = 1.0  # reading, superpixels and merging
 COST_SCORE = 0.3  # of input and result against the photos
 COST_NETWORKS = 1.4
 COST_FIT = 0.5  # besides the steps
-COST_UNMERGED_STEP = 0.15  # of a step of the fit of an input that was not merged
 COST_SLOW = {"bass-adaptive": 6.0, "slic": 4.5, "greedy": 25.0, "splat-transform": 60.0}  # more than usual
-# Per million pixels of one view:
-COST_STEP = 0.14  # of the fit
+# Of a step of the fit:
+COST_STEP = 0.1  # per million pixels of its view
+COST_DRAWN = 0.15  # per million Gaussians that it draws
+USUAL_DRAWN = 0.3  # Gaussians of the result per pixel of a view that lie in it, where the scene is not known
 
 # Memory, in bytes
 BYTES_FIXED = 250_000_000  # interpreter and libraries
 BYTES_PER_GAUSSIAN = 150
 BYTES_PER_VALUE = 4.5  # of higher harmonics, per Gaussian: those of the scene, and of some of its groups
 BYTES_PER_PIXEL = 90  # the photo as floats and what segmentation and rendering hold of it
+BYTES_ELSEWHERE = 40  # per Gaussian of the whole scene while a block of it is in memory
 
 
-def work_seconds(pixels: int, view_pixels: float, options: Mapping[str, Any], *, photos: bool, fit_steps: int) -> float:
+def work_seconds(
+    pixels: int,
+    view_pixels: float,
+    options: Mapping[str, Any],
+    *,
+    photos: bool,
+    fit_steps: int,
+    num_drawn: float | None = None,
+) -> float:
     """Estimate the processor seconds that a scene takes, without imports.
 
     ``pixels`` of all views together, or Gaussians where they are more; ``view_pixels`` of one view;
     ``options``: all settings by flat name, with the checkpoint that is used; ``photos``: whether
-    there are any to fit to and to score on.
+    there are any to fit to and to score on; ``num_drawn``: Gaussians that lie in a view of the
+    fit, on average, None: the usual number.
     """
     method, fits = options["method"], fit_of(options, photos=photos) == "full"
     work = COST_MERGE + COST_SCORE * photos + COST_FIT * fits
     work += COST_SLOW.get(options["segmentation"] if method == "gsmerge" else method, 0.0)
     work += COST_NETWORKS * (method == "gsmerge" and options["checkpoint"] != "none")
-    step = COST_STEP * view_pixels + COST_UNMERGED_STEP * pixels * (method == "unmerged-fit")
+    if num_drawn is None:
+        num_drawn = pixels if method == "unmerged-fit" else USUAL_DRAWN * view_pixels
+    step = COST_STEP * view_pixels + COST_DRAWN * num_drawn
     return (pixels * work + fit_steps * fits * step) / 1e6
 
 
-def wall_seconds(
-    pixels: int, num_views: int, options: Mapping[str, Any], *, photos: bool, fit_steps: int, threads: int
-) -> float:
+def wall_seconds(pixels: int, num_views: int, options: Mapping[str, Any], *, threads: int, **facts: Any) -> float:
     """Estimate the wall time of a run on so many threads, imports included; arguments as of :func:`work_seconds`."""
-    work = work_seconds(pixels, pixels / max(num_views, 1), options, photos=photos, fit_steps=fit_steps)
+    work = work_seconds(pixels, pixels / max(num_views, 1), options, **facts)
     return IMPORT_SECONDS + work / max(1, min(threads, num_views))
 
 
@@ -55,9 +66,14 @@ def fit_of(options: Mapping[str, Any], *, photos: bool) -> str:
     return own.get(options["method"], "none") if photos else "none"
 
 
-def memory_bytes(pixels: int, *, photos: bool, num_rest: int = 0) -> int:
-    """Estimate the memory of a run, imports included; ``num_rest``: columns of higher harmonics."""
-    return BYTES_FIXED + round((BYTES_PER_GAUSSIAN + BYTES_PER_VALUE * num_rest + BYTES_PER_PIXEL * photos) * pixels)
+def memory_bytes(pixels: int, *, photos: bool, num_rest: int = 0, num_elsewhere: int = 0) -> int:
+    """Estimate the memory of a run, imports included.
+
+    ``num_rest``: columns of higher harmonics; ``num_elsewhere``: Gaussians of a scene beyond the ``pixels`` of the
+    block that is worked on.
+    """
+    each = BYTES_PER_GAUSSIAN + BYTES_PER_VALUE * num_rest + BYTES_PER_PIXEL * photos
+    return BYTES_FIXED + round(each * pixels + BYTES_ELSEWHERE * num_elsewhere)
 
 
 def memory_problem(needed: int) -> str | None:

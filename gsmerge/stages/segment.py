@@ -76,6 +76,7 @@ class CountLimits:
     min_count: int  # Fewest Gaussians that the scene can be cut to: one for each view
     max_count: int  # Most Gaussians that a budget, a size or a device allows
     exact: int | None  # Gaussians that a budget or a size asks for; None without either
+    num_pixels: int  # Of all views
 
     @property
     def count(self) -> int | None:
@@ -83,6 +84,11 @@ class CountLimits:
         if self.exact is not None:
             return self.exact
         return self.max_count if self.default > self.max_count else None
+
+    @property
+    def share(self) -> float:
+        """Gaussians for each pixel."""
+        return (self.count or self.default) / max(1, self.num_pixels)
 
 
 def count_limits(
@@ -114,6 +120,7 @@ def count_limits(
         min_count=len(scene),
         max_count=max_count,
         exact=exact,
+        num_pixels=len(scene) * scene.pixels_per_view,
     )
 
 

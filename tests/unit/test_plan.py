@@ -55,22 +55,20 @@ def test_what_is_given_goes_before_effort(scene: Scene) -> None:
 
 
 def test_steps_grow_with_the_root_of_the_share(scene: Scene) -> None:
-    pixels, usual = len(scene) * scene.pixels_per_view, EFFORTS["default"].steps
-    steps = [steps_for(options_of(), round(share * pixels), scene) for share in (0.01, 0.044, 0.088, 0.176, 1.0)]
+    usual, views = EFFORTS["default"].steps, len(scene)
+    steps = [steps_for(options_of(), views, share) for share in (0.01, 0.044, 0.088, 0.176, 1.0)]
     assert steps == [usual, usual, pytest.approx(usual * 2**0.5, abs=2), pytest.approx(2 * usual, abs=2), 2 * usual]
-    assert steps_for(options_of(fit_steps=9), pixels, scene) == 9
-    assert steps_for(options_of(budget="auto"), 10, scene) == 2 * usual
+    assert steps_for(options_of(fit_steps=9), views, 1.0) == 9
+    assert steps_for(options_of(budget="auto"), views) == 2 * usual
 
 
 def test_steps_grow_with_the_views() -> None:
     """By their root, so that a view of many never gets more steps than one of twelve."""
-    counts = (3, 12, 24, 48)
-    scenes_of = [scenes.make_scene(scenes.wall(), scenes.arc(count, 8, 6)) for count in counts]
-    steps = [steps_for(options_of(), 1, one) for one in scenes_of]
+    steps = [steps_for(options_of(), views) for views in (3, 12, 24, 48)]
     usual = EFFORTS["default"].steps
     assert steps == [usual, usual, round(2**0.5 * usual), 2 * usual]
-    assert steps_for(options_of(effort="fast"), 1, scenes_of[3]) == 2 * EFFORTS["fast"].steps
-    assert steps_for(options_of(fit_steps=9), 1, scenes_of[3]) == 9
+    assert steps_for(options_of(effort="fast"), 48) == 2 * EFFORTS["fast"].steps
+    assert steps_for(options_of(fit_steps=9), 48) == 9
 
 
 def test_a_draft_without_a_fit_leaves_out_nothing() -> None:

@@ -16,10 +16,12 @@ from gsmerge.runtime.memory import machine_memory, peak_memory
 VIEW = 480 * 320
 
 
-def seconds(views: int = 12, *, photos: bool = True, fit_steps: int = 240, **settings: Any) -> float:
+def seconds(
+    views: int = 12, *, photos: bool = True, fit_steps: int = 240, num_drawn: float | None = None, **settings: Any
+) -> float:
     options = CompactOptions().with_settings(settings)
     plain = resolved_settings(options, photos=photos)
-    return work_seconds(views * VIEW, VIEW, plain, photos=photos, fit_steps=fit_steps)
+    return work_seconds(views * VIEW, VIEW, plain, photos=photos, fit_steps=fit_steps, num_drawn=num_drawn)
 
 
 def test_more_work_takes_longer() -> None:
@@ -29,6 +31,8 @@ def test_more_work_takes_longer() -> None:
     assert seconds(photos=False, checkpoint="none") < none
     assert seconds(24, fit="none") == pytest.approx(2 * seconds(12, fit="none"))
     assert seconds(method="voxel") < seconds() < seconds(method="unmerged-fit")
+    assert seconds(num_drawn=0) < seconds() < seconds(num_drawn=VIEW)
+    assert seconds(fit="none", num_drawn=0) == seconds(fit="none", num_drawn=VIEW)
 
 
 def test_threads_share_the_views() -> None:
@@ -42,6 +46,11 @@ def test_threads_share_the_views() -> None:
 def test_higher_harmonics_are_counted_once() -> None:
     plain, degree4 = (memory_bytes(10**7, photos=True, num_rest=num) for num in (0, 72))
     assert 4 * 72 * 10**7 <= degree4 - plain <= 5 * 72 * 10**7
+
+
+def test_a_block_takes_less_memory_than_the_whole() -> None:
+    block = memory_bytes(10**6, photos=True, num_elsewhere=10**7)
+    assert memory_bytes(10**6, photos=True) < block < memory_bytes(10**7, photos=True)
 
 
 def test_the_papers_online_setting_fits_into_24_gb() -> None:
