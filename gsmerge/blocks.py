@@ -249,7 +249,8 @@ def with_whole_choices(options: CompactOptions, given: Scene, whole: CountLimits
     settings: dict[str, Any] = {"fit_steps": steps, "checkpoint": options.checkpoint if networks != "none" else "none"}
     if options.blocks.engine.name != "local" and os.path.isfile(options.checkpoint):
         settings["require_checkpoint"] = True  # a node without it would make other bytes
-    return options.with_settings(settings)
+    options = options.with_settings(settings)
+    return replace(options, fit=replace(options.fit, share=whole.share))
 
 
 def block_options(

@@ -20,6 +20,7 @@ from gsmerge.stages.assign import merge_unseen
 from gsmerge.stages.clean import CleanOptions, clean
 from gsmerge.stages.decode import USUAL_K, DecodeOptions
 from gsmerge.stages.fit import FitBackend, FitOptions, photo_scale, start_share
+from gsmerge.stages.fit.fit_options import USUAL_SHARE
 from gsmerge.stages.match import MatchOptions, Method
 from gsmerge.stages.partition import usual_blocks
 from gsmerge.stages.prepare import Prepared
@@ -34,8 +35,7 @@ if TYPE_CHECKING:
 
 AUTO_STEPS = 2  # times the usual steps with budget auto: fewer Gaussians cost less, and need them for detail
 SHORT_STEPS = 60  # of a fit that a better start still matters to
-USUAL_SHARE = 0.044  # of Gaussians in the pixels that the steps of an effort are for; more need more steps, up to
-MOST_STEPS = 2.0  # times as many
+MOST_STEPS = 2.0  # times the steps, for more than the usual share of Gaussians in the pixels
 USUAL_VIEWS = 12  # that the steps of an effort are for; more need more
 LONE_K = 4  # where all views have one camera: no other adds Gaussians of its own to a surface
 
@@ -343,7 +343,8 @@ def _resolve_fit_to(
     if scene.images is None or not prepared.photo_views:
         options = replace(options, fit=replace(options.fit, fit="none"))
     fit = resolve_fit(options)
-    fit = replace(fit, fit_steps=steps_for(options, len(scene), limits.share))
+    share = limits.share if fit.share is None else fit.share
+    fit = replace(fit, fit_steps=steps_for(options, len(scene), limits.share), share=share)
     if scene.images is None or not fit.needs_photos:
         return replace(fit, photo_scale=1.0)
     auto = EFFORTS[options.effort].large_photos and backend.device == "cpu"

@@ -12,7 +12,6 @@ import time
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 import torch
@@ -32,10 +31,10 @@ from gsmerge.stages.fit.full import (
     MAX_STEPS,
     PROBE,
     FitPlan,
+    Look,
     Progress,
     TailMean,
     affordable_steps,
-    look_of,
     plan_run,
     step_sizes,
 )
@@ -183,22 +182,23 @@ def step_gradients(
     background: Tensor,
     kept: Tensor | None,
     options: FitOptions,
-    look: dict[str, Any],
+    look: Look,
+    progress: float = 1.0,
 ) -> tuple[StepGradients, Tensor]:
     """Differentiate one view's loss, and sum its weighted squared errors.
 
-    ``kept [n]``: opacities of what is drawn, None: the state's own. ``look``: low-pass and
-    antialiasing, see :func:`gsmerge.stages.fit.full.look_of`.
+    ``kept [n]``: opacities of what is drawn, None: the state's own.
     """
     photos = level.photos
     shape = (state.means, state.quats, state.scales, state.opacities if kept is None else kept)
     with torch.enable_grad():
         leaves = [tensor.detach().requires_grad_() for tensor in (*shape, state_colors(state, photos, view))]
         drawn = leaves[0], leaves[1], leaves[2], leaves[3]
-        image, reached = draw(drawn, leaves[4], photos, view, background, **look)
-    wanted, error = loss_gradient(
-        image.detach(), photos.images[view], level.means[view], level.weight(view), options.tuning.ssim_lambda
-    )
+        image, reached = draw(
+            drawn, leaves[4], photos, view, background, eps2d=look.eps2d, antialiased=look.antialiased
+        )
+    weights = options.tuning.ssim_lambda, options.tuning.edge_weight * progress
+    wanted, error = loss_gradient(image.detach(), photos.images[view], level.means[view], level.weight(view), *weights)
     of_means, of_quats, of_scales, of_opacities, of_colors = torch.autograd.grad(image, leaves, wanted)
     return StepGradients(of_means, of_quats, of_scales, of_opacities, of_colors, reached), error
 
@@ -296,10 +296,11 @@ class _Run:
 
     def _move(self, state: FitState, kept: Tensor | None) -> Tensor:
         """Move a state by the present step, and return the mean squared error of the view before it."""
-        at, options = self.plan.level_at(self.step + 1, self.step / self.steps), self.plan.options
-        level, view = self.levels[at], self.views[self.step]
-        look = look_of(self.step + 1, at, level.photos.host.eps2d)
-        gradients, error = step_gradients(state, level, view, self.backgrounds[self.step], kept, options, look)
+        progress, options = self.step / self.steps, self.plan.options
+        look = self.plan.look_at(self.step + 1, progress)
+        level, view = self.levels[look.size], self.views[self.step]
+        background = self.backgrounds[self.step]
+        gradients, error = step_gradients(state, level, view, background, kept, options, look, progress)
         adam_step(state, gradients, options, self.rates[self.step], self.step + 1)
         return error / max(3 * level.counts[view], 1)
 

@@ -27,9 +27,9 @@ def photo_means(images: Tensor) -> Tensor:
 
 
 def loss_gradient(
-    image: Tensor, photo: Tensor, means: Tensor, weight: Tensor, ssim_lambda: float
+    image: Tensor, photo: Tensor, means: Tensor, weight: Tensor, ssim_lambda: float, edge_weight: float = 0.0
 ) -> tuple[Tensor, Tensor]:
-    """Differentiate (1 - l) |image - photo| + l (1 - SSIM), l = ``ssim_lambda``; sum the squared errors.
+    """Differentiate the loss of :func:`gsmerge.stages.fit.loss.image_gradient`; sum the squared errors.
 
     SSIM's windows are uniform, of 7 x 7 pixels, with population covariances, K1 = .01, K2 = .03
     (Wang et al. 2004). Images are ``[h,w,3]``, ``means [2,3,h,w]`` those of :func:`photo_means`,
@@ -41,7 +41,18 @@ def loss_gradient(
     if ssim_lambda > 0:
         similar = ssim_lambda / pixels * _ssim_gradient(image.permute(2, 0, 1), photo.permute(2, 0, 1), means, weight)
         gradient = gradient - similar.permute(1, 2, 0)
+    if edge_weight > 0:
+        _add_edges(gradient, off, wide, edge_weight / pixels)
     return gradient, (wide * off * off).sum()
+
+
+def _add_edges(gradient: Tensor, off: Tensor, wide: Tensor, each: float) -> None:
+    """Add to a gradient ``[h,w,3]`` that of the L1 of the differences of ``off`` to the right and below."""
+    for axis in (0, 1):
+        size = off.shape[axis] - 1
+        pull = off.diff(dim=axis).sign() * each * wide.narrow(axis, 0, size).minimum(wide.narrow(axis, 1, size))
+        gradient.narrow(axis, 1, size).add_(pull)
+        gradient.narrow(axis, 0, size).sub_(pull)
 
 
 def _ssim_gradient(x: Tensor, y: Tensor, means: Tensor, weight: Tensor) -> Tensor:

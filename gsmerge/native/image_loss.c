@@ -1,4 +1,5 @@
-// The gradient of the fit's image loss: L1, and structural similarity by sums over windows.
+// The gradient of the fit's image loss: L1, structural similarity by sums over windows, and L1 of the
+// differences between neighbouring pixels.
 //
 // Rows go in groups of four, at multiples of four wherever a range begins: sums over seven rows
 // share what they have in common, and are always added up in the same order. A group is summed
@@ -206,20 +207,85 @@ static void fill_gradient(Loss l, int64_t row, int64_t first, int64_t last,
     errors[y] = total(squares[y - row]);
 }
 
+// Differences of a row and the weights of its values, both with a pixel of weight zero after the
+// last; so are rows outside the image.
+static void fill_row(Loss l, int64_t row, float *restrict off, float *restrict wide) {
+  int64_t pixels = l.width / 3, i = 0;
+  if (row < 0 || row >= l.height) {
+    for (int64_t j = 0; j < l.width + 3; j++) off[j] = wide[j] = 0.f;
+    return;
+  }
+  const float *x = l.image + row * l.width, *y = l.photo + row * l.width;
+  const float *weight = l.weight + row * pixels;
+  for (int64_t j = 0; j < l.width; j++) off[j] = x[j] - y[j];
+  for (; i + LANES <= pixels; i += LANES) {
+    v16f w = load(weight + i);
+    float *to = wide + 3 * i;
+    store(to, PICK(w, w, 0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 4, 4, 4, 5));
+    store(to + LANES, PICK(w, w, 5, 5, 6, 6, 6, 7, 7, 7, 8, 8, 8, 9, 9, 9, 10, 10));
+    store(to + 2 * LANES, PICK(w, w, 10, 11, 11, 11, 12, 12, 12, 13, 13, 13, 14, 14, 14, 15, 15, 15));
+  }
+  for (; i < pixels; i++)
+    for (int c = 0; c < 3; c++) wide[3 * i + c] = weight[i];
+  for (int c = 0; c < 3; c++) off[l.width + c] = wide[l.width + c] = 0.f;
+}
+
+// What pairs of values add to the gradient of the first ones, and take from that of the second: the
+// sign of their difference, times the lesser weight.
+static inline void pull(const float *off, const float *wide, const float *off2, const float *wide2,
+                        float *restrict to, int64_t count) {
+  for (int64_t i = 0; i < count; i++) {
+    float least = minf(wide[i], wide2[i]), further = off[i] - off2[i];
+    to[i] = further > 0.f ? least : further < 0.f ? -least : 0.f;
+  }
+}
+
+// What the next row needs of the last one: differences and weights, and pulls across.
+typedef struct {
+  float *here, *below, *along, *before, *after;  // rows of a given room, the first two pairs of them
+  int64_t room;
+  float each;
+} Edges;
+
+static Edges start_edges(Loss l, float each, int64_t first, float *rows, int64_t room) {
+  Edges e = {rows, rows + 2 * room, rows + 4 * room, rows + 5 * room, rows + 6 * room, room, each};
+  fill_row(l, first - 1, e.below, e.below + room);
+  fill_row(l, first, e.here, e.here + room);
+  pull(e.below, e.below + room, e.here, e.here + room, e.before, l.width);
+  for (int c = 0; c < 3; c++) e.along[c] = 0.f;
+  return e;
+}
+
+// Add the gradient of the L1 of differences to a row, and go on to the next.
+static void add_edges(Loss l, Edges *e, int64_t row, float *restrict gradient) {
+  float *here = e->here, *below = e->below, *restrict along = e->along;
+  float *restrict before = e->before, *restrict after = e->after, *restrict to = gradient + row * l.width;
+  fill_row(l, row + 1, below, below + e->room);
+  pull(here, here + e->room, below, below + e->room, after, l.width);
+  pull(here, here + e->room, here + 3, here + e->room + 3, along + 3, l.width);
+  for (int64_t i = 0; i < l.width; i++)
+    to[i] += e->each * ((along[i + 3] - along[i]) + (after[i] - before[i]));
+  e->here = below;
+  e->below = here;
+  e->before = after;
+  e->after = before;
+}
+
 // The first row of the group of a row, which may lie above the image.
 static inline int64_t group_of(int64_t row) { return (row + GROUP) / GROUP * GROUP - GROUP; }
 
 API int32_t loss_gradient(const float *restrict image, const float *restrict photo,
-                          const float *restrict weight, float ssim_lambda, int64_t first,
-                          int64_t last, float *restrict gradient, float *restrict errors,
-                          float *restrict terms, int64_t height, int64_t width, int64_t pixels,
-                          int64_t room) {
+                          const float *restrict weight, float ssim_lambda, float edge_weight,
+                          int64_t first, int64_t last, float *restrict gradient,
+                          float *restrict errors, float *restrict terms, float *restrict rows,
+                          int64_t height, int64_t width, int64_t pixels, int64_t room) {
   if (width != 3 * pixels || room < (width + CHUNK - 1) / CHUNK * CHUNK + PAD) return OUTSIDE;
   float count = (float)(height * pixels);
   Loss l = {image, photo, weight, height, width, (1.f - ssim_lambda) / count, ssim_lambda / count};
   float *ring[3];
   for (int k = 0; k < 3; k++) ring[k] = terms + k * GROUP * TERMS * room;
   if (first == last) return 0;
+  Edges edges = start_edges(l, edge_weight / count, first, rows, room);
   for (int64_t row = group_of(first - RADIUS); row <= group_of(last - 1) + GROUP; row += GROUP) {
     float *oldest = ring[0];
     ring[0] = ring[1];
@@ -227,6 +293,9 @@ API int32_t loss_gradient(const float *restrict image, const float *restrict pho
     ring[2] = oldest;
     fill_terms(l, row, ring[2], room);
     fill_gradient(l, row - GROUP, first, last, (const float *const *)ring, room, gradient, errors);
+    if (edge_weight > 0.f)
+      for (int64_t y = maxi(first, row - GROUP); y < mini(last, row); y++)
+        add_edges(l, &edges, y, gradient);
   }
   return 0;
 }

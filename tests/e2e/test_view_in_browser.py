@@ -72,11 +72,18 @@ def wait(tab: Browser, condition: str) -> None:
 
 
 def picture(tab: Browser) -> np.ndarray:
-    """``[h,w,3]`` what the stage shows, in [0, 1]."""
+    """``[h,w,3]`` what the stage shows, in [0, 1], once it is the same twice: a busy browser is late."""
     wait(tab, f"({SETTLED}) || state.solid === '' && [...document.images].every(image => image.complete)")
-    box = tab.run("JSON.parse(JSON.stringify(stage.getBoundingClientRect()))")
-    clip = {"x": box["x"], "y": box["y"], "width": WIDTH, "height": HEIGHT, "scale": 1}
-    data = tab.call("Page.captureScreenshot", format="png", clip=clip)["data"]
+    end, before = time.monotonic() + PATIENCE, None
+    while True:
+        wait(tab, "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))")
+        box = tab.run("JSON.parse(JSON.stringify(stage.getBoundingClientRect()))")
+        clip = {"x": box["x"], "y": box["y"], "width": WIDTH, "height": HEIGHT, "scale": 1}
+        data = tab.call("Page.captureScreenshot", format="png", clip=clip)["data"]
+        if data == before:
+            break
+        assert time.monotonic() < end, "the picture changes all the time"
+        before = data
     image = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
     return np.asarray(image[..., ::-1], np.float32) / 255
 
@@ -200,16 +207,16 @@ def test_full_screen(opened: tuple[Browser, Any]) -> None:
         tab.press("f", 70)
         wait(tab, f"id('full').textContent === '{words}'")
         assert tab.run("document.fullscreenElement !== null") == (words != "Full screen")
-        assert tab.run("stage.getBoundingClientRect().bottom <= innerHeight + scrollY")
+        wait(tab, "stage.getBoundingClientRect().bottom <= innerHeight + scrollY")
 
 
 def test_an_upright_photo_takes_the_height_of_the_window(opened: tuple[Browser, Any]) -> None:
     tab, _ = opened
     tab.call("Emulation.setDeviceMetricsOverride", width=1440, height=900, deviceScaleFactor=1, mobile=False)
     tab.run("set('mode', 'swipe'); stage.style.width = ''; [view().width, view().height] = [128, 192]; show()")
-    assert tab.run("stage.getBoundingClientRect().height") > 0.7 * 900
+    wait(tab, "stage.getBoundingClientRect().height > 0.7 * 900")
     tab.run("[view().width, view().height] = [192, 128]; show()")
-    assert tab.run("stage.getBoundingClientRect().height") < 0.63 * 900
+    wait(tab, "stage.getBoundingClientRect().height < 0.63 * 900")
     tab.call("Emulation.clearDeviceMetricsOverride")
 
 

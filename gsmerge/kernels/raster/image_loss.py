@@ -1,8 +1,8 @@
 """The gradient of the fit's image loss in one pass over the rows: no image is written but the result.
 
 Structural similarity needs sums over windows of image, photo and their products, and then sums over windows of what
-those give. Every sum is added up in the same order wherever a range of rows begins, so results do not depend on how
-rows are shared out.
+those give. Differences between neighbouring pixels follow row by row. Every sum is added up in the same order
+wherever a range of rows begins, so results do not depend on how rows are shared out.
 """
 
 from __future__ import annotations
@@ -15,28 +15,35 @@ SIDE = 7  # of the windows, pixels
 C1, C2 = np.float32(1e-4), np.float32(9e-4)  # SSIM's constants for a data range of 1
 
 ROWS, TERMS = 12, 3  # rows of derivatives that are kept at a time, and numbers of each of their values
+EDGE_ROWS = 7  # of differences, weights and what they give
 CHUNK, PAD = 96, 9  # values that are summed at a time, and beside a row
 
 
 @native(
     STATUS, image=f4("height", "width"), photo=f4("height", "width"), weight=f4("height", "pixels"), ssim_lambda=f4(),
-    first=i8(least=0, most="height"), last=i8(least="first", most="height"),
+    edge_weight=f4(), first=i8(least=0, most="height"), last=i8(least="first", most="height"),
     gradient=f4("height", "width", out=True), errors=f4("height", out=True), terms=f4(ROWS, TERMS, "room", out=True),
+    rows=f4(EDGE_ROWS, "room", out=True),
 )  # fmt: skip
-def _loss_gradient(image, photo, weight, ssim_lambda, first, last, gradient, errors, terms):
-    """Write what :func:`image_gradient` does; ``terms`` are overwritten, of a width rounded up to CHUNK, and PAD."""
+def _loss_gradient(image, photo, weight, ssim_lambda, edge_weight, first, last, gradient, errors, terms, rows):
+    """Write what :func:`image_gradient` does.
+
+    ``terms`` and ``rows`` are overwritten, of a width rounded up to CHUNK, and PAD.
+    """
 
 
-def image_gradient(image, photo, weight, ssim_lambda, first, last, gradient, errors):
-    """Write the gradient of (1 - ssim_lambda) |image - photo| + ssim_lambda (1 - SSIM), each pixel with its weight.
+def image_gradient(image, photo, weight, ssim_lambda, edge_weight, first, last, gradient, errors):
+    """Write the gradient of (1 - ssim_lambda) |e| + ssim_lambda (1 - SSIM) + edge_weight |difference of e|.
 
-    Windows of SSIM are uniform, of 7 x 7 pixels, zero beyond the border.
+    e is ``image - photo``, its differences are those to the next pixel of a row and of a column. Pixels have their
+    weights, a pair of pixels the lesser one. Windows of SSIM are uniform, of 7 x 7 pixels, zero beyond the border.
 
     Args:
         image: ``[h,3w]`` float32, interleaved channels.
         photo: ``[h,3w]`` float32.
         weight: ``[h,w]`` float32.
         ssim_lambda: Share of structural similarity, float32.
+        edge_weight: Weight of the differences between neighbouring pixels, float32.
         first: First row.
         last: Last row, exclusive.
         gradient: ``[h,3w]`` float32, the rows are written, divided by the number of pixels.
@@ -44,4 +51,5 @@ def image_gradient(image, photo, weight, ssim_lambda, first, last, gradient, err
     """
     room = -(-image.shape[1] // CHUNK) * CHUNK + PAD
     terms = np.empty((ROWS, TERMS, room), np.float32)
-    _loss_gradient(image, photo, weight, ssim_lambda, first, last, gradient, errors, terms)
+    rows = np.empty((EDGE_ROWS, room), np.float32)
+    _loss_gradient(image, photo, weight, ssim_lambda, edge_weight, first, last, gradient, errors, terms, rows)

@@ -14,6 +14,7 @@ from gsmerge.types import Cameras, Gaussians
 Fit = Literal["none", "full"]
 STEPS = 320  # of the full fit
 LONG_STEPS = 600  # from here on full-size photos and a little dropout pay
+USUAL_SHARE = 0.044  # of Gaussians in the pixels, which half-size photos show well
 EARLIER = 0.1  # share of the steps by which half-size photos end sooner where larger ones follow
 HASTY_STEPS = 20  # shorter runs have no time for full-size photos
 GROW_STEPS = 150  # shorter runs do better when they begin with all that they may have
@@ -44,6 +45,9 @@ class Tuning:
     min_scale: float = 0.5
     average_share: float = 0.2  # Share of the last steps that the parameters are averaged over
     ssim_lambda: float = 0.35  # Share of structural similarity in the loss, the rest is L1
+    # Weight in the loss, at the end, of the L1 of differences between neighbouring pixels; it
+    # grows from 0: edges say little where they lie elsewhere
+    edge_weight: float = 2.4
     # Weight of the mean opacity in the loss of the full fit (3DGS-MCMC, Kheradmand et al. 2024):
     # what the photos do not need fades, instead of standing in front of other views
     opacity_reg: float = 0.03
@@ -79,13 +83,14 @@ class FitOptions:
         dropout: Share of the Gaussians that a step leaves out; None: 0.1 for five views or fewer and 150 steps or
             more, where the fit would memorise the photos, otherwise 0.05 from 600 steps and 30 looks at
             each view on, and 0 below.
-        half_res_share: Share of the steps on half-size photos; None: 0.7, from 600 steps on 0.5, below 20 all; 0.1 less
-            where ``photo_scale`` is above 1.
+        half_res_share: Share of the steps on half-size photos; None: 0.7, from 600 steps on 0.5, below 20 all; less for
+            more than 4.4 % of the Gaussians, and 0.1 less where ``photo_scale`` is above 1.
         holdout: Share of the photos' blocks that decides whether a fit is accepted.
         min_contribution: Least blending weight at some pixel of some photo; Gaussians below it in all photos that they
             lie in are left out.
         judged: Whether the result has to show held-out blocks better than its start; not where the start has seen them.
         move_cameras: Whether the full fit moves the cameras on; a plan decides it by ``poses``.
+        share: Gaussians of the result for each pixel, None: 0.044; a plan knows it.
         tuning: Constants.
 
     Raises:
@@ -102,6 +107,7 @@ class FitOptions:
     min_contribution: float = 1 / 255
     judged: bool = field(default=True, metadata=NOT_A_SETTING)
     move_cameras: bool = field(default=False, metadata=NOT_A_SETTING)
+    share: float | None = field(default=None, metadata=NOT_A_SETTING)
     tuning: Tuning = field(default_factory=Tuning, metadata=NOT_A_SETTING)
 
     @property
@@ -114,7 +120,12 @@ class FitOptions:
         """Share of the steps on half-size photos."""
         if self.half_res_share is not None:
             return self.half_res_share
-        return 1.0 if self.steps < HASTY_STEPS else 0.5 if self.steps >= LONG_STEPS else 0.7
+        if self.steps < HASTY_STEPS:
+            return 1.0
+        part = 0.5 if self.steps >= LONG_STEPS else 0.7
+        if self.share is None or not self.grows:
+            return part
+        return min(part, 0.7 * math.sqrt(USUAL_SHARE / max(self.share, USUAL_SHARE)))
 
     @property
     def needs_photos(self) -> bool:

@@ -1,8 +1,8 @@
 """Gaussians -> fitted Gaussians: a short optimisation of all parameters, confined to a box about the start.
 
-One view per step: L1 and structural similarity on a random background, half-size photos first, Adam
-with rates in units of each Gaussian's own size. Longer runs begin with fewer Gaussians than they
-may have and spend the rest where the error is.
+One view per step: L1 of pixels and of their differences, and structural similarity, on a random
+background, half-size photos first, Adam with rates in units of each Gaussian's own size. Longer runs
+begin with fewer Gaussians than they may have and spend the rest where the error is.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -44,15 +43,28 @@ LARGE_STEPS = (0, 2)  # of every five, look at larger photos; with more of them 
 PROBE = 6  # steps that are timed to plan a time budget
 MAX_STEPS = 2000
 LONG_RUN = 300  # steps beyond which the last ones shrink in proportion
-# How full-size steps draw, in turn: the low-pass as a share of the viewers' own, and whether small Gaussians are made
-# clearer by what it adds to them. Some viewers do that, and enlarged twice the low-pass is a quarter: what was fitted
-# to one way alone looks thin or fat in the others (Mip-Splatting, Yu et al. 2024).
+# How steps after those on half-size photos draw, in turn: whether at half size, the low-pass as a share of the
+# viewers' own, and whether small Gaussians are made clearer by what it adds to them. Some viewers do that, enlarged
+# twice the low-pass is a quarter, and from afar it covers more of the scene: what was fitted to one way alone looks
+# thin or fat in the others (Mip-Splatting, Yu et al. 2024).
 LOOKS = (
-    (1.0, True), (1.0, False), (0.25, False), (1.0, False), (1.0, False), (1.0, False), (0.25, False), (1.0, False),
+    (0, 1.0, True), (0, 1.0, False), (0, 0.25, False), (1, 1.0, False),
+    (0, 1.0, False), (0, 1.0, False), (0, 0.25, False), (0, 1.0, False),
+    (0, 1.0, True), (1, 1.0, False), (0, 0.25, False), (0, 1.0, False),
+    (0, 1.0, False), (0, 1.0, False), (0, 0.25, False), (1, 1.0, False),
 )  # fmt: skip
 
 Progress = Callable[[int, int, float, float], None]  # step, steps, PSNR of the photos and of their held-out blocks
 EPS = 1e-15  # of Adam
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a step looks at the scene."""
+
+    size: int  # Of the photos: 0 full, 1 half, 2 larger
+    eps2d: float  # Low-pass, pixels squared
+    antialiased: bool = False  # Whether small Gaussians are made clearer by it
 
 
 @dataclass(frozen=True)
@@ -72,11 +84,18 @@ class FitPlan:
     poses: PoseState | None = None  # The motions of the cameras; None where they are fixed
     fixed: np.ndarray | None = None  # [n] bool, Gaussians that stay as they are; None: none
 
-    def level_at(self, step: int, progress: float) -> int:
-        """Return the size of photos of a step: 1 half-size, which come first; 0 full-size; 2 larger, in between."""
+    def look_at(self, step: int, progress: float) -> Look:
+        """Return how a step looks at the scene.
+
+        Half-size photos come first. Then photos are drawn in turn in the ways of viewers; larger
+        ones in between show what an enlarged view shows.
+        """
         if progress < self.half_part:
-            return 1
-        return 2 if len(self.photos) > 2 and step % 5 in LARGE_STEPS else 0
+            return Look(1, self.photos[1].eps2d)
+        if len(self.photos) > 2 and step % 5 in LARGE_STEPS:
+            return Look(2, self.photos[2].eps2d)
+        size, share, antialiased = LOOKS[step % len(LOOKS)]
+        return Look(size * self.options.grows, share * self.photos[0].eps2d, antialiased)  # short runs lose by it
 
 
 def plan_run(photos: tuple[Photos, ...], options: FitOptions, seed: int) -> FitPlan:
@@ -109,24 +128,27 @@ def _weights_of(photos: Photos) -> list[np.ndarray]:
 
 def fit_step(state: State, plan: FitPlan, view: int, step: int, progress: float, rng: np.random.Generator) -> float:
     """Take one Adam step on one view; return the mean squared error of its training pixels."""
-    level = plan.level_at(step, progress)
-    photos = plan.photos[level]
-    weight = plan.step_weights[level][view]
+    look = plan.look_at(step, progress)
+    photos = plan.photos[look.size]
+    weight = plan.step_weights[look.size][view]
     background, opacities = rng.random(3, dtype=np.float32), None
     if plan.dropout > 0:
         kept = rng.random(len(state.x), dtype=np.float32) >= plan.dropout
         opacities = kept * np.minimum(state.splats.opacities / np.float32(1 - plan.dropout), MAX_ALPHA)
-    drawn = plan_view(state.splats, **(photos.camera(view) | look_of(step, level, photos.eps2d)), opacities=opacities)
+    camera = photos.camera(view) | {"eps2d": look.eps2d, "antialiased": look.antialiased}
+    drawn = plan_view(state.splats, **camera, opacities=opacities)
     all_colors = state.view_colors()
     colors = view_colors(drawn) if all_colors is None else all_colors.take(drawn.ids, 0)
     image, transmittance = blend(drawn, colors, background)
-    gradient, error = image_gradient(image, photos.image(view), weight, plan.options.tuning.ssim_lambda)
+    rates = plan.options.tuning
+    edge_weight = rates.edge_weight * progress
+    gradient, error = image_gradient(image, photos.image(view), weight, rates.ssim_lambda, edge_weight)
     g = gradients_of(drawn, colors, image, transmittance, gradient, None, with_viewmat=plan.poses is not None)
     if plan.poses is not None and g.viewmat is not None:  # that harmonics change with the camera is left out
-        plan.poses.step(view, g.viewmat, plan.options.tuning, progress)
+        plan.poses.step(view, g.viewmat, rates, progress)
     if plan.fixed is not None:
         g = _take(g, ~plan.fixed[g.ids])
-    rates, s, count = plan.options.tuning, state.splats, max(len(state.x), 1)
+    s, count = state.splats, max(len(state.x), 1)
     steps = step_sizes(rates, progress, plan.options.steps)
     limits = np.array([rates.max_mean_shift, rates.max_scale_change, rates.max_opacity_change], np.float32)
     betas = np.array([rates.beta1, rates.beta2], np.float32)
@@ -147,17 +169,6 @@ def fit_step(state: State, plan: FitPlan, view: int, step: int, progress: float,
 def _take(g: Gradients, rows: np.ndarray) -> Gradients:
     names = ("ids", "means", "quats", "scales", "opacities", "colors")
     return replace(g, **{name: np.ascontiguousarray(getattr(g, name)[rows]) for name in names})
-
-
-def look_of(step: int, level: int, eps2d: float) -> dict[str, Any]:
-    """Return the arguments of :func:`gsmerge.render.plan_view` for low-pass and antialiasing of a step.
-
-    Full-size photos (level 0) are drawn in turn in the ways of viewers. Half-size ones (1) and
-    larger ones (2) are all drawn one way: the first are coarse, the others what an enlarged view
-    shows.
-    """
-    share, antialiased = (1.0, False) if level else LOOKS[step % len(LOOKS)]
-    return {"eps2d": share * eps2d, "antialiased": antialiased}
 
 
 def step_sizes(rates: Tuning, progress: float, steps: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The image loss of the full fit: L1 and structural similarity.
+"""The image loss of the full fit: L1, structural similarity, and L1 of the differences between neighbouring pixels.
 
 The structural similarity of the loss, :func:`loss_ssim`, is that of training too. It has uniform windows, which are
 quick to differentiate, so its values differ from the measured ones of :func:`gsmerge.render.metrics.ssim`.
@@ -39,13 +39,14 @@ def loss_ssim(image: Tensor, photo: Tensor) -> Tensor:
 
 
 def image_gradient(
-    image: np.ndarray, photo: np.ndarray, weight: np.ndarray, ssim_lambda: float
+    image: np.ndarray, photo: np.ndarray, weight: np.ndarray, ssim_lambda: float, edge_weight: float = 0.0
 ) -> tuple[np.ndarray, float]:
-    """Return the gradient of (1 - l) |image - photo| + l (1 - SSIM), l = ``ssim_lambda``, and the squared error.
+    """Return the gradient of (1 - l) |e| + l (1 - SSIM) + d (|right - e| + |below - e|), and the squared error.
 
-    Images are ``[h,w,3]`` float32, pixels weigh ``weight [h,w]`` float32. The gradient ``[h,w,3]``
-    is divided by the number of pixels, so that it means the same at every size; the squared errors
-    are summed over all channels.
+    e is ``image - photo``, right and below its neighbours, l is ``ssim_lambda`` and d is
+    ``edge_weight``. Images are ``[h,w,3]`` float32, pixels weigh ``weight [h,w]`` float32, and a
+    pair of pixels the lesser weight. The gradient ``[h,w,3]`` is divided by the number of pixels, so
+    that it means the same at every size; the squared errors are summed over all channels.
     """
     height, width = weight.shape
     gradient, errors = np.empty((height, 3 * width), np.float32), np.empty(height, np.float32)
@@ -53,7 +54,9 @@ def image_gradient(
     with use_threads() as threads:
         cuts = [height * i // threads for i in range(threads + 1)]
         parallel_map(
-            lambda span: image_loss.image_gradient(flat, goal, weight, f4(ssim_lambda), *span, gradient, errors),
+            lambda span: image_loss.image_gradient(
+                flat, goal, weight, f4(ssim_lambda), f4(edge_weight), *span, gradient, errors
+            ),
             list(pairwise(cuts)),
         )
     return gradient.reshape(height, width, 3), float(errors.sum(dtype=np.float64))

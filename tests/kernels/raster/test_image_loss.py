@@ -38,37 +38,48 @@ def similarity(image: torch.Tensor, photo: torch.Tensor) -> torch.Tensor:
     return (2 * mx * my + c1) * (2 * xy + c2) / ((mx * mx + my * my + c1) * (xx + yy + c2))
 
 
-def loss(image: torch.Tensor, photo: torch.Tensor, weight: torch.Tensor, ssim_lambda: float) -> torch.Tensor:
-    each = (1 - ssim_lambda) * (image - photo).abs() + ssim_lambda * (1 - similarity(image, photo))
-    return (weight[..., None] * each).sum() / (image.shape[0] * image.shape[1])
+def loss(
+    image: torch.Tensor, photo: torch.Tensor, weight: torch.Tensor, ssim_lambda: float, edge_weight: float = 0.0
+) -> torch.Tensor:
+    off = image - photo
+    each = (1 - ssim_lambda) * off.abs() + ssim_lambda * (1 - similarity(image, photo))
+    down = torch.minimum(weight[1:], weight[:-1])[..., None] * (off[1:] - off[:-1]).abs()
+    along = torch.minimum(weight[:, 1:], weight[:, :-1])[..., None] * (off[:, 1:] - off[:, :-1]).abs()
+    edges = down.sum() + along.sum()
+    return ((weight[..., None] * each).sum() + edge_weight * edges) / (image.shape[0] * image.shape[1])
 
 
-def autograd(image: np.ndarray, photo: np.ndarray, weight: np.ndarray, ssim_lambda: float) -> np.ndarray:
+def autograd(
+    image: np.ndarray, photo: np.ndarray, weight: np.ndarray, ssim_lambda: float, edge_weight: float
+) -> np.ndarray:
     variable = torch.from_numpy(image).double().requires_grad_()
-    loss(variable, torch.from_numpy(photo).double(), torch.from_numpy(weight).double(), ssim_lambda).backward()
+    others = torch.from_numpy(photo).double(), torch.from_numpy(weight).double()
+    loss(variable, *others, ssim_lambda, edge_weight).backward()
     return variable.grad.numpy()
 
 
 @pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("ssim_lambda", [0.0, 0.2, 1.0])
+@pytest.mark.parametrize(("ssim_lambda", "edge_weight"), [(0.0, 0.0), (0.2, 0.0), (1.0, 0.0), (0.2, 1.2), (1.0, 3.0)])
 @pytest.mark.parametrize("weighted", [True, False])
-def test_gradient_matches_autograd(size: tuple[int, int], ssim_lambda: float, weighted: bool) -> None:
+def test_gradient_matches_autograd(
+    size: tuple[int, int], ssim_lambda: float, edge_weight: float, weighted: bool
+) -> None:
     image, photo, weight = pictures(size)
     weight = weight if weighted else np.ones_like(weight)
-    actual, _ = image_gradient(image, photo, weight, ssim_lambda)
-    reference = autograd(image, photo, weight, ssim_lambda)
+    actual, _ = image_gradient(image, photo, weight, ssim_lambda, edge_weight)
+    reference = autograd(image, photo, weight, ssim_lambda, edge_weight)
     assert actual.dtype == np.float32
     assert np.linalg.norm(actual - reference) <= 1e-3 * np.linalg.norm(reference)
 
 
 def test_gradient_matches_finite_differences() -> None:
     image, photo, weight = pictures((12, 10), seed=1)
-    actual, _ = image_gradient(image, photo, weight, 0.2)
+    actual, _ = image_gradient(image, photo, weight, 0.2, 1.2)
     rng, step = np.random.default_rng(0), 1e-6
     for _ in range(5):
         way = rng.normal(size=image.shape)
         ends = [
-            float(loss(*(torch.from_numpy(a) for a in (image + sign * step * way, photo, weight)), 0.2))
+            float(loss(*(torch.from_numpy(a) for a in (image + sign * step * way, photo, weight)), 0.2, 1.2))
             for sign in (1.0, -1.0)
         ]
         assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(float((actual * way).sum()), rel=2e-3, abs=1e-5)
@@ -77,11 +88,12 @@ def test_gradient_matches_finite_differences() -> None:
 @pytest.mark.parametrize("cuts", [[0, 20], [0, 7, 20], list(range(21))], ids=str)
 def test_rows_do_not_depend_on_how_they_are_shared_out(cuts: list[int]) -> None:
     image, photo, weight = pictures((20, 17))
-    whole, error = image_gradient(image, photo, weight, 0.2)
+    whole, error = image_gradient(image, photo, weight, 0.2, 1.2)
     flat, goal = image.reshape(20, -1), photo.reshape(20, -1)
     gradient, errors = np.empty_like(flat), np.empty(20, np.float32)
     for first, last in pairwise(cuts):
-        image_loss.image_gradient(flat, goal, weight, np.float32(0.2), first, last, gradient, errors)
+        weights = np.float32(0.2), np.float32(1.2)
+        image_loss.image_gradient(flat, goal, weight, *weights, first, last, gradient, errors)
     np.testing.assert_array_equal(gradient, whole.reshape(20, -1))
     assert float(errors.sum(dtype=np.float64)) == error
 
@@ -96,7 +108,14 @@ def test_error_is_the_weighted_square(size: tuple[int, int]) -> None:
 @pytest.mark.parametrize("ssim_lambda", [0.0, 0.2, 1.0])
 def test_no_gradient_at_the_photo(ssim_lambda: float) -> None:
     _, photo, weight = pictures((16, 16))
-    assert np.abs(image_gradient(photo, photo, weight, ssim_lambda)[0]).max() < 1e-5
+    assert np.abs(image_gradient(photo, photo, weight, ssim_lambda, 1.2)[0]).max() < 1e-5
+
+
+def test_another_exposure_has_no_edges_of_its_own() -> None:
+    _, photo, weight = pictures((16, 16))
+    brighter = np.full_like(photo, 0.25)
+    plain, _ = image_gradient(brighter, 0 * photo, weight, 0.0)
+    np.testing.assert_array_equal(image_gradient(brighter, 0 * photo, weight, 0.0, 1.2)[0], plain)
 
 
 def test_pixels_without_weight_teach_nothing() -> None:
@@ -104,16 +123,16 @@ def test_pixels_without_weight_teach_nothing() -> None:
     image, photo, _ = pictures((40, 40))
     weight = np.ones((40, 40), np.float32)
     weight[:, 20:] = 0
-    gradient, _ = image_gradient(image, photo, weight, 0.2)
+    gradient, _ = image_gradient(image, photo, weight, 0.2, 1.2)
     assert (gradient[:, 23:] == 0).all()
     assert (gradient[:, :20] != 0).any(-1).all()
     elsewhere = photo.copy()
     elsewhere[:, 23:] = 0.3  # seen by no window of a weighted pixel
-    np.testing.assert_allclose(image_gradient(image, elsewhere, weight, 0.2)[0], gradient, atol=1e-7)
+    np.testing.assert_allclose(image_gradient(image, elsewhere, weight, 0.2, 1.2)[0], gradient, atol=1e-7)
 
 
 def test_flat_pictures_stay_finite() -> None:
     flat, weight = np.zeros((9, 9, 3), np.float32), np.ones((9, 9), np.float32)
     for image in (flat, flat + 1):
-        assert np.isfinite(image_gradient(image, flat, weight, 0.2)[0]).all()
-    assert np.isfinite(image_gradient(flat, flat + 1, 0 * weight, 0.2)[0]).all()
+        assert np.isfinite(image_gradient(image, flat, weight, 0.2, 1.2)[0]).all()
+    assert np.isfinite(image_gradient(flat, flat + 1, 0 * weight, 0.2, 1.2)[0]).all()

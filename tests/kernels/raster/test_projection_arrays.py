@@ -202,7 +202,8 @@ def test_loss_has_the_same_bits_on_every_processor(each_target: Any, size: tuple
 
     def run() -> list[np.ndarray]:
         gradient, errors = np.empty_like(image), np.empty(height, np.float32)
-        image_loss.image_gradient(image, photo, weight, np.float32(0.2), 0, height, gradient, errors)
+        weights = np.float32(0.2), np.float32(1.2)
+        image_loss.image_gradient(image, photo, weight, *weights, 0, height, gradient, errors)
         return plain([gradient, errors])
 
     gradient, _ = each_target(run)
@@ -212,6 +213,7 @@ def test_loss_has_the_same_bits_on_every_processor(each_target: Any, size: tuple
 
 def test_memory_of_the_loss_that_is_too_small_is_refused() -> None:
     image, weight = np.zeros((4, 9), np.float32), np.zeros((4, 3), np.float32)
-    terms = np.empty((12, 3, image_loss.CHUNK), np.float32)
+    terms, rows = (np.empty((*shape, image_loss.CHUNK), np.float32) for shape in ((12, 3), (7,)))
+    outputs = image.copy(), weight[:, 0].copy(), terms, rows
     with pytest.raises(ValueError, match="indices inside"):
-        image_loss._loss_gradient(image, image, weight, 0.2, 0, 4, image.copy(), weight[:, 0].copy(), terms)
+        image_loss._loss_gradient(image, image, weight, 0.2, 1.2, 0, 4, *outputs)

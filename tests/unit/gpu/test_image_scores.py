@@ -13,16 +13,16 @@ from gsmerge.stages.fit.loss import image_gradient
 
 
 @pytest.mark.parametrize("size", [(20, 17), (7, 7), (3, 5), (1, 9)])
-@pytest.mark.parametrize("ssim_lambda", [0.0, 0.2, 1.0])
-def test_loss_is_the_kernels(size: tuple[int, int], ssim_lambda: float) -> None:
+@pytest.mark.parametrize(("ssim_lambda", "edge_weight"), [(0.0, 0.0), (0.2, 0.0), (0.2, 1.2), (1.0, 1.2)])
+def test_loss_is_the_kernels(size: tuple[int, int], ssim_lambda: float, edge_weight: float) -> None:
     rng = np.random.default_rng(0)
     photos = rng.uniform(0, 1, (2, *size, 3)).astype(np.float32)
     image = photos[1] + 0.2 * rng.normal(size=photos[1].shape).astype(np.float32)
     weight = (rng.random(size) > 0.2).astype(np.float32)
     tensors = [torch.from_numpy(array) for array in (image, photos[1], weight)]
     means = photo_means(torch.from_numpy(photos))
-    actual, error = loss_gradient(*tensors[:2], means[1], tensors[2], ssim_lambda)
-    expected, squares = image_gradient(image, photos[1], weight, ssim_lambda)
+    actual, error = loss_gradient(*tensors[:2], means[1], tensors[2], ssim_lambda, edge_weight)
+    expected, squares = image_gradient(image, photos[1], weight, ssim_lambda, edge_weight)
     assert np.linalg.norm(actual.numpy() - expected) <= 1e-3 * np.linalg.norm(expected)
     assert float(error) == pytest.approx(squares, rel=1e-5)
 

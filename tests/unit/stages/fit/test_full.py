@@ -16,11 +16,11 @@ from gsmerge.stages.fit import full as full_module
 from gsmerge.stages.fit.fit_options import Tuning
 from gsmerge.stages.fit.fit_state import start_state
 from gsmerge.stages.fit.full import (
+    Look,
     affordable_steps,
     fit_full,
     holdout_score,
     initial_scores,
-    look_of,
     plan_run,
     step_sizes,
 )
@@ -96,12 +96,16 @@ def test_nothing_becomes_thinner_than_half_a_pixel(truth: Gaussians, photos: Pai
     assert (needles.scales.min(1) < np.exp(min_sizes) / 3).mean() > 0.5
 
 
-def test_full_size_steps_draw_as_viewers_do() -> None:
-    """With and without compensation, and as when enlarged twice; half-size steps always in one way."""
-    looks = [look_of(step, 0, 0.3) for step in range(1, 9)]
-    assert {(look["eps2d"], look["antialiased"]) for look in looks} == {(0.3, True), (0.3, False), (0.075, False)}
-    assert looks[0] == look_of(9, 0, 0.3)
-    assert {tuple(look_of(step, 1, 0.075).values()) for step in range(1, 9)} == {(0.075, False)}
+def test_steps_draw_as_viewers_do(photos: Pair) -> None:
+    """With and without compensation, as when enlarged twice, and from afar; before that always in one way."""
+    plan = plan_run(photos, LONG, 0)
+    looks = [plan.look_at(step, 0.8) for step in range(1, 17)]
+    afar = Look(1, 0.3)
+    assert set(looks) == {Look(0, 0.3, antialiased=True), Look(0, 0.3), Look(0, 0.075), afar}
+    assert looks.count(afar) == 3
+    assert looks[0] == plan.look_at(17, 0.8)
+    assert {plan.look_at(step, 0.5) for step in range(1, 17)} == {Look(1, 0.075)}
+    assert afar not in {plan_run(photos, QUICK, 0).look_at(step, 0.8) for step in range(1, 17)}
 
 
 @pytest.mark.parametrize(("name", "field"), [("opacity_reg", "opacities"), ("scale_reg", "scales")])

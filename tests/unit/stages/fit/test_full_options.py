@@ -16,7 +16,7 @@ from gsmerge.render.gradient import gradients_of
 from gsmerge.render.photos import Photos
 from gsmerge.stages.fit import FitOptions
 from gsmerge.stages.fit import full as full_module
-from gsmerge.stages.fit.fit_options import LONG_STEPS, Tuning
+from gsmerge.stages.fit.fit_options import LONG_STEPS, USUAL_SHARE, Tuning
 from gsmerge.stages.fit.fit_state import start_state
 from gsmerge.stages.fit.full import fit_full, plan_run, start_poses
 
@@ -66,6 +66,15 @@ def test_dropout_where_there_are_few_views(photos: tuple[Photos, Photos]) -> Non
     very_long = replace(LONG, fit_steps=LONG_STEPS)
     assert 0 < plan_run(pair, very_long, 0).dropout < plan_run(photos, very_long, 0).dropout
     assert very_long.half_res_part < LONG.half_res_part < replace(LONG, half_res_share=0.9).half_res_part
+
+
+def test_more_gaussians_have_fewer_steps_on_half_size_photos() -> None:
+    parts = [replace(LONG, share=share).half_res_part for share in (0.01, USUAL_SHARE, 2 * USUAL_SHARE, 0.2)]
+    assert parts[0] == parts[1] == LONG.half_res_part
+    assert parts[1] > parts[2] > parts[3] > 0.3
+    short = replace(QUICK, share=0.2)
+    assert short.half_res_part == QUICK.half_res_part
+    assert replace(LONG, share=0.2, half_res_share=0.9).half_res_part == 0.9
 
 
 def test_dropout_leaves_out_its_share(truth: Gaussians, photos: tuple[Photos, Photos]) -> None:

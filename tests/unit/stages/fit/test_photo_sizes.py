@@ -142,11 +142,13 @@ def test_some_views_have_their_own_photos(scene: Scene) -> None:
 def test_steps_look_at_half_full_and_larger_photos(scene: Scene) -> None:
     options = FitOptions(fit_steps=200, photo_scale=2)
     plan = plan_run(fit_photos(with_large(scene, 2), options), options, 0)
-    levels = [plan.level_at(step + 1, step / 200) for step in range(200)]
-    assert [levels.count(level) for level in (1, 0, 2)] == [120, 48, 32]
-    assert levels[:120] == [1] * 120
+    sizes = [plan.look_at(step + 1, step / 200).size for step in range(200)]
+    assert [sizes.count(size) for size in (1, 0, 2)] == [129, 39, 32]
+    assert sizes[:120] == [1] * 120
     usual = plan_run(scenes.pair_of(scene), options, 0)
-    assert [usual.level_at(step + 1, step / 200) for step in range(200)] == [1] * 140 + [0] * 60
+    sizes = [usual.look_at(step + 1, step / 200).size for step in range(200)]
+    assert sizes[:140] == [1] * 140
+    assert [sizes[140:].count(size) for size in (0, 1)] == [49, 11]
 
 
 def test_the_users_share_of_half_size_steps_stays(scene: Scene) -> None:
