@@ -95,7 +95,9 @@ class FitPlan:
         if len(self.photos) > 2 and step % 5 in LARGE_STEPS:
             return Look(2, self.photos[2].eps2d)
         size, share, antialiased = LOOKS[step % len(LOOKS)]
-        return Look(size * self.options.grows, share * self.photos[0].eps2d, antialiased)  # short runs lose by it
+        if not self.options.grows or (len(self.photos) > 2 and step % 3):  # short runs lose by it, and what is near
+            size = 0
+        return Look(size, share * self.photos[0].eps2d, antialiased)
 
 
 def plan_run(photos: tuple[Photos, ...], options: FitOptions, seed: int) -> FitPlan:
