@@ -95,7 +95,9 @@ class FitPlan:
         if len(self.photos) > 2 and step % 5 in LARGE_STEPS:
             return Look(2, self.photos[2].eps2d)
         size, share, antialiased = LOOKS[step % len(LOOKS)]
-        if not self.options.grows or (len(self.photos) > 2 and step % 3):  # short runs lose by it, and what is near
+        # From afar costs short runs more than it gains; beside larger photos, which are for looking
+        # closely, every third such look is enough
+        if not self.options.grows or (len(self.photos) > 2 and step % 3):
             size = 0
         return Look(size, share * self.photos[0].eps2d, antialiased)
 
