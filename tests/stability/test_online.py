@@ -61,13 +61,17 @@ def test_batches_fed_again_and_again(made: list[Scene]) -> None:
 # 53: batches in reverse
 
 
-@pytest.mark.parametrize("wish", [{"fit": "none"}, FULL], ids=str)
-def test_batches_in_reverse(wish: dict[str, Any], made: list[Scene], forward: list[Compactor]) -> None:
-    """Within 0.2 dB on average over the scenes, 0.5 dB in each: tiny ones, of some 260 Gaussians."""
+@pytest.mark.parametrize("wishes", [[{"fit": "none"}], [FULL | {"fit_steps": n} for n in (30, 60, 200)]], ids=str)
+def test_batches_in_reverse(wishes: list[dict[str, Any]], made: list[Scene], forward: list[Compactor]) -> None:
+    """Within 0.2 dB on average over the scenes, 0.5 dB in each: tiny ones, of some 260 Gaussians.
+
+    One fit rounds to 0.3 dB of either, so the mean of short and long ones counts.
+    """
     backward = [fed(parts_of(scene, 2, backwards=True)) for scene in made]
     for one, other in zip(forward, backward, strict=True):
         assert abs(len(one) - len(other)) < 0.08 * len(one)
-    difference = psnrs(backward, made, **wish) - psnrs(forward, made, **wish)
+    differences = [psnrs(backward, made, **wish) - psnrs(forward, made, **wish) for wish in wishes]
+    difference = np.mean(differences, 0)
     assert abs(difference.mean()) < 0.2
     assert np.abs(difference).max() < 0.5
 
