@@ -344,7 +344,7 @@ def _resolve_fit_to(
         options = replace(options, fit=replace(options.fit, fit="none"))
     fit = resolve_fit(options)
     share = limits.share if fit.share is None else fit.share
-    fit = replace(fit, fit_steps=steps_for(options, len(scene), limits.share), share=share)
+    fit = replace(fit, fit_steps=steps_for(options, len(scene), share), share=share)
     if scene.images is None or not fit.needs_photos:
         return replace(fit, photo_scale=1.0)
     auto = EFFORTS[options.effort].large_photos and backend.device == "cpu"

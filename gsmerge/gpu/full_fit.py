@@ -35,6 +35,7 @@ from gsmerge.stages.fit.full import (
     Progress,
     TailMean,
     affordable_steps,
+    loss_weights,
     plan_run,
     step_sizes,
 )
@@ -181,13 +182,13 @@ def step_gradients(
     view: int,
     background: Tensor,
     kept: Tensor | None,
-    options: FitOptions,
     look: Look,
-    progress: float = 1.0,
+    weights: tuple[float, float],
 ) -> tuple[StepGradients, Tensor]:
     """Differentiate one view's loss, and sum its weighted squared errors.
 
-    ``kept [n]``: opacities of what is drawn, None: the state's own.
+    ``kept [n]``: opacities of what is drawn, None: the state's own. ``weights``: see
+    :func:`gsmerge.stages.fit.full.loss_weights`.
     """
     photos = level.photos
     shape = (state.means, state.quats, state.scales, state.opacities if kept is None else kept)
@@ -197,7 +198,6 @@ def step_gradients(
         image, reached = draw(
             drawn, leaves[4], photos, view, background, eps2d=look.eps2d, antialiased=look.antialiased
         )
-    weights = options.tuning.ssim_lambda, options.tuning.edge_weight * progress
     wanted, error = loss_gradient(image.detach(), photos.images[view], level.means[view], level.weight(view), *weights)
     of_means, of_quats, of_scales, of_opacities, of_colors = torch.autograd.grad(image, leaves, wanted)
     return StepGradients(of_means, of_quats, of_scales, of_opacities, of_colors, reached), error
@@ -299,8 +299,8 @@ class _Run:
         progress, options = self.step / self.steps, self.plan.options
         look = self.plan.look_at(self.step + 1, progress)
         level, view = self.levels[look.size], self.views[self.step]
-        background = self.backgrounds[self.step]
-        gradients, error = step_gradients(state, level, view, background, kept, options, look, progress)
+        background, weights = self.backgrounds[self.step], loss_weights(options.tuning, progress)
+        gradients, error = step_gradients(state, level, view, background, kept, look, weights)
         adam_step(state, gradients, options, self.rates[self.step], self.step + 1)
         return error / max(3 * level.counts[view], 1)
 

@@ -194,11 +194,7 @@ def coverage(scene: Scene) -> list[dict[str, Any]]:
     """
     if len(scene) == 0:
         return []
-    rows = np.arange(0, len(scene.gaussians), -(-len(scene.gaussians) // MAX_SAMPLES))
-    if scene.aligned:
-        rows = rows[scene.stored.reshape(-1)[rows]]
-    points = scene.gaussians.means[rows].astype(np.float64)
-    shares = [float(inside.mean()) if len(points) else 0.0 for inside in inside_views(points, scene.cameras)]
+    shares = _shares_inside(scene, MAX_SAMPLES)
     pixels: list[float | None] = [None] * len(scene)
     if scene.aligned:
         visible = (scene.gaussians.opacities >= _TRANSPARENT).reshape(scene.valid.shape) & scene.stored
@@ -225,10 +221,11 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     count = min(scene.num_gaussians or pixels, most)
     blocks = choose_blocks(scene, options)
     at_once, num_rest = gaussians_at_once(pixels, blocks), 3 * scene.gaussians.shN.shape[1]
+    drawn = pixels if options.method == "unmerged-fit" else count
     seconds = wall_seconds(
         at_once * blocks, len(scene), settings, threads=options.threads or available_threads(), photos=photos,
         fit_steps=steps_for(options, len(scene), limits.share),
-        num_drawn=(pixels if options.method == "unmerged-fit" else count) * _share_inside(scene),
+        num_drawn=drawn * float(np.mean(_shares_inside(scene, MAX_DRAWN_SAMPLES) or [1.0])),
     )  # fmt: skip
     memory = memory_bytes(at_once, photos=photos, num_rest=num_rest, num_elsewhere=pixels - at_once)
     distributed = limits.count is not None or options.budget.auto
@@ -247,11 +244,13 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     }
 
 
-def _share_inside(scene: Scene) -> float:
-    """Measure the share of the Gaussians whose centres lie in a view, on average."""
-    points = scene.gaussians.means[:: -(-max(1, len(scene.gaussians)) // MAX_DRAWN_SAMPLES)]
-    inside = inside_views(points.astype(np.float64), scene.cameras)
-    return float(np.mean([row.mean() for row in inside])) if len(scene) and len(points) else 1.0
+def _shares_inside(scene: Scene, most: int) -> list[float]:
+    """Measure the share of the Gaussians, of at most so many, whose centres lie in each view."""
+    rows = np.arange(0, len(scene.gaussians), max(1, -(-len(scene.gaussians) // most)))
+    if scene.aligned:
+        rows = rows[scene.stored.reshape(-1)[rows]]
+    points = scene.gaussians.means[rows].astype(np.float64)
+    return [float(inside.mean()) if len(points) else 0.0 for inside in inside_views(points, scene.cameras)]
 
 
 def estimate_lines(run: Mapping[str, Any]) -> list[str]:

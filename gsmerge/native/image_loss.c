@@ -89,11 +89,12 @@ static inline void slide(float *lines, int count) {
     for (int i = 0; i < 2 * PAD; i++) lines[line * LINE + i] = lines[line * LINE + CHUNK + i];
 }
 
-// Weights of a chunk of a row's pixels, for each channel; zero past the end.
-static inline void repeat_weights(Loss l, int64_t row, int64_t column, float wide[CHUNK]) {
+// Weights of a row's pixels from a column on, for each channel; zero past the end. The count of
+// values is one of whole pixels.
+static inline void repeat_weights(Loss l, int64_t row, int64_t column, float *wide, int64_t count) {
   const float *weight = l.weight + row * (l.width / 3) + column / 3;
-  int64_t left = mini(CHUNK, l.width - column) / 3;
-  for (int i = 0; i < CHUNK / 3; i++) {
+  int64_t left = mini(count, l.width - column) / 3;
+  for (int64_t i = 0; i < count / 3; i++) {
     float w = i < left ? weight[i] : 0.f;
     for (int c = 0; c < 3; c++) wide[3 * i + c] = w;
   }
@@ -131,7 +132,7 @@ static void fill_terms(Loss l, int64_t row, float *terms, int64_t room) {
     for (int k = 0; k < GROUP; k++) {
       float *to = terms + k * TERMS * room + column;
       if (row + k < 0 || row + k >= l.height) continue;
-      repeat_weights(l, row + k, column, wide);
+      repeat_weights(l, row + k, column, wide, CHUNK);
       write_terms(sums[k], wide, to, room);
     }
   }
@@ -189,7 +190,7 @@ static void fill_gradient(Loss l, int64_t row, int64_t first, int64_t last,
     append_terms(terms[0] + ahead, terms[1] + ahead, terms[2] + ahead, room, sums, CHUNK);
     for (int64_t y = maxi(first, row); y < mini(last, row + GROUP); y++) {
       int64_t at = y * l.width + column, k = y - row;
-      repeat_weights(l, y, column, wide);
+      repeat_weights(l, y, column, wide, CHUNK);
       if (left == CHUNK) {
         write_gradient(l, sums[k], l.image + at, l.photo + at, wide, gradient + at, squares + k);
         continue;
@@ -210,24 +211,14 @@ static void fill_gradient(Loss l, int64_t row, int64_t first, int64_t last,
 // Differences of a row and the weights of its values, both with a pixel of weight zero after the
 // last; so are rows outside the image.
 static void fill_row(Loss l, int64_t row, float *restrict off, float *restrict wide) {
-  int64_t pixels = l.width / 3, i = 0;
   if (row < 0 || row >= l.height) {
     for (int64_t j = 0; j < l.width + 3; j++) off[j] = wide[j] = 0.f;
     return;
   }
   const float *x = l.image + row * l.width, *y = l.photo + row * l.width;
-  const float *weight = l.weight + row * pixels;
   for (int64_t j = 0; j < l.width; j++) off[j] = x[j] - y[j];
-  for (; i + LANES <= pixels; i += LANES) {
-    v16f w = load(weight + i);
-    float *to = wide + 3 * i;
-    store(to, PICK(w, w, 0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 4, 4, 4, 5));
-    store(to + LANES, PICK(w, w, 5, 5, 6, 6, 6, 7, 7, 7, 8, 8, 8, 9, 9, 9, 10, 10));
-    store(to + 2 * LANES, PICK(w, w, 10, 11, 11, 11, 12, 12, 12, 13, 13, 13, 14, 14, 14, 15, 15, 15));
-  }
-  for (; i < pixels; i++)
-    for (int c = 0; c < 3; c++) wide[3 * i + c] = weight[i];
-  for (int c = 0; c < 3; c++) off[l.width + c] = wide[l.width + c] = 0.f;
+  for (int c = 0; c < 3; c++) off[l.width + c] = 0.f;
+  repeat_weights(l, row, 0, wide, l.width + 3);
 }
 
 // What pairs of values add to the gradient of the first ones, and take from that of the second: the

@@ -74,16 +74,15 @@ def wait(tab: Browser, condition: str) -> None:
 def picture(tab: Browser) -> np.ndarray:
     """``[h,w,3]`` what the stage shows, in [0, 1], once it is the same twice: a busy browser is late."""
     wait(tab, f"({SETTLED}) || state.solid === '' && [...document.images].every(image => image.complete)")
-    end, before = time.monotonic() + PATIENCE, None
-    while True:
-        wait(tab, "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))")
-        box = tab.run("JSON.parse(JSON.stringify(stage.getBoundingClientRect()))")
+    data = None
+    for _ in range(100):
+        tab.run("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
+        before, box = data, tab.run("JSON.parse(JSON.stringify(stage.getBoundingClientRect()))")
         clip = {"x": box["x"], "y": box["y"], "width": WIDTH, "height": HEIGHT, "scale": 1}
         data = tab.call("Page.captureScreenshot", format="png", clip=clip)["data"]
         if data == before:
             break
-        assert time.monotonic() < end, "the picture changes all the time"
-        before = data
+    assert data == before, "the picture changes all the time"
     image = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
     return np.asarray(image[..., ::-1], np.float32) / 255
 

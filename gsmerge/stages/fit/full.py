@@ -145,8 +145,7 @@ def fit_step(state: State, plan: FitPlan, view: int, step: int, progress: float,
     colors = view_colors(drawn) if all_colors is None else all_colors.take(drawn.ids, 0)
     image, transmittance = blend(drawn, colors, background)
     rates = plan.options.tuning
-    edge_weight = rates.edge_weight * progress
-    gradient, error = image_gradient(image, photos.image(view), weight, rates.ssim_lambda, edge_weight)
+    gradient, error = image_gradient(image, photos.image(view), weight, *loss_weights(rates, progress))
     g = gradients_of(drawn, colors, image, transmittance, gradient, None, with_viewmat=plan.poses is not None)
     if plan.poses is not None and g.viewmat is not None:  # that harmonics change with the camera is left out
         plan.poses.step(view, g.viewmat, rates, progress)
@@ -173,6 +172,11 @@ def fit_step(state: State, plan: FitPlan, view: int, step: int, progress: float,
 def _take(g: Gradients, rows: np.ndarray) -> Gradients:
     names = ("ids", "means", "quats", "scales", "opacities", "colors")
     return replace(g, **{name: np.ascontiguousarray(getattr(g, name)[rows]) for name in names})
+
+
+def loss_weights(rates: Tuning, progress: float) -> tuple[float, float]:
+    """Return the weights of structural similarity and of edges in the loss of a step."""
+    return rates.ssim_lambda, rates.edge_weight * progress
 
 
 def step_sizes(rates: Tuning, progress: float, steps: int) -> np.ndarray:

@@ -138,9 +138,9 @@ def test_all_of_a_step_is_on_the_device(start: Gaussians, photos: Pair, monkeypa
     meta = torch.device("meta")
     state = start_state(start.to(meta))
     plan = stage_full.plan_run(photos, QUICK, 0)
-    look = plan.look_at(1, 1.0)
+    look, weights = plan.look_at(1, 1.0), stage_full.loss_weights(QUICK.tuning, 1.0)
     for level in make_levels((upload_photos(photos[0], meta), upload_photos(photos[1], meta)), plan):
-        gradients, error = step_gradients(state, level, 1, torch.zeros(3, device=meta), None, QUICK, look)
+        gradients, error = step_gradients(state, level, 1, torch.zeros(3, device=meta), None, look, weights)
         adam_step(state, gradients, QUICK, torch.empty(14, device=meta), 1)
         assert error.is_meta
     assert state.x.is_meta
