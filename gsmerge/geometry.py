@@ -14,6 +14,7 @@ from gsmerge.types import SH_C0, Array, Cameras
 
 State = TypeVar("State")  # what a descent moves
 MORTON_BITS = 21  # per axis: three fit into 63 bits
+DEPTH_SAMPLE = 50_000  # points that say how far away the middle of a view lies
 
 
 def quat_to_rotmat(quats: np.ndarray) -> np.ndarray:
@@ -127,6 +128,31 @@ def without_common_motion(start: np.ndarray, end: np.ndarray, middle: Callable[.
 def camera_centres(viewmats: np.ndarray) -> np.ndarray:
     """Return the centres ``[...,3]`` of cameras in the world, of rigid viewmats ``[...,4,4]``."""
     return -(viewmats[..., :3, :3] * viewmats[..., :3, 3:]).sum(-2)
+
+
+def middle_depth(means: np.ndarray, camera: Cameras) -> float:
+    """Measure the median depth of the points ``[n,3]`` that one camera has in its picture; 1 without any."""
+    points = means[:: max(1, len(means) // DEPTH_SAMPLE)]
+    (pixels,), (depths,) = project(points, camera)
+    inside = (depths > 0) & ((pixels >= 0) & (pixels <= (camera.width, camera.height))).all(1)
+    return float(np.median(depths[inside])) if inside.any() else 1.0
+
+
+def step_outside(
+    viewmat: np.ndarray, depth: float, back: float, azimuth: float = 0.0, elevation: float = 0.0
+) -> np.ndarray:
+    """Return the viewmat ``[4,4]`` float64 of a camera that circles about what it sees and steps back from it.
+
+    It keeps looking at the point ``depth`` in front of it, world units. ``azimuth`` moves it to the right and
+    ``elevation`` upwards, in degrees; ``back`` is the step away from the point as a share of ``depth``.
+    """
+    turns = np.radians([[0.0, azimuth, 0.0], [elevation, 0.0, 0.0]])
+    about_y, about_x = motion_matrices(np.concatenate([turns, np.zeros((2, 3))], 1))
+    pivot = np.eye(4)
+    pivot[2, 3] = depth
+    away = pivot.copy()
+    away[2, 3] = (1 + back) * depth
+    return matmul(matmul(away, matmul(about_x, about_y)), matmul(invert(pivot), viewmat.astype(np.float64)))
 
 
 def pose_changes(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

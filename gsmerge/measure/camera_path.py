@@ -6,13 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmerge.geometry import camera_centres, lower_median, normalize, project, quat_to_rotmat, rotmat_to_quat
+from gsmerge.geometry import camera_centres, lower_median, middle_depth, normalize, quat_to_rotmat, rotmat_to_quat
 from gsmerge.kernels.elementary import cos, sin
 from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Cameras
 
 PATHS = ("orbit", "spline")
-DEPTH_SAMPLE = 50_000  # Gaussians that say how far away the middle of a view lies
 FINE = 64  # straight pieces of a curve from camera to camera by which its length is measured
 TURN = 6 * FINE  # the same for a whole orbit
 # Half axes of an orbit, shares of the distance of its middle: as far as half of the cameras are apart within these.
@@ -52,14 +51,6 @@ def median_camera(cameras: Cameras) -> int:
     away = _lengths(centres - lower_median(centres))
     turned = _lengths(forward - normalize(forward.mean(0)))
     return int((away / (away.mean() or 1.0) + turned).argmin())
-
-
-def middle_depth(means: np.ndarray, camera: Cameras) -> float:
-    """Measure the median depth of the points ``[n,3]`` that one camera has in its picture; 1 without any."""
-    points = means[:: max(1, len(means) // DEPTH_SAMPLE)]
-    (pixels,), (depths,) = project(points, camera)
-    inside = (depths > 0) & ((pixels >= 0) & (pixels <= (camera.width, camera.height))).all(1)
-    return float(np.median(depths[inside])) if inside.any() else 1.0
 
 
 def orbit(cameras: Cameras, depth: float, count: int) -> Cameras:

@@ -11,9 +11,9 @@ from pathlib import PurePosixPath
 import cv2
 import numpy as np
 
+from gsmerge.geometry import middle_depth
 from gsmerge.io.formats import spz
 from gsmerge.io.photo_files import encode_indexed
-from gsmerge.measure.camera_path import middle_depth
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Progress, Quality, ResultScores, evaluate
 from gsmerge.measure.preview import Picture, borders, mean_colors, to_picture
 from gsmerge.runtime.threads import use_threads

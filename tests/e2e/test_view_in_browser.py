@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 import gsmerge
-from gsmerge.geometry import rotmat_to_quat
-from gsmerge.measure.camera_path import middle_depth
+from gsmerge.geometry import middle_depth, rotmat_to_quat
 from gsmerge.measure.evaluate import near_plane
 from gsmerge.render.metrics import psnr
 

@@ -5,7 +5,17 @@ import math
 import numpy as np
 import pytest
 
-from gsmerge.geometry import covariances, lower_median, normalize, project, quat_to_rotmat, rotmat_to_quat
+from gsmerge.geometry import (
+    camera_centres,
+    covariances,
+    lower_median,
+    middle_depth,
+    normalize,
+    project,
+    quat_to_rotmat,
+    rotmat_to_quat,
+    step_outside,
+)
 from gsmerge.types import Cameras
 
 HALF = math.sqrt(0.5)
@@ -64,3 +74,25 @@ def test_quaternions_of_rotations_and_back() -> None:
 def test_lower_median_is_a_value_of_each_column() -> None:
     assert lower_median(np.array([4.0, 1.0, 3.0, 2.0])) == 2
     assert lower_median(np.array([[5.0, 0.0], [1.0, 9.0], [3.0, 8.0]])).tolist() == [3, 8]
+
+
+def one_camera() -> Cameras:
+    K = np.array([[100.0, 0, 50], [0, 100, 40], [0, 0, 1]])
+    return Cameras(np.eye(4)[None], K[None], 100, 80)
+
+
+def test_middle_depth_is_of_the_points_in_the_picture_alone() -> None:
+    points = np.array([[0.0, 0, 4], [0, 0, 5], [0.1, 0, 6], [0, 0, -9], [900, 0, 9]])
+    assert middle_depth(points, one_camera()) == 5
+    assert middle_depth(points[3:], one_camera()) == middle_depth(points[:0], one_camera()) == 1
+
+
+def test_a_camera_steps_back_and_turns_about_what_it_sees() -> None:
+    viewmat = one_camera().viewmats[0]
+    assert camera_centres(step_outside(viewmat, 4, 0.5)) == pytest.approx([0, 0, -2])
+    pivot = np.array([[0.0, 0, 4]])
+    for azimuth, elevation in ((30, 0), (0, 20), (-75, 40)):
+        outside = step_outside(viewmat, 4, 0.5, azimuth, elevation)
+        assert pivot @ outside[:3, :3].T + outside[:3, 3] == pytest.approx(np.array([[0, 0, 6]]), abs=1e-9)
+    assert camera_centres(step_outside(viewmat, 4, 0.5, azimuth=90)) == pytest.approx([6, 0, 4])  # on the right
+    assert camera_centres(step_outside(viewmat, 4, 0.5, elevation=90)) == pytest.approx([0, -6, 4])  # above

@@ -13,7 +13,6 @@ from gsmerge.measure.camera_path import (
     ACROSS,
     UPRIGHT,
     median_camera,
-    middle_depth,
     orbit,
     plan_path,
     spline,
@@ -152,8 +151,3 @@ def test_a_path_moves_with_its_scene(kind: str, walk: Cameras) -> None:
 def test_a_path_has_two_frames_at_least(walk: Cameras) -> None:
     with pytest.raises(ValueError, match="frames: expected at least 2, got 1"):
         plan_path("orbit", walk, DEPTH, 1)
-
-
-def test_middle_depth(walk: Cameras) -> None:
-    ahead, behind = np.array([[0.0, 0, 5]]), np.array([[0.0, 0, -5]])
-    assert [middle_depth(points, walk[[0]]) for points in (ahead, behind, ahead[:0])] == [pytest.approx(5), 1, 1]

@@ -1,0 +1,86 @@
+"""Fog: what a compact scene shows where its input shows nothing, seen from outside of the capture.
+
+Photos judge a scene from where they stand. A viewer's first move is to step back and turn: Gaussians that hang in gaps
+between the views then show as haze, and gaps in surfaces as holes. The measure needs no photos, only the input and the
+cameras of its views; docs/guide/evaluate.md defines it for others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from gsmerge.geometry import middle_depth, step_outside
+from gsmerge.measure.sizes import shrink_cameras
+from gsmerge.render import Splats, plan_view, prepare
+from gsmerge.render.composite import blend
+from gsmerge.types import Cameras, Gaussians
+from gsmerge.views import pick_views
+
+VIEWS = 3  # of the input, evenly spread, that the cameras start from
+# Steps back as shares of the depth of what a view sees, and turns about its middle in degrees, by kind
+CAMERAS = {"back": ((0.5, 0), (1.5, 0)), "turned": ((0.5, -30), (0.5, 30))}
+SIDE = 480  # pixels, at most, of the longer side of the pictures
+EMPTY, SOLID, OPEN = 0.05, 0.9, 0.5  # opacities: input below, input above, result below
+MARGIN = 17  # pixels per side of the square that erodes what is empty
+FAR = 0.1  # of the width: distance from the input's outline from which fog is far
+
+
+@dataclass(frozen=True)
+class Fog:
+    """What a result shows from outside that its input does not; None where there is nothing to measure on.
+
+    Args:
+        near: Mean opacity, in [0, 1], where the input is empty.
+        far: The same farther than a tenth of the width from what the input shows.
+        holes: Share of the pixels where the input is solid and the result is not.
+    """
+
+    near: float | None
+    far: float | None
+    holes: float | None
+
+
+def measure_fog(given: Gaussians, result: Gaussians, cameras: Cameras, near: float = 0.01) -> dict[str, Fog]:
+    """Measure fog and holes of a result of some scene ``given``, from outside of the ``cameras`` of its views.
+
+    Returns one :class:`Fog` for each kind of :data:`CAMERAS`, and one for ``"all"`` of them. ``near`` is the near
+    plane of the pictures, world units. A kind's numbers are means over the pixels of all its pictures.
+    """
+    first, second = (prepare(gaussians) for gaussians in (given, result))
+    sums = {kind: np.zeros((3, 2)) for kind in CAMERAS}
+    for kind, camera in outside_cameras(given, cameras):
+        sums[kind] += fog_sums(draw_opacity(first, camera, near), draw_opacity(second, camera, near))
+    sums["all"] = np.sum(list(sums.values()), axis=0)
+    return {kind: Fog(*(above / count if count else None for above, count in rows)) for kind, rows in sums.items()}
+
+
+def outside_cameras(given: Gaussians, cameras: Cameras) -> Iterator[tuple[str, Cameras]]:
+    """Yield kind and camera of each picture."""
+    cameras = shrink_cameras(cameras, SIDE)
+    for view in pick_views(len(cameras), VIEWS):
+        camera = cameras[[view]]
+        depth = middle_depth(given.means, camera)
+        for kind, places in CAMERAS.items():
+            for back, turn in places:
+                viewmat = step_outside(camera.viewmats[0], depth, back, turn)
+                yield kind, replace(camera, viewmats=viewmat[None])
+
+
+def draw_opacity(splats: Splats, camera: Cameras, near: float) -> np.ndarray:
+    """Draw the opacity ``[h,w]`` of what one camera sees."""
+    plan = plan_view(splats, camera.viewmats[0], camera.Ks[0], camera.width, camera.height, near=near)
+    black = np.zeros((len(plan.ids) + 1, 3), np.float32)
+    return 1 - blend(plan, black[1:], black[0])[1]
+
+
+def fog_sums(given: np.ndarray, result: np.ndarray) -> np.ndarray:
+    """Return sum and number of pixels ``[3,2]`` of near fog, far fog and holes, of opacities ``[h,w]``."""
+    empty, solid = (given < EMPTY).astype(np.uint8), given > SOLID
+    sides = MARGIN, 2 * round(FAR * given.shape[1]) + 1
+    masks = [cv2.erode(empty, np.ones((side, side), np.uint8)) > 0 for side in sides]
+    fog = [(float(result[mask].sum(dtype=np.float64)), float(mask.sum())) for mask in masks]
+    return np.array([*fog, (float((result[solid] < OPEN).sum()), float(solid.sum()))])
