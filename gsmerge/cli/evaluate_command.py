@@ -71,7 +71,7 @@ def parse_align(text: str) -> tuple[str, ...]:
     "overwrite threads",
 )  # fmt: skip
 def evaluate(args: opt.Args) -> None:
-    """Measure a scene and its compact versions against photos: PSNR, SSIM, LPIPS, counts, bytes, render time."""
+    """Measure a scene and its compact versions against photos: PSNR, SSIM, LPIPS, fog, counts, bytes, render time."""
     if not args.context and args.targets is None:
         raise UsageError("--no-context: expected held-out views to measure instead; name them with --targets")
     if args.align and args.targets is None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from gsmerge.errors import UsageError
 from gsmerge.measure.align import PoseChange, fit_colors, refine_pose
+from gsmerge.measure.fog import ALL, Fog, describe_fog, measure_fog
 from gsmerge.measure.sizes import resize_mask, resize_photo, shrink_cameras, shrink_views, zoom_cameras
 from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.render import prepare, render
@@ -30,6 +31,7 @@ MENDED = (
 )
 MIN_SEEN_SHARE = 0.1  # of the held-out pixels, seen by input views; less suggests another world frame
 INPUT = "input"  # name of the scene itself among the results
+RENDERS = "renders of the input"  # what stands in for photos
 MAX_ZOOM = 16.0  # and its inverse the least: beyond, pictures have no pixels left or fill the memory
 Progress = Callable[[str, int, int], None]
 OnImage = Callable[[str, str, int, np.ndarray], None]
@@ -54,6 +56,7 @@ class EvaluateOptions:
         align: Also score held-out views after "color", the affine map of the render's colours that brings it closest
             to the photo, and "pose", the camera moved to where the render is closest; with both also after one and
             then the other.
+        fog: Also measure fog and holes of the results, which the scene's Gaussians are drawn twelve more times for.
 
     Raises:
         ValueError: If a name is unknown, the number of views not positive, or a zoom or a name given twice or out of
@@ -69,6 +72,7 @@ class EvaluateOptions:
     zoom: tuple[float, ...] = (1,)
     antialiased: bool = False
     align: tuple[str, ...] = ()
+    fog: bool = True
 
     def __post_init__(self) -> None:
         unknown = next((net for net in self.lpips if net not in NETS), None)
@@ -136,6 +140,7 @@ class ResultScores:
     ratio: float  # of the input's
     render_seconds: float  # mean wall time of one view, all threads
     scores: tuple[ViewScore, ...]  # one for each view
+    fog: Mapping[str, Fog] = field(default_factory=dict)  # by kind of camera; empty of the input or if not asked for
 
     def mean(self, split: str, *, zoom: float | None = None, align: str | None = None) -> Pair:
         """Average over the views of a split, or over their scores at one size or after one alignment.
@@ -243,24 +248,19 @@ def evaluate(
         renderer = _Renderer(NEAR * frame.unit, frame.origin, options)
         splits, scores = _splits(scene, own, targets, renderer), []
         named = {INPUT: own, **results} if options.own else results
+        fog = measure_fog(own, results, scene.cameras, renderer.near) if options.fog and results else {}
         renderer.image(own[:1], scene.cameras, 0)  # loads the kernels, so that no result's time contains that
         for i, (name, gaussians) in enumerate(named.items()):
             mine = {kind: one.under(cameras.get(name)) if kind == "context" else one for kind, one in splits.items()}
-            scores.append(_score_result(name, gaussians, len(own), mine, renderer, on_image))
+            score = _score_result(name, gaussians, len(own), mine, renderer, on_image)
+            scores.append(replace(score, fog=fog.get(name, {})))
             if progress:
                 progress("evaluate", i + 1, len(named))
     counts = {name: len(split.views.names) for name, split in splits.items()}
     reference = "photos"
     if scene.images is None and "context" in counts:
-        reference = (
-            "photos, and renders of the input in its own views" if "target" in counts else "renders of the input"
-        )
-    notes = list(_notes(splits))
-    if scene.images is not None and "context" in counts and not photos_count_as_they_are(scene):
-        notes.append(MENDED)
-    elif scene.images is not None and options.own and options.context:
-        notes[:0] = _losses(scores)
-    return Evaluation(tuple(scores), reference, counts, tuple(notes), options)
+        reference = f"photos, and {RENDERS} in its own views" if "target" in counts else RENDERS
+    return Evaluation(tuple(scores), reference, counts, tuple(_notes(scene, splits, scores)), options)
 
 
 def near_plane(scene: Scene) -> float:
@@ -268,20 +268,20 @@ def near_plane(scene: Scene) -> float:
     return NEAR * scene_frame(scene).unit
 
 
-def _losses(scores: Sequence[ResultScores]) -> list[str]:
-    """Name the results that show the input views' photos worse than the first of the scores."""
-    before, *after = [(one.name, one.mean("context")[0].psnr) for one in scores]
-    losses = [describe_loss(name, before[1], psnr) for name, psnr in after]
-    return [loss for loss in losses if loss is not None]
-
-
-def _notes(splits: Mapping[str, _Split]) -> tuple[str, ...]:
+def _notes(scene: Scene, splits: Mapping[str, _Split], scores: Sequence[ResultScores]) -> Iterator[str]:
+    """Name results that are worse than the input where it matters, and say what figures may mislead about."""
+    photos = scene.images is not None and "context" in splits
+    mended = photos and not photos_count_as_they_are(scene)
+    psnrs = {one.name: one.mean("context")[0].psnr for one in scores}
+    if photos and INPUT in psnrs and not mended:
+        yield from filter(None, (describe_loss(name, psnrs[INPUT], psnr) for name, psnr in psnrs.items()))
+    yield from filter(None, (describe_fog(one.name, one.fog[ALL]) for one in scores if one.fog))
     if "target" not in splits:
-        return ("no held-out views were given: input views flatter what was fitted to them",)
-    share = splits["target"].visible.mean()
-    if share < MIN_SEEN_SHARE:
-        return (f"the input views have seen {100 * share:.0f} % of the held-out views: are those of the same world?",)
-    return ()
+        yield "no held-out views were given: input views flatter what was fitted to them"
+    elif (share := splits["target"].visible.mean()) < MIN_SEEN_SHARE:
+        yield f"the input views have seen {100 * share:.0f} % of the held-out views: are those of the same world?"
+    if mended:
+        yield MENDED
 
 
 def _splits(scene: Scene, own: Gaussians, targets: Views | None, renderer: _Renderer) -> dict[str, _Split]:

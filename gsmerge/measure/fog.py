@@ -7,7 +7,7 @@ cameras of its views; docs/guide/evaluate.md defines it for others.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import cv2
@@ -23,10 +23,12 @@ from gsmerge.views import pick_views
 VIEWS = 3  # of the input, evenly spread, that the cameras start from
 # Steps back as shares of the depth of what a view sees, and turns about its middle in degrees, by kind
 CAMERAS = {"back": ((0.5, 0), (1.5, 0)), "turned": ((0.5, -30), (0.5, 30))}
+ALL = "all"  # kind of all these cameras together
 SIDE = 480  # pixels, at most, of the longer side of the pictures
 EMPTY, SOLID, OPEN = 0.05, 0.9, 0.5  # opacities: input below, input above, result below
 MARGIN = 17  # pixels per side of the square that erodes what is empty
-FAR = 0.1  # of the width: distance from the input's outline from which fog is far
+FAR = 0.1  # of the width: distance from what the input shows from which fog is far
+HAZE = 0.05  # far fog above which a result gets a note: plain to see in a viewer
 
 
 @dataclass(frozen=True)
@@ -34,28 +36,43 @@ class Fog:
     """What a result shows from outside that its input does not; None where there is nothing to measure on.
 
     Args:
-        near: Mean opacity, in [0, 1], where the input is empty.
-        far: The same farther than a tenth of the width from what the input shows.
+        fog_near: Mean opacity, in [0, 1], where the input is empty.
+        fog_far: The same farther than a tenth of the width from what the input shows.
         holes: Share of the pixels where the input is solid and the result is not.
     """
 
-    near: float | None
-    far: float | None
-    holes: float | None
+    fog_near: float | None = None
+    fog_far: float | None = None
+    holes: float | None = None
 
 
-def measure_fog(given: Gaussians, result: Gaussians, cameras: Cameras, near: float = 0.01) -> dict[str, Fog]:
-    """Measure fog and holes of a result of some scene ``given``, from outside of the ``cameras`` of its views.
+def measure_fog(
+    given: Gaussians, results: Mapping[str, Gaussians], cameras: Cameras, near: float = 0.01
+) -> dict[str, dict[str, Fog]]:
+    """Measure fog and holes of the results of a scene ``given``, by name, from outside of the ``cameras`` of its views.
 
-    Returns one :class:`Fog` for each kind of :data:`CAMERAS`, and one for ``"all"`` of them. ``near`` is the near
-    plane of the pictures, world units. A kind's numbers are means over the pixels of all its pictures.
+    Returns one :class:`Fog` by name of the result and kind of camera, of :data:`CAMERAS` and "all"; its figures are
+    means over the pixels of all pictures of the kind. ``near`` is the near plane of the pictures, world units.
     """
-    first, second = (prepare(gaussians) for gaussians in (given, result))
-    sums = {kind: np.zeros((3, 2)) for kind in CAMERAS}
+    first, splats = prepare(given), {name: prepare(one) for name, one in results.items()}
+    sums = {name: {kind: np.zeros((3, 2)) for kind in CAMERAS} for name in results}
     for kind, camera in outside_cameras(given, cameras):
-        sums[kind] += fog_sums(draw_opacity(first, camera, near), draw_opacity(second, camera, near))
-    sums["all"] = np.sum(list(sums.values()), axis=0)
-    return {kind: Fog(*(above / count if count else None for above, count in rows)) for kind, rows in sums.items()}
+        shown = draw_opacity(first, camera, near)
+        for name in results:
+            sums[name][kind] += fog_sums(shown, draw_opacity(splats[name], camera, near))
+    for kinds in sums.values():
+        kinds[ALL] = np.sum(list(kinds.values()), axis=0)
+    return {name: {kind: mean_fog(rows) for kind, rows in kinds.items()} for name, kinds in sums.items()}
+
+
+def describe_fog(name: str, fog: Fog) -> str | None:
+    """Say that a result shows haze from outside; None up to :data:`HAZE`."""
+    if fog.fog_far is None or fog.fog_far <= HAZE:
+        return None
+    return (
+        f"{name}: seen from outside, the result shows haze where the input shows nothing: far fog {fog.fog_far:.2f};"
+        " compact the scene again if an earlier version made it, or with --fit none, which makes no haze"
+    )
 
 
 def outside_cameras(given: Gaussians, cameras: Cameras) -> Iterator[tuple[str, Cameras]]:
@@ -80,7 +97,12 @@ def draw_opacity(splats: Splats, camera: Cameras, near: float) -> np.ndarray:
 def fog_sums(given: np.ndarray, result: np.ndarray) -> np.ndarray:
     """Return sum and number of pixels ``[3,2]`` of near fog, far fog and holes, of opacities ``[h,w]``."""
     empty, solid = (given < EMPTY).astype(np.uint8), given > SOLID
-    sides = MARGIN, 2 * round(FAR * given.shape[1]) + 1
+    sides = MARGIN, max(MARGIN, 2 * round(FAR * given.shape[1]) + 1)
     masks = [cv2.erode(empty, np.ones((side, side), np.uint8)) > 0 for side in sides]
     fog = [(float(result[mask].sum(dtype=np.float64)), float(mask.sum())) for mask in masks]
     return np.array([*fog, (float((result[solid] < OPEN).sum()), float(solid.sum()))])
+
+
+def mean_fog(sums: np.ndarray) -> Fog:
+    """Divide sums by numbers of pixels ``[3,2]``, as of :func:`fog_sums`."""
+    return Fog(*(above / count if count else None for above, count in sums.tolist()))

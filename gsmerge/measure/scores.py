@@ -12,6 +12,7 @@ from typing import Any
 
 from gsmerge.measure.align import PoseChange
 from gsmerge.measure.evaluate import Evaluation, Pair, Quality, ResultScores
+from gsmerge.measure.fog import ALL, Fog
 from gsmerge.report import csv_cell, document_head, human_bytes
 
 Row = Sequence[str]
@@ -20,10 +21,11 @@ Table = tuple[str, Row, Sequence[Row]]  # heading, columns, rows
 ZOOMED = ("psnr", "ssim")  # what is measured at other sizes
 COLUMNS = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips_vgg": "LPIPS VGG", "lpips_alex": "LPIPS AlexNet"}
 METRICS = tuple(field.name for field in fields(Quality))
+OUTSIDE = {"fog_near": "near fog", "fog_far": "far fog", "holes": "holes"}  # fields of Fog
 MASKED = "_visible"  # suffix of what is measured over the pixels that the input views have seen
 CSV_COLUMNS = (
     "schema_version", "result", "num_gaussians", "ratio", "split", "view", "visible_share",
-    *METRICS, *(name + MASKED for name in METRICS),
+    *METRICS, *(name + MASKED for name in METRICS), *OUTSIDE,
 )  # fmt: skip
 
 
@@ -32,10 +34,11 @@ def evaluation_document(
 ) -> dict[str, Any]:
     """Write an evaluation as plain JSON types, with further facts on each result, such as its file's path and bytes.
 
-    ``schema_version`` 1: tool, reference, views, results (facts, count, ratio, render seconds, means by split, a score
-    for each view), notes. Means and scores have ``zooms`` where other sizes than the photos' own were asked for,
-    those of held-out views ``aligned`` and ``pose_change`` where that was; ``photo_side`` is there where it is not 0,
-    ``antialiased`` where it is true. Keys are only ever added within one schema version.
+    ``schema_version`` 1: tool, reference, views, results (facts, count, ratio, render seconds, fog and holes, which are
+    null of the input, means by split, a score for each view), notes. Means and scores have ``zooms`` where other sizes
+    than the photos' own were asked for, those of held-out views ``aligned`` and ``pose_change`` where that was;
+    ``photo_side`` is there where it is not 0, ``antialiased`` where it is true. Keys are only ever added within one
+    schema version.
     """
     return {
         **document_head(),
@@ -55,6 +58,8 @@ def _result(one: ResultScores, evaluation: Evaluation, facts: Mapping[str, Any])
         "num_gaussians": one.num_gaussians,
         "ratio": one.ratio,
         "render_seconds": round(one.render_seconds, 5),
+        **asdict(one.fog.get(ALL, Fog())),
+        "fog_by_kind": {kind: asdict(fog) for kind, fog in one.fog.items() if kind != ALL},
         "mean": {split: _mean(one, split, evaluation) for split in evaluation.num_views},
         "views": [
             {
@@ -108,7 +113,7 @@ def evaluation_csv(document: Mapping[str, Any]) -> str:
     rows = []
     for result in document["results"]:
         same = {"schema_version": document["schema_version"], "result": result["name"]}
-        same |= {name: result[name] for name in ("num_gaussians", "ratio")}
+        same |= {name: result[name] for name in ("num_gaussians", "ratio", *OUTSIDE)}
         rows += [same | _more_columns(view) for view in result["views"]]
     columns = dict.fromkeys(CSV_COLUMNS) | dict.fromkeys(name for row in rows for name in row)
     return csv_text(list(columns), rows)
@@ -150,6 +155,8 @@ def evaluation_tables(document: Mapping[str, Any]) -> Iterator[Table]:
         ("", "views", *COLUMNS.values()),
         [(name, f"{split} ({document['num_views'][split]})", *_cells(mean)) for name, split, mean in means],
     )
+    outside = [(result["name"], *(_number(result[name]) for name in OUTSIDE)) for result in results]
+    yield "Seen from outside, against the input", ("", *OUTSIDE.values()), [row for row in outside if any(row[1:])]
     sizes = [one["zoom"] for one in means[0][2].get("zooms", ())]
     heads = [f"{name.upper()} {zoom:g}x" for zoom in sizes for name in ZOOMED]
     yield "At other sizes, photos resized", ("", "views", *heads), [
@@ -199,8 +206,11 @@ def _speed_row(result: Mapping[str, Any], speed: Mapping[str, Any]) -> Row:
 def _cells(score: Mapping[str, Any], names: Iterable[str] = METRICS) -> Iterator[str]:
     """Format the figures of the visible pixels; empty where one was not measured."""
     for name in names:
-        value = score[name + MASKED]
-        yield "" if value is None else f"{value:.{2 if name == 'psnr' else 3}f}"
+        yield _number(score[name + MASKED], 2 if name == "psnr" else 3)
+
+
+def _number(value: float | None, digits: int = 3) -> str:
+    return "" if value is None else f"{value:.{digits}f}"
 
 
 def _move(mean: Mapping[str, Any]) -> str:

@@ -15,6 +15,7 @@ from gsmerge.geometry import middle_depth
 from gsmerge.io.formats import spz
 from gsmerge.io.photo_files import encode_indexed
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Progress, Quality, ResultScores, evaluate
+from gsmerge.measure.fog import ALL, Fog
 from gsmerge.measure.preview import Picture, borders, mean_colors, to_picture
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.prepare import scene_frame
@@ -44,6 +45,7 @@ class Side:
     splats: bytes | None  # the Gaussians in the page's frame, see :func:`pack_splats`; None: too many for a page
     sh_degree: int  # of the harmonics that the page has
     file_sh_degree: int  # of those in the file
+    fog: Fog | None  # of a result
 
 
 @dataclass(frozen=True)
@@ -191,8 +193,9 @@ def encode_outlines(photo: np.ndarray, labels: np.ndarray) -> bytes:
 
 def _side(result: ResultScores, gaussians: Gaussians, file_bytes: int, split: str) -> Side:
     splats, degree = pack_splats(gaussians)
-    mean = result.mean(split)[1]
-    return Side(result.name, result.num_gaussians, file_bytes, mean, splats, degree, highest_degree(gaussians.shN))
+    mean, highest = result.mean(split)[1], highest_degree(gaussians.shN)
+    fog = result.fog.get(ALL)
+    return Side(result.name, result.num_gaussians, file_bytes, mean, splats, degree, highest, fog)
 
 
 def _shown(views: Sequence[PageView]) -> tuple[PageView, ...]:

@@ -27,11 +27,15 @@ def test_table_and_files(scene_copy: Path, small: Path, run: Run, floor: Callabl
         "evaluate", scene_copy / "scene.ply", small, "--targets", scene_copy / "targets", "--lpips", "none",
         "-o", table, "-o", report,
     )  # fmt: skip
-    assert (outcome.code, outcome.err) == (0, "")
+    assert outcome.code == 0
+    assert [line for line in outcome.err.splitlines() if "seen from outside" not in line] == []
     assert "small.ply" in outcome.out
+    assert "far fog" in outcome.out
     document = json.loads(report.read_text())
     before, after = document["results"]
     assert after["bytes"] == small.stat().st_size
+    assert before["holes"] is None
+    assert 0 <= after["holes"] < 0.1
     assert sum(after["bytes_by_attribute"].values()) < after["bytes"]
     floor(after["mean"]["target"]["psnr_visible"] - before["mean"]["target"]["psnr_visible"])
     assert document["num_views"] == {"context": 5, "target": 4}

@@ -302,7 +302,7 @@ def measure(
     Without ``gaussians`` the scene's own are measured.
     """
     results = {} if gaussians is None else {"result": gaussians}
-    evaluation = evaluate(scene, results, targets, replace(options, own=gaussians is None))
+    evaluation = evaluate(scene, results, targets, replace(options, own=gaussians is None, fog=False))
     scores: dict[str, float] = {}
     for split in evaluation.num_views:
         full, masked = evaluation.results[-1].mean(split)

@@ -25,7 +25,7 @@ MAX_WORSE = 0.1  # dB that a result may be below its input
 MAX_SAME, MAX_NEAR = 0.2, 1.0  # dB that a changed scene's result may be below the unchanged one's
 FIT_SLACK = 1.0  # dB more after a full fit, whose result rounding alone changes this much on thin structures
 SAME_COUNT, ONCE_COUNT = 0.005, 1.05  # largest relative difference, and ratio, of counts
-_QUICK = EvaluateOptions(lpips=())
+_QUICK = EvaluateOptions(lpips=(), fog=False)
 _FIELDS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 Progress = Callable[[str, int, int], None]
 

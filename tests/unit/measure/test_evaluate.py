@@ -18,7 +18,8 @@ import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 import gsmerge
-from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Evaluation, evaluate
+from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Evaluation, evaluate, near_plane
+from gsmerge.measure.fog import measure_fog
 from gsmerge.measure.scores import (
     CSV_COLUMNS,
     evaluation_csv,
@@ -346,7 +347,7 @@ def test_tables_for_people(actual: Evaluation) -> None:
     lines = evaluation_lines(evaluation_document(actual, {"half": {"bytes": 1234}}))
     assert lines[0] == "Size"
     assert lines[4].startswith("Quality against photos")
-    assert len(lines) == 1 + 3 + 1 + 5
+    assert len(lines) == 1 + 3 + 1 + 5 + 3
     assert "1.2 kB" in lines[3]
     assert "LPIPS" not in lines[5]
     assert "smaller by" not in lines[1]
@@ -364,9 +365,45 @@ def test_markdown_has_whole_tables(actual: Evaluation) -> None:
     assert markdown.startswith("# in.ply: before and after\n")
     assert "- first &lt;note&gt;" in markdown
     tables = [block for block in markdown.split("\n\n") if block.startswith("|")]
-    assert len(tables) == 3
+    assert len(tables) == 4
     for table in tables:
         assert len({len(re.findall(r"(?<!\\)\|", line)) for line in table.splitlines()}) == 1, table
+
+
+def test_fog_and_holes_are_of_each_result(scene: Scene, half: Gaussians, actual: Evaluation) -> None:
+    given, result = actual.results
+    assert given.fog == {}
+    expected = measure_fog(scene.gaussians, {"half": half}, scene.cameras, near_plane(scene))["half"]
+    assert result.fog == expected
+    loose = Scene(scene.gaussians, scene.cameras, None, None, scene.names)
+    assert evaluate(loose, {"half": half}, None, replace(PLAIN, photo_side=24)).results[1].fog == expected
+    assert evaluate(scene, {"half": half}, None, replace(PLAIN, fog=False)).results[1].fog == {}
+
+
+def test_documents_have_fog_and_holes(actual: Evaluation) -> None:
+    document = json.loads(to_json(evaluation_document(actual, {})))
+    given, result = document["results"]
+    names = ["fog_near", "fog_far", "holes"]
+    assert [given[name] for name in names] == [None] * 3
+    assert given["fog_by_kind"] == {}
+    assert [result[name] for name in names] == list(vars(actual.results[1].fog["all"]).values())
+    assert result["fog_by_kind"]["turned"] == vars(actual.results[1].fog["turned"])
+    assert list(result["fog_by_kind"]) == ["back", "turned"]
+    rows = list(csv.DictReader(io.StringIO(evaluation_csv(document))))
+    assert (rows[0]["holes"], float(rows[-1]["holes"])) == ("", result["holes"])
+    heading, head, row = evaluation_lines(document)[-3:]
+    assert heading.startswith("Seen from outside")
+    assert head.split() == ["near", "fog", "far", "fog", "holes"]
+    assert row.split() == ["half", *(f"{result[name]:.3f}" for name in names)]
+
+
+def test_haze_is_noted(scene: Scene, half: Gaussians) -> None:
+    curtain = half[[0]]
+    curtain = replace(curtain, scales=np.full_like(curtain.scales, 1e4), opacities=np.full_like(curtain.opacities, 0.3))
+    actual = evaluate(scene, {"half": half, "foggy": Gaussians.concat([half, curtain])}, held_out(), PLAIN)
+    assert actual.results[2].fog["all"].fog_far == pytest.approx(0.3, abs=0.02)
+    notes = [note for note in actual.notes if "seen from outside" in note]
+    assert [note.split(":")[0] for note in notes] == ["foggy"]
 
 
 def test_progress_is_reported(scene: Scene, half: Gaussians) -> None:

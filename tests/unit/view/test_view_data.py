@@ -71,6 +71,7 @@ def test_numbers_are_those_of_evaluate(actual: ViewData, scene: Scene, half: Gau
     for side, result in enumerate(expected.results):
         assert [view.scores[side] for view in by_place] == [score.masked for score in result.scores]
         assert actual.sides[side].mean == result.mean("target")[1]
+        assert actual.sides[side].fog == result.fog.get("all")
     assert [side.name for side in actual.sides] == ["input", "half", "all"]
     assert [side.file_bytes for side in actual.sides] == [300, 200, 100]
     assert [view.held_out for view in by_place] == [False, False, False, True, True]

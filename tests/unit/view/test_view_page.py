@@ -15,6 +15,7 @@ import pytest
 import scenes
 
 from gsmerge.measure.evaluate import EvaluateOptions, Quality, evaluate
+from gsmerge.measure.fog import Fog
 from gsmerge.measure.preview import view_pictures
 from gsmerge.measure.scores import evaluation_document
 from gsmerge.view.data import ViewData, collect
@@ -108,6 +109,16 @@ def test_what_the_script_reads(page: str, data: ViewData) -> None:
     for i, side in enumerate(data.sides):
         assert base64.b64decode(block(page, f"splats-{i}")) == side.splats
     assert b"SparkRenderer" in gzip.decompress(base64.b64decode(block(page, "engine")))
+
+
+def test_fog_and_holes_are_in_a_table(data: ViewData, alone: ViewData) -> None:
+    sides = data.sides[0], replace(data.sides[1], fog=Fog(0.25, None, 0.0126))
+    page = view_page(replace(data, sides=sides))
+    table = re.findall('<table class="outside">(.*?)</table>', page, re.DOTALL)[0]
+    cells = [re.findall(">([^<]*)</t[hd]>", row) for row in table.split("<tr>")[1:]]
+    assert cells[0] == ["from outside", "near fog", "far fog", "holes"]
+    assert [[html.unescape(cell) for cell in row] for row in cells[1:]] == [[EVIL, "0.250", "-", "0.013"]]
+    assert 'class="outside"' not in view_page(alone)
 
 
 def test_without_gaussians_there_is_no_3d(data: ViewData) -> None:

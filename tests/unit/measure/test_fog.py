@@ -1,0 +1,152 @@
+"""Fog and holes of cases that can be worked out: curtains of a known opacity, walls with pieces missing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+from tiny_scene import rotation
+
+from gsmerge.geometry import camera_centres
+from gsmerge.measure.fog import ALL, CAMERAS, HAZE, Fog, describe_fog, fog_sums, mean_fog, measure_fog, outside_cameras
+from gsmerge.types import Cameras, Gaussians
+
+DEPTH = 2.0  # of the wall, which just fills the picture of a camera at the origin
+WIDTH, HEIGHT = 160, 120  # pixels, and the focal length is the width
+
+
+def balls(means: np.ndarray, scale: float, opacity: float) -> Gaussians:
+    """Grey round Gaussians at ``means [n,3]``."""
+    n = len(means)
+    return Gaussians(
+        means.astype(np.float32), np.tile(np.float32([1, 0, 0, 0]), (n, 1)), np.full((n, 3), scale, np.float32),
+        np.full(n, opacity, np.float32), np.zeros((n, 1, 3), np.float32), np.zeros((n, 0, 3), np.float32),
+    )  # fmt: skip
+
+
+def wall(left: float = -1.0, right: float = 1.0) -> Gaussians:
+    """An opaque wall between two x, at which the picture spans -1 to 1."""
+    x, y = np.meshgrid(np.arange(left, right, 0.02) + 0.01, np.arange(-0.75, 0.75, 0.02) + 0.01)
+    return balls(np.stack([x.ravel(), y.ravel(), np.full(x.size, DEPTH)], 1), 0.014, 0.95)
+
+
+def curtain(opacity: float, place: tuple[float, float, float] = (0, 0, DEPTH), size: float = 1e4) -> Gaussians:
+    """One Gaussian, which has everywhere the same opacity unless its size, world units, says otherwise."""
+    return balls(np.array([place]), size, opacity)
+
+
+def cameras(width: int = WIDTH, height: int = HEIGHT, views: int = 1) -> Cameras:
+    return Cameras(np.tile(np.eye(4), (views, 1, 1)), scenes.intrinsics(views, width, height), width, height)
+
+
+def fog_of(given: Gaussians, result: Gaussians, seen: Cameras | None = None, near: float = 0.01) -> dict[str, Fog]:
+    return measure_fog(given, {"it": result}, seen or cameras(), near)["it"]
+
+
+def figures(kinds: dict[str, Fog]) -> np.ndarray:
+    """Near fog, far fog and holes ``[3,3]``, of cameras stepped back, turned, and all."""
+    return np.array([list(vars(kinds[kind]).values()) for kind in (*CAMERAS, ALL)], float)
+
+
+def test_the_input_itself_has_no_fog() -> None:
+    assert figures(fog_of(wall(), wall())) == pytest.approx(0, abs=2e-3)
+
+
+def test_a_curtain_is_fog_of_its_opacity() -> None:
+    result = Gaussians.concat([wall(), curtain(0.3)])
+    assert figures(fog_of(wall(), result))[:, :2] == pytest.approx(0.3, abs=2e-3)
+    assert figures(fog_of(wall(), result))[:, 2] == pytest.approx(0)
+    both = measure_fog(wall(), {"clean": wall(), "foggy": result}, cameras())
+    assert list(both) == ["clean", "foggy"]
+    assert both["foggy"] == fog_of(wall(), result)
+
+
+def test_a_rim_about_the_outline_is_no_fog() -> None:
+    """Stepped back by half the depth the wall is 107 pixels wide, and what it is widened by a third less, too."""
+    thin = fog_of(wall(), wall(-1.1, 1.1))["back"]  # 5 pixels a side: within the eroded rim
+    assert list(vars(thin).values()) == pytest.approx([0, 0, 0], abs=2e-3)
+    wide = fog_of(wall(), wall(-1.3, 1.3))["back"]  # 16 pixels, a tenth of the width: near fog alone
+    assert wide.fog_near > 0.02
+    assert wide.fog_far == pytest.approx(0, abs=2e-3)
+
+
+def test_pixels_that_count() -> None:
+    """Of a picture of 100 columns whose left 20 are solid: empty from the 28th on, far from the 30th on."""
+    given, result = np.zeros((50, 100)), np.zeros((50, 100))
+    given[:, :20] = 0.95
+    result[:, :5], result[:, 20:28], result[:, 28:30] = 0.6, 1, 0.5
+    sums = fog_sums(given, result)
+    assert sums == pytest.approx(np.array([[50 * 2 * 0.5, 50 * 72], [0, 50 * 70], [50 * 15, 50 * 20]]))
+    assert mean_fog(sums) == Fog(1 / 72, 0, 0.75)
+    given[:, 50] = 0.06  # neither solid nor empty, so that the rim is about it, too
+    assert fog_sums(given, result)[:, 1] == pytest.approx([50 * (72 - 17), 50 * (70 - 21), 50 * 20])
+
+
+def test_in_a_narrow_picture_far_is_no_nearer_than_near() -> None:
+    given = np.zeros((50, 40))
+    given[:, 0] = 0.95
+    near, far, _ = fog_sums(given, given)
+    assert near.tolist() == far.tolist() == [0, 50 * 31]
+
+
+def test_missing_pieces_are_holes() -> None:
+    kinds = fog_of(wall(), wall(-1.0, 0.5))
+    assert kinds["back"].holes == pytest.approx(0.25, abs=0.02)
+    assert kinds["turned"].holes == pytest.approx(0.25, abs=0.03)  # larger from one side, smaller from the other
+    assert figures(kinds)[:, :2] == pytest.approx(0, abs=2e-3)
+    assert fog_of(wall(), curtain(0.45))[ALL].holes == 1
+
+
+def test_nothing_empty_and_nothing_solid() -> None:
+    kinds = (*CAMERAS, ALL)
+    assert fog_of(curtain(0.95), curtain(0.95)) == dict.fromkeys(kinds, Fog(None, None, 0.0))
+    assert fog_of(curtain(0.5), curtain(0.2)) == dict.fromkeys(kinds, Fog(None, None, None))
+
+
+def test_places_of_the_cameras() -> None:
+    """Of each view two behind it, and two beside it at half the depth more from what it looks at."""
+    seen = cameras(views=7)
+    seen.viewmats[:, 1, 3] = -np.arange(7) / 10  # the second, fourth and sixth are taken
+    places = [(kind, *camera_centres(camera.viewmats)[0]) for kind, camera in outside_cameras(curtain(1), seen[[3]])]
+    y, side, back = 0.3, 3 * np.sin(np.radians(30)), 2 - 3 * np.cos(np.radians(30))
+    expected = [("back", 0, y, -1), ("back", 0, y, -3), ("turned", -side, y, back), ("turned", side, y, back)]
+    for (kind, *place), (expected_kind, *expected_place) in zip(places, expected, strict=True):
+        assert kind == expected_kind
+        assert place == pytest.approx(expected_place, abs=1e-6)
+    every = [camera_centres(camera.viewmats)[0, 1] for _, camera in outside_cameras(wall(), seen)]
+    assert every == pytest.approx(np.repeat([0.1, 0.3, 0.5], 4))
+
+
+@pytest.mark.parametrize("size", [(1920, 1440), (1440, 1920)])
+def test_large_pictures_are_shrunk(size: tuple[int, int]) -> None:
+    result = Gaussians.concat([wall(-1.0, 0.5), curtain(0.3)])
+    large, small = cameras(*size), cameras(size[0] // 4, size[1] // 4)
+    for _, camera in outside_cameras(wall(), large):
+        assert (camera.width, camera.height) == (small.width, small.height)
+    assert fog_of(wall(), result, large) == fog_of(wall(), result, small)
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1, 1e3])
+def test_units_and_rigid_motions_change_nothing(factor: float) -> None:
+    """With holes and a curtain on one side; the near plane is in the scene's units."""
+    result = Gaussians.concat([wall(-1.0, 0.5), curtain(0.8, (1.5, 0.2, DEPTH), size=0.2)])
+    expected = figures(fog_of(wall(), result))
+    assert (expected[2] > 0.01).all()
+    turn, shift = rotation(0.4, -0.3, 0.9), factor * np.array([3.0, -2, 1])
+    given, moved = (scenes.move_gaussians(one, turn, factor, shift) for one in (wall(), result))
+    viewmats = np.eye(4)[None].copy()
+    viewmats[:, :3, :3] = turn.T
+    viewmats[:, :3, 3] = -turn.T @ shift
+    actual = fog_of(given, moved, replace(cameras(), viewmats=viewmats), 0.01 * factor)
+    assert figures(actual) == pytest.approx(expected, abs=2e-4)
+
+
+def test_a_note_on_haze() -> None:
+    assert describe_fog("a", Fog(0.9, HAZE, 0)) is None
+    assert describe_fog("a", Fog(None, None, 0)) is None
+    note = describe_fog("small.ply", Fog(0.4, 0.314, 0))
+    assert note is not None
+    assert note.startswith("small.ply: seen from outside")
+    assert "far fog 0.31" in note
