@@ -88,7 +88,7 @@ def test_names_are_escaped(page: str) -> None:
 def test_what_the_script_reads(page: str, data: ViewData) -> None:
     read = json.loads(block(page, "data"))
     assert [source["name"] for source in read["sources"]] == ["photo", "input", EVIL]
-    assert [view["name"] for view in read["views"]] == [view.name for view in data.views]
+    assert [view["name"] for view in read["views"]] == [view.name for view in data.shown]
     first = read["views"][0]
     assert len(first["viewmat"]) == 16
     assert (first["width"], first["height"]) == (data.views[0].camera.width, data.views[0].camera.height)
@@ -102,12 +102,24 @@ def test_what_the_script_reads(page: str, data: ViewData) -> None:
     assert base64.b64decode(stills[0][2].removeprefix(WEBP)) == data.views[0].stills[1]
     outlines = json.loads(block(page, "outline-pictures"))
     assert [one and base64.b64decode(one.removeprefix("data:image/png;base64,")) for one in outlines] == [
-        view.outlines for view in data.views
+        view.outlines for view in data.shown
     ]
     assert page.index("data:image/webp") < page.index("<script")
     for i, side in enumerate(data.sides):
         assert base64.b64decode(block(page, f"splats-{i}")) == side.splats
     assert b"SparkRenderer" in gzip.decompress(base64.b64decode(block(page, "engine")))
+
+
+def test_the_view_from_outside_has_neither_photo_nor_score(page: str, data: ViewData) -> None:
+    *views, outside = json.loads(block(page, "data"))["views"]
+    assert [view["outside"] for view in views] == [False] * len(data.views)
+    assert (outside["outside"], outside["held_out"], outside["scores"]) == (True, False, [])
+    photo, *renders = json.loads(block(page, "stills"))[-1]
+    assert photo is None
+    assert [base64.b64decode(one.removeprefix(WEBP)) for one in renders] == list(data.outside.stills)
+    cards = re.findall('<button class="card".*?</button>', page, re.DOTALL)
+    assert ["from outside" in card for card in cards] == [False] * len(data.views) + [True]
+    assert ["dB" in card for card in cards] == [True] * len(data.views) + [False]
 
 
 def test_without_gaussians_there_is_no_3d(data: ViewData) -> None:
