@@ -43,8 +43,9 @@ KINDS = ("borders", "means", "saliency")  # pictures of the superpixels of a vie
     ),
     *opt.panel(
         opt.OUTPUT,
-        opt.option("kind", ("panel", "views", "superpixels"), "panel: photo and scenes side by side; views: one "
-                   "picture for each camera; superpixels: the borders, mean colours and saliency of each photo.",
+        opt.option("kind", ("panel", "views", "superpixels"), "panel: photo and scenes side by side, and in a last "
+                   "row the scenes from outside, where no photo is; views: one picture for each camera; superpixels: "
+                   "the borders, mean colours and saliency of each photo.",
                    "--as", wording="panel for a .png, views for a folder"),
     ),
     opt.output("The picture of a panel, .png, a video, .mp4 or .webm, or a folder for pictures.",
@@ -52,8 +53,9 @@ KINDS = ("borders", "means", "saliency")  # pictures of the superpixels of a vie
     *opt.panel(
         opt.OUTPUT,
         opt.option("path", str, "A video, or its frames in a folder. orbit: around the middle view and back to the "
-                   "start; spline: through all views in their order; or the cameras of a file, one for each frame.",
-                   metavar="orbit|spline|FILE"),
+                   "start; orbit:45: by 45 degrees to each side, beyond the cameras; spline: through all views in "
+                   "their order. orbit,back:0.5 or spline,back:0.5: half of the depth farther back. Or the cameras of "
+                   "a file, one for each frame.", metavar="orbit|spline|FILE"),
         opt.option("frames", int, "Frames along an orbit or a spline.",
                    wording="120, for a spline at least 4 for each view", min=2, max=100_000),
         opt.option("fps", int, "Frames of a video per second.", wording="30", min=1, max=120),
@@ -118,7 +120,7 @@ def _choose_plan(args: opt.Args) -> Callable[[opt.Args, SceneFiles], Drawing]:
 
 def _check_path(args: opt.Args) -> None:
     """Refuse an unknown path, and options and outputs that do not go with one."""
-    from gsmerge.measure.camera_path import PATHS
+    from gsmerge.measure.camera_path import parse_path
     from gsmerge.measure.video import is_video
 
     if args.kind is not None:
@@ -127,8 +129,9 @@ def _check_path(args: opt.Args) -> None:
         raise UsageError(f"{args.output}: expected a video, .mp4 or .webm, or a folder for the frames of --path")
     if args.fps is not None and not is_video(args.output):
         raise UsageError(f"--fps: expected a video, .mp4 or .webm, got the folder {args.output}")
-    if args.path in PATHS:
-        return
+    with opt.usage_errors():
+        if parse_path(args.path) is not None:
+            return
     if not Path(args.path).exists():
         raise UsageError(f"--path {args.path}: expected orbit, spline or a file of cameras, found no such file")
     if args.frames is not None:
@@ -155,7 +158,7 @@ def _describe(num_files: int, facts: dict[str, Any]) -> str:
 
 
 def _plan_panel(args: opt.Args, files: SceneFiles) -> Drawing:
-    """Plan a picture of photo, before, after, ... of some views, one row each."""
+    """Plan a picture of photo, before, after, ... of some views, one row each, and of all scenes from outside."""
     like = _frame_files(args, files)
     inputs = (*args.scenes, *input_files(files), *input_files(like))
     check_outputs((args.output,), inputs, overwrite=args.overwrite or args.dry_run)
@@ -165,12 +168,13 @@ def _plan_panel(args: opt.Args, files: SceneFiles) -> Drawing:
     ids = _choose(args, len(used), PANEL_VIEWS)
 
     def draw(_: int) -> Iterator[Picture]:
-        from gsmerge.measure.preview import contact_sheet, view_pictures
+        from gsmerge.measure.preview import contact_sheet, outside_pictures, view_pictures
 
         parts = [(path.name, gaussians) for path, gaussians in zip(args.scenes, scenes, strict=True)]
         own = None if photos is None else photos[used]
         how = {"background": args.background, "antialiased": args.antialiased}
-        yield contact_sheet(view_pictures(parts, cameras, own, max_views=len(ids), **how))
+        rows = view_pictures(parts, cameras, own, max_views=len(ids), **how)
+        yield contact_sheet([*rows, outside_pictures(parts, cameras, photos=own is not None, **how)])
 
     facts = {"scenes": _counts(args, scenes), "views": ids, "photos": photos is not None, "notes": notes}
     return [args.output], facts, draw
@@ -251,10 +255,11 @@ def _path_cameras(
     args: opt.Args, files: SceneFiles, like: SceneFiles
 ) -> tuple[list[Gaussians], Cameras, float, dict[str, Any]]:
     """Read the scenes and make the cameras of the path; also return its near plane, and facts."""
-    from gsmerge.measure.camera_path import PATHS, plan_path, viewing_depth
+    from gsmerge.measure.camera_path import parse_path, plan_path, viewing_depth
     from gsmerge.render.photos import NEAR
 
-    file, own = None if args.path in PATHS else Path(args.path), True
+    path = parse_path(args.path)
+    file, own = None if path else Path(args.path), True
     try:
         check_cameras(like)
     except SceneError:
@@ -266,10 +271,10 @@ def _path_cameras(
     ids = _choose(args, len(cameras))
     cameras = cameras[ids]
     depth = viewing_depth(cameras if file is None else placed.cameras, scenes[0].means)
-    if file is None:
-        least = VIEW_FRAMES * len(ids) if args.path == "spline" else 0
+    if path is not None:
+        least = VIEW_FRAMES * len(ids) if path.kind == "spline" else 0
         with opt.usage_errors():
-            cameras = plan_path(args.path, cameras, depth, args.frames or max(PATH_FRAMES, least))
+            cameras = plan_path(path, cameras, depth, args.frames or max(PATH_FRAMES, least))
     return scenes, cameras, NEAR * depth, {"views": ids, "notes": notes}
 
 

@@ -1,17 +1,28 @@
-"""Paths through a scene for videos: the cameras of its views -> the cameras of the frames, in float64."""
+"""Paths through a scene for videos, and a camera outside: the cameras of its views -> other cameras, in float64."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import re
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsmerge.geometry import camera_centres, lower_median, middle_depth, normalize, quat_to_rotmat, rotmat_to_quat
+from gsmerge.geometry import (
+    camera_centres,
+    lower_median,
+    middle_depth,
+    normalize,
+    quat_to_rotmat,
+    rotmat_to_quat,
+    step_outside,
+)
 from gsmerge.kernels.elementary import cos, sin
 from gsmerge.kernels.matrices import matmul
+from gsmerge.measure.fog import CAMERAS
 from gsmerge.types import Cameras
 
-PATHS = ("orbit", "spline")
+PATH = re.compile(r"(?:orbit(?::(?P<turn>[^,]*))?|spline)(?:,back:(?P<back>[^,]*))?")
+MAX_TURN, MAX_BACK = 90.0, 10.0  # degrees to each side of an orbit; shares of the depth
 FINE = 64  # straight pieces of a curve from camera to camera by which its length is measured
 TURN = 6 * FINE  # the same for a whole orbit
 # Half axes of an orbit, shares of the distance of its middle: as far as half of the cameras are apart within these.
@@ -20,11 +31,57 @@ ACROSS, UPRIGHT = (0.06, 0.25), (0.03, 0.125)
 SAME = 1e-9  # of a path's length: cameras that are no farther apart are one
 
 
-def plan_path(kind: str, cameras: Cameras, depth: float, count: int) -> Cameras:
+@dataclass(frozen=True)
+class CameraPath:
+    """An orbit or a spline.
+
+    Args:
+        kind: "orbit" or "spline".
+        turn: Degrees by which an orbit turns to each side; None: it stays where cameras are.
+        back: Step back from the path, a share of the viewing depth.
+    """
+
+    kind: str
+    turn: float | None = None
+    back: float = 0.0
+
+
+def parse_path(text: str) -> CameraPath | None:
+    """Read a path, such as ``orbit``, ``orbit:45`` or ``spline,back:0.5``; None for the name of a file.
+
+    Raises:
+        ValueError: If the text begins as a path does and goes on otherwise, or a number is out of range.
+    """
+    kind = re.split("[:,]", text, maxsplit=1)[0]
+    if kind not in ("orbit", "spline"):
+        return None
+    match = PATH.fullmatch(text)
+    if match is None:
+        form = "orbit[:DEGREES][,back:SHARE]" if kind == "orbit" else "spline[,back:SHARE]"
+        raise ValueError(f"path: expected {form}, got {text}")
+    turn = _parse_number(match["turn"], "orbit: expected degrees", MAX_TURN)
+    back = _parse_number(match["back"], "back: expected a share of the depth", MAX_BACK)
+    return CameraPath(kind, turn, back or 0.0)
+
+
+def _parse_number(text: str | None, expected: str, most: float) -> float | None:
+    """Read a number above 0 and up to ``most``; None where there is none."""
+    if text is None:
+        return None
+    try:
+        number = float(text)
+    except ValueError:
+        number = np.nan
+    if not 0 < number <= most:
+        raise ValueError(f"path, {expected} above 0 and at most {most:g}, got {text!r}")
+    return number
+
+
+def plan_path(path: CameraPath, cameras: Cameras, depth: float, count: int) -> Cameras:
     """Make the ``count`` cameras of an orbit or a spline through the cameras of a scene.
 
     Args:
-        kind: One of ``PATHS``.
+        path: Its kind, and how far it leaves the cameras.
         cameras: c >= 1 cameras of the scene, for a spline in the order in which it passes them.
         depth: How far away what they show lies, see :func:`viewing_depth`.
         count: Frames.
@@ -34,9 +91,29 @@ def plan_path(kind: str, cameras: Cameras, depth: float, count: int) -> Cameras:
     """
     if count < 2:
         raise ValueError(f"frames: expected at least 2, got {count}")
-    if kind == "orbit":
-        return orbit(cameras, depth, count)
-    return spline(cameras, depth, count)
+    if path.kind == "spline":
+        return spline(step_back(cameras, depth, path.back), (1 + path.back) * depth, count)
+    made = orbit(cameras, depth, count) if path.turn is None else wide_orbit(cameras, depth, count, path.turn)
+    return step_back(made, depth, path.back)
+
+
+def step_back(cameras: Cameras, depth: float, back: float) -> Cameras:
+    """Move cameras backwards by a share ``back`` of the ``depth`` of what they show, world units."""
+    if not back:
+        return cameras
+    return replace(cameras, viewmats=np.stack([step_outside(one, depth, back) for one in cameras.viewmats]))
+
+
+def outside_camera(cameras: Cameras, means: np.ndarray) -> tuple[Cameras, float]:
+    """Step back from the middle camera and turn, to where a viewer sees points ``[n,3]`` as no photo does.
+
+    Returns one camera, one of those that :mod:`gsmerge.measure.fog` measures with, and its distance from the point
+    about which it turned, world units.
+    """
+    back, turn = CAMERAS["turned"][-1]
+    middle, depth = cameras[[median_camera(cameras)]], viewing_depth(cameras, means)
+    viewmat = step_outside(middle.viewmats[0], depth, back, turn)
+    return replace(middle, viewmats=viewmat[None]), (1 + back) * depth
 
 
 def viewing_depth(cameras: Cameras, means: np.ndarray) -> float:
@@ -80,6 +157,23 @@ def orbit(cameras: Cameras, depth: float, count: int) -> Cameras:
     turned = np.stack([right, np.cross(looks, right), looks], 1)
     Ks = np.repeat(cameras.Ks[middle][None].astype(np.float64), count, 0)
     return replace(cameras, viewmats=_viewmats(turned, centre + eyes), Ks=Ks)
+
+
+def wide_orbit(cameras: Cameras, depth: float, count: int, turn: float) -> Cameras:
+    """Turn about the point ``depth`` in front of the middle camera, by ``turn`` degrees to each side of it.
+
+    By half of that upwards and downwards, always as far from the point as that camera. Frames are equally far apart,
+    and the one after the last is the first. The picture's vertical stays that of the middle camera.
+    """
+    middle = median_camera(cameras)
+
+    def turned(angles: np.ndarray) -> np.ndarray:
+        turns = turn * np.stack([sin(angles), cos(angles) / 2], 1)
+        return np.stack([step_outside(cameras.viewmats[middle], depth, 0, *one) for one in turns])
+
+    angles = np.linspace(0, 2 * np.pi, TURN + 1)
+    even = _at_equal_steps(camera_centres(turned(angles)), angles, np.arange(count) / count)
+    return replace(cameras[[middle] * count], viewmats=turned(even))
 
 
 def spline(cameras: Cameras, depth: float, count: int) -> Cameras:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsmerge.io import atomic_output
+from gsmerge.measure.camera_path import outside_camera
 from gsmerge.render import render
 from gsmerge.render.metrics import psnr
 from gsmerge.types import Cameras, Gaussians
@@ -19,6 +20,7 @@ from gsmerge.views import pick_views
 Picture = NDArray[np.uint8]  # [h,w,3], sRGB, RGB order
 BAND = 22  # height of the band that carries a tile's label, pixels
 GAP = 4
+OUTSIDE = "step back"  # name of the view from outside
 BORDER_COLOR = (255, 230, 40)  # of superpixels: seldom in photos
 
 
@@ -69,6 +71,18 @@ def view_pictures(
             pictures.append((f"{name}: {len(gaussians):,}{quality}", renders[i][row]))
         views.append(pictures)
     return views
+
+
+def outside_pictures(
+    scenes: Sequence[tuple[str, Gaussians]], cameras: Cameras, *, photos: bool, **drawing: Any
+) -> list[tuple[str, np.ndarray]]:
+    """Render each scene from outside of the capture, where no photo is: a row like those of :func:`view_pictures`.
+
+    Every render ``[h,w,3]`` comes with its name. With ``photos`` a white picture comes first, in the photos' column.
+    """
+    camera, _ = outside_camera(cameras, scenes[0][1].means)
+    renders = [(f"{name}: {OUTSIDE}", render(some, camera, **drawing).images[0].clip(0, 1)) for name, some in scenes]
+    return [(f"{OUTSIDE}: no photo", np.ones_like(renders[0][1]))] * photos + renders
 
 
 def contact_sheet(views: Sequence[Sequence[tuple[str, np.ndarray]]], *, min_width: int = 320) -> Picture:

@@ -14,11 +14,13 @@ import numpy as np
 from gsmerge.geometry import middle_depth
 from gsmerge.io.formats import spz
 from gsmerge.io.photo_files import encode_indexed
-from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Progress, Quality, ResultScores, evaluate
+from gsmerge.measure.camera_path import outside_camera
+from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Progress, Quality, ResultScores, evaluate, near_plane
 from gsmerge.measure.fog import ALL, Fog
-from gsmerge.measure.preview import Picture, borders, mean_colors, to_picture
+from gsmerge.measure.preview import OUTSIDE, Picture, borders, mean_colors, to_picture
+from gsmerge.render import render
 from gsmerge.runtime.threads import use_threads
-from gsmerge.stages.prepare import scene_frame
+from gsmerge.stages.prepare import Frame, scene_frame
 from gsmerge.stages.superpixels import SegmentOptions, segment
 from gsmerge.types import Cameras, Gaussians, Scene, Views
 from gsmerge.views import even_views
@@ -61,6 +63,7 @@ class PageView:
     stills: tuple[bytes, ...]  # WebP, one for each side
     scores: tuple[Quality, ...]  # one for each side, over the pixels that the input views have seen
     outlines: bytes | None = None  # borders of the photo's superpixels as PNG; None of held-out views
+    outside: bool = False  # a camera where no photo is; it has no scores
 
 
 @dataclass(frozen=True)
@@ -70,10 +73,16 @@ class ViewData:
     title: str  # name of the scene
     sides: tuple[Side, ...]  # the scene itself, then its results
     views: tuple[PageView, ...]  # the worst of the first result first, of the scene without one
+    outside: PageView  # the view from outside of the capture
     num_views: int  # views that were measured, which may be more
     reference: str  # words for the pictures that scores compare with
     notes: tuple[str, ...]  # warnings and limits, one sentence each
     num_superpixels: tuple[int, int] | None = None  # least and most of a photo; None without outlines
+
+    @property
+    def shown(self) -> tuple[PageView, ...]:
+        """The views, and behind them the one from outside."""
+        return (*self.views, self.outside)
 
     @property
     def start(self) -> int:
@@ -139,10 +148,28 @@ def collect(
                 scores=tuple(one.scores[len(views)].masked for one in evaluation.results),
             ))  # fmt: skip
     with use_threads(threads):
+        outside = _outside_view(scene, named, frame, len(views))
         shown, num_superpixels = with_outlines(_shown(views), scene.images, segmentation or SegmentOptions())
     measured = evaluation.notes if results else ()  # which are about what was fitted
     notes = (*measured, *_limits(sides, len(shown), len(views)))
-    return ViewData(title, tuple(sides), shown, len(views), evaluation.reference, notes, num_superpixels)
+    return ViewData(title, tuple(sides), shown, outside, len(views), evaluation.reference, notes, num_superpixels)
+
+
+def _outside_view(scene: Scene, named: Mapping[str, Gaussians], frame: Frame, place: int) -> PageView:
+    """Draw Gaussians of a scene's world from outside of its capture."""
+    camera, distance = outside_camera(scene.cameras.numpy(), scene.file_gaussians.means)
+    renders = (render(some, camera, near=near_plane(scene)) for some in named.values())
+    return PageView(
+        name=OUTSIDE,
+        place=place,
+        held_out=False,
+        camera=frame.enter_cameras(camera),
+        distance=distance / frame.unit,
+        photo=None,
+        stills=tuple(encode_still(to_picture(one.images[0])) for one in renders),
+        scores=(),
+        outside=True,
+    )
 
 
 def with_outlines(

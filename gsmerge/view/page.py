@@ -43,7 +43,7 @@ def view_page(data: ViewData) -> str:
     left = max(right - 1, 0)
     stills = [
         [None if still is None else data_uri(still, "image/webp") for still in (view.photo, *view.stills)[not photos :]]
-        for view in data.views
+        for view in data.shown
     ]
     opened = stills[data.start]
     first = {side: opened[side] for side in (left, right)}  # in the page itself, to be seen at once
@@ -63,10 +63,10 @@ def view_page(data: ViewData) -> str:
             "sources": sources,
             "photos": photos,
             "start": data.start,
-            "views": [_view(view) for view in data.views],
+            "views": [_view(view) for view in data.shown],
         },
         stills=stills,
-        outlines=[view.outlines and data_uri(view.outlines, "image/png") for view in data.views],
+        outlines=[view.outlines and data_uri(view.outlines, "image/png") for view in data.shown],
         splats=splats,
         engine=engine and base64_text(engine),
     )
@@ -128,6 +128,7 @@ def _view(view: PageView) -> dict[str, Any]:
     return {
         "name": view.name,
         "held_out": view.held_out,
+        "outside": view.outside,
         "viewmat": camera.viewmats[0].reshape(-1).tolist(),
         "K": [float(camera.Ks[0, row, column]) for row, column in ((0, 0), (1, 1), (0, 2), (1, 2))],
         "width": camera.width,

@@ -31,7 +31,7 @@ def error(one: np.ndarray, other: np.ndarray) -> float:
     return float(np.abs(one.astype(float) - other).mean())
 
 
-@pytest.mark.parametrize(("kind", "name"), [("orbit", "walk.mp4"), ("spline", "walk.webm")])
+@pytest.mark.parametrize(("kind", "name"), [("orbit", "walk.mp4"), ("orbit:45", "a.mp4"), ("spline", "walk.webm")])
 def test_a_video_shows_the_frames_of_its_path(kind: str, name: str, made_scene: Path, tmp_path: Path, run: Run) -> None:
     call = ("render", made_scene, "--path", kind, "--frames", 8)
     outcome = run(*call, "-o", tmp_path / name, "--fps", 4, code=0)
@@ -117,7 +117,7 @@ def test_frames_grow_with_the_views_of_a_spline(
     made_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gsmerge.cli.render_command.PATH_FRAMES", 12)
-    for kind, count in (("spline", 20), ("orbit", 12)):
+    for kind, count in (("spline,back:0.5", 20), ("orbit", 12)):
         outcome = run("render", made_scene, "--path", kind, "-o", tmp_path / "x", "--dry-run", "--json", code=0)
         assert json.loads(outcome.out)["frames"] == count
 

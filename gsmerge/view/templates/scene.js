@@ -291,6 +291,7 @@ class SplatView {
     const depth = 0.08 * distances[distances.length >> 1];
     const [places, colors] = [[], []];
     this.views.forEach((view, index) => {
+      if (view.outside) return;
       const [fx, fy, cx, cy] = view.K;
       const corner = (u, v) => new Vendor.Vector3(((u - cx) / fx) * depth, ((cy - v) / fy) * depth, -depth);
       const corners = [[0, 0], [view.width, 0], [view.width, view.height], [0, view.height]].map((at) => corner(...at));

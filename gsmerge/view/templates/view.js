@@ -88,7 +88,7 @@ function show() {
     const tag = id(`${side}-tag`);
     tag.hidden = !here;
     tag.textContent = data.sources[source].name;
-    if (here && state.solid && !drawn && !state.atCamera) missing.push(data.sources[source].name);
+    if (here && !drawn && ((state.solid && !state.atCamera) || (stills && !still))) missing.push(data.sources[source].name);
   }
   id("message").hidden = missing.length === 0;
   id("message").textContent = `${[...new Set(missing)].join(" and ")}: at the photos' cameras only`;
@@ -114,13 +114,14 @@ function showLimits() {
   const away = state.atCamera ? "" : "From the photo's camera only: press R";
   const none = solid ? "" : id("status").textContent || "3D is not there yet";
   const flat = state.solid ? "" : none || "In 3D only";
-  const bare = outlines[state.view] ? "" : view().held_out ? "Held-out photos have no superpixels" : "Not there yet";
+  const outside = view().outside ? "No photo is outside" : "";
+  const bare = outlines[state.view] ? "" : outside || (view().held_out ? "Held-out photos have no superpixels" : "Not there yet");
   const reasons = { shape: flat, frustums: flat, background: flat, pixels: flat, outlines: bare || away };
   for (const button of document.querySelectorAll("[data-set]")) {
     const { set: name, value } = button.dataset;
     grey(button, name === "solid" && value ? none : reasons[name]);
   }
-  if (id("overlay-share")) grey(id("overlay-share"), away);
+  if (id("overlay-share")) grey(id("overlay-share"), outside || away);
   grey(id("full"), document.fullscreenEnabled ? "" : "This browser has no full screen");
 }
 
@@ -133,8 +134,8 @@ function showNumbers() {
   const named = view();
   const badge = document.createElement("em");
   badge.className = "badge";
-  badge.textContent = "held out";
-  id("view-name").replaceChildren(`${named.name} `, ...(named.held_out ? [badge] : []));
+  badge.textContent = named.held_out ? "held out" : "from outside";
+  id("view-name").replaceChildren(`${named.name} `, ...(named.held_out || named.outside ? [badge] : []));
   const rows = named.scores.map(([psnr, ssim], i) => {
     const row = document.createElement("tr");
     const cells = [data.sources[i + Number(data.photos)].name, psnr === null ? "-" : psnr.toFixed(2), ssim === null ? "-" : ssim.toFixed(3)];
@@ -165,6 +166,10 @@ function jump(index) {
   if (solid) solid.look(state.view);
   showNumbers();
   show();
+}
+
+function stepBack() {
+  jump(data.views.findIndex((one) => one.outside));
 }
 
 // The view that many cards further along the strip.
@@ -205,7 +210,7 @@ function onKey(event) {
   const actions = {
     arrowleft: () => swipeTo(state.at - 0.02), arrowright: () => swipeTo(state.at + 0.02),
     home: () => swipeTo(0), end: () => swipeTo(1), arrowup: () => step(-1), arrowdown: () => step(1),
-    f: toggleFull, o: () => set("outlines", state.outlines ? "" : "1"), s: () => toggle("solid"), p: () => toggle("shape"), c: () => toggle("frustums"), r: () => jump(state.view),
+    b: stepBack, f: toggleFull, o: () => set("outlines", state.outlines ? "" : "1"), s: () => toggle("solid"), p: () => toggle("shape"), c: () => toggle("frustums"), r: () => jump(state.view),
     " ": () => { state.other = true; show(); },
   };
   if (KEYS[key] && data.sources.length > 1) set("mode", KEYS[key]);
@@ -228,6 +233,7 @@ function listen() {
   for (const side of ["left", "right"]) id(`${side}-source`).addEventListener("input", (event) => set(side, Number(event.target.value)));
   if (id("overlay-share")) id("overlay-share").addEventListener("input", (event) => set("overlay", event.target.value / 100));
   id("back").addEventListener("click", () => jump(state.view));
+  id("outside").addEventListener("click", stepBack);
   id("full").addEventListener("click", toggleFull);
   document.addEventListener("fullscreenchange", () => {
     id("full").textContent = document.fullscreenElement ? "Leave full screen" : "Full screen";

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,12 +14,17 @@ from gsmerge.geometry import camera_centres, motion_matrices, project
 from gsmerge.measure.camera_path import (
     ACROSS,
     UPRIGHT,
+    CameraPath,
     median_camera,
     orbit,
+    outside_camera,
+    parse_path,
     plan_path,
     spline,
     viewing_depth,
+    wide_orbit,
 )
+from gsmerge.measure.fog import outside_cameras
 from gsmerge.types import Cameras
 
 DEPTH = 3.0
@@ -45,11 +52,11 @@ def angles_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.arccos(cosines.clip(-1, 1))
 
 
-def pose_steps(path: Cameras) -> np.ndarray:
+def pose_steps(path: Cameras, depth: float = DEPTH) -> np.ndarray:
     """How far each camera is from the one before, turns by what they move at the depth."""
     shifts = np.linalg.norm(np.diff(camera_centres(path.viewmats), axis=0), axis=1)
     turns = angles_between(path.viewmats[1:], path.viewmats[:-1])
-    return np.hypot(shifts, DEPTH * turns)
+    return np.hypot(shifts, depth * turns)
 
 
 def test_a_spline_passes_through_all_cameras_at_even_speed(walk: Cameras) -> None:
@@ -137,17 +144,91 @@ def test_the_middle_camera_is_none_that_looks_elsewhere() -> None:
     assert median_camera(make_cameras(places, turns)) == 3
 
 
-@pytest.mark.parametrize("kind", ["orbit", "spline"])
+@pytest.mark.parametrize("turn", [20.0, 90.0])
+def test_a_wide_orbit_turns_that_far_and_keeps_its_distance(walk: Cameras, turn: float) -> None:
+    path = wide_orbit(walk, DEPTH, 60, turn)
+    home = walk.viewmats[median_camera(walk)]
+    centres, focus = camera_centres(path.viewmats), camera_centres(home) + DEPTH * home[2, :3]
+    np.testing.assert_allclose(np.linalg.norm(centres - focus, axis=1), DEPTH)
+    np.testing.assert_allclose(project(focus[None], path)[0][:, 0], np.tile([16.0, 12], (60, 1)), atol=1e-9)
+    np.testing.assert_allclose((path.viewmats[:, 0, :3] * home[1, :3]).sum(1), 0, atol=1e-12)  # upright
+    x, y, z = ((path.viewmats[:, 2, :3] * axis).sum(1) for axis in home[:3, :3])
+    assert np.degrees(np.arctan2(x, z)).max() == pytest.approx(turn, rel=0.01)
+    assert np.degrees(np.arcsin(np.abs(y))).max() == pytest.approx(turn / 2, rel=0.01)
+    steps = np.linalg.norm(centres - np.roll(centres, 1, 0), axis=1)
+    assert steps.max() / steps.min() < 1.01
+
+
+@pytest.mark.parametrize("kind", ["orbit", "orbit:30", "spline"])
+def test_a_step_back_keeps_what_is_looked_at(kind: str, walk: Cameras) -> None:
+    path, back = (plan_path(parse_path(text), walk, DEPTH, 20) for text in (kind, f"{kind},back:0.5"))
+    if kind == "spline":  # even speed is another one farther away: the ends are the same cameras
+        path, back = path[[0, -1]], back[[0, -1]]
+    np.testing.assert_allclose(back.viewmats[:, :3, :3], path.viewmats[:, :3, :3], atol=1e-12)
+    shifts = camera_centres(back.viewmats) - camera_centres(path.viewmats)
+    np.testing.assert_allclose(shifts, -0.5 * DEPTH * path.viewmats[:, 2, :3], atol=1e-9)
+
+
+def test_a_spline_that_steps_back_has_even_speed(walk: Cameras) -> None:
+    steps = pose_steps(plan_path(CameraPath("spline", back=0.5), walk, DEPTH, 400), 1.5 * DEPTH)
+    assert steps.max() / steps.min() < 1.03
+
+
+@pytest.mark.parametrize(
+    ("text", "path"),
+    [
+        ("orbit", CameraPath("orbit")),
+        ("orbit:45", CameraPath("orbit", 45)),
+        ("orbit:7.5,back:0.5", CameraPath("orbit", 7.5, 0.5)),
+        ("spline,back:2", CameraPath("spline", None, 2)),
+        ("orbits.json", None),
+        ("orbit.json", None),
+        ("room/orbit:45", None),
+    ],
+)
+def test_parse_path(text: str, path: CameraPath | None) -> None:
+    assert parse_path(text) == path
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("orbit:", "path, orbit: expected degrees above 0 and at most 90, got ''"),
+        ("orbit:0", "path, orbit: expected degrees above 0 and at most 90, got '0'"),
+        ("orbit:90.5", "at most 90, got '90.5'"),
+        ("orbit:nan", "at most 90, got 'nan'"),
+        ("orbit,back:-1", "path, back: expected a share of the depth above 0 and at most 10, got '-1'"),
+        ("spline,back:inf", "at most 10, got 'inf'"),
+        ("orbit,back=1", "path: expected orbit[:DEGREES][,back:SHARE], got orbit,back=1"),
+        ("orbit:9,back:1,back:1", "path: expected orbit[:DEGREES][,back:SHARE], got"),
+        ("spline:9", "path: expected spline[,back:SHARE], got spline:9"),
+    ],
+)
+def test_other_paths_are_refused(text: str, words: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(words)):
+        parse_path(text)
+
+
+def test_the_camera_outside_is_one_that_fog_is_measured_with(walk: Cameras) -> None:
+    middle = walk[[median_camera(walk)] * 3]
+    means = np.random.default_rng(1).uniform(-4, 4, (500, 3)).astype(np.float32)
+    camera, distance = outside_camera(middle, means)
+    assert distance == pytest.approx(1.5 * viewing_depth(middle, means))
+    given = SimpleNamespace(means=means)
+    assert any(np.array_equal(camera.viewmats, one.viewmats) for _, one in outside_cameras(given, middle))
+
+
+@pytest.mark.parametrize("kind", ["orbit", "orbit:40", "spline,back:0.5"])
 def test_a_path_moves_with_its_scene(kind: str, walk: Cameras) -> None:
     means = np.random.default_rng(1).uniform(-4, 4, (500, 3))
     motion = motion_matrices(np.array([[0.3, -1.1, 0.7, 4, -2, 1]]))[0]
     moved = replace(walk, viewmats=walk.viewmats @ np.linalg.inv(motion))
-    path = plan_path(kind, walk, viewing_depth(walk, means), 30)
+    path = plan_path(parse_path(kind), walk, viewing_depth(walk, means), 30)
     depth = viewing_depth(moved, means @ motion[:3, :3].T + motion[:3, 3])
-    other = plan_path(kind, moved, depth, 30)
+    other = plan_path(parse_path(kind), moved, depth, 30)
     np.testing.assert_allclose(other.viewmats @ motion, path.viewmats, atol=1e-9)
 
 
 def test_a_path_has_two_frames_at_least(walk: Cameras) -> None:
     with pytest.raises(ValueError, match="frames: expected at least 2, got 1"):
-        plan_path("orbit", walk, DEPTH, 1)
+        plan_path(CameraPath("orbit"), walk, DEPTH, 1)

@@ -46,6 +46,15 @@ def test_contact_sheet_shows_scenes_left_to_right_below_their_labels() -> None:
     assert bright == pytest.approx(0.95 * 0.9 * 255, abs=4)
 
 
+@pytest.mark.parametrize("photos", [True, False])
+def test_the_row_from_outside_has_no_photo_and_no_score(photos: bool) -> None:
+    row = preview.outside_pictures([("dark", blob(0.3)), ("bright", blob(0.9))], cameras(2), photos=photos)
+    assert [text for text, _ in row] == ["step back: no photo"] * photos + ["dark: step back", "bright: step back"]
+    *blank, dark, bright = [float(image.mean()) for _, image in row]
+    assert blank == [1.0] * photos
+    assert 0 < dark < bright < 1
+
+
 def test_small_renders_are_enlarged_by_whole_pixels() -> None:
     sheet = preview.contact_sheet(preview.view_pictures([("one", blob(0.5))], cameras(1)), min_width=50)
     assert sheet.shape == (3 * 12 + preview.BAND, 3 * 20, 3)

@@ -16,9 +16,11 @@ import scenes
 
 from gsmerge import Gaussians, Scene, evaluate, render
 from gsmerge.io.formats.spz import spz_bytes
+from gsmerge.measure.camera_path import outside_camera
 from gsmerge.measure.evaluate import EvaluateOptions, near_plane
 from gsmerge.measure.preview import to_picture
 from gsmerge.render.metrics import psnr
+from gsmerge.stages.prepare import scene_frame
 from gsmerge.stages.segment import SegmentOptions, segment
 from gsmerge.types import Views
 from gsmerge.view import data
@@ -109,6 +111,17 @@ def test_stills_are_our_renders(actual: ViewData, scene: Scene, half: Gaussians,
         ]
         for still, picture in zip((view.photo, *view.stills), (split.images[i], *renders), strict=False):
             assert psnr(decoded(still), picture) > 34  # 41 where pictures are not as small and colourful
+
+
+def test_the_view_from_outside(actual: ViewData, scene: Scene, half: Gaussians) -> None:
+    camera, distance = outside_camera(scene.cameras, scene.gaussians.means)
+    for some, still in zip((scene.gaussians, half), actual.outside.stills, strict=False):
+        assert psnr(decoded(still), render(some, camera, near=near_plane(scene)).images[0].clip(0, 1)) > 30
+    frame = scene_frame(scene)
+    assert actual.outside.distance == pytest.approx(distance / frame.unit)
+    np.testing.assert_allclose(actual.outside.camera.viewmats, frame.enter_cameras(camera).viewmats)
+    assert (actual.outside.photo, actual.outside.scores, actual.outside.outlines) == (None, (), None)
+    assert actual.outside not in actual.views
 
 
 def test_cameras_and_gaussians_are_in_one_frame(actual: ViewData, half: Gaussians, scene: Scene) -> None:

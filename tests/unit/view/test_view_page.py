@@ -89,7 +89,7 @@ def test_names_are_escaped(page: str) -> None:
 def test_what_the_script_reads(page: str, data: ViewData) -> None:
     read = json.loads(block(page, "data"))
     assert [source["name"] for source in read["sources"]] == ["photo", "input", EVIL]
-    assert [view["name"] for view in read["views"]] == [view.name for view in data.views]
+    assert [view["name"] for view in read["views"]] == [view.name for view in data.shown]
     first = read["views"][0]
     assert len(first["viewmat"]) == 16
     assert (first["width"], first["height"]) == (data.views[0].camera.width, data.views[0].camera.height)
@@ -103,7 +103,7 @@ def test_what_the_script_reads(page: str, data: ViewData) -> None:
     assert base64.b64decode(stills[0][2].removeprefix(WEBP)) == data.views[0].stills[1]
     outlines = json.loads(block(page, "outline-pictures"))
     assert [one and base64.b64decode(one.removeprefix("data:image/png;base64,")) for one in outlines] == [
-        view.outlines for view in data.views
+        view.outlines for view in data.shown
     ]
     assert page.index("data:image/webp") < page.index("<script")
     for i, side in enumerate(data.sides):
@@ -119,6 +119,18 @@ def test_fog_and_holes_are_in_a_table(data: ViewData, alone: ViewData) -> None:
     assert cells[0] == ["from outside", "near fog", "far fog", "holes"]
     assert [[html.unescape(cell) for cell in row] for row in cells[1:]] == [[EVIL, "0.250", "-", "0.013"]]
     assert 'class="outside"' not in view_page(alone)
+
+
+def test_the_view_from_outside_has_neither_photo_nor_score(page: str, data: ViewData) -> None:
+    *views, outside = json.loads(block(page, "data"))["views"]
+    assert [view["outside"] for view in views] == [False] * len(data.views)
+    assert (outside["outside"], outside["held_out"], outside["scores"]) == (True, False, [])
+    photo, *renders = json.loads(block(page, "stills"))[-1]
+    assert photo is None
+    assert [base64.b64decode(one.removeprefix(WEBP)) for one in renders] == list(data.outside.stills)
+    cards = re.findall('<button class="card".*?</button>', page, re.DOTALL)
+    assert ["from outside" in card for card in cards] == [False] * len(data.views) + [True]
+    assert ["dB" in card for card in cards] == [True] * len(data.views) + [False]
 
 
 def test_without_gaussians_there_is_no_3d(data: ViewData) -> None:
