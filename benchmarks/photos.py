@@ -4,6 +4,7 @@ python benchmarks/photos.py fern,fox                          # a third of the s
 python benchmarks/photos.py fern --cases "half exposure" bgr
 python benchmarks/photos.py fern --shrink 2 --cases "gain .5 to 2 in both"
 python benchmarks/photos.py eval --cases sound --shrink 1 --views 0   # what is found where nothing is wrong
+python benchmarks/photos.py train --views 0 --set effort=fast exposure=fixed --cases "auto exposure in all"
 
 Visible pixels; inside and outside an ellipse; after the colours of each held-out photo were aligned.
 """

@@ -36,13 +36,13 @@ SAME_DEPTH = 0.05  # logarithm of depths that are of one surface
 LOW, HIGH = 0.05, 0.95  # colours in between are neither noise nor clipped
 MIN_PAIRS = 60  # pixels that two views must share; so many of each pair are compared again
 # When gains are taken out, on the plain exports of 15 captures. Root mean square of the logarithmic gains: above it in
-# nineteen of twenty draws of random gains of 0.8 to 1.25, and in six captures as they were taken.
+# nine of ten draws of random gains of 0.8 to 1.25 for five photos, and in six captures as they were taken.
 DIFFERENT = 0.06
-# Differences between colours of the same surfaces, as a share of those before: 0.11 to 0.62 with random gains.
+# Differences between colours of the same surfaces, as a share of those before: 0.12 to 0.60 with random gains.
 NEARER = 0.75
-# How a photo's brightness grows with its gain, logarithms: by 0.61 to 1.11 with random gains of 0.5 to 2, by 0.46 at
-# most where a camera metered light. Places that differ in brightness by more than the gains bury that, so it counts
-# only where both are opposed: their correlation is -0.67 to -0.99 where light was metered.
+# How a photo's brightness grows with its gain, logarithms: by 0.61 to 1.11 with random gains of 0.5 to 2, by 0.41 at
+# most where a camera metered light and gains are 0.1 or more. Places that differ in brightness by more than the gains
+# bury that, so it counts only where both are opposed: there, their correlation is -0.67 to -0.99.
 FOLLOWS, OPPOSED = 0.5, -0.6
 # Distance of a gain from the mean of its two nearest views', as a share of what random gains have: 0.71 to 1.22 with
 # gains of 0.5 to 2, 0.19 to 0.57 where exposure drifts and compensation loses 1.7 dB or more; 0.67 of four in a row.
