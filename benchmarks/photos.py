@@ -4,6 +4,7 @@ python benchmarks/photos.py fern,fox                          # a third of the s
 python benchmarks/photos.py fern --cases "half exposure" bgr
 python benchmarks/photos.py fern --shrink 2 --cases "gain .5 to 2 in both"
 python benchmarks/photos.py eval --cases sound --shrink 1 --views 0   # what is found where nothing is wrong
+python benchmarks/photos.py train --views 0 --set effort=fast exposure=fixed --cases "auto exposure in all"
 
 Visible pixels; inside and outside an ellipse; after the colours of each held-out photo were aligned.
 """
@@ -30,7 +31,9 @@ from gsmerge.types import Gaussians
 
 BAND = 0.3  # of the height
 SETTINGS: dict[str, Any] = {}
-Change = Callable[[int, np.ndarray], np.ndarray]  # number, photo [h,w,3] in [0, 1] -> photo as it is written
+METERED, MOST = 0.18, 4.0  # linear light that an automatic exposure makes of a photo's middle; its largest gain
+# place (0, 1, 2 ... for context photos, halves for those between), photo [h,w,3] in [0, 1] -> photo as it is written
+Change = Callable[[float, np.ndarray], np.ndarray]
 
 
 def ellipse(height: int, width: int) -> np.ndarray:
@@ -39,24 +42,24 @@ def ellipse(height: int, width: int) -> np.ndarray:
     return y[:, None] ** 2 / 0.72 + x**2 / 0.72 < 1
 
 
-def band(number: int, photo: np.ndarray) -> np.ndarray:
+def band(place: float, photo: np.ndarray) -> np.ndarray:
     """A flat band over the lower part of three of five photos."""
     out = photo.copy()
-    if number % 2 == 0:
+    if place % 2 == 0:
         out[round((1 - BAND) * len(photo)) :] = (0.85, 0.8, 0.1)
     return out
 
 
-def mask_black(_: int, photo: np.ndarray) -> np.ndarray:
+def mask_black(_: float, photo: np.ndarray) -> np.ndarray:
     return photo * ellipse(*photo.shape[:2])[..., None]
 
 
-def alpha(_: int, photo: np.ndarray) -> np.ndarray:
+def alpha(_: float, photo: np.ndarray) -> np.ndarray:
     inside = ellipse(*photo.shape[:2])[..., None]
     return np.concatenate([photo * inside, inside], -1)
 
 
-def letterbox(_: int, photo: np.ndarray) -> np.ndarray:
+def letterbox(_: float, photo: np.ndarray) -> np.ndarray:
     """The picture, smaller, between black bars in a frame of the same size."""
     height, width = photo.shape[:2]
     bar = round(0.14 * height)
@@ -65,7 +68,7 @@ def letterbox(_: int, photo: np.ndarray) -> np.ndarray:
     return out
 
 
-def bars(_: int, photo: np.ndarray) -> np.ndarray:
+def bars(_: float, photo: np.ndarray) -> np.ndarray:
     """Black bars over the picture."""
     height, out = len(photo), photo.copy()
     bar = round(0.14 * height)
@@ -73,22 +76,41 @@ def bars(_: int, photo: np.ndarray) -> np.ndarray:
     return out
 
 
-def padded(_: int, photo: np.ndarray) -> np.ndarray:
+def padded(_: float, photo: np.ndarray) -> np.ndarray:
     """Black bars above and below, in a taller frame."""
     bar = round(0.14 * len(photo))
     return np.pad(photo, ((bar, bar), (0, 0), (0, 0)))
 
 
-def linear(_: int, photo: np.ndarray) -> np.ndarray:
+def linear(_: float, photo: np.ndarray) -> np.ndarray:
     return np.where(photo <= 0.04045, photo / 12.92, ((photo + 0.055) / 1.055) ** 2.4)
 
 
 def gains(low: float, high: float, channels: int) -> Change:
     """Factors for every photo, evenly many brighter and darker."""
 
-    def change(number: int, photo: np.ndarray) -> np.ndarray:
-        random = np.random.default_rng([7, number])
+    def change(place: float, photo: np.ndarray) -> np.ndarray:
+        random = np.random.default_rng([7, int(place)])
         return np.clip(photo * np.exp(random.uniform(np.log(low), np.log(high), channels)), 0, 1)
+
+    return change
+
+
+def drift(place: float, photo: np.ndarray) -> np.ndarray:
+    """Factors of 0.7 to 1.4 that come and go along a video of twelve context photos."""
+    return np.clip(photo * np.exp(0.35 * np.cos(2 * np.pi * place / 12)), 0, 1)
+
+
+def meter(share: float) -> Change:
+    """Exposure that a camera chooses for each photo: light is metered within ``share`` of the sides from the middle."""
+
+    def change(_: float, photo: np.ndarray) -> np.ndarray:
+        y, x = (np.linspace(-0.5, 0.5, side) / share for side in photo.shape[:2])
+        weights = np.exp(-0.5 * (y[:, None] ** 2 + x**2))[..., None]
+        light = linear(0, photo)
+        gain = np.clip(METERED * 3 * weights.sum() / (weights * light).sum(), 1 / MOST, MOST)
+        light = np.clip(gain * light, 0, 1)
+        return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
 
     return change
 
@@ -97,6 +119,7 @@ def gains(low: float, high: float, channels: int) -> Change:
 class Case:
     change: Change
     gaussians_too: bool = False  # whether the model saw the photos so
+    targets_too: bool = False  # whether held-out photos were taken so
     masks: bool = False  # whether masks lie beside the photos
 
 
@@ -116,15 +139,18 @@ CASES = {
     "gain .5 to 2 in both": Case(gains(0.5, 2, 1), gaussians_too=True),
     "gain .8 to 1.25 in both": Case(gains(0.8, 1.25, 1), gaussians_too=True),
     "white balance .8 to 1.25 in both": Case(gains(0.8, 1.25, 3), gaussians_too=True),
+    "drift .7 to 1.4 in all": Case(drift, gaussians_too=True, targets_too=True),
+    "auto exposure in all": Case(meter(0.5), gaussians_too=True, targets_too=True),
+    "spot exposure in all": Case(meter(0.15), gaussians_too=True, targets_too=True),
     "gain .8 to 1.25 in photos": Case(gains(0.8, 1.25, 1)),
 }
 
 
-def shrink_scene(scene: Path, out: Path, by: int, change: Change | None) -> Path:
-    """A scene's folder with photos, depths and confidence ``by`` times smaller; context photos changed."""
+def shrink_scene(scene: Path, out: Path, by: int, change: Change | None, *, targets_too: bool) -> Path:
+    """A scene's folder with photos, depths and confidence ``by`` times smaller; its photos changed."""
     shutil.rmtree(out, ignore_errors=True)
     document = json.loads((scene / "transforms.json").read_text())
-    context = 0
+    place = 0.0
     for frame in document["frames"]:
         for name in ("file_path", "depth_path", "confidence_path"):
             if name not in frame:
@@ -134,13 +160,13 @@ def shrink_scene(scene: Path, out: Path, by: int, change: Change | None) -> Path
             kind = cv2.INTER_AREA if name == "file_path" else cv2.INTER_NEAREST
             image = cv2.resize(image, size, interpolation=kind) if by > 1 else image
             path = (out / frame[name]).with_suffix(".png")
-            if name == "file_path" and frame["role"] == "context" and change is not None:
-                changed = change(context, image[..., ::-1].astype(np.float64) / 255)
+            if name == "file_path" and change is not None and (targets_too or frame["role"] == "context"):
+                changed = change(place, image[..., ::-1].astype(np.float64) / 255)
                 image = np.round(changed[..., ::-1] * 255).astype(np.uint8)
             path.parent.mkdir(parents=True, exist_ok=True)
             cv2.imwrite(str(path), image)
             frame[name] = str(path.relative_to(out))
-        context += frame["role"] == "context"
+        place += 0.5  # context and held-out photos take turns
         for key, side in (("fl_x", "w"), ("cx", "w"), ("fl_y", "h"), ("cy", "h")):
             frame[key] *= (frame[side] // by) / frame[side]
         frame["w"], frame["h"] = frame["w"] // by, frame["h"] // by
@@ -149,9 +175,10 @@ def shrink_scene(scene: Path, out: Path, by: int, change: Change | None) -> Path
 
 
 def export_case(scene: Path, case: Case, out: Path, by: int, views: int) -> tuple[Path, Targets]:
-    """The export of a scene whose photos were changed, and its held-out photos, which were not."""
+    """The export of a scene whose photos were changed, and its held-out photos."""
     shutil.rmtree(out, ignore_errors=True)
-    small = shrink_scene(scene, out / "small", by, case.change if case.gaussians_too else None)
+    change = case.change if case.gaussians_too else None
+    small = shrink_scene(scene, out / "small", by, change, targets_too=case.targets_too)
     path = Path(exporter().export(small, out / "export", "plain", views or None))
     photos = sorted((out / "export" / "images").iterdir(), key=lambda file: _order(out / "export", file.name))
     for number, file in enumerate(photos):

@@ -148,6 +148,32 @@ def test_exposures_are_brought_to_their_mean(room: Scene, sound: CompactResult, 
     assert result.report.psnr_after > fixed.report.psnr_after  # in the exposure that the result has
 
 
+def metered_views(eyes: list[float], targets: list[float]) -> Scene:
+    """A wall that is dark on its left, seen by a camera that makes all photos equally bright."""
+
+    def lit(surface: scenes.Surface) -> scenes.Surface:
+        light = lambda x: (0.25 + 0.25 * x.clip(-1, 2))[..., None]  # noqa: E731
+        return scenes.Surface(surface.shape, lambda p: surface.texture(p) * (0.1 + light(p[..., 0])))
+
+    poses = [
+        scenes.look_at(np.array([x, 0.1 * x, 0.0]), np.array([at, 0.0, 3.0]))
+        for x, at in zip(eyes, targets, strict=True)
+    ]
+    cameras = scenes.Cameras(np.stack(poses), scenes.intrinsics(len(eyes), WIDTH, HEIGHT), WIDTH, HEIGHT)
+    scene = scenes.make_scene([lit(surface) for surface in scenes.room()], cameras, noise=0.005)
+    return exposed(scene, 0.25 / scene.images.mean((1, 2, 3))[:, None] * np.ones(3))
+
+
+def test_exposure_that_a_camera_metered_stays() -> None:
+    eyes, targets = [-0.4, -0.2, 0.0, 0.2, 0.4, 0.1], [-0.5, 0.4, -0.3, 0.5, 0.0, 0.2]
+    scene, held_out = metered_views(eyes, targets), metered_views([-0.3, 0.3], [0.4, -0.4])
+    auto, fixed, mean = (compact(scene, **FIT, exposure=setting) for setting in ("auto", "fixed", "per-photo"))
+    (note,) = (one for one in auto.report.notes if one.startswith("the photos differ in exposure by factors of"))
+    assert "a camera chose it by what it saw" in note
+    assert scenes.identical(auto.gaussians, fixed.gaussians)
+    assert scenes.psnr_of(auto.gaussians, held_out) > scenes.psnr_of(mean.gaussians, held_out) + 0.5
+
+
 def test_exposure_that_drifts_stays_unless_asked(room: Scene) -> None:
     drift = np.linspace(0.94, 1.06, VIEWS)[:, None] * np.ones(3)
     scene = exposed(room, drift)
