@@ -6,7 +6,7 @@ also write what the new parameters mean to the rasterizer, so a step begins with
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 from importlib.util import find_spec
 
@@ -39,6 +39,10 @@ class FitState:
 
     def __len__(self) -> int:
         return len(self.x)
+
+    def __getitem__(self, rows: Tensor) -> FitState:
+        """Return the state of some Gaussians, by mask or by row."""
+        return FitState(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)

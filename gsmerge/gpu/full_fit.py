@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import time
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -18,14 +18,22 @@ import torch
 from torch import Tensor
 
 from gsmerge.gpu.adam import FitState, StepGradients, adam_step, gaussians_of, start_state, state_of
-from gsmerge.gpu.device_photos import DevicePhotos, draw, draw_and_transpose, draw_black, harmonic_colors
+from gsmerge.gpu.device_photos import (
+    DevicePhotos,
+    draw,
+    draw_and_transpose,
+    draw_black,
+    harmonic_colors,
+    upload_photos,
+)
 from gsmerge.gpu.image_scores import holdout_psnr, loss_gradient, photo_means
 from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT, SIZE
 from gsmerge.kernels.raster.blend import MAX_ALPHA
 from gsmerge.networks.tensors import quat_to_rotmat
 from gsmerge.render.autograd import Shape
+from gsmerge.render.photos import Photos
 from gsmerge.stages.fit.fit_options import FitOptions, FitReport
-from gsmerge.stages.fit.fit_state import DEPTH, OFFSET
+from gsmerge.stages.fit.fit_state import DEPTH, FADED, OFFSET
 from gsmerge.stages.fit.full import (
     GROWTH,
     MAX_STEPS,
@@ -39,6 +47,7 @@ from gsmerge.stages.fit.full import (
     plan_run,
     step_sizes,
 )
+from gsmerge.stages.fit.outside import TOUCHED
 from gsmerge.types import SH_C0, Gaussians
 
 READ_EVERY = 20  # steps; each reading waits for the device
@@ -139,8 +148,8 @@ def error_masses(state: FitState, photos: DevicePhotos) -> Tensor:
 
 
 def grow_to(state: FitState, photos: DevicePhotos, count: int) -> FitState:
-    """Call :func:`grow` until there are ``count`` or nothing that the photos show is left to halve."""
-    before = 0
+    """Leave out what has faded and halve others, see :func:`gsmerge.stages.fit.fit_state.grow_to`."""
+    before, state = 0, state[state.opacities >= state.opacities.median().clamp_max(FADED)]
     while before < len(state) < count:
         before, state = len(state), grow(state, photos, count)
     return state
@@ -203,6 +212,20 @@ def step_gradients(
     return StepGradients(of_means, of_quats, of_scales, of_opacities, of_colors, reached), error
 
 
+def fog_gradients(state: FitState, outside: DevicePhotos, weights: Tensor, view: int) -> StepGradients:
+    """Differentiate the fog of a view outside, see :func:`gsmerge.stages.fit.outside.fog_gradients`."""
+    with torch.enable_grad():
+        means, quats, scales, opacities = (tensor.detach().requires_grad_() for tensor in state_shape(state))
+        white = torch.ones_like(state.colors)
+        image = draw_black((means, quats, scales, opacities), white, outside, view)  # the opacity, three times
+    wanted = (weights[view] / (3 * weights[view].numel()))[..., None].expand_as(image)
+    of_means, of_quats, of_scales, of_opacities = torch.autograd.grad(
+        image, (means, quats, scales, opacities), wanted.contiguous()
+    )
+    touched = of_opacities.abs() > TOUCHED
+    return StepGradients(of_means, of_quats, of_scales, of_opacities, torch.zeros_like(white), touched)
+
+
 def leave_out(state: FitState, dropout: float, generator: torch.Generator) -> Tensor:
     """Return opacities ``[n]`` with a share of the Gaussians left out, the others a little more opaque."""
     kept = torch.rand(len(state), device=state.x.device, generator=generator) >= dropout
@@ -219,9 +242,10 @@ def fit_full(
     baseline_start: Gaussians | None,
     look: None = None,  # what the CPU's fit takes over from the look before
     fixed: None = None,  # Gaussians that stay as they are, which only the CPU can do
+    outside: Photos | None = None,
 ) -> tuple[Gaussians, FitReport]:
     """Fit as :func:`gsmerge.stages.fit.full.fit_full` does; report progress every ``READ_EVERY`` steps."""
-    plan = plan_run((photos[0].host, photos[1].host), options, seed)
+    plan = replace(plan_run((photos[0].host, photos[1].host), options, seed), outside=outside)
     run = _Run(start_state(gaussians), make_levels(photos, plan), plan, seed, progress)
     judged = torch.from_numpy(np.stack(plan.weights[1])).to(gaussians.means.device)
     half = photos[1]
@@ -280,6 +304,9 @@ class _Run:
         self.backgrounds = torch.from_numpy(backgrounds).to(device)
         self.generator = torch.Generator(device).manual_seed(seed)
         self.rates = self._all_rates()
+        if plan.outside is not None:
+            self.outside = upload_photos(plan.outside, device)
+            self.empty = torch.as_tensor(plan.outside.weights, device=device)
 
     def _all_rates(self) -> Tensor:
         """Return the sizes ``[steps,14]`` of all steps."""
@@ -309,6 +336,10 @@ class _Run:
         options, dropout = self.plan.options, self.plan.dropout
         mean = self._move(self.state, leave_out(self.state, dropout, self.generator) if dropout > 0 else None)
         self.error.lerp_(mean, 1 / min(self.step + 1, 10))
+        outside_view = self.plan.outside_view(self.step + 1, self.step / self.steps)
+        if outside_view is not None:
+            gradients = fog_gradients(self.state, self.outside, self.empty, outside_view)
+            adam_step(self.state, gradients, options, self.rates[self.step], self.step + 1)
         self.step += 1
         if self.step > self.steps * (1 - options.tuning.average_share):
             self.tail.add(self.state.x)

@@ -17,6 +17,7 @@ from gsmerge.geometry import middle_depth, step_outside
 from gsmerge.measure.sizes import shrink_cameras
 from gsmerge.render import Splats, plan_view, prepare
 from gsmerge.render.composite import blend
+from gsmerge.stages.fit.fit_options import HAZE
 from gsmerge.types import Cameras, Gaussians
 from gsmerge.views import pick_views
 
@@ -28,7 +29,6 @@ SIDE = 480  # pixels, at most, of the longer side of the pictures
 EMPTY, SOLID, OPEN = 0.05, 0.9, 0.5  # opacities: input below, input above, result below
 MARGIN = 17  # pixels per side of the square that erodes what is empty
 FAR = 0.1  # of the width: distance from what the input shows from which fog is far
-HAZE = 0.05  # far fog above which a result gets a note: plain to see in a viewer
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def measure_fog(
 
 
 def describe_fog(name: str, fog: Fog) -> str | None:
-    """Say that a result shows haze from outside; None up to :data:`HAZE`."""
+    """Say that a result shows haze from outside; None up to a far fog of 0.05."""
     if fog.fog_far is None or fog.fog_far <= HAZE:
         return None
     return (

@@ -12,7 +12,7 @@ For training loops, on arrays and without autograd::
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -37,6 +37,11 @@ class Gradients:
     opacities: Array  # [m] float32
     colors: Array  # [m,3] float32, with respect to the colours in this view, as they are blended
     viewmat: Array | None  # [4,4] float64, last row 0; None if not asked for
+
+    def __getitem__(self, rows: Array) -> Gradients:
+        """Return the gradients of some Gaussians, by mask or by row; that of the view matrix stays."""
+        names = ("ids", "means", "quats", "scales", "opacities", "colors")
+        return replace(self, **{name: np.ascontiguousarray(getattr(self, name)[rows]) for name in names})
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,6 +28,9 @@ OUTLIER_BOX = 10.0  # times that box: what lies beyond is far from the scene
 NEIGHBORS = 8  # nearest Gaussians, of which a floater touches none
 TOUCH = 3.0  # Gaussians touch within so many of their largest scales together
 APART = 3.0  # times the median distance of nearest Gaussians: a floater's own is larger
+# Second and largest scale, as shares of half the diagonal of the scene's box, from which on a Gaussian hangs across the
+# scene if it is also so many times as large as the median one. Exports, and results without a fit, have none
+CURTAIN, WIDER = (0.1, 0.33), 8.0
 MAX_SAMPLES = 200_000  # Gaussians that a share is estimated from
 MAX_BUILDS, SURPLUS = 3, 1.05  # tries to meet a count; more than it by so much at first
 CROP = "sphere:x,y,z,radius or box:x0,y0,z0,x1,y1,z1"
@@ -45,7 +48,8 @@ class CleanOptions:
     Args:
         crop: Keep the Gaussians whose centre is inside: ``"sphere:x,y,z,radius"`` or ``"box:x0,y0,z0,x1,y1,z1"``, in
             the scene's world units; None: all.
-        drop_floaters: Leave out Gaussians that are isolated or far beyond the scene, see :func:`floaters`.
+        drop_floaters: Leave out Gaussians that are isolated, far beyond the scene, or hang across it, see
+            :func:`floaters`.
         drop_sky: Leave out Gaussians that are sky in the photos, see :func:`gsmerge.stages.sky.sky`.
 
     Raises:
@@ -108,11 +112,11 @@ def beyond_scene(means: np.ndarray, samples: np.ndarray | None = None) -> np.nda
 
 
 def floaters(gaussians: Gaussians, rows: np.ndarray | None = None) -> np.ndarray:
-    """Return a mask ``[n]`` of finite Gaussians that are isolated, or far beyond the scene.
+    """Return a mask ``[n]`` of finite Gaussians that are isolated, far beyond the scene, or hang across it.
 
     Isolated: none of the eight nearest is within three times the largest scales of both, and the
     nearest is more than three times as far as the median Gaussian's. Far beyond:
-    :func:`beyond_scene`. ``rows [m]``: only these.
+    :func:`beyond_scene`. Across: :func:`curtains`. ``rows [m]``: only these.
     """
     rows = np.arange(len(gaussians)) if rows is None else rows
     means, sizes = gaussians.means.astype(np.float64), gaussians.scales.max(1).astype(np.float64)
@@ -125,7 +129,16 @@ def floaters(gaussians: Gaussians, rows: np.ndarray | None = None) -> np.ndarray
     distances, ids = distances[:, 1:], ids[:, 1:]  # the first is the Gaussian itself
     touched = (distances <= TOUCH * (sizes[rows][:, None] + sizes[ids])).any(1)
     apart = distances[:, 0] > APART * np.median(distances[:, 0])
-    return np.asarray(~touched & apart) | beyond_scene(means[rows], means)
+    return np.asarray(~touched & apart) | beyond_scene(means[rows], means) | curtains(gaussians, rows)
+
+
+def curtains(gaussians: Gaussians, rows: np.ndarray) -> np.ndarray:
+    """Return a mask ``[m]`` of Gaussians ``rows [m]`` that hang across the scene: as large as it, and unlike others."""
+    low, high = np.percentile(gaussians.means.astype(np.float64), BOX_QUANTILES, axis=0)
+    radius = np.sqrt(((high - low) ** 2).sum()) / 2
+    scales = np.sort(gaussians.scales, axis=1)[:, 1:]
+    wide = (scales[rows] > radius * np.array(CURTAIN)) & (scales[rows] > WIDER * np.median(scales, axis=0))
+    return np.asarray(wide.any(1))
 
 
 def floater_share(gaussians: Gaussians) -> float:

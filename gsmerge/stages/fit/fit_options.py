@@ -18,6 +18,7 @@ USUAL_SHARE = 0.044  # of Gaussians in the pixels, which half-size photos show w
 EARLIER = 0.1  # share of the steps by which half-size photos end sooner where larger ones follow
 HASTY_STEPS = 20  # shorter runs have no time for full-size photos
 GROW_STEPS = 150  # shorter runs do better when they begin with all that they may have
+HAZE = 0.05  # far fog above which a result gets a note: plain to see in a viewer
 NOT_A_SETTING = {"setting": False}  # of fields that a user does not set by name
 
 
@@ -54,6 +55,8 @@ class Tuning:
     # The same of the mean size, in units of each Gaussian's own at its start: fewer of them
     # overlap, and a step takes a third less time
     scale_reg: float = 0.01
+    outside_every: int = 4  # Steps from one look from outside to the next, see gsmerge.stages.fit.outside
+    outside_from: float = 0.35  # Share of the steps that come before them; what hangs in gaps early on helps the rest
     iterations: int = 6  # Conjugate-gradient steps of the colour fit
     prior_weight: float = 0.03  # Weight of the unfitted colours, relative to visibility
     huber: float = 0.2  # Colour error beyond which a pixel counts less in the colour fit
@@ -167,6 +170,8 @@ class FitReport:
     holdout_after: float  # The same after it
     stopped: str  # Why it ended
     viewmats: np.ndarray | None = None  # [v,4,4] poses after the fit; None: fixed
+    # Mean opacity of the result, in [0, 1], seen from outside where the start shows nothing; None: it fills every view
+    fog: float | None = None
     device: str = "cpu"  # Where it ran: `"cpu"` or `"cuda"`
     # [n] row of the start that each Gaussian comes from; None: not known
     origins: np.ndarray | None = field(default=None, compare=False)
@@ -190,6 +195,9 @@ def record_fit(report: FitReport | None) -> None:
     if report is None:
         return
     choose(fit=report.to_dict())
+    if report.fog is not None and report.fog > HAZE:
+        seen = f"seen from outside, the result shows haze where the scene is empty: fog {report.fog:.2f}"
+        note(f"{seen}; --fit none makes none")
     if not report.accepted:
         note("the fit was not accepted: held-out parts of the photos did not get better")
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmerge.geometry import quat_to_rotmat
+from gsmerge.geometry import lower_median, quat_to_rotmat
 from gsmerge.kernels.elementary import exp, log, power
 from gsmerge.kernels.gaussians.optimise import COLOR, COLUMNS, LOGIT, QUAT, SIZE
 from gsmerge.render import Splats, composite, plan_view, splat_adjoint
@@ -15,6 +15,7 @@ from gsmerge.runtime.threads import in_turn
 from gsmerge.types import SH_C0, Gaussians
 
 OFFSET = 0.7  # of the halves from the middle, in standard deviations; their own shrinks so that the sum keeps its own
+FADED = 0.005  # opacity that is as good as none; halves of what has more have at least 1 / 255, which renderers draw
 DEPTH = 0.8  # of the halves' optical depth: two narrower ones with 0.7 would cover the same, a little more closes gaps
 
 
@@ -32,6 +33,13 @@ class State:
     origins: np.ndarray  # [n] row of the start that each comes from
     splats: Splats  # Means, quaternions, scales and opacities as the rasterizer takes them
     colors: np.ndarray  # [n,3] base colours
+
+    def __getitem__(self, rows: np.ndarray) -> State:
+        """Return the state of some Gaussians, by mask or by row."""
+        kept = state_of(self.x[rows], self.splats.shN[rows])
+        for name in ("x0", "m", "v", "units", "box_shares", "min_sizes", "origins"):
+            setattr(kept, name, getattr(self, name)[rows])
+        return kept
 
     def view_colors(self) -> np.ndarray | None:
         """Return the colours for the rasterizer; None after updating the harmonics that it shall use instead."""
@@ -99,8 +107,9 @@ def error_masses(state: State, photos: Photos) -> np.ndarray:
 
 
 def grow_to(state: State, photos: Photos, count: int) -> State:
-    """Call :func:`grow` until there are ``count`` Gaussians or nothing that the photos show is left to halve."""
-    before = 0
+    """Leave out what has faded, and halve others until there are ``count`` or nothing that photos show is left."""
+    before, opacities = 0, state.splats.opacities
+    state = state[opacities >= min(FADED, float(lower_median(opacities)))]  # of a faint scene most stay
     while before < len(state.x) < count:
         before, state = len(state.x), grow(state, photos, count)
     return state

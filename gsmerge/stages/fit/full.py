@@ -28,6 +28,7 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.fit.fit_options import EARLIER, LONG_STEPS, FitOptions, FitReport, Tuning
 from gsmerge.stages.fit.fit_state import State, gaussians_of, grow_to, start_state
 from gsmerge.stages.fit.loss import image_gradient
+from gsmerge.stages.fit.outside import fog_gradients
 from gsmerge.stages.fit.photo_sizes import HIDDEN, holdout_psnr, reduced, training_weights
 from gsmerge.stages.fit.survey import Survey, survey_photos
 from gsmerge.types import Array, Gaussians
@@ -83,6 +84,14 @@ class FitPlan:
     half_part: float  # Share of the steps, the first ones, on half-size photos
     poses: PoseState | None = None  # The motions of the cameras; None where they are fixed
     fixed: np.ndarray | None = None  # [n] bool, Gaussians that stay as they are; None: none
+    outside: Photos | None = None  # Views whose weights say where the start is empty; None: none
+
+    def outside_view(self, step: int, progress: float) -> int | None:
+        """Return the view from outside that is looked at after a step, from 1; None: none."""
+        rates = self.options.tuning
+        if self.outside is None or progress < rates.outside_from or step % rates.outside_every:
+            return None
+        return step // rates.outside_every % len(self.outside)
 
     def look_at(self, step: int, progress: float) -> Look:
         """Return how a step looks at the scene.
@@ -150,8 +159,21 @@ def fit_step(state: State, plan: FitPlan, view: int, step: int, progress: float,
     if plan.poses is not None and g.viewmat is not None:  # that harmonics change with the camera is left out
         plan.poses.step(view, g.viewmat, rates, progress)
     if plan.fixed is not None:
-        g = _take(g, ~plan.fixed[g.ids])
-    s, count = state.splats, max(len(state.x), 1)
+        g = g[~plan.fixed[g.ids]]
+    move(state, plan, g, step, progress)
+    return error / max(3 * float(weight.sum()), 1)
+
+
+def clear_fog(state: State, plan: FitPlan, view: int, step: int, progress: float) -> None:
+    """Take one Adam step against what shows in a view from outside where the start shows nothing."""
+    assert plan.outside is not None
+    g = fog_gradients(state.splats, plan.outside, view)
+    move(state, plan, g if plan.fixed is None else g[~plan.fixed[g.ids]], step, progress)
+
+
+def move(state: State, plan: FitPlan, g: Gradients, step: int, progress: float) -> None:
+    """Take one Adam step along gradients."""
+    s, rates, count = state.splats, plan.options.tuning, max(len(state.x), 1)
     steps = step_sizes(rates, progress, plan.options.steps)
     limits = np.array([rates.max_mean_shift, rates.max_scale_change, rates.max_opacity_change], np.float32)
     betas = np.array([rates.beta1, rates.beta2], np.float32)
@@ -166,12 +188,6 @@ def fit_step(state: State, plan: FitPlan, view: int, step: int, progress: float,
         )  # fmt: skip
 
     parallel_map(update, range(0, len(g.ids), ROWS))
-    return error / max(3 * float(weight.sum()), 1)
-
-
-def _take(g: Gradients, rows: np.ndarray) -> Gradients:
-    names = ("ids", "means", "quats", "scales", "opacities", "colors")
-    return replace(g, **{name: np.ascontiguousarray(getattr(g, name)[rows]) for name in names})
 
 
 def loss_weights(rates: Tuning, progress: float) -> tuple[float, float]:
@@ -257,6 +273,7 @@ def fit_full(
     baseline_start: Gaussians | None = None,
     look: Survey | None = None,
     fixed: np.ndarray | None = None,
+    outside: Photos | None = None,
 ) -> tuple[Gaussians, FitReport]:
     """Fit all parameters to the photos.
 
@@ -267,10 +284,12 @@ def fit_full(
     ``photos`` come at full and at half size, and larger if the fit is to see them. ``count``:
     number of Gaussians to grow to, where the run is long enough. ``baseline_start``: another start that the fit
     may beat instead, see :func:`judge`. ``look``: a survey of the Gaussians, where there is
-    one already. ``progress`` is called after every step.
+    one already. ``fixed [n]``: Gaussians that stay as they are. ``outside``: views in which some
+    steps look for fog, see :func:`gsmerge.stages.fit.outside.outside_views`. ``progress`` is
+    called after every step.
     """
     rng, state, plan = np.random.default_rng(seed), start_state(gaussians), plan_run(photos, options, seed)
-    plan = replace(plan, fixed=fixed)
+    plan = replace(plan, fixed=fixed, outside=outside)
     tail = TailMean()
     look = survey_photos(gaussians, photos) if look is None else look
     own, state.box_shares[:], state.min_sizes[:] = initial_scores(look, plan)
@@ -290,6 +309,9 @@ def fit_full(
             queue = rng.permutation(len(photos[0])).tolist()
         error += (fit_step(state, plan, queue.pop(), step + 1, part, rng) - error) / min(step + 1, 10)
         step += 1
+        outside_view = plan.outside_view(step, part)
+        if outside_view is not None:
+            clear_fog(state, plan, outside_view, step, part)
         if step > steps * (1 - options.tuning.average_share):
             tail.add(state.x)
         if options.time_budget is not None and step == PROBE:

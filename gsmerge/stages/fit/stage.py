@@ -17,6 +17,7 @@ from gsmerge.stages.fit.color import draw, fit_colors
 from gsmerge.stages.fit.fit_options import FitOptions, FitReport, Fitted, record_fit, report_steps
 from gsmerge.stages.fit.fit_state import gaussians_of, grow_to, start_state
 from gsmerge.stages.fit.full import Progress, fit_full
+from gsmerge.stages.fit.outside import measure_fog, outside_views
 from gsmerge.stages.fit.photo_sizes import fit_photos
 from gsmerge.stages.fit.survey import Survey, survey_photos
 from gsmerge.types import Array, Gaussians, Scene, as_array
@@ -138,12 +139,16 @@ def fit(
     if not options.needs_photos:  # it costs as much as all that was done before
         return gaussians, None
 
+    outside = None if options.fit == "none" else outside_views(prepare(gaussians), photos[1], options)
+
     def fit_on(chosen: FitBackend[Any]) -> tuple[Gaussians, FitReport | None]:
         start = chosen.upload(gaussians)
         other = None if baseline_start is None else chosen.upload(baseline_start)
         sizes = tuple(chosen.upload_photos(one_size) for one_size in photos)
-        fitted, report = _choose_fit(chosen, start, sizes, options, count, seed, progress, other, fixed)
-        return chosen.download(fitted), report and replace(report, device=chosen.device)
+        fitted, report = _choose_fit(chosen, start, sizes, options, count, seed, progress, other, fixed, outside)
+        fitted = chosen.download(fitted)
+        fog = None if report is None or outside is None else measure_fog(prepare(fitted), outside)
+        return fitted, report and replace(report, device=chosen.device, fog=fog)
 
     on_cpu = len(photos) > 2 or options.move_cameras or fixed is not None  # what only the CPU's fit can do
     return run_on(ON_CPU if on_cpu else backend, "fit", fit_on)
@@ -190,6 +195,7 @@ def _choose_fit(
     progress: Progress | None,
     baseline_start: Gaussians | None,
     fixed: np.ndarray | None,
+    outside: Photos | None,
 ) -> tuple[Gaussians, FitReport | None]:
     """Run :func:`fit` on a back end, with Gaussians and photos of its own."""
     full, half = photos[:2]
@@ -199,7 +205,7 @@ def _choose_fit(
         return kept, None
     fitted, report = backend.fit_full(
         kept, photos, options, count, seed, progress, baseline_start=baseline_start, look=look,
-        fixed=None if fixed is None else fixed[rows],
+        fixed=None if fixed is None else fixed[rows], outside=outside,
     )  # fmt: skip
     fitted, report = _better_of(backend, full, kept, fitted, report, CLOSE)
     if report.accepted:

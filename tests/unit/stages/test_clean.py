@@ -79,6 +79,16 @@ def test_floaters_are_alone_or_far_away(scene: Scene) -> None:
     assert (len(left), counts) == (1589, {"cropped": 10, "floaters": 1})
 
 
+def test_curtains_are_floaters() -> None:
+    """The wall's half diagonal is 29: a tenth of it across two axes is a sheet, a third along one a streak."""
+    given = wall()
+    scales = given.scales.copy()
+    scales[7], scales[8] = (0.01, 5, 5), (0.01, 0.5, 12)
+    scales[9], scales[10] = (2, 2, 9), (0.5, 0.5, 3)  # long or wide, but within measure
+    assert np.flatnonzero(floaters(replace(given, scales=scales))).tolist() == [7, 8]
+    assert not floaters(replace(given, scales=np.full_like(scales, 12))).any()  # all alike
+
+
 def test_the_faintest_go_first() -> None:
     given = wall(3)
     opacities = np.array([5, 1, 8, 2, 7, 3, 9, 4, 6], np.float32) / 10

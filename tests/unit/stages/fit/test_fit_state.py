@@ -13,7 +13,7 @@ from gsmerge.geometry import covariances
 from gsmerge.kernels.gaussians.optimise import COLOR, COLUMNS, LOGIT, QUAT, SIZE
 from gsmerge.render.metrics import psnr
 from gsmerge.render.photos import Photos, scene_photos
-from gsmerge.stages.fit.fit_state import State, error_masses, gaussians_of, grow, start_state
+from gsmerge.stages.fit.fit_state import FADED, State, error_masses, gaussians_of, grow, grow_to, start_state
 from gsmerge.stages.fit.photo_sizes import holdout_psnr, reduced, training_weights
 
 
@@ -251,3 +251,32 @@ def test_holdout_psnr_sets_exposure_aside(photos: Photos) -> None:
     assert holdout_psnr(images, halved, weights, 1.15) > 60
     assert holdout_psnr(images, halved, weights, np.inf) < 40
     assert holdout_psnr(images, photos, weights, 1.15) < 15
+
+
+# what has faded
+
+
+def test_growth_spends_the_count_on_what_can_be_seen(gaussians: Gaussians, photos: Photos) -> None:
+    opacities = gaussians.opacities.clip(0.3, 0.9)
+    opacities[::7] = 0.0041
+    state = start_state(replace(gaussians, opacities=opacities))
+    grown = grow_to(state, photos, len(gaussians) + 9)
+    assert len(grown.x) == len(gaussians) + 9
+    assert not np.isin(grown.origins, np.arange(len(gaussians))[::7]).any()
+    assert grown.splats.opacities.min() > FADED
+    rows = used(gaussians)[np.array([4, 2])]
+    for name in ("x", "x0", "m", "v", "units", "box_shares", "min_sizes"):
+        np.testing.assert_array_equal(getattr(rows, name), getattr(used(gaussians), name)[[4, 2]])
+    assert rows.origins.tolist() == [4, 2]
+
+
+def test_halves_of_what_has_not_faded_are_drawn(gaussians: Gaussians, photos: Photos) -> None:
+    faint = start_state(replace(gaussians, opacities=np.full_like(gaussians.opacities, FADED * 1.0001)))
+    grown = grow(faint, photos, 2 * len(gaussians))
+    assert len(grown.x) > len(gaussians)
+    assert grown.splats.opacities.min() >= 1 / 255
+
+
+def test_a_faint_scene_does_not_fade_away(gaussians: Gaussians, photos: Photos) -> None:
+    faint = start_state(replace(gaussians, opacities=np.full_like(gaussians.opacities, 0.0045)))
+    assert len(grow_to(faint, photos, len(gaussians)).x) == len(gaussians)
