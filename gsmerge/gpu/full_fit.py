@@ -276,7 +276,7 @@ def fit_full(
         why = f"held-out parts of the photos were no better after {run.step} steps"
         rows = np.arange(len(gaussians))
         return gaussians, FitReport("none", False, run.step, before, after, why, origins=rows)
-    if options.grows:  # a time budget may end before the growth
+    if options.grows and len(run.state) < count:  # a time budget may end before the growth
         run.state = grow_to(run.state, half, count)
     why = "time budget spent" if options.time_budget is not None else "all steps done"
     fitted = gaussians_of(run.tail.of(run.state.x), run.state.shN)

@@ -47,6 +47,7 @@ FOLLOWS, OPPOSED = 0.5, -0.6
 # Distance of a gain from the mean of its two nearest views', as a share of what random gains have: 0.71 to 1.22 with
 # gains of 0.5 to 2, 0.19 to 0.57 where exposure drifts and compensation loses 1.7 dB or more; 0.67 of four in a row.
 UNEXPECTED = 0.69
+COARSE = 4  # pixels per side of those that one says the brightness of
 BRIGHT = 1.15  # gain from which on clipped pixels no longer count
 NEIGHBOURS = 8  # views in which the surfaces of clipped pixels are looked up
 
@@ -95,8 +96,8 @@ def equalise_exposure(scene: Scene, views: Sequence[int], exposure: Exposure) ->
 def _find_objection(scene: Scene, views: Sequence[int], pairs: Sequence[_Pair], gains: np.ndarray) -> str:
     """Say why photos are better left as they are; an empty text where they are not."""
     assert scene.images is not None
-    own, chosen = gains[list(views)], scene.images[list(views)]
-    brightness = log(np.maximum(chosen.mean((1, 2), dtype=np.float64), 1 / 255))
+    own, some = gains[list(views)], [scene.images[view][::COARSE, ::COARSE] for view in views]
+    brightness = log(np.maximum([photo.mean((0, 1), dtype=np.float64) for photo in some], 1 / 255))
     if share_left(pairs, gains) > NEARER:
         return "other exposures do not bring the colours of the same surfaces clearly nearer"
     if is_metered(brightness, own):

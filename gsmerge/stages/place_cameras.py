@@ -30,9 +30,11 @@ ENOUGH = 1.0  # pixels of blending weight at which a Gaussian counts as seen
 def add_views(scene: Scene) -> Scene:
     """Keep the finite Gaussians, at least one, and place cameras where there are none; a note says what was done."""
     g = scene.gaussians
-    finite = np.isfinite(g.opacities)
-    for array in (g.means, g.quats, g.scales, g.sh0, g.shN):
-        finite &= np.isfinite(array).all(tuple(range(1, array.ndim)))
+    finite = np.ones(len(g), bool)
+    for array in vars(g).values():
+        each = np.isfinite(array)
+        if not each.all():  # seldom, and row by row it takes ten times as long
+            finite &= each.reshape(len(g), -1).all(1)
     count = int((~finite).sum())
     if count == len(g):
         raise ValueError("expected at least one finite Gaussian, got none")

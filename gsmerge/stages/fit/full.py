@@ -323,7 +323,7 @@ def fit_full(
     if options.judged and after <= before:
         why = f"held-out parts of the photos were no better after {step} steps"
         return gaussians, FitReport("none", False, step, before, after, why, origins=np.arange(len(gaussians)))
-    if grows:  # a time budget may end before the growth
+    if grows and len(state.x) < count:  # a time budget may end before the growth
         state = grow_to(state, plan.photos[1], count)
     why = "time budget spent" if options.time_budget is not None else "all steps done"
     viewmats = None if plan.poses is None else plan.poses.viewmats

@@ -28,7 +28,8 @@ BACK = (0.4, 1.6)  # least and largest step back, as shares of the depth of what
 AZIMUTH, ELEVATION = 35.0, 25.0  # largest turns about its middle, to the sides and up or down, degrees
 # Steps of three numbers, modulo one, that fill a cube evenly however many there are (the R sequence of Roberts 2018)
 EVEN = np.array([0.8191725134, 0.6710436067, 0.5497004779])
-PLACES = 6  # views outside, at most, for each photo
+PLACES = 24  # views outside, at most, or as many as there are photos
+SAMPLE = 2000  # Gaussians that say how far away the middle of a view lies
 EMPTY = 0.05  # opacity of the start below which a pixel is empty
 # Distance from what the start shows, as a share of the width, within which nothing is asked: what stands beside the
 # outline fills what the foreground uncovers in new views
@@ -46,7 +47,7 @@ def outside_views(start: Splats, photos: Photos, options: FitOptions) -> Photos 
     """
     cameras = Cameras(photos.viewmats, photos.Ks, photos.width, photos.height)
     looks = math.ceil(options.steps * (1 - options.tuning.outside_from) / options.tuning.outside_every)
-    views = blank_photos(_place_cameras(start.means, cameras, min(looks, PLACES * len(photos))), 2)
+    views = blank_photos(_place_cameras(start.means, cameras, min(looks, max(PLACES, len(photos)))), 2)
 
     def mark(view: int) -> np.ndarray:
         return mark_empty(1 - _blend_black(start, views, view)[1])
@@ -58,7 +59,8 @@ def outside_views(start: Splats, photos: Photos, options: FitOptions) -> Photos 
 
 def _place_cameras(means: np.ndarray, cameras: Cameras, count: int) -> Cameras:
     """Step back from what the cameras see of means ``[n,3]``, one after the other, and turn about its middle."""
-    depths = [middle_depth(means, cameras[[view]]) for view in range(min(count, len(cameras)))]
+    some = means[:: max(1, len(means) // SAMPLE)]
+    depths = [middle_depth(some, cameras[[view]]) for view in range(min(count, len(cameras)))]
     views, viewmats = [number % len(cameras) for number in range(count)], []
     for number, view in enumerate(views):
         share, across, along = (0.5 + number * EVEN) % 1
