@@ -149,7 +149,9 @@ def error_masses(state: FitState, photos: DevicePhotos) -> Tensor:
 
 def grow_to(state: FitState, photos: DevicePhotos, count: int) -> FitState:
     """Leave out what has faded and halve others, see :func:`gsmerge.stages.fit.fit_state.grow_to`."""
-    before, state = 0, state[state.opacities >= state.opacities.median().clamp_max(FADED)]
+    before = 0
+    if len(state):
+        state = state[state.opacities >= state.opacities.median().clamp_max(FADED)]
     while before < len(state) < count:
         before, state = len(state), grow(state, photos, count)
     return state

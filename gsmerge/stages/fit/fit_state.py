@@ -109,7 +109,8 @@ def error_masses(state: State, photos: Photos) -> np.ndarray:
 def grow_to(state: State, photos: Photos, count: int) -> State:
     """Leave out what has faded, and halve others until there are ``count`` or nothing that photos show is left."""
     before, opacities = 0, state.splats.opacities
-    state = state[opacities >= min(FADED, float(lower_median(opacities)))]  # of a faint scene most stay
+    if len(opacities):
+        state = state[opacities >= min(FADED, float(lower_median(opacities)))]  # of a faint scene most stay
     while before < len(state.x) < count:
         before, state = len(state.x), grow(state, photos, count)
     return state

@@ -34,27 +34,36 @@ EMPTY = 0.05  # opacity of the start below which a pixel is empty
 # Distance from what the start shows, as a share of the width, within which nothing is asked: what stands beside the
 # outline fills what the foreground uncovers in new views
 RIM = 0.08
+# Gaussians of the start for each photo from which on fog weighs as much as errors of the photos: fewer and larger ones
+# reach from the borders of photos into what is empty, and would leave both. LIGHT is the least weight
+MANY, LIGHT = 1000, 0.15
+LEAST_WIDTH = 64  # pixels of the pictures
 LEAST = 0.005  # share of a picture that must be empty for it to count
 TOUCHED = 1e-9  # gradient of the opacity from which on a Gaussian takes part in a step
 SCORED = 12  # views, at most, that the fog of a result is measured in
 
 
 def outside_views(start: Splats, photos: Photos, options: FitOptions) -> Photos | None:
-    """Place the views of a fit outside; their weights are 1 on pixels where the start shows nothing, 0 elsewhere.
+    """Place the views of a fit outside; their weights are above 0 on pixels where the start shows nothing.
 
     The pictures are black, and half as large as the ``photos`` from whose cameras they step back. None where the start
     fills all of them.
     """
+    if len(start) == 0 or len(photos) == 0:
+        return None
     cameras = Cameras(photos.viewmats, photos.Ks, photos.width, photos.height)
     looks = math.ceil(options.steps * (1 - options.tuning.outside_from) / options.tuning.outside_every)
-    views = blank_photos(_place_cameras(start.means, cameras, min(looks, max(PLACES, len(photos)))), 2)
+    views = blank_photos(
+        _place_cameras(start.means, cameras, min(looks, max(PLACES, len(photos)))), min(2, photos.width / LEAST_WIDTH)
+    )
 
     def mark(view: int) -> np.ndarray:
         return mark_empty(1 - _blend_black(start, views, view)[1])
 
     marks = list(in_turn(mark, range(len(views))))
     kept = [view for view, empty in enumerate(marks) if empty.mean() > LEAST]
-    return replace(views[kept], weights=np.stack([marks[view] for view in kept]).astype(np.float32)) if kept else None
+    weight = np.float32(np.clip(len(start) / (MANY * len(photos)), LIGHT, 1.0))
+    return replace(views[kept], weights=weight * np.stack([marks[view] for view in kept])) if kept else None
 
 
 def _place_cameras(means: np.ndarray, cameras: Cameras, count: int) -> Cameras:

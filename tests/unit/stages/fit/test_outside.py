@@ -16,7 +16,15 @@ from gsmerge.runtime.record import record_run
 from gsmerge.stages.fit import FitOptions, fit
 from gsmerge.stages.fit.fit_options import HAZE, record_fit
 from gsmerge.stages.fit.full import fit_full
-from gsmerge.stages.fit.outside import RIM, fog_gradients, mark_empty, measure_fog, outside_views
+from gsmerge.stages.fit.outside import (
+    LEAST_WIDTH,
+    LIGHT,
+    RIM,
+    fog_gradients,
+    mark_empty,
+    measure_fog,
+    outside_views,
+)
 
 Pair = tuple[Photos, Photos]
 OPTIONS = FitOptions(fit_steps=60, holdout=0.2)
@@ -43,8 +51,7 @@ def with_curtain(gaussians: Gaussians, opacity: float = 0.8) -> Gaussians:
 def test_a_rim_beside_what_is_shown_does_not_count() -> None:
     opacities = np.zeros((40, 100), np.float32)
     opacities[:, :10] = 0.06
-    rim = round(100 * RIM)
-    assert mark_empty(opacities)[20].tolist() == [column >= 10 + rim for column in range(100)]
+    assert mark_empty(opacities)[20].tolist() == [column >= 10 + round(100 * RIM) for column in range(100)]
     assert mark_empty(np.zeros((3, 4), np.float32)).all()
     assert not mark_empty(np.full((3, 4), 0.5, np.float32)).any()
 
@@ -52,7 +59,8 @@ def test_a_rim_beside_what_is_shown_does_not_count() -> None:
 def test_views_stand_behind_and_around(outside: Photos, truth: Gaussians, photos: Pair) -> None:
     """Each looks at the middle of what its photo sees, from no nearer than the photo's camera."""
     assert outside.weights is not None
-    assert outside.weights.shape == (len(outside), photos[1].height // 2, photos[1].width // 2)
+    assert outside.weights.shape == (len(outside), LEAST_WIDTH * photos[1].height // photos[1].width, LEAST_WIDTH)
+    assert np.unique(outside.weights).tolist() == [0, np.float32(LIGHT)]
     eyes, own = camera_centres(outside.viewmats), camera_centres(photos[1].viewmats)
     assert np.linalg.norm(eyes - truth.means.mean(0), axis=1).min() > 0.8 * np.linalg.norm(own, axis=1).min()
     assert len(np.unique(outside.viewmats.round(6), axis=0)) == len(outside)
@@ -93,7 +101,8 @@ def test_a_fit_keeps_empty_what_its_start_has_empty(truth: Gaussians, photos: Pa
     wanted = with_curtain(truth, 0.3)
     shown = tuple(replace(some, images=np.stack(render_photos(wanted, some)).clip(0, 1)) for some in photos)
     start = scenes.spoil(truth)
-    fitted, without = fit_full(start, shown, LONG, outside=outside)[0], fit_full(start, shown, LONG)[0]
+    whole = replace(outside, weights=np.sign(outside.weights))
+    fitted, without = fit_full(start, shown, LONG, outside=whole)[0], fit_full(start, shown, LONG)[0]
     kept, grown = measure_fog(prepare(fitted), outside), measure_fog(prepare(without), outside)
     assert kept < 0.02
     assert grown > 4 * kept
