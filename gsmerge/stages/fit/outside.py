@@ -1,8 +1,7 @@
 """Views from outside of the capture, in which a fit keeps empty what its start shows as empty.
 
-Photos say nothing of what hangs in gaps between them, and a fit fills these gaps with large Gaussians: fog, for who
-steps back. So in the second half of a run some steps look from behind, beside, above and below, at the opacity alone.
-A rim about the start's outline is left alone: what stands there fills what the foreground uncovers in new views.
+Photos say nothing of what hangs in gaps between them, and a fit fills these gaps with large Gaussians: fog, for whom
+steps back. So after a third of a run some steps look from behind and beside, above and below, at opacities alone.
 """
 
 from __future__ import annotations
@@ -24,8 +23,9 @@ from gsmerge.runtime.threads import in_turn
 from gsmerge.stages.fit.fit_options import FitOptions
 from gsmerge.types import Cameras
 
-BACK = (0.4, 1.6)  # least and largest step back, as shares of the depth of what a view sees
-AZIMUTH, ELEVATION = 35.0, 25.0  # largest turns about its middle, to the sides and up or down, degrees
+# Least and largest step back, as a share of the depth of what a view sees, and turns about its middle to the sides, and
+# up or down, degrees. Cameras that turn without a step back see what new views see, and would cost them their fill
+LOW, HIGH = np.array([0.4, -35.0, -25.0]), np.array([1.6, 35.0, 25.0])
 # Steps of three numbers, modulo one, that fill a cube evenly however many there are (the R sequence of Roberts 2018)
 EVEN = np.array([0.8191725134, 0.6710436067, 0.5497004779])
 PLACES = 24  # views outside, at most, or as many as there are photos
@@ -46,16 +46,16 @@ SCORED = 12  # views, at most, that the fog of a result is measured in
 def outside_views(start: Splats, photos: Photos, options: FitOptions) -> Photos | None:
     """Place the views of a fit outside; their weights are above 0 on pixels where the start shows nothing.
 
-    The pictures are black, and half as large as the ``photos`` from whose cameras they step back. None where the start
-    fills all of them.
+    They step back from the cameras of ``photos``, and are black and half as large, at least ``LEAST_WIDTH`` wide. None
+    where the start fills all of them.
     """
     if len(start) == 0 or len(photos) == 0:
         return None
     cameras = Cameras(photos.viewmats, photos.Ks, photos.width, photos.height)
     looks = math.ceil(options.steps * (1 - options.tuning.outside_from) / options.tuning.outside_every)
-    views = blank_photos(
-        _place_cameras(start.means, cameras, min(looks, max(PLACES, len(photos)))), min(2, photos.width / LEAST_WIDTH)
-    )
+    some = start.means[:: max(1, len(start) // SAMPLE)] + start.origin
+    placed = _place_cameras(some, cameras, min(looks, max(PLACES, len(photos))))
+    views = blank_photos(placed, min(2, photos.width / LEAST_WIDTH))
 
     def mark(view: int) -> np.ndarray:
         return mark_empty(1 - _blend_black(start, views, view)[1])
@@ -68,16 +68,10 @@ def outside_views(start: Splats, photos: Photos, options: FitOptions) -> Photos 
 
 def _place_cameras(means: np.ndarray, cameras: Cameras, count: int) -> Cameras:
     """Step back from what the cameras see of means ``[n,3]``, one after the other, and turn about its middle."""
-    some = means[:: max(1, len(means) // SAMPLE)]
-    depths = [middle_depth(some, cameras[[view]]) for view in range(min(count, len(cameras)))]
+    depths = [middle_depth(means, cameras[[view]]) for view in range(min(count, len(cameras)))]
     views, viewmats = [number % len(cameras) for number in range(count)], []
     for number, view in enumerate(views):
-        share, across, along = (0.5 + number * EVEN) % 1
-        back, azimuth, elevation = (
-            BACK[0] + share * (BACK[1] - BACK[0]),
-            (2 * across - 1) * AZIMUTH,
-            (2 * along - 1) * ELEVATION,
-        )
+        back, azimuth, elevation = LOW + (0.5 + number * EVEN) % 1 * (HIGH - LOW)
         viewmats.append(step_outside(cameras.viewmats[view], depths[view], back, azimuth, elevation))
     return replace(cameras, viewmats=np.stack(viewmats), Ks=cameras.Ks[views])
 
@@ -115,7 +109,7 @@ def fog_gradients(splats: Splats, views: Photos, view: int) -> Gradients:
     return g[np.flatnonzero(np.abs(g.opacities) > TOUCHED)]
 
 
-def measure_fog(splats: Splats, views: Photos) -> float:
+def score_fog(splats: Splats, views: Photos) -> float:
     """Measure the mean opacity, in [0, 1], of Gaussians where views have pixels that count, in some of the views."""
     assert views.weights is not None
     fog, count = 0.0, 0.0

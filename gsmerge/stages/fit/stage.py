@@ -17,7 +17,7 @@ from gsmerge.stages.fit.color import draw, fit_colors
 from gsmerge.stages.fit.fit_options import FitOptions, FitReport, Fitted, record_fit, report_steps
 from gsmerge.stages.fit.fit_state import gaussians_of, grow_to, start_state
 from gsmerge.stages.fit.full import Progress, fit_full
-from gsmerge.stages.fit.outside import measure_fog, outside_views
+from gsmerge.stages.fit.outside import outside_views, score_fog
 from gsmerge.stages.fit.photo_sizes import fit_photos
 from gsmerge.stages.fit.survey import Survey, survey_photos
 from gsmerge.types import Array, Gaussians, Scene, as_array
@@ -147,7 +147,7 @@ def fit(
         sizes = tuple(chosen.upload_photos(one_size) for one_size in photos)
         fitted, report = _choose_fit(chosen, start, sizes, options, count, seed, progress, other, fixed, outside)
         fitted = chosen.download(fitted)
-        fog = None if report is None or outside is None else measure_fog(prepare(fitted), outside)
+        fog = None if report is None or outside is None else score_fog(prepare(fitted), outside)
         return fitted, report and replace(report, device=chosen.device, fog=fog)
 
     on_cpu = len(photos) > 2 or options.move_cameras or fixed is not None  # what only the CPU's fit can do

@@ -22,8 +22,8 @@ from gsmerge.stages.fit.outside import (
     RIM,
     fog_gradients,
     mark_empty,
-    measure_fog,
     outside_views,
+    score_fog,
 )
 
 Pair = tuple[Photos, Photos]
@@ -90,9 +90,9 @@ def test_gradients_are_those_of_the_weighted_opacity(outside: Photos, truth: Gau
 
 
 def test_fog_is_the_opacity_far_outside(outside: Photos, truth: Gaussians) -> None:
-    assert measure_fog(prepare(truth), outside) == pytest.approx(0, abs=0.01)
-    thick = measure_fog(prepare(with_curtain(truth, 0.8)), outside)
-    thin = measure_fog(prepare(with_curtain(truth, 0.2)), outside)
+    assert score_fog(prepare(truth), outside) == pytest.approx(0, abs=0.01)
+    thick = score_fog(prepare(with_curtain(truth, 0.8)), outside)
+    thin = score_fog(prepare(with_curtain(truth, 0.2)), outside)
     assert 0.3 < 2 * thin < thick <= 0.81
 
 
@@ -103,7 +103,7 @@ def test_a_fit_keeps_empty_what_its_start_has_empty(truth: Gaussians, photos: Pa
     start = scenes.spoil(truth)
     whole = replace(outside, weights=np.sign(outside.weights))
     fitted, without = fit_full(start, shown, LONG, outside=whole)[0], fit_full(start, shown, LONG)[0]
-    kept, grown = measure_fog(prepare(fitted), outside), measure_fog(prepare(without), outside)
+    kept, grown = score_fog(prepare(fitted), outside), score_fog(prepare(without), outside)
     assert kept < 0.02
     assert grown > 4 * kept
 

@@ -15,7 +15,7 @@ from gsmerge.stages.fit import FitOptions, FitReport, fit, stage
 from gsmerge.stages.fit.color import draw, fit_colors
 from gsmerge.stages.fit.fit_state import start_state
 from gsmerge.stages.fit.full import fit_full
-from gsmerge.stages.fit.outside import measure_fog, outside_views
+from gsmerge.stages.fit.outside import outside_views, score_fog
 from gsmerge.stages.fit.stage import visible_mask
 from gsmerge.stages.fit.survey import survey_photos
 from gsmerge.types import SH_C0
@@ -31,7 +31,7 @@ def test_stage_takes_the_full_fit(truth: Gaussians, photos: Pair) -> None:
     outside = outside_views(prepare(start), photos[1], QUICK)
     assert outside is not None
     expected, own = fit_full(start, photos, QUICK, seed=4, outside=outside)
-    assert report == replace(own, fog=measure_fog(prepare(result), outside))
+    assert report == replace(own, fog=score_fog(prepare(result), outside))
     assert scenes.identical(result, expected)
 
 
