@@ -1,6 +1,6 @@
 """Views from outside of the capture, in which a fit keeps empty what its start shows as empty.
 
-Photos say nothing of what hangs in gaps between them, and a fit fills these gaps with large Gaussians: fog, for whom
+Photos say nothing of what hangs in gaps between them, and a fit fills these gaps with large Gaussians: fog, to whoever
 steps back. So after a third of a run some steps look from behind and beside, above and below, at opacities alone.
 """
 
