@@ -86,7 +86,6 @@ def test_no_fog_and_no_holes(name: str, floor: Callable[..., None]) -> None:
     result = scenes.compacted(scene)
     assert result.report.choices["fit"]["accepted"]
     fog = measure_fog(scene.gaussians, {"result": result.gaussians}, scene.cameras)["result"]["all"]
-    print(name, fog)
     assert fog.fog_far is not None
     assert fog.fog_far < HAZE
     assert fog.holes < 0.02
@@ -99,6 +98,5 @@ def test_every_effort_and_size(settings: dict[str, object]) -> None:
     scene = room()
     result = scenes.compacted(scene, **settings)
     fog = measure_fog(scene.gaussians, {"result": result.gaussians}, scene.cameras)["result"]["all"]
-    print(settings, fog)
     assert fog.fog_far < HAZE
     assert fog.holes < 0.02
