@@ -11,7 +11,7 @@ from pathlib import Path
 
 ROOT, TOOLS = Path(__file__).parent, Path(sys.executable).parent
 TASKS = {
-    "native": (("python", "gsmerge/native/build.py"),),
+    "native": (("python", "gsmerge/kernels/build.py"),),
     "tests": (("python", "-m", "pytest"),),
     "sweeps": (("python", "-m", "pytest", "-m", "slow"),),
     "lint": (("ruff", "check", "."), ("ruff", "format", "--check", ".")),

@@ -19,13 +19,13 @@ from quality import score
 from shared_scenes import export, read_held_out, scene_folders
 
 import gsmerge
+from gsmerge.facts.prepare import Frame, canonicalise
+from gsmerge.fit import FitOptions, fit
 from gsmerge.moments import Members, scene_members
-from gsmerge.render.photos import scene_photos
+from gsmerge.raster.photos import scene_photos
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.decode import DecodeOptions, decode, split_counts
 from gsmerge.stages.encode import encode
-from gsmerge.stages.fit import FitOptions, fit
-from gsmerge.stages.prepare import Frame, canonicalise
 from gsmerge.stages.region_tree import auto_count, cut_tree, pixel_depths, region_tree
 from gsmerge.stages.superpixels import SegmentOptions, segment
 from gsmerge.types import Gaussians, Groups, Scene

@@ -20,7 +20,8 @@ from quality import score
 from shared_scenes import Targets, exporter, read_held_out, scene_folders
 
 import gsmerge
-from gsmerge.io import Recovery, SceneLoad, load_scene
+from gsmerge.alignment import Recovery
+from gsmerge.scene.read import SceneLoad, load_scene
 
 STYLES: dict[str, tuple[str, float]] = {
     "plain": ("plain", 1.0),

@@ -25,11 +25,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import torch
 
 from gsmerge import compact, plan, read_scene
-from gsmerge.gpu import cuda_problem
-from gsmerge.gpu.backend import make_backend
+from gsmerge.compaction.result import CompactResult
+from gsmerge.fit.gpu import cuda_problem
+from gsmerge.fit.gpu.backend import make_backend
 from gsmerge.measure.evaluate import near_plane
 from gsmerge.measure.speed import measure_costs
-from gsmerge.result import CompactResult
 from gsmerge.runtime.threads import available_threads
 from gsmerge.types import Scene
 

@@ -15,10 +15,10 @@ from quality import score
 from shared_scenes import Targets, export, read_held_out, scene_folders
 
 import gsmerge
+from gsmerge.alignment.registration.join import join_scenes
+from gsmerge.facts.views import subset
 from gsmerge.geometry import camera_centres, multiply_quats, rotmat_to_quat
-from gsmerge.io.registration.join import join_scenes
 from gsmerge.types import Cameras
-from gsmerge.views import subset
 
 LOW, HIGH = 0.8, 1.25  # by which the unit of each file is multiplied
 

@@ -25,13 +25,13 @@ from typing import Any
 from shared_scenes import LEFT_OUT, export, read_held_out, scene_folders
 
 import gsmerge
+from gsmerge.facts.views import even_views, subset
 from gsmerge.measure.evaluate import EvaluateOptions, evaluate
 from gsmerge.networks.checkpoint import SHIPPED, load_checkpoint, save_checkpoint
 from gsmerge.networks.options import SLOTS
 from gsmerge.research.charts.lines import Interval, mean_interval, paired_difference
 from gsmerge.stages.clean import faintest_dropped
 from gsmerge.types import Views
-from gsmerge.views import even_views, subset
 
 MEASURES = ("psnr", "ssim", "lpips_vgg")
 STAGES = ("encode", "match", "refine", "decode")  # that networks take part in

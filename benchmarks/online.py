@@ -27,7 +27,7 @@ from shared_scenes import Targets, export, exporter, read_held_out, scene_folder
 
 import gsmerge
 from gsmerge import Compactor
-from gsmerge.io import find_scene_files
+from gsmerge.scene.files import find_scene_files
 
 KS = (1, 2, 4)  # Gaussians of each group
 

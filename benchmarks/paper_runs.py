@@ -18,15 +18,17 @@ from networks import Store, silenced
 from shared_scenes import export
 
 import gsmerge
-from gsmerge.io import HeldOutViews, find_scene_files, load_files, read_held_out
+from gsmerge.facts.views import pick_views
 from gsmerge.io.formats.writing import file_bytes
 from gsmerge.measure.evaluate import EvaluateOptions, evaluate, near_plane
 from gsmerge.measure.lpips import lpips
 from gsmerge.measure.sizes import shrink_cameras, shrink_views
 from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.research.charts.measure_run import SCORING, choose_views
+from gsmerge.scene.files import find_scene_files
+from gsmerge.scene.held_out import HeldOutViews, read_held_out
+from gsmerge.scene.read import load_files
 from gsmerge.types import Cameras, Gaussians, Views
-from gsmerge.views import pick_views
 
 PHOTO_SIDE = 476  # pixels on the longer side, as in the paper
 LPIPS_VIEWS = 2

@@ -16,7 +16,7 @@ from shared_scenes import LEFT_OUT, Targets, exporter, read_held_out, scene_fold
 
 import gsmerge
 from gsmerge.measure.sizes import resize_mask, resize_photo, zoom_cameras
-from gsmerge.render.metrics import psnr, ssim
+from gsmerge.raster.metrics import psnr, ssim
 from gsmerge.types import Cameras, LargePhotos
 
 HALF = 2

@@ -26,7 +26,7 @@ from shared_scenes import Targets, exporter, read_held_out, scene_folders
 
 import gsmerge
 from gsmerge.measure.align import fit_colors
-from gsmerge.render.metrics import psnr
+from gsmerge.raster.metrics import psnr
 from gsmerge.types import Gaussians
 
 BAND = 0.3  # of the height

@@ -26,7 +26,7 @@ import gsmerge
 from gsmerge.measure.evaluate import near_plane
 from gsmerge.measure.fog import ALL, measure_fog
 from gsmerge.measure.lpips import INSTALL, lpips, lpips_available
-from gsmerge.render.metrics import psnr, ssim
+from gsmerge.raster.metrics import psnr, ssim
 from gsmerge.types import Gaussians, Scene
 
 LPIPS_VIEWS = 4  # at most this many target views of a scene, every second, third, ...

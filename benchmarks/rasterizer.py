@@ -32,10 +32,10 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 from gsmerge.kernels.raster.blend_backward import SUMS, blend_backward, gather_slots  # noqa: E402
-from gsmerge.render import composite, contributions, plan_view, prepare, splat_adjoint  # noqa: E402
-from gsmerge.render.composite import view_colors  # noqa: E402
-from gsmerge.render.gradient import color_gradients, gradients_of  # noqa: E402
-from gsmerge.render.metrics import psnr  # noqa: E402
+from gsmerge.raster import composite, contributions, plan_view, prepare, splat_adjoint  # noqa: E402
+from gsmerge.raster.composite import view_colors  # noqa: E402
+from gsmerge.raster.gradient import color_gradients, gradients_of  # noqa: E402
+from gsmerge.raster.metrics import psnr  # noqa: E402
 from gsmerge.runtime.threads import available_threads, use_threads  # noqa: E402
 from gsmerge.types import Gaussians  # noqa: E402
 

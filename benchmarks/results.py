@@ -24,8 +24,8 @@ from result_tables import SHARE, page_of
 from shared_scenes import exporter, scene_folders, shared_folder
 
 from gsmerge.cli import main as gsmerge
-from gsmerge.cli.chart_command import CHARTS
 from gsmerge.research.charts.measure_run import RunRecord, read_runs
+from gsmerge.research.commands.chart_command import CHARTS
 
 FAST_BASELINES = "random,opacity,contribution,blocks,voxel,moment-matching"
 NO_PROXIES = ("--proxy-views", "0")

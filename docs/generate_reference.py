@@ -135,10 +135,10 @@ def _cell(text: str | None) -> str:
 def _settings_page() -> str:
     from gsmerge.cli.parameters import HINTS, words_for
     from gsmerge.cli.paths import FileOptions
-    from gsmerge.io import ReadHints
     from gsmerge.io.formats.ply import OpacityChoice
     from gsmerge.online.options import OnlineOptions
     from gsmerge.options import CompactOptions
+    from gsmerge.scene.exporters import ReadHints
 
     stages = {f.name: f.default_factory for f in fields(CompactOptions) if isinstance(f.default_factory, type)}
     tables = {
@@ -168,8 +168,8 @@ def _settings_page() -> str:
 
 
 def _training_page() -> str:
-    from gsmerge.networks.modules import NetworkOptions
     from gsmerge.research.training import TrainOptions
+    from gsmerge.research.training.modules import NetworkOptions
 
     lines = [NOTICE, "", "# Settings of a training run", ""]
     lines += ["Keys of the TOML or JSON file that `gsmerge train --config` reads.", "", *_settings(TrainOptions)]
@@ -180,11 +180,11 @@ def _training_page() -> str:
 def _settings(options: Any, names: Sequence[str] | None = None) -> list[str]:
     """A table of a dataclass, or of some of its fields: name, default, values, and what its docstring says of it."""
     from gsmerge.cli.parameters import words_for
-    from gsmerge.options import DEVICES, EFFORTS, METHODS
+    from gsmerge.options import DEVICES, EFFORTS, method_names
     from gsmerge.stages.decode import K_RULES
     from gsmerge.stages.superpixels import SEGMENTATIONS
 
-    named = {"method": METHODS, "effort": EFFORTS, "device": DEVICES}
+    named = {"method": method_names(), "effort": EFFORTS, "device": DEVICES}
     named |= {"segmentation": SEGMENTATIONS, "k_rule": K_RULES}
     arguments = (options.__doc__ or "").partition("Args:")[2].partition("Raises:")[0]
     described = dict(re.findall(r"^ {8}(\w+): (.*?)(?=^ {8}\w+: |\Z)", arguments, re.DOTALL | re.MULTILINE))

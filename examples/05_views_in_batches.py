@@ -9,7 +9,7 @@ import argparse
 from pathlib import Path
 
 import gsmerge
-from gsmerge.views import subset
+from gsmerge.facts.views import subset
 
 
 def main() -> None:

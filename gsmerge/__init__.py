@@ -11,13 +11,15 @@ Everything public is here and loads at first use, so that importing the package 
 
 from __future__ import annotations
 
-import sys
 from importlib import import_module
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gsmerge import integrations as integrations
+    from gsmerge.compaction.compact import compact as compact
+    from gsmerge.compaction.result import CompactReport as CompactReport
+    from gsmerge.compaction.result import CompactResult as CompactResult
+    from gsmerge.compaction.tensors import compact_tensors as compact_tensors
     from gsmerge.encoded.encoded import Encoded as Encoded
     from gsmerge.encoded.gsm_file import load_encoded as load_encoded
     from gsmerge.encoded.gsm_file import save_encoded as save_encoded
@@ -25,11 +27,9 @@ if TYPE_CHECKING:
     from gsmerge.encoded.to_gaussians import decode_scene as decode_scene
     from gsmerge.errors import GsmergeError as GsmergeError
     from gsmerge.errors import SceneError as SceneError
-    from gsmerge.in_memory import compact_tensors as compact_tensors
     from gsmerge.io import read_cameras as read_cameras
     from gsmerge.io import read_gaussians as read_gaussians
     from gsmerge.io import read_ply as read_ply
-    from gsmerge.io import read_scene as read_scene
     from gsmerge.io import to_cameras as to_cameras
     from gsmerge.io import write_gaussians as write_gaussians
     from gsmerge.io import write_levels as write_levels
@@ -40,11 +40,9 @@ if TYPE_CHECKING:
     from gsmerge.measure.inspect import inspect as inspect
     from gsmerge.online.compactor import Compactor as Compactor
     from gsmerge.options import CompactOptions as CompactOptions
-    from gsmerge.pipeline import compact as compact
-    from gsmerge.render import Rendering as Rendering
-    from gsmerge.render import render as render
-    from gsmerge.result import CompactReport as CompactReport
-    from gsmerge.result import CompactResult as CompactResult
+    from gsmerge.raster import Rendering as Rendering
+    from gsmerge.raster import render as render
+    from gsmerge.scene.read import read_scene as read_scene
     from gsmerge.stages.superpixels import saliency as saliency
     from gsmerge.stages.superpixels import superpixels as superpixels
     from gsmerge.types import Cameras as Cameras
@@ -55,36 +53,28 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _PUBLIC = {
-    "errors": ("GsmergeError", "SceneError"),
-    "in_memory": ("compact_tensors",),
-    "measure.evaluate": ("EvaluateOptions", "Evaluation", "evaluate"),
-    "measure.inspect": ("inspect",),
-    "io": ("read_cameras", "read_gaussians", "read_ply", "read_scene", "to_cameras"),
-    "io.formats.writing": ("write_gaussians", "write_levels", "write_ply"),
-    "online.compactor": ("Compactor",),
-    "options": ("CompactOptions",),
-    "pipeline": ("compact",),
-    "render": ("Rendering", "render"),
-    "result": ("CompactReport", "CompactResult"),
-    "stages.superpixels": ("saliency", "superpixels"),
-    "encoded.to_gaussians": ("decode_scene",),
-    "encoded.to_encoded": ("encode_scene",),
+    "compaction.compact": ("compact",),
+    "compaction.result": ("CompactReport", "CompactResult"),
+    "compaction.tensors": ("compact_tensors",),
     "encoded.encoded": ("Encoded",),
     "encoded.gsm_file": ("load_encoded", "save_encoded"),
+    "encoded.to_encoded": ("encode_scene",),
+    "encoded.to_gaussians": ("decode_scene",),
+    "errors": ("GsmergeError", "SceneError"),
+    "io": ("read_cameras", "read_gaussians", "read_ply", "to_cameras"),
+    "io.formats.writing": ("write_gaussians", "write_levels", "write_ply"),
+    "measure.evaluate": ("EvaluateOptions", "Evaluation", "evaluate"),
+    "measure.inspect": ("inspect",),
+    "online.compactor": ("Compactor",),
+    "options": ("CompactOptions",),
+    "raster": ("Rendering", "render"),
+    "scene.read": ("read_scene",),
+    "stages.superpixels": ("saliency", "superpixels"),
     "types": ("Cameras", "Gaussians", "Scene", "Views"),
 }
 _EXPORTS = {name: home for home, names in _PUBLIC.items() for name in names}
 
 __all__ = ["__version__", *sorted(_EXPORTS)]  # noqa: PLE0604 - strings all, from the table above
-
-
-class _Package(ModuleType):
-    """The package, in which a public function wins over the module of the same name that holds it."""
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if isinstance(value, ModuleType) and name in _EXPORTS:
-            return  # the import of gsmerge.render must not hide the function render
-        super().__setattr__(name, value)
 
 
 def __getattr__(name: str) -> Any:
@@ -99,6 +89,3 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
-
-
-sys.modules[__name__].__class__ = _Package

@@ -13,10 +13,10 @@ from gsmerge.io import ply_notes, read_cameras, read_gaussians
 from gsmerge.io.cameras.read import find_cameras, read_sharp
 from gsmerge.io.formats import ply_file, spz, streamed
 from gsmerge.io.formats.ply import SCENE_SUFFIXES, PlyInfo, read_level
-from gsmerge.io.scene_files import named_ply, other_plys
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.online.file import load_stored
 from gsmerge.report import human_bytes
+from gsmerge.scene.files import named_ply, other_plys
 
 NETWORKS = ".safetensors"
 CAMERAS = (".json", ".npz", ".torch", ".txt", ".bin")

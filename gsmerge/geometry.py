@@ -1,9 +1,9 @@
-"""Quaternions, covariances, projection, motions of cameras, medians, on batches of arrays; descent by damped steps."""
+"""Quaternions, covariances, projection, similarities, motions, medians, on batches; descent by damped steps."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -238,3 +238,29 @@ def descend(
             break
         damping *= schedule.ease
     return state
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """A map ``x_gaussians = scale * rotation @ x_cameras + shift`` between frames."""
+
+    rotation: np.ndarray  # ``[3,3]``
+    scale: float  # positive
+    shift: np.ndarray  # ``[3]``, units of the Gaussians
+    description: str = ""  # what it is, for people; empty where both frames are the same
+    # "same", "scaled", "shifted"; "first", "middle" or "upright" by which camera it was rotated; "other"
+    kind: str = "same"
+
+    def move_viewmats(self, viewmats: np.ndarray) -> np.ndarray:
+        """Move world-to-camera matrices ``[c,4,4]`` into the frame of the Gaussians."""
+        out = viewmats.copy()
+        out[:, :3, :3] = matmul(viewmats[:, :3, :3], self.rotation.T)
+        out[:, :3, 3] = self.scale * viewmats[:, :3, 3] - matmul(out[:, :3, :3], self.shift)
+        return out
+
+    def move(self, cameras: Cameras) -> Cameras:
+        """Move cameras into the frame of the Gaussians."""
+        return replace(cameras, viewmats=self.move_viewmats(cameras.viewmats))
+
+
+IDENTITY = Similarity(np.eye(3), 1.0, np.zeros(3))

@@ -7,18 +7,16 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
 from gsmerge.budget import BudgetOptions
+from gsmerge.facts.partition import BlockOptions
+from gsmerge.facts.prepare import PrepareOptions
+from gsmerge.fit import FitOptions
+from gsmerge.runtime.plugins import METHODS, find_plugins
 from gsmerge.stages.clean import CleanOptions
 from gsmerge.stages.decode import MIXED, DecodeOptions
-from gsmerge.stages.fit import FitOptions
 from gsmerge.stages.match import MatchOptions
-from gsmerge.stages.partition import BlockOptions
-from gsmerge.stages.prepare import PrepareOptions
 from gsmerge.stages.superpixels import SegmentOptions
 
-METHODS = (
-    "gsmerge", "unmerged", "unmerged-fit", "moment-matching", "voxel", "opacity", "contribution", "random", "blocks",
-    "greedy", "splat-transform",
-)  # fmt: skip
+OURS = "gsmerge"  # the method that is no plugin
 EFFORTS = ("draft", "fast", "default", "best")  # what each means: gsmerge.plan
 DEVICES = ("cpu", "cuda", "auto")
 CHECKPOINTS = ("auto", "shipped", "paper", "none")  # names that are no files
@@ -30,6 +28,11 @@ RECIPES: Mapping[str, Mapping[str, Any]] = {
         "k_low": 100 / 3, "k_high": 200 / 3, "checkpoint": "paper", "require_checkpoint": True,
     },
 }  # fmt: skip
+
+
+def method_names() -> tuple[str, ...]:
+    """Return the names of all methods: ours, and those that installed packages add."""
+    return (OURS, *find_plugins(METHODS))
 
 
 def setting_names(options: type) -> list[str]:
@@ -50,8 +53,8 @@ class CompactOptions:
         clean: What is left out of the result.
         budget: What decides the number of Gaussians.
         blocks: Parts in which scenes of many views are compacted.
-        method: ``"gsmerge"``: the stages above. Any other: a baseline, see :mod:`gsmerge.baselines`, for which
-            the number of Gaussians has to be settled beforehand.
+        method: ``"gsmerge"``: the stages above. Any other: one that a package adds by an entry point, see
+            :class:`gsmerge.compaction.methods.Method`, for which the number of Gaussians has to be settled beforehand.
         effort: ``"draft"``, ``"fast"``, ``"default"`` or ``"best"``: how much work goes into superpixels, merging and
             fit, as far as their own settings leave it open.
         device: Where the fit and the scores run: ``"cpu"``; ``"cuda"``, which draws with gsplat, whose sums have no
@@ -90,7 +93,8 @@ class CompactOptions:
     threads: int | None = None
 
     def __post_init__(self) -> None:
-        for name, known in (("method", METHODS), ("effort", EFFORTS), ("device", DEVICES)):
+        methods = (OURS,) if self.method == OURS else method_names()
+        for name, known in (("method", methods), ("effort", EFFORTS), ("device", DEVICES)):
             if getattr(self, name) not in known:
                 raise ValueError(f"{name}: expected one of {', '.join(known)}, got {getattr(self, name)!r}")
         if self.recipe not in (None, *RECIPES):

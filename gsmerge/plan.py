@@ -12,22 +12,22 @@ from typing import TYPE_CHECKING, Any
 
 from gsmerge.budget import AUTO, BudgetOptions, exact_count
 from gsmerge.errors import UsageError
-from gsmerge.gpu import choose_backend
+from gsmerge.facts.partition import usual_blocks
+from gsmerge.facts.prepare import Prepared
+from gsmerge.facts.views import camera_kinds, report_views, scored_views
+from gsmerge.fit import FitBackend, FitOptions, photo_scale, start_share
+from gsmerge.fit.fit_options import USUAL_SHARE
+from gsmerge.fit.gpu import choose_backend
 from gsmerge.options import CompactOptions
 from gsmerge.runtime.record import note, stage
 from gsmerge.stages.agreement import measured_share
 from gsmerge.stages.assign import merge_unseen
 from gsmerge.stages.clean import CleanOptions, clean
 from gsmerge.stages.decode import USUAL_K, DecodeOptions
-from gsmerge.stages.fit import FitBackend, FitOptions, photo_scale, start_share
-from gsmerge.stages.fit.fit_options import USUAL_SHARE
 from gsmerge.stages.match import MatchOptions, Method
-from gsmerge.stages.partition import usual_blocks
-from gsmerge.stages.prepare import Prepared
 from gsmerge.stages.segment import CountLimits, SuperpixelPlan, count_limits, scene_tree
 from gsmerge.stages.superpixels import AUTO_SHARE, SHARE, SegmentOptions
 from gsmerge.types import Gaussians, Scene
-from gsmerge.views import camera_kinds, report_views, scored_views
 
 if TYPE_CHECKING:
     from gsmerge.networks.checkpoint import Checkpoint

@@ -8,11 +8,13 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gsmerge import __version__
-from gsmerge.result import CompactReport
 from gsmerge.runtime.memory import human_bytes
+
+if TYPE_CHECKING:
+    from gsmerge.compaction.result import CompactReport
 
 SCHEMA_VERSION = 1
 

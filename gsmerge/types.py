@@ -396,3 +396,14 @@ class FeatureGaussians:
         sizes = np.concatenate([np.diff(p.starts) for p in parts])
         starts = np.concatenate([np.zeros(1, np.int64), sizes.cumsum()])
         return FeatureGaussians(starts=starts, **columns)
+
+
+@dataclass(frozen=True, eq=False)
+class Decoded:
+    """Start of a fit."""
+
+    gaussians: Gaussians  # Canonical Gaussians
+    count: int  # Number to which the fit may grow
+    exact: bool  # Whether that number is to be met
+    baseline_start: Gaussians | None = None  # Another start that the fit may beat instead
+    fixed: np.ndarray | None = None  # [n] bool, Gaussians that the fit leaves as they are; None: none

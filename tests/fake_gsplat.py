@@ -18,7 +18,7 @@ import torch
 from slow_renderer import footprints, harmonics, render_reference
 from torch import Tensor
 
-from gsmerge.render import cuda
+from gsmerge.raster import cuda
 
 CALLS: list[dict[str, Any]] = []
 WEIGHTS: list[Tensor] = []  # of every view of the last call, [n,h,w]

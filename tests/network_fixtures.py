@@ -12,8 +12,8 @@ from scenes import arc, make_scene, room
 from gsmerge.moments import Members, scene_members
 from gsmerge.networks.apply import NetworkContext
 from gsmerge.networks.checkpoint import save_checkpoint
-from gsmerge.networks.modules import Networks
 from gsmerge.networks.options import NetworkOptions
+from gsmerge.research.training.modules import Networks
 from gsmerge.stages.encode import encode
 from gsmerge.types import FeatureGaussians, Groups, Scene
 

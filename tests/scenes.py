@@ -16,15 +16,15 @@ import numpy as np
 from floors import nudged
 
 from gsmerge import Cameras, Gaussians, Scene, compact, render
+from gsmerge.compaction.result import CompactReport, CompactResult
+from gsmerge.facts.views import subset
+from gsmerge.fit import FitOptions
 from gsmerge.geometry import covariances, normalize, quat_to_rotmat
-from gsmerge.render.photos import Photos, scene_photos
+from gsmerge.raster.photos import Photos, scene_photos
 from gsmerge.research.generate import objects, photograph, shapes
 from gsmerge.research.generate.noise import Noise, TrueView, pixel_gaussians
 from gsmerge.research.generate.synthetic_scene import look_at as camera_to_world
-from gsmerge.result import CompactReport, CompactResult
-from gsmerge.stages.fit import FitOptions
 from gsmerge.types import SH_C0, FeatureGaussians, grid_ids
-from gsmerge.views import subset
 
 Texture = Callable[[np.ndarray], np.ndarray]
 FIELDS = ("means", "quats", "scales", "opacities", "sh0", "shN")

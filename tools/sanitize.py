@@ -15,9 +15,9 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-from gsmerge.native import build  # noqa: E402
+from gsmerge.kernels import build  # noqa: E402
 
-TESTS = ("tests/kernels", "tests/unit/native", "tests/property")
+TESTS = ("tests/kernels", "tests/property")
 FLAGS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-fno-omit-frame-pointer", "-g", "-O1", "-w")
 
 

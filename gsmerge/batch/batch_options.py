@@ -6,11 +6,12 @@ from dataclasses import dataclass, field
 from string import Formatter
 from typing import Any
 
-from gsmerge.io import AUTO, OUTPUT_FORMATS, ReadHints, output_format
-from gsmerge.io.content_hash import digest
+from gsmerge.io import OUTPUT_FORMATS, output_format
 from gsmerge.io.formats.ply import OpacityChoice
 from gsmerge.options import CompactOptions
 from gsmerge.runtime.cluster import Engine
+from gsmerge.scene.content_hash import digest
+from gsmerge.scene.exporters import AUTO, ReadHints
 
 FIELDS = ("stem", "parent", "index", "k")
 

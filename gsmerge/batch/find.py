@@ -11,15 +11,15 @@ from typing import Any, Protocol
 
 from gsmerge.batch.batch_options import BatchOptions
 from gsmerge.budget import AUTO
-from gsmerge.compact_file import level_output
+from gsmerge.compaction.files import level_output
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.io import SCENE_SUFFIXES, SceneFiles
+from gsmerge.io import SCENE_SUFFIXES
 from gsmerge.io.bounds import read_text
-from gsmerge.io.content_hash import stem_of
 from gsmerge.io.formats.ply_file import header_counts
-from gsmerge.io.scene_files import IMAGE_PLACES, PLY_PLACES, named_ply, other_plys
 from gsmerge.options import CompactOptions
 from gsmerge.runtime.estimate import memory_bytes
+from gsmerge.scene.content_hash import stem_of
+from gsmerge.scene.files import IMAGE_PLACES, PLY_PLACES, SceneFiles, named_ply, other_plys
 
 MAX_FOLDERS = 100_000  # without a scene; a link to a system's folders leads to more
 FOLDERS_PER_SCENE = 5  # that are not counted for it

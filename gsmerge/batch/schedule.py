@@ -18,12 +18,12 @@ from gsmerge.batch.pools import LocalPool, RayPool, with_whole_paths
 from gsmerge.batch.records import BUSY, LOST, RECORDS, STUCK, RecordIndex, check_folder
 from gsmerge.batch.task import BatchContext, Task, record_failure, run_lock
 from gsmerge.errors import SceneError
-from gsmerge.io import find_scene_files
-from gsmerge.io.content_hash import cameras_of
 from gsmerge.plan import resolved_settings, steps_for
 from gsmerge.runtime.estimate import IMPORT_SECONDS, work_seconds
 from gsmerge.runtime.memory import human_bytes, machine_memory
 from gsmerge.runtime.threads import available_threads
+from gsmerge.scene.content_hash import cameras_of
+from gsmerge.scene.files import find_scene_files
 
 FREE_MEMORY_SHARE = 0.8  # of the free memory that is used by default
 POLL_SECONDS = 0.5  # between two queries of the pool

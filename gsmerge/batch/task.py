@@ -32,14 +32,14 @@ from gsmerge.batch.records import (
     RecordIndex,
     record,
 )
-from gsmerge.compact_file import compact_files
+from gsmerge.compaction.files import compact_files
 from gsmerge.errors import SceneError, UsageError, error_line
-from gsmerge.io import SceneFiles, find_scene_files
 from gsmerge.io.atomic import remove_stale
-from gsmerge.io.content_hash import content_hash, digest, filled, read_files
 from gsmerge.options import CHECKPOINTS
 from gsmerge.report import SCHEMA_VERSION, file_sha256, finite
 from gsmerge.runtime.jsonl import append_line
+from gsmerge.scene.content_hash import content_hash, digest, filled, read_files
+from gsmerge.scene.files import SceneFiles, find_scene_files
 
 PREFIX = ".batch-"  # of the names of all files here, which are in the output folder
 RUN_TIMEOUT = 10.0  # seconds: other runs look at the lock of a run for an instant only

@@ -30,6 +30,8 @@ from gsmerge.errors import (
     is_out_of_memory,
     is_torch_missing,
 )
+from gsmerge.runtime.plugins import COMMANDS as PLUGINS
+from gsmerge.runtime.plugins import find_plugins, load_plugin
 
 PROGRAM = "gsmerge"
 INTERRUPTED = 130
@@ -49,13 +51,14 @@ BUDGET_WORDS = (
     "num_gaussians", "max_gaussians", "num_points", "target_count", "size", "max_size",
 )  # fmt: skip
 
-# Panel of the help -> commands, each the function of its name in the module of its name
+# Panel of the help -> commands, each the function of its name in the module of its name; others are plugins
 COMMANDS = {
     "Compact": ("compact",),
     "Many scenes, and encoding once": ("batch", "encode", "decode", "extend"),
     "Look and measure": ("inspect", "check", "view", "render", "evaluate"),
-    "Research": ("stress", "chart", "generate", "train"),
 }
+OWN_COMMANDS = {name for names in COMMANDS.values() for name in names}
+RESEARCH, ADDED = "Research", "Added by other packages"
 
 
 def make_app(only: str | None = None) -> typer.Typer:
@@ -69,6 +72,17 @@ def make_app(only: str | None = None) -> typer.Typer:
             if only in (None, name):
                 function = getattr(import_module(f"gsmerge.cli.{name}_command"), name)
                 made.command(rich_help_panel=panel)(function)
+    if only in OWN_COMMANDS:
+        return made
+    for name, entry in find_plugins(PLUGINS).items():
+        if only in (None, name) and name not in OWN_COMMANDS:
+            try:
+                function = load_plugin(PLUGINS, name)
+            except UsageError as error:  # a package that is broken must not take the others with it
+                say(f"{PROGRAM}: warning: {error}")
+                continue
+            panel = RESEARCH if entry.module.startswith("gsmerge.") else ADDED
+            made.command(name, rich_help_panel=panel)(function)
     return made
 
 
@@ -194,7 +208,7 @@ def run(args: Sequence[str] | None = None) -> int:
         say(f"{PROGRAM}: error: {message}")
         return code
 
-    known = any(words[:1] == [name] for names in COMMANDS.values() for name in names)
+    known = bool(words) and (words[0] in OWN_COMMANDS or words[0] in find_plugins(PLUGINS))
     signals: list[signal.Signals] = []
 
     def stopped() -> int:

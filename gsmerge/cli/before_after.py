@@ -12,7 +12,9 @@ from gsmerge.cli.parameters import Args, usage_errors
 from gsmerge.errors import SceneError, UsageError
 
 if TYPE_CHECKING:
-    from gsmerge.io import PlyScene, SceneFiles, SceneLoad
+    from gsmerge.io import PlyScene
+    from gsmerge.scene.files import SceneFiles
+    from gsmerge.scene.read import SceneLoad
     from gsmerge.types import Cameras, Gaussians, Scene, Views
 
 SAME = 1e-5  # difference of two poses, of 1 and of their numbers, that writing and reading may make
@@ -54,10 +56,10 @@ def read_before_after(args: Args, files: SceneFiles, *, alone: bool = False) -> 
 
     A scene that is looked at ``alone`` needs no cameras: views are placed about it.
     """
+    from gsmerge.facts.place_cameras import add_views
     from gsmerge.io import read_gaussians
     from gsmerge.io.cameras.embedded import holds_cameras
     from gsmerge.runtime.record import record_run
-    from gsmerge.stages.place_cameras import add_views
 
     if files.cameras is None:  # a result may know those that its scene has lost
         files = replace(files, cameras=next(filter(holds_cameras, args.after), None))
@@ -89,11 +91,11 @@ def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras]
     """Read the moved cameras that ``compact`` wrote into results or beside them, by result; with notes."""
     import numpy as np
 
+    from gsmerge.facts.prepare import scene_depth
     from gsmerge.io.cameras.camera_file import describe_moves, list_moves
     from gsmerge.io.cameras.embedded import holds_cameras
     from gsmerge.io.cameras.json_files import viewer_cameras_path
     from gsmerge.io.cameras.read import read_cameras
-    from gsmerge.stages.prepare import scene_depth
 
     own: dict[str, Cameras] = {}
     notes, start = list[str](), scene.cameras.viewmats
@@ -121,8 +123,8 @@ def held_out_views(
     load: SceneLoad, targets: Path | None, target_images: Path | None, views: int | None
 ) -> tuple[Scene, Views | None, tuple[str, ...]]:
     """Choose the context views of ``--views`` and the unseen views; return the scene, the views, and notes."""
-    from gsmerge.io import read_held_out
-    from gsmerge.views import even_views, midpoint_views, subset
+    from gsmerge.facts.views import even_views, midpoint_views, subset
+    from gsmerge.scene.held_out import read_held_out
 
     if target_images is not None and targets is None:
         raise UsageError("--target-images: expected the cameras of those photos too; name them with --targets")

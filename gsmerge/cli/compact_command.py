@@ -26,8 +26,9 @@ from gsmerge.cli.paths import (
 from gsmerge.errors import TargetError, UsageError
 
 if TYPE_CHECKING:
-    from gsmerge.io import ReadHints, SceneFiles
     from gsmerge.options import CompactOptions
+    from gsmerge.scene.exporters import ReadHints
+    from gsmerge.scene.files import SceneFiles
 
 
 STREAMED_LEVELS = 3  # of a lod-meta.json: the coarsest, a sixteenth, is there at once
@@ -48,7 +49,7 @@ def compact(args: opt.Args) -> None:
     """Write a compact scene that renders like the given one, or better, with 1 to 10 % of its Gaussians."""
     start = perf_counter()
     hints = args.hints()
-    from gsmerge.compact_file import level_output
+    from gsmerge.compaction.files import level_output
     from gsmerge.io.cameras.json_files import viewer_cameras_path
     from gsmerge.options import CompactOptions
 
@@ -75,7 +76,7 @@ def compact(args: opt.Args) -> None:
         print_plan(args, files, settings, out, hints)
         return
     _warn_of_memory(files, settings, quiet=args.silent)
-    from gsmerge.compact_file import compact_files
+    from gsmerge.compaction.files import compact_files
     from gsmerge.report import result_table, summary_lines
 
     seconds_before = {"import": perf_counter() - start}
@@ -130,10 +131,10 @@ def _check_scenes(args: opt.Args) -> None:
 
 def _warn_of_memory(files: SceneFiles, settings: CompactOptions, *, quiet: bool) -> None:
     """Warn before anything is read if the scene is not likely to fit into memory; in blocks it does."""
+    from gsmerge.facts.partition import gaussians_at_once
     from gsmerge.io.formats.ply_file import header_counts
     from gsmerge.plan import wanted_blocks
     from gsmerge.runtime.estimate import memory_bytes, memory_problem
-    from gsmerge.stages.partition import gaussians_at_once
 
     counts = [header_counts(ply) for one in (files, *files.more) for ply in one.plys]
     count, num_rest = sum(count for count, _ in counts), max(rest for _, rest in counts)
@@ -146,9 +147,9 @@ def _warn_of_memory(files: SceneFiles, settings: CompactOptions, *, quiet: bool)
 
 def print_plan(args: opt.Args, files: SceneFiles, settings: CompactOptions, out: Path, hints: ReadHints) -> None:
     """Print an estimate of what compact or encode would make of a scene."""
-    from gsmerge.baselines import choose_baseline
-    from gsmerge.compact_file import check_saved_cameras, read_input
-    from gsmerge.gpu import choose_backend
+    from gsmerge.compaction.files import check_saved_cameras, read_input
+    from gsmerge.compaction.methods import check_method
+    from gsmerge.fit.gpu import choose_backend
     from gsmerge.measure.inspect import estimate, estimate_lines
     from gsmerge.plan import load_networks
     from gsmerge.report import document_head
@@ -158,7 +159,7 @@ def print_plan(args: opt.Args, files: SceneFiles, settings: CompactOptions, out:
     scene = given.scene
     paths = {name: path and str(path) for name, path in vars(files).items() if name != "more"}
     check_saved_cameras(scene, vars(args).get("save_cameras"), embed=bool(vars(args).get("embed_cameras")))
-    _, unused = choose_baseline(settings, scene)
+    _, unused = check_method(settings, scene)
     backend, problem = choose_backend(settings.device, scene.num_gaussians)
     settings = replace(settings, device=backend.device)
     notes = [*given.notes, *unused, *([] if problem is None else [problem])]

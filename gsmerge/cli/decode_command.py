@@ -33,13 +33,13 @@ def decode(args: opt.Args) -> None:
     import numpy as np
 
     from gsmerge.encoded.to_gaussians import plan_decode
+    from gsmerge.fit import FitOptions
     from gsmerge.io import atomic_output, lost_harmonics, output_format, write_gaussians
     from gsmerge.online.decode_stored import check_fit, decodable, decode_stored, default_fit, num_photos
     from gsmerge.online.file import load_stored
     from gsmerge.options import CompactOptions
     from gsmerge.plan import resolve_fit
     from gsmerge.report import document_head, seconds_document
-    from gsmerge.stages.fit import FitOptions
 
     wanted, writing = args.make(FitOptions, FileOptions, viewer_cameras=False)  # a .gsm has no names of views
     check_format(out, writing)

@@ -30,7 +30,7 @@ def encode(args: opt.Args) -> None:
 
         print_plan(args, files, settings, out, hints)
         return
-    from gsmerge.compact_file import read_input
+    from gsmerge.compaction.files import read_input
     from gsmerge.encoded.gsm_file import save_encoded
     from gsmerge.encoded.to_encoded import encode_scene
     from gsmerge.io import atomic_output

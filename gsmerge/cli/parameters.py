@@ -25,11 +25,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin,
 import typer
 
 from gsmerge.errors import UsageError
+from gsmerge.runtime.plugins import METHODS, find_plugins
 
 if TYPE_CHECKING:
-    from gsmerge.io import ReadHints, SceneFiles, SceneLoad
     from gsmerge.io.formats.ply import OpacityChoice
     from gsmerge.options import CompactOptions
+    from gsmerge.scene.exporters import ReadHints
+    from gsmerge.scene.files import SceneFiles
+    from gsmerge.scene.read import SceneLoad
 
 INPUT, COUNT, METHOD, MEASURING, OUTPUT, GENERAL = (
     "Input", "How many Gaussians", "Method", "Measuring", "Output", "General"
@@ -98,8 +101,7 @@ class Args(SimpleNamespace):
 
     def hints(self, **defaults: Any) -> ReadHints:
         """Make the hints on how to read the scene, on top of ``defaults``; UsageError for an unknown name or value."""
-        from gsmerge.io import ReadHints
-        from gsmerge.io.exporters import find_exporter
+        from gsmerge.scene.exporters import ReadHints, find_exporter
 
         values = {name: value for name, value in self._parse_hints().items() if name != "opacity"}
         with usage_errors():
@@ -107,8 +109,8 @@ class Args(SimpleNamespace):
             return ReadHints(**{**defaults, **values})
 
     def _parse_hints(self) -> dict[str, Any]:
-        from gsmerge.io import ReadHints
         from gsmerge.io.formats.ply import OpacityChoice
+        from gsmerge.scene.exporters import ReadHints
 
         return parse_pairs("--hint", self.hint or (), setting_kinds(ReadHints) | {"opacity": OpacityChoice})
 
@@ -117,7 +119,7 @@ class Args(SimpleNamespace):
 
         Cameras and photos are the named ones, or those beside each.
         """
-        from gsmerge.io import find_scene_files
+        from gsmerge.scene.files import find_scene_files
 
         places = {"cameras": self.cameras, **{name: vars(self).get(name) for name in ("images", "masks")}}
         first, *others = (find_scene_files(one, **places) for one in (scene, *more))
@@ -125,7 +127,7 @@ class Args(SimpleNamespace):
 
     def load(self, files: SceneFiles, **defaults: Any) -> SceneLoad:
         """Read the scene of these files; ``defaults`` are hints that the user may override."""
-        from gsmerge.io import load_files
+        from gsmerge.scene.read import load_files
 
         return load_files(files, opacity=self.opacity, hints=self.hints(**defaults))
 
@@ -338,10 +340,8 @@ _TABLE = (
                "their mean: where they differ at random, never, or always.", wording="auto"),
         option("device", ("cpu", "cuda", "auto"), "Where the fit and the scores run; cuda needs gsmerge[cuda]. auto: "
                "a GPU where there is one and the scene is large enough.", wording="cpu"),
-        option("method", (
-            "gsmerge", "unmerged", "unmerged-fit", "moment-matching", "voxel", "opacity",
-            "contribution", "random", "blocks", "greedy", "splat-transform",
-        ), "gsmerge, or a baseline to compare it with.", wording="gsmerge"),
+        option("method", ("gsmerge", *find_plugins(METHODS)), "gsmerge, or a baseline to compare it with.",
+               wording="gsmerge"),
         option("recipe", ("paper",), "Settings that belong together. paper: the superpixel merging paper's own method, "
                "with networks that have absolute outputs."),
         option("checkpoint", str, "Trained networks that correct the analytic stages: a file, shipped, paper, none, or "

@@ -13,7 +13,7 @@ from gsmerge.errors import SceneError, UsageError
 
 if TYPE_CHECKING:
     from gsmerge.budget import BudgetOptions
-    from gsmerge.io import SceneFiles
+    from gsmerge.scene.files import SceneFiles
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,10 @@ from gsmerge.errors import SceneError, UsageError
 if TYPE_CHECKING:
     import numpy as np
 
-    from gsmerge.io import ReadHints, SceneFiles, SceneLoad
-    from gsmerge.io.scene import SceneViews
     from gsmerge.measure.preview import Picture
+    from gsmerge.scene.exporters import ReadHints
+    from gsmerge.scene.files import SceneFiles
+    from gsmerge.scene.read import SceneLoad, SceneViews
     from gsmerge.types import Cameras, Gaussians
 
     Drawing = tuple[list[Path], dict[str, Any], Callable[[int], Iterator[Picture]]]  # files, facts, and what draws them
@@ -207,7 +208,7 @@ def _draw_views(
     args: opt.Args, scenes: Sequence[Gaussians], views: Cameras, threads: int, near: float = 0.01
 ) -> Iterator[tuple[np.ndarray, ...]]:
     """Yield the pictures ``[h,w,3]`` of all scenes from each camera, with as many views in memory as threads."""
-    from gsmerge.render import render_in_turn
+    from gsmerge.raster import render_in_turn
 
     drawn = (
         render_in_turn(gaussians, views, args.background, at_once=threads, antialiased=args.antialiased, near=near)
@@ -256,7 +257,7 @@ def _path_cameras(
 ) -> tuple[list[Gaussians], Cameras, float, dict[str, Any]]:
     """Read the scenes and make the cameras of the path; also return its near plane, and facts."""
     from gsmerge.measure.camera_path import parse_path, plan_path, viewing_depth
-    from gsmerge.render.photos import NEAR
+    from gsmerge.raster.photos import NEAR
 
     path = parse_path(args.path)
     file, own = None if path else Path(args.path), True
@@ -282,7 +283,7 @@ def _place_file(file: Path, cameras: Cameras, load: SceneLoad | None) -> Cameras
     """Read the cameras of a path into the frame of a scene, with the size of the scene's where they have none."""
     from gsmerge.io import read_cameras, to_cameras
     from gsmerge.io.cameras.camera_file import sizes_of
-    from gsmerge.io.held_out import place_camera_file
+    from gsmerge.scene.held_out import place_camera_file
 
     stored = read_cameras(file) if load is None else place_camera_file(load, file)[0]
     size = None if sizes_of(stored) else (cameras.width, cameras.height)
@@ -302,7 +303,7 @@ def _plan_superpixels(args: opt.Args, files: SceneFiles) -> Drawing:
 
     def draw(_: int) -> Iterator[Picture]:
         from gsmerge.measure.preview import draw_borders, draw_heat, draw_means
-        from gsmerge.render.photos import scene_pictures
+        from gsmerge.raster.photos import scene_pictures
         from gsmerge.stages.superpixels import saliency, segment
 
         images = scene_pictures(scene)
@@ -318,14 +319,14 @@ def _plan_superpixels(args: opt.Args, files: SceneFiles) -> Drawing:
 
 def _choose(args: opt.Args, count: int, most: int | None = None) -> list[int]:
     """Choose the views to draw: those of ``--views``, or at most ``most``; None: all."""
-    from gsmerge.views import pick_views
+    from gsmerge.facts.views import pick_views
 
     return pick_views(count, args.views or most or count)
 
 
 def _frame_files(args: opt.Args, files: SceneFiles) -> SceneFiles:
     """Find the files of the scene whose frame the cameras are moved into."""
-    from gsmerge.io import find_scene_files
+    from gsmerge.scene.files import find_scene_files
 
     source = args.frame_of or source_of(files.ply)
     if source is None:
@@ -337,7 +338,9 @@ def _read(
     args: opt.Args, files: SceneFiles, like: SceneFiles, hints: ReadHints, *, photos: bool
 ) -> tuple[list[Gaussians], SceneViews, list[str], SceneLoad | None]:
     """Read the scenes, and place the cameras in the frame of ``like``; also return notes, and ``like`` if it fits."""
-    from gsmerge.io import AUTO, place_cameras_in_scene, ply_notes, read_gaussians, read_ply_with_hints
+    from gsmerge.io import ply_notes, read_gaussians
+    from gsmerge.scene.exporters import AUTO
+    from gsmerge.scene.read import place_cameras_in_scene, read_ply_with_hints
 
     check_cameras(like)
     first = read_ply_with_hints(files, opacity=args.opacity, hints=hints)

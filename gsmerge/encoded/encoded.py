@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gsmerge.stages.prepare import Frame
+from gsmerge.facts.prepare import Frame
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
 
 if TYPE_CHECKING:

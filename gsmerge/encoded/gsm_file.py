@@ -22,12 +22,12 @@ from safetensors.numpy import save
 from gsmerge import __version__
 from gsmerge.encoded.encoded import Division, Encoded, StoredHeads, StoredScene, StoredSettings
 from gsmerge.errors import SceneError
+from gsmerge.facts.prepare import Frame
 from gsmerge.io.atomic import atomic_output
 from gsmerge.io.bounds import check_file, check_pixels
 from gsmerge.io.cameras.camera_file import MAX_NUMBER as MAX_LENGTH
 from gsmerge.io.cameras.camera_file import check_camera, check_size
 from gsmerge.stages.decode import MAX_CHILDREN
-from gsmerge.stages.prepare import Frame
 from gsmerge.types import Array, Cameras, FeatureGaussians, Gaussians, as_array
 
 if TYPE_CHECKING:

@@ -9,18 +9,18 @@ from typing import Any
 
 from gsmerge import __version__
 from gsmerge.budget import AUTO
+from gsmerge.compaction.search import choose_count
 from gsmerge.encoded.encoded import Encoded, StoredHeads, StoredSettings, without_members
 from gsmerge.encoded.to_gaussians import divide_all
 from gsmerge.errors import UsageError
+from gsmerge.facts.prepare import Prepared, prepare
 from gsmerge.options import CompactOptions
-from gsmerge.pipeline import build, merge_views
+from gsmerge.pipeline import merge_views
 from gsmerge.plan import Plan, make_plan, require_children
 from gsmerge.runtime.record import Progress, current_record, record_run, stage
 from gsmerge.runtime.threads import use_threads
-from gsmerge.search import choose_count
 from gsmerge.stages.decode import MAX_CHILDREN, keep_all, merged_count
 from gsmerge.stages.merge import MergedViews
-from gsmerge.stages.prepare import Prepared, prepare
 from gsmerge.stages.segment import knee_count
 from gsmerge.types import Scene
 
@@ -62,7 +62,7 @@ def encode_scene(
         prepared = prepare(scene.numpy(), options.prepare)
         plan = make_plan(prepared, options)
         require_children("max k", max_k or 1, plan.checkpoint)
-        count = choose_count(prepared, plan, build)
+        count = choose_count(prepared, plan)
         if keep_all(prepared.scene, count) is not None:
             raise UsageError(f"budget: {count} keeps every Gaussian, which needs no encoding; use compact")
         merged = merge_views(prepared, plan, count)

@@ -9,12 +9,12 @@ import numpy as np
 from gsmerge.budget import AUTO, BudgetOptions, exact_count
 from gsmerge.encoded.encoded import Division, Encoded
 from gsmerge.errors import UsageError
+from gsmerge.fit import visible_mask
 from gsmerge.kernels.gaussians.bisect import gather_groups
 from gsmerge.moments import Members, feature_to_gaussians, gaussian_members
-from gsmerge.render.photos import blank_photos
+from gsmerge.raster.photos import blank_photos
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.decode import MAX_CHILDREN, deal_order, deal_visible, halve, pool_children
-from gsmerge.stages.fit import visible_mask
 from gsmerge.types import FeatureGaussians, Gaussians
 
 

@@ -1,14 +1,11 @@
 """Files: the only place that knows their formats."""
 
-from gsmerge.io.alignment import Recovery as Recovery
 from gsmerge.io.atomic import atomic_output as atomic_output
 from gsmerge.io.atomic import atomic_outputs as atomic_outputs
 from gsmerge.io.bounds import read_json as read_json
 from gsmerge.io.cameras.camera_file import CameraFile as CameraFile
 from gsmerge.io.cameras.camera_file import to_cameras as to_cameras
 from gsmerge.io.cameras.read import read_cameras as read_cameras
-from gsmerge.io.exporters import AUTO as AUTO
-from gsmerge.io.exporters import ReadHints as ReadHints
 from gsmerge.io.formats.ply import SCENE_SUFFIXES as SCENE_SUFFIXES
 from gsmerge.io.formats.ply import PlyScene as PlyScene
 from gsmerge.io.formats.ply import kept_comments as kept_comments
@@ -21,16 +18,4 @@ from gsmerge.io.formats.writing import output_format as output_format
 from gsmerge.io.formats.writing import write_gaussians as write_gaussians
 from gsmerge.io.formats.writing import write_levels as write_levels
 from gsmerge.io.formats.writing import write_ply as write_ply
-from gsmerge.io.held_out import HeldOutViews as HeldOutViews
-from gsmerge.io.held_out import read_held_out as read_held_out
 from gsmerge.io.photo_files import read_images as read_images
-from gsmerge.io.scene import SceneLoad as SceneLoad
-from gsmerge.io.scene import align_scene as align_scene
-from gsmerge.io.scene import as_scene as as_scene
-from gsmerge.io.scene import load_files as load_files
-from gsmerge.io.scene import load_scene as load_scene
-from gsmerge.io.scene import place_cameras_in_scene as place_cameras_in_scene
-from gsmerge.io.scene import read_ply_with_hints as read_ply_with_hints
-from gsmerge.io.scene import read_scene as read_scene
-from gsmerge.io.scene_files import SceneFiles as SceneFiles
-from gsmerge.io.scene_files import find_scene_files as find_scene_files

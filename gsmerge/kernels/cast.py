@@ -14,7 +14,7 @@ Every shape has a frame of its own (centre, rotation local to world) and half si
 
 from __future__ import annotations
 
-from gsmerge.native.signature import STATUS, f4, f8, i4, native
+from gsmerge.kernels.signature import STATUS, f4, f8, i4, native
 
 QUAD, BOX, ELLIPSOID, CONE, LEAF, BLOB = range(6)
 

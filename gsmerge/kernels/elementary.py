@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gsmerge.native.signature import f4, f8, native
+from gsmerge.kernels.signature import f4, f8, native
 
 Array = np.ndarray[Any, Any]
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gsmerge.native.signature import STATUS, f8, i4, native
+from gsmerge.kernels.signature import STATUS, f8, i4, native
 
 Array = np.ndarray[Any, Any]
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.kernels.elementary import exp
-from gsmerge.native.signature import STATUS, f4, native
+from gsmerge.kernels.signature import STATUS, f4, native
 
 SLOPE, SMOOTH = np.array([-1, 0, 1], np.float32), np.array([1, 2, 1], np.float32)  # Sobel's filters
 Picture = np.ndarray[Any, Any]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.native.signature import STATUS, i1, i4, i8, native
+from gsmerge.kernels.signature import STATUS, i1, i4, i8, native
 
 BACK = 200.0  # cost of a step that goes back, in pixels
 FAR = 50.0  # cost of any longer step forward: a stretch that was dropped costs no more

@@ -18,10 +18,10 @@ from gsmerge.geometry import Schedule, descend, motion_matrices, pose_changes
 from gsmerge.kernels.elementary import log1p
 from gsmerge.kernels.matrices import matmul, solve, solve_symmetric
 from gsmerge.measure.sizes import resize_mask
-from gsmerge.render import Splats, ViewPlan, composite, plan_view
-from gsmerge.render.composite import mean_depths
-from gsmerge.render.gradient import color_gradients, plan_gradients, pose_gradient
-from gsmerge.render.photos import photos_of
+from gsmerge.raster import Splats, ViewPlan, composite, plan_view
+from gsmerge.raster.composite import mean_depths
+from gsmerge.raster.gradient import color_gradients, plan_gradients, pose_gradient
+from gsmerge.raster.photos import photos_of
 from gsmerge.types import Cameras
 
 LEVELS = (4, 2, 1)  # what the sides of the photo are divided by, one after the other
@@ -121,7 +121,7 @@ def refine_pose(
     The photo ``[h,w,3]``, sRGB in [0, 1], is compared within ``mask [h,w]`` at a quarter, at half and at its full size.
     Pixels whose error is large count less, so that the camera is not moved to get a flaw of the scene out of the
     picture. It turns about ``centre [3]``, the scene's middle in the world. ``splats`` are those of
-    :func:`gsmerge.render.prepare`, ``near`` is in world units, ``antialiased`` that of :func:`gsmerge.render`.
+    :func:`gsmerge.raster.prepare`, ``near`` is in world units, ``antialiased`` that of :func:`gsmerge.render`.
     """
     start = camera.viewmats[0].astype(np.float64)
     viewmat, unit = start, 0.0

@@ -11,17 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsmerge.errors import UsageError
+from gsmerge.facts.prepare import photos_count_as_they_are, scene_frame
+from gsmerge.facts.views import pick_views
 from gsmerge.measure.align import PoseChange, fit_colors, refine_pose
 from gsmerge.measure.fog import ALL, Fog, describe_fog, measure_fog
 from gsmerge.measure.sizes import resize_mask, resize_photo, shrink_cameras, shrink_views, zoom_cameras
 from gsmerge.measure.visibility import context_points, visible_pixels
-from gsmerge.render import prepare, render
-from gsmerge.render.metrics import describe_loss, psnr, ssim
-from gsmerge.render.photos import NEAR
+from gsmerge.raster import prepare, render
+from gsmerge.raster.metrics import describe_loss, psnr, ssim
+from gsmerge.raster.photos import NEAR
 from gsmerge.runtime.threads import use_threads
-from gsmerge.stages.prepare import photos_count_as_they_are, scene_frame
 from gsmerge.types import Cameras, Gaussians, Scene, Views, as_array
-from gsmerge.views import pick_views
 
 NETS = ("vgg", "alex")
 ALIGNMENTS = ("color", "pose")

@@ -13,13 +13,13 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from gsmerge.facts.views import pick_views
+from gsmerge.fit.fit_options import HAZE
 from gsmerge.geometry import middle_depth, step_outside
 from gsmerge.measure.sizes import shrink_cameras
-from gsmerge.render import Splats, plan_view, prepare
-from gsmerge.render.composite import blend
-from gsmerge.stages.fit.fit_options import HAZE
+from gsmerge.raster import Splats, plan_view, prepare
+from gsmerge.raster.composite import blend
 from gsmerge.types import Cameras, Gaussians
-from gsmerge.views import pick_views
 
 VIEWS = 3  # of the input, evenly spread, that the cameras start from
 # Steps back as shares of the depth of what a view sees, and turns about its middle in degrees, by kind

@@ -19,7 +19,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from gsmerge.errors import GsmergeError, SceneError
 from gsmerge.kernels.networks.layers import PLAIN, dense, pack
-from gsmerge.render.metrics import image_pair, pixel_mask
+from gsmerge.raster.metrics import image_pair, pixel_mask
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Array
 

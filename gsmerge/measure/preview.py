@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsmerge.facts.views import pick_views
 from gsmerge.io import atomic_output
 from gsmerge.measure.camera_path import outside_camera
-from gsmerge.render import render
-from gsmerge.render.metrics import psnr
+from gsmerge.raster import render
+from gsmerge.raster.metrics import psnr
 from gsmerge.types import Cameras, Gaussians
-from gsmerge.views import pick_views
 
 Picture = NDArray[np.uint8]  # [h,w,3], sRGB, RGB order
 BAND = 22  # height of the band that carries a tile's label, pixels

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsmerge.facts.views import resize_cameras
 from gsmerge.kernels.pictures import enlarge
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Views
-from gsmerge.views import resize_cameras
 
 SomeViews = TypeVar("SomeViews", bound=Views)
 

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from gsmerge.facts.views import pick_views
 from gsmerge.measure.sizes import zoom_cameras
-from gsmerge.render import plan_view, prepare, render
-from gsmerge.render.weights import view_weights
+from gsmerge.raster import plan_view, prepare, render
+from gsmerge.raster.weights import view_weights
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import Cameras, Gaussians
-from gsmerge.views import pick_views
 
 NUM_VIEWS, REPEATS = 3, 3  # evenly spread views that are rendered, each so many times
 MAX_REPEATED_SECONDS = 2.0  # what takes longer is rendered once
@@ -36,7 +36,7 @@ def measure_costs(
     plain JSON types by name: ``overdraw``, Gaussians blended into a pixel; ``speeds`` by device and zoom: seconds per
     view, and of all scenes but the first ``speedup`` and ``break_even_frames``, next to ``merge_seconds``.
     """
-    from gsmerge.gpu import cuda_problem
+    from gsmerge.fit.gpu import cuda_problem
 
     few = cameras[pick_views(len(cameras), NUM_VIEWS)]
     costs: dict[str, dict[str, Any]] = {

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gsmerge.geometry import project
 from gsmerge.kernels.matrices import invert, matmul
-from gsmerge.render import render
+from gsmerge.raster import render
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, Scene
 

@@ -32,7 +32,7 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Array, Cameras, FeatureGaussians, Gaussians, as_array, concat_columns, concat_rows, like
 
 if TYPE_CHECKING:
-    from gsmerge.networks.modules import Networks
+    from gsmerge.research.training.modules import Networks
 
 # What a Feature Gaussian says of itself; its members, their weights and its view are those of its cluster.
 OWN = (*CORRECTED, "gains", "shN", "footprints")

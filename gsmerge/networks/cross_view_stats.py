@@ -10,7 +10,7 @@ from gsmerge.kernels.elementary import log
 from gsmerge.kernels.gaussians.cross_view import COLUMNS, sum_cross_view
 from gsmerge.kernels.gaussians.nearest import LEAF, build_tree, nearest_of_others
 from gsmerge.moments import Members
-from gsmerge.render.view_plan import pieces
+from gsmerge.raster.view_plan import pieces
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import SH_C0, Cameras
 

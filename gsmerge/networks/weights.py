@@ -1,7 +1,8 @@
 """The networks as arrays of weights, and their forward pass through the native library.
 
-It is the arithmetic of :mod:`gsmerge.networks.modules`, which training needs, to rounding, without torch. Every group
-is computed alone: results depend neither on the table that it shares with others nor on the number of threads.
+It is the arithmetic of :mod:`gsmerge.research.training.modules`, which training needs, to rounding, without torch.
+Every group is computed alone: results depend neither on the table that it shares with others nor on the number of
+threads.
 """
 
 from __future__ import annotations

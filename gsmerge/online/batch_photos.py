@@ -7,19 +7,19 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from gsmerge.facts.views import in_float64, resize_cameras
+from gsmerge.fit import FitReport
+from gsmerge.fit.color import draw, fit_colors
+from gsmerge.fit.fit_options import FitOptions
 from gsmerge.geometry import normalize
 from gsmerge.kernels.matrices import matmul
 from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.online.options import OnlineOptions
 from gsmerge.online.state import GroupSet, Replay, replace_groups, select_groups
-from gsmerge.render.photos import Photos, photo_errors, photos_of, scene_pictures
-from gsmerge.render.weights import apply_transposed
+from gsmerge.raster.photos import Photos, photo_errors, photos_of, scene_pictures
+from gsmerge.raster.weights import apply_transposed
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.stages.fit import FitReport
-from gsmerge.stages.fit.color import draw, fit_colors
-from gsmerge.stages.fit.fit_options import FitOptions
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Scene
-from gsmerge.views import in_float64, resize_cameras
 
 REACH = 3.34  # standard deviations to where an opaque Gaussian adds 1/255
 MARGIN = 2.0  # pixels that the rasterizer's low-pass adds to that

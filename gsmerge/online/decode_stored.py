@@ -9,13 +9,13 @@ import numpy as np
 from gsmerge.encoded.encoded import Encoded
 from gsmerge.encoded.to_gaussians import decode_scene, plan_decode
 from gsmerge.errors import UsageError
-from gsmerge.gpu import choose_backend
+from gsmerge.facts.prepare import Frame
+from gsmerge.fit import FitOptions, FitReport, fit, report_steps, start_share
+from gsmerge.fit.gpu import choose_backend
 from gsmerge.online.batch_photos import BatchPhotos
 from gsmerge.online.state import OnlineState, to_encoded
 from gsmerge.runtime.record import Progress, record_run, stage
 from gsmerge.runtime.threads import use_threads
-from gsmerge.stages.fit import FitOptions, FitReport, fit, report_steps, start_share
-from gsmerge.stages.prepare import Frame
 from gsmerge.types import Gaussians
 
 

@@ -10,7 +10,10 @@ import numpy as np
 
 from gsmerge import __version__
 from gsmerge.budget import AUTO
+from gsmerge.compaction.search import choose_count
 from gsmerge.errors import UsageError
+from gsmerge.facts.prepare import Prepared, prepare
+from gsmerge.fit import visible_mask
 from gsmerge.moments import feature_to_gaussians
 from gsmerge.online.batch_photos import (
     BatchPhotos,
@@ -35,16 +38,13 @@ from gsmerge.online.state import (
     with_fitted_colors,
 )
 from gsmerge.options import CompactOptions
-from gsmerge.pipeline import build, merge_views
+from gsmerge.pipeline import merge_views
 from gsmerge.plan import Plan, make_plan, require_children
 from gsmerge.runtime.record import Progress, choose, note, record_run, stage
 from gsmerge.runtime.threads import use_threads
-from gsmerge.search import choose_count
 from gsmerge.stages.decode import USUAL_K, keep_all
-from gsmerge.stages.fit import visible_mask
 from gsmerge.stages.match import MatchOptions, match
 from gsmerge.stages.merge import MergedViews, merge, take
-from gsmerge.stages.prepare import Prepared, prepare
 from gsmerge.types import FeatureGaussians, Gaussians, Matches, Scene
 
 
@@ -91,7 +91,7 @@ def extend(
         plan = make_plan(prepared, options, None if state is None else own_checkpoint(state, options))
         plan = plan.with_fit(replace(plan.fit, min_contribution=options.fit.min_contribution))  # in drafts, too
         require_children("max k", max_k, plan.checkpoint)
-        count = choose_count(prepared, plan, build)
+        count = choose_count(prepared, plan)
         if keep_all(prepared.scene, count) is not None:
             raise UsageError(f"budget: {count} keeps every Gaussian, which needs no state; use compact")
         if keeps_features(plan) if state is None else state.networks is not None:

@@ -12,6 +12,8 @@ import numpy as np
 
 from gsmerge.encoded.encoded import without_members
 from gsmerge.errors import SceneError, UsageError
+from gsmerge.facts.prepare import Prepared
+from gsmerge.facts.views import concat_cameras
 from gsmerge.kernels.gaussians.cluster import connected_components
 from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.networks.apply import NetworkContext, decode_gaussians, decode_with_group_features, find_neighbors
@@ -50,10 +52,8 @@ from gsmerge.stages.decode import divide
 from gsmerge.stages.encode import correct, encode
 from gsmerge.stages.match import MatchOptions, match
 from gsmerge.stages.merge import merge, refine, take
-from gsmerge.stages.prepare import Prepared
 from gsmerge.stages.segment import segment_scene
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches
-from gsmerge.views import concat_cameras
 
 WIDE = 3 * REACH  # standard deviations about what a view sees, in which the refiner finds the neighbours of its border
 SAMPLE_STEP = 8  # pixels between the samples of a view along each axis

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gsmerge.compact_file import read_input
+from gsmerge.compaction.files import read_input
 from gsmerge.encoded.encoded import Encoded, without_members
 from gsmerge.encoded.gsm_file import ENCODED, MINOR, STATE, GsmFile, read_encoded, read_gsm, write_gsm
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.io import AUTO, ReadHints, SceneFiles, atomic_output
+from gsmerge.io import atomic_output
 from gsmerge.io.formats.ply import OpacityChoice
 from gsmerge.networks.options import CORRECTED
 from gsmerge.online.extend import extend
@@ -34,6 +34,8 @@ from gsmerge.online.state import (
 from gsmerge.report import document_head, seconds_document
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.record import Progress
+from gsmerge.scene.exporters import AUTO, ReadHints
+from gsmerge.scene.files import SceneFiles
 from gsmerge.types import Cameras, FeatureGaussians
 
 if TYPE_CHECKING:

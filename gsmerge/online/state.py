@@ -11,20 +11,20 @@ from gsmerge import __version__
 from gsmerge.budget import AUTO
 from gsmerge.encoded.encoded import Encoded, StoredHeads, StoredScene, StoredSettings, without_members
 from gsmerge.encoded.to_gaussians import children_of, divide_all, divide_by_heads
+from gsmerge.facts.views import concat_cameras, in_float64, resize_cameras
 from gsmerge.geometry import covariances
 from gsmerge.kernels.elementary import log1p
 from gsmerge.moments import MAX_OPACITY, Members, feature_to_gaussians, gaussian_members
 from gsmerge.stages.decode import divide
 from gsmerge.stages.merge import take
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, to_float32
-from gsmerge.views import concat_cameras, in_float64, resize_cameras
 
 if TYPE_CHECKING:
+    from gsmerge.facts.prepare import Prepared
     from gsmerge.networks.apply import NetworkContext
     from gsmerge.networks.tokens import GroupFeatures
     from gsmerge.networks.weights import NetworkWeights
     from gsmerge.plan import Plan
-    from gsmerge.stages.prepare import Prepared
 
 CHILD_FOOTPRINT = 1e-3  # of the group's: children need no least size, as it is in their own
 

@@ -6,7 +6,6 @@ supplement "Compaction of Non-Pixel-Aligned FF Backbones"). Gaussians that no vi
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from threading import Lock
 
@@ -16,16 +15,13 @@ from gsmerge.errors import UsageError
 from gsmerge.geometry import morton_codes
 from gsmerge.kernels.raster.contribution import dominant_labels
 from gsmerge.moments import Members, pool_members, scene_members, unaligned_members
-from gsmerge.render import ViewPlan, contributions, plan_view, prepare, render
-from gsmerge.render.photos import NEAR
+from gsmerge.raster import ViewPlan
+from gsmerge.raster.seen import plan_views
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.decode import DecodeOptions, decode
 from gsmerge.stages.encode import from_moments
 from gsmerge.types import Gaussians, Groups, Scene
-
-ONE_AT_A_TIME = 4_000_000  # Gaussians; the plan of a view is as large as they are
-MIN_ALPHA = 0.5  # opacity of a pixel from which it counts when superpixels are merged
 
 
 @stage("members")
@@ -73,43 +69,8 @@ def find_owners(scene: Scene, groups: Groups) -> Owners:
             ids = plan.ids[better]
             best.values[ids], best.views[ids], best.labels[ids] = values[better], view, labels[better]
 
-    _plan_views(scene, one_view)
+    plan_views(scene, one_view)
     return best
-
-
-def seen_weights(scene: Scene) -> np.ndarray:
-    """Measure the largest blending weight ``[n]`` float32 of each Gaussian in one view, pixels."""
-    most, lock = np.zeros(len(scene.gaussians), np.float32), Lock()
-
-    def one_view(_: int, plan: ViewPlan) -> None:
-        sums, _peaks = contributions(plan)
-        with lock:
-            np.maximum(most, sums, out=most)
-
-    _plan_views(scene, one_view)
-    return most
-
-
-def _plan_views(scene: Scene, use: Callable[[int, ViewPlan], None]) -> None:
-    """Plan every view and use it, in parallel unless the plans would fill the memory."""
-    splats, cameras = prepare(scene.gaussians), scene.cameras
-    viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
-
-    def one_view(view: int) -> None:
-        use(view, plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, near=NEAR))
-
-    if len(splats) <= ONE_AT_A_TIME:
-        parallel_map(one_view, range(len(scene)))
-        return
-    for view in range(len(scene)):
-        one_view(view)
-
-
-def seen_depths(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Render the mean depth ``[v,h,w]`` of every pixel, and a mask ``[v,h,w]`` of mostly opaque pixels."""
-    drawn = render(scene.gaussians, scene.cameras, near=NEAR, with_depths=True)
-    assert drawn.depths is not None
-    return drawn.depths[..., 0], drawn.alphas[..., 0] > MIN_ALPHA
 
 
 def view_owners(plan: ViewPlan, labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:

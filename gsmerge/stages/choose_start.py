@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from gsmerge.render.metrics import decibels
-from gsmerge.render.photos import Photos, photo_errors, scene_photos, scene_pictures
+from gsmerge.facts.views import pick_views
+from gsmerge.raster.metrics import decibels
+from gsmerge.raster.photos import Photos, photo_errors, scene_photos, scene_pictures
 from gsmerge.runtime.memory import release_memory
 from gsmerge.runtime.record import choose, stage
 from gsmerge.stages.decode import DecodeOptions, decode
 from gsmerge.stages.merge import MergedViews
 from gsmerge.types import Gaussians, Scene
-from gsmerge.views import pick_views
 
 if TYPE_CHECKING:
     from gsmerge.networks.checkpoint import Checkpoint

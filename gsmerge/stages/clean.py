@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsmerge.errors import UsageError
+from gsmerge.fit import Fitted
 from gsmerge.runtime.record import Record, add_seconds, adopt, choose, note, record_part
-from gsmerge.stages.fit import Fitted
 from gsmerge.stages.sky import sky
 from gsmerge.types import Gaussians, Scene
 
 if TYPE_CHECKING:
-    from gsmerge.stages.prepare import Prepared
+    from gsmerge.facts.prepare import Prepared
 
 BOX_QUANTILES = (1, 99)  # % of the positions along each axis: the scene's box
 OUTLIER_BOX = 10.0  # times that box: what lies beyond is far from the scene

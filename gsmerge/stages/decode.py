@@ -11,12 +11,12 @@ import numpy as np
 from gsmerge.budget import AUTO
 from gsmerge.kernels.gaussians.bisect import bisect, gather_groups, split_errors
 from gsmerge.moments import Members, feature_to_gaussians, pool_members, to_gaussians
-from gsmerge.render.photos import scene_pictures
+from gsmerge.raster.photos import scene_pictures
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.merge import MergedViews
 from gsmerge.stages.superpixels import scene_saliency
-from gsmerge.types import FeatureGaussians, Gaussians, Scene, as_array
+from gsmerge.types import Decoded, FeatureGaussians, Gaussians, Scene, as_array
 
 if TYPE_CHECKING:
     from gsmerge.networks.apply import NetworkContext
@@ -103,17 +103,6 @@ def decode(
 
         gaussians = decode_gaussians(gaussians, parents, features, networks)
     return gaussians[gaussians.opacities >= options.min_opacity]
-
-
-@dataclass(frozen=True, eq=False)
-class Decoded:
-    """Start of a fit."""
-
-    gaussians: Gaussians  # Canonical Gaussians
-    count: int  # Number to which the fit may grow
-    exact: bool  # Whether that number is to be met
-    baseline_start: Gaussians | None = None  # Another start that the fit may beat instead
-    fixed: np.ndarray | None = None  # [n] bool, Gaussians that the fit leaves as they are; None: none
 
 
 def keep_all(scene: Scene, count: int | None) -> Decoded | None:

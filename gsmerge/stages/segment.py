@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 from gsmerge.budget import BudgetOptions, exact_count, max_allowed
 from gsmerge.errors import UsageError
-from gsmerge.render.photos import scene_pictures
+from gsmerge.raster.photos import scene_pictures
+from gsmerge.raster.seen import seen_depths
 from gsmerge.runtime.record import stage
-from gsmerge.stages.assign import seen_depths
 from gsmerge.stages.decode import DecodeOptions
 from gsmerge.stages.region_tree import RegionTree, auto_count, cut_tree, pixel_depths, region_tree
 from gsmerge.stages.superpixels import MAX_FACTOR, SegmentOptions, count_for, segment

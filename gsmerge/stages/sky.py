@@ -15,9 +15,9 @@ import numpy as np
 
 from gsmerge.geometry import correlation, project
 from gsmerge.kernels.pictures import blur, sobel
-from gsmerge.render import plan_view, prepare
-from gsmerge.render.photos import NEAR
-from gsmerge.render.weights import apply_transposed, view_weights
+from gsmerge.raster import plan_view, prepare
+from gsmerge.raster.photos import NEAR
+from gsmerge.raster.weights import apply_transposed, view_weights
 from gsmerge.types import Cameras, Gaussians
 
 SIDE = 480.0  # pixels of the longer side that gradients are measured for

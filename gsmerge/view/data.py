@@ -11,6 +11,8 @@ from pathlib import PurePosixPath
 import cv2
 import numpy as np
 
+from gsmerge.facts.prepare import Frame, scene_frame
+from gsmerge.facts.views import even_views
 from gsmerge.geometry import middle_depth
 from gsmerge.io.formats import spz
 from gsmerge.io.photo_files import encode_indexed
@@ -18,12 +20,10 @@ from gsmerge.measure.camera_path import outside_camera
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Progress, Quality, ResultScores, evaluate, near_plane
 from gsmerge.measure.fog import ALL, Fog
 from gsmerge.measure.preview import OUTSIDE, Picture, borders, mean_colors, to_picture
-from gsmerge.render import render
+from gsmerge.raster import render
 from gsmerge.runtime.threads import use_threads
-from gsmerge.stages.prepare import Frame, scene_frame
 from gsmerge.stages.superpixels import SegmentOptions, segment
 from gsmerge.types import Cameras, Gaussians, Scene, Views
-from gsmerge.views import even_views
 
 MAX_VIEWS = 32  # of more, some at equal intervals: each takes up to 300 kB
 WEBP_QUALITY = 90  # stills are within 1 dB of the scores of lossless ones

@@ -19,8 +19,8 @@ import tomllib
 
 import gsmerge
 from gsmerge.io.formats import spz
-from gsmerge.native.build import find_platform
-from gsmerge.render.cuda import INSTALL
+from gsmerge.kernels.build import find_platform
+from gsmerge.raster.cuda import INSTALL
 from gsmerge.research.charts import INSTALL_HINT
 
 pytest.importorskip("setuptools", minversion="77")
@@ -80,7 +80,7 @@ def test_the_wheel_holds_the_library_of_its_platform(built: Path) -> None:
     assert wheel.name == f"gsmerge-{gsmerge.__version__}-py3-none-{tag}.whl"
     here = find_platform()
     libraries = {name for name in zipfile.ZipFile(wheel).namelist() if "/kernels-" in name}
-    assert libraries == {f"gsmerge/native/{here.library_name(target)}" for target in here.targets}
+    assert libraries == {f"gsmerge/kernels/{here.library_name(target)}" for target in here.targets}
     (archive,) = (built / "dist").glob("*.tar.gz")
     with tarfile.open(archive) as file:
         assert [name for name in file.getnames() if "/kernels-" in name] == []

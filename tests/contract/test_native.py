@@ -5,7 +5,7 @@ import pkgutil
 import re
 
 import gsmerge.kernels
-from gsmerge.native.build import FOLDER
+from gsmerge.kernels.build import FOLDER
 
 
 def functions():

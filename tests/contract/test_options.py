@@ -17,12 +17,12 @@ from gsmerge.batch import BatchOptions
 from gsmerge.cli import main
 from gsmerge.cli.app import app
 from gsmerge.cli.parameters import HINTS, OPTIONS, setting_kinds
-from gsmerge.io import ReadHints
 from gsmerge.measure.evaluate import NETS
 from gsmerge.online.options import OnlineOptions
 from gsmerge.research.generate import GenerateOptions
 from gsmerge.research.training import preset_options
 from gsmerge.runtime.cluster import ENGINES
+from gsmerge.scene.exporters import ReadHints
 
 COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 SETTINGS = gsmerge.CompactOptions().to_dict()

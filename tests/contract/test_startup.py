@@ -61,7 +61,7 @@ def test_compacting_loads_neither_torch_nor_scipy(settings: list[str], made_scen
     The scene counts as a large one, for which a GPU would be taken.
     """
     arguments = ["compact", str(made_scene), "-o", str(tmp_path / "small.ply"), *settings]
-    large = "import gsmerge.gpu\ngsmerge.gpu.MIN_PIXELS, gsmerge.gpu.has_driver = 0, lambda: False\n"
+    large = "import gsmerge.fit.gpu\ngsmerge.fit.gpu.MIN_PIXELS, gsmerge.fit.gpu.has_driver = 0, lambda: False\n"
     code = f"{large}from gsmerge.cli import main\nassert main({arguments!r}) == 0\nimport sys\n"
     modules = set(run_python(f"{code}print(*sys.modules)").splitlines()[-1].split())
     heavy = ("linalg", "ndimage", "optimize", "spatial", "sparse")
@@ -86,9 +86,9 @@ def test_naming_a_device_loads_no_torch() -> None:
 
 
 def test_submodule_imports_do_not_hide_functions() -> None:
-    """The modules render and inspect share their names with the functions that they hold."""
+    """Modules may share their names with public functions, but not at the top."""
     print_kinds = "print(type(gsmerge.render).__name__, type(gsmerge.inspect).__name__)"
-    assert run_python(f"import gsmerge.render, gsmerge.measure.inspect\n{print_kinds}").split() == [
+    assert run_python(f"import gsmerge.raster, gsmerge.measure.inspect\n{print_kinds}").split() == [
         "function",
         "function",
     ]

@@ -14,7 +14,7 @@ from tiny_scene import edited_json
 
 import gsmerge
 from gsmerge.cli import main
-from gsmerge.compact_file import NO_PHOTOS
+from gsmerge.compaction.files import NO_PHOTOS
 
 from .conftest import Run, assert_refused, listing
 

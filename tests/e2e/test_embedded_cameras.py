@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import gsmerge
-from gsmerge.io import load_scene, read_cameras
+from gsmerge.io import read_cameras
+from gsmerge.scene.read import load_scene
 
 from .conftest import Run
 

@@ -19,8 +19,8 @@ import numpy as np
 import pytest
 
 import gsmerge
-from gsmerge import gpu
 from gsmerge.errors import OUT_OF_MEMORY, SceneError
+from gsmerge.fit import gpu
 from gsmerge.io import write_gaussians
 
 from .conftest import Run, assert_refused, listing
@@ -51,7 +51,7 @@ class Broken:
 def test_failures_inside_the_work(
     error: BaseException, code: int, line: str, scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gsmerge.compact_file.compact", Broken(error))
+    monkeypatch.setattr("gsmerge.compaction.files.compact", Broken(error))
     before = listing(scene_copy)
     outcome = run("compact", scene_copy, "--quiet")
     assert (outcome.code, outcome.err, outcome.out) == (code, line, "")
@@ -100,7 +100,7 @@ def test_a_scene_of_points_without_size_leaves_no_file(scene_copy: Path, run: Ru
 
 
 def test_debug_shows_the_traceback(scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gsmerge.compact_file.compact", Broken(KeyError("lost")))
+    monkeypatch.setattr("gsmerge.compaction.files.compact", Broken(KeyError("lost")))
     outcome = run("compact", scene_copy, "--quiet", "--debug", code=1)
     assert outcome.err.startswith("Traceback (most recent call last):")
     assert "Traceback" not in run("compact", scene_copy, "--quiet").err  # and is forgotten by the next call
@@ -119,7 +119,7 @@ def test_failures_while_writing_leave_nothing(
     if command == "decode":
         given = scene_copy / "kept.gsm"
         assert run("encode", scene_copy, "-o", given, *quick).code == 0
-    for place in ("gsmerge.compact_file", "gsmerge.io"):
+    for place in ("gsmerge.compaction.files", "gsmerge.io"):
         monkeypatch.setattr(f"{place}.write_gaussians", half)
     monkeypatch.setattr("gsmerge.encoded.gsm_file.save_encoded", half)
     before = listing(scene_copy)
@@ -164,8 +164,8 @@ def test_several_outputs_are_all_there_or_none(
     def no_room(*_: object) -> str:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("gsmerge.compact_file.write_gaussians", full)
-    monkeypatch.setattr("gsmerge.compact_file.to_json", no_room)
+    monkeypatch.setattr("gsmerge.compaction.files.write_gaussians", full)
+    monkeypatch.setattr("gsmerge.compaction.files.to_json", no_room)
     before = listing(scene_copy)
     where = [scene_copy / word if isinstance(word, str) and word.endswith("json") else word for word in more]
     quick = ("--superpixels", 40, "--fit", "none")
@@ -203,7 +203,7 @@ def test_a_signal_in_a_callback_is_not_lost(
         while time.monotonic() < deadline:
             time.sleep(0.001)
 
-    monkeypatch.setattr("gsmerge.compact_file.compact", busy)
+    monkeypatch.setattr("gsmerge.compaction.files.compact", busy)
     outcome = run("compact", scene_copy, code=code)
     assert outcome.err == f"gsmerge: error: {'interrupted' if code == 130 else f'ended by {name}'}\n"
     assert not (scene_copy / "scene.compact.ply").exists()
@@ -220,7 +220,7 @@ def test_a_signal_that_a_library_makes_an_error_of(
         except KeyboardInterrupt as interrupt:
             raise error from interrupt
 
-    monkeypatch.setattr("gsmerge.compact_file.compact", compact)
+    monkeypatch.setattr("gsmerge.compaction.files.compact", compact)
     outcome = run("compact", scene_copy, code=code)
     assert outcome.err == f"gsmerge: error: {'interrupted' if code == 130 else f'ended by {name}'}\n"
 
@@ -229,7 +229,9 @@ def test_a_signal_that_a_library_makes_an_error_of(
 def test_an_ignored_signal_stays_ignored(scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """As under nohup."""
     seen = []
-    monkeypatch.setattr("gsmerge.compact_file.compact", lambda *_, **__: seen.append(signal.getsignal(signal.SIGHUP)))
+    monkeypatch.setattr(
+        "gsmerge.compaction.files.compact", lambda *_, **__: seen.append(signal.getsignal(signal.SIGHUP))
+    )
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         run("compact", scene_copy, "--quiet")

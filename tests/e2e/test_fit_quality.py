@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import gsmerge
-from gsmerge.pipeline import CompactResult
+from gsmerge.compaction.result import CompactResult
 
 Measure = Callable[[Path, Path], float]
 NUM_VIEWS = 5

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from gsmerge import read_ply
-from gsmerge.options import METHODS
+from gsmerge.options import method_names
 
 from .conftest import Run, listing
 
@@ -35,7 +35,7 @@ def program(folder: Path, text: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", method_names())
 def test_every_method_writes_a_ply(
     method: str, made_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -109,7 +109,7 @@ def test_missing_photos_are_one_line(scene_copy: Path, run: Run) -> None:
     assert "method unmerged-fit: expected photos, found none; give --images" in said.err
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", method_names())
 def test_a_plan_names_the_method(
     method: str, made_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -14,7 +14,7 @@ from floors import nudged
 import gsmerge
 from gsmerge.io import read_images
 from gsmerge.measure.sizes import resize_photo, zoom_cameras
-from gsmerge.render.metrics import psnr
+from gsmerge.raster.metrics import psnr
 from gsmerge.research.generate import GenerateOptions, NoiseOptions, generate_scene
 
 Floor = Callable[..., None]

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gsmerge.native.library import _able_targets
+from gsmerge.kernels.library import _able_targets
 
 TARGETS = [target.name for target in _able_targets()]
 SETTINGS = {

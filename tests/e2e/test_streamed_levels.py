@@ -85,7 +85,7 @@ def test_a_run_that_fails_leaves_no_folder(
     def fail(*_: object) -> Any:
         raise gsmerge.errors.SceneError(made_scene, "expected luck, found none")
 
-    monkeypatch.setattr("gsmerge.compact_file.viewer_cameras", fail)  # when all chunks are written
+    monkeypatch.setattr("gsmerge.compaction.files.viewer_cameras", fail)  # when all chunks are written
     assert run("compact", made_scene, "-o", index, *QUICK).code == 3
     assert not index.parent.exists()
     assert cli.main(["compact", str(made_scene), "-o", str(index.parent / "deep" / "lod-meta.json")]) == 3

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from network_fixtures import SMALL, noisy, written
 
-from gsmerge.cli.train_command import find_training_scenes
 from gsmerge.networks.checkpoint import load_checkpoint
+from gsmerge.research.commands.train_command import find_training_scenes
 from gsmerge.research.training import Example, TrainOptions
 from gsmerge.research.training.examples import make_examples
 from gsmerge.research.training.losses import render_window, window_psnr

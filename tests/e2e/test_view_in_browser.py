@@ -16,7 +16,7 @@ import gsmerge
 from gsmerge.geometry import middle_depth, rotmat_to_quat
 from gsmerge.measure.camera_path import outside_camera
 from gsmerge.measure.evaluate import near_plane
-from gsmerge.render.metrics import psnr
+from gsmerge.raster.metrics import psnr
 
 from .browser import CHROMIUM, Browser, browser
 

@@ -18,7 +18,7 @@ import torch
 
 from gsmerge.cli import main
 from gsmerge.errors import TORCH_INSTALL
-from gsmerge.gpu import NO_TORCH
+from gsmerge.fit.gpu import NO_TORCH
 from gsmerge.measure import lpips
 
 Call = Callable[..., subprocess.CompletedProcess[str]]
@@ -138,7 +138,7 @@ except gsmerge.GsmergeError as error:
 
 @pytest.mark.parametrize("device", ["cuda", "auto"])
 def test_a_gpu_that_was_asked_for_is_named_in_a_note(device: str, call: Call) -> None:
-    code = f"""import sys, gsmerge.gpu as gpu
+    code = f"""import sys, gsmerge.fit.gpu as gpu
 from gsmerge.cli import main
 gpu.MIN_PIXELS, gpu.has_driver = 0, lambda: True
 sys.exit(main(["compact", "scene", *{FEW!r}, "--device", "{device}", "-o", "new.ply"]))

@@ -14,8 +14,8 @@ from scenes import psnr_of
 
 import gsmerge
 from gsmerge import Scene
-from gsmerge.render.metrics import MAX_LOSS
-from gsmerge.views import subset
+from gsmerge.facts.views import subset
+from gsmerge.raster.metrics import MAX_LOSS
 
 from .conftest import Run
 

@@ -15,9 +15,10 @@ import pytest
 from tiny_scene import edited_json
 
 from gsmerge.geometry import pose_changes
-from gsmerge.io import load_scene, write_gaussians
+from gsmerge.io import write_gaussians
 from gsmerge.io.cameras.json_files import write_transforms
 from gsmerge.io.cameras.read import read_cameras
+from gsmerge.scene.read import load_scene
 
 from .conftest import Run
 

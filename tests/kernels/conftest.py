@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 import pytest
 
-from gsmerge.native.library import _able_targets, load_library
+from gsmerge.kernels.library import _able_targets, load_library
 
 Function = Callable[[], Sequence[np.ndarray]]
 

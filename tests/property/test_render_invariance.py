@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from gsmerge import Cameras, Gaussians
 from gsmerge.geometry import normalize, quat_to_rotmat
-from gsmerge.render import composite, contributions, plan_view, prepare, render, splat_adjoint
-from gsmerge.render.metrics import psnr
+from gsmerge.raster import composite, contributions, plan_view, prepare, render, splat_adjoint
+from gsmerge.raster.metrics import psnr
 from gsmerge.runtime.threads import use_threads
 
 WIDTH, HEIGHT = 70, 50

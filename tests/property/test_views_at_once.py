@@ -10,10 +10,10 @@ import scenes
 import unaligned_scenes
 
 from gsmerge import Scene, compact
+from gsmerge.fit import FitOptions
+from gsmerge.fit.color import draw, fit_colors
 from gsmerge.moments import scene_members
-from gsmerge.render.photos import scene_photos
-from gsmerge.stages.fit import FitOptions
-from gsmerge.stages.fit.color import draw, fit_colors
+from gsmerge.raster.photos import scene_photos
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,8 @@ import pytest
 import scenes
 
 from gsmerge import Scene
+from gsmerge.facts.prepare import scene_frame
 from gsmerge.moments import scene_members
-from gsmerge.stages.prepare import scene_frame
 
 UTM = np.array([4e5, 5e6, 120.0])
 

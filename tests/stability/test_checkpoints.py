@@ -13,8 +13,8 @@ from scenes import arc, assert_invariants, identical, make_scene, room
 from unaligned_scenes import shuffled
 
 import gsmerge
-from gsmerge.networks.modules import Networks
 from gsmerge.networks.options import Bounds
+from gsmerge.research.training.modules import Networks
 from gsmerge.types import SH_C0
 
 PLAIN = {"fit": "none", "match": "none", "superpixels": 100}

@@ -9,9 +9,9 @@ import pytest
 import scenes
 
 from gsmerge import Gaussians, Scene
-from gsmerge.render.photos import scene_photos
-from gsmerge.stages.fit import FitOptions
-from gsmerge.stages.fit.color import draw, fit_colors
+from gsmerge.fit import FitOptions
+from gsmerge.fit.color import draw, fit_colors
+from gsmerge.raster.photos import scene_photos
 from gsmerge.types import SH_C0
 
 

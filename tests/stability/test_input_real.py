@@ -9,7 +9,7 @@ from types import ModuleType
 import pytest
 from scripts import load_script
 
-from gsmerge.io import load_scene
+from gsmerge.scene.read import load_scene
 
 
 def shared_folder(root: Path) -> Path:

@@ -12,7 +12,7 @@ import scenes
 import unaligned_scenes
 
 from gsmerge import Gaussians, Scene, compact, render
-from gsmerge.pipeline import CompactResult
+from gsmerge.compaction.result import CompactResult
 
 
 @pytest.fixture(scope="module")

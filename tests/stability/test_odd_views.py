@@ -9,7 +9,7 @@ import pytest
 import scenes
 
 from gsmerge import Cameras, Scene
-from gsmerge.views import concat_cameras
+from gsmerge.facts.views import concat_cameras
 
 
 @pytest.fixture(scope="module")

@@ -10,9 +10,9 @@ import pytest
 import scenes
 
 from gsmerge import CompactResult, Gaussians, Scene, compact
+from gsmerge.facts.prepare import PrepareOptions, prepare
 from gsmerge.geometry import rgb_to_sh0, sh0_to_rgb
 from gsmerge.online.extend import extend
-from gsmerge.stages.prepare import PrepareOptions, prepare
 
 Photos = np.ndarray
 Change = Callable[[Photos], Photos]

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsmerge import Cameras, Gaussians
-from gsmerge.render import composite, contributions, plan_view, prepare, render, splat_adjoint
+from gsmerge.raster import composite, contributions, plan_view, prepare, render, splat_adjoint
 
 EXTREMES = [0.0, 1e-30, 1e-8, 0.01, 0.0100001, 0.5, 1.0, 3.0, 1e3, 1e8, 1e20, 1e30]
 

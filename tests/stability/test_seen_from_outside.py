@@ -10,9 +10,9 @@ import pytest
 import scenes
 
 from gsmerge import Gaussians, Scene
+from gsmerge.facts.views import concat_cameras
 from gsmerge.measure.fog import HAZE, measure_fog
 from gsmerge.types import grid_ids
-from gsmerge.views import concat_cameras
 
 SIZE = (112, 84)
 

@@ -11,8 +11,8 @@ import pytest
 import scenes
 
 from gsmerge import CompactResult, Gaussians, Scene, compact
-from gsmerge.stages.compare_photos import odd_photos, show_photos
-from gsmerge.stages.fit import FitOptions, fit_photos
+from gsmerge.facts.compare_photos import odd_photos, show_photos
+from gsmerge.fit import FitOptions, fit_photos
 
 Photos = np.ndarray
 VIEWS = 6

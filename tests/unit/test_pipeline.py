@@ -48,7 +48,7 @@ def test_the_input_is_scored_as_its_file_has_it(scene: Scene) -> None:
 
 def test_many_views_are_scored_by_some(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of both the same ones, and it is said."""
-    monkeypatch.setattr("gsmerge.views.REPORT_VIEWS", 1)
+    monkeypatch.setattr("gsmerge.facts.views.REPORT_VIEWS", 1)
     result = scenes.compacted(scene, fit="none")
     some = scenes.take_views(scene, [1])
     assert result.report.psnr_before == pytest.approx(scenes.psnr_of(scene.gaussians, some), abs=0.1)

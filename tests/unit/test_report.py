@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from gsmerge import report
-from gsmerge.pipeline import CompactOptions
-from gsmerge.result import CompactReport
+from gsmerge.compaction.result import CompactReport
+from gsmerge.options import CompactOptions
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import cv2
 import numpy as np
@@ -30,6 +30,9 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL camera axes (y up, z backward) 
 
 MAX_NORMALISED_FOCAL = 10.0  # a longer one is in pixels; and no image is that small
 
+# Of the rows of a file, which a file of cameras may name
+Order = Literal["auto", "view-major", "view-fastest", "layer-major", "column-major", "unordered", "none"]
+ORDERS: tuple[str, ...] = get_args(Order)
 # How a format stores poses: direction of the matrix, and the camera's axes.
 Convention = tuple[str, str]
 W2C_OPENCV: Convention = ("world-to-camera", "OpenCV")

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import normalize
-from gsmerge.io.alignment import Similarity
+from gsmerge.geometry import Similarity, normalize
 from gsmerge.io.bounds import read_json, read_text
 from gsmerge.io.cameras.camera_file import (
     C2W_OPENCV,

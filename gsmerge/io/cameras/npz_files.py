@@ -18,9 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.io.alignment import ORDERS
 from gsmerge.io.bounds import check_file, check_pixels
-from gsmerge.io.cameras.camera_file import C2W_OPENCV, W2C_OPENCV, CameraFile, View, make_camera_file
+from gsmerge.io.cameras.camera_file import C2W_OPENCV, ORDERS, W2C_OPENCV, CameraFile, View, make_camera_file
 
 _EXTRINSICS, _INTRINSICS = ("extrinsics", "exts", "extrinsic"), ("intrinsics", "ixts", "intrinsic")
 _IMAGES, _DEPTHS = ("image", "images"), ("depth", "depths")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.native.signature import STATUS, f4, f8, i4, i8, native
+from gsmerge.kernels.signature import STATUS, f4, f8, i4, i8, native
 
 
 @native(

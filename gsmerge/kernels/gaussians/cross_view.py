@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gsmerge.native.signature import STATUS, f4, f8, i8, native
+from gsmerge.kernels.signature import STATUS, f4, f8, i8, native
 
 COLUMNS = 6
 

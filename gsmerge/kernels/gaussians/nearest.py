@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.native.signature import STATUS, f8, i1, i8, native
+from gsmerge.kernels.signature import STATUS, f8, i1, i8, native
 
 LEAF = 16  # points up to which a run is not divided
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.native.signature import STATUS, f4, i4, i8, native
+from gsmerge.kernels.signature import STATUS, f4, i4, i8, native
 
 # columns of the state: mean 3, log scale 3, quaternion 4, opacity logit 1, colour 3
 MEAN, SIZE, QUAT, LOGIT, COLOR, COLUMNS = 0, 3, 6, 10, 11, 14

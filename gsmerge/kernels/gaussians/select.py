@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gsmerge.native.signature import STATUS, f8, i8, native
+from gsmerge.kernels.signature import STATUS, f8, i8, native
 
 
 @native(STATUS, values=f8("n"), order=i8("m", out=True, least=0, below="n"), low=i8(least=0), high=i8(), place=i8())

@@ -5,7 +5,7 @@ Arrays are float32. Corrections have 13 columns, see :mod:`gsmerge.networks.corr
 
 from __future__ import annotations
 
-from gsmerge.native.signature import f4, i8, native
+from gsmerge.kernels.signature import f4, i8, native
 
 
 @native(

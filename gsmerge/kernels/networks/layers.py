@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.native.signature import STATUS, f4, i8, native, u1
+from gsmerge.kernels.signature import STATUS, f4, i8, native, u1
 
 LANES = 16  # floats of a vector; weights are filled up to whole ones
 PLAIN, GELU, TANH = range(3)  # activations of dense layers

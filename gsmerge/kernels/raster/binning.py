@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.native.signature import STATUS, i2, i4, i8, native, u4, u8
+from gsmerge.kernels.signature import STATUS, i2, i4, i8, native, u4, u8
 
 
 @native(bits=u4("m"), order=i4("m", out=True), keys=u8("m", out=True), spare=u8("m", out=True))

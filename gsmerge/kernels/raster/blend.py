@@ -1,12 +1,12 @@
 """Front-to-back blending of one view, tile by tile, and sums over its blending weights.
 
-All kernels here walk the same lists with the same weights, see ``gsmerge/native/walk.h``.
+All kernels here walk the same lists with the same weights, see ``gsmerge/kernels/raster/walk.h``.
 """
 
 from __future__ import annotations
 
 from gsmerge.kernels.raster.project import FOOTPRINT
-from gsmerge.native.signature import STATUS, f4, i4, i8, native
+from gsmerge.kernels.signature import STATUS, f4, i4, i8, native
 
 CHANNELS = 4  # channels that one walk of weighted_sums adds up
 MAX_ALPHA = 0.99  # largest share of the light that one Gaussian takes (gsplat)

@@ -1,13 +1,13 @@
 """The backward pass of blending: what a loss wants of every Gaussian's footprint and colour.
 
 Sums over a tile go to one row per intersection and are then added up in the order of the lists: nothing is shared
-between threads, and no result depends on them. The formula is in ``gsmerge/native/blend_backward.c``.
+between threads, and no result depends on them. The formula is in ``gsmerge/kernels/raster/blend_backward.c``.
 """
 
 from __future__ import annotations
 
 from gsmerge.kernels.raster.blend import LISTS, TILES
-from gsmerge.native.signature import STATUS, f4, i4, i8, native
+from gsmerge.kernels.signature import STATUS, f4, i4, i8, native
 
 # Numbers per Gaussian: the sums of w g (3), of v = d loss / d exponent, and of v times x, y, xx, xy, yy, where x, y
 # is the pixel less the Gaussian's mean.

@@ -11,7 +11,7 @@ import numpy as np
 
 from gsmerge.kernels.raster.blend import LISTS
 from gsmerge.kernels.raster.project import FOOTPRINT, TILE
-from gsmerge.native.signature import STATUS, f4, f8, i4, i8, native
+from gsmerge.kernels.signature import STATUS, f4, f8, i4, i8, native
 
 FIRST_PAIRS = 1 << 16  # room for pairs of Gaussian and superpixel to begin with
 PAIR = 3  # numbers of a pair: label, sum, the next pair of the same Gaussian or -1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gsmerge.native.signature import STATUS, f4, i4, i8, native
+from gsmerge.kernels.signature import STATUS, f4, i4, i8, native
 
 
 @native(

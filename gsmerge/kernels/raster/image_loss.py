@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.native.signature import STATUS, f4, i8, native
+from gsmerge.kernels.signature import STATUS, f4, i8, native
 
 SIDE = 7  # of the windows, pixels
 C1, C2 = np.float32(1e-4), np.float32(9e-4)  # SSIM's constants for a data range of 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsmerge.kernels.raster import blend
-from gsmerge.native.signature import STATUS, f4, f8, i4, i8, native, u1
+from gsmerge.kernels.signature import STATUS, f4, f8, i4, i8, native, u1
 
 LANES = 4  # channels of an image row
 FIRST_ENTRIES = 40  # entries for each pixel that there is room for to begin with

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.native.signature import STATUS, f4, i2, i4, i8, native, u1
+from gsmerge.kernels.signature import STATUS, f4, i2, i4, i8, native, u1
 
 TILE = 16  # pixels per side; one row of a tile is one AVX-512 vector
 FOOTPRINT = 8  # numbers per footprint: mean_x, mean_y, rate_x, slope, rate_y, lnop, first row, last row

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from gsmerge.kernels.raster.blend_backward import SUMS
 from gsmerge.kernels.raster.project import CAMERA
-from gsmerge.native.signature import STATUS, f4, i4, i8, native
+from gsmerge.kernels.signature import STATUS, f4, i4, i8, native
 
 BLOCK = 128
 POSE = 12  # numbers of a world-to-camera matrix: rotation (9, row by row), shift (3)

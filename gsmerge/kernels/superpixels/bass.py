@@ -11,8 +11,8 @@ import math
 
 import numpy as np
 
+from gsmerge.kernels.signature import COUNT, STATUS, f4, f8, i4, native, u1
 from gsmerge.kernels.superpixels.split_merge import merge, split
-from gsmerge.native.signature import COUNT, STATUS, f4, f8, i4, native, u1
 
 COLOUR_DEVIATION = 0.018 / 2  # CIELAB / 100
 NUM_PASSES = 4  # label passes per update of the parameters

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.native.signature import COUNT, STATUS, f4, f8, i4, i8, native
+from gsmerge.kernels.signature import COUNT, STATUS, f4, f8, i4, i8, native
 
 NUM_BUCKETS = 2048  # lists of cuts of about the same gain
 NODE = 8  # columns of a rectangle's row

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.native.signature import STATUS, f4, f8, i4, i8, native, u1
+from gsmerge.kernels.signature import STATUS, f4, f8, i4, i8, native, u1
 
 NUM_PIXELS, PLANE_ERROR, ROW = 5, 15, 20  # columns of a row after the mean, and its length
 SLOPE_RIDGE = 1e-3  # square pixels; holds the slopes of planes through fewer than three points

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.native.signature import STATUS, f4, f8, i4, native
+from gsmerge.kernels.signature import STATUS, f4, f8, i4, native
 
 NUM_PIXELS, ROW = 5, 8  # column after the five of the mean, and the length of a row
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from gsmerge.native.signature import STATUS, f4, f8, i4, i8, native, u1
+from gsmerge.kernels.signature import STATUS, f4, f8, i4, i8, native, u1
 
 DENSITY_FLOOR = 0.3  # share of the seeds that is spread evenly
 JITTER = 0.3  # width of the noise on the dithering threshold, against worm patterns

@@ -14,8 +14,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsmerge.kernels.signature import STATUS, f4, f8, i4, i8, native, u1
 from gsmerge.kernels.superpixels.ward import adjacent_pairs
-from gsmerge.native.signature import STATUS, f4, f8, i4, i8, native, u1
 
 SUMS = 7  # columns of a region's sums: pixels, colours (3), squared colours (3)
 

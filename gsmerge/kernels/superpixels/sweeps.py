@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsmerge.kernels.signature import COUNT, f4, i4, i8, native, u1
 from gsmerge.kernels.superpixels.regions import NUM_PIXELS, ROW, region_rows
-from gsmerge.native.signature import COUNT, f4, i4, i8, native, u1
 
 LEAVE, JOIN = 6, 7  # columns of a region's row: n / (n - 1) for a pixel that leaves, n / (n + 1) for one that joins
 

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsmerge.kernels.signature import COUNT, STATUS, f4, i4, i8, native, u1
 from gsmerge.kernels.superpixels.regions import NUM_PIXELS, ROW, region_rows
-from gsmerge.native.signature import COUNT, STATUS, f4, i4, i8, native, u1
 
 INVERSE, HEIGHT = 6, 7  # columns of a region's row: 1 / n, and the cost at which it came to be
 NUM_SAMPLES = 4096  # edges whose costs tell where to put the first ceiling

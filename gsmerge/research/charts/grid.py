@@ -13,16 +13,16 @@ from typing import Any
 
 from gsmerge.batch.find import Job, find_scenes, main_file
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.io import find_scene_files
 from gsmerge.io.bounds import read_table
 from gsmerge.io.cameras.colmap import is_colmap
 from gsmerge.io.cameras.read import find_cameras
-from gsmerge.io.content_hash import cameras_of, content_hash, digest, filled, photos_of, read_files, stem_of
 from gsmerge.io.formats.ply_file import header_counts
 from gsmerge.measure.evaluate import EvaluateOptions
 from gsmerge.options import CompactOptions
 from gsmerge.research.charts.lines import ONE_SIZE
 from gsmerge.research.charts.measure_run import INPUT, OURS, SUPERPIXELS, ChartRun, RunRecord, describe
+from gsmerge.scene.content_hash import cameras_of, content_hash, digest, filled, photos_of, read_files, stem_of
+from gsmerge.scene.files import find_scene_files
 
 ALL = "all"  # word for all views
 OWN_OPTIONS = {"method": "--methods", "seed": "--seed", "threads": "--threads"}  # that set the same
@@ -133,19 +133,17 @@ def list_settings(grid: Grid) -> tuple[list[tuple[str, dict[str, Any]]], list[st
 
 def _options_of(method: str, settings: Mapping[str, Any], seed: int) -> CompactOptions:
     """Make the options of a run; a UsageError if the library does not take a setting, or a program is missing."""
-    from gsmerge.baselines import check_program, find_baseline
+    from gsmerge.compaction.methods import find_method
 
     own = {} if method in (OURS, INPUT) else {"method": method}
     try:
         options = CompactOptions().with_settings({**settings, **own, "seed": seed})
-        baseline = None if method == INPUT else find_baseline(method)
     except ValueError as error:
         raise UsageError(str(error)) from error
     except TypeError as error:  # text instead of a number
         given = ", ".join(f"{name}={value}" for name, value in settings.items())
         raise UsageError(f"{method}: expected settings that compact takes, got {given}") from error
-    if baseline is not None:
-        check_program(baseline)
+    find_method(options)
     return options
 
 

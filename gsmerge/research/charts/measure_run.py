@@ -22,8 +22,8 @@ import numpy as np
 from gsmerge import __version__
 from gsmerge.batch import BatchOptions
 from gsmerge.batch.records import FAILED, newest_records
-from gsmerge.io import HeldOutViews, ReadHints, SceneFiles, load_files, read_held_out
-from gsmerge.io.content_hash import digest
+from gsmerge.compaction.compact import compact
+from gsmerge.facts.views import even_views, midpoint_views, pick_views, subset
 from gsmerge.io.formats.ply import OpacityChoice
 from gsmerge.io.formats.writing import file_bytes
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, evaluate, near_plane
@@ -31,15 +31,18 @@ from gsmerge.measure.preview import Picture, draw_means, heat_map, save_picture,
 from gsmerge.measure.sizes import shrink_cameras
 from gsmerge.measure.speed import time_render
 from gsmerge.options import CompactOptions
-from gsmerge.pipeline import compact
-from gsmerge.render import render
-from gsmerge.render.metrics import psnr
+from gsmerge.raster import render
+from gsmerge.raster.metrics import psnr
 from gsmerge.report import document_head
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.threads import available_threads, parallel_map, use_threads
+from gsmerge.scene.content_hash import digest
+from gsmerge.scene.exporters import ReadHints
+from gsmerge.scene.files import SceneFiles
+from gsmerge.scene.held_out import HeldOutViews, read_held_out
+from gsmerge.scene.read import load_files
 from gsmerge.stages.superpixels import superpixels
 from gsmerge.types import Gaussians, Scene, Views
-from gsmerge.views import even_views, midpoint_views, pick_views, subset
 
 RECORD_VERSION = 1  # of what a run records; another version is run again
 OURS, SUPERPIXELS = "gsmerge", "superpixels"  # methods of runs, as INPUT (nothing is merged) and baselines

@@ -13,11 +13,11 @@ from typing import Literal
 import cv2
 import numpy as np
 
+from gsmerge.facts.align_views import move_views
+from gsmerge.facts.prepare import scene_frame
+from gsmerge.facts.views import even_views, subset
 from gsmerge.io.cameras.camera_file import CONVENTIONS
-from gsmerge.stages.align_views import move_views
-from gsmerge.stages.prepare import scene_frame
 from gsmerge.types import SH_C0, Cameras, Scene, Views, grid_ids
-from gsmerge.views import even_views, subset
 
 Needs = Literal["anything", "pixels", "photos", "file", "pixel-file"]
 Check = Literal["better", "same", "near", "once", "bits", "again", "convention", "moved", "refused"]

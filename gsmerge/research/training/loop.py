@@ -24,10 +24,10 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from gsmerge.errors import SceneError
+from gsmerge.facts.views import even_views
 from gsmerge.io.atomic import atomic_output
 from gsmerge.networks.checkpoint import save_checkpoint
 from gsmerge.networks.corrections import LOGIT
-from gsmerge.networks.modules import Head, Networks
 from gsmerge.research.training.examples import Example, draw_views, recolor
 from gsmerge.research.training.losses import (
     WindowLoss,
@@ -36,6 +36,7 @@ from gsmerge.research.training.losses import (
     target_scales,
     window_loss,
 )
+from gsmerge.research.training.modules import Head, Networks
 from gsmerge.research.training.predict import predict
 from gsmerge.research.training.processes import ALONE, Processes
 from gsmerge.research.training.shards import Shard, read_targets
@@ -44,7 +45,6 @@ from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.research.training.validation import Row, TrainingRun, validate
 from gsmerge.research.training.windows import sample_crop, sample_window
 from gsmerge.runtime.threads import parallel_map, use_threads
-from gsmerge.views import even_views
 
 Progress = Callable[[int, int, float], None]  # step, steps, loss
 FORMAT = "gsmerge-training"

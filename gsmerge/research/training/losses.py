@@ -14,19 +14,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsmerge.fit.loss import loss_ssim
 from gsmerge.moments import Members, pool_members, principal_axes
 from gsmerge.networks.corrections import ROTATION, residual_limits
-from gsmerge.networks.modules import Networks
 from gsmerge.networks.options import RESIDUAL
 from gsmerge.networks.tensors import gaussian_sizes, quat_to_rotmat, skew_vectors
-from gsmerge.render.autograd import render_tensors
-from gsmerge.render.photos import NEAR
+from gsmerge.raster.autograd import render_tensors
+from gsmerge.raster.photos import NEAR
+from gsmerge.research.training.modules import Networks
 from gsmerge.research.training.perceptual import lpips_loss
 from gsmerge.research.training.predict import Prediction, analytic_gaussians, crop_targets, match_crop, predict
 from gsmerge.research.training.targets import Targets, corrections_between, nearest_axes
 from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.research.training.windows import Crop, Window
-from gsmerge.stages.fit.loss import loss_ssim
 from gsmerge.stages.merge import take
 from gsmerge.types import Gaussians
 

@@ -17,7 +17,6 @@ from gsmerge.networks.apply import (
     refine_features,
     run_heads,
 )
-from gsmerge.networks.modules import Networks
 from gsmerge.networks.tensors import move_tensors
 from gsmerge.networks.tokens import GroupFeatures
 from gsmerge.research.training.geometry import (
@@ -31,6 +30,7 @@ from gsmerge.research.training.geometry import (
     move_feature_tensors,
     pool_tensors,
 )
+from gsmerge.research.training.modules import Networks
 from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.research.training.windows import Crop
 from gsmerge.stages.decode import divide

@@ -8,15 +8,15 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from gsmerge.facts.prepare import canonicalise
+from gsmerge.facts.views import concat_cameras, even_views, resize_cameras, subset
 from gsmerge.measure.sizes import resize_photo
 from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.moments import Members, scene_members
-from gsmerge.render import composite, plan_view, prepare
-from gsmerge.render.photos import NEAR, Photos, scene_photos
+from gsmerge.raster import composite, plan_view, prepare
+from gsmerge.raster.photos import NEAR, Photos, scene_photos
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.stages.prepare import canonicalise
 from gsmerge.types import Cameras, Scene, Views
-from gsmerge.views import concat_cameras, even_views, resize_cameras, subset
 
 OPAQUE = 0.5  # alpha from which the Gaussians cover a pixel
 

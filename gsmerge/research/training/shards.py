@@ -20,15 +20,15 @@ from safetensors.numpy import save
 
 from gsmerge import __version__
 from gsmerge.errors import SceneError
-from gsmerge.io import find_scene_files
 from gsmerge.io.atomic import atomic_output
-from gsmerge.io.content_hash import content_hash, digest, read_files
 from gsmerge.moments import Members
-from gsmerge.render.photos import Photos
+from gsmerge.raster.photos import Photos
 from gsmerge.research.training.examples import Example, make_examples, scene_name
 from gsmerge.research.training.processes import ALONE, Processes
 from gsmerge.research.training.targets import Targets
 from gsmerge.research.training.train_options import TrainOptions
+from gsmerge.scene.content_hash import content_hash, digest, read_files
+from gsmerge.scene.files import find_scene_files
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches
 
 Report = Callable[[str, int, int], None]  # what is done, step, steps

@@ -15,16 +15,16 @@ import torch
 from torch import Tensor
 
 from gsmerge.errors import SceneError
+from gsmerge.fit.fit_options import FitOptions
+from gsmerge.fit.full import fit_full
+from gsmerge.fit.stage import visible_mask
 from gsmerge.networks.options import RESIDUAL
 from gsmerge.networks.tensors import gaussian_sizes, quat_to_rotmat, rotate_vectors, skew_vectors
 from gsmerge.networks.tokens import compute_group_features
-from gsmerge.render.photos import Photos
+from gsmerge.raster.photos import Photos
 from gsmerge.research.training.scenes import TrainingScene, coverage, covered_pixels, reduced_masks
 from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.stages.decode import DecodeOptions, divide
-from gsmerge.stages.fit.fit_options import FitOptions
-from gsmerge.stages.fit.full import fit_full
-from gsmerge.stages.fit.stage import visible_mask
 from gsmerge.types import SH_C0, FeatureGaussians, Gaussians, as_tensor
 
 Progress = Callable[[int, int], None]  # step, steps

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge.errors import SceneError
+from gsmerge.fit.loss import LOSS_WINDOW
 from gsmerge.io.bounds import read_table
 from gsmerge.measure.lpips import require_lpips
 from gsmerge.networks.options import SLOTS, NetworkOptions
-from gsmerge.stages.fit.loss import LOSS_WINDOW
 from gsmerge.stages.match import MatchOptions
 from gsmerge.stages.superpixels import SegmentOptions
 

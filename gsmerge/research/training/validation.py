@@ -12,9 +12,9 @@ from torch import Tensor
 
 from gsmerge.measure.preview import save_picture, to_picture
 from gsmerge.networks.corrections import COLOR, LOGIT, MEAN, ROTATION, SIZE
-from gsmerge.networks.modules import Networks
 from gsmerge.research.training.examples import Example, draw_views
 from gsmerge.research.training.losses import correction_loss, render_window, scaled_corrections, window_psnr
+from gsmerge.research.training.modules import Networks
 from gsmerge.research.training.predict import predict
 from gsmerge.research.training.processes import Processes
 from gsmerge.research.training.shards import Shard, read_shard

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsmerge.render import plan_view, prepare
-from gsmerge.render.photos import NEAR, Photos
+from gsmerge.raster import plan_view, prepare
+from gsmerge.raster.photos import NEAR, Photos
 from gsmerge.research.training.examples import Example
 from gsmerge.types import Cameras
 
@@ -142,7 +142,7 @@ def _whole_clusters(example: Example, chosen: np.ndarray) -> np.ndarray:
 
 
 def box_camera(photos: Photos, photo: int, box: Box) -> dict[str, Any]:
-    """Make the camera whose image is a part of a photo, as arguments of :func:`gsmerge.render.plan_view`."""
+    """Make the camera whose image is a part of a photo, as arguments of :func:`gsmerge.raster.plan_view`."""
     K = photos.Ks[photo].copy()
     K[:2, 2] -= box.left, box.top
     return {**photos.camera(photo), "K": K, "width": box.width, "height": box.height}

@@ -22,9 +22,9 @@ from gsmerge.kernels.networks.layers import (
     scratch_size,
 )
 from gsmerge.networks.checkpoint import IN_PACKAGE, load_checkpoint
-from gsmerge.networks.modules import Networks
 from gsmerge.networks.options import GROUP, MEMBER, PART, SLOTS, NetworkOptions, weight_shapes
 from gsmerge.networks.weights import NetworkWeights
+from gsmerge.research.training.modules import Networks
 from gsmerge.runtime.threads import parallel_map, use_threads
 
 SHAPES = [(0, 3, 2), (1, 1, 1), (1, 5, 3), (5, 16, 16), (7, 48, 48), (13, 19, 50), (6, 0, 4)]

@@ -8,7 +8,7 @@ import numpy as np
 from slow_renderer import turned_cameras
 
 from gsmerge import Gaussians
-from gsmerge.render import ViewPlan, plan_view, prepare
+from gsmerge.raster import ViewPlan, plan_view, prepare
 
 
 def plan_of(gaussians: Gaussians, **options: Any) -> ViewPlan:

@@ -10,8 +10,8 @@ from made_gaussians import random_gaussians
 from slow_renderer import Reference, render_arrays
 
 from gsmerge import Cameras, Gaussians
-from gsmerge.render import composite, contributions, plan_view, prepare, render, splat_adjoint
-from gsmerge.render.metrics import psnr
+from gsmerge.raster import composite, contributions, plan_view, prepare, render, splat_adjoint
+from gsmerge.raster.metrics import psnr
 
 WIDTH, HEIGHT = 45, 37  # not multiples of a tile
 

@@ -13,8 +13,8 @@ from plan_gradients_of import assert_near, full, normal, plan_of
 from slow_renderer import BACKGROUND, HEIGHT, WIDTH, random_gaussians, render_reference, turned_cameras
 
 from gsmerge import Gaussians
-from gsmerge.render import ViewPlan, composite, plan_view, prepare
-from gsmerge.render.gradient import (
+from gsmerge.raster import ViewPlan, composite, plan_view, prepare
+from gsmerge.raster.gradient import (
     Gradients,
     color_gradients,
     plan_gradients,
@@ -97,8 +97,8 @@ def test_finite_differences() -> None:
 
 @pytest.mark.parametrize("threads", [2, 8])
 def test_threads_change_nothing(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys.modules["gsmerge.render.view_plan"], "PIECE", 200)
-    monkeypatch.setattr(sys.modules["gsmerge.render.gradient"], "WORTH", 200)
+    monkeypatch.setattr(sys.modules["gsmerge.raster.view_plan"], "PIECE", 200)
+    monkeypatch.setattr(sys.modules["gsmerge.raster.gradient"], "WORTH", 200)
     gaussians, cameras = random_gaussians(2000, 3, 10).numpy(), turned_cameras(1).numpy()
     gaussians = replace(gaussians, scales=gaussians.scales * 0.3)
     K, size = cameras.Ks[0] * [[4.0], [4.0], [1.0]], (4 * HEIGHT, 4 * WIDTH)

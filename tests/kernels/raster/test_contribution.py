@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 from slow_renderer import render_arrays
 
 from gsmerge.kernels.raster.contribution import FIRST_PAIRS
-from gsmerge.render import plan_view, prepare
+from gsmerge.raster import plan_view, prepare
 from gsmerge.stages.assign import find_owners, view_owners
 from gsmerge.stages.superpixels import superpixels
 from gsmerge.types import Cameras, Gaussians, Groups, Scene

@@ -13,7 +13,7 @@ from slow_renderer import (
 )
 
 from gsmerge.kernels.raster import harmonics
-from gsmerge.render.gradient import (
+from gsmerge.raster.gradient import (
     color_gradients,
 )
 

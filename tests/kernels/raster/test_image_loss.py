@@ -9,9 +9,9 @@ import pytest
 import torch
 from torch.nn.functional import avg_pool2d
 
+from gsmerge.fit.loss import image_gradient
 from gsmerge.kernels.raster import image_loss
 from gsmerge.kernels.raster.image_loss import C1, C2
-from gsmerge.stages.fit.loss import image_gradient
 
 SIZES = [(20, 17), (7, 7), (3, 5), (1, 9)]
 

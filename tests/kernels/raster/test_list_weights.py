@@ -11,8 +11,8 @@ from numpy.testing import assert_allclose
 from slow_renderer import render_arrays
 
 from gsmerge.geometry import quat_to_rotmat
-from gsmerge.render import ViewPlan, composite, plan_view, prepare, splat_adjoint
-from gsmerge.render.weights import ViewWeights, apply, apply_transposed, view_weights
+from gsmerge.raster import ViewPlan, composite, plan_view, prepare, splat_adjoint
+from gsmerge.raster.weights import ViewWeights, apply, apply_transposed, view_weights
 from gsmerge.types import Gaussians
 
 WIDTH, HEIGHT = 45, 37  # not multiples of a tile

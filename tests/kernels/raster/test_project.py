@@ -7,7 +7,7 @@ import torch
 from slow_renderer import footprints
 
 from gsmerge import Gaussians
-from gsmerge.render import plan_view, prepare
+from gsmerge.raster import plan_view, prepare
 
 
 def random_gaussians(n: int, seed: int, *, spread: float, depth: float, sizes: float) -> Gaussians:

@@ -252,7 +252,7 @@ def test_warnings_become_notes(scene: Path, out: Path, monkeypatch: pytest.Monke
 
 KILLS = {
     "while it reads": ("gsmerge.batch.task.scene_key", True),
-    "while it writes": ("gsmerge.compact_file.write_gaussians", False),
+    "while it writes": ("gsmerge.compaction.files.write_gaussians", False),
     "before the result is renamed": ("gsmerge.io.atomic._flush", True),
     "before the record": ("gsmerge.batch.task.append_line", True),
     "before the lock is gone": ("gsmerge.batch.task.Path.unlink", True),
@@ -313,7 +313,7 @@ def failing(code: int, where: Path) -> Any:
 def test_a_full_disk_fails_the_scene_and_leaves_nothing(
     scene: Path, out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gsmerge.compact_file.write_gaussians", failing(errno.ENOSPC, out))
+    monkeypatch.setattr("gsmerge.compaction.files.write_gaussians", failing(errno.ENOSPC, out))
     actual = run(scene, out)
     assert actual["status"] == FAILED
     assert "room.ply: could not be written (No space left on device)" in actual["error"]

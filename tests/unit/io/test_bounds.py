@@ -11,8 +11,8 @@ import pytest
 from gsmerge.errors import SceneError
 from gsmerge.io import bounds
 from gsmerge.io.bounds import check_file, check_pixels, read_table, read_text
-from gsmerge.io.content_hash import content_hash
 from gsmerge.io.image_names import list_images
+from gsmerge.scene.content_hash import content_hash
 
 
 def test_images_beyond_all_use_are_refused(tmp_path: Path) -> None:

@@ -16,10 +16,10 @@ from tiny_scene import Tiny, edited_json
 import gsmerge
 from gsmerge import Scene
 from gsmerge.errors import SceneError
-from gsmerge.io import load_scene
-from gsmerge.render.metrics import psnr
+from gsmerge.fit.photo_sizes import large_photos, largest_scale
+from gsmerge.raster.metrics import psnr
 from gsmerge.research.generate import GenerateOptions, generate_scene
-from gsmerge.stages.fit.photo_sizes import large_photos, largest_scale
+from gsmerge.scene.read import load_scene
 
 WIDTH, HEIGHT, SCALE = 72, 48, 3
 
@@ -199,7 +199,7 @@ def test_memory_is_bounded_before_pixels_are_known(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shuffled: bool
 ) -> None:
     """More photos than fit are resized first; a grid that they were resized to is found all the same."""
-    monkeypatch.setattr("gsmerge.io.scene_views._MAX_BYTES", 3 * 100 * 75 * 12)
+    monkeypatch.setattr("gsmerge.scene.views._MAX_BYTES", 3 * 100 * 75 * 12)
     loaded = load_scene(save(tmp_path, shuffled=shuffled), max_side=96)
     assert NOTE in loaded.notes
     assert loaded.scene.aligned != shuffled
@@ -208,7 +208,7 @@ def test_memory_is_bounded_before_pixels_are_known(
 
 
 def test_photos_that_may_be_the_grid_are_never_resized(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gsmerge.io.scene_views._MAX_BYTES", 0)
+    monkeypatch.setattr("gsmerge.scene.views._MAX_BYTES", 0)
     loaded = load_scene(save(tmp_path, shuffled=False, tiny=SMOOTH), max_side=16)
     assert loaded.pixel_scene().valid.all()
     assert loaded.notes == ()

@@ -11,7 +11,7 @@ import scenes
 
 from gsmerge import Cameras, Gaussians, render
 from gsmerge.measure.align import _curvature, _moved, _slope, _Target, fit_colors, refine_pose
-from gsmerge.render import prepare
+from gsmerge.raster import prepare
 from gsmerge.runtime.threads import use_threads
 
 CENTRE = np.array([0.0, 0.0, 3.0])

@@ -7,8 +7,8 @@ import pytest
 import scenes
 
 from gsmerge.measure.speed import break_even, measure_costs, overdraw
-from gsmerge.render import plan_view, prepare
-from gsmerge.render.weights import view_weights
+from gsmerge.raster import plan_view, prepare
+from gsmerge.raster.weights import view_weights
 from gsmerge.types import Scene
 
 

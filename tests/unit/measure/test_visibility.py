@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import scenes
 
+from gsmerge.facts.views import subset
 from gsmerge.measure import visibility
 from gsmerge.measure.sizes import zoom_cameras
 from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.types import Cameras, Scene, grid_ids
-from gsmerge.views import subset
 
 
 def slow_mask(points: np.ndarray, cameras: Cameras, view: int) -> np.ndarray:

@@ -19,8 +19,8 @@ from gsmerge.networks.apply import (
     refine_features,
     run_heads,
 )
-from gsmerge.networks.modules import Networks
 from gsmerge.networks.options import NetworkOptions
+from gsmerge.research.training.modules import Networks
 from gsmerge.stages.decode import DecodeOptions, decode, divide
 from gsmerge.stages.match import MatchOptions, match
 from gsmerge.stages.merge import merge, refine, take

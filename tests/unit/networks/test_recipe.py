@@ -14,11 +14,11 @@ from gsmerge import Scene
 from gsmerge.encoded.to_encoded import encode_scene
 from gsmerge.errors import UsageError
 from gsmerge.networks.checkpoint import save_checkpoint
-from gsmerge.networks.modules import Networks
 from gsmerge.networks.options import NetworkOptions
 from gsmerge.online.extend import extend
 from gsmerge.online.options import OnlineOptions
 from gsmerge.options import CompactOptions
+from gsmerge.research.training.modules import Networks
 
 SMALL = NetworkOptions(width=16, heads=2, latent=8, members=4, neighbors=4, outputs="absolute")
 

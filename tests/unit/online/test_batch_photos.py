@@ -13,6 +13,8 @@ from unaligned_scenes import loosened
 from view_batches import fed, random_gaussians, room, same_group, state_of
 
 from gsmerge import Cameras, Gaussians, Scene
+from gsmerge.fit import FitOptions
+from gsmerge.fit.color import Drawn, draw, fit_colors
 from gsmerge.moments import feature_to_gaussians, scene_members, unaligned_members
 from gsmerge.online.batch_photos import (
     MARGIN,
@@ -27,11 +29,9 @@ from gsmerge.online.batch_photos import (
     view_ids,
 )
 from gsmerge.online.state import GroupSet, Replay, moments_of
-from gsmerge.render import contributions, plan_view, prepare
-from gsmerge.render.photos import Photos, photos_of, scene_photos
-from gsmerge.render.weights import apply
-from gsmerge.stages.fit import FitOptions
-from gsmerge.stages.fit.color import Drawn, draw, fit_colors
+from gsmerge.raster import contributions, plan_view, prepare
+from gsmerge.raster.photos import Photos, photos_of, scene_photos
+from gsmerge.raster.weights import apply
 from gsmerge.types import SH_C0, FeatureGaussians
 
 

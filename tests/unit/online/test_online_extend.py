@@ -14,11 +14,11 @@ from view_batches import FAST, counts, fed, parts_of, room, same_groups, same_st
 
 from gsmerge import Compactor, Gaussians, Scene, decode_scene, encode_scene
 from gsmerge.errors import UsageError
+from gsmerge.fit import FitOptions, FitReport
 from gsmerge.online.decode_stored import decode_stored
 from gsmerge.online.extend import extend
 from gsmerge.online.state import OnlineState, from_encoded
 from gsmerge.options import CompactOptions
-from gsmerge.stages.fit import FitOptions, FitReport
 from gsmerge.types import grid_ids
 
 Change = Callable[[Scene], Scene]

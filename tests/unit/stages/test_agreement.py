@@ -11,13 +11,13 @@ import unaligned_scenes
 
 import gsmerge
 from gsmerge import Scene
+from gsmerge.facts.prepare import prepare
 from gsmerge.moments import scene_members
 from gsmerge.options import CompactOptions
 from gsmerge.plan import make_plan
 from gsmerge.runtime.record import record_run
 from gsmerge.stages.agreement import contradicted_share, weaken_contradicted
 from gsmerge.stages.encode import encode
-from gsmerge.stages.prepare import prepare
 from gsmerge.types import Groups, grid_ids
 
 AUTO = CompactOptions().with_settings({"superpixels": "auto"})

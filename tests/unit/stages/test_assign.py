@@ -9,18 +9,18 @@ import unaligned_scenes
 
 from gsmerge import Scene, compact
 from gsmerge.errors import UsageError
+from gsmerge.facts.place_cameras import add_views
+from gsmerge.facts.prepare import canonicalise, prepare, scene_frame
 from gsmerge.moments import scene_members, unaligned_members
+from gsmerge.raster.seen import seen_depths
 from gsmerge.runtime.record import record_run
 from gsmerge.stages.assign import (
     find_owners,
     merge_unseen,
     middle_pixels,
     owner_pixels,
-    seen_depths,
 )
 from gsmerge.stages.encode import encode, member_rows
-from gsmerge.stages.place_cameras import add_views
-from gsmerge.stages.prepare import canonicalise, prepare, scene_frame
 from gsmerge.stages.segment import superpixels_per_view
 from gsmerge.stages.superpixels import SegmentOptions, segment
 from gsmerge.types import Groups

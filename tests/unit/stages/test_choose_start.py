@@ -12,8 +12,8 @@ from network_fixtures import Made, made, noisy
 
 from gsmerge import Gaussians, Scene
 from gsmerge.networks.apply import encode_features
-from gsmerge.networks.modules import Networks
-from gsmerge.render.photos import render_photos, scene_photos, scene_pictures
+from gsmerge.raster.photos import render_photos, scene_photos, scene_pictures
+from gsmerge.research.training.modules import Networks
 from gsmerge.runtime.record import record_run
 from gsmerge.stages.choose_start import choose_start, views_psnr
 from gsmerge.stages.decode import DecodeOptions, decode

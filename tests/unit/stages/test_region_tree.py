@@ -9,8 +9,8 @@ import pytest
 import scenes
 
 from gsmerge import Scene
-from gsmerge.baselines.baseline import most_important
 from gsmerge.moments import Members, scene_members
+from gsmerge.research.baselines.baseline import most_important
 from gsmerge.stages import region_tree as module
 from gsmerge.stages.decode import DecodeOptions, decode, split_counts
 from gsmerge.stages.encode import encode

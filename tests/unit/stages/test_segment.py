@@ -9,8 +9,8 @@ import pytest
 import scenes
 
 from gsmerge import CompactOptions, Scene
+from gsmerge.facts.prepare import prepare
 from gsmerge.plan import make_plan
-from gsmerge.stages.prepare import prepare
 from gsmerge.stages.segment import SuperpixelPlan, count_limits, default_count, largest_count, segment_scene
 
 ADAPTIVE = {"segmentation": "bass-adaptive", "superpixels": "5%"}

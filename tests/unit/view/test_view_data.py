@@ -15,12 +15,12 @@ import pytest
 import scenes
 
 from gsmerge import Gaussians, Scene, evaluate, render
+from gsmerge.facts.prepare import scene_frame
 from gsmerge.io.formats.spz import spz_bytes
 from gsmerge.measure.camera_path import outside_camera
 from gsmerge.measure.evaluate import EvaluateOptions, near_plane
 from gsmerge.measure.preview import to_picture
-from gsmerge.render.metrics import psnr
-from gsmerge.stages.prepare import scene_frame
+from gsmerge.raster.metrics import psnr
 from gsmerge.stages.segment import SegmentOptions, segment
 from gsmerge.types import Views
 from gsmerge.view import data

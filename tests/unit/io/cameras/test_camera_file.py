@@ -22,9 +22,10 @@ from tiny_scene import (
 )
 
 from gsmerge.errors import SceneError
-from gsmerge.io import load_scene, read_cameras, to_cameras
+from gsmerge.io import read_cameras, to_cameras
 from gsmerge.io.cameras.camera_file import make_lens, select_views, undistort_photos
 from gsmerge.measure.inspect import inspect
+from gsmerge.scene.read import load_scene
 
 
 def test_to_cameras_scales_each_axis(tmp_path: Path, tiny: Tiny) -> None:

@@ -23,8 +23,9 @@ from tiny_scene import (
 )
 
 from gsmerge.errors import SceneError
-from gsmerge.io import load_scene, read_cameras, to_cameras
-from gsmerge.io.held_out import place_camera_file
+from gsmerge.io import read_cameras, to_cameras
+from gsmerge.scene.held_out import place_camera_file
+from gsmerge.scene.read import load_scene
 
 
 def test_transforms_with_global_intrinsics(tmp_path: Path, tiny: Tiny) -> None:

@@ -14,8 +14,10 @@ from exports import export_rows, save_export, smooth_scene, turned
 from tiny_scene import Tiny
 
 from gsmerge.errors import SceneError
-from gsmerge.io import find_scene_files, load_scene, read_cameras
+from gsmerge.io import read_cameras
 from gsmerge.io.photo_files import resize_and_crop
+from gsmerge.scene.files import find_scene_files
+from gsmerge.scene.read import load_scene
 
 SMOOTH = smooth_scene(48, 36)
 

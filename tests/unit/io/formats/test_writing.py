@@ -13,17 +13,10 @@ from plyfile import PlyData
 from tiny_scene import Tiny
 
 from gsmerge import Scene
-from gsmerge.baselines.simple import find_program
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry import normalize
-from gsmerge.io import (
-    OUTPUT_FORMATS,
-    lost_harmonics,
-    output_format,
-    read_ply,
-    write_gaussians,
-    write_ply,
-)
+from gsmerge.io import OUTPUT_FORMATS, lost_harmonics, output_format, read_ply, write_gaussians, write_ply
+from gsmerge.research.baselines.simple import find_program
 from gsmerge.types import Gaussians
 
 from .slow_readers import corners, drawn, read_back

@@ -10,7 +10,6 @@ import pytest
 from gsmerge.batch import BatchOptions
 from gsmerge.batch.schedule import Schedule, estimate_seconds
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.io import ReadHints
 from gsmerge.measure.evaluate import EvaluateOptions
 from gsmerge.research.charts.grid import (
     Grid,
@@ -22,6 +21,7 @@ from gsmerge.research.charts.grid import (
     scene_names,
 )
 from gsmerge.research.charts.measure_run import ChartRun
+from gsmerge.scene.exporters import ReadHints
 
 
 def test_the_smallest_grid_is_the_input_and_the_defaults() -> None:

@@ -16,7 +16,6 @@ from experiments import make_record
 import gsmerge
 from gsmerge.batch import BatchOptions
 from gsmerge.batch.records import DONE, FAILED, RECORDS, SKIPPED, record
-from gsmerge.io import find_scene_files
 from gsmerge.measure.evaluate import EvaluateOptions
 from gsmerge.options import CompactOptions
 from gsmerge.research.charts.measure_run import (
@@ -29,6 +28,7 @@ from gsmerge.research.charts.measure_run import (
     read_runs,
 )
 from gsmerge.runtime.jsonl import append_line
+from gsmerge.scene.files import find_scene_files
 
 
 def line(run: RunRecord, **changes: Any) -> dict[str, Any]:

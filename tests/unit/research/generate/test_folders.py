@@ -11,11 +11,12 @@ import pytest
 import gsmerge
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry import project
-from gsmerge.io import load_scene, read_held_out
-from gsmerge.render.metrics import psnr
+from gsmerge.raster.metrics import psnr
 from gsmerge.research.generate import GenerateOptions, generate, make_scene
 from gsmerge.research.generate.objects import STYLES
 from gsmerge.runtime.threads import use_threads
+from gsmerge.scene.held_out import read_held_out
+from gsmerge.scene.read import load_scene
 
 TINY = GenerateOptions(views=(3, 3), width=48, height=36)
 

@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 
-from gsmerge.native.library import _able_targets
+from gsmerge.kernels.library import _able_targets
 
 SCENE = """
 import hashlib

@@ -16,7 +16,6 @@ from gsmerge.moments import feature_to_gaussians
 from gsmerge.networks import apply, tokens
 from gsmerge.networks.apply import NetworkContext, encode_features, merge_features, refine_features
 from gsmerge.networks.corrections import COLOR, LOGIT, MASS, MEAN, ROTATION, SIZE
-from gsmerge.networks.modules import Networks
 from gsmerge.networks.options import FEATURE
 from gsmerge.networks.tensors import quat_to_rotmat
 from gsmerge.research.training import Example, make_example, make_training_scene
@@ -26,6 +25,7 @@ from gsmerge.research.training.geometry import (
     features_to_tensors,
     pool_tensors,
 )
+from gsmerge.research.training.modules import Networks
 from gsmerge.research.training.predict import TrainingContext, match_crop, predict
 from gsmerge.research.training.windows import Crop, whole_photo
 from gsmerge.stages.merge import cluster_runs, pool_runs

@@ -15,11 +15,11 @@ from training_runs import PAPER, TINY, written
 
 from gsmerge.geometry import rotmat_to_quat
 from gsmerge.networks.checkpoint import load_checkpoint
-from gsmerge.networks.modules import Networks
 from gsmerge.networks.tensors import quat_to_rotmat
 from gsmerge.research.training import Example, make_example, make_training_scene, preset_options, train
 from gsmerge.research.training.examples import draw_views, select_views
 from gsmerge.research.training.losses import teacher_loss, window_loss
+from gsmerge.research.training.modules import Networks
 from gsmerge.research.training.predict import Prediction, match_crop, predict
 from gsmerge.research.training.windows import Window, sample_window, whole_photo
 from gsmerge.stages.merge import merge

@@ -16,8 +16,7 @@ from training_runs import OPTIONS, TINY, written
 from gsmerge.errors import GsmergeError
 from gsmerge.measure.lpips import lpips, lpips_available
 from gsmerge.networks.apply import NetworkContext, encode_features, refine_features
-from gsmerge.networks.modules import Networks
-from gsmerge.render import render
+from gsmerge.raster import render
 from gsmerge.research.training import Example, TrainOptions, make_example, make_training_scene, train
 from gsmerge.research.training.examples import recolor
 from gsmerge.research.training.loop import is_best
@@ -32,6 +31,7 @@ from gsmerge.research.training.losses import (
     window_loss,
     window_psnr,
 )
+from gsmerge.research.training.modules import Networks
 from gsmerge.research.training.perceptual import lpips_loss
 from gsmerge.research.training.predict import analytic_gaussians, match_crop, predict
 from gsmerge.research.training.scenes import coverage, covered_pixels, reduced_masks, view_subsets

@@ -15,7 +15,6 @@ from training_runs import OPTIONS, TINY, written
 from gsmerge.errors import SceneError
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.networks.corrections import LOGIT, residual_limits
-from gsmerge.networks.modules import Networks
 from gsmerge.networks.options import Bounds, NetworkOptions
 from gsmerge.networks.tensors import move_tensors
 from gsmerge.research.training import (
@@ -28,6 +27,7 @@ from gsmerge.research.training import (
     read_config,
     train,
 )
+from gsmerge.research.training.modules import Networks
 from gsmerge.research.training.predict import analytic_gaussians, crop_targets, merged_rows, predict
 from gsmerge.research.training.scenes import TrainingScene, make_training_scene
 from gsmerge.research.training.targets import corrections_between

@@ -1,0 +1,223 @@
+"""Estimate the focal length of cameras whose poses alone are known.
+
+Where rows are pixels it follows from their rays: under a pose, a pixel's place is a linear
+function of the slope of its Gaussian's direction; the factor is the focal length, the place of
+slope 0 the principal point. Otherwise the photos show it: under the right one, Gaussians project
+to places of their own colours.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from gsmerge.alignment.cameras import estimate_cameras, fit_line, other_conventions
+from gsmerge.alignment.layouts import exact_layouts, grids_of_count, subsample
+from gsmerge.alignment.score import MARGIN, Correspondences, find_correspondences, pixel_limit
+from gsmerge.alignment.unaligned import CameraCheck, check_cameras
+from gsmerge.geometry import project_points, sh0_to_rgb
+from gsmerge.io.cameras.camera_file import CameraFile, make_pinhole
+from gsmerge.io.formats.ply import PlyScene
+from gsmerge.io.image_names import natural_key
+from gsmerge.io.photo_files import (
+    Photos,
+    Size,
+    as_floats,
+    photo_size,
+    resize_to,
+)
+from gsmerge.kernels.matrices import matmul
+from gsmerge.kernels.pictures import sample_bilinear
+from gsmerge.types import Cameras, Gaussians
+
+_GRID_SAMPLES = 500  # Gaussians per view that intrinsics are solved from
+_ROUNDS = 4  # of reweighted least squares
+_MAX_UNEVEN = 1.5  # of one focal length to the other
+_MAX_GRIDS = 6  # smaller grids that the number of rows allows, which are tried
+_MAX_VIEWS = 12  # whose photos are compared with the Gaussians
+_SIDE = 256  # the longer one of these photos, pixels
+_SHORTEST = 0.25  # focal length that is tried, over the photo's longer side
+_STEP = 1.06  # from one that is tried to the next
+_STEPS = 48  # so that the last is four sides
+_FEW_SAMPLES = 3000  # Gaussians that are compared with the photos at each of these
+_SAMPLES = 20_000  # and near the best
+_SPANS = (0.08, 0.02, 0.005, 0.00125)  # shares around the best that are searched next
+_HALF = 4  # places on either side in each
+
+
+@dataclass(frozen=True)
+class _Pictures:
+    """Views whose photos are compared with the Gaussians."""
+
+    views: list[int]  # of the camera file
+    images: np.ndarray  # ``[v,h,w,3]`` float32, small
+    ratio: float  # of their side to the photos'
+
+    def cameras(self, viewmats: np.ndarray, focal: float) -> Cameras:
+        """Make the views' cameras of all poses ``[c,4,4]`` and a focal length in these pixels."""
+        height, width = self.images.shape[1:3]
+        K = make_pinhole(focal, focal, width / 2, height / 2)
+        return Cameras(viewmats[self.views], np.tile(K, (len(self.views), 1, 1)), width, height)
+
+
+def estimate_focal(ply: PlyScene, camera_file: CameraFile, photos: Photos | None) -> CameraFile | None:
+    """Return the cameras with the intrinsics that fit the Gaussians, and a note; None without any.
+
+    ``camera_file`` has poses alone; ``photos`` are its c ``[h,w,3]`` uint8. Where only they show
+    the focal length, pixels are taken to be square, and the principal point to be in the middle.
+    """
+    own = int(camera_file.widths[0]), int(camera_file.heights[0])
+    size = photo_size(photos) or own
+    if min(size) <= 1:
+        return None
+    others = other_conventions(camera_file.viewmats, camera_file.convention)
+    readings = [camera_file.viewmats, *(poses.viewmats for poses in others)]
+    K = _intrinsics_of_rays(ply, camera_file, readings, size)
+    what = "the rays of the pixels"
+    if K is None and photos is not None:
+        K = _intrinsics_of_colors(ply, readings, photos, size)
+        what = "the photos' colours"
+    if K is None:
+        return None
+    share = f"{K[0, 0] / size[0]:.4g}"
+    count = len(camera_file)
+    return replace(
+        camera_file,
+        Ks=np.tile(K, (count, 1, 1)),
+        widths=np.full(count, size[0], np.int64),
+        heights=np.full(count, size[1], np.int64),
+        focal=f"no intrinsics were given: a focal length of {share} widths is estimated from {what}",
+    )
+
+
+def _intrinsics_of_rays(
+    ply: PlyScene, camera_file: CameraFile, readings: list[np.ndarray], size: Size
+) -> np.ndarray | None:
+    """Solve for intrinsics ``[3,3]``, pixels, under which the rows of a grid lie on their rays."""
+    count, views, names = len(ply.gaussians), len(camera_file), camera_file.names
+    by_name = sorted(range(views), key=lambda view: natural_key(names[view]))
+    labellings = list(dict.fromkeys((tuple(range(views)), tuple(by_name))))
+    smaller = islice(grids_of_count(count, views, size), _MAX_GRIDS)
+    for grid in (resize_to(size, size), *smaller):
+        fits: list[tuple[float, tuple[float, ...], int]] = []
+        for number, layout in enumerate(exact_layouts(count, views, grid.width, grid.height)):
+            if len(set(layout.views)) < views:
+                continue
+            some = subsample(layout, _GRID_SAMPLES)
+            for labelling in labellings:
+                labelled = replace(some, views=tuple(labelling[view] for view in some.views))
+                pairs = find_correspondences(ply.gaussians.means, ply.valid, labelled)
+                solved = (_solve_intrinsics(pairs, viewmats) for viewmats in readings)
+                fits += [(px, values, number) for px, values in solved]
+        fits.sort()
+        if not fits or fits[0][0] > pixel_limit(grid.width, grid.height):
+            continue
+        px, values, best = fits[0]
+        if all(other >= MARGIN * px for other, _, number in fits if number != best):
+            fx, fy, cx, cy = values
+            x, y = (cx + grid.left) / grid.scale_x, (cy + grid.top) / grid.scale_y
+            return make_pinhole(fx / grid.scale_x, fy / grid.scale_y, x, y)
+    free = estimate_cameras(Path(camera_file.path), ply.gaussians, ply.valid, names, *size)
+    return None if free is None else free.Ks[0]
+
+
+def _solve_intrinsics(pairs: Correspondences, viewmats: np.ndarray) -> tuple[float, tuple[float, ...]]:
+    """Solve for (largest median distance of a block, (fx, fy, cx, cy)), pixels; inf on failure."""
+    poses = viewmats[pairs.views]
+    turned = matmul(poses[:, :3, :3], pairs.points[:, :, None])[..., 0]
+    camera = turned + poses[:, :3, 3]
+    front = camera[:, 2] > 0
+    if not front.any() or front.mean() <= 0.5:
+        return math.inf, ()
+    slopes = camera[front, :2] / camera[front, 2:]
+    places = pairs.pixels[front]
+    weights = np.ones(len(slopes))
+    away = np.zeros_like(places)
+    lines = [(0.0, 0.0), (0.0, 0.0)]
+    with np.errstate(all="ignore"):  # points in the camera's plane
+        for _ in range(_ROUNDS):
+            for axis in range(2):
+                slope, height = fit_line(slopes[:, axis], places[:, axis], weights)
+                away[:, axis] = places[:, axis] - slope * slopes[:, axis] - height
+                lines[axis] = slope, height
+            errors = np.sqrt((away * away).sum(1))
+            weights = 1 / (1 + (errors / (3 * np.median(errors) + 1e-9)) ** 2)
+    (fx, cx), (fy, cy) = lines
+    blocks = pairs.blocks[front]
+    worst = max(float(np.median(errors[blocks == block])) for block in np.unique(blocks))
+    uneven = fx / fy if 0 < fx < math.inf and 0 < fy < math.inf else math.inf
+    if not (math.isfinite(worst) and 1 / _MAX_UNEVEN < uneven < _MAX_UNEVEN):
+        return math.inf, ()
+    return worst, (fx, fy, cx, cy)
+
+
+def _intrinsics_of_colors(ply: PlyScene, readings: list[np.ndarray], photos: Photos, size: Size) -> np.ndarray | None:
+    """Search for intrinsics ``[3,3]``, pixels, under which the Gaussians have the photos' colours."""
+    pictures = _small_pictures(photos, size)
+    few = _sample(ply, _FEW_SAMPLES)
+    focals = [_SHORTEST * max(pictures.images.shape[1:3])]
+    while len(focals) < _STEPS:
+        focals.append(focals[-1] * _STEP)
+    for viewmats in readings:
+        checks = [_check(few, pictures, viewmats, focal) for focal in focals]
+        best = max(range(len(focals)), key=lambda number: checks[number].score)
+        if checks[best].ok and not math.isnan(checks[best].color_ratio):
+            many = _sample(ply, _SAMPLES)
+            focal = _refine(many, pictures, viewmats, focals[best]) / pictures.ratio
+            return make_pinhole(focal, focal, size[0] / 2, size[1] / 2)
+    return None
+
+
+def _sample(ply: PlyScene, count: int) -> Gaussians:
+    """Take about ``count`` finite Gaussians, spread over the file."""
+    rows = np.flatnonzero(ply.valid)
+    return ply.gaussians[rows[:: max(1, len(rows) // count)]]
+
+
+def _small_pictures(photos: Photos, size: Size) -> _Pictures:
+    """Reduce the photos of some views."""
+    count = len(photos)
+    places = np.linspace(0, count - 1, min(count, _MAX_VIEWS))
+    views = sorted({round(place) for place in places})
+    ratio = min(1.0, _SIDE / max(size))
+    width, height = (max(1, round(side * ratio)) for side in size)
+    small = resize_to(size, (width, height))
+    images = as_floats(small.photos([photos[view] for view in views]))
+    return _Pictures(views, images, small.scale_x)
+
+
+def _check(gaussians: Gaussians, pictures: _Pictures, viewmats: np.ndarray, focal: float) -> CameraCheck:
+    """Measure how well the views see Gaussians under a focal length."""
+    valid = np.ones(len(gaussians), bool)
+    return check_cameras(gaussians, valid, pictures.cameras(viewmats, focal), pictures.images)
+
+
+def _refine(gaussians: Gaussians, pictures: _Pictures, viewmats: np.ndarray, focal: float) -> float:
+    """Search ever nearer to a focal length for the one with the smallest distance of colours."""
+    points = gaussians.means.astype(np.float64)
+    colors = sh0_to_rgb(gaussians.sh0[:, 0]).clip(0, 1)
+
+    def color_error(place: float) -> float:
+        return _color_error(points, colors, pictures.cameras(viewmats, place), pictures.images)
+
+    for span in _SPANS:
+        places = [focal * (1 + span * step / _HALF) for step in range(-_HALF, _HALF + 1)]
+        focal = min(places, key=color_error)
+    return focal
+
+
+def _color_error(points: np.ndarray, colors: np.ndarray, cameras: Cameras, images: np.ndarray) -> float:
+    """Measure the mean distance of colours ``[n,3]`` from the photos where points are seen."""
+    errors = []
+    for view, image in enumerate(images):
+        with np.errstate(all="ignore"):
+            xy, depth = project_points(points, cameras.viewmats[view], cameras.Ks[view])
+        inside = (depth > 0) & (xy >= 0).all(1) & (xy < (cameras.width, cameras.height)).all(1)
+        x, y = xy[inside].T - 0.5
+        errors.append(np.abs(colors[inside] - sample_bilinear(image, x, y)).mean(1))
+    every = np.concatenate(errors)
+    return float(every.mean()) if len(every) else math.inf

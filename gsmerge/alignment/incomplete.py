@@ -1,0 +1,242 @@
+"""Score readings of files that lack unknown pixels, or have their rows in no order.
+
+Rows in no order can be read where Gaussians were made on the rays of their pixels' centres: a Gaussian then
+projects to the very centre of a pixel in its own view, and anywhere in a pixel of the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from gsmerge.alignment.layouts import Layout
+from gsmerge.alignment.ordered_rows import (
+    FAR,
+    FAR_PX,
+    MIN_BLOCK,
+    ProjectedRows,
+    finer_scale,
+    read_view_fastest,
+    read_view_major,
+    rough_scale,
+)
+from gsmerge.alignment.score import (
+    AlignmentInput,
+    AlignmentScore,
+    candidate_similarities,
+    sample_layout,
+    scale_by,
+    score_layout,
+)
+from gsmerge.geometry import Similarity, sh0_to_rgb
+from gsmerge.runtime.threads import parallel_map
+
+TOLERANCES = (0.05, 0.02, 0.01, 0.005, 0.002)  # pixels from a centre that count as being there
+MIN_SHARE = 0.9  # of the rows at the centre of a pixel of some view, and of those that come to a pixel in the end
+MAX_CHANCE = 0.2  # of that share: as many at a second view's centre, or at the corners of pixels, are chance
+_SAMPLES = 20_000  # rows that the file is judged by
+_FEW, _MIN_FEW = 10, 0.5  # every how many of them are tried first, and share at centres without which none are
+_CHUNK = 1 << 15  # rows at a time
+_SMALLEST_PX, _SMALLEST_COLOR = 1e-4, 0.005  # units of the distances, at least
+
+# pixels from a centre within which a view may be a row's own; median distance from the centre in the own view, pixels,
+# and of the base colour from the photo there, inf without photos
+Spread = tuple[float, float, float]
+# (rows, view, pixels) -> [r] distances of the rows' base colours from the photo there, 0 to 1
+ColorOf = Callable[[np.ndarray, int, np.ndarray], np.ndarray]
+_ROUNDS = 3  # of a layout and the scale that follows from it
+_CERTAIN_PX = 0.3  # median distance that a search does not reach in a wrong frame
+_AS_GOOD = 1.05  # of that distance: no worse, where the scale is solved from more rows
+_BETTER = 2.0  # times nearer to the pixels: another scale, where the same fits as well
+
+
+def score_incomplete(inputs: AlignmentInput) -> list[AlignmentScore]:
+    """Score readings with missing pixels in the possible orders, each tried only where none before it fits."""
+    cameras = inputs.cameras
+    missing = len(cameras) * cameras.width * cameras.height - len(inputs.gaussians)
+    ids = np.flatnonzero(inputs.valid)
+    rows = ProjectedRows(inputs.gaussians.means[ids].astype(np.float64), ids, cameras)
+    # frames that need no solving: without a layout no pixel is known
+    frames = list(candidate_similarities(None, cameras, scale=inputs.scale, effort=0))
+    searches: dict[str, Callable[[], AlignmentScore | None]] = {
+        "view-major": lambda: _score_view_major(inputs, rows, frames[0]),
+        "view-fastest": lambda: _score(inputs, rows, read_view_fastest, frames[0]),
+        "unordered": lambda: _score_unordered(inputs, rows, frames),
+    }
+    scores: list[AlignmentScore] = []
+    for order, search in searches.items():
+        possible = missing > 0 or (missing == 0 and order == "unordered")
+        if possible and inputs.order in ("auto", order) and not any(score.ok for score in scores):
+            score = search()
+            scores += [] if score is None else [score]
+    return scores
+
+
+def _score(
+    inputs: AlignmentInput, rows: ProjectedRows, search: Callable[[ProjectedRows], Layout | None], frame: Similarity
+) -> AlignmentScore | None:
+    """Score the layout that a search makes of the rows in one frame; None without one."""
+    layout = search(rows.with_frame(frame))
+    return None if layout is None else score_layout(inputs, layout, frame)
+
+
+def _score_view_major(inputs: AlignmentInput, rows: ProjectedRows, frame: Similarity) -> AlignmentScore | None:
+    """Score one view after the other in a frame, and at any other scale where that does not fit well."""
+    same = _score(inputs, rows, read_view_major, frame)
+    if same is not None and same.worst_px >= _CERTAIN_PX:
+        num_pixels = len(same.layout.views) * rows.cameras.width * rows.cameras.height
+        if 2 * sum(map(len, same.layout.rows)) < num_pixels:  # with so many pixels to choose from, any row is near one
+            same = replace(same, ok=False)
+    if inputs.scale is not None or (same is not None and same.worst_px < _CERTAIN_PX):
+        return same
+    other = _score_scaled(inputs, rows)
+    if other is None or same is None:
+        return other or same
+    return other if other.ok and (other.worst_px * _BETTER < same.worst_px or not same.ok) else same
+
+
+def _score_scaled(inputs: AlignmentInput, rows: ProjectedRows) -> AlignmentScore | None:
+    """Search for scale and pixels in turn, until neither changes."""
+    scale = rough_scale(rows)
+    best = None if scale is None else _score(inputs, rows, read_view_major, scale_by(scale))
+    far = max(FAR_PX, FAR * min(rows.cameras.width, rows.cameras.height))
+    if scale is None or best is None or best.worst_px > far:
+        return None
+    every = replace(rows, points=inputs.gaussians.means.astype(np.float64))
+    frame = scale_by(finer_scale(every, best.layout, scale))
+    for _ in range(_ROUNDS):
+        score = _score(inputs, rows, read_view_major, frame)
+        if score is None or score.worst_px > _AS_GOOD * best.worst_px:
+            break
+        best = score
+        frames = candidate_similarities(inputs.pairs(sample_layout(best.layout)), inputs.cameras, effort=1)
+        frame = next((finer for finer in frames if finer.scale != 1), frame)
+    return replace(best, ok=best.ok and best.worst_px < _CERTAIN_PX)
+
+
+def _score_unordered(inputs: AlignmentInput, rows: ProjectedRows, frames: list[Similarity]) -> AlignmentScore | None:
+    """Score rows in no order, in the first frame in which they are at the centres of pixels."""
+    color_of: ColorOf | None = None
+    if inputs.images is not None:
+        base = sh0_to_rgb(inputs.gaussians.sh0[rows.ids, 0])
+        photos = inputs.images.reshape(len(inputs.cameras), -1, 3)
+
+        def color_of(some: np.ndarray, view: int, pixels: np.ndarray) -> np.ndarray:
+            return np.abs(base[some].clip(0, 1) - photos[view, pixels]).mean(1)
+
+    scores = (_score(inputs, rows, partial(read_unordered, color_of=color_of), frame) for frame in frames)
+    return next((score for score in scores if score is not None), None)
+
+
+def read_unordered(rows: ProjectedRows, *, color_of: ColorOf | None = None) -> Layout | None:
+    """Find the pixel of every row in a file without an order; None unless nearly all are at centres, not by chance.
+
+    Each row goes to the view in which it is nearest to a pixel's centre; between several near ones, the colours of
+    the photos count as well. A pixel keeps the row that fits it best, the others go to their second choice.
+    """
+    count, num_views = len(rows), len(rows.cameras)
+    num_pixels = rows.cameras.width * rows.cameras.height
+    spread = _measure_spread(rows, color_of)
+    if spread is None:
+        return None
+    chunks = [np.arange(a, min(a + _CHUNK, count)) for a in range(0, count, _CHUNK)]
+    choices = parallel_map(lambda some: _choices(rows, some, spread, color_of), chunks)
+    slots, cost = np.concatenate([c[0] for c in choices]), np.concatenate([c[1] for c in choices])
+    owner = _assign(slots, cost, num_views * num_pixels)
+    used = np.flatnonzero(owner >= 0)
+    if len(used) < MIN_SHARE * count:
+        return None
+    slots_of_views = np.split(used, np.searchsorted(used, np.arange(1, num_views) * num_pixels))
+    parts = [(view, owner[own], own - view * num_pixels) for view, own in enumerate(slots_of_views) if len(own)]
+    lost = count - len(used)
+    note = f", {lost:,} rows without a pixel" if lost else ""
+    return rows.layout("unordered", parts, missing=num_views * num_pixels - len(used), note=note)
+
+
+def _measure_spread(rows: ProjectedRows, color_of: ColorOf | None) -> Spread | None:
+    """Measure how near rows are to the centres of pixels, on a sample; None where it may be chance.
+
+    Chance is measured at the corners of pixels, and in the second nearest view, which cameras side by side share.
+    """
+    if len(rows) < MIN_BLOCK:
+        return None
+    some = np.unique(np.linspace(0, len(rows) - 1, _SAMPLES).astype(np.int64))
+    few, _ = _distances(rows, some[::_FEW])
+    if (few.min(1) < TOLERANCES[0]).mean() < _MIN_FEW:
+        return None
+    centre, pixels = _distances(rows, some)
+    corner, _ = _distances(rows, some, shift=0.5)
+    ranked = np.sort(centre, axis=1)
+    second = ranked[:, 1] if len(rows.cameras) > 1 else np.full(len(some), np.inf)
+    for tolerance in TOLERANCES:
+        near, by_chance = ranked[:, 0] < tolerance, max(np.mean(second < tolerance), np.mean(corner.min(1) < tolerance))
+        if near.mean() < MIN_SHARE:
+            return None
+        if by_chance <= MAX_CHANCE * near.mean():
+            break
+    else:
+        return None
+    color = np.inf
+    if color_of is not None:
+        sure = np.flatnonzero(near & (second >= tolerance))
+        own = centre[sure].argmin(1)
+        ids = [sure[own == view] for view in range(len(rows.cameras))]
+        colors = [color_of(some[part], view, pixels[part, view]) for view, part in enumerate(ids)]
+        color = float(np.median(np.concatenate(colors)))
+    px = float(np.median(ranked[near, 0]))
+    return tolerance, max(px, _SMALLEST_PX), max(color, _SMALLEST_COLOR)
+
+
+def _distances(rows: ProjectedRows, some: np.ndarray, *, shift: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Measure distances ``[r,c]`` from the nearest pixel's centre in each view, inf outside; also return the pixels."""
+    distances = np.full((len(some), len(rows.cameras)), np.inf, np.float32)
+    pixels = np.zeros((len(some), len(rows.cameras)), np.int32)
+    for view in range(len(rows.cameras)):
+        pixels[:, view], u, v = rows.pixels(some, view)
+        inside = pixels[:, view] >= 0
+        du, dv = (x + shift - np.floor(x + shift) - 0.5 for x in (u[inside], v[inside]))
+        distances[inside, view] = np.sqrt(du * du + dv * dv)
+    return distances, pixels
+
+
+def _choices(
+    rows: ProjectedRows, some: np.ndarray, spread: Spread, color_of: ColorOf | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Choose the best and second best slots ``view·H·W + pixel [r,2]`` of some rows, -1: none; and their costs."""
+    distances, pixels = _distances(rows, some)
+    tolerance, px, color = spread
+    near = distances < tolerance
+    torn = near.sum(1) > 1
+    cost = distances / np.float32(px)
+    cost[torn[:, None] & ~near] = np.inf
+    if color_of is not None:
+        for view in range(len(rows.cameras)):
+            ids = np.flatnonzero(torn & near[:, view])
+            cost[ids, view] += color_of(some[ids], view, pixels[ids, view]) / color
+    every, slots, costs = np.arange(len(some)), [], []
+    for _ in range(2):
+        view = cost.argmin(1)
+        lowest = cost[every, view]
+        slot = view * (rows.cameras.width * rows.cameras.height) + pixels[every, view].astype(np.int64)
+        slots.append(np.where(np.isfinite(lowest), slot, -1))
+        costs.append(lowest)
+        cost[every, view] = np.inf
+    return np.stack(slots, 1), np.stack(costs, 1)
+
+
+def _assign(slots: np.ndarray, cost: np.ndarray, size: int) -> np.ndarray:
+    """Choose the row that each slot keeps ``[size]``, -1 for none: the cheapest; second choices take free slots."""
+    owner = np.full(size, -1, np.int64)
+    waiting = np.arange(len(slots))
+    for choice in range(2):
+        slot = slots[waiting, choice]
+        asking = waiting[(slot >= 0) & (owner[slot] < 0)]
+        asking = asking[np.argsort(-cost[asking, choice], kind="stable")]
+        owner[slots[asking, choice]] = asking  # of several the last one stays: the cheapest
+        placed = np.zeros(len(slots), bool)
+        placed[owner[owner >= 0]] = True
+        waiting = np.flatnonzero(~placed)
+    return owner

@@ -1,0 +1,374 @@
+"""Lay rows out as pixels: the layouts that a number of rows allows, and the possible sizes of their grid."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from gsmerge.errors import SceneError
+from gsmerge.geometry import rgb_to_sh0
+from gsmerge.io.cameras.camera_file import CameraFile, sizes_of, to_cameras
+from gsmerge.io.formats.ply import PlyInfo
+from gsmerge.io.photo_files import (
+    ASPECT_TOLERANCE,
+    PhotoTransform,
+    Size,
+    resize_and_crop,
+    resize_to,
+    same_shape,
+)
+from gsmerge.kernels.matrices import invert, matmul
+from gsmerge.types import Cameras, Gaussians, Scene, grid_ids
+
+MAY_BE_UNALIGNED: tuple[str, ...] = ("unordered", "none")  # orders of files whose rows need not belong to pixels
+TRIM = 8  # pixels that DepthSplat and its relatives cut off at every side
+PER_PIXEL = (1, 2, 3, 4, 16)  # Gaussians per pixel that backbones write
+DEPTH_SHARE = 0.9  # of each view's pixels, the nearest ones, that Depth Anything 3 keeps
+_MAX_SPREAD = 0.15  # of the Gaussians' depth over a depth map's: above it the map is not that of the Gaussians
+PATCH = 14  # sides of vision transformers' inputs are multiples of it
+SIDES = (504, 518)  # to which Depth Anything 3 and others resize the longer or the shorter side, pixels
+_ROUND = (8, PATCH)  # sides of grids that photos are cropped to are multiples of one of them
+_MIN_KEPT = 0.5  # of a photo's area, when it is cropped
+_MAX_ENLARGED = 1.5  # times the side of a photo; some networks enlarge small ones
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Rows and their pixels, block by block; a block is one view, or one layer of a view."""
+
+    description: str  # what it is, for people
+    kind: str  # "full", "trim", "box", "box+depth" or "pruned": which pixels there are
+    order: str  # in which order the rows are
+    width: int  # of the grid, pixels
+    height: int
+    views: tuple[int, ...]  # the camera of each block
+    rows: tuple[np.ndarray, ...]  # the rows of each block, of any shape: not a copy where a stride will do
+    pixels: tuple[np.ndarray, ...]  # ``[p]`` the pixel ``y·W + x`` of each of these rows
+    per_pixel: int = 1  # Gaussians per pixel; above 1 each layer is a block
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether the rows are the grid in order: nothing to move, nothing missing."""
+        return self.kind == "full" and self.order == "view-major" and self.per_pixel == 1
+
+    def pixel_ids(self, count: int) -> np.ndarray:
+        """Return the pixel ``(block·H + y)·W + x`` of each of ``count`` rows, int64; -1 for rows without one."""
+        if self.is_plain:
+            return np.arange(count, dtype=np.int64)
+        ids = np.full(count, -1, np.int64)
+        for block, (rows, pixels) in enumerate(zip(self.rows, self.pixels, strict=True)):
+            ids[rows.reshape(-1)] = block * self.width * self.height + pixels
+        return ids
+
+
+@dataclass(frozen=True)
+class KeptBox:
+    """The kept part of a view: rows ``top`` to ``height - top``, columns ``left`` to ``width - left``."""
+
+    kind: str
+    description: str
+    top: int
+    left: int
+
+    def pixels(self, width: int, height: int) -> np.ndarray:
+        """Return the pixels of the box, row by row."""
+        grid = np.arange(width * height, dtype=np.int64).reshape(height, width)
+        return grid[self.top : height - self.top, self.left : width - self.left]
+
+
+def boxes(width: int, height: int) -> list[KeptBox]:
+    """List possible borders: none, 8 pixels, or 8/256 of each side as Depth Anything 3 trims."""
+    out = [KeptBox("full", "every pixel", 0, 0)]
+    if min(width, height) > 2 * TRIM:
+        out.append(KeptBox("trim", f"{TRIM} pixels trimmed at every border", TRIM, TRIM))
+    da3 = da3_box(width, height)
+    if (da3.top or da3.left) and (da3.top, da3.left) != (TRIM, TRIM):
+        out.append(da3)
+    return out
+
+
+def da3_box(width: int, height: int) -> KeptBox:
+    """Return the box that Depth Anything 3 keeps."""
+    top, left = int(8 / 256 * height), int(8 / 256 * width)
+    return KeptBox("box", f"{top} rows and {left} columns trimmed at every border", top, left)
+
+
+def every_nth(views: int) -> list[tuple[int, ...]]:
+    """List the choices of every n-th view, for all n."""
+    return [tuple(range(0, views, step)) for step in range(1, views + 1)]
+
+
+def plain_layout(views: int, width: int, height: int) -> Layout:
+    """Return the layout of one Gaussian per pixel, view by view and row by row."""
+    return next(one for one in exact_layouts(views * width * height, views, width, height) if one.is_plain)
+
+
+def exact_layouts(count: int, views: int, width: int, height: int) -> Iterator[Layout]:
+    """Yield the layouts with exactly ``count`` rows, for every number of views up to ``views``.
+
+    The cameras of the blocks are a first guess: in order, or every n-th of them.
+    """
+    for box in boxes(width, height):
+        for per_pixel in PER_PIXEL:
+            blocks, rest = divmod(count, (height - 2 * box.top) * (width - 2 * box.left) * per_pixel)
+            if rest or not 1 <= blocks <= views:
+                continue
+            chosen = next((some for some in every_nth(views) if len(some) == blocks), tuple(range(blocks)))
+            yield from _orders(count, box, per_pixel, chosen, width, height)
+
+
+def _orders(
+    count: int, box: KeptBox, per_pixel: int, views: tuple[int, ...], width: int, height: int
+) -> Iterator[Layout]:
+    index, grid = np.arange(count, dtype=np.int64), box.pixels(width, height)
+    rows, columns, blocks = *grid.shape, len(views)
+    arranged = {
+        "view-major": index.reshape(blocks, rows, columns, per_pixel).transpose(0, 3, 1, 2),
+        "view-fastest": index.reshape(rows, columns, per_pixel, blocks).transpose(3, 2, 0, 1),
+        "column-major": index.reshape(blocks, columns, rows, per_pixel).transpose(0, 3, 2, 1),
+        "layer-major": index.reshape(per_pixel, blocks, rows, columns).transpose(1, 0, 2, 3),
+    }
+    layers = f", {per_pixel} Gaussians per pixel" if per_pixel > 1 else ""
+    for order, ids in arranged.items():
+        if (order == "layer-major" and per_pixel == 1) or (order == "view-fastest" and blocks == 1):
+            continue
+        yield Layout(
+            description=f"{box.description}{layers}, {order}",
+            kind=box.kind,
+            order=order,
+            width=width,
+            height=height,
+            views=tuple(view for view in views for _ in range(per_pixel)),
+            rows=tuple(layer for block in ids for layer in block),
+            pixels=(grid.reshape(-1),) * (blocks * per_pixel),
+            per_pixel=per_pixel,
+        )
+
+
+def depth_layouts(count: int, depths: np.ndarray) -> list[Layout]:
+    """Make the layout of Depth Anything 3 from its depth maps: border, nearest 90 % of each view, every n-th view.
+
+    Only the order of ``depths [v,h,w]`` matters, so any scale will do. Empty if no choice of views has ``count``
+    pixels.
+    """
+    views, height, width = depths.shape
+    inside = da3_box(width, height).pixels(width, height)
+    # the threshold is the interpolated 90 % quantile of all the view's depths: the lower of the two around it decides
+    rank = int(DEPTH_SHARE * (width * height - 1))
+    kept = []
+    for depth in depths:
+        mask = depth <= np.partition(depth.reshape(-1), rank)[rank]
+        kept.append(inside[mask.reshape(-1)[inside]])
+    for step, chosen in enumerate(every_nth(views), 1):
+        pixels = tuple(kept[view] for view in chosen)
+        ends = np.cumsum([len(some) for some in pixels])
+        if ends[-1] == count:
+            border = da3_box(width, height).description.removesuffix(" at every border")
+            every = "" if step == 1 else f", every {step}. view"
+            description = f"{border}, nearest 90 % of each view{every}, view-major"
+            rows = tuple(np.split(np.arange(count, dtype=np.int64), ends[:-1]))
+            return [Layout(description, "box+depth", "view-major", width, height, chosen, rows, pixels)]
+    return []
+
+
+def fill_from_depths(scene: Scene, depths: np.ndarray) -> Scene:
+    """Add a Gaussian for each pixel that the file has no row for, at the depth of the maps ``depths [v,h,w]``.
+
+    Units, and depth along z or distance, follow from the other pixels. The colour is the photo's; opacity, rotation
+    and size in pixels are those of the pixel before it in the row. The scene is unchanged if it has no photos,
+    lacks nothing, or its Gaussians do not lie at the maps' depths.
+    """
+    if scene.images is None or scene.missing is None:
+        return scene
+    V = scene.cameras.viewmats
+    views, height, width = scene.valid.shape
+    valid, g = scene.valid.reshape(views, -1), scene.gaussians
+    means = g.means.astype(np.float64).reshape(views, -1, 3)
+    y, x = np.mgrid[:height, :width].reshape(2, -1) + 0.5
+    pixels = np.stack([x, y, np.ones(x.size)], 1)
+    rays = matmul(pixels, invert(scene.cameras.Ks).transpose(0, 2, 1))  # [v,p,3] in the camera, z = 1
+    z = matmul(means, V[:, 2, :3, None])[..., 0] + V[:, 2, 3, None]
+    length = np.linalg.norm(rays, axis=2)
+    maps = depths.reshape(views, -1).astype(np.float64)
+    usable = valid & (maps > 0) & np.isfinite(maps) & (z > 0)
+    if not usable.any():
+        return scene
+    ratio = z[usable] / maps[usable]
+    fits = []
+    for along, ratios in enumerate((ratio, ratio * length[usable])):  # depth along z, distance
+        middle = float(np.median(ratios))
+        fits.append((float(np.median(np.abs(ratios / middle - 1))), middle, along))
+    spread, unit, along = min(fits)
+    if spread > _MAX_SPREAD:
+        return scene
+    new_z = unit * maps / (length if along else 1)
+    ranks = np.arange(usable.size).reshape(usable.shape)
+    before = np.maximum.accumulate(np.where(usable, ranks, 0), axis=1).reshape(-1)
+    before = np.where(usable.reshape(-1)[before], before, np.flatnonzero(usable)[0])
+    rows = np.flatnonzero(~valid & (maps > 0) & np.isfinite(maps))
+    view = rows // (height * width)
+    local = rays.reshape(-1, 3)[rows] * new_z.reshape(-1)[rows, None]
+    world = (V[view, :3, :3] * (local - V[view, :3, 3])[:, :, None]).sum(1)
+    source = before[rows]
+    full = Gaussians(**{field.name: getattr(g, field.name).copy() for field in fields(g)})
+    full.means[rows] = world
+    growth = new_z.reshape(-1)[rows] / z.reshape(-1)[source]
+    full.scales[rows] = g.scales[source] * growth.astype(np.float32)[:, None]
+    full.quats[rows], full.opacities[rows] = g.quats[source], g.opacities[source]
+    full.sh0[rows] = rgb_to_sh0(scene.images.reshape(-1, 1, 3)[rows])
+    kept = scene.valid.reshape(-1).copy()
+    kept[rows] = True
+    return replace(scene, gaussians=full, pixel_ids=grid_ids(kept))
+
+
+def subsample(layout: Layout, per_block: int) -> Layout:
+    """Thin a layout to about ``per_block`` rows of each block, spread over all columns and rows."""
+    rows, pixels = [], []
+    for some, where in zip(layout.rows, layout.pixels, strict=True):
+        chosen = np.arange(0, some.size, spread_step(-(-some.size // per_block), layout.width))
+        rows.append(some.flat[chosen])
+        pixels.append(where[chosen])
+    return replace(layout, rows=tuple(rows), pixels=tuple(pixels))
+
+
+def spread_step(step: int, width: int) -> int:
+    """Enlarge a step until it shares no divisor with the width, so that samples spread over all columns."""
+    step = max(1, step)
+    while step > 1 and np.gcd(step, width) > 1:
+        step += 1
+    return step
+
+
+@dataclass(frozen=True)
+class GridFit:
+    """One way to bring cameras and photos to the size of the grid."""
+
+    cameras: Cameras  # at the grid's size
+    transform: PhotoTransform | None  # what is done to the photos, if anything
+    notes: tuple[str, ...]  # what it is, for people
+    # what suggests it: a size in files (0), the number of rows and the photos' shape (1), the number alone (2), or a
+    # network's usual sizes (3)
+    rank: int = 0
+
+    @property
+    def size(self) -> Size:
+        """(width, height) of the grid, pixels."""
+        return self.cameras.width, self.cameras.height
+
+    @property
+    def guessed(self) -> bool:
+        """Whether the number of rows allows many others."""
+        return self.rank in (1, 2)
+
+
+def photo_grid(camera_file: CameraFile, size: Size | None) -> GridFit:
+    """Assume that the grid has the photos' size, or the cameras' without photos; SceneError if the two disagree."""
+    if size is None:
+        return GridFit(to_cameras(camera_file), None, ())
+    width, height = size
+    for w, h in sizes_of(camera_file):
+        if not same_shape((w, h), size) and not _are_stretched(camera_file, size):
+            problem = f"expected cameras of the images' size {width} x {height} or a multiple of it, found {w} x {h}"
+            swapped = (w, h) == (height, width)
+            remedy = "width and height are swapped" if swapped else "crop cameras and images alike"
+            raise SceneError(camera_file.path, problem, remedy)
+    other = [s for s in sizes_of(camera_file) if s != size]
+    notes = tuple(f"intrinsics scaled from {w} x {h} to the images' {width} x {height}" for w, h in other)
+    return GridFit(to_cameras(camera_file, size), None, notes)
+
+
+def _are_stretched(camera_file: CameraFile, size: Size) -> bool:
+    """Return whether cameras of oblong pixels have square ones at the photos' size, which a model has stretched."""
+    if camera_file.focal is None:
+        return False
+    focals = camera_file.Ks[:, (0, 1), (0, 1)]
+    sides = np.stack([camera_file.widths, camera_file.heights], 1)
+    ratios = np.divide(*(focals * size / np.maximum(sides, 1)).T)
+    return bool((np.abs(ratios - 1) <= ASPECT_TOLERANCE).all())
+
+
+def other_grids(ply: PlyInfo, camera_file: CameraFile, size: Size | None) -> Iterator[GridFit]:
+    """Yield all other grids that the files and the number of rows allow, the likely first; ``size`` is the photos'."""
+    known = sizes_of(camera_file)
+    own = known[0] if len(known) == 1 else None
+    if size is not None and own is not None and own != size:
+        yield from _between(camera_file, size, own)
+    base = size or own
+    if base is None or any(not same_shape(s, base) for s in known):
+        return
+    cameras = to_cameras(camera_file, base)
+    what = "photos and cameras" if size is not None else "cameras"
+    ranked = [(2 if t.crops else 1, t) for t in grids_of_count(ply.count, len(camera_file), base)]
+    if ply.sh_degree == 0 and ply.opacity_encoding == "logit":
+        ranked += [(3, t) for t in patch_grids(base) if ply.count < len(camera_file) * t.width * t.height]
+    for rank, transform in ranked:
+        note = f"{what} of {base[0]} x {base[1]} are {transform.description}, the Gaussian grid's size"
+        yield GridFit(transform.cameras(cameras), transform, (note,), rank)
+        if not known and transform.crops:
+            whole = to_cameras(camera_file, (transform.width, transform.height))
+            yield GridFit(whole, transform, (f"{note}; the intrinsics are those of the result",), rank)
+
+
+def _between(camera_file: CameraFile, size: Size, own: Size) -> Iterator[GridFit]:
+    """Bring photos to the cameras' size, or cameras of uncropped pictures to the photos'."""
+    cameras = to_cameras(camera_file, own)
+    for transform in (resize_to(size, own), resize_and_crop(size, own)):
+        if max(transform.scale_x, transform.scale_y) > _MAX_ENLARGED:
+            continue  # previews: a fit to them would blur the Gaussians
+        note = f"photos of {size[0]} x {size[1]} are {transform.description}, the cameras' and the Gaussian grid's size"
+        yield GridFit(cameras, transform, (note,))
+    if not same_shape(own, size):
+        for transform in (resize_to(own, size), resize_and_crop(own, size)):
+            note = f"cameras of {own[0]} x {own[1]} are {transform.description}, the images' size"
+            yield GridFit(transform.cameras(cameras), None, (note,))
+
+
+def grids_of_count(count: int, views: int, size: Size) -> Iterator[PhotoTransform]:
+    """Yield transforms of photos to smaller grids of which ``views`` have ``count`` rows."""
+    crops: list[PhotoTransform] = []
+    for trim in (0, TRIM):
+        for per_pixel in PER_PIXEL:
+            pixels, rest = divmod(count, views * per_pixel)
+            if rest:
+                continue
+            for to in _sizes_of_area(pixels, trim, size):
+                aspect = to[0] * size[1] / (to[1] * size[0])
+                if abs(aspect - 1) <= ASPECT_TOLERANCE:
+                    yield resize_to(size, to)
+                is_round = to[0] == to[1] or any(to[0] % side == to[1] % side == 0 for side in _ROUND)
+                if to[0] * to[1] < size[0] * size[1] and min(aspect, 1 / aspect) >= _MIN_KEPT and is_round:
+                    crops.append(resize_and_crop(size, to))
+    yield from (crop for crop in crops if crop.crops)
+
+
+def _sizes_of_area(pixels: int, trim: int, size: Size) -> Iterator[Size]:
+    """Yield sizes up to ``size`` that have ``pixels`` pixels when ``trim`` is cut off at every border."""
+    for width in range(max(1, pixels // size[1]), min(size[0], pixels) + 1):
+        height, rest = divmod(pixels, width)
+        to = width + 2 * trim, height + 2 * trim
+        if not rest and to != size and to[0] <= size[0] and to[1] <= size[1]:
+            yield to
+
+
+def patch_grids(size: Size) -> list[PhotoTransform]:
+    """List transforms for networks that take multiples of 14: each side to the nearest one, or cropped to it."""
+    transforms = []
+    for side in SIDES:
+        for scale in (side / max(size), side / min(size)):
+            if scale <= 1:
+                width, height = (PATCH * max(1, round(s * scale / PATCH)) for s in size)
+                transforms.append(resize_to(size, (width, height)))
+                width, height = (PATCH * max(1, round(s * scale) // PATCH) for s in size)
+                transforms.append(resize_and_crop(size, (width, height), scale))
+    return list(dict.fromkeys(transforms))
+
+
+def small_photos_error(ply: PlyInfo, camera_file: CameraFile, size: Size | None) -> SceneError | None:
+    """Make the SceneError for photos smaller than the cameras' size, of which the rows are the pixels; or None."""
+    own = next((s for s in sizes_of(camera_file) if ply.count == len(camera_file) * s[0] * s[1]), None)
+    if size is None or own is None or own == size:
+        return None
+    problem = f"expected images of the Gaussian grid's size {own[0]} x {own[1]} or larger, found {size[0]} x {size[1]}"
+    return SceneError(camera_file.path, problem, "give the images that the backbone saw, or their originals")

@@ -1,0 +1,236 @@
+"""Estimate cameras from photos alone, for files of which Depth Anything 3 dropped unknown pixels.
+
+Rows come view by view and row by row, so every stretch of them without a gap shows the colours of a
+stretch of the photo. Its place there says which pixels these rows are; they give the cameras, the
+cameras all others.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from gsmerge.alignment.cameras import calibrate
+from gsmerge.alignment.layouts import (
+    DEPTH_SHARE,
+    Layout,
+    da3_box,
+    every_nth,
+    patch_grids,
+)
+from gsmerge.alignment.score import Correspondences, find_correspondences, pixel_limit
+from gsmerge.geometry import project_points, sh0_to_rgb
+from gsmerge.io.cameras.camera_file import (
+    W2C_OPENCV,
+    CameraFile,
+    View,
+    make_camera_file,
+    make_pinhole,
+)
+from gsmerge.io.photo_files import Photos, PhotoTransform, Size, resize_to
+from gsmerge.types import Cameras, Gaussians
+
+WITH_PHOTOS = "estimated from rows and photos"  # of the cameras
+_STRETCH, _STEP = 96, 2  # rows that are compared with a photo, and every how many of them
+_STRETCHES = 60  # of a view
+_PER_STRETCH = 12  # rows of each that cameras are estimated from
+_SLACK = 8  # pixels more than the bounds on both sides that are searched
+_UNIQUE = 1.1  # times as far as the nearest place is the next one, at least
+_MAX_COST = 3.0  # times the distance of the nearest quarter of a view's stretches
+_BACK = 1  # pixels that one stretch may lie too far ahead of the next
+_MIN_STRETCHES, _MIN_AGREEING = 8, 0.5  # of a view that agree, and share of the unique ones
+_ROUNDS = 4  # of cameras and of the shape of their pixels
+_OWN_FOCALS = 1.3  # times nearer with a focal length for each view
+_OUTSIDE = 999  # a colour that no pixel has
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """A size of the pictures that the model may have seen, and the views it may have written."""
+
+    transform: PhotoTransform
+    views: tuple[int, ...]
+
+    @property
+    def inside(self) -> np.ndarray:
+        """Pixels ``[m]`` of the kept box, row by row."""
+        width, height = self.transform.width, self.transform.height
+        return da3_box(width, height).pixels(width, height).reshape(-1)
+
+    @property
+    def bounds(self) -> tuple[int, int]:
+        """Fewest and most rows that a view has, by whether the farthest pixels lie in the box."""
+        pixels, box = self.transform.width * self.transform.height, len(self.inside)
+        return box - (pixels - int(DEPTH_SHARE * (pixels - 1)) - 1), box
+
+
+def _possible_grids(count: int, views: int, size: Size) -> Iterator[_Grid]:
+    """Yield the grids whose views can have ``count`` rows, for photos of one size."""
+    for transform in (resize_to(size, size), *patch_grids(size)):
+        for chosen in every_nth(views):
+            grid = _Grid(transform, chosen)
+            fewest, most = grid.bounds
+            if fewest * len(chosen) <= count <= most * len(chosen):
+                yield grid
+
+
+def estimate_with_photos(
+    path: Path,
+    gaussians: Gaussians,
+    valid: np.ndarray,
+    names: Sequence[str],
+    size: Size,
+    read_photos: Callable[[], Photos],
+) -> CameraFile | None:
+    """Estimate the cameras of a file that lacks unknown pixels, from the colours of its photos.
+
+    ``names`` are those of the photos, which have one ``size``; ``valid [n]`` bool; ``path`` is for
+    messages. None where colours and rows do not agree.
+    """
+    grids = list(_possible_grids(len(gaussians), len(names), size))
+    if not grids:
+        return None
+    photos = read_photos()
+    with np.errstate(invalid="ignore"):
+        base = np.nan_to_num(sh0_to_rgb(gaussians.sh0[:, 0])).clip(0, 1)
+    colors = np.ascontiguousarray(np.rint(255 * base).astype(np.int16).T)
+    for grid in grids:
+        layout = _match_colors(colors, grid, grid.transform.photos(photos))
+        cameras = None if layout is None else _solve(gaussians, valid, layout, grid)
+        if cameras is not None:
+            size = cameras.width, cameras.height
+            views = [
+                View(names[view], cameras.viewmats[block, :3], cameras.Ks[block], size)
+                for block, view in enumerate(grid.views)
+            ]
+            return make_camera_file(path, WITH_PHOTOS, W2C_OPENCV, views)
+    return None
+
+
+def _match_colors(colors: np.ndarray, grid: _Grid, photos: Photos) -> Layout | None:
+    """Find pixels of some rows of each view by their ``colors [3,n]``, or None if they are too few."""
+    inside, (fewest, _) = grid.inside, grid.bounds
+    dropped = len(inside) - fewest  # pixels of a view, at most
+    length = min(_STRETCH, grid.transform.width)
+    first, unsure = 0, 0  # row that the view begins with, and by how many that may be wrong
+    rows, pixels = [], []
+    for view in grid.views:
+        shown = photos[view].reshape(-1, 3)[inside].T.astype(np.int16)
+        shown = np.concatenate([shown, np.full((3, length), _OUTSIDE, np.int16)], 1)
+        last = min(first + len(inside), colors.shape[1]) - length
+        found = []
+        for start in np.unique(np.linspace(first + unsure // 2, last, _STRETCHES).astype(int)):
+            low = max(0, start - first - unsure - _SLACK)
+            high = min(len(inside), start - first + unsure + dropped + _SLACK)
+            if start >= 0 and low < high:
+                found.append((start, *_place(shown, colors[:, start : start + length], low, high)))
+        placed = _agreeing(np.array(found, np.int64).reshape(-1, 4))
+        if not len(placed):
+            return None
+        within = np.linspace(0, length - 1, _PER_STRETCH).astype(int)
+        rows.append((placed[:, :1] + within).reshape(-1))
+        pixels.append(inside[(placed[:, 1:2] + within).clip(max=len(inside) - 1)].reshape(-1))
+        start, place = (int(value) for value in placed[-1, :2])
+        left = max(0, len(inside) - place - length)
+        first = start + length + left // 2
+        unsure = left // 2 + length
+    width, height = grid.transform.width, grid.transform.height
+    blocks = tuple(range(len(grid.views)))
+    return Layout("", "pruned", "view-major", width, height, blocks, tuple(rows), tuple(pixels))
+
+
+def _place(shown: np.ndarray, wanted: np.ndarray, low: int, high: int) -> tuple[int, int, int]:
+    """Find where the colours ``wanted [3,l]`` lie in ``shown [3,m]``, by absolute differences.
+
+    Returns the place, from ``low`` on and below ``high``, its sum, and that of the next best place.
+    """
+    sums, difference = np.zeros(high - low, np.int32), np.empty(high - low, np.int16)
+    for offset in range(0, wanted.shape[1], _STEP):
+        for channel in range(3):
+            values = shown[channel, low + offset : high + offset]
+            np.subtract(values, wanted[channel, offset], out=difference)
+            np.abs(difference, out=difference)
+            sums += difference
+    best = int(sums.argmin())
+    others = np.concatenate([sums[: max(0, best - 2)], sums[best + 3 :]])
+    return low + best, int(sums[best]), int(others.min(initial=np.iinfo(np.int32).max))
+
+
+def _agreeing(found: np.ndarray) -> np.ndarray:
+    """Choose the stretches ``[s,4]`` that are unique and in order; none if few are.
+
+    Their columns are row, place, sum and the next best sum.
+    """
+    if not len(found):
+        return found
+    near = found[:, 2] <= _MAX_COST * max(1.0, float(np.quantile(found[:, 2], 0.25)))
+    found = found[near & (found[:, 3] > _UNIQUE * found[:, 2])]
+    gaps = found[:, 1] - found[:, 0]  # pixels dropped so far and a constant: never fewer
+    longest, before = np.ones(len(found), int), np.full(len(found), -1)
+    for i in range(len(found)):
+        earlier = np.flatnonzero(gaps[:i] <= gaps[i] + _BACK)
+        if len(earlier):
+            before[i] = earlier[longest[earlier].argmax()]
+            longest[i] = longest[before[i]] + 1
+    chain, i = [], int(longest.argmax()) if len(found) else -1
+    while i >= 0:
+        chain.append(i)
+        i = int(before[i])
+    enough = max(_MIN_STRETCHES, _MIN_AGREEING * len(found))
+    return found[chain[::-1]] if len(chain) >= enough else found[:0]
+
+
+def _solve(gaussians: Gaussians, valid: np.ndarray, layout: Layout, grid: _Grid) -> Cameras | None:
+    """Solve for the cameras from the rows whose pixels are known; None where they do not fit."""
+    aspect = grid.transform.scale_y / grid.transform.scale_x
+    pairs = find_correspondences(gaussians.means, valid, layout)
+    for _ in range(_ROUNDS):
+        _, cameras = _calibrate(gaussians, valid, layout, aspect, alone=False)
+        if cameras is None:
+            return None
+        aspect *= _stretch(pairs, cameras)
+    worst, cameras = _calibrate(gaussians, valid, layout, aspect, alone=True)
+    return cameras if worst <= pixel_limit(layout.width, layout.height) else None
+
+
+def _calibrate(
+    gaussians: Gaussians, valid: np.ndarray, layout: Layout, aspect: float, *, alone: bool
+) -> tuple[float, Cameras | None]:
+    """Solve for the cameras of some rows, with one focal length.
+
+    With ``alone`` each view gets its own where that is clearly better. Returns the largest median
+    distance in pixels as well, inf where there are no cameras.
+    """
+    worst, focal, poses = calibrate(gaussians.means, valid, layout, aspect)
+    focals = [focal] * len(poses)
+    views = [
+        replace(layout, views=(0,), rows=(rows,), pixels=(pixels,))
+        for rows, pixels in zip(layout.rows, layout.pixels, strict=True)
+    ]
+    ones = [calibrate(gaussians.means, valid, view, aspect) for view in views] if alone else []
+    largest = max((one[0] for one in ones), default=math.inf)
+    if largest * _OWN_FOCALS < worst:
+        worst, focals, poses = largest, [one[1] for one in ones], [one[2][0] for one in ones]
+    if not math.isfinite(worst):
+        return math.inf, None
+    width, height = layout.width, layout.height
+    Ks = np.stack([make_pinhole(focal, aspect * focal, width / 2, height / 2) for focal in focals])
+    viewmats = np.stack([np.vstack([pose, [0, 0, 0, 1]]) for pose in poses])
+    return worst, Cameras(viewmats, Ks, width, height)
+
+
+def _stretch(pairs: Correspondences, cameras: Cameras) -> float:
+    """Measure how much taller the pixels of pictures must be to fit the rows."""
+    viewmats, Ks = cameras.viewmats[pairs.views], cameras.Ks[pairs.views]
+    with np.errstate(all="ignore"):  # rows in a camera's plane, which are left out
+        xy, _ = project_points(pairs.points[:, None], viewmats, Ks)
+    middle = np.array([cameras.width, cameras.height]) / 2
+    seen, wanted = xy[:, 0] - middle, pairs.pixels - middle
+    error = np.linalg.norm(seen - wanted, axis=1)
+    near = error <= max(1.0, 3 * float(np.nanmedian(error)))
+    x, y = (seen[near] * wanted[near]).sum(0) / (seen[near] ** 2).sum(0)
+    return float(y / x)

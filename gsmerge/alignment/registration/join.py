@@ -1,0 +1,206 @@
+"""Scenes of one place -> one scene: each is moved to where it lies in the first one."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsmerge.alignment.registration.register import register
+from gsmerge.alignment.registration.similarities import move_points
+from gsmerge.errors import SceneError
+from gsmerge.geometry import Similarity, multiply_quats, normalize, rotmat_to_quat
+from gsmerge.kernels.elementary import arccos
+from gsmerge.kernels.matrices import matmul, solve
+from gsmerge.kernels.raster.harmonics import view_colors
+from gsmerge.types import Cameras, Gaussians, LargePhotos, Scene, grid_ids
+
+DIRECTIONS = 96  # in which harmonics are compared before and after a turn
+BRIGHT = np.float32(20.0)  # harmonic of degree 0 with which no colour is cut off below 0
+
+
+@dataclass(frozen=True)
+class JoinedScene:
+    """Several scenes as one, in the frame of the first that is in it."""
+
+    scene: Scene
+    used: tuple[int, ...]  # which of the given scenes are in it
+    names: tuple[str, ...]  # of the given scenes, for people
+    notes: tuple[str, ...]
+    # for each given scene its path, whether it was joined, and then the keypoints that say where it
+    # lies, the degrees that it was turned, its scale and the shift of its origin
+    facts: tuple[dict[str, Any], ...]
+
+
+def join_scenes(scenes: Sequence[Scene], paths: Sequence[Path]) -> JoinedScene:
+    """Put aligned scenes of one place, each in a frame and a scale of its own, into one.
+
+    ``paths`` are their files, for messages. SceneError if one has no pixels, two differ in the size
+    of their views or in their harmonics, or no two show the same surfaces.
+    """
+    _check(scenes, paths)
+    found = register(scenes)
+    names = _names(paths)
+    used = [i for i, place in enumerate(found.places) if place is not None]
+    if len(used) < 2:
+        problem = f"expected files that show one place, found no two of {len(paths)}"
+        remedy = "give photos that overlap by half, name their folder with --images"
+        remedy += ", or compact each file by itself"
+        raise SceneError(paths[0], f"{problem} whose photos share enough of it", remedy)
+    moved = [move_scene(scenes[i], place) for i in used if (place := found.places[i]) is not None]
+    counts = [found.matches[i] for i in used]
+    joined = f"{len(used)} of {len(scenes)} files are joined in the frame of {names[used[0]]}"
+    notes = [f"{joined}, by {min(counts)} to {max(counts)} keypoints each"]
+    left_out = "is left out: too little of what its photo shows is found in the others"
+    notes += [f"{name} {left_out}" for i, name in enumerate(names) if i not in used]
+    if len({scene.images is None for scene in moved}) > 1:
+        notes.append(
+            "some files have no photos, so none are used; name the folder of all with --images"
+        )  # fmt: skip
+    facts = [_facts(*one) for one in zip(paths, found.places, found.matches, strict=True)]
+    return JoinedScene(concat_scenes(moved), tuple(used), tuple(names), tuple(notes), tuple(facts))
+
+
+def _names(paths: Sequence[Path]) -> list[str]:
+    """Return the files' names, with their folders where they are called alike."""
+    alike = len({path.name for path in paths}) < len(paths)
+    return [os.path.join(path.parent.name, path.name) if alike else path.name for path in paths]
+
+
+def _check(scenes: Sequence[Scene], paths: Sequence[Path]) -> None:
+    first = scenes[0]
+    size = first.cameras.width, first.cameras.height
+    degree = first.gaussians.sh_degree
+    for scene, path in zip(scenes, paths, strict=True):
+        other = scene.cameras.width, scene.cameras.height
+        own = scene.gaussians.sh_degree
+        if not scene.aligned:
+            problem = "expected one Gaussian per pixel and a camera, to be joined, found none"
+            raise SceneError(path, problem, "compact it by itself; a result is named with -o")
+        if other != size:
+            problem = f"expected views of {size[0]} x {size[1]} as in {paths[0].name}"
+            problem += f", found {other[0]} x {other[1]}"
+            raise SceneError(path, problem, "export all at one size")
+        if own != degree:
+            problem = f"expected harmonics of degree {degree} as in {paths[0].name}, found {own}"
+            raise SceneError(path, problem, "export all with one degree")
+
+
+def _facts(path: Path, place: Similarity | None, matches: int) -> dict[str, Any]:
+    facts: dict[str, Any] = {"path": str(path), "joined": place is not None}
+    if place is None:
+        return facts
+    half = np.abs(rotmat_to_quat(place.rotation[None])[0, :1]).clip(0, 1)
+    degrees = round(float(np.degrees(2 * arccos(half))[0]), 4)
+    facts |= {"matches": matches, "degrees": degrees}
+    return facts | {"scale": place.scale, "shift": place.shift.tolist()}
+
+
+def move_scene(scene: Scene, place: Similarity) -> Scene:
+    """Move Gaussians and cameras of a scene by a similarity; pictures stay the same."""
+    g = scene.gaussians
+    if place.scale == 1 and np.array_equal(place.rotation, np.eye(3)) and not place.shift.any():
+        return scene
+    turn = rotmat_to_quat(place.rotation[None])[0]
+    gaussians = Gaussians(
+        means=move_points(place, g.means).astype(g.means.dtype),
+        quats=multiply_quats(turn, g.quats).astype(g.quats.dtype),
+        scales=(place.scale * g.scales).astype(g.scales.dtype),
+        opacities=g.opacities,
+        sh0=g.sh0,
+        shN=turn_harmonics(g.shN, place.rotation),
+    )
+    return replace(scene, gaussians=gaussians, cameras=place.move(scene.cameras))
+
+
+def turn_harmonics(shN: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """Turn spherical harmonics ``[n,k-1,3]`` with their Gaussians, by ``rotation [3,3]``.
+
+    They are fitted to the same colours in turned directions, which those of a degree show exactly.
+    """
+    num = shN.shape[1]
+    if num == 0 or len(shN) == 0:
+        return shN
+    directions = normalize(np.random.default_rng(0).normal(size=(DIRECTIONS, 3)))
+    before = _basis(matmul(directions, rotation), num)
+    after = _basis(directions, num)
+    turn = solve(matmul(after.T, after), matmul(after.T, before))
+    rows = matmul(shN.swapaxes(1, 2).reshape(-1, num), turn.T)
+    return np.ascontiguousarray(rows.reshape(-1, 3, num).swapaxes(1, 2), shN.dtype)
+
+
+def _basis(directions: np.ndarray, num: int) -> np.ndarray:
+    """Evaluate the higher harmonics in directions ``[d,3]``: ``[d,num]`` float64."""
+    means = directions.astype(np.float32)
+    count = len(means)
+    sh0 = np.full((count, 1, 3), BRIGHT)
+    ids = np.arange(count, dtype=np.int32)
+    plain = np.empty((count, 3), np.float32)
+    colors = np.empty((count, 3), np.float32)
+    eye = np.zeros(3, np.float32)
+    view_colors(means, sh0, np.zeros((count, num, 3), np.float32), ids, eye, 0, count, plain)
+    columns = []
+    for base in range(num):
+        one = np.zeros((count, num, 3), np.float32)
+        one[:, base] = 1
+        view_colors(means, sh0, one, ids, eye, 0, count, colors)
+        columns.append((colors - plain)[:, 0].astype(np.float64))
+    return np.stack(columns, 1)
+
+
+def concat_scenes(scenes: Sequence[Scene]) -> Scene:
+    """Put the views of scenes of one size and in one frame one after the other; all are aligned, or none is."""
+    cameras = Cameras(
+        np.concatenate([scene.cameras.viewmats for scene in scenes]),
+        np.concatenate([scene.cameras.Ks for scene in scenes]),
+        scenes[0].cameras.width,
+        scenes[0].cameras.height,
+    )
+    images = [scene.images for scene in scenes if scene.images is not None]
+    gaps = [scene.missing for scene in scenes]
+    incomplete = any(one is not None for one in gaps)
+    filled = [
+        np.zeros(_grid(scene), bool) if one is None else one
+        for scene, one in zip(scenes, gaps, strict=True)
+    ]  # fmt: skip
+    aligned = all(scene.aligned for scene in scenes)
+    return Scene(
+        gaussians=Gaussians.concat([scene.gaussians for scene in scenes]),
+        cameras=cameras,
+        images=np.concatenate(images) if len(images) == len(scenes) else None,
+        pixel_ids=grid_ids(np.concatenate([scene.valid for scene in scenes])) if aligned else None,
+        names=tuple(name for scene in scenes for name in scene.names),
+        missing=np.concatenate(filled) if incomplete else None,
+        large_photos=_concat_large([scene.large_photos for scene in scenes]),
+        masks=_concat_masks(scenes) if len(images) == len(scenes) else None,
+    )
+
+
+def _concat_masks(scenes: Sequence[Scene]) -> np.ndarray | None:
+    """Put masks one after the other, whole ones where a scene has none; None without any."""
+    if all(scene.masks is None for scene in scenes):
+        return None
+    return np.concatenate([np.full(_grid(s), True) if s.masks is None else s.masks for s in scenes])
+
+
+def _grid(scene: Scene) -> tuple[int, int, int]:
+    return len(scene), scene.cameras.height, scene.cameras.width
+
+
+def _concat_large(photos: Sequence[LargePhotos | None]) -> LargePhotos | None:
+    """Put large photos one after the other; None where some are missing or sizes differ."""
+    given = [one for one in photos if one is not None]
+    if len(given) < len(photos) or len({(one.width, one.height) for one in given}) > 1:
+        return None
+    readers = [(one, number) for one in given for number in one.ids]
+
+    def read(view: int) -> np.ndarray:
+        one, number = readers[view]
+        return one.read(number)
+
+    Ks = np.concatenate([one.Ks for one in given])
+    return LargePhotos(Ks, given[0].width, given[0].height, tuple(range(len(readers))), read)

@@ -1,0 +1,344 @@
+"""Find how scenes of one place lie in one another, by their photos and the depths under them.
+
+Keypoints of two photos that look alike are points of both scenes, at the depths of their Gaussians.
+Three of them give a similarity (Umeyama 1991); of seeded samples the one is chosen that most
+matches agree with. All scenes are then moved at once, by Gauss-Newton steps, until points project
+to where the other photos show them. A depth may be wrong by itself: a point is free to lie
+elsewhere along its ray, within the spread that the depths have.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from gsmerge.alignment.registration.keypoints import End, Matches, Photo, find_keypoints, match_photos
+from gsmerge.alignment.registration.similarities import (
+    apply_after,
+    fit_similarities,
+    invert_place,
+    move_points,
+    round_place,
+)
+from gsmerge.geometry import IDENTITY, Schedule, Similarity, camera_depths, descend, lower_median, motion_matrices
+from gsmerge.kernels.elementary import exp, log, log1p
+from gsmerge.kernels.matrices import matmul, solve
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.types import Scene
+
+SAMPLES = 2000  # triples of matches
+TRIALS = 60  # of their similarities, those that are tried in the photos
+CLOSE = 0.25  # distance of matched points, share of their depths, up to which a triple counts it
+DEPTH_SPREAD = 0.1  # standard deviation of the logarithm of a depth, before it is measured
+MIN_DEPTH_SPREAD = 0.01  # the least that is measured
+MIN_PIXELS = 0.2  # the least standard deviation of a keypoint that is measured
+NORMAL = 1.4826  # standard deviation over the median size of a normal number
+NORMAL_2D = 1 / 1.1774  # the same for the length of a vector of two
+AGREE = 9.0  # squared residual, in standard deviations, up to which a match agrees
+LOOSE = (100.0, 10.0, 2.0, 2.0)  # times AGREE, round by round: a chain of scenes has drifted
+BEHIND = 1e3  # stands for the logarithm of a depth behind the camera
+DOUBT = 4.0  # squared residual from which on a match counts less
+MIN_MATCHES = 16  # that agree where two scenes are connected; of unrelated photos up to 5 do
+MIN_SHARE = 0.15  # of the matches
+ROUNDS = 3  # of choosing the matches of a pair that agree, and moving it by them
+SCHEDULE = Schedule(steps=40, first=1e-4, ease=0.1, brake=10.0, most=1e6, min_gain=1e-9)
+SIZE = 7  # numbers of a step: turn, shift, logarithm of the scale
+
+Places = Sequence[Similarity | None]
+_Fit = tuple[Places, tuple[float, np.ndarray, np.ndarray]]  # with the cost there, its curvature and its slope
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """Where the scenes lie in the frame of the first one that is connected."""
+
+    places: tuple[Similarity | None, ...]  # of each scene; None where it is not connected
+    matches: tuple[int, ...]  # keypoints of each that agree with those of others
+
+
+def register(scenes: Sequence[Scene]) -> Registration:
+    """Find where aligned scenes, with grids of one size, lie in the frame of the first.
+
+    Of several connected sets the largest is used.
+    """
+    count, cameras = len(scenes), scenes[0].cameras
+    photos = [find_keypoints(scene) for scene in scenes]
+    size = cameras.width, cameras.height
+    ids = combinations(range(count), 2)
+    pairs = [match_photos((a, b), photos[a], photos[b], size) for a, b in ids]
+    links = [link for link in parallel_map(connect, pairs) if link is not None]
+    places = _chain(links, count)
+    inside = [some for _, some in links if all(places[scene] is not None for scene in some.scenes)]
+    spread = DEPTH_SPREAD
+    for loose in LOOSE if inside else ():
+        kept = [some.select(_squares(places, some, spread) < loose * AGREE) for some in inside]
+        places = _refine(places, kept, spread)
+        inside, spread = _measure_spreads(places, inside)
+    agreeing = [some.select(_squares(places, some, spread) < AGREE) for some in inside]
+    matches = [sum(len(some) for some in agreeing if i in some.scenes) for i in range(count)]
+    unit = _unit(photos, places)
+    rounded = tuple(None if place is None else round_place(place, unit) for place in places)
+    return Registration(rounded, tuple(matches))
+
+
+# Two scenes
+
+
+def connect(matches: Matches) -> tuple[Similarity, Matches] | None:
+    """Find the similarity from the first scene to the second that most matches agree with.
+
+    Returns it with those matches; None where they are too few.
+    """
+    if len(matches) < MIN_MATCHES:
+        return None
+    pair = replace(matches, scenes=(0, 1))
+    trials = _sample_places(matches)
+    misses = [_squares((one, IDENTITY), pair, DEPTH_SPREAD) for one in trials]
+    scores = [(1 - squares / AGREE).clip(0).sum() for squares in misses]
+    places: Places = (trials[int(np.argmax(scores))], IDENTITY)
+    agree = misses[int(np.argmax(scores))] < AGREE
+    for _ in range(ROUNDS):
+        if agree.sum() < MIN_MATCHES // 2:
+            return None
+        places = _refine(places, [pair.select(agree)], DEPTH_SPREAD, fixed=1)
+        agree = _squares(places, pair, DEPTH_SPREAD) < AGREE
+    found = places[0]
+    if found is None or agree.sum() < max(MIN_MATCHES, MIN_SHARE * len(matches)):
+        return None
+    return found, matches.select(agree)
+
+
+def _sample_places(matches: Matches) -> list[Similarity]:
+    """Fit similarities to triples of matches; return those that leave most matches close."""
+    rng = np.random.default_rng(0)
+    p, q = (end.points for end in matches.ends)
+    near, far = (camera_depths(end.points, end.viewmats) for end in matches.ends)
+    rows = rng.integers(0, len(matches), (SAMPLES, 3))
+    weights = (1 / (near * far))[rows]
+    rotations, scales, shifts = fit_similarities(p[rows], q[rows], weights)
+    moved = scales[:, None, None] * matmul(p, rotations.swapaxes(1, 2)) + shifts[:, None]
+    away = ((moved - q) ** 2).sum(2) / np.minimum(far, scales[:, None] * near) ** 2
+    closeness = (1 - away / CLOSE**2).clip(0).sum(1)
+    best = np.argsort(-closeness, kind="stable")[:TRIALS]
+    return [Similarity(rotations[i], float(scales[i]), shifts[i], kind="other") for i in best]
+
+
+def _between(places: Places, scenes: Sequence[int]) -> Similarity:
+    """Return the similarity from the frame of the first of two placed scenes to the second's."""
+    first, second = (places[scene] for scene in scenes)
+    assert first is not None
+    assert second is not None
+    return apply_after(invert_place(second), first)
+
+
+# Residuals
+
+
+@dataclass(frozen=True, eq=False)
+class _Residuals:
+    """What points of one scene miss in the photos of another, in standard deviations."""
+
+    moved: np.ndarray  # [m,3] points in the other's frame
+    values: np.ndarray  # [m,3]: two of the place in the photo, one of the depth
+    slopes: np.ndarray  # [m,3,3] their derivatives by ``moved``
+
+
+def _residuals(
+    place: Similarity,
+    own: End,
+    other: End,
+    pixels: float,
+    spread: float,
+) -> _Residuals:
+    """Project one end's points into the other's photos, by the similarity between their frames.
+
+    ``pixels``, ``spread``: standard deviations of a keypoint and of the logarithm of a depth.
+    """
+    turns = other.viewmats[:, :3, :3]
+    moved = move_points(place, own.points)
+    camera = _times(turns, moved) + other.viewmats[:, :3, 3]
+    z = np.maximum(camera[:, 2], 1e-9 * np.abs(camera).max(1) + 1e-30)
+    projected = _times(other.Ks, camera)[:, :2] / z[:, None]
+    by_camera = np.zeros((len(moved), 3, 3))
+    by_camera[:, :2] = (other.Ks[:, :2] - projected[..., None] * np.eye(3)[2]) / z[:, None, None]
+    # how the place in the photo moves where a depth is wrong by one standard deviation
+    poses = own.viewmats[:, :3, :3]
+    eyes = -_times(poses.swapaxes(1, 2), own.viewmats[:, :3, 3])
+    along = place.scale * _times(turns, matmul(own.points - eyes, place.rotation.T))
+    streaks = spread * _times(by_camera[:, :2], along)
+    lengths = np.maximum((streaks * streaks).sum(1), 1e-30)
+    shrink = (1 - pixels / np.sqrt(pixels**2 + lengths)) / lengths
+    outer = shrink[:, None, None] * streaks[:, :, None] * streaks[:, None]
+    whiten = (np.eye(2) - outer) / pixels
+    by_camera[:, :2] = matmul(whiten, by_camera[:, :2])
+    depth_share = np.sqrt(2) * spread  # both depths have errors
+    by_camera[:, 2, 2] = 1 / (depth_share * z)
+    ratios = log(z / camera_depths(other.points, other.viewmats))
+    values = np.empty((len(moved), 3))
+    values[:, :2] = _times(whiten, projected - other.pixels)
+    values[:, 2] = np.where(camera[:, 2] > 0, ratios, BEHIND) / depth_share
+    return _Residuals(moved, values, matmul(by_camera, turns))
+
+
+def _times(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Multiply matrices ``[m,i,j]`` and vectors ``[m,j]``."""
+    return matmul(matrices, vectors[..., None])[..., 0]
+
+
+def _squares(places: Places, matches: Matches, spread: float) -> np.ndarray:
+    """Return the squared residual ``[m]`` of each match, the larger of both ways."""
+    both = [(one.values**2).sum(1) for one in _both_ways(places, matches, spread)]
+    return np.asarray(np.maximum(*both))
+
+
+def _both_ways(places: Places, matches: Matches, spread: float) -> list[_Residuals]:
+    first, second = matches.ends
+    there = _between(places, matches.scenes)
+    return [
+        _residuals(there, first, second, matches.spread, spread),
+        _residuals(invert_place(there), second, first, matches.spread, spread),
+    ]
+
+
+def _measure_spreads(places: Places, matches: Sequence[Matches]) -> tuple[list[Matches], float]:
+    """Measure how far keypoints are off, and the logarithms of depths, robustly.
+
+    Returns the matches with the former, and the latter.
+    """
+    values = [_both_ways(places, some, DEPTH_SPREAD)[0].values for some in matches]
+    lengths = [
+        some.spread * np.sqrt((one[:, :2] ** 2).sum(1))
+        for some, one in zip(matches, values, strict=True)
+    ]  # fmt: skip
+    ratios = np.abs(np.concatenate(values)[:, 2]) * DEPTH_SPREAD
+    spread = NORMAL * float(lower_median(ratios))
+    pixels = max(NORMAL_2D * float(lower_median(np.concatenate(lengths))), MIN_PIXELS)
+    measured = [replace(some, spread=min(pixels, some.spread)) for some in matches]
+    return measured, min(max(spread, MIN_DEPTH_SPREAD), DEPTH_SPREAD)
+
+
+# All scenes
+
+
+def _chain(links: Sequence[tuple[Similarity, Matches]], count: int) -> Places:
+    """Place the largest connected set by its strongest links, in the frame of its first scene."""
+    strength = [0] * count
+    for _, some in links:
+        for scene in some.scenes:
+            strength[scene] += len(some)
+    best: Places = []
+    for start in sorted(range(count), key=lambda scene: -strength[scene]):
+        places = _chain_from(start, links, count)
+        if _num_placed(places) > _num_placed(best):
+            best = places
+    first = next(place for place in best if place is not None)
+    back = invert_place(first)
+    return [place and (IDENTITY if place is first else apply_after(back, place)) for place in best]
+
+
+def _num_placed(places: Places) -> int:
+    return sum(place is not None for place in places)
+
+
+def _chain_from(start: int, links: Sequence[tuple[Similarity, Matches]], count: int) -> Places:
+    """Place scenes in the frame of one, each by the strongest link to those that are placed."""
+    places: list[Similarity | None] = [None] * count
+    places[start] = IDENTITY
+    while True:
+        ends = [
+            link for link in links
+            if sum(places[scene] is not None for scene in link[1].scenes) == 1
+        ]  # fmt: skip
+        if not ends:
+            return places
+        place, some = max(ends, key=lambda link: len(link[1]))
+        a, b = some.scenes
+        first = places[a]
+        second = places[b]
+        if second is not None:
+            places[a] = apply_after(second, place)
+        elif first is not None:
+            places[b] = apply_after(first, invert_place(place))
+
+
+def _refine(
+    places: Places, matches: Sequence[Matches], spread: float, fixed: int | None = None
+) -> Places:  # fmt: skip
+    """Move all placed scenes but one until matches agree best, by damped Gauss-Newton steps.
+
+    ``fixed``: the scene that stays; None: the first that is placed.
+    """
+    placed = [i for i, place in enumerate(places) if place is not None]
+    free = [i for i in placed if i != (placed[0] if fixed is None else fixed)]
+
+    def fit(near: Places) -> _Fit:
+        return near, _normal_equations(near, matches, spread, free)
+
+    def step(state: _Fit, damping: float) -> _Fit | None:
+        own, (_, curvature, slope) = state
+        scale = damping * np.diag(curvature) + 1e-12 * curvature.trace() + 1e-30
+        steps = -solve(curvature + np.diag(scale), slope).reshape(-1, SIZE)
+        if not np.isfinite(steps).all():
+            return None
+        moved = list(own)
+        for i, vector in zip(free, steps, strict=True):
+            moved[i] = apply_after(own[i] or IDENTITY, _make_step(vector))
+        return fit(moved)
+
+    return descend(fit(places), lambda state: state[1][0], step, SCHEDULE)[0]
+
+
+def _make_step(step: np.ndarray) -> Similarity:
+    """Make a similarity of a turn, a shift and the logarithm of a scale, ``[7]``."""
+    turn = motion_matrices(np.concatenate([step[:3], np.zeros(3)])[None])[0, :3, :3]
+    growth = float(exp(step[6:].clip(-1, 1))[0])
+    return Similarity(turn, growth, step[3:6], kind="other")
+
+
+def _normal_equations(
+    places: Places, matches: Sequence[Matches], spread: float, free: Sequence[int]
+) -> tuple[float, np.ndarray, np.ndarray]:  # fmt: skip
+    """Return the cost (Cauchy's), its curvature and its slope by the steps of the free scenes."""
+    size = len(free) * SIZE
+    curvature = np.zeros((size, size))
+    slope = np.zeros(size)
+    cost = 0.0
+    columns = {scene: slice(i * SIZE, (i + 1) * SIZE) for i, scene in enumerate(free)}
+    for some in matches:
+        there = _between(places, some.scenes)
+        ways = _both_ways(places, some, spread)
+        for way, place, found in zip((0, 1), (there, invert_place(there)), ways, strict=True):
+            squares = (found.values**2).sum(1)
+            weights = 1 / (1 + squares / DOUBT)
+            cost += DOUBT * float(log1p(squares / DOUBT).sum())
+            own = _by_step(found.slopes, some.ends[way].points, place)
+            other = -_by_step(found.slopes, found.moved, IDENTITY)
+            parts = {some.scenes[way]: own, some.scenes[1 - way]: other}
+            parts = {scene: part for scene, part in parts.items() if scene in columns}
+            for scene, part in parts.items():
+                weighted = (weights[:, None, None] * part).reshape(-1, SIZE).T
+                slope[columns[scene]] += matmul(weighted, found.values.reshape(-1))
+                for second, more in parts.items():
+                    block = matmul(weighted, more.reshape(-1, SIZE))
+                    curvature[columns[scene], columns[second]] += block
+    return cost, curvature, slope
+
+
+def _by_step(slopes: np.ndarray, points: np.ndarray, place: Similarity) -> np.ndarray:
+    """Derive residuals by a step of their points before ``place`` is applied: ``[m,3,7]``."""
+    by_point = place.scale * matmul(slopes, place.rotation)
+    x, y, z = points.T
+    zero = np.zeros_like(x)
+    turns = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], 1).reshape(-1, 3, 3)
+    by_scale = matmul(by_point, points[..., None])
+    return np.concatenate([matmul(by_point, turns), by_point, by_scale], 2)
+
+
+def _unit(photos: Sequence[Sequence[Photo]], places: Places) -> float:
+    """Return the power of two next to the median depth of the first placed scene's points."""
+    first = next(some for some, place in zip(photos, places, strict=True) if place is not None)
+    depths = np.concatenate([camera_depths(photo.points, photo.viewmat) for photo in first])
+    return float(2.0 ** np.frexp(lower_median(depths))[1]) if len(depths) else 1.0

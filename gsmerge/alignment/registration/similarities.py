@@ -1,0 +1,68 @@
+"""Similarities: fitted to points, applied, combined and rounded."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsmerge.geometry import Similarity, normalize, quat_to_rotmat, rotmat_to_quat
+from gsmerge.kernels.matrices import eigh, matmul
+
+DIGITS = 7  # decimals of a rounded place: its last bits mean nothing
+
+
+def fit_similarities(
+    p: np.ndarray,
+    q: np.ndarray,
+    weights: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Fit ``q = scale * rotation @ p + shift`` to b sets of points ``[b,n,3]``, weights ``[b,n]``.
+
+    Rotations by Horn (1987); the scale is that of both spreads, as both have errors. Returns
+    rotations ``[b,3,3]``, scales ``[b]`` and shifts ``[b,3]``.
+    """
+    share = (weights / weights.sum(1, keepdims=True))[..., None]
+    middle_p = (share * p).sum(1)
+    middle_q = (share * q).sum(1)
+    a = p - middle_p[:, None]
+    b = q - middle_q[:, None]
+    scales = np.sqrt(_spread(b, share) / _spread(a, share))
+    m = matmul((share * b).swapaxes(1, 2), a)
+    trace = np.trace(m, axis1=1, axis2=2)
+    turn = np.stack([m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]], 1)
+    form = np.empty((len(m), 4, 4))
+    form[:, 0, 0] = trace
+    form[:, 0, 1:] = turn
+    form[:, 1:, 0] = turn
+    form[:, 1:, 1:] = m + m.swapaxes(1, 2) - trace[:, None, None] * np.eye(3)
+    rotations = quat_to_rotmat(eigh(form)[1][:, :, -1])
+    shifts = middle_q - scales[:, None] * matmul(rotations, middle_p[..., None])[..., 0]
+    return rotations, scales, shifts
+
+
+def _spread(points: np.ndarray, share: np.ndarray) -> np.ndarray:
+    return np.asarray(np.maximum((share * points**2).sum((1, 2)), 1e-30))
+
+
+def move_points(place: Similarity, points: np.ndarray) -> np.ndarray:
+    """Move points ``[n,3]`` or ``[3]`` by a similarity."""
+    return np.asarray(place.scale * matmul(points, place.rotation.T) + place.shift)
+
+
+def apply_after(second: Similarity, first: Similarity) -> Similarity:
+    """Return the similarity that applies ``first``, then ``second``."""
+    rotation = matmul(second.rotation, first.rotation)
+    shift = move_points(second, first.shift)
+    return Similarity(rotation, second.scale * first.scale, shift, kind="other")
+
+
+def invert_place(place: Similarity) -> Similarity:
+    """Return the similarity that undoes another."""
+    shift = -matmul(place.rotation.T, place.shift) / place.scale
+    return Similarity(place.rotation.T, 1 / place.scale, shift, kind="other")
+
+
+def round_place(place: Similarity, unit: float) -> Similarity:
+    """Round a similarity to so many digits, so that the last bits of keypoints do not matter."""
+    quat = normalize(rotmat_to_quat(place.rotation[None]).round(DIGITS))
+    shift = unit * (place.shift / unit).round(DIGITS)
+    return Similarity(quat_to_rotmat(quat)[0], round(place.scale, DIGITS), shift, kind="other")

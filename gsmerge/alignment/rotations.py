@@ -1,0 +1,180 @@
+"""Read rotations that an exporter stored in another order, or left in the camera's frame."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal, get_args
+
+import numpy as np
+
+from gsmerge.alignment.layouts import spread_step
+from gsmerge.geometry import multiply_quats, normalize, quat_to_rotmat, rotmat_to_quat
+from gsmerge.kernels.pictures import convolve
+from gsmerge.runtime.memory import free_pages
+from gsmerge.types import Scene
+
+QuatChoice = Literal["auto", "wxyz", "xyzw", "xyzw-root", "camera"]
+QUATS: tuple[str, ...] = get_args(QuatChoice)
+_SAMPLES = 3000  # pixels per view whose surface is used
+_STEP = 2  # pixels to the neighbours that span the surface
+_FLAT = 0.8  # thinnest over middle scale, at most, where a Gaussian's thinnest axis is a normal of its surface
+_MIN_TESTED = 300  # Gaussians
+_MIN_COSINE, _MIN_GAIN = 0.6, 0.15  # of the mean cosine between thinnest axis and normal, for another reading
+_AROUND = 5  # pixels of the square over which means are averaged before roots are compared
+_FOLLOWS = 0.95  # cosine above which an axis follows the surface
+_MAX_LEFT = 0.5  # share of Gaussians that follow under no root, over that under any other reading
+_READINGS: tuple[QuatChoice, ...] = ("wxyz", "xyzw", "camera")
+_DESCRIPTIONS = {
+    "xyzw": "stored with w last",
+    "camera": "relative to each view's camera",
+    "xyzw-root": "stored with w last and each applied twice",
+}
+
+
+def read_rotations(scene: Scene, quats: QuatChoice) -> Scene:
+    """Read a scene's stored rotations, which were read as wxyz, in another way; see :class:`ReadHints`.
+
+    Of the two square roots that "xyzw-root" has, the one whose thinnest axis follows the surface better is taken.
+    Where rows belong to no pixels, only "xyzw" changes anything.
+    """
+    if quats in ("auto", "wxyz") or not (scene.aligned or quats == "xyzw"):
+        return scene
+    stored = scene.gaussians.quats
+    if quats == "xyzw":
+        read = from_xyzw(stored)
+    elif quats == "xyzw-root":
+        normals, thinnest = _smooth_normals(scene), scene.gaussians.scales.argmin(1)
+        roots = square_roots(from_xyzw(stored))
+        first, second = (_cosines(root, thinnest, normals) for root in roots)
+        read = np.where((second > first)[:, None], roots[1], roots[0])
+    else:
+        read = multiply_quats(_camera_quats(scene).repeat(scene.pixels_per_view, 0), stored)
+    return replace(scene, gaussians=replace(scene.gaussians, quats=read))
+
+
+def from_xyzw(quats: np.ndarray) -> np.ndarray:
+    """Bring ``[n,4]`` xyzw into the order wxyz."""
+    return quats[:, [3, 0, 1, 2]]
+
+
+def square_roots(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Compute both rotations that, applied twice, give ``quats [n,4]`` wxyz: half the angle, and half a turn more."""
+    unit = normalize(quats)
+    unit = np.where(unit[:, :1] < 0, -unit, unit)
+    half = normalize(unit + np.array((1, 0, 0, 0), unit.dtype))
+    return half, _half_a_turn_more(half)
+
+
+def choose_rotations(scene: Scene) -> tuple[QuatChoice, str]:
+    """Choose the reading whose thinnest axes follow the surface's normals, with a note; "wxyz" and "" in doubt."""
+    normals, rows, views = _normals(scene)
+    scales = scene.gaussians.scales[rows]
+    free_pages(vars(scene.gaussians).values())
+    ordered = np.sort(scales, 1)
+    flat = ordered[:, 0] < _FLAT * ordered[:, 1]
+    normals, rows, views = normals[flat], rows[flat], views[flat]
+    if len(rows) < _MIN_TESTED:
+        return "wxyz", ""
+    thinnest, quats = scales[flat].argmin(1), scene.gaussians.quats[rows]
+    free_pages([scene.gaussians.quats])
+    as_xyzw = from_xyzw(quats)
+    single = [quats, as_xyzw, multiply_quats(_camera_quats(scene)[views], quats)]
+    means = (float(_cosines(read, thinnest, normals).mean()) for read in single)
+    cosine: dict[QuatChoice, float] = dict(zip(_READINGS, means, strict=True))
+    best: QuatChoice = max(_READINGS, key=lambda name: cosine[name])
+    if _is_root(scene, rows, single, thinnest, normals):
+        best, cosine["xyzw-root"] = "xyzw-root", _better_of(square_roots(as_xyzw), thinnest, normals, 0.0)
+    elif best == "wxyz" or cosine[best] < max(_MIN_COSINE, cosine["wxyz"] + _MIN_GAIN):
+        return "wxyz", ""
+    return best, (
+        f"rotations are {_DESCRIPTIONS[best]}: the thinnest axes are at a mean cosine of {cosine[best]:.2f} to the"
+        f" surface then, {cosine['wxyz']:.2f} as stored; quats 'wxyz' says otherwise"
+    )
+
+
+def _camera_quats(scene: Scene) -> np.ndarray:
+    """Compute rotations ``[v,4]`` from each camera to the world, wxyz."""
+    return rotmat_to_quat(scene.cameras.viewmats[:, :3, :3].swapaxes(1, 2)).astype(np.float32)
+
+
+def _cosines(quats: np.ndarray, thinnest: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Compute cosines ``[n]`` between Gaussians' thinnest axes under ``quats [n,4]`` and the normals, 0 to 1."""
+    axes = np.take_along_axis(quat_to_rotmat(quats), thinnest[:, None, None], 2)[:, :, 0]
+    return np.abs((axes * normals).sum(1))
+
+
+def _is_root(
+    scene: Scene, rows: np.ndarray, single: list[np.ndarray], thinnest: np.ndarray, normals: np.ndarray
+) -> bool:
+    """Return whether the roots of the rotations as xyzw follow the surface far better than all other readings.
+
+    The better of two is better by chance as well: so every other reading gets a second rotation, half a turn more.
+    ``single`` are readings ``[t,4]``, as stored first, as xyzw next; ``normals`` are rough, for a quick comparison.
+    """
+    others = [square_roots(single[0]), *((one, _half_a_turn_more(one)) for one in single)]
+    roots = square_roots(single[1])
+    if _better_of(roots, thinnest, normals, 0.0) <= max(_better_of(pair, thinnest, normals, 0.0) for pair in others):
+        return False
+    smooth = _smooth_normals(scene)[rows]
+    best_other = max(_better_of(pair, thinnest, smooth, _FOLLOWS) for pair in others)
+    return 1 - _better_of(roots, thinnest, smooth, _FOLLOWS) <= _MAX_LEFT * (1 - best_other)
+
+
+def _better_of(
+    pair: tuple[np.ndarray, np.ndarray], thinnest: np.ndarray, normals: np.ndarray, threshold: float
+) -> float:
+    """Average the cosine of the better of two rotations ``[n,4]``; with a threshold > 0, the share above it."""
+    better = np.maximum(*(_cosines(quats, thinnest, normals) for quats in pair))
+    return float((better > threshold).mean() if threshold else better.mean())
+
+
+def _half_a_turn_more(quats: np.ndarray) -> np.ndarray:
+    """Turn rotations ``[n,4]`` by half a turn more about their own axes, or an arbitrary axis without an angle."""
+    length = np.linalg.norm(quats[:, 1:], axis=1, keepdims=True)
+    axis = np.where(length > 0, normalize(quats[:, 1:]), np.array((0, 0, 1), quats.dtype))
+    return np.concatenate([-length, quats[:, :1] * axis], 1)
+
+
+def _smooth_normals(scene: Scene) -> np.ndarray:
+    """Compute normals ``[n,3]`` of the surface at all pixels from means that are averaged around; 0 on overflow."""
+    v, h, w = scene.valid.shape
+    weights = scene.valid[..., None].astype(np.float32)
+    means = scene.gaussians.means.reshape(v, h, w, 3)
+    middle = means.mean((0, 1, 2), np.float64, where=weights > 0).astype(means.dtype)
+    with np.errstate(over="ignore"):
+        both = np.concatenate([np.where(weights > 0, means - middle, 0).astype(np.float32), weights], 3)
+    around = np.stack([_average_around(view) for view in both])
+    grid = around[..., :3] / np.maximum(around[..., 3:], np.float32(1e-6))
+    x, y = np.arange(w), np.arange(h)
+    with np.errstate(all="ignore"):  # means as large as 1e38 overflow
+        across = grid[:, :, np.minimum(x + _STEP, w - 1)] - grid[:, :, np.maximum(x - _STEP, 0)]
+        down = grid[:, np.minimum(y + _STEP, h - 1)] - grid[:, np.maximum(y - _STEP, 0)]
+        normals = normalize(np.cross(across, down).reshape(-1, 3))
+    return np.where(np.isfinite(normals).all(1, keepdims=True), normals, 0)
+
+
+def _average_around(picture: np.ndarray) -> np.ndarray:
+    """Average a picture ``[h,w,c]`` over squares of ``_AROUND`` pixels a side, zero outside."""
+    half = _AROUND // 2
+    taps = np.full(_AROUND, 1 / _AROUND)
+    return convolve(np.pad(picture, ((half, half), (half, half), (0, 0))), taps, taps)[half:-half, half:-half]
+
+
+def _normals(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Compute normals ``[t,3]`` of some pixels' surface; also return their rows and views."""
+    v, h, w = scene.valid.shape
+    inner = np.arange(h * w).reshape(h, w)[_STEP:-_STEP, _STEP:-_STEP].reshape(-1)
+    step = spread_step(len(inner) // _SAMPLES, w - 2 * _STEP)
+    rows = (h * w * np.arange(v)[:, None] + inner[::step]).reshape(-1)
+    valid, means = scene.valid.reshape(-1), scene.gaussians.means
+    good = valid[rows]
+    for offset in (_STEP, -_STEP, _STEP * w, -_STEP * w):
+        good = good & valid[rows + offset]
+    rows = rows[good]
+    with np.errstate(all="ignore"):  # means as large as 1e38 overflow: their pixels are left out
+        across = (means[rows + _STEP] - means[rows - _STEP]).astype(np.float32)
+        down = (means[rows + _STEP * w] - means[rows - _STEP * w]).astype(np.float32)
+        normals = normalize(np.cross(across, down))
+    finite = np.isfinite(normals).all(1)
+    rows = rows[finite]
+    return normals[finite], rows, rows // (h * w)

@@ -1,0 +1,211 @@
+"""Choose cameras that see rows without pixels, by the share of Gaussians they see and by the photos' colours."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gsmerge.alignment.cameras import Poses, other_conventions
+from gsmerge.alignment.score import MARGIN, AlignmentInput, candidate_similarities
+from gsmerge.errors import SceneError
+from gsmerge.geometry import IDENTITY, Similarity, lower_median, project_points, sh0_to_rgb
+from gsmerge.io.cameras.camera_file import CameraFile, Convention, with_convention
+from gsmerge.kernels.elementary import exp
+from gsmerge.types import Cameras, Gaussians
+
+_SEEN_AS_MUCH = 0.98  # of the score of what the cameras see: no difference
+_SEEN_SAMPLES = 20_000  # Gaussians that are projected to see whether cameras see them
+_MIN_SEEN = 0.5  # share of them that some camera sees
+_MAX_COLOR_RATIO = 0.85  # of their colours' distance from the photos, over that from random pixels
+_SAME_COLORS = 0.01  # mean distance of the colours from random pixels below which photos say nothing
+_FRAME_GAIN = 1.1  # times the score of the cameras as given, for another frame
+# a scale stands out whose score is so many times that of a scale which is this factor off
+_PEAK, _PEAK_GAIN = 1.15, 1.05
+_SCALES = np.geomspace(1 / 30, 30, 55)  # of the cameras' positions, tried in turn
+_SCALE_SAMPLES = 2000  # Gaussians that they are tried on
+# next, nearer and nearer: reach (natural logarithm), steps, Gaussians
+_FINER = ((0.1, 11, 2000), (0.015, 7, 20_000), (0.004, 5, 20_000))
+_MIN_PADDING = 16  # equal rows at the origin: fewer may be Gaussians
+
+
+@dataclass(frozen=True)
+class CameraCheck:
+    """Measures of how well cameras see some Gaussians."""
+
+    share_seen: float  # share of the Gaussians inside at least one picture
+    # distance of their colours from the photos where they are seen, over the distance from the same pixels shuffled;
+    # NaN without photos, or where the colours hardly vary
+    color_ratio: float
+    ok: bool  # whether these are likely the cameras of these Gaussians
+
+    @property
+    def score(self) -> float:
+        """0 to 1, to rank cameras by: the share that is seen, reduced where colours fit little better than random."""
+        return self.share_seen * (1.0 if np.isnan(self.color_ratio) else max(0.0, 1 - self.color_ratio))
+
+    @property
+    def description(self) -> str:
+        """The figures in one sentence."""
+        seen = f"the cameras see {100 * self.share_seen:.0f} % of the Gaussians"
+        if np.isnan(self.color_ratio):
+            return seen
+        return f"{seen}, whose colours are {self.color_ratio:.2f} times as far from the photos as any others"
+
+
+def check_cameras(
+    gaussians: Gaussians,
+    valid: np.ndarray,
+    cameras: Cameras,
+    images: np.ndarray | None,
+    samples: int = _SEEN_SAMPLES,
+) -> CameraCheck:
+    """Project some valid Gaussians into all views, and compare their colours with ``images [c,h,w,3]``, if any."""
+    rows = np.flatnonzero(valid)
+    rows = rows[:: max(1, len(rows) // samples)]
+    points = gaussians.means[rows].astype(np.float64)
+    colors = sh0_to_rgb(gaussians.sh0[rows, 0]).clip(0, 1)
+    visible, errors, others = np.zeros(len(rows), bool), [], []
+    rng = np.random.default_rng(0)
+    for view in range(len(cameras)):
+        with np.errstate(all="ignore"):
+            xy, depth = project_points(points, cameras.viewmats[view], cameras.Ks[view])
+            xy = np.floor(xy)
+        inside = (depth > 0) & (xy >= 0).all(1) & (xy < (cameras.width, cameras.height)).all(1)
+        visible |= inside
+        if images is not None and inside.any():
+            x, y = xy[inside].astype(np.int64).T
+            photo = images[view, y, x]
+            errors.append(np.abs(colors[inside] - photo).mean(1))
+            others.append(np.abs(colors[inside] - rng.permutation(photo)).mean(1))
+    share, ratio = float(visible.mean()), np.nan
+    if errors and (other := float(np.concatenate(others).mean())) > _SAME_COLORS:
+        ratio = float(np.concatenate(errors).mean()) / other
+    return CameraCheck(share, ratio, share >= _MIN_SEEN and not ratio > _MAX_COLOR_RATIO)
+
+
+def choose_poses(
+    gaussians: Gaussians, valid: np.ndarray, cameras: Cameras, images: np.ndarray | None, convention: Convention
+) -> tuple[Poses | None, CameraCheck, str | None]:
+    """Choose the convention of the poses that sees most unaligned Gaussians, with colours nearest to the photos.
+
+    Arguments are as for :func:`check_cameras`, with the cameras under the usual convention. Returns the poses if
+    they are clearly better than the usual ones and all others, otherwise None; the check of the chosen ones; and a
+    note where others see as much as the usual ones.
+    """
+    usual = check_cameras(gaussians, valid, cameras, images)
+    others = [
+        (poses, check_cameras(gaussians, valid, replace(cameras, viewmats=poses.viewmats), images))
+        for poses in other_conventions(cameras.viewmats, convention)
+    ]
+    ranked = sorted(others, key=lambda one: -one[1].score)
+    if not ranked or not ranked[0][1].ok:
+        return None, usual, None
+    poses, best = ranked[0]
+    scores = [check.score for check in (usual, *(check for _, check in ranked[1:2])) if check.ok]
+    if best.score >= MARGIN * max(scores, default=0.0):
+        return poses, best, None
+    as_good = usual.ok and best.score >= _SEEN_AS_MUCH * usual.score
+    note = f"the poses fit as well when read as {poses.description}; they are read as the format has them"
+    return None, usual, note if as_good else None
+
+
+def find_padding(gaussians: Gaussians) -> np.ndarray:
+    """Find equal rows at the origin ``[n]`` bool, with which VolSplat fills its files up."""
+    padding = np.zeros(len(gaussians), bool)
+    rows = np.flatnonzero((gaussians.means == 0).all(1))
+    if len(rows) >= _MIN_PADDING:
+        columns = gaussians.scales, gaussians.opacities[:, None], gaussians.sh0[:, 0]
+        shape = np.concatenate(columns, 1)[rows]
+        padding[rows[(shape == lower_median(shape)).all(1)]] = True
+    return padding
+
+
+def choose_cameras(
+    inputs: AlignmentInput, camera_file: CameraFile, frames: Sequence[Similarity], why: SceneError
+) -> tuple[Cameras, CameraFile, list[str]]:
+    """Choose cameras that see the Gaussians: as given, in another frame, or in another convention; with notes.
+
+    ``frames`` are those that a file names; next come those of exporters. SceneError if none of these sees
+    them, with the reason ``why`` there are no pixels.
+    """
+    inputs = replace(inputs, valid=inputs.valid & ~find_padding(inputs.gaussians))
+    rows = inputs.gaussians, inputs.valid
+    moved = [(frame, frame.move(inputs.cameras)) for frame in (IDENTITY, *frames)]
+    if frames:
+        stay, *checks = (check_cameras(*rows, cameras, inputs.images) for _, cameras in moved)
+        best = max(checks, key=lambda check: check.score)
+        if best.ok and best.score > stay.score:
+            frame, cameras = moved[1 + checks.index(best)]
+            return cameras, replace(camera_file, viewmats=cameras.viewmats), [f"the cameras are {frame.description}"]
+    poses, check, note = choose_poses(*rows, inputs.cameras, inputs.images, camera_file.convention)
+    other = _choose_frame(inputs, check)
+    if other is not None:
+        cameras = other.move(inputs.cameras)
+        note = f"the cameras are {other.description}, as the photos' colours show"
+        return cameras, replace(camera_file, viewmats=cameras.viewmats), [note]
+    if not check.ok:
+        raise SceneError(why.path, f"{why.problem}; {check.description}", why.remedy)
+    if poses is None:
+        return inputs.cameras, camera_file, [note] if note else []
+    cameras = replace(inputs.cameras, viewmats=poses.viewmats)
+    note = f"{poses.describe(camera_file.convention)}: read so"
+    return cameras, with_convention(camera_file, poses.convention), [note]
+
+
+def _exporter_frames(inputs: AlignmentInput) -> Iterator[Similarity]:
+    """Yield the frames that exporters leave rows in, at the cameras' own scale."""
+    yield from list(candidate_similarities(None, inputs.cameras, effort=0))[1:]
+    first = inputs.cameras.viewmats[0]
+    yield Similarity(first[:3, :3], 1.0, first[:3, 3], "moved into the first camera", "first")
+
+
+def _choose_frame(inputs: AlignmentInput, usual: CameraCheck) -> Similarity | None:
+    """Choose the frame of an exporter under which the colours fit the photos clearly better, or None.
+
+    The true scale stands out: at any other the colours fit less. It is solved for where no frame stands out
+    at the cameras' own.
+    """
+    if inputs.images is None:
+        return None
+    # the first camera may see all Gaussians at any scale
+    seen = slice(1 if len(inputs.cameras) > 1 else 0, None)
+
+    def score(frame: Similarity, samples: int = _SEEN_SAMPLES) -> float:
+        cameras = frame.move(inputs.cameras)[seen]
+        images = None if inputs.images is None else inputs.images[seen]
+        check = check_cameras(inputs.gaussians, inputs.valid, cameras, images, samples)
+        return 0.0 if np.isnan(check.color_ratio) or not check.ok else check.score
+
+    def stands_out(frame: Similarity) -> bool:
+        beside = (score(_scaled(frame, factor)) for factor in (1 / _PEAK, _PEAK))
+        return score(frame) > _PEAK_GAIN * max(beside)
+
+    frames = [IDENTITY, *_exporter_frames(inputs)]
+    best = max(frames, key=score)
+    if inputs.scale is None and not stands_out(best):
+        scaled = (_solve_scale(frame, score) for frame in (IDENTITY, frames[1], frames[-1]))
+        best = max((best, *scaled), key=score)
+    enough = max(score(IDENTITY), usual.score if usual.ok else 0.0)
+    return best if stands_out(best) and score(best) > _FRAME_GAIN * enough else None
+
+
+def _scaled(frame: Similarity, factor: float) -> Similarity:
+    """Return a frame with another scale, about the origin of the Gaussians."""
+    scale = factor * frame.scale
+    text = f"positions scaled by {scale:.4g}"
+    name = frame.description.partition(", positions scaled")[0]
+    words = f"{name}, {text}" if name else text
+    return replace(frame, scale=scale, shift=factor * frame.shift, description=words)
+
+
+def _solve_scale(frame: Similarity, score: Callable[[Similarity, int], float]) -> Similarity:
+    """Find the scale under which the colours are nearest to the photos."""
+    tried = (_scaled(frame, float(scale)) for scale in _SCALES)
+    best = max(tried, key=lambda one: score(one, _SCALE_SAMPLES))
+    for reach, steps, samples in _FINER:
+        factors = exp(np.linspace(-reach, reach, steps))
+        near = [_scaled(best, float(factor)) for factor in factors]
+        best = max(near, key=lambda one: score(one, samples))
+    return best

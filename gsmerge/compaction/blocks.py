@@ -1,0 +1,307 @@
+"""A scene of many views in blocks: each is compacted by itself, cut to what is its own, and joined with the others."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, TypeVar
+
+import numpy as np
+
+from gsmerge.alignment.registration.join import concat_scenes
+from gsmerge.budget import parse_share, share_text
+from gsmerge.compaction.result import CompactReport, CompactResult, measure_psnr
+from gsmerge.facts.partition import (
+    Block,
+    Covisibility,
+    count_factors,
+    gaussians_at_once,
+    measure_covisibility,
+    owning_views,
+    partition_views,
+)
+from gsmerge.facts.prepare import Frame, Prepared, prepare, scene_frame
+from gsmerge.facts.views import in_float64, subset
+from gsmerge.fit import fit_scene, peak_weights
+from gsmerge.options import CompactOptions
+from gsmerge.pipeline import start
+from gsmerge.plan import Plan, choose_networks, make_plan, resolve_decode, steps_for
+from gsmerge.raster import contributions, plan_view
+from gsmerge.raster import prepare as prepare_splats
+from gsmerge.raster.metrics import describe_loss
+from gsmerge.raster.photos import Photos, blank_photos
+from gsmerge.runtime.estimate import memory_bytes
+from gsmerge.runtime.memory import free_pages, peak_memory
+from gsmerge.runtime.record import Record, add_seconds, choose, current_record, note, record_part, stage
+from gsmerge.runtime.threads import in_turn
+from gsmerge.stages.clean import faintest_dropped
+from gsmerge.stages.segment import CountLimits, count_limits
+from gsmerge.stages.superpixels import AUTO_SHARE, SHARE
+from gsmerge.types import Decoded, Gaussians, Scene
+
+T = TypeVar("T")
+FOREIGN = 0.1  # share of a Gaussian's weights in other blocks' views from which on it is at a seam
+SEAM_SHARE = 0.1  # of a view's weights that such Gaussians have from which on it is fitted to
+SEAM_STEPS = 100  # at least
+SEAM_LOOKS = 2  # at each view, at least
+SEAM_RATE = 0.6  # times the usual first steps: what is there is fitted, but not beside its neighbours as they are now
+SEAM_DECAY = 0.1  # factor on the steps at the end
+MOST_DENSITY = 2.0  # times the superpixels of one piece, where a scene's views see so much of each other's
+SURPLUS = 1.03  # times an exact number of Gaussians: the faintest of what is too many are left out
+
+
+def compact_in_blocks(given: Scene, options: CompactOptions, count: int) -> CompactResult:
+    """Compact an aligned scene in ``count`` blocks of views.
+
+    The views of each block are merged first, and of the Gaussians those are kept that belong to it, so that all blocks
+    together have one set of Gaussians to start with. Then each block fits what its views see, its neighbours'
+    Gaussians included, and keeps its own: where two blocks meet, both fit the same Gaussians to the same photos.
+    """
+    device, given = given.gaussians.device, given.numpy()
+    with stage("partition"):
+        covisibility = measure_covisibility(given)
+        blocks = partition_views(covisibility.weights, count)
+        factors = count_factors(blocks, covisibility).tolist()
+        frame, whole = scene_frame(given), whole_limits(given, options)
+        options = with_whole_choices(options, given, whole)
+    size = gaussians_at_once(given.num_gaussians, count)
+    memory = memory_bytes(size, photos=given.images is not None, num_rest=3 * given.gaussians.shN.shape[1])
+    with options.blocks.engine.start(threads=options.threads, memory=memory) as work:
+        seen = work.share(covisibility)
+
+        def pieces() -> Iterator[tuple[Any, ...]]:
+            for block, factor in zip(blocks, factors, strict=True):
+                free_scene(given)
+                own = block_options(options, given, block, factor, whole.count)
+                yield subset(given, block.views), block, seen, own, frame
+
+        parts = [part for part, _ in adopt_records(work.run("merge", start_part, count, pieces()))]
+        with stage("join"):
+            joined = Gaussians.concat([part.gaussians for part in parts])
+            owners = np.repeat(np.arange(count), [len(part.gaussians) for part in parts])
+            growth = sum(part.count for part in parts) / max(1, len(joined))
+        everything = work.share((joined, owners))
+        fits = ((part, everything, i, growth) for i, part in enumerate(parts))
+        fitted = list(adopt_records(work.run("fit", fit_part, count, fits)))
+        joined = Gaussians.concat([gaussians for gaussians, _ in fitted])
+        owners = np.repeat(np.arange(count), [len(gaussians) for gaussians, _ in fitted])
+        result = frame.leave(fit_seams(joined, owners, parts, options.seed))
+        if whole.count is not None and whole.count < len(result):
+            result = faintest_dropped(result, whole.count)
+        everything = work.share(result)
+        views = ((part, everything) for part in parts)
+        scores = [psnr for psnr, _ in adopt_records(work.run("score", score_part, count, views))]
+    facts = [
+        {
+            "views": len(part.block.own), "shared_views": len(part.block.shared), "num_start": len(part.gaussians),
+            "psnr_input_views": score, "fit": choices.get("fit"),
+        }
+        for part, (_, choices), score in zip(parts, fitted, scores, strict=True)
+    ]  # fmt: skip
+    choose(blocks=facts)
+    return CompactResult(result, join_reports(given, result, parts, scores, options), given.cameras).to(device)
+
+
+def adopt_records(outcomes: Iterable[tuple[T, Record]]) -> Iterator[tuple[T, dict[str, Any]]]:
+    """Yield the values and choices of parts of the work, whose seconds and notes enter the current record."""
+    for value, record in outcomes:
+        add_seconds(record.seconds)
+        for text in record.notes:
+            note(text)
+        yield value, record.choices
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A block between merging and fit."""
+
+    block: Block
+    gaussians: Gaussians  # canonical ones that belong to it
+    count: int  # Gaussians that it is to have in the end
+    prepared: Prepared  # its views, without the Gaussians of their pixels
+    plan: Plan
+    psnr_before: float | None  # of the scored views
+
+
+def start_part(piece: Scene, block: Block, covisibility: Covisibility, options: CompactOptions, frame: Frame) -> Part:
+    """Merge the views of a block, and keep what belongs to it of the Gaussians that its fit starts with."""
+    prepared = prepare(piece, options.prepare, frame)
+    plan = make_plan(prepared, options)
+    decoded = start(prepared, plan, plan.limits.count)
+    own = belongs_to_block(frame.leave(decoded.gaussians).means, block, covisibility)
+    before = measure_psnr("input", prepared.given.file_gaussians, prepared.given, prepared, plan)
+    share = own.sum() / max(1, len(own))
+    return Part(block, decoded.gaussians[own], round(share * decoded.count), without_gaussians(prepared), plan, before)
+
+
+def without_gaussians(prepared: Prepared) -> Prepared:
+    """Return a prepared scene without the Gaussians of its pixels."""
+
+    def bare(scene: Scene) -> Scene:
+        return replace(scene, gaussians=scene.gaussians[np.zeros(0, int)], pixel_ids=None, missing=None)
+
+    return replace(prepared, scene=bare(prepared.scene), given=bare(prepared.given))
+
+
+def fit_part(part: Part, everything: tuple[Gaussians, np.ndarray], own: int, growth: float) -> Gaussians:
+    """Fit the canonical Gaussians of all blocks that a block's views may see, and return those of block ``own``.
+
+    ``everything``: the Gaussians and the number of each one's block. ``growth``: of their number in the fit.
+    """
+    (joined, owners), scene, plan = everything, part.prepared.scene, part.plan
+    used = owners == own
+    if plan.fit.fit != "none" and scene.images is not None:
+        used |= peak_weights(joined, blank_photos(scene.cameras, 2))[0] >= plan.fit.min_contribution
+    rows = np.flatnonzero(used)
+    decoded = Decoded(joined[rows], round(growth * len(rows)), exact=False)
+    fitted = fit_scene(decoded, scene, part.prepared.photo_views, plan.fit, plan.seed, plan.backend)
+    if fitted.report is None:  # nothing was fitted, and what no photo shows is left out
+        return fitted.gaussians
+    assert fitted.report.origins is not None
+    return fitted.gaussians[owners[rows[fitted.report.origins]] == own]
+
+
+def score_part(part: Part, gaussians: Gaussians) -> float | None:
+    """Measure the PSNR of some of a block's photos from the whole result; None without photos."""
+    return measure_psnr("score", gaussians, part.prepared.result_views(), part.prepared, part.plan)
+
+
+def fit_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[Part], seed: int) -> Gaussians:
+    """Fit what views of several blocks show, once more, to all photos that show it; all else stays as it is.
+
+    Until here each Gaussian was fitted beside its neighbours as its own block has them, not as they are.
+    """
+    plan = next((part.plan for part in parts if part.plan.fit.fit != "none"), None)
+    if plan is None:
+        return joined
+    with stage("join"):
+        at_seam, views = find_seams(joined, owners, parts)
+        scenes = [subset(part.prepared.scene, some) for part, some in zip(parts, views, strict=True) if some]
+    if not scenes:
+        return joined
+    scene = concat_scenes(scenes)
+    scene = replace(scene, cameras=in_float64(scene.cameras))
+    rows = np.flatnonzero(peak_weights(joined, blank_photos(scene.cameras, 2))[0] >= plan.fit.min_contribution)
+    tuning = replace(plan.fit.tuning.scaled(SEAM_RATE), decay=SEAM_DECAY)
+    options = replace(
+        plan.fit, fit_steps=max(SEAM_STEPS, SEAM_LOOKS * len(scene)), photo_scale=1.0, judged=False, dropout=0.0,
+        half_res_share=0.0, min_contribution=0.0, tuning=tuning,
+    )  # fmt: skip
+    decoded = Decoded(joined[rows], len(rows), exact=True, fixed=~at_seam[rows])
+    with record_part(title="seams") as record:
+        fitted = fit_scene(decoded, scene, range(len(scene)), options, seed, plan.backend)
+    add_seconds(record.seconds)
+    choose(seams={"views": len(scene), "num_gaussians": int(at_seam.sum())})
+    columns = {f.name: np.array(getattr(joined, f.name)) for f in fields(Gaussians)}
+    moved = at_seam[rows]  # what was fixed comes back rounded
+    for name, column in columns.items():
+        column[rows[moved]] = getattr(fitted.gaussians, name)[moved]
+    return Gaussians(**columns)
+
+
+def find_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[Part]) -> tuple[np.ndarray, list[list[int]]]:
+    """Return which of n Gaussians are at seams, ``[n]``, and for each block its own views whose photos show many."""
+    total, foreign, seen = np.zeros(len(joined)), np.zeros(len(joined)), []
+    splats = prepare_splats(joined)
+    for number, part in enumerate(parts):
+        own = set(part.block.own)
+        repeated = part.prepared.repeated
+        places = sorted({repeated[place] for place, view in enumerate(part.block.views) if view in own})
+        photos = blank_photos(part.prepared.scene.cameras[places], 2)
+
+        def weights_of(view: int, photos: Photos = photos) -> np.ndarray:
+            return contributions(plan_view(splats, **photos.camera(view)))[0]
+
+        for place, weights in zip(places, in_turn(weights_of, range(len(photos))), strict=True):
+            rows = np.flatnonzero(weights)
+            total[rows] += weights[rows]
+            foreign[rows] += np.where(owners[rows] == number, 0, weights[rows])
+            seen.append((number, place, rows, weights[rows]))
+    at_seam = foreign > FOREIGN * total
+    views: list[list[int]] = [[] for _ in parts]
+    for number, place, rows, weights in seen:
+        if place in parts[number].prepared.photo_views and weights[at_seam[rows]].sum() > SEAM_SHARE * weights.sum():
+            views[number].append(place)
+    return at_seam, views
+
+
+def free_scene(scene: Scene) -> None:
+    """Take what is in files of a scene's arrays out of memory."""
+    free_pages([*vars(scene.gaussians).values(), *([] if scene.images is None else [scene.images])])
+
+
+def whole_limits(given: Scene, options: CompactOptions) -> CountLimits:
+    """Compute the limits of the number of Gaussians of all blocks together."""
+    segment, decode = options.segment, resolve_decode(options, given, photos=given.images is not None)
+    if segment.superpixels == AUTO_SHARE:  # which each block decides
+        segment = replace(segment, superpixels=SHARE)
+    return count_limits(given, segment, decode, options.budget)
+
+
+def with_whole_choices(options: CompactOptions, given: Scene, whole: CountLimits) -> CompactOptions:
+    """Return the options with the steps of a fit of the whole, which blocks share by their views, and its networks."""
+    steps = steps_for(options, len(given), whole.share)
+    networks = choose_networks(options, photos=given.images is not None)
+    settings: dict[str, Any] = {"fit_steps": steps, "checkpoint": options.checkpoint if networks != "none" else "none"}
+    if options.blocks.engine.name != "local" and os.path.isfile(options.checkpoint):
+        settings["require_checkpoint"] = True  # a node without it would make other bytes
+    options = options.with_settings(settings)
+    return replace(options, fit=replace(options.fit, share=whole.share))
+
+
+def block_options(
+    options: CompactOptions, given: Scene, block: Block, factor: float, most: int | None
+) -> CompactOptions:
+    """Return the options of a block: cameras and exposures stay, and ``factor`` times its share of the Gaussians.
+
+    It has a share of the steps, too, so that each view is looked at as often as in one piece, and as many of them on
+    half-size photos. ``most``: Gaussians of all blocks together, see :func:`whole_limits`; None: as many as
+    ``superpixels`` and K give.
+    """
+    settings: dict[str, Any] = {"poses": "fixed", "exposure": "fixed", "blocks": "none", "budget": None}
+    settings["fit_steps"] = max(1, round(options.fit.steps * len(block.views) / len(given)))
+    if replace(options.fit, fit_steps=settings["fit_steps"]).half_res_part != options.fit.half_res_part:
+        settings["half_res_share"] = options.fit.half_res_part
+    superpixels = options.segment.superpixels
+    if most is not None:
+        settings["budget"] = max(1, round(SURPLUS * factor * most * len(block.views) / len(given)))
+    elif isinstance(superpixels, str) and superpixels.endswith("%"):
+        share = min(1.0, min(factor, MOST_DENSITY) * parse_share(superpixels))
+        settings["superpixels"] = share_text(round(share, 6))
+    elif superpixels != AUTO_SHARE:
+        settings["superpixels"] = round(min(factor, MOST_DENSITY) * int(superpixels))
+    return options.with_settings(settings)
+
+
+def belongs_to_block(means: np.ndarray, block: Block, covisibility: Covisibility) -> np.ndarray:
+    """Return which of n means ``[n,3]`` belong to a block: of all views that see one, its nearest is the block's own.
+
+    Every view that sees something of the block counts.
+    """
+    sees = covisibility.weights[list(block.own)].sum(0) > 0
+    sees[list(block.own)] = True
+    owners = owning_views(means, covisibility, np.flatnonzero(sees).tolist())
+    return np.isin(owners, block.own)
+
+
+def join_reports(
+    given: Scene, gaussians: Gaussians, parts: Sequence[Part], scores: Sequence[float | None], options: CompactOptions
+) -> CompactReport:
+    """Report the whole: PSNR of the blocks weighted by their views, seconds added up, notes of all."""
+    run, sizes = current_record(), [len(part.block.own) for part in parts]
+
+    def mean(values: Sequence[float | None]) -> float | None:
+        known = [value for value in values if value is not None]
+        return None if len(known) < len(values) else float(np.average(known, weights=sizes))
+
+    scored = sum(len(part.plan.scored_views) for part, score in zip(parts, scores, strict=True) if score is not None)
+    before, after = mean([part.psnr_before for part in parts]), mean(scores)
+    worse = describe_loss("the result", before, after)
+    notes = list(dict.fromkeys(run.notes))
+    return CompactReport(
+        num_input=given.num_gaussians, num_output=len(gaussians), seconds=dict(run.seconds), psnr_before=before,
+        psnr_after=after, choices=run.choices | {"scored_views": scored},
+        notes=notes if worse is None else [*notes, worse], options=options.to_dict(),
+        peak_memory_bytes=peak_memory(), worse=worse,
+    )  # fmt: skip

@@ -1,0 +1,223 @@
+"""From a scene's files to the compact file: read, compact, write, report."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+from gsmerge.compaction.compact import compact
+from gsmerge.compaction.result import CompactResult
+from gsmerge.errors import SceneError, UsageError
+from gsmerge.io import atomic_outputs, kept_comments, lost_harmonics, output_format, write_gaussians
+from gsmerge.io.atomic import AddOutput
+from gsmerge.io.cameras.embedded import camera_comments
+from gsmerge.io.cameras.json_files import viewer_cameras, write_transforms
+from gsmerge.io.cameras.read import read_cameras
+from gsmerge.io.formats.ply import OpacityChoice
+from gsmerge.io.formats.ply_file import LOGIT_COMMENT
+from gsmerge.io.formats.streamed import INDEX, remove_unused_chunks
+from gsmerge.io.formats.writing import add_levels
+from gsmerge.options import CompactOptions
+from gsmerge.report import report_document, to_json
+from gsmerge.runtime.memory import release_memory
+from gsmerge.runtime.record import Progress
+from gsmerge.scene.exporters import AUTO, ReadHints
+from gsmerge.scene.files import SceneFiles
+from gsmerge.scene.read import SceneLoad, load_files
+from gsmerge.types import Scene
+
+NO_PHOTOS = "no photos found, so nothing is fitted and no PSNR measured; name their folder with --images"
+
+
+@dataclass(frozen=True, eq=False)
+class SceneInput:
+    """A scene and the facts of its reading that a report needs."""
+
+    scene: Scene
+    recognised: dict[str, Any]  # Facts about the input for the report
+    comments: Sequence[str]  # Comments of the header that the result keeps
+    notes: Sequence[str]  # Notes of the reader, one sentence each
+
+
+def compact_files(
+    files: SceneFiles,
+    settings: CompactOptions,
+    out: Path,
+    *,
+    opacity: OpacityChoice = "auto",
+    hints: ReadHints = AUTO,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+    hashed: bool = False,
+    seconds_before: Mapping[str, float] | None = None,
+    report_path: Path | None = None,
+    normals: bool = True,
+    spz_version: int = 3,
+    cameras_path: Path | None = None,
+    saved_cameras: Path | None = None,
+    embed_cameras: bool = False,
+) -> dict[str, Any]:
+    """Read a scene, compact it, and write result, levels, cameras and report: all files or none.
+
+    ``out``: its name chooses the format; a ``lod-meta.json`` has all levels, in chunks beside it.
+    ``hashed``: hash the input for the report. ``seconds_before``: wall time by name of the caller's
+    earlier steps. ``cameras_path``, ``saved_cameras``: files for the views, for viewers and as
+    ``transforms.json`` with all intrinsics; the former may be there with the same content, beside
+    a result in another format. ``embed_cameras``: also write them into the header of a ``.ply``.
+    Returns the report, see :func:`gsmerge.report.report_document`. Raises SceneError if the scene
+    cannot be read or the result cannot be written, UsageError if the settings need what the scene
+    does not have.
+    """
+    start = perf_counter()
+    streamed = output_format(out, spz_version, levels=True) == INDEX
+    with atomic_outputs(overwrite=overwrite) as add:
+        at = {out: add(out, make_folder=streamed)}
+        at |= {path: add(path) for path in (report_path, saved_cameras) if path is not None}
+        given = read_input(files, opacity=opacity, hints=hints)
+        check_saved_cameras(given.scene, saved_cameras, embed=embed_cameras)
+        shared = None if cameras_path is None or overwrite or not cameras_path.exists() else cameras_path
+        views = _views_once(given.scene)
+        names = [given.scene.names[view] for view in views]
+        if shared is not None and list(read_cameras(shared).names) != names:
+            raise _other_cameras(shared)
+        read = perf_counter()
+        result = compact(given.scene, settings, progress=progress)
+        if len(result.gaussians) == 0:
+            problem = "expected Gaussians that show something, found none that is left once they are merged"
+            raise SceneError(files.ply, problem, "look at its scales and opacities with gsmerge inspect")
+        compacted = perf_counter()
+        results = (result, *result.coarser)
+        embedded = [camera_comments(one.cameras[views], names) if embed_cameras else [] for one in results]
+        written = _write_results(
+            add, out, at[out], results, [[*given.comments, *lines] for lines in embedded],
+            spz_version=spz_version, normals=normals,
+        )  # fmt: skip
+        cameras_path = cameras_path if len(given.scene) else None
+        if cameras_path is not None:
+            text = viewer_cameras(result.cameras[views], names)
+            if shared is None:
+                add(cameras_path).write_text(text, encoding="utf-8")
+            elif shared.read_text(encoding="utf-8", errors="replace") != text:
+                raise _other_cameras(shared)
+        if saved_cameras is not None:
+            write_transforms(at[saved_cameras], result.cameras[views], names)
+        lost = lost_harmonics(out, result.gaussians.sh_degree, spz_version)
+        document = report_document(
+            result.report,
+            input_paths=files.plys,
+            output_path=out,
+            seconds_before={**(seconds_before or {}), "read": read - start},
+            seconds_after={"write": perf_counter() - compacted},
+            coarser=[(path, one.report) for path, one in zip([*written][1:], result.coarser, strict=True)],
+            recognised=given.recognised,
+            notes=[*given.notes, *([lost] if lost else [])],
+            hashed=hashed,
+            written_at=written,
+            cameras_path=cameras_path,
+        )
+        if report_path is not None:
+            at[report_path].write_text(to_json(document), encoding="utf-8", errors="replace")
+    if streamed:
+        remove_unused_chunks(out)
+    return document
+
+
+def _write_results(
+    add: AddOutput,
+    out: Path,
+    first: Path,
+    results: Sequence[CompactResult],
+    comments: Sequence[Sequence[str]],
+    *,
+    normals: bool,
+    spz_version: int,
+) -> dict[Path, list[Path]]:
+    """Write a result, whose file is ``first`` now, and its coarser levels, each with its lines of the header.
+
+    Returns the path of each, in their order, with its files as they are before they are renamed.
+    """
+    ending = output_format(out, spz_version, levels=True)
+    if ending == INDEX:
+        (_, finest), *rest = add_levels(add, out, first, [one.gaussians for one in results], comments[0])
+        return {out: [first, *finest], **dict(rest)}
+    written = {out: [first]}
+    for level in range(1, len(results)):
+        path = level_output(out, level)
+        written[path] = [add(path)]
+    for (file,), one, lines in zip(written.values(), results, comments, strict=True):
+        write_gaussians(
+            file, one.gaussians, overwrite=True, comments=lines, ending=ending, normals=normals,
+            spz_version=spz_version,
+        )  # fmt: skip
+    return written
+
+
+def _views_once(scene: Scene) -> list[int]:
+    """Return the views without further layers of a view, which have its name and camera."""
+    cameras = zip(scene.names, scene.cameras.viewmats, scene.cameras.Ks, strict=True)
+    keys = [(name, viewmat.tobytes(), K.tobytes()) for name, viewmat, K in cameras]
+    return [view for view, key in enumerate(keys) if key not in keys[:view]]
+
+
+def _other_cameras(path: Path) -> UsageError:
+    """Make the error of a file of cameras for viewers that belongs to another result."""
+    remedy = "pass --overwrite to replace it, or name another with --output"
+    return UsageError(f"{path}: exists already, with other cameras than this result's; {remedy}")
+
+
+def read_input(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = AUTO) -> SceneInput:
+    """Read a scene from its files, and note what is missing or odd; raise SceneError if it cannot be read."""
+    loaded = load_files(files, opacity=opacity, hints=hints)
+    no_photos = loaded.scene.aligned and loaded.scene.images is None
+    notes = (*loaded.notes, *([NO_PHOTOS] if no_photos else []), *compact_notes(loaded))
+    scene_input = SceneInput(loaded.scene, recognised_of(loaded), kept_comments(loaded.ply), notes)
+    del loaded  # its arrays are as large as the scene's
+    release_memory()
+    return scene_input
+
+
+def check_saved_cameras(scene: Scene, path: Path | None, *, embed: bool = False) -> None:
+    """Refuse a file for the cameras of a scene without any, or to embed them."""
+    if len(scene) == 0 and (path is not None or embed):
+        option = "--embed-cameras" if path is None else f"--save-cameras {path}"
+        raise UsageError(f"{option}: expected a scene with cameras, got none")
+    if embed:
+        views = _views_once(scene)
+        camera_comments(scene.cameras[views], [scene.names[view] for view in views])  # refuses too many before the work
+
+
+def compact_notes(loaded: SceneLoad) -> tuple[str, ...]:
+    """Return a note if the scene is a result of gsmerge, with far fewer Gaussians than pixels."""
+    scene = loaded.scene
+    pixels = len(scene) * scene.cameras.height * scene.cameras.width
+    if scene.aligned or LOGIT_COMMENT not in loaded.ply.comments or scene.num_gaussians > pixels / 2:
+        return ()
+    count = f"{scene.num_gaussians:,} Gaussians for {pixels:,} pixels" if pixels else "no Gaussian per pixel"
+    return (f"the scene is compact already ({count}, written by gsmerge): start from the original for more detail",)
+
+
+def recognised_of(loaded: SceneLoad) -> dict[str, Any]:
+    """Return the facts about the input for the report."""
+    names = ("layout", "sh_degree", "opacity_encoding", "num_nonfinite")
+    cameras, recovery = loaded.scene.cameras, loaded.recovery
+    views: dict[str, Any] = {"num_views": len(cameras), "height": cameras.height, "width": cameras.width}
+    views |= {"exporters": [exporter.name for exporter in loaded.exporters], "rows": recovery and recovery.description}
+    views["moved_cameras"] = list(loaded.moves)
+    if loaded.files.parts:
+        views["parts"] = [str(path) for path in loaded.files.parts]
+    if loaded.joined:
+        num_bytes = sum(os.stat(one["path"]).st_size for one in loaded.joined if one["joined"])
+        views |= {"files": list(loaded.joined), "bytes": num_bytes}
+    return views | {name: getattr(loaded.ply, name) for name in names}
+
+
+def level_output(output: Path, level: int) -> Path:
+    """Return the path of a further level of detail, counted from 1: ``out.ply`` -> ``out.level1.ply``."""
+    compressed = output.name.lower().endswith(".compressed.ply")
+    length = len(".compressed.ply" if compressed else output.suffix)
+    cut = len(output.name) - length
+    return output.with_name(f"{output.name[:cut]}.level{level}{output.name[cut:]}")

@@ -1,0 +1,87 @@
+"""Other methods than ours behind one interface: ``compact(scene, method=NAME)``.
+
+A package adds one by an entry point of the group ``gsmerge.methods`` that names a :class:`Method`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+from gsmerge.errors import UsageError
+from gsmerge.facts.prepare import Prepared
+from gsmerge.fit import Fitted
+from gsmerge.options import CompactOptions
+from gsmerge.plan import Plan
+from gsmerge.runtime.plugins import METHODS, load_plugin
+from gsmerge.runtime.record import note
+from gsmerge.types import Gaussians, Scene
+
+Build = Callable[[Prepared, Plan, int | None], Fitted]
+Need = Literal["photos", "pixels"]
+COUNTS = ("budget", "superpixels", "k")  # settings that decide how many
+COMMON_SETTINGS = {"method", "seed", "threads", "crop", "drop_floaters", "drop_sky"}  # that every method uses
+
+
+@dataclass(frozen=True)
+class Method:
+    """One other method.
+
+    Args:
+        name: As on the command line.
+        run: Prepared scene, plan and a number of Gaussians -> canonical Gaussians, at most that many unless the method
+            keeps the input's. It times itself by stages of the record.
+        needs: What the scene has to have: ``"photos"``; ``"pixels"``: one Gaussian per pixel.
+        uses: Settings that it uses, by flat name, besides those that all methods use.
+        check: Raises a UsageError where a program that it runs is missing.
+    """
+
+    name: str
+    run: Callable[[Prepared, Plan, int], Gaussians]
+    needs: tuple[Need, ...] = ()
+    uses: tuple[str, ...] = COUNTS
+    check: Callable[[], object] = lambda: None
+
+    def build(self, prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
+        """Build ``count`` canonical Gaussians; None: as many as ``superpixels`` and K give."""
+        gaussians = self.run(prepared, plan, plan.limits.default if count is None else count)
+        return Fitted(gaussians, prepared.scene.cameras, None)
+
+
+def find_method(options: CompactOptions) -> Method | None:
+    """Load the method of the options; None for our own. A UsageError if a program is missing."""
+    if options.method == "gsmerge":
+        return None
+    method: Method = load_plugin(METHODS, options.method)
+    method.check()
+    return method
+
+
+def check_method(options: CompactOptions, scene: Scene) -> tuple[Method | None, list[str]]:
+    """Find the method of the options, and a note on changed settings that it does not use.
+
+    A UsageError if the scene does not have what it needs, or a program is missing.
+    """
+    method = find_method(options)
+    if method is None:
+        return None, []
+    place = f"method {method.name}"
+    if "photos" in method.needs and scene.images is None:
+        raise UsageError(f"{place}: expected photos, found none; give --images, or another --method")
+    if "pixels" in method.needs and not scene.aligned:
+        raise UsageError(f"{place}: expected one Gaussian per pixel, found an unaligned scene; give another --method")
+    default, used = CompactOptions().to_dict(), {*method.uses, *COMMON_SETTINGS}
+    unused = [name for name, value in options.to_dict().items() if name not in used and value != default[name]]
+    return method, [f"{place} does not use {', '.join(unused)}"] if unused else []
+
+
+def choose_method(options: CompactOptions, scene: Scene, ours: Build) -> Build:
+    """Choose the builder of the Gaussians: ``ours`` or another method's, with a note on settings it does not use.
+
+    Raises as :func:`check_method` does.
+    """
+    method, notes = check_method(options, scene)
+    for text in notes:
+        note(text)
+    return ours if method is None else method.build

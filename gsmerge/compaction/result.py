@@ -1,0 +1,171 @@
+"""fitted -> result: Gaussians in the world, scored on the input photos, with the report of the run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from gsmerge.facts.prepare import Prepared, scene_depth
+from gsmerge.fit import FitBackend, Fitted, run_on
+from gsmerge.io.cameras.camera_file import describe_moves, list_moves
+from gsmerge.plan import Plan
+from gsmerge.raster.metrics import describe_loss
+from gsmerge.raster.photos import NEAR, scene_photos
+from gsmerge.runtime.memory import peak_memory
+from gsmerge.runtime.record import Record, choose, current_record, note, stage
+from gsmerge.types import Cameras, Gaussians, Scene
+
+if TYPE_CHECKING:
+    import torch
+
+
+@dataclass(frozen=True)
+class CompactReport:
+    """Report of a run.
+
+    Args:
+        num_input: Gaussians in the scene.
+        num_output: Gaussians in the result.
+        seconds: Wall time of each stage.
+        psnr_before: Mean PSNR (dB) of the input views rendered from the input, of many views some, and in a fixed
+            quarter of each unless a quality was asked for; None without photos. :func:`gsmerge.evaluate` is exact.
+        psnr_after: The same from the result.
+        choices: Decisions of the stages (count, curve, merge, scores, clusters, fit).
+        notes: Warnings about the input and adaptations to it, one sentence each.
+        options: All settings by flat name.
+        peak_memory_bytes: Largest resident memory of the process so far.
+        unmet: Why a target that was asked for is not met, and how far the result got; None if it is.
+        worse: That the result shows the scene's own photos by more than .5 dB worse than the input does, a sentence
+            that is among the notes, too; None where it does not, or photos cannot say it: none, odd ones, or a crop.
+    """
+
+    num_input: int
+    num_output: int
+    seconds: dict[str, float]
+    psnr_before: float | None
+    psnr_after: float | None
+    choices: dict[str, Any]
+    notes: list[str]
+    options: dict[str, Any]
+    peak_memory_bytes: int
+    unmet: str | None = None
+    worse: str | None = None
+
+
+@dataclass(frozen=True)
+class CompactResult:
+    """The compact Gaussians, in the scene's own world frame, and the report.
+
+    Args:
+        gaussians: The Gaussians.
+        report: What was done.
+        cameras: The given views as the Gaussians were made from them, in the same frame: moved where their poses were
+            wrong, see ``poses`` of :class:`gsmerge.PrepareOptions`.
+        coarser: Further levels of detail, each with a quarter of the Gaussians of the one before.
+    """
+
+    gaussians: Gaussians
+    report: CompactReport
+    cameras: Cameras
+    coarser: tuple[CompactResult, ...] = ()
+
+    def to(self, device: torch.device | str | None) -> CompactResult:
+        """Return the same result with tensors on a device; None leaves NumPy arrays."""
+        if device is None:
+            return self
+        coarser = tuple(one.to(device) for one in self.coarser)
+        return replace(self, gaussians=self.gaussians.to(device), coarser=coarser)
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """Gaussians built for one count, with their score."""
+
+    count: int | None  # Gaussians that were asked for; None: as many as `superpixels` and K give
+    fitted: Fitted  # Fitted canonical Gaussians
+    gaussians: Gaussians  # The same in the world, with those that no view sees
+    cameras: Cameras  # The given views as the Gaussians were made from them, in the world
+    psnr: float | None  # Mean PSNR (dB) of the scored views; None without photos
+    record: Record  # Seconds, choices and notes of building and scoring it
+
+
+def score(count: int | None, fitted: Fitted, prepared: Prepared, plan: Plan) -> Candidate:
+    """Move canonical Gaussians into the world, add the unseen, and score them on the input photos."""
+    gaussians, prepared = fitted.gaussians, prepared.with_cameras(fitted.cameras)
+    if plan.unseen is not None:
+        gaussians = Gaussians.concat([gaussians, plan.unseen])
+    gaussians, cameras = prepared.frame.leave(gaussians), prepared.final_cameras()
+    if cameras is not prepared.given.cameras:
+        _note_moves(prepared, cameras, plan)
+        prepared = replace(prepared, given=replace(prepared.given, cameras=cameras))
+    psnr = measure_psnr("score", gaussians, prepared.result_views(), prepared, plan)
+    if psnr is not None:
+        choose(scored_views=len(plan.scored_views))
+    return Candidate(count, fitted, gaussians, cameras, psnr, current_record())
+
+
+def _note_moves(prepared: Prepared, cameras: Cameras, plan: Plan) -> None:
+    """Say how far each camera was moved."""
+    given, cause = prepared.given, "poses are free"
+    if plan.settings["poses"] == "auto":
+        cause = "the photos of some views agree only under other poses"
+    depth = scene_depth(prepared.scene) * prepared.frame.unit
+    moves = list_moves(given.names, given.cameras.viewmats, cameras.viewmats, depth)
+    choose(poses=moves)
+    note(f"{cause}: cameras were moved by {describe_moves(moves)}")
+
+
+def measure_psnr(name: str, gaussians: Gaussians, views: Scene, prepared: Prepared, plan: Plan) -> float | None:
+    """Measure the mean PSNR (dB) of the scored photos, of a quarter of each unless a quality was asked for.
+
+    None where there are no photos that show the scene. ``name``: of the stage that this is.
+    """
+    if views.images is None or not prepared.photo_views:
+        return None
+    with stage(name):
+        photos, near, quarter = scene_photos(views), NEAR * prepared.frame.unit, plan.target_psnr is None
+
+        def score_on(backend: FitBackend[Any]) -> float:
+            return backend.photo_psnr(gaussians, photos, plan.scored_views, quarter=quarter, near=near)
+
+        return run_on(plan.backend, "scores", score_on)
+
+
+def make_result(
+    best: Candidate,
+    levels: Sequence[Candidate],
+    prepared: Prepared,
+    plan: Plan,
+    search: Mapping[str, Any],
+) -> CompactResult:
+    """Report the best candidate and its coarser levels of detail, with the input's PSNR beside their own.
+
+    ``search`` are the facts of :meth:`gsmerge.compaction.search.CountSearch.facts`. The input is scored last,
+    when the kernels are compiled and memory is free again. The seconds, choices and notes of the
+    current record, which come before those of the candidates, enter the report.
+    """
+    run, seconds = current_record(), search["seconds"]
+    before = measure_psnr("input", prepared.given.file_gaussians, prepared.given, prepared, plan)
+    comparable = prepared.photo_views and not plan.clean.hides  # or photos show something else
+
+    def report(one: Candidate, seconds: Mapping[str, float], name: str) -> CompactReport:
+        counts, record = (prepared.given.num_gaussians, len(one.gaussians)), one.record
+        made = CompactReport(
+            *counts, dict(seconds), before, one.psnr, record.choices, record.notes, plan.settings, peak_memory()
+        )
+        worse = describe_loss(name, before, one.psnr) if comparable else None
+        return made if worse is None else replace(made, notes=[*made.notes, worse], worse=worse)
+
+    names = {**run.seconds, **seconds}
+    seconds = {name: run.seconds.get(name, 0.0) + seconds.get(name, 0.0) for name in names}
+    if "input" in seconds:
+        seconds["input"] = seconds.pop("input")  # the last stage, after those of the candidates
+    main = report(best, seconds, "the result")
+    choices, notes = run.choices | main.choices | search["choices"], [*run.notes, *main.notes]
+    main = replace(main, choices=choices, notes=notes, unmet=search["unmet"])
+    coarser = tuple(
+        CompactResult(one.gaussians, report(one, one.record.seconds, f"level {i}"), one.cameras)
+        for i, one in enumerate(levels, 1)
+    )
+    return CompactResult(best.gaussians, main, best.cameras, coarser)

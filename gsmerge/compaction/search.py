@@ -1,0 +1,251 @@
+"""Search for the number of Gaussians: the knee of the scene's curve, a quality target, levels of detail.
+
+A curve is measured by short fits, judged by parts of the photos that they left out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from gsmerge.compaction.result import Candidate
+from gsmerge.facts.prepare import Prepared
+from gsmerge.fit import FitOptions
+from gsmerge.fit.photo_sizes import holdout_psnr, training_weights
+from gsmerge.kernels.elementary import exp, log, power
+from gsmerge.pipeline import build
+from gsmerge.plan import Plan
+from gsmerge.raster.metrics import WINDOW, ssim
+from gsmerge.raster.photos import Photos, render_photos, scene_photos
+from gsmerge.runtime.record import choose, record_part, report_progress, stage
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.stages.clean import CleanOptions
+from gsmerge.stages.segment import knee_count
+from gsmerge.types import Gaussians
+
+SHORT, LONG = 60, 300  # steps of half-size photos: enough to find the knee; to tell tenths of a dB on clean scenes
+HOLDOUT = 0.1  # share of the photos' blocks
+NET, PERCEPTUAL_VIEWS = "alex", 2  # the fast net, and as many views: LPIPS takes longer than the fit
+PERCEPTUAL_SIDE = 64  # pixels, at least
+LEVEL_FACTOR = 4  # each level of detail has this many times fewer Gaussians than the one before
+RUNGS = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0)  # of the usual count: where the scene's curve is measured
+AUTO_RUNGS = RUNGS[1:5]  # the same where only its knee is looked for
+SSIM_DB = 40.0  # dB that count as much as 1 of SSIM: where 1 % of the Gaussians beats 4 % in PSNR it still blurs
+KNEE = 0.15  # dB of that mixture per doubling of the count: below it, more Gaussians are not worth it
+SLOPE = 1.0  # dB per doubling of the count, until two counts have been tried
+CLOSE = 1.15  # counts this near to each other are one
+MAX_RUNS = 6
+MAX_FACTOR = 4  # times the usual count is the most that a quality target may take
+
+
+@dataclass(frozen=True)
+class CurvePoint:
+    """Quality of a number of Gaussians after a short fit, on parts of the photos that were held out."""
+
+    count: int  # Gaussians
+    psnr: float  # dB
+    ssim: float  # Structural similarity
+    lpips: float | None = None  # LPIPS (AlexNet), None where its weights are not installed
+
+
+@dataclass(eq=False)
+class CountSearch:
+    """Search for the number of Gaussians: one count, or several until a quality is met."""
+
+    plan: Plan  # Target and limits
+    first: int | None  # The count to begin with; None: as many as `superpixels` and K give
+    candidates: list[Candidate] = field(default_factory=list)  # Candidates built so far
+
+    def __iter__(self) -> Iterator[int | None]:
+        """Yield counts; each candidate is added before the next one is asked for."""
+        yield self.first
+        target, limits = self.plan.target_psnr, self.plan.limits
+        most = min(limits.max_count, MAX_FACTOR * limits.default)
+        while target is not None and len(self.candidates) < MAX_RUNS:
+            count = next_count(self.tried, target, limits.min_count, most)
+            if count in self.tried:
+                return
+            yield count
+
+    @property
+    def tried(self) -> dict[int, float]:
+        """PSNR (dB) of the counts so far, in the order of the runs."""
+        return {one.count: one.psnr or 0.0 for one in self.candidates if one.count is not None}
+
+    def add(self, candidate: Candidate) -> None:
+        """Add the result of the last count."""
+        self.candidates.append(candidate)
+
+    @property
+    def best(self) -> Candidate:
+        """Candidate with the fewest Gaussians that reaches the target, or the one with the highest PSNR."""
+        if self.plan.target_psnr is None:
+            return self.candidates[0]
+        tried, target = self.tried, self.plan.target_psnr
+        reached = [count for count, psnr in tried.items() if psnr >= target]
+        chosen = min(reached) if reached else max(tried, key=lambda count: tried[count])
+        return next(one for one in self.candidates if one.count == chosen)
+
+    @property
+    def unmet(self) -> str | None:
+        """Why the target is not met; None if it is."""
+        if self.plan.target_psnr is None or max(self.tried.values()) >= self.plan.target_psnr:
+            return None
+        psnr, count = self.best.psnr or 0.0, len(self.best.gaussians)
+        reached = f"the input views reach {psnr:.2f} dB with {count} Gaussians"
+        return f"quality: {self.plan.target_psnr:g} dB was asked for, {reached}"
+
+    def facts(self) -> dict[str, Any]:
+        """Return the search's part of a report: ``seconds`` of all candidates, ``choices``, ``unmet``."""
+        names = dict.fromkeys(name for one in self.candidates for name in one.record.seconds)
+        seconds = {name: sum(one.record.seconds.get(name, 0.0) for one in self.candidates) for name in names}
+        choices: dict[str, Any] = {}
+        if self.plan.target_psnr is not None:
+            best, tried = self.best, tuple(self.tried.items())
+            choices["search"] = {"count": best.count, "psnr": best.psnr, "met": self.unmet is None, "tried": tried}
+        return {"seconds": seconds, "choices": choices, "unmet": self.unmet}
+
+
+def search_count(prepared: Prepared, plan: Plan) -> CountSearch:
+    """Start a search for the number of Gaussians."""
+    limits = plan.limits
+    if plan.target_psnr is not None:
+        return CountSearch(plan, min(max(limits.default, limits.min_count), limits.max_count))
+    return CountSearch(plan, choose_count(prepared, plan))
+
+
+def choose_count(prepared: Prepared, plan: Plan) -> int | None:
+    """Choose the number of Gaussians by the budget or the scene's own curve; None: ``superpixels`` and K decide."""
+    limits, drop = plan.limits, plan.max_drop
+    if drop is None and not plan.auto_count:
+        return limits.count
+    if prepared.given.images is None or not prepared.photo_views:
+        return knee_count(prepared.scene, plan.superpixels)
+    with stage("curve"):
+        counts = rungs(AUTO_RUNGS if drop is None else RUNGS, limits.default, limits.min_count, limits.max_count)
+        points = measure_curve(prepared, plan, SHORT if drop is None else LONG, counts)
+    choose(curve=[asdict(point) for point in points])
+    return curve_knee(points) if drop is None else count_within(points, drop)
+
+
+def measure_curve(prepared: Prepared, plan: Plan, steps: int, counts: Sequence[int]) -> list[CurvePoint]:
+    """Measure PSNR, SSIM and, where its weights are installed, LPIPS (AlexNet) of the photos at some counts.
+
+    The fits take ``steps``, whatever the plan says. PSNR and SSIM are those of blocks that the fits leave out, at
+    full size; LPIPS needs whole pictures.
+    """
+    short = FitOptions(fit="full", fit_steps=steps, half_res_share=1.0, holdout=HOLDOUT, tuning=plan.fit.tuning)
+    quick = replace(plan.with_fit(short), networks=(None,), checkpoint=None, clean=CleanOptions())  # nothing grows
+    photos = scene_photos(prepared.scene)[prepared.photo_views]
+    weights = training_weights(photos, HOLDOUT, plan.seed)
+    points: list[CurvePoint] = []
+    for count in counts:
+        report_progress("curve: what each count brings", len(points), len(counts))
+        with record_part(silent=True):
+            gaussians = build(prepared, quick, count).gaussians
+        points.append(_point(count, gaussians, photos, weights, short.tuning.min_gain))
+    return points
+
+
+def _point(count: int, gaussians: Gaussians, photos: Photos, weights: list[np.ndarray], min_gain: float) -> CurvePoint:
+    images = [np.clip(image, 0, 1) for image in render_photos(gaussians, photos)]
+    views = range(len(photos))
+    similar = parallel_map(lambda v: _similarity(images[v], photos.images[v], weights[v] == 0), views)
+    perceptual = None
+    if min(photos.height, photos.width) >= PERCEPTUAL_SIDE:
+        from gsmerge.measure.lpips import lpips, lpips_available
+
+        if lpips_available(NET):
+            some = np.linspace(0, len(photos) - 1, min(PERCEPTUAL_VIEWS, len(photos))).round().astype(int)
+            perceptual = float(np.mean([lpips(images[v], photos.images[v], NET) for v in some]))
+    psnr = holdout_psnr(images, photos, weights, min_gain)
+    return CurvePoint(count, psnr, float(np.mean(similar)), perceptual)
+
+
+def _similarity(image: np.ndarray, photo: np.ndarray, mask: np.ndarray) -> float:
+    """Return SSIM over the held-out windows inside the picture; of the whole without any, 0 if too small."""
+    if min(mask.shape) < WINDOW:
+        return 0.0
+    border = WINDOW // 2
+    return ssim(image, photo, mask if mask[border:-border, border:-border].any() else None)
+
+
+def rungs(shares: Sequence[float], usual: int, least: int, most: int) -> list[int]:
+    """Return rising counts for measuring a curve: shares of the usual count, clipped to least and most."""
+    return sorted({min(max(round(usual * share), least), most) for share in shares})
+
+
+def level_counts(finest: int, plan: Plan) -> list[int]:
+    """Return the Gaussians of the levels of detail after the finest, as long as a coarser one has one for each view."""
+    counts = [finest // LEVEL_FACTOR**i for i in range(1, plan.levels)]
+    return [count for count in counts if count >= plan.limits.min_count]
+
+
+def count_within(points: Sequence[CurvePoint], max_drop: float) -> int:
+    """Return the fewest Gaussians at which the curve lies at most ``max_drop`` dB below its best.
+
+    Between points, which come by rising count, the curve is a straight line over the logarithm of
+    the count.
+    """
+    if not points:
+        raise ValueError("points: expected at least one, got none")
+    wanted = max(p.psnr for p in points) - max_drop
+    first = next(i for i, p in enumerate(points) if p.psnr >= wanted)
+    if first == 0:
+        return points[0].count
+    below, above = points[first - 1], points[first]
+    share = (wanted - below.psnr) / (above.psnr - below.psnr)
+    return math.ceil(below.count * float(power(above.count / below.count, share)))
+
+
+def curve_knee(points: Sequence[CurvePoint]) -> int:
+    """Return the count beyond which more Gaussians are not worth it, by PSNR and structure together.
+
+    The quality is PSNR + 40 SSIM, in dB. The knee is the last count up to which it grows by 0.15 dB
+    per doubling, on a straight line between the slopes that lie midway between the points, which
+    come by rising count.
+    """
+    if not points:
+        raise ValueError("points: expected at least one, got none")
+    if len(points) == 1:
+        return points[0].count
+    scale = [float(log(p.count) / log(2)) for p in points]
+    quality = [p.psnr + SSIM_DB * p.ssim for p in points]
+    pairs = list(pairwise(range(len(points))))
+    middles = [(scale[a] + scale[b]) / 2 for a, b in pairs]
+    slopes = [(quality[b] - quality[a]) / max(scale[b] - scale[a], 1e-9) for a, b in pairs]
+    steep = max((i for i, slope in enumerate(slopes) if slope >= KNEE), default=None)
+    if steep is None:
+        return points[0].count
+    if steep == len(slopes) - 1:
+        return points[-1].count
+    share = (slopes[steep] - KNEE) / (slopes[steep] - slopes[steep + 1])
+    return round(float(power(2, middles[steep] + share * (middles[steep + 1] - middles[steep]))))
+
+
+def next_count(tried: Mapping[int, float], target: float, least: int, most: int) -> int:
+    """Choose the next count to try for the fewest Gaussians that reach a PSNR, within 15 %.
+
+    ``tried`` has the PSNR (dB) of at least one count, taken to rise with the count. A count that
+    was tried already ends the search.
+    """
+    above = min((c for c, psnr in tried.items() if psnr >= target), default=None)
+    below = max((c for c, psnr in tried.items() if psnr < target and (above is None or c < above)), default=None)
+    if above is not None and below is not None:
+        if above <= below * CLOSE:
+            return above
+        inner = float(log(above / below))
+        slope = (tried[above] - tried[below]) / inner
+        step = (target - tried[below]) / slope if slope > 0 else inner / 2
+        return round(below * float(exp(min(max(step + 0.1 * inner, 0.15 * inner), 0.85 * inner))))
+    edge = below if above is None else above
+    assert edge is not None  # one count has been tried
+    doublings = (target - tried[edge]) / SLOPE
+    if above is None:
+        return min(most, round(edge * float(power(2, min(max(doublings, 0.5), 3.0)))))
+    return max(least, round(edge * float(power(2, max(min(doublings, -0.5), -3.0)))))

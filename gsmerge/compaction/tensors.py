@@ -1,0 +1,383 @@
+"""Compaction of arrays and tensors in memory, whose conventions are checked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from gsmerge.alignment import (
+    check_pairs,
+    choose_poses,
+    choose_rotations,
+    explain_misalignment,
+    misalignment_error,
+    move_cameras,
+    other_conventions,
+    sample_pixels,
+)
+from gsmerge.compaction.compact import compact
+from gsmerge.compaction.result import CompactResult
+from gsmerge.errors import SceneError
+from gsmerge.geometry import normalize, rgb_to_sh0
+from gsmerge.io.bounds import check_pixels
+from gsmerge.io.cameras.camera_file import (
+    C2W_OPENCV,
+    C2W_OPENGL,
+    MAX_NORMALISED_FOCAL,
+    W2C_OPENCV,
+    W2C_OPENGL,
+    Convention,
+    check_camera,
+    check_size,
+)
+from gsmerge.io.formats.ply import clear_invalid
+from gsmerge.runtime.record import Progress
+from gsmerge.scene.read import NO_CAMERAS
+from gsmerge.types import Array, Cameras, Gaussians, Scene, as_array, grid_ids, to_float32
+
+ORDERS = ("view-major", "none")
+_TOLERANCE = 1e-3  # by which opacities and images may leave [0, 1]
+_NOT_UNIT, _FEW = 0.01, 0.01  # difference of a quaternion's length from 1; share of rows that may have it
+_EXACT = 1e-5  # the same difference from which on they are normalised
+_MAX_COLOR = 2.0  # of colours, which harmonics may take a little beyond 1
+_CORNER = 0.1  # pixels by which the rows are off from the corners of their pixels where these are taken for centres
+_REMEDIES = {
+    C2W_OPENCV: "pass their inverse, torch.linalg.inv(viewmats)",
+    W2C_OPENGL: "negate the second and the third row of each",
+    C2W_OPENGL: "negate the second and the third column of each, and pass the inverse",
+}
+_ROTATION_REMEDIES = {
+    "xyzw": "pass quats[:, [3, 0, 1, 2]]",
+    "camera": "multiply each by its view's rotation from camera to world",
+    "xyzw-root": "pass the rotations that the model rendered with",
+}
+
+
+def compact_tensors(
+    *,
+    means: Array,
+    quats: Array,
+    scales: Array,
+    opacities: Array,
+    sh0: Array | None = None,
+    colors: Array | None = None,
+    shN: Array | None = None,
+    images: Array | None = None,
+    viewmats: Array | None = None,
+    Ks: Array | None = None,
+    shape: tuple[int, int, int] | None = None,
+    names: Sequence[str] | None = None,
+    order: str = "view-major",
+    check_rotations: bool = True,
+    progress: Progress | None = None,
+    **settings: Any,
+) -> CompactResult:
+    """Compact Gaussians given as arrays or tensors, as :func:`gsmerge.compact` does a scene.
+
+    Arrays are NumPy's or torch's, on any device, and are copied without gradients. Leading axes are
+    flattened, so ``[1,n,3]`` and ``[V,H,W,3]`` mean ``[n,3]``. Rows with NaN or infinities are left out.
+
+    Args:
+        means: ``[n,3]`` centres, world units; row ``(v·H + y)·W + x`` belongs to pixel (x, y) of view v.
+        quats: ``[n,4]`` unit quaternions wxyz that rotate local to world.
+        scales: ``[n,3]`` standard deviations, world units, linear.
+        opacities: ``[n]`` in [0, 1].
+        sh0: ``[n,1,3]`` or ``[n,3]`` harmonics of degree 0; rgb = 0.5 + 0.2821 sh0.
+        colors: ``[n,3]`` sRGB in [0, 1], in place of ``sh0``.
+        shN: ``[n,k-1,3]`` higher harmonics, basis-major; None: none.
+        images: ``[V,H,W,3]`` photos, sRGB in [0, 1]; None: no fit and no PSNR.
+        viewmats: ``[V,4,4]`` or ``[V,3,4]`` world to camera, OpenCV axes.
+        Ks: ``[V,3,3]`` intrinsics in pixels; the top-left pixel's centre is (0.5, 0.5).
+        shape: Views, height and width; None: those of the images.
+        names: Names of the views; None: numbers.
+        order: ``"view-major"``: one Gaussian per pixel, as above; ``"none"``: Gaussians without pixels
+            (trained scenes, voxels), for which cameras are optional.
+        check_rotations: Refuse rotations that follow the surface far better in another convention;
+            False for models whose own renderer takes them unchanged.
+        progress: See :func:`gsmerge.compact`.
+        **settings: Settings of :func:`gsmerge.compact`, such as ``budget="4%"``, ``k=2``.
+
+    Returns:
+        The result of :func:`gsmerge.compact`; tensors on the device of ``means`` if that is a tensor.
+
+    Raises:
+        SceneError: If an array has another shape or convention; it says what to pass instead.
+        ValueError: If a setting is unknown or out of range.
+    """
+    if order not in ORDERS:
+        raise ValueError(f"order: expected one of {', '.join(ORDERS)}, got {order!r}")
+    columns = {
+        "means": _rows("means", means, 3),
+        "quats": _rows("quats", quats, 4),
+        "scales": _rows("scales", scales, 3),
+        "opacities": _rows("opacities", opacities),
+        "sh0": _read_base(sh0, colors),
+    }
+    columns["shN"] = _read_harmonics(shN, len(columns["means"]))
+    gaussians, valid, notes = _make_gaussians(columns)
+    cameras, photos = NO_CAMERAS, None
+    if order != "none" or viewmats is not None or images is not None:
+        cameras, photos = _read_views(viewmats, Ks, images, shape)
+    scene, more = _make_scene(gaussians, valid, cameras, photos, names, order)
+    if scene.aligned and check_rotations:
+        _check_rotations(scene)
+    more += _rotation_notes(scene, check_rotations=check_rotations)
+    result = compact(scene, progress=progress, **settings)
+    result.report.notes[:0] = notes + more
+    return result.to(means.device if hasattr(means, "detach") else None)
+
+
+def _make_scene(
+    gaussians: Gaussians,
+    valid: np.ndarray,
+    cameras: Cameras,
+    images: np.ndarray | None,
+    names: Sequence[str] | None,
+    order: str,
+) -> tuple[Scene, list[str]]:
+    """Join Gaussians and views to a scene in the given order; return it and notes."""
+    if names is None or len(cameras) == 0:
+        names = [f"view{view}" for view in range(len(cameras))]
+    views = tuple(map(str, names))
+    if len(views) != len(cameras):
+        raise SceneError("names", f"expected {len(cameras)} names, one for each view, found {len(views)}")
+    if order == "none":
+        notes = _check_seen(gaussians, valid, cameras, images) if len(cameras) else []
+        return Scene(gaussians[valid], cameras, images, None, views), notes
+    count = len(cameras) * cameras.height * cameras.width
+    if len(gaussians) != count:
+        sizes = f"{len(cameras)} x {cameras.height} x {cameras.width} = {count}"
+        problem = f"expected one Gaussian per pixel, {sizes} (views x height x width), found {len(gaussians)}"
+        raise SceneError("means", problem, 'pass shape=(V, H, W) as the model has it, or order="none"')
+    cameras, notes = _check_pixels(gaussians, cameras, valid, views)
+    return Scene(gaussians, cameras, images, grid_ids(valid), views), notes
+
+
+def _to_numpy(name: str, values: Any) -> np.ndarray:
+    """Return an array or tensor as a NumPy array; raise SceneError if it holds no numbers."""
+    if hasattr(values, "detach") and "float" in str(values.dtype):  # NumPy knows no bfloat16
+        values = values.detach().double() if str(values.dtype) == "torch.float64" else values.detach().float()
+    array = as_array(values)
+    if array.dtype.kind not in "fiub":
+        raise SceneError(name, f"expected an array or tensor of numbers, found {type(values).__name__}")
+    return array
+
+
+def _rows(name: str, values: Any, *tail: int) -> np.ndarray:
+    """Copy values ``[...,*tail]`` to ``[n,*tail]`` float32; means may stay float64."""
+    array = _to_numpy(name, values)
+    if array.ndim < len(tail) or array.shape[array.ndim - len(tail) :] != tail:
+        expected = ", ".join(map(str, ("n", *tail)))
+        raise SceneError(name, f"expected shape [{expected}], found {list(array.shape)}")
+    array = array.reshape(-1, *tail)
+    return array.copy() if name == "means" and array.dtype == np.float64 else to_float32(array)
+
+
+def _make_gaussians(out: dict[str, np.ndarray]) -> tuple[Gaussians, np.ndarray, list[str]]:
+    """Make Gaussians of columns, transparent in rows that are not finite; return them, the finite rows and notes."""
+    n = len(out["means"])
+    for name, column in out.items():
+        if len(column) != n:
+            remedy = "pass sh0=sh[:, :1] and shN=sh[:, 1:]" if name == "sh0" and len(column) % max(n, 1) == 0 else ""
+            raise SceneError(name, f"expected {n} rows, one for each mean, found {len(column)}", remedy)
+    if n == 0:
+        raise SceneError("means", "expected at least one Gaussian, found none")
+    valid = np.ones(n, np.bool_)
+    for column in out.values():
+        valid &= np.isfinite(column.reshape(n, -1)).all(1)
+    num_bad = clear_invalid("means", out | {"valid": valid})
+    _check_values(out, valid)
+    np.clip(out["opacities"], 0, 1, out=out["opacities"])
+    off = np.flatnonzero(np.abs(np.linalg.norm(out["quats"], axis=1) - 1) > _EXACT)
+    out["quats"][off] = normalize(out["quats"][off])
+    out["quats"][(out["quats"] == 0).all(1)] = (1, 0, 0, 0)
+    notes = [f"{num_bad:,} row(s) with NaN or inf, set aside"] if num_bad else []
+    return Gaussians(**out), valid, notes
+
+
+def _read_base(sh0: Array | None, colors: Array | None) -> np.ndarray:
+    """Return ``sh0 [n,1,3]``, given or computed from colours."""
+    if (sh0 is None) == (colors is None):
+        found = "neither" if sh0 is None else "both"
+        raise SceneError("sh0", f"expected either sh0 or colors, found {found}")
+    if sh0 is not None:
+        return _rows("sh0", sh0, 3).reshape(-1, 1, 3)
+    rgb = _rows("colors", colors, 3)
+    _expect_unit_range("colors", rgb[np.isfinite(rgb)], _MAX_COLOR - 1)
+    return rgb_to_sh0(rgb)[:, None]
+
+
+def _read_harmonics(shN: Array | None, n: int) -> np.ndarray:
+    shape = (0, 3) if shN is None else _to_numpy("shN", shN).shape
+    if shape[-2:] == (0, 3):
+        return np.zeros((n, 0, 3), np.float32)
+    known = (3, 8, 15, 24)
+    if len(shape) < 3 or shape[-1] != 3 or shape[-2] not in known:
+        swapped = len(shape) >= 3 and shape[-2] == 3 and shape[-1] in known
+        problem = f"expected shape [n, k-1, 3] with 3, 8, 15 or 24 coefficients, found {list(shape)}"
+        raise SceneError("shN", problem, "pass shN.transpose(-1, -2): each coefficient's colours last" * swapped)
+    return _rows("shN", shN, shape[-2], 3)
+
+
+def _check_values(out: dict[str, np.ndarray], valid: np.ndarray) -> None:
+    """Refuse log scales, logits, and quaternions that are not of length 1."""
+    scales, opacities = out["scales"][valid], out["opacities"][valid]
+    negative = float((scales < 0).any(1).mean())
+    if negative > 0:
+        problem = f"expected standard deviations of at least 0, found negative ones in {100 * negative:.3g} % of rows"
+        raise SceneError("scales", problem, "they look like log scales: pass scales.exp()")
+    low, high = float(opacities.min()), float(opacities.max())
+    if low < -_TOLERANCE or high > 1 + _TOLERANCE:
+        problem = f"expected opacities in [0, 1], found {low:.3g} to {high:.3g}"
+        raise SceneError("opacities", problem, "they look like logits: pass torch.sigmoid(opacities)")
+    lengths = np.linalg.norm(out["quats"][valid], axis=1)
+    share = float((np.abs(lengths - 1) > _NOT_UNIT).mean())
+    if share > _FEW:
+        sizes = f"{100 * share:.3g} % with lengths of {lengths.min():.3g} to {lengths.max():.3g}"
+        remedy = "pass torch.nn.functional.normalize(quats, dim=-1)"
+        raise SceneError("quats", f"expected unit quaternions wxyz, found {sizes}", remedy)
+
+
+def _expect_unit_range(name: str, values: np.ndarray, slack: float) -> None:
+    """Refuse colours far outside [0, 1], and name the range that they seem to have."""
+    low, high = float(values.min(initial=0)), float(values.max(initial=0))
+    if -slack <= low and high <= 1 + slack:
+        return
+    remedy = ""
+    if low >= 0 and high <= 255 + slack:
+        remedy = f"they look like 0 to 255: pass {name} / 255"
+    elif low >= -1 - slack and high <= 1 + slack:
+        remedy = f"they look like -1 to 1: pass ({name} + 1) / 2"
+    raise SceneError(name, f"expected sRGB in [0, 1], found {low:.3g} to {high:.3g}", remedy)
+
+
+def _read_views(
+    viewmats: Array | None, Ks: Array | None, images: Array | None, shape: Sequence[int] | None
+) -> tuple[Cameras, np.ndarray | None]:
+    """Return the cameras and ``images [v,h,w,3]``, each checked alone."""
+    if viewmats is None or Ks is None:
+        raise SceneError("viewmats" if viewmats is None else "Ks", "expected one matrix for each view, found none")
+    photos = None if images is None else _to_numpy("images", images)
+    views, height, width = _view_shape(shape, photos)
+    matrices = _matrices("viewmats", viewmats, ((3, 4), (4, 4)), views)
+    intrinsics = _matrices("Ks", Ks, ((3, 3),), views)
+    poses = np.tile(np.eye(4), (views, 1, 1))
+    poses[:, : matrices.shape[1]] = matrices
+    for view, (pose, K) in enumerate(zip(poses, intrinsics, strict=True)):
+        if np.abs(pose[3] - (0, 0, 0, 1)).max() > 1e-3:
+            problem = f"view {view}: expected 0 0 0 1 as the last row, found another"
+            raise SceneError("viewmats", problem, "if they are transposed, pass viewmats.transpose(-1, -2)")
+        if max(K[0, 0], K[1, 1]) < MAX_NORMALISED_FOCAL <= min(width, height):
+            problem = f"view {view}: expected intrinsics in pixels, found a focal length of {K[0, 0]:.3g}"
+            raise SceneError("Ks", problem, "they look divided by the image's size: multiply the rows by W, H and 1")
+        check_camera("viewmats", str(view), pose, np.eye(3))
+        check_camera("Ks", str(view), np.eye(4), K)
+        check_size("Ks", str(view), K, (width, height))
+    cameras = Cameras(poses, intrinsics, width, height)
+    if photos is None:
+        return cameras, None
+    expected = (views, height, width, 3)
+    if photos.shape[-4:] != expected or photos.size != np.prod(expected):
+        raise _image_error(photos, str(list(expected)))
+    if not np.isfinite(photos).all():
+        raise SceneError("images", "expected finite numbers, found NaN or inf")
+    _expect_unit_range("images", photos, _TOLERANCE)
+    return cameras, to_float32(photos.reshape(expected)).clip(0, 1)
+
+
+def _matrices(name: str, values: Any, shapes: Sequence[tuple[int, int]], views: int) -> np.ndarray:
+    array = _to_numpy(name, values).astype(np.float64)
+    if array.shape[-2:] not in shapes or array.size != views * array.shape[-2] * array.shape[-1]:
+        expected = " or ".join(str([views, *shape]) for shape in shapes)
+        raise SceneError(name, f"expected shape {expected}, found {list(array.shape)}")
+    return array.reshape(views, *array.shape[-2:])
+
+
+def _view_shape(shape: Sequence[int] | None, photos: np.ndarray | None) -> tuple[int, int, int]:
+    """Return views, height and width as given, or those of the images."""
+    if shape is not None:
+        if len(shape) != 3:
+            raise SceneError("shape", f"expected views, height and width, found {list(shape)}")
+        views, height, width = (int(side) for side in shape)
+    elif photos is None:
+        raise SceneError("shape", "expected the number of views, their height and width, found neither it nor images")
+    else:
+        if photos.ndim < 4 or photos.shape[-1] != 3:
+            raise _image_error(photos, "[V, H, W, 3]")
+        views, height, width = photos.shape[-4:-1]
+    check_pixels("shape", width, height)
+    return views, height, width
+
+
+def _image_error(photos: np.ndarray, expected: str) -> SceneError:
+    """Return the error for images of another shape, with a remedy."""
+    first = photos.ndim >= 4 and photos.shape[-3] == 3 != photos.shape[-1]
+    remedy = "channels come first: pass images.permute(0, 2, 3, 1)" if first else "resize them to the model's input"
+    return SceneError("images", f"expected shape {expected}, found {list(photos.shape)}", remedy)
+
+
+def _check_pixels(
+    gaussians: Gaussians, cameras: Cameras, valid: np.ndarray, names: tuple[str, ...]
+) -> tuple[Cameras, list[str]]:
+    """Check that Gaussians project into their own pixels; return cameras, moved a little, and notes."""
+    pairs = sample_pixels(gaussians, cameras, valid)
+    alignment = check_pairs(pairs, cameras)
+    if alignment.ok:
+        shifted = check_pairs(replace(pairs, pixels=pairs.pixels - 0.5), cameras)
+        corners = np.median(shifted.median_px) < _CORNER and np.median(alignment.median_px) > 0.5 - _CORNER
+        text = "the Gaussians project onto the corners of their pixels: if Ks take these for centres, add 0.5 to cx, cy"
+        return cameras, [text] if corners else []
+    for poses in other_conventions(cameras.viewmats, W2C_OPENCV):
+        if check_pairs(pairs, replace(cameras, viewmats=poses.viewmats)).ok:
+            raise _convention_error(poses.convention, poses.description, "the means project into their own pixels")
+    factors = np.array([cameras.width, cameras.height]) / np.maximum(2 * cameras.Ks[0, :2, 2], 1e-6)
+    scaled = cameras.Ks * np.array([*factors, 1])[:, None]
+    if check_pairs(pairs, replace(cameras, Ks=scaled)).ok:
+        problem = f"expected intrinsics of {cameras.width} x {cameras.height} pixels, found those of another size"
+        remedy = f"multiply their first row by {factors[0]:.6g} and the second by {factors[1]:.6g}"
+        raise SceneError("Ks", problem, remedy)
+    reason = explain_misalignment(gaussians, cameras, valid, W2C_OPENCV)
+    moved = None if reason else move_cameras(pairs, cameras, names)
+    if moved is not None:
+        return moved.cameras, [moved.note]
+    raise misalignment_error("means", alignment, reason)
+
+
+def _check_rotations(scene: Scene) -> None:
+    """Refuse rotations that follow the surface far better in another convention."""
+    choice, note = choose_rotations(scene)
+    if choice == "wxyz":
+        return
+    facts = note.partition(";")[0]
+    remedy = f"{_ROTATION_REMEDIES[choice]}; pass check_rotations=False if they are right as they are"
+    raise SceneError("quats", f"expected unit quaternions wxyz, local to world, found that {facts}", remedy)
+
+
+def _rotation_notes(scene: Scene, *, check_rotations: bool) -> list[str]:
+    """Note quaternions whose w may come last: those of matrices usually have no negative w.
+
+    Depth Anything 3 writes w first and takes the sign from the last column: where the pixels are known, the surface
+    decides, otherwise the caller.
+    """
+    first, last = scene.file_gaussians.quats[:, 0], scene.file_gaussians.quats[:, 3]
+    if not last.min() >= 0 > first.min():
+        return []
+    last_w = choose_rotations(scene)[0] == "xyzw" if scene.aligned else check_rotations
+    return ["the last column of quats is never negative: if w comes last, pass quats[:, [3, 0, 1, 2]]"] * last_w
+
+
+def _check_seen(gaussians: Gaussians, valid: np.ndarray, cameras: Cameras, images: np.ndarray | None) -> list[str]:
+    """Refuse poses that see the Gaussians only in another convention; return notes."""
+    poses, check, note = choose_poses(gaussians, valid, cameras, images, W2C_OPENCV)
+    if poses is not None:
+        raise _convention_error(poses.convention, poses.description, check.description)
+    return [text for text in (note, None if check.ok else check.description) if text]
+
+
+def _convention_error(convention: Convention, description: str, fact: str) -> SceneError:
+    """Return the error for view matrices of another convention, with a remedy."""
+    problem = f"expected world-to-camera matrices with OpenCV axes, found that {fact} when the matrices are read as"
+    return SceneError("viewmats", f"{problem} {description}", _REMEDIES[convention])

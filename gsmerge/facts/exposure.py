@@ -1,0 +1,265 @@
+"""Aligned scene -> the same in one exposure, where its photos and their Gaussians differ in it at random.
+
+Cameras that choose exposure and white balance for each photo, and models that copy them into their
+Gaussians, show one surface in several tones. Pixels of a view are looked up in the others, where
+these have Gaussians at the same depth; the median ratio of each channel is the pair's, and the
+gains of the views follow from all pairs by least squares, with a geometric mean of one.
+
+Gains are taken out where that brings the colours of the same surfaces clearly nearer, and where a new
+view tells nothing of its own gain, so that the mean of all is the best guess. It tells something in two
+cases, and photos stay as they are. A camera that meters light makes bright places darker, and does so in
+a new photo too: then photos of larger gains are not brighter. And exposure may drift along a video: then
+neighbours have nearly the same gain. A mean would be farther from new photos, in a video of a kitchen by
+1.5 dB.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from gsmerge.facts.mend_photos import CLIPPED, PhotoChange, change_large
+from gsmerge.geometry import camera_centres, camera_depths, correlation, project, rgb_to_sh0, sh0_to_rgb
+from gsmerge.kernels.elementary import exp, log
+from gsmerge.kernels.matrices import solve_symmetric
+from gsmerge.raster.photos import NEAR
+from gsmerge.runtime.record import choose, note
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.types import Cameras, Scene
+
+Exposure = Literal["auto", "fixed", "per-photo"]
+SAMPLES = 2000  # pixels of a view that are looked up in the others
+SAME_DEPTH = 0.05  # logarithm of depths that are of one surface
+LOW, HIGH = 0.05, 0.95  # colours in between are neither noise nor clipped
+MIN_PAIRS = 60  # pixels that two views must share; so many of each pair are compared again
+# When gains are taken out, on the plain exports of 15 captures. Root mean square of the logarithmic gains: above it in
+# nine of ten draws of random gains of 0.8 to 1.25 for five photos, and in six captures as they were taken.
+DIFFERENT = 0.06
+# Differences between colours of the same surfaces, as a share of those before: 0.12 to 0.60 with random gains.
+NEARER = 0.75
+# How a photo's brightness grows with its gain, logarithms: by 0.61 to 1.11 with random gains of 0.5 to 2, by 0.41 at
+# most where a camera metered light and gains are 0.1 or more. Places that differ in brightness by more than the gains
+# bury that, so it counts only where both are opposed: there, their correlation is -0.67 to -0.99.
+FOLLOWS, OPPOSED = 0.5, -0.6
+# Distance of a gain from the mean of its two nearest views', as a share of what random gains have: 0.71 to 1.22 with
+# gains of 0.5 to 2, 0.19 to 0.57 where exposure drifts and compensation loses 1.7 dB or more; 0.67 of four in a row.
+UNEXPECTED = 0.69
+COARSE = 4  # pixels per side of those that one says the brightness of
+BRIGHT = 1.15  # gain from which on clipped pixels no longer count
+NEIGHBOURS = 8  # views in which the surfaces of clipped pixels are looked up
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """Ratios of the colours of one view's pixels in another."""
+
+    view: int
+    other: int
+    ratios: np.ndarray  # [3] logarithm, their median
+    some: np.ndarray  # [MIN_PAIRS,3] logarithms of single pixels
+    count: int
+
+
+def equalise_exposure(scene: Scene, views: Sequence[int], exposure: Exposure) -> Scene:
+    """Divide the photos, and the Gaussians of their pixels, by the gains of their views, if that is called for.
+
+    ``views`` are those whose photos show the scene. Clipped pixels of brighter photos no longer count where another
+    photo shows more. The record gets a note, and the choice ``exposure``: the gain of each view, red, green and blue;
+    where photos differ and stay, a note says why.
+    """
+    if exposure == "fixed" or not scene.aligned or scene.images is None or len(views) < 2:
+        return scene
+    pairs = _measure_pairs(scene, views)
+    gains = _solve_gains(pairs, len(scene))
+    if gains is None:
+        return scene
+    factors = np.round(exp(gains), 3)
+    low, high = factors.min(), factors.max()
+    if low == high:
+        return scene
+    differ = f"the photos differ in exposure by factors of {low:.2f} to {high:.2f}"
+    if exposure == "auto":
+        if root_mean_square(gains[list(views)]) < DIFFERENT:
+            return scene
+        objection = _find_objection(scene, views, pairs, gains)
+        if objection:
+            note(f"{differ} and stay as they are: {objection}; --exposure per-photo brings them to their mean")
+            return scene
+    choose(exposure=factors.tolist())
+    note(f"{differ}: brought to their mean")
+    return _divide(scene, factors)
+
+
+def _find_objection(scene: Scene, views: Sequence[int], pairs: Sequence[_Pair], gains: np.ndarray) -> str:
+    """Say why photos are better left as they are; an empty text where they are not."""
+    assert scene.images is not None
+    own, some = gains[list(views)], [scene.images[view][::COARSE, ::COARSE] for view in views]
+    brightness = log(np.maximum([photo.mean((0, 1), dtype=np.float64) for photo in some], 1 / 255))
+    if share_left(pairs, gains) > NEARER:
+        return "other exposures do not bring the colours of the same surfaces clearly nearer"
+    if is_metered(brightness, own):
+        return "those of a longer exposure are not brighter, as where a camera chose it by what it saw"
+    if share_unexpected(own, camera_distances(scene.cameras[list(views)])) < UNEXPECTED:
+        return "neighbouring ones have nearly the same exposure, so new views between them have it, too"
+    return ""
+
+
+def root_mean_square(gains: np.ndarray) -> float:
+    """Compute how far logarithmic gains ``[v,3]`` are from their mean."""
+    away = gains - gains.mean(0)
+    return float(np.sqrt((away * away).mean()))
+
+
+def share_left(pairs: Sequence[_Pair], gains: np.ndarray) -> float:
+    """Divide the differences of colours that logarithmic gains ``[v,3]`` leave between views by those before."""
+    before = sum(float(np.median(np.abs(pair.some))) for pair in pairs)
+    after = sum(float(np.median(np.abs(pair.some - gains[pair.other] + gains[pair.view]))) for pair in pairs)
+    return after / max(before, 1e-9)
+
+
+def is_metered(brightness: np.ndarray, gains: np.ndarray) -> bool:
+    """Return whether gains make up for how bright the places are that photos show; both logarithms ``[v,3]``.
+
+    Brightness grows as gains do where these are independent of the places; metered photos are all equally bright.
+    """
+    gains, brightness = gains - gains.mean(0), brightness - brightness.mean(0)
+    slope = float((gains * brightness).sum() / max((gains * gains).sum(), 1e-12))
+    return slope < FOLLOWS and correlation(gains.ravel(), (brightness - gains).ravel()) < OPPOSED
+
+
+def share_unexpected(gains: np.ndarray, distances: np.ndarray) -> float:
+    """Measure how far gains are from the mean of the two nearest views', root mean square; 1 for random ones.
+
+    ``gains [v,3]`` are logarithms, ``distances [v,v]`` those of the cameras.
+    """
+    nearest = _order_others(distances)[:, :2]
+    away = gains - gains[nearest].mean(1)
+    random = root_mean_square(gains) * np.sqrt(len(gains) / (len(gains) - 1) * (1 + 1 / nearest.shape[1]))
+    return float(np.sqrt((away * away).mean()) / max(random, 1e-9))
+
+
+def camera_distances(cameras: Cameras) -> np.ndarray:
+    """Compute distances ``[v,v]``: between centres, canonical units, plus between unit vectors along their views."""
+    viewmats = cameras.viewmats.astype(np.float64)
+    both = (camera_centres(viewmats), viewmats[:, 2, :3])
+    differences = [some[:, None] - some[None] for some in both]
+    return np.asarray(sum(np.sqrt((some * some).sum(-1)) for some in differences))
+
+
+def _order_others(distances: np.ndarray) -> np.ndarray:
+    """Return the other views ``[v,v-1]`` of each one, the nearest first."""
+    apart = distances.copy()
+    np.fill_diagonal(apart, -1)
+    return np.argsort(apart, axis=1, kind="stable")[:, 1:]
+
+
+@dataclass(frozen=True)
+class _Pixels:
+    """Where every pixel's Gaussian is, and which pixels count."""
+
+    cameras: Cameras
+    means: np.ndarray  # [v,h*w,3] canonical units
+    valid: np.ndarray  # [v,h*w]
+
+    def look_up(self, view: int, rows: np.ndarray, other: int) -> tuple[np.ndarray, np.ndarray]:
+        """Find pixels ``rows`` of a view in another that has the same surface there: which ones, and its pixels."""
+        width, height = self.cameras.width, self.cameras.height
+        (pixels,), (z,) = project(self.means[view, rows], self.cameras[[other]])
+        x, y = np.floor(np.nan_to_num(pixels, nan=-1.0).clip(-1, max(width, height))).astype(np.int64).T
+        inside = (z > NEAR) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        places = np.where(inside, y * width + x, 0)
+        both = np.flatnonzero(inside & self.valid[other, places])
+        depths = camera_depths(self.means[other, places[both]], self.cameras.viewmats[other])
+        same = np.abs(log(np.maximum(z[both], NEAR) / np.maximum(depths, NEAR))) < SAME_DEPTH
+        return both[same], places[both[same]]
+
+
+def _pixels_of(scene: Scene) -> _Pixels:
+    """Collect the pixels of an aligned scene; those outside masks do not count."""
+    shape = len(scene), scene.pixels_per_view
+    valid = scene.valid.reshape(shape)
+    if scene.masks is not None:
+        valid = valid & scene.masks.reshape(shape)
+    return _Pixels(scene.cameras, scene.gaussians.means.reshape(*shape, 3), valid)
+
+
+def _measure_pairs(scene: Scene, views: Sequence[int]) -> list[_Pair]:
+    """Measure the ratios of colours between views that see the same surfaces."""
+    assert scene.images is not None
+    size, known = scene.pixels_per_view, _pixels_of(scene)
+    photos = scene.images.reshape(len(scene), size, 3)
+    some = np.random.default_rng(0).permutation(size)[:SAMPLES]
+
+    def measure(view: int) -> list[_Pair]:
+        rows = some[known.valid[view, some]]
+        pairs = []
+        for other in (other for other in views if other != view):
+            both, places = known.look_up(view, rows, other)
+            here, there = photos[view, rows[both]], photos[other, places]
+            clear = ((here > LOW) & (here < HIGH) & (there > LOW) & (there < HIGH)).all(1)
+            if clear.sum() >= MIN_PAIRS:
+                ratios = log(there[clear].astype(np.float64) / here[clear])
+                pairs.append(_Pair(view, other, np.median(ratios, 0), ratios[:MIN_PAIRS].copy(), len(ratios)))
+        return pairs
+
+    return [pair for pairs in parallel_map(measure, views) for pair in pairs]
+
+
+def _solve_gains(pairs: Sequence[_Pair], num_views: int) -> np.ndarray | None:
+    """Solve for the logarithmic gains ``[v,3]`` of all views, with mean zero; None without pairs."""
+    if not pairs:
+        return None
+    matrix, right = np.full((num_views, num_views), 1.0 / num_views), np.zeros((num_views, 3))
+    for pair in pairs:
+        ends, weight = [pair.view, pair.other], np.sqrt(min(pair.count, 1000))
+        matrix[np.ix_(ends, ends)] += weight * np.array([[1, -1], [-1, 1]])
+        right[ends] += weight * np.array([-pair.ratios, pair.ratios])
+    matrix[np.diag_indices(num_views)] += 1e-6  # of views without pairs
+    gains: np.ndarray = solve_symmetric(matrix, right)
+    return gains
+
+
+def _find_clipped(scene: Scene, gains: np.ndarray) -> np.ndarray:
+    """Return a mask ``[v,h,w]`` of clipped pixels of brighter photos whose surface another photo shows unclipped.
+
+    Without that, what is clipped everywhere (a sky) would be left to no photo.
+    """
+    assert scene.images is not None
+    clipped = ((scene.images >= CLIPPED) & (gains[:, None, None] > BRIGHT)).any(-1)
+    known, flat = _pixels_of(scene), clipped.reshape(len(scene), -1)
+    order = _order_others(camera_distances(scene.cameras))[:, :NEIGHBOURS]
+
+    def confirm(view: int) -> np.ndarray:
+        left, shown = np.flatnonzero(flat[view] & known.valid[view]), np.zeros_like(flat[view])
+        for other in order[view]:
+            both, places = known.look_up(view, left, other)
+            shown[left[both[~flat[other, places]]]] = True
+            left = left[~shown[left]]
+        return shown
+
+    return np.stack(parallel_map(confirm, range(len(scene)))).reshape(clipped.shape)
+
+
+def _divide(scene: Scene, gains: np.ndarray) -> Scene:
+    """Divide photos and colours of Gaussians by the gains ``[v,3]``; what is known to be clipped leaves the masks."""
+    assert scene.images is not None
+    factors = (1 / gains).astype(np.float32)
+    levels = np.arange(256, dtype=np.float32) / np.float32(255)
+    changes = [PhotoChange(tones=(factor[:, None] * levels).clip(0, 1)) for factor in factors]
+    images, masks = np.empty_like(scene.images), ~_find_clipped(scene, gains)
+    if scene.masks is not None:
+        masks &= scene.masks
+
+    def divide(view: int) -> None:
+        images[view] = (scene.images[view] * factors[view]).clip(0, 1)  # type: ignore[index]
+
+    parallel_map(divide, range(len(scene)))
+    g, each = scene.gaussians, factors.repeat(scene.pixels_per_view, 0)[:, None]
+    gaussians = replace(g, sh0=rgb_to_sh0(sh0_to_rgb(g.sh0) * each).astype(np.float32), shN=g.shN * each)
+    large = scene.large_photos
+    large = None if large is None else change_large(large, changes, {})
+    counting = scene.masks if masks.all() else masks
+    return replace(scene, images=images, gaussians=gaussians, masks=counting, large_photos=large)

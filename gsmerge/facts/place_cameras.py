@@ -1,0 +1,153 @@
+"""Unaligned scene -> the same with views: cameras that show most of it, and renders in place of photos."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from gsmerge.kernels.elementary import cos, sin
+from gsmerge.kernels.matrices import matmul
+from gsmerge.raster import contributions, plan_view, prepare, render
+from gsmerge.runtime.record import note
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.types import Cameras, Gaussians, Scene
+
+NUM_VIEWS = 24
+SAMPLES = 40_000  # Gaussians that candidates are judged by
+EXTENT = (0.05, 0.95)  # quantiles of the positions, per axis, that the scene is taken to span
+AROUND = 40  # candidate cameras around the scene
+INSIDE = (0.0, -0.5, 0.5)  # places of cameras inside, per axis, as a share of half the extent
+LOOKS = 8  # directions of a camera inside
+FIELD = 1.0  # width of the image over the focal length
+PROBE = 96  # pixels per side of the pictures that candidates are judged by
+SMALLEST, LARGEST = 96, 640  # pixels per side
+CLEAR = 0.02  # near plane, as a share of the scene's radius
+ENOUGH = 1.0  # pixels of blending weight at which a Gaussian counts as seen
+
+
+def add_views(scene: Scene) -> Scene:
+    """Keep the finite Gaussians, at least one, and place cameras where there are none; a note says what was done."""
+    g = scene.gaussians
+    finite = np.ones(len(g), bool)
+    for array in vars(g).values():
+        each = np.isfinite(array)
+        if not each.all():  # seldom, and row by row it takes ten times as long
+            finite &= each.reshape(len(g), -1).all(1)
+    count = int((~finite).sum())
+    if count == len(g):
+        raise ValueError("expected at least one finite Gaussian, got none")
+    if count:
+        note(f"{count} Gaussians are not finite and were left out")
+        scene = replace(scene, gaussians=g[finite])
+    if len(scene) == 0:
+        cameras = place_cameras(scene.gaussians)
+        names = tuple(f"placed {view}" for view in range(len(cameras)))
+        scene = Scene(scene.gaussians, cameras, None, None, names)
+        note(f"no cameras: {len(cameras)} placed around and inside the scene, where they show most of it")
+    return scene
+
+
+def add_pictures(scene: Scene) -> Scene:
+    """Add renders of the canonical scene itself in place of photos where it has none."""
+    if scene.images is not None:
+        return scene
+    note("no photos: views rendered from the scene itself stand in for them")
+    return replace(scene, images=render(scene.gaussians, scene.cameras).images.clip(0, 1))
+
+
+def place_cameras(gaussians: Gaussians, num_views: int = NUM_VIEWS) -> Cameras:
+    """Place cameras that see as much of the scene as possible.
+
+    Candidates stand on a sphere around the robust extent, looking in, and on a grid inside it,
+    looking everywhere. They are taken one by one, each time the one that shows most opacity which
+    none has shown so far, in pictures of a sample of the Gaussians. There are at most
+    ``num_views``, of square images that are larger for more Gaussians. Raises ValueError if there
+    is no Gaussian.
+    """
+    if len(gaussians) == 0:
+        raise ValueError("expected at least one Gaussian, got none")
+    sample = sampled(gaussians)
+    centre, half = _extent(sample.means.astype(np.float64))
+    viewmats = _candidates(centre, half)
+    shares = _shares_seen(sample, viewmats, CLEAR * float(np.sqrt((half * half).sum())))
+    chosen = _most_seen(shares, num_views)
+    size = int(np.clip(round(math.sqrt(len(gaussians))), SMALLEST, LARGEST))
+    return Cameras(viewmats[chosen], np.repeat(_lens(size)[None], len(chosen), 0), size, size)
+
+
+def _lens(size: int) -> np.ndarray:
+    return np.array([[size / FIELD, 0, size / 2], [0, size / FIELD, size / 2], [0, 0, 1]])
+
+
+def sampled(gaussians: Gaussians, count: int = SAMPLES) -> Gaussians:
+    """Return evenly spaced Gaussians, at most ``count``, enlarged so that they cover the same area."""
+    step = max(1, -(-len(gaussians) // count))
+    few = gaussians[::step]
+    return Gaussians(few.means, few.quats, few.scales * math.sqrt(step), few.opacities, few.sh0, few.shN)
+
+
+def _extent(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return middle ``[3]`` and half sides ``[3]`` of the box of most Gaussians."""
+    low, high = np.quantile(means, EXTENT, axis=0)
+    half = (high - low) / 2
+    widest = float(half.max()) if half.max() > 0 else 1.0
+    return (low + high) / 2, np.maximum(half, 1e-3 * widest)
+
+
+def _sphere(count: int) -> np.ndarray:
+    """Return directions ``[count,3]`` spread evenly over the sphere (golden spiral)."""
+    i = np.arange(count) + 0.5
+    height, turn = 1 - 2 * i / count, np.pi * (1 + math.sqrt(5)) * i
+    ring = np.sqrt(1 - height**2)
+    return np.stack([ring * cos(turn), height, ring * sin(turn)], 1)
+
+
+def _candidates(centre: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """Return the world-to-camera matrices ``[c,4,4]`` of all candidates."""
+    radius = float(np.sqrt((half * half).sum()))
+    away = _sphere(AROUND)
+    distance = radius * (1 + 2 / FIELD) / 1.5  # the box fills the image
+    eyes, looks = [centre + distance * away], [-away]
+    grid = np.stack(np.meshgrid(INSIDE, INSIDE, INSIDE, indexing="ij"), -1).reshape(-1, 3)
+    for place in grid:
+        eyes.append(np.broadcast_to(centre + place * half, (LOOKS, 3)))
+        looks.append(_sphere(LOOKS))
+    return np.stack([_look(e, d) for e, d in zip(np.concatenate(eyes), np.concatenate(looks), strict=True)])
+
+
+def _look(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Return the world-to-camera matrix, OpenCV axes, of an eye and a viewing direction."""
+    up = np.array([0.0, 1.0, 0.0]) if abs(direction[1]) < 0.9 else np.array([0.0, 0.0, 1.0])
+    x = np.cross(up, direction)
+    x /= np.sqrt((x * x).sum())
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = np.stack([x, np.cross(direction, x), direction])
+    viewmat[:3, 3] = -matmul(viewmat[:3, :3], eye)
+    return viewmat
+
+
+def _shares_seen(sample: Gaussians, viewmats: np.ndarray, near: float) -> np.ndarray:
+    """Measure how much of each Gaussian's opacity each candidate shows, ``[c,n]`` float32."""
+    splats, K = prepare(sample), _lens(PROBE)
+
+    def one_view(viewmat: np.ndarray) -> np.ndarray:
+        sums, _ = contributions(plan_view(splats, viewmat, K, PROBE, PROBE, near=near))
+        return np.minimum(sums / np.float32(ENOUGH), 1) * splats.opacities
+
+    return np.stack(parallel_map(one_view, viewmats))
+
+
+def _most_seen(shares: np.ndarray, num_views: int) -> list[int]:
+    """Choose candidates one by one, each adding most to what is seen; at least one."""
+    seen = np.zeros(shares.shape[1], np.float32)
+    chosen: list[int] = []
+    for _ in range(num_views):
+        gains = np.maximum(shares - seen, 0).sum(1, dtype=np.float64)
+        best = int(gains.argmax())
+        if chosen and gains[best] <= 1e-3 * seen.sum(dtype=np.float64):
+            break
+        chosen.append(best)
+        np.maximum(seen, shares[best], out=seen)
+    return chosen

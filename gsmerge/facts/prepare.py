@@ -1,0 +1,228 @@
+"""Scene -> prepared scene: facts about it, and the scene in the frame of all arithmetic.
+
+The canonical frame has its origin at the scene's middle and the median depth as its unit, so that
+float32 keeps its precision far from the world's origin and thresholds (near plane, floors) mean the
+same at every scale. The unit is a power of two: scaling there and back changes no bit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from gsmerge.facts.align_views import align_views
+from gsmerge.facts.compare_photos import compare_photos
+from gsmerge.facts.exposure import Exposure, equalise_exposure
+from gsmerge.facts.place_cameras import add_pictures, add_views
+from gsmerge.facts.views import distinct_views, subset
+from gsmerge.geometry import camera_depths, lower_median, project
+from gsmerge.kernels.matrices import matmul
+from gsmerge.raster.seen import seen_weights
+from gsmerge.runtime.record import note, record_part, stage
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.types import Cameras, Gaussians, Scene
+
+SAMPLES = 65536  # Gaussians that the frame is measured on
+ROWS = 65536  # Gaussians per task
+MAX_VIEWS = 32  # of an unaligned scene, that the unit is taken from
+
+Poses = Literal["auto", "fixed", "free"]
+Unseen = Literal["drop", "keep"]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Canonical frame: x_canonical = (x_world - origin) / unit."""
+
+    origin: np.ndarray  # [3] float64, world units
+    unit: float  # Length of the canonical unit in world units, a power of two
+
+    def enter(self, gaussians: Gaussians) -> Gaussians:
+        """Move Gaussians from the world into the frame; means in float32."""
+        means, scales = np.empty(gaussians.means.shape, np.float32), np.empty_like(gaussians.scales)
+
+        def fill(first: int) -> None:
+            rows = slice(first, first + ROWS)
+            means[rows] = (gaussians.means[rows] - self.origin) / self.unit
+            np.divide(gaussians.scales[rows], self.unit, out=scales[rows])
+
+        parallel_map(fill, range(0, len(gaussians), ROWS))
+        return replace(gaussians, means=means, scales=scales)
+
+    def leave(self, gaussians: Gaussians) -> Gaussians:
+        """Move Gaussians from the frame into the world; means in float64."""
+        means = gaussians.means.astype(np.float64) * self.unit + self.origin
+        return replace(gaussians, means=means, scales=gaussians.scales * self.unit)
+
+    def leave_cameras(self, cameras: Cameras) -> Cameras:
+        """Move cameras from the frame into the world."""
+        viewmats = cameras.viewmats.astype(np.float64)
+        viewmats[:, :3, 3] = self.unit * viewmats[:, :3, 3] - matmul(viewmats[:, :3, :3], self.origin)
+        return replace(cameras, viewmats=viewmats)
+
+    def enter_cameras(self, cameras: Cameras) -> Cameras:
+        """Move cameras from the world into the frame."""
+        viewmats = cameras.viewmats.astype(np.float64)
+        shift = viewmats[:, :3, 3] + matmul(viewmats[:, :3, :3], self.origin)
+        viewmats[:, :3, 3] = shift / self.unit
+        return replace(cameras, viewmats=viewmats)
+
+
+def scene_frame(scene: Scene) -> Frame:
+    """Choose the canonical frame: median mean (float64) and median depth; ValueError without Gaussians or views."""
+    if len(scene.gaussians) == 0 or len(scene) == 0:
+        raise ValueError(f"expected Gaussians and views, got {len(scene.gaussians)} and {len(scene)}")
+    means = scene.gaussians.means[_sample_rows(scene)].astype(np.float64)
+    depth = scene_depth(scene)
+    mantissa, exponent = math.frexp(depth if depth > 0 and math.isfinite(depth) else 1.0)
+    return Frame(lower_median(means), math.ldexp(1.0, exponent - (mantissa < math.sqrt(0.5))))
+
+
+def scene_depth(scene: Scene) -> float:
+    """Measure the median depth of some Gaussians, each in its own view, or in all that see it; 0 where none does."""
+    rows = _sample_rows(scene)
+    means = scene.gaussians.means[rows].astype(np.float64)
+    if scene.aligned:
+        viewmats = scene.cameras.viewmats[rows // scene.pixels_per_view]
+        return float(lower_median(np.abs(camera_depths(means, viewmats))))
+    views = scene.cameras[:: max(1, len(scene) // MAX_VIEWS)]
+    pixels, depths = project(means, views)
+    seen = (depths > 0) & ((pixels > 0) & (pixels < (views.width, views.height))).all(-1)
+    return float(lower_median(depths[seen])) if seen.any() else 0.0
+
+
+def _sample_rows(scene: Scene) -> np.ndarray:
+    """Choose evenly spread rows among the valid ones; raise ValueError if there is none."""
+    rows = np.arange(len(scene.gaussians)) if scene.pixel_ids is None else np.flatnonzero(scene.pixel_ids >= 0)
+    if len(rows) == 0:
+        raise ValueError("expected at least one valid Gaussian, got none")
+    return rows[:: max(1, len(rows) // SAMPLES)]
+
+
+def canonicalise(scene: Scene, frame: Frame | None = None) -> tuple[Scene, Frame]:
+    """Move a scene into its canonical frame, or into a given one; return it and the frame."""
+    frame = frame or scene_frame(scene)
+    return replace(scene, gaussians=frame.enter(scene.gaussians), cameras=frame.enter_cameras(scene.cameras)), frame
+
+
+@dataclass(frozen=True)
+class PrepareOptions:
+    """Options of the preparation, before anything is merged.
+
+    Args:
+        poses: ``"free"``: views of one Gaussian per pixel are moved to where their photos agree, and the full fit moves
+            the cameras on (on the CPU); ``"fixed"``: cameras stay where they are; ``"auto"``: free where some view is
+            more than 1.5 pixels off and its photo and the others agree clearly better elsewhere
+            (:mod:`gsmerge.facts.align_views` says by how much); fixed elsewhere, and without photos.
+        exposure: ``"auto"``: exposures and white balances of the photos, and of the Gaussians of their pixels, are
+            brought to their mean where they differ at random (:mod:`gsmerge.facts.exposure` says when);
+            ``"per-photo"``: wherever they differ; ``"fixed"``: never.
+        unseen: ``"drop"``: Gaussians without a pixel that no view sees are left out. ``"keep"``: they are merged among
+            their neighbours in space, at the rate of the others, and added to the result.
+
+    Raises:
+        ValueError: If a setting is unknown.
+    """
+
+    poses: Poses = "auto"
+    exposure: Exposure = "auto"
+    unseen: Unseen = "drop"
+
+    def __post_init__(self) -> None:
+        if self.poses not in ("auto", "fixed", "free"):
+            raise ValueError(f'poses: expected "auto", "fixed" or "free", got {self.poses!r}')
+        if self.exposure not in ("auto", "fixed", "per-photo"):
+            raise ValueError(f'exposure: expected "auto", "fixed" or "per-photo", got {self.exposure!r}')
+        if self.unseen not in ("drop", "keep"):
+            raise ValueError(f'unseen: expected "drop" or "keep", got {self.unseen!r}')
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """Facts about a scene, and the scene as the stages work on it."""
+
+    given: Scene  # The scene as it was given, in its own world frame, with photos that look as its Gaussians
+    # The canonical scene: every view once, photos that do not show it replaced; an unaligned one
+    # has cameras, pictures and only finite Gaussians that are seen, or all if none is set aside
+    scene: Scene
+    frame: Frame  # The canonical frame
+    photo_views: tuple[int, ...]  # Views whose photos a fit may use
+    repeated: tuple[int, ...]  # Place in the scene of every given view
+    moved: bool  # Whether views were moved to where their photos agree, before a fit or by it
+    unseen: Gaussians | None  # Canonical Gaussians that no view sees, if kept
+
+    def with_cameras(self, cameras: Cameras) -> Prepared:
+        """Replace the canonical cameras by those of a fit; the scene's own change nothing."""
+        if cameras is self.scene.cameras:
+            return self
+        return replace(self, scene=replace(self.scene, cameras=cameras), moved=True)
+
+    def result_views(self) -> Scene:
+        """Return the given scene with the photos as a result is to show them: in one exposure, if they were changed."""
+        return _with_photos(self.given, self.scene, self.repeated)
+
+    def final_cameras(self) -> Cameras:
+        """Return the given views' cameras as the result was made from them, in the world."""
+        given = self.given.cameras
+        if not self.moved:
+            return given
+        return replace(given, viewmats=self.frame.leave_cameras(self.scene.cameras).viewmats[list(self.repeated)])
+
+
+@stage("prepare")
+def prepare(scene: Scene, options: PrepareOptions | None = None, frame: Frame | None = None) -> Prepared:
+    """Collect the facts of a scene before anything is decided; notes say what was missing and replaced.
+
+    ``frame``: canonical frame; None: the scene's own. Raises ValueError if there is no finite
+    Gaussian, or there are images without cameras.
+    """
+    options = options or PrepareOptions()
+    views, repeated = distinct_views(scene)
+    own = scene
+    if len(views) < len(scene):
+        own = subset(scene, views)
+        note(f"{len(scene) - len(views)} views repeat others in every pixel and count once")
+    canonical, frame = canonicalise(add_views(own), frame)
+    compared, photo_views = compare_photos(canonical)
+    given = _with_photos(scene, compared, repeated)
+    checked = equalise_exposure(compared, photo_views, options.exposure)
+    placed = checked
+    if checked.aligned and checked.images is not None and options.poses != "fixed":
+        placed = align_views(checked, photo_views, always=options.poses == "free") or checked
+    seen, unseen = _split_unseen(placed) if options.unseen == "keep" else (placed, None)
+    shown = seen if seen.aligned else add_pictures(seen)  # pixels that are known have colours of their own
+    return Prepared(given, shown, frame, photo_views, tuple(repeated), placed is not checked, unseen)
+
+
+def photos_count_as_they_are(scene: Scene) -> bool:
+    """Return whether :func:`prepare` would leave the photos of a scene and their exposure as they are."""
+    if scene.images is None or len(scene) == 0 or len(scene.gaussians) == 0:
+        return True
+    with record_part(silent=True):
+        canonical, _ = canonicalise(add_views(scene))
+        compared, views = compare_photos(canonical)
+        return equalise_exposure(compared, views, "auto").images is canonical.images
+
+
+def _with_photos(given: Scene, own: Scene, repeated: Sequence[int]) -> Scene:
+    """Return the given scene with the photos and masks of its distinct views; itself where they are its own."""
+    if own.images is None or given.images is None or (own.images is given.images and own.masks is given.masks):
+        return given
+    images, masks = (None if some is None else some[list(repeated)] for some in (own.images, own.masks))
+    return replace(given, images=images, masks=masks)
+
+
+def _split_unseen(scene: Scene) -> tuple[Scene, Gaussians | None]:
+    """Split a scene into what some view sees and the Gaussians that none does; None without any, or without others."""
+    if scene.aligned:
+        return scene, None
+    seen = seen_weights(scene) > 0
+    num_unseen = int((~seen).sum())
+    note(f"{num_unseen if num_unseen < len(seen) else 0} Gaussians that no view sees are kept, merged")
+    if num_unseen in (0, len(seen)):
+        return scene, None
+    return replace(scene, gaussians=scene.gaussians[seen]), scene.gaussians[~seen]

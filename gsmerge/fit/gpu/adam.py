@@ -1,0 +1,168 @@
+"""Parameters under optimisation on a device, and the optimiser step of the kernel ``optimise.adam``.
+
+On CUDA one Triton kernel does all of a step (:mod:`gsmerge.fit.gpu.adam_kernel`), elsewhere torch. Both
+also write what the new parameters mean to the rasterizer, so a step begins with nothing to compute.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from functools import cache
+from importlib.util import find_spec
+
+import torch
+from torch import Tensor
+
+from gsmerge.fit.fit_options import FitOptions
+from gsmerge.kernels.gaussians.optimise import COLOR, LOGIT, MAX_LOGIT, MIN_LOGIT, QUAT, SIZE
+from gsmerge.types import SH_C0, Gaussians
+
+
+@dataclass(eq=False)
+class FitState:
+    """Parameters under optimisation, and their meaning for the rasterizer; see :mod:`gsmerge.fit.fit_state`."""
+
+    x: Tensor  # [n,14] mean, log scale, quaternion, opacity logit, colour; as the next three
+    x0: Tensor  # Values at the start
+    m: Tensor  # First moment
+    v: Tensor  # Second moment
+    units: Tensor  # [n] size of each Gaussian when it began
+    box_shares: Tensor  # [n] share of the box about the start that each may use
+    min_sizes: Tensor  # [n] least log scale of each
+    origins: Tensor  # [n] row of the start that each comes from
+    shN: Tensor  # [n,k-1,3] higher harmonics
+    means: Tensor  # [n,3]
+    quats: Tensor  # [n,4]
+    scales: Tensor  # [n,3]
+    opacities: Tensor  # [n]
+    colors: Tensor  # [n,3] base colours
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    def __getitem__(self, rows: Tensor) -> FitState:
+        """Return the state of some Gaussians, by mask or by row."""
+        return FitState(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+
+@dataclass(frozen=True, eq=False)
+class StepGradients:
+    """Gradients of a loss in the rasterizer's inputs; ``reached [n]`` bool: drawn in the view."""
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    colors: Tensor
+    reached: Tensor
+
+
+def start_state(gaussians: Gaussians) -> FitState:
+    """Make a fresh state at some Gaussians."""
+    opacities = gaussians.opacities.double().clamp(0.004, 0.999)
+    x = torch.cat(
+        [
+            gaussians.means,
+            gaussians.scales.clamp_min(1e-9).log(),
+            gaussians.quats,
+            (opacities / (1 - opacities)).log().float()[:, None],
+            0.5 + SH_C0 * gaussians.sh0[:, 0],
+        ],
+        1,
+    )
+    return state_of(x, gaussians.shN)
+
+
+def gaussians_of(x: Tensor, shN: Tensor) -> Gaussians:
+    """Return the Gaussians that parameters ``[n,14]`` and higher harmonics ``[n,k-1,3]`` stand for."""
+    return Gaussians(
+        means=x[:, :SIZE].contiguous(),
+        quats=x[:, QUAT:LOGIT].contiguous(),
+        scales=x[:, SIZE:QUAT].exp(),
+        opacities=x[:, LOGIT].sigmoid(),
+        sh0=((x[:, COLOR:] - 0.5) / SH_C0)[:, None],
+        shN=shN,
+    )
+
+
+def state_of(x: Tensor, shN: Tensor) -> FitState:
+    """Make a fresh state at parameters ``[n,14]`` and higher harmonics ``[n,k-1,3]``."""
+    sizes = x[:, SIZE:QUAT].sort(1).values
+    units = ((sizes[:, 1] + sizes[:, 2]) / 2).exp()
+    shown = (x[:, :SIZE], x[:, QUAT:LOGIT], x[:, SIZE:QUAT].exp(), x[:, LOGIT].sigmoid(), x[:, COLOR:])
+    shares, least = torch.ones_like(units), torch.full_like(units, -torch.inf)
+    rows = torch.arange(len(x), device=x.device)
+    return FitState(
+        x, x.clone(), torch.zeros_like(x), torch.zeros_like(x), units, shares, least, rows, shN,
+        *(tensor.clone(memory_format=torch.contiguous_format) for tensor in shown),
+    )  # fmt: skip
+
+
+def adam_step(state: FitState, gradients: StepGradients, options: FitOptions, rates: Tensor, step: int) -> None:
+    """Take an Adam step by a view's gradients, in place, within the box about the start.
+
+    Gaussians that the view does not show stay unchanged. The pulls on opacity and size are added to
+    the gradients of the image loss here. ``rates [14]``: see
+    :func:`gsmerge.fit.full.step_sizes`; ``step`` counts from 1.
+    """
+    if state.x.is_cuda and has_triton():
+        from gsmerge.fit.gpu.adam_kernel import launch
+
+        launch(state, gradients, options.tuning, rates, step)
+    else:
+        step_in_torch(state, gradients, options, rates, step)
+
+
+@cache
+def has_triton() -> bool:
+    """Return whether Triton is there; CUDA builds of torch for Linux bring it."""
+    return find_spec("triton") is not None
+
+
+def step_in_torch(state: FitState, gradients: StepGradients, options: FitOptions, rates: Tensor, step: int) -> None:
+    """Take the step of :func:`adam_step` without Triton."""
+    gradient, limits = parameter_gradient(state, gradients, options), options.tuning
+    energy = gradient * gradient
+    for shared in (slice(0, SIZE), slice(QUAT, LOGIT)):  # one second moment, so that steps turn with the scene
+        energy[:, shared] = energy[:, shared].sum(1, keepdim=True) / 3  # degrees of freedom, of a rotation too
+    reached = gradients.reached[:, None]
+    state.m.copy_(torch.where(reached, state.m.lerp(gradient, 1 - limits.beta1), state.m))
+    state.v.copy_(torch.where(reached, state.v.lerp(energy, 1 - limits.beta2), state.v))
+    first, second = state.m / (1 - limits.beta1**step), state.v / (1 - limits.beta2**step)
+    move = rates * first / (second.sqrt() + 1e-15)
+    move[:, :SIZE] *= state.units[:, None]
+    state.x.copy_(torch.where(reached, confine(state, state.x - move, options), state.x))
+    for shown, meaning in (
+        (state.means, state.x[:, :SIZE]), (state.quats, state.x[:, QUAT:LOGIT]),
+        (state.scales, state.x[:, SIZE:QUAT].exp()), (state.opacities, state.x[:, LOGIT].sigmoid()),
+        (state.colors, state.x[:, COLOR:]),
+    ):  # fmt: skip
+        shown.copy_(meaning)
+
+
+def parameter_gradient(state: FitState, gradients: StepGradients, options: FitOptions) -> Tensor:
+    """Return the gradient ``[n,14]`` in the optimiser's parameters: means in units of each size, log, logit."""
+    units, each = state.units[:, None], gradients.reached[:, None] / max(len(state), 1)
+    slope = (state.opacities * (1 - state.opacities))[:, None]
+    fade = gradients.opacities[:, None] + options.tuning.opacity_reg * each
+    shrink = gradients.scales + options.tuning.scale_reg * each / units
+    return torch.cat(
+        (gradients.means * units, shrink * state.scales, gradients.quats, fade * slope, gradients.colors), 1
+    )
+
+
+def confine(state: FitState, x: Tensor, options: FitOptions) -> Tensor:
+    """Bring new parameters ``[n,14]`` into the box about the start, with unit quaternions."""
+    x0, rates, shares = state.x0, options.tuning, state.box_shares[:, None]
+    offset = x[:, :SIZE] - x0[:, :SIZE]
+    far, reach = offset.norm(dim=1, keepdim=True), shares * rates.max_mean_shift * state.units[:, None]
+    x[:, :SIZE] = torch.where(far > reach, x0[:, :SIZE] + reach / far * offset, x[:, :SIZE])
+    sizes, logits, colors = x0[:, SIZE:QUAT], x0[:, LOGIT], x0[:, COLOR:]
+    grown = shares * rates.max_scale_change
+    x[:, SIZE:QUAT] = x[:, SIZE:QUAT].clamp(sizes - grown, sizes + grown).maximum(state.min_sizes[:, None])
+    logit = x[:, LOGIT].clamp(logits - rates.max_opacity_change, logits + rates.max_opacity_change)
+    x[:, LOGIT] = logit.clamp(float(MIN_LOGIT), float(MAX_LOGIT))
+    x[:, COLOR:] = x[:, COLOR:].clamp(colors.clamp_max(-0.05), colors.clamp_min(1.05))
+    norm = x[:, QUAT:LOGIT].norm(dim=1, keepdim=True)
+    x[:, QUAT:LOGIT] = torch.where(norm > 0, x[:, QUAT:LOGIT] / norm, 0)
+    return x

@@ -1,0 +1,121 @@
+"""Views from outside of the capture, in which a fit keeps empty what its start shows as empty.
+
+Photos say nothing of what hangs in gaps between them, and a fit fills these gaps with large Gaussians: fog, to whoever
+steps back. So after a third of a run some steps look from behind and beside, above and below, at opacities alone.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from gsmerge.fit.fit_options import FitOptions
+from gsmerge.geometry import middle_depth, step_outside
+from gsmerge.kernels.raster.project import TILE
+from gsmerge.raster import Splats, plan_view
+from gsmerge.raster.composite import blend
+from gsmerge.raster.gradient import Gradients, gradients_of
+from gsmerge.raster.photos import Photos, blank_photos
+from gsmerge.raster.view_plan import ViewPlan
+from gsmerge.runtime.threads import in_turn
+from gsmerge.types import Cameras
+
+# Least and largest step back, as a share of the depth of what a view sees, and turns about its middle to the sides, and
+# up or down, degrees. Cameras that turn without a step back see what new views see, and would cost them their fill
+LOW, HIGH = np.array([0.4, -35.0, -25.0]), np.array([1.6, 35.0, 25.0])
+# Steps of three numbers, modulo one, that fill a cube evenly however many there are (the R sequence of Roberts 2018)
+EVEN = np.array([0.8191725134, 0.6710436067, 0.5497004779])
+PLACES = 24  # views outside, at most, or as many as there are photos
+SAMPLE = 2000  # Gaussians that say how far away the middle of a view lies
+EMPTY = 0.05  # opacity of the start below which a pixel is empty
+# Distance from what the start shows, as a share of the width, within which nothing is asked: what stands beside the
+# outline fills what the foreground uncovers in new views
+RIM = 0.08
+# Gaussians of the start for each photo from which on fog weighs as much as errors of the photos: fewer and larger ones
+# reach from the borders of photos into what is empty, and would leave both. LIGHT is the least weight
+MANY, LIGHT = 1000, 0.15
+LEAST_WIDTH = 64  # pixels of the pictures
+LEAST = 0.005  # share of a picture that must be empty for it to count
+TOUCHED = 1e-9  # gradient of the opacity from which on a Gaussian takes part in a step
+SCORED = 12  # views, at most, that the fog of a result is measured in
+
+
+def outside_views(start: Splats, photos: Photos, options: FitOptions) -> Photos | None:
+    """Place the views of a fit outside; their weights are above 0 on pixels where the start shows nothing.
+
+    They step back from the cameras of ``photos``, and are black and half as large, at least ``LEAST_WIDTH`` wide. None
+    where the start fills all of them.
+    """
+    if len(start) == 0 or len(photos) == 0:
+        return None
+    cameras = Cameras(photos.viewmats, photos.Ks, photos.width, photos.height)
+    looks = math.ceil(options.steps * (1 - options.tuning.outside_from) / options.tuning.outside_every)
+    some = start.means[:: max(1, len(start) // SAMPLE)] + start.origin
+    placed = _place_cameras(some, cameras, min(looks, max(PLACES, len(photos))))
+    views = blank_photos(placed, min(2, photos.width / LEAST_WIDTH))
+
+    def mark(view: int) -> np.ndarray:
+        return mark_empty(1 - _blend_black(start, views, view)[1])
+
+    marks = list(in_turn(mark, range(len(views))))
+    kept = [view for view, empty in enumerate(marks) if empty.mean() > LEAST]
+    weight = np.float32(np.clip(len(start) / (MANY * len(photos)), LIGHT, 1.0))
+    return replace(views[kept], weights=weight * np.stack([marks[view] for view in kept])) if kept else None
+
+
+def _place_cameras(means: np.ndarray, cameras: Cameras, count: int) -> Cameras:
+    """Step back from what the cameras see of means ``[n,3]``, one after the other, and turn about its middle."""
+    depths = [middle_depth(means, cameras[[view]]) for view in range(min(count, len(cameras)))]
+    views, viewmats = [number % len(cameras) for number in range(count)], []
+    for number, view in enumerate(views):
+        back, azimuth, elevation = LOW + (0.5 + number * EVEN) % 1 * (HIGH - LOW)
+        viewmats.append(step_outside(cameras.viewmats[view], depths[view], back, azimuth, elevation))
+    return replace(cameras, viewmats=np.stack(viewmats), Ks=cameras.Ks[views])
+
+
+def mark_empty(opacities: np.ndarray) -> np.ndarray:
+    """Mark the pixels of a picture's ``opacities [h,w]`` that are empty, and farther than the rim from all others."""
+    side = 2 * round(RIM * opacities.shape[1]) + 1
+    empty = cv2.erode((opacities < EMPTY).astype(np.uint8), np.ones((side, side), np.uint8))
+    return np.asarray(empty, bool)
+
+
+def _blend_black(
+    splats: Splats, views: Photos, view: int, tiles: np.ndarray | None = None
+) -> tuple[ViewPlan, np.ndarray]:
+    """Plan a view and blend black Gaussians in it; return the plan and the transmittance ``[h,w]``."""
+    plan = plan_view(splats, **views.camera(view), tiles=tiles)
+    return plan, blend(plan, np.zeros((len(plan.ids), 3), np.float32), np.zeros(3, np.float32))[1]
+
+
+def _tiles_of(weights: np.ndarray) -> np.ndarray:
+    """Return a mask ``[lines,columns]`` of the tiles with pixels that count: the others need not be drawn."""
+    height, width = weights.shape
+    padded = np.pad(weights > 0, ((0, -height % TILE), (0, -width % TILE)))
+    return np.asarray(padded.reshape(-(-height // TILE), TILE, -1, TILE).any((1, 3)))
+
+
+def fog_gradients(splats: Splats, views: Photos, view: int) -> Gradients:
+    """Return the gradients of a view's mean of weight times opacity, of the Gaussians that take part in it."""
+    assert views.weights is not None
+    weights = views.weights[view]
+    plan, transmittance = _blend_black(splats, views, view, _tiles_of(weights))
+    black, colors = np.zeros((*weights.shape, 3), np.float32), np.zeros((len(plan.ids), 3), np.float32)
+    wanted = weights / np.float32(-weights.size)  # of the transmittance, which is 1 - opacity
+    g = gradients_of(plan, colors, black, transmittance, black, wanted, with_viewmat=False)
+    return g[np.flatnonzero(np.abs(g.opacities) > TOUCHED)]
+
+
+def score_fog(splats: Splats, views: Photos) -> float:
+    """Measure the mean opacity, in [0, 1], of Gaussians where views have pixels that count, in some of the views."""
+    assert views.weights is not None
+    fog, count = 0.0, 0.0
+    for view in range(0, len(views), -(-len(views) // SCORED)):
+        weights = views.weights[view]
+        _, transmittance = _blend_black(splats, views, view, _tiles_of(weights))
+        fog += float((weights * (1 - transmittance)).sum(dtype=np.float64))
+        count += float(weights.sum(dtype=np.float64))
+    return fog / count

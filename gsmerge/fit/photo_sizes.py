@@ -1,0 +1,158 @@
+"""Scene -> photos for a fit: at full and at half size, and larger where its photos are larger."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from gsmerge.fit.fit_options import FitOptions
+from gsmerge.kernels.elementary import exp, log
+from gsmerge.raster.metrics import decibels
+from gsmerge.raster.photos import EPS2D, Photos, pixel_weights, scene_photos
+from gsmerge.runtime.record import choose, note
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.types import Scene
+
+AUTO_SCALE = 2.0  # most that "auto" looks at: steps cost as many pixels, and photos beyond that are rarely sharp
+MIN_AUTO_SCALE = 1.25  # below it "auto" leaves it at the views' size
+ALIKE = 0.01  # of the scale: the rounding of sizes
+BLOCK = 32  # pixels, at most
+HIDDEN = np.float32(1e-9)  # a weight that is neither that of a held-out pixel nor one that counts
+
+
+def fit_photos(scene: Scene, options: FitOptions, views: Sequence[int] | None = None) -> tuple[Photos, ...]:
+    """Return the photos at full and half size, and larger if ``photo_scale`` is above 1, which is recorded."""
+    views = range(len(scene)) if views is None else views
+    photos = scene_photos(scene)[views], scene_photos(scene, 2)[views]
+    scale = 1.0 if options.photo_scale == "auto" else options.photo_scale
+    if scale == 1:
+        return photos
+    large = large_photos(scene, scale)[views]
+    size = f"{large.width} x {large.height}"
+    choose(photo_scale=round(scale, 4))
+    note(
+        f"the photos are larger than the views of {photos[0].width} x {photos[0].height}: the fit looks at them at"
+        f" {size} as well, which takes time; --set photo_scale=1 does without"
+    )
+    return *photos, large
+
+
+def photo_scale(scene: Scene, options: FitOptions, *, auto: bool) -> tuple[float, str | None]:
+    """Choose the multiple of the views' size for photos in a fit, 1 or more; say why it is less than asked."""
+    wanted, largest = options.photo_scale, largest_scale(scene)
+    covered = options.fit == "full" and options.half_res_part < 1
+    if wanted == "auto":
+        worth = covered and auto and largest >= MIN_AUTO_SCALE
+        return (min(largest, AUTO_SCALE) if worth else 1.0), None
+    if wanted == 1:
+        return 1.0, None
+    if not covered:
+        return 1.0, f"photo_scale {wanted:g} is 1: larger photos need the full fit, with steps on photos of full size"
+    if wanted > largest * (1 + ALIKE):
+        return largest, f"photo_scale {wanted:g} is {largest:.3g}: the photos are no larger"
+    return float(min(wanted, largest)), None
+
+
+def largest_scale(scene: Scene) -> float:
+    """Return how many times the views' size the photos have, at least 1."""
+    large = scene.large_photos
+    if large is None or scene.images is None or len(scene) == 0:
+        return 1.0
+    focals = (0, 1), (0, 1)
+    return max(1.0, float((large.Ks[0][focals] / scene.cameras.Ks[0][focals]).min()))
+
+
+def large_photos(scene: Scene, scale: float) -> Photos:
+    """Read the photos at ``scale`` times the views' size, at most :func:`largest_scale`, one by one.
+
+    As uint8, because they may be as large as the scene. Their low-pass is that of a viewer of this
+    size: the views' own size is seen with its own in the steps between. Raises ValueError if the
+    scene has no larger photos.
+    """
+    large, cameras = scene.large_photos, scene.cameras
+    if large is None:
+        raise ValueError("expected a scene with photos larger than its views, got one without")
+    focals = (0, 1), (0, 1)
+    shares = scale * cameras.Ks[0][focals] / large.Ks[0][focals]
+    width, height = (max(1, round(side * by)) for side, by in zip((large.width, large.height), shares, strict=True))
+
+    def read(photo: int) -> np.ndarray:
+        return np.asarray(cv2.resize(large.read(photo), (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+
+    Ks = large.Ks * np.array([[width / large.width], [height / large.height], [1.0]])
+    weights = pixel_weights(scene.masks, width, height)
+    return Photos(np.stack(parallel_map(read, large.ids)), cameras.viewmats.astype(np.float64), Ks, EPS2D, weights)
+
+
+def training_weights(photos: Photos, share: float, seed: int) -> list[np.ndarray]:
+    """Return weights ``[h,w]`` float32 per view: 0 on held-out blocks, at least one a view, the photos' elsewhere.
+
+    Pixels that count less are not held out; those that do not count at all have the weight ``HIDDEN``.
+    """
+    size = max(1, min(BLOCK, min(photos.height, photos.width) // 4))
+
+    def one_view(view: int) -> np.ndarray:
+        rows, columns = -(-photos.height // size), -(-photos.width // size)
+        random = np.random.default_rng([seed, view])
+        blocks = random.random((rows, columns)) < share
+        if not blocks.any():
+            blocks[random.integers(rows), random.integers(columns)] = rows * columns > 1
+        full = np.repeat(np.repeat(~blocks, size, 0), size, 1)[: photos.height, : photos.width]
+        if photos.weights is None:
+            return full.astype(np.float32)
+        own = photos.weights[view]
+        return np.where(own == 1, full.astype(np.float32), np.maximum(own, HIDDEN))
+
+    return [one_view(view) for view in range(len(photos))]
+
+
+def reduced(weights: list[np.ndarray], photos: Photos) -> list[np.ndarray]:
+    """Reduce weights of full-size photos to half size."""
+    return [np.ascontiguousarray(weight[::2, ::2][: photos.height, : photos.width]) for weight in weights]
+
+
+def holdout_psnr(images: Sequence[np.ndarray], photos: Photos, weights: list[np.ndarray], min_gain: float) -> float:
+    """Return the PSNR (dB) of renders on the held-out blocks, where ``weights [h,w]`` are 0.
+
+    Exposure of the photos that differs by a factor of ``min_gain`` or more is compensated.
+    """
+    views = range(len(photos))
+    clipped = parallel_map(lambda view: np.clip(images[view], 0, 1), views)
+    gains = exposure_gains(clipped, photos.images, weights, min_gain)
+
+    def one_view(view: int) -> tuple[float, float]:
+        error = ((clipped[view] * gains[view] - photos.images[view]) ** 2).sum(-1)
+        mask = weights[view] == 0
+        return float(error[mask].sum(dtype=np.float64)), float(mask.sum())
+
+    error, count = np.sum(parallel_map(one_view, views), axis=0)
+    return decibels(error / max(3 * count, 1))
+
+
+def exposure_gains(
+    images: Sequence[np.ndarray],
+    photos: np.ndarray,
+    weights: Sequence[np.ndarray],
+    min_gain: float,
+    max_gain: float = 2.0,
+) -> np.ndarray:
+    """Return factors ``[v,3]`` float32 from renders to the photos' exposure, with geometric mean one.
+
+    Least squares on the weighted pixels, per view and channel; ones where no view differs by
+    ``min_gain``.
+    """
+
+    def one_view(view: int) -> np.ndarray:
+        image, weight = images[view], weights[view][..., None]
+        with_photo, with_image = (
+            (weight * other * image).sum((0, 1), dtype=np.float64) for other in (photos[view], image)
+        )
+        return np.clip(with_photo / np.maximum(with_image, 1e-9), 1 / max_gain, max_gain)
+
+    gains = np.stack(parallel_map(one_view, range(len(photos))))
+    gains /= exp(log(gains).mean(0))
+    if np.abs(log(gains)).max() < log(min_gain):
+        gains[:] = 1
+    return gains.astype(np.float32)

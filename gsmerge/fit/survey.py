@@ -1,0 +1,57 @@
+"""A first look at all photos: what the fit has to know about its start before it begins."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from gsmerge.fit.fit_state import start_state
+from gsmerge.raster import plan_view
+from gsmerge.raster.composite import survey
+from gsmerge.raster.photos import Photos
+from gsmerge.runtime.threads import in_turn
+from gsmerge.types import Array, Gaussians
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """Half-size pictures of a start, and what they show of its n Gaussians."""
+
+    images: tuple[Array, ...]  # [h,w,3] float32 of each photo's camera, over black
+    inside: Array  # [n] bool, whether some photo's frustum may hold it
+    peaks: Array  # [n] float32 largest blending weight
+    sums: Array  # [n] float64 blending weights summed over all photos, pixels
+    squares: Array  # [n] float64 squares of each photo's sum, summed
+    pixels: Array  # [n] float32 size of the finest pixel that shows it, world units; inf if none does
+
+    def visible(self, min_weight: float) -> Array:
+        """Return a mask ``[n]``: a weight of ``min_weight`` in some photo, or in no photo's frustum."""
+        return ~self.inside | (self.peaks >= min_weight)
+
+    def __getitem__(self, rows: Array) -> Survey:
+        columns = {field.name: getattr(self, field.name)[rows] for field in fields(self) if field.name != "images"}
+        return Survey(self.images, **columns)
+
+
+def survey_photos(gaussians: Gaussians, photos: Sequence[Photos]) -> Survey:
+    """Look once at the half-size photos, ``photos[1]``; the others, full size first, say how fine their pixels are."""
+    state, half, count = start_state(gaussians), photos[1], len(gaussians)
+    colors = state.view_colors()
+
+    def one_view(view: int) -> tuple[Array, ...]:
+        plan = plan_view(state.splats, **half.camera(view))
+        focal = max(sized.Ks[view][[0, 1], [0, 1]].max() for sized in photos)
+        return plan.ids, plan.depths / focal, *survey(plan, colors)
+
+    images, inside, peaks = [], np.zeros(count, bool), np.zeros(count, np.float32)
+    sums, squares, pixels = np.zeros(count), np.zeros(count), np.full(count, np.inf, np.float32)
+    for ids, sizes, image, weights, most in in_turn(one_view, range(len(half))):
+        images.append(image)
+        inside[ids] = True
+        peaks[ids] = np.maximum(peaks[ids], most)
+        pixels[ids] = np.minimum(pixels[ids], sizes)
+        sums[ids] += weights
+        squares[ids] += weights.astype(np.float64) ** 2
+    return Survey(tuple(images), inside, peaks, sums, squares, pixels)

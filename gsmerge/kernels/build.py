@@ -1,0 +1,156 @@
+"""Build the native library: called by ``pip install``, and by ``python tasks.py native`` after a change.
+
+It runs before anything is installed, so it needs the standard library alone. One compiler for all, the clang of the
+PyPI wheel ``ziglang``, makes the code of every target; ``GSMERGE_CC`` names another one, whose rounding may differ.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+FOLDER = Path(__file__).parent
+FLAGS = (
+    "-std=c11", "-O3", "-ffp-contract=on", "-fno-math-errno", "-ffreestanding", "-fPIC", "-fvisibility=hidden",
+    "-Wall", "-Wextra", "-Werror", "-Wno-psabi", "-g0",
+)  # fmt: skip
+LINK = ("-shared", "-nostdlib")
+
+
+@dataclass(frozen=True)
+class Target:
+    """A kind of processor that the library is built for."""
+
+    name: str  # of the library's file, and of GSMERGE_TARGET
+    zig: tuple[str, ...]  # options of the clang of ziglang
+    other: tuple[str, ...]  # options of another compiler
+
+
+V3 = Target("v3", ("-mcpu=x86_64_v3",), ("-march=x86-64-v3",))
+V4 = Target("v4", ("-mcpu=x86_64_v4", "-mprefer-vector-width=512"), ("-march=x86-64-v4", "-mprefer-vector-width=512"))
+ARM64 = Target("arm64", (), ())
+
+
+@dataclass(frozen=True)
+class Platform:
+    """A system and a family of processors that share a wheel."""
+
+    system: str  # linux, macosx or win, as tags of wheels begin
+    machine: str  # x86_64 or arm64
+
+    @property
+    def suffix(self) -> str:
+        """End of the file names of libraries."""
+        return {"macosx": ".dylib", "win": ".dll"}.get(self.system, ".so")
+
+    @property
+    def targets(self) -> tuple[Target, ...]:
+        """The targets, the least demanding first."""
+        return (V3, V4) if self.machine == "x86_64" else (ARM64,)
+
+    @property
+    def triple(self) -> str:
+        """The platform in words of the compiler; a C library is named, none is linked."""
+        kind = "x86_64" if self.machine == "x86_64" else "aarch64"
+        system = {"macosx": "macos", "win": "windows-gnu"}.get(self.system, "linux-gnu.2.17")
+        return f"{kind}-{system}"
+
+    @property
+    def flags(self) -> tuple[str, ...]:
+        """Further options: without a C library nothing can probe the stack."""
+        return ("-mno-stack-arg-probe",) if self.system == "win" else ()
+
+    def library_name(self, target: Target) -> str:
+        """Return the file name of a target's library."""
+        return f"kernels-{target.name}{self.suffix}"
+
+
+def find_platform(tag: str | None = None) -> Platform:
+    """Return the platform of a wheel's tag, such as ``manylinux_2_17_aarch64``; None: this machine's."""
+    name = (tag or sysconfig.get_platform()).lower()
+    system = next((system for system in ("macosx", "win") if name.startswith(system)), "linux")
+    return Platform(system, "arm64" if name.endswith(("arm64", "aarch64")) else "x86_64")
+
+
+def source_files() -> list[Path]:
+    """Return the sources that are at hand."""
+    return sorted([*FOLDER.rglob("*.c"), *FOLDER.rglob("*.h")], key=lambda path: path.name)
+
+
+def hash_sources() -> str:
+    """Return a hash of all sources; empty where they are not at hand."""
+    digest = hashlib.sha256()
+    for path in source_files():
+        digest.update(path.name.encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:16] if source_files() else ""
+
+
+def compiler() -> list[str]:
+    """Return the command of the compiler; OSError if there is none."""
+    given = shlex.split(os.environ.get("GSMERGE_CC", ""))
+    if given:
+        if shutil.which(given[0]) is None:
+            raise OSError(f"GSMERGE_CC: expected a compiler, found no program {given[0]!r}")
+        return given
+    try:
+        import ziglang
+    except ImportError:
+        raise OSError("expected the compiler of the package ziglang, found none; run pip install ziglang") from None
+    return [str(Path(ziglang.__path__[0]) / ("zig.exe" if os.name == "nt" else "zig")), "cc"]
+
+
+def build_target(
+    target: Target, folder: Path, platform: Platform, extra: tuple[str, ...] = (), link: tuple[str, ...] = LINK
+) -> Path:
+    """Build one target's library into a folder; OSError with the compiler's words if that fails."""
+    command, path = compiler(), folder / platform.library_name(target)
+    is_zig = Path(command[0]).stem == "zig"
+    options = ["-target", platform.triple, *platform.flags, *target.zig] if is_zig else target.other
+    with tempfile.TemporaryDirectory() as cache:
+        whole = Path(cache) / path.name
+        caches = {"ZIG_GLOBAL_CACHE_DIR": f"{cache}/global", "ZIG_LOCAL_CACHE_DIR": f"{cache}/local"}
+        call = [
+            *command, *options, *FLAGS, f'-DSOURCES_HASH="{hash_sources()}"', *extra, *link,
+            *(f"-I{folder}" for folder in sorted({path.parent for path in source_files()})),
+            *(str(path) for path in source_files() if path.suffix == ".c"), "-o", str(whole),
+        ]  # fmt: skip
+        run = subprocess.run(call, env={**os.environ, **caches}, capture_output=True, text=True, check=False)
+        if run.returncode:
+            raise OSError(f"{command[0]}: building {path.name} failed\n{run.stderr[-4000:]}")
+        folder.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(whole, f"{path}.new")
+        os.replace(f"{path}.new", path)
+    return path
+
+
+def build(
+    folder: Path = FOLDER, extra: tuple[str, ...] = (), platform: str | None = None, link: tuple[str, ...] = LINK
+) -> list[Path]:
+    """Build the libraries of all targets into a folder.
+
+    Args:
+        folder: Where they go.
+        extra: Further options of the compiler.
+        platform: Tag of a wheel; None: this machine's.
+        link: Options that make a library of the objects.
+    """
+    where = find_platform(platform)
+    with ThreadPoolExecutor() as pool:
+        return list(pool.map(lambda target: build_target(target, folder, where, extra, link), where.targets))
+
+
+if __name__ == "__main__":
+    try:
+        for built in build():
+            print(built)
+    except OSError as error:
+        sys.exit(str(error))

@@ -1,0 +1,55 @@
+"""Load the native library that fits the processor."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from functools import lru_cache
+from pathlib import Path
+
+from gsmerge.errors import UsageError
+from gsmerge.kernels.build import FOLDER, Target, find_platform, hash_sources
+
+REMEDY = "run python tasks.py native, or pip install again"
+
+
+@lru_cache(maxsize=1)
+def load_library() -> ctypes.CDLL:
+    """Return the library of the most demanding target that this processor runs, or of ``GSMERGE_TARGET``.
+
+    ``GSMERGE_NATIVE`` names another folder of libraries. Raises UsageError where none fits, or where it is missing or
+    older than the sources beside it.
+    """
+    able, wanted = _able_targets(), os.environ.get("GSMERGE_TARGET")
+    names = [target.name for target in able]
+    if wanted and wanted not in names:
+        raise UsageError(f"GSMERGE_TARGET: expected {' or '.join(names)} on this processor, found {wanted!r}; unset it")
+    return _open(next(target for target in able if target.name == wanted) if wanted else able[-1])
+
+
+def _able_targets() -> list[Target]:
+    """Return the targets that this processor runs, at least one."""
+    least, *more = find_platform().targets
+    if least.name == "arm64":
+        return [least]
+    library = _open(least)  # the function that asks the processor is made of plain instructions
+    level = library.processor_level()
+    if level < 3:
+        raise UsageError("expected a processor with AVX2 and FMA (x86-64-v3, from 2013 on), found an older one")
+    return [least, *(target for target in more if level >= int(target.name[1:]))]
+
+
+@lru_cache
+def _open(target: Target) -> ctypes.CDLL:
+    folder = Path(os.environ.get("GSMERGE_NATIVE") or FOLDER)
+    path = folder / find_platform().library_name(target)
+    try:
+        library = ctypes.CDLL(str(path))
+    except OSError as error:
+        problem = "cannot be loaded" if path.exists() else "is missing"
+        reason = f" ({error})" if path.exists() else ""
+        raise UsageError(f"{path}: the native library {problem}{reason}; {REMEDY}") from None
+    built = ctypes.c_char_p.in_dll(library, "sources_hash").value or b""
+    if hash_sources() not in ("", built.decode()):
+        raise UsageError(f"{path}: the native library is older than its sources; {REMEDY}")
+    return library

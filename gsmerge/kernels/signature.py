@@ -1,0 +1,197 @@
+"""Declare functions of the native library: what they take is checked here, so that C sees memory that it may use.
+
+    @native(values=f4("n"), ids=i4("m", least=0, below="n"), out=f4("m", out=True))
+    def take(values, ids, out):
+        \"\"\"Write the values at the ids.\"\"\"
+
+calls ``void take(const float *values, const int32_t *ids, float *out, int64_t n, int64_t m)``: the arguments in their
+order, then the sizes that have names, in the order in which they appear.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial, wraps
+from typing import Any
+
+import numpy as np
+
+from gsmerge.kernels.library import load_library
+
+_CODES = {
+    "u1": ("uint8_t", ctypes.c_uint8), "i1": ("int8_t", ctypes.c_int8), "i2": ("int16_t", ctypes.c_int16),
+    "u4": ("uint32_t", ctypes.c_uint32), "i4": ("int32_t", ctypes.c_int32), "u8": ("uint64_t", ctypes.c_uint64),
+    "i8": ("int64_t", ctypes.c_int64), "f4": ("float", ctypes.c_float), "f8": ("double", ctypes.c_double),
+}  # fmt: skip
+Size = int | str  # a number, or the name of a size or of an integer argument
+
+
+@dataclass(frozen=True)
+class Argument:
+    """What a function takes: an array in C order, or a scalar where there is no shape.
+
+    Args:
+        code: NumPy's name of the type.
+        shape: Sizes of the array's axes: numbers, or names that stand for the same size everywhere.
+        least: Smallest value, None for any.
+        below: What all values are below, None for any.
+        most: Largest value, None for any. Rules may name sizes and integers.
+        ascending: No value is below the one before it.
+        out: The array is written.
+        optional: None is allowed and becomes a null pointer; its names must appear elsewhere.
+    """
+
+    code: str
+    shape: tuple[Size, ...]
+    least: Size | None = None
+    below: Size | None = None
+    most: Size | None = None
+    ascending: bool = False
+    out: bool = False
+    optional: bool = False
+
+    @property
+    def c(self) -> str:
+        """The type in C."""
+        name = _CODES[self.code][0]
+        return name if not self.shape else f"{name} *" if self.out else f"const {name} *"
+
+    @property
+    def has_rules(self) -> bool:
+        """Whether values are checked, not only type and shape."""
+        return self.ascending or not (self.least is self.below is self.most is None)
+
+    def __str__(self) -> str:
+        return f"{np.dtype(self.code)} [{','.join(map(str, self.shape))}]"
+
+
+def _argument(code: str, *shape: Size, **rules: Any) -> Argument:
+    return Argument(code, shape, **rules)
+
+
+u1, i1, i2, u4, i4, u8, i8, f4, f8 = (
+    partial(_argument, code) for code in ("u1", "i1", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
+)
+
+STATUS = i4()  # what a function returns that checks indices on its way: 0, or another number for one outside its array
+COUNT = i8()  # the same of a function that counts: a number from 0 on, or a negative one for an index outside
+
+
+def native(returns: Argument | None = None, /, **arguments: Argument) -> Callable[[Callable[..., Any]], Any]:
+    """Replace a function by the one of the same name, without an underscore in front, in the native library.
+
+    The arguments are checked at every call: ValueError says which has another type, shape or range.
+
+    Args:
+        returns: Scalar that the function returns; None for nothing. STATUS: nothing, or ValueError for an index that
+            points outside its array. COUNT: a number, or ValueError.
+        arguments: What each argument is, in their order.
+    """
+
+    def wrap(function: Callable[..., Any]) -> Any:
+        name, signature = function.__name__.lstrip("_"), inspect.signature(function)
+        if list(signature.parameters) != list(arguments):
+            raise TypeError(f"{name}: expected declarations of {list(signature.parameters)}, got {list(arguments)}")
+        entries: dict[ctypes.CDLL, Any] = {}  # the function in each library that was loaded: tests load several
+
+        @wraps(function)
+        def call(*values: Any, **named: Any) -> Any:
+            if named or len(values) != len(arguments):
+                bound = signature.bind(*values, **named)
+                bound.apply_defaults()
+                values = bound.args
+            sizes: dict[str, int] = {}
+            passed = [_pass(name, key, kind, value, sizes) for (key, kind), value in zip(kinds, values, strict=True)]
+            for place, key, kind in ruled:
+                _check_values(name, key, kind, values[place], sizes)
+            library = load_library()
+            if library not in entries:
+                entries[library] = _entry(library, name, returns, arguments)
+            result = entries[library](*passed, *[sizes.get(key, 0) for key in names])
+            if (returns is STATUS and result) or (returns is COUNT and result < 0):
+                raise ValueError(f"{name}: expected indices inside their arrays, found one outside")
+            return None if returns is STATUS else result
+
+        kinds, names = list(arguments.items()), size_names(arguments)
+        ruled = [(place, key, kind) for place, (key, kind) in enumerate(kinds) if kind.has_rules]
+        call.prototype = _prototype(name, returns, arguments)  # type: ignore[attr-defined]
+        return call
+
+    return wrap
+
+
+def size_names(arguments: dict[str, Argument]) -> list[str]:
+    """Return the names of sizes that are no arguments, in the order in which they appear."""
+    sizes = (size for kind in arguments.values() for size in kind.shape)
+    return list(dict.fromkeys(size for size in sizes if isinstance(size, str) and size not in arguments))
+
+
+def _prototype(name: str, returns: Argument | None, arguments: dict[str, Argument]) -> str:
+    """Return the declaration in C that a function must have."""
+    parts = [f"{kind.c}{'' if kind.shape else ' '}{key}" for key, kind in arguments.items()]
+    parts += [f"int64_t {size}" for size in size_names(arguments)]
+    return f"{returns.c if returns else 'void'} {name}({', '.join(parts)})"
+
+
+def _entry(library: ctypes.CDLL, name: str, returns: Argument | None, arguments: dict[str, Argument]) -> Any:
+    function = getattr(library, name)
+    kinds = [ctypes.c_void_p if kind.shape else _CODES[kind.code][1] for kind in arguments.values()]
+    function.argtypes = [*kinds, *[ctypes.c_int64] * len(size_names(arguments))]
+    function.restype = _CODES[returns.code][1] if returns else None
+    return function
+
+
+def _pass(name: str, key: str, kind: Argument, value: Any, sizes: dict[str, int]) -> Any:
+    """Check one argument -> what ctypes is given for it; ``sizes`` learns its names."""
+    if not kind.shape:
+        if kind.code[0] != "f":
+            value = int(value)
+            if sizes.setdefault(key, value) != value:
+                raise ValueError(f"{name}: {key}: expected {sizes[key]}, as arrays have it, got {value}")
+        return value
+    if value is None and kind.optional:
+        return None
+    if type(value) is not np.ndarray or value.dtype != kind.code or value.ndim != len(kind.shape):
+        raise ValueError(f"{name}: {key}: expected {kind}, got {_describe(value)}")
+    for size, length in zip(kind.shape, value.shape, strict=True):
+        if (size if isinstance(size, int) else sizes.setdefault(size, length)) != length:
+            known = f" with {size} = {sizes[size]}" if isinstance(size, str) else ""
+            raise ValueError(f"{name}: {key}: expected {kind}{known}, got {_describe(value)}")
+    flags = value.flags
+    if not flags.c_contiguous or not flags.aligned or (kind.out and not flags.writeable):
+        raise ValueError(f"{name}: {key}: expected an aligned{' writable' * kind.out} array in C order")
+    return _address(value)
+
+
+def _address(array: np.ndarray[Any, Any]) -> int:
+    """Return where an array's values lie; through the buffer where that can be, a fifth of the time."""
+    if array.flags.writeable and array.size:
+        return ctypes.addressof(ctypes.c_char.from_buffer(array))  # type: ignore[arg-type]
+    return int(array.ctypes.data)
+
+
+def _check_values(name: str, key: str, kind: Argument, value: Any, sizes: dict[str, int]) -> None:
+    """Check the values of an argument whose type and shape are sound."""
+    if value is None or (kind.shape and not value.size):
+        return
+    low, high = (value.min(), value.max()) if kind.shape else (value, value)
+    least, below, most = (
+        sizes[rule] if isinstance(rule, str) else rule for rule in (kind.least, kind.below, kind.most)
+    )
+    if least is not None and not low >= least:
+        raise ValueError(f"{name}: {key}: expected values from {least} on, found {low}")
+    if below is not None and not high < below:
+        raise ValueError(f"{name}: {key}: expected values below {below}, found {high}")
+    if most is not None and not high <= most:
+        raise ValueError(f"{name}: {key}: expected values up to {most}, found {high}")
+    if kind.ascending and (value[1:] < value[:-1]).any():
+        raise ValueError(f"{name}: {key}: expected values in rising order")
+
+
+def _describe(value: Any) -> str:
+    if not isinstance(value, np.ndarray):
+        return type(value).__name__
+    return f"{value.dtype} [{','.join(map(str, value.shape))}]"

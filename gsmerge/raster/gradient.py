@@ -1,0 +1,180 @@
+"""Gradients of a loss on the image of a view with respect to its Gaussians.
+
+For training loops, on arrays and without autograd::
+
+    plan = plan_view(splats, viewmat, K, width, height)
+    image, transmittance = composite(plan, colors, background)
+    wanted = plan_gradients(plan, grad_image, image=image, transmittance=transmittance, colors=colors)
+    means[wanted.ids] -= rate * wanted.means
+
+:func:`gsmerge.render` is differentiable with the same kernels. Results do not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from gsmerge.kernels.matrices import matmul
+from gsmerge.kernels.raster import blend_backward, harmonics, project_backward
+from gsmerge.raster.composite import view_colors
+from gsmerge.raster.view_plan import Array, ViewPlan, pieces, tile_ranges
+from gsmerge.runtime.threads import parallel_map, use_threads
+
+WORTH = 1 << 12  # intersections or Gaussians that are worth handing to another thread: they take longer than forward
+
+
+@dataclass(frozen=True, eq=False)
+class Gradients:
+    """Gradients of a loss with respect to the Gaussians of a plan."""
+
+    ids: Array  # [m] int32, ascending: the Gaussians that the rows belong to; all others have none
+    means: Array  # [m,3] float32, through geometry alone (colours seen from elsewhere: color_gradients)
+    quats: Array  # [m,4] float32, with respect to the quaternions as they are, of whatever length
+    scales: Array  # [m,3] float32, with respect to linear scales
+    opacities: Array  # [m] float32
+    colors: Array  # [m,3] float32, with respect to the colours in this view, as they are blended
+    viewmat: Array | None  # [4,4] float64, last row 0; None if not asked for
+
+    def __getitem__(self, rows: Array) -> Gradients:
+        """Return the gradients of some Gaussians, by mask or by row; that of the view matrix stays."""
+        names = ("ids", "means", "quats", "scales", "opacities", "colors")
+        return replace(self, **{name: np.ascontiguousarray(getattr(self, name)[rows]) for name in names})
+
+
+@dataclass(frozen=True, eq=False)
+class ColorGradients:
+    """Gradients of a loss through the colours of a plan's Gaussians in its view."""
+
+    ids: Array  # [m] int32, ascending: the Gaussians that the rows belong to; all others have none
+    sh0: Array  # [m,1,3] float32
+    shN: Array  # [m,k-1,3] float32
+    means: Array  # [m,3] float32, through the viewing direction alone
+
+
+def _expect(name: str, array: Array, shape: tuple[int, ...]) -> Array:
+    if array.shape != shape:
+        raise ValueError(f"{name}: expected shape {list(shape)}, got {list(array.shape)}")
+    return np.ascontiguousarray(array, np.float32)
+
+
+def _blocks(count: int, threads: int) -> list[tuple[int, int]]:
+    """Return ranges of Gaussians, each of whole blocks of the kernels."""
+    block = project_backward.BLOCK
+    num_blocks = -(-count // block)
+    num = max(1, min(threads, count // WORTH))
+    edges = [block * (num_blocks * i // num) for i in range(num)] + [count]
+    return list(pairwise(edges))
+
+
+def gradients_of(
+    plan: ViewPlan,
+    colors: Array,
+    image: Array,
+    transmittance: Array,
+    grad_image: Array,
+    grad_left: Array | None,
+    with_viewmat: bool,
+) -> Gradients:
+    """Return the gradients of :func:`plan_gradients` for unchecked contiguous float32 arrays; colours ``[m,3]``."""
+    m, splats = len(plan.ids), plan.splats
+    slots = np.empty((len(plan.members), blend_backward.SUMS), np.float32)
+    sums = np.zeros((m, blend_backward.SUMS), np.float32)
+    means, quats, scales, tints = (np.empty((m, size), np.float32) for size in (3, 4, 3, 3))
+    opacities = np.empty(m, np.float32)
+    num_blocks = -(-m // project_backward.BLOCK)
+    poses = np.empty((num_blocks, project_backward.POSE), np.float32) if with_viewmat else None
+
+    def tiles(span: tuple[int, int]) -> None:
+        blend_backward.blend_backward(
+            plan.footprints, colors, plan.members, plan.offsets, plan.columns, *span,
+            image, transmittance, grad_image, grad_left, slots,
+        )  # fmt: skip
+
+    def project(span: tuple[int, int]) -> None:
+        blend_backward.gather_slots(plan.members, slots, *span, sums)
+        project_backward.project_backward(
+            splats.means, splats.quats, splats.scales, plan.opacities, plan.ids, sums, plan.camera, *span,
+            means, quats, scales, opacities, poses,
+        )  # fmt: skip
+        tints[slice(*span)] = sums[slice(*span), :3]
+
+    with use_threads() as threads:
+        parallel_map(tiles, tile_ranges(plan, threads, WORTH))
+        parallel_map(project, _blocks(m, threads))
+    viewmat = None
+    if poses is not None:
+        pose = poses.sum(0, dtype=np.float64)
+        viewmat = np.zeros((4, 4))
+        viewmat[:3, 3] = pose[9:]
+        viewmat[:3, :3] = pose[:9].reshape(3, 3) + np.outer(pose[9:], splats.origin)
+    return Gradients(plan.ids, means, quats, scales, opacities, tints, viewmat)
+
+
+def plan_gradients(
+    plan: ViewPlan,
+    grad_image: Array,
+    grad_transmittance: Array | None = None,
+    *,
+    image: Array,
+    transmittance: Array,
+    colors: Array | None = None,
+    with_viewmat: bool = False,
+) -> Gradients:
+    """Return the gradients of a loss on the image that :func:`gsmerge.raster.composite` made of a plan.
+
+    ``grad_image [h,w,3]`` and ``grad_transmittance [h,w]`` (None: zero) are those of the loss;
+    ``image``, with its background, and ``transmittance`` are what ``composite`` returned,
+    ``colors`` what it was given. ``with_viewmat`` asks for the gradient of the world-to-camera
+    matrix as well. Gradients are zero where alpha is clamped at 0.99, and through what decides
+    which weights are drawn at all. Raises ValueError if an array has another shape.
+    """
+    size = plan.height, plan.width
+    grad_image, image = _expect("grad_image", grad_image, (*size, 3)), _expect("image", image, (*size, 3))
+    transmittance = _expect("transmittance", transmittance, size)
+    left = None if grad_transmittance is None else _expect("grad_transmittance", grad_transmittance, size)
+    drawn = view_colors(plan) if colors is None else _expect("colors", colors, (len(plan.splats), 3))[plan.ids]
+    return gradients_of(plan, drawn, image, transmittance, grad_image, left, with_viewmat)
+
+
+def color_gradients(
+    plan: ViewPlan, grad_colors: Array, colors: Array | None = None, *, used: ColorGradients | None = None
+) -> ColorGradients:
+    """Return the gradients of a loss through the spherical harmonics of a plan's Gaussians in its view.
+
+    ``grad_colors [m,3]`` are such as :attr:`Gradients.colors`. ``colors [m,3]`` float32 are the
+    colours themselves, where they are at hand; no gradient passes where they are cut at 0.
+    ``used``: an earlier answer of as many coefficients that nobody needs any more, whose memory is
+    written again if it is large enough: new memory costs a quarter of the time, and where pages are
+    small several times all of it. The gradient of the eye is minus the sum of those of the means.
+    """
+    m, splats = len(plan.ids), plan.splats
+    grad_colors = _expect("grad_colors", grad_colors, (m, 3))
+    colors = view_colors(plan) if colors is None else _expect("colors", colors, (m, 3))
+    rest = splats.shN.shape[1:]
+    if used is not None and len(used.ids) >= m and used.shN.shape[1:] == rest:
+        sh0, shN, means = used.sh0[:m], used.shN[:m], used.means[:m]
+    else:
+        sh0, shN, means = (np.empty((m, *shape), np.float32) for shape in ((1, 3), rest, (3,)))
+    with use_threads() as threads:
+        parallel_map(
+            lambda span: harmonics.view_colors_backward(
+                splats.means, splats.shN, plan.ids, plan.eye, *span, colors, grad_colors, sh0, shN, means
+            ),
+            pieces(m, threads),
+        )
+    return ColorGradients(plan.ids, sh0, shN, means)
+
+
+def pose_gradient(plan: ViewPlan, gradients: Gradients, shade: ColorGradients | None = None) -> Array:
+    """Return the gradient ``[4,4]`` float64 of the world-to-camera matrix, through geometry and, if given, colours."""
+    assert gradients.viewmat is not None
+    viewmat = gradients.viewmat.copy()
+    if shade is not None:
+        # the eye is -R^T t, and moves against the means
+        eye = -shade.means.sum(0, dtype=np.float64)
+        viewmat[:3, :3] -= np.outer(plan.viewmat[:3, 3], eye)
+        viewmat[:3, 3] -= matmul(plan.viewmat[:3, :3], eye)
+    return viewmat

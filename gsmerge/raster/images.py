@@ -1,0 +1,115 @@
+"""Rendering of Gaussians into every camera."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gsmerge.raster.composite import Rendering, background_color, draw_views, prepare_views
+from gsmerge.raster.view_plan import ViewPlan, plan_view
+from gsmerge.types import Array, Cameras, Gaussians, as_tensor
+
+if TYPE_CHECKING:
+    import torch
+
+
+def one_device(gaussians: Gaussians, cameras: Cameras) -> torch.device | None:
+    """Return the device of all tensors, None for arrays; refuse several devices."""
+    values = (*vars(gaussians).values(), cameras.viewmats, cameras.Ks)
+    devices = {value.device for value in values if not isinstance(value, np.ndarray)}
+    if len(devices) > 1:
+        named = " and ".join(sorted(map(str, devices)))
+        raise ValueError(f"expected Gaussians and cameras on one device, got {named}; move them with .to(device)")
+    return devices.pop() if devices else None
+
+
+def _needs_gradient(gaussians: Gaussians, cameras: Cameras) -> bool:
+    import torch
+
+    return torch.is_grad_enabled() and any(t.requires_grad for t in (*vars(gaussians).values(), cameras.viewmats))
+
+
+def render(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    background: float | Sequence[float] | Array = 0.0,
+    *,
+    antialiased: bool = False,
+    near: float = 0.01,
+    far: float = 1e10,
+    with_depths: bool = False,
+) -> Rendering:
+    """Render Gaussians into every camera.
+
+    Arrays give arrays, tensors give tensors. CUDA tensors are rendered by gsplat (``pip install
+    ".[cuda]"``), and the results are on their device; all others on the CPU. How the two differ:
+    :mod:`gsmerge.raster.cuda`.
+
+    Of tensors, images and alphas are differentiable with respect to every tensor of the Gaussians
+    and the view matrices, where autograd is on and one of them asks for it; depths and intrinsics
+    are not. No gradient passes where alpha is clamped at 0.99 or a colour at 0.
+
+    Args:
+        gaussians: n Gaussians, SH degrees 0 to 4.
+        cameras: c cameras; their intrinsics' skew is ignored.
+        background: What shines through, 1 or 3 numbers.
+        antialiased: Lower the opacity of small Gaussians by what the dilation adds to them.
+        near: Nearest depth drawn, world units, above 0.
+        far: Farthest depth drawn.
+        with_depths: Also render the mean depth.
+
+    Returns:
+        Images, alphas and, if asked for, depths.
+
+    Raises:
+        ValueError: If the background or the depth range makes no sense, or the tensors are on several devices.
+        GsmergeError: If CUDA tensors are given and gsplat is not installed.
+    """
+    under = background_color(background.detach().cpu() if hasattr(background, "detach") else background)
+    options: dict[str, Any] = {"antialiased": antialiased, "near": near, "far": far}
+    device = one_device(gaussians, cameras)
+    if device is not None:  # torch is imported only for those who have tensors
+        gaussians, cameras = gaussians.to(device), cameras.to(device)
+        if device.type == "cuda":
+            from gsmerge.raster.cuda import render_cuda
+
+            return render_cuda(gaussians, cameras, under, with_depths=with_depths, **options)
+        if _needs_gradient(gaussians, cameras):
+            from gsmerge.raster.autograd import render_tensors  # only for those who train
+
+            return render_tensors(gaussians, cameras, under, with_depths=with_depths, **options)
+    plan_one = _planner(gaussians, cameras, options)
+    drawn = draw_views(plan_one, (len(cameras), cameras.height, cameras.width), under, with_depths)
+    if device is None:
+        return drawn
+    return Rendering(*(None if part is None else as_tensor(part) for part in vars(drawn).values()))
+
+
+def render_in_turn(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    background: float | Sequence[float] = 0.0,
+    *,
+    at_once: int,
+    antialiased: bool = False,
+    near: float = 0.01,
+) -> Iterator[np.ndarray]:
+    """Yield the images ``[h,w,3]`` that :func:`render` makes of arrays, to the bit, with ``at_once`` in memory."""
+    under = background_color(background)
+    plan_one = _planner(gaussians, cameras, {"antialiased": antialiased, "near": near})
+    for first in range(0, len(cameras), at_once):
+        count = min(at_once, len(cameras) - first)
+        shape = count, cameras.height, cameras.width
+        yield from draw_views(plan_one, shape, under, with_depths=False, first=first).images
+
+
+def _planner(gaussians: Gaussians, cameras: Cameras, options: Mapping[str, Any]) -> Callable[[int], ViewPlan]:
+    """Prepare the Gaussians for cameras, and return what plans the drawing of each view by its number."""
+    splats, viewmats, Ks = prepare_views(gaussians, cameras)
+
+    def plan_one(view: int) -> ViewPlan:
+        return plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, **options)
+
+    return plan_one

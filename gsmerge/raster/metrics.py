@@ -1,0 +1,92 @@
+"""Image metrics on sRGB values in [0, 1], of arrays or tensors."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsmerge.kernels.elementary import log10
+from gsmerge.kernels.pictures import blur
+from gsmerge.types import Array, as_array
+
+WINDOW, SIGMA = 11, 1.5  # pixels per side of ssim's windows, and their standard deviation in pixels
+C1, C2 = 0.01**2, 0.03**2  # ssim's stabilisers (K1 = .01, K2 = .03) for a data range of 1
+MAX_LOSS = 0.5  # dB that a result may show the photos worse than its input without a word about it
+
+
+def image_pair(image: Array, reference: Array) -> tuple[Array, Array]:
+    """Return two images ``[h,w,c]`` as arrays; raise ValueError if their shapes differ."""
+    first, second = as_array(image), as_array(reference)
+    if first.ndim != 3 or first.shape != second.shape:
+        raise ValueError(f"expected two images [h,w,c] of one shape, got {list(first.shape)} and {list(second.shape)}")
+    return first, second
+
+
+def pixel_mask(mask: Array, image: Array) -> Array:
+    """Return a mask as ``[h,w]`` bool; raise ValueError if its shape differs from the image's or it is empty."""
+    chosen = as_array(mask).astype(bool)
+    if chosen.ndim == 3 and chosen.shape[2] == 1:
+        chosen = chosen[..., 0]
+    if chosen.shape != image.shape[:2]:
+        raise ValueError(f"mask: expected shape {list(image.shape[:2])}, got {list(chosen.shape)}")
+    if not chosen.any():
+        raise ValueError("mask: expected at least one pixel, got none")
+    return chosen
+
+
+def psnr(image: Array, reference: Array, mask: Array | None = None) -> float:
+    """Return the peak signal-to-noise ratio in dB of images ``[h,w,c]`` in [0, 1], in a mask ``[h,w]`` if given."""
+    first, second = image_pair(image, reference)
+    if mask is not None:  # first, as float64 of a whole photo is more than all else that is known of it
+        chosen = pixel_mask(mask, first)
+        first, second = first[chosen], second[chosen]
+    errors = np.subtract(first, second, dtype=np.float64)
+    error = float(np.square(errors, out=errors).mean())
+    return -10 * float(log10(error)) if error > 0 else float("inf")
+
+
+def decibels(error: float) -> float:
+    """Return the peak signal-to-noise ratio, dB, of a mean squared error of values in [0, 1]; at most 120."""
+    return -10 * float(log10(max(error, 1e-12)))
+
+
+def describe_loss(name: str, before: float | None, after: float | None) -> str | None:
+    """Say that a result shows its scene's own photos worse than the input; None up to ``MAX_LOSS``.
+
+    ``before``, ``after``: PSNR (dB) of the photos from the input and from the result; None without
+    photos.
+    """
+    if before is None or after is None or not before - after > MAX_LOSS:  # the difference of infinities is NaN
+        return None
+    loss = f"{after:.2f} dB, {before:.2f} dB before"
+    return f"{name} shows the scene's own photos worse than the input does: {loss}"
+
+
+def ssim(image: Array, reference: Array, mask: Array | None = None) -> float:
+    """Return the structural similarity, at most 1, over Gaussian windows of 11 x 11 pixels (Wang et al. 2004).
+
+    The mean over channels and over the windows that lie wholly inside the image, as scikit-image's
+    ``structural_similarity(gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
+    channel_axis=-1, data_range=1)`` computes it. For measuring only; the loss of the full fit and
+    of training has a definition of its own, :func:`gsmerge.fit.loss.loss_ssim`.
+
+    Images are ``[h,w,c]`` with at most 4 channels; ``mask [h,w]``: centres of the windows that
+    count, which also contain the pixels around. Raises ValueError if the shapes differ, the image
+    is too small or no window counts.
+    """
+    first, second = image_pair(image, reference)
+    if min(first.shape[:2]) < WINDOW:
+        raise ValueError(f"expected at least {WINDOW} x {WINDOW} pixels, got {list(first.shape[:2])}")
+    border = WINDOW // 2
+    inner = slice(border, -border), slice(border, -border)
+    chosen = None if mask is None else pixel_mask(pixel_mask(mask, first)[inner], first[inner])
+    # Variances are small differences of large numbers: float32 does when values are centred first.
+    x, y = first.astype(np.float32) - np.float32(0.5), second.astype(np.float32) - np.float32(0.5)
+
+    def mean(values: Array) -> Array:
+        return blur(values, SIGMA, WINDOW)[inner]
+
+    ux, uy = mean(x), mean(y)
+    variances, covariance = mean(x * x + y * y) - ux * ux - uy * uy, mean(x * y) - ux * uy
+    ux, uy = ux + np.float32(0.5), uy + np.float32(0.5)
+    scores = (2 * ux * uy + C1) * (2 * covariance + C2) / ((ux * ux + uy * uy + C1) * (variances + C2))
+    return float((scores if chosen is None else scores[chosen]).mean(dtype=np.float64))

@@ -1,0 +1,194 @@
+"""Input photos with their cameras, at full or reduced size, for rendering against them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+import cv2
+import numpy as np
+
+from gsmerge.geometry import sh0_to_rgb
+from gsmerge.kernels.raster.project import TILE
+from gsmerge.raster.composite import composite
+from gsmerge.raster.metrics import psnr
+from gsmerge.raster.view_plan import Splats, plan_view, prepare
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.types import Cameras, Gaussians, Scene
+
+Score = TypeVar("Score")
+
+NEAR = 0.01  # near plane of every render that is scored, in canonical units
+ONE_AT_A_TIME = 400_000  # Gaussians; the plan of a view is as large as they are, so threads share one view instead
+BLOCK = 2  # tiles per side of the blocks that scored_tiles chooses among
+MASKED = np.float32(0.1)  # weight of pixels outside masks, which show the Gaussians' colours: none would let them drift
+EPS2D = 0.3  # low-pass of the rasterizer, square pixels of the full-size image
+
+
+@dataclass(frozen=True)
+class Photos:
+    """V photos of one size."""
+
+    images: np.ndarray  # [v,h,w,3] float32, sRGB in [0, 1]; uint8 of photos larger than the grid, see image()
+    viewmats: np.ndarray  # [v,4,4] world to camera
+    Ks: np.ndarray  # [v,3,3] intrinsics at this size
+    # Low-pass variance in square pixels of this size: it stays that of the full-size image, so that scales are judged
+    # against the filter that they will be rendered with
+    eps2d: float
+    weights: np.ndarray | None = None  # [v,h,w] float32 of the pixels, in [0, 1]; None: all 1
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def __getitem__(self, views: Sequence[int]) -> Photos:
+        """Return the photos of some views; of all views, in order, without a copy."""
+        ids = list(views)
+        if ids == list(range(len(self))):
+            return self
+        weights = None if self.weights is None else self.weights[ids]
+        return Photos(self.images[ids], self.viewmats[ids], self.Ks[ids], self.eps2d, weights)
+
+    @property
+    def height(self) -> int:
+        """Number of rows."""
+        return self.images.shape[1]
+
+    @property
+    def width(self) -> int:
+        """Number of columns."""
+        return self.images.shape[2]
+
+    def image(self, view: int) -> np.ndarray:
+        """Return the photo of a view ``[h,w,3]``, sRGB in [0, 1]."""
+        image = self.images[view]
+        return np.multiply(image, np.float32(1 / 255), dtype=np.float32) if image.dtype == np.uint8 else image
+
+    def camera(self, view: int) -> dict[str, Any]:
+        """Return the arguments of :func:`gsmerge.raster.plan_view` for rendering into a photo."""
+        return {
+            "viewmat": self.viewmats[view],
+            "K": self.Ks[view],
+            "width": self.width,
+            "height": self.height,
+            "eps2d": self.eps2d,
+        }
+
+
+def scene_pictures(scene: Scene) -> np.ndarray:
+    """Return the photos ``[v,h,w,3]``, or base colours of an aligned scene without photos; else raise ValueError."""
+    if scene.images is not None:
+        return scene.images
+    if not scene.aligned:
+        raise ValueError("expected a scene with images")
+    shape = (len(scene), scene.cameras.height, scene.cameras.width, 3)
+    return sh0_to_rgb(scene.gaussians.sh0[:, 0]).clip(0, 1).reshape(shape)
+
+
+def scene_photos(scene: Scene, level: float = 1) -> Photos:
+    """Return the scene's photos, each side divided by ``level`` (area averages)."""
+    if scene.images is None:
+        raise ValueError("expected a scene with images")
+    photos = photos_of(scene.images, scene.cameras, level)
+    return replace(photos, weights=pixel_weights(scene.masks, photos.width, photos.height))
+
+
+def pixel_weights(masks: np.ndarray | None, width: int, height: int) -> np.ndarray | None:
+    """Return weights ``[v,height,width]`` float32 of photos with masks ``[v,h,w]``: 1 inside, little outside."""
+    if masks is None:
+        return None
+    size = width, height
+    levels = [cv2.resize(mask.astype(np.uint8) * 255, size, interpolation=cv2.INTER_AREA) for mask in masks]
+    return np.where(np.stack(levels) == 255, np.float32(1), MASKED)
+
+
+def photos_of(images: np.ndarray, cameras: Cameras, level: float = 1) -> Photos:
+    """Return photos ``[v,h,w,3]`` of the cameras' size, each side divided by ``level`` (area averages)."""
+    blank = blank_photos(cameras, level)
+    if level == 1:
+        return replace(blank, images=images)
+    size = blank.width, blank.height
+    small = np.stack(parallel_map(lambda image: cv2.resize(image, size, interpolation=cv2.INTER_AREA), images))
+    return replace(blank, images=small)
+
+
+def blank_photos(cameras: Cameras, level: float = 1) -> Photos:
+    """Return black photos, which take no memory, where only cameras matter; each side divided by ``level``."""
+    viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
+    w, h = cameras.width, cameras.height
+    width, height = max(1, round(w / level)), max(1, round(h / level))
+    black = np.broadcast_to(np.float32(0), (len(cameras), height, width, 3))
+    sx, sy = width / w, height / h
+    return Photos(black, viewmats, Ks * np.array([[sx], [sy], [1.0]]), EPS2D * sx * sy)
+
+
+def photo_errors(
+    gaussians: Gaussians | Splats,
+    photos: Photos,
+    score: Callable[[int, np.ndarray, np.ndarray], Score],
+    views: Iterable[int] | None = None,
+    *,
+    near: float = NEAR,
+    colors: np.ndarray | None = None,
+    keep: Callable[[int], np.ndarray] | None = None,
+    tiles: Callable[[int], np.ndarray | None] | None = None,
+) -> list[Score]:
+    """Render Gaussians into the photos' cameras and score every picture, several views at once.
+
+    ``score`` gets the view, its render ``[h,w,3]`` float32 (not clipped) and the transmittance
+    ``[h,w]``. ``views`` of the photos, in the order of the result; None: all. ``near`` is in the
+    Gaussians' unit; ``colors [n,3]`` replace the harmonics. ``keep`` gives a view's mask ``[n]`` of
+    the Gaussians to draw, ``tiles`` its mask ``[lines,columns]`` of the tiles to complete; None is
+    all.
+    """
+    splats = gaussians if isinstance(gaussians, Splats) else prepare(gaussians)
+
+    def one_view(view: int) -> Score:
+        shown, complete = (None if choose is None else choose(view) for choose in (keep, tiles))
+        plan = plan_view(splats, **photos.camera(view), near=near, keep=shown, tiles=complete)
+        return score(view, *composite(plan, colors))
+
+    chosen = range(len(photos)) if views is None else views
+    if len(splats) > ONE_AT_A_TIME:
+        return [one_view(view) for view in chosen]
+    return parallel_map(one_view, chosen)
+
+
+def photo_psnr(
+    gaussians: Gaussians | Splats, photos: Photos, views: Iterable[int], *, quarter: bool = False, **settings: Any
+) -> float:
+    """Return the mean PSNR (dB) of some photos, or of a ``quarter`` of each; ``settings``: see :func:`photo_errors`."""
+
+    def tiles(view: int) -> np.ndarray | None:
+        return scored_tiles(view, photos.width, photos.height) if quarter else None
+
+    def score(view: int, image: np.ndarray, _: np.ndarray) -> float:
+        return view_psnr(image, photos, view, quarter=quarter)
+
+    return float(np.mean(photo_errors(gaussians, photos, score, views, tiles=tiles, **settings)))
+
+
+def view_psnr(image: np.ndarray, photos: Photos, view: int, *, quarter: bool) -> float:
+    """Return the PSNR (dB) of a photo, or a quarter of it, and its render ``[h,w,3]``, clipped in place."""
+    tiles = scored_tiles(view, photos.width, photos.height) if quarter else None
+    mask = None if tiles is None else tiles.repeat(TILE, 0).repeat(TILE, 1)[: photos.height, : photos.width]
+    if photos.weights is not None:
+        counts = photos.weights[view] == 1
+        both = counts if mask is None or not (mask & counts).any() else mask & counts
+        mask = both if both.any() else mask
+    return psnr(np.clip(image, 0, 1, out=image), photos.images[view], mask)
+
+
+def scored_tiles(view: int, width: int, height: int) -> np.ndarray | None:
+    """Return a mask ``[lines,columns]`` of a quarter of a view's tiles, alternating in blocks; None for small views."""
+    lines, columns = -(-height // TILE), -(-width // TILE)
+    if min(lines, columns) <= 3 * BLOCK:
+        return None
+    y, x = np.arange(lines)[:, None] // BLOCK, np.arange(columns) // BLOCK
+    chosen: np.ndarray = (y % 2 * 2 + x % 2) == (view + x // 2 + 2 * (y // 2)) % 4
+    return chosen
+
+
+def render_photos(gaussians: Gaussians | Splats, photos: Photos, **settings: Any) -> list[np.ndarray]:
+    """Render every photo ``[h,w,3]``, not clipped; ``settings``: see :func:`photo_errors`."""
+    return photo_errors(gaussians, photos, lambda _, image, __: image, **settings)

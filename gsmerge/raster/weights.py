@@ -1,0 +1,63 @@
+"""Blending weights of a view as a sparse matrix, for stages that apply one geometry many times.
+
+Image = W colors, with one row per pixel and one column per Gaussian. Twenty-odd entries per pixel:
+a product costs a small part of walking the tiles again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsmerge.kernels.raster import list_weights as kernels
+from gsmerge.raster import ViewPlan
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True, eq=False)
+class ViewWeights:
+    """Matrix W of one view, stored by tile and Gaussian."""
+
+    ids: Array  # [m] int32: the Gaussians that may touch the image
+    members: Array  # [intersections] int32 rows of `ids`
+    offsets: Array  # [tiles + 1] int64 starts of the tiles' lists in `members`
+    columns: int  # Tiles per row
+    starts: Array  # [intersections + 1] int64 into `lanes` and `weights`
+    lanes: Array  # Pixel of each entry within its tile, row-major, uint8
+    weights: Array  # Blending weight of each entry, float32
+    height: int  # pixels
+    width: int  # pixels
+
+
+def view_weights(plan: ViewPlan) -> ViewWeights:
+    """Write out the weights of a planned view."""
+    starts, lanes, weights = kernels.list_weights(
+        plan.footprints, plan.members, plan.offsets, plan.columns, plan.height, plan.width
+    )
+    return ViewWeights(
+        plan.ids, plan.members, plan.offsets, plan.columns, starts, lanes, weights, plan.height, plan.width
+    )
+
+
+def apply(view: ViewWeights, colors: Array) -> Array:
+    """Multiply W with ``colors [n,c]``, up to four channels: image ``[h,w,c]`` float32."""
+    channels = colors.shape[1]
+    rows = np.zeros((len(view.ids), kernels.LANES), np.float32)
+    rows[:, :channels] = colors[view.ids]
+    image = np.empty((view.height, view.width, kernels.LANES), np.float32)
+    kernels.spread(view.starts, view.lanes, view.weights, view.members, view.offsets, view.columns, rows, image)
+    return image[..., :channels]
+
+
+def apply_transposed(view: ViewWeights, image: Array) -> Array:
+    """Multiply the transpose of W with ``image [h,w,c]``, up to four channels: ``[m,c]`` float64 by ``view.ids``."""
+    channels = image.shape[2]
+    padded = np.zeros((view.height, view.width, kernels.LANES), np.float32)
+    padded[..., :channels] = image
+    sums = np.zeros((len(view.ids), kernels.LANES))
+    kernels.collect(view.starts, view.lanes, view.weights, view.members, view.offsets, view.columns, padded, sums)
+    return sums[:, :channels]

@@ -1,0 +1,142 @@
+"""Baselines of a few lines: the input unmerged or fitted, pruned, merged over blocks, or by splat-transform."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from gsmerge.errors import GsmergeError, UsageError
+from gsmerge.facts.prepare import Prepared
+from gsmerge.fit import fit_scene
+from gsmerge.io import read_ply, write_ply
+from gsmerge.plan import Plan
+from gsmerge.raster import contributions, plan_view, prepare
+from gsmerge.raster.photos import scene_pictures
+from gsmerge.research.baselines.baseline import merge_groups, most_important, own_gaussians, view_shares
+from gsmerge.runtime.record import stage
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.stages.superpixels import grid_labels, superpixels
+from gsmerge.types import Cameras, Decoded, Gaussians, Groups
+
+PROGRAM, VARIABLE = "splat-transform", "GSMERGE_SPLAT_TRANSFORM"
+INSTALL = "npm install -g @playcanvas/splat-transform@3.7.0"
+MAX_OUTPUT = 300  # characters of the program's own output in an error
+PAPER_SUPERPIXELS = "bass-st"  # BASS from seeds drawn by the Shi-Tomasi response
+MAX_PLANNED = 2_000_000  # Gaussians in the plans of the views under way: each plan is as large as they are
+
+
+def unmerged(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
+    """Return all Gaussians, whatever the count."""
+    return own_gaussians(prepared.scene)
+
+
+def unmerged_fit(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
+    """Run the full fit on the input, with as many steps or as much time as ours: what merging has to beat.
+
+    Gaussians that no photo shows are replaced by others, so the number stays, whatever the count.
+    """
+    gaussians = own_gaussians(prepared.scene)
+    start, options = Decoded(gaussians, len(gaussians), exact=False), replace(plan.fit, fit="full")
+    return fit_scene(start, prepared.scene, prepared.photo_views, options, plan.seed, plan.backend).gaussians
+
+
+def prune_by_opacity(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
+    """Keep the most opaque Gaussians, unchanged and in their order; the first of equals."""
+    gaussians = own_gaussians(prepared.scene)
+    with stage("reduce"):
+        return gaussians[most_important(gaussians.opacities, count)]
+
+
+def prune_by_contribution(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
+    """Keep the Gaussians that add most to the views (Mini-Splatting), unchanged and in their order."""
+    gaussians = own_gaussians(prepared.scene)
+    with stage("reduce"):
+        return gaussians[most_important(summed_weights(gaussians, prepared.scene.cameras), count)]
+
+
+def summed_weights(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
+    """Sum the blending weights ``[n]`` float64 over the pixels of all views; the same on any number of threads."""
+    splats = prepare(gaussians)
+    viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
+
+    def one_view(view: int) -> np.ndarray:
+        sums, _ = contributions(plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height))
+        return sums
+
+    total, step = np.zeros(len(splats)), max(1, MAX_PLANNED // max(len(splats), 1))
+    for first in range(0, len(cameras), step):
+        for sums in parallel_map(one_view, range(first, min(first + step, len(cameras)))):
+            total += sums
+    return total
+
+
+def prune_at_random(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
+    """Keep a random choice that depends only on the seed, unchanged and in their order."""
+    gaussians = own_gaussians(prepared.scene)
+    with stage("reduce"):
+        rng = np.random.default_rng(plan.seed)
+        return gaussians[np.sort(rng.choice(len(gaussians), min(count, len(gaussians)), replace=False))]
+
+
+def merge_blocks(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
+    """Merge as many blocks as Gaussians, the same number in every view; blocks without a valid pixel are left out."""
+    scene = prepared.scene
+    height, width = scene.cameras.height, scene.cameras.width
+    with stage("segment"):
+        counts = view_shares(count, len(scene), height * width)
+        labels = np.stack([grid_labels(height, width, own) for own in counts])
+    return merge_groups(prepared, Groups(labels, tuple(counts)))
+
+
+def match_moments(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
+    """Merge superpixels by the paper's moment matching, its baseline without a network ("Mom. Match.").
+
+    One Gaussian for each superpixel: opacity-weighted mean and the spread of the members' means (eq. teacher_mean,
+    teacher_cov). The paper states no opacity; the members' mean is taken. Superpixels are the paper's, as many as
+    Gaussians, the same number in every view; empty ones are left out.
+    """
+    scene = prepared.scene
+    counts = view_shares(count, len(scene), scene.pixels_per_view)
+    with stage("segment"):
+        pictures, views = scene_pictures(scene), range(len(scene))
+        labels = parallel_map(lambda view: superpixels(pictures[view], counts[view], PAPER_SUPERPIXELS), views)
+    return merge_groups(prepared, Groups(np.stack(labels), tuple(counts)), rule="paper")
+
+
+def find_program() -> str:
+    """Find the path of splat-transform; a UsageError if there is none."""
+    named = os.environ.get(VARIABLE)
+    program = shutil.which(named or PROGRAM)
+    if program is None:
+        place = f"at {VARIABLE}={named}" if named else f"on PATH or named by {VARIABLE}"
+        problem = f"expected the program {place}, found none; install it with: {INSTALL}"
+        raise UsageError(f"method splat-transform: {problem}")
+    return program
+
+
+def splat_transform(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
+    """Merge by PlayCanvas' splat-transform, an installed program: ``-d COUNT`` on the CPU, by its own defaults.
+
+    The input itself is returned where it has no more. Nothing is downloaded. Only the program's own run counts as time,
+    start-up included; handing the Gaussians over and back does not.
+    """
+    gaussians, program = own_gaussians(prepared.scene), find_program()
+    if len(gaussians) <= count:
+        return gaussians
+    with tempfile.TemporaryDirectory(prefix="gsmerge-") as folder:
+        before, after = Path(folder) / "in.ply", Path(folder) / "out.ply"
+        write_ply(before, gaussians)
+        command = [program, "-w", "-g", "cpu", str(before), "-d", str(count), str(after)]
+        with stage("reduce"):
+            done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False)
+        if done.returncode != 0 or not after.exists():
+            output = " ".join((done.stderr or done.stdout).decode(errors="replace").split())[-MAX_OUTPUT:]
+            problem = f"expected a decimated .ply, it ended with code {done.returncode}: {output or 'without output'}"
+            raise GsmergeError(f"{program}: {problem}")
+        return read_ply(after, opacity="logit").gaussians

@@ -1,0 +1,90 @@
+"""AnySplat's rule (Jiang et al. 2025): one Gaussian for each voxel, a softmax-weighted mean of what lies in it.
+
+The means run over the parameters as a network puts them out: logarithms of scales, logits of opacities. AnySplat
+weighs with the softmax of a confidence that no file stores; opacity replaces it. Bisection gives the size of the
+voxels, so the count is met from below.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import numpy as np
+
+from gsmerge.facts.prepare import Prepared
+from gsmerge.kernels.elementary import exp, log, power
+from gsmerge.kernels.matrices import eigh
+from gsmerge.plan import Plan
+from gsmerge.research.baselines.baseline import own_gaussians
+from gsmerge.runtime.record import choose, stage
+from gsmerge.types import Gaussians
+
+BITS = 21  # of a voxel's number along each axis; what lies farther out is in the outermost ones
+FINEST = -17.0  # octaves of the canonical unit: there the outermost voxels lie 8 units away, farther for larger ones
+PRECISION = 1e-4  # octaves
+MIN_OPACITY, MIN_SCALE = 1e-6, 1e-12  # least that logits and logarithms are taken of
+
+
+def voxel_keys(means: np.ndarray, size: float) -> np.ndarray:
+    """Number the voxel of each mean ``[n,3]``, ``[n]`` int64, by the nearest multiple of ``size``."""
+    half = 1 << (BITS - 1)
+    index = np.clip(np.rint(means / size), -half, half - 1).astype(np.int64) + half
+    return (index[:, 0] << 2 * BITS) | (index[:, 1] << BITS) | index[:, 2]
+
+
+def voxel_size(means: np.ndarray, count: int) -> float:
+    """Find the smallest size, within a ten-thousandth octave, that leaves at most ``count`` voxels occupied."""
+
+    def occupied(octave: float) -> int:
+        keys = np.sort(voxel_keys(means, power(2, octave)))
+        return 1 + int((keys[1:] != keys[:-1]).sum())
+
+    extent = float(np.abs(means).max(initial=0))
+    fine, coarse = FINEST, max(FINEST, float(log(4 * extent) / log(2))) if extent > 0 else FINEST  # coarse: all in one
+    if occupied(fine) <= count:
+        return float(power(2, fine))
+    while coarse - fine > PRECISION:
+        middle = (fine + coarse) / 2
+        fine, coarse = (fine, middle) if occupied(middle) <= count else (middle, coarse)
+    return float(power(2, coarse))
+
+
+def fuse(gaussians: Gaussians, keys: np.ndarray) -> Gaussians:
+    """Make one Gaussian for each voxel, in the order of the keys ``[n]``: means with weights exp(opacity).
+
+    Rotations are averaged whatever the sign of their quaternions (Markley et al. 2007).
+    """
+    _, cells = np.unique(keys, return_inverse=True)
+    means, quats, scales, opacities, sh0, shN = (
+        getattr(gaussians, f.name).astype(np.float64) for f in fields(Gaussians)
+    )
+    weights = exp(opacities)
+    count = int(cells.max(initial=-1)) + 1
+    total = np.bincount(cells, weights, count)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        flat = values.reshape(len(values), -1)
+        columns = [np.bincount(cells, weights * column, count) / total for column in flat.T]
+        return np.stack(columns, 1).reshape(count, *values.shape[1:]) if columns else values[:count]
+
+    bounded = opacities.clip(MIN_OPACITY, 1 - MIN_OPACITY)
+    _, axes = eigh(mean(quats[:, :, None] * quats[:, None]))
+    arrays = (
+        mean(means),
+        axes[:, :, -1],
+        exp(mean(log(scales.clip(MIN_SCALE)))),
+        1 / (1 + exp(-mean(log(bounded / (1 - bounded))))),
+        mean(sh0),
+        mean(shN),
+    )
+    return Gaussians(*(array.astype(np.float32) for array in arrays))
+
+
+def run(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
+    """Merge to at most ``count`` voxels, and hardly fewer."""
+    gaussians = own_gaussians(prepared.scene)
+    with stage("reduce"):
+        means = gaussians.means.astype(np.float64)
+        size = voxel_size(means, count)
+        choose(voxel_size=size)
+        return fuse(gaussians, voxel_keys(means, size))

@@ -1,0 +1,1 @@
+"""Commands of the entry points ``gsmerge.commands``: stress, chart, generate and train."""

@@ -1,0 +1,1 @@
+"""Scenes from files: the files that belong together, their exporters' habits, views and held-out views."""

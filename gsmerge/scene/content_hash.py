@@ -1,0 +1,83 @@
+"""Hash everything that is read of a scene, and make names from a scene's own."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from gsmerge.errors import SceneError, UsageError
+from gsmerge.io import SCENE_SUFFIXES, CameraFile, read_cameras
+from gsmerge.io.bounds import read_errors, walk_files
+from gsmerge.io.cameras.json_files import DATAPARSER, FRAMES_FILE, POSE_FILE, SCALE_FILE
+from gsmerge.io.cameras.read import INTRINSICS
+from gsmerge.scene.files import IMAGE_PLACES, SceneFiles
+from gsmerge.scene.views import images_beside
+
+EXTRA_FILES = (DATAPARSER, *INTRINSICS, FRAMES_FILE, POSE_FILE, SCALE_FILE)  # read with some camera files
+
+
+def digest(value: Mapping[str, Any]) -> str:
+    """Compute SHA-256 of plain JSON types; the order of the keys does not matter."""
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
+    return hashlib.sha256(text.encode("ascii")).hexdigest()
+
+
+def content_hash(files: Sequence[Path]) -> str:
+    """Compute SHA-256 over the names and contents of files; of folders, over everything in them."""
+    state = hashlib.sha256()
+    for given in files:
+        inside = sorted(p for p in walk_files(given) if p.is_file()) if given.is_dir() else [given]
+        for path in inside:
+            name = path.relative_to(given).as_posix() if given.is_dir() else path.name
+            with read_errors(path), path.open("rb") as file:
+                state.update(f"{len(name)}:{name}:{path.stat().st_size}:".encode())
+                while block := file.read(1 << 20):
+                    state.update(block)
+    return state.hexdigest()
+
+
+def read_files(files: SceneFiles) -> list[Path]:
+    """List everything that is read of a scene, each once: files, and folders that are read as a whole."""
+    paths = [path for path in (*files.plys, files.cameras, files.images, files.masks) if path is not None]
+    if files.cameras is not None:
+        root = files.cameras if files.cameras.is_dir() else files.cameras.parent
+        folders = (root, files.ply.parent)
+        paths += [place / name for place in folders for name in EXTRA_FILES if (place / name).is_file()]
+        paths += photos_of(files.cameras) or ([] if files.images else images_beside(files.ply))
+    return list(dict.fromkeys(paths))
+
+
+def photos_of(cameras: Path) -> list[Path]:
+    """List where the photos of a camera file may be, by its names or next to it."""
+    camera_file = cameras_of(cameras)
+    root = cameras if cameras.is_dir() else cameras.parent
+    names = () if camera_file is None else camera_file.names
+    named = [root / name for name in names if (root / name).is_file()]
+    return named or [root / place for place in IMAGE_PLACES if (root / place).is_dir()]
+
+
+def cameras_of(path: Path, scene: str | None = None) -> CameraFile | None:
+    """Read the cameras of a file; None where they cannot be read, which reading the scene reports."""
+    try:
+        return read_cameras(path, scene=scene)
+    except SceneError:
+        return None
+
+
+def stem_of(scene: Path) -> str:
+    """Return a scene's name: of a file without the extension, of a folder as it stands."""
+    return scene.stem if scene.suffix in SCENE_SUFFIXES else scene.name
+
+
+def filled(template: str | None, scene: Path) -> Path | None:
+    """Fill ``{scene}``, ``{parent}`` (its folder) and ``{stem}`` (its name) into a path; UsageError on other names."""
+    if template is None:
+        return None
+    parent = scene if scene.is_dir() else scene.parent
+    try:
+        return Path(template.format(scene=scene, parent=parent, stem=stem_of(scene)))
+    except (AttributeError, LookupError, TypeError, ValueError) as error:
+        raise UsageError(f"expected {{scene}}, {{parent}} or {{stem}} in braces, got {template}") from error

@@ -1,0 +1,170 @@
+"""Read unseen photos with their cameras in the frame of a scene, to compare its renders with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from gsmerge.errors import SceneError
+from gsmerge.geometry import IDENTITY, Similarity, camera_centres
+from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views, to_cameras, with_convention
+from gsmerge.io.cameras.read import read_cameras
+from gsmerge.io.image_names import find_image
+from gsmerge.io.photo_files import as_floats, photo_size
+from gsmerge.kernels.elementary import arccos
+from gsmerge.kernels.matrices import closest_rotation, matmul
+from gsmerge.scene.exporters import AUTO
+from gsmerge.scene.files import IMAGE_PLACES, SceneFiles
+from gsmerge.scene.read import SceneLoad
+from gsmerge.scene.views import limit_photo_size, stored_photos
+from gsmerge.types import Scene, StrPath, Views
+
+_MAX_ANGLE = 0.2  # degrees that a view's two poses may differ by, once one frame is moved to the other
+_MAX_SHIFT = 0.005  # of the distance between the views
+_MIN_SHARED = 3  # views that determine how two worlds lie to one another
+_SAME_POSE = 1e-4  # of the distance to the scene, and in entries of the rotation: the very same view
+
+
+@dataclass(frozen=True)
+class HeldOutViews(Views):
+    """t views that were no input, in the frame of the scene's Gaussians, named as in their camera file."""
+
+    places: tuple[int, ...]  # of each along the trajectory: its index in the camera file
+    context_places: tuple[int, ...] | None  # the same of the scene's views; None where they are not all in the file
+    notes: tuple[str, ...] = ()  # what was adapted, one sentence each
+
+
+def read_held_out(load: SceneLoad, cameras: StrPath, images: StrPath | None = None) -> HeldOutViews:
+    """Read unseen photos and their cameras, in any of the forms that scenes may have.
+
+    Views that the scene was made of are left out. Where the file has those too, under the same names, their poses
+    determine how its world lies to that of the Gaussians; otherwise it is assumed to be the world of the scene's
+    own cameras. Poses are read in the scene's convention if it is not its format's. ``images`` is the folder of the
+    photos; None: where the camera file says. SceneError if a file is missing or damaged, or no view is left.
+    """
+    path = Path(cameras)
+    if not path.exists():
+        raise SceneError(path, "expected cameras of held-out views, found nothing")
+    camera_file, shared = place_camera_file(load, path)
+    shared |= _repeated(camera_file.viewmats, load.scene)
+    places = [i for i in range(len(camera_file)) if i not in shared]
+    if not places:
+        raise SceneError(path, "expected views that the scene was not made of, found none")
+    chosen = select_views(camera_file, places)
+    photos = stored_photos(SceneFiles(load.files.ply, path, _folder(path, chosen, images)), chosen)
+    if photos is None:
+        root = path if path.is_dir() else path.parent
+        missing = next((name for name in chosen.names if find_image(root, name) is None), chosen.names[0])
+        raise SceneError(path, f"no photo found for {missing}", "name their folder with --target-images")
+    pinholes, photos, _ = as_pinholes(chosen, photos)
+    photos, notes = limit_photo_size(photos, 0, AUTO.max_side, unaligned=False)
+    assert photos is not None
+    inverse = {view: place for place, view in shared.items()}
+    complete = 0 < len(inverse) == len(load.scene)
+    return HeldOutViews(
+        cameras=to_cameras(pinholes, photo_size(photos)),
+        images=as_floats(photos),
+        names=chosen.names,
+        places=tuple(places),
+        context_places=tuple(inverse[view] for view in range(len(load.scene))) if complete else None,
+        notes=tuple(notes),
+    )
+
+
+def place_camera_file(load: SceneLoad, path: Path) -> tuple[CameraFile, dict[int, int]]:
+    """Read cameras into the frame of a scene's Gaussians; also map those of the scene, if any, to its views.
+
+    Which frame they are in, and in which convention, is decided as :func:`read_held_out` says.
+    """
+    stored, own = read_cameras(path, scene=load.files.ply.stem), load.cameras
+    readings = [stored]
+    if own is not None and own.source == stored.source and own.convention != stored.convention:
+        readings.insert(0, with_convention(stored, own.convention))  # as the scene's own had to be read
+    worlds = [(one, *_find_world(one, _shared_views(one, load.scene.names), load)) for one in readings]
+    camera_file, world, shared = next((one for one in worlds if one[2]), worlds[0])
+    return replace(camera_file, viewmats=world.move_viewmats(camera_file.viewmats)), shared
+
+
+def _folder(path: Path, cameras: CameraFile, images: StrPath | None) -> Path | None:
+    """Find the folder of the photos: the given one, or one next to cameras that do not name files."""
+    if images is not None:
+        if not Path(images).is_dir():
+            raise SceneError(images, "expected a folder of photos")
+        return Path(images)
+    if cameras.images is not None:
+        return path
+    root = path if path.is_dir() else path.parent
+    says = any((root / name).is_file() for name in cameras.names)
+    return None if says else next((root / place for place in IMAGE_PLACES if (root / place).is_dir()), None)
+
+
+def _shared_views(camera_file: CameraFile, names: tuple[str, ...]) -> dict[int, int]:
+    """Map indices in the file to views of the scene that have the same name; empty if stems are not unique."""
+    place, own = (
+        {PurePosixPath(name.replace("\\", "/")).stem: i for i, name in enumerate(some)}
+        for some in (camera_file.names, names)
+    )
+    if len(place) < len(camera_file) or len(own) < len(names):
+        return {}
+    return {place[stem]: view for stem, view in own.items() if stem in place}
+
+
+def _find_world(camera_file: CameraFile, named: dict[int, int], load: SceneLoad) -> tuple[Similarity, dict[int, int]]:
+    """Find the similarity from the file's world to that of the Gaussians, and the views that the scene has too."""
+    stored = _stored_world(load)
+    if not named:
+        return stored, {}
+    theirs = camera_file.viewmats[list(named)]
+    ours = load.scene.cameras.viewmats[list(named.values())]
+    frames = [stored] + [fit_similarity(theirs, ours, stored.scale)] * (len(named) >= _MIN_SHARED)
+    for frame in frames:
+        moved, centres = frame.move_viewmats(theirs), camera_centres(ours)
+        cosines = ((moved[:, :3, :3] * ours[:, :3, :3]).sum((1, 2)) - 1) / 2
+        distance = np.linalg.norm(camera_centres(moved) - centres, axis=1).max()
+        spread = float(np.linalg.norm(np.ptp(centres, axis=0), axis=0)) or 1.0
+        angle = np.degrees(arccos(cosines.clip(-1, 1))).max()
+        if angle <= _MAX_ANGLE and distance / spread <= _MAX_SHIFT:
+            return frame, dict(named)
+    return stored, {}
+
+
+def _stored_world(load: SceneLoad) -> Similarity:
+    """Find the similarity from the world of the scene's own camera file to that of its Gaussians."""
+    if load.recovery is not None:
+        return load.recovery.best.frame
+    if load.cameras is None or load.files.cameras is None:
+        return IDENTITY
+    own = read_cameras(load.files.cameras, scene=load.files.ply.stem, folder=load.files.ply.parent)
+    if (own.names, own.convention) != (load.cameras.names, load.cameras.convention):
+        return IDENTITY
+    if np.array_equal(own.viewmats, load.cameras.viewmats):
+        return IDENTITY  # to the bit
+    return fit_similarity(own.viewmats, load.cameras.viewmats)
+
+
+def fit_similarity(theirs: np.ndarray, ours: np.ndarray, scale: float = 1.0) -> Similarity:
+    """Fit the similarity that moves cameras ``theirs [c,4,4]`` (world to camera) onto their poses ``ours``.
+
+    By least squares; with the given scale where all stand in one place and do not determine it.
+    """
+    rotation = closest_rotation(matmul(ours[:, :3, :3].swapaxes(1, 2), theirs[:, :3, :3]).sum(0))
+    a, b = matmul(camera_centres(theirs), rotation.T), camera_centres(ours)
+    a0, b0 = a - a.mean(0), b - b.mean(0)
+    spread = float((a0**2).sum())
+    if spread > 1e-12 * max(float((a**2).sum()), 1e-300) and len(ours) > 1:
+        scale = float((a0 * b0).sum()) / spread
+    return Similarity(rotation, scale, b.mean(0) - scale * a.mean(0))
+
+
+def _repeated(moved: np.ndarray, scene: Scene) -> dict[int, int]:
+    """Map views to the views of the scene that stand in the same place and look the same way."""
+    if len(scene) == 0 or len(scene.gaussians) == 0:
+        return {}
+    ours, middle = scene.cameras.viewmats, np.median(scene.gaussians.means, 0)
+    # what is seen lies as far away as the views may be apart, or farther; one view has nothing else to measure by
+    limit = _SAME_POSE * float(np.linalg.norm(camera_centres(ours) - middle, axis=1).max())
+    near = np.linalg.norm(camera_centres(moved)[:, None] - camera_centres(ours), axis=2) <= limit
+    alike = np.abs(moved[:, None, :3, :3] - ours[None, :, :3, :3]).max((2, 3)) <= _SAME_POSE
+    return {int(i): int(view) for i, view in zip(*np.nonzero(near & alike), strict=True)}

@@ -1,0 +1,398 @@
+"""Read a scene from its files: a :class:`gsmerge.types.Scene` with the pixel of every row where it has one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsmerge.alignment import (
+    WITH_PHOTOS,
+    Alignment,
+    AlignmentResult,
+    Layout,
+    Recovery,
+    align,
+    check_alignment,
+    choose_rotations,
+    fill_from_depths,
+    find_padding,
+    guess_depths,
+    read_rotations,
+)
+from gsmerge.alignment.registration.join import join_scenes
+from gsmerge.errors import SceneError
+from gsmerge.geometry import Similarity
+from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views, to_cameras
+from gsmerge.io.cameras.json_files import DATAPARSER, find_dataparser, read_dataparser
+from gsmerge.io.cameras.npz_files import read_depths
+from gsmerge.io.formats.ply import OpacityChoice, PlyInfo, PlyScene, ply_notes, read_gaussians, read_parts
+from gsmerge.io.photo_files import as_floats, photo_size
+from gsmerge.runtime.record import note
+from gsmerge.runtime.threads import use_threads
+from gsmerge.scene.exporters import AUTO, Exporter, ReadHints, choose_exporters, find_exporter, make_hints
+from gsmerge.scene.files import SceneFiles, find_scene_files
+from gsmerge.scene.views import (
+    cut_bars,
+    find_larger_and_masks,
+    limit_photo_size,
+    limit_view_size,
+    read_scene_cameras,
+    stored_photos,
+)
+from gsmerge.types import Cameras, Gaussians, LargePhotos, Scene, StrPath, grid_ids
+
+_MAX_MASKED = 0.98  # share of the pixels of photos that masks may leave out
+NO_CAMERAS = Cameras(np.empty((0, 4, 4)), np.empty((0, 3, 3)), 1, 1)
+_NO_ALIGNMENT = AlignmentResult(
+    None, NO_CAMERAS, None, None, problem="expected one Gaussian per pixel, found no cameras that have any"
+)
+
+
+@dataclass(frozen=True)
+class SceneViews:
+    """All c views of the camera file, in the frame of the Gaussians and at the size of the scene's pictures."""
+
+    cameras: Cameras
+    images: np.ndarray | None  # ``[c,h,w,3]`` photos
+    names: tuple[str, ...]
+    used: tuple[int, ...]  # which of them the scene has, each once, in its order
+
+
+@dataclass(frozen=True)
+class SceneLoad:
+    """A scene and how it was read."""
+
+    # the scene: one Gaussian per pixel, or an unaligned one where the rows belong to no pixels
+    scene: Scene
+    ply: PlyInfo
+    files: SceneFiles
+    # the cameras in the order of the views, as their file has them; None where there are none
+    cameras: CameraFile | None
+    views: SceneViews  # all views that there are cameras of, also those that the scene does not have
+    exporters: tuple[Exporter, ...]  # the exporters that may have written the file, or the one that the caller named
+    notes: tuple[str, ...]  # what was adapted or looks odd, one sentence each, without a full stop
+    # how well every view's Gaussians project into their own pixels; None for an unaligned scene
+    alignment: Alignment | None = None
+    recovery: Recovery | None = None  # which reading of the rows won, and by how much; None for an unaligned scene
+    problem: str | None = None  # why the scene is unaligned, in one sentence; None where it is not
+    # how far each camera was moved to its Gaussians; empty where none was
+    moves: Sequence[dict[str, Any]] = ()
+    joined: Sequence[dict[str, Any]] = ()  # where each of several scenes lies; empty for one
+
+    def pixel_scene(self) -> Scene:
+        """Return the scene if it has one Gaussian per pixel; otherwise raise a SceneError with the reason."""
+        if self.scene.aligned:
+            return self.scene
+        raise SceneError(self.ply.path, self.problem or "expected one Gaussian per pixel")
+
+
+def read_scene(
+    path: StrPath,
+    *more: StrPath,
+    cameras: StrPath | None = None,
+    images: StrPath | None = None,
+    masks: StrPath | None = None,
+    opacity: OpacityChoice = "auto",
+    **hints: Any,
+) -> Scene:
+    """Read a scene: ``.ply``, cameras, and images where there are any.
+
+    Which row belongs to which pixel is found by measuring (docs/reference/exporters.md).
+
+    Args:
+        path: The ``.ply``, or a folder that has it.
+        *more: Other scenes of the same place, each in a frame of its own, which are joined with it
+            in its frame (docs/guide/sharp.md).
+        cameras: Camera file or folder; None looks next to the ``.ply``.
+        images: Folder of images, or an ``.npz`` that holds them; None looks next to the ``.ply``.
+        masks: Folder of masks, images named as the photos, dark where a photo does not count; None: ``masks`` beside
+            the photos. Where a photo is transparent, it does not count either.
+        opacity: How opacities are stored; see :func:`gsmerge.io.read_gaussians`.
+        **hints: Fields of :class:`gsmerge.io.ReadHints`: ``exporter``, ``quats``, ``order``, ``scene_scale``,
+            ``max_side``.
+
+    Returns:
+        The scene; its ``pixel_ids`` are None where the rows belong to no pixels.
+
+    Raises:
+        SceneError: If a file is missing or damaged, or the Gaussians are not those of the cameras' views.
+        ValueError: If an argument is none of the possible ones.
+
+    Example:
+        >>> scene = read_scene("scene.ply")  # doctest: +SKIP
+    """
+    return load_scene(path, *more, cameras=cameras, images=images, masks=masks, opacity=opacity, **hints).scene
+
+
+def as_scene(scene: Scene | StrPath) -> Scene:
+    """Return a scene, or read it from a path and note what is odd about the file."""
+    if isinstance(scene, Scene):
+        return scene
+    load = load_scene(scene)
+    for text in load.notes:
+        note(text)
+    return load.scene
+
+
+def load_scene(
+    path: StrPath,
+    *more: StrPath,
+    cameras: StrPath | None = None,
+    images: StrPath | None = None,
+    masks: StrPath | None = None,
+    opacity: OpacityChoice = "auto",
+    **hints: Any,
+) -> SceneLoad:
+    """Read a scene as :func:`read_scene` does, with all facts about its files."""
+    read_hints = make_hints(hints)
+    named = {"cameras": cameras, "images": images, "masks": masks}
+    first, *others = (find_scene_files(one, **named) for one in (path, *more))
+    return load_files(replace(first, more=tuple(others)), opacity=opacity, hints=read_hints)
+
+
+def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = AUTO) -> SceneLoad:
+    """Read the scene of given files as :func:`load_scene` does."""
+    with use_threads():
+        loads = [_load_one(one, opacity, hints) for one in (replace(files, more=()), *files.more)]
+    return loads[0] if len(loads) == 1 else _join_loads(loads, files)
+
+
+def _load_one(files: SceneFiles, opacity: OpacityChoice, hints: ReadHints) -> SceneLoad:
+    return align_scene(read_ply_with_hints(files, opacity=opacity, hints=hints), files, hints=hints)
+
+
+def _join_loads(loads: Sequence[SceneLoad], files: SceneFiles) -> SceneLoad:
+    """Make one scene of several of the same place, with the notes of all."""
+    joined = join_scenes([load.scene for load in loads], [load.files.ply for load in loads])
+    used = [loads[i] for i in joined.used]
+    scene = joined.scene
+    named = zip(joined.names, loads, strict=True)
+    notes = [f"{name}: {text}" for name, load in named for text in load.notes]
+    return replace(
+        used[0],
+        scene=scene,
+        ply=replace(used[0].ply, num_nonfinite=sum(load.ply.num_nonfinite for load in used)),
+        files=files,
+        views=SceneViews(scene.cameras, scene.images, scene.names, tuple(range(len(scene)))),
+        exporters=tuple(dict.fromkeys(exporter for load in used for exporter in load.exporters)),
+        notes=(*notes, *joined.notes),
+        alignment=check_alignment(scene.gaussians, scene.cameras, scene.stored),
+        moves=[move for load in used for move in load.moves],
+        joined=joined.facts,
+    )
+
+
+def read_ply_with_hints(files: SceneFiles, *, opacity: OpacityChoice, hints: ReadHints) -> PlyScene:
+    """Read the rows of a scene's files, with opacities as given, or as the given exporter stores them."""
+    exporter = find_exporter(hints.exporter)
+    if exporter is not None and exporter.opacity == "logit" and opacity == "auto":
+        opacity = "logit"  # activated ones show themselves, and some versions write logits in their place
+    return read_parts(files.parts, opacity=opacity) if files.parts else read_gaussians(files.ply, opacity=opacity)
+
+
+def align_scene(
+    ply: PlyScene,
+    files: SceneFiles,
+    camera_file: CameraFile | None = None,
+    *,
+    hints: ReadHints = AUTO,
+    photos: bool = True,
+) -> SceneLoad:
+    """Put Gaussians, cameras and photos together, with the pixel of every row where it has one.
+
+    Raises as :func:`read_scene`. ``camera_file`` has the cameras if they are read already; without ``photos`` none
+    are searched.
+    """
+    if camera_file is None and files.cameras is None and hints.order == "none":  # cameras are placed later
+        return _make_load(ply, files, hints, _NO_ALIGNMENT, [])
+    exporter = find_exporter(hints.exporter)
+    camera_file = read_scene_cameras(ply, files) if camera_file is None else camera_file
+    known = camera_file.order if exporter is None else exporter.order
+    order = known if hints.order == "auto" else hints.order
+    pinholes, pictures, notes = as_pinholes(camera_file, stored_photos(files, camera_file) if photos else None)
+    notes += [camera_file.focal] if camera_file.focal else []
+    whole, (pictures, cut) = pictures, cut_bars(pictures, camera_file)
+    limited, smaller = limit_photo_size(pictures, len(ply.gaussians), hints.max_side, unaligned=order == "none")
+
+    def read_frames() -> list[Similarity]:
+        path = find_dataparser(files.ply, files.cameras)
+        frames = [] if path is None else read_dataparser(path, files.cameras)
+        return [replace(frame, description=f"moved into the Gaussians' frame by {DATAPARSER}") for frame in frames]
+
+    result = align(
+        ply,
+        pinholes,
+        limited,
+        order=order,
+        scale=hints.scene_scale,
+        depths=partial(read_depths, Path(camera_file.path)),
+        frames=read_frames,
+    )
+    notes += [*cut, *smaller, *result.notes]
+    if result.pixel_ids is None:
+        cameras, images, smaller = limit_view_size(result.cameras, result.images, hints.max_side)
+        result = replace(result, cameras=cameras, images=images)
+        notes += smaller
+    size = photo_size(limited)
+    if files.masks is not None and (pictures is None or pictures is not whole):
+        notes.append(f"masks are not used: {'there are no photos' if pictures is None else 'the photos have bars'}")
+    if pictures is not whole:  # files with bars are not read again
+        return _make_load(ply, files, hints, result, notes)
+    large, masks, more = find_larger_and_masks(files, camera_file, pictures, size, result.transform, result.cameras)
+    return _make_load(ply, files, hints, result, [*notes, *more], large, masks)
+
+
+def _make_load(
+    ply: PlyScene,
+    files: SceneFiles,
+    hints: ReadHints,
+    result: AlignmentResult,
+    notes: Sequence[str],
+    large: LargePhotos | None = None,
+    masks: np.ndarray | None = None,
+) -> SceneLoad:
+    """Make the scene of rows, their pixels and the views, with notes on how it was read."""
+    camera_file, layout, views = result.camera_file, result.layout, list(result.views)
+    names = () if camera_file is None else camera_file.names
+    gaussians, pixel_ids, missing, more = _place_rows(ply, result)
+    cameras, images = result.cameras, result.images
+    if views != list(range(len(cameras))):
+        cameras, images = cameras[views], None if images is None else images[views]
+    large = None if large is None else large[views]
+    masks = None if masks is None else masks[views]
+    masks, described = _check_masks(masks, files)
+    more += described
+    scene = Scene(gaussians, cameras, images, pixel_ids, tuple(names[view] for view in views), missing, large, masks)
+    if camera_file is not None and layout is not None:
+        scene, note = _put_back(scene, camera_file, layout, views)
+        more += note
+        if layout.per_pixel == 1:
+            camera_file = select_views(camera_file, views)
+    frame = None if result.recovery is None else result.recovery.best.frame
+    source = "" if camera_file is None else camera_file.source
+    exporters = choose_exporters(hints.exporter, ply.info, layout, frame, source)
+    scene, turned = _with_rotations(scene, hints, exporters)
+    more += turned
+    if not scene.aligned and camera_file is not None:
+        more.append("the rows belong to no pixels that could be found: unaligned")
+        if hints.exporter != "auto":
+            more[-1] += f"; only the layouts of {hints.exporter} were tried, as given; --hint exporter=auto tries all"
+    return SceneLoad(
+        scene=scene,
+        ply=ply.info,
+        files=files,
+        cameras=camera_file,
+        views=SceneViews(result.cameras, result.images, names, tuple(dict.fromkeys(views))),
+        exporters=exporters,
+        notes=(*files.notes, *ply_notes(ply.info), *notes, *more),
+        alignment=check_alignment(scene.gaussians, scene.cameras, scene.stored) if scene.aligned else None,
+        recovery=result.recovery,
+        problem=result.problem,
+        moves=result.moves,
+    )
+
+
+def _check_masks(masks: np.ndarray | None, files: SceneFiles) -> tuple[np.ndarray | None, list[str]]:
+    """Say how much of the photos masks leave out; SceneError if that is nearly all, which transparency may not be."""
+    if masks is None:
+        return None, []
+    share = float(1 - masks.mean())
+    if share < _MAX_MASKED:
+        count = int((~masks.all((1, 2))).sum())
+        return masks, [f"masks leave out {100 * share:.0f} % of the photos; of {len(masks)}, {count} have one"]
+    if files.masks is None:
+        return None, ["the photos are transparent nearly everywhere, which is not taken for masks"]
+    problem = f"expected masks that are bright where photos count, found {100 * share:.0f} % dark"
+    raise SceneError(files.masks, problem, "invert them, or name another folder with --masks")
+
+
+def _put_back(scene: Scene, camera_file: CameraFile, layout: Layout, views: Sequence[int]) -> tuple[Scene, list[str]]:
+    """Put pixels back that the exporter dropped, where their depths are known or can be guessed; with a note."""
+    depths = read_depths(Path(camera_file.path)) if layout.kind == "box+depth" else None
+    source = "from the depth maps"
+    if depths is not None:
+        full = fill_from_depths(scene, depths[views])
+    elif camera_file.source == WITH_PHOTOS and scene.missing is not None:
+        full = fill_from_depths(scene, guess_depths(scene))
+        source = "at depths where the photos agree"
+    else:
+        return scene, []
+    count = int(full.valid.sum()) - int(scene.valid.sum())
+    note = f"{count:,} pixels that the exporter dropped are put back {source}"
+    return full, [note] * (count > 0)
+
+
+def _place_rows(
+    ply: PlyScene, result: AlignmentResult
+) -> tuple[Gaussians, np.ndarray | None, np.ndarray | None, list[str]]:
+    """Bring rows to the pixels of the grid; return Gaussians, ``pixel_ids``, ``missing`` and notes.
+
+    Pixels without a row get a fully transparent Gaussian. Of rows without pixels the finite ones stay, except for
+    padding.
+    """
+    if result.pixel_ids is None:
+        gaussians = ply.gaussians
+        keep = ply.valid & ~find_padding(gaussians)
+        count = int(ply.valid.sum()) - int(keep.sum())
+        notes = [f"{count:,} rows that only fill the file up are left out"] if count else []
+        return ply.gaussians[keep], None, None, notes
+    grid = len(result.views), result.cameras.height, result.cameras.width
+    size, ids = int(np.prod(grid)), result.pixel_ids
+    if len(ids) == size and np.array_equal(ids, np.arange(size)):
+        return ply.gaussians, grid_ids(ply.valid), None, []
+    source = np.full(size, -1, np.int64)
+    rows = np.flatnonzero(ids >= 0)
+    source[ids[rows]] = rows
+    missing = source < 0
+    if not missing.any():
+        return ply.gaussians[source], grid_ids(ply.valid[source]), None, []
+    before = np.maximum.accumulate(np.where(missing, np.argmin(missing), np.arange(size)))
+    out = ply.gaussians[source[before]]
+    valid = ply.valid[source[before]] & ~missing
+    for values in (out.opacities, out.sh0, out.shN):
+        values[missing] = 0
+    out.quats[missing] = (1, 0, 0, 0)
+    return out, grid_ids(valid), missing.reshape(grid), []
+
+
+def _with_rotations(scene: Scene, hints: ReadHints, exporters: Sequence[Exporter]) -> tuple[Scene, list[str]]:
+    """Read rotations as given, as the given exporter stores them, or as fits the surface; with a note."""
+    if hints.quats != "auto" or not scene.aligned:
+        return read_rotations(scene, hints.quats), []
+    if hints.exporter != "auto":
+        return read_rotations(scene, exporters[0].quats), []
+    if any(not exporter.check_rotations for exporter in exporters):
+        return scene, []
+    choice, note = choose_rotations(scene)
+    return read_rotations(scene, choice), [note] if note else []
+
+
+def place_cameras_in_scene(
+    ply: PlyScene, files: SceneFiles, *, hints: ReadHints = AUTO, photos: bool = True
+) -> tuple[Gaussians, SceneViews, tuple[str, ...], SceneLoad | None]:
+    """Move views into the frame of the Gaussians, if pixels or colours show it; otherwise keep their file's.
+
+    Returns the Gaussians with rotations as the scene has them, the views of the camera file, notes, and the scene,
+    None where the views do not fit. ``photos`` that cannot be read are an error; with False they are left out.
+    SceneError if there are no cameras, or they have no size.
+    """
+    camera_file = read_scene_cameras(ply, files)
+    for with_photos in (True,) if photos else (True, False):
+        try:
+            load = align_scene(ply, files, camera_file, hints=hints, photos=with_photos)
+        except SceneError:
+            continue
+        aligned = load.scene.aligned
+        notes = load.notes if aligned else load.notes[:-1]  # except the one that there are no pixels
+        return load.scene.file_gaussians, load.views, notes, load
+    pictures = stored_photos(files, camera_file) if photos else None
+    images = None if pictures is None else as_floats(pictures)
+    cameras = to_cameras(camera_file, photo_size(pictures))
+    views = SceneViews(cameras, images, camera_file.names, tuple(range(len(cameras))))
+    note = "the cameras do not fit the Gaussians and stay as their file has them"
+    return ply.gaussians, views, (*ply_notes(ply.info), note), None

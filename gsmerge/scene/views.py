@@ -1,0 +1,330 @@
+"""The cameras and photos of a scene: read, turned, cut, at a size that memory has room for; masks and larger files."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from gsmerge.alignment import estimate_cameras, estimate_focal, estimate_with_photos
+from gsmerge.errors import SceneError
+from gsmerge.io.cameras.camera_file import CameraFile, missing_intrinsics, sizes_of, to_cameras, undistort_photos
+from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
+from gsmerge.io.cameras.read import CAMERA_PLACES, SHARP, read_cameras, read_sharp
+from gsmerge.io.formats.ply import PlyScene
+from gsmerge.io.image_names import (
+    IMAGE_SUFFIXES,
+    find_image,
+    list_images,
+    match_images,
+    match_masks,
+    natural_key,
+)
+from gsmerge.io.photo_files import (
+    Photos,
+    PhotoTransform,
+    Size,
+    change_photos,
+    decode_alpha,
+    decode_image,
+    decode_images,
+    decode_mask,
+    image_size,
+    keep_photos,
+    photo_size,
+    quarter_turns,
+    resize_to,
+    same_shape,
+)
+from gsmerge.kernels.matrices import matmul
+from gsmerge.kernels.pictures import count_bars
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.scene.files import MASK_PLACES, SceneFiles
+from gsmerge.types import Cameras, LargePhotos
+
+_MAX_BYTES = 2 << 30  # of all photos as floats, before it is known whether the Gaussians belong to pixels
+_FLOAT_PIXEL = 12  # bytes
+_BAR_SPREAD = 8  # of 255, range of a bar's colours
+_ROUNDING = 1e-6  # pixels
+_MASK_LEVEL = 191  # of 255: a pixel of a view counts if three quarters of its pixels in the file do
+
+
+def read_scene_cameras(ply: PlyScene, files: SceneFiles) -> CameraFile:
+    """Read the cameras from their file or the ``.ply``, or estimate them for the images; SceneError if all fail.
+
+    Where a file has poses alone, the focal length is estimated.
+    """
+    if files.cameras is not None:
+        stored = read_cameras(files.cameras, scene=files.ply.stem, folder=files.ply.parent)
+        if stored.focal is not None:
+            return stored
+        photos = stored_photos(files, stored)
+        estimated = estimate_focal(ply, stored, photos)
+        if estimated is None:
+            reason = "no focal length fits the Gaussians" if photos is not None else "no photos that show them"
+            raise missing_intrinsics(stored.path, f", and {reason}")
+        return estimated
+    cameras = read_sharp(files.ply)
+    if cameras is None and files.images is not None and files.images.is_dir():
+        paths = list_images(files.images)
+        width, height = image_size(paths[0]) if paths else (0, 0)
+        names = [path.relative_to(files.images).as_posix() for path in paths]
+        rows = ply.gaussians, ply.valid
+        cameras = estimate_cameras(files.ply, *rows, names, width, height)
+        if cameras is None:
+            size, read = (width, height), partial(decode_images, paths)
+            cameras = estimate_with_photos(files.ply, *rows, names, size, read)
+    if cameras is None:
+        places = ", ".join(place for place in CAMERA_PLACES if len(place) > 1)
+        problem = f"no cameras found next to it (looked for {places}, one .torch chunk)"
+        remedy = "name them with --cameras, or have views placed with --hint order=none"
+        if files.ply.parent.name == "gs_ply" or files.ply.name == "0000.ply":
+            formats = 'export_format="npz-gs_ply" or "mini_npz-gs_ply" in Depth Anything 3'
+            remedy = f"export them as well, by {formats}, {remedy}"
+        raise SceneError(files.ply, problem, remedy)
+    return cameras
+
+
+def stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos | None:
+    """Read the photos of the cameras from a folder, a file that holds them, or where the camera file says; or None."""
+    photos = _stored_photos(files, camera_file)
+    photos = photos if photos is None else _turn_photos(photos, _photo_turns(files, camera_file))
+    old, size = photo_size(photos), (int(camera_file.widths[0]), int(camera_file.heights[0]))
+    if photos is None or old is None or camera_file.source != SHARP or old == size:
+        return photos
+    return resize_to(old, size).photos(photos)
+
+
+def _stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos | None:
+    paths = _photo_paths(files, camera_file)
+    if paths is not None or files.images is None:
+        return decode_images(paths) if paths else None
+    own = files.cameras is not None and os.path.realpath(files.cameras) == os.path.realpath(files.images)
+    stored = (camera_file if own else read_cameras(files.images, scene=files.ply.stem)).images
+    if own and stored is None and files.images.suffix == CHUNK:
+        return None
+    if stored is None or len(stored) != len(camera_file):
+        count = 0 if stored is None else len(stored)
+        raise SceneError(files.images, f"expected {len(camera_file)} images, one per camera, found {count}")
+    return stored
+
+
+def _photo_turns(files: SceneFiles, camera_file: CameraFile) -> int:
+    """Return the quarter turns that SHARP, alone among the models, makes by the orientation tag."""
+    paths = _photo_paths(files, camera_file) if camera_file.source == SHARP else None
+    turns = quarter_turns(paths[0]) if paths else 0
+    if turns % 2 == 0 or not paths:
+        return turns
+    width, height = image_size(paths[0])
+    K = camera_file.Ks[0]
+    aspect = K[1, 1] / K[0, 0]  # of the photo as it was read, whose pixels are square
+    as_turned = height / width / aspect
+    as_stored = width / height / aspect
+    return turns if max(as_turned, 1 / as_turned) < max(as_stored, 1 / as_stored) else 0
+
+
+def _turn_photos(photos: Photos, turns: int) -> Photos:
+    """Turn photos by quarter turns, counterclockwise."""
+    if turns == 0:
+        return photos
+    size = photo_size(photos)
+    turned = size[::-1] if turns % 2 else size
+
+    def turn(_: int, photo: np.ndarray) -> np.ndarray:
+        return np.ascontiguousarray(np.rot90(photo, turns))
+
+    return change_photos(photos, turned, turn)
+
+
+def _photo_paths(files: SceneFiles, camera_file: CameraFile) -> list[Path] | None:
+    """Find the photo file of every camera; None where there are none, or they are inside another file."""
+    if files.images is None:
+        folder = Path(camera_file.path).parent
+        paths = [path for path in (find_image(folder, name) for name in camera_file.names) if path is not None]
+        if not paths and all(name.removeprefix("view ").isdecimal() for name in camera_file.names):
+            paths = images_beside(files.ply)  # the format has no names; AnySplat writes its Gaussians among the photos
+        return paths if len(paths) == len(camera_file) else None
+    return None if files.images.suffix in (".npz", CHUNK) else match_images(files.images, camera_file.names)
+
+
+def images_beside(ply: Path) -> list[Path]:
+    """List the images in the folder of a ``.ply``, without those below it, in the order of :func:`list_images`."""
+    named = (path for path in ply.parent.glob("[!.]*") if path.suffix.lower() in IMAGE_SUFFIXES)
+    return sorted((path for path in named if path.is_file()), key=lambda path: natural_key(path.name))
+
+
+def find_larger_and_masks(
+    files: SceneFiles,
+    camera_file: CameraFile,
+    photos: Photos | None,
+    size: Size | None,
+    transform: PhotoTransform | None,
+    cameras: Cameras,
+) -> tuple[LargePhotos | None, np.ndarray | None, list[str]]:
+    """Find the photos at the size of their files, where that is larger than the scene's, and where they count.
+
+    Files are read again when a photo is asked for; photos inside other files stay in memory. ``photos`` are those
+    of :func:`stored_photos`, undistorted; ``size`` is theirs when they were fitted to the rows by ``transform``;
+    ``cameras`` are those of the scene's grid, in the order of the camera file. The masks ``[c,h,w]`` bool come from
+    files and from transparency; None where all photos count wholly. With notes.
+    """
+    if photos is None or size is None:
+        return None, None, []
+    paths = _photo_paths(files, camera_file)
+    own = photo_size(photos) if paths is None else image_size(paths[0])
+    turns = 0 if paths is None else _photo_turns(files, camera_file)
+    stored = own[::-1] if turns % 2 else own
+    window = _file_window(stored, size, transform, cameras)
+    lenses = () if paths is None else camera_file.lenses
+    Ks = to_cameras(replace(camera_file, lenses=()), stored).Ks if lenses else None
+
+    def cut(view: int, picture: np.ndarray) -> np.ndarray:
+        """Undistort and turn a picture as it is in a photo's file, and cut out what the view shows."""
+        if Ks is not None:
+            picture = undistort_photos([picture], Ks[view : view + 1], lenses[view : view + 1])[0]
+        return np.ascontiguousarray(np.rot90(picture, turns)[window.rows, window.columns])
+
+    def read(view: int) -> np.ndarray:
+        return cut(view, photos[view] if paths is None else decode_image(paths[view], own))
+
+    large = None
+    if window.is_larger:
+        width, height = (part.stop - part.start for part in (window.columns, window.rows))
+        large = LargePhotos(matmul(window.to_file, cameras.Ks), width, height, tuple(range(len(cameras))), read)
+    names = camera_file.names if paths is None else [path.as_posix() for path in paths]
+    named, notes = _match_masks(files.masks, names)
+    alphas = [None] * len(names) if paths is None else paths
+
+    def read_parts(view: int) -> list[np.ndarray]:
+        """Read what a mask, upright, and the photo's transparency, as it is stored, say."""
+        mask, photo = named[view], alphas[view]
+        parts = [None if photo is None else decode_alpha(photo)]
+        parts += [None if mask is None else np.rot90(decode_mask(mask), -turns)]
+        return [part for part in parts if part is not None]
+
+    return large, _read_masks(read_parts, len(names), own, cameras, cut), notes
+
+
+def _match_masks(folder: Path | None, names: Sequence[str]) -> tuple[Sequence[Path | None], list[str]]:
+    """Find the masks of photos; of a folder that was not named, only where their names tell, with a note."""
+    if folder is None:
+        return [None] * len(names), []
+    try:
+        return match_masks(folder, names), []
+    except SceneError as error:
+        if folder.name not in MASK_PLACES:
+            raise
+        return [None] * len(names), [f"masks are not used: {error.path}: {error.problem}"]
+
+
+def _read_masks(
+    read_parts: Callable[[int], list[np.ndarray]],
+    count: int,
+    size: Size,
+    cameras: Cameras,
+    cut: Callable[[int, np.ndarray], np.ndarray],
+) -> np.ndarray | None:
+    """Read where photos, of ``size`` in their files, count; ``cut`` brings their pictures to the views' part."""
+    shape = cameras.height, cameras.width
+
+    def read(view: int) -> np.ndarray | None:
+        mask = np.full(shape, True)
+        for part in read_parts(view):
+            whole = cv2.resize(part.astype(np.uint8) * 255, size, interpolation=cv2.INTER_NEAREST)
+            seen = cut(view, whole[..., None].repeat(3, -1))[..., 0]
+            mask &= cv2.resize(seen, shape[::-1], interpolation=cv2.INTER_AREA) > _MASK_LEVEL
+        return None if mask.all() else mask
+
+    masks = parallel_map(read, range(count))
+    if all(mask is None for mask in masks):
+        return None
+    return np.stack([np.full(shape, True) if mask is None else mask for mask in masks])
+
+
+@dataclass(frozen=True)
+class _Window:
+    """The part of a photo's file that a view of the grid shows."""
+
+    rows: slice
+    columns: slice
+    to_file: np.ndarray  # [3,3] from pixels of the grid to those of the part
+    is_larger: bool  # whether it has more pixels than the view on both sides
+
+
+def _file_window(stored: Size, size: Size, transform: PhotoTransform | None, cameras: Cameras) -> _Window:
+    """Find the part of files of the size ``stored`` that the grid shows; see :func:`find_larger_and_masks`."""
+    fitted = transform or resize_to(size, size)
+    scale = np.array([fitted.scale_x, fitted.scale_y]) * size / np.array(stored)
+    cut, grid = np.array([fitted.left, fitted.top]), np.array([fitted.width, fitted.height])
+    shown = np.array([cameras.width, cameras.height]) / grid  # of unaligned scenes, whose views may be reduced again
+    first = np.floor(cut / scale).astype(int)
+    last = np.minimum(np.ceil((cut + grid) / scale - _ROUNDING).astype(int), stored)
+    to_file = np.eye(3)
+    to_file[(0, 1), (0, 1)] = 1 / (scale * shown)
+    to_file[:2, 2] = cut / scale - first
+    (left, top), (right, bottom) = first.tolist(), last.tolist()
+    return _Window(slice(top, bottom), slice(left, right), to_file, bool((scale * shown).max() < 1))
+
+
+def cut_bars(photos: Photos | None, camera_file: CameraFile) -> tuple[Photos | None, list[str]]:
+    """Cut off the bars around photos that have the cameras' shape without them, with a note; or return them as is."""
+    size = photo_size(photos)
+    shapes = sizes_of(camera_file)
+    if photos is None or size is None or not shapes or any(same_shape(one, size) for one in shapes):
+        return photos, []
+    counts = [count_bars(photos[view], _BAR_SPREAD) for view in range(len(photos))]
+    above, below, left, right = (int(count) for count in np.median(counts, 0))
+    inner = size[0] - left - right, size[1] - above - below
+    if inner == size or not any(same_shape(one, inner) for one in shapes):
+        return photos, []
+
+    def cut(_: int, photo: np.ndarray) -> np.ndarray:
+        return np.ascontiguousarray(photo[above : size[1] - below, left : size[0] - right])
+
+    note = f"the photos of {size[0]} x {size[1]} have bars around pictures of {inner[0]} x {inner[1]}: they are cut off"
+    return keep_photos(change_photos(photos, inner, cut)), [note]
+
+
+def limit_photo_size(
+    photos: Photos | None, rows: int, max_side: int, *, unaligned: bool
+) -> tuple[Photos | None, list[str]]:
+    """Resize photos that are too large for memory to at most ``max_side`` pixels a side, with notes about it.
+
+    Where the file's Gaussians (``rows``) may be the photos' pixels, the photos stay; not where they are known to be
+    unaligned.
+    """
+    size = photo_size(photos)
+    if photos is None or size is None:
+        return photos, []
+    pixels = len(photos) * size[0] * size[1]
+    if not unaligned and (_FLOAT_PIXEL * pixels <= _MAX_BYTES or 2 * rows > pixels):
+        return photos, []
+    transform, notes = _limit(size, max_side)
+    return photos if transform is None else keep_photos(transform.photos(photos)), notes
+
+
+def limit_view_size(
+    cameras: Cameras, images: np.ndarray | None, max_side: int
+) -> tuple[Cameras, np.ndarray | None, list[str]]:
+    """Resize cameras and photos ``[c,h,w,3]`` to sides of at most ``max_side`` pixels; with a note."""
+    transform, notes = _limit((cameras.width, cameras.height), max_side)
+    if transform is not None:
+        cameras = transform.cameras(cameras)
+        smaller = None if images is None else transform.photos(images)
+        images = None if smaller is None else np.stack([smaller[view] for view in range(len(smaller))])
+    return cameras, images, notes
+
+
+def _limit(size: Size, max_side: int) -> tuple[PhotoTransform | None, list[str]]:
+    """Make the transform that brings pictures to ``max_side``, and a note; None where nothing has to be done."""
+    if max(size) <= max_side:
+        return None, []
+    scale = max_side / max(size)
+    width, height = (max(1, round(side * scale)) for side in size)
+    note = f"views of {size[0]} x {size[1]} are worked on at {width} x {height}"
+    return resize_to(size, (width, height)), [f"{note}: no side is longer than {max_side} pixels (max_side)"]

@@ -1,0 +1,63 @@
+"""The build: every platform, other compilers, and what it says where it cannot."""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+from pathlib import Path
+
+import pytest
+
+from gsmerge.kernels import build as module
+from gsmerge.kernels.build import build, compiler, find_platform, hash_sources
+
+HEADS = {"linux": b"\x7fELF", "macosx": b"\xcf\xfa\xed\xfe", "win": b"MZ"}
+PLATFORMS = (
+    "manylinux_2_17_x86_64", "manylinux_2_17_aarch64", "macosx_11_0_arm64", "macosx_10_13_x86_64", "win_amd64",
+    "win_arm64",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("tag", PLATFORMS)
+def test_libraries_of_every_platform_are_built_here(tag: str, tmp_path: Path) -> None:
+    where = find_platform(tag)
+    paths = build(tmp_path, platform=tag)
+    assert [path.name for path in paths] == [where.library_name(target) for target in where.targets]
+    for path in paths:
+        content = path.read_bytes()
+        assert content.startswith(HEADS[where.system])
+        assert all(name in content for name in (b"blend_backward", b"sources_hash", hash_sources().encode()))
+    assert sorted(tmp_path.iterdir()) == sorted(paths)
+
+
+def test_two_builds_are_equal(tmp_path: Path) -> None:
+    first, second = (build(tmp_path / name) for name in "ab")
+    assert [path.read_bytes() for path in first] == [path.read_bytes() for path in second]
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
+def test_another_compiler_can_be_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GSMERGE_CC", "gcc -Wno-error")
+    for path in build(tmp_path):
+        assert ctypes.c_char_p.in_dll(ctypes.CDLL(str(path)), "sources_hash").value == hash_sources().encode()
+
+
+def test_a_compiler_that_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GSMERGE_CC", "no-such-compiler -O2")
+    with pytest.raises(OSError, match="GSMERGE_CC: expected a compiler, found no program 'no-such-compiler'"):
+        build(tmp_path)
+
+
+def test_an_error_of_the_compiler_is_shown_and_nothing_is_left(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match=r"(?s)building kernels-.* failed\n.*error:"):
+        build(tmp_path, ("-include", "no-such-header.h"))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_a_compiler_the_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("GSMERGE_CC", raising=False)
+    monkeypatch.setitem(module.sys.modules, "ziglang", None)
+    with pytest.raises(
+        OSError, match="expected the compiler of the package ziglang, found none; run pip install ziglang"
+    ):
+        compiler()

@@ -1,0 +1,135 @@
+"""Which library is loaded, and what is said where none fits."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from gsmerge.errors import UsageError
+from gsmerge.kernels import library as module
+from gsmerge.kernels.build import ARM64, FOLDER, V3, V4, Platform, find_platform, hash_sources
+from gsmerge.kernels.library import load_library
+
+
+@pytest.fixture(autouse=True)
+def _fresh(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Load anew, with no variable set."""
+    for name in ("GSMERGE_TARGET", "GSMERGE_NATIVE"):
+        monkeypatch.delenv(name, raising=False)
+    load_library.cache_clear()
+    module._open.cache_clear()
+    yield
+    load_library.cache_clear()
+    module._open.cache_clear()
+
+
+class OldProcessor:
+    """A library on a processor of some level."""
+
+    def __init__(self, level: int) -> None:
+        self.level = level
+
+    def processor_level(self) -> int:
+        return self.level
+
+
+x86_only = pytest.mark.skipif(find_platform().machine != "x86_64", reason="needs an x86-64 processor")
+
+
+def set_level(monkeypatch: pytest.MonkeyPatch, level: int) -> None:
+    monkeypatch.setattr(module, "_open", lambda target: (target.name, OldProcessor(level))[1])
+    monkeypatch.setattr(module._open, "cache_clear", lambda: None, raising=False)
+
+
+def test_the_most_demanding_target_is_taken() -> None:
+    assert load_library()._name == str(FOLDER / find_platform().library_name(module._able_targets()[-1]))
+
+
+@x86_only
+def test_a_target_can_be_forced(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GSMERGE_TARGET", "v3")
+    assert load_library()._name == str(FOLDER / find_platform().library_name(V3))
+
+
+@pytest.mark.parametrize("target", ["v5", "V3", "x86-64-v3"])
+def test_other_targets_are_refused(target: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GSMERGE_TARGET", target)
+    with pytest.raises(UsageError, match=f"GSMERGE_TARGET: expected .*, found '{target}'; unset it"):
+        load_library()
+
+
+@x86_only
+@pytest.mark.parametrize("level", [0, 2])
+def test_an_older_processor_is_refused_in_one_line(level: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    set_level(monkeypatch, level)
+    with pytest.raises(UsageError, match=r"expected a processor with AVX2 and FMA .*, found an older one$"):
+        load_library()
+
+
+@x86_only
+def test_a_target_beyond_the_processor_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    set_level(monkeypatch, 3)
+    monkeypatch.setenv("GSMERGE_TARGET", "v4")
+    with pytest.raises(UsageError, match="expected v3 on this processor, found 'v4'"):
+        load_library()
+
+
+def test_a_missing_library_names_the_command_that_builds_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("GSMERGE_NATIVE", str(tmp_path))
+    with pytest.raises(UsageError, match=r"the native library is missing; run python tasks.py native, or pip install"):
+        load_library()
+
+
+def test_a_damaged_library_names_the_command_that_builds_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for target in find_platform().targets:
+        (tmp_path / find_platform().library_name(target)).write_bytes(b"no library")
+    monkeypatch.setenv("GSMERGE_NATIVE", str(tmp_path))
+    with pytest.raises(UsageError, match=r"the native library cannot be loaded .*; run python tasks.py native"):
+        load_library()
+
+
+def test_a_library_of_other_sources_names_the_command_that_builds_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "hash_sources", lambda: "0" * 16)
+    with pytest.raises(UsageError, match=r"is older than its sources; run python tasks.py native"):
+        load_library()
+
+
+def test_a_wheel_without_sources_is_not_asked_for_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "hash_sources", lambda: "")
+    assert ctypes.c_char_p.in_dll(load_library(), "sources_hash").value == hash_sources().encode()
+
+
+def test_the_command_line_says_it_in_one_line(tmp_path: Path, made_scene: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "gsmerge", "compact", str(made_scene), "-o", str(tmp_path / "x.ply")],
+        capture_output=True, text=True, check=False, env={**os.environ, "GSMERGE_TARGET": "v5"},
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert done.stderr.startswith("gsmerge: error: GSMERGE_TARGET: expected ")
+    assert done.stderr.count("\n") == 1
+
+
+def test_platforms_of_wheels() -> None:
+    tags = {
+        "manylinux_2_17_x86_64": Platform("linux", "x86_64"), "linux-aarch64": Platform("linux", "arm64"),
+        "macosx_11_0_arm64": Platform("macosx", "arm64"), "macosx-10.13-x86_64": Platform("macosx", "x86_64"),
+        "win_amd64": Platform("win", "x86_64"), "win-arm64": Platform("win", "arm64"),
+    }  # fmt: skip
+    assert {tag: find_platform(tag) for tag in tags} == tags
+    assert Platform("linux", "x86_64").targets == (V3, V4)
+    assert Platform("win", "arm64").targets == (ARM64,)
+    assert Platform("win", "x86_64").library_name(V4) == "kernels-v4.dll"
+    assert Platform("macosx", "arm64").library_name(ARM64) == "kernels-arm64.dylib"
+
+
+def test_a_copied_folder_of_libraries_is_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for path in FOLDER.glob("kernels-*"):
+        shutil.copy(path, tmp_path)
+    monkeypatch.setenv("GSMERGE_NATIVE", str(tmp_path))
+    assert Path(load_library()._name).parent == tmp_path

@@ -1,0 +1,116 @@
+"""Poses that are in another convention than their format has."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from exports import smooth_scene
+from tiny_scene import Tiny, edited_json, make_tiny
+
+from gsmerge.alignment import choose_poses, other_conventions
+from gsmerge.errors import SceneError
+from gsmerge.io.cameras.camera_file import C2W_OPENGL, CONVENTIONS, W2C_OPENCV, from_viewmats
+from gsmerge.scene.read import load_scene
+from gsmerge.types import Cameras
+
+SMOOTH = smooth_scene(40, 30)
+
+
+def rewrite_poses(folder: Path, tiny: Tiny, convention: tuple[str, str]) -> None:
+    with edited_json(folder / "transforms.json") as data:
+        for frame, pose in zip(data["frames"], from_viewmats(tiny.w2c, convention), strict=True):
+            frame["transform_matrix"] = pose.tolist()
+
+
+def some_rows(tiny: Tiny) -> Tiny:
+    """Two thirds of the Gaussians in a random order: no pixels."""
+    order = np.random.default_rng(0).permutation(len(tiny.gaussians))
+    return replace(tiny, gaussians=tiny.gaussians[order[: len(order) * 2 // 3]])
+
+
+@pytest.mark.parametrize("true", [c for c in CONVENTIONS if c != C2W_OPENGL], ids=" ".join)
+def test_the_reading_that_fits_is_taken_and_said(tiny_folder: Path, tiny: Tiny, true: tuple[str, str]) -> None:
+    rewrite_poses(tiny_folder, tiny, true)
+    loaded = load_scene(tiny_folder)
+    assert loaded.alignment.ok
+    assert np.allclose(loaded.pixel_scene().cameras.viewmats, tiny.w2c)
+    assert np.allclose(loaded.cameras.viewmats, tiny.w2c)
+    assert loaded.cameras.convention == true
+    assert loaded.notes == (
+        f"the poses fit when read as {true[0]} matrices with {true[1]} axes,"
+        " where this format has camera-to-world with OpenGL axes: read so",
+    )
+
+
+@pytest.mark.parametrize("true", [c for c in CONVENTIONS if c != C2W_OPENGL], ids=" ".join)
+def test_without_pixels_the_photos_tell(tmp_path: Path, true: tuple[str, str]) -> None:
+    folder = some_rows(SMOOTH).save(tmp_path / "scene")
+    rewrite_poses(folder, SMOOTH, true)
+    loaded = load_scene(folder)
+    assert not loaded.scene.aligned
+    assert np.allclose(loaded.scene.cameras.viewmats, SMOOTH.w2c)
+    assert any(f"when read as {true[0]} matrices with {true[1]} axes" in note for note in loaded.notes)
+
+
+def test_the_usual_reading_is_not_doubted(tmp_path: Path) -> None:
+    notes = load_scene(some_rows(SMOOTH).save(tmp_path)).notes
+    assert notes == ("the rows belong to no pixels that could be found: unaligned",)
+
+
+def test_a_tie_is_said() -> None:
+    """Cameras in the middle of a ball of Gaussians: both axes see the same number, and there are no photos."""
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(4000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    tiny = make_tiny()
+    gaussians = replace(tiny.gaussians[np.arange(4000) % 840], means=points.astype(np.float32))
+    c2w = tiny.c2w.copy()
+    c2w[:, :3, 3] *= 0.1
+    wide = np.array([[3.0, 0, 10], [0, 3, 7], [0, 0, 1]])
+    cameras = Cameras(np.linalg.inv(c2w), np.tile(wide, (3, 1, 1)), 20, 14)
+    poses, seen, said = choose_poses(gaussians, np.ones(4000, bool), cameras, None, W2C_OPENCV)
+    assert poses is None
+    assert seen.ok
+    assert said is not None
+    assert "fit as well when read as" in said
+
+
+def test_one_pose_without_turn_has_fewer_readings() -> None:
+    assert [p.description for p in other_conventions(np.eye(4)[None], W2C_OPENCV)] == [
+        "world-to-camera matrices with OpenGL axes"
+    ]
+
+
+def test_two_readings_that_fit_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = SMOOTH.save(tmp_path / "scene")
+    rewrite_poses(folder, SMOOTH, W2C_OPENCV)
+    true = other_conventions(SMOOTH.w2c, C2W_OPENGL)[0]
+    same = replace(true, viewmats=SMOOTH.w2c)
+    monkeypatch.setattr(
+        "gsmerge.alignment.other_conventions", lambda *_: [same, replace(same, convention=("another", "way"))]
+    )
+    with pytest.raises(SceneError, match=r"expected poses that fit in one reading, found that they fit as .* another"):
+        load_scene(folder)
+
+
+def test_rows_without_finite_positions_are_not_looked_at(tmp_path: Path, tiny: Tiny) -> None:
+    folder = tiny.save(tmp_path / "scene")
+    rewrite_poses(folder, tiny, W2C_OPENCV)
+    data = bytearray((folder / "scene.ply").read_bytes())
+    start = data.index(b"end_header\n") + 11
+    data[start + 5 * 68 : start + 5 * 68 + 4] = np.float32(np.nan).tobytes()
+    (folder / "scene.ply").write_bytes(data)
+    assert load_scene(folder).pixel_scene().valid.sum() == 839
+
+
+def test_poses_that_fit_in_no_reading(tmp_path: Path) -> None:
+    folder = some_rows(SMOOTH).save(tmp_path / "scene")
+    away = SMOOTH.c2w.copy()
+    away[:, :3, 3] += 50
+    away[:, :3, :3] = away[:, :3, :3] @ np.diag([-1.0, 1, -1])
+    rewrite_poses(folder, replace(SMOOTH, c2w=away), C2W_OPENGL)
+    with pytest.raises(SceneError, match="the cameras see 0 % of the Gaussians"):
+        load_scene(folder)

@@ -1,0 +1,57 @@
+"""Depths of pixels that an exporter dropped, from the photos of other views."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tiny_scene import make_tiny
+
+from gsmerge.alignment import guess_depths
+from gsmerge.types import Cameras, Scene, grid_ids
+
+WIDTH, HEIGHT, NEAR, FAR, FLOOR = 96, 64, 3.0, 6.0, 32
+K = np.array([[80.0, 0, 48], [0, 80, 32], [0, 0, 1]])
+
+
+def scene_of(*, moved: float) -> Scene:
+    """Three views of a far wall above a near one, each ``moved`` to the right; the far wall and borders are missing."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    depth = np.where(y < FLOOR, FAR, NEAR)
+    viewmats = np.tile(np.eye(4), (3, 1, 1))
+    means, images = [], []
+    for view in range(3):
+        viewmats[view, 0, 3] = -moved * view
+        rays = np.stack([(x - 48) / 80, (y - 32) / 80, np.ones_like(x)], -1)
+        world = rays * depth[..., None] + np.array([moved * view, 0, 0])
+        u, v = world[..., 0], world[..., 1]
+        colors = [np.sin(9 * u + 3 * v), np.sin(5 * u - 8 * v), np.sin(2 * u * v + 4 * v)]
+        images.append(0.5 + 0.4 * np.stack(colors, -1))
+        means.append(world.reshape(-1, 3))
+    kept = np.zeros((3, HEIGHT, WIDTH), bool)
+    kept[:, FLOOR:-2, 3:-3] = True
+    count = kept.size
+    tiny = make_tiny().gaussians
+    gaussians = replace(tiny[np.arange(count) % len(tiny)], means=np.concatenate(means).astype(np.float32))
+    cameras = Cameras(viewmats, np.tile(K, (3, 1, 1)), WIDTH, HEIGHT)
+    photos = np.stack(images).astype(np.float32)
+    return Scene(gaussians, cameras, photos, grid_ids(kept), ("a", "b", "c"), ~kept)
+
+
+def test_far_pixels_lie_where_the_photos_agree() -> None:
+    maps = guess_depths(scene_of(moved=0.5))
+    far = maps[:, 6 : FLOOR - 6, 10:-10]
+    assert (np.abs(np.log(far / FAR)) < 0.1).mean() > 0.9
+
+
+def test_kept_pixels_and_borders_have_the_depths_of_rows() -> None:
+    maps = guess_depths(scene_of(moved=0.5))
+    assert np.allclose(maps[:, FLOOR:], NEAR, rtol=1e-5)
+
+
+@pytest.mark.parametrize("without", ["parallax", "photos"])
+def test_far_pixels_are_no_nearer_than_the_farthest_row(without: str) -> None:
+    scene = scene_of(moved=0.0)
+    maps = guess_depths(scene if without == "parallax" else replace(scene, images=None))
+    assert np.allclose(maps[:, 2:FLOOR], NEAR, rtol=1e-5)

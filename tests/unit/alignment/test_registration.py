@@ -1,0 +1,185 @@
+"""Scenes of one place, each in a frame and a unit of its own, found in one another and joined."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from sharp_files import split_views
+from tiny_scene import rotation
+
+from gsmerge import Cameras, Gaussians, Scene, render
+from gsmerge.alignment.registration import keypoints
+from gsmerge.alignment.registration.join import join_scenes, move_scene, turn_harmonics
+from gsmerge.alignment.registration.register import register
+from gsmerge.alignment.registration.similarities import DIGITS, fit_similarities
+from gsmerge.errors import SceneError
+from gsmerge.facts.views import subset
+from gsmerge.geometry import Similarity, camera_centres
+from gsmerge.research.generate import GenerateOptions, NoiseOptions, make_scene
+from gsmerge.types import grid_ids
+
+VIEWS = 6
+SCALES = (1.1, 0.8, 1.25, 0.93, 1.0, 0.87)
+PATHS = [Path(f"{name}.ply") for name in "abcdef"]
+
+
+def made_scene(seed: int) -> Scene:
+    """A photographed room with the depth errors of a network."""
+    ranges = NoiseOptions(sh_degrees=(0,), constant_opacity=0.0, unit=(1.0, 1.0))
+    options = GenerateOptions(views=(VIEWS, VIEWS), width=240, height=160, style="room", path="arc", ranges=ranges)
+    made = make_scene(seed, 0, options)
+    ids = grid_ids(np.ones((VIEWS, 160, 240), bool))
+    return Scene(made.gaussians, made.cameras, np.stack(made.images), ids, tuple("abcdef"))
+
+
+@pytest.fixture(scope="module")
+def place() -> Scene:
+    return made_scene(2)
+
+
+@pytest.fixture(scope="module")
+def parts(place: Scene) -> list[Scene]:
+    return split_views(place, SCALES)
+
+
+def test_views_are_found_up_to_a_similarity(place: Scene, parts: list[Scene]) -> None:
+    """Within half a degree and one per cent of the truth."""
+    joined = join_scenes(parts, PATHS)
+    assert joined.used == (0, 1, 2, 3, 4, 5)
+    true, found = place.cameras.viewmats, joined.scene.cameras.viewmats
+    centres = [camera_centres(poses)[None] for poses in (found, true)]
+    _, scales, _ = fit_similarities(*centres, np.ones((1, VIEWS)))
+    # the rotation of all views at once, and what each is off by then
+    turns = found[:, :3, :3].swapaxes(1, 2) @ true[:, :3, :3]
+    u, _, v = np.linalg.svd(turns.sum(0))
+    chords = np.linalg.norm(turns - u @ v, axis=(1, 2)) / np.sqrt(8)
+    assert np.degrees(2 * np.arcsin(chords)).max() < 0.5
+    apart = [one[0] - one[0].mean(0) for one in centres]
+    missed = np.linalg.norm(scales[0] * apart[0] @ (u @ v) - apart[1], axis=1)
+    assert missed.max() < 0.01 * np.linalg.norm(apart[1], axis=1).max()
+    own = np.array([fact["scale"] for fact in joined.facts])
+    assert np.abs(own * SCALES / SCALES[0] - 1).max() < 0.01
+
+
+def test_the_first_file_stays_where_it_is(parts: list[Scene]) -> None:
+    joined = join_scenes(parts[:2], PATHS[:2])
+    size = parts[0].pixels_per_view
+    assert np.array_equal(joined.scene.gaussians.means[:size], parts[0].gaussians.means)
+    assert np.array_equal(joined.scene.images, np.concatenate([parts[0].images, parts[1].images]))
+    assert joined.scene.names == ("a", "b")
+    assert joined.notes[0].startswith("2 of 2 files are joined in the frame of a.ply, by ")
+
+
+def test_a_view_of_another_place_is_left_out(parts: list[Scene]) -> None:
+    stranger = split_views(made_scene(5), SCALES)[1]
+    joined = join_scenes([stranger, *parts[:2]], PATHS[:3])
+    assert joined.used == (1, 2)
+    assert [fact["joined"] for fact in joined.facts] == [False, True, True]
+    assert "in the frame of b.ply" in joined.notes[0]
+    assert joined.notes[1].startswith("a.ply is left out")
+    with pytest.raises(SceneError, match="no two of 2 whose photos share enough of it; give photos that overlap"):
+        join_scenes([stranger, parts[0]], PATHS[:2])
+
+
+def test_files_of_several_views(place: Scene) -> None:
+    """Each with frame and unit of its own: two exports of one room."""
+    turn, shift = rotation(0.5, -1.0, 2.2), np.array([4.0, -3, 2])
+    other = move_scene(subset(place, [1, 3, 5]), Similarity(turn, 1.6, shift))
+    joined = join_scenes([subset(place, [0, 2, 4]), other], PATHS[:2])
+    true = place.cameras.viewmats[[0, 2, 4, 1, 3, 5]]
+    assert abs(joined.facts[1]["scale"] * 1.6 - 1) < 0.01
+    apart = camera_centres(joined.scene.cameras.viewmats) - camera_centres(true)
+    assert np.linalg.norm(apart, axis=1).max() < 0.03
+
+
+def test_without_photos_base_colours_are_compared(parts: list[Scene]) -> None:
+    bare = [replace(part, images=None) for part in parts[:3]]
+    assert join_scenes(bare, PATHS[:3]).used == (0, 1, 2)
+    joined = join_scenes([bare[0], parts[1]], PATHS[:2])
+    assert joined.scene.images is None
+    assert "some files have no photos" in joined.notes[-1]
+
+
+def test_the_last_bits_do_not_matter(parts: list[Scene], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Places are rounded, and what moves keypoints by a rounding error moves no place."""
+    places = register(parts[:2]).places
+    assert places[1].scale == round(places[1].scale, DIGITS)
+    find = keypoints._describe
+
+    def shaken(picture: np.ndarray, stretch: float) -> tuple[np.ndarray, np.ndarray]:
+        pixels, descriptors = find(picture, stretch)
+        return pixels * (1 + 2e-16), descriptors
+
+    monkeypatch.setattr(keypoints, "_describe", shaken)
+    other = register(parts[:2]).places[1]
+    for name in ("rotation", "scale", "shift"):
+        assert np.array_equal(getattr(other, name), getattr(places[1], name))
+
+
+def test_opencv_is_left_as_it_was(parts: list[Scene]) -> None:
+    before = cv2.useOptimized()
+    keypoints.find_keypoints(parts[0])
+    assert cv2.useOptimized() == before
+
+
+def test_files_that_cannot_be_joined(parts: list[Scene]) -> None:
+    loose = replace(parts[1], pixel_ids=None)
+    with pytest.raises(SceneError, match=r"b\.ply: expected one Gaussian per pixel"):
+        join_scenes([parts[0], loose], PATHS[:2])
+    small = replace(parts[1].cameras, width=160, height=240)
+    tall = replace(parts[1], cameras=small, images=parts[1].images.reshape(1, 240, 160, 3))
+    with pytest.raises(SceneError, match=r"expected views of 240 x 160 as in a\.ply, found 160 x 240"):
+        join_scenes([parts[0], tall], PATHS[:2])
+    g = parts[1].gaussians
+    shiny = replace(parts[1], gaussians=replace(g, shN=np.zeros((len(g), 3, 3), np.float32)))
+    with pytest.raises(SceneError, match=r"harmonics of degree 0 as in a\.ply, found 1"):
+        join_scenes([parts[0], shiny], PATHS[:2])
+
+
+def test_similarities_of_exact_points() -> None:
+    rng = np.random.default_rng(0)
+    p, turn, shift = rng.normal(size=(5, 4, 3)), rotation(0.4, -1.2, 2.0), np.array([3.0, -2, 1])
+    rotations, scales, shifts = fit_similarities(p, 1.7 * p @ turn.T + shift, np.ones((5, 4)))
+    assert np.allclose(rotations, turn)
+    assert np.allclose(scales, 1.7)
+    assert np.allclose(shifts, shift)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3, 4])
+def test_a_moved_scene_looks_the_same(degree: int) -> None:
+    """Gaussians, harmonics and cameras move together."""
+    rng, num = np.random.default_rng(1), (degree + 1) ** 2 - 1
+    n = 24
+    means = np.concatenate([rng.uniform(-1, 1, (n, 2)), rng.uniform(3, 5, (n, 1))], 1)
+    quats = rng.normal(size=(n, 4))
+    gaussians = Gaussians(
+        means=means.astype(np.float32),
+        quats=(quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32),
+        scales=rng.uniform(0.1, 0.5, (n, 3)).astype(np.float32),
+        opacities=rng.uniform(0.2, 0.9, n).astype(np.float32),
+        sh0=rng.normal(size=(n, 1, 3)).astype(np.float32),
+        shN=0.2 * rng.normal(size=(n, num, 3)).astype(np.float32),
+    )
+    K = np.array([[40.0, 0, 16], [0, 40, 12], [0, 0, 1]])
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[1, :3, 3] = (0.2, -0.1, 0.3)
+    scene = Scene(gaussians, pinholes(poses, K), None, None, ("a", "b"))
+    moved = move_scene(scene, Similarity(rotation(0.5, -1.0, 2.2), 1.6, np.array([4.0, -3, 2])))
+    before, after = (render(one.gaussians, one.cameras).images for one in (scene, moved))
+    assert np.abs(before - after).max() < 2e-4
+    if num:
+        plain = render(replace(moved.gaussians, shN=gaussians.shN), moved.cameras).images
+        assert np.abs(before - plain).max() > 0.02
+
+
+def pinholes(poses: np.ndarray, K: np.ndarray) -> Cameras:
+    return Cameras(poses, np.tile(K, (2, 1, 1)), 32, 24)
+
+
+def test_a_turn_back_gives_the_same_harmonics() -> None:
+    shN, turn = np.random.default_rng(2).normal(size=(7, 15, 3)).astype(np.float32), rotation(1.0, 0.3, -2.0)
+    assert np.allclose(turn_harmonics(turn_harmonics(shN, turn), turn.T), shN, atol=1e-5)

@@ -1,0 +1,128 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tiny_scene import Tiny, make_tiny
+
+from gsmerge.alignment import check_alignment, explain_misalignment
+from gsmerge.io.cameras.camera_file import CONVENTIONS, FLIP, W2C_OPENCV, from_viewmats, to_viewmats
+from gsmerge.types import Cameras
+
+
+def cameras_of(tiny: Tiny, viewmats: np.ndarray | None = None) -> Cameras:
+    w2c = tiny.w2c if viewmats is None else viewmats
+    return Cameras(w2c, np.tile(tiny.K, (3, 1, 1)), tiny.width, tiny.height)
+
+
+def valid_of(tiny: Tiny) -> np.ndarray:
+    return np.ones((3, tiny.height, tiny.width), bool)
+
+
+def test_a_scene_aligned_with_jitter(tiny: Tiny) -> None:
+    actual = check_alignment(tiny.gaussians, cameras_of(tiny), valid_of(tiny))
+    assert actual.ok
+    assert len(actual.median_px) == 3
+    assert all(0.05 < m < 0.25 for m in actual.median_px)  # the jitter is 0.2 px along each axis
+    assert actual.share_in_front == 1
+    assert actual.share_within_1px == 1
+
+
+def test_a_known_shift_is_measured(tiny: Tiny) -> None:
+    moved = cameras_of(tiny)
+    Ks = moved.Ks.copy()
+    Ks[1, 0, 2] += 3
+    actual = check_alignment(tiny.gaussians, replace(moved, Ks=Ks), valid_of(tiny))
+    assert not actual.ok
+    assert actual.median_px[1] == pytest.approx(3, abs=0.2)
+    assert actual.worst_px == actual.median_px[1]
+    assert actual.share_within_1px == pytest.approx(2 / 3, abs=0.01)
+
+
+def test_rows_that_are_set_aside_do_not_count(tiny: Tiny) -> None:
+    means, valid = tiny.gaussians.means.copy(), valid_of(tiny).reshape(-1)
+    means[: len(means) // 2] += 100
+    valid[: len(means) // 2] = False
+    actual = check_alignment(replace(tiny.gaussians, means=means), cameras_of(tiny), valid)
+    assert actual.ok
+    assert np.isnan(actual.median_px[0])
+
+
+def test_a_scene_behind_its_cameras_is_refused(tiny: Tiny) -> None:
+    behind = cameras_of(tiny, np.diag([-1.0, -1, -1, 1]) @ tiny.w2c)  # same pixels, but negative depth
+    actual = check_alignment(tiny.gaussians, behind, valid_of(tiny))
+    assert not actual.ok
+    assert actual.share_in_front == 0
+    assert actual.median_px == (np.inf,) * 3
+
+
+def test_large_views_are_sampled_in_all_columns() -> None:
+    tiny = make_tiny(200, 250)
+    actual = check_alignment(tiny.gaussians, cameras_of(tiny), valid_of(tiny))
+    assert actual.ok
+    means = tiny.gaussians.means.reshape(3, 250, 200, 3).copy()
+    means[:, :, 1::2] += 50  # every other column: a step of two pixels would miss it
+    odd = check_alignment(replace(tiny.gaussians, means=means.reshape(-1, 3)), cameras_of(tiny), valid_of(tiny))
+    assert odd.share_within_1px == pytest.approx(0.5, abs=0.02)
+
+
+def test_tiny_views_are_not_aligned_by_being_tiny(tiny: Tiny) -> None:
+    small = make_tiny(6, 5)
+    assert check_alignment(small.gaussians, cameras_of(small), valid_of(small)).ok
+    shuffled = small.gaussians[np.random.default_rng(0).permutation(len(small.gaussians))]
+    assert not check_alignment(shuffled, cameras_of(small), valid_of(small)).ok
+
+
+def test_a_wrong_number_of_rows(tiny: Tiny) -> None:
+    with pytest.raises(ValueError, match="expected 3 x 14 x 20 Gaussians, got 839"):
+        check_alignment(tiny.gaussians[:-1], cameras_of(tiny), valid_of(tiny))
+
+
+@pytest.mark.parametrize("true", CONVENTIONS)
+@pytest.mark.parametrize("assumed", CONVENTIONS)
+def test_the_fitting_convention_is_named(tiny: Tiny, true: tuple[str, str], assumed: tuple[str, str]) -> None:
+    if true == assumed:
+        return
+    wrong = cameras_of(tiny, to_viewmats(from_viewmats(tiny.w2c, true), assumed))
+    assert not check_alignment(tiny.gaussians, wrong, valid_of(tiny)).ok
+    words = explain_misalignment(tiny.gaussians, wrong, valid_of(tiny), assumed)
+    assert words is not None
+    assert f"read as {true[0]} matrices with {true[1]} axes" in words
+    assert f"this format has {assumed[0]} with {assumed[1]} axes" in words
+
+
+def test_conventions_are_inverse_to_each_other(tiny: Tiny) -> None:
+    for convention in CONVENTIONS:
+        assert np.allclose(to_viewmats(from_viewmats(tiny.w2c, convention), convention), tiny.w2c)
+    assert np.allclose(to_viewmats(tiny.c2w @ FLIP, ("camera-to-world", "OpenGL")), tiny.w2c)
+
+
+def test_other_readings_are_named(tiny: Tiny) -> None:
+    good, valid, n = cameras_of(tiny), valid_of(tiny), len(tiny.gaussians)
+
+    def explain(cameras: Cameras = good, rows: np.ndarray | None = None) -> str | None:
+        gaussians = tiny.gaussians if rows is None else tiny.gaussians[rows]
+        assert not check_alignment(gaussians, cameras, valid).ok
+        return explain_misalignment(gaussians, cameras, valid, W2C_OPENCV)
+
+    flipped = tiny.w2c.copy()
+    flipped[:, 1] *= -1
+    assert "y axis flipped" in explain(cameras_of(tiny, flipped))
+    mirrored = tiny.w2c.copy()
+    mirrored[:, 0] *= -1
+    assert "x axis flipped" in explain(cameras_of(tiny, mirrored))
+    scaled = tiny.w2c.copy()
+    scaled[:, :3, 3] *= 1.7
+    assert "positions scaled by 0.588" in explain(cameras_of(tiny, scaled))
+    transposed = tiny.w2c.copy()
+    transposed[:, :3, :3] = tiny.w2c[:, :3, :3].transpose(0, 2, 1)
+    transposed[:, :3, 3] = -np.einsum("vij,vj->vi", transposed[:, :3, :3], tiny.c2w[:, :3, 3])
+    assert "rotations transposed" in explain(cameras_of(tiny, transposed))
+    assert "width and height swapped" in explain(replace(good, width=tiny.height, height=tiny.width))
+
+    rows = np.arange(n).reshape(3, tiny.height, tiny.width)
+    assert "view fastest" in explain(rows=rows.transpose(1, 2, 0).reshape(-1))
+    assert "column-major" in explain(rows=rows.transpose(0, 2, 1).reshape(-1))
+    assert "reverse order" in explain(rows=rows[::-1].reshape(-1))
+    assert explain(rows=np.random.default_rng(0).permutation(n)) is None

@@ -1,0 +1,161 @@
+"""Scenes in blocks: as good and as large as in one piece, cut where they meet."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import scenes
+
+from gsmerge import CompactOptions, compact
+from gsmerge.budget import DEVICES
+from gsmerge.errors import UsageError
+from gsmerge.facts.prepare import canonicalise
+from gsmerge.facts.views import subset
+from gsmerge.fit import FitOptions, fit
+from gsmerge.fit.photo_sizes import fit_photos
+from gsmerge.plan import choose_blocks
+from gsmerge.types import Cameras, Scene
+
+SETTINGS: dict[str, Any] = {"checkpoint": "none", "superpixels": "10%", "fit_steps": 40, "threads": 1}
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """Eight views along a wall."""
+    return scenes.make_scene(scenes.wall(), scenes.arc(8, 40, 30, span=2.4, start=-1.2), noise=0.01)
+
+
+def along(places: np.ndarray) -> Scene:
+    """Views along a wall of eight views' width, at places from 0 to 1."""
+    viewmats = np.tile(np.eye(4), (len(places), 1, 1))
+    viewmats[:, 0, 3] = -20 * places
+    cameras = Cameras(viewmats, scenes.intrinsics(len(places), 40, 30), 40, 30)
+    return scenes.make_scene(scenes.wall(), cameras, noise=0.01)
+
+
+def test_blocks_are_as_good_as_one_piece() -> None:
+    places = np.linspace(0, 1, 36)
+    scene, between = along(places), along((places[1:] + places[:-1]) / 2)
+    whole, parts = (compact(scene, blocks=blocks, **{**SETTINGS, "fit_steps": 600}) for blocks in ("none", 3))
+    assert len(parts.gaussians) == pytest.approx(len(whole.gaussians), rel=0.1)
+    one, other = (scenes.psnr_of(result.gaussians, between) for result in (whole, parts))
+    assert other > one - 0.3
+    scenes.assert_invariants(parts.gaussians, scene)
+    blocks = parts.report.choices["blocks"]
+    assert [block["views"] for block in blocks] == pytest.approx([12] * 3, abs=2)
+    assert all(block["shared_views"] for block in blocks)
+    scores = [block["psnr_input_views"] for block in blocks]
+    assert parts.report.psnr_after == pytest.approx(np.average(scores, weights=[block["views"] for block in blocks]))
+    each = [scenes.psnr_of(parts.gaussians, subset(scene, [view])) for view in range(len(scene))]
+    assert min(each) < parts.report.psnr_after < max(each)  # of some views
+    assert parts.report.num_output == len(parts.gaussians)
+
+
+def test_a_budget_is_met_exactly(scene: Scene) -> None:
+    result = compact(scene, blocks=2, budget=700, **SETTINGS)
+    assert len(result.gaussians) == 700
+
+
+def test_a_device_limits_the_whole(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As many as it draws in all, not in each block; fewer where superpixels ask for fewer."""
+    monkeypatch.setitem(DEVICES, "quest3", 600)
+    assert len(compact(scene, blocks=2, budget="quest3", **SETTINGS).gaussians) == 600
+    free = compact(scene, blocks=2, **SETTINGS)
+    monkeypatch.setitem(DEVICES, "quest3", 5000)
+    assert scenes.identical(compact(scene, blocks=2, budget="quest3", **SETTINGS).gaussians, free.gaussians)
+
+
+def test_threads_do_not_change_a_bit(scene: Scene) -> None:
+    one, two = (compact(scene, blocks=2, **{**SETTINGS, "threads": threads}) for threads in (1, 2))
+    assert scenes.identical(one.gaussians, two.gaussians)
+
+
+def test_without_photos(scene: Scene) -> None:
+    result = compact(replace(scene, images=None), blocks=2, **SETTINGS)
+    assert result.report.psnr_after is None
+    assert len(result.gaussians)
+
+
+@pytest.mark.parametrize("checkpoint", ["none", "shipped"])
+def test_without_a_fit(scene: Scene, checkpoint: str) -> None:
+    """Each Gaussian is in one block, and they show the photos as those of one piece do."""
+    settings = {**SETTINGS, "checkpoint": checkpoint, "fit": "none"}
+    whole, result = (compact(scene, blocks=blocks, **settings) for blocks in ("none", 2))
+    scenes.assert_invariants(result.gaussians, scene)
+    assert scenes.psnr_of(result.gaussians, scene) > scenes.psnr_of(whole.gaussians, scene) - 1
+    assert len(np.unique(result.gaussians.means, axis=0)) == len(result.gaussians)
+
+
+def test_a_block_without_photos_that_show_it(scene: Scene) -> None:
+    """It is merged, and its neighbour is fitted."""
+    images = scene.images.copy()
+    images[:4] = np.random.default_rng(0).random(images[:4].shape, np.float32)
+    result = compact(replace(scene, images=images), blocks=2, **SETTINGS)
+    scenes.assert_invariants(result.gaussians, scene)
+    assert any("photo" in note for note in result.report.notes)
+
+
+def test_views_that_repeat_others(scene: Scene) -> None:
+    """They count once, wherever they are."""
+    again = subset(scene, [0, 0, 1, 2, 3, 3, 4, 5, 6, 7, 7])
+    result = compact(again, blocks=2, **SETTINGS)
+    scenes.assert_invariants(result.gaussians, scene)
+    assert result.report.choices["seams"]["views"] <= len(scene)
+
+
+def test_small_scenes_stay_in_one_piece(scene: Scene) -> None:
+    assert choose_blocks(scene, CompactOptions()) == 1
+    assert choose_blocks(scene, CompactOptions().with_settings({"blocks": 4})) == 4
+    assert choose_blocks(scene, CompactOptions().with_settings({"blocks": "none"})) == 1
+
+
+def test_large_scenes_are_cut(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gsmerge.facts.partition.WHOLE_GAUSSIANS", 5000)
+    monkeypatch.setattr("gsmerge.facts.partition.BLOCK_GAUSSIANS", 4000)
+    assert choose_blocks(scene, CompactOptions()) == 3
+    assert choose_blocks(scene, CompactOptions().with_settings({"levels": 2})) == 1
+
+
+@pytest.mark.parametrize(
+    ("settings", "problem"),
+    [
+        ({"quality": "30dB"}, "quality 30dB"), ({"budget": "auto"}, "budget auto"), ({"levels": 2}, "levels"),
+        ({"method": "voxel"}, "method voxel"), ({"poses": "free"}, "poses free"), ({"drop_sky": True}, "drop_sky"),
+        ({"crop": "sphere:0,0,3,2"}, "crop"), ({"drop_floaters": True}, "drop_floaters"),
+    ],
+)  # fmt: skip
+def test_what_needs_one_piece(scene: Scene, settings: dict[str, Any], problem: str) -> None:
+    with pytest.raises(UsageError, match=f"blocks 2: expected one piece .* with {problem}"):
+        compact(scene, blocks=2, **settings)
+
+
+def test_more_blocks_than_views(scene: Scene) -> None:
+    with pytest.raises(UsageError, match="blocks 9: expected at most one for each of 8 views"):
+        compact(scene, blocks=9)
+
+
+def test_unaligned_scenes_have_no_blocks(scene: Scene) -> None:
+    unaligned = replace(scene, pixel_ids=None)
+    assert choose_blocks(unaligned, CompactOptions()) == 1
+    with pytest.raises(UsageError, match="without one Gaussian per pixel"):
+        compact(unaligned, blocks=2)
+
+
+def test_what_is_fixed_stays(scene: Scene) -> None:
+    """To the bit, beside Gaussians that a fit moves."""
+    canonical, _ = canonicalise(scene)
+    start = compact(scene, fit="none", **{**SETTINGS, "superpixels": "5%"}).gaussians
+    fixed = np.arange(len(start)) % 2 == 0
+    settings = FitOptions(fit_steps=20, judged=False, min_contribution=0.0)
+    photos = fit_photos(canonical, settings)
+    frame_start = replace(start, means=start.means.astype(np.float32))
+    fitted, report = fit(frame_start, photos, settings, len(start), exact=True, fixed=fixed)
+    assert report is not None
+    assert report.accepted
+    for name in ("means", "sh0"):
+        moved = (getattr(fitted, name) != getattr(frame_start, name)).reshape(len(start), -1).any(1)
+        assert moved[~fixed].any()
+    assert np.abs(fitted.means - frame_start.means)[fixed].max() == 0

@@ -1,0 +1,197 @@
+"""How many Gaussians: limits, the scene's curve, and the search for a quality."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import cast
+
+import pytest
+
+from gsmerge.budget import DEVICES, BudgetOptions, exact_count, max_allowed, parse_share, share_text
+from gsmerge.compaction.search import (
+    MAX_RUNS,
+    CountSearch,
+    CurvePoint,
+    count_within,
+    curve_knee,
+    level_counts,
+    rungs,
+    search_count,
+)
+from gsmerge.facts.prepare import Prepared
+from gsmerge.plan import Plan
+
+
+def points(*values: tuple[int, float, float]) -> list[CurvePoint]:
+    return [CurvePoint(*value) for value in values]
+
+
+def make_plan(
+    target_psnr: float | None = None, least: int = 1, most: int = 10**6, default: int | None = None, levels: int = 1
+) -> Plan:
+    """What a search reads of a plan."""
+    limits = SimpleNamespace(min_count=least, max_count=most, default=most if default is None else default)
+    return cast("Plan", SimpleNamespace(target_psnr=target_psnr, limits=limits, levels=levels))
+
+
+@pytest.mark.parametrize(
+    ("settings", "exact", "most"),
+    [
+        ({}, None, 50_000_000),
+        ({"budget": "2%"}, 1_000_000, 1_000_000),
+        ({"budget": 400}, 400, 400),
+        ({"budget": "20KB"}, 287, 287),
+        ({"budget": "auto"}, None, 50_000_000),
+        ({"budget": "quest3"}, None, DEVICES["quest3"]),
+    ],
+)
+def test_limits(settings: dict[str, object], exact: int | None, most: int) -> None:
+    options = BudgetOptions(**settings)
+    assert exact_count(options, 50_000_000, 0) == exact
+    assert max_allowed(options, 50_000_000, 0) == most
+
+
+def test_a_small_scene_is_its_own_limit() -> None:
+    assert max_allowed(BudgetOptions(budget="mobile"), 777, 0) == 777
+    assert exact_count(BudgetOptions(budget=9999), 777, 0) == 777
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"budget": "phone"}, "budget: expected .* auto or quest3, mobile, desktop, got 'phone'"),
+        ({"budget": 0}, "budget: expected at least one Gaussian"),
+        ({"quality": "0dB"}, 'quality: expected a PSNR as "30dB" or a loss as "-0.2dB"'),
+        ({"quality": "30"}, "quality: expected a PSNR"),
+        ({"quality": "nandB"}, "quality: expected a PSNR"),
+        ({"levels": 0}, "levels: expected 1 to 8"),
+        ({"levels": 9}, "levels: expected 1 to 8"),
+    ],
+)
+def test_refused(settings: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        BudgetOptions(**settings)
+
+
+def test_qualities() -> None:
+    psnr, loss, best = (BudgetOptions(quality=text) for text in ("30dB", "-0.2 db", "-0dB"))
+    assert (psnr.target_psnr, psnr.max_drop) == (30.0, None)
+    assert (loss.target_psnr, loss.max_drop) == (None, 0.2)
+    assert (best.target_psnr, best.max_drop) == (None, 0.0)
+
+
+@pytest.mark.parametrize("share", [0.044, 0.02, 1, 1e-6, 0.087, 1 / 3])
+def test_shares_are_exact(share: float) -> None:
+    assert parse_share(share_text(share)) == share
+
+
+def test_rungs_rise_within_their_limits() -> None:
+    assert rungs((0.25, 0.5, 1.0, 2.0), 1000, 10, 5000) == [250, 500, 1000, 2000]
+    assert rungs((0.25, 0.5, 1.0, 2.0), 1000, 300, 900) == [300, 500, 900]
+    assert rungs((0.25, 1.0), 1000, 100, 100) == [100]
+
+
+def test_levels_end_where_a_view_would_have_none() -> None:
+    assert level_counts(6400, make_plan(levels=4, least=12)) == [1600, 400, 100]
+    assert level_counts(6400, make_plan(levels=4, least=200)) == [1600, 400]
+    assert level_counts(6400, make_plan(levels=1, least=12)) == []
+
+
+def test_count_within_is_read_off_the_curve() -> None:
+    curve = points((100, 20.0, 0), (200, 22.0, 0), (400, 23.0, 0), (800, 22.5, 0))
+    assert count_within(curve, 0.0) == 400
+    assert count_within(curve, 0.5) == math.ceil(200 * 2**0.5)
+    assert count_within(curve, 1.0) == 200
+    assert count_within(curve, 99.0) == 100
+    assert count_within(curve[:1], 0.0) == 100
+
+
+def test_count_within_falls_as_more_may_be_lost() -> None:
+    curve = points((100, 20.0, 0), (200, 24.0, 0), (400, 23.5, 0), (800, 26.0, 0), (1600, 26.1, 0))
+    counts = [count_within(curve, drop / 10) for drop in range(80)]
+    assert counts == sorted(counts, reverse=True)
+
+
+def test_knee_of_a_curve_that_stops_rising() -> None:
+    flat_after_400 = points((100, 20, 0.5), (200, 22, 0.6), (400, 23, 0.7), (800, 23, 0.7), (1600, 23, 0.7))
+    assert 283 <= curve_knee(flat_after_400) <= 566  # between the middles of the steep and of the flat part
+    assert curve_knee(points((100, 20, 0.5), (200, 22, 0.6), (400, 24, 0.7))) == 400
+    assert curve_knee(points((100, 24, 0.7), (200, 22, 0.6), (400, 20, 0.5))) == 100
+    assert curve_knee(points((100, 24, 0.7))) == 100
+
+
+def test_knee_weighs_structure_against_psnr() -> None:
+    """A blurred scene can have the better PSNR; it is not the knee while structure still grows."""
+    psnr_falls = [(100, 22.0), (200, 21.9), (400, 21.8), (800, 21.7)]
+    without = points(*((count, psnr, 0.7) for count, psnr in psnr_falls))
+    grows = points(*((count, psnr, 0.60 + 0.04 * i) for i, (count, psnr) in enumerate(psnr_falls)))
+    assert curve_knee(without) == 100
+    assert curve_knee(grows) == 800
+
+
+@pytest.mark.parametrize("function", [lambda p: count_within(p, 0.1), curve_knee])
+def test_a_curve_needs_a_point(function: Callable[[list[CurvePoint]], int]) -> None:
+    with pytest.raises(ValueError, match="expected at least one, got none"):
+        function([])
+
+
+def rises(count: int) -> float:
+    """2 dB per doubling."""
+    return 20 + 2 * math.log2(count / 1000)
+
+
+def search(curve: Callable[[int], float], target: float, start: int, least: int, most: int) -> CountSearch:
+    """Run a search on a curve that is known, instead of building scenes."""
+    counts = CountSearch(make_plan(target_psnr=target, least=least, most=most), start)
+    for count in counts:
+        counts.add(SimpleNamespace(count=count, psnr=curve(count), gaussians=range(count)))
+    return counts
+
+
+@pytest.mark.parametrize("start", [10, 300, 1000, 4000, 90_000])
+@pytest.mark.parametrize("target", [17.0, 20.0, 23.3, 27.0])
+def test_search_finds_the_fewest(start: int, target: float) -> None:
+    actual = search(rises, target, start, 10, 100_000)
+    fewest = 1000 * 2 ** ((target - 20) / 2)
+    best = actual.best
+    assert actual.unmet is None
+    assert best.psnr == rises(best.count) >= target
+    assert best.count <= max(2.5 * fewest, 10)
+    assert len(actual.tried) <= MAX_RUNS
+
+
+def test_search_near_the_answer_ends_close_to_it() -> None:
+    count = search(rises, 24.0, 3000, 10, 100_000).best.count
+    assert 4000 <= count <= 4000 * 1.3
+
+
+def test_search_says_when_it_is_out_of_reach() -> None:
+    actual = search(rises, 40.0, 1000, 10, 5000)
+    assert (
+        actual.unmet == f"quality: 40 dB was asked for, the input views reach {rises(5000):.2f} dB with 5000 Gaussians"
+    )
+    assert (actual.best.count, actual.best.psnr) == (5000, rises(5000))
+
+
+def test_search_keeps_the_best_of_a_curve_that_falls() -> None:
+    actual = search(lambda count: 20 - abs(math.log2(count / 1000)), 25.0, 1000, 10, 5000)
+    assert actual.unmet is not None
+    assert actual.best.count == 1000
+
+
+def test_search_stays_within_its_limits() -> None:
+    assert all(700 <= count <= 900 for count in search(rises, 25.0, 800, 700, 900).tried)
+    assert all(count >= 700 for count in search(rises, 1.0, 5000, 700, 9000).tried)
+
+
+@pytest.mark.parametrize(("default", "first"), [(500, 700), (800, 800), (100_000, 900)])
+def test_search_begins_within_its_limits(default: int, first: int) -> None:
+    plan = make_plan(target_psnr=25.0, least=700, most=900, default=default)
+    assert search_count(cast("Prepared", None), plan).first == first
+
+
+def test_one_count_is_built_once_where_no_quality_is_asked_for() -> None:
+    assert list(CountSearch(make_plan(), 300)) == [300]
+    assert list(CountSearch(make_plan(), None)) == [None]

@@ -1,0 +1,159 @@
+"""Views that do not agree with each other are found and moved; those that agree are left alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import motions
+import numpy as np
+import pytest
+import scenes
+
+from gsmerge import CompactOptions, Scene, compact
+from gsmerge.facts.align_views import align_views
+from gsmerge.facts.prepare import prepare
+from gsmerge.fit import Fitted
+from gsmerge.geometry import motion_matrices, motion_vectors, pose_changes, project, quat_to_rotmat
+from gsmerge.geometry import without_common_motion as without_common
+from gsmerge.plan import make_plan
+from gsmerge.runtime.threads import use_threads
+from gsmerge.stages.clean import CleanOptions, clean_to_count
+
+VIEWS = range(5)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    made = scenes.make_scene(scenes.room(), scenes.arc(5, 160, 120))
+    back = -np.median(made.gaussians.means[:, 2])  # the canonical frame is about the scene's middle
+    return scenes.move(made, np.eye(3), 0.5, np.array([0, 0, 0.5 * back]))
+
+
+def worst_error(scene: Scene, truth: Scene) -> tuple[float, float]:
+    """Degrees and distances between relative poses."""
+    relative = [one.cameras.viewmats @ np.linalg.inv(one.cameras.viewmats[2]) for one in (scene, truth)]
+    degrees, distances = pose_changes(*relative)
+    return float(degrees.max()), float(distances.max())
+
+
+def test_moved_gaussians_stay_at_their_pixels(scene: Scene) -> None:
+    moved = motions.disagreeing(scene)
+    for view in VIEWS:
+        rows = slice(view * scene.pixels_per_view, (view + 1) * scene.pixels_per_view)
+        (before,), _ = project(scene.gaussians.means[rows], scene.cameras[[view]])
+        (after,), _ = project(moved.gaussians.means[rows], moved.cameras[[view]])
+        np.testing.assert_allclose(before, after, atol=1e-2)
+        axes = [
+            one.cameras.viewmats[view, :3, :3] @ quat_to_rotmat(one.gaussians.quats[rows]) for one in (scene, moved)
+        ]
+        np.testing.assert_allclose(*axes, atol=1e-5)
+
+
+def test_views_that_agree_are_left_alone(scene: Scene) -> None:
+    assert align_views(scene, VIEWS) is None
+
+
+@pytest.mark.parametrize("views", [slice(None), slice(1, 2)], ids=["all", "one"])
+def test_views_are_moved_to_where_they_agree(views: slice, scene: Scene) -> None:
+    wrong = motions.disagreeing(scene, views=views)
+    before = worst_error(wrong, scene)
+    found = align_views(wrong, VIEWS)
+    degrees, distance = worst_error(found, scene)
+    assert degrees < 0.25 * before[0]
+    assert distance < 0.25 * before[1]
+    common = motion_vectors(wrong.cameras.viewmats, found.cameras.viewmats)
+    np.testing.assert_allclose(np.median(common, 0), 0, atol=2e-3)
+
+
+def test_views_that_are_left_out_stay(scene: Scene) -> None:
+    wrong = motions.disagreeing(scene)
+    found = align_views(wrong, range(4))
+    last = slice(4 * scene.pixels_per_view, None)
+    np.testing.assert_allclose(found.cameras.viewmats[4], wrong.cameras.viewmats[4], atol=1e-12)
+    np.testing.assert_allclose(found.gaussians.means[last], wrong.gaussians.means[last], atol=1e-6)
+    common = motion_vectors(wrong.cameras.viewmats, found.cameras.viewmats)
+    np.testing.assert_allclose(np.median(common[:4], 0), 0, atol=2e-3)
+
+
+def test_cameras_of_repeated_views_and_of_views_that_share_one(scene: Scene) -> None:
+    viewmats = scene.cameras.viewmats.copy()
+    viewmats[1] = viewmats[0]  # of other Gaussians and another photo
+    shared = scenes.take_views(replace(scene, cameras=replace(scene.cameras, viewmats=viewmats)), [0, 1, 0, 2])
+    options = CompactOptions().with_settings({"fit": "none", "poses": "fixed"})
+    prepared = prepare(shared, options.prepare)
+    assert prepared.repeated == (0, 1, 0, 2)
+    assert prepared.final_cameras() is shared.cameras
+    placed = motions.random_motions(3, 1.0, 0.1) @ prepared.scene.cameras.viewmats
+    found = prepared.with_cameras(replace(prepared.scene.cameras, viewmats=placed)).final_cameras()
+    np.testing.assert_allclose(prepared.frame.enter_cameras(found).viewmats, placed[[0, 1, 0, 2]], atol=1e-9)
+    assert make_plan(replace(prepared, photo_views=(0, 2)), options).scored_views == (0, 2, 3)
+
+
+@pytest.mark.parametrize("cameras", [True, False])
+def test_nothing_is_moved_without_photos(cameras: bool, scene: Scene) -> None:
+    places, names = (scene.cameras, scene.names) if cameras else (scene.cameras[[]], ())
+    loose = Scene(scene.gaussians[::8], places, None, None, names)
+    result = compact(loose, poses="free", budget=200, fit_steps=4)
+    assert "poses" not in result.report.choices
+    np.testing.assert_array_equal(result.cameras.viewmats, places.viewmats)
+
+
+def test_all_levels_have_the_cameras_of_the_finest(scene: Scene) -> None:
+    result = compact(scene, poses="free", fit_steps=12, superpixels="2%", levels=2)
+    assert np.abs(result.cameras.viewmats - scene.cameras.viewmats).max() > 0
+    np.testing.assert_array_equal(result.coarser[0].cameras.viewmats, result.cameras.viewmats)
+
+
+def test_clean_up_keeps_the_poses_of_the_fit(scene: Scene) -> None:
+    moved = replace(scene.cameras, viewmats=scene.cameras.viewmats + 0.01)
+
+    def make(count: int | None) -> Fitted:
+        return Fitted(scene.gaussians, moved, None)
+
+    cleaned = clean_to_count(make, None, CleanOptions(drop_floaters=True), prepare(scene))
+    assert cleaned.cameras is moved
+
+
+def test_the_same_with_one_thread(scene: Scene) -> None:
+    wrong, found = motions.disagreeing(scene), []
+    for threads in (1, 2):
+        with use_threads(threads):
+            found.append(align_views(wrong, VIEWS))
+    np.testing.assert_array_equal(found[0].cameras.viewmats, found[1].cameras.viewmats)
+    np.testing.assert_array_equal(found[0].gaussians.means, found[1].gaussians.means)
+
+
+@pytest.mark.parametrize("size", [(12, 8), (40, 1)])
+def test_nothing_can_be_told_of_tiny_photos(size: tuple[int, int]) -> None:
+    tiny = scenes.make_scene(scenes.room(), scenes.arc(3, *size))
+    assert align_views(tiny, range(3), always=True) is None
+
+
+def test_one_view_agrees_with_itself(scene: Scene) -> None:
+    assert align_views(scenes.take_views(scene, [0]), [0], always=True) is None
+
+
+def test_no_motion_in_common() -> None:
+    start = np.tile(np.eye(4), (3, 1, 1))
+    together = start @ motion_matrices(np.tile([0.1, 0.2, -0.1, 1.0, 2.0, 3.0], (3, 1)))
+    np.testing.assert_allclose(without_common(start, together, np.mean), start, atol=1e-12)
+
+
+def test_compacting_says_how_far_views_were_moved(scene: Scene) -> None:
+    wrong, settings = motions.disagreeing(scene), {"effort": "draft", "superpixels": "2%", "match": "overlap"}
+    fixed, auto = (compact(wrong, **settings, poses=poses) for poses in ("fixed", "auto"))
+    assert "poses" not in fixed.report.choices
+    np.testing.assert_array_equal(fixed.cameras.viewmats, wrong.cameras.viewmats)
+    assert [move["view"] for move in auto.report.choices["poses"]] == list(wrong.names)
+    assert sum("cameras were moved by" in note for note in auto.report.notes) == 1
+    assert worst_error(replace(wrong, cameras=auto.cameras), scene)[0] < 0.25 * worst_error(wrong, scene)[0]
+    assert len(auto.gaussians) < 0.7 * len(fixed.gaussians)  # what two views show is merged where they agree on it
+    assert auto.report.psnr_after > fixed.report.psnr_after - 0.2
+
+
+def test_right_poses_are_the_same_run(scene: Scene) -> None:
+    settings = {"fit_steps": 12, "superpixels": "2%"}
+    fixed, auto = (compact(scene, **settings, poses=poses) for poses in ("fixed", "auto"))
+    np.testing.assert_array_equal(fixed.gaussians.means, auto.gaussians.means)
+    np.testing.assert_array_equal(fixed.gaussians.sh0, auto.gaussians.sh0)
+    np.testing.assert_array_equal(auto.cameras.viewmats, scene.cameras.viewmats)

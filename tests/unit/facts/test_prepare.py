@@ -1,0 +1,97 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+
+from gsmerge import Scene
+from gsmerge.facts.prepare import canonicalise, prepare, scene_frame
+from gsmerge.geometry import project
+from gsmerge.types import grid_ids
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return scenes.make_scene(scenes.room(), scenes.arc(2, 32, 24))
+
+
+def moved(scene: Scene, factor: float, shift: list[float]) -> Scene:
+    return scenes.move(scene, np.eye(3), factor, np.array(shift))
+
+
+def test_unit_is_a_power_of_two_near_the_median_depth(scene: Scene) -> None:
+    for factor in (1e-4, 1.0, 3.0, 1e4):
+        large = moved(scene, factor, [0, 0, 0])
+        unit = scene_frame(large).unit
+        depths = project(large.gaussians.means, large.cameras)[1]
+        own = np.concatenate([depths[0, : scene.pixels_per_view], depths[1, scene.pixels_per_view :]])
+        assert np.log2(unit) % 1 == 0
+        assert 2**-0.51 < float(np.median(own)) / unit < 2**0.51
+
+
+def test_leave_undoes_enter(scene: Scene) -> None:
+    far = moved(scene, 7.0, [4e5, 5e6, 100])
+    canonical, frame = canonicalise(far)
+    assert canonical.gaussians.means.dtype == np.float32
+    assert np.abs(canonical.gaussians.means).max() < 10
+    back = frame.leave(canonical.gaussians)
+    assert back.means.dtype == np.float64
+    assert np.abs(back.means - far.gaussians.means).max() < 1e-5
+    assert np.array_equal(back.scales, far.gaussians.scales)  # a power of two changes no bit
+    for name in ("quats", "opacities", "sh0", "shN"):
+        assert np.array_equal(getattr(back, name), getattr(far.gaussians, name))
+
+
+def test_projections_do_not_change(scene: Scene) -> None:
+    far = moved(scene, 0.01, [4e5, 5e6, 100])
+    canonical, frame = canonicalise(far)
+    before, after = project(far.gaussians.means, far.cameras), project(canonical.gaussians.means, canonical.cameras)
+    assert np.abs(before[0] - after[0]).max() < 1e-2  # pixels; 5e6 and 0.03 share 15 digits
+    np.testing.assert_allclose(after[1] * frame.unit, before[1], rtol=1e-4)
+
+
+def test_flyaways_and_invalid_rows_do_not_move_the_frame(scene: Scene) -> None:
+    means, valid = scene.gaussians.means.copy(), scene.valid.copy()
+    means[::100] = 1e8
+    means[50::100] = 0
+    valid.reshape(-1)[50::100] = False
+    frame = scene_frame(replace(scene, gaussians=replace(scene.gaussians, means=means), pixel_ids=grid_ids(valid)))
+    assert frame.unit == scene_frame(scene).unit
+    assert np.abs(frame.origin - scene_frame(scene).origin).max() < 0.3
+
+
+def test_one_valid_row(scene: Scene) -> None:
+    mask = np.zeros_like(scene.valid)
+    mask.reshape(-1)[7] = True
+    frame = scene_frame(replace(scene, pixel_ids=grid_ids(mask)))
+    assert np.allclose(frame.origin, scene.gaussians.means[7])
+    assert frame.unit > 0
+
+
+def test_few_valid_rows_of_many() -> None:
+    """Only some rows are looked at; they must be valid ones."""
+    large = scenes.make_scene(scenes.wall(), scenes.arc(1, 512, 256))
+    mask = np.zeros_like(large.valid)
+    mask.reshape(-1)[1::2] = True
+    frame = scene_frame(replace(large, pixel_ids=grid_ids(mask)))
+    assert np.abs(frame.origin - scene_frame(large).origin).max() < 0.1
+
+
+def test_no_valid_row_is_refused(scene: Scene) -> None:
+    with pytest.raises(ValueError, match="expected at least one valid Gaussian"):
+        scene_frame(replace(scene, pixel_ids=grid_ids(np.zeros_like(scene.valid))))
+
+
+def test_gaussians_in_the_cameras_plane_have_a_unit() -> None:
+    flat = scenes.make_scene(scenes.wall(), scenes.arc(1, 8, 6))
+    still = replace(flat, gaussians=replace(flat.gaussians, means=flat.cameras.centres.repeat(48, 0)))
+    assert scene_frame(still).unit == 1.0
+
+
+def test_renders_stand_in_for_photos_where_no_pixels_are_known_alone(scene: Scene) -> None:
+    """A fit to renders of one Gaussian per pixel would keep its errors."""
+    bare = replace(scene, images=None)
+    assert prepare(bare).scene.images is None
+    assert prepare(replace(bare, pixel_ids=None)).scene.images is not None

@@ -1,0 +1,29 @@
+"""A small room whose photos show exactly the Gaussians that are known."""
+
+from __future__ import annotations
+
+import pytest
+import scenes
+
+from gsmerge import Gaussians, Scene
+from gsmerge.raster.photos import Photos
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return scenes.self_made(0)[0]
+
+
+@pytest.fixture(scope="module")
+def truth() -> Gaussians:
+    return scenes.self_made(0)[1]
+
+
+@pytest.fixture(scope="module")
+def photos(scene: Scene) -> tuple[Photos, Photos]:
+    return scenes.pair_of(scene)
+
+
+@pytest.fixture(scope="module")
+def noise(photos: tuple[Photos, Photos]) -> tuple[Photos, Photos]:
+    return scenes.noise_for(photos)

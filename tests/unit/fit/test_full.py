@@ -1,0 +1,340 @@
+"""The full fit, on a tiny scene whose photos some known Gaussians made."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+
+from gsmerge import Gaussians, Scene
+from gsmerge.fit import FitOptions, start_share
+from gsmerge.fit import full as full_module
+from gsmerge.fit.fit_options import Tuning
+from gsmerge.fit.fit_state import start_state
+from gsmerge.fit.full import (
+    Look,
+    affordable_steps,
+    fit_full,
+    holdout_score,
+    initial_scores,
+    plan_run,
+    step_sizes,
+)
+from gsmerge.fit.survey import survey_photos
+from gsmerge.raster import plan_view, splat_adjoint
+from gsmerge.raster.photos import Photos
+from gsmerge.types import SH_C0
+
+Pair = tuple[Photos, Photos]
+QUICK = FitOptions(fit_steps=30, holdout=0.2)
+LONG = FitOptions(fit_steps=160, holdout=0.2)
+
+
+# what it reaches
+
+
+def test_perturbed_scene_comes_back(scene: Scene, truth: Gaussians, photos: Pair) -> None:
+    start = scenes.spoil(truth)
+    result, report = fit_full(start, photos, replace(LONG, dropout=0.0))
+    assert (report.method, report.accepted, report.steps) == ("full", True, 160)
+    assert report.holdout_after > report.holdout_before + 4
+    assert scenes.psnr_of(result, scene) > scenes.psnr_of(start, scene) + 6
+    assert len(result) == len(start)
+    scenes.assert_invariants(result, scene)
+
+
+def test_moves_stay_in_the_box(truth: Gaussians, photos: Pair) -> None:
+    box = {"max_mean_shift": 0.5, "max_scale_change": 0.1, "max_opacity_change": 0.2, "min_scale": 0}
+    start = scenes.spoil(truth)
+    result, report = fit_full(start, photos, scenes.tuned(QUICK, **box))
+    assert report.accepted
+    unit = np.sort(start.scales, 1)[:, 1:].prod(1) ** 0.5
+    assert (np.linalg.norm(result.means - start.means, axis=1) <= 0.501 * unit).all()
+    assert float(np.abs(np.log(result.scales / start.scales)).max()) <= 0.1001
+    before, after = (np.log(a / (1 - a)) for a in (g.opacities.astype(np.float64) for g in (start, result)))
+    assert float(np.abs(after - before).max()) <= 0.2001
+
+
+def test_what_one_photo_shows_has_a_smaller_box(truth: Gaussians, photos: Pair) -> None:
+    state, least = start_state(truth), QUICK.tuning.single_view_share
+
+    def shares_of(some: Pair) -> np.ndarray:
+        plan = plan_run(some, QUICK, 0)
+        psnr, actual, _ = initial_scores(survey_photos(truth, some), plan)
+        assert psnr == holdout_score(state, plan)
+        return actual
+
+    def with_views(views: list[int]) -> Pair:
+        return tuple(Photos(p.images[views], p.viewmats[views], p.Ks[views], p.eps2d) for p in photos)
+
+    box_shares, alone = shares_of(photos), with_views([0])
+    assert box_shares.dtype == np.float32
+    assert box_shares.min() >= np.float32(least)
+    assert box_shares.max() == 1
+    np.testing.assert_array_equal(shares_of(alone), np.full(len(truth), least, np.float32))
+    whole = np.ones((alone[1].height, alone[1].width, 1))
+    shown = splat_adjoint(plan_view(state.splats, **alone[1].camera(0)), whole)[:, 0]
+    np.testing.assert_allclose(shares_of(with_views([0, 0])), np.where(shown > 0, 1, least), atol=1e-6)
+
+
+def test_nothing_becomes_thinner_than_half_a_pixel(truth: Gaussians, photos: Pair) -> None:
+    """Of the photo that it is nearest to, whatever the box says."""
+    start = scenes.spoil(truth)
+    thin = replace(start, scales=start.scales * np.array([0.02, 1, 1], np.float32))
+    _, _, min_sizes = initial_scores(survey_photos(thin, photos), plan_run(photos, QUICK, 0))
+    views = photos[0].viewmats
+    depths = start.means @ views[:, 2, :3].T + views[:, 2, 3]
+    np.testing.assert_allclose(np.exp(min_sizes), 0.5 * depths.min(1) / photos[0].Ks[0, 0, 0], rtol=1e-4)
+    free = scenes.tuned(QUICK, min_scale=0.0)
+    kept, report = fit_full(thin, photos, QUICK)
+    needles, other = fit_full(thin, photos, free)
+    assert report.accepted
+    assert other.accepted
+    assert (kept.scales >= np.exp(min_sizes)[:, None] * (1 - 1e-5)).all()
+    assert (needles.scales.min(1) < np.exp(min_sizes) / 3).mean() > 0.5
+
+
+def test_steps_draw_as_viewers_do(photos: Pair) -> None:
+    """With and without compensation, as when enlarged twice, and from afar; before that always in one way."""
+    plan = plan_run(photos, LONG, 0)
+    looks = [plan.look_at(step, 0.8) for step in range(1, 17)]
+    afar = Look(1, 0.3)
+    assert set(looks) == {Look(0, 0.3, antialiased=True), Look(0, 0.3), Look(0, 0.075), afar}
+    assert looks.count(afar) == 3
+    assert looks[0] == plan.look_at(17, 0.8)
+    assert {plan.look_at(step, 0.5) for step in range(1, 17)} == {Look(1, 0.075)}
+    assert afar not in {plan_run(photos, QUICK, 0).look_at(step, 0.8) for step in range(1, 17)}
+
+
+@pytest.mark.parametrize(("name", "field"), [("opacity_reg", "opacities"), ("scale_reg", "scales")])
+def test_pulls_make_them_fade_and_shrink(truth: Gaussians, photos: Pair, name: str, field: str) -> None:
+    start = scenes.spoil(truth)
+    free, pulled = (
+        fit_full(start, photos, scenes.tuned(QUICK, **{name: prior_weight}))[0] for prior_weight in (0.0, 0.05)
+    )
+    assert np.log(getattr(pulled, field)).mean() < np.log(getattr(free, field)).mean() - 0.02
+
+
+# counts
+
+
+@pytest.mark.parametrize("extra", [0, 1, 30, 70])
+def test_count_asked_for_is_met(truth: Gaussians, photos: Pair, extra: int) -> None:
+    start = scenes.spoil(truth)
+    result, report = fit_full(start, photos, LONG, count=len(start) + extra)
+    assert report.accepted
+    assert len(result) == len(start) + extra
+
+
+def test_a_fit_is_judged_before_it_grows(truth: Gaussians, photos: Pair) -> None:
+    """Halves that were never fitted show less than their parents, and would have the fit refused."""
+    start = truth[::8]
+    options = replace(LONG, half_res_share=0.5, dropout=0.0)
+    (_, grown), (_, same) = (fit_full(start, photos, options, count=count) for count in (8 * len(start), 0))
+    assert grown.accepted
+    assert grown.holdout_after == same.holdout_after
+
+
+@pytest.mark.parametrize(("views", "dropout"), [(20, 0.05), (21, 0.0)])
+def test_dropout_needs_many_looks_at_each_view(photos: Pair, views: int, dropout: float) -> None:
+    many = tuple(one[[view % len(one) for view in range(views)]] for one in photos)
+    assert plan_run(many, FitOptions(fit_steps=600), 0).dropout == dropout
+
+
+def test_more_than_double_is_grown_in_turns(truth: Gaussians, photos: Pair) -> None:
+    start = truth[::4]
+    result, report = fit_full(start, photos, LONG, count=3 * len(start) + 5)
+    assert report.accepted
+    assert len(result) == 3 * len(start) + 5
+
+
+def test_short_runs_do_not_grow(truth: Gaussians, photos: Pair) -> None:
+    start = scenes.spoil(truth)
+    assert len(fit_full(start, photos, QUICK, count=2 * len(start))[0]) == len(start)
+    assert start_share(QUICK) == 1
+    assert start_share(replace(LONG, fit="none")) == 1
+    assert 0 < start_share(LONG) < 1
+
+
+# safety
+
+
+def test_fit_that_makes_it_worse_returns_the_same(truth: Gaussians, noise: Pair) -> None:
+    grey = replace(truth, sh0=np.zeros_like(truth.sh0))
+    result, report = fit_full(grey, noise, LONG, count=2 * len(grey))
+    assert (report.method, report.accepted) == ("none", False)
+    assert report.holdout_after <= report.holdout_before
+    assert result is grey
+    assert report.steps < 160  # judged before the steps that look at everything
+    assert "no better" in report.stopped
+
+
+def test_a_rival_is_what_the_fit_has_to_beat(truth: Gaussians, noise: Pair) -> None:
+    """Held-out blocks that the start shows too well to be bettered do not forbid a fit; those of a rival would."""
+    grey = replace(truth, sh0=np.zeros_like(truth.sh0))
+    _, alone = fit_full(grey, noise, LONG)
+    black = replace(truth, sh0=np.full_like(truth.sh0, -0.5 / SH_C0))
+    _, report = fit_full(grey, noise, LONG, baseline_start=black)
+    assert not alone.accepted
+    assert alone.holdout_before - 2 > report.holdout_before  # of black
+    assert report.accepted
+    _, better = fit_full(black, noise, LONG, baseline_start=grey)
+    assert better == fit_full(black, noise, LONG)[1]  # its own blocks are the worse ones
+
+
+def test_input_is_left_alone(truth: Gaussians, photos: Pair) -> None:
+    start = scenes.spoil(truth)
+    before = [getattr(start, name).copy() for name in scenes.FIELDS]
+    images = [p.images.copy() for p in photos]
+    fit_full(start, photos, QUICK)
+    assert all(np.array_equal(getattr(start, n), b) for n, b in zip(scenes.FIELDS, before, strict=True))
+    for photo, image in zip(photos, images, strict=True):
+        np.testing.assert_array_equal(photo.images, image)
+
+
+def test_perfect_start_is_not_spoilt(scene: Scene, truth: Gaussians, photos: Pair) -> None:
+    result, report = fit_full(truth, photos, LONG)
+    assert report.accepted == (report.holdout_after > report.holdout_before)
+    assert report.accepted or result is truth
+    actual, expected = (scenes.images_of(g, scene.cameras)[0].clip(0, 1) for g in (result, truth))
+    assert np.abs(actual - expected).mean() < 0.01
+
+
+def test_held_out_blocks_teach_nothing_while_they_judge(truth: Gaussians, photos: Pair) -> None:
+    """All steps at half size: what the photos show there does not matter. (SSIM's windows do reach into them.)"""
+    options = scenes.tuned(replace(QUICK, half_res_share=1.0), ssim_lambda=0.0)
+    start = scenes.spoil(truth)
+    weights = plan_run(photos, options, seed=0).weights[1]
+    painted = photos[1].images.copy()
+    for image, weight in zip(painted, weights, strict=True):
+        image[weight == 0] = 1 - image[weight == 0]
+    one = run_steps(start, photos, options)
+    other = run_steps(start, (photos[0], replace(photos[1], images=painted)), options)
+    np.testing.assert_array_equal(one, other)
+
+
+def run_steps(gaussians: Gaussians, photos: Pair, options: FitOptions) -> np.ndarray:
+    """The state after some steps, without a judge."""
+    rng, state, plan = np.random.default_rng(0), start_state(gaussians), plan_run(photos, options, 0)
+    for step in range(options.fit_steps):
+        full_module.fit_step(state, plan, step % len(photos[0]), step + 1, step / options.fit_steps, rng)
+    return state.x
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_unseen_ones_stay_as_they_are(degree: int) -> None:
+    """Outside all photos; also with colours that no photo has."""
+    scene, truth = scenes.self_made(degree)
+    behind = replace(truth[:4], means=truth.means[:4] - 100, sh0=np.full((4, 1, 3), 4.0, np.float32))
+    start = Gaussians.concat([scenes.spoil(truth), behind])
+    result, report = fit_full(start, scenes.pair_of(scene), QUICK)
+    assert report.accepted
+    for name in scenes.FIELDS:
+        np.testing.assert_allclose(getattr(result, name)[-4:], getattr(behind, name), rtol=1e-5, atol=1e-6)
+
+
+# views, harmonics
+
+
+def test_harmonics_are_inherited_by_grown_ones() -> None:
+    scene, truth = scenes.self_made(1)
+    start = scenes.spoil(truth)
+    result, report = fit_full(start, scenes.pair_of(scene), LONG, count=len(start) + 20)
+    assert report.accepted
+    assert len(result) == len(start) + 20
+    assert np.array_equal(result.shN[: len(start)], start.shN)
+    assert all((row == start.shN).all((1, 2)).any() for row in result.shN[len(start) :])
+
+
+# time
+
+
+def test_time_budget_ends_the_run(truth: Gaussians, photos: Pair) -> None:
+    """Hardly any: a few steps, and still judged."""
+    result, report = fit_full(scenes.spoil(truth), photos, replace(LONG, time_budget=1e-6))
+    assert full_module.PROBE < report.steps <= full_module.PROBE + 1
+    assert report.accepted == (report.holdout_after > report.holdout_before)
+    if report.accepted:
+        assert report.stopped == "time budget spent"
+        assert len(result) == len(truth)
+
+
+def test_steps_follow_the_time_budget(photos: Pair) -> None:
+    def steps(budget: float, seconds: float) -> int:
+        return affordable_steps(seconds, plan_run(photos, replace(LONG, time_budget=budget), 0))
+
+    probe, most = full_module.PROBE, full_module.MAX_STEPS
+    assert steps(1e-9, 1.0) == probe + 1
+    assert steps(1e9, 1.0) == most
+    actual = [steps(budget, 0.06) for budget in (0.5, 1, 2, 4)]
+    assert actual == sorted(actual)
+    assert actual[0] > probe + 1
+    # a step of 10 ms at half size: 70 % of the steps at that, the rest at three times it
+    assert steps(1.0, 0.06) == pytest.approx(probe + (1.0 - 0.06) / (0.01 * (0.7 + 3 * 0.3)), abs=1)
+
+
+# rates, report, progress
+
+
+def test_rates_decay() -> None:
+    rates = Tuning()
+    start, half, end = (step_sizes(rates, p, 100) for p in (0.0, 0.5, 1.0))
+    expected = (
+        [rates.means_lr] * 3
+        + [rates.scales_lr] * 3
+        + [rates.quats_lr] * 4
+        + [rates.opacities_lr]
+        + [rates.colors_lr] * 3
+    )
+    np.testing.assert_allclose(start, expected, rtol=1e-6)
+    np.testing.assert_allclose(end, rates.decay * start, rtol=1e-6)
+    assert rates.decay < 1
+    np.testing.assert_allclose(half**2, start * end, rtol=1e-6)
+
+
+def test_progress_counts_the_steps(truth: Gaussians, photos: Pair) -> None:
+    calls: list[tuple[int, int, float, float]] = []
+    _, report = fit_full(scenes.spoil(truth), photos, QUICK, progress=lambda *call: calls.append(call))
+    assert [call[:2] for call in calls] == [(step, 30) for step in range(1, 31)]
+    assert calls[-1][2] > calls[0][2]  # of the photos
+    assert calls[0][3] == pytest.approx(report.holdout_before)
+    assert calls[-1][3] == pytest.approx(report.holdout_after)
+    assert np.isfinite(np.array(calls, float)).all()
+
+
+# the same again
+
+
+def test_pieces_of_a_step_change_no_bit(truth: Gaussians, photos: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    one = fit_full(scenes.spoil(truth), photos, QUICK)
+    monkeypatch.setattr(full_module, "ROWS", 17)
+    assert scenes.identical(fit_full(scenes.spoil(truth), photos, QUICK)[0], one[0])
+
+
+def test_seed_repeats_and_matters(truth: Gaussians, photos: Pair) -> None:
+    start = scenes.spoil(truth)
+    one, two, other = (fit_full(start, photos, QUICK, seed=seed) for seed in (5, 5, 6))
+    assert scenes.identical(one[0], two[0])
+    assert one[1] == two[1]
+    assert not scenes.identical(one[0], other[0])
+
+
+@pytest.mark.parametrize("size", [(8, 6), (5, 1), (1, 1)])
+def test_tiny_photos(size: tuple[int, int]) -> None:
+    scene = scenes.make_scene(scenes.wall(), scenes.arc(2, *size))
+    start = replace(scene.gaussians, means=scene.gaussians.means.astype(np.float32))
+    result, report = fit_full(start, scenes.pair_of(scene), QUICK)
+    assert len(result) == len(start)
+    assert np.isfinite([report.holdout_before, report.holdout_after]).all()
+    for name in scenes.FIELDS:
+        assert np.isfinite(getattr(result, name)).all()
+
+
+def test_longer_runs_end_with_smaller_steps() -> None:
+    rates = Tuning()
+    usual, long = step_sizes(rates, 1.0, 300), step_sizes(rates, 1.0, 900)
+    np.testing.assert_allclose(long, usual / 3, rtol=1e-6)
+    np.testing.assert_array_equal(step_sizes(rates, 0.0, 300), step_sizes(rates, 0.0, 900))
+    np.testing.assert_array_equal(step_sizes(rates, 1.0, 12), usual)

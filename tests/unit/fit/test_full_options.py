@@ -1,0 +1,136 @@
+"""Masks, dropout and moving cameras of the full fit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+
+from gsmerge import Gaussians
+from gsmerge.fit import FitOptions
+from gsmerge.fit import full as full_module
+from gsmerge.fit.fit_options import LONG_STEPS, USUAL_SHARE, Tuning
+from gsmerge.fit.fit_state import start_state
+from gsmerge.fit.full import fit_full, plan_run, start_poses
+from gsmerge.geometry import motion_matrices, motion_vectors, project_points
+from gsmerge.raster import plan_view
+from gsmerge.raster.composite import blend, view_colors
+from gsmerge.raster.gradient import gradients_of
+from gsmerge.raster.photos import Photos
+
+
+@pytest.mark.parametrize("coarse", [0.5, 1.0])
+def test_steps_do_not_look_where_the_mask_is_not(coarse: float) -> None:
+    """Rubbish on the left third of every photo; at both sizes, and at half size alone."""
+    scene, truth = scenes.self_made(0)
+    start = scenes.spoil(truth)
+    options = FitOptions(fit_steps=40, holdout=0.2, half_res_share=coarse, dropout=0.0)
+
+    def spoilt(photos: Photos) -> Photos:
+        images = photos.images.copy()
+        images[:, :, : photos.width // 3] = (1, 0, 1)
+        return replace(photos, images=images)
+
+    rubbish = tuple(map(spoilt, scenes.pair_of(scene)))
+    masks = tuple(np.ones(photos.images.shape[:3], bool) for photos in rubbish)
+    for mask in masks:
+        mask[:, :, : mask.shape[2] // 3] = False
+    whole, _ = fit_full(start, rubbish, options)
+    pairs = list(zip(rubbish, masks, strict=True))
+    masked, report = fit_full(
+        start, tuple(replace(photos, weights=mask.astype(np.float32)) for photos, mask in pairs), options
+    )
+    again, _ = fit_full(
+        start, tuple(replace(photos, weights=np.ones(mask.shape, np.float32)) for photos, mask in pairs), options
+    )
+    assert report.accepted
+    assert scenes.psnr_of(masked, scene) > scenes.psnr_of(whole, scene) + 2
+    assert np.array_equal(again.means, whole.means)
+
+
+QUICK = FitOptions(fit_steps=30, holdout=0.2)
+LONG = FitOptions(fit_steps=160, holdout=0.2)
+
+
+def test_dropout_where_there_are_few_views(photos: tuple[Photos, Photos]) -> None:
+    many = Photos(*(np.concatenate([a, a]) for a in (photos[0].images, photos[0].viewmats, photos[0].Ks)), eps2d=0.3)
+    pair = many, replace(photos[1], images=np.concatenate([photos[1].images] * 2))
+    assert len(photos[0]) <= full_module.FEW_VIEWS < len(many)
+    assert plan_run(photos, LONG, 0).dropout == full_module.DROPOUT > 0
+    assert plan_run(photos, replace(LONG, fit_steps=full_module.MANY_STEPS - 1), 0).dropout == 0
+    assert plan_run(pair, LONG, 0).dropout == 0
+    assert plan_run(pair, replace(LONG, dropout=0.15), 0).dropout == 0.15
+    assert plan_run(photos, replace(LONG, dropout=0.0), 0).dropout == 0
+    very_long = replace(LONG, fit_steps=LONG_STEPS)
+    assert 0 < plan_run(pair, very_long, 0).dropout < plan_run(photos, very_long, 0).dropout
+    assert very_long.half_res_part < LONG.half_res_part < replace(LONG, half_res_share=0.9).half_res_part
+
+
+def test_more_gaussians_have_fewer_steps_on_half_size_photos() -> None:
+    parts = [replace(LONG, share=share).half_res_part for share in (0.01, USUAL_SHARE, 2 * USUAL_SHARE, 0.2)]
+    assert parts[0] == parts[1] == LONG.half_res_part
+    assert parts[1] > parts[2] > parts[3] > 0.3
+    short = replace(QUICK, share=0.2)
+    assert short.half_res_part == QUICK.half_res_part
+    assert replace(LONG, share=0.2, half_res_share=0.9).half_res_part == 0.9
+
+
+def test_dropout_leaves_out_its_share(truth: Gaussians, photos: tuple[Photos, Photos]) -> None:
+    """What is left out learns nothing from the step."""
+    moved = []
+    for share in (0.0, 0.5):
+        state, plan = start_state(truth), plan_run(photos, replace(QUICK, dropout=share), 0)
+        full_module.fit_step(state, plan, 1, 1, 0.0, np.random.default_rng(0))
+        moved.append(state.m.any(1).mean())
+    assert moved[0] > 0.6
+    assert moved[1] == pytest.approx(0.5 * moved[0], abs=0.1)
+
+
+Pair = tuple[Photos, Photos]
+FREE = FitOptions(fit_steps=120, holdout=0.2, move_cameras=True, dropout=0.0)
+
+
+def spoil(photos: Pair, size: float = 0.01) -> Pair:
+    """Photos whose poses are off; the mean of the motions is none."""
+    motions = np.random.default_rng(0).normal(size=(len(photos[0]), 6)) * size
+    viewmats = photos[0].viewmats @ motion_matrices(motions - motions.mean(0))
+    return replace(photos[0], viewmats=viewmats), replace(photos[1], viewmats=viewmats)
+
+
+def squared_error(truth: Gaussians, photos: Photos, view: int) -> tuple[float, np.ndarray]:
+    """Of a view, and its gradient by the viewmat."""
+    drawn = plan_view(start_state(truth).splats, **photos.camera(view))
+    colors = view_colors(drawn)
+    image, left = blend(drawn, colors, np.zeros(3, np.float32))
+    residual = image - photos.images[view]
+    wanted = gradients_of(drawn, colors, image, left, 2 * residual, None, with_viewmat=True).viewmat
+    return float((residual**2).sum()), wanted
+
+
+@pytest.mark.parametrize("view", [0, 1])
+def test_steps_of_a_pose_lower_the_loss(view: int, truth: Gaussians, photos: Pair) -> None:
+    poses, (full, _) = start_poses(spoil(photos))
+    before = squared_error(truth, full, view)[0]
+    rates = Tuning(poses_lr=0.1)
+    for _ in range(10):
+        poses.step(view, squared_error(truth, full, view)[1], rates, 0.0)
+    assert squared_error(truth, full, view)[0] < 0.9 * before
+    np.testing.assert_allclose(poses.x.mean(0), 0, atol=1e-12)
+    np.testing.assert_allclose(motion_vectors(poses.start, poses.viewmats), poses.x, atol=1e-9)
+
+
+def test_the_fit_finds_the_cameras(truth: Gaussians, photos: Pair) -> None:
+    wrong, start = spoil(photos), scenes.spoil(truth)
+    free, report = fit_full(start, wrong, FREE)
+    fixed, other = fit_full(start, wrong, replace(FREE, move_cameras=False))
+    assert other.viewmats is None
+    pixels = [project_points(truth.means, one, photos[0].Ks)[0] for one in (
+        photos[0].viewmats, wrong[0].viewmats, report.viewmats,
+    )]  # fmt: skip
+    before, after = (float(np.median(np.linalg.norm(one - pixels[0], axis=-1))) for one in pixels[1:])
+    assert after < 0.5 * before
+    assert report.holdout_after > other.holdout_after + 0.5
+    np.testing.assert_allclose(motion_vectors(wrong[0].viewmats, report.viewmats).mean(0), 0, atol=1e-9)
+    assert len(free) == len(fixed)

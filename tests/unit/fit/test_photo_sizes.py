@@ -1,0 +1,198 @@
+"""The photos of a fit: at which size, read how often, and which of them a step looks at."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import scenes
+
+from gsmerge import Gaussians, Scene, compact
+from gsmerge.facts.views import subset
+from gsmerge.fit import FitOptions, fit, fit_photos
+from gsmerge.fit.full import affordable_steps, fit_full, plan_run
+from gsmerge.fit.photo_sizes import large_photos, largest_scale, photo_scale
+from gsmerge.geometry import project
+from gsmerge.raster.photos import EPS2D, photo_psnr
+from gsmerge.runtime.record import record_run
+from gsmerge.runtime.threads import use_threads
+from gsmerge.types import LargePhotos
+
+LONG = FitOptions(fit_steps=160, holdout=0.2)
+
+
+def with_large(scene: Scene, scale: float, read: list[int] | None = None) -> Scene:
+    """The scene with enlarged photos of its own; ``read`` gets the number of every photo that is read."""
+    width, height = (round(scale * side) for side in (scene.cameras.width, scene.cameras.height))
+    images = [cv2.resize(image, (width, height), interpolation=cv2.INTER_CUBIC) for image in scene.images]
+    stored = [np.rint(255 * image.clip(0, 1)).astype(np.uint8) for image in images]
+
+    def one(photo: int) -> np.ndarray:
+        if read is not None:
+            read.append(photo)
+        return stored[photo]
+
+    shape = np.array([[width / scene.cameras.width], [height / scene.cameras.height], [1.0]])
+    large = LargePhotos(scene.cameras.Ks * shape, width, height, tuple(range(len(scene))), one)
+    return replace(scene, large_photos=large)
+
+
+# which size
+
+
+@pytest.mark.parametrize(
+    ("larger", "auto", "settings", "expected"),
+    [
+        (4, True, {}, 2), (1.5, True, {}, 1.5), (1.2, True, {}, 1), (4, False, {}, 1), (4, True, {"fit": "none"}, 1),
+        (4, True, {"fit_steps": 12}, 1), (4, True, {"photo_scale": 1}, 1), (4, True, {"photo_scale": 3}, 3),
+        (4, False, {"photo_scale": 1.5}, 1.5), (1.2, True, {"photo_scale": 1.1}, 1.1),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_scale_is_chosen(scene: Scene, larger: float, auto: bool, settings: dict[str, Any], expected: float) -> None:
+    actual, problem = photo_scale(with_large(scene, larger), FitOptions(**settings), auto=auto)
+    assert actual == pytest.approx(expected, rel=0.02)
+    assert problem is None
+
+
+@pytest.mark.parametrize(
+    ("larger", "settings", "expected", "reason"),
+    [
+        (1.5, {"photo_scale": 4}, 1.5, "photo_scale 4 is 1.5: the photos are no larger"),
+        (2, {"photo_scale": 2, "fit": "none"}, 1, "photo_scale 2 is 1: larger photos need the full fit"),
+        (2, {"photo_scale": 2, "fit_steps": 12}, 1, "photo_scale 2 is 1: larger photos need the full fit"),
+    ],
+    ids=str,
+)
+def test_less_than_asked_for_is_said(
+    scene: Scene, larger: float, settings: dict[str, Any], expected: float, reason: str
+) -> None:
+    actual, problem = photo_scale(with_large(scene, larger), FitOptions(**settings), auto=True)
+    assert actual == pytest.approx(expected, rel=0.02)
+    assert problem.startswith(reason)
+
+
+def test_larger_photos_are_recorded(scene: Scene) -> None:
+    for scale, levels in ((1.0, 2), (2.0, 3)):
+        with record_run() as record:
+            photos = fit_photos(with_large(scene, 2), FitOptions(photo_scale=scale))
+        assert len(photos) == levels
+        assert record.choices == ({"photo_scale": scale} if scale > 1 else {})
+        assert len(record.notes) == levels - 2
+
+
+def test_photos_of_the_views_size_are_no_larger(scene: Scene) -> None:
+    assert largest_scale(scene) == 1
+    assert photo_scale(scene, FitOptions(), auto=True) == (1, None)
+    assert photo_scale(scene, FitOptions(photo_scale=2), auto=True) == (
+        1,
+        "photo_scale 2 is 1: the photos are no larger",
+    )
+    with pytest.raises(ValueError, match="expected a scene with photos larger than its views"):
+        large_photos(scene, 2)
+
+
+@pytest.mark.parametrize("value", [0.5, 0, -1, float("inf"), float("nan"), "2", "large"])
+def test_impossible_scales_are_refused(value: Any) -> None:
+    with pytest.raises(ValueError, match='photo_scale: expected "auto" or a number from 1'):
+        FitOptions(photo_scale=value)
+
+
+# what is read
+
+
+def test_photos_are_read_once_at_their_scale(scene: Scene) -> None:
+    read: list[int] = []
+    large = with_large(scene, 4, read)
+    photos = large_photos(large, 2)
+    assert sorted(read) == list(range(len(scene)))
+    assert photos.images.dtype == np.uint8
+    assert (photos.width, photos.height) == (2 * scene.cameras.width, 2 * scene.cameras.height)
+    np.testing.assert_allclose(photos.Ks, scene.cameras.Ks * [[2], [2], [1]])
+    assert photos.eps2d == EPS2D  # of a viewer at this size
+    small = cv2.resize(large.large_photos.read(1), (photos.width, photos.height), interpolation=cv2.INTER_AREA)
+    assert photos.image(1).dtype == np.float32
+    np.testing.assert_allclose(photos.image(1), small / 255, atol=1e-6)
+
+
+def test_a_point_has_the_same_place_in_every_size(scene: Scene) -> None:
+    photos = large_photos(with_large(scene, 3), 1.7)
+    shape = np.array([photos.width / scene.cameras.width, photos.height / scene.cameras.height])
+    places, _ = project(scene.gaussians.means[:50].astype(np.float64), scene.cameras)
+    large = replace(scene.cameras, Ks=photos.Ks, width=photos.width, height=photos.height)
+    np.testing.assert_allclose(project(scene.gaussians.means[:50].astype(np.float64), large)[0], places * shape)
+
+
+def test_some_views_have_their_own_photos(scene: Scene) -> None:
+    read: list[int] = []
+    large_photos(subset(with_large(scene, 2, read), [2, 0]), 2)
+    assert sorted(read) == [0, 2]
+    three = subset(with_large(scene, 2), [0, 1, 2])
+    two = three.large_photos[[0, 1]]
+    with pytest.raises(ValueError, match="expected 3 large photos, got 2"):
+        replace(three, large_photos=two)
+
+
+# the steps
+
+
+def test_steps_look_at_half_full_and_larger_photos(scene: Scene) -> None:
+    options = FitOptions(fit_steps=200, photo_scale=2)
+    plan = plan_run(fit_photos(with_large(scene, 2), options), options, 0)
+    sizes = [plan.look_at(step + 1, step / 200).size for step in range(200)]
+    assert [sizes.count(size) for size in (1, 0, 2)] == [122, 46, 32]
+    assert sizes[:120] == [1] * 120
+    usual = plan_run(scenes.pair_of(scene), options, 0)
+    sizes = [usual.look_at(step + 1, step / 200).size for step in range(200)]
+    assert sizes[:140] == [1] * 140
+    assert [sizes[140:].count(size) for size in (0, 1)] == [49, 11]
+
+
+def test_the_users_share_of_half_size_steps_stays(scene: Scene) -> None:
+    options = FitOptions(half_res_share=0.8, photo_scale=2)
+    assert plan_run(fit_photos(with_large(scene, 2), options), options, 0).half_part == 0.8
+
+
+def test_large_photos_count_in_every_pixel(scene: Scene) -> None:
+    plan = plan_run(fit_photos(with_large(scene, 2), replace(LONG, photo_scale=2)), LONG, 0)
+    assert all((weight == 1).all() for weight in plan.step_weights[2])
+
+
+def test_time_budget_counts_larger_photos(scene: Scene) -> None:
+    options = replace(LONG, time_budget=1.0)
+    steps = [
+        affordable_steps(0.06, plan_run(fit_photos(with_large(scene, s), replace(options, photo_scale=s)), o, 0))
+        for s, o in ((1, replace(options, half_res_share=0.6)), (2, options), (3, options))
+    ]
+    assert steps[0] > steps[1] > steps[2]
+
+
+def test_result_shows_larger_photos_better(truth: Gaussians, scene: Scene) -> None:
+    large, start = with_large(scene, 2), scenes.spoil(truth)
+    near = large_photos(large, 2)
+    near = replace(near, images=np.stack([near.image(view) for view in range(len(near))]))
+    usual, sharp = (fit_full(start, fit_photos(large, replace(LONG, photo_scale=scale)), LONG)[0] for scale in (1, 2))
+    assert scenes.identical(usual, fit_full(start, scenes.pair_of(scene), LONG)[0])
+    views = range(len(near))
+    assert photo_psnr(sharp, near, views) > photo_psnr(usual, near, views) + 0.3
+
+
+def test_result_does_not_depend_on_threads(truth: Gaussians, scene: Scene) -> None:
+    results, start = [], scenes.spoil(truth)
+    for threads in (1, 3):
+        with use_threads(threads):
+            photos = fit_photos(with_large(scene, 2), replace(LONG, photo_scale=2))
+            results.append(fit(start, photos, LONG, count=len(start) + 20)[0])
+    assert scenes.identical(*results)
+
+
+def test_a_run_says_at_what_scale_it_looked(scene: Scene) -> None:
+    report = compact(with_large(scene, 2), superpixels="10%", fit_steps=30).report
+    assert report.choices["photo_scale"] == 2
+    assert [note for note in report.notes if "--set photo_scale=1 does without" in note]
+    report = compact(with_large(scene, 2), superpixels="10%", fit_steps=30, photo_scale=1).report
+    assert "photo_scale" not in report.choices
+    assert report.notes == []

@@ -1,0 +1,122 @@
+"""The stage: what stays, and which fit is taken."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+
+from gsmerge import Gaussians
+from gsmerge.fit import FitOptions, FitReport, fit, stage
+from gsmerge.fit.color import draw, fit_colors
+from gsmerge.fit.fit_state import start_state
+from gsmerge.fit.full import fit_full
+from gsmerge.fit.outside import outside_views, score_fog
+from gsmerge.fit.stage import visible_mask
+from gsmerge.fit.survey import survey_photos
+from gsmerge.raster import composite, contributions, plan_view, prepare
+from gsmerge.raster.photos import Photos
+from gsmerge.types import SH_C0
+
+Pair = tuple[Photos, Photos]
+QUICK = FitOptions(fit_steps=30, holdout=0.2)
+LONG = FitOptions(fit_steps=160, holdout=0.2)
+
+
+def test_stage_takes_the_full_fit(truth: Gaussians, photos: Pair) -> None:
+    start = scenes.spoil(truth)
+    result, report = fit(start, photos, QUICK, seed=4)
+    outside = outside_views(prepare(start), photos[1], QUICK)
+    assert outside is not None
+    expected, own = fit_full(start, photos, QUICK, seed=4, outside=outside)
+    assert report == replace(own, fog=score_fog(prepare(result), outside))
+    assert scenes.identical(result, expected)
+
+
+def test_stage_falls_back_to_colours(truth: Gaussians, photos: Pair) -> None:
+    """Where the full fit is refused."""
+    refused = FitReport("none", False, 7, 20.0, 19.0, "worse")
+    backend = replace(stage.ON_CPU, fit_full=lambda gaussians, *_, **__: (gaussians, refused))
+    start = replace(truth, sh0=truth.sh0 + 0.2 / SH_C0)
+    result, report = fit(start, photos, QUICK, backend=backend)
+    assert (report.method, report.accepted) == ("color", True)
+    colored, _ = fit_colors(start, draw(start, photos[1]), photos[1], QUICK)
+    assert scenes.identical(result, colored[visible_mask(start, photos[1], QUICK.min_contribution)])
+    assert np.array_equal(result.means, start.means)
+    assert not np.array_equal(result.sh0, start.sh0)
+
+
+def test_colours_after_a_growth_know_where_each_comes_from(truth: Gaussians, photos: Pair) -> None:
+    refused = FitReport("none", False, 7, 20.0, 19.0, "worse")
+    backend = replace(stage.ON_CPU, fit_full=lambda gaussians, *_, **__: (gaussians, refused))
+    start = replace(truth, sh0=truth.sh0 + 0.2 / SH_C0)
+    result, report = fit(start, photos, LONG, count=len(start) + 20, backend=backend)
+    assert (report.method, report.accepted, len(result)) == ("color", True, len(start) + 20)
+    near = np.linalg.norm(result.means - start.means[report.origins], axis=1) <= 2 * start.scales[report.origins].max(1)
+    assert near.all()
+
+
+def test_stage_refuses_both_on_noise(truth: Gaussians, noise: Pair) -> None:
+    grey = replace(truth, sh0=np.zeros_like(truth.sh0))
+    options = scenes.tuned(LONG, prior_weight=1e-6, iterations=60, huber=10.0)
+    result, report = fit(grey, noise, options, count=2 * len(grey))
+    assert not report.accepted
+    assert scenes.identical(result, grey)
+
+
+def test_stage_without_a_fit_only_prunes(truth: Gaussians, photos: Pair) -> None:
+    """Hidden ones go, those outside all photos stay, nothing else changes."""
+    opaque = replace(truth, opacities=np.full_like(truth.opacities, 0.98), scales=2 * truth.scales)
+    hidden = replace(truth[:3], means=4 * truth.means[:3], scales=0.2 * truth.scales[:3])
+    behind = replace(truth[:3], means=truth.means[:3] - 100)
+    start = Gaussians.concat([opaque, hidden, behind])
+    result, report = fit(start, photos, replace(QUICK, fit="none"))
+    assert report is None
+    keep = visible_mask(start, photos[1], QUICK.min_contribution)
+    assert scenes.identical(result, start[keep])
+    assert not keep[-6:-3].any()
+    assert keep[-3:].all()
+    assert scenes.identical(fit(start, photos, replace(QUICK, fit="none", min_contribution=0.0))[0], start)
+
+
+def test_stage_prunes_before_it_fits(truth: Gaussians, photos: Pair) -> None:
+    opaque = replace(truth, opacities=np.full_like(truth.opacities, 0.98), scales=2 * truth.scales)
+    hidden = replace(truth[:3], means=4 * truth.means[:3], scales=0.2 * truth.scales[:3])
+    alone, both = (fit(g, photos, QUICK)[0] for g in (opaque, Gaussians.concat([opaque, hidden])))
+    assert len(both) == len(alone)
+
+
+@pytest.mark.parametrize("method", ["none", "full"])
+def test_nothing_to_fit(truth: Gaussians, photos: Pair, method: str) -> None:
+    result, _ = fit(truth[:0], photos, replace(QUICK, fit=method))
+    assert len(result) == 0
+
+
+def test_a_survey_is_what_its_parts_are(truth: Gaussians, photos: Pair) -> None:
+    look, half, state = survey_photos(truth, photos), photos[1], start_state(truth)
+    np.testing.assert_array_equal(look.visible(1 / 255), visible_mask(truth, half, 1 / 255))
+    sums = np.zeros((len(half), len(truth)))
+    for view in range(len(half)):
+        plan = plan_view(state.splats, **half.camera(view))
+        image, _ = composite(plan, state.colors)
+        np.testing.assert_array_equal(look.images[view], image)
+        sums[view] = contributions(plan)[0]
+    np.testing.assert_array_equal(look.sums, sums.sum(0))
+    np.testing.assert_array_equal(look.squares, (sums**2).sum(0))
+    rows = np.arange(0, len(truth), 3)
+    np.testing.assert_array_equal(look[rows].peaks, look.peaks[rows])
+
+
+def test_shown(photos: Pair) -> None:
+    """In sight, hidden behind an opaque sheet, and outside all photos."""
+    sheet = [[x, y, 2.0] for x in np.linspace(-2, 2, 41) for y in np.linspace(-2, 2, 41)]
+    means = np.array([*sheet, [0.0, 0, 2.5], [0, 0, -5], [0, 0, 1.0]], np.float32)
+    n = len(means)
+    made = Gaussians(
+        means, np.tile(np.eye(1, 4, dtype=np.float32), (n, 1)), np.full((n, 3), 0.1, np.float32),
+        np.full(n, 0.99, np.float32), np.zeros((n, 1, 3), np.float32), np.zeros((n, 0, 3), np.float32),
+    )  # fmt: skip
+    made.scales[-3:] = 0.02
+    assert visible_mask(made, photos[1], 1 / 255)[-3:].tolist() == [False, True, True]

@@ -1,0 +1,57 @@
+"""The quarter of the input views that scenes are judged by."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scenes
+
+from gsmerge import Scene
+from gsmerge.raster.composite import composite
+from gsmerge.raster.photos import NEAR, photo_psnr, scene_photos, scored_tiles
+from gsmerge.raster.view_plan import plan_view, prepare
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return scenes.make_scene(scenes.room(), scenes.arc(4, 160, 128), noise=0.05)
+
+
+def test_wanted_tiles_are_drawn_as_in_the_whole(scene: Scene) -> None:
+    """Bit for bit, with Gaussians of all sizes, from fewer of them."""
+    rng, splats = np.random.default_rng(0), prepare(scene.gaussians)
+    scales = splats.scales * rng.choice([0.2, 1, 30], (len(splats), 1)).astype(np.float32)
+    splats = type(splats)(**{**vars(splats), "scales": scales})
+    photos = scene_photos(scene)
+    whole = plan_view(splats, **photos.camera(1))
+    for tiles in (rng.random((8, 10)) < 0.2, np.zeros((8, 10), bool), np.ones((8, 10), bool)):
+        part = plan_view(splats, **photos.camera(1), tiles=tiles)
+        pixels = tiles.repeat(16, 0).repeat(16, 1)
+        for expected, actual in zip(composite(whole), composite(part), strict=True):
+            np.testing.assert_array_equal(actual[pixels], expected[pixels])
+        assert (len(part.ids) == len(whole.ids)) is bool(tiles.all())
+    with pytest.raises(ValueError, match="tiles"):
+        plan_view(splats, **photos.camera(1), tiles=np.ones((8, 8), bool))
+
+
+def test_four_views_score_every_place_once() -> None:
+    tiles = [scored_tiles(view, 512, 384) for view in range(4)]
+    assert (np.sum(tiles, 0) == 1).all()
+    assert [one.mean() for one in tiles if one is not None] == [0.25] * 4
+    assert scored_tiles(0, 97, 1000) is not None
+    assert scored_tiles(0, 96, 1000) is None
+
+
+@pytest.mark.parametrize(("width", "height"), [(97, 113), (131, 500), (1000, 97)])
+def test_odd_sizes_have_about_a_quarter(width: int, height: int) -> None:
+    for view in range(4):
+        tiles = scored_tiles(view, width, height)
+        assert tiles.shape == (-(-height // 16), -(-width // 16))
+        assert tiles.mean() == pytest.approx(0.25, abs=0.1)
+
+
+def test_quarter_is_near_the_whole(scene: Scene) -> None:
+    photos, views = scene_photos(scene), range(len(scene))
+    whole, quarter = (photo_psnr(scene.gaussians, photos, views, near=NEAR, quarter=part) for part in (False, True))
+    assert quarter == pytest.approx(whole, abs=0.5)
+    assert quarter != whole

@@ -1,0 +1,208 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from gsmerge import Cameras, Gaussians
+from gsmerge.raster import composite, contributions, plan_view, prepare, render, render_in_turn, splat_adjoint
+from gsmerge.types import SH_C0
+
+FOCAL = 100.0
+
+
+def camera(width: int = 21, height: int = 11, count: int = 1) -> Cameras:
+    """At the origin, looking along z; the principal point is the centre of the middle pixel."""
+    K = np.array([[FOCAL, 0, width / 2], [0, FOCAL, height / 2], [0, 0, 1]])
+    return Cameras(np.stack([np.eye(4)] * count), np.stack([K] * count), width, height)
+
+
+def balls(*rows: tuple[float, float, float, float, float, float]) -> Gaussians:
+    """Round grey Gaussians: x, y, z, standard deviation, opacity, grey."""
+    means, sizes, opacities, greys = np.split(np.array(rows, np.float32).reshape(-1, 6), [3, 4, 5], axis=1)
+    n = len(means)
+    quats, scales = np.eye(1, 4, dtype=np.float32).repeat(n, 0), sizes.repeat(3, 1)
+    sh0 = ((greys - np.float32(0.5)) / np.float32(SH_C0)).repeat(3, 1)[:, None]
+    return Gaussians(np.ascontiguousarray(means), quats, scales, opacities[:, 0], sh0, np.zeros((n, 0, 3), np.float32))
+
+
+def value(image: np.ndarray, x: int, y: int) -> float:
+    return float(image[0, y, x, 0])
+
+
+def test_one_gaussian_by_hand() -> None:
+    # 0.02 wide, 1 away: 2 px; its centre is that of pixel (10, 5); dilation adds 0.3 px^2
+    images = render(balls((0, 0, 1, 0.02, 0.8, 1.0)), camera()).images
+    assert value(images, 10, 5) == pytest.approx(0.8, abs=1e-6)
+    assert value(images, 13, 5) == pytest.approx(0.8 * math.exp(-0.5 * 9 / 4.3), abs=1e-6)
+    assert value(images, 10, 3) == pytest.approx(0.8 * math.exp(-0.5 * 4 / 4.3), abs=1e-6)
+
+
+def test_opacity_is_clamped() -> None:
+    rendering = render(balls((0, 0, 1, 0.5, 1.0, 1.0)), camera())
+    assert float(rendering.alphas[0, 5, 10, 0]) == pytest.approx(0.99)
+
+
+def test_nearer_ones_hide_farther_ones_whatever_their_order() -> None:
+    rows = [(0, 0, 2, 1.0, 0.5, 0.0), (0, 0, 1, 0.5, 0.6, 1.0)]
+    for ordered in (rows, rows[::-1]):
+        rendering = render(balls(*ordered), camera(), 0.25)
+        assert value(rendering.images, 10, 5) == pytest.approx(0.6 + 0.4 * 0.5 * 0.25, abs=1e-5)
+        assert value(rendering.alphas, 10, 5) == pytest.approx(0.8, abs=1e-5)
+
+
+def test_a_pixel_stops_before_it_is_too_dark() -> None:
+    # 0.1^3 = 1e-3 stays; the fourth would reach 1e-4 and is left out
+    rows = [(0, 0, 1 + i, 5.0 * (1 + i), 0.9001, 0.0) for i in range(4)]
+    rendering = render(balls(*rows), camera(), 1.0)
+    assert value(rendering.images, 10, 5) == pytest.approx(0.0999**3, rel=1e-4)
+
+
+def test_depth_is_the_mean_of_what_was_blended() -> None:
+    rendering = render(balls((0, 0, 1, 0.5, 0.5, 1.0), (0, 0, 3, 1.5, 0.5, 1.0)), camera(), with_depths=True)
+    assert value(rendering.depths, 10, 5) == pytest.approx((0.5 * 1 + 0.25 * 3) / 0.75, abs=1e-4)
+
+
+def test_no_gaussians_leave_the_background() -> None:
+    rendering = render(balls(), camera(count=2), 0.5, with_depths=True)
+    assert rendering.images.shape == (2, 11, 21, 3)
+    assert (rendering.images == 0.5).all()
+    assert (rendering.alphas == 0).all()
+    assert (rendering.depths == 0).all()
+
+
+def test_what_is_behind_or_too_faint_is_not_seen() -> None:
+    gaussians = balls((0, 0, -1, 0.1, 1, 1), (0, 0, 0.01, 0.1, 1, 1), (0, 0, 1, 0.1, 1 / 256, 1), (9, 0, 1, 0.1, 1, 1))
+    plan = plan_view(prepare(gaussians), np.eye(4), camera().Ks[0], 21, 11)
+    assert len(plan.ids) == 0
+    assert len(plan.members) == 0
+
+
+def test_antialiasing_dims_what_is_small() -> None:
+    # 0.1 px wide: the dilation spreads it over 0.3 px^2 more
+    gaussians = balls((0, 0, 1, 0.001, 0.8, 1.0))
+    dimmed = value(render(gaussians, camera(), antialiased=True).images, 10, 5)
+    assert dimmed == pytest.approx(0.8 * 0.01 / 0.31, rel=1e-4)
+
+
+def test_colours_depend_on_the_viewing_direction() -> None:
+    gaussians = balls((0, 0, 1, 0.02, 0.8, 0.5))
+    shN = np.zeros((1, 3, 3), np.float32)
+    shN[0, 1, 0] = 1  # along z
+    turned = Gaussians(gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh0, shN)
+    image = render(turned, camera()).images
+    assert image[0, 5, 10].tolist() == pytest.approx([0.8 * (0.5 + 0.48860251), 0.4, 0.4], abs=1e-5)
+
+
+def test_negative_colours_are_clamped_but_given_ones_are_not() -> None:
+    plan = plan_view(prepare(balls((0, 0, 1, 0.02, 0.8, -3.0))), np.eye(4), camera().Ks[0], 21, 11)
+    assert composite(plan)[0].max() == 0
+    image, transmittance = composite(plan, np.array([[-3.0, 0.0, 7.0]]))
+    assert image[5, 10].tolist() == pytest.approx([-2.4, 0, 5.6], abs=1e-5)
+    assert transmittance[5, 10] == pytest.approx(0.2, abs=1e-6)
+
+
+def test_left_out_ones_and_other_opacities() -> None:
+    splats = prepare(balls((0, 0, 1, 0.5, 0.5, 1), (0, 0, 2, 1.0, 0.5, 1)))
+    alone = plan_view(splats, np.eye(4), camera().Ks[0], 21, 11, keep=np.array([False, True]))
+    assert alone.ids.tolist() == [1]
+    assert contributions(alone)[1].tolist() == pytest.approx([0, 0.5], abs=1e-5)
+    fainter = plan_view(splats, np.eye(4), camera().Ks[0], 21, 11, opacities=np.array([0.25, 0.5]))
+    assert contributions(fainter)[1].tolist() == pytest.approx([0.25, 0.375], abs=1e-5)
+
+
+def test_geographic_coordinates_keep_their_detail() -> None:
+    rows = balls((0.01, 0, 1, 0.02, 0.8, 1.0), (-0.03, 0.02, 1.3, 0.02, 0.8, 0.3))
+    shift = np.array([500_000.0, 5_400_000.0, 300.0])
+    moved = Gaussians(rows.means + shift, rows.quats, rows.scales, rows.opacities, rows.sh0, rows.shN)
+    viewmats = camera().viewmats.copy()
+    viewmats[:, :3, 3] = -shift
+    there = Cameras(viewmats, camera().Ks, 21, 11)
+    np.testing.assert_allclose(render(moved, there).images, render(rows, camera()).images, atol=1e-5, rtol=0)
+    plan = plan_view(prepare(moved), viewmats[0], camera().Ks[0], 21, 11)
+    np.testing.assert_allclose(composite(plan)[0], render(rows, camera()).images[0], atol=1e-5)
+
+
+def test_nothing_is_copied_that_need_not_be() -> None:
+    gaussians = balls((0, 0, 1, 0.02, 0.8, 1.0), (1, 1, 0, 0.02, 0.8, 1.0))
+    for given in (gaussians, gaussians.to("cpu")):
+        splats = prepare(given)
+        assert np.shares_memory(splats.means, gaussians.means)
+        assert np.shares_memory(splats.sh0, gaussians.sh0)
+
+
+@pytest.mark.parametrize("with_depths", [False, True])
+@pytest.mark.parametrize("count", [0, 2])
+def test_arrays_give_arrays_and_tensors_tensors(with_depths: bool, count: int) -> None:
+    """Of equal values, also where only the Gaussians or only the cameras are tensors."""
+    gaussians, cameras = balls((0, 0, 1, 0.02, 0.8, 1.0), (0.01, 0, 1.2, 0.03, 0.5, 0.2)), camera(count=2)[:count]
+    options = {"antialiased": True, "near": 0.1, "far": 5.0, "with_depths": with_depths}
+    expected = render(gaussians, cameras, (0.1, 0.2, 0.3), **options)
+    assert (expected.depths is not None) == with_depths
+    under = torch.tensor([0.1, 0.2, 0.3])
+    for some, seen in (
+        (gaussians.to("cpu"), cameras.to("cpu")),
+        (gaussians.to("cpu"), cameras),
+        (gaussians, cameras.to("cpu")),
+    ):
+        actual = render(some, seen, under, **options)
+        for name, one in vars(expected).items():
+            tensor = getattr(actual, name)
+            if one is None:
+                assert tensor is None
+                continue
+            assert isinstance(one, np.ndarray)
+            assert isinstance(tensor, torch.Tensor)
+            assert one.dtype == np.float32
+            assert tensor.dtype == torch.float32
+            assert not tensor.requires_grad
+            np.testing.assert_array_equal(tensor.numpy(), one)
+    assert isinstance(render(gaussians, cameras, under).images, np.ndarray)
+
+
+def test_every_view_has_its_own_image() -> None:
+    gaussians, cameras = balls((0, 0, 1, 0.02, 0.8, 1.0)), camera(count=2)
+    viewmats = cameras.viewmats.copy()
+    viewmats[1, 0, 3] = 0.05  # 5 px to the right
+    images = render(gaussians, Cameras(viewmats, cameras.Ks, 21, 11)).images
+    np.testing.assert_allclose(images[1, :, 5:], images[0, :, :-5], atol=2e-3, rtol=0)
+    assert np.abs(images[1] - images[0]).max() > 0.5
+
+
+def test_messages() -> None:
+    gaussians, splats, K = balls((0, 0, 1, 0.02, 0.8, 1.0)), prepare(balls((0, 0, 1, 0.02, 0.8, 1.0))), camera().Ks[0]
+    with pytest.raises(ValueError, match="background of 1 or 3 numbers"):
+        render(gaussians, camera(), (0.1, 0.2))
+    with pytest.raises(ValueError, match="0 < near < far"):
+        render(gaussians, camera(), near=0)
+    with pytest.raises(ValueError, match="0 < near < far"):
+        render(gaussians, camera(), near=2, far=1)
+    with pytest.raises(ValueError, match=r"\[4,4\] view matrix"):
+        plan_view(splats, np.eye(3), K, 21, 11)
+    with pytest.raises(ValueError, match="image size"):
+        plan_view(splats, np.eye(4), K, 0, 11)
+    with pytest.raises(ValueError, match="focal"):
+        plan_view(splats, np.eye(4), -np.eye(3), 21, 11)
+    with pytest.raises(ValueError, match="1 opacities"):
+        plan_view(splats, np.eye(4), K, 21, 11, opacities=np.ones(2))
+    with pytest.raises(ValueError, match="keep flags"):
+        plan_view(splats, np.eye(4), K, 21, 11, keep=np.ones(2, bool))
+    plan = plan_view(splats, np.eye(4), K, 21, 11)
+    with pytest.raises(ValueError, match=r"colors: expected shape \[1, 3\]"):
+        composite(plan, np.ones((2, 3)))
+    with pytest.raises(ValueError, match="image: expected shape"):
+        splat_adjoint(plan, np.ones((11, 20, 3)))
+
+
+@pytest.mark.parametrize("at_once", [1, 2, 3, 8])
+def test_many_views_are_drawn_in_turn_as_they_are_together(at_once: int) -> None:
+    rng = np.random.default_rng(4)
+    rows = np.concatenate(
+        [rng.uniform(-1, 1, (300, 2)), rng.uniform(1, 4, (300, 1)), rng.uniform(0.01, 0.9, (300, 3))], 1
+    )
+    gaussians, cameras = balls(*map(tuple, rows)), camera(41, 31, 5)
+    cameras.viewmats[:, 0, 3] = np.linspace(-0.3, 0.37, 5)
+    images = list(render_in_turn(gaussians, cameras, 0.3, at_once=at_once, antialiased=True))
+    np.testing.assert_array_equal(images, render(gaussians, cameras, 0.3, antialiased=True).images)

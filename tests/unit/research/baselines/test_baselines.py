@@ -1,0 +1,219 @@
+"""Every baseline: its count, its order, and what defines it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import scenes
+import unaligned_scenes
+
+from gsmerge import CompactOptions, Gaussians, Scene, compact
+from gsmerge.compaction.result import CompactResult
+from gsmerge.errors import UsageError
+from gsmerge.research.baselines.simple import summed_weights
+from gsmerge.runtime.plugins import METHODS, find_plugins, load_plugin
+from gsmerge.stages.superpixels import grid_labels
+from gsmerge.types import grid_ids
+
+COUNT = 200
+KEEPERS = ("unmerged", "unmerged-fit")
+PRUNERS = ("opacity", "contribution", "random")
+EXACT = (*PRUNERS, "moment-matching", "blocks", "greedy")
+BASELINES = {name: load_plugin(METHODS, name) for name in find_plugins(METHODS)}
+OWN = sorted(set(BASELINES) - {"splat-transform"})  # which need no program
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24), noise=0.01)
+
+
+def made(scene: Scene, method: str, **settings: Any) -> CompactResult:
+    """With a few steps of the fit for the one that has one."""
+    quick = {"fit_steps": 12} if method == "unmerged-fit" else {}
+    return compact(scene, method=method, **{"budget": COUNT, **quick, **settings})
+
+
+def rows_of(part: Gaussians, whole: Gaussians) -> list[int]:
+    """The rows of ``whole`` whose opacity and colour the rows of ``part`` have."""
+
+    def columns(gaussians: Gaussians) -> list[list[float]]:
+        return np.concatenate([gaussians.opacities[:, None], gaussians.sh0[:, 0]], 1).tolist()
+
+    keys = {tuple(row): i for i, row in enumerate(columns(whole))}
+    return [keys[tuple(row)] for row in columns(part)]
+
+
+def test_entry_points_name_their_methods() -> None:
+    assert all(name == baseline.name for name, baseline in BASELINES.items())
+
+
+def test_used_settings_exist() -> None:
+    known = set(CompactOptions().to_dict())
+    assert {setting for baseline in BASELINES.values() for setting in baseline.uses} - known == set()
+
+
+@pytest.mark.parametrize("method", EXACT)
+@pytest.mark.parametrize("count", [3, 100, 2000, 3 * 32 * 24])
+def test_budgets_are_met(scene: Scene, method: str, count: int) -> None:
+    result = made(scene, method, budget=count)
+    assert len(result.gaussians) == count
+    scenes.assert_invariants(result.gaussians, scene)
+    scenes.assert_consistent(result.report, scene, result.gaussians)
+
+
+@pytest.mark.parametrize("method", EXACT)
+def test_the_usual_count_without_a_budget(scene: Scene, method: str) -> None:
+    assert len(made(scene, method, budget=None, superpixels="10%").gaussians) == 3 * 76
+    assert len(made(scene, method, budget=None, superpixels="10%", k=2).gaussians) == 2 * 3 * 76
+
+
+@pytest.mark.parametrize("method", OWN)
+def test_a_run_repeats_on_any_number_of_threads(scene: Scene, method: str) -> None:
+    one, other = (made(scene, method, threads=threads).gaussians for threads in (1, 3))
+    assert scenes.identical(one, other)
+
+
+@pytest.mark.parametrize("method", OWN)
+def test_scenes_without_an_order(scene: Scene, method: str) -> None:
+    if method == "blocks":
+        with pytest.raises(
+            UsageError, match="method blocks: expected one Gaussian per pixel, found an unaligned scene"
+        ):
+            compact(unaligned_scenes.shuffled(scene), method=method)
+        return
+    result = compact(unaligned_scenes.shuffled(scene), method=method, budget=COUNT, fit_steps=4)
+    assert method in KEEPERS or len(result.gaussians) <= COUNT
+    assert len(result.gaussians) > COUNT / 2
+
+
+@pytest.mark.parametrize("method", ["unmerged", "opacity", "contribution", "voxel", "greedy"])
+def test_the_order_of_the_rows_does_not_matter(scene: Scene, method: str) -> None:
+    actual = [compact(unaligned_scenes.shuffled(scene, seed), method=method, budget=COUNT).gaussians for seed in (1, 2)]
+    scenes.assert_same_set(*actual, atol=1e-4)
+
+
+@pytest.mark.parametrize("method", OWN)
+def test_rows_that_are_not_there_stay_out(scene: Scene, method: str) -> None:
+    valid = scene.valid.copy()
+    valid[:, :4] = False
+    gone = ~valid.reshape(-1)
+    means, opacities = scene.gaussians.means.copy(), scene.gaussians.opacities.copy()
+    opacities[gone], means[gone] = 0, 50.0
+    holed = replace(
+        scene, gaussians=replace(scene.gaussians, means=means, opacities=opacities), pixel_ids=grid_ids(valid)
+    )
+    result = made(holed, method)
+    assert np.abs(result.gaussians.means).max() < 10
+    assert len(result.gaussians) <= int(valid.sum())
+
+
+def test_photos_are_asked_for(scene: Scene) -> None:
+    with pytest.raises(UsageError, match="method unmerged-fit: expected photos, found none"):
+        made(replace(scene, images=None), "unmerged-fit")
+
+
+@pytest.mark.parametrize("method", sorted(set(OWN) - {"unmerged-fit"}))
+def test_the_others_do_without_photos(scene: Scene, method: str) -> None:
+    result = made(replace(scene, images=None), method)
+    assert result.report.psnr_after is None
+    assert len(result.gaussians) > COUNT / 2
+
+
+def test_settings_without_effect_are_told(scene: Scene) -> None:
+    def notes_of(method: str, **settings: Any) -> list[str]:
+        report = made(scene, method, **settings).report
+        return [note for note in report.notes if note != report.worse]
+
+    assert notes_of("voxel", seed=3, threads=1) == []
+    assert notes_of("voxel", effort="best", match="none") == ["method voxel does not use match, effort"]
+    assert notes_of("unmerged-fit", budget=None, effort="fast") == []
+    assert notes_of("unmerged") == ["method unmerged does not use budget"]
+
+
+def test_only_its_stages_are_timed(scene: Scene) -> None:
+    around = {"prepare", "score", "input"}
+    assert set(made(scene, "unmerged").report.seconds) == around
+    assert set(made(scene, "opacity").report.seconds) == around | {"reduce"}
+    assert set(made(scene, "moment-matching").report.seconds) == around | {"segment", "members", "encode", "decode"}
+    assert set(made(scene, "unmerged-fit").report.seconds) == around | {"fit"}
+
+
+def test_unmerged_is_the_input(scene: Scene) -> None:
+    actual = made(scene, "unmerged")
+    scenes.assert_same_set(actual.gaussians, scene.gaussians, atol=1e-5)
+    assert actual.report.psnr_after == pytest.approx(actual.report.psnr_before, abs=1e-3)
+
+
+def test_the_same_fit_for_the_input(scene: Scene) -> None:
+    """By steps, or by time; whatever ``fit`` says."""
+    actual = made(scene, "unmerged-fit", fit_steps=20, fit="none")
+    assert (actual.report.choices["fit"]["method"], actual.report.choices["fit"]["steps"]) == ("full", 20)
+    assert "method unmerged-fit does not use fit, budget" in actual.report.notes
+    limited = made(scene, "unmerged-fit", fit_steps=20, time_budget=1e-3).report.choices["fit"]
+    assert limited["steps"] < 20
+
+
+def test_the_most_opaque_stay(scene: Scene) -> None:
+    kept = rows_of(made(scene, "opacity").gaussians, scene.gaussians)
+    assert kept == sorted(kept)
+    left = np.setdiff1d(np.arange(len(scene.gaussians)), kept)
+    opacities = scene.gaussians.opacities
+    assert opacities[kept].min() >= opacities[left].max()
+
+
+def test_the_first_of_equally_opaque_ones_stay(scene: Scene) -> None:
+    equal = replace(scene, gaussians=replace(scene.gaussians, opacities=np.full_like(scene.gaussians.opacities, 0.5)))
+    np.testing.assert_array_equal(made(equal, "opacity").gaussians.sh0, scene.gaussians.sh0[:COUNT])
+
+
+def test_those_that_show_most_stay(scene: Scene) -> None:
+    kept = rows_of(made(scene, "contribution").gaussians, scene.gaussians)
+    weights = summed_weights(scene.gaussians, scene.cameras)
+    left = np.setdiff1d(np.arange(len(weights)), kept)
+    assert weights[kept].min() >= weights[left].max() - 1e-3
+    alphas = scenes.images_of(scene.gaussians, scene.cameras)[1]
+    assert weights.sum() == pytest.approx(alphas.sum(), rel=1e-3)
+
+
+def test_the_seed_chooses(scene: Scene) -> None:
+    one, two = (rows_of(made(scene, "random", seed=seed).gaussians, scene.gaussians) for seed in (1, 2))
+    assert len(set(one)) == COUNT
+    assert one == sorted(one)
+    assert set(one) != set(two)
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "count"),
+    [(24, 32, 66), (24, 32, 1), (24, 32, 768), (24, 32, 767), (1, 40, 7), (40, 1, 7), (5, 7, 11)],
+)
+def test_blocks_are_as_many_as_asked_for(height: int, width: int, count: int) -> None:
+    labels = grid_labels(height, width, count)
+    assert np.array_equal(np.unique(labels), np.arange(count))
+    for label in range(count):
+        ys, xs = np.nonzero(labels == label)
+        assert len(ys) == (np.ptp(ys) + 1) * (np.ptp(xs) + 1)  # a rectangle
+
+
+def test_blocks_are_about_equal() -> None:
+    sizes = np.bincount(grid_labels(240, 320, 300).reshape(-1))
+    assert sizes.max() < 1.5 * sizes.min()
+
+
+def test_one_gaussian_for_each_superpixel_has_their_mean_opacity() -> None:
+    """The paper's rule: the spread of the means, the mean opacity."""
+    flat = scenes.make_scene(scenes.wall(), scenes.arc(2, 32, 24), opacity=(0.7, 0.7))
+    actual = made(flat, "moment-matching").gaussians
+    np.testing.assert_allclose(actual.opacities, np.full(COUNT, 0.7), atol=1e-4)
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+@pytest.mark.parametrize("method", OWN)
+def test_harmonics_are_kept(method: str, degree: int) -> None:
+    scene = scenes.make_scene(scenes.wall(), scenes.arc(2, 24, 16), degree=degree)
+    actual = made(scene, method, budget=50).gaussians
+    assert actual.sh_degree == degree
+    assert degree == 0 or np.abs(actual.shN).max() > 0.01

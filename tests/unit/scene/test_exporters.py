@@ -1,0 +1,325 @@
+"""Files as exporters write them: each is read without a word, and every row comes to its own pixel."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from exports import (
+    da3_rows,
+    depth_map_mask,
+    export_rows,
+    home,
+    save_export,
+    smooth_scene,
+    turned,
+    with_intrinsics,
+    with_surface_rotations,
+)
+from plyfile import PlyData, PlyElement
+from scripts import load_script
+from tiny_scene import Tiny, make_tiny, write_npz
+
+from gsmerge.errors import SceneError
+from gsmerge.io import read_ply
+from gsmerge.scene.exporters import EXPORTERS
+from gsmerge.scene.read import load_scene, read_scene
+
+
+@pytest.fixture(scope="module")
+def smooth() -> Tiny:
+    """Three views of 48 x 36 of a smooth surface."""
+    return smooth_scene(48, 36)
+
+
+def test_depthsplat(tmp_path: Path, smooth: Tiny) -> None:
+    h, w = smooth.height, smooth.width
+    inner = np.arange(3 * h * w).reshape(3, h, w)[:, 8:-8, 8:-8].reshape(3, -1)
+    rows = export_rows(smooth, inner.T.reshape(-1))
+    turn = smooth.w2c[0, :3, :3]
+    loaded = load_scene(save_export(tmp_path, smooth, turned(rows, turn)))
+    scene = loaded.pixel_scene()
+    assert home(scene, smooth) == 1
+    assert [d.name for d in loaded.exporters] == ["depthsplat"]
+    assert loaded.recovery.best.frame.kind == "first"
+    assert scene.num_gaussians == int(scene.valid.sum()) == inner.size
+    assert scene.num_missing == 3 * h * w - inner.size
+    # the Gaussians stay where the file has them, and the cameras are moved
+    assert np.array_equal(
+        scene.gaussians.means[scene.valid.reshape(-1)][0], read_ply(tmp_path / "scene.ply").gaussians.means[0]
+    )
+    assert np.allclose(scene.cameras.viewmats[0, :3, :3], np.eye(3), atol=1e-6)
+    transparent = ~scene.valid.reshape(-1)
+    assert (scene.gaussians.opacities[transparent] == 0).all()
+    assert np.isfinite(scene.gaussians.means).all()
+
+
+@pytest.mark.parametrize("nested", [1.0, 1.7])
+@pytest.mark.parametrize("ties", [False, True])
+def test_depth_anything(tmp_path: Path, nested: float, ties: bool) -> None:
+    tiny = smooth_scene(96, 72)
+    depths = tiny.depths.copy()
+    if ties:
+        depths[:, :14] = depths.max()  # a sky of one depth, more than a tenth of the view: kept
+    kept = da3_rows(tiny, depths)
+    rows = export_rows(tiny, kept)
+    save_export(tmp_path / "gs_ply", tiny, rows, cameras=False, name="0000.ply")
+    w2c = tiny.w2c[:, :3].astype(np.float32)
+    w2c[:, :, 3] *= nested
+    write_npz(tmp_path / "exports/mini_npz/results.npz", tiny, extrinsics=w2c,
+              depth=(depths * nested).astype(np.float32), image=tiny.images)  # fmt: skip
+    loaded = load_scene(tmp_path / "gs_ply" / "0000.ply")
+    assert loaded.recovery.best.layout.kind in (("box", "box+depth") if ties else ("box+depth",))
+    assert loaded.recovery.best.frame.scale == pytest.approx(1 / nested, rel=1e-3)
+    assert [d.name for d in loaded.exporters] == ["da3"]
+    scene = loaded.pixel_scene()
+    assert home(scene, tiny, kept) == 1
+    assert scene.num_gaussians == len(kept)
+    sky = np.isin(np.arange(4 * 96 + 3, 5 * 96 - 3), kept)
+    assert ties == bool(sky.all())
+    if not ties:  # what was dropped is put back where the depth maps have it
+        assert scene.valid.all()
+        error = np.linalg.norm(scene.gaussians.means - tiny.gaussians.means, axis=1)
+        assert error.max() < 0.1
+        assert np.abs(scene.gaussians.sh0 - tiny.gaussians.sh0).max() < 1e-4
+
+
+def test_depth_anything_every_other_view(tmp_path: Path) -> None:
+    tiny = smooth_scene(96, 72)
+    kept = [np.flatnonzero(depth_map_mask(d)) + i * d.size for i, d in enumerate(tiny.depths)]
+    save_export(tmp_path / "gs_ply", tiny, export_rows(tiny, np.concatenate(kept[::2])), cameras=False, name="0000.ply")
+    write_npz(tmp_path / "exports/npz/results.npz", tiny, depth=tiny.depths, image=tiny.images)
+    loaded = load_scene(tmp_path / "gs_ply" / "0000.ply")
+    assert loaded.scene.names == ("view 0", "view 2")
+    assert "2 of 3 views are in the file" in loaded.notes
+
+
+@pytest.mark.parametrize(
+    ("order", "axes"),
+    [("view-fastest", (1, 2, 0)), ("column-major", (0, 2, 1)), ("view-major", (0, 1, 2))],
+)
+def test_orders(tmp_path: Path, smooth: Tiny, order: str, axes: tuple[int, int, int]) -> None:
+    index = np.arange(3 * smooth.height * smooth.width).reshape(3, smooth.height, smooth.width)
+    path = save_export(tmp_path, smooth, export_rows(smooth, index.transpose(axes).reshape(-1)))
+    loaded = load_scene(path)
+    assert loaded.recovery.best.layout.order == order
+    assert home(loaded.pixel_scene(), smooth) == 1
+    assert home(load_scene(path, order=order).pixel_scene(), smooth) == 1
+
+
+def test_views_in_reverse(tmp_path: Path, smooth: Tiny) -> None:
+    index = np.arange(3 * smooth.height * smooth.width).reshape(3, -1)[::-1].reshape(-1)
+    scene = load_scene(save_export(tmp_path, smooth, export_rows(smooth, index))).pixel_scene()
+    assert scene.names == tuple(f"images/{n}" for n in smooth.names[::-1])
+    assert np.allclose(scene.cameras.viewmats, smooth.w2c[::-1])
+    assert np.array_equal((scene.images * 255).round(), smooth.images[::-1])
+
+
+def test_some_of_the_views(tmp_path: Path, smooth: Tiny) -> None:
+    size = smooth.height * smooth.width
+    for views in ((0, 1), (1, 2), (0, 2), (2,)):
+        index = np.concatenate([np.arange(size) + view * size for view in views])
+        folder = tmp_path / str(views)
+        scene = load_scene(save_export(folder, smooth, export_rows(smooth, index))).pixel_scene()
+        assert scene.names == tuple(f"images/{smooth.names[view]}" for view in views)
+
+
+@pytest.mark.parametrize("layers_first", [False, True])
+def test_three_gaussians_per_pixel(tmp_path: Path, smooth: Tiny, layers_first: bool) -> None:
+    size = smooth.height * smooth.width
+    pixel = np.arange(3 * size).reshape(3, size)
+    index = np.stack([pixel] * 3, 0 if layers_first else 2).reshape(-1)
+    rows = export_rows(smooth, index)
+    layer = np.stack([np.full((3, size), i) for i in range(3)], 0 if layers_first else 2).reshape(-1)
+    rows["opacity"] = layer - 1.0
+    loaded = load_scene(save_export(tmp_path, smooth, rows))
+    scene = loaded.pixel_scene()
+    assert len(scene) == 9
+    assert scene.names[:3] == (f"images/{smooth.names[0]}",) * 3
+    opacities = scene.gaussians.opacities.reshape(9, -1)
+    assert (opacities == opacities[:, :1]).all()
+    assert np.allclose(opacities[:3, 0], 1 / (1 + np.exp([1, 0, -1])))
+
+
+def test_any_similarity(tmp_path: Path, smooth: Tiny) -> None:
+    rows = export_rows(smooth)
+    turn = make_tiny().c2w[2, :3, :3] @ make_tiny().c2w[1, :3, :3]
+    moved = turned(rows, turn, scale=0.3, shift=np.array([3.0, -1, 2]))
+    loaded = load_scene(save_export(tmp_path, smooth, moved))
+    assert home(loaded.pixel_scene(), smooth) == 1
+    assert loaded.recovery.best.frame.kind == "other"
+    assert loaded.recovery.best.frame.scale == pytest.approx(0.3, rel=1e-2)
+    assert loaded.alignment.worst_px < 0.3
+
+
+def test_the_pixelsplat_world(tmp_path: Path, smooth: Tiny) -> None:
+    """Recentred, divided, upright from the first camera; raw opacities; camera-frame rotations."""
+    tiny = with_surface_rotations(smooth, relative_to_camera=True)
+    half = np.sqrt(0.5)
+    upright = np.array([[half, half, 0], [-half, half, 0], [0, 0, 1]]) @ np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
+    rows = turned(export_rows(tiny), upright @ tiny.w2c[0, :3, :3], scale=1 / 3, shift=np.array([0.3, 0.1, -0.2]),
+                  rotate_quats=False)  # fmt: skip
+    rows["opacity"] = tiny.gaussians.opacities
+    loaded = load_scene(save_export(tmp_path, tiny, rows))
+    assert loaded.recovery.best.frame.kind == "upright"
+    assert "pixelsplat" in [d.name for d in loaded.exporters]
+    assert any("relative to each view's camera" in note for note in loaded.notes)
+    assert home(loaded.pixel_scene(), tiny) == 1
+
+
+@pytest.mark.parametrize("stored", ["wxyz", "xyzw", "camera"])
+def test_rotations(tmp_path: Path, smooth: Tiny, stored: str) -> None:
+    true = with_surface_rotations(smooth)
+    rows = export_rows(with_surface_rotations(smooth, relative_to_camera=stored == "camera"))
+    if stored == "xyzw":
+        w, x, y, z = (rows[f"rot_{i}"].copy() for i in range(4))
+        rows["rot_0"], rows["rot_1"], rows["rot_2"], rows["rot_3"] = x, y, z, w
+    path = save_export(tmp_path, smooth, rows)
+    # the cameras differ by a few degrees only: not enough to tell from the surface
+    for hints in (stored,) if stored == "camera" else ("auto", stored):
+        quats = read_scene(path, quats=hints).gaussians.quats
+        agree = np.abs((quats * true.gaussians.quats).sum(1))
+        assert agree.min() > 0.9999
+    loaded = load_scene(path)
+    assert any("rotations are" in note for note in loaded.notes) == (stored == "xyzw")
+
+
+def test_raw_opacities(tmp_path: Path, smooth: Tiny) -> None:
+    rows = export_rows(smooth)
+    rows["opacity"] = smooth.gaussians.opacities
+    path = save_export(tmp_path, smooth, rows)
+    assert home(read_scene(path), smooth) == 1
+    logit = read_scene(path, exporter="splatter-image", order="view-major").gaussians.opacities
+    assert np.allclose(logit, 1 / (1 + np.exp(-smooth.gaussians.opacities)), atol=1e-5)
+
+
+def test_logits_under_the_name_of_an_exporter_of_raw_opacities(tmp_path: Path, smooth: Tiny) -> None:
+    """Versions differ: a later AnySplat writes logits."""
+    path = save_export(tmp_path, smooth, export_rows(smooth))
+    read = read_scene(path, exporter="noposplat").gaussians.opacities
+    assert np.allclose(read, smooth.gaussians.opacities, atol=1e-5)
+
+
+def test_infinite_opacities_and_nan_scales(tmp_path: Path, smooth: Tiny) -> None:
+    h, w = smooth.height, smooth.width
+    rows = export_rows(smooth, np.arange(3 * h * w).reshape(3, h, w)[:, 8:-8, 8:-8].transpose(1, 2, 0).reshape(-1))
+    rows["opacity"][0], rows["opacity"][1] = np.inf, -np.inf
+    rows["scale_1"][3:6] = np.nan
+    scene = load_scene(save_export(tmp_path, smooth, rows)).pixel_scene()
+    assert scene.gaussians.opacities.reshape(3, h, w)[0, 8, 8] == 1
+    assert scene.gaussians.opacities.reshape(3, h, w)[1, 8, 8] == 0
+    assert scene.valid[1, 8, 8]
+    assert not scene.valid[:, 8, 9].any()
+    assert int(scene.valid.sum()) == len(rows) - 3
+    assert scene.num_gaussians == len(rows)  # rows of the file, the set-aside ones included
+
+
+def test_byte_normals_are_long_lrm(tmp_path: Path, smooth: Tiny) -> None:
+    rows = export_rows(smooth, rest=45, normals="u1")
+    loaded = load_scene(save_export(tmp_path, smooth, rows))
+    assert [d.name for d in loaded.exporters] == ["longlrm"]
+    assert home(loaded.pixel_scene(), smooth) == 1
+
+
+def test_extra_elements_are_ignored(tmp_path: Path, smooth: Tiny) -> None:
+    rows = export_rows(smooth)
+    path = save_export(tmp_path, smooth, rows)
+    extra = [PlyElement.describe(np.zeros(n, [("value", t)]), name)
+             for name, n, t in (("extrinsic", 16, "f4"), ("intrinsic", 9, "f4"), ("image_size", 2, "u4"))]  # fmt: skip
+    PlyData([PlyElement.describe(rows, "vertex"), *extra], byte_order="<").write(str(path / "scene.ply"))
+    assert home(read_scene(path), smooth) == 1
+
+
+def test_voxels_are_unaligned(tmp_path: Path, smooth: Tiny) -> None:
+    rows = export_rows(smooth, np.lexsort(smooth.gaussians.means.round(1).T)[::2])
+    rows["opacity"] = 1 / (1 + np.exp(-rows["opacity"]))
+    loaded = load_scene(save_export(tmp_path, smooth, rows))
+    assert not loaded.scene.aligned
+    assert len(loaded.scene.gaussians) == len(rows)
+    assert loaded.scene.images is not None
+    assert {d.name for d in loaded.exporters} == {"anysplat", "worldmirror"}
+    assert loaded.alignment is None
+    assert loaded.problem is not None
+
+
+def test_a_scene_can_be_given_as_unaligned(tmp_path: Path, smooth: Tiny) -> None:
+    path = save_export(tmp_path, smooth, export_rows(smooth))
+    assert not read_scene(path, order="none").aligned
+    assert not read_scene(path, exporter="volsplat").aligned
+
+
+def test_a_given_scale(tmp_path: Path, smooth: Tiny) -> None:
+    c2w = smooth.c2w.copy()
+    c2w[:, :3, 3] *= 2
+    path = save_export(tmp_path, replace(smooth, c2w=c2w), export_rows(smooth))
+    scene = read_scene(path, scene_scale=0.5)
+    assert np.allclose(scene.cameras.viewmats, smooth.w2c)
+    assert read_scene(path).aligned
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("order", "spiral"), ("quats", "zyxw"), ("scene_scale", 0.0), ("exporter", "x"), ("magic", 1)]
+)
+def test_wrong_arguments(tmp_path: Path, smooth: Tiny, name: str, value: object) -> None:
+    path = save_export(tmp_path, smooth, export_rows(smooth))
+    with pytest.raises(ValueError, match="expected"):
+        read_scene(path, **{name: value})
+
+
+def test_every_exporter_is_documented(root: Path) -> None:
+    text = (root / "docs" / "reference" / "exporters.md").read_text()
+    assert [name for name in EXPORTERS if f"| `{name}` |" not in text] == []
+
+
+def dump_of(tiny: Tiny, folder: Path, root: Path, **changes: Any) -> Path:
+    """``views.npz`` beside the Gaussians, written by the lines of the example."""
+    save_export(folder, tiny, export_rows(tiny), cameras=False)
+    values = {"c2w": tiny.c2w, "K": np.tile(tiny.K, (3, 1, 1)), "images": tiny.images} | changes
+    load_script(root / "examples" / "04_dump_views.py").dump_views(str(folder / "views.npz"), **values)
+    return folder
+
+
+def test_views_dumped_from_a_model(tmp_path: Path, smooth: Tiny, root: Path) -> None:
+    normalised = np.tile(smooth.K / np.array([[smooth.width], [smooth.height], [1.0]]), (3, 1, 1))
+    forms: dict[str, dict[str, Any]] = {
+        "plain": {},
+        "normalised": {"K": normalised},
+        "three rows": {"c2w": smooth.c2w[:, :3]},
+        "channels first": {"images": smooth.images.transpose(0, 3, 1, 2) / 255},
+        "order": {"order": "view-major"},
+    }
+    for name, changes in forms.items():
+        loaded = load_scene(dump_of(smooth, tmp_path / name, root, **changes))
+        scene = loaded.pixel_scene()
+        assert home(scene, smooth) == 1, name
+        assert loaded.cameras.source == "dump of a model"
+        assert np.allclose(scene.cameras.Ks, smooth.K)
+        assert np.array_equal((scene.images * 255).round(), smooth.images)
+    assert not read_scene(dump_of(smooth, tmp_path / "none", root, order="none")).aligned
+
+
+def test_a_damaged_dump(tmp_path: Path, smooth: Tiny, root: Path) -> None:
+    with pytest.raises(SceneError, match="expected 'order' to be one of auto, view-major"):
+        read_scene(dump_of(smooth, tmp_path / "order", root, order="magic"))
+    with pytest.raises(SceneError, match=r"expected c2w \[v,4,4\] and K \[v,3,3\]"):
+        read_scene(dump_of(smooth, tmp_path / "K", root, K=smooth.K))
+
+
+@pytest.mark.parametrize("fastest", [False, True])
+def test_cameras_from_the_grid_alone(tmp_path: Path, fastest: bool) -> None:
+    tiny = smooth_scene(96, 72)
+    K = np.array([[110.0, 0, 48], [0, 110, 36], [0, 0, 1]])
+    tiny = with_intrinsics(tiny, K)
+    index = np.arange(3 * 96 * 72).reshape(3, -1)
+    save_export(tmp_path, tiny, export_rows(tiny, (index.T if fastest else index).reshape(-1)))
+    (tmp_path / "transforms.json").unlink()
+    loaded = load_scene(tmp_path)
+    scene = loaded.pixel_scene()
+    assert home(scene, tiny) == 1
+    assert loaded.cameras.source == "estimated from the grid"
+    assert any("no cameras were given" in note for note in loaded.notes)
+    assert scene.cameras.Ks[0, 0, 0].item() == pytest.approx(110, rel=0.02)
+    assert np.allclose(scene.cameras.centres, tiny.c2w[:, :3, 3], atol=0.1)

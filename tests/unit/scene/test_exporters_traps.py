@@ -1,0 +1,387 @@
+"""Facts about exporters that break a naive reader, each in a small file of its own."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from exports import (
+    Smooth,
+    da3_rows,
+    export_rows,
+    home,
+    save_export,
+    smooth_scene,
+    turned,
+    with_intrinsics,
+    with_surface_rotations,
+)
+from PIL import Image
+from plyfile import PlyData
+from sharp_files import write_elements
+from tiny_scene import rotation, write_colmap_text, write_inria, write_npz
+
+from gsmerge.io import read_ply
+from gsmerge.scene.read import load_scene, read_scene
+from gsmerge.types import SH_C0
+
+SMOOTH = smooth_scene(48, 36)
+
+
+UNIT = 0.01  # of the maps in the Gaussians' world: six decimals are a ten thousandth of a depth, then
+ROWS = np.arange(3 * 36 * 48).reshape(3, 36, 48)
+
+
+def along_the_rays(tiny: Smooth) -> Smooth:
+    """The same, with the depth maps' values taken as the distance from the eye."""
+    means = []
+    for pose, points, depth in zip(
+        tiny.c2w, tiny.gaussians.means.astype(np.float64).reshape(3, -1, 3), tiny.depths, strict=True
+    ):
+        rays = points - pose[:3, 3]
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        means.append(pose[:3, 3] + rays * depth.reshape(-1, 1))
+    return replace(tiny, gaussians=replace(tiny.gaussians, means=np.concatenate(means).astype(np.float32)))
+
+
+# Depth Anything 3
+
+
+@pytest.mark.parametrize("decimals", [6, 8])
+def test_depth_maps_that_were_rounded(tmp_path: Path, decimals: int) -> None:
+    """The mask was made before the maps were rounded: a few pixels at the threshold may differ."""
+    tiny = smooth_scene(96, 72)
+    depths = UNIT * tiny.depths
+    save_export(tmp_path / "gs_ply", tiny, export_rows(tiny, da3_rows(tiny)), cameras=False, name="0000.ply")
+    w2c = tiny.w2c[:, :3].copy()
+    w2c[:, :, 3] *= UNIT
+    write_npz(tmp_path / "exports/mini_npz/results.npz", tiny, extrinsics=w2c, depth=depths.round(decimals))
+    loaded = load_scene(tmp_path / "gs_ply/0000.ply")
+    scene = loaded.pixel_scene()
+    same = np.abs(scene.gaussians.opacities - tiny.gaussians.opacities) < 1e-5
+    assert float(same[da3_rows(tiny)].mean()) > 0.99
+    assert scene.num_gaussians == loaded.ply.count
+
+
+@pytest.mark.parametrize("aligned", [True, False])
+def test_poses_of_the_user(tmp_path: Path, aligned: bool) -> None:
+    """Cameras and depths in the user's world, Gaussians in the predicted one: any similarity, and a mask."""
+    tiny = smooth_scene(96, 72)
+    turn, shift, scale = rotation(0.5, -0.8, 0.3), np.array([2.0, -1, 4]), 1.9
+    rows = turned(export_rows(tiny, da3_rows(tiny)), tiny.w2c[0, :3, :3] if aligned else turn, scale=1 / scale,
+                  shift=tiny.w2c[0, :3, 3] / scale if aligned else shift)  # fmt: skip
+    save_export(tmp_path / "gs_ply", tiny, rows, cameras=False, name="0000.ply")
+    write_npz(tmp_path / "exports/npz/results.npz", tiny, depth=tiny.depths.astype(np.float32))
+    loaded = load_scene(tmp_path / "gs_ply/0000.ply")
+    scene = loaded.pixel_scene()
+    same = np.abs(scene.gaussians.opacities - tiny.gaussians.opacities) < 1e-5
+    assert same[da3_rows(tiny)].all()
+    assert loaded.alignment.worst_px < 0.5
+    assert np.array_equal(scene.gaussians.means[da3_rows(tiny)[0]], read_ply(loaded.ply.path).gaussians.means[0])
+
+
+def test_depth_is_the_distance_along_the_ray(tmp_path: Path) -> None:
+    """What is put back lies as far from the eye as the rest does, not as deep."""
+    tiny = along_the_rays(smooth_scene(96, 72))
+    save_export(tmp_path / "gs_ply", tiny, export_rows(tiny, da3_rows(tiny)), cameras=False, name="0000.ply")
+    write_npz(tmp_path / "exports/npz/results.npz", tiny, depth=tiny.depths.astype(np.float32))
+    scene = load_scene(tmp_path / "gs_ply/0000.ply").pixel_scene()
+    assert scene.valid.all()
+    assert np.linalg.norm(scene.gaussians.means - tiny.gaussians.means, axis=1).max() < 0.05
+    rows = da3_rows(tiny)  # and is never taken for the file's own
+    assert np.array_equal(np.flatnonzero(scene.stored.reshape(-1)), rows)
+    assert np.array_equal(scene.file_gaussians.means, tiny.gaussians.means[rows])
+
+
+def test_rotations_are_never_changed(tmp_path: Path) -> None:
+    tiny = with_surface_rotations(smooth_scene(96, 72))
+    rows = export_rows(tiny, da3_rows(tiny))
+    w, x, y, z = (rows[f"rot_{i}"].copy() for i in range(4))
+    rows["rot_0"], rows["rot_1"], rows["rot_2"], rows["rot_3"] = x, y, z, w
+    save_export(tmp_path / "gs_ply", tiny, rows, cameras=False, name="0000.ply")
+    write_npz(tmp_path / "exports/npz/results.npz", tiny, depth=tiny.depths.astype(np.float32))
+    loaded = load_scene(tmp_path / "gs_ply/0000.ply")
+    assert not any("rotations" in note for note in loaded.notes)
+    first = np.array([x[0], y[0], z[0], w[0]])
+    assert np.allclose(loaded.scene.gaussians.quats[da3_rows(tiny)[0]], first, atol=1e-5)
+
+
+def test_arrays_as_the_demo_names_them(tmp_path: Path) -> None:
+    K = np.array([[52.8, 0, 24], [0, 54, 18], [0, 0, 1]])
+    tiny = with_intrinsics(SMOOTH, K)
+    tiny.save(tmp_path, cameras=False, images=False)
+    np.savez(tmp_path / "predictions.npz", images=tiny.images.transpose(0, 3, 1, 2) / 255.0, depths=tiny.depths,
+             conf=tiny.depths, extrinsics=tiny.w2c[:, :3], intrinsics=np.tile(K, (3, 1, 1)))  # fmt: skip
+    loaded = load_scene(tmp_path, cameras=tmp_path / "predictions.npz")
+    assert home(loaded.pixel_scene(), tiny) == 1
+    assert loaded.scene.images is not None
+
+
+# The family of pixelSplat
+
+
+@pytest.mark.parametrize("trim", [0, 8])
+def test_several_gaussians_per_pixel_before_the_view(tmp_path: Path, trim: int) -> None:
+    """Row, column, Gaussian of the pixel, view: three per pixel with the view index fastest."""
+    inner = ROWS[:, trim : 36 - trim, trim : 48 - trim]
+    index = np.repeat(inner.transpose(1, 2, 0)[:, :, None], 3, axis=2)
+    rows = export_rows(SMOOTH, index.reshape(-1))
+    rows["opacity"] = np.broadcast_to(np.arange(3)[:, None] - 1.0, index.shape).reshape(-1)
+    scene = load_scene(save_export(tmp_path, SMOOTH, rows)).pixel_scene()
+    assert len(scene) == 9
+    opacities = scene.gaussians.opacities.reshape(9, -1)[scene.valid.reshape(9, -1)].reshape(9, -1)
+    assert (opacities == opacities[:, :1]).all()
+    assert np.allclose(opacities[3:6, 0], 1 / (1 + np.exp([1, 0, -1])))
+
+
+def test_resplat(tmp_path: Path) -> None:
+    """A grid of a quarter of the photos' size, turned into the middle camera, with 45 harmonics."""
+    tiny = with_surface_rotations(SMOOTH, relative_to_camera=True)
+    rows = turned(export_rows(tiny, rest=45), tiny.w2c[1, :3, :3], rotate_quats=False)
+    large = replace(
+        tiny,
+        K=tiny.K * np.array([[4.0], [4], [1]]),
+        width=192,
+        height=144,
+        images=np.stack([cv2.resize(image, (192, 144), interpolation=cv2.INTER_CUBIC) for image in tiny.images]),
+    )
+    loaded = load_scene(save_export(tmp_path, large, rows))
+    assert home(loaded.pixel_scene(), tiny) == 1
+    assert loaded.recovery.best.frame.kind == "middle"
+    assert [d.name for d in loaded.exporters] == ["resplat"]
+
+
+def test_rows_sorted_by_opacity(tmp_path: Path) -> None:
+    """VicaSplat's and Long-LRM's pruning leaves no order: nothing is guessed, and nothing is lost but what was cut."""
+    order = np.argsort(-SMOOTH.gaussians.opacities, kind="stable")[:4000]
+    loaded = load_scene(save_export(tmp_path, SMOOTH, export_rows(SMOOTH, order, rest=72)))
+    assert not loaded.scene.aligned
+    assert np.array_equal(loaded.scene.gaussians.means, SMOOTH.gaussians.means[order])
+    assert "vicasplat" in [d.name for d in loaded.exporters]
+
+
+def test_two_layers_one_after_the_other(tmp_path: Path) -> None:
+    """Flash3D: one photo, activated opacities, a recentred and upright world."""
+    one = replace(SMOOTH, c2w=SMOOTH.c2w[:1], images=SMOOTH.images[:1], names=SMOOTH.names[:1])
+    rows = export_rows(SMOOTH, np.tile(ROWS[0].reshape(-1), 2))
+    rows["opacity"] = np.repeat([0.75, 0.25], ROWS[0].size)
+    half = np.sqrt(0.5)
+    upright = np.array([[half, half, 0], [-half, half, 0], [0, 0, 1]]) @ np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
+    moved = turned(rows, upright @ SMOOTH.w2c[0, :3, :3], scale=0.4, shift=np.array([0.1, 0.2, 0.3]))
+    loaded = load_scene(save_export(tmp_path, one, moved))
+    scene = loaded.pixel_scene()
+    assert scene.valid.shape == (2, 36, 48)
+    assert scene.gaussians.opacities.reshape(2, -1).mean(1).tolist() == pytest.approx([0.75, 0.25])
+    assert "flash3d" in [d.name for d in loaded.exporters]
+
+
+# Columns
+
+
+def test_harmonics_in_any_order_of_columns(tmp_path: Path) -> None:
+    """``f_rest_10`` comes before ``f_rest_2`` where names were sorted as text; all columns may be anywhere."""
+    rng = np.random.default_rng(0)
+    rows = export_rows(SMOOTH, rest=45)
+    for i in range(45):
+        rows[f"f_rest_{i}"] = rng.normal(size=len(rows))
+    usual = read_ply(save_export(tmp_path / "a", SMOOTH, rows, cameras=False) / "scene.ply")
+    for name, names in (("text", sorted(rows.dtype.names)), ("any", rng.permutation(rows.dtype.names).tolist())):
+        other = np.empty(len(rows), [(column, "<f4") for column in names])
+        for column in names:
+            other[column] = rows[column]
+        actual = read_ply(save_export(tmp_path / name, SMOOTH, other, cameras=False) / "scene.ply")
+        for field in ("means", "quats", "scales", "opacities", "sh0", "shN"):
+            assert np.array_equal(getattr(actual.gaussians, field), getattr(usual.gaussians, field)), field
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_harmonics_of_long_lrm(tmp_path: Path, degree: int) -> None:
+    """45 columns whatever the degree: those of a lower one stand side by side in the first columns."""
+    rng, higher = np.random.default_rng(0), (degree + 1) ** 2 - 1
+    shN = rng.normal(size=(ROWS.size, higher, 3)).astype(np.float32)
+    rows = export_rows(SMOOTH, rest=45, normals="u1")
+    for i in range(3 * higher):
+        rows[f"f_rest_{i}"] = shN[:, i % higher, i // higher]
+    actual = read_ply(save_export(tmp_path, SMOOTH, rows, cameras=False) / "scene.ply").gaussians.shN
+    assert np.array_equal(actual[:, :higher], shN)
+    assert not actual[:, higher:].any()
+
+
+def test_colours_as_bytes(tmp_path: Path) -> None:
+    """nerfstudio's ``rgb`` mode: red, green and blue instead of harmonics."""
+    rows = export_rows(SMOOTH)
+    kept = [name for name in rows.dtype.names if not name.startswith("f_dc")]
+    other = np.zeros(len(rows), [(name, "f4") for name in kept] + [(name, "u1") for name in ("red", "green", "blue")])
+    for name in kept:
+        other[name] = rows[name]
+    for i, name in enumerate(("red", "green", "blue")):
+        other[name] = SMOOTH.images.reshape(-1, 3)[:, i]
+    path = save_export(tmp_path, SMOOTH, other)
+    scene = read_scene(path)
+    assert home(scene, SMOOTH) == 1
+    colours = 0.5 + SH_C0 * scene.gaussians.sh0[:, 0]
+    assert np.abs(colours * 255 - SMOOTH.images.reshape(-1, 3)).max() < 0.01
+
+
+def test_the_header_of_nerfstudio(tmp_path: Path) -> None:
+    some = np.random.default_rng(0).permutation(ROWS.size)[:3000]
+    save_export(tmp_path, SMOOTH, export_rows(SMOOTH, some, rest=45))
+    data = PlyData.read(str(tmp_path / "scene.ply"), mmap=False)
+    data.comments = ["Generated by Nerstudio 1.1.5", "Vertical Axis: z"]
+    data.write(str(tmp_path / "scene.ply"))
+    assert [d.name for d in load_scene(tmp_path).exporters] == ["nerfstudio"]
+
+
+# SHARP
+
+
+def sharp_rows(square: Smooth) -> np.ndarray:
+    """Two layers seen by a camera at the origin."""
+    one = np.arange(36 * 36)
+    rows = turned(export_rows(square, np.concatenate([one, one]), normals=""), square.w2c[0, :3, :3],
+                  shift=square.w2c[0, :3, 3])  # fmt: skip
+    rows["opacity"][36 * 36 :] = -2
+    return rows
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+def test_all_elements_of_sharp(tmp_path: Path, legacy: bool) -> None:
+    size = (48, 36)
+    (tmp_path / "images").mkdir()
+    square = with_intrinsics(smooth_scene(36, 36), np.array([[39.6, 0, 18], [0, 54, 18], [0, 0, 1]]))
+    cv2.imwrite(str(tmp_path / "images" / "photo.png"), cv2.resize(square.images[0], size)[..., ::-1])
+    K = square.K * np.array([[size[0] / 36], [size[1] / 36], [1.0]])
+    rows = sharp_rows(square)
+    pose = square.w2c[1]
+    rows = turned(rows, pose[:3, :3].T, shift=-pose[:3, :3].T @ pose[:3, 3])
+    if legacy:
+        numbers = np.concatenate([pose[:3, :3].T, pose[:3, 3:]], 1).reshape(-1)
+        write_elements(tmp_path / "photo.ply", rows, numbers, [K[0, 0], K[1, 1], *size], None)
+    else:
+        write_elements(tmp_path / "photo.ply", rows, pose.reshape(-1), K.reshape(-1), size)
+    loaded = load_scene(tmp_path / "photo.ply")
+    scene = loaded.pixel_scene()
+    assert scene.valid.shape == (2, 36, 36)
+    assert np.allclose(scene.cameras.Ks[0], square.K, atol=1e-4)
+    assert np.allclose(scene.cameras.viewmats, pose, atol=1e-6)
+    assert set(loaded.ply.extra_elements) >= {"frame", "disparity", "color_space", "version"}
+    assert "version" not in loaded.ply.columns
+    assert [d.name for d in loaded.exporters] == ["sharp"]
+    assert scene.images.shape == (2, 36, 36, 3)
+    assert np.allclose(scene.gaussians.opacities[36 * 36 :], 1 / (1 + np.exp(2)))
+
+
+@pytest.mark.parametrize("tag", [1, 3, 6, 8])
+def test_sharp_turns_photos_upright(tmp_path: Path, tag: int) -> None:
+    """As their orientation tag says, as no other model does; its camera is that of the upright photo."""
+    size = (48, 64)
+    square = with_intrinsics(smooth_scene(36, 36), np.array([[60.0, 0, 18], [0, 45, 18], [0, 0, 1]]))
+    K = square.K * np.array([[size[0] / 36], [size[1] / 36], [1.0]])
+    write_elements(tmp_path / "photo.ply", sharp_rows(square), np.eye(4).reshape(-1), K.reshape(-1), size)
+    upright = cv2.resize(square.images[0], size)
+    turns = {1: 0, 3: 2, 6: 1, 8: 3}[tag]  # of the pixels, which the tag undoes
+    exif = Image.Exif()
+    exif[274] = tag
+    Image.fromarray(np.rot90(upright, turns).copy()).save(tmp_path / "photo.jpg", quality=100, subsampling=0, exif=exif)
+    scene = load_scene(tmp_path / "photo.ply").pixel_scene()
+    small = cv2.resize(upright, (36, 36), interpolation=cv2.INTER_AREA)
+    assert np.abs(scene.images[0] * 255 - small).mean() < 1.5
+    large = scene.large_photos
+    assert (large.width, large.height) == size
+    assert np.abs(large.read(large.ids[0]).astype(int) - upright).mean() < 1.5
+    # a photo that was turned already, whose tag was left as it was
+    if tag in (6, 8):
+        Image.fromarray(upright).save(tmp_path / "photo.jpg", quality=100, subsampling=0, exif=exif)
+        again = load_scene(tmp_path / "photo.ply").pixel_scene()
+        assert np.abs(again.images[0] * 255 - small).mean() < 1.5
+
+
+# Cameras
+
+
+def test_image_ids_in_another_order_than_names(tmp_path: Path) -> None:
+    """COLMAP numbers images as it pleases, and writes them in any order; the rows follow the names."""
+    SMOOTH.save(tmp_path, cameras=False)
+    write_colmap_text(tmp_path / "sparse", SMOOTH)
+    lines = (tmp_path / "sparse/images.txt").read_text().splitlines()
+    entries = [lines[i : i + 2] for i in range(2, 8, 2)]
+    for number, entry in zip((12, 3, 9), entries, strict=True):
+        entry[0] = " ".join([str(number), *entry[0].split(" ")[1:]])
+    (tmp_path / "sparse/images.txt").write_text("\n".join(line for i in (1, 2, 0) for line in entries[i]) + "\n")
+    loaded = load_scene(tmp_path)
+    assert loaded.scene.names == SMOOTH.names
+    assert home(loaded.pixel_scene(), SMOOTH) == 1
+    assert np.array_equal((loaded.scene.images * 255).round(), SMOOTH.images)
+
+
+def test_views_in_the_order_of_names_sorted_as_text(tmp_path: Path) -> None:
+    """Exporters sort names as text: 10, 11, 2."""
+    rows = export_rows(SMOOTH, ROWS[[1, 2, 0]].reshape(-1))
+    scene = load_scene(save_export(tmp_path, SMOOTH, rows)).pixel_scene()
+    assert [Path(name).stem for name in scene.names] == ["10", "11", "2"]
+    assert np.array_equal((scene.images * 255).round(), SMOOTH.images[[1, 2, 0]])
+
+
+def test_inria_s_test_cameras_come_first(tmp_path: Path) -> None:
+    """Names lack their extension, the file is not in the order of the names; each camera keeps its own photo."""
+    centred = with_intrinsics(SMOOTH, np.array([[52.8, 0, 24], [0, 54, 18], [0, 0, 1]]))
+    some = np.random.default_rng(0).permutation(ROWS.size)[:3000]
+    save_export(tmp_path, centred, export_rows(centred, some, rest=45))
+    (tmp_path / "transforms.json").unlink()
+    write_inria(tmp_path / "cameras.json", centred)
+    entries = json.loads((tmp_path / "cameras.json").read_text())
+    (tmp_path / "cameras.json").write_text(json.dumps([entries[2], *entries[:2]]))
+    loaded = load_scene(tmp_path)
+    assert loaded.scene.names == ("11", "2", "10")
+    assert np.array_equal((loaded.scene.images * 255).round(), centred.images[[2, 0, 1]])
+    assert np.allclose(loaded.scene.cameras.viewmats, centred.w2c[[2, 0, 1]])
+    assert "inria" in [d.name for d in loaded.exporters]
+
+
+@pytest.mark.parametrize("ids", [(0, 1, 2), ("image_0000", "image_0001", "image_0002"), ("0", "1", "2")])
+def test_cameras_of_world_mirror_by_number_or_stem(tmp_path: Path, ids: tuple) -> None:
+    named = replace(SMOOTH, names=tuple(f"image_{i:04d}.png" for i in range(3)))
+    some = np.random.default_rng(0).permutation(ROWS.size)[:3000]
+    save_export(tmp_path, named, export_rows(named, some))
+    (tmp_path / "transforms.json").unlink()
+    document = {
+        "num_cameras": 3,
+        "extrinsics": [{"camera_id": i, "matrix": m.tolist()} for i, m in zip(ids, named.c2w, strict=True)][::-1],
+        "intrinsics": [{"camera_id": i, "matrix": named.K.tolist()} for i in ids],
+    }
+    (tmp_path / "camera_params.json").write_text(json.dumps(document))
+    scene = load_scene(tmp_path).scene
+    order = [0, 1, 2] if str(ids[0]).isdecimal() else [2, 1, 0]
+    assert np.array_equal((scene.images * 255).round(), named.images[order])
+    assert np.allclose(scene.cameras.viewmats, named.w2c[order])
+    assert (scene.cameras.width, scene.cameras.height) == (48, 36)
+
+
+@pytest.mark.parametrize("factor", [0, 1, 2, 3])
+def test_photos_of_another_size_than_world_mirror_s(tmp_path: Path, factor: int) -> None:
+    """Its intrinsics are of the processed size, its principal point in the middle of that; 0: no photos."""
+    named = replace(SMOOTH, names=tuple(f"image_{i:04d}.png" for i in range(3)))
+    centred = with_intrinsics(named, np.array([[52.8, 0, 24], [0, 54, 18], [0, 0, 1]]))
+    some = np.random.default_rng(0).permutation(ROWS.size)[:3000]
+    save_export(tmp_path, centred, export_rows(centred, some))
+    (tmp_path / "transforms.json").unlink()
+    for name in centred.names:
+        path = tmp_path / "images" / name
+        if factor == 0:
+            path.unlink()
+        else:
+            photo = cv2.imread(str(path))
+            assert cv2.imwrite(str(path), cv2.resize(photo, None, fx=factor, fy=factor))
+    document = {
+        "extrinsics": [{"camera_id": i, "matrix": m.tolist()} for i, m in enumerate(centred.c2w)],
+        "intrinsics": [{"camera_id": i, "matrix": centred.K.tolist()} for i in range(3)],
+    }
+    (tmp_path / "camera_params.json").write_text(json.dumps(document))
+    cameras = load_scene(tmp_path).scene.cameras
+    times = max(1, factor)
+    assert (cameras.width, cameras.height) == (48 * times, 36 * times)
+    assert np.allclose(cameras.Ks, centred.K * np.array([[times], [times], [1]]))

@@ -1,0 +1,126 @@
+"""Folders as the programs of models leave them: Gaussians one folder down, cameras under names of their own."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from exports import export_rows, home, save_export, smooth_scene, turned
+from tiny_scene import frames_of, save_json, write_images, write_npz
+
+from gsmerge.errors import SceneError
+from gsmerge.io import read_cameras
+from gsmerge.scene.content_hash import read_files
+from gsmerge.scene.files import find_scene_files
+from gsmerge.scene.read import load_scene
+
+SMOOTH = replace(smooth_scene(48, 36), names=tuple(f"input_{i:06d}.png" for i in (4, 17, 30)))
+ROWS = np.arange(3 * 36 * 48).reshape(3, 36, 48)
+
+
+def test_depthsplat_s_folders(tmp_path: Path) -> None:
+    """Rows trimmed, view fastest, in the first camera's frame; the photos of another scene are there as well."""
+    rows = ROWS[:, 8:-8, 8:-8].transpose(1, 2, 0).reshape(-1)
+    kept = np.isin(ROWS.reshape(-1), rows)
+    moved = turned(export_rows(SMOOTH, rows), SMOOTH.c2w[0, :3, :3].T)
+    save_export(tmp_path / "gaussians", SMOOTH, moved, cameras=False, name="room.ply")
+    write_images(tmp_path / "images/room/color", SMOOTH)
+    write_images(tmp_path / "images/hall/color", replace(SMOOTH, images=SMOOTH.images[::-1]))
+    save_json(tmp_path / "poses_of_room.json", frames_of(SMOOTH))
+    save_json(tmp_path / "scores.json", {"psnr": 27.1})
+    for path in (tmp_path, tmp_path / "gaussians", tmp_path / "gaussians/room.ply"):
+        files = find_scene_files(path)
+        assert files.ply == tmp_path / "gaussians/room.ply"
+        assert files.cameras == tmp_path / "poses_of_room.json"
+        assert files.images == tmp_path / "images/room"
+    loaded = load_scene(tmp_path)
+    assert loaded.scene.aligned
+    assert home(loaded.scene, SMOOTH, kept) == 1
+    assert np.array_equal((loaded.scene.images * 255).round(), SMOOTH.images)
+    assert "depthsplat" in [exporter.name for exporter in loaded.exporters]
+    shutil.copy(tmp_path / "gaussians/room.ply", tmp_path / "gaussians/hall.ply")
+    assert find_scene_files(tmp_path / "gaussians/hall.ply").images == tmp_path / "images/hall"
+    with pytest.raises(SceneError, match=r"expected one \.ply file in the folder, found 2 \(hall\.ply, room\.ply\)"):
+        find_scene_files(tmp_path)
+
+
+@pytest.mark.parametrize("written", ["AnySplat", "VGGT"])
+def test_gaussians_among_the_photos_and_poses_as_a_model_returns_them(tmp_path: Path, written: str) -> None:
+    """AnySplat's script writes among the photos; poses have no names then: photos are taken in order."""
+    tiny = replace(SMOOTH, names=("2.png", "10.png", "11.png"))
+    some = np.random.default_rng(0).permutation(ROWS.size)[:3000]
+    save_export(tmp_path, tiny, export_rows(tiny, some), cameras=False, name="gaussians.ply")
+    write_images(tmp_path, tiny)
+    K = np.tile(tiny.K / np.array([[48], [36], [1]]), (3, 1, 1))
+    arrays = {"extrinsic": tiny.c2w[None], "intrinsic": K[None]}
+    if written == "VGGT":
+        arrays = {"extrinsic": tiny.w2c[:, :3], "intrinsic": np.tile(tiny.K, (3, 1, 1)), "images": tiny.images}
+    nothing = dict.fromkeys(("extrinsics", "intrinsics", "depth", "image"))
+    write_npz(tmp_path / "predicted.npz", tiny, **(nothing | arrays))
+    loaded = load_scene(tmp_path)
+    assert not loaded.scene.aligned
+    np.testing.assert_allclose(loaded.scene.cameras.viewmats, tiny.w2c, atol=1e-6)
+    np.testing.assert_allclose(loaded.scene.cameras.Ks, np.tile(tiny.K, (3, 1, 1)), atol=1e-4)
+    assert np.array_equal((loaded.scene.images * 255).round(), tiny.images)
+    assert not [note for note in loaded.notes if "poses fit" in note]
+    if written == "AnySplat":
+        assert {tmp_path / name for name in tiny.names} <= set(read_files(loaded.files))
+
+
+@pytest.mark.parametrize("beside", [True, False])
+@pytest.mark.parametrize("normalisation", [True, False])
+def test_long_lrm_s_folders(tmp_path: Path, beside: bool, normalisation: bool) -> None:
+    """The Gaussians' world has its origin in the mean pose of the inputs, which lie within +-1."""
+    tiny, out, data = SMOOTH, tmp_path / "out/scene", tmp_path / "data"
+    ids = [2, 0, 1]
+    mean = np.eye(4)
+    mean[:3, 2] = tiny.c2w[:, :3, 2].mean(0) / np.linalg.norm(tiny.c2w[:, :3, 2].mean(0))
+    down = tiny.c2w[:, :3, 1].mean(0)
+    down -= (down @ mean[:3, 2]) * mean[:3, 2]
+    mean[:3, 1] = down / np.linalg.norm(down)
+    mean[:3, 0], mean[:3, 3] = np.cross(mean[:3, 1], mean[:3, 2]), tiny.c2w[:, :3, 3].mean(0)
+    move = np.linalg.inv(mean)
+    scale = 1 / np.abs((move @ tiny.c2w)[:, :3, 3]).max()
+    rows = export_rows(tiny, ROWS[ids].reshape(-1), rest=45, normals="u1")
+    rows = turned(rows, move[:3, :3], scale=scale, shift=scale * move[:3, 3])
+    save_export(out, tiny, rows, cameras=False, name="gaussians_001.ply")
+    (out / "input_frame_idx.txt").write_text("".join(f"{i}\n" for i in ids))
+    if normalisation:
+        np.savetxt(out / "pos_avg_inv.txt", move)
+        np.savetxt(out / "scene_scale.txt", [scale])
+    common = {"fx": tiny.K[0, 0], "fy": tiny.K[1, 1], "cx": tiny.K[0, 2], "cy": tiny.K[1, 2], "w": 48, "h": 36}
+    frames = [
+        {"file_path": f"images/{n}", "w2c": m.tolist(), **common} for n, m in zip(tiny.names, tiny.w2c, strict=True)
+    ]
+    place = out if beside else data
+    place.mkdir(exist_ok=True)
+    write_images(place / "images", tiny)
+    save_json(place / "opencv_cameras.json", {"scene_name": "scene", "frames": frames})
+    loaded = load_scene(out, cameras=None if beside else data / "opencv_cameras.json")
+    assert loaded.scene.names == tuple(f"images/{tiny.names[i]}" for i in ids)
+    assert np.array_equal((loaded.scene.images * 255).round(), tiny.images[ids])
+    assert loaded.alignment is not None
+    assert loaded.alignment.worst_px < 0.5
+    assert not [note for note in loaded.notes if "scaled" in note]
+    assert {out / "input_frame_idx.txt"} <= set(read_files(loaded.files))
+
+
+def test_cameras_of_any_name_only_where_one_file_has_them(tmp_path: Path) -> None:
+    tiny = SMOOTH
+    save_export(tmp_path, tiny, export_rows(tiny), cameras=False)
+    document = json.dumps(frames_of(tiny))
+    for name in ("scene.compact.cameras.json", ".hidden.json"):  # the cameras for viewers beside a result
+        (tmp_path / name).write_text(document)
+    assert find_scene_files(tmp_path).cameras is None
+    (tmp_path / "train.json").write_text(document)
+    (tmp_path / "broken.json").write_text(document[:50])
+    assert find_scene_files(tmp_path).cameras == tmp_path / "train.json"
+    assert len(read_cameras(tmp_path)) == 3
+    (tmp_path / "test.json").write_text(document)
+    assert find_scene_files(tmp_path).cameras is None
+    (tmp_path / "transforms.json").write_text(document)
+    assert find_scene_files(tmp_path).cameras == tmp_path / "transforms.json"

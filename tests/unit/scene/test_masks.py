@@ -1,0 +1,115 @@
+"""Masks beside the photos and inside them, and bars around them."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from tiny_scene import Tiny
+
+from gsmerge.errors import SceneError
+from gsmerge.io.photo_files import decode_alpha, decode_mask
+from gsmerge.scene.read import load_scene, read_scene
+
+
+def half(tiny: Tiny) -> np.ndarray:
+    """A mask of the left half."""
+    mask = np.zeros((tiny.height, tiny.width), bool)
+    mask[:, : tiny.width // 2] = True
+    return mask
+
+
+def write(path: Path, image: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), image)
+
+
+NAMINGS: list[Callable[[str], str]] = [
+    lambda name: name,  # masks/a b/2.png
+    lambda name: f"{name}.png",  # COLMAP: masks/a b/2.png.png
+    lambda name: Path(name).name,  # masks/2.png
+]
+
+
+@pytest.mark.parametrize("naming", NAMINGS)
+def test_masks_beside_the_photos_by_their_names(tiny_folder: Path, tiny: Tiny, naming: Callable[[str], str]) -> None:
+    write(tiny_folder / "masks" / naming(tiny.names[1]), half(tiny).astype(np.uint8) * 255)
+    load = load_scene(tiny_folder)
+    assert load.scene.masks is not None
+    assert np.array_equal(load.scene.masks[1], half(tiny))
+    assert load.scene.masks[[0, 2]].all()  # they have none
+    assert "masks leave out 17 % of the photos; of 3, 1 have one" in load.notes
+
+
+def test_a_folder_of_masks_that_is_named(tiny_folder: Path, tiny: Tiny, tmp_path: Path) -> None:
+    """Of twice the size, in another format, of 0 and 1."""
+    large = half(tiny).repeat(2, 0).repeat(2, 1).astype(np.uint8)
+    for name in tiny.names:
+        write(tmp_path / "other" / Path(name).with_suffix(".bmp"), large)
+    scene = read_scene(tiny_folder, masks=tmp_path / "other")
+    assert np.array_equal(scene.masks, np.stack([half(tiny)] * 3))
+    with pytest.raises(SceneError, match=r"no such file or folder"):
+        read_scene(tiny_folder, masks=tmp_path / "missing")
+    with pytest.raises(SceneError, match=r"expected a folder of masks, found a file"):
+        read_scene(tiny_folder, masks=tiny_folder / "scene.ply")
+    shutil.copytree(tmp_path / "other" / "a b", tmp_path / "wrong")
+    for number, path in enumerate(sorted((tmp_path / "wrong").iterdir())):
+        path.rename(path.with_name(f"x{number}.bmp"))
+    with pytest.raises(SceneError, match=r"expected masks named as the photos, such as 2\.png, found none"):
+        read_scene(tiny_folder, masks=tmp_path / "wrong")
+
+
+def test_where_photos_are_transparent_they_do_not_count(tiny_folder: Path, tiny: Tiny) -> None:
+    alpha = half(tiny).astype(np.uint8) * 255
+    for name, image in zip(tiny.names, tiny.images, strict=True):
+        write(tiny_folder / "images" / name, np.dstack([image[..., ::-1], alpha]))
+    scene = read_scene(tiny_folder)
+    assert np.array_equal(scene.masks, np.stack([half(tiny)] * 3))
+    assert np.array_equal((scene.images * 255).round(), tiny.images)
+
+
+def test_opaque_photos_have_no_masks(tiny_folder: Path, tiny: Tiny) -> None:
+    path = tiny_folder / "images" / tiny.names[0]
+    write(path, np.dstack([tiny.images[0][..., ::-1], np.full((tiny.height, tiny.width), 255, np.uint8)]))
+    assert decode_alpha(path) is None
+    assert read_scene(tiny_folder).masks is None
+
+
+def test_a_mask_that_is_no_image(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"no image")
+    with pytest.raises(SceneError, match="expected an image"):
+        decode_mask(tmp_path / "a.png")
+
+
+def test_bars_around_photos_are_cut_off(tiny_folder: Path, tiny: Tiny) -> None:
+    for name, image in zip(tiny.names, tiny.images, strict=True):
+        write(tiny_folder / "images" / name, np.pad(image, ((3, 4), (0, 0), (0, 0)))[..., ::-1])
+    load = load_scene(tiny_folder)
+    assert np.array_equal((load.scene.images * 255).round(), tiny.images)
+    assert "the photos of 20 x 21 have bars around pictures of 20 x 14: they are cut off" in load.notes
+
+
+def test_masks_of_many_bits_and_of_transparency(tmp_path: Path) -> None:
+    levels = np.array([[0, 256, 65535, 40000]], np.uint16)
+    write(tmp_path / "deep.png", levels)
+    assert decode_mask(tmp_path / "deep.png").tolist() == [[False, False, True, True]]
+    clear = np.dstack([np.full((1, 4, 3), 255, np.uint8), np.array([[0, 0, 255, 255]], np.uint8)])
+    write(tmp_path / "clear.png", clear)
+    assert decode_mask(tmp_path / "clear.png").tolist() == [[False, False, True, True]]
+
+
+def test_a_folder_of_other_masks_beside_the_photos_is_not_used(tiny_folder: Path, tiny: Tiny) -> None:
+    write(tiny_folder / "masks" / "object_0.png", half(tiny).astype(np.uint8) * 255)
+    load = load_scene(tiny_folder)
+    assert load.scene.masks is None
+    assert any(note.startswith("masks are not used: ") and "found none of them" in note for note in load.notes)
+
+
+def test_masks_without_photos_are_noted(tiny_folder: Path, tiny: Tiny) -> None:
+    write(tiny_folder / "masks" / tiny.names[0], half(tiny).astype(np.uint8) * 255)
+    shutil.rmtree(tiny_folder / "images")
+    assert "masks are not used: there are no photos" in load_scene(tiny_folder).notes

@@ -1,0 +1,173 @@
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from exports import export_rows, save_export, smooth_scene
+from tiny_scene import (
+    Tiny,
+    edited_json,
+    frames_of,
+    write_images,
+    write_npz,
+    write_transforms,
+)
+
+from gsmerge.errors import SceneError
+from gsmerge.io.cameras.read import read_cameras
+from gsmerge.measure.inspect import inspect
+from gsmerge.scene.files import find_scene_files
+from gsmerge.scene.read import load_scene, read_scene
+from gsmerge.scene.views import stored_photos
+
+
+def rewrite(path: Path, change: Callable[[dict], None]) -> None:
+    with edited_json(path) as data:
+        change(data)
+
+
+def test_a_plain_scene(tiny_folder: Path, tiny: Tiny) -> None:
+    scene = read_scene(tiny_folder)
+    assert len(scene) == 3
+    assert (scene.cameras.width, scene.cameras.height) == (20, 14)
+    assert np.allclose(scene.cameras.viewmats, tiny.w2c)
+    assert np.array_equal((scene.images * 255).round(), tiny.images)
+    assert scene.valid.all()
+    assert scene.names == tuple(f"images/{n}" for n in tiny.names)
+    assert np.allclose(scene.gaussians.means, tiny.gaussians.means)
+
+
+def test_loading_reports_files_layout_and_alignment(tiny_folder: Path) -> None:
+    loaded = load_scene(tiny_folder / "scene.ply")
+    assert loaded.alignment.ok
+    assert loaded.ply.layout == "17-column export"
+    assert loaded.files.images == tiny_folder / "images"
+    assert loaded.cameras.source == "transforms.json"
+    assert loaded.notes == ()
+
+
+def test_an_npz_with_its_own_images(tmp_path: Path, tiny: Tiny) -> None:
+    tiny.save(tmp_path / "gs_ply", cameras=False, images=False)
+    (tmp_path / "gs_ply" / "scene.ply").rename(tmp_path / "gs_ply" / "0000.ply")
+    write_npz(tmp_path / "exports/npz/results.npz", tiny)
+    scene = read_scene(tmp_path / "gs_ply" / "0000.ply")
+    assert np.array_equal((scene.images * 255).round(), tiny.images)
+    assert scene.names == ("view 0", "view 1", "view 2")
+    other = tiny.save(tmp_path / "other", images=False)
+    named = read_scene(other, images=tmp_path / "exports/npz/results.npz")
+    assert np.array_equal(named.images, scene.images)
+
+
+def test_a_scene_without_images(tmp_path: Path, tiny: Tiny) -> None:
+    assert read_scene(tiny.save(tmp_path, images=False)).images is None
+
+
+def test_images_where_the_camera_file_says(tmp_path: Path, tiny: Tiny) -> None:
+    tiny.save(tmp_path, images=False)
+    write_images(tmp_path / "train", tiny)
+    rewrite(tmp_path / "transforms.json", lambda d: [f.update(file_path=f["file_path"].replace("images", "train"))
+                                                     for f in d["frames"]])  # fmt: skip
+    assert np.array_equal((read_scene(tmp_path).images * 255).round(), tiny.images)
+    files = find_scene_files(tmp_path)
+    assert files.images is None
+    assert stored_photos(files, read_cameras(files.cameras)) is not None
+
+
+def test_rows_with_nan_keep_the_order(tmp_path: Path, tiny: Tiny) -> None:
+    folder = tiny.save(tmp_path / "scene")
+    data = bytearray((folder / "scene.ply").read_bytes())
+    start = data.index(b"end_header\n") + 11
+    for row in (0, 301):
+        data[start + 68 * row : start + 68 * row + 4] = np.float32(np.nan).tobytes()
+    (folder / "scene.ply").write_bytes(data)
+    before = read_scene(tiny.save(tmp_path / "whole")).gaussians
+    scene = read_scene(folder)
+    good = scene.valid.reshape(-1)
+    for name, column in vars(before).items():
+        assert np.array_equal(getattr(scene.gaussians, name)[good], column[good]), name
+    assert scene.valid.sum() == 3 * 14 * 20 - 2
+    assert not scene.valid[0, 0, 0]
+    assert not scene.valid[1, 1, 1]  # 301 = 280 + 20 + 1
+    assert scene.gaussians.opacities[301] == 0
+
+
+def test_views_in_the_order_of_their_names(tiny_folder: Path, tiny: Tiny) -> None:
+    rewrite(tiny_folder / "transforms.json", lambda data: data["frames"].reverse())
+    loaded = load_scene(tiny_folder)
+    assert loaded.scene.names == tuple(f"images/{n}" for n in tiny.names)  # 2, 10, 11: numbers, not letters
+    assert loaded.cameras.names == loaded.scene.names
+    assert np.allclose(loaded.scene.cameras.viewmats, tiny.w2c)
+    assert np.array_equal((loaded.scene.images * 255).round(), tiny.images)
+    assert loaded.notes == ("views are in the order of the image names, not of the camera file",)
+
+
+def test_cameras_of_a_resized_image_are_scaled(tiny_folder: Path, tiny: Tiny) -> None:
+    data = frames_of(tiny)
+    for key in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
+        data[key] *= 4
+    (tiny_folder / "transforms.json").write_text(json.dumps(data))
+    loaded = load_scene(tiny_folder)
+    assert np.allclose(loaded.scene.cameras.Ks, tiny.K)
+    assert loaded.notes == ("intrinsics scaled from 80 x 56 to the images' 20 x 14",)
+
+
+def test_images_of_other_views_are_noted(tiny_folder: Path, tiny: Tiny) -> None:
+    swapped = replace(tiny, images=tiny.images[::-1])
+    write_images(tiny_folder / "images", swapped)
+    assert load_scene(tiny_folder).notes == ()
+    (note,) = inspect(tiny_folder)["notes"]
+    assert note.startswith("2 of 3 photos do not show what the Gaussians show")
+
+
+# What does not fit
+
+
+def test_cameras_of_another_shape(tiny_folder: Path, tiny: Tiny) -> None:
+    rewrite(tiny_folder / "transforms.json", lambda data: data.update(w=30))
+    with pytest.raises(SceneError, match=r"expected cameras of the images' size 20 x 14 .* found 30 x 14; crop"):
+        read_scene(tiny_folder)
+    rewrite(tiny_folder / "transforms.json", lambda data: data.update(w=14, h=20))
+    with pytest.raises(SceneError, match="found 14 x 20; width and height are swapped"):
+        read_scene(tiny_folder)
+
+
+def test_swapped_sizes_without_images(tmp_path: Path, tiny: Tiny) -> None:
+    folder = tiny.save(tmp_path, images=False)
+    rewrite(folder / "transforms.json", lambda data: data.update(w=14, h=20))
+    with pytest.raises(SceneError, match="the cameras fit with width and height swapped"):
+        read_scene(folder)
+
+
+def test_too_few_images_in_an_npz(tiny_folder: Path, tiny: Tiny, tmp_path: Path) -> None:
+    two = {"extrinsics": tiny.w2c[:2], "intrinsics": np.tile(tiny.K, (2, 1, 1)), "depth": None}
+    write_npz(tmp_path / "two.npz", tiny, image=tiny.images[:2], **two)
+    with pytest.raises(SceneError, match="expected 3 images, one per camera, found 2"):
+        read_scene(tiny_folder, images=tmp_path / "two.npz")
+
+
+def test_cameras_of_another_scene_are_refused_with_what_was_measured(tiny_folder: Path, tiny: Tiny) -> None:
+    strange = tiny.c2w.copy()
+    strange[:, :3, 3] += np.array([[0.3], [-0.2], [0.4]])
+    write_transforms(tiny_folder / "transforms.json", replace(tiny, c2w=strange))
+    with pytest.raises(SceneError, match=r"found a median of up to [0-9.]+ px and 100 % .*no other convention fits"):
+        read_scene(tiny_folder)
+    rewrite(tiny_folder / "transforms.json", lambda data: data.update(frames_of(tiny), cx=data["cx"] + 5))
+    with pytest.raises(SceneError, match=r"found a median of up to [45]\.[0-9] px and 100 % in front"):
+        read_scene(tiny_folder)
+
+
+def test_rows_that_only_fill_a_file_up_are_left_out(tmp_path: Path) -> None:
+    """As VolSplat writes them: at the origin, all alike."""
+    smooth = smooth_scene(24, 16)
+    rows = export_rows(smooth)
+    rows[-40:] = rows[0]
+    for name, value in (("x", 0), ("y", 0), ("z", 0), ("f_dc_0", 0.1), ("opacity", -4.6)):
+        rows[name][-40:] = value
+    rows["f_dc_1"][-1] = 0.7  # another one at the origin
+    loaded = load_scene(save_export(tmp_path, smooth, rows), order="none")
+    assert len(loaded.scene.gaussians) == len(rows) - 39
+    assert "39 rows that only fill the file up are left out" in loaded.notes

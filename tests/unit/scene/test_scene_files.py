@@ -1,0 +1,108 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from tiny_scene import Tiny, write_colmap_binary, write_colmap_text, write_images, write_npz, write_transforms
+
+from gsmerge.errors import SceneError
+from gsmerge.io import write_ply
+from gsmerge.scene.files import find_scene_files
+
+
+def make(folder: Path, *names: str) -> Path:
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).touch()
+    return folder
+
+
+def test_a_plain_export(tiny_folder: Path) -> None:
+    for path in (tiny_folder, tiny_folder / "scene.ply"):
+        actual = find_scene_files(path)
+        assert actual.ply == tiny_folder / "scene.ply"
+        assert actual.cameras == tiny_folder / "transforms.json"
+        assert actual.images == tiny_folder / "images"
+
+
+def test_depth_anything_s_folders(tmp_path: Path, tiny: Tiny) -> None:
+    (tmp_path / "gs_ply").mkdir()
+    write_ply(tmp_path / "gs_ply" / "0000.ply", tiny.gaussians)
+    write_colmap_binary(tmp_path, tiny)
+    write_images(tmp_path / "images", tiny)
+    write_npz(tmp_path / "exports/mini_npz/results.npz", tiny, image=None)
+    for path in (tmp_path, tmp_path / "gs_ply" / "0000.ply", tmp_path / "gs_ply"):
+        actual = find_scene_files(path)
+        assert actual.ply == tmp_path / "gs_ply" / "0000.ply"
+        assert actual.cameras == tmp_path / "exports/mini_npz/results.npz"
+        assert actual.images == tmp_path / "images"
+    write_npz(tmp_path / "exports/npz/results.npz", tiny)
+    actual = find_scene_files(tmp_path)
+    assert actual.cameras == tmp_path / "exports/npz/results.npz"
+    assert actual.images == actual.cameras
+
+
+def test_a_trained_model_s_folders(tmp_path: Path, tiny: Tiny) -> None:
+    make(tmp_path, "point_cloud/iteration_7000/point_cloud.ply", "point_cloud/iteration_30000/point_cloud.ply")
+    make(tmp_path, "input.ply", "cameras.json")
+    actual = find_scene_files(tmp_path)
+    assert actual.ply == tmp_path / "point_cloud/iteration_30000/point_cloud.ply"
+    assert actual.cameras == tmp_path / "cameras.json"
+    assert find_scene_files(actual.ply).cameras == tmp_path / "cameras.json"
+
+
+def test_which_ply_of_a_folder(tmp_path: Path) -> None:
+    make(tmp_path, "room.ply", "room.compact.ply", "points3D.ply", ".room-12.ply")
+    assert find_scene_files(tmp_path).ply == tmp_path / "room.ply"
+    make(tmp_path, "hall.ply")
+    with pytest.raises(SceneError, match=r"expected one \.ply file in the folder, found 2 \(hall\.ply, room\.ply\)"):
+        find_scene_files(tmp_path)
+    make(tmp_path, "gaussians.ply")
+    assert find_scene_files(tmp_path).ply == tmp_path / "gaussians.ply"
+    make(tmp_path, "scene.ply")
+    assert find_scene_files(tmp_path).ply == tmp_path / "scene.ply"
+
+
+def test_named_files_go_first(tiny_folder: Path, tmp_path: Path, tiny: Tiny) -> None:
+    write_colmap_text(tmp_path / "other", tiny)
+    write_images(tmp_path / "photos", tiny)
+    actual = find_scene_files(tiny_folder, cameras=tmp_path / "other", images=str(tmp_path / "photos"))
+    assert actual.cameras == tmp_path / "other"
+    assert actual.images == tmp_path / "photos"
+
+
+def test_image_folders_in_order(tmp_path: Path, tiny: Tiny) -> None:
+    make(tmp_path, "scene.ply", "rgb/1.png", "context/1.png", "images/readme.txt")
+    assert find_scene_files(tmp_path).images == tmp_path / "context"
+    make(tmp_path, "input/1.jpg")
+    assert find_scene_files(tmp_path).images == tmp_path / "input"
+    make(tmp_path, "images/deep/1.JPG")
+    assert find_scene_files(tmp_path).images == tmp_path / "images"
+
+
+def test_what_is_not_there(tmp_path: Path, tiny: Tiny) -> None:
+    with pytest.raises(SceneError, match="no such file"):
+        find_scene_files(tmp_path / "none.ply")
+    with pytest.raises(SceneError, match=r"expected a \.ply file in the folder, found none"):
+        find_scene_files(tmp_path)
+    make(tmp_path, "scene.ply")
+    assert find_scene_files(tmp_path).cameras is None
+    assert find_scene_files(tmp_path).images is None
+    with pytest.raises(SceneError, match=r"lost\.json: no such file or folder"):
+        find_scene_files(tmp_path, cameras=tmp_path / "lost.json")
+    with pytest.raises(SceneError, match="photos: no such file or folder"):
+        find_scene_files(tmp_path, images=tmp_path / "photos")
+
+
+def test_a_broken_npz_is_no_source_of_images(tmp_path: Path, tiny: Tiny) -> None:
+    make(tmp_path, "scene.ply", "results.npz")
+    assert find_scene_files(tmp_path).cameras == tmp_path / "results.npz"
+    assert find_scene_files(tmp_path).images is None
+
+
+def test_files_beside_a_relative_path(tiny_folder: Path, monkeypatch: pytest.MonkeyPatch, tiny: Tiny) -> None:
+    monkeypatch.chdir(tiny_folder)
+    write_transforms(tiny_folder / "transforms.json", tiny)
+    actual = find_scene_files("scene.ply")
+    assert actual.ply == Path("scene.ply")
+    assert actual.cameras == tiny_folder.resolve() / "transforms.json"

@@ -1,0 +1,110 @@
+"""Scenes whose rows are in several files: one for each view, or chunks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_scene import Tiny
+
+import gsmerge
+from gsmerge.cli import main
+from gsmerge.compaction.files import compact_files
+from gsmerge.errors import SceneError
+from gsmerge.io import write_ply
+from gsmerge.options import CompactOptions
+from gsmerge.scene.content_hash import read_files
+from gsmerge.scene.files import find_scene_files
+from gsmerge.scene.read import load_scene, read_scene
+
+
+def split(folder: Path, tiny: Tiny, names: list[str], cuts: list[int]) -> Path:
+    """Save the tiny scene with its rows in files of their own, cut at ``cuts``."""
+    tiny.save(folder)
+    (folder / "scene.ply").unlink()
+    for name, rows in zip(names, np.split(np.arange(len(tiny.gaussians)), cuts), strict=True):
+        write_ply(folder / name, tiny.gaussians[rows])
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("names", "cuts"),
+    [
+        (["view_8.ply", "view_9.ply", "view_10.ply"], [280, 560]),
+        (["scene.chunk000.ply", "scene.chunk001.ply"], [123]),
+        (["0012.ply", "0040.ply", "0077.ply"], [280, 560]),  # as many as cameras
+    ],
+)
+def test_parts_are_one_scene(tmp_path: Path, tiny: Tiny, names: list[str], cuts: list[int]) -> None:
+    whole = read_scene(tiny.save(tmp_path / "whole"))
+    folder = split(tmp_path / "parts", tiny, names, cuts)
+    files = find_scene_files(folder)
+    assert [path.name for path in files.plys] == names
+    assert set(files.plys) <= set(read_files(files))
+    load = load_scene(folder)
+    assert load.notes[0] == f"{len(names)} files are read as one scene: {names[0]} to {names[-1]}"
+    assert load.ply.count == len(tiny.gaussians)
+    assert load.ply.file_bytes == sum(path.stat().st_size for path in files.plys)
+    for name, column in vars(whole.gaussians).items():
+        np.testing.assert_array_equal(getattr(load.scene.gaussians, name), column)
+
+
+def test_a_part_that_is_not_there(tmp_path: Path, tiny: Tiny) -> None:
+    folder = split(tmp_path, tiny, ["part_0.ply", "part_1.ply", "part_3.ply"], [280, 560])
+    with pytest.raises(SceneError, match=r"all parts from part_0.ply to part_3.ply, found none with number 2"):
+        find_scene_files(folder)
+
+
+def test_parts_of_different_kinds(tmp_path: Path, tiny: Tiny) -> None:
+    folder = split(tmp_path, tiny, ["view_0.ply", "view_1.ply"], [280])
+    degree = replace(tiny.gaussians[:280], shN=np.zeros((280, 3, 3), np.float32))
+    write_ply(folder / "view_1.ply", degree, overwrite=True)
+    with pytest.raises(SceneError, match=r"view_1.ply: expected the columns of view_0.ply, found others"):
+        read_scene(folder)
+
+
+def test_numbered_files_may_be_several_scenes(tmp_path: Path, tiny: Tiny) -> None:
+    """Two for three cameras, and names that say nothing."""
+    folder = split(tmp_path, tiny, ["0.ply", "1.ply"], [420])
+    with pytest.raises(SceneError, match=r"expected one .ply file in the folder, found 2 \(0.ply, 1.ply\); name one"):
+        find_scene_files(folder)
+
+
+@pytest.mark.parametrize("names", [["0.ply", "1.ply", "2.ply"], ["step_7000.ply", "step_30000.ply", "step_3.ply"]])
+def test_files_of_different_sizes_are_different_scenes(tmp_path: Path, tiny: Tiny, names: list[str]) -> None:
+    """Even if there are as many as cameras."""
+    folder = split(tmp_path, tiny, names, [100, 560])
+    with pytest.raises(SceneError, match=r"expected one .ply file in the folder, found 3"):
+        find_scene_files(folder)
+
+
+def test_a_large_gap_in_the_numbers(tmp_path: Path, tiny: Tiny) -> None:
+    folder = split(tmp_path, tiny, ["view_1.ply", "view_20241122101500.ply"], [280])
+    with pytest.raises(SceneError, match="found none with number 2"):
+        find_scene_files(folder)
+
+
+def test_scenes_of_one_backbone_stay_apart(tmp_path: Path, tiny: Tiny) -> None:
+    """One file for each scene in a folder gaussians, as DepthSplat writes them."""
+    folder = split(tmp_path / "gaussians", tiny, ["0.ply", "1.ply", "2.ply"], [280, 560])
+    with pytest.raises(SceneError, match=r"expected one .ply file in the folder, found 3"):
+        find_scene_files(folder)
+
+
+def test_encode_reads_all_parts(tmp_path: Path, tiny: Tiny) -> None:
+    folder = split(tmp_path, tiny, ["view_0.ply", "view_1.ply", "view_2.ply"], [280, 560])
+    assert main(["encode", str(folder), "--superpixels", "20%", "-q"]) == 0
+    source = gsmerge.load_encoded(folder / "scene.gsm").about["source"]
+    assert source["bytes"] == sum(path.stat().st_size for path in find_scene_files(folder).plys)
+
+
+def test_the_report_has_all_parts(tmp_path: Path, tiny: Tiny) -> None:
+    folder = split(tmp_path, tiny, ["view_0.ply", "view_1.ply", "view_2.ply"], [280, 560])
+    settings = CompactOptions().with_settings({"superpixels": "20%", "fit": "none", "threads": 1})
+    files = find_scene_files(folder)
+    document = compact_files(files, settings, tmp_path / "out.ply", hashed=True)
+    assert document["input"]["parts"] == [str(path) for path in files.plys]
+    assert document["input"]["bytes"] == sum(path.stat().st_size for path in files.plys)
+    assert gsmerge.read_ply(tmp_path / "out.ply").info.count == document["output"]["num_gaussians"]
