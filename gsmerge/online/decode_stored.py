@@ -12,7 +12,7 @@ from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import Frame
 from gsmerge.fit import FitOptions, FitReport, fit, report_steps, start_share
 from gsmerge.fit.gpu import choose_backend
-from gsmerge.online.batch_photos import BatchPhotos
+from gsmerge.online.batch import BatchPhotos
 from gsmerge.online.state import OnlineState, to_encoded
 from gsmerge.runtime.record import Progress, record_run, stage
 from gsmerge.runtime.threads import use_threads
