@@ -61,7 +61,7 @@ def calls_in(page: str) -> list[str]:
 
 
 def test_commands_are_the_documented_ones() -> None:
-    listed = "compact batch encode decode extend inspect check view render evaluate stress chart generate train"
+    listed = "compact batch encode decode extend inspect check view render evaluate chart generate stress train"
     assert list(COMMANDS) == listed.split()
 
 

@@ -14,6 +14,8 @@ import gsmerge
 from gsmerge.options import CompactOptions
 from gsmerge.research.charts import measure_run as running
 from gsmerge.research.charts.measure_run import RunRecord, read_runs
+from gsmerge.scene.held_out import read_held_out
+from gsmerge.scene.read import load_scene
 
 from .conftest import Outcome, Run, listing
 
@@ -155,8 +157,8 @@ def test_photos_of_a_given_size_are_measured_anew(copied: Path, run: Run) -> Non
     after = runs(copied / "out")["input"]
     assert after.value("psnr_target_visible") != before.value("psnr_target_visible")
     assert "--photo-side 48" in after.command
-    scene = gsmerge.io.load_scene(copied / "room")
-    targets = gsmerge.io.read_held_out(scene, copied / "room" / "targets")
+    scene = load_scene(copied / "room")
+    targets = read_held_out(scene, copied / "room" / "targets")
     options = gsmerge.EvaluateOptions(lpips=(), photo_side=48)
     expected = gsmerge.evaluate(scene.scene, {}, targets, options).results[0].mean("target")[1].psnr
     assert after.value("psnr_target_visible") == expected

@@ -213,7 +213,7 @@ def test_wrong_usage_is_one_line_and_writes_nothing(
     def work(*_: object, **__: object) -> None:
         raise AssertionError("wrong usage is refused before the work")
 
-    for name in ("compact_file.compact", "view.data.evaluate") if words not in NEED_THE_SCENE else ():
+    for name in ("compaction.files.compact", "view.data.evaluate") if words not in NEED_THE_SCENE else ():
         monkeypatch.setattr(f"gsmerge.{name}", work)
     monkeypatch.chdir(prepared)
     before = listing(prepared)

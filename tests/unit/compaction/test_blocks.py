@@ -16,7 +16,8 @@ from gsmerge.facts.prepare import canonicalise
 from gsmerge.facts.views import subset
 from gsmerge.fit import FitOptions, fit
 from gsmerge.fit.photo_sizes import fit_photos
-from gsmerge.plan import choose_blocks
+from gsmerge.plan import plan_whole
+from gsmerge.stages.segment import measure_size
 from gsmerge.types import Cameras, Scene
 
 SETTINGS: dict[str, Any] = {"checkpoint": "none", "superpixels": "10%", "fit_steps": 40, "threads": 1}
@@ -106,17 +107,21 @@ def test_views_that_repeat_others(scene: Scene) -> None:
     assert result.report.choices["seams"]["views"] <= len(scene)
 
 
+def count_blocks(scene: Scene, **settings: Any) -> int:
+    return plan_whole(measure_size(scene), CompactOptions().with_settings(settings)).blocks
+
+
 def test_small_scenes_stay_in_one_piece(scene: Scene) -> None:
-    assert choose_blocks(scene, CompactOptions()) == 1
-    assert choose_blocks(scene, CompactOptions().with_settings({"blocks": 4})) == 4
-    assert choose_blocks(scene, CompactOptions().with_settings({"blocks": "none"})) == 1
+    assert count_blocks(scene) == 1
+    assert count_blocks(scene, blocks=4) == 4
+    assert count_blocks(scene, blocks="none") == 1
 
 
 def test_large_scenes_are_cut(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gsmerge.facts.partition.WHOLE_GAUSSIANS", 5000)
     monkeypatch.setattr("gsmerge.facts.partition.BLOCK_GAUSSIANS", 4000)
-    assert choose_blocks(scene, CompactOptions()) == 3
-    assert choose_blocks(scene, CompactOptions().with_settings({"levels": 2})) == 1
+    assert count_blocks(scene) == 3
+    assert count_blocks(scene, levels=2) == 1
 
 
 @pytest.mark.parametrize(
@@ -139,7 +144,7 @@ def test_more_blocks_than_views(scene: Scene) -> None:
 
 def test_unaligned_scenes_have_no_blocks(scene: Scene) -> None:
     unaligned = replace(scene, pixel_ids=None)
-    assert choose_blocks(unaligned, CompactOptions()) == 1
+    assert count_blocks(unaligned) == 1
     with pytest.raises(UsageError, match="without one Gaussian per pixel"):
         compact(unaligned, blocks=2)
 

@@ -21,7 +21,7 @@ from gsmerge.stages.assign import (
     owner_pixels,
 )
 from gsmerge.stages.encode import encode, member_rows
-from gsmerge.stages.segment import superpixels_per_view
+from gsmerge.stages.segment import measure_size, superpixels_per_view
 from gsmerge.stages.superpixels import SegmentOptions, segment
 from gsmerge.types import Groups
 
@@ -96,10 +96,9 @@ def test_depths_are_those_of_the_surfaces(room: Scene) -> None:
 def test_density_is_of_the_gaussians_where_those_are_fewer(room: Scene) -> None:
     options = SegmentOptions(superpixels="10%")
     whole = unaligned_scenes.loosened(room)
-    assert superpixels_per_view(whole, options) == superpixels_per_view(room, options) == 76
-    assert superpixels_per_view(replace(whole, gaussians=room.gaussians[::2]), options) == 38
-    assert superpixels_per_view(replace(whole, gaussians=room.gaussians[:1]), options) == 1
-    assert superpixels_per_view(whole, SegmentOptions(superpixels=50)) == 50
+    sizes = [whole, room, *(replace(whole, gaussians=room.gaussians[rows]) for rows in (slice(0, None, 2), slice(1)))]
+    assert [superpixels_per_view(measure_size(scene), options) for scene in sizes] == [76, 76, 38, 1]
+    assert superpixels_per_view(measure_size(whole), SegmentOptions(superpixels=50)) == 50
 
 
 def test_unknown_cameras_are_placed(room: Scene) -> None:
