@@ -255,7 +255,7 @@ def choose_networks(options: CompactOptions, *, photos: bool, aligned: bool = Tr
 
     That is where no fit follows, or a short one of an effort that has the time for both, on scenes
     with one Gaussian per pixel (``aligned``), which the shipped networks learnt from
-    (docs/internals/networks.md). ``photos``: whether there are any to fit to.
+    (docs/laboratory/networks.md). ``photos``: whether there are any to fit to.
     """
     if options.checkpoint != "auto":
         return options.checkpoint
@@ -361,7 +361,7 @@ def steps_for(options: CompactOptions, num_views: int, share: float = USUAL_SHAR
     """Return the steps of the full fit: as given, or by effort and more with the roots of views and ``share``.
 
     ``share``: Gaussians of the result for each pixel. A step looks at one view. Measurements are in
-    docs/internals/large-scenes.md.
+    docs/laboratory/large-scenes.md.
     """
     if options.fit.fit_steps is not None:
         return options.fit.fit_steps
