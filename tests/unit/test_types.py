@@ -5,6 +5,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 import torch
+from messages import refuses
 
 from gsmerge.types import (
     Cameras,
@@ -124,7 +125,7 @@ def test_wrong_shapes_are_named(name: str, shape: tuple[int, ...]) -> None:
 
 
 def test_incomplete_harmonics_are_refused() -> None:
-    with pytest.raises(ValueError, match="expected 0, 3, 8, 15 or 24 coefficients, got 5"):
+    with refuses(ValueError, "shN", 24, 5):
         gaussians(2, 5)
 
 
@@ -211,7 +212,7 @@ def test_wrong_scenes_are_refused(change: dict, message: str) -> None:
 
 def test_groups_count_all_views() -> None:
     assert len(Groups(np.zeros((2, 3, 4), np.int32), (3, 4))) == 7
-    with pytest.raises(ValueError, match="labels: expected shape"):
+    with refuses(ValueError, "labels", [2, 3, 4]):
         Groups(np.zeros((2, 3, 4), np.int32), (3,))
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from messages import refuses
 
 from gsmerge.batch import BatchOptions
 from gsmerge.options import CompactOptions
@@ -49,5 +50,5 @@ def test_settings_out_of_range_are_refused(wrong: dict[str, Any], said: str) -> 
     ["{name}.ply", "{stem.real}.ply", "{0}.ply", "{}.ply", "{stem", "{stem}.txt", "/x/{stem}.ply", "../{stem}.ply"],
 )
 def test_templates_that_make_no_sense_are_refused(template: str) -> None:
-    with pytest.raises(ValueError, match="output: expected"):
+    with refuses(ValueError, "output"):
         BatchOptions(output=template)

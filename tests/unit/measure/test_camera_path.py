@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from messages import refuses
 
 from gsmerge.geometry import camera_centres, motion_matrices, project
 from gsmerge.measure.camera_path import (
@@ -90,7 +91,7 @@ def test_cameras_that_only_turn_are_turned_evenly() -> None:
 def test_repeated_cameras_count_once(walk: Cameras) -> None:
     path = spline(walk[[0, 0, 1, 2, 3, 3, 3, 4, 5]], DEPTH, 50)
     np.testing.assert_allclose(path.viewmats, spline(walk, DEPTH, 50).viewmats, atol=1e-12)
-    with pytest.raises(ValueError, match="expected at least 2 different cameras, got 1"):
+    with refuses(ValueError, "spline", 2, 1):
         spline(walk[[2, 2, 2]], DEPTH, 50)
 
 
@@ -230,5 +231,5 @@ def test_a_path_moves_with_its_scene(kind: str, walk: Cameras) -> None:
 
 
 def test_a_path_has_two_frames_at_least(walk: Cameras) -> None:
-    with pytest.raises(ValueError, match="frames: expected at least 2, got 1"):
+    with refuses(ValueError, "frames", 2, 1):
         plan_path(CameraPath("orbit"), walk, DEPTH, 1)

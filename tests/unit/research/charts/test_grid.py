@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from messages import refuses
 
 from gsmerge.batch import BatchOptions
 from gsmerge.batch.schedule import Schedule, estimate_seconds
@@ -116,7 +117,7 @@ def test_files_that_hold_no_grid(text: str, message: str, tmp_path: Path) -> Non
 
 
 def test_a_missing_file_is_told(tmp_path: Path) -> None:
-    with pytest.raises(SceneError, match="expected a TOML or JSON file"):
+    with refuses(SceneError, "grid.toml", "TOML", "JSON"):
         read_grid(tmp_path / "grid.toml")
 
 
@@ -146,7 +147,7 @@ def test_what_cannot_be_fixed(text: str) -> None:
 
 def test_a_program_that_is_missing_is_told_before_anything_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GSMERGE_SPLAT_TRANSFORM", "/nowhere/splat-transform")
-    with pytest.raises(UsageError, match="install it with"):
+    with refuses(UsageError, "method splat-transform", "/nowhere/splat-transform", "@playcanvas/splat-transform@3.7.0"):
         make_jobs([], Grid(methods=("gsmerge", "splat-transform"), budgets=("1%",)), EvaluateOptions(()))
 
 
@@ -180,10 +181,10 @@ def test_targets_are_one_file_or_a_template(scene_copy: Path) -> None:
     assert named.targets == ply
     (scene_copy / "transforms.json").write_text("{")  # an error when the scene is read
     assert sources(scene_copy)[0].num_views is None
-    with pytest.raises(SceneError, match="expected cameras of held-out views"):
+    with refuses(SceneError, "nothing.json", "cameras", "nothing"):
         sources(scene_copy, targets="{scene}/nothing.json")
     for template in ("{}/targets", "{scene.foo}/targets", "{stem[foo]}", "{"):
-        with pytest.raises(UsageError, match="in braces"):
+        with refuses(UsageError, "", "{scene}", template):
             sources(scene_copy, targets=template)
 
 
