@@ -95,7 +95,7 @@ def test_gaussians_of_no_pixels(scene: Scene) -> None:
     assert 0 < len(small.gaussians) < len(rows)
     bare = {name: given[name] for name in FIELDS}
     assert len(compact_tensors(**bare, order="none", **FAST).cameras) == 0
-    with pytest.raises(SceneError, match=r"^viewmats: .*camera-to-world .*; pass their inverse"):
+    with refuses(SceneError, "viewmats", "camera-to-world", "inverse"):
         compact_tensors(**given | {"viewmats": np.linalg.inv(given["viewmats"])}, order="none", **FAST)
 
 

@@ -168,7 +168,7 @@ def test_indices_outside_are_refused(wrong: int, place: int) -> None:
         ),
     ]
     for call in calls:
-        with pytest.raises(ValueError, match="expected indices inside their arrays"):
+        with pytest.raises(ValueError, match="indices"):
             call()
 
 
@@ -176,7 +176,7 @@ def test_ranges_outside_are_refused() -> None:
     c, eye, colors = columns_of(10), np.zeros(3, np.float32), np.zeros((10, 3), np.float32)
     ids = np.arange(10, dtype=np.int32)
     for first, last in ((-1, 5), (0, 11), (7, 6)):
-        with pytest.raises(ValueError, match="expected values"):
+        with refuses(ValueError, f"view_colors: {'first' if first < 0 else 'last'}", first if first < 0 else last):
             harmonics.view_colors(c["means"], c["sh0"], c["shN"], ids, eye, first, last, colors)
     head = c["means"], c["quats"], c["scales"], c["opacities"], ids, np.zeros((10, 9), np.float32), camera_of()
     results = colors, np.zeros((10, 4), np.float32), colors, np.zeros(10, np.float32), None

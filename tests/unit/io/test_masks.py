@@ -53,7 +53,7 @@ def test_a_folder_of_masks_that_is_named(tiny_folder: Path, tiny: Tiny, tmp_path
         write(tmp_path / "other" / Path(name).with_suffix(".bmp"), large)
     scene = read_scene(tiny_folder, masks=tmp_path / "other")
     assert np.array_equal(scene.masks, np.stack([half(tiny)] * 3))
-    with pytest.raises(SceneError, match=r"no such file or folder"):
+    with pytest.raises(SceneError, match="no such"):
         read_scene(tiny_folder, masks=tmp_path / "missing")
     with refuses(SceneError, "scene.ply", "masks", "file"):
         read_scene(tiny_folder, masks=tiny_folder / "scene.ply")
@@ -82,7 +82,7 @@ def test_opaque_photos_have_no_masks(tiny_folder: Path, tiny: Tiny) -> None:
 
 def test_a_mask_that_is_no_image(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(b"no image")
-    with pytest.raises(SceneError, match="expected an image"):
+    with pytest.raises(SceneError, match="decoded"):
         decode_mask(tmp_path / "a.png")
 
 

@@ -94,7 +94,7 @@ def test_what_cannot_be_read(tmp_path: Path, tiny: Tiny) -> None:
     (tmp_path / tiny.names[1]).write_bytes(b"")
     with refuses(SceneError, "10.png", "decoded"):
         read_images(tmp_path, tiny.names)
-    with pytest.raises(SceneError, match="no such folder"):
+    with pytest.raises(SceneError, match="no such"):
         read_images(tmp_path / "none", tiny.names)
     with refuses(SceneError, "2.png", "folder", "file"):
         read_images(tmp_path / tiny.names[0], tiny.names)

@@ -142,11 +142,9 @@ def test_bad_arguments(scene: Scene, half: Gaussians) -> None:
         evaluate(empty, {}, None, PLAIN)
 
 
-@pytest.mark.parametrize(
-    ("zoom", "words"), [((0.01,), "1/16 to 16"), ((), "got none"), ((1, 2, 2), "once"), ((math.nan,), "got nan")]
-)
-def test_bad_zooms(zoom: tuple[float, ...], words: str) -> None:
-    with pytest.raises(ValueError, match=words):
+@pytest.mark.parametrize(("zoom", "found"), [((0.01,), 0.01), ((), "none"), ((1, 2, 2), "1,2,2"), ((math.nan,), "nan")])
+def test_bad_zooms(zoom: tuple[float, ...], found: object) -> None:
+    with refuses(ValueError, "zoom", found):
         EvaluateOptions(zoom=zoom)
 
 
@@ -233,7 +231,7 @@ def test_a_photo_side_without_photos(scene: Scene, half: Gaussians) -> None:
 
 @pytest.mark.parametrize("side", [-1, 476.5])
 def test_bad_photo_sides(side: float) -> None:
-    with pytest.raises(ValueError, match="photo_side: expected a number of pixels"):
+    with refuses(ValueError, "photo_side", side):
         EvaluateOptions(photo_side=side)  # type: ignore[arg-type]
 
 
@@ -272,7 +270,7 @@ def test_documents_have_zooms_where_they_were_asked_for(scene: Scene, actual: Ev
 
 @pytest.mark.parametrize("align", [("colour",), ("pose", "pose")])
 def test_bad_alignments(align: tuple[str, ...], scene: Scene) -> None:
-    with pytest.raises(ValueError, match="color or pose"):
+    with refuses(ValueError, "align", ",".join(align)):
         EvaluateOptions(align=align)
     with refuses(ValueError, "align", "held-out", "none"):
         evaluate(scene, {}, None, replace(PLAIN, align=("color",)))

@@ -72,7 +72,7 @@ def test_decoded_geometry_decides_what_is_merged(scene: Scene, absolute: Path) -
 
 @pytest.mark.parametrize("checkpoint", ["auto", "none"])
 def test_it_needs_networks(checkpoint: str) -> None:
-    with refuses(ValueError, "recipe paper", "absolute"):
+    with refuses(ValueError, "recipe paper", "absolute", checkpoint):
         CompactOptions().with_settings({"recipe": "paper", "checkpoint": checkpoint})
 
 

@@ -287,8 +287,7 @@ def test_other_networks_are_refused(
     name: str, pairs: Compactor, scene: Scene, absolute: dict[str, Any], checkpoints: dict[str, str]
 ) -> None:
     other = options_of(absolute | {"checkpoint": checkpoints.get(name, name)})
-    words = "expected the networks that made the state .*leave the checkpoint out, or begin a new state"
-    with pytest.raises(UsageError, match=words):
+    with refuses(UsageError, f"checkpoint {checkpoints.get(name, name)}", "state", absolute["checkpoint"]):
         extend(state_of(pairs), scene, other)
 
 

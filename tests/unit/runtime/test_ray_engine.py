@@ -48,11 +48,10 @@ def test_calls_are_made_one_by_one() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "address", "problem"),
-    [("spark", None, "expected one of local, ray"), ("local", "auto", "expected engine ray")],
+    ("name", "address", "named"), [("spark", None, ("engine", "'spark'")), ("local", "auto", ("address", "local"))]
 )
-def test_wrong_engines(name: str, address: str | None, problem: str) -> None:
-    with pytest.raises(ValueError, match=problem):
+def test_wrong_engines(name: str, address: str | None, named: tuple[str, ...]) -> None:
+    with refuses(ValueError, *named):
         Engine(name, address)
 
 

@@ -63,20 +63,15 @@ def test_cameras_that_fit_stay_bit_for_bit(large: Tiny) -> None:
 
 
 @pytest.mark.parametrize(
-    ("factor", "shift", "words"),
-    [
-        (1, 4, "multiply fx by 1 and fy by 1, and add -4.0"),
-        (1, 8, "multiply fx by 1 and fy by 1, and add -8.0"),
-        (1.05, 0, "multiply fx by 0.952"),
-        (0.92, 0, "multiply fx by 1.087"),
-    ],
+    ("factor", "shift", "found"),
+    [(1, 4, "-4.00 to cx"), (1, 8, "-8.00 to cx"), (1.05, 0, "fx by 0.9523"), (0.92, 0, "fx by 1.087")],
 )
-def test_intrinsics_that_are_off_are_no_poses_that_are(factor: float, shift: float, words: str, large: Tiny) -> None:
+def test_intrinsics_that_are_off_are_no_poses_that_are(factor: float, shift: float, found: str, large: Tiny) -> None:
     pairs = sample_pixels(large.gaussians, cameras_of(large), np.ones(len(large.gaussians), bool))
     cameras = cameras_of(large)
     Ks = cameras.Ks * np.array([[factor, 1, 1], [1, factor, 1], [1, 1, 1]])
     Ks[:, 0, 2] += shift
-    with pytest.raises(SceneError, match=words):
+    with refuses(SceneError, "Ks", found):
         move_cameras(pairs, replace(cameras, Ks=Ks), NAMES)
 
 

@@ -131,7 +131,7 @@ def test_what_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("gsmerge.research.generate.folders.write_ply", full)
-    with pytest.raises(SceneError, match="No space left"):
+    with refuses(SceneError, "scene_0000", "No space left"):
         generate(tmp_path, 1, TINY)
     assert list(tmp_path.iterdir()) == []
 
