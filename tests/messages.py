@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+ERROR = "gsmerge: error: "  # at the start of the command line's error lines
 
 def names(text: str, *values: object) -> bool:
     """Return whether a text has all of these as whole words: 5 is not in "15", "-5" or "5.1"."""
@@ -22,9 +23,10 @@ def names(text: str, *values: object) -> bool:
 def says(text: str, place: object, *values: object) -> bool:
     """Return whether a message begins with a place and has these values after it.
 
-    Of a path its end suffices; ``view.ply: rows`` is a place in a place. An empty place is none.
+    Of a path its end suffices; ``view.ply: rows`` is a place in a place. An empty place is none. What the parser of
+    the command line refuses reads ``Invalid value for '--k': ...``.
     """
-    start = re.match(rf"(?:[^:]*/)?{re.escape(str(place))}: " if str(place) else "", text)
+    start = re.match(rf"(?:[^:]*/|Invalid value for ')?{re.escape(str(place))}'?: " if str(place) else "", text)
     return start is not None and names(text[start.end() :], *values)
 
 
