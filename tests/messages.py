@@ -15,6 +15,7 @@ import pytest
 
 ERROR = "gsmerge: error: "  # at the start of the command line's error lines
 
+
 def names(text: str, *values: object) -> bool:
     """Return whether a text has all of these as whole words: 5 is not in "15", "-5" or "5.1"."""
     return all(re.search(rf"(?<![\w.-]){re.escape(str(value))}(?!\w|[.,]\d)", text) for value in values)
