@@ -77,10 +77,10 @@ class Batch:
 def make_batch(state: OnlineState | None, prepared: Prepared, plan: Plan, online: OnlineOptions, max_k: int) -> Batch:
     """Bring the photos of views to the size of the state's; without a state these views are the first."""
     cameras = prepared.scene.cameras
-    known = cameras[:0] if state is None else state.cameras
-    photos = resize_photos(scene_pictures(prepared.scene), cameras, known.width, known.height)
-    ids = np.arange(len(photos)) if state is None else view_ids(known, photos.cameras)
-    return Batch(prepared, plan, online, max_k, photos, ids, ids >= len(known))
+    before = cameras[:0] if state is None else state.cameras
+    photos = resize_photos(scene_pictures(prepared.scene), cameras, before.width, before.height)
+    ids = view_ids(before, photos.cameras)
+    return Batch(prepared, plan, online, max_k, photos, ids, ids >= len(before))
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,14 +208,11 @@ def group_errors(features: FeatureGaussians, members: Members, errors: np.ndarra
     return np.add.reduceat(each, starts[:-1]) / np.diff(starts)
 
 
-def novel_rows(new: BatchFeatures, batch: Batch, there: Gaussians, own: Gaussians) -> np.ndarray:
-    """Return the rows of a batch's groups whose ``own`` Gaussians show half-size photos better than ``there``.
-
-    These are the Gaussians of the state.
-    """
+def novel_rows(new: BatchFeatures, batch: Batch, state_gaussians: Gaussians, batch_gaussians: Gaussians) -> np.ndarray:
+    """Return the rows of a batch's Feature Gaussians that show half-size photos better than the state does."""
     photos, cameras, online = batch.photos.photos(2), batch.scene.cameras, batch.online
-    errors, own_errors = (
+    state_errors, batch_errors = (
         group_errors(new.features, new.members, pixel_errors(gaussians, photos, cameras.height, cameras.width))
-        for gaussians in (there, own)
+        for gaussians in (state_gaussians, batch_gaussians)
     )
-    return np.flatnonzero(errors > np.maximum(online.tolerance**2, online.margin**2 * own_errors))
+    return np.flatnonzero(state_errors > np.maximum(online.tolerance**2, online.margin**2 * batch_errors))

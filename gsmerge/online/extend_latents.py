@@ -130,9 +130,9 @@ def _encode(state: OnlineState | None, batch: Batch, count: int | None) -> Batch
     else:
         assert state.networks is not None
         before, is_new = state.networks.samples, batch.is_new
-        own = sample_views(members, cameras, before.opacities.shape[1:])
-        fresh = ViewSamples(own.means[is_new], own.opacities[is_new], own.sh0[is_new])
-        samples = ViewSamples.concat([before, fresh])
+        after = sample_views(members, cameras, before.opacities.shape[1:])
+        added = ViewSamples(after.means[is_new], after.opacities[is_new], after.sh0[is_new])
+        samples = ViewSamples.concat([before, added])
         pixels = np.arange(len(members.means)) if members.pixels is None else members.pixels
         context = StateContext(
             networks=weights,
@@ -166,14 +166,15 @@ def _children(features: FeatureGaussians, context: NetworkContext, max_k: int) -
     return divide(features, context.members, np.full(len(features), max_k))
 
 
-def _decode(there: GroupSet, new: BatchFeatures) -> tuple[Gaussians, Gaussians]:
+def _decode(groups: GroupSet, new: BatchFeatures) -> tuple[Gaussians, Gaussians]:
     """Return the Gaussians of the state and of the batch, one for each group, as the heads make them."""
     context, features = new.context, new.features
     assert isinstance(context, StateContext)
-    assert there.learned is not None
-    described = context.samples.describe(there.learned, context.cameras)
-    shown = decode_with_group_features(described.base, np.arange(len(there)), described, context)
-    return shown, decode_gaussians(feature_to_gaussians(features), np.arange(len(features)), features, context)
+    assert groups.learned is not None
+    described = context.samples.describe(groups.learned, context.cameras)
+    state_gaussians = decode_with_group_features(described.base, np.arange(len(groups)), described, context)
+    batch_gaussians = decode_gaussians(feature_to_gaussians(features), np.arange(len(features)), features, context)
+    return state_gaussians, batch_gaussians
 
 
 def _join(groups: GroupSet, rows: np.ndarray, new: BatchFeatures, batch: Batch) -> tuple[GroupSet, dict[str, int]]:
@@ -181,10 +182,10 @@ def _join(groups: GroupSet, rows: np.ndarray, new: BatchFeatures, batch: Batch) 
 
     The state's groups come before the batch's, so that the merger's cluster begins with one of them.
     """
-    away, there = (select_groups(groups, r) for r in (np.setdiff1d(np.arange(len(groups)), rows), rows))
+    far, near = (select_groups(groups, r) for r in (np.setdiff1d(np.arange(len(groups)), rows), rows))
     assert isinstance(new.context, StateContext)
-    assert there.learned is not None
-    both, num_old = concat_groups([there, _parts(new.features, new.context, batch)]), len(there)
+    assert near.learned is not None
+    both, num_old = concat_groups([near, _parts(new.features, new.context, batch)]), len(near)
     assert both.learned is not None
     context = replace(
         new.context,
@@ -195,22 +196,22 @@ def _join(groups: GroupSet, rows: np.ndarray, new: BatchFeatures, batch: Batch) 
     ids = np.arange(len(both))
     parts = replace(both.features, starts=np.arange(len(both) + 1), members=ids.astype(np.int32))
     merged = merge(parts, _match_parts(parts, num_old, batch.plan.match, context), context)
-    refined = _refine_near(merged, there.learned.refined, context)
+    refined = _refine_near(merged, near.learned.refined, context)
     sizes = np.diff(both.features.starts)[merged.members]
     owners = np.repeat(np.arange(len(merged)), np.diff(merged.starts))
     children = both.children[take(both.features, merged.members).members]
     joined = make_groups(merged, children, owners.repeat(sizes), context.learn(refined))
     has_old = np.bincount(owners, merged.members < num_old, len(merged)) > 0
     num_joined = int((has_old[owners] & (merged.members >= num_old)).sum())
-    return concat_groups([away, limit_children(joined, batch.max_k)]), {"num_joined": num_joined}
+    return concat_groups([far, limit_children(joined, batch.max_k)]), {"num_joined": num_joined}
 
 
 def _parts(features: FeatureGaussians, context: NetworkContext, batch: Batch) -> GroupSet:
     """Make groups of a batch's Feature Gaussians, each of one view."""
     views = batch.view_ids[features.views]
-    own = replace(features, views=views)
-    learned = Learned(own, views, np.diff(features.starts))
-    return make_groups(own, *_children(features, context, batch.max_k), learned)
+    parts = replace(features, views=views)
+    learned = Learned(parts, views, np.diff(features.starts))
+    return make_groups(parts, *_children(features, context, batch.max_k), learned)
 
 
 def _match_parts(parts: FeatureGaussians, num_old: int, options: MatchOptions, context: StateContext) -> Matches:

@@ -38,9 +38,9 @@ def _first(new: BatchFeatures, batch: Batch) -> GroupSet:
     return bake(new.features, new.members, new.context, batch.max_k)
 
 
-def _decode(there: GroupSet, new: BatchFeatures) -> tuple[Gaussians, Gaussians]:
+def _decode(groups: GroupSet, new: BatchFeatures) -> tuple[Gaussians, Gaussians]:
     """Return the Gaussians of the state and of the batch, one for each group."""
-    return feature_to_gaussians(with_fitted_colors(there).features), feature_to_gaussians(new.features)
+    return feature_to_gaussians(with_fitted_colors(groups).features), feature_to_gaussians(new.features)
 
 
 def _join(groups: GroupSet, rows: np.ndarray, new: BatchFeatures, batch: Batch) -> tuple[GroupSet, dict[str, int]]:
