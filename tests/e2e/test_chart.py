@@ -169,11 +169,11 @@ def test_hints_count_for_all_scenes(copied: Path, run: Run) -> None:
     (copied / "room" / "transforms.json").unlink()  # no pixels can be found, and views have to be placed
     shutil.rmtree(copied / "room" / "images")
     said = ("--hint", "order=none", "--fit", "none", "--budgets", "2%", "--proxy-views", "0", "--lpips", "none")
-    run("chart", copied / "room", "--output", copied / "loose", *said, code=5)
+    run("chart", copied / "room", "--output", copied / "unaligned", *said, code=5)
     shutil.copyfile(copied / "room" / "targets" / "transforms.json", copied / "room" / "transforms.json")
     shutil.copytree(copied / "room" / "targets" / "images", copied / "room" / "images")
-    assert run("chart", copied / "room", "--output", copied / "loose", *said).code == 0
-    records = runs(copied / "loose").values()
+    assert run("chart", copied / "room", "--output", copied / "unaligned", *said).code == 0
+    records = runs(copied / "unaligned").values()
     assert {(record.views, record.error) for record in records} == {(2, None)}
     assert all("--hint order=none" in record.command for record in records)
 

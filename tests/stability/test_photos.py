@@ -106,8 +106,8 @@ def test_photos_are_mended(room: Scene, sound: CompactResult, change: Change, lo
 
 @pytest.mark.parametrize("change", [bgr, half, linear])
 def test_photos_of_gaussians_without_pixels_are_mended(room: Scene, change: Change) -> None:
-    loose = Scene(room.gaussians, room.cameras, room.images, None, room.names)
-    right, mended = (compact(replace(loose, images=images), **FIT) for images in (room.images, change(room.images)))
+    unaligned = Scene(room.gaussians, room.cameras, room.images, None, room.names)
+    right, mended = (compact(replace(unaligned, images=images), **FIT) for images in (room.images, change(room.images)))
     assert novel_psnr(mended.gaussians) > novel_psnr(right.gaussians) - 1
     assert "photos_changed" in mended.report.choices
     assert "photos_changed" not in right.report.choices

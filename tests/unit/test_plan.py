@@ -149,10 +149,10 @@ def test_a_budget_counts_repeated_views(scene: Scene) -> None:
 
 
 def test_what_no_view_sees_takes_its_share_of_a_budget(scene: Scene) -> None:
-    loose = unaligned_scenes.loosened(scene)
-    means = loose.gaussians.means.copy()
+    unaligned = unaligned_scenes.without_order(scene)
+    means = unaligned.gaussians.means.copy()
     means[::4] *= -1  # behind the cameras
-    hidden = replace(loose, gaussians=replace(loose.gaussians, means=means))
+    hidden = replace(unaligned, gaussians=replace(unaligned.gaussians, means=means))
     plan = plan_of(hidden, unseen="keep", budget=400)
     assert 0 < len(plan.unseen) < 400
     assert (plan.limits.exact or 0) + len(plan.unseen) == 400

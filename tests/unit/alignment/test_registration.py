@@ -128,9 +128,9 @@ def test_opencv_is_left_as_it_was(parts: list[Scene]) -> None:
 
 
 def test_files_that_cannot_be_joined(parts: list[Scene]) -> None:
-    loose = replace(parts[1], pixel_ids=None)
+    unaligned = replace(parts[1], pixel_ids=None)
     with refuses(SceneError, "b.ply", "-o"):
-        join_scenes([parts[0], loose], PATHS[:2])
+        join_scenes([parts[0], unaligned], PATHS[:2])
     small = replace(parts[1].cameras, width=160, height=240)
     tall = replace(parts[1], cameras=small, images=parts[1].images.reshape(1, 240, 160, 3))
     with refuses(SceneError, "b.ply", "240 x 160", "a.ply", "160 x 240"):

@@ -92,8 +92,8 @@ def test_cameras_of_repeated_views_and_of_views_that_share_one(scene: Scene) -> 
 @pytest.mark.parametrize("cameras", [True, False])
 def test_nothing_is_moved_without_photos(cameras: bool, scene: Scene) -> None:
     places, names = (scene.cameras, scene.names) if cameras else (scene.cameras[[]], ())
-    loose = Scene(scene.gaussians[::8], places, None, None, names)
-    result = compact(loose, poses="free", budget=200, fit_steps=4)
+    unaligned = Scene(scene.gaussians[::8], places, None, None, names)
+    result = compact(unaligned, poses="free", budget=200, fit_steps=4)
     assert "poses" not in result.report.choices
     np.testing.assert_array_equal(result.cameras.viewmats, places.viewmats)
 

@@ -101,8 +101,8 @@ def test_views_of_another_world_are_noted(scene: Scene) -> None:
 
 
 def test_a_scene_in_no_order(scene: Scene, half: Gaussians) -> None:
-    loose = Scene(scene.gaussians, scene.cameras, scene.images, None, scene.names)
-    actual = evaluate(loose, {"half": half}, held_out(), PLAIN)
+    unaligned = Scene(scene.gaussians, scene.cameras, scene.images, None, scene.names)
+    actual = evaluate(unaligned, {"half": half}, held_out(), PLAIN)
     usual = evaluate(scene, {"half": half}, held_out(), PLAIN)
     for one, other in zip(actual.results[1].scores, usual.results[1].scores, strict=True):
         assert one.full == other.full
@@ -188,14 +188,14 @@ def expect_equal(actual: Evaluation, expected: Evaluation) -> None:
 
 def test_a_photo_side_is_what_hand_resized_photos_and_cameras_give(scene: Scene, half: Gaussians) -> None:
     options = replace(PLAIN, zoom=(1, 2))
-    loose = Scene(scene.gaussians, scene.cameras, scene.images, None, scene.names)
+    unaligned = Scene(scene.gaussians, scene.cameras, scene.images, None, scene.names)
     masks = np.ones(scene.images.shape[:3], bool)
     masks[:, :, :9] = False
     small = halved(Views(scene.cameras, scene.images, scene.names))
     by_hand = Scene(scene.gaussians, small.cameras, small.images, None, scene.names)
     own = {"half": scene.cameras[[1, 2, 0]]}  # of a result that moved them
     actual = evaluate(
-        replace(loose, masks=masks), {"half": half}, held_out(), replace(options, photo_side=24), cameras=own
+        replace(unaligned, masks=masks), {"half": half}, held_out(), replace(options, photo_side=24), cameras=own
     )
     expected = evaluate(
         replace(by_hand, masks=~(np.arange(24) < 5) & np.ones((3, 18, 1), bool)), {"half": half}, halved(held_out()),
@@ -203,7 +203,7 @@ def test_a_photo_side_is_what_hand_resized_photos_and_cameras_give(scene: Scene,
     )  # fmt: skip
     expect_equal(actual, expected)
     assert actual.results[0].scores[0].visible < 0.9  # without what the masks leave out, in part too
-    usual = evaluate(loose, {"half": half}, held_out(), options)
+    usual = evaluate(unaligned, {"half": half}, held_out(), options)
     assert actual.results[0].mean("target") != usual.results[0].mean("target")
 
 
@@ -374,8 +374,8 @@ def test_fog_and_holes_are_of_each_result(scene: Scene, half: Gaussians, actual:
     assert given.fog == {}
     expected = measure_fog(scene.gaussians, {"half": half}, scene.cameras, near_plane(scene))["half"]
     assert result.fog == expected
-    loose = Scene(scene.gaussians, scene.cameras, None, None, scene.names)
-    assert evaluate(loose, {"half": half}, None, replace(PLAIN, photo_side=24)).results[1].fog == expected
+    unaligned = Scene(scene.gaussians, scene.cameras, None, None, scene.names)
+    assert evaluate(unaligned, {"half": half}, None, replace(PLAIN, photo_side=24)).results[1].fog == expected
     assert evaluate(scene, {"half": half}, None, replace(PLAIN, fog=False)).results[1].fog == {}
 
 

@@ -20,7 +20,7 @@ from hostile.gsm_files import (
 )
 from messages import refuses
 from network_fixtures import SMALL, Made, made, noisy, scaled, written
-from unaligned_scenes import loosened
+from unaligned_scenes import without_order
 from view_batches import FAST, fed, parts_of, room, same_state, state_of
 
 from gsmerge import Compactor, Scene, compact, encode_scene
@@ -185,7 +185,7 @@ def test_odd_batches(place: int, scene: Scene, absolute: dict[str, Any]) -> None
     """Gaussians in no order, photos of another size, no photos, and nothing at all."""
     batches = parts_of(scene, 2)
     small = scenes.take_views(room(4, 54, 36), [0, 1])
-    for odd in (loosened(batches[place]), replace(batches[place], images=None), small):
+    for odd in (without_order(batches[place]), replace(batches[place], images=None), small):
         both = list(batches)
         both[place] = odd
         compactor = fed(both, **absolute)

@@ -73,7 +73,7 @@ def test_views_that_agree_get_more_superpixels(wall: Scene) -> None:
 
 
 def test_scenes_whose_depths_cannot_be_compared_get_the_usual_share(wall: Scene) -> None:
-    for scene in (scenes.take_views(wall, [0]), unaligned_scenes.loosened(wall)):
+    for scene in (scenes.take_views(wall, [0]), unaligned_scenes.without_order(wall)):
         with record_run() as log:
             assert make_plan(prepare(scene), AUTO).superpixels.options.share == CompactOptions().segment.share
         assert "cannot be compared" in log.notes[0]

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from messages import refuses
+from slow_readers import assert_damage_is_one_line, corners
 
 from gsmerge import Gaussians
 from gsmerge.cli import main
@@ -17,8 +18,6 @@ from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import kept_comments, lost_harmonics, read_gaussians, write_gaussians
 from gsmerge.io.formats import spz
 from gsmerge.io.formats.spz import spz_bytes
-
-from .slow_readers import assert_damage_is_one_line, corners
 
 zstandard = pytest.importorskip("zstandard")
 

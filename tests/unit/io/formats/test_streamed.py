@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import scenes
 from messages import refuses
+from slow_readers import corners, drawn
 
 from gsmerge import Gaussians, Scene
 from gsmerge.cli import main
@@ -27,7 +28,6 @@ from gsmerge.io.formats import sog, streamed
 from gsmerge.io.formats.ply import read_level
 from gsmerge.io.formats.writing import write_levels
 
-from .slow_readers import corners, drawn
 from .test_sog import webp
 from .test_writing import needs_program, program, psnr
 
