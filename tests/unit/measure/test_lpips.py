@@ -270,10 +270,9 @@ def test_other_calls_in_a_pickle_are_refused(package: Path, call: Any) -> None:
     trap = package / "trap"
     tree = made_up("alex") | {"extra": _Calls(call, str(trap))}
     path = write_package(package, "alex", tree)
-    with refuses(SceneError, path, "load") as error:
+    with refuses(SceneError, path, "(alex)", "load") as error:
         lpips(FIRST, SECOND, "alex")
     assert not trap.exists()
-    assert str(error.value).startswith(f"{path}: expected the weights of LPIPS (alex)")
     assert "\n" not in str(error.value)
 
 
