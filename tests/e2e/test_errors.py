@@ -174,6 +174,7 @@ def test_several_outputs_are_all_there_or_none(
     assert listing(scene_copy) == before
 
 
+@pytest.mark.usefixtures("foreground")
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="signals as POSIX has them")
 @pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGHUP", 129), ("SIGINT", 130)])
 def test_a_signal_ends_it_in_order(name: str, code: int, scene_copy: Path, root: Path) -> None:
@@ -190,6 +191,7 @@ def test_a_signal_ends_it_in_order(name: str, code: int, scene_copy: Path, root:
     assert listing(scene_copy) == before
 
 
+@pytest.mark.usefixtures("foreground")
 @pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGINT", 130)])
 def test_a_signal_in_a_callback_is_not_lost(
     name: str, code: int, scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
@@ -209,6 +211,7 @@ def test_a_signal_in_a_callback_is_not_lost(
     assert not (scene_copy / "scene.compact.ply").exists()
 
 
+@pytest.mark.usefixtures("foreground")
 @pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGINT", 130)])
 @pytest.mark.parametrize("error", [SystemError("returned a result with an exception set"), SceneError("a.ply", "odd")])
 def test_a_signal_that_a_library_makes_an_error_of(
@@ -225,6 +228,7 @@ def test_a_signal_that_a_library_makes_an_error_of(
     assert outcome.err == f"{ERROR}{'interrupted' if code == 130 else f'ended by {name}'}\n"
 
 
+@pytest.mark.usefixtures("foreground")
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="signals as POSIX has them")
 def test_an_ignored_signal_stays_ignored(scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """As under nohup."""
