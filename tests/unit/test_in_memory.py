@@ -134,9 +134,8 @@ WRONG: list[tuple[str, Change, list[object]]] = [
 
 @pytest.mark.parametrize(("name", "change", "found"), WRONG, ids=[f"{name}-{i}" for i, (name, *_) in enumerate(WRONG)])
 def test_a_wrong_convention_is_named(scene: Scene, name: str, change: Change, found: list[object]) -> None:
-    with refuses(SceneError, name, *found) as error:
+    with refuses(SceneError, name, *found):
         compact_tensors(**changed(scene, name, change), **FAST)
-    assert "\n" not in str(error.value)
 
 
 def test_colors_of_bytes_and_channel_major_harmonics_are_named(scene: Scene) -> None:
@@ -151,22 +150,14 @@ def test_colors_of_bytes_and_channel_major_harmonics_are_named(scene: Scene) -> 
 
 
 def test_wrong_sizes_are_named(scene: Scene) -> None:
-    with refuses(SceneError, "means", 5040, 5184):
-        compact_tensors(**tensors_of(scene, images=None), shape=(3, 35, 48), **FAST)
-    with refuses(SceneError, "shape", "neither"):
-        compact_tensors(**tensors_of(scene, images=None), **FAST)
-    with refuses(SceneError, "images", [3, 35, 48, 3], [3, 36, 48, 3]):
-        compact_tensors(**tensors_of(scene), shape=(3, 35, 48), **FAST)
-    with refuses(SceneError, "shape", [36, 48]):
-        compact_tensors(**tensors_of(scene), shape=(36, 48), **FAST)
-    with refuses(SceneError, "viewmats", "none"):
-        compact_tensors(**tensors_of(scene, viewmats=None, Ks=None), order="none", **FAST)
-    with refuses(SceneError, "names", 3, 1):
-        compact_tensors(**tensors_of(scene), names=["a"], **FAST)
-    with refuses(SceneError, "quats", "str"):
-        compact_tensors(**tensors_of(scene, quats="wxyz"), **FAST)
-    with refuses(SceneError, "means", "5,184 rows"):
-        compact_tensors(**changed(scene, "scales", lambda s: s * np.nan), **FAST)
+    for changes, place, *found in (
+        ({"images": None, "shape": (3, 35, 48)}, "means", 5040, 5184), ({"images": None}, "shape", "neither"),
+        ({"shape": (3, 35, 48)}, "images", [3, 35, 48, 3], [3, 36, 48, 3]), ({"shape": (36, 48)}, "shape", [36, 48]),
+        ({"viewmats": None, "Ks": None, "order": "none"}, "viewmats", "none"), ({"names": ["a"]}, "names", 3, 1),
+        ({"quats": "wxyz"}, "quats", "str"), ({"scales": scene.gaussians.scales * np.nan}, "means", "5,184 rows"),
+    ):  # fmt: skip
+        with refuses(SceneError, place, *found):
+            compact_tensors(**tensors_of(scene) | changes, **FAST)
     with refuses(ValueError, "order", "'layers'"):
         compact_tensors(**tensors_of(scene), order="layers", **FAST)
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import pytest
-from messages import refuses
+from messages import refuse_all, refuses
 
 from gsmerge.cli.parameters import Args, parse_pairs, setting_kinds, words_for
 from gsmerge.errors import UsageError
@@ -58,12 +58,10 @@ def test_options_and_set_are_one() -> None:
     args = Args(k=2, effort="fast", set=["overlap=0.5"])
     settings = args.settings()
     assert (settings.decode.k, settings.effort, settings.match.overlap) == (2, "fast", 0.5)
-    with refuses(UsageError, "--set k", "--k"):
-        Args(k=2, set=["k=3"]).settings()
-    with refuses(UsageError, "iou", "0 to 1", 2):
-        Args(set=["iou=2"]).settings()
-    with refuses(UsageError, "--set fit", "unknown", "fit_steps"):
-        Args(set=["fit=full"]).settings(fit="none")
+    refuse_all(UsageError, [
+        (Args(k=2, set=["k=3"]).settings, "--set k", "--k"), (Args(set=["iou=2"]).settings, "iou", "0 to 1", 2),
+        (lambda: Args(set=["fit=full"]).settings(fit="none"), "--set fit", "unknown", "fit_steps"),
+    ])  # fmt: skip
 
 
 def test_several_kinds_of_settings() -> None:

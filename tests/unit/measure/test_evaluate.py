@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import scenes
 import torch
-from messages import names, refuses
+from messages import names, refuse_all, refuses
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 import gsmerge
@@ -131,15 +131,13 @@ def test_threads_do_not_matter(threads: int, scene: Scene, half: Gaussians, actu
 
 
 def test_bad_arguments(scene: Scene, half: Gaussians) -> None:
-    with refuses(ValueError, "lpips", "squeeze"):
-        EvaluateOptions(lpips=("squeeze",))
-    with refuses(ValueError, "lpips_views", 1, 0):
-        EvaluateOptions(lpips_views=0)
-    with refuses(ValueError, "results", "'input'"):
-        evaluate(scene, {INPUT: half}, None, PLAIN)
     empty = Scene(half, scene.cameras[[]], None, None, ())
-    with refuses(ValueError, "", "views", "none"):
-        evaluate(empty, {}, None, PLAIN)
+    refuse_all(ValueError, [
+        (lambda: EvaluateOptions(lpips=("squeeze",)), "lpips", "'squeeze'"),
+        (lambda: EvaluateOptions(lpips_views=0), "lpips_views", 1, 0),
+        (lambda: evaluate(scene, {INPUT: half}, None, PLAIN), "results", "'input'"),
+        (lambda: evaluate(empty, {}, None, PLAIN), "", "views", "none"),
+    ])  # fmt: skip
 
 
 @pytest.mark.parametrize(("zoom", "found"), [((0.01,), 0.01), ((), "none"), ((1, 2, 2), "1,2,2"), ((math.nan,), "nan")])

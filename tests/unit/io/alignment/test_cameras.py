@@ -80,9 +80,8 @@ def test_a_file_with_other_intrinsics_is_refused_with_the_remedy(large: Tiny, tm
     cameras.Ks[:, 0, 2] += 4
     large.save(tmp_path)
     write_transforms(tmp_path / "transforms.json", cameras, large.names)
-    with refuses(SceneError, "transforms.json", "4.0 px", "-4.00") as error:
+    with refuses(SceneError, "transforms.json", "4.0 px", "-4.00"):
         load_scene(tmp_path)
-    assert "\n" not in str(error.value)
 
 
 def test_far_off_is_too_far(large: Tiny) -> None:
@@ -104,9 +103,8 @@ def test_a_file_whose_cameras_are_off_is_read_with_a_note(large: Tiny, tmp_path:
     assert pose_changes(large.w2c, load.scene.cameras.viewmats)[0].max() < 0.05
     assert sum(names(note, "cameras", "median") for note in load.notes) == 1
     assert len(load.moves) == 3
-    with refuses(SceneError, "transforms.json", "1.5 px", "median") as error:
+    with refuses(SceneError, "transforms.json", "1.5 px", "median"):
         load_scene(save_with(large, tmp_path / "far", off(large, 8.0, 0.02)))
-    assert "\n" not in str(error.value)
 
 
 def test_right_cameras_get_no_note(large: Tiny, tmp_path: Path) -> None:
