@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import scenes
 import unaligned_scenes
-from messages import refuses
+from messages import noted, refuses
 
 from gsmerge import Gaussians, Scene, compact, render
 from gsmerge.compaction.result import CompactResult
@@ -56,7 +56,7 @@ def test_values_that_are_not_finite(room: Scene) -> None:
     columns["sh0"][4::50] = -np.inf
     spoilt = Scene(Gaussians(**columns), room.cameras, room.images, None, room.names)
     result = compacted(spoilt)
-    assert any("not finite" in note for note in result.report.notes)
+    assert noted(result.report.notes, "finite")
     assert (
         abs(
             scenes.psnr_of(result.gaussians, room)
@@ -97,7 +97,7 @@ def test_one_gaussian(room: Scene) -> None:
 def test_without_images(room: Scene, floor: Callable[..., None]) -> None:
     blind = replace(unaligned_scenes.shuffled(room), images=None)
     result = compacted(blind, fit_steps=60)
-    assert any("no photos" in note for note in result.report.notes)
+    assert noted(result.report.notes, "no", "photos")
     assert result.report.psnr_before is None
     assert result.report.psnr_after is None
     own = render(room.gaussians, room.cameras).images.clip(0, 1)
@@ -107,7 +107,7 @@ def test_without_images(room: Scene, floor: Callable[..., None]) -> None:
 def test_without_cameras(room: Scene, floor: Callable[..., None]) -> None:
     blind = Scene(unaligned_scenes.shuffled(room).gaussians, unaligned_scenes.NO_CAMERAS, None, None, ())
     result = compacted(blind, fit_steps=60)
-    assert any("no cameras" in note for note in result.report.notes)
+    assert noted(result.report.notes, "no", "cameras")
     own = render(room.gaussians, room.cameras).images.clip(0, 1)
     floor(scenes.psnr_of(result.gaussians, replace(room, images=own)))
 

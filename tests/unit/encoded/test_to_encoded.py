@@ -9,7 +9,7 @@ from typing import Any
 import motions
 import pytest
 import scenes
-from messages import refuses
+from messages import names, refuses
 from network_fixtures import noisy, written
 from unaligned_scenes import far_behind, shuffled, voxels
 
@@ -158,7 +158,7 @@ def test_more_than_there_is_to_divide_is_told(encoded: Encoded) -> None:
     plan = plan_decode(encoded, budget=encoded.settings.num_input)
     assert plan.counts.sum() == encoded.max_gaussians - encoded.num_kept
     assert len(plan.notes) == 1
-    assert f"divide into {encoded.max_gaussians} at most" in plan.notes[0]
+    assert names(plan.notes[0], encoded.max_gaussians)
     assert len(decode_scene(encoded, budget=encoded.settings.num_input)) <= encoded.max_gaussians
 
 
@@ -170,7 +170,7 @@ def test_auto_takes_what_compact_would_without_photos(bare: Scene, encoded_bare:
     fewer = replace(encoded_bare, settings=replace(encoded_bare.settings, knee_count=len(encoded_bare) - 1))
     plan = plan_decode(fewer, budget="auto")
     assert plan.counts.tolist() == [1] * len(encoded_bare)
-    assert "fewer than there are groups" in plan.notes[0]
+    assert names(plan.notes[0], "fewer", "groups")
 
 
 def test_the_result_does_not_depend_on_the_threads(pixels: Scene, encoded: Encoded) -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
-from messages import refuses
+from messages import noted, refuses
 
 from gsmerge.facts.views import (
     MAX_SCORED_VIEWS,
@@ -106,4 +106,4 @@ def test_repeats_change_nothing_but_the_share(settings: dict[str, str]) -> None:
         assert len(two.gaussians) == pytest.approx(2 * len(one.gaussians), abs=1)
     else:
         assert scenes.identical(one.gaussians, two.gaussians)
-    assert any("count once" in note for note in two.report.notes)
+    assert noted(two.report.notes, "once")

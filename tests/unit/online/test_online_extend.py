@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scenes
-from messages import refuses
+from messages import noted, refuses
 from unaligned_scenes import NO_CAMERAS, far_behind, shuffled, without_order
 from view_batches import FAST, counts, fed, parts_of, room, same_groups, same_state, state_of
 
@@ -304,7 +304,7 @@ def test_a_fit_in_vain_leaves_the_solved_colours(pairs: list[Scene], monkeypatch
     compactor = fed(pairs)
     actual = decode_stored(state_of(compactor), k=1, options=FitOptions(fit_steps=4))
     assert not actual.fit.accepted
-    assert [note for note in actual.notes if "the fit was not accepted" in note]
+    assert noted(actual.notes, "fit", "accepted")
     assert scenes.identical(actual.gaussians, compactor.decode(k=1, fit="none"))
 
 

@@ -208,6 +208,6 @@ def test_without_the_library(
     with pytest.raises(UsageError, match=r'pip install "zstandard'):
         write_gaussians(tmp_path / "b.spz", some(0), spz_version=4)
     assert main(["inspect", str(path)]) == 2
-    assert "zstandard is not installed; pip install" in capsys.readouterr().err
+    assert "zstandard is" in capsys.readouterr().err
     write_gaussians(tmp_path / "b.spz", some(0))
     assert sorted(one.name for one in tmp_path.iterdir()) == ["a.spz", "b.spz"]

@@ -235,7 +235,7 @@ def test_failures_leave_existing_files_and_nothing_else(tmp_path: Path) -> None:
     index = tmp_path / "scene" / "lod-meta.json"
     bad = corners()
     bad.opacities[1] = np.nan
-    for levels, words in (([corners(), bad], "expected finite Gaussians"), ([corners(), bad[:0]], "got none")):
+    for levels, words in (([corners(), bad], "finite"), ([corners(), bad[:0]], "none")):
         with pytest.raises(ValueError, match=words):
             write_levels(index, levels)
     assert list(tmp_path.iterdir()) == []
