@@ -177,12 +177,12 @@ def test_scenes_of_tensors_become_such_of_arrays(missing: np.ndarray | None) -> 
     changed |= {name: as_tensor(getattr(given, name)) for name in ("images", "pixel_ids")}
     if missing is not None:
         changed["missing"] = as_tensor(missing)
-    loose = Scene(changed["gaussians"], changed["cameras"], changed["images"], None, given.names)
+    unaligned = Scene(changed["gaussians"], changed["cameras"], changed["images"], None, given.names)
     for tensors in (
         replace(given, **changed),
         replace(given, **{**changed, "images": None}),
-        loose,
-        replace(loose, images=None),
+        unaligned,
+        replace(unaligned, images=None),
     ):
         arrays = tensors.numpy()
         assert type(arrays) is type(tensors)

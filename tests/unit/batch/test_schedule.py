@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from batches import QUICK, records
-from messages import refuses
+from messages import names, refuses
 
 from gsmerge.batch import BatchOptions, Job
 from gsmerge.batch import schedule as runs
@@ -69,10 +69,10 @@ def test_memory_limits_how_many_come_at_once(monkeypatch: pytest.MonkeyPatch) ->
     assert (schedule(2 * need - 1).jobs, schedule(2 * need - 1).threads) == (1, 4)
     assert schedule(2 * need).memory == 2 * need
     assert schedule(2 * need).notes == ()
-    assert "2 at once instead of 3" in schedule(2 * need, jobs=3).notes[0]
+    assert names(schedule(2 * need, jobs=3).notes[0], 2, 3)
     alone = schedule(need // 2)
     assert alone.jobs == 1
-    assert "the largest scene alone may take" in alone.notes[0]
+    assert names(alone.notes[0], "largest", "alone")
     monkeypatch.setattr(runs, "free_memory", lambda: need)
     assert schedule(None).jobs == 1
     assert schedule(None, jobs=3).jobs == 3  # who asks for it gets it

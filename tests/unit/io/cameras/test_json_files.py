@@ -109,7 +109,7 @@ def test_a_bare_list_is_opencv_and_may_lack_intrinsics(tmp_path: Path, tiny: Tin
         ({"w": 1e999}, "images/a b/2.png", "infinity"),
         ({"h": -14}, "", "20 x -14"),
         ({"cx": float("nan")}, "images/a b/2.png", "NaN"),
-        ({"frames": []}, "", "one camera"),
+        ({"frames": []}, "", "camera"),
         ({"frames": {"a": 1}}, "", "'frames'"),
         ({"frames": [{"file_path": "a.png"}]}, "a.png", "'transform_matrix'"),
         ({"frames": [{"transform_matrix": [[1, 0], [0, 1]]}]}, "view 0", (2, 2)),

@@ -10,6 +10,7 @@ import pytest
 import scenes
 from messages import refuses
 from plyfile import PlyData, PlyElement
+from slow_readers import corners, drawn, read_splat, read_spz
 
 from gsmerge.errors import SceneError
 from gsmerge.io import kept_comments, read_gaussians, read_ply, write_gaussians, write_ply
@@ -18,8 +19,6 @@ from gsmerge.io.formats.sog import sog_bytes
 from gsmerge.io.formats.spz import spz_bytes
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import Gaussians
-
-from .slow_readers import corners, drawn, read_splat, read_spz
 
 NAMES = (
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),

@@ -11,6 +11,7 @@ import pytest
 import scenes
 from messages import refuses
 from plyfile import PlyData
+from slow_readers import corners, drawn, read_back
 from tiny_scene import Tiny
 
 from gsmerge import Scene
@@ -19,8 +20,6 @@ from gsmerge.geometry import normalize
 from gsmerge.io import OUTPUT_FORMATS, lost_harmonics, output_format, read_ply, write_gaussians, write_ply
 from gsmerge.research.baselines.simple import find_program
 from gsmerge.types import Gaussians
-
-from .slow_readers import corners, drawn, read_back
 
 QUANTISED = (".compressed.ply", ".spz", ".sog", ".splat")
 

