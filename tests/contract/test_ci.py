@@ -13,7 +13,9 @@ import pytest
 import typer.main
 from scripts import load_script
 
+from gsmerge import __version__
 from gsmerge.cli.app import app
+from gsmerge.native.build import find_platform
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -133,3 +135,28 @@ def test_templates_ask_for_calls_that_are_there(form: Path) -> None:
         name, *arguments = shlex.split(call)
         if name not in ("--version", "--debug"):
             COMMANDS[name].make_context(name, arguments)  # raises where an argument is wrong
+
+
+def test_the_version_is_released_with_notes() -> None:
+    sections = re.findall(r"^## (.+)$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert re.fullmatch(rf"{re.escape(__version__)} \(\d{{4}}-\d\d-\d\d\)", sections[1])
+    assert f"\nversion: {__version__}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert (ROOT / "docs" / "releases" / f"{__version__}.md").exists()
+
+
+def test_wheels_are_built_for_the_platforms_that_the_notes_name_and_tried_there() -> None:
+    text = (ROOT / ".github" / "workflows" / "wheels.yml").read_text(encoding="utf-8")
+    platforms = re.findall(r"for platform in (.+); do", text)[0].split()
+    assert len({find_platform(tag) for tag in platforms}) == len(platforms) == 4
+    assert sorted(re.findall(r'file: "\*-(\w+)\.whl"', text)) == sorted(platforms)
+    notes = (ROOT / "docs" / "releases" / f"{__version__}.md").read_text(encoding="utf-8")
+    assert re.findall(r"^\| `(\w+)\.whl`", notes, re.MULTILINE) == platforms
+
+
+@pytest.mark.parametrize(("tag", "code"), [(f"v{__version__}", 0), (__version__, 1), (f"v{__version__}.1", 1)])
+def test_a_tag_that_is_not_the_version_stops_the_wheels(tag: str, code: int) -> None:
+    text = (ROOT / ".github" / "workflows" / "wheels.yml").read_text(encoding="utf-8")
+    (step,) = re.findall(r"^ {10}version=\$.+?(?=^ {6}- )", text, re.DOTALL | re.MULTILINE)
+    env = {**os.environ, "GITHUB_REF_NAME": tag}
+    done = subprocess.run([*SHELL, step], cwd=ROOT, env=env, capture_output=True, check=False)
+    assert done.returncode == code
