@@ -74,7 +74,8 @@ def test_what_is_no_table_is_refused_in_one_line(tmp_path: Path, text: str) -> N
 
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     (tmp_path / "bytes.json").write_bytes(b"\xff\xfe\x00")
-    for name in ("nowhere.json", "bytes.json", "."):
+    (tmp_path / "folder.json").mkdir()
+    for name in ("nowhere.json", "bytes.json", "folder.json"):
         with pytest.raises(SceneError, match="TOML or JSON"):
             read_table(tmp_path / name)
 
