@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.kernels.signature import STATUS, f8, i1, i8, native
+from gsmerge.kernels.signature import STATUS, declare, f8, i1, i8, native
 
 LEAF = 16  # points up to which a run is not divided
 
@@ -27,12 +27,10 @@ def build_tree(points, order, axes, splits):
     """
 
 
-@native(
-    STATUS, points=f8("n", 3), views=i8("n"), order=i8("m"), axes=i1("nodes"), splits=f8("nodes"), first=i8(least=0),
-    last=i8(), most=i8(), distances=f8("k", out=True), out=i8("n", "k", out=True),
+_search_tree = declare(
+    "search_tree", STATUS, points=f8("n", 3), views=i8("n"), order=i8("m"), axes=i1("nodes"), splits=f8("nodes"),
+    first=i8(least=0), last=i8(), most=i8(), distances=f8("k", out=True), out=i8("n", "k", out=True),
 )  # fmt: skip
-def _search_tree(points, views, order, axes, splits, first, last, most, distances, out):
-    """Do what :func:`nearest_of_others` does; ``distances`` is overwritten."""
 
 
 def nearest_of_others(points, views, order, axes, splits, first, last, most, out):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsmerge.kernels.raster import blend
-from gsmerge.kernels.signature import STATUS, f4, f8, i4, i8, native, u1
+from gsmerge.kernels.signature import STATUS, declare, f4, f8, i4, i8, native, u1
 
 LANES = 4  # channels of an image row
 FIRST_ENTRIES = 40  # entries for each pixel that there is room for to begin with
@@ -21,12 +21,11 @@ ENTRIES = {
 }
 
 
-@native(
-    STATUS, **blend.LISTS, height=i8(least=1), width=i8(least=1), starts=i8("more", out=True),
+# Writes entries of tiles from progress[0] on behind progress[1] entries, as far as there is room.
+_list_weights = declare(
+    "list_weights", STATUS, **blend.LISTS, height=i8(least=1), width=i8(least=1), starts=i8("more", out=True),
     lanes=u1("room", out=True), weights=f4("room", out=True), progress=i8(2, least=0, out=True),
 )  # fmt: skip
-def _list_weights(footprints, members, offsets, columns, height, width, starts, lanes, weights, progress):
-    """Write entries of tiles from ``progress[0]`` on behind ``progress[1]`` entries, as far as there is room."""
 
 
 def list_weights(footprints, members, offsets, columns, height, width):

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from gsmerge.kernels.signature import COUNT, STATUS, f4, f8, i4, native, u1
+from gsmerge.kernels.signature import COUNT, STATUS, declare, f4, f8, i4, native, u1
 from gsmerge.kernels.superpixels.split_merge import merge, split
 
 COLOUR_DEVIATION = 0.018 / 2  # CIELAB / 100
@@ -35,12 +35,11 @@ def simple_point_table():
     return ((changes == 2) & (edges > 0) & (edges < 4)).astype(np.uint8)
 
 
-@native(
-    STATUS, labels=i4("padded_height", "padded_width"), colours=f4("height", "width", 3), areas=f8("count"),
-    sums=f8("count", 9, out=True), rows=f4("count", ROW, out=True),
+# sums are zero before
+_fit_regions = declare(
+    "fit_regions", STATUS, labels=i4("padded_height", "padded_width"), colours=f4("height", "width", 3),
+    areas=f8("count"), sums=f8("count", 9, out=True), rows=f4("count", ROW, out=True),
 )  # fmt: skip
-def _fit_regions(labels, colours, areas, sums, rows):
-    """Write what :func:`fit_regions` returns; ``sums`` are zero before."""
 
 
 def fit_regions(labels, colours, areas):

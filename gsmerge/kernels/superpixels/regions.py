@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.kernels.signature import STATUS, f4, f8, i4, native
+from gsmerge.kernels.signature import STATUS, declare, f4, f8, i4
 
 NUM_PIXELS, ROW = 5, 8  # column after the five of the mean, and the length of a row
 
@@ -20,12 +20,11 @@ def pad_labels(labels):
     return np.pad(np.ascontiguousarray(labels, np.int32), 1, constant_values=-1)
 
 
-@native(
-    STATUS, labels=i4("padded_height", "padded_width"), pixels=f4("height", "width", 3), spread=f4(),
+# sums are zero before; the first ``count`` rows are written
+_region_rows = declare(
+    "region_rows", STATUS, labels=i4("padded_height", "padded_width"), pixels=f4("height", "width", 3), spread=f4(),
     sums=f8("count", 6, out=True), rows=f4("capacity", ROW, out=True),
 )  # fmt: skip
-def _region_rows(labels, pixels, spread, sums, rows):
-    """Write the first ``count`` rows of a padded label picture; ``sums`` are zero before."""
 
 
 def region_rows(labels, pixels, count, capacity, spread):

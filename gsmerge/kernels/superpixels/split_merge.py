@@ -14,18 +14,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.kernels.signature import STATUS, f4, f8, i4, i8, native, u1
+from gsmerge.kernels.signature import STATUS, declare, f4, f8, i4, i8, native, u1
 from gsmerge.kernels.superpixels.ward import adjacent_pairs
 
 SUMS = 7  # columns of a region's sums: pixels, colours (3), squared colours (3)
 
 
-@native(
-    STATUS, labels=i4("padded_height", "padded_width"), colours=f4("height", "width", 3), marks=u1("height", "width"),
-    sums=f8("count", SUMS, out=True),
+_sum_regions = declare(
+    "sum_regions", STATUS, labels=i4("padded_height", "padded_width"), colours=f4("height", "width", 3),
+    marks=u1("height", "width"), sums=f8("count", SUMS, out=True),
 )  # fmt: skip
-def _sum_regions(labels, colours, marks, sums):
-    """Add the marked pixels to the sums of their regions."""
 
 
 def sum_regions(labels, colours, marks, count):
@@ -52,13 +50,12 @@ def log_evidence(sums, prior):
     """
 
 
-@native(
-    STATUS, labels=i4("padded_height", "padded_width"), across=i4(), boxes=i8("count", 4, out=True),
+# sums are zero before
+_mark_halves = declare(
+    "mark_halves", STATUS, labels=i4("padded_height", "padded_width"), across=i4(), boxes=i8("count", 4, out=True),
     sums=f8("count", 3, out=True), offsets=f8("count", 2, out=True), ends=i8("count", 2, out=True),
     queue=i4("places", 2, out=True), halves=u1("height", "width", out=True),
 )  # fmt: skip
-def _mark_halves(labels, across, boxes, sums, offsets, ends, queue, halves):
-    """Write what :func:`mark_halves` returns; ``sums`` are zero before, the other buffers are overwritten."""
 
 
 def mark_halves(labels, count, across):
@@ -74,9 +71,10 @@ def mark_halves(labels, count, across):
     return halves == 1
 
 
-@native(whole=f8("count", SUMS), second=f8("count", SUMS), prior=f8(4), ratios=f8("count", out=True))
-def _weigh_splits(whole, second, prior, ratios):
-    """Write what :func:`weigh_splits` returns, but leave alone where there is nothing to split."""
+# leaves ratios where there is nothing to split
+_weigh_splits = declare(
+    "weigh_splits", whole=f8("count", SUMS), second=f8("count", SUMS), prior=f8(4), ratios=f8("count", out=True)
+)
 
 
 def weigh_splits(whole, second, prior):
@@ -92,12 +90,11 @@ def weigh_splits(whole, second, prior):
     return ratios
 
 
-@native(
-    sums=f8("count", SUMS), pairs=i4("num_pairs", 2, least=0, below="count"), prior=f8(4), own=f8("count", out=True),
-    partners=i4("count", out=True), ratios=f8("count", out=True),
+# partners are -1 and ratios -inf before
+_choose_merges = declare(
+    "choose_merges", sums=f8("count", SUMS), pairs=i4("num_pairs", 2, least=0, below="count"), prior=f8(4),
+    own=f8("count", out=True), partners=i4("count", out=True), ratios=f8("count", out=True),
 )  # fmt: skip
-def _choose_merges(sums, pairs, prior, own, partners, ratios):
-    """Write what :func:`choose_merges` returns over -1 and -inf; ``own`` is overwritten."""
 
 
 def choose_merges(pairs, sums, prior):
