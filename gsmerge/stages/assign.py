@@ -76,7 +76,7 @@ def find_owners(scene: Scene, groups: Groups) -> Owners:
 def view_owners(plan: ViewPlan, labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Find contribution ``[m]`` to, and label ``[m]`` of, the dominant superpixel of each of a plan's Gaussians."""
     labels = np.ascontiguousarray(labels, np.int32)
-    return dominant_labels(plan.footprints, plan.members, plan.offsets, plan.columns, labels, count)
+    return dominant_labels(*plan.lists, labels, count)
 
 
 def owner_pixels(owners: Owners, groups: Groups) -> np.ndarray:

@@ -46,3 +46,16 @@ def nearest_of_others(points, views, order, axes, splits, first, last, most, out
         out: ``[n,k]`` int64: nearest first, -1 where there are fewer.
     """
     _search_tree(points, views, order, axes, splits, first, last, most, np.empty(out.shape[1]), out)
+
+
+@native(STATUS, values=f8("n"), order=i8("m", out=True, least=0, below="n"), low=i8(least=0), high=i8(), place=i8())
+def partition(values, order, low, high, place):
+    """Reorder a run of an order so that one place holds the value that sorting would put there.
+
+    No value before the place is above it, and none after it below.
+
+    Args:
+        values: ``[n]`` float64 numbers, left as they are.
+        order: ``[m]`` int64 places in ``values``; those from ``low`` to before ``high`` are reordered.
+        place: In ``order``, from ``low`` to before ``high``.
+    """
