@@ -208,6 +208,6 @@ def render_cuda(
 
 
 def harmonic_colors(means: Tensor, sh: Tensor, eye: Tensor) -> Tensor:
-    """Evaluate the colours ``[n,3]`` of ``sh[n,k,3]`` seen from ``eye [3]``, not below 0."""
+    """Evaluate the colours ``[n,3]`` of ``sh [n,k,3]`` seen from ``eye [3]``, not below 0."""
     degree = round(sh.shape[1] ** 0.5) - 1
     return (_gsplat().spherical_harmonics(degree, means - eye, sh) + 0.5).clamp_min(0)

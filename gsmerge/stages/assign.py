@@ -16,7 +16,7 @@ from gsmerge.geometry import morton_codes
 from gsmerge.kernels.raster.contribution import dominant_labels
 from gsmerge.moments import Members, pool_members, scene_members, unaligned_members
 from gsmerge.raster import ViewPlan
-from gsmerge.raster.seen import plan_views
+from gsmerge.raster.images import plan_views
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.decode import DecodeOptions, decode

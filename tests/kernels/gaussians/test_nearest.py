@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsmerge.kernels.gaussians.nearest import build_tree, nearest_of_others, partition
+from gsmerge.kernels.gaussians.cross_view import build_tree, nearest_of_others, partition
 from gsmerge.networks.cross_view_stats import nearest_of_other_views
 from gsmerge.runtime.threads import use_threads
 
