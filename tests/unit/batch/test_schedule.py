@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from batches import QUICK, records
+from messages import names, refuses
 
 from gsmerge.batch import BatchOptions, Job
 from gsmerge.batch import schedule as runs
@@ -66,10 +67,10 @@ def test_memory_limits_how_many_come_at_once(monkeypatch: pytest.MonkeyPatch) ->
     assert (schedule(2 * need - 1).jobs, schedule(2 * need - 1).threads) == (1, 4)
     assert schedule(2 * need).memory == 2 * need
     assert schedule(2 * need).notes == ()
-    assert "2 at once instead of 3" in schedule(2 * need, jobs=3).notes[0]
+    assert names(schedule(2 * need, jobs=3).notes[0], 2, 3)
     alone = schedule(need // 2)
     assert alone.jobs == 1
-    assert "the largest scene alone may take" in alone.notes[0]
+    assert names(alone.notes[0], "largest", "alone")
     monkeypatch.setattr(runs, "free_memory", lambda: need)
     assert schedule(None).jobs == 1
     assert schedule(None, jobs=3).jobs == 3  # who asks for it gets it
@@ -145,7 +146,7 @@ def test_what_others_work_on_comes_last(context: BatchContext, monkeypatch: pyte
 
 
 def test_a_batch_that_cannot_record_ends(context: BatchContext) -> None:
-    with pytest.raises(SceneError, match=r"batch\.jsonl: the batch cannot go on: told so"):
+    with refuses(SceneError, "batch.jsonl", "told so"):
         handed_out(Script({"1": [STUCK]}), context, 3)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scenes
+from messages import refuses
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import project
@@ -79,8 +80,8 @@ def test_rows_that_are_spoilt(scene: Scene) -> None:
     assert sorted(set(large[:, 0].round().tolist())) == [1.0, 8.0]
     away = (module.throw_away(scene_in).scene.gaussians.means != scene.gaussians.means).any(1)
     assert int(away.sum()) == 1
-    loose = Scene(scene.gaussians, scene.cameras, scene.images, None, scene.names)
-    assert len(module.break_rows(StressScene(loose, None)).scene.gaussians) == n - round(0.01 * n)
+    unaligned = Scene(scene.gaussians, scene.cameras, scene.images, None, scene.names)
+    assert len(module.break_rows(StressScene(unaligned, None)).scene.gaussians) == n - round(0.01 * n)
 
 
 def test_views_are_taken_away_shuffled_and_repeated(scene: Scene) -> None:
@@ -113,8 +114,9 @@ def test_every_case_on_a_scene_with_held_out_views(load: SceneLoad, made_scene: 
 
 
 def test_a_scene_in_no_order_skips_what_needs_pixels(load: SceneLoad) -> None:
-    loose = Scene(load.scene.gaussians, load.scene.cameras, load.scene.images, None, load.scene.names)
-    actual = stress(replace(load, scene=loose, cameras=None), FAST, cases=["order", "views-3", "large", "c2w-opencv"])
+    unaligned = Scene(load.scene.gaussians, load.scene.cameras, load.scene.images, None, load.scene.names)
+    names = ["order", "views-3", "large", "c2w-opencv"]
+    actual = stress(replace(load, scene=unaligned, cameras=None), FAST, cases=names)
     assert [outcome.passed for outcome in actual] == [None, None, True, None]
 
 
@@ -179,8 +181,8 @@ def test_wrong_conventions_that_are_believed_are_noticed(load: SceneLoad, monkey
 
 
 def test_bad_arguments(load: SceneLoad) -> None:
-    with pytest.raises(ValueError, match="cases: expected some of unchanged"):
+    with refuses(ValueError, "cases", "unchanged"):
         stress(load, FAST, cases=["nonsense"])
     bare = Scene(load.scene.gaussians, load.scene.cameras[[]], None, None, ())
-    with pytest.raises(ValueError, match="a scene with views"):
+    with refuses(ValueError, "", "views", "none"):
         stress(replace(load, scene=bare), FAST)

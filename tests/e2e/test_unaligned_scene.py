@@ -20,7 +20,7 @@ Measure = Callable[[Path, Path], float]
 @pytest.fixture(scope="module")
 def made(made_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The made scene as voxels."""
-    folder = Path(shutil.copytree(made_scene, tmp_path_factory.mktemp("loose") / "scene"))
+    folder = Path(shutil.copytree(made_scene, tmp_path_factory.mktemp("unaligned") / "scene"))
     scene = gsmerge.read_scene(folder)
     gsmerge.write_ply(folder / "scene.ply", unaligned_scenes.voxels(scene, 0.03).gaussians, overwrite=True)
     return folder

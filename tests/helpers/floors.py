@@ -18,7 +18,7 @@ import numpy as np
 
 from gsmerge import Gaussians
 
-TABLE = Path(__file__).with_name("floors.csv")
+TABLE = Path(__file__).parent.parent / "floors.csv"
 COLUMNS = ("test", "n", "mean", "sd", "floor")
 RECORD = "GSMERGE_FLOORS_RECORD"  # a file: values are written there instead of being compared
 NUDGE = "GSMERGE_FLOORS_NUDGE"  # which of the runs

@@ -12,7 +12,7 @@ from gsmerge.geometry import normalize
 NO_CAMERAS = Cameras(np.empty((0, 4, 4)), np.empty((0, 3, 3)), 1, 1)
 
 
-def loosened(scene: Scene, order: np.ndarray | None = None) -> Scene:
+def without_order(scene: Scene, order: np.ndarray | None = None) -> Scene:
     """The same Gaussians without their order."""
     gaussians = scene.gaussians if order is None else scene.gaussians[order]
     return Scene(gaussians, scene.cameras, scene.images, None, scene.names)
@@ -20,7 +20,7 @@ def loosened(scene: Scene, order: np.ndarray | None = None) -> Scene:
 
 def shuffled(scene: Scene, seed: int = 0) -> Scene:
     """In a random order."""
-    return loosened(scene, np.random.default_rng(seed).permutation(len(scene.gaussians)))
+    return without_order(scene, np.random.default_rng(seed).permutation(len(scene.gaussians)))
 
 
 def voxels(scene: Scene, size: float) -> Scene:

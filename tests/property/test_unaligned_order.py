@@ -39,7 +39,7 @@ def owners_equal(one: Owners, other: Owners) -> bool:
 @given(st.integers(0, 1000), st.integers(1, 300), st.sampled_from([ROOM, TURNED]))
 def test_permuted_gaussians_have_permuted_owners(seed: int, count: int, scene: Scene) -> None:
     """Of so few no two have the same depth in float32, so that each view has one order."""
-    few = replace(unaligned_scenes.loosened(scene), gaussians=scene.gaussians[::8])
+    few = replace(unaligned_scenes.without_order(scene), gaussians=scene.gaussians[::8])
     order = np.random.default_rng(seed).permutation(len(few.gaussians))
     one = find_owners(few, groups(count))
     other = find_owners(replace(few, gaussians=few.gaussians[order]), groups(count))
@@ -49,7 +49,7 @@ def test_permuted_gaussians_have_permuted_owners(seed: int, count: int, scene: S
 @FEW
 @given(st.integers(1, 300))
 def test_each_gaussian_is_in_at_most_one_superpixel(count: int) -> None:
-    scene = unaligned_scenes.loosened(TURNED)
+    scene = unaligned_scenes.without_order(TURNED)
     owners = find_owners(scene, groups(count))
     members = unaligned_members(scene, owner_pixels(owners, groups(count)))
     starts, ids, views = member_rows(scene, members, groups(count))
@@ -68,7 +68,7 @@ def test_each_gaussian_is_in_at_most_one_superpixel(count: int) -> None:
 def test_permuted_gaussians_merge_alike(seed: int, options: dict) -> None:
     one, other = (
         compact(scene, superpixels="10%", fit="none", **options).gaussians
-        for scene in (unaligned_scenes.loosened(ROOM), unaligned_scenes.shuffled(ROOM, seed))
+        for scene in (unaligned_scenes.without_order(ROOM), unaligned_scenes.shuffled(ROOM, seed))
     )
     assert abs(len(one) - len(other)) <= 2
     assert abs(scenes.psnr_of(one, ROOM) - scenes.psnr_of(other, ROOM)) < 0.1
@@ -90,7 +90,8 @@ def test_similarity(seed: int, exponent: float) -> None:
     transform = scenes.random_rotation(seed), factor, factor * rng.uniform(-10, 10, 3)
     moved = scenes.move(ROOM, *transform)
     one, other = (
-        compact(unaligned_scenes.loosened(scene), superpixels="10%", fit="none").gaussians for scene in (ROOM, moved)
+        compact(unaligned_scenes.without_order(scene), superpixels="10%", fit="none").gaussians
+        for scene in (ROOM, moved)
     )
     expected = scenes.move_gaussians(one, *transform)
     assert abs(len(one) - len(other)) <= 2
