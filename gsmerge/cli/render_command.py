@@ -83,7 +83,7 @@ def render(args: opt.Args) -> None:
         ):
             pictures = _count(draw(threads), facts.get("frames", len(paths)), progress)
             if "fps" in facts:
-                from gsmerge.measure.video import write_video
+                from gsmerge.measure.preview import write_video
 
                 facts["encoding"] = write_video(args.output, pictures, facts["fps"], overwrite=args.overwrite)
             else:
@@ -107,7 +107,7 @@ def _choose_plan(args: opt.Args) -> Callable[[opt.Args, SceneFiles], Drawing]:
     if args.path is not None:
         _check_path(args)
         return _plan_path
-    from gsmerge.measure.video import is_video
+    from gsmerge.measure.preview import is_video
 
     if args.frames or args.fps or is_video(args.output):
         what = f"{args.output}" if is_video(args.output) else "--frames and --fps"
@@ -122,7 +122,7 @@ def _choose_plan(args: opt.Args) -> Callable[[opt.Args, SceneFiles], Drawing]:
 def _check_path(args: opt.Args) -> None:
     """Refuse an unknown path, and options and outputs that do not go with one."""
     from gsmerge.measure.camera_path import parse_path
-    from gsmerge.measure.video import is_video
+    from gsmerge.measure.preview import is_video
 
     if args.kind is not None:
         raise UsageError(f"--path: expected no --as with it, got --as {args.kind}")
@@ -219,7 +219,7 @@ def _draw_views(
 
 def _plan_path(args: opt.Args, files: SceneFiles) -> Drawing:
     """Plan a video, or its frames as pictures, of the scenes side by side along a path."""
-    from gsmerge.measure.video import is_video
+    from gsmerge.measure.preview import is_video
 
     like, named = _frame_files(args, files), Path(args.path)
     inputs = (*args.scenes, *input_files(files), *input_files(like), named)
