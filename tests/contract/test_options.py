@@ -21,7 +21,7 @@ from gsmerge.measure.evaluate import NETS
 from gsmerge.online.options import OnlineOptions
 from gsmerge.research.generate import GenerateOptions
 from gsmerge.research.training import preset_options
-from gsmerge.runtime.cluster import ENGINES
+from gsmerge.runtime.work import ENGINES
 from gsmerge.scene.exporters import ReadHints
 
 COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]

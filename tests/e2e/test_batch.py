@@ -46,7 +46,7 @@ def first(rooms: Path) -> tuple[int, Path]:
 @pytest.fixture(autouse=True)
 def in_this_process(first: tuple[int, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     """Processes are the subject of ``first`` alone, and of ``test_batch_faults.py``; each takes seconds to start."""
-    monkeypatch.setattr("gsmerge.batch.schedule.LocalPool", InlinePool)
+    monkeypatch.setattr("gsmerge.batch.schedule.ProcessPool", InlinePool)
 
 
 @pytest.fixture

@@ -46,7 +46,7 @@ def copied(results: Path, tmp_path: Path) -> Path:
 @pytest.fixture(autouse=True)
 def _inline(monkeypatch: pytest.MonkeyPatch) -> None:
     """Run the jobs of a test in this process, where they can be watched; the fixture above has processes."""
-    monkeypatch.setattr("gsmerge.batch.schedule.LocalPool", InlinePool)
+    monkeypatch.setattr("gsmerge.batch.schedule.ProcessPool", InlinePool)
 
 
 @pytest.fixture

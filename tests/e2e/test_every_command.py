@@ -12,7 +12,7 @@ from tiny_scene import edited_json
 
 import gsmerge
 from gsmerge.cli import main
-from gsmerge.cli.render_command import picture_stems
+from gsmerge.measure.drawings import picture_stems
 from gsmerge.scene.read import load_scene
 
 from .conftest import Run, assert_refused, listing

@@ -135,7 +135,7 @@ def test_the_warning_is_red(
 def test_a_batch_names_worse_results(
     small_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gsmerge.batch.schedule.LocalPool", InlinePool)
+    monkeypatch.setattr("gsmerge.batch.schedule.ProcessPool", InlinePool)
     out = tmp_path / "out"
     call = ("batch", small_scene, "-o", out, "--jobs", 1, *FEW)
     said = run(*call, code=0)

@@ -15,7 +15,7 @@ from typing import Any
 from gsmerge.batch import BatchOptions, Job
 from gsmerge.batch.find import output_name
 from gsmerge.batch.records import RECORDS, SUMMARY, RecordIndex
-from gsmerge.batch.task import BatchContext, Task, run_task
+from gsmerge.batch.task import BatchContext, Task, new_records
 from gsmerge.options import CompactOptions
 
 NAMES = [f"room{number}.ply" for number in range(4)]  # results of the fixture ``rooms``
@@ -85,25 +85,25 @@ def holders(folder: Path) -> list[int]:
 
 
 class InlinePool:
-    """In place of :class:`gsmerge.batch.pools.LocalPool`: one scene after the other in this process."""
+    """In place of :class:`gsmerge.runtime.work.ProcessPool`: one call after the other in this process."""
 
-    def __init__(self, work: BatchContext, _: int) -> None:
-        self.work, self.index = work, RecordIndex(work.folder, work.start)
-        self.ended: list[tuple[Task, dict[str, Any]]] = []
+    def __init__(self, *_: object, **__: object) -> None:
+        new_records.cache_clear()  # as in a new process
+        self.ended: list[tuple[Any, Any]] = []
 
     @property
     def has_room(self) -> bool:
         return not self.ended
 
-    def submit(self, task: Task) -> None:
-        self.ended.append((task, run_task(task, self.work, self.index)))
+    def submit(self, key: Any, function: Callable[..., Any], *arguments: Any, memory: int = 0) -> None:
+        self.ended.append((key, function(*arguments)))
 
-    def wait(self, _: float) -> list[tuple[Task, dict[str, Any]]]:
+    def wait(self, _: float | None) -> list[tuple[Any, Any]]:
         ended, self.ended = self.ended, []
         return ended
 
-    def close(self) -> None:
-        pass
+    def close(self) -> list[Any]:
+        return []
 
 
 def one_task(scene: Path, out: Path, options: BatchOptions = QUICK) -> tuple[Task, BatchContext, RecordIndex]:

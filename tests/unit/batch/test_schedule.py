@@ -18,7 +18,6 @@ from gsmerge.batch.records import (
     BUSY,
     DONE,
     FAILED,
-    LOST,
     SKIPPED,
     STUCK,
     record,
@@ -28,6 +27,9 @@ from gsmerge.batch.task import BatchContext, Task
 from gsmerge.errors import SceneError
 from gsmerge.options import CompactOptions
 from gsmerge.runtime.estimate import memory_bytes
+from gsmerge.runtime.work import Lost
+
+LOST = "lost"
 
 
 def jobs(*counts: int) -> list[Job]:
@@ -96,18 +98,19 @@ class Script:
     def has_room(self) -> bool:
         return len(self.tasks) < self.room
 
-    def submit(self, task: Task) -> None:
+    def submit(self, task: Task, *_: object, memory: int = 0) -> None:
         self.tasks.append(task)
         self.seen.append((task.job.scene, task.attempt))
 
-    def wait(self, _: float) -> list[tuple[Task, dict[str, Any]]]:
+    def wait(self, _: float | None) -> list[tuple[Task, Any]]:
         task = self.tasks.pop(0)
         script = self.scripts.get(task.job.scene, [])
         status = script.pop(0) if script else DONE
-        return [(task, record(status, task.job.scene, task.job.output, error="told so"))]
+        lost, actual = Lost("told so"), record(status, task.job.scene, task.job.output, error="told so")
+        return [(task, lost if status == LOST else actual)]
 
-    def close(self) -> None:
-        pass
+    def close(self) -> list[Task]:
+        return []
 
 
 def handed_out(pool: Script, context: BatchContext, count: int) -> list[tuple[str, str]]:

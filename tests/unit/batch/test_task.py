@@ -231,7 +231,7 @@ def test_what_another_run_works_on_is_left_to_it(scene: Path, out: Path) -> None
         (out / left_by_a_dead_process()).touch()
         assert run_task(task, context, later)["status"] == BUSY
         assert record_failure(task, context, "died")["status"] == BUSY
-        clean_up(task, context)
+        clean_up([task], context)
         assert len(results(out)) == 2  # the lock, and the file that the other process may yet clean up
     assert not (out / "batch.jsonl").exists()
 
@@ -333,7 +333,7 @@ def test_where_nothing_can_be_recorded_nothing_is_forgotten(
     assert says(actual["error"], "batch.jsonl", "No space")
     task, context, _ = one_task(scene, out)
     assert record_failure(task, context, "died")["status"] == STUCK
-    clean_up(task, context)
+    clean_up([task], context)
     monkeypatch.undo()
     assert run(scene, out)["status"] == DONE  # the result is there without a record, and known as ours
     assert results(out) == undisturbed
@@ -381,7 +381,7 @@ def test_who_is_given_up_leaves_a_record_and_nothing_else(scene: Path, out: Path
 def test_who_is_stopped_leaves_nothing(scene: Path, out: Path) -> None:
     task, context, _ = one_task(scene, out)
     killed(out)
-    clean_up(task, context)
+    clean_up([task], context)
     assert list(out.iterdir()) == []
 
 
@@ -389,7 +389,7 @@ def test_who_is_stopped_between_result_and_record_leaves_the_mark_that_says_whos
     task, context, _ = one_task(scene, out)
     begun = killed(out)
     (out / "room.ply").write_bytes(b"ours")
-    clean_up(task, context)
+    clean_up([task], context)
     assert sorted(out.iterdir()) == sorted([begun, out / "room.ply"])
     assert run(scene, out)["status"] == DONE
     assert list(results(out)) == ["room.ply"]

@@ -16,7 +16,7 @@ from gsmerge import Cameras, Gaussians, Scene
 from gsmerge.fit import FitOptions
 from gsmerge.fit.color import Drawn, draw, fit_colors
 from gsmerge.moments import feature_to_gaussians, scene_members, unaligned_members
-from gsmerge.online.batch_photos import (
+from gsmerge.online.batch import (
     MARGIN,
     REACH,
     BatchPhotos,

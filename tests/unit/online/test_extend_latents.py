@@ -27,11 +27,11 @@ from gsmerge import Compactor, Scene, compact, encode_scene
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.networks.apply import encode_features, refine_features
 from gsmerge.networks.tokens import compute_group_features
-from gsmerge.online import extend_features
+from gsmerge.online import extend_latents
 from gsmerge.online.extend import extend
+from gsmerge.online.extend_latents import StateContext
 from gsmerge.online.file import load_state, save_state
 from gsmerge.online.state import OnlineState, sample_views, select_groups, to_encoded
-from gsmerge.online.state_context import StateContext
 from gsmerge.options import CompactOptions
 from gsmerge.stages.match import MatchOptions, match
 from gsmerge.stages.merge import merge, take
@@ -80,7 +80,7 @@ def test_one_batch_is_a_scene(
     outputs: str, scene: Scene, checkpoints: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Bit for bit, where every pixel of the views is kept."""
-    monkeypatch.setattr(extend_features, "SAMPLE_STEP", 1)
+    monkeypatch.setattr(extend_latents, "SAMPLE_STEP", 1)
     settings = PLAIN | {"checkpoint": checkpoints[outputs]}
     settings.pop("tolerance")
     actual = fed([scene], **settings).decode(k=1, fit="none")
@@ -92,7 +92,7 @@ def test_some_pixels_of_the_views_say_about_the_same(
     scene: Scene, absolute: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Feature Gaussians are those of the scene; only what other views say is told by fewer pixels."""
-    monkeypatch.setattr(extend_features, "SAMPLE_STEP", 2)  # pictures are tiny
+    monkeypatch.setattr(extend_latents, "SAMPLE_STEP", 2)  # pictures are tiny
     settings = {name: value for name, value in absolute.items() if name != "tolerance"}
     expected, actual = encode_scene(scene, **settings), to_encoded(state_of(fed([scene], **absolute)))
     for name in ("means", "covars", "latents", "extinctions", "masses"):
@@ -254,7 +254,7 @@ def test_only_what_is_touched_is_refined(some: Made) -> None:
     )
     every = refine_features(features, plain)
     before = take(replace(parts, means=parts.means + 7), np.arange(count - 3))  # the last three are new
-    actual = extend_features._refine_near(parts, before, context)
+    actual = extend_latents._refine_near(parts, before, context)
     moved = np.flatnonzero(np.abs(actual.means - parts.means).max(1) < 5)
     assert set(range(count - 3, count)) < set(moved.tolist())
     assert len(moved) < count

@@ -1,12 +1,15 @@
-"""Photos of a batch: resizing to the state, fit of colours, storage of some for later."""
+"""A batch of views beside a state: photos of one size, what of it is new, fit of colours, photos kept for later."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
+from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.views import in_float64, resize_cameras
 from gsmerge.fit import FitReport
 from gsmerge.fit.color import draw, fit_colors
@@ -15,11 +18,15 @@ from gsmerge.geometry import normalize
 from gsmerge.kernels.matrices import matmul
 from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.online.options import OnlineOptions
-from gsmerge.online.state import GroupSet, Replay, replace_groups, select_groups
+from gsmerge.online.state import GroupSet, OnlineState, Replay, StateNetworks, replace_groups, select_groups
+from gsmerge.plan import Plan
 from gsmerge.raster.photos import Photos, photo_errors, photos_of, scene_pictures
 from gsmerge.raster.weights import apply_transposed
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Scene
+
+if TYPE_CHECKING:
+    from gsmerge.networks.apply import NetworkContext
 
 REACH = 3.34  # standard deviations to where an opaque Gaussian adds 1/255
 MARGIN = 2.0  # pixels that the rasterizer's low-pass adds to that
@@ -49,15 +56,53 @@ def resize_photos(images: np.ndarray, cameras: Cameras, width: int, height: int)
     return BatchPhotos(np.stack(small), resize_cameras(in_float64(cameras), width, height))
 
 
-def photos_of_batch(scene: Scene, known: Cameras | None) -> tuple[BatchPhotos, np.ndarray]:
-    """Return a scene's photos at the size of the ``known`` views, and which of all views they are, ``[v]``.
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """A batch of views, and how it enters a state."""
 
-    Without photos, the colours of the Gaussians stand in for them; without known views, the scene's are the first.
-    """
-    cameras = scene.cameras
-    size = cameras if known is None else known
-    photos = resize_photos(scene_pictures(scene), cameras, size.width, size.height)
-    return photos, np.arange(len(photos)) if known is None else view_ids(known, photos.cameras)
+    prepared: Prepared
+    plan: Plan
+    online: OnlineOptions
+    max_k: int  # Most Gaussians of a group of the state
+    photos: BatchPhotos  # At the size of the state's views; the colours of the Gaussians where there are no photos
+    view_ids: np.ndarray  # [v] int64, which of all views each is
+    is_new: np.ndarray  # [v] bool, which views the state does not have yet
+
+    @property
+    def scene(self) -> Scene:
+        """The views."""
+        return self.prepared.scene
+
+
+def make_batch(state: OnlineState | None, prepared: Prepared, plan: Plan, online: OnlineOptions, max_k: int) -> Batch:
+    """Bring the photos of views to the size of the state's; without a state these views are the first."""
+    cameras = prepared.scene.cameras
+    before = cameras[:0] if state is None else state.cameras
+    photos = resize_photos(scene_pictures(prepared.scene), cameras, before.width, before.height)
+    ids = view_ids(before, photos.cameras)
+    return Batch(prepared, plan, online, max_k, photos, ids, ids >= len(before))
+
+
+@dataclass(frozen=True, eq=False)
+class BatchFeatures:
+    """Feature Gaussians of a batch."""
+
+    features: FeatureGaussians
+    members: Members  # The batch's Gaussians, which `features.members` are rows of
+    context: NetworkContext | None  # Networks that correct; None without
+    networks: StateNetworks | None = None  # What the state keeps of them: None where groups are decoded as they enter
+
+
+@dataclass(frozen=True)
+class StateKind:
+    """What differs between states of moments and of latents."""
+
+    reach: float  # Standard deviations of a group, to where a view touches it
+    encode: Callable[[OnlineState | None, Batch, int | None], BatchFeatures]  # Make about so many Gaussians
+    decode: Callable[[GroupSet, BatchFeatures], tuple[Gaussians, Gaussians]]  # One of each group, and of each feature
+    first: Callable[[BatchFeatures, Batch], GroupSet]  # Make the groups of a first batch
+    # Merge a batch with the groups at some rows, those in reach; return all groups, and counts by key of the report
+    join: Callable[[GroupSet, np.ndarray, BatchFeatures, Batch], tuple[GroupSet, dict[str, int]]]
 
 
 def view_ids(known: Cameras, cameras: Cameras) -> np.ndarray:
@@ -163,23 +208,11 @@ def group_errors(features: FeatureGaussians, members: Members, errors: np.ndarra
     return np.add.reduceat(each, starts[:-1]) / np.diff(starts)
 
 
-def novel_rows(
-    there: Gaussians,
-    own: Gaussians,
-    features: FeatureGaussians,
-    members: Members,
-    photos: Photos,
-    cameras: Cameras,
-    options: OnlineOptions,
-) -> np.ndarray:
-    """Return the rows of a batch's groups whose ``own`` Gaussians show half-size photos better than ``there``.
-
-    These are the Gaussians of the state.
-    """
-    if options.tolerance == 0:
-        return np.arange(len(features))
-    size = cameras.height, cameras.width
-    errors = group_errors(features, members, pixel_errors(there, photos, *size))
-    own_errors = group_errors(features, members, pixel_errors(own, photos, *size))
-    limit = np.maximum(options.tolerance**2, options.margin**2 * own_errors)
-    return np.flatnonzero(errors > limit)
+def novel_rows(new: BatchFeatures, batch: Batch, state_gaussians: Gaussians, batch_gaussians: Gaussians) -> np.ndarray:
+    """Return the rows of a batch's Feature Gaussians that show half-size photos better than the state does."""
+    photos, cameras, online = batch.photos.photos(2), batch.scene.cameras, batch.online
+    state_errors, batch_errors = (
+        group_errors(new.features, new.members, pixel_errors(gaussians, photos, cameras.height, cameras.width))
+        for gaussians in (state_gaussians, batch_gaussians)
+    )
+    return np.flatnonzero(state_errors > np.maximum(online.tolerance**2, online.margin**2 * batch_errors))
