@@ -12,7 +12,7 @@ from gsmerge.cli.parameters import Args, usage_errors
 from gsmerge.errors import SceneError, UsageError
 
 if TYPE_CHECKING:
-    from gsmerge.io import PlyScene
+    from gsmerge.io import GaussianFile
     from gsmerge.scene.files import SceneFiles
     from gsmerge.scene.read import SceneLoad
     from gsmerge.types import Cameras, Gaussians, Scene, Views
@@ -41,7 +41,7 @@ class BeforeAfter:
     load: SceneLoad  # the scene as it was read
     scene: Scene  # the same with views: placed ones where it has none
     held_out: Views | None  # views that were no input
-    plys: dict[str, PlyScene]  # the compact versions by name
+    plys: dict[str, GaussianFile]  # the compact versions by name
     cameras: dict[str, Cameras]  # of the input views, by name of a version that was made with others than the scene's
     notes: list[str]  # what was adapted, one sentence each
 

@@ -80,7 +80,7 @@ def decode(args: opt.Args) -> None:
             raise SceneError(path, "expected visible Gaussians, found none", "encode the scene again")
         if not all(np.isfinite(getattr(decoded.gaussians, name)).all() for name in ("means", "scales", "quats")):
             raise SceneError(path, "expected Gaussians of finite numbers, found others", "encode the scene again")
-        done, ending = perf_counter(), output_format(out)
+        done, ending = perf_counter(), output_format(out).ending
         source = stored.about.get("source")
         texts = source.get("comments") if isinstance(source, dict) else None
         lines = [line for line in texts if isinstance(line, str)] if isinstance(texts, list) else []

@@ -15,7 +15,7 @@ from gsmerge.cli.paths import check_outputs, input_files, write_texts
 from gsmerge.errors import SceneError, UsageError
 
 if TYPE_CHECKING:
-    from gsmerge.io import PlyScene
+    from gsmerge.io import GaussianFile
     from gsmerge.types import Cameras
 
 OUTSIDE = 0.03  # share of a result's Gaussians beyond all of its own views: what merging and a fit move there
@@ -146,7 +146,7 @@ def _seconds_of(text: str) -> float:
     return float(seconds)
 
 
-def _more_views(name: str, ply: PlyScene, cameras: Cameras) -> str:
+def _more_views(name: str, ply: GaussianFile, cameras: Cameras) -> str:
     """Write what is known of a result that is measured as one of some views, but may be made of all."""
     from gsmerge.measure.visibility import share_outside
 

@@ -28,7 +28,7 @@ from gsmerge.errors import UsageError
 from gsmerge.runtime.plugins import METHODS, find_plugins
 
 if TYPE_CHECKING:
-    from gsmerge.io.formats.ply import OpacityChoice
+    from gsmerge.io.formats.read import OpacityChoice
     from gsmerge.options import CompactOptions
     from gsmerge.scene.exporters import ReadHints
     from gsmerge.scene.files import SceneFiles
@@ -109,7 +109,7 @@ class Args(SimpleNamespace):
             return ReadHints(**{**defaults, **values})
 
     def _parse_hints(self) -> dict[str, Any]:
-        from gsmerge.io.formats.ply import OpacityChoice
+        from gsmerge.io.formats.read import OpacityChoice
         from gsmerge.scene.exporters import ReadHints
 
         return parse_pairs("--hint", self.hint or (), setting_kinds(ReadHints) | {"opacity": OpacityChoice})

@@ -338,7 +338,7 @@ def _read(
     args: opt.Args, files: SceneFiles, like: SceneFiles, hints: ReadHints, *, photos: bool
 ) -> tuple[list[Gaussians], SceneViews, list[str], SceneLoad | None]:
     """Read the scenes, and place the cameras in the frame of ``like``; also return notes, and ``like`` if it fits."""
-    from gsmerge.io import ply_notes, read_gaussians
+    from gsmerge.io import file_notes, read_gaussians
     from gsmerge.scene.exporters import AUTO
     from gsmerge.scene.read import place_cameras_in_scene, read_ply_with_hints
 
@@ -349,12 +349,12 @@ def _read(
     framed = first if own else read_ply_with_hints(like, opacity="auto", hints=AUTO)
     gaussians, views, placing, load = place_cameras_in_scene(framed, like, hints=hints, photos=photos)
     scenes = [gaussians if own else first.gaussians, *(ply.gaussians for ply in others)]
-    notes = [*([] if own else ply_notes(first.info)), *placing]
+    notes = [*([] if own else file_notes(first.info)), *placing]
     if others:
         names = [str(path) for path in args.scenes]
         notes = [f"{names[0]}: {note}" for note in notes]
         notes += [
-            f"{name}: {note}" for name, ply in zip(names[1:], others, strict=True) for note in ply_notes(ply.info)
+            f"{name}: {note}" for name, ply in zip(names[1:], others, strict=True) for note in file_notes(ply.info)
         ]
     return scenes, views, notes, load
 

@@ -17,10 +17,10 @@ from gsmerge.io.atomic import AddOutput
 from gsmerge.io.cameras.embedded import camera_comments
 from gsmerge.io.cameras.json_files import viewer_cameras, write_transforms
 from gsmerge.io.cameras.read import read_cameras
-from gsmerge.io.formats.ply import OpacityChoice
-from gsmerge.io.formats.ply_file import LOGIT_COMMENT
+from gsmerge.io.formats.arrays import LOGIT_COMMENT
+from gsmerge.io.formats.read import OpacityChoice
 from gsmerge.io.formats.streamed import INDEX, remove_unused_chunks
-from gsmerge.io.formats.writing import add_levels
+from gsmerge.io.formats.write import add_levels
 from gsmerge.options import CompactOptions
 from gsmerge.report import report_document, to_json
 from gsmerge.runtime.memory import release_memory
@@ -73,7 +73,7 @@ def compact_files(
     does not have.
     """
     start = perf_counter()
-    streamed = output_format(out, spz_version, levels=True) == INDEX
+    streamed = output_format(out, spz_version, levels=True).ending == INDEX
     with atomic_outputs(overwrite=overwrite) as add:
         at = {out: add(out, make_folder=streamed)}
         at |= {path: add(path) for path in (report_path, saved_cameras) if path is not None}
@@ -140,7 +140,7 @@ def _write_results(
 
     Returns the path of each, in their order, with its files as they are before they are renamed.
     """
-    ending = output_format(out, spz_version, levels=True)
+    ending = output_format(out, spz_version, levels=True).ending
     if ending == INDEX:
         (_, finest), *rest = add_levels(add, out, first, [one.gaussians for one in results], comments[0])
         return {out: [first, *finest], **dict(rest)}

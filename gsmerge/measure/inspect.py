@@ -13,10 +13,10 @@ from gsmerge.errors import SceneError
 from gsmerge.facts.compare_photos import compare_photos
 from gsmerge.facts.partition import gaussians_at_once
 from gsmerge.facts.prepare import canonicalise
-from gsmerge.io import PlyScene, ply_notes
-from gsmerge.io.formats.ply import OpacityChoice
-from gsmerge.io.formats.ply_file import LOGIT_COMMENT
-from gsmerge.io.formats.writing import file_bytes
+from gsmerge.io import GaussianFile, file_notes
+from gsmerge.io.formats.arrays import LOGIT_COMMENT
+from gsmerge.io.formats.ply import file_bytes
+from gsmerge.io.formats.read import OpacityChoice
 from gsmerge.measure.visibility import MAX_SAMPLES, inside_views
 from gsmerge.options import CompactOptions
 from gsmerge.plan import choose_blocks, resolve_decode, resolved_settings, steps_for
@@ -91,7 +91,7 @@ def inspect(
     return document
 
 
-def _describe_file(ply: PlyScene) -> dict[str, Any]:
+def _describe_file(ply: GaussianFile) -> dict[str, Any]:
     info, opacities = ply.info, ply.gaussians.opacities[ply.valid]
     return {
         **{name: getattr(info, name) for name in _FILE_KEYS},
@@ -111,13 +111,13 @@ def _photo_notes(scene: Scene) -> list[str]:
     return record.notes
 
 
-def _describe_views(ply: PlyScene, files: SceneFiles, hints: ReadHints) -> dict[str, Any]:
+def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> dict[str, Any]:
     own = LOGIT_COMMENT in ply.info.comments
     facts: dict[str, Any] = {
         "cameras": files.cameras and str(files.cameras),
         "images": files.images and str(files.images),
         "exporter": _OWN if own else "not known before the cameras fit",
-        "notes": ply_notes(ply.info),
+        "notes": file_notes(ply.info),
         **dict.fromkeys(("num_views", "width", "height", "per_pixel", "num_missing", "num_sky_views"), 0),
         **dict.fromkeys(("camera_format", "rows", "alignment", "alignment_problem", "sight", "compact")),
         "coverage": [],

@@ -16,7 +16,7 @@ from gsmerge.io.cameras.embedded import holds_cameras
 from gsmerge.io.cameras.npz_files import holds_images
 from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
 from gsmerge.io.cameras.read import find_cameras, find_other_cameras, read_cameras, read_sharp
-from gsmerge.io.formats.ply_file import header_counts
+from gsmerge.io.formats.ply import header_counts
 from gsmerge.io.image_names import list_images
 from gsmerge.types import StrPath
 

@@ -30,7 +30,7 @@ from gsmerge.geometry import Similarity
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views, to_cameras
 from gsmerge.io.cameras.json_files import DATAPARSER, find_dataparser, read_dataparser
 from gsmerge.io.cameras.npz_files import read_depths
-from gsmerge.io.formats.ply import OpacityChoice, PlyInfo, PlyScene, ply_notes, read_gaussians, read_parts
+from gsmerge.io.formats.read import FileInfo, GaussianFile, OpacityChoice, file_notes, read_gaussians, read_parts
 from gsmerge.io.photo_files import as_floats, photo_size
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import use_threads
@@ -69,7 +69,7 @@ class SceneLoad:
 
     # the scene: one Gaussian per pixel, or an unaligned one where the rows belong to no pixels
     scene: Scene
-    ply: PlyInfo
+    ply: FileInfo
     files: SceneFiles
     # the cameras in the order of the views, as their file has them; None where there are none
     cameras: CameraFile | None
@@ -187,7 +187,7 @@ def _join_loads(loads: Sequence[SceneLoad], files: SceneFiles) -> SceneLoad:
     )
 
 
-def read_ply_with_hints(files: SceneFiles, *, opacity: OpacityChoice, hints: ReadHints) -> PlyScene:
+def read_ply_with_hints(files: SceneFiles, *, opacity: OpacityChoice, hints: ReadHints) -> GaussianFile:
     """Read the rows of a scene's files, with opacities as given, or as the given exporter stores them."""
     exporter = find_exporter(hints.exporter)
     if exporter is not None and exporter.opacity == "logit" and opacity == "auto":
@@ -196,7 +196,7 @@ def read_ply_with_hints(files: SceneFiles, *, opacity: OpacityChoice, hints: Rea
 
 
 def align_scene(
-    ply: PlyScene,
+    ply: GaussianFile,
     files: SceneFiles,
     camera_file: CameraFile | None = None,
     *,
@@ -248,7 +248,7 @@ def align_scene(
 
 
 def _make_load(
-    ply: PlyScene,
+    ply: GaussianFile,
     files: SceneFiles,
     hints: ReadHints,
     result: AlignmentResult,
@@ -289,7 +289,7 @@ def _make_load(
         cameras=camera_file,
         views=SceneViews(result.cameras, result.images, names, tuple(dict.fromkeys(views))),
         exporters=exporters,
-        notes=(*files.notes, *ply_notes(ply.info), *notes, *more),
+        notes=(*files.notes, *file_notes(ply.info), *notes, *more),
         alignment=check_alignment(scene.gaussians, scene.cameras, scene.stored) if scene.aligned else None,
         recovery=result.recovery,
         problem=result.problem,
@@ -328,7 +328,7 @@ def _put_back(scene: Scene, camera_file: CameraFile, layout: Layout, views: Sequ
 
 
 def _place_rows(
-    ply: PlyScene, result: AlignmentResult
+    ply: GaussianFile, result: AlignmentResult
 ) -> tuple[Gaussians, np.ndarray | None, np.ndarray | None, list[str]]:
     """Bring rows to the pixels of the grid; return Gaussians, ``pixel_ids``, ``missing`` and notes.
 
@@ -373,7 +373,7 @@ def _with_rotations(scene: Scene, hints: ReadHints, exporters: Sequence[Exporter
 
 
 def place_cameras_in_scene(
-    ply: PlyScene, files: SceneFiles, *, hints: ReadHints = AUTO, photos: bool = True
+    ply: GaussianFile, files: SceneFiles, *, hints: ReadHints = AUTO, photos: bool = True
 ) -> tuple[Gaussians, SceneViews, tuple[str, ...], SceneLoad | None]:
     """Move views into the frame of the Gaussians, if pixels or colours show it; otherwise keep their file's.
 
@@ -395,4 +395,4 @@ def place_cameras_in_scene(
     cameras = to_cameras(camera_file, photo_size(pictures))
     views = SceneViews(cameras, images, camera_file.names, tuple(range(len(cameras))))
     note = "the cameras do not fit the Gaussians and stay as their file has them"
-    return ply.gaussians, views, (*ply_notes(ply.info), note), None
+    return ply.gaussians, views, (*file_notes(ply.info), note), None

@@ -16,7 +16,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import CameraFile, missing_intrinsics, sizes_of, to_cameras, undistort_photos
 from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
 from gsmerge.io.cameras.read import CAMERA_PLACES, SHARP, read_cameras, read_sharp
-from gsmerge.io.formats.ply import PlyScene
+from gsmerge.io.formats.read import GaussianFile
 from gsmerge.io.image_names import (
     IMAGE_SUFFIXES,
     find_image,
@@ -54,7 +54,7 @@ _ROUNDING = 1e-6  # pixels
 _MASK_LEVEL = 191  # of 255: a pixel of a view counts if three quarters of its pixels in the file do
 
 
-def read_scene_cameras(ply: PlyScene, files: SceneFiles) -> CameraFile:
+def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile:
     """Read the cameras from their file or the ``.ply``, or estimate them for the images; SceneError if all fail.
 
     Where a file has poses alone, the focal length is estimated.

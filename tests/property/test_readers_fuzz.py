@@ -25,7 +25,7 @@ from gsmerge.io import read_cameras, read_images, read_ply
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.cameras.npz_files import read_depths
 from gsmerge.io.cameras.read import read_sharp
-from gsmerge.io.formats.ply_file import REQUIRED
+from gsmerge.io.formats.arrays import REQUIRED
 
 EXAMPLES = int(os.environ.get("GSMERGE_FUZZ_EXAMPLES", "40"))
 ROWS = 3

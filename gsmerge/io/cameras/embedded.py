@@ -15,7 +15,7 @@ from gsmerge.errors import SceneError, UsageError
 from gsmerge.io.bounds import read_errors
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.cameras.json_files import read_transforms, transforms_document
-from gsmerge.io.formats.ply_file import MAX_HEADER_BYTES
+from gsmerge.io.formats.ply import MAX_HEADER_BYTES
 from gsmerge.types import Cameras
 
 EMBEDDED = "inside the .ply"  # source of such cameras

@@ -18,8 +18,8 @@ from gsmerge.io.cameras.json_files import VIEWER_CAMERAS, read_json_cameras
 from gsmerge.io.cameras.npz_files import array_names, holds_poses, read_da3, read_dump
 from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
 from gsmerge.io.cameras.re10k import read_re10k
-from gsmerge.io.formats.ply import find_reader
-from gsmerge.io.formats.ply_file import open_ply
+from gsmerge.io.formats.ply import open_ply
+from gsmerge.io.formats.table import PLY, input_format
 from gsmerge.types import StrPath
 
 # Where cameras are in a scene's folder, the first that exists wins; a COLMAP model directly in the folder comes last,
@@ -157,7 +157,7 @@ def read_sharp(path: Path) -> CameraFile | None:
     The grid is square whatever the photo's shape: the photo was stretched to it. SceneError if the numbers are
     damaged.
     """
-    if find_reader(path) is not None:
+    if input_format(path).read is not PLY.read:
         return None
     data = open_ply(path)
     present = [name for name in _SHARP_ELEMENTS if name in data]

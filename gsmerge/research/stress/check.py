@@ -14,7 +14,7 @@ from gsmerge.budget import BudgetOptions
 from gsmerge.compaction.compact import compact
 from gsmerge.errors import GsmergeError, SceneError, UsageError
 from gsmerge.io.cameras.camera_file import CameraFile, from_viewmats, to_viewmats
-from gsmerge.io.formats.ply import OpacityChoice
+from gsmerge.io.formats.read import OpacityChoice
 from gsmerge.measure.evaluate import EvaluateOptions, evaluate
 from gsmerge.options import CompactOptions
 from gsmerge.research.stress.cases import CASES, PROPERTIES, Case, StressScene
