@@ -119,7 +119,7 @@ def _facts(args: opt.Args, given: BeforeAfter, seconds: Mapping[str, float]) -> 
     from gsmerge.measure.sizes import shrink_cameras
     from gsmerge.measure.speed import measure_costs
 
-    infos = {INPUT: given.load.ply, **{name: ply.info for name, ply in given.plys.items()}}
+    infos = {INPUT: given.load.info, **{name: ply.info for name, ply in given.plys.items()}}
     facts: dict[str, dict[str, Any]] = {
         name: {"path": info.path, "bytes": info.file_bytes, "bytes_by_attribute": info.bytes_by_attribute}
         for name, info in infos.items()

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from gsmerge.measure.preview import Picture
     from gsmerge.scene.exporters import ReadHints
     from gsmerge.scene.files import SceneFiles
-    from gsmerge.scene.read import SceneLoad, SceneViews
+    from gsmerge.scene.read import Loaded
     from gsmerge.types import Cameras, Gaussians
 
     Drawing = tuple[list[Path], dict[str, Any], Callable[[int], Iterator[Picture]]]  # files, facts, and what draws them
@@ -163,8 +163,8 @@ def _plan_panel(args: opt.Args, files: SceneFiles) -> Drawing:
     like = _frame_files(args, files)
     inputs = (*args.scenes, *input_files(files), *input_files(like))
     check_outputs((args.output,), inputs, overwrite=args.overwrite or args.dry_run)
-    scenes, views, notes, _ = _read(args, files, like, args.hints(), photos=True)
-    used = list(views.used)
+    scenes, load, notes = _read(args, files, like, args.hints(), photos=True)
+    views, used = load.views, list(load.views.used)
     cameras, photos = views.cameras[used], views.images
     ids = _choose(args, len(used), PANEL_VIEWS)
 
@@ -190,7 +190,8 @@ def _plan_views(args: opt.Args, files: SceneFiles) -> Drawing:
     like = _frame_files(args, files)
     inputs = (*input_files(files), *input_files(like))
     check_folder(args.output, inputs, overwrite=args.overwrite or args.dry_run)
-    scenes, placed, notes, _ = _read(args, files, like, args.hints(max_side=MAX_SIDE), photos=False)
+    scenes, load, notes = _read(args, files, like, args.hints(max_side=MAX_SIDE), photos=False)
+    placed = load.views
     ids = _choose(args, len(placed.cameras))
     views, stems = placed.cameras[ids], picture_stems(placed.names)
 
@@ -267,8 +268,9 @@ def _path_cameras(
         if file is None:
             raise
         like, own = replace(like, cameras=file), False
-    scenes, placed, notes, load = _read(args, files, like, args.hints(), photos=False)
-    cameras = placed.cameras if file is None or not own else _place_file(file, placed.cameras, load)
+    scenes, load, notes = _read(args, files, like, args.hints(), photos=False)
+    placed = load.views
+    cameras = placed.cameras if file is None or not own else _place_file(file, load)
     ids = _choose(args, len(cameras))
     cameras = cameras[ids]
     depth = viewing_depth(cameras if file is None else placed.cameras, scenes[0].means)
@@ -279,14 +281,14 @@ def _path_cameras(
     return scenes, cameras, NEAR * depth, {"views": ids, "notes": notes}
 
 
-def _place_file(file: Path, cameras: Cameras, load: SceneLoad | None) -> Cameras:
+def _place_file(file: Path, load: Loaded) -> Cameras:
     """Read the cameras of a path into the frame of a scene, with the size of the scene's where they have none."""
     from gsmerge.io import read_cameras, to_cameras
     from gsmerge.io.cameras.camera_file import sizes_of
     from gsmerge.scene.held_out import place_camera_file
 
-    stored = read_cameras(file) if load is None else place_camera_file(load, file)[0]
-    size = None if sizes_of(stored) else (cameras.width, cameras.height)
+    stored = read_cameras(file) if load.cameras is None else place_camera_file(load, file)[0]
+    size = None if sizes_of(stored) else (load.views.cameras.width, load.views.cameras.height)
     return to_cameras(replace(stored, lenses=()), size)
 
 
@@ -336,27 +338,27 @@ def _frame_files(args: opt.Args, files: SceneFiles) -> SceneFiles:
 
 def _read(
     args: opt.Args, files: SceneFiles, like: SceneFiles, hints: ReadHints, *, photos: bool
-) -> tuple[list[Gaussians], SceneViews, list[str], SceneLoad | None]:
-    """Read the scenes, and place the cameras in the frame of ``like``; also return notes, and ``like`` if it fits."""
+) -> tuple[list[Gaussians], Loaded, list[str]]:
+    """Read the scenes, and ``like``, with its cameras in the frame of its Gaussians; also return notes."""
     from gsmerge.io import file_notes, read_gaussians
     from gsmerge.scene.exporters import AUTO
-    from gsmerge.scene.read import place_cameras_in_scene, read_ply_with_hints
+    from gsmerge.scene.read import place_cameras_in_scene, read_rows
 
     check_cameras(like)
-    first = read_ply_with_hints(files, opacity=args.opacity, hints=hints)
+    first = read_rows(files, opacity=args.opacity, hints=hints)
     others = [read_gaussians(path, opacity=args.opacity) for path in args.scenes[1:]]
     own = like.ply == files.ply
-    framed = first if own else read_ply_with_hints(like, opacity="auto", hints=AUTO)
-    gaussians, views, placing, load = place_cameras_in_scene(framed, like, hints=hints, photos=photos)
-    scenes = [gaussians if own else first.gaussians, *(ply.gaussians for ply in others)]
-    notes = [*([] if own else file_notes(first.info)), *placing]
+    framed = first if own else read_rows(like, opacity="auto", hints=AUTO)
+    load = place_cameras_in_scene(framed, like, hints=hints, photos=photos)
+    scenes = [load.scene.file_gaussians if own else first.gaussians, *(ply.gaussians for ply in others)]
+    notes = [*([] if own else file_notes(first.info)), *load.notes]
     if others:
         names = [str(path) for path in args.scenes]
         notes = [f"{names[0]}: {note}" for note in notes]
         notes += [
             f"{name}: {note}" for name, ply in zip(names[1:], others, strict=True) for note in file_notes(ply.info)
         ]
-    return scenes, views, notes, load
+    return scenes, load, notes
 
 
 def picture_stems(names: Sequence[str]) -> list[str]:

@@ -26,7 +26,7 @@ from gsmerge.runtime.record import record_part
 from gsmerge.runtime.threads import available_threads, use_threads
 from gsmerge.scene.exporters import ReadHints, exporter_names, make_hints
 from gsmerge.scene.files import SceneFiles, find_scene_files
-from gsmerge.scene.read import align_scene, read_ply_with_hints
+from gsmerge.scene.read import align_scene, read_rows
 from gsmerge.scene.views import read_scene_cameras
 from gsmerge.stages.clean import BOX_QUANTILES, beyond_scene, floater_share
 from gsmerge.stages.segment import count_limits, largest_count
@@ -86,7 +86,7 @@ def inspect(
     read_hints = make_hints(hints)
     files = find_scene_files(path, cameras=cameras, images=images, masks=masks)
     with use_threads():
-        ply = read_ply_with_hints(files, opacity=opacity, hints=read_hints)
+        ply = read_rows(files, opacity=opacity, hints=read_hints)
         document: dict[str, Any] = finite(_describe_file(ply) | _describe_views(ply, files, read_hints))
     return document
 

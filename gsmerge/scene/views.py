@@ -51,6 +51,7 @@ _MAX_BYTES = 2 << 30  # of all photos as floats, before it is known whether the 
 _FLOAT_PIXEL = 12  # bytes
 _BAR_SPREAD = 8  # of 255, range of a bar's colours
 _ROUNDING = 1e-6  # pixels
+_MAX_MASKED = 0.98  # share of the pixels of photos that masks may leave out
 _MASK_LEVEL = 191  # of 255: a pixel of a view counts if three quarters of its pixels in the file do
 
 
@@ -244,6 +245,20 @@ def _read_masks(
     if all(mask is None for mask in masks):
         return None
     return np.stack([np.full(shape, True) if mask is None else mask for mask in masks])
+
+
+def check_masks(masks: np.ndarray | None, files: SceneFiles) -> tuple[np.ndarray | None, list[str]]:
+    """Say how much of the photos masks leave out; SceneError if that is nearly all, which transparency may not be."""
+    if masks is None:
+        return None, []
+    share = float(1 - masks.mean())
+    if share < _MAX_MASKED:
+        count = int((~masks.all((1, 2))).sum())
+        return masks, [f"masks leave out {100 * share:.0f} % of the photos; of {len(masks)}, {count} have one"]
+    if files.masks is None:
+        return None, ["the photos are transparent nearly everywhere, which is not taken for masks"]
+    problem = f"expected masks that are bright where photos count, found {100 * share:.0f} % dark"
+    raise SceneError(files.masks, problem, "invert them, or name another folder with --masks")
 
 
 @dataclass(frozen=True)

@@ -334,19 +334,18 @@ def viewer_cameras(cameras: Cameras, names: Sequence[str]) -> str:
     return json.dumps(entries) + "\n"
 
 
-def find_dataparser(ply: Path, cameras: Path | None) -> Path | None:
-    """Find the file in which nerfstudio writes how it moved cameras, next to the ``.ply`` or the cameras."""
-    folders = [ply.parent] + ([] if cameras is None else [cameras.parent])
-    return next((folder / DATAPARSER for folder in folders if (folder / DATAPARSER).is_file()), None)
+def read_dataparser(ply: Path, cameras: Path | None) -> list[Similarity]:
+    """Read the similarities that nerfstudio's file next to a ``.ply`` or its cameras may mean; none without the file.
 
-
-def read_dataparser(path: Path, cameras: Path | None) -> list[Similarity]:
-    """Read the similarities that nerfstudio's file may mean: X' = scale (transform [X; 1]).
-
+    It says how cameras were moved into the Gaussians' world: X' = scale (transform [X; 1]).
     ``transform`` starts from the capture's own world. The poses of a ``transforms.json`` with ``applied_transform``
     (and ``applied_scale``) are already moved by that, so it is undone; the reading has to be measured. SceneError
     if the file lacks a rotation, shift and positive scale.
     """
+    folders = [ply.parent] + ([] if cameras is None else [cameras.parent])
+    path = next((folder / DATAPARSER for folder in folders if (folder / DATAPARSER).is_file()), None)
+    if path is None:
+        return []
     data = read_json(path)
     with _number_errors(path, "expected 'transform' of 3x4 numbers and 'scale'"):
         moved = _square(data["transform"])
@@ -375,4 +374,4 @@ def _similarity(path: Path, matrix: np.ndarray, scale: float) -> Similarity:
         or not 0 < scale < MAX_NUMBER
     ):
         raise SceneError(path, "expected 'transform' to rotate and shift and 'scale' to be positive, found another map")
-    return Similarity(R, scale, scale * matrix[:3, 3], "moved as nerfstudio does", "other")
+    return Similarity(R, scale, scale * matrix[:3, 3], f"moved into the Gaussians' frame by {DATAPARSER}", "other")
