@@ -10,7 +10,7 @@ from gsmerge.encoded.encoded import Encoded
 from gsmerge.encoded.gsm_file import ENCODED, STATE, SUFFIX, read_gsm, wrong_checksums
 from gsmerge.errors import SceneError
 from gsmerge.io import file_notes, read_cameras, read_gaussians
-from gsmerge.io.cameras.read import find_cameras, read_sharp
+from gsmerge.io.cameras.read import CAMERA_ENDINGS, find_cameras, read_sharp_camera
 from gsmerge.io.formats import ply, spz, streamed
 from gsmerge.io.formats.read import FileInfo, read_level
 from gsmerge.io.formats.table import SCENE_SUFFIXES
@@ -20,7 +20,7 @@ from gsmerge.report import human_bytes
 from gsmerge.scene.files import named_ply, other_plys
 
 NETWORKS = ".safetensors"
-CAMERAS = (".json", ".npz", ".torch", ".txt", ".bin")
+CAMERAS = (*CAMERA_ENDINGS, ".bin")
 ARCHIVES = (".sog", ".npz")
 
 
@@ -91,7 +91,7 @@ def _read(path: Path) -> FileCheck:
     if suffix == ".spz":
         problems += [problem for problem in [spz.problem_at_end(path)] if problem]
     elif suffix == ".ply":
-        read_sharp(path)
+        read_sharp_camera(path)
         left = ply.bytes_after_rows(path)
         behind = f"{left:,} bytes after the last of {info.count:,} rows, which nothing reads"
         problems += [behind] if left else []

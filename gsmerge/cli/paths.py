@@ -186,7 +186,7 @@ def source_of(ply: Path) -> Path | None:
 
 def check_cameras(files: SceneFiles) -> None:
     """Refuse a scene with neither cameras, beside it or inside, nor photos that they can be estimated for."""
-    from gsmerge.io.cameras.read import read_sharp
+    from gsmerge.io.cameras.read import read_sharp_camera
 
-    if files.cameras is None and files.images is None and read_sharp(files.ply) is None:
+    if files.cameras is None and files.images is None and read_sharp_camera(files.ply) is None:
         raise SceneError(files.ply, "no cameras beside it", "name them with --cameras")

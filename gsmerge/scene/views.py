@@ -14,8 +14,9 @@ import numpy as np
 from gsmerge.alignment import estimate_cameras, estimate_focal, estimate_with_photos
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import CameraFile, missing_intrinsics, sizes_of, to_cameras, undistort_photos
+from gsmerge.io.cameras.embedded import SHARP
 from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
-from gsmerge.io.cameras.read import CAMERA_PLACES, SHARP, read_cameras, read_sharp
+from gsmerge.io.cameras.read import CAMERA_PLACES, read_cameras, read_sharp_camera
 from gsmerge.io.formats.read import GaussianFile
 from gsmerge.io.image_names import (
     IMAGE_SUFFIXES,
@@ -70,7 +71,7 @@ def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile:
             reason = "no focal length fits the Gaussians" if photos is not None else "no photos that show them"
             raise missing_intrinsics(stored.path, f", and {reason}")
         return estimated
-    cameras = read_sharp(files.ply)
+    cameras = read_sharp_camera(files.ply)
     if cameras is None and files.images is not None and files.images.is_dir():
         paths = list_images(files.images)
         width, height = image_size(paths[0]) if paths else (0, 0)

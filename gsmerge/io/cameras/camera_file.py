@@ -109,11 +109,12 @@ def make_camera_file(
     convention: Convention,
     views: Sequence[View],
     images: np.ndarray | None = None,
+    order: str = "auto",
 ) -> CameraFile:
     """Translate poses to world-to-camera with OpenCV axes, and check that they are poses.
 
-    ``images [c,h,w,3]`` are given if the file holds them. SceneError if there is no camera, a number is infinite or
-    too large, a rotation is not orthonormal, or a focal length is not positive.
+    ``images [c,h,w,3]`` and the ``order`` of rows are given if the file holds them. SceneError if there is no camera, a
+    number is infinite or too large, a rotation is not orthonormal, or a focal length is not positive.
     """
     if not views:
         raise SceneError(path, "expected at least one camera, found none")
@@ -153,6 +154,7 @@ def make_camera_file(
         source=source,
         convention=convention,
         images=images,
+        order=order,
         lenses=lenses if any(lenses) else (),
         focal=None if missing else "",
     )
