@@ -31,7 +31,6 @@ DIGITS = 10  # of each number: 1e-9 of a pixel or of the scene, in half the spac
 SHARP = "SHARP"  # the same
 _SHARP_ELEMENTS = ("extrinsic", "intrinsic", "image_size")  # the last not in its first versions
 SHARP_LAYERS = 2  # Gaussians per cell: a front and a back layer
-_PROBE = 1 << 12  # bytes from the start of a file within which the first comment is
 
 
 def camera_comments(cameras: Cameras, names: Sequence[str]) -> list[str]:
@@ -51,18 +50,13 @@ def camera_comments(cameras: Cameras, names: Sequence[str]) -> list[str]:
 
 def holds_cameras(path: Path) -> bool:
     """Return whether a file is a ``.ply`` with cameras in the comments of its header."""
-    if path.suffix.lower() != ".ply":
-        return False
-    with read_errors(path), path.open("rb") as file:
-        start = file.read(_PROBE)
-    header = start.partition(b"\nend_header")[0]
-    return header.startswith(b"ply") and f"\ncomment {PREFIX}".encode() in header
+    return path.suffix.lower() == ".ply" and bool(camera_lines(path))
 
 
 def camera_lines(path: Path) -> list[bytes]:
     """Read the comments of a ``.ply`` that :func:`camera_comments` made; none without any."""
     with read_errors(path), path.open("rb") as file:
-        header = file.read(MAX_HEADER_BYTES).partition(b"\nend_header")[0]
+        header = file.read(MAX_HEADER_BYTES if file.peek(3)[:3] == b"ply" else 0).partition(b"\nend_header")[0]
     start = f"comment {PREFIX}".encode()
     return [line[len(start) :].strip() for line in header.splitlines() if line.startswith(start)]
 
@@ -84,10 +78,11 @@ def read_embedded(source: CameraSource) -> StoredCameras:
     return StoredCameras(transforms_views(path, data))
 
 
-def sharp_camera(source: CameraSource) -> tuple[np.ndarray, np.ndarray, np.ndarray, int] | None:
-    """Read the pose, intrinsics and size that SHARP writes into its ``.ply``, and the side of its square grid.
+def read_sharp(source: CameraSource) -> StoredCameras | None:
+    """Read the camera that SHARP writes into its ``.ply``, at the size of the file's grid; None without one.
 
-    None without them, or where they are not those of the file's Gaussians.
+    The grid is square whatever the photo's shape: the photo was stretched to it. SceneError if the numbers are
+    damaged.
     """
     if input_format(source.path).read is not PLY.read:
         return None
@@ -107,22 +102,11 @@ def sharp_camera(source: CameraSource) -> tuple[np.ndarray, np.ndarray, np.ndarr
     side = round((data["vertex"].count / SHARP_LAYERS) ** 0.5)
     if SHARP_LAYERS * side * side != data["vertex"].count or len(size) != 2 or not (size > 0).all():
         return None
-    return extrinsic, intrinsic, size, side
-
-
-def read_sharp(source: CameraSource) -> StoredCameras:
-    """Read the camera that SHARP writes into its ``.ply``, at the size of the file's grid.
-
-    The grid is square whatever the photo's shape: the photo was stretched to it. SceneError if the numbers are
-    damaged.
-    """
-    path, camera = source.path, sharp_camera(source)
-    assert camera is not None
-    extrinsic, intrinsic, size, side = camera
     if len(extrinsic) not in (12, 16) or len(intrinsic) != 9:
-        raise SceneError(path, f"expected 16 and 9 numbers of a camera, found {len(extrinsic)} and {len(intrinsic)}")
+        problem = f"expected 16 and 9 numbers of a camera, found {len(extrinsic)} and {len(intrinsic)}"
+        raise SceneError(source.path, problem)
     pose, K = extrinsic.reshape(-1, 4).copy(), intrinsic.reshape(3, 3)
     if len(extrinsic) == 12:  # its first versions: the rotation column by column
         pose[:, :3] = pose[:, :3].T.copy()
     K = K * np.array([[side / size[0]], [side / size[1]], [1.0]])
-    return StoredCameras([View(path.stem, pose, K, (side, side))])
+    return StoredCameras([View(source.path.stem, pose, K, (side, side))])

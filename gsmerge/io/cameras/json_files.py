@@ -21,6 +21,7 @@ from gsmerge.io.cameras.camera_file import (
     Lens,
     View,
     from_viewmats,
+    is_orthonormal,
     make_lens,
     make_pinhole,
 )
@@ -42,7 +43,6 @@ FRAMES_FILE, POSE_FILE, SCALE_FILE = "input_frame_idx.txt", "pos_avg_inv.txt", "
 VIEWER_CAMERAS = ".cameras.json"  # ending of the cameras for viewers beside a result
 DATAPARSER = "dataparser_transforms.json"
 _CENTRED = 1e-3  # pixels by which twice a principal point in the middle may differ from the image's size
-_ROTATION_TOLERANCE = 0.02  # of a rotation's columns, as for poses
 
 
 def is_long_lrm(source: CameraSource) -> bool:
@@ -352,10 +352,6 @@ def _square(values: Any) -> np.ndarray:
 
 def _similarity(path: Path, matrix: np.ndarray, scale: float) -> Similarity:
     R = matrix[:3, :3]
-    if (
-        np.abs(matmul(R, R.T) - np.eye(3)).max() > _ROTATION_TOLERANCE
-        or determinant(R) < 0
-        or not 0 < scale < MAX_NUMBER
-    ):
+    if not is_orthonormal(R) or determinant(R) < 0 or not 0 < scale < MAX_NUMBER:
         raise SceneError(path, "expected 'transform' to rotate and shift and 'scale' to be positive, found another map")
     return Similarity(R, scale, scale * matrix[:3, 3], f"moved into the Gaussians' frame by {DATAPARSER}", "other")

@@ -13,7 +13,7 @@ from gsmerge.io.bounds import MAX_VIEWS, check_file, read_text
 from gsmerge.io.cameras.camera_file import C2W_OPENCV, C2W_OPENGL, W2C_OPENCV, CameraFile, View, make_pinhole
 from gsmerge.io.cameras.camera_format import CameraFormat, CameraSource, StoredCameras
 from gsmerge.io.cameras.colmap import holds_model, is_colmap, read_colmap
-from gsmerge.io.cameras.embedded import EMBEDDED, SHARP, camera_lines, read_embedded, read_sharp, sharp_camera
+from gsmerge.io.cameras.embedded import EMBEDDED, SHARP, camera_lines, read_embedded, read_sharp
 from gsmerge.io.cameras.json_files import (
     VIEWER_CAMERAS,
     is_long_lrm,
@@ -152,14 +152,9 @@ def _numbers(line: str) -> np.ndarray:
 
 
 _SHARP = CameraFormat(
-    SHARP,
-    "inside the `.ply` of SHARP",
-    ".ply",
-    read_sharp,
-    W2C_OPENCV,
-    "pixels of the photo",
-    lambda file: sharp_camera(file) is not None,
-)
+    SHARP, "inside the `.ply` of SHARP", ".ply", lambda file: read_sharp(file) or StoredCameras([]), W2C_OPENCV,
+    "pixels of the photo", lambda file: read_sharp(file) is not None,
+)  # fmt: skip
 # In the order of trial: the first of a file's ending that recognises it
 CAMERA_FORMATS = (
     CameraFormat(

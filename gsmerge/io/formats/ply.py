@@ -41,7 +41,7 @@ def read_rows(path: Path) -> arrays.StoredRows:
     data = open_ply(path)
     compressed = is_compressed(data)
     rows = unpack(path, data) if compressed else _vertex(path, data).data
-    names = tuple(rows.dtype.names)
+    names = tuple(rows.dtype.names or ())
     comments = (*data.comments, *(c for e in data.elements for c in e.comments))
     return arrays.StoredRows(
         rows=rows,
