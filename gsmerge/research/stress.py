@@ -23,11 +23,11 @@ from gsmerge.facts.align_views import move_views
 from gsmerge.facts.prepare import scene_frame
 from gsmerge.facts.views import even_views, subset
 from gsmerge.io.cameras.camera_file import CONVENTIONS, CameraFile, from_viewmats, to_viewmats
-from gsmerge.io.formats.ply import OpacityChoice
+from gsmerge.io.formats.read import OpacityChoice
 from gsmerge.measure.evaluate import EvaluateOptions, evaluate
 from gsmerge.options import CompactOptions
 from gsmerge.scene.exporters import AUTO, ReadHints
-from gsmerge.scene.read import SceneLoad, align_scene, read_ply_with_hints
+from gsmerge.scene.read import Loaded, align_scene, read_rows
 from gsmerge.types import SH_C0, Cameras, Gaussians, Scene, Views, grid_ids
 
 Needs = Literal["anything", "pixels", "photos", "file", "pixel-file"]
@@ -247,7 +247,7 @@ class _Result:
 
 
 def stress(
-    load: SceneLoad,
+    load: Loaded,
     options: CompactOptions | None = None,
     *,
     targets: Views | None = None,
@@ -287,7 +287,7 @@ def stress(
 
 
 def _check_case(
-    case: Case, load: SceneLoad, given: StressScene, base: _Result | None, options: CompactOptions, hints: ReadHints
+    case: Case, load: Loaded, given: StressScene, base: _Result | None, options: CompactOptions, hints: ReadHints
 ) -> tuple[bool | None, str]:
     """Check whether the case's property holds, and return that with the figures."""
     problem = _inapplicable(case, load)
@@ -310,7 +310,7 @@ def _check_case(
     return (False, defect) if defect else _check_result(case, base, result, _slack(options))
 
 
-def _inapplicable(case: Case, load: SceneLoad) -> str | None:
+def _inapplicable(case: Case, load: Loaded) -> str | None:
     """Say why a case does not apply to a scene; None where it does."""
     scene = load.scene
     if case.needs in ("pixels", "photos", "pixel-file") and not scene.aligned:
@@ -370,7 +370,7 @@ def _check_again(given: StressScene, base: _Result, options: CompactOptions) -> 
     return after >= base.after - MAX_SAME - _slack(options), f"{after:.2f} dB; before {base.after:.2f} dB"
 
 
-def _check_convention(case: Case, load: SceneLoad, hints: ReadHints) -> tuple[bool, str]:
+def _check_convention(case: Case, load: Loaded, hints: ReadHints) -> tuple[bool, str]:
     """Read the scene from cameras whose poses are in another convention than that of their format."""
     assert load.cameras is not None
     assert case.convention is not None
@@ -386,7 +386,7 @@ def _check_convention(case: Case, load: SceneLoad, hints: ReadHints) -> tuple[bo
     return bool(same), "recognised" if same else "taken for something else"
 
 
-def _check_cameras(case: Case, load: SceneLoad, hints: ReadHints) -> tuple[bool, str]:
+def _check_cameras(case: Case, load: Loaded, hints: ReadHints) -> tuple[bool, str]:
     """Read the scene from cameras that are off, with Gaussians that are not."""
     assert load.cameras is not None
     assert case.cameras is not None
@@ -400,10 +400,10 @@ def _check_cameras(case: Case, load: SceneLoad, hints: ReadHints) -> tuple[bool,
     return case.check == "moved" and read.alignment.ok, f"{read.alignment.worst_px:.2f} px from the pixels"
 
 
-def _read_again(load: SceneLoad, cameras: CameraFile, hints: ReadHints) -> SceneLoad:
+def _read_again(load: Loaded, cameras: CameraFile, hints: ReadHints) -> Loaded:
     """Read the scene's own file with other cameras."""
-    opacity: OpacityChoice = "raw" if load.ply.opacity_encoding == "raw" else "logit"
-    return align_scene(read_ply_with_hints(load.files, opacity=opacity, hints=hints), load.files, cameras, hints=hints)
+    opacity: OpacityChoice = "raw" if load.info.opacity_encoding == "raw" else "logit"
+    return align_scene(read_rows(load.files, opacity=opacity, hints=hints), load.files, cameras, hints=hints)
 
 
 def _find_defect(gaussians: Gaussians, scene: Scene) -> str | None:

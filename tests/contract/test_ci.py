@@ -11,11 +11,11 @@ from typing import Any
 
 import pytest
 import typer.main
-from gsmerge.native.build import find_platform
 from scripts import load_script
 
 from gsmerge import __version__
 from gsmerge.cli.app import app
+from gsmerge.kernels.build import find_platform
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -19,6 +19,8 @@ import typer.main
 
 import gsmerge
 from gsmerge.cli.app import app
+from gsmerge.io.cameras.read import CAMERA_FORMATS
+from gsmerge.io.formats.table import FORMATS
 from gsmerge.options import method_names
 from gsmerge.report import report_document
 
@@ -71,6 +73,16 @@ def test_generated_pages_are_up_to_date() -> None:
         capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": str(ROOT)},
     )  # fmt: skip
     assert done.returncode == 0, f"run python docs/generate_reference.py to renew\n{done.stdout}{done.stderr}"
+
+
+def test_formats_are_those_of_the_tables() -> None:
+    page = read("docs/guide/formats.md")
+    _, _, *rows = page.partition("## Camera formats")[2].partition("\n\n## ")[0].split("\n\n")[-1].splitlines()
+    assert rows == [f"| {row.files} | {' '.join(row.convention)} | {row.intrinsics} |" for row in CAMERA_FORMATS]
+    read_cell, written_cell = next(line for line in page.splitlines() if line.startswith("| Gaussians")).split("|")[2:4]
+    for row in FORMATS:
+        assert row.encode is None or f"`{row.ending}`" in written_cell
+        assert row.read is None or row.ending == ".compressed.ply" or f"`{row.ending}`" in read_cell
 
 
 @pytest.mark.parametrize("name", sorted(COMMANDS))

@@ -17,7 +17,7 @@ from gsmerge.options import CompactOptions
 from gsmerge.research import stress as module
 from gsmerge.research.stress import CASES, StressScene, stress
 from gsmerge.scene.held_out import read_held_out
-from gsmerge.scene.read import SceneLoad, load_scene
+from gsmerge.scene.read import Loaded, load_scene
 from gsmerge.types import Scene, Views
 
 FAST = CompactOptions().with_settings({"fit": "none"})
@@ -29,7 +29,7 @@ def scene() -> Scene:
 
 
 @pytest.fixture(scope="module")
-def load(made_scene: Path) -> SceneLoad:
+def load(made_scene: Path) -> Loaded:
     return load_scene(made_scene)
 
 
@@ -97,7 +97,7 @@ def test_views_are_taken_away_shuffled_and_repeated(scene: Scene) -> None:
 
 
 @pytest.mark.slow
-def test_every_case_on_a_scene_with_held_out_views(load: SceneLoad, made_scene: Path) -> None:
+def test_every_case_on_a_scene_with_held_out_views(load: Loaded, made_scene: Path) -> None:
     read = read_held_out(load, made_scene / "targets")
     steps: list[tuple[str, int, int]] = []
     actual = stress(
@@ -113,14 +113,14 @@ def test_every_case_on_a_scene_with_held_out_views(load: SceneLoad, made_scene: 
     assert steps[-1] == ("done", len(CASES), len(CASES))
 
 
-def test_a_scene_in_no_order_skips_what_needs_pixels(load: SceneLoad) -> None:
+def test_a_scene_in_no_order_skips_what_needs_pixels(load: Loaded) -> None:
     unaligned = Scene(load.scene.gaussians, load.scene.cameras, load.scene.images, None, load.scene.names)
     names = ["order", "views-3", "large", "c2w-opencv"]
     actual = stress(replace(load, scene=unaligned, cameras=None), FAST, cases=names)
     assert [outcome.passed for outcome in actual] == [None, None, True, None]
 
 
-def test_without_photos(load: SceneLoad) -> None:
+def test_without_photos(load: Loaded) -> None:
     bare = replace(load, scene=replace(load.scene, images=None))
     actual = stress(bare, FAST, cases=["unchanged", "exposure", "utm"])
     assert [outcome.passed for outcome in actual] == [True, None, True]
@@ -150,21 +150,19 @@ def spoilt(monkeypatch: pytest.MonkeyPatch, change: Any) -> None:
         (lambda g: replace(g, opacities=g.opacities * 0), "outside of 0 to 1"),
     ],
 )
-def test_what_does_not_hold_is_noticed(
-    change: Any, words: str, load: SceneLoad, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_does_not_hold_is_noticed(change: Any, words: str, load: Loaded, monkeypatch: pytest.MonkeyPatch) -> None:
     spoilt(monkeypatch, change)
     outcome = stress(load, FAST, cases=["large"])[0]
     assert outcome.passed is False
     assert words in outcome.measured
 
 
-def test_threads_that_change_a_bit_are_noticed(load: SceneLoad, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_threads_that_change_a_bit_are_noticed(load: Loaded, monkeypatch: pytest.MonkeyPatch) -> None:
     spoilt(monkeypatch, lambda g: replace(g, opacities=g.opacities * (1 - 1e-6)))
     assert stress(load, FAST, cases=["threads"])[0].passed is False
 
 
-def test_an_error_is_an_outcome(load: SceneLoad, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_is_an_outcome(load: Loaded, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*_: Any) -> None:
         raise SceneError("scene.ply", "expected mercy")
 
@@ -173,14 +171,14 @@ def test_an_error_is_an_outcome(load: SceneLoad, monkeypatch: pytest.MonkeyPatch
     assert (outcome.passed, outcome.measured) == (False, "ended with: scene.ply: expected mercy")
 
 
-def test_wrong_conventions_that_are_believed_are_noticed(load: SceneLoad, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wrong_conventions_that_are_believed_are_noticed(load: Loaded, monkeypatch: pytest.MonkeyPatch) -> None:
     wrong = replace(load, scene=replace(load.scene, cameras=load.scene.cameras[[1, 0, 2, 3, 4]]))
     monkeypatch.setattr(module, "align_scene", lambda *_, **__: wrong)
     outcome = stress(load, FAST, cases=["w2c-opencv"])[0]
     assert (outcome.passed, outcome.measured) == (False, "taken for something else")
 
 
-def test_bad_arguments(load: SceneLoad) -> None:
+def test_bad_arguments(load: Loaded) -> None:
     with refuses(ValueError, "cases", "unchanged"):
         stress(load, FAST, cases=["nonsense"])
     bare = Scene(load.scene.gaussians, load.scene.cameras[[]], None, None, ())
