@@ -132,7 +132,7 @@ def _check_scenes(args: opt.Args) -> None:
 def _warn_of_memory(files: SceneFiles, settings: CompactOptions, *, quiet: bool) -> None:
     """Warn before anything is read if the scene is not likely to fit into memory; in blocks it does."""
     from gsmerge.facts.partition import gaussians_at_once
-    from gsmerge.io.formats.ply_file import header_counts
+    from gsmerge.io.formats.ply import header_counts
     from gsmerge.plan import wanted_blocks
     from gsmerge.runtime.estimate import memory_bytes, memory_problem
 

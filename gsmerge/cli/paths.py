@@ -61,7 +61,7 @@ def check_format(
     """
     from gsmerge.io import output_format
 
-    ending = output_format(output, options.spz_version, levels=levels)
+    ending = output_format(output, options.spz_version, levels=levels).ending
     if options.spz_version != 3 and ending != ".spz":
         raise UsageError(f"spz_version {options.spz_version}: expected an output as .spz, got {ending}")
     if budget is not None and budget.in_bytes and ending != ".ply":

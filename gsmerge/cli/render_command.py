@@ -52,7 +52,7 @@ def render(args: opt.Args) -> None:
     """Draw scenes: side by side with their photos, a picture for each camera, a video along a path, or superpixels."""
     kind, overwrite = _choose_kind(args), args.overwrite or args.dry_run
     from gsmerge.measure import drawings
-    from gsmerge.measure.video import is_video
+    from gsmerge.measure.preview import is_video
     from gsmerge.stages.superpixels import SegmentOptions
 
     files = like = args.files(args.scenes[0])
@@ -94,7 +94,7 @@ def _choose_kind(args: opt.Args) -> str:
     if args.path is not None:
         _check_path(args)
         return "path"
-    from gsmerge.measure.video import is_video
+    from gsmerge.measure.preview import is_video
 
     if args.frames or args.fps or is_video(args.output):
         what = f"{args.output}" if is_video(args.output) else "--frames and --fps"
@@ -109,7 +109,7 @@ def _choose_kind(args: opt.Args) -> str:
 def _check_path(args: opt.Args) -> None:
     """Refuse an unknown path, and options and outputs that do not go with one."""
     from gsmerge.measure.camera_path import parse_path
-    from gsmerge.measure.video import is_video
+    from gsmerge.measure.preview import is_video
 
     if args.kind is not None:
         raise UsageError(f"--path: expected no --as with it, got --as {args.kind}")

@@ -18,7 +18,7 @@ from gsmerge.encoded.to_gaussians import divide_all
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import Prepared, prepare
 from gsmerge.io import atomic_output
-from gsmerge.io.formats.ply import OpacityChoice
+from gsmerge.io.formats.read import OpacityChoice
 from gsmerge.options import CompactOptions
 from gsmerge.pipeline import merge_views
 from gsmerge.plan import Plan, make_plan, require_children

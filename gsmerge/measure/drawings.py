@@ -12,10 +12,10 @@ import numpy as np
 
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.views import pick_views
-from gsmerge.io import ply_notes, read_cameras, read_gaussians, to_cameras
+from gsmerge.io import file_notes, read_cameras, read_gaussians, to_cameras
 from gsmerge.io.cameras.camera_file import sizes_of
-from gsmerge.io.cameras.read import read_sharp
-from gsmerge.io.formats.ply import OpacityChoice
+from gsmerge.io.cameras.read import read_sharp_camera
+from gsmerge.io.formats.read import OpacityChoice
 from gsmerge.io.image_names import IMAGE_SUFFIXES
 from gsmerge.measure.camera_path import parse_path, plan_path, viewing_depth
 from gsmerge.measure.preview import (
@@ -24,12 +24,13 @@ from gsmerge.measure.preview import (
     draw_borders,
     draw_heat,
     draw_means,
+    is_video,
     outside_pictures,
     save_picture,
     to_picture,
     view_pictures,
+    write_video,
 )
-from gsmerge.measure.video import is_video, write_video
 from gsmerge.raster import render_in_turn
 from gsmerge.raster.photos import NEAR, scene_pictures
 from gsmerge.report import document_head
@@ -38,7 +39,7 @@ from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import SceneFiles, find_scene_files
 from gsmerge.scene.held_out import place_camera_file
-from gsmerge.scene.read import SceneLoad, SceneViews, load_files, place_cameras_in_scene, read_ply_with_hints
+from gsmerge.scene.read import Loaded, load_files, place_cameras_in_scene, read_rows
 from gsmerge.stages.superpixels import SegmentOptions, count_for, saliency, segment
 from gsmerge.types import Cameras, Gaussians
 
@@ -83,12 +84,11 @@ class Drawing:
 
 @dataclass(frozen=True, eq=False)
 class Framed:
-    """Scenes by the paths that they are called by, and views in their frame."""
+    """Scenes by the paths that they are called by, and the views of one of them."""
 
     scenes: list[tuple[Path, Gaussians]]
-    views: SceneViews
     notes: list[str]
-    load: SceneLoad | None  # The scene whose frame it is; None where the views do not fit it
+    load: Loaded  # The scene whose frame it is
 
     def counts(self) -> dict[str, int]:
         """Return the number of Gaussians of every scene by its path."""
@@ -117,8 +117,8 @@ def frame_files(files: SceneFiles, source: Path | None, cameras: Path | None, im
 def plan_panel(options: DrawOptions) -> Drawing:
     """Plan a picture of photo, before, after, ... of some views, one row each, and of all scenes from outside."""
     framed = _read(options, photos=True)
-    used = list(framed.views.used)
-    cameras, photos = framed.views.cameras[used], framed.views.images
+    used = list(framed.load.views.used)
+    cameras, photos = framed.load.views.cameras[used], framed.load.views.images
     ids = options.choose(len(used), PANEL_VIEWS)
 
     def draw(_: int) -> Iterator[Picture]:
@@ -135,8 +135,8 @@ def plan_panel(options: DrawOptions) -> Drawing:
 def plan_pictures(options: DrawOptions) -> Drawing:
     """Plan one picture for each camera."""
     framed = _read(options, photos=False)
-    ids = options.choose(len(framed.views.cameras))
-    views, stems = framed.views.cameras[ids], picture_stems(framed.views.names)
+    ids = options.choose(len(framed.load.views.cameras))
+    views, stems = framed.load.views.cameras[ids], picture_stems(framed.load.views.names)
     size = {"width": views.width, "height": views.height}
     return Drawing(
         [options.output / f"{stems[i]}.png" for i in ids],
@@ -173,8 +173,8 @@ def _path_cameras(options: DrawOptions) -> tuple[Framed, Cameras, float, list[in
             raise
         options, own = replace(options, like=replace(options.like, cameras=file)), False
     framed = _read(options, photos=False)
-    placed = framed.views.cameras
-    cameras = placed if file is None or not own else _place_file(file, placed, framed.load)
+    placed = framed.load.views.cameras
+    cameras = placed if file is None or not own else _place_file(file, framed.load)
     ids = options.choose(len(cameras))
     cameras = cameras[ids]
     depth = viewing_depth(cameras if file is None else placed, framed.scenes[0][1].means)
@@ -187,9 +187,12 @@ def _path_cameras(options: DrawOptions) -> tuple[Framed, Cameras, float, list[in
     return framed, cameras, NEAR * depth, ids
 
 
-def _place_file(file: Path, cameras: Cameras, load: SceneLoad | None) -> Cameras:
+def _place_file(file: Path, load: Loaded) -> Cameras:
     """Read the cameras of a path into the frame of a scene, with the size of the scene's where they have none."""
-    stored = read_cameras(file) if load is None else place_camera_file(load, file)[0]
+    stored, cameras = (
+        read_cameras(file) if load.cameras is None else place_camera_file(load, file)[0],
+        load.views.cameras,
+    )
     return to_cameras(replace(stored, lenses=()), None if sizes_of(stored) else (cameras.width, cameras.height))
 
 
@@ -218,7 +221,7 @@ PLANS = {"panel": plan_panel, "views": plan_pictures, "path": plan_frames, "supe
 
 def check_cameras(files: SceneFiles) -> None:
     """Refuse a scene with neither cameras, beside it or inside, nor photos that they can be estimated for."""
-    if files.cameras is None and files.images is None and read_sharp(files.ply) is None:
+    if files.cameras is None and files.images is None and read_sharp_camera(files.ply) is None:
         raise SceneError(files.ply, "no cameras beside it", "name them with --cameras")
 
 
@@ -226,15 +229,15 @@ def _read(options: DrawOptions, *, photos: bool) -> Framed:
     """Read the scenes, and place the cameras in the frame of ``options.like``."""
     files, like, paths = options.files, options.like, options.paths
     check_cameras(like)
-    first = read_ply_with_hints(files, opacity=options.opacity, hints=options.hints)
+    first = read_rows(files, opacity=options.opacity, hints=options.hints)
     others = [read_gaussians(path, opacity=options.opacity) for path in paths[1:]]
     own = like.ply == files.ply
-    framed = first if own else read_ply_with_hints(like, opacity="auto", hints=AUTO)
-    gaussians, views, placing, load = place_cameras_in_scene(framed, like, hints=options.hints, photos=photos)
-    scenes = [gaussians if own else first.gaussians, *(ply.gaussians for ply in others)]
-    notes = [[*([] if own else ply_notes(first.info)), *placing], *(ply_notes(ply.info) for ply in others)]
+    framed = first if own else read_rows(like, opacity="auto", hints=AUTO)
+    load = place_cameras_in_scene(framed, like, hints=options.hints, photos=photos)
+    scenes = [load.scene.file_gaussians if own else first.gaussians, *(ply.gaussians for ply in others)]
+    notes = [[*([] if own else file_notes(first.info)), *load.notes], *(file_notes(ply.info) for ply in others)]
     named = [f"{path}: {note}" for path, some in zip(paths, notes, strict=True) for note in some]
-    return Framed(list(zip(paths, scenes, strict=True)), views, named if others else list(notes[0]), load)
+    return Framed(list(zip(paths, scenes, strict=True)), named if others else list(notes[0]), load)
 
 
 def picture_stems(names: Sequence[str]) -> list[str]:

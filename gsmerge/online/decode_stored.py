@@ -153,7 +153,7 @@ def decode_file(
         if not all(np.isfinite(getattr(gaussians, name)).all() for name in ("means", "scales", "quats")):
             raise SceneError(path, "expected Gaussians of finite numbers, found others", "encode the scene again")
         write_gaussians(
-            temporary, gaussians, overwrite=True, comments=_comments(stored), ending=output_format(out),
+            temporary, gaussians, overwrite=True, comments=_comments(stored), ending=output_format(out).ending,
             normals=normals, spz_version=spz_version,
         )  # fmt: skip
     seconds = {**(seconds_before or {}), "read": read - start, "decode": done - read, "write": perf_counter() - done}

@@ -17,7 +17,7 @@ from gsmerge.encoded.encoded import Encoded, without_members
 from gsmerge.encoded.gsm_file import ENCODED, MINOR, STATE, GsmFile, read_encoded, read_gsm, write_gsm
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import atomic_output
-from gsmerge.io.formats.ply import OpacityChoice
+from gsmerge.io.formats.read import OpacityChoice
 from gsmerge.networks.options import CORRECTED
 from gsmerge.online.extend import extend
 from gsmerge.online.options import merge_settings

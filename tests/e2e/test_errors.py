@@ -70,7 +70,7 @@ def test_a_folder_without_permission(scene_copy: Path, run: Run) -> None:
 @pytest.mark.parametrize(
     ("file", "reader"),
     [
-        ("scene.ply", "gsmerge.io.formats.ply_file.PlyData.read"),
+        ("scene.ply", "gsmerge.io.formats.ply.PlyData.read"),
         ("scene.sog", "gsmerge.io.formats.sog._read_columns"),
         ("scene.spz", "gsmerge.io.formats.spz._read_columns"),
         ("views.npz", "numpy.lib.format.read_array"),

@@ -10,7 +10,7 @@ from messages import refuses
 
 from gsmerge import write_ply
 from gsmerge.budget import parse_budget, parse_bytes
-from gsmerge.io.formats.writing import count_for_bytes, file_bytes
+from gsmerge.io.formats.ply import count_for_bytes, file_bytes
 
 
 @pytest.mark.parametrize(

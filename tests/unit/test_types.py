@@ -144,10 +144,9 @@ def test_cameras() -> None:
     [
         ({"viewmats": np.stack([np.eye(3)] * 2)}, ("viewmats", [2, 4, 4], [2, 3, 3])),
         ({"Ks": np.eye(3)[None]}, ("Ks", [2, 3, 3], [1, 3, 3])),
-        ({"width": 0}, ("", "0 x 3")),
-        ({"height": -1}, ("", "4 x -1")),
+        ({"width": 0}, ("", "0 x 3")), ({"height": -1}, ("", "4 x -1")),
     ],
-)
+)  # fmt: skip
 def test_wrong_cameras_are_refused(change: dict, named: tuple[object, ...]) -> None:
     with refuses(ValueError, *named):
         replace(cameras(), **change)

@@ -78,7 +78,7 @@ def test_what_is_behind_or_too_faint_is_not_seen() -> None:
     gaussians = balls((0, 0, -1, 0.1, 1, 1), (0, 0, 0.01, 0.1, 1, 1), (0, 0, 1, 0.1, 1 / 256, 1), (9, 0, 1, 0.1, 1, 1))
     plan = plan_view(prepare(gaussians), np.eye(4), camera().Ks[0], 21, 11)
     assert len(plan.ids) == 0
-    assert len(plan.members) == 0
+    assert len(plan.flatten_ids) == 0
 
 
 def test_antialiasing_dims_what_is_small() -> None:

@@ -44,7 +44,7 @@ def test_a_plain_scene(tiny_folder: Path, tiny: Tiny) -> None:
 def test_loading_reports_files_layout_and_alignment(tiny_folder: Path) -> None:
     loaded = load_scene(tiny_folder / "scene.ply")
     assert loaded.alignment.ok
-    assert loaded.ply.layout == "17-column export"
+    assert loaded.info.layout == "17-column export"
     assert loaded.files.images == tiny_folder / "images"
     assert loaded.cameras.source == "transforms.json"
     assert loaded.notes == ()

@@ -13,7 +13,7 @@ from gsmerge.errors import UsageError
 from gsmerge.facts.place_cameras import add_views
 from gsmerge.facts.prepare import canonicalise, prepare, scene_frame
 from gsmerge.moments import scene_members, unaligned_members
-from gsmerge.raster.seen import seen_depths
+from gsmerge.raster.images import seen_depths
 from gsmerge.runtime.record import record_run
 from gsmerge.stages.assign import (
     find_owners,

@@ -27,8 +27,7 @@ from gsmerge.research.training import (
     train,
 )
 from gsmerge.research.training.examples import make_examples as make_each
-from gsmerge.research.training.shards import read_targets, scene_key
-from gsmerge.research.training.stream import ExampleStreams, open_streams
+from gsmerge.research.training.shards import ExampleStreams, open_streams, read_targets, scene_key
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -181,7 +180,7 @@ def test_few_examples_are_in_memory_and_draws_are_spread(monkeypatch: pytest.Mon
         reads[number] += 1
         return number
 
-    monkeypatch.setattr("gsmerge.research.training.stream.read_shard", read)
+    monkeypatch.setattr("gsmerge.research.training.shards.read_shard", read)
     shards = [Shard(Path(str(i)), str(i), str(i)) for i in range(100)]
     options, rng, drawn = replace(PAPER, buffer=4, refresh=2), np.random.default_rng(0), Counter[int]()
     with open_streams(shards, options, (0, 1)) as streams:

@@ -5,50 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from gsmerge.errors import UsageError
 from gsmerge.io.atomic import AddOutput, atomic_output, atomic_outputs
-from gsmerge.io.formats import compressed, glb, ply_file, sog, splat, spz, streamed
-from gsmerge.io.formats.arrays import to_columns
-from gsmerge.kernels.elementary import log, log1p
+from gsmerge.io.formats import ply, sog, streamed
+from gsmerge.io.formats.arrays import MIP_COMMENT
+from gsmerge.io.formats.table import output_format
 from gsmerge.types import Gaussians, StrPath
-
-# File endings, the longest first, and the highest degree of the harmonics that there is room for.
-OUTPUT_FORMATS = {
-    ".compressed.ply": compressed.MAX_DEGREE,
-    ".ply": 4,
-    ".spz": spz.MAX_DEGREES[3],
-    ".sog": sog.MAX_DEGREE,
-    ".splat": splat.MAX_DEGREE,
-    ".glb": glb.MAX_DEGREE,
-}
-
-
-def output_format(path: StrPath, spz_version: int = 3, *, levels: bool = False) -> str:
-    """Return the ending of a name, by which its format is chosen; UsageError if unknown or a package is missing.
-
-    ``levels``: the name may be that of an index of levels of detail, which is returned.
-    """
-    if levels and Path(path).name == streamed.INDEX:
-        return streamed.INDEX
-    name = Path(path).name.lower()
-    ending = next((ending for ending in OUTPUT_FORMATS if name.endswith(ending)), None)
-    if ending is None:
-        *first, last = OUTPUT_FORMATS
-        index = f", or the name {streamed.INDEX}" if levels else ""
-        raise UsageError(f"{path}: expected a name that ends in {', '.join(first)} or {last}{index}")
-    if ending == ".spz" and spz_version == 4:
-        spz.zstandard()
-    return ending
 
 
 def lost_harmonics(path: StrPath, sh_degree: int, spz_version: int = 3) -> str | None:
     """Describe the harmonics that a format has no room for; None if it holds all, UsageError on an unknown one."""
-    ending = output_format(path, levels=True)
-    room = {**OUTPUT_FORMATS, ".spz": spz.MAX_DEGREES[spz_version], streamed.INDEX: streamed.MAX_DEGREE}
-    highest = room[ending]
-    return None if sh_degree <= highest else f"{ending} has no room for harmonics above degree {highest}: left out"
+    chosen = output_format(path, spz_version, levels=True)
+    if sh_degree <= chosen.max_degree:
+        return None
+    return f"{chosen.ending} has no room for harmonics above degree {chosen.max_degree}: left out"
 
 
 def write_gaussians(
@@ -80,22 +50,11 @@ def write_gaussians(
         SceneError: If the file exists or cannot be written.
         ValueError: If there is NaN or inf, a comment is no line of ASCII, or there is no such version.
     """
-    ending = output_format(path) if ending is None else ending
-    if ending == ".ply":
-        write_ply(path, gaussians, overwrite=overwrite, comments=comments, normals=normals)
-        return
+    chosen = output_format(ending or path, spz_version)
+    assert chosen.encode is not None
     _check_comments(comments)
-    mip = ply_file.MIP_COMMENT in comments
-    with atomic_output(path, overwrite=overwrite) as temporary:
-        if ending == ".compressed.ply":
-            content = compressed.compressed_bytes(gaussians, comments)
-        elif ending == ".spz":
-            content = spz.spz_bytes(gaussians, mip=mip, version=spz_version)
-        elif ending == ".sog":
-            content = sog.sog_bytes(gaussians, mip=mip)
-        else:
-            content = splat.splat_bytes(gaussians) if ending == ".splat" else glb.glb_bytes(gaussians)
-        temporary.write_bytes(content)
+    with atomic_output(path, overwrite=overwrite) as temporary, temporary.open("wb") as file:
+        file.writelines(chosen.encode(gaussians, comments, normals))
 
 
 def write_levels(
@@ -135,7 +94,7 @@ def add_levels(
     _check_comments(comments)
     firsts: dict[str, Path] = {}
     written: dict[str, list[Path]] = {}
-    for name, data in streamed.streamed_files(levels, mip=ply_file.MIP_COMMENT in comments).items():
+    for name, data in streamed.streamed_files(levels, mip=MIP_COMMENT in comments).items():
         if name == streamed.INDEX:
             index.write_bytes(data)
             continue
@@ -179,65 +138,10 @@ def write_ply(
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     if not 0 <= degree <= gaussians.sh_degree:
         raise ValueError(f"sh_degree: expected 0 to {gaussians.sh_degree}, got {sh_degree}")
-    header, num_columns = _header(len(gaussians), degree, comments, normals=normals)
-    block = max(1, ply_file.BLOCK_BYTES // (4 * num_columns))
     with atomic_output(path, overwrite=overwrite) as temporary, temporary.open("wb") as file:
-        file.write(header)
-        for start in range(0, len(gaussians), block):
-            columns = to_columns(gaussians[start : start + block], degree, start)
-            logits = log(columns.opacities) - log1p(-columns.opacities)  # 0 and 1 are clipped, impossible ones NaN
-            parts = [
-                columns.means,
-                np.zeros((len(columns), 3 * normals)),
-                columns.sh0,
-                columns.harmonics.transpose(0, 2, 1).reshape(len(columns), 3 * columns.harmonics.shape[1]),
-                np.clip(logits, -ply_file.MAX_LOGIT, ply_file.MAX_LOGIT)[:, None],
-                columns.log_scales,
-                columns.quats,
-            ]
-            rows = np.concatenate(parts, axis=1, dtype="<f4", casting="same_kind")
-            if not np.isfinite(rows).all():
-                raise ValueError(f"expected finite Gaussians, got an opacity outside [0, 1] in the rows from {start}")
-            file.write(rows.data)
+        file.writelines(ply.ply_blocks(gaussians, comments, degree=degree, normals=normals))
 
 
 def _check_comments(comments: Sequence[str]) -> None:
     if not all(comment.isascii() and comment.isprintable() for comment in comments):
         raise ValueError(f"comments: expected printable lines of ASCII, got {list(comments)}")
-
-
-def _header(count: int, sh_degree: int, comments: Sequence[str] = (), *, normals: bool = True) -> tuple[bytes, int]:
-    """Return the header of a float32 ``.ply`` of ``count`` Gaussians, and its number of columns."""
-    num_rest = 3 * ((sh_degree + 1) ** 2 - 1)
-    start = (*ply_file.MEANS, *ply_file.NORMALS) if normals else ply_file.MEANS
-    names = [
-        *start,
-        *ply_file.SH0,
-        *(f"f_rest_{i}" for i in range(num_rest)),
-        "opacity",
-        *ply_file.SCALES,
-        *ply_file.QUATS,
-    ]
-    lines = ["ply", "format binary_little_endian 1.0", f"comment {ply_file.LOGIT_COMMENT}"]
-    lines += [*(f"comment {comment}" for comment in comments), f"element vertex {count}"]
-    lines += [*(f"property float {name}" for name in names), "end_header", ""]
-    return "\n".join(lines).encode("ascii"), len(names)
-
-
-def file_bytes(count: int, sh_degree: int) -> int:
-    """Return the size in bytes of the ``.ply`` of ``count`` Gaussians, without comments."""
-    header, num_columns = _header(count, sh_degree)
-    return len(header) + 4 * num_columns * count
-
-
-def count_for_bytes(max_bytes: int, sh_degree: int) -> int:
-    """Return the largest number of Gaussians whose ``.ply`` has at most ``max_bytes``; UsageError if none fits."""
-    if not 0 <= sh_degree <= 4:
-        raise ValueError(f"sh_degree: expected 0 to 4, got {sh_degree}")
-    least = file_bytes(1, sh_degree)
-    if max_bytes < least:
-        raise UsageError(f"budget: expected at least {least} bytes for one Gaussian, got {max_bytes}")
-    count = (max_bytes - file_bytes(0, sh_degree)) // (file_bytes(2, sh_degree) - least)
-    while file_bytes(count, sh_degree) > max_bytes:  # the header contains the count itself
-        count -= 1
-    return count

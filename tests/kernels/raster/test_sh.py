@@ -13,7 +13,7 @@ from slow_renderer import (
     view_colors,
 )
 
-from gsmerge.kernels.raster import harmonics
+from gsmerge.kernels.raster import sh
 from gsmerge.raster.gradient import (
     color_gradients,
 )
@@ -28,11 +28,11 @@ def test_view_colors(degree: int) -> None:
     shN = RNG.normal(size=(50, (degree + 1) ** 2 - 1, 3)).astype(np.float32)
     eye, ids = np.array([0.3, -2.0, 1.0], np.float32), np.arange(1, 50, 2, dtype=np.int32)
     colors = np.full((25, 3), -1, np.float32)
-    harmonics.view_colors(means, sh0, shN, ids, eye, 0, 25, colors)
+    sh.view_colors(means, sh0, shN, ids, eye, 0, 25, colors)
     viewmat = torch.eye(4, dtype=torch.float64)
     viewmat[:3, 3] = -torch.from_numpy(eye).double()
-    sh = torch.from_numpy(np.concatenate([sh0, shN], 1)).double()
-    np.testing.assert_allclose(colors, view_colors(torch.from_numpy(means).double(), sh, viewmat)[ids], atol=1e-5)
+    coeffs = torch.from_numpy(np.concatenate([sh0, shN], 1)).double()
+    np.testing.assert_allclose(colors, view_colors(torch.from_numpy(means).double(), coeffs, viewmat)[ids], atol=1e-5)
     assert (colors == 0).any()
 
 
