@@ -189,10 +189,8 @@ def _path_cameras(options: DrawOptions) -> tuple[Framed, Cameras, float, list[in
 
 def _place_file(file: Path, load: Loaded) -> Cameras:
     """Read the cameras of a path into the frame of a scene, with the size of the scene's where they have none."""
-    stored, cameras = (
-        read_cameras(file) if load.cameras is None else place_camera_file(load, file)[0],
-        load.views.cameras,
-    )
+    cameras = load.views.cameras
+    stored = read_cameras(file) if load.cameras is None else place_camera_file(load, file)[0]
     return to_cameras(replace(stored, lenses=()), None if sizes_of(stored) else (cameras.width, cameras.height))
 
 
