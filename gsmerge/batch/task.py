@@ -89,11 +89,11 @@ def run_task(task: Task, context: BatchContext, new_records: RecordIndex) -> dic
 
 def run_recorded(task: Task, context: BatchContext) -> dict[str, Any]:
     """Compact a scene in a process that keeps the index of new records from call to call, see :func:`run_task`."""
-    return run_task(task, context, new_records(context.folder, context.start))
+    return run_task(task, context, make_index(context.folder, context.start))
 
 
 @lru_cache(maxsize=1)
-def new_records(folder: Path, start: int) -> RecordIndex:
+def make_index(folder: Path, start: int) -> RecordIndex:
     """Return the index of records since the run began, one for all calls in a process."""
     return RecordIndex(folder, start)
 

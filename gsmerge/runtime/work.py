@@ -216,7 +216,7 @@ class RayPool:
             return Lost(f"its process or node was lost ({type(error).__name__}){late}", error)
 
     def close(self) -> list[Any]:
-        """End unfinished calls; return the keys of those that left something here, which is nobody's then: none."""
+        """End unfinished calls; return no keys, as what these calls left may be anywhere."""
         for ref in self.keys:
             with suppress(self.ray.exceptions.RayError, ValueError):
                 self.ray.cancel(ref, force=True)
