@@ -16,13 +16,12 @@ from pathlib import Path
 import numpy as np
 
 from gsmerge.alignment.cameras import estimate_cameras, fit_line, other_conventions
-from gsmerge.alignment.layouts import exact_layouts, grids_of_count, subsample
+from gsmerge.alignment.layouts import exact_layouts, grids_of_count, subsample, view_orders
 from gsmerge.alignment.score import MARGIN, Correspondences, find_correspondences, pixel_limit
 from gsmerge.alignment.unaligned import CameraCheck, check_cameras
 from gsmerge.geometry import project_points, sh0_to_rgb
 from gsmerge.io.cameras.camera_file import CameraFile, make_pinhole
 from gsmerge.io.formats.ply import PlyScene
-from gsmerge.io.image_names import natural_key
 from gsmerge.io.photo_files import (
     Photos,
     Size,
@@ -99,18 +98,14 @@ def _intrinsics_of_rays(
 ) -> np.ndarray | None:
     """Solve for intrinsics ``[3,3]``, pixels, under which the rows of a grid lie on their rays."""
     count, views, names = len(ply.gaussians), len(camera_file), camera_file.names
-    by_name = sorted(range(views), key=lambda view: natural_key(names[view]))
-    labellings = list(dict.fromkeys((tuple(range(views)), tuple(by_name))))
     smaller = islice(grids_of_count(count, views, size), _MAX_GRIDS)
     for grid in (resize_to(size, size), *smaller):
         fits: list[tuple[float, tuple[float, ...], int]] = []
         for number, layout in enumerate(exact_layouts(count, views, grid.width, grid.height)):
             if len(set(layout.views)) < views:
                 continue
-            some = subsample(layout, _GRID_SAMPLES)
-            for labelling in labellings:
-                labelled = replace(some, views=tuple(labelling[view] for view in some.views))
-                pairs = find_correspondences(ply.gaussians.means, ply.valid, labelled)
+            for sample in subsample(layout, _GRID_SAMPLES).with_views_in(view_orders(names)):
+                pairs = find_correspondences(ply.gaussians.means, ply.valid, sample)
                 solved = (_solve_intrinsics(pairs, viewmats) for viewmats in readings)
                 fits += [(px, values, number) for px, values in solved]
         fits.sort()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -11,6 +11,7 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry import rgb_to_sh0
 from gsmerge.io.cameras.camera_file import CameraFile, sizes_of, to_cameras
 from gsmerge.io.formats.ply import PlyInfo
+from gsmerge.io.image_names import natural_key
 from gsmerge.io.photo_files import (
     ASPECT_TOLERANCE,
     PhotoTransform,
@@ -47,6 +48,11 @@ class Layout:
     rows: tuple[np.ndarray, ...]  # the rows of each block, of any shape: not a copy where a stride will do
     pixels: tuple[np.ndarray, ...]  # ``[p]`` the pixel ``y·W + x`` of each of these rows
     per_pixel: int = 1  # Gaussians per pixel; above 1 each layer is a block
+
+    def with_views_in(self, orders: Iterable[Sequence[int]]) -> Iterator[Layout]:
+        """Yield the same rows and pixels with the views in each of some orders."""
+        views = dict.fromkeys(tuple(order[view] for view in self.views) for order in orders)
+        return (replace(self, views=some) for some in views)
 
     @property
     def is_plain(self) -> bool:
@@ -93,6 +99,12 @@ def da3_box(width: int, height: int) -> KeptBox:
     """Return the box that Depth Anything 3 keeps."""
     top, left = int(8 / 256 * height), int(8 / 256 * width)
     return KeptBox("box", f"{top} rows and {left} columns trimmed at every border", top, left)
+
+
+def view_orders(names: Sequence[str]) -> list[tuple[int, ...]]:
+    """List the orders that a file's views may be in: that of their cameras, that of their names."""
+    views = range(len(names))
+    return [tuple(views), tuple(sorted(views, key=lambda view: natural_key(names[view])))]
 
 
 def every_nth(views: int) -> list[tuple[int, ...]]:
