@@ -1,14 +1,18 @@
-"""Find the pixel that each row of a file belongs to, and estimate cameras; the door: modules in here are private."""
+"""Find the pixel that each row of a file belongs to, and estimate cameras; the door: modules in here are private.
+
+``search`` tries sizes of the grid and readings of the poses, ``recovery`` the readings of the rows in one grid: from
+``layouts``, or, with pixels missing, from ``ordered_rows`` and ``incomplete``. ``score`` measures them. ``cameras``
+reads or moves poses, ``unaligned`` chooses those of rows without pixels, ``estimate`` and ``focal`` solve for cameras.
+"""
 
 # ruff: noqa: F401  names for other packages
 
-from gsmerge.alignment.cameras import estimate_cameras, move_cameras, other_conventions
-from gsmerge.alignment.dropped_depths import guess_depths
-from gsmerge.alignment.explain import explain_misalignment, misalignment_error
+from gsmerge.alignment.cameras import move_cameras, other_conventions
+from gsmerge.alignment.dropped_depths import fill_from_depths, guess_depths
+from gsmerge.alignment.estimate import WITH_PHOTOS, estimate_cameras, estimate_with_photos
 from gsmerge.alignment.focal import estimate_focal
-from gsmerge.alignment.layouts import MAY_BE_UNALIGNED, Layout, fill_from_depths
-from gsmerge.alignment.photos_alone import WITH_PHOTOS, estimate_with_photos
-from gsmerge.alignment.recovery import Recovery
+from gsmerge.alignment.layouts import MAY_BE_UNALIGNED, Layout
+from gsmerge.alignment.recovery import Recovery, explain_misalignment, misalignment_error
 from gsmerge.alignment.rotations import QUATS, QuatChoice, choose_rotations, read_rotations
 from gsmerge.alignment.score import Alignment, check_alignment, check_pairs, sample_pixels
 from gsmerge.alignment.search import AlignmentResult, align

@@ -15,26 +15,20 @@ from pathlib import Path
 
 import numpy as np
 
-from gsmerge.alignment.cameras import estimate_cameras, fit_line, other_conventions
+from gsmerge.alignment.cameras import fit_lines, other_conventions
+from gsmerge.alignment.estimate import estimate_cameras
 from gsmerge.alignment.layouts import exact_layouts, grids_of_count, subsample, view_orders
 from gsmerge.alignment.score import MARGIN, Correspondences, find_correspondences, pixel_limit
 from gsmerge.alignment.unaligned import CameraCheck, check_cameras
 from gsmerge.geometry import project_points, sh0_to_rgb
 from gsmerge.io.cameras.camera_file import CameraFile, make_pinhole
 from gsmerge.io.formats.ply import PlyScene
-from gsmerge.io.photo_files import (
-    Photos,
-    Size,
-    as_floats,
-    photo_size,
-    resize_to,
-)
+from gsmerge.io.photo_files import Photos, Size, as_floats, photo_size, resize_to
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.pictures import sample_bilinear
 from gsmerge.types import Cameras, Gaussians
 
 _GRID_SAMPLES = 500  # Gaussians per view that intrinsics are solved from
-_ROUNDS = 4  # of reweighted least squares
 _MAX_UNEVEN = 1.5  # of one focal length to the other
 _MAX_GRIDS = 6  # smaller grids that the number of rows allows, which are tried
 _MAX_VIEWS = 12  # whose photos are compared with the Gaussians
@@ -129,25 +123,13 @@ def _solve_intrinsics(pairs: Correspondences, viewmats: np.ndarray) -> tuple[flo
     if not front.any() or front.mean() <= 0.5:
         return math.inf, ()
     slopes = camera[front, :2] / camera[front, 2:]
-    places = pairs.pixels[front]
-    weights = np.ones(len(slopes))
-    away = np.zeros_like(places)
-    lines = [(0.0, 0.0), (0.0, 0.0)]
-    with np.errstate(all="ignore"):  # points in the camera's plane
-        for _ in range(_ROUNDS):
-            for axis in range(2):
-                slope, height = fit_line(slopes[:, axis], places[:, axis], weights)
-                away[:, axis] = places[:, axis] - slope * slopes[:, axis] - height
-                lines[axis] = slope, height
-            errors = np.sqrt((away * away).sum(1))
-            weights = 1 / (1 + (errors / (3 * np.median(errors) + 1e-9)) ** 2)
-    (fx, cx), (fy, cy) = lines
+    (fx, fy), (cx, cy), errors = fit_lines(slopes, pairs.pixels[front])
     blocks = pairs.blocks[front]
     worst = max(float(np.median(errors[blocks == block])) for block in np.unique(blocks))
     uneven = fx / fy if 0 < fx < math.inf and 0 < fy < math.inf else math.inf
     if not (math.isfinite(worst) and 1 / _MAX_UNEVEN < uneven < _MAX_UNEVEN):
         return math.inf, ()
-    return worst, (fx, fy, cx, cy)
+    return worst, (float(fx), float(fy), float(cx), float(cy))
 
 
 def _intrinsics_of_colors(ply: PlyScene, readings: list[np.ndarray], photos: Photos, size: Size) -> np.ndarray | None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from gsmerge.alignment.layouts import Layout, plain_layout, subsample
 from gsmerge.alignment.resection import projection_errors, refine_poses, start_pose
-from gsmerge.geometry import IDENTITY, Similarity, camera_centres, project_points, sh0_to_rgb
+from gsmerge.geometry import IDENTITY, Similarity, camera_centres, project_points, robust_weights, sh0_to_rgb
 from gsmerge.kernels.elementary import arccos, log
 from gsmerge.kernels.matrices import closest_rotation, eigh, invert, matmul, solve_symmetric
 from gsmerge.runtime.memory import free_pages
@@ -145,8 +145,7 @@ def _solve(
         away = points - solution[0] * centres - shift
         depth = np.abs((away * rays).sum(1)) + 1e-12
         angle = np.linalg.norm(_apply(across, away), axis=1) / depth
-        spread = 3 * np.median(angle) + 1e-12
-        weights = 1 / (depth**2 * (1 + (angle / spread) ** 2))
+        weights = robust_weights(angle, 3, 1e-12, depth)
     return Similarity(rotation, float(solution[0]), shift)
 
 

@@ -1,9 +1,4 @@
-"""Search the size of the grid, the frame and the convention of the poses, and the photos' size, cheap first.
-
-``layouts`` lists possible orders, ``ordered_rows`` and ``incomplete`` search files that lack pixels, ``score``
-measures, ``recovery`` decides for one grid, ``cameras`` reads or moves poses, ``unaligned`` chooses those of rows
-without pixels, ``explain`` says why there are none.
-"""
+"""Search the pixels of rows over sizes of the grid, conventions and frames of the poses, and orders, cheap first."""
 
 from __future__ import annotations
 
@@ -11,13 +6,13 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import groupby
+from itertools import chain, groupby
 from typing import Any
 
 import numpy as np
 
-from gsmerge.alignment.cameras import ESTIMATED, MovedCameras, Poses, max_pixels, move_cameras, other_conventions
-from gsmerge.alignment.explain import explain_count
+from gsmerge.alignment.cameras import describe_convention, describe_reading, max_pixels, move_cameras, other_conventions
+from gsmerge.alignment.estimate import ESTIMATED, WITH_PHOTOS
 from gsmerge.alignment.layouts import (
     MAY_BE_UNALIGNED,
     GridFit,
@@ -28,8 +23,7 @@ from gsmerge.alignment.layouts import (
     subsample,
     view_orders,
 )
-from gsmerge.alignment.photos_alone import WITH_PHOTOS
-from gsmerge.alignment.recovery import SMALLEST_PX, Recovery, is_seen, possible_layouts, recover
+from gsmerge.alignment.recovery import SMALLEST_PX, Recovery, explain_count, is_seen, possible_layouts, recover
 from gsmerge.alignment.score import MARGIN, AlignmentInput, color_error, scale_by, score_layout
 from gsmerge.alignment.unaligned import check_cameras, choose_cameras
 from gsmerge.errors import SceneError
@@ -116,17 +110,14 @@ class _Source:
 
 @dataclass(frozen=True)
 class _Fit:
-    """A grid of which rows are the pixels, under poses in one convention."""
+    """A grid of which rows are the pixels."""
 
     grid: GridFit
-    camera_file: CameraFile
-    inputs: AlignmentInput
     recovery: Recovery
-    moved: MovedCameras | None = None
 
     @property
     def px(self) -> float:
-        """Median distance of the Gaussians from their pixels, in the worst view."""
+        """Median distance of the Gaussians from their pixels in the worst view, pixels."""
         return self.recovery.best.worst_px
 
 
@@ -159,15 +150,14 @@ def align(
             or other cameras would make pixels of the rows.
     """
     source = _Source(ply, camera_file, photos, order, scale, depths)
-    sizes = _fits_of_other_sizes(source)
     try:
         grid = photo_grid(camera_file, photo_size(photos))
     except SceneError:
-        fit = next(filter(None, sizes), None)
+        fit = _choose_first(source, _fit_other_sizes(source))
         if fit is None:
             raise
-        return _make_result(source, fit)
-    fit = next(filter(None, _fits(source, grid, sizes)), None)
+    else:
+        fit = _choose_first(source, _fits(source, grid))
     if fit is not None:
         return _make_result(source, fit)
     small = small_photos_error(ply.info, camera_file, photo_size(photos)) if order not in MAY_BE_UNALIGNED else None
@@ -183,29 +173,33 @@ def align(
     )
 
 
-def _fits(source: _Source, grid: GridFit, sizes: Iterator[_Fit | None]) -> Iterator[_Fit | None]:
-    """Try the photos' size and all others, with poses as stored, moved, and in other conventions, the likely first."""
+def _fits(source: _Source, grid: GridFit) -> Iterator[list[_Fit]]:
+    """Yield fits of the photos' size and others, with poses as stored, moved and in other conventions; likely first."""
+    other_sizes = _fit_other_sizes(source)
     large = len(grid.cameras) * math.prod(grid.size) > _LARGE * len(source.ply.gaussians)
     if large:
-        yield next(sizes, None)
-    inputs = source.inputs(grid)
-    yield _fit(grid, source.camera_file, inputs)
+        yield next(other_sizes, [])
+    yield _fit_all(source, [grid])
     if source.order not in MAY_BE_UNALIGNED:
-        yield _fit_moved(grid, source.camera_file, inputs)
+        yield _fit_moved(source, grid)
     if not large:
-        yield next(sizes, None)
+        yield next(other_sizes, [])
     if source.order != "none":
-        yield _choose_convention(_fit_posed(grid, other, inputs) for other in _conventions(source.camera_file))
-    yield from sizes
+        rows = source.ply.gaussians, source.ply.valid
+        others = (_with_poses(grid, other) for other in _conventions(source.camera_file))
+        seen = (other for other in others if check_cameras(*rows, other.cameras, None).ok)
+        yield _fit_all(source, seen)
+    yield from other_sizes
 
 
-def _fits_of_other_sizes(source: _Source) -> Iterator[_Fit | None]:
-    """Try other sizes than the photos'; next, other conventions of the poses as well."""
+def _fit_other_sizes(source: _Source) -> Iterator[list[_Fit]]:
+    """Yield fits of other sizes than the photos'; next, those in other conventions of the poses as well."""
     if source.order != "none":
-        yield _fit_size(source, source.camera_file)
+        yield _fit_sizes(source, source.camera_file)
     if source.order not in MAY_BE_UNALIGNED:
         others = _conventions(source.camera_file)
-        yield _choose_convention(_fit_size(source, other, exact_frames=True) for other in others)
+        fits = (_choose(source, _fit_sizes(source, other, exact_frames=True)) for other in others)
+        yield list(filter(None, fits))
 
 
 def _conventions(camera_file: CameraFile) -> Iterator[CameraFile]:
@@ -214,108 +208,102 @@ def _conventions(camera_file: CameraFile) -> Iterator[CameraFile]:
         yield replace(camera_file, viewmats=poses.viewmats, convention=poses.convention)
 
 
-def _fit(grid: GridFit, camera_file: CameraFile, inputs: AlignmentInput, *, exact_frames: bool = False) -> _Fit | None:
-    """Recover the pixels of the rows in a grid; None if they are not its pixels."""
-    recovery = recover(inputs, exact_frames=exact_frames)
-    return None if recovery is None else _Fit(grid, camera_file, inputs, recovery)
+def _with_poses(grid: GridFit, camera_file: CameraFile) -> GridFit:
+    """Return a grid whose cameras have other poses."""
+    return replace(grid, camera_file=camera_file, cameras=replace(grid.cameras, viewmats=camera_file.viewmats))
 
 
-def _fit_posed(grid: GridFit, camera_file: CameraFile, inputs: AlignmentInput) -> _Fit | None:
-    """Fit a grid under poses in another convention, if the cameras see the Gaussians then."""
-    inputs = replace(inputs, cameras=replace(inputs.cameras, viewmats=camera_file.viewmats))
-    seen = check_cameras(inputs.gaussians, inputs.valid, inputs.cameras, None).ok
-    return _fit(grid, camera_file, inputs) if seen else None
+def _fit_all(
+    source: _Source, grids: Iterable[GridFit], *, photos: bool = True, exact_frames: bool = False
+) -> list[_Fit]:
+    """Recover the pixels of the rows in each of some grids; leave out those whose pixels they are not."""
+    recoveries = ((grid, recover(source.inputs(grid, photos=photos), exact_frames=exact_frames)) for grid in grids)
+    return [_Fit(grid, recovery) for grid, recovery in recoveries if recovery is not None]
 
 
-def _fit_moved(grid: GridFit, camera_file: CameraFile, inputs: AlignmentInput) -> _Fit | None:
-    """Fit a grid without missing pixels under slightly moved cameras; None where that does not fit.
+def _fit_moved(source: _Source, grid: GridFit) -> list[_Fit]:
+    """Fit a grid without missing pixels under slightly moved cameras; nothing where that does not fit.
 
-    None, too, where another convention fits or the photos' colours disagree: views in the wrong order look the same.
+    Nothing, too, where another convention fits or the photos' colours disagree: views in the wrong order look the
+    same.
     """
-    if inputs.scale is not None:
-        return None
-    layouts = (
-        layout for any_views in possible_layouts(inputs) for layout in any_views.with_views_in(inputs.labellings)
-    )
-    readings = (score_layout(inputs, layout, IDENTITY) for layout in layouts)
-    best = min(readings, key=lambda reading: reading.worst_px, default=None)
+    inputs = source.inputs(grid)
+    layouts = (layout.with_views_in(inputs.labellings) for layout in possible_layouts(inputs))
+    readings = (score_layout(inputs, layout, IDENTITY) for layout in chain.from_iterable(layouts))
+    best = None if inputs.scale is not None else min(readings, key=lambda reading: reading.worst_px, default=None)
     if best is None or not best.worst_px <= max_pixels(*grid.size):
-        return None
-    for other in _conventions(camera_file):
-        posed = replace(inputs, cameras=replace(inputs.cameras, viewmats=other.viewmats))
+        return []
+    for other in _conventions(source.camera_file):
+        posed = replace(inputs, cameras=_with_poses(grid, other).cameras)
         if score_layout(posed, best.layout, IDENTITY).ok:
-            return None
+            return []
     pairs = inputs.pairs(subsample(best.layout, _MOVED_SAMPLES))
-    moved = move_cameras(pairs, inputs.cameras, camera_file.names, str(camera_file.path))
+    moved = move_cameras(pairs, grid.cameras, source.camera_file.names, str(source.camera_file.path))
     if moved is None:
-        return None
-    fit = _fit(grid, camera_file, replace(inputs, cameras=moved.cameras), exact_frames=True)
-    return None if fit is None or fit.recovery.confirmed is False else replace(fit, moved=moved)
+        return []
+    grid = replace(grid, cameras=moved.cameras, notes=(*grid.notes, moved.note), moves=moved.moves)
+    return [fit for fit in _fit_all(source, [grid], exact_frames=True) if fit.recovery.confirmed is not False]
 
 
-def _fit_size(source: _Source, camera_file: CameraFile, *, exact_frames: bool = False) -> _Fit | None:
-    """Find the other size that puts the Gaussians nearest to their pixels; None where grids of two sizes do.
+def _fit_sizes(source: _Source, camera_file: CameraFile, *, exact_frames: bool = False) -> list[_Fit]:
+    """Fit grids of other sizes than the photos', by positions alone: the likeliest of which some fit.
 
     Sizes that only the number of rows suggests are tried in the cameras' own frame first; with ``exact_frames`` all
     are.
     """
-    fits: list[_Fit] = []
     guesses: list[GridFit] = []
     others = other_grids(source.ply.info, camera_file, photo_size(source.photos))
     for _, ranked in groupby(others, key=lambda grid: grid.rank):
         grids = [grid for grid in ranked if not grid.guessed or source.may_be(grid)]
         guesses += [grid for grid in grids if grid.guessed]
         exact = exact_frames or any(grid.guessed for grid in grids)
-        fits = _fit_grids(source, camera_file, grids, exact_frames=exact)
+        fits = _fit_all(source, grids, photos=False, exact_frames=exact)
         if fits:
-            break
-    if not (fits or exact_frames):
-        fits = _fit_grids(source, camera_file, guesses[:_MAX_TRIED], exact_frames=False)
-    if not fits:
+            return fits
+    return [] if exact_frames else _fit_all(source, guesses[:_MAX_TRIED], photos=False)
+
+
+def _choose_first(source: _Source, rivals: Iterable[list[_Fit]]) -> _Fit | None:
+    """Choose a fit from the first of several lists that has one."""
+    return next(filter(None, (_choose(source, fits) for fits in rivals)), None)
+
+
+def _choose(source: _Source, fits: Sequence[_Fit]) -> _Fit | None:
+    """Choose the fit that is nearest to its pixels, and of several alike the one whose photos have the colours.
+
+    None where a grid of another size is about as near, SceneError where poses in another convention are.
+    """
+    best = min(fits, key=lambda fit: fit.px, default=None)
+    if best is None:
         return None
-    best = min(fits, key=lambda fit: fit.px)
+    rivals = sorted((fit for fit in fits if fit.px < MARGIN * max(best.px, SMALLEST_PX)), key=lambda fit: fit.px)
+    conventions = list(dict.fromkeys(fit.grid.camera_file.convention for fit in rivals))
+    if len(conventions) > 1:
+        both = " and as ".join(map(describe_convention, conventions[:2]))
+        problem = f"expected poses that fit in one reading, found that they fit as {both}"
+        raise SceneError(source.camera_file.path, problem, "convert them to the format's own")
     exact = best.recovery.best.layout.kind != "pruned"  # what lacks pixels fits into grids of nearly its size as well
-    next_px = min((fit.px for fit in fits if fit.grid.size != best.grid.size), default=math.inf)
-    if exact and next_px < MARGIN * max(best.px, SMALLEST_PX):
+    if exact and any(fit.grid.size != best.grid.size for fit in rivals):
         return None
     near = max(_ALIKE * best.px, best.px + _ALIKE_PX)
-    alike = [fit for fit in fits if fit.grid.size == best.grid.size and fit.px <= near]
-    alike = [replace(fit, inputs=source.inputs(fit.grid)) for fit in alike]
-    errors = [color_error(fit.inputs, fit.recovery.best.layout) for fit in alike] if len(alike) > 1 else [0.0]
-    return alike[int(np.argmin(np.nan_to_num(errors, nan=1.0)))]
-
-
-def _fit_grids(source: _Source, camera_file: CameraFile, grids: Sequence[GridFit], *, exact_frames: bool) -> list[_Fit]:
-    """Fit grids of several sizes by the positions alone; those that do not fit are left out."""
-    inputs = ((grid, source.inputs(grid, photos=False)) for grid in grids)
-    fits = (_fit(grid, camera_file, rows, exact_frames=exact_frames) for grid, rows in inputs)
-    return [fit for fit in fits if fit is not None]
-
-
-def _choose_convention(fits: Iterable[_Fit | None]) -> _Fit | None:
-    """Choose the fit in the one convention that fits; None without one, SceneError if several fit about as well."""
-    best, *others = sorted(filter(None, fits), key=lambda fit: fit.px) or [None]
-    if best is None or not others or others[0].px >= MARGIN * max(best.px, SMALLEST_PX):
+    same = (fit for fit in fits if fit.grid.camera_file is best.grid.camera_file and fit.grid.size == best.grid.size)
+    alike = [fit for fit in same if fit.px <= near]
+    if len(alike) == 1:
         return best
-    one, other = (Poses(fit.camera_file.convention, fit.camera_file.viewmats) for fit in (best, others[0]))
-    both = f"{one.description} and as {other.description}"
-    problem = f"expected poses that fit in one reading, found that they fit as {both}"
-    raise SceneError(best.camera_file.path, problem, "convert them to the format's own")
+    errors = [color_error(source.inputs(fit.grid), fit.recovery.best.layout) for fit in alike]
+    return alike[int(np.argmin(np.nan_to_num(errors, nan=1.0)))]
 
 
 def _make_result(source: _Source, fit: _Fit) -> AlignmentResult:
     """Make the result of rows that are pixels, with the cameras in the frame of the Gaussians."""
-    inputs, camera_file, best = fit.inputs, fit.camera_file, fit.recovery.best
+    inputs, grid, best = source.inputs(fit.grid), fit.grid, fit.recovery.best
     free_pages(vars(inputs.gaussians).values())  # the search has looked at all rows
-    frame, layout, count = best.frame, best.layout, len(inputs.cameras)
-    notes = [*fit.grid.notes]
-    if fit.moved is not None:
-        notes.append(fit.moved.note)
-    if camera_file.convention != source.camera_file.convention:
-        poses = Poses(camera_file.convention, camera_file.viewmats)
-        notes.append(f"{poses.describe(source.camera_file.convention)}: read so")
-    if camera_file.source in (ESTIMATED, WITH_PHOTOS):
-        from_what = "own grid" if camera_file.source == ESTIMATED else "order and the photos' colours"
+    frame, layout, count = best.frame, best.layout, len(grid.cameras)
+    notes, usual = [*grid.notes], source.camera_file
+    if grid.camera_file.convention != usual.convention:
+        notes.append(f"{describe_reading(grid.camera_file.convention, usual.convention)}: read so")
+    if usual.source in (ESTIMATED, WITH_PHOTOS):
+        from_what = "own grid" if usual.source == ESTIMATED else "order and the photos' colours"
         notes.append(f"no cameras were given: poses and focal length are estimated from the Gaussians' {from_what}")
     in_order = layout.is_plain and frame is IDENTITY and len(layout.views) == count
     if in_order and layout.views == inputs.labellings[1] != inputs.labellings[0]:
@@ -326,11 +314,11 @@ def _make_result(source: _Source, fit: _Fit) -> AlignmentResult:
         notes += [f"{used} of {count} views are in the file"] * (used < count)
     return AlignmentResult(
         pixel_ids=layout.pixel_ids(len(inputs.gaussians)),
-        cameras=inputs.cameras if frame is IDENTITY else frame.move(inputs.cameras),
+        cameras=grid.cameras if frame is IDENTITY else frame.move(grid.cameras),
         images=inputs.images,
-        camera_file=camera_file,
+        camera_file=grid.camera_file,
         notes=tuple(notes),
-        transform=fit.grid.transform,
+        transform=grid.transform,
         recovery=fit.recovery,
-        moves=() if fit.moved is None else fit.moved.moves,
+        moves=grid.moves,
     )
