@@ -135,7 +135,7 @@ def _cell(text: str | None) -> str:
 def _settings_page() -> str:
     from gsmerge.cli.parameters import HINTS, words_for
     from gsmerge.cli.paths import FileOptions
-    from gsmerge.io.formats.ply import OpacityChoice
+    from gsmerge.io.formats.read import OpacityChoice
     from gsmerge.online.options import OnlineOptions
     from gsmerge.options import CompactOptions
     from gsmerge.scene.exporters import ReadHints

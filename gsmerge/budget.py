@@ -10,7 +10,7 @@ from decimal import Decimal
 from fractions import Fraction
 
 from gsmerge.errors import UsageError
-from gsmerge.io.formats.writing import count_for_bytes
+from gsmerge.io.formats.ply import count_for_bytes
 
 DEVICES = {"quest3": 400_000, "mobile": 1_000_000, "desktop": 3_000_000}  # most Gaussians that they draw fluidly
 SIZES = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}  # bytes

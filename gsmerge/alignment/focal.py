@@ -22,7 +22,7 @@ from gsmerge.alignment.score import MARGIN, Correspondences, find_correspondence
 from gsmerge.alignment.unaligned import CameraCheck, check_cameras
 from gsmerge.geometry import project_points, sh0_to_rgb
 from gsmerge.io.cameras.camera_file import CameraFile, make_pinhole
-from gsmerge.io.formats.ply import PlyScene
+from gsmerge.io.formats.read import GaussianFile
 from gsmerge.io.photo_files import Photos, Size, as_floats, photo_size, resize_to
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.pictures import sample_bilinear
@@ -57,7 +57,7 @@ class _Pictures:
         return Cameras(viewmats[self.views], np.tile(K, (len(self.views), 1, 1)), width, height)
 
 
-def estimate_focal(ply: PlyScene, camera_file: CameraFile, photos: Photos | None) -> CameraFile | None:
+def estimate_focal(ply: GaussianFile, camera_file: CameraFile, photos: Photos | None) -> CameraFile | None:
     """Return the cameras with the intrinsics that fit the Gaussians, and a note; None without any.
 
     ``camera_file`` has poses alone; ``photos`` are its c ``[h,w,3]`` uint8. Where only they show
@@ -88,7 +88,7 @@ def estimate_focal(ply: PlyScene, camera_file: CameraFile, photos: Photos | None
 
 
 def _intrinsics_of_rays(
-    ply: PlyScene, camera_file: CameraFile, readings: list[np.ndarray], size: Size
+    ply: GaussianFile, camera_file: CameraFile, readings: list[np.ndarray], size: Size
 ) -> np.ndarray | None:
     """Solve for intrinsics ``[3,3]``, pixels, under which the rows of a grid lie on their rays."""
     count, views, names = len(ply.gaussians), len(camera_file), camera_file.names
@@ -132,7 +132,9 @@ def _solve_intrinsics(pairs: Correspondences, viewmats: np.ndarray) -> tuple[flo
     return worst, (float(fx), float(fy), float(cx), float(cy))
 
 
-def _intrinsics_of_colors(ply: PlyScene, readings: list[np.ndarray], photos: Photos, size: Size) -> np.ndarray | None:
+def _intrinsics_of_colors(
+    ply: GaussianFile, readings: list[np.ndarray], photos: Photos, size: Size
+) -> np.ndarray | None:
     """Search for intrinsics ``[3,3]``, pixels, under which the Gaussians have the photos' colours."""
     pictures = _small_pictures(photos, size)
     few = _sample(ply, _FEW_SAMPLES)
@@ -149,7 +151,7 @@ def _intrinsics_of_colors(ply: PlyScene, readings: list[np.ndarray], photos: Pho
     return None
 
 
-def _sample(ply: PlyScene, count: int) -> Gaussians:
+def _sample(ply: GaussianFile, count: int) -> Gaussians:
     """Take about ``count`` finite Gaussians, spread over the file."""
     rows = np.flatnonzero(ply.valid)
     return ply.gaussians[rows[:: max(1, len(rows) // count)]]

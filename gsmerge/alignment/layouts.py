@@ -10,7 +10,7 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import CameraFile, sizes_of, to_cameras
-from gsmerge.io.formats.ply import PlyInfo
+from gsmerge.io.formats.read import FileInfo
 from gsmerge.io.image_names import natural_key
 from gsmerge.io.photo_files import ASPECT_TOLERANCE, PhotoTransform, Size, resize_and_crop, resize_to, same_shape
 from gsmerge.types import Cameras
@@ -244,7 +244,7 @@ def _are_stretched(camera_file: CameraFile, size: Size) -> bool:
     return bool((np.abs(ratios - 1) <= ASPECT_TOLERANCE).all())
 
 
-def other_grids(ply: PlyInfo, camera_file: CameraFile, size: Size | None) -> Iterator[GridFit]:
+def other_grids(ply: FileInfo, camera_file: CameraFile, size: Size | None) -> Iterator[GridFit]:
     """Yield all other grids that the files and the number of rows allow, the likely first; ``size`` is the photos'."""
     known = sizes_of(camera_file)
     own = known[0] if len(known) == 1 else None
@@ -320,7 +320,7 @@ def patch_grids(size: Size) -> list[PhotoTransform]:
     return list(dict.fromkeys(transforms))
 
 
-def small_photos_error(ply: PlyInfo, camera_file: CameraFile, size: Size | None) -> SceneError | None:
+def small_photos_error(ply: FileInfo, camera_file: CameraFile, size: Size | None) -> SceneError | None:
     """Make the SceneError for photos smaller than the cameras' size, of which the rows are the pixels; or None."""
     own = next((s for s in sizes_of(camera_file) if ply.count == len(camera_file) * s[0] * s[1]), None)
     if size is None or own is None or own == size:

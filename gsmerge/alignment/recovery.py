@@ -37,7 +37,7 @@ from gsmerge.alignment.score import (
 from gsmerge.errors import SceneError
 from gsmerge.geometry import IDENTITY
 from gsmerge.io.cameras.camera_file import CameraFile, Convention
-from gsmerge.io.formats.ply import PlyInfo
+from gsmerge.io.formats.read import FileInfo
 from gsmerge.io.photo_files import ASPECT_TOLERANCE
 from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Cameras, Gaussians
@@ -252,7 +252,7 @@ def _differs(one: Layout, other: Layout) -> bool:
     return not all(np.array_equal(x, y) for x, y in zip((*a.rows, *a.pixels), (*b.rows, *b.pixels), strict=True))
 
 
-def explain_count(ply: PlyInfo, inputs: AlignmentInput, camera_file: CameraFile) -> SceneError:
+def explain_count(ply: FileInfo, inputs: AlignmentInput, camera_file: CameraFile) -> SceneError:
     """Make the SceneError of rows that are no pixels; raise it where other cameras would make pixels of them."""
     cameras, count = inputs.cameras, len(inputs.gaussians)
     views, width, height = len(cameras), cameras.width, cameras.height

@@ -29,7 +29,7 @@ from gsmerge.alignment.unaligned import check_cameras, choose_cameras
 from gsmerge.errors import SceneError
 from gsmerge.geometry import IDENTITY, Similarity
 from gsmerge.io.cameras.camera_file import CameraFile
-from gsmerge.io.formats.ply import PlyScene
+from gsmerge.io.formats.read import GaussianFile
 from gsmerge.io.photo_files import Photos, PhotoTransform, Size, as_floats, photo_size
 from gsmerge.runtime.memory import free_pages
 from gsmerge.types import Cameras
@@ -71,7 +71,7 @@ class AlignmentResult:
 class _Source:
     """The Gaussians, the cameras, the photos and the known facts about the rows."""
 
-    ply: PlyScene
+    ply: GaussianFile
     camera_file: CameraFile
     photos: Photos | None
     order: str
@@ -122,7 +122,7 @@ class _Fit:
 
 
 def align(
-    ply: PlyScene,
+    ply: GaussianFile,
     camera_file: CameraFile,
     photos: Photos | None = None,
     *,

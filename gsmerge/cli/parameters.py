@@ -28,11 +28,11 @@ from gsmerge.errors import UsageError
 from gsmerge.runtime.plugins import METHODS, find_plugins
 
 if TYPE_CHECKING:
-    from gsmerge.io.formats.ply import OpacityChoice
+    from gsmerge.io.formats.read import OpacityChoice
     from gsmerge.options import CompactOptions
     from gsmerge.scene.exporters import ReadHints
     from gsmerge.scene.files import SceneFiles
-    from gsmerge.scene.read import SceneLoad
+    from gsmerge.scene.read import Loaded
 
 INPUT, COUNT, METHOD, MEASURING, OUTPUT, GENERAL = (
     "Input", "How many Gaussians", "Method", "Measuring", "Output", "General"
@@ -109,7 +109,7 @@ class Args(SimpleNamespace):
             return ReadHints(**{**defaults, **values})
 
     def _parse_hints(self) -> dict[str, Any]:
-        from gsmerge.io.formats.ply import OpacityChoice
+        from gsmerge.io.formats.read import OpacityChoice
         from gsmerge.scene.exporters import ReadHints
 
         return parse_pairs("--hint", self.hint or (), setting_kinds(ReadHints) | {"opacity": OpacityChoice})
@@ -125,7 +125,7 @@ class Args(SimpleNamespace):
         first, *others = (find_scene_files(one, **places) for one in (scene, *more))
         return replace(first, more=tuple(others))
 
-    def load(self, files: SceneFiles, **defaults: Any) -> SceneLoad:
+    def load(self, files: SceneFiles, **defaults: Any) -> Loaded:
         """Read the scene of these files; ``defaults`` are hints that the user may override."""
         from gsmerge.scene.read import load_files
 

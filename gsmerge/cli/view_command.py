@@ -48,7 +48,7 @@ def view(args: opt.Args) -> None:
     from gsmerge.view.data import collect
     from gsmerge.view.page import headline, view_page
 
-    sizes = [given.load.ply.file_bytes, *(ply.info.file_bytes for ply in given.plys.values())]
+    sizes = [given.load.info.file_bytes, *(ply.info.file_bytes for ply in given.plys.values())]
     with stage_progress(quiet=args.silent) as progress:
         title = files.ply.parent.absolute().name if files.ply.stem == "scene" else files.ply.stem
         data = collect(
