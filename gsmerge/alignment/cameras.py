@@ -142,7 +142,9 @@ def _check_intrinsics(pairs: Correspondences, cameras: Cameras, before_px: float
     with np.errstate(all="ignore"):
         places, depth = project_points(pairs.points[:, None], cameras.viewmats[pairs.views], cameras.Ks[pairs.views])
     good = (depth[:, 0] > 0) & np.isfinite(places[:, 0]).all(1)
-    factors, shifts, _ = fit_lines(places[good, 0], pairs.pixels[good])
+    before, wanted = places[good, 0], pairs.pixels[good]
+    axes = [fit_lines(before[:, [axis]], wanted[:, [axis]])[:2] for axis in range(2)]  # each with weights of its own
+    factors, shifts = np.array(axes)[:, :, 0].T
     Ks = cameras.Ks * np.array([*factors, 1])[:, None]
     Ks[:, :2, 2] += shifts
     other = check_pairs(pairs, replace(cameras, Ks=Ks))
