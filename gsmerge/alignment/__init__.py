@@ -31,8 +31,6 @@ from gsmerge.alignment.recovery import Recovery as Recovery
 from gsmerge.alignment.recovery import explain_count, is_seen, possible_layouts, recover
 from gsmerge.alignment.recovery import explain_misalignment as explain_misalignment
 from gsmerge.alignment.recovery import misalignment_error as misalignment_error
-from gsmerge.alignment.rotations import QUATS as QUATS
-from gsmerge.alignment.rotations import QuatChoice as QuatChoice
 from gsmerge.alignment.rotations import choose_rotations as choose_rotations
 from gsmerge.alignment.rotations import read_rotations as read_rotations
 from gsmerge.alignment.score import MARGIN, AlignmentInput, color_error, scale_by, score_layout

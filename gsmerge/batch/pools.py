@@ -24,8 +24,8 @@ from typing import Any
 from gsmerge.batch.batch_options import BatchOptions
 from gsmerge.batch.records import LOST, RecordIndex, record
 from gsmerge.batch.task import BatchContext, Task, clean_up, run_task
-from gsmerge.options import CHECKPOINTS
 from gsmerge.runtime.cluster import SMALL_STORE, Cluster
+from gsmerge.settings.compact import CHECKPOINTS
 
 SCENES_PER_PROCESS = 200  # then it is replaced by a new one, so that what libraries leave in memory cannot add up
 STARTED = "begun"  # what a process sends when it takes a scene

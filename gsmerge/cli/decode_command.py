@@ -37,9 +37,9 @@ def decode(args: opt.Args) -> None:
     from gsmerge.io import atomic_output, lost_harmonics, output_format, write_gaussians
     from gsmerge.online.decode_stored import check_fit, decodable, decode_stored, default_fit, num_photos
     from gsmerge.online.file import load_stored
-    from gsmerge.options import CompactOptions
     from gsmerge.plan import resolve_fit
     from gsmerge.report import document_head, seconds_document
+    from gsmerge.settings.compact import CompactOptions
 
     wanted, writing = args.make(FitOptions, FileOptions, viewer_cameras=False)  # a .gsm has no names of views
     check_format(out, writing)

@@ -10,7 +10,6 @@ from typing import Any, TypeVar
 import numpy as np
 
 from gsmerge.alignment.registration.join import concat_scenes
-from gsmerge.budget import parse_share, share_text
 from gsmerge.compaction.result import CompactReport, CompactResult, measure_psnr
 from gsmerge.facts.partition import (
     Block,
@@ -24,20 +23,22 @@ from gsmerge.facts.partition import (
 from gsmerge.facts.prepare import Frame, Prepared, prepare, scene_frame
 from gsmerge.facts.views import in_float64, subset
 from gsmerge.fit import fit_scene, peak_weights
-from gsmerge.options import CompactOptions
 from gsmerge.pipeline import start
 from gsmerge.plan import Plan, choose_networks, make_plan, resolve_decode, steps_for
 from gsmerge.raster import contributions, plan_view
 from gsmerge.raster import prepare as prepare_splats
 from gsmerge.raster.metrics import describe_loss
 from gsmerge.raster.photos import Photos, blank_photos
+from gsmerge.runtime.cluster import start_work
 from gsmerge.runtime.estimate import memory_bytes
 from gsmerge.runtime.memory import free_pages, peak_memory
 from gsmerge.runtime.record import Record, add_seconds, choose, current_record, note, record_part, stage
 from gsmerge.runtime.threads import in_turn
+from gsmerge.settings.budget import parse_share, share_text
+from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.stages import AUTO_SHARE, SHARE
 from gsmerge.stages.clean import faintest_dropped
 from gsmerge.stages.segment import CountLimits, count_limits
-from gsmerge.stages.superpixels import AUTO_SHARE, SHARE
 from gsmerge.types import Decoded, Gaussians, Scene
 
 T = TypeVar("T")
@@ -67,7 +68,8 @@ def compact_in_blocks(given: Scene, options: CompactOptions, count: int) -> Comp
         options = with_whole_choices(options, given, whole)
     size = gaussians_at_once(given.num_gaussians, count)
     memory = memory_bytes(size, photos=given.images is not None, num_rest=3 * given.gaussians.shN.shape[1])
-    with options.blocks.engine.start(threads=options.threads, memory=memory) as work:
+    engine = options.blocks.engine
+    with start_work(engine.name, engine.address, threads=options.threads, memory=memory) as work:
         seen = work.share(covisibility)
 
         def pieces() -> Iterator[tuple[Any, ...]]:

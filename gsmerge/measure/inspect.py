@@ -14,11 +14,9 @@ from gsmerge.facts.compare_photos import compare_photos
 from gsmerge.facts.partition import gaussians_at_once
 from gsmerge.facts.prepare import canonicalise
 from gsmerge.io import PlyScene, ply_notes
-from gsmerge.io.formats.ply import OpacityChoice
 from gsmerge.io.formats.ply_file import LOGIT_COMMENT
 from gsmerge.io.formats.writing import file_bytes
 from gsmerge.measure.visibility import MAX_SAMPLES, inside_views
-from gsmerge.options import CompactOptions
 from gsmerge.plan import choose_blocks, resolve_decode, resolved_settings, steps_for
 from gsmerge.report import finite, human_bytes
 from gsmerge.runtime.estimate import fit_of, memory_bytes, memory_problem, wall_seconds
@@ -28,6 +26,8 @@ from gsmerge.scene.exporters import ReadHints, exporter_names, make_hints
 from gsmerge.scene.files import SceneFiles, find_scene_files
 from gsmerge.scene.read import align_scene, read_ply_with_hints
 from gsmerge.scene.views import read_scene_cameras
+from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.reading import OpacityChoice
 from gsmerge.stages.clean import BOX_QUANTILES, beyond_scene, floater_share
 from gsmerge.stages.segment import count_limits, largest_count
 from gsmerge.stages.sky import sky_regions

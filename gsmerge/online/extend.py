@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from gsmerge import __version__
-from gsmerge.budget import AUTO
 from gsmerge.compaction.search import choose_count
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import Prepared, prepare
@@ -37,12 +36,14 @@ from gsmerge.online.state import (
     select_groups,
     with_fitted_colors,
 )
-from gsmerge.options import CompactOptions
 from gsmerge.pipeline import merge_views
 from gsmerge.plan import Plan, make_plan, require_children
 from gsmerge.runtime.record import Progress, choose, note, record_run, stage
 from gsmerge.runtime.threads import use_threads
-from gsmerge.stages.decode import USUAL_K, keep_all
+from gsmerge.settings.budget import AUTO
+from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.stages import USUAL_K
+from gsmerge.stages.decode import keep_all
 from gsmerge.stages.match import MatchOptions, match
 from gsmerge.stages.merge import MergedViews, merge, take
 from gsmerge.types import FeatureGaussians, Gaussians, Matches, Scene
@@ -90,7 +91,7 @@ def extend(
         prepared = prepare(scene.numpy(), fixed, None if state is None else state.frame)
         plan = make_plan(prepared, options, None if state is None else own_checkpoint(state, options))
         plan = plan.with_fit(replace(plan.fit, min_contribution=options.fit.min_contribution))  # in drafts, too
-        require_children("max k", max_k, plan.checkpoint)
+        require_children("max_k", max_k, plan.checkpoint)
         count = choose_count(prepared, plan)
         if keep_all(prepared.scene, count) is not None:
             raise UsageError(f"budget: {count} keeps every Gaussian, which needs no state; use compact")
@@ -159,7 +160,7 @@ def _check(state: OnlineState | None, scene: Scene, options: CompactOptions, max
     if options.fit.fit == "full":
         raise UsageError("fit full: goes with all photos together; expected none, and the full fit at decoding")
     if options.decode.max_k > max_k:
-        raise UsageError(f"max k: expected at least {options.decode.k}, which is k, got {max_k}")
+        raise UsageError(f"max_k: expected at least {options.decode.k}, which is k, got {max_k}")
     degree = scene.gaussians.sh_degree
     if state is not None and degree != state.sh_degree:
         expected = state.sh_degree

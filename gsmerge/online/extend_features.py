@@ -44,9 +44,9 @@ from gsmerge.online.state import (
     with_child_rows,
 )
 from gsmerge.online.state_context import StateContext
-from gsmerge.options import CompactOptions
 from gsmerge.plan import Plan
 from gsmerge.runtime.record import choose, note, stage
+from gsmerge.settings.compact import CompactOptions
 from gsmerge.stages.assign import assign
 from gsmerge.stages.decode import divide
 from gsmerge.stages.encode import correct, encode

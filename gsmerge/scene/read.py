@@ -30,7 +30,7 @@ from gsmerge.geometry import Similarity
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views, to_cameras
 from gsmerge.io.cameras.json_files import DATAPARSER, find_dataparser, read_dataparser
 from gsmerge.io.cameras.npz_files import read_depths
-from gsmerge.io.formats.ply import OpacityChoice, PlyInfo, PlyScene, ply_notes, read_gaussians, read_parts
+from gsmerge.io.formats.ply import PlyInfo, PlyScene, ply_notes, read_gaussians, read_parts
 from gsmerge.io.photo_files import as_floats, photo_size
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import use_threads
@@ -44,6 +44,7 @@ from gsmerge.scene.views import (
     read_scene_cameras,
     stored_photos,
 )
+from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Cameras, Gaussians, LargePhotos, Scene, StrPath, grid_ids
 
 _MAX_MASKED = 0.98  # share of the pixels of photos that masks may leave out

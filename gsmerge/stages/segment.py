@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gsmerge.budget import BudgetOptions, exact_count, max_allowed
+from gsmerge.budget import exact_count, max_allowed
 from gsmerge.errors import UsageError
 from gsmerge.raster.photos import scene_pictures
 from gsmerge.raster.seen import seen_depths
 from gsmerge.runtime.record import stage
-from gsmerge.stages.decode import DecodeOptions
+from gsmerge.settings.budget import BudgetOptions
+from gsmerge.settings.stages import DecodeOptions, SegmentOptions
 from gsmerge.stages.region_tree import RegionTree, auto_count, cut_tree, pixel_depths, region_tree
-from gsmerge.stages.superpixels import MAX_FACTOR, SegmentOptions, count_for, segment
+from gsmerge.stages.superpixels import MAX_FACTOR, count_for, segment
 from gsmerge.types import Scene, Segmentation
 
 

@@ -19,8 +19,8 @@ import typer.main
 
 import gsmerge
 from gsmerge.cli.app import app
-from gsmerge.options import method_names
 from gsmerge.report import report_document
+from gsmerge.settings.compact import method_names
 
 ROOT = Path(__file__).parents[2]
 COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]

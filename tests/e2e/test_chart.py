@@ -11,9 +11,9 @@ import pytest
 from batches import InlinePool
 
 import gsmerge
-from gsmerge.options import CompactOptions
 from gsmerge.research.charts import measure_run as running
 from gsmerge.research.charts.measure_run import RunRecord, read_runs
+from gsmerge.settings.compact import CompactOptions
 
 from .conftest import Outcome, Run, listing
 

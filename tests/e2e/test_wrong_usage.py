@@ -125,7 +125,7 @@ USAGE = {
     "evaluate room --lpips none --align=color": "expected held-out views",
     "evaluate room --lpips none --align=colour --targets room/targets": "color or pose",
     "evaluate room --lpips none --zoom=a,2": "sizes such as .5,1,2,4",
-    "evaluate room --lpips none --zoom=0": "from 1/16 to 16",
+    "evaluate room --lpips none --zoom=0": "zoom: expected 0.0625 to 16, got 0",
     "evaluate room --lpips none --zoom=2,2": "every size once",
     "evaluate room --lpips none --photo-side -1": "greater than or equal to 0",
     "evaluate room --lpips none --views 6": "expected 1 to 5",

@@ -8,8 +8,8 @@ import pytest
 import scenes
 
 from gsmerge import write_ply
-from gsmerge.budget import parse_budget, parse_bytes
 from gsmerge.io.formats.writing import count_for_bytes, file_bytes
+from gsmerge.settings.budget import parse_budget, parse_bytes
 
 
 @pytest.mark.parametrize(

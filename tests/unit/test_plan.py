@@ -13,9 +13,9 @@ import unaligned_scenes
 from gsmerge import CompactOptions, Scene, compact
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import prepare
-from gsmerge.options import EFFORTS as NAMES
 from gsmerge.plan import EFFORTS, Plan, choose_networks, make_plan, resolve_fit, resolved_settings, steps_for
 from gsmerge.runtime.record import record_run
+from gsmerge.settings.compact import EFFORTS as NAMES
 
 
 @pytest.fixture(scope="module")

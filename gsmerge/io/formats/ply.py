@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from plyfile import PlyData, PlyElement
@@ -18,10 +17,10 @@ from gsmerge.io.formats.compressed import is_compressed, unpack
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.runtime.memory import free_pages, make_array
 from gsmerge.runtime.threads import parallel_map
+from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Gaussians, StrPath
 
 MIN_FINITE = 0.002  # of the rows: the rest of a file tells nothing about the scene
-OpacityChoice = Literal["auto", "logit", "raw"]
 
 # What reads a file of Gaussians, by its ending; all others but the index of levels are taken for PLY
 READERS: dict[str, Callable[[Path], StoredRows]] = {

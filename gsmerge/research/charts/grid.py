@@ -18,11 +18,11 @@ from gsmerge.io.cameras.colmap import is_colmap
 from gsmerge.io.cameras.read import find_cameras
 from gsmerge.io.formats.ply_file import header_counts
 from gsmerge.measure.evaluate import EvaluateOptions
-from gsmerge.options import CompactOptions
 from gsmerge.research.charts.lines import ONE_SIZE
 from gsmerge.research.charts.measure_run import INPUT, OURS, SUPERPIXELS, ChartRun, RunRecord, describe
 from gsmerge.scene.content_hash import cameras_of, content_hash, digest, filled, photos_of, read_files, stem_of
 from gsmerge.scene.files import find_scene_files
+from gsmerge.settings.compact import CompactOptions
 
 ALL = "all"  # word for all views
 OWN_OPTIONS = {"method": "--methods", "seed": "--seed", "threads": "--threads"}  # that set the same

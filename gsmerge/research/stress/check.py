@@ -14,12 +14,12 @@ from gsmerge.budget import BudgetOptions
 from gsmerge.compaction.compact import compact
 from gsmerge.errors import GsmergeError, SceneError, UsageError
 from gsmerge.io.cameras.camera_file import CameraFile, from_viewmats, to_viewmats
-from gsmerge.io.formats.ply import OpacityChoice
 from gsmerge.measure.evaluate import EvaluateOptions, evaluate
-from gsmerge.options import CompactOptions
 from gsmerge.research.stress.cases import CASES, PROPERTIES, Case, StressScene
 from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.read import SceneLoad, align_scene, read_ply_with_hints
+from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Gaussians, Scene, Views
 
 MAX_WORSE = 0.1  # dB that a result may be below its input

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from gsmerge.batch import BatchOptions
-from gsmerge.options import CompactOptions
+from gsmerge.settings.compact import CompactOptions
 
 
 def test_runs_that_may_share_a_folder_have_one_name() -> None:
@@ -33,10 +33,10 @@ def test_runs_that_may_share_a_folder_have_one_name() -> None:
         ({"retries": -1}, "retries: expected at least 0"),
         ({"timeout": 0.0}, "timeout: expected more than 0"),
         ({"timeout": math.nan}, "timeout: expected more than 0"),
-        ({"max_memory": 0}, "max memory: expected at least"),
-        ({"engine": "slurm"}, "engine: expected one of local, ray"),
+        ({"max_memory": 0}, "max_memory: expected at least"),
+        ({"engine": "slurm"}, "engine: expected local or ray"),
         ({"address": "auto"}, "address: expected engine ray"),
-        ({"engine": "ray", "max_memory": 5}, "max memory: expected engine local"),
+        ({"engine": "ray", "max_memory": 5}, "max_memory: expected engine local"),
     ],
 )
 def test_settings_out_of_range_are_refused(wrong: dict[str, Any], said: str) -> None:

@@ -25,8 +25,8 @@ from gsmerge.batch.records import (
 from gsmerge.batch.schedule import dispatch, estimate_seconds, make_schedule
 from gsmerge.batch.task import BatchContext, Task
 from gsmerge.errors import SceneError
-from gsmerge.options import CompactOptions
 from gsmerge.runtime.estimate import memory_bytes
+from gsmerge.settings.compact import CompactOptions
 
 
 def jobs(*counts: int) -> list[Job]:

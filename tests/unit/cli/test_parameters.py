@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import pytest
 
-from gsmerge.cli.parameters import Args, parse_pairs, setting_kinds, words_for
+from gsmerge.cli.parameters import Args, parse_pairs
 from gsmerge.errors import UsageError
 from gsmerge.online.options import OnlineOptions
-from gsmerge.options import CompactOptions
+from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.setting import flat_settings
 
-KINDS = setting_kinds(CompactOptions)
+KNOWN = flat_settings(CompactOptions)
 
 
 @pytest.mark.parametrize(
@@ -34,7 +34,7 @@ KINDS = setting_kinds(CompactOptions)
     ],
 )
 def test_values_are_json_or_text(pair: str, expected: dict[str, Any]) -> None:
-    assert parse_pairs("--set", [pair], KINDS) == expected
+    assert parse_pairs("--set", [pair], KNOWN) == expected
 
 
 @pytest.mark.parametrize(
@@ -45,16 +45,15 @@ def test_values_are_json_or_text(pair: str, expected: dict[str, Any]) -> None:
         (["pose=free"], "--set pose: unknown, the closest name is poses; docs/reference/settings.md lists all"),
         (["k=1", "k=2"], "--set k: expected it once, got it twice"),
         (["drop_sky=1"], "--set drop_sky: expected true or false, got '1'"),
-        (["neighbors=true"], "--set neighbors: expected a whole number or null, got 'true'"),
-        (["neighbors=2.5"], "--set neighbors: expected a whole number or null, got '2.5'"),
+        (["neighbors=true"], "--set neighbors: expected at least 1 or null, got 'true'"),
+        (["neighbors=2.5"], "--set neighbors: expected a whole number, at least 1 or null, got '2.5'"),
         (["match=all"], "--set match: expected overlap, aabb, none or null, got 'all'"),
         (["k=" + "[" * 100_000], "[["),
     ],
 )
 def test_what_cannot_be_meant(pairs: list[str], words: str) -> None:
-    kinds = {"k": int, **{name: kind for name, kind in KINDS.items() if name != "k"}}
     with pytest.raises(UsageError) as error:
-        parse_pairs("--set", pairs, kinds)
+        parse_pairs("--set", pairs, KNOWN)
     assert words in str(error.value)
 
 
@@ -64,7 +63,7 @@ def test_options_and_set_are_one() -> None:
     assert (settings.decode.k, settings.effort, settings.match.overlap) == (2, "fast", 0.5)
     with pytest.raises(UsageError, match="--set k: expected it once, got --k too"):
         Args(k=2, set=["k=3"]).settings()
-    with pytest.raises(UsageError, match="iou: expected 0 to 1, got 2"):
+    with pytest.raises(UsageError, match="iou: expected 0 to 1, got '2'"):
         Args(set=["iou=2"]).settings()
     with pytest.raises(UsageError, match="--set fit: unknown"):
         Args(set=["fit=full"]).settings(fit="none")
@@ -76,16 +75,3 @@ def test_several_kinds_of_settings() -> None:
     }  # fmt: skip
     made, online = Args(set=["recipe=paper", "replay=3"]).make(CompactOptions, OnlineOptions)
     assert (made.segment.segmentation, online.replay) == ("bass-st", 3)
-
-
-@dataclass
-class Kinds:
-    choice: Literal["a", "b"] | None
-    numbers: tuple[int, ...]
-    size: int | float
-
-
-def test_values_in_words() -> None:
-    assert [words_for(kind) for kind in setting_kinds(Kinds).values()] == [
-        "a, b or null", "a list", "a whole number or a number",
-    ]  # fmt: skip

@@ -10,13 +10,13 @@ import pytest
 import scenes
 
 from gsmerge import CompactOptions, compact
-from gsmerge.budget import DEVICES
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import canonicalise
 from gsmerge.facts.views import subset
 from gsmerge.fit import FitOptions, fit
 from gsmerge.fit.photo_sizes import fit_photos
 from gsmerge.plan import choose_blocks
+from gsmerge.settings.budget import DEVICES
 from gsmerge.types import Cameras, Scene
 
 SETTINGS: dict[str, Any] = {"checkpoint": "none", "superpixels": "10%", "fit_steps": 40, "threads": 1}

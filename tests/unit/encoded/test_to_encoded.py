@@ -199,8 +199,8 @@ def test_wishes_that_cannot_be_met(wish: dict[str, Any], words: str, encoded: En
         ({"levels": 2}, "levels: cannot be encoded"),
         ({"quality": "-0.1dB"}, "quality -0.1dB: cannot be encoded"),
         ({"quality": "20dB"}, "quality 20dB: cannot be encoded"),
-        ({"max_k": 9}, "max k: expected 1 to 8, got 9"),
-        ({"max_k": 2, "k": 3}, "max k: expected at least 3, which is k, got 2"),
+        ({"max_k": 9}, "max_k: expected 1 to 8, got 9"),
+        ({"max_k": 2, "k": 3}, "max_k: expected at least 3, which is k, got 2"),
     ],
 )
 def test_what_cannot_be_encoded(settings: dict[str, Any], words: str, pixels: Scene) -> None:

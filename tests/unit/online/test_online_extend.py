@@ -18,7 +18,7 @@ from gsmerge.fit import FitOptions, FitReport
 from gsmerge.online.decode_stored import decode_stored
 from gsmerge.online.extend import extend
 from gsmerge.online.state import OnlineState, from_encoded
-from gsmerge.options import CompactOptions
+from gsmerge.settings.compact import CompactOptions
 from gsmerge.types import grid_ids
 
 Change = Callable[[Scene], Scene]
@@ -348,9 +348,9 @@ def test_what_a_state_cannot_have(settings: dict[str, Any], words: str, pairs: l
 
 
 def test_more_gaussians_of_a_group_than_are_kept(pairs: list[Scene], first: OnlineState) -> None:
-    with pytest.raises(UsageError, match="max k: expected at least 3, which is k, got 2"):
+    with pytest.raises(UsageError, match="max_k: expected at least 3, which is k, got 2"):
         Compactor(**FAST, k=3, max_k=2).extend(pairs[0])
-    with pytest.raises(UsageError, match="max k: expected at least 5, which is k, got 4"):
+    with pytest.raises(UsageError, match="max_k: expected at least 5, which is k, got 4"):
         extend(first, pairs[1], options(k=5))
 
 

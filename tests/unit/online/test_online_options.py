@@ -15,8 +15,8 @@ from gsmerge.online.options import OnlineOptions
 @pytest.mark.parametrize(
     ("values", "words"),
     [
-        ({"max_k": 0}, "max k: expected 1 to 8, got 0"),
-        ({"max_k": 9}, "max k: expected 1 to 8, got 9"),
+        ({"max_k": 0}, "max_k: expected 1 to 8, got 0"),
+        ({"max_k": 9}, "max_k: expected 1 to 8, got 9"),
         ({"tolerance": -0.1}, r"tolerance: expected 0 to 1, got -0\.1"),
         ({"tolerance": 1.1}, "tolerance: expected 0 to 1"),
         ({"tolerance": float("nan")}, "tolerance: expected 0 to 1, got nan"),

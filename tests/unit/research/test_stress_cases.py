@@ -12,11 +12,11 @@ import scenes
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import project
-from gsmerge.options import CompactOptions
 from gsmerge.research.stress import CASES, cases, check, stress
 from gsmerge.research.stress.cases import StressScene
 from gsmerge.scene.held_out import read_held_out
 from gsmerge.scene.read import SceneLoad, load_scene
+from gsmerge.settings.compact import CompactOptions
 from gsmerge.types import Scene, Views
 
 FAST = CompactOptions().with_settings({"fit": "none"})

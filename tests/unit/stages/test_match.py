@@ -142,5 +142,5 @@ def test_thresholds_out_of_range_are_refused(setting: dict[str, float]) -> None:
 
 
 def test_unknown_method_is_refused() -> None:
-    with pytest.raises(ValueError, match='match: expected "overlap", "aabb" or "none", got "iou"'):
+    with pytest.raises(ValueError, match="match: expected overlap, aabb or none, got 'iou'"):
         match(make_features(np.zeros((2, 3))), MatchOptions(match="iou"))

@@ -74,7 +74,7 @@ def test_computer_without_cuda_is_noted_only_where_cuda_is_asked_for(monkeypatch
 def test_options_only_name_a_device() -> None:
     """Whether there is one is asked when it is used."""
     assert [CompactOptions(device=name).device for name in ("cpu", "cuda", "auto")] == ["cpu", "cuda", "auto"]
-    with pytest.raises(ValueError, match="device: expected one of cpu, cuda, auto, got 'gpu'"):
+    with pytest.raises(ValueError, match="device: expected cpu, cuda or auto, got 'gpu'"):
         CompactOptions(device="gpu")
 
 
