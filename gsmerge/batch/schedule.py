@@ -17,13 +17,14 @@ from gsmerge.batch.find import Job
 from gsmerge.batch.pools import LocalPool, RayPool, with_whole_paths
 from gsmerge.batch.records import BUSY, LOST, RECORDS, STUCK, RecordIndex, check_folder
 from gsmerge.batch.task import BatchContext, Task, record_failure, run_lock
-from gsmerge.errors import SceneError
-from gsmerge.plan import resolved_settings, steps_for
+from gsmerge.errors import SceneError, UsageError
+from gsmerge.plan import plan_whole
 from gsmerge.runtime.estimate import IMPORT_SECONDS, work_seconds
 from gsmerge.runtime.memory import human_bytes, machine_memory
 from gsmerge.runtime.threads import available_threads
 from gsmerge.scene.content_hash import cameras_of
 from gsmerge.scene.files import find_scene_files
+from gsmerge.stages.segment import SceneSize
 
 FREE_MEMORY_SHARE = 0.8  # of the free memory that is used by default
 POLL_SECONDS = 0.5  # between two queries of the pool
@@ -71,7 +72,7 @@ def free_memory() -> int | None:
 def estimate_seconds(jobs: Sequence[Job], options: BatchOptions, schedule: Schedule) -> float:
     """Estimate the wall time of scenes, within a factor of about two."""
 
-    total, usual = 0.0, resolved_settings(options.settings, photos=True)
+    total = 0.0
     for job in jobs:
         views = 1  # where cameras cannot be read
         with suppress(SceneError):
@@ -79,10 +80,13 @@ def estimate_seconds(jobs: Sequence[Job], options: BatchOptions, schedule: Sched
             cameras = None if files.cameras is None else cameras_of(files.cameras, files.ply.stem)
             views = max(1, len(cameras or ()))
         own = options.settings if job.work is None else job.work.settings
-        settings = usual if job.work is None else resolved_settings(own, photos=True)
-        each, steps = job.num_gaussians / views, steps_for(own, views)
-        seconds = work_seconds(job.num_gaussians, each, settings, photos=True, fit_steps=steps)
-        total += seconds / min(schedule.threads, views)
+        size = SceneSize(job.num_gaussians, views, 1, -(-job.num_gaussians // views), aligned=True, photos=True)
+        with suppress(UsageError):  # the run says so
+            whole = plan_whole(size, own)
+            seconds = work_seconds(
+                job.num_gaussians, size.width, whole.settings(own), photos=True, fit_steps=whole.fit.steps
+            )
+            total += seconds / min(schedule.threads, views)
     return IMPORT_SECONDS * bool(jobs) + total / max(1, min(schedule.jobs, len(jobs)))
 
 

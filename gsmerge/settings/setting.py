@@ -67,21 +67,20 @@ class Setting:
         return (*listed, *(word for kind in literals for word in get_args(kind)))
 
     def fits(self, value: Any) -> bool:
-        """Return whether a value is possible; of text only the type is looked at."""
+        """Return whether a value is of the type; it may still be out of range, or none of the choices."""
         if self.is_list:
             return isinstance(value, list | tuple) and all(map(self._fits, value))
         return self._fits(value)
 
     def _fits(self, value: Any) -> bool:
         is_bool = type(value).__name__.startswith("bool")  # Python's, or NumPy's, which is not loaded here
-        if not is_bool and value in self.words:
-            return True
-        for kind in self.kinds:
-            if kind is bool:
+        for kind in _parts(self.kind):
+            if get_origin(kind) is Literal:
+                fits = value in get_args(kind)
+            elif kind is bool:
                 fits = is_bool
             elif kind in (int, float):
-                is_number = isinstance(value, Integral if kind is int else Real) and not is_bool
-                fits = is_number and self._in_range(value)
+                fits = isinstance(value, Integral if kind is int else Real) and not is_bool
             else:
                 fits = isinstance(value, kind)
             if fits:
@@ -89,7 +88,9 @@ class Setting:
         return False
 
     def _in_range(self, value: Any) -> bool:
-        return bool(
+        if self.choices:
+            return value is None or value in self.words
+        return not isinstance(value, Real) or bool(
             (self.least is None or value >= self.least)
             and (self.most is None or value <= self.most)
             and (self.above is None or value > self.above)
@@ -131,13 +132,13 @@ class Setting:
             for one in value:
                 self._check(one)
             if self.unique and len(set(value)) < len(value):
-                raise ValueError(f"{self.name}: expected every value once, got {', '.join(map(str, value))}")
+                raise ValueError(f"{self.name}: expected every value once, got {','.join(map(str, value))}")
         else:
             self._check(value)
 
     def _check(self, value: Any) -> None:
         free = any(kind not in (int, float, bool, NoneType) for kind in self.kinds)  # checked by the class itself
-        if free or self._fits(value):
+        if free or (self._fits(value) and self._in_range(value)):
             return
         raise ValueError(f"{self.name}: expected {self.expected(value)}, got {value!r}")
 

@@ -23,7 +23,7 @@ AUTO_SHARE = "auto"
 MAX_CHILDREN = 8
 MIXED, MIXED_COUNTS = "mixed", (1, 2, 4)  # the K of groups of their own, and its values
 USUAL_K = 1  # what "auto" is unless there are reasons for more
-NEIGHBORS = {"overlap": 16, "aabb": 1}  # Nearest neighbours that are compared; docs/internals/notebook.md has figures
+NEIGHBORS = {"overlap": 16, "aabb": 1}  # Nearest neighbours that are compared; docs/laboratory/notebook.md has figures
 CROP = "sphere:x,y,z,radius or box:x0,y0,z0,x1,y1,z1"
 CROP_NUMBERS = {"sphere": 4, "box": 6}
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from gsmerge.budget import exact_count, max_allowed
 from gsmerge.errors import UsageError
+from gsmerge.facts.views import camera_kinds
 from gsmerge.raster.photos import scene_pictures
 from gsmerge.raster.seen import seen_depths
 from gsmerge.runtime.record import stage
@@ -92,8 +93,38 @@ class CountLimits:
         return (self.count or self.default) / max(1, self.num_pixels)
 
 
+@dataclass(frozen=True)
+class SceneSize:
+    """Numbers of a scene, read or not, that a plan is made of."""
+
+    num_gaussians: int  # without rows that stand in for missing ones
+    num_views: int
+    height: int  # pixels
+    width: int
+    aligned: bool  # whether each Gaussian belongs to a pixel
+    photos: bool  # whether there are photos to fit to
+    num_cameras: int = 2  # views at different places; 1: one camera took all
+    sh_degree: int = 0
+
+    @property
+    def pixels_per_view(self) -> int:
+        """Pixels of each view."""
+        return self.height * self.width
+
+
+def measure_size(scene: Scene, *, photos: bool | None = None) -> SceneSize:
+    """Return the numbers of a scene; ``photos``: whether there are any to fit to, None: as the scene has them."""
+    cameras = scene.cameras
+    return SceneSize(
+        scene.num_gaussians, len(scene), cameras.height, cameras.width, scene.aligned,
+        photos=scene.images is not None if photos is None else photos,
+        num_cameras=1 + int(camera_kinds(cameras).max()) if len(scene) else 0,
+        sh_degree=scene.gaussians.sh_degree,
+    )  # fmt: skip
+
+
 def count_limits(
-    scene: Scene,
+    scene: SceneSize,
     segment: SegmentOptions,
     decode: DecodeOptions,
     budget: BudgetOptions,
@@ -108,39 +139,39 @@ def count_limits(
     UsageError if more superpixels are asked for than there are pixels, or fewer Gaussians than
     views.
     """
-    degree, own = scene.gaussians.sh_degree, scene.num_gaussians
-    exact = exact_count(budget, own if num_input is None else num_input, degree)
+    count, views = scene.num_gaussians, scene.num_views
+    exact = exact_count(budget, count if num_input is None else num_input, scene.sh_degree)
     if exact is not None:
-        exact = min(max(1, exact - num_reserved), own)
-    max_count = min(max_allowed(budget, own, degree), own if exact is None else exact)
-    if max_count < min(len(scene), own):
-        raise UsageError(f"budget: expected at least {len(scene)}, one for each view, got {max_count}")
+        exact = min(max(1, exact - num_reserved), count)
+    max_count = min(max_allowed(budget, count, scene.sh_degree), count if exact is None else exact)
+    if max_count < min(views, count):
+        raise UsageError(f"budget: expected at least {views}, one for each view, got {max_count}")
     return CountLimits(
-        per_view=superpixels_per_view(scene, segment) if len(scene) else 0,
+        per_view=superpixels_per_view(scene, segment) if views else 0,
         default=default_count(scene, segment, decode),
-        min_count=len(scene),
+        min_count=views,
         max_count=max_count,
         exact=exact,
-        num_pixels=len(scene) * scene.pixels_per_view,
+        num_pixels=views * scene.pixels_per_view,
     )
 
 
-def superpixels_per_view(scene: Scene, segment: SegmentOptions) -> int:
+def superpixels_per_view(scene: SceneSize, segment: SegmentOptions) -> int:
     """Return the superpixels of each view; where Gaussians are fewer than pixels, a share is taken of the Gaussians."""
-    cameras = scene.cameras
-    per_view = count_for(segment, cameras.height, cameras.width)
+    per_view = count_for(segment, scene.height, scene.width)
     if scene.aligned or segment.per_view is not None:
         return per_view
-    return max(1, min(per_view, int(segment.share * len(scene.gaussians) / len(cameras))))
+    return max(1, min(per_view, int(segment.share * scene.num_gaussians / scene.num_views)))
 
 
-def default_count(scene: Scene, segment: SegmentOptions, decode: DecodeOptions) -> int:
+def default_count(scene: SceneSize, segment: SegmentOptions, decode: DecodeOptions) -> int:
     """Return the Gaussians that ``superpixels`` and K ask for; of a scene without views, a share of its Gaussians."""
-    if len(scene) == 0:
-        return round(max(1, int(segment.share * scene.num_gaussians)) * decode.mean_k)
+    count, views = scene.num_gaussians, scene.num_views
+    if views == 0:
+        return round(max(1, int(segment.share * count)) * decode.mean_k)
     per_view = superpixels_per_view(scene, segment)
-    total = per_view * scene.num_gaussians // scene.pixels_per_view if scene.aligned else per_view * len(scene)
-    return round(max(len(scene), total) * decode.mean_k)
+    total = per_view * count // scene.pixels_per_view if scene.aligned else per_view * views
+    return round(max(views, total) * decode.mean_k)
 
 
 def largest_count(limits: CountLimits, segment: SegmentOptions) -> int:

@@ -19,11 +19,12 @@ def functions():
 
 
 def walk():
-    return pkgutil.walk_packages(gsmerge.kernels.__path__, "gsmerge.kernels.")
+    modules = pkgutil.walk_packages(gsmerge.kernels.__path__, "gsmerge.kernels.")
+    return (module for module in modules if "kernels-" not in module.name)  # the libraries lie beside them
 
 
 def sources():
-    text = "".join(path.read_text() for path in sorted(FOLDER.glob("*.c")))
+    text = "".join(path.read_text() for path in sorted(FOLDER.rglob("*.c")))
     return re.sub(r"\s+", " ", re.sub(r"\brestrict ", "", text))
 
 

@@ -62,7 +62,7 @@ def test_failures_inside_the_work(
 def test_a_folder_without_permission(scene_copy: Path, run: Run) -> None:
     locked = scene_copy / "locked"
     locked.mkdir(mode=0o500)
-    assert_refused(run("compact", scene_copy, "-o", locked / "small.ply"), 3, "cannot be written")
+    assert_refused(run("compact", scene_copy, "-o", locked / "small.ply"), 3, locked / "small.ply", "Permission denied")
     assert list(locked.iterdir()) == []
 
 
@@ -86,7 +86,7 @@ def test_a_lack_of_memory_is_no_damage(
         write_gaussians(path, gsmerge.read_ply(scene_copy / "scene.ply").gaussians, overwrite=True)
         words = ("inspect", path)
     monkeypatch.setattr(reader, Broken(MemoryError("Unable to allocate 9 GiB")))
-    assert_refused(run(*words), 3, OUT_OF_MEMORY)
+    assert_refused(run(*words), 3, "", OUT_OF_MEMORY)
 
 
 def test_a_scene_of_points_without_size_leaves_no_file(scene_copy: Path, run: Run) -> None:
@@ -95,7 +95,7 @@ def test_a_scene_of_points_without_size_leaves_no_file(scene_copy: Path, run: Ru
     gsmerge.write_ply(scene_copy / "scene.ply", points, overwrite=True)
     before = listing(scene_copy)
     outcome = run("compact", scene_copy, "--fit", "none")
-    assert (outcome.code, "found none that is left" in outcome.err) == (3, True)
+    assert_refused(outcome, 3, scene_copy / "scene.ply", "none")
     assert listing(scene_copy) == before
 
 
@@ -127,7 +127,7 @@ def test_failures_while_writing_leave_nothing(
     outcome = run(command, given, "--quiet", *more, code=3)
     assert outcome.err.count("\n") == 1
     assert {"compact": "scene.compact.ply", "encode": "scene.gsm", "decode": "kept.compact.ply"}[command] in outcome.err
-    assert "No space left" in outcome.err
+    assert "No space" in outcome.err
     assert listing(scene_copy) == before
 
 
@@ -251,18 +251,14 @@ def in_shell(command: str, cwd: Path, root: Path, **environment: str) -> subproc
 
 QUICK = "--superpixels 40 --fit none --checkpoint none"
 ODD_PLACES = {
-    "output is full": (
-        f"$G compact . -o a.ply {QUICK} --json -q >/dev/full",
-        3,
-        "what was printed could not be written",
-    ),
-    "help is full": ("$G --help >/dev/full", 3, "what was printed could not be written"),
+    "output is full": (f"$G compact . -o a.ply {QUICK} --json -q >/dev/full", 3, "printed"),
+    "help is full": ("$G --help >/dev/full", 3, "printed"),
     "errors are full": ("$G compact none 2>/dev/full", 3, ""),
     "notes are full": (f"$G compact . -o a.ply {QUICK} 2>/dev/full", 0, ""),
     "output is closed": (f"$G compact . -o a.ply {QUICK} --json >&-", 0, ""),
     "errors are closed": ("$G compact none 2>&-", 3, ""),
     "output ends early": ("$G inspect . | head -c 10 >head && cat head", 0, ""),
-    "a name of 300 letters": ("$G compact . -o $(printf 'a%.0s' $(seq 300)).ply", 3, "File name too long"),
+    "a name of 300 letters": ("$G compact . -o $(printf 'a%.0s' $(seq 300)).ply", 3, "name too"),
     "a name of 251 letters": (f"$G compact . -q {QUICK} -o $(printf 'a%.0s' $(seq 247)).ply", 0, ""),
     "no working directory": ("mkdir gone && cd gone && rmdir ../gone && $G compact ..", 3, "working directory"),
     "little memory": (f"ulimit -v 400000; $G compact . -o a.ply {QUICK}", 3, "out of memory"),

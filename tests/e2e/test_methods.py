@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from messages import ERROR, says
 
 from gsmerge import read_ply
 from gsmerge.settings.compact import method_names
@@ -79,26 +80,23 @@ def test_a_missing_program_is_one_line(
     before = listing(scene_copy)
     said = run("compact", scene_copy, "--method", "splat-transform")
     assert (said.code, said.out, said.err.count("\n")) == (2, "", 1)
-    assert (named or "on PATH or named by GSMERGE_SPLAT_TRANSFORM") in said.err
+    assert (named or "GSMERGE_SPLAT_TRANSFORM") in said.err
     assert "npm install -g @playcanvas/splat-transform" in said.err
     assert listing(scene_copy) == before
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("#!{python}\nraise SystemExit('out of\\nmemory')\n", "it ended with code 1: out of memory"),
-        ("#!{python}\n", "it ended with code 0: without output"),
-    ],
+    ("text", "found"),
+    [("#!{python}\nraise SystemExit('out of\\nmemory')\n", "1: out of memory"), ("#!{python}\n", "0: ")],
 )
 def test_a_failing_program_is_one_line(
-    text: str, words: str, scene_copy: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+    text: str, found: str, scene_copy: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("GSMERGE_SPLAT_TRANSFORM", str(program(tmp_path, text)))
     before = listing(scene_copy)
     said = run("compact", scene_copy, "--method", "splat-transform", "--quiet")
     assert (said.code, said.out, said.err.count("\n")) == (1, "", 1)
-    assert words in said.err
+    assert found in said.err
     assert listing(scene_copy) == before
 
 
@@ -106,7 +104,7 @@ def test_missing_photos_are_one_line(scene_copy: Path, run: Run) -> None:
     shutil.rmtree(scene_copy / "images")
     said = run("compact", scene_copy, "--method", "unmerged-fit", "--quiet")
     assert (said.code, said.out, said.err.count("\n")) == (2, "", 1)
-    assert "method unmerged-fit: expected photos, found none; give --images" in said.err
+    assert says(said.err.removeprefix(ERROR), "method unmerged-fit", "photos", "--images")
 
 
 @pytest.mark.parametrize("method", method_names())
@@ -116,7 +114,7 @@ def test_a_plan_names_the_method(
     monkeypatch.setenv("GSMERGE_SPLAT_TRANSFORM", str(program(tmp_path, FAKE)))
     said = run("compact", made_scene, "--method", method, "--dry-run", "--budget", 400, code=0)
     assert (f"method     {method}; fit" in said.out) == (method != "gsmerge")
-    assert ("merging across views" in said.out) == (method == "gsmerge")
+    assert ("merging" in said.out) == (method == "gsmerge")
     document = json.loads(run("compact", made_scene, "--method", method, "--dry-run", "--json").out)
     assert document["compact"]["method"] == method
     assert document["compact"]["seconds"] > 0

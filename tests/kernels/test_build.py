@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from messages import refuses
 
 from gsmerge.kernels import build as module
 from gsmerge.kernels.build import build, compiler, find_platform, hash_sources
@@ -44,7 +45,7 @@ def test_another_compiler_can_be_named(tmp_path: Path, monkeypatch: pytest.Monke
 
 def test_a_compiler_that_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GSMERGE_CC", "no-such-compiler -O2")
-    with pytest.raises(OSError, match="GSMERGE_CC: expected a compiler, found no program 'no-such-compiler'"):
+    with refuses(OSError, "GSMERGE_CC", "'no-such-compiler'"):
         build(tmp_path)
 
 
@@ -57,7 +58,5 @@ def test_an_error_of_the_compiler_is_shown_and_nothing_is_left(tmp_path: Path) -
 def test_without_a_compiler_the_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("GSMERGE_CC", raising=False)
     monkeypatch.setitem(module.sys.modules, "ziglang", None)
-    with pytest.raises(
-        OSError, match="expected the compiler of the package ziglang, found none; run pip install ziglang"
-    ):
+    with refuses(OSError, "", "ziglang", "none"):
         compiler()

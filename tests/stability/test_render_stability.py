@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from messages import refuses
 
 from gsmerge import Cameras, Gaussians
 from gsmerge.raster import composite, contributions, plan_view, prepare, render, splat_adjoint
@@ -128,5 +129,5 @@ def test_a_very_wide_image() -> None:
     gaussians = make([[(width - 0.5) / 100, 0, 1.0]], [[1, 0, 0, 0]], [[0.01] * 3], [0.5])
     plan = plan_view(prepare(gaussians), np.eye(4), K, width, 1)
     assert composite(plan)[1][0, -1] == pytest.approx(0.5, abs=0.01)
-    with pytest.raises(ValueError, match="image size"):
+    with refuses(ValueError, "", "524273 x 1"):
         plan_view(prepare(gaussians), np.eye(4), K, width + 1, 1)

@@ -13,9 +13,11 @@ import unaligned_scenes
 from gsmerge import CompactOptions, Scene, compact
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import prepare
-from gsmerge.plan import EFFORTS, Plan, choose_networks, make_plan, resolve_fit, resolved_settings, steps_for
+from gsmerge.measure.inspect import estimate
+from gsmerge.plan import EFFORTS, Plan, choose_networks, make_plan, plan_whole, resolve_fit, steps_for
 from gsmerge.runtime.record import record_run
 from gsmerge.settings.compact import EFFORTS as NAMES
+from gsmerge.stages.segment import measure_size
 
 
 @pytest.fixture(scope="module")
@@ -197,5 +199,38 @@ def test_reports_say_what_was_settled(scene: Scene) -> None:
     assert plan.settings["fit_steps"] == plan.fit.steps
     assert "tuning" not in plan.settings
     assert "move_cameras" not in plan.settings
-    settled = resolved_settings(options_of(effort="draft"), photos=True)
+    settings = options_of(effort="draft")
+    settled = plan_whole(measure_size(scene), settings).settings(settings)
     assert (settled["match"], settled["checkpoint"]) == ("none", "none")
+
+
+SETTLED = [{}, {"budget": 200}, {"budget": "3%", "effort": "fast"}, {"budget": "30kB", "effort": "draft"}]
+OPEN = [  # merging across views decides how many there are, of at most as many
+    {"effort": "draft"}, {"effort": "fast", "k": 2}, {"superpixels": 40, "fit": "none"}, {"recipe": "paper"},
+    {"superpixels": "10%", "fit_steps": 9}, {"blocks": 2, "effort": "draft"},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("settings", SETTLED + OPEN, ids=str)
+def test_the_estimate_is_what_the_run_does(
+    settings: dict[str, Any], scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plans: list[Plan] = []
+
+    def record_plan(*arguments: Any) -> Plan:
+        plans.append(make_plan(*arguments))
+        return plans[-1]
+
+    monkeypatch.setattr("gsmerge.compaction.compact.make_plan", record_plan)
+    options = options_of(**settings)
+    run, result, whole = estimate(scene, options), compact(scene, options), plan_whole(measure_size(scene), options)
+    assert run["fit_steps"] == whole.fit.steps == result.report.options["fit_steps"]
+    assert run["blocks"] == whole.blocks == len(result.report.choices.get("blocks", "1"))
+    count = len(result.gaussians)
+    assert run["num_gaussians"] == count if settings in SETTLED else 0.5 * run["num_gaussians"] < count
+    assert count <= run["num_gaussians"]
+    for plan in plans:  # none of a scene in blocks
+        assert (plan.limits, plan.decode, plan.match.match) == (whole.limits, whole.decode, whole.match)
+        assert (plan.fit.fit, plan.fit.steps, plan.fit.share) == (whole.fit.fit, whole.fit.steps, whole.fit.share)
+        assert run["k"] == plan.decode.k
+        assert (plan.checkpoint is None) == (run["checkpoint"] == "none")

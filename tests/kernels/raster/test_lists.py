@@ -59,14 +59,14 @@ def test_sound_lists_are_taken() -> None:
 )
 @pytest.mark.parametrize("walk", range(6))
 def test_lists_outside_their_arrays_are_refused(walk: int, change: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match="expected indices inside their arrays"):
+    with pytest.raises(ValueError, match="indices"):
         walks(lists(**change))[walk]()
 
 
 @pytest.mark.parametrize("span", [(-1, 2), (0, 5), (0, 1 << 62)])
 @pytest.mark.parametrize("walk", [0, 1, 4])
 def test_tiles_that_are_not_there_are_refused(walk: int, span: tuple[int, int]) -> None:
-    with pytest.raises(ValueError, match="expected indices inside their arrays"):
+    with pytest.raises(ValueError, match="indices"):
         walks(lists(), *span)[walk]()
 
 

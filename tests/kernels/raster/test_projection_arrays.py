@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from messages import refuses
 
 from gsmerge.kernels.raster import harmonics, image_loss, project, project_backward
 
@@ -167,7 +168,7 @@ def test_indices_outside_are_refused(wrong: int, place: int) -> None:
         ),
     ]
     for call in calls:
-        with pytest.raises(ValueError, match="expected indices inside their arrays"):
+        with pytest.raises(ValueError, match="indices"):
             call()
 
 
@@ -175,11 +176,11 @@ def test_ranges_outside_are_refused() -> None:
     c, eye, colors = columns_of(10), np.zeros(3, np.float32), np.zeros((10, 3), np.float32)
     ids = np.arange(10, dtype=np.int32)
     for first, last in ((-1, 5), (0, 11), (7, 6)):
-        with pytest.raises(ValueError, match="expected values"):
+        with refuses(ValueError, f"view_colors: {'first' if first < 0 else 'last'}", first if first < 0 else last):
             harmonics.view_colors(c["means"], c["sh0"], c["shN"], ids, eye, first, last, colors)
     head = c["means"], c["quats"], c["scales"], c["opacities"], ids, np.zeros((10, 9), np.float32), camera_of()
     results = colors, np.zeros((10, 4), np.float32), colors, np.zeros(10, np.float32), None
-    with pytest.raises(ValueError, match="indices inside"):  # a range of blocks begins at one
+    with refuses(ValueError, "project_backward", "indices"):  # a range of blocks begins at one
         project_backward.project_backward(*head, 1, 5, *results)
 
 
@@ -215,5 +216,5 @@ def test_memory_of_the_loss_that_is_too_small_is_refused() -> None:
     image, weight = np.zeros((4, 9), np.float32), np.zeros((4, 3), np.float32)
     terms, rows = (np.empty((*shape, image_loss.CHUNK), np.float32) for shape in ((12, 3), (7,)))
     outputs = image.copy(), weight[:, 0].copy(), terms, rows
-    with pytest.raises(ValueError, match="indices inside"):
+    with refuses(ValueError, "loss_gradient", "indices"):
         image_loss._loss_gradient(image, image, weight, 0.2, 1.2, 0, 4, *outputs)

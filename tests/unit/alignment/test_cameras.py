@@ -9,6 +9,7 @@ from pathlib import Path
 import motions
 import numpy as np
 import pytest
+from messages import refuses
 from tiny_scene import Tiny, make_tiny
 
 from gsmerge import compact_tensors
@@ -62,20 +63,15 @@ def test_cameras_that_fit_stay_bit_for_bit(large: Tiny) -> None:
 
 
 @pytest.mark.parametrize(
-    ("factor", "shift", "words"),
-    [
-        (1, 4, "multiply fx by 1 and fy by 1, and add -4.0"),
-        (1, 8, "multiply fx by 1 and fy by 1, and add -8.0"),
-        (1.05, 0, "multiply fx by 0.952"),
-        (0.92, 0, "multiply fx by 1.087"),
-    ],
+    ("factor", "shift", "found"),
+    [(1, 4, "-4.00 to cx"), (1, 8, "-8.00 to cx"), (1.05, 0, "fx by 0.9523"), (0.92, 0, "fx by 1.087")],
 )
-def test_intrinsics_that_are_off_are_no_poses_that_are(factor: float, shift: float, words: str, large: Tiny) -> None:
+def test_intrinsics_that_are_off_are_no_poses_that_are(factor: float, shift: float, found: str, large: Tiny) -> None:
     pairs = sample_pixels(large.gaussians, cameras_of(large), np.ones(len(large.gaussians), bool))
     cameras = cameras_of(large)
     Ks = cameras.Ks * np.array([[factor, 1, 1], [1, factor, 1], [1, 1, 1]])
     Ks[:, 0, 2] += shift
-    with pytest.raises(SceneError, match=words):
+    with refuses(SceneError, "Ks", found):
         move_cameras(pairs, replace(cameras, Ks=Ks), NAMES)
 
 
@@ -84,7 +80,7 @@ def test_a_file_with_other_intrinsics_is_refused_with_the_remedy(large: Tiny, tm
     cameras.Ks[:, 0, 2] += 4
     large.save(tmp_path)
     write_transforms(tmp_path / "transforms.json", cameras, large.names)
-    with pytest.raises(SceneError, match=r"transforms.json: expected intrinsics .* add -4.0") as error:
+    with refuses(SceneError, "transforms.json", "4.0 px", "-4.00") as error:
         load_scene(tmp_path)
     assert "\n" not in str(error.value)
 
@@ -108,7 +104,7 @@ def test_a_file_whose_cameras_are_off_is_read_with_a_note(large: Tiny, tmp_path:
     assert pose_changes(large.w2c, load.scene.cameras.viewmats)[0].max() < 0.05
     assert sum("the cameras are off by a median of up to" in note for note in load.notes) == 1
     assert len(load.moves) == 3
-    with pytest.raises(SceneError, match=r"within 1.5 px of their own pixels, found a median of up to") as error:
+    with refuses(SceneError, "transforms.json", "1.5 px", "median") as error:
         load_scene(save_with(large, tmp_path / "far", off(large, 8.0, 0.02)))
     assert "\n" not in str(error.value)
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from batches import QUICK, records
+from messages import refuses
 
 from gsmerge.batch import BatchOptions, Job
 from gsmerge.batch import schedule as runs
@@ -145,7 +146,7 @@ def test_what_others_work_on_comes_last(context: BatchContext, monkeypatch: pyte
 
 
 def test_a_batch_that_cannot_record_ends(context: BatchContext) -> None:
-    with pytest.raises(SceneError, match=r"batch\.jsonl: the batch cannot go on: told so"):
+    with refuses(SceneError, "batch.jsonl", "told so"):
         handed_out(Script({"1": [STUCK]}), context, 3)
 
 

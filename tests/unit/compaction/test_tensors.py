@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from messages import refuses
 from scenes import FIELDS, arc, make_scene, move, room
 
 from gsmerge import CompactResult, Gaussians, Scene, SceneError, compact, compact_tensors
@@ -94,7 +95,7 @@ def test_gaussians_of_no_pixels(scene: Scene) -> None:
     assert 0 < len(small.gaussians) < len(rows)
     bare = {name: given[name] for name in FIELDS}
     assert len(compact_tensors(**bare, order="none", **FAST).cameras) == 0
-    with pytest.raises(SceneError, match=r"^viewmats: .*camera-to-world .*; pass their inverse"):
+    with refuses(SceneError, "viewmats", "camera-to-world", "inverse"):
         compact_tensors(**given | {"viewmats": np.linalg.inv(given["viewmats"])}, order="none", **FAST)
 
 
@@ -143,33 +144,33 @@ def test_a_wrong_convention_is_named(scene: Scene, name: str, change: Change, wo
 
 def test_colors_of_bytes_and_channel_major_harmonics_are_named(scene: Scene) -> None:
     colors = 255 * sh0_to_rgb(scene.gaussians.sh0[:, 0]).clip(0, 1)
-    with pytest.raises(SceneError, match=r"^colors: .*pass colors / 255"):
+    with refuses(SceneError, "colors", "colors / 255"):
         compact_tensors(**tensors_of(scene, sh0=None, colors=colors), **FAST)
     with pytest.raises(SceneError, match=r"^shN: .*transpose"):
         compact_tensors(**tensors_of(scene, shN=np.zeros((len(colors), 3, 8))), **FAST)
     for more in ({"colors": colors}, {"sh0": None}):
-        with pytest.raises(SceneError, match=r"^sh0: expected either sh0 or colors"):
+        with refuses(SceneError, "sh0", "colors"):
             compact_tensors(**tensors_of(scene, **more), **FAST)
 
 
 def test_wrong_sizes_are_named(scene: Scene) -> None:
-    with pytest.raises(SceneError, match=r"^means: expected one Gaussian per pixel, 3 x 35 x 48 = 5040"):
+    with refuses(SceneError, "means", 5040, 5184):
         compact_tensors(**tensors_of(scene, images=None), shape=(3, 35, 48), **FAST)
-    with pytest.raises(SceneError, match=r"^shape: .*found neither"):
+    with refuses(SceneError, "shape", "neither"):
         compact_tensors(**tensors_of(scene, images=None), **FAST)
-    with pytest.raises(SceneError, match=r"^images: expected shape \[3, 35, 48, 3\], found \[3, 36, 48, 3\]"):
+    with refuses(SceneError, "images", [3, 35, 48, 3], [3, 36, 48, 3]):
         compact_tensors(**tensors_of(scene), shape=(3, 35, 48), **FAST)
-    with pytest.raises(SceneError, match=r"^shape: expected views, height and width, found \[36, 48\]"):
+    with refuses(SceneError, "shape", [36, 48]):
         compact_tensors(**tensors_of(scene), shape=(36, 48), **FAST)
-    with pytest.raises(SceneError, match=r"^viewmats: expected one matrix for each view, found none"):
+    with refuses(SceneError, "viewmats", "none"):
         compact_tensors(**tensors_of(scene, viewmats=None, Ks=None), order="none", **FAST)
-    with pytest.raises(SceneError, match=r"^names: expected 3 names"):
+    with refuses(SceneError, "names", 3, 1):
         compact_tensors(**tensors_of(scene), names=["a"], **FAST)
-    with pytest.raises(SceneError, match=r"^quats: expected an array or tensor of numbers, found str"):
+    with refuses(SceneError, "quats", "str"):
         compact_tensors(**tensors_of(scene, quats="wxyz"), **FAST)
-    with pytest.raises(SceneError, match=r"^means: expected finite Gaussians, .* in all 5,184 rows"):
+    with refuses(SceneError, "means", "5,184 rows"):
         compact_tensors(**changed(scene, "scales", lambda s: s * np.nan), **FAST)
-    with pytest.raises(ValueError, match="order: expected one of"):
+    with refuses(ValueError, "order", "'layers'"):
         compact_tensors(**tensors_of(scene), order="layers", **FAST)
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
+from messages import refuses
 
 from gsmerge.facts.views import (
     MAX_SCORED_VIEWS,
@@ -31,7 +32,7 @@ def test_even_views(num_views: int, count: int, expected: list[int]) -> None:
 
 @pytest.mark.parametrize("count", [0, 6])
 def test_more_views_than_there_are(count: int) -> None:
-    with pytest.raises(ValueError, match="expected 1 to 5"):
+    with refuses(ValueError, "views", "1 to 5"):
         even_views(5, count)
 
 

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import scenes
 import torch
+from messages import refuses
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 import gsmerge
@@ -130,22 +131,20 @@ def test_threads_do_not_matter(threads: int, scene: Scene, half: Gaussians, actu
 
 
 def test_bad_arguments(scene: Scene, half: Gaussians) -> None:
-    with pytest.raises(ValueError, match="vgg or alex"):
+    with refuses(ValueError, "lpips", "squeeze"):
         EvaluateOptions(lpips=("squeeze",))
-    with pytest.raises(ValueError, match="at least 1"):
+    with refuses(ValueError, "lpips_views", 1, 0):
         EvaluateOptions(lpips_views=0)
-    with pytest.raises(ValueError, match="other than 'input'"):
+    with refuses(ValueError, "results", "'input'"):
         evaluate(scene, {INPUT: half}, None, PLAIN)
     empty = Scene(half, scene.cameras[[]], None, None, ())
-    with pytest.raises(ValueError, match="a scene with views"):
+    with refuses(ValueError, "", "views", "none"):
         evaluate(empty, {}, None, PLAIN)
 
 
-@pytest.mark.parametrize(
-    ("zoom", "words"), [((0.01,), "0.0625 to 16"), ((), "got none"), ((1, 2, 2), "once"), ((math.nan,), "got nan")]
-)
-def test_bad_zooms(zoom: tuple[float, ...], words: str) -> None:
-    with pytest.raises(ValueError, match=words):
+@pytest.mark.parametrize(("zoom", "found"), [((0.01,), 0.01), ((), "none"), ((1, 2, 2), "1,2,2"), ((math.nan,), "nan")])
+def test_bad_zooms(zoom: tuple[float, ...], found: object) -> None:
+    with refuses(ValueError, "zoom", found):
         EvaluateOptions(zoom=zoom)
 
 
@@ -232,7 +231,7 @@ def test_a_photo_side_without_photos(scene: Scene, half: Gaussians) -> None:
 
 @pytest.mark.parametrize("side", [-1, 476.5])
 def test_bad_photo_sides(side: float) -> None:
-    with pytest.raises(ValueError, match=r"photo_side: expected (a whole number, )?at least 0 pixels"):
+    with refuses(ValueError, "photo_side", side):
         EvaluateOptions(photo_side=side)  # type: ignore[arg-type]
 
 
@@ -271,9 +270,9 @@ def test_documents_have_zooms_where_they_were_asked_for(scene: Scene, actual: Ev
 
 @pytest.mark.parametrize("align", [("colour",), ("pose", "pose")])
 def test_bad_alignments(align: tuple[str, ...], scene: Scene) -> None:
-    with pytest.raises(ValueError, match=r"align: expected (color or pose|every value once), got"):
+    with refuses(ValueError, "align", ",".join(align)):
         EvaluateOptions(align=align)
-    with pytest.raises(ValueError, match="held-out views"):
+    with refuses(ValueError, "align", "held-out", "none"):
         evaluate(scene, {}, None, replace(PLAIN, align=("color",)))
 
 

@@ -18,6 +18,7 @@ from hostile.gsm_files import (
     with_array,
     with_header,
 )
+from messages import refuses
 from network_fixtures import SMALL, Made, made, noisy, scaled, written
 from unaligned_scenes import loosened
 from view_batches import FAST, fed, parts_of, room, same_state, state_of
@@ -110,7 +111,7 @@ def test_children_are_those_of_the_heads(whole: Compactor) -> None:
     most = [int(np.minimum(sizes, k).sum()) for k in (1, 2, 4)]
     assert all(0.5 * limit < count <= limit for count, limit in zip(counts, most, strict=True))
     assert len(whole.decode(k=3, fit="none")) > counts[1]
-    with pytest.raises(UsageError, match="expected 1 to 4"):
+    with refuses(UsageError, "k", "1 to 4", 5):
         whole.decode(k=5)
 
 
@@ -286,8 +287,7 @@ def test_other_networks_are_refused(
     name: str, pairs: Compactor, scene: Scene, absolute: dict[str, Any], checkpoints: dict[str, str]
 ) -> None:
     other = options_of(absolute | {"checkpoint": checkpoints.get(name, name)})
-    words = "expected the networks that made the state .*leave the checkpoint out, or begin a new state"
-    with pytest.raises(UsageError, match=words):
+    with refuses(UsageError, f"checkpoint {checkpoints.get(name, name)}", "state", absolute["checkpoint"]):
         extend(state_of(pairs), scene, other)
 
 
@@ -298,7 +298,7 @@ def test_networks_of_another_name_may_be_the_same(
     copy.write_bytes(Path(absolute["checkpoint"]).read_bytes())
     _, report = extend(state_of(pairs), scenes.take_views(scene, [0]), options_of(absolute | {"checkpoint": str(copy)}))
     assert report.notes == ()
-    with pytest.raises(SceneError, match="expected a checkpoint, found no such file"):
+    with refuses(SceneError, "missing.safetensors", "checkpoint"):
         extend(state_of(pairs), scene, options_of(absolute | {"checkpoint": str(tmp_path / "missing.safetensors")}))
 
 

@@ -24,6 +24,7 @@ from hostile.gsm_files import (
     with_text,
     without,
 )
+from messages import refuses
 from safetensors.numpy import load_file, save_file
 from unaligned_scenes import far_behind, shuffled
 from view_batches import fed, parts_of, room, same_state, state_of
@@ -145,5 +146,5 @@ def test_damage_is_told_in_one_line(damage: str, path: Path) -> None:
 
 def test_a_newer_schema_says_what_to_do(path: Path) -> None:
     DAMAGED["a newer schema"](path)
-    with pytest.raises(SceneError, match=r"expected schema 1, found 2; written by gsmerge 9\.9; this is .*, update it"):
+    with refuses(SceneError, path, 1, 2, 9.9):
         load_state(path)

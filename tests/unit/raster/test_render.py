@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from messages import refuses
 
 from gsmerge import Cameras, Gaussians
 from gsmerge.raster import composite, contributions, plan_view, prepare, render, render_in_turn, splat_adjoint
@@ -173,13 +174,13 @@ def test_every_view_has_its_own_image() -> None:
 
 def test_messages() -> None:
     gaussians, splats, K = balls((0, 0, 1, 0.02, 0.8, 1.0)), prepare(balls((0, 0, 1, 0.02, 0.8, 1.0))), camera().Ks[0]
-    with pytest.raises(ValueError, match="background of 1 or 3 numbers"):
+    with refuses(ValueError, "", "background", (0.1, 0.2)):
         render(gaussians, camera(), (0.1, 0.2))
     with pytest.raises(ValueError, match="0 < near < far"):
         render(gaussians, camera(), near=0)
     with pytest.raises(ValueError, match="0 < near < far"):
         render(gaussians, camera(), near=2, far=1)
-    with pytest.raises(ValueError, match=r"\[4,4\] view matrix"):
+    with pytest.raises(ValueError, match=r"\[4,4\]"):
         plan_view(splats, np.eye(3), K, 21, 11)
     with pytest.raises(ValueError, match="image size"):
         plan_view(splats, np.eye(4), K, 0, 11)
@@ -187,12 +188,12 @@ def test_messages() -> None:
         plan_view(splats, np.eye(4), -np.eye(3), 21, 11)
     with pytest.raises(ValueError, match="1 opacities"):
         plan_view(splats, np.eye(4), K, 21, 11, opacities=np.ones(2))
-    with pytest.raises(ValueError, match="keep flags"):
+    with pytest.raises(ValueError, match="got 1 and 2"):
         plan_view(splats, np.eye(4), K, 21, 11, keep=np.ones(2, bool))
     plan = plan_view(splats, np.eye(4), K, 21, 11)
-    with pytest.raises(ValueError, match=r"colors: expected shape \[1, 3\]"):
+    with refuses(ValueError, "colors", [1, 3], [2, 3]):
         composite(plan, np.ones((2, 3)))
-    with pytest.raises(ValueError, match="image: expected shape"):
+    with pytest.raises(ValueError, match="image: "):
         splat_adjoint(plan, np.ones((11, 20, 3)))
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scenes
+from messages import refuses
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import project
@@ -179,8 +180,8 @@ def test_wrong_conventions_that_are_believed_are_noticed(load: SceneLoad, monkey
 
 
 def test_bad_arguments(load: SceneLoad) -> None:
-    with pytest.raises(ValueError, match="cases: expected some of unchanged"):
+    with refuses(ValueError, "cases", "unchanged"):
         stress(load, FAST, cases=["nonsense"])
     bare = Scene(load.scene.gaussians, load.scene.cameras[[]], None, None, ())
-    with pytest.raises(ValueError, match="a scene with views"):
+    with refuses(ValueError, "", "views", "none"):
         stress(replace(load, scene=bare), FAST)

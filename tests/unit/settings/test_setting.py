@@ -52,7 +52,7 @@ class Example(Settings):
         ("switch", "no", "true or false, got 'no'"),
         ("sizes", (), "at least one value, got none"),
         ("sizes", (2, 0), "at least 1, got 0"),
-        ("sizes", (2, 2), "every value once, got 2, 2"),
+        ("sizes", (2, 2), "every value once, got 2,2"),
     ],
 )
 def test_impossible_values_are_refused(name: str, value: Any, expected: str) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from messages import refuses
 
 from gsmerge import Gaussians
 from gsmerge.cli import main
@@ -184,7 +185,7 @@ def test_more_gaussians_than_its_bytes_can_describe(version: int, tmp_path: Path
         content += bytes(20 * count // 1000)  # so that it is not refused for its ratio alone
     path = tmp_path / "a.spz"
     path.write_bytes(content)
-    with pytest.raises(SceneError, match=r"at most 1,000,000 Gaussians in .* bytes, found 1,000,001 promised"):
+    with refuses(SceneError, "a.spz", "1,000,000", "1,000,001"):
         read_gaussians(path)
 
 
@@ -195,7 +196,7 @@ def test_a_wrong_version_leaks_no_warning(tmp_path: Path) -> None:
 
 
 def test_another_version_is_refused() -> None:
-    with pytest.raises(ValueError, match="spz_version: expected 3 or 4, got 2"):
+    with refuses(ValueError, "spz_version", "3 or 4", 2):
         spz_bytes(some(0), version=2)
 
 
