@@ -23,25 +23,16 @@ class BatchOptions(Settings):
     settings: CompactOptions = setting(CompactOptions(), "Of each scene; no threads, which are processors by jobs.")
     opacity: OpacityChoice = setting("auto", "How all files store opacity.")
     hints: ReadHints = setting(ReadHints(), "What is known of all files and need not be recognised.")
-    cameras: str | None = setting(
-        None,
-        "Cameras: one path for all scenes, or with {scene}, {parent} and {stem} of each in it.",
-        "By default those beside each scene.",
-    )
+    cameras: str | None = setting(None, "Cameras: one path for all scenes, or with {scene}, {parent} and {stem} of "
+        "each in it.",
+        "By default those beside each scene.")  # fmt: skip
     images: str | None = setting(None, "Folder of the photos, in the same way.")
-    output: str = setting(
-        "{stem}.ply",
-        "Name of a result in the output folder: {stem} (the scene's name), {parent} (the folder it is in), {index} "
-        "(its place in the list, from 0) and {k} are filled in; its ending says the format.",
-    )
+    output: str = setting("{stem}.ply", "Name of a result in the output folder: {stem} (the scene's name), {parent} "
+        "(the folder it is in), {index} (its place in the list, from 0) and {k} are filled in; its ending says the "
+        "format.")  # fmt: skip
     jobs: int | None = setting(None, "Scenes at once.", "By default as many as processors and memory allow.", least=1)
-    max_memory: int | None = setting(
-        None,
-        "Memory that all scenes at once may take.",
-        "By default what is free, which is also the limit on the nodes of Ray.",
-        least=1,
-        unit="bytes",
-    )
+    max_memory: int | None = setting(None, "Memory that all scenes at once may take.",
+        "By default what is free, which is also the limit on the nodes of Ray.", least=1, unit="bytes")  # fmt: skip
     timeout: float | None = setting(None, "Seconds that a scene may take.", above=0, unit="seconds")
     retries: int = setting(1, "How often a scene is tried again whose process died or took too long.", least=0)
     rerun: bool = setting(False, "Compact scenes again that are done.")

@@ -22,20 +22,13 @@ if TYPE_CHECKING:
 class FileOptions(Settings):
     """How a result is written."""
 
-    normals: bool = setting(
-        True,
-        "Write the three columns of zeros that some viewers want of a `.ply`, 12 of its 68 bytes per Gaussian; a "
-        "`budget` in bytes counts them.",
-    )
-    spz_version: int = setting(
-        3,
-        "Version of a `.spz`: 3, which most programs read, or 4, with room for harmonics of degree 4.",
-        "The latter needs `gsmerge[spz4]`.",
-        choices=(3, 4),
-    )
-    viewer_cameras: bool = setting(
-        True, "Write the input views beside the result of `compact`, as `NAME.cameras.json` for viewers."
-    )
+    normals: bool = setting(True, "Write the three columns of zeros that some viewers want of a `.ply`, 12 of its 68 "
+        "bytes per Gaussian; a `budget` in bytes counts them.")  # fmt: skip
+    spz_version: int = setting(3, "Version of a `.spz`: 3, which most programs read, or 4, with room for harmonics of "
+        "degree 4.",
+        "The latter needs `gsmerge[spz4]`.", choices=(3, 4))  # fmt: skip
+    viewer_cameras: bool = setting(True, "Write the input views beside the result of `compact`, as `NAME.cameras.json` "
+        "for viewers.")  # fmt: skip
 
 
 def default_output(ply: Path) -> Path:

@@ -21,28 +21,16 @@ AUTO = "auto"
 class BudgetOptions(Settings):
     """Settings that decide the number of Gaussians, next to superpixels per view and K."""
 
-    budget: int | str | None = setting(
-        None,
-        "Gaussians in the result: a number, a share such as 2% of the input, or a size such as 5MB, met exactly; "
-        "quest3, mobile or desktop: at most what it draws fluidly; auto: as many as the scene needs.",
-        "A size is that of the `.ply` and never exceeded.",
-        metavar="40000|2%|5MB|DEVICE|auto",
-    )
-    quality: str | None = setting(
-        None,
-        "Fewest Gaussians that render the input photos at a PSNR such as 30dB, or that lose at most so much against "
-        "the best, such as -0.2dB.",
-        "The best is what the scene's own curve reaches.",
-        metavar="30dB|-0.2dB",
-    )
-    levels: int = setting(
-        1,
-        "Levels of detail, each in a file of its own or all in a lod-meta.json, with a quarter of the Gaussians of the "
-        "one before.",
-        "Each is fitted by itself.",
-        least=1,
-        most=8,
-    )
+    budget: int | str | None = setting(None, "Gaussians in the result: a number, a share such as 2% of the input, or a "
+        "size such as 5MB, met exactly; quest3, mobile or desktop: at most what it draws fluidly; auto: as many as the "
+        "scene needs.",
+        "A size is that of the `.ply` and never exceeded.", metavar="40000|2%|5MB|DEVICE|auto")  # fmt: skip
+    quality: str | None = setting(None, "Fewest Gaussians that render the input photos at a PSNR such as 30dB, or that "
+        "lose at most so much against the best, such as -0.2dB.",
+        "The best is what the scene's own curve reaches.", metavar="30dB|-0.2dB")  # fmt: skip
+    levels: int = setting(1, "Levels of detail, each in a file of its own or all in a lod-meta.json, with a quarter of "
+        "the Gaussians of the one before.",
+        "Each is fitted by itself.", least=1, most=8)  # fmt: skip
 
     def __post_init__(self) -> None:
         super().__post_init__()

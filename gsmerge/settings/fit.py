@@ -70,66 +70,31 @@ class FitOptions(Settings):
     """Settings of the fit to the photos."""
 
     fit: Fit = setting("full", "What is fitted to the photos.", "`full`: all parameters; `none`: nothing.")
-    fit_steps: int | None = setting(
-        None,
-        "Steps of the full fit, one view each.",
-        f"By default {STEPS}, and by effort and numbers of views and Gaussians.",
-        least=1,
-    )
-    time_budget: float | None = setting(
-        None,
-        "Seconds after which the full fit stops.",
+    fit_steps: int | None = setting(None, "Steps of the full fit, one view each.",
+        "By default 320, and by effort and numbers of views and Gaussians.", least=1)  # fmt: skip
+    time_budget: float | None = setting(None, "Seconds after which the full fit stops.",
         "The steps are then chosen from the measured time of the first ones, and the result is no longer the same on "
-        "every machine. By default there is no limit.",
-        above=0,
-        unit="seconds",
-    )
-    photo_scale: float | Literal["auto"] = setting(
-        "auto",
-        "Times the views' size at which two of every five steps after those on half-size photos look at larger photos, "
-        "as far as the photos are that large.",
+        "every machine. By default there is no limit.", above=0, unit="seconds")  # fmt: skip
+    photo_scale: float | Literal["auto"] = setting("auto", "Times the views' size at which two of every five steps "
+        "after those on half-size photos look at larger photos, as far as the photos are that large.",
         "`auto`: up to 2 with effort `default` and `best` where the photos are at least 1.25 times as large, on the "
-        "CPU; 1 otherwise.",
-        least=1,
-        below=math.inf,
-    )
-    dropout: float | None = setting(
-        None,
-        "Share of the Gaussians that a step leaves out.",
+        "CPU; 1 otherwise.", least=1, below=math.inf)  # fmt: skip
+    dropout: float | None = setting(None, "Share of the Gaussians that a step leaves out.",
         "By default 0.1 for five views or fewer and 150 steps or more, where the fit would memorise the photos, "
-        "otherwise 0.05 from 600 steps and 30 looks at each view on, and 0 below.",
-        least=0,
-        below=1,
-    )
-    half_res_share: float | None = setting(
-        None,
-        "Share of the steps on half-size photos.",
+        "otherwise 0.05 from 600 steps and 30 looks at each view on, and 0 below.", least=0, below=1)  # fmt: skip
+    half_res_share: float | None = setting(None, "Share of the steps on half-size photos.",
         "By default 0.7, from 600 steps on 0.5, below 20 all; less for more than 4.4 % of the Gaussians, and 0.1 less "
-        "where `photo_scale` is above 1.",
-        least=0,
-        most=1,
-    )
-    holdout: float = setting(
-        0.05, "Share of the photos' blocks that decides whether a fit is accepted.", above=0, below=1
-    )
-    min_contribution: float = setting(
-        1 / 255,
-        "Least blending weight at some pixel of some photo; Gaussians below it in all photos that they lie in are left "
-        "out.",
-        least=0,
-        most=1,
-    )
-    judged: bool = setting(
-        True,
-        "Whether the result has to show held-out blocks better than its start; not where the start has seen them.",
-        internal=True,
-    )
-    move_cameras: bool = setting(
-        False, "Whether the full fit moves the cameras on; a plan decides it by `poses`.", internal=True
-    )
-    share: float | None = setting(
-        None, "Gaussians of the result for each pixel; a plan knows it.", "By default 0.044.", internal=True
-    )
+        "where `photo_scale` is above 1.", least=0, most=1)  # fmt: skip
+    holdout: float = setting(0.05, "Share of the photos' blocks that decides whether a fit is accepted.", above=0,
+        below=1)  # fmt: skip
+    min_contribution: float = setting(1 / 255, "Least blending weight at some pixel of some photo; Gaussians below it "
+        "in all photos that they lie in are left out.", least=0, most=1)  # fmt: skip
+    judged: bool = setting(True, "Whether the result has to show held-out blocks better than its start; not where the "
+        "start has seen them.", internal=True)  # fmt: skip
+    move_cameras: bool = setting(False, "Whether the full fit moves the cameras on; a plan decides it by `poses`.",
+        internal=True)  # fmt: skip
+    share: float | None = setting(None, "Gaussians of the result for each pixel; a plan knows it.",
+        "By default 0.044.", internal=True)  # fmt: skip
     tuning: Tuning = setting(Tuning(), "Constants.", internal=True)
 
     @property

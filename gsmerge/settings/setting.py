@@ -11,6 +11,7 @@ from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
 from inspect import cleandoc
 from math import inf
 from numbers import Integral, Real
+from operator import ge, gt, le, lt
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -90,12 +91,9 @@ class Setting:
     def _in_range(self, value: Any) -> bool:
         if self.choices:
             return value is None or value in self.words
-        return not isinstance(value, Real) or bool(
-            (self.least is None or value >= self.least)
-            and (self.most is None or value <= self.most)
-            and (self.above is None or value > self.above)
-            and (self.below is None or value < self.below)
-        )
+        is_number = isinstance(value, Real)
+        limits = ((self.least, ge), (self.most, le), (self.above, gt), (self.below, lt))
+        return all(bool(holds(value, limit)) for limit, holds in limits if is_number and limit is not None)
 
     def values(self, *, null: bool = True) -> str:
         """Describe the possible values: listed ones, a range, or a kind of value; ``null``: whether None is one."""
