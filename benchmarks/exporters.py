@@ -21,7 +21,7 @@ from shared_scenes import Targets, exporter, read_held_out, scene_folders
 
 import gsmerge
 from gsmerge.alignment import Recovery
-from gsmerge.scene.read import SceneLoad, load_scene
+from gsmerge.scene.read import Loaded, load_scene
 
 STYLES: dict[str, tuple[str, float]] = {
     "plain": ("plain", 1.0),
@@ -83,7 +83,7 @@ def export_volsplat(scene: Path, out: Path, max_views: int | None) -> Path:
     return ply
 
 
-def share_at_home(loaded: SceneLoad, truth: Truth | None) -> float:
+def share_at_home(loaded: Loaded, truth: Truth | None) -> float:
     """Share of the file's rows that were put to their own pixel; NaN where there is no truth or no pixels."""
     if loaded.recovery is None or truth is None:
         return float("nan")
@@ -132,7 +132,7 @@ def _targets(scene: Path, recovery: Recovery | None, nested: float) -> Targets:
 
 def _line(row: dict[str, Any]) -> str:
     cells = [f"{row['scene']:<11}{row['style']:<12}{row['views']!s:>5}", f"{row['seconds']:7.1f} CPU s"]
-    cells.append("pixels" if row["aligned"] else "loose ")
+    cells.append("pixels" if row["aligned"] else "unaligned ")
     cells.append(f"{100 * row['at home']:8.3f} % at home, margin {row['margin']:7.0f}")
     if "psnr" in row:
         cells.append(f"kept {100 * row['kept']:.2f} %, {row['psnr']:.2f} dB")

@@ -19,7 +19,7 @@ from shared_scenes import export
 
 import gsmerge
 from gsmerge.facts.views import pick_views
-from gsmerge.io.formats.writing import file_bytes
+from gsmerge.io.formats.ply import file_bytes
 from gsmerge.measure.evaluate import EvaluateOptions, evaluate, near_plane
 from gsmerge.measure.lpips import lpips
 from gsmerge.measure.sizes import shrink_cameras, shrink_views

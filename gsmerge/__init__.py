@@ -62,7 +62,7 @@ _PUBLIC = {
     "encoded.to_gaussians": ("decode_scene",),
     "errors": ("GsmergeError", "SceneError"),
     "io": ("read_cameras", "read_gaussians", "read_ply", "to_cameras"),
-    "io.formats.writing": ("write_gaussians", "write_levels", "write_ply"),
+    "io.formats.write": ("write_gaussians", "write_levels", "write_ply"),
     "measure.evaluate": ("Evaluation", "evaluate"),
     "measure.inspect": ("inspect",),
     "online.compactor": ("Compactor",),

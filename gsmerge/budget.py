@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gsmerge.io.formats.writing import count_for_bytes
+from gsmerge.io.formats.ply import count_for_bytes
 from gsmerge.settings.budget import AUTO, DEVICES, BudgetOptions, parse_budget, parse_bytes
 
 

@@ -9,17 +9,18 @@ from pathlib import Path
 from gsmerge.encoded.encoded import Encoded
 from gsmerge.encoded.gsm_file import ENCODED, STATE, SUFFIX, read_gsm, wrong_checksums
 from gsmerge.errors import SceneError
-from gsmerge.io import ply_notes, read_cameras, read_gaussians
-from gsmerge.io.cameras.read import find_cameras, read_sharp
-from gsmerge.io.formats import ply_file, spz, streamed
-from gsmerge.io.formats.ply import SCENE_SUFFIXES, PlyInfo, read_level
+from gsmerge.io import file_notes, read_cameras, read_gaussians
+from gsmerge.io.cameras.read import CAMERA_ENDINGS, find_cameras, read_sharp_camera
+from gsmerge.io.formats import ply, spz, streamed
+from gsmerge.io.formats.read import FileInfo, read_level
+from gsmerge.io.formats.table import SCENE_SUFFIXES
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.online.file import load_stored
 from gsmerge.report import human_bytes
 from gsmerge.scene.files import named_ply, other_plys
 
 NETWORKS = ".safetensors"
-CAMERAS = (".json", ".npz", ".torch", ".txt", ".bin")
+CAMERAS = (*CAMERA_ENDINGS, ".bin")
 ARCHIVES = (".sog", ".npz")
 
 
@@ -73,12 +74,12 @@ def _read(path: Path) -> FileCheck:
         return _read_levels(path)
     if suffix == NETWORKS:
         return FileCheck(str(path), "networks", load_checkpoint(path).networks.num_parameters)
-    ply = named_ply(path) or next(iter(other_plys(path)), None) if path.is_dir() else None
-    if ply is not None:  # a scene
+    gaussians = named_ply(path) or next(iter(other_plys(path)), None) if path.is_dir() else None
+    if gaussians is not None:  # a scene
         cameras_path = find_cameras(path)
         if cameras_path is not None:
-            read_cameras(cameras_path, scene=ply.stem)
-        return replace(_read(ply), path=str(path))
+            read_cameras(cameras_path, scene=gaussians.stem)
+        return replace(_read(gaussians), path=str(path))
     if path.is_dir() or suffix in CAMERAS:
         cameras = read_cameras(path)
         return FileCheck(str(path), "cameras", len(cameras), cameras.source)
@@ -90,11 +91,11 @@ def _read(path: Path) -> FileCheck:
     if suffix == ".spz":
         problems += [problem for problem in [spz.problem_at_end(path)] if problem]
     elif suffix == ".ply":
-        read_sharp(path)
-        left = ply_file.bytes_after_rows(path)
+        read_sharp_camera(path)
+        left = ply.bytes_after_rows(path)
         behind = f"{left:,} bytes after the last of {info.count:,} rows, which nothing reads"
         problems += [behind] if left else []
-    notes = [note for note in ply_notes(info) if "opacit" in note]
+    notes = [note for note in file_notes(info) if "opacit" in note]
     facts = (str(path), "Gaussians", info.count, info.layout)
     return FileCheck(*facts, problems=tuple(problems), notes=tuple(notes))
 
@@ -107,7 +108,7 @@ def _read_levels(path: Path) -> FileCheck:
     return FileCheck(str(path), "Gaussians", infos[0].count, infos[0].layout, beside, tuple(problems))
 
 
-def _problems(info: PlyInfo) -> list[str]:
+def _problems(info: FileInfo) -> list[str]:
     """Describe the rows that a reader sets aside or changes."""
     extreme = "Gaussian(s) with a log scale beyond +-30 or a harmonic beyond +-1e6"
     counted = {

@@ -45,7 +45,7 @@ from gsmerge.alignment.unaligned import find_padding as find_padding
 from gsmerge.errors import SceneError
 from gsmerge.geometry import IDENTITY, Similarity
 from gsmerge.io.cameras.camera_file import CameraFile
-from gsmerge.io.formats.ply import PlyScene
+from gsmerge.io.formats.read import GaussianFile as PlyScene
 from gsmerge.io.image_names import natural_key
 from gsmerge.io.photo_files import Photos, PhotoTransform, Size, as_floats, photo_size
 from gsmerge.runtime.memory import free_pages

@@ -21,7 +21,7 @@ from gsmerge.alignment.score import MARGIN, Correspondences, find_correspondence
 from gsmerge.alignment.unaligned import CameraCheck, check_cameras
 from gsmerge.geometry import project_points, sh0_to_rgb
 from gsmerge.io.cameras.camera_file import CameraFile, make_pinhole
-from gsmerge.io.formats.ply import PlyScene
+from gsmerge.io.formats.read import GaussianFile as PlyScene
 from gsmerge.io.image_names import natural_key
 from gsmerge.io.photo_files import (
     Photos,

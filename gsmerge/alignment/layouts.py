@@ -10,7 +10,7 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.geometry import rgb_to_sh0
 from gsmerge.io.cameras.camera_file import CameraFile, sizes_of, to_cameras
-from gsmerge.io.formats.ply import PlyInfo
+from gsmerge.io.formats.read import FileInfo as PlyInfo
 from gsmerge.io.photo_files import (
     ASPECT_TOLERANCE,
     PhotoTransform,

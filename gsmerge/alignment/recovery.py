@@ -35,7 +35,7 @@ from gsmerge.alignment.score import (
 from gsmerge.errors import SceneError
 from gsmerge.geometry import IDENTITY
 from gsmerge.io.cameras.camera_file import CameraFile, Convention
-from gsmerge.io.formats.ply import PlyInfo
+from gsmerge.io.formats.read import FileInfo as PlyInfo
 from gsmerge.io.photo_files import ASPECT_TOLERANCE
 from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Cameras, Gaussians

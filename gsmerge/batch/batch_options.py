@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import os
+from dataclasses import dataclass, replace
 from string import Formatter
 from typing import Any
 
 from gsmerge.io import OUTPUT_FORMATS, output_format
 from gsmerge.scene.content_hash import digest
-from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.compact import CHECKPOINTS, CompactOptions
 from gsmerge.settings.reading import OpacityChoice, ReadHints
 from gsmerge.settings.setting import Settings, setting
 from gsmerge.settings.stages import Engine
@@ -47,7 +48,7 @@ class BatchOptions(Settings):
             example = self.output.format(**dict.fromkeys(FIELDS, 1))
         except (ValueError, LookupError, AttributeError, TypeError):
             names, example = [""], ""
-        known, endings = ", ".join(f"{{{name}}}" for name in FIELDS), tuple(OUTPUT_FORMATS)
+        known, endings = ", ".join(f"{{{name}}}" for name in FIELDS), OUTPUT_FORMATS
         is_outside = example.startswith(("/", "~", ".")) or ".." in example.split("/")
         for is_possible, expected in (
             (all(name in FIELDS for name in names), f"{known} in braces"),
@@ -60,7 +61,7 @@ class BatchOptions(Settings):
             if not is_possible:
                 raise ValueError(f"output: expected {expected}, got {self.output!r}")
         budget = self.settings.budget
-        if budget.in_bytes and output_format(self.output) != ".ply":
+        if budget.in_bytes and output_format(self.output).ending != ".ply":
             raise ValueError(f"budget {budget.budget}: expected an output as .ply, got {self.output}; give a number")
         if Engine(self.engine, self.address).name == "ray" and self.max_memory is not None:
             raise ValueError("max_memory: expected engine local; Ray knows the memory of its nodes")
@@ -74,3 +75,15 @@ class BatchOptions(Settings):
     def name(self) -> str:
         """Return a digest that is equal for runs that make the same results."""
         return digest({**self.result_settings(), "output": self.output, "cameras": self.cameras, "images": self.images})
+
+
+def with_whole_paths(options: BatchOptions) -> BatchOptions:
+    """Return the options with absolute paths, which mean the same on every node."""
+    settings = options.settings
+    if settings.checkpoint not in CHECKPOINTS:
+        settings = replace(settings, checkpoint=os.path.abspath(settings.checkpoint))
+    cameras, images = (
+        path if path is None or path.startswith("{") else os.path.abspath(path)
+        for path in (options.cameras, options.images)
+    )
+    return replace(options, settings=settings, cameras=cameras, images=images)

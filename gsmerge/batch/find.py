@@ -14,7 +14,7 @@ from gsmerge.compaction.files import level_output
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import SCENE_SUFFIXES
 from gsmerge.io.bounds import read_text
-from gsmerge.io.formats.ply_file import header_counts
+from gsmerge.io.formats.ply import header_counts
 from gsmerge.runtime.estimate import memory_bytes
 from gsmerge.scene.content_hash import stem_of
 from gsmerge.scene.files import IMAGE_PLACES, PLY_PLACES, SceneFiles, named_ply, other_plys

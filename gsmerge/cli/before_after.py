@@ -13,9 +13,9 @@ from gsmerge.errors import SceneError, UsageError
 from gsmerge.settings.evaluate import NETS
 
 if TYPE_CHECKING:
-    from gsmerge.io import PlyScene
+    from gsmerge.io import GaussianFile
     from gsmerge.scene.files import SceneFiles
-    from gsmerge.scene.read import SceneLoad
+    from gsmerge.scene.read import Loaded
     from gsmerge.types import Cameras, Gaussians, Scene, Views
 
 SAME = 1e-5  # difference of two poses, of 1 and of their numbers, that writing and reading may make
@@ -38,10 +38,10 @@ def lpips_networks(choice: str | None) -> tuple[tuple[str, ...], list[str]]:
 class BeforeAfter:
     """A scene and its compact versions, as commands compare them."""
 
-    load: SceneLoad  # the scene as it was read
+    load: Loaded  # the scene as it was read
     scene: Scene  # the same with views: placed ones where it has none
     held_out: Views | None  # views that were no input
-    plys: dict[str, PlyScene]  # the compact versions by name
+    plys: dict[str, GaussianFile]  # the compact versions by name
     cameras: dict[str, Cameras]  # of the input views, by name of a version that was made with others than the scene's
     notes: list[str]  # what was adapted, one sentence each
 
@@ -77,7 +77,7 @@ def read_before_after(args: Args, files: SceneFiles, *, alone: bool = False) -> 
     return BeforeAfter(load, scene, held_out, plys, cameras, [*load.notes, *adapted, *notes, *moved])
 
 
-def _load(args: Args, files: SceneFiles, alone: bool) -> SceneLoad:
+def _load(args: Args, files: SceneFiles, alone: bool) -> Loaded:
     """Read the scene, without cameras where there are none and it is looked at alone."""
     try:
         return args.load(files)
@@ -112,7 +112,7 @@ def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras]
     return own, notes
 
 
-def require_views(load: SceneLoad) -> None:
+def require_views(load: Loaded) -> None:
     """Raise a SceneError for a scene without cameras."""
     if len(load.scene) == 0:
         problem = "expected cameras to measure from, found none beside it"
@@ -120,7 +120,7 @@ def require_views(load: SceneLoad) -> None:
 
 
 def held_out_views(
-    load: SceneLoad, targets: Path | None, target_images: Path | None, views: int | None
+    load: Loaded, targets: Path | None, target_images: Path | None, views: int | None
 ) -> tuple[Scene, Views | None, tuple[str, ...]]:
     """Choose the context views of ``--views`` and the unseen views; return the scene, the views, and notes."""
     from gsmerge.facts.views import even_views, midpoint_views, subset

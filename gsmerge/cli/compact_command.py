@@ -105,7 +105,7 @@ def compact(args: opt.Args) -> None:
 
 def _with_engine(settings: CompactOptions, args: opt.Args) -> CompactOptions:
     """Return the settings with the engine that was asked for; UsageError where it is not installed."""
-    from gsmerge.runtime.cluster import require_ray
+    from gsmerge.runtime.work import require_ray
     from gsmerge.settings.stages import Engine
 
     with opt.usage_errors():
@@ -133,7 +133,7 @@ def _check_scenes(args: opt.Args) -> None:
 def _warn_of_memory(files: SceneFiles, settings: CompactOptions, *, quiet: bool) -> None:
     """Warn before anything is read if the scene is not likely to fit into memory; in blocks it does."""
     from gsmerge.facts.partition import gaussians_at_once
-    from gsmerge.io.formats.ply_file import header_counts
+    from gsmerge.io.formats.ply import header_counts
     from gsmerge.plan import wanted_blocks
     from gsmerge.runtime.estimate import memory_bytes, memory_problem
 

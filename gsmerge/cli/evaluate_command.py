@@ -15,7 +15,7 @@ from gsmerge.cli.paths import check_outputs, input_files, write_texts
 from gsmerge.errors import SceneError, UsageError
 
 if TYPE_CHECKING:
-    from gsmerge.io import PlyScene
+    from gsmerge.io import GaussianFile
     from gsmerge.types import Cameras
 
 OUTSIDE = 0.03  # share of a result's Gaussians beyond all of its own views: what merging and a fit move there
@@ -119,7 +119,7 @@ def _facts(args: opt.Args, given: BeforeAfter, seconds: Mapping[str, float]) -> 
     from gsmerge.measure.sizes import shrink_cameras
     from gsmerge.measure.speed import measure_costs
 
-    infos = {INPUT: given.load.ply, **{name: ply.info for name, ply in given.plys.items()}}
+    infos = {INPUT: given.load.info, **{name: ply.info for name, ply in given.plys.items()}}
     facts: dict[str, dict[str, Any]] = {
         name: {"path": info.path, "bytes": info.file_bytes, "bytes_by_attribute": info.bytes_by_attribute}
         for name, info in infos.items()
@@ -146,7 +146,7 @@ def _seconds_of(text: str) -> float:
     return float(seconds)
 
 
-def _more_views(name: str, ply: PlyScene, cameras: Cameras) -> str:
+def _more_views(name: str, ply: GaussianFile, cameras: Cameras) -> str:
     """Write what is known of a result that is measured as one of some views, but may be made of all."""
     from gsmerge.measure.visibility import share_outside
 

@@ -33,7 +33,7 @@ from gsmerge.settings.stages import Engine
 
 if TYPE_CHECKING:
     from gsmerge.scene.files import SceneFiles
-    from gsmerge.scene.read import SceneLoad
+    from gsmerge.scene.read import Loaded
 
 INPUT, COUNT, METHOD, MEASURING, OUTPUT, GENERAL = (
     "Input", "How many Gaussians", "Method", "Measuring", "Output", "General"
@@ -115,7 +115,7 @@ class Args(SimpleNamespace):
         first, *others = (find_scene_files(one, **places) for one in (scene, *more))
         return replace(first, more=tuple(others))
 
-    def load(self, files: SceneFiles, **defaults: Any) -> SceneLoad:
+    def load(self, files: SceneFiles, **defaults: Any) -> Loaded:
         """Read the scene of these files; ``defaults`` are hints that the user may override."""
         from gsmerge.scene.read import load_files
 

@@ -26,7 +26,8 @@ from gsmerge.errors import UsageError
 def view(args: opt.Args) -> None:
     """Show a scene, alone or beside its compact versions, in the browser: photos, stills, 3D, scores in one file."""
     from gsmerge.report import document_head
-    from gsmerge.stages.superpixels import SegmentOptions, count_for
+    from gsmerge.settings.stages import SegmentOptions
+    from gsmerge.stages.superpixels import count_for
 
     (segmentation,) = args.make(SegmentOptions)
     args.after = args.after or []
@@ -48,7 +49,7 @@ def view(args: opt.Args) -> None:
     from gsmerge.view.data import collect
     from gsmerge.view.page import headline, view_page
 
-    sizes = [given.load.ply.file_bytes, *(ply.info.file_bytes for ply in given.plys.values())]
+    sizes = [given.load.info.file_bytes, *(ply.info.file_bytes for ply in given.plys.values())]
     with stage_progress(quiet=args.silent) as progress:
         title = files.ply.parent.absolute().name if files.ply.stem == "scene" else files.ply.stem
         data = collect(

@@ -29,11 +29,11 @@ from gsmerge.raster import contributions, plan_view
 from gsmerge.raster import prepare as prepare_splats
 from gsmerge.raster.metrics import describe_loss
 from gsmerge.raster.photos import Photos, blank_photos
-from gsmerge.runtime.cluster import start_work
 from gsmerge.runtime.estimate import memory_bytes
 from gsmerge.runtime.memory import free_pages, peak_memory
 from gsmerge.runtime.record import Record, add_seconds, choose, current_record, note, record_part, stage
 from gsmerge.runtime.threads import in_turn
+from gsmerge.runtime.work import start_work
 from gsmerge.settings.budget import parse_share, share_text
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.stages import AUTO_SHARE

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -12,35 +11,25 @@ from typing import Any
 from gsmerge.compaction.compact import compact
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.io import atomic_outputs, kept_comments, lost_harmonics, output_format, write_gaussians
+from gsmerge.io import atomic_outputs, lost_harmonics, output_format, write_gaussians
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.cameras.embedded import camera_comments
 from gsmerge.io.cameras.json_files import viewer_cameras, write_transforms
 from gsmerge.io.cameras.read import read_cameras
-from gsmerge.io.formats.ply_file import LOGIT_COMMENT
+from gsmerge.io.formats.arrays import LOGIT_COMMENT
 from gsmerge.io.formats.streamed import INDEX, remove_unused_chunks
-from gsmerge.io.formats.writing import add_levels
+from gsmerge.io.formats.write import add_levels
 from gsmerge.report import report_document, to_json
 from gsmerge.runtime.memory import release_memory
 from gsmerge.runtime.record import Progress
 from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import SceneFiles
-from gsmerge.scene.read import SceneLoad, load_files
+from gsmerge.scene.read import Loaded, load_files
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Scene
 
 NO_PHOTOS = "no photos found, so nothing is fitted and no PSNR measured; name their folder with --images"
-
-
-@dataclass(frozen=True, eq=False)
-class SceneInput:
-    """A scene and the facts of its reading that a report needs."""
-
-    scene: Scene
-    recognised: dict[str, Any]  # Facts about the input for the report
-    comments: Sequence[str]  # Comments of the header that the result keeps
-    notes: Sequence[str]  # Notes of the reader, one sentence each
 
 
 def compact_files(
@@ -73,7 +62,7 @@ def compact_files(
     does not have.
     """
     start = perf_counter()
-    streamed = output_format(out, spz_version, levels=True) == INDEX
+    streamed = output_format(out, spz_version, levels=True).ending == INDEX
     with atomic_outputs(overwrite=overwrite) as add:
         at = {out: add(out, make_folder=streamed)}
         at |= {path: add(path) for path in (report_path, saved_cameras) if path is not None}
@@ -140,7 +129,7 @@ def _write_results(
 
     Returns the path of each, in their order, with its files as they are before they are renamed.
     """
-    ending = output_format(out, spz_version, levels=True)
+    ending = output_format(out, spz_version, levels=True).ending
     if ending == INDEX:
         (_, finest), *rest = add_levels(add, out, first, [one.gaussians for one in results], comments[0])
         return {out: [first, *finest], **dict(rest)}
@@ -169,15 +158,12 @@ def _other_cameras(path: Path) -> UsageError:
     return UsageError(f"{path}: exists already, with other cameras than this result's; {remedy}")
 
 
-def read_input(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = AUTO) -> SceneInput:
+def read_input(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = AUTO) -> Loaded:
     """Read a scene from its files, and note what is missing or odd; raise SceneError if it cannot be read."""
-    loaded = load_files(files, opacity=opacity, hints=hints)
-    no_photos = loaded.scene.aligned and loaded.scene.images is None
-    notes = (*loaded.notes, *([NO_PHOTOS] if no_photos else []), *compact_notes(loaded))
-    scene_input = SceneInput(loaded.scene, recognised_of(loaded), kept_comments(loaded.ply), notes)
-    del loaded  # its arrays are as large as the scene's
+    loaded = load_files(files, opacity=opacity, hints=hints).without_photos()
     release_memory()
-    return scene_input
+    no_photos = [NO_PHOTOS] if loaded.scene.aligned and loaded.scene.images is None else []
+    return replace(loaded, notes=(*loaded.notes, *no_photos, *_compact_notes(loaded)))
 
 
 def check_saved_cameras(scene: Scene, path: Path | None, *, embed: bool = False) -> None:
@@ -190,29 +176,14 @@ def check_saved_cameras(scene: Scene, path: Path | None, *, embed: bool = False)
         camera_comments(scene.cameras[views], [scene.names[view] for view in views])  # refuses too many before the work
 
 
-def compact_notes(loaded: SceneLoad) -> tuple[str, ...]:
+def _compact_notes(loaded: Loaded) -> tuple[str, ...]:
     """Return a note if the scene is a result of gsmerge, with far fewer Gaussians than pixels."""
     scene = loaded.scene
     pixels = len(scene) * scene.cameras.height * scene.cameras.width
-    if scene.aligned or LOGIT_COMMENT not in loaded.ply.comments or scene.num_gaussians > pixels / 2:
+    if scene.aligned or LOGIT_COMMENT not in loaded.info.comments or scene.num_gaussians > pixels / 2:
         return ()
     count = f"{scene.num_gaussians:,} Gaussians for {pixels:,} pixels" if pixels else "no Gaussian per pixel"
     return (f"the scene is compact already ({count}, written by gsmerge): start from the original for more detail",)
-
-
-def recognised_of(loaded: SceneLoad) -> dict[str, Any]:
-    """Return the facts about the input for the report."""
-    names = ("layout", "sh_degree", "opacity_encoding", "num_nonfinite")
-    cameras, recovery = loaded.scene.cameras, loaded.recovery
-    views: dict[str, Any] = {"num_views": len(cameras), "height": cameras.height, "width": cameras.width}
-    views |= {"exporters": [exporter.name for exporter in loaded.exporters], "rows": recovery and recovery.description}
-    views["moved_cameras"] = list(loaded.moves)
-    if loaded.files.parts:
-        views["parts"] = [str(path) for path in loaded.files.parts]
-    if loaded.joined:
-        num_bytes = sum(os.stat(one["path"]).st_size for one in loaded.joined if one["joined"])
-        views |= {"files": list(loaded.joined), "bytes": num_bytes}
-    return views | {name: getattr(loaded.ply, name) for name in names}
 
 
 def level_output(output: Path, level: int) -> Path:

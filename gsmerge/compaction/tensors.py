@@ -33,7 +33,7 @@ from gsmerge.io.cameras.camera_file import (
     check_camera,
     check_size,
 )
-from gsmerge.io.formats.ply import clear_invalid
+from gsmerge.io.formats.read import clear_invalid
 from gsmerge.runtime.record import Progress
 from gsmerge.scene.read import NO_CAMERAS
 from gsmerge.types import Array, Cameras, Gaussians, Scene, as_array, grid_ids, to_float32

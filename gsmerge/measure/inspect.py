@@ -13,9 +13,9 @@ from gsmerge.errors import SceneError
 from gsmerge.facts.compare_photos import compare_photos
 from gsmerge.facts.partition import gaussians_at_once
 from gsmerge.facts.prepare import canonicalise
-from gsmerge.io import PlyScene, ply_notes
-from gsmerge.io.formats.ply_file import LOGIT_COMMENT
-from gsmerge.io.formats.writing import file_bytes
+from gsmerge.io import GaussianFile, file_notes
+from gsmerge.io.formats.arrays import LOGIT_COMMENT
+from gsmerge.io.formats.ply import file_bytes
 from gsmerge.measure.visibility import MAX_SAMPLES, inside_views
 from gsmerge.plan import plan_whole
 from gsmerge.report import finite, human_bytes
@@ -24,7 +24,7 @@ from gsmerge.runtime.record import record_part
 from gsmerge.runtime.threads import available_threads, use_threads
 from gsmerge.scene.exporters import ReadHints, exporter_names, make_hints
 from gsmerge.scene.files import SceneFiles, find_scene_files
-from gsmerge.scene.read import align_scene, read_ply_with_hints
+from gsmerge.scene.read import align_scene, read_rows
 from gsmerge.scene.views import read_scene_cameras
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.reading import OpacityChoice
@@ -86,12 +86,12 @@ def inspect(
     read_hints = make_hints(hints)
     files = find_scene_files(path, cameras=cameras, images=images, masks=masks)
     with use_threads():
-        ply = read_ply_with_hints(files, opacity=opacity, hints=read_hints)
+        ply = read_rows(files, opacity=opacity, hints=read_hints)
         document: dict[str, Any] = finite(_describe_file(ply) | _describe_views(ply, files, read_hints))
     return document
 
 
-def _describe_file(ply: PlyScene) -> dict[str, Any]:
+def _describe_file(ply: GaussianFile) -> dict[str, Any]:
     info, opacities = ply.info, ply.gaussians.opacities[ply.valid]
     return {
         **{name: getattr(info, name) for name in _FILE_KEYS},
@@ -111,13 +111,13 @@ def _photo_notes(scene: Scene) -> list[str]:
     return record.notes
 
 
-def _describe_views(ply: PlyScene, files: SceneFiles, hints: ReadHints) -> dict[str, Any]:
+def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> dict[str, Any]:
     own = LOGIT_COMMENT in ply.info.comments
     facts: dict[str, Any] = {
         "cameras": files.cameras and str(files.cameras),
         "images": files.images and str(files.images),
         "exporter": _OWN if own else "not known before the cameras fit",
-        "notes": ply_notes(ply.info),
+        "notes": file_notes(ply.info),
         **dict.fromkeys(("num_views", "width", "height", "per_pixel", "num_missing", "num_sky_views"), 0),
         **dict.fromkeys(("camera_format", "rows", "alignment", "alignment_problem", "sight", "compact")),
         "coverage": [],

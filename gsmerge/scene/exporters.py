@@ -14,7 +14,7 @@ from gsmerge.geometry import Similarity
 from gsmerge.settings.reading import QuatChoice, ReadHints
 
 if TYPE_CHECKING:
-    from gsmerge.io.formats.ply import PlyInfo
+    from gsmerge.io.formats.read import FileInfo
 
 FrameKind = Literal["same", "scaled", "shifted", "first", "middle", "upright", "other"]
 
@@ -57,7 +57,7 @@ class Exporter:
     comment: str = ""  # part of a comment in the header that it always writes
     cameras: tuple[str, ...] = ()  # formats of cameras that it writes; empty: none, any may be given
 
-    def may_have_written(self, info: PlyInfo, layout: Layout | None, frame: Similarity | None, cameras: str) -> bool:
+    def may_have_written(self, info: FileInfo, layout: Layout | None, frame: Similarity | None, cameras: str) -> bool:
         """Return whether a file looks like one of this exporter; see :func:`choose_exporters`."""
         header = (
             info.sh_degree in self.degrees
@@ -145,7 +145,7 @@ def find_exporter(name: str) -> Exporter | None:
 
 
 def choose_exporters(
-    name: str, info: PlyInfo, layout: Layout | None, frame: Similarity | None, cameras: str
+    name: str, info: FileInfo, layout: Layout | None, frame: Similarity | None, cameras: str
 ) -> tuple[Exporter, ...]:
     """Return the exporter with a name; for "auto", all that may have written a file with cameras of a format.
 

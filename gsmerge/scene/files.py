@@ -15,8 +15,8 @@ from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.embedded import holds_cameras
 from gsmerge.io.cameras.npz_files import holds_images
 from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
-from gsmerge.io.cameras.read import find_cameras, find_other_cameras, read_cameras, read_sharp
-from gsmerge.io.formats.ply_file import header_counts
+from gsmerge.io.cameras.read import find_cameras, find_other_cameras, read_cameras, read_sharp_camera
+from gsmerge.io.formats.ply import header_counts
 from gsmerge.io.image_names import list_images
 from gsmerge.types import StrPath
 
@@ -164,7 +164,7 @@ def _order_parts(folder: Path, plys: Sequence[Path], cameras: Path | None) -> li
     elif plys[0].parent.name == SCENES_PLACE or not _has_camera_each(plys, cameras):
         return None
     with suppress(SceneError):
-        if not any(holds_cameras(path) or read_sharp(path) is not None for path in plys):
+        if not any(holds_cameras(path) or read_sharp_camera(path) is not None for path in plys):
             return [numbers[number] for number in ordered]
     return None
 

@@ -17,7 +17,7 @@ from gsmerge.kernels.elementary import arccos
 from gsmerge.kernels.matrices import closest_rotation, matmul
 from gsmerge.scene.exporters import AUTO
 from gsmerge.scene.files import IMAGE_PLACES, SceneFiles
-from gsmerge.scene.read import SceneLoad
+from gsmerge.scene.read import Loaded
 from gsmerge.scene.views import limit_photo_size, stored_photos
 from gsmerge.types import Scene, StrPath, Views
 
@@ -36,7 +36,7 @@ class HeldOutViews(Views):
     notes: tuple[str, ...] = ()  # what was adapted, one sentence each
 
 
-def read_held_out(load: SceneLoad, cameras: StrPath, images: StrPath | None = None) -> HeldOutViews:
+def read_held_out(load: Loaded, cameras: StrPath, images: StrPath | None = None) -> HeldOutViews:
     """Read unseen photos and their cameras, in any of the forms that scenes may have.
 
     Views that the scene was made of are left out. Where the file has those too, under the same names, their poses
@@ -73,7 +73,7 @@ def read_held_out(load: SceneLoad, cameras: StrPath, images: StrPath | None = No
     )
 
 
-def place_camera_file(load: SceneLoad, path: Path) -> tuple[CameraFile, dict[int, int]]:
+def place_camera_file(load: Loaded, path: Path) -> tuple[CameraFile, dict[int, int]]:
     """Read cameras into the frame of a scene's Gaussians; also map those of the scene, if any, to its views.
 
     Which frame they are in, and in which convention, is decided as :func:`read_held_out` says.
@@ -111,7 +111,7 @@ def _shared_views(camera_file: CameraFile, names: tuple[str, ...]) -> dict[int, 
     return {place[stem]: view for stem, view in own.items() if stem in place}
 
 
-def _find_world(camera_file: CameraFile, named: dict[int, int], load: SceneLoad) -> tuple[Similarity, dict[int, int]]:
+def _find_world(camera_file: CameraFile, named: dict[int, int], load: Loaded) -> tuple[Similarity, dict[int, int]]:
     """Find the similarity from the file's world to that of the Gaussians, and the views that the scene has too."""
     stored = _stored_world(load)
     if not named:
@@ -130,7 +130,7 @@ def _find_world(camera_file: CameraFile, named: dict[int, int], load: SceneLoad)
     return stored, {}
 
 
-def _stored_world(load: SceneLoad) -> Similarity:
+def _stored_world(load: Loaded) -> Similarity:
     """Find the similarity from the world of the scene's own camera file to that of its Gaussians."""
     if load.recovery is not None:
         return load.recovery.best.frame

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -26,17 +28,17 @@ from gsmerge.alignment import (
 )
 from gsmerge.alignment.registration.join import join_scenes
 from gsmerge.errors import SceneError
-from gsmerge.geometry import Similarity
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views, to_cameras
-from gsmerge.io.cameras.json_files import DATAPARSER, find_dataparser, read_dataparser
+from gsmerge.io.cameras.json_files import read_dataparser
 from gsmerge.io.cameras.npz_files import read_depths
-from gsmerge.io.formats.ply import PlyInfo, PlyScene, ply_notes, read_gaussians, read_parts
+from gsmerge.io.formats.read import FileInfo, GaussianFile, file_notes, kept_comments, read_gaussians, read_parts
 from gsmerge.io.photo_files import as_floats, photo_size
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.exporters import AUTO, Exporter, ReadHints, choose_exporters, find_exporter, make_hints
 from gsmerge.scene.files import SceneFiles, find_scene_files
 from gsmerge.scene.views import (
+    check_masks,
     cut_bars,
     find_larger_and_masks,
     limit_photo_size,
@@ -47,11 +49,7 @@ from gsmerge.scene.views import (
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Cameras, Gaussians, LargePhotos, Scene, StrPath, grid_ids
 
-_MAX_MASKED = 0.98  # share of the pixels of photos that masks may leave out
 NO_CAMERAS = Cameras(np.empty((0, 4, 4)), np.empty((0, 3, 3)), 1, 1)
-_NO_ALIGNMENT = AlignmentResult(
-    None, NO_CAMERAS, None, None, problem="expected one Gaussian per pixel, found no cameras that have any"
-)
 
 
 @dataclass(frozen=True)
@@ -65,14 +63,14 @@ class SceneViews:
 
 
 @dataclass(frozen=True)
-class SceneLoad:
+class Loaded:
     """A scene and how it was read."""
 
     # the scene: one Gaussian per pixel, or an unaligned one where the rows belong to no pixels
     scene: Scene
-    ply: PlyInfo
+    info: FileInfo
     files: SceneFiles
-    # the cameras in the order of the views, as their file has them; None where there are none
+    # the cameras in the order of the views, as their file has them; None where there are none, or they do not fit
     cameras: CameraFile | None
     views: SceneViews  # all views that there are cameras of, also those that the scene does not have
     exporters: tuple[Exporter, ...]  # the exporters that may have written the file, or the one that the caller named
@@ -89,7 +87,32 @@ class SceneLoad:
         """Return the scene if it has one Gaussian per pixel; otherwise raise a SceneError with the reason."""
         if self.scene.aligned:
             return self.scene
-        raise SceneError(self.ply.path, self.problem or "expected one Gaussian per pixel")
+        raise SceneError(self.info.path, self.problem or "expected one Gaussian per pixel")
+
+    def without_photos(self) -> Loaded:
+        """Drop the photos that are not the scene's own, which may take as much memory."""
+        cameras = None if self.cameras is None else replace(self.cameras, images=None)
+        return replace(self, cameras=cameras, views=replace(self.views, images=None))
+
+    @property
+    def comments(self) -> tuple[str, ...]:
+        """Comments of the file's header that a result keeps."""
+        return kept_comments(self.info)
+
+    @property
+    def recognised(self) -> dict[str, Any]:
+        """Facts about the input for a report."""
+        cameras, recovery, info = self.scene.cameras, self.recovery, self.info
+        facts: dict[str, Any] = {"num_views": len(cameras), "height": cameras.height, "width": cameras.width}
+        facts |= {"exporters": [one.name for one in self.exporters], "rows": recovery and recovery.description}
+        facts["moved_cameras"] = list(self.moves)
+        if self.files.parts:
+            facts["parts"] = [str(path) for path in self.files.parts]
+        if self.joined:
+            num_bytes = sum(os.stat(one["path"]).st_size for one in self.joined if one["joined"])
+            facts |= {"files": list(self.joined), "bytes": num_bytes}
+        facts |= {"layout": info.layout, "sh_degree": info.sh_degree, "opacity_encoding": info.opacity_encoding}
+        return facts | {"num_nonfinite": info.num_nonfinite}
 
 
 def read_scene(
@@ -148,7 +171,7 @@ def load_scene(
     masks: StrPath | None = None,
     opacity: OpacityChoice = "auto",
     **hints: Any,
-) -> SceneLoad:
+) -> Loaded:
     """Read a scene as :func:`read_scene` does, with all facts about its files."""
     read_hints = make_hints(hints)
     named = {"cameras": cameras, "images": images, "masks": masks}
@@ -156,28 +179,23 @@ def load_scene(
     return load_files(replace(first, more=tuple(others)), opacity=opacity, hints=read_hints)
 
 
-def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = AUTO) -> SceneLoad:
+def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = AUTO) -> Loaded:
     """Read the scene of given files as :func:`load_scene` does."""
     with use_threads():
-        loads = [_load_one(one, opacity, hints) for one in (replace(files, more=()), *files.more)]
+        each = (replace(files, more=()), *files.more)
+        loads = [align_scene(read_rows(one, opacity=opacity, hints=hints), one, hints=hints) for one in each]
     return loads[0] if len(loads) == 1 else _join_loads(loads, files)
 
 
-def _load_one(files: SceneFiles, opacity: OpacityChoice, hints: ReadHints) -> SceneLoad:
-    return align_scene(read_ply_with_hints(files, opacity=opacity, hints=hints), files, hints=hints)
-
-
-def _join_loads(loads: Sequence[SceneLoad], files: SceneFiles) -> SceneLoad:
+def _join_loads(loads: Sequence[Loaded], files: SceneFiles) -> Loaded:
     """Make one scene of several of the same place, with the notes of all."""
     joined = join_scenes([load.scene for load in loads], [load.files.ply for load in loads])
-    used = [loads[i] for i in joined.used]
-    scene = joined.scene
-    named = zip(joined.names, loads, strict=True)
-    notes = [f"{name}: {text}" for name, load in named for text in load.notes]
+    scene, used = joined.scene, [loads[i] for i in joined.used]
+    notes = [f"{name}: {text}" for name, load in zip(joined.names, loads, strict=True) for text in load.notes]
     return replace(
         used[0],
         scene=scene,
-        ply=replace(used[0].ply, num_nonfinite=sum(load.ply.num_nonfinite for load in used)),
+        info=replace(used[0].info, num_nonfinite=sum(load.info.num_nonfinite for load in used)),
         files=files,
         views=SceneViews(scene.cameras, scene.images, scene.names, tuple(range(len(scene)))),
         exporters=tuple(dict.fromkeys(exporter for load in used for exporter in load.exporters)),
@@ -188,7 +206,7 @@ def _join_loads(loads: Sequence[SceneLoad], files: SceneFiles) -> SceneLoad:
     )
 
 
-def read_ply_with_hints(files: SceneFiles, *, opacity: OpacityChoice, hints: ReadHints) -> PlyScene:
+def read_rows(files: SceneFiles, *, opacity: OpacityChoice, hints: ReadHints) -> GaussianFile:
     """Read the rows of a scene's files, with opacities as given, or as the given exporter stores them."""
     exporter = find_exporter(hints.exporter)
     if exporter is not None and exporter.opacity == "logit" and opacity == "auto":
@@ -197,20 +215,21 @@ def read_ply_with_hints(files: SceneFiles, *, opacity: OpacityChoice, hints: Rea
 
 
 def align_scene(
-    ply: PlyScene,
+    ply: GaussianFile,
     files: SceneFiles,
     camera_file: CameraFile | None = None,
     *,
     hints: ReadHints = AUTO,
     photos: bool = True,
-) -> SceneLoad:
+) -> Loaded:
     """Put Gaussians, cameras and photos together, with the pixel of every row where it has one.
 
     Raises as :func:`read_scene`. ``camera_file`` has the cameras if they are read already; without ``photos`` none
     are searched.
     """
     if camera_file is None and files.cameras is None and hints.order == "none":  # cameras are placed later
-        return _make_load(ply, files, hints, _NO_ALIGNMENT, [])
+        problem = "expected one Gaussian per pixel, found no cameras that have any"
+        return _make_load(ply, files, hints, AlignmentResult(None, NO_CAMERAS, None, None, problem=problem), [])
     exporter = find_exporter(hints.exporter)
     camera_file = read_scene_cameras(ply, files) if camera_file is None else camera_file
     known = camera_file.order if exporter is None else exporter.order
@@ -220,20 +239,8 @@ def align_scene(
     whole, (pictures, cut) = pictures, cut_bars(pictures, camera_file)
     limited, smaller = limit_photo_size(pictures, len(ply.gaussians), hints.max_side, unaligned=order == "none")
 
-    def read_frames() -> list[Similarity]:
-        path = find_dataparser(files.ply, files.cameras)
-        frames = [] if path is None else read_dataparser(path, files.cameras)
-        return [replace(frame, description=f"moved into the Gaussians' frame by {DATAPARSER}") for frame in frames]
-
-    result = align(
-        ply,
-        pinholes,
-        limited,
-        order=order,
-        scale=hints.scene_scale,
-        depths=partial(read_depths, Path(camera_file.path)),
-        frames=read_frames,
-    )
+    depths, frames = partial(read_depths, Path(camera_file.path)), partial(read_dataparser, files.ply, files.cameras)
+    result = align(ply, pinholes, limited, order=order, scale=hints.scene_scale, depths=depths, frames=frames)
     notes += [*cut, *smaller, *result.notes]
     if result.pixel_ids is None:
         cameras, images, smaller = limit_view_size(result.cameras, result.images, hints.max_side)
@@ -249,14 +256,14 @@ def align_scene(
 
 
 def _make_load(
-    ply: PlyScene,
+    ply: GaussianFile,
     files: SceneFiles,
     hints: ReadHints,
     result: AlignmentResult,
     notes: Sequence[str],
     large: LargePhotos | None = None,
     masks: np.ndarray | None = None,
-) -> SceneLoad:
+) -> Loaded:
     """Make the scene of rows, their pixels and the views, with notes on how it was read."""
     camera_file, layout, views = result.camera_file, result.layout, list(result.views)
     names = () if camera_file is None else camera_file.names
@@ -266,7 +273,7 @@ def _make_load(
         cameras, images = cameras[views], None if images is None else images[views]
     large = None if large is None else large[views]
     masks = None if masks is None else masks[views]
-    masks, described = _check_masks(masks, files)
+    masks, described = check_masks(masks, files)
     more += described
     scene = Scene(gaussians, cameras, images, pixel_ids, tuple(names[view] for view in views), missing, large, masks)
     if camera_file is not None and layout is not None:
@@ -283,33 +290,19 @@ def _make_load(
         more.append("the rows belong to no pixels that could be found: unaligned")
         if hints.exporter != "auto":
             more[-1] += f"; only the layouts of {hints.exporter} were tried, as given; --hint exporter=auto tries all"
-    return SceneLoad(
+    return Loaded(
         scene=scene,
-        ply=ply.info,
+        info=ply.info,
         files=files,
         cameras=camera_file,
         views=SceneViews(result.cameras, result.images, names, tuple(dict.fromkeys(views))),
         exporters=exporters,
-        notes=(*files.notes, *ply_notes(ply.info), *notes, *more),
+        notes=(*files.notes, *file_notes(ply.info), *notes, *more),
         alignment=check_alignment(scene.gaussians, scene.cameras, scene.stored) if scene.aligned else None,
         recovery=result.recovery,
         problem=result.problem,
         moves=result.moves,
     )
-
-
-def _check_masks(masks: np.ndarray | None, files: SceneFiles) -> tuple[np.ndarray | None, list[str]]:
-    """Say how much of the photos masks leave out; SceneError if that is nearly all, which transparency may not be."""
-    if masks is None:
-        return None, []
-    share = float(1 - masks.mean())
-    if share < _MAX_MASKED:
-        count = int((~masks.all((1, 2))).sum())
-        return masks, [f"masks leave out {100 * share:.0f} % of the photos; of {len(masks)}, {count} have one"]
-    if files.masks is None:
-        return None, ["the photos are transparent nearly everywhere, which is not taken for masks"]
-    problem = f"expected masks that are bright where photos count, found {100 * share:.0f} % dark"
-    raise SceneError(files.masks, problem, "invert them, or name another folder with --masks")
 
 
 def _put_back(scene: Scene, camera_file: CameraFile, layout: Layout, views: Sequence[int]) -> tuple[Scene, list[str]]:
@@ -329,7 +322,7 @@ def _put_back(scene: Scene, camera_file: CameraFile, layout: Layout, views: Sequ
 
 
 def _place_rows(
-    ply: PlyScene, result: AlignmentResult
+    ply: GaussianFile, result: AlignmentResult
 ) -> tuple[Gaussians, np.ndarray | None, np.ndarray | None, list[str]]:
     """Bring rows to the pixels of the grid; return Gaussians, ``pixel_ids``, ``missing`` and notes.
 
@@ -373,27 +366,22 @@ def _with_rotations(scene: Scene, hints: ReadHints, exporters: Sequence[Exporter
     return read_rotations(scene, choice), [note] if note else []
 
 
-def place_cameras_in_scene(
-    ply: PlyScene, files: SceneFiles, *, hints: ReadHints = AUTO, photos: bool = True
-) -> tuple[Gaussians, SceneViews, tuple[str, ...], SceneLoad | None]:
+def place_cameras_in_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints, photos: bool) -> Loaded:
     """Move views into the frame of the Gaussians, if pixels or colours show it; otherwise keep their file's.
 
-    Returns the Gaussians with rotations as the scene has them, the views of the camera file, notes, and the scene,
-    None where the views do not fit. ``photos`` that cannot be read are an error; with False they are left out.
-    SceneError if there are no cameras, or they have no size.
+    ``photos`` that cannot be read are an error; with False they are left out. SceneError if there are no cameras, or
+    they have no size.
     """
     camera_file = read_scene_cameras(ply, files)
     for with_photos in (True,) if photos else (True, False):
-        try:
+        with suppress(SceneError):
             load = align_scene(ply, files, camera_file, hints=hints, photos=with_photos)
-        except SceneError:
-            continue
-        aligned = load.scene.aligned
-        notes = load.notes if aligned else load.notes[:-1]  # except the one that there are no pixels
-        return load.scene.file_gaussians, load.views, notes, load
-    pictures = stored_photos(files, camera_file) if photos else None
-    images = None if pictures is None else as_floats(pictures)
-    cameras = to_cameras(camera_file, photo_size(pictures))
-    views = SceneViews(cameras, images, camera_file.names, tuple(range(len(cameras))))
-    note = "the cameras do not fit the Gaussians and stay as their file has them"
-    return ply.gaussians, views, (*ply_notes(ply.info), note), None
+            break
+    else:
+        pictures = stored_photos(files, camera_file) if photos else None
+        images = None if pictures is None else as_floats(pictures)
+        cameras = to_cameras(camera_file, photo_size(pictures))
+        note = "the cameras do not fit the Gaussians and stay as their file has them"
+        as_stored = AlignmentResult(None, cameras, images, camera_file)
+        load = replace(_make_load(ply, files, hints, as_stored, [note]), cameras=None)
+    return load if load.scene.aligned else replace(load, notes=load.notes[:-1])  # without that there are no pixels

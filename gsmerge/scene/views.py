@@ -14,9 +14,10 @@ import numpy as np
 from gsmerge.alignment import estimate_cameras, estimate_focal, estimate_with_photos
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import CameraFile, missing_intrinsics, sizes_of, to_cameras, undistort_photos
+from gsmerge.io.cameras.embedded import SHARP
 from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
-from gsmerge.io.cameras.read import CAMERA_PLACES, SHARP, read_cameras, read_sharp
-from gsmerge.io.formats.ply import PlyScene
+from gsmerge.io.cameras.read import CAMERA_PLACES, read_cameras, read_sharp_camera
+from gsmerge.io.formats.read import GaussianFile
 from gsmerge.io.image_names import (
     IMAGE_SUFFIXES,
     find_image,
@@ -51,10 +52,11 @@ _MAX_BYTES = 2 << 30  # of all photos as floats, before it is known whether the 
 _FLOAT_PIXEL = 12  # bytes
 _BAR_SPREAD = 8  # of 255, range of a bar's colours
 _ROUNDING = 1e-6  # pixels
+_MAX_MASKED = 0.98  # share of the pixels of photos that masks may leave out
 _MASK_LEVEL = 191  # of 255: a pixel of a view counts if three quarters of its pixels in the file do
 
 
-def read_scene_cameras(ply: PlyScene, files: SceneFiles) -> CameraFile:
+def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile:
     """Read the cameras from their file or the ``.ply``, or estimate them for the images; SceneError if all fail.
 
     Where a file has poses alone, the focal length is estimated.
@@ -69,7 +71,7 @@ def read_scene_cameras(ply: PlyScene, files: SceneFiles) -> CameraFile:
             reason = "no focal length fits the Gaussians" if photos is not None else "no photos that show them"
             raise missing_intrinsics(stored.path, f", and {reason}")
         return estimated
-    cameras = read_sharp(files.ply)
+    cameras = read_sharp_camera(files.ply)
     if cameras is None and files.images is not None and files.images.is_dir():
         paths = list_images(files.images)
         width, height = image_size(paths[0]) if paths else (0, 0)
@@ -244,6 +246,20 @@ def _read_masks(
     if all(mask is None for mask in masks):
         return None
     return np.stack([np.full(shape, True) if mask is None else mask for mask in masks])
+
+
+def check_masks(masks: np.ndarray | None, files: SceneFiles) -> tuple[np.ndarray | None, list[str]]:
+    """Say how much of the photos masks leave out; SceneError if that is nearly all, which transparency may not be."""
+    if masks is None:
+        return None, []
+    share = float(1 - masks.mean())
+    if share < _MAX_MASKED:
+        count = int((~masks.all((1, 2))).sum())
+        return masks, [f"masks leave out {100 * share:.0f} % of the photos; of {len(masks)}, {count} have one"]
+    if files.masks is None:
+        return None, ["the photos are transparent nearly everywhere, which is not taken for masks"]
+    problem = f"expected masks that are bright where photos count, found {100 * share:.0f} % dark"
+    raise SceneError(files.masks, problem, "invert them, or name another folder with --masks")
 
 
 @dataclass(frozen=True)

@@ -195,4 +195,4 @@ def _parts(kind: Any) -> list[Any]:
 
 
 def _number(value: float | None) -> str:
-    return f"{value:,}" if isinstance(value, int) else f"{value:g}"
+    return str(value) if isinstance(value, int) else f"{value:g}"

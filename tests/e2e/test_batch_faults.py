@@ -116,6 +116,7 @@ def test_a_scene_that_takes_too_long_fails_alone(rooms: Path, tmp_path: Path) ->
     assert finish(quick, "--output", tmp_path / "out", *FAST, "--timeout", PATIENCE, "-q") == 0
 
 
+@pytest.mark.usefixtures("foreground")
 @pytest.mark.slow
 def test_ctrl_c_ends_with_what_is_done(rooms: Path, tmp_path: Path, undisturbed: dict[str, str]) -> None:
     process = start(rooms, "--output", tmp_path, *FAST, "--jobs", 1)

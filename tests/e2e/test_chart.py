@@ -46,7 +46,7 @@ def copied(results: Path, tmp_path: Path) -> Path:
 @pytest.fixture(autouse=True)
 def _inline(monkeypatch: pytest.MonkeyPatch) -> None:
     """Run the jobs of a test in this process, where they can be watched; the fixture above has processes."""
-    monkeypatch.setattr("gsmerge.batch.schedule.LocalPool", InlinePool)
+    monkeypatch.setattr("gsmerge.batch.schedule.ProcessPool", InlinePool)
 
 
 @pytest.fixture
@@ -120,7 +120,7 @@ def test_nothing_is_run_twice(copied: Path, merges: list[CompactOptions], run: R
     assert outcome.code == 0, outcome.err
     assert merges == []
     assert (copied / "out" / "batch.jsonl").read_bytes() == before
-    assert "4 runs (0 new), " in outcome.out
+    assert names(outcome.out, "4 runs", "0 new")
     assert len((copied / "out" / "index.html").read_bytes()) == pytest.approx(len(page), rel=0.01)
 
 
@@ -169,11 +169,11 @@ def test_hints_count_for_all_scenes(copied: Path, run: Run) -> None:
     (copied / "room" / "transforms.json").unlink()  # no pixels can be found, and views have to be placed
     shutil.rmtree(copied / "room" / "images")
     said = ("--hint", "order=none", "--fit", "none", "--budgets", "2%", "--proxy-views", "0", "--lpips", "none")
-    run("chart", copied / "room", "--output", copied / "loose", *said, code=5)
+    run("chart", copied / "room", "--output", copied / "unaligned", *said, code=5)
     shutil.copyfile(copied / "room" / "targets" / "transforms.json", copied / "room" / "transforms.json")
     shutil.copytree(copied / "room" / "targets" / "images", copied / "room" / "images")
-    assert run("chart", copied / "room", "--output", copied / "loose", *said).code == 0
-    records = runs(copied / "loose").values()
+    assert run("chart", copied / "room", "--output", copied / "unaligned", *said).code == 0
+    records = runs(copied / "unaligned").values()
     assert {(record.views, record.error) for record in records} == {(2, None)}
     assert all("--hint order=none" in record.command for record in records)
 
@@ -191,14 +191,14 @@ def test_a_failed_run_does_not_end_the_grid(copied: Path, run: Run, monkeypatch:
     outcome = again(run, copied, *options)
     assert outcome.code == 5
     last = outcome.err.splitlines()[-1]
-    assert names(last, "1 of 3", "room/gsmerge, budget 3%, fit none: ValueError: two lines")
+    assert names(last, "1 of 3", "room/gsmerge, budget 3%, fit none: ValueError")
     assert names(outcome.out, "3 runs", "3 new", "1 failed")
     page = (copied / "new" / "index.html").read_text()
     assert "ValueError: two lines" in page
     monkeypatch.setattr(running, "compact", compact)
     mended = again(run, copied, *options)  # what failed is tried again
     assert mended.code == 0
-    assert "3 runs (1 new), " in mended.out
+    assert names(mended.out, "3 runs", "1 new")
 
 
 def test_a_scene_that_cannot_be_read_is_a_failure_of_its_runs(copied: Path, run: Run) -> None:

@@ -115,7 +115,7 @@ def test_one_camera_has_an_orbit_but_no_spline(made_scene: Path, tmp_path: Path,
 def test_frames_grow_with_the_views_of_a_spline(
     made_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gsmerge.cli.render_command.PATH_FRAMES", 12)
+    monkeypatch.setattr("gsmerge.measure.drawings.PATH_FRAMES", 12)
     for kind, count in (("spline,back:0.5", 20), ("orbit", 12)):
         outcome = run("render", made_scene, "--path", kind, "-o", tmp_path / "x", "--dry-run", "--json", code=0)
         assert json.loads(outcome.out)["frames"] == count

@@ -59,7 +59,7 @@ def test_several_files_become_one_scene(run: Run, sharp: Path, tmp_path: Path) -
     assert report["input"]["num_gaussians"] == 3 * 2 * 150 * 150
     assert report["input"]["bytes"] == sum(file.stat().st_size for file in files)
     assert noted(report["notes"], "3 of 4", "joined", "IMG_0001.ply")
-    assert noted(report["notes"], "IMG_0009.ply", "left out")
+    assert noted(report["notes"], "IMG_0009.ply", "left")
     assert report["psnr_input_views"]["after"] > report["psnr_input_views"]["before"] + 2
     assert len(json.loads((tmp_path / "place.cameras.json").read_text())) == 3  # one for both layers of a view
     inside = tmp_path / "inside" / "place.ply"

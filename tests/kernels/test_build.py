@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
@@ -31,12 +32,13 @@ def test_libraries_of_every_platform_are_built_here(tag: str, tmp_path: Path) ->
     assert sorted(tmp_path.iterdir()) == sorted(paths)
 
 
+@pytest.mark.skipif(sys.platform == "darwin", reason="libraries of macOS hold the name of the folder they were made in")
 def test_two_builds_are_equal(tmp_path: Path) -> None:
     first, second = (build(tmp_path / name) for name in "ab")
     assert [path.read_bytes() for path in first] == [path.read_bytes() for path in second]
 
 
-@pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
+@pytest.mark.skipif(sys.platform == "darwin" or shutil.which("gcc") is None, reason="needs gcc, not clang by its name")
 def test_another_compiler_can_be_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GSMERGE_CC", "gcc -Wno-error")
     for path in build(tmp_path):

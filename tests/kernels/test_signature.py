@@ -50,7 +50,7 @@ def test_arguments_may_be_named():
 
 
 def test_scalars_have_ranges():
-    with refuses(ValueError, "count_boxes: lines", -1):
+    with refuses(ValueError, "count_boxes: tile_height", -1):
         count_boxes(np.zeros((0, 4), np.int16), -1, 1, np.zeros(0, np.int64), np.zeros(0, np.int64))
 
 
@@ -62,6 +62,6 @@ def test_indices_outside_their_arrays_are_refused(box):
 
 @pytest.mark.parametrize("cursor", [-1, 1, 1 << 62])
 def test_a_cursor_outside_the_list_is_refused(cursor):
-    cursors, members = np.full(4, cursor), np.zeros(1, np.int32)
+    cursors, flatten_ids = np.full(4, cursor), np.zeros(1, np.int32)
     with refuses(ValueError, "deal_tiles", "indices"):
-        deal_tiles(np.zeros(1, np.int32), np.array([[0, 1, 0, 1]], np.int16), 2, cursors, members)
+        deal_tiles(np.zeros(1, np.int32), np.array([[0, 1, 0, 1]], np.int16), 2, cursors, flatten_ids)

@@ -24,8 +24,8 @@ from gsmerge.errors import SceneError
 from gsmerge.io import read_cameras, read_images, read_ply
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.cameras.npz_files import read_depths
-from gsmerge.io.cameras.read import read_sharp
-from gsmerge.io.formats.ply_file import REQUIRED
+from gsmerge.io.cameras.read import read_sharp_camera
+from gsmerge.io.formats.arrays import REQUIRED
 
 EXAMPLES = int(os.environ.get("GSMERGE_FUZZ_EXAMPLES", "40"))
 ROWS = 3
@@ -131,7 +131,7 @@ def test_made_up_ply_headers(form: str, header: str, rows: bytes) -> None:
 @given(mutated(sharp_seed()))
 @fuzzed
 def test_mutated_cameras_inside_a_ply(data: bytes) -> None:
-    attempt("a.ply", data, read_sharp)
+    attempt("a.ply", data, read_sharp_camera)
 
 
 def check_cameras(path: Path) -> None:

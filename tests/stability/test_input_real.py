@@ -43,5 +43,5 @@ def test_a_pruned_export_is_put_back(exporter: ModuleType, root: Path, tmp_path:
     assert loaded.recovery.best.layout.kind == "box+depth"
     assert loaded.recovery.best.frame.scale == pytest.approx(1 / 1.7, rel=1e-3)
     actual = loaded.pixel_scene()
-    assert actual.num_gaussians == loaded.ply.count
+    assert actual.num_gaussians == loaded.info.count
     assert actual.valid.all()  # what was dropped is put back from the depth maps

@@ -118,9 +118,9 @@ def test_more_tiles_than_sixteen_bits_count() -> None:
     last = (width - 8) / 100, (height - 8) / 100
     gaussians = make([[*last, 1.0], [0.08, 0.08, 1.0]], [[1, 0, 0, 0]] * 2, [[0.01] * 3] * 2, [0.5] * 2)
     plan = plan_view(prepare(gaussians), np.eye(4), K, width, height)
-    assert len(plan.offsets) == 260 * 260 + 1
-    assert plan.members[plan.offsets[-2] : plan.offsets[-1]].tolist() == [0]
-    assert plan.members[: plan.offsets[1]].tolist() == [1]
+    assert len(plan.isect_offsets) == 260 * 260 + 1
+    assert plan.flatten_ids[plan.isect_offsets[-2] : plan.isect_offsets[-1]].tolist() == [0]
+    assert plan.flatten_ids[: plan.isect_offsets[1]].tolist() == [1]
 
 
 def test_a_very_wide_image() -> None:

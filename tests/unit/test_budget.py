@@ -9,7 +9,7 @@ import scenes
 from messages import refuses
 
 from gsmerge import write_ply
-from gsmerge.io.formats.writing import count_for_bytes, file_bytes
+from gsmerge.io.formats.ply import count_for_bytes, file_bytes
 from gsmerge.settings.budget import parse_budget, parse_bytes
 
 

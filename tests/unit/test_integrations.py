@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from messages import refuses
+from messages import noted, refuses
 from scenes import arc, make_scene, move, room
 
 from gsmerge import Gaussians, Scene, SceneError, compact_tensors, integrations
@@ -98,7 +98,7 @@ def test_rotations_of_depth_anything_3_get_no_note(scene: Scene) -> None:
         **integrations.depth_anything_3(prediction_of(scene, gaussians=gaussians)), **FAST
     ).report.notes
     assert turned[:, 0].min() < 0
-    assert not [note for note in notes if "w comes last" in note]
+    assert not noted(notes, "w", "last")
 
 
 def test_depth_anything_3_in_metres_and_after_writing_colmap(scene: Scene) -> None:

@@ -144,10 +144,9 @@ def test_cameras() -> None:
     [
         ({"viewmats": np.stack([np.eye(3)] * 2)}, ("viewmats", [2, 4, 4], [2, 3, 3])),
         ({"Ks": np.eye(3)[None]}, ("Ks", [2, 3, 3], [1, 3, 3])),
-        ({"width": 0}, ("", "0 x 3")),
-        ({"height": -1}, ("", "4 x -1")),
+        ({"width": 0}, ("", "0 x 3")), ({"height": -1}, ("", "4 x -1")),
     ],
-)
+)  # fmt: skip
 def test_wrong_cameras_are_refused(change: dict, named: tuple[object, ...]) -> None:
     with refuses(ValueError, *named):
         replace(cameras(), **change)
@@ -177,12 +176,12 @@ def test_scenes_of_tensors_become_such_of_arrays(missing: np.ndarray | None) -> 
     changed |= {name: as_tensor(getattr(given, name)) for name in ("images", "pixel_ids")}
     if missing is not None:
         changed["missing"] = as_tensor(missing)
-    loose = Scene(changed["gaussians"], changed["cameras"], changed["images"], None, given.names)
+    unaligned = Scene(changed["gaussians"], changed["cameras"], changed["images"], None, given.names)
     for tensors in (
         replace(given, **changed),
         replace(given, **{**changed, "images": None}),
-        loose,
-        replace(loose, images=None),
+        unaligned,
+        replace(unaligned, images=None),
     ):
         arrays = tensors.numpy()
         assert type(arrays) is type(tensors)

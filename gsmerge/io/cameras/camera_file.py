@@ -109,11 +109,12 @@ def make_camera_file(
     convention: Convention,
     views: Sequence[View],
     images: np.ndarray | None = None,
+    order: str = "auto",
 ) -> CameraFile:
     """Translate poses to world-to-camera with OpenCV axes, and check that they are poses.
 
-    ``images [c,h,w,3]`` are given if the file holds them. SceneError if there is no camera, a number is infinite or
-    too large, a rotation is not orthonormal, or a focal length is not positive.
+    ``images [c,h,w,3]`` and the ``order`` of rows are given if the file holds them. SceneError if there is no camera, a
+    number is infinite or too large, a rotation is not orthonormal, or a focal length is not positive.
     """
     if not views:
         raise SceneError(path, "expected at least one camera, found none")
@@ -153,6 +154,7 @@ def make_camera_file(
         source=source,
         convention=convention,
         images=images,
+        order=order,
         lenses=lenses if any(lenses) else (),
         focal=None if missing else "",
     )
@@ -182,7 +184,7 @@ def check_camera(path: StrPath, name: str, pose: np.ndarray, K: np.ndarray) -> N
     if largest > MAX_NUMBER:
         raise SceneError(path, f"view {name}: expected numbers up to {MAX_NUMBER:g}, found {largest:g}")
     rotation = pose[:3, :3]
-    if np.abs(matmul(rotation, rotation.T) - np.eye(3)).max() > _MAX_ROTATION_ERROR:
+    if not is_orthonormal(rotation):
         raise SceneError(path, f"view {name}: expected a rotation matrix, found one whose axes are not orthonormal")
     if determinant(rotation) < 0:
         problem = f"view {name}: expected a rotation, found a mirrored (left-handed) one"
@@ -191,6 +193,11 @@ def check_camera(path: StrPath, name: str, pose: np.ndarray, K: np.ndarray) -> N
         raise SceneError(path, f"view {name}: expected positive focal lengths, found {K[0, 0]:g} and {K[1, 1]:g}")
     if np.abs(K[2] - (0, 0, 1)).max() > 1e-3 or abs(K[1, 0]) > 1e-3 * K[0, 0]:
         raise SceneError(path, f"view {name}: expected intrinsics whose last row is 0 0 1, found others")
+
+
+def is_orthonormal(axes: np.ndarray) -> bool:
+    """Return whether the axes ``[3,3]`` of a rotation, maybe a mirrored one, are orthonormal but for rounding."""
+    return bool(np.abs(matmul(axes, axes.T) - np.eye(3)).max() <= _MAX_ROTATION_ERROR)
 
 
 def check_size(path: StrPath, name: str, K: np.ndarray, size: tuple[int, int]) -> None:

@@ -14,7 +14,8 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.geometry import rotation_entries
 from gsmerge.io.bounds import MAX_MODEL_BYTES, MAX_VIEWS, check_file, read_text
-from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, View, make_camera_file, make_lens, make_pinhole
+from gsmerge.io.cameras.camera_file import View, make_lens, make_pinhole
+from gsmerge.io.cameras.camera_format import StoredCameras
 
 # model: (id, name, number of parameters); the first focal lengths and principal point, then the distortion
 _MODELS = (
@@ -38,16 +39,19 @@ _Image = tuple[str, int, np.ndarray]  # name, camera id, pose [3,4]
 
 def is_colmap(folder: Path) -> bool:
     """Return whether a folder holds a COLMAP model."""
-    return any((folder / f"cameras{s}").is_file() and (folder / f"images{s}").is_file() for s in (".bin", ".txt"))
+    return holds_model(folder, ".bin") or holds_model(folder, ".txt")
 
 
-def read_colmap(folder: Path) -> CameraFile:
+def holds_model(folder: Path, suffix: str) -> bool:
+    """Return whether a folder holds the files of a COLMAP model with an ending, ``.bin`` or ``.txt``."""
+    return (folder / f"cameras{suffix}").is_file() and (folder / f"images{suffix}").is_file()
+
+
+def read_colmap(folder: Path, suffix: str) -> StoredCameras:
     """Read the cameras of a COLMAP model in the order of its images; SceneError if it is damaged or unknown."""
-    binary = (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file()
-    suffix = ".bin" if binary else ".txt"
     camera_path, image_path = folder / f"cameras{suffix}", folder / f"images{suffix}"
     try:
-        if binary:
+        if suffix == ".bin":
             with _mapped(camera_path) as data:
                 cameras = _binary_cameras(camera_path, data)
             with _mapped(image_path) as data:
@@ -62,8 +66,7 @@ def read_colmap(folder: Path) -> CameraFile:
         raise SceneError(folder, f"expected a COLMAP model, found damaged cameras or images{suffix}") from error
     except OSError as error:
         raise SceneError(folder, f"cannot be read ({error.strerror})") from error
-    views = [cameras[camera]._replace(name=name, pose=pose) for name, camera, pose in images]
-    return make_camera_file(folder, f"COLMAP {'binary' if binary else 'text'}", W2C_OPENCV, views)
+    return StoredCameras([cameras[camera]._replace(name=name, pose=pose) for name, camera, pose in images])
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Cameras inside a ``.ply``: comments of its header, which other readers skip."""
+"""Cameras inside a ``.ply``: comments of its header, which other readers skip, or the elements of SHARP."""
 
 from __future__ import annotations
 
@@ -8,14 +8,18 @@ import json
 import textwrap
 import zlib
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
+from plyfile import PlyListProperty
 
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io.bounds import read_errors
-from gsmerge.io.cameras.camera_file import CameraFile
-from gsmerge.io.cameras.json_files import read_transforms, transforms_document
-from gsmerge.io.formats.ply_file import MAX_HEADER_BYTES
+from gsmerge.io.cameras.camera_file import View, make_pinhole
+from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
+from gsmerge.io.cameras.json_files import transforms_document, transforms_views
+from gsmerge.io.formats.ply import MAX_HEADER_BYTES
+from gsmerge.io.formats.table import PLY, input_format
 from gsmerge.types import Cameras
 
 EMBEDDED = "inside the .ply"  # source of such cameras
@@ -24,7 +28,9 @@ LINE = 900  # characters of a comment: readers in C keep lines of 1,024
 MAX_CHARS = 96 << 10  # of all: splat-transform looks for the end of a header in 128 KiB
 MAX_TEXT = 32 << 20  # bytes of the JSON, as of a file of cameras
 DIGITS = 10  # of each number: 1e-9 of a pixel or of the scene, in half the space of all
-_PROBE = 1 << 12  # bytes from the start of a file within which the first comment is
+SHARP = "SHARP"  # the same
+_SHARP_ELEMENTS = ("extrinsic", "intrinsic", "image_size")  # the last not in its first versions
+SHARP_LAYERS = 2  # Gaussians per cell: a front and a back layer
 
 
 def camera_comments(cameras: Cameras, names: Sequence[str]) -> list[str]:
@@ -44,23 +50,20 @@ def camera_comments(cameras: Cameras, names: Sequence[str]) -> list[str]:
 
 def holds_cameras(path: Path) -> bool:
     """Return whether a file is a ``.ply`` with cameras in the comments of its header."""
-    if path.suffix.lower() != ".ply":
-        return False
-    with read_errors(path), path.open("rb") as file:
-        start = file.read(_PROBE)
-    header = start.partition(b"\nend_header")[0]
-    return header.startswith(b"ply") and f"\ncomment {PREFIX}".encode() in header
+    return path.suffix.lower() == ".ply" and bool(camera_lines(path))
 
 
-def read_embedded(path: Path) -> CameraFile:
-    """Read the cameras in the header of a ``.ply``; SceneError if there are none, or damaged ones."""
+def camera_lines(path: Path) -> list[bytes]:
+    """Read the comments of a ``.ply`` that :func:`camera_comments` made; none without any."""
     with read_errors(path), path.open("rb") as file:
-        header = file.read(MAX_HEADER_BYTES).partition(b"\nend_header")[0]
+        header = file.read(MAX_HEADER_BYTES if file.peek(3)[:3] == b"ply" else 0).partition(b"\nend_header")[0]
     start = f"comment {PREFIX}".encode()
-    lines = [line[len(start) :].strip() for line in header.splitlines() if line.startswith(start)]
-    if not lines:
-        problem = "expected cameras inside it (compact --embed-cameras), found none"
-        raise SceneError(path, problem, "name another file")
+    return [line[len(start) :].strip() for line in header.splitlines() if line.startswith(start)]
+
+
+def read_embedded(source: CameraSource) -> StoredCameras:
+    """Read the cameras in the header of a ``.ply``; SceneError if they are damaged."""
+    path, lines = source.path, camera_lines(source.path)
     try:
         unpacking = zlib.decompressobj()
         text = unpacking.decompress(base64.b64decode(b"".join(lines), validate=True), MAX_TEXT)
@@ -72,4 +75,38 @@ def read_embedded(path: Path) -> CameraFile:
     except (ValueError, RecursionError, zlib.error, binascii.Error) as error:
         problem = f"expected whole cameras in its header, found damaged ones ({error})"
         raise SceneError(path, problem, "name others with --cameras") from error
-    return replace(read_transforms(path, data), source=EMBEDDED)
+    return StoredCameras(transforms_views(path, data))
+
+
+def read_sharp(source: CameraSource) -> StoredCameras | None:
+    """Read the camera that SHARP writes into its ``.ply``, at the size of the file's grid; None without one.
+
+    The grid is square whatever the photo's shape: the photo was stretched to it. SceneError if the numbers are
+    damaged.
+    """
+    if input_format(source.path).read is not PLY.read:
+        return None
+    data = source.ply
+    present = [name for name in _SHARP_ELEMENTS if name in data]
+    if "vertex" not in data or not {"extrinsic", "intrinsic"}.issubset(present):
+        return None
+    for element in (data[name] for name in present):
+        if element.count > 16 or len(element.properties) != 1 or isinstance(element.properties[0], PlyListProperty):
+            return None
+    numbers = {name: np.asarray([row[0] for row in data[name].data], np.float64) for name in present}
+    extrinsic, intrinsic = numbers["extrinsic"], numbers["intrinsic"]
+    if len(intrinsic) == 4 and "image_size" not in numbers:  # first versions: focal lengths and size
+        numbers["image_size"] = intrinsic[2:]
+        intrinsic = make_pinhole(*intrinsic[:2], *(intrinsic[2:] / 2)).reshape(-1)
+    size = numbers.get("image_size", np.zeros(0))
+    side = round((data["vertex"].count / SHARP_LAYERS) ** 0.5)
+    if SHARP_LAYERS * side * side != data["vertex"].count or len(size) != 2 or not (size > 0).all():
+        return None
+    if len(extrinsic) not in (12, 16) or len(intrinsic) != 9:
+        problem = f"expected 16 and 9 numbers of a camera, found {len(extrinsic)} and {len(intrinsic)}"
+        raise SceneError(source.path, problem)
+    pose, K = extrinsic.reshape(-1, 4).copy(), intrinsic.reshape(3, 3)
+    if len(extrinsic) == 12:  # its first versions: the rotation column by column
+        pose[:, :3] = pose[:, :3].T.copy()
+    K = K * np.array([[side / size[0]], [side / size[1]], [1.0]])
+    return StoredCameras([View(source.path.stem, pose, K, (side, side))])

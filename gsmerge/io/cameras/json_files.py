@@ -15,19 +15,17 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry import Similarity, normalize
 from gsmerge.io.bounds import read_json, read_text
 from gsmerge.io.cameras.camera_file import (
-    C2W_OPENCV,
     C2W_OPENGL,
     MAX_NORMALISED_FOCAL,
     MAX_NUMBER,
-    W2C_OPENCV,
-    CameraFile,
     Lens,
     View,
     from_viewmats,
-    make_camera_file,
+    is_orthonormal,
     make_lens,
     make_pinhole,
 )
+from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
 from gsmerge.io.image_names import find_image
 from gsmerge.io.photo_files import image_size
 from gsmerge.kernels.elementary import cos, sin
@@ -45,28 +43,12 @@ FRAMES_FILE, POSE_FILE, SCALE_FILE = "input_frame_idx.txt", "pos_avg_inv.txt", "
 VIEWER_CAMERAS = ".cameras.json"  # ending of the cameras for viewers beside a result
 DATAPARSER = "dataparser_transforms.json"
 _CENTRED = 1e-3  # pixels by which twice a principal point in the middle may differ from the image's size
-_ROTATION_TOLERANCE = 0.02  # of a rotation's columns, as for poses
 
 
-def read_json_cameras(path: Path, folder: Path | None = None) -> CameraFile:
-    """Read the cameras of any known JSON file; SceneError if it is none of them, or damaged.
-
-    ``folder`` is that of the Gaussians, for :func:`read_long_lrm`.
-    """
-    data = read_json(path)
-    if isinstance(data, dict) and "frames" in data:
-        frames = data["frames"]
-        if isinstance(frames, list) and frames and all(isinstance(f, dict) and "w2c" in f for f in frames):
-            return read_long_lrm(path, data, folder)
-        return read_transforms(path, data)
-    if isinstance(data, list) and data and all(isinstance(entry, dict) for entry in data):
-        if "transform_matrix" in data[0]:
-            return read_transforms(path, data)
-        if "position" in data[0] or "rotation" in data[0]:
-            return read_inria(path, data)
-    if isinstance(data, dict) and {"extrinsics", "intrinsics"} <= data.keys():
-        return read_world_mirror(path, data)
-    raise SceneError(path, "expected 'frames' (nerfstudio) or a list of cameras (INRIA), found neither")
+def is_long_lrm(source: CameraSource) -> bool:
+    """Return whether a JSON file has ``frames`` with ``w2c``, as no other format."""
+    frames = source.object.get("frames")
+    return bool(frames) and isinstance(frames, list) and all(isinstance(f, dict) and "w2c" in f for f in frames)
 
 
 @contextmanager
@@ -78,15 +60,18 @@ def _number_errors(path: Path, expected: str) -> Iterator[None]:
         raise SceneError(path, f"{expected} ({error})") from error
 
 
-def read_transforms(path: Path, data: Mapping[str, Any] | list[Any]) -> CameraFile:
-    """Read the cameras of a parsed ``transforms.json``; SceneError if a pose or an intrinsic is missing.
+def read_transforms(source: CameraSource) -> StoredCameras:
+    """Read the cameras of a ``transforms.json`` or a bare list of frames; SceneError if a value is missing.
 
-    A dictionary with ``frames`` has camera-to-world poses with OpenGL axes; a bare list of frames (as one backbone
-    writes) has OpenCV axes. Intrinsics are global or per frame, in pixels or as field of view; no frame need have any.
-    ``applied_transform`` is not applied: poses are in the Gaussians' world.
+    Intrinsics are global or per frame, in pixels or as field of view; no frame need have any. ``applied_transform``
+    is not applied: poses are in the Gaussians' world.
     """
-    source, convention = ("frame list", C2W_OPENCV) if isinstance(data, list) else ("transforms.json", C2W_OPENGL)
-    common, frames = ({}, data) if isinstance(data, list) else (data, data["frames"])
+    return StoredCameras(transforms_views(source.path, source.json))
+
+
+def transforms_views(path: Path, data: Any) -> list[View]:
+    """Read the views of a parsed ``transforms.json``; see :func:`read_transforms`."""
+    common, frames = (data, data["frames"]) if isinstance(data, dict) else ({}, data)
     if not isinstance(frames, list) or not all(isinstance(f, dict) for f in frames):
         raise SceneError(path, "expected 'frames' to be a list of objects, found something else")
     views = []
@@ -101,7 +86,7 @@ def read_transforms(path: Path, data: Mapping[str, Any] | list[Any]) -> CameraFi
             lens = _lens(path, name, values)
             K, size = (None, _stored_size(values)) if bare else _intrinsics(path, name, values)
             views.append(View(name, pose, K, size, lens))
-    return make_camera_file(path, source, convention, views)
+    return views
 
 
 def _stored_size(values: Mapping[str, Any]) -> tuple[int, int]:
@@ -156,13 +141,13 @@ def _lens(path: Path, name: str, values: Mapping[str, Any]) -> Lens | None:
     return make_lens(model if model in _DISTORTED else "OPENCV", "perspective", coefficients)
 
 
-def read_inria(path: Path, entries: list[dict[str, Any]]) -> CameraFile:
-    """Read the cameras of a parsed ``cameras.json``; SceneError if a key is missing or not a number.
+def read_inria(source: CameraSource) -> StoredCameras:
+    """Read the cameras of a ``cameras.json``; SceneError if a key is missing or not a number.
 
     It has rows of the camera-to-world rotation, and the centre; the principal point is in the middle.
     """
-    views = []
-    for i, entry in enumerate(entries):
+    views, path = [], source.path
+    for i, entry in enumerate(source.json):
         name = str(entry.get("img_name", f"view {i}"))
         missing = [key for key in _INRIA_KEYS if key not in entry]
         if missing:
@@ -174,25 +159,25 @@ def read_inria(path: Path, entries: list[dict[str, Any]]) -> CameraFile:
             size = round(width), round(height)
         K = make_pinhole(fx, fy, width / 2, height / 2)
         views.append(View(name, np.concatenate([rotation, centre], 1), K, size))
-    return make_camera_file(path, "INRIA cameras.json", C2W_OPENCV, views)
+    return StoredCameras(views)
 
 
-def read_world_mirror(path: Path, data: Mapping[str, Any]) -> CameraFile:
-    """Read the cameras of a parsed ``camera_params.json``.
+def read_world_mirror(source: CameraSource) -> StoredCameras:
+    """Read the cameras of a ``camera_params.json``.
 
     ``extrinsics`` and ``intrinsics`` are lists of ``{camera_id, matrix}``; poses are camera-to-world with OpenCV
     axes, intrinsics in pixels of the processed size, which is twice the principal point. ``camera_id`` is the stem of
     the image's name, or its number, by which the cameras are then sorted. SceneError if the lists differ in cameras,
     or a matrix is damaged.
     """
+    path, data = source.path, source.json
     poses, Ks = (_matrices(path, data, key, side) for key, side in (("extrinsics", 4), ("intrinsics", 3)))
     if poses.keys() != Ks.keys():
         odd = sorted(poses.keys() ^ Ks.keys())[0]
         raise SceneError(path, f"expected extrinsics and intrinsics of the same cameras, found only one for {odd}")
     names = sorted(poses, key=int) if all(name.isdecimal() for name in poses) else list(poses)
     size = _centred_size([Ks[name] for name in names])
-    views = [View(name, poses[name], Ks[name], size) for name in names]
-    return make_camera_file(path, "camera_params.json", C2W_OPENCV, views)
+    return StoredCameras([View(name, poses[name], Ks[name], size) for name in names])
 
 
 def _centred_size(Ks: Sequence[np.ndarray]) -> tuple[int, int]:
@@ -219,16 +204,16 @@ def _matrices(path: Path, data: Mapping[str, Any], key: str, side: int) -> dict[
     return matrices
 
 
-def read_long_lrm(path: Path, data: Mapping[str, Any], folder: Path | None = None) -> CameraFile:
-    """Read the cameras of a parsed dataset file: ``frames`` of ``fx fy cx cy w h`` and ``w2c``.
+def read_long_lrm(source: CameraSource) -> StoredCameras:
+    """Read the cameras of a dataset file: ``frames`` of ``fx fy cx cy w h`` and ``w2c``.
 
-    Next to its Gaussians (in ``folder``, or copied next to the dataset file) Long-LRM writes which frames it took
+    Next to its Gaussians (or copied next to the dataset file) Long-LRM writes which frames it took
     (``input_frame_idx.txt``) and how the Gaussians' world lies in the cameras': X = scene_scale (pos_avg_inv
     X_cameras); some versions write the frames alone, from which the rest follows. The cameras are moved into the
     Gaussians' world. SceneError if an entry is missing or no number, or a frame does not exist.
     """
-    frames = []
-    for i, frame in enumerate(data["frames"]):
+    frames, path, folder = [], source.path, source.folder
+    for i, frame in enumerate(source.json["frames"]):
         name = str(frame.get("file_path") or frame.get("image_path") or f"view {i}")
         with _number_errors(path, f"view {name}: expected w2c, fx, fy, cx, cy, w, h as numbers"):
             pose = np.array(frame["w2c"], np.float64).reshape(4, 4)
@@ -258,8 +243,7 @@ def read_long_lrm(path: Path, data: Mapping[str, Any], folder: Path | None = Non
             poses[:, :3, 3] *= 1.0 if scale is None else scale[0]
     except np.linalg.LinAlgError as error:
         raise SceneError(pose_path, "expected a matrix that can be inverted") from error
-    views = [frames[i]._replace(pose=pose) for i, pose in zip(ids, poses, strict=True)]
-    return make_camera_file(path, "Long-LRM", W2C_OPENCV, views)
+    return StoredCameras([frames[i]._replace(pose=pose) for i, pose in zip(ids, poses, strict=True)])
 
 
 def _average_frame(c2w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -334,19 +318,18 @@ def viewer_cameras(cameras: Cameras, names: Sequence[str]) -> str:
     return json.dumps(entries) + "\n"
 
 
-def find_dataparser(ply: Path, cameras: Path | None) -> Path | None:
-    """Find the file in which nerfstudio writes how it moved cameras, next to the ``.ply`` or the cameras."""
-    folders = [ply.parent] + ([] if cameras is None else [cameras.parent])
-    return next((folder / DATAPARSER for folder in folders if (folder / DATAPARSER).is_file()), None)
+def read_dataparser(ply: Path, cameras: Path | None) -> list[Similarity]:
+    """Read the similarities that nerfstudio's file next to a ``.ply`` or its cameras may mean; none without the file.
 
-
-def read_dataparser(path: Path, cameras: Path | None) -> list[Similarity]:
-    """Read the similarities that nerfstudio's file may mean: X' = scale (transform [X; 1]).
-
+    It says how cameras were moved into the Gaussians' world: X' = scale (transform [X; 1]).
     ``transform`` starts from the capture's own world. The poses of a ``transforms.json`` with ``applied_transform``
     (and ``applied_scale``) are already moved by that, so it is undone; the reading has to be measured. SceneError
     if the file lacks a rotation, shift and positive scale.
     """
+    folders = [ply.parent] + ([] if cameras is None else [cameras.parent])
+    path = next((folder / DATAPARSER for folder in folders if (folder / DATAPARSER).is_file()), None)
+    if path is None:
+        return []
     data = read_json(path)
     with _number_errors(path, "expected 'transform' of 3x4 numbers and 'scale'"):
         moved = _square(data["transform"])
@@ -369,10 +352,6 @@ def _square(values: Any) -> np.ndarray:
 
 def _similarity(path: Path, matrix: np.ndarray, scale: float) -> Similarity:
     R = matrix[:3, :3]
-    if (
-        np.abs(matmul(R, R.T) - np.eye(3)).max() > _ROTATION_TOLERANCE
-        or determinant(R) < 0
-        or not 0 < scale < MAX_NUMBER
-    ):
+    if not is_orthonormal(R) or determinant(R) < 0 or not 0 < scale < MAX_NUMBER:
         raise SceneError(path, "expected 'transform' to rotate and shift and 'scale' to be positive, found another map")
-    return Similarity(R, scale, scale * matrix[:3, 3], "moved as nerfstudio does", "other")
+    return Similarity(R, scale, scale * matrix[:3, 3], f"moved into the Gaussians' frame by {DATAPARSER}", "other")

@@ -12,14 +12,14 @@ import math
 import warnings
 import zipfile
 from collections.abc import Collection
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file, check_pixels
-from gsmerge.io.cameras.camera_file import C2W_OPENCV, ORDERS, W2C_OPENCV, CameraFile, View, make_camera_file
+from gsmerge.io.cameras.camera_file import C2W_OPENCV, ORDERS, View
+from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
 
 _EXTRINSICS, _INTRINSICS = ("extrinsics", "exts", "extrinsic"), ("intrinsics", "ixts", "intrinsic")
 _IMAGES, _DEPTHS = ("image", "images"), ("depth", "depths")
@@ -29,7 +29,12 @@ _MAX_RATIO = 100  # of unpacked to packed bytes; photos and depth maps reach 20
 _KINDS = "biufU"
 
 
-def read_da3(path: Path) -> CameraFile:
+def is_da3(path: Path) -> bool:
+    """Return whether an npz has the poses of Depth Anything 3 by their names."""
+    return not array_names(path).isdisjoint(_EXTRINSICS[:2])
+
+
+def read_da3(source: CameraSource) -> StoredCameras:
     """Read the cameras (and images, if stored) of an npz: world-to-camera 3x4 or 4x4, intrinsics in pixels.
 
     Intrinsics of another image size than the depth maps' (a COLMAP export in the same call writes those), or
@@ -37,6 +42,7 @@ def read_da3(path: Path) -> CameraFile:
     world, normalised, in a batch of one) return is read as well. SceneError if the file cannot be read or lacks an
     array.
     """
+    path = source.path
     sizes = () if holds_images(path) else _DEPTHS  # of depths only the shape counts, the confidence is never read
     arrays = read_arrays(path, {*_EXTRINSICS, *_INTRINSICS, *_IMAGES, *sizes})
     poses, Ks, images, depths = (_first(arrays, names) for names in (_EXTRINSICS, _INTRINSICS, _IMAGES, _DEPTHS))
@@ -54,15 +60,14 @@ def read_da3(path: Path) -> CameraFile:
         Ks = None if Ks is None else _at_size(Ks, width, height)
     elif Ks is not None:
         width, height = round(2 * Ks[0, 0, 2]), round(2 * Ks[0, 1, 2])
-    if _EXTRINSICS[0] in arrays or _EXTRINSICS[1] in arrays:
-        return make_camera_file(path, "DA3 npz", W2C_OPENCV, _views(poses, Ks, (width, height)), images)
-    normalised = width <= 1 and Ks is not None
-    size, convention = ((0, 0), C2W_OPENCV) if normalised else ((width, height), W2C_OPENCV)
-    return make_camera_file(path, "npz of poses", convention, _views(poses, Ks, size), images)
+    if width <= 1 and Ks is not None and not is_da3(path):  # normalised: AnySplat's
+        return StoredCameras(_views(poses, Ks, (0, 0)), images, convention=C2W_OPENCV)
+    return StoredCameras(_views(poses, Ks, (width, height)), images)
 
 
-def read_dump(path: Path) -> CameraFile:
+def read_dump(source: CameraSource) -> StoredCameras:
     """Read the cameras and images of a ``views.npz``, which may lack ``K``; SceneError if another array is missing."""
+    path = source.path
     arrays = read_arrays(path, ("c2w", "K", "images", "order"))
     missing = [name for name in ("c2w", "images") if name not in arrays]
     if missing:
@@ -73,8 +78,7 @@ def read_dump(path: Path) -> CameraFile:
     order = str(arrays.get("order", "auto"))
     if order not in ORDERS:
         raise SceneError(path, f"expected 'order' to be one of {', '.join(ORDERS)}, found {order[:40]!r}")
-    views = _views(poses, Ks, (images.shape[2], images.shape[1]))
-    return replace(make_camera_file(path, "dump of a model", C2W_OPENCV, views, images), order=order)
+    return StoredCameras(_views(poses, Ks, (images.shape[2], images.shape[1])), images, order)
 
 
 def holds_images(path: Path) -> bool:

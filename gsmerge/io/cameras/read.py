@@ -1,4 +1,4 @@
-"""Read cameras by the kind of their file; lists of poses and cameras inside a ``.ply`` are read here."""
+"""Read cameras: the table of their formats, and the places where they are in folders."""
 
 from __future__ import annotations
 
@@ -7,19 +7,24 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
-from plyfile import PlyListProperty
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import MAX_VIEWS, check_file, read_text
-from gsmerge.io.cameras.camera_file import C2W_OPENCV, W2C_OPENCV, CameraFile, View, make_camera_file, make_pinhole
-from gsmerge.io.cameras.colmap import is_colmap, read_colmap
-from gsmerge.io.cameras.embedded import read_embedded
-from gsmerge.io.cameras.json_files import VIEWER_CAMERAS, read_json_cameras
-from gsmerge.io.cameras.npz_files import array_names, holds_poses, read_da3, read_dump
+from gsmerge.io.cameras.camera_file import C2W_OPENCV, C2W_OPENGL, W2C_OPENCV, CameraFile, View, make_pinhole
+from gsmerge.io.cameras.camera_format import CameraFormat, CameraSource, StoredCameras
+from gsmerge.io.cameras.colmap import holds_model, is_colmap, read_colmap
+from gsmerge.io.cameras.embedded import EMBEDDED, SHARP, camera_lines, read_embedded, read_sharp
+from gsmerge.io.cameras.json_files import (
+    VIEWER_CAMERAS,
+    is_long_lrm,
+    read_inria,
+    read_long_lrm,
+    read_transforms,
+    read_world_mirror,
+)
+from gsmerge.io.cameras.npz_files import array_names, holds_poses, is_da3, read_da3, read_dump
 from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
 from gsmerge.io.cameras.re10k import read_re10k
-from gsmerge.io.formats.ply import find_reader
-from gsmerge.io.formats.ply_file import open_ply
 from gsmerge.types import StrPath
 
 # Where cameras are in a scene's folder, the first that exists wins; a COLMAP model directly in the folder comes last,
@@ -32,9 +37,6 @@ CAMERA_PLACES = (
 INTRINSICS = ("intrinsic.txt", "intrinsics.txt")
 _POSE_COLUMNS = (12, 16)  # numbers of a pose in a line
 _MAX_OTHERS = 16  # files in a folder that are looked into for cameras
-SHARP = "SHARP"
-_SHARP_ELEMENTS = ("extrinsic", "intrinsic", "image_size")  # the last not in its first versions
-SHARP_LAYERS = 2  # Gaussians per cell: a front and a back layer
 
 
 def find_cameras(folder: Path) -> Path | None:
@@ -59,7 +61,7 @@ def _holds_cameras(path: Path) -> bool:
     if path.suffix == ".npz":
         return holds_poses(path)
     try:
-        return len(read_json_cameras(path)) > 0
+        return len(read_cameras(path)) > 0
     except SceneError:
         return False
 
@@ -67,10 +69,7 @@ def _holds_cameras(path: Path) -> bool:
 def read_cameras(path: StrPath, *, scene: str | None = None, folder: Path | None = None) -> CameraFile:
     """Read cameras from a file, or from a folder that holds one of the known kinds.
 
-    ``transforms.json`` (nerfstudio, instant-ngp), COLMAP text and binary models, INRIA's ``cameras.json``,
-    ``results.npz`` of Depth Anything 3, ``views.npz`` dumped from a running model, ``camera_params.json`` of
-    WorldMirror, the dataset file of Long-LRM, ``.torch`` chunks of re10k, text files with one pose per line, and a
-    ``.ply`` of gsmerge that holds its own. Poses become world-to-camera with OpenCV axes.
+    The formats are those of docs/guide/formats.md. Poses become world-to-camera with OpenCV axes.
 
     Args:
         path: The file, a COLMAP folder, or a folder that has the cameras in one of the usual places.
@@ -83,52 +82,53 @@ def read_cameras(path: StrPath, *, scene: str | None = None, folder: Path | None
     path = Path(path)
     if not os.path.exists(path):
         raise SceneError(path, "no such file or folder")
-    if path.is_dir():
-        inside = path if is_colmap(path) else find_cameras(path) or find_other_cameras(path)
+    if path.is_dir() and not is_colmap(path):
+        inside = find_cameras(path) or find_other_cameras(path)
         if inside is None:
             raise SceneError(path, "expected transforms.json, cameras.json, a COLMAP model or results.npz, found none")
         path = inside
-    if path.is_dir():
-        return read_colmap(path)
-    check_file(path)
-    if path.suffix in (".bin", ".txt"):
-        columns = 0
-        with suppress(OSError, ValueError), path.open(encoding="utf-8-sig") as file:
-            columns = len(_numbers(file.readline(4096)))
-        if columns in _POSE_COLUMNS:
-            return read_trajectory(path)
-        if not is_colmap(path.parent):
-            raise SceneError(path, "expected a COLMAP model with cameras and images files, found no pair of them")
-        return read_colmap(path.parent)
-    if path.suffix == ".npz":
-        return read_dump(path) if "c2w" in array_names(path) else read_da3(path)
-    if path.suffix == CHUNK:
-        return read_re10k(path, scene)
-    if path.suffix == ".json":
-        return read_json_cameras(path, folder)
-    if path.suffix.lower() == ".ply":
-        return read_embedded(path)
-    raise SceneError(path, "expected cameras as .json, .npz, .torch or a COLMAP folder, found another kind of file")
+    if not path.is_dir():
+        check_file(path)
+        if path.suffix in (".bin", ".txt") and not _lists_poses(path):
+            if not is_colmap(path.parent):
+                raise SceneError(path, "expected a COLMAP model with cameras and images files, found no pair of them")
+            path = path.parent
+    source, ending = CameraSource(path, scene, folder), "" if path.is_dir() else path.suffix.lower()
+    chosen = next((row for row in CAMERA_FORMATS if row.ending == ending and row.recognise(source)), None)
+    if chosen is None:
+        raise SceneError(path, *_UNKNOWN.get(ending, _UNKNOWN[""]))
+    return chosen.cameras(source)
 
 
-def read_trajectory(path: Path) -> CameraFile:
+def read_sharp_camera(path: Path) -> CameraFile | None:
+    """Read the camera that SHARP writes into its ``.ply``; None without one."""
+    source = CameraSource(path)
+    return _SHARP.cameras(source) if _SHARP.recognise(source) else None
+
+
+def _lists_poses(path: Path) -> bool:
+    with suppress(OSError, ValueError), path.open(encoding="utf-8-sig") as file:
+        return len(_numbers(file.readline(4096))) in _POSE_COLUMNS
+    return False
+
+
+def _read_poses(source: CameraSource) -> StoredCameras:
     """Read the cameras of a text file with one pose per line, as KITTI and DA3 write it.
 
     A line has 12 or 16 numbers: camera-to-world, OpenCV axes, row by row. Next to the file is ``intrinsic.txt`` (or
     ``intrinsics.txt``) with fx, fy, cx, cy in pixels, one line for all views or one for each, or nothing; the images
     have the size. SceneError if a line has another number of numbers.
     """
-    poses = _rows(path, _POSE_COLUMNS)
+    path, poses = source.path, _rows(source.path, _POSE_COLUMNS)
     intrinsics = next((path.with_name(name) for name in INTRINSICS if path.with_name(name).is_file()), None)
     if intrinsics is None:
-        views = [View(f"{i:06d}", pose.reshape(-1, 4), None) for i, pose in enumerate(poses)]
-        return make_camera_file(path, "pose list", C2W_OPENCV, views)
+        return StoredCameras([View(f"{i:06d}", pose.reshape(-1, 4), None) for i, pose in enumerate(poses)])
     values = _rows(intrinsics, (4,))
     if len(values) not in (1, len(poses)):
         raise SceneError(intrinsics, f"expected one line, or one for each of {len(poses)} views, found {len(values)}")
     Ks = [make_pinhole(*row) for row in (values * len(poses) if len(values) == 1 else values)]
     views = [View(f"{i:06d}", pose.reshape(-1, 4), K) for i, (pose, K) in enumerate(zip(poses, Ks, strict=True))]
-    return make_camera_file(path, "pose list", C2W_OPENCV, views)
+    return StoredCameras(views)
 
 
 def _rows(path: Path, lengths: tuple[int, ...]) -> list[np.ndarray]:
@@ -151,36 +151,66 @@ def _numbers(line: str) -> np.ndarray:
     return np.array(line.replace(",", " ").split(), np.float64)
 
 
-def read_sharp(path: Path) -> CameraFile | None:
-    """Read the camera that SHARP writes into its ``.ply``, at the size of the file's grid; None without one.
-
-    The grid is square whatever the photo's shape: the photo was stretched to it. SceneError if the numbers are
-    damaged.
-    """
-    if find_reader(path) is not None:
-        return None
-    data = open_ply(path)
-    present = [name for name in _SHARP_ELEMENTS if name in data]
-    if "vertex" not in data or not {"extrinsic", "intrinsic"}.issubset(present):
-        return None
-    for element in (data[name] for name in present):
-        if element.count > 16 or len(element.properties) != 1 or isinstance(element.properties[0], PlyListProperty):
-            return None
-    rows = {name: [row[0] for row in data[name].data] for name in present}
-    numbers = {name: np.asarray(values, np.float64) for name, values in rows.items()}
-    extrinsic, intrinsic = numbers["extrinsic"], numbers["intrinsic"]
-    if len(intrinsic) == 4 and "image_size" not in numbers:  # first versions: focal lengths and size
-        numbers["image_size"] = intrinsic[2:]
-        intrinsic = make_pinhole(*intrinsic[:2], *(intrinsic[2:] / 2)).reshape(-1)
-    size = numbers.get("image_size", np.zeros(0))
-    side = round((data["vertex"].count / SHARP_LAYERS) ** 0.5)
-    if SHARP_LAYERS * side * side != data["vertex"].count or len(size) != 2 or not (size > 0).all():
-        return None
-    if len(extrinsic) not in (12, 16) or len(intrinsic) != 9:
-        raise SceneError(path, f"expected 16 and 9 numbers of a camera, found {len(extrinsic)} and {len(intrinsic)}")
-    pose, K = extrinsic.reshape(-1, 4).copy(), intrinsic.reshape(3, 3)
-    if len(extrinsic) == 12:  # its first versions: the rotation column by column
-        pose[:, :3] = pose[:, :3].T.copy()
-    K = K * np.array([[side / size[0]], [side / size[1]], [1.0]])
-    view = View(path.stem, pose, K, (side, side))
-    return make_camera_file(path, SHARP, W2C_OPENCV, [view])
+_SHARP = CameraFormat(
+    SHARP, "inside the `.ply` of SHARP", ".ply", lambda file: read_sharp(file) or StoredCameras([]), W2C_OPENCV,
+    "pixels of the photo", lambda file: read_sharp(file) is not None,
+)  # fmt: skip
+# In the order of trial: the first of a file's ending that recognises it
+CAMERA_FORMATS = (
+    CameraFormat(
+        "COLMAP binary", "COLMAP: `cameras.bin` and `images.bin`", "", lambda file: read_colmap(file.path, ".bin"),
+        W2C_OPENCV, "pixels; lenses", lambda file: holds_model(file.path, ".bin"),
+    ),
+    CameraFormat(
+        "COLMAP text", "COLMAP: `cameras.txt` and `images.txt`", "", lambda file: read_colmap(file.path, ".txt"),
+        W2C_OPENCV, "pixels; lenses",
+    ),
+    CameraFormat(
+        "pose list", "text with one pose of 12 or 16 numbers a line", ".txt", _read_poses, C2W_OPENCV,
+        "pixels, in `intrinsic.txt` beside it; may be missing",
+    ),
+    CameraFormat("Long-LRM", "dataset file of Long-LRM", ".json", read_long_lrm, W2C_OPENCV, "pixels", is_long_lrm),
+    CameraFormat(
+        "transforms.json", "`transforms.json` of nerfstudio and instant-ngp", ".json", read_transforms, C2W_OPENGL,
+        "pixels or field of view; may be missing; lenses", lambda file: "frames" in file.object,
+    ),
+    CameraFormat(
+        "frame list", "list of frames with `transform_matrix`", ".json", read_transforms, C2W_OPENCV,
+        "pixels or field of view; may be missing; lenses", lambda file: "transform_matrix" in file.first,
+    ),
+    CameraFormat(
+        "INRIA cameras.json", "`cameras.json` of INRIA", ".json", read_inria, C2W_OPENCV,
+        "pixels; principal point in the middle", lambda file: "position" in file.first or "rotation" in file.first,
+    ),
+    CameraFormat(
+        "camera_params.json", "`camera_params.json` of WorldMirror", ".json", read_world_mirror, C2W_OPENCV, "pixels",
+        lambda file: {"extrinsics", "intrinsics"} <= file.object.keys(),
+    ),
+    CameraFormat(
+        "dump of a model", "`views.npz` ([below](#models-that-save-no-cameras))", ".npz", read_dump, C2W_OPENCV,
+        "pixels, or divided by the size; may be missing", lambda file: "c2w" in array_names(file.path),
+    ),
+    CameraFormat(
+        "DA3 npz", "`results.npz` of Depth Anything 3", ".npz", read_da3, W2C_OPENCV,
+        "pixels, or divided by the size; may be missing", lambda file: is_da3(file.path),
+    ),
+    CameraFormat(
+        "npz of poses", "`.npz` of what VGGT or AnySplat (camera-to-world) returns", ".npz", read_da3, W2C_OPENCV,
+        "pixels; of AnySplat divided by the size; may be missing",
+    ),
+    CameraFormat(
+        "re10k chunk", "`.torch` chunk of re10k, the scene named like the `.ply`", CHUNK, read_re10k, W2C_OPENCV,
+        "divided by the size",
+    ),
+    CameraFormat(
+        EMBEDDED, "inside a `.ply` of gsmerge ([below](#cameras-for-viewers))", ".ply", read_embedded, C2W_OPENGL,
+        "pixels", lambda file: bool(camera_lines(file.path)),
+    ),
+    _SHARP,
+)  # fmt: skip
+CAMERA_ENDINGS = tuple(dict.fromkeys(row.ending for row in CAMERA_FORMATS if row.ending not in ("", ".ply")))
+_UNKNOWN = {  # what was expected of a file of an ending, and a remedy
+    "": ("expected cameras as .json, .npz, .torch or a COLMAP folder, found another kind of file",),
+    ".json": ("expected 'frames' (nerfstudio) or a list of cameras (INRIA), found neither",),
+    ".ply": ("expected cameras inside it (compact --embed-cameras), found none", "name another file"),
+}

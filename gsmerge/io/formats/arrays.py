@@ -8,9 +8,30 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from gsmerge.geometry import morton_codes, sh0_to_rgb
-from gsmerge.io.formats.ply_file import MAX_LOG_SCALE, MEANS, MIP_COMMENT, QUATS, SCALES, SH0
 from gsmerge.kernels.elementary import log
 from gsmerge.types import Array, Gaussians, as_array
+
+MAX_LOG_SCALE = 30.0  # exp(30) squared and exp(-30) squared are still normal float32 numbers
+LOGIT_COMMENT = "opacity: logit"  # so that our own files are never guessed at
+RENDER_COMMENT = "SplatRenderMode"  # brush writes it: plain, or mip for Gaussians with a filter of their own
+MIP_COMMENT = f"{RENDER_COMMENT}: mip"
+
+MEANS, NORMALS = ("x", "y", "z"), ("nx", "ny", "nz")
+SH0 = ("f_dc_0", "f_dc_1", "f_dc_2")
+RGB = ("red", "green", "blue")  # instead of the former, in nerfstudio's files of plain colours
+SCALES = ("scale_0", "scale_1", "scale_2")
+QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
+REQUIRED = (*MEANS, *SH0, "opacity", *SCALES, *QUATS)
+
+
+def sh_degree(num_higher: int) -> int:
+    """Return the degree of so many harmonics above degree 0."""
+    return round((num_higher + 1) ** 0.5) - 1
+
+
+def color_columns(names: tuple[str, ...] | None) -> tuple[str, ...]:
+    """Name the columns of the base colour."""
+    return SH0 if names is None or SH0[0] in names else RGB
 
 
 @dataclass(frozen=True)
@@ -58,13 +79,13 @@ def concatenate(parts: Sequence[Columns]) -> Columns:
 
 @dataclass(frozen=True)
 class StoredRows:
-    """Gaussians as a file stores them: ``rows`` has the columns of :mod:`gsmerge.io.formats.ply_file`."""
+    """Gaussians as a file stores them: ``rows`` has the columns of a PLY file, ``REQUIRED`` and more."""
 
     rows: np.ndarray
     layout: str  # for people
     format: str
     encoding: str | None  # of the opacities: "logit", "raw", or None where the file does not say
-    sizes: dict[str, int] | None = None  # bytes by attribute; None: those of the rows
+    sizes: dict[str, int]  # bytes by attribute
     comments: tuple[str, ...] = ()
     extra_elements: tuple[str, ...] = ()
     bytes_beside: int = 0  # of other files that the rows are in
@@ -80,7 +101,7 @@ def to_rows(columns: Columns, name: str, sizes: dict[str, int], *, mip: bool = F
         table = np.concatenate(parts, axis=1, dtype=np.float32, casting="same_kind")
     return StoredRows(
         rows=table.view([(column, np.float32) for column in names])[:, 0],
-        layout=f"{name}, SH degree {round((num_higher + 1) ** 0.5) - 1}",
+        layout=f"{name}, SH degree {sh_degree(num_higher)}",
         format="quantised",
         encoding="raw",
         sizes=sizes,

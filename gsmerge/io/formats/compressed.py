@@ -14,8 +14,7 @@ from plyfile import PlyData, PlyElement, PlyListProperty
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import rgb_to_sh0
-from gsmerge.io.formats.arrays import from_smallest_three, smallest_three, to_bytes, to_columns
-from gsmerge.io.formats.ply_file import MEANS, QUATS, REQUIRED, SCALES, SH0
+from gsmerge.io.formats import arrays
 from gsmerge.kernels.elementary import log, log1p
 from gsmerge.types import Gaussians
 
@@ -51,18 +50,18 @@ def unpack(path: Path, data: PlyData) -> np.ndarray:
         problem = f"expected {num_chunks} chunks for {count} Gaussians, found {chunk.count}"
         raise SceneError(path, problem, "export it again")
     num_rest = _num_rest(path, data, count)
-    rows = np.empty(count, [(name, "<f4") for name in (*REQUIRED, *(f"f_rest_{i}" for i in range(num_rest)))])
+    rows = np.empty(count, [(name, "<f4") for name in (*arrays.REQUIRED, *(f"f_rest_{i}" for i in range(num_rest)))])
     words = {name: np.asarray(vertex[name]).astype(np.uint32) for name in PACKED}
     with np.errstate(all="ignore"):  # what is not finite is set aside later
-        _fill_between(rows, MEANS, _shares(words["packed_position"], (11, 10, 11)), chunk, RANGES[:6])
-        _fill_between(rows, SCALES, _shares(words["packed_scale"], (11, 10, 11)), chunk, RANGES[6:])
+        _fill_between(rows, arrays.MEANS, _shares(words["packed_position"], (11, 10, 11)), chunk, RANGES[:6])
+        _fill_between(rows, arrays.SCALES, _shares(words["packed_scale"], (11, 10, 11)), chunk, RANGES[6:])
         *colors, alpha = _shares(words["packed_color"], (8, 8, 8, 8))
-        _fill_between(rows, SH0, colors, chunk, COLORS)
+        _fill_between(rows, arrays.SH0, colors, chunk, COLORS)
         rows["opacity"] = log(alpha) - log1p(-alpha)  # infinite for 0 and 1, which the reader takes as such
     largest = (words["packed_rotation"] >> np.uint32(30)).astype(np.int64)  # of wxyz
     others = np.stack(_shares(words["packed_rotation"], (10, 10, 10)), 1) - 0.5  # within +-sqrt(1/2)
-    quats = from_smallest_three(largest, others * np.sqrt(2.0))
-    for i, name in enumerate(QUATS):
+    quats = arrays.from_smallest_three(largest, others * np.sqrt(2.0))
+    for i, name in enumerate(arrays.QUATS):
         rows[name] = quats[:, i]
     for i in range(num_rest):
         stored = np.asarray(data["sh"][f"f_rest_{i}"], np.float32)
@@ -91,7 +90,7 @@ def _fill_between(
         if has_ranges:
             least, most = (np.asarray(chunk[name], np.float32)[ids] for name in (low, high))
             share = least * (1 - share) + most * share
-        rows[column] = rgb_to_sh0(share) if column in SH0 else share
+        rows[column] = rgb_to_sh0(share) if column in arrays.SH0 else share
 
 
 def _shares(words: np.ndarray, bits: tuple[int, ...]) -> list[np.ndarray]:
@@ -105,14 +104,14 @@ def _shares(words: np.ndarray, bits: tuple[int, ...]) -> list[np.ndarray]:
 
 def compressed_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
     """Encode a ``.compressed.ply`` file along a space-filling curve; ValueError if there is NaN or inf."""
-    columns = to_columns(gaussians, MAX_DEGREE).along_curve()
+    columns = arrays.to_columns(gaussians, MAX_DEGREE).along_curve()
     count, num_rest = len(columns), 3 * columns.harmonics.shape[1]
     ranged = [_ranged(values) for values in (columns.means, columns.log_scales, columns.colors)]
     chunks = np.concatenate([end for low, high, _ in ranged for end in (low, high)], 1)
     means, scales, colors = (shares for _, _, shares in ranged)
     words = np.empty((count, 4), "<u4")
     words[:, 0], words[:, 2] = _packed(means, (11, 10, 11)), _packed(scales, (11, 10, 11))
-    largest, others = smallest_three(columns.quats)
+    largest, others = arrays.smallest_three(columns.quats)
     words[:, 1] = largest.astype(np.uint32) << np.uint32(30) | _packed(others / np.sqrt(2.0) + 0.5, (10, 10, 10))
     words[:, 3] = _packed(np.concatenate([colors, columns.opacities[:, None]], 1), (8, 8, 8, 8))
     harmonics = np.floor((columns.harmonics / SH_RANGE + 0.5) * 256).transpose(0, 2, 1)
@@ -122,7 +121,9 @@ def compressed_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> byte
     if num_rest:
         header += [f"element sh {count}", *(f"property uchar f_rest_{i}" for i in range(num_rest))]
     text = "\n".join([*header, "end_header", ""])
-    return text.encode("ascii") + chunks.astype("<f4").tobytes() + words.tobytes() + to_bytes(harmonics).tobytes()
+    return (
+        text.encode("ascii") + chunks.astype("<f4").tobytes() + words.tobytes() + arrays.to_bytes(harmonics).tobytes()
+    )
 
 
 def _ranged(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

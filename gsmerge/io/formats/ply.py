@@ -1,216 +1,57 @@
-"""Read Gaussian splats from files: log scales, logits and channel-major harmonics end here."""
+"""PLY: files opened with their header checked against the file's size, read and written as INRIA lays them out."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import re
+import threading
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from io import BufferedReader, FileIO, TextIOWrapper
 from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
-from plyfile import PlyData, PlyElement
+from plyfile import PlyData, PlyElement, PlyElementParseError, PlyListProperty, PlyParseError
 
-from gsmerge.errors import SceneError
-from gsmerge.geometry import rgb_to_sh0
-from gsmerge.io.formats import ply_file, sog, splat, spz, streamed
-from gsmerge.io.formats.arrays import StoredRows
+from gsmerge.errors import SceneError, UsageError
+from gsmerge.io.bounds import check_file
+from gsmerge.io.formats import arrays
 from gsmerge.io.formats.compressed import is_compressed, unpack
-from gsmerge.kernels.elementary import exp, log
-from gsmerge.runtime.memory import free_pages, make_array
-from gsmerge.runtime.threads import parallel_map
-from gsmerge.settings.reading import OpacityChoice
-from gsmerge.types import Gaussians, StrPath
+from gsmerge.kernels.elementary import log, log1p
+from gsmerge.types import Gaussians
 
-MIN_FINITE = 0.002  # of the rows: the rest of a file tells nothing about the scene
+MAX_DEGREE = 4
+MAX_LOGIT = 16.0  # from 16.6 on the sigmoid is 1 in float32, and its logit infinite
+BLOCK_BYTES = 1 << 19  # of file rows converted at a time: they stay in the cache from the first column to the last
 
-# What reads a file of Gaussians, by its ending; all others but the index of levels are taken for PLY
-READERS: dict[str, Callable[[Path], StoredRows]] = {
-    ".spz": spz.read_rows,
-    ".splat": splat.read_rows,
-    ".sog": sog.read_rows,
+MAX_HEADER_BYTES = 1 << 20
+MAX_LIST_VALUES = 1_000_000  # of elements with lists, which are read one value at a time
+_SIZES = {
+    **dict.fromkeys(("char", "uchar", "int8", "uint8", "i1", "u1", "b1"), 1),
+    **dict.fromkeys(("short", "ushort", "int16", "uint16", "i2", "u2"), 2),
+    **dict.fromkeys(("int", "uint", "int32", "uint32", "float", "float32", "i4", "u4", "f4"), 4),
+    **dict.fromkeys(("double", "float64", "f8"), 8),
 }
-SCENE_SUFFIXES = (".ply", *READERS)
-
-FREED_ROWS = 1 << 20  # after which the pages of large columns leave memory
-_MIN_JUDGED = 100  # Gaussians whose scales say something
-_SCALE_SAMPLES = 20_000  # of them that are looked at
-_MAX_WIDTH = 0.25  # share of the scene's width from which on standard deviations are wrong
-# The same in units of the width over the root of the number of Gaussians: sound files have 0.3 to
-# 2, linear scales that are taken for logarithms 10 to 1,000.
-_MAX_SPACINGS = 6.0
 
 
-@dataclass(frozen=True)
-class PlyInfo:
-    """Facts about a file of Gaussians; of another format than PLY, about its rows as float32 columns."""
-
-    path: str
-    layout: str  # name of the column layout, as "17-column export" or "INRIA, SH degree 3"
-    format: str  # "ascii", "binary little-endian" or "binary big-endian"
-    count: int  # Gaussians, the unusable ones included
-    file_bytes: int  # of an index, with those of its level's chunks
-    # bytes of the rows by attribute (means, normals, sh0, shN, opacities, scales, quats, extra); of the values' binary
-    # types for an ascii file; before gzip for .spz, and of the textures for .sog, where sh0 includes the opacities
-    bytes_by_attribute: dict[str, int]
-    # all columns of the vertex element, in the file's order; ``extra_columns`` are ignored, and ``byte_columns`` stored
-    # as bytes
-    columns: tuple[str, ...]
-    extra_columns: tuple[str, ...]
-    extra_elements: tuple[str, ...]  # elements besides ``vertex``
-    byte_columns: tuple[str, ...]
-    comments: tuple[str, ...]  # of the header
-    sh_degree: int  # 0 to 4
-    opacity_encoding: str  # "logit", or "raw" where the file holds opacities in [0, 1]
-    opacity_guessed: bool  # whether the encoding was guessed from the values, not given by the caller or the file
-    num_nonfinite: int  # rows with NaN or inf, set aside
-    num_clipped_scales: int  # Gaussians with a log scale beyond +-30 or a harmonic beyond +-1e6, clipped
-    num_zero_quats: int  # Gaussians without a rotation, read as the identity
-    # why the scales are likely wrong, one sentence without a full stop; empty where they are not
-    odd_scales: str = ""
-
-
-@dataclass(frozen=True)
-class PlyScene:
-    """The n Gaussians of a file, row by row; float32, means float64 where the file stores them so.
-
-    A row that was not finite is False in ``valid [n]``, fully transparent and grey, and has the position and scales of
-    the finite row before it.
-    """
-
-    gaussians: Gaussians
-    valid: np.ndarray
-    info: PlyInfo
-
-
-def kept_comments(info: PlyInfo) -> tuple[str, ...]:
-    """Return the comments of a file's header that tell viewers how to render its Gaussians."""
-    lines = (comment for comment in info.comments if comment.isascii() and comment.isprintable())
-    return tuple(comment for comment in lines if comment.startswith(ply_file.RENDER_COMMENT))
-
-
-def ply_notes(info: PlyInfo) -> tuple[str, ...]:
-    """Describe what was adapted or looks odd in a PLY file, one sentence each, without a full stop."""
-    counted = {
-        "row(s) with NaN or inf, set aside": info.num_nonfinite,
-        "Gaussian(s) with extreme scales or colours, clipped": info.num_clipped_scales,
-        "Gaussian(s) with a zero quaternion, taken as the identity": info.num_zero_quats,
-    }
-    raw = ("all opacities lie in [0, 1]: taken as activated, not as logits; opacity 'logit' says otherwise",)
-    notes = raw if info.opacity_encoding == "raw" and info.opacity_guessed else ()
-    odd = (info.odd_scales,) if info.odd_scales else ()
-    return (*notes, *odd, *(f"{count:,} {what}" for what, count in counted.items() if count))
-
-
-def read_ply(path: StrPath, *, opacity: OpacityChoice = "auto") -> PlyScene:
-    """Read a PLY file of Gaussians: binary or ascii, any SH degree up to 4, extra columns and elements ignored.
-
-    Colours may be red, green and blue (bytes, or floats in [0, 1]) where the harmonics of degree 0 are missing.
-
-    Args:
-        path: The file.
-        opacity: How opacities are stored; "auto" takes them as activated if all finite ones lie in [0, 1], else
-            as logits. Infinite logits are opacities of 0 and 1.
-
-    Raises:
-        SceneError: If the file cannot be read, lacks columns, or hardly has a finite Gaussian: 2 in 1,000 rows.
-        ValueError: If ``opacity`` is none of the three.
-    """
-    return read_parts([Path(path)], opacity=opacity)
-
-
-def read_parts(paths: Sequence[Path], *, opacity: OpacityChoice = "auto") -> PlyScene:
-    """Read one PLY file, or several with the same columns as if they were one, in their order, see :func:`read_ply`."""
-    if opacity not in ("auto", "logit", "raw"):
-        raise ValueError(f"opacity: expected 'auto', 'logit' or 'raw', got {opacity!r}")
-    parts = [_open_rows(path) for path in paths]
-    for path, part in zip(paths, parts, strict=True):
-        if np.asarray(part.rows).dtype != np.asarray(parts[0].rows).dtype:
-            problem = f"expected the columns of {paths[0].name}, found others, so they are no parts of one scene"
-            raise SceneError(path, problem, "name one of the files")
-    return _to_scene(paths, parts, opacity)
-
-
-def _open_rows(path: Path) -> StoredRows:
-    data = ply_file.open_ply(path)
+def read_rows(path: Path) -> arrays.StoredRows:
+    """Read the rows of a PLY file, whose values :func:`open_rows` reads; SceneError if there are none of Gaussians."""
+    data = open_ply(path)
     compressed = is_compressed(data)
     rows = unpack(path, data) if compressed else _vertex(path, data).data
-    names = tuple(np.asarray(rows).dtype.names or ())
-    num_rest = _num_rest(path, names)
+    names = tuple(rows.dtype.names or ())
     comments = (*data.comments, *(c for e in data.elements for c in e.comments))
-    return StoredRows(
+    return arrays.StoredRows(
         rows=rows,
-        layout=ply_file.layout_name(names, num_rest, compressed=compressed),
+        layout=_layout_name(names, _num_rest(path, names), compressed=compressed),
         format="ascii" if data.text else "binary big-endian" if data.byte_order == ">" else "binary little-endian",
-        encoding="logit" if compressed or ply_file.LOGIT_COMMENT in comments else None,
+        encoding="logit" if compressed or arrays.LOGIT_COMMENT in comments else None,
+        sizes=_bytes_by_attribute(rows.dtype, len(rows)),
         comments=comments,
         extra_elements=tuple(e.name for e in data.elements if e.name != "vertex"),
     )
-
-
-def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto") -> PlyScene:
-    """Read a file of Gaussians in the format of its ending.
-
-    Endings are ``.spz`` (versions 1 to 4), ``.splat`` and ``.sog`` (version 2); of a ``lod-meta.json``, it is
-    the finest level. Everything else is read by :func:`read_ply`, for which ``opacity`` is. SceneError if the file
-    cannot be read, is damaged, or holds no finite Gaussian; ValueError for another ``opacity``.
-    """
-    read = find_reader(Path(path))
-    return read_ply(path, opacity=opacity) if read is None else _to_scene([Path(path)], [read(Path(path))], "auto")
-
-
-def find_reader(path: Path) -> Callable[[Path], StoredRows] | None:
-    """Return what reads a file of this name; None for a PLY file."""
-    return streamed.read_rows if path.name == streamed.INDEX else READERS.get(path.suffix.lower())
-
-
-def read_level(path: Path, level: int) -> PlyScene:
-    """Read one level of detail of a ``lod-meta.json``, 0 the finest; SceneError as of :func:`read_gaussians`."""
-    return _to_scene([path], [streamed.read_rows(path, level)], "auto")
-
-
-def _to_scene(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: OpacityChoice) -> PlyScene:
-    """Convert the rows of files, one after the other; facts that are not sums are those of the first."""
-    path, stored, rows = paths[0], parts[0], np.asarray(parts[0].rows)
-    names = tuple(rows.dtype.names or ())
-    num_rest = _num_rest(path, names)
-    n = sum(len(part.rows) for part in parts)
-    wide = any(rows.dtype[name].kind == "f" and rows.dtype[name].itemsize == 8 for name in ply_file.MEANS)
-    shapes = {"quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh0": (n, 1, 3), "shN": (n, num_rest // 3, 3)}
-    out = {"means": make_array((n, 3), np.float64 if wide else np.float32), "valid": np.empty(n, np.bool_)}
-    out |= {name: make_array(shape, np.float32) for name, shape in shapes.items()}
-    num_clipped = num_zero_quats = first = 0
-    for name, part in zip(paths, parts, strict=True):
-        some = slice(first, first + len(part.rows))
-        clipped, zero = _convert_file(name, part, {key: column[some] for key, column in out.items()})
-        num_clipped, num_zero_quats, first = num_clipped + clipped, num_zero_quats + zero, some.stop
-    known = opacity if opacity != "auto" else stored.encoding
-    encoding = _activate(out["opacities"], out["valid"], known)
-    num_bad = clear_invalid(path, out)
-    byte_columns = tuple(name for name in names if rows.dtype[name].itemsize == 1)
-    if byte_columns == ply_file.NORMALS:
-        ply_file.spread_low_degree(out["shN"])
-    used = {*ply_file.REQUIRED, *ply_file.color_columns(names), *ply_file.NORMALS}
-    extra = tuple(name for name in names if name not in used and not name.startswith("f_rest_"))
-    info = PlyInfo(
-        path=str(path),
-        layout=stored.layout,
-        format=stored.format,
-        count=n,
-        file_bytes=sum(path.stat().st_size + part.bytes_beside for path, part in zip(paths, parts, strict=True)),
-        bytes_by_attribute=stored.sizes or ply_file.bytes_by_attribute(rows.dtype, n, extra),
-        columns=names,
-        extra_columns=extra,
-        extra_elements=stored.extra_elements,
-        byte_columns=byte_columns,
-        comments=stored.comments,
-        sh_degree=ply_file.sh_degree(num_rest),
-        opacity_encoding=encoding,
-        opacity_guessed=known is None,
-        num_nonfinite=num_bad,
-        num_clipped_scales=num_clipped,
-        num_zero_quats=num_zero_quats,
-        odd_scales=_describe_odd_scales(out["means"], out["scales"], out["valid"]),
-    )
-    return PlyScene(valid=out.pop("valid"), gaussians=Gaussians(**out), info=info)
 
 
 def _vertex(path: Path, data: PlyData) -> PlyElement:
@@ -219,37 +60,21 @@ def _vertex(path: Path, data: PlyData) -> PlyElement:
         raise SceneError(path, f"expected an element 'vertex', found {names}")
     vertex = data["vertex"]
     columns = {p.name for p in vertex.properties}
-    missing = [name for name in ply_file.REQUIRED if name not in columns]
-    if columns.issuperset(ply_file.RGB):
-        missing = [name for name in missing if name not in ply_file.SH0]
+    missing = [name for name in arrays.REQUIRED if name not in columns]
+    if columns.issuperset(arrays.RGB):
+        missing = [name for name in missing if name not in arrays.SH0]
     if missing:
         remedy = "this is no Gaussian splat"
         if any(name.startswith("packed_") for name in columns):
             remedy = "it is compressed, but lacks its element 'chunk'"
         elif missing == ["scale_2"]:
             remedy = "flat 2D Gaussians need a scale_2 column of their own"
-        elif len(missing) < len(ply_file.REQUIRED) // 2:
+        elif len(missing) < len(arrays.REQUIRED) // 2:
             remedy = "export it again with them"
         raise SceneError(path, f"missing column{'s' * (len(missing) > 1)} {', '.join(missing)}", remedy)
     if vertex.count == 0:
         raise SceneError(path, "expected at least one Gaussian, found 0 vertices")
     return vertex
-
-
-def _convert_file(path: Path, stored: StoredRows, out: dict[str, np.ndarray]) -> tuple[int, int]:
-    """Fill arrays with the rows of a file, and count what was clipped and what had no rotation."""
-    n, size = len(stored.rows), max(1, ply_file.BLOCK_BYTES // np.asarray(stored.rows).dtype.itemsize)
-    with ply_file.open_rows(path, stored.rows) as read:
-
-        def convert(start: int) -> tuple[int, int]:
-            block = slice(start, min(start + size, n))
-            counts = _convert(read(block), {name: column[block] for name, column in out.items()})
-            if start % FREED_ROWS < size:
-                free_pages(out.values())
-            return counts
-
-        num_clipped, num_zero = map(sum, zip(*parallel_map(convert, range(0, n, size)), strict=True))
-    return num_clipped, num_zero
 
 
 def _num_rest(path: Path, columns: tuple[str, ...]) -> int:
@@ -260,139 +85,242 @@ def _num_rest(path: Path, columns: tuple[str, ...]) -> int:
     return len(names)
 
 
-def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int, int]:
-    """Fill the arrays of one block of rows, column by column; opacities are only copied."""
-    with np.errstate(all="ignore"):
-        total = np.zeros(len(rows), np.float32)  # not finite where any column is not: one test instead of many
-
-        def take(name: str) -> np.ndarray:
-            column = rows[name].astype(np.float32)
-            np.add(total, column, out=total)
-            return column
-
-        for j, name in enumerate(ply_file.MEANS):
-            column = take(name)
-            out["means"][:, j] = column if out["means"].dtype == np.float32 else rows[name]
-        clipped = np.zeros(len(rows), np.bool_)
-
-        def take_harmonic(name: str) -> np.ndarray:
-            column = take(name)
-            size = np.abs(column)
-            if not size.max() <= ply_file.MAX_HARMONIC:
-                np.logical_or(clipped, size > ply_file.MAX_HARMONIC, out=clipped)
-                np.clip(column, -ply_file.MAX_HARMONIC, ply_file.MAX_HARMONIC, out=column)
-            return column
-
-        for j, name in enumerate(ply_file.color_columns(rows.dtype.names)):
-            column = take_harmonic(name)
-            if name in ply_file.RGB:
-                column = rgb_to_sh0(column / (255 if rows.dtype[name].kind == "u" else 1))
-            out["sh0"][:, 0, j] = column
-        num_higher = out["shN"].shape[1]
-        for channel in range(3):
-            for j in range(num_higher):
-                out["shN"][:, j, channel] = take_harmonic(f"f_rest_{channel * num_higher + j}")
-        for j, name in enumerate(ply_file.SCALES):
-            column = take(name)
-            clipped |= np.abs(column) > ply_file.MAX_LOG_SCALE
-            np.clip(column, -ply_file.MAX_LOG_SCALE, ply_file.MAX_LOG_SCALE, out=column)
-            out["scales"][:, j] = exp(column)
-        quats = [take(name) for name in ply_file.QUATS]
-        zero = _normalise(quats, out["quats"])
-        out["opacities"][:] = take("opacity")
-        valid = np.isfinite(total, out=out["valid"])
-        doubtful = np.flatnonzero(~valid)
-        if len(doubtful):
-            valid[doubtful] = _exactly_valid(rows[doubtful], num_higher)
-    return int((clipped & valid).sum()), int((zero & valid).sum())
+def _layout_name(names: tuple[str, ...], num_rest: int, *, compressed: bool) -> str:
+    """Name the layout of a file with these columns."""
+    if compressed:
+        return f"compressed, SH degree {arrays.sh_degree(num_rest // 3)}"
+    if arrays.SH0[0] not in names:
+        return "columns of red, green and blue"
+    normals = set(arrays.NORMALS) <= set(names)
+    if num_rest == 0:
+        return "17-column export" if normals else "14-column export (no normals)"
+    return f"INRIA, SH degree {arrays.sh_degree(num_rest // 3)}" + ("" if normals else " (no normals)")
 
 
-def _exactly_valid(rows: np.ndarray, num_higher: int) -> np.ndarray:
-    """Return which rows are usable: finite, except for infinite logits and scales of zero."""
-    valid = ~np.isnan(rows["opacity"].astype(np.float32))
-    colors = ply_file.color_columns(rows.dtype.names)
-    for name in (*ply_file.MEANS, *colors, *ply_file.QUATS, *(f"f_rest_{i}" for i in range(3 * num_higher))):
-        valid &= np.isfinite(rows[name].astype(np.float32))
-    for name in ply_file.SCALES:
-        column = rows[name].astype(np.float32)
-        valid &= np.isfinite(column) | (column == -np.inf)
-    return valid
+def _bytes_by_attribute(row: np.dtype[Any], count: int) -> dict[str, int]:
+    """Count the bytes of ``count`` rows by attribute."""
+    groups = {
+        "means": arrays.MEANS,
+        "normals": arrays.NORMALS,
+        "sh0": arrays.color_columns(row.names),
+        "opacities": ("opacity",),
+    }
+    groups |= {"scales": arrays.SCALES, "quats": arrays.QUATS}
+    kinds = {name: kind for kind, names in groups.items() for name in names}
+    sizes: Counter[str] = Counter()
+    for name in row.names or ():
+        kind = kinds.get(name, "shN" if name.startswith("f_rest_") else "extra")
+        sizes[kind] += row[name].itemsize * count
+    return dict(sizes)
 
 
-def _normalise(quats: list[np.ndarray], out: np.ndarray) -> np.ndarray:
-    """Write unit quaternions, the identity for zero; return the mask of zero quaternions."""
-    w, x, y, z = quats
-    squared = w * w + x * x + y * y + z * z
-    inverse = 1 / np.sqrt(squared)
-    for j, column in enumerate(quats):
-        np.multiply(column, inverse, out=out[:, j])
-    zero = np.zeros(len(w), np.bool_)
-    extreme = np.flatnonzero(~((squared > 1e-30) & (squared < 1e30)))  # float32 squares under- or overflow
-    if len(extreme):
-        exact = np.stack([column[extreme].astype(np.float64) for column in quats], 1)
-        length = np.linalg.norm(exact, axis=1)
-        zero[extreme] = length == 0
-        exact[length == 0] = (1, 0, 0, 0)
-        out[extreme] = exact / np.where(length == 0, 1, length)[:, None]
-    return zero
+def open_ply(path: Path) -> PlyData:
+    """Open a PLY file; its binary vertices, unless packed, are mapped for :func:`open_rows`.
 
-
-def _activate(opacities: np.ndarray, valid: np.ndarray, known: str | None) -> str:
-    """Convert stored opacities to [0, 1] in place, and return their encoding, guessed where it is not known.
-
-    They are raw if all finite ones lie in [0, 1]. An infinite raw one makes its row invalid.
+    SceneError if it is no PLY file, is truncated or damaged, or its header promises more than it has.
     """
-    finite = np.isfinite(opacities)
-    if known is None:
-        low = opacities.min(where=finite, initial=np.inf)
-        high = opacities.max(where=finite, initial=-np.inf)
-        known = "raw" if 0 <= low <= high <= 1 else "logit"
-    if known == "raw":
-        valid &= finite
-        np.clip(opacities, 0, 1, out=opacities)
-        return known
-    with np.errstate(all="ignore"):
-        opacities[:] = exp(np.negative(opacities, out=opacities))
-        np.add(opacities, 1, out=opacities)
-        np.reciprocal(opacities, out=opacities)
-    return known
+    size = check_file(path)
+    try:
+        with path.open("rb") as file:
+            start = file.read(MAX_HEADER_BYTES)
+        if start[:4] not in (b"ply\n", b"ply\r"):
+            problem = "expected a PLY file, found one that does not start with the line 'ply'"
+            raise SceneError(path, problem, "name the .ply")
+        end, text = _check_header(path, start, size)
+        with _stream(path, end, text=text) as file, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # an empty list, a number beyond the column's type
+            data = PlyData.read(file, mmap="r")
+        for element in data.elements:
+            if isinstance(element.data, np.memmap) and (element.name != "vertex" or "chunk" in data):
+                with open_rows(path, element.data) as read:  # small, or packed
+                    element.data = read(slice(None))
+        return data
+    except OSError as error:
+        raise SceneError(path, f"cannot be read ({error.strerror})") from error
+    except PlyElementParseError as error:
+        element, row = error.element, error.row
+        promise = f"element '{element.name}' with {element.count} rows" if element is not None else "more data"
+        raise _truncated(path, promise, row or 0, error.message) from error
+    except (PlyParseError, ValueError, ArithmeticError) as error:
+        raise SceneError(path, f"expected a readable PLY file, found a damaged one ({error})") from error
 
 
-def _describe_odd_scales(means: np.ndarray, scales: np.ndarray, valid: np.ndarray) -> str:
-    """Explain why ``scales [n,3]`` are likely wrong for ``means [n,3]``; "" where they are not."""
-    rows = np.flatnonzero(valid)
-    if len(rows) < _MIN_JUDGED:
-        return ""
-    some = rows[:: max(1, len(rows) // _SCALE_SAMPLES)]
-    low, high = np.quantile(means[some].astype(np.float64), (0.05, 0.95), axis=0)
-    width = float((high - low).max())
-    size = float(np.median(scales[some].max(1)))
-    text = f"half of the Gaussians have a standard deviation above {size:.3g}"
-    text += f" in a scene of a width of {width:.3g}"
-    most = _MAX_SPACINGS * width / float(np.sqrt(len(rows)))
-    linear = float(log(size))
-    if linear <= most < size and scales.min(where=valid[:, None], initial=np.inf) >= 1:
-        start = f"no stored scale is negative (median {linear:.3g}), as if linear"
-        return f"{start}: {text}; logarithms are expected"
-    if size > _MAX_WIDTH * width:
-        return f"{text}: the scales, which are logarithms, are too large"
-    return ""
+def _stream(path: Path, end: int, *, text: bool) -> IO[Any]:
+    """Open a PLY file for the parser, without bytes beyond ASCII in the header and empty lines in the text."""
+    if text:
+        return _TextRows(path.open("rb"), "ascii", "backslashreplace", newline="")
+    file = _BinaryRows(FileIO(str(path)))
+    file.end = end
+    return file
 
 
-def clear_invalid(path: str | Path, out: dict[str, np.ndarray]) -> int:
-    """Make the invalid rows transparent, in place; return their number."""
-    valid = out["valid"]
-    bad = np.flatnonzero(~valid)
-    if len(bad) == 0:
+class _TextRows(TextIOWrapper):
+    def readline(self, size: int = -1, /) -> str:  # type: ignore[override]  # bytes in the base of all
+        line = super().readline(size)
+        while line and not line.strip():
+            line = super().readline(size)
+        return line
+
+
+class _BinaryRows(BufferedReader):
+    end = 0  # of the header
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        data = super().read(size)
+        if data.isascii() or self.tell() > self.end:
+            return data
+        return bytes(byte if byte < 128 else ord("?") for byte in data)
+
+
+@contextmanager
+def open_rows(path: Path, rows: np.ndarray) -> Iterator[Callable[[slice], np.ndarray]]:
+    """Yield a function that returns blocks of a PLY file's rows; several threads may call it.
+
+    Mapped pages of a file that shrinks would end the process; reading such a file is a SceneError.
+    """
+    if not isinstance(rows, np.memmap):
+        yield rows.__getitem__
+        return
+    lock = threading.Lock()
+    with path.open("rb") as file:
+
+        def read(block: slice) -> np.ndarray:
+            start, stop, _ = block.indices(len(rows))
+            out = np.empty(stop - start, rows.dtype)
+            with lock:
+                file.seek(rows.offset + start * rows.dtype.itemsize)
+                num_bytes = file.readinto(out.view(np.uint8).data)
+            if num_bytes < out.nbytes:
+                whole = start + num_bytes // rows.dtype.itemsize
+                raise _truncated(path, f"{len(rows)} rows", whole, "it became shorter while it was read")
+            return out
+
+        yield read
+
+
+def bytes_after_rows(path: Path) -> int:
+    """Count the bytes of a binary PLY file after its last row; 0 where rows are text or have lists."""
+    data = open_ply(path)
+    if data.text or any(isinstance(p, PlyListProperty) for element in data.elements for p in element.properties):
         return 0
-    good = np.flatnonzero(valid)
-    if len(good) < MIN_FINITE * len(valid):
-        number = f"{len(bad):,} of" if len(good) else "all"
-        problem = f"expected finite Gaussians, found NaN or inf in {number} {len(valid):,} rows"
-        raise SceneError(path, problem, "export it again" if len(good) else "")
-    before = good[np.maximum(np.searchsorted(good, bad) - 1, 0)]
-    for name in ("means", "scales"):
-        out[name][bad] = out[name][before]
-    for name, value in {"quats": (1, 0, 0, 0), "opacities": 0, "sh0": 0, "shN": 0}.items():
-        out[name][bad] = value
-    return len(bad)
+    with path.open("rb") as file:
+        end, _ = _check_header(path, file.read(MAX_HEADER_BYTES), size := check_file(path))
+    return size - end - sum(element.data.nbytes for element in data.elements)
+
+
+def header_counts(path: Path) -> tuple[int, int]:
+    """Return the numbers of Gaussians and of ``f_rest`` columns in a PLY file's header; zeros if unreadable."""
+    try:
+        check_file(path)  # a pipe would never end
+        with path.open("rb") as file:
+            header = file.read(1 << 16).partition(b"end_header")[0]
+    except (OSError, SceneError):
+        return 0, 0
+    match = re.search(rb"^element vertex (\d{1,12})\s*$", header, re.MULTILINE)
+    return int(match[1]) if match else 0, len(re.findall(rb"^property \S+ f_rest_\d+\s*$", header, re.MULTILINE))
+
+
+def _check_header(path: Path, start: bytes, size: int) -> tuple[int, bool]:
+    """Return the size of a header and whether rows are text; SceneError if the file is too short for it.
+
+    ``start`` has the first bytes of ``size``. Everything else is left to the parser.
+    """
+    newline = b"\r\n" if start[3:5] == b"\r\n" else start[3:4]
+    last = newline + b"end_header" + newline
+    end = start.find(last)
+    if end < 0:
+        problem = f"no 'end_header' within {MAX_HEADER_BYTES >> 20} MiB" if size > len(start) else "early end of file"
+        raise SceneError(path, f"expected a PLY header, found {problem}", "copy or export it again")
+    words = [line.split() for line in start[:end].decode("latin-1").split(newline.decode())]
+    text = ["format", "ascii", "1.0"] in words
+    elements: list[tuple[str, int, list[list[str]]]] = []
+    for line in words:
+        if line[:1] == ["element"] and len(line) == 3 and re.fullmatch(r"[+-]?\d[\d_]*", line[2]):
+            elements.append((line[1], int(line[2]), []))
+        elif line[:1] == ["property"] and len(line) > 2 and elements:
+            elements[-1][2].append(line[1:-1])
+    left = size - end - len(last)
+    for name, count, properties in elements:
+        lists = any(kind[0] == "list" for kind in properties)
+        if count < 0:
+            raise SceneError(path, f"expected a number of rows, found element '{name}' with {count}")
+        if count and not properties:
+            raise SceneError(path, f"expected columns, found element '{name}' of {count} rows without any")
+        if lists and name == "vertex":
+            raise SceneError(path, "expected one number a column and vertex, found a list property")
+        if lists and count * len(properties) > MAX_LIST_VALUES:
+            raise SceneError(path, f"found element '{name}' with lists in {count} rows", "export it without this one")
+        each = sum(2 if text else _SIZES.get((kind[1:2] or kind)[0], 1) for kind in properties)
+        before, left = left, left - count * each
+        if left < -1:  # the last row of a text may end without a new line
+            raise _truncated(path, f"element '{name}' with {count} rows", before // each, "early end-of-file")
+    return end + len(last), text
+
+
+def _truncated(path: Path, promise: str, num_whole: int, reason: str) -> SceneError:
+    problem = f"truncated or damaged: expected {promise}, found {num_whole} whole ones ({reason})"
+    return SceneError(path, problem, "copy or export it again")
+
+
+def ply_blocks(
+    gaussians: Gaussians, comments: Sequence[str] = (), *, degree: int | None = None, normals: bool = True
+) -> Iterator[bytes | memoryview]:
+    """Yield the header and blocks of rows of a PLY file; ValueError if there is NaN or inf.
+
+    ``degree`` of the harmonics; None: all. ``normals``: with three columns of zeros.
+    """
+    degree = gaussians.sh_degree if degree is None else degree
+    header, num_columns = _header(len(gaussians), degree, comments, normals=normals)
+    yield header
+    block = max(1, BLOCK_BYTES // (4 * num_columns))
+    for start in range(0, len(gaussians), block):
+        columns = arrays.to_columns(gaussians[start : start + block], degree, start)
+        logits = log(columns.opacities) - log1p(-columns.opacities)  # 0 and 1 are clipped, impossible ones NaN
+        parts = [
+            columns.means,
+            np.zeros((len(columns), 3 * normals)),
+            columns.sh0,
+            columns.harmonics.transpose(0, 2, 1).reshape(len(columns), 3 * columns.harmonics.shape[1]),
+            np.clip(logits, -MAX_LOGIT, MAX_LOGIT)[:, None],
+            columns.log_scales,
+            columns.quats,
+        ]
+        rows = np.concatenate(parts, axis=1, dtype="<f4", casting="same_kind")
+        if not np.isfinite(rows).all():
+            raise ValueError(f"expected finite Gaussians, got an opacity outside [0, 1] in the rows from {start}")
+        yield rows.data
+
+
+def _header(count: int, sh_degree: int, comments: Sequence[str] = (), *, normals: bool = True) -> tuple[bytes, int]:
+    """Return the header of a float32 ``.ply`` of ``count`` Gaussians, and its number of columns."""
+    num_rest = 3 * ((sh_degree + 1) ** 2 - 1)
+    names = [
+        *arrays.MEANS,
+        *(arrays.NORMALS if normals else ()),
+        *arrays.SH0,
+        *(f"f_rest_{i}" for i in range(num_rest)),
+    ]
+    names += ["opacity", *arrays.SCALES, *arrays.QUATS]
+    lines = ["ply", "format binary_little_endian 1.0", f"comment {arrays.LOGIT_COMMENT}"]
+    lines += [*(f"comment {comment}" for comment in comments), f"element vertex {count}"]
+    lines += [*(f"property float {name}" for name in names), "end_header", ""]
+    return "\n".join(lines).encode("ascii"), len(names)
+
+
+def file_bytes(count: int, sh_degree: int) -> int:
+    """Return the size in bytes of the ``.ply`` of ``count`` Gaussians, without comments."""
+    header, num_columns = _header(count, sh_degree)
+    return len(header) + 4 * num_columns * count
+
+
+def count_for_bytes(max_bytes: int, sh_degree: int) -> int:
+    """Return the largest number of Gaussians whose ``.ply`` has at most ``max_bytes``; UsageError if none fits."""
+    if not 0 <= sh_degree <= MAX_DEGREE:
+        raise ValueError(f"sh_degree: expected 0 to {MAX_DEGREE}, got {sh_degree}")
+    least = file_bytes(1, sh_degree)
+    if max_bytes < least:
+        raise UsageError(f"budget: expected at least {least} bytes for one Gaussian, got {max_bytes}")
+    count = (max_bytes - file_bytes(0, sh_degree)) // (file_bytes(2, sh_degree) - least)
+    while file_bytes(count, sh_degree) > max_bytes:  # the header contains the count itself
+        count -= 1
+    return count

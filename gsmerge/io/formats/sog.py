@@ -279,7 +279,7 @@ def sog_files(columns: arrays.Columns, *, mip: bool = False) -> dict[str, bytes]
             "shN_centroids.webp": _webp(centroids.reshape(rows, PALETTE_COLUMNS * num_higher, 3)),
             "shN_labels.webp": _texture(np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], 1)),
         }
-        bands = round((num_higher + 1) ** 0.5) - 1
+        bands = arrays.sh_degree(num_higher)
         add("shN", files, count=len(palette), bands=bands, codebook=_shorten(codebook))
     return {**textures, META: json.dumps(meta).encode("ascii")}
 

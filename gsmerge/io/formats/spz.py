@@ -247,7 +247,7 @@ def spz_columns(gaussians: Gaussians, max_degree: int, *, mip: bool = False, fin
         words.astype("<u4")[:, None].view(np.uint8),
         np.clip(stepped, 0, 255).astype(np.uint8).reshape(len(stepped), 3 * stepped.shape[1]),
     )
-    degree = round((columns.harmonics.shape[1] + 1) ** 0.5) - 1
+    degree = arrays.sh_degree(columns.harmonics.shape[1])
     return SpzColumns(len(columns), degree, fraction, mip, parts)
 
 

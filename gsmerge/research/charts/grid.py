@@ -16,7 +16,7 @@ from gsmerge.errors import SceneError, UsageError
 from gsmerge.io.bounds import read_table
 from gsmerge.io.cameras.colmap import is_colmap
 from gsmerge.io.cameras.read import find_cameras
-from gsmerge.io.formats.ply_file import header_counts
+from gsmerge.io.formats.ply import header_counts
 from gsmerge.measure.evaluate import EvaluateOptions
 from gsmerge.research.charts.lines import ONE_SIZE
 from gsmerge.research.charts.measure_run import INPUT, OURS, SUPERPIXELS, ChartRun, RunRecord, describe

@@ -24,7 +24,7 @@ from gsmerge.batch import BatchOptions
 from gsmerge.batch.records import FAILED, newest_records
 from gsmerge.compaction.compact import compact
 from gsmerge.facts.views import even_views, midpoint_views, pick_views, subset
-from gsmerge.io.formats.writing import file_bytes
+from gsmerge.io.formats.ply import file_bytes
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, evaluate, near_plane
 from gsmerge.measure.preview import Picture, draw_means, heat_map, save_picture, to_picture
 from gsmerge.measure.sizes import shrink_cameras

@@ -13,7 +13,7 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import read_table
 from gsmerge.kernels.elementary import exp, log
-from gsmerge.kernels.raster.harmonics import view_colors
+from gsmerge.kernels.raster.sh import view_colors
 from gsmerge.research.generate.photograph import Float, Pinhole
 from gsmerge.research.generate.shapes import Array, rotate
 from gsmerge.research.generate.textures import enlarge

@@ -108,7 +108,7 @@ def test_threads_change_nothing(threads: int, monkeypatch: pytest.MonkeyPatch) -
     def run(count: int) -> list[np.ndarray]:
         with use_threads(count):
             plan = plan_view(prepare(gaussians), cameras.viewmats[0], K, size[1], size[0])
-            assert len(plan.members) > 2000
+            assert len(plan.flatten_ids) > 2000
             image, left = composite(plan)
             shape = plan_gradients(
                 plan, grads[..., :3], grads[..., 3], image=image, transmittance=left, with_viewmat=True

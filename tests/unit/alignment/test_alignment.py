@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from exports import smooth_scene
-from messages import refuses
+from messages import noted, refuses
 from tiny_scene import Tiny, edited_json, make_tiny
 
 from gsmerge.alignment import choose_poses, other_conventions
@@ -53,7 +53,7 @@ def test_without_pixels_the_photos_tell(tmp_path: Path, true: tuple[str, str]) -
     loaded = load_scene(folder)
     assert not loaded.scene.aligned
     assert np.allclose(loaded.scene.cameras.viewmats, SMOOTH.w2c)
-    assert any(f"when read as {true[0]} matrices with {true[1]} axes" in note for note in loaded.notes)
+    assert noted(loaded.notes, *true)
 
 
 def test_the_usual_reading_is_not_doubted(tmp_path: Path) -> None:

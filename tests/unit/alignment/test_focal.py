@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from exports import Smooth, export_rows, home, save_export, smooth_scene, with_intrinsics
-from messages import refuses
+from messages import noted, refuses
 from tiny_scene import FLIP, save_json, write_images, write_npz
 
 from gsmerge.errors import SceneError
@@ -60,7 +60,7 @@ def test_rows_that_are_pixels_show_it(tmp_path: Path, cameras: Callable[[Path, S
     loaded = load_scene(write(tmp_path, SCENE, export_rows(SCENE), cameras))
     assert home(loaded.pixel_scene(), SCENE) == 1
     np.testing.assert_allclose(loaded.scene.cameras.Ks, np.tile(SCENE.K, (3, 1, 1)), atol=0.3)
-    assert any("no intrinsics were given" in note and "the rays of the pixels" in note for note in loaded.notes)
+    assert noted(loaded.notes, "intrinsics", "rays")
     assert loaded.alignment is not None
     assert loaded.alignment.worst_px < 0.5
 
@@ -97,7 +97,7 @@ def test_photos_show_it_where_rows_are_no_pixels(tmp_path: Path, views: int) -> 
     loaded = load_scene(write(tmp_path, one, rows, frame_list))
     assert not loaded.scene.aligned
     assert loaded.scene.cameras.Ks[0, 0, 0] == pytest.approx(FOCAL, rel=0.01)
-    assert any("no intrinsics were given" in note and "the photos' colours" in note for note in loaded.notes)
+    assert noted(loaded.notes, "intrinsics", "colours")
 
 
 def test_what_shows_no_focal_length_is_refused(tmp_path: Path) -> None:

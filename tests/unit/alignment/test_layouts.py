@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from exports import export_rows, save_export, smooth_scene
-from messages import refuses
+from messages import names, noted, refuses
 from tiny_scene import Tiny, edited_json, frames_of, write_colmap_text, write_npz
 
 from gsmerge.alignment.layouts import grids_of_count, patch_grids
@@ -117,7 +117,7 @@ def test_photos_of_another_size_and_poses_read_in_another_way(
     assert loaded.cameras.convention == true
     assert len(loaded.notes) == 2
     assert "48 x 36" in loaded.notes[0]
-    assert f"the poses fit when read as {true[0]} matrices with {true[1]} axes" in loaded.notes[1]
+    assert names(loaded.notes[1], "poses", *true)
 
 
 def test_cameras_larger_than_the_grid_and_no_photos(tmp_path: Path) -> None:
@@ -154,7 +154,7 @@ def test_dropped_pixels_of_a_patched_grid(tmp_path: Path) -> None:
     loaded = load_scene(tmp_path)
     assert loaded.scene.aligned
     assert (loaded.scene.cameras.width, loaded.scene.cameras.height) == (504, 28)
-    assert any("resized to 504 x 28, the Gaussian grid's size" in note for note in loaded.notes)
+    assert noted(loaded.notes, "resized", "504 x 28")
 
 
 def test_mappings_move_a_point_and_its_photo_alike() -> None:

@@ -13,7 +13,7 @@ from tiny_scene import write_images
 
 from gsmerge.alignment.photos_alone import _possible_grids
 from gsmerge.errors import SceneError
-from gsmerge.scene.read import SceneLoad, load_scene
+from gsmerge.scene.read import Loaded, load_scene
 from gsmerge.types import SH_C0
 
 WIDTH, HEIGHT = 160, 120
@@ -30,14 +30,14 @@ def textured(fx: float = 170.0, fy: float = 170.0) -> Smooth:
     return replace(tiny, images=images, gaussians=replace(tiny.gaussians, sh0=sh0.astype(np.float32)))
 
 
-def export(folder: Path, tiny: Smooth, kept: np.ndarray) -> SceneLoad:
+def export(folder: Path, tiny: Smooth, kept: np.ndarray) -> Loaded:
     """Write the kept rows as the model does, with photos beside them, and read them."""
     save_export(folder / "gs_ply", tiny, export_rows(tiny, kept), cameras=False, name="0000.ply")
     write_images(folder / "images", tiny)
     return load_scene(folder)
 
 
-def pixels_of(loaded: SceneLoad, count: int) -> np.ndarray:
+def pixels_of(loaded: Loaded, count: int) -> np.ndarray:
     """The pixel that each row was put to."""
     assert loaded.recovery is not None
     layout, out = loaded.recovery.best.layout, np.full(count, -1)

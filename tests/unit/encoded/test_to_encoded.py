@@ -9,7 +9,7 @@ from typing import Any
 import motions
 import pytest
 import scenes
-from messages import refuses
+from messages import names, refuses
 from network_fixtures import noisy, written
 from unaligned_scenes import far_behind, shuffled, voxels
 
@@ -123,11 +123,11 @@ def test_networks_are_kept_with_the_scene(settings: dict[str, Any], pixels: Scen
 
 @pytest.mark.parametrize("k", [1, 2, 4])
 def test_scenes_in_no_order(k: int, pixels: Scene) -> None:
-    loose = voxels(pixels, 0.05)
-    actual = encode_scene(loose, superpixels="20%")
+    unaligned = voxels(pixels, 0.05)
+    actual = encode_scene(unaligned, superpixels="20%")
     assert actual.settings.num_slots is not None
     assert actual.settings.max_k == 8
-    assert scenes.identical(decode_scene(actual, k=k), unfitted(loose, k=k, superpixels="20%"))
+    assert scenes.identical(decode_scene(actual, k=k), unfitted(unaligned, k=k, superpixels="20%"))
 
 
 def test_shuffled_rows_and_a_budget(pixels: Scene) -> None:
@@ -136,9 +136,9 @@ def test_shuffled_rows_and_a_budget(pixels: Scene) -> None:
 
 @pytest.mark.parametrize("settings", [{"k": 1}, {"k": 2}, {"budget": "5%"}], ids=str)
 def test_what_no_view_sees_is_kept(settings: dict[str, Any], pixels: Scene) -> None:
-    loose = shuffled(pixels)
-    hidden = far_behind(loose.gaussians, 200)
-    both = replace(loose, gaussians=Gaussians.concat([loose.gaussians, hidden]))
+    unaligned = shuffled(pixels)
+    hidden = far_behind(unaligned.gaussians, 200)
+    both = replace(unaligned, gaussians=Gaussians.concat([unaligned.gaussians, hidden]))
     actual = encode_scene(both, superpixels=SHARE, unseen="keep", **settings)
     assert actual.num_kept > 0
     assert scenes.identical(decode_scene(actual), unfitted(both, unseen="keep", **settings))
@@ -158,7 +158,7 @@ def test_more_than_there_is_to_divide_is_told(encoded: Encoded) -> None:
     plan = plan_decode(encoded, budget=encoded.settings.num_input)
     assert plan.counts.sum() == encoded.max_gaussians - encoded.num_kept
     assert len(plan.notes) == 1
-    assert f"divide into {encoded.max_gaussians} at most" in plan.notes[0]
+    assert names(plan.notes[0], encoded.max_gaussians)
     assert len(decode_scene(encoded, budget=encoded.settings.num_input)) <= encoded.max_gaussians
 
 
@@ -170,7 +170,7 @@ def test_auto_takes_what_compact_would_without_photos(bare: Scene, encoded_bare:
     fewer = replace(encoded_bare, settings=replace(encoded_bare.settings, knee_count=len(encoded_bare) - 1))
     plan = plan_decode(fewer, budget="auto")
     assert plan.counts.tolist() == [1] * len(encoded_bare)
-    assert "fewer than there are groups" in plan.notes[0]
+    assert names(plan.notes[0], "fewer", "groups")
 
 
 def test_the_result_does_not_depend_on_the_threads(pixels: Scene, encoded: Encoded) -> None:

@@ -309,7 +309,7 @@ def test_names_as_long_as_there_are(tmp_path: Path, name: str) -> None:
     with atomic_output(tmp_path / name) as temporary:
         temporary.write_text("new")
     assert [p.name for p in tmp_path.iterdir()] == [name]
-    with pytest.raises(SceneError, match="File name too long"), atomic_output(tmp_path / ("a" * 300)):
+    with pytest.raises(SceneError, match="too long"), atomic_output(tmp_path / ("a" * 300)):
         pass
 
 
@@ -325,7 +325,7 @@ def test_an_unwritable_folder_is_refused(tmp_path: Path, monkeypatch: pytest.Mon
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(os, "open", refuse)  # permissions mean nothing to root, which tests may run as
-    with pytest.raises(SceneError, match=r"cannot be written \(Permission denied\)"), atomic_output(tmp_path / "o.ply"):
+    with refuses(SceneError, "o.ply", "Permission denied"), atomic_output(tmp_path / "o.ply"):
         pass
     monkeypatch.undo()
     assert list(tmp_path.iterdir()) == []

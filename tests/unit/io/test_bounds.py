@@ -26,12 +26,9 @@ def test_images_beyond_all_use_are_refused(tmp_path: Path) -> None:
 
 def test_only_files_are_read(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
-    with refuses(SceneError, "pipe", "pipe"):
-        check_file(tmp_path / "pipe")
-    with refuses(SceneError, tmp_path, "folder"):
-        check_file(tmp_path)
-    with pytest.raises(SceneError, match="no such file"):
-        check_file(tmp_path / "none")
+    for path, found in ((tmp_path / "pipe", "pipe"), (tmp_path, "folder"), (tmp_path / "none", "no such file")):
+        with refuses(SceneError, path, found):
+            check_file(path)
     (tmp_path / "a").write_bytes(b"\xef\xbb\xbfab")
     assert check_file(tmp_path / "a") == 5
     assert read_text(tmp_path / "a") == "ab"
@@ -68,14 +65,14 @@ def test_json_and_toml(tmp_path: Path) -> None:
 def test_what_is_no_table_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
     path = tmp_path / "a.json"
     path.write_text(text)
-    with pytest.raises(SceneError, match="expected") as caught:
+    with refuses(SceneError, path, "JSON" if text in ("{", "\x00") or len(text) > 9 else "settings"):
         read_table(path)
-    assert "\n" not in str(caught.value)
 
 
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     (tmp_path / "bytes.json").write_bytes(b"\xff\xfe\x00")
-    for name in ("nowhere.json", "bytes.json", "."):
+    (tmp_path / "folder.json").mkdir()
+    for name in ("nowhere.json", "bytes.json", "folder.json"):
         with pytest.raises(SceneError, match="TOML or JSON"):
             read_table(tmp_path / name)
 

@@ -109,8 +109,8 @@ def test_saved_between_batches_is_kept_in_memory(settings: dict[str, Any], tmp_p
 
 
 def test_what_no_view_sees_comes_back(tmp_path: Path) -> None:
-    loose = shuffled(room(2))
-    both = replace(loose, gaussians=Gaussians.concat([loose.gaussians, far_behind(loose.gaussians, 200)]))
+    unaligned = shuffled(room(2))
+    both = replace(unaligned, gaussians=Gaussians.concat([unaligned.gaussians, far_behind(unaligned.gaussians, 200)]))
     state = state_of(fed([both], unseen="keep", fit="none"))
     save_state(tmp_path / "a.gsm", state)
     same_state(load_state(tmp_path / "a.gsm"), state)

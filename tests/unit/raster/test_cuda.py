@@ -283,7 +283,7 @@ def test_without_gsplat_it_is_said_what_to_install(monkeypatch: pytest.MonkeyPat
 def test_gsplat_without_its_compiled_part_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a wheel and a compiler gsplat can be imported, and fails at its first kernel."""
     install(monkeypatch, compiled=None)
-    with pytest.raises(GsmergeError, match="gsplat has no compiled part, and no CUDA toolkit was found to compile it"):
+    with pytest.raises(GsmergeError, match="toolkit"):
         by_adapter(random_gaussians(3), cameras_of())
 
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from messages import refuses
+from messages import refuse_all, refuses
 from skimage.metrics import structural_similarity
 
 from gsmerge.raster.metrics import psnr, ssim
@@ -76,14 +76,12 @@ def test_ssim_of_a_mask_is_the_mean_of_its_windows() -> None:
 @pytest.mark.parametrize("metric", [psnr, ssim])
 def test_messages(metric: object) -> None:
     assert callable(metric)
-    with refuses(ValueError, "", [40, 50, 3], [39, 50, 3]):
-        metric(PHOTO, PHOTO[:-1])
-    with refuses(ValueError, "", "[h,w,c]", [40, 50]):
-        metric(PHOTO[..., 0], PHOTO[..., 0])
-    with refuses(ValueError, "mask", [40, 50], [3, 3]):
-        metric(PHOTO, PHOTO, np.ones((3, 3)))
-    with refuses(ValueError, "mask", "pixel", "none"):
-        metric(PHOTO, PHOTO, np.zeros(PHOTO.shape[:2]))
+    refuse_all(ValueError, [
+        (lambda: metric(PHOTO, PHOTO[:-1]), "", [40, 50, 3], [39, 50, 3]),
+        (lambda: metric(PHOTO[..., 0], PHOTO[..., 0]), "", "[h,w,c]", [40, 50]),
+        (lambda: metric(PHOTO, PHOTO, np.ones((3, 3))), "mask", [40, 50], [3, 3]),
+        (lambda: metric(PHOTO, PHOTO, np.zeros(PHOTO.shape[:2])), "mask", "pixel", "none"),
+    ])  # fmt: skip
 
 
 def test_ssim_refuses_images_smaller_than_its_window() -> None:

@@ -11,8 +11,8 @@ import pytest
 from messages import refuses
 
 from gsmerge.errors import UsageError
-from gsmerge.runtime.cluster import Cluster, ClusterWork, start_work
 from gsmerge.runtime.record import note, record_run, stage
+from gsmerge.runtime.work import Cluster, Work, start_work
 from gsmerge.settings.stages import Engine
 
 
@@ -89,8 +89,6 @@ class FakeRay:
         return {"CPU": sum(node.get("CPU", 0) for node in self.given)}
 
     def remote(self, **options: Any) -> Any:
-        self.options.append(options)
-
         def decorate(function: Callable[..., Any]) -> Any:
             def submit(*arguments: Any) -> Ref:
                 self.running += 1
@@ -104,11 +102,17 @@ class FakeRay:
                 except KeyError:
                     return Ref(self.exceptions.RayError("worker died"))
 
-            return SimpleNamespace(remote=submit)
+            def with_needs(**needs: Any) -> Any:
+                self.options.append(options | needs)
+                return SimpleNamespace(remote=submit)
+
+            return SimpleNamespace(options=with_needs)
 
         return decorate
 
-    def wait(self, refs: list[Any], num_returns: int) -> tuple[list[Any], list[Any]]:
+    def wait(self, refs: list[Any], num_returns: int, timeout: float | None) -> tuple[list[Any], list[Any]]:
+        if timeout == 0:
+            return [], refs
         self.running -= num_returns
         return refs[:num_returns], refs[num_returns:]
 
@@ -118,10 +122,10 @@ class FakeRay:
         return ref.value
 
 
-def work_of(nodes: list[dict[str, float]], threads: int | None = None, memory: int = 8) -> tuple[ClusterWork, FakeRay]:
+def work_of(nodes: list[dict[str, float]], threads: int | None = None, memory: int = 8) -> tuple[Work, FakeRay]:
     cluster, ray = Cluster.__new__(Cluster), FakeRay(nodes)
     cluster.ray = ray  # type: ignore[assignment]
-    return ClusterWork(cluster, threads, memory), ray
+    return Work(cluster, threads, memory), ray
 
 
 TWO = [{"CPU": 1.0, "memory": 100.0}, {"CPU": 2.0, "memory": 100.0}]

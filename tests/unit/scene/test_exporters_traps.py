@@ -64,7 +64,7 @@ def test_depth_maps_that_were_rounded(tmp_path: Path, decimals: int) -> None:
     scene = loaded.pixel_scene()
     same = np.abs(scene.gaussians.opacities - tiny.gaussians.opacities) < 1e-5
     assert float(same[da3_rows(tiny)].mean()) > 0.99
-    assert scene.num_gaussians == loaded.ply.count
+    assert scene.num_gaussians == loaded.info.count
 
 
 @pytest.mark.parametrize("aligned", [True, False])
@@ -81,7 +81,7 @@ def test_poses_of_the_user(tmp_path: Path, aligned: bool) -> None:
     same = np.abs(scene.gaussians.opacities - tiny.gaussians.opacities) < 1e-5
     assert same[da3_rows(tiny)].all()
     assert loaded.alignment.worst_px < 0.5
-    assert np.array_equal(scene.gaussians.means[da3_rows(tiny)[0]], read_ply(loaded.ply.path).gaussians.means[0])
+    assert np.array_equal(scene.gaussians.means[da3_rows(tiny)[0]], read_ply(loaded.info.path).gaussians.means[0])
 
 
 def test_depth_is_the_distance_along_the_ray(tmp_path: Path) -> None:
@@ -268,8 +268,8 @@ def test_all_elements_of_sharp(tmp_path: Path, legacy: bool) -> None:
     assert scene.valid.shape == (2, 36, 36)
     assert np.allclose(scene.cameras.Ks[0], square.K, atol=1e-4)
     assert np.allclose(scene.cameras.viewmats, pose, atol=1e-6)
-    assert set(loaded.ply.extra_elements) >= {"frame", "disparity", "color_space", "version"}
-    assert "version" not in loaded.ply.columns
+    assert set(loaded.info.extra_elements) >= {"frame", "disparity", "color_space", "version"}
+    assert "version" not in loaded.info.columns
     assert [d.name for d in loaded.exporters] == ["sharp"]
     assert scene.images.shape == (2, 36, 36, 3)
     assert np.allclose(scene.gaussians.opacities[36 * 36 :], 1 / (1 + np.exp(2)))

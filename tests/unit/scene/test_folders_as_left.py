@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from exports import export_rows, home, save_export, smooth_scene, turned
-from messages import refuses
+from messages import noted, refuses
 from tiny_scene import frames_of, save_json, write_images, write_npz
 
 from gsmerge.errors import SceneError
@@ -67,7 +67,7 @@ def test_gaussians_among_the_photos_and_poses_as_a_model_returns_them(tmp_path: 
     np.testing.assert_allclose(loaded.scene.cameras.viewmats, tiny.w2c, atol=1e-6)
     np.testing.assert_allclose(loaded.scene.cameras.Ks, np.tile(tiny.K, (3, 1, 1)), atol=1e-4)
     assert np.array_equal((loaded.scene.images * 255).round(), tiny.images)
-    assert not [note for note in loaded.notes if "poses fit" in note]
+    assert not noted(loaded.notes, "poses")
     if written == "AnySplat":
         assert {tmp_path / name for name in tiny.names} <= set(read_files(loaded.files))
 

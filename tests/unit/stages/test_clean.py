@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
-from messages import refuses
+from messages import noted, refuses
 
 from gsmerge import CompactOptions, Gaussians, Scene, compact
 from gsmerge.errors import UsageError
@@ -104,7 +104,7 @@ def test_a_budget_is_met_after_the_crop(scene: Scene, share: float) -> None:
     assert inside_crop(result.gaussians.means, crop).all()
     assert result.report.choices["clean"]["cropped"] > 0
     assert result.report.num_output == 150
-    assert sum(note.startswith("left out by clean-up: ") for note in result.report.notes) == 1
+    assert sum("clean-up: " in note for note in result.report.notes) == 1
 
 
 def test_a_crop_without_a_budget_keeps_the_rest_as_it_is(scene: Scene) -> None:
@@ -124,7 +124,7 @@ def test_levels_and_baselines_are_cropped(scene: Scene) -> None:
     opaque = compact(scene, method="opacity", crop=crop, budget=100)
     assert len(opaque.gaussians) == 100
     assert inside_crop(opaque.gaussians.means, crop).all()
-    assert not any("does not use" in note for note in opaque.report.notes)
+    assert not any("use" in note for note in opaque.report.notes)
 
 
 def test_what_cannot_be(scene: Scene) -> None:
@@ -135,7 +135,7 @@ def test_what_cannot_be(scene: Scene) -> None:
     few = sphere_in(scene, 0.002)
     result = compact(scene, **QUICK, crop=few, budget=5000)
     assert 0 < len(result.gaussians) < 5000
-    assert any("budget: 5,000 Gaussians were asked for" in note for note in result.report.notes)
+    assert noted(result.report.notes, "budget", "5,000")
     assert CompactOptions().with_settings({"crop": "sphere:0,0,0,1", "drop_floaters": True}).whole_only == [
         "crop", "drop_floaters",
     ]  # fmt: skip

@@ -7,7 +7,8 @@ import pytest
 from messages import refuses
 from scenes import make_features
 
-from gsmerge.stages.match import MatchOptions, match
+from gsmerge.settings.stages import MatchOptions
+from gsmerge.stages.match import match
 from gsmerge.types import FeatureGaussians
 
 METHODS = ["overlap", "aabb"]

@@ -11,19 +11,21 @@ from messages import refuses
 
 from gsmerge import Scene
 from gsmerge.moments import Members, scene_members
-from gsmerge.research.baselines.baseline import most_important
-from gsmerge.stages import region_tree as module
-from gsmerge.stages.decode import DecodeOptions, decode, split_counts
+from gsmerge.research.baselines.simple import most_important
+from gsmerge.settings.stages import DecodeOptions
+from gsmerge.stages import segment as module
+from gsmerge.stages.decode import decode, split_counts
 from gsmerge.stages.encode import encode
-from gsmerge.stages.region_tree import (
+from gsmerge.stages.segment import (
     RegionTree,
+    SegmentOptions,
     auto_count,
     cut_tree,
     knee,
     pixel_depths,
     region_tree,
+    segment,
 )
-from gsmerge.stages.segment import SegmentOptions, segment
 from gsmerge.types import FeatureGaussians, Groups
 
 HEIGHT, WIDTH = 40, 60

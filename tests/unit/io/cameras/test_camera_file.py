@@ -165,9 +165,8 @@ def test_larger_photos_are_undistorted_and_resized(tmp_path: Path) -> None:
 def test_no_photos_or_others_are_refused(tmp_path: Path) -> None:
     SMOOTH.save(tmp_path, cameras=False, images=False)
     as_transforms(tmp_path, SMOOTH, [0.1, 0, 0, 0])
-    with refuses(SceneError, "transforms.json", "OPENCV", "--images") as caught:
+    with refuses(SceneError, "transforms.json", "OPENCV", "--images"):
         load_scene(tmp_path)
-    assert "\n" not in str(caught.value)
     assert "no images" in inspect(tmp_path)["alignment_problem"]
     with refuses(SceneError, "transforms.json: view images/a b/2.png", "OPENCV"):
         to_cameras(read_cameras(tmp_path))

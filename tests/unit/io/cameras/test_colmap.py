@@ -92,7 +92,7 @@ def test_a_stripped_list_with_a_line_that_is_no_image_is_refused(tmp_path: Path,
     lines = [line for line in (tmp_path / "images.txt").read_text().splitlines() if line and line[:4] != "10.5"]
     for odd in (lines[2].rsplit(maxsplit=2)[0], lines[2].replace(" 7 ", " 8 ")):
         (tmp_path / "images.txt").write_text("\n".join([*lines[:2], odd, *lines[3:]]))
-        with pytest.raises(SceneError, match=r"damaged cameras or images\.txt|its camera is not in"):
+        with pytest.raises(SceneError, match=r"images\.txt|cameras\.txt"):
             read_cameras(tmp_path)
 
 

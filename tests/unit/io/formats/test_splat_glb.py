@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 import scenes
 from messages import refuses
+from slow_readers import drawn
 
 from gsmerge import Scene
 from gsmerge.errors import SceneError
 from gsmerge.io import read_gaussians, write_gaussians
-
-from .slow_readers import drawn
 
 
 @pytest.mark.parametrize(

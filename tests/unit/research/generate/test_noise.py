@@ -12,7 +12,7 @@ from messages import refuses
 from gsmerge import Cameras, Gaussians
 from gsmerge.errors import SceneError
 from gsmerge.geometry import project, quat_to_rotmat
-from gsmerge.kernels.raster.harmonics import view_colors
+from gsmerge.kernels.raster.sh import view_colors
 from gsmerge.research.generate import GenerateOptions, NoiseOptions, read_ranges
 from gsmerge.research.generate.noise import (
     ERRORS,

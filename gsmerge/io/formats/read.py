@@ -1,0 +1,355 @@
+"""Read Gaussian splats from files: log scales, logits and channel-major harmonics end here."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from gsmerge.errors import SceneError
+from gsmerge.geometry import rgb_to_sh0
+from gsmerge.io.formats import arrays, ply, streamed
+from gsmerge.io.formats.arrays import StoredRows
+from gsmerge.io.formats.table import input_format
+from gsmerge.kernels.elementary import exp, log
+from gsmerge.runtime.memory import free_pages, make_array
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.types import Gaussians, StrPath
+
+MIN_FINITE = 0.002  # of the rows: the rest of a file tells nothing about the scene
+OpacityChoice = Literal["auto", "logit", "raw"]
+MAX_HARMONIC = 1e6  # pictures of it can still be squared and summed in float32
+FREED_ROWS = 1 << 20  # after which the pages of large columns leave memory
+_MIN_JUDGED = 100  # Gaussians whose scales say something
+_SCALE_SAMPLES = 20_000  # of them that are looked at
+_MAX_WIDTH = 0.25  # share of the scene's width from which on standard deviations are wrong
+# The same in units of the width over the root of the number of Gaussians: sound files have 0.3 to
+# 2, linear scales that are taken for logarithms 10 to 1,000.
+_MAX_SPACINGS = 6.0
+
+
+@dataclass(frozen=True)
+class FileInfo:
+    """Facts about a file of Gaussians; its columns are those of a PLY file with the same content."""
+
+    path: str
+    layout: str  # name of the column layout, as "17-column export" or "INRIA, SH degree 3"
+    format: str  # "ascii", "binary little-endian" or "binary big-endian"
+    count: int  # Gaussians, the unusable ones included
+    file_bytes: int  # of an index, with those of its level's chunks
+    # bytes of the rows by attribute (means, normals, sh0, shN, opacities, scales, quats, extra); of the values' binary
+    # types for an ascii file; before gzip for .spz, and of the textures for .sog, where sh0 includes the opacities
+    bytes_by_attribute: dict[str, int]
+    # all columns of the vertex element, in the file's order; ``extra_columns`` are ignored, and ``byte_columns`` stored
+    # as bytes
+    columns: tuple[str, ...]
+    extra_columns: tuple[str, ...]
+    extra_elements: tuple[str, ...]  # elements besides ``vertex``
+    byte_columns: tuple[str, ...]
+    comments: tuple[str, ...]  # of the header
+    sh_degree: int  # 0 to 4
+    opacity_encoding: str  # "logit", or "raw" where the file holds opacities in [0, 1]
+    opacity_guessed: bool  # whether the encoding was guessed from the values, not given by the caller or the file
+    num_nonfinite: int  # rows with NaN or inf, set aside
+    num_clipped_scales: int  # Gaussians with a log scale beyond +-30 or a harmonic beyond +-1e6, clipped
+    num_zero_quats: int  # Gaussians without a rotation, read as the identity
+    # why the scales are likely wrong, one sentence without a full stop; empty where they are not
+    odd_scales: str = ""
+
+
+@dataclass(frozen=True)
+class GaussianFile:
+    """The n Gaussians of a file, row by row; float32, means float64 where the file stores them so.
+
+    A row that was not finite is False in ``valid [n]``, fully transparent and grey, and has the position and scales of
+    the finite row before it.
+    """
+
+    gaussians: Gaussians
+    valid: np.ndarray
+    info: FileInfo
+
+
+def kept_comments(info: FileInfo) -> tuple[str, ...]:
+    """Return the comments of a file's header that tell viewers how to render its Gaussians."""
+    lines = (comment for comment in info.comments if comment.isascii() and comment.isprintable())
+    return tuple(comment for comment in lines if comment.startswith(arrays.RENDER_COMMENT))
+
+
+def file_notes(info: FileInfo) -> tuple[str, ...]:
+    """Describe what was adapted or looks odd in a file, one sentence each, without a full stop."""
+    counted = {
+        "row(s) with NaN or inf, set aside": info.num_nonfinite,
+        "Gaussian(s) with extreme scales or colours, clipped": info.num_clipped_scales,
+        "Gaussian(s) with a zero quaternion, taken as the identity": info.num_zero_quats,
+    }
+    raw = ("all opacities lie in [0, 1]: taken as activated, not as logits; opacity 'logit' says otherwise",)
+    notes = raw if info.opacity_encoding == "raw" and info.opacity_guessed else ()
+    odd = (info.odd_scales,) if info.odd_scales else ()
+    return (*notes, *odd, *(f"{count:,} {what}" for what, count in counted.items() if count))
+
+
+def read_ply(path: StrPath, *, opacity: OpacityChoice = "auto") -> GaussianFile:
+    """Read a PLY file of Gaussians: binary or ascii, any SH degree up to 4, extra columns and elements ignored.
+
+    Colours may be red, green and blue (bytes, or floats in [0, 1]) where the harmonics of degree 0 are missing.
+
+    Args:
+        path: The file.
+        opacity: How opacities are stored; "auto" takes them as activated if all finite ones lie in [0, 1], else
+            as logits. Infinite logits are opacities of 0 and 1.
+
+    Raises:
+        SceneError: If the file cannot be read, lacks columns, or hardly has a finite Gaussian: 2 in 1,000 rows.
+        ValueError: If ``opacity`` is none of the three.
+    """
+    return read_parts([Path(path)], opacity=opacity)
+
+
+def read_parts(paths: Sequence[Path], *, opacity: OpacityChoice = "auto") -> GaussianFile:
+    """Read one PLY file, or several with the same columns as if they were one, in their order, see :func:`read_ply`."""
+    if opacity not in ("auto", "logit", "raw"):
+        raise ValueError(f"opacity: expected 'auto', 'logit' or 'raw', got {opacity!r}")
+    parts = [ply.read_rows(path) for path in paths]
+    for path, part in zip(paths, parts, strict=True):
+        if part.rows.dtype != parts[0].rows.dtype:
+            problem = f"expected the columns of {paths[0].name}, found others, so they are no parts of one scene"
+            raise SceneError(path, problem, "name one of the files")
+    return _convert_files(paths, parts, opacity)
+
+
+def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto") -> GaussianFile:
+    """Read a file of Gaussians in the format of its ending.
+
+    Endings are ``.spz`` (versions 1 to 4), ``.splat`` and ``.sog`` (version 2); of a ``lod-meta.json``, it is
+    the finest level. Everything else is read by :func:`read_ply`, for which ``opacity`` is. SceneError if the file
+    cannot be read, is damaged, or holds no finite Gaussian; ValueError for another ``opacity``.
+    """
+    path, read = Path(path), input_format(path).read
+    if read is None or read is ply.read_rows:
+        return read_ply(path, opacity=opacity)
+    return _convert_files([path], [read(path)], "auto")
+
+
+def read_level(path: Path, level: int) -> GaussianFile:
+    """Read one level of detail of a ``lod-meta.json``, 0 the finest; SceneError as of :func:`read_gaussians`."""
+    return _convert_files([path], [streamed.read_rows(path, level)], "auto")
+
+
+def _convert_files(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: OpacityChoice) -> GaussianFile:
+    """Convert the rows of files, one after the other; facts that are not sums are those of the first."""
+    path, stored, dtype = paths[0], parts[0], parts[0].rows.dtype
+    names = tuple(dtype.names or ())
+    num_higher = sum(name.startswith("f_rest_") for name in names) // 3
+    n = sum(len(part.rows) for part in parts)
+    wide = any(dtype[name].kind == "f" and dtype[name].itemsize == 8 for name in arrays.MEANS)
+    shapes = {"quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh0": (n, 1, 3), "shN": (n, num_higher, 3)}
+    out = {"means": make_array((n, 3), np.float64 if wide else np.float32), "valid": np.empty(n, np.bool_)}
+    out |= {name: make_array(shape, np.float32) for name, shape in shapes.items()}
+    num_clipped = num_zero_quats = first = 0
+    for name, part in zip(paths, parts, strict=True):
+        some = slice(first, first + len(part.rows))
+        clipped, zero = _convert_file(name, part, {key: column[some] for key, column in out.items()})
+        num_clipped, num_zero_quats, first = num_clipped + clipped, num_zero_quats + zero, some.stop
+    known = opacity if opacity != "auto" else stored.encoding
+    encoding = _activate(out["opacities"], out["valid"], known)
+    num_bad = clear_invalid(path, out)
+    byte_columns = tuple(name for name in names if dtype[name].itemsize == 1)
+    if byte_columns == arrays.NORMALS:
+        _spread_low_degree(out["shN"])
+    used = {*arrays.REQUIRED, *arrays.color_columns(names), *arrays.NORMALS}
+    extra = tuple(name for name in names if name not in used and not name.startswith("f_rest_"))
+    info = FileInfo(
+        path=str(path),
+        layout=stored.layout,
+        format=stored.format,
+        count=n,
+        file_bytes=sum(path.stat().st_size + part.bytes_beside for path, part in zip(paths, parts, strict=True)),
+        bytes_by_attribute={name: sum(part.sizes[name] for part in parts) for name in stored.sizes},
+        columns=names,
+        extra_columns=extra,
+        extra_elements=stored.extra_elements,
+        byte_columns=byte_columns,
+        comments=stored.comments,
+        sh_degree=arrays.sh_degree(num_higher),
+        opacity_encoding=encoding,
+        opacity_guessed=known is None,
+        num_nonfinite=num_bad,
+        num_clipped_scales=num_clipped,
+        num_zero_quats=num_zero_quats,
+        odd_scales=_describe_odd_scales(out["means"], out["scales"], out["valid"]),
+    )
+    return GaussianFile(valid=out.pop("valid"), gaussians=Gaussians(**out), info=info)
+
+
+def _convert_file(path: Path, stored: StoredRows, out: dict[str, np.ndarray]) -> tuple[int, int]:
+    """Fill arrays with the rows of a file, and count what was clipped and what had no rotation."""
+    n, size = len(stored.rows), max(1, ply.BLOCK_BYTES // stored.rows.dtype.itemsize)
+    with ply.open_rows(path, stored.rows) as read:
+
+        def convert(start: int) -> tuple[int, int]:
+            block = slice(start, min(start + size, n))
+            counts = _convert(read(block), {name: column[block] for name, column in out.items()})
+            if start % FREED_ROWS < size:
+                free_pages(out.values())
+            return counts
+
+        num_clipped, num_zero = map(sum, zip(*parallel_map(convert, range(0, n, size)), strict=True))
+    return num_clipped, num_zero
+
+
+def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int, int]:
+    """Fill the arrays of one block of rows, column by column; opacities are only copied."""
+    with np.errstate(all="ignore"):
+        total = np.zeros(len(rows), np.float32)  # not finite where any column is not: one test instead of many
+
+        def take(name: str) -> np.ndarray:
+            column = rows[name].astype(np.float32)
+            np.add(total, column, out=total)
+            return column
+
+        for j, name in enumerate(arrays.MEANS):
+            column = take(name)
+            out["means"][:, j] = column if out["means"].dtype == np.float32 else rows[name]
+        clipped = np.zeros(len(rows), np.bool_)
+
+        def take_harmonic(name: str) -> np.ndarray:
+            column = take(name)
+            size = np.abs(column)
+            if not size.max() <= MAX_HARMONIC:
+                np.logical_or(clipped, size > MAX_HARMONIC, out=clipped)
+                np.clip(column, -MAX_HARMONIC, MAX_HARMONIC, out=column)
+            return column
+
+        for j, name in enumerate(arrays.color_columns(rows.dtype.names)):
+            column = take_harmonic(name)
+            if name in arrays.RGB:
+                column = rgb_to_sh0(column / (255 if rows.dtype[name].kind == "u" else 1))
+            out["sh0"][:, 0, j] = column
+        num_higher = out["shN"].shape[1]
+        for channel in range(3):
+            for j in range(num_higher):
+                out["shN"][:, j, channel] = take_harmonic(f"f_rest_{channel * num_higher + j}")
+        for j, name in enumerate(arrays.SCALES):
+            column = take(name)
+            clipped |= np.abs(column) > arrays.MAX_LOG_SCALE
+            np.clip(column, -arrays.MAX_LOG_SCALE, arrays.MAX_LOG_SCALE, out=column)
+            out["scales"][:, j] = exp(column)
+        quats = [take(name) for name in arrays.QUATS]
+        zero = _normalise(quats, out["quats"])
+        out["opacities"][:] = take("opacity")
+        valid = np.isfinite(total, out=out["valid"])
+        doubtful = np.flatnonzero(~valid)
+        if len(doubtful):
+            valid[doubtful] = _exactly_valid(rows[doubtful], num_higher)
+    return int((clipped & valid).sum()), int((zero & valid).sum())
+
+
+def _exactly_valid(rows: np.ndarray, num_higher: int) -> np.ndarray:
+    """Return which rows are usable: finite, except for infinite logits and scales of zero."""
+    valid = ~np.isnan(rows["opacity"].astype(np.float32))
+    colors = arrays.color_columns(rows.dtype.names)
+    for name in (*arrays.MEANS, *colors, *arrays.QUATS, *(f"f_rest_{i}" for i in range(3 * num_higher))):
+        valid &= np.isfinite(rows[name].astype(np.float32))
+    for name in arrays.SCALES:
+        column = rows[name].astype(np.float32)
+        valid &= np.isfinite(column) | (column == -np.inf)
+    return valid
+
+
+def _normalise(quats: list[np.ndarray], out: np.ndarray) -> np.ndarray:
+    """Write unit quaternions, the identity for zero; return the mask of zero quaternions."""
+    w, x, y, z = quats
+    squared = w * w + x * x + y * y + z * z
+    inverse = 1 / np.sqrt(squared)
+    for j, column in enumerate(quats):
+        np.multiply(column, inverse, out=out[:, j])
+    zero = np.zeros(len(w), np.bool_)
+    extreme = np.flatnonzero(~((squared > 1e-30) & (squared < 1e30)))  # float32 squares under- or overflow
+    if len(extreme):
+        exact = np.stack([column[extreme].astype(np.float64) for column in quats], 1)
+        length = np.linalg.norm(exact, axis=1)
+        zero[extreme] = length == 0
+        exact[length == 0] = (1, 0, 0, 0)
+        out[extreme] = exact / np.where(length == 0, 1, length)[:, None]
+    return zero
+
+
+def _activate(opacities: np.ndarray, valid: np.ndarray, known: str | None) -> str:
+    """Convert stored opacities to [0, 1] in place, and return their encoding, guessed where it is not known.
+
+    They are raw if all finite ones lie in [0, 1]. An infinite raw one makes its row invalid.
+    """
+    finite = np.isfinite(opacities)
+    if known is None:
+        low = opacities.min(where=finite, initial=np.inf)
+        high = opacities.max(where=finite, initial=-np.inf)
+        known = "raw" if 0 <= low <= high <= 1 else "logit"
+    if known == "raw":
+        valid &= finite
+        np.clip(opacities, 0, 1, out=opacities)
+        return known
+    with np.errstate(all="ignore"):
+        opacities[:] = exp(np.negative(opacities, out=opacities))
+        np.add(opacities, 1, out=opacities)
+        np.reciprocal(opacities, out=opacities)
+    return known
+
+
+def _describe_odd_scales(means: np.ndarray, scales: np.ndarray, valid: np.ndarray) -> str:
+    """Explain why ``scales [n,3]`` are likely wrong for ``means [n,3]``; "" where they are not."""
+    rows = np.flatnonzero(valid)
+    if len(rows) < _MIN_JUDGED:
+        return ""
+    some = rows[:: max(1, len(rows) // _SCALE_SAMPLES)]
+    low, high = np.quantile(means[some].astype(np.float64), (0.05, 0.95), axis=0)
+    width = float((high - low).max())
+    size = float(np.median(scales[some].max(1)))
+    text = f"half of the Gaussians have a standard deviation above {size:.3g}"
+    text += f" in a scene of a width of {width:.3g}"
+    most = _MAX_SPACINGS * width / float(np.sqrt(len(rows)))
+    linear = float(log(size))
+    if linear <= most < size and scales.min(where=valid[:, None], initial=np.inf) >= 1:
+        start = f"no stored scale is negative (median {linear:.3g}), as if linear"
+        return f"{start}: {text}; logarithms are expected"
+    if size > _MAX_WIDTH * width:
+        return f"{text}: the scales, which are logarithms, are too large"
+    return ""
+
+
+def _spread_low_degree(shN: np.ndarray) -> None:
+    """Move harmonics of a low degree to their places in ``shN [n,15,3]``, in place.
+
+    Long-LRM writes 45 columns whatever the degree, the used ones channel-major in the first 9 or 24.
+    """
+    if shN.shape[1] != 15:
+        return
+    columns = shN.transpose(0, 2, 1).reshape(len(shN), 45)
+    last = int(np.flatnonzero(columns.any(0)).max(initial=-1))
+    for higher in (3, 8):
+        if 0 <= last < 3 * higher:
+            shN[:] = 0
+            shN[:, :higher] = columns[:, : 3 * higher].reshape(-1, 3, higher).transpose(0, 2, 1)
+            return
+
+
+def clear_invalid(path: str | Path, out: dict[str, np.ndarray]) -> int:
+    """Make the invalid rows transparent, in place; return their number."""
+    valid = out["valid"]
+    bad = np.flatnonzero(~valid)
+    if len(bad) == 0:
+        return 0
+    good = np.flatnonzero(valid)
+    if len(good) < MIN_FINITE * len(valid):
+        number = f"{len(bad):,} of" if len(good) else "all"
+        problem = f"expected finite Gaussians, found NaN or inf in {number} {len(valid):,} rows"
+        raise SceneError(path, problem, "export it again" if len(good) else "")
+    before = good[np.maximum(np.searchsorted(good, bad) - 1, 0)]
+    for name in ("means", "scales"):
+        out[name][bad] = out[name][before]
+    for name, value in {"quats": (1, 0, 0, 0), "opacities": 0, "sh0": 0, "shN": 0}.items():
+        out[name][bad] = value
+    return len(bad)

@@ -1,0 +1,147 @@
+"""Writers of Gaussians, by the format that a file's name asks for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from gsmerge.errors import UsageError
+from gsmerge.io.atomic import AddOutput, atomic_output, atomic_outputs
+from gsmerge.io.formats import ply, sog, streamed
+from gsmerge.io.formats.arrays import MIP_COMMENT
+from gsmerge.io.formats.table import output_format
+from gsmerge.types import Gaussians, StrPath
+
+
+def lost_harmonics(path: StrPath, sh_degree: int, spz_version: int = 3) -> str | None:
+    """Describe the harmonics that a format has no room for; None if it holds all, UsageError on an unknown one."""
+    chosen = output_format(path, spz_version, levels=True)
+    if sh_degree <= chosen.max_degree:
+        return None
+    return f"{chosen.ending} has no room for harmonics above degree {chosen.max_degree}: left out"
+
+
+def write_gaussians(
+    path: StrPath,
+    gaussians: Gaussians,
+    *,
+    overwrite: bool = False,
+    comments: Sequence[str] = (),
+    ending: str | None = None,
+    normals: bool = True,
+    spz_version: int = 3,
+) -> None:
+    """Write Gaussians in one of ``OUTPUT_FORMATS``, by the ending of the name.
+
+    All but ``.ply`` and ``.glb`` quantise; none of them changes the frame of the Gaussians.
+
+    Args:
+        path: The file; complete or not there at all.
+        gaussians: Finite values.
+        overwrite: Replace an existing file.
+        comments: Lines for the header of the two that have one; ``.spz`` and ``.sog`` keep "SplatRenderMode: mip".
+        ending: Format to write instead of the name's.
+        normals: Of a ``.ply``, as of :func:`write_ply`.
+        spz_version: Of a ``.spz``: 3, which most programs read, or 4, which has room for harmonics of degree 4 and
+            needs ``zstandard``.
+
+    Raises:
+        UsageError: If the name ends in none of these, or ``zstandard`` is needed and not installed.
+        SceneError: If the file exists or cannot be written.
+        ValueError: If there is NaN or inf, a comment is no line of ASCII, or there is no such version.
+    """
+    chosen = output_format(ending or path, spz_version)
+    assert chosen.encode is not None
+    _check_comments(comments)
+    with atomic_output(path, overwrite=overwrite) as temporary, temporary.open("wb") as file:
+        file.writelines(chosen.encode(gaussians, comments, normals))
+
+
+def write_levels(
+    path: StrPath, levels: Sequence[Gaussians], *, overwrite: bool = False, comments: Sequence[str] = ()
+) -> None:
+    """Write levels of detail as Streamed SOG: an index, and chunks in folders beside it.
+
+    A viewer loads the chunks that it sees, at the level that fits. All files are written, or none; the chunks of
+    an index that is replaced are removed.
+
+    Args:
+        path: The index, a ``lod-meta.json``; its folder is made if it is missing.
+        levels: Finite values, the finest level first.
+        overwrite: Replace an existing index.
+        comments: Lines as of :func:`write_gaussians`, of which "SplatRenderMode: mip" is kept.
+
+    Raises:
+        UsageError: If the name is another one.
+        SceneError: If the file exists or cannot be written.
+        ValueError: If there is NaN or inf, no Gaussian at some level, or a comment is no line of ASCII.
+    """
+    path = Path(path)
+    if path.name != streamed.INDEX:
+        raise UsageError(f"{path}: expected the name {streamed.INDEX}, by which viewers recognise the format")
+    with atomic_outputs(overwrite=overwrite) as add:
+        add_levels(add, path, add(path, make_folder=True), levels, comments)
+    streamed.remove_unused_chunks(path)
+
+
+def add_levels(
+    add: AddOutput, path: Path, index: Path, levels: Sequence[Gaussians], comments: Sequence[str] = ()
+) -> list[tuple[Path, list[Path]]]:
+    """Write levels of detail as some of several outputs, ``index`` in place of ``path``.
+
+    Returns of each level the ``meta.json`` of its first chunk, as it will be named, and all files as they are now.
+    """
+    _check_comments(comments)
+    firsts: dict[str, Path] = {}
+    written: dict[str, list[Path]] = {}
+    for name, data in streamed.streamed_files(levels, mip=MIP_COMMENT in comments).items():
+        if name == streamed.INDEX:
+            index.write_bytes(data)
+            continue
+        target, level = path.parent / name, name.partition("_")[0]
+        same = target.is_file() and target.read_bytes() == data  # its name has a hash of its content
+        written.setdefault(level, []).append(target if same else add(target, make_folder=True))
+        if not same:
+            written[level][-1].write_bytes(data)
+        if target.name == sog.META:
+            firsts.setdefault(level, target)
+    return [(firsts[level], files) for level, files in written.items()]
+
+
+def write_ply(
+    path: StrPath,
+    gaussians: Gaussians,
+    *,
+    overwrite: bool = False,
+    sh_degree: int | None = None,
+    comments: Sequence[str] = (),
+    normals: bool = True,
+) -> None:
+    """Write Gaussians in INRIA's column order, binary little-endian float32.
+
+    Opacities become finite logits (within +-16), scales finite logarithms (within +-30), quaternions unit ones.
+
+    Args:
+        path: The file; complete or not there at all.
+        gaussians: Finite values.
+        overwrite: Replace an existing file.
+        sh_degree: Drop harmonics above this degree; None keeps all.
+        comments: Lines for the header, such as :func:`gsmerge.io.kept_comments` of another file.
+        normals: Write three columns of zeros that no renderer uses but a few readers, such as SIBR's, expect: 12 bytes
+            per Gaussian.
+
+    Raises:
+        SceneError: If the file exists or cannot be written.
+        ValueError: If there is NaN or inf, fewer harmonics than asked for, or a comment is no line of ASCII.
+    """
+    _check_comments(comments)
+    degree = gaussians.sh_degree if sh_degree is None else sh_degree
+    if not 0 <= degree <= gaussians.sh_degree:
+        raise ValueError(f"sh_degree: expected 0 to {gaussians.sh_degree}, got {sh_degree}")
+    with atomic_output(path, overwrite=overwrite) as temporary, temporary.open("wb") as file:
+        file.writelines(ply.ply_blocks(gaussians, comments, degree=degree, normals=normals))
+
+
+def _check_comments(comments: Sequence[str]) -> None:
+    if not all(comment.isascii() and comment.isprintable() for comment in comments):
+        raise ValueError(f"comments: expected printable lines of ASCII, got {list(comments)}")

@@ -1,0 +1,254 @@
+"""Formats of results: read back by slow, obvious readers, and by splat-transform where that is installed."""
+
+from __future__ import annotations
+
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scenes
+from messages import refuses
+from plyfile import PlyData
+from slow_readers import corners, drawn, read_back
+from tiny_scene import Tiny
+
+from gsmerge import Scene
+from gsmerge.errors import SceneError, UsageError
+from gsmerge.geometry import normalize
+from gsmerge.io import OUTPUT_FORMATS, lost_harmonics, output_format, read_ply, write_gaussians, write_ply
+from gsmerge.research.baselines.simple import find_program
+from gsmerge.types import Gaussians
+
+QUANTISED = (".compressed.ply", ".spz", ".sog", ".splat")
+
+
+# dB between a render of the .ply and one of the file, of Gaussians with every parameter drawn at random; with rows in
+# another order alone, as in .compressed.ply and .sog, 44 of degree 0 and 37 of degree 3
+FLOORS = {
+    (".compressed.ply", 0): 40, (".spz", 0): 48, (".splat", 0): 48, (".sog", 0): 42,
+    (".compressed.ply", 3): 34, (".spz", 3): 32, (".sog", 3): 35,
+}  # fmt: skip
+
+
+def program() -> str | None:
+    try:
+        return find_program()
+    except UsageError:
+        return None
+
+
+needs_program = pytest.mark.skipif(program() is None, reason="needs splat-transform")
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return scenes.make_scene(scenes.room(), scenes.arc(3, 96, 72))
+
+
+def psnr(scene: Scene, one: Gaussians, other: Gaussians) -> float:
+    a, b = (scenes.images_of(g, scene.cameras)[0].clip(0, 1) for g in (one, other))
+    return float(-10 * np.log10(max(((a - b) ** 2).mean(), 1e-12)))
+
+
+@pytest.mark.parametrize(("ending", "degree"), FLOORS)
+def test_what_is_read_back_shows_the_same(ending: str, degree: int, scene: Scene, tmp_path: Path) -> None:
+    gaussians, path = drawn(scene, degree), tmp_path / f"a{ending}"
+    write_gaussians(path, gaussians)
+    actual = read_back(path)
+    assert (len(actual), actual.sh_degree) == (len(gaussians), degree)
+    assert psnr(scene, gaussians, actual) > FLOORS[ending, degree]
+
+
+@needs_program
+@pytest.mark.parametrize(("ending", "degree"), FLOORS)
+def test_splat_transform_reads_the_same(ending: str, degree: int, scene: Scene, tmp_path: Path) -> None:
+    gaussians, path, back = drawn(scene, degree), tmp_path / f"a{ending}", tmp_path / "back.ply"
+    write_gaussians(path, gaussians)
+    subprocess.run([str(program()), "-q", str(path), str(back)], check=True, capture_output=True)
+    actual = read_ply(back).gaussians
+    assert (len(actual), actual.sh_degree) == (len(gaussians), degree)
+    assert psnr(scene, gaussians, actual) > FLOORS[ending, degree]
+    assert psnr(scene, read_back(path), actual) > 50  # of .splat, it takes 127.5 for the middle
+
+
+@pytest.mark.parametrize("ending", QUANTISED)
+def test_they_are_smaller(ending: str, scene: Scene, tmp_path: Path) -> None:
+    gaussians = drawn(scene, 0)
+    write_gaussians(tmp_path / "a.ply", gaussians)
+    write_gaussians(tmp_path / f"b{ending}", gaussians)
+    assert (tmp_path / f"b{ending}").stat().st_size < (tmp_path / "a.ply").stat().st_size / 2
+
+
+@pytest.mark.parametrize("ending", OUTPUT_FORMATS)
+def test_the_same_gaussians_give_the_same_bytes(ending: str, scene: Scene, tmp_path: Path) -> None:
+    for name in "ab":
+        write_gaussians(tmp_path / f"{name}{ending}", drawn(scene, 0))
+    assert (tmp_path / f"a{ending}").read_bytes() == (tmp_path / f"b{ending}").read_bytes()
+
+
+@pytest.mark.parametrize("ending", [".ply", *QUANTISED])
+def test_extremes_stay_finite(ending: str, tmp_path: Path) -> None:
+    write_gaussians(tmp_path / f"a{ending}", corners())
+    actual = read_back(tmp_path / f"a{ending}")
+    for name, array in vars(actual).items():
+        assert np.isfinite(array).all(), name
+    assert sorted(actual.opacities.round(1).tolist()) == [0.0, 0.5, 1.0]
+    assert float(actual.means[:, 0].max()) == pytest.approx(1e5, rel=1e-3)
+
+
+@pytest.mark.parametrize("ending", QUANTISED)
+def test_rotations_are_the_same_up_to_a_sign(ending: str, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    quats = normalize(rng.normal(size=(300, 4)).astype(np.float32))
+    n = len(quats)
+    # along a line, so that rows keep their order along the curve through space
+    means = np.repeat(np.arange(n, dtype=np.float32)[:, None], 3, 1)
+    colors = np.zeros((n, 1, 3), np.float32)
+    gaussians = Gaussians(means, quats, np.full_like(means, 0.1), np.full_like(means[:, 0], 0.5), colors, colors[:, :0])
+    write_gaussians(tmp_path / f"a{ending}", gaussians)
+    actual = read_back(tmp_path / f"a{ending}")
+    cosines = np.abs((actual.quats * quats).sum(1))
+    assert (
+        float(cosines.min()) > {".splat": 0.9998, ".sog": 0.9998, ".spz": 0.99999, ".compressed.ply": 0.99999}[ending]
+    )
+    assert float(np.abs(actual.means - means).max()) < 0.5
+
+
+def test_harmonics_without_room_are_noted() -> None:
+    assert lost_harmonics("a.ply", 4) is None
+    assert lost_harmonics("a.spz", 3) is None
+    note = lost_harmonics("a.splat", 1)
+    assert note == ".splat has no room for harmonics above degree 0: left out"
+    assert "above degree 3" in str(lost_harmonics("a.COMPRESSED.ply", 4))
+
+
+def test_a_higher_degree_loses_its_top(scene: Scene, tmp_path: Path) -> None:
+    for ending, degree in ((".spz", 3), (".sog", 3), (".compressed.ply", 3), (".splat", 0)):
+        write_gaussians(tmp_path / f"a{ending}", drawn(scene, 4))
+        assert read_back(tmp_path / f"a{ending}").sh_degree == degree
+
+
+@pytest.mark.parametrize(
+    ("name", "ending"),
+    [("a.ply", ".ply"), ("a.compressed.ply", ".compressed.ply"), ("A.SPZ", ".spz"), ("x/b.splat", ".splat")],
+)
+def test_names_ask_for_formats(name: str, ending: str) -> None:
+    assert output_format(name).ending == ending
+
+
+@pytest.mark.parametrize("name", ["a", "a.ksplat", "ply", "a.ply.gz", "spz/a"])
+def test_other_names_are_refused(name: str) -> None:
+    with refuses(UsageError, name, ".compressed.ply, .ply, .spz, .sog, .splat or .glb"):
+        output_format(name)
+
+
+@pytest.mark.parametrize("ending", OUTPUT_FORMATS)
+def test_failures_leave_existing_files_and_nothing_else(ending: str, tmp_path: Path) -> None:
+    bad, path = replace(corners(), opacities=np.array([0.0, float("nan"), 0.5], np.float32)), tmp_path / f"a{ending}"
+    with refuses(ValueError, "", "finite", 1):
+        write_gaussians(path, bad)
+    assert list(tmp_path.iterdir()) == []
+    path.write_text("precious")
+    with refuses(SceneError, path, "exists"):
+        write_gaussians(path, corners())
+    with refuses(ValueError, "", "finite", 1):
+        write_gaussians(path, bad, overwrite=True)
+    assert [one.read_text() for one in tmp_path.iterdir()] == ["precious"]
+
+
+@pytest.mark.parametrize("ending", OUTPUT_FORMATS)
+def test_no_gaussians(ending: str, tmp_path: Path) -> None:
+    write_gaussians(tmp_path / f"a{ending}", corners()[:0])
+    assert (tmp_path / f"a{ending}").exists()
+
+
+def test_comments_reach_the_headers(tmp_path: Path) -> None:
+    write_gaussians(tmp_path / "a.compressed.ply", corners(), comments=["SplatRenderMode: mip"])
+    assert "SplatRenderMode: mip" in read_ply(tmp_path / "a.compressed.ply").info.comments
+    with refuses(ValueError, "comments", "ASCII"):
+        write_gaussians(tmp_path / "b.compressed.ply", corners(), comments=["two\nlines"])
+
+
+def test_no_normals_is_the_same_without_twelve_bytes(scene: Scene, tmp_path: Path) -> None:
+    gaussians = drawn(scene, 1)
+    for name, normals in {"with": True, "without": False}.items():
+        write_gaussians(tmp_path / f"{name}.ply", gaussians, normals=normals)
+    wide, narrow = (read_ply(tmp_path / f"{name}.ply") for name in ("with", "without"))
+    assert wide.info.layout == "INRIA, SH degree 1"
+    assert narrow.info.layout == "INRIA, SH degree 1 (no normals)"
+    line = len("property float nx\n")
+    assert wide.info.file_bytes - narrow.info.file_bytes == 12 * len(gaussians) + 3 * line
+    for name, array in vars(wide.gaussians).items():
+        np.testing.assert_array_equal(getattr(narrow.gaussians, name), array)
+
+
+def with_harmonics(gaussians: Gaussians, degree: int) -> Gaussians:
+    shN = np.random.default_rng(0).normal(size=(len(gaussians), (degree + 1) ** 2 - 1, 3))
+    return replace(gaussians, shN=shN.astype(np.float32))
+
+
+def test_the_layout_is_inrias(tmp_path: Path, tiny: Tiny) -> None:
+    gaussians = with_harmonics(tiny.gaussians, 1)
+    write_ply(tmp_path / "a.ply", gaussians)
+    data = PlyData.read(str(tmp_path / "a.ply"))
+    vertex = data["vertex"]
+    assert (data.text, data.byte_order) == (False, "<")
+    assert [p.name for p in vertex.properties] == [
+        *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
+        *(f"f_rest_{i}" for i in range(9)),
+        *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+    ]
+    assert {p.val_dtype for p in vertex.properties} == {"f4"}
+    assert vertex["f_rest_4"].tolist() == gaussians.shN[:, 1, 1].tolist()
+    assert np.allclose(vertex["scale_2"], np.log(gaussians.scales[:, 2]), atol=1e-6)
+    opacities = gaussians.opacities.astype(np.float64)
+    assert np.allclose(vertex["opacity"], np.log(opacities / (1 - opacities)), atol=1e-6)
+    assert not vertex["nx"].any()
+
+
+def test_tensors_are_written_alike(tmp_path: Path, tiny: Tiny) -> None:
+    write_ply(tmp_path / "a.ply", tiny.gaussians)
+    tensors = tiny.gaussians.to("cpu")
+    write_ply(tmp_path / "b.ply", replace(tensors, means=tensors.means.clone().requires_grad_()))
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+def test_harmonics_are_dropped_on_demand(tmp_path: Path, tiny: Tiny) -> None:
+    gaussians = with_harmonics(tiny.gaussians, 3)
+    write_ply(tmp_path / "a.ply", gaussians, sh_degree=1)
+    assert np.array_equal(read_ply(tmp_path / "a.ply").gaussians.shN, gaussians.shN[:, :3])
+    write_ply(tmp_path / "b.ply", gaussians, sh_degree=0)
+    assert read_ply(tmp_path / "b.ply").info.layout == "17-column export"
+    with refuses(ValueError, "sh_degree", "0 to 3", 4):
+        write_ply(tmp_path / "c.ply", gaussians, sh_degree=4)
+
+
+def test_extremes_are_written_as_finite_numbers(tmp_path: Path, tiny: Tiny) -> None:
+    few = tiny.gaussians[:3]
+    extreme = replace(
+        few,
+        opacities=np.array([0.0, 1.0, 0.5], np.float32),
+        scales=np.array([[0.1, 0.1, 0.0], [1e-38, 1e30, 1.0], [1.0, 1.0, 1.0]], np.float32),
+        quats=np.array([[0.0, 0, 0, 0], [2, 0, 0, 0], [0, 0, -3, 4]], np.float32),
+    )
+    write_ply(tmp_path / "a.ply", extreme)
+    rows = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
+    assert all(np.isfinite(rows[name]).all() for name in rows.dtype.names)
+    back = read_ply(tmp_path / "a.ply").gaussians
+    assert back.opacities.tolist() == pytest.approx([0, 1, 0.5], abs=2e-7)
+    assert ((back.opacities > 0) & (back.opacities < 1)).all()
+    assert (back.scales > 0).all()
+    assert back.quats[0].tolist() == [1, 0, 0, 0]
+    assert back.quats[2].tolist() == pytest.approx([0, 0, -0.6, 0.8], abs=1e-6)
+
+
+def test_impossible_values_are_refused(tmp_path: Path, tiny: Tiny) -> None:
+    odd = dict.fromkeys(("means", "scales", "opacities", "sh0", "quats"), np.nan)
+    for field, value in [*odd.items(), ("opacities", 1.5), ("scales", -1.0)]:
+        values = getattr(tiny.gaussians, field).copy()
+        values[5] = value
+        with refuses(ValueError, "", "finite"):
+            write_ply(tmp_path / "a.ply", replace(tiny.gaussians, **{field: values}))
+        assert list(tmp_path.iterdir()) == []
