@@ -13,7 +13,7 @@ from gsmerge.alignment.estimate import WITH_PHOTOS, estimate_cameras, estimate_w
 from gsmerge.alignment.focal import estimate_focal
 from gsmerge.alignment.layouts import MAY_BE_UNALIGNED, Layout
 from gsmerge.alignment.recovery import Recovery, explain_misalignment, misalignment_error
-from gsmerge.alignment.rotations import QUATS, QuatChoice, choose_rotations, read_rotations
+from gsmerge.alignment.rotations import choose_rotations, read_rotations
 from gsmerge.alignment.score import Alignment, check_alignment, check_pairs, sample_pixels
 from gsmerge.alignment.search import AlignmentResult, align
 from gsmerge.alignment.unaligned import check_cameras, choose_poses, find_padding

@@ -15,7 +15,6 @@ from gsmerge.facts.views import pick_views
 from gsmerge.io import file_notes, read_cameras, read_gaussians, to_cameras
 from gsmerge.io.cameras.camera_file import sizes_of
 from gsmerge.io.cameras.read import read_sharp_camera
-from gsmerge.io.formats.read import OpacityChoice
 from gsmerge.io.image_names import IMAGE_SUFFIXES
 from gsmerge.measure.camera_path import parse_path, plan_path, viewing_depth
 from gsmerge.measure.preview import (
@@ -40,7 +39,9 @@ from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import SceneFiles, find_scene_files
 from gsmerge.scene.held_out import place_camera_file
 from gsmerge.scene.read import Loaded, load_files, place_cameras_in_scene, read_rows
-from gsmerge.stages.superpixels import SegmentOptions, count_for, saliency, segment
+from gsmerge.settings.reading import OpacityChoice
+from gsmerge.settings.stages import SegmentOptions
+from gsmerge.stages.superpixels import count_for, saliency, segment
 from gsmerge.types import Cameras, Gaussians
 
 PANEL_VIEWS = 4  # rows of a panel

@@ -16,7 +16,7 @@ from gsmerge.batch import BatchOptions, Job
 from gsmerge.batch.find import output_name
 from gsmerge.batch.records import RECORDS, SUMMARY, RecordIndex
 from gsmerge.batch.task import BatchContext, Task, make_index
-from gsmerge.options import CompactOptions
+from gsmerge.settings.compact import CompactOptions
 
 NAMES = [f"room{number}.ply" for number in range(4)]  # results of the fixture ``rooms``
 PATIENCE = 180  # seconds, on a machine that is busy with other things
