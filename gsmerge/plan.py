@@ -77,7 +77,7 @@ class Plan:
     auto_count: bool  # Whether the scene's own curve decides the number of Gaussians
     levels: int  # Levels of detail
     scored_views: tuple[int, ...]  # Given views that input and result are scored on
-    backend: FitBackend[Any]  # Where the fit and the scores run
+    backend: FitBackend  # Where the fit and the scores run
     seed: int  # Everything random depends on it alone
     checkpoint: Checkpoint | None  # Where the networks come from; None without any
     settings: dict[str, Any]  # All settings by flat name, for reports
@@ -336,7 +336,7 @@ def steps_for(options: CompactOptions, num_views: int, share: float = USUAL_SHAR
 
 
 def _resolve_fit_to(
-    prepared: Prepared, options: CompactOptions, limits: CountLimits, backend: FitBackend[Any]
+    prepared: Prepared, options: CompactOptions, limits: CountLimits, backend: FitBackend
 ) -> FitOptions:
     """Fill in the options of the fit that effort, scene and device decide."""
     scene = prepared.scene

@@ -4,12 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
-
-import numpy as np
-
-from gsmerge.runtime.record import choose, note, report_progress
-from gsmerge.types import Cameras, Gaussians
+from typing import Literal
 
 Fit = Literal["none", "full"]
 STEPS = 320  # of the full fit
@@ -18,7 +13,6 @@ USUAL_SHARE = 0.044  # of Gaussians in the pixels, which half-size photos show w
 EARLIER = 0.1  # share of the steps by which half-size photos end sooner where larger ones follow
 HASTY_STEPS = 20  # shorter runs have no time for full-size photos
 GROW_STEPS = 150  # shorter runs do better when they begin with all that they may have
-HAZE = 0.05  # far fog above which a result gets a note: plain to see in a viewer
 NOT_A_SETTING = {"setting": False}  # of fields that a user does not set by name
 
 
@@ -157,51 +151,3 @@ class FitOptions:
             raise ValueError(f"dropout: expected a number from 0 to below 1, got {self.dropout}")
         if self.time_budget is not None and not self.time_budget > 0:
             raise ValueError(f"time_budget: expected more than 0 seconds, got {self.time_budget}")
-
-
-@dataclass(frozen=True)
-class FitReport:
-    """Report of a fit."""
-
-    method: str  # `"none"`, `"color"` or `"full"`: what the result comes from
-    accepted: bool  # Whether the held-out blocks got better; if not, nothing was changed
-    steps: int  # Steps of the full fit, or conjugate-gradient steps
-    holdout_before: float  # PSNR (dB) on the held-out blocks before the fit
-    holdout_after: float  # The same after it
-    stopped: str  # Why it ended
-    viewmats: np.ndarray | None = None  # [v,4,4] poses after the fit; None: fixed
-    # Mean opacity of the result, in [0, 1], seen from outside where the start shows nothing; None: it fills every view
-    fog: float | None = None
-    device: str = "cpu"  # Where it ran: `"cpu"` or `"cuda"`
-    # [n] row of the start that each Gaussian comes from; None: not known
-    origins: np.ndarray | None = field(default=None, compare=False)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return all but the arrays, as plain values."""
-        return {name: value for name, value in vars(self).items() if name not in ("viewmats", "origins")}
-
-
-@dataclass(frozen=True, eq=False)
-class Fitted:
-    """Gaussians after the fit."""
-
-    gaussians: Gaussians  # Canonical Gaussians
-    cameras: Cameras  # The scene's cameras, canonical, moved where the fit moved them
-    report: FitReport | None  # What the fit did; None where nothing was fitted
-
-
-def record_fit(report: FitReport | None) -> None:
-    """Add what a fit did to the current record; None: nothing was fitted."""
-    if report is None:
-        return
-    choose(fit=report.to_dict())
-    if report.fog is not None and report.fog > HAZE:
-        seen = f"seen from outside, the result shows haze where the scene is empty: fog {report.fog:.2f}"
-        note(f"{seen}; --fit none makes none")
-    if not report.accepted:
-        note("the fit was not accepted: held-out parts of the photos did not get better")
-
-
-def report_steps(step: int, steps: int, photos: float, held_out: float) -> None:
-    """Report a step of the fit and the PSNR (dB) of the photos and of their held-out blocks."""
-    report_progress(f"fit: photos {photos:.1f} dB, held out {held_out:.1f} dB", step, steps)

@@ -1,4 +1,4 @@
-"""A first look at all photos: what the fit has to know about its start before it begins."""
+"""What photos show of each Gaussian: what the fit has to know about its start before it begins."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from gsmerge.fit.fit_state import start_state
-from gsmerge.raster import plan_view
+from gsmerge.raster import contributions, plan_view, prepare
 from gsmerge.raster.composite import survey
 from gsmerge.raster.photos import Photos
 from gsmerge.runtime.threads import in_turn
@@ -55,3 +55,24 @@ def survey_photos(gaussians: Gaussians, photos: Sequence[Photos]) -> Survey:
         sums[ids] += weights
         squares[ids] += weights.astype(np.float64) ** 2
     return Survey(tuple(images), inside, peaks, sums, squares, pixels)
+
+
+def visible_mask(gaussians: Gaussians, photos: Photos, min_weight: float) -> np.ndarray:
+    """Return a mask ``[n]`` of Gaussians with a weight of ``min_weight`` in some photo, or in no photo's frustum."""
+    peaks, inside = peak_weights(gaussians, photos)
+    return ~inside | (peaks >= min_weight)
+
+
+def peak_weights(gaussians: Gaussians, photos: Photos) -> tuple[np.ndarray, np.ndarray]:
+    """Return the largest blending weights of n Gaussians in some photos, ``[n]``, and which lie in some frustum."""
+    splats = prepare(gaussians)
+
+    def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
+        plan = plan_view(splats, **photos.camera(view))
+        return plan.ids, contributions(plan)[1]
+
+    peak, inside = np.zeros(len(gaussians), np.float32), np.zeros(len(gaussians), bool)
+    for ids, peaks in in_turn(one_view, range(len(photos))):
+        inside[ids] = True
+        np.maximum(peak, peaks, out=peak)
+    return peak, inside

@@ -146,15 +146,13 @@ class Transpose:
         return torch.autograd.grad(self.image, self.colors, values.contiguous(), retain_graph=True)[0]
 
 
-def peak_weights(gaussians: Gaussians, photos: DevicePhotos, view: int) -> tuple[Tensor, Tensor]:
-    """Find the largest blending weight ``[n]`` of every Gaussian in a view, and ``[n]`` which lie in it."""
-    if gaussians.means.device.type != "cpu":
+def view_peaks(shape: Shape, photos: DevicePhotos, view: int) -> Tensor:
+    """Find the largest blending weight ``[n]`` of every Gaussian in a view."""
+    if shape[0].device.type != "cpu":
         from gsmerge.raster import cuda
 
-        return cuda.peak_weights(shape_of(gaussians), photos.camera(view), eps2d=photos.host.eps2d)
-    means, quats, scales, opacities = (tensor.contiguous().numpy() for tensor in shape_of(gaussians))
-    sh0, shN = gaussians.sh0.numpy(), gaussians.shN.numpy()
+        return cuda.peak_weights(shape, photos.camera(view), eps2d=photos.host.eps2d)[0]
+    means, quats, scales, opacities = (tensor.contiguous().numpy() for tensor in shape)
+    sh0, shN = (np.zeros((len(means), size, 3), np.float32) for size in (1, 0))
     plan = plan_view(Splats(means, quats, scales, opacities, sh0, shN, np.zeros(3)), **photos.host.camera(view))
-    inside = torch.zeros(len(gaussians), dtype=torch.bool)
-    inside[torch.from_numpy(plan.ids).long()] = True
-    return torch.from_numpy(contributions(plan)[1]), inside
+    return torch.from_numpy(contributions(plan)[1])

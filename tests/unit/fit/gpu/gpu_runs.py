@@ -12,8 +12,8 @@ import torch
 from gsmerge import Gaussians
 from gsmerge.fit import FitOptions
 from gsmerge.fit.fit_options import Tuning
-from gsmerge.fit.gpu.backend import make_backend
 from gsmerge.fit.gpu.device_photos import DevicePhotos, upload_photos
+from gsmerge.fit.gpu.engine import make_backend
 from gsmerge.raster.photos import Photos
 
 Pair = tuple[Photos, Photos]

@@ -14,8 +14,8 @@ import torch
 from gpu_runs import gpu
 from step_states import gradients_of, odd_state
 
-from gsmerge.fit.full import step_sizes
 from gsmerge.fit.gpu.adam import adam_step
+from gsmerge.fit.schedule import step_sizes
 from gsmerge.kernels.gaussians import optimise
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -1,8 +1,7 @@
-"""Gaussians -> Gaussians with fitted colours, on a device; see :mod:`gsmerge.fit.color`.
+"""The least-squares system of the colours on a device; :mod:`gsmerge.fit.color` solves it.
 
-The same conjugate gradients with the same weights. The matrix of a view, applied to colours, is an
-image, and its transpose the gradient of an image: each view is drawn once, and its transpose kept
-for as long as it is used.
+The matrix of a view, applied to colours, is an image, and its transpose the gradient of an image: each view
+is drawn once, and its transpose kept for as long as it is used.
 """
 
 from __future__ import annotations
@@ -13,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsmerge.fit.color import HOLDOUT, add_offsets, solve_colors
-from gsmerge.fit.fit_options import FitOptions, FitReport
+from gsmerge.fit.color import color_weights
+from gsmerge.fit.fit_options import FitOptions
 from gsmerge.fit.gpu.device_photos import (
     DevicePhotos,
     Transpose,
@@ -23,26 +22,18 @@ from gsmerge.fit.gpu.device_photos import (
     draw_gaussians,
     shape_of,
 )
-from gsmerge.fit.gpu.image_scores import exposure_gains, holdout_psnr
-from gsmerge.fit.photo_sizes import training_weights
+from gsmerge.fit.gpu.image_scores import match_exposures, score_blocks
 from gsmerge.types import Gaussians
 
 
-def fit_colors(
-    gaussians: Gaussians, photos: DevicePhotos, options: FitOptions, seed: int
-) -> tuple[Gaussians, FitReport]:
-    """Fit base colours alone to the photos, and keep them only if held-out blocks, chosen by ``seed``, get better."""
+def color_system(gaussians: Gaussians, photos: DevicePhotos, options: FitOptions, seed: int) -> _DeviceSystem:
+    """Make the system of the base colours; ``seed`` chooses the held-out blocks."""
     device = gaussians.means.device
-    train = training_weights(photos.host, min(0.5, HOLDOUT * options.holdout), seed)
-    weights = torch.from_numpy(np.stack(train)).to(device)
+    weights = torch.from_numpy(np.stack(color_weights(photos.host, options, seed))).to(device)
     images = torch.stack([draw_gaussians(gaussians, photos, view) for view in range(len(photos))])
-    gains = torch.ones(len(photos), 3, device=device)
-    system = _DeviceSystem(gaussians, photos, options, images, weights, weights, gains)
-    start = torch.zeros(len(gaussians), 3, dtype=torch.float64, device=device)
-    offsets, report = solve_colors(system, start, options)
-    if not report.accepted:
-        return gaussians, report
-    return replace(gaussians, sh0=add_offsets(gaussians.sh0.double(), offsets[:, None]).float()), report
+    return _DeviceSystem(
+        gaussians, photos, options, images, weights, weights, torch.ones(len(photos), 3, device=device)
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +60,7 @@ class _DeviceSystem:
 
     def score(self, x: Tensor | None = None) -> float:
         images = self.images if x is None else self._fitted(x)
-        return holdout_psnr(images, self.photos.images, self.train, self.options.tuning.min_gain)
+        return score_blocks(images, self.photos.images, self.train, self.options.tuning.min_gain)
 
     def residual(self, x: Tensor) -> tuple[Tensor, Tensor]:
         mass, gradient = torch.zeros_like(x), torch.zeros_like(x)
@@ -94,5 +85,5 @@ class _DeviceSystem:
         error = ((photos - images) ** 2).mean(-1).sqrt()
         robust = base * (tuning.huber / error.clamp_min(1e-6)).clamp_max(1)
         calm = base * (error < 2 * tuning.huber)
-        gains = exposure_gains(images, photos, calm, tuning.min_gain, tuning.max_gain)
+        gains = match_exposures(images, photos, calm, tuning.min_gain, tuning.max_gain)
         return replace(self, weights=robust, gains=gains)

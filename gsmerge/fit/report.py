@@ -1,0 +1,64 @@
+"""What a fit reports, and its result."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from gsmerge.runtime.record import choose, note, report_progress
+from gsmerge.types import Cameras, Gaussians
+
+HAZE = 0.05  # far fog above which a result gets a note: plain to see in a viewer
+
+
+@dataclass(frozen=True)
+class FitReport:
+    """Report of a fit."""
+
+    method: str  # `"none"`, `"color"` or `"full"`: what the result comes from
+    accepted: bool  # Whether the held-out blocks got better; if not, nothing was changed
+    steps: int  # Steps of the full fit, or conjugate-gradient steps
+    holdout_before: float  # PSNR (dB) on the held-out blocks before the fit
+    holdout_after: float  # The same after it
+    stopped: str  # Why it ended
+    viewmats: np.ndarray | None = None  # [v,4,4] poses after the fit; None: fixed
+    # Mean opacity of the result, in [0, 1], seen from outside where the start shows nothing; None: it fills every view
+    fog: float | None = None
+    device: str = "cpu"  # Where it ran: `"cpu"` or `"cuda"`
+    # [n] row of the start that each Gaussian comes from; None: not known
+    origins: np.ndarray | None = field(default=None, compare=False)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return all but the arrays, as plain values."""
+        return {name: value for name, value in vars(self).items() if name not in ("viewmats", "origins")}
+
+
+FitResult = tuple[Gaussians, FitReport]
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """Gaussians after the fit."""
+
+    gaussians: Gaussians  # Canonical Gaussians
+    cameras: Cameras  # The scene's cameras, canonical, moved where the fit moved them
+    report: FitReport | None  # What the fit did; None where nothing was fitted
+
+
+def record_fit(report: FitReport | None) -> None:
+    """Add what a fit did to the current record; None: nothing was fitted."""
+    if report is None:
+        return
+    choose(fit=report.to_dict())
+    if report.fog is not None and report.fog > HAZE:
+        seen = f"seen from outside, the result shows haze where the scene is empty: fog {report.fog:.2f}"
+        note(f"{seen}; --fit none makes none")
+    if not report.accepted:
+        note("the fit was not accepted: held-out parts of the photos did not get better")
+
+
+def report_steps(step: int, steps: int, photos: float, held_out: float) -> None:
+    """Report a step of the fit and the PSNR (dB) of the photos and of their held-out blocks."""
+    report_progress(f"fit: photos {photos:.1f} dB, held out {held_out:.1f} dB", step, steps)
