@@ -51,7 +51,7 @@ class _CpuEngine:
         return replace(self, photos=photos, poses=poses)
 
     def survey(self, gaussians: Gaussians) -> Survey:
-        return survey_photos(gaussians, self.photos)
+        return survey_photos(gaussians, self.photos, self._score_images)
 
     def start(self, state: State) -> State:
         return state
@@ -108,11 +108,14 @@ class _CpuEngine:
 
         parallel_map(update, range(0, len(g.ids), ROWS))
 
-    def render(self, state: State) -> Sequence[np.ndarray]:
-        return render_photos(state.splats, self.photos[1], colors=state.view_colors())
+    def score(self, state: State) -> float:
+        return self._score_images(render_photos(state.splats, self.photos[1], colors=state.view_colors()))
 
-    def score(self, images: Sequence[np.ndarray]) -> float:
-        return holdout_psnr(images, self.photos[1], self.plan.weights[1], self.plan.job.options.tuning.min_gain)
+    def _score_images(self, images: Sequence[np.ndarray]) -> float:
+        options = self.plan.job.options
+        if options.fit == "none":
+            return float("nan")
+        return holdout_psnr(images, self.photos[1], self.plan.weights[1], options.tuning.min_gain)
 
     def error_masses(self, state: State) -> np.ndarray:
         photos = self.photos[1]

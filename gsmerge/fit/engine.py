@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -31,7 +31,7 @@ class Engine(Protocol):
         """Steps from one report of progress to the next."""
 
     def survey(self, gaussians: Gaussians) -> Survey:
-        """Look once at all half-size photos."""
+        """Look once at all half-size photos; without a fit the score is not measured, NaN."""
 
     def start(self, state: State) -> Any:
         """Bring a state to the engine; its parameters are in ``x``."""
@@ -48,11 +48,8 @@ class Engine(Protocol):
     def clear_fog(self, state: Any, step: Step, view: int) -> None:
         """Take one Adam step against what shows in a view from outside where the start shows nothing."""
 
-    def render(self, state: Any) -> Sequence[Array]:
-        """Render all half-size photos ``[h,w,3]`` over black."""
-
-    def score(self, images: Sequence[Array]) -> float:
-        """Return the PSNR (dB) of the held-out blocks of half-size images."""
+    def score(self, state: Any) -> float:
+        """Return the PSNR (dB) of the held-out blocks of the half-size photos."""
 
     def error_masses(self, state: State) -> np.ndarray:
         """Sum ``[n]`` each Gaussian's blending weight times the pixel's absolute error over all half-size photos."""

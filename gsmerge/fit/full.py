@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmerge.fit.engine import Engine
+from gsmerge.fit.fit_options import Tuning
 from gsmerge.fit.fit_state import gaussians_of, grow_to, start_state
 from gsmerge.fit.report import FitReport, FitResult
 from gsmerge.fit.schedule import GROWTH, PROBE, Schedule, affordable_steps
@@ -38,9 +39,10 @@ def fit_full(
     if fixed is not None:
         start.fixed[:] = fixed
     survey = engine.survey(gaussians) if survey is None else survey
-    own, start.box_shares[:], start.min_sizes[:] = initial_scores(survey, engine)
+    start.box_shares[:], start.min_sizes[:] = limit_moves(survey, options.tuning)
     moving = engine.at_poses(job.photos[0].viewmats) if options.move_cameras else engine
-    state, before, after, judged = moving.start(start), own, own, not options.judged
+    state, own, judged = moving.start(start), survey.score, not options.judged
+    before = after = own
     step, steps, error, grows = 0, options.steps, 0.0, options.grows
     if options.time_budget is not None:
         moving.warm_up(state)
@@ -79,20 +81,18 @@ def fit_full(
     return fitted, FitReport("full", True, step, before, after, why, moving.viewmats, origins=end.origins)
 
 
-def initial_scores(survey: Survey, engine: Engine) -> tuple[float, np.ndarray, np.ndarray]:
-    """Score the start: PSNR (dB) of the held-out half-size blocks, ``[n]`` box shares, ``[n]`` least log scales.
+def limit_moves(survey: Survey, rates: Tuning) -> tuple[np.ndarray, np.ndarray]:
+    """Return the share ``[n]`` of its box that each Gaussian may use, and its least log scale ``[n]``.
 
-    The share of its box that a Gaussian may use is ``single_view_share`` to 1, by how many photos
-    show it: the effective number of them, (sum w)^2 / sum w^2 of its blending weights w in them.
-    Its least scale is ``min_scale`` pixels of the largest photo that it is nearest to (the 3D
-    filter of Mip-Splatting); none where no photo shows it.
+    The share is ``single_view_share`` to 1, by how many photos show the Gaussian: the effective
+    number of them, (sum w)^2 / sum w^2 of its blending weights w in them. The least scale is
+    ``min_scale`` pixels of the largest photo that it is nearest to (the 3D filter of Mip-Splatting);
+    none where no photo shows it.
     """
-    rates = engine.plan.job.options.tuning
     photos_each = survey.sums**2 / np.maximum(survey.squares, 1e-12)
     box_shares = np.clip(photos_each - 1, rates.single_view_share, 1).astype(np.float32)
     pixels = np.where(np.isfinite(survey.pixels), survey.pixels, 0)
-    min_sizes = log(rates.min_scale * pixels).astype(np.float32)
-    return engine.score(survey.images), box_shares, min_sizes
+    return box_shares, log(rates.min_scale * pixels).astype(np.float32)
 
 
 def judge(state: Array, own: float, engine: Engine, moving: Engine) -> tuple[float, float]:
@@ -103,10 +103,10 @@ def judge(state: Array, own: float, engine: Engine, moving: Engine) -> tuple[flo
     looked at only where the fit does not beat its start, with the cameras as they were: those of
     ``engine``, not those of ``moving``.
     """
-    after, baseline_start = moving.score(moving.render(state)), engine.plan.job.baseline_start
+    after, baseline_start = moving.score(state), engine.plan.job.baseline_start
     if baseline_start is None or after > own:
         return own, after
-    return min(own, engine.score(engine.render(engine.start(start_state(baseline_start))))), after
+    return min(own, engine.score(engine.start(start_state(baseline_start)))), after
 
 
 def grow_state(state: Array, engine: Engine) -> Array:

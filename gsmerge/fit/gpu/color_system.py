@@ -16,7 +16,6 @@ from gsmerge.fit.color import color_weights
 from gsmerge.fit.fit_options import FitOptions
 from gsmerge.fit.gpu.device_photos import (
     DevicePhotos,
-    Transpose,
     draw_and_transpose,
     draw_black,
     draw_gaussians,
@@ -54,10 +53,6 @@ class _DeviceSystem:
         shape, colors = shape_of(self.gaussians), x.float()
         return torch.stack([image + draw_black(shape, colors, self.photos, i) for i, image in enumerate(self.images)])
 
-    def _draw(self, x: Tensor, view: int) -> tuple[Tensor, Transpose]:
-        """Multiply the matrix of a view by ``x``: an image ``[h,w,3]``, and the matrix' transpose."""
-        return draw_and_transpose(shape_of(self.gaussians), x.float(), self.photos, view)
-
     def score(self, x: Tensor | None = None) -> float:
         images = self.images if x is None else self._fitted(x)
         return score_blocks(images, self.photos.images, self.train, self.options.tuning.min_gain)
@@ -66,7 +61,7 @@ class _DeviceSystem:
         mass, gradient = torch.zeros_like(x), torch.zeros_like(x)
         for view, image in enumerate(self.images):
             weight, gain = self.weights[view][..., None], self.gains[view]
-            added, transpose = self._draw(x, view)
+            added, transpose, _ = draw_and_transpose(shape_of(self.gaussians), x.float(), self.photos, view)
             residual = weight * (self.photos.images[view] - gain * (image + added))
             mass += transpose(weight.expand_as(image)) * gain**2
             gradient += transpose(residual) * gain
@@ -75,7 +70,7 @@ class _DeviceSystem:
     def normal(self, x: Tensor) -> Tensor:
         total = torch.zeros_like(x)
         for view in range(len(self.images)):
-            image, transpose = self._draw(x, view)
+            image, transpose, _ = draw_and_transpose(shape_of(self.gaussians), x.float(), self.photos, view)
             total += transpose(image * self.weights[view][..., None]) * self.gains[view] ** 2
         return total
 

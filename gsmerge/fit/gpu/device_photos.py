@@ -5,6 +5,7 @@ On CUDA gsplat draws, on the CPU the project's own kernels; all other files here
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -127,23 +128,21 @@ def harmonic_colors(means: Tensor, sh0: Tensor, shN: Tensor, photos: DevicePhoto
         return cuda.harmonic_colors(means, torch.cat([sh0, shN], 1), photos.eyes[view])
 
 
-def draw_and_transpose(shape: Shape, colors: Tensor, photos: DevicePhotos, view: int) -> tuple[Tensor, Transpose]:
-    """Draw a view over black: the image, and the function that takes images back to the Gaussians."""
+def draw_and_transpose(
+    shape: Shape, colors: Tensor, photos: DevicePhotos, view: int
+) -> tuple[Tensor, Callable[[Tensor], Tensor], Tensor]:
+    """Draw a view over black: the image, its transpose, and a mask ``[n]`` of footprints in it.
+
+    The transpose takes an image ``[h,w,3]`` to sums ``[n,3]`` of each Gaussian's blending weight times the image.
+    """
     with torch.enable_grad():
         leaf = colors.detach().requires_grad_()
         image, reached = draw(shape, leaf, photos, view, torch.zeros(3, device=colors.device))
-    return image.detach(), Transpose(image, leaf, reached)
 
+    def transpose(values: Tensor) -> Tensor:
+        return torch.autograd.grad(image, leaf, values.contiguous(), retain_graph=True)[0]
 
-class Transpose:
-    """Transpose of drawing a view: sums of every Gaussian's blending weight times an image; ``reached [n]`` bool."""
-
-    def __init__(self, image: Tensor, colors: Tensor, reached: Tensor):
-        self.image, self.colors, self.reached = image, colors, reached
-
-    def __call__(self, values: Tensor) -> Tensor:
-        """Return the sums ``[n,3]`` of an image ``[h,w,3]``."""
-        return torch.autograd.grad(self.image, self.colors, values.contiguous(), retain_graph=True)[0]
+    return image.detach(), transpose, reached
 
 
 def view_peaks(shape: Shape, photos: DevicePhotos, view: int) -> Tensor:

@@ -28,6 +28,7 @@ from gsmerge.fit.gpu.device_photos import (
     draw_black,
     draw_gaussians,
     harmonic_colors,
+    to_device,
     upload_gaussians,
     upload_photos,
     view_peaks,
@@ -46,19 +47,6 @@ READ_EVERY = 20  # steps; each reading waits for the device
 
 
 @dataclass(frozen=True, eq=False)
-class PhotoLevel:
-    """Photos of one size, with weights and window means for the steps."""
-
-    photos: DevicePhotos
-    means: Tensor  # [v,2,3,h,w] window means, see gsmerge.fit.gpu.image_scores.photo_means
-    weights: Tensor  # [v,h,w] weights of pixels in a step, or [1,h,w] for all views
-
-    def weight(self, view: int) -> Tensor:
-        """Return the weights ``[h,w]`` of a view."""
-        return self.weights[view if len(self.weights) > 1 else 0]
-
-
-@dataclass(frozen=True, eq=False)
 class _GpuEngine:
     """Engine of tensors, see :class:`gsmerge.fit.engine.Engine`."""
 
@@ -73,13 +61,17 @@ class _GpuEngine:
         return tuple(upload_photos(photos, self.device) for photos in self.plan.job.photos)
 
     @cached_property
-    def levels(self) -> tuple[PhotoLevel, ...]:
-        """The same with what steps need."""
-        levels = []
-        for photos, weights in zip(self.photos, self.plan.step_weights, strict=True):
-            rows = weights[:1] if all(weight is weights[0] for weight in weights) else weights
-            levels.append(PhotoLevel(photos, photo_means(photos.images), self._send(np.stack(rows))))
-        return tuple(levels)
+    def means(self) -> list[Tensor]:
+        """Window means of the photos of each size, for steps, see :func:`gsmerge.fit.gpu.image_scores.photo_means`."""
+        return [photo_means(photos.images) for photos in self.photos]
+
+    @cached_property
+    def weights(self) -> list[Tensor]:
+        """Weights of a step ``[v,h,w]`` at each size; ``[1,h,w]`` where those of all views are the same."""
+        return [
+            to_device(np.stack(each[: 1 if each[0] is each[-1] else None]), self.device)
+            for each in self.plan.step_weights
+        ]
 
     @cached_property
     def outside(self) -> DevicePhotos:
@@ -88,7 +80,7 @@ class _GpuEngine:
         return upload_photos(self.plan.job.outside, self.device)
 
     def _send(self, array: np.ndarray) -> Tensor:
-        """Bring an array to the device without waiting for it."""
+        """Bring a small array to the device without waiting for it."""
         tensor = torch.from_numpy(array)
         return (tensor.pin_memory() if self.device.type == "cuda" else tensor).to(self.device, non_blocking=True)
 
@@ -102,18 +94,18 @@ class _GpuEngine:
         peaks, pixels = torch.zeros_like(state.units), torch.full_like(state.units, torch.inf)
         inside = torch.zeros_like(state.units, dtype=torch.bool)
         for view in range(len(half)):
-            image, transpose = draw_and_transpose(state.shape, state_colors(state, half, view), half, view)
+            image, transpose, reached = draw_and_transpose(state.shape, state_colors(state, half, view), half, view)
             each = transpose(torch.ones_like(image))[:, 0].double()
             images.append(image)
             sums += each
             squares += each * each
-            inside |= transpose.reached
+            inside |= reached
             peaks = peaks.maximum(view_peaks(state.shape, half, view))
             ahead = half.viewmats[view, 2]
             focal = max(float(photos.Ks[view][[0, 1], [0, 1]].max()) for photos in self.plan.job.photos)
             sizes = (state.means @ ahead[:3] + ahead[3]) / focal
-            pixels = torch.where(transpose.reached, pixels.minimum(sizes), pixels)
-        return Survey(tuple(images), *map(as_array, (inside, peaks, sums, squares, pixels)))
+            pixels = torch.where(reached, pixels.minimum(sizes), pixels)
+        return Survey(self._score_images(images), *map(as_array, (inside, peaks, sums, squares, pixels)))
 
     def start(self, state: State) -> DeviceState:
         return upload_state(state, self.device)
@@ -128,22 +120,24 @@ class _GpuEngine:
         float(error)  # waits for the device
 
     def step(self, state: DeviceState, step: Step) -> Tensor:
-        level, mode, rates = self.levels[step.mode.size], step.mode, self.plan.job.options.tuning
+        mode, rates = step.mode, self.plan.job.options.tuning
+        photos, weights = self.photos[mode.size], self.weights[mode.size]
         means, quats, scales, opacities = state.shape
         if step.kept is not None:
             fuller = (opacities / (1 - self.plan.dropout)).clamp_max(float(MAX_ALPHA))
             opacities = self._send(step.kept) * fuller
-        colors = state_colors(state, level.photos, step.view)
+        colors = state_colors(state, photos, step.view)
         with torch.enable_grad():
             leaves = [tensor.detach().requires_grad_() for tensor in (means, quats, scales, opacities, colors)]
             image, reached = draw(
-                (leaves[0], leaves[1], leaves[2], leaves[3]), leaves[4], level.photos, step.view,
+                (leaves[0], leaves[1], leaves[2], leaves[3]), leaves[4], photos, step.view,
                 self._send(step.background), eps2d=mode.eps2d, antialiased=mode.antialiased,
             )  # fmt: skip
-        photo, weight = level.photos.images[step.view], level.weight(step.view)
-        weights = loss_weights(rates, step.progress)
-        wanted, error = loss_gradient(image.detach(), photo, level.means[step.view], weight, *weights)
-        self._move(state, StepGradients(*torch.autograd.grad(image, leaves, wanted), reached=reached), step)
+        photo, weight = photos.images[step.view], weights[step.view % len(weights)]
+        balance = loss_weights(rates, step.progress)
+        wanted, error = loss_gradient(image.detach(), photo, self.means[mode.size][step.view], weight, *balance)
+        g = torch.autograd.grad(image, leaves, wanted)
+        self._move(state, StepGradients(g[0], g[1], g[2], g[3], g[4], reached), step)
         return error / (3 * weight.sum()).clamp_min(1)
 
     def clear_fog(self, state: DeviceState, step: Step, view: int) -> None:
@@ -153,29 +147,32 @@ class _GpuEngine:
             means, quats, scales, opacities = (tensor.detach().requires_grad_() for tensor in state.shape)
             image = draw_black((means, quats, scales, opacities), white, self.outside, view)  # the opacity, three times
         wanted = (weights / (3 * weights.numel()))[..., None].expand_as(image)
-        rows = torch.autograd.grad(image, (means, quats, scales, opacities), wanted.contiguous())
-        touched = rows[3].abs() > TOUCHED
-        self._move(state, StepGradients(*rows, colors=torch.zeros_like(white), reached=touched), step)
+        g = torch.autograd.grad(image, (means, quats, scales, opacities), wanted.contiguous())
+        touched = g[3].abs() > TOUCHED
+        self._move(state, StepGradients(g[0], g[1], g[2], g[3], torch.zeros_like(white), touched), step)
 
     def _move(self, state: DeviceState, gradients: StepGradients, step: Step) -> None:
         options = self.plan.job.options
         rates = self._send(step_sizes(options.tuning, step.progress, options.steps))
         adam_step(state, gradients, options, rates, step.number)
 
-    def render(self, state: DeviceState) -> Sequence[Tensor]:
+    def score(self, state: DeviceState) -> float:
         half = self.photos[1]
-        return [draw_black(state.shape, state_colors(state, half, i), half, i) for i in range(len(half))]
+        views = range(len(half))
+        return self._score_images([draw_black(state.shape, state_colors(state, half, i), half, i) for i in views])
 
-    def score(self, images: Sequence[Tensor]) -> float:
-        weights = self._send(np.stack(self.plan.weights[1]))
-        min_gain = self.plan.job.options.tuning.min_gain
-        return score_blocks(torch.stack(tuple(images)), self.photos[1].images, weights, min_gain)
+    def _score_images(self, images: list[Tensor]) -> float:
+        options = self.plan.job.options
+        if options.fit == "none":
+            return float("nan")
+        weights = to_device(np.stack(self.plan.weights[1]), self.device)
+        return score_blocks(torch.stack(images), self.photos[1].images, weights, options.tuning.min_gain)
 
     def error_masses(self, state: State) -> np.ndarray:
         there, half = self.start(state), self.photos[1]
         masses = torch.zeros(len(there), dtype=torch.float64, device=self.device)
         for view in range(len(half)):
-            image, transpose = draw_and_transpose(there.shape, state_colors(there, half, view), half, view)
+            image, transpose, _ = draw_and_transpose(there.shape, state_colors(there, half, view), half, view)
             error = (image - half.images[view]).abs().mean(-1, keepdim=True)
             masses += transpose(error.expand_as(image))[:, 0]
         return as_array(masses)

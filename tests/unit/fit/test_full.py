@@ -12,7 +12,7 @@ from gsmerge import Gaussians, Scene
 from gsmerge.fit import FitJob, FitOptions, cpu, start_share
 from gsmerge.fit.fit_options import Tuning
 from gsmerge.fit.fit_state import start_state
-from gsmerge.fit.full import fit_full, initial_scores
+from gsmerge.fit.full import fit_full, limit_moves
 from gsmerge.fit.schedule import MAX_STEPS, PROBE, DrawMode, Schedule, affordable_steps, plan_run, step_sizes
 from gsmerge.raster import plan_view, splat_adjoint
 from gsmerge.raster.photos import Photos
@@ -53,8 +53,9 @@ def test_what_one_photo_shows_has_a_smaller_box(truth: Gaussians, photos: Pair) 
 
     def shares_of(some: Pair) -> np.ndarray:
         engine = scenes.engine_for(some, QUICK)
-        psnr, actual, _ = initial_scores(engine.survey(truth), engine)
-        assert psnr == engine.score(engine.render(state))
+        survey = engine.survey(truth)
+        actual, _ = limit_moves(survey, QUICK.tuning)
+        assert survey.score == engine.score(state)
         return actual
 
     def with_views(views: list[int]) -> Pair:
@@ -74,8 +75,7 @@ def test_nothing_becomes_thinner_than_half_a_pixel(truth: Gaussians, photos: Pai
     """Of the photo that it is nearest to, whatever the box says."""
     start = scenes.spoil(truth)
     thin = replace(start, scales=start.scales * np.array([0.02, 1, 1], np.float32))
-    engine = scenes.engine_for(photos, QUICK)
-    _, _, min_sizes = initial_scores(engine.survey(thin), engine)
+    _, min_sizes = limit_moves(scenes.engine_for(photos, QUICK).survey(thin), QUICK.tuning)
     views = photos[0].viewmats
     depths = start.means @ views[:, 2, :3].T + views[:, 2, 3]
     np.testing.assert_allclose(np.exp(min_sizes), 0.5 * depths.min(1) / photos[0].Ks[0, 0, 0], rtol=1e-4)
