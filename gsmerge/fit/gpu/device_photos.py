@@ -71,7 +71,7 @@ def upload_gaussians(
     return Gaussians(*(to_device(array, device, dtype) for array in arrays))
 
 
-def draw(
+def draw_view(
     shape: Shape,
     colors: Tensor,
     photos: DevicePhotos,
@@ -101,7 +101,7 @@ def draw(
 
 def draw_black(shape: Shape, colors: Tensor, photos: DevicePhotos, view: int) -> Tensor:
     """Draw one view ``[h,w,3]`` over black."""
-    return draw(shape, colors, photos, view, torch.zeros(3, device=colors.device))[0]
+    return draw_view(shape, colors, photos, view, torch.zeros(3, device=colors.device))[0]
 
 
 def draw_gaussians(gaussians: Gaussians, photos: DevicePhotos, view: int) -> Tensor:
@@ -137,7 +137,7 @@ def draw_and_transpose(
     """
     with torch.enable_grad():
         leaf = colors.detach().requires_grad_()
-        image, reached = draw(shape, leaf, photos, view, torch.zeros(3, device=colors.device))
+        image, reached = draw_view(shape, leaf, photos, view, torch.zeros(3, device=colors.device))
 
     def transpose(values: Tensor) -> Tensor:
         return torch.autograd.grad(image, leaf, values.contiguous(), retain_graph=True)[0]

@@ -23,10 +23,10 @@ from gsmerge.fit.gpu.adam import DeviceState, StepGradients, adam_step, download
 from gsmerge.fit.gpu.color_system import color_system
 from gsmerge.fit.gpu.device_photos import (
     DevicePhotos,
-    draw,
     draw_and_transpose,
     draw_black,
     draw_gaussians,
+    draw_view,
     harmonic_colors,
     to_device,
     upload_gaussians,
@@ -129,7 +129,7 @@ class _GpuEngine:
         colors = state_colors(state, photos, step.view)
         with torch.enable_grad():
             leaves = [tensor.detach().requires_grad_() for tensor in (means, quats, scales, opacities, colors)]
-            image, reached = draw(
+            image, reached = draw_view(
                 (leaves[0], leaves[1], leaves[2], leaves[3]), leaves[4], photos, step.view,
                 self._send(step.background), eps2d=mode.eps2d, antialiased=mode.antialiased,
             )  # fmt: skip

@@ -62,7 +62,7 @@ def compare_triton() -> None:
     for step in (1, 2, 3):
         rates = torch.from_numpy(step_sizes(options.tuning, 0.3, 8))
         step_in_torch(state, gradients, options, rates, step)
-        adam_kernel.launch(other, gradients, options, rates, step)
+        adam_kernel.launch(other, gradients, options.tuning, rates, step)
         for name in ("x", "m", "v", "means", "quats", "scales", "opacities", "colors"):
             torch.testing.assert_close(getattr(other, name), getattr(state, name), rtol=1e-4, atol=1e-5, msg=name)
     print("same")

@@ -148,7 +148,7 @@ def test_all_of_a_step_is_on_the_device(start: Gaussians, photos: Pair, monkeypa
         reached = torch.ones(len(colors), dtype=torch.bool, device=colors.device)
         return colors.sum() * torch.ones(photos.height, photos.width, 3, device=colors.device), reached
 
-    monkeypatch.setattr(device_engine, "draw", drawn)
+    monkeypatch.setattr(device_engine, "draw_view", drawn)
     monkeypatch.setattr(torch.autograd, "grad", lambda image, leaves, wanted: [torch.empty_like(x) for x in leaves])
     engine = scenes.engine_for(photos, QUICK, backend=make_backend(torch.device("meta")))
     state, background = engine.start(start_state(start)), np.zeros(3, np.float32)
