@@ -20,7 +20,7 @@ from shared_scenes import export, read_held_out, scene_folders
 
 import gsmerge
 from gsmerge.facts.prepare import Frame, canonicalise
-from gsmerge.fit import FitOptions, fit
+from gsmerge.fit import FitJob, FitOptions, fit
 from gsmerge.moments import Members, scene_members
 from gsmerge.raster.photos import scene_photos
 from gsmerge.runtime.threads import use_threads
@@ -50,7 +50,7 @@ def spent(scene: Scene, members: Members, groups: Groups, count: int) -> Gaussia
 
 def fitted(gaussians: Gaussians, scene: Scene, frame: Frame, steps: int) -> Gaussians:
     photos = scene_photos(scene), scene_photos(scene, 2)
-    return frame.leave(fit(gaussians, photos, FitOptions(fit="full", fit_steps=steps), 0)[0])
+    return frame.leave(fit(gaussians, FitJob(photos, FitOptions(fit="full", fit_steps=steps)))[0])
 
 
 def show(folder: Path, cache: Path, steps: int) -> None:

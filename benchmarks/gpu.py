@@ -27,7 +27,7 @@ import torch
 from gsmerge import compact, plan, read_scene
 from gsmerge.compaction.result import CompactResult
 from gsmerge.fit.gpu import cuda_problem
-from gsmerge.fit.gpu.backend import make_backend
+from gsmerge.fit.gpu.engine import make_backend
 from gsmerge.measure.evaluate import near_plane
 from gsmerge.measure.speed import measure_costs
 from gsmerge.runtime.threads import available_threads

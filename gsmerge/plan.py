@@ -85,7 +85,7 @@ class Plan:
     auto_count: bool  # Whether the scene's own curve decides the number of Gaussians
     levels: int  # Levels of detail
     scored_views: tuple[int, ...]  # Given views that input and result are scored on
-    backend: FitBackend[Any]  # Where the fit and the scores run
+    backend: FitBackend  # Where the fit and the scores run
     seed: int  # Everything random depends on it alone
     checkpoint: Checkpoint | None  # Where the networks come from; None without any
     settings: dict[str, Any]  # All settings by flat name, for reports
@@ -379,7 +379,7 @@ def steps_for(options: CompactOptions, num_views: int, share: float = USUAL_SHAR
     return round(min(max(1.0, math.sqrt(share / USUAL_SHARE)), MOST_STEPS) * steps)
 
 
-def _fit_photos(prepared: Prepared, options: CompactOptions, fit: FitOptions, backend: FitBackend[Any]) -> FitOptions:
+def _fit_photos(prepared: Prepared, options: CompactOptions, fit: FitOptions, backend: FitBackend) -> FitOptions:
     """Fill in the size of the photos that the fit sees, and whether it moves cameras."""
     scene = prepared.scene
     if scene.images is None or not fit.needs_photos:

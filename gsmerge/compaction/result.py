@@ -126,7 +126,7 @@ def measure_psnr(name: str, gaussians: Gaussians, views: Scene, prepared: Prepar
     with stage(name):
         photos, near, quarter = scene_photos(views), NEAR * prepared.frame.unit, plan.target_psnr is None
 
-        def score_on(backend: FitBackend[Any]) -> float:
+        def score_on(backend: FitBackend) -> float:
             return backend.photo_psnr(gaussians, photos, plan.scored_views, quarter=quarter, near=near)
 
         return run_on(plan.backend, "scores", score_on)

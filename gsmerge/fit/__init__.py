@@ -1,10 +1,15 @@
 """Gaussians -> fitted Gaussians: all parameters, or colours alone, against the input photos."""
 
-from gsmerge.fit.fit_options import Fit, FitOptions, FitReport, Fitted, Tuning, record_fit, report_steps
+from gsmerge.fit.cpu import ON_CPU
+from gsmerge.fit.engine import FitBackend
 from gsmerge.fit.photo_sizes import fit_photos, photo_scale
-from gsmerge.fit.stage import ON_CPU, FitBackend, fit, fit_scene, peak_weights, run_on, start_share, visible_mask
+from gsmerge.fit.report import FitReport, Fitted, record_fit, report_steps
+from gsmerge.fit.schedule import FitJob
+from gsmerge.fit.stage import fit, fit_scene, run_on, start_share
+from gsmerge.fit.survey import peak_weights, visible_mask
+from gsmerge.settings.fit import Fit, FitOptions, Tuning
 
 __all__ = [
-    "ON_CPU", "Fit", "FitBackend", "FitOptions", "FitReport", "Fitted", "Tuning", "fit", "fit_photos",
+    "ON_CPU", "Fit", "FitBackend", "FitJob", "FitOptions", "FitReport", "Fitted", "Tuning", "fit", "fit_photos",
     "fit_scene", "peak_weights", "photo_scale", "record_fit", "report_steps", "run_on", "start_share", "visible_mask",
 ]  # fmt: skip

@@ -12,14 +12,15 @@ from typing import Protocol
 
 import numpy as np
 
-from gsmerge.fit.fit_options import FitOptions, FitReport
 from gsmerge.fit.photo_sizes import exposure_gains, holdout_psnr, training_weights
+from gsmerge.fit.report import FitReport, FitResult
 from gsmerge.geometry import rgb_to_sh0, sh0_to_rgb
 from gsmerge.raster import composite, plan_view, prepare
 from gsmerge.raster.photos import Photos
 from gsmerge.raster.weights import ViewWeights, apply, apply_transposed, view_weights
 from gsmerge.runtime.threads import in_turn, parallel_map
-from gsmerge.types import Array, Gaussians
+from gsmerge.settings.fit import FitOptions
+from gsmerge.types import Array, Gaussians, as_array
 
 MAX_RETRIES = 2
 HOLDOUT = 4  # times the share: the last steps see everything, and a small sample misjudges a scene of few views
@@ -52,20 +53,30 @@ def fit_colors(
     options: FitOptions,
     seed: int = 0,
     color_precision: np.ndarray | None = None,
-) -> tuple[Gaussians, FitReport]:
+) -> FitResult:
     """Fit base colours to the photos, and keep them only if held-out blocks get better.
 
     ``drawn`` are the same Gaussians in the photos, see :func:`draw`; ``seed`` chooses the held-out
     blocks; ``color_precision [n]`` counts pixels of photos that are gone which each colour was
     fitted to. Geometry, opacities and higher harmonics stay.
     """
-    train = training_weights(photos, min(0.5, HOLDOUT * options.holdout), seed)
+    train = color_weights(photos, options, seed)
     precision = 0.0 if color_precision is None else color_precision[:, None].astype(np.float64)
     system = _System(drawn, photos, options, train, train, np.ones((len(photos), 3)), precision)
-    offsets, report = solve_colors(system, np.zeros((len(gaussians), 3)), options)
+    return fit_offsets(gaussians, system, np.zeros((len(gaussians), 3)), options)
+
+
+def color_weights(photos: Photos, options: FitOptions, seed: int) -> list[np.ndarray]:
+    """Return the training weights ``[h,w]`` of the photos in a fit of the colours alone."""
+    return training_weights(photos, min(0.5, HOLDOUT * options.holdout), seed)
+
+
+def fit_offsets(gaussians: Gaussians, system: ColorSystem, start: Array, options: FitOptions) -> FitResult:
+    """Add the offsets that solve a system from ``start [n,3]`` on to base colours, if held-out blocks get better."""
+    offsets, report = solve_colors(system, start, options)
     if not report.accepted:
         return gaussians, report
-    sh0 = add_offsets(gaussians.sh0.astype(np.float64), offsets[:, None])
+    sh0 = add_offsets(gaussians.sh0.astype(np.float64), as_array(offsets)[:, None])
     return replace(gaussians, sh0=sh0.astype(np.float32)), report
 
 

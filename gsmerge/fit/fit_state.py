@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,14 +10,14 @@ import numpy as np
 from gsmerge.geometry import lower_median, quat_to_rotmat
 from gsmerge.kernels.elementary import exp, log, power
 from gsmerge.kernels.gaussians.optimise import COLOR, COLUMNS, LOGIT, QUAT, SIZE
-from gsmerge.raster import Splats, composite, plan_view, splat_adjoint
-from gsmerge.raster.photos import Photos
-from gsmerge.runtime.threads import in_turn
+from gsmerge.raster import Splats
 from gsmerge.types import SH_C0, Gaussians
 
 OFFSET = 0.7  # of the halves from the middle, in standard deviations; their own shrinks so that the sum keeps its own
 FADED = 0.005  # opacity that is as good as none; halves of what has more have at least 1 / 255, which renderers draw
 DEPTH = 0.8  # of the halves' optical depth: two narrower ones with 0.7 would cover the same, a little more closes gaps
+# What rows of a state carry along, beside what follows from their parameters
+CARRIED = ("x0", "m", "v", "units", "box_shares", "min_sizes", "origins", "fixed")
 
 
 @dataclass(eq=False)
@@ -31,13 +32,14 @@ class State:
     box_shares: np.ndarray  # [n] share of the box about the start for means and scales
     min_sizes: np.ndarray  # [n] least log scale of each Gaussian
     origins: np.ndarray  # [n] row of the start that each comes from
+    fixed: np.ndarray  # [n] bool, whether it stays as it is
     splats: Splats  # Means, quaternions, scales and opacities as the rasterizer takes them
     colors: np.ndarray  # [n,3] base colours
 
     def __getitem__(self, rows: np.ndarray) -> State:
         """Return the state of some Gaussians, by mask or by row."""
         kept = state_of(self.x[rows], self.splats.shN[rows])
-        for name in ("x0", "m", "v", "units", "box_shares", "min_sizes", "origins"):
+        for name in CARRIED:
             setattr(kept, name, getattr(self, name)[rows])
         return kept
 
@@ -50,7 +52,7 @@ class State:
 
 
 def start_state(gaussians: Gaussians) -> State:
-    """Return a fresh state at some Gaussians."""
+    """Start the optimiser's state from Gaussians: their parameters, zero moments."""
     x = np.empty((len(gaussians), COLUMNS), np.float32)
     opacities = gaussians.opacities.astype(np.float64).clip(0.004, 0.999)
     x[:, :3] = gaussians.means
@@ -62,7 +64,7 @@ def start_state(gaussians: Gaussians) -> State:
 
 
 def state_of(x: np.ndarray, shN: np.ndarray) -> State:
-    """Return a fresh state at parameters ``[n,14]`` and higher harmonics ``[n,k-1,3]``."""
+    """Start the optimiser's state from parameters ``[n,14]`` and higher harmonics ``[n,k-1,3]``."""
     sizes = np.sort(x[:, SIZE:QUAT], 1)
     colors = np.ascontiguousarray(x[:, COLOR:])
     splats = Splats(
@@ -76,8 +78,8 @@ def state_of(x: np.ndarray, shN: np.ndarray) -> State:
     )
     units = exp((sizes[:, 1] + sizes[:, 2]) / 2)
     shares, least = np.ones_like(units), np.full_like(units, -np.inf)
-    zero, rows = np.zeros_like(x), np.arange(len(x))
-    return State(x, x.copy(), zero, zero.copy(), units, shares, least, rows, splats, colors)
+    zero, rows, fixed = np.zeros_like(x), np.arange(len(x)), np.zeros(len(x), bool)
+    return State(x, x.copy(), zero, zero.copy(), units, shares, least, rows, fixed, splats, colors)
 
 
 def gaussians_of(x: np.ndarray, shN: np.ndarray) -> Gaussians:
@@ -92,38 +94,23 @@ def gaussians_of(x: np.ndarray, shN: np.ndarray) -> Gaussians:
     )
 
 
-def error_masses(state: State, photos: Photos) -> np.ndarray:
-    """Sum every Gaussian's blending weight times the absolute error of the pixel over all photos, ``[n]``."""
-
-    def one_view(view: int) -> np.ndarray:
-        plan = plan_view(state.splats, **photos.camera(view))
-        image, _ = composite(plan, state.view_colors())
-        return splat_adjoint(plan, np.abs(image - photos.image(view)).mean(-1, keepdims=True))[:, 0]
-
-    masses = np.zeros(len(state.x))
-    for of_view in in_turn(one_view, range(len(photos))):
-        masses += of_view
-    return masses
-
-
-def grow_to(state: State, photos: Photos, count: int) -> State:
+def grow_to(state: State, error_masses: Callable[[State], np.ndarray], count: int) -> State:
     """Leave out what has faded, and halve others until there are ``count`` or nothing that photos show is left."""
     before, opacities = 0, state.splats.opacities
     if len(opacities):
         state = state[opacities >= min(FADED, float(lower_median(opacities)))]  # of a faint scene most stay
     while before < len(state.x) < count:
-        before, state = len(state.x), grow(state, photos, count)
+        before, state = len(state.x), grow(state, error_masses(state), count)
     return state
 
 
-def grow(state: State, photos: Photos, count: int) -> State:
-    """Halve the Gaussians with the largest error masses across their longest axis, until there are ``count``.
+def grow(state: State, masses: np.ndarray, count: int) -> State:
+    """Halve the Gaussians with the largest error ``masses [n]`` across their longest axis, until there are ``count``.
 
     Each is halved at most once, so the number at most doubles, and what no photo shows is left
     alone. The halves start with their parent's momentum, share of the box and least size; the old
     ones come first and in order, the second halves after them.
     """
-    masses = error_masses(state, photos)
     num = min(count - len(state.x), int((masses > 0).sum()))
     if num <= 0:
         return state
@@ -146,6 +133,6 @@ def grow(state: State, photos: Photos, count: int) -> State:
     old = np.ones(len(x), bool)
     old[picked] = old[len(state.x) :] = False
     grown.x0[old], grown.units[old] = state.x0[old[: len(state.x)]], state.units[old[: len(state.x)]]
-    for name in ("m", "v", "box_shares", "min_sizes", "origins"):
+    for name in set(CARRIED) - {"x0", "units"}:
         getattr(grown, name)[:] = getattr(state, name)[source]
     return grown

@@ -12,7 +12,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from gsmerge.fit.fit_options import FitOptions
 from gsmerge.geometry import middle_depth, step_outside
 from gsmerge.kernels.raster.project import TILE
 from gsmerge.raster import Splats, plan_view
@@ -21,6 +20,7 @@ from gsmerge.raster.gradient import Gradients, gradients_of
 from gsmerge.raster.photos import Photos, blank_photos
 from gsmerge.raster.view_plan import ViewPlan
 from gsmerge.runtime.threads import in_turn
+from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Cameras
 
 # Least and largest step back, as a share of the depth of what a view sees, and turns about its middle to the sides, and

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from gsmerge.fit.fit_options import FitOptions
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.raster.metrics import decibels
 from gsmerge.raster.photos import EPS2D, Photos, pixel_weights, scene_photos
 from gsmerge.runtime.record import choose, note
 from gsmerge.runtime.threads import parallel_map
+from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Scene
 
 AUTO_SCALE = 2.0  # most that "auto" looks at: steps cost as many pixels, and photos beyond that are rarely sharp

@@ -1,14 +1,14 @@
-"""A first look at all photos: what the fit has to know about its start before it begins."""
+"""What photos show of each Gaussian: what the fit has to know about its start before it begins."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
 
 from gsmerge.fit.fit_state import start_state
-from gsmerge.raster import plan_view
+from gsmerge.raster import contributions, plan_view, prepare
 from gsmerge.raster.composite import survey
 from gsmerge.raster.photos import Photos
 from gsmerge.runtime.threads import in_turn
@@ -17,9 +17,9 @@ from gsmerge.types import Array, Gaussians
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """Half-size pictures of a start, and what they show of its n Gaussians."""
+    """What half-size pictures of a start show of its n Gaussians."""
 
-    images: tuple[Array, ...]  # [h,w,3] float32 of each photo's camera, over black
+    score: float  # PSNR (dB) of the held-out blocks of these pictures
     inside: Array  # [n] bool, whether some photo's frustum may hold it
     peaks: Array  # [n] float32 largest blending weight
     sums: Array  # [n] float64 blending weights summed over all photos, pixels
@@ -31,12 +31,17 @@ class Survey:
         return ~self.inside | (self.peaks >= min_weight)
 
     def __getitem__(self, rows: Array) -> Survey:
-        columns = {field.name: getattr(self, field.name)[rows] for field in fields(self) if field.name != "images"}
-        return Survey(self.images, **columns)
+        columns = {field.name: getattr(self, field.name)[rows] for field in fields(self) if field.name != "score"}
+        return Survey(self.score, **columns)
 
 
-def survey_photos(gaussians: Gaussians, photos: Sequence[Photos]) -> Survey:
-    """Look once at the half-size photos, ``photos[1]``; the others, full size first, say how fine their pixels are."""
+def survey_photos(
+    gaussians: Gaussians, photos: Sequence[Photos], score: Callable[[Sequence[np.ndarray]], float]
+) -> Survey:
+    """Look once at the half-size photos, ``photos[1]``; the others, full size first, say how fine their pixels are.
+
+    ``score``: of half-size pictures over black.
+    """
     state, half, count = start_state(gaussians), photos[1], len(gaussians)
     colors = state.view_colors()
 
@@ -54,4 +59,25 @@ def survey_photos(gaussians: Gaussians, photos: Sequence[Photos]) -> Survey:
         pixels[ids] = np.minimum(pixels[ids], sizes)
         sums[ids] += weights
         squares[ids] += weights.astype(np.float64) ** 2
-    return Survey(tuple(images), inside, peaks, sums, squares, pixels)
+    return Survey(score(images), inside, peaks, sums, squares, pixels)
+
+
+def visible_mask(gaussians: Gaussians, photos: Photos, min_weight: float) -> np.ndarray:
+    """Return a mask ``[n]`` of Gaussians with a weight of ``min_weight`` in some photo, or in no photo's frustum."""
+    peaks, inside = peak_weights(gaussians, photos)
+    return ~inside | (peaks >= min_weight)
+
+
+def peak_weights(gaussians: Gaussians, photos: Photos) -> tuple[np.ndarray, np.ndarray]:
+    """Return the largest blending weights of n Gaussians in some photos, ``[n]``, and which lie in some frustum."""
+    splats = prepare(gaussians)
+
+    def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
+        plan = plan_view(splats, **photos.camera(view))
+        return plan.ids, contributions(plan)[1]
+
+    peak, inside = np.zeros(len(gaussians), np.float32), np.zeros(len(gaussians), bool)
+    for ids, peaks in in_turn(one_view, range(len(photos))):
+        inside[ids] = True
+        np.maximum(peak, peaks, out=peak)
+    return peak, inside

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from gsmerge.facts.views import pick_views
-from gsmerge.fit.fit_options import HAZE
+from gsmerge.fit.report import HAZE
 from gsmerge.geometry import middle_depth, step_outside
 from gsmerge.measure.sizes import shrink_cameras
 from gsmerge.raster import Splats, plan_view, prepare

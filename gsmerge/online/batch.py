@@ -13,7 +13,6 @@ from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.views import in_float64, resize_cameras
 from gsmerge.fit import FitReport
 from gsmerge.fit.color import draw, fit_colors
-from gsmerge.fit.fit_options import FitOptions
 from gsmerge.geometry import normalize
 from gsmerge.kernels.matrices import matmul
 from gsmerge.moments import Members, feature_to_gaussians
@@ -23,6 +22,7 @@ from gsmerge.plan import Plan
 from gsmerge.raster.photos import Photos, photo_errors, photos_of, scene_pictures
 from gsmerge.raster.weights import apply_transposed
 from gsmerge.runtime.threads import parallel_map
+from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Scene
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from gsmerge.encoded.encoded import Encoded
 from gsmerge.encoded.to_gaussians import decode_scene, plan_decode
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.prepare import Frame
-from gsmerge.fit import FitOptions, FitReport, fit, report_steps, start_share
+from gsmerge.fit import FitJob, FitOptions, FitReport, fit, report_steps, start_share
 from gsmerge.fit.gpu import choose_backend
 from gsmerge.io import atomic_output, lost_harmonics, output_format, write_gaussians
 from gsmerge.online.batch import BatchPhotos
@@ -92,7 +92,8 @@ def decode_stored(
         num_pixels = len(photos[0]) * photos[0].height * photos[0].width
         backend, problem = choose_backend(device, num_pixels)
         with stage("fit"):
-            gaussians, report = fit(gaussians, photos, options, max_count, seed, report_steps, backend=backend)
+            job = FitJob(photos, options, max_count, seed, report_steps)
+            gaussians, report = fit(gaussians, job, backend)
     notes = *notes, *([] if problem is None else [problem]), *record.notes
     if report is not None and not report.accepted:  # then the colours that were fitted batch by batch are better
         note = "the fit was not accepted: held-out parts of the photos did not get better"

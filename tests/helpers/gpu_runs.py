@@ -11,10 +11,10 @@ import torch
 
 from gsmerge import Gaussians
 from gsmerge.fit import FitOptions
-from gsmerge.fit.fit_options import Tuning
-from gsmerge.fit.gpu.backend import make_backend
 from gsmerge.fit.gpu.device_photos import DevicePhotos, upload_photos
+from gsmerge.fit.gpu.engine import make_backend
 from gsmerge.raster.photos import Photos
+from gsmerge.settings.fit import Tuning
 
 Pair = tuple[Photos, Photos]
 CPU = torch.device("cpu")

@@ -18,7 +18,9 @@ from floors import nudged
 from gsmerge import Cameras, Gaussians, Scene, compact, render
 from gsmerge.compaction.result import CompactReport, CompactResult
 from gsmerge.facts.views import subset
-from gsmerge.fit import FitOptions
+from gsmerge.fit import ON_CPU, FitBackend, FitJob, FitOptions
+from gsmerge.fit.engine import Engine
+from gsmerge.fit.schedule import plan_run
 from gsmerge.geometry import covariances, normalize, quat_to_rotmat
 from gsmerge.raster.photos import Photos, scene_photos
 from gsmerge.research.generate import objects, photograph, shapes
@@ -275,6 +277,13 @@ def pair_of(scene: Scene) -> tuple[Photos, Photos]:
 def tuned(options: FitOptions, **constants: float) -> FitOptions:
     """The options with other constants of the fit."""
     return replace(options, tuning=replace(options.tuning, **constants))  # type: ignore[arg-type]
+
+
+def engine_for(
+    photos: tuple[Photos, ...], options: FitOptions, count: int = 0, *, backend: FitBackend = ON_CPU, **job: Any
+) -> Engine:
+    """The engine of a fit to photos; ``job``: more of it."""
+    return backend.make_engine(plan_run(FitJob(photos, options, count, **job)))
 
 
 def noise_for(photos: tuple[Photos, Photos]) -> tuple[Photos, Photos]:

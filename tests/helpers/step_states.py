@@ -5,11 +5,13 @@ from __future__ import annotations
 from copy import deepcopy
 from dataclasses import replace
 
+import numpy as np
 import torch
 
-from gsmerge.fit.fit_options import FitOptions, Tuning
-from gsmerge.fit.full import step_sizes
-from gsmerge.fit.gpu.adam import FitState, StepGradients, state_of, step_in_torch
+from gsmerge.fit.fit_state import state_of
+from gsmerge.fit.gpu.adam import DeviceState, StepGradients, step_in_torch, upload_state
+from gsmerge.fit.schedule import step_sizes
+from gsmerge.settings.fit import FitOptions, Tuning
 
 RATES = Tuning(
     means_lr=3.0, scales_lr=3.0, opacities_lr=5.0, colors_lr=1.0, max_mean_shift=0.2, max_scale_change=0.1,
@@ -17,7 +19,7 @@ RATES = Tuning(
 )  # fmt: skip
 
 
-def odd_state(count: int, device: torch.device | str = "cpu") -> tuple[FitState, FitOptions]:
+def odd_state(count: int, device: torch.device | str = "cpu") -> tuple[DeviceState, FitOptions]:
     """At its border in most columns, colours beyond the range, a quaternion of length zero, earlier moments."""
     generator = torch.Generator().manual_seed(0)
 
@@ -28,16 +30,16 @@ def odd_state(count: int, device: torch.device | str = "cpu") -> tuple[FitState,
     x[: count // 8, 11:] += 3
     x[3, 6:10] = 0.0
     x[5, 10], x[6, 10] = 9.0, -9.0
-    state = state_of(x, torch.zeros(count, 0, 3))
+    state = upload_state(state_of(x.numpy(), np.zeros((count, 0, 3), np.float32)), torch.device("cpu"))
     state.m, state.v = normal(count, 14) * 0.1, normal(count, 14) ** 2 * 0.1
     state.m[3, 6:10] = 0.0
     state.box_shares = torch.rand(count, generator=generator)
     state.min_sizes = torch.where(torch.rand(count, generator=generator) < 0.5, -torch.inf, normal(count))
-    moved = {name: getattr(state, name).to(device) for name in FitState.__dataclass_fields__}
-    return FitState(**moved), FitOptions(tuning=replace(RATES, opacity_reg=0.5, scale_reg=0.7))
+    moved = {name: value.to(device) for name, value in vars(state).items() if name != "host"}
+    return replace(state, **moved), FitOptions(tuning=replace(RATES, opacity_reg=0.5, scale_reg=0.7))
 
 
-def gradients_of(state: FitState) -> StepGradients:
+def gradients_of(state: DeviceState) -> StepGradients:
     """Random ones; a third of the Gaussians has none."""
     generator, count = torch.Generator().manual_seed(1), len(state)
     reached = torch.rand(count, generator=generator) > 0.3
@@ -60,7 +62,7 @@ def compare_triton() -> None:
     for step in (1, 2, 3):
         rates = torch.from_numpy(step_sizes(options.tuning, 0.3, 8))
         step_in_torch(state, gradients, options, rates, step)
-        adam_kernel.launch(other, gradients, options, rates, step)
+        adam_kernel.launch(other, gradients, options.tuning, rates, step)
         for name in ("x", "m", "v", "means", "quats", "scales", "opacities", "colors"):
             torch.testing.assert_close(getattr(other, name), getattr(state, name), rtol=1e-4, atol=1e-5, msg=name)
     print("same")

@@ -1,7 +1,7 @@
-"""Fit, growth, colours and scores on a GPU: plain functions on tensors of any device.
+"""The engine of the fit and the scores on a GPU: tensors of any device.
 
 Merging stays on the CPU. torch is loaded only where :func:`choose_backend` may take CUDA. On the
-torch CPU device every function gives what the kernels give, which is how it is tested;
+torch CPU device the engine gives what the CPU's gives, which is how it is tested;
 docs/internals/gpu.md says what differs on a GPU.
 """
 
@@ -11,9 +11,9 @@ import ctypes
 import os
 from functools import cache
 from importlib.util import find_spec
-from typing import Any
 
-from gsmerge.fit.stage import ON_CPU, FitBackend
+from gsmerge.fit.cpu import ON_CPU
+from gsmerge.fit.engine import FitBackend
 
 # Pixels of all views, as many as an aligned scene has Gaussians, from which "auto" takes CUDA. Starting
 # it and importing gsplat takes one to three seconds, in which two processors do a scene of this size from
@@ -23,7 +23,7 @@ NO_DEVICE = "torch finds no CUDA device"
 NO_TORCH = 'torch is not installed; pip install "torch>=2.4,<3" "gsplat>=1.5,<1.6"'  # as the extra cuda asks for
 
 
-def choose_backend(device: str, num_pixels: int) -> tuple[FitBackend[Any], str | None]:
+def choose_backend(device: str, num_pixels: int) -> tuple[FitBackend, str | None]:
     """Choose where the fit and the scores run; a note says why CUDA was asked for and cannot be used.
 
     ``"auto"`` takes CUDA where it can be used and ``num_pixels`` of all views are enough; on a
@@ -38,7 +38,7 @@ def choose_backend(device: str, num_pixels: int) -> tuple[FitBackend[Any], str |
         return ON_CPU, None if device == "auto" and problem in (NO_DEVICE, NO_TORCH) else note
     import torch
 
-    from gsmerge.fit.gpu.backend import make_backend
+    from gsmerge.fit.gpu.engine import make_backend
 
     return make_backend(torch.device("cuda")), None
 

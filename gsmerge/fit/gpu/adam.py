@@ -6,30 +6,32 @@ also write what the new parameters mean to the rasterizer, so a step begins with
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.util import find_spec
 
 import torch
 from torch import Tensor
 
-from gsmerge.fit.fit_options import FitOptions
+from gsmerge.fit.fit_state import CARRIED, State, state_of
 from gsmerge.kernels.gaussians.optimise import COLOR, LOGIT, MAX_LOGIT, MIN_LOGIT, QUAT, SIZE
-from gsmerge.types import SH_C0, Gaussians
+from gsmerge.raster.autograd import Shape
+from gsmerge.settings.fit import FitOptions
+from gsmerge.types import as_array
 
 
 @dataclass(eq=False)
-class FitState:
-    """Parameters under optimisation, and their meaning for the rasterizer; see :mod:`gsmerge.fit.fit_state`."""
+class DeviceState:
+    """Parameters under optimisation on a device, and their meaning for the rasterizer."""
 
-    x: Tensor  # [n,14] mean, log scale, quaternion, opacity logit, colour; as the next three
-    x0: Tensor  # Values at the start
-    m: Tensor  # First moment
-    v: Tensor  # Second moment
-    units: Tensor  # [n] size of each Gaussian when it began
-    box_shares: Tensor  # [n] share of the box about the start that each may use
-    min_sizes: Tensor  # [n] least log scale of each
-    origins: Tensor  # [n] row of the start that each comes from
+    host: State  # What was brought to the device, with all that steps do not change
+    x: Tensor  # [n,14], as the next three, like the columns of the same names of the host's state
+    x0: Tensor
+    m: Tensor
+    v: Tensor
+    units: Tensor  # [n]
+    box_shares: Tensor  # [n]
+    min_sizes: Tensor  # [n]
     shN: Tensor  # [n,k-1,3] higher harmonics
     means: Tensor  # [n,3]
     quats: Tensor  # [n,4]
@@ -40,9 +42,10 @@ class FitState:
     def __len__(self) -> int:
         return len(self.x)
 
-    def __getitem__(self, rows: Tensor) -> FitState:
-        """Return the state of some Gaussians, by mask or by row."""
-        return FitState(*(getattr(self, field.name)[rows] for field in fields(self)))
+    @property
+    def shape(self) -> Shape:
+        """What the rasterizer takes."""
+        return self.means, self.quats, self.scales, self.opacities
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,53 +60,29 @@ class StepGradients:
     reached: Tensor
 
 
-def start_state(gaussians: Gaussians) -> FitState:
-    """Make a fresh state at some Gaussians."""
-    opacities = gaussians.opacities.double().clamp(0.004, 0.999)
-    x = torch.cat(
-        [
-            gaussians.means,
-            gaussians.scales.clamp_min(1e-9).log(),
-            gaussians.quats,
-            (opacities / (1 - opacities)).log().float()[:, None],
-            0.5 + SH_C0 * gaussians.sh0[:, 0],
-        ],
-        1,
-    )
-    return state_of(x, gaussians.shN)
-
-
-def gaussians_of(x: Tensor, shN: Tensor) -> Gaussians:
-    """Return the Gaussians that parameters ``[n,14]`` and higher harmonics ``[n,k-1,3]`` stand for."""
-    return Gaussians(
-        means=x[:, :SIZE].contiguous(),
-        quats=x[:, QUAT:LOGIT].contiguous(),
-        scales=x[:, SIZE:QUAT].exp(),
-        opacities=x[:, LOGIT].sigmoid(),
-        sh0=((x[:, COLOR:] - 0.5) / SH_C0)[:, None],
-        shN=shN,
-    )
-
-
-def state_of(x: Tensor, shN: Tensor) -> FitState:
-    """Make a fresh state at parameters ``[n,14]`` and higher harmonics ``[n,k-1,3]``."""
-    sizes = x[:, SIZE:QUAT].sort(1).values
-    units = ((sizes[:, 1] + sizes[:, 2]) / 2).exp()
-    shown = (x[:, :SIZE], x[:, QUAT:LOGIT], x[:, SIZE:QUAT].exp(), x[:, LOGIT].sigmoid(), x[:, COLOR:])
-    shares, least = torch.ones_like(units), torch.full_like(units, -torch.inf)
-    rows = torch.arange(len(x), device=x.device)
-    return FitState(
-        x, x.clone(), torch.zeros_like(x), torch.zeros_like(x), units, shares, least, rows, shN,
-        *(tensor.clone(memory_format=torch.contiguous_format) for tensor in shown),
+def upload_state(state: State, device: torch.device) -> DeviceState:
+    """Copy a state to a device."""
+    shown = state.splats
+    arrays = (
+        state.x, state.x0, state.m, state.v, state.units, state.box_shares, state.min_sizes,
+        shown.shN, shown.means, shown.quats, shown.scales, shown.opacities, state.colors,
     )  # fmt: skip
+    return DeviceState(state, *(torch.tensor(array, dtype=torch.float32, device=device) for array in arrays))
 
 
-def adam_step(state: FitState, gradients: StepGradients, options: FitOptions, rates: Tensor, step: int) -> None:
+def download_state(state: DeviceState) -> State:
+    """Bring a state back to the host."""
+    moved = state_of(as_array(state.x), state.host.splats.shN)
+    carried = {name: getattr(state.host, name) for name in CARRIED}
+    return replace(moved, **carried | {"m": as_array(state.m), "v": as_array(state.v)})
+
+
+def adam_step(state: DeviceState, gradients: StepGradients, options: FitOptions, rates: Tensor, step: int) -> None:
     """Take an Adam step by a view's gradients, in place, within the box about the start.
 
     Gaussians that the view does not show stay unchanged. The pulls on opacity and size are added to
     the gradients of the image loss here. ``rates [14]``: see
-    :func:`gsmerge.fit.full.step_sizes`; ``step`` counts from 1.
+    :func:`gsmerge.fit.schedule.step_sizes`; ``step`` counts from 1.
     """
     if state.x.is_cuda and has_triton():
         from gsmerge.fit.gpu.adam_kernel import launch
@@ -119,7 +98,7 @@ def has_triton() -> bool:
     return find_spec("triton") is not None
 
 
-def step_in_torch(state: FitState, gradients: StepGradients, options: FitOptions, rates: Tensor, step: int) -> None:
+def step_in_torch(state: DeviceState, gradients: StepGradients, options: FitOptions, rates: Tensor, step: int) -> None:
     """Take the step of :func:`adam_step` without Triton."""
     gradient, limits = parameter_gradient(state, gradients, options), options.tuning
     energy = gradient * gradient
@@ -140,7 +119,7 @@ def step_in_torch(state: FitState, gradients: StepGradients, options: FitOptions
         shown.copy_(meaning)
 
 
-def parameter_gradient(state: FitState, gradients: StepGradients, options: FitOptions) -> Tensor:
+def parameter_gradient(state: DeviceState, gradients: StepGradients, options: FitOptions) -> Tensor:
     """Return the gradient ``[n,14]`` in the optimiser's parameters: means in units of each size, log, logit."""
     units, each = state.units[:, None], gradients.reached[:, None] / max(len(state), 1)
     slope = (state.opacities * (1 - state.opacities))[:, None]
@@ -151,7 +130,7 @@ def parameter_gradient(state: FitState, gradients: StepGradients, options: FitOp
     )
 
 
-def confine(state: FitState, x: Tensor, options: FitOptions) -> Tensor:
+def confine(state: DeviceState, x: Tensor, options: FitOptions) -> Tensor:
     """Bring new parameters ``[n,14]`` into the box about the start, with unit quaternions."""
     x0, rates, shares = state.x0, options.tuning, state.box_shares[:, None]
     offset = x[:, :SIZE] - x0[:, :SIZE]

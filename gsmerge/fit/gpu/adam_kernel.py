@@ -10,8 +10,8 @@ import triton.language as tl
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from gsmerge.fit.fit_options import Tuning
-    from gsmerge.fit.gpu.adam import FitState, StepGradients
+    from gsmerge.fit.gpu.adam import DeviceState, StepGradients
+    from gsmerge.settings.fit import Tuning
 
 BLOCK = 128  # Gaussians to a program
 TINY = tl.constexpr(1e-15)  # beside the root of the second moment
@@ -125,7 +125,7 @@ def _step(
         tl.store(colors + 3 * i + c, new, mask)
 
 
-def launch(state: FitState, gradients: StepGradients, limits: Tuning, rates: Tensor, step: int) -> None:
+def launch(state: DeviceState, gradients: StepGradients, limits: Tuning, rates: Tensor, step: int) -> None:
     """Take one step on tensors of one device, in place; :func:`gsmerge.fit.gpu.adam.adam_step` says what they are."""
     count, g = len(state), gradients
     if count == 0:

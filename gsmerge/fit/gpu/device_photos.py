@@ -5,6 +5,7 @@ On CUDA gsplat draws, on the CPU the project's own kernels; all other files here
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -70,7 +71,7 @@ def upload_gaussians(
     return Gaussians(*(to_device(array, device, dtype) for array in arrays))
 
 
-def draw(
+def draw_view(
     shape: Shape,
     colors: Tensor,
     photos: DevicePhotos,
@@ -100,7 +101,7 @@ def draw(
 
 def draw_black(shape: Shape, colors: Tensor, photos: DevicePhotos, view: int) -> Tensor:
     """Draw one view ``[h,w,3]`` over black."""
-    return draw(shape, colors, photos, view, torch.zeros(3, device=colors.device))[0]
+    return draw_view(shape, colors, photos, view, torch.zeros(3, device=colors.device))[0]
 
 
 def draw_gaussians(gaussians: Gaussians, photos: DevicePhotos, view: int) -> Tensor:
@@ -127,34 +128,30 @@ def harmonic_colors(means: Tensor, sh0: Tensor, shN: Tensor, photos: DevicePhoto
         return cuda.harmonic_colors(means, torch.cat([sh0, shN], 1), photos.eyes[view])
 
 
-def draw_and_transpose(shape: Shape, colors: Tensor, photos: DevicePhotos, view: int) -> tuple[Tensor, Transpose]:
-    """Draw a view over black: the image, and the function that takes images back to the Gaussians."""
+def draw_and_transpose(
+    shape: Shape, colors: Tensor, photos: DevicePhotos, view: int
+) -> tuple[Tensor, Callable[[Tensor], Tensor], Tensor]:
+    """Draw a view over black: the image, its transpose, and a mask ``[n]`` of footprints in it.
+
+    The transpose takes an image ``[h,w,3]`` to sums ``[n,3]`` of each Gaussian's blending weight times the image.
+    """
     with torch.enable_grad():
         leaf = colors.detach().requires_grad_()
-        image, reached = draw(shape, leaf, photos, view, torch.zeros(3, device=colors.device))
-    return image.detach(), Transpose(image, leaf, reached)
+        image, reached = draw_view(shape, leaf, photos, view, torch.zeros(3, device=colors.device))
+
+    def transpose(values: Tensor) -> Tensor:
+        return torch.autograd.grad(image, leaf, values.contiguous(), retain_graph=True)[0]
+
+    return image.detach(), transpose, reached
 
 
-class Transpose:
-    """Transpose of drawing a view: sums of every Gaussian's blending weight times an image; ``reached [n]`` bool."""
-
-    def __init__(self, image: Tensor, colors: Tensor, reached: Tensor):
-        self.image, self.colors, self.reached = image, colors, reached
-
-    def __call__(self, values: Tensor) -> Tensor:
-        """Return the sums ``[n,3]`` of an image ``[h,w,3]``."""
-        return torch.autograd.grad(self.image, self.colors, values.contiguous(), retain_graph=True)[0]
-
-
-def peak_weights(gaussians: Gaussians, photos: DevicePhotos, view: int) -> tuple[Tensor, Tensor]:
-    """Find the largest blending weight ``[n]`` of every Gaussian in a view, and ``[n]`` which lie in it."""
-    if gaussians.means.device.type != "cpu":
+def view_peaks(shape: Shape, photos: DevicePhotos, view: int) -> Tensor:
+    """Find the largest blending weight ``[n]`` of every Gaussian in a view."""
+    if shape[0].device.type != "cpu":
         from gsmerge.raster import cuda
 
-        return cuda.peak_weights(shape_of(gaussians), photos.camera(view), eps2d=photos.host.eps2d)
-    means, quats, scales, opacities = (tensor.contiguous().numpy() for tensor in shape_of(gaussians))
-    sh0, shN = gaussians.sh0.numpy(), gaussians.shN.numpy()
+        return cuda.peak_weights(shape, photos.camera(view), eps2d=photos.host.eps2d)[0]
+    means, quats, scales, opacities = (tensor.contiguous().numpy() for tensor in shape)
+    sh0, shN = (np.zeros((len(means), size, 3), np.float32) for size in (1, 0))
     plan = plan_view(Splats(means, quats, scales, opacities, sh0, shN, np.zeros(3)), **photos.host.camera(view))
-    inside = torch.zeros(len(gaussians), dtype=torch.bool)
-    inside[torch.from_numpy(plan.ids).long()] = True
-    return torch.from_numpy(contributions(plan)[1]), inside
+    return torch.from_numpy(contributions(plan)[1])

@@ -73,17 +73,17 @@ def _ssim_gradient(x: Tensor, y: Tensor, means: Tensor, weight: Tensor) -> Tenso
     return by_mean + 2 * by_square * x + by_product * y
 
 
-def holdout_psnr(images: Tensor, photos: Tensor, weights: Tensor, min_gain: float) -> float:
+def score_blocks(images: Tensor, photos: Tensor, weights: Tensor, min_gain: float) -> float:
     """Return the PSNR (dB) of held-out blocks; see :func:`gsmerge.fit.photo_sizes.holdout_psnr`."""
     clipped = images.clamp(0, 1)
-    gains = exposure_gains(clipped, photos, weights, min_gain)
+    gains = match_exposures(clipped, photos, weights, min_gain)
     mask = weights == 0
     squares = ((clipped * gains[:, None, None] - photos) ** 2).sum(-1) * mask
     error, count = squares.sum(dtype=torch.float64), mask.sum()
     return float(-10 * (error / (3 * count).clamp_min(1)).clamp_min(1e-12).log10())
 
 
-def exposure_gains(images: Tensor, photos: Tensor, weights: Tensor, min_gain: float, max_gain: float = 2.0) -> Tensor:
+def match_exposures(images: Tensor, photos: Tensor, weights: Tensor, min_gain: float, max_gain: float = 2.0) -> Tensor:
     """Return factors ``[v,3]`` to the exposure; see :func:`gsmerge.fit.photo_sizes.exposure_gains`."""
     weighted = weights[..., None] * images
     with_photo, with_image = ((weighted * other).sum((1, 2), dtype=torch.float64) for other in (photos, images))

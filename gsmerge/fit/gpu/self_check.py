@@ -12,14 +12,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsmerge.fit.fit_options import FitOptions
-from gsmerge.fit.full import step_sizes
-from gsmerge.fit.gpu.adam import StepGradients, adam_step, start_state, step_in_torch
-from gsmerge.fit.gpu.device_photos import peak_weights, shape_of, upload_gaussians, upload_photos
+from gsmerge.fit.fit_state import start_state
+from gsmerge.fit.gpu.adam import StepGradients, adam_step, step_in_torch, upload_state
+from gsmerge.fit.gpu.device_photos import shape_of, upload_gaussians, upload_photos, view_peaks
+from gsmerge.fit.schedule import step_sizes
 from gsmerge.geometry import normalize, quat_to_rotmat
 from gsmerge.raster import cuda
 from gsmerge.raster.autograd import Shape, draw_colored, seen_colors
 from gsmerge.raster.photos import EPS2D, Photos
+from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Gaussians
 
 CPU = torch.device("cpu")
@@ -72,7 +73,7 @@ def measure_errors(device: torch.device) -> dict[str, float]:
     pairs = [(getattr(gradients, name).cpu(), getattr(expected, name)) for name in GRADIENTS]
     shares = [(actual - wanted).norm() / wanted.norm() for actual, wanted in pairs]
     peaks, _ = cuda.peak_weights(shape_of(placed), camera)
-    expected_peaks, _ = peak_weights(host, upload_photos(photos, CPU), 0)
+    expected_peaks = view_peaks(shape_of(host), upload_photos(photos, CPU), 0)
     harmonics = torch.cat([placed.sh0, placed.shN], 1)
     colors = cuda.harmonic_colors(placed.means, harmonics, resident.eyes[0])
     expected_colors = seen_colors(host.means, host.sh0, host.shN, photos.viewmats[0])
@@ -81,7 +82,7 @@ def measure_errors(device: torch.device) -> dict[str, float]:
         "gradients": float(torch.stack(shares).max()),
         "blending weights": largest(peaks, expected_peaks),
         "harmonics": largest(colors, expected_colors),
-        "optimiser step": compare_steps(host, placed, expected),
+        "optimiser step": compare_steps(gaussians, expected, device),
     }
 
 
@@ -123,13 +124,11 @@ def differentiate(
     return image.detach(), StepGradients(used[0], used[1], used[2], used[3], used[4], reached)
 
 
-def compare_steps(host: Gaussians, placed: Gaussians, gradients: StepGradients) -> float:
+def compare_steps(gaussians: Gaussians, gradients: StepGradients, device: torch.device) -> float:
     """Take an optimiser step by the same gradients on the CPU and on a device; the largest difference."""
-    options = FitOptions()
-    device = placed.means.device
+    options, start = FitOptions(), start_state(gaussians)
     rates = torch.from_numpy(step_sizes(options.tuning, 0.0, options.steps))
-    state = start_state(host)
-    other = start_state(placed)
+    state, other = upload_state(start, CPU), upload_state(start, device)
     step_in_torch(state, gradients, options, rates, 1)
     uploaded = StepGradients(*(tensor.to(device) for tensor in vars(gradients).values()))
     adam_step(other, uploaded, options, rates.to(device), 1)

@@ -15,15 +15,16 @@ import torch
 from torch import Tensor
 
 from gsmerge.errors import SceneError
-from gsmerge.fit.fit_options import FitOptions
+from gsmerge.fit import ON_CPU, FitJob, visible_mask
 from gsmerge.fit.full import fit_full
-from gsmerge.fit.stage import visible_mask
+from gsmerge.fit.schedule import plan_run
 from gsmerge.networks.options import RESIDUAL
 from gsmerge.networks.tensors import gaussian_sizes, quat_to_rotmat, rotate_vectors, skew_vectors
 from gsmerge.networks.tokens import compute_group_features
 from gsmerge.raster.photos import Photos
 from gsmerge.research.training.scenes import TrainingScene, coverage, covered_pixels, reduced_masks
 from gsmerge.research.training.train_options import TrainOptions
+from gsmerge.settings.fit import FitOptions
 from gsmerge.settings.stages import DecodeOptions
 from gsmerge.stages.decode import divide
 from gsmerge.types import SH_C0, FeatureGaussians, Gaussians, as_tensor
@@ -84,7 +85,8 @@ def _fit_level(
     fit = FitOptions(fit_steps=options.fit_steps)
     mask = start.opacities >= DecodeOptions().min_opacity
     mask[mask.copy()] = visible_mask(start[mask], photos[1], fit.min_contribution)
-    fitted, report = fit_full(start[mask], photos, fit, seed=options.seed, progress=progress)
+    job = FitJob(photos, fit, seed=options.seed, progress=progress)
+    fitted, report = fit_full(start[mask], ON_CPU.make_engine(plan_run(job)))
     if not report.accepted:
         problem = f"expected a scene that the fit makes better ({report.stopped})"
         raise SceneError(name, problem, "leave it out")

@@ -14,7 +14,7 @@ from gsmerge import CompactOptions, compact
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import canonicalise
 from gsmerge.facts.views import subset
-from gsmerge.fit import FitOptions, fit
+from gsmerge.fit import FitJob, FitOptions, fit
 from gsmerge.fit.photo_sizes import fit_photos
 from gsmerge.plan import plan_whole
 from gsmerge.settings.budget import DEVICES
@@ -158,7 +158,7 @@ def test_what_is_fixed_stays(scene: Scene) -> None:
     settings = FitOptions(fit_steps=20, judged=False, min_contribution=0.0)
     photos = fit_photos(canonical, settings)
     frame_start = replace(start, means=start.means.astype(np.float32))
-    fitted, report = fit(frame_start, photos, settings, len(start), exact=True, fixed=fixed)
+    fitted, report = fit(frame_start, FitJob(photos, settings, len(start), fixed=fixed))
     assert report is not None
     assert report.accepted
     for name in ("means", "sh0"):

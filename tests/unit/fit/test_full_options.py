@@ -9,16 +9,17 @@ import pytest
 import scenes
 
 from gsmerge import Gaussians
-from gsmerge.fit import FitOptions
-from gsmerge.fit import full as full_module
-from gsmerge.fit.fit_options import LONG_STEPS, USUAL_SHARE, Tuning
+from gsmerge.fit import FitJob, FitOptions
+from gsmerge.fit.cpu import start_poses
 from gsmerge.fit.fit_state import start_state
-from gsmerge.fit.full import fit_full, plan_run, start_poses
+from gsmerge.fit.full import fit_full
+from gsmerge.fit.schedule import DROPOUT, FEW_VIEWS, MANY_STEPS, Schedule, plan_run
 from gsmerge.geometry import motion_matrices, motion_vectors, project_points
 from gsmerge.raster import plan_view
 from gsmerge.raster.composite import blend, view_colors
 from gsmerge.raster.gradient import gradients_of
 from gsmerge.raster.photos import Photos
+from gsmerge.settings.fit import LONG_STEPS, USUAL_SHARE, Tuning
 
 
 @pytest.mark.parametrize("coarse", [0.5, 1.0])
@@ -34,17 +35,16 @@ def test_steps_do_not_look_where_the_mask_is_not(coarse: float) -> None:
         return replace(photos, images=images)
 
     rubbish = tuple(map(spoilt, scenes.pair_of(scene)))
-    masks = tuple(np.ones(photos.images.shape[:3], bool) for photos in rubbish)
+    masks = tuple(np.ones(photos.images.shape[:3], np.float32) for photos in rubbish)
     for mask in masks:
-        mask[:, :, : mask.shape[2] // 3] = False
-    whole, _ = fit_full(start, rubbish, options)
-    pairs = list(zip(rubbish, masks, strict=True))
-    masked, report = fit_full(
-        start, tuple(replace(photos, weights=mask.astype(np.float32)) for photos, mask in pairs), options
+        mask[:, :, : mask.shape[2] // 3] = 0
+    whole, _ = fit_full(start, scenes.engine_for(rubbish, options))
+    weighed, even = (
+        tuple(replace(photos, weights=np.maximum(mask, least)) for photos, mask in zip(rubbish, masks, strict=True))
+        for least in np.array([0, 1], np.float32)
     )
-    again, _ = fit_full(
-        start, tuple(replace(photos, weights=np.ones(mask.shape, np.float32)) for photos, mask in pairs), options
-    )
+    masked, report = fit_full(start, scenes.engine_for(weighed, options))
+    again, _ = fit_full(start, scenes.engine_for(even, options))
     assert report.accepted
     assert scenes.psnr_of(masked, scene) > scenes.psnr_of(whole, scene) + 2
     assert np.array_equal(again.means, whole.means)
@@ -57,14 +57,14 @@ LONG = FitOptions(fit_steps=160, holdout=0.2)
 def test_dropout_where_there_are_few_views(photos: tuple[Photos, Photos]) -> None:
     many = Photos(*(np.concatenate([a, a]) for a in (photos[0].images, photos[0].viewmats, photos[0].Ks)), eps2d=0.3)
     pair = many, replace(photos[1], images=np.concatenate([photos[1].images] * 2))
-    assert len(photos[0]) <= full_module.FEW_VIEWS < len(many)
-    assert plan_run(photos, LONG, 0).dropout == full_module.DROPOUT > 0
-    assert plan_run(photos, replace(LONG, fit_steps=full_module.MANY_STEPS - 1), 0).dropout == 0
-    assert plan_run(pair, LONG, 0).dropout == 0
-    assert plan_run(pair, replace(LONG, dropout=0.15), 0).dropout == 0.15
-    assert plan_run(photos, replace(LONG, dropout=0.0), 0).dropout == 0
+    assert len(photos[0]) <= FEW_VIEWS < len(many)
+    assert plan_run(FitJob(photos, LONG)).dropout == DROPOUT > 0
+    assert plan_run(FitJob(photos, replace(LONG, fit_steps=MANY_STEPS - 1))).dropout == 0
+    assert plan_run(FitJob(pair, LONG)).dropout == 0
+    assert plan_run(FitJob(pair, replace(LONG, dropout=0.15))).dropout == 0.15
+    assert plan_run(FitJob(photos, replace(LONG, dropout=0.0))).dropout == 0
     very_long = replace(LONG, fit_steps=LONG_STEPS)
-    assert 0 < plan_run(pair, very_long, 0).dropout < plan_run(photos, very_long, 0).dropout
+    assert 0 < plan_run(FitJob(pair, very_long)).dropout < plan_run(FitJob(photos, very_long)).dropout
     assert very_long.half_res_part < LONG.half_res_part < replace(LONG, half_res_share=0.9).half_res_part
 
 
@@ -81,8 +81,8 @@ def test_dropout_leaves_out_its_share(truth: Gaussians, photos: tuple[Photos, Ph
     """What is left out learns nothing from the step."""
     moved = []
     for share in (0.0, 0.5):
-        state, plan = start_state(truth), plan_run(photos, replace(QUICK, dropout=share), 0)
-        full_module.fit_step(state, plan, 1, 1, 0.0, np.random.default_rng(0))
+        state, engine = start_state(truth), scenes.engine_for(photos, replace(QUICK, dropout=share))
+        engine.step(state, Schedule(engine.plan).draw(1, 0.0, len(truth)))
         moved.append(state.m.any(1).mean())
     assert moved[0] > 0.6
     assert moved[1] == pytest.approx(0.5 * moved[0], abs=0.1)
@@ -123,8 +123,8 @@ def test_steps_of_a_pose_lower_the_loss(view: int, truth: Gaussians, photos: Pai
 
 def test_the_fit_finds_the_cameras(truth: Gaussians, photos: Pair) -> None:
     wrong, start = spoil(photos), scenes.spoil(truth)
-    free, report = fit_full(start, wrong, FREE)
-    fixed, other = fit_full(start, wrong, replace(FREE, move_cameras=False))
+    free, report = fit_full(start, scenes.engine_for(wrong, FREE))
+    fixed, other = fit_full(start, scenes.engine_for(wrong, replace(FREE, move_cameras=False)))
     assert other.viewmats is None
     pixels = [project_points(truth.means, one, photos[0].Ks)[0] for one in (
         photos[0].viewmats, wrong[0].viewmats, report.viewmats,

@@ -9,8 +9,7 @@ import pytest
 import scenes
 
 from gsmerge import Gaussians
-from gsmerge.fit import FitOptions, fit
-from gsmerge.fit.fit_options import HAZE, record_fit
+from gsmerge.fit import FitJob, FitOptions, fit, record_fit
 from gsmerge.fit.full import fit_full
 from gsmerge.fit.outside import (
     LEAST_WIDTH,
@@ -21,6 +20,7 @@ from gsmerge.fit.outside import (
     outside_views,
     score_fog,
 )
+from gsmerge.fit.report import HAZE
 from gsmerge.geometry import camera_centres
 from gsmerge.raster import composite, plan_view, prepare
 from gsmerge.raster.photos import Photos, render_photos
@@ -102,14 +102,14 @@ def test_a_fit_keeps_empty_what_its_start_has_empty(truth: Gaussians, photos: Pa
     shown = tuple(replace(some, images=np.stack(render_photos(wanted, some)).clip(0, 1)) for some in photos)
     start = scenes.spoil(truth)
     whole = replace(outside, weights=np.sign(outside.weights))
-    fitted, without = fit_full(start, shown, LONG, outside=whole)[0], fit_full(start, shown, LONG)[0]
+    fitted, without = (fit_full(start, scenes.engine_for(shown, LONG, outside=views))[0] for views in (whole, None))
     kept, grown = score_fog(prepare(fitted), outside), score_fog(prepare(without), outside)
     assert kept < 0.02
     assert grown > 4 * kept
 
 
 def test_a_note_says_where_fog_is_left(truth: Gaussians, photos: Pair) -> None:
-    _, report = fit(scenes.spoil(truth), photos, OPTIONS)
+    _, report = fit(scenes.spoil(truth), FitJob(photos, OPTIONS))
     for fog, count in ((HAZE, 0), (HAZE + 0.01, 1), (None, 0)):
         with record_run(None) as record:
             record_fit(replace(report, fog=fog))

@@ -13,9 +13,10 @@ from messages import refuses
 
 from gsmerge import Gaussians, Scene, compact
 from gsmerge.facts.views import subset
-from gsmerge.fit import FitOptions, fit, fit_photos
-from gsmerge.fit.full import affordable_steps, fit_full, plan_run
+from gsmerge.fit import FitJob, FitOptions, fit, fit_photos
+from gsmerge.fit.full import fit_full
 from gsmerge.fit.photo_sizes import large_photos, largest_scale, photo_scale
+from gsmerge.fit.schedule import affordable_steps, plan_run
 from gsmerge.geometry import project
 from gsmerge.raster.photos import EPS2D, photo_psnr
 from gsmerge.runtime.record import record_run
@@ -142,30 +143,30 @@ def test_some_views_have_their_own_photos(scene: Scene) -> None:
 
 def test_steps_look_at_half_full_and_larger_photos(scene: Scene) -> None:
     options = FitOptions(fit_steps=200, photo_scale=2)
-    plan = plan_run(fit_photos(with_large(scene, 2), options), options, 0)
-    sizes = [plan.look_at(step + 1, step / 200).size for step in range(200)]
+    plan = plan_run(FitJob(fit_photos(with_large(scene, 2), options), options))
+    sizes = [plan.draw_mode(step + 1, step / 200).size for step in range(200)]
     assert [sizes.count(size) for size in (1, 0, 2)] == [122, 46, 32]
     assert sizes[:120] == [1] * 120
-    usual = plan_run(scenes.pair_of(scene), options, 0)
-    sizes = [usual.look_at(step + 1, step / 200).size for step in range(200)]
+    usual = plan_run(FitJob(scenes.pair_of(scene), options))
+    sizes = [usual.draw_mode(step + 1, step / 200).size for step in range(200)]
     assert sizes[:140] == [1] * 140
     assert [sizes[140:].count(size) for size in (0, 1)] == [49, 11]
 
 
 def test_the_users_share_of_half_size_steps_stays(scene: Scene) -> None:
     options = FitOptions(half_res_share=0.8, photo_scale=2)
-    assert plan_run(fit_photos(with_large(scene, 2), options), options, 0).half_part == 0.8
+    assert plan_run(FitJob(fit_photos(with_large(scene, 2), options), options)).half_part == 0.8
 
 
 def test_large_photos_count_in_every_pixel(scene: Scene) -> None:
-    plan = plan_run(fit_photos(with_large(scene, 2), replace(LONG, photo_scale=2)), LONG, 0)
+    plan = plan_run(FitJob(fit_photos(with_large(scene, 2), replace(LONG, photo_scale=2)), LONG))
     assert all((weight == 1).all() for weight in plan.step_weights[2])
 
 
 def test_time_budget_counts_larger_photos(scene: Scene) -> None:
     options = replace(LONG, time_budget=1.0)
     steps = [
-        affordable_steps(0.06, plan_run(fit_photos(with_large(scene, s), replace(options, photo_scale=s)), o, 0))
+        affordable_steps(0.06, plan_run(FitJob(fit_photos(with_large(scene, s), replace(options, photo_scale=s)), o)))
         for s, o in ((1, replace(options, half_res_share=0.6)), (2, options), (3, options))
     ]
     assert steps[0] > steps[1] > steps[2]
@@ -175,8 +176,11 @@ def test_result_shows_larger_photos_better(truth: Gaussians, scene: Scene) -> No
     large, start = with_large(scene, 2), scenes.spoil(truth)
     near = large_photos(large, 2)
     near = replace(near, images=np.stack([near.image(view) for view in range(len(near))]))
-    usual, sharp = (fit_full(start, fit_photos(large, replace(LONG, photo_scale=scale)), LONG)[0] for scale in (1, 2))
-    assert scenes.identical(usual, fit_full(start, scenes.pair_of(scene), LONG)[0])
+    usual, sharp = (
+        fit_full(start, scenes.engine_for(fit_photos(large, replace(LONG, photo_scale=scale)), LONG))[0]
+        for scale in (1, 2)
+    )
+    assert scenes.identical(usual, fit_full(start, scenes.engine_for(scenes.pair_of(scene), LONG))[0])
     views = range(len(near))
     assert photo_psnr(sharp, near, views) > photo_psnr(usual, near, views) + 0.3
 
@@ -186,7 +190,7 @@ def test_result_does_not_depend_on_threads(truth: Gaussians, scene: Scene) -> No
     for threads in (1, 3):
         with use_threads(threads):
             photos = fit_photos(with_large(scene, 2), replace(LONG, photo_scale=2))
-            results.append(fit(start, photos, LONG, count=len(start) + 20)[0])
+            results.append(fit(start, FitJob(photos, LONG, count=len(start) + 20))[0])
     assert scenes.identical(*results)
 
 

@@ -9,13 +9,12 @@ import pytest
 import scenes
 
 from gsmerge import Gaussians
-from gsmerge.fit import FitOptions, FitReport, fit, stage
+from gsmerge.fit import FitJob, FitOptions, FitReport, fit, stage
 from gsmerge.fit.color import draw, fit_colors
 from gsmerge.fit.fit_state import start_state
 from gsmerge.fit.full import fit_full
 from gsmerge.fit.outside import outside_views, score_fog
-from gsmerge.fit.stage import visible_mask
-from gsmerge.fit.survey import survey_photos
+from gsmerge.fit.survey import survey_photos, visible_mask
 from gsmerge.raster import composite, contributions, plan_view, prepare
 from gsmerge.raster.photos import Photos
 from gsmerge.types import SH_C0
@@ -27,20 +26,20 @@ LONG = FitOptions(fit_steps=160, holdout=0.2)
 
 def test_stage_takes_the_full_fit(truth: Gaussians, photos: Pair) -> None:
     start = scenes.spoil(truth)
-    result, report = fit(start, photos, QUICK, seed=4)
+    result, report = fit(start, FitJob(photos, QUICK, seed=4))
     outside = outside_views(prepare(start), photos[1], QUICK)
     assert outside is not None
-    expected, own = fit_full(start, photos, QUICK, seed=4, outside=outside)
+    expected, own = fit_full(start, scenes.engine_for(photos, QUICK, seed=4, outside=outside))
     assert report == replace(own, fog=score_fog(prepare(result), outside))
     assert scenes.identical(result, expected)
 
 
-def test_stage_falls_back_to_colours(truth: Gaussians, photos: Pair) -> None:
+def test_stage_falls_back_to_colours(truth: Gaussians, photos: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where the full fit is refused."""
     refused = FitReport("none", False, 7, 20.0, 19.0, "worse")
-    backend = replace(stage.ON_CPU, fit_full=lambda gaussians, *_, **__: (gaussians, refused))
+    monkeypatch.setattr(stage, "fit_full", lambda gaussians, *_: (gaussians, refused))
     start = replace(truth, sh0=truth.sh0 + 0.2 / SH_C0)
-    result, report = fit(start, photos, QUICK, backend=backend)
+    result, report = fit(start, FitJob(photos, QUICK))
     assert (report.method, report.accepted) == ("color", True)
     colored, _ = fit_colors(start, draw(start, photos[1]), photos[1], QUICK)
     assert scenes.identical(result, colored[visible_mask(start, photos[1], QUICK.min_contribution)])
@@ -48,11 +47,13 @@ def test_stage_falls_back_to_colours(truth: Gaussians, photos: Pair) -> None:
     assert not np.array_equal(result.sh0, start.sh0)
 
 
-def test_colours_after_a_growth_know_where_each_comes_from(truth: Gaussians, photos: Pair) -> None:
+def test_colours_after_a_growth_know_where_each_comes_from(
+    truth: Gaussians, photos: Pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
     refused = FitReport("none", False, 7, 20.0, 19.0, "worse")
-    backend = replace(stage.ON_CPU, fit_full=lambda gaussians, *_, **__: (gaussians, refused))
+    monkeypatch.setattr(stage, "fit_full", lambda gaussians, *_: (gaussians, refused))
     start = replace(truth, sh0=truth.sh0 + 0.2 / SH_C0)
-    result, report = fit(start, photos, LONG, count=len(start) + 20, backend=backend)
+    result, report = fit(start, FitJob(photos, LONG, count=len(start) + 20))
     assert (report.method, report.accepted, len(result)) == ("color", True, len(start) + 20)
     near = np.linalg.norm(result.means - start.means[report.origins], axis=1) <= 2 * start.scales[report.origins].max(1)
     assert near.all()
@@ -61,7 +62,7 @@ def test_colours_after_a_growth_know_where_each_comes_from(truth: Gaussians, pho
 def test_stage_refuses_both_on_noise(truth: Gaussians, noise: Pair) -> None:
     grey = replace(truth, sh0=np.zeros_like(truth.sh0))
     options = scenes.tuned(LONG, prior_weight=1e-6, iterations=60, huber=10.0)
-    result, report = fit(grey, noise, options, count=2 * len(grey))
+    result, report = fit(grey, FitJob(noise, options, count=2 * len(grey)))
     assert not report.accepted
     assert scenes.identical(result, grey)
 
@@ -72,41 +73,43 @@ def test_stage_without_a_fit_only_prunes(truth: Gaussians, photos: Pair) -> None
     hidden = replace(truth[:3], means=4 * truth.means[:3], scales=0.2 * truth.scales[:3])
     behind = replace(truth[:3], means=truth.means[:3] - 100)
     start = Gaussians.concat([opaque, hidden, behind])
-    result, report = fit(start, photos, replace(QUICK, fit="none"))
+    result, report = fit(start, FitJob(photos, replace(QUICK, fit="none")))
     assert report is None
     keep = visible_mask(start, photos[1], QUICK.min_contribution)
     assert scenes.identical(result, start[keep])
     assert not keep[-6:-3].any()
     assert keep[-3:].all()
-    assert scenes.identical(fit(start, photos, replace(QUICK, fit="none", min_contribution=0.0))[0], start)
+    assert scenes.identical(fit(start, FitJob(photos, replace(QUICK, fit="none", min_contribution=0.0)))[0], start)
 
 
 def test_stage_prunes_before_it_fits(truth: Gaussians, photos: Pair) -> None:
     opaque = replace(truth, opacities=np.full_like(truth.opacities, 0.98), scales=2 * truth.scales)
     hidden = replace(truth[:3], means=4 * truth.means[:3], scales=0.2 * truth.scales[:3])
-    alone, both = (fit(g, photos, QUICK)[0] for g in (opaque, Gaussians.concat([opaque, hidden])))
+    alone, both = (fit(g, FitJob(photos, QUICK))[0] for g in (opaque, Gaussians.concat([opaque, hidden])))
     assert len(both) == len(alone)
 
 
 @pytest.mark.parametrize("method", ["none", "full"])
 def test_nothing_to_fit(truth: Gaussians, photos: Pair, method: str) -> None:
-    result, _ = fit(truth[:0], photos, replace(QUICK, fit=method))
+    result, _ = fit(truth[:0], FitJob(photos, replace(QUICK, fit=method)))
     assert len(result) == 0
 
 
 def test_a_survey_is_what_its_parts_are(truth: Gaussians, photos: Pair) -> None:
-    look, half, state = survey_photos(truth, photos), photos[1], start_state(truth)
-    np.testing.assert_array_equal(look.visible(1 / 255), visible_mask(truth, half, 1 / 255))
+    pictures: list[np.ndarray] = []
+    survey = survey_photos(truth, photos, lambda images: pictures.extend(images) or 0.0)
+    half, state = photos[1], start_state(truth)
+    np.testing.assert_array_equal(survey.visible(1 / 255), visible_mask(truth, half, 1 / 255))
     sums = np.zeros((len(half), len(truth)))
     for view in range(len(half)):
         plan = plan_view(state.splats, **half.camera(view))
         image, _ = composite(plan, state.colors)
-        np.testing.assert_array_equal(look.images[view], image)
+        np.testing.assert_array_equal(pictures[view], image)
         sums[view] = contributions(plan)[0]
-    np.testing.assert_array_equal(look.sums, sums.sum(0))
-    np.testing.assert_array_equal(look.squares, (sums**2).sum(0))
+    np.testing.assert_array_equal(survey.sums, sums.sum(0))
+    np.testing.assert_array_equal(survey.squares, (sums**2).sum(0))
     rows = np.arange(0, len(truth), 3)
-    np.testing.assert_array_equal(look[rows].peaks, look.peaks[rows])
+    np.testing.assert_array_equal(survey[rows].peaks, survey.peaks[rows])
 
 
 def test_shown(photos: Pair) -> None:

@@ -14,11 +14,11 @@ import torch
 from gpu_runs import gpu
 from step_states import gradients_of, odd_state
 
-from gsmerge.fit.full import step_sizes
 from gsmerge.fit.gpu.adam import adam_step
+from gsmerge.fit.schedule import step_sizes
 from gsmerge.kernels.gaussians import optimise
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[4]
 
 
 @pytest.mark.parametrize("step", [1, 7])

@@ -9,15 +9,13 @@ import numpy as np
 import pytest
 import scenes
 import torch
-from gpu_runs import CPU, ON_TORCH, QUICK, Pair, assert_close, gpu, on_device
+from gpu_runs import ON_TORCH, QUICK, Pair, assert_close, gpu
 from messages import noted
 
 from gsmerge import Gaussians, Scene
-from gsmerge.fit import ON_CPU, FitOptions, FitReport, fit, run_on, stage
+from gsmerge.fit import ON_CPU, FitBackend, FitJob, FitOptions, FitReport, fit, run_on, visible_mask
 from gsmerge.fit.gpu import choose_backend
-from gsmerge.fit.gpu.backend import make_backend, photo_error, visible_mask
-from gsmerge.fit.gpu.device_photos import upload_gaussians
-from gsmerge.fit.stage import FitBackend
+from gsmerge.fit.gpu.engine import make_backend
 from gsmerge.raster import photos as render_photos
 from gsmerge.raster.photos import EPS2D, NEAR
 from gsmerge.runtime.record import record_run
@@ -29,30 +27,30 @@ def test_failing_fit_falls_back_as_the_stage_does(start: Gaussians, photos: Pair
     grey = replace(start, sh0=np.zeros_like(start.sh0))
     for steps in (8, 150):
         options = replace(QUICK, fit_steps=steps)
-        actual, report = fit(grey, noise, options, len(grey) + 9, backend=ON_TORCH)
-        expected, other = fit(grey, noise, options, len(grey) + 9)
+        actual, report = fit(grey, FitJob(noise, options, len(grey) + 9), ON_TORCH)
+        expected, other = fit(grey, FitJob(noise, options, len(grey) + 9))
         assert (report.method, report.stopped) == (other.method, other.stopped)
         assert len(actual) == len(expected)
 
 
 def test_nothing_is_fitted_where_nothing_is_asked_for(start: Gaussians, photos: Pair) -> None:
-    same, report = fit(start, photos, replace(QUICK, fit="none", min_contribution=0.0), backend=ON_TORCH)
+    same, report = fit(start, FitJob(photos, replace(QUICK, fit="none", min_contribution=0.0)), ON_TORCH)
     assert same is start
     assert report is None
-    few, _ = fit(start[:0], photos, QUICK, backend=ON_TORCH)
+    few, _ = fit(start[:0], FitJob(photos, QUICK), ON_TORCH)
     assert len(few) == 0
 
 
 def test_larger_photos_are_fitted_to_on_the_cpu(start: Gaussians, photos: Pair) -> None:
-    failing = replace(ON_TORCH, fit_full=None)
-    fitted, report = fit(start, (*photos, photos[0]), QUICK, backend=failing)
+    failing = replace(ON_TORCH, make_engine=None)
+    fitted, report = fit(start, FitJob((*photos, photos[0]), QUICK), failing)
     assert report.device == "cpu"
     assert len(fitted) == len(start)
 
 
 def test_cameras_are_moved_by_the_cpu(start: Gaussians, photos: Pair) -> None:
-    failing = replace(ON_TORCH, fit_full=None)
-    _, report = fit(start, photos, replace(QUICK, move_cameras=True), backend=failing)
+    failing = replace(ON_TORCH, make_engine=None)
+    _, report = fit(start, FitJob(photos, replace(QUICK, move_cameras=True)), failing)
     assert report is not None
     assert report.device == "cpu"
     assert report.viewmats is not None
@@ -62,10 +60,10 @@ def test_what_no_photo_shows_is_left_out(start: Gaussians, photos: Pair) -> None
     opacities = start.opacities.copy()
     opacities[::5] = 0.0045
     faint = replace(start, opacities=opacities)
-    actual = visible_mask(upload_gaussians(faint, CPU), on_device(photos)[1], 1 / 255)
-    np.testing.assert_array_equal(actual, stage.visible_mask(faint, photos[1], 1 / 255))
+    actual = scenes.engine_for(photos, QUICK, backend=ON_TORCH).survey(faint).visible(1 / 255)
+    np.testing.assert_array_equal(actual, visible_mask(faint, photos[1], 1 / 255))
     assert 0 < int(actual.sum()) < len(faint)
-    kept, report = fit(faint, photos, replace(QUICK, fit="none"), backend=ON_TORCH)
+    kept, report = fit(faint, FitJob(photos, replace(QUICK, fit="none")), ON_TORCH)
     assert (len(kept), report) == (int(actual.sum()), None)
 
 
@@ -86,8 +84,8 @@ def test_scores_are_the_renderers(
             for score in (ON_TORCH.photo_psnr, render_photos.photo_psnr)
         )
         assert actual == pytest.approx(expected, abs=1e-4)
-    error = photo_error(upload_gaussians(start, CPU), on_device(photos)[0])
-    assert error == pytest.approx(stage.photo_error(start, photos[0]), rel=1e-4)
+    errors = [scenes.engine_for(photos, QUICK, backend=one).photo_error(start) for one in (ON_TORCH, ON_CPU)]
+    assert errors[0] == pytest.approx(errors[1], rel=1e-4)
 
 
 def test_fit_without_enough_memory_is_done_again_on_the_cpu(start: Gaussians, photos: Pair) -> None:
@@ -101,8 +99,8 @@ def test_fit_without_enough_memory_is_done_again_on_the_cpu(start: Gaussians, ph
 
     options = replace(QUICK, fit_steps=60)
     with record_run() as record:
-        actual, report = fit(start, photos, options, progress=fail, backend=ON_TORCH)
-    expected, other = fit(start, photos, options)
+        actual, report = fit(start, FitJob(photos, options, progress=fail), ON_TORCH)
+    expected, other = fit(start, FitJob(photos, options))
     assert taken[:3] == [20, 40, 1]
     assert scenes.identical(actual, expected)
     assert report == other
@@ -113,14 +111,14 @@ def test_other_errors_are_not_hidden(start: Gaussians, photos: Pair) -> None:
     def fail(*_: Any) -> Any:
         raise RuntimeError("a mistake of ours")
 
-    for backend in (replace(ON_TORCH, look_at=fail), replace(stage.ON_CPU, look_at=fail)):
+    for backend in (replace(ON_TORCH, make_engine=fail), replace(ON_CPU, make_engine=fail)):
         with pytest.raises(RuntimeError, match="a mistake of ours"):
-            fit(start, photos, QUICK, backend=backend)
+            fit(start, FitJob(photos, QUICK), backend)
 
 
 def test_scores_without_enough_memory_are_done_again_on_the_cpu() -> None:
-    def work(backend: stage.FitBackend[Any]) -> str:
-        if backend is not stage.ON_CPU:
+    def work(backend: FitBackend) -> str:
+        if backend is not ON_CPU:
             raise torch.cuda.OutOfMemoryError("CUDA out of memory.")
         return backend.device
 
@@ -132,21 +130,15 @@ def test_scores_without_enough_memory_are_done_again_on_the_cpu() -> None:
 @gpu
 def test_mask_and_scores_of_a_gpu_are_the_cpus(scene: Scene, start: Gaussians, photos: Pair) -> None:
     cuda = torch.device("cuda")
-    masks = [
-        visible_mask(upload_gaussians(start, device), on_device(photos, device)[1], 1 / 255).cpu()
-        for device in (cuda, CPU)
-    ]
-    assert (masks[0] == masks[1]).float().mean() > 0.99
-    scores = [
-        backend.photo_psnr(start, photos[0], [0, 2], quarter=False, near=NEAR)
-        for backend in (make_backend(cuda), stage.ON_CPU)
-    ]
+    backends = make_backend(cuda), ON_CPU
+    masks = [scenes.engine_for(photos, QUICK, backend=one).survey(start).visible(1 / 255) for one in backends]
+    assert (masks[0] == masks[1]).mean() > 0.99
+    scores = [one.photo_psnr(start, photos[0], [0, 2], quarter=False, near=NEAR) for one in backends]
     assert scores[0] == pytest.approx(scores[1], abs=0.05)
 
 
-def colored(start: Gaussians, photos: Pair, backend: FitBackend[Any]) -> tuple[Gaussians, FitReport]:
-    result, report = backend.fit_colors(backend.upload(start), backend.upload_photos(photos[1]), FitOptions(), 0)
-    return backend.download(result), report
+def colored(start: Gaussians, photos: Pair, backend: FitBackend) -> tuple[Gaussians, FitReport]:
+    return scenes.engine_for(photos, FitOptions(), backend=backend).fit_colors(start)
 
 
 def test_colors_are_the_stages(start: Gaussians, photos: Pair) -> None:

@@ -8,7 +8,7 @@ import torch
 from gpu_runs import Pair
 
 from gsmerge.fit import photo_sizes as fit_photos
-from gsmerge.fit.gpu.image_scores import exposure_gains, holdout_psnr, loss_gradient, photo_means
+from gsmerge.fit.gpu.image_scores import loss_gradient, match_exposures, photo_means, score_blocks
 from gsmerge.fit.loss import image_gradient
 
 
@@ -35,6 +35,6 @@ def test_exposures_and_held_out_blocks_are_the_stages(photos: Pair) -> None:
     tensors = [torch.from_numpy(array) for array in (images, photos[1].images, np.stack(weights))]
     for min_gain in (1.15, 3.0):
         expected = fit_photos.exposure_gains(list(images), photos[1].images, weights, min_gain)
-        np.testing.assert_allclose(exposure_gains(*tensors, min_gain), expected, rtol=1e-5)
+        np.testing.assert_allclose(match_exposures(*tensors, min_gain), expected, rtol=1e-5)
         score = fit_photos.holdout_psnr(list(images), photos[1], weights, min_gain)
-        assert holdout_psnr(*tensors, min_gain) == pytest.approx(score, abs=1e-4)
+        assert score_blocks(*tensors, min_gain) == pytest.approx(score, abs=1e-4)

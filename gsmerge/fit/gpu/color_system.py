@@ -1,8 +1,7 @@
-"""Gaussians -> Gaussians with fitted colours, on a device; see :mod:`gsmerge.fit.color`.
+"""The least-squares system of the colours on a device; :mod:`gsmerge.fit.color` solves it.
 
-The same conjugate gradients with the same weights. The matrix of a view, applied to colours, is an
-image, and its transpose the gradient of an image: each view is drawn once, and its transpose kept
-for as long as it is used.
+The matrix of a view, applied to colours, is an image, and its transpose the gradient of an image: each view
+is drawn once, and its transpose kept for as long as it is used.
 """
 
 from __future__ import annotations
@@ -13,36 +12,27 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsmerge.fit.color import HOLDOUT, add_offsets, solve_colors
-from gsmerge.fit.fit_options import FitOptions, FitReport
+from gsmerge.fit.color import color_weights
 from gsmerge.fit.gpu.device_photos import (
     DevicePhotos,
-    Transpose,
     draw_and_transpose,
     draw_black,
     draw_gaussians,
     shape_of,
 )
-from gsmerge.fit.gpu.image_scores import exposure_gains, holdout_psnr
-from gsmerge.fit.photo_sizes import training_weights
+from gsmerge.fit.gpu.image_scores import match_exposures, score_blocks
+from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Gaussians
 
 
-def fit_colors(
-    gaussians: Gaussians, photos: DevicePhotos, options: FitOptions, seed: int
-) -> tuple[Gaussians, FitReport]:
-    """Fit base colours alone to the photos, and keep them only if held-out blocks, chosen by ``seed``, get better."""
+def color_system(gaussians: Gaussians, photos: DevicePhotos, options: FitOptions, seed: int) -> _DeviceSystem:
+    """Make the system of the base colours; ``seed`` chooses the held-out blocks."""
     device = gaussians.means.device
-    train = training_weights(photos.host, min(0.5, HOLDOUT * options.holdout), seed)
-    weights = torch.from_numpy(np.stack(train)).to(device)
+    weights = torch.from_numpy(np.stack(color_weights(photos.host, options, seed))).to(device)
     images = torch.stack([draw_gaussians(gaussians, photos, view) for view in range(len(photos))])
-    gains = torch.ones(len(photos), 3, device=device)
-    system = _DeviceSystem(gaussians, photos, options, images, weights, weights, gains)
-    start = torch.zeros(len(gaussians), 3, dtype=torch.float64, device=device)
-    offsets, report = solve_colors(system, start, options)
-    if not report.accepted:
-        return gaussians, report
-    return replace(gaussians, sh0=add_offsets(gaussians.sh0.double(), offsets[:, None]).float()), report
+    return _DeviceSystem(
+        gaussians, photos, options, images, weights, weights, torch.ones(len(photos), 3, device=device)
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,19 +53,15 @@ class _DeviceSystem:
         shape, colors = shape_of(self.gaussians), x.float()
         return torch.stack([image + draw_black(shape, colors, self.photos, i) for i, image in enumerate(self.images)])
 
-    def _draw(self, x: Tensor, view: int) -> tuple[Tensor, Transpose]:
-        """Multiply the matrix of a view by ``x``: an image ``[h,w,3]``, and the matrix' transpose."""
-        return draw_and_transpose(shape_of(self.gaussians), x.float(), self.photos, view)
-
     def score(self, x: Tensor | None = None) -> float:
         images = self.images if x is None else self._fitted(x)
-        return holdout_psnr(images, self.photos.images, self.train, self.options.tuning.min_gain)
+        return score_blocks(images, self.photos.images, self.train, self.options.tuning.min_gain)
 
     def residual(self, x: Tensor) -> tuple[Tensor, Tensor]:
         mass, gradient = torch.zeros_like(x), torch.zeros_like(x)
         for view, image in enumerate(self.images):
             weight, gain = self.weights[view][..., None], self.gains[view]
-            added, transpose = self._draw(x, view)
+            added, transpose, _ = draw_and_transpose(shape_of(self.gaussians), x.float(), self.photos, view)
             residual = weight * (self.photos.images[view] - gain * (image + added))
             mass += transpose(weight.expand_as(image)) * gain**2
             gradient += transpose(residual) * gain
@@ -84,7 +70,7 @@ class _DeviceSystem:
     def normal(self, x: Tensor) -> Tensor:
         total = torch.zeros_like(x)
         for view in range(len(self.images)):
-            image, transpose = self._draw(x, view)
+            image, transpose, _ = draw_and_transpose(shape_of(self.gaussians), x.float(), self.photos, view)
             total += transpose(image * self.weights[view][..., None]) * self.gains[view] ** 2
         return total
 
@@ -94,5 +80,5 @@ class _DeviceSystem:
         error = ((photos - images) ** 2).mean(-1).sqrt()
         robust = base * (tuning.huber / error.clamp_min(1e-6)).clamp_max(1)
         calm = base * (error < 2 * tuning.huber)
-        gains = exposure_gains(images, photos, calm, tuning.min_gain, tuning.max_gain)
+        gains = match_exposures(images, photos, calm, tuning.min_gain, tuning.max_gain)
         return replace(self, weights=robust, gains=gains)

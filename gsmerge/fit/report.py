@@ -1,4 +1,4 @@
-"""What a fit returns and reports."""
+"""What a fit reports, and its result."""
 
 from __future__ import annotations
 
@@ -8,10 +8,8 @@ from typing import Any
 import numpy as np
 
 from gsmerge.runtime.record import choose, note, report_progress
-from gsmerge.settings.fit import LONG_STEPS, USUAL_SHARE, Fit, FitOptions, Tuning  # noqa: F401
 from gsmerge.types import Cameras, Gaussians
 
-EARLIER = 0.1  # share of the steps by which half-size photos end sooner where larger ones follow
 HAZE = 0.05  # far fog above which a result gets a note: plain to see in a viewer
 
 
@@ -35,6 +33,9 @@ class FitReport:
     def to_dict(self) -> dict[str, Any]:
         """Return all but the arrays, as plain values."""
         return {name: value for name, value in vars(self).items() if name not in ("viewmats", "origins")}
+
+
+FitResult = tuple[Gaussians, FitReport]
 
 
 @dataclass(frozen=True, eq=False)

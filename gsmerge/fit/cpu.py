@@ -1,0 +1,184 @@
+"""The engine of the fit on the CPU: the rasterizer, its gradient and the optimiser are the project's kernels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gsmerge.fit.color import draw, fit_colors
+from gsmerge.fit.engine import FitBackend
+from gsmerge.fit.fit_state import State
+from gsmerge.fit.loss import image_gradient
+from gsmerge.fit.outside import fog_gradients
+from gsmerge.fit.photo_sizes import holdout_psnr
+from gsmerge.fit.report import FitResult
+from gsmerge.fit.schedule import FitPlan, Step, loss_weights, step_sizes
+from gsmerge.fit.survey import Survey, survey_photos
+from gsmerge.geometry import motion_matrices
+from gsmerge.kernels.elementary import power
+from gsmerge.kernels.gaussians import optimise as kernels
+from gsmerge.kernels.matrices import matmul
+from gsmerge.kernels.raster.blend import MAX_ALPHA
+from gsmerge.raster import composite, plan_view, splat_adjoint
+from gsmerge.raster.composite import blend, view_colors
+from gsmerge.raster.gradient import Gradients, gradients_of
+from gsmerge.raster.photos import Photos, photo_errors, photo_psnr, render_photos
+from gsmerge.runtime.threads import in_turn, parallel_map
+from gsmerge.settings.fit import Tuning
+from gsmerge.types import Gaussians
+
+ROWS = 16384  # Gaussians per piece of an optimiser step
+EPS = 1e-15  # of Adam
+
+
+@dataclass(frozen=True, eq=False)
+class _CpuEngine:
+    """Engine of arrays, see :class:`gsmerge.fit.engine.Engine`; its states are those of the host."""
+
+    plan: FitPlan
+    photos: tuple[Photos, ...]  # Those of the plan's job, at the poses of the moment
+    poses: PoseState | None = None  # The motions of the cameras; None where they are fixed
+    read_every: int = 1
+
+    @property
+    def viewmats(self) -> np.ndarray | None:
+        return None if self.poses is None else self.poses.viewmats
+
+    def at_poses(self, viewmats: np.ndarray) -> _CpuEngine:
+        poses, photos = start_poses(tuple(replace(photos, viewmats=viewmats) for photos in self.photos))
+        return replace(self, photos=photos, poses=poses)
+
+    def survey(self, gaussians: Gaussians) -> Survey:
+        return survey_photos(gaussians, self.photos, self._score_images)
+
+    def start(self, state: State) -> State:
+        return state
+
+    def read(self, state: State) -> State:
+        return state
+
+    def warm_up(self, state: State) -> None:
+        """Do nothing: the kernels are compiled."""
+
+    def step(self, state: State, step: Step) -> float:
+        photos, mode, opacities = self.photos[step.mode.size], step.mode, None
+        weight = self.plan.step_weights[mode.size][step.view]
+        if step.kept is not None:
+            fuller = state.splats.opacities / np.float32(1 - self.plan.dropout)
+            opacities = step.kept * np.minimum(fuller, MAX_ALPHA)
+        camera = photos.camera(step.view) | {"eps2d": mode.eps2d, "antialiased": mode.antialiased}
+        drawn = plan_view(state.splats, **camera, opacities=opacities)
+        all_colors = state.view_colors()
+        colors = view_colors(drawn) if all_colors is None else all_colors.take(drawn.ids, 0)
+        image, transmittance = blend(drawn, colors, step.background)
+        rates = self.plan.job.options.tuning
+        weights = loss_weights(rates, step.progress)
+        gradient, error = image_gradient(image, photos.image(step.view), weight, *weights)
+        with_viewmat = self.poses is not None
+        g = gradients_of(drawn, colors, image, transmittance, gradient, None, with_viewmat=with_viewmat)
+        if self.poses is not None and g.viewmat is not None:  # that harmonics change with the camera is left out
+            self.poses.step(step.view, g.viewmat, rates, step.progress)
+        self._move(state, g, step)
+        return error / max(3 * float(weight.sum()), 1)
+
+    def clear_fog(self, state: State, step: Step, view: int) -> None:
+        assert self.plan.job.outside is not None
+        self._move(state, fog_gradients(state.splats, self.plan.job.outside, view), step)
+
+    def _move(self, state: State, g: Gradients, step: Step) -> None:
+        """Take one Adam step along gradients."""
+        s, options, count = state.splats, self.plan.job.options, max(len(state.x), 1)
+        if state.fixed.any():
+            g = g[~state.fixed[g.ids]]
+        rates = options.tuning
+        steps = step_sizes(rates, step.progress, options.steps)
+        limits = np.array([rates.max_mean_shift, rates.max_scale_change, rates.max_opacity_change], np.float32)
+        betas = np.array([rates.beta1, rates.beta2], np.float32)
+        regs = np.array([rates.opacity_reg / count, rates.scale_reg / count], np.float32)
+
+        def update(first: int) -> None:
+            last = min(first + ROWS, len(g.ids))
+            kernels.adam(
+                state.x, state.x0, state.m, state.v, state.units, state.box_shares, state.min_sizes, g.ids,
+                g.means, g.quats, g.scales, g.opacities, g.colors, steps, limits, betas, regs, step.number,
+                first, last, s.means, s.quats, s.scales, s.opacities, state.colors,
+            )  # fmt: skip
+
+        parallel_map(update, range(0, len(g.ids), ROWS))
+
+    def score(self, state: State) -> float:
+        return self._score_images(render_photos(state.splats, self.photos[1], colors=state.view_colors()))
+
+    def _score_images(self, images: Sequence[np.ndarray]) -> float:
+        options = self.plan.job.options
+        if options.fit == "none":
+            return float("nan")
+        return holdout_psnr(images, self.photos[1], self.plan.weights[1], options.tuning.min_gain)
+
+    def error_masses(self, state: State) -> np.ndarray:
+        photos = self.photos[1]
+
+        def one_view(view: int) -> np.ndarray:
+            plan = plan_view(state.splats, **photos.camera(view))
+            image, _ = composite(plan, state.view_colors())
+            return splat_adjoint(plan, np.abs(image - photos.image(view)).mean(-1, keepdims=True))[:, 0]
+
+        masses = np.zeros(len(state.x))
+        for of_view in in_turn(one_view, range(len(photos))):
+            masses += of_view
+        return masses
+
+    def fit_colors(self, gaussians: Gaussians) -> FitResult:
+        half, job = self.photos[1], self.plan.job
+        return fit_colors(gaussians, draw(gaussians, half), half, job.options, job.seed)
+
+    def photo_error(self, gaussians: Gaussians) -> float:
+        photos = self.photos[0]
+
+        def score(view: int, image: np.ndarray, _: np.ndarray) -> float:
+            return float(((np.clip(image, 0, 1) - photos.images[view]) ** 2).mean(dtype=np.float64))
+
+        return float(np.mean(photo_errors(gaussians, photos, score)))
+
+
+ON_CPU = FitBackend("cpu", lambda plan: _CpuEngine(plan, plan.job.photos), photo_psnr)
+
+
+@dataclass(eq=False)
+class PoseState:
+    """Motions of the views under optimisation; their mean stays zero, so that the scene stays where it is."""
+
+    start: np.ndarray  # [v,4,4] viewmats before the fit
+    viewmats: np.ndarray  # [v,4,4] float64, updated by steps, shared with all photos
+    # [v,6] motion of each, see gsmerge.geometry.motion_vectors: about the scene's middle, where
+    # turns and shifts of a camera show differently
+    x: np.ndarray
+    m: np.ndarray  # First moment
+    v: np.ndarray  # Second moment
+    counts: np.ndarray  # [v] steps of each
+    pixel: float  # Angle of a pixel, radians; also its size at the scene's depth
+
+    def step(self, view: int, gradient: np.ndarray, rates: Tuning, progress: float) -> None:
+        """Take one Adam step of a view by the gradient ``[4,4]`` of its viewmat; steps fall to zero at the end."""
+        turns = matmul(self.viewmats[view, :3, :3].T, gradient[:3])
+        (_, ab, ac), (ba, _, bc), (ca, cb, _) = turns[:, :3]
+        slope = np.array([cb - bc, ac - ca, ba - ab, *turns[:, 3]])
+        self.counts[view] += 1
+        for moment, beta, value in ((self.m, rates.beta1, slope), (self.v, rates.beta2, slope**2)):
+            moment[view] += (1 - beta) * (value - moment[view])
+        first_left, second_left = power([rates.beta1, rates.beta2], self.counts[view])
+        first, second = self.m[view] / (1 - first_left), self.v[view] / (1 - second_left)
+        self.x[view] -= rates.poses_lr * self.pixel * (1 - progress) * first / (np.sqrt(second) + EPS)
+        self.x -= self.x.mean(0)
+        self.viewmats[:] = matmul(self.start, motion_matrices(self.x))
+
+
+def start_poses(photos: tuple[Photos, ...]) -> tuple[PoseState, tuple[Photos, ...]]:
+    """Return zero motions at the poses of some photos, and the photos with viewmats shared with them."""
+    start = photos[0].viewmats.astype(np.float64)
+    zero, shared = np.zeros((len(start), 6)), start.copy()
+    pixel = 1 / float(photos[0].Ks[:, [0, 1], [0, 1]].mean())
+    state = PoseState(start, shared, zero, zero.copy(), zero.copy(), np.zeros(len(start), np.int64), pixel)
+    return state, tuple(replace(some, viewmats=shared) for some in photos)

@@ -1,0 +1,188 @@
+"""What each step of a full fit does: how it draws, which view, background and Gaussians it takes, how far it goes.
+
+An engine does the steps (:class:`gsmerge.fit.engine.Engine`); here is what engines have in common.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmerge.fit.photo_sizes import HIDDEN, reduced, training_weights
+from gsmerge.kernels.elementary import power
+from gsmerge.raster.photos import Photos
+from gsmerge.settings.fit import LONG_STEPS, FitOptions, Tuning
+from gsmerge.types import Gaussians
+
+EARLIER = 0.1  # share of the steps by which half-size photos end sooner where larger ones follow
+GROWTH = 0.5  # part of the run after which Gaussians are added
+FEW_VIEWS = 5  # views up to which a run of MANY_STEPS memorises the photos, unless Gaussians are dropped
+MANY_STEPS = 150
+DROPOUT = 0.1  # share of the Gaussians that a step leaves out with few views
+LONG_DROPOUT = 0.05  # the same in runs of LONG_STEPS that look at each view often
+LONG_LOOKS = 30
+LARGE_STEPS = (0, 2)  # of every five, look at larger photos; with more of them the views' own size gets worse
+PROBE = 6  # steps that are timed to plan a time budget
+MAX_STEPS = 2000
+LONG_RUN = 300  # steps beyond which the last ones shrink in proportion
+# How steps after those on half-size photos draw, in turn: whether at half size, the low-pass as a share of the
+# viewers' own, and whether small Gaussians are made clearer by what it adds to them. Some viewers do that, enlarged
+# twice the low-pass is a quarter, and from afar it covers more of the scene: what was fitted to one way alone looks
+# thin or fat in the others (Mip-Splatting, Yu et al. 2024).
+DRAW_MODES = (
+    (0, 1.0, True), (0, 1.0, False), (0, 0.25, False), (1, 1.0, False),
+    (0, 1.0, False), (0, 1.0, False), (0, 0.25, False), (0, 1.0, False),
+    (0, 1.0, True), (1, 1.0, False), (0, 0.25, False), (0, 1.0, False),
+    (0, 1.0, False), (0, 1.0, False), (0, 0.25, False), (1, 1.0, False),
+)  # fmt: skip
+
+Progress = Callable[[int, int, float, float], None]  # step, steps, PSNR of the photos and of their held-out blocks
+
+
+@dataclass(frozen=True, eq=False)
+class FitJob:
+    """What to fit to, and how."""
+
+    photos: tuple[Photos, ...]  # At full and at half size, and larger if the fit is to see them
+    options: FitOptions
+    count: int = 0  # Gaussians to grow to, where the run is long enough
+    seed: int = 0
+    progress: Progress | None = None  # Called after steps, on a GPU after some of them
+    baseline_start: Gaussians | None = None  # Another start to beat instead, see gsmerge.fit.full.judge
+    fixed: np.ndarray | None = None  # [n] bool, Gaussians that stay as they are; None: none
+    outside: Photos | None = None  # Views in which some steps clear fog, see gsmerge.fit.outside; None: none
+
+
+@dataclass(frozen=True)
+class DrawMode:
+    """How a step draws the scene."""
+
+    size: int  # Of the photos: 0 full, 1 half, 2 larger
+    eps2d: float  # Low-pass, pixels squared
+    antialiased: bool = False  # Whether small Gaussians are made clearer by it
+
+
+@dataclass(frozen=True)
+class FitPlan:
+    """Plan of a full fit: weights and shares of the steps."""
+
+    job: FitJob
+    # [h,w] float32 of each photo at full and at half size: 0 on held-out blocks, `HIDDEN` on pixels
+    # that neither steps nor scores use, 1 elsewhere
+    weights: tuple[list[np.ndarray], list[np.ndarray]]
+    # The same as a step uses them, at every size: 0 on hidden pixels; at full size 1 on held-out
+    # blocks, too, and larger photos count everywhere
+    step_weights: tuple[list[np.ndarray], ...]
+    dropout: float  # Share of the Gaussians that a step leaves out
+    half_part: float  # Share of the steps, the first ones, on half-size photos
+
+    def outside_view(self, step: int, progress: float) -> int | None:
+        """Return the view from outside that is looked at after a step, from 1; None: none."""
+        outside, rates = self.job.outside, self.job.options.tuning
+        if outside is None or progress < rates.outside_from or step % rates.outside_every:
+            return None
+        return step // rates.outside_every % len(outside)
+
+    def draw_mode(self, step: int, progress: float) -> DrawMode:
+        """Return how a step, from 1, draws the scene.
+
+        Half-size photos come first. Then photos are drawn in turn in the ways of viewers; larger
+        ones in between show what an enlarged view shows.
+        """
+        photos = self.job.photos
+        if progress < self.half_part:
+            return DrawMode(1, photos[1].eps2d)
+        if len(photos) > 2 and step % 5 in LARGE_STEPS:
+            return DrawMode(2, photos[2].eps2d)
+        size, share, antialiased = DRAW_MODES[step % len(DRAW_MODES)]
+        # From afar costs short runs more than it gains; beside larger photos, which are for looking
+        # closely, every third such look is enough
+        if not self.job.options.grows or (len(photos) > 2 and step % 3):
+            size = 0
+        return DrawMode(size, share * photos[0].eps2d, antialiased)
+
+
+def plan_run(job: FitJob) -> FitPlan:
+    """Plan a fit: held-out blocks, pixels outside masks, and dropout where there are few views."""
+    photos, options = job.photos, job.options
+    full = training_weights(photos[0], options.holdout, job.seed)
+    few = len(photos[0]) <= FEW_VIEWS and options.steps >= MANY_STEPS
+    long = options.steps >= max(LONG_STEPS, LONG_LOOKS * len(photos[0]))
+    default = DROPOUT if few else LONG_DROPOUT if long else 0.0
+    dropout = default if options.dropout is None else options.dropout
+    weights = full, reduced(full, photos[1])
+    everywhere, *larger = (_weights_of(one) for one in (photos[0], *photos[2:]))
+    trained = [np.where(weight == HIDDEN, np.float32(0), weight) for weight in weights[1]]
+    if len(photos[0]) == 1:  # no other photo shows what is held out: the fit is judged by all that it sees
+        weights = weights[0], [np.where(weight == 1, np.float32(0), weight) for weight in weights[1]]
+    half_part = options.half_res_part
+    if len(photos) > 2 and options.half_res_share is None:
+        half_part -= EARLIER
+    return FitPlan(job, weights, (everywhere, trained, *larger), dropout, half_part)
+
+
+def _weights_of(photos: Photos) -> list[np.ndarray]:
+    """Return the weights ``[h,w]`` of all pixels of each photo."""
+    if photos.weights is None:
+        return [np.ones((photos.height, photos.width), np.float32)] * len(photos)
+    return list(photos.weights)
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """What a step does."""
+
+    number: int  # From 1
+    progress: float  # Share of the steps before it
+    mode: DrawMode
+    view: int
+    background: np.ndarray  # [3] float32
+    kept: np.ndarray | None  # [n] bool, the Gaussians that dropout leaves in; None: all
+
+
+class Schedule:
+    """Draws the order of the views, the backgrounds and the Gaussians that steps leave out.
+
+    All engines follow it, so they take the same steps. One generator draws everything, a step's
+    dropout after its background: a generator of its own for dropout would change all results of
+    few views and of long runs.
+    """
+
+    def __init__(self, plan: FitPlan):
+        self.plan, self.rng = plan, np.random.default_rng(plan.job.seed)
+        self.queue: list[int] = []
+
+    def draw(self, number: int, progress: float, count: int) -> Step:
+        """Draw a step, from 1, of ``count`` Gaussians; every view comes once before any comes again."""
+        if not self.queue:
+            self.queue = self.rng.permutation(len(self.plan.job.photos[0])).tolist()
+        view, background, kept = self.queue.pop(), self.rng.random(3, dtype=np.float32), None
+        if self.plan.dropout > 0:
+            kept = self.rng.random(count, dtype=np.float32) >= self.plan.dropout
+        return Step(number, progress, self.plan.draw_mode(number, progress), view, background, kept)
+
+
+def loss_weights(rates: Tuning, progress: float) -> tuple[float, float]:
+    """Return the weights of structural similarity and of edges in the loss of a step."""
+    return rates.ssim_lambda, rates.edge_weight * progress
+
+
+def step_sizes(rates: Tuning, progress: float, steps: int) -> np.ndarray:
+    """Return the step of each of the fourteen columns, decaying geometrically, and farther in longer runs."""
+    decay = rates.decay * min(1.0, LONG_RUN / steps)
+    each = [rates.means_lr, rates.scales_lr, rates.quats_lr, rates.opacities_lr, rates.colors_lr]
+    return (np.repeat(each, [3, 3, 4, 1, 3]) * power(decay, progress)).astype(np.float32)
+
+
+def affordable_steps(seconds: float, plan: FitPlan) -> int:
+    """Return the steps that fit into the time budget, from the time of the first PROBE steps at half size.
+
+    A step at full size costs up to three times as much, one on larger photos more by their pixels.
+    """
+    budget, coarse = plan.job.options.time_budget, plan.half_part
+    assert budget is not None
+    pixels = [photos.height * photos.width for photos in plan.job.photos]
+    mean_step = seconds / PROBE * (coarse + 3 * (1 - coarse) * (1 + max(pixels) / pixels[0]) / 2)
+    return int(np.clip((budget - seconds) / mean_step + PROBE, PROBE + 1, MAX_STEPS))
