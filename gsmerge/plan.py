@@ -20,10 +20,10 @@ from gsmerge.fit.fit_options import USUAL_SHARE
 from gsmerge.fit.gpu import choose_backend
 from gsmerge.options import CompactOptions
 from gsmerge.runtime.record import note, stage
-from gsmerge.stages.agreement import measured_share
 from gsmerge.stages.assign import merge_unseen
 from gsmerge.stages.clean import CleanOptions, clean
 from gsmerge.stages.decode import USUAL_K, DecodeOptions
+from gsmerge.stages.encode import measured_share
 from gsmerge.stages.match import MatchOptions, Method
 from gsmerge.stages.segment import CountLimits, SceneSize, SuperpixelPlan, count_limits, measure_size, scene_tree
 from gsmerge.stages.superpixels import AUTO_SHARE, SHARE, SegmentOptions
