@@ -31,9 +31,9 @@ from gsmerge.settings.stages import (
     Method,
     SegmentOptions,
 )
-from gsmerge.stages.agreement import measured_share
 from gsmerge.stages.assign import merge_unseen
 from gsmerge.stages.clean import clean
+from gsmerge.stages.encode import measured_share
 from gsmerge.stages.segment import CountLimits, SceneSize, SuperpixelPlan, count_limits, measure_size, scene_tree
 from gsmerge.types import Gaussians, Scene
 

@@ -16,6 +16,7 @@ from gsmerge.types import Array, Cameras, Gaussians, Scene, as_tensor
 
 if TYPE_CHECKING:
     import torch
+
 ONE_AT_A_TIME = 4_000_000  # Gaussians; the plan of a view is as large as they are
 MIN_ALPHA = 0.5  # opacity of a pixel from which it counts when superpixels are merged
 
