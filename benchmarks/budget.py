@@ -26,7 +26,7 @@ from gsmerge.raster.photos import scene_photos
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.decode import DecodeOptions, decode, split_counts
 from gsmerge.stages.encode import encode
-from gsmerge.stages.region_tree import auto_count, cut_tree, pixel_depths, region_tree
+from gsmerge.stages.segment import auto_count, cut_tree, pixel_depths, region_tree
 from gsmerge.stages.superpixels import SegmentOptions, segment
 from gsmerge.types import Gaussians, Groups, Scene
 

@@ -132,7 +132,7 @@ def _targets(scene: Path, recovery: Recovery | None, nested: float) -> Targets:
 
 def _line(row: dict[str, Any]) -> str:
     cells = [f"{row['scene']:<11}{row['style']:<12}{row['views']!s:>5}", f"{row['seconds']:7.1f} CPU s"]
-    cells.append("pixels" if row["aligned"] else "loose ")
+    cells.append("pixels" if row["aligned"] else "unaligned ")
     cells.append(f"{100 * row['at home']:8.3f} % at home, margin {row['margin']:7.0f}")
     if "psnr" in row:
         cells.append(f"kept {100 * row['kept']:.2f} %, {row['psnr']:.2f} dB")

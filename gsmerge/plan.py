@@ -14,7 +14,7 @@ from gsmerge.budget import AUTO, BudgetOptions, exact_count
 from gsmerge.errors import UsageError
 from gsmerge.facts.partition import usual_blocks
 from gsmerge.facts.prepare import Prepared
-from gsmerge.facts.views import camera_kinds, report_views, scored_views
+from gsmerge.facts.views import report_views, scored_views
 from gsmerge.fit import FitBackend, FitOptions, photo_scale, start_share
 from gsmerge.fit.fit_options import USUAL_SHARE
 from gsmerge.fit.gpu import choose_backend
@@ -25,7 +25,7 @@ from gsmerge.stages.assign import merge_unseen
 from gsmerge.stages.clean import CleanOptions, clean
 from gsmerge.stages.decode import USUAL_K, DecodeOptions
 from gsmerge.stages.match import MatchOptions, Method
-from gsmerge.stages.segment import CountLimits, SuperpixelPlan, count_limits, scene_tree
+from gsmerge.stages.segment import CountLimits, SceneSize, SuperpixelPlan, count_limits, measure_size, scene_tree
 from gsmerge.stages.superpixels import AUTO_SHARE, SHARE, SegmentOptions
 from gsmerge.types import Gaussians, Scene
 
@@ -118,19 +118,20 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         if clean_options.drop_sky and not prepared.photo_views:
             note("drop_sky: no photo is used that could say where the sky is, so it stays")
             clean_options = replace(clean_options, drop_sky=False)
-        decode = resolve_decode(options, scene, photos=has_photos)
+        decode = resolve_decode(options, measure_size(scene, photos=has_photos))
         if decode.k != options.decode.k and decode.max_k > USUAL_K:
             note(f"k: {decode.k}, because one camera shows the scene, and no long fit follows")
         options = replace(options, decode=decode)
         unseen, num_input = _merge_unseen(prepared, options, segment, clean_options)
-        limits = count_limits(
-            scene, segment, options.decode, options.budget,
+        whole = plan_whole(
+            measure_size(scene, photos=has_photos), replace(options, segment=segment),
             num_input=num_input, num_reserved=0 if unseen is None else len(unseen),
         )  # fmt: skip
+        limits = whole.limits
         backend, problem = choose_backend(options.device, given.num_gaussians)
         if problem is not None:
             note(problem)
-        fit = _resolve_fit_to(prepared, options, limits, backend)
+        fit = _fit_photos(prepared, options, whole.fit, backend)
     tree = None
     searches = options.budget.quality is not None or options.budget.auto or options.budget.levels > 1
     if own and (searches or limits.count is not None):
@@ -141,7 +142,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
     return Plan(
         superpixels=SuperpixelPlan(segment, limits, start_share(fit), tree),
         networks=networks,
-        match=replace(options.match, match=_match_method(options)),
+        match=replace(options.match, match=whole.match),
         decode=options.decode,
         fit=fit,
         clean=clean_options,
@@ -158,24 +159,69 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
     )
 
 
-def choose_blocks(scene: Scene, options: CompactOptions) -> int:
+@dataclass(frozen=True)
+class WholePlan:
+    """Decisions that take no work, about a scene as a whole: what a run, its estimate and its blocks share."""
+
+    blocks: int  # Parts in which the scene is compacted
+    decode: DecodeOptions  # Gaussians per group
+    limits: CountLimits  # Limits of the number of Gaussians
+    match: Method  # Of merging across views
+    checkpoint: str  # Name of the networks to load; "none"
+    fit: FitOptions  # With the steps that are taken
+
+    def settings(self, options: CompactOptions) -> dict[str, Any]:
+        """Return all settings by flat name, with those that the plan decides."""
+        return options.to_dict() | {"k": self.decode.k, "match": self.match, "checkpoint": self.checkpoint}
+
+
+def plan_whole(
+    scene: SceneSize, options: CompactOptions, *, num_input: int | None = None, num_reserved: int = 0
+) -> WholePlan:
+    """Decide what numbers of a scene can decide; UsageError where it cannot be done as asked.
+
+    ``num_input``, ``num_reserved``: as of :func:`gsmerge.stages.segment.count_limits`.
+    """
+    if not scene.photos:
+        options = replace(options, fit=replace(options.fit, fit="none"))
+    segment, decode = options.segment, resolve_decode(options, scene)
+    if segment.superpixels == AUTO_SHARE:  # which work on the scene decides
+        segment = replace(segment, superpixels=SHARE)
+    limits = count_limits(scene, segment, decode, options.budget, num_input=num_input, num_reserved=num_reserved)
+    fit = resolve_fit(options)
+    share = limits.share if fit.share is None else fit.share
+    fit = replace(fit, fit_steps=steps_for(options, scene.num_views, share), share=share)
+    match = options.match.match or ("overlap" if EFFORTS[options.effort].merges else "none")
+    networks = choose_networks(options, photos=scene.photos, aligned=scene.aligned)
+    return WholePlan(choose_blocks(scene, options), decode, limits, match, networks, fit)
+
+
+def choose_blocks(scene: SceneSize, options: CompactOptions) -> int:
     """Return the number of blocks in which a scene is compacted; UsageError where it cannot be in as many as asked."""
-    problems = _whole_needed(options)
-    if not scene.aligned:
-        problems.append("a scene without one Gaussian per pixel")
-    asked = wanted_blocks(options, len(scene.gaussians) if scene.aligned else 0)
+    problems = blocks_problems(scene, options)
+    asked = wanted_blocks(options, scene.num_gaussians if scene.aligned else 0)
     if options.blocks.blocks == "auto":
-        asked = min(len(scene), asked)
+        asked = min(scene.num_views, asked)
     if asked <= 1:
-        if options.blocks.engine.name != "local":
-            remedy = f"which {problems[0]} needs" if problems else "--blocks NUMBER makes several"
-            note(f"engine ray: the scene is compacted in one piece, on this machine; {remedy}")
         return 1
     if problems:
         raise UsageError(f"blocks {asked}: expected one piece (--blocks none) with {problems[0]}")
-    if asked > len(scene):
-        raise UsageError(f"blocks {asked}: expected at most one for each of {len(scene)} views")
+    if asked > scene.num_views:
+        raise UsageError(f"blocks {asked}: expected at most one for each of {scene.num_views} views")
     return asked
+
+
+def note_engine(scene: SceneSize, options: CompactOptions, blocks: int) -> None:
+    """Say that a cluster has nothing to do where a scene is compacted in one piece."""
+    if blocks == 1 and options.blocks.engine.name != "local":
+        problems = blocks_problems(scene, options)
+        remedy = f"which {problems[0]} needs" if problems else "--blocks NUMBER makes several"
+        note(f"engine ray: the scene is compacted in one piece, on this machine; {remedy}")
+
+
+def blocks_problems(scene: SceneSize, options: CompactOptions) -> list[str]:
+    """Name what keeps a scene from being cut into blocks."""
+    return [*_whole_needed(options), *([] if scene.aligned else ["a scene without one Gaussian per pixel"])]
 
 
 def wanted_blocks(options: CompactOptions, num_gaussians: int) -> int:
@@ -209,7 +255,7 @@ def choose_networks(options: CompactOptions, *, photos: bool, aligned: bool = Tr
 
     That is where no fit follows, or a short one of an effort that has the time for both, on scenes
     with one Gaussian per pixel (``aligned``), which the shipped networks learnt from
-    (docs/internals/networks.md). ``photos``: whether there are any to fit to.
+    (docs/laboratory/networks.md). ``photos``: whether there are any to fit to.
     """
     if options.checkpoint != "auto":
         return options.checkpoint
@@ -217,16 +263,6 @@ def choose_networks(options: CompactOptions, *, photos: bool, aligned: bool = Tr
     short = EFFORTS[options.effort].networks and steps <= SHORT_STEPS
     bare = not photos or options.fit.fit == "none"
     return "shipped" if aligned and (bare or short) else "none"
-
-
-def resolved_settings(options: CompactOptions, *, photos: bool) -> dict[str, Any]:
-    """Return all settings by flat name, with checkpoint and matching resolved."""
-    return options.to_dict() | {"checkpoint": choose_networks(options, photos=photos), "match": _match_method(options)}
-
-
-def _match_method(options: CompactOptions) -> Method:
-    """Return the method of merging views: as asked, or by effort."""
-    return options.match.match or ("overlap" if EFFORTS[options.effort].merges else "none")
 
 
 def load_networks(options: CompactOptions, scene: Scene, *, photos: bool) -> Checkpoint | None:
@@ -297,19 +333,19 @@ def _merge_unseen(
     return (clean(merged, clean_options, scene, prepared.frame.leave)[0] if clean_options.asked else merged), num_input
 
 
-def resolve_decode(options: CompactOptions, scene: Scene, *, photos: bool) -> DecodeOptions:
+def resolve_decode(options: CompactOptions, scene: SceneSize) -> DecodeOptions:
     """Fill in K: more where one camera sees a surface once, and no fit or a short one follows.
 
     With K = 1, 4.4 % of the pixels of one photo are too few to show it; of more views each has
-    Gaussians of its own. ``photos``: whether there are any to fit to.
+    Gaussians of its own.
     """
     decode, budget, segment = options.decode, options.budget, options.segment
     if decode.k != AUTO:
         return decode
     asked = budget != BudgetOptions() or segment.superpixels != SHARE
     other = options.method != "gsmerge" or options.recipe is not None or options.checkpoint not in ("auto", "none")
-    fits = photos and options.fit.fit != "none" and resolve_fit(options).steps > SHORT_STEPS
-    lone = scene.aligned and len(scene) > 0 and camera_kinds(scene.cameras).max() == 0
+    fits = scene.photos and options.fit.fit != "none" and resolve_fit(options).steps > SHORT_STEPS
+    lone = scene.aligned and scene.num_cameras == 1
     return replace(decode, k=LONE_K if lone and not (asked or other or fits) else USUAL_K)
 
 
@@ -325,7 +361,7 @@ def steps_for(options: CompactOptions, num_views: int, share: float = USUAL_SHAR
     """Return the steps of the full fit: as given, or by effort and more with the roots of views and ``share``.
 
     ``share``: Gaussians of the result for each pixel. A step looks at one view. Measurements are in
-    docs/internals/large-scenes.md.
+    docs/laboratory/large-scenes.md.
     """
     if options.fit.fit_steps is not None:
         return options.fit.fit_steps
@@ -335,16 +371,9 @@ def steps_for(options: CompactOptions, num_views: int, share: float = USUAL_SHAR
     return round(min(max(1.0, math.sqrt(share / USUAL_SHARE)), MOST_STEPS) * steps)
 
 
-def _resolve_fit_to(
-    prepared: Prepared, options: CompactOptions, limits: CountLimits, backend: FitBackend[Any]
-) -> FitOptions:
-    """Fill in the options of the fit that effort, scene and device decide."""
+def _fit_photos(prepared: Prepared, options: CompactOptions, fit: FitOptions, backend: FitBackend[Any]) -> FitOptions:
+    """Fill in the size of the photos that the fit sees, and whether it moves cameras."""
     scene = prepared.scene
-    if scene.images is None or not prepared.photo_views:
-        options = replace(options, fit=replace(options.fit, fit="none"))
-    fit = resolve_fit(options)
-    share = limits.share if fit.share is None else fit.share
-    fit = replace(fit, fit_steps=steps_for(options, len(scene), share), share=share)
     if scene.images is None or not fit.needs_photos:
         return replace(fit, photo_scale=1.0)
     auto = EFFORTS[options.effort].large_photos and backend.device == "cpu"

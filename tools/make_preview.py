@@ -1,4 +1,4 @@
-"""Makes docs/images/preview.jpg: the picture of the README's first command, of one view and from outside, as a JPEG.
+"""Makes docs/images/preview.jpg: the picture of the README's first commands, of one view and from outside, as a JPEG.
 
 python tools/make_preview.py
 """

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import os
+from dataclasses import dataclass, field, replace
 from string import Formatter
 from typing import Any
 
 from gsmerge.io import OUTPUT_FORMATS, output_format
 from gsmerge.io.formats.read import OpacityChoice
-from gsmerge.options import CompactOptions
-from gsmerge.runtime.cluster import Engine
+from gsmerge.options import CHECKPOINTS, CompactOptions
+from gsmerge.runtime.work import Engine
 from gsmerge.scene.content_hash import digest
 from gsmerge.scene.exporters import AUTO, ReadHints
 
@@ -81,3 +82,15 @@ class BatchOptions:
     def name(self) -> str:
         """Return a digest that is equal for runs that make the same results."""
         return digest({**self.result_settings(), "output": self.output, "cameras": self.cameras, "images": self.images})
+
+
+def with_whole_paths(options: BatchOptions) -> BatchOptions:
+    """Return the options with absolute paths, which mean the same on every node."""
+    settings = options.settings
+    if settings.checkpoint not in CHECKPOINTS:
+        settings = replace(settings, checkpoint=os.path.abspath(settings.checkpoint))
+    cameras, images = (
+        path if path is None or path.startswith("{") else os.path.abspath(path)
+        for path in (options.cameras, options.images)
+    )
+    return replace(options, settings=settings, cameras=cameras, images=images)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import os
 import socket
 from collections.abc import Callable, Mapping, Sequence
@@ -12,13 +11,13 @@ from typing import Any, TypeVar
 
 from gsmerge.errors import SceneError
 from gsmerge.io import atomic_output
-from gsmerge.report import csv_cell, document_head, file_sha256, human_bytes
+from gsmerge.report import csv_text, document_head, file_sha256, human_bytes, text_table
 from gsmerge.runtime.jsonl import each_line
 
 RECORDS, SUMMARY = "batch.jsonl", "summary.csv"
 DONE, FAILED, SKIPPED = "done", "failed", "skipped"  # of records
-# Of outcomes that are not recorded: another process has the scene, its process died, records cannot be written.
-BUSY, LOST, STUCK = "busy", "lost", "stuck"
+# Of outcomes that are not recorded: another process has the scene, records cannot be written.
+BUSY, STUCK = "busy", "stuck"
 COLUMNS = (
     "scene", "output", "status", "num_input", "num_output", "ratio", "bytes_input", "bytes_output", "psnr_before",
     "psnr_after", "seconds", "peak_memory_bytes", "attempt", "unmet", "worse", "error",
@@ -182,13 +181,8 @@ def write_summary(folder: Path) -> Path:
     records, read = folder / RECORDS, -1
     while (size := records.stat().st_size if records.exists() else 0) != read:  # other runs may add to them meanwhile
         rows = [row for _, row in sorted(newest_records(folder, row_of).items())]
-        with (
-            atomic_output(folder / SUMMARY, overwrite=True) as temporary,
-            temporary.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file,
-        ):
-            writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-            writer.writeheader()
-            writer.writerows({name: csv_cell(value) for name, value in row.items()} for row in rows)
+        with atomic_output(folder / SUMMARY, overwrite=True) as temporary:
+            temporary.write_text(csv_text(COLUMNS, rows), encoding="utf-8", errors="backslashreplace", newline="")
         read = size
     return folder / SUMMARY
 
@@ -210,15 +204,15 @@ def newest_records(folder: Path, keep: Callable[[dict[str, Any]], T]) -> dict[st
 
 def summary_lines(totals: Totals, path: Path | None) -> list[str]:
     """Format the totals of a run as a table for people."""
-    lines = _table(totals.rows)
-    more = totals.counts[DONE] - len(totals.rows)
-    lines += [f"... and {more:,} more"] if more > 0 else []
-    lines += [f"worse: {scene}: {why}" for scene, why in totals.worse]
-    more = totals.num_worse - len(totals.worse)
-    lines += [f"... and {more:,} more worse"] if more > 0 else []
-    lines += [f"failed: {scene}: {error}" for scene, error in totals.failures]
-    more = totals.counts[FAILED] - len(totals.failures)
-    lines += [f"... and {more:,} more failed"] if more > 0 else []
+    worse = [f"worse: {scene}: {why}" for scene, why in totals.worse]
+    failed = [f"failed: {scene}: {error}" for scene, error in totals.failures]
+    lines = list[str]()
+    for count, listed, shown, what in (
+        (totals.counts[DONE], len(totals.rows), _table(totals.rows), ""),
+        (totals.num_worse, len(worse), worse, " worse"),
+        (totals.counts[FAILED], len(failed), failed, " failed"),
+    ):
+        lines += [*shown, *([f"... and {count - listed:,} more{what}"] if count > listed else [])]
     counts = [f"{count:,} {status}" for status, count in totals.counts.items() if count or status == DONE]
     left = totals.total - totals.ended
     line = f"{totals.total:,} scenes: {', '.join(counts)}" + (f", {left:,} left" if left else "")
@@ -242,5 +236,4 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
         share = f"{100 * row['ratio']:.2f} %"
         counts = f"{row['num_output']:,}", f"{row['num_input']:,}"
         cells.append((row["output"], *counts, share, *quality, f"{row['seconds']:.1f}"))
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    return ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in cells]
+    return text_table(cells)

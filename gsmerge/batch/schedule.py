@@ -5,25 +5,26 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Generator, Iterator, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 from heapq import nlargest
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
-from gsmerge.batch.batch_options import BatchOptions
+from gsmerge.batch.batch_options import BatchOptions, with_whole_paths
 from gsmerge.batch.find import Job
-from gsmerge.batch.pools import LocalPool, RayPool, with_whole_paths
-from gsmerge.batch.records import BUSY, LOST, RECORDS, STUCK, RecordIndex, check_folder
-from gsmerge.batch.task import BatchContext, Task, record_failure, run_lock
-from gsmerge.errors import SceneError
-from gsmerge.plan import resolved_settings, steps_for
+from gsmerge.batch.records import BUSY, RECORDS, STUCK, RecordIndex, check_folder
+from gsmerge.batch.task import BatchContext, Task, clean_up, record_failure, run_lock, run_recorded
+from gsmerge.errors import SceneError, UsageError
+from gsmerge.plan import plan_whole
 from gsmerge.runtime.estimate import IMPORT_SECONDS, work_seconds
 from gsmerge.runtime.memory import human_bytes, machine_memory
 from gsmerge.runtime.threads import available_threads
+from gsmerge.runtime.work import SMALL_STORE, Cluster, Lost, ProcessPool, RayPool
 from gsmerge.scene.content_hash import cameras_of
 from gsmerge.scene.files import find_scene_files
+from gsmerge.stages.segment import SceneSize
 
 FREE_MEMORY_SHARE = 0.8  # of the free memory that is used by default
 POLL_SECONDS = 0.5  # between two queries of the pool
@@ -71,7 +72,7 @@ def free_memory() -> int | None:
 def estimate_seconds(jobs: Sequence[Job], options: BatchOptions, schedule: Schedule) -> float:
     """Estimate the wall time of scenes, within a factor of about two."""
 
-    total, usual = 0.0, resolved_settings(options.settings, photos=True)
+    total = 0.0
     for job in jobs:
         views = 1  # where cameras cannot be read
         with suppress(SceneError):
@@ -79,10 +80,13 @@ def estimate_seconds(jobs: Sequence[Job], options: BatchOptions, schedule: Sched
             cameras = None if files.cameras is None else cameras_of(files.cameras, files.ply.stem)
             views = max(1, len(cameras or ()))
         own = options.settings if job.work is None else job.work.settings
-        settings = usual if job.work is None else resolved_settings(own, photos=True)
-        each, steps = job.num_gaussians / views, steps_for(own, views)
-        seconds = work_seconds(job.num_gaussians, each, settings, photos=True, fit_steps=steps)
-        total += seconds / min(schedule.threads, views)
+        size = SceneSize(job.num_gaussians, views, 1, -(-job.num_gaussians // views), aligned=True, photos=True)
+        with suppress(UsageError):  # the run says so
+            whole = plan_whole(size, own)
+            seconds = work_seconds(
+                job.num_gaussians, size.width, whole.settings(own), photos=True, fit_steps=whole.fit.steps
+            )
+            total += seconds / min(schedule.threads, views)
     return IMPORT_SECONDS * bool(jobs) + total / max(1, min(schedule.jobs, len(jobs)))
 
 
@@ -109,18 +113,17 @@ def run_batch(
     with ExitStack() as stack:
         stack.enter_context(run_lock(folder, options.name()))
         options = replace(options, settings=replace(options.settings, threads=schedule.threads))
-        pool: LocalPool | RayPool
-        if options.engine == "ray":
+        context = BatchContext(folder, options, index.end)
+        pool: ProcessPool | RayPool = ProcessPool(schedule.jobs, schedule.threads, timeout=options.timeout)
+        if options.engine == "ray":  # scenes and output folder must have the same paths on all its nodes
             context = BatchContext(folder.absolute(), with_whole_paths(options), index.end)
-            pool = RayPool(context, schedule.jobs)
-        else:
-            context = BatchContext(folder, options, index.end)
-            pool = LocalPool(context, schedule.jobs)
-        stack.callback(pool.close)
+            cluster = stack.enter_context(closing(Cluster(options.address, store_bytes=SMALL_STORE)))
+            pool = RayPool(cluster, schedule.threads, jobs=schedule.jobs, timeout=options.timeout)
+        stack.callback(lambda: clean_up(pool.close(), context))
         yield from dispatch((Task(job, index.known.get(job.output)) for job in jobs), pool, context)
 
 
-def dispatch(tasks: Iterator[Task], pool: LocalPool | RayPool, context: BatchContext) -> Iterator[dict[str, Any]]:
+def dispatch(tasks: Iterator[Task], pool: ProcessPool | RayPool, context: BatchContext) -> Iterator[dict[str, Any]]:
     """Keep a pool busy until every scene has ended; SceneError if nothing can be recorded."""
     retried: deque[Task] = deque()  # their process died
     busy: deque[tuple[float, Task]] = deque()  # another run works on them; when to try again, and the task
@@ -134,7 +137,7 @@ def dispatch(tasks: Iterator[Task], pool: LocalPool | RayPool, context: BatchCon
 
     while True:
         while pool.has_room and (task := next_task()) is not None:
-            pool.submit(task)
+            pool.submit(task, run_recorded, task, context, memory=task.job.memory)
             active += 1
         if not active and not busy:
             return
@@ -143,11 +146,11 @@ def dispatch(tasks: Iterator[Task], pool: LocalPool | RayPool, context: BatchCon
             continue
         for task, outcome in pool.wait(POLL_SECONDS):
             active -= 1
-            if outcome["status"] == LOST and task.attempt <= context.options.retries:
-                retried.append(replace(task, attempt=task.attempt + 1))
-                continue
-            if outcome["status"] == LOST:
-                outcome = record_failure(task, context, outcome["error"])
+            if isinstance(outcome, Lost):
+                if task.attempt <= context.options.retries:
+                    retried.append(replace(task, attempt=task.attempt + 1))
+                    continue
+                outcome = record_failure(task, context, outcome.reason)
             if outcome["status"] == BUSY:
                 busy.append((time.monotonic() + BUSY_RETRY_SECONDS, task))
             elif outcome["status"] == STUCK:

@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -84,6 +85,17 @@ def run_task(task: Task, context: BatchContext, new_records: RecordIndex) -> dic
         return outcome
 
     return _locked(job, context, work)
+
+
+def run_recorded(task: Task, context: BatchContext) -> dict[str, Any]:
+    """Compact a scene in a process that keeps the index of new records from call to call, see :func:`run_task`."""
+    return run_task(task, context, new_records(context.folder, context.start))
+
+
+@lru_cache(maxsize=1)
+def new_records(folder: Path, start: int) -> RecordIndex:
+    """Return the index of records since the run began, one for all calls in a process."""
+    return RecordIndex(folder, start)
 
 
 def _locked(job: Job, context: BatchContext, work: Callable[[Path], dict[str, Any]]) -> dict[str, Any]:
@@ -183,10 +195,11 @@ def record_failure(task: Task, context: BatchContext, error: str) -> dict[str, A
     return _locked(task.job, context, work)
 
 
-def clean_up(task: Task, context: BatchContext) -> None:
-    """Remove the unfinished files of a scene whose process was ended on purpose; the next run may where that fails."""
-    with suppress(BusyError, SceneError, OSError), scene_lock(context.folder, task.job.output) as begun:
-        _clean(task.job, context, begun)
+def clean_up(tasks: Iterable[Task], context: BatchContext) -> None:
+    """Remove unfinished files of scenes whose processes were ended on purpose; the next run may where that fails."""
+    for task in tasks:
+        with suppress(BusyError, SceneError, OSError), scene_lock(context.folder, task.job.output) as begun:
+            _clean(task.job, context, begun)
 
 
 def _clean(job: Job, context: BatchContext, begun: Path) -> None:

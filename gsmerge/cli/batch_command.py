@@ -92,7 +92,7 @@ def batch(args: opt.Args) -> None:
             engine=args.engine, address=args.address,
         )  # fmt: skip
     if options.engine == "ray" and not args.dry_run:
-        from gsmerge.runtime.cluster import require_ray
+        from gsmerge.runtime.work import require_ray
 
         require_ray()
     index = RecordIndex(out)

@@ -105,7 +105,7 @@ def compact(args: opt.Args) -> None:
 
 def _with_engine(settings: CompactOptions, args: opt.Args) -> CompactOptions:
     """Return the settings with the engine that was asked for; UsageError where it is not installed."""
-    from gsmerge.runtime.cluster import Engine, require_ray
+    from gsmerge.runtime.work import Engine, require_ray
 
     with opt.usage_errors():
         engine = Engine(args.engine, args.address)

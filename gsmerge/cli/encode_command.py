@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from time import perf_counter
-from typing import Any
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say_notes, stage_progress
@@ -30,47 +28,13 @@ def encode(args: opt.Args) -> None:
 
         print_plan(args, files, settings, out, hints)
         return
-    from gsmerge.compaction.files import read_input
-    from gsmerge.encoded.gsm_file import save_encoded
-    from gsmerge.encoded.to_encoded import encode_scene
-    from gsmerge.io import atomic_output
-    from gsmerge.report import document_head, file_sha256, seconds_document
+    from gsmerge.encoded.to_encoded import encode_files, encoding_line
 
-    imported = perf_counter()
-    with atomic_output(out, overwrite=args.overwrite) as temporary:
-        given = read_input(files, opacity=args.opacity, hints=hints)
-        read = perf_counter()
-        with stage_progress(quiet=args.silent) as progress:
-            encoded = encode_scene(given.scene, settings, max_k=args.max_k, progress=progress)
-        done = perf_counter()
-        hashed: dict[str, Any] = {"sha256": file_sha256(*files.plys)}
-        hashed["bytes"] = sum(path.stat().st_size for path in files.plys)
-        texts = {"comments": list(given.comments), "notes": list(given.notes)}
-        save_encoded(temporary, encoded, overwrite=True, source={"name": files.ply.name, **hashed, **texts})
-    seconds = {"import": imported - start, "read": read - imported, "encode": done - read}
-    seconds["write"] = perf_counter() - done
-    own, size, about = encoded.settings, out.stat().st_size, encoded.about
-    counts = {"num_groups": len(encoded), "num_gaussians_at_most": encoded.max_gaussians, "max_k": own.max_k}
-    document = {
-        **document_head(),
-        "input": {"path": str(files.ply), "num_gaussians": own.num_input, **hashed, **given.recognised},
-        "output": {"path": str(out), "bytes": size, **counts},
-        "ratio_bytes": size / hashed["bytes"],
-        "options": about["options"],
-        "seed": about["options"]["seed"],
-        "choices": about["choices"],
-        **seconds_document(seconds),
-        "notes": [*given.notes, *about["notes"]],
-    }
+    before = {"import": perf_counter() - start}
+    with stage_progress(quiet=args.silent) as progress:
+        document = encode_files(
+            files, settings, out, max_k=args.max_k, opacity=args.opacity, hints=hints, overwrite=args.overwrite,
+            progress=progress, seconds_before=before,
+        )  # fmt: skip
     say_notes(document["notes"], quiet=args.silent)
-    print_document(document, _summary(document), as_json=args.json, quiet=args.quiet)
-
-
-def _summary(document: Mapping[str, Any]) -> str:
-    """Write the line that the command ends with."""
-    from gsmerge.report import human_bytes, seconds_line
-
-    scene, file = document["input"], document["output"]
-    line = f"{file['path']}: {scene['num_gaussians']:,} Gaussians -> {file['num_groups']:,} groups, "
-    line += f"{human_bytes(scene['bytes'])} -> {human_bytes(file['bytes'])} ({100 * document['ratio_bytes']:.0f} %); "
-    return f"{line}decodes to {file['num_gaussians_at_most']:,} Gaussians at most; {seconds_line(document)}"
+    print_document(document, encoding_line(document), as_json=args.json, quiet=args.quiet)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -29,7 +28,7 @@ def extend(args: opt.Args) -> None:
     hints = args.hints()
     if len(args.scenes) > 1 and (args.cameras is not None or args.images is not None):
         raise UsageError("--cameras and --images: expected one batch with them, got several; extend by one at a time")
-    from gsmerge.online.file import extend_file
+    from gsmerge.online.file import batch_line, extend_file
     from gsmerge.online.options import OnlineOptions
     from gsmerge.options import CompactOptions
 
@@ -49,21 +48,8 @@ def extend(args: opt.Args) -> None:
         documents.append(document)
         say_notes(document["notes"], quiet=args.silent)
         if not args.silent:
-            print(one_line(_summary(document)))
+            print(one_line(batch_line(document)))
     if args.json:
         from gsmerge.report import to_json
 
         sys.stdout.write(to_json({"batches": documents}))
-
-
-def _summary(document: Mapping[str, Any]) -> str:
-    """Write the line about a batch."""
-    from gsmerge.report import human_bytes, seconds_line
-
-    state, dropped = document["state"], document["num_covered"] + document["num_hidden"]
-    return (
-        f"{state['path']}: batch {state['num_batches']}, {document['num_views']} views,"
-        f" {document['num_input']:,} Gaussians -> {document['num_new']:,} groups: {document['num_joined']:,} joined"
-        f" others, {dropped:,} not needed; {document['num_groups']:,} groups in all,"
-        f" {human_bytes(state['bytes'])}; {seconds_line(document)}"
-    )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -175,18 +174,3 @@ def check_folder(folder: Path, inputs: tuple[Path, ...], *, overwrite: bool) -> 
         raise SceneError(folder, f"cannot be written: no permission for {nearest}", "name another with --output")
     if occupied and not overwrite:
         raise UsageError(f"{folder}: expected an empty folder; pass --overwrite to write into it")
-
-
-def source_of(ply: Path) -> Path | None:
-    """Find the scene that a file was compacted from beside it, as ``scene.ply`` for ``scene.compact.ply``."""
-    match = re.fullmatch(r"(.+)\.compact(\.level\d+)?(\.compressed)?\.(ply|spz|sog|splat)", ply.name)
-    source = None if match is None else ply.with_name(f"{match[1]}.ply")
-    return source if source is not None and source.is_file() else None
-
-
-def check_cameras(files: SceneFiles) -> None:
-    """Refuse a scene with neither cameras, beside it or inside, nor photos that they can be estimated for."""
-    from gsmerge.io.cameras.read import read_sharp_camera
-
-    if files.cameras is None and files.images is None and read_sharp_camera(files.ply) is None:
-        raise SceneError(files.ply, "no cameras beside it", "name them with --cameras")

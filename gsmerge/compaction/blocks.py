@@ -26,7 +26,7 @@ from gsmerge.facts.views import in_float64, subset
 from gsmerge.fit import fit_scene, peak_weights
 from gsmerge.options import CompactOptions
 from gsmerge.pipeline import start
-from gsmerge.plan import Plan, choose_networks, make_plan, resolve_decode, steps_for
+from gsmerge.plan import Plan, WholePlan, make_plan
 from gsmerge.raster import contributions, plan_view
 from gsmerge.raster import prepare as prepare_splats
 from gsmerge.raster.metrics import describe_loss
@@ -36,8 +36,7 @@ from gsmerge.runtime.memory import free_pages, peak_memory
 from gsmerge.runtime.record import Record, add_seconds, choose, current_record, note, record_part, stage
 from gsmerge.runtime.threads import in_turn
 from gsmerge.stages.clean import faintest_dropped
-from gsmerge.stages.segment import CountLimits, count_limits
-from gsmerge.stages.superpixels import AUTO_SHARE, SHARE
+from gsmerge.stages.superpixels import AUTO_SHARE
 from gsmerge.types import Decoded, Gaussians, Scene
 
 T = TypeVar("T")
@@ -51,20 +50,20 @@ MOST_DENSITY = 2.0  # times the superpixels of one piece, where a scene's views 
 SURPLUS = 1.03  # times an exact number of Gaussians: the faintest of what is too many are left out
 
 
-def compact_in_blocks(given: Scene, options: CompactOptions, count: int) -> CompactResult:
-    """Compact an aligned scene in ``count`` blocks of views.
+def compact_in_blocks(given: Scene, options: CompactOptions, whole: WholePlan) -> CompactResult:
+    """Compact an aligned scene in blocks of views, as many as its plan says.
 
     The views of each block are merged first, and of the Gaussians those are kept that belong to it, so that all blocks
     together have one set of Gaussians to start with. Then each block fits what its views see, its neighbours'
     Gaussians included, and keeps its own: where two blocks meet, both fit the same Gaussians to the same photos.
     """
     device, given = given.gaussians.device, given.numpy()
+    count, most = whole.blocks, whole.limits.count
     with stage("partition"):
         covisibility = measure_covisibility(given)
         blocks = partition_views(covisibility.weights, count)
         factors = count_factors(blocks, covisibility).tolist()
-        frame, whole = scene_frame(given), whole_limits(given, options)
-        options = with_whole_choices(options, given, whole)
+        frame, options = scene_frame(given), with_whole_choices(options, whole)
     size = gaussians_at_once(given.num_gaussians, count)
     memory = memory_bytes(size, photos=given.images is not None, num_rest=3 * given.gaussians.shN.shape[1])
     with options.blocks.engine.start(threads=options.threads, memory=memory) as work:
@@ -73,7 +72,7 @@ def compact_in_blocks(given: Scene, options: CompactOptions, count: int) -> Comp
         def pieces() -> Iterator[tuple[Any, ...]]:
             for block, factor in zip(blocks, factors, strict=True):
                 free_scene(given)
-                own = block_options(options, given, block, factor, whole.count)
+                own = block_options(options, given, block, factor, most)
                 yield subset(given, block.views), block, seen, own, frame
 
         parts = [part for part, _ in adopt_records(work.run("merge", start_part, count, pieces()))]
@@ -87,8 +86,8 @@ def compact_in_blocks(given: Scene, options: CompactOptions, count: int) -> Comp
         joined = Gaussians.concat([gaussians for gaussians, _ in fitted])
         owners = np.repeat(np.arange(count), [len(gaussians) for gaussians, _ in fitted])
         result = frame.leave(fit_seams(joined, owners, parts, options.seed))
-        if whole.count is not None and whole.count < len(result):
-            result = faintest_dropped(result, whole.count)
+        if most is not None and most < len(result):
+            result = faintest_dropped(result, most)
         everything = work.share(result)
         views = ((part, everything) for part in parts)
         scores = [psnr for psnr, _ in adopt_records(work.run("score", score_part, count, views))]
@@ -231,23 +230,14 @@ def free_scene(scene: Scene) -> None:
     free_pages([*vars(scene.gaussians).values(), *([] if scene.images is None else [scene.images])])
 
 
-def whole_limits(given: Scene, options: CompactOptions) -> CountLimits:
-    """Compute the limits of the number of Gaussians of all blocks together."""
-    segment, decode = options.segment, resolve_decode(options, given, photos=given.images is not None)
-    if segment.superpixels == AUTO_SHARE:  # which each block decides
-        segment = replace(segment, superpixels=SHARE)
-    return count_limits(given, segment, decode, options.budget)
-
-
-def with_whole_choices(options: CompactOptions, given: Scene, whole: CountLimits) -> CompactOptions:
+def with_whole_choices(options: CompactOptions, whole: WholePlan) -> CompactOptions:
     """Return the options with the steps of a fit of the whole, which blocks share by their views, and its networks."""
-    steps = steps_for(options, len(given), whole.share)
-    networks = choose_networks(options, photos=given.images is not None)
-    settings: dict[str, Any] = {"fit_steps": steps, "checkpoint": options.checkpoint if networks != "none" else "none"}
+    checkpoint = options.checkpoint if whole.checkpoint != "none" else "none"
+    settings: dict[str, Any] = {"fit_steps": whole.fit.steps, "checkpoint": checkpoint}
     if options.blocks.engine.name != "local" and os.path.isfile(options.checkpoint):
         settings["require_checkpoint"] = True  # a node without it would make other bytes
     options = options.with_settings(settings)
-    return replace(options, fit=replace(options.fit, share=whole.share))
+    return replace(options, fit=replace(options.fit, share=whole.limits.share))
 
 
 def block_options(
@@ -256,7 +246,7 @@ def block_options(
     """Return the options of a block: cameras and exposures stay, and ``factor`` times its share of the Gaussians.
 
     It has a share of the steps, too, so that each view is looked at as often as in one piece, and as many of them on
-    half-size photos. ``most``: Gaussians of all blocks together, see :func:`whole_limits`; None: as many as
+    half-size photos. ``most``: Gaussians of all blocks together, None: as many as
     ``superpixels`` and K give.
     """
     settings: dict[str, Any] = {"poses": "fixed", "exposure": "fixed", "blocks": "none", "budget": None}

@@ -12,11 +12,12 @@ from gsmerge.compaction.search import level_counts, search_count
 from gsmerge.facts.prepare import Prepared, prepare
 from gsmerge.options import CompactOptions
 from gsmerge.pipeline import build
-from gsmerge.plan import Plan, choose_blocks, make_plan
+from gsmerge.plan import Plan, make_plan, note_engine, plan_whole
 from gsmerge.runtime.record import Progress, record_part, record_run
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.read import as_scene
 from gsmerge.stages.clean import clean_to_count
+from gsmerge.stages.segment import measure_size
 from gsmerge.types import Scene, StrPath
 
 
@@ -36,8 +37,10 @@ def compact(
     options = (options or CompactOptions()).with_settings(settings)
     with use_threads(options.threads), record_run(progress):
         given = as_scene(scene)
-        blocks = choose_blocks(given, options)  # 1: one piece
-        return compact_in_blocks(given, options, blocks) if blocks > 1 else compact_piece(given, options)
+        size = measure_size(given.numpy())
+        whole = plan_whole(size, options)  # what needs no work to decide
+        note_engine(size, options, whole.blocks)
+        return compact_in_blocks(given, options, whole) if whole.blocks > 1 else compact_piece(given, options)
 
 
 def compact_piece(given: Scene, options: CompactOptions) -> CompactResult:

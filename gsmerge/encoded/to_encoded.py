@@ -5,20 +5,28 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 from gsmerge import __version__
 from gsmerge.budget import AUTO
+from gsmerge.compaction.files import read_input
 from gsmerge.compaction.search import choose_count
 from gsmerge.encoded.encoded import Encoded, StoredHeads, StoredSettings, without_members
+from gsmerge.encoded.gsm_file import save_encoded
 from gsmerge.encoded.to_gaussians import divide_all
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import Prepared, prepare
+from gsmerge.io import atomic_output
+from gsmerge.io.formats.read import OpacityChoice
 from gsmerge.options import CompactOptions
 from gsmerge.pipeline import merge_views
 from gsmerge.plan import Plan, make_plan, require_children
+from gsmerge.report import document_head, file_sha256, human_bytes, seconds_document, seconds_line
 from gsmerge.runtime.record import Progress, current_record, record_run, stage
 from gsmerge.runtime.threads import use_threads
+from gsmerge.scene.exporters import ReadHints
+from gsmerge.scene.files import SceneFiles
 from gsmerge.stages.decode import MAX_CHILDREN, keep_all, merged_count
 from gsmerge.stages.merge import MergedViews
 from gsmerge.stages.segment import knee_count
@@ -119,3 +127,53 @@ def _about(settings: Mapping[str, Any]) -> dict[str, Any]:
     record = current_record()
     choices = {name: value for name, value in record.choices.items() if name != "networks"}
     return {"gsmerge": __version__, "options": settings, "choices": choices, "notes": list(record.notes)}
+
+
+def encode_files(
+    files: SceneFiles,
+    settings: CompactOptions,
+    out: Path,
+    *,
+    max_k: int | None,
+    opacity: OpacityChoice = "auto",
+    hints: ReadHints,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+    seconds_before: Mapping[str, float] | None = None,
+) -> dict[str, Any]:
+    """Read a scene, encode it, write it to a file, and return the report as plain JSON types.
+
+    Arguments and errors are those of :func:`encode_scene` and :func:`gsmerge.compaction.files.compact_files`.
+    """
+    start = perf_counter()
+    with atomic_output(out, overwrite=overwrite) as temporary:
+        given = read_input(files, opacity=opacity, hints=hints)
+        read = perf_counter()
+        encoded = encode_scene(given.scene, settings, max_k=max_k, progress=progress)
+        done = perf_counter()
+        hashed: dict[str, Any] = {"sha256": file_sha256(*files.plys)}
+        hashed["bytes"] = sum(path.stat().st_size for path in files.plys)
+        texts = {"comments": list(given.comments), "notes": list(given.notes)}
+        save_encoded(temporary, encoded, overwrite=True, source={"name": files.ply.name, **hashed, **texts})
+    seconds = {**(seconds_before or {}), "read": read - start, "encode": done - read, "write": perf_counter() - done}
+    stored, size, about = encoded.settings, out.stat().st_size, encoded.about
+    counts = {"num_groups": len(encoded), "num_gaussians_at_most": encoded.max_gaussians, "max_k": stored.max_k}
+    return {
+        **document_head(),
+        "input": {"path": str(files.ply), "num_gaussians": stored.num_input, **hashed, **given.recognised},
+        "output": {"path": str(out), "bytes": size, **counts},
+        "ratio_bytes": size / hashed["bytes"],
+        "options": about["options"],
+        "seed": about["options"]["seed"],
+        "choices": about["choices"],
+        **seconds_document(seconds),
+        "notes": [*given.notes, *about["notes"]],
+    }
+
+
+def encoding_line(document: Mapping[str, Any]) -> str:
+    """Write the report of an encoding in a line."""
+    scene, file = document["input"], document["output"]
+    line = f"{file['path']}: {scene['num_gaussians']:,} Gaussians -> {file['num_groups']:,} groups, "
+    line += f"{human_bytes(scene['bytes'])} -> {human_bytes(file['bytes'])} ({100 * document['ratio_bytes']:.0f} %); "
+    return f"{line}decodes to {file['num_gaussians_at_most']:,} Gaussians at most; {seconds_line(document)}"

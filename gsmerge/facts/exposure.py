@@ -76,7 +76,7 @@ def equalise_exposure(scene: Scene, views: Sequence[int], exposure: Exposure) ->
     gains = _solve_gains(pairs, len(scene))
     if gains is None:
         return scene
-    factors = np.round(exp(gains), 3)
+    factors = exp(gains).round(3)
     low, high = factors.min(), factors.max()
     if low == high:
         return scene

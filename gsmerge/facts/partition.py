@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gsmerge.geometry import camera_centres, project
-from gsmerge.runtime.cluster import Engine
 from gsmerge.runtime.threads import parallel_map
+from gsmerge.runtime.work import Engine
 from gsmerge.types import Cameras, Scene
 
 GRID = 24  # cells along the longer side of a view's depth map

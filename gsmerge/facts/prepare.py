@@ -21,7 +21,7 @@ from gsmerge.facts.place_cameras import add_pictures, add_views
 from gsmerge.facts.views import distinct_views, subset
 from gsmerge.geometry import camera_depths, lower_median, project
 from gsmerge.kernels.matrices import matmul
-from gsmerge.raster.seen import seen_weights
+from gsmerge.raster.images import seen_weights
 from gsmerge.runtime.record import note, record_part, stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, Scene

@@ -11,24 +11,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gsmerge.kernels.signature import STATUS, f8, i4, native
+from gsmerge.kernels.signature import STATUS, declare, f8, i4
 
 Array = np.ndarray[Any, Any]
 
 
-@native(STATUS, a=f8("n", "i", "j"), b=f8("m", "j", "k"), out=f8("n", "i", "k", out=True))
-def _multiply_matrices(a, b, out):
-    """Write the products of matrices; ``b`` may be one for all."""
+# b may be one matrix for all
+_multiply_matrices = declare(
+    "multiply_matrices", STATUS, a=f8("n", "i", "j"), b=f8("m", "j", "k"), out=f8("n", "i", "k", out=True)
+)
 
 
-@native(i4(), a=f8("n", "d", "d", out=True), b=f8("n", "d", "k", out=True))
-def _solve_equations(a, b):
-    """Replace ``b`` by the solutions, overwriting ``a``, and return 0; 1 where a matrix is singular."""
+# Replaces b by the solutions, overwriting a, and returns 0; 1 where a matrix is singular.
+_solve_equations = declare("solve_equations", i4(), a=f8("n", "d", "d", out=True), b=f8("n", "d", "k", out=True))
 
 
-@native(a=f8("n", "d", "d", out=True), v=f8("n", "d", "d", out=True))
-def _diagonalise(a, v):
-    """Replace symmetric matrices by their eigenvalues on the diagonal; write their eigenvectors to the columns."""
+# Replaces symmetric matrices by their eigenvalues on the diagonal; writes their eigenvectors to the columns.
+_diagonalise = declare("diagonalise", a=f8("n", "d", "d", out=True), v=f8("n", "d", "d", out=True))
 
 
 def _wide(*arrays: ArrayLike) -> tuple[list[Array], np.dtype[Any]]:

@@ -7,27 +7,24 @@ from typing import Any
 import numpy as np
 
 from gsmerge.kernels.elementary import exp
-from gsmerge.kernels.signature import STATUS, f4, native
+from gsmerge.kernels.signature import STATUS, declare, f4
 
 SLOPE, SMOOTH = np.array([-1, 0, 1], np.float32), np.array([1, 2, 1], np.float32)  # Sobel's filters
 Picture = np.ndarray[Any, Any]
 CUBIC = -0.75  # slope parameter of the cubic convolution (Keys 1981), OpenCV's
 
 
-@native(
-    STATUS, picture=f4("height", "width", "channels"), across=f4("taps_across"), down=f4("taps_down"),
+_filter_picture = declare(
+    "filter_picture", STATUS, picture=f4("height", "width", "channels"), across=f4("taps_across"), down=f4("taps_down"),
     padded=f4("room", out=True), rows=f4("padded_height", "width", "channels", out=True),
     out=f4("height", "width", "channels", out=True),
 )  # fmt: skip
-def _filter_picture(picture, across, down, padded, rows, out):
-    """Write what :func:`convolve` returns; ``padded`` and ``rows`` are overwritten."""
 
 
-@native(
-    STATUS, picture=f4("height", "width", "channels"), x=f4("n"), y=f4("n"), out=f4("n", "channels", out=True),
+_sample_picture = declare(
+    "sample_picture", STATUS, picture=f4("height", "width", "channels"), x=f4("n"), y=f4("n"),
+    out=f4("n", "channels", out=True),
 )  # fmt: skip
-def _sample_picture(picture, x, y, out):
-    """Write what :func:`sample_bilinear` returns."""
 
 
 def convolve(picture: Picture, across: np.ndarray, down: np.ndarray) -> Picture:

@@ -26,6 +26,7 @@ _CODES = {
     "u4": ("uint32_t", ctypes.c_uint32), "i4": ("int32_t", ctypes.c_int32), "u8": ("uint64_t", ctypes.c_uint64),
     "i8": ("int64_t", ctypes.c_int64), "f4": ("float", ctypes.c_float), "f8": ("double", ctypes.c_double),
 }  # fmt: skip
+_POSITIONAL = inspect.Parameter.POSITIONAL_OR_KEYWORD
 Size = int | str  # a number, or the name of a size or of an integer argument
 
 
@@ -80,8 +81,11 @@ STATUS = i4()  # what a function returns that checks indices on its way: 0, or a
 COUNT = i8()  # the same of a function that counts: a number from 0 on, or a negative one for an index outside
 
 
+PROTOTYPES: dict[str, str] = {}  # of all functions declared so far, in C: tests compare them with the sources
+
+
 def native(returns: Argument | None = None, /, **arguments: Argument) -> Callable[[Callable[..., Any]], Any]:
-    """Replace a function by the one of the same name, without an underscore in front, in the native library.
+    """Replace a function by the one of the same name in the native library.
 
     The arguments are checked at every call: ValueError says which has another type, shape or range.
 
@@ -92,35 +96,37 @@ def native(returns: Argument | None = None, /, **arguments: Argument) -> Callabl
     """
 
     def wrap(function: Callable[..., Any]) -> Any:
-        name, signature = function.__name__.lstrip("_"), inspect.signature(function)
-        if list(signature.parameters) != list(arguments):
-            raise TypeError(f"{name}: expected declarations of {list(signature.parameters)}, got {list(arguments)}")
-        entries: dict[ctypes.CDLL, Any] = {}  # the function in each library that was loaded: tests load several
-
-        @wraps(function)
-        def call(*values: Any, **named: Any) -> Any:
-            if named or len(values) != len(arguments):
-                bound = signature.bind(*values, **named)
-                bound.apply_defaults()
-                values = bound.args
-            sizes: dict[str, int] = {}
-            passed = [_pass(name, key, kind, value, sizes) for (key, kind), value in zip(kinds, values, strict=True)]
-            for place, key, kind in ruled:
-                _check_values(name, key, kind, values[place], sizes)
-            library = load_library()
-            if library not in entries:
-                entries[library] = _entry(library, name, returns, arguments)
-            result = entries[library](*passed, *[sizes.get(key, 0) for key in names])
-            if (returns is STATUS and result) or (returns is COUNT and result < 0):
-                raise ValueError(f"{name}: expected indices inside their arrays, found one outside")
-            return None if returns is STATUS else result
-
-        kinds, names = list(arguments.items()), size_names(arguments)
-        ruled = [(place, key, kind) for place, (key, kind) in enumerate(kinds) if kind.has_rules]
-        call.prototype = _prototype(name, returns, arguments)  # type: ignore[attr-defined]
-        return call
+        if list(inspect.signature(function).parameters) != list(arguments):
+            raise TypeError(f"{function.__name__}: expected parameters {list(arguments)}, as they are declared")
+        return wraps(function)(declare(function.__name__, returns, **arguments))
 
     return wrap
+
+
+def declare(name: str, returns: Argument | None = None, /, **arguments: Argument) -> Callable[..., Any]:
+    """Return a function of the native library, as :func:`native` does, for those that need no documentation."""
+    signature = inspect.Signature([inspect.Parameter(key, _POSITIONAL) for key in arguments])
+    entries: dict[ctypes.CDLL, Any] = {}  # the function in each library that was loaded: tests load several
+    kinds, names = list(arguments.items()), size_names(arguments)
+    ruled = [(place, key, kind) for place, (key, kind) in enumerate(kinds) if kind.has_rules]
+
+    def call(*values: Any, **named: Any) -> Any:
+        if named or len(values) != len(arguments):
+            values = signature.bind(*values, **named).args
+        sizes: dict[str, int] = {}
+        passed = [_pass(name, key, kind, value, sizes) for (key, kind), value in zip(kinds, values, strict=True)]
+        for place, key, kind in ruled:
+            _check_values(name, key, kind, values[place], sizes)
+        library = load_library()
+        if library not in entries:
+            entries[library] = _entry(library, name, returns, arguments)
+        result = entries[library](*passed, *[sizes.get(key, 0) for key in names])
+        if (returns is STATUS and result) or (returns is COUNT and result < 0):
+            raise ValueError(f"{name}: expected indices inside their arrays, found one outside")
+        return None if returns is STATUS else result
+
+    PROTOTYPES[name] = _prototype(name, returns, arguments)
+    return call
 
 
 def size_names(arguments: dict[str, Argument]) -> list[str]:

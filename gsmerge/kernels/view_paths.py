@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.kernels.signature import STATUS, i1, i4, i8, native
+from gsmerge.kernels.signature import STATUS, declare, i1, i4, i8
 
 BACK = 200.0  # cost of a step that goes back, in pixels
 FAR = 50.0  # cost of any longer step forward: a stretch that was dropped costs no more
 
 
-@native(
-    STATUS, pixels=i4("n", "v", least=-1, below=(1 << 31) - 1), came_from=i1("n", "v", out=True),
+_find_path = declare(
+    "find_path", STATUS, pixels=i4("n", "v", least=-1, below=(1 << 31) - 1), came_from=i1("n", "v", out=True),
     views=i8("n", out=True), back=i8(1, out=True),
 )  # fmt: skip
-def _find_path(pixels, came_from, views, back):
-    """Do what :func:`cheapest_views` does; ``back`` becomes its result."""
 
 
 def cheapest_views(pixels, came_from, views):

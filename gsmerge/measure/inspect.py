@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.formats.read import OpacityChoice
 from gsmerge.measure.visibility import MAX_SAMPLES, inside_views
 from gsmerge.options import CompactOptions
-from gsmerge.plan import choose_blocks, resolve_decode, resolved_settings, steps_for
+from gsmerge.plan import plan_whole
 from gsmerge.report import finite, human_bytes
 from gsmerge.runtime.estimate import fit_of, memory_bytes, memory_problem, wall_seconds
 from gsmerge.runtime.record import record_part
@@ -29,7 +29,7 @@ from gsmerge.scene.files import SceneFiles, find_scene_files
 from gsmerge.scene.read import align_scene, read_rows
 from gsmerge.scene.views import read_scene_cameras
 from gsmerge.stages.clean import BOX_QUANTILES, beyond_scene, floater_share
-from gsmerge.stages.segment import count_limits, largest_count
+from gsmerge.stages.segment import largest_count, measure_size
 from gsmerge.stages.sky import sky_regions
 from gsmerge.types import Gaussians, Scene, StrPath
 
@@ -203,35 +203,34 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     Returns:
         ``num_gaussians``: the most that the result can have; ``ratio`` to the input, ``bytes`` as a ``.ply``;
         ``blocks``, ``method``, ``superpixels_per_view`` (None where a budget distributes them), ``k``, ``match``,
-        ``checkpoint`` and ``fit`` as they are used; ``seconds`` and ``memory_bytes``, to two digits and right
-        within a factor of about two; ``memory_problem``, None where this machine has enough.
+        ``checkpoint``, ``fit`` and ``fit_steps`` as they are used; ``seconds`` and ``memory_bytes``, to two digits and
+        right within a factor of about two; ``memory_problem``, None where this machine has enough.
     """
-    photos = scene.images is not None
-    options = replace(options, decode=resolve_decode(options, scene, photos=photos))
-    settings = resolved_settings(options, photos=photos)
-    limits = count_limits(scene, options.segment, options.decode, options.budget)
+    size = measure_size(scene)
+    whole = plan_whole(size, options)
+    limits, settings = whole.limits, whole.settings(options)
     pixels = max(limits.num_pixels, scene.num_gaussians)
     most = pixels if options.method.startswith("unmerged") else largest_count(limits, options.segment)
     count = min(scene.num_gaussians or pixels, most)
-    blocks = choose_blocks(scene, options)
-    at_once, num_rest = gaussians_at_once(pixels, blocks), 3 * scene.gaussians.shN.shape[1]
+    at_once, num_rest = gaussians_at_once(pixels, whole.blocks), 3 * scene.gaussians.shN.shape[1]
     drawn = pixels if options.method == "unmerged-fit" else count
     seconds = wall_seconds(
-        at_once * blocks, len(scene), settings, threads=options.threads or available_threads(), photos=photos,
-        fit_steps=steps_for(options, len(scene), limits.share),
+        at_once * whole.blocks, len(scene), settings, threads=options.threads or available_threads(),
+        photos=size.photos, fit_steps=whole.fit.steps,
         num_drawn=drawn * float(np.mean(_shares_inside(scene, MAX_DRAWN_SAMPLES) or [1.0])),
     )  # fmt: skip
-    memory = memory_bytes(at_once, photos=photos, num_rest=num_rest, num_elsewhere=pixels - at_once)
+    memory = memory_bytes(at_once, photos=size.photos, num_rest=num_rest, num_elsewhere=pixels - at_once)
     distributed = limits.count is not None or options.budget.auto
     return {
         "num_gaussians": count,
         "ratio": count / max(1, scene.num_gaussians),
         "bytes": file_bytes(count, scene.gaussians.sh_degree),
-        "blocks": blocks,
+        "blocks": whole.blocks,
         "method": options.method,
         "superpixels_per_view": None if distributed else limits.per_view,
         **{name: settings[name] for name in ("k", "match", "checkpoint")},
-        "fit": fit_of(settings, photos=photos),
+        "fit": fit_of(settings, photos=size.photos),
+        "fit_steps": whole.fit.steps,
         "seconds": float(f"{seconds:.2g}"),
         "memory_bytes": int(float(f"{memory:.2g}")),
         "memory_problem": memory_problem(memory),

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import html
-import io
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -13,7 +11,7 @@ from typing import Any
 from gsmerge.measure.align import PoseChange
 from gsmerge.measure.evaluate import Evaluation, Pair, Quality, ResultScores
 from gsmerge.measure.fog import ALL, Fog
-from gsmerge.report import csv_cell, document_head, human_bytes
+from gsmerge.report import csv_text, document_head, human_bytes, text_table
 
 Row = Sequence[str]
 Table = tuple[str, Row, Sequence[Row]]  # heading, columns, rows
@@ -119,15 +117,6 @@ def evaluation_csv(document: Mapping[str, Any]) -> str:
     return csv_text(list(columns), rows)
 
 
-def csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
-    """Write rows as comma-separated values under a line of the columns; other keys are left out."""
-    out = io.StringIO()
-    writer = csv.DictWriter(out, columns, extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({name: csv_cell(value) for name, value in row.items()} for row in rows)
-    return out.getvalue()
-
-
 def _more_columns(view: Mapping[str, Any]) -> dict[str, Any]:
     """Flatten the score of a view: a column for each figure at another size or after alignment."""
     row = {key: value for key, value in view.items() if key not in ("zooms", "aligned", "pose_change")}
@@ -227,15 +216,9 @@ def filled_tables(document: Mapping[str, Any]) -> Iterator[Table]:
 
 
 def evaluation_lines(document: Mapping[str, Any]) -> list[str]:
-    """Write the tables as lines for a terminal: the first column to the left, the others to the right."""
-    lines = []
-    for heading, head, rows in filled_tables(document):
-        widths = [max(len(row[i]) for row in (head, *rows)) for i in range(len(head))]
-        lines.append(heading)
-        for name, *cells in (head, *rows):
-            aligned = (cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True))
-            lines.append("  ".join((f"  {name:{widths[0]}}", *aligned)))
-    return lines
+    """Write the tables as lines for a terminal."""
+    tables = filled_tables(document)
+    return [line for heading, head, rows in tables for line in (heading, *text_table([head, *rows], "  "))]
 
 
 def evaluation_markdown(document: Mapping[str, Any]) -> str:

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from gsmerge.kernels.elementary import exp
-from gsmerge.kernels.networks.corrections import correct_features, correct_gaussians
+from gsmerge.kernels.networks.tokens import correct_features, correct_gaussians
 from gsmerge.networks.options import RESIDUAL, Bounds
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Array, FeatureGaussians, Gaussians, like

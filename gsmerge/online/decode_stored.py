@@ -1,19 +1,28 @@
-"""State -> Gaussians: decoded at any K or number, and fitted to the stored photos."""
+"""State -> Gaussians, or a file of them: decoded at any K or number, and fitted to the stored photos."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
+from time import perf_counter
+from typing import Any
 
 import numpy as np
 
 from gsmerge.encoded.encoded import Encoded
 from gsmerge.encoded.to_gaussians import decode_scene, plan_decode
-from gsmerge.errors import UsageError
+from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.prepare import Frame
 from gsmerge.fit import FitOptions, FitReport, fit, report_steps, start_share
 from gsmerge.fit.gpu import choose_backend
-from gsmerge.online.batch_photos import BatchPhotos
+from gsmerge.io import atomic_output, lost_harmonics, output_format, write_gaussians
+from gsmerge.online.batch import BatchPhotos
+from gsmerge.online.file import load_stored
 from gsmerge.online.state import OnlineState, to_encoded
+from gsmerge.options import CompactOptions
+from gsmerge.plan import resolve_fit
+from gsmerge.report import document_head, human_bytes, seconds_document, seconds_line
 from gsmerge.runtime.record import Progress, record_run, stage
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import Gaussians
@@ -29,18 +38,13 @@ class DecodeResult:
 
 
 def decodable(stored: Encoded | OnlineState, *, fitted_colors: bool = True) -> Encoded:
-    """What is decoded: the encoded scene, or the state as one, see :func:`gsmerge.online.state.to_encoded`."""
+    """Return the encoded scene, or the state as one, see :func:`gsmerge.online.state.to_encoded`."""
     return stored if isinstance(stored, Encoded) else to_encoded(stored, fitted_colors=fitted_colors)
 
 
 def num_photos(stored: Encoded | OnlineState) -> int:
     """Return the number of photos that a fit can use."""
     return 0 if isinstance(stored, Encoded) else len(stored.replay)
-
-
-def default_fit(stored: Encoded | OnlineState) -> FitOptions:
-    """Return the options of the full fit where there are photos, otherwise of none."""
-    return FitOptions(fit="full" if num_photos(stored) else "none")
 
 
 def check_fit(stored: Encoded | OnlineState, options: FitOptions) -> None:
@@ -67,7 +71,7 @@ def decode_stored(
     where there are photos, otherwise none. Raises UsageError if a fit is asked for and there are no
     photos, or K or the budget is out of range.
     """
-    options = options or default_fit(stored)
+    options = options or FitOptions(fit="full" if num_photos(stored) else "none")
     check_fit(stored, options)
     encoded = decodable(stored, fitted_colors=options.fit == "none")
     plan = plan_decode(encoded, k=k, budget=budget)
@@ -95,3 +99,88 @@ def decode_stored(
         gaussians = decode_scene(to_encoded(stored), k=k, budget=budget, threads=threads)
         return DecodeResult(gaussians, report, (*notes, note))
     return DecodeResult(stored.frame.leave(gaussians), report, notes)
+
+
+def decode_file(
+    path: Path,
+    out: Path,
+    settings: CompactOptions,
+    *,
+    k: int | None = None,
+    budget: int | str | None = None,
+    always_fit: bool = False,
+    normals: bool = True,
+    spz_version: int = 3,
+    overwrite: bool = False,
+    dry_run: bool = False,
+    progress: Progress | None = None,
+    seconds_before: Mapping[str, float] | None = None,
+) -> dict[str, Any]:
+    """Decode what a ``.gsm`` file holds, write it to a file, and return the report as plain JSON types.
+
+    ``settings``: of the fit and the run; ``always_fit``: refuse a file without photos, which otherwise is not fitted.
+    ``dry_run``: write nothing. Other arguments and errors are those of :func:`decode_stored` and
+    :func:`gsmerge.compaction.files.compact_files`.
+    """
+    start, stored = perf_counter(), load_stored(path)
+    lost, read = lost_harmonics(out, stored.sh_degree, spz_version), perf_counter()
+    notes = [lost] if lost else []
+    fit_options = resolve_fit(settings) if always_fit or num_photos(stored) else FitOptions(fit="none")
+    check_fit(stored, fit_options)
+    document: dict[str, Any] = {
+        **document_head(),
+        "input": {
+            "path": str(path), "bytes": path.stat().st_size, "num_groups": len(stored),
+            "num_gaussians_encoded": stored.settings.num_input, "encoding": dict(stored.about),
+        },
+        "k": k,
+        "budget": budget,
+    }  # fmt: skip
+    if dry_run:
+        encoded = decodable(stored)
+        plan = plan_decode(encoded, k=k, budget=budget)
+        most = int(plan.counts.sum()) + encoded.num_kept
+        output = {"dry_run": True, "output": {"path": str(out), "num_gaussians_at_most": most}}
+        return document | output | {"notes": [*plan.notes, *notes]}
+    with atomic_output(out, overwrite=overwrite) as temporary:
+        decoded = decode_stored(
+            stored, k=k, budget=budget, options=fit_options, seed=settings.seed, threads=settings.threads,
+            device=settings.device, progress=progress,
+        )  # fmt: skip
+        gaussians, done = decoded.gaussians, perf_counter()
+        if len(gaussians) == 0:
+            raise SceneError(path, "expected visible Gaussians, found none", "encode the scene again")
+        if not all(np.isfinite(getattr(gaussians, name)).all() for name in ("means", "scales", "quats")):
+            raise SceneError(path, "expected Gaussians of finite numbers, found others", "encode the scene again")
+        write_gaussians(
+            temporary, gaussians, overwrite=True, comments=_comments(stored), ending=output_format(out).ending,
+            normals=normals, spz_version=spz_version,
+        )  # fmt: skip
+    seconds = {**(seconds_before or {}), "read": read - start, "decode": done - read, "write": perf_counter() - done}
+    return document | {
+        "output": {"path": str(out), "bytes": out.stat().st_size, "num_gaussians": len(gaussians)},
+        "ratio": len(gaussians) / max(stored.settings.num_input, 1),
+        "fit": decoded.fit and decoded.fit.to_dict(),
+        **seconds_document(seconds),
+        "notes": [*decoded.notes, *notes],
+    }
+
+
+def _comments(stored: Encoded | OnlineState) -> list[str]:
+    """Return the lines of the header of the file that was encoded, which compact copies too."""
+    source = stored.about.get("source")
+    texts = source.get("comments") if isinstance(source, dict) else None
+    lines = [line for line in texts if isinstance(line, str)] if isinstance(texts, list) else []
+    return [line for line in lines if line.isascii() and line.isprintable()]
+
+
+def decoding_line(document: Mapping[str, Any]) -> str:
+    """Write the report of a decoding in a line."""
+    before, after = document["input"], document["output"]
+    if "dry_run" in document:
+        return f"would write  {after['path']}: at most {after['num_gaussians_at_most']:,} Gaussians"
+    return (
+        f"{after['path']}: {before['num_groups']:,} groups -> {after['num_gaussians']:,} Gaussians"
+        f" ({100 * document['ratio']:.2f} % of the scene's), {human_bytes(before['bytes'])} ->"
+        f" {human_bytes(after['bytes'])}; {seconds_line(document)}"
+    )

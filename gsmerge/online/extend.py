@@ -6,46 +6,33 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-import numpy as np
-
 from gsmerge import __version__
 from gsmerge.budget import AUTO
 from gsmerge.compaction.search import choose_count
+from gsmerge.encoded.encoded import StoredSettings
 from gsmerge.errors import UsageError
-from gsmerge.facts.prepare import Prepared, prepare
-from gsmerge.fit import visible_mask
-from gsmerge.moments import feature_to_gaussians
-from gsmerge.online.batch_photos import (
-    BatchPhotos,
+from gsmerge.facts.prepare import prepare
+from gsmerge.facts.views import concat_cameras, in_float64
+from gsmerge.online.batch import (
+    Batch,
+    StateKind,
     fit_batch_colors,
+    make_batch,
     novel_rows,
-    photos_of_batch,
     rows_in_view,
     update_replay,
 )
-from gsmerge.online.extend_features import add_features, keeps_features, own_checkpoint
+from gsmerge.online.extend_latents import LATENTS, keeps_latents, own_checkpoint
+from gsmerge.online.extend_moments import MOMENTS
 from gsmerge.online.options import OnlineOptions
-from gsmerge.online.state import (
-    GroupSet,
-    OnlineState,
-    bake,
-    concat_groups,
-    first_state,
-    grown_state,
-    limit_children,
-    replace_groups,
-    select_groups,
-    with_fitted_colors,
-)
+from gsmerge.online.state import GroupSet, OnlineState, no_photos, select_groups
 from gsmerge.options import CompactOptions
-from gsmerge.pipeline import merge_views
-from gsmerge.plan import Plan, make_plan, require_children
+from gsmerge.plan import make_plan, require_children
 from gsmerge.runtime.record import Progress, choose, note, record_run, stage
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.decode import USUAL_K, keep_all
-from gsmerge.stages.match import MatchOptions, match
-from gsmerge.stages.merge import MergedViews, merge, take
-from gsmerge.types import FeatureGaussians, Gaussians, Matches, Scene
+from gsmerge.stages.merge import take
+from gsmerge.types import Gaussians, Scene
 
 
 @dataclass(frozen=True)
@@ -94,13 +81,11 @@ def extend(
         count = choose_count(prepared, plan)
         if keep_all(prepared.scene, count) is not None:
             raise UsageError(f"budget: {count} keeps every Gaussian, which needs no state; use compact")
-        if keeps_features(plan) if state is None else state.networks is not None:
-            state, counts = add_features(state, prepared, plan, count, online, max_k)
-        else:
-            if state is not None and keeps_features(plan):
-                note("the state holds no latents: groups of this batch are decoded when they enter")
-            merged = merge_views(prepared, plan, count)
-            state, counts = _add_batch(state, prepared, plan, merged, online, max_k)
+        has_latents = keeps_latents(plan) if state is None else state.networks is not None
+        if keeps_latents(plan) and not has_latents:
+            note("the state holds no latents: groups of this batch are decoded when they enter")
+        batch = make_batch(state, prepared, plan, online, max_k)
+        state, counts = _add_batch(state, batch, LATENTS if has_latents else MOMENTS, count)
     numbers = {"num_views": len(prepared.scene), "num_input": scene.num_gaussians, **counts, "num_groups": len(state)}
     settings = options.to_dict() | asdict(online)
     stored = {name: value for name, value in settings.items() if name != "threads"}  # which depend on the machine
@@ -112,44 +97,58 @@ def extend(
 
 
 def _add_batch(
-    state: OnlineState | None,
-    prepared: Prepared,
-    plan: Plan,
-    merged: MergedViews,
-    online: OnlineOptions,
-    max_k: int,
+    state: OnlineState | None, batch: Batch, kind: StateKind, count: int | None
 ) -> tuple[OnlineState, dict[str, int]]:
     """Add a batch to the state; return it, and the numbers of the batch's groups by key of the report."""
-    scene = prepared.scene
-    photos, ids = photos_of_batch(scene, None if state is None else state.cameras)
-    counts = {"num_new": len(merged.features), "num_covered": 0, "num_joined": 0, "num_hidden": 0}
-    features, rows = merged.features, np.zeros(0, np.int64)
-    if state is not None:
-        with stage("cover"):
-            rows = rows_in_view(state.groups.features, photos.cameras)
-            there = feature_to_gaussians(with_fitted_colors(select_groups(state.groups, rows)).features)
-            own = feature_to_gaussians(features)
-            novel = novel_rows(there, own, features, merged.members, photos.photos(2), scene.cameras, online)
-            counts["num_covered"] = len(features) - len(novel)
-            features = take(features, novel)
-    with stage("decode"):
-        new = bake(features, merged.members, merged.networks, max_k)
-    with stage("join"):
-        if state is None:
-            state = first_state(new, prepared, plan, max_k)
-        else:
-            groups, entered = _enter(state.groups, new, prepared, plan, photos, rows, max_k)
-            state = grown_state(state, groups, prepared, plan, photos.cameras[ids >= len(state.cameras)])
-            counts |= entered
-    if prepared.given.images is None:
+    new = kind.encode(state, batch, count)
+    counts = {"num_new": len(new.features), "num_covered": 0, "num_joined": 0, "num_hidden": 0}
+    if state is None:
+        groups = kind.first(new, batch)
+    else:
+        rows = rows_in_view(state.groups.features, batch.photos.cameras, kind.reach)
+        if batch.online.tolerance > 0:
+            with stage("cover"):
+                novel = novel_rows(new, batch, *kind.decode(select_groups(state.groups, rows), new))
+                counts["num_covered"] = len(new.features) - len(novel)
+                new = replace(new, features=take(new.features, novel))
+        groups, joined = kind.join(state.groups, rows, new, batch)
+        counts |= joined
+    if new.networks is not None and batch.plan.checkpoint is not None:
+        choose(groups=counts["num_new"], clusters=len(groups), networks=batch.plan.checkpoint.facts())
+    state = replace(_with_views(state, groups, batch), networks=new.networks)
+    if batch.prepared.given.images is None:
         return state, counts
-    groups = state.groups
-    if online.fit_colors:
+    if batch.online.fit_colors and new.networks is None:
         with stage("fit"):
-            groups, report = fit_batch_colors(groups, photos, plan.fit, plan.seed)
+            groups, report = fit_batch_colors(groups, batch.photos, batch.plan.fit, batch.plan.seed)
             choose(fit=report.to_dict())
-    replay = update_replay(state.replay, photos, ids, len(state.cameras), online.replay)
+    replay = update_replay(state.replay, batch.photos, batch.view_ids, len(state.cameras), batch.online.replay)
     return replace(state, groups=groups, replay=replay), counts
+
+
+def _with_views(state: OnlineState | None, groups: GroupSet, batch: Batch) -> OnlineState:
+    """Return the state with other groups, and with the views and unseen Gaussians of a batch."""
+    plan, given, cameras = batch.plan, batch.prepared.given, batch.photos.cameras[batch.is_new]
+    k = AUTO if plan.auto_count else plan.decode.k
+    if state is None:
+        least = plan.fit.min_contribution if given.images is not None else 0.0
+        return OnlineState(
+            groups=groups,
+            kept=plan.unseen,
+            frame=batch.prepared.frame,
+            cameras=in_float64(cameras),
+            replay=no_photos(cameras),
+            settings=StoredSettings(given.num_gaussians, k, batch.max_k, plan.decode.min_opacity, least),
+            about={},
+        )
+    kept = [gaussians for gaussians in (state.kept, plan.unseen) if gaussians is not None]
+    return replace(
+        state,
+        groups=groups,
+        kept=Gaussians.concat(kept) if kept else None,
+        cameras=concat_cameras(state.cameras, cameras),
+        settings=replace(state.settings, num_input=state.settings.num_input + given.num_gaussians, k=k),
+    )
 
 
 def _check(state: OnlineState | None, scene: Scene, options: CompactOptions, max_k: int) -> None:
@@ -164,54 +163,3 @@ def _check(state: OnlineState | None, scene: Scene, options: CompactOptions, max
     if state is not None and degree != state.sh_degree:
         expected = state.sh_degree
         raise UsageError(f"expected Gaussians with harmonics of degree {expected} as the state's, got degree {degree}")
-
-
-def _enter(
-    groups: GroupSet, new: GroupSet, prepared: Prepared, plan: Plan, photos: BatchPhotos, rows: np.ndarray, max_k: int
-) -> tuple[GroupSet, dict[str, int]]:
-    """Merge new groups into the state's ``rows`` in view, and add those that a view shows; return groups and counts."""
-    partners = find_partners(take(groups.features, rows), new.features, plan.match)
-    has_partner = partners >= 0
-    joining = select_groups(new, np.flatnonzero(has_partner))
-    groups = merge_into(groups, joining, rows[partners[has_partner]], max_k)
-    alone = select_groups(new, np.flatnonzero(~has_partner))
-    counts = {"num_joined": int(has_partner.sum())}
-    if plan.fit.min_contribution > 0 and prepared.scene.images is not None:
-        in_view = feature_to_gaussians(take(groups.features, rows))
-        both = Gaussians.concat([in_view, feature_to_gaussians(alone.features)])
-        visible = visible_mask(both, photos.photos(2), plan.fit.min_contribution)[len(in_view) :]
-        counts["num_hidden"] = int((~visible).sum())
-        alone = select_groups(alone, np.flatnonzero(visible))
-    return concat_groups([groups, alone]), counts
-
-
-def find_partners(features: FeatureGaussians, new: FeatureGaussians, options: MatchOptions) -> np.ndarray:
-    """Return the state's group with the same surface as each new one, ``[n]`` int64, -1 for none.
-
-    No group gets two: of several in a cluster by boxes, the first. Matched as across the views of one batch, the state
-    being one view and the batch another.
-    """
-    both = FeatureGaussians.concat([features, new])
-    sides = (np.arange(len(both)) >= len(features)).astype(np.int64)
-    matches = match(replace(both, views=sides), replace(options, cluster_size=2))
-    owner = np.full(matches.count, -1)
-    owner[matches.clusters[: len(features)]] = np.arange(len(features))
-    partners = owner[matches.clusters[len(features) :]]
-    again = np.ones(len(partners), bool)
-    again[np.unique(partners, return_index=True)[1]] = False
-    partners[again] = -1
-    return partners
-
-
-def merge_into(groups: GroupSet, new: GroupSet, rows: np.ndarray, max_k: int) -> GroupSet:
-    """Merge n new groups into those of the state at ``rows [n]`` int64, all different: moments add up, in place."""
-    if len(rows) == 0:
-        return groups
-    old = select_groups(groups, rows)
-    both = concat_groups([old, new])
-    pairs = np.tile(np.arange(len(rows)), 2)
-    features = merge(both.features, Matches(pairs, len(rows)))
-    children = both.children[features.members]
-    fitted_sh0 = np.where((old.color_precision > 0)[:, None, None], old.fitted_sh0, features.sh0)
-    merged = GroupSet(replace(features, members=np.arange(len(children))), children, fitted_sh0, old.color_precision)
-    return replace_groups(groups, rows, limit_children(merged, max_k))

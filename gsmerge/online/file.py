@@ -31,7 +31,7 @@ from gsmerge.online.state import (
     from_encoded,
     with_child_rows,
 )
-from gsmerge.report import document_head, seconds_document
+from gsmerge.report import document_head, human_bytes, seconds_document, seconds_line
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.record import Progress
 from gsmerge.scene.exporters import AUTO, ReadHints
@@ -199,6 +199,17 @@ def extend_file(
         "peak_memory_bytes": peak_memory(),
         "notes": [*given.notes, *report.notes],
     }
+
+
+def batch_line(document: Mapping[str, Any]) -> str:
+    """Write the report of a batch in a line."""
+    state, dropped = document["state"], document["num_covered"] + document["num_hidden"]
+    return (
+        f"{state['path']}: batch {state['num_batches']}, {document['num_views']} views,"
+        f" {document['num_input']:,} Gaussians -> {document['num_new']:,} groups: {document['num_joined']:,} joined"
+        f" others, {dropped:,} not needed; {document['num_groups']:,} groups in all,"
+        f" {human_bytes(state['bytes'])}; {seconds_line(document)}"
+    )
 
 
 def _file_identity(path: Path) -> tuple[int, int, int] | None:

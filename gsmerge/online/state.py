@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gsmerge import __version__
-from gsmerge.budget import AUTO
-from gsmerge.encoded.encoded import Encoded, StoredHeads, StoredScene, StoredSettings, without_members
+from gsmerge.encoded.encoded import Encoded, StoredHeads, StoredScene, without_members
 from gsmerge.encoded.to_gaussians import children_of, divide_all, divide_by_heads
-from gsmerge.facts.views import concat_cameras, in_float64, resize_cameras
+from gsmerge.facts.views import resize_cameras
 from gsmerge.geometry import covariances
 from gsmerge.kernels.elementary import log1p
 from gsmerge.moments import MAX_OPACITY, Members, feature_to_gaussians, gaussian_members
@@ -20,11 +19,9 @@ from gsmerge.stages.merge import take
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, to_float32
 
 if TYPE_CHECKING:
-    from gsmerge.facts.prepare import Prepared
     from gsmerge.networks.apply import NetworkContext
     from gsmerge.networks.tokens import GroupFeatures
     from gsmerge.networks.weights import NetworkWeights
-    from gsmerge.plan import Plan
 
 CHILD_FOOTPRINT = 1e-3  # of the group's: children need no least size, as it is in their own
 
@@ -59,10 +56,8 @@ class ViewSamples:
         names = [f.name for f in fields(ViewSamples)]
         return ViewSamples(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
-    def describe(
-        self, features: FeatureGaussians, views: np.ndarray, num_members: np.ndarray, cameras: Cameras
-    ) -> GroupFeatures:
-        """Compute the networks' inputs for Feature Gaussians of ``views [g]`` among all ``cameras``."""
+    def describe(self, learned: Learned, cameras: Cameras) -> GroupFeatures:
+        """Compute the networks' inputs for groups; ``cameras``: of all views."""
         from gsmerge.networks.cross_view_stats import cross_view_stats
         from gsmerge.networks.tokens import describe_features
 
@@ -78,8 +73,9 @@ class ViewSamples:
             footprints=nothing,
         )
         grid = resize_cameras(cameras, width, height)
+        features, views = learned.refined, learned.views
         stats = cross_view_stats(features.means, features.sh0, views, members, grid)
-        return describe_features(features, views, num_members, stats, cameras)
+        return describe_features(features, views, learned.num_members, stats, cameras)
 
 
 def sample_views(members: Members, cameras: Cameras, shape: tuple[int, int]) -> ViewSamples:
@@ -184,22 +180,30 @@ def bake(features: FeatureGaussians, members: Members, networks: NetworkContext 
 
         ones = decode_gaussians(ones, np.arange(len(features)), features, networks)
         children = decode_gaussians(children, parents, features, networks)
-    return _group_set(features, ones, children, parents)
+    return make_groups(decoding_to(ones, features), children, parents)
 
 
-def _group_set(features: FeatureGaussians, ones: Gaussians, children: Gaussians, parents: np.ndarray) -> GroupSet:
-    """Make groups with the moments of ``ones``, to which they decode; ``parents``: the rising group of each child."""
-    count = len(features)
-    neutral, no_latents = np.ones(count, np.float32), np.zeros((count, 0), np.float32)
-    same = replace(features, gains=neutral, latents=no_latents, **moments_of(ones))
-    return GroupSet(with_child_rows(same, parents), children, ones.sh0, np.zeros(count, np.float32))
+def make_groups(
+    features: FeatureGaussians, children: Gaussians, parents: np.ndarray, learned: Learned | None = None
+) -> GroupSet:
+    """Make groups that no photo was fitted to; ``parents``: the rising group of each child."""
+    if learned is not None:
+        learned = replace(learned, refined=without_members(learned.refined))
+    precision = np.zeros(len(features), np.float32)
+    return GroupSet(with_child_rows(features, parents), children, features.sh0, precision, learned)
+
+
+def decoding_to(ones: Gaussians, features: FeatureGaussians) -> FeatureGaussians:
+    """Return Feature Gaussians with the moments of ``ones``, to which they decode without gains and latents."""
+    neutral, no_latents = np.ones(len(ones), np.float32), np.zeros((len(ones), 0), np.float32)
+    return replace(features, gains=neutral, latents=no_latents, **moments_of(ones))
 
 
 def from_encoded(encoded: Encoded) -> OnlineState:
     """Make a state of one batch, without photos, of an encoded scene."""
     ones, _ = children_of(encoded, np.ones(len(encoded), np.int64))
     children, parents = children_of(encoded, np.full(len(encoded), encoded.settings.max_k))
-    groups = _group_set(encoded.features, ones, children, parents)
+    groups = make_groups(decoding_to(ones, encoded.features), children, parents)
     cameras = encoded.cameras
     settings = replace(encoded.settings, target_count=None, num_slots=None)
     options = dict(encoded.about.get("options", {}))
@@ -296,12 +300,6 @@ def with_fitted_colors(groups: GroupSet) -> GroupSet:
     return replace(groups, features=features, children=children)
 
 
-def _stored_heads(networks: StateNetworks, learned: Learned, cameras: Cameras) -> StoredHeads:
-    """Return the networks of a state with the numbers that describe its groups."""
-    described = networks.samples.describe(learned.refined, learned.views, learned.num_members, cameras)
-    return StoredHeads(networks.weights, learned.views, described.group)
-
-
 def to_encoded(state: OnlineState, *, fitted_colors: bool = True) -> Encoded:
     """Return the state as an encoded scene, in the fitted colours or in those of the exports.
 
@@ -314,9 +312,11 @@ def to_encoded(state: OnlineState, *, fitted_colors: bool = True) -> Encoded:
     if state.networks is None or groups.learned is None:
         division = divide_all(features, members, max_k)
     else:
-        features, heads = groups.learned.refined, _stored_heads(state.networks, groups.learned, state.cameras)
-        if heads.networks.options.outputs == "absolute":
-            division = divide_by_heads(features, groups.learned.num_members, max_k)
+        learned, networks = groups.learned, state.networks
+        described = networks.samples.describe(learned, state.cameras)
+        features, heads = learned.refined, StoredHeads(networks.weights, learned.views, described.group)
+        if networks.weights.options.outputs == "absolute":
+            division = divide_by_heads(features, learned.num_members, max_k)
         else:
             rows = {"starts": groups.features.starts, "members": groups.features.members}
             division = divide_all(replace(features, **rows), members, max_k)
@@ -329,41 +329,4 @@ def to_encoded(state: OnlineState, *, fitted_colors: bool = True) -> Encoded:
         settings=replace(state.settings, knee_count=len(features)),
         heads=heads,
         about=state.about,
-    )
-
-
-def first_state(groups: GroupSet, prepared: Prepared, plan: Plan, max_k: int) -> OnlineState:
-    """Make the state of a first batch."""
-    cameras = prepared.scene.cameras
-    settings = StoredSettings(
-        num_input=prepared.given.num_gaussians,
-        k=AUTO if plan.auto_count else plan.decode.k,
-        max_k=max_k,
-        min_opacity=plan.decode.min_opacity,
-        min_contribution=plan.fit.min_contribution if prepared.given.images is not None else 0.0,
-    )
-    return OnlineState(
-        groups=groups,
-        kept=plan.unseen,
-        frame=prepared.frame,
-        cameras=in_float64(cameras),
-        replay=no_photos(cameras),
-        settings=settings,
-        about={},
-    )
-
-
-def grown_state(
-    state: OnlineState, groups: GroupSet, prepared: Prepared, plan: Plan, new_cameras: Cameras
-) -> OnlineState:
-    """Return the state with other groups, and with the views and unseen Gaussians of a further batch."""
-    kept = [gaussians for gaussians in (state.kept, plan.unseen) if gaussians is not None]
-    num_input = state.settings.num_input + prepared.given.num_gaussians
-    k = AUTO if plan.auto_count else plan.decode.k
-    return replace(
-        state,
-        groups=groups,
-        kept=Gaussians.concat(kept) if kept else None,
-        cameras=concat_cameras(state.cameras, new_cameras),
-        settings=replace(state.settings, num_input=num_input, k=k),
     )

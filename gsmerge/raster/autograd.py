@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from gsmerge.geometry import camera_centres
-from gsmerge.kernels.raster import harmonics
-from gsmerge.kernels.raster.project_backward import add_rows
+from gsmerge.kernels.raster import sh
+from gsmerge.kernels.raster.project import add_rows
 from gsmerge.raster.composite import Rendering, composite, draw_views, prepare_views, view_colors
 from gsmerge.raster.gradient import ColorGradients, color_gradients, gradients_of, plan_gradients, pose_gradient
 from gsmerge.raster.view_plan import Array, Splats, ViewPlan, plan_view
@@ -131,5 +131,5 @@ def seen_colors(means: Tensor, sh0: Tensor, shN: Tensor, viewmat: np.ndarray) ->
     eye = camera_centres(viewmat).astype(np.float32)
     count, arrays = len(means), [tensor.detach().contiguous().numpy() for tensor in (means, sh0, shN)]
     colors = np.empty((count, 3), np.float32)
-    harmonics.view_colors(*arrays, np.arange(count, dtype=np.int32), eye, 0, count, colors)
+    sh.view_colors(*arrays, np.arange(count, dtype=np.int32), eye, 0, count, colors)
     return torch.from_numpy(colors)

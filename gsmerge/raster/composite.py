@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gsmerge.kernels.raster import blend as kernels
-from gsmerge.kernels.raster import harmonics
+from gsmerge.kernels.raster import sh
 from gsmerge.raster.view_plan import Array, Splats, ViewPlan, pieces, prepare, tile_ranges
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import Array as AnyArray
@@ -29,7 +29,7 @@ def view_colors(plan: ViewPlan) -> Array:
     colors, splats = np.empty((len(plan.ids), 3), np.float32), plan.splats
     with use_threads() as threads:
         parallel_map(
-            lambda span: harmonics.view_colors(splats.means, splats.sh0, splats.shN, plan.ids, plan.eye, *span, colors),
+            lambda span: sh.view_colors(splats.means, splats.sh0, splats.shN, plan.ids, plan.eye, *span, colors),
             pieces(len(plan.ids), threads),
         )
     return colors
@@ -41,9 +41,7 @@ def blend(plan: ViewPlan, colors: Array, background: Array) -> tuple[Array, Arra
     transmittance = np.empty((plan.height, plan.width), np.float32)
 
     def tiles(span: tuple[int, int]) -> None:
-        kernels.blend(
-            plan.footprints, colors, plan.members, plan.offsets, plan.columns, *span, background, image, transmittance
-        )
+        kernels.blend(*plan.lists, colors, *span, background, image, transmittance)
 
     with use_threads() as threads:
         parallel_map(tiles, tile_ranges(plan, threads))
@@ -80,16 +78,16 @@ def splat_adjoint(plan: ViewPlan, image: Array) -> Array:
     if image.ndim != 3 or image.shape[:2] != (plan.height, plan.width):
         raise ValueError(f"image: expected shape {[plan.height, plan.width, 'c']}, got {list(image.shape)}")
     sums = np.zeros((len(plan.splats), image.shape[2]), np.float32)
-    slots = np.empty((len(plan.members), kernels.CHANNELS), np.float32)
+    slots = np.empty((len(plan.flatten_ids), kernels.CHANNELS), np.float32)
 
     def tiles(span: tuple[int, int]) -> None:
-        kernels.weighted_sums(plan.footprints, plan.members, plan.offsets, plan.columns, *span, part, slots)
+        kernels.weighted_sums(*plan.lists, *span, part, slots)
 
     with use_threads() as threads:
         for first in range(0, image.shape[2], kernels.CHANNELS):
             part = np.ascontiguousarray(image[..., first : first + kernels.CHANNELS], np.float32)
             parallel_map(tiles, tile_ranges(plan, threads))
-            kernels.add_slots(plan.members, slots, plan.ids, first, sums)
+            kernels.add_slots(plan.flatten_ids, slots, plan.ids, first, sums)
     return sums
 
 
@@ -97,14 +95,14 @@ def survey(plan: ViewPlan, colors: Array | None = None) -> tuple[Array, Array, A
     """Return the image of :func:`composite` over black, and sums and maxima of :func:`contributions`, ``[m]`` each."""
     drawn = view_colors(plan) if colors is None else np.ascontiguousarray(colors.take(plan.ids, 0), np.float32)
     image, totals = np.empty((plan.height, plan.width, 3), np.float32), np.zeros((len(plan.ids), 2), np.float32)
-    kernels.survey(plan.footprints, drawn, plan.members, plan.offsets, plan.columns, image, totals)
+    kernels.survey(*plan.lists, drawn, image, totals)
     return image, totals[:, 0], totals[:, 1]
 
 
 def contributions(plan: ViewPlan) -> tuple[Array, Array]:
     """Return sum (pixels) and maximum of every Gaussian's blending weight, both ``[n]`` float32; 0 if unseen."""
     totals = np.zeros((len(plan.ids), 2), np.float32)
-    kernels.contributions(plan.footprints, plan.members, plan.offsets, plan.columns, plan.height, plan.width, totals)
+    kernels.contributions(*plan.lists, plan.height, plan.width, totals)
     mass, peak = np.zeros((2, len(plan.splats)), np.float32)
     mass[plan.ids], peak[plan.ids] = totals.T
     return mass, peak

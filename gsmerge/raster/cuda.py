@@ -189,7 +189,7 @@ def render_cuda(
     local = torch.cat([torch.cat([viewmats[:, :3, :3], shifts], 2), viewmats[:, 3:]], 1)
     means = (gaussians.means.double() - origin).float()
     shape = means, gaussians.quats, gaussians.scales, gaussians.opacities
-    harmonics = torch.cat([gaussians.sh0, gaussians.shN], 1)
+    sh = torch.cat([gaussians.sh0, gaussians.shN], 1)
     under = torch.from_numpy(background).to(means)
     size = len(cameras), cameras.height, cameras.width
     images = torch.empty(*size, 3, device=means.device)
@@ -198,7 +198,7 @@ def render_cuda(
     for view in range(len(cameras)):
         camera = local[view], cameras.Ks[view], cameras.width, cameras.height
         image, alpha, depth, _ = rasterize(
-            shape, harmonics, camera, under, sh_degree=gaussians.sh_degree,
+            shape, sh, camera, under, sh_degree=gaussians.sh_degree,
             near=near, far=far, antialiased=antialiased, with_depths=with_depths,
         )  # fmt: skip
         images[view], alphas[view] = image, alpha
@@ -207,7 +207,7 @@ def render_cuda(
     return Rendering(images, alphas, depths)
 
 
-def harmonic_colors(means: Tensor, harmonics: Tensor, eye: Tensor) -> Tensor:
-    """Evaluate the colours ``[n,3]`` of harmonics ``[n,k,3]`` seen from ``eye [3]``, not below 0."""
-    degree = round(harmonics.shape[1] ** 0.5) - 1
-    return (_gsplat().spherical_harmonics(degree, means - eye, harmonics) + 0.5).clamp_min(0)
+def harmonic_colors(means: Tensor, sh: Tensor, eye: Tensor) -> Tensor:
+    """Evaluate the colours ``[n,3]`` of ``sh [n,k,3]`` seen from ``eye [3]``, not below 0."""
+    degree = round(sh.shape[1] ** 0.5) - 1
+    return (_gsplat().spherical_harmonics(degree, means - eye, sh) + 0.5).clamp_min(0)

@@ -18,7 +18,9 @@ from itertools import pairwise
 import numpy as np
 
 from gsmerge.kernels.matrices import matmul
-from gsmerge.kernels.raster import blend_backward, harmonics, project_backward
+from gsmerge.kernels.raster import sh
+from gsmerge.kernels.raster.blend import blend_backward, gather_slots
+from gsmerge.kernels.raster.project import BLOCK, POSE, SUMS, project_backward
 from gsmerge.raster.composite import view_colors
 from gsmerge.raster.view_plan import Array, ViewPlan, pieces, tile_ranges
 from gsmerge.runtime.threads import parallel_map, use_threads
@@ -62,10 +64,9 @@ def _expect(name: str, array: Array, shape: tuple[int, ...]) -> Array:
 
 def _blocks(count: int, threads: int) -> list[tuple[int, int]]:
     """Return ranges of Gaussians, each of whole blocks of the kernels."""
-    block = project_backward.BLOCK
-    num_blocks = -(-count // block)
+    num_blocks = -(-count // BLOCK)
     num = max(1, min(threads, count // WORTH))
-    edges = [block * (num_blocks * i // num) for i in range(num)] + [count]
+    edges = [BLOCK * (num_blocks * i // num) for i in range(num)] + [count]
     return list(pairwise(edges))
 
 
@@ -80,22 +81,19 @@ def gradients_of(
 ) -> Gradients:
     """Return the gradients of :func:`plan_gradients` for unchecked contiguous float32 arrays; colours ``[m,3]``."""
     m, splats = len(plan.ids), plan.splats
-    slots = np.empty((len(plan.members), blend_backward.SUMS), np.float32)
-    sums = np.zeros((m, blend_backward.SUMS), np.float32)
+    slots = np.empty((len(plan.flatten_ids), SUMS), np.float32)
+    sums = np.zeros((m, SUMS), np.float32)
     means, quats, scales, tints = (np.empty((m, size), np.float32) for size in (3, 4, 3, 3))
     opacities = np.empty(m, np.float32)
-    num_blocks = -(-m // project_backward.BLOCK)
-    poses = np.empty((num_blocks, project_backward.POSE), np.float32) if with_viewmat else None
+    num_blocks = -(-m // BLOCK)
+    poses = np.empty((num_blocks, POSE), np.float32) if with_viewmat else None
 
     def tiles(span: tuple[int, int]) -> None:
-        blend_backward.blend_backward(
-            plan.footprints, colors, plan.members, plan.offsets, plan.columns, *span,
-            image, transmittance, grad_image, grad_left, slots,
-        )  # fmt: skip
+        blend_backward(*plan.lists, colors, *span, image, transmittance, grad_image, grad_left, slots)
 
     def project(span: tuple[int, int]) -> None:
-        blend_backward.gather_slots(plan.members, slots, *span, sums)
-        project_backward.project_backward(
+        gather_slots(plan.flatten_ids, slots, *span, sums)
+        project_backward(
             splats.means, splats.quats, splats.scales, plan.opacities, plan.ids, sums, plan.camera, *span,
             means, quats, scales, opacities, poses,
         )  # fmt: skip
@@ -160,7 +158,7 @@ def color_gradients(
         sh0, shN, means = (np.empty((m, *shape), np.float32) for shape in ((1, 3), rest, (3,)))
     with use_threads() as threads:
         parallel_map(
-            lambda span: harmonics.view_colors_backward(
+            lambda span: sh.view_colors_backward(
                 splats.means, splats.shN, plan.ids, plan.eye, *span, colors, grad_colors, sh0, shN, means
             ),
             pieces(m, threads),

@@ -138,8 +138,8 @@ def photo_errors(
     ``score`` gets the view, its render ``[h,w,3]`` float32 (not clipped) and the transmittance
     ``[h,w]``. ``views`` of the photos, in the order of the result; None: all. ``near`` is in the
     Gaussians' unit; ``colors [n,3]`` replace the harmonics. ``keep`` gives a view's mask ``[n]`` of
-    the Gaussians to draw, ``tiles`` its mask ``[lines,columns]`` of the tiles to complete; None is
-    all.
+    the Gaussians to draw, ``tiles`` its mask ``[tile_height,tile_width]`` of the tiles to complete;
+    None is all.
     """
     splats = gaussians if isinstance(gaussians, Splats) else prepare(gaussians)
 
@@ -180,11 +180,11 @@ def view_psnr(image: np.ndarray, photos: Photos, view: int, *, quarter: bool) ->
 
 
 def scored_tiles(view: int, width: int, height: int) -> np.ndarray | None:
-    """Return a mask ``[lines,columns]`` of a quarter of a view's tiles, alternating in blocks; None for small views."""
-    lines, columns = -(-height // TILE), -(-width // TILE)
-    if min(lines, columns) <= 3 * BLOCK:
+    """Return a mask ``[tile_height,tile_width]`` of a quarter of a view's tiles, in blocks; None for small views."""
+    tile_height, tile_width = -(-height // TILE), -(-width // TILE)
+    if min(tile_height, tile_width) <= 3 * BLOCK:
         return None
-    y, x = np.arange(lines)[:, None] // BLOCK, np.arange(columns) // BLOCK
+    y, x = np.arange(tile_height)[:, None] // BLOCK, np.arange(tile_width) // BLOCK
     chosen: np.ndarray = (y % 2 * 2 + x % 2) == (view + x // 2 + 2 * (y // 2)) % 4
     return chosen
 

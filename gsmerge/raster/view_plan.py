@@ -11,15 +11,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from gsmerge.geometry import camera_centres
 from gsmerge.kernels.matrices import matmul
-from gsmerge.kernels.raster import binning
 from gsmerge.kernels.raster import project as projection
+from gsmerge.kernels.raster.binning import count_tiles, deal_tiles, depth_order
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import Gaussians
 
 Array = NDArray[Any]
 
 PIECE = 1 << 13  # Gaussians or intersections that are worth handing to another thread
-EPS2D = 0.3  # dilation of the footprints, pixels squared
+EPS2D = 0.3  # dilation of Gaussians in the image, pixels squared
 MAX_SIZE = 32767 * projection.TILE  # pixels per side: tile columns and rows are kept in 16 bits
 
 
@@ -45,10 +45,10 @@ class ViewPlan:
 
     splats: Splats
     ids: Array  # [m] int32, ascending: the Gaussians that may touch the image. (A few at its border may miss it.)
-    footprints: Array  # [m,8] float32, see gsmerge.kernels.raster.project
+    conics: Array  # [m,8] float32, see gsmerge.kernels.raster.project
     depths: Array  # [m] float32, camera z
-    members: Array  # [intersections] int32 rows of `ids`, tile after tile, nearest first
-    offsets: Array  # [tiles+1] int64 starts of the tiles' lists
+    flatten_ids: Array  # [intersections] int32 rows of `ids`, tile after tile, nearest first
+    isect_offsets: Array  # [tiles+1] int64 starts of the tiles' lists
     eye: Array  # [3] float32, the camera's centre less `splats.origin`
     opacities: Array  # [n] float32, those that are drawn
     camera: Array  # The view's numbers in the order of gsmerge.kernels.raster.project, float32
@@ -57,14 +57,9 @@ class ViewPlan:
     height: int  # pixels
 
     @property
-    def columns(self) -> int:
-        """Number of tiles per row."""
-        return -(-self.width // projection.TILE)
-
-    @property
-    def lines(self) -> int:
-        """Number of rows of tiles."""
-        return -(-self.height // projection.TILE)
+    def lists(self) -> tuple[Array, Array, Array, int]:
+        """The first arguments of the kernels that walk the tiles' lists; the last is the number of tiles per row."""
+        return self.conics, self.flatten_ids, self.isect_offsets, -(-self.width // projection.TILE)
 
 
 def _float32(array: Array) -> Array:
@@ -108,10 +103,10 @@ def pieces(count: int, threads: int) -> list[tuple[int, int]]:
 
 def tile_ranges(plan: ViewPlan, threads: int, least: int = PIECE) -> list[tuple[int, int]]:
     """Return ranges of tiles with about equally many intersections, at least about ``least``, for the pool."""
-    count = len(plan.members)
+    count = len(plan.flatten_ids)
     num = num_pieces(count, threads, least)
-    cuts = np.searchsorted(plan.offsets, count * np.arange(1, num) / num)
-    edges = np.unique(np.concatenate([[0], cuts, [len(plan.offsets) - 1]]))
+    cuts = np.searchsorted(plan.isect_offsets, count * np.arange(1, num) / num)
+    edges = np.unique(np.concatenate([[0], cuts, [len(plan.isect_offsets) - 1]]))
     return list(pairwise(edges.tolist()))
 
 
@@ -131,10 +126,10 @@ def _camera(viewmat: Array, K: Array, width: int, height: int, eps2d: float, ant
     return camera
 
 
-def _corner_sums(tiles: Array, lines: int, columns: int) -> Array:
-    """Count the tiles above and left of each corner, ``[lines+1,columns+1]`` int32."""
-    if tiles.shape != (lines, columns):
-        raise ValueError(f"tiles: expected shape {[lines, columns]}, got {list(tiles.shape)}")
+def _corner_sums(tiles: Array, tile_height: int, tile_width: int) -> Array:
+    """Count the tiles above and left of each corner, ``[tile_height+1,tile_width+1]`` int32."""
+    if tiles.shape != (tile_height, tile_width):
+        raise ValueError(f"tiles: expected shape {[tile_height, tile_width]}, got {list(tiles.shape)}")
     return np.pad(tiles.astype(np.int32).cumsum(0).cumsum(1), ((1, 0), (1, 0))).astype(np.int32)
 
 
@@ -163,38 +158,38 @@ def _aligned_rows(count: int, width: int) -> Array:
 
 
 def _project(splats: Splats, opacities: Array, ids: Array, camera: Array, threads: int) -> tuple[Array, Array, Array]:
-    """Return footprints, depths and tile boxes of the listed Gaussians."""
+    """Return conics, depths and tile boxes of the listed Gaussians."""
     m = len(ids)
-    footprints, depths = _aligned_rows(m, projection.FOOTPRINT), np.empty(m, np.float32)
+    conics, depths = _aligned_rows(m, projection.CONIC), np.empty(m, np.float32)
     boxes = np.empty((m, 4), np.int16)
 
     def project(span: tuple[int, int]) -> None:
         part = slice(*span)
         projection.project(
             splats.means, splats.quats, splats.scales, opacities, ids[part], camera,
-            footprints[part], depths[part], boxes[part],
+            conics[part], depths[part], boxes[part],
         )  # fmt: skip
 
     parallel_map(project, pieces(m, threads))
-    return footprints, depths, boxes
+    return conics, depths, boxes
 
 
-def _bin(order: Array, boxes: Array, lines: int, columns: int, threads: int) -> tuple[Array, Array]:
+def _bin(order: Array, boxes: Array, tile_height: int, tile_width: int, threads: int) -> tuple[Array, Array]:
     """Return the tile lists and their starts."""
     # One gather in advance, 8 bytes a box: in the loops below every miss would be paid in full.
     boxes = boxes.view(np.uint64)[order, 0].view(np.int16).reshape(-1, 4)
     spans = pieces(len(order), threads)
-    counts = np.stack(parallel_map(lambda span: binning.count_tiles(boxes[slice(*span)], lines, columns), spans))
-    offsets = np.concatenate([[0], np.cumsum(counts.sum(0))])
-    cursors = offsets[:-1] + np.cumsum(counts, 0) - counts
-    members = np.empty(offsets[-1], np.int32)
+    counts = np.stack(parallel_map(lambda part: count_tiles(boxes[slice(*part)], tile_height, tile_width), spans))
+    isect_offsets = np.concatenate([[0], np.cumsum(counts.sum(0))])
+    cursors = isect_offsets[:-1] + np.cumsum(counts, 0) - counts
+    flatten_ids = np.empty(isect_offsets[-1], np.int32)
 
     def deal(piece: tuple[tuple[int, int], Array]) -> None:
         part = slice(*piece[0])
-        binning.deal_tiles(order[part], boxes[part], columns, piece[1], members)
+        deal_tiles(order[part], boxes[part], tile_width, piece[1], flatten_ids)
 
     parallel_map(deal, zip(spans, cursors, strict=True))
-    return members, offsets
+    return flatten_ids, isect_offsets
 
 
 def _check_view(viewmat: Array, K: Array, width: int, height: int) -> None:
@@ -230,12 +225,12 @@ def plan_view(
     """Project Gaussians into one view, sort them by depth and bin them into tiles.
 
     ``viewmat [4,4]`` is world to camera, ``K [3,3]`` in pixels without skew; ``near`` and ``far``
-    are exclusive, in world units; ``eps2d`` is the dilation of the footprints, pixels squared.
-    ``antialiased`` lowers the opacity by what the dilation adds to the footprint (Mip-Splatting's
+    are exclusive, in world units; ``eps2d`` is the dilation in the image, pixels squared.
+    ``antialiased`` lowers the opacity by what the dilation adds to a Gaussian (Mip-Splatting's
     2D filter). ``opacities [n]`` replace the Gaussians' own, where ``keep [n]`` is False they are
-    left out, and only ``tiles [lines,columns]`` of 16 x 16 pixels have to be complete. The size of
-    the plan goes with what is visible, not with n. Raises ValueError if a size or a number is out
-    of range.
+    left out, and only ``tiles [tile_height,tile_width]`` of 16 x 16 pixels have to be complete.
+    The size of the plan goes with what is visible, not with n. Raises ValueError if a size or a
+    number is out of range.
     """
     viewmat, K = np.asarray(viewmat, np.float64).copy(), np.asarray(K, np.float64)
     _check_view(viewmat, K, width, height)
@@ -250,14 +245,14 @@ def plan_view(
     local[:3, 3] += matmul(local[:3, :3], splats.origin)
     camera = _camera(local, K, width, height, eps2d, antialiased)
     camera[projection.NEAR], camera[projection.FAR] = near, far
-    columns, lines = -(-width // projection.TILE), -(-height // projection.TILE)
-    wanted = None if tiles is None else _corner_sums(tiles, lines, columns)
+    tile_width, tile_height = -(-width // projection.TILE), -(-height // projection.TILE)
+    wanted = None if tiles is None else _corner_sums(tiles, tile_height, tile_width)
     with use_threads() as threads:
         ids = _visible(splats, opacities, keep, wanted, camera, threads)
-        footprints, depths, boxes = _project(splats, opacities, ids, camera, threads)
-        order = binning.depth_order(depths.view(np.uint32))
-        members, offsets = _bin(order, boxes, lines, columns, threads)
+        conics, depths, boxes = _project(splats, opacities, ids, camera, threads)
+        order = depth_order(depths.view(np.uint32))
+        flatten_ids, isect_offsets = _bin(order, boxes, tile_height, tile_width, threads)
     eye = camera_centres(local).astype(np.float32)
     return ViewPlan(
-        splats, ids, footprints, depths, members, offsets, eye, opacities, camera, viewmat, width, height
+        splats, ids, conics, depths, flatten_ids, isect_offsets, eye, opacities, camera, viewmat, width, height
     )  # fmt: skip

@@ -23,24 +23,25 @@ class ViewWeights:
     """Matrix W of one view, stored by tile and Gaussian."""
 
     ids: Array  # [m] int32: the Gaussians that may touch the image
-    members: Array  # [intersections] int32 rows of `ids`
-    offsets: Array  # [tiles + 1] int64 starts of the tiles' lists in `members`
-    columns: int  # Tiles per row
+    flatten_ids: Array  # [intersections] int32 rows of `ids`
+    isect_offsets: Array  # [tiles + 1] int64 starts of the tiles' lists in `flatten_ids`
+    tile_width: int  # Tiles per row
     starts: Array  # [intersections + 1] int64 into `lanes` and `weights`
     lanes: Array  # Pixel of each entry within its tile, row-major, uint8
     weights: Array  # Blending weight of each entry, float32
     height: int  # pixels
     width: int  # pixels
 
+    @property
+    def entries(self) -> tuple[Array, Array, Array, Array, Array, int]:
+        """The first arguments of the kernels that go over the entries."""
+        return self.starts, self.lanes, self.weights, self.flatten_ids, self.isect_offsets, self.tile_width
+
 
 def view_weights(plan: ViewPlan) -> ViewWeights:
     """Write out the weights of a planned view."""
-    starts, lanes, weights = kernels.list_weights(
-        plan.footprints, plan.members, plan.offsets, plan.columns, plan.height, plan.width
-    )
-    return ViewWeights(
-        plan.ids, plan.members, plan.offsets, plan.columns, starts, lanes, weights, plan.height, plan.width
-    )
+    starts, lanes, weights = kernels.list_weights(*plan.lists, plan.height, plan.width)
+    return ViewWeights(plan.ids, *plan.lists[1:], starts, lanes, weights, plan.height, plan.width)
 
 
 def apply(view: ViewWeights, colors: Array) -> Array:
@@ -49,7 +50,7 @@ def apply(view: ViewWeights, colors: Array) -> Array:
     rows = np.zeros((len(view.ids), kernels.LANES), np.float32)
     rows[:, :channels] = colors[view.ids]
     image = np.empty((view.height, view.width, kernels.LANES), np.float32)
-    kernels.spread(view.starts, view.lanes, view.weights, view.members, view.offsets, view.columns, rows, image)
+    kernels.spread(*view.entries, rows, image)
     return image[..., :channels]
 
 
@@ -59,5 +60,5 @@ def apply_transposed(view: ViewWeights, image: Array) -> Array:
     padded = np.zeros((view.height, view.width, kernels.LANES), np.float32)
     padded[..., :channels] = image
     sums = np.zeros((len(view.ids), kernels.LANES))
-    kernels.collect(view.starts, view.lanes, view.weights, view.members, view.offsets, view.columns, padded, sums)
+    kernels.collect(*view.entries, padded, sums)
     return sums[:, :channels]

@@ -16,7 +16,7 @@ from gsmerge.geometry import morton_codes
 from gsmerge.kernels.raster.contribution import dominant_labels
 from gsmerge.moments import Members, pool_members, scene_members, unaligned_members
 from gsmerge.raster import ViewPlan
-from gsmerge.raster.seen import plan_views
+from gsmerge.raster.images import plan_views
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.decode import DecodeOptions, decode
@@ -76,7 +76,7 @@ def find_owners(scene: Scene, groups: Groups) -> Owners:
 def view_owners(plan: ViewPlan, labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Find contribution ``[m]`` to, and label ``[m]`` of, the dominant superpixel of each of a plan's Gaussians."""
     labels = np.ascontiguousarray(labels, np.int32)
-    return dominant_labels(plan.footprints, plan.members, plan.offsets, plan.columns, labels, count)
+    return dominant_labels(*plan.lists, labels, count)
 
 
 def owner_pixels(owners: Owners, groups: Groups) -> np.ndarray:

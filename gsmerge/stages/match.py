@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 Method = Literal["overlap", "aabb", "none"]
 Geometry = Literal["analytic", "decoded"]
 
-NEIGHBORS = {"overlap": 16, "aabb": 1}  # Nearest neighbours that are compared; docs/internals/notebook.md has figures
+NEIGHBORS = {"overlap": 16, "aabb": 1}  # Nearest neighbours that are compared; docs/laboratory/notebook.md has figures
 
 
 @dataclass(frozen=True)

@@ -1,18 +1,49 @@
-"""Scene -> groups: the superpixels of every view, evenly many or cut from a region tree."""
+"""Scene -> groups: the superpixels of every view, evenly many or cut from a region tree.
+
+In the tree superpixels merge where little is lost, and split where much is gained. Distortion lives in image space:
+squared colour error plus the squared error of the depth relative to a plane, so that a flat wall costs nothing from any
+angle and far things count no less than near ones. All views of a scene share one threshold, so every Gaussian buys
+about the same.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from gsmerge.budget import BudgetOptions, exact_count, max_allowed
 from gsmerge.errors import UsageError
+from gsmerge.facts.views import camera_kinds
+from gsmerge.geometry import camera_depths
+from gsmerge.kernels.elementary import log, log10
+from gsmerge.kernels.superpixels.merge_tree import (
+    OVERSIZE,
+    PLANE_ERROR,
+    ROW,
+    cut_labels,
+    merge_order,
+    region_sums,
+)
+from gsmerge.kernels.superpixels.regions import pad_labels
+from gsmerge.kernels.superpixels.ward import adjacent_pairs
+from gsmerge.raster.images import seen_depths
 from gsmerge.raster.photos import scene_pictures
-from gsmerge.raster.seen import seen_depths
 from gsmerge.runtime.record import stage
+from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.decode import DecodeOptions
-from gsmerge.stages.region_tree import RegionTree, auto_count, cut_tree, pixel_depths, region_tree
 from gsmerge.stages.superpixels import MAX_FACTOR, SegmentOptions, count_for, segment
-from gsmerge.types import Scene, Segmentation
+from gsmerge.types import Groups, Scene, Segmentation
+
+DEPTH_RANGE = 1e3  # depths are clipped to this factor of the view's median
+DEPTH_WEIGHT = 1.0  # of squared relative depth errors against squared colour errors (sRGB in [0, 1])
+COMPACTNESS = 1e-5  # of squared pixels against squared colours; without it regions become snakes that no Gaussian fits
+# Largest side of a region, as a share of the image's longer side: the rasterizer's affine approximation bends larger
+# Gaussians. Exceeded only where the budget leaves no other choice.
+MAX_EXTENT = 1 / 8
+KNEE_STEP = 1.25  # the slope of the curve is taken over this factor of the count
+KNEE_SLOPE = 1.0  # dB of predicted quality per relative increase of the count: below it, more are not worth it
+KNEE_FLOOR = 3e-4  # squared error per pixel and channel that no count removes (noise, views that disagree)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,8 +122,38 @@ class CountLimits:
         return (self.count or self.default) / max(1, self.num_pixels)
 
 
+@dataclass(frozen=True)
+class SceneSize:
+    """Numbers of a scene, read or not, that a plan is made of."""
+
+    num_gaussians: int  # without rows that stand in for missing ones
+    num_views: int
+    height: int  # pixels
+    width: int
+    aligned: bool  # whether each Gaussian belongs to a pixel
+    photos: bool  # whether there are photos to fit to
+    num_cameras: int = 2  # views at different places; 1: one camera took all
+    sh_degree: int = 0
+
+    @property
+    def pixels_per_view(self) -> int:
+        """Pixels of each view."""
+        return self.height * self.width
+
+
+def measure_size(scene: Scene, *, photos: bool | None = None) -> SceneSize:
+    """Return the numbers of a scene; ``photos``: whether there are any to fit to, None: as the scene has them."""
+    cameras = scene.cameras
+    return SceneSize(
+        scene.num_gaussians, len(scene), cameras.height, cameras.width, scene.aligned,
+        photos=scene.images is not None if photos is None else photos,
+        num_cameras=1 + int(camera_kinds(cameras).max()) if len(scene) else 0,
+        sh_degree=scene.gaussians.sh_degree,
+    )  # fmt: skip
+
+
 def count_limits(
-    scene: Scene,
+    scene: SceneSize,
     segment: SegmentOptions,
     decode: DecodeOptions,
     budget: BudgetOptions,
@@ -107,39 +168,39 @@ def count_limits(
     UsageError if more superpixels are asked for than there are pixels, or fewer Gaussians than
     views.
     """
-    degree, own = scene.gaussians.sh_degree, scene.num_gaussians
-    exact = exact_count(budget, own if num_input is None else num_input, degree)
+    count, views = scene.num_gaussians, scene.num_views
+    exact = exact_count(budget, count if num_input is None else num_input, scene.sh_degree)
     if exact is not None:
-        exact = min(max(1, exact - num_reserved), own)
-    max_count = min(max_allowed(budget, own, degree), own if exact is None else exact)
-    if max_count < min(len(scene), own):
-        raise UsageError(f"budget: expected at least {len(scene)}, one for each view, got {max_count}")
+        exact = min(max(1, exact - num_reserved), count)
+    max_count = min(max_allowed(budget, count, scene.sh_degree), count if exact is None else exact)
+    if max_count < min(views, count):
+        raise UsageError(f"budget: expected at least {views}, one for each view, got {max_count}")
     return CountLimits(
-        per_view=superpixels_per_view(scene, segment) if len(scene) else 0,
+        per_view=superpixels_per_view(scene, segment) if views else 0,
         default=default_count(scene, segment, decode),
-        min_count=len(scene),
+        min_count=views,
         max_count=max_count,
         exact=exact,
-        num_pixels=len(scene) * scene.pixels_per_view,
+        num_pixels=views * scene.pixels_per_view,
     )
 
 
-def superpixels_per_view(scene: Scene, segment: SegmentOptions) -> int:
+def superpixels_per_view(scene: SceneSize, segment: SegmentOptions) -> int:
     """Return the superpixels of each view; where Gaussians are fewer than pixels, a share is taken of the Gaussians."""
-    cameras = scene.cameras
-    per_view = count_for(segment, cameras.height, cameras.width)
+    per_view = count_for(segment, scene.height, scene.width)
     if scene.aligned or segment.per_view is not None:
         return per_view
-    return max(1, min(per_view, int(segment.share * len(scene.gaussians) / len(cameras))))
+    return max(1, min(per_view, int(segment.share * scene.num_gaussians / scene.num_views)))
 
 
-def default_count(scene: Scene, segment: SegmentOptions, decode: DecodeOptions) -> int:
+def default_count(scene: SceneSize, segment: SegmentOptions, decode: DecodeOptions) -> int:
     """Return the Gaussians that ``superpixels`` and K ask for; of a scene without views, a share of its Gaussians."""
-    if len(scene) == 0:
-        return round(max(1, int(segment.share * scene.num_gaussians)) * decode.mean_k)
+    count, views = scene.num_gaussians, scene.num_views
+    if views == 0:
+        return round(max(1, int(segment.share * count)) * decode.mean_k)
     per_view = superpixels_per_view(scene, segment)
-    total = per_view * scene.num_gaussians // scene.pixels_per_view if scene.aligned else per_view * len(scene)
-    return round(max(len(scene), total) * decode.mean_k)
+    total = per_view * count // scene.pixels_per_view if scene.aligned else per_view * views
+    return round(max(views, total) * decode.mean_k)
 
 
 def largest_count(limits: CountLimits, segment: SegmentOptions) -> int:
@@ -147,3 +208,133 @@ def largest_count(limits: CountLimits, segment: SegmentOptions) -> int:
     if limits.count is not None:
         return limits.count
     return min(MAX_FACTOR * limits.default, limits.max_count) if segment.adapts else limits.default
+
+
+@dataclass(frozen=True, eq=False)
+class RegionTree:
+    """All merges of the superpixels of all views, from the finest to one per view, and their order."""
+
+    groups: Groups  # The superpixels that it starts from
+    parents: tuple[np.ndarray, ...]  # Per view [2·leaves-1] int32: union of a region, or -1
+    order: np.ndarray  # [m] int64, all merges, cheapest first; view v's from `first[v]` on
+    first: np.ndarray  # [v+1] int64, merges in the views before
+    distortions: np.ndarray  # [m+1] float64 mean squared error after the first i merges
+    min_regions: int  # Fewest regions before any is larger than `MAX_EXTENT`
+
+    def __len__(self) -> int:
+        """Return the number of superpixels at the start."""
+        return len(self.groups)
+
+    @property
+    def counts(self) -> np.ndarray:
+        """Number of regions ``[m+1]`` left after the first i merges."""
+        return len(self) - np.arange(len(self.distortions))
+
+
+def pixel_depths(scene: Scene) -> np.ndarray:
+    """Return the depth of every pixel's Gaussian in its own view, ``[v,h,w]`` float32, world units."""
+    cameras, means = scene.cameras, scene.gaussians.means
+    height, width, pixels = cameras.height, cameras.width, scene.pixels_per_view
+
+    def one_view(view: int) -> np.ndarray:
+        own = means[view * pixels : (view + 1) * pixels]
+        depths = camera_depths(own, cameras.viewmats[view].astype(means.dtype))
+        return depths.astype(np.float32).reshape(height, width)
+
+    return np.stack(parallel_map(one_view, range(len(scene))))
+
+
+def region_tree(images: np.ndarray, depths: np.ndarray, groups: Groups, valid: np.ndarray) -> RegionTree:
+    """Merge neighbouring superpixels by added distortion, each view down to a single region.
+
+    ``images [v,h,w,3]`` sRGB in [0, 1]; ``depths [v,h,w]``, of which those of at most 0 count as
+    very near; ``groups`` are 4-connected, none empty; pixels outside of ``valid [v,h,w]`` do not
+    count, and superpixels without a valid pixel merge first. Raises ValueError if these do not fit
+    together.
+    """
+    _check_pictures(images, depths, groups, valid)
+    extent = max(1.0, MAX_EXTENT * max(images.shape[1:3]))
+
+    def one_view(view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, int]:
+        usable = _usable_depths(depths[view], valid[view])
+        labels, count = pad_labels(groups.labels[view]), groups.counts[view]
+        pixels = np.ascontiguousarray(images[view], np.float32)
+        rows = np.empty((2 * count, ROW))
+        start = region_sums(labels, pixels, usable, count, rows) + DEPTH_WEIGHT * float(rows[:count, PLANE_ERROR].sum())
+        pairs = adjacent_pairs(labels)
+        return *merge_order(pairs, rows, DEPTH_WEIGHT, COMPACTNESS, extent), start, int((usable > 0).sum())
+
+    parents, of_view, growths, starts, num_pixels = zip(*parallel_map(one_view, range(len(images))), strict=True)
+    first, heights = np.concatenate([[0], np.cumsum([len(h) for h in of_view])]), np.concatenate(of_view)
+    # Heights never fall from child to parent and children come first, so a stable sort keeps them in front.
+    order = np.argsort(heights, kind="stable")
+    added = np.concatenate([[sum(starts)], np.concatenate(growths)[order]])
+    distortions = np.cumsum(added) / (3 * max(sum(num_pixels), 1))
+    min_regions = len(groups) - int(np.count_nonzero(heights < OVERSIZE))
+    return RegionTree(groups, parents, order, first, distortions, min_regions)
+
+
+def _check_pictures(images: np.ndarray, depths: np.ndarray, groups: Groups, valid: np.ndarray) -> None:
+    shape = list(groups.labels.shape)
+    for name, array, want in (("images", images, [*shape, 3]), ("depths", depths, shape), ("valid", valid, shape)):
+        if list(array.shape) != want:
+            raise ValueError(f"{name}: expected shape {want}, got {list(array.shape)}")
+    for view, count in enumerate(groups.counts):
+        sizes = np.bincount(groups.labels[view].reshape(-1), minlength=count)
+        if len(sizes) > count or int(sizes.min()) < 1:
+            raise ValueError(f"groups: expected {count} superpixels with pixels in view {view}")
+
+
+def _usable_depths(depths: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Return depths in units of their median, float32; 0 for pixels that do not count."""
+    usable = valid & np.isfinite(depths)
+    middle = float(np.median(depths[usable & (depths > 0)])) if (usable & (depths > 0)).any() else 1.0
+    clipped = np.clip(depths / middle, 1 / DEPTH_RANGE, DEPTH_RANGE)
+    return np.ascontiguousarray(np.where(usable, clipped, 0), np.float32)
+
+
+def cut_tree(tree: RegionTree, budget: int) -> Groups:
+    """Cut the tree into exactly ``budget`` regions over all views, at least one in each.
+
+    There are at most as many as superpixels. The regions of a smaller budget are unions of those of
+    a larger one. Raises ValueError if ``budget`` is below the number of views.
+    """
+    num_views = len(tree.parents)
+    if budget < num_views:
+        raise ValueError(f"budget: expected at least {num_views}, one per view, got {budget}")
+    keep = np.zeros(len(tree.order), bool)
+    keep[tree.order[: max(0, len(tree) - budget)]] = True
+
+    def one_view(view: int) -> tuple[np.ndarray, int]:
+        own = keep[tree.first[view] : tree.first[view + 1]]
+        leaves = tree.groups.counts[view]
+        of_leaf = cut_labels(tree.parents[view], own, leaves)
+        return of_leaf[tree.groups.labels[view]], leaves - int(own.sum())
+
+    labels, counts = zip(*parallel_map(one_view, range(num_views)), strict=True)
+    return Groups(np.stack(labels), counts)
+
+
+def auto_count(tree: RegionTree) -> int:
+    """Find the :func:`knee` of a scene, among the counts that need no region larger than ``MAX_EXTENT``."""
+    usable = tree.counts >= tree.min_regions
+    return knee(tree.counts[usable], tree.distortions[usable])
+
+
+def knee(counts: np.ndarray, distortions: np.ndarray) -> int:
+    """Return the count beyond which more Gaussians are not worth it.
+
+    Predicted quality is q(N) = -10 log10(floor + D(N)) dB. The knee is the largest count from whose
+    surroundings (a factor of 1.25) q still grows by ``KNEE_SLOPE`` dB per relative increase; the
+    least count if there is none. ``counts [m]`` are all different; ``distortions [m]`` are mean
+    squared errors per pixel and channel.
+    """
+    counts, distortions = np.asarray(counts), np.asarray(distortions, dtype=float)
+    if len(counts) == 0 or counts.shape != distortions.shape:
+        raise ValueError(f"expected as many distortions as counts, got {distortions.shape} for {counts.shape}")
+    order = np.argsort(counts)
+    scale, error = log(counts[order].astype(float)), np.maximum.accumulate(distortions[order][::-1])[::-1]
+    quality = -10 * log10(KNEE_FLOOR + np.maximum(error, 0))
+    before = np.interp(scale - log(KNEE_STEP), scale, quality)
+    steep = (quality - before) / log(KNEE_STEP) >= KNEE_SLOPE
+    return int(counts[order][np.flatnonzero(steep)[-1] if steep.any() else 0])

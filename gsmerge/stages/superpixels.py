@@ -24,7 +24,7 @@ from gsmerge.budget import parse_share
 from gsmerge.errors import UsageError
 from gsmerge.kernels.superpixels.bass import adapt_labels, infer_labels
 from gsmerge.kernels.superpixels.kd import split_rectangles
-from gsmerge.kernels.superpixels.regions import pad_labels
+from gsmerge.kernels.superpixels.regions import pad_labels, refine
 from gsmerge.kernels.superpixels.seeds import (
     corner_response,
     hexagonal_seeds,
@@ -32,7 +32,6 @@ from gsmerge.kernels.superpixels.seeds import (
     seeds_from_density,
     voronoi,
 )
-from gsmerge.kernels.superpixels.sweeps import refine
 from gsmerge.kernels.superpixels.ward import merge_regions
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Array, Groups, as_array, like

@@ -62,8 +62,3 @@ def test_unknown_names_are_refused() -> None:
 def test_type_checkers_see_what_is_exported(root: Path) -> None:
     text = (root / "gsmerge" / "__init__.py").read_text()
     assert [name for name in PUBLIC if f" {name} as {name}\n" not in text] == []
-
-
-@pytest.mark.parametrize("path", sorted((Path(gsmerge.__file__).parent).rglob("*.py")), ids=lambda p: p.stem)
-def test_files_stay_short(path: Path) -> None:
-    assert len(path.read_text().splitlines()) <= 400

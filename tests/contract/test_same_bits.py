@@ -28,17 +28,17 @@ REFUSED = {
 }
 # What computes no result: a GPU's arithmetic, pages and pictures for people, research.
 OTHERS = (
-    "gpu/",
+    "fit/gpu/",
     "view/",
     "research/",
-    "render/cuda.py",
+    "raster/cuda.py",
     "measure/lpips.py",
     "measure/preview.py",
     "networks/tensors.py",
 )
 ALLOWED = {
     ("io/cameras/camera_file.py", "cv2.remap"),  # of bytes: whole numbers
-    ("io/registration/keypoints.py", "@"),  # of whole numbers below 2^24, which float32 has exactly
+    ("alignment/registration/keypoints.py", "@"),  # of whole numbers below 2^24, which float32 has exactly
     ("alignment/ordered_rows.py", "np.hypot"),  # of medians by which a reading is chosen
     ("kernels/raster/project.py", "np.log"),  # a constant in float32
 }

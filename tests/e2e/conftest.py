@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 from batches import FAST, NAMES, finish, results
+from messages import ERROR, says
 
 from gsmerge.cli import main
 
@@ -62,9 +63,8 @@ def listing(folder: Path) -> dict[str, int]:
     return {str(p.relative_to(folder)): p.stat().st_size for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
-def assert_refused(outcome: Outcome, code: int, *words: str) -> None:
-    """One line on stderr with these words, and nothing else."""
-    err = outcome.err
-    assert (outcome.code, outcome.out, err.count("\n")) == (code, "", 1), err
-    assert err.startswith("gsmerge: error: ")
-    assert [part for part in words if part not in err] == []
+def assert_refused(outcome: Outcome, code: int, place: object, *values: object) -> None:
+    """One line on stderr, and nothing else, which names a place and has these values (:func:`messages.says`)."""
+    assert (outcome.code, outcome.out, outcome.err.count("\n")) == (code, "", 1), outcome.err
+    assert outcome.err.startswith(ERROR)
+    assert says(outcome.err.removeprefix(ERROR).strip(), place, *values), outcome.err

@@ -13,7 +13,7 @@ import gsmerge
 from gsmerge.io import read_cameras
 from gsmerge.scene.read import load_scene
 
-from .conftest import Run
+from .conftest import Run, assert_refused
 
 FAST = ("--effort", "draft", "--set", "fit_steps=5", "--threads", 1)
 
@@ -61,7 +61,7 @@ def test_commands_read_them(alone: Path, tmp_path: Path, run: Run, command: str)
     }
     said = run(command, *calls[command], code=0)
     if command == "inspect":
-        assert "5 (inside the .ply)" in said.out
+        assert "5 (inside" in said.out
     if command == "extend":
         assert "5 views" in said.out
 
@@ -87,8 +87,8 @@ def test_named_cameras_go_before(alone: Path, small_scene: Path, run: Run) -> No
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("-o", "x.spz"), "--embed-cameras: expected an output as .ply"),
-        (("-o", "x.ply", "--budget", "20KB"), "--embed-cameras: expected a --budget without cameras inside"),
+        (("-o", "x.spz"), ".ply"),
+        (("-o", "x.ply", "--budget", "20KB"), "--budget"),
     ],
     ids=["spz", "bytes"],
 )
@@ -96,11 +96,11 @@ def test_where_they_have_no_place_they_are_refused(
     small_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...], said: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert said in run("compact", small_scene, *options, "--embed-cameras", code=2).err
+    assert_refused(run("compact", small_scene, *options, "--embed-cameras"), 2, "--embed-cameras", said)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_scene_without_cameras_has_none_to_embed(small_scene: Path, tmp_path: Path, run: Run) -> None:
     shutil.copy(small_scene / "scene.ply", tmp_path / "bare.ply")
     call = ("compact", tmp_path / "bare.ply", "--hint", "order=none", "--embed-cameras")
-    assert "--embed-cameras: expected a scene with cameras" in run(*call, code=2).err
+    assert_refused(run(*call), 2, "--embed-cameras", "cameras")

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from messages import ERROR, noted
 
 import gsmerge
 from gsmerge.errors import OUT_OF_MEMORY, SceneError
@@ -39,12 +40,12 @@ class Broken:
 @pytest.mark.parametrize(
     ("error", "code", "line"),
     [
-        (KeyError("lost"), 1, "gsmerge: error: unexpected error: KeyError: 'lost'; run again with --debug\n"),
-        (ValueError("two\nlines"), 1, "gsmerge: error: unexpected error: ValueError: two; run again with --debug\n"),
-        (MemoryError(), 3, f"gsmerge: error: {OUT_OF_MEMORY}\n"),
-        (ImportError("a.so: failed to map segment from shared object"), 3, f"gsmerge: error: {OUT_OF_MEMORY}\n"),
-        (PermissionError(13, "Denied", "a/b"), 3, "gsmerge: error: a/b: cannot be read or written (Denied)\n"),
-        (KeyboardInterrupt(), 130, "gsmerge: error: interrupted\n"),
+        (KeyError("lost"), 1, "unexpected error: KeyError: 'lost'; run again with --debug"),
+        (ValueError("two\nlines"), 1, "unexpected error: ValueError: two; run again with --debug"),
+        (MemoryError(), 3, OUT_OF_MEMORY),
+        (ImportError("a.so: failed to map segment from shared object"), 3, OUT_OF_MEMORY),
+        (PermissionError(13, "Denied", "a/b"), 3, "a/b: cannot be read or written (Denied)"),
+        (KeyboardInterrupt(), 130, "interrupted"),
     ],
     ids=lambda value: type(value).__name__ if isinstance(value, BaseException) else "",
 )
@@ -54,7 +55,7 @@ def test_failures_inside_the_work(
     monkeypatch.setattr("gsmerge.compaction.files.compact", Broken(error))
     before = listing(scene_copy)
     outcome = run("compact", scene_copy, "--quiet")
-    assert (outcome.code, outcome.err, outcome.out) == (code, line, "")
+    assert (outcome.code, outcome.err, outcome.out) == (code, f"{ERROR}{line}\n", "")
     assert listing(scene_copy) == before
 
 
@@ -62,7 +63,7 @@ def test_failures_inside_the_work(
 def test_a_folder_without_permission(scene_copy: Path, run: Run) -> None:
     locked = scene_copy / "locked"
     locked.mkdir(mode=0o500)
-    assert_refused(run("compact", scene_copy, "-o", locked / "small.ply"), 3, "cannot be written")
+    assert_refused(run("compact", scene_copy, "-o", locked / "small.ply"), 3, locked / "small.ply", "Permission denied")
     assert list(locked.iterdir()) == []
 
 
@@ -86,7 +87,7 @@ def test_a_lack_of_memory_is_no_damage(
         write_gaussians(path, gsmerge.read_ply(scene_copy / "scene.ply").gaussians, overwrite=True)
         words = ("inspect", path)
     monkeypatch.setattr(reader, Broken(MemoryError("Unable to allocate 9 GiB")))
-    assert_refused(run(*words), 3, OUT_OF_MEMORY)
+    assert_refused(run(*words), 3, "", OUT_OF_MEMORY)
 
 
 def test_a_scene_of_points_without_size_leaves_no_file(scene_copy: Path, run: Run) -> None:
@@ -95,14 +96,14 @@ def test_a_scene_of_points_without_size_leaves_no_file(scene_copy: Path, run: Ru
     gsmerge.write_ply(scene_copy / "scene.ply", points, overwrite=True)
     before = listing(scene_copy)
     outcome = run("compact", scene_copy, "--fit", "none")
-    assert (outcome.code, "found none that is left" in outcome.err) == (3, True)
+    assert_refused(outcome, 3, scene_copy / "scene.ply", "none")
     assert listing(scene_copy) == before
 
 
 def test_debug_shows_the_traceback(scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gsmerge.compaction.files.compact", Broken(KeyError("lost")))
     outcome = run("compact", scene_copy, "--quiet", "--debug", code=1)
-    assert outcome.err.startswith("Traceback (most recent call last):")
+    assert outcome.err.startswith("Traceback (")
     assert "Traceback" not in run("compact", scene_copy, "--quiet").err  # and is forgotten by the next call
 
 
@@ -127,7 +128,7 @@ def test_failures_while_writing_leave_nothing(
     outcome = run(command, given, "--quiet", *more, code=3)
     assert outcome.err.count("\n") == 1
     assert {"compact": "scene.compact.ply", "encode": "scene.gsm", "decode": "kept.compact.ply"}[command] in outcome.err
-    assert "No space left" in outcome.err
+    assert "No space" in outcome.err
     assert listing(scene_copy) == before
 
 
@@ -137,14 +138,13 @@ def test_gpu_that_is_not_there_is_noted(
     """The CPU does the work; where CUDA was asked for a note says why, before the work, too."""
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     monkeypatch.setattr(gpu, "cuda_problem", gpu.cuda_problem.__wrapped__)
-    note = "the fit and the scores run on the CPU, not on a GPU: torch finds no CUDA device"
     for device, is_noted in (("cuda", True), ("auto", False)):
         plan = run("compact", scene_copy, "--device", device, "--dry-run", "--json", code=0)
         assert json.loads(plan.out)["options"]["device"] == "cpu"
-        assert (note in json.loads(plan.out)["notes"]) == is_noted
+        assert noted(json.loads(plan.out)["notes"], "CPU", "torch", "CUDA") == is_noted
     call = ("compact", scene_copy, "-o", tmp_path / "a.ply", "--device", "cuda", "--effort", "draft", "--json")
     outcome = run(*call, code=0)
-    assert note in json.loads(outcome.out)["notes"]
+    assert noted(json.loads(outcome.out)["notes"], "CPU", "torch", "CUDA")
 
 
 @pytest.mark.parametrize("more", [("--report", "none/report.json"), ("--levels", 2), ("--report", "report.json")])
@@ -174,6 +174,7 @@ def test_several_outputs_are_all_there_or_none(
     assert listing(scene_copy) == before
 
 
+@pytest.mark.usefixtures("foreground")
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="signals as POSIX has them")
 @pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGHUP", 129), ("SIGINT", 130)])
 def test_a_signal_ends_it_in_order(name: str, code: int, scene_copy: Path, root: Path) -> None:
@@ -186,10 +187,11 @@ def test_a_signal_ends_it_in_order(name: str, code: int, scene_copy: Path, root:
         process.send_signal(signal.Signals[name])
         _, err = process.communicate()
     assert process.returncode == code
-    assert err == f"gsmerge: error: {'interrupted' if code == 130 else f'ended by {name}'}\n"
+    assert err == f"{ERROR}{'interrupted' if code == 130 else f'ended by {name}'}\n"
     assert listing(scene_copy) == before
 
 
+@pytest.mark.usefixtures("foreground")
 @pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGINT", 130)])
 def test_a_signal_in_a_callback_is_not_lost(
     name: str, code: int, scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
@@ -205,10 +207,11 @@ def test_a_signal_in_a_callback_is_not_lost(
 
     monkeypatch.setattr("gsmerge.compaction.files.compact", busy)
     outcome = run("compact", scene_copy, code=code)
-    assert outcome.err == f"gsmerge: error: {'interrupted' if code == 130 else f'ended by {name}'}\n"
+    assert outcome.err == f"{ERROR}{'interrupted' if code == 130 else f'ended by {name}'}\n"
     assert not (scene_copy / "scene.compact.ply").exists()
 
 
+@pytest.mark.usefixtures("foreground")
 @pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGINT", 130)])
 @pytest.mark.parametrize("error", [SystemError("returned a result with an exception set"), SceneError("a.ply", "odd")])
 def test_a_signal_that_a_library_makes_an_error_of(
@@ -222,9 +225,10 @@ def test_a_signal_that_a_library_makes_an_error_of(
 
     monkeypatch.setattr("gsmerge.compaction.files.compact", compact)
     outcome = run("compact", scene_copy, code=code)
-    assert outcome.err == f"gsmerge: error: {'interrupted' if code == 130 else f'ended by {name}'}\n"
+    assert outcome.err == f"{ERROR}{'interrupted' if code == 130 else f'ended by {name}'}\n"
 
 
+@pytest.mark.usefixtures("foreground")
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="signals as POSIX has them")
 def test_an_ignored_signal_stays_ignored(scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """As under nohup."""
@@ -251,18 +255,14 @@ def in_shell(command: str, cwd: Path, root: Path, **environment: str) -> subproc
 
 QUICK = "--superpixels 40 --fit none --checkpoint none"
 ODD_PLACES = {
-    "output is full": (
-        f"$G compact . -o a.ply {QUICK} --json -q >/dev/full",
-        3,
-        "what was printed could not be written",
-    ),
-    "help is full": ("$G --help >/dev/full", 3, "what was printed could not be written"),
+    "output is full": (f"$G compact . -o a.ply {QUICK} --json -q >/dev/full", 3, "printed"),
+    "help is full": ("$G --help >/dev/full", 3, "printed"),
     "errors are full": ("$G compact none 2>/dev/full", 3, ""),
     "notes are full": (f"$G compact . -o a.ply {QUICK} 2>/dev/full", 0, ""),
     "output is closed": (f"$G compact . -o a.ply {QUICK} --json >&-", 0, ""),
     "errors are closed": ("$G compact none 2>&-", 3, ""),
     "output ends early": ("$G inspect . | head -c 10 >head && cat head", 0, ""),
-    "a name of 300 letters": ("$G compact . -o $(printf 'a%.0s' $(seq 300)).ply", 3, "File name too long"),
+    "a name of 300 letters": ("$G compact . -o $(printf 'a%.0s' $(seq 300)).ply", 3, "name too"),
     "a name of 251 letters": (f"$G compact . -q {QUICK} -o $(printf 'a%.0s' $(seq 247)).ply", 0, ""),
     "no working directory": ("mkdir gone && cd gone && rmdir ../gone && $G compact ..", 3, "working directory"),
     "little memory": (f"ulimit -v 400000; $G compact . -o a.ply {QUICK}", 3, "out of memory"),
@@ -277,7 +277,7 @@ def test_odd_places_to_write_to_and_run_in(case: str, scene_copy: Path, root: Pa
     assert done.returncode == code, done.stderr
     assert line in done.stderr
     if line:
-        assert done.stderr.startswith("gsmerge: error: ")
+        assert done.stderr.startswith(ERROR)
         assert done.stderr.count("\n") == 1
 
 

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from messages import names
 from tiny_scene import edited_json
 
 import gsmerge
 from gsmerge.cli import main
-from gsmerge.cli.render_command import picture_stems
+from gsmerge.measure.drawings import picture_stems
 from gsmerge.scene.read import load_scene
 
 from .conftest import Run, assert_refused, listing
@@ -103,7 +104,7 @@ def test_a_dry_run_writes_nothing(command: str, scene_copy: Path, run: Run) -> N
     before = listing(scene_copy)
     outcome = run(*words, "--dry-run", code=0)
     assert (WRITERS | OTHERS)[command][0] in outcome.out
-    assert "would write" in outcome.out
+    assert "would" in outcome.out
     assert json.loads(run(*words, "--dry-run", "--json").out)["dry_run"] is True
     assert listing(scene_copy) == before
 
@@ -117,14 +118,14 @@ def test_a_dry_run_knows_budgets(wish: tuple[str, ...], most: int, scene_copy: P
     plan = json.loads(run(*arguments, "--json").out)["compact"]
     assert plan["num_gaussians"] == most
     assert plan["superpixels_per_view"] is None
-    assert f"at most {most:,} Gaussians" in run(*arguments).out
+    assert f"{most:,} Gaussians" in run(*arguments).out
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_file_that_is_no_scene_is_refused_and_nothing_is_written(command: str, scene_copy: Path, run: Run) -> None:
     (scene_copy / "scene.ply").write_text("These are notes, not Gaussians.\n")
     before = listing(scene_copy)
-    assert_refused(run(*call(command, scene_copy)), 3, "expected a PLY file")
+    assert_refused(run(*call(command, scene_copy)), 3, "scene.ply", "PLY")
     assert listing(scene_copy) == before
 
 
@@ -146,8 +147,7 @@ def test_every_command_notes_odd_rows(command: str, scene_copy: Path, run: Run) 
     said = outcome.out if command == "inspect" else outcome.err
     notes = [line for line in said.splitlines() if line.startswith("note")]
     assert len(notes) == 3
-    parts = ("taken as activated", "1 row(s) with NaN or inf", "1 Gaussian(s) with extreme scales")
-    assert [part for part in parts if part not in said] == []
+    assert names(said, "activated", "1 row(s)", "NaN", "1 Gaussian(s)", "scales")
 
 
 def test_odd_rows_reach_the_scene_s_notes_and_the_report(scene_copy: Path, run: Run) -> None:
@@ -162,21 +162,17 @@ def test_odd_rows_reach_the_scene_s_notes_and_the_report(scene_copy: Path, run: 
 @pytest.mark.parametrize(
     ("command", "output"),
     [
-        ("compact", "transforms.json"),
-        ("encode", "transforms.json"),
-        ("render", "images/view_000.png"),
-        ("render --as views", "images"),
-        ("render --as superpixels", "images"),
+        ("compact", "transforms.json"), ("encode", "transforms.json"), ("view", "transforms.json"),
+        ("render", "images/view_000.png"), ("render --as views", "images"), ("render --as superpixels", "images"),
         ("render --path orbit", "images"),
-        ("view", "transforms.json"),
     ],
-)
+)  # fmt: skip
 def test_inputs_are_not_replaced(command: str, output: str, scene_copy: Path, run: Run) -> None:
     before = listing(scene_copy)
     scene = scene_copy / "scene.ply"
     results = [scene] if command == "view" else []
-    outcome = run(*command.split(), scene, *results, "-o", scene_copy / output, "--overwrite", code=2)
-    assert "other than the input" in outcome.err
+    outcome = run(*command.split(), scene, *results, "-o", scene_copy / output, "--overwrite")
+    assert_refused(outcome, 2, scene_copy / output, "input")
     assert listing(scene_copy) == before
 
 

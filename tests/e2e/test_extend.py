@@ -19,7 +19,7 @@ import gsmerge
 from gsmerge.cli import main
 from gsmerge.online.file import load_state
 
-from .conftest import Run, assert_refused, listing
+from .conftest import Outcome, Run, assert_refused, listing
 
 SMALL = ("--superpixels", 60, "--checkpoint", "none")
 PATIENCE = 120  # seconds, on a machine that is busy with other things
@@ -119,7 +119,7 @@ def test_settings_are_those_of_the_state(walks: list[Path], tmp_path: Path, run:
 def test_an_encoded_scene_is_extended(encoded: Path, walks: list[Path], tmp_path: Path, run: Run) -> None:
     state = Path(shutil.copy(encoded, tmp_path / "state.gsm"))
     outcome = run("extend", state, walks[1], code=0)
-    assert "batch 2, 4 views" in outcome.out
+    assert "batch 2," in outcome.out
     assert len(load_state(state).replay) == 4
     assert run("decode", state, "--set", "fit_steps=4", "-o", tmp_path / "a.ply").code == 0
 
@@ -202,9 +202,8 @@ def test_the_heads_run_when_they_are_asked(latents: Path, tmp_path: Path, run: R
 
 def test_networks_of_another_state(latents: Path, walks: list[Path], tmp_path: Path, run: Run) -> None:
     state = Path(shutil.copy(latents, tmp_path / "state.gsm"))
-    words = "checkpoint shipped: expected the networks that made the state (paper), whose latents it holds"
     outcome = run("extend", state, walks[0], "--checkpoint", "shipped")
-    assert_refused(outcome, 2, words, "leave the checkpoint out, or begin a new state")
+    assert_refused(outcome, 2, "checkpoint shipped", "(paper)", "state")
     assert state.read_bytes() == latents.read_bytes()
 
 
@@ -222,7 +221,7 @@ def test_harmonics_of_another_degree(state: Path, walks: list[Path], tmp_path: P
     other = replace(have, shN=np.zeros((len(have), (degree + 1) ** 2 - 1, 3), np.float32))
     gsmerge.write_ply(scene / "scene.ply", other, overwrite=True)
     before = state.read_bytes()
-    assert_refused(run("extend", state, scene), 2, f"harmonics of degree {have.sh_degree} as the state's")
+    assert_refused(run("extend", state, scene), 2, "", f"degree {have.sh_degree}", f"degree {degree}")
     assert state.read_bytes() == before
 
 
@@ -230,20 +229,17 @@ def test_harmonics_of_another_degree(state: Path, walks: list[Path], tmp_path: P
 
 
 @pytest.mark.parametrize(
-    ("spoil", "words"),
-    [
-        (with_header(schema=9, gsmerge="9.9"), "expected schema 1, found 9; written by gsmerge 9.9"),
-        (cut(0.5), "could not read it"),
-    ],
+    ("spoil", "found"),
+    [(with_header(schema=9, gsmerge="9.9"), ("schema 1", 9, "gsmerge 9.9")), (cut(0.5), (".gsm", "read"))],
     ids=["newer", "half"],
 )
 @pytest.mark.parametrize("command", ["extend", "decode"])
 def test_a_damaged_state_is_refused(
-    spoil: Spoil, words: str, command: str, state: Path, walks: list[Path], run: Run
+    spoil: Spoil, found: tuple[object, ...], command: str, state: Path, walks: list[Path], run: Run
 ) -> None:
     spoil(state)
     before = digests(state.parent)
-    assert_refused(run(command, state, *([walks[1]] if command == "extend" else [])), 3, words)
+    assert_refused(run(command, state, *([walks[1]] if command == "extend" else [])), 3, state, *found)
     assert digests(state.parent) == before
 
 
@@ -260,7 +256,7 @@ def test_batches_before_a_broken_one_stay(states: list[Path], walks: list[Path],
 def test_a_broken_first_batch_makes_no_file(scene_copy: Path, tmp_path: Path, run: Run) -> None:
     (scene_copy / "scene.ply").write_bytes(b"")
     outcome = run("extend", tmp_path / "state.gsm", scene_copy)
-    assert_refused(outcome, 3, "")
+    assert_refused(outcome, 3, scene_copy / "scene.ply", "PLY")
     assert not (tmp_path / "state.gsm").exists()
     assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
 
@@ -279,7 +275,7 @@ def test_a_state_that_another_process_changes_meanwhile(
         return done
 
     monkeypatch.setattr(files, "extend", slowly)
-    assert_refused(run("extend", state, walks[1]), 3, "was changed by another process meanwhile")
+    assert_refused(run("extend", state, walks[1]), 3, state, "process")
     assert state.read_bytes() == states[1].read_bytes()
     assert list(listing(state.parent)) == ["state.gsm"]
 
@@ -296,7 +292,7 @@ def test_a_state_that_another_process_makes_meanwhile(
         return extended(*arguments, **named)  # type: ignore[arg-type]
 
     monkeypatch.setattr(files, "extend", slowly)
-    assert_refused(run("extend", state, walks[0], *SMALL), 3, "state.gsm")
+    assert_refused(run("extend", state, walks[0], *SMALL), 3, state, "process")
     assert state.read_bytes() == states[1].read_bytes()
 
 
@@ -308,8 +304,7 @@ def test_a_full_disk_leaves_the_old_state(state: Path, states: list[Path], walks
     code += "import sys; from gsmerge.cli import main; sys.exit(main(sys.argv[1:]))"
     command = [sys.executable, "-c", code, "extend", str(state), str(walks[1])]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (3, "", 1), done.stderr
-    assert "state.gsm: could not be written (" in done.stderr
+    assert_refused(Outcome(done.returncode, done.stdout, done.stderr), 3, state, "File too large")
     assert list(listing(state.parent)) == ["state.gsm"]
     assert state.read_bytes() == states[0].read_bytes()
     assert run("extend", state, walks[1]).code == 0

@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 from hostile import CASES, MARKER, Case
+from messages import ERROR, names
 
 from .conftest import Run, listing
 
@@ -74,7 +75,7 @@ def scene(small_scene: Path, tmp_path: Path) -> Path:
 
 
 def one_line(err: str) -> None:
-    assert err.startswith("gsmerge: error: ")
+    assert err.startswith(ERROR)
     assert err.endswith("\n")
     assert err.count("\n") == 1
     assert err[:-1].isprintable()
@@ -105,7 +106,8 @@ def test_hostile_input_is_read_or_refused_in_one_line(name: str, scene: Path, ru
         return
     assert outcome.out == ""
     one_line(outcome.err)
-    assert [part for part in (case.named, *case.says) if part not in outcome.err] == []
+    assert case.named in outcome.err
+    assert names(outcome.err, *case.says), outcome.err
 
 
 @pytest.mark.parametrize("name", list(CASES)[::12])

@@ -14,6 +14,7 @@ pytestmark = [
 ]
 
 
+@pytest.mark.usefixtures("foreground")
 @pytest.mark.parametrize("command", ["compact", "encode", "extend", "batch"])
 def test_nothing_is_half_written_and_nothing_is_left(command: str, root: Path, tmp_path: Path) -> None:
     kills = load_script(root / "benchmarks" / "kills.py")

@@ -12,7 +12,7 @@ import pytest
 from gsmerge import read_ply
 from gsmerge.options import method_names
 
-from .conftest import Run, listing
+from .conftest import Run, assert_refused, listing
 
 FAKE = """#!{python}
 import sys
@@ -78,35 +78,28 @@ def test_a_missing_program_is_one_line(
     monkeypatch.setenv("GSMERGE_SPLAT_TRANSFORM", named or "")
     before = listing(scene_copy)
     said = run("compact", scene_copy, "--method", "splat-transform")
-    assert (said.code, said.out, said.err.count("\n")) == (2, "", 1)
-    assert (named or "on PATH or named by GSMERGE_SPLAT_TRANSFORM") in said.err
-    assert "npm install -g @playcanvas/splat-transform" in said.err
+    found = f"GSMERGE_SPLAT_TRANSFORM={named}" if named else "GSMERGE_SPLAT_TRANSFORM"
+    assert_refused(said, 2, "method splat-transform", found, "npm install -g @playcanvas/splat-transform")
     assert listing(scene_copy) == before
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("#!{python}\nraise SystemExit('out of\\nmemory')\n", "it ended with code 1: out of memory"),
-        ("#!{python}\n", "it ended with code 0: without output"),
-    ],
+    ("text", "found"),
+    [("#!{python}\nraise SystemExit('out of\\nmemory')\n", "code 1: out of memory"), ("#!{python}\n", "code 0")],
 )
 def test_a_failing_program_is_one_line(
-    text: str, words: str, scene_copy: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+    text: str, found: str, scene_copy: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("GSMERGE_SPLAT_TRANSFORM", str(program(tmp_path, text)))
     before = listing(scene_copy)
-    said = run("compact", scene_copy, "--method", "splat-transform", "--quiet")
-    assert (said.code, said.out, said.err.count("\n")) == (1, "", 1)
-    assert words in said.err
+    assert_refused(run("compact", scene_copy, "--method", "splat-transform", "--quiet"), 1, "", found)
     assert listing(scene_copy) == before
 
 
 def test_missing_photos_are_one_line(scene_copy: Path, run: Run) -> None:
     shutil.rmtree(scene_copy / "images")
     said = run("compact", scene_copy, "--method", "unmerged-fit", "--quiet")
-    assert (said.code, said.out, said.err.count("\n")) == (2, "", 1)
-    assert "method unmerged-fit: expected photos, found none; give --images" in said.err
+    assert_refused(said, 2, "method unmerged-fit", "photos", "--images")
 
 
 @pytest.mark.parametrize("method", method_names())
@@ -116,7 +109,7 @@ def test_a_plan_names_the_method(
     monkeypatch.setenv("GSMERGE_SPLAT_TRANSFORM", str(program(tmp_path, FAKE)))
     said = run("compact", made_scene, "--method", method, "--dry-run", "--budget", 400, code=0)
     assert (f"method     {method}; fit" in said.out) == (method != "gsmerge")
-    assert ("merging across views" in said.out) == (method == "gsmerge")
+    assert ("merging" in said.out) == (method == "gsmerge")
     document = json.loads(run("compact", made_scene, "--method", method, "--dry-run", "--json").out)
     assert document["compact"]["method"] == method
     assert document["compact"]["seconds"] > 0

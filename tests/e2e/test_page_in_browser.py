@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from typing import Any
 
@@ -10,10 +9,7 @@ import pytest
 
 from .browser import CHROMIUM, Browser, browser
 
-pytestmark = [
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium installed"),
-    pytest.mark.skipif("GSMERGE_BROWSER" not in os.environ, reason="GSMERGE_BROWSER is not set"),
-]
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium installed")
 FIRST = "document.querySelector('.compare')"
 
 

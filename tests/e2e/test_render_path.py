@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from messages import names, says
 from tiny_scene import edited_json
 
 import gsmerge
@@ -35,7 +36,7 @@ def error(one: np.ndarray, other: np.ndarray) -> float:
 def test_a_video_shows_the_frames_of_its_path(kind: str, name: str, made_scene: Path, tmp_path: Path, run: Run) -> None:
     call = ("render", made_scene, "--path", kind, "--frames", 8)
     outcome = run(*call, "-o", tmp_path / name, "--fps", 4, code=0)
-    assert outcome.err.splitlines()[-1].startswith(f"{tmp_path / name}: 8 frames of {WIDTH} x {HEIGHT}, 2.0 s, VP")
+    assert says(outcome.err.splitlines()[-1], tmp_path / name, "8 frames", f"{WIDTH} x {HEIGHT}", "2.0 s")
     run(*call, "-o", tmp_path / "frames", "--threads", 1, code=0)
     run(*call, "-o", tmp_path / "again", "--threads", 2, code=0)
     assert list(listing(tmp_path / "frames")) == [f"frame_{i:05d}.png" for i in range(8)]
@@ -90,7 +91,7 @@ def test_the_path_of_a_file_is_placed_as_held_out_views_are(scene_copy: Path, tm
         errors = [error(picture, photo) for photo in photos]
         assert errors[i] == min(errors) < 20
     some = run("render", scene_copy, "--path", targets, "--views", 2, "-o", tmp_path / "x.mp4", "--dry-run", code=0)
-    assert some.out.endswith(f"x.mp4: 2 frames of {WIDTH} x {HEIGHT}, 0.1 s\n")
+    assert names(some.out, "x.mp4", "2 frames", f"{WIDTH} x {HEIGHT}", "0.1 s")
 
 
 def test_a_scene_without_cameras_takes_those_of_the_path(scene_copy: Path, tmp_path: Path, run: Run) -> None:
@@ -100,14 +101,12 @@ def test_a_scene_without_cameras_takes_those_of_the_path(scene_copy: Path, tmp_p
     out = tmp_path / "out.mp4"
     run("render", bare, "--path", scene_copy / "transforms.json", "-o", out, code=0)
     assert len(read(out)) == 5
-    assert_refused(run("render", bare, "--path", "orbit", "-o", tmp_path / "x.mp4"), 3, "no cameras beside it")
+    assert_refused(run("render", bare, "--path", "orbit", "-o", tmp_path / "x.mp4"), 3, bare, "cameras", "--cameras")
 
 
 def test_one_camera_has_an_orbit_but_no_spline(made_scene: Path, tmp_path: Path, run: Run) -> None:
     call = ("render", made_scene, "--views", 1, "--frames", 2, "-o", tmp_path / "a.mp4")
-    assert_refused(
-        run(*call, "--path", "spline"), 2, "expected at least 2 different cameras, got 1; an orbit needs one"
-    )
+    assert_refused(run(*call, "--path", "spline"), 2, "spline", 2, 1)
     assert not (tmp_path / "a.mp4").exists()
     run(*call, "--path", "orbit", code=0)
     assert len(read(tmp_path / "a.mp4")) == 2
@@ -116,7 +115,7 @@ def test_one_camera_has_an_orbit_but_no_spline(made_scene: Path, tmp_path: Path,
 def test_frames_grow_with_the_views_of_a_spline(
     made_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gsmerge.cli.render_command.PATH_FRAMES", 12)
+    monkeypatch.setattr("gsmerge.measure.drawings.PATH_FRAMES", 12)
     for kind, count in (("spline,back:0.5", 20), ("orbit", 12)):
         outcome = run("render", made_scene, "--path", kind, "-o", tmp_path / "x", "--dry-run", "--json", code=0)
         assert json.loads(outcome.out)["frames"] == count

@@ -119,9 +119,9 @@ def scenes(make_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFac
     """Three folders: of one Gaussian per pixel, of Gaussians without an order, and of exact numbers."""
     folder = tmp_path_factory.mktemp("processors")
     aligned = make_scene(folder / "aligned", num_views=4, width=96, height=64)
-    loose = make_scene(folder / "loose", num_views=4, width=96, height=64, seed=5)
-    take_rows(loose / "scene.ply", 8000)
-    return {"aligned": aligned, "loose": loose, "exact": write_exact_scene(folder / "exact")}
+    unaligned = make_scene(folder / "unaligned", num_views=4, width=96, height=64, seed=5)
+    take_rows(unaligned / "scene.ply", 8000)
+    return {"aligned": aligned, "unaligned": unaligned, "exact": write_exact_scene(folder / "exact")}
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
+from messages import noted
 from sharp_files import split_views, write_sharp
 
 from gsmerge import read_scene
@@ -42,7 +43,7 @@ def test_one_file_with_its_photo(run: Run, sharp: Path, tmp_path: Path) -> None:
     assert report["input"]["num_gaussians"] == 2 * 150 * 150
     assert report["output"]["num_gaussians"] == 3000
     assert report["psnr_input_views"]["after"] > report["psnr_input_views"]["before"]
-    assert any("2 Gaussians per pixel, layer-major" in note for note in report["notes"])
+    assert noted(report["notes"], "2 Gaussians", "layer-major")
 
 
 def test_several_files_become_one_scene(run: Run, sharp: Path, tmp_path: Path) -> None:
@@ -57,8 +58,8 @@ def test_several_files_become_one_scene(run: Run, sharp: Path, tmp_path: Path) -
     assert abs(joined[1]["scale"] * 0.85 / 1.1 - 1) < 0.02
     assert report["input"]["num_gaussians"] == 3 * 2 * 150 * 150
     assert report["input"]["bytes"] == sum(file.stat().st_size for file in files)
-    assert any(note.startswith("3 of 4 files are joined in the frame of IMG_0001.ply") for note in report["notes"])
-    assert any(note.startswith("IMG_0009.ply is left out") for note in report["notes"])
+    assert noted(report["notes"], "3 of 4", "joined", "IMG_0001.ply")
+    assert noted(report["notes"], "IMG_0009.ply", "left")
     assert report["psnr_input_views"]["after"] > report["psnr_input_views"]["before"] + 2
     assert len(json.loads((tmp_path / "place.cameras.json").read_text())) == 3  # one for both layers of a view
     inside = tmp_path / "inside" / "place.ply"
@@ -86,9 +87,9 @@ def test_what_cannot_be_joined(run: Run, sharp: Path, tmp_path: Path) -> None:
     stranger, out = sharp / "other/IMG_0009.ply", tmp_path / "a.ply"
     photos = ("--images", sharp / "photos")
     refused = run("compact", first, stranger, *photos, "-o", out, "-q")
-    assert_refused(refused, 3, "no two of 2 whose photos share enough", "give photos that overlap by half")
-    assert_refused(run("compact", first, tmp_path / "small.ply"), 2, "no such scene; name the output with -o")
-    assert_refused(run("compact", first, second, first, "-o", out), 2, "expected each scene once, got it twice")
-    assert_refused(run("compact", first, second, "--cameras", sharp / "made"), 2, "--cameras: expected one scene")
-    assert_refused(run("compact", first, second, "-o", second, "--overwrite"), 2, "other than the input")
+    assert_refused(refused, 3, first, "two of 2", "--images")
+    assert_refused(run("compact", first, tmp_path / "small.ply"), 2, "small.ply", "-o")
+    assert_refused(run("compact", first, second, first, "-o", out), 2, first, "twice")
+    assert_refused(run("compact", first, second, "--cameras", sharp / "made"), 2, "--cameras", "one scene")
+    assert_refused(run("compact", first, second, "-o", second, "--overwrite"), 2, second, "input")
     assert not out.exists()

@@ -11,6 +11,8 @@ from scripts import load_script
 
 import gsmerge
 from gsmerge.networks.checkpoint import SHIPPED
+from gsmerge.scene.held_out import read_held_out
+from gsmerge.scene.read import load_scene
 
 LEAST_GAIN = 1.0  # dB on photos that the scene was not made from
 
@@ -47,9 +49,9 @@ def test_the_benchmark_compares_at_equal_count(
     monkeypatch.syspath_prepend(str(root / "benchmarks"))
     benchmark = load_script(root / "benchmarks" / "networks.py")
     made = make_scene(tmp_path / "scene", num_views=3, width=96, height=72, seed=123)
-    load = gsmerge.io.load_scene(made)
+    load = load_scene(made)
     monkeypatch.setattr(benchmark, "export", lambda folder, cache: load.files.ply)
-    monkeypatch.setattr(benchmark, "read_held_out", lambda folder: gsmerge.io.read_held_out(load, made / "targets"))
+    monkeypatch.setattr(benchmark, "read_held_out", lambda folder: read_held_out(load, made / "targets"))
     store = benchmark.Store(tmp_path / "runs.jsonl")
     args = argparse.Namespace(checkpoint=SHIPPED, lpips=False, cache=tmp_path, store=store)
     condition = benchmark.Condition("no fit", {"fit": "none", "min_opacity": 0.5, "k": 2})

@@ -100,5 +100,5 @@ def test_cameras_that_are_far_off(exact: Path, tmp_path: Path, run: Run) -> None
     turn_cameras(folder, 15, only=2)
     outcome = run("compact", folder, *FAST, "-o", tmp_path / "a.ply", code=3)
     assert outcome.err.count("\n") == 1
-    assert "px of their own pixels, found a median of up to" in outcome.err
+    assert "median" in outcome.err
     assert not (tmp_path / "a.ply").exists()

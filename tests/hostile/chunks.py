@@ -101,36 +101,35 @@ def two_sizes(entry: dict[str, Any], _: Path) -> None:
 
 
 def _shapes() -> dict[str, Case]:
-    zeros, byte, shape = torch.zeros(VIEWS, 18), torch.zeros(1, dtype=torch.uint8), "expected cameras [v,18], found"
-    no_numbers, no_tensors = "expected cameras of numbers", "expected images as tensors"
-    objects = "or objects, which are not read"
+    zeros, byte, shape = torch.zeros(VIEWS, 18), torch.zeros(1, dtype=torch.uint8), "[v,18], found"
+    no_numbers, no_tensors, objects = "cameras of numbers", "images as tensors", "objects"
     cameras: dict[str, tuple[Any, str]] = {
         "17 columns": (zeros[:, :17].clone(), f"{shape} [3, 17]"),
         "one row": (torch.zeros(18), f"{shape} [18]"),
         "text": ("many", f"{shape} str"),
         "a list": ([[0.0] * 18] * VIEWS, f"{shape} list"),
         "None": (None, ""),
-        "no rows": (torch.zeros(0, 18), "expected 1 to 10000 cameras, found 0"),
-        "2^40 rows": (torch.zeros(1, 18).expand(2**40, 18), "expected 1 to 10000 cameras"),
+        "no rows": (torch.zeros(0, 18), "10000 cameras, found 0"),
+        "2^40 rows": (torch.zeros(1, 18).expand(2**40, 18), "10000 cameras"),
         "integers": (zeros.int(), no_numbers),
         "bool": (zeros.bool(), no_numbers),
         "bfloat16": (zeros.bfloat16(), no_numbers),
         "complex": (zeros.to(torch.complex64), no_numbers),
         "sparse": (zeros.to_sparse(), objects),
         "no values": (torch.empty(VIEWS, 18, device="meta"), objects),
-        "NaN": (torch.full((VIEWS, 18), torch.nan), "expected finite numbers"),
+        "NaN": (torch.full((VIEWS, 18), torch.nan), "finite"),
         "1e38": (torch.full((VIEWS, 18), 1e38), ""),
-        "zeros": (zeros, "axes are not orthonormal"),
+        "zeros": (zeros, "orthonormal"),
     }
     images: dict[str, tuple[Any, str]] = {
-        "too few": ([byte], "expected 3 images, one per camera, found 1"),
-        "one text": ("abc", "expected 3 images, one per camera, found str"),
-        "empty": ([byte[:0].clone()] * VIEWS, "cannot be decoded"),
+        "too few": ([byte], "found 1"),
+        "one text": ("abc", "found str"),
+        "empty": ([byte[:0].clone()] * VIEWS, "decoded"),
         "2^40 bytes": ([byte.expand(2**40)] * VIEWS, no_tensors),
         "floats": ([torch.zeros(9)] * VIEWS, no_tensors),
         "no values": ([torch.empty(9, dtype=torch.uint8, device="meta")] * VIEWS, objects),
         "numbers": ([1] * VIEWS, no_tensors),
-        "zeros": ([byte.repeat(99)] * VIEWS, "cannot be decoded"),
+        "zeros": ([byte.repeat(99)] * VIEWS, "decoded"),
     }
     lists: dict[str, Any] = {
         "no scenes": [], "numbers": [1, 2], "one number": 5, "an object": {"a": 1}, "a tensor": torch.zeros(3),
@@ -140,10 +139,10 @@ def _shapes() -> dict[str, Case]:
         for key, values in {"cameras": cameras, "images": images}.items()
         for word, (value, says) in values.items()
     }
-    listed = ("expected a list of scenes",)
+    listed = ("list",)
     cases |= {word: Case(saved(lambda *_, value=value: value), says=listed) for word, value in lists.items()}
     cases["one scene and a part of one"] = Case(saved(lambda entry, _: [entry, {"key": "b"}]), says=listed)
-    cases["images of two sizes"] = Case(saved(two_sizes), says=("expected images of one size",))
+    cases["images of two sizes"] = Case(saved(two_sizes), says=("images", "size"))
     cases["images of 200 bytes"] = Case(saved(lambda e, _: e.update(images=[image[:200] for image in e["images"]])))
     cases["no photos"] = Case(saved(replaced("images", None)), EITHER)
     cases["as it is"] = Case(saved(lambda entry, _: None), READ)
@@ -154,14 +153,14 @@ def _shapes() -> dict[str, Case]:
 
 
 def _bytes() -> dict[str, Case]:
-    cut, objects = ("expected a chunk written by torch",), ("a damaged one, or objects, which are not read",)
+    cut, objects = ("chunk", "torch"), ("damaged", "objects")
     shares = {f"{share} of it": Case(bytes_of(lambda d, s=share: d[: int(s * len(d))]), says=cut)
               for share in (0.0, 0.01, 0.5, 0.99)}  # fmt: skip
     return shares | {
         "text": Case(bytes_of(lambda _: b"text"), says=cut),
         "all but the end": Case(bytes_of(lambda data: data[:-30])),
-        "an older form": Case(older_form, says=("found something else",)),
-        "packed members": Case(with_pickle(lambda _, x: x, zipfile.ZIP_DEFLATED), says=("found packed members",)),
+        "an older form": Case(older_form, says=("something",)),
+        "packed members": Case(with_pickle(lambda _, x: x, zipfile.ZIP_DEFLATED), says=("packed",)),
         "8 GB of zeros": Case(zeros),
         "a pickle": Case(bare_pickle),
         "a payload": Case(saved(lambda _, folder: Payload(folder / MARKER)), says=objects),
@@ -173,7 +172,7 @@ def _bytes() -> dict[str, Case]:
         "a structure of 20 MB": Case(with_pickle(lambda _, content: content + bytes(20 << 20))),
         "a structure of nested lists": Case(with_pickle(lambda *_: b"\x80\x02" + b"]" * 99_999 + b"a" * 99_998 + b".")),
         "a structure that names another file": Case(with_pickle(renamed), says=objects),
-        "a tensor past its numbers": Case(with_pickle(moved), says=("found a damaged one",)),
+        "a tensor past its numbers": Case(with_pickle(moved), says=("damaged",)),
         "2^40 bytes asked for": Case(with_pickle(lambda *_: GREEDY)),
     }
 

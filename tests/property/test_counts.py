@@ -13,8 +13,7 @@ from skimage.measure import label as connected_parts
 from gsmerge.moments import Members
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.decode import split_counts
-from gsmerge.stages.region_tree import RegionTree, cut_tree, region_tree
-from gsmerge.stages.segment import SegmentOptions, segment
+from gsmerge.stages.segment import RegionTree, SegmentOptions, cut_tree, region_tree, segment
 from gsmerge.types import FeatureGaussians, Groups
 
 FEW = settings(max_examples=25, deadline=None, derandomize=True)

@@ -42,7 +42,7 @@ def test_threads_change_no_bit(views: int) -> None:
             plan = plan_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], WIDTH, HEIGHT)
             rendering = render(gaussians, cameras, with_depths=True)
             results.append([
-                plan.ids, plan.members, plan.offsets, plan.footprints, rendering.images,
+                plan.ids, plan.flatten_ids, plan.isect_offsets, plan.conics, rendering.images,
                 rendering.alphas, rendering.depths, splat_adjoint(plan, image), *contributions(plan),
             ])  # fmt: skip
     assert len(results[0][1]) > 4 * 2**15
@@ -112,7 +112,7 @@ def test_depth_order_and_lists(seed: int) -> None:
     gaussians, cameras = scene(300, seed)
     plan = plan_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], WIDTH, HEIGHT)
     assert (np.diff(plan.ids) > 0).all()
-    for start, end in zip(plan.offsets[:-1], plan.offsets[1:], strict=True):
-        depths = plan.depths[plan.members[start:end]]
+    for start, end in zip(plan.isect_offsets[:-1], plan.isect_offsets[1:], strict=True):
+        depths = plan.depths[plan.flatten_ids[start:end]]
         assert (np.diff(depths) >= 0).all()
-        assert len(set(plan.members[start:end].tolist())) == end - start
+        assert len(set(plan.flatten_ids[start:end].tolist())) == end - start

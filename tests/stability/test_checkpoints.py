@@ -50,14 +50,14 @@ def test_scenes_in_no_order_and_repeated_runs(tmp_path: Path) -> None:
     scene = make_scene(room(), arc(3))
     chosen = {"fit": "none", "superpixels": "10%"}
     path = written(tmp_path / "a.safetensors", Networks())
-    loose = shuffled(scene)
-    plain = gsmerge.compact(loose, **chosen, checkpoint="none")
-    assert identical(plain.gaussians, gsmerge.compact(loose, **chosen, checkpoint=str(path)).gaussians)
+    unaligned = shuffled(scene)
+    plain = gsmerge.compact(unaligned, **chosen, checkpoint="none")
+    assert identical(plain.gaussians, gsmerge.compact(unaligned, **chosen, checkpoint=str(path)).gaussians)
     written(path, noisy())
-    one = gsmerge.compact(loose, **chosen, checkpoint=str(path), threads=1)
+    one = gsmerge.compact(unaligned, **chosen, checkpoint=str(path), threads=1)
     assert_invariants(one.gaussians, scene)
     assert not np.array_equal(one.gaussians.means[:20], plain.gaussians.means[:20])
-    assert identical(one.gaussians, gsmerge.compact(loose, **chosen, checkpoint=str(path), threads=3).gaussians)
+    assert identical(one.gaussians, gsmerge.compact(unaligned, **chosen, checkpoint=str(path), threads=3).gaussians)
 
 
 @pytest.mark.parametrize("settings", [{}, {"quality": "15dB"}, {"levels": 2}], ids=str)

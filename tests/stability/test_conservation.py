@@ -115,8 +115,8 @@ def test_faint_scenes_keep_their_coverage(clean: Scene, match: str) -> None:
 
 def test_a_second_pass_neither_blurs_nor_darkens(scene: Scene) -> None:
     once = scenes.compacted(scene, superpixels="4.4%").gaussians
-    loose = Scene(once, scene.cameras, scene.images, None, scene.names)
-    twice = compact(loose, budget=len(once)).gaussians
+    unaligned = Scene(once, scene.cameras, scene.images, None, scene.names)
+    twice = compact(unaligned, budget=len(once)).gaussians
     assert 0.95 * len(once) <= len(twice) <= len(once)  # what the pull on opacities has faded goes
     assert scenes.psnr_of(twice, scene) > scenes.psnr_of(once, scene) - 0.2
     assert coverage(twice, scene)[1] == pytest.approx(coverage(once, scene)[1], abs=1 / 255)

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from segmentation_scores import DENSITIES, count_at, photos, proxy_psnr, splat_psnr
 
-from gsmerge.kernels.superpixels.regions import pad_labels, region_rows
-from gsmerge.kernels.superpixels.sweeps import refine
+from gsmerge.kernels.superpixels.regions import pad_labels, refine, region_rows
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.segment import SegmentOptions, segment
 from gsmerge.stages.superpixels import SEGMENTATIONS, superpixels

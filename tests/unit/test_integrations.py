@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from messages import noted, refuses
 from scenes import arc, make_scene, move, room
 
 from gsmerge import Gaussians, Scene, SceneError, compact_tensors, integrations
@@ -97,7 +98,7 @@ def test_rotations_of_depth_anything_3_get_no_note(scene: Scene) -> None:
         **integrations.depth_anything_3(prediction_of(scene, gaussians=gaussians)), **FAST
     ).report.notes
     assert turned[:, 0].min() < 0
-    assert not [note for note in notes if "w comes last" in note]
+    assert not noted(notes, "w", "last")
 
 
 def test_depth_anything_3_in_metres_and_after_writing_colmap(scene: Scene) -> None:
@@ -110,7 +111,7 @@ def test_depth_anything_3_in_metres_and_after_writing_colmap(scene: Scene) -> No
 
 
 def test_depth_anything_3_without_gaussians(scene: Scene) -> None:
-    with pytest.raises(SceneError, match=r"prediction: expected a field gaussians, found none; .*infer_gs=True"):
+    with refuses(SceneError, "prediction", "gaussians", "infer_gs=True"):
         integrations.depth_anything_3(prediction_of(scene, gaussians=None))
 
 
@@ -125,7 +126,7 @@ def test_anysplat(scene: Scene) -> None:
     assert given["order"] == "none"
     two = family(fewer)
     two.means = two.means.repeat(2, 1, 1)
-    with pytest.raises(SceneError, match="means: expected a batch of one scene, found shape"):
+    with refuses(SceneError, "means", [2, 5134, 3]):
         integrations.anysplat(two, poses_of(scene, "extrinsic", "intrinsic"), images)
 
 

@@ -5,6 +5,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 import torch
+from messages import refuses
 
 from gsmerge.types import (
     Cameras,
@@ -119,12 +120,12 @@ def test_single_arrays() -> None:
     [("means", (5, 2)), ("quats", (5, 3)), ("scales", (4, 3)), ("opacities", (5, 1)), ("sh0", (5, 3)), ("shN", (5, 3))],
 )
 def test_wrong_shapes_are_named(name: str, shape: tuple[int, ...]) -> None:
-    with pytest.raises(ValueError, match=f"{name}: expected shape .* got "):
+    with refuses(ValueError, name, list(shape)):
         replace(gaussians(5), **{name: np.zeros(shape)})
 
 
 def test_incomplete_harmonics_are_refused() -> None:
-    with pytest.raises(ValueError, match="expected 0, 3, 8, 15 or 24 coefficients, got 5"):
+    with refuses(ValueError, "shN", 24, 5):
         gaussians(2, 5)
 
 
@@ -139,16 +140,15 @@ def test_cameras() -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "named"),
     [
-        ({"viewmats": np.stack([np.eye(3)] * 2)}, "viewmats: expected shape"),
-        ({"Ks": np.eye(3)[None]}, "Ks: expected shape"),
-        ({"width": 0}, "expected a positive image size, got 0 x 3"),
-        ({"height": -1}, "expected a positive image size"),
+        ({"viewmats": np.stack([np.eye(3)] * 2)}, ("viewmats", [2, 4, 4], [2, 3, 3])),
+        ({"Ks": np.eye(3)[None]}, ("Ks", [2, 3, 3], [1, 3, 3])),
+        ({"width": 0}, ("", "0 x 3")), ({"height": -1}, ("", "4 x -1")),
     ],
-)
-def test_wrong_cameras_are_refused(change: dict, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
+)  # fmt: skip
+def test_wrong_cameras_are_refused(change: dict, named: tuple[object, ...]) -> None:
+    with refuses(ValueError, *named):
         replace(cameras(), **change)
 
 
@@ -176,12 +176,12 @@ def test_scenes_of_tensors_become_such_of_arrays(missing: np.ndarray | None) -> 
     changed |= {name: as_tensor(getattr(given, name)) for name in ("images", "pixel_ids")}
     if missing is not None:
         changed["missing"] = as_tensor(missing)
-    loose = Scene(changed["gaussians"], changed["cameras"], changed["images"], None, given.names)
+    unaligned = Scene(changed["gaussians"], changed["cameras"], changed["images"], None, given.names)
     for tensors in (
         replace(given, **changed),
         replace(given, **{**changed, "images": None}),
-        loose,
-        replace(loose, images=None),
+        unaligned,
+        replace(unaligned, images=None),
     ):
         arrays = tensors.numpy()
         assert type(arrays) is type(tensors)
@@ -195,23 +195,23 @@ def test_scenes_of_tensors_become_such_of_arrays(missing: np.ndarray | None) -> 
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "named"),
     [
-        ({"gaussians": gaussians(23)}, "expected 2 x 3 x 4 = 24 Gaussians, got 23"),
-        ({"pixel_ids": np.ones((2, 4), int)}, "pixel_ids: expected shape"),
-        ({"images": np.zeros((2, 3, 4, 4))}, "images: expected shape"),
-        ({"names": ("a",)}, "expected 2 view names, got 1"),
-        ({"missing": np.ones((2, 4, 3), bool)}, "missing: expected shape"),
+        ({"gaussians": gaussians(23)}, ("", "2 x 3 x 4", 23)),
+        ({"pixel_ids": np.ones((2, 4), int)}, ("pixel_ids", [24], [2, 4])),
+        ({"images": np.zeros((2, 3, 4, 4))}, ("images", [2, 3, 4, 3], [2, 3, 4, 4])),
+        ({"names": ("a",)}, ("", 2, "names", 1)),
+        ({"missing": np.ones((2, 4, 3), bool)}, ("missing", [2, 3, 4], [2, 4, 3])),
     ],
 )
-def test_wrong_scenes_are_refused(change: dict, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
+def test_wrong_scenes_are_refused(change: dict, named: tuple[object, ...]) -> None:
+    with refuses(ValueError, *named):
         replace(scene(), **change)
 
 
 def test_groups_count_all_views() -> None:
     assert len(Groups(np.zeros((2, 3, 4), np.int32), (3, 4))) == 7
-    with pytest.raises(ValueError, match="labels: expected shape"):
+    with refuses(ValueError, "labels", [2, 3, 4]):
         Groups(np.zeros((2, 3, 4), np.int32), (3,))
 
 
@@ -225,5 +225,5 @@ def test_features_concat_shifts_the_starts() -> None:
 
 @pytest.mark.parametrize("name", ["weights", "masses", "extinctions", "gains", "footprints", "starts"])
 def test_wrong_features_are_refused(name: str) -> None:
-    with pytest.raises(ValueError, match=f"{name}: expected shape"):
+    with refuses(ValueError, name, [7]):
         replace(features([1, 2]), **{name: np.zeros(7)})

@@ -16,7 +16,7 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry import Similarity, multiply_quats, normalize, rotmat_to_quat
 from gsmerge.kernels.elementary import arccos
 from gsmerge.kernels.matrices import matmul, solve
-from gsmerge.kernels.raster.harmonics import view_colors
+from gsmerge.kernels.raster.sh import view_colors
 from gsmerge.types import Cameras, Gaussians, LargePhotos, Scene, grid_ids
 
 DIRECTIONS = 96  # in which harmonics are compared before and after a turn

@@ -4,25 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.kernels.signature import STATUS, f4, f8, i4, i8, native
+from gsmerge.kernels.signature import STATUS, declare, f4, f8, i4, i8
 
-
-@native(
-    STATUS, starts=i8("ends", least=0, ascending=True), ids=i4("m"), means=f4("n", 3), sh0=f4("n", 1, 3),
-    opacities=f4("n"), centres=f8("groups", 3), footprints=f8("groups"), counts=i8("groups", least=1),
-    plane_weight=f8(), features=f8("longest", 8, out=True), weights=f8("longest", out=True),
-    order=i8(2, "longest", out=True), cuts=i8("bounds", out=True), room=f8("most", 18, out=True),
-    child_starts=i8("slots", out=True), child_ids=i4("own", out=True), parents=i8("children", out=True),
-    num_children=i8(1, out=True), errors=f8("groups", "width", out=True),
+# features to room are work space for the longest group and the most children; errors may have no columns
+_split_groups = declare(
+    "split_groups", STATUS, starts=i8("ends", least=0, ascending=True), ids=i4("m"), means=f4("n", 3),
+    sh0=f4("n", 1, 3), opacities=f4("n"), centres=f8("groups", 3), footprints=f8("groups"),
+    counts=i8("groups", least=1), plane_weight=f8(), features=f8("longest", 8, out=True),
+    weights=f8("longest", out=True), order=i8(2, "longest", out=True), cuts=i8("bounds", out=True),
+    room=f8("most", 18, out=True), child_starts=i8("slots", out=True), child_ids=i4("own", out=True),
+    parents=i8("children", out=True), num_children=i8(1, out=True), errors=f8("groups", "width", out=True),
 )  # fmt: skip
-def _split_groups(
-    starts, ids, means, sh0, opacities, centres, footprints, counts, plane_weight, features, weights, order, cuts, room,
-    child_starts, child_ids, parents, num_children, errors,
-):  # fmt: skip
-    """Write children of every group, at most ``counts`` of them, their number, and their errors if there is room.
-
-    ``features`` to ``room``, for the longest group and the most children, are overwritten.
-    """
 
 
 def gather_groups(starts, ids, rows):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.kernels.signature import STATUS, f4, f8, i4, i8, native
+from gsmerge.kernels.signature import STATUS, declare, f4, f8, i4, i8, native
 
 
 @native(f8(), mean_a=f8(3), cov_a=f8(6), mean_b=f8(3), cov_b=f8(6))
@@ -38,13 +38,10 @@ def edge_scores(neighbors, means, covars, colors, latents, views, max_color, sim
     """
 
 
-@native(
-    STATUS, neighbors=i8("n", "k"), scores=f8("n", "k"), views=i8("n"), order=i8("m", least=0, below="n"),
-    threshold=f8(), max_size=i8(), left=f8("k", out=True), clusters=i8("n", out=True),
-    num_clusters=i8(1, out=True),
+_find_stars = declare(
+    "find_stars", STATUS, neighbors=i8("n", "k"), scores=f8("n", "k"), views=i8("n"), order=i8("m", least=0, below="n"),
+    threshold=f8(), max_size=i8(), left=f8("k", out=True), clusters=i8("n", out=True), num_clusters=i8(1, out=True),
 )  # fmt: skip
-def _find_stars(neighbors, scores, views, order, threshold, max_size, left, clusters, num_clusters):
-    """Write the results of :func:`leader_clusters`; ``left`` is overwritten."""
 
 
 def leader_clusters(order, neighbors, scores, views, threshold, max_size):
@@ -67,12 +64,10 @@ def leader_clusters(order, neighbors, scores, views, threshold, max_size):
     return clusters, int(count[0])
 
 
-@native(
-    STATUS, neighbors=i8("n", "k"), scores=f8("n", "k"), threshold=f8(), parents=i8("n", out=True),
+_find_components = declare(
+    "find_components", STATUS, neighbors=i8("n", "k"), scores=f8("n", "k"), threshold=f8(), parents=i8("n", out=True),
     clusters=i8("n", out=True), num_clusters=i8(1, out=True),
 )  # fmt: skip
-def _find_components(neighbors, scores, threshold, parents, clusters, num_clusters):
-    """Write the results of :func:`connected_components`; ``parents`` is overwritten."""
 
 
 def connected_components(neighbors, scores, threshold):

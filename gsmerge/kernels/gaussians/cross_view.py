@@ -1,10 +1,66 @@
-"""Agreement of points with the Gaussians of other views, one per pixel: each view is read at one pixel."""
+"""Points and other views: the nearest points of other views, and agreement with their Gaussians, one per pixel.
+
+Nearest points are found by a balanced k-d tree in arrays, searched without recursion. Node i of the tree is a run of
+``order``; its children 2 i + 1 and 2 i + 2 are the halves of the run, which is sorted about its middle along one axis.
+For agreement each view is read at one pixel.
+"""
 
 from __future__ import annotations
 
-from gsmerge.kernels.signature import STATUS, f4, f8, i8, native
+import numpy as np
 
+from gsmerge.kernels.signature import STATUS, declare, f4, f8, i1, i8, native
+
+LEAF = 16  # points up to which a run is not divided
 COLUMNS = 6
+
+
+@native(
+    STATUS, points=f8("n", 3), order=i8("m", out=True, least=0, below="n"), axes=i1("nodes", out=True),
+    splits=f8("nodes", out=True),
+)  # fmt: skip
+def build_tree(points, order, axes, splits):
+    """Build the tree of finite points ``[n,3]``.
+
+    Args:
+        order: ``[n]`` int64 rows of the points, in any order; reordered.
+        axes: ``[nodes]`` int8, written: along which axis each node is divided.
+        splits: ``[nodes]`` float64, written: where.
+    """
+
+
+_search_tree = declare(
+    "search_tree", STATUS, points=f8("n", 3), views=i8("n"), order=i8("m"), axes=i1("nodes"), splits=f8("nodes"),
+    first=i8(least=0), last=i8(), most=i8(), distances=f8("k", out=True), out=i8("n", "k", out=True),
+)  # fmt: skip
+
+
+def nearest_of_others(points, views, order, axes, splits, first, last, most, out):
+    """Write the nearest points of other views than the own to rows ``first`` to ``last`` of ``out [n,k]``.
+
+    Args:
+        points: As :func:`build_tree` took them.
+        views: ``[n]`` int64; points of views below 0 belong to none, and are of another one to each other.
+        order: As :func:`build_tree` left it, as are ``axes`` and ``splits``.
+        first: Of the rows.
+        last: After the last row.
+        most: Points that are looked at for each, whole leaves of the tree.
+        out: ``[n,k]`` int64: nearest first, -1 where there are fewer.
+    """
+    _search_tree(points, views, order, axes, splits, first, last, most, np.empty(out.shape[1]), out)
+
+
+@native(STATUS, values=f8("n"), order=i8("m", out=True, least=0, below="n"), low=i8(least=0), high=i8(), place=i8())
+def partition(values, order, low, high, place):
+    """Reorder a run of an order so that one place holds the value that sorting would put there.
+
+    No value before the place is above it, and none after it below.
+
+    Args:
+        values: ``[n]`` float64 numbers, left as they are.
+        order: ``[m]`` int64 places in ``values``; those from ``low`` to before ``high`` are reordered.
+        place: In ``order``, from ``low`` to before ``high``.
+    """
 
 
 @native(

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.kernels.signature import STATUS, f4, f8, i4, i8, native
+from gsmerge.kernels.signature import STATUS, declare, f4, f8, i4, i8, native
 
-
-@native(STATUS, labels=i4("n"), starts=i8("ends", out=True), ids=i4("n", out=True))
-def _sort_labels(labels, starts, ids):
-    """Write where each label's members begin and, to the front of ``ids``, the members."""
+_sort_labels = declare("sort_labels", STATUS, labels=i4("n"), starts=i8("ends", out=True), ids=i4("n", out=True))
 
 
 def group_members(labels, count):
@@ -24,17 +21,13 @@ def group_members(labels, count):
     return starts, ids[: starts[-1]]
 
 
-@native(
-    STATUS, starts=i8("ends", least=0, ascending=True), ids=i4("m"), means=f4("n", 3), quats=f4("n", 4),
+# caps and order are work space for the longest group
+_pool_groups = declare(
+    "pool_groups", STATUS, starts=i8("ends", least=0, ascending=True), ids=i4("m"), means=f4("n", 3), quats=f4("n", 4),
     scales=f4("n", 3), opacities=f4("n"), sh0=f4("n", 1, 3), shN=f4("n", "rest", 3), footprints=f4("n"),
     own_covariance=i4(), caps=f8("longest", out=True), order=i8("longest", out=True),
     out_geometry=f8("groups", 13, out=True), out_sh=f4("groups", "bases", 3, out=True),
 )  # fmt: skip
-def _pool_groups(
-    starts, ids, means, quats, scales, opacities, sh0, shN, footprints, own_covariance, caps, order, out_geometry,
-    out_sh,
-):  # fmt: skip
-    """Do what :func:`pool` does; ``caps`` and ``order``, as long as the longest group, are overwritten."""
 
 
 def pool(starts, ids, means, quats, scales, opacities, sh0, shN, footprints, own_covariance, out_geometry, out_sh):

@@ -1,4 +1,8 @@
-"""What the networks read of Gaussians and groups, in a frame of each group; arrays are float32, ids int64."""
+"""What the networks read of Gaussians and groups, and their corrections, in a frame of each group.
+
+Arrays are float32, ids int64. Corrections are made in place, and one of zero changes no bit; they have 13 columns, see
+:mod:`gsmerge.networks.corrections`; frames have axes as columns.
+"""
 
 from __future__ import annotations
 
@@ -46,3 +50,20 @@ def describe_parts(
     Three of the position, three log scales, logit of the opacity, three of the colour and three of the normal. With
     ``members`` six more: the position in pixels, and the colour itself.
     """
+
+
+@native(
+    means=f4("g", 3, out=True), covars=f4("g", 3, 3, out=True), masses=f4("g", out=True),
+    extinctions=f4("g", out=True), sh0=f4("g", 1, 3, out=True), quats=f4("g", 4), scales=f4("g", 3),
+    frames=f4("g", 3, 3), residuals=f4("g", 13),
+)  # fmt: skip
+def correct_features(means, covars, masses, extinctions, sh0, quats, scales, frames, residuals):
+    """Correct Feature Gaussians with principal axes ``quats`` and ``scales``."""
+
+
+@native(
+    means=f4("n", 3, out=True), quats=f4("n", 4, out=True), scales=f4("n", 3, out=True), opacities=f4("n", out=True),
+    sh0=f4("n", 1, 3, out=True), residuals=f4("n", 13), frames=f4("g", 3, 3), owners=i8("n", least=0, below="g"),
+)  # fmt: skip
+def correct_gaussians(means, quats, scales, opacities, sh0, residuals, frames, owners):
+    """Correct Gaussians in the frames of their groups ``owners``."""

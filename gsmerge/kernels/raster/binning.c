@@ -40,44 +40,44 @@ API void sort_bits(const uint32_t *bits, int32_t *order, uint64_t *keys, uint64_
 }
 
 // Differences at the boxes' corners, then running sums: no loop over tiles, so nothing to mispredict.
-API int32_t count_boxes(const int16_t *boxes, int64_t lines, int64_t columns, int64_t *corners, int64_t *counts,
-                        int64_t m, int64_t num_corners, int64_t tiles) {
-  int64_t stride = columns + 1;
-  if (num_corners != (lines + 1) * stride || tiles != lines * columns) return OUTSIDE;
+API int32_t count_boxes(const int16_t *boxes, int64_t tile_height, int64_t tile_width, int64_t *corners,
+                        int64_t *counts, int64_t m, int64_t num_corners, int64_t tiles) {
+  int64_t stride = tile_width + 1;
+  if (num_corners != (tile_height + 1) * stride || tiles != tile_height * tile_width) return OUTSIDE;
   for (int64_t i = 0; i < m; i++) {
     int64_t x0 = boxes[4 * i], x1 = boxes[4 * i + 1], y0 = boxes[4 * i + 2], y1 = boxes[4 * i + 3];
-    if (x0 < 0 || y0 < 0 || x0 > x1 || y0 > y1 || x1 > columns || y1 > lines) return OUTSIDE;
+    if (x0 < 0 || y0 < 0 || x0 > x1 || y0 > y1 || x1 > tile_width || y1 > tile_height) return OUTSIDE;
     corners[y0 * stride + x0]++;
     corners[y0 * stride + x1]--;
     corners[y1 * stride + x0]--;
     corners[y1 * stride + x1]++;
   }
-  for (int64_t line = 0; line < lines; line++) {
+  for (int64_t line = 0; line < tile_height; line++) {
     int64_t run = 0;
-    for (int64_t column = 0; column < columns; column++) {
-      int64_t tile = line * columns + column;
+    for (int64_t column = 0; column < tile_width; column++) {
+      int64_t tile = line * tile_width + column;
       run += corners[line * stride + column];
-      counts[tile] = run + (line > 0 ? counts[tile - columns] : 0);
+      counts[tile] = run + (line > 0 ? counts[tile - tile_width] : 0);
     }
   }
   return 0;
 }
 
-API int32_t deal_tiles(const int32_t *order, const int16_t *boxes, int64_t columns, int64_t *cursors, int32_t *members,
-                       int64_t m, int64_t tiles, int64_t intersections) {
+API int32_t deal_tiles(const int32_t *order, const int16_t *boxes, int64_t tile_width, int64_t *cursors,
+                       int32_t *flatten_ids, int64_t m, int64_t tiles, int64_t intersections) {
   for (int64_t i = 0; i < m; i++) {
     int64_t x0 = boxes[4 * i], y0 = boxes[4 * i + 2], width = boxes[4 * i + 1] - x0, height = boxes[4 * i + 3] - y0;
     if (x0 < 0 || y0 < 0 || width <= 0 || height <= 0) continue;
-    if (x0 + width > columns || (y0 + height) * columns > tiles) return OUTSIDE;
-    int64_t tile = y0 * columns + x0, column = 0;
+    if (x0 + width > tile_width || (y0 + height) * tile_width > tiles) return OUTSIDE;
+    int64_t tile = y0 * tile_width + x0, column = 0;
     // One loop for both axes: most boxes hold a tile or two, and the end of a loop is mispredicted.
     for (int64_t n = width * height; n > 0; n--) {
       uint64_t slot = (uint64_t)cursors[tile]++;
       if (slot >= (uint64_t)intersections) return OUTSIDE;
-      members[slot] = order[i];
+      flatten_ids[slot] = order[i];
       column++;
       bool wrap = column == width;
-      tile += wrap ? columns - width + 1 : 1;
+      tile += wrap ? tile_width - width + 1 : 1;
       column = wrap ? 0 : column;
     }
   }

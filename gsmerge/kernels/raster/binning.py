@@ -21,34 +21,34 @@ def depth_order(bits):
 
 
 @native(
-    STATUS, boxes=i2("m", 4), lines=i8(least=0), columns=i8(least=0), corners=i8("num_corners", out=True),
+    STATUS, boxes=i2("m", 4), tile_height=i8(least=0), tile_width=i8(least=0), corners=i8("num_corners", out=True),
     counts=i8("tiles", out=True),
 )  # fmt: skip
-def count_boxes(boxes, lines, columns, corners, counts):
+def count_boxes(boxes, tile_height, tile_width, corners, counts):
     """Write the number of boxes over each tile; ``corners``, zero before, has a place for every corner of a tile."""
 
 
-def count_tiles(boxes, lines, columns):
-    """``[lines * columns]`` int64 boxes over each tile.
+def count_tiles(boxes, tile_height, tile_width):
+    """``[tile_height * tile_width]`` int64 boxes over each tile.
 
     ``boxes [m,4]`` int16: first and (exclusive) last tile column, first and last tile row.
     """
-    counts = np.empty(lines * columns, np.int64)
-    count_boxes(boxes, lines, columns, np.zeros((lines + 1) * (columns + 1), np.int64), counts)
+    counts = np.empty(tile_height * tile_width, np.int64)
+    count_boxes(boxes, tile_height, tile_width, np.zeros((tile_height + 1) * (tile_width + 1), np.int64), counts)
     return counts
 
 
 @native(
-    STATUS, order=i4("m"), boxes=i2("m", 4), columns=i8(), cursors=i8("tiles", out=True),
-    members=i4("intersections", out=True),
+    STATUS, order=i4("m"), boxes=i2("m", 4), tile_width=i8(), cursors=i8("tiles", out=True),
+    flatten_ids=i4("intersections", out=True),
 )  # fmt: skip
-def deal_tiles(order, boxes, columns, cursors, members):
+def deal_tiles(order, boxes, tile_width, cursors, flatten_ids):
     """Append Gaussians to the lists of the tiles under their boxes.
 
     Args:
         order: ``[m]`` int32 Gaussians in depth order.
         boxes: ``[m,4]`` int16 their boxes, in the same order.
-        columns: Tiles per row.
+        tile_width: Tiles per row.
         cursors: ``[tiles]`` int64 where each list goes on, advanced.
-        members: ``[intersections]`` int32, written.
+        flatten_ids: ``[intersections]`` int32, written.
     """

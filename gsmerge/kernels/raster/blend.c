@@ -41,22 +41,22 @@ static inline Weights blend_rows(float *state, const Batch *b, int64_t j, int32_
   return weights;
 }
 
-API int32_t blend(const float *restrict footprints, const float *restrict colors, const int32_t *restrict members,
-               const int64_t *restrict offsets, int64_t columns, int64_t first, int64_t last,
-               const float *restrict background, float *restrict image, float *restrict transmittance, int64_t m,
-                  int64_t n, int64_t ends, int64_t h, int64_t w) {
-  Lists lists = {footprints, members, offsets, columns, m, n, ends};
+API int32_t blend(const float *restrict conics, const int32_t *restrict flatten_ids,
+                  const int64_t *restrict isect_offsets, int64_t tile_width, const float *restrict colors,
+                  int64_t first, int64_t last, const float *restrict background, float *restrict image,
+                  float *restrict transmittance, int64_t m, int64_t n, int64_t ends, int64_t h, int64_t w) {
+  Lists lists = {conics, flatten_ids, isect_offsets, tile_width, m, n, ends};
   if (!lists_are_sound(&lists, first, last)) return OUTSIDE;
   float state[4 * PLANE] __attribute__((aligned(64)));
   Batch batch;
   clear_batch(&batch);
   for (int64_t tile = first; tile < last; tile++) {
-    Tile t = open_tile(state, 4, tile, columns, h, w);
-    int64_t end = offsets[tile + 1];
-    for (int64_t start = offsets[tile]; start < end && t.y_low <= t.y_high; start += BATCH) {
+    Tile t = open_tile(state, 4, tile, tile_width, h, w);
+    int64_t end = isect_offsets[tile + 1];
+    for (int64_t start = isect_offsets[tile]; start < end && t.y_low <= t.y_high; start += BATCH) {
       int64_t stop = mini(end, start + BATCH);
       if (!gather(&batch, &t, &lists, start, stop, end)) return OUTSIDE;
-      gather_colors(&batch, colors, members, start, stop, end);
+      gather_colors(&batch, colors, flatten_ids, start, stop, end);
       for (int64_t j = 0; j < stop - start; j++)
         blend_rows(state, &batch, j, first_row(&t, &batch, j), last_row(&t, &batch, j));
       narrow_tile(&t, state);
@@ -87,22 +87,22 @@ static inline void sum_weights(float *state, const Batch *b, int64_t j, int32_t 
   for (int c = 0; c < CHANNELS; c++) slot[c] = c < channels ? total(sums[c]) : 0.f;
 }
 
-API int32_t weighted_sums(const float *restrict footprints, const int32_t *restrict members,
-                       const int64_t *restrict offsets, int64_t columns, int64_t first, int64_t last,
-                       const float *restrict image, float *restrict slots, int64_t m, int64_t n, int64_t ends,
+API int32_t weighted_sums(const float *restrict conics, const int32_t *restrict flatten_ids,
+                          const int64_t *restrict isect_offsets, int64_t tile_width, int64_t first, int64_t last,
+                          const float *restrict image, float *restrict slots, int64_t m, int64_t n, int64_t ends,
                           int64_t h, int64_t w, int64_t channels) {
-  Lists lists = {footprints, members, offsets, columns, m, n, ends};
+  Lists lists = {conics, flatten_ids, isect_offsets, tile_width, m, n, ends};
   if (!lists_are_sound(&lists, first, last)) return OUTSIDE;
   float state[(CHANNELS + 1) * PLANE] __attribute__((aligned(64)));
   Batch batch;
   clear_batch(&batch);
   for (int64_t tile = first; tile < last; tile++) {
-    Tile t = open_tile(state, CHANNELS + 1, tile, columns, h, w);
+    Tile t = open_tile(state, CHANNELS + 1, tile, tile_width, h, w);
     for (int y = 0; y < t.num_y; y++)
       for (int x = 0; x < t.num_x; x++)
         for (int64_t c = 0; c < channels && c < CHANNELS; c++)
           state[(c + 1) * PLANE + y * TILE + x] = image[((t.top + y) * w + t.left + x) * channels + c];
-    int64_t start = offsets[tile], end = offsets[tile + 1];
+    int64_t start = isect_offsets[tile], end = isect_offsets[tile + 1];
     for (; start < end && t.y_low <= t.y_high; start += BATCH) {
       int64_t stop = mini(end, start + BATCH);
       if (!gather(&batch, &t, &lists, start, stop, end)) return OUTSIDE;
@@ -121,38 +121,40 @@ API int32_t weighted_sums(const float *restrict footprints, const int32_t *restr
   return 0;
 }
 
-API int32_t add_slots(const int32_t *restrict members, const float *restrict slots, const int32_t *restrict ids,
-                   int64_t first, float *restrict sums, int64_t n, int64_t m, int64_t gaussians, int64_t channels) {
+API int32_t add_slots(const int32_t *restrict flatten_ids, const float *restrict slots, const int32_t *restrict ids,
+                      int64_t first, float *restrict sums, int64_t n, int64_t m, int64_t gaussians, int64_t channels) {
   int64_t count = mini(CHANNELS, channels - first);
-  for (int64_t i = 0; i < n; i++)
-    if ((uint64_t)(int64_t)members[i] >= (uint64_t)m || (uint64_t)(int64_t)ids[members[i]] >= (uint64_t)gaussians)
-      return OUTSIDE;
   for (int64_t i = 0; i < n; i++) {
-    __builtin_prefetch(sums + channels * ids[members[mini(i + BATCH, n - 1)]]);
-    float *sum = sums + channels * ids[members[i]] + first;
+    int64_t row = flatten_ids[i];
+    if ((uint64_t)row >= (uint64_t)m || (uint64_t)(int64_t)ids[row] >= (uint64_t)gaussians) return OUTSIDE;
+  }
+  for (int64_t i = 0; i < n; i++) {
+    __builtin_prefetch(sums + channels * ids[flatten_ids[mini(i + BATCH, n - 1)]]);
+    float *sum = sums + channels * ids[flatten_ids[i]] + first;
     for (int64_t c = 0; c < count; c++) sum[c] += slots[CHANNELS * i + c];
   }
   return 0;
 }
 
 // Blend the whole image, black behind it, and gather mass and peak of every Gaussian's weights on the way.
-API int32_t survey(const float *restrict footprints, const float *restrict colors, const int32_t *restrict members,
-                const int64_t *restrict offsets, int64_t columns, float *restrict image, float *restrict totals,
-                   int64_t m, int64_t n, int64_t ends, int64_t h, int64_t w) {
-  Lists lists = {footprints, members, offsets, columns, m, n, ends};
+API int32_t survey(const float *restrict conics, const int32_t *restrict flatten_ids,
+                   const int64_t *restrict isect_offsets, int64_t tile_width, const float *restrict colors,
+                   float *restrict image, float *restrict totals, int64_t m, int64_t n, int64_t ends, int64_t h,
+                   int64_t w) {
+  Lists lists = {conics, flatten_ids, isect_offsets, tile_width, m, n, ends};
   if (!lists_are_sound(&lists, 0, ends - 1)) return OUTSIDE;
   float state[4 * PLANE] __attribute__((aligned(64)));
   Batch batch;
   clear_batch(&batch);
   for (int64_t tile = 0; tile < ends - 1; tile++) {
-    Tile t = open_tile(state, 4, tile, columns, h, w);
-    int64_t end = offsets[tile + 1];
-    for (int64_t start = offsets[tile]; start < end && t.y_low <= t.y_high; start += BATCH) {
+    Tile t = open_tile(state, 4, tile, tile_width, h, w);
+    int64_t end = isect_offsets[tile + 1];
+    for (int64_t start = isect_offsets[tile]; start < end && t.y_low <= t.y_high; start += BATCH) {
       int64_t stop = mini(end, start + BATCH);
       if (!gather(&batch, &t, &lists, start, stop, end)) return OUTSIDE;
-      gather_colors(&batch, colors, members, start, stop, end);
+      gather_colors(&batch, colors, flatten_ids, start, stop, end);
       for (int64_t j = 0; j < stop - start; j++)
-        add_total(totals + 2 * (int64_t)members[start + j],
+        add_total(totals + 2 * (int64_t)flatten_ids[start + j],
                   blend_rows(state, &batch, j, first_row(&t, &batch, j), last_row(&t, &batch, j)));
       narrow_tile(&t, state);
     }
@@ -164,21 +166,21 @@ API int32_t survey(const float *restrict footprints, const float *restrict color
   return 0;
 }
 
-API int32_t contributions(const float *restrict footprints, const int32_t *restrict members,
-                       const int64_t *restrict offsets, int64_t columns, int64_t height, int64_t width,
+API int32_t contributions(const float *restrict conics, const int32_t *restrict flatten_ids,
+                          const int64_t *restrict isect_offsets, int64_t tile_width, int64_t height, int64_t width,
                           float *restrict totals, int64_t m, int64_t n, int64_t ends) {
-  Lists lists = {footprints, members, offsets, columns, m, n, ends};
+  Lists lists = {conics, flatten_ids, isect_offsets, tile_width, m, n, ends};
   if (!lists_are_sound(&lists, 0, ends - 1)) return OUTSIDE;
   float state[PLANE] __attribute__((aligned(64)));
   Batch batch;
   clear_batch(&batch);
   for (int64_t tile = 0; tile < ends - 1; tile++) {
-    Tile t = open_tile(state, 1, tile, columns, height, width);
-    int64_t end = offsets[tile + 1];
-    for (int64_t start = offsets[tile]; start < end && t.y_low <= t.y_high; start += BATCH) {
+    Tile t = open_tile(state, 1, tile, tile_width, height, width);
+    int64_t end = isect_offsets[tile + 1];
+    for (int64_t start = isect_offsets[tile]; start < end && t.y_low <= t.y_high; start += BATCH) {
       int64_t stop = mini(end, start + BATCH);
       if (!gather(&batch, &t, &lists, start, stop, end)) return OUTSIDE;
-      for (int64_t i = start; i < stop; i++) __builtin_prefetch(totals + 2 * (int64_t)members[i]);
+      for (int64_t i = start; i < stop; i++) __builtin_prefetch(totals + 2 * (int64_t)flatten_ids[i]);
       for (int64_t j = 0; j < stop - start; j++) {
         Curve curve = curve_of(&batch, (int)j);
         Weights weights = {{0}, {0}};
@@ -187,7 +189,7 @@ API int32_t contributions(const float *restrict footprints, const int32_t *restr
           store(state + y * TILE, s.left);
           weights = add_weights(weights, s.weight);
         }
-        add_total(totals + 2 * (int64_t)members[start + j], weights);
+        add_total(totals + 2 * (int64_t)flatten_ids[start + j], weights);
       }
       narrow_tile(&t, state);
     }
@@ -195,10 +197,10 @@ API int32_t contributions(const float *restrict footprints, const int32_t *restr
   return 0;
 }
 
-// The rows of one tile in which the members of a list show, as the walks take them: first and last of each.
-API int32_t rows_in_tile(const float *footprints, const int32_t *members, int64_t left, int64_t top, int32_t *rows,
+// The rows of one tile in which the Gaussians of a list show, as the walks take them: first and last of each.
+API int32_t rows_in_tile(const float *conics, const int32_t *flatten_ids, int64_t left, int64_t top, int32_t *rows,
                          int64_t m, int64_t n) {
-  Lists lists = {footprints, members, 0, 1, m, n, 0};
+  Lists lists = {conics, flatten_ids, 0, 1, m, n, 0};
   Batch batch;
   clear_batch(&batch);
   Tile t = {left, top, TILE, TILE, 0, TILE - 1};

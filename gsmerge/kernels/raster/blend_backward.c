@@ -1,4 +1,4 @@
-// The backward pass of blending: what a loss wants of every Gaussian's footprint and colour.
+// The backward pass of blending: what a loss wants of every Gaussian's conic and colour.
 //
 // The tiles are walked front to back again, with the weights of blend.c. With g the gradient of a pixel's colour and h
 // that of its transmittance, a pixel starts with the whole rest = g.C + h T (C its final colour, T its final
@@ -44,18 +44,19 @@ static inline void walk_back(float *state, const Batch *b, int64_t j, int32_t y0
   slot[8] = total(syy);
 }
 
-API int32_t blend_backward(const float *restrict footprints, const float *restrict colors, const int32_t *restrict members,
-                        const int64_t *restrict offsets, int64_t columns, int64_t first, int64_t last,
-                        const float *restrict image, const float *restrict transmittance,
-                        const float *restrict grad_image, const float *restrict grad_left, float *restrict slots,
-                           int64_t m, int64_t n, int64_t ends, int64_t h, int64_t w) {
-  Lists lists = {footprints, members, offsets, columns, m, n, ends};
+API int32_t blend_backward(const float *restrict conics, const int32_t *restrict flatten_ids,
+                           const int64_t *restrict isect_offsets, int64_t tile_width, const float *restrict colors,
+                           int64_t first, int64_t last, const float *restrict image,
+                           const float *restrict transmittance, const float *restrict grad_image,
+                           const float *restrict grad_left, float *restrict slots, int64_t m, int64_t n, int64_t ends,
+                           int64_t h, int64_t w) {
+  Lists lists = {conics, flatten_ids, isect_offsets, tile_width, m, n, ends};
   if (!lists_are_sound(&lists, first, last)) return OUTSIDE;
   float state[5 * PLANE] __attribute__((aligned(64)));
   Batch batch;
   clear_batch(&batch);
   for (int64_t tile = first; tile < last; tile++) {
-    Tile t = open_tile(state, 5, tile, columns, h, w);
+    Tile t = open_tile(state, 5, tile, tile_width, h, w);
     for (int y = 0; y < t.num_y; y++)
       for (int x = 0; x < t.num_x; x++) {
         int64_t pixel = (t.top + y) * w + t.left + x;
@@ -67,11 +68,11 @@ API int32_t blend_backward(const float *restrict footprints, const float *restri
         }
         lane[PLANE] = rest;
       }
-    int64_t start = offsets[tile], end = offsets[tile + 1];
+    int64_t start = isect_offsets[tile], end = isect_offsets[tile + 1];
     for (; start < end && t.y_low <= t.y_high; start += BATCH) {
       int64_t stop = mini(end, start + BATCH);
       if (!gather(&batch, &t, &lists, start, stop, end)) return OUTSIDE;
-      gather_colors(&batch, colors, members, start, stop, end);
+      gather_colors(&batch, colors, flatten_ids, start, stop, end);
       for (int64_t j = 0; j < stop - start; j++)
         walk_back(state, &batch, j, first_row(&t, &batch, j), last_row(&t, &batch, j), slots + SUMS * (start + j));
       narrow_tile(&t, state);
@@ -81,12 +82,12 @@ API int32_t blend_backward(const float *restrict footprints, const float *restri
   return 0;
 }
 
-API int32_t gather_slots(const int32_t *restrict members, const float *restrict slots, int64_t first, int64_t last,
-                      float *restrict sums, int64_t n, int64_t m) {
+API int32_t gather_slots(const int32_t *restrict flatten_ids, const float *restrict slots, int64_t first, int64_t last,
+                         float *restrict sums, int64_t n, int64_t m) {
   if (first < 0 || last > m) return OUTSIDE;
   for (int64_t i = 0; i < n; i++) {
-    int64_t k = members[i];
-    __builtin_prefetch(sums + SUMS * (int64_t)members[mini(i + BATCH, n - 1)]);
+    int64_t k = flatten_ids[i];
+    __builtin_prefetch(sums + SUMS * (int64_t)flatten_ids[mini(i + BATCH, n - 1)]);
     if (k < first || k >= last) continue;
     for (int c = 0; c < SUMS; c++) sums[SUMS * k + c] += slots[SUMS * i + c];
   }

@@ -6,7 +6,7 @@
 #include "walk.h"
 
 enum { LABEL, SUM, NEXT, PAIR };  // columns of a pair, the last the next pair of the same Gaussian, -1 for none
-enum { LAST_ROW = 7 };            // column of a footprint
+enum { LAST_ROW = 7 };            // column of a conic
 enum { NUM_PAIRS, NUM_ACTIVE, NEXT_TILE, COUNTS };  // what the kernels count, and the tile that comes next
 
 // Write a pair and put it in front of its Gaussian's chain.
@@ -53,32 +53,32 @@ static inline int32_t sum_tile(const float *weights, const Batch *b, int64_t j, 
 
 // Append the pairs of a row of tiles from counts[NEXT_TILE] on. A tile whose pairs may not fit is left for a call with
 // more room.
-API int32_t add_row(const float *restrict footprints, const int32_t *restrict members, const int64_t *restrict offsets,
-                 int64_t columns, int64_t line, const int32_t *restrict labels, int32_t *restrict heads,
-                 double *restrict pairs, int32_t *restrict active, int32_t *restrict stamps, int64_t *restrict counts,
-                 int64_t m, int64_t n, int64_t ends, int64_t h, int64_t w, int64_t room, int64_t slots,
-                 int64_t num_labels) {
+API int32_t add_row(const float *restrict conics, const int32_t *restrict flatten_ids,
+                    const int64_t *restrict isect_offsets, int64_t tile_width, int64_t line,
+                    const int32_t *restrict labels, int32_t *restrict heads, double *restrict pairs,
+                    int32_t *restrict active, int32_t *restrict stamps, int64_t *restrict counts, int64_t m, int64_t n,
+                    int64_t ends, int64_t h, int64_t w, int64_t room, int64_t slots, int64_t num_labels) {
   (void)num_labels;
-  if (line < 0 || (line + 1) * columns >= ends || slots <= m || counts[NUM_ACTIVE] < 0 || counts[NUM_ACTIVE] > m ||
+  if (line < 0 || (line + 1) * tile_width >= ends || slots <= m || counts[NUM_ACTIVE] < 0 || counts[NUM_ACTIVE] > m ||
       counts[NUM_PAIRS] < 0 || counts[NUM_PAIRS] > room)
     return OUTSIDE;
-  Lists lists = {footprints, members, offsets, columns, m, n, ends};
-  if (!lists_are_sound(&lists, line * columns, (line + 1) * columns)) return OUTSIDE;
+  Lists lists = {conics, flatten_ids, isect_offsets, tile_width, m, n, ends};
+  if (!lists_are_sound(&lists, line * tile_width, (line + 1) * tile_width)) return OUTSIDE;
   float state[2 * PLANE] __attribute__((aligned(64))), sums[PLANE] = {0};
   int32_t lanes[PLANE] = {0}, names[PLANE], touched[PLANE + 1];
   Batch batch;
   clear_batch(&batch);
   int64_t num_pairs = counts[NUM_PAIRS], num_active = counts[NUM_ACTIVE];
-  for (int64_t tile = maxi(line * columns, counts[NEXT_TILE]); tile < (line + 1) * columns; tile++) {
-    int64_t start = offsets[tile], end = offsets[tile + 1];
-    Tile t = open_tile(state, 2, tile, columns, h, w);
+  for (int64_t tile = maxi(line * tile_width, counts[NEXT_TILE]); tile < (line + 1) * tile_width; tile++) {
+    int64_t start = isect_offsets[tile], end = isect_offsets[tile + 1];
+    Tile t = open_tile(state, 2, tile, tile_width, h, w);
     counts[NEXT_TILE] = tile;
     if (num_pairs + (end - start) * number_labels(labels, &t, w, stamps, lanes, names) > room) return 0;
     for (; start < end && t.y_low <= t.y_high; start += BATCH) {
       int64_t stop = mini(end, start + BATCH);
       if (!gather(&batch, &t, &lists, start, stop, end)) return OUTSIDE;
       for (int64_t j = 0; j < stop - start; j++) {
-        int32_t y0 = first_row(&t, &batch, j), y1 = last_row(&t, &batch, j), k = members[start + j];
+        int32_t y0 = first_row(&t, &batch, j), y1 = last_row(&t, &batch, j), k = flatten_ids[start + j];
         weigh_rows(state, &batch, j, y0, y1);
         int32_t count = sum_tile(state + PLANE, &batch, j, y0, y1, t.num_x, lanes, sums, touched);
         active[num_active] = k;
@@ -98,7 +98,7 @@ API int32_t add_row(const float *restrict footprints, const int32_t *restrict me
 }
 
 // Add up the pairs of every Gaussian; decide on those that end above bottom, carry over the others' sums.
-API int32_t settle_row(int64_t bottom, const float *restrict footprints, int32_t *restrict heads,
+API int32_t settle_row(int64_t bottom, const float *restrict conics, int32_t *restrict heads,
                        const double *restrict pairs, double *restrict carried, int32_t *restrict active,
                        double *restrict totals, int32_t *restrict seen, float *restrict out_values,
                        int32_t *restrict out_labels, int64_t *restrict counts, int64_t m, int64_t room, int64_t slots,
@@ -117,7 +117,7 @@ API int32_t settle_row(int64_t bottom, const float *restrict footprints, int32_t
     }
     if (count == 0) return OUTSIDE;
     heads[k] = -1;
-    bool final = footprints[FOOTPRINT * k + LAST_ROW] < (float)bottom;
+    bool final = conics[CONIC * k + LAST_ROW] < (float)bottom;
     int32_t best = seen[0];
     for (int64_t i = 0; i < count; i++) {
       int32_t label = seen[i];

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.kernels.signature import STATUS, f4, i8, native
+from gsmerge.kernels.signature import STATUS, declare, f4, i8
 
 SIDE = 7  # of the windows, pixels
 C1, C2 = np.float32(1e-4), np.float32(9e-4)  # SSIM's constants for a data range of 1
@@ -19,17 +19,13 @@ EDGE_ROWS = 7  # of differences, weights and what they give
 CHUNK, PAD = 96, 9  # values that are summed at a time, and beside a row
 
 
-@native(
-    STATUS, image=f4("height", "width"), photo=f4("height", "width"), weight=f4("height", "pixels"), ssim_lambda=f4(),
-    edge_weight=f4(), first=i8(least=0, most="height"), last=i8(least="first", most="height"),
+# terms and rows are overwritten, of a width rounded up to CHUNK, and PAD
+_loss_gradient = declare(
+    "loss_gradient", STATUS, image=f4("height", "width"), photo=f4("height", "width"), weight=f4("height", "pixels"),
+    ssim_lambda=f4(), edge_weight=f4(), first=i8(least=0, most="height"), last=i8(least="first", most="height"),
     gradient=f4("height", "width", out=True), errors=f4("height", out=True), terms=f4(ROWS, TERMS, "room", out=True),
     rows=f4(EDGE_ROWS, "room", out=True),
 )  # fmt: skip
-def _loss_gradient(image, photo, weight, ssim_lambda, edge_weight, first, last, gradient, errors, terms, rows):
-    """Write what :func:`image_gradient` does.
-
-    ``terms`` and ``rows`` are overwritten, of a width rounded up to CHUNK, and PAD.
-    """
 
 
 def image_gradient(image, photo, weight, ssim_lambda, edge_weight, first, last, gradient, errors):

@@ -5,19 +5,19 @@ enum { CHANNELS = 4 };  // of an image row
 
 // Write the weights of tiles from progress[0] on behind the progress[1] entries that are there, and advance both. A tile
 // whose entries may not fit is not begun in earnest: it is left for a call with more room.
-API int32_t list_weights(const float *restrict footprints, const int32_t *restrict members,
-                      const int64_t *restrict offsets, int64_t columns, int64_t height, int64_t width,
-                      int64_t *restrict starts, uint8_t *restrict lanes, float *restrict weights,
-                      int64_t *restrict progress, int64_t m, int64_t n, int64_t ends, int64_t more, int64_t room) {
+API int32_t list_weights(const float *restrict conics, const int32_t *restrict flatten_ids,
+                         const int64_t *restrict isect_offsets, int64_t tile_width, int64_t height, int64_t width,
+                         int64_t *restrict starts, uint8_t *restrict lanes, float *restrict weights,
+                         int64_t *restrict progress, int64_t m, int64_t n, int64_t ends, int64_t more, int64_t room) {
   if (more != n + 1 || progress[0] < 0 || progress[1] < 0) return OUTSIDE;
-  Lists lists = {footprints, members, offsets, columns, m, n, ends};
+  Lists lists = {conics, flatten_ids, isect_offsets, tile_width, m, n, ends};
   if (!lists_are_sound(&lists, progress[0], ends - 1)) return OUTSIDE;
   float state[2 * PLANE] __attribute__((aligned(64)));
   Batch batch;
   clear_batch(&batch);
   for (int64_t tile = progress[0]; tile < ends - 1; tile++) {
-    Tile t = open_tile(state, 2, tile, columns, height, width);
-    int64_t start = offsets[tile], end = offsets[tile + 1], count = progress[1];
+    Tile t = open_tile(state, 2, tile, tile_width, height, width);
+    int64_t start = isect_offsets[tile], end = isect_offsets[tile + 1], count = progress[1];
     for (; start < end && t.y_low <= t.y_high; start += BATCH) {
       int64_t stop = mini(end, start + BATCH);
       if (count + BATCH * PLANE > room) return 0;
@@ -45,7 +45,7 @@ API int32_t list_weights(const float *restrict footprints, const int32_t *restri
 }
 
 API void spread(const int64_t *restrict starts, const uint8_t *restrict lanes, const float *restrict weights,
-                const int32_t *restrict members, const int64_t *restrict offsets, int64_t columns,
+                const int32_t *restrict flatten_ids, const int64_t *restrict isect_offsets, int64_t tile_width,
                 const float *restrict colors, float *restrict image, int64_t more, int64_t entries, int64_t n,
                 int64_t ends, int64_t m, int64_t h, int64_t w) {
   (void)more, (void)entries, (void)n, (void)m;
@@ -53,12 +53,12 @@ API void spread(const int64_t *restrict starts, const uint8_t *restrict lanes, c
   for (int64_t tile = 0; tile < ends - 1; tile++) {
     for (int i = 0; i < PLANE; i++)
       for (int c = 0; c < CHANNELS; c++) state[i][c] = 0.f;
-    for (int64_t i = offsets[tile]; i < offsets[tile + 1]; i++) {
-      const float *color = colors + CHANNELS * (int64_t)members[i];
+    for (int64_t i = isect_offsets[tile]; i < isect_offsets[tile + 1]; i++) {
+      const float *color = colors + CHANNELS * (int64_t)flatten_ids[i];
       for (int64_t e = starts[i]; e < starts[i + 1]; e++)
         for (int c = 0; c < CHANNELS; c++) state[lanes[e]][c] += weights[e] * color[c];
     }
-    int64_t left = tile % columns * TILE, top = tile / columns * TILE;
+    int64_t left = tile % tile_width * TILE, top = tile / tile_width * TILE;
     for (int64_t y = 0; y < mini(TILE, h - top); y++)
       for (int64_t x = 0; x < mini(TILE, w - left); x++)
         for (int c = 0; c < CHANNELS; c++)
@@ -67,7 +67,7 @@ API void spread(const int64_t *restrict starts, const uint8_t *restrict lanes, c
 }
 
 API void collect(const int64_t *restrict starts, const uint8_t *restrict lanes, const float *restrict weights,
-                 const int32_t *restrict members, const int64_t *restrict offsets, int64_t columns,
+                 const int32_t *restrict flatten_ids, const int64_t *restrict isect_offsets, int64_t tile_width,
                  const float *restrict image, double *restrict sums, int64_t more, int64_t entries, int64_t n,
                  int64_t ends, int64_t h, int64_t w, int64_t m) {
   (void)more, (void)entries, (void)n, (void)m;
@@ -75,16 +75,16 @@ API void collect(const int64_t *restrict starts, const uint8_t *restrict lanes, 
   for (int i = 0; i < PLANE; i++)
     for (int c = 0; c < CHANNELS; c++) state[i][c] = 0.f;
   for (int64_t tile = 0; tile < ends - 1; tile++) {
-    int64_t left = tile % columns * TILE, top = tile / columns * TILE;
+    int64_t left = tile % tile_width * TILE, top = tile / tile_width * TILE;
     for (int64_t y = 0; y < mini(TILE, h - top); y++)
       for (int64_t x = 0; x < mini(TILE, w - left); x++)
         for (int c = 0; c < CHANNELS; c++)
           state[y * TILE + x][c] = image[((top + y) * w + left + x) * CHANNELS + c];
-    for (int64_t i = offsets[tile]; i < offsets[tile + 1]; i++) {
+    for (int64_t i = isect_offsets[tile]; i < isect_offsets[tile + 1]; i++) {
       float own[CHANNELS] = {0};
       for (int64_t e = starts[i]; e < starts[i + 1]; e++)
         for (int c = 0; c < CHANNELS; c++) own[c] += weights[e] * state[lanes[e]][c];
-      for (int c = 0; c < CHANNELS; c++) sums[CHANNELS * (int64_t)members[i] + c] += own[c];
+      for (int c = 0; c < CHANNELS; c++) sums[CHANNELS * (int64_t)flatten_ids[i] + c] += own[c];
     }
   }
 }

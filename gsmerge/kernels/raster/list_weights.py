@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsmerge.kernels.raster import blend
-from gsmerge.kernels.signature import STATUS, f4, f8, i4, i8, native, u1
+from gsmerge.kernels.signature import STATUS, declare, f4, f8, i4, i8, native, u1
 
 LANES = 4  # channels of an image row
 FIRST_ENTRIES = 40  # entries for each pixel that there is room for to begin with
@@ -15,43 +15,42 @@ ENTRIES = {
     "starts": i8("more", least=0, most="entries", ascending=True),
     "lanes": u1("entries"),
     "weights": f4("entries"),
-    "members": i4("n", least=0, below="m"),
-    "offsets": i8("ends", least=0, most="n", ascending=True),
-    "columns": i8(least=1),
+    "flatten_ids": i4("n", least=0, below="m"),
+    "isect_offsets": i8("ends", least=0, most="n", ascending=True),
+    "tile_width": i8(least=1),
 }
 
 
-@native(
-    STATUS, **blend.LISTS, height=i8(least=1), width=i8(least=1), starts=i8("more", out=True),
+# Writes entries of tiles from progress[0] on behind progress[1] entries, as far as there is room.
+_list_weights = declare(
+    "list_weights", STATUS, **blend.LISTS, height=i8(least=1), width=i8(least=1), starts=i8("more", out=True),
     lanes=u1("room", out=True), weights=f4("room", out=True), progress=i8(2, least=0, out=True),
 )  # fmt: skip
-def _list_weights(footprints, members, offsets, columns, height, width, starts, lanes, weights, progress):
-    """Write entries of tiles from ``progress[0]`` on behind ``progress[1]`` entries, as far as there is room."""
 
 
-def list_weights(footprints, members, offsets, columns, height, width):
+def list_weights(conics, flatten_ids, isect_offsets, tile_width, height, width):
     """List all weights of a view that are not zero.
 
     Returns:
         ``starts [intersections + 1]`` int64, ``lanes`` uint8 (pixel within its tile, row-major), ``weights`` float32.
     """
-    starts, progress = np.zeros(len(members) + 1, np.int64), np.zeros(2, np.int64)
+    starts, progress = np.zeros(len(flatten_ids) + 1, np.int64), np.zeros(2, np.int64)
     lanes, weights = (
         np.empty(max(BATCH_ENTRIES, FIRST_ENTRIES * height * width), dtype) for dtype in (np.uint8, np.float32)
     )
     while True:
-        _list_weights(footprints, members, offsets, columns, height, width, starts, lanes, weights, progress)
+        _list_weights(conics, flatten_ids, isect_offsets, tile_width, height, width, starts, lanes, weights, progress)
         tile, count = progress
-        if tile == len(offsets) - 1:
+        if tile == len(isect_offsets) - 1:
             return starts, lanes[:count].copy(), weights[:count].copy()
         lanes, weights = (np.concatenate([array, np.empty_like(array)]) for array in (lanes, weights))
 
 
 @native(**ENTRIES, colors=f4("m", LANES), image=f4("h", "w", LANES, out=True))
-def spread(starts, lanes, weights, members, offsets, columns, colors, image):
+def spread(starts, lanes, weights, flatten_ids, isect_offsets, tile_width, colors, image):
     """Sums of weights times ``colors [m,LANES]`` -> ``image [h,w,LANES]``, every pixel of it."""
 
 
 @native(**ENTRIES, image=f4("h", "w", LANES), sums=f8("m", LANES, out=True))
-def collect(starts, lanes, weights, members, offsets, columns, image, sums):
+def collect(starts, lanes, weights, flatten_ids, isect_offsets, tile_width, image, sums):
     """Add weights times ``image [h,w,LANES]`` to ``sums [m,LANES]`` float64."""

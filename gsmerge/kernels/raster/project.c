@@ -1,9 +1,9 @@
-// Projection of Gaussians into one view: culling, EWA footprints, tile boxes.
+// Projection of Gaussians into one view: culling, EWA conics, tile boxes.
 #include "exp_log.h"
 #include "projection.h"
 
 enum { MOST_TILES = 1 << 15 };  // corners per side: columns and rows of tiles are kept in 16 bits
-enum { BLOCK = 64 };  // Gaussians; members are gathered into planes, the loops over which vectorise
+enum { BLOCK = 64 };  // Gaussians; they are gathered into planes, the loops over which vectorise
 
 static inline int32_t tile(float pixel) {
   return whole(pixel, 0.f, (MOST_TILES - 1) * (float)TILE) / TILE;
@@ -81,15 +81,15 @@ API int64_t cull(const float *restrict means, const float *restrict scales,
   return count;
 }
 
-// Planes of a block of footprints, and the first and (exclusive) last tile column and row.
+// Planes of a block of conics, and the first and (exclusive) last tile column and row.
 typedef struct {
   float mean[3][BLOCK], quat[4][BLOCK], scale[3][BLOCK], opacity[BLOCK];
-  float footprint[FOOTPRINT][BLOCK], depth[BLOCK];
+  float conic[CONIC][BLOCK], depth[BLOCK];
   int32_t box[4][BLOCK];
 } Block;
 
 // ln w(x, y) = lnop - (rate_x (x - mean_x - slope (y - mean_y)))^2 - rate_y (y - mean_y)^2 is what
-// a footprint stands for: never above 0, however thin the Gaussian.
+// a conic stands for: never above 0, however thin the Gaussian.
 static inline void project_one(Block *b, int64_t j, Camera c) {
   Ray ray = see(c, (vec3){b->mean[0][j], b->mean[1][j], b->mean[2][j]});
   float w = b->quat[0][j], x = b->quat[1][j], y = b->quat[2][j], z = b->quat[3][j];
@@ -114,14 +114,14 @@ static inline void project_one(Block *b, int64_t j, Camera c) {
   float rx = sqrtf4(reach * cxx), ry = sqrtf4(reach * cyy);
   float x0 = maxf(ceilf4(mx - rx - 0.5f), 0.f), x1 = minf(floorf4(mx + rx - 0.5f), c.width - 1.f);
   float y0 = maxf(ceilf4(my - ry - 0.5f), 0.f), y1 = minf(floorf4(my + ry - 0.5f), c.height - 1.f);
-  b->footprint[0][j] = mx;
-  b->footprint[1][j] = my;
-  b->footprint[2][j] = sqrtf4(0.5f * cyy / det);
-  b->footprint[3][j] = uv * iy;
-  b->footprint[4][j] = 0.5f * iy;
-  b->footprint[5][j] = lnop;
-  b->footprint[6][j] = y0;
-  b->footprint[7][j] = y1;
+  b->conic[0][j] = mx;
+  b->conic[1][j] = my;
+  b->conic[2][j] = sqrtf4(0.5f * cyy / det);
+  b->conic[3][j] = uv * iy;
+  b->conic[4][j] = 0.5f * iy;
+  b->conic[5][j] = lnop;
+  b->conic[6][j] = y0;
+  b->conic[7][j] = y1;
   b->depth[j] = ray.at.z;
   int32_t drawn = -((x1 >= x0) & (y1 >= y0) & (lnop >= LN_CUT));  // all bits or none
   b->box[0][j] = drawn & tile(x0);
@@ -133,7 +133,7 @@ static inline void project_one(Block *b, int64_t j, Camera c) {
 API int32_t project(const float *restrict means, const float *restrict quats,
                     const float *restrict scales, const float *restrict opacities,
                     const int32_t *restrict ids, const float *restrict camera,
-                    float *restrict footprints, float *restrict depths, int16_t *restrict boxes,
+                    float *restrict conics, float *restrict depths, int16_t *restrict boxes,
                     int64_t n, int64_t m) {
   if (any_outside(ids, m, n)) return OUTSIDE;
   Camera c = *(const Camera *)camera;
@@ -149,8 +149,8 @@ API int32_t project(const float *restrict means, const float *restrict quats,
     }
     for (int64_t j = 0; j < BLOCK; j++) project_one(&b, j, c);
     for (int64_t j = 0; j < size; j++)
-      for (int k = 0; k < FOOTPRINT; k++)
-        footprints[FOOTPRINT * (start + j) + k] = b.footprint[k][j];
+      for (int k = 0; k < CONIC; k++)
+        conics[CONIC * (start + j) + k] = b.conic[k][j];
     for (int64_t j = 0; j < size; j++) depths[start + j] = b.depth[j];
     for (int64_t j = 0; j < size; j++)
       for (int k = 0; k < 4; k++) boxes[4 * (start + j) + k] = (int16_t)b.box[k][j];

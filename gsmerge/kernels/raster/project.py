@@ -1,10 +1,14 @@
-"""Projection of Gaussians into one view: culling, EWA footprints, tile boxes.
+"""Projection of Gaussians into one view, and its backward pass: culling, EWA conics, tile boxes.
 
-The conventions are those of gsplat: 0.3 px dilation, footprints from the first-order (EWA) projection with the
-direction clamped 15 % outside the image, no contribution below 1/255. A footprint is stored with its square
+The conventions are those of gsplat: 0.3 px dilation, conics from the first-order (EWA) projection with the
+direction clamped 15 % outside the image, no contribution below 1/255. A conic is stored with its square
 completed, so that the exponent of a pixel is never positive, however thin the Gaussian::
 
     ln w(x, y) = lnop - (rate_x (x - mean_x - slope (y - mean_y)))^2 - rate_y (y - mean_y)^2
+
+The backward pass leads from sums over an image to means, rotations, scales and opacities (EWA: Zwicker et al. 2001; the
+derivatives as in Ye et al., "Mathematical supplement for the gsplat library", 2023): conic, half axes, rotation and
+scale, and the mean through its image position and through the projection's derivative.
 """
 
 from __future__ import annotations
@@ -14,13 +18,16 @@ import numpy as np
 from gsmerge.kernels.signature import STATUS, f4, i2, i4, i8, native, u1
 
 TILE = 16  # pixels per side; one row of a tile is one AVX-512 vector
-FOOTPRINT = 8  # numbers per footprint: mean_x, mean_y, rate_x, slope, rate_y, lnop, first row, last row
+CONIC = 8  # numbers per conic: mean_x, mean_y, rate_x, slope, rate_y, lnop, first row, last row
+SUMS = 9  # per Gaussian: those of w g (3), of v = d loss / d exponent, and of v times x, y, xx, xy, yy from the mean
 LN_CUT = np.float32(np.log(1 / 255))  # ln of the smallest weight that is drawn
 
 # Positions in the camera's array of numbers.
 ROTATION, SHIFT, FX, FY, CX, CY, WIDTH, HEIGHT, NEAR, FAR, EPS2D = 0, 9, 12, 13, 14, 15, 16, 17, 18, 19, 20
 LIMIT_X, LIMIT_Y, ANTIALIASED = 21, 23, 25
 CAMERA = 26
+BLOCK = 128  # Gaussians whose gradients of the pose are summed
+POSE = 12  # numbers of a world-to-camera matrix: rotation (9, row by row), shift (3)
 
 
 @native(
@@ -32,8 +39,8 @@ def cull(means, scales, opacities, keep, wanted, camera, start, ids):
 
     Args:
         keep: ``[n]`` uint8, 0 drops a Gaussian; None keeps all.
-        wanted: ``[lines + 1, columns + 1]`` int32: the number of tiles above and left of each corner that a Gaussian
-            has to touch one of; None wants all.
+        wanted: ``[tile_height + 1, tile_width + 1]`` int32: the number of tiles above and left of each corner that a
+            Gaussian has to touch one of; None wants all.
         start: What the first Gaussian is called.
         ids: ``[n]`` int32, the first ones are written: ascending.
     """
@@ -41,16 +48,46 @@ def cull(means, scales, opacities, keep, wanted, camera, start, ids):
 
 @native(
     STATUS, means=f4("n", 3), quats=f4("n", 4), scales=f4("n", 3), opacities=f4("n"), ids=i4("m"), camera=f4(CAMERA),
-    footprints=f4("m", FOOTPRINT, out=True), depths=f4("m", out=True), boxes=i2("m", 4, out=True),
+    conics=f4("m", CONIC, out=True), depths=f4("m", out=True), boxes=i2("m", 4, out=True),
 )  # fmt: skip
-def project(means, quats, scales, opacities, ids, camera, footprints, depths, boxes):
+def project(means, quats, scales, opacities, ids, camera, conics, depths, boxes):
     """Project the listed Gaussians.
 
     Args:
         quats: ``[n,4]`` wxyz; normalised here.
         opacities: ``[n]``; above 1 they count as 1.
-        footprints: ``[m,FOOTPRINT]`` float32, written.
+        conics: ``[m,CONIC]`` float32, written.
         depths: ``[m]`` float32, written: camera z.
         boxes: ``[m,4]`` int16, written: first and (exclusive) last tile column, first and last tile row; all 0
             where nothing is drawn.
     """
+
+
+@native(
+    STATUS, means=f4("n", 3), quats=f4("n", 4), scales=f4("n", 3), opacities=f4("n"), ids=i4("m"), sums=f4("m", SUMS),
+    camera=f4(CAMERA), first=i8(least=0, most="m"), last=i8(least="first", most="m"),
+    grad_means=f4("m", 3, out=True), grad_quats=f4("m", 4, out=True), grad_scales=f4("m", 3, out=True),
+    grad_opacities=f4("m", out=True), grad_poses=f4("blocks", POSE, out=True, optional=True),
+)  # fmt: skip
+def project_backward(
+    means, quats, scales, opacities, ids, sums, camera, first, last,
+    grad_means, grad_quats, grad_scales, grad_opacities, grad_poses,
+):  # fmt: skip
+    """Write the gradients of a range of the listed Gaussians.
+
+    Args:
+        sums: ``[m,SUMS]`` float32, see :func:`gsmerge.kernels.raster.blend.blend_backward`.
+        first: Start of the range, a multiple of BLOCK.
+        last: End of the range, exclusive.
+        grad_means: ``[m,3]`` float32, written.
+        grad_quats: ``[m,4]`` float32, written.
+        grad_scales: ``[m,3]`` float32, written.
+        grad_opacities: ``[m]`` float32, written.
+        grad_poses: ``[blocks,POSE]`` float32, written: gradient of the world-to-camera matrix, summed over blocks of
+            BLOCK Gaussians; None for none.
+    """
+
+
+@native(STATUS, ids=i4("m"), rows=f4("m", "c"), totals=f4("n", "c", out=True))
+def add_rows(ids, rows, totals):
+    """Add ``rows [m,c]`` to ``totals [n,c]`` at the ``ids [m]`` int32."""

@@ -2,10 +2,10 @@
 #pragma once
 #include "native.h"
 
-enum { FOOTPRINT = 8, TILE = 16 };
+enum { CONIC = 8, TILE = 16 };
 static const float LN_CUT = -5.541263545158426f;  // ln(1/255): smaller weights are not drawn
 static const float MIN_OPACITY = 1.f / 255.f;
-static const float MAX_SIGMA = 1e6f;  // pixels; wider footprints are flat, their squares still fit
+static const float MAX_SIGMA = 1e6f;  // pixels; wider conics are flat, their squares still fit
 static const float LEAST_SHARE = 0.005f * 0.005f;  // of the density that dilation may leave
 
 typedef struct {

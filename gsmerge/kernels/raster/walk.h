@@ -6,7 +6,7 @@
 #pragma once
 #include "native.h"
 
-enum { TILE = 16, PLANE = TILE * TILE, BATCH = 32, FOOTPRINT = 8, SPLAT_COLORS = 3 };
+enum { TILE = 16, PLANE = TILE * TILE, BATCH = 32, CONIC = 8, SPLAT_COLORS = 3 };
 
 #define LN_CUT -5.541263545158426f  // ln(1/255)
 #define MAX_ALPHA 0.99f
@@ -103,31 +103,33 @@ static inline void clear_batch(Batch *b) {
   for (int i = 0; i < 11 * BATCH; i++) numbers[i] = 1.f;
 }
 
-// The lists of all tiles: rows of footprints, tile after tile.
+// The lists of all tiles: rows of conics, tile after tile.
 typedef struct {
-  const float *footprints;
-  const int32_t *members;
-  const int64_t *offsets;
-  int64_t columns, m, n, ends;  // tiles per row; footprints, members and offsets that there are
+  const float *conics;
+  const int32_t *flatten_ids;
+  const int64_t *isect_offsets;
+  int64_t tile_width, m, n, ends;  // tiles per row; lengths of conics, flatten_ids and isect_offsets
 } Lists;
 
-// Whether there is such a range of tiles, and their lists lie among the members.
+// Whether there is such a range of tiles, and their lists lie within flatten_ids.
 static inline bool lists_are_sound(const Lists *l, int64_t first, int64_t last) {
-  if (l->columns < 1 || first < 0 || last >= l->ends) return false;
-  for (int64_t tile = first; tile < last; tile++)
-    if (l->offsets[tile] < 0 || l->offsets[tile] > l->offsets[tile + 1] || l->offsets[tile + 1] > l->n) return false;
+  if (l->tile_width < 1 || first < 0 || last >= l->ends) return false;
+  for (int64_t tile = first; tile < last; tile++) {
+    int64_t start = l->isect_offsets[tile], end = l->isect_offsets[tile + 1];
+    if (start < 0 || start > end || end > l->n) return false;
+  }
   return true;
 }
 
-// Copy the footprints of members start to stop into the batch, and call for those of the next batch -> whether there
-// are such footprints.
+// Copy the conics of the intersections start to stop into the batch, and call for those of the next batch -> whether
+// there are such conics.
 static inline bool gather(Batch *b, const Tile *tile, const Lists *l, int64_t start, int64_t stop, int64_t end) {
   float left = (float)tile->left + 0.5f, top = (float)tile->top + 0.5f;
-  const float *footprints = l->footprints;
-  const int32_t *members = l->members;
+  const float *conics = l->conics;
+  const int32_t *flatten_ids = l->flatten_ids;
   for (int64_t i = start; i < stop; i++) {
-    if ((uint64_t)(int64_t)members[i] >= (uint64_t)l->m) return false;
-    const float *f = footprints + FOOTPRINT * (int64_t)members[i];
+    if ((uint64_t)(int64_t)flatten_ids[i] >= (uint64_t)l->m) return false;
+    const float *f = conics + CONIC * (int64_t)flatten_ids[i];
     int64_t j = i - start;
     b->mx[j] = f[0] - left;
     b->my[j] = f[1] - top;
@@ -140,26 +142,26 @@ static inline bool gather(Batch *b, const Tile *tile, const Lists *l, int64_t st
   }
   narrow_rows(b);
   for (int64_t i = stop; i < end && i < stop + BATCH; i++)
-    __builtin_prefetch(footprints + FOOTPRINT * (int64_t)members[i]);
+    __builtin_prefetch(conics + CONIC * (int64_t)flatten_ids[i]);
   return true;
 }
 
-// Copy the colours of members start to stop into the batch, and call for those of the next batch.
-static inline void gather_colors(Batch *b, const float *colors, const int32_t *members, int64_t start, int64_t stop,
+// Copy the colours of the intersections start to stop into the batch, and call for those of the next batch.
+static inline void gather_colors(Batch *b, const float *colors, const int32_t *flatten_ids, int64_t start, int64_t stop,
                                  int64_t end) {
   for (int64_t i = start; i < stop; i++) {
-    const float *c = colors + SPLAT_COLORS * (int64_t)members[i];
+    const float *c = colors + SPLAT_COLORS * (int64_t)flatten_ids[i];
     b->red[i - start] = c[0];
     b->green[i - start] = c[1];
     b->blue[i - start] = c[2];
   }
   for (int64_t i = stop; i < end && i < stop + BATCH; i++)
-    __builtin_prefetch(colors + SPLAT_COLORS * (int64_t)members[i]);
+    __builtin_prefetch(colors + SPLAT_COLORS * (int64_t)flatten_ids[i]);
 }
 
 // Reset the planes of a tile: all light passes, the others are zero; lanes outside the image have stopped.
-static inline Tile open_tile(float *state, int planes, int64_t tile, int64_t columns, int64_t h, int64_t w) {
-  int64_t left = tile % columns * TILE, top = tile / columns * TILE;
+static inline Tile open_tile(float *state, int planes, int64_t tile, int64_t tile_width, int64_t h, int64_t w) {
+  int64_t left = tile % tile_width * TILE, top = tile / tile_width * TILE;
   int32_t num_x = (int32_t)mini(TILE, w - left), num_y = (int32_t)mini(TILE, h - top);
   for (int i = PLANE; i < planes * PLANE; i++) state[i] = 0.f;
   for (int y = 0; y < TILE; y++)

@@ -2,7 +2,17 @@
 
 Hard expectation maximisation of Gaussians in colour (fixed deviation) and position (normal-inverse-Wishart prior),
 with a Potts term on the borders. A pixel may change its label only where no label is taken apart; the pixels at the
-picture's edge take part, and no region can run empty. The adaptive form splits and merges between the rounds.
+picture's edge take part, and no region can run empty. The adaptive form splits and merges between the rounds, by
+moves that are accepted by their Hastings ratio (Chang and Fisher 2013).
+
+Splitting c into a and b has the ratio ``H = α Γ(n_a) f(a) Γ(n_b) f(b) / (Γ(n_c) f(c))``, merging them its inverse, with
+the concentration α of a Dirichlet process and the marginal likelihood ``f`` of a superpixel's n pixels. Moves with
+H > 1 are made. ``f`` is that of colours of unknown mean and variance (normal-inverse-gamma) times ``n^-n`` for
+positions anywhere in the superpixel's area: without it Γ would favour few large superpixels in every picture, as the
+density of positions grows as a superpixel shrinks.
+
+The authors' CUDA code differs: it has neither α nor Γ nor positions in a split, overwrites a_0 by a_n (so that Γ(a_n)
+is lost), sets b_0 to a_0 times a deviation instead of a variance, and accepts log H > -2 in both directions.
 """
 
 from __future__ import annotations
@@ -11,9 +21,16 @@ import math
 
 import numpy as np
 
-from gsmerge.kernels.signature import COUNT, STATUS, f4, f8, i4, native, u1
-from gsmerge.kernels.superpixels.split_merge import merge, split
+from gsmerge.kernels.signature import COUNT, STATUS, declare, f4, f8, i4, i8, native, u1
+from gsmerge.kernels.superpixels.ward import adjacent_pairs
 
+SUMS = 7  # columns of a region's sums: pixels, colours (3), squared colours (3)
+
+
+_sum_regions = declare(
+    "sum_regions", STATUS, labels=i4("padded_height", "padded_width"), colours=f4("height", "width", 3),
+    marks=u1("height", "width"), sums=f8("count", SUMS, out=True),
+)  # fmt: skip
 COLOUR_DEVIATION = 0.018 / 2  # CIELAB / 100
 NUM_PASSES = 4  # label passes per update of the parameters
 NUM_ROUNDS = 12  # of the adaptive form: splits and merges in turn
@@ -22,6 +39,131 @@ NUM_ROUNDS = 12  # of the adaptive form: splits and merges in turn
 # rather keep it than pay for it twice, at up to 0.2 dB). The deviation of mean colours in a picture, CIELAB / 100.
 ALPHA, PRIOR_SHAPE, MEAN_DEVIATION = 0.01, 1e6, 0.5
 ROW = 9  # columns of a region's parameters
+
+
+def sum_regions(labels, colours, marks, count):
+    """``[count,7]`` float64 sums over the marked pixels of every region.
+
+    Args:
+        labels: Padded labels.
+        colours: ``[h,w,3]`` float32.
+        marks: ``[h,w]`` bool.
+        count: Number of regions.
+    """
+    sums = np.zeros((count, SUMS))
+    _sum_regions(labels, colours, marks.view(np.uint8), sums)
+    return sums
+
+
+@native(f8(), sums=f8(SUMS), prior=f8(4))
+def log_evidence(sums, prior):
+    """Logarithm of ``Γ(n) f`` of a region's ``[7]`` sums.
+
+    With ``m ~ N(0, v σ²)`` and ``σ² ~ IG(a, b)`` for each channel, its colours have the likelihood ``(2π)^(-n/2)
+    (1 + n v)^(-1/2) Γ(a_n) / Γ(a) b^a / b_n^(a_n)``, where ``a_n = a + n / 2`` and ``b_n = b + (Σ c² - (Σ c)² v /
+    (1 + n v)) / 2`` (Murphy 2007, section 3).
+    """
+
+
+# sums are zero before
+_mark_halves = declare(
+    "mark_halves", STATUS, labels=i4("padded_height", "padded_width"), across=i4(), boxes=i8("count", 4, out=True),
+    sums=f8("count", 3, out=True), offsets=f8("count", 2, out=True), ends=i8("count", 2, out=True),
+    queue=i4("places", 2, out=True), halves=u1("height", "width", out=True),
+)  # fmt: skip
+
+
+def mark_halves(labels, count, across):
+    """``[h,w]`` bool: the second half of every region, both halves 4-connected; none of a region of one pixel.
+
+    A pixel goes with the nearer, in steps inside the region, of two ends in the middle of its top and bottom, or where
+    ``across`` of its left and right.
+    """
+    height, width = labels.shape[0] - 2, labels.shape[1] - 2
+    halves, queue = np.empty((height, width), np.uint8), np.empty((height * width, 2), np.int32)
+    boxes, ends = np.empty((count, 4), np.int64), np.empty((count, 2), np.int64)
+    _mark_halves(labels, across, boxes, np.zeros((count, 3)), np.empty((count, 2)), ends, queue, halves)
+    return halves == 1
+
+
+# leaves ratios where there is nothing to split
+_weigh_splits = declare(
+    "weigh_splits", whole=f8("count", SUMS), second=f8("count", SUMS), prior=f8(4), ratios=f8("count", out=True)
+)
+
+
+def weigh_splits(whole, second, prior):
+    """``[count]`` log H of splitting every region; -inf where there is nothing to split.
+
+    Args:
+        whole: ``[count,7]`` sums of the regions.
+        second: The same of their second halves.
+        prior: ``[4]`` float64, log α, a, b and v.
+    """
+    ratios = np.full(len(whole), -np.inf)
+    _weigh_splits(whole, second, prior, ratios)
+    return ratios
+
+
+# partners are -1 and ratios -inf before
+_choose_merges = declare(
+    "choose_merges", sums=f8("count", SUMS), pairs=i4("num_pairs", 2, least=0, below="count"), prior=f8(4),
+    own=f8("count", out=True), partners=i4("count", out=True), ratios=f8("count", out=True),
+)  # fmt: skip
+
+
+def choose_merges(pairs, sums, prior):
+    """Every region's best neighbour ``[count]`` (-1: none) and log H ``[count]`` of merging with it."""
+    count = len(sums)
+    partners, ratios = np.full(count, -1, np.int32), np.full(count, -np.inf)
+    _choose_merges(sums, pairs, prior, np.empty(count), partners, ratios)
+    return partners, ratios
+
+
+def split(labels, colours, areas, prior, across, most, least=0.0):
+    """Split the regions whose log H is above ``least``, at most ``most`` of them, the highest first.
+
+    Args:
+        labels: Padded labels 0 to ``len(areas) - 1``, each region 4-connected and none empty; they stay so.
+        colours: ``[h,w,3]`` float32.
+        areas: ``[count]`` float64 expected area of every region, pixels; halves share it.
+        prior: ``[4]`` float64, log α, a, b and v.
+        across: Whether the halves are left and right, else top and bottom.
+        most: Largest number of splits.
+        least: log H.
+
+    Returns:
+        (labels, areas) with the new regions at the end.
+    """
+    count = len(areas)
+    marks = mark_halves(labels, count, across)
+    whole = sum_regions(labels, colours, np.ones_like(marks), count)
+    ratios = weigh_splits(whole, sum_regions(labels, colours, marks, count), prior)
+    order = np.argsort(-ratios, kind="stable")[: max(0, most)]
+    order = order[ratios[order] > least]
+    news = np.arange(count, dtype=np.int32)
+    news[order] = count + np.arange(len(order))
+    labels = labels.copy()
+    inner = labels[1:-1, 1:-1]
+    inner[marks] = news[inner[marks]]
+    areas = areas.copy()
+    areas[order] /= 2
+    return labels, np.append(areas, areas[order])
+
+
+def merge(labels, colours, areas, prior, most, least=0.0):
+    """Merge pairs of regions that are each other's best neighbour; arguments and result as of :func:`split`."""
+    count = len(areas)
+    sums = sum_regions(labels, colours, np.ones(colours.shape[:2], np.bool_), count)
+    partners, ratios = choose_merges(adjacent_pairs(labels), sums, prior)
+    first = np.flatnonzero((partners > np.arange(count)) & (ratios > least))
+    first = first[partners[partners[first]] == first]
+    first = first[np.argsort(-ratios[first], kind="stable")[: max(0, most)]]
+    targets = np.arange(count, dtype=np.int32)
+    targets[partners[first]] = first
+    kept = targets == np.arange(count)
+    news = (np.cumsum(kept) - 1).astype(np.int32)[targets]
+    return np.append(news, np.int32(-1))[labels], np.bincount(news, areas)
 
 
 def simple_point_table():
@@ -35,12 +177,11 @@ def simple_point_table():
     return ((changes == 2) & (edges > 0) & (edges < 4)).astype(np.uint8)
 
 
-@native(
-    STATUS, labels=i4("padded_height", "padded_width"), colours=f4("height", "width", 3), areas=f8("count"),
-    sums=f8("count", 9, out=True), rows=f4("count", ROW, out=True),
+# sums are zero before
+_fit_regions = declare(
+    "fit_regions", STATUS, labels=i4("padded_height", "padded_width"), colours=f4("height", "width", 3),
+    areas=f8("count"), sums=f8("count", 9, out=True), rows=f4("count", ROW, out=True),
 )  # fmt: skip
-def _fit_regions(labels, colours, areas, sums, rows):
-    """Write what :func:`fit_regions` returns; ``sums`` are zero before."""
 
 
 def fit_regions(labels, colours, areas):

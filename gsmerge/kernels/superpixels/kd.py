@@ -7,15 +7,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.kernels.signature import COUNT, STATUS, f4, f8, i4, i8, native
+from gsmerge.kernels.signature import COUNT, STATUS, declare, f4, f8, i4, i8
 
 NUM_BUCKETS = 2048  # lists of cuts of about the same gain
 NODE = 8  # columns of a rectangle's row
 
 
-@native(STATUS, pixels=f4("height", "width", 3), integral=f8("places", 3, out=True))
-def _integral_image(pixels, integral):
-    """Write what :func:`integral_image` returns."""
+_integral_image = declare("integral_image", STATUS, pixels=f4("height", "width", 3), integral=f8("places", 3, out=True))
 
 
 def integral_image(pixels):
@@ -26,12 +24,10 @@ def integral_image(pixels):
     return integral
 
 
-@native(
-    STATUS, integral=f8("places", 3), near=i8(least=0), far=i8(least=0), step=i8(least=1), side=i8(least=0),
+_cut_gain = declare(
+    "cut_gain", STATUS, integral=f8("places", 3), near=i8(least=0), far=i8(least=0), step=i8(least=1), side=i8(least=0),
     num_pixels=f8(), compactness=f8(), found=f8(2, out=True),
 )  # fmt: skip
-def _cut_gain(integral, near, far, step, side, num_pixels, compactness, found):
-    """Write what :func:`cut_gain` returns."""
 
 
 def cut_gain(integral, near, far, step, side, num_pixels, compactness):
@@ -57,13 +53,12 @@ def cut_gain(integral, near, far, step, side, num_pixels, compactness):
     return float(found[0]), int(found[1])
 
 
-@native(
-    COUNT, integral=f8("places", 3), count=i8(least=0), block=i8(least=1), compactness=f8(),
+# returns how many labels there are
+_split_rectangles = declare(
+    "split_rectangles", COUNT, integral=f8("places", 3), count=i8(least=0), block=i8(least=1), compactness=f8(),
     nodes=i4("capacity", NODE, out=True), heads=i8(NUM_BUCKETS, out=True),
     labels=i4("padded_height", "padded_width", out=True),
 )  # fmt: skip
-def _split_rectangles(integral, count, block, compactness, nodes, heads, labels):
-    """Write the labels of :func:`split_rectangles` and return how many there are; nodes and heads are overwritten."""
 
 
 def split_rectangles(pixels, count, block, compactness):

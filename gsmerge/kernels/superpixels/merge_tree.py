@@ -9,19 +9,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.kernels.signature import STATUS, f4, f8, i4, i8, native, u1
+from gsmerge.kernels.signature import STATUS, declare, f4, f8, i4, i8, u1
 
 NUM_PIXELS, PLANE_ERROR, ROW = 5, 15, 20  # columns of a row after the mean, and its length
 SLOPE_RIDGE = 1e-3  # square pixels; holds the slopes of planes through fewer than three points
 OVERSIZE = 1e9  # added to the cost of a merge beyond the largest extent: these come last, in their own order
 
 
-@native(
-    STATUS, labels=i4("padded_height", "padded_width"), pixels=f4("height", "width", 3), depths=f4("height", "width"),
-    rows=f8("capacity", ROW, out=True), boxes=i4("count", 4, out=True), squares=f8(1, out=True),
+_region_sums = declare(
+    "region_sums", STATUS, labels=i4("padded_height", "padded_width"), pixels=f4("height", "width", 3),
+    depths=f4("height", "width"), rows=f8("capacity", ROW, out=True), boxes=i4("count", 4, out=True),
+    squares=f8(1, out=True),
 )  # fmt: skip
-def _region_sums(labels, pixels, depths, rows, boxes, squares):
-    """Do the work of :func:`region_sums`, which returns ``squares``; ``boxes`` are overwritten."""
 
 
 def region_sums(labels, pixels, depths, count, rows):
@@ -34,12 +33,10 @@ def region_sums(labels, pixels, depths, count, rows):
     return float(squares[0])
 
 
-@native(
-    rows=f8("capacity", ROW), u=i8(least=0, below="capacity"), v=i8(least=0, below="capacity"), depth_weight=f8(),
-    compactness=f8(), growth=f8(2, out=True),
+_merge_growth = declare(
+    "merge_growth", rows=f8("capacity", ROW), u=i8(least=0, below="capacity"), v=i8(least=0, below="capacity"),
+    depth_weight=f8(), compactness=f8(), growth=f8(2, out=True),
 )  # fmt: skip
-def _merge_growth(rows, u, v, depth_weight, compactness, growth):
-    """Write what :func:`merge_growth` returns."""
 
 
 def merge_growth(rows, u, v, depth_weight, compactness):
@@ -49,19 +46,14 @@ def merge_growth(rows, u, v, depth_weight, compactness):
     return tuple(growth.tolist())
 
 
-@native(
-    STATUS, num_leaves=i8(least=0), pairs=i4("num_pairs", 2, least=0, below="num_leaves"),
+_merge_order = declare(
+    "merge_order", STATUS, num_leaves=i8(least=0), pairs=i4("num_pairs", 2, least=0, below="num_leaves"),
     rows=f8("num_nodes", ROW, out=True), depth_weight=f8(), compactness=f8(), max_extent=f8(),
     parents=i4("num_nodes", out=True), heights=f8("num_nodes", out=True), growths=f8("num_nodes", out=True),
     heads=i4("num_nodes", out=True), marks=i4("num_nodes", out=True), nexts=i4("num_halves", out=True),
     ends=i4("num_halves", out=True), heap=i4("num_pairs", out=True), places=i4("num_pairs", out=True),
     costs=f8("num_pairs", out=True),
 )  # fmt: skip
-def _merge_order(
-    num_leaves, pairs, rows, depth_weight, compactness, max_extent, parents, heights, growths, heads, marks, nexts,
-    ends, heap, places, costs,
-):  # fmt: skip
-    """Do the work of :func:`merge_order` in the buffers that it hands over."""
 
 
 def merge_order(pairs, rows, depth_weight, compactness, max_extent):
@@ -91,12 +83,10 @@ def merge_order(pairs, rows, depth_weight, compactness, max_extent):
     return parents[:last], heights[num_leaves:last], growths[num_leaves:last]
 
 
-@native(
-    STATUS, parents=i4("num_nodes"), keep=u1("num_merges"), tops=i4("num_nodes", out=True),
+_cut_labels = declare(
+    "cut_labels", STATUS, parents=i4("num_nodes"), keep=u1("num_merges"), tops=i4("num_nodes", out=True),
     names=i4("num_nodes", out=True), labels=i4("num_leaves", out=True),
 )  # fmt: skip
-def _cut_labels(parents, keep, tops, names, labels):
-    """Write what :func:`cut_labels` returns; ``tops`` and ``names`` are overwritten."""
 
 
 def cut_labels(parents, keep, num_leaves):

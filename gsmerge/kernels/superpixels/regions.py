@@ -1,4 +1,4 @@
-"""What the segmentation kernels share: padded label pictures and the rows of their regions.
+"""Regions of a picture: padded labels, a row of numbers for each, and exact border moves between them.
 
 Label pictures are padded: ``[h+2,w+2]`` int32 with a frame of -1, so that no kernel asks where the picture ends.
 A region's row holds what a cost needs in half a cache line of float32: its mean feature (r, g, b, y·spread,
@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.kernels.signature import STATUS, f4, f8, i4, native
+from gsmerge.kernels.signature import COUNT, STATUS, declare, f4, f8, i4, i8, native, u1
 
 NUM_PIXELS, ROW = 5, 8  # column after the five of the mean, and the length of a row
+LEAVE, JOIN = 6, 7  # columns of a region's row: n / (n - 1) for a pixel that leaves, n / (n + 1) for one that joins
 
 
 def pad_labels(labels):
@@ -20,12 +21,11 @@ def pad_labels(labels):
     return np.pad(np.ascontiguousarray(labels, np.int32), 1, constant_values=-1)
 
 
-@native(
-    STATUS, labels=i4("padded_height", "padded_width"), pixels=f4("height", "width", 3), spread=f4(),
+# sums are zero before; the first ``count`` rows are written
+_region_rows = declare(
+    "region_rows", STATUS, labels=i4("padded_height", "padded_width"), pixels=f4("height", "width", 3), spread=f4(),
     sums=f8("count", 6, out=True), rows=f4("capacity", ROW, out=True),
 )  # fmt: skip
-def _region_rows(labels, pixels, spread, sums, rows):
-    """Write the first ``count`` rows of a padded label picture; ``sums`` are zero before."""
 
 
 def region_rows(labels, pixels, count, capacity, spread):
@@ -36,3 +36,63 @@ def region_rows(labels, pixels, count, capacity, spread):
     rows = np.zeros((capacity, ROW), np.float32)
     _region_rows(labels, pixels, spread, np.zeros((count, 6)), rows)
     return rows
+
+
+def connectivity_table() -> np.ndarray:
+    """``[256]`` uint8: 1 where a pixel may leave its region without taking it apart.
+
+    Bit i of the index is set if neighbour i (N, NE, E, SE, S, SW, W, NW) has the pixel's label. The label's cells of
+    the ring must form one 4-connected part that touches the pixel by an edge; counted as edge cells less the
+    corners that join two of them (Yokoi's connectivity number); a closed ring has as many of both.
+    """
+    cells = (np.arange(256)[:, None] >> np.arange(8)) & 1
+    edges, corners = cells[:, 0::2], cells[:, 1::2]
+    joined = edges * corners * np.roll(edges, -1, axis=1)
+    return ((edges.sum(1) - joined.sum(1) == 1) | cells.all(1)).astype(np.uint8)
+
+
+@native(COUNT, labels=i4("rows", "columns"), y=i8(), x=i8(), label=i4())
+def ring_mask(labels, y, x, label):
+    """Bits of the eight neighbours (N, NE, E, SE, S, SW, W, NW) that have ``label``."""
+
+
+@native(
+    COUNT, labels=i4("padded_height", "padded_width", out=True), pixels=f4("height", "width", 3),
+    rows=f4("count", ROW, out=True), table=u1(256), spread=f4(), backward=i4(),
+)  # fmt: skip
+def sweep(labels, pixels, rows, table, spread, backward):
+    """One raster pass of border moves: each lowers the total squared error, and the means follow at once.
+
+    A pixel goes from region A to a 4-neighbour's region B if ``n_A/(n_A-1)·d_A² > n_B/(n_B+1)·d_B²`` and A stays
+    connected without it. It needs a neighbour of its own label, so that no region can run empty.
+
+    Args:
+        labels: Padded labels 0 to ``count - 1``, changed.
+        pixels: ``[h,w,3]`` float32.
+        rows: ``[count,8]`` float32 rows of the regions with their last two columns, changed.
+        table: From :func:`connectivity_table`.
+        spread: Square root of the weight of squared pixels against squared colours.
+        backward: Whether the pass goes from the last pixel to the first.
+
+    Returns:
+        How many pixels moved.
+    """
+
+
+CONNECTIVITY = connectivity_table()
+
+
+def refine(labels, pixels, count, num_sweeps, spread):
+    """Sweep in place, forth and back, until nothing moves or ``num_sweeps`` are done; returns the padded labels.
+
+    Each of the ``count`` regions is 4-connected and not empty, and stays so. ``spread``: square root of the weight of
+    squared pixels against squared colours, float32.
+    """
+    rows = region_rows(labels, pixels, count, count, spread)
+    num_pixels = rows[:, NUM_PIXELS]
+    rows[:, LEAVE] = num_pixels / np.maximum(num_pixels - 1, 1)  # the pixel of a one-pixel region never leaves
+    rows[:, JOIN] = num_pixels / (num_pixels + 1)
+    for i in range(num_sweeps):
+        if sweep(labels, pixels, rows, CONNECTIVITY, spread, i % 2 == 1) == 0:
+            break
+    return labels

@@ -6,18 +6,16 @@ import math
 
 import numpy as np
 
-from gsmerge.kernels.signature import STATUS, f4, f8, i4, i8, native, u1
+from gsmerge.kernels.signature import STATUS, declare, f4, f8, i4, i8, u1
 
 DENSITY_FLOOR = 0.3  # share of the seeds that is spread evenly
 JITTER = 0.3  # width of the noise on the dithering threshold, against worm patterns
 
 
-@native(
-    STATUS, pixels=f4("height", "width", 3), planes=f4(4, "height", "stride", out=True),
+_corner_response = declare(
+    "corner_response", STATUS, pixels=f4("height", "width", 3), planes=f4(4, "height", "stride", out=True),
     response=f4("height", "width", out=True),
 )  # fmt: skip
-def _corner_response(pixels, planes, response):
-    """Write what :func:`corner_response` returns; ``planes`` are overwritten."""
 
 
 def corner_response(pixels):
@@ -57,12 +55,11 @@ def seed_density(saliency, count):
     return density
 
 
-@native(
-    STATUS, density=f8("height", "width"), jitter=f8(), errors=f8(2, "columns", out=True),
+# errors are zero before
+_dither = declare(
+    "dither", STATUS, density=f8("height", "width"), jitter=f8(), errors=f8(2, "columns", out=True),
     seeds=u1("height", "width", out=True),
 )  # fmt: skip
-def _dither(density, jitter, errors, seeds):
-    """Write what :func:`dither` returns; ``errors`` are zero before."""
 
 
 def dither(density):
@@ -96,9 +93,9 @@ def seeds_from_density(density, count):
     return np.stack(np.unravel_index(np.flatnonzero(seeds), density.shape), 1)
 
 
-@native(STATUS, seeds=i8("count", 2), queue=i4("places", 2, out=True), labels=i4("height", "width", out=True))
-def _voronoi(seeds, queue, labels):
-    """Write what :func:`voronoi` returns; ``queue`` is overwritten."""
+_voronoi = declare(
+    "voronoi", STATUS, seeds=i8("count", 2), queue=i4("places", 2, out=True), labels=i4("height", "width", out=True)
+)
 
 
 def voronoi(seeds, height, width):

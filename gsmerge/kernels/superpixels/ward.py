@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.kernels.signature import COUNT, STATUS, f4, i4, i8, native, u1
+from gsmerge.kernels.signature import COUNT, STATUS, declare, f4, i4, i8, u1
 from gsmerge.kernels.superpixels.regions import NUM_PIXELS, ROW, region_rows
 
 INVERSE, HEIGHT = 6, 7  # columns of a region's row: 1 / n, and the cost at which it came to be
@@ -18,9 +18,8 @@ NUM_SAMPLES = 4096  # edges whose costs tell where to put the first ceiling
 TIE_BREAK = 1e-7  # squared colour; what the kernel adds to equal costs, so that flat pictures merge many pairs a round
 
 
-@native(COUNT, labels=i4("rows", "columns"), pairs=i4("capacity", 2, out=True))
-def _adjacent_pairs(labels, pairs):
-    """Write what :func:`adjacent_pairs` returns and return how many there are."""
+# returns how many there are
+_adjacent_pairs = declare("adjacent_pairs", COUNT, labels=i4("rows", "columns"), pairs=i4("capacity", 2, out=True))
 
 
 def adjacent_pairs(labels):
@@ -29,9 +28,10 @@ def adjacent_pairs(labels):
     return pairs[: _adjacent_pairs(labels, pairs)]
 
 
-@native(rows=f4("capacity", ROW), pairs=i4("count", 2, least=0, below="capacity"), costs=f4("count", out=True))
-def _merge_costs(rows, pairs, costs):
-    """Write the cost of merging each of the pairs."""
+_merge_costs = declare(
+    "merge_costs", rows=f4("capacity", ROW), pairs=i4("count", 2, least=0, below="capacity"),
+    costs=f4("count", out=True),
+)  # fmt: skip
 
 
 def merge_cost(rows, u, v):
@@ -54,16 +54,13 @@ def _first_ceiling(pairs, rows, share):
     return np.float32(max(1.1 * np.partition(costs, rank)[rank], 2 * TIE_BREAK))
 
 
-@native(
-    COUNT, num_leaves=i8(least=0), num_merges=i8(), ceiling=f4(),
+# returns the number of nodes
+_merge_tree = declare(
+    "merge_tree", COUNT, num_leaves=i8(least=0), num_merges=i8(), ceiling=f4(),
     pairs=i4("num_pairs", 2, least=0, below="num_leaves", out=True), costs=f4("num_pairs", out=True),
     parked_pairs=i4("capacity", 2, out=True), parked_costs=f4("capacity", out=True),
     rows=f4("num_nodes", ROW, out=True), parents=i4("num_nodes", out=True), best_costs=f4("num_nodes", out=True),
 )  # fmt: skip
-def _merge_tree(
-    num_leaves, num_merges, ceiling, pairs, costs, parked_pairs, parked_costs, rows, parents, best_costs
-):  # fmt: skip
-    """Do the work of :func:`merge_tree` in the buffers that it hands over -> number of nodes."""
 
 
 def merge_tree(pairs, rows, num_leaves, num_merges, ceiling):
@@ -88,12 +85,11 @@ def merge_tree(pairs, rows, num_leaves, num_merges, ceiling):
     return parents, num_nodes
 
 
-@native(
-    STATUS, parents=i4("num_nodes", below="num_nodes"), keep=u1("num_nodes"), names=i4("num_nodes", out=True),
-    num_leaves=i8(),
+# names the leaves, dense from 0, when only the merges in keep are made
+_label_leaves = declare(
+    "label_leaves", STATUS, parents=i4("num_nodes", below="num_nodes"), keep=u1("num_nodes"),
+    names=i4("num_nodes", out=True), num_leaves=i8(),
 )  # fmt: skip
-def _label_leaves(parents, keep, names, num_leaves):
-    """Name the leaves, dense from 0, when only the merges in ``keep`` are made."""
 
 
 def merge_regions(labels, pixels, num_regions, count, spread):

@@ -19,7 +19,7 @@ from gsmerge.geometry import covariances
 from gsmerge.kernels.elementary import log, power
 from gsmerge.moments import MAX_OPACITY, principal_axes
 from gsmerge.plan import Plan
-from gsmerge.research.baselines.baseline import own_gaussians
+from gsmerge.research.baselines.simple import own_gaussians
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import Gaussians

@@ -8,6 +8,7 @@ import subprocess
 import tempfile
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -18,17 +19,50 @@ from gsmerge.io import read_ply, write_ply
 from gsmerge.plan import Plan
 from gsmerge.raster import contributions, plan_view, prepare
 from gsmerge.raster.photos import scene_pictures
-from gsmerge.research.baselines.baseline import merge_groups, most_important, own_gaussians, view_shares
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
+from gsmerge.stages.assign import assign
+from gsmerge.stages.decode import DecodeOptions, decode
+from gsmerge.stages.encode import encode
 from gsmerge.stages.superpixels import grid_labels, superpixels
-from gsmerge.types import Cameras, Decoded, Gaussians, Groups
+from gsmerge.types import Cameras, Decoded, Gaussians, Groups, Scene
 
 PROGRAM, VARIABLE = "splat-transform", "GSMERGE_SPLAT_TRANSFORM"
 INSTALL = "npm install -g @playcanvas/splat-transform@3.7.0"
 MAX_OUTPUT = 300  # characters of the program's own output in an error
 PAPER_SUPERPIXELS = "bass-st"  # BASS from seeds drawn by the Shi-Tomasi response
 MAX_PLANNED = 2_000_000  # Gaussians in the plans of the views under way: each plan is as large as they are
+
+
+def own_gaussians(scene: Scene) -> Gaussians:
+    """Return the Gaussians of the file, without rows that only stand in for missing or broken Gaussians."""
+    if scene.aligned and not bool(scene.stored.all()):
+        return scene.gaussians[scene.stored.reshape(-1)]
+    return scene.gaussians
+
+
+def view_shares(count: int, num_views: int, max_per_view: int) -> list[int]:
+    """Divide a number evenly among the views, at most ``max_per_view`` each; the first views get the rest."""
+    return [min(max_per_view, count // num_views + (view < count % num_views)) for view in range(num_views)]
+
+
+def most_important(importance: np.ndarray, count: int) -> np.ndarray:
+    """Find the rising indices of the ``count`` most important Gaussians, or all; the first of equals.
+
+    ``importance [n]`` is for instance the summed blending weight over all photos. A ValueError if ``count`` is below 0.
+    """
+    if count < 0:
+        raise ValueError(f"count: expected at least 0, got {count}")
+    order = np.argsort(-np.nan_to_num(importance, nan=-np.inf, neginf=-np.inf), kind="stable")
+    return np.sort(order[:count])
+
+
+def merge_groups(prepared: Prepared, groups: Groups, rule: Literal["depth", "paper"] = "depth") -> Gaussians:
+    """Make one Gaussian for each group, without matching across views; empty groups are left out."""
+    members = assign(prepared.scene, groups)
+    features = encode(prepared.scene, members, groups, rule=rule)
+    with stage("decode"):
+        return decode(features, members, DecodeOptions(min_opacity=0.0))
 
 
 def unmerged(prepared: Prepared, plan: Plan, count: int) -> Gaussians:

@@ -15,7 +15,7 @@ from gsmerge.facts.prepare import Prepared
 from gsmerge.kernels.elementary import exp, log, power
 from gsmerge.kernels.matrices import eigh
 from gsmerge.plan import Plan
-from gsmerge.research.baselines.baseline import own_gaussians
+from gsmerge.research.baselines.simple import own_gaussians
 from gsmerge.runtime.record import choose, stage
 from gsmerge.types import Gaussians
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from gsmerge.measure.scores import csv_text
-from gsmerge.report import human_bytes
+from gsmerge.report import csv_text, human_bytes
 from gsmerge.research.charts.figures import Figure
 from gsmerge.research.charts.lines import (
     METRICS,

@@ -17,11 +17,15 @@ from gsmerge.research.generate.floor_plan import (
     STAIR_LENGTH,
     STOREY,
     TREADS,
+    TURNS,
     WALL,
     FloorPlan,
     RoomPlan,
+    furnish,
+    sideboard,
+    small_plant,
+    stand,
 )
-from gsmerge.research.generate.furniture import TURNS, furnish, sideboard, small_plant, stand
 from gsmerge.research.generate.objects import Shapes, picture, window
 from gsmerge.research.generate.photograph import Light, Portal, Stage, Zone
 from gsmerge.research.generate.shapes import (

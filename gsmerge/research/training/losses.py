@@ -1,20 +1,24 @@
 """Losses: renders compared with photos, corrections compared with those of the fit, and regularizers.
 
 A window of a photo is rendered from all Feature Gaussians that reach into it, each run through all networks (paper
-section 4.6). Pixels that the scene does not cover have no loss, so that networks need not guess them. Regularizers hold
-early training near the moments of the groups, which are the paper's teacher, and siblings apart.
+section 4.6). Pixels that the scene does not cover have no loss, so that networks need not guess them. LPIPS is that of
+:mod:`gsmerge.measure.lpips`, differentiable by torch. Regularizers hold early training near the moments of the groups,
+which are the paper's teacher, and siblings apart.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from gsmerge.fit.loss import loss_ssim
+from gsmerge.measure.lpips import EPSILON, SCALE, SHIFT, Layer, min_size, read_layers
 from gsmerge.moments import Members, pool_members, principal_axes
 from gsmerge.networks.corrections import ROTATION, residual_limits
 from gsmerge.networks.options import RESIDUAL
@@ -22,7 +26,6 @@ from gsmerge.networks.tensors import gaussian_sizes, quat_to_rotmat, skew_vector
 from gsmerge.raster.autograd import render_tensors
 from gsmerge.raster.photos import NEAR
 from gsmerge.research.training.modules import Networks
-from gsmerge.research.training.perceptual import lpips_loss
 from gsmerge.research.training.predict import Prediction, analytic_gaussians, crop_targets, match_crop, predict
 from gsmerge.research.training.targets import Targets, corrections_between, nearest_axes
 from gsmerge.research.training.train_options import TrainOptions
@@ -31,6 +34,47 @@ from gsmerge.stages.merge import take
 from gsmerge.types import Gaussians
 
 MAX_DEVIATIONS = 4.0  # standard deviations that targets are clamped to
+
+
+def lpips_loss(image: Tensor, reference: Tensor, mask: Tensor, net: str = "vgg") -> Tensor:
+    """Measure LPIPS, differentiable in ``image [h,w,3]`` float32 on the CPU; the reference has no gradient.
+
+    Pixels outside of ``mask [h,w]`` are taken from the reference; 0 where the images are too small
+    for the network or no pixel counts.
+    """
+    if min(image.shape[:2]) < min_size(net) or not bool(mask.any()):
+        return image.new_zeros(())
+    layers, kernels = read_layers(net), _kernels(net)
+    with torch.no_grad():
+        features = list(_unit_features(reference, layers, kernels))
+    seen = torch.where(mask[..., None], image, reference)
+    compared = [torch.from_numpy(one.weights) for one in layers if one.weights is not None]
+    distance = torch.zeros((), dtype=torch.float64)
+    units = _unit_features(seen, layers, kernels)
+    for weights, unit, other in zip(compared, units, features, strict=True):
+        distance = distance + ((unit - other).square().mean((1, 2)) @ weights).double()
+    return distance
+
+
+@lru_cache(maxsize=1)
+def _kernels(net: str) -> list[Tensor]:
+    """Return the kernels ``[out,in,h,w]`` of a network, channels last in memory."""
+    return [torch.from_numpy(layer.kernel).permute(0, 3, 1, 2) for layer in read_layers(net)]
+
+
+def _unit_features(image: Tensor, layers: tuple[Layer, ...], kernels: list[Tensor]) -> Iterator[Tensor]:
+    """Compute features ``[c,h,w]`` of unit length at every pixel, of each layer that is compared."""
+    values = (2 * image[None] - 1 - torch.from_numpy(SHIFT)) / torch.from_numpy(SCALE)
+    features = values.permute(0, 3, 1, 2)
+    for layer, kernel in zip(layers, kernels, strict=True):
+        conv = layer.conv
+        if conv.pool:
+            features = functional.max_pool2d(features, conv.pool, 2)
+        bias = torch.from_numpy(layer.bias)
+        features = functional.conv2d(features, kernel, bias, conv.stride, conv.padding).relu_()
+        if layer.weights is not None:
+            lengths = torch.linalg.vector_norm(features, dim=1, keepdim=True)
+            yield (features / (lengths + float(EPSILON)))[0]
 
 
 def target_scales(every: Iterable[Mapping[int, Targets]]) -> dict[int, Tensor]:

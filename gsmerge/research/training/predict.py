@@ -1,4 +1,10 @@
-"""Predictions of all networks for crops of examples, with gradients through every stage."""
+"""Predictions of all networks for crops of examples, with gradients through every stage.
+
+The geometry of the stages is done on tensors here, so that gradients pass from a stage's results to what earlier ones
+made of them. The formulas are those of the kernels that the stages use (:mod:`gsmerge.networks.tokens`,
+:mod:`gsmerge.moments`, :mod:`gsmerge.networks.corrections`). Choices have no gradient: members, neighbours, clusters,
+order of axes, views and what these say of a group.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
-from gsmerge.moments import Members
+from gsmerge.moments import MAX_OPACITY, Members, principal_axes
 from gsmerge.networks.apply import (
     NetworkContext,
     encode_features,
@@ -17,26 +24,204 @@ from gsmerge.networks.apply import (
     refine_features,
     run_heads,
 )
-from gsmerge.networks.tensors import move_tensors
-from gsmerge.networks.tokens import GroupFeatures
-from gsmerge.research.training.geometry import (
-    differentiate_base,
-    differentiate_groups,
-    differentiate_tokens,
-    features_to_arrays,
-    features_to_tensors,
-    groups_to_arrays,
-    make_round_tensors,
-    move_feature_tensors,
-    pool_tensors,
+from gsmerge.networks.corrections import COLOR, LOGIT, MASS, MEAN, ROTATION, SIZE
+from gsmerge.networks.options import CORRECTED, PART
+from gsmerge.networks.tensors import (
+    gaussian_sizes,
+    move_tensors,
+    quat_to_rotmat,
+    rotate_quats,
+    rotate_vectors,
+    skew_vectors,
 )
+from gsmerge.networks.tokens import GroupFeatures
 from gsmerge.research.training.modules import Networks
 from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.research.training.windows import Crop
 from gsmerge.stages.decode import divide
 from gsmerge.stages.match import match
-from gsmerge.stages.merge import cluster_runs, merge, take
-from gsmerge.types import Array, FeatureGaussians, Gaussians, Matches, as_tensor
+from gsmerge.stages.merge import cluster_runs, merge, pool_runs, take
+from gsmerge.types import SH_C0, Array, FeatureGaussians, Gaussians, Matches, as_array, as_tensor
+
+TINY = 1e-12  # world units
+MIN_GAP = 1e-3  # least difference of two squared scales that turns axes, as a share of the largest
+
+
+def features_to_tensors(features: FeatureGaussians) -> FeatureGaussians:
+    """Return Feature Gaussians whose columns that networks change are tensors."""
+    columns: dict[str, Array] = {name: as_tensor(getattr(features, name)) for name in CORRECTED}
+    return replace(features, **columns)
+
+
+def features_to_arrays(features: FeatureGaussians) -> FeatureGaussians:
+    """Return Feature Gaussians without gradients."""
+    return replace(features, **{name: as_array(getattr(features, name)) for name in CORRECTED})
+
+
+def groups_to_arrays(groups: GroupFeatures) -> GroupFeatures:
+    """Return what networks read of groups without gradients."""
+    numbers = {name: as_array(getattr(groups, name)) for name in ("frames", "sizes", "group")}
+    return replace(groups, features=features_to_arrays(groups.features), base=groups.base.numpy(), **numbers)
+
+
+def differentiate_axes(covars: Tensor) -> tuple[Tensor, Tensor]:
+    """Compute scales ``[g,3]``, rising, and quaternions ``[g,4]`` of covariances ``[g,3,3]``, differentiable.
+
+    Values are those of :func:`gsmerge.moments.principal_axes`; gradients are of first-order perturbation theory. Axes
+    of nearly equal scales have no direction, so their turn is held back.
+    """
+    scales, quats = (torch.from_numpy(axes).float() for axes in principal_axes(as_array(covars)))
+    if not covars.requires_grad:
+        return scales, quats
+    axes = quat_to_rotmat(quats)
+    change = axes.transpose(1, 2) @ (covars - covars.detach()) @ axes  # zero, with a gradient
+    squares = scales.square()
+    gaps = squares[:, None] - squares[:, :, None]  # [i,j]: square of j less that of i
+    least = (MIN_GAP * squares[:, 2])[:, None, None]
+    spins = change * gaps / (gaps.square() + least.square()).clamp_min(1e-37)
+    grown = scales + change.diagonal(dim1=1, dim2=2) / (2 * scales)
+    return grown, rotate_quats(rotate_vectors(axes, skew_vectors(spins)), quats)
+
+
+def differentiate_base(features: FeatureGaussians) -> Gaussians:
+    """Decode Feature Gaussians as :func:`gsmerge.moments.feature_to_gaussians` does, differentiable."""
+    scales, quats = differentiate_axes(features.covars)
+    depths = features.extinctions * as_tensor(features.gains) / (scales[:, 1] * scales[:, 2])
+    opacities = (1 - torch.exp(-depths)).clamp(0, MAX_OPACITY)
+    return Gaussians(features.means, quats, scales, opacities, features.sh0, as_tensor(features.shN))
+
+
+def differentiate_groups(features: FeatureGaussians, known: GroupFeatures, viewmats: np.ndarray) -> GroupFeatures:
+    """Compute what networks read of groups, differentiable, from the ``known`` values of the same groups."""
+    chosen = torch.from_numpy(viewmats[known.views]).float()
+    base, frames = differentiate_base(features), _differentiate_frames(features.means, chosen, known.frames)
+    sizes = gaussian_sizes(base.scales).clamp_min(TINY)
+    pixels = torch.from_numpy(known.footprints).clamp_min(TINY)
+    covars = frames.transpose(1, 2) @ features.covars @ frames / sizes.square()[:, None, None]
+    places = rotate_vectors(chosen[:, :3, :3], features.means) + chosen[:, :3, 3]
+    numbers = [
+        _log_scales(base.scales, pixels),
+        _logits(base.opacities)[:, None],
+        _log_ratio(features.masses, pixels**3)[:, None],
+        _log_ratio(features.extinctions, pixels**2)[:, None],
+        torch.from_numpy(known.group[:, 6:8]),
+        SH_C0 * features.sh0[:, 0],
+        torch.asinh(torch.stack([covars[:, i, j] for i in range(3) for j in range(i, 3)], 1)),
+        (places[:, :2] / places[:, 2:].clamp_min(1e-6)).clamp(-3, 3),
+    ]
+    group = torch.cat([torch.cat(numbers, 1).nan_to_num(), torch.from_numpy(known.group[:, 19:])], 1)
+    return replace(known, features=features, base=base, frames=frames, sizes=sizes, group=group)
+
+
+def _differentiate_frames(means: Tensor, viewmats: Tensor, known: np.ndarray) -> Tensor:
+    """Compute the frames of points in views ``[g,4,4]``, differentiable where the ray is not the image's right."""
+    frames = torch.from_numpy(known)
+    if not means.requires_grad:
+        return frames
+    centres = -rotate_vectors(viewmats[:, :3, :3].transpose(1, 2), viewmats[:, :3, 3])
+    away = normalize(means - centres, dim=1)
+    across = viewmats[:, 0, :3] - (viewmats[:, 0, :3] * away).sum(1, keepdim=True) * away
+    right = normalize(across, dim=1)
+    turned = torch.stack([right, torch.linalg.cross(away, right), away], 2)
+    return torch.where((across.norm(dim=1) > 1e-3)[:, None, None], frames + turned - turned.detach(), frames)
+
+
+def differentiate_tokens(
+    parts: Gaussians, ids: np.ndarray, owners: np.ndarray, group_features: GroupFeatures
+) -> Tensor:
+    """Describe Gaussians relative to groups, ``[n,13]``, as :func:`gsmerge.networks.tokens.part_tokens` does."""
+    g, own = group_features, torch.from_numpy(owners)
+    chosen = parts[torch.from_numpy(ids)]
+    back = g.frames[own].transpose(1, 2)
+    pixels = torch.from_numpy(g.footprints)[own].clamp_min(TINY)
+    local = rotate_vectors(back, chosen.means - g.base.means[own]) / g.sizes[own, None]
+    ordered = chosen.scales.sort(-1).values.clamp_min(TINY)
+    normals = quat_to_rotmat(chosen.quats).gather(2, chosen.scales.argmin(1)[:, None, None].expand(-1, 3, 1))[..., 0]
+    facing = rotate_vectors(back, normals)
+    flat = -(1 - ordered[:, 0] / ordered[:, 1]) * facing[:, 2].sign()
+    colors = SH_C0 * (chosen.sh0 - g.base.sh0[own])[:, 0]
+    numbers = [torch.asinh(local), _log_scales(ordered, pixels), _logits(chosen.opacities)[:, None], colors]
+    tokens = torch.cat([*numbers, flat[:, None] * facing], 1)
+    assert tokens.shape[1] == PART
+    return tokens.nan_to_num()
+
+
+def _log_scales(scales: Tensor, pixels: Tensor) -> Tensor:
+    return torch.log(scales.clamp_min(TINY) / pixels[:, None]).clamp(-12, 12) / 4
+
+
+def _logits(opacities: Tensor) -> Tensor:
+    return torch.logit(opacities.clamp(1e-4, 1 - 1e-4)) / 3
+
+
+def _log_ratio(values: Tensor, units: Tensor) -> Tensor:
+    return (torch.log(values.clamp_min(1e-30)) - torch.log(units)).clamp(-30, 30) / 10
+
+
+def move_feature_tensors(group_features: GroupFeatures, residuals: Tensor) -> FeatureGaussians:
+    """Apply corrections ``[g,14]`` as :func:`gsmerge.networks.corrections.move_features` does, differentiable."""
+    g, f = group_features, group_features.features
+    turns = _rotations(rotate_vectors(g.frames, residuals[:, ROTATION]))
+    axes, logs = quat_to_rotmat(g.base.quats), residuals[:, SIZE]
+    stretches = torch.eye(3) + (axes * torch.expm1(logs)[:, None]) @ axes.transpose(1, 2)
+    changes = turns @ stretches
+    covars = changes @ f.covars @ changes.transpose(1, 2)
+    discs = logs[:, 1] + logs[:, 2]
+    return replace(
+        f,
+        means=f.means + rotate_vectors(g.frames, residuals[:, MEAN] * gaussian_sizes(g.base.scales)[:, None]),
+        covars=(covars + covars.transpose(1, 2)) / 2,
+        masses=f.masses * torch.exp(residuals[:, LOGIT] + logs[:, 0] + discs + residuals[:, MASS]),
+        extinctions=f.extinctions * torch.exp(residuals[:, LOGIT] + discs),
+        sh0=f.sh0 + residuals[:, None, COLOR] / SH_C0,
+    )
+
+
+def _rotations(vectors: Tensor) -> Tensor:
+    """Compute the rotations ``[n,3,3]`` of rotation vectors ``[n,3]`` (Rodrigues), differentiable at zero, too."""
+    x, y, z = vectors.unbind(1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], 1).reshape(-1, 3, 3)
+    angles = (vectors.square().sum(1) + 1e-12).sqrt()[:, None, None]
+    return torch.eye(3) + torch.sin(angles) / angles * cross + (1 - torch.cos(angles)) / angles**2 * cross @ cross
+
+
+def pool_tensors(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray) -> FeatureGaussians:
+    """Pool runs of rows as :func:`gsmerge.stages.merge.pool_runs` does, differentiable."""
+    pooled = pool_runs(features_to_arrays(features), order, cuts)
+    run = torch.from_numpy(np.repeat(np.arange(len(cuts)), np.diff(np.append(cuts, len(order)))))
+    weights = torch.from_numpy(np.maximum(features.weights[order].astype(np.float64) * features.gains[order], 1e-12))
+    share = (weights / torch.zeros(len(cuts), dtype=torch.float64).index_add(0, run, weights)[run]).float()
+
+    def total(values: Tensor) -> Tensor:
+        return torch.zeros(len(cuts), *values.shape[1:]).index_add(0, run, values)
+
+    def average(values: Tensor) -> Tensor:
+        return total(values * share.reshape(-1, *[1] * (values.ndim - 1)))
+
+    means = average(features.means[order])
+    offsets = features.means[order] - means[run]
+    spread = features.covars[order] + offsets[:, :, None] * offsets[:, None]
+    columns: dict[str, Array] = {"means": means, "covars": average(spread), "sh0": average(features.sh0[order])}
+    columns |= {name: total(getattr(features, name)[order]) for name in ("masses", "extinctions")}
+    return replace(pooled, **columns, latents=average(features.latents[order]))
+
+
+def make_round_tensors(parents: np.ndarray, group_features: GroupFeatures, known: Gaussians) -> Gaussians:
+    """Make the Gaussians that absolute heads correct, see :func:`gsmerge.networks.apply.prepare_children`.
+
+    ``known`` are the same ``n`` Gaussians as arrays.
+    """
+    own, base, same = torch.from_numpy(parents), group_features.base, known.to("cpu")
+    frames = group_features.frames[own]
+    turns = (frames - frames.detach()) @ frames.detach().transpose(1, 2)  # zero, with a gradient
+    return replace(
+        same,
+        means=base.means[own],
+        quats=rotate_quats(skew_vectors(turns), same.quats),
+        scales=group_features.sizes[own, None].expand(-1, 3),
+        sh0=base.sh0[own],
+    )
 
 
 class TrainingContext(NetworkContext):

@@ -1,8 +1,14 @@
-"""Examples in files: written once, hashed, and read one by one.
+"""Examples in files: written once, hashed, and read in random order, of which few are in memory.
 
 A shard is a safetensors file with one example. A scene's shards are named in a record, a JSON file that is written
 when all of them are; its name is a hash of the scene's files and of the settings. So a call that was interrupted goes
 on with the first example that is missing, and what is complete is not made again.
+
+Threads read ahead. Every crop of a step has a stream of its own: every ``crops``-th of the shards, in an order that is
+shuffled anew for each pass over them. A stream holds ``buffer`` examples, from which the crop draws one at random;
+every ``refresh`` steps the next in the order takes the place of the oldest. Which examples these are depends on seed
+and step alone. So a run that is resumed goes on as if it had not stopped, and so does one that is shared among
+processes, each of which reads the streams of its own crops.
 """
 
 from __future__ import annotations
@@ -10,7 +16,10 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +48,7 @@ REMEDY = "remove it; the next call makes it again"
 SETTINGS = ("densities", "segmentation", "photo_scale", "photo_side", "seed")
 FIT_SETTINGS = ("match", "overlap", "iou", "fit_steps", "levels")
 PARTS = {"members": Members, "features": FeatureGaussians, "base": Gaussians}
+ORDER = 2**32 + 1  # takes the place of the step in the seed of the order's random numbers
 
 
 @dataclass(frozen=True)
@@ -203,3 +213,55 @@ def read_targets(shard: Shard) -> dict[int, Targets]:
     arrays, facts = _read(shard.path, "targets.")
     names = [f.name for f in fields(Targets)]
     return {k: Targets(*(arrays[f"targets.{k}.{n}"] for n in names)) for k in facts["levels"]}
+
+
+class ExampleStreams:
+    """Streams of examples, one for each of some of a step's crops."""
+
+    def __init__(self, shards: Sequence[Shard], options: TrainOptions, crops: Sequence[int]) -> None:
+        self.shards, self.options, self.crops = shards, options, crops
+        self.pool = ThreadPoolExecutor(options.workers, thread_name_prefix="gsmerge-read")
+        self.examples: dict[int, Future[Example]] = {}  # by number of the shard: those in memory, or being read
+        self.checked: set[int] = set()
+
+    def move_to(self, step: int) -> None:
+        """Read what the step may draw, and what comes next; forget everything else."""
+        ahead = self.options.buffer + 1
+        ids = [self.shard_id(step, crop, slot) for slot in range(ahead) for crop in self.crops]
+        for number in self.examples.keys() - set(ids):
+            self.examples.pop(number).cancel()
+        for number in ids:
+            if number not in self.examples:
+                self.examples[number] = self.pool.submit(self._read, number)
+
+    def draw(self, step: int, crop: int, rng: np.random.Generator) -> Example:
+        """Draw one of the examples of a crop of the step that was moved to."""
+        slot = int(rng.integers(self.options.buffer))
+        return self.examples[self.shard_id(step, crop, slot)].result()
+
+    def shard_id(self, step: int, crop: int, slot: int) -> int:
+        """Return the number of the shard that a crop's stream has in a slot: 0 is the oldest."""
+        position = (step // self.options.refresh + slot) * self.options.crops + crop
+        epoch, rest = divmod(position, len(self.shards))
+        return int(_order(self.options.seed, epoch, len(self.shards))[rest])
+
+    def _read(self, number: int) -> Example:
+        example = read_shard(self.shards[number], check=number not in self.checked)
+        self.checked.add(number)
+        return example
+
+
+@contextmanager
+def open_streams(shards: Sequence[Shard], options: TrainOptions, crops: Sequence[int]) -> Iterator[ExampleStreams]:
+    """Open streams whose threads end with the block."""
+    streams = ExampleStreams(shards, options, crops)
+    try:
+        yield streams
+    finally:
+        streams.pool.shutdown(cancel_futures=True)
+
+
+@lru_cache(maxsize=4)
+def _order(seed: int, epoch: int, count: int) -> np.ndarray:
+    """Shuffle all shards for one pass over them, ``[count]``."""
+    return np.random.default_rng([seed, ORDER, epoch]).permutation(count)

@@ -128,7 +128,7 @@ def _rows(example: Example, photo: int, box: Box) -> np.ndarray:
     wide = Box(box.left - BORDER, box.top - BORDER, box.width + 2 * BORDER, box.height + 2 * BORDER)
     plan = plan_view(prepare(example.base, np.zeros(3)), **box_camera(example.photos, photo, wide), near=NEAR)
     reached = np.zeros(len(example.base), bool)
-    reached[plan.ids[np.unique(plan.members)]] = True
+    reached[plan.ids[np.unique(plan.flatten_ids)]] = True
     return _whole_clusters(example, reached)
 
 

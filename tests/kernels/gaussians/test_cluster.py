@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from messages import refuse_all
 from scipy.sparse import coo_matrix, csgraph
 
 from gsmerge.kernels.gaussians.cluster import (
@@ -213,11 +214,10 @@ def test_neighbours_that_are_none_are_refused(neighbor: int) -> None:
     neighbors, ones, views = np.array([[1], [neighbor]]), np.ones((2, 3)), np.array([0, 1])
     scores, order = np.ones((2, 1)), np.array([0, 1])
     latents, covars = np.empty((2, 0), np.float32), np.ones((2, 6))
-    with pytest.raises(ValueError, match="edge_scores: expected indices inside"):
-        edge_scores(neighbors, ones, covars, ones, latents, views, 1.0, 0.0, True, np.empty_like(scores))
-    with pytest.raises(ValueError, match="find_components: expected indices inside"):
-        connected_components(neighbors, scores, 0.5)
-    with pytest.raises(ValueError, match="find_stars: expected indices inside"):
-        leader_clusters(order[::-1].copy(), neighbors, scores, views, 0.5, 3)
-    with pytest.raises(ValueError, match="order: expected values below 2"):
-        leader_clusters(order + 1, neighbors, scores, views, 0.5, 3)
+    edges = neighbors, ones, covars, ones, latents, views, 1.0, 0.0, True, np.empty_like(scores)
+    refuse_all(ValueError, [
+        (lambda: edge_scores(*edges), "edge_scores", "indices"),
+        (lambda: connected_components(neighbors, scores, 0.5), "find_components", "indices"),
+        (lambda: leader_clusters(order[::-1].copy(), neighbors, scores, views, 0.5, 3), "find_stars", "indices"),
+        (lambda: leader_clusters(order + 1, neighbors, scores, views, 0.5, 3), "find_stars: order", "below 2"),
+    ])  # fmt: skip

@@ -7,6 +7,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from messages import refuses
 from network_fixtures import Made, made
 
 from gsmerge.geometry import quat_to_rotmat
@@ -139,10 +140,10 @@ def test_ids_outside_are_refused(some: Made) -> None:
     ids = np.zeros(3, np.int64)
     for wrong in (-1, len(some.features)):
         bad = np.array([0, wrong, 0])
-        for pair in ((bad, ids), (ids, bad)):
-            with pytest.raises(ValueError, match="expected values"):
+        for name, pair in (("ids", (bad, ids)), ("owners", (ids, bad))):
+            with refuses(ValueError, f"describe_parts: {name}", wrong):
                 part_tokens(features.base, *pair, features)
-        with pytest.raises(ValueError, match="expected values"):
+        with refuses(ValueError, "correct_gaussians: owners", wrong):
             move_gaussians(features.base[:3], np.zeros((3, RESIDUAL), np.float32), bad, features.frames)
     with pytest.raises(ValueError, match="describe_parts"):
         part_tokens(features.base, ids, ids, features, PART - 1)

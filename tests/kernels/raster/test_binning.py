@@ -28,25 +28,28 @@ def test_depth_order_is_a_stable_sort(values: np.ndarray) -> None:
     np.testing.assert_array_equal(binning.depth_order(depths.view(np.uint32)), np.argsort(depths, kind="stable"))
 
 
-def random_boxes(count: int, lines: int, columns: int) -> np.ndarray:
+def random_boxes(count: int, tile_height: int, tile_width: int) -> np.ndarray:
     """First and exclusive last column and row; every fifth one empty."""
-    x, y = np.sort(RNG.integers(0, columns + 1, (count, 2)), 1), np.sort(RNG.integers(0, lines + 1, (count, 2)), 1)
+    x, y = (
+        np.sort(RNG.integers(0, tile_width + 1, (count, 2)), 1),
+        np.sort(RNG.integers(0, tile_height + 1, (count, 2)), 1),
+    )
     boxes = np.concatenate([x, y], 1).astype(np.int16)
     boxes[(boxes[:, 1] == boxes[:, 0]) | (boxes[:, 3] == boxes[:, 2])] = 0
     boxes[::5] = 0
     return boxes
 
 
-@pytest.mark.parametrize(("lines", "columns"), [(1, 1), (1, 9), (9, 1), (5, 7)])
-def test_tile_lists(lines: int, columns: int) -> None:
-    boxes, order = random_boxes(200, lines, columns), RNG.permutation(200).astype(np.int32)
-    expected: list[list[int]] = [[] for _ in range(lines * columns)]
+@pytest.mark.parametrize(("tile_height", "tile_width"), [(1, 1), (1, 9), (9, 1), (5, 7)])
+def test_tile_lists(tile_height: int, tile_width: int) -> None:
+    boxes, order = random_boxes(200, tile_height, tile_width), RNG.permutation(200).astype(np.int32)
+    expected: list[list[int]] = [[] for _ in range(tile_height * tile_width)]
     for k, (x0, x1, y0, y1) in zip(order.tolist(), boxes[order].tolist(), strict=True):
         for y in range(y0, y1):
             for x in range(x0, x1):
-                expected[y * columns + x].append(k)
-    counts = binning.count_tiles(boxes, lines, columns)
+                expected[y * tile_width + x].append(k)
+    counts = binning.count_tiles(boxes, tile_height, tile_width)
     assert counts.tolist() == [len(tile) for tile in expected]
-    members, starts = np.full(counts.sum(), -1, np.int32), np.cumsum(counts) - counts
-    binning.deal_tiles(order, boxes[order], columns, starts.copy(), members)
-    assert members.tolist() == [k for tile in expected for k in tile]
+    flatten_ids, starts = np.full(counts.sum(), -1, np.int32), np.cumsum(counts) - counts
+    binning.deal_tiles(order, boxes[order], tile_width, starts.copy(), flatten_ids)
+    assert flatten_ids.tolist() == [k for tile in expected for k in tile]

@@ -30,10 +30,10 @@ def planned(gaussians: Gaussians) -> tuple[ViewPlan, ViewWeights]:
 
 def entry_pixels(weights: ViewWeights) -> np.ndarray:
     """Row-major pixel of the image of every entry."""
-    tiles = np.repeat(np.arange(len(weights.offsets) - 1), np.diff(weights.offsets))
+    tiles = np.repeat(np.arange(len(weights.isect_offsets) - 1), np.diff(weights.isect_offsets))
     tiles = np.repeat(tiles, np.diff(weights.starts))
-    y = tiles // weights.columns * 16 + weights.lanes // 16
-    x = tiles % weights.columns * 16 + weights.lanes % 16
+    y = tiles // weights.tile_width * 16 + weights.lanes // 16
+    x = tiles % weights.tile_width * 16 + weights.lanes % 16
     assert (x < WIDTH).all()
     assert (y < HEIGHT).all()
     return y * WIDTH + x
@@ -42,7 +42,7 @@ def entry_pixels(weights: ViewWeights) -> np.ndarray:
 def dense(weights: ViewWeights, count: int) -> np.ndarray:
     """``[pixels,n]``."""
     matrix, pixels = np.zeros((HEIGHT * WIDTH, count)), entry_pixels(weights)
-    for i, member in enumerate(weights.members):
+    for i, member in enumerate(weights.flatten_ids):
         entries = slice(weights.starts[i], weights.starts[i + 1])
         np.add.at(matrix, (pixels[entries], weights.ids[member]), weights.weights[entries])
     return matrix
@@ -55,12 +55,12 @@ CASES = [(200, 0, 0.5), (3000, 1, 0.05), (3000, 2, 3.0), (1, 3, 0.5)]
 @pytest.mark.parametrize("case", CASES)
 def test_entries_are_sound(case: tuple[int, int, float]) -> None:
     plan, weights = planned(of_case(case))
-    assert len(weights.starts) == len(plan.members) + 1
+    assert len(weights.starts) == len(plan.flatten_ids) + 1
     assert weights.starts[0] == 0
     assert (np.diff(weights.starts) >= 0).all()
     assert weights.starts[-1] == len(weights.lanes) == len(weights.weights)
     assert (weights.weights > 0).all()
-    owners = weights.ids[np.repeat(weights.members, np.diff(weights.starts))].astype(np.int64)
+    owners = weights.ids[np.repeat(weights.flatten_ids, np.diff(weights.starts))].astype(np.int64)
     assert len(np.unique(owners * HEIGHT * WIDTH + entry_pixels(weights))) == len(owners)
 
 

@@ -7,8 +7,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gsmerge.kernels.raster.blend import add_slots, blend, contributions, rows_in_tile, survey, weighted_sums
-from gsmerge.kernels.raster.blend_backward import SUMS, blend_backward, gather_slots
+from gsmerge.kernels.raster.blend import (
+    SUMS,
+    add_slots,
+    blend,
+    blend_backward,
+    contributions,
+    gather_slots,
+    rows_in_tile,
+    survey,
+    weighted_sums,
+)
 from gsmerge.kernels.raster.list_weights import list_weights
 
 M, N, SIDE = 3, 5, 20
@@ -16,9 +25,10 @@ M, N, SIDE = 3, 5, 20
 
 def lists(**changes: Any) -> dict[str, Any]:
     """Three Gaussians in the first and the last of four tiles."""
-    footprints = np.tile(np.array([8, 8, 0.2, 0, 0.04, -1, 0, SIDE], np.float32), (M, 1))
-    members = np.array([0, 1, 2, 0, 1], np.int32)
-    return {"footprints": footprints, "members": members, "offsets": np.array([0, 3, 3, 3, 5]), "columns": 2} | changes
+    conics = np.tile(np.array([8, 8, 0.2, 0, 0.04, -1, 0, SIDE], np.float32), (M, 1))
+    flatten_ids, isect_offsets = np.array([0, 1, 2, 0, 1], np.int32), np.array([0, 3, 3, 3, 5])
+    lists = {"conics": conics, "flatten_ids": flatten_ids, "isect_offsets": isect_offsets, "tile_width": 2}
+    return lists | changes
 
 
 def walks(given: dict[str, Any], first: int = 0, last: int = 4) -> list[Any]:
@@ -28,15 +38,15 @@ def walks(given: dict[str, Any], first: int = 0, last: int = 4) -> list[Any]:
         np.empty((SIDE, SIDE, 3), np.float32),
         np.empty((SIDE, SIDE), "f4"),
     )
-    f, m, o, c = given.values()
-    slots = np.empty((len(m), SUMS), np.float32)
+    walked = list(given.values())
+    slots = np.empty((len(walked[1]), SUMS), np.float32)
     return [
-        lambda: blend(f, colors, m, o, c, first, last, np.zeros(3, np.float32), image, left),
-        lambda: weighted_sums(f, m, o, c, first, last, image, np.empty((len(m), 4), np.float32)),
-        lambda: survey(f, colors, m, o, c, image, np.zeros((M, 2), np.float32)),
-        lambda: contributions(f, m, o, c, SIDE, SIDE, np.zeros((M, 2), np.float32)),
-        lambda: blend_backward(f, colors, m, o, c, first, last, image, left, image, None, slots),
-        lambda: list_weights(f, m, o, c, SIDE, SIDE),
+        lambda: blend(*walked, colors, first, last, np.zeros(3, np.float32), image, left),
+        lambda: weighted_sums(*walked, first, last, image, np.empty((len(walked[1]), 4), np.float32)),
+        lambda: survey(*walked, colors, image, np.zeros((M, 2), np.float32)),
+        lambda: contributions(*walked, SIDE, SIDE, np.zeros((M, 2), np.float32)),
+        lambda: blend_backward(*walked, colors, first, last, image, left, image, None, slots),
+        lambda: list_weights(*walked, SIDE, SIDE),
     ]
 
 
@@ -48,39 +58,39 @@ def test_sound_lists_are_taken() -> None:
 @pytest.mark.parametrize(
     "change",
     [
-        pytest.param({"members": np.array([0, 1, M, 0, 1], np.int32)}, id="member too large"),
-        pytest.param({"members": np.array([0, 1, 2, 0, -1], np.int32)}, id="member below zero"),
-        pytest.param({"offsets": np.array([0, 3, 3, 3, N + 1])}, id="end too large"),
-        pytest.param({"offsets": np.array([-1, 3, 3, 3, 5])}, id="start below zero"),
-        pytest.param({"offsets": np.array([0, 3, 2, 3, 5])}, id="falling"),
-        pytest.param({"offsets": np.array([0, 1 << 62, 3, 3, 5])}, id="huge"),
-        pytest.param({"columns": 0}, id="no columns"),
+        pytest.param({"flatten_ids": np.array([0, 1, M, 0, 1], np.int32)}, id="member too large"),
+        pytest.param({"flatten_ids": np.array([0, 1, 2, 0, -1], np.int32)}, id="member below zero"),
+        pytest.param({"isect_offsets": np.array([0, 3, 3, 3, N + 1])}, id="end too large"),
+        pytest.param({"isect_offsets": np.array([-1, 3, 3, 3, 5])}, id="start below zero"),
+        pytest.param({"isect_offsets": np.array([0, 3, 2, 3, 5])}, id="falling"),
+        pytest.param({"isect_offsets": np.array([0, 1 << 62, 3, 3, 5])}, id="huge"),
+        pytest.param({"tile_width": 0}, id="no columns"),
     ],
 )
 @pytest.mark.parametrize("walk", range(6))
 def test_lists_outside_their_arrays_are_refused(walk: int, change: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match="expected indices inside their arrays"):
+    with pytest.raises(ValueError, match="indices"):
         walks(lists(**change))[walk]()
 
 
 @pytest.mark.parametrize("span", [(-1, 2), (0, 5), (0, 1 << 62)])
 @pytest.mark.parametrize("walk", [0, 1, 4])
 def test_tiles_that_are_not_there_are_refused(walk: int, span: tuple[int, int]) -> None:
-    with pytest.raises(ValueError, match="expected indices inside their arrays"):
+    with pytest.raises(ValueError, match="indices"):
         walks(lists(), *span)[walk]()
 
 
 @pytest.mark.parametrize("bad", [M, -1, np.iinfo(np.int32).min])
 def test_members_outside_are_refused_by_what_adds_up(bad: int) -> None:
-    members, rows = np.array([0, bad], np.int32), np.zeros((1, 8), np.float32)
+    flatten_ids, rows = np.array([0, bad], np.int32), np.zeros((1, 8), np.float32)
     sums, ids = np.zeros((M, SUMS), np.float32), np.arange(M, dtype=np.int32)
     with pytest.raises(ValueError, match="add_slots"):
-        add_slots(members, np.zeros((2, 4), np.float32), ids, 0, sums)
+        add_slots(flatten_ids, np.zeros((2, 4), np.float32), ids, 0, sums)
     with pytest.raises(ValueError, match="add_slots"):
         add_slots(np.zeros(2, np.int32), np.zeros((2, 4), np.float32), np.full(M, bad, np.int32), 0, sums)
     with pytest.raises(ValueError, match="rows_in_tile"):
-        rows_in_tile(rows, members, 0, 0, np.zeros((2, 2), np.int32))
-    gather_slots(members, np.ones((2, SUMS), np.float32), 0, M, sums)
+        rows_in_tile(rows, flatten_ids, 0, 0, np.zeros((2, 2), np.int32))
+    gather_slots(flatten_ids, np.ones((2, SUMS), np.float32), 0, M, sums)
     assert sums.sum() == SUMS  # those outside the range of Gaussians are another thread's
 
 

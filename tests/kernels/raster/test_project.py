@@ -34,7 +34,7 @@ def test_footprints() -> None:
     plan = plan_view(prepare(gaussians), viewmat, K, width, height)
     positions, covars, depths = slow_footprints(gaussians, viewmat, K, width, height)
     ids = plan.ids
-    mean_x, mean_y, rate_x, slope, rate_y, lnop, first, last = plan.footprints.T.astype(np.float64)
+    mean_x, mean_y, rate_x, slope, rate_y, lnop, first, last = plan.conics.T.astype(np.float64)
     np.testing.assert_allclose(np.stack([mean_x, mean_y], 1), positions[ids], rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(plan.depths, depths[ids], rtol=1e-5)
     conics = np.linalg.inv(covars + 0.3 * np.eye(2))[ids]
@@ -44,7 +44,7 @@ def test_footprints() -> None:
     np.testing.assert_allclose(np.exp(lnop), gaussians.opacities[ids], rtol=1e-5)
 
     rows = np.arange(height)[:, None] + 0.5
-    reached = (lnop - rate_y * (rows - mean_y) ** 2 >= np.log(1 / 255)) & np.isin(np.arange(len(ids)), plan.members)
+    reached = (lnop - rate_y * (rows - mean_y) ** 2 >= np.log(1 / 255)) & np.isin(np.arange(len(ids)), plan.flatten_ids)
     listed = (rows - 0.5 >= first) & (rows - 0.5 <= last)
     assert (listed | ~reached).all()
     assert (listed == reached)[:, reached.any(0)].mean() > 0.999
@@ -63,7 +63,7 @@ def test_no_gaussian_that_adds_light_is_missing() -> None:
     distances = ((offsets @ conics) * offsets).sum(-1)
     alphas = gaussians.opacities[:, None] * np.exp(-0.5 * distances)
     visible = (alphas.max(1) > 1.001 / 255) & (depths > 0.01)
-    drawn = set(plan.ids[np.unique(plan.members)].tolist())
+    drawn = set(plan.ids[np.unique(plan.flatten_ids)].tolist())
     assert set(np.flatnonzero(visible).tolist()) <= drawn
     # boxes have corners that their ellipses do not fill, and culling only looks at the longest axis
     assert visible.sum() > 0.9 * len(drawn)

@@ -12,13 +12,13 @@ BATCH = 32  # Gaussians that the kernels take at once
 LEFT, TOP = 32, 48  # the tile's first pixel
 
 
-def rows_of(footprints: np.ndarray) -> np.ndarray:
-    rows = np.empty((len(footprints), 2), np.int32)
-    rows_in_tile(footprints, np.arange(len(footprints), dtype=np.int32), LEFT, TOP, rows)
+def rows_of(conics: np.ndarray) -> np.ndarray:
+    rows = np.empty((len(conics), 2), np.int32)
+    rows_in_tile(conics, np.arange(len(conics), dtype=np.int32), LEFT, TOP, rows)
     return rows
 
 
-def footprints_of(kind: str, rng: np.random.Generator) -> np.ndarray:
+def conics_of(kind: str, rng: np.random.Generator) -> np.ndarray:
     """``[BATCH,8]`` of Gaussians around the tile, their rows those of the whole image."""
     rows = np.zeros((BATCH, 8), np.float32)
     reach = {"near": 8, "far": 40, "huge": 3000}[kind]
@@ -36,9 +36,9 @@ def footprints_of(kind: str, rng: np.random.Generator) -> np.ndarray:
 @pytest.mark.parametrize("seed", range(20))
 def test_rows_are_those_that_reach_the_cut(kind: str, seed: int) -> None:
     """None that shows is left out, and at most one beside them is kept."""
-    footprints = footprints_of(kind, np.random.default_rng(seed))
-    rows = rows_of(footprints)
-    mx, my, rate, slope, decay, lnop = footprints.T[:6].astype(np.float64)[..., None, None]
+    conics = conics_of(kind, np.random.default_rng(seed))
+    rows = rows_of(conics)
+    mx, my, rate, slope, decay, lnop = conics.T[:6].astype(np.float64)[..., None, None]
     mx, my = mx - LEFT - 0.5, my - TOP - 0.5
     y, x = np.mgrid[:TILE, :TILE].astype(np.float64)
     exponents = lnop - (rate * (x - mx - slope * (y - my))) ** 2 - decay * (y - my) ** 2
@@ -61,7 +61,7 @@ def test_rows_are_those_that_reach_the_cut(kind: str, seed: int) -> None:
 
 
 def test_a_gaussian_that_misses_the_tile_has_no_rows() -> None:
-    footprints = np.zeros((1, 8), np.float32)
-    footprints[0] = LEFT + 60, TOP + 8, 1, 0, 1, 0, 0, 1000
-    first, last = rows_of(footprints)[0]
+    conics = np.zeros((1, 8), np.float32)
+    conics[0] = LEFT + 60, TOP + 8, 1, 0, 1, 0, 0, 1000
+    first, last = rows_of(conics)[0]
     assert first > last

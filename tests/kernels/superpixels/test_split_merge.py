@@ -11,7 +11,7 @@ from regions_of_noise import neighbours
 from scipy import stats
 from skimage.measure import label as connected_parts
 
-from gsmerge.kernels.superpixels import bass, split_merge
+from gsmerge.kernels.superpixels import bass
 from gsmerge.kernels.superpixels.regions import pad_labels
 
 COUNT = 30
@@ -48,12 +48,12 @@ def sums_of(points: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("size", [1, 2, 7, 40])
 def test_evidence_is_that_of_pixels_one_after_the_other(size: int) -> None:
     points = np.random.default_rng(size).random((size, 3))
-    assert split_merge.log_evidence(sums_of(points), PRIOR) == pytest.approx(slow_evidence(points), rel=1e-9)
+    assert bass.log_evidence(sums_of(points), PRIOR) == pytest.approx(slow_evidence(points), rel=1e-9)
 
 
 def test_sums_of_regions(colours: np.ndarray, labels: np.ndarray) -> None:
     marks = np.random.default_rng(1).random(labels.shape) < 0.5
-    sums = split_merge.sum_regions(pad_labels(labels), colours, marks, COUNT)
+    sums = bass.sum_regions(pad_labels(labels), colours, marks, COUNT)
     for k in range(COUNT):
         assert sums[k] == pytest.approx(sums_of(colours[(labels == k) & marks]), rel=1e-6)
 
@@ -95,7 +95,7 @@ def test_halves(labels: np.ndarray, across: bool) -> None:
     labels[0, 0], labels[16, 1:] = 7, COUNT + 1  # and one of a row
     parts = connected_parts(labels, connectivity=1, background=-1) - 1
     labels, count = parts.astype(np.int32), parts.max() + 1
-    marks = split_merge.mark_halves(pad_labels(labels), count, across)
+    marks = bass.mark_halves(pad_labels(labels), count, across)
     expected = sum(slow_half(labels == k, across) for k in range(count))
     assert np.array_equal(marks, expected > 0)
     for k in range(count):
@@ -108,10 +108,10 @@ def test_halves(labels: np.ndarray, across: bool) -> None:
 def test_a_single_pixel_has_no_second_half() -> None:
     labels = pad_labels(np.array([[0, 1], [1, 1]]))
     colours = np.random.default_rng(0).random((2, 2, 3), dtype=np.float32)
-    marks = split_merge.mark_halves(labels, 2, False)
+    marks = bass.mark_halves(labels, 2, False)
     assert not marks[0, 0]
-    whole = split_merge.sum_regions(labels, colours, np.ones((2, 2), bool), 2)
-    ratios = split_merge.weigh_splits(whole, split_merge.sum_regions(labels, colours, marks, 2), PRIOR)
+    whole = bass.sum_regions(labels, colours, np.ones((2, 2), bool), 2)
+    ratios = bass.weigh_splits(whole, bass.sum_regions(labels, colours, marks, 2), PRIOR)
     assert ratios[0] == -np.inf
     assert np.isfinite(ratios[1])
 
@@ -132,7 +132,7 @@ def test_split(colours: np.ndarray, labels: np.ndarray, across: bool) -> None:
         ratios.append(ratio_of(colours[(labels == k) & ~half], colours[half]))
     chosen = [k for k in range(COUNT) if ratios[k] > 0]
     assert 0 < len(chosen) < COUNT
-    actual, new_areas = split_merge.split(pad_labels(labels), colours, areas, PRIOR, across, COUNT)
+    actual, new_areas = bass.split(pad_labels(labels), colours, areas, PRIOR, across, COUNT)
     assert len(new_areas) == COUNT + len(chosen)
     assert new_areas.sum() == pytest.approx(areas.sum())
     actual = actual[1:-1, 1:-1]
@@ -141,9 +141,9 @@ def test_split(colours: np.ndarray, labels: np.ndarray, across: bool) -> None:
         assert len(parts) == 1 + (k in chosen)
         assert new_areas[parts] == pytest.approx(areas[k] / len(parts))
     order = sorted(chosen, key=lambda k: -ratios[k])
-    fewer, _ = split_merge.split(pad_labels(labels), colours, areas, PRIOR, across, 2)
+    fewer, _ = bass.split(pad_labels(labels), colours, areas, PRIOR, across, 2)
     assert set(labels[fewer[1:-1, 1:-1] >= COUNT]) == set(order[:2])
-    same, _ = split_merge.split(pad_labels(labels), colours, areas, PRIOR, across, 0)
+    same, _ = bass.split(pad_labels(labels), colours, areas, PRIOR, across, 0)
     assert np.array_equal(same, pad_labels(labels))
 
 
@@ -154,7 +154,7 @@ def test_merge(colours: np.ndarray, labels: np.ndarray) -> None:
     best = {k: max((p for p in ratios if k in p), key=ratios.__getitem__) for k in range(COUNT)}
     chosen = {p for p in best.values() if best[p[0]] == best[p[1]] and ratios[p] > 0}
     assert 2 < len(chosen) < COUNT // 2
-    actual, new_areas = split_merge.merge(pad_labels(labels), colours, areas, PRIOR, COUNT)
+    actual, new_areas = bass.merge(pad_labels(labels), colours, areas, PRIOR, COUNT)
     actual = actual[1:-1, 1:-1]
     assert np.array_equal(np.unique(actual), np.arange(COUNT - len(chosen)))
     for u, v in ratios:
@@ -162,7 +162,7 @@ def test_merge(colours: np.ndarray, labels: np.ndarray) -> None:
     for k in range(COUNT):
         parts = [j for j in range(COUNT) if actual[labels == j][0] == actual[labels == k][0]]
         assert new_areas[actual[labels == k][0]] == pytest.approx(areas[parts].sum())
-    fewer, _ = split_merge.merge(pad_labels(labels), colours, areas, PRIOR, 1)
+    fewer, _ = bass.merge(pad_labels(labels), colours, areas, PRIOR, 1)
     first = max(chosen, key=ratios.__getitem__)
     assert len(np.unique(fewer[1:-1, 1:-1])) == COUNT - 1
     assert len(np.unique(fewer[1:-1, 1:-1][(labels == first[0]) | (labels == first[1])])) == 1
@@ -176,7 +176,7 @@ def test_flat_regions_merge_and_edges_split() -> None:
     halves = pad_labels(np.arange(64).reshape(8, 8) % 8 // 4)
     whole, one = pad_labels(np.zeros((8, 8), int)), np.array([64.0])
     two, prior = np.array([32.0, 32.0]), bass.move_prior()
-    assert len(split_merge.merge(halves, flat, two, prior, 9)[1]) == 1
-    assert len(split_merge.merge(halves, tones, two, prior, 9)[1]) == 2
-    assert len(split_merge.split(whole, flat, one, prior, True, 9)[1]) == 1
-    assert np.array_equal(split_merge.split(whole, tones, one, prior, True, 9)[0], halves)
+    assert len(bass.merge(halves, flat, two, prior, 9)[1]) == 1
+    assert len(bass.merge(halves, tones, two, prior, 9)[1]) == 2
+    assert len(bass.split(whole, flat, one, prior, True, 9)[1]) == 1
+    assert np.array_equal(bass.split(whole, tones, one, prior, True, 9)[0], halves)

@@ -7,17 +7,17 @@ import pytest
 from regions_of_noise import RING, SPREAD, ring_of, total_error
 from skimage.measure import label as connected_parts
 
-from gsmerge.kernels.superpixels import seeds, sweeps
+from gsmerge.kernels.superpixels import regions, seeds
 from gsmerge.kernels.superpixels.regions import pad_labels, region_rows
 
 
 def test_ring_mask_reads_the_ring_in_order() -> None:
     for mask in range(256):
-        assert sweeps.ring_mask(np.where(ring_of(mask), 5, 2).astype(np.int32), 1, 1, 5) == mask
+        assert regions.ring_mask(np.where(ring_of(mask), 5, 2).astype(np.int32), 1, 1, 5) == mask
 
 
 def test_connectivity_table_is_what_components_say() -> None:
-    table = sweeps.connectivity_table()
+    table = regions.connectivity_table()
     for mask in range(256):
         parts = connected_parts(ring_of(mask), connectivity=1)
         touching = {int(parts[place]) for place in RING[::2]} - {0}
@@ -52,8 +52,8 @@ def test_sweep_makes_the_moves_that_lower_the_error(backward: bool) -> None:
     labels = seeds.voronoi(seeds.hexagonal_seeds(9, 11, 12), 9, 11)
     padded = pad_labels(labels)
     rows = region_rows(padded, pixels, 12, 12, SPREAD)
-    rows[:, sweeps.LEAVE], rows[:, sweeps.JOIN] = rows[:, 5] / (rows[:, 5] - 1), rows[:, 5] / (rows[:, 5] + 1)
-    moved = sweeps.sweep(padded, pixels, rows, sweeps.CONNECTIVITY, SPREAD, backward)
+    rows[:, regions.LEAVE], rows[:, regions.JOIN] = rows[:, 5] / (rows[:, 5] - 1), rows[:, 5] / (rows[:, 5] + 1)
+    moved = regions.sweep(padded, pixels, rows, regions.CONNECTIVITY, SPREAD, backward)
     expected = slow_sweep(pixels, labels, backward)
     assert moved >= np.count_nonzero(expected != labels) > 10
     assert np.array_equal(padded[1:-1, 1:-1], expected)

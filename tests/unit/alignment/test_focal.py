@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from exports import Smooth, export_rows, home, save_export, smooth_scene, with_intrinsics
+from messages import noted, refuses
 from tiny_scene import FLIP, save_json, write_images, write_npz
 
 from gsmerge.errors import SceneError
@@ -59,7 +60,7 @@ def test_rows_that_are_pixels_show_it(tmp_path: Path, cameras: Callable[[Path, S
     loaded = load_scene(write(tmp_path, SCENE, export_rows(SCENE), cameras))
     assert home(loaded.pixel_scene(), SCENE) == 1
     np.testing.assert_allclose(loaded.scene.cameras.Ks, np.tile(SCENE.K, (3, 1, 1)), atol=0.3)
-    assert any("no intrinsics were given" in note and "the rays of the pixels" in note for note in loaded.notes)
+    assert noted(loaded.notes, "intrinsics", "rays")
     assert loaded.alignment is not None
     assert loaded.alignment.worst_px < 0.5
 
@@ -96,7 +97,7 @@ def test_photos_show_it_where_rows_are_no_pixels(tmp_path: Path, views: int) -> 
     loaded = load_scene(write(tmp_path, one, rows, frame_list))
     assert not loaded.scene.aligned
     assert loaded.scene.cameras.Ks[0, 0, 0] == pytest.approx(FOCAL, rel=0.01)
-    assert any("no intrinsics were given" in note and "the photos' colours" in note for note in loaded.notes)
+    assert noted(loaded.notes, "intrinsics", "colours")
 
 
 def test_what_shows_no_focal_length_is_refused(tmp_path: Path) -> None:
@@ -104,9 +105,7 @@ def test_what_shows_no_focal_length_is_refused(tmp_path: Path) -> None:
     folder = write(tmp_path / "a", SCENE, export_rows(SCENE), frame_list)
     for path in (folder / "context").iterdir():
         path.unlink()
-    with pytest.raises(
-        SceneError, match=r"transforms\.json: expected intrinsics .* no photos that show them; add them"
-    ):
+    with refuses(SceneError, "transforms.json", "intrinsics", "photos"):
         load_scene(folder)
     frames = json.loads((folder / "transforms.json").read_text())
     save_json(folder / "transforms.json", [frame | {"w": 96, "h": 72} for frame in frames])
@@ -114,5 +113,5 @@ def test_what_shows_no_focal_length_is_refused(tmp_path: Path) -> None:
     noise = np.random.default_rng(0).integers(0, 256, SCENE.images.shape, np.uint8)
     other = replace(SCENE, images=noise)
     some = np.random.default_rng(0).permutation(ROWS.size)[:9000]
-    with pytest.raises(SceneError, match=r"expected intrinsics .* no focal length fits the Gaussians; add them"):
+    with refuses(SceneError, "transforms.json", "intrinsics", "focal"):
         load_scene(write(tmp_path / "b", other, export_rows(other, some), frame_list))

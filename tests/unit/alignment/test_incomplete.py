@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from exports import Smooth, da3_rows, export_rows, save_export, smooth_scene, turned
+from messages import noted
 from tiny_scene import Tiny, make_tiny, rotation
 
 from gsmerge.alignment.incomplete import read_unordered
@@ -76,7 +77,7 @@ def test_rows_sorted_by_opacity_come_to_their_pixels(tmp_path: Path, views: int,
     assert share_at_home(loaded, tiny, kept) >= 0.99
     assert loaded.recovery.best.layout.order == "unordered"
     assert [d.name for d in loaded.exporters] == ["vicasplat"]
-    assert any("in no order" in note for note in loaded.notes)
+    assert noted(loaded.notes, "order")
     scene = loaded.pixel_scene()
     assert scene.num_gaussians == len(kept)
 

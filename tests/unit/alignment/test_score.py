@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from messages import refuses
 from tiny_scene import Tiny, make_tiny
 
 from gsmerge.alignment import check_alignment, explain_misalignment
@@ -75,7 +76,7 @@ def test_tiny_views_are_not_aligned_by_being_tiny(tiny: Tiny) -> None:
 
 
 def test_a_wrong_number_of_rows(tiny: Tiny) -> None:
-    with pytest.raises(ValueError, match="expected 3 x 14 x 20 Gaussians, got 839"):
+    with refuses(ValueError, "", "3 x 14 x 20", 839):
         check_alignment(tiny.gaussians[:-1], cameras_of(tiny), valid_of(tiny))
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from messages import refuses
 
 from gsmerge.batch import BatchOptions
 from gsmerge.options import CompactOptions
@@ -27,20 +28,16 @@ def test_runs_that_may_share_a_folder_have_one_name() -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "said"),
+    ("wrong", "named"),
     [
-        ({"jobs": 0}, "jobs: expected at least 1"),
-        ({"retries": -1}, "retries: expected at least 0"),
-        ({"timeout": 0.0}, "timeout: expected more than 0"),
-        ({"timeout": math.nan}, "timeout: expected more than 0"),
-        ({"max_memory": 0}, "max memory: expected at least"),
-        ({"engine": "slurm"}, "engine: expected one of local, ray"),
-        ({"address": "auto"}, "address: expected engine ray"),
-        ({"engine": "ray", "max_memory": 5}, "max memory: expected engine local"),
+        ({"jobs": 0}, ("jobs", 1, 0)), ({"retries": -1}, ("retries", 0, -1)), ({"timeout": 0.0}, ("timeout", "0.0")),
+        ({"timeout": math.nan}, ("timeout", "nan")), ({"max_memory": 0}, ("max memory", 1, 0)),
+        ({"engine": "slurm"}, ("engine", "'slurm'")), ({"address": "auto"}, ("address", "ray", "local")),
+        ({"engine": "ray", "max_memory": 5}, ("max memory", "local", "Ray")),
     ],
-)
-def test_settings_out_of_range_are_refused(wrong: dict[str, Any], said: str) -> None:
-    with pytest.raises(ValueError, match=said):
+)  # fmt: skip
+def test_settings_out_of_range_are_refused(wrong: dict[str, Any], named: tuple[object, ...]) -> None:
+    with refuses(ValueError, *named):
         BatchOptions(**wrong)
 
 
@@ -49,5 +46,5 @@ def test_settings_out_of_range_are_refused(wrong: dict[str, Any], said: str) -> 
     ["{name}.ply", "{stem.real}.ply", "{0}.ply", "{}.ply", "{stem", "{stem}.txt", "/x/{stem}.ply", "../{stem}.ply"],
 )
 def test_templates_that_make_no_sense_are_refused(template: str) -> None:
-    with pytest.raises(ValueError, match="output: expected"):
+    with refuses(ValueError, "output"):
         BatchOptions(output=template)

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from messages import refuses
 
 from gsmerge.batch import BatchOptions, find_jobs
 from gsmerge.batch.find import find_scenes, output_name
@@ -57,7 +58,7 @@ def test_the_output_folder_is_not_searched() -> None:
     touch("all/a.ply", "all/out/a.ply", "all/out/deep/b.ply")
     assert actual("all", out=Path("all/out")) == ["all/a.ply"]
     assert actual("all/*", out=Path("all/out")) == ["all/a.ply"]
-    with pytest.raises(UsageError, match="another folder for the results"):
+    with refuses(UsageError, "all", "results"):
         actual("all", out=Path("all"))
 
 
@@ -119,7 +120,7 @@ def test_a_folder_of_too_many_others_is_refused(monkeypatch: pytest.MonkeyPatch)
     touch("system/1/2/3/4.txt", "all/a.ply", *(f"many/{i}/scene.ply" for i in range(9)))
     assert len(actual("many")) == 9
     link("all/link", "../system")
-    with pytest.raises(SceneError, match="all/link/1/2/3: expected scenes, found more than 3 folders without one"):
+    with refuses(SceneError, "all/link/1/2/3", 3):
         actual("all")
 
 
@@ -128,7 +129,7 @@ def test_a_list_may_name_a_scene_again_and_again(monkeypatch: pytest.MonkeyPatch
     Path("list").write_text("s/a\ns/b.ply\n" * 100_000 + "./s/a\ns\n")
     assert actual("list") == ["s/a", "s/b.ply", "s/b.ply"]
     monkeypatch.setattr("gsmerge.batch.find.MAX_LISTED", 3)
-    with pytest.raises(SceneError, match="at most 3 scenes in a list"):
+    with refuses(SceneError, "list", "3 scenes"):
         actual("list")
 
 
@@ -151,30 +152,25 @@ def test_a_folder_that_cannot_be_read_is_passed_by() -> None:
     errors: list[SceneError] = []
     jobs = find_jobs(["all", "all/*"], OUT, BatchOptions(), unreadable=errors)
     assert [job.scene for job in jobs] == ["all/a.ply", "all/z/c.ply"]
-    assert {str(error) for error in errors} == {"all/locked: cannot be read (Permission denied)"}
+    assert {error.path for error in errors} == {"all/locked"}
     for given in (["all/locked"], ["all"], ["all/locked/**/*.ply"]):
-        with pytest.raises(SceneError, match="all/locked: cannot be read"):
+        with refuses(SceneError, "all/locked", "Permission denied"):
             list(find_scenes(given, OUT))
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("given", "found"),
     [
-        ("gone.ply", "no such file"),
-        ("gone", "no such file or folder"),
-        ("gone/*", "scenes that match, found none"),
-        ("empty", "scenes in the folder, found none"),
-        ("blank.txt", "scenes in the list, found none"),
-        ("binary.bin", "no text"),
+        ("gone.ply", "file"), ("gone", "file or folder"), ("gone/*", "match"), ("empty", "folder"),
+        ("blank.txt", "list"), ("binary.bin", "text"),
     ],
-)
-def test_places_without_a_scene_are_refused(given: str, said: str) -> None:
+)  # fmt: skip
+def test_places_without_a_scene_are_refused(given: str, found: str) -> None:
     Path("empty").mkdir()
     Path("blank.txt").write_text("\n# nothing\n")
     Path("binary.bin").write_bytes(b"a\0b")
-    with pytest.raises(SceneError, match=said) as raised:
+    with refuses(SceneError, given, found):
         actual(given)
-    assert given in str(raised.value)
 
 
 def test_each_scene_comes_once() -> None:
@@ -184,7 +180,7 @@ def test_each_scene_comes_once() -> None:
 
 def test_two_scenes_are_not_written_to_one_file() -> None:
     touch("s/a/scene.ply", "t/a/scene.ply")
-    with pytest.raises(UsageError, match=r"out/a\.ply.* of s/a and of t/a; .*--name"):
+    with refuses(UsageError, "out/a.ply", "s/a", "t/a", "--name"):
         outputs("s", "t")
     apart = outputs("s", "t", options=BatchOptions(output="{parent}/{stem}.ply"))
     assert apart == {"s/a.ply": "s/a", "t/a.ply": "t/a"}
@@ -200,7 +196,7 @@ def test_levels_need_files_of_their_own_too() -> None:
 
 def test_a_result_does_not_replace_a_scene() -> None:
     touch("out/a.ply", "b/a.ply")
-    with pytest.raises(UsageError, match="is one of the scenes"):
+    with refuses(UsageError, "out/a.ply", "--output"):
         outputs("out/a.ply")
 
 
@@ -224,5 +220,5 @@ def test_names_are_filled_in(tmp_path: Path) -> None:
     assert name("{stem}.ply", "a.compressed.ply") == "a.ply"
     assert name("{stem}.compressed.ply", "a.ply") == "a.compressed.ply"
     assert name("{stem}.ply", ".") == f"{tmp_path.name}.ply"
-    with pytest.raises(UsageError, match="does not fit"):
+    with refuses(UsageError, "--name", "{stem:d}.ply"):
         name("{stem:d}.ply", "a.ply")

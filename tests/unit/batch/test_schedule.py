@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from batches import QUICK, records
+from messages import names, refuses
 
 from gsmerge.batch import BatchOptions, Job
 from gsmerge.batch import schedule as runs
@@ -17,7 +18,6 @@ from gsmerge.batch.records import (
     BUSY,
     DONE,
     FAILED,
-    LOST,
     SKIPPED,
     STUCK,
     record,
@@ -27,6 +27,9 @@ from gsmerge.batch.task import BatchContext, Task
 from gsmerge.errors import SceneError
 from gsmerge.options import CompactOptions
 from gsmerge.runtime.estimate import memory_bytes
+from gsmerge.runtime.work import Lost
+
+LOST = "lost"
 
 
 def jobs(*counts: int) -> list[Job]:
@@ -66,10 +69,10 @@ def test_memory_limits_how_many_come_at_once(monkeypatch: pytest.MonkeyPatch) ->
     assert (schedule(2 * need - 1).jobs, schedule(2 * need - 1).threads) == (1, 4)
     assert schedule(2 * need).memory == 2 * need
     assert schedule(2 * need).notes == ()
-    assert "2 at once instead of 3" in schedule(2 * need, jobs=3).notes[0]
+    assert names(schedule(2 * need, jobs=3).notes[0], 2, 3)
     alone = schedule(need // 2)
     assert alone.jobs == 1
-    assert "the largest scene alone may take" in alone.notes[0]
+    assert names(alone.notes[0], "largest", "alone")
     monkeypatch.setattr(runs, "free_memory", lambda: need)
     assert schedule(None).jobs == 1
     assert schedule(None, jobs=3).jobs == 3  # who asks for it gets it
@@ -95,18 +98,19 @@ class Script:
     def has_room(self) -> bool:
         return len(self.tasks) < self.room
 
-    def submit(self, task: Task) -> None:
+    def submit(self, task: Task, *_: object, memory: int = 0) -> None:
         self.tasks.append(task)
         self.seen.append((task.job.scene, task.attempt))
 
-    def wait(self, _: float) -> list[tuple[Task, dict[str, Any]]]:
+    def wait(self, _: float | None) -> list[tuple[Task, Any]]:
         task = self.tasks.pop(0)
         script = self.scripts.get(task.job.scene, [])
         status = script.pop(0) if script else DONE
-        return [(task, record(status, task.job.scene, task.job.output, error="told so"))]
+        lost, actual = Lost("told so"), record(status, task.job.scene, task.job.output, error="told so")
+        return [(task, lost if status == LOST else actual)]
 
-    def close(self) -> None:
-        pass
+    def close(self) -> list[Task]:
+        return []
 
 
 def handed_out(pool: Script, context: BatchContext, count: int) -> list[tuple[str, str]]:
@@ -145,7 +149,7 @@ def test_what_others_work_on_comes_last(context: BatchContext, monkeypatch: pyte
 
 
 def test_a_batch_that_cannot_record_ends(context: BatchContext) -> None:
-    with pytest.raises(SceneError, match=r"batch\.jsonl: the batch cannot go on: told so"):
+    with refuses(SceneError, "batch.jsonl", "told so"):
         handed_out(Script({"1": [STUCK]}), context, 3)
 
 

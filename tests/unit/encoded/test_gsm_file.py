@@ -133,7 +133,7 @@ def test_a_newer_schema_says_what_to_do(path: Path) -> None:
 
 def test_an_existing_file_is_kept(path: Path, encoded: Encoded) -> None:
     before = path.read_bytes()
-    with pytest.raises(SceneError, match="exists already"):
+    with pytest.raises(SceneError, match="exists"):
         save_encoded(path, encoded)
     save_encoded(path, encoded, overwrite=True)
     assert path.read_bytes() == before

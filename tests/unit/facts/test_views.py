@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
+from messages import noted, refuses
 
 from gsmerge.facts.views import (
     MAX_SCORED_VIEWS,
@@ -31,7 +32,7 @@ def test_even_views(num_views: int, count: int, expected: list[int]) -> None:
 
 @pytest.mark.parametrize("count", [0, 6])
 def test_more_views_than_there_are(count: int) -> None:
-    with pytest.raises(ValueError, match="expected 1 to 5"):
+    with refuses(ValueError, "views", "1 to 5"):
         even_views(5, count)
 
 
@@ -74,8 +75,8 @@ def test_subset_is_the_scene_of_those_views() -> None:
 
 def test_gaussians_in_no_order_all_stay() -> None:
     scene = scenes.make_scene(scenes.room(), scenes.arc(3))
-    loose = Scene(scene.gaussians, scene.cameras, scene.images, None, scene.names)
-    small = subset(loose, [2])
+    unaligned = Scene(scene.gaussians, scene.cameras, scene.images, None, scene.names)
+    small = subset(unaligned, [2])
     assert len(small.gaussians) == len(scene.gaussians)
     assert np.array_equal(small.cameras.viewmats, scene.cameras.viewmats[2:])
 
@@ -92,8 +93,8 @@ def test_only_true_repeats_count_as_such() -> None:
     other_depth = twice.gaussians.means.copy()
     other_depth[-1] += 1
     assert distinct_views(replace(twice, gaussians=replace(twice.gaussians, means=other_depth)))[0] == [0, 1, 3, 4]
-    loose = Scene(scene.gaussians, twice.cameras, twice.images, None, twice.names)
-    assert distinct_views(loose)[0] == [0, 1, 3]
+    unaligned = Scene(scene.gaussians, twice.cameras, twice.images, None, twice.names)
+    assert distinct_views(unaligned)[0] == [0, 1, 3]
 
 
 @pytest.mark.parametrize("settings", [{}, {"budget": "10%"}], ids=str)
@@ -105,4 +106,4 @@ def test_repeats_change_nothing_but_the_share(settings: dict[str, str]) -> None:
         assert len(two.gaussians) == pytest.approx(2 * len(one.gaussians), abs=1)
     else:
         assert scenes.identical(one.gaussians, two.gaussians)
-    assert any("count once" in note for note in two.report.notes)
+    assert noted(two.report.notes, "once")

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from messages import refuses
 
 from gsmerge.errors import SceneError
 from gsmerge.io import atomic, atomic_output, atomic_outputs
@@ -66,7 +67,7 @@ def test_an_existing_file_needs_overwrite(tmp_path: Path) -> None:
 
 def test_a_file_that_appears_meanwhile_is_kept(tmp_path: Path) -> None:
     target = tmp_path / "out.txt"
-    with pytest.raises(SceneError, match="exists already"):
+    with pytest.raises(SceneError, match="exists"):
         write_while_another_does(target)
     assert [p.name for p in tmp_path.iterdir()] == ["out.txt"]
     assert target.read_text() == "theirs"
@@ -141,9 +142,9 @@ def write_both(folder: Path, second: str, *, fail: bool = False) -> None:
 
 def test_several_files_are_all_there_or_none(tmp_path: Path) -> None:
     (tmp_path / "b.txt").write_text("old")
-    with pytest.raises(SceneError, match=r"b\.txt: could not be written"):
+    with refuses(SceneError, "b.txt", "No space left"):
         write_both(tmp_path, "b.txt", fail=True)
-    with pytest.raises(SceneError, match="does not exist"):
+    with refuses(SceneError, "b.txt", "folder", "none"):
         write_both(tmp_path, "none/b.txt")
     assert {p.name: p.read_text() for p in tmp_path.iterdir()} == {"b.txt": "old"}
     write_both(tmp_path, "b.txt")
@@ -182,7 +183,7 @@ def test_a_rename_that_fails_leaves_each_file_old_or_new(
     for name in ("a.txt", "b.txt"):
         (tmp_path / name).write_text("old")
     fail_at(monkeypatch, call, OSError(errno.EIO, "Input/output error"))
-    with pytest.raises(SceneError, match="could not be written"):
+    with refuses(SceneError, "a.txt", "Input/output error"):
         write_three(tmp_path)
     assert contents(tmp_path) == ["new"] * call + ["old", "old", None][call:]
 
@@ -253,7 +254,7 @@ def test_a_writer_inside_writes_the_same_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize("inside", [False, True])
 def test_a_disk_error_names_the_file_that_was_asked_for(tmp_path: Path, inside: bool) -> None:
     with (
-        pytest.raises(SceneError, match=r"out\.txt: could not be written \(No space left"),
+        refuses(SceneError, "out.txt", "No space left"),
         atomic_output(tmp_path / "out.txt") if inside else nullcontext(tmp_path / "out.txt") as path,
     ):
         write_half_and_fail(path, OSError(errno.ENOSPC, "No space left on device"))
@@ -286,7 +287,7 @@ def test_a_link_stays_one_and_what_it_leads_to_is_replaced(tmp_path: Path) -> No
     (tmp_path / "far" / "file.txt").write_text("old")
     for name, target in (("link.txt", "far/file.txt"), ("dangling.txt", "far/new.txt")):
         (tmp_path / name).symlink_to(target)
-        with pytest.raises(SceneError, match="exists already"), atomic_output(tmp_path / name):
+        with refuses(SceneError, tmp_path / name, "exists"), atomic_output(tmp_path / name):
             pass
         with atomic_output(tmp_path / name, overwrite=True) as temporary:
             temporary.write_text("new")
@@ -299,7 +300,7 @@ def test_a_link_stays_one_and_what_it_leads_to_is_replaced(tmp_path: Path) -> No
 def test_pipes_and_devices_are_not_replaced(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     for path in (tmp_path / "pipe", Path("/dev/null")):
-        with pytest.raises(SceneError, match="found a pipe or a device"), atomic_output(path, overwrite=True):
+        with refuses(SceneError, path, "pipe"), atomic_output(path, overwrite=True):
             pass
 
 
@@ -308,7 +309,7 @@ def test_names_as_long_as_there_are(tmp_path: Path, name: str) -> None:
     with atomic_output(tmp_path / name) as temporary:
         temporary.write_text("new")
     assert [p.name for p in tmp_path.iterdir()] == [name]
-    with pytest.raises(SceneError, match="File name too long"), atomic_output(tmp_path / ("a" * 300)):
+    with pytest.raises(SceneError, match="too long"), atomic_output(tmp_path / ("a" * 300)):
         pass
 
 
@@ -324,7 +325,7 @@ def test_an_unwritable_folder_is_refused(tmp_path: Path, monkeypatch: pytest.Mon
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(os, "open", refuse)  # permissions mean nothing to root, which tests may run as
-    with pytest.raises(SceneError, match=r"cannot be written \(Permission denied\)"), atomic_output(tmp_path / "o.ply"):
+    with refuses(SceneError, "o.ply", "Permission denied"), atomic_output(tmp_path / "o.ply"):
         pass
     monkeypatch.undo()
     assert list(tmp_path.iterdir()) == []

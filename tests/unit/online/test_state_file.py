@@ -24,6 +24,7 @@ from hostile.gsm_files import (
     with_text,
     without,
 )
+from messages import refuses
 from safetensors.numpy import load_file, save_file
 from unaligned_scenes import far_behind, shuffled
 from view_batches import fed, parts_of, room, same_state, state_of
@@ -108,8 +109,8 @@ def test_saved_between_batches_is_kept_in_memory(settings: dict[str, Any], tmp_p
 
 
 def test_what_no_view_sees_comes_back(tmp_path: Path) -> None:
-    loose = shuffled(room(2))
-    both = replace(loose, gaussians=Gaussians.concat([loose.gaussians, far_behind(loose.gaussians, 200)]))
+    unaligned = shuffled(room(2))
+    both = replace(unaligned, gaussians=Gaussians.concat([unaligned.gaussians, far_behind(unaligned.gaussians, 200)]))
     state = state_of(fed([both], unseen="keep", fit="none"))
     save_state(tmp_path / "a.gsm", state)
     same_state(load_state(tmp_path / "a.gsm"), state)
@@ -145,5 +146,5 @@ def test_damage_is_told_in_one_line(damage: str, path: Path) -> None:
 
 def test_a_newer_schema_says_what_to_do(path: Path) -> None:
     DAMAGED["a newer schema"](path)
-    with pytest.raises(SceneError, match=r"expected schema 1, found 2; written by gsmerge 9\.9; this is .*, update it"):
+    with refuses(SceneError, path, 1, 2, 9.9):
         load_state(path)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from fake_gsplat import forget, install
+from messages import refuses
 from slow_renderer import BACKGROUND, NAMES, assert_close, leaves, pixel_gradients, random_gaussians
 from slow_renderer import turned_cameras as cameras_of
 from torch import Tensor
@@ -266,9 +267,9 @@ def test_gsplat_gets_tensors_of_the_device_alone(with_depths: bool, monkeypatch:
 
 def test_devices_must_agree() -> None:
     gaussians, cameras = random_gaussians(3), cameras_of()
-    with pytest.raises(ValueError, match=r"one device, got cpu and meta; move them with \.to\(device\)"):
+    with refuses(ValueError, "", "cpu", "meta"):
         render(gaussians, cameras.to("meta"))
-    with pytest.raises(ValueError, match="one device"):
+    with refuses(ValueError, "", "cpu", "meta"):
         render(replace(gaussians, sh0=gaussians.sh0.to("meta")), cameras)
 
 
@@ -282,7 +283,7 @@ def test_without_gsplat_it_is_said_what_to_install(monkeypatch: pytest.MonkeyPat
 def test_gsplat_without_its_compiled_part_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a wheel and a compiler gsplat can be imported, and fails at its first kernel."""
     install(monkeypatch, compiled=None)
-    with pytest.raises(GsmergeError, match="gsplat has no compiled part, and no CUDA toolkit was found to compile it"):
+    with pytest.raises(GsmergeError, match="toolkit"):
         by_adapter(random_gaussians(3), cameras_of())
 
 
@@ -301,7 +302,7 @@ def test_gsplat_that_cannot_be_compiled_is_told(
         monkeypatch.delitem(sys.modules, name, raising=False)
     forget(monkeypatch)
     for _ in range(2):
-        with pytest.raises(GsmergeError, match=r"cannot be loaded \(RuntimeError: Error building extension\)$"):
+        with refuses(GsmergeError, "", "gsplat", "RuntimeError", "extension"):
             by_adapter(random_gaussians(3), cameras_of())
     printed = capsys.readouterr()
     assert (printed.out, printed.err.count("Setting up CUDA")) == ("", 1)

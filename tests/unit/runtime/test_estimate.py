@@ -8,10 +8,11 @@ from typing import Any
 import pytest
 
 from gsmerge.options import CompactOptions
-from gsmerge.plan import resolved_settings
+from gsmerge.plan import plan_whole
 from gsmerge.runtime import estimate, memory
 from gsmerge.runtime.estimate import memory_bytes, memory_problem, wall_seconds, work_seconds
 from gsmerge.runtime.memory import machine_memory, peak_memory
+from gsmerge.stages.segment import SceneSize
 
 VIEW = 480 * 320
 
@@ -20,7 +21,8 @@ def seconds(
     views: int = 12, *, photos: bool = True, fit_steps: int = 240, num_drawn: float | None = None, **settings: Any
 ) -> float:
     options = CompactOptions().with_settings(settings)
-    plain = resolved_settings(options, photos=photos)
+    size = SceneSize(views * VIEW, views, 320, 480, aligned=True, photos=photos)
+    plain = plan_whole(size, options).settings(options)
     return work_seconds(views * VIEW, VIEW, plain, photos=photos, fit_steps=fit_steps, num_drawn=num_drawn)
 
 

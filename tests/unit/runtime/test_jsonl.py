@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from messages import refuses
 
 from gsmerge.errors import SceneError
 from gsmerge.runtime.jsonl import append_line, each_line
@@ -109,5 +110,5 @@ def test_what_is_no_json_is_refused_and_leaves_the_file_alone(tmp_path: Path) ->
 
 def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(SceneError, match="cannot be written"):
+    with refuses(SceneError, "lines.jsonl", "File exists", "--output"):
         append_line(tmp_path / "file" / "lines.jsonl", {})

@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from messages import refuses
 from tiny_scene import FLIP, Tiny, edited_json, make_tiny, rotation
 
 from gsmerge.errors import SceneError
@@ -114,7 +115,7 @@ def test_views_of_other_names_that_stand_in_the_same_place_are_no_targets(tiny: 
     load = load_scene(tiny.save(tmp_path / "scene"))
     poses = {"p": tiny.c2w[0], "q": between(tiny), "r": tiny.c2w[1]}
     assert read_held_out(load, write_views(tmp_path / "all", poses, tiny)).names == ("images/q.png",)
-    with pytest.raises(SceneError, match="that the scene was not made of, found none"):
+    with refuses(SceneError, "transforms.json", "views", "none"):
         read_held_out(load, write_views(tmp_path / "none", {"p": tiny.c2w[0]}, tiny))
 
 
@@ -132,7 +133,7 @@ def test_photos_elsewhere(tiny: Tiny, tmp_path: Path) -> None:
     with pytest.raises(SceneError, match="--target-images"):
         read_held_out(load, cameras)
     assert len(read_held_out(load, cameras, tmp_path / "photos")) == 1
-    with pytest.raises(SceneError, match="expected a folder of photos"):
+    with pytest.raises(SceneError, match="folder"):
         read_held_out(load, cameras, tmp_path / "nowhere")
 
 
@@ -140,7 +141,7 @@ def test_the_photo_that_is_missing_is_named(tiny: Tiny, tmp_path: Path) -> None:
     load = load_scene(tiny.save(tmp_path / "scene"))
     path = write_views(tmp_path / "held", {"q": between(tiny), "r": between(tiny)}, tiny)
     (path.parent / "images" / "r.png").unlink()
-    with pytest.raises(SceneError, match=r"no photo found for images/r\.png"):
+    with refuses(SceneError, "transforms.json", "images/r.png", "--target-images"):
         read_held_out(load, path)
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from messages import refuses
 from tiny_scene import Tiny
 
 from gsmerge.errors import SceneError
@@ -52,14 +53,14 @@ def test_a_folder_of_masks_that_is_named(tiny_folder: Path, tiny: Tiny, tmp_path
         write(tmp_path / "other" / Path(name).with_suffix(".bmp"), large)
     scene = read_scene(tiny_folder, masks=tmp_path / "other")
     assert np.array_equal(scene.masks, np.stack([half(tiny)] * 3))
-    with pytest.raises(SceneError, match=r"no such file or folder"):
+    with pytest.raises(SceneError, match="no such"):
         read_scene(tiny_folder, masks=tmp_path / "missing")
-    with pytest.raises(SceneError, match=r"expected a folder of masks, found a file"):
+    with refuses(SceneError, "scene.ply", "masks", "file"):
         read_scene(tiny_folder, masks=tiny_folder / "scene.ply")
     shutil.copytree(tmp_path / "other" / "a b", tmp_path / "wrong")
     for number, path in enumerate(sorted((tmp_path / "wrong").iterdir())):
         path.rename(path.with_name(f"x{number}.bmp"))
-    with pytest.raises(SceneError, match=r"expected masks named as the photos, such as 2\.png, found none"):
+    with refuses(SceneError, "wrong", "2.png", "--masks"):
         read_scene(tiny_folder, masks=tmp_path / "wrong")
 
 
@@ -81,7 +82,7 @@ def test_opaque_photos_have_no_masks(tiny_folder: Path, tiny: Tiny) -> None:
 
 def test_a_mask_that_is_no_image(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(b"no image")
-    with pytest.raises(SceneError, match="expected an image"):
+    with pytest.raises(SceneError, match="decoded"):
         decode_mask(tmp_path / "a.png")
 
 

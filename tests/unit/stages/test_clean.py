@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
+from messages import noted, refuses
 
 from gsmerge import CompactOptions, Gaussians, Scene, compact
 from gsmerge.errors import UsageError
@@ -41,18 +42,15 @@ def wall(n: int = 40) -> Gaussians:
 
 
 @pytest.mark.parametrize(
-    ("text", "problem"),
+    ("text", "expected"),
     [
-        ("sphere:0,0,0", "expected sphere:x,y,z,radius or box"),
-        ("ball:0,0,0,1", "expected sphere:x,y,z,radius or box"),
-        ("sphere:0,0,nan,1", "expected sphere:x,y,z,radius or box"),
-        ("box:a,0,0,1,1,1", "expected sphere:x,y,z,radius or box"),
-        ("sphere:0,0,0,0", "expected a radius above 0"),
-        ("box:0,0,0,1,1,0", "expected x0 < x1, y0 < y1 and z0 < z1"),
+        ("sphere:0,0,0", "sphere:x,y,z,radius"), ("ball:0,0,0,1", "sphere:x,y,z,radius"),
+        ("sphere:0,0,nan,1", "sphere:x,y,z,radius"), ("box:a,0,0,1,1,1", "sphere:x,y,z,radius"),
+        ("sphere:0,0,0,0", "radius"), ("box:0,0,0,1,1,0", "x0 < x1"),
     ],
-)
-def test_a_crop_that_is_none(text: str, problem: str) -> None:
-    with pytest.raises(ValueError, match=problem):
+)  # fmt: skip
+def test_a_crop_that_is_none(text: str, expected: str) -> None:
+    with refuses(ValueError, "crop", expected, f"'{text}'"):
         CleanOptions(crop=text)
 
 
@@ -105,7 +103,7 @@ def test_a_budget_is_met_after_the_crop(scene: Scene, share: float) -> None:
     assert inside_crop(result.gaussians.means, crop).all()
     assert result.report.choices["clean"]["cropped"] > 0
     assert result.report.num_output == 150
-    assert sum(note.startswith("left out by clean-up: ") for note in result.report.notes) == 1
+    assert sum("clean-up: " in note for note in result.report.notes) == 1
 
 
 def test_a_crop_without_a_budget_keeps_the_rest_as_it_is(scene: Scene) -> None:
@@ -125,18 +123,18 @@ def test_levels_and_baselines_are_cropped(scene: Scene) -> None:
     opaque = compact(scene, method="opacity", crop=crop, budget=100)
     assert len(opaque.gaussians) == 100
     assert inside_crop(opaque.gaussians.means, crop).all()
-    assert not any("does not use" in note for note in opaque.report.notes)
+    assert not any("use" in note for note in opaque.report.notes)
 
 
 def test_what_cannot_be(scene: Scene) -> None:
-    with pytest.raises(UsageError, match="expected Gaussians of the scene in sphere:0,0,1e9,1, found none"):
+    with refuses(UsageError, "crop", "sphere:0,0,1e9,1", "none"):
         compact(scene, **QUICK, crop="sphere:0,0,1e9,1")
-    with pytest.raises(ValueError, match="crop: expected a budget or superpixels, got quality 30dB"):
+    with refuses(ValueError, "crop", "budget", "quality 30dB"):
         CompactOptions().with_settings({"crop": "sphere:0,0,0,1", "quality": "30dB"})
     few = sphere_in(scene, 0.002)
     result = compact(scene, **QUICK, crop=few, budget=5000)
     assert 0 < len(result.gaussians) < 5000
-    assert any("budget: 5,000 Gaussians were asked for" in note for note in result.report.notes)
+    assert noted(result.report.notes, "budget", "5,000")
     assert CompactOptions().with_settings({"crop": "sphere:0,0,0,1", "drop_floaters": True}).whole_only == [
         "crop", "drop_floaters",
     ]  # fmt: skip

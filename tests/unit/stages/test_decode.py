@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import scenes
+from messages import refuses
 
 from gsmerge import Gaussians, Scene
 from gsmerge.geometry import covariances
@@ -128,7 +129,7 @@ def test_faint_ones_are_left_out(scene: Scene, k: int) -> None:
 
 @pytest.mark.parametrize("k", [0, -1, 9])
 def test_k_out_of_range(features: FeatureGaussians, members: Members, k: int) -> None:
-    with pytest.raises(ValueError, match=f"k: expected 1 to 8, mixed or auto, got {k}"):
+    with refuses(ValueError, "k", "1 to 8", k):
         decode(features, members, DecodeOptions(k=k))
 
 

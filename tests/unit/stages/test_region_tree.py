@@ -7,22 +7,24 @@ from unittest import mock
 import numpy as np
 import pytest
 import scenes
+from messages import refuses
 
 from gsmerge import Scene
 from gsmerge.moments import Members, scene_members
-from gsmerge.research.baselines.baseline import most_important
-from gsmerge.stages import region_tree as module
+from gsmerge.research.baselines.simple import most_important
+from gsmerge.stages import segment as module
 from gsmerge.stages.decode import DecodeOptions, decode, split_counts
 from gsmerge.stages.encode import encode
-from gsmerge.stages.region_tree import (
+from gsmerge.stages.segment import (
     RegionTree,
+    SegmentOptions,
     auto_count,
     cut_tree,
     knee,
     pixel_depths,
     region_tree,
+    segment,
 )
-from gsmerge.stages.segment import SegmentOptions, segment
 from gsmerge.types import FeatureGaussians, Groups
 
 HEIGHT, WIDTH = 40, 60
@@ -144,23 +146,23 @@ def test_pixel_depths() -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("name", "value", "found"),
     [
-        ({"images": np.zeros((1, HEIGHT, WIDTH))}, r"images: expected shape \[1, 40, 60, 3\]"),
-        ({"depths": np.zeros((2, HEIGHT, WIDTH))}, r"depths: expected shape \[1, 40, 60\]"),
-        ({"valid": np.zeros((1, 3, 3))}, r"valid: expected shape"),
-        ({"groups": Groups(np.zeros((1, HEIGHT, WIDTH), np.int32), (2,))}, "expected 2 superpixels"),
-        ({"groups": Groups(np.ones((1, HEIGHT, WIDTH), np.int32), (1,))}, "expected 1 superpixels"),
+        ("images", np.zeros((1, HEIGHT, WIDTH)), [[1, 40, 60, 3], [1, 40, 60]]),
+        ("depths", np.zeros((2, HEIGHT, WIDTH)), [[1, 40, 60], [2, 40, 60]]),
+        ("valid", np.zeros((1, 3, 3)), [[1, 40, 60], [1, 3, 3]]),
+        ("groups", Groups(np.zeros((1, HEIGHT, WIDTH), np.int32), (2,)), ["2 superpixels", "view 0"]),
+        ("groups", Groups(np.ones((1, HEIGHT, WIDTH), np.int32), (1,)), ["1 superpixels", "view 0"]),
     ],
 )
-def test_arguments_that_do_not_fit(change: dict[str, object], message: str) -> None:
+def test_arguments_that_do_not_fit(name: str, value: object, found: list[object]) -> None:
     good = {"images": grey(), "depths": slanted(), "groups": cut(grey(), 5), "valid": slanted() > 0}
-    with pytest.raises(ValueError, match=message):
-        region_tree(**{**good, **change})
+    with refuses(ValueError, name, *found):
+        region_tree(**good | {name: value})
 
 
 def test_budget_below_the_number_of_views() -> None:
-    with pytest.raises(ValueError, match="budget: expected at least 2, one per view, got 1"):
+    with refuses(ValueError, "budget", 2, 1):
         cut_tree(tree_of(noise(2), slanted(2)), 1)
 
 
@@ -195,7 +197,7 @@ def test_knee_is_where_the_slope_is_the_one_that_is_worth_it(monkeypatch: pytest
 
 
 def test_knee_of_nothing() -> None:
-    with pytest.raises(ValueError, match="as many distortions as counts"):
+    with refuses(ValueError, "", "distortions", "(0,)"):
         knee(np.array([], int), np.array([]))
 
 
@@ -241,9 +243,9 @@ def test_a_first_step_that_only_pays_with_the_second() -> None:
 
 
 def test_splits_out_of_range(features: FeatureGaussians, members: Members) -> None:
-    with pytest.raises(ValueError, match="extra: expected at least 0, got -1"):
+    with refuses(ValueError, "extra", 0, -1):
         split_counts(features, members, -1)
-    with pytest.raises(ValueError, match="max_children: expected at least 1, got 0"):
+    with refuses(ValueError, "max_children", 1, 0):
         split_counts(features, members, 1, 0)
 
 
@@ -261,7 +263,7 @@ def test_children_stand_in_the_order_of_their_groups(features: FeatureGaussians,
 
 def test_decode_refuses_strange_counts(features: FeatureGaussians, members: Members) -> None:
     for counts in (np.ones(3, int), np.zeros(24, int)):
-        with pytest.raises(ValueError, match="counts: expected 24 numbers"):
+        with refuses(ValueError, "counts", 24):
             decode(features, members, DecodeOptions(), counts)
 
 
@@ -275,5 +277,5 @@ def test_most_important_keeps_the_most_important() -> None:
     assert most_important(importance, 5).tolist() == [0, 1, 2, 4, 5]
     assert most_important(importance, 9).tolist() == [0, 1, 2, 3, 4, 5]
     assert most_important(importance, 0).tolist() == []
-    with pytest.raises(ValueError, match="count: expected at least 0, got -1"):
+    with refuses(ValueError, "count", 0, -1):
         most_important(importance, -1)

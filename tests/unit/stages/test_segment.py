@@ -11,7 +11,14 @@ import scenes
 from gsmerge import CompactOptions, Scene
 from gsmerge.facts.prepare import prepare
 from gsmerge.plan import make_plan
-from gsmerge.stages.segment import SuperpixelPlan, count_limits, default_count, largest_count, segment_scene
+from gsmerge.stages.segment import (
+    SuperpixelPlan,
+    count_limits,
+    default_count,
+    largest_count,
+    measure_size,
+    segment_scene,
+)
 
 ADAPTIVE = {"segmentation": "bass-adaptive", "superpixels": "5%"}
 
@@ -68,8 +75,8 @@ def test_an_exact_number_is_met(scene: Scene) -> None:
 def test_largest_count(scene: Scene) -> None:
     def largest(**settings: object) -> int:
         options = CompactOptions().with_settings(settings)
-        limits = count_limits(scene, options.segment, options.decode, options.budget)
-        assert limits.default == default_count(scene, options.segment, options.decode)
+        limits = count_limits(measure_size(scene), options.segment, options.decode, options.budget)
+        assert limits.default == default_count(measure_size(scene), options.segment, options.decode)
         return largest_count(limits, options.segment)
 
     assert largest(superpixels="5%") == 3 * 38

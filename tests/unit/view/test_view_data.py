@@ -13,6 +13,7 @@ import motions
 import numpy as np
 import pytest
 import scenes
+from messages import noted
 
 from gsmerge import Gaussians, Scene, evaluate, render
 from gsmerge.facts.prepare import scene_frame
@@ -145,7 +146,7 @@ def test_too_many_gaussians_are_left_out(scene: Scene, half: Gaussians, monkeypa
     actual = collect("room", scene, {"half": half}, (2, 1))
     assert actual.sides[0].splats is None
     assert actual.sides[1].splats is not None
-    assert any("input: " in note and "stills only" in note for note in actual.notes)
+    assert noted(actual.notes, "stills")
 
 
 def test_harmonics_that_do_not_fit_are_left_out(half: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -215,7 +216,7 @@ def test_many_views_are_thinned(scene: Scene, half: Gaussians, monkeypatch: pyte
     everything = evaluate(scene, {"half": half}, None, EvaluateOptions(lpips=())).results[1].scores
     assert 1 <= len(actual.views) <= 2
     assert actual.views[0].scores[1].psnr == min(score.masked.psnr or 0 for score in everything)
-    assert any(f"{len(actual.views)} of 3 views" in note for note in actual.notes)
+    assert noted(actual.notes, f"{len(actual.views)} of 3")
 
 
 def test_without_photos_results_are_compared_with_the_input(scene: Scene, half: Gaussians) -> None:

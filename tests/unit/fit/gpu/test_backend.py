@@ -10,6 +10,7 @@ import pytest
 import scenes
 import torch
 from gpu_runs import CPU, ON_TORCH, QUICK, Pair, assert_close, gpu, on_device
+from messages import noted
 
 from gsmerge import Gaussians, Scene
 from gsmerge.fit import ON_CPU, FitOptions, FitReport, fit, run_on, stage
@@ -105,7 +106,7 @@ def test_fit_without_enough_memory_is_done_again_on_the_cpu(start: Gaussians, ph
     assert taken[:3] == [20, 40, 1]
     assert scenes.identical(actual, expected)
     assert report == other
-    assert record.notes == ["the memory of the GPU did not suffice for the fit: the CPU did it"]
+    assert noted(record.notes, "GPU", "fit", "CPU")
 
 
 def test_other_errors_are_not_hidden(start: Gaussians, photos: Pair) -> None:
@@ -125,7 +126,7 @@ def test_scores_without_enough_memory_are_done_again_on_the_cpu() -> None:
 
     with record_run() as record:
         assert run_on(ON_TORCH, "scores", work) == "cpu"
-    assert record.notes == ["the memory of the GPU did not suffice for the scores: the CPU did it"]
+    assert noted(record.notes, "GPU", "scores", "CPU")
 
 
 @gpu

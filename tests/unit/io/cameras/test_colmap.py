@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from messages import refuses
 from tiny_scene import (
     Tiny,
     assert_same,
@@ -31,7 +32,7 @@ def test_colmap_by_one_of_its_files(tmp_path: Path, tiny: Tiny) -> None:
     write_colmap_binary(tmp_path, tiny)
     assert_same(read_cameras(tmp_path / "images.bin"), tiny)
     (tmp_path / "cameras.bin").unlink()
-    with pytest.raises(SceneError, match="expected a COLMAP model with cameras and images"):
+    with refuses(SceneError, "images.bin", "COLMAP", "pair"):
         read_cameras(tmp_path / "images.bin")
 
 
@@ -47,9 +48,11 @@ def test_colmap_models_without_distortion(tmp_path: Path, tiny: Tiny) -> None:
 
 
 def test_unknown_colmap_models_are_refused(tmp_path: Path, tiny: Tiny) -> None:
-    for name, model, extra in (("a", 7, (0.1,)), ("b", 10, (0.0,) * 8), ("c", 99, ())):
+    for name, model, extra, found in (
+        ("a", 7, (0.1,), "FOV"), ("b", 10, (0.0,) * 8, "THIN_PRISM_FISHEYE"), ("c", 99, (), "model 99"),
+    ):  # fmt: skip
         write_colmap_binary(tmp_path / name, tiny, model, extra)
-        with pytest.raises(SceneError, match=r"camera 7: expected a pinhole, .* found (FOV|THIN|model 99).*undistort"):
+        with refuses(SceneError, "cameras.bin: camera 7", found):
             read_cameras(tmp_path / name)
 
 
@@ -59,7 +62,7 @@ def test_truncated_colmap_files_are_named(tmp_path: Path, tiny: Tiny, name: str)
     data = (tmp_path / name).read_bytes()
     for length in (3, 20, len(data) - 5):
         (tmp_path / name).write_bytes(data[:length])
-        with pytest.raises(SceneError, match=r"found damaged cameras or images\.bin"):
+        with refuses(SceneError, tmp_path, "damaged", "images.bin"):
             read_cameras(tmp_path)
 
 
@@ -89,16 +92,16 @@ def test_a_stripped_list_with_a_line_that_is_no_image_is_refused(tmp_path: Path,
     lines = [line for line in (tmp_path / "images.txt").read_text().splitlines() if line and line[:4] != "10.5"]
     for odd in (lines[2].rsplit(maxsplit=2)[0], lines[2].replace(" 7 ", " 8 ")):
         (tmp_path / "images.txt").write_text("\n".join([*lines[:2], odd, *lines[3:]]))
-        with pytest.raises(SceneError, match=r"damaged cameras or images\.txt|its camera is not in"):
+        with pytest.raises(SceneError, match=r"images\.txt|cameras\.txt"):
             read_cameras(tmp_path)
 
 
 def test_damaged_colmap_text(tmp_path: Path, tiny: Tiny) -> None:
     write_colmap_text(tmp_path, tiny)
     (tmp_path / "images.txt").write_text("1 0.5 0.5 nonsense\n\n")
-    with pytest.raises(SceneError, match=r"found damaged cameras or images\.txt"):
+    with refuses(SceneError, tmp_path, "damaged", "images.txt"):
         read_cameras(tmp_path)
     write_colmap_text(tmp_path, tiny)
     (tmp_path / "cameras.txt").write_text("8 PINHOLE 20 14 1 1 1 1\n")
-    with pytest.raises(SceneError, match=r"view a b/2\.png: its camera is not in cameras\.txt"):
+    with refuses(SceneError, "images.txt: view a b/2.png", "cameras.txt"):
         read_cameras(tmp_path)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pytest
+from messages import refuses
 from tiny_scene import (
     Tiny,
     assert_same,
@@ -49,23 +49,19 @@ def test_npz_intrinsics_of_another_size_are_scaled(tmp_path: Path, tiny: Tiny) -
 
 def test_npz_that_are_refused(tmp_path: Path, tiny: Tiny) -> None:
     write_npz(tmp_path / "a.npz", tiny, extrinsics=None, intrinsics=None)
-    with pytest.raises(SceneError, match="missing arrays extrinsics, intrinsics, found"):
-        read_cameras(tmp_path / "a.npz")
     write_npz(tmp_path / "b.npz", tiny, intrinsics=np.eye(3))
-    with pytest.raises(SceneError, match=r"expected extrinsics \[c,3,4\]"):
-        read_cameras(tmp_path / "b.npz")
     write_npz(tmp_path / "c.npz", tiny, image=tiny.images[:2])
-    with pytest.raises(SceneError, match=r"expected images \[3,h,w,3\], found \[2, 14, 20, 3\]"):
-        read_cameras(tmp_path / "c.npz")
     (tmp_path / "d.npz").write_bytes(b"no archive")
-    with pytest.raises(SceneError, match=r"readable \.npz file, found something else"):
-        read_cameras(tmp_path / "d.npz")
     write_npz(tmp_path / "e.npz", tiny)
     data = bytearray((tmp_path / "e.npz").read_bytes())
     data[200:240] = bytes(40)  # in the first array: its checksum no longer fits
     (tmp_path / "e.npz").write_bytes(data)
-    with pytest.raises(SceneError, match=r"readable \.npz file, found a damaged one"):
-        read_cameras(tmp_path / "e.npz")
+    for name, *found in (
+        ("a.npz", "missing", "extrinsics, intrinsics", ["image"]), ("b.npz", "[c,3,4]", (3, 3, 4)),
+        ("c.npz", "[3,h,w,3]", [2, 14, 20, 3]), ("d.npz", "something"), ("e.npz", "damaged", "extrinsics.npy"),
+    ):  # fmt: skip
+        with refuses(SceneError, name, *found):
+            read_cameras(tmp_path / name)
 
 
 def test_arrays_are_read_by_name(tmp_path: Path) -> None:
@@ -75,6 +71,6 @@ def test_arrays_are_read_by_name(tmp_path: Path) -> None:
     actual = read_arrays(tmp_path / "a.npz", ("a", "b", "c", "e"))
     assert actual.keys() == {"a", "b", "c"}
     assert all(np.array_equal(actual[name], arrays[name]) for name in actual)
-    with pytest.raises(SceneError, match="found objects, which are not read because they could run code"):
+    with refuses(SceneError, "a.npz: d.npy", "objects"):
         read_arrays(tmp_path / "a.npz", ("d",))
     assert array_names(tmp_path / "none.npz") == frozenset()

@@ -8,9 +8,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-import pytest
 import torch
 from exports import export_rows, save_export, smooth_scene, turned
+from messages import refuses
 from tiny_scene import Tiny
 
 from gsmerge.errors import SceneError
@@ -62,7 +62,7 @@ def test_the_scene_is_picked_by_the_name_of_the_ply(tmp_path: Path) -> None:
     assert np.allclose(scene.cameras.viewmats, SMOOTH.w2c, atol=1e-6)
     assert np.abs(scene.images * 255 - SMOOTH.images).mean() < 2
     (tmp_path / "a.ply").rename(tmp_path / "c.ply")
-    with pytest.raises(SceneError, match=r"scene with the key 'c', found 0 among 2 \(b, a, \.\.\.\); name the \.ply"):
+    with refuses(SceneError, "000000.torch", "'c'", 2, "(b, a, ...)"):
         load_scene(tmp_path)
 
 

@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scenes
+from messages import refuses
 from plyfile import PlyData, PlyElement
+from slow_readers import corners, drawn, read_splat, read_spz
 
 from gsmerge.errors import SceneError
 from gsmerge.io import kept_comments, read_gaussians, read_ply, write_gaussians, write_ply
@@ -17,8 +19,6 @@ from gsmerge.io.formats.sog import sog_bytes
 from gsmerge.io.formats.spz import spz_bytes
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import Gaussians
-
-from .slow_readers import corners, drawn, read_splat, read_spz
 
 NAMES = (
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
@@ -139,7 +139,7 @@ def test_activated_opacities_are_recognised(tmp_path: Path) -> None:
     rows["opacity"] = (0.0, 0.25, 1.001)
     assert read_ply(save(tmp_path / "b.ply", rows)).info.opacity_encoding == "logit"
     assert read_ply(tmp_path / "b.ply", opacity="raw").gaussians.opacities.max() == 1
-    with pytest.raises(ValueError, match="expected 'auto', 'logit' or 'raw', got 'linear'"):
+    with refuses(ValueError, "opacity", "linear"):
         read_ply(path, opacity="linear")
 
 
@@ -260,11 +260,11 @@ def test_many_blocks_and_any_number_of_threads_give_the_same(tmp_path: Path) -> 
 
 def test_missing_columns_are_each_named(tmp_path: Path) -> None:
     names = tuple(n for n in NAMES if n not in ("opacity", "rot_2"))
-    with pytest.raises(SceneError, match="missing columns opacity, rot_2; export it again"):
+    with refuses(SceneError, "a.ply", "columns opacity, rot_2"):
         read_ply(save(tmp_path / "a.ply", columns(names=names)))
-    with pytest.raises(SceneError, match="missing column scale_2; flat 2D Gaussians"):
+    with refuses(SceneError, "b.ply", "column scale_2", "2D"):
         read_ply(save(tmp_path / "b.ply", columns(names=tuple(n for n in NAMES if n != "scale_2"))))
-    with pytest.raises(SceneError, match=r"f_dc_0, f_dc_1, f_dc_2, opacity, .*no Gaussian splat"):
+    with refuses(SceneError, "c.ply", "f_dc_0, f_dc_1, f_dc_2, opacity", "splat"):
         read_ply(save(tmp_path / "c.ply", columns(names=("x", "y", "z", "nx"))))
     with pytest.raises(SceneError, match="compressed"):
         read_ply(save(tmp_path / "d.ply", columns(names=("packed_position", "packed_scale"))))
@@ -272,13 +272,13 @@ def test_missing_columns_are_each_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("num_rest", [1, 8, 10, 46])
 def test_a_wrong_number_of_harmonics_is_named(tmp_path: Path, num_rest: int) -> None:
-    with pytest.raises(SceneError, match=f"found {num_rest} f_rest columns"):
+    with refuses(SceneError, "a.ply", f"{num_rest} f_rest"):
         read_ply(save(tmp_path / "a.ply", columns(num_rest=num_rest)))
 
 
 def test_harmonics_with_a_gap_are_refused(tmp_path: Path) -> None:
     names = (*NAMES, *(f"f_rest_{i}" for i in range(8)), "f_rest_9")
-    with pytest.raises(SceneError, match="found 9 f_rest columns"):
+    with refuses(SceneError, "a.ply", "9 f_rest"):
         read_ply(save(tmp_path / "a.ply", columns(names=names)))
 
 

@@ -14,12 +14,11 @@ import cv2
 import numpy as np
 import pytest
 import scenes
+from slow_readers import assert_damage_is_one_line, corners, drawn
 
 from gsmerge import Gaussians
 from gsmerge.io import read_gaussians, write_gaussians
 from gsmerge.io.formats.sog import fit_codebook, fit_palette, nearest_codes, sog_bytes
-
-from .slow_readers import assert_damage_is_one_line, corners, drawn
 
 
 @pytest.fixture(scope="module")

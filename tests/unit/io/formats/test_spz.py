@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from messages import refuses
+from slow_readers import assert_damage_is_one_line, corners
 
 from gsmerge import Gaussians
 from gsmerge.cli import main
@@ -17,8 +19,6 @@ from gsmerge.io import kept_comments, lost_harmonics, read_gaussians, write_gaus
 from gsmerge.io.formats import spz
 from gsmerge.io.formats.arrays import MIP_COMMENT
 from gsmerge.io.formats.spz import spz_bytes
-
-from .slow_readers import assert_damage_is_one_line, corners
 
 zstandard = pytest.importorskip("zstandard")
 
@@ -185,7 +185,7 @@ def test_more_gaussians_than_its_bytes_can_describe(version: int, tmp_path: Path
         content += bytes(20 * count // 1000)  # so that it is not refused for its ratio alone
     path = tmp_path / "a.spz"
     path.write_bytes(content)
-    with pytest.raises(SceneError, match=r"at most 1,000,000 Gaussians in .* bytes, found 1,000,001 promised"):
+    with refuses(SceneError, "a.spz", "1,000,000", "1,000,001"):
         read_gaussians(path)
 
 
@@ -196,7 +196,7 @@ def test_a_wrong_version_leaks_no_warning(tmp_path: Path) -> None:
 
 
 def test_another_version_is_refused() -> None:
-    with pytest.raises(ValueError, match="spz_version: expected 3 or 4, got 2"):
+    with refuses(ValueError, "spz_version", "3 or 4", 2):
         spz_bytes(some(0), version=2)
 
 
@@ -209,6 +209,6 @@ def test_without_the_library(
     with pytest.raises(UsageError, match=r'pip install "zstandard'):
         write_gaussians(tmp_path / "b.spz", some(0), spz_version=4)
     assert main(["inspect", str(path)]) == 2
-    assert "zstandard is not installed; pip install" in capsys.readouterr().err
+    assert "zstandard is" in capsys.readouterr().err
     write_gaussians(tmp_path / "b.spz", some(0))
     assert sorted(one.name for one in tmp_path.iterdir()) == ["a.spz", "b.spz"]

@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 import scenes
+from messages import refuses
+from slow_readers import corners, drawn
 
 from gsmerge import Gaussians, Scene
 from gsmerge.cli import main
@@ -26,7 +28,6 @@ from gsmerge.io.formats import sog, streamed
 from gsmerge.io.formats.read import read_level
 from gsmerge.io.formats.write import write_levels
 
-from .slow_readers import corners, drawn
 from .test_sog import webp
 from .test_write import needs_program, program, psnr
 
@@ -234,20 +235,20 @@ def test_failures_leave_existing_files_and_nothing_else(tmp_path: Path) -> None:
     index = tmp_path / "scene" / "lod-meta.json"
     bad = corners()
     bad.opacities[1] = np.nan
-    for levels, words in (([corners(), bad], "expected finite Gaussians"), ([corners(), bad[:0]], "got none")):
+    for levels, words in (([corners(), bad], "finite"), ([corners(), bad[:0]], "none")):
         with pytest.raises(ValueError, match=words):
             write_levels(index, levels)
     assert list(tmp_path.iterdir()) == []
-    with pytest.raises(SceneError, match="cannot be made"):
+    with refuses(SceneError, "scene", "No such file"):
         write_levels(tmp_path / "none" / "scene" / "lod-meta.json", [corners()])
     write_levels(index, [corners()])
     before = content(tmp_path)
-    with pytest.raises(SceneError, match="exists already"):
+    with refuses(SceneError, "lod-meta.json", "exists"):
         write_levels(index, chain())
-    with pytest.raises(ValueError, match="expected finite"):
+    with refuses(ValueError, "", "finite", 1):
         write_levels(index, [bad], overwrite=True)
     assert content(tmp_path) == before
-    with pytest.raises(UsageError, match=r"expected the name lod-meta\.json"):
+    with refuses(UsageError, "levels.json", "lod-meta.json"):
         write_levels(tmp_path / "levels.json", [corners()])
 
 
@@ -291,7 +292,7 @@ def test_an_index_names_no_chunk_that_is_not_there(
         replace(*paths)
 
     monkeypatch.setattr(os, "replace", rename)
-    with pytest.raises(SceneError, match="could not be written"):
+    with refuses(SceneError, "", "Input/output error"):
         write_levels(index, new, overwrite=True)
     check_dataset(index, old)
     write_levels(index, new, overwrite=True)
@@ -304,7 +305,7 @@ def test_an_index_names_no_chunk_that_is_not_there(
 def test_the_name_chooses_the_format_where_levels_are_written() -> None:
     assert output_format("scene/lod-meta.json", levels=True).ending == "lod-meta.json"
     for name, levels in {"scene/lod-meta.json": False, "my-lod-meta.json": True, "LOD-meta.json": True}.items():
-        with pytest.raises(UsageError, match="expected a name that ends in"):
+        with refuses(UsageError, name, ".compressed.ply", ".glb"):
             output_format(name, levels=levels)
 
 

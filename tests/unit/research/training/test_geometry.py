@@ -19,14 +19,16 @@ from gsmerge.networks.corrections import COLOR, LOGIT, MASS, MEAN, ROTATION, SIZ
 from gsmerge.networks.options import FEATURE
 from gsmerge.networks.tensors import quat_to_rotmat
 from gsmerge.research.training import Example, make_example, make_training_scene
-from gsmerge.research.training.geometry import (
+from gsmerge.research.training.modules import Networks
+from gsmerge.research.training.predict import (
+    TrainingContext,
     differentiate_axes,
     features_to_arrays,
     features_to_tensors,
+    match_crop,
     pool_tensors,
+    predict,
 )
-from gsmerge.research.training.modules import Networks
-from gsmerge.research.training.predict import TrainingContext, match_crop, predict
 from gsmerge.research.training.windows import Crop, whole_photo
 from gsmerge.stages.merge import cluster_runs, pool_runs
 from gsmerge.types import FeatureGaussians, Matches, as_array

@@ -24,6 +24,7 @@ from gsmerge.research.training.losses import (
     color_loss,
     diversity_loss,
     draw_window,
+    lpips_loss,
     masked_ssim,
     overlap_profile,
     render_window,
@@ -32,7 +33,6 @@ from gsmerge.research.training.losses import (
     window_psnr,
 )
 from gsmerge.research.training.modules import Networks
-from gsmerge.research.training.perceptual import lpips_loss
 from gsmerge.research.training.predict import analytic_gaussians, match_crop, predict
 from gsmerge.research.training.scenes import coverage, covered_pixels, reduced_masks, view_subsets
 from gsmerge.research.training.windows import Box, Window, sample_window, whole_photo

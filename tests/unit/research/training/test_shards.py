@@ -10,6 +10,7 @@ from shutil import copytree
 
 import numpy as np
 import pytest
+from messages import refuses
 from scenes import arc, make_scene, room
 from training_runs import OPTIONS, PAPER, written
 
@@ -26,8 +27,7 @@ from gsmerge.research.training import (
     train,
 )
 from gsmerge.research.training.examples import make_examples as make_each
-from gsmerge.research.training.shards import read_targets, scene_key
-from gsmerge.research.training.stream import ExampleStreams, open_streams
+from gsmerge.research.training.shards import ExampleStreams, open_streams, read_targets, scene_key
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -78,15 +78,15 @@ def test_a_damaged_shard_is_named_in_one_line(example: Example, tmp_path: Path) 
     data = bytearray(shard.path.read_bytes())
     data[-100] ^= 1
     shard.path.write_bytes(bytes(data))
-    with pytest.raises(SceneError, match=r"damaged file or another; remove it; the next call makes it again"):
+    with pytest.raises(SceneError, match="damaged"):
         read_shard(shard)
     read_shard(shard, check=False)
     with pytest.raises(SceneError, match="damaged"):
         read_shard(replace(shard, sha256="0"), check=False)
     shard.path.write_bytes(bytes(data[:1000]))
-    with pytest.raises(SceneError, match="expected an example"):
+    with refuses(SceneError, shard.path, "example"):
         read_shard(shard)
-    with pytest.raises(SceneError, match="expected an example"):
+    with refuses(SceneError, "none.safetensors", "example"):
         read_targets(replace(shard, path=tmp_path / "none.safetensors"))
 
 
@@ -180,7 +180,7 @@ def test_few_examples_are_in_memory_and_draws_are_spread(monkeypatch: pytest.Mon
         reads[number] += 1
         return number
 
-    monkeypatch.setattr("gsmerge.research.training.stream.read_shard", read)
+    monkeypatch.setattr("gsmerge.research.training.shards.read_shard", read)
     shards = [Shard(Path(str(i)), str(i), str(i)) for i in range(100)]
     options, rng, drawn = replace(PAPER, buffer=4, refresh=2), np.random.default_rng(0), Counter[int]()
     with open_streams(shards, options, (0, 1)) as streams:
@@ -230,7 +230,7 @@ def test_a_run_names_the_shard_that_is_damaged(shards: list[Shard], tmp_path: Pa
     data[-1] ^= 1
     damaged = replace(shards[0], path=tmp_path / "damaged.safetensors")
     damaged.path.write_bytes(bytes(data))
-    with pytest.raises(SceneError, match=r"damaged\.safetensors: expected .* remove it"):
+    with refuses(SceneError, "damaged.safetensors", "example", "damaged"):
         train([damaged], shards[:1], tmp_path / "run", PAPER, threads=1)
 
 
@@ -238,5 +238,5 @@ def test_shares_of_processes_come_back_in_order() -> None:
     items = list(range(7))
     assert [list(Processes(rank, 3).share(items)) for rank in range(3)] == [[0, 3, 6], [1, 4], [2, 5]]
     assert Processes().gather(items) == items
-    with pytest.raises(ValueError, match="crops: expected a multiple of the 3 processes, got 2"):
+    with refuses(ValueError, "crops", 3, 2):
         Processes(0, 3).require_even(2)

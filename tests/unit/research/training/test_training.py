@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from messages import refuses
 from network_fixtures import noisy
 from scenes import arc, make_scene, room
 from training_runs import OPTIONS, TINY, written
@@ -163,9 +164,9 @@ def test_interrupted_runs_end_with_the_same_bytes_on_any_number_of_threads(shard
 
 def test_another_run_is_not_gone_on_with(shard: Shard, tmp_path: Path) -> None:
     train([shard], [], tmp_path, replace(OPTIONS, steps=4))
-    with pytest.raises(SceneError, match="same options"):
+    with refuses(SceneError, "state.safetensors", "options", "--output"):
         train([shard], [], tmp_path, replace(OPTIONS, steps=8))
-    with pytest.raises(SceneError, match="same data"):
+    with refuses(SceneError, "state.safetensors", "data", "--output"):
         train([replace(shard, sha256="0")], [], tmp_path, replace(OPTIONS, steps=4))
     with pytest.raises(ValueError, match="examples"):
         train([], [], tmp_path)
@@ -268,8 +269,8 @@ def test_device_of_the_networks(monkeypatch: pytest.MonkeyPatch) -> None:
         assert choose_device("auto") == expected
     assert choose_device("cuda") == "cuda"
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    for expected in ("cuda", "tpu"):
-        with pytest.raises(ValueError, match="device: expected"):
+    for expected, found in (("cuda", "torch"), ("tpu", "'tpu'")):
+        with refuses(ValueError, "device", found):
             choose_device(expected)
 
 

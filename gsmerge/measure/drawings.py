@@ -1,0 +1,295 @@
+"""Drawings of scenes: a panel beside photos, a picture for each camera, frames along a path, and superpixels."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsmerge.errors import SceneError, UsageError
+from gsmerge.facts.views import pick_views
+from gsmerge.io import file_notes, read_cameras, read_gaussians, to_cameras
+from gsmerge.io.cameras.camera_file import sizes_of
+from gsmerge.io.cameras.read import read_sharp_camera
+from gsmerge.io.formats.read import OpacityChoice
+from gsmerge.io.image_names import IMAGE_SUFFIXES
+from gsmerge.measure.camera_path import parse_path, plan_path, viewing_depth
+from gsmerge.measure.preview import (
+    Picture,
+    contact_sheet,
+    draw_borders,
+    draw_heat,
+    draw_means,
+    is_video,
+    outside_pictures,
+    save_picture,
+    to_picture,
+    view_pictures,
+    write_video,
+)
+from gsmerge.raster import render_in_turn
+from gsmerge.raster.photos import NEAR, scene_pictures
+from gsmerge.report import document_head
+from gsmerge.runtime.record import Progress
+from gsmerge.runtime.threads import use_threads
+from gsmerge.scene.exporters import AUTO, ReadHints
+from gsmerge.scene.files import SceneFiles, find_scene_files
+from gsmerge.scene.held_out import place_camera_file
+from gsmerge.scene.read import Loaded, load_files, place_cameras_in_scene, read_rows
+from gsmerge.stages.superpixels import SegmentOptions, count_for, saliency, segment
+from gsmerge.types import Cameras, Gaussians
+
+PANEL_VIEWS = 4  # rows of a panel
+PATH_FRAMES = 120  # of a path, at least
+VIEW_FRAMES = 4  # for each view of a spline, at least
+FPS = 30  # frames per second
+KINDS = ("borders", "means", "saliency")  # pictures of the superpixels of a view
+
+
+@dataclass(frozen=True)
+class DrawOptions:
+    """What is drawn of scenes, how they are read, and where pictures are written."""
+
+    files: SceneFiles  # Of the first scene
+    paths: Sequence[Path]  # Of all scenes, as they are called
+    like: SceneFiles  # Of the scene whose frame the cameras are moved into
+    output: Path  # A picture, a video, or a folder for pictures
+    opacity: OpacityChoice = "auto"
+    hints: ReadHints = AUTO
+    views: int | None = None  # Views at most; None: all, of a panel four
+    path: str | None = None  # See :func:`gsmerge.measure.camera_path.parse_path`, or a file of cameras
+    frames: int | None = None  # Along the path; None: 120, of a spline at least 4 for each view
+    fps: int | None = None  # Frames of a video per second; None: 30
+    background: float = 0.0  # Grey level
+    antialiased: bool = False
+    segmentation: SegmentOptions | None = None  # How superpixels are cut
+
+    def choose(self, count: int, most: int | None = None) -> list[int]:
+        """Choose at most ``views`` of so many views, or at most ``most``; None: all."""
+        return pick_views(count, self.views or most or count)
+
+
+@dataclass(frozen=True, eq=False)
+class Drawing:
+    """Pictures that are drawn one after the other."""
+
+    paths: list[Path]  # Of the pictures, or that of the video
+    facts: dict[str, Any]  # About them, for the report
+    draw: Callable[[int], Iterator[Picture]]  # Draws with so many threads, as many views being in memory
+
+
+@dataclass(frozen=True, eq=False)
+class Framed:
+    """Scenes by the paths that they are called by, and the views of one of them."""
+
+    scenes: list[tuple[Path, Gaussians]]
+    notes: list[str]
+    load: Loaded  # The scene whose frame it is
+
+    def counts(self) -> dict[str, int]:
+        """Return the number of Gaussians of every scene by its path."""
+        return {str(path): len(one) for path, one in self.scenes}
+
+    def draw(
+        self, cameras: Cameras, options: DrawOptions, threads: int, near: float = 0.01
+    ) -> Iterator[tuple[np.ndarray, ...]]:
+        """Yield the pictures ``[h,w,3]`` of all scenes from each camera, with as many views in memory as threads."""
+        grey, antialiased = options.background, options.antialiased
+        drawn = (
+            render_in_turn(one, cameras, grey, at_once=threads, antialiased=antialiased, near=near)
+            for _, one in self.scenes
+        )
+        return zip(*drawn, strict=True)
+
+
+def frame_files(files: SceneFiles, source: Path | None, cameras: Path | None, images: Path | None) -> SceneFiles:
+    """Find the files of the scene whose frame cameras are moved into: ``source``, else what it was compacted from."""
+    match = re.fullmatch(r"(.+)\.compact(\.level\d+)?(\.compressed)?\.(ply|spz|sog|splat)", files.ply.name)
+    if source is None and match is not None and (beside := files.ply.with_name(f"{match[1]}.ply")).is_file():
+        source = beside
+    return files if source is None else find_scene_files(source, cameras=cameras or files.cameras, images=images)
+
+
+def plan_panel(options: DrawOptions) -> Drawing:
+    """Plan a picture of photo, before, after, ... of some views, one row each, and of all scenes from outside."""
+    framed = _read(options, photos=True)
+    used = list(framed.load.views.used)
+    cameras, photos = framed.load.views.cameras[used], framed.load.views.images
+    ids = options.choose(len(used), PANEL_VIEWS)
+
+    def draw(_: int) -> Iterator[Picture]:
+        parts = [(path.name, one) for path, one in framed.scenes]
+        own = None if photos is None else photos[used]
+        how = {"background": options.background, "antialiased": options.antialiased}
+        rows = view_pictures(parts, cameras, own, max_views=len(ids), **how)
+        yield contact_sheet([*rows, outside_pictures(parts, cameras, photos=own is not None, **how)])
+
+    facts = {"scenes": framed.counts(), "views": ids, "photos": photos is not None, "notes": framed.notes}
+    return Drawing([options.output], facts, draw)
+
+
+def plan_pictures(options: DrawOptions) -> Drawing:
+    """Plan one picture for each camera."""
+    framed = _read(options, photos=False)
+    ids = options.choose(len(framed.load.views.cameras))
+    views, stems = framed.load.views.cameras[ids], picture_stems(framed.load.views.names)
+    size = {"width": views.width, "height": views.height}
+    return Drawing(
+        [options.output / f"{stems[i]}.png" for i in ids],
+        {**size, "num_gaussians": len(framed.scenes[0][1]), "views": ids, "notes": framed.notes},
+        lambda threads: (to_picture(image) for (image,) in framed.draw(views, options, threads)),
+    )
+
+
+def plan_frames(options: DrawOptions) -> Drawing:
+    """Plan a video, or its frames as pictures, of the scenes side by side along a path."""
+    framed, cameras, near, ids = _path_cameras(options)
+    labels = [f"{path.name}: {len(one):,}" for path, one in framed.scenes]
+
+    def draw(threads: int) -> Iterator[Picture]:
+        for images in framed.draw(cameras, options, threads, near):
+            yield contact_sheet([list(zip(labels, images, strict=True))]) if len(images) > 1 else to_picture(images[0])
+
+    facts = {"views": ids, "notes": framed.notes, "scenes": framed.counts(), "path": options.path}
+    facts |= {"frames": len(cameras), "width": cameras.width, "height": cameras.height}
+    if is_video(options.output):
+        return Drawing([options.output], facts | {"fps": options.fps or FPS}, draw)
+    return Drawing([options.output / f"frame_{i:05d}.png" for i in range(len(cameras))], facts, draw)
+
+
+def _path_cameras(options: DrawOptions) -> tuple[Framed, Cameras, float, list[int]]:
+    """Read the scenes and make the cameras of the path; also return its near plane, and the views that it uses."""
+    assert options.path is not None
+    path = parse_path(options.path)
+    file, own = None if path else Path(options.path), True
+    try:
+        check_cameras(options.like)
+    except SceneError:
+        if file is None:
+            raise
+        options, own = replace(options, like=replace(options.like, cameras=file)), False
+    framed = _read(options, photos=False)
+    placed = framed.load.views.cameras
+    cameras = placed if file is None or not own else _place_file(file, framed.load)
+    ids = options.choose(len(cameras))
+    cameras = cameras[ids]
+    depth = viewing_depth(cameras if file is None else placed, framed.scenes[0][1].means)
+    if path is not None:
+        least = VIEW_FRAMES * len(ids) if path.kind == "spline" else 0
+        try:
+            cameras = plan_path(path, cameras, depth, options.frames or max(PATH_FRAMES, least))
+        except ValueError as error:
+            raise UsageError(str(error)) from error
+    return framed, cameras, NEAR * depth, ids
+
+
+def _place_file(file: Path, load: Loaded) -> Cameras:
+    """Read the cameras of a path into the frame of a scene, with the size of the scene's where they have none."""
+    cameras = load.views.cameras
+    stored = read_cameras(file) if load.cameras is None else place_camera_file(load, file)[0]
+    return to_cameras(replace(stored, lenses=()), None if sizes_of(stored) else (cameras.width, cameras.height))
+
+
+def plan_superpixels(options: DrawOptions) -> Drawing:
+    """Plan the pictures of every photo's superpixels: borders, mean colours, and the saliency that seeds them."""
+    load, cut = load_files(options.files, opacity=options.opacity, hints=options.hints), options.segmentation
+    assert cut is not None
+    scene = load.pixel_scene()
+    ids, stems = options.choose(len(scene)), picture_stems(scene.names)
+    counts = [count_for(cut, scene.cameras.height, scene.cameras.width)] * len(ids)
+
+    def draw(_: int) -> Iterator[Picture]:
+        images = scene_pictures(scene)
+        images = images[ids] if len(ids) < len(images) else images  # all of them without a copy
+        groups = segment(images, cut)
+        counts[:] = groups.counts
+        for image, labels in zip(images, groups.labels, strict=True):
+            yield from (draw_borders(image, labels), draw_means(image, labels), draw_heat(saliency(image)))
+
+    facts = {"superpixels": counts, "options": vars(cut), "views": ids, "notes": load.notes}
+    return Drawing([options.output / f"{stems[i]}.{kind}.png" for i in ids for kind in KINDS], facts, draw)
+
+
+PLANS = {"panel": plan_panel, "views": plan_pictures, "path": plan_frames, "superpixels": plan_superpixels}
+
+
+def check_cameras(files: SceneFiles) -> None:
+    """Refuse a scene with neither cameras, beside it or inside, nor photos that they can be estimated for."""
+    if files.cameras is None and files.images is None and read_sharp_camera(files.ply) is None:
+        raise SceneError(files.ply, "no cameras beside it", "name them with --cameras")
+
+
+def _read(options: DrawOptions, *, photos: bool) -> Framed:
+    """Read the scenes, and place the cameras in the frame of ``options.like``."""
+    files, like, paths = options.files, options.like, options.paths
+    check_cameras(like)
+    first = read_rows(files, opacity=options.opacity, hints=options.hints)
+    others = [read_gaussians(path, opacity=options.opacity) for path in paths[1:]]
+    own = like.ply == files.ply
+    framed = first if own else read_rows(like, opacity="auto", hints=AUTO)
+    load = place_cameras_in_scene(framed, like, hints=options.hints, photos=photos)
+    scenes = [load.scene.file_gaussians if own else first.gaussians, *(ply.gaussians for ply in others)]
+    notes = [[*([] if own else file_notes(first.info)), *load.notes], *(file_notes(ply.info) for ply in others)]
+    named = [f"{path}: {note}" for path, some in zip(paths, notes, strict=True) for note in some]
+    return Framed(list(zip(paths, scenes, strict=True)), named if others else list(notes[0]), load)
+
+
+def picture_stems(names: Sequence[str]) -> list[str]:
+    """Choose a different file name per view: the image's name, its path joined by ``_``, or the view's number."""
+    paths = []
+    for name in names:
+        parts = [part for part in re.split(r"[\\/]+", name) if part not in ("", ".", "..")] or ["view"]
+        stem, dot, suffix = parts[-1].rpartition(".")
+        known = stem and f"{dot}{suffix}".lower() in IMAGE_SUFFIXES
+        paths.append([*parts[:-1], stem if known else parts[-1]])
+    numbers = [[f"view_{i:03d}"] for i in range(len(names))]
+    for candidates in ([path[-1:] for path in paths], paths, numbers):
+        stems = ["_".join(path) for path in candidates]
+        if len({stem.lower() for stem in stems}) == len(stems):  # some file systems do not tell case apart
+            break
+    return stems
+
+
+def drawing_document(drawing: Drawing, output: Path, *, dry_run: bool) -> dict[str, Any]:
+    """Return the report of a drawing as plain JSON types."""
+    head = {**document_head(), "dry_run": dry_run, "output": str(output)}
+    return {**head, "pictures": [str(path) for path in drawing.paths], **drawing.facts}
+
+
+def write_drawing(drawing: Drawing, *, overwrite: bool, threads: int | None, progress: Progress) -> dict[str, Any]:
+    """Draw the pictures and write them, in folders that are made; return what is known only then."""
+    total, fps = drawing.facts.get("frames", len(drawing.paths)), drawing.facts.get("fps")
+
+    def count(pictures: Iterator[Picture]) -> Iterator[Picture]:
+        for done, picture in enumerate(pictures, 1):
+            yield picture
+            progress("render", done, total)
+
+    with use_threads(threads) as at_once:
+        pictures = count(drawing.draw(at_once))
+        if fps is not None:
+            return {"encoding": write_video(drawing.paths[0], pictures, fps, overwrite=overwrite)}
+        for path, picture in zip(drawing.paths, pictures, strict=True):
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                problem = f"cannot be made ({error.strerror})"
+                raise SceneError(path.parent, problem, "name another with --output") from error
+            save_picture(path, picture, overwrite=overwrite)
+    return {}
+
+
+def drawing_line(document: Mapping[str, Any]) -> str:
+    """Write in a line what was drawn."""
+    if "frames" in document:
+        line = f"{document['frames']} frames of {document['width']} x {document['height']}"
+        line += f", {document['frames'] / document['fps']:.1f} s" if "fps" in document else ""
+        return f"{line}, {document['encoding']}" if "encoding" in document else line
+    line = f"{len(document['pictures'])} picture(s) of {len(document['views'])} views"
+    if "superpixels" in document:
+        line += f", {min(document['superpixels'])} to {max(document['superpixels'])} superpixels per view"
+    return line

@@ -1,0 +1,97 @@
+"""How a batch enters a state whose groups are decoded: as moments, which add up, and children."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from gsmerge.fit import visible_mask
+from gsmerge.moments import feature_to_gaussians
+from gsmerge.online.batch import REACH, Batch, BatchFeatures, StateKind
+from gsmerge.online.state import (
+    GroupSet,
+    OnlineState,
+    bake,
+    concat_groups,
+    limit_children,
+    replace_groups,
+    select_groups,
+    with_fitted_colors,
+)
+from gsmerge.pipeline import merge_views
+from gsmerge.runtime.record import stage
+from gsmerge.stages.match import MatchOptions, match
+from gsmerge.stages.merge import merge, take
+from gsmerge.types import FeatureGaussians, Gaussians, Matches
+
+
+def _encode(state: OnlineState | None, batch: Batch, count: int | None) -> BatchFeatures:
+    """Merge a batch's superpixels across its own views."""
+    merged = merge_views(batch.prepared, batch.plan, count)
+    return BatchFeatures(merged.features, merged.members, merged.networks)
+
+
+@stage("decode")
+def _first(new: BatchFeatures, batch: Batch) -> GroupSet:
+    """Decode Feature Gaussians into groups of a state."""
+    return bake(new.features, new.members, new.context, batch.max_k)
+
+
+def _decode(groups: GroupSet, new: BatchFeatures) -> tuple[Gaussians, Gaussians]:
+    """Return the Gaussians of the state and of the batch, one for each group."""
+    return feature_to_gaussians(with_fitted_colors(groups).features), feature_to_gaussians(new.features)
+
+
+def _join(groups: GroupSet, rows: np.ndarray, new: BatchFeatures, batch: Batch) -> tuple[GroupSet, dict[str, int]]:
+    """Merge a batch into the state's ``rows`` in view, and add the rest where a view shows it."""
+    fresh = _first(new, batch)
+    with stage("join"):
+        partners = find_partners(take(groups.features, rows), fresh.features, batch.plan.match)
+        has_partner = partners >= 0
+        joining = select_groups(fresh, np.flatnonzero(has_partner))
+        groups = merge_into(groups, joining, rows[partners[has_partner]], batch.max_k)
+        alone = select_groups(fresh, np.flatnonzero(~has_partner))
+        counts, least = {"num_joined": int(has_partner.sum())}, batch.plan.fit.min_contribution
+        if least > 0 and batch.prepared.scene.images is not None:
+            in_view = feature_to_gaussians(take(groups.features, rows))
+            both = Gaussians.concat([in_view, feature_to_gaussians(alone.features)])
+            visible = visible_mask(both, batch.photos.photos(2), least)[len(in_view) :]
+            counts["num_hidden"] = int((~visible).sum())
+            alone = select_groups(alone, np.flatnonzero(visible))
+        return concat_groups([groups, alone]), counts
+
+
+MOMENTS = StateKind(REACH, _encode, _decode, _first, _join)
+
+
+def find_partners(features: FeatureGaussians, new: FeatureGaussians, options: MatchOptions) -> np.ndarray:
+    """Return the state's group with the same surface as each new one, ``[n]`` int64, -1 for none.
+
+    No group gets two: of several in a cluster by boxes, the first. Matched as across the views of one batch, the state
+    being one view and the batch another.
+    """
+    both = FeatureGaussians.concat([features, new])
+    sides = (np.arange(len(both)) >= len(features)).astype(np.int64)
+    matches = match(replace(both, views=sides), replace(options, cluster_size=2))
+    owner = np.full(matches.count, -1)
+    owner[matches.clusters[: len(features)]] = np.arange(len(features))
+    partners = owner[matches.clusters[len(features) :]]
+    again = np.ones(len(partners), bool)
+    again[np.unique(partners, return_index=True)[1]] = False
+    partners[again] = -1
+    return partners
+
+
+def merge_into(groups: GroupSet, new: GroupSet, rows: np.ndarray, max_k: int) -> GroupSet:
+    """Merge n new groups into those of the state at ``rows [n]`` int64, all different: moments add up, in place."""
+    if len(rows) == 0:
+        return groups
+    old = select_groups(groups, rows)
+    both = concat_groups([old, new])
+    pairs = np.tile(np.arange(len(rows)), 2)
+    features = merge(both.features, Matches(pairs, len(rows)))
+    children = both.children[features.members]
+    fitted_sh0 = np.where((old.color_precision > 0)[:, None, None], old.fitted_sh0, features.sh0)
+    merged = GroupSet(replace(features, members=np.arange(len(children))), children, fitted_sh0, old.color_precision)
+    return replace_groups(groups, rows, limit_children(merged, max_k))

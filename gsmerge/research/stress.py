@@ -1,0 +1,421 @@
+"""Stress test: compaction of a scene under bad conditions, with worse views, poses, photos or rows.
+
+A case says how a scene is changed, which scenes it is for, and the property that must hold. Every change returns a new
+scene and applies to the views that results are compared with, too.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+
+from gsmerge.budget import BudgetOptions
+from gsmerge.compaction.compact import compact
+from gsmerge.errors import GsmergeError, SceneError, UsageError
+from gsmerge.facts.align_views import move_views
+from gsmerge.facts.prepare import scene_frame
+from gsmerge.facts.views import even_views, subset
+from gsmerge.io.cameras.camera_file import CONVENTIONS, CameraFile, from_viewmats, to_viewmats
+from gsmerge.io.formats.read import OpacityChoice
+from gsmerge.measure.evaluate import EvaluateOptions, evaluate
+from gsmerge.options import CompactOptions
+from gsmerge.scene.exporters import AUTO, ReadHints
+from gsmerge.scene.read import Loaded, align_scene, read_rows
+from gsmerge.types import SH_C0, Cameras, Gaussians, Scene, Views, grid_ids
+
+Needs = Literal["anything", "pixels", "photos", "file", "pixel-file"]
+Check = Literal["better", "same", "near", "once", "bits", "again", "convention", "moved", "refused"]
+
+UTM = (4.0e5, 5.0e6, 100.0)  # metres, as in map coordinates
+
+PROPERTIES: dict[Check, str] = {
+    "better": "not below its own input by more than {worse:g} dB",
+    "same": "as many Gaussians within 0.5 %, not more than {same:g} dB below the unchanged scene",
+    "near": "not more than {near:g} dB below the unchanged scene",
+    "once": "at most 1.05 times the Gaussians, not more than {same:g} dB below the unchanged scene",
+    "bits": "the same result, bit for bit",
+    "again": "compacted again to the same count, not more than {same:g} dB below",
+    "convention": "recognised, with every Gaussian at its pixel, or refused in one line",
+    "moved": "read with cameras moved to where every view's Gaussians lie in their pixels",
+    "refused": "refused in one line",
+}
+SEED = 7  # of all random choices
+FAR_SHARE = 2.5e-5  # share of the Gaussians that are moved far away
+LARGE_SHARE, LARGE_FACTOR = 0.01, 8.0  # share of the Gaussians that are enlarged, and the factor
+BROKEN_SHARE = 0.01  # share of the rows that become NaN
+MAX_WORSE = 0.1  # dB that a result may be below its input
+MAX_SAME, MAX_NEAR = 0.2, 1.0  # dB that a changed scene's result may be below the unchanged one's
+FIT_SLACK = 1.0  # dB more after a full fit, whose result rounding alone changes this much on thin structures
+SAME_COUNT, ONCE_COUNT = 0.005, 1.05  # largest relative difference, and ratio, of counts
+_QUICK = EvaluateOptions(lpips=(), fog=False)
+_FIELDS = ("means", "quats", "scales", "opacities", "sh0", "shN")
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class StressScene:
+    """A scene and the views that its results are compared with."""
+
+    scene: Scene
+    views: Views | None  # held-out views in its world; None: its own views
+
+
+def keep_views(given: StressScene, choose: Callable[[int], Sequence[int]]) -> StressScene:
+    """Keep the views that ``choose`` lists, given their number."""
+    return replace(given, scene=subset(given.scene, choose(len(given.scene))))
+
+
+def move(given: StressScene, factor: float, shift: Sequence[float]) -> StressScene:
+    """Scale the world, and move it by ``shift`` in units of its own size."""
+    offset = np.array(shift, np.float64) * scene_frame(given.scene).unit * factor
+    scene, views = given.scene, given.views
+    means = factor * scene.gaussians.means.astype(np.float64) + offset
+    gaussians = replace(scene.gaussians, means=means, scales=scene.gaussians.scales * factor)
+    scene = replace(scene, gaussians=gaussians, cameras=_move_cameras(scene.cameras, factor, offset))
+    if views is not None:
+        views = replace(views, cameras=_move_cameras(views.cameras, factor, offset))
+    return StressScene(scene, views)
+
+
+def _move_cameras(cameras: Cameras, factor: float, offset: np.ndarray) -> Cameras:
+    viewmats = cameras.viewmats.astype(np.float64)
+    viewmats[:, :3, 3] = factor * viewmats[:, :3, 3] - viewmats[:, :3, :3] @ offset
+    return replace(cameras, viewmats=viewmats)
+
+
+def perturb_poses(given: StressScene, degrees: float) -> StressScene:
+    """Rotate every view, with its Gaussians, about its camera centre by a random axis."""
+    scene = given.scene
+    viewmats = turn_cameras(scene.cameras.viewmats.astype(np.float64), degrees, slice(None))
+    return replace(given, scene=move_views(scene, viewmats))
+
+
+def move_view(given: StressScene, share: float) -> StressScene:
+    """Move the middle view, with its Gaussians, sideways by a share of the scene's size."""
+    scene = given.scene
+    view, viewmats = len(scene) // 2, scene.cameras.viewmats.astype(np.float64)
+    step = viewmats[view, 0, :3] * share * scene_frame(scene).unit
+    viewmats[view, :3, 3] -= viewmats[view, :3, :3] @ step
+    return replace(given, scene=move_views(scene, viewmats))
+
+
+def turn_cameras(viewmats: np.ndarray, degrees: float, views: slice) -> np.ndarray:
+    """Turn some cameras, without their Gaussians, about their centres, each about another axis."""
+    turned, rng = viewmats.copy(), np.random.default_rng(SEED)
+    for view in range(len(viewmats))[views]:
+        axis = rng.normal(size=3)
+        turned[view, :3] = cv2.Rodrigues(np.deg2rad(degrees) * axis / np.linalg.norm(axis))[0] @ viewmats[view, :3]
+    return turned
+
+
+def change_exposure(given: StressScene, share: float) -> StressScene:
+    """Make photos, and the Gaussians of their views, alternately brighter and darker."""
+    scene = given.scene
+    assert scene.images is not None
+    gains = np.array([1 + share if view % 2 else 1 - share for view in range(len(scene))], np.float32)
+    rows = gains.repeat(scene.pixels_per_view)[:, None, None]
+    g = scene.gaussians
+    sh0 = ((0.5 + SH_C0 * g.sh0) * rows - 0.5) / SH_C0
+    gaussians = replace(g, sh0=sh0, shN=g.shN * rows)
+    images = (scene.images * gains[:, None, None, None]).clip(0, 1)
+    return replace(given, scene=replace(scene, gaussians=gaussians, images=images, large_photos=None))
+
+
+def break_rows(given: StressScene) -> StressScene:
+    """Take away the finite numbers of some rows, which the reader leaves out."""
+    scene = given.scene
+    chosen = _choose(len(scene.gaussians), BROKEN_SHARE)
+    if not scene.aligned:
+        return replace(given, scene=replace(scene, gaussians=scene.gaussians[~chosen]))
+    gaussians = replace(scene.gaussians, opacities=np.where(chosen, np.float32(0), scene.gaussians.opacities))
+    valid = scene.valid & ~chosen.reshape(scene.valid.shape)
+    return replace(given, scene=replace(scene, gaussians=gaussians, pixel_ids=grid_ids(valid)))
+
+
+def throw_away(given: StressScene) -> StressScene:
+    """Move a few Gaussians a thousand times as far away."""
+    scene = given.scene
+    chosen = _choose(len(scene.gaussians), FAR_SHARE)[:, None]
+    means = np.where(chosen, 1000 * scene.gaussians.means, scene.gaussians.means)
+    return replace(given, scene=replace(scene, gaussians=replace(scene.gaussians, means=means)))
+
+
+def enlarge(given: StressScene) -> StressScene:
+    """Make some Gaussians many times as large."""
+    gaussians = given.scene.gaussians
+    chosen = _choose(len(gaussians), LARGE_SHARE)[:, None]
+    scales = np.where(chosen, LARGE_FACTOR * gaussians.scales, gaussians.scales)
+    return replace(given, scene=replace(given.scene, gaussians=replace(gaussians, scales=scales)))
+
+
+def _choose(count: int, share: float) -> np.ndarray:
+    """Mark a random share of the rows, ``[count]`` bool, at least one."""
+    chosen = np.zeros(count, bool)
+    chosen[np.random.default_rng(SEED).choice(count, max(1, round(share * count)), replace=False)] = True
+    return chosen
+
+
+@dataclass(frozen=True)
+class Case:
+    """One bad condition."""
+
+    name: str  # on the command line
+    words: str  # the change in words
+    check: Check  # which property must hold, see ``PROPERTIES``
+    # "pixels": one Gaussian per pixel; "photos": that and photos; "file": a scene with cameras in a file; "pixel-file":
+    # that and one Gaussian per pixel
+    needs: Needs = "anything"
+    # returns the changed scene; None: the scene stays, the run differs
+    change: Callable[[StressScene], StressScene] | None = None
+    threads: int | None = None  # threads of the run; None: as in the options
+    convention: tuple[str, str] | None = None  # pose convention to write, in the terms of camera files
+    cameras: Callable[[np.ndarray], np.ndarray] | None = None  # changes the viewmats of the camera file alone
+
+
+def _rewrite_poses(direction: str, axes: str) -> Case:
+    """Make a case of poses in another convention, such as "c2w-opencv" of "camera-to-world" and "OpenCV"."""
+    name = direction[0] + "2" + direction.split("-")[2][0] + "-" + axes.lower()
+    return Case(name, f"poses written {direction}, {axes} axes", "convention", "file", convention=(direction, axes))
+
+
+CASES: dict[str, Case] = {
+    case.name: case
+    for case in (
+        Case("unchanged", "the scene as it is", "better"),
+        Case("views-half", "half of the views", "better", "pixels",
+             partial(keep_views, choose=lambda num: even_views(num, max(1, num // 2)))),
+        Case("views-3", "three views", "better", "pixels",
+             partial(keep_views, choose=lambda num: even_views(num, min(3, num)))),
+        Case("views-1", "one view", "better", "pixels", partial(keep_views, choose=lambda num: even_views(num, 1))),
+        Case("order", "views in another order", "same", "pixels",
+             partial(keep_views, choose=lambda num: np.random.default_rng(SEED).permutation(num).tolist())),
+        Case("twice", "every view twice", "once", "pixels",
+             partial(keep_views, choose=lambda num: [*range(num)] * 2)),
+        Case("poses-0.2", "poses 0.2 degrees off", "better", "photos", partial(perturb_poses, degrees=0.2)),
+        Case("poses-1", "poses 1 degree off", "better", "photos", partial(perturb_poses, degrees=1.0)),
+        Case("poses-5", "poses 5 degrees off", "better", "photos", partial(perturb_poses, degrees=5.0)),
+        Case("view-moved", "one view 2 % of the depth aside", "near", "photos", partial(move_view, share=0.02)),
+        Case("cameras-0.5", "cameras 0.5 degrees off, not their Gaussians", "moved", "pixel-file",
+             cameras=partial(turn_cameras, degrees=0.5, views=slice(None))),
+        Case("camera-far", "one camera 15 degrees off", "refused", "pixel-file",
+             cameras=partial(turn_cameras, degrees=15.0, views=slice(1))),
+        Case("exposure", "exposure +-20 % by turns", "better", "photos", partial(change_exposure, share=0.2)),
+        Case("utm", "moved to map coordinates", "same", "anything", partial(move, factor=1.0, shift=UTM)),
+        Case("small", "scaled by 1e-4", "same", "anything", partial(move, factor=1e-4, shift=(0, 0, 0))),
+        Case("large", "scaled by 1e4", "same", "anything", partial(move, factor=1e4, shift=(0, 0, 0))),
+        Case("broken", "1 % of the rows not finite", "near", "anything", break_rows),
+        Case("flyaways", "0.0025 % of the Gaussians far away", "near", "anything", throw_away),
+        Case("oversized", "1 % of the Gaussians 8 times as large", "near", "anything", enlarge),
+        Case("threads", "one thread", "bits", threads=1),
+        Case("again", "the result compacted once more", "again"),
+        *(_rewrite_poses(*convention) for convention in CONVENTIONS),
+    )
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class StressOutcome:
+    """Outcome of one case."""
+
+    case: str  # its name
+    change: str  # how the scene was changed, in words
+    expected: str  # the property that must hold
+    passed: bool | None  # whether it does; None where the case does not apply to the scene
+    measured: str  # the figures, or why the case does not apply
+    seconds: float  # wall time
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the outcome under the keys of the report."""
+        keys = ("case", "words", "wanted", "held", "found", "seconds")
+        return dict(zip(keys, vars(self).values(), strict=True))
+
+
+@dataclass(frozen=True)
+class _Result:
+    """A compact result with its figures."""
+
+    gaussians: Gaussians
+    before: float
+    after: float
+
+
+def stress(
+    load: Loaded,
+    options: CompactOptions | None = None,
+    *,
+    targets: Views | None = None,
+    cases: Sequence[str] | None = None,
+    hints: ReadHints = AUTO,
+    progress: Progress | None = None,
+) -> tuple[StressOutcome, ...]:
+    """Compact a scene under bad conditions: all ``CASES``, or those with some names.
+
+    Results are compared on held-out views (``targets``), or on the input views with their photos, or with renders of
+    the input where there are none. ``hints`` are those that the scene was read with; ``progress`` is called with (case,
+    done, total).
+
+    Raises:
+        UsageError: If a case is unknown, or the scene has no views.
+    """
+    names = list(CASES if cases is None else cases)
+    unknown = next((name for name in names if name not in CASES), None)
+    if unknown is not None:
+        raise UsageError(f"cases: expected some of {', '.join(CASES)}, got {unknown!r}")
+    if len(load.scene) == 0:
+        raise UsageError("expected a scene with views, got none")
+    options = options or CompactOptions()
+    report, slack = progress or (lambda *_: None), _slack(options)
+    limits = {"same": MAX_SAME + slack, "near": MAX_NEAR + slack, "worse": MAX_WORSE}
+    given = StressScene(load.scene, targets)
+    base = _run(given, options) if any(CASES[name].needs not in ("file", "pixel-file") for name in names) else None
+    out = []
+    for i, name in enumerate(names):
+        case, start = CASES[name], time.perf_counter()
+        report(case.words, i, len(names))
+        passed, measured = _check_case(case, load, given, base, options, hints)
+        seconds, expected = time.perf_counter() - start, PROPERTIES[case.check].format(**limits)
+        out.append(StressOutcome(name, case.words, expected, passed, measured, seconds))
+    report("done", len(names), len(names))
+    return tuple(out)
+
+
+def _check_case(
+    case: Case, load: Loaded, given: StressScene, base: _Result | None, options: CompactOptions, hints: ReadHints
+) -> tuple[bool | None, str]:
+    """Check whether the case's property holds, and return that with the figures."""
+    problem = _inapplicable(case, load)
+    if problem is not None:
+        return None, problem
+    if case.check == "convention":
+        return _check_convention(case, load, hints)
+    if case.cameras is not None:
+        return _check_cameras(case, load, hints)
+    assert base is not None
+    try:
+        if case.check == "again":
+            return _check_again(given, base, options)
+        changed = given if case.change is None else case.change(given)
+        settings = options if case.threads is None else replace(options, threads=case.threads)
+        result = base if case.name == "unchanged" else _run(changed, settings)
+    except (GsmergeError, ValueError) as error:  # a case that fails must not end the others
+        return False, f"ended with: {error}"
+    defect = _find_defect(result.gaussians, changed.scene)
+    return (False, defect) if defect else _check_result(case, base, result, _slack(options))
+
+
+def _inapplicable(case: Case, load: Loaded) -> str | None:
+    """Say why a case does not apply to a scene; None where it does."""
+    scene = load.scene
+    if case.needs in ("pixels", "photos", "pixel-file") and not scene.aligned:
+        return "needs a Gaussian for each pixel"
+    if case.needs == "photos" and scene.images is None:
+        return "needs photos"
+    if case.needs in ("file", "pixel-file"):
+        if load.cameras is None:
+            return "needs cameras from a file"
+        if case.convention == load.cameras.convention:
+            return "is how the cameras' format has them"
+    return None
+
+
+def _run(given: StressScene, options: CompactOptions) -> _Result:
+    result = compact(given.scene, options)
+    return _Result(result.gaussians, *_quality(given, result.gaussians))
+
+
+def _quality(given: StressScene, gaussians: Gaussians) -> tuple[float, float]:
+    """Measure the PSNR (dB) of the input and of a result on the views; infinite for an input that is the reference."""
+    evaluation = evaluate(given.scene, {"result": gaussians}, given.views, replace(_QUICK, context=given.views is None))
+    split = "context" if given.views is None else "target"
+    before, after = (one.mean(split)[1].psnr for one in evaluation.results)
+    return (math.inf if before is None else before), (math.nan if after is None else after)
+
+
+def _slack(options: CompactOptions) -> float:
+    return FIT_SLACK if options.fit.fit == "full" else 0.0
+
+
+def _check_result(case: Case, base: _Result, result: _Result, slack: float) -> tuple[bool, str]:
+    count, former = len(result.gaussians), len(base.gaussians)
+    figures = f"{count:,} Gaussians, {result.after:.2f} dB"
+    both = f"{figures}; unchanged {former:,}, {base.after:.2f} dB"
+    if case.check == "better":
+        if math.isinf(result.before):
+            return True, f"{figures} against renders of the input"
+        return result.after >= result.before - MAX_WORSE, f"{figures}; its input {result.before:.2f} dB"
+    if case.check == "bits":
+        same = all(np.array_equal(getattr(base.gaussians, n), getattr(result.gaussians, n)) for n in _FIELDS)
+        return same, "equal" if same else f"differs: {both}"
+    if case.check == "near":
+        return result.after >= base.after - MAX_NEAR - slack, both
+    near = result.after >= base.after - MAX_SAME - slack
+    if case.check == "once":
+        return near and count <= ONCE_COUNT * former, both
+    return near and abs(count - former) <= max(1, SAME_COUNT * former), both
+
+
+def _check_again(given: StressScene, base: _Result, options: CompactOptions) -> tuple[bool, str]:
+    """Compact the result as a scene of its own to as many Gaussians as it has."""
+    scene = given.scene
+    unaligned = Scene(base.gaussians, scene.cameras, scene.images, None, scene.names)
+    once = replace(options, budget=BudgetOptions(budget=len(base.gaussians)), decode=replace(options.decode, k=1))
+    after = _quality(given, compact(unaligned, once).gaussians)[1]
+    return after >= base.after - MAX_SAME - _slack(options), f"{after:.2f} dB; before {base.after:.2f} dB"
+
+
+def _check_convention(case: Case, load: Loaded, hints: ReadHints) -> tuple[bool, str]:
+    """Read the scene from cameras whose poses are in another convention than that of their format."""
+    assert load.cameras is not None
+    assert case.convention is not None
+    stored = from_viewmats(load.cameras.viewmats, case.convention)
+    wrong = replace(load.cameras, viewmats=to_viewmats(stored, load.cameras.convention))
+    try:
+        read = _read_again(load, wrong, hints).scene
+    except SceneError as error:
+        return True, f"refused: {error.problem}"
+    expected, viewmats = load.scene.cameras.viewmats, read.cameras.viewmats
+    tolerance = 1e-3 * (1 + np.abs(expected).max())
+    same = expected.shape == viewmats.shape and np.allclose(expected, viewmats, atol=tolerance)
+    return bool(same), "recognised" if same else "taken for something else"
+
+
+def _check_cameras(case: Case, load: Loaded, hints: ReadHints) -> tuple[bool, str]:
+    """Read the scene from cameras that are off, with Gaussians that are not."""
+    assert load.cameras is not None
+    assert case.cameras is not None
+    wrong = replace(load.cameras, viewmats=case.cameras(load.cameras.viewmats))
+    try:
+        read = _read_again(load, wrong, hints)
+    except SceneError as error:
+        return case.check == "refused", f"refused: {error.problem}"
+    if read.alignment is None:
+        return False, "taken for an unaligned scene"
+    return case.check == "moved" and read.alignment.ok, f"{read.alignment.worst_px:.2f} px from the pixels"
+
+
+def _read_again(load: Loaded, cameras: CameraFile, hints: ReadHints) -> Loaded:
+    """Read the scene's own file with other cameras."""
+    opacity: OpacityChoice = "raw" if load.info.opacity_encoding == "raw" else "logit"
+    return align_scene(read_rows(load.files, opacity=opacity, hints=hints), load.files, cameras, hints=hints)
+
+
+def _find_defect(gaussians: Gaussians, scene: Scene) -> str | None:
+    """Say what is wrong with a result for any scene; None where nothing is."""
+    for name in _FIELDS:
+        if not np.isfinite(getattr(gaussians, name)).all():
+            return f"{name} are not finite"
+    if not 1 <= len(gaussians) <= scene.num_gaussians:
+        return f"{len(gaussians)} Gaussians of {scene.num_gaussians}"
+    if not ((gaussians.opacities > 0) & (gaussians.opacities < 1)).all():
+        return "opacities outside of 0 to 1"
+    if not (gaussians.scales > 0).all():
+        return "scales that are not positive"
+    lengths = np.linalg.norm(gaussians.quats, axis=1)
+    return None if np.abs(lengths - 1).max() < 1e-4 else "quaternions that are no unit quaternions"

@@ -1,0 +1,162 @@
+"""The automatic checks, and what the front page and the templates of issues say of them."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer.main
+from scripts import load_script
+
+from gsmerge import __version__
+from gsmerge.cli.app import app
+from gsmerge.kernels.build import find_platform
+
+ROOT = Path(__file__).parents[2]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+PROJECT = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+SHELL = ("/bin/bash", "-euo", "pipefail", "-c")
+
+pytestmark = pytest.mark.skipif(not Path(SHELL[0]).exists(), reason="needs bash")
+
+
+def find_block(words: str, **page: Path) -> str:
+    block: str = load_script(ROOT / "tools" / "readme_block.py").find_block(words, **page)
+    return block
+
+
+def write_program(path: Path, lines: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f"#!/bin/bash\n{lines}\n", encoding="utf-8")
+    path.chmod(0o755)
+
+
+def run_block(block: str, folder: Path, failing: str = "none") -> list[str]:
+    """Run a block with programs that only write down how they were called; one of them fails."""
+    note = f'echo "{{}} $*" >> "{folder}/calls"; [ {{}} != {failing} ]'
+    write_program(folder / "bin" / "python3", note.replace("{}", "python3"))
+    for name in ("pip", "python", "gsmerge"):
+        write_program(folder / ".venv" / "bin" / name, note.replace("{}", name))
+    env = {"PATH": f"{folder}/bin:{os.environ['PATH']}"}
+    code = subprocess.run([*SHELL, block], cwd=folder, env=env, check=False).returncode
+    assert (code == 0) == (failing == "none")
+    return (folder / "calls").read_text(encoding="utf-8").splitlines()
+
+
+def test_the_commands_that_test_run_as_a_whole(tmp_path: Path) -> None:
+    made, installed, tested = run_block(find_block("-m pytest"), tmp_path)
+    assert made == "python3 -m venv .venv"
+    assert installed == "pip install -q -c constraints.txt -e .[test]"
+    assert tested == "python -m pytest"
+
+
+def test_the_commands_that_test_stop_where_one_fails(tmp_path: Path) -> None:
+    assert run_block(find_block("-m pytest"), tmp_path, failing="pip")[-1].startswith("pip install")
+
+
+def test_the_main_job_runs_as_a_whole(tmp_path: Path) -> None:
+    calls = [call.split()[:2] for call in run_block(find_block("examples/01_make_scene.py"), tmp_path)]
+    install, make = ["pip", "install"], ["python", "examples/01_make_scene.py"]
+    assert calls == [["python3", "-m"], install, make, ["gsmerge", "compact"], ["gsmerge", "render"]]
+
+
+def test_blocks_are_found_by_their_words(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("```bash\none \\\n  -m two\n```\n\n```bash\nthree\nfour\n```\n")
+    assert find_block("-m two", page=page) == "one \\\n  -m two\n"
+    assert find_block("four", page=page) == "three\nfour\n"
+    for words, count in (("five", 0), ("o", 2)):
+        with pytest.raises(ValueError, match=f"found {count}$"):
+            find_block(words, page=page)
+
+
+def test_ci_runs_that_block() -> None:
+    script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+    assert 'commands=$(python3 tools/readme_block.py "-m pytest")' in script
+    assert 'bash -euo pipefail -c "$commands"' in script
+    assert "run: .ci/run" in (ROOT / ".github" / "workflows" / "ci.yml").read_text(encoding="utf-8")
+
+
+CHROMIUM = {
+    "there already": ({"chromium": "", "apt-get": "exit 1"}, "", ""),
+    "no apt-get": ({}, "no Chromium, and no apt-get to install one", ""),
+    "no rights": ({"id": "echo 1000", "sudo": "exit 1", "apt-get": ""}, "neither root nor sudo", ""),
+    "no network": ({"id": "echo 0", "apt-get": "exit 100"}, "apt-get could not install one", ""),
+    "root": ({"id": "echo 0", "apt-get": "{install}"}, "+ apt-get install chromium\n", "{bin}/chromium"),
+    "sudo": ({"id": "echo 1000", "sudo": 'shift; "$@"', "apt-get": "{install}"}, "+ apt-get", "{bin}/chromium"),
+}
+
+
+@pytest.mark.parametrize("case", CHROMIUM)
+def test_a_browser_is_installed_where_that_is_allowed(case: str, tmp_path: Path) -> None:
+    programs, said, made = CHROMIUM[case]
+    folder = tmp_path / "bin"
+    install = f'[[ "$*" != *install* ]] || {{ echo > "{folder}/chromium"; /bin/chmod +x "{folder}/chromium"; }}'
+    write_program(folder / "env", 'export "$1"; shift; "$@"')
+    for name, lines in programs.items():
+        write_program(folder / name, lines.replace("{install}", install) or "true")
+    command = [SHELL[0], str(ROOT / ".ci" / "chromium")]
+    done = subprocess.run(command, env={"PATH": str(folder)}, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert said in done.stdout
+    assert done.stdout.count("no Chromium") == done.stdout.count("will be skipped\n") <= 1
+    assert not made or Path(made.format(bin=folder)).exists()
+
+
+def test_badges_say_what_the_project_says() -> None:
+    badges = dict(re.findall(r"^\[!\[([^\]]+)\]\(\S+\)\]\((\S+)\)$", README, re.MULTILINE))
+    first, end = re.findall(r'^requires-python = ">=3\.(\d+),<3\.(\d+)"$', PROJECT, re.MULTILINE)[0]
+    (name,) = re.findall(r'^license = "(.+)"$', PROJECT, re.MULTILINE)
+    assert list(badges) == ["CI", f"License: {name}", f"Python 3.{first} to 3.{int(end) - 1}"]
+    assert (ROOT / badges["CI"].replace("../../actions", ".github")).exists()
+    assert f"license-{name.replace('-', '--')}-" in README
+    assert f"python-3.{first}%20to%203.{int(end) - 1}-" in README
+
+
+def test_every_version_of_python_at_the_ends_is_tested() -> None:
+    text = (ROOT / ".github" / "workflows" / "ci.yml").read_text(encoding="utf-8")
+    first, end = re.findall(r'^requires-python = ">=3\.(\d+),<3\.(\d+)"$', PROJECT, re.MULTILINE)[0]
+    assert {f"3.{first}", f"3.{int(end) - 1}"} <= set(re.findall(r'python: "([\d.]+)"', text))
+
+
+@pytest.mark.parametrize(
+    "form", sorted((ROOT / ".github" / "ISSUE_TEMPLATE").glob("[!c]*.yml")), ids=lambda path: path.stem
+)
+def test_templates_ask_for_calls_that_are_there(form: Path) -> None:
+    calls = re.findall(r"`gsmerge ([^`]+)`", form.read_text(encoding="utf-8"))
+    assert calls
+    for call in calls:
+        name, *arguments = shlex.split(call)
+        if name not in ("--version", "--debug"):
+            COMMANDS[name].make_context(name, arguments)  # raises where an argument is wrong
+
+
+def test_the_version_is_released_with_notes() -> None:
+    sections = re.findall(r"^## (.+)$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert re.fullmatch(rf"{re.escape(__version__)} \(\d{{4}}-\d\d-\d\d\)", sections[1])
+    assert f"\nversion: {__version__}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert (ROOT / "docs" / "releases" / f"{__version__}.md").exists()
+
+
+def test_wheels_are_built_for_the_platforms_that_the_notes_name_and_tried_there() -> None:
+    text = (ROOT / ".github" / "workflows" / "wheels.yml").read_text(encoding="utf-8")
+    platforms = re.findall(r"for platform in (.+); do", text)[0].split()
+    assert len({find_platform(tag) for tag in platforms}) == len(platforms) == 4
+    assert sorted(re.findall(r'file: "\*-(\w+)\.whl"', text)) == sorted(platforms)
+    notes = (ROOT / "docs" / "releases" / f"{__version__}.md").read_text(encoding="utf-8")
+    assert re.findall(r"^\| `(\w+)\.whl`", notes, re.MULTILINE) == platforms
+
+
+@pytest.mark.parametrize(("tag", "code"), [(f"v{__version__}", 0), (__version__, 1), (f"v{__version__}.1", 1)])
+def test_a_tag_that_is_not_the_version_stops_the_wheels(tag: str, code: int) -> None:
+    text = (ROOT / ".github" / "workflows" / "wheels.yml").read_text(encoding="utf-8")
+    (step,) = re.findall(r"^ {10}version=\$.+?(?=^ {6}- )", text, re.DOTALL | re.MULTILINE)
+    env = {**os.environ, "GITHUB_REF_NAME": tag}
+    done = subprocess.run([*SHELL, step], cwd=ROOT, env=env, capture_output=True, check=False)
+    assert done.returncode == code

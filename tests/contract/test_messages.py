@@ -1,0 +1,24 @@
+"""The helpers of ``messages.py`` let no other kind, place or value pass."""
+
+from __future__ import annotations
+
+import pytest
+from messages import names, refuses, says
+
+
+@pytest.mark.parametrize(("text", "value"), [("got 15", 5), ("got 5.1", 5), ("got -5", 5), ("k_low", "k"), ("a", "b")])
+def test_values_are_whole_words(text: str, value: object) -> None:
+    assert not names(text, value)
+    assert names(f"{text}, got {value}; more", value)
+
+
+def test_places_are_whole() -> None:
+    text = "/b/a/scene.ply: got 5"
+    assert not any(says(text, place, 5) for place in ("scene.pl", "ply", "other.ply", "scene.ply: rows"))
+    assert all(says(text, place, 5) for place in ("scene.ply", "a/scene.ply", "/b/a/scene.ply", ""))
+
+
+@pytest.mark.parametrize(("kind", "place", "value"), [(KeyError, "k", 9), (ValueError, "kk", 9), (ValueError, "k", 7)])
+def test_what_differs_is_refused(kind: type[Exception], place: str, value: int) -> None:
+    with pytest.raises((AssertionError, ValueError)), refuses(kind, place, value):
+        raise ValueError("k: expected 1 to 8, got 9")

@@ -1,0 +1,49 @@
+"""Installs a wheel or source archive in a fresh environment and does the README's main job with it.
+
+python tools/smoke_test.py dist/gsmerge-0.1.0-py3-none-manylinux_2_17_x86_64.whl -c constraints.txt
+
+Arguments after the file are passed to pip install.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from readme_block import find_block
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ("scene.ply", "scene.compact.ply", "preview.png")  # of the main job, in demo/
+
+
+def main(archive: Path, options: list[str]) -> None:
+    """Install, compare the version with the file's name, and run all of the README's block but its installation."""
+    env = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    with TemporaryDirectory() as folder:
+        work, bin_folder = Path(folder), Path(folder, ".venv", "bin")
+        subprocess.run([sys.executable, "-m", "venv", str(work / ".venv")], env=env, check=True)
+        install = [str(bin_folder / "python"), "-m", "pip", "install", "-q", *options, str(archive)]
+        subprocess.run(install, env=env, check=True)
+        shutil.copytree(ROOT / "examples", work / "examples")
+
+        version = subprocess.check_output([str(bin_folder / "gsmerge"), "--version"], cwd=work, env=env, text=True)
+        print(version, end="", flush=True)
+        expected = archive.name.removesuffix(".tar.gz").split("-")[1]
+        if version.split() != ["gsmerge", expected]:
+            sys.exit(f"expected version {expected}, as in {archive.name}, found {version.strip()!r}")
+
+        lines = find_block("examples/01_make_scene.py").splitlines()
+        job = "\n".join(line for line in lines if "pip install" not in line)
+        subprocess.run(["bash", "-euxo", "pipefail", "-c", job], cwd=work, env=env, check=True)
+        missing = [name for name in RESULTS if not (work / "demo" / name).exists()]
+        if missing:
+            sys.exit(f"the README's main job left no {', '.join(missing)} in demo/")
+    print(f"{archive.name}: installed, and the README's main job is done")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]).resolve(), sys.argv[2:])
