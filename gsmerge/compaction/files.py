@@ -188,7 +188,5 @@ def _compact_notes(loaded: Loaded) -> tuple[str, ...]:
 
 def level_output(output: Path, level: int) -> Path:
     """Return the path of a further level of detail, counted from 1: ``out.ply`` -> ``out.level1.ply``."""
-    compressed = output.name.lower().endswith(".compressed.ply")
-    length = len(".compressed.ply" if compressed else output.suffix)
-    cut = len(output.name) - length
+    cut = len(output.name) - len(output_format(output).ending)
     return output.with_name(f"{output.name[:cut]}.level{level}{output.name[cut:]}")

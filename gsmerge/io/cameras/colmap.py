@@ -15,7 +15,7 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry import rotation_entries
 from gsmerge.io.bounds import MAX_MODEL_BYTES, MAX_VIEWS, check_file, read_text
 from gsmerge.io.cameras.camera_file import View, make_lens, make_pinhole
-from gsmerge.io.cameras.camera_format import StoredCameras
+from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
 
 # model: (id, name, number of parameters); the first focal lengths and principal point, then the distortion
 _MODELS = (
@@ -47,8 +47,9 @@ def holds_model(folder: Path, suffix: str) -> bool:
     return (folder / f"cameras{suffix}").is_file() and (folder / f"images{suffix}").is_file()
 
 
-def read_colmap(folder: Path, suffix: str) -> StoredCameras:
+def read_colmap(source: CameraSource, suffix: str) -> StoredCameras:
     """Read the cameras of a COLMAP model in the order of its images; SceneError if it is damaged or unknown."""
+    folder = source.path
     camera_path, image_path = folder / f"cameras{suffix}", folder / f"images{suffix}"
     try:
         if suffix == ".bin":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -157,55 +158,34 @@ _SHARP = CameraFormat(
 )  # fmt: skip
 # In the order of trial: the first of a file's ending that recognises it
 CAMERA_FORMATS = (
-    CameraFormat(
-        "COLMAP binary", "COLMAP: `cameras.bin` and `images.bin`", "", lambda file: read_colmap(file.path, ".bin"),
-        W2C_OPENCV, "pixels; lenses", lambda file: holds_model(file.path, ".bin"),
-    ),
-    CameraFormat(
-        "COLMAP text", "COLMAP: `cameras.txt` and `images.txt`", "", lambda file: read_colmap(file.path, ".txt"),
-        W2C_OPENCV, "pixels; lenses",
-    ),
-    CameraFormat(
-        "pose list", "text with one pose of 12 or 16 numbers a line", ".txt", _read_poses, C2W_OPENCV,
-        "pixels, in `intrinsic.txt` beside it; may be missing",
-    ),
+    CameraFormat("COLMAP binary", "COLMAP: `cameras.bin` and `images.bin`", "", partial(read_colmap, suffix=".bin"),
+                 W2C_OPENCV, "pixels; lenses", lambda file: holds_model(file.path, ".bin")),
+    CameraFormat("COLMAP text", "COLMAP: `cameras.txt` and `images.txt`", "", partial(read_colmap, suffix=".txt"),
+                 W2C_OPENCV, "pixels; lenses"),
+    CameraFormat("pose list", "text with one pose of 12 or 16 numbers a line", ".txt", _read_poses,
+                 C2W_OPENCV, "pixels, in `intrinsic.txt` beside it; may be missing"),
     CameraFormat("Long-LRM", "dataset file of Long-LRM", ".json", read_long_lrm, W2C_OPENCV, "pixels", is_long_lrm),
-    CameraFormat(
-        "transforms.json", "`transforms.json` of nerfstudio and instant-ngp", ".json", read_transforms, C2W_OPENGL,
-        "pixels or field of view; may be missing; lenses", lambda file: "frames" in file.object,
-    ),
-    CameraFormat(
-        "frame list", "list of frames with `transform_matrix`", ".json", read_transforms, C2W_OPENCV,
-        "pixels or field of view; may be missing; lenses", lambda file: "transform_matrix" in file.first,
-    ),
-    CameraFormat(
-        "INRIA cameras.json", "`cameras.json` of INRIA", ".json", read_inria, C2W_OPENCV,
-        "pixels; principal point in the middle", lambda file: "position" in file.first or "rotation" in file.first,
-    ),
-    CameraFormat(
-        "camera_params.json", "`camera_params.json` of WorldMirror", ".json", read_world_mirror, C2W_OPENCV, "pixels",
-        lambda file: {"extrinsics", "intrinsics"} <= file.object.keys(),
-    ),
-    CameraFormat(
-        "dump of a model", "`views.npz` ([below](#models-that-save-no-cameras))", ".npz", read_dump, C2W_OPENCV,
-        "pixels, or divided by the size; may be missing", lambda file: "c2w" in array_names(file.path),
-    ),
-    CameraFormat(
-        "DA3 npz", "`results.npz` of Depth Anything 3", ".npz", read_da3, W2C_OPENCV,
-        "pixels, or divided by the size; may be missing", lambda file: is_da3(file.path),
-    ),
-    CameraFormat(
-        "npz of poses", "`.npz` of what VGGT or AnySplat (camera-to-world) returns", ".npz", read_da3, W2C_OPENCV,
-        "pixels; of AnySplat divided by the size; may be missing",
-    ),
-    CameraFormat(
-        "re10k chunk", "`.torch` chunk of re10k, the scene named like the `.ply`", CHUNK, read_re10k, W2C_OPENCV,
-        "divided by the size",
-    ),
-    CameraFormat(
-        EMBEDDED, "inside a `.ply` of gsmerge ([below](#cameras-for-viewers))", ".ply", read_embedded, C2W_OPENGL,
-        "pixels", lambda file: bool(camera_lines(file.path)),
-    ),
+    CameraFormat("transforms.json", "`transforms.json` of nerfstudio and instant-ngp", ".json", read_transforms,
+                 C2W_OPENGL, "pixels or field of view; may be missing; lenses", lambda file: "frames" in file.object),
+    CameraFormat("frame list", "list of frames with `transform_matrix`", ".json", read_transforms,
+                 C2W_OPENCV, "pixels or field of view; may be missing; lenses",
+                 lambda file: "transform_matrix" in file.first),
+    CameraFormat("INRIA cameras.json", "`cameras.json` of INRIA", ".json", read_inria,
+                 C2W_OPENCV, "pixels; principal point in the middle",
+                 lambda file: "position" in file.first or "rotation" in file.first),
+    CameraFormat("camera_params.json", "`camera_params.json` of WorldMirror", ".json", read_world_mirror,
+                 C2W_OPENCV, "pixels", lambda file: {"extrinsics", "intrinsics"} <= file.object.keys()),
+    CameraFormat("dump of a model", "`views.npz` ([below](#models-that-save-no-cameras))", ".npz", read_dump,
+                 C2W_OPENCV, "pixels, or divided by the size; may be missing",
+                 lambda file: "c2w" in array_names(file.path)),
+    CameraFormat("DA3 npz", "`results.npz` of Depth Anything 3", ".npz", read_da3,
+                 W2C_OPENCV, "pixels, or divided by the size; may be missing", lambda file: is_da3(file.path)),
+    CameraFormat("npz of poses", "`.npz` of what VGGT or AnySplat (camera-to-world) returns", ".npz", read_da3,
+                 W2C_OPENCV, "pixels; of AnySplat divided by the size; may be missing"),
+    CameraFormat("re10k chunk", "`.torch` chunk of re10k, the scene named like the `.ply`", CHUNK, read_re10k,
+                 W2C_OPENCV, "divided by the size"),
+    CameraFormat(EMBEDDED, "inside a `.ply` of gsmerge ([below](#cameras-for-viewers))", ".ply", read_embedded,
+                 C2W_OPENGL, "pixels", lambda file: bool(camera_lines(file.path))),
     _SHARP,
 )  # fmt: skip
 CAMERA_ENDINGS = tuple(dict.fromkeys(row.ending for row in CAMERA_FORMATS if row.ending not in ("", ".ply")))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -22,8 +23,8 @@ _FLOAT, _BYTE, _VERTICES, _POINTS = 5126, 5121, 34962, 0  # numbers of glTF
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
-def glb_bytes(gaussians: Gaussians) -> bytes:
-    """Encode a ``.glb`` file; ValueError if there is NaN or inf."""
+def glb_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
+    """Encode a ``.glb`` file, without comments; ValueError if there is NaN or inf."""
     columns = to_columns(gaussians, MAX_DEGREE)
     values = {
         "POSITION": columns.means,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import threading
 import warnings
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -263,13 +264,9 @@ def _truncated(path: Path, promise: str, num_whole: int, reason: str) -> SceneEr
 
 
 def ply_blocks(
-    gaussians: Gaussians, comments: Sequence[str] = (), *, degree: int | None = None, normals: bool = True
+    gaussians: Gaussians, degree: int, comments: Sequence[str], *, normals: bool
 ) -> Iterator[bytes | memoryview]:
-    """Yield the header and blocks of rows of a PLY file; ValueError if there is NaN or inf.
-
-    ``degree`` of the harmonics; None: all. ``normals``: with three columns of zeros.
-    """
-    degree = gaussians.sh_degree if degree is None else degree
+    """Yield the header and blocks of rows of a PLY file with harmonics up to ``degree``; ValueError for NaN or inf."""
     header, num_columns = _header(len(gaussians), degree, comments, normals=normals)
     yield header
     block = max(1, BLOCK_BYTES // (4 * num_columns))
@@ -320,7 +317,4 @@ def count_for_bytes(max_bytes: int, sh_degree: int) -> int:
     least = file_bytes(1, sh_degree)
     if max_bytes < least:
         raise UsageError(f"budget: expected at least {least} bytes for one Gaussian, got {max_bytes}")
-    count = (max_bytes - file_bytes(0, sh_degree)) // (file_bytes(2, sh_degree) - least)
-    while file_bytes(count, sh_degree) > max_bytes:  # the header contains the count itself
-        count -= 1
-    return count
+    return bisect_right(range(max_bytes), max_bytes, key=lambda count: file_bytes(count, sh_degree)) - 1

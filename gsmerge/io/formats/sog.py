@@ -14,7 +14,7 @@ import math
 import os
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -234,12 +234,12 @@ def _read_harmonics(files: _Files, part: dict[str, Any], count: int) -> np.ndarr
     return _decode_values(part, centroids.reshape(-1, num_higher, 3)[labels])
 
 
-def sog_bytes(gaussians: Gaussians, *, mip: bool = False) -> bytes:
-    """Encode a ``.sog`` along a space-filling curve; ``mip`` marks antialiased Gaussians, NaN is a ValueError."""
+def sog_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
+    """Encode a ``.sog`` along a space-filling curve, marked as the ``comments`` say; ValueError if there is NaN."""
     columns = arrays.to_columns(gaussians, MAX_DEGREE).along_curve()
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
-        for name, data in sog_files(columns, mip=mip).items():
+        for name, data in sog_files(columns, mip=arrays.MIP_COMMENT in comments).items():
             archive.writestr(zipfile.ZipInfo(name), data)  # of 1980: the same bytes at any time
     return content.getvalue()
 

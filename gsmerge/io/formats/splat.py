@@ -5,6 +5,7 @@ Quaternions wxyz are bytes 128 + 128 q; there is no room for harmonics above deg
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +21,8 @@ MAX_DEGREE = 0
 ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colors", "u1", 4), ("quats", "u1", 4)])
 
 
-def splat_bytes(gaussians: Gaussians) -> bytes:
-    """Encode a ``.splat`` file; ValueError if there is NaN or inf."""
+def splat_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
+    """Encode a ``.splat`` file, which has no comments; ValueError if there is NaN or inf."""
     columns = to_columns(gaussians, MAX_DEGREE)
     rows = np.empty(len(columns), ROW)
     rows["means"], rows["scales"] = columns.means, exp(columns.log_scales)

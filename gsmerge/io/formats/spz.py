@@ -251,15 +251,15 @@ def spz_columns(gaussians: Gaussians, max_degree: int, *, mip: bool = False, fin
     return SpzColumns(len(columns), degree, fraction, mip, parts)
 
 
-def spz_bytes(gaussians: Gaussians, *, mip: bool = False, version: int = 3) -> bytes:
-    """Encode a ``.spz`` file; ``mip`` sets the flag of antialiased Gaussians.
+def spz_bytes(gaussians: Gaussians, comments: Sequence[str] = (), *, version: int = 3) -> bytes:
+    """Encode a ``.spz`` file, of which one of the ``comments`` may say that the Gaussians are antialiased.
 
     ValueError if there is NaN or inf, or the version is not 3 or 4; UsageError if ``zstandard`` is missing for
     version 4.
     """
     if version not in VERSIONS:
         raise ValueError(f"spz_version: expected 3 or 4, got {version}")
-    columns = spz_columns(gaussians, MAX_DEGREES[version], mip=mip)
+    columns = spz_columns(gaussians, MAX_DEGREES[version], mip=arrays.MIP_COMMENT in comments)
     if version == 3:
         return gzip.compress(columns.header(3) + b"".join(columns.streams), mtime=0)  # the same bytes at any time
     compressor = zstandard().ZstdCompressor(level=ZSTD_LEVEL)

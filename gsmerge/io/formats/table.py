@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from gsmerge.errors import UsageError
 from gsmerge.io.formats import compressed, glb, ply, sog, splat, spz, streamed
-from gsmerge.io.formats.arrays import MIP_COMMENT, StoredRows
+from gsmerge.io.formats.arrays import StoredRows
 from gsmerge.types import Gaussians, StrPath
-
-# What encodes Gaussians with lines for the header and, where there are such, columns of normals, as parts of a file
-Encode = Callable[[Gaussians, Sequence[str], bool], Iterable[bytes | memoryview]]
 
 
 @dataclass(frozen=True)
@@ -21,7 +19,8 @@ class Format:
 
     ending: str  # of files' names, in lower case; without a dot, the whole name of an index
     read: Callable[[Path], StoredRows] | None  # None: it is only written
-    encode: Encode | None  # None: :func:`gsmerge.io.write_levels` writes it
+    # with comments for the header; None: :func:`gsmerge.io.write_ply` or :func:`gsmerge.io.write_levels` writes it
+    encode: Callable[[Gaussians, Sequence[str]], bytes] | None
     max_degree: int  # of the harmonics that there is room for
     version: int | None = None  # where several are written
     require: Callable[[], object] = lambda: None  # raises UsageError where the writer's package is missing
@@ -32,31 +31,18 @@ class Format:
         return name.lower().endswith(self.ending) if self.ending[0] == "." else name == self.ending
 
 
-PLY = Format(
-    ".ply", ply.read_rows, lambda rows, lines, normals: ply.ply_blocks(rows, lines, normals=normals), ply.MAX_DEGREE
-)
+PLY = Format(".ply", ply.read_rows, None, ply.MAX_DEGREE)
 FORMATS = (  # of endings that end alike the longest first
-    Format(
-        ".compressed.ply", ply.read_rows, lambda rows, lines, _: [compressed.compressed_bytes(rows, lines)],
-        compressed.MAX_DEGREE,
-    ),
+    Format(".compressed.ply", ply.read_rows, compressed.compressed_bytes, compressed.MAX_DEGREE),
     PLY,
-    Format(
-        ".spz", spz.read_rows, lambda rows, lines, _: [spz.spz_bytes(rows, mip=MIP_COMMENT in lines)],
-        spz.MAX_DEGREES[3], version=3,
-    ),
-    Format(
-        ".spz", spz.read_rows, lambda rows, lines, _: [spz.spz_bytes(rows, mip=MIP_COMMENT in lines, version=4)],
-        spz.MAX_DEGREES[4], version=4, require=spz.zstandard,
-    ),
-    Format(
-        ".sog", sog.read_rows, lambda rows, lines, _: [sog.sog_bytes(rows, mip=MIP_COMMENT in lines)], sog.MAX_DEGREE
-    ),
-    Format(".splat", splat.read_rows, lambda rows, *_: [splat.splat_bytes(rows)], splat.MAX_DEGREE),
-    Format(".glb", None, lambda rows, *_: [glb.glb_bytes(rows)], glb.MAX_DEGREE),
+    Format(".spz", spz.read_rows, spz.spz_bytes, spz.MAX_DEGREES[3], 3),
+    Format(".spz", spz.read_rows, partial(spz.spz_bytes, version=4), spz.MAX_DEGREES[4], 4, spz.zstandard),
+    Format(".sog", sog.read_rows, sog.sog_bytes, sog.MAX_DEGREE),
+    Format(".splat", splat.read_rows, splat.splat_bytes, splat.MAX_DEGREE),
+    Format(".glb", None, glb.glb_bytes, glb.MAX_DEGREE),
     Format(streamed.INDEX, streamed.read_rows, None, streamed.MAX_DEGREE),
-)  # fmt: skip
-OUTPUT_FORMATS = tuple(dict.fromkeys(row.ending for row in FORMATS if row.encode is not None))
+)
+OUTPUT_FORMATS = tuple(dict.fromkeys(row.ending for row in FORMATS[:-1]))
 SCENE_SUFFIXES = tuple(dict.fromkeys(Path(f"_{row.ending}").suffix for row in FORMATS[:-1] if row.read is not None))
 
 
@@ -70,7 +56,7 @@ def output_format(path: StrPath, spz_version: int = 3, *, levels: bool = False) 
 
     ``levels``: the name may be that of an index of levels of detail. ValueError if there is no such version.
     """
-    rows = [row for row in FORMATS if (levels or row.encode is not None) and row.names(path)]
+    rows = [row for row in (FORMATS if levels else FORMATS[:-1]) if row.names(path)]
     if not rows:
         *first, last = OUTPUT_FORMATS
         index = f", or the name {streamed.INDEX}" if levels else ""

@@ -51,10 +51,12 @@ def write_gaussians(
         ValueError: If there is NaN or inf, a comment is no line of ASCII, or there is no such version.
     """
     chosen = output_format(ending or path, spz_version)
-    assert chosen.encode is not None
+    if chosen.encode is None:
+        write_ply(path, gaussians, overwrite=overwrite, comments=comments, normals=normals)
+        return
     _check_comments(comments)
-    with atomic_output(path, overwrite=overwrite) as temporary, temporary.open("wb") as file:
-        file.writelines(chosen.encode(gaussians, comments, normals))
+    with atomic_output(path, overwrite=overwrite) as temporary:
+        temporary.write_bytes(chosen.encode(gaussians, comments))
 
 
 def write_levels(
@@ -139,7 +141,7 @@ def write_ply(
     if not 0 <= degree <= gaussians.sh_degree:
         raise ValueError(f"sh_degree: expected 0 to {gaussians.sh_degree}, got {sh_degree}")
     with atomic_output(path, overwrite=overwrite) as temporary, temporary.open("wb") as file:
-        file.writelines(ply.ply_blocks(gaussians, comments, degree=degree, normals=normals))
+        file.writelines(ply.ply_blocks(gaussians, degree, comments, normals=normals))
 
 
 def _check_comments(comments: Sequence[str]) -> None:

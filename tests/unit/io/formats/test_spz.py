@@ -17,6 +17,7 @@ from gsmerge.cli import main
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import kept_comments, lost_harmonics, read_gaussians, write_gaussians
 from gsmerge.io.formats import spz
+from gsmerge.io.formats.arrays import MIP_COMMENT
 from gsmerge.io.formats.spz import spz_bytes
 
 zstandard = pytest.importorskip("zstandard")
@@ -95,7 +96,7 @@ def test_older_spz(version: int, tmp_path: Path) -> None:
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_columns_are_those_of_version_3(degree: int) -> None:
     older = gzip.decompress(spz_bytes(some(degree)))
-    header, columns = columns_of(spz_bytes(some(degree), version=4, mip=True))
+    header, columns = columns_of(spz_bytes(some(degree), [MIP_COMMENT], version=4))
     assert columns == older[16:]
     fraction = older[13]
     assert header == (0x5053474E, 4, 50, degree, fraction, 1, 6 if degree else 5)
