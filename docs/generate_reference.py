@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any, get_args
 
 import typer.main
+from api_page import api_page
 
 REFERENCE = Path(__file__).parent / "reference"
-COMMANDS, SETTINGS, TRAINING = "commands", "settings.md", "training-settings.md"
+COMMANDS, SETTINGS, TRAINING, API = "commands", "settings.md", "training-settings.md", "api.md"
 NOTICE = "<!-- Made by docs/generate_reference.py from the program: change the help there and run it again. -->"
 KINDS = {int: "whole number", float: "number", str: "text", Path: "path"}
 
@@ -56,6 +57,7 @@ def make_pages() -> dict[str, str]:
     pages = {f"{COMMANDS}/{name}.md": command_page(name, command) for name, command in commands.items()}
     pages[f"{COMMANDS}/README.md"] = _index(commands)
     pages[SETTINGS], pages[TRAINING] = _settings_page(), _training_page()
+    pages[API] = f"{NOTICE}\n\n{api_page()}"
     return pages
 
 

@@ -13,7 +13,15 @@ from os import PathLike
 
 
 class GsmergeError(Exception):
-    """Base of all errors that a user can fix; ``exit_code`` is that of the command line."""
+    """Base of all errors that a user can fix; ``exit_code`` is that of the command line.
+
+    Example:
+        >>> try:
+        ...     gsmerge.read_scene("nowhere")
+        ... except gsmerge.GsmergeError as error:
+        ...     print(error.exit_code)
+        3
+    """
 
     exit_code = 1
 
@@ -25,7 +33,15 @@ class UsageError(GsmergeError, ValueError):
 
 
 class SceneError(GsmergeError):
-    """A file, folder or argument without the expected content: ``problem`` and ``remedy`` without full stops."""
+    """A file, folder or argument without the expected content: ``problem`` and ``remedy`` without full stops.
+
+    Example:
+        >>> try:
+        ...     gsmerge.read_ply("nowhere.ply")
+        ... except gsmerge.SceneError as error:
+        ...     print(error.path)
+        nowhere.ply
+    """
 
     exit_code = 3
 

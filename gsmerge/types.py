@@ -88,6 +88,11 @@ class Gaussians:
 
     Raises:
         ValueError: If the shapes do not fit together.
+
+    Example:
+        >>> gaussians = gsmerge.read_ply("demo/scene.ply").gaussians
+        >>> gaussians.means.shape, gaussians[gaussians.opacities > 0.9].sh_degree
+        ((7680, 3), 0)
     """
 
     means: Array
@@ -151,6 +156,13 @@ class Cameras:
 
     Raises:
         ValueError: If the shapes do not fit together or the size is not positive.
+
+    Example:
+        >>> cameras = gsmerge.read_scene("demo").cameras
+        >>> len(cameras), cameras.width, cameras.height
+        (5, 48, 32)
+        >>> cameras[[0, 2]].viewmats.shape
+        (2, 4, 4)
     """
 
     viewmats: Array
@@ -209,6 +221,11 @@ class Views:
         cameras: v cameras, in the world of the Gaussians that they look at.
         images: ``[v,h,w,3]`` sRGB in [0, 1].
         names: One for each view.
+
+    Example:
+        >>> scene = gsmerge.read_scene("demo")
+        >>> gsmerge.Views(scene.cameras[[1]], scene.images[[1]], scene.names[1:2]).images.shape
+        (1, 32, 48, 3)
     """
 
     cameras: Cameras
@@ -246,6 +263,11 @@ class Scene:
 
     Raises:
         ValueError: If the sizes do not fit together.
+
+    Example:
+        >>> scene = gsmerge.read_scene("demo")
+        >>> scene.aligned, len(scene), scene.images.shape
+        (True, 5, (5, 32, 48, 3))
     """
 
     gaussians: Gaussians

@@ -33,6 +33,11 @@ def compact(
         **settings: Single settings by name, on top of ``options``: ``compact(scene, k=2, superpixels="1%")``.
 
     Raises SceneError for a path that cannot be read, ValueError for a setting that is unknown or out of range.
+
+    Example:
+        >>> result = gsmerge.compact("demo", effort="draft", budget="5%")
+        >>> len(result.gaussians)
+        384
     """
     options = (options or CompactOptions()).with_settings(settings)
     with use_threads(options.threads), record_run(progress):

@@ -38,6 +38,11 @@ class CompactReport:
         unmet: Why a target that was asked for is not met, and how far the result got; None if it is.
         worse: That the result shows the scene's own photos by more than .5 dB worse than the input does, a sentence
             that is among the notes, too; None where it does not, or photos cannot say it: none, odd ones, or a crop.
+
+    Example:
+        >>> report = gsmerge.compact("demo", effort="draft", budget=300).report
+        >>> report.num_input, report.num_output
+        (7680, 300)
     """
 
     num_input: int
@@ -63,6 +68,11 @@ class CompactResult:
         cameras: The given views as the Gaussians were made from them, in the same frame: moved where their poses were
             wrong, see ``poses`` of :class:`gsmerge.PrepareOptions`.
         coarser: Further levels of detail, each with a quarter of the Gaussians of the one before.
+
+    Example:
+        >>> result = gsmerge.compact("demo", effort="draft", budget=300, levels=2)
+        >>> [len(level.gaussians) for level in (result, *result.coarser)]
+        [300, 75]
     """
 
     gaussians: Gaussians

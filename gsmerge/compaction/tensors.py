@@ -106,6 +106,13 @@ def compact_tensors(
     Raises:
         SceneError: If an array has another shape or convention; it says what to pass instead.
         ValueError: If a setting is unknown or out of range.
+
+    Example:
+        >>> scene = gsmerge.read_scene("demo")
+        >>> columns = vars(scene.gaussians)  # means, quats, scales, opacities, sh0, shN
+        >>> views = {"viewmats": scene.cameras.viewmats, "Ks": scene.cameras.Ks, "images": scene.images}
+        >>> len(gsmerge.compact_tensors(**columns, **views, effort="draft", budget=300).gaussians)
+        300
     """
     if order not in ORDERS:
         raise ValueError(f"order: expected one of {', '.join(ORDERS)}, got {order!r}")

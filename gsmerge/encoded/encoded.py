@@ -91,6 +91,11 @@ class Encoded(StoredScene):
         features: g Feature Gaussians, canonical, without their members.
         division: Their children.
         heads: Networks that correct the children; None without any.
+
+    Example:
+        >>> encoded = gsmerge.encode_scene(gsmerge.read_scene("demo"), superpixels="2%")
+        >>> len(encoded) == len(encoded.features)
+        True
     """
 
     features: FeatureGaussians

@@ -145,6 +145,10 @@ def save_encoded(
 
     Raises:
         SceneError: If the file exists or cannot be written.
+
+    Example:
+        >>> encoded = gsmerge.encode_scene(gsmerge.read_scene("demo"), superpixels="2%")
+        >>> gsmerge.save_encoded("demo/scene.gsm", encoded, overwrite=True)
     """
     division, heads = encoded.division, encoded.heads
     entries = {
@@ -314,6 +318,11 @@ def load_encoded(path: str | PathLike[str]) -> Encoded:
     Raises:
         SceneError: If the file is missing or damaged, of another format or a newer schema, lacks an array, or holds
             numbers out of range.
+
+    Example:
+        >>> gsmerge.save_encoded("demo/scene.gsm", gsmerge.encode_scene(gsmerge.read_scene("demo")), overwrite=True)
+        >>> len(gsmerge.decode_scene(gsmerge.load_encoded("demo/scene.gsm"), budget=200))
+        200
     """
     return read_encoded(read_gsm(path, ENCODED))
 

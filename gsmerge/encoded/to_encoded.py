@@ -61,6 +61,11 @@ def encode_scene(
 
     Raises:
         ValueError: If a setting is unknown or out of range, or goes with a fit or another method.
+
+    Example:
+        >>> encoded = gsmerge.encode_scene(gsmerge.read_scene("demo"), superpixels="2%", max_k=2)
+        >>> len(gsmerge.decode_scene(encoded, k=2)) > len(gsmerge.decode_scene(encoded, k=1))
+        True
     """
     options = _without_fit((options or CompactOptions()).with_settings(settings), settings)
     if max_k is not None and not 1 <= max_k <= MAX_CHILDREN:

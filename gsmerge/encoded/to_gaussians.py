@@ -97,6 +97,11 @@ def decode_scene(
 
     Raises:
         UsageError: If K is more than was encoded, the budget below the number of groups, or both are given.
+
+    Example:
+        >>> encoded = gsmerge.encode_scene(gsmerge.read_scene("demo"), superpixels="2%")
+        >>> len(gsmerge.decode_scene(encoded, budget=100))
+        100
     """
     plan, s = plan_decode(encoded, k=k, budget=budget), encoded.settings
     with use_threads(threads):

@@ -107,6 +107,13 @@ class Evaluation:
         num_views: Views by split.
         notes: Warnings, one sentence each.
         options: What was measured.
+
+    Example:
+        >>> scene = gsmerge.read_scene("demo")
+        >>> result = gsmerge.compact(scene, effort="draft", budget=300)
+        >>> quick = gsmerge.EvaluateOptions(lpips=(), fog=False)
+        >>> [scores.name for scores in gsmerge.evaluate(scene, {"small": result.gaussians}, options=quick).results]
+        ['input', 'small']
     """
 
     results: tuple[ResultScores, ...]
@@ -165,6 +172,14 @@ def evaluate(
     Raises:
         UsageError: If the scene has no views, a result is called "input", or alignment is asked for without targets.
         GsmergeError: If LPIPS is asked for and its weights are not installed.
+
+    Example:
+        >>> scene = gsmerge.read_scene("demo")
+        >>> result = gsmerge.compact(scene, effort="fast", budget=600)
+        >>> quick = gsmerge.EvaluateOptions(lpips=(), fog=False)
+        >>> evaluation = gsmerge.evaluate(scene, {"small": result.gaussians}, options=quick)
+        >>> evaluation.num_views
+        {'context': 5}
     """
     options, cameras = options or EvaluateOptions(), cameras or {}
     if INPUT in results:

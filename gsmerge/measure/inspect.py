@@ -82,6 +82,11 @@ def inspect(
     Raises:
         SceneError: If the ``.ply`` cannot be read, or a named file does not exist; cameras that are missing or do not
             fit are reported instead.
+
+    Example:
+        >>> facts = gsmerge.inspect("demo")
+        >>> facts["count"], facts["num_views"], facts["camera_format"]
+        (7680, 5, 'transforms.json')
     """
     read_hints = make_hints(hints)
     files = find_scene_files(path, cameras=cameras, images=images, masks=masks)

@@ -28,10 +28,10 @@ class Compactor:
         ValueError: If a setting is unknown or out of range.
 
     Example:
-        >>> compactor = Compactor()
-        >>> for batch in batches:  # doctest: +SKIP
-        ...     compactor.extend(batch)
-        >>> gaussians = compactor.decode(k=2)  # doctest: +SKIP
+        >>> compactor = gsmerge.Compactor(superpixels="3%")
+        >>> outcome = compactor.extend(gsmerge.read_scene("demo"))
+        >>> len(compactor.decode(k=1, fit="none")) < 500
+        True
     """
 
     def __init__(self, **settings: Any) -> None:

@@ -116,6 +116,12 @@ class Rendering:
         images: ``[c,h,w,3]`` float32 over the background, not clamped at 1.
         alphas: ``[c,h,w,1]`` float32, 1 less the remaining transmittance.
         depths: ``[c,h,w,1]`` float32 mean camera z of what was blended, 0 where nothing was; None if not asked for.
+
+    Example:
+        >>> scene = gsmerge.read_scene("demo")
+        >>> drawn = gsmerge.render(scene.gaussians, scene.cameras[[0]], with_depths=True)
+        >>> drawn.images.shape, drawn.alphas.shape, drawn.depths.shape
+        ((1, 32, 48, 3), (1, 32, 48, 1), (1, 32, 48, 1))
     """
 
     images: AnyArray

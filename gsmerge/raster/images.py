@@ -72,6 +72,11 @@ def render(
     Raises:
         ValueError: If the background or the depth range makes no sense, or the tensors are on several devices.
         GsmergeError: If CUDA tensors are given and gsplat is not installed.
+
+    Example:
+        >>> scene = gsmerge.read_scene("demo")
+        >>> gsmerge.render(scene.gaussians, scene.cameras, background=1.0).images.shape
+        (5, 32, 48, 3)
     """
     under = background_color(background.detach().cpu() if hasattr(background, "detach") else background)
     options: dict[str, Any] = {"antialiased": antialiased, "near": near, "far": far}

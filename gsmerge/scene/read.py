@@ -148,7 +148,9 @@ def read_scene(
         ValueError: If an argument is none of the possible ones.
 
     Example:
-        >>> scene = read_scene("scene.ply")  # doctest: +SKIP
+        >>> scene = gsmerge.read_scene("demo/scene.ply", cameras="demo/transforms.json")
+        >>> len(scene), scene.num_gaussians
+        (5, 7680)
     """
     return load_scene(path, *more, cameras=cameras, images=images, masks=masks, opacity=opacity, **hints).scene
 

@@ -44,6 +44,11 @@ class CompactOptions(Settings):
 
     A ValueError besides: a PSNR is asked for of a crop, or without the sky; another method than ``"gsmerge"`` is asked
     to find the number of Gaussians; a checkpoint is required and none is named.
+
+    Example:
+        >>> options = gsmerge.CompactOptions().with_settings({"k": 2, "effort": "draft"})
+        >>> options.decode.k, options.to_dict()["effort"]
+        (2, 'draft')
     """
 
     prepare: PrepareOptions = setting(PrepareOptions(), "What may be changed before anything is merged.")

@@ -13,7 +13,12 @@ MAX_ZOOM = 16.0  # and its inverse the least: beyond, pictures have no pixels le
 
 @dataclass(frozen=True)
 class EvaluateOptions(Settings):
-    """Settings of an evaluation."""
+    """Settings of an evaluation.
+
+    Example:
+        >>> gsmerge.EvaluateOptions(lpips=(), photo_side=476).photo_side
+        476
+    """
 
     lpips: tuple[str, ...] = setting(NETS, "Networks of the perceptual distance; none is much faster.", choices=NETS)
     lpips_views: int | None = setting(None, "Measure LPIPS on at most so many views of each split.",

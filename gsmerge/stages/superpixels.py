@@ -109,8 +109,9 @@ def superpixels(
         ValueError: If an argument is out of range.
 
     Example:
-        >>> superpixels(np.zeros((2, 2, 3)), 1).tolist()
-        [[0, 0], [0, 0]]
+        >>> labels = gsmerge.superpixels(gsmerge.read_scene("demo").images[0], 60)
+        >>> labels.shape, int(labels.max())
+        ((32, 48), 59)
     """
     SegmentOptions(segmentation=segmentation, rectangles=rectangles, compactness=compactness)  # checks them
     pixels = _as_pixels(as_array(image))
@@ -155,6 +156,10 @@ def saliency(image: Array) -> Array:
 
     Raises:
         ValueError: If the image has the wrong shape or range.
+
+    Example:
+        >>> gsmerge.saliency(gsmerge.read_scene("demo").images[0]).shape
+        (32, 48)
     """
     return like(corner_response(_as_pixels(as_array(image))), image)
 

@@ -258,6 +258,10 @@ def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> 
 
     Intrinsics of another size are scaled, each axis by itself. SceneError if no size is given and the file's
     cameras have none, or several; or a lens is no pinhole.
+
+    Example:
+        >>> gsmerge.to_cameras(gsmerge.read_cameras("demo/transforms.json")).Ks.shape
+        (5, 3, 3)
     """
     path = camera_file.path
     if camera_file.focal is None:

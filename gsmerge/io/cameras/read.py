@@ -79,6 +79,11 @@ def read_cameras(path: StrPath, *, scene: str | None = None, folder: Path | None
 
     Raises:
         SceneError: If there are no cameras, a file is damaged or incomplete, or a lens of an unknown kind.
+
+    Example:
+        >>> cameras = gsmerge.read_cameras("demo/transforms.json")
+        >>> len(cameras), cameras.source
+        (5, 'transforms.json')
     """
     path = Path(path)
     if not os.path.exists(path):

@@ -105,6 +105,10 @@ def read_ply(path: StrPath, *, opacity: OpacityChoice = "auto") -> GaussianFile:
     Raises:
         SceneError: If the file cannot be read, lacks columns, or hardly has a finite Gaussian: 2 in 1,000 rows.
         ValueError: If ``opacity`` is none of the three.
+
+    Example:
+        >>> len(gsmerge.read_ply("demo/scene.ply").gaussians)
+        7680
     """
     return read_parts([Path(path)], opacity=opacity)
 
@@ -127,6 +131,11 @@ def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto") -> Gaussia
     Endings are ``.spz`` (versions 1 to 4), ``.splat`` and ``.sog`` (version 2); of a ``lod-meta.json``, it is
     the finest level. Everything else is read by :func:`read_ply`, for which ``opacity`` is. SceneError if the file
     cannot be read, is damaged, or holds no finite Gaussian; ValueError for another ``opacity``.
+
+    Example:
+        >>> gsmerge.write_gaussians("demo/small.spz", gsmerge.read_ply("demo/scene.ply").gaussians, overwrite=True)
+        >>> len(gsmerge.read_gaussians("demo/small.spz").gaussians)
+        7680
     """
     path, read = Path(path), input_format(path).read
     if read is None or read is ply.read_rows:

@@ -49,6 +49,10 @@ def write_gaussians(
         UsageError: If the name ends in none of these, or ``zstandard`` is needed and not installed.
         SceneError: If the file exists or cannot be written.
         ValueError: If there is NaN or inf, a comment is no line of ASCII, or there is no such version.
+
+    Example:
+        >>> gaussians = gsmerge.compact("demo", effort="draft", budget=300).gaussians
+        >>> gsmerge.write_gaussians("demo/small.splat", gaussians, overwrite=True)
     """
     chosen = output_format(ending or path, spz_version)
     if chosen.encode is None:
@@ -77,6 +81,11 @@ def write_levels(
         UsageError: If the name is another one.
         SceneError: If the file exists or cannot be written.
         ValueError: If there is NaN or inf, no Gaussian at some level, or a comment is no line of ASCII.
+
+    Example:
+        >>> result = gsmerge.compact("demo", effort="draft", budget=300, levels=2)
+        >>> levels = [result.gaussians, *(level.gaussians for level in result.coarser)]
+        >>> gsmerge.write_levels("demo/web/lod-meta.json", levels, overwrite=True)
     """
     path = Path(path)
     if path.name != streamed.INDEX:
@@ -135,6 +144,10 @@ def write_ply(
     Raises:
         SceneError: If the file exists or cannot be written.
         ValueError: If there is NaN or inf, fewer harmonics than asked for, or a comment is no line of ASCII.
+
+    Example:
+        >>> result = gsmerge.compact("demo", effort="draft", budget=300)
+        >>> gsmerge.write_ply("demo/small.ply", result.gaussians, overwrite=True)
     """
     _check_comments(comments)
     degree = gaussians.sh_degree if sh_degree is None else sh_degree

@@ -1,0 +1,72 @@
+"""The page of the Python API: every public name by topic, from its signature and docstring."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import textwrap
+from typing import Any
+
+import gsmerge
+
+TOPICS = {
+    "Read": ("read_scene", "read_ply", "read_gaussians", "read_cameras", "to_cameras", "inspect"),
+    "Compact": ("compact", "compact_tensors", "CompactOptions", "CompactResult", "CompactReport"),
+    "Write": ("write_ply", "write_gaussians", "write_levels"),
+    "Draw and measure": ("render", "Rendering", "evaluate", "EvaluateOptions", "Evaluation", "superpixels", "saliency"),
+    "Encode once, decode many": (
+        "encode_scene",
+        "decode_scene",
+        "save_encoded",
+        "load_encoded",
+        "Encoded",
+        "Compactor",
+    ),
+    "Data": ("Scene", "Gaussians", "Cameras", "Views"),
+    "Errors": ("GsmergeError", "SceneError"),
+}
+HEAD = """# Python API
+
+Every public name of `gsmerge`, from its docstring, which `help()` shows as well; [the guide](../guide/python.md) says how
+they work together. The examples run after `import gsmerge`, in a folder with a scene `demo` of 5 views of 48 x 32 pixels,
+as `examples/01_make_scene.py` makes it."""
+
+
+def api_page() -> str:
+    """Write the page."""
+    listed = [name for names in TOPICS.values() for name in names]
+    if sorted(listed) != sorted(set(gsmerge.__all__) - {"__version__"}):
+        raise ValueError(f"TOPICS: expected every public name once, got {', '.join(listed)}")
+    lines = [HEAD]
+    for topic, names in TOPICS.items():
+        lines += ["", f"## {topic}"]
+        for name in names:
+            lines += ["", f"### {name}", "", *_describe(name, getattr(gsmerge, name))]
+    return "\n".join([*lines, ""])
+
+
+def _describe(name: str, value: Any) -> list[str]:
+    """Write a name's signature, text, arguments and example as lines of Markdown."""
+    text = re.sub(r":\w+:`~?([\w.]+?)`", r"`\1`", inspect.cleandoc(value.__doc__)).replace("``", "`")
+    about, *parts = re.split(r"^(Args|Returns|Raises|Example):\n", text, flags=re.MULTILINE)
+    lines = [about.strip()]
+    if not inspect.isclass(value):
+        lines = ["```python", f"gsmerge.{name}{_parameters(value)}", "```", "", *lines]
+    for title, body in zip(parts[::2], parts[1::2], strict=True):
+        body = textwrap.dedent(body).strip()
+        if title == "Example":
+            lines += ["", "```pycon", body, "```"]
+        elif title == "Returns":
+            lines += ["", f"Returns: {body}"]
+        else:
+            entries = re.findall(r"^(\*{0,2}\w+): (.*?)(?=^\*{0,2}\w+: |\Z)", body, re.DOTALL | re.MULTILINE)
+            lines += [""] + [f"- `{entry}`: {' '.join(about.split())}" for entry, about in entries]
+    return lines
+
+
+def _parameters(function: Any) -> str:
+    """Write a function's parameters with their defaults, without types."""
+    signature = inspect.signature(function)
+    bare = [one.replace(annotation=inspect.Parameter.empty) for one in signature.parameters.values()]
+    text = str(signature.replace(parameters=bare, return_annotation=inspect.Signature.empty))
+    return re.sub(r"<function .*?>", "...", text)
