@@ -27,9 +27,9 @@ TOPICS = {
 }
 HEAD = """# Python API
 
-Every public name of `gsmerge`, from its docstring, which `help()` shows as well; [the guide](../guide/python.md) says how
-they work together. The examples run after `import gsmerge`, in a folder with a scene `demo` of 5 views of 48 x 32 pixels,
-as `examples/01_make_scene.py` makes it."""
+Every public name of `gsmerge`, from its docstring, which `help()` shows as well; [the guide](../guide/python.md) says
+how they work together. The examples run after `import gsmerge`, in a folder with a scene `demo` of 5 views of 48 x 32
+pixels, as `examples/01_make_scene.py` makes it."""
 
 
 def api_page() -> str:
