@@ -7,9 +7,9 @@ from gsmerge.fit.report import FitReport, Fitted, record_fit, report_steps
 from gsmerge.fit.schedule import FitJob
 from gsmerge.fit.stage import fit, fit_scene, run_on, start_share
 from gsmerge.fit.survey import peak_weights, visible_mask
-from gsmerge.settings.fit import Fit, FitOptions, Tuning
+from gsmerge.settings.fit import FitOptions
 
 __all__ = [
-    "ON_CPU", "Fit", "FitBackend", "FitJob", "FitOptions", "FitReport", "Fitted", "Tuning", "fit", "fit_photos",
-    "fit_scene", "peak_weights", "photo_scale", "record_fit", "report_steps", "run_on", "start_share", "visible_mask",
+    "ON_CPU", "FitBackend", "FitJob", "FitOptions", "FitReport", "Fitted", "fit", "fit_photos", "fit_scene",
+    "peak_weights", "photo_scale", "record_fit", "report_steps", "run_on", "start_share", "visible_mask",
 ]  # fmt: skip
