@@ -24,10 +24,11 @@ from gsmerge.fit import FitOptions, fit
 from gsmerge.moments import Members, scene_members
 from gsmerge.raster.photos import scene_photos
 from gsmerge.runtime.threads import use_threads
-from gsmerge.stages.decode import DecodeOptions, decode, split_counts
+from gsmerge.settings.stages import DecodeOptions, SegmentOptions
+from gsmerge.stages.decode import decode, split_counts
 from gsmerge.stages.encode import encode
 from gsmerge.stages.segment import auto_count, cut_tree, pixel_depths, region_tree
-from gsmerge.stages.superpixels import SegmentOptions, segment
+from gsmerge.stages.superpixels import segment
 from gsmerge.types import Gaussians, Groups, Scene
 
 DENSITY = 0.044

@@ -23,12 +23,13 @@ from result_cells import make_table
 from shared_scenes import export, scene_folders
 
 import gsmerge
-from gsmerge.measure.evaluate import ALIGNMENTS, EvaluateOptions, evaluate
+from gsmerge.measure.evaluate import EvaluateOptions, evaluate
 from gsmerge.measure.fog import ALL
 from gsmerge.measure.scores import OUTSIDE
 from gsmerge.research.charts.lines import mean_interval
 from gsmerge.scene.held_out import read_held_out as read_views
 from gsmerge.scene.read import load_scene
+from gsmerge.settings.evaluate import ALIGNMENTS
 from gsmerge.types import Views
 
 NAME = "defaults.jsonl"

@@ -22,8 +22,9 @@ from shared_scenes import export, read_held_out, scene_folders
 import gsmerge
 from gsmerge import read_scene
 from gsmerge.runtime.threads import use_threads
+from gsmerge.settings.stages import SegmentOptions
 from gsmerge.stages.assign import find_owners
-from gsmerge.stages.superpixels import SegmentOptions, segment
+from gsmerge.stages.superpixels import segment
 
 
 def without_order(scene: gsmerge.Scene) -> gsmerge.Scene:

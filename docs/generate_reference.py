@@ -6,13 +6,11 @@ python docs/generate_reference.py --check  # name them, exit code 1 if there are
 
 from __future__ import annotations
 
-import re
 import sys
-from collections.abc import Sequence
-from dataclasses import fields
+from collections.abc import Iterable
 from enum import Enum
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any, get_args
 
 import typer.main
 
@@ -133,23 +131,23 @@ def _cell(text: str | None) -> str:
 
 
 def _settings_page() -> str:
-    from gsmerge.cli.parameters import HINTS, words_for
     from gsmerge.cli.paths import FileOptions
-    from gsmerge.io.formats.read import OpacityChoice
     from gsmerge.online.options import OnlineOptions
-    from gsmerge.options import CompactOptions
-    from gsmerge.scene.exporters import ReadHints
+    from gsmerge.settings.compact import CompactOptions
+    from gsmerge.settings.reading import FileHints
+    from gsmerge.settings.setting import flat_settings, settings_of
 
-    stages = {f.name: f.default_factory for f in fields(CompactOptions) if isinstance(f.default_factory, type)}
+    whole = settings_of(CompactOptions)
+    stages = {name: list(flat_settings(one.kind).values()) for name, one in whole.items() if one.is_group}
     tables = {
-        "How many Gaussians": _settings(stages["budget"]) + _settings(stages["decode"])[2:],
-        "Superpixels": _settings(stages["segment"]),
-        "Merging across views": _settings(stages["match"]),
-        "Fit": _settings(stages["fit"]),
-        "Before and after": _settings(stages["prepare"]) + _settings(stages["clean"])[2:],
-        "The whole run": _settings(CompactOptions, [f.name for f in fields(CompactOptions) if f.name not in stages]),
-        "Files": _settings(FileOptions),
-        "`gsmerge extend`": _settings(OnlineOptions),
+        "How many Gaussians": stages["budget"] + stages["blocks"] + stages["decode"],
+        "Superpixels": stages["segment"],
+        "Merging across views": stages["match"],
+        "Fit": stages["fit"],
+        "Before and after": stages["prepare"] + stages["clean"],
+        "The whole run": [one for name, one in whole.items() if name not in stages],
+        "Files": flat_settings(FileOptions).values(),
+        "`gsmerge extend`": flat_settings(OnlineOptions).values(),
     }
     lines = [NOTICE, "", "# Settings", ""]
     lines += ["`compact`, `batch`, `encode`, `extend` and `stress` take them as `--set NAME=VALUE`, such as"]
@@ -157,52 +155,31 @@ def _settings_page() -> str:
     lines += ["superpixels, `compact` and `decode` those of files. In Python they are arguments of `gsmerge.compact`."]
     lines += ["A value is JSON, or text as it is; an empty default is `null`: the program chooses. Settings with"]
     lines += ["an option of their own are listed too: `--k 2` is `--set k=2`."]
-    for title, rows in tables.items():
-        lines += ["", f"## {title}", "", *rows]
-    kinds = get_type_hints(ReadHints) | {"opacity": OpacityChoice}
-    defaults = {"opacity": "auto", **vars(ReadHints())}
-    lines += ["", "## Hints", "", "`--hint NAME=VALUE` says how to read a file that is recognised wrongly."]
-    lines += ["", "| hint | default | values | what it is |", "|---|---|---|---|"]
-    lines += [_row(name, defaults[name], words_for(kinds[name]), about) for name, about in HINTS.items()]
+    for title, settings in tables.items():
+        lines += ["", f"## {title}", "", *_table(settings)]
+    lines += ["", "## Hints", "", "`--hint NAME=VALUE` says how to read a file that is recognised wrongly.", ""]
+    lines += _table(flat_settings(FileHints).values(), "hint")
     return "\n".join([*lines, ""])
 
 
 def _training_page() -> str:
+    from gsmerge.networks.options import NetworkOptions
     from gsmerge.research.training import TrainOptions
-    from gsmerge.research.training.modules import NetworkOptions
+    from gsmerge.settings.setting import settings_of
 
     lines = [NOTICE, "", "# Settings of a training run", ""]
-    lines += ["Keys of the TOML or JSON file that `gsmerge train --config` reads.", "", *_settings(TrainOptions)]
-    lines += ["", "## The table `network`", "", *_settings(NetworkOptions), ""]
-    return "\n".join(lines)
+    lines += ["Keys of the TOML or JSON file that `gsmerge train --config` reads.", ""]
+    lines += [*_table(settings_of(TrainOptions).values()), ""]
+    return "\n".join([*lines, "## The table `network`", "", *_table(settings_of(NetworkOptions).values()), ""])
 
 
-def _settings(options: Any, names: Sequence[str] | None = None) -> list[str]:
-    """A table of a dataclass, or of some of its fields: name, default, values, and what its docstring says of it."""
-    from gsmerge.cli.parameters import words_for
-    from gsmerge.options import DEVICES, EFFORTS, method_names
-    from gsmerge.stages.decode import K_RULES
-    from gsmerge.stages.superpixels import SEGMENTATIONS
-
-    named = {"method": method_names(), "effort": EFFORTS, "device": DEVICES}
-    named |= {"segmentation": SEGMENTATIONS, "k_rule": K_RULES}
-    arguments = (options.__doc__ or "").partition("Args:")[2].partition("Raises:")[0]
-    described = dict(re.findall(r"^ {8}(\w+): (.*?)(?=^ {8}\w+: |\Z)", arguments, re.DOTALL | re.MULTILINE))
-    values, kinds = vars(options()), get_type_hints(options)
-    if names is None:
-        names = [f.name for f in fields(options) if f.metadata.get("setting", True)]
-    words = {name: ", ".join(named[name]) if name in named else words_for(kinds[name]) for name in names}
-    rows = [_row(name, values[name], words[name], described[name]) for name in names]
-    return ["| setting | default | values | what it is |", "|---|---|---|---|", *rows]
-
-
-def _row(name: str, default: Any, kind: str, about: str) -> str:
-    if hasattr(default, "__dataclass_fields__"):
-        default = None
-    shown = "" if default is None else f"`{_plain(default)}`"
-    text = re.sub(r", see :\w+:`[^`]*`", "", _cell(about))
-    text = re.sub(r":\w+:`~?([^`]*)`", r"`\1`", text.replace("``", "`"))
-    return f"| `{name}` | {shown} | {_cell(kind)} | {text} |"
+def _table(settings: Iterable[Any], head: str = "setting") -> list[str]:
+    """A table of settings: name, default, values, and what is said of each."""
+    rows = []
+    for one in settings:
+        shown = "" if one.default is None or one.is_group else f"`{_plain(one.default)}`"
+        rows.append(f"| `{one.name}` | {shown} | {_cell(one.values())} | {_cell(one.text)} |")
+    return [f"| {head} | default | values | what it is |", "|---|---|---|---|", *rows]
 
 
 def _plain(value: Any) -> Any:

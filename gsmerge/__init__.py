@@ -34,15 +34,15 @@ if TYPE_CHECKING:
     from gsmerge.io import write_gaussians as write_gaussians
     from gsmerge.io import write_levels as write_levels
     from gsmerge.io import write_ply as write_ply
-    from gsmerge.measure.evaluate import EvaluateOptions as EvaluateOptions
     from gsmerge.measure.evaluate import Evaluation as Evaluation
     from gsmerge.measure.evaluate import evaluate as evaluate
     from gsmerge.measure.inspect import inspect as inspect
     from gsmerge.online.compactor import Compactor as Compactor
-    from gsmerge.options import CompactOptions as CompactOptions
     from gsmerge.raster import Rendering as Rendering
     from gsmerge.raster import render as render
     from gsmerge.scene.read import read_scene as read_scene
+    from gsmerge.settings.compact import CompactOptions as CompactOptions
+    from gsmerge.settings.evaluate import EvaluateOptions as EvaluateOptions
     from gsmerge.stages.superpixels import saliency as saliency
     from gsmerge.stages.superpixels import superpixels as superpixels
     from gsmerge.types import Cameras as Cameras
@@ -63,12 +63,13 @@ _PUBLIC = {
     "errors": ("GsmergeError", "SceneError"),
     "io": ("read_cameras", "read_gaussians", "read_ply", "to_cameras"),
     "io.formats.write": ("write_gaussians", "write_levels", "write_ply"),
-    "measure.evaluate": ("EvaluateOptions", "Evaluation", "evaluate"),
+    "measure.evaluate": ("Evaluation", "evaluate"),
     "measure.inspect": ("inspect",),
     "online.compactor": ("Compactor",),
-    "options": ("CompactOptions",),
     "raster": ("Rendering", "render"),
     "scene.read": ("read_scene",),
+    "settings.compact": ("CompactOptions",),
+    "settings.evaluate": ("EvaluateOptions",),
     "stages.superpixels": ("saliency", "superpixels"),
     "types": ("Cameras", "Gaussians", "Scene", "Views"),
 }

@@ -10,23 +10,31 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from gsmerge.budget import AUTO, BudgetOptions, exact_count
+from gsmerge.budget import exact_count
 from gsmerge.errors import UsageError
 from gsmerge.facts.partition import usual_blocks
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.views import report_views, scored_views
-from gsmerge.fit import FitBackend, FitOptions, photo_scale, start_share
-from gsmerge.fit.fit_options import USUAL_SHARE
+from gsmerge.fit import FitBackend, photo_scale, start_share
 from gsmerge.fit.gpu import choose_backend
-from gsmerge.options import CompactOptions
 from gsmerge.runtime.record import note, stage
+from gsmerge.settings.budget import AUTO, BudgetOptions
+from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.fit import USUAL_SHARE, FitOptions
+from gsmerge.settings.stages import (
+    AUTO_SHARE,
+    SHARE,
+    USUAL_K,
+    CleanOptions,
+    DecodeOptions,
+    MatchOptions,
+    Method,
+    SegmentOptions,
+)
 from gsmerge.stages.assign import merge_unseen
-from gsmerge.stages.clean import CleanOptions, clean
-from gsmerge.stages.decode import USUAL_K, DecodeOptions
+from gsmerge.stages.clean import clean
 from gsmerge.stages.encode import measured_share
-from gsmerge.stages.match import MatchOptions, Method
 from gsmerge.stages.segment import CountLimits, SceneSize, SuperpixelPlan, count_limits, measure_size, scene_tree
-from gsmerge.stages.superpixels import AUTO_SHARE, SHARE, SegmentOptions
 from gsmerge.types import Gaussians, Scene
 
 if TYPE_CHECKING:

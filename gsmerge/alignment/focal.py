@@ -15,27 +15,20 @@ from pathlib import Path
 
 import numpy as np
 
-from gsmerge.alignment.cameras import estimate_cameras, fit_line, other_conventions
-from gsmerge.alignment.layouts import exact_layouts, grids_of_count, subsample
+from gsmerge.alignment.cameras import fit_lines, other_conventions
+from gsmerge.alignment.estimate import estimate_cameras
+from gsmerge.alignment.layouts import exact_layouts, grids_of_count, subsample, view_orders
 from gsmerge.alignment.score import MARGIN, Correspondences, find_correspondences, pixel_limit
 from gsmerge.alignment.unaligned import CameraCheck, check_cameras
 from gsmerge.geometry import project_points, sh0_to_rgb
 from gsmerge.io.cameras.camera_file import CameraFile, make_pinhole
-from gsmerge.io.formats.read import GaussianFile as PlyScene
-from gsmerge.io.image_names import natural_key
-from gsmerge.io.photo_files import (
-    Photos,
-    Size,
-    as_floats,
-    photo_size,
-    resize_to,
-)
+from gsmerge.io.formats.read import GaussianFile
+from gsmerge.io.photo_files import Photos, Size, as_floats, photo_size, resize_to
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.pictures import sample_bilinear
 from gsmerge.types import Cameras, Gaussians
 
 _GRID_SAMPLES = 500  # Gaussians per view that intrinsics are solved from
-_ROUNDS = 4  # of reweighted least squares
 _MAX_UNEVEN = 1.5  # of one focal length to the other
 _MAX_GRIDS = 6  # smaller grids that the number of rows allows, which are tried
 _MAX_VIEWS = 12  # whose photos are compared with the Gaussians
@@ -64,7 +57,7 @@ class _Pictures:
         return Cameras(viewmats[self.views], np.tile(K, (len(self.views), 1, 1)), width, height)
 
 
-def estimate_focal(ply: PlyScene, camera_file: CameraFile, photos: Photos | None) -> CameraFile | None:
+def estimate_focal(ply: GaussianFile, camera_file: CameraFile, photos: Photos | None) -> CameraFile | None:
     """Return the cameras with the intrinsics that fit the Gaussians, and a note; None without any.
 
     ``camera_file`` has poses alone; ``photos`` are its c ``[h,w,3]`` uint8. Where only they show
@@ -95,22 +88,18 @@ def estimate_focal(ply: PlyScene, camera_file: CameraFile, photos: Photos | None
 
 
 def _intrinsics_of_rays(
-    ply: PlyScene, camera_file: CameraFile, readings: list[np.ndarray], size: Size
+    ply: GaussianFile, camera_file: CameraFile, readings: list[np.ndarray], size: Size
 ) -> np.ndarray | None:
     """Solve for intrinsics ``[3,3]``, pixels, under which the rows of a grid lie on their rays."""
     count, views, names = len(ply.gaussians), len(camera_file), camera_file.names
-    by_name = sorted(range(views), key=lambda view: natural_key(names[view]))
-    labellings = list(dict.fromkeys((tuple(range(views)), tuple(by_name))))
     smaller = islice(grids_of_count(count, views, size), _MAX_GRIDS)
     for grid in (resize_to(size, size), *smaller):
         fits: list[tuple[float, tuple[float, ...], int]] = []
         for number, layout in enumerate(exact_layouts(count, views, grid.width, grid.height)):
             if len(set(layout.views)) < views:
                 continue
-            some = subsample(layout, _GRID_SAMPLES)
-            for labelling in labellings:
-                labelled = replace(some, views=tuple(labelling[view] for view in some.views))
-                pairs = find_correspondences(ply.gaussians.means, ply.valid, labelled)
+            for sample in subsample(layout, _GRID_SAMPLES).with_views_in(view_orders(names)):
+                pairs = find_correspondences(ply.gaussians.means, ply.valid, sample)
                 solved = (_solve_intrinsics(pairs, viewmats) for viewmats in readings)
                 fits += [(px, values, number) for px, values in solved]
         fits.sort()
@@ -134,28 +123,18 @@ def _solve_intrinsics(pairs: Correspondences, viewmats: np.ndarray) -> tuple[flo
     if not front.any() or front.mean() <= 0.5:
         return math.inf, ()
     slopes = camera[front, :2] / camera[front, 2:]
-    places = pairs.pixels[front]
-    weights = np.ones(len(slopes))
-    away = np.zeros_like(places)
-    lines = [(0.0, 0.0), (0.0, 0.0)]
-    with np.errstate(all="ignore"):  # points in the camera's plane
-        for _ in range(_ROUNDS):
-            for axis in range(2):
-                slope, height = fit_line(slopes[:, axis], places[:, axis], weights)
-                away[:, axis] = places[:, axis] - slope * slopes[:, axis] - height
-                lines[axis] = slope, height
-            errors = np.sqrt((away * away).sum(1))
-            weights = 1 / (1 + (errors / (3 * np.median(errors) + 1e-9)) ** 2)
-    (fx, cx), (fy, cy) = lines
+    (fx, fy), (cx, cy), errors = fit_lines(slopes, pairs.pixels[front])
     blocks = pairs.blocks[front]
     worst = max(float(np.median(errors[blocks == block])) for block in np.unique(blocks))
     uneven = fx / fy if 0 < fx < math.inf and 0 < fy < math.inf else math.inf
     if not (math.isfinite(worst) and 1 / _MAX_UNEVEN < uneven < _MAX_UNEVEN):
         return math.inf, ()
-    return worst, (fx, fy, cx, cy)
+    return worst, (float(fx), float(fy), float(cx), float(cy))
 
 
-def _intrinsics_of_colors(ply: PlyScene, readings: list[np.ndarray], photos: Photos, size: Size) -> np.ndarray | None:
+def _intrinsics_of_colors(
+    ply: GaussianFile, readings: list[np.ndarray], photos: Photos, size: Size
+) -> np.ndarray | None:
     """Search for intrinsics ``[3,3]``, pixels, under which the Gaussians have the photos' colours."""
     pictures = _small_pictures(photos, size)
     few = _sample(ply, _FEW_SAMPLES)
@@ -172,7 +151,7 @@ def _intrinsics_of_colors(ply: PlyScene, readings: list[np.ndarray], photos: Pho
     return None
 
 
-def _sample(ply: PlyScene, count: int) -> Gaussians:
+def _sample(ply: GaussianFile, count: int) -> Gaussians:
     """Take about ``count`` finite Gaussians, spread over the file."""
     rows = np.flatnonzero(ply.valid)
     return ply.gaussians[rows[:: max(1, len(rows) // count)]]

@@ -6,7 +6,7 @@ projects to the very centre of a pixel in its own view, and anywhere in a pixel 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 
@@ -25,7 +25,7 @@ from gsmerge.alignment.ordered_rows import (
 )
 from gsmerge.alignment.score import (
     AlignmentInput,
-    AlignmentScore,
+    Reading,
     candidate_similarities,
     sample_layout,
     scale_by,
@@ -53,82 +53,75 @@ _AS_GOOD = 1.05  # of that distance: no worse, where the scale is solved from mo
 _BETTER = 2.0  # times nearer to the pixels: another scale, where the same fits as well
 
 
-def score_incomplete(inputs: AlignmentInput) -> list[AlignmentScore]:
-    """Score readings with missing pixels in the possible orders, each tried only where none before it fits."""
+def read_incomplete(inputs: AlignmentInput) -> Iterator[Reading | None]:
+    """Yield readings with missing pixels in the possible orders, the likely first; None where an order cannot be."""
     cameras = inputs.cameras
     missing = len(cameras) * cameras.width * cameras.height - len(inputs.gaussians)
+    if missing < 0:
+        return
     ids = np.flatnonzero(inputs.valid)
     rows = ProjectedRows(inputs.gaussians.means[ids].astype(np.float64), ids, cameras)
     # frames that need no solving: without a layout no pixel is known
     frames = list(candidate_similarities(None, cameras, scale=inputs.scale, effort=0))
-    searches: dict[str, Callable[[], AlignmentScore | None]] = {
-        "view-major": lambda: _score_view_major(inputs, rows, frames[0]),
-        "view-fastest": lambda: _score(inputs, rows, read_view_fastest, frames[0]),
-        "unordered": lambda: _score_unordered(inputs, rows, frames),
-    }
-    scores: list[AlignmentScore] = []
-    for order, search in searches.items():
-        possible = missing > 0 or (missing == 0 and order == "unordered")
-        if possible and inputs.order in ("auto", order) and not any(score.ok for score in scores):
-            score = search()
-            scores += [] if score is None else [score]
-    return scores
+    if missing and inputs.order in ("auto", "view-major"):
+        yield _read_view_major(inputs, rows, frames[0])
+    if missing and inputs.order in ("auto", "view-fastest"):
+        yield _read(inputs, rows, read_view_fastest, frames[0])
+    if inputs.order in ("auto", "unordered"):
+        search = partial(read_unordered, color_of=_photo_colors(inputs, ids))
+        readings = (_read(inputs, rows, search, frame) for frame in frames)
+        yield next((reading for reading in readings if reading is not None), None)
 
 
-def _score(
+def _read(
     inputs: AlignmentInput, rows: ProjectedRows, search: Callable[[ProjectedRows], Layout | None], frame: Similarity
-) -> AlignmentScore | None:
+) -> Reading | None:
     """Score the layout that a search makes of the rows in one frame; None without one."""
     layout = search(rows.with_frame(frame))
     return None if layout is None else score_layout(inputs, layout, frame)
 
 
-def _score_view_major(inputs: AlignmentInput, rows: ProjectedRows, frame: Similarity) -> AlignmentScore | None:
-    """Score one view after the other in a frame, and at any other scale where that does not fit well."""
-    same = _score(inputs, rows, read_view_major, frame)
+def _read_view_major(inputs: AlignmentInput, rows: ProjectedRows, frame: Similarity) -> Reading | None:
+    """Read one view after the other in a frame, and at any other scale where that does not fit well."""
+    same = _read(inputs, rows, read_view_major, frame)
     if same is not None and same.worst_px >= _CERTAIN_PX:
         num_pixels = len(same.layout.views) * rows.cameras.width * rows.cameras.height
         if 2 * sum(map(len, same.layout.rows)) < num_pixels:  # with so many pixels to choose from, any row is near one
             same = replace(same, ok=False)
     if inputs.scale is not None or (same is not None and same.worst_px < _CERTAIN_PX):
         return same
-    other = _score_scaled(inputs, rows)
+    other = _read_scaled(inputs, rows)
     if other is None or same is None:
         return other or same
     return other if other.ok and (other.worst_px * _BETTER < same.worst_px or not same.ok) else same
 
 
-def _score_scaled(inputs: AlignmentInput, rows: ProjectedRows) -> AlignmentScore | None:
+def _read_scaled(inputs: AlignmentInput, rows: ProjectedRows) -> Reading | None:
     """Search for scale and pixels in turn, until neither changes."""
     scale = rough_scale(rows)
-    best = None if scale is None else _score(inputs, rows, read_view_major, scale_by(scale))
+    best = None if scale is None else _read(inputs, rows, read_view_major, scale_by(scale))
     far = max(FAR_PX, FAR * min(rows.cameras.width, rows.cameras.height))
     if scale is None or best is None or best.worst_px > far:
         return None
     every = replace(rows, points=inputs.gaussians.means.astype(np.float64))
     frame = scale_by(finer_scale(every, best.layout, scale))
     for _ in range(_ROUNDS):
-        score = _score(inputs, rows, read_view_major, frame)
-        if score is None or score.worst_px > _AS_GOOD * best.worst_px:
+        reading = _read(inputs, rows, read_view_major, frame)
+        if reading is None or reading.worst_px > _AS_GOOD * best.worst_px:
             break
-        best = score
+        best = reading
         frames = candidate_similarities(inputs.pairs(sample_layout(best.layout)), inputs.cameras, effort=1)
         frame = next((finer for finer in frames if finer.scale != 1), frame)
     return replace(best, ok=best.ok and best.worst_px < _CERTAIN_PX)
 
 
-def _score_unordered(inputs: AlignmentInput, rows: ProjectedRows, frames: list[Similarity]) -> AlignmentScore | None:
-    """Score rows in no order, in the first frame in which they are at the centres of pixels."""
-    color_of: ColorOf | None = None
-    if inputs.images is not None:
-        base = sh0_to_rgb(inputs.gaussians.sh0[rows.ids, 0])
-        photos = inputs.images.reshape(len(inputs.cameras), -1, 3)
-
-        def color_of(some: np.ndarray, view: int, pixels: np.ndarray) -> np.ndarray:
-            return np.abs(base[some].clip(0, 1) - photos[view, pixels]).mean(1)
-
-    scores = (_score(inputs, rows, partial(read_unordered, color_of=color_of), frame) for frame in frames)
-    return next((score for score in scores if score is not None), None)
+def _photo_colors(inputs: AlignmentInput, ids: np.ndarray) -> ColorOf | None:
+    """Return what measures the distances of some rows' base colours from the photos; None without photos."""
+    if inputs.images is None:
+        return None
+    base = sh0_to_rgb(inputs.gaussians.sh0[ids, 0])
+    photos = inputs.images.reshape(len(inputs.cameras), -1, 3)
+    return lambda rows, view, pixels: np.abs(base[rows].clip(0, 1) - photos[view, pixels]).mean(1)
 
 
 def read_unordered(rows: ProjectedRows, *, color_of: ColorOf | None = None) -> Layout | None:

@@ -2,31 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import rgb_to_sh0
 from gsmerge.io.cameras.camera_file import CameraFile, sizes_of, to_cameras
-from gsmerge.io.formats.read import FileInfo as PlyInfo
-from gsmerge.io.photo_files import (
-    ASPECT_TOLERANCE,
-    PhotoTransform,
-    Size,
-    resize_and_crop,
-    resize_to,
-    same_shape,
-)
-from gsmerge.kernels.matrices import invert, matmul
-from gsmerge.types import Cameras, Gaussians, Scene, grid_ids
+from gsmerge.io.formats.read import FileInfo
+from gsmerge.io.image_names import natural_key
+from gsmerge.io.photo_files import ASPECT_TOLERANCE, PhotoTransform, Size, resize_and_crop, resize_to, same_shape
+from gsmerge.types import Cameras
 
 MAY_BE_UNALIGNED: tuple[str, ...] = ("unordered", "none")  # orders of files whose rows need not belong to pixels
 TRIM = 8  # pixels that DepthSplat and its relatives cut off at every side
 PER_PIXEL = (1, 2, 3, 4, 16)  # Gaussians per pixel that backbones write
 DEPTH_SHARE = 0.9  # of each view's pixels, the nearest ones, that Depth Anything 3 keeps
-_MAX_SPREAD = 0.15  # of the Gaussians' depth over a depth map's: above it the map is not that of the Gaussians
 PATCH = 14  # sides of vision transformers' inputs are multiples of it
 SIDES = (504, 518)  # to which Depth Anything 3 and others resize the longer or the shorter side, pixels
 _ROUND = (8, PATCH)  # sides of grids that photos are cropped to are multiples of one of them
@@ -47,6 +39,11 @@ class Layout:
     rows: tuple[np.ndarray, ...]  # the rows of each block, of any shape: not a copy where a stride will do
     pixels: tuple[np.ndarray, ...]  # ``[p]`` the pixel ``y·W + x`` of each of these rows
     per_pixel: int = 1  # Gaussians per pixel; above 1 each layer is a block
+
+    def with_views_in(self, orders: Iterable[Sequence[int]]) -> Iterator[Layout]:
+        """Yield the same rows and pixels with the views in each of some orders."""
+        views = dict.fromkeys(tuple(order[view] for view in self.views) for order in orders)
+        return (replace(self, views=some) for some in views)
 
     @property
     def is_plain(self) -> bool:
@@ -93,6 +90,12 @@ def da3_box(width: int, height: int) -> KeptBox:
     """Return the box that Depth Anything 3 keeps."""
     top, left = int(8 / 256 * height), int(8 / 256 * width)
     return KeptBox("box", f"{top} rows and {left} columns trimmed at every border", top, left)
+
+
+def view_orders(names: Sequence[str]) -> list[tuple[int, ...]]:
+    """List the orders that a file's views may be in: that of their cameras, that of their names."""
+    views = range(len(names))
+    return [tuple(views), tuple(sorted(views, key=lambda view: natural_key(names[view])))]
 
 
 def every_nth(views: int) -> list[tuple[int, ...]]:
@@ -173,56 +176,6 @@ def depth_layouts(count: int, depths: np.ndarray) -> list[Layout]:
     return []
 
 
-def fill_from_depths(scene: Scene, depths: np.ndarray) -> Scene:
-    """Add a Gaussian for each pixel that the file has no row for, at the depth of the maps ``depths [v,h,w]``.
-
-    Units, and depth along z or distance, follow from the other pixels. The colour is the photo's; opacity, rotation
-    and size in pixels are those of the pixel before it in the row. The scene is unchanged if it has no photos,
-    lacks nothing, or its Gaussians do not lie at the maps' depths.
-    """
-    if scene.images is None or scene.missing is None:
-        return scene
-    V = scene.cameras.viewmats
-    views, height, width = scene.valid.shape
-    valid, g = scene.valid.reshape(views, -1), scene.gaussians
-    means = g.means.astype(np.float64).reshape(views, -1, 3)
-    y, x = np.mgrid[:height, :width].reshape(2, -1) + 0.5
-    pixels = np.stack([x, y, np.ones(x.size)], 1)
-    rays = matmul(pixels, invert(scene.cameras.Ks).transpose(0, 2, 1))  # [v,p,3] in the camera, z = 1
-    z = matmul(means, V[:, 2, :3, None])[..., 0] + V[:, 2, 3, None]
-    length = np.linalg.norm(rays, axis=2)
-    maps = depths.reshape(views, -1).astype(np.float64)
-    usable = valid & (maps > 0) & np.isfinite(maps) & (z > 0)
-    if not usable.any():
-        return scene
-    ratio = z[usable] / maps[usable]
-    fits = []
-    for along, ratios in enumerate((ratio, ratio * length[usable])):  # depth along z, distance
-        middle = float(np.median(ratios))
-        fits.append((float(np.median(np.abs(ratios / middle - 1))), middle, along))
-    spread, unit, along = min(fits)
-    if spread > _MAX_SPREAD:
-        return scene
-    new_z = unit * maps / (length if along else 1)
-    ranks = np.arange(usable.size).reshape(usable.shape)
-    before = np.maximum.accumulate(np.where(usable, ranks, 0), axis=1).reshape(-1)
-    before = np.where(usable.reshape(-1)[before], before, np.flatnonzero(usable)[0])
-    rows = np.flatnonzero(~valid & (maps > 0) & np.isfinite(maps))
-    view = rows // (height * width)
-    local = rays.reshape(-1, 3)[rows] * new_z.reshape(-1)[rows, None]
-    world = (V[view, :3, :3] * (local - V[view, :3, 3])[:, :, None]).sum(1)
-    source = before[rows]
-    full = Gaussians(**{field.name: getattr(g, field.name).copy() for field in fields(g)})
-    full.means[rows] = world
-    growth = new_z.reshape(-1)[rows] / z.reshape(-1)[source]
-    full.scales[rows] = g.scales[source] * growth.astype(np.float32)[:, None]
-    full.quats[rows], full.opacities[rows] = g.quats[source], g.opacities[source]
-    full.sh0[rows] = rgb_to_sh0(scene.images.reshape(-1, 1, 3)[rows])
-    kept = scene.valid.reshape(-1).copy()
-    kept[rows] = True
-    return replace(scene, gaussians=full, pixel_ids=grid_ids(kept))
-
-
 def subsample(layout: Layout, per_block: int) -> Layout:
     """Thin a layout to about ``per_block`` rows of each block, spread over all columns and rows."""
     rows, pixels = [], []
@@ -245,12 +198,14 @@ def spread_step(step: int, width: int) -> int:
 class GridFit:
     """One way to bring cameras and photos to the size of the grid."""
 
-    cameras: Cameras  # at the grid's size
+    camera_file: CameraFile  # the cameras as they are read, in one convention of the poses
+    cameras: Cameras  # the same at the grid's size
     transform: PhotoTransform | None  # what is done to the photos, if anything
     notes: tuple[str, ...]  # what it is, for people
     # what suggests it: a size in files (0), the number of rows and the photos' shape (1), the number alone (2), or a
     # network's usual sizes (3)
     rank: int = 0
+    moves: Sequence[dict[str, Any]] = ()  # how far each camera was moved to its Gaussians; empty where none was
 
     @property
     def size(self) -> Size:
@@ -266,7 +221,7 @@ class GridFit:
 def photo_grid(camera_file: CameraFile, size: Size | None) -> GridFit:
     """Assume that the grid has the photos' size, or the cameras' without photos; SceneError if the two disagree."""
     if size is None:
-        return GridFit(to_cameras(camera_file), None, ())
+        return GridFit(camera_file, to_cameras(camera_file), None, ())
     width, height = size
     for w, h in sizes_of(camera_file):
         if not same_shape((w, h), size) and not _are_stretched(camera_file, size):
@@ -276,7 +231,7 @@ def photo_grid(camera_file: CameraFile, size: Size | None) -> GridFit:
             raise SceneError(camera_file.path, problem, remedy)
     other = [s for s in sizes_of(camera_file) if s != size]
     notes = tuple(f"intrinsics scaled from {w} x {h} to the images' {width} x {height}" for w, h in other)
-    return GridFit(to_cameras(camera_file, size), None, notes)
+    return GridFit(camera_file, to_cameras(camera_file, size), None, notes)
 
 
 def _are_stretched(camera_file: CameraFile, size: Size) -> bool:
@@ -289,7 +244,7 @@ def _are_stretched(camera_file: CameraFile, size: Size) -> bool:
     return bool((np.abs(ratios - 1) <= ASPECT_TOLERANCE).all())
 
 
-def other_grids(ply: PlyInfo, camera_file: CameraFile, size: Size | None) -> Iterator[GridFit]:
+def other_grids(ply: FileInfo, camera_file: CameraFile, size: Size | None) -> Iterator[GridFit]:
     """Yield all other grids that the files and the number of rows allow, the likely first; ``size`` is the photos'."""
     known = sizes_of(camera_file)
     own = known[0] if len(known) == 1 else None
@@ -305,10 +260,10 @@ def other_grids(ply: PlyInfo, camera_file: CameraFile, size: Size | None) -> Ite
         ranked += [(3, t) for t in patch_grids(base) if ply.count < len(camera_file) * t.width * t.height]
     for rank, transform in ranked:
         note = f"{what} of {base[0]} x {base[1]} are {transform.description}, the Gaussian grid's size"
-        yield GridFit(transform.cameras(cameras), transform, (note,), rank)
+        yield GridFit(camera_file, transform.cameras(cameras), transform, (note,), rank)
         if not known and transform.crops:
             whole = to_cameras(camera_file, (transform.width, transform.height))
-            yield GridFit(whole, transform, (f"{note}; the intrinsics are those of the result",), rank)
+            yield GridFit(camera_file, whole, transform, (f"{note}; the intrinsics are those of the result",), rank)
 
 
 def _between(camera_file: CameraFile, size: Size, own: Size) -> Iterator[GridFit]:
@@ -318,11 +273,11 @@ def _between(camera_file: CameraFile, size: Size, own: Size) -> Iterator[GridFit
         if max(transform.scale_x, transform.scale_y) > _MAX_ENLARGED:
             continue  # previews: a fit to them would blur the Gaussians
         note = f"photos of {size[0]} x {size[1]} are {transform.description}, the cameras' and the Gaussian grid's size"
-        yield GridFit(cameras, transform, (note,))
+        yield GridFit(camera_file, cameras, transform, (note,))
     if not same_shape(own, size):
         for transform in (resize_to(own, size), resize_and_crop(own, size)):
             note = f"cameras of {own[0]} x {own[1]} are {transform.description}, the images' size"
-            yield GridFit(transform.cameras(cameras), None, (note,))
+            yield GridFit(camera_file, transform.cameras(cameras), None, (note,))
 
 
 def grids_of_count(count: int, views: int, size: Size) -> Iterator[PhotoTransform]:
@@ -365,7 +320,7 @@ def patch_grids(size: Size) -> list[PhotoTransform]:
     return list(dict.fromkeys(transforms))
 
 
-def small_photos_error(ply: PlyInfo, camera_file: CameraFile, size: Size | None) -> SceneError | None:
+def small_photos_error(ply: FileInfo, camera_file: CameraFile, size: Size | None) -> SceneError | None:
     """Make the SceneError for photos smaller than the cameras' size, of which the rows are the pixels; or None."""
     own = next((s for s in sizes_of(camera_file) if ply.count == len(camera_file) * s[0] * s[1]), None)
     if size is None or own is None or own == size:

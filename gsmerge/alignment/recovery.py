@@ -3,26 +3,28 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsmerge.alignment.cameras import other_conventions
-from gsmerge.alignment.incomplete import score_incomplete
+from gsmerge.alignment.cameras import describe_reading, other_conventions
+from gsmerge.alignment.incomplete import read_incomplete
 from gsmerge.alignment.layouts import MAY_BE_UNALIGNED, Layout, depth_layouts, exact_layouts, plain_layout, subsample
 from gsmerge.alignment.resection import projective_error
 from gsmerge.alignment.score import (
     MARGIN,
+    MAX_CHECKED,
     QUICK_SAMPLES,
     SAMPLES,
     Alignment,
     AlignmentInput,
-    AlignmentScore,
+    Reading,
     candidate_similarities,
     check_alignment,
     check_pairs,
     color_error,
+    find_correspondences,
     fits_all_cameras,
     pixel_errors,
     pixel_limit,
@@ -35,7 +37,7 @@ from gsmerge.alignment.score import (
 from gsmerge.errors import SceneError
 from gsmerge.geometry import IDENTITY
 from gsmerge.io.cameras.camera_file import CameraFile, Convention
-from gsmerge.io.formats.read import FileInfo as PlyInfo
+from gsmerge.io.formats.read import FileInfo
 from gsmerge.io.photo_files import ASPECT_TOLERANCE
 from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Cameras, Gaussians
@@ -51,15 +53,20 @@ _PLAIN_PX = 0.5  # a file whose rows are the grid as they are is not searched if
 # pixels from which no camera sees the rows of a layout: times the limit, and share of the shorter side
 _SEEN_LIMITS, _SEEN_SHARE = 2.0, 0.03
 _SEEN_SAMPLES = 200  # Gaussians of a view that it is judged by
-_SMALLEST_PX = 1e-3  # distances are compared as if none were smaller, pixels
+SMALLEST_PX = 1e-3  # distances are compared as if none were smaller, pixels
+_ORDERS = {  # in which rows may be instead, by the order of their layout
+    "view-fastest": "in the order row, column, view (view fastest)",
+    "column-major": "in the order view, column, row (column-major)",
+    "reversed": "with the views in reverse order",
+}
 
 
 @dataclass(frozen=True)
 class Recovery:
     """The winning reading of the rows, with its margin."""
 
-    best: AlignmentScore
-    runner_up: AlignmentScore | None  # the next best; None where the count allows no other
+    best: Reading
+    runner_up: Reading | None  # the next best; None where the count allows no other
     # how many times nearer the winner's Gaussians are to their pixels than the runner-up's, or than to shuffled pixels
     margin: float
     # how many times farther from the photos the runner-up's colours are, where only that decides between the two; None
@@ -84,35 +91,76 @@ class Recovery:
 def recover(inputs: AlignmentInput, *, exact_frames: bool = False) -> Recovery | None:
     """Find the reading under which every Gaussian projects into its own pixel; None where none stands out.
 
-    Of readings about equally near to the pixels, the photos' colours choose one. With ``exact_frames`` only cameras
-    in the frame of their file and files without missing pixels are considered: quick.
+    With ``exact_frames`` only cameras in the frame of their file and files without missing pixels are considered:
+    quick.
     """
     finite = int(inputs.valid.sum())
     if inputs.order == "none" or (finite < ENOUGH and finite < FEW * len(inputs.gaussians)):
         return None
     inputs = _without_same_labellings(inputs)
-    plain = _recover_plain(inputs)
-    if plain is not None:
-        return plain
-    scores: list[AlignmentScore] = []
-    layouts = possible_layouts(inputs)
-    searched = (0,) if exact_frames or not is_seen(inputs, layouts) else (0, 1, 2)
-    for effort in searched:
-        if not any(score.ok for score in scores):
-            scores += [score for layout in layouts for score in _score_labellings(inputs, layout, effort)]
-    if not (exact_frames or any(score.ok for score in scores)):
-        scores += score_incomplete(inputs)
-    scores.sort(key=lambda score: (not score.ok, score.worst_px))
-    if not scores or not scores[0].ok:
+    plain = _read_plain(inputs)
+    recovery = None if plain is None else _accept(inputs, [plain])
+    if recovery is not None:
+        return recovery
+    readings: list[Reading] = []
+    for tier in _readings(inputs, exact_frames=exact_frames):
+        readings += tier
+        if any(reading.ok for reading in readings):
+            return _accept(inputs, readings)
+    return None
+
+
+def _read_plain(inputs: AlignmentInput) -> Reading | None:
+    """Read the rows in order under the stored cameras, as most files need; None in doubt, for a longer search."""
+    cameras, count = inputs.cameras, len(inputs.gaussians)
+    expected = len(cameras) * cameras.width * cameras.height
+    if inputs.order not in ("auto", "view-major") or inputs.scale is not None or count != expected:
         return None
-    first, *others = scores
+    layouts = plain_layout(len(cameras), cameras.width, cameras.height).with_views_in(inputs.labellings)
+    best, *others = (score_layout(inputs, layout, IDENTITY) for layout in layouts)
+    far = SHUFFLED_MARGIN * max(best.worst_px, SMALLEST_PX)
+    return best if best.worst_px <= _PLAIN_PX and all(other.worst_px >= far for other in others) else None
+
+
+def _readings(inputs: AlignmentInput, *, exact_frames: bool) -> Iterator[list[Reading]]:
+    """Yield readings, those side by side that cost as much, the cheap first."""
+    layouts = possible_layouts(inputs)
+    for effort in (0,) if exact_frames or not is_seen(inputs, layouts) else (0, 1, 2):
+        yield [reading for layout in layouts for reading in _read_layout(inputs, layout, effort)]
+    if not exact_frames:
+        yield from ([reading] for reading in read_incomplete(inputs) if reading is not None)
+
+
+def _accept(inputs: AlignmentInput, readings: Sequence[Reading]) -> Recovery | None:
+    """Accept the reading that is nearest to its pixels, by far; None where none is.
+
+    Of readings about equally near, the one whose colours the photos have by far is accepted.
+    """
+    first, *others = sorted(readings, key=lambda reading: (not reading.ok, reading.worst_px))
+    if not first.ok:
+        return None
     others = [other for other in others if _differs(other.layout, first.layout)]
-    best = _refine(inputs, first)
-    close = [other for other in others if other.worst_px < MARGIN * max(best.worst_px, _SMALLEST_PX)]
+    best, runner_up = _refine(inputs, first), min(others, key=lambda other: other.worst_px, default=None)
+    close = [other for other in others if other.worst_px < MARGIN * max(best.worst_px, SMALLEST_PX)]
     if close:
-        return _choose_by_colors(inputs, [first, *close])
-    runner_up = min(others, key=lambda e: e.worst_px, default=None)
-    return _accept(inputs, best, runner_up)
+        close = [first, *close]
+        colors = [color_error(inputs, reading.layout) for reading in close]
+        chosen, second = sorted(range(len(close)), key=lambda i: (colors[i], i))[:2]
+        best, runner_up = _refine(inputs, close[chosen]), close[second]
+    shuffled_px, shuffled_color = score_shuffled(inputs, best)
+    px = max(best.worst_px, SMALLEST_PX)
+    if not (best.ok and shuffled_px >= SHUFFLED_MARGIN * px):
+        return None
+    margin = min(shuffled_px, math.inf if runner_up is None else runner_up.worst_px) / px
+    if not close:
+        confirmed = None  # where colours hardly vary, or there are no photos
+        if shuffled_color > _VARIES:
+            confirmed = color_error(inputs, best.layout) <= _UNCONFIRMED * shuffled_color
+        return Recovery(best, runner_up, margin, None, confirmed)
+    color, next_color = colors[chosen], min(colors[second], shuffled_color)  # NaN without photos: nothing is accepted
+    if not (next_color > _VARIES and next_color >= COLOR_MARGIN * color):
+        return None
+    return Recovery(best, runner_up, margin, next_color / max(color, 1e-3), True)
 
 
 def is_seen(inputs: AlignmentInput, layouts: Sequence[Layout]) -> bool:
@@ -144,54 +192,6 @@ def _without_same_labellings(inputs: AlignmentInput) -> AlignmentInput:
     return replace(inputs, labellings=[first, *(first if same(other) else other for other in others)])
 
 
-def _accept(inputs: AlignmentInput, best: AlignmentScore, runner_up: AlignmentScore | None) -> Recovery | None:
-    """Accept a reading that the pixels alone decide for; None where shuffled pixels are about as near."""
-    shuffled_px, shuffled_color = score_shuffled(inputs, best)
-    if not _stands_out(best, shuffled_px):
-        return None
-    next_px = min(shuffled_px, math.inf if runner_up is None else runner_up.worst_px)
-    margin = next_px / max(best.worst_px, _SMALLEST_PX)
-    confirmed = None  # where colours hardly vary, or there are no photos
-    if shuffled_color > _VARIES:
-        confirmed = color_error(inputs, best.layout) <= _UNCONFIRMED * shuffled_color
-    return Recovery(best, runner_up, margin, None, confirmed)
-
-
-def _recover_plain(inputs: AlignmentInput) -> Recovery | None:
-    """Take the rows in order under the stored cameras, as most files need; None in doubt, for a longer search."""
-    cameras, count = inputs.cameras, len(inputs.gaussians)
-    expected = len(cameras) * cameras.width * cameras.height
-    if inputs.order not in ("auto", "view-major") or inputs.scale is not None or count != expected:
-        return None
-    layout = plain_layout(len(cameras), cameras.width, cameras.height)
-    best, *others = (
-        score_layout(inputs, replace(layout, views=views), IDENTITY)
-        for views in dict.fromkeys(map(tuple, inputs.labellings))
-    )
-    distance = max(best.worst_px, _SMALLEST_PX)
-    if best.worst_px > _PLAIN_PX or any(other.worst_px < SHUFFLED_MARGIN * distance for other in others):
-        return None
-    return _accept(inputs, best, None)
-
-
-def _choose_by_colors(inputs: AlignmentInput, close: list[AlignmentScore]) -> Recovery | None:
-    """Choose the reading whose colours the photos have by far, of several about equally near to their pixels."""
-    ranked = sorted((color_error(inputs, score.layout), i) for i, score in enumerate(close))
-    (color, first), (next_color, second) = ranked[:2]
-    best, runner_up = _refine(inputs, close[first]), close[second]
-    shuffled_px, shuffled_color = score_shuffled(inputs, best)
-    others = min(next_color, shuffled_color)  # NaN without photos, which no comparison holds for
-    if not (_stands_out(best, shuffled_px) and others > _VARIES and others >= COLOR_MARGIN * color):
-        return None
-    margin = min(shuffled_px, runner_up.worst_px) / max(best.worst_px, _SMALLEST_PX)
-    return Recovery(best, runner_up, margin, others / max(color, 1e-3), True)
-
-
-def _stands_out(best: AlignmentScore, shuffled_px: float) -> bool:
-    """Return whether a reading is near to its pixels, and shuffled pixels are far from them."""
-    return best.ok and shuffled_px >= SHUFFLED_MARGIN * max(best.worst_px, _SMALLEST_PX)
-
-
 def possible_layouts(inputs: AlignmentInput) -> list[Layout]:
     """List the layouts that the number of rows allows, or the depth maps next to the cameras."""
     cameras, count = inputs.cameras, len(inputs.gaussians)
@@ -203,39 +203,34 @@ def possible_layouts(inputs: AlignmentInput) -> list[Layout]:
     return [layout for layout in layouts if inputs.order in ("auto", layout.order)]
 
 
-def _score_labellings(inputs: AlignmentInput, layout: Layout, effort: int) -> list[AlignmentScore]:
-    """Score the layout under the best frame for each likely order of the views; any order with effort 2."""
-    out: dict[tuple[int, ...], AlignmentScore] = {}
-    labellings = [[labelling[view] for view in layout.views] for labelling in inputs.labellings]
+def _read_layout(inputs: AlignmentInput, layout: Layout, effort: int) -> list[Reading]:
+    """Score a layout in its best frame for each likely order of the views; any order with effort 2."""
+    layouts = {labelled.views: labelled for labelled in layout.with_views_in(inputs.labellings)}
     lacks_views = len(set(layout.views)) < len(inputs.cameras)
-    if (lacks_views or effort == 2) and inputs.scale is None:
-        labellings.append(_nearest_views(inputs, layout) or [])
-    for labelling in labellings:
-        views = tuple(labelling)
-        if views and views not in out:
-            out[views] = _best_frame(inputs, replace(layout, views=views), QUICK_SAMPLES, effort)
-    return list(out.values())
+    nearest = _nearest_views(inputs, layout) if (lacks_views or effort == 2) and inputs.scale is None else None
+    if nearest is not None:
+        layouts.setdefault(nearest, replace(layout, views=nearest))
+    return [_best_frame(inputs, labelled, QUICK_SAMPLES, effort) for labelled in layouts.values()]
 
 
-def _best_frame(inputs: AlignmentInput, layout: Layout, samples: int, effort: int) -> AlignmentScore:
+def _best_frame(inputs: AlignmentInput, layout: Layout, samples: int, effort: int) -> Reading:
     pairs = inputs.pairs(sample_layout(layout, samples))
     frames = candidate_similarities(pairs, inputs.cameras, scale=inputs.scale, effort=effort)
-    scores = [score_layout(inputs, layout, frame, pairs) for frame in frames]
-    lowest = min(score.worst_px for score in scores)
-    best = next(score for score in scores if score.worst_px <= max(_SIMPLER * lowest, lowest + _SIMPLER_PX))
-    if best.ok and best.frame is not IDENTITY and inputs.scale is None:
-        return replace(best, ok=fits_all_cameras(best.frame, pairs, inputs.cameras))
-    return best
+    readings = [score_layout(inputs, layout, frame, pairs) for frame in frames]
+    lowest = min(reading.worst_px for reading in readings)
+    best = next(one for one in readings if one.worst_px <= max(_SIMPLER * lowest, lowest + _SIMPLER_PX))
+    solved = best.ok and best.frame is not IDENTITY and inputs.scale is None
+    ok = fits_all_cameras(best.frame, pairs, inputs.cameras) if solved else best.ok
+    return replace(best, ok=ok, quick=samples < SAMPLES)
 
 
-def _refine(inputs: AlignmentInput, score: AlignmentScore) -> AlignmentScore:
-    """Score the winner again, and solve its frame again, on more Gaussians."""
-    if score.layout.kind == "pruned":
-        return score
-    return _best_frame(inputs, score.layout, SAMPLES, 2 if score.frame.kind == "other" else 1)
+def _refine(inputs: AlignmentInput, reading: Reading) -> Reading:
+    """Score a reading again, and solve its frame again, on more Gaussians if they were few."""
+    effort = 2 if reading.frame.kind == "other" else 1
+    return _best_frame(inputs, reading.layout, SAMPLES, effort) if reading.quick else reading
 
 
-def _nearest_views(inputs: AlignmentInput, layout: Layout) -> list[int] | None:
+def _nearest_views(inputs: AlignmentInput, layout: Layout) -> tuple[int, ...] | None:
     """Find for each block the camera into whose pixels it projects best; None where two choose the same."""
     pairs = inputs.pairs(subsample(layout, 300))
     chosen = []
@@ -246,7 +241,7 @@ def _nearest_views(inputs: AlignmentInput, layout: Layout) -> list[int] | None:
         views = (np.full(len(own.rows), view) for view in range(len(inputs.cameras)))
         errors = [np.median(pixel_errors(replace(own, views=some), inputs.cameras)) for some in views]
         chosen.append(int(np.argmin(errors)))
-    return chosen if len(set(chosen)) * layout.per_pixel == len(chosen) else None
+    return tuple(chosen) if len(set(chosen)) * layout.per_pixel == len(chosen) else None
 
 
 def _differs(one: Layout, other: Layout) -> bool:
@@ -257,7 +252,7 @@ def _differs(one: Layout, other: Layout) -> bool:
     return not all(np.array_equal(x, y) for x, y in zip((*a.rows, *a.pixels), (*b.rows, *b.pixels), strict=True))
 
 
-def explain_count(ply: PlyInfo, inputs: AlignmentInput, camera_file: CameraFile) -> SceneError:
+def explain_count(ply: FileInfo, inputs: AlignmentInput, camera_file: CameraFile) -> SceneError:
     """Make the SceneError of rows that are no pixels; raise it where other cameras would make pixels of them."""
     cameras, count = inputs.cameras, len(inputs.gaussians)
     views, width, height = len(cameras), cameras.width, cameras.height
@@ -327,7 +322,10 @@ def explain_misalignment(
     pairs = sample_pixels(gaussians, cameras, valid)
     given = cameras.viewmats
     frames = candidate_similarities(pairs, cameras, effort=1)
-    others = [(poses.describe(convention), poses.viewmats) for poses in other_conventions(given, convention)]
+    others = [
+        (describe_reading(poses.convention, convention), poses.viewmats)
+        for poses in other_conventions(given, convention)
+    ]
     transposed = given.copy()
     transposed[:, :3, :3] = given[:, :3, :3].transpose(0, 2, 1)
     transposed[:, :3, 3] = -matmul(transposed[:, :3, :3], cameras.centres[:, :, None])[..., 0]
@@ -342,17 +340,13 @@ def explain_misalignment(
     for reason, viewmats in others:
         if check_pairs(pairs, replace(cameras, viewmats=viewmats)).ok:
             return reason
-    views, height, width = len(cameras), cameras.height, cameras.width
-    rows = np.arange(views * height * width)
-    by_pixel, by_column = rows.reshape(height, width, views), rows.reshape(views, width, height)
-    for reason, order in (
-        ("in the order row, column, view (view fastest)", by_pixel.transpose(2, 0, 1)),
-        ("in the order view, column, row (column-major)", by_column.transpose(0, 2, 1)),
-        ("with the views in reverse order", rows.reshape(views, -1)[::-1]),
-    ):
-        order = order.reshape(-1)
-        if check_alignment(gaussians[order], cameras, valid.reshape(-1)[order]).ok:
-            return f"the rows fit {reason}"
+    size = len(cameras), cameras.width, cameras.height
+    full = [one for one in exact_layouts(len(gaussians), *size) if one.kind == "full" and one.per_pixel == 1]
+    plain = plain_layout(*size)
+    for layout in (*full, replace(plain, order="reversed", views=plain.views[::-1])):
+        pairs = find_correspondences(gaussians.means, valid.reshape(-1), subsample(layout, MAX_CHECKED))
+        if layout.order in _ORDERS and check_pairs(pairs, cameras).ok:
+            return f"the rows fit {_ORDERS[layout.order]}"
     swapped = replace(cameras, width=cameras.height, height=cameras.width)
     if check_alignment(gaussians, swapped, valid).ok:
         return "the cameras fit with width and height swapped"

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from gsmerge.geometry import Schedule, descend, motion_matrices
+from gsmerge.geometry import Schedule, descend, motion_matrices, robust_weights
 from gsmerge.kernels.matrices import eigh, matmul, solve
 
 SCHEDULE = Schedule(steps=30, first=1e-3, ease=0.1, brake=10.0, most=1e8, min_gain=1e-10)
@@ -129,6 +129,5 @@ def projective_error(points: np.ndarray, pixels: np.ndarray) -> float:
         with np.errstate(all="ignore"):
             error = np.linalg.norm(places[:, :2] / places[:, 2:] - wanted, axis=1)
             error = np.where(np.isfinite(error), error, np.inf)
-            spread = 2 * float(np.median(error)) + _SMALLEST_ERROR
-            weights = 1 / ((np.abs(places[:, 2]) + _SMALLEST_ERROR) * np.sqrt(1 + (error / spread) ** 2))
+            weights = np.sqrt(robust_weights(error, 2, _SMALLEST_ERROR, np.abs(places[:, 2]) + _SMALLEST_ERROR))
     return size * float(np.median(error))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal, get_args
 
 import numpy as np
 
@@ -11,10 +10,9 @@ from gsmerge.alignment.layouts import spread_step
 from gsmerge.geometry import multiply_quats, normalize, quat_to_rotmat, rotmat_to_quat
 from gsmerge.kernels.pictures import convolve
 from gsmerge.runtime.memory import free_pages
+from gsmerge.settings.reading import QuatChoice
 from gsmerge.types import Scene
 
-QuatChoice = Literal["auto", "wxyz", "xyzw", "xyzw-root", "camera"]
-QUATS: tuple[str, ...] = get_args(QuatChoice)
 _SAMPLES = 3000  # pixels per view whose surface is used
 _STEP = 2  # pixels to the neighbours that span the surface
 _FLAT = 0.8  # thinnest over middle scale, at most, where a Gaussian's thinnest axis is a normal of its surface

@@ -14,7 +14,7 @@ import numpy as np
 
 from gsmerge.alignment.layouts import Layout, plain_layout, subsample
 from gsmerge.alignment.resection import projection_errors, refine_poses, start_pose
-from gsmerge.geometry import IDENTITY, Similarity, camera_centres, project_points, sh0_to_rgb
+from gsmerge.geometry import IDENTITY, Similarity, camera_centres, project_points, robust_weights, sh0_to_rgb
 from gsmerge.kernels.elementary import arccos, log
 from gsmerge.kernels.matrices import closest_rotation, eigh, invert, matmul, solve_symmetric
 from gsmerge.runtime.memory import free_pages
@@ -145,8 +145,7 @@ def _solve(
         away = points - solution[0] * centres - shift
         depth = np.abs((away * rays).sum(1)) + 1e-12
         angle = np.linalg.norm(_apply(across, away), axis=1) / depth
-        spread = 3 * np.median(angle) + 1e-12
-        weights = 1 / (depth**2 * (1 + (angle / spread) ** 2))
+        weights = robust_weights(angle, 3, 1e-12, depth)
     return Similarity(rotation, float(solution[0]), shift)
 
 
@@ -209,7 +208,7 @@ class AlignmentInput:
     valid: np.ndarray  # ``[n]`` bool
     cameras: Cameras  # all c cameras at the grid's size, in their own world
     images: np.ndarray | None  # ``[c,h,w,3]``, or None
-    labellings: Sequence[Sequence[int]]  # orders that the views may be in: the file's, that of the names
+    labellings: Sequence[tuple[int, ...]]  # orders that the views may be in: the file's, that of the names
     # reads ``[c,h,w]`` depth maps next to the cameras; None where there are none
     depths: Callable[[], np.ndarray | None]
     order: str = "auto"  # the order of the rows where it is given, otherwise "auto"
@@ -232,14 +231,15 @@ def find_correspondences(means: np.ndarray, valid: np.ndarray, layout: Layout) -
 
 
 @dataclass(frozen=True)
-class AlignmentScore:
-    """One reading of a file, and how well it fits."""
+class Reading:
+    """One way to read the rows of a file as pixels, and how well it fits."""
 
     layout: Layout  # which row belongs to which pixel
     frame: Similarity  # from the frame of the cameras to that of the Gaussians
     median_px: float  # median distance of the projected Gaussians from their pixels; inf where most are behind
     worst_px: float  # the same of the worst view
     ok: bool  # whether it is near enough to be true
+    quick: bool = False  # whether it was scored, and its frame solved, on few Gaussians
 
     @property
     def description(self) -> str:
@@ -259,7 +259,7 @@ def sample_layout(layout: Layout, samples: int = SAMPLES) -> Layout:
 
 def score_layout(
     inputs: AlignmentInput, layout: Layout, frame: Similarity, pairs: Correspondences | None = None
-) -> AlignmentScore:
+) -> Reading:
     """Score a layout in a frame, on a sample of its rows or on ``pairs`` that are at hand."""
     if pairs is None:
         pairs = inputs.pairs(sample_layout(layout))
@@ -267,10 +267,10 @@ def score_layout(
     medians = [float(np.median(part)) for part in pairs.split(errors, len(layout.views)) if len(part)]
     median, worst = float(np.median(errors)) if len(errors) else math.inf, max(medians, default=math.inf)
     ok = bool(medians) and worst < pixel_limit(layout.width, layout.height) and bool(np.isfinite(errors).mean() > 0.5)
-    return AlignmentScore(layout, frame, median, worst, ok)
+    return Reading(layout, frame, median, worst, ok)
 
 
-def score_shuffled(inputs: AlignmentInput, best: AlignmentScore) -> tuple[float, float]:
+def score_shuffled(inputs: AlignmentInput, best: Reading) -> tuple[float, float]:
     """Measure the median distance, pixels, and the mean colour distance, with pixels shuffled within each block."""
     rng, some = np.random.default_rng(0), sample_layout(best.layout)
     pairs = inputs.pairs(replace(some, pixels=tuple(rng.permutation(pixels) for pixels in some.pixels)))

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsmerge.alignment.cameras import Poses, other_conventions
+from gsmerge.alignment.cameras import Poses, describe_reading, other_conventions
 from gsmerge.alignment.score import MARGIN, AlignmentInput, candidate_similarities
 from gsmerge.errors import SceneError
 from gsmerge.geometry import IDENTITY, Similarity, lower_median, project_points, sh0_to_rgb
@@ -150,7 +150,7 @@ def choose_cameras(
     if poses is None:
         return inputs.cameras, camera_file, [note] if note else []
     cameras = replace(inputs.cameras, viewmats=poses.viewmats)
-    note = f"{poses.describe(camera_file.convention)}: read so"
+    note = f"{describe_reading(poses.convention, camera_file.convention)}: read so"
     return cameras, with_convention(camera_file, poses.convention), [note]
 
 
@@ -169,26 +169,33 @@ def _choose_frame(inputs: AlignmentInput, usual: CameraCheck) -> Similarity | No
     """
     if inputs.images is None:
         return None
+    frames = [IDENTITY, *_exporter_frames(inputs)]
+    best = _best_frame(inputs, frames)
+    if inputs.scale is None and not _stands_out(inputs, best):
+        best = _best_frame(
+            inputs, [best, *(_solve_scale(inputs, frame) for frame in (IDENTITY, frames[1], frames[-1]))]
+        )
+    enough = max(_score_frame(inputs, IDENTITY), usual.score if usual.ok else 0.0)
+    return best if _stands_out(inputs, best) and _score_frame(inputs, best) > _FRAME_GAIN * enough else None
+
+
+def _score_frame(inputs: AlignmentInput, frame: Similarity, samples: int = _SEEN_SAMPLES) -> float:
+    """Score what the cameras see in a frame; 0 where the photos cannot tell."""
     # the first camera may see all Gaussians at any scale
     seen = slice(1 if len(inputs.cameras) > 1 else 0, None)
+    images = None if inputs.images is None else inputs.images[seen]
+    check = check_cameras(inputs.gaussians, inputs.valid, frame.move(inputs.cameras)[seen], images, samples)
+    return 0.0 if np.isnan(check.color_ratio) or not check.ok else check.score
 
-    def score(frame: Similarity, samples: int = _SEEN_SAMPLES) -> float:
-        cameras = frame.move(inputs.cameras)[seen]
-        images = None if inputs.images is None else inputs.images[seen]
-        check = check_cameras(inputs.gaussians, inputs.valid, cameras, images, samples)
-        return 0.0 if np.isnan(check.color_ratio) or not check.ok else check.score
 
-    def stands_out(frame: Similarity) -> bool:
-        beside = (score(_scaled(frame, factor)) for factor in (1 / _PEAK, _PEAK))
-        return score(frame) > _PEAK_GAIN * max(beside)
+def _best_frame(inputs: AlignmentInput, frames: Iterable[Similarity], samples: int = _SEEN_SAMPLES) -> Similarity:
+    return max(frames, key=lambda frame: _score_frame(inputs, frame, samples))
 
-    frames = [IDENTITY, *_exporter_frames(inputs)]
-    best = max(frames, key=score)
-    if inputs.scale is None and not stands_out(best):
-        scaled = (_solve_scale(frame, score) for frame in (IDENTITY, frames[1], frames[-1]))
-        best = max((best, *scaled), key=score)
-    enough = max(score(IDENTITY), usual.score if usual.ok else 0.0)
-    return best if stands_out(best) and score(best) > _FRAME_GAIN * enough else None
+
+def _stands_out(inputs: AlignmentInput, frame: Similarity) -> bool:
+    """Return whether a frame scores clearly higher than with scales beside its own."""
+    beside = (_score_frame(inputs, _scaled(frame, factor)) for factor in (1 / _PEAK, _PEAK))
+    return _score_frame(inputs, frame) > _PEAK_GAIN * max(beside)
 
 
 def _scaled(frame: Similarity, factor: float) -> Similarity:
@@ -200,12 +207,10 @@ def _scaled(frame: Similarity, factor: float) -> Similarity:
     return replace(frame, scale=scale, shift=factor * frame.shift, description=words)
 
 
-def _solve_scale(frame: Similarity, score: Callable[[Similarity, int], float]) -> Similarity:
+def _solve_scale(inputs: AlignmentInput, frame: Similarity) -> Similarity:
     """Find the scale under which the colours are nearest to the photos."""
-    tried = (_scaled(frame, float(scale)) for scale in _SCALES)
-    best = max(tried, key=lambda one: score(one, _SCALE_SAMPLES))
+    best = _best_frame(inputs, (_scaled(frame, float(scale)) for scale in _SCALES), _SCALE_SAMPLES)
     for reach, steps, samples in _FINER:
         factors = exp(np.linspace(-reach, reach, steps))
-        near = [_scaled(best, float(factor)) for factor in factors]
-        best = max(near, key=lambda one: score(one, samples))
+        best = _best_frame(inputs, [_scaled(best, float(factor)) for factor in factors], samples)
     return best

@@ -3,44 +3,46 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from string import Formatter
 from typing import Any
 
 from gsmerge.io import OUTPUT_FORMATS, output_format
-from gsmerge.io.formats.read import OpacityChoice
-from gsmerge.options import CHECKPOINTS, CompactOptions
-from gsmerge.runtime.work import Engine
 from gsmerge.scene.content_hash import digest
-from gsmerge.scene.exporters import AUTO, ReadHints
+from gsmerge.settings.compact import CHECKPOINTS, CompactOptions
+from gsmerge.settings.reading import OpacityChoice, ReadHints
+from gsmerge.settings.setting import Settings, setting
+from gsmerge.settings.stages import Engine
 
 FIELDS = ("stem", "parent", "index", "k")
 
 
 @dataclass(frozen=True)
-class BatchOptions:
-    """Settings of :func:`gsmerge.batch.run_batch`; ValueError if one is out of range."""
+class BatchOptions(Settings):
+    """Settings of :func:`gsmerge.batch.run_batch`."""
 
-    settings: CompactOptions = field(default_factory=CompactOptions)  # of a scene; no threads: processors by jobs
-    opacity: OpacityChoice = "auto"  # how all files store opacity
-    hints: ReadHints = AUTO  # what is known of all files and need not be recognised
-    # Cameras, and folder of photos, of a scene: one path for all, or with ``{scene}``, ``{parent}`` and ``{stem}`` in
-    # it; None: next to each scene.
-    cameras: str | None = None
-    images: str | None = None
-    # Name of a result in the output folder, made of ``{stem}`` (the scene's name), ``{parent}`` (name of the folder it
-    # is in), ``{index}`` (its place in the list, from 0) and ``{k}``; its ending says the format.
-    output: str = "{stem}.ply"
-    jobs: int | None = None  # scenes at once; None: as many as processors and memory allow
-    max_memory: int | None = None  # bytes that they may take together; None: what is free, on the nodes of Ray always
-    timeout: float | None = None  # seconds that a scene may take; None: any
-    retries: int = 1  # how often a scene is tried again if its process died or took too long
-    rerun: bool = False  # compact scenes again that are done
-    overwrite: bool = False  # replace files in the output folder that no batch wrote
-    engine: str = "local"  # "local": processes on this machine; "ray": a Ray cluster
-    address: str | None = None  # of the Ray cluster; None: one of this machine alone, started for the run
+    settings: CompactOptions = setting(CompactOptions(), "Of each scene; no threads, which are processors by jobs.")
+    opacity: OpacityChoice = setting("auto", "How all files store opacity.")
+    hints: ReadHints = setting(ReadHints(), "What is known of all files and need not be recognised.")
+    cameras: str | None = setting(None, "Cameras: one path for all scenes, or with {scene}, {parent} and {stem} of "
+        "each in it.",
+        "By default those beside each scene.")  # fmt: skip
+    images: str | None = setting(None, "Folder of the photos, in the same way.")
+    output: str = setting("{stem}.ply", "Name of a result in the output folder: {stem} (the scene's name), {parent} "
+        "(the folder it is in), {index} (its place in the list, from 0) and {k} are filled in; its ending says the "
+        "format.")  # fmt: skip
+    jobs: int | None = setting(None, "Scenes at once.", "By default as many as processors and memory allow.", least=1)
+    max_memory: int | None = setting(None, "Memory that all scenes at once may take.",
+        "By default what is free, which is also the limit on the nodes of Ray.", least=1, unit="bytes")  # fmt: skip
+    timeout: float | None = setting(None, "Seconds that a scene may take.", above=0, unit="seconds")
+    retries: int = setting(1, "How often a scene is tried again whose process died or took too long.", least=0)
+    rerun: bool = setting(False, "Compact scenes again that are done.")
+    overwrite: bool = setting(False, "Replace files in the output folder that no batch wrote.")
+    engine: str = setting("local", "Where scenes are compacted, see `Engine`.")
+    address: str | None = setting(None, "Address of the Ray cluster, see `Engine`.")
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         try:
             names = [name for _, name, _, _ in Formatter().parse(self.output) if name is not None]
             example = self.output.format(**dict.fromkeys(FIELDS, 1))
@@ -61,17 +63,8 @@ class BatchOptions:
         budget = self.settings.budget
         if budget.in_bytes and output_format(self.output).ending != ".ply":
             raise ValueError(f"budget {budget.budget}: expected an output as .ply, got {self.output}; give a number")
-        is_ray = Engine(self.engine, self.address).name == "ray"
-        memory = self.max_memory
-        for is_possible, problem in (
-            (self.jobs is None or self.jobs >= 1, f"jobs: expected at least 1, got {self.jobs}"),
-            (memory is None or memory >= 1, f"max memory: expected at least 1 byte, got {memory}"),
-            (self.timeout is None or self.timeout > 0, f"timeout: expected more than 0 s, got {self.timeout}"),
-            (self.retries >= 0, f"retries: expected at least 0, got {self.retries}"),
-            (memory is None or not is_ray, "max memory: expected engine local; Ray knows the memory of its nodes"),
-        ):
-            if not is_possible:
-                raise ValueError(problem)
+        if Engine(self.engine, self.address).name == "ray" and self.max_memory is not None:
+            raise ValueError("max_memory: expected engine local; Ray knows the memory of its nodes")
 
     def result_settings(self) -> dict[str, Any]:
         """Return everything that a result depends on besides the scene's files, as plain values."""

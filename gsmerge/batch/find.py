@@ -10,16 +10,16 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from gsmerge.batch.batch_options import BatchOptions
-from gsmerge.budget import AUTO
 from gsmerge.compaction.files import level_output
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import SCENE_SUFFIXES
 from gsmerge.io.bounds import read_text
 from gsmerge.io.formats.ply import header_counts
-from gsmerge.options import CompactOptions
 from gsmerge.runtime.estimate import memory_bytes
 from gsmerge.scene.content_hash import stem_of
 from gsmerge.scene.files import IMAGE_PLACES, PLY_PLACES, SceneFiles, named_ply, other_plys
+from gsmerge.settings.budget import AUTO
+from gsmerge.settings.compact import CompactOptions
 
 MAX_FOLDERS = 100_000  # without a scene; a link to a system's folders leads to more
 FOLDERS_PER_SCENE = 5  # that are not counted for it

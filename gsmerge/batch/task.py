@@ -36,11 +36,11 @@ from gsmerge.batch.records import (
 from gsmerge.compaction.files import compact_files
 from gsmerge.errors import SceneError, UsageError, error_line
 from gsmerge.io.atomic import remove_stale
-from gsmerge.options import CHECKPOINTS
 from gsmerge.report import SCHEMA_VERSION, file_sha256, finite
 from gsmerge.runtime.jsonl import append_line
 from gsmerge.scene.content_hash import content_hash, digest, filled, read_files
 from gsmerge.scene.files import SceneFiles, find_scene_files
+from gsmerge.settings.compact import CHECKPOINTS
 
 PREFIX = ".batch-"  # of the names of all files here, which are in the output folder
 RUN_TIMEOUT = 10.0  # seconds: other runs look at the lock of a run for an instant only
@@ -89,11 +89,11 @@ def run_task(task: Task, context: BatchContext, new_records: RecordIndex) -> dic
 
 def run_recorded(task: Task, context: BatchContext) -> dict[str, Any]:
     """Compact a scene in a process that keeps the index of new records from call to call, see :func:`run_task`."""
-    return run_task(task, context, new_records(context.folder, context.start))
+    return run_task(task, context, make_index(context.folder, context.start))
 
 
 @lru_cache(maxsize=1)
-def new_records(folder: Path, start: int) -> RecordIndex:
+def make_index(folder: Path, start: int) -> RecordIndex:
     """Return the index of records since the run began, one for all calls in a process."""
     return RecordIndex(folder, start)
 

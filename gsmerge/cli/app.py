@@ -17,7 +17,6 @@ import typer
 
 from gsmerge import __version__
 from gsmerge.cli.console import plain_warnings, say
-from gsmerge.cli.parameters import HINTS
 from gsmerge.errors import (
     DAMAGED_OPENCV,
     NO_TORCH,
@@ -32,6 +31,9 @@ from gsmerge.errors import (
 )
 from gsmerge.runtime.plugins import COMMANDS as PLUGINS
 from gsmerge.runtime.plugins import find_plugins, load_plugin
+from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.reading import FileHints
+from gsmerge.settings.setting import flat_settings
 
 PROGRAM = "gsmerge"
 INTERRUPTED = 130
@@ -137,18 +139,18 @@ def _suggest(option: str, parameters: Sequence[Any]) -> str | None:
     if name in BUDGET_WORDS and "budget" in names:
         more = ", or --k" if "k" in names else ""
         return f"{option} is no option: use --budget, such as 2%, 40000 or 5MB{more}"
-    if name in HINTS and "hint" in names:
+    if name in flat_settings(FileHints) and "hint" in names:
         return f"{option} is no option: use --hint {name}=VALUE"
     if "set" not in names:
         return None
     from gsmerge.cli.paths import FileOptions
-    from gsmerge.options import CompactOptions
 
-    known = {**CompactOptions().to_dict(), **vars(FileOptions())}
+    known = flat_settings(CompactOptions) | flat_settings(FileOptions)
     positive = name.removeprefix("no_")
     if positive not in known:
         return None
-    value = str(not known[positive]).lower() if isinstance(known[positive], bool) else "VALUE"
+    default = known[positive].default
+    value = str(not default).lower() if isinstance(default, bool) else "VALUE"
     return f"{option} is no option: use --set {positive}={value}"
 
 

@@ -112,7 +112,7 @@ def batch(args: opt.Args) -> None:
 
 
 def _bytes(text: str | None) -> int | None:
-    from gsmerge.budget import parse_bytes
+    from gsmerge.settings.budget import parse_bytes
 
     try:
         return None if text is None else parse_bytes(text)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from gsmerge.cli.parameters import Args, usage_errors
 from gsmerge.errors import SceneError, UsageError
+from gsmerge.settings.evaluate import NETS
 
 if TYPE_CHECKING:
     from gsmerge.io import GaussianFile
@@ -22,7 +23,6 @@ SAME = 1e-5  # difference of two poses, of 1 and of their numbers, that writing 
 
 def lpips_networks(choice: str | None) -> tuple[tuple[str, ...], list[str]]:
     """Choose the networks of ``--lpips``, or those that are installed, with a note where none is."""
-    from gsmerge.measure.evaluate import NETS
     from gsmerge.measure.lpips import INSTALL, lpips_available
 
     if choice is None:

@@ -26,9 +26,9 @@ from gsmerge.cli.paths import (
 from gsmerge.errors import TargetError, UsageError
 
 if TYPE_CHECKING:
-    from gsmerge.options import CompactOptions
     from gsmerge.scene.exporters import ReadHints
     from gsmerge.scene.files import SceneFiles
+    from gsmerge.settings.compact import CompactOptions
 
 
 STREAMED_LEVELS = 3  # of a lod-meta.json: the coarsest, a sixteenth, is there at once
@@ -51,7 +51,7 @@ def compact(args: opt.Args) -> None:
     hints = args.hints()
     from gsmerge.compaction.files import level_output
     from gsmerge.io.cameras.json_files import viewer_cameras_path
-    from gsmerge.options import CompactOptions
+    from gsmerge.settings.compact import CompactOptions
 
     settings, writing = args.make(CompactOptions, FileOptions)
     settings = _with_engine(settings, args)
@@ -105,7 +105,8 @@ def compact(args: opt.Args) -> None:
 
 def _with_engine(settings: CompactOptions, args: opt.Args) -> CompactOptions:
     """Return the settings with the engine that was asked for; UsageError where it is not installed."""
-    from gsmerge.runtime.work import Engine, require_ray
+    from gsmerge.runtime.work import require_ray
+    from gsmerge.settings.stages import Engine
 
     with opt.usage_errors():
         engine = Engine(args.engine, args.address)

@@ -29,7 +29,7 @@ def decode(args: opt.Args) -> None:
     check_outputs((out,), (args.encoded,), overwrite=args.overwrite or args.dry_run)
     from gsmerge.fit import FitOptions
     from gsmerge.online.decode_stored import decode_file, decoding_line
-    from gsmerge.options import CompactOptions
+    from gsmerge.settings.compact import CompactOptions
 
     wanted, writing = args.make(FitOptions, FileOptions, viewer_cameras=False)  # a .gsm has no names of views
     check_format(out, writing)

@@ -17,8 +17,7 @@ from gsmerge.errors import UsageError
     opt.argument("state", Path, "STATE", "A .gsm file: of gsmerge extend or encode, or made by the first batch."),
     opt.argument("scenes", list[Path], "SCENE", "Batches of new views, in order: each a scene as of compact."),
     f"{opt.READING} k superpixels",
-    opt.changed("max_k", help="Most Gaussians per superpixel that can be decoded later: fixed by the first batch.",
-                show_default="4"),
+    *opt.panel(opt.COUNT, opt.setting_option("max_k")),
     "effort recipe checkpoint set",
     opt.RUN,
 )  # fmt: skip
@@ -30,7 +29,7 @@ def extend(args: opt.Args) -> None:
         raise UsageError("--cameras and --images: expected one batch with them, got several; extend by one at a time")
     from gsmerge.online.file import batch_line, extend_file
     from gsmerge.online.options import OnlineOptions
-    from gsmerge.options import CompactOptions
+    from gsmerge.settings.compact import CompactOptions
 
     settings = args.values(CompactOptions, OnlineOptions)
     batches = [args.files(scene) for scene in args.scenes]

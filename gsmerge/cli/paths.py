@@ -9,34 +9,25 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gsmerge.errors import SceneError, UsageError
+from gsmerge.settings.budget import BudgetOptions
+from gsmerge.settings.compact import CHECKPOINTS
+from gsmerge.settings.setting import Settings, setting
 
 if TYPE_CHECKING:
-    from gsmerge.budget import BudgetOptions
     from gsmerge.scene.files import SceneFiles
 
 
 @dataclass(frozen=True)
-class FileOptions:
-    """How a result is written.
+class FileOptions(Settings):
+    """How a result is written."""
 
-    Args:
-        normals: Write the three columns of zeros that some viewers want of a ``.ply``, 12 of its 68 bytes per
-            Gaussian; a ``budget`` in bytes counts them.
-        spz_version: Version of a ``.spz``: 3, which most programs read, or 4, with room for harmonics of degree 4;
-            it needs ``gsmerge[spz4]``.
-        viewer_cameras: Write the input views beside the result of ``compact``, as ``NAME.cameras.json`` for viewers.
-
-    Raises:
-        ValueError: If the version is unknown.
-    """
-
-    normals: bool = True
-    spz_version: int = 3
-    viewer_cameras: bool = True
-
-    def __post_init__(self) -> None:
-        if self.spz_version not in (3, 4):
-            raise ValueError(f"spz_version: expected 3 or 4, got {self.spz_version}")
+    normals: bool = setting(True, "Write the three columns of zeros that some viewers want of a `.ply`, 12 of its 68 "
+        "bytes per Gaussian; a `budget` in bytes counts them.")  # fmt: skip
+    spz_version: int = setting(3, "Version of a `.spz`: 3, which most programs read, or 4, with room for harmonics of "
+        "degree 4.",
+        "The latter needs `gsmerge[spz4]`.", choices=(3, 4))  # fmt: skip
+    viewer_cameras: bool = setting(True, "Write the input views beside the result of `compact`, as `NAME.cameras.json` "
+        "for viewers.")  # fmt: skip
 
 
 def default_output(ply: Path) -> Path:
@@ -141,8 +132,6 @@ def input_files(files: SceneFiles) -> tuple[Path, ...]:
 
 def checkpoint_files(checkpoint: str) -> tuple[Path, ...]:
     """Return the file that ``checkpoint`` names; none where it is one of the package's own names."""
-    from gsmerge.options import CHECKPOINTS
-
     return () if checkpoint in CHECKPOINTS else (Path(checkpoint),)
 
 

@@ -53,7 +53,7 @@ def render(args: opt.Args) -> None:
     kind, overwrite = _choose_kind(args), args.overwrite or args.dry_run
     from gsmerge.measure import drawings
     from gsmerge.measure.preview import is_video
-    from gsmerge.stages.superpixels import SegmentOptions
+    from gsmerge.settings.stages import SegmentOptions
 
     files = like = args.files(args.scenes[0])
     (segmentation,) = args.make(SegmentOptions)

@@ -26,7 +26,8 @@ from gsmerge.errors import UsageError
 def view(args: opt.Args) -> None:
     """Show a scene, alone or beside its compact versions, in the browser: photos, stills, 3D, scores in one file."""
     from gsmerge.report import document_head
-    from gsmerge.stages.superpixels import SegmentOptions, count_for
+    from gsmerge.settings.stages import SegmentOptions
+    from gsmerge.stages.superpixels import count_for
 
     (segmentation,) = args.make(SegmentOptions)
     args.after = args.after or []

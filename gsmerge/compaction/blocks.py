@@ -10,7 +10,6 @@ from typing import Any, TypeVar
 import numpy as np
 
 from gsmerge.alignment.registration.join import concat_scenes
-from gsmerge.budget import parse_share, share_text
 from gsmerge.compaction.result import CompactReport, CompactResult, measure_psnr
 from gsmerge.facts.partition import (
     Block,
@@ -24,7 +23,6 @@ from gsmerge.facts.partition import (
 from gsmerge.facts.prepare import Frame, Prepared, prepare, scene_frame
 from gsmerge.facts.views import in_float64, subset
 from gsmerge.fit import fit_scene, peak_weights
-from gsmerge.options import CompactOptions
 from gsmerge.pipeline import start
 from gsmerge.plan import Plan, WholePlan, make_plan
 from gsmerge.raster import contributions, plan_view
@@ -35,8 +33,11 @@ from gsmerge.runtime.estimate import memory_bytes
 from gsmerge.runtime.memory import free_pages, peak_memory
 from gsmerge.runtime.record import Record, add_seconds, choose, current_record, note, record_part, stage
 from gsmerge.runtime.threads import in_turn
+from gsmerge.runtime.work import start_work
+from gsmerge.settings.budget import parse_share, share_text
+from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.stages import AUTO_SHARE
 from gsmerge.stages.clean import faintest_dropped
-from gsmerge.stages.superpixels import AUTO_SHARE
 from gsmerge.types import Decoded, Gaussians, Scene
 
 T = TypeVar("T")
@@ -66,7 +67,8 @@ def compact_in_blocks(given: Scene, options: CompactOptions, whole: WholePlan) -
         frame, options = scene_frame(given), with_whole_choices(options, whole)
     size = gaussians_at_once(given.num_gaussians, count)
     memory = memory_bytes(size, photos=given.images is not None, num_rest=3 * given.gaussians.shN.shape[1])
-    with options.blocks.engine.start(threads=options.threads, memory=memory) as work:
+    engine = options.blocks.engine
+    with start_work(engine.name, engine.address, threads=options.threads, memory=memory) as work:
         seen = work.share(covisibility)
 
         def pieces() -> Iterator[tuple[Any, ...]]:

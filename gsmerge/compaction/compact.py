@@ -10,12 +10,12 @@ from gsmerge.compaction.methods import Build, choose_method
 from gsmerge.compaction.result import Candidate, CompactResult, make_result, score
 from gsmerge.compaction.search import level_counts, search_count
 from gsmerge.facts.prepare import Prepared, prepare
-from gsmerge.options import CompactOptions
 from gsmerge.pipeline import build
 from gsmerge.plan import Plan, make_plan, note_engine, plan_whole
 from gsmerge.runtime.record import Progress, record_part, record_run
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.read import as_scene
+from gsmerge.settings.compact import CompactOptions
 from gsmerge.stages.clean import clean_to_count
 from gsmerge.stages.segment import measure_size
 from gsmerge.types import Scene, StrPath

@@ -17,16 +17,16 @@ from gsmerge.io.cameras.embedded import camera_comments
 from gsmerge.io.cameras.json_files import viewer_cameras, write_transforms
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.formats.arrays import LOGIT_COMMENT
-from gsmerge.io.formats.read import OpacityChoice
 from gsmerge.io.formats.streamed import INDEX, remove_unused_chunks
 from gsmerge.io.formats.write import add_levels
-from gsmerge.options import CompactOptions
 from gsmerge.report import report_document, to_json
 from gsmerge.runtime.memory import release_memory
 from gsmerge.runtime.record import Progress
 from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import SceneFiles
 from gsmerge.scene.read import Loaded, load_files
+from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Scene
 
 NO_PHOTOS = "no photos found, so nothing is fitted and no PSNR measured; name their folder with --images"

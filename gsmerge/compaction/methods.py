@@ -12,10 +12,10 @@ from typing import Literal
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import Prepared
 from gsmerge.fit import Fitted
-from gsmerge.options import CompactOptions
 from gsmerge.plan import Plan
 from gsmerge.runtime.plugins import METHODS, load_plugin
 from gsmerge.runtime.record import note
+from gsmerge.settings.compact import CompactOptions
 from gsmerge.types import Gaussians, Scene
 
 Build = Callable[[Prepared, Plan, int | None], Fitted]

@@ -24,7 +24,7 @@ from gsmerge.raster.metrics import WINDOW, ssim
 from gsmerge.raster.photos import Photos, render_photos, scene_photos
 from gsmerge.runtime.record import choose, record_part, report_progress, stage
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.stages.clean import CleanOptions
+from gsmerge.settings.stages import CleanOptions
 from gsmerge.stages.segment import knee_count
 from gsmerge.types import Gaussians
 

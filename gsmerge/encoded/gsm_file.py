@@ -27,7 +27,7 @@ from gsmerge.io.atomic import atomic_output
 from gsmerge.io.bounds import check_file, check_pixels
 from gsmerge.io.cameras.camera_file import MAX_NUMBER as MAX_LENGTH
 from gsmerge.io.cameras.camera_file import check_camera, check_size
-from gsmerge.stages.decode import MAX_CHILDREN
+from gsmerge.settings.stages import MAX_CHILDREN
 from gsmerge.types import Array, Cameras, FeatureGaussians, Gaussians, as_array
 
 if TYPE_CHECKING:

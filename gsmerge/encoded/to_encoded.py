@@ -9,7 +9,6 @@ from time import perf_counter
 from typing import Any
 
 from gsmerge import __version__
-from gsmerge.budget import AUTO
 from gsmerge.compaction.files import read_input
 from gsmerge.compaction.search import choose_count
 from gsmerge.encoded.encoded import Encoded, StoredHeads, StoredSettings, without_members
@@ -18,8 +17,6 @@ from gsmerge.encoded.to_gaussians import divide_all
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import Prepared, prepare
 from gsmerge.io import atomic_output
-from gsmerge.io.formats.read import OpacityChoice
-from gsmerge.options import CompactOptions
 from gsmerge.pipeline import merge_views
 from gsmerge.plan import Plan, make_plan, require_children
 from gsmerge.report import document_head, file_sha256, human_bytes, seconds_document, seconds_line
@@ -27,7 +24,11 @@ from gsmerge.runtime.record import Progress, current_record, record_run, stage
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.exporters import ReadHints
 from gsmerge.scene.files import SceneFiles
-from gsmerge.stages.decode import MAX_CHILDREN, keep_all, merged_count
+from gsmerge.settings.budget import AUTO
+from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.reading import OpacityChoice
+from gsmerge.settings.stages import MAX_CHILDREN
+from gsmerge.stages.decode import keep_all, merged_count
 from gsmerge.stages.merge import MergedViews
 from gsmerge.stages.segment import knee_count
 from gsmerge.types import Scene
@@ -63,13 +64,13 @@ def encode_scene(
     """
     options = _without_fit((options or CompactOptions()).with_settings(settings), settings)
     if max_k is not None and not 1 <= max_k <= MAX_CHILDREN:
-        raise UsageError(f"max k: expected 1 to {MAX_CHILDREN}, got {max_k}")
+        raise UsageError(f"max_k: expected 1 to {MAX_CHILDREN}, got {max_k}")
     if max_k is not None and max_k < options.decode.max_k:
-        raise UsageError(f"max k: expected at least {options.decode.k}, which is k, got {max_k}")
+        raise UsageError(f"max_k: expected at least {options.decode.k}, which is k, got {max_k}")
     with use_threads(options.threads), record_run(progress):
         prepared = prepare(scene.numpy(), options.prepare)
         plan = make_plan(prepared, options)
-        require_children("max k", max_k or 1, plan.checkpoint)
+        require_children("max_k", max_k or 1, plan.checkpoint)
         count = choose_count(prepared, plan)
         if keep_all(prepared.scene, count) is not None:
             raise UsageError(f"budget: {count} keeps every Gaussian, which needs no encoding; use compact")

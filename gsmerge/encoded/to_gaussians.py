@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsmerge.budget import AUTO, BudgetOptions, exact_count
+from gsmerge.budget import exact_count
 from gsmerge.encoded.encoded import Division, Encoded
 from gsmerge.errors import UsageError
 from gsmerge.fit import visible_mask
@@ -14,7 +14,9 @@ from gsmerge.kernels.gaussians.bisect import gather_groups
 from gsmerge.moments import Members, feature_to_gaussians, gaussian_members
 from gsmerge.raster.photos import blank_photos
 from gsmerge.runtime.threads import use_threads
-from gsmerge.stages.decode import MAX_CHILDREN, deal_order, deal_visible, halve, pool_children
+from gsmerge.settings.budget import AUTO, BudgetOptions
+from gsmerge.settings.stages import MAX_CHILDREN
+from gsmerge.stages.decode import deal_order, deal_visible, halve, pool_children
 from gsmerge.types import FeatureGaussians, Gaussians
 
 

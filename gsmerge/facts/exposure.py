@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
@@ -28,9 +27,9 @@ from gsmerge.kernels.matrices import solve_symmetric
 from gsmerge.raster.photos import NEAR
 from gsmerge.runtime.record import choose, note
 from gsmerge.runtime.threads import parallel_map
+from gsmerge.settings.stages import Exposure
 from gsmerge.types import Cameras, Scene
 
-Exposure = Literal["auto", "fixed", "per-photo"]
 SAMPLES = 2000  # pixels of a view that are looked up in the others
 SAME_DEPTH = 0.05  # logarithm of depths that are of one surface
 LOW, HIGH = 0.05, 0.95  # colours in between are neither noise nor clipped
@@ -76,7 +75,7 @@ def equalise_exposure(scene: Scene, views: Sequence[int], exposure: Exposure) ->
     gains = _solve_gains(pairs, len(scene))
     if gains is None:
         return scene
-    factors: np.ndarray = np.round(exp(gains), 3)
+    factors = exp(gains).round(3)
     low, high = factors.min(), factors.max()
     if low == high:
         return scene

@@ -13,7 +13,6 @@ import numpy as np
 
 from gsmerge.geometry import camera_centres, project
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.runtime.work import Engine
 from gsmerge.types import Cameras, Scene
 
 GRID = 24  # cells along the longer side of a view's depth map
@@ -25,29 +24,6 @@ SWEEPS = 8  # exchanges of views between blocks, at most
 POINTS = 65536  # per task
 BLOCK_GAUSSIANS = 8_000_000  # of a block's own views, of an automatic number of blocks
 WHOLE_GAUSSIANS = 20_000_000  # up to which a scene is in one piece
-
-
-@dataclass(frozen=True)
-class BlockOptions:
-    """Options of scenes with many views.
-
-    Args:
-        blocks: Number of blocks of views that are compacted one by one, so memory is that of one block. ``"auto"``:
-            one for every 8 million Gaussians of scenes with more than 20 million, one for each pixel; ``"none"``: one
-            piece.
-        engine: Where they are compacted: here, one after the other, or side by side on a Ray cluster.
-
-    Raises:
-        ValueError: If a setting is out of range.
-    """
-
-    blocks: int | str = "auto"
-    engine: Engine = field(default_factory=Engine, metadata={"setting": False})
-
-    def __post_init__(self) -> None:
-        whole = isinstance(self.blocks, int) and not isinstance(self.blocks, bool) and self.blocks >= 1
-        if not whole and self.blocks not in ("auto", "none"):
-            raise ValueError(f'blocks: expected a number from 1, "auto" or "none", got {self.blocks!r}')
 
 
 def usual_blocks(num_gaussians: int) -> int:

@@ -10,13 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
 from gsmerge.facts.align_views import align_views
 from gsmerge.facts.compare_photos import compare_photos
-from gsmerge.facts.exposure import Exposure, equalise_exposure
+from gsmerge.facts.exposure import equalise_exposure
 from gsmerge.facts.place_cameras import add_pictures, add_views
 from gsmerge.facts.views import distinct_views, subset
 from gsmerge.geometry import camera_depths, lower_median, project
@@ -24,14 +23,12 @@ from gsmerge.kernels.matrices import matmul
 from gsmerge.raster.images import seen_weights
 from gsmerge.runtime.record import note, record_part, stage
 from gsmerge.runtime.threads import parallel_map
+from gsmerge.settings.stages import PrepareOptions
 from gsmerge.types import Cameras, Gaussians, Scene
 
 SAMPLES = 65536  # Gaussians that the frame is measured on
 ROWS = 65536  # Gaussians per task
 MAX_VIEWS = 32  # of an unaligned scene, that the unit is taken from
-
-Poses = Literal["auto", "fixed", "free"]
-Unseen = Literal["drop", "keep"]
 
 
 @dataclass(frozen=True)
@@ -107,38 +104,6 @@ def canonicalise(scene: Scene, frame: Frame | None = None) -> tuple[Scene, Frame
     """Move a scene into its canonical frame, or into a given one; return it and the frame."""
     frame = frame or scene_frame(scene)
     return replace(scene, gaussians=frame.enter(scene.gaussians), cameras=frame.enter_cameras(scene.cameras)), frame
-
-
-@dataclass(frozen=True)
-class PrepareOptions:
-    """Options of the preparation, before anything is merged.
-
-    Args:
-        poses: ``"free"``: views of one Gaussian per pixel are moved to where their photos agree, and the full fit moves
-            the cameras on (on the CPU); ``"fixed"``: cameras stay where they are; ``"auto"``: free where some view is
-            more than 1.5 pixels off and its photo and the others agree clearly better elsewhere
-            (:mod:`gsmerge.facts.align_views` says by how much); fixed elsewhere, and without photos.
-        exposure: ``"auto"``: exposures and white balances of the photos, and of the Gaussians of their pixels, are
-            brought to their mean where they differ at random (:mod:`gsmerge.facts.exposure` says when);
-            ``"per-photo"``: wherever they differ; ``"fixed"``: never.
-        unseen: ``"drop"``: Gaussians without a pixel that no view sees are left out. ``"keep"``: they are merged among
-            their neighbours in space, at the rate of the others, and added to the result.
-
-    Raises:
-        ValueError: If a setting is unknown.
-    """
-
-    poses: Poses = "auto"
-    exposure: Exposure = "auto"
-    unseen: Unseen = "drop"
-
-    def __post_init__(self) -> None:
-        if self.poses not in ("auto", "fixed", "free"):
-            raise ValueError(f'poses: expected "auto", "fixed" or "free", got {self.poses!r}')
-        if self.exposure not in ("auto", "fixed", "per-photo"):
-            raise ValueError(f'exposure: expected "auto", "fixed" or "per-photo", got {self.exposure!r}')
-        if self.unseen not in ("drop", "keep"):
-            raise ValueError(f'unseen: expected "drop" or "keep", got {self.unseen!r}')
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,6 @@ from gsmerge.facts.views import pick_views
 from gsmerge.io import file_notes, read_cameras, read_gaussians, to_cameras
 from gsmerge.io.cameras.camera_file import sizes_of
 from gsmerge.io.cameras.read import read_sharp_camera
-from gsmerge.io.formats.read import OpacityChoice
 from gsmerge.io.image_names import IMAGE_SUFFIXES
 from gsmerge.measure.camera_path import parse_path, plan_path, viewing_depth
 from gsmerge.measure.preview import (
@@ -40,7 +39,9 @@ from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import SceneFiles, find_scene_files
 from gsmerge.scene.held_out import place_camera_file
 from gsmerge.scene.read import Loaded, load_files, place_cameras_in_scene, read_rows
-from gsmerge.stages.superpixels import SegmentOptions, count_for, saliency, segment
+from gsmerge.settings.reading import OpacityChoice
+from gsmerge.settings.stages import SegmentOptions
+from gsmerge.stages.superpixels import count_for, saliency, segment
 from gsmerge.types import Cameras, Gaussians
 
 PANEL_VIEWS = 4  # rows of a panel
@@ -189,10 +190,8 @@ def _path_cameras(options: DrawOptions) -> tuple[Framed, Cameras, float, list[in
 
 def _place_file(file: Path, load: Loaded) -> Cameras:
     """Read the cameras of a path into the frame of a scene, with the size of the scene's where they have none."""
-    stored, cameras = (
-        read_cameras(file) if load.cameras is None else place_camera_file(load, file)[0],
-        load.views.cameras,
-    )
+    cameras = load.views.cameras
+    stored = read_cameras(file) if load.cameras is None else place_camera_file(load, file)[0]
     return to_cameras(replace(stored, lenses=()), None if sizes_of(stored) else (cameras.width, cameras.height))
 
 

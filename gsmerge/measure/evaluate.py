@@ -21,10 +21,9 @@ from gsmerge.raster import prepare, render
 from gsmerge.raster.metrics import describe_loss, psnr, ssim
 from gsmerge.raster.photos import NEAR
 from gsmerge.runtime.threads import use_threads
+from gsmerge.settings.evaluate import EvaluateOptions
 from gsmerge.types import Cameras, Gaussians, Scene, Views, as_array
 
-NETS = ("vgg", "alex")
-ALIGNMENTS = ("color", "pose")
 MENDED = (
     "the photos of the input views differ from their Gaussians or each other in tone, exposure or by what covers them,"
     " which compact mends: their scores here are of the photos as they are"
@@ -32,72 +31,8 @@ MENDED = (
 MIN_SEEN_SHARE = 0.1  # of the held-out pixels, seen by input views; less suggests another world frame
 INPUT = "input"  # name of the scene itself among the results
 RENDERS = "renders of the input"  # what stands in for photos
-MAX_ZOOM = 16.0  # and its inverse the least: beyond, pictures have no pixels left or fill the memory
 Progress = Callable[[str, int, int], None]
 OnImage = Callable[[str, str, int, np.ndarray], None]
-
-
-@dataclass(frozen=True)
-class EvaluateOptions:
-    """Settings of an evaluation.
-
-    Args:
-        lpips: Networks of the perceptual distance, of "vgg" and "alex"; none: it is left out, which is much faster.
-        lpips_views: At most so many views of each split get it, evenly spread; None: all.
-        context: Also measure the input views.
-        own: Also measure the input itself.
-        threads: Threads to use; None: all processors. The figures do not depend on it.
-        photo_side: Longer side, in pixels, that photos are resized to together with their cameras where it is longer,
-            before anything is measured; 476 in the paper; 0: they stay as they are.
-        zoom: Sizes, in units of the photos' own pixels per side, at which PSNR and SSIM are also measured: the
-            Gaussians are rendered at that size and compared with the photo resized to it.
-        antialiased: Render with the opacity lowered by what the rasterizer's low-pass adds to small Gaussians, as some
-            viewers do (``antialiased`` of :func:`gsmerge.render`).
-        align: Also score held-out views after "color", the affine map of the render's colours that brings it closest
-            to the photo, and "pose", the camera moved to where the render is closest; with both also after one and
-            then the other.
-        fog: Also measure fog and holes of the results, which the scene's Gaussians are drawn twelve more times for.
-
-    Raises:
-        ValueError: If a name is unknown, the number of views not positive, or a zoom or a name given twice or out of
-            range.
-    """
-
-    lpips: tuple[str, ...] = NETS
-    lpips_views: int | None = None
-    context: bool = True
-    own: bool = True
-    threads: int | None = None
-    photo_side: int = 0
-    zoom: tuple[float, ...] = (1,)
-    antialiased: bool = False
-    align: tuple[str, ...] = ()
-    fog: bool = True
-
-    def __post_init__(self) -> None:
-        unknown = next((net for net in self.lpips if net not in NETS), None)
-        if unknown is not None:
-            raise ValueError(f"lpips: expected {' or '.join(NETS)}, got {unknown!r}")
-        if self.lpips_views is not None and self.lpips_views < 1:
-            raise ValueError(f"lpips_views: expected at least 1, got {self.lpips_views}")
-        if not isinstance(self.photo_side, int) or self.photo_side < 0:
-            raise ValueError(f"photo_side: expected a number of pixels, or 0 for all, got {self.photo_side}")
-        if not all(1 / MAX_ZOOM <= zoom <= MAX_ZOOM for zoom in self.zoom) or not self.zoom:
-            raise ValueError(f"zoom: expected numbers from 1/{MAX_ZOOM:g} to {MAX_ZOOM:g}, got {_listed(self.zoom)}")
-        if len(set(self.zoom)) < len(self.zoom):
-            raise ValueError(f"zoom: expected every size once, got {_listed(self.zoom)}")
-        if not set(self.align) <= set(ALIGNMENTS) or len(set(self.align)) < len(self.align):
-            raise ValueError(f"align: expected {' or '.join(ALIGNMENTS)}, or both, got {_listed(self.align)}")
-
-    @property
-    def alignments(self) -> tuple[str, ...]:
-        """Names of the aligned scores, of "color", "pose" and "both"."""
-        chosen = tuple(name for name in ALIGNMENTS if name in self.align)
-        return (*chosen, "both") if chosen == ALIGNMENTS else chosen
-
-
-def _listed(values: Sequence[object]) -> str:
-    return ",".join(map(str, values)) or "none"
 
 
 @dataclass(frozen=True)

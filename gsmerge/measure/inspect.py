@@ -16,9 +16,7 @@ from gsmerge.facts.prepare import canonicalise
 from gsmerge.io import GaussianFile, file_notes
 from gsmerge.io.formats.arrays import LOGIT_COMMENT
 from gsmerge.io.formats.ply import file_bytes
-from gsmerge.io.formats.read import OpacityChoice
 from gsmerge.measure.visibility import MAX_SAMPLES, inside_views
-from gsmerge.options import CompactOptions
 from gsmerge.plan import plan_whole
 from gsmerge.report import finite, human_bytes
 from gsmerge.runtime.estimate import fit_of, memory_bytes, memory_problem, wall_seconds
@@ -28,6 +26,8 @@ from gsmerge.scene.exporters import ReadHints, exporter_names, make_hints
 from gsmerge.scene.files import SceneFiles, find_scene_files
 from gsmerge.scene.read import align_scene, read_rows
 from gsmerge.scene.views import read_scene_cameras
+from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.reading import OpacityChoice
 from gsmerge.stages.clean import BOX_QUANTILES, beyond_scene, floater_share
 from gsmerge.stages.segment import largest_count, measure_size
 from gsmerge.stages.sky import sky_regions

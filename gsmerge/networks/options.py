@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from itertools import pairwise
 from typing import Any
 
 from gsmerge.networks.cross_view_stats import NUM_STATS
+from gsmerge.settings.setting import Settings, setting
 
 SLOTS = (1, 2, 4)  # numbers of children that have a decoder head
 OUTPUTS = ("residual", "absolute")
@@ -22,77 +23,44 @@ PAPER_NUMBERS = (4, 8, 9, 10)  # columns of a group that the paper's decoder rea
 
 
 @dataclass(frozen=True)
-class Bounds:
-    """Largest correction that the decoder may make, 0: none; merger, refiner and encoder may each make half of it.
+class Bounds(Settings):
+    """Largest correction that the decoder may make, 0: none; merger, refiner and encoder may each make half of it."""
 
-    Args:
-        mean: Shift along each axis of the group's frame, in units of the Gaussian's size.
-        size: Change of each log scale.
-        turn: Rotation about each axis of the group's frame, radians.
-        logit: Change of the opacity's logit; of Feature Gaussians, of the logarithms of optical depth and of mass.
-        color: Change of each channel of the base colour, sRGB in [0, 1].
-
-    Raises:
-        ValueError: If one is below 0, or too large to bound anything.
-    """
-
-    mean: float = 1.0
-    size: float = 1.1
-    turn: float = 0.5
-    logit: float = 3.0
-    color: float = 0.25
-
-    def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= 8:
-                raise ValueError(f"{f.name}: expected a number from 0 to 8, got {value!r}")
+    mean: float = setting(1.0, "Shift along each axis of the group's frame, in units of the Gaussian's size.", least=0,
+        most=8)  # fmt: skip
+    size: float = setting(1.1, "Change of each log scale.", least=0, most=8)
+    turn: float = setting(0.5, "Rotation about each axis of the group's frame, radians.", least=0, most=8)
+    logit: float = setting(3.0, "Change of the opacity's logit; of Feature Gaussians, of the logarithms of optical "
+        "depth and of mass.", least=0, most=8)  # fmt: skip
+    color: float = setting(0.25, "Change of each channel of the base colour, sRGB in [0, 1].", least=0, most=8)
 
 
 WIDE = Bounds(mean=4.0, size=6.0, turn=3.2, logit=8.0, color=0.75)  # of absolute outputs
 
 
 @dataclass(frozen=True)
-class NetworkOptions:
-    """Sizes of the networks, and the kind of their heads' output.
+class NetworkOptions(Settings):
+    """Sizes of the networks, and the kind of their heads' output."""
 
-    Args:
-        width: Width of the tokens, a multiple of ``heads``.
-        heads: Attention heads.
-        blocks: Set attention blocks of the encoder and of the merger.
-        refine_blocks: Attention blocks of the refiner.
-        latent: Width of a Feature Gaussian's latent.
-        members: Largest number of members that the encoder reads; larger groups are sampled.
-        neighbors: Neighbours that the refiner reads.
-        bounds: Largest corrections.
-        outputs: ``"residual"``: the heads correct the analytic children. ``"absolute"``, as in the paper: they do not
-            read these, and correct a round Gaussian of the group's mean and base colour, within wide bounds.
-        encoder: Whether there is one; without it all latents are zero.
-        merger: Whether there is one; without it clusters are pooled, and no more.
-        merger_start: What the merger corrects: ``"pooled"``: the moments of the whole cluster. ``"first"``, as in the
-            paper: its 0th Feature Gaussian.
-        refiner: Whether there is one.
-        group_numbers: Whether the heads read all numbers that describe a group, which are ours. Without them a head
-            reads latent, base colour and mass, as in the paper.
-
-    Raises:
-        ValueError: If a size is out of range or they do not go together.
-    """
-
-    width: int = 48
-    heads: int = 4
-    blocks: int = 1
-    refine_blocks: int = 2
-    latent: int = 32
-    members: int = 16
-    neighbors: int = 8
-    bounds: Bounds = field(default_factory=Bounds)
-    outputs: str = "residual"
-    encoder: bool = True
-    merger: bool = True
-    merger_start: str = "pooled"
-    refiner: bool = True
-    group_numbers: bool = True
+    width: int = setting(48, "Width of the tokens, a multiple of `heads`.", least=1, most=512)
+    heads: int = setting(4, "Attention heads.", least=1, most=16)
+    blocks: int = setting(1, "Set attention blocks of the encoder and of the merger.", least=1, most=8)
+    refine_blocks: int = setting(2, "Attention blocks of the refiner.", least=1, most=8)
+    latent: int = setting(32, "Width of a Feature Gaussian's latent.", least=1, most=256)
+    members: int = setting(16, "Largest number of members that the encoder reads; larger groups are sampled.", least=1,
+        most=256)  # fmt: skip
+    neighbors: int = setting(8, "Neighbours that the refiner reads.", least=1, most=64)
+    bounds: Bounds = setting(Bounds(), "Largest corrections.")
+    outputs: str = setting("residual", "`residual`: the heads correct the analytic children.",
+        "`absolute`, as in the paper: they do not read these, and correct a round Gaussian of the group's mean and "
+        "base colour, within wide bounds.", choices=OUTPUTS)  # fmt: skip
+    encoder: bool = setting(True, "Whether there is one; without it all latents are zero.")
+    merger: bool = setting(True, "Whether there is one; without it clusters are pooled, and no more.")
+    merger_start: str = setting("pooled", "What the merger corrects: `pooled`: the moments of the whole cluster.",
+        "`first`, as in the paper: its 0th Feature Gaussian.", choices=STARTS)  # fmt: skip
+    refiner: bool = setting(True, "Whether there is one.")
+    group_numbers: bool = setting(True, "Whether the heads read all numbers that describe a group, which are ours.",
+        "Without them a head reads latent, base colour and mass, as in the paper.")  # fmt: skip
 
     @property
     def head_numbers(self) -> tuple[int, ...]:
@@ -115,18 +83,7 @@ class NetworkOptions:
         return WIDE if self.outputs == "absolute" else self.bounds
 
     def __post_init__(self) -> None:
-        if self.outputs not in OUTPUTS:
-            raise ValueError(f"outputs: expected {' or '.join(OUTPUTS)}, got {self.outputs!r}")
-        if self.merger_start not in STARTS:
-            raise ValueError(f"merger_start: expected {' or '.join(STARTS)}, got {self.merger_start!r}")
-        limits = {"width": 512, "heads": 16, "blocks": 8, "refine_blocks": 8, "latent": 256, "members": 256}
-        for name, limit in (limits | {"neighbors": 64}).items():
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= limit:
-                raise ValueError(f"{name}: expected a whole number from 1 to {limit}, got {value!r}")
-        for name in ("encoder", "merger", "refiner", "group_numbers"):
-            if not isinstance(getattr(self, name), bool):
-                raise ValueError(f"{name}: expected true or false, got {getattr(self, name)!r}")
+        super().__post_init__()
         if self.width % self.heads:
             raise ValueError(f"width: expected a multiple of {self.heads} heads, got {self.width}")
 

@@ -11,9 +11,9 @@ from gsmerge.online.extend import BatchReport, extend
 from gsmerge.online.file import load_state, save_state
 from gsmerge.online.options import merge_settings
 from gsmerge.online.state import OnlineState
-from gsmerge.options import CompactOptions
 from gsmerge.plan import resolve_fit
 from gsmerge.runtime.record import Progress
+from gsmerge.settings.compact import CompactOptions
 from gsmerge.types import Gaussians, Scene
 
 

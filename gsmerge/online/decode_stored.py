@@ -20,11 +20,11 @@ from gsmerge.io import atomic_output, lost_harmonics, output_format, write_gauss
 from gsmerge.online.batch import BatchPhotos
 from gsmerge.online.file import load_stored
 from gsmerge.online.state import OnlineState, to_encoded
-from gsmerge.options import CompactOptions
 from gsmerge.plan import resolve_fit
 from gsmerge.report import document_head, human_bytes, seconds_document, seconds_line
 from gsmerge.runtime.record import Progress, record_run, stage
 from gsmerge.runtime.threads import use_threads
+from gsmerge.settings.compact import CompactOptions
 from gsmerge.types import Gaussians
 
 

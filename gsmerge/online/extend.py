@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from gsmerge import __version__
-from gsmerge.budget import AUTO
 from gsmerge.compaction.search import choose_count
 from gsmerge.encoded.encoded import StoredSettings
 from gsmerge.errors import UsageError
@@ -26,11 +25,13 @@ from gsmerge.online.extend_latents import LATENTS, keeps_latents, own_checkpoint
 from gsmerge.online.extend_moments import MOMENTS
 from gsmerge.online.options import OnlineOptions
 from gsmerge.online.state import GroupSet, OnlineState, no_photos, select_groups
-from gsmerge.options import CompactOptions
 from gsmerge.plan import make_plan, require_children
 from gsmerge.runtime.record import Progress, choose, note, record_run, stage
 from gsmerge.runtime.threads import use_threads
-from gsmerge.stages.decode import USUAL_K, keep_all
+from gsmerge.settings.budget import AUTO
+from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.stages import USUAL_K
+from gsmerge.stages.decode import keep_all
 from gsmerge.stages.merge import take
 from gsmerge.types import Gaussians, Scene
 
@@ -77,7 +78,7 @@ def extend(
         prepared = prepare(scene.numpy(), fixed, None if state is None else state.frame)
         plan = make_plan(prepared, options, None if state is None else own_checkpoint(state, options))
         plan = plan.with_fit(replace(plan.fit, min_contribution=options.fit.min_contribution))  # in drafts, too
-        require_children("max k", max_k, plan.checkpoint)
+        require_children("max_k", max_k, plan.checkpoint)
         count = choose_count(prepared, plan)
         if keep_all(prepared.scene, count) is not None:
             raise UsageError(f"budget: {count} keeps every Gaussian, which needs no state; use compact")
@@ -158,7 +159,7 @@ def _check(state: OnlineState | None, scene: Scene, options: CompactOptions, max
     if options.fit.fit == "full":
         raise UsageError("fit full: goes with all photos together; expected none, and the full fit at decoding")
     if options.decode.max_k > max_k:
-        raise UsageError(f"max k: expected at least {options.decode.k}, which is k, got {max_k}")
+        raise UsageError(f"max_k: expected at least {options.decode.k}, which is k, got {max_k}")
     degree = scene.gaussians.sh_degree
     if state is not None and degree != state.sh_degree:
         expected = state.sh_degree

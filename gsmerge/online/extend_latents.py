@@ -32,13 +32,14 @@ from gsmerge.online.state import (
     sample_views,
     select_groups,
 )
-from gsmerge.options import CompactOptions
 from gsmerge.plan import Plan
 from gsmerge.runtime.record import note
+from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.stages import MatchOptions
 from gsmerge.stages.assign import assign
 from gsmerge.stages.decode import divide
 from gsmerge.stages.encode import correct, encode
-from gsmerge.stages.match import MatchOptions, match
+from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge, refine, take
 from gsmerge.stages.segment import segment_scene
 from gsmerge.types import FeatureGaussians, Gaussians, Matches

@@ -21,7 +21,8 @@ from gsmerge.online.state import (
 )
 from gsmerge.pipeline import merge_views
 from gsmerge.runtime.record import stage
-from gsmerge.stages.match import MatchOptions, match
+from gsmerge.settings.stages import MatchOptions
+from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge, take
 from gsmerge.types import FeatureGaussians, Gaussians, Matches
 

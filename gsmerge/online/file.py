@@ -17,7 +17,6 @@ from gsmerge.encoded.encoded import Encoded, without_members
 from gsmerge.encoded.gsm_file import ENCODED, MINOR, STATE, GsmFile, read_encoded, read_gsm, write_gsm
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import atomic_output
-from gsmerge.io.formats.read import OpacityChoice
 from gsmerge.networks.options import CORRECTED
 from gsmerge.online.extend import extend
 from gsmerge.online.options import merge_settings
@@ -36,6 +35,7 @@ from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.record import Progress
 from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import SceneFiles
+from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Cameras, FeatureGaussians
 
 if TYPE_CHECKING:

@@ -4,50 +4,36 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from gsmerge.encoded.encoded import StoredScene
-from gsmerge.options import CompactOptions
-from gsmerge.stages.decode import MAX_CHILDREN
+from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.setting import Settings, setting
+from gsmerge.settings.stages import MAX_CHILDREN
 
-# Settings of this module under the name of a recipe, see gsmerge.options.RECIPES
+if TYPE_CHECKING:
+    from gsmerge.encoded.encoded import StoredScene
+
+# Settings of this module under the name of a recipe, see gsmerge.settings.compact.RECIPES
 RECIPES: Mapping[str, Mapping[str, Any]] = {"paper": {"tolerance": 0.0, "replay": 0}}
 
 
 @dataclass(frozen=True)
-class OnlineOptions:
-    """Options of the way in which new views enter a state.
+class OnlineOptions(Settings):
+    """Settings of the way in which new views enter a state."""
 
-    Args:
-        max_k: Most Gaussians of a group that can be decoded later, 1 to 8; an existing state keeps its own.
-        tolerance: A new group is left out where the state shows its pixels with a colour error (root mean square,
-            sRGB in [0, 1], holes counted) below this, or no larger than ``margin`` times that of the new views' own
-            Gaussians. 0: nothing is left out, which is what the recipe ``"paper"`` sets.
-        margin: See ``tolerance``.
-        replay: Most photos that are stored, spread evenly over all views, for a full fit when decoding. Colours are
-            fitted batch by batch and need none. The recipe ``"paper"`` sets 0: it has no fit.
-        fit_colors: Fit the base colours to the photos of each batch; not of groups that keep their latents, whose
-            colours are those of the heads.
-
-    Raises:
-        ValueError: If a setting is out of range.
-    """
-
-    max_k: int = 4
-    tolerance: float = 0.06
-    margin: float = 1.0
-    replay: int = 96
-    fit_colors: bool = True
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.max_k <= MAX_CHILDREN:
-            raise ValueError(f"max k: expected 1 to {MAX_CHILDREN}, got {self.max_k}")
-        if not 0 <= self.tolerance <= 1:
-            raise ValueError(f"tolerance: expected 0 to 1, got {self.tolerance}")
-        if not self.margin >= 0:
-            raise ValueError(f"margin: expected at least 0, got {self.margin}")
-        if self.replay < 0:
-            raise ValueError(f"replay: expected at least 0, got {self.replay}")
+    max_k: int = setting(4, "Most Gaussians per superpixel that can be decoded later: fixed by the first batch.",
+        "More take more space.", least=1, most=MAX_CHILDREN)  # fmt: skip
+    tolerance: float = setting(0.06, "Leave out a new group where the state shows its pixels with a colour error (root "
+        "mean square, sRGB in [0, 1], holes counted) below this, or no larger than `margin` times that of the new "
+        "views' own Gaussians.",
+        "0: nothing is left out, which is what the recipe `paper` sets.", least=0, most=1)  # fmt: skip
+    margin: float = setting(1.0, "See `tolerance`.", least=0)
+    replay: int = setting(96, "Most photos that are stored, spread evenly over all views, for a full fit when "
+        "decoding.",
+        "Colours are fitted batch by batch and need none. The recipe `paper` sets 0: it has no fit.",
+        least=0)  # fmt: skip
+    fit_colors: bool = setting(True, "Fit the base colours to the photos of each batch; not of groups that keep their "
+        "latents, whose colours are those of the heads.")  # fmt: skip
 
 
 def merge_settings(

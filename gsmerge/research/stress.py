@@ -16,18 +16,18 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
-from gsmerge.budget import BudgetOptions
 from gsmerge.compaction.compact import compact
 from gsmerge.errors import GsmergeError, SceneError, UsageError
 from gsmerge.facts.align_views import move_views
 from gsmerge.facts.prepare import scene_frame
 from gsmerge.facts.views import even_views, subset
 from gsmerge.io.cameras.camera_file import CONVENTIONS, CameraFile, from_viewmats, to_viewmats
-from gsmerge.io.formats.read import OpacityChoice
 from gsmerge.measure.evaluate import EvaluateOptions, evaluate
-from gsmerge.options import CompactOptions
 from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.read import Loaded, align_scene, read_rows
+from gsmerge.settings.budget import BudgetOptions
+from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import SH_C0, Cameras, Gaussians, Scene, Views, grid_ids
 
 Needs = Literal["anything", "pixels", "photos", "file", "pixel-file"]

@@ -27,7 +27,6 @@ from gsmerge.runtime.record import Record, record_part, report_progress
 from gsmerge.runtime.threads import use_threads
 
 T = TypeVar("T")
-ENGINES = ("local", "ray")
 CONNECT_TIMEOUT = 10.0  # seconds to reach a cluster
 RETRIES = 5  # of a call whose process or node was lost
 SMALL_STORE = 100 << 20  # bytes of objects that the calls on a cluster of this machine may share
@@ -38,33 +37,15 @@ EXTRA_CALLS = 2  # submitted beyond those that the cluster has processors for
 CLUSTER_SIZE_SECONDS = 5.0  # between two queries of the cluster's size
 
 
-@dataclass(frozen=True)
-class Engine:
-    """Where the blocks of a scene are compacted; the result does not depend on it.
+@contextmanager
+def start_work(engine: str, address: str | None = None, *, threads: int | None, memory: int) -> Iterator[Work]:
+    """Begin work whose calls take so many threads (None: as fit beside each other) and bytes of memory.
 
-    Args:
-        name: ``"local"``: in this process, one after the other; ``"ray"``: on a Ray cluster.
-        address: Of the cluster; None: one of this machine alone, started for the run.
-
-    Raises:
-        ValueError: If a name is unknown, or there is an address without Ray.
+    ``engine``: ``"local"``: in this process, one call after the other; ``"ray"``: on the Ray cluster at ``address``.
     """
-
-    name: str = "local"
-    address: str | None = None
-
-    def __post_init__(self) -> None:
-        if self.name not in ENGINES:
-            raise ValueError(f"engine: expected one of {', '.join(ENGINES)}, got {self.name!r}")
-        if self.address is not None and self.name != "ray":
-            raise ValueError(f"address: expected engine ray, got {self.name}")
-
-    @contextmanager
-    def start(self, *, threads: int | None, memory: int) -> Iterator[Work]:
-        """Begin work whose calls take so many threads (None: as fit beside each other) and bytes of memory."""
-        with ExitStack() as stack:
-            cluster = None if self.name == "local" else stack.enter_context(closing(Cluster(self.address)))
-            yield Work(cluster, threads, memory)
+    with ExitStack() as stack:
+        cluster = None if engine == "local" else stack.enter_context(closing(Cluster(address)))
+        yield Work(cluster, threads, memory)
 
 
 class Cluster:
@@ -216,7 +197,7 @@ class RayPool:
             return Lost(f"its process or node was lost ({type(error).__name__}){late}", error)
 
     def close(self) -> list[Any]:
-        """End unfinished calls; return the keys of those that left something here, which is nobody's then: none."""
+        """End unfinished calls; return no keys, as what these calls left may be anywhere."""
         for ref in self.keys:
             with suppress(self.ray.exceptions.RayError, ValueError):
                 self.ray.cancel(ref, force=True)

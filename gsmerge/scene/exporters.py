@@ -9,37 +9,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, Literal
 
-from gsmerge.alignment import MAY_BE_UNALIGNED, QUATS, WITH_PHOTOS, Layout, QuatChoice
+from gsmerge.alignment import MAY_BE_UNALIGNED, WITH_PHOTOS, Layout
 from gsmerge.geometry import Similarity
-from gsmerge.io.cameras.camera_file import ORDERS, Order
+from gsmerge.settings.reading import QuatChoice, ReadHints
 
 if TYPE_CHECKING:
     from gsmerge.io.formats.read import FileInfo
 
 FrameKind = Literal["same", "scaled", "shifted", "first", "middle", "upright", "other"]
-
-
-@dataclass(frozen=True)
-class ReadHints:
-    """Hints on how to read a file whose values do not show it, or mislead; ValueError for an unknown value."""
-
-    exporter: str = "auto"  # which one wrote it, of :data:`EXPORTERS`; "auto": recognised
-    # How rotations are stored: "wxyz"; "xyzw"; "xyzw-root": xyzw, each applied twice, so the roots are used where the
-    # pixels are known; "camera": wxyz, relative to the own view's camera; "auto": as the exporter says, and checked
-    # against the surface where the pixels are known.
-    quats: QuatChoice = "auto"
-    order: Order = "auto"  # of the rows; "unordered": each may be made of a pixel; "none": they belong to no pixels
-    scene_scale: float | None = None  # size of the Gaussians' world in units of the cameras'; None: solved for
-    max_side: int = 1200  # longest side of the views of unaligned Gaussians, pixels; larger ones are resized
-
-    def __post_init__(self) -> None:
-        for name, known in (("quats", QUATS), ("order", ORDERS)):
-            if getattr(self, name) not in known:
-                raise ValueError(f"{name}: expected {_listed(known)}, got {getattr(self, name)!r}")
-        if self.scene_scale is not None and not 0 < self.scene_scale < float("inf"):
-            raise ValueError(f"scene_scale: expected a positive number, got {self.scene_scale}")
-        if isinstance(self.max_side, bool) or not isinstance(self.max_side, int) or self.max_side < 16:
-            raise ValueError(f"max_side: expected a whole number of at least 16 pixels, got {self.max_side!r}")
 
 
 AUTO = ReadHints()

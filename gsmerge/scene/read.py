@@ -31,15 +31,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views, to_cameras
 from gsmerge.io.cameras.json_files import read_dataparser
 from gsmerge.io.cameras.npz_files import read_depths
-from gsmerge.io.formats.read import (
-    FileInfo,
-    GaussianFile,
-    OpacityChoice,
-    file_notes,
-    kept_comments,
-    read_gaussians,
-    read_parts,
-)
+from gsmerge.io.formats.read import FileInfo, GaussianFile, file_notes, kept_comments, read_gaussians, read_parts
 from gsmerge.io.photo_files import as_floats, photo_size
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import use_threads
@@ -54,6 +46,7 @@ from gsmerge.scene.views import (
     read_scene_cameras,
     stored_photos,
 )
+from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Cameras, Gaussians, LargePhotos, Scene, StrPath, grid_ids
 
 NO_CAMERAS = Cameras(np.empty((0, 4, 4)), np.empty((0, 3, 3)), 1, 1)

@@ -19,7 +19,8 @@ from gsmerge.raster import ViewPlan
 from gsmerge.raster.images import plan_views
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.stages.decode import DecodeOptions, decode
+from gsmerge.settings.stages import DecodeOptions
+from gsmerge.stages.decode import decode
 from gsmerge.stages.encode import from_moments
 from gsmerge.types import Gaussians, Groups, Scene
 

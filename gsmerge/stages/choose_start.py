@@ -14,7 +14,8 @@ from gsmerge.raster.metrics import decibels
 from gsmerge.raster.photos import Photos, photo_errors, scene_photos, scene_pictures
 from gsmerge.runtime.memory import release_memory
 from gsmerge.runtime.record import choose, stage
-from gsmerge.stages.decode import DecodeOptions, decode
+from gsmerge.settings.stages import DecodeOptions
+from gsmerge.stages.decode import decode
 from gsmerge.stages.merge import MergedViews
 from gsmerge.types import Gaussians, Scene
 

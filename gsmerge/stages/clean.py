@@ -7,9 +7,8 @@ is too many are left out (:func:`clean_to_count`).
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,6 +16,7 @@ import numpy as np
 from gsmerge.errors import UsageError
 from gsmerge.fit import Fitted
 from gsmerge.runtime.record import Record, add_seconds, adopt, choose, note, record_part
+from gsmerge.settings.stages import CleanOptions, parse_crop
 from gsmerge.stages.sky import sky
 from gsmerge.types import Gaussians, Scene
 
@@ -33,72 +33,16 @@ APART = 3.0  # times the median distance of nearest Gaussians: a floater's own i
 CURTAIN, WIDER = (0.1, 0.33), 8.0
 MAX_SAMPLES = 200_000  # Gaussians that a share is estimated from
 MAX_BUILDS, SURPLUS = 3, 1.05  # tries to meet a count; more than it by so much at first
-CROP = "sphere:x,y,z,radius or box:x0,y0,z0,x1,y1,z1"
-SIZES = {"sphere": 4, "box": 6}  # numbers of a crop
 
 Make = Callable[[int | None], Fitted]
 ToWorld = Callable[[Gaussians], Gaussians]
 Counts = dict[str, int]
 
 
-@dataclass(frozen=True)
-class CleanOptions:
-    """Options of clean-up: what to leave out of the result.
-
-    Args:
-        crop: Keep the Gaussians whose centre is inside: ``"sphere:x,y,z,radius"`` or ``"box:x0,y0,z0,x1,y1,z1"``, in
-            the scene's world units; None: all.
-        drop_floaters: Leave out Gaussians that are isolated, far beyond the scene, or hang across it, see
-            :func:`floaters`.
-        drop_sky: Leave out Gaussians that are sky in the photos, see :func:`gsmerge.stages.sky.sky`.
-
-    Raises:
-        ValueError: If the crop cannot be parsed, or holds nothing.
-    """
-
-    crop: str | None = None
-    drop_floaters: bool = False
-    drop_sky: bool = False
-
-    def __post_init__(self) -> None:
-        if self.crop is not None:
-            parse_crop(self.crop)
-
-    @property
-    def asked(self) -> bool:
-        """Whether anything is to be left out."""
-        return self.crop is not None or self.drop_floaters or self.drop_sky
-
-    @property
-    def hides(self) -> bool:
-        """Whether what photos show is left out on purpose."""
-        return self.crop is not None or self.drop_sky
-
-
-def parse_crop(text: str) -> tuple[str, np.ndarray]:
-    """Parse the shape of a crop and its numbers, float64.
-
-    Example:
-        >>> parse_crop("sphere:0,0,2,1.5")
-        ('sphere', array([0. , 0. , 2. , 1.5]))
-    """
-    match = re.fullmatch(r"\s*(sphere|box)\s*:(.*)", text)
-    try:
-        numbers = np.array([float(part) for part in match[2].split(",")] if match else [])
-    except ValueError:
-        numbers = np.array([])
-    if match is None or len(numbers) != SIZES[match[1]] or not np.isfinite(numbers).all():
-        raise ValueError(f"crop: expected {CROP}, got {text!r}")
-    empty = numbers[3] <= 0 if match[1] == "sphere" else (numbers[3:] <= numbers[:3]).any()
-    if empty:
-        expected = "a radius above 0" if match[1] == "sphere" else "x0 < x1, y0 < y1 and z0 < z1"
-        raise ValueError(f"crop: expected {expected}, got {text!r}")
-    return match[1], numbers
-
-
 def inside_crop(means: np.ndarray, crop: str) -> np.ndarray:
     """Return a mask ``[n]`` of the world-frame centres ``[n,3]`` inside a crop or on its border."""
-    shape, numbers = parse_crop(crop)
+    shape, parsed = parse_crop(crop)
+    numbers = np.array(parsed)
     if shape == "sphere":
         return np.asarray(np.square(means - numbers[:3]).sum(1) <= numbers[3] ** 2)
     return np.asarray(((means >= numbers[:3]) & (means <= numbers[3:])).all(1))

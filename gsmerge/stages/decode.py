@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gsmerge.budget import AUTO
 from gsmerge.kernels.gaussians.bisect import bisect, gather_groups, split_errors
 from gsmerge.moments import Members, feature_to_gaussians, pool_members, to_gaussians
 from gsmerge.raster.photos import scene_pictures
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
+from gsmerge.settings.stages import MAX_CHILDREN, MIXED, MIXED_COUNTS, DecodeOptions
 from gsmerge.stages.merge import MergedViews
 from gsmerge.stages.superpixels import scene_saliency
 from gsmerge.types import Decoded, FeatureGaussians, Gaussians, Scene, as_array
@@ -21,62 +21,9 @@ from gsmerge.types import Decoded, FeatureGaussians, Gaussians, Scene, as_array
 if TYPE_CHECKING:
     from gsmerge.networks.apply import NetworkContext
 
-MAX_CHILDREN = 8
-MIXED, MIXED_COUNTS = "mixed", (1, 2, 4)  # the K of groups of their own, and its values
-USUAL_K = 1  # what "auto" is unless there are reasons for more
-K_RULES = ("saliency", "distortion")
 GROUPS_PER_TASK = 8192
 REFILLS = 3  # times that Gaussians too faint to be seen are replaced by others, of which a few are faint again
 PLANE_WEIGHT = 1 / 16  # of squared distances from a group's plane; the unit is that of the children's features
-
-
-@dataclass(frozen=True)
-class DecodeOptions:
-    """Number of Gaussians that a Feature Gaussian becomes.
-
-    Args:
-        k: Children of each group, 1 to 8; or ``"mixed"``: 1, 2 or 4 (paper supplement, per-superpixel K); or
-            ``"auto"``: 4 where all views have one camera, nothing else says how many Gaussians there are to be, and no
-            fit follows or one of at most 60 steps; otherwise 1.
-        k_low: Percentile of ``"mixed"`` up to which groups become one Gaussian. The paper's percentiles are 33.3 and
-            66.7, which give more Gaussians than K = 2 everywhere.
-        k_high: Percentile above which they become four.
-        k_rule: What the percentiles are of: ``"saliency"``: the mean corner response of the group's pixels, as in the
-            paper. ``"distortion"``: as many Gaussians, where they lower distortion most.
-        min_opacity: Gaussians below this opacity are left out (paper section 4.3, tau_a).
-
-    Raises:
-        ValueError: If a setting is unknown or out of range.
-    """
-
-    k: int | str = AUTO
-    k_low: float = 50.0
-    k_high: float = 85.0
-    k_rule: str = "saliency"
-    min_opacity: float = 1 / 255
-
-    def __post_init__(self) -> None:
-        if self.k not in (MIXED, AUTO) and not (isinstance(self.k, int) and 1 <= self.k <= MAX_CHILDREN):
-            raise ValueError(f"k: expected 1 to {MAX_CHILDREN}, {MIXED} or {AUTO}, got {self.k!r}")
-        if not 0 <= self.k_low <= 100:
-            raise ValueError(f"k_low: expected 0 to 100, got {self.k_low}")
-        if not self.k_low <= self.k_high <= 100:
-            raise ValueError(f"k_high: expected {self.k_low:g}, which is k_low, to 100, got {self.k_high}")
-        if self.k_rule not in K_RULES:
-            raise ValueError(f"k_rule: expected {' or '.join(K_RULES)}, got {self.k_rule!r}")
-        if not 0 <= self.min_opacity <= 1:
-            raise ValueError(f"min_opacity: expected 0 to 1, got {self.min_opacity}")
-
-    @property
-    def mean_k(self) -> float:
-        """Mean number of children of a group."""
-        mixed = 1 + (100 - self.k_low + 2 * (100 - self.k_high)) / 100
-        return mixed if self.k == MIXED else float(self.max_k)
-
-    @property
-    def max_k(self) -> int:
-        """Largest number of children of a group."""
-        return {MIXED: MIXED_COUNTS[-1], AUTO: USUAL_K}.get(str(self.k)) or int(self.k)
 
 
 def decode(

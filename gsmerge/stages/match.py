@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,69 +10,11 @@ from gsmerge.geometry import normalize
 from gsmerge.kernels.gaussians.cluster import connected_components, edge_scores, leader_clusters
 from gsmerge.networks.cross_view_stats import nearest_of_other_views
 from gsmerge.runtime.record import stage
+from gsmerge.settings.stages import MatchOptions
 from gsmerge.types import SH_C0, FeatureGaussians, Matches, as_array
 
 if TYPE_CHECKING:
     from gsmerge.networks.apply import NetworkContext
-
-Method = Literal["overlap", "aabb", "none"]
-Geometry = Literal["analytic", "decoded"]
-
-NEIGHBORS = {"overlap": 16, "aabb": 1}  # Nearest neighbours that are compared; docs/laboratory/notebook.md has figures
-
-
-@dataclass(frozen=True)
-class MatchOptions:
-    """Conditions under which two Feature Gaussians are merged.
-
-    Args:
-        match: ``"overlap"``: Bhattacharyya coefficient (does not depend on the world's axes), similar colours, and
-            star clusters that cannot chain. ``"aabb"``, as in the paper (section 4.4): box IoU, similar latents, and
-            connected components. ``"none"``: no merging across views. None: ``"overlap"``, but ``"none"`` in a draft.
-        geometry: Of what is compared where networks are loaded: ``"analytic"``, that of the moments, or ``"decoded"``,
-            that of the K = 1 head (paper section 4.3), which merges less, takes longer and is no better.
-        overlap: Least overlap of ``"overlap"``, 0 to 1.
-        iou: Least IoU of the boxes of ``"aabb"``, 0 to 1 (tau_g).
-        similarity: Least cosine of the latents of ``"aabb"``, -1 to 1 (tau_f). Without an encoder there are no
-            latents, and colours are compared in their place.
-        max_color: Largest difference of base colours (Euclidean, sRGB in [0, 1]).
-        neighbors: Nearest neighbours of other views in 3D that are compared (k, which the paper leaves open); None: 16
-            with ``"overlap"``, 1 with ``"aabb"``, whose components chain and leave holes with more.
-        cluster_size: Most Feature Gaussians in a star cluster; None: as many as there are views (a cluster holds
-            one of each view at most).
-
-    Raises:
-        ValueError: If a setting is unknown or out of range.
-    """
-
-    match: Method | None = None
-    geometry: Geometry = "analytic"
-    overlap: float = 0.7
-    iou: float = 0.2
-    similarity: float = 0.8
-    max_color: float = 0.12
-    neighbors: int | None = None
-    cluster_size: int | None = None
-
-    def __post_init__(self) -> None:
-        if self.match not in (None, "overlap", "aabb", "none"):
-            raise ValueError(f'match: expected "overlap", "aabb" or "none", got "{self.match}"')
-        if self.geometry not in ("analytic", "decoded"):
-            raise ValueError(f'geometry: expected "analytic" or "decoded", got "{self.geometry}"')
-        for name, low in (("overlap", 0), ("iou", 0), ("similarity", -1)):
-            if not low <= getattr(self, name) <= 1:
-                raise ValueError(f"{name}: expected {low} to 1, got {getattr(self, name)}")
-        if not self.max_color >= 0:
-            raise ValueError(f"max_color: expected at least 0, got {self.max_color}")
-        if self.neighbors is not None and self.neighbors < 1:
-            raise ValueError(f"neighbors: expected at least 1, got {self.neighbors}")
-        if self.cluster_size is not None and self.cluster_size < 1:
-            raise ValueError(f"cluster_size: expected at least 1, got {self.cluster_size}")
-
-    @property
-    def num_neighbors(self) -> int:
-        """Nearest neighbours of other views that are compared."""
-        return self.neighbors or NEIGHBORS["aabb" if self.match == "aabb" else "overlap"]
 
 
 @stage("match")

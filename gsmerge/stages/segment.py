@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmerge.budget import BudgetOptions, exact_count, max_allowed
+from gsmerge.budget import exact_count, max_allowed
 from gsmerge.errors import UsageError
 from gsmerge.facts.views import camera_kinds
 from gsmerge.geometry import camera_depths
@@ -31,8 +31,9 @@ from gsmerge.raster.images import seen_depths
 from gsmerge.raster.photos import scene_pictures
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.stages.decode import DecodeOptions
-from gsmerge.stages.superpixels import MAX_FACTOR, SegmentOptions, count_for, segment
+from gsmerge.settings.budget import BudgetOptions
+from gsmerge.settings.stages import DecodeOptions, SegmentOptions
+from gsmerge.stages.superpixels import MAX_FACTOR, count_for, segment
 from gsmerge.types import Groups, Scene, Segmentation
 
 DEPTH_RANGE = 1e3  # depths are clipped to this factor of the view's median

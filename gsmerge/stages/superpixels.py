@@ -14,13 +14,11 @@ budget, its moves go on to that number, those of the highest Hastings ratio firs
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 
 import cv2
 import numpy as np
 
-from gsmerge.budget import parse_share
 from gsmerge.errors import UsageError
 from gsmerge.kernels.superpixels.bass import adapt_labels, infer_labels
 from gsmerge.kernels.superpixels.kd import split_rectangles
@@ -34,9 +32,9 @@ from gsmerge.kernels.superpixels.seeds import (
 )
 from gsmerge.kernels.superpixels.ward import merge_regions
 from gsmerge.runtime.threads import parallel_map
+from gsmerge.settings.stages import SegmentOptions
 from gsmerge.types import Array, Groups, as_array, like
 
-SEGMENTATIONS = ("rdseg", "bass", "bass-st", "bass-adaptive", "slic", "grid")
 RECTANGLES, EARLY_SWEEPS = 2.0, 0  # rectangles per superpixel that rdseg merges, and sweeps before it does
 NUM_SWEEPS = 2
 BLOCK = 32  # side of the squares that the cutting starts from, pixels
@@ -44,70 +42,6 @@ PIXEL_START = 0.45  # above this many rectangles per pixel, merging starts from 
 RANGE_SLACK = 1e-3  # colours may leave [0, 1] by this much, as resampled pictures do
 SLIC_COMPACTNESS = 10  # scikit-image's default
 MAX_FACTOR = 4  # most times more or fewer superpixels than bass-adaptive starts with
-
-SHARE = "4.4%"  # superpixels per pixel by default
-AUTO_SHARE = "auto"
-
-
-@dataclass(frozen=True)
-class SegmentOptions:
-    """Options of the superpixels of a view.
-
-    Args:
-        superpixels: Superpixels of each view: a number, or a share of its pixels as "4.4%"; ``"auto"``: 1.5 to 8 %,
-            the more the better the depths of the views agree. A share is where ``bass-adaptive`` starts from.
-        segmentation: ``rdseg``, ``bass``, ``bass-st``, ``bass-adaptive``, ``slic`` or ``grid``.
-        rectangles: Of ``rdseg``: rectangles per superpixel that it begins with, at least 1; None: 2, and by effort.
-        early_sweeps: Of ``rdseg``: sweeps over border pixels before rectangles are merged; None: 0, and by effort.
-        compactness: Of ``rdseg`` and ``slic``'s clean-up: weight of squared pixels against squared colours in
-            [0, 1]. At 0 the colours alone decide, and superpixels become snakes that no Gaussian fits.
-
-    Raises:
-        ValueError: If an option is out of range.
-    """
-
-    superpixels: int | str = SHARE
-    segmentation: str = "rdseg"
-    rectangles: float | None = None
-    early_sweeps: int | None = None
-    compactness: float = 1e-5
-
-    def __post_init__(self) -> None:
-        if self.per_view is not None and self.per_view < 1:
-            raise ValueError(f"superpixels: expected at least 1, got {self.superpixels}")
-        if self.per_view is None and self.superpixels != AUTO_SHARE:
-            try:
-                parse_share(str(self.superpixels))
-            except ValueError as error:
-                raise ValueError(f"superpixels: expected a number, or {str(error).partition(' ')[2]}") from None
-        rectangles = RECTANGLES if self.rectangles is None else self.rectangles
-        _check(self.segmentation, rectangles, self.compactness)
-
-    @property
-    def per_view(self) -> int | None:
-        """Number of superpixels of each view; None where a share of its pixels is asked for."""
-        text = str(self.superpixels)
-        return int(text) if text.removeprefix("-").isdecimal() else None
-
-    @property
-    def share(self) -> float:
-        """Superpixels per pixel; the default where a number is asked for, or the scene decides."""
-        given = self.per_view is None and self.superpixels != AUTO_SHARE
-        return parse_share(str(self.superpixels) if given else SHARE)
-
-    @property
-    def adapts(self) -> bool:
-        """Whether views choose their number of superpixels: ``bass-adaptive`` from a share of the pixels."""
-        return self.segmentation == "bass-adaptive" and self.per_view is None
-
-
-def _check(segmentation: str, rectangles: float, compactness: float) -> None:
-    if segmentation not in SEGMENTATIONS:
-        raise ValueError(f"segmentation: expected one of {', '.join(SEGMENTATIONS)}, got {segmentation!r}")
-    if not rectangles >= 1:
-        raise ValueError(f"rectangles: expected at least 1 per superpixel, got {rectangles}")
-    if not 0 <= compactness <= 1:
-        raise ValueError(f"compactness: expected a number in [0, 1], got {compactness}")
 
 
 def count_for(options: SegmentOptions, height: int, width: int) -> int:
@@ -178,7 +112,7 @@ def superpixels(
         >>> superpixels(np.zeros((2, 2, 3)), 1).tolist()
         [[0, 0], [0, 0]]
     """
-    _check(segmentation, rectangles, compactness)
+    SegmentOptions(segmentation=segmentation, rectangles=rectangles, compactness=compactness)  # checks them
     pixels = _as_pixels(as_array(image))
     height, width, _ = pixels.shape
     if count < 1:

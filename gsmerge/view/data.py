@@ -22,7 +22,8 @@ from gsmerge.measure.fog import ALL, Fog
 from gsmerge.measure.preview import OUTSIDE, Picture, borders, mean_colors, to_picture
 from gsmerge.raster import render
 from gsmerge.runtime.threads import use_threads
-from gsmerge.stages.superpixels import SegmentOptions, segment
+from gsmerge.settings.stages import SegmentOptions
+from gsmerge.stages.superpixels import segment
 from gsmerge.types import Cameras, Gaussians, Scene, Views
 
 MAX_VIEWS = 32  # of more, some at equal intervals: each takes up to 300 kB

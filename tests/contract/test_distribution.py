@@ -110,7 +110,7 @@ def test_messages_install_what_the_extras_ask_for(root: Path, project: dict[str,
     extras = project["optional-dependencies"]
     hints = [INSTALL, INSTALL_HINT, spz.INSTALL]
     assert [f'pip install "{extras[name][0]}"' for name in ("cuda", "chart", "spz4")] == hints
-    assert f"pip install '{extras['ray'][0]}'" in (root / "gsmerge" / "runtime" / "cluster.py").read_text()
+    assert f"pip install '{extras['ray'][0]}'" in (root / "gsmerge" / "runtime" / "work.py").read_text()
     pages = (*root.glob("*.md"), *(root / "docs").rglob("*.md"), *(root / "gsmerge").rglob("*.py"))
     assert [str(page) for page in pages if re.search(r"""pip install ["']gsmerge""", page.read_text())] == []
 

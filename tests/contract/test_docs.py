@@ -21,8 +21,8 @@ import gsmerge
 from gsmerge.cli.app import app
 from gsmerge.io.cameras.read import CAMERA_FORMATS
 from gsmerge.io.formats.table import FORMATS
-from gsmerge.options import method_names
 from gsmerge.report import report_document
+from gsmerge.settings.compact import method_names
 
 ROOT = Path(__file__).parents[2]
 COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]

@@ -156,7 +156,7 @@ def test_a_full_disk_is_one_line_and_nothing_is_lost(rooms: Path, tmp_path: Path
     assert results(tmp_path) == {}
     code, errors = limited((tmp_path / "batch.jsonl").stat().st_size + 100, *said)
     assert code == 3
-    assert says(errors.removeprefix(ERROR), tmp_path / "batch.jsonl", "File too large")
+    assert says(errors.removeprefix(ERROR), tmp_path / "batch.jsonl", "batch", "--output")
     assert errors.count("\n") == 1
     assert finish(*said) == 0
     assert results(tmp_path) == undisturbed

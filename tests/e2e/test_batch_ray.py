@@ -54,7 +54,7 @@ sys.exit(code)
 
 @needs_ray
 def test_a_lost_node_is_survived(rooms: Path, tmp_path: Path, root: Path, undisturbed: dict[str, str]) -> None:
-    paths = os.pathsep.join([str(root), str(root / "tests"), os.environ.get("PYTHONPATH", "")])
+    paths = os.pathsep.join([str(root), str(root / "tests" / "helpers"), os.environ.get("PYTHONPATH", "")])
     done = subprocess.run(
         [sys.executable, "-c", CLUSTER, str(rooms), str(tmp_path), *FAST, "-q"],
         capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": paths},

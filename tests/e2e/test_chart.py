@@ -12,11 +12,11 @@ from batches import InlinePool
 from messages import names, noted
 
 import gsmerge
-from gsmerge.options import CompactOptions
 from gsmerge.research.charts import measure_run as running
 from gsmerge.research.charts.measure_run import RunRecord, read_runs
 from gsmerge.scene.held_out import read_held_out
 from gsmerge.scene.read import load_scene
+from gsmerge.settings.compact import CompactOptions
 
 from .conftest import Outcome, Run, listing
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from gsmerge import read_ply
-from gsmerge.options import method_names
+from gsmerge.settings.compact import method_names
 
 from .conftest import Run, assert_refused, listing
 

@@ -109,7 +109,7 @@ USAGE = {
     "evaluate room alone.ply --lpips none --merge-seconds run.json -o run.json --overwrite": "run.json*input*--output",
     "evaluate room --lpips none --align=color": "--align*held-out*--targets",
     "evaluate room --lpips none --zoom=a,2": "--zoom*.5,1,2,4*'a,2'",
-    "evaluate room --lpips none --zoom=0": "zoom*1/16 to 16*0.0",
+    "evaluate room --lpips none --zoom=0": "zoom*0.0625 to 16*0.0",
     "evaluate room --lpips none --photo-side -1": "--photo-side*0",
     "evaluate room --lpips none --views 6": "views*1 to 5*6",
     "evaluate room --lpips none --views 3 --targets room/targets": "--views*--targets",

@@ -15,8 +15,8 @@ from typing import Any
 from gsmerge.batch import BatchOptions, Job
 from gsmerge.batch.find import output_name
 from gsmerge.batch.records import RECORDS, SUMMARY, RecordIndex
-from gsmerge.batch.task import BatchContext, Task, new_records
-from gsmerge.options import CompactOptions
+from gsmerge.batch.task import BatchContext, Task, make_index
+from gsmerge.settings.compact import CompactOptions
 
 NAMES = [f"room{number}.ply" for number in range(4)]  # results of the fixture ``rooms``
 PATIENCE = 180  # seconds, on a machine that is busy with other things
@@ -88,7 +88,7 @@ class InlinePool:
     """In place of :class:`gsmerge.runtime.work.ProcessPool`: one call after the other in this process."""
 
     def __init__(self, *_: object, **__: object) -> None:
-        new_records.cache_clear()  # as in a new process
+        make_index.cache_clear()  # as in a new process
         self.ended: list[tuple[Any, Any]] = []
 
     @property

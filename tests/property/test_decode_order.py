@@ -11,7 +11,8 @@ from scenes import assert_same_set, make_features, move_gaussians, random_rotati
 
 from gsmerge.geometry import quat_to_rotmat
 from gsmerge.moments import Members
-from gsmerge.stages.decode import DecodeOptions, decode
+from gsmerge.settings.stages import DecodeOptions
+from gsmerge.stages.decode import decode
 from gsmerge.types import FeatureGaussians
 
 FEW = settings(max_examples=15, deadline=None, derandomize=True)

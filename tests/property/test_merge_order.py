@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from scenes import make_features, random_rotation
 
 from gsmerge.moments import Members, pool_members
-from gsmerge.stages.match import MatchOptions, match
+from gsmerge.settings.stages import MatchOptions
+from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge, take
 from gsmerge.types import FeatureGaussians, Matches
 

@@ -8,7 +8,8 @@ import scenes
 
 from gsmerge import Cameras
 from gsmerge.moments import feature_to_gaussians
-from gsmerge.stages.match import MatchOptions, match
+from gsmerge.settings.stages import MatchOptions
+from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge
 from gsmerge.types import FeatureGaussians
 

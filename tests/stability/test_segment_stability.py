@@ -11,8 +11,9 @@ from segmentation_scores import DENSITIES, count_at, photos, proxy_psnr, splat_p
 
 from gsmerge.kernels.superpixels.regions import pad_labels, refine, region_rows
 from gsmerge.runtime.threads import use_threads
+from gsmerge.settings.stages import SEGMENTATIONS
 from gsmerge.stages.segment import SegmentOptions, segment
-from gsmerge.stages.superpixels import SEGMENTATIONS, superpixels
+from gsmerge.stages.superpixels import superpixels
 
 
 @pytest.mark.parametrize("segmentation", SEGMENTATIONS)

@@ -9,8 +9,8 @@ import scenes
 from messages import refuses
 
 from gsmerge import write_ply
-from gsmerge.budget import parse_budget, parse_bytes
 from gsmerge.io.formats.ply import count_for_bytes, file_bytes
+from gsmerge.settings.budget import parse_budget, parse_bytes
 
 
 @pytest.mark.parametrize(

@@ -7,14 +7,14 @@ import pytest
 from messages import refuses
 
 from gsmerge import CompactOptions
-from gsmerge.options import setting_names
+from gsmerge.settings.setting import flat_settings
 
 STAGES = [f.name for f in fields(CompactOptions) if is_dataclass(getattr(CompactOptions(), f.name))]
 
 
 def test_flat_names_are_unique() -> None:
     options = CompactOptions()
-    names = [name for stage in STAGES for name in setting_names(type(getattr(options, stage)))]
+    names = [name for stage in STAGES for name in flat_settings(type(getattr(options, stage)))]
     names += [f.name for f in fields(options) if f.name not in STAGES]
     assert len(names) == len(set(names))
     assert sorted(options.to_dict()) == sorted(names)

@@ -10,7 +10,7 @@ from messages import refuses
 
 from gsmerge import CompactOptions, Scene, compact
 from gsmerge.runtime.record import STAGES
-from gsmerge.stages.superpixels import SEGMENTATIONS
+from gsmerge.settings.stages import SEGMENTATIONS
 
 UNUSUAL = ("partition", "curve", "reduce", "refine", "cover", "choose", "join")
 USUAL = [stage for stage in STAGES if stage not in UNUSUAL]

@@ -14,9 +14,9 @@ from gsmerge import CompactOptions, Scene, compact
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import prepare
 from gsmerge.measure.inspect import estimate
-from gsmerge.options import EFFORTS as NAMES
 from gsmerge.plan import EFFORTS, Plan, choose_networks, make_plan, plan_whole, resolve_fit, steps_for
 from gsmerge.runtime.record import record_run
+from gsmerge.settings.compact import EFFORTS as NAMES
 from gsmerge.stages.segment import measure_size
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from gsmerge import report
 from gsmerge.compaction.result import CompactReport
-from gsmerge.options import CompactOptions
+from gsmerge.settings.compact import CompactOptions
 
 
 @pytest.fixture

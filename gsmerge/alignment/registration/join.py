@@ -58,9 +58,7 @@ def join_scenes(scenes: Sequence[Scene], paths: Sequence[Path]) -> JoinedScene:
     left_out = "is left out: too little of what its photo shows is found in the others"
     notes += [f"{name} {left_out}" for i, name in enumerate(names) if i not in used]
     if len({scene.images is None for scene in moved}) > 1:
-        notes.append(
-            "some files have no photos, so none are used; name the folder of all with --images"
-        )  # fmt: skip
+        notes.append("some files have no photos, so none are used; name the folder of all with --images")
     facts = [_facts(*one) for one in zip(paths, found.places, found.matches, strict=True)]
     return JoinedScene(concat_scenes(moved), tuple(used), tuple(names), tuple(notes), tuple(facts))
 
@@ -163,10 +161,7 @@ def concat_scenes(scenes: Sequence[Scene]) -> Scene:
     images = [scene.images for scene in scenes if scene.images is not None]
     gaps = [scene.missing for scene in scenes]
     incomplete = any(one is not None for one in gaps)
-    filled = [
-        np.zeros(_grid(scene), bool) if one is None else one
-        for scene, one in zip(scenes, gaps, strict=True)
-    ]  # fmt: skip
+    filled = [np.zeros(_grid(scene), bool) if one is None else one for scene, one in zip(scenes, gaps, strict=True)]
     aligned = all(scene.aligned for scene in scenes)
     return Scene(
         gaussians=Gaussians.concat([scene.gaussians for scene in scenes]),

@@ -168,10 +168,7 @@ def _depths_at(depths: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def match_photos(
-    scenes: tuple[int, int],
-    one: Sequence[Photo],
-    other: Sequence[Photo],
-    size: tuple[int, int],
+    scenes: tuple[int, int], one: Sequence[Photo], other: Sequence[Photo], size: tuple[int, int]
 ) -> Matches:
     """Match the keypoints of all photos of two scenes, whose grids have a ``size``."""
     pairs = [(a, b) for a in one for b in other]

@@ -146,13 +146,7 @@ class _Residuals:
     slopes: np.ndarray  # [m,3,3] their derivatives by ``moved``
 
 
-def _residuals(
-    place: Similarity,
-    own: End,
-    other: End,
-    pixels: float,
-    spread: float,
-) -> _Residuals:
+def _residuals(place: Similarity, own: End, other: End, pixels: float, spread: float) -> _Residuals:
     """Project one end's points into the other's photos, by the similarity between their frames.
 
     ``pixels``, ``spread``: standard deviations of a keypoint and of the logarithm of a depth.
@@ -209,10 +203,7 @@ def _measure_spreads(places: Places, matches: Sequence[Matches]) -> tuple[list[M
     Returns the matches with the former, and the latter.
     """
     values = [_both_ways(places, some, DEPTH_SPREAD)[0].values for some in matches]
-    lengths = [
-        some.spread * np.sqrt((one[:, :2] ** 2).sum(1))
-        for some, one in zip(matches, values, strict=True)
-    ]  # fmt: skip
+    lengths = [some.spread * np.sqrt((one[:, :2] ** 2).sum(1)) for some, one in zip(matches, values, strict=True)]
     ratios = np.abs(np.concatenate(values)[:, 2]) * DEPTH_SPREAD
     spread = NORMAL * float(lower_median(ratios))
     pixels = max(NORMAL_2D * float(lower_median(np.concatenate(lengths))), MIN_PIXELS)
@@ -248,10 +239,7 @@ def _chain_from(start: int, links: Sequence[tuple[Similarity, Matches]], count: 
     places: list[Similarity | None] = [None] * count
     places[start] = IDENTITY
     while True:
-        ends = [
-            link for link in links
-            if sum(places[scene] is not None for scene in link[1].scenes) == 1
-        ]  # fmt: skip
+        ends = [link for link in links if sum(places[scene] is not None for scene in link[1].scenes) == 1]
         if not ends:
             return places
         place, some = max(ends, key=lambda link: len(link[1]))
@@ -264,9 +252,7 @@ def _chain_from(start: int, links: Sequence[tuple[Similarity, Matches]], count: 
             places[b] = apply_after(first, invert_place(place))
 
 
-def _refine(
-    places: Places, matches: Sequence[Matches], spread: float, fixed: int | None = None
-) -> Places:  # fmt: skip
+def _refine(places: Places, matches: Sequence[Matches], spread: float, fixed: int | None = None) -> Places:
     """Move all placed scenes but one until matches agree best, by damped Gauss-Newton steps.
 
     ``fixed``: the scene that stays; None: the first that is placed.
@@ -300,7 +286,7 @@ def _make_step(step: np.ndarray) -> Similarity:
 
 def _normal_equations(
     places: Places, matches: Sequence[Matches], spread: float, free: Sequence[int]
-) -> tuple[float, np.ndarray, np.ndarray]:  # fmt: skip
+) -> tuple[float, np.ndarray, np.ndarray]:
     """Return the cost (Cauchy's), its curvature and its slope by the steps of the free scenes."""
     size = len(free) * SIZE
     curvature = np.zeros((size, size))

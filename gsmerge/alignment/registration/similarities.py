@@ -10,11 +10,7 @@ from gsmerge.kernels.matrices import eigh, matmul
 DIGITS = 7  # decimals of a rounded place: its last bits mean nothing
 
 
-def fit_similarities(
-    p: np.ndarray,
-    q: np.ndarray,
-    weights: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def fit_similarities(p: np.ndarray, q: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Fit ``q = scale * rotation @ p + shift`` to b sets of points ``[b,n,3]``, weights ``[b,n]``.
 
     Rotations by Horn (1987); the scale is that of both spreads, as both have errors. Returns

@@ -20,6 +20,7 @@ from gsmerge.io.photo_files import (
     same_shape,
 )
 from gsmerge.kernels.matrices import determinant, invert, matmul
+from gsmerge.settings.reading import Order
 from gsmerge.types import Cameras, StrPath
 
 MAX_NUMBER, _MAX_SIDE, _MIN_FOCAL = 1e12, 1e6, 1e-6  # beyond them no camera is, and numbers would overflow later
@@ -31,7 +32,6 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL camera axes (y up, z backward) 
 MAX_NORMALISED_FOCAL = 10.0  # a longer one is in pixels; and no image is that small
 
 # Of the rows of a file, which a file of cameras may name
-Order = Literal["auto", "view-major", "view-fastest", "layer-major", "column-major", "unordered", "none"]
 ORDERS: tuple[str, ...] = get_args(Order)
 # How a format stores poses: direction of the matrix, and the camera's axes.
 Convention = tuple[str, str]

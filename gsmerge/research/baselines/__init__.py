@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from gsmerge.compaction.methods import Method
 from gsmerge.fit import FitOptions
-from gsmerge.options import setting_names
 from gsmerge.research.baselines import greedy, simple, voxel
+from gsmerge.settings.setting import flat_settings
 
-FULL_FIT_SETTINGS = ("effort", "device", "poses", *(name for name in setting_names(FitOptions) if name != "fit"))
+FULL_FIT_SETTINGS = ("effort", "device", "poses", *(name for name in flat_settings(FitOptions) if name != "fit"))
 
 UNMERGED = Method("unmerged", simple.unmerged, uses=())
 UNMERGED_FIT = Method("unmerged-fit", simple.unmerged_fit, needs=("photos",), uses=FULL_FIT_SETTINGS)

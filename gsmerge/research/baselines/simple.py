@@ -21,8 +21,9 @@ from gsmerge.raster import contributions, plan_view, prepare
 from gsmerge.raster.photos import scene_pictures
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
+from gsmerge.settings.stages import DecodeOptions
 from gsmerge.stages.assign import assign
-from gsmerge.stages.decode import DecodeOptions, decode
+from gsmerge.stages.decode import decode
 from gsmerge.stages.encode import encode
 from gsmerge.stages.superpixels import grid_labels, superpixels
 from gsmerge.types import Cameras, Decoded, Gaussians, Groups, Scene

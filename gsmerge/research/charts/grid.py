@@ -6,10 +6,10 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from gsmerge.batch.find import Job, find_scenes, main_file
 from gsmerge.errors import SceneError, UsageError
@@ -18,13 +18,15 @@ from gsmerge.io.cameras.colmap import is_colmap
 from gsmerge.io.cameras.read import find_cameras
 from gsmerge.io.formats.ply import header_counts
 from gsmerge.measure.evaluate import EvaluateOptions
-from gsmerge.options import CompactOptions
 from gsmerge.research.charts.lines import ONE_SIZE
 from gsmerge.research.charts.measure_run import INPUT, OURS, SUPERPIXELS, ChartRun, RunRecord, describe
 from gsmerge.scene.content_hash import cameras_of, content_hash, digest, filled, photos_of, read_files, stem_of
 from gsmerge.scene.files import find_scene_files
+from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.setting import Settings, setting, settings_of
 
 ALL = "all"  # word for all views
+NEEDED: dict[str, Any] = {"filled": True, "unique": True}
 OWN_OPTIONS = {"method": "--methods", "seed": "--seed", "threads": "--threads"}  # that set the same
 FITTED = {"unmerged-fit": ("effort",)}  # settings of ours that baselines have, too
 NUMBERS = ("k", "budgets", "superpixels", "views")  # lists whose values may be numbers
@@ -34,31 +36,22 @@ MAX_NAME = 100  # characters of a run in names of files
 
 
 @dataclass(frozen=True)
-class Grid:
-    """Lists whose product is run; a ValueError if one is empty that must not be, or a value is impossible."""
+class Grid(Settings):
+    """Lists whose product is run."""
 
-    methods: tuple[str, ...] = (OURS,)  # ``gsmerge`` and baselines
-    k: tuple[int, ...] = (1,)  # Gaussians per superpixel: 1 to 8
-    budgets: tuple[int | str, ...] = ()  # Gaussians in the result, such as 40000, "2%" or "auto"
-    # superpixels per view, such as 3000 or "4.4%"; in addition to the budgets, not times them
-    superpixels: tuple[int | str, ...] = ()
-    segmentations: tuple[str, ...] = ("rdseg",)  # superpixel methods
-    fit: tuple[str, ...] = ("full",)  # ``full``, ``none``
-    efforts: tuple[str, ...] = ("default",)  # ``draft``, ``fast``, ``default``, ``best``
-    matches: tuple[str, ...] = ("overlap",)  # merging across views: ``overlap``, ``aabb``, ``none``
-    views: tuple[int | str, ...] = (ALL,)  # numbers of views; "all" for all
-    fixed: tuple[str, ...] = ()  # any other settings of ours, each "name=value", the same in all runs
-
-    def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            if not value and f.name not in ("budgets", "superpixels", "fixed"):
-                raise ValueError(f"{f.name}: expected at least one value, got none")
-            if len(set(value)) < len(value):
-                raise ValueError(f"{f.name}: expected every value once, got {', '.join(map(str, value))}")
-        for value in self.views:
-            if value != ALL and not (isinstance(value, int) and value >= 1):
-                raise ValueError(f'views: expected numbers from 1 or "all", got {value!r}')
+    methods: tuple[str, ...] = setting((OURS,), "Methods: gsmerge and baselines.", **NEEDED)
+    k: tuple[int, ...] = setting((1,), "Gaussians per superpixel: 1 to 8.", **NEEDED)
+    budgets: tuple[int | str, ...] = setting((), "Gaussians in the result, such as 0.5%,2%,40000,auto.", unique=True)
+    superpixels: tuple[int | str, ...] = setting((), "Superpixels per view, such as 3000,4.4%, next to the budgets.",
+        unique=True)  # fmt: skip
+    segmentations: tuple[str, ...] = setting(("rdseg",), "Superpixel methods.", **NEEDED)
+    fit: tuple[str, ...] = setting(("full",), "What is fitted: full, none.", **NEEDED)
+    efforts: tuple[str, ...] = setting(("default",), "Amount of work: draft, fast, default, best.", **NEEDED)
+    matches: tuple[str, ...] = setting(("overlap",), "Merging across views: overlap, aabb, none.", **NEEDED)
+    views: tuple[int | Literal["all"], ...] = setting((ALL,), "Numbers of input views, evenly spread; all for all.",
+        least=1, **NEEDED)  # fmt: skip
+    fixed: tuple[str, ...] = setting((), "Any other setting of compact for all runs of gsmerge, each NAME=VALUE.",
+        unique=True)  # fmt: skip
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -97,7 +90,7 @@ def read_grid(path: Path) -> Grid:
 
     A SceneError if the file cannot be read, or holds anything else.
     """
-    values, known = read_table(path), {f.name for f in fields(Grid)}
+    values, known = read_table(path), settings_of(Grid).keys()
     if values.keys() - known:
         odd = ", ".join(sorted(values.keys() - known))
         raise SceneError(path, f"expected lists named {', '.join(sorted(known))}, found {odd}")

@@ -25,12 +25,10 @@ from gsmerge.batch.records import FAILED, newest_records
 from gsmerge.compaction.compact import compact
 from gsmerge.facts.views import even_views, midpoint_views, pick_views, subset
 from gsmerge.io.formats.ply import file_bytes
-from gsmerge.io.formats.read import OpacityChoice
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, evaluate, near_plane
 from gsmerge.measure.preview import Picture, draw_means, heat_map, save_picture, to_picture
 from gsmerge.measure.sizes import shrink_cameras
 from gsmerge.measure.speed import time_render
-from gsmerge.options import CompactOptions
 from gsmerge.raster import render
 from gsmerge.raster.metrics import psnr
 from gsmerge.report import document_head
@@ -41,6 +39,8 @@ from gsmerge.scene.exporters import ReadHints
 from gsmerge.scene.files import SceneFiles
 from gsmerge.scene.held_out import HeldOutViews, read_held_out
 from gsmerge.scene.read import load_files
+from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.reading import OpacityChoice
 from gsmerge.stages.superpixels import superpixels
 from gsmerge.types import Gaussians, Scene, Views
 

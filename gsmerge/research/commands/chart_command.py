@@ -106,8 +106,8 @@ def _make_jobs(args: opt.Args, scenes: Sequence[str]) -> tuple[list[Job], BatchO
     """Make the jobs of the grid, the options of their batch, and notes."""
     from gsmerge.batch import BatchOptions
     from gsmerge.measure.evaluate import EvaluateOptions
-    from gsmerge.options import CompactOptions
     from gsmerge.research.charts.grid import Grid, find_sources, make_jobs, parse_grid, read_grid
+    from gsmerge.settings.compact import CompactOptions
 
     nets, notes = lpips_networks(args.lpips)
     base = Grid() if args.grid is None else read_grid(args.grid)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
@@ -34,6 +34,7 @@ from gsmerge.research.generate.photograph import (
 from gsmerge.research.generate.shapes import Array, compose, invert, norm
 from gsmerge.research.generate.textures import Palette, pyramid
 from gsmerge.runtime.threads import parallel_map
+from gsmerge.settings.setting import Settings, setting
 from gsmerge.types import Cameras, Gaussians
 
 PATH_TRIES, STAGE_TRIES = 6, 6  # paths per stage, and stages, until all views are usable
@@ -133,35 +134,28 @@ def is_usable(hits: Hits) -> bool:
 
 
 @dataclass(frozen=True)
-class GenerateOptions:
-    """Settings of synthetic scenes; a ValueError if one is out of range."""
+class GenerateOptions(Settings):
+    """Settings of synthetic scenes."""
 
-    views: tuple[int, int] = (6, 6)  # range of their number in a scene; one target is between any two neighbours,
-    # or, in a building, at most 50 of these, evenly spread
-    width: int = 320  # of the views, pixels: 16 to 2048
-    height: int = 240  # the same
-    photo_scale: int = 1  # times the views' size that the photos have, 1 to 8; the network sees the views' own
-    style: str = MIXED  # one of STYLES, or "mixed": each in turn; or BUILDING
-    path: str = MIXED  # one of PATHS, or "mixed": any
-    noise: float = 1.0  # factor on the errors: 0 to 10
-    ranges: NoiseOptions = field(default_factory=NoiseOptions)  # the errors and habits
+    views: tuple[int, int] = setting((6, 6), "Range of the number of views in a scene.",
+        "One target is between any two neighbours, or, in a building, at most 50 of these, evenly spread.", least=2,
+        most=MAX_VIEWS)  # fmt: skip
+    width: int = setting(320, "Width of the views.", least=16, most=2048, unit="pixels")
+    height: int = setting(240, "Height of the views.", least=16, most=2048, unit="pixels")
+    photo_scale: int = setting(1, "Times the views' size that the photos have; the network sees the views' own.",
+        least=1, most=8)  # fmt: skip
+    style: str = setting(MIXED, "Rooms or gardens, mixed: these two in turn, or building: many rooms.",
+        choices=(MIXED, *STYLES, BUILDING))  # fmt: skip
+    path: str = setting(MIXED, "Path of the cameras; mixed: any, or a walk in a building.", choices=(MIXED, *PATHS))
+    noise: float = setting(1.0, "Factor on the simulated errors of the network.", least=0, most=10)
+    ranges: NoiseOptions = setting(NoiseOptions(), "The errors and habits.")
 
     def __post_init__(self) -> None:
-        low, high = self.views
-        if not 2 <= low <= high <= MAX_VIEWS:
-            raise ValueError(f"views: expected 2 to {MAX_VIEWS}, got {low} to {high}")
-        for name in ("width", "height"):
-            if not 16 <= getattr(self, name) <= 2048:
-                raise ValueError(f"{name}: expected 16 to 2048 pixels, got {getattr(self, name)}")
-        if not 1 <= self.photo_scale <= 8:
-            raise ValueError(f"photo_scale: expected 1 to 8, got {self.photo_scale}")
-        for name, known in (("style", (*STYLES, BUILDING)), ("path", tuple(PATHS))):
-            if getattr(self, name) not in (MIXED, *known):
-                raise ValueError(f"{name}: expected {', '.join((MIXED, *known))}, got {getattr(self, name)!r}")
+        super().__post_init__()
+        if self.views[0] > self.views[1]:
+            raise ValueError(f"views: expected the least and the most, got {self.views[0]} to {self.views[1]}")
         if self.style == BUILDING and self.path not in (MIXED, "walk"):
             raise ValueError(f"path: expected walk or mixed in a building, got {self.path!r}")
-        if not 0 <= self.noise <= 10:
-            raise ValueError(f"noise: expected 0 to 10, got {self.noise:g}")
 
     def to_dict(self) -> dict[str, Any]:
         """Convert all settings to JSON types."""

@@ -15,12 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.budget import share_text
 from gsmerge.errors import SceneError
 from gsmerge.geometry import lower_median
 from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.networks.corrections import COLOR
-from gsmerge.options import CompactOptions
 from gsmerge.raster.photos import Photos, blank_photos, scene_pictures
 from gsmerge.research.training.scenes import (
     TrainingScene,
@@ -33,6 +31,8 @@ from gsmerge.research.training.targets import Progress, Targets, fit_targets
 from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.scene.held_out import read_held_out
 from gsmerge.scene.read import load_scene
+from gsmerge.settings.budget import share_text
+from gsmerge.settings.compact import CompactOptions
 from gsmerge.stages.encode import encode
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge, take

@@ -24,7 +24,8 @@ from gsmerge.networks.tokens import compute_group_features
 from gsmerge.raster.photos import Photos
 from gsmerge.research.training.scenes import TrainingScene, coverage, covered_pixels, reduced_masks
 from gsmerge.research.training.train_options import TrainOptions
-from gsmerge.stages.decode import DecodeOptions, divide
+from gsmerge.settings.stages import DecodeOptions
+from gsmerge.stages.decode import divide
 from gsmerge.types import SH_C0, FeatureGaussians, Gaussians, as_tensor
 
 Progress = Callable[[int, int], None]  # step, steps

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,189 +13,106 @@ from gsmerge.fit.loss import LOSS_WINDOW
 from gsmerge.io.bounds import read_table
 from gsmerge.measure.lpips import require_lpips
 from gsmerge.networks.options import SLOTS, NetworkOptions
-from gsmerge.stages.match import MatchOptions
-from gsmerge.stages.superpixels import SegmentOptions
+from gsmerge.settings.setting import Settings, setting
+from gsmerge.settings.stages import SEGMENTATIONS, Geometry, MatchOptions, Method
 
+COUNT: dict[str, Any] = {"least": 1, "most": 10**9}
+FROM_0: dict[str, Any] = {"least": 0, "most": 10**9}
+PART: dict[str, Any] = {"least": 0, "most": 1}
+RATE: dict[str, Any] = {"least": 1e-12, "most": 1e6}
+WEIGHT: dict[str, Any] = {"least": 0, "most": 1e6}
 LISTS = ("levels", "densities", "views", "random_views")
-COUNTS = (
-    "fit_steps", "steps", "crops", "crop", "save_every", "validation_crops", "photo_scale", "most",
-    "validation_windows", "teacher_steps", "diversity_steps", "buffer", "refresh", "workers", "validation_examples",
-)  # fmt: skip
-WEIGHTS = ("photo_weight", "ssim_weight", "lpips_weight", "regression_weight", "teacher_weight", "diversity_weight")
-RANGES: tuple[tuple[tuple[str, ...], float, float, bool], ...] = (  # settings, least, most, whole numbers
-    (COUNTS, 1, 10**9, True),
-    (("warmup", "seed", "photo_side"), 0, 10**9, True),
-    (("window",), LOSS_WINDOW, 10**9, True),
-    (("average", "photo_start", "novel", "lpips_start", "overlap", "iou"), 0, 1, False),
-    (("rate", "least_rate", "clip"), 1e-12, 1e6, False),
-    (("decay", "turn_weight", *WEIGHTS), 0, 1e6, False),
-    (("inner",), 1e-6, 1, False),
-    (("opacity_shift",), -8, 8, False),
-    (("similarity",), -1, 1, False),
-)
 
 
 @dataclass(frozen=True)
-class TrainOptions:
-    """Settings of a training run: what networks are trained on, and how.
+class TrainOptions(Settings):
+    """Settings of a training run: what networks are trained on, and how."""
 
-    Args:
-        network: Sizes of the networks.
-        views: Numbers of views, evenly spread; 0 means all. A scene gives an example for each. The photos of the
-            other views are novel views.
-        random_views: Least and most views of a subset that is drawn anew for every window, as ``[1, 12]`` in the
-            paper, in place of ``views``; empty: those. Not with a loss that uses the fit, whose result is that of one
-            subset.
-        recolor: Whether every window has colours of its own: channels in any order, less contrast, negatives. Few
-            scenes have few colours, and networks learn these.
-        densities: Superpixels per pixel; a scene gives an example for each. Two by default, since the full fit starts
-            with 57 % of the usual number.
-        segmentation: Superpixel method.
-        match: Merging across views, see :class:`gsmerge.stages.match.MatchOptions`. Where no fit is used, what the
-            networks make of a window is matched in every step.
-        overlap: Least overlap of a match by ``"overlap"``, 0 to 1.
-        iou: Least intersection over union of the boxes of a match by ``"aabb"``, 0 to 1.
-        similarity: Least cosine of the latents of a match by ``"aabb"``, -1 to 1.
-        geometry: What is matched in every step: ``"analytic"``: the moments, ``"decoded"``: the K = 1 head's output.
-        fit_steps: Steps of the full fit whose result is the target; fitted only where a loss uses it:
-            ``regression_weight`` or ``photo_start`` above 0.
-        levels: Numbers of children K whose heads are trained, of 1, 2 and 4; each needs a fit, if there is one.
-        buffer: Examples in memory for each crop of a step, which draws one of them.
-        refresh: Steps after which the next example takes the place of the oldest of these.
-        workers: Threads that read examples ahead.
-        steps: Steps of the training.
-        warmup: Steps over which the learning rate increases.
-        rate: Highest learning rate.
-        least_rate: Rate at the end of the cosine.
-        decay: Weight decay (AdamW).
-        clip: Largest norm of the gradient.
-        average: Weight of the previous mean in the running mean of the weights, which is validated and saved; less in
-            the first steps.
-        crops: Crops or windows per step, of all processes together; worked on in parallel.
-        crop: Feature Gaussians of a crop: those nearest to one of them.
-        inner: Share of a crop that is scored; the rest are neighbours.
-        turn_weight: Weight of the rotation in the loss; it is small because axes of similar length have no direction.
-        photo_start: Share of the steps after which renders are compared with photos; 1: never. Of two runs of
-            400 steps on two scenes, the one with 0.3 ended 0.9 dB below the one with 0.
-        novel: Share of the windows in novel views, if there are any.
-        photo_scale: Factor by which the sides of the photos are divided.
-        photo_side: Longer side of the photos in pixels, where they are larger, in place of ``photo_scale``; 476 in the
-            paper; 0: not used.
-        window: Side of a window of a photo that is rendered, pixels.
-        most: Feature Gaussians that may reach into a window; a window with more is halved.
-        photo_loss: Colour loss: ``"l1"`` or ``"mse"`` (as in the paper).
-        photo_weight: Weight of the colour loss.
-        ssim_weight: Weight of 1 - SSIM.
-        lpips_weight: Weight of LPIPS (VGG), whose weights must be installed; a step takes twice as long with it.
-        lpips_start: Share of the steps after which LPIPS has its weight.
-        regression_weight: Weight of the regression when renders are compared; it falls to 0 until the end of the run.
-        teacher_weight: Weight of the distance from the moments of the groups (paper eq. teacher_mean, teacher_cov).
-        teacher_steps: Steps that compare renders over which it falls to 0.
-        diversity_weight: Weight of the diversification of several children.
-        diversity_unit: Unit of the volumes by which pairs of children are weighted: ``"group"``: the size of theirs,
-            so that weights start near 1. ``"scene"``: the scene's median depth, which is closest to the paper's letter
-            and leaves nothing of the loss.
-        diversity_steps: Steps that compare renders over which it falls to 0.
-        opacity_shift: Added to the raw correction of the opacity by the heads of the checkpoints. New captures have
-            holes that scenes in training lack.
-        save_every: Steps between checkpoints, validation and lines of the table.
-        validation_examples: Most examples for validation, evenly spread over those that there are.
-        validation_crops: Crops of each of them, always the same; only where a loss uses the fit.
-        validation_windows: Windows of each of them, always the same.
-        seed: Seed of all random numbers.
-
-    Raises:
-        ValueError: If a setting is out of range.
-    """
-
-    network: NetworkOptions = field(default_factory=NetworkOptions)
-    views: tuple[int, ...] = (3, 6, 0)
-    random_views: tuple[int, ...] = ()
-    recolor: bool = False
-    densities: tuple[float, ...] = (0.025, 0.044)
-    segmentation: str = "rdseg"
-    match: str = "overlap"
-    overlap: float = 0.7
-    iou: float = 0.2
-    similarity: float = 0.8
-    geometry: str = "analytic"
-    fit_steps: int = 300
-    levels: tuple[int, ...] = SLOTS
-    buffer: int = 4
-    refresh: int = 4
-    workers: int = 1
-    steps: int = 6000
-    warmup: int = 200
-    rate: float = 1e-3
-    least_rate: float = 1e-5
-    decay: float = 1e-4
-    clip: float = 1.0
-    average: float = 0.998
-    crops: int = 2
-    crop: int = 512
-    inner: float = 0.6
-    turn_weight: float = 0.1
-    photo_start: float = 0.0
-    novel: float = 0.75
-    photo_scale: int = 2
-    photo_side: int = 0
-    window: int = 96
-    most: int = 4000
-    photo_loss: str = "l1"
-    photo_weight: float = 0.8
-    ssim_weight: float = 0.2
-    lpips_weight: float = 0.0
-    lpips_start: float = 0.0
-    regression_weight: float = 0.1
-    teacher_weight: float = 0.0
-    teacher_steps: int = 2000
-    diversity_weight: float = 0.0
-    diversity_unit: str = "group"
-    diversity_steps: int = 50_000
-    opacity_shift: float = 0.0
-    save_every: int = 200
-    validation_examples: int = 24
-    validation_crops: int = 8
-    validation_windows: int = 4
-    seed: int = 0
+    network: NetworkOptions = setting(NetworkOptions(), "Sizes of the networks.")
+    views: tuple[int, ...] = setting((3, 6, 0), "Numbers of views, evenly spread; 0 means all.",
+        "A scene gives an example for each. The photos of the other views are novel views.", least=0, most=10**6,
+        filled=True)  # fmt: skip
+    random_views: tuple[int, ...] = setting((), "Least and most views of a subset that is drawn anew for every window, "
+        "as `[1, 12]` in the paper, in place of `views`; empty: those.",
+        "Not with a loss that uses the fit, whose result is that of one subset.", least=1, most=10**6)  # fmt: skip
+    recolor: bool = setting(False, "Whether every window has colours of its own: channels in any order, less contrast, "
+        "negatives.",
+        "Few scenes have few colours, and networks learn these.")  # fmt: skip
+    densities: tuple[float, ...] = setting((0.025, 0.044), "Superpixels per pixel; a scene gives an example for each.",
+        "Two by default, since the full fit starts with 57 % of the usual number.", least=1e-6, most=1,
+        filled=True)  # fmt: skip
+    segmentation: str = setting("rdseg", "Superpixel method.", choices=SEGMENTATIONS)
+    match: Method = setting("overlap", "Merging across views.",
+        "Where no fit is used, what the networks make of a window is matched in every step.")  # fmt: skip
+    overlap: float = setting(0.7, "Least overlap of a match by `overlap`.", **PART)
+    iou: float = setting(0.2, "Least intersection over union of the boxes of a match by `aabb`.", **PART)
+    similarity: float = setting(0.8, "Least cosine of the latents of a match by `aabb`.", least=-1, most=1)
+    geometry: Geometry = setting("analytic", "What is matched in every step: `analytic`: the moments, `decoded`: the K "
+        "= 1 head's output.")  # fmt: skip
+    fit_steps: int = setting(300, "Steps of the full fit whose result is the target; fitted only where a loss uses it: "
+        "`regression_weight` or `photo_start` above 0.", **COUNT)  # fmt: skip
+    levels: tuple[int, ...] = setting(SLOTS, "Numbers of children K whose heads are trained, each needs a fit, if "
+        "there is one.", choices=SLOTS, filled=True, unique=True)  # fmt: skip
+    buffer: int = setting(4, "Examples in memory for each crop of a step, which draws one of them.", **COUNT)
+    refresh: int = setting(4, "Steps after which the next example takes the place of the oldest of these.", **COUNT)
+    workers: int = setting(1, "Threads that read examples ahead.", **COUNT)
+    steps: int = setting(6000, "Steps of the training.", **COUNT)
+    warmup: int = setting(200, "Steps over which the learning rate increases.", **FROM_0)
+    rate: float = setting(1e-3, "Highest learning rate.", **RATE)
+    least_rate: float = setting(1e-5, "Rate at the end of the cosine.", **RATE)
+    decay: float = setting(1e-4, "Weight decay (AdamW).", **WEIGHT)
+    clip: float = setting(1.0, "Largest norm of the gradient.", **RATE)
+    average: float = setting(0.998, "Weight of the previous mean in the running mean of the weights, which is "
+        "validated and saved; less in the first steps.", **PART)  # fmt: skip
+    crops: int = setting(2, "Crops or windows per step, of all processes together; worked on in parallel.", **COUNT)
+    crop: int = setting(512, "Feature Gaussians of a crop: those nearest to one of them.", **COUNT)
+    inner: float = setting(0.6, "Share of a crop that is scored; the rest are neighbours.", least=1e-6, most=1)
+    turn_weight: float = setting(0.1, "Weight of the rotation in the loss; it is small because axes of similar length "
+        "have no direction.", **WEIGHT)  # fmt: skip
+    photo_start: float = setting(0.0, "Share of the steps after which renders are compared with photos; 1: never.",
+        "Of two runs of 400 steps on two scenes, the one with 0.3 ended 0.9 dB below the one with 0.",
+        **PART)  # fmt: skip
+    novel: float = setting(0.75, "Share of the windows in novel views, if there are any.", **PART)
+    photo_scale: int = setting(2, "Factor by which the sides of the photos are divided.", **COUNT)
+    photo_side: int = setting(0, "Longer side of the photos in pixels, where they are larger, in place of "
+        "`photo_scale`; 476 in the paper; 0: not used.", **FROM_0)  # fmt: skip
+    window: int = setting(96, "Side of a window of a photo that is rendered, pixels.", least=LOSS_WINDOW, most=10**9)
+    most: int = setting(4000, "Feature Gaussians that may reach into a window; a window with more is halved.", **COUNT)
+    photo_loss: str = setting("l1", "Colour loss: `l1` or `mse` (as in the paper).", choices=("l1", "mse"))
+    photo_weight: float = setting(0.8, "Weight of the colour loss.", **WEIGHT)
+    ssim_weight: float = setting(0.2, "Weight of 1 - SSIM.", **WEIGHT)
+    lpips_weight: float = setting(0.0, "Weight of LPIPS (VGG), whose weights must be installed; a step takes twice as "
+        "long with it.", **WEIGHT)  # fmt: skip
+    lpips_start: float = setting(0.0, "Share of the steps after which LPIPS has its weight.", **PART)
+    regression_weight: float = setting(0.1, "Weight of the regression when renders are compared; it falls to 0 until "
+        "the end of the run.", **WEIGHT)  # fmt: skip
+    teacher_weight: float = setting(0.0, "Weight of the distance from the moments of the groups (paper eq. "
+        "teacher_mean, teacher_cov).", **WEIGHT)  # fmt: skip
+    teacher_steps: int = setting(2000, "Steps that compare renders over which it falls to 0.", **COUNT)
+    diversity_weight: float = setting(0.0, "Weight of the diversification of several children.", **WEIGHT)
+    diversity_unit: str = setting("group", "Unit of the volumes by which pairs of children are weighted: `group`: the "
+        "size of theirs, so that weights start near 1.",
+        "`scene`: the scene's median depth, which is closest to the paper's letter and leaves nothing of the loss.",
+        choices=("group", "scene"))  # fmt: skip
+    diversity_steps: int = setting(50_000, "Steps that compare renders over which it falls to 0.", **COUNT)
+    opacity_shift: float = setting(0.0, "Added to the raw correction of the opacity by the heads of the checkpoints.",
+        "New captures have holes that scenes in training lack.", least=-8, most=8)  # fmt: skip
+    save_every: int = setting(200, "Steps between checkpoints, validation and lines of the table.", **COUNT)
+    validation_examples: int = setting(24, "Most examples for validation, evenly spread over those that there are.",
+        **COUNT)  # fmt: skip
+    validation_crops: int = setting(8, "Crops of each of them, always the same; only where a loss uses the fit.",
+        **COUNT)  # fmt: skip
+    validation_windows: int = setting(4, "Windows of each of them, always the same.", **COUNT)
+    seed: int = setting(0, "Seed of all random numbers.", **FROM_0)
 
     def __post_init__(self) -> None:
-        for names, low, high, whole in RANGES:
-            for name in names:
-                self._expect(name, getattr(self, name), low, high, whole=whole)
         for name in LISTS:  # JSON and TOML have lists
             object.__setattr__(self, name, tuple(getattr(self, name)))
-        for name, least in (("views", 0), ("random_views", 1)):
-            for count in getattr(self, name):
-                self._expect(name, count, least, 10**6, whole=True)
-        for density in self.densities:
-            self._expect("densities", density, 1e-6, 1)
-        for name in ("views", "densities"):
-            if not getattr(self, name):
-                raise ValueError(f"{name}: expected at least one number, got none")
+        super().__post_init__()
         if self.random_views and (len(self.random_views) != 2 or self.random_views[0] > self.random_views[1]):
             raise ValueError(f"random_views: expected the least and the most, got {list(self.random_views)}")
         if self.random_views and self.uses_fit:
             raise ValueError("random_views: expected regression_weight 0 and photo_start 0, got a loss that uses a fit")
-        if self.diversity_unit not in ("group", "scene"):
-            raise ValueError(f'diversity_unit: expected "group" or "scene", got {self.diversity_unit!r}')
-        if not isinstance(self.recolor, bool):
-            raise ValueError(f"recolor: expected true or false, got {self.recolor!r}")
-        if self.photo_loss not in ("l1", "mse"):
-            raise ValueError(f'photo_loss: expected "l1" or "mse", got {self.photo_loss!r}')
-        if not self.levels or len(set(self.levels)) < len(self.levels) or not set(self.levels) <= set(SLOTS):
-            raise ValueError(f"levels: expected some of 1, 2 and 4, got {list(self.levels)}")
-        if self.match is None:
-            raise ValueError('match: expected "overlap", "aabb" or "none", got None')
-        SegmentOptions(segmentation=self.segmentation)
-        self.match_options()
-
-    @staticmethod
-    def _expect(name: str, value: Any, low: float, high: float, *, whole: bool = False) -> None:
-        kind = int if whole else int | float
-        if isinstance(value, bool) or not isinstance(value, kind) or not low <= value <= high:
-            number = "a whole number" if whole else "a number"
-            raise ValueError(f"{name}: expected {number} from {low:g}, got {value!r}")
 
     @property
     def uses_fit(self) -> bool:

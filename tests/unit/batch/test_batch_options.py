@@ -10,7 +10,7 @@ import pytest
 from messages import refuses
 
 from gsmerge.batch import BatchOptions
-from gsmerge.options import CompactOptions
+from gsmerge.settings.compact import CompactOptions
 
 
 def test_runs_that_may_share_a_folder_have_one_name() -> None:
@@ -31,9 +31,9 @@ def test_runs_that_may_share_a_folder_have_one_name() -> None:
     ("wrong", "named"),
     [
         ({"jobs": 0}, ("jobs", 1, 0)), ({"retries": -1}, ("retries", 0, -1)), ({"timeout": 0.0}, ("timeout", "0.0")),
-        ({"timeout": math.nan}, ("timeout", "nan")), ({"max_memory": 0}, ("max memory", 1, 0)),
+        ({"timeout": math.nan}, ("timeout", "nan")), ({"max_memory": 0}, ("max_memory", 1, 0)),
         ({"engine": "slurm"}, ("engine", "'slurm'")), ({"address": "auto"}, ("address", "ray", "local")),
-        ({"engine": "ray", "max_memory": 5}, ("max memory", "local", "Ray")),
+        ({"engine": "ray", "max_memory": 5}, ("max_memory", "local", "Ray")),
     ],
 )  # fmt: skip
 def test_settings_out_of_range_are_refused(wrong: dict[str, Any], named: tuple[object, ...]) -> None:

@@ -12,7 +12,7 @@ from messages import refuses
 from gsmerge.batch import BatchOptions, find_jobs
 from gsmerge.batch.find import find_scenes, output_name
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.options import CompactOptions
+from gsmerge.settings.compact import CompactOptions
 
 OUT = Path("out")
 

@@ -25,9 +25,9 @@ from gsmerge.batch.records import (
 from gsmerge.batch.schedule import dispatch, estimate_seconds, make_schedule
 from gsmerge.batch.task import BatchContext, Task
 from gsmerge.errors import SceneError
-from gsmerge.options import CompactOptions
 from gsmerge.runtime.estimate import memory_bytes
 from gsmerge.runtime.work import Lost
+from gsmerge.settings.compact import CompactOptions
 
 LOST = "lost"
 

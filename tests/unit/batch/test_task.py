@@ -267,7 +267,7 @@ def test_a_kill_at_any_moment_loses_nothing(
     where, before = KILLS[moment]
     code = f"""
 import os, signal, sys
-sys.path.insert(0, {str(root / "tests")!r})
+sys.path.insert(0, {str(root / "tests" / "helpers")!r})
 from pathlib import Path
 from batches import one_task
 from gsmerge.batch.task import run_task

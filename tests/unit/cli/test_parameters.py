@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import pytest
 from messages import refuse_all, refuses
 
-from gsmerge.cli.parameters import Args, parse_pairs, setting_kinds, words_for
+from gsmerge.cli.parameters import Args, parse_pairs
 from gsmerge.errors import UsageError
 from gsmerge.online.options import OnlineOptions
-from gsmerge.options import CompactOptions
+from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.setting import flat_settings
 
-KINDS = setting_kinds(CompactOptions)
+KNOWN = flat_settings(CompactOptions)
 
 
 @pytest.mark.parametrize(
@@ -35,7 +35,7 @@ KINDS = setting_kinds(CompactOptions)
     ],
 )
 def test_values_are_json_or_text(pair: str, expected: dict[str, Any]) -> None:
-    assert parse_pairs("--set", [pair], KINDS) == expected
+    assert parse_pairs("--set", [pair], KNOWN) == expected
 
 
 @pytest.mark.parametrize(
@@ -49,9 +49,8 @@ def test_values_are_json_or_text(pair: str, expected: dict[str, Any]) -> None:
     ],
 )  # fmt: skip
 def test_what_cannot_be_meant(pairs: list[str], place: str, found: list[str]) -> None:
-    kinds = {"k": int, **{name: kind for name, kind in KINDS.items() if name != "k"}}
     with refuses(UsageError, place, *found):
-        parse_pairs("--set", pairs, kinds)
+        parse_pairs("--set", pairs, KNOWN)
 
 
 def test_options_and_set_are_one() -> None:
@@ -70,16 +69,3 @@ def test_several_kinds_of_settings() -> None:
     }  # fmt: skip
     made, online = Args(set=["recipe=paper", "replay=3"]).make(CompactOptions, OnlineOptions)
     assert (made.segment.segmentation, online.replay) == ("bass-st", 3)
-
-
-@dataclass
-class Kinds:
-    choice: Literal["a", "b"] | None
-    numbers: tuple[int, ...]
-    size: int | float
-
-
-def test_values_in_words() -> None:
-    assert [words_for(kind) for kind in setting_kinds(Kinds).values()] == [
-        "a, b or null", "a list", "a whole number or a number",
-    ]  # fmt: skip

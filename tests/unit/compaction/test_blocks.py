@@ -11,13 +11,13 @@ import scenes
 from messages import refuses
 
 from gsmerge import CompactOptions, compact
-from gsmerge.budget import DEVICES
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import canonicalise
 from gsmerge.facts.views import subset
 from gsmerge.fit import FitOptions, fit
 from gsmerge.fit.photo_sizes import fit_photos
 from gsmerge.plan import plan_whole
+from gsmerge.settings.budget import DEVICES
 from gsmerge.stages.segment import measure_size
 from gsmerge.types import Cameras, Scene
 

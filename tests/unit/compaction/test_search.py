@@ -10,7 +10,7 @@ from typing import cast
 import pytest
 from messages import refuses
 
-from gsmerge.budget import DEVICES, BudgetOptions, exact_count, max_allowed, parse_share, share_text
+from gsmerge.budget import exact_count, max_allowed
 from gsmerge.compaction.search import (
     MAX_RUNS,
     CountSearch,
@@ -23,6 +23,7 @@ from gsmerge.compaction.search import (
 )
 from gsmerge.facts.prepare import Prepared
 from gsmerge.plan import Plan
+from gsmerge.settings.budget import DEVICES, BudgetOptions, parse_share, share_text
 
 
 def points(*values: tuple[int, float, float]) -> list[CurvePoint]:

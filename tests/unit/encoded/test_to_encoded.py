@@ -192,8 +192,8 @@ def test_wishes_that_cannot_be_met(name: str, value: Any, found: str, encoded: E
     [
         ({"fit": "full"}, "fit full", ["encoded"]), ({"method": "voxel"}, "method voxel", ["encoded"]),
         ({"levels": 2}, "levels", ["encoded"]), ({"quality": "-0.1dB"}, "quality -0.1dB", ["encoded"]),
-        ({"quality": "20dB"}, "quality 20dB", ["encoded"]), ({"max_k": 9}, "max k", ["1 to 8", 9]),
-        ({"max_k": 2, "k": 3}, "max k", [3, 2]),
+        ({"quality": "20dB"}, "quality 20dB", ["encoded"]), ({"max_k": 9}, "max_k", ["1 to 8", 9]),
+        ({"max_k": 2, "k": 3}, "max_k", [3, 2]),
     ],
 )  # fmt: skip
 def test_what_cannot_be_encoded(settings: dict[str, Any], place: str, found: list[object], pixels: Scene) -> None:

@@ -17,7 +17,8 @@ from gsmerge.geometry import motion_matrices, motion_vectors, pose_changes, proj
 from gsmerge.geometry import without_common_motion as without_common
 from gsmerge.plan import make_plan
 from gsmerge.runtime.threads import use_threads
-from gsmerge.stages.clean import CleanOptions, clean_to_count
+from gsmerge.settings.stages import CleanOptions
+from gsmerge.stages.clean import clean_to_count
 
 VIEWS = range(5)
 

@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 
 from gsmerge.facts.partition import (
     SHARED,
-    BlockOptions,
     count_factors,
     measure_covisibility,
     owning_views,
     partition_views,
     see,
 )
+from gsmerge.settings.stages import BlockOptions
 from gsmerge.types import Cameras, Scene
 
 

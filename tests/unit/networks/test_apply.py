@@ -21,8 +21,9 @@ from gsmerge.networks.apply import (
 )
 from gsmerge.networks.options import NetworkOptions
 from gsmerge.research.training.modules import Networks
-from gsmerge.stages.decode import DecodeOptions, decode, divide
-from gsmerge.stages.match import MatchOptions, match
+from gsmerge.settings.stages import DecodeOptions, MatchOptions
+from gsmerge.stages.decode import decode, divide
+from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge, refine, take
 from gsmerge.types import FeatureGaussians, Gaussians, Matches, as_array
 

@@ -18,8 +18,8 @@ from gsmerge.networks.checkpoint import save_checkpoint
 from gsmerge.networks.options import NetworkOptions
 from gsmerge.online.extend import extend
 from gsmerge.online.options import OnlineOptions
-from gsmerge.options import CompactOptions
 from gsmerge.research.training.modules import Networks
+from gsmerge.settings.compact import CompactOptions
 
 SMALL = NetworkOptions(width=16, heads=2, latent=8, members=4, neighbors=4, outputs="absolute")
 
@@ -94,9 +94,9 @@ def test_more_children_than_a_head_has_are_refused(scene: Scene, absolute: Path)
     with refuses(UsageError, "k", 4, 5):
         scenes.compacted(scene, recipe="paper", checkpoint=str(absolute), k=5)
     options = CompactOptions().with_settings({"recipe": "paper", "checkpoint": str(absolute)})
-    with refuses(UsageError, "max k", 4, 8):
+    with refuses(UsageError, "max_k", 4, 8):
         encode_scene(scene, options, max_k=8)
-    with refuses(UsageError, "max k", 4, 8):
+    with refuses(UsageError, "max_k", 4, 8):
         extend(None, scene, options, OnlineOptions(max_k=8))
 
 

@@ -11,7 +11,7 @@ from view_batches import fed, group, parts_of, room, same_group, state_of
 
 from gsmerge.online.extend_moments import find_partners, merge_into
 from gsmerge.online.state import GroupSet, limit_children, select_groups
-from gsmerge.stages.match import MatchOptions
+from gsmerge.settings.stages import MatchOptions
 
 
 @pytest.fixture(scope="module")

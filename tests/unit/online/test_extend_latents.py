@@ -32,8 +32,9 @@ from gsmerge.online.extend import extend
 from gsmerge.online.extend_latents import StateContext
 from gsmerge.online.file import load_state, save_state
 from gsmerge.online.state import OnlineState, sample_views, select_groups, to_encoded
-from gsmerge.options import CompactOptions
-from gsmerge.stages.match import MatchOptions, match
+from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.stages import MatchOptions
+from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge, take
 from gsmerge.types import grid_ids
 

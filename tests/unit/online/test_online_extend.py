@@ -19,7 +19,7 @@ from gsmerge.fit import FitOptions, FitReport
 from gsmerge.online.decode_stored import decode_stored
 from gsmerge.online.extend import extend
 from gsmerge.online.state import OnlineState, from_encoded
-from gsmerge.options import CompactOptions
+from gsmerge.settings.compact import CompactOptions
 from gsmerge.types import grid_ids
 
 Change = Callable[[Scene], Scene]
@@ -346,9 +346,9 @@ def test_what_a_state_cannot_have(settings: dict[str, Any], place: str, pairs: l
 
 
 def test_more_gaussians_of_a_group_than_are_kept(pairs: list[Scene], first: OnlineState) -> None:
-    with refuses(UsageError, "max k", 3, 2):
+    with refuses(UsageError, "max_k", 3, 2):
         Compactor(**FAST, k=3, max_k=2).extend(pairs[0])
-    with refuses(UsageError, "max k", 5, 4):
+    with refuses(UsageError, "max_k", 5, 4):
         extend(first, pairs[1], options(k=5))
 
 

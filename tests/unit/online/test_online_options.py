@@ -22,7 +22,7 @@ from gsmerge.online.options import OnlineOptions
 )  # fmt: skip
 def test_settings_out_of_range(name: str, value: float) -> None:
     for use in (OnlineOptions, Compactor):
-        with refuses(ValueError, name.replace("_", " "), value):
+        with refuses(ValueError, name, value):
             use(**{name: value})
 
 

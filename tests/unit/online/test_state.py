@@ -28,7 +28,8 @@ from gsmerge.online.state import (
     to_encoded,
     with_fitted_colors,
 )
-from gsmerge.stages.decode import DecodeOptions, decode
+from gsmerge.settings.stages import DecodeOptions
+from gsmerge.stages.decode import decode
 from gsmerge.types import SH_C0, FeatureGaussians
 
 ALL = DecodeOptions(min_opacity=0.0)

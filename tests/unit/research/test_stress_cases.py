@@ -13,11 +13,11 @@ from messages import refuses
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import project
-from gsmerge.options import CompactOptions
 from gsmerge.research import stress as module
 from gsmerge.research.stress import CASES, StressScene, stress
 from gsmerge.scene.held_out import read_held_out
 from gsmerge.scene.read import Loaded, load_scene
+from gsmerge.settings.compact import CompactOptions
 from gsmerge.types import Scene, Views
 
 FAST = CompactOptions().with_settings({"fit": "none"})

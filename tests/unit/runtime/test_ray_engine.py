@@ -12,7 +12,8 @@ from messages import refuses
 
 from gsmerge.errors import UsageError
 from gsmerge.runtime.record import note, record_run, stage
-from gsmerge.runtime.work import Cluster, Engine, Work
+from gsmerge.runtime.work import Cluster, Work, start_work
+from gsmerge.settings.stages import Engine
 
 
 def halve(number: int) -> float:
@@ -23,7 +24,7 @@ def halve(number: int) -> float:
 
 def test_calls_have_records_of_their_own() -> None:
     heard = []
-    with record_run(lambda text, *_: heard.append(text)) as run, Engine().start(threads=1, memory=0) as work:
+    with record_run(lambda text, *_: heard.append(text)) as run, start_work("local", threads=1, memory=0) as work:
         made = list(work.run("halve", halve, 2, ((number,) for number in (4, 6))))
     assert [value for value, _ in made] == [2, 3]
     assert [record.notes for _, record in made] == [["half of 4"], ["half of 6"]]
@@ -41,7 +42,7 @@ def test_calls_are_made_one_by_one() -> None:
             events.append(f"take {number}")
             yield (number,)
 
-    with Engine().start(threads=1, memory=0) as work:
+    with start_work("local", threads=1, memory=0) as work:
         for value, _ in work.run("halve", halve, 2, calls()):
             events.append(f"made {value}")
     assert events == ["take 1", "made 0.5", "take 2", "made 1.0"]
@@ -57,7 +58,7 @@ def test_wrong_engines(name: str, address: str | None, named: tuple[str, ...]) -
 
 def test_without_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
-    with refuses(UsageError, "engine ray", "ray>=2.9,<3"), Engine("ray").start(threads=1, memory=0):
+    with refuses(UsageError, "engine ray", "ray>=2.9,<3"), start_work("ray", threads=1, memory=0):
         pass
 
 

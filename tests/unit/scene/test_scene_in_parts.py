@@ -15,10 +15,10 @@ from gsmerge.cli import main
 from gsmerge.compaction.files import compact_files
 from gsmerge.errors import SceneError
 from gsmerge.io import write_ply
-from gsmerge.options import CompactOptions
 from gsmerge.scene.content_hash import read_files
 from gsmerge.scene.files import find_scene_files
 from gsmerge.scene.read import load_scene, read_scene
+from gsmerge.settings.compact import CompactOptions
 
 
 def split(folder: Path, tiny: Tiny, names: list[str], cuts: list[int]) -> Path:

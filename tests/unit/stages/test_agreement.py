@@ -13,9 +13,9 @@ import gsmerge
 from gsmerge import Scene
 from gsmerge.facts.prepare import prepare
 from gsmerge.moments import scene_members
-from gsmerge.options import CompactOptions
 from gsmerge.plan import make_plan
 from gsmerge.runtime.record import record_run
+from gsmerge.settings.compact import CompactOptions
 from gsmerge.stages.encode import contradicted_share, encode, weaken_contradicted
 from gsmerge.types import Groups, grid_ids
 

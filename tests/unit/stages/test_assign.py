@@ -15,6 +15,7 @@ from gsmerge.facts.prepare import canonicalise, prepare, scene_frame
 from gsmerge.moments import scene_members, unaligned_members
 from gsmerge.raster.images import seen_depths
 from gsmerge.runtime.record import record_run
+from gsmerge.settings.stages import SegmentOptions
 from gsmerge.stages.assign import (
     find_owners,
     merge_unseen,
@@ -23,7 +24,7 @@ from gsmerge.stages.assign import (
 )
 from gsmerge.stages.encode import encode, member_rows
 from gsmerge.stages.segment import measure_size, superpixels_per_view
-from gsmerge.stages.superpixels import SegmentOptions, segment
+from gsmerge.stages.superpixels import segment
 from gsmerge.types import Groups
 
 

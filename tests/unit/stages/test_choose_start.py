@@ -15,8 +15,9 @@ from gsmerge.networks.apply import encode_features
 from gsmerge.raster.photos import render_photos, scene_photos, scene_pictures
 from gsmerge.research.training.modules import Networks
 from gsmerge.runtime.record import record_run
+from gsmerge.settings.stages import DecodeOptions
 from gsmerge.stages.choose_start import choose_start, views_psnr
-from gsmerge.stages.decode import DecodeOptions, decode
+from gsmerge.stages.decode import decode
 from gsmerge.stages.merge import MergedViews
 from gsmerge.types import Groups, Segmentation, grid_ids
 

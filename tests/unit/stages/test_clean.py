@@ -11,7 +11,8 @@ from messages import noted, refuses
 
 from gsmerge import CompactOptions, Gaussians, Scene, compact
 from gsmerge.errors import UsageError
-from gsmerge.stages.clean import CleanOptions, clean, faintest_dropped, floater_share, floaters, inside_crop, parse_crop
+from gsmerge.settings.stages import CleanOptions, parse_crop
+from gsmerge.stages.clean import clean, faintest_dropped, floater_share, floaters, inside_crop
 
 QUICK = {"fit": "none", "checkpoint": "none", "superpixels": 60}
 
@@ -58,7 +59,7 @@ def test_crops_keep_what_is_inside() -> None:
     means = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [-1, -1, -1]], float)
     assert inside_crop(means, "sphere: 0, 0, 0, 1").tolist() == [True, True, False, False]
     assert inside_crop(means, "box:0,0,-.5,1,2,1").tolist() == [True, True, True, False]
-    assert parse_crop("sphere:1,2,3,4")[1].tolist() == [1, 2, 3, 4]
+    assert parse_crop("sphere:1,2,3,4")[1] == (1, 2, 3, 4)
 
 
 def test_floaters_are_alone_or_far_away(scene: Scene) -> None:

@@ -11,7 +11,8 @@ from messages import refuses
 from gsmerge import Gaussians, Scene
 from gsmerge.geometry import covariances
 from gsmerge.moments import Members, feature_to_gaussians, scene_members
-from gsmerge.stages.decode import DecodeOptions, deal_visible, decode, mixed_counts, split_counts
+from gsmerge.settings.stages import DecodeOptions
+from gsmerge.stages.decode import deal_visible, decode, mixed_counts, split_counts
 from gsmerge.stages.encode import encode
 from gsmerge.stages.segment import SegmentOptions, segment
 from gsmerge.types import FeatureGaussians, Groups

@@ -7,7 +7,8 @@ import pytest
 from messages import refuses
 from scenes import make_features
 
-from gsmerge.stages.match import MatchOptions, match
+from gsmerge.settings.stages import MatchOptions
+from gsmerge.stages.match import match
 from gsmerge.types import FeatureGaussians
 
 METHODS = ["overlap", "aabb"]
@@ -143,5 +144,5 @@ def test_thresholds_out_of_range_are_refused(setting: dict[str, float]) -> None:
 
 
 def test_unknown_method_is_refused() -> None:
-    with refuses(ValueError, "match", '"iou"'):
+    with refuses(ValueError, "match", "'iou'"):
         match(make_features(np.zeros((2, 3))), MatchOptions(match="iou"))

@@ -12,8 +12,9 @@ from messages import refuses
 from gsmerge import Scene
 from gsmerge.moments import Members, scene_members
 from gsmerge.research.baselines.simple import most_important
+from gsmerge.settings.stages import DecodeOptions
 from gsmerge.stages import segment as module
-from gsmerge.stages.decode import DecodeOptions, decode, split_counts
+from gsmerge.stages.decode import decode, split_counts
 from gsmerge.stages.encode import encode
 from gsmerge.stages.segment import (
     RegionTree,

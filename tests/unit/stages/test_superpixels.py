@@ -6,8 +6,9 @@ import torch
 from messages import refuses
 
 from gsmerge.kernels.superpixels.seeds import seed_density, seeds_from_density
+from gsmerge.settings.stages import SEGMENTATIONS
 from gsmerge.stages.segment import SegmentOptions, count_for, segment
-from gsmerge.stages.superpixels import SEGMENTATIONS, saliency, superpixels
+from gsmerge.stages.superpixels import saliency, superpixels
 
 
 def random_image(height: int, width: int, seed: int = 0) -> np.ndarray:

@@ -65,7 +65,7 @@ def test_methods_that_keep_all_run_once_and_fits_once_per_effort() -> None:
 
 @pytest.mark.parametrize(
     ("name", "text", "found"),
-    [("k", "1,1", "1, 1"), ("k", " , ", "none"), ("views", "0", 0), ("views", "some", "'some'")],
+    [("k", "1,1", "1,1"), ("k", " , ", "none"), ("views", "0", 0), ("views", "some", "'some'")],
 )
 def test_lists_that_cannot_be(name: str, text: str, found: object) -> None:
     with refuses(UsageError, name, found):
@@ -74,7 +74,7 @@ def test_lists_that_cannot_be(name: str, text: str, found: object) -> None:
 
 @pytest.mark.parametrize(
     ("name", "text", "named"),
-    [("k", "9", ("k", "1 to 8", 9)), ("fit", "some", ("fit", '"some"')), ("budgets", "x", ("budget", "'x'"))],
+    [("k", "9", ("k", "1 to 8", 9)), ("fit", "some", ("fit", "'some'")), ("budgets", "x", ("budget", "'x'"))],
 )
 def test_settings_that_the_library_refuses(name: str, text: str, named: tuple[object, ...]) -> None:
     with refuses(UsageError, *named):
@@ -99,7 +99,7 @@ def test_toml_files(tmp_path: Path) -> None:
     ("text", "named"),
     [
         ("{", ("grid.json", "TOML", "JSON")), ("[]", ("grid.json", "table")), ('{"kk": [1]}', ("grid.json", "kk")),
-        ('{"views": [0]}', ("grid.json: views", 0)), ('{"views": [[1]]}', ("grid.json", "'list'")),
+        ('{"views": [0]}', ("grid.json: views", 0)), ('{"views": [[1]]}', ("grid.json: views", 1)),
     ],
 )  # fmt: skip
 def test_files_that_hold_no_grid(text: str, named: tuple[object, ...], tmp_path: Path) -> None:

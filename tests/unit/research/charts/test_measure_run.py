@@ -17,7 +17,6 @@ import gsmerge
 from gsmerge.batch import BatchOptions
 from gsmerge.batch.records import DONE, FAILED, RECORDS, SKIPPED, record
 from gsmerge.measure.evaluate import EvaluateOptions
-from gsmerge.options import CompactOptions
 from gsmerge.research.charts.measure_run import (
     SEGMENTATIONS,
     SHARES,
@@ -29,6 +28,7 @@ from gsmerge.research.charts.measure_run import (
 )
 from gsmerge.runtime.jsonl import append_line
 from gsmerge.scene.files import find_scene_files
+from gsmerge.settings.compact import CompactOptions
 
 
 def line(run: RunRecord, **changes: Any) -> dict[str, Any]:

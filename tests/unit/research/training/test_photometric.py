@@ -36,7 +36,8 @@ from gsmerge.research.training.modules import Networks
 from gsmerge.research.training.predict import analytic_gaussians, match_crop, predict
 from gsmerge.research.training.scenes import coverage, covered_pixels, reduced_masks, view_subsets
 from gsmerge.research.training.windows import Box, Window, sample_window, whole_photo
-from gsmerge.stages.decode import DecodeOptions, decode
+from gsmerge.settings.stages import DecodeOptions
+from gsmerge.stages.decode import decode
 from gsmerge.stages.merge import merge
 from gsmerge.types import Cameras, Gaussians, Scene, Views
 

@@ -11,7 +11,7 @@ import pytest
 from exports import Smooth, da3_rows, depth_map_mask, export_rows, save_export, smooth_scene, with_intrinsics
 from tiny_scene import write_images
 
-from gsmerge.alignment.photos_alone import _possible_grids
+from gsmerge.alignment.estimate import _possible_grids
 from gsmerge.errors import SceneError
 from gsmerge.scene.read import Loaded, load_scene
 from gsmerge.types import SH_C0

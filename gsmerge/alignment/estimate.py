@@ -1,8 +1,8 @@
-"""Estimate cameras from photos alone, for files of which Depth Anything 3 dropped unknown pixels.
+"""Estimate cameras where no file gives any: from a full grid alone, or, with pixels dropped, from photos as well.
 
-Rows come view by view and row by row, so every stretch of them without a gap shows the colours of a
-stretch of the photo. Its place there says which pixels these rows are; they give the cameras, the
-cameras all others.
+Depth Anything 3 drops unknown pixels. Its rows come view by view and row by row, so every stretch of them without a
+gap shows the colours of a stretch of the photo. Its place there says which pixels these rows are; they give the
+cameras, the cameras all others.
 """
 
 from __future__ import annotations
@@ -14,26 +14,18 @@ from pathlib import Path
 
 import numpy as np
 
-from gsmerge.alignment.cameras import calibrate
-from gsmerge.alignment.layouts import (
-    DEPTH_SHARE,
-    Layout,
-    da3_box,
-    every_nth,
-    patch_grids,
-)
-from gsmerge.alignment.score import Correspondences, find_correspondences, pixel_limit
+from gsmerge.alignment.layouts import DEPTH_SHARE, Layout, da3_box, every_nth, exact_layouts, patch_grids, subsample
+from gsmerge.alignment.resection import projection_errors, refine_poses, start_pose
+from gsmerge.alignment.score import MARGIN, Correspondences, find_correspondences, pixel_limit
 from gsmerge.geometry import project_points, sh0_to_rgb
-from gsmerge.io.cameras.camera_file import (
-    W2C_OPENCV,
-    CameraFile,
-    View,
-    make_camera_file,
-    make_pinhole,
-)
+from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, View, make_camera_file, make_pinhole
 from gsmerge.io.photo_files import Photos, PhotoTransform, Size, resize_to
+from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Cameras, Gaussians
 
+ESTIMATED = "estimated from the grid"  # source of estimated cameras
+_GRID_SAMPLES = 300  # Gaussians per view that cameras are estimated from
+_CALIBRATIONS = 2  # each time without the Gaussians that lie far from their pixels
 WITH_PHOTOS = "estimated from rows and photos"  # of the cameras
 _STRETCH, _STEP = 96, 2  # rows that are compared with a photo, and every how many of them
 _STRETCHES = 60  # of a view
@@ -46,6 +38,60 @@ _MIN_STRETCHES, _MIN_AGREEING = 8, 0.5  # of a view that agree, and share of the
 _ROUNDS = 4  # of cameras and of the shape of their pixels
 _OWN_FOCALS = 1.3  # times nearer with a focal length for each view
 _OUTSIDE = 999  # a colour that no pixel has
+
+
+def estimate_cameras(
+    path: Path, gaussians: Gaussians, valid: np.ndarray, names: Sequence[str], width: int, height: int
+) -> CameraFile | None:
+    """Estimate poses and one focal length under which rows of a full or trimmed grid project into their own pixels.
+
+    ``names`` are those of the views, all ``width`` x ``height`` pixels; ``valid [n]`` bool; ``path`` is for
+    messages. None if no order of the rows fits at least twice as well as all others.
+    """
+    layouts = exact_layouts(len(gaussians), len(names), width, height)
+    possible = [layout for layout in layouts if layout.per_pixel == 1 and len(layout.views) == len(names)]
+    fits = [calibrate(gaussians.means, valid, subsample(layout, _GRID_SAMPLES)) for layout in possible]
+    fits.sort(key=lambda fit: fit[0])
+    limit = pixel_limit(width, height)
+    if not fits or fits[0][0] > limit or (len(fits) > 1 and fits[1][0] < MARGIN * fits[0][0]):
+        return None
+    _, focal, poses = fits[0]
+    K = make_pinhole(focal, focal, width / 2, height / 2)
+    views = [View(name, pose, K, (width, height)) for name, pose in zip(names, poses, strict=True)]
+    return make_camera_file(path, ESTIMATED, W2C_OPENCV, views)
+
+
+def calibrate(
+    means: np.ndarray, valid: np.ndarray, layout: Layout, aspect: float = 1.0
+) -> tuple[float, float, list[np.ndarray]]:
+    """Solve for (largest median distance in pixels, focal length, poses) of one order of the rows; inf on failure.
+
+    The vertical focal length is ``aspect`` times the horizontal one; the principal point is the middle.
+    """
+    pairs = find_correspondences(means, valid, layout)
+    middle = np.median(pairs.points, 0)
+    unit = float(np.median(np.abs(pairs.points - middle))) or 1.0
+    points = pairs.split((pairs.points - middle) / unit, len(layout.views))
+    pixels = pairs.split(pairs.pixels, len(layout.views))
+    focal = 1.2 * max(layout.width, layout.height)
+    K = make_pinhole(focal, aspect * focal, layout.width / 2, layout.height / 2)
+    kept = [np.ones(len(p), bool) for p in points]
+    starts = [start_pose(p, q, K) for p, q in zip(points, pixels, strict=True)]
+    found = [pose for pose in starts if pose is not None]
+    if len(found) < len(starts):
+        return math.inf, 0.0, []
+    poses = np.stack(found)
+    for _ in range(_CALIBRATIONS):
+        near, where = ([p[k] for p, k in zip(some, kept, strict=True)] for some in (points, pixels))
+        try:
+            K, poses = refine_poses(near, where, K, poses, focal=True)
+        except np.linalg.LinAlgError:
+            return math.inf, 0.0, []
+        errors = [projection_errors(p, q, K, pose) for p, q, pose in zip(points, pixels, poses, strict=True)]
+        kept = [e <= max(1.0, 3 * float(np.median(e))) for e in errors]
+    poses[:, :3, 3] = unit * poses[:, :3, 3] - matmul(poses[:, :3, :3], middle)
+    worst = max(float(np.median(e)) for e in errors)
+    return (worst if np.isfinite(worst) else math.inf), float(K[0, 0]), list(poses[:, :3])
 
 
 @dataclass(frozen=True)

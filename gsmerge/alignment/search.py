@@ -1,0 +1,324 @@
+"""Search the pixels of rows over sizes of the grid, conventions and frames of the poses, and orders, cheap first."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import chain, groupby
+from typing import Any
+
+import numpy as np
+
+from gsmerge.alignment.cameras import describe_convention, describe_reading, max_pixels, move_cameras, other_conventions
+from gsmerge.alignment.estimate import ESTIMATED, WITH_PHOTOS
+from gsmerge.alignment.layouts import (
+    MAY_BE_UNALIGNED,
+    GridFit,
+    Layout,
+    other_grids,
+    photo_grid,
+    small_photos_error,
+    subsample,
+    view_orders,
+)
+from gsmerge.alignment.recovery import SMALLEST_PX, Recovery, explain_count, is_seen, possible_layouts, recover
+from gsmerge.alignment.score import MARGIN, AlignmentInput, color_error, scale_by, score_layout
+from gsmerge.alignment.unaligned import check_cameras, choose_cameras
+from gsmerge.errors import SceneError
+from gsmerge.geometry import IDENTITY, Similarity
+from gsmerge.io.cameras.camera_file import CameraFile
+from gsmerge.io.formats.read import GaussianFile
+from gsmerge.io.photo_files import Photos, PhotoTransform, Size, as_floats, photo_size
+from gsmerge.runtime.memory import free_pages
+from gsmerge.types import Cameras
+
+_LARGE = 2  # times as many pixels as rows: likely photos of another size than the grid's
+_ALIKE, _ALIKE_PX = 1.15, 0.02  # two fits of one grid between which only the photos' colours can decide
+_MAX_TRIED = 6  # grids that only the number of rows speaks for and that are tried with all frames
+_MOVED_SAMPLES = 2000  # Gaussians of a view that its moved pose is solved from
+
+
+@dataclass(frozen=True)
+class AlignmentResult:
+    """The pixel of every row, or the cameras that see rows without pixels, with a description of the search."""
+
+    # ``[n]`` int64, the pixel ``(block·H + y)·W + x`` of each row, -1: none; None where the rows belong to no pixels.
+    # A block is a view, or one layer of a view with several Gaussians per pixel
+    pixel_ids: np.ndarray | None
+    cameras: Cameras  # all c views, in the frame of the Gaussians, at the size of the grid
+    images: np.ndarray | None  # ``[c,h,w,3]`` photos of that size, sRGB in [0, 1], float32
+    camera_file: CameraFile | None  # as it was read in the end; None where there are no cameras
+    notes: tuple[str, ...] = ()  # what was adapted, one sentence each
+    transform: PhotoTransform | None = None  # what was done to the photos
+    recovery: Recovery | None = None  # which reading of the rows won, and by how much; None without pixels
+    moves: Sequence[dict[str, Any]] = ()  # how far each camera was moved to its Gaussians; empty where none was
+    problem: str | None = None  # why the rows belong to no pixels; None where they do
+
+    @property
+    def layout(self) -> Layout | None:
+        """Layout of the rows, block by block; None without pixels."""
+        return None if self.recovery is None else self.recovery.best.layout
+
+    @property
+    def views(self) -> tuple[int, ...]:
+        """Camera of each block; all cameras without pixels."""
+        return tuple(range(len(self.cameras))) if self.layout is None else self.layout.views
+
+
+@dataclass(frozen=True)
+class _Source:
+    """The Gaussians, the cameras, the photos and the known facts about the rows."""
+
+    ply: GaussianFile
+    camera_file: CameraFile
+    photos: Photos | None
+    order: str
+    scale: float | None
+    depths: Callable[[], np.ndarray | None]
+    seen: dict[Size, bool] = field(default_factory=dict)  # what is known of :meth:`may_be`
+
+    @cached_property
+    def images(self) -> np.ndarray | None:
+        """Photos at their own size, ``[c,h,w,3]`` float32."""
+        return None if self.photos is None else as_floats(self.photos)
+
+    def may_be(self, grid: GridFit) -> bool:
+        """Return whether any cameras could show the rows as the pixels of a grid; remembered for each size."""
+        if grid.size not in self.seen:
+            inputs = self.inputs(grid, photos=False)
+            self.seen[grid.size] = is_seen(inputs, possible_layouts(inputs))
+        return self.seen[grid.size]
+
+    def inputs(self, grid: GridFit, *, photos: bool = True) -> AlignmentInput:
+        """Put rows, cameras and photos at the size of a grid together; without photos where only positions matter."""
+        images = None
+        if photos and self.photos is not None:
+            images = self.images if grid.transform is None else as_floats(grid.transform.photos(self.photos))
+        return AlignmentInput(
+            gaussians=self.ply.gaussians,
+            valid=self.ply.valid,
+            cameras=grid.cameras,
+            images=images,
+            labellings=view_orders(self.camera_file.names),
+            depths=self.depths,
+            order=self.order,
+            scale=self.scale,
+        )
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """A grid of which rows are the pixels."""
+
+    grid: GridFit
+    recovery: Recovery
+
+    @property
+    def px(self) -> float:
+        """Median distance of the Gaussians from their pixels in the worst view, pixels."""
+        return self.recovery.best.worst_px
+
+
+def align(
+    ply: GaussianFile,
+    camera_file: CameraFile,
+    photos: Photos | None = None,
+    *,
+    order: str = "auto",
+    scale: float | None = None,
+    depths: Callable[[], np.ndarray | None] = lambda: None,
+    frames: Callable[[], Sequence[Similarity]] = tuple,
+) -> AlignmentResult:
+    """Find the pixel of every row; for rows that belong to none, the poses from which the cameras see them.
+
+    The size of the grid, the frame and the convention of the poses, and the transform of the photos are searched
+    too.
+
+    Args:
+        ply: The file's rows.
+        camera_file: Its cameras.
+        photos: c uint8 photos of one size.
+        order: The order of the rows where it is known, see :class:`gsmerge.io.ReadHints`.
+        scale: Size of the Gaussians' world in units of the cameras', where it is given.
+        depths: Reads ``[c,h,w]`` depth maps next to the cameras; None where there are none.
+        frames: Reads the frames that a file names in which the cameras may see rows without pixels.
+
+    Raises:
+        SceneError: If sizes do not agree, several conventions fit, the Gaussians are not those of the cameras' views,
+            or other cameras would make pixels of the rows.
+    """
+    source = _Source(ply, camera_file, photos, order, scale, depths)
+    try:
+        grid = photo_grid(camera_file, photo_size(photos))
+    except SceneError:
+        fit = _choose_first(source, _fit_other_sizes(source))
+        if fit is None:
+            raise
+    else:
+        fit = _choose_first(source, _fits(source, grid))
+    if fit is not None:
+        return _make_result(source, fit)
+    small = small_photos_error(ply.info, camera_file, photo_size(photos)) if order not in MAY_BE_UNALIGNED else None
+    if small is not None:
+        raise small
+    inputs = source.inputs(grid)
+    why = explain_count(ply.info, inputs, camera_file)
+    if scale is not None:
+        inputs = replace(inputs, cameras=scale_by(scale).move(inputs.cameras))
+    cameras, camera_file, notes = choose_cameras(inputs, camera_file, frames(), why)
+    return AlignmentResult(
+        None, cameras, inputs.images, camera_file, (*grid.notes, *notes), grid.transform, problem=why.problem
+    )
+
+
+def _fits(source: _Source, grid: GridFit) -> Iterator[list[_Fit]]:
+    """Yield fits of the photos' size and others, with poses as stored, moved and in other conventions; likely first."""
+    other_sizes = _fit_other_sizes(source)
+    large = len(grid.cameras) * math.prod(grid.size) > _LARGE * len(source.ply.gaussians)
+    if large:
+        yield next(other_sizes, [])
+    yield _fit_all(source, [grid])
+    if source.order not in MAY_BE_UNALIGNED:
+        yield _fit_moved(source, grid)
+    if not large:
+        yield next(other_sizes, [])
+    if source.order != "none":
+        rows = source.ply.gaussians, source.ply.valid
+        others = (_with_poses(grid, other) for other in _conventions(source.camera_file))
+        seen = (other for other in others if check_cameras(*rows, other.cameras, None).ok)
+        yield _fit_all(source, seen)
+    yield from other_sizes
+
+
+def _fit_other_sizes(source: _Source) -> Iterator[list[_Fit]]:
+    """Yield fits of other sizes than the photos'; next, those in other conventions of the poses as well."""
+    if source.order != "none":
+        yield _fit_sizes(source, source.camera_file)
+    if source.order not in MAY_BE_UNALIGNED:
+        others = _conventions(source.camera_file)
+        fits = (_choose(source, _fit_sizes(source, other, exact_frames=True)) for other in others)
+        yield list(filter(None, fits))
+
+
+def _conventions(camera_file: CameraFile) -> Iterator[CameraFile]:
+    """Yield the cameras with their poses read in each other convention."""
+    for poses in other_conventions(camera_file.viewmats, camera_file.convention):
+        yield replace(camera_file, viewmats=poses.viewmats, convention=poses.convention)
+
+
+def _with_poses(grid: GridFit, camera_file: CameraFile) -> GridFit:
+    """Return a grid whose cameras have other poses."""
+    return replace(grid, camera_file=camera_file, cameras=replace(grid.cameras, viewmats=camera_file.viewmats))
+
+
+def _fit_all(
+    source: _Source, grids: Iterable[GridFit], *, photos: bool = True, exact_frames: bool = False
+) -> list[_Fit]:
+    """Recover the pixels of the rows in each of some grids; leave out those whose pixels they are not."""
+    recoveries = ((grid, recover(source.inputs(grid, photos=photos), exact_frames=exact_frames)) for grid in grids)
+    return [_Fit(grid, recovery) for grid, recovery in recoveries if recovery is not None]
+
+
+def _fit_moved(source: _Source, grid: GridFit) -> list[_Fit]:
+    """Fit a grid without missing pixels under slightly moved cameras; nothing where that does not fit.
+
+    Nothing, too, where another convention fits or the photos' colours disagree: views in the wrong order look the
+    same.
+    """
+    inputs = source.inputs(grid)
+    layouts = (layout.with_views_in(inputs.labellings) for layout in possible_layouts(inputs))
+    readings = (score_layout(inputs, layout, IDENTITY) for layout in chain.from_iterable(layouts))
+    best = None if inputs.scale is not None else min(readings, key=lambda reading: reading.worst_px, default=None)
+    if best is None or not best.worst_px <= max_pixels(*grid.size):
+        return []
+    for other in _conventions(source.camera_file):
+        posed = replace(inputs, cameras=_with_poses(grid, other).cameras)
+        if score_layout(posed, best.layout, IDENTITY).ok:
+            return []
+    pairs = inputs.pairs(subsample(best.layout, _MOVED_SAMPLES))
+    moved = move_cameras(pairs, grid.cameras, source.camera_file.names, str(source.camera_file.path))
+    if moved is None:
+        return []
+    grid = replace(grid, cameras=moved.cameras, notes=(*grid.notes, moved.note), moves=moved.moves)
+    return [fit for fit in _fit_all(source, [grid], exact_frames=True) if fit.recovery.confirmed is not False]
+
+
+def _fit_sizes(source: _Source, camera_file: CameraFile, *, exact_frames: bool = False) -> list[_Fit]:
+    """Fit grids of other sizes than the photos', by positions alone: the likeliest of which some fit.
+
+    Sizes that only the number of rows suggests are tried in the cameras' own frame first; with ``exact_frames`` all
+    are.
+    """
+    guesses: list[GridFit] = []
+    others = other_grids(source.ply.info, camera_file, photo_size(source.photos))
+    for _, ranked in groupby(others, key=lambda grid: grid.rank):
+        grids = [grid for grid in ranked if not grid.guessed or source.may_be(grid)]
+        guesses += [grid for grid in grids if grid.guessed]
+        exact = exact_frames or any(grid.guessed for grid in grids)
+        fits = _fit_all(source, grids, photos=False, exact_frames=exact)
+        if fits:
+            return fits
+    return [] if exact_frames else _fit_all(source, guesses[:_MAX_TRIED], photos=False)
+
+
+def _choose_first(source: _Source, rivals: Iterable[list[_Fit]]) -> _Fit | None:
+    """Choose a fit from the first of several lists that has one."""
+    return next(filter(None, (_choose(source, fits) for fits in rivals)), None)
+
+
+def _choose(source: _Source, fits: Sequence[_Fit]) -> _Fit | None:
+    """Choose the fit that is nearest to its pixels, and of several alike the one whose photos have the colours.
+
+    None where a grid of another size is about as near, SceneError where poses in another convention are.
+    """
+    best = min(fits, key=lambda fit: fit.px, default=None)
+    if best is None:
+        return None
+    rivals = sorted((fit for fit in fits if fit.px < MARGIN * max(best.px, SMALLEST_PX)), key=lambda fit: fit.px)
+    conventions = list(dict.fromkeys(fit.grid.camera_file.convention for fit in rivals))
+    if len(conventions) > 1:
+        both = " and as ".join(map(describe_convention, conventions[:2]))
+        problem = f"expected poses that fit in one reading, found that they fit as {both}"
+        raise SceneError(source.camera_file.path, problem, "convert them to the format's own")
+    exact = best.recovery.best.layout.kind != "pruned"  # what lacks pixels fits into grids of nearly its size as well
+    if exact and any(fit.grid.size != best.grid.size for fit in rivals):
+        return None
+    near = max(_ALIKE * best.px, best.px + _ALIKE_PX)
+    same = (fit for fit in fits if fit.grid.camera_file is best.grid.camera_file and fit.grid.size == best.grid.size)
+    alike = [fit for fit in same if fit.px <= near]
+    if len(alike) == 1:
+        return best
+    errors = [color_error(source.inputs(fit.grid), fit.recovery.best.layout) for fit in alike]
+    return alike[int(np.argmin(np.nan_to_num(errors, nan=1.0)))]
+
+
+def _make_result(source: _Source, fit: _Fit) -> AlignmentResult:
+    """Make the result of rows that are pixels, with the cameras in the frame of the Gaussians."""
+    inputs, grid, best = source.inputs(fit.grid), fit.grid, fit.recovery.best
+    free_pages(vars(inputs.gaussians).values())  # the search has looked at all rows
+    frame, layout, count = best.frame, best.layout, len(grid.cameras)
+    notes, usual = [*grid.notes], source.camera_file
+    if grid.camera_file.convention != usual.convention:
+        notes.append(f"{describe_reading(grid.camera_file.convention, usual.convention)}: read so")
+    if usual.source in (ESTIMATED, WITH_PHOTOS):
+        from_what = "own grid" if usual.source == ESTIMATED else "order and the photos' colours"
+        notes.append(f"no cameras were given: poses and focal length are estimated from the Gaussians' {from_what}")
+    in_order = layout.is_plain and frame is IDENTITY and len(layout.views) == count
+    if in_order and layout.views == inputs.labellings[1] != inputs.labellings[0]:
+        notes.append("views are in the order of the image names, not of the camera file")
+    elif not (in_order and layout.views in inputs.labellings):
+        used = len(set(layout.views))
+        notes.append(f"read as: {fit.recovery.description}")
+        notes += [f"{used} of {count} views are in the file"] * (used < count)
+    return AlignmentResult(
+        pixel_ids=layout.pixel_ids(len(inputs.gaussians)),
+        cameras=grid.cameras if frame is IDENTITY else frame.move(grid.cameras),
+        images=inputs.images,
+        camera_file=grid.camera_file,
+        notes=tuple(notes),
+        transform=grid.transform,
+        recovery=fit.recovery,
+        moves=grid.moves,
+    )

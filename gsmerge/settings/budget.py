@@ -1,0 +1,141 @@
+"""How many Gaussians a result has: budgets, file sizes, devices and quality targets, and their texts."""
+
+from __future__ import annotations
+
+import math
+import re
+import sys
+from dataclasses import dataclass
+from decimal import Decimal
+from fractions import Fraction
+
+from gsmerge.errors import UsageError
+from gsmerge.settings.setting import Settings, setting
+
+DEVICES = {"quest3": 400_000, "mobile": 1_000_000, "desktop": 3_000_000}  # most Gaussians that they draw fluidly
+SIZES = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}  # bytes
+AUTO = "auto"
+
+
+@dataclass(frozen=True)
+class BudgetOptions(Settings):
+    """Settings that decide the number of Gaussians, next to superpixels per view and K."""
+
+    budget: int | str | None = setting(None, "Gaussians in the result: a number, a share such as 2% of the input, or a "
+        "size such as 5MB, met exactly; quest3, mobile or desktop: at most what it draws fluidly; auto: as many as the "
+        "scene needs.",
+        "A size is that of the `.ply` and never exceeded.", metavar="40000|2%|5MB|DEVICE|auto")  # fmt: skip
+    quality: str | None = setting(None, "Fewest Gaussians that render the input photos at a PSNR such as 30dB, or that "
+        "lose at most so much against the best, such as -0.2dB.",
+        "The best is what the scene's own curve reaches.", metavar="30dB|-0.2dB")  # fmt: skip
+    levels: int = setting(1, "Levels of detail, each in a file of its own or all in a lod-meta.json, with a quarter of "
+        "the Gaussians of the one before.",
+        "Each is fitted by itself.", least=1, most=8)  # fmt: skip
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.in_bytes:
+            parse_bytes(str(self.budget))
+        elif self.budget not in (None, AUTO, *DEVICES):
+            parse_budget(self.budget, sys.maxsize)
+        if self.quality is not None:
+            parse_quality(self.quality)
+
+    @property
+    def auto(self) -> bool:
+        """Whether the scene decides the count."""
+        return self.budget == AUTO
+
+    @property
+    def in_bytes(self) -> bool:
+        """Whether the budget is a file size."""
+        return re.fullmatch(r"[^a-z]*[kmg]?i?b", str(self.budget).strip().lower()) is not None
+
+    @property
+    def target_psnr(self) -> float | None:
+        """PSNR (dB) that the input photos have to reach; None without this target."""
+        quality = None if self.quality is None else parse_quality(self.quality)
+        return None if quality is None or self.max_drop is not None else quality
+
+    @property
+    def max_drop(self) -> float | None:
+        """Allowed loss in dB against the best of the scene's curve; None without this target."""
+        loss = self.quality is not None and self.quality.strip().startswith("-")
+        return -parse_quality(str(self.quality)) if loss else None
+
+
+def parse_quality(text: str) -> float:
+    """Parse the dB of ``--quality``: a PSNR as "30dB", or a loss below zero as "-0.2dB".
+
+    Example:
+        >>> parse_quality("30dB"), parse_quality("-0.2dB")
+        (30.0, -0.2)
+    """
+    match = re.fullmatch(r"(-?)(\d*\.?\d+)\s*db", str(text).strip().lower(), re.ASCII)
+    value = float(match[2]) if match else math.inf
+    if match is None or not math.isfinite(value) or (value == 0 and not match[1]):
+        raise ValueError(f'quality: expected a PSNR as "30dB" or a loss as "-0.2dB", got {text!r}')
+    return -value if match[1] else value
+
+
+def parse_share(text: str) -> float:
+    """Parse a share above 0 and up to 100 %: "4.4%" -> 0.044."""
+    match = re.fullmatch(r"(\d*\.?\d+)\s*%", str(text).strip(), re.ASCII)
+    share = Fraction(match[1]) / 100 if match else Fraction(0)
+    if not 0 < share <= 1:
+        raise ValueError(f'expected a share as "4.4%", above 0 and up to 100%, got {text!r}')
+    return float(share)
+
+
+def share_text(share: float) -> str:
+    """Format a share exactly as :func:`parse_share` reads it: 0.044 -> "4.4%"."""
+    if isinstance(share, bool) or not isinstance(share, int | float):
+        raise ValueError(f"expected a share as a number, got {share!r}")
+    return f"{(Decimal(repr(share)) * 100).normalize():f}%"
+
+
+def parse_budget(budget: str | int | None, num_input: int) -> int:
+    """Parse a number of Gaussians, or a share of the input as "2%", rounded down; at most ``num_input``.
+
+    Raises:
+        ValueError: If it is neither.
+        UsageError: If it is not at least one Gaussian.
+
+    Example:
+        >>> parse_budget("40000", 1_000_000), parse_budget("2.5%", 1_000_000)
+        (40000, 25000)
+    """
+    text = str(budget).strip()
+    match = re.fullmatch(r"(\d[\d_]*|\d*\.?\d+\s*%)", text, re.ASCII)
+    if not match:
+        number = re.fullmatch(r"\d*\.\d+", text, re.ASCII)
+        percent = float(text) * (100 if float(text) < 1 else 1) if number else 0.0
+        raise ValueError(
+            f'budget: expected a number of Gaussians as "40000", a share as "2%", a size as "5MB", auto or'
+            f" {', '.join(DEVICES)}, got {text!r}" + (f'; perhaps "{percent:g}%"' if 0 < percent <= 100 else "")
+        )
+    if text.endswith("%"):
+        share = Fraction(text[:-1].strip())
+        if share > 100:
+            raise ValueError(f"budget: expected at most 100%, got {text!r}")
+        count = int(share * num_input / 100)
+    else:
+        count = min(int(text), num_input)
+    if count < 1:
+        raise UsageError(f"budget: expected at least one Gaussian, got {text!r}")
+    return count
+
+
+def parse_bytes(size: str | int) -> int:
+    """Parse a size in bytes, as "5MB", "800 KiB" or "5000000".
+
+    Example:
+        >>> parse_bytes("1.5MB")
+        1500000
+    """
+    text = str(size).strip()
+    match = re.fullmatch(r"(\d*\.?\d+)\s*([A-Za-z]*)", text, re.ASCII)
+    unit = SIZES.get((match[2] or "B").upper()) if match else None
+    if match is None or unit is None:
+        raise ValueError(f'budget: expected a size as "5MB" or "800KiB", got {text!r}')
+    return int(Fraction(match[1]) * unit)

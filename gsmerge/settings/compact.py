@@ -1,0 +1,138 @@
+"""All settings of a run as a user gives them: the stages' settings in one place, by flat names."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from gsmerge.runtime.plugins import METHODS, find_plugins
+from gsmerge.settings.budget import BudgetOptions
+from gsmerge.settings.fit import FitOptions
+from gsmerge.settings.setting import Settings, flat_settings, setting, settings_of
+from gsmerge.settings.stages import (
+    MIXED,
+    BlockOptions,
+    CleanOptions,
+    DecodeOptions,
+    MatchOptions,
+    PrepareOptions,
+    SegmentOptions,
+)
+
+OURS = "gsmerge"  # the method that is no plugin
+EFFORTS = ("draft", "fast", "default", "best")  # what each means: gsmerge.plan
+CHECKPOINTS = ("auto", "shipped", "paper", "none")  # names that are no files
+# Settings under one name; what is set besides goes before. "paper": the superpixel merging paper's own chain: BASS from
+# saliency seeds, networks whose outputs are absolute, matching by latents and boxes of the decoded geometry, no fit.
+RECIPES: Mapping[str, Mapping[str, Any]] = {
+    "paper": {
+        "segmentation": "bass-st", "match": "aabb", "geometry": "decoded", "fit": "none",
+        "k_low": 100 / 3, "k_high": 200 / 3, "checkpoint": "paper", "require_checkpoint": True,
+    },
+}  # fmt: skip
+
+
+def method_names() -> tuple[str, ...]:
+    """Return the names of all methods: ours, and those that installed packages add."""
+    return (OURS, *find_plugins(METHODS))
+
+
+@dataclass(frozen=True)
+class CompactOptions(Settings):
+    """Every setting of :func:`gsmerge.compact`, stage by stage.
+
+    A ValueError besides: a PSNR is asked for of a crop, or without the sky; another method than ``"gsmerge"`` is asked
+    to find the number of Gaussians; a checkpoint is required and none is named.
+    """
+
+    prepare: PrepareOptions = setting(PrepareOptions(), "What may be changed before anything is merged.")
+    segment: SegmentOptions = setting(SegmentOptions(), "Superpixels.")
+    match: MatchOptions = setting(MatchOptions(), "Merging across views.")
+    decode: DecodeOptions = setting(DecodeOptions(), "Gaussians per group.")
+    fit: FitOptions = setting(FitOptions(), "Fit to the photos.")
+    clean: CleanOptions = setting(CleanOptions(), "What is left out of the result.")
+    budget: BudgetOptions = setting(BudgetOptions(), "What decides the number of Gaussians.")
+    blocks: BlockOptions = setting(BlockOptions(), "Parts in which scenes of many views are compacted.")
+    method: str = setting(OURS, "gsmerge, or a baseline to compare it with.",
+        "Packages add methods by entry points (`gsmerge.compaction.methods.Method`); for all but `gsmerge` the number "
+        "of Gaussians has to be settled beforehand.", choices=method_names)  # fmt: skip
+    effort: str = setting("default", "How much work goes into superpixels, merging and fit.",
+        "It decides what their own settings leave open.", choices=EFFORTS)  # fmt: skip
+    device: str = setting("cpu", "Where the fit and the scores run; cuda needs gsmerge[cuda]. auto: a GPU where there "
+        "is one and the scene is large enough.",
+        "`cuda` draws with gsplat, whose sums have no fixed order, so that runs differ in the last bits.",
+        choices=("cpu", "cuda", "auto"))  # fmt: skip
+    checkpoint: str = setting("auto", "Trained networks that correct the analytic stages: a file, shipped, paper, "
+        "none, or auto: the shipped ones where they improve the result.",
+        "`shipped`: those that come with the package; `paper`: those with absolute outputs; `none`: the analytic "
+        "stages alone. `auto`: the shipped ones where no fit follows or a short one, unless the analytic start shows "
+        "the views better; of these, a draft or a fast run without a fit takes the decoder heads alone, one with a fit "
+        "none.", metavar="FILE|NAME")  # fmt: skip
+    recipe: str | None = setting(None, "Settings that belong together. paper: the superpixel merging paper's own "
+        "method, with networks that have absolute outputs.", choices=tuple(RECIPES))  # fmt: skip
+    require_checkpoint: bool = setting(False, "A checkpoint that cannot be used is an error, instead of a note and the "
+        "analytic stages.")  # fmt: skip
+    seed: int = setting(0, "Seed of all random numbers.",
+        "Everything random depends on it alone; on the CPU, runs with one seed are bit-identical.",
+        least=0)  # fmt: skip
+    threads: int | None = setting(None, "Threads; the result does not depend on their number.", least=1,
+        shown="all processors")  # fmt: skip
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.recipe == "paper" and self.checkpoint in ("auto", "none"):
+            raise ValueError(f'recipe paper: expected a checkpoint with absolute outputs, got "{self.checkpoint}"')
+        if self.require_checkpoint and self.checkpoint == "none":
+            raise ValueError('require_checkpoint: expected a checkpoint, got "none"')
+        for name, wanted in {"crop": self.clean.crop is not None, "drop_sky": self.clean.drop_sky}.items():
+            if wanted and self.budget.target_psnr is not None:
+                quality = f"quality {self.budget.quality}"
+                raise ValueError(
+                    f"{name}: expected a budget or superpixels, got {quality}: photos show what it leaves out"
+                )
+        if self.method == OURS:
+            return
+        asked = {"budget auto": self.budget.auto, "levels": self.budget.levels > 1}
+        asked |= {f"quality {self.budget.quality}": self.budget.quality is not None}
+        for name in (name for name, wanted in asked.items() if wanted):
+            raise ValueError(f"method {self.method}: expected a budget or superpixels, got {name}")
+
+    @property
+    def whole_only(self) -> list[str]:
+        """Names of the settings in use that need a scene in one piece."""
+        budget = self.budget
+        asked = {f"method {self.method}": self.method != "gsmerge", "levels": budget.levels > 1}
+        asked |= {f"quality {budget.quality}": budget.quality is not None, "crop": self.clean.crop is not None}
+        asked |= {"drop_floaters": self.clean.drop_floaters, "drop_sky": self.clean.drop_sky}
+        return [name for name, wanted in asked.items() if wanted]
+
+    @property
+    def compact_only(self) -> list[str]:
+        """Names of the settings in use that ``encode`` and ``extend`` cannot honour."""
+        asked = {"k mixed": self.decode.k == MIXED, f"blocks {self.blocks.blocks}": isinstance(self.blocks.blocks, int)}
+        return [*self.whole_only, *(name for name, wanted in asked.items() if wanted)]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return all settings by their flat names, as plain values."""
+        flat: dict[str, Any] = {}
+        for name, declared in settings_of(CompactOptions).items():
+            value = getattr(self, name)
+            names = flat_settings(declared.kind) if declared.is_group else ()
+            flat |= {inner: getattr(value, inner) for inner in names} or {name: value}
+        return flat
+
+    def with_settings(self, settings: Mapping[str, Any]) -> CompactOptions:
+        """Change settings by flat name (``k=2``), on top of a recipe's; raise ValueError for unknown names."""
+        known, changes = flat_settings(CompactOptions), dict[str, Any]()
+        settings = {**RECIPES.get(str(settings.get("recipe")), {}), **settings}
+        for name, declared in settings_of(CompactOptions).items():
+            if declared.is_group:
+                chosen = {inner: settings[inner] for inner in flat_settings(declared.kind) if inner in settings}
+                changes[name] = replace(getattr(self, name), **chosen)
+            elif name in settings:
+                changes[name] = settings[name]
+        unknown = sorted(settings.keys() - known.keys())
+        if unknown:
+            raise ValueError(f"unknown setting {unknown[0]!r}; known: {', '.join(sorted(known))}")
+        return replace(self, **changes)

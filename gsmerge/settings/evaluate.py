@@ -1,0 +1,46 @@
+"""Settings of an evaluation against photos."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gsmerge.settings.setting import Settings, setting
+
+NETS = ("vgg", "alex")
+ALIGNMENTS = ("color", "pose")
+MAX_ZOOM = 16.0  # and its inverse the least: beyond, pictures have no pixels left or fill the memory
+
+
+@dataclass(frozen=True)
+class EvaluateOptions(Settings):
+    """Settings of an evaluation."""
+
+    lpips: tuple[str, ...] = setting(NETS, "Networks of the perceptual distance; none is much faster.", choices=NETS)
+    lpips_views: int | None = setting(None, "Measure LPIPS on at most so many views of each split.",
+        "They are evenly spread.", least=1, shown="all")  # fmt: skip
+    context: bool = setting(True, "Also measure the input views.")
+    own: bool = setting(True, "Also measure the input itself.")
+    threads: int | None = setting(None, "Threads; the figures do not depend on their number.", least=1)
+    photo_side: int = setting(0, "Resize larger photos and their cameras to so many pixels on the longer side; the "
+        "paper measures at 476.",
+        "0: they stay as they are.", least=0, unit="pixels", shown="as they are")  # fmt: skip
+    zoom: tuple[float, ...] = setting((1,), "Also measure PSNR and SSIM at other sizes: rendered at these multiples of "
+        "the photos' pixels per side.",
+        "The photo is resized to the same size.", least=1 / MAX_ZOOM, most=MAX_ZOOM, filled=True, unique=True,
+        metavar="LIST")  # fmt: skip
+    antialiased: bool = setting(False, "Lower the opacity of small Gaussians by what the low-pass adds to them, as "
+        "some viewers do (Mip-Splatting).",
+        "See `antialiased` of `gsmerge.render`.")  # fmt: skip
+    align: tuple[str, ...] = setting((), "Also score held-out views after alignment with their photos: of the renders' "
+        "colours (color), of the cameras (pose), or both (color,pose).",
+        "`color`: the affine map of the render's colours that brings it closest to the photo; `pose`: the camera moved "
+        "to where the render is closest; with both also after one and then the other.", choices=ALIGNMENTS, unique=True,
+        metavar="LIST")  # fmt: skip
+    fog: bool = setting(True, "Also measure fog and holes of the results, which the scene's Gaussians are drawn twelve "
+        "more times for.")  # fmt: skip
+
+    @property
+    def alignments(self) -> tuple[str, ...]:
+        """Names of the aligned scores, of "color", "pose" and "both"."""
+        chosen = tuple(name for name in ALIGNMENTS if name in self.align)
+        return (*chosen, "both") if chosen == ALIGNMENTS else chosen

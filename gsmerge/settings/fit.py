@@ -1,0 +1,125 @@
+"""Settings of the fit to the photos."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from gsmerge.settings.setting import Settings, setting
+
+Fit = Literal["full", "none"]
+STEPS = 320  # of the full fit
+LONG_STEPS = 600  # from here on full-size photos and a little dropout pay
+USUAL_SHARE = 0.044  # of Gaussians in the pixels, which half-size photos show well
+HASTY_STEPS = 20  # shorter runs have no time for full-size photos
+GROW_STEPS = 150  # shorter runs do better when they begin with all that they may have
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """Constants of the fit, chosen on training scenes; tests and research change them."""
+
+    means_lr: float = 0.1  # Step of a mean, in units of the Gaussian's size
+    scales_lr: float = 0.2  # Step of a log scale
+    quats_lr: float = 0.03  # Step of a quaternion
+    opacities_lr: float = 0.3  # Step of an opacity's logit
+    colors_lr: float = 0.03  # Step of a colour, sRGB in [0, 1]
+    poses_lr: float = 0.1  # First step of a moved camera: turns and shifts by so many pixels
+    decay: float = 0.4  # Factor on the other steps at the end; less beyond 300 steps
+    beta1: float = 0.5  # Decay of Adam's first moment
+    beta2: float = 0.9  # Decay of its second moment
+    max_mean_shift: float = 2.0  # Largest shift of a mean, in units of the Gaussian's size
+    max_scale_change: float = 2.5  # Largest change of a log scale
+    max_opacity_change: float = 4.0  # Largest change of an opacity's logit
+    # Share of the limits of mean and scales for a Gaussian that one photo alone shows: that photo
+    # says what it looks like, not where it is. From two photos on the limits are whole
+    single_view_share: float = 0.3
+    # Least scale, in pixels of the photo that a Gaussian is nearest to: thinner ones show as
+    # needles when a viewer enlarges them. 0 for none
+    min_scale: float = 0.5
+    average_share: float = 0.2  # Share of the last steps that the parameters are averaged over
+    ssim_lambda: float = 0.35  # Share of structural similarity in the loss, the rest is L1
+    # Weight in the loss, at the end, of the L1 of differences between neighbouring pixels; it
+    # grows from 0: edges say little where they lie elsewhere
+    edge_weight: float = 2.4
+    # Weight of the mean opacity in the loss of the full fit (3DGS-MCMC, Kheradmand et al. 2024):
+    # what the photos do not need fades, instead of standing in front of other views
+    opacity_reg: float = 0.03
+    # The same of the mean size, in units of each Gaussian's own at its start: fewer of them
+    # overlap, and a step takes a third less time
+    scale_reg: float = 0.01
+    outside_every: int = 4  # Steps from one look from outside to the next, see gsmerge.fit.outside
+    outside_from: float = 0.35  # Share of the steps that come before them; what hangs in gaps early on helps the rest
+    iterations: int = 6  # Conjugate-gradient steps of the colour fit
+    prior_weight: float = 0.03  # Weight of the unfitted colours, relative to visibility
+    huber: float = 0.2  # Colour error beyond which a pixel counts less in the colour fit
+    # Exposure of a view against the mean, as a factor, from which on the colour fit compensates it;
+    # smaller differences come from holes and highlights as often as from the camera
+    min_gain: float = 1.15
+    max_gain: float = 2.0  # Largest exposure factor that is believed
+
+    def scaled(self, factor: float) -> Tuning:
+        """Return the same constants with all steps of Gaussians ``factor`` times as large."""
+        names = ("means_lr", "scales_lr", "quats_lr", "opacities_lr", "colors_lr")
+        return replace(self, **{name: factor * getattr(self, name) for name in names})
+
+
+@dataclass(frozen=True)
+class FitOptions(Settings):
+    """Settings of the fit to the photos."""
+
+    fit: Fit = setting("full", "What is fitted to the photos.", "`full`: all parameters; `none`: nothing.")
+    fit_steps: int | None = setting(None, "Steps of the full fit, one view each.",
+        "By default 320, and by effort and numbers of views and Gaussians.", least=1)  # fmt: skip
+    time_budget: float | None = setting(None, "Seconds after which the full fit stops.",
+        "The steps are then chosen from the measured time of the first ones, and the result is no longer the same on "
+        "every machine. By default there is no limit.", above=0, unit="seconds")  # fmt: skip
+    photo_scale: float | Literal["auto"] = setting("auto", "Times the views' size at which two of every five steps "
+        "after those on half-size photos look at larger photos, as far as the photos are that large.",
+        "`auto`: up to 2 with effort `default` and `best` where the photos are at least 1.25 times as large, on the "
+        "CPU; 1 otherwise.", least=1, below=math.inf)  # fmt: skip
+    dropout: float | None = setting(None, "Share of the Gaussians that a step leaves out.",
+        "By default 0.1 for five views or fewer and 150 steps or more, where the fit would memorise the photos, "
+        "otherwise 0.05 from 600 steps and 30 looks at each view on, and 0 below.", least=0, below=1)  # fmt: skip
+    half_res_share: float | None = setting(None, "Share of the steps on half-size photos.",
+        "By default 0.7, from 600 steps on 0.5, below 20 all; less for more than 4.4 % of the Gaussians, and 0.1 less "
+        "where `photo_scale` is above 1.", least=0, most=1)  # fmt: skip
+    holdout: float = setting(0.05, "Share of the photos' blocks that decides whether a fit is accepted.", above=0,
+        below=1)  # fmt: skip
+    min_contribution: float = setting(1 / 255, "Least blending weight at some pixel of some photo; Gaussians below it "
+        "in all photos that they lie in are left out.", least=0, most=1)  # fmt: skip
+    judged: bool = setting(True, "Whether the result has to show held-out blocks better than its start; not where the "
+        "start has seen them.", internal=True)  # fmt: skip
+    move_cameras: bool = setting(False, "Whether the full fit moves the cameras on; a plan decides it by `poses`.",
+        internal=True)  # fmt: skip
+    share: float | None = setting(None, "Gaussians of the result for each pixel; a plan knows it.",
+        "By default 0.044.", internal=True)  # fmt: skip
+    tuning: Tuning = setting(Tuning(), "Constants.", internal=True)
+
+    @property
+    def steps(self) -> int:
+        """Number of steps of the full fit."""
+        return STEPS if self.fit_steps is None else self.fit_steps
+
+    @property
+    def half_res_part(self) -> float:
+        """Share of the steps on half-size photos."""
+        if self.half_res_share is not None:
+            return self.half_res_share
+        if self.steps < HASTY_STEPS:
+            return 1.0
+        part = 0.5 if self.steps >= LONG_STEPS else 0.7
+        if self.share is None or not self.grows:
+            return part
+        return min(part, 0.7 * math.sqrt(USUAL_SHARE / max(self.share, USUAL_SHARE)))
+
+    @property
+    def needs_photos(self) -> bool:
+        """Whether the photos are needed: to fit, or to leave out what none of them shows."""
+        return self.fit != "none" or self.min_contribution > 0
+
+    @property
+    def grows(self) -> bool:
+        """Whether the fit starts with fewer Gaussians than are asked for, and adds the rest on the way."""
+        return self.fit == "full" and self.steps >= GROW_STEPS

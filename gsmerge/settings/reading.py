@@ -1,0 +1,38 @@
+"""How to read a file of Gaussians whose values do not show it, or mislead."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import inf
+from typing import Literal
+
+from gsmerge.settings.setting import Settings, setting
+
+OpacityChoice = Literal["auto", "logit", "raw"]
+QuatChoice = Literal["auto", "wxyz", "xyzw", "xyzw-root", "camera"]
+Order = Literal["auto", "view-major", "view-fastest", "layer-major", "column-major", "unordered", "none"]
+
+
+@dataclass(frozen=True)
+class ReadHints(Settings):
+    """Hints on how to read a file whose values do not show it, or mislead."""
+
+    exporter: str = setting("auto", "The program that wrote the file, such as da3 or depthsplat; auto recognises it.")
+    quats: QuatChoice = setting("auto", "How the file stores rotations: w first, w last, w last and applied twice, or "
+        "relative to each view's camera.",
+        "The roots of rotations that are applied twice are used where the pixels are known. `auto`: as the exporter "
+        "says, and checked against the surface where the pixels are known.")  # fmt: skip
+    order: Order = setting("auto", "Order of the rows; none: the Gaussians belong to no pixels.",
+        "`unordered`: each may be made of a pixel.")  # fmt: skip
+    scene_scale: float | None = setting(None, "Size of the Gaussians' world in units of the cameras'; null: it is "
+        "estimated.", above=0, below=inf)  # fmt: skip
+    max_side: int = setting(1200, "Longest side of a view, pixels, where the Gaussians belong to no pixels; larger "
+        "photos are resized.", least=16, unit="pixels")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class FileHints(ReadHints):
+    """All that ``--hint`` may say of a file."""
+
+    opacity: OpacityChoice = setting("auto", "How the file stores opacity: as logits, or raw in [0, 1]; auto decides "
+        "by the values.")  # fmt: skip

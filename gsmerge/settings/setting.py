@@ -1,0 +1,198 @@
+"""Declare a setting once: its default, what it does, and the values that it takes.
+
+The checks of values, Python's help, the options of the command line and docs/reference are made from declarations. The
+package loads neither NumPy nor torch, so that ``--help`` can read it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
+from inspect import cleandoc
+from math import inf
+from numbers import Integral, Real
+from operator import ge, gt, le, lt
+from types import NoneType, UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+PLAIN = {int: "a whole number", float: "a number", bool: "true or false", str: "text", NoneType: "null"}
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What is declared of a setting; :func:`setting` makes it, and the class of the field adds name, kind, default."""
+
+    help: str  # one sentence, as the command line shows it; names of values in single backticks
+    more: str = ""  # sentences that Python's help and docs/reference show besides
+    choices: Sequence[Any] | Callable[[], Sequence[Any]] = ()  # possible values, where the type does not list them
+    least: float | None = None
+    most: float | None = None
+    above: float | None = None
+    below: float | None = None
+    unit: str = ""
+    unique: bool = False  # whether a list has no value twice
+    filled: bool = False  # whether a list has at least one value
+    internal: bool = False  # whether the program sets it, and no user by name
+    shown: str | None = None  # the default in words, where the program chooses it
+    metavar: str | None = None  # form of the values on the command line
+    name: str = ""
+    kind: Any = None
+    default: Any = None
+
+    @property
+    def text(self) -> str:
+        """All that is said about the setting."""
+        return f"{self.help} {self.more}".strip()
+
+    @property
+    def is_group(self) -> bool:
+        """Whether the value is a dataclass of settings, as those of a stage are."""
+        return is_dataclass(self.kind)
+
+    @property
+    def is_list(self) -> bool:
+        """Whether the value is a list, of whose elements choices and range are."""
+        return get_origin(self.kind) is tuple
+
+    @property
+    def kinds(self) -> list[Any]:
+        """Types whose values are all possible, as far as the range goes."""
+        kinds = [kind for kind in _parts(self.kind) if get_origin(kind) is not Literal]
+        return [kind for kind in kinds if kind is NoneType] if self.choices else kinds
+
+    @property
+    def words(self) -> tuple[Any, ...]:
+        """Possible values that are listed one by one."""
+        listed = self.choices() if callable(self.choices) else self.choices
+        literals = [kind for kind in _parts(self.kind) if get_origin(kind) is Literal]
+        return (*listed, *(word for kind in literals for word in get_args(kind)))
+
+    def fits(self, value: Any) -> bool:
+        """Return whether a value is of the type; it may still be out of range, or none of the choices."""
+        if self.is_list:
+            return isinstance(value, list | tuple) and all(map(self._fits, value))
+        return self._fits(value)
+
+    def _fits(self, value: Any) -> bool:
+        is_bool = type(value).__name__.startswith("bool")  # Python's, or NumPy's, which is not loaded here
+        for kind in _parts(self.kind):
+            if get_origin(kind) is Literal:
+                fits = value in get_args(kind)
+            elif kind is bool:
+                fits = is_bool
+            elif kind in (int, float):
+                fits = isinstance(value, Integral if kind is int else Real) and not is_bool
+            else:
+                fits = isinstance(value, kind)
+            if fits:
+                return True
+        return False
+
+    def _in_range(self, value: Any) -> bool:
+        if self.choices:
+            return value is None or value in self.words
+        is_number = isinstance(value, Real)
+        limits = ((self.least, ge), (self.most, le), (self.above, gt), (self.below, lt))
+        return all(bool(holds(value, limit)) for limit, holds in limits if is_number and limit is not None)
+
+    def values(self, *, null: bool = True) -> str:
+        """Describe the possible values: listed ones, a range, or a kind of value; ``null``: whether None is one."""
+        kinds = [kind for kind in self.kinds if kind is not NoneType]
+        texts = [self._describe_range(kind) if kind in (int, float) else PLAIN.get(kind, "") for kind in kinds]
+        texts += [str(word) for word in self.words]
+        return join_words([*texts, PLAIN[NoneType]] if null and NoneType in self.kinds else texts)
+
+    def expected(self, value: Any, *, null: bool = False) -> str:
+        """Describe the possible values to who gave another one."""
+        values = self.values(null=null)
+        needs_whole = isinstance(value, float) and int in self.kinds and float not in self.kinds
+        return f"{PLAIN[int]}, {values}" if needs_whole and not values.startswith(PLAIN[int]) else values
+
+    def _describe_range(self, kind: type) -> str:
+        low = None if self.least is None else _number(self.least)
+        high = None if self.most is None else _number(self.most)
+        if low is None and self.above is not None:
+            low = f"above {_number(self.above)}"
+        if high is None and self.below not in (None, inf):
+            high = f"below {_number(self.below)}"
+        if low is None:
+            return PLAIN[kind]
+        text = f"at least {low}".replace("at least above", "more than") if high is None else f"{low} to {high}"
+        return f"{text} {self.unit}".strip()
+
+    def check(self, value: Any) -> None:
+        """Raise a ValueError that says what was expected if a value is impossible."""
+        if value is self.default:
+            return
+        if self.is_list:
+            if self.filled and not value:
+                raise ValueError(f"{self.name}: expected at least one value, got none")
+            for one in value:
+                self._check(one)
+            if self.unique and len(set(value)) < len(value):
+                raise ValueError(f"{self.name}: expected every value once, got {','.join(map(str, value))}")
+        else:
+            self._check(value)
+
+    def _check(self, value: Any) -> None:
+        free = any(kind not in (int, float, bool, NoneType) for kind in self.kinds)  # checked by the class itself
+        if free or (self._fits(value) and self._in_range(value)):
+            return
+        raise ValueError(f"{self.name}: expected {self.expected(value)}, got {value!r}")
+
+
+def setting(default: Any, help: str, more: str = "", **declared: Any) -> Any:
+    """Declare a field of a class of settings; ``declared`` are fields of :class:`Setting`."""
+    return field(default=default, metadata={"setting": Setting(help, more, default=default, **declared)})
+
+
+class Settings:
+    """Base of the frozen dataclasses whose fields are settings; impossible values are a ValueError."""
+
+    def __init_subclass__(cls) -> None:
+        """Write what is declared of the fields into the docstring."""
+        own = [(name, f) for name, f in vars(cls).items() if isinstance(f, Field) and "setting" in f.metadata]
+        lines = [f"    {name}: {f.metadata['setting'].text}" for name, f in own]
+        cls.__doc__ = "\n".join([cleandoc(cls.__doc__ or ""), "", "Args:", *lines])
+
+    def __post_init__(self) -> None:
+        for name, declared in settings_of(type(self)).items():
+            declared.check(getattr(self, name))
+
+
+_declared: dict[type, dict[str, Setting]] = {}  # by class, whose types are resolved once
+
+
+def settings_of(options: type) -> dict[str, Setting]:
+    """Return what is declared of the fields of a class of settings, by the fields' names."""
+    if options not in _declared:
+        kinds = get_type_hints(options)
+        made = {f.name: f.metadata["setting"] for f in fields(options) if "setting" in f.metadata}
+        _declared[options] = {name: replace(one, name=one.name or name, kind=kinds[name]) for name, one in made.items()}
+    return _declared[options]
+
+
+def flat_settings(options: type) -> dict[str, Setting]:
+    """Return the settings that a user may set by name; those of a stage stand in the place of the stage."""
+    flat: dict[str, Setting] = {}
+    for name, declared in settings_of(options).items():
+        if not declared.internal:
+            flat |= flat_settings(declared.kind) if declared.is_group else {name: declared}
+    return flat
+
+
+def join_words(words: Iterable[str]) -> str:
+    """Join words as "a, b or c"."""
+    listed = list(words)
+    return " or ".join(filter(None, (", ".join(listed[:-1]), *listed[-1:])))
+
+
+def _parts(kind: Any) -> list[Any]:
+    """List the types of which a value, or an element of a list, may be one."""
+    if get_origin(kind) in (Union, UnionType):
+        return [part for one in get_args(kind) for part in _parts(one)]
+    return _parts(get_args(kind)[0]) if get_origin(kind) is tuple else [kind]
+
+
+def _number(value: float | None) -> str:
+    return str(value) if isinstance(value, int) else f"{value:g}"

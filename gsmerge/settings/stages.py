@@ -1,0 +1,234 @@
+"""Settings of the stages before and after the fit, in their order."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from typing import Literal
+
+from gsmerge.settings.budget import AUTO, parse_share
+from gsmerge.settings.setting import Settings, setting
+
+Poses = Literal["auto", "fixed", "free"]
+Exposure = Literal["auto", "fixed", "per-photo"]
+Unseen = Literal["drop", "keep"]
+Method = Literal["overlap", "aabb", "none"]
+Geometry = Literal["analytic", "decoded"]
+KRule = Literal["saliency", "distortion"]
+
+SEGMENTATIONS = ("rdseg", "bass", "bass-st", "bass-adaptive", "slic", "grid")
+SHARE = "4.4%"  # superpixels per pixel by default
+AUTO_SHARE = "auto"
+MAX_CHILDREN = 8
+MIXED, MIXED_COUNTS = "mixed", (1, 2, 4)  # the K of groups of their own, and its values
+USUAL_K = 1  # what "auto" is unless there are reasons for more
+NEIGHBORS = {"overlap": 16, "aabb": 1}  # Nearest neighbours that are compared; docs/laboratory/notebook.md has figures
+CROP = "sphere:x,y,z,radius or box:x0,y0,z0,x1,y1,z1"
+CROP_NUMBERS = {"sphere": 4, "box": 6}
+
+
+@dataclass(frozen=True)
+class PrepareOptions(Settings):
+    """Settings of the preparation, before anything is merged."""
+
+    poses: Poses = setting("auto", "Whether cameras may move: where they are off, never, or always.",
+        "`free`: views of one Gaussian per pixel are moved to where their photos agree, and the full fit moves the "
+        "cameras on (on the CPU); `auto`: free where some view is more than 1.5 pixels off and its photo and the "
+        "others agree clearly better elsewhere (`gsmerge.facts.align_views` says by how much); fixed elsewhere, and "
+        "without photos.")  # fmt: skip
+    exposure: Exposure = setting("auto", "Bring photos that differ in exposure or white balance to their mean: where "
+        "they differ at random, never, or always.",
+        "The Gaussians of their pixels change with them; `gsmerge.facts.exposure` says when they differ at "
+        "random.")  # fmt: skip
+    unseen: Unseen = setting("drop", "What becomes of Gaussians without a pixel that no view sees.",
+        "`drop`: they are left out. `keep`: they are merged among their neighbours in space, at the rate of the "
+        "others, and added to the result.")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class SegmentOptions(Settings):
+    """Settings of the superpixels of a view."""
+
+    superpixels: int | str = setting(SHARE, "Superpixels per view: a number such as 3000, a share of its pixels, or "
+        "auto: 1.5 to 8 %, the more the better the depths of the views agree.",
+        "A share is where `bass-adaptive` starts from.", metavar="NUMBER|SHARE|auto")  # fmt: skip
+    segmentation: str = setting("rdseg", "How superpixels are cut; `gsmerge.stages.superpixels` describes the methods.",
+        choices=SEGMENTATIONS)  # fmt: skip
+    rectangles: float | None = setting(None, "Of `rdseg`: rectangles per superpixel that it begins with.",
+        "By default 2, and by effort.", least=1, unit="per superpixel")  # fmt: skip
+    early_sweeps: int | None = setting(None, "Of `rdseg`: sweeps over border pixels before rectangles are merged.",
+        "By default 0, and by effort.")  # fmt: skip
+    compactness: float = setting(1e-5, "Of `rdseg` and the clean-up of `slic`: weight of squared pixels against "
+        "squared colours in [0, 1].",
+        "At 0 the colours alone decide, and superpixels become snakes that no Gaussian fits.", least=0,
+        most=1)  # fmt: skip
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.per_view is not None and self.per_view < 1:
+            raise ValueError(f"superpixels: expected at least 1, got {self.superpixels}")
+        if self.per_view is None and self.superpixels != AUTO_SHARE:
+            try:
+                parse_share(str(self.superpixels))
+            except ValueError as error:
+                raise ValueError(f"superpixels: expected a number, or {str(error).partition(' ')[2]}") from None
+
+    @property
+    def per_view(self) -> int | None:
+        """Number of superpixels of each view; None where a share of its pixels is asked for."""
+        text = str(self.superpixels)
+        return int(text) if text.removeprefix("-").isdecimal() else None
+
+    @property
+    def share(self) -> float:
+        """Superpixels per pixel; the default where a number is asked for, or the scene decides."""
+        given = self.per_view is None and self.superpixels != AUTO_SHARE
+        return parse_share(str(self.superpixels) if given else SHARE)
+
+    @property
+    def adapts(self) -> bool:
+        """Whether views choose their number of superpixels: ``bass-adaptive`` from a share of the pixels."""
+        return self.segmentation == "bass-adaptive" and self.per_view is None
+
+
+@dataclass(frozen=True)
+class MatchOptions(Settings):
+    """Conditions under which two Feature Gaussians are merged."""
+
+    match: Method | None = setting(None, "How Feature Gaussians of different views are merged.",
+        "`overlap`: Bhattacharyya coefficient (does not depend on the world's axes), similar colours, and star "
+        "clusters that cannot chain. `aabb`, as in the paper (section 4.4): box IoU, similar latents, and connected "
+        "components. `none`: no merging across views. By default `overlap`, but `none` in a draft.")  # fmt: skip
+    geometry: Geometry = setting("analytic", "What is compared where networks are loaded: `analytic`, the moments, or "
+        "`decoded`, the K = 1 head's output.",
+        "The latter (paper section 4.3) merges less, takes longer and is no better.")  # fmt: skip
+    overlap: float = setting(0.7, "Least overlap of `overlap`.", least=0, most=1)
+    iou: float = setting(0.2, "Least IoU of the boxes of `aabb` (tau_g).", least=0, most=1)
+    similarity: float = setting(0.8, "Least cosine of the latents of `aabb` (tau_f).",
+        "Without an encoder there are no latents, and colours are compared in their place.", least=-1,
+        most=1)  # fmt: skip
+    max_color: float = setting(0.12, "Largest difference of base colours (Euclidean, sRGB in [0, 1]).", least=0)
+    neighbors: int | None = setting(None, "Nearest neighbours of other views in 3D that are compared (k, which the "
+        "paper leaves open).",
+        "By default 16 with `overlap`, 1 with `aabb`, whose components chain and leave holes with more.",
+        least=1)  # fmt: skip
+    cluster_size: int | None = setting(None, "Most Feature Gaussians in a star cluster.",
+        "By default as many as there are views (a cluster holds one of each view at most).", least=1)  # fmt: skip
+
+    @property
+    def num_neighbors(self) -> int:
+        """Nearest neighbours of other views that are compared."""
+        return self.neighbors or NEIGHBORS["aabb" if self.match == "aabb" else "overlap"]
+
+
+@dataclass(frozen=True)
+class DecodeOptions(Settings):
+    """Number of Gaussians that a Feature Gaussian becomes."""
+
+    k: int | Literal["mixed", "auto"] = setting(AUTO, "Gaussians per superpixel: finer with more; mixed: 1, 2 or 4 by "
+        "its saliency; auto: 1, and 4 for one photo without a long fit.",
+        "`mixed` is of the paper's supplement. `auto`: 4 where all views have one camera, nothing else says how many "
+        "Gaussians there are to be, and no fit follows or one of at most 60 steps.", least=1, most=MAX_CHILDREN,
+        metavar="1-8|mixed|auto")  # fmt: skip
+    k_low: float = setting(50.0, "Percentile of `mixed` up to which groups become one Gaussian.",
+        "The paper's percentiles are 33.3 and 66.7, which give more Gaussians than K = 2 everywhere.", least=0,
+        most=100)  # fmt: skip
+    k_high: float = setting(85.0, "Percentile of `mixed` above which groups become four Gaussians.", least=0, most=100)
+    k_rule: KRule = setting("saliency", "What the percentiles are of: `saliency`, the mean corner response of the "
+        "group's pixels, as in the paper, or `distortion`: as many Gaussians, where they lower distortion "
+        "most.")  # fmt: skip
+    min_opacity: float = setting(1 / 255, "Gaussians below this opacity are left out (paper section 4.3, tau_a).",
+        least=0, most=1)  # fmt: skip
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.k_high < self.k_low:
+            raise ValueError(f"k_high: expected {self.k_low:g}, which is k_low, to 100, got {self.k_high}")
+
+    @property
+    def mean_k(self) -> float:
+        """Mean number of children of a group."""
+        mixed = 1 + (100 - self.k_low + 2 * (100 - self.k_high)) / 100
+        return mixed if self.k == MIXED else float(self.max_k)
+
+    @property
+    def max_k(self) -> int:
+        """Largest number of children of a group."""
+        return {MIXED: MIXED_COUNTS[-1], AUTO: USUAL_K}.get(str(self.k)) or int(self.k)
+
+
+@dataclass(frozen=True)
+class CleanOptions(Settings):
+    """Settings of clean-up: what to leave out of the result."""
+
+    crop: str | None = setting(None, "Keep the Gaussians inside a sphere:x,y,z,radius or box:x0,y0,z0,x1,y1,z1, in the "
+        "scene's world units; a budget is met after it.",
+        "Their centres have to be inside.", metavar="SHAPE")  # fmt: skip
+    drop_floaters: bool = setting(False, "Leave out Gaussians that are isolated, far beyond the scene, or hang across "
+        "it.",
+        "`gsmerge.stages.clean.floaters` says which these are.")  # fmt: skip
+    drop_sky: bool = setting(False, "Leave out Gaussians that are sky in the photos.",
+        "`gsmerge.stages.sky.sky` says which these are.")  # fmt: skip
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.crop is not None:
+            parse_crop(self.crop)
+
+    @property
+    def asked(self) -> bool:
+        """Whether anything is to be left out."""
+        return self.crop is not None or self.drop_floaters or self.drop_sky
+
+    @property
+    def hides(self) -> bool:
+        """Whether what photos show is left out on purpose."""
+        return self.crop is not None or self.drop_sky
+
+
+def parse_crop(text: str) -> tuple[str, tuple[float, ...]]:
+    """Parse the shape of a crop and its numbers.
+
+    Example:
+        >>> parse_crop("sphere:0,0,2,1.5")
+        ('sphere', (0.0, 0.0, 2.0, 1.5))
+    """
+    match = re.fullmatch(r"\s*(sphere|box)\s*:(.*)", text)
+    try:
+        numbers = tuple(float(part) for part in match[2].split(",")) if match else ()
+    except ValueError:
+        numbers = ()
+    if match is None or len(numbers) != CROP_NUMBERS[match[1]] or not all(map(math.isfinite, numbers)):
+        raise ValueError(f"crop: expected {CROP}, got {text!r}")
+    is_sphere = match[1] == "sphere"
+    if numbers[3] <= 0 if is_sphere else any(high <= low for low, high in zip(numbers, numbers[3:], strict=False)):
+        expected = "a radius above 0" if is_sphere else "x0 < x1, y0 < y1 and z0 < z1"
+        raise ValueError(f"crop: expected {expected}, got {text!r}")
+    return match[1], numbers
+
+
+@dataclass(frozen=True)
+class Engine(Settings):
+    """Where the blocks of a scene are compacted; the result does not depend on it."""
+
+    name: str = setting("local", "Where scenes, or the blocks of one, are compacted. local: on this machine; ray: a "
+        "Ray cluster, gsmerge[ray].", name="engine", choices=("local", "ray"))  # fmt: skip
+    address: str | None = setting(None, "Address of the Ray cluster, such as auto or HOST:PORT.",
+        shown="one of this machine")  # fmt: skip
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.address is not None and self.name != "ray":
+            raise ValueError(f"address: expected engine ray, got {self.name}")
+
+
+@dataclass(frozen=True)
+class BlockOptions(Settings):
+    """Settings of scenes with many views."""
+
+    blocks: int | Literal["auto", "none"] = setting("auto", "Blocks of views that are compacted one by one, for scenes "
+        "of hundreds of views; auto: from 20 million Gaussians on, one for every 8 million.",
+        "Memory is that of one block. `auto` counts one Gaussian for each pixel; `none`: one piece.", least=1,
+        metavar="auto|none|NUMBER")  # fmt: skip
+    engine: Engine = setting(Engine(), "Where the blocks are compacted.", internal=True)
