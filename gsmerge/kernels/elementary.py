@@ -7,16 +7,26 @@ float64.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from gsmerge.kernels.signature import declare, f4, f8
 
-Unary = Callable[[ArrayLike], Any]
-Binary = Callable[[ArrayLike, ArrayLike], Any]
+
+class Unary(Protocol):
+    """A function of one array."""
+
+    def __call__(self, values: ArrayLike, /) -> Any:
+        """Return a new array of the same shape."""
+
+
+class Binary(Protocol):
+    """A function of two arrays that are broadcast together."""
+
+    def __call__(self, first: ArrayLike, second: ArrayLike, /) -> Any:
+        """Return a new array of the shape of both."""
 
 
 def _make(name: str, doc: str, arguments: tuple[str, ...] = ("values",), narrow: bool = False) -> Any:
