@@ -47,7 +47,7 @@ def opened(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterato
     with browser(CHROMIUM, folder / "profile", "--enable-unsafe-swiftshader") as tab:
         tab.open(page)
         wait(tab, "solid !== null")
-        tab.run("set('solid', '1')")
+        tab.run("clearInterval(blinking); set('solid', '1')")
         wait(tab, SETTLED)
         yield tab, (gsmerge.read_scene(scene), *results)
 
@@ -89,7 +89,7 @@ def picture(tab: Browser) -> np.ndarray:
 
 def test_3d_is_what_we_render_at_every_input_view(opened: tuple[Browser, Any]) -> None:
     tab, (scene, small, _) = opened
-    tab.run(f"{BARE} set('mode', 'blink'); set('pixels', 'photo'); clearInterval(blinking)")
+    tab.run(f"{BARE} set('mode', 'blink'); set('pixels', 'photo')")
     inputs = tab.run(
         "data.views.map((view, i) => [view.held_out || view.outside, view.name, i]).filter(one => !one[0])"
     )
