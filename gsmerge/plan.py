@@ -114,7 +114,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
 
     ``checkpoint``: in the place of the one that the options name.
     """
-    given, scene, effort = prepared.given, prepared.scene, EFFORTS[options.effort]
+    given, scene, effort = prepared.input_scene, prepared.scene, EFFORTS[options.effort]
     _check_photos(given, options)
     own = options.method == "gsmerge"
     with stage("prepare"):
@@ -327,7 +327,7 @@ def _merge_unseen(
 ) -> tuple[Gaussians | None, int | None]:
     """Merge and clean the unseen Gaussians; return them and the number that shares of a budget refer to, or None."""
     scene, unseen = prepared.scene, prepared.unseen
-    num_input = prepared.given.num_gaussians if len(scene) < len(prepared.given) else None
+    num_input = prepared.input_scene.num_gaussians if len(scene) < len(prepared.input_scene) else None
     if unseen is None:
         return None, num_input
     num_input = scene.num_gaussians + len(unseen)
@@ -389,7 +389,7 @@ def _fit_photos(prepared: Prepared, options: CompactOptions, fit: FitOptions, ba
     if problem is not None:
         note(problem)
     free = options.prepare.poses == "free" or (options.prepare.poses == "auto" and prepared.moved)
-    moves = free and fit.fit == "full" and prepared.given.images is not None  # which only the CPU can do
+    moves = free and fit.fit == "full" and prepared.input_scene.images is not None  # which only the CPU can do
     return replace(fit, photo_scale=scale, move_cameras=moves)
 
 

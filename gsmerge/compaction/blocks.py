@@ -131,7 +131,7 @@ def start_part(piece: Scene, block: Block, covisibility: Covisibility, options: 
     plan = make_plan(prepared, options)
     decoded = start(prepared, plan, plan.limits.count)
     own = belongs_to_block(frame.leave(decoded.gaussians).means, block, covisibility)
-    before = measure_psnr("input", prepared.given.file_gaussians, prepared.given, prepared, plan)
+    before = measure_psnr("input", prepared.input_scene.file_gaussians, prepared.input_scene, prepared, plan)
     share = own.sum() / max(1, len(own))
     return Part(block, decoded.gaussians[own], round(share * decoded.count), without_gaussians(prepared), plan, before)
 
@@ -142,7 +142,7 @@ def without_gaussians(prepared: Prepared) -> Prepared:
     def bare(scene: Scene) -> Scene:
         return replace(scene, gaussians=scene.gaussians[np.zeros(0, int)], pixel_ids=None, missing=None)
 
-    return replace(prepared, scene=bare(prepared.scene), given=bare(prepared.given))
+    return replace(prepared, scene=bare(prepared.scene), input_scene=bare(prepared.input_scene))
 
 
 def fit_part(part: Part, everything: tuple[Gaussians, np.ndarray], own: int, growth: float) -> Gaussians:

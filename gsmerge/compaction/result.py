@@ -106,9 +106,9 @@ def score(count: int | None, fitted: Fitted, prepared: Prepared, plan: Plan) -> 
     if plan.unseen is not None:
         gaussians = Gaussians.concat([gaussians, plan.unseen])
     gaussians, cameras = prepared.frame.leave(gaussians), prepared.final_cameras()
-    if cameras is not prepared.given.cameras:
+    if cameras is not prepared.input_scene.cameras:
         _note_moves(prepared, cameras, plan)
-        prepared = replace(prepared, given=replace(prepared.given, cameras=cameras))
+        prepared = replace(prepared, input_scene=replace(prepared.input_scene, cameras=cameras))
     psnr = measure_psnr("score", gaussians, prepared.result_views(), prepared, plan)
     if psnr is not None:
         choose(scored_views=len(plan.scored_views))
@@ -117,7 +117,7 @@ def score(count: int | None, fitted: Fitted, prepared: Prepared, plan: Plan) -> 
 
 def _note_moves(prepared: Prepared, cameras: Cameras, plan: Plan) -> None:
     """Say how far each camera was moved."""
-    given, cause = prepared.given, "poses are free"
+    given, cause = prepared.input_scene, "poses are free"
     if plan.settings["poses"] == "auto":
         cause = "the photos of some views agree only under other poses"
     depth = scene_depth(prepared.scene) * prepared.frame.unit
@@ -156,11 +156,11 @@ def make_result(
     current record, which come before those of the candidates, enter the report.
     """
     run, seconds = current_record(), search["seconds"]
-    before = measure_psnr("input", prepared.given.file_gaussians, prepared.given, prepared, plan)
+    before = measure_psnr("input", prepared.input_scene.file_gaussians, prepared.input_scene, prepared, plan)
     comparable = prepared.photo_views and not plan.clean.hides  # or photos show something else
 
     def report(one: Candidate, seconds: Mapping[str, float], name: str) -> CompactReport:
-        counts, record = (prepared.given.num_gaussians, len(one.gaussians)), one.record
+        counts, record = (prepared.input_scene.num_gaussians, len(one.gaussians)), one.record
         made = CompactReport(
             *counts, dict(seconds), before, one.psnr, record.choices, record.notes, plan.settings, peak_memory()
         )

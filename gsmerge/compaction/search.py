@@ -124,7 +124,7 @@ def choose_count(prepared: Prepared, plan: Plan) -> int | None:
     limits, drop = plan.limits, plan.max_drop
     if drop is None and not plan.auto_count:
         return limits.count
-    if prepared.given.images is None or not prepared.photo_views:
+    if prepared.input_scene.images is None or not prepared.photo_views:
         return knee_count(prepared.scene, plan.superpixels)
     with stage("curve"):
         counts = rungs(AUTO_RUNGS if drop is None else RUNGS, limits.default, limits.min_count, limits.max_count)

@@ -101,7 +101,7 @@ def _to_encoded(prepared: Prepared, plan: Plan, merged: MergedViews, max_k: int 
     if networks is not None:
         max_k = min(max_k, networks.options.max_children)
     settings = StoredSettings(
-        num_input=prepared.given.num_gaussians,
+        num_input=prepared.input_scene.num_gaussians,
         k=AUTO if plan.auto_count else options.k,
         max_k=max_k,
         min_opacity=options.min_opacity,
