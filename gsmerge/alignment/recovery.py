@@ -117,9 +117,9 @@ def _read_plain(inputs: AlignmentInput) -> Reading | None:
     if inputs.order not in ("auto", "view-major") or inputs.scale is not None or count != expected:
         return None
     layouts = plain_layout(len(cameras), cameras.width, cameras.height).with_views_in(inputs.labellings)
-    best, *rivals = (score_layout(inputs, layout, IDENTITY) for layout in layouts)
+    best, *others = (score_layout(inputs, layout, IDENTITY) for layout in layouts)
     far = SHUFFLED_MARGIN * max(best.worst_px, SMALLEST_PX)
-    return best if best.worst_px <= _PLAIN_PX and all(rival.worst_px >= far for rival in rivals) else None
+    return best if best.worst_px <= _PLAIN_PX and all(other.worst_px >= far for other in others) else None
 
 
 def _readings(inputs: AlignmentInput, *, exact_frames: bool) -> Iterator[list[Reading]]:
@@ -136,12 +136,12 @@ def _accept(inputs: AlignmentInput, readings: Sequence[Reading]) -> Recovery | N
 
     Of readings about equally near, the one whose colours the photos have by far is accepted.
     """
-    first, *rivals = sorted(readings, key=lambda reading: (not reading.ok, reading.worst_px))
+    first, *others = sorted(readings, key=lambda reading: (not reading.ok, reading.worst_px))
     if not first.ok:
         return None
-    rivals = [rival for rival in rivals if _differs(rival.layout, first.layout)]
-    best, runner_up = _refine(inputs, first), min(rivals, key=lambda rival: rival.worst_px, default=None)
-    close = [rival for rival in rivals if rival.worst_px < MARGIN * max(best.worst_px, SMALLEST_PX)]
+    others = [other for other in others if _differs(other.layout, first.layout)]
+    best, runner_up = _refine(inputs, first), min(others, key=lambda other: other.worst_px, default=None)
+    close = [other for other in others if other.worst_px < MARGIN * max(best.worst_px, SMALLEST_PX)]
     if close:
         close = [first, *close]
         colors = [color_error(inputs, reading.layout) for reading in close]
