@@ -56,14 +56,14 @@ def check_content(path: Path) -> FileCheck:
     is missing.
     """
     try:
-        found = _read(path)
+        file_check = _read(path)
     except SceneError as error:
         problem = str(error).removeprefix(f"{path}: ")
         return FileCheck(str(path), "", problems=(problem,))
     damaged = _damaged_member(path) if path.suffix.lower() in ARCHIVES else None
-    problems = (*found.problems, *([damaged] if damaged else []))
+    problems = (*file_check.problems, *([damaged] if damaged else []))
     size = 0 if path.is_dir() else path.stat().st_size
-    return replace(found, file_bytes=found.file_bytes or size, problems=problems)
+    return replace(file_check, file_bytes=file_check.file_bytes or size, problems=problems)
 
 
 def _read(path: Path) -> FileCheck:
@@ -84,8 +84,8 @@ def _read(path: Path) -> FileCheck:
         cameras = read_cameras(path)
         return FileCheck(str(path), "cameras", len(cameras), cameras.source)
     if suffix not in SCENE_SUFFIXES:
-        known = ", ".join((*SCENE_SUFFIXES, *CAMERAS, SUFFIX, NETWORKS, streamed.INDEX))
-        raise SceneError(path, f"expected one of {known}, found another kind of file", "it is not checked")
+        endings = ", ".join((*SCENE_SUFFIXES, *CAMERAS, SUFFIX, NETWORKS, streamed.INDEX))
+        raise SceneError(path, f"expected one of {endings}, found another kind of file", "it is not checked")
     info = read_gaussians(path).info
     problems = _problems(info)
     if suffix == ".spz":
@@ -103,7 +103,7 @@ def _read(path: Path) -> FileCheck:
 def _read_levels(path: Path) -> FileCheck:
     """Read all levels of an index, one after the other."""
     infos = [read_level(path, level).info for level in range(len(streamed.read_index(path).levels))]
-    problems = [f"level {level}: {one}" for level, info in enumerate(infos) for one in _problems(info)]
+    problems = [f"level {level}: {problem}" for level, info in enumerate(infos) for problem in _problems(info)]
     beside = sum(info.file_bytes for info in infos) - (len(infos) - 1) * path.stat().st_size
     return FileCheck(str(path), "Gaussians", infos[0].count, infos[0].layout, beside, tuple(problems))
 

@@ -174,7 +174,7 @@ def lower_median(values: np.ndarray) -> np.ndarray:
 
 def correlation(a: np.ndarray, b: np.ndarray) -> float:
     """Return Pearson's correlation of two rows of numbers ``[n]``."""
-    a, b = (one - one.mean() for one in (a.astype(np.float64), b.astype(np.float64)))
+    a, b = (values - values.mean() for values in (a.astype(np.float64), b.astype(np.float64)))
     return float((a * b).sum() / np.sqrt((a * a).sum() * (b * b).sum()))
 
 

@@ -114,13 +114,13 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
 
     ``checkpoint``: in the place of the one that the options name.
     """
-    given, scene, effort = prepared.given, prepared.scene, EFFORTS[options.effort]
-    _check_photos(given, options)
-    own = options.method == "gsmerge"
+    input_scene, scene, effort = prepared.input_scene, prepared.scene, EFFORTS[options.effort]
+    _check_photos(input_scene, options)
+    is_ours = options.method == "gsmerge"
     with stage("prepare"):
         has_photos = scene.images is not None and bool(prepared.photo_views)
-        if checkpoint is None and own:  # baselines learn nothing
-            checkpoint = load_networks(options, given, photos=has_photos)
+        if checkpoint is None and is_ours:  # baselines learn nothing
+            checkpoint = load_networks(options, input_scene, photos=has_photos)
         segment = _resolve_superpixels(options.segment, scene, effort)
         clean_options = options.clean
         if clean_options.drop_sky and not prepared.photo_views:
@@ -136,13 +136,13 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
             num_input=num_input, num_reserved=0 if unseen is None else len(unseen),
         )  # fmt: skip
         limits = whole.limits
-        backend, problem = choose_backend(options.device, given.num_gaussians)
+        backend, problem = choose_backend(options.device, input_scene.num_gaussians)
         if problem is not None:
             note(problem)
         fit = _fit_photos(prepared, options, whole.fit, backend)
     tree = None
     searches = options.budget.quality is not None or options.budget.auto or options.budget.levels > 1
-    if own and (searches or limits.count is not None):
+    if is_ours and (searches or limits.count is not None):
         tree = scene_tree(scene, segment, limits, limits.exact or limits.default)
     networks: tuple[NetworkWeights | None, ...] = (None,)
     if checkpoint is not None:
@@ -327,7 +327,7 @@ def _merge_unseen(
 ) -> tuple[Gaussians | None, int | None]:
     """Merge and clean the unseen Gaussians; return them and the number that shares of a budget refer to, or None."""
     scene, unseen = prepared.scene, prepared.unseen
-    num_input = prepared.given.num_gaussians if len(scene) < len(prepared.given) else None
+    num_input = prepared.input_scene.num_gaussians if len(scene) < len(prepared.input_scene) else None
     if unseen is None:
         return None, num_input
     num_input = scene.num_gaussians + len(unseen)
@@ -389,7 +389,7 @@ def _fit_photos(prepared: Prepared, options: CompactOptions, fit: FitOptions, ba
     if problem is not None:
         note(problem)
     free = options.prepare.poses == "free" or (options.prepare.poses == "auto" and prepared.moved)
-    moves = free and fit.fit == "full" and prepared.given.images is not None  # which only the CPU can do
+    moves = free and fit.fit == "full" and prepared.input_scene.images is not None  # which only the CPU can do
     return replace(fit, photo_scale=scale, move_cameras=moves)
 
 

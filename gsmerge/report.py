@@ -94,7 +94,7 @@ def report_document(
         "peak_memory_bytes": numbers["peak_memory_bytes"],
         "notes": [*notes, *numbers["notes"]],
         "unmet": numbers["unmet"],
-        "worse": next((one.worse for one in (report, *(level for _, level in coarser)) if one.worse), None),
+        "worse": next((entry.worse for entry in (report, *(level for _, level in coarser)) if entry.worse), None),
     }
 
 

@@ -55,9 +55,9 @@ def to_float32(values: np.ndarray) -> np.ndarray:
         return values.astype(np.float32)
 
 
-def like(values: np.ndarray, given: Array) -> Array:
+def like(values: np.ndarray, template: Array) -> Array:
     """Return an array in the kind of another: an array, or a tensor on the same device."""
-    return as_tensor(values, given.device) if hasattr(given, "detach") else values
+    return as_tensor(values, template.device) if hasattr(template, "detach") else values
 
 
 def concat_rows(parts: Sequence[Array], axis: int = 0) -> Array:
@@ -288,9 +288,9 @@ class Scene:
         for name, shape in (("missing", (v, h, w)), ("masks", (v, h, w)), ("images", (v, h, w, 3))):
             if getattr(self, name) is not None:
                 _expect(name, getattr(self, name), shape)
-        for what, some in (("view names", self.names), ("large photos", getattr(self.large_photos, "ids", None))):
-            if some is not None and len(some) != v:
-                raise ValueError(f"expected {v} {what}, got {len(some)}")
+        for what, values in (("view names", self.names), ("large photos", getattr(self.large_photos, "ids", None))):
+            if values is not None and len(values) != v:
+                raise ValueError(f"expected {v} {what}, got {len(values)}")
 
     def __len__(self) -> int:
         return len(self.cameras)

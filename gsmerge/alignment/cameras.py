@@ -63,8 +63,8 @@ def other_conventions(viewmats: np.ndarray, convention: Convention) -> list[Pose
     stored, readings = from_viewmats(viewmats, convention), [Poses(convention, viewmats)]
     for other in CONVENTIONS:
         read = to_viewmats(stored, other)
-        known = [poses.viewmats for poses in readings]
-        if not any(np.allclose(read, one, atol=_SAME * (1 + np.abs(one).max())) for one in known):
+        stacks = [poses.viewmats for poses in readings]
+        if not any(np.allclose(read, stack, atol=_SAME * (1 + np.abs(stack).max())) for stack in stacks):
             readings.append(Poses(other, read))
     return readings[1:]
 

@@ -109,28 +109,28 @@ def _far_factors(scene: Scene, view: int, far: np.ndarray, depth: float) -> np.n
     rays = matmul(matmul(pixels, invert(cameras.Ks[view]).T), viewmat[:3, :3])
     centres = cameras.centres
     away = np.linalg.norm(centres - centres[view], axis=1)
-    others = np.argsort(away, kind="stable")[1 : 1 + _OTHERS]
-    own = images[view, y, x]
+    neighbours = np.argsort(away, kind="stable")[1 : 1 + _OTHERS]
+    colors = images[view, y, x]
     costs = np.empty((len(_FACTORS), len(x)))
     for i, factor in enumerate(_FACTORS):
         points = centres[view] + factor * depth * rays
         total, count = np.zeros(len(x)), np.zeros(len(x))
-        for other in others:
+        for neighbour in neighbours:
             with np.errstate(all="ignore"):
-                xy, z = project_points(points, cameras.viewmats[other], cameras.Ks[other])
+                xy, z = project_points(points, cameras.viewmats[neighbour], cameras.Ks[neighbour])
             inside = (z > 0) & (xy >= 0).all(1) & (xy < (cameras.width, cameras.height)).all(1)
             column, row = xy[inside].astype(np.int64).T
-            total[inside] += np.abs(own[inside] - images[other, row, column]).mean(1)
+            total[inside] += np.abs(colors[inside] - images[neighbour, row, column]).mean(1)
             count[inside] += 1
         seen = np.zeros((2, *far.shape))
         seen[0, y, x] = total
         seen[1, y, x] = count
         total, count = _sums_around(seen)[:, y, x]
         costs[i] = np.where(count > 0, total / np.maximum(count, 1), np.inf)
-    known = np.isfinite(costs).all(0)
+    finite = np.isfinite(costs).all(0)
     chosen = (costs + _FARTHER * np.arange(len(_FACTORS))[:, None]).argmin(0)
-    if known.any():
-        chosen[~known] = int(np.median(chosen[known]))
+    if finite.any():
+        chosen[~finite] = int(np.median(chosen[finite]))
     return _FACTORS[chosen]
 
 

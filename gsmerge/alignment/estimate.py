@@ -77,12 +77,12 @@ def calibrate(
     K = make_pinhole(focal, aspect * focal, layout.width / 2, layout.height / 2)
     kept = [np.ones(len(p), bool) for p in points]
     starts = [start_pose(p, q, K) for p, q in zip(points, pixels, strict=True)]
-    found = [pose for pose in starts if pose is not None]
-    if len(found) < len(starts):
+    start_poses = [pose for pose in starts if pose is not None]
+    if len(start_poses) < len(starts):
         return math.inf, 0.0, []
-    poses = np.stack(found)
+    poses = np.stack(start_poses)
     for _ in range(_CALIBRATIONS):
-        near, where = ([p[k] for p, k in zip(some, kept, strict=True)] for some in (points, pixels))
+        near, where = ([p[k] for p, k in zip(values, kept, strict=True)] for values in (points, pixels))
         try:
             K, poses = refine_poses(near, where, K, poses, focal=True)
         except np.linalg.LinAlgError:
@@ -168,13 +168,13 @@ def _match_colors(colors: np.ndarray, grid: _Grid, photos: Photos) -> Layout | N
         shown = photos[view].reshape(-1, 3)[inside].T.astype(np.int16)
         shown = np.concatenate([shown, np.full((3, length), _OUTSIDE, np.int16)], 1)
         last = min(first + len(inside), colors.shape[1]) - length
-        found = []
+        matches = []
         for start in np.unique(np.linspace(first + unsure // 2, last, _STRETCHES).astype(int)):
             low = max(0, start - first - unsure - _SLACK)
             high = min(len(inside), start - first + unsure + dropped + _SLACK)
             if start >= 0 and low < high:
-                found.append((start, *_place(shown, colors[:, start : start + length], low, high)))
-        placed = _agreeing(np.array(found, np.int64).reshape(-1, 4))
+                matches.append((start, *_place(shown, colors[:, start : start + length], low, high)))
+        placed = _agreeing(np.array(matches, np.int64).reshape(-1, 4))
         if not len(placed):
             return None
         within = np.linspace(0, length - 1, _PER_STRETCH).astype(int)
@@ -202,32 +202,32 @@ def _place(shown: np.ndarray, wanted: np.ndarray, low: int, high: int) -> tuple[
             np.abs(difference, out=difference)
             sums += difference
     best = int(sums.argmin())
-    others = np.concatenate([sums[: max(0, best - 2)], sums[best + 3 :]])
-    return low + best, int(sums[best]), int(others.min(initial=np.iinfo(np.int32).max))
+    other_sums = np.concatenate([sums[: max(0, best - 2)], sums[best + 3 :]])
+    return low + best, int(sums[best]), int(other_sums.min(initial=np.iinfo(np.int32).max))
 
 
-def _agreeing(found: np.ndarray) -> np.ndarray:
+def _agreeing(stretches: np.ndarray) -> np.ndarray:
     """Choose the stretches ``[s,4]`` that are unique and in order; none if few are.
 
     Their columns are row, place, sum and the next best sum.
     """
-    if not len(found):
-        return found
-    near = found[:, 2] <= _MAX_COST * max(1.0, float(np.quantile(found[:, 2], 0.25)))
-    found = found[near & (found[:, 3] > _UNIQUE * found[:, 2])]
-    gaps = found[:, 1] - found[:, 0]  # pixels dropped so far and a constant: never fewer
-    longest, before = np.ones(len(found), int), np.full(len(found), -1)
-    for i in range(len(found)):
+    if not len(stretches):
+        return stretches
+    near = stretches[:, 2] <= _MAX_COST * max(1.0, float(np.quantile(stretches[:, 2], 0.25)))
+    stretches = stretches[near & (stretches[:, 3] > _UNIQUE * stretches[:, 2])]
+    gaps = stretches[:, 1] - stretches[:, 0]  # pixels dropped so far and a constant: never fewer
+    longest, before = np.ones(len(stretches), int), np.full(len(stretches), -1)
+    for i in range(len(stretches)):
         earlier = np.flatnonzero(gaps[:i] <= gaps[i] + _BACK)
         if len(earlier):
             before[i] = earlier[longest[earlier].argmax()]
             longest[i] = longest[before[i]] + 1
-    chain, i = [], int(longest.argmax()) if len(found) else -1
+    chain, i = [], int(longest.argmax()) if len(stretches) else -1
     while i >= 0:
         chain.append(i)
         i = int(before[i])
-    enough = max(_MIN_STRETCHES, _MIN_AGREEING * len(found))
-    return found[chain[::-1]] if len(chain) >= enough else found[:0]
+    enough = max(_MIN_STRETCHES, _MIN_AGREEING * len(stretches))
+    return stretches[chain[::-1]] if len(chain) >= enough else stretches[:0]
 
 
 def _solve(gaussians: Gaussians, valid: np.ndarray, layout: Layout, grid: _Grid) -> Cameras | None:
@@ -257,10 +257,10 @@ def _calibrate(
         replace(layout, views=(0,), rows=(rows,), pixels=(pixels,))
         for rows, pixels in zip(layout.rows, layout.pixels, strict=True)
     ]
-    ones = [calibrate(gaussians.means, valid, view, aspect) for view in views] if alone else []
-    largest = max((one[0] for one in ones), default=math.inf)
+    fits = [calibrate(gaussians.means, valid, view, aspect) for view in views] if alone else []
+    largest = max((fit[0] for fit in fits), default=math.inf)
     if largest * _OWN_FOCALS < worst:
-        worst, focals, poses = largest, [one[1] for one in ones], [one[2][0] for one in ones]
+        worst, focals, poses = largest, [fit[1] for fit in fits], [fit[2][0] for fit in fits]
     if not math.isfinite(worst):
         return math.inf, None
     width, height = layout.width, layout.height

@@ -63,12 +63,12 @@ def estimate_focal(ply: GaussianFile, camera_file: CameraFile, photos: Photos | 
     ``camera_file`` has poses alone; ``photos`` are its c ``[h,w,3]`` uint8. Where only they show
     the focal length, pixels are taken to be square, and the principal point to be in the middle.
     """
-    own = int(camera_file.widths[0]), int(camera_file.heights[0])
-    size = photo_size(photos) or own
+    camera_size = int(camera_file.widths[0]), int(camera_file.heights[0])
+    size = photo_size(photos) or camera_size
     if min(size) <= 1:
         return None
-    others = other_conventions(camera_file.viewmats, camera_file.convention)
-    readings = [camera_file.viewmats, *(poses.viewmats for poses in others)]
+    other_poses = other_conventions(camera_file.viewmats, camera_file.convention)
+    readings = [camera_file.viewmats, *(poses.viewmats for poses in other_poses)]
     K = _intrinsics_of_rays(ply, camera_file, readings, size)
     what = "the rays of the pixels"
     if K is None and photos is not None:

@@ -136,14 +136,14 @@ def read_unordered(rows: ProjectedRows, *, color_of: ColorOf | None = None) -> L
     if spread is None:
         return None
     chunks = [np.arange(a, min(a + _CHUNK, count)) for a in range(0, count, _CHUNK)]
-    choices = parallel_map(lambda some: _choices(rows, some, spread, color_of), chunks)
+    choices = parallel_map(lambda row_ids: _choices(rows, row_ids, spread, color_of), chunks)
     slots, cost = np.concatenate([c[0] for c in choices]), np.concatenate([c[1] for c in choices])
     owner = _assign(slots, cost, num_views * num_pixels)
     used = np.flatnonzero(owner >= 0)
     if len(used) < MIN_SHARE * count:
         return None
     slots_of_views = np.split(used, np.searchsorted(used, np.arange(1, num_views) * num_pixels))
-    parts = [(view, owner[own], own - view * num_pixels) for view, own in enumerate(slots_of_views) if len(own)]
+    parts = [(view, owner[part], part - view * num_pixels) for view, part in enumerate(slots_of_views) if len(part)]
     lost = count - len(used)
     note = f", {lost:,} rows without a pixel" if lost else ""
     return rows.layout("unordered", parts, missing=num_views * num_pixels - len(used), note=note)
@@ -156,14 +156,14 @@ def _measure_spread(rows: ProjectedRows, color_of: ColorOf | None) -> Spread | N
     """
     if len(rows) < MIN_BLOCK:
         return None
-    some = np.unique(np.linspace(0, len(rows) - 1, _SAMPLES).astype(np.int64))
-    few, _ = _distances(rows, some[::_FEW])
+    sample = np.unique(np.linspace(0, len(rows) - 1, _SAMPLES).astype(np.int64))
+    few, _ = _distances(rows, sample[::_FEW])
     if (few.min(1) < TOLERANCES[0]).mean() < _MIN_FEW:
         return None
-    centre, pixels = _distances(rows, some)
-    corner, _ = _distances(rows, some, shift=0.5)
+    centre, pixels = _distances(rows, sample)
+    corner, _ = _distances(rows, sample, shift=0.5)
     ranked = np.sort(centre, axis=1)
-    second = ranked[:, 1] if len(rows.cameras) > 1 else np.full(len(some), np.inf)
+    second = ranked[:, 1] if len(rows.cameras) > 1 else np.full(len(sample), np.inf)
     for tolerance in TOLERANCES:
         near, by_chance = ranked[:, 0] < tolerance, max(np.mean(second < tolerance), np.mean(corner.min(1) < tolerance))
         if near.mean() < MIN_SHARE:
@@ -175,20 +175,20 @@ def _measure_spread(rows: ProjectedRows, color_of: ColorOf | None) -> Spread | N
     color = np.inf
     if color_of is not None:
         sure = np.flatnonzero(near & (second >= tolerance))
-        own = centre[sure].argmin(1)
-        ids = [sure[own == view] for view in range(len(rows.cameras))]
-        colors = [color_of(some[part], view, pixels[part, view]) for view, part in enumerate(ids)]
+        nearest = centre[sure].argmin(1)
+        ids = [sure[nearest == view] for view in range(len(rows.cameras))]
+        colors = [color_of(sample[part], view, pixels[part, view]) for view, part in enumerate(ids)]
         color = float(np.median(np.concatenate(colors)))
     px = float(np.median(ranked[near, 0]))
     return tolerance, max(px, _SMALLEST_PX), max(color, _SMALLEST_COLOR)
 
 
-def _distances(rows: ProjectedRows, some: np.ndarray, *, shift: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+def _distances(rows: ProjectedRows, row_ids: np.ndarray, *, shift: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Measure distances ``[r,c]`` from the nearest pixel's centre in each view, inf outside; also return the pixels."""
-    distances = np.full((len(some), len(rows.cameras)), np.inf, np.float32)
-    pixels = np.zeros((len(some), len(rows.cameras)), np.int32)
+    distances = np.full((len(row_ids), len(rows.cameras)), np.inf, np.float32)
+    pixels = np.zeros((len(row_ids), len(rows.cameras)), np.int32)
     for view in range(len(rows.cameras)):
-        pixels[:, view], u, v = rows.pixels(some, view)
+        pixels[:, view], u, v = rows.pixels(row_ids, view)
         inside = pixels[:, view] >= 0
         du, dv = (x + shift - np.floor(x + shift) - 0.5 for x in (u[inside], v[inside]))
         distances[inside, view] = np.sqrt(du * du + dv * dv)
@@ -196,10 +196,10 @@ def _distances(rows: ProjectedRows, some: np.ndarray, *, shift: float = 0.0) -> 
 
 
 def _choices(
-    rows: ProjectedRows, some: np.ndarray, spread: Spread, color_of: ColorOf | None
+    rows: ProjectedRows, row_ids: np.ndarray, spread: Spread, color_of: ColorOf | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Choose the best and second best slots ``view·H·W + pixel [r,2]`` of some rows, -1: none; and their costs."""
-    distances, pixels = _distances(rows, some)
+    distances, pixels = _distances(rows, row_ids)
     tolerance, px, color = spread
     near = distances < tolerance
     torn = near.sum(1) > 1
@@ -208,8 +208,8 @@ def _choices(
     if color_of is not None:
         for view in range(len(rows.cameras)):
             ids = np.flatnonzero(torn & near[:, view])
-            cost[ids, view] += color_of(some[ids], view, pixels[ids, view]) / color
-    every, slots, costs = np.arange(len(some)), [], []
+            cost[ids, view] += color_of(row_ids[ids], view, pixels[ids, view]) / color
+    every, slots, costs = np.arange(len(row_ids)), [], []
     for _ in range(2):
         view = cost.argmin(1)
         lowest = cost[every, view]

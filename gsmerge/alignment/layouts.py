@@ -42,8 +42,8 @@ class Layout:
 
     def with_views_in(self, orders: Iterable[Sequence[int]]) -> Iterator[Layout]:
         """Yield the same rows and pixels with the views in each of some orders."""
-        views = dict.fromkeys(tuple(order[view] for view in self.views) for order in orders)
-        return (replace(self, views=some) for some in views)
+        labellings = dict.fromkeys(tuple(order[view] for view in self.views) for order in orders)
+        return (replace(self, views=labelling) for labelling in labellings)
 
     @property
     def is_plain(self) -> bool:
@@ -105,7 +105,7 @@ def every_nth(views: int) -> list[tuple[int, ...]]:
 
 def plain_layout(views: int, width: int, height: int) -> Layout:
     """Return the layout of one Gaussian per pixel, view by view and row by row."""
-    return next(one for one in exact_layouts(views * width * height, views, width, height) if one.is_plain)
+    return next(layout for layout in exact_layouts(views * width * height, views, width, height) if layout.is_plain)
 
 
 def exact_layouts(count: int, views: int, width: int, height: int) -> Iterator[Layout]:
@@ -115,10 +115,10 @@ def exact_layouts(count: int, views: int, width: int, height: int) -> Iterator[L
     """
     for box in boxes(width, height):
         for per_pixel in PER_PIXEL:
-            blocks, rest = divmod(count, (height - 2 * box.top) * (width - 2 * box.left) * per_pixel)
-            if rest or not 1 <= blocks <= views:
+            blocks, remainder = divmod(count, (height - 2 * box.top) * (width - 2 * box.left) * per_pixel)
+            if remainder or not 1 <= blocks <= views:
                 continue
-            chosen = next((some for some in every_nth(views) if len(some) == blocks), tuple(range(blocks)))
+            chosen = next((ids for ids in every_nth(views) if len(ids) == blocks), tuple(range(blocks)))
             yield from _orders(count, box, per_pixel, chosen, width, height)
 
 
@@ -166,7 +166,7 @@ def depth_layouts(count: int, depths: np.ndarray) -> list[Layout]:
         kept.append(inside[mask.reshape(-1)[inside]])
     for step, chosen in enumerate(every_nth(views), 1):
         pixels = tuple(kept[view] for view in chosen)
-        ends = np.cumsum([len(some) for some in pixels])
+        ends = np.cumsum([len(view_pixels) for view_pixels in pixels])
         if ends[-1] == count:
             border = da3_box(width, height).description.removesuffix(" at every border")
             every = "" if step == 1 else f", every {step}. view"
@@ -179,10 +179,10 @@ def depth_layouts(count: int, depths: np.ndarray) -> list[Layout]:
 def subsample(layout: Layout, per_block: int) -> Layout:
     """Thin a layout to about ``per_block`` rows of each block, spread over all columns and rows."""
     rows, pixels = [], []
-    for some, where in zip(layout.rows, layout.pixels, strict=True):
-        chosen = np.arange(0, some.size, spread_step(-(-some.size // per_block), layout.width))
-        rows.append(some.flat[chosen])
-        pixels.append(where[chosen])
+    for block_rows, block_pixels in zip(layout.rows, layout.pixels, strict=True):
+        chosen = np.arange(0, block_rows.size, spread_step(-(-block_rows.size // per_block), layout.width))
+        rows.append(block_rows.flat[chosen])
+        pixels.append(block_pixels[chosen])
     return replace(layout, rows=tuple(rows), pixels=tuple(pixels))
 
 
@@ -246,12 +246,12 @@ def _are_stretched(camera_file: CameraFile, size: Size) -> bool:
 
 def other_grids(ply: FileInfo, camera_file: CameraFile, size: Size | None) -> Iterator[GridFit]:
     """Yield all other grids that the files and the number of rows allow, the likely first; ``size`` is the photos'."""
-    known = sizes_of(camera_file)
-    own = known[0] if len(known) == 1 else None
-    if size is not None and own is not None and own != size:
-        yield from _between(camera_file, size, own)
-    base = size or own
-    if base is None or any(not same_shape(s, base) for s in known):
+    sizes = sizes_of(camera_file)
+    camera_size = sizes[0] if len(sizes) == 1 else None
+    if size is not None and camera_size is not None and camera_size != size:
+        yield from _between(camera_file, size, camera_size)
+    base = size or camera_size
+    if base is None or any(not same_shape(s, base) for s in sizes):
         return
     cameras = to_cameras(camera_file, base)
     what = "photos and cameras" if size is not None else "cameras"
@@ -261,22 +261,22 @@ def other_grids(ply: FileInfo, camera_file: CameraFile, size: Size | None) -> It
     for rank, transform in ranked:
         note = f"{what} of {base[0]} x {base[1]} are {transform.description}, the Gaussian grid's size"
         yield GridFit(camera_file, transform.cameras(cameras), transform, (note,), rank)
-        if not known and transform.crops:
+        if not sizes and transform.crops:
             whole = to_cameras(camera_file, (transform.width, transform.height))
             yield GridFit(camera_file, whole, transform, (f"{note}; the intrinsics are those of the result",), rank)
 
 
-def _between(camera_file: CameraFile, size: Size, own: Size) -> Iterator[GridFit]:
+def _between(camera_file: CameraFile, size: Size, camera_size: Size) -> Iterator[GridFit]:
     """Bring photos to the cameras' size, or cameras of uncropped pictures to the photos'."""
-    cameras = to_cameras(camera_file, own)
-    for transform in (resize_to(size, own), resize_and_crop(size, own)):
+    cameras = to_cameras(camera_file, camera_size)
+    for transform in (resize_to(size, camera_size), resize_and_crop(size, camera_size)):
         if max(transform.scale_x, transform.scale_y) > _MAX_ENLARGED:
             continue  # previews: a fit to them would blur the Gaussians
         note = f"photos of {size[0]} x {size[1]} are {transform.description}, the cameras' and the Gaussian grid's size"
         yield GridFit(camera_file, cameras, transform, (note,))
-    if not same_shape(own, size):
-        for transform in (resize_to(own, size), resize_and_crop(own, size)):
-            note = f"cameras of {own[0]} x {own[1]} are {transform.description}, the images' size"
+    if not same_shape(camera_size, size):
+        for transform in (resize_to(camera_size, size), resize_and_crop(camera_size, size)):
+            note = f"cameras of {camera_size[0]} x {camera_size[1]} are {transform.description}, the images' size"
             yield GridFit(camera_file, transform.cameras(cameras), None, (note,))
 
 
@@ -285,8 +285,8 @@ def grids_of_count(count: int, views: int, size: Size) -> Iterator[PhotoTransfor
     crops: list[PhotoTransform] = []
     for trim in (0, TRIM):
         for per_pixel in PER_PIXEL:
-            pixels, rest = divmod(count, views * per_pixel)
-            if rest:
+            pixels, remainder = divmod(count, views * per_pixel)
+            if remainder:
                 continue
             for to in _sizes_of_area(pixels, trim, size):
                 aspect = to[0] * size[1] / (to[1] * size[0])
@@ -301,9 +301,9 @@ def grids_of_count(count: int, views: int, size: Size) -> Iterator[PhotoTransfor
 def _sizes_of_area(pixels: int, trim: int, size: Size) -> Iterator[Size]:
     """Yield sizes up to ``size`` that have ``pixels`` pixels when ``trim`` is cut off at every border."""
     for width in range(max(1, pixels // size[1]), min(size[0], pixels) + 1):
-        height, rest = divmod(pixels, width)
+        height, remainder = divmod(pixels, width)
         to = width + 2 * trim, height + 2 * trim
-        if not rest and to != size and to[0] <= size[0] and to[1] <= size[1]:
+        if not remainder and to != size and to[0] <= size[0] and to[1] <= size[1]:
             yield to
 
 
@@ -322,8 +322,9 @@ def patch_grids(size: Size) -> list[PhotoTransform]:
 
 def small_photos_error(ply: FileInfo, camera_file: CameraFile, size: Size | None) -> SceneError | None:
     """Make the SceneError for photos smaller than the cameras' size, of which the rows are the pixels; or None."""
-    own = next((s for s in sizes_of(camera_file) if ply.count == len(camera_file) * s[0] * s[1]), None)
-    if size is None or own is None or own == size:
+    grid_size = next((s for s in sizes_of(camera_file) if ply.count == len(camera_file) * s[0] * s[1]), None)
+    if size is None or grid_size is None or grid_size == size:
         return None
-    problem = f"expected images of the Gaussian grid's size {own[0]} x {own[1]} or larger, found {size[0]} x {size[1]}"
+    problem = f"expected images of the Gaussian grid's size {grid_size[0]} x {grid_size[1]} or larger"
+    problem += f", found {size[0]} x {size[1]}"
     return SceneError(camera_file.path, problem, "give the images that the backbone saw, or their originals")

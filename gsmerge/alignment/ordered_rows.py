@@ -94,12 +94,12 @@ def read_view_major(rows: ProjectedRows) -> Layout | None:
         return None
     width, height = rows.cameras.width, rows.cameras.height
     parts = []
-    for view, some in blocks:
-        u, v = rows.project(some, view)
+    for view, ids in blocks:
+        u, v = rows.project(ids, view)
         pixels = assign_pixels(u, v, width, height)
         if not _distance(u, v, pixels, width) <= max(FAR_PX, FAR * min(width, height)):
             return None
-        parts.append((view, some, pixels))
+        parts.append((view, ids, pixels))
     return rows.layout("view-major", parts, missing=len(blocks) * width * height - len(rows))
 
 
@@ -117,8 +117,8 @@ def _find_blocks(rows: ProjectedRows) -> list[tuple[int, np.ndarray]] | None:
     parts: list[np.ndarray] = []
     costs: list[np.ndarray] = []
     while start < count:
-        some = np.arange(start, min(count, start + SHORT))
-        cost = np.array([_unevenness(*rows.project(some, view)) for view in range(views)])
+        window = np.arange(start, min(count, start + SHORT))
+        cost = np.array([_unevenness(*rows.project(window, view)) for view in range(views)])
         if len(parts) == views or not np.isfinite(cost).any():
             return None
         later = cost[view + 1 :]
@@ -187,23 +187,23 @@ def assign_pixels(u: np.ndarray, v: np.ndarray, width: int, height: int) -> np.n
     the row known, ``pixel - rank`` never decreases: isotonic regression finds it, and averages the jitter between
     gaps.
     """
-    count, known = len(u), np.isfinite(u) & np.isfinite(v)
-    u, v = np.where(known, u, 0.0), np.where(known, v, 0.0)
+    count, finite = len(u), np.isfinite(u) & np.isfinite(v)
+    u, v = np.where(finite, u, 0.0), np.where(finite, v, 0.0)
     du = np.diff(u)
-    noise = float(np.median(np.abs(du[known[1:] & known[:-1]] - 1))) if (known[1:] & known[:-1]).any() else 0.0
-    cut = (du < -max(2.0, 4 * noise + 1)) & known[1:] & known[:-1]
+    noise = float(np.median(np.abs(du[finite[1:] & finite[:-1]] - 1))) if (finite[1:] & finite[:-1]).any() else 0.0
+    cut = (du < -max(2.0, 4 * noise + 1)) & finite[1:] & finite[:-1]
     scanline = np.concatenate([[0], np.cumsum(cut)])
-    counts = np.bincount(scanline[known], minlength=scanline[-1] + 1)
-    medians, some = np.zeros(len(counts)), np.flatnonzero(counts)
-    if len(some):
-        ordered = v[known][np.lexsort((v[known], scanline[known]))]
-        first = np.cumsum(counts)[some] - counts[some]
-        lower, upper = first + (counts[some] - 1) // 2, first + counts[some] // 2
-        medians[some] = (ordered[lower] + ordered[upper]) / 2
+    counts = np.bincount(scanline[finite], minlength=scanline[-1] + 1)
+    medians, nonempty = np.zeros(len(counts)), np.flatnonzero(counts)
+    if len(nonempty):
+        ordered = v[finite][np.lexsort((v[finite], scanline[finite]))]
+        first = np.cumsum(counts)[nonempty] - counts[nonempty]
+        lower, upper = first + (counts[nonempty] - 1) // 2, first + counts[nonempty] // 2
+        medians[nonempty] = (ordered[lower] + ordered[upper]) / 2
     rows = _never_falling(medians, np.maximum(counts, _SMALL))
     row = np.clip(np.floor(rows), 0, height - 1)[scanline]
     rank = np.arange(count)
-    sure = known & (np.abs(v - row - 0.5) < 2 + 4 * noise) & (u > -2 - 4 * noise) & (u < width + 2 + 4 * noise)
+    sure = finite & (np.abs(v - row - 0.5) < 2 + 4 * noise) & (u > -2 - 4 * noise) & (u < width + 2 + 4 * noise)
     key = row * width + np.clip(u, 0, width) - 0.5 - rank
     pixels = _never_falling(key, np.where(sure, 1.0, _SMALL))
     return np.asarray(np.clip(np.rint(pixels), 0, width * height - count), np.int64) + rank
@@ -230,7 +230,7 @@ def rough_scale(rows: ProjectedRows) -> float | None:
 
     def cost(scale: float) -> float:
         there = rows.with_frame(scale_by(scale))
-        uneven = (_unevenness(*there.project(some, view)) for view, some in enumerate(windows))
+        uneven = (_unevenness(*there.project(window, view)) for view, window in enumerate(windows))
         return float(np.mean([min(pixels, _MAX_UNEVENNESS) for pixels in uneven]))
 
     best = float(min(SCALES, key=cost))
@@ -253,7 +253,7 @@ def finer_scale(rows: ProjectedRows, layout: Layout, rough: float) -> float:
 
     def projected(scale: float) -> list[tuple[np.ndarray, np.ndarray]]:
         there = rows.with_frame(scale_by(scale))
-        return [there.project(some, view) for view, some in parts]
+        return [there.project(ids, view) for view, ids in parts]
 
     def distance(u: np.ndarray, v: np.ndarray) -> float:
         return _distance(u, v, assign_pixels(u, v, layout.width, layout.height), layout.width)
@@ -293,14 +293,14 @@ def read_view_fastest(rows: ProjectedRows) -> Layout | None:
     chosen, goes_forward = _best_path(pixels)
     if not goes_forward:
         return None
-    own_pixel = pixels[np.arange(count), chosen]
+    chosen_pixel = pixels[np.arange(count), chosen]
     parts = []
     for view in range(views):
-        own = np.flatnonzero((chosen == view) & (own_pixel >= 0))
-        first = np.unique(own_pixel[own], return_index=True)[1]  # a step back may come to a pixel twice
-        own = own[np.sort(first)]
-        parts.append((view, own, own_pixel[own].astype(np.int64)))
-    if min(len(own) for _, own, _ in parts) < MIN_BLOCK:
+        ids = np.flatnonzero((chosen == view) & (chosen_pixel >= 0))
+        first = np.unique(chosen_pixel[ids], return_index=True)[1]  # a step back may come to a pixel twice
+        ids = ids[np.sort(first)]
+        parts.append((view, ids, chosen_pixel[ids].astype(np.int64)))
+    if min(len(ids) for _, ids, _ in parts) < MIN_BLOCK:
         return None
     return rows.layout("view-fastest", parts, missing=views * rows.cameras.width * rows.cameras.height - count)
 
@@ -312,6 +312,6 @@ def _best_path(pixels: np.ndarray) -> tuple[np.ndarray, bool]:
     return chosen, bool(back <= MAX_BACK * len(pixels) and np.mean(chosen[1:] != chosen[:-1]) >= MIN_CHANGES)
 
 
-def _pixels_in_views(rows: ProjectedRows, some: slice) -> np.ndarray:
+def _pixels_in_views(rows: ProjectedRows, part: slice) -> np.ndarray:
     """Find the pixel ``[r,c]`` int32 of some rows in each view; -1 outside."""
-    return np.stack([rows.pixels(some, view)[0] for view in range(len(rows.cameras))], 1)
+    return np.stack([rows.pixels(part, view)[0] for view in range(len(rows.cameras))], 1)

@@ -172,8 +172,8 @@ def _is_seen(inputs: AlignmentInput, layout: Layout) -> bool:
     limit = max(_SEEN_LIMITS * pixel_limit(layout.width, layout.height), _SEEN_SHARE * min(layout.width, layout.height))
     count = len(layout.views)
     for block in sorted({0, count // 2, count - 1}):
-        one = replace(layout, views=(0,), rows=layout.rows[block : block + 1], pixels=layout.pixels[block : block + 1])
-        pairs = inputs.pairs(subsample(one, _SEEN_SAMPLES))
+        part = replace(layout, views=(0,), rows=layout.rows[block : block + 1], pixels=layout.pixels[block : block + 1])
+        pairs = inputs.pairs(subsample(part, _SEEN_SAMPLES))
         if projective_error(pairs.points, pairs.pixels) <= limit:
             return True
     return False
@@ -181,7 +181,7 @@ def _is_seen(inputs: AlignmentInput, layout: Layout) -> bool:
 
 def _without_same_labellings(inputs: AlignmentInput) -> AlignmentInput:
     """Drop orders that only exchange views of one pose with equal photos, or without any: either is right."""
-    cameras, images, (first, *others) = inputs.cameras, inputs.images, inputs.labellings
+    cameras, images, (first, *labellings) = inputs.cameras, inputs.images, inputs.labellings
     facts = np.concatenate([cameras.viewmats[:, :3].reshape(-1, 12), cameras.Ks.reshape(-1, 9)], 1)
 
     def same(other: Sequence[int]) -> bool:
@@ -189,7 +189,7 @@ def _without_same_labellings(inputs: AlignmentInput) -> AlignmentInput:
         alike = images is None or all(np.array_equal(images[a], images[b]) for a, b in moved)
         return alike and all(np.array_equal(facts[a], facts[b]) for a, b in moved)
 
-    return replace(inputs, labellings=[first, *(first if same(other) else other for other in others)])
+    return replace(inputs, labellings=[first, *(first if same(other) else other for other in labellings)])
 
 
 def possible_layouts(inputs: AlignmentInput) -> list[Layout]:
@@ -218,7 +218,7 @@ def _best_frame(inputs: AlignmentInput, layout: Layout, samples: int, effort: in
     frames = candidate_similarities(pairs, inputs.cameras, scale=inputs.scale, effort=effort)
     readings = [score_layout(inputs, layout, frame, pairs) for frame in frames]
     lowest = min(reading.worst_px for reading in readings)
-    best = next(one for one in readings if one.worst_px <= max(_SIMPLER * lowest, lowest + _SIMPLER_PX))
+    best = next(reading for reading in readings if reading.worst_px <= max(_SIMPLER * lowest, lowest + _SIMPLER_PX))
     solved = best.ok and best.frame is not IDENTITY and inputs.scale is None
     ok = fits_all_cameras(best.frame, pairs, inputs.cameras) if solved else best.ok
     return replace(best, ok=ok, quick=samples < SAMPLES)
@@ -235,20 +235,20 @@ def _nearest_views(inputs: AlignmentInput, layout: Layout) -> tuple[int, ...] | 
     pairs = inputs.pairs(subsample(layout, 300))
     chosen = []
     for block in range(len(layout.views)):
-        own = pairs.select(pairs.blocks == block)
-        if not len(own.rows):
+        block_pairs = pairs.select(pairs.blocks == block)
+        if not len(block_pairs.rows):
             return None
-        views = (np.full(len(own.rows), view) for view in range(len(inputs.cameras)))
-        errors = [np.median(pixel_errors(replace(own, views=some), inputs.cameras)) for some in views]
+        views = (np.full(len(block_pairs.rows), view) for view in range(len(inputs.cameras)))
+        errors = [np.median(pixel_errors(replace(block_pairs, views=view_ids), inputs.cameras)) for view_ids in views]
         chosen.append(int(np.argmin(errors)))
     return tuple(chosen) if len(set(chosen)) * layout.per_pixel == len(chosen) else None
 
 
-def _differs(one: Layout, other: Layout) -> bool:
+def _differs(layout: Layout, other: Layout) -> bool:
     """Return whether two layouts put rows to different pixels, judged by some rows of each block."""
-    if one.views != other.views or [r.size for r in one.rows] != [r.size for r in other.rows]:
+    if layout.views != other.views or [r.size for r in layout.rows] != [r.size for r in other.rows]:
         return True
-    a, b = subsample(one, 200), subsample(other, 200)
+    a, b = subsample(layout, 200), subsample(other, 200)
     return not all(np.array_equal(x, y) for x, y in zip((*a.rows, *a.pixels), (*b.rows, *b.pixels), strict=True))
 
 
@@ -320,28 +320,28 @@ def explain_misalignment(
 ) -> str | None:
     """Name another reading of cameras or row order under which the scene fits; None without one."""
     pairs = sample_pixels(gaussians, cameras, valid)
-    given = cameras.viewmats
+    input_viewmats = cameras.viewmats
     frames = candidate_similarities(pairs, cameras, effort=1)
-    others = [
+    readings = [
         (describe_reading(poses.convention, convention), poses.viewmats)
-        for poses in other_conventions(given, convention)
+        for poses in other_conventions(input_viewmats, convention)
     ]
-    transposed = given.copy()
-    transposed[:, :3, :3] = given[:, :3, :3].transpose(0, 2, 1)
+    transposed = input_viewmats.copy()
+    transposed[:, :3, :3] = input_viewmats[:, :3, :3].transpose(0, 2, 1)
     transposed[:, :3, 3] = -matmul(transposed[:, :3, :3], cameras.centres[:, :, None])[..., 0]
-    others.append(("the cameras fit with their rotations transposed", transposed))
+    readings.append(("the cameras fit with their rotations transposed", transposed))
     flips = (1, "y axis flipped (rows counted from the bottom)"), (0, "x axis flipped (mirrored images)")
     for axis, words in flips:
-        mirrored = given.copy()
+        mirrored = input_viewmats.copy()
         mirrored[:, axis] *= -1
-        others.append((f"the cameras fit with the {words}", mirrored))
+        readings.append((f"the cameras fit with the {words}", mirrored))
     scaled = [f for f in frames if f.kind == "scaled"]
-    others += [(f"the cameras fit with their {f.description}", f.move_viewmats(given)) for f in scaled]
-    for reason, viewmats in others:
+    readings += [(f"the cameras fit with their {f.description}", f.move_viewmats(input_viewmats)) for f in scaled]
+    for reason, viewmats in readings:
         if check_pairs(pairs, replace(cameras, viewmats=viewmats)).ok:
             return reason
     size = len(cameras), cameras.width, cameras.height
-    full = [one for one in exact_layouts(len(gaussians), *size) if one.kind == "full" and one.per_pixel == 1]
+    full = [grid for grid in exact_layouts(len(gaussians), *size) if grid.kind == "full" and grid.per_pixel == 1]
     plain = plain_layout(*size)
     for layout in (*full, replace(plain, order="reversed", views=plain.views[::-1])):
         pairs = find_correspondences(gaussians.means, valid.reshape(-1), subsample(layout, MAX_CHECKED))

@@ -51,10 +51,10 @@ def refine_poses(
         return near_K, near, _linearise(points, pixels, near_K, near)
 
     def step(state: _Fit, damping: float) -> _Fit:
-        own_K, own, (curvature, slope, _) = state
+        current_K, current_poses, (curvature, slope, _) = state
         stretch, motions = _step(curvature, slope, damping, focal=focal)
-        near_K = np.concatenate([own_K[:2, :2] * stretch, own_K[:2, 2:]], 1)
-        return fit(np.concatenate([near_K, own_K[2:]]), matmul(motion_matrices(motions), own))
+        near_K = np.concatenate([current_K[:2, :2] * stretch, current_K[:2, 2:]], 1)
+        return fit(np.concatenate([near_K, current_K[2:]]), matmul(motion_matrices(motions), current_poses))
 
     K, poses, _ = descend(fit(K, poses), lambda state: state[2][2], step, SCHEDULE)
     return K, poses

@@ -109,12 +109,12 @@ def _is_root(
     The better of two is better by chance as well: so every other reading gets a second rotation, half a turn more.
     ``single`` are readings ``[t,4]``, as stored first, as xyzw next; ``normals`` are rough, for a quick comparison.
     """
-    others = [square_roots(single[0]), *((one, _half_a_turn_more(one)) for one in single)]
+    pairs = [square_roots(single[0]), *((quats, _half_a_turn_more(quats)) for quats in single)]
     roots = square_roots(single[1])
-    if _better_of(roots, thinnest, normals, 0.0) <= max(_better_of(pair, thinnest, normals, 0.0) for pair in others):
+    if _better_of(roots, thinnest, normals, 0.0) <= max(_better_of(pair, thinnest, normals, 0.0) for pair in pairs):
         return False
     smooth = _smooth_normals(scene)[rows]
-    best_other = max(_better_of(pair, thinnest, smooth, _FOLLOWS) for pair in others)
+    best_other = max(_better_of(pair, thinnest, smooth, _FOLLOWS) for pair in pairs)
     return 1 - _better_of(roots, thinnest, smooth, _FOLLOWS) <= _MAX_LEFT * (1 - best_other)
 
 

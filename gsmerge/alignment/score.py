@@ -51,9 +51,9 @@ class Correspondences:
     blocks: np.ndarray  # ``[t]`` what wrote them, in order: a view, or one layer of it
     rows: np.ndarray  # ``[t]`` of the file
 
-    def select(self, some: np.ndarray) -> Correspondences:
+    def select(self, index: np.ndarray) -> Correspondences:
         """Select some rows."""
-        return Correspondences(*(column[some] for column in vars(self).values()))
+        return Correspondences(*(column[index] for column in vars(self).values()))
 
     def split(self, values: np.ndarray, blocks: int) -> list[np.ndarray]:
         """Split values ``[t,...]`` by block."""
@@ -96,13 +96,13 @@ def candidate_similarities(
     yield IDENTITY if scale is None else scale_by(scale, ", as given")
     rays = None if pairs is None or effort == 0 else _ray_directions(pairs, cameras)
     first, middle = cameras.viewmats[0, :3, :3], cameras.viewmats[len(cameras) // 2, :3, :3]
-    known = (
+    rotations = (
         (np.eye(3), "", ""),
         (first, "rotated into the first camera", "first"),
         (middle, "rotated into the middle camera", "middle"),
         (matmul(_UPRIGHT, first), "rotated upright from the first camera", "upright"),
     )
-    for rotation, name, kind in known:
+    for rotation, name, kind in rotations:
         if name:
             yield Similarity(rotation, scale or 1.0, np.zeros(3), name, kind)
         if pairs is None or rays is None:
@@ -168,10 +168,10 @@ def _mean_rotation(poses: dict[int, np.ndarray], viewmats: np.ndarray) -> np.nda
 
 def fits_all_cameras(frame: Similarity, pairs: Correspondences, cameras: Cameras) -> bool:
     """Return whether one similarity does about as well as a pose for each camera: otherwise the cameras are wrong."""
-    own = cameras.viewmats.copy()
+    viewmats = cameras.viewmats.copy()
     for view, pose in _solve_poses(pairs, cameras.Ks).items():
-        own[view] = pose
-    best = float(np.median(pixel_errors(pairs, replace(cameras, viewmats=own))))
+        viewmats[view] = pose
+    best = float(np.median(pixel_errors(pairs, replace(cameras, viewmats=viewmats))))
     return float(np.median(pixel_errors(pairs, frame.move(cameras)))) <= max(_AS_GOOD * best, best + _AS_GOOD_PX)
 
 
@@ -222,7 +222,7 @@ class AlignmentInput:
 def find_correspondences(means: np.ndarray, valid: np.ndarray, layout: Layout) -> Correspondences:
     """Return the valid rows of a layout (``means [n,3]``, ``valid [n]``) with their pixels and views."""
     rows, pixels = np.concatenate(layout.rows), np.concatenate(layout.pixels)
-    blocks = np.repeat(np.arange(len(layout.views)), [len(some) for some in layout.rows])
+    blocks = np.repeat(np.arange(len(layout.views)), [len(block_rows) for block_rows in layout.rows])
     good = valid[rows]
     rows, pixels, blocks = rows[good], pixels[good], blocks[good]
     y, x = np.divmod(pixels, layout.width)
@@ -272,8 +272,8 @@ def score_layout(
 
 def score_shuffled(inputs: AlignmentInput, best: Reading) -> tuple[float, float]:
     """Measure the median distance, pixels, and the mean colour distance, with pixels shuffled within each block."""
-    rng, some = np.random.default_rng(0), sample_layout(best.layout)
-    pairs = inputs.pairs(replace(some, pixels=tuple(rng.permutation(pixels) for pixels in some.pixels)))
+    rng, layout = np.random.default_rng(0), sample_layout(best.layout)
+    pairs = inputs.pairs(replace(layout, pixels=tuple(rng.permutation(pixels) for pixels in layout.pixels)))
     errors = pixel_errors(pairs, best.frame.move(inputs.cameras))
     return float(np.median(errors)), _color_distance(inputs, pairs)
 

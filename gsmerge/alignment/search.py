@@ -186,8 +186,8 @@ def _fits(source: _Source, grid: GridFit) -> Iterator[list[_Fit]]:
         yield next(other_sizes, [])
     if source.order != "none":
         rows = source.ply.gaussians, source.ply.valid
-        others = (_with_poses(grid, other) for other in _conventions(source.camera_file))
-        seen = (other for other in others if check_cameras(*rows, other.cameras, None).ok)
+        grids = (_with_poses(grid, other) for other in _conventions(source.camera_file))
+        seen = (other for other in grids if check_cameras(*rows, other.cameras, None).ok)
         yield _fit_all(source, seen)
     yield from other_sizes
 
@@ -197,8 +197,8 @@ def _fit_other_sizes(source: _Source) -> Iterator[list[_Fit]]:
     if source.order != "none":
         yield _fit_sizes(source, source.camera_file)
     if source.order not in MAY_BE_UNALIGNED:
-        others = _conventions(source.camera_file)
-        fits = (_choose(source, _fit_sizes(source, other, exact_frames=True)) for other in others)
+        camera_files = _conventions(source.camera_file)
+        fits = (_choose(source, _fit_sizes(source, camera_file, exact_frames=True)) for camera_file in camera_files)
         yield list(filter(None, fits))
 
 
@@ -252,8 +252,8 @@ def _fit_sizes(source: _Source, camera_file: CameraFile, *, exact_frames: bool =
     are.
     """
     guesses: list[GridFit] = []
-    others = other_grids(source.ply.info, camera_file, photo_size(source.photos))
-    for _, ranked in groupby(others, key=lambda grid: grid.rank):
+    candidates = other_grids(source.ply.info, camera_file, photo_size(source.photos))
+    for _, ranked in groupby(candidates, key=lambda grid: grid.rank):
         grids = [grid for grid in ranked if not grid.guessed or source.may_be(grid)]
         guesses += [grid for grid in grids if grid.guessed]
         exact = exact_frames or any(grid.guessed for grid in grids)

@@ -66,7 +66,7 @@ def check_cameras(
     rows = rows[:: max(1, len(rows) // samples)]
     points = gaussians.means[rows].astype(np.float64)
     colors = sh0_to_rgb(gaussians.sh0[rows, 0]).clip(0, 1)
-    visible, errors, others = np.zeros(len(rows), bool), [], []
+    visible, errors, shuffled_errors = np.zeros(len(rows), bool), [], []
     rng = np.random.default_rng(0)
     for view in range(len(cameras)):
         with np.errstate(all="ignore"):
@@ -78,9 +78,9 @@ def check_cameras(
             x, y = xy[inside].astype(np.int64).T
             photo = images[view, y, x]
             errors.append(np.abs(colors[inside] - photo).mean(1))
-            others.append(np.abs(colors[inside] - rng.permutation(photo)).mean(1))
+            shuffled_errors.append(np.abs(colors[inside] - rng.permutation(photo)).mean(1))
     share, ratio = float(visible.mean()), np.nan
-    if errors and (other := float(np.concatenate(others).mean())) > _SAME_COLORS:
+    if errors and (other := float(np.concatenate(shuffled_errors).mean())) > _SAME_COLORS:
         ratio = float(np.concatenate(errors).mean()) / other
     return CameraCheck(share, ratio, share >= _MIN_SEEN and not ratio > _MAX_COLOR_RATIO)
 
@@ -95,11 +95,11 @@ def choose_poses(
     note where others see as much as the usual ones.
     """
     usual = check_cameras(gaussians, valid, cameras, images)
-    others = [
+    candidates = [
         (poses, check_cameras(gaussians, valid, replace(cameras, viewmats=poses.viewmats), images))
         for poses in other_conventions(cameras.viewmats, convention)
     ]
-    ranked = sorted(others, key=lambda one: -one[1].score)
+    ranked = sorted(candidates, key=lambda candidate: -candidate[1].score)
     if not ranked or not ranked[0][1].ok:
         return None, usual, None
     poses, best = ranked[0]

@@ -48,10 +48,10 @@ class BatchOptions(Settings):
             example = self.output.format(**dict.fromkeys(FIELDS, 1))
         except (ValueError, LookupError, AttributeError, TypeError):
             names, example = [""], ""
-        known, endings = ", ".join(f"{{{name}}}" for name in FIELDS), OUTPUT_FORMATS
+        placeholders, endings = ", ".join(f"{{{name}}}" for name in FIELDS), OUTPUT_FORMATS
         is_outside = example.startswith(("/", "~", ".")) or ".." in example.split("/")
         for is_possible, expected in (
-            (all(name in FIELDS for name in names), f"{known} in braces"),
+            (all(name in FIELDS for name in names), f"{placeholders} in braces"),
             (example.lower().endswith(endings), f"a name that ends in {', '.join(endings)}"),
             (
                 not is_outside and "\\" not in example and "\0" not in example,

@@ -60,16 +60,16 @@ class Job:
 
 
 def find_jobs(
-    given: Sequence[str],
+    arguments: Sequence[str],
     out: Path,
     options: BatchOptions,
-    own: Collection[str] = (),
+    results: Collection[str] = (),
     unreadable: list[SceneError] | None = None,
 ) -> list[Job]:
     """List all scenes, each once, and where their results go in the output folder.
 
-    ``given`` are folders, which are searched except for ``out``; patterns; ``.ply`` files; text files with one of
-    these per line. ``own`` has the real paths of former results, which are no scenes. ``unreadable`` receives the
+    ``arguments`` are folders, which are searched except for ``out``; patterns; ``.ply`` files; text files with one of
+    these per line. ``results`` are the real paths of former results, which are no scenes. ``unreadable`` receives the
     errors of folders inside the given ones that cannot be read. SceneError if something does not exist, has no scene
     or, without ``unreadable``, cannot be read; UsageError if two scenes would be written to one file, or one over
     another.
@@ -77,10 +77,10 @@ def find_jobs(
     jobs: list[Job] = []
     owners: dict[str, str] = {}
     inputs: set[str] = set()
-    for scene in find_scenes(given, out, unreadable):
+    for scene in find_scenes(arguments, out, unreadable):
         ply = main_file(scene)
         real = os.path.realpath(ply)
-        if real in inputs or real in own:
+        if real in inputs or real in results:
             continue
         inputs.add(real)
         job = Job(len(jobs), str(scene), output_name(options, scene, len(jobs)), *header_counts(ply))
@@ -115,8 +115,9 @@ def output_name(options: BatchOptions, scene: Path, index: int) -> str:
     """Return the name of a scene's result in the output folder."""
     whole = Path(os.path.abspath(scene))
     stem = stem_of(whole).removesuffix(".compressed")  # which is the scene's format, not its result's
-    own = options.settings.decode
-    values = {"stem": stem, "parent": whole.parent.name, "index": index, "k": own.k if own.k != AUTO else own.max_k}
+    decode = options.settings.decode
+    k = decode.k if decode.k != AUTO else decode.max_k
+    values = {"stem": stem, "parent": whole.parent.name, "index": index, "k": k}
     try:
         return os.path.normpath(options.output.format(**values))
     except ValueError as error:  # a format that fits numbers only
@@ -124,7 +125,7 @@ def output_name(options: BatchOptions, scene: Path, index: int) -> str:
 
 
 def find_scenes(
-    given: Sequence[str],
+    arguments: Sequence[str],
     out: Path,
     unreadable: list[SceneError] | None = None,
 ) -> Iterator[Path]:
@@ -135,7 +136,7 @@ def find_scenes(
     many folders without one, UsageError if it is the output folder.
     """
     skip = os.path.realpath(out)
-    for argument in given:
+    for argument in arguments:
         path, search = Path(argument), _Search(skip)
         if path.is_dir():
             if os.path.realpath(path) == skip:
@@ -207,7 +208,7 @@ class _Search:
                 with os.scandir(folder) as opened:
                     entries = {entry.name: entry for entry in opened}
             except OSError as error:
-                if str(folder) not in {known.path for known in self.unreadable}:
+                if str(folder) not in {failure.path for failure in self.unreadable}:
                     self.unreadable.append(SceneError(folder, f"cannot be read ({error.strerror})"))
                 continue
             names = sorted(name for name in entries if not name.startswith("."))
@@ -249,13 +250,13 @@ def _expand(pattern: str, search: _Search) -> Iterator[str]:
         yield from glob.iglob(pattern)
         return
     at = parts.index("**")
-    rest = parts[at + 1 :]
-    own = _Search(search.skip, search.unreadable)
+    tail = parts[at + 1 :]
+    inner = _Search(search.skip, search.unreadable)
     for base in glob.iglob(os.path.join(*parts[:at])) if at else (os.curdir,):
-        for folder, _, _ in own.folders(Path(base)):
-            names = [] if rest else [str(folder)]
-            names += _expand(os.path.join(glob.escape(str(folder)), *(rest or ("*",))), search)
-            own.num_empty = max(0, own.num_empty - FOLDERS_PER_SCENE * len(names))
+        for folder, _, _ in inner.folders(Path(base)):
+            names = [] if tail else [str(folder)]
+            names += _expand(os.path.join(glob.escape(str(folder)), *(tail or ("*",))), search)
+            inner.num_empty = max(0, inner.num_empty - FOLDERS_PER_SCENE * len(names))
             yield from names
 
 

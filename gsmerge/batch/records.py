@@ -71,7 +71,7 @@ class RecordIndex:
 
     def result_paths(self) -> set[str]:
         """Return the real paths of all results."""
-        names = [name for known in self.known.values() for name, _ in known.files]
+        names = [name for result in self.known.values() for name, _ in result.files]
         return {os.path.realpath(self.folder / name) for name in names}
 
 

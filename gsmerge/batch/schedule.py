@@ -79,12 +79,12 @@ def estimate_seconds(jobs: Sequence[Job], options: BatchOptions, schedule: Sched
             files = find_scene_files(Path(job.scene))
             cameras = None if files.cameras is None else cameras_of(files.cameras, files.ply.stem)
             views = max(1, len(cameras or ()))
-        own = options.settings if job.work is None else job.work.settings
+        settings = options.settings if job.work is None else job.work.settings
         size = SceneSize(job.num_gaussians, views, 1, -(-job.num_gaussians // views), aligned=True, photos=True)
         with suppress(UsageError):  # the run says so
-            whole = plan_whole(size, own)
+            whole = plan_whole(size, settings)
             seconds = work_seconds(
-                job.num_gaussians, size.width, whole.settings(own), photos=True, fit_steps=whole.fit.steps
+                job.num_gaussians, size.width, whole.settings(settings), photos=True, fit_steps=whole.fit.steps
             )
             total += seconds / min(schedule.threads, views)
     return IMPORT_SECONDS * bool(jobs) + total / max(1, min(schedule.jobs, len(jobs)))

@@ -78,8 +78,8 @@ def run_task(task: Task, context: BatchContext, new_records: RecordIndex) -> dic
             outcome = _process(task, context, new_records, begun)
         except Exception as error:  # a bad scene must not end the batch
             outcome = record(FAILED, job.scene, job.output, error=error_line(error), attempt=task.attempt)
-        known = new_records.known.get(job.output, task.known)
-        if outcome["status"] != SKIPPED or (known is not None and known.failed_since):
+        done = new_records.known.get(job.output, task.known)
+        if outcome["status"] != SKIPPED or (done is not None and done.failed_since):
             append_line(context.folder / RECORDS, outcome)
         begun.unlink(missing_ok=True)
         return outcome
@@ -115,13 +115,13 @@ def _process(task: Task, context: BatchContext, new_records: RecordIndex, begun:
     files = _files_of(job, options)
     key = _key_of(job, files, options)
     before, since = task.known, new_records.known.get(job.output)
-    for known in (since, None if options.rerun else before):
-        if known is not None and known.holds(context.folder, key):
-            files_of = _describe(context.folder, known.files)
-            return record(SKIPPED, job.scene, job.output, key=key, files=files_of, worse=known.worse)
-    own = {name for known in (before, since) if known is not None for name, _ in known.files}
+    for done in (since, None if options.rerun else before):
+        if done is not None and done.holds(context.folder, key):
+            files_of = _describe(context.folder, done.files)
+            return record(SKIPPED, job.scene, job.output, key=key, files=files_of, worse=done.worse)
+    result_files = {name for done in (before, since) if done is not None for name, _ in done.files}
     names = [name for name in result_names(job.output, options) if os.path.lexists(context.folder / name)]
-    foreign = [] if begun.exists() else [name for name in names if name not in own]
+    foreign = [] if begun.exists() else [name for name in names if name not in result_files]
     if foreign and not options.overwrite:
         problem = "exists already, and no batch wrote it; pass --overwrite to replace it"
         raise UsageError(f"{context.folder / foreign[0]}: {problem}")
@@ -175,10 +175,10 @@ def scene_key(files: SceneFiles, options: BatchOptions) -> str:
     return digest({**content, "tool_version": __version__, "schema_version": SCHEMA_VERSION})
 
 
-def is_done(job: Job, known: DoneResult, context: BatchContext) -> bool:
+def is_done(job: Job, done: DoneResult, context: BatchContext) -> bool:
     """Return whether a result would be skipped."""
     try:
-        return known.holds(context.folder, _key_of(job, _files_of(job, context.options), context.options))
+        return done.holds(context.folder, _key_of(job, _files_of(job, context.options), context.options))
     except SceneError:
         return False
 
@@ -232,10 +232,10 @@ def run_lock(folder: Path, name: str) -> Iterator[None]:
 
     UsageError if a run of another name uses the folder, SceneError if the lock cannot be made.
     """
-    own = f"{PREFIX}{name[:32]}.{secrets.token_hex(4)}.{os.getpid()}.{socket.gethostname()}.run"
-    with _lock(folder / own, RUN_TIMEOUT):  # before others are looked for: of two, one sees the other
+    lock_name = f"{PREFIX}{name[:32]}.{secrets.token_hex(4)}.{os.getpid()}.{socket.gethostname()}.run"
+    with _lock(folder / lock_name, RUN_TIMEOUT):  # before others are looked for: of two, one sees the other
         for path in folder.glob(f"{PREFIX}*.run"):
-            if path.name == own:
+            if path.name == lock_name:
                 continue
             try:
                 with _lock(path):  # which removes what a killed run left

@@ -119,7 +119,7 @@ def _usage_message(error: Any) -> str:
     place = PROGRAM if error.ctx is None else error.ctx.command_path
     message = error.format_message().replace("Value error, ", "", 1).rstrip(".")  # a prefix of checks inside Typer
     parameters = [] if error.ctx is None else error.ctx.command.params
-    has_output = any(one.name == "output" for one in parameters)
+    has_output = any(parameter.name == "output" for parameter in parameters)
     if hasattr(error, "option_name"):
         message = _suggest(error.option_name, parameters) or message
     elif message.startswith("Got unexpected extra argument") and has_output:
@@ -145,11 +145,11 @@ def _suggest(option: str, parameters: Sequence[Any]) -> str | None:
         return None
     from gsmerge.cli.paths import FileOptions
 
-    known = flat_settings(CompactOptions) | flat_settings(FileOptions)
+    settings = flat_settings(CompactOptions) | flat_settings(FileOptions)
     positive = name.removeprefix("no_")
-    if positive not in known:
+    if positive not in settings:
         return None
-    default = known[positive].default
+    default = settings[positive].default
     value = str(not default).lower() if isinstance(default, bool) else "VALUE"
     return f"{option} is no option: use --set {positive}={value}"
 
@@ -198,19 +198,19 @@ def _orderly_stop(signals: list[signal.Signals]) -> Iterator[None]:
 
 def run(args: Sequence[str] | None = None) -> int:
     """Run the application; every error becomes one line on stderr and an exit code."""
-    given = list(sys.argv[1:] if args is None else args)
-    words = [word for word in given if word != DEBUG]
+    arguments = list(sys.argv[1:] if args is None else args)
+    words = [word for word in arguments if word != DEBUG]
 
     def fail(message: str, code: int) -> int:
         cause = getattr(sys.exc_info()[1], "__cause__", None)
         if code < 128 and (signals or isinstance(cause, KeyboardInterrupt)):
             return stopped()  # libraries make errors of their own of it
-        if DEBUG in given:
+        if DEBUG in arguments:
             traceback.print_exc()
         say(f"{PROGRAM}: error: {message}")
         return code
 
-    known = bool(words) and (words[0] in OWN_COMMANDS or words[0] in find_plugins(PLUGINS))
+    is_command = bool(words) and (words[0] in OWN_COMMANDS or words[0] in find_plugins(PLUGINS))
     signals: list[signal.Signals] = []
 
     def stopped() -> int:
@@ -223,7 +223,7 @@ def run(args: Sequence[str] | None = None) -> int:
             except OSError as error:  # libraries fail in ways of their own without a folder
                 reason = f"the working directory cannot be used ({error.strerror})"
                 raise SceneError(os.curdir, reason, "change it") from error
-            app = make_app(words[0] if known else None)
+            app = make_app(words[0] if is_command else None)
             code = app(args=words, prog_name=PROGRAM, standalone_mode=False) or 0
             with suppress(BrokenPipeError):  # whoever read our output has seen enough
                 sys.stdout.flush()

@@ -191,8 +191,8 @@ def pending_jobs(jobs: Sequence[Job], out: Path, options: BatchOptions, index: R
     from gsmerge.batch.task import BatchContext, is_done
 
     shared = BatchContext(out, options, 0)
-    known = {} if options.rerun else index.known
-    return [job for job in jobs if job.output not in known or not is_done(job, known[job.output], shared)]
+    done = {} if options.rerun else index.known
+    return [job for job in jobs if job.output not in done or not is_done(job, done[job.output], shared)]
 
 
 def print_plan(

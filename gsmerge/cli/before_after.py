@@ -97,7 +97,7 @@ def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras]
     from gsmerge.io.cameras.json_files import viewer_cameras_path
     from gsmerge.io.cameras.read import read_cameras
 
-    own: dict[str, Cameras] = {}
+    cameras: dict[str, Cameras] = {}
     notes, start = list[str](), scene.cameras.viewmats
     for name, path in zip(file_names(paths), paths, strict=True):
         holder, read = path if holds_cameras(path) else viewer_cameras_path(path), None
@@ -106,10 +106,10 @@ def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras]
                 read = read_cameras(holder)
         if read is None or read.names != scene.names or np.allclose(read.viewmats, start, rtol=SAME, atol=SAME):
             continue
-        own[name] = replace(scene.cameras, viewmats=read.viewmats)
+        cameras[name] = replace(scene.cameras, viewmats=read.viewmats)
         moves = describe_moves(list_moves(scene.names, start, read.viewmats, scene_depth(scene)))
         notes.append(f"{name}: its input views are seen from the cameras in {holder.name}, moved by {moves}")
-    return own, notes
+    return cameras, notes
 
 
 def require_views(load: Loaded) -> None:

@@ -21,16 +21,16 @@ def check(args: opt.Args) -> None:
     from gsmerge.report import document_head
 
     checks = [check_content(path) for path in args.paths]
-    wrong = [one for one in checks if one.problems]
-    notes = [f"{one.path}: {note}" for one in checks for note in one.notes]
+    wrong = [result for result in checks if result.problems]
+    notes = [f"{result.path}: {note}" for result in checks for note in result.notes]
     say_notes(notes, quiet=args.silent)
     document = {
         **document_head(),
-        "files": [asdict(one) for one in checks],
+        "files": [asdict(result) for result in checks],
         "num_wrong": len(wrong),
         "notes": notes,
     }
-    print_document(document, [one.line for one in checks], as_json=args.json, quiet=args.quiet)
+    print_document(document, [result.line for result in checks], as_json=args.json, quiet=args.quiet)
     if wrong:
         problem = "; ".join(wrong[0].problems)
         more = f"wrong files: {len(wrong)} of {len(checks)}" if len(checks) > 1 else ""

@@ -137,7 +137,7 @@ def _warn_of_memory(files: SceneFiles, settings: CompactOptions, *, quiet: bool)
     from gsmerge.plan import wanted_blocks
     from gsmerge.runtime.estimate import memory_bytes, memory_problem
 
-    counts = [header_counts(ply) for one in (files, *files.more) for ply in one.plys]
+    counts = [header_counts(ply) for scene_files in (files, *files.more) for ply in scene_files.plys]
     count, num_rest = sum(count for count, _ in counts), max(rest for _, rest in counts)
     at_once = gaussians_at_once(count, wanted_blocks(settings, count))
     needed = memory_bytes(at_once, photos=True, num_rest=num_rest, num_elsewhere=count - at_once)
@@ -156,14 +156,14 @@ def print_plan(args: opt.Args, files: SceneFiles, settings: CompactOptions, out:
     from gsmerge.report import document_head
     from gsmerge.runtime.record import record_run
 
-    given = read_input(files, opacity=args.opacity, hints=hints)
-    scene = given.scene
+    load = read_input(files, opacity=args.opacity, hints=hints)
+    scene = load.scene
     paths = {name: path and str(path) for name, path in vars(files).items() if name != "more"}
     check_saved_cameras(scene, vars(args).get("save_cameras"), embed=bool(vars(args).get("embed_cameras")))
     _, unused = check_method(settings, scene)
     backend, problem = choose_backend(settings.device, scene.num_gaussians)
     settings = replace(settings, device=backend.device)
-    notes = [*given.notes, *unused, *([] if problem is None else [problem])]
+    notes = [*load.notes, *unused, *([] if problem is None else [problem])]
     if os.path.lexists(out) and not args.overwrite:
         notes.append(f"{out} exists already: --overwrite would replace it")
     with opt.usage_errors(), record_run() as record:
@@ -174,7 +174,7 @@ def print_plan(args: opt.Args, files: SceneFiles, settings: CompactOptions, out:
     document = {
         **document_head(),
         "dry_run": True,
-        "input": {**paths, "num_gaussians": scene.num_gaussians, **given.recognised},
+        "input": {**paths, "num_gaussians": scene.num_gaussians, **load.recognised},
         "output": {"path": str(out)},
         "compact": run,
         "options": settings.to_dict(),

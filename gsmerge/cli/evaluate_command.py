@@ -97,37 +97,37 @@ def evaluate(args: opt.Args) -> None:
             nets, args.lpips_views, args.context, threads=args.threads, antialiased=args.antialiased,
             **args.given(("photo_side", "zoom", "align")),
         )  # fmt: skip
-    given = read_before_after(args, files)
-    notes = [*given.notes, *missing]
-    if len(given.scene) < len(given.load.scene):
-        notes += [_more_views(name, ply, given.scene.cameras) for name, ply in given.plys.items()]
+    pair = read_before_after(args, files)
+    notes = [*pair.notes, *missing]
+    if len(pair.scene) < len(pair.load.scene):
+        notes += [_more_views(name, ply, pair.scene.cameras) for name, ply in pair.plys.items()]
     say_notes(notes, quiet=args.silent)
     with stage_progress(quiet=args.silent) as progress:
         evaluation = evaluate_scene(
-            given.scene, given.gaussians, given.held_out, options, cameras=given.cameras, progress=progress
+            pair.scene, pair.gaussians, pair.held_out, options, cameras=pair.cameras, progress=progress
         )
-        facts = _facts(args, given, dict(zip(given.plys, seconds, strict=False)))
+        facts = _facts(args, pair, dict(zip(pair.plys, seconds, strict=False)))
     document = evaluation_document(evaluation, facts, notes)
-    _write(outputs, document, given, overwrite=args.overwrite)
+    _write(outputs, document, pair, overwrite=args.overwrite)
     print_document(document, evaluation_lines(document), as_json=args.json, quiet=args.quiet)
     say_notes(evaluation.notes, quiet=args.silent)
 
 
-def _facts(args: opt.Args, given: BeforeAfter, seconds: Mapping[str, float]) -> dict[str, dict[str, Any]]:
+def _facts(args: opt.Args, pair: BeforeAfter, seconds: Mapping[str, float]) -> dict[str, dict[str, Any]]:
     """Collect the facts of each file by name, with the costs of drawing it where they are asked for."""
     from gsmerge.measure.evaluate import INPUT, near_plane
     from gsmerge.measure.sizes import shrink_cameras
     from gsmerge.measure.speed import measure_costs
 
-    infos = {INPUT: given.load.info, **{name: ply.info for name, ply in given.plys.items()}}
+    infos = {INPUT: pair.load.info, **{name: ply.info for name, ply in pair.plys.items()}}
     facts: dict[str, dict[str, Any]] = {
         name: {"path": info.path, "bytes": info.file_bytes, "bytes_by_attribute": info.bytes_by_attribute}
         for name, info in infos.items()
     }
     if args.speed or args.merge_seconds:
-        scenes = {INPUT: given.scene.file_gaussians, **given.gaussians}
-        cameras = shrink_cameras(given.scene.cameras, args.photo_side or 0)
-        zooms, near = args.zoom or SPEED_ZOOMS, near_plane(given.scene)
+        scenes = {INPUT: pair.scene.file_gaussians, **pair.gaussians}
+        cameras = shrink_cameras(pair.scene.cameras, args.photo_side or 0)
+        zooms, near = args.zoom or SPEED_ZOOMS, near_plane(pair.scene)
         costs = measure_costs(scenes, cameras, zooms, near, merge_seconds=seconds, threads=args.threads)
         facts = {name: facts[name] | costs[name] for name in facts}
     return facts
@@ -159,7 +159,7 @@ def _more_views(name: str, ply: GaussianFile, cameras: Cameras) -> str:
     return f"{name}: measured as a result of {views} views; if it was made of more, it has seen what it is asked here"
 
 
-def _write(outputs: Sequence[Path], document: Mapping[str, Any], given: BeforeAfter, *, overwrite: bool) -> None:
+def _write(outputs: Sequence[Path], document: Mapping[str, Any], pair: BeforeAfter, *, overwrite: bool) -> None:
     """Write the files, each in the format of its ending."""
     from gsmerge.measure.scores import evaluation_csv, evaluation_markdown
     from gsmerge.report import to_json
@@ -171,8 +171,8 @@ def _write(outputs: Sequence[Path], document: Mapping[str, Any], given: BeforeAf
         from gsmerge.measure.preview import view_pictures
         from gsmerge.view.page import report_page
 
-        scene = given.scene
-        parts, near = [("before", scene.file_gaussians), *given.gaussians.items()], near_plane(scene)
+        scene = pair.scene
+        parts, near = [("before", scene.file_gaussians), *pair.gaussians.items()], near_plane(scene)
         pictures = view_pictures(parts, scene.cameras, scene.images, max_views=PAGE_VIEWS, near=near)
         texts |= {path: report_page(document, pictures) for path in outputs if path not in texts}
     write_texts(texts, overwrite=overwrite)

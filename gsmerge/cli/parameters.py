@@ -42,8 +42,8 @@ REQUIRED = Parameter.empty
 SETTINGS_PAGE = "docs/reference/settings.md"
 
 SETTINGS = {
-    one.name: one for kind in (EvaluateOptions, Engine, OnlineOptions, CompactOptions)
-    for one in flat_settings(kind).values()
+    setting.name: setting for kind in (EvaluateOptions, Engine, OnlineOptions, CompactOptions)
+    for setting in flat_settings(kind).values()
 }  # fmt: skip
 
 
@@ -65,21 +65,21 @@ class Args(SimpleNamespace):
         wrong.
         """
         values = self.values(*kinds, but=changes) | changes
-        own = [{name: values[name] for name in flat_settings(kind) if name in values} for kind in kinds]
+        settings = [{name: values[name] for name in flat_settings(kind) if name in values} for kind in kinds]
         with usage_errors():
             return [
-                kind().with_settings(some) if hasattr(kind, "with_settings") else kind(**some)
-                for kind, some in zip(kinds, own, strict=True)
+                kind().with_settings(arguments) if hasattr(kind, "with_settings") else kind(**arguments)
+                for kind, arguments in zip(kinds, settings, strict=True)
             ]
 
     def values(self, *kinds: type, but: Collection[str] = ()) -> dict[str, Any]:
         """Collect the settings of these kinds that were given, by flat name, without the names in ``but``."""
-        known = {name: one for kind in kinds for name, one in flat_settings(kind).items() if name not in but}
-        own = self.given(known)
-        chosen = parse_pairs("--set", vars(self).get("set") or (), known)
-        for name in own.keys() & chosen.keys():
+        settings = {name: setting for kind in kinds for name, setting in flat_settings(kind).items() if name not in but}
+        options = self.given(settings)
+        chosen = parse_pairs("--set", vars(self).get("set") or (), settings)
+        for name in options.keys() & chosen.keys():
             raise UsageError(f"--set {name}: expected it once, got --{name.replace('_', '-')} too")
-        return own | chosen
+        return options | chosen
 
     def settings(self, **changes: Any) -> CompactOptions:
         """Make the library's options, as :meth:`make` does."""
@@ -112,7 +112,7 @@ class Args(SimpleNamespace):
         from gsmerge.scene.files import find_scene_files
 
         places = {"cameras": self.cameras, **{name: vars(self).get(name) for name in ("images", "masks")}}
-        first, *others = (find_scene_files(one, **places) for one in (scene, *more))
+        first, *others = (find_scene_files(path, **places) for path in (scene, *more))
         return replace(first, more=tuple(others))
 
     def load(self, files: SceneFiles, **defaults: Any) -> Loaded:
@@ -122,7 +122,7 @@ class Args(SimpleNamespace):
         return load_files(files, opacity=self.opacity, hints=self.hints(**defaults))
 
 
-def parse_pairs(flag: str, pairs: Iterable[str], known: Mapping[str, Setting]) -> dict[str, Any]:
+def parse_pairs(flag: str, pairs: Iterable[str], settings: Mapping[str, Setting]) -> dict[str, Any]:
     """Parse the NAME=VALUE of ``--set`` or ``--hint``, as JSON where that fits; UsageError if one is wrong."""
     values: dict[str, Any] = {}
     for pair in pairs:
@@ -130,17 +130,17 @@ def parse_pairs(flag: str, pairs: Iterable[str], known: Mapping[str, Setting]) -
         name = name.strip().replace("-", "_")
         if not sign:
             raise UsageError(f"{flag}: expected NAME=VALUE, got {pair!r}")
-        if name not in known:
-            near = get_close_matches(name, known, 1, 0)[0]
+        if name not in settings:
+            near = get_close_matches(name, settings, 1, 0)[0]
             raise UsageError(f"{flag} {name}: unknown, the closest name is {near}; {SETTINGS_PAGE} lists all")
         if name in values:
             raise UsageError(f"{flag} {name}: expected it once, got it twice")
         readings: list[Any] = [text]
         with suppress(ValueError, RecursionError):
             readings.insert(0, json.loads(text))
-        fitting = [value for value in readings if known[name].fits(value)]
+        fitting = [value for value in readings if settings[name].fits(value)]
         if not fitting:
-            raise UsageError(f"{flag} {name}: expected {known[name].expected(readings[0], null=True)}, got {text!r}")
+            raise UsageError(f"{flag} {name}: expected {settings[name].expected(readings[0], null=True)}, got {text!r}")
         values[name] = fitting[0]
     return values
 
@@ -225,9 +225,9 @@ def _escape(help: str) -> str:
 def command(*parameters: str | Parameter, rare: str = "") -> Callable[[Callable[[Args], None]], Callable[..., None]]:
     """Give a command its parameters in the order of help; ``rare`` names are shown by ``--help-all`` alone."""
     listed: dict[str, Parameter] = {}
-    for given in (*parameters, "json quiet", *(["help_all"] if rare else [])):
-        for name in given.split() if isinstance(given, str) else [given.name]:
-            listed.setdefault(name, OPTIONS[name] if isinstance(given, str) else given)
+    for parameter in (*parameters, "json quiet", *(["help_all"] if rare else [])):
+        for name in parameter.split() if isinstance(parameter, str) else [parameter.name]:
+            listed.setdefault(name, OPTIONS[name] if isinstance(parameter, str) else parameter)
     for name in rare.split():
         listed[name] = _change(listed[name], hidden=True)
 

@@ -79,13 +79,13 @@ def check_outputs(
     """
     from gsmerge.io.cameras.read import find_cameras
 
-    given = [path for path in inputs if path is not None]
-    inside = [cameras for path in given if path.is_dir() and (cameras := find_cameras(path)) is not None]
-    known, seen = {os.path.realpath(path) for path in (*given, *inside)}, set[str]()
+    paths = [path for path in inputs if path is not None]
+    inside = [cameras for path in paths if path.is_dir() and (cameras := find_cameras(path)) is not None]
+    input_paths, seen = {os.path.realpath(path) for path in (*paths, *inside)}, set[str]()
     for output in outputs:
         if output is None:
             continue
-        _check_output(output, known, overwrite=overwrite, made=made)
+        _check_output(output, input_paths, overwrite=overwrite, made=made)
         if os.path.realpath(output) in seen:
             raise UsageError(f"{output}: expected a file of its own for each output, got it twice")
         seen.add(os.path.realpath(output))
@@ -126,8 +126,8 @@ def is_camera_file(path: Path) -> bool:
 
 def input_files(files: SceneFiles) -> tuple[Path, ...]:
     """List the files of Gaussians, cameras and photos that are read."""
-    own = tuple(path for path in (*files.plys, files.cameras, files.images, files.masks) if path is not None)
-    return (*own, *(path for one in files.more for path in input_files(one)))
+    paths = tuple(path for path in (*files.plys, files.cameras, files.images, files.masks) if path is not None)
+    return (*paths, *(path for scene_files in files.more for path in input_files(scene_files)))
 
 
 def checkpoint_files(checkpoint: str) -> tuple[Path, ...]:

@@ -67,10 +67,10 @@ def render(args: opt.Args) -> None:
     else:
         check_folder(args.output, inputs, overwrite=overwrite)
     hints = args.hints(max_side=MAX_SIDE) if kind == "views" else args.hints()
-    given = args.given(("views", "path", "frames", "fps", "background", "antialiased"))
+    arguments = args.given(("views", "path", "frames", "fps", "background", "antialiased"))
     drawing = drawings.PLANS[kind](
         drawings.DrawOptions(
-            files, args.scenes, like, args.output, args.opacity, hints, segmentation=segmentation, **given
+            files, args.scenes, like, args.output, args.opacity, hints, segmentation=segmentation, **arguments
         )
     )
     document = drawings.drawing_document(drawing, args.output, dry_run=args.dry_run)

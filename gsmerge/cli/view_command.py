@@ -38,29 +38,29 @@ def view(args: opt.Args) -> None:
     check_outputs((output,), inputs, overwrite=args.overwrite or args.dry_run)
     if output.suffix.lower() not in (".html", ".htm"):
         raise UsageError(f"{output}: expected a name that ends in .html")
-    given = read_before_after(args, files, alone=not after)
-    if given.scene.images is not None:
-        count_for(segmentation, *given.scene.images.shape[1:3])  # refuses more than pixels, before anything is measured
-    say_notes(given.notes, quiet=args.silent)
-    document = {**document_head(), "output": str(output), "dry_run": args.dry_run, "notes": given.notes}
+    pair = read_before_after(args, files, alone=not after)
+    if pair.scene.images is not None:
+        count_for(segmentation, *pair.scene.images.shape[1:3])  # refuses more than pixels, before anything is measured
+    say_notes(pair.notes, quiet=args.silent)
+    document = {**document_head(), "output": str(output), "dry_run": args.dry_run, "notes": pair.notes}
     if args.dry_run:
         print_document(document, f"would write {output}", as_json=args.json)
         return
     from gsmerge.view.data import collect
     from gsmerge.view.page import headline, view_page
 
-    sizes = [given.load.info.file_bytes, *(ply.info.file_bytes for ply in given.plys.values())]
+    sizes = [pair.load.info.file_bytes, *(ply.info.file_bytes for ply in pair.plys.values())]
     with stage_progress(quiet=args.silent) as progress:
         title = files.ply.parent.absolute().name if files.ply.stem == "scene" else files.ply.stem
         data = collect(
-            title, given.scene, given.gaussians, sizes, given.held_out, cameras=given.cameras,
+            title, pair.scene, pair.gaussians, sizes, pair.held_out, cameras=pair.cameras,
             segmentation=segmentation, threads=args.threads, progress=progress,
         )  # fmt: skip
     page = view_page(data)
     write_texts({output: page}, overwrite=args.overwrite)
     say_notes(data.notes, quiet=args.silent)
     said = headline(*data.sides[:2])
-    document |= {"bytes": len(page), "headline": said, "notes": [*given.notes, *data.notes]}
+    document |= {"bytes": len(page), "headline": said, "notes": [*pair.notes, *data.notes]}
     print_document(document, f"{output}: {said}", as_json=args.json, quiet=args.quiet)
     if args.open and not _open(output):
         say(f"open {output.absolute().as_uri()} in a browser", quiet=args.silent)

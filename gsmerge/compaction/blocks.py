@@ -51,31 +51,31 @@ MOST_DENSITY = 2.0  # times the superpixels of one piece, where a scene's views 
 SURPLUS = 1.03  # times an exact number of Gaussians: the faintest of what is too many are left out
 
 
-def compact_in_blocks(given: Scene, options: CompactOptions, whole: WholePlan) -> CompactResult:
+def compact_in_blocks(scene: Scene, options: CompactOptions, whole: WholePlan) -> CompactResult:
     """Compact an aligned scene in blocks of views, as many as its plan says.
 
     The views of each block are merged first, and of the Gaussians those are kept that belong to it, so that all blocks
     together have one set of Gaussians to start with. Then each block fits what its views see, its neighbours'
     Gaussians included, and keeps its own: where two blocks meet, both fit the same Gaussians to the same photos.
     """
-    device, given = given.gaussians.device, given.numpy()
+    device, scene = scene.gaussians.device, scene.numpy()
     count, most = whole.blocks, whole.limits.count
     with stage("partition"):
-        covisibility = measure_covisibility(given)
+        covisibility = measure_covisibility(scene)
         blocks = partition_views(covisibility.weights, count)
         factors = count_factors(blocks, covisibility).tolist()
-        frame, options = scene_frame(given), with_whole_choices(options, whole)
-    size = gaussians_at_once(given.num_gaussians, count)
-    memory = memory_bytes(size, photos=given.images is not None, num_rest=3 * given.gaussians.shN.shape[1])
+        frame, options = scene_frame(scene), with_whole_choices(options, whole)
+    size = gaussians_at_once(scene.num_gaussians, count)
+    memory = memory_bytes(size, photos=scene.images is not None, num_rest=3 * scene.gaussians.shN.shape[1])
     engine = options.blocks.engine
     with start_work(engine.name, engine.address, threads=options.threads, memory=memory) as work:
         seen = work.share(covisibility)
 
         def pieces() -> Iterator[tuple[Any, ...]]:
             for block, factor in zip(blocks, factors, strict=True):
-                free_scene(given)
-                own = block_options(options, given, block, factor, most)
-                yield subset(given, block.views), block, seen, own, frame
+                free_scene(scene)
+                piece_options = block_options(options, scene, block, factor, most)
+                yield subset(scene, block.views), block, seen, piece_options, frame
 
         parts = [part for part, _ in adopt_records(work.run("merge", start_part, count, pieces()))]
         with stage("join"):
@@ -101,7 +101,7 @@ def compact_in_blocks(given: Scene, options: CompactOptions, whole: WholePlan) -
         for part, (_, choices), score in zip(parts, fitted, scores, strict=True)
     ]  # fmt: skip
     choose(blocks=facts)
-    return CompactResult(result, join_reports(given, result, parts, scores, options), given.cameras).to(device)
+    return CompactResult(result, join_reports(scene, result, parts, scores, options), scene.cameras).to(device)
 
 
 def adopt_records(outcomes: Iterable[tuple[T, Record]]) -> Iterator[tuple[T, dict[str, Any]]]:
@@ -130,10 +130,10 @@ def start_part(piece: Scene, block: Block, covisibility: Covisibility, options: 
     prepared = prepare(piece, options.prepare, frame)
     plan = make_plan(prepared, options)
     decoded = start(prepared, plan, plan.limits.count)
-    own = belongs_to_block(frame.leave(decoded.gaussians).means, block, covisibility)
-    before = measure_psnr("input", prepared.given.file_gaussians, prepared.given, prepared, plan)
-    share = own.sum() / max(1, len(own))
-    return Part(block, decoded.gaussians[own], round(share * decoded.count), without_gaussians(prepared), plan, before)
+    keep = belongs_to_block(frame.leave(decoded.gaussians).means, block, covisibility)
+    before = measure_psnr("input", prepared.input_scene.file_gaussians, prepared.input_scene, prepared, plan)
+    share = keep.sum() / max(1, len(keep))
+    return Part(block, decoded.gaussians[keep], round(share * decoded.count), without_gaussians(prepared), plan, before)
 
 
 def without_gaussians(prepared: Prepared) -> Prepared:
@@ -142,16 +142,16 @@ def without_gaussians(prepared: Prepared) -> Prepared:
     def bare(scene: Scene) -> Scene:
         return replace(scene, gaussians=scene.gaussians[np.zeros(0, int)], pixel_ids=None, missing=None)
 
-    return replace(prepared, scene=bare(prepared.scene), given=bare(prepared.given))
+    return replace(prepared, scene=bare(prepared.scene), input_scene=bare(prepared.input_scene))
 
 
-def fit_part(part: Part, everything: tuple[Gaussians, np.ndarray], own: int, growth: float) -> Gaussians:
-    """Fit the canonical Gaussians of all blocks that a block's views may see, and return those of block ``own``.
+def fit_part(part: Part, everything: tuple[Gaussians, np.ndarray], number: int, growth: float) -> Gaussians:
+    """Fit the canonical Gaussians of all blocks that a block's views may see, and return those of block ``number``.
 
     ``everything``: the Gaussians and the number of each one's block. ``growth``: of their number in the fit.
     """
     (joined, owners), scene, plan = everything, part.prepared.scene, part.plan
-    used = owners == own
+    used = owners == number
     if plan.fit.fit != "none" and scene.images is not None:
         used |= peak_weights(joined, blank_photos(scene.cameras, 2))[0] >= plan.fit.min_contribution
     rows = np.flatnonzero(used)
@@ -160,7 +160,7 @@ def fit_part(part: Part, everything: tuple[Gaussians, np.ndarray], own: int, gro
     if fitted.report is None:  # nothing was fitted, and what no photo shows is left out
         return fitted.gaussians
     assert fitted.report.origins is not None
-    return fitted.gaussians[owners[rows[fitted.report.origins]] == own]
+    return fitted.gaussians[owners[rows[fitted.report.origins]] == number]
 
 
 def score_part(part: Part, gaussians: Gaussians) -> float | None:
@@ -178,7 +178,7 @@ def fit_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[Part], seed
         return joined
     with stage("join"):
         at_seam, views = find_seams(joined, owners, parts)
-        scenes = [subset(part.prepared.scene, some) for part, some in zip(parts, views, strict=True) if some]
+        scenes = [subset(part.prepared.scene, ids) for part, ids in zip(parts, views, strict=True) if ids]
     if not scenes:
         return joined
     scene = concat_scenes(scenes)
@@ -206,9 +206,9 @@ def find_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[Part]) -> 
     total, foreign, seen = np.zeros(len(joined)), np.zeros(len(joined)), []
     splats = prepare_splats(joined)
     for number, part in enumerate(parts):
-        own = set(part.block.own)
+        own_views = set(part.block.own)
         repeated = part.prepared.repeated
-        places = sorted({repeated[place] for place, view in enumerate(part.block.views) if view in own})
+        places = sorted({repeated[place] for place, view in enumerate(part.block.views) if view in own_views})
         photos = blank_photos(part.prepared.scene.cameras[places], 2)
 
         def weights_of(view: int, photos: Photos = photos) -> np.ndarray:
@@ -243,7 +243,7 @@ def with_whole_choices(options: CompactOptions, whole: WholePlan) -> CompactOpti
 
 
 def block_options(
-    options: CompactOptions, given: Scene, block: Block, factor: float, most: int | None
+    options: CompactOptions, scene: Scene, block: Block, factor: float, most: int | None
 ) -> CompactOptions:
     """Return the options of a block: cameras and exposures stay, and ``factor`` times its share of the Gaussians.
 
@@ -252,12 +252,12 @@ def block_options(
     ``superpixels`` and K give.
     """
     settings: dict[str, Any] = {"poses": "fixed", "exposure": "fixed", "blocks": "none", "budget": None}
-    settings["fit_steps"] = max(1, round(options.fit.steps * len(block.views) / len(given)))
+    settings["fit_steps"] = max(1, round(options.fit.steps * len(block.views) / len(scene)))
     if replace(options.fit, fit_steps=settings["fit_steps"]).half_res_part != options.fit.half_res_part:
         settings["half_res_share"] = options.fit.half_res_part
     superpixels = options.segment.superpixels
     if most is not None:
-        settings["budget"] = max(1, round(SURPLUS * factor * most * len(block.views) / len(given)))
+        settings["budget"] = max(1, round(SURPLUS * factor * most * len(block.views) / len(scene)))
     elif isinstance(superpixels, str) and superpixels.endswith("%"):
         share = min(1.0, min(factor, MOST_DENSITY) * parse_share(superpixels))
         settings["superpixels"] = share_text(round(share, 6))
@@ -278,21 +278,21 @@ def belongs_to_block(means: np.ndarray, block: Block, covisibility: Covisibility
 
 
 def join_reports(
-    given: Scene, gaussians: Gaussians, parts: Sequence[Part], scores: Sequence[float | None], options: CompactOptions
+    scene: Scene, gaussians: Gaussians, parts: Sequence[Part], scores: Sequence[float | None], options: CompactOptions
 ) -> CompactReport:
     """Report the whole: PSNR of the blocks weighted by their views, seconds added up, notes of all."""
     run, sizes = current_record(), [len(part.block.own) for part in parts]
 
     def mean(values: Sequence[float | None]) -> float | None:
-        known = [value for value in values if value is not None]
-        return None if len(known) < len(values) else float(np.average(known, weights=sizes))
+        numbers = [value for value in values if value is not None]
+        return None if len(numbers) < len(values) else float(np.average(numbers, weights=sizes))
 
     scored = sum(len(part.plan.scored_views) for part, score in zip(parts, scores, strict=True) if score is not None)
     before, after = mean([part.psnr_before for part in parts]), mean(scores)
     worse = describe_loss("the result", before, after)
     notes = list(dict.fromkeys(run.notes))
     return CompactReport(
-        num_input=given.num_gaussians, num_output=len(gaussians), seconds=dict(run.seconds), psnr_before=before,
+        num_input=scene.num_gaussians, num_output=len(gaussians), seconds=dict(run.seconds), psnr_before=before,
         psnr_after=after, choices=run.choices | {"scored_views": scored},
         notes=notes if worse is None else [*notes, worse], options=options.to_dict(),
         peak_memory_bytes=peak_memory(), worse=worse,

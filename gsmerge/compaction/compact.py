@@ -41,24 +41,24 @@ def compact(
     """
     options = (options or CompactOptions()).with_settings(settings)
     with use_threads(options.threads), record_run(progress):
-        given = as_scene(scene)
-        size = measure_size(given.numpy())
+        scene = as_scene(scene)
+        size = measure_size(scene.numpy())
         whole = plan_whole(size, options)  # what needs no work to decide
         note_engine(size, options, whole.blocks)
-        return compact_in_blocks(given, options, whole) if whole.blocks > 1 else compact_piece(given, options)
+        return compact_in_blocks(scene, options, whole) if whole.blocks > 1 else compact_piece(scene, options)
 
 
-def compact_piece(given: Scene, options: CompactOptions) -> CompactResult:
+def compact_piece(scene: Scene, options: CompactOptions) -> CompactResult:
     """Compact a scene as a whole."""
-    method = choose_method(options, given, build)  # ours, or a baseline
-    prepared = prepare(given.numpy(), options.prepare)  # facts: frame, photos, poses, unseen
+    method = choose_method(options, scene, build)  # ours, or a baseline
+    prepared = prepare(scene.numpy(), options.prepare)  # facts: frame, photos, poses, unseen
     plan = make_plan(prepared, options)  # every "auto" is decided once; options end here
     search = search_count(prepared, plan)  # one count, or counts until a quality is met
     for count in search:
         search.add(build_scored(method, prepared, plan, count))
     fixed = prepared.with_cameras(search.best.fitted.cameras), plan.with_fixed_cameras()
     levels = [build_scored(method, *fixed, count) for count in level_counts(len(search.best.gaussians), plan)]
-    return make_result(search.best, levels, prepared, plan, search.facts()).to(given.gaussians.device)
+    return make_result(search.best, levels, prepared, plan, search.facts()).to(scene.gaussians.device)
 
 
 @record_part()

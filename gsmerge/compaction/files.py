@@ -66,26 +66,26 @@ def compact_files(
     with atomic_outputs(overwrite=overwrite) as add:
         at = {out: add(out, make_folder=streamed)}
         at |= {path: add(path) for path in (report_path, saved_cameras) if path is not None}
-        given = read_input(files, opacity=opacity, hints=hints)
-        check_saved_cameras(given.scene, saved_cameras, embed=embed_cameras)
+        load = read_input(files, opacity=opacity, hints=hints)
+        check_saved_cameras(load.scene, saved_cameras, embed=embed_cameras)
         shared = None if cameras_path is None or overwrite or not cameras_path.exists() else cameras_path
-        views = _views_once(given.scene)
-        names = [given.scene.names[view] for view in views]
+        views = _views_once(load.scene)
+        names = [load.scene.names[view] for view in views]
         if shared is not None and list(read_cameras(shared).names) != names:
             raise _other_cameras(shared)
         read = perf_counter()
-        result = compact(given.scene, settings, progress=progress)
+        result = compact(load.scene, settings, progress=progress)
         if len(result.gaussians) == 0:
             problem = "expected Gaussians that show something, found none that is left once they are merged"
             raise SceneError(files.ply, problem, "look at its scales and opacities with gsmerge inspect")
         compacted = perf_counter()
         results = (result, *result.coarser)
-        embedded = [camera_comments(one.cameras[views], names) if embed_cameras else [] for one in results]
+        embedded = [camera_comments(level.cameras[views], names) if embed_cameras else [] for level in results]
         written = _write_results(
-            add, out, at[out], results, [[*given.comments, *lines] for lines in embedded],
+            add, out, at[out], results, [[*load.comments, *lines] for lines in embedded],
             spz_version=spz_version, normals=normals,
         )  # fmt: skip
-        cameras_path = cameras_path if len(given.scene) else None
+        cameras_path = cameras_path if len(load.scene) else None
         if cameras_path is not None:
             text = viewer_cameras(result.cameras[views], names)
             if shared is None:
@@ -101,9 +101,9 @@ def compact_files(
             output_path=out,
             seconds_before={**(seconds_before or {}), "read": read - start},
             seconds_after={"write": perf_counter() - compacted},
-            coarser=[(path, one.report) for path, one in zip([*written][1:], result.coarser, strict=True)],
-            recognised=given.recognised,
-            notes=[*given.notes, *([lost] if lost else [])],
+            coarser=[(path, level.report) for path, level in zip([*written][1:], result.coarser, strict=True)],
+            recognised=load.recognised,
+            notes=[*load.notes, *([lost] if lost else [])],
             hashed=hashed,
             written_at=written,
             cameras_path=cameras_path,
@@ -131,15 +131,15 @@ def _write_results(
     """
     ending = output_format(out, spz_version, levels=True).ending
     if ending == INDEX:
-        (_, finest), *rest = add_levels(add, out, first, [one.gaussians for one in results], comments[0])
-        return {out: [first, *finest], **dict(rest)}
+        (_, finest), *coarser = add_levels(add, out, first, [result.gaussians for result in results], comments[0])
+        return {out: [first, *finest], **dict(coarser)}
     written = {out: [first]}
     for level in range(1, len(results)):
         path = level_output(out, level)
         written[path] = [add(path)]
-    for (file,), one, lines in zip(written.values(), results, comments, strict=True):
+    for (file,), result, lines in zip(written.values(), results, comments, strict=True):
         write_gaussians(
-            file, one.gaussians, overwrite=True, comments=lines, ending=ending, normals=normals,
+            file, result.gaussians, overwrite=True, comments=lines, ending=ending, normals=normals,
             spz_version=spz_version,
         )  # fmt: skip
     return written

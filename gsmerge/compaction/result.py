@@ -84,7 +84,7 @@ class CompactResult:
         """Return the same result with tensors on a device; None leaves NumPy arrays."""
         if device is None:
             return self
-        coarser = tuple(one.to(device) for one in self.coarser)
+        coarser = tuple(level.to(device) for level in self.coarser)
         return replace(self, gaussians=self.gaussians.to(device), coarser=coarser)
 
 
@@ -106,9 +106,9 @@ def score(count: int | None, fitted: Fitted, prepared: Prepared, plan: Plan) -> 
     if plan.unseen is not None:
         gaussians = Gaussians.concat([gaussians, plan.unseen])
     gaussians, cameras = prepared.frame.leave(gaussians), prepared.final_cameras()
-    if cameras is not prepared.given.cameras:
+    if cameras is not prepared.input_scene.cameras:
         _note_moves(prepared, cameras, plan)
-        prepared = replace(prepared, given=replace(prepared.given, cameras=cameras))
+        prepared = replace(prepared, input_scene=replace(prepared.input_scene, cameras=cameras))
     psnr = measure_psnr("score", gaussians, prepared.result_views(), prepared, plan)
     if psnr is not None:
         choose(scored_views=len(plan.scored_views))
@@ -117,11 +117,11 @@ def score(count: int | None, fitted: Fitted, prepared: Prepared, plan: Plan) -> 
 
 def _note_moves(prepared: Prepared, cameras: Cameras, plan: Plan) -> None:
     """Say how far each camera was moved."""
-    given, cause = prepared.given, "poses are free"
+    input_scene, cause = prepared.input_scene, "poses are free"
     if plan.settings["poses"] == "auto":
         cause = "the photos of some views agree only under other poses"
     depth = scene_depth(prepared.scene) * prepared.frame.unit
-    moves = list_moves(given.names, given.cameras.viewmats, cameras.viewmats, depth)
+    moves = list_moves(input_scene.names, input_scene.cameras.viewmats, cameras.viewmats, depth)
     choose(poses=moves)
     note(f"{cause}: cameras were moved by {describe_moves(moves)}")
 
@@ -156,15 +156,15 @@ def make_result(
     current record, which come before those of the candidates, enter the report.
     """
     run, seconds = current_record(), search["seconds"]
-    before = measure_psnr("input", prepared.given.file_gaussians, prepared.given, prepared, plan)
+    before = measure_psnr("input", prepared.input_scene.file_gaussians, prepared.input_scene, prepared, plan)
     comparable = prepared.photo_views and not plan.clean.hides  # or photos show something else
 
-    def report(one: Candidate, seconds: Mapping[str, float], name: str) -> CompactReport:
-        counts, record = (prepared.given.num_gaussians, len(one.gaussians)), one.record
+    def report(candidate: Candidate, seconds: Mapping[str, float], name: str) -> CompactReport:
+        counts, record = (prepared.input_scene.num_gaussians, len(candidate.gaussians)), candidate.record
         made = CompactReport(
-            *counts, dict(seconds), before, one.psnr, record.choices, record.notes, plan.settings, peak_memory()
+            *counts, dict(seconds), before, candidate.psnr, record.choices, record.notes, plan.settings, peak_memory()
         )
-        worse = describe_loss(name, before, one.psnr) if comparable else None
+        worse = describe_loss(name, before, candidate.psnr) if comparable else None
         return made if worse is None else replace(made, notes=[*made.notes, worse], worse=worse)
 
     names = {**run.seconds, **seconds}
@@ -175,7 +175,7 @@ def make_result(
     choices, notes = run.choices | main.choices | search["choices"], [*run.notes, *main.notes]
     main = replace(main, choices=choices, notes=notes, unmet=search["unmet"])
     coarser = tuple(
-        CompactResult(one.gaussians, report(one, one.record.seconds, f"level {i}"), one.cameras)
-        for i, one in enumerate(levels, 1)
+        CompactResult(candidate.gaussians, report(candidate, candidate.record.seconds, f"level {i}"), candidate.cameras)
+        for i, candidate in enumerate(levels, 1)
     )
     return CompactResult(best.gaussians, main, best.cameras, coarser)

@@ -75,7 +75,7 @@ class CountSearch:
     @property
     def tried(self) -> dict[int, float]:
         """PSNR (dB) of the counts so far, in the order of the runs."""
-        return {one.count: one.psnr or 0.0 for one in self.candidates if one.count is not None}
+        return {candidate.count: candidate.psnr or 0.0 for candidate in self.candidates if candidate.count is not None}
 
     def add(self, candidate: Candidate) -> None:
         """Add the result of the last count."""
@@ -89,7 +89,7 @@ class CountSearch:
         tried, target = self.tried, self.plan.target_psnr
         reached = [count for count, psnr in tried.items() if psnr >= target]
         chosen = min(reached) if reached else max(tried, key=lambda count: tried[count])
-        return next(one for one in self.candidates if one.count == chosen)
+        return next(candidate for candidate in self.candidates if candidate.count == chosen)
 
     @property
     def unmet(self) -> str | None:
@@ -102,8 +102,8 @@ class CountSearch:
 
     def facts(self) -> dict[str, Any]:
         """Return the search's part of a report: ``seconds`` of all candidates, ``choices``, ``unmet``."""
-        names = dict.fromkeys(name for one in self.candidates for name in one.record.seconds)
-        seconds = {name: sum(one.record.seconds.get(name, 0.0) for one in self.candidates) for name in names}
+        names = dict.fromkeys(name for run in self.candidates for name in run.record.seconds)
+        seconds = {name: sum(run.record.seconds.get(name, 0.0) for run in self.candidates) for name in names}
         choices: dict[str, Any] = {}
         if self.plan.target_psnr is not None:
             best, tried = self.best, tuple(self.tried.items())
@@ -124,7 +124,7 @@ def choose_count(prepared: Prepared, plan: Plan) -> int | None:
     limits, drop = plan.limits, plan.max_drop
     if drop is None and not plan.auto_count:
         return limits.count
-    if prepared.given.images is None or not prepared.photo_views:
+    if prepared.input_scene.images is None or not prepared.photo_views:
         return knee_count(prepared.scene, plan.superpixels)
     with stage("curve"):
         counts = rungs(AUTO_RUNGS if drop is None else RUNGS, limits.default, limits.min_count, limits.max_count)
@@ -161,8 +161,8 @@ def _point(count: int, gaussians: Gaussians, photos: Photos, weights: list[np.nd
         from gsmerge.measure.lpips import lpips, lpips_available
 
         if lpips_available(NET):
-            some = np.linspace(0, len(photos) - 1, min(PERCEPTUAL_VIEWS, len(photos))).round().astype(int)
-            perceptual = float(np.mean([lpips(images[v], photos.images[v], NET) for v in some]))
+            view_ids = np.linspace(0, len(photos) - 1, min(PERCEPTUAL_VIEWS, len(photos))).round().astype(int)
+            perceptual = float(np.mean([lpips(images[v], photos.images[v], NET) for v in view_ids]))
     psnr = holdout_psnr(images, photos, weights, min_gain)
     return CurvePoint(count, psnr, float(np.mean(similar)), perceptual)
 

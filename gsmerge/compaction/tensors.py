@@ -221,9 +221,9 @@ def _read_harmonics(shN: Array | None, n: int) -> np.ndarray:
     shape = (0, 3) if shN is None else _to_numpy("shN", shN).shape
     if shape[-2:] == (0, 3):
         return np.zeros((n, 0, 3), np.float32)
-    known = (3, 8, 15, 24)
-    if len(shape) < 3 or shape[-1] != 3 or shape[-2] not in known:
-        swapped = len(shape) >= 3 and shape[-2] == 3 and shape[-1] in known
+    counts = (3, 8, 15, 24)
+    if len(shape) < 3 or shape[-1] != 3 or shape[-2] not in counts:
+        swapped = len(shape) >= 3 and shape[-2] == 3 and shape[-1] in counts
         problem = f"expected shape [n, k-1, 3] with 3, 8, 15 or 24 coefficients, found {list(shape)}"
         raise SceneError("shN", problem, "pass shN.transpose(-1, -2): each coefficient's colours last" * swapped)
     return _rows("shN", shN, shape[-2], 3)

@@ -120,9 +120,9 @@ def wrong_checksums(file: GsmFile) -> list[str] | None:
     stored = file.header.get("checksums")
     if not isinstance(stored, dict):
         return None
-    found = _checksums(file.header, file.arrays)
-    missing = [name for name in stored if name not in found and name.startswith(PREFIXES)]
-    return [name for name, value in found.items() if stored.get(name) != value] + missing
+    checksums = _checksums(file.header, file.arrays)
+    missing = [name for name in stored if name not in checksums and name.startswith(PREFIXES)]
+    return [name for name, value in checksums.items() if stored.get(name) != value] + missing
 
 
 def _float32(values: Array) -> np.ndarray:
@@ -282,8 +282,8 @@ def read_gsm(path: str | PathLike[str], *kinds: str) -> GsmFile:
     check_file(path)
     try:
         with safe_open(path, "np") as file:
-            known = [name for name in file.keys() if name.startswith(PREFIXES)]  # noqa: SIM118 - no mapping
-            metadata, arrays = file.metadata() or {}, {name: file.get_tensor(name) for name in known}
+            names = [name for name in file.keys() if name.startswith(PREFIXES)]  # noqa: SIM118 - no mapping
+            metadata, arrays = file.metadata() or {}, {name: file.get_tensor(name) for name in names}
     except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as error:  # the last two: types of torch
         reason = str(error).splitlines()[0]
         remedy = REMEDY if path.suffix == SUFFIX else "name a file of gsmerge encode or extend"

@@ -101,7 +101,7 @@ def _to_encoded(prepared: Prepared, plan: Plan, merged: MergedViews, max_k: int 
     if networks is not None:
         max_k = min(max_k, networks.options.max_children)
     settings = StoredSettings(
-        num_input=prepared.given.num_gaussians,
+        num_input=prepared.input_scene.num_gaussians,
         k=AUTO if plan.auto_count else options.k,
         max_k=max_k,
         min_opacity=options.min_opacity,
@@ -153,27 +153,27 @@ def encode_files(
     """
     start = perf_counter()
     with atomic_output(out, overwrite=overwrite) as temporary:
-        given = read_input(files, opacity=opacity, hints=hints)
+        load = read_input(files, opacity=opacity, hints=hints)
         read = perf_counter()
-        encoded = encode_scene(given.scene, settings, max_k=max_k, progress=progress)
+        encoded = encode_scene(load.scene, settings, max_k=max_k, progress=progress)
         done = perf_counter()
         hashed: dict[str, Any] = {"sha256": file_sha256(*files.plys)}
         hashed["bytes"] = sum(path.stat().st_size for path in files.plys)
-        texts = {"comments": list(given.comments), "notes": list(given.notes)}
+        texts = {"comments": list(load.comments), "notes": list(load.notes)}
         save_encoded(temporary, encoded, overwrite=True, source={"name": files.ply.name, **hashed, **texts})
     seconds = {**(seconds_before or {}), "read": read - start, "encode": done - read, "write": perf_counter() - done}
     stored, size, about = encoded.settings, out.stat().st_size, encoded.about
     counts = {"num_groups": len(encoded), "num_gaussians_at_most": encoded.max_gaussians, "max_k": stored.max_k}
     return {
         **document_head(),
-        "input": {"path": str(files.ply), "num_gaussians": stored.num_input, **hashed, **given.recognised},
+        "input": {"path": str(files.ply), "num_gaussians": stored.num_input, **hashed, **load.recognised},
         "output": {"path": str(out), "bytes": size, **counts},
         "ratio_bytes": size / hashed["bytes"],
         "options": about["options"],
         "seed": about["options"]["seed"],
         "choices": about["choices"],
         **seconds_document(seconds),
-        "notes": [*given.notes, *about["notes"]],
+        "notes": [*load.notes, *about["notes"]],
     }
 
 

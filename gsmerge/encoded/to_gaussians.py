@@ -155,14 +155,14 @@ def divide_all(features: FeatureGaussians, members: Members, max_k: int) -> Divi
         grown, first = run_counts == number, np.cumsum(run_counts) - run_counts
         if number == 2:
             uniform = rows[~grown]
-            own_starts, own = gather_groups(starts, ids, first[~grown])
-            uniform_children = pool_children(features, members, own_starts, own, uniform)
+            run_starts, run_ids = gather_groups(starts, ids, first[~grown])
+            uniform_children = pool_children(features, members, run_starts, run_ids, uniform)
         rows, before = rows[grown], sizes[grown]
         sizes = np.diff(starts)[first[grown, None] + np.arange(number)]
         slot = np.argmax(sizes[:, :-1] != before, axis=1)  # the run that got smaller is the one that was split
         pairs = (first[grown] + slot)[:, None] + np.arange(2)
-        own_starts, own = gather_groups(starts, ids, pairs.ravel())
-        parts.append(pool_children(features, members, own_starts, own, rows.repeat(2)))
+        run_starts, run_ids = gather_groups(starts, ids, pairs.ravel())
+        parts.append(pool_children(features, members, run_starts, run_ids, rows.repeat(2)))
         owners.append(rows)
         slots.append(slot)
     owner = np.concatenate(owners)

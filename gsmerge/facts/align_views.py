@@ -100,8 +100,8 @@ def align_views(scene: Scene, views: Sequence[int], *, always: bool = False) -> 
         check = side == sides[0] != sides[-1] and not always
         level = _level_of(scene, pairs, largest / side, FIRST_SAMPLES if check else SAMPLES)
         viewmats, first, last = _descend(level, viewmats, check=check)
-        given = first if side == sides[0] else parallel_map(partial(_compare, level, start), pairs)
-        if not np.isfinite(viewmats).all() or not (always or _any_wrong(level, given, last, end=side == sides[-1])):
+        before = first if side == sides[0] else parallel_map(partial(_compare, level, start), pairs)
+        if not np.isfinite(viewmats).all() or not (always or _any_wrong(level, before, last, end=side == sides[-1])):
             return None
     placed = sorted({view for pair in pairs for view in pair})  # the others stay where they are
     viewmats[placed] = without_common_motion(start[placed], viewmats[placed], np.median)
@@ -134,14 +134,14 @@ def _choose_pairs(scene: Scene, views: Sequence[int]) -> list[tuple[int, int]]:
     step = max(1, scene.pixels_per_view // OVERLAP_SAMPLES)
     size, pairs = np.array([cameras.width, cameras.height]), set()
     for view in views:
-        some = means[view, ::step][scene.valid[view].reshape(-1)[::step]]
-        pixels, z = project(some, cameras)
-        seen = ((z > NEAR) & (pixels > 0).all(-1) & (pixels < size).all(-1)).mean(1) if len(some) else np.zeros(len(z))
+        xyz = means[view, ::step][scene.valid[view].reshape(-1)[::step]]
+        pixels, z = project(xyz, cameras)
+        seen = ((z > NEAR) & (pixels > 0).all(-1) & (pixels < size).all(-1)).mean(1) if len(xyz) else np.zeros(len(z))
         overlap = seen * matmul(cameras.viewmats[:, 2, :3], cameras.viewmats[view, 2, :3]).clip(0)
-        ranked = [int(one) for one in np.argsort(-overlap, kind="stable") if one != view and one in views]
-        for one in ranked[:NEIGHBOURS]:
-            if overlap[one] > MIN_OVERLAP:
-                pairs |= {(view, one), (one, view)}
+        ranked = [int(other) for other in np.argsort(-overlap, kind="stable") if other != view and other in views]
+        for other in ranked[:NEIGHBOURS]:
+            if overlap[other] > MIN_OVERLAP:
+                pairs |= {(view, other), (other, view)}
     return sorted(pairs)
 
 
@@ -188,12 +188,12 @@ def _descend(level: _Level, viewmats: np.ndarray, *, check: bool) -> tuple[np.nd
         if step == most or (check and step == 1 and _flows(level, now).max() < EARLY_PX):
             break
         curvature, slope = np.diag(prior), prior * motion_vectors(level.start, viewmats).ravel()
-        for (a, b), one in zip(level.pairs, now, strict=True):
+        for (a, b), comparison in zip(level.pairs, now, strict=True):
             rows, columns = slice(6 * a, 6 * a + 6), slice(6 * b, 6 * b + 6)
-            for some, other, sign in ((rows, rows, 1), (columns, columns, 1), (rows, columns, -1), (columns, rows, -1)):
-                curvature[some, other] += sign * one.curvature
-            slope[rows] -= one.slope
-            slope[columns] += one.slope
+            for row, column, sign in ((rows, rows, 1), (columns, columns, 1), (rows, columns, -1), (columns, rows, -1)):
+                curvature[row, column] += sign * comparison.curvature
+            slope[rows] -= comparison.slope
+            slope[columns] += comparison.slope
         curvature[np.diag_indices(len(curvature))] *= 1 + DAMPING
         change = -solve(curvature, slope).reshape(-1, 6)
         viewmats = matmul(viewmats, motion_matrices(change))
@@ -238,17 +238,17 @@ def _look_up(level: _Level, viewmats: np.ndarray, a: int, b: int) -> tuple[np.nd
 def _flows(level: _Level, pairs: list[_Pair]) -> np.ndarray:
     """Return how far the pixels of each view moved, ``[v]`` pixels: the median over its pairs."""
     both = list(zip(level.pairs, pairs, strict=True))
-    flows = [[one.flow for pair, one in both if view in pair] for view in range(len(level.start))]
-    return np.array([np.median(some) if some else 0.0 for some in flows])
+    flows = [[comparison.flow for pair, comparison in both if view in pair] for view in range(len(level.start))]
+    return np.array([np.median(view_flows) if view_flows else 0.0 for view_flows in flows])
 
 
-def _any_wrong(level: _Level, given: list[_Pair], last: list[_Pair], *, end: bool) -> bool:
+def _any_wrong(level: _Level, before: list[_Pair], last: list[_Pair], *, end: bool) -> bool:
     """Return whether a view moved far and now disagrees less with the others, at the ``end`` much less."""
     far = _flows(level, last) > LIMIT_PX
-    costs = np.zeros((2, len(far)))  # of each view, given and last
-    for i, pairs in enumerate((given, last)):
-        for pair, one in zip(level.pairs, pairs, strict=True):
-            costs[i, list(pair)] += one.cost
+    costs = np.zeros((2, len(far)))  # of each view, before and last
+    for i, pairs in enumerate((before, last)):
+        for pair, comparison in zip(level.pairs, pairs, strict=True):
+            costs[i, list(pair)] += comparison.cost
     gains = 1 - costs[1] / np.maximum(costs[0], 1e-9)
     all_gain = 1 - costs[1].sum() / max(costs[0].sum(), 1e-9)
     if end:

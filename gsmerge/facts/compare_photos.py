@@ -72,13 +72,13 @@ class Shown:
     """Small pictures of the photos and of what the Gaussians show."""
 
     photos: np.ndarray  # [v,h,w,3]
-    own: np.ndarray  # [v,h,w,3]
+    pictures: np.ndarray  # [v,h,w,3]
     weights: np.ndarray  # [v,h,w] how much of a pixel the Gaussians show; 0 outside the masks
     drawn: bool  # whether the pictures are drawings, which wrong depth displaces
 
     @property
     def clear(self) -> np.ndarray:
-        """``[v,h,w]`` bool: pixels whose colour in ``own`` can be compared."""
+        """``[v,h,w]`` bool: pixels whose colour in ``pictures`` can be compared."""
         return self.weights > (0.5 if self.drawn else 0.05)
 
 
@@ -111,25 +111,25 @@ def find_changes(scene: Scene, shown: Shown) -> list[PhotoChange]:
     clear = small.clear
     for view in views:
         change = replace(changes[view], tones=curves[view])
-        own, photo = small.own[view], change(shown.photos[view], None)
-        cover = _covered(own, photo, clear[view], flat[view], drawn=small.drawn)
+        picture, photo = small.pictures[view], change(shown.photos[view], None)
+        cover = _covered(picture, photo, clear[view], flat[view], drawn=small.drawn)
         if (curves[view] is None and cover is None) or (cover is not None and cover.mean() > MAX_COVER):
             continue
         if drawing is None:
-            drawing = small.own if small.drawn else _draw(scene, SMALL_SIDE)[0]
-        changes[view] = _confirmed(change, cover, small.photos[view], photo, own, drawing[view])
+            drawing = small.pictures if small.drawn else _draw(scene, SMALL_SIDE)[0]
+        changes[view] = _confirmed(change, cover, small.photos[view], photo, picture, drawing[view])
     return changes
 
 
 def _confirmed(
-    change: PhotoChange, cover: np.ndarray | None, before: np.ndarray, after: np.ndarray, own: np.ndarray,
+    change: PhotoChange, cover: np.ndarray | None, before: np.ndarray, after: np.ndarray, picture: np.ndarray,
     drawing: np.ndarray,
 ) -> PhotoChange:  # fmt: skip
     """Keep of a change what brings the photo nearer to a drawing of the scene as well."""
     outside = np.full(before.shape[:2], True) if cover is None else ~cover
     if change.tones is not None and not _difference(after, drawing, outside) < _difference(before, drawing, outside):
         change = replace(change, tones=None)
-    if cover is not None and _difference(own, drawing, cover) < _difference(after, drawing, cover):
+    if cover is not None and _difference(picture, drawing, cover) < _difference(after, drawing, cover):
         change = replace(change, cover=cover)
     return change
 
@@ -141,13 +141,13 @@ def show_photos(scene: Scene) -> Shown:
     level = max(1.0, max(scene.cameras.width, scene.cameras.height) / side)
     photos = photos_of(scene.images, scene.cameras, level)
     if scene.aligned:
-        own, weights = _shrink_colors(scene, (photos.width, photos.height))
+        pictures, weights = _shrink_colors(scene, (photos.width, photos.height))
     else:
-        own, weights = _draw(scene, side)
+        pictures, weights = _draw(scene, side)
     inside = pixel_weights(scene.masks, photos.width, photos.height)
     if inside is not None:
         weights = weights * (inside == 1)
-    return Shown(photos.images, own, weights, not scene.aligned)
+    return Shown(photos.images, pictures, weights, not scene.aligned)
 
 
 def _shrink_colors(scene: Scene, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -157,12 +157,12 @@ def _shrink_colors(scene: Scene, size: tuple[int, int]) -> tuple[np.ndarray, np.
     opacities = np.where(scene.valid, scene.gaussians.opacities.reshape(shape), 0).astype(np.float32)
 
     def shrink(view: int) -> tuple[np.ndarray, np.ndarray]:
-        color, weight = (np.ascontiguousarray(some[view], np.float32) for some in (colors, opacities))
+        color, weight = (np.ascontiguousarray(values[view], np.float32) for values in (colors, opacities))
         small = cv2.resize(sh0_to_rgb(color).clip(0, 1), size, interpolation=cv2.INTER_AREA)
         return small, cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
 
-    own, weights = zip(*parallel_map(shrink, range(len(scene))), strict=True)
-    return np.stack(own), np.stack(weights)
+    pictures, weights = zip(*parallel_map(shrink, range(len(scene))), strict=True)
+    return np.stack(pictures), np.stack(weights)
 
 
 def _draw(scene: Scene, side: int) -> tuple[np.ndarray, np.ndarray]:
@@ -170,15 +170,15 @@ def _draw(scene: Scene, side: int) -> tuple[np.ndarray, np.ndarray]:
     level = max(1.0, max(scene.cameras.width, scene.cameras.height) / side)
     few, blank = sampled(scene.gaussians, SAMPLES), blank_photos(scene.cameras, level)
     drawn = photo_errors(few, blank, lambda _, image, left: (image.clip(0, 1), 1 - left))
-    own, weights = zip(*drawn, strict=True)
-    return np.stack(own), np.stack(weights)
+    pictures, weights = zip(*drawn, strict=True)
+    return np.stack(pictures), np.stack(weights)
 
 
 def _change_small(shown: Shown, changes: Sequence[PhotoChange]) -> Shown:
     """Mend the small photos; what is covered keeps no weight."""
     if not any(map(is_change, changes)):
         return shown
-    photos = [change(photo, own) for change, photo, own in zip(changes, shown.photos, shown.own, strict=True)]
+    photos = [change(photo, fill) for change, photo, fill in zip(changes, shown.photos, shown.pictures, strict=True)]
     weights = [
         weight if change.cover is None else weight * ~change.cover
         for change, weight in zip(changes, shown.weights, strict=True)
@@ -186,9 +186,9 @@ def _change_small(shown: Shown, changes: Sequence[PhotoChange]) -> Shown:
     return replace(shown, photos=np.stack(photos), weights=np.stack(weights))
 
 
-def _difference(one: np.ndarray, other: np.ndarray, mask: np.ndarray | None = None) -> float:
+def _difference(picture: np.ndarray, other: np.ndarray, mask: np.ndarray | None = None) -> float:
     """Return the median difference of two pictures over the pixels of a mask; 0 without any."""
-    values = _over_channels(np.add, np.abs(one - other)) / 3
+    values = _over_channels(np.add, np.abs(picture - other)) / 3
     chosen = values if mask is None else values[mask]
     return float(np.median(chosen)) if chosen.size else 0.0
 
@@ -213,9 +213,9 @@ def _find_bars(scene: Scene, shown: Shown) -> tuple[float, float, float, float]:
     inside = np.zeros((rows, columns), bool)
     inside[change.inside(rows, columns)] = True
     as_cover = replace(shown, weights=shown.weights * inside)
-    own = [float(np.median(np.diag(gradient_correlations(some)[0]))) for some in (cropped, as_cover, shown)]
+    scores = [float(np.median(np.diag(gradient_correlations(trial)[0]))) for trial in (cropped, as_cover, shown)]
     least = LEAST_DRAWN if shown.drawn else LEAST
-    if own[0] <= max(*own[1:], least):
+    if scores[0] <= max(*scores[1:], least):
         return none
     places = zip(bars, ("above", "below", "left", "right"), strict=True)
     what = ", ".join(f"{100 * bar:.0f} % {name}" for bar, name in places if bar)
@@ -226,8 +226,8 @@ def _find_bars(scene: Scene, shown: Shown) -> tuple[float, float, float, float]:
 def _is_reversed(shown: Shown) -> bool:
     """Return whether all photos together are nearer to their Gaussians with red and blue exchanged."""
     counts = shown.clear
-    as_given, swapped = (_difference(photos, shown.own, counts) for photos in (shown.photos, shown.photos[..., ::-1]))
-    return swapped < SWAPPED * as_given and as_given - swapped > MIN_SWAP
+    rgb, bgr = (_difference(photos, shown.pictures, counts) for photos in (shown.photos, shown.photos[..., ::-1]))
+    return bgr < SWAPPED * rgb and rgb - bgr > MIN_SWAP
 
 
 def _find_tones(shown: Shown, flat: Sequence[np.ndarray]) -> list[np.ndarray | None]:
@@ -251,22 +251,22 @@ def _find_curves(shown: Shown, views: Sequence[int], counts: np.ndarray) -> tupl
     """
     if counts.sum() < MIN_PIXELS:
         return None, 0.0
-    photos, own = shown.photos[list(views)][counts], shown.own[list(views)][counts]
+    photos, pictures = shown.photos[list(views)][counts], shown.pictures[list(views)][counts]
     least, most = (MIN_TONE_DRAWN, EXPLAINED_DRAWN) if shown.drawn else (MIN_TONE, EXPLAINED)
-    before = _difference(photos, own)
+    before = _difference(photos, pictures)
     if before < least / 2:  # no curve could change so much and explain it
         return None, 0.0
-    tones = np.stack([_curve(photos[:, channel], own[:, channel]) for channel in range(3)])
+    tones = np.stack([_curve(photos[:, channel], pictures[:, channel]) for channel in range(3)])
     after = look_up(tones, photos)
     change = _difference(after, photos)
-    is_explained = change >= least and _difference(after, own) <= most * before
+    is_explained = change >= least and _difference(after, pictures) <= most * before
     return (tones, change) if is_explained else (None, 0.0)
 
 
 def _curve(levels: np.ndarray, tones: np.ndarray) -> np.ndarray:
     """Return the curve ``[256]`` float32 that joins the quantiles of two samples, and its ends in proportion."""
     shares = (np.arange(LEVELS) + 0.5) / LEVELS
-    x, y = (np.round(np.quantile(some.astype(np.float64), shares), 6) for some in (levels, tones))
+    x, y = (np.round(np.quantile(values.astype(np.float64), shares), 6) for values in (levels, tones))
     keep = np.concatenate([[True], np.diff(x) > 1 / 255]) & (x > 0) & (x < 1)
     x, y = x[keep], np.maximum.accumulate(y[keep].clip(0, 1))
     end = min(1.0, max(y[-1], y[-1] / x[-1])) if len(x) else 1.0
@@ -296,16 +296,16 @@ def _large_parts(mask: np.ndarray, share: float, marked: np.ndarray | None = Non
 
 
 def _covered(
-    own: np.ndarray, photo: np.ndarray, clear: np.ndarray, flat: np.ndarray, *, drawn: bool
+    picture: np.ndarray, photo: np.ndarray, clear: np.ndarray, flat: np.ndarray, *, drawn: bool
 ) -> np.ndarray | None:
     """Return a mask ``[h,w]`` of what covers the scene in a photo; None where nothing does."""
     clipped = _over_channels(np.maximum, photo) > CLIPPED
     seen = (clear & (flat | ~clipped)).astype(np.float32)
     share = _box_means(seen[..., None])[..., 0]
-    away = np.abs(_box_means((photo - own) * seen[..., None]))
+    away = np.abs(_box_means((photo - picture) * seen[..., None]))
     away = _over_channels(np.add, away) / (3 * np.maximum(share, 0.1))
-    rest = clear & ~flat
-    usual = float(np.quantile(away[rest], 0.75)) if rest.any() else 0.0
+    textured = clear & ~flat
+    usual = float(np.quantile(away[textured], 0.75)) if textured.any() else 0.0
     limit = max(COVERED, DOUBT * usual)
     if drawn:
         parts = _large_parts(flat & (away > limit) & clear, MIN_COVER_DRAWN)
@@ -351,15 +351,15 @@ def odd_photos(shown: Shown) -> list[int]:
     if min(height, width) < 2 or height * width / level**2 < MIN_PIXELS:
         return []
     scores, judged = gradient_correlations(shown)
-    own, near = np.diag(scores).copy(), scores.clip(-CLOSEST, CLOSEST)
-    others = 0.5 * log((1 + near) / (1 - near))  # inverse hyperbolic tangents
-    fits = np.diag(others).copy()
-    np.fill_diagonal(others, -np.inf)
-    others[~judged] = -np.inf
-    gains = np.maximum(others.max(0), others.max(1)) - fits
+    correlations, near = np.diag(scores).copy(), scores.clip(-CLOSEST, CLOSEST)
+    z_scores = 0.5 * log((1 + near) / (1 - near))  # inverse hyperbolic tangents
+    fits = np.diag(z_scores).copy()
+    np.fill_diagonal(z_scores, -np.inf)
+    z_scores[~judged] = -np.inf
+    gains = np.maximum(z_scores.max(0), z_scores.max(1)) - fits
     if judged.any():
-        least = max(least, SHARE * float(np.median(own[judged])))
-    return np.flatnonzero(judged & ((own < least) | (gains > GAIN))).tolist()
+        least = max(least, SHARE * float(np.median(correlations[judged])))
+    return np.flatnonzero(judged & ((correlations < least) | (gains > GAIN))).tolist()
 
 
 def gradient_correlations(shown: Shown) -> tuple[np.ndarray, np.ndarray]:
@@ -374,7 +374,7 @@ def gradient_correlations(shown: Shown) -> tuple[np.ndarray, np.ndarray]:
     def shrink(images: np.ndarray) -> list[np.ndarray]:
         return [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images.astype(np.float32)]
 
-    a = np.stack([_gradients(image) for image in shrink(shown.own)])
+    a = np.stack([_gradients(image) for image in shrink(shown.pictures)])
     b = np.stack([_gradients(image) for image in shrink(shown.photos)])
     w = np.stack([_gradient_weights(weight) for weight in shrink(shown.weights)])
     weighted, squares = w * a, (w * a * a).sum(1)

@@ -58,7 +58,7 @@ class _Pair:
     view: int
     other: int
     ratios: np.ndarray  # [3] logarithm, their median
-    some: np.ndarray  # [MIN_PAIRS,3] logarithms of single pixels
+    sample: np.ndarray  # [MIN_PAIRS,3] logarithms of single pixels
     count: int
 
 
@@ -95,13 +95,13 @@ def equalise_exposure(scene: Scene, views: Sequence[int], exposure: Exposure) ->
 def _find_objection(scene: Scene, views: Sequence[int], pairs: Sequence[_Pair], gains: np.ndarray) -> str:
     """Say why photos are better left as they are; an empty text where they are not."""
     assert scene.images is not None
-    own, some = gains[list(views)], [scene.images[view][::COARSE, ::COARSE] for view in views]
-    brightness = log(np.maximum([photo.mean((0, 1), dtype=np.float64) for photo in some], 1 / 255))
+    view_gains, photos = gains[list(views)], [scene.images[view][::COARSE, ::COARSE] for view in views]
+    brightness = log(np.maximum([photo.mean((0, 1), dtype=np.float64) for photo in photos], 1 / 255))
     if share_left(pairs, gains) > NEARER:
         return "other exposures do not bring the colours of the same surfaces clearly nearer"
-    if is_metered(brightness, own):
+    if is_metered(brightness, view_gains):
         return "those of a longer exposure are not brighter, as where a camera chose it by what it saw"
-    if share_unexpected(own, camera_distances(scene.cameras[list(views)])) < UNEXPECTED:
+    if share_unexpected(view_gains, camera_distances(scene.cameras[list(views)])) < UNEXPECTED:
         return "neighbouring ones have nearly the same exposure, so new views between them have it, too"
     return ""
 
@@ -114,8 +114,8 @@ def root_mean_square(gains: np.ndarray) -> float:
 
 def share_left(pairs: Sequence[_Pair], gains: np.ndarray) -> float:
     """Divide the differences of colours that logarithmic gains ``[v,3]`` leave between views by those before."""
-    before = sum(float(np.median(np.abs(pair.some))) for pair in pairs)
-    after = sum(float(np.median(np.abs(pair.some - gains[pair.other] + gains[pair.view]))) for pair in pairs)
+    before = sum(float(np.median(np.abs(pair.sample))) for pair in pairs)
+    after = sum(float(np.median(np.abs(pair.sample - gains[pair.other] + gains[pair.view]))) for pair in pairs)
     return after / max(before, 1e-9)
 
 
@@ -144,8 +144,8 @@ def camera_distances(cameras: Cameras) -> np.ndarray:
     """Compute distances ``[v,v]``: between centres, canonical units, plus between unit vectors along their views."""
     viewmats = cameras.viewmats.astype(np.float64)
     both = (camera_centres(viewmats), viewmats[:, 2, :3])
-    differences = [some[:, None] - some[None] for some in both]
-    return np.asarray(sum(np.sqrt((some * some).sum(-1)) for some in differences))
+    differences = [vectors[:, None] - vectors[None] for vectors in both]
+    return np.asarray(sum(np.sqrt((vectors * vectors).sum(-1)) for vectors in differences))
 
 
 def _order_others(distances: np.ndarray) -> np.ndarray:
@@ -188,15 +188,15 @@ def _pixels_of(scene: Scene) -> _Pixels:
 def _measure_pairs(scene: Scene, views: Sequence[int]) -> list[_Pair]:
     """Measure the ratios of colours between views that see the same surfaces."""
     assert scene.images is not None
-    size, known = scene.pixels_per_view, _pixels_of(scene)
+    size, pixels = scene.pixels_per_view, _pixels_of(scene)
     photos = scene.images.reshape(len(scene), size, 3)
-    some = np.random.default_rng(0).permutation(size)[:SAMPLES]
+    sample = np.random.default_rng(0).permutation(size)[:SAMPLES]
 
     def measure(view: int) -> list[_Pair]:
-        rows = some[known.valid[view, some]]
+        rows = sample[pixels.valid[view, sample]]
         pairs = []
         for other in (other for other in views if other != view):
-            both, places = known.look_up(view, rows, other)
+            both, places = pixels.look_up(view, rows, other)
             here, there = photos[view, rows[both]], photos[other, places]
             clear = ((here > LOW) & (here < HIGH) & (there > LOW) & (there < HIGH)).all(1)
             if clear.sum() >= MIN_PAIRS:
@@ -228,13 +228,13 @@ def _find_clipped(scene: Scene, gains: np.ndarray) -> np.ndarray:
     """
     assert scene.images is not None
     clipped = ((scene.images >= CLIPPED) & (gains[:, None, None] > BRIGHT)).any(-1)
-    known, flat = _pixels_of(scene), clipped.reshape(len(scene), -1)
+    pixels, flat = _pixels_of(scene), clipped.reshape(len(scene), -1)
     order = _order_others(camera_distances(scene.cameras))[:, :NEIGHBOURS]
 
     def confirm(view: int) -> np.ndarray:
-        left, shown = np.flatnonzero(flat[view] & known.valid[view]), np.zeros_like(flat[view])
+        left, shown = np.flatnonzero(flat[view] & pixels.valid[view]), np.zeros_like(flat[view])
         for other in order[view]:
-            both, places = known.look_up(view, left, other)
+            both, places = pixels.look_up(view, left, other)
             shown[left[both[~flat[other, places]]]] = True
             left = left[~shown[left]]
         return shown

@@ -27,8 +27,8 @@ class PhotoChange:
     tones: np.ndarray | None = None  # [3,256] float32: what each level of each channel becomes
     cover: np.ndarray | None = None  # [h,w] bool at a small size, what is replaced
 
-    def __call__(self, photo: np.ndarray, own: np.ndarray | None) -> np.ndarray:
-        """Mend a photo ``[h,w,3]`` in [0, 1] of any size; ``own [h,w,3]`` is what replaces covered pixels."""
+    def __call__(self, photo: np.ndarray, fill: np.ndarray | None) -> np.ndarray:
+        """Mend a photo ``[h,w,3]`` in [0, 1] of any size; ``fill [h,w,3]`` is what replaces covered pixels."""
         if any(self.bars):  # as whole numbers, which OpenCV resizes alike on every processor
             levels = np.rint(255 * photo.clip(0, 1)).astype(np.uint8)
             photo = self.without_bars(levels, cv2.INTER_LINEAR) / np.float32(255)
@@ -36,8 +36,8 @@ class PhotoChange:
             photo = photo[..., ::-1]
         if self.tones is not None:
             photo = look_up(self.tones, photo)
-        if self.cover is not None and own is not None:
-            photo = np.where(_enlarge(self.cover, photo.shape)[..., None], own, photo)
+        if self.cover is not None and fill is not None:
+            photo = np.where(_enlarge(self.cover, photo.shape)[..., None], fill, photo)
         return np.ascontiguousarray(photo, np.float32)
 
     def without_bars(self, picture: np.ndarray, interpolation: int) -> np.ndarray:
@@ -88,26 +88,26 @@ def mend_photos(scene: Scene, changes: Sequence[PhotoChange]) -> Scene:
     if not changed and not filled:
         return scene
     _note_changes(changes, scene.names)
-    own = dict(zip(filled, own_pictures(scene, filled), strict=True)) if filled else {}
+    fills = dict(zip(filled, own_pictures(scene, filled), strict=True)) if filled else {}
     images = scene.images.copy()
     for view in sorted({*changed, *filled}):
-        images[view] = changes[view](images[view], own.get(view))
+        images[view] = changes[view](images[view], fills.get(view))
         if not inside[view].all():
-            images[view] = np.where(inside[view][..., None], images[view], own[view])
+            images[view] = np.where(inside[view][..., None], images[view], fills[view])
     large = scene.large_photos
     if large is not None and changed:
-        large = change_large(large, changes, own)
+        large = change_large(large, changes, fills)
     return replace(scene, images=images, large_photos=large, masks=masks)
 
 
-def change_large(large: LargePhotos, changes: Sequence[PhotoChange], own: dict[int, np.ndarray]) -> LargePhotos:
-    """Mend larger photos when they are read; ``own`` has what replaces covered pixels, by view."""
+def change_large(large: LargePhotos, changes: Sequence[PhotoChange], fills: dict[int, np.ndarray]) -> LargePhotos:
+    """Mend larger photos when they are read; ``fills`` are what replaces covered pixels, by view."""
 
     def read(view: int) -> np.ndarray:
         photo = large.read(large.ids[view])
         if not is_change(changes[view]):
             return photo
-        cover = own.get(view)
+        cover = fills.get(view)
         if cover is not None:  # as whole numbers, which OpenCV resizes alike on every processor
             levels = np.rint(255 * cover.clip(0, 1)).astype(np.uint8)
             cover = cv2.resize(levels, photo.shape[1::-1], interpolation=cv2.INTER_LINEAR) / np.float32(255)
@@ -149,19 +149,19 @@ def own_pictures(scene: Scene, views: list[int]) -> np.ndarray:
     """Return some views of a scene in the colours of its Gaussians, ``[n,h,w,3]``."""
     if not scene.aligned:
         return np.asarray(render(scene.gaussians, scene.cameras[views]).images).clip(0, 1)
-    some = subset(scene, views)
-    pictures = scene_pictures(replace(some, images=None))
-    known = some.stored if some.missing is not None else some.valid
-    return np.stack([_fill_gaps(*pair) for pair in zip(pictures, known, strict=True)])
+    part = subset(scene, views)
+    pictures = scene_pictures(replace(part, images=None))
+    valid = part.stored if part.missing is not None else part.valid
+    return np.stack([_fill_gaps(*pair) for pair in zip(pictures, valid, strict=True)])
 
 
-def _fill_gaps(picture: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Give pixels ``[h,w]`` that are not known the colour of the nearest one that is."""
-    if known.all() or not known.any():
+def _fill_gaps(picture: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Give pixels ``[h,w]`` that are not ``valid`` the colour of the nearest one that is."""
+    if valid.all() or not valid.any():
         return picture
     _, labels = cv2.distanceTransformWithLabels(
-        (~known).astype(np.uint8), cv2.DIST_L1, 3, labelType=cv2.DIST_LABEL_PIXEL
+        (~valid).astype(np.uint8), cv2.DIST_L1, 3, labelType=cv2.DIST_LABEL_PIXEL
     )
     nearest = np.zeros(int(labels.max()) + 1, np.int64)
-    nearest[labels[known]] = np.flatnonzero(known)
+    nearest[labels[valid]] = np.flatnonzero(valid)
     return np.asarray(picture.reshape(-1, 3)[nearest[labels]])

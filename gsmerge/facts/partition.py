@@ -81,8 +81,8 @@ def measure_covisibility(scene: Scene) -> Covisibility:
         return np.where(valid[view] & (z > 0), z, np.inf)
 
     depths = np.stack(parallel_map(one_depth, range(len(scene)))).reshape(-1, len(rows), len(columns))
-    some = slice(None, None, max(1, len(picked) // SAMPLES))
-    samples = [means[view, some][valid[view, some]] for view in range(len(scene))]
+    stride = slice(None, None, max(1, len(picked) // SAMPLES))
+    samples = [means[view, stride][valid[view, stride]] for view in range(len(scene))]
 
     def one_view(points: np.ndarray) -> np.ndarray:
         return see(points, cameras, depths)[0].mean(1) if len(points) else np.zeros(len(scene))
@@ -132,10 +132,10 @@ def partition_views(weights: np.ndarray, count: int, shared: float = SHARED) -> 
     labels = exchange(weights, grow_blocks(weights, count))
     blocks = []
     for label in range(count):
-        own = np.flatnonzero(labels == label)
-        seen = np.where(labels == label, 0, weights[own].sum(0))
-        nearest = np.argsort(-seen, kind="stable")[: round(shared * len(own))]
-        blocks.append(Block(tuple(own.tolist()), tuple(sorted(nearest[seen[nearest] > 0].tolist()))))
+        members = np.flatnonzero(labels == label)
+        seen = np.where(labels == label, 0, weights[members].sum(0))
+        nearest = np.argsort(-seen, kind="stable")[: round(shared * len(members))]
+        blocks.append(Block(tuple(members.tolist()), tuple(sorted(nearest[seen[nearest] > 0].tolist()))))
     return blocks
 
 
@@ -171,9 +171,9 @@ def exchange(weights: np.ndarray, labels: np.ndarray) -> np.ndarray:
         moved = False
         for view in range(len(labels)):
             ties = np.bincount(labels, weights[view], count)
-            sizes, own = np.bincount(labels, minlength=count), labels[view]
-            free = (sizes < most) & (ties > ties[own])
-            if sizes[own] > max(1, least) and free.any():
+            sizes, label = np.bincount(labels, minlength=count), labels[view]
+            free = (sizes < most) & (ties > ties[label])
+            if sizes[label] > max(1, least) and free.any():
                 labels[view] = int(np.where(free, ties, -np.inf).argmax())
                 moved = True
         if not moved:

@@ -110,7 +110,7 @@ def canonicalise(scene: Scene, frame: Frame | None = None) -> tuple[Scene, Frame
 class Prepared:
     """Facts about a scene, and the scene as the stages work on it."""
 
-    given: Scene  # The scene as it was given, in its own world frame, with photos that look as its Gaussians
+    input_scene: Scene  # The scene as it was given, in its own world frame, with photos that look as its Gaussians
     # The canonical scene: every view once, photos that do not show it replaced; an unaligned one
     # has cameras, pictures and only finite Gaussians that are seen, or all if none is set aside
     scene: Scene
@@ -128,14 +128,14 @@ class Prepared:
 
     def result_views(self) -> Scene:
         """Return the given scene with the photos as a result is to show them: in one exposure, if they were changed."""
-        return _with_photos(self.given, self.scene, self.repeated)
+        return _with_photos(self.input_scene, self.scene, self.repeated)
 
     def final_cameras(self) -> Cameras:
         """Return the given views' cameras as the result was made from them, in the world."""
-        given = self.given.cameras
+        cameras = self.input_scene.cameras
         if not self.moved:
-            return given
-        return replace(given, viewmats=self.frame.leave_cameras(self.scene.cameras).viewmats[list(self.repeated)])
+            return cameras
+        return replace(cameras, viewmats=self.frame.leave_cameras(self.scene.cameras).viewmats[list(self.repeated)])
 
 
 @stage("prepare")
@@ -147,20 +147,20 @@ def prepare(scene: Scene, options: PrepareOptions | None = None, frame: Frame | 
     """
     options = options or PrepareOptions()
     views, repeated = distinct_views(scene)
-    own = scene
+    distinct = scene
     if len(views) < len(scene):
-        own = subset(scene, views)
+        distinct = subset(scene, views)
         note(f"{len(scene) - len(views)} views repeat others in every pixel and count once")
-    canonical, frame = canonicalise(add_views(own), frame)
+    canonical, frame = canonicalise(add_views(distinct), frame)
     compared, photo_views = compare_photos(canonical)
-    given = _with_photos(scene, compared, repeated)
+    input_scene = _with_photos(scene, compared, repeated)
     checked = equalise_exposure(compared, photo_views, options.exposure)
     placed = checked
     if checked.aligned and checked.images is not None and options.poses != "fixed":
         placed = align_views(checked, photo_views, always=options.poses == "free") or checked
     seen, unseen = _split_unseen(placed) if options.unseen == "keep" else (placed, None)
     shown = seen if seen.aligned else add_pictures(seen)  # pixels that are known have colours of their own
-    return Prepared(given, shown, frame, photo_views, tuple(repeated), placed is not checked, unseen)
+    return Prepared(input_scene, shown, frame, photo_views, tuple(repeated), placed is not checked, unseen)
 
 
 def photos_count_as_they_are(scene: Scene) -> bool:
@@ -173,12 +173,12 @@ def photos_count_as_they_are(scene: Scene) -> bool:
         return equalise_exposure(compared, views, "auto").images is canonical.images
 
 
-def _with_photos(given: Scene, own: Scene, repeated: Sequence[int]) -> Scene:
+def _with_photos(scene: Scene, source: Scene, repeated: Sequence[int]) -> Scene:
     """Return the given scene with the photos and masks of its distinct views; itself where they are its own."""
-    if own.images is None or given.images is None or (own.images is given.images and own.masks is given.masks):
-        return given
-    images, masks = (None if some is None else some[list(repeated)] for some in (own.images, own.masks))
-    return replace(given, images=images, masks=masks)
+    if source.images is None or scene.images is None or (source.images is scene.images and source.masks is scene.masks):
+        return scene
+    images, masks = (None if array is None else array[list(repeated)] for array in (source.images, source.masks))
+    return replace(scene, images=images, masks=masks)
 
 
 def _split_unseen(scene: Scene) -> tuple[Scene, Gaussians | None]:

@@ -68,22 +68,22 @@ def distinct_views(scene: Scene) -> tuple[list[int], list[int]]:
     kinds = camera_kinds(scene.cameras)
     kept, places = list[int](), list[int]()
     for view, kind in enumerate(kinds):
-        equal = (i for i, one in enumerate(kept) if kinds[one] == kind and _equal_views(scene, one, view))
+        equal = (i for i, other in enumerate(kept) if kinds[other] == kind and _equal_views(scene, other, view))
         places.append(next(equal, len(kept)))
         if places[-1] == len(kept):
             kept.append(view)
     return kept, places
 
 
-def _equal_views(scene: Scene, one: int, other: int) -> bool:
+def _equal_views(scene: Scene, first: int, second: int) -> bool:
     """Return whether two views of one camera have the same photo, mask and Gaussians."""
     for pictures in (scene.images, scene.masks):
-        if pictures is not None and not np.array_equal(pictures[one], pictures[other]):
+        if pictures is not None and not np.array_equal(pictures[first], pictures[second]):
             return False
     if not scene.aligned:
         return True
     size = scene.pixels_per_view
-    a, b = (vars(scene.gaussians[view * size : (view + 1) * size]) for view in (one, other))
+    a, b = (vars(scene.gaussians[view * size : (view + 1) * size]) for view in (first, second))
     return all(np.array_equal(a[name], b[name]) for name in a)
 
 

@@ -181,4 +181,4 @@ def start_poses(photos: tuple[Photos, ...]) -> tuple[PoseState, tuple[Photos, ..
     zero, shared = np.zeros((len(start), 6)), start.copy()
     pixel = 1 / float(photos[0].Ks[:, [0, 1], [0, 1]].mean())
     state = PoseState(start, shared, zero, zero.copy(), zero.copy(), np.zeros(len(start), np.int64), pixel)
-    return state, tuple(replace(some, viewmats=shared) for some in photos)
+    return state, tuple(replace(level, viewmats=shared) for level in photos)

@@ -41,8 +41,8 @@ def fit_full(
     survey = engine.survey(gaussians) if survey is None else survey
     start.box_shares[:], start.min_sizes[:] = limit_moves(survey, options.tuning)
     moving = engine.at_poses(job.photos[0].viewmats) if options.move_cameras else engine
-    state, own, judged = moving.start(start), survey.score, not options.judged
-    before = after = own
+    state, start_score, judged = moving.start(start), survey.score, not options.judged
+    before = after = start_score
     step, steps, error, grows = 0, options.steps, 0.0, options.grows
     if options.time_budget is not None:
         moving.warm_up(state)
@@ -50,7 +50,7 @@ def fit_full(
     while step < steps:
         part = step / steps
         if part >= plan.half_part and not judged:  # before growth: halves that were never fitted show less
-            (before, after), judged = judge(state, own, engine, moving), True
+            (before, after), judged = judge(state, start_score, engine, moving), True
             if after <= before:
                 break
         if grows and part >= GROWTH and len(state.x) < job.count:
@@ -69,7 +69,7 @@ def fit_full(
         if job.progress and (step % moving.read_every == 0 or step == steps):
             job.progress(step, steps, decibels(float(error)), after)
     if not judged:
-        before, after = judge(state, own, engine, moving)
+        before, after = judge(state, start_score, engine, moving)
     if options.judged and after <= before:
         why = f"held-out parts of the photos were no better after {step} steps"
         return gaussians, FitReport("none", False, step, before, after, why, origins=np.arange(len(gaussians)))
@@ -95,18 +95,18 @@ def limit_moves(survey: Survey, rates: Tuning) -> tuple[np.ndarray, np.ndarray]:
     return box_shares, log(rates.min_scale * pixels).astype(np.float32)
 
 
-def judge(state: Array, own: float, engine: Engine, moving: Engine) -> tuple[float, float]:
+def judge(state: Array, start_score: float, engine: Engine, moving: Engine) -> tuple[float, float]:
     """Return the PSNR (dB) of the held-out blocks that a fit has to beat, and its own.
 
-    To beat are ``own``, of its start, or a worse baseline: networks learn to show whole photos, and a
+    To beat are ``start_score``, of its start, or a worse baseline: networks learn to show whole photos, and a
     fit to the other blocks then makes the held-out ones worse and new views better. The baseline is
     looked at only where the fit does not beat its start, with the cameras as they were: those of
     ``engine``, not those of ``moving``.
     """
     after, baseline_start = moving.score(state), engine.plan.job.baseline_start
-    if baseline_start is None or after > own:
-        return own, after
-    return min(own, engine.score(engine.start(start_state(baseline_start)))), after
+    if baseline_start is None or after > start_score:
+        return start_score, after
+    return min(start_score, engine.score(engine.start(start_state(baseline_start)))), after
 
 
 def grow_state(state: Array, engine: Engine) -> Array:

@@ -53,8 +53,8 @@ def outside_views(start: Splats, photos: Photos, options: FitOptions) -> Photos 
         return None
     cameras = Cameras(photos.viewmats, photos.Ks, photos.width, photos.height)
     looks = math.ceil(options.steps * (1 - options.tuning.outside_from) / options.tuning.outside_every)
-    some = start.means[:: max(1, len(start) // SAMPLE)] + start.origin
-    placed = _place_cameras(some, cameras, min(looks, max(PLACES, len(photos))))
+    points = start.means[:: max(1, len(start) // SAMPLE)] + start.origin
+    placed = _place_cameras(points, cameras, min(looks, max(PLACES, len(photos))))
     views = blank_photos(placed, min(2, photos.width / LEAST_WIDTH))
 
     def mark(view: int) -> np.ndarray:

@@ -102,8 +102,8 @@ def training_weights(photos: Photos, share: float, seed: int) -> list[np.ndarray
         full = np.repeat(np.repeat(~blocks, size, 0), size, 1)[: photos.height, : photos.width]
         if photos.weights is None:
             return full.astype(np.float32)
-        own = photos.weights[view]
-        return np.where(own == 1, full.astype(np.float32), np.maximum(own, HIDDEN))
+        weights = photos.weights[view]
+        return np.where(weights == 1, full.astype(np.float32), np.maximum(weights, HIDDEN))
 
     return [one_view(view) for view in range(len(photos))]
 

@@ -113,7 +113,7 @@ def plan_run(job: FitJob) -> FitPlan:
     default = DROPOUT if few else LONG_DROPOUT if long else 0.0
     dropout = default if options.dropout is None else options.dropout
     weights = full, reduced(full, photos[1])
-    everywhere, *larger = (_weights_of(one) for one in (photos[0], *photos[2:]))
+    everywhere, *larger = (_weights_of(level) for level in (photos[0], *photos[2:]))
     trained = [np.where(weight == HIDDEN, np.float32(0), weight) for weight in weights[1]]
     if len(photos[0]) == 1:  # no other photo shows what is held out: the fit is judged by all that it sees
         weights = weights[0], [np.where(weight == 1, np.float32(0), weight) for weight in weights[1]]

@@ -53,7 +53,7 @@ def _by_ending(root: Path, files: Sequence[Path]) -> dict[str, list[Path]]:
 def _endings(path: PurePath) -> list[str]:
     """List every ending of a path, the longest first, with and without its extension."""
     endings = [PurePosixPath(*path.parts[i:]) for i in range(len(path.parts))]
-    return list(dict.fromkeys(str(some) for ending in endings for some in (ending, ending.with_suffix(""))))
+    return list(dict.fromkeys(str(name) for ending in endings for name in (ending, ending.with_suffix(""))))
 
 
 def _lookup(root: Path, by_ending: dict[str, list[Path]], name: str, option: str = "--images") -> Path | None:

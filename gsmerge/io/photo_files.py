@@ -128,9 +128,9 @@ def photo_size(photos: Photos | None) -> Size | None:
     return photos[0].shape[1], photos[0].shape[0]
 
 
-def same_shape(one: Size, other: Size) -> bool:
+def same_shape(size: Size, other: Size) -> bool:
     """Return whether two sizes have the same shape, except for rounding."""
-    return abs(one[0] * other[1] / (one[1] * other[0]) - 1) <= ASPECT_TOLERANCE
+    return abs(size[0] * other[1] / (size[1] * other[0]) - 1) <= ASPECT_TOLERANCE
 
 
 def decode_mask(path: Path) -> np.ndarray:

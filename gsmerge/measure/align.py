@@ -138,7 +138,7 @@ def refine_pose(
             continue
         unit = float(np.median(depth[depth > 0]))
         doubt = target.doubt(first)
-        best = first if viewmat is start else min(first, target.try_pose(viewmat), key=lambda one: one.error(doubt))
+        best = first if viewmat is start else min(first, target.try_pose(viewmat), key=lambda trial: trial.error(doubt))
         ends = first, _descend(target, best, unit, doubt)
         viewmat = ends[1].viewmat
     if ends and ends[1].squares.sum(dtype=np.float64) >= ends[0].squares.sum(dtype=np.float64):
@@ -191,13 +191,13 @@ def _curvature(target: _Target, trial: _Trial, unit: float, doubt: float) -> np.
     fx, fy, cx, cy = target.K[0, 0], target.K[1, 1], target.K[0, 2], target.K[1, 2]
     rays = np.stack([(x + 0.5 - cx) / fx, (y + 0.5 - cy) / fy], 1)
     a, b, c = (rays[:, 0] * z, rays[:, 1] * z, z) - _in_camera(target.centre, trial.viewmat)[:, None]
-    zero, one = np.zeros_like(z), np.full_like(z, unit)
-    forward = np.stack([b, -a, zero, zero, zero, one], 1)  # how z changes with the six numbers
-    right = np.stack([zero, c, -b, one, zero, zero], 1) - rays[:, :1] * forward
-    down = np.stack([-c, zero, a, zero, one, zero], 1) - rays[:, 1:] * forward
+    zero, units = np.zeros_like(z), np.full_like(z, unit)
+    forward = np.stack([b, -a, zero, zero, zero, units], 1)  # how z changes with the six numbers
+    right = np.stack([zero, c, -b, units, zero, zero], 1) - rays[:, :1] * forward
+    down = np.stack([-c, zero, a, zero, units, zero], 1) - rays[:, 1:] * forward
     right, down = right * (fx / z)[:, None], down * (fy / z)[:, None]  # pixels
     weights = 2 * trial.weights(doubt)[y, x].astype(np.float64)[:, None]
-    xx, xy, yy = (weights * (one * other).sum(1)[:, None] for one, other in ((dx, dx), (dx, dy), (dy, dy)))
+    xx, xy, yy = (weights * (first * second).sum(1)[:, None] for first, second in ((dx, dx), (dx, dy), (dy, dy)))
     return matmul(right.T, xx * right + xy * down) + matmul(down.T, xy * right + yy * down)
 
 

@@ -101,7 +101,7 @@ def step_back(cameras: Cameras, depth: float, back: float) -> Cameras:
     """Move cameras backwards by a share ``back`` of the ``depth`` of what they show, world units."""
     if not back:
         return cameras
-    return replace(cameras, viewmats=np.stack([step_outside(one, depth, back) for one in cameras.viewmats]))
+    return replace(cameras, viewmats=np.stack([step_outside(viewmat, depth, back) for viewmat in cameras.viewmats]))
 
 
 def outside_camera(cameras: Cameras, means: np.ndarray) -> tuple[Cameras, float]:
@@ -169,7 +169,7 @@ def wide_orbit(cameras: Cameras, depth: float, count: int, turn: float) -> Camer
 
     def turned(angles: np.ndarray) -> np.ndarray:
         turns = turn * np.stack([sin(angles), cos(angles) / 2], 1)
-        return np.stack([step_outside(cameras.viewmats[middle], depth, 0, *one) for one in turns])
+        return np.stack([step_outside(cameras.viewmats[middle], depth, 0, *vector) for vector in turns])
 
     angles = np.linspace(0, 2 * np.pi, TURN + 1)
     even = _at_equal_steps(camera_centres(turned(angles)), angles, np.arange(count) / count)

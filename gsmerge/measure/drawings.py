@@ -93,7 +93,7 @@ class Framed:
 
     def counts(self) -> dict[str, int]:
         """Return the number of Gaussians of every scene by its path."""
-        return {str(path): len(one) for path, one in self.scenes}
+        return {str(path): len(gaussians) for path, gaussians in self.scenes}
 
     def draw(
         self, cameras: Cameras, options: DrawOptions, threads: int, near: float = 0.01
@@ -101,8 +101,8 @@ class Framed:
         """Yield the pictures ``[h,w,3]`` of all scenes from each camera, with as many views in memory as threads."""
         grey, antialiased = options.background, options.antialiased
         drawn = (
-            render_in_turn(one, cameras, grey, at_once=threads, antialiased=antialiased, near=near)
-            for _, one in self.scenes
+            render_in_turn(gaussians, cameras, grey, at_once=threads, antialiased=antialiased, near=near)
+            for _, gaussians in self.scenes
         )
         return zip(*drawn, strict=True)
 
@@ -123,11 +123,11 @@ def plan_panel(options: DrawOptions) -> Drawing:
     ids = options.choose(len(used), PANEL_VIEWS)
 
     def draw(_: int) -> Iterator[Picture]:
-        parts = [(path.name, one) for path, one in framed.scenes]
-        own = None if photos is None else photos[used]
+        parts = [(path.name, gaussians) for path, gaussians in framed.scenes]
+        view_photos = None if photos is None else photos[used]
         how = {"background": options.background, "antialiased": options.antialiased}
-        rows = view_pictures(parts, cameras, own, max_views=len(ids), **how)
-        yield contact_sheet([*rows, outside_pictures(parts, cameras, photos=own is not None, **how)])
+        rows = view_pictures(parts, cameras, view_photos, max_views=len(ids), **how)
+        yield contact_sheet([*rows, outside_pictures(parts, cameras, photos=view_photos is not None, **how)])
 
     facts = {"scenes": framed.counts(), "views": ids, "photos": photos is not None, "notes": framed.notes}
     return Drawing([options.output], facts, draw)
@@ -149,7 +149,7 @@ def plan_pictures(options: DrawOptions) -> Drawing:
 def plan_frames(options: DrawOptions) -> Drawing:
     """Plan a video, or its frames as pictures, of the scenes side by side along a path."""
     framed, cameras, near, ids = _path_cameras(options)
-    labels = [f"{path.name}: {len(one):,}" for path, one in framed.scenes]
+    labels = [f"{path.name}: {len(gaussians):,}" for path, gaussians in framed.scenes]
 
     def draw(threads: int) -> Iterator[Picture]:
         for images in framed.draw(cameras, options, threads, near):
@@ -166,16 +166,16 @@ def _path_cameras(options: DrawOptions) -> tuple[Framed, Cameras, float, list[in
     """Read the scenes and make the cameras of the path; also return its near plane, and the views that it uses."""
     assert options.path is not None
     path = parse_path(options.path)
-    file, own = None if path else Path(options.path), True
+    file, separate = None if path else Path(options.path), True
     try:
         check_cameras(options.like)
     except SceneError:
         if file is None:
             raise
-        options, own = replace(options, like=replace(options.like, cameras=file)), False
+        options, separate = replace(options, like=replace(options.like, cameras=file)), False
     framed = _read(options, photos=False)
     placed = framed.load.views.cameras
-    cameras = placed if file is None or not own else _place_file(file, framed.load)
+    cameras = placed if file is None or not separate else _place_file(file, framed.load)
     ids = options.choose(len(cameras))
     cameras = cameras[ids]
     depth = viewing_depth(cameras if file is None else placed, framed.scenes[0][1].means)
@@ -229,14 +229,14 @@ def _read(options: DrawOptions, *, photos: bool) -> Framed:
     files, like, paths = options.files, options.like, options.paths
     check_cameras(like)
     first = read_rows(files, opacity=options.opacity, hints=options.hints)
-    others = [read_gaussians(path, opacity=options.opacity) for path in paths[1:]]
-    own = like.ply == files.ply
-    framed = first if own else read_rows(like, opacity="auto", hints=AUTO)
+    plys = [read_gaussians(path, opacity=options.opacity) for path in paths[1:]]
+    same_file = like.ply == files.ply
+    framed = first if same_file else read_rows(like, opacity="auto", hints=AUTO)
     load = place_cameras_in_scene(framed, like, hints=options.hints, photos=photos)
-    scenes = [load.scene.file_gaussians if own else first.gaussians, *(ply.gaussians for ply in others)]
-    notes = [[*([] if own else file_notes(first.info)), *load.notes], *(file_notes(ply.info) for ply in others)]
-    named = [f"{path}: {note}" for path, some in zip(paths, notes, strict=True) for note in some]
-    return Framed(list(zip(paths, scenes, strict=True)), named if others else list(notes[0]), load)
+    scenes = [load.scene.file_gaussians if same_file else first.gaussians, *(ply.gaussians for ply in plys)]
+    notes = [[*([] if same_file else file_notes(first.info)), *load.notes], *(file_notes(ply.info) for ply in plys)]
+    named = [f"{path}: {note}" for path, texts in zip(paths, notes, strict=True) for note in texts]
+    return Framed(list(zip(paths, scenes, strict=True)), named if plys else list(notes[0]), load)
 
 
 def picture_stems(names: Sequence[str]) -> list[str]:
@@ -245,8 +245,8 @@ def picture_stems(names: Sequence[str]) -> list[str]:
     for name in names:
         parts = [part for part in re.split(r"[\\/]+", name) if part not in ("", ".", "..")] or ["view"]
         stem, dot, suffix = parts[-1].rpartition(".")
-        known = stem and f"{dot}{suffix}".lower() in IMAGE_SUFFIXES
-        paths.append([*parts[:-1], stem if known else parts[-1]])
+        is_image = stem and f"{dot}{suffix}".lower() in IMAGE_SUFFIXES
+        paths.append([*parts[:-1], stem if is_image else parts[-1]])
     numbers = [[f"view_{i:03d}"] for i in range(len(names))]
     for candidates in ([path[-1:] for path in paths], paths, numbers):
         stems = ["_".join(path) for path in candidates]

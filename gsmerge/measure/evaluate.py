@@ -133,8 +133,8 @@ class _Split:
 
     def under(self, cameras: Cameras | None) -> _Split:
         """Move the views to a result's own cameras; renders of the input are shown from the given cameras."""
-        own = self.views.cameras if cameras is None or self.drawn is not None else cameras
-        return replace(self, views=replace(self.views, cameras=own))
+        view_cameras = self.views.cameras if cameras is None or self.drawn is not None else cameras
+        return replace(self, views=replace(self.views, cameras=view_cameras))
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,21 +188,21 @@ def evaluate(
         raise UsageError("expected a scene with views, got none")
     if options.align and targets is None:
         raise UsageError("align: expected held-out views, got none")
-    own, results = scene.file_gaussians, {name: gaussians.numpy() for name, gaussians in results.items()}
+    inputs, results = scene.file_gaussians, {name: gaussians.numpy() for name, gaussians in results.items()}
     if targets is not None:
         targets = replace(targets, cameras=targets.cameras.numpy(), images=as_array(targets.images))
         targets = shrink_views(targets, options.photo_side)
-    cameras = {name: shrink_cameras(one.numpy(), options.photo_side) for name, one in cameras.items()}
+    cameras = {name: shrink_cameras(moved.numpy(), options.photo_side) for name, moved in cameras.items()}
     with use_threads(options.threads):
         frame = scene_frame(scene)
         renderer = _Renderer(NEAR * frame.unit, frame.origin, options)
-        splits, scores = _splits(scene, own, targets, renderer), []
-        named = {INPUT: own, **results} if options.own else results
-        fog = measure_fog(own, results, scene.cameras, renderer.near) if options.fog and results else {}
-        renderer.image(own[:1], scene.cameras, 0)  # loads the kernels, so that no result's time contains that
+        splits, scores = _splits(scene, inputs, targets, renderer), []
+        named = {INPUT: inputs, **results} if options.own else results
+        fog = measure_fog(inputs, results, scene.cameras, renderer.near) if options.fog and results else {}
+        renderer.image(inputs[:1], scene.cameras, 0)  # loads the kernels, so that no result's time contains that
         for i, (name, gaussians) in enumerate(named.items()):
-            mine = {kind: one.under(cameras.get(name)) if kind == "context" else one for kind, one in splits.items()}
-            score = _score_result(name, gaussians, len(own), mine, renderer, on_image)
+            mine = {kind: part.under(cameras.get(name)) if kind == "context" else part for kind, part in splits.items()}
+            score = _score_result(name, gaussians, len(inputs), mine, renderer, on_image)
             scores.append(replace(score, fog=fog.get(name, {})))
             if progress:
                 progress("evaluate", i + 1, len(named))
@@ -222,10 +222,10 @@ def _notes(scene: Scene, splits: Mapping[str, _Split], scores: Sequence[ResultSc
     """Name results that are worse than the input where it matters, and say what figures may mislead about."""
     photos = scene.images is not None and "context" in splits
     mended = photos and not photos_count_as_they_are(scene)
-    psnrs = {one.name: one.mean("context")[0].psnr for one in scores}
+    psnrs = {score.name: score.mean("context")[0].psnr for score in scores}
     if photos and INPUT in psnrs and not mended:
         yield from filter(None, (describe_loss(name, psnrs[INPUT], psnr) for name, psnr in psnrs.items()))
-    yield from filter(None, (describe_fog(one.name, one.fog[ALL]) for one in scores if one.fog))
+    yield from filter(None, (describe_fog(score.name, score.fog[ALL]) for score in scores if score.fog))
     if "target" not in splits:
         yield "no held-out views were given: input views flatter what was fitted to them"
     elif (share := splits["target"].visible.mean()) < MIN_SEEN_SHARE:
@@ -234,7 +234,7 @@ def _notes(scene: Scene, splits: Mapping[str, _Split], scores: Sequence[ResultSc
         yield MENDED
 
 
-def _splits(scene: Scene, own: Gaussians, targets: Views | None, renderer: _Renderer) -> dict[str, _Split]:
+def _splits(scene: Scene, inputs: Gaussians, targets: Views | None, renderer: _Renderer) -> dict[str, _Split]:
     """Split the views into input and held-out views, with photos or the input's renders, and visible pixels."""
     side = renderer.options.photo_side
     cameras = shrink_cameras(scene.cameras, side)
@@ -253,8 +253,8 @@ def _splits(scene: Scene, own: Gaussians, targets: Views | None, renderer: _Rend
     if scene.images is not None:
         views = shrink_views(Views(scene.cameras, scene.images, scene.names), side)
     else:
-        views = Views(cameras, np.stack([renderer.image(own, cameras, i) for i in range(len(scene))]), scene.names)
-    return {"context": split(views, own if scene.images is None else None, scene.masks), **target}
+        views = Views(cameras, np.stack([renderer.image(inputs, cameras, i) for i in range(len(scene))]), scene.names)
+    return {"context": split(views, inputs if scene.images is None else None, scene.masks), **target}
 
 
 def _score_result(
@@ -277,7 +277,7 @@ def _score_result(
             seen, nets = split.visible[i], options.lpips if i in perceptual else ()
             both = _both(image, views.images[i], seen, nets)
             sizes = () if options.zoom == (1,) else options.zoom
-            full, masked = (replace(one, lpips_vgg=None, lpips_alex=None) for one in both)
+            full, masked = (replace(quality, lpips_vgg=None, lpips_alex=None) for quality in both)
             zooms = {
                 zoom: (full, masked) if zoom == 1 else _score_zoom(gaussians, split, i, zoom, renderer)
                 for zoom in sizes
@@ -345,5 +345,5 @@ def _quality(image: np.ndarray, photo: np.ndarray, mask: NDArray[np.bool_] | Non
 
 
 def _mean(scores: Sequence[Quality]) -> Quality:
-    columns = {f.name: [v for one in scores if (v := getattr(one, f.name)) is not None] for f in fields(Quality)}
+    columns = {f.name: [v for score in scores if (v := getattr(score, f.name)) is not None] for f in fields(Quality)}
     return Quality(**{name: float(np.mean(values)) if values else None for name, values in columns.items()})

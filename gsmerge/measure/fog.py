@@ -47,16 +47,16 @@ class Fog:
 
 
 def measure_fog(
-    given: Gaussians, results: Mapping[str, Gaussians], cameras: Cameras, near: float = 0.01
+    reference: Gaussians, results: Mapping[str, Gaussians], cameras: Cameras, near: float = 0.01
 ) -> dict[str, dict[str, Fog]]:
-    """Measure fog and holes of the results of a scene ``given``, by name, from outside of the ``cameras`` of its views.
+    """Measure fog and holes of the results of a scene, ``reference``, by name, from outside of its ``cameras``.
 
     Returns one :class:`Fog` by name of the result and kind of camera, of :data:`CAMERAS` and "all"; its figures are
     means over the pixels of all pictures of the kind. ``near`` is the near plane of the pictures, world units.
     """
-    first, splats = prepare(given), {name: prepare(one) for name, one in results.items()}
+    first, splats = prepare(reference), {name: prepare(result) for name, result in results.items()}
     sums = {name: {kind: np.zeros((3, 2)) for kind in CAMERAS} for name in results}
-    for kind, camera in outside_cameras(given, cameras):
+    for kind, camera in outside_cameras(reference, cameras):
         shown = draw_opacity(first, camera, near)
         for name in results:
             sums[name][kind] += fog_sums(shown, draw_opacity(splats[name], camera, near))
@@ -75,12 +75,12 @@ def describe_fog(name: str, fog: Fog) -> str | None:
     )
 
 
-def outside_cameras(given: Gaussians, cameras: Cameras) -> Iterator[tuple[str, Cameras]]:
+def outside_cameras(gaussians: Gaussians, cameras: Cameras) -> Iterator[tuple[str, Cameras]]:
     """Yield kind and camera of each picture."""
     cameras = shrink_cameras(cameras, SIDE)
     for view in pick_views(len(cameras), VIEWS):
         camera = cameras[[view]]
-        depth = middle_depth(given.means, camera)
+        depth = middle_depth(gaussians.means, camera)
         for kind, places in CAMERAS.items():
             for back, turn in places:
                 viewmat = step_outside(camera.viewmats[0], depth, back, turn)
@@ -94,10 +94,10 @@ def draw_opacity(splats: Splats, camera: Cameras, near: float) -> np.ndarray:
     return 1 - blend(plan, black[1:], black[0])[1]
 
 
-def fog_sums(given: np.ndarray, result: np.ndarray) -> np.ndarray:
+def fog_sums(reference: np.ndarray, result: np.ndarray) -> np.ndarray:
     """Return sum and number of pixels ``[3,2]`` of near fog, far fog and holes, of opacities ``[h,w]``."""
-    empty, solid = (given < EMPTY).astype(np.uint8), given > SOLID
-    sides = MARGIN, max(MARGIN, 2 * round(FAR * given.shape[1]) + 1)
+    empty, solid = (reference < EMPTY).astype(np.uint8), reference > SOLID
+    sides = MARGIN, max(MARGIN, 2 * round(FAR * reference.shape[1]) + 1)
     masks = [cv2.erode(empty, np.ones((side, side), np.uint8)) > 0 for side in sides]
     fog = [(float(result[mask].sum(dtype=np.float64)), float(mask.sum())) for mask in masks]
     return np.array([*fog, (float((result[solid] < OPEN).sum()), float(solid.sum()))])

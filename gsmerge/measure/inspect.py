@@ -117,11 +117,11 @@ def _photo_notes(scene: Scene) -> list[str]:
 
 
 def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> dict[str, Any]:
-    own = LOGIT_COMMENT in ply.info.comments
+    is_result = LOGIT_COMMENT in ply.info.comments
     facts: dict[str, Any] = {
         "cameras": files.cameras and str(files.cameras),
         "images": files.images and str(files.images),
-        "exporter": _OWN if own else "not known before the cameras fit",
+        "exporter": _OWN if is_result else "not known before the cameras fit",
         "notes": file_notes(ply.info),
         **dict.fromkeys(("num_views", "width", "height", "per_pixel", "num_missing", "num_sky_views"), 0),
         **dict.fromkeys(("camera_format", "rows", "alignment", "alignment_problem", "sight", "compact")),
@@ -147,7 +147,7 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
     facts |= {"camera_format": load.cameras and load.cameras.source}
     facts |= {"coverage": coverage(scene), "sight": sight and asdict(sight)}
     facts |= {"num_sky_views": num_sky_views, "compact": estimate(scene, CompactOptions())}
-    if not own:
+    if not is_result:
         facts["exporter"] = exporter_names(load.exporters)
     if load.recovery is None or load.alignment is None:
         return facts | {"alignment_problem": load.problem}
@@ -257,12 +257,12 @@ def estimate_lines(run: Mapping[str, Any]) -> list[str]:
     superpixels = "superpixels where the scene needs them"
     if per_view is not None:
         superpixels = f"{per_view:,} superpixels per view, {run['k']} Gaussian(s) each"
-    own = f"{superpixels}; merging across views: {run['match']}; networks: {run['checkpoint']}"
+    method = f"{superpixels}; merging across views: {run['match']}; networks: {run['checkpoint']}"
     return [
         f"compact    at most {run['num_gaussians']:,} Gaussians ({100 * run['ratio']:.1f} %),"
         f" {human_bytes(run['bytes'])} as .ply, in about {run['seconds']:g} s with {run['memory_bytes'] / 1e9:g} GB of"
         " memory" + (f", in {run['blocks']} blocks" if run["blocks"] > 1 else ""),
-        f"method     {own if run['method'] == 'gsmerge' else run['method']}; fit: {run['fit']}",
+        f"method     {method if run['method'] == 'gsmerge' else run['method']}; fit: {run['fit']}",
         *([f"memory     {run['memory_problem']}"] if run["memory_problem"] else []),
     ]
 

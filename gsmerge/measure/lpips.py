@@ -148,11 +148,11 @@ def read_layers(net: str) -> tuple[Layer, ...]:
     return _load(require_lpips(net), net)
 
 
-def _weighted(units: Iterable[np.ndarray], others: Iterable[np.ndarray], layers: tuple[Layer, ...]) -> float:
+def _weighted(units: Iterable[np.ndarray], other_units: Iterable[np.ndarray], layers: tuple[Layer, ...]) -> float:
     """Weight squared differences of unit features, average over pixels, and add up (equation 1 of Zhang et al.)."""
     distance = 0.0
     compared = [layer.weights for layer in layers if layer.weights is not None]
-    for weights, unit, other in zip(compared, units, others, strict=True):
+    for weights, unit, other in zip(compared, units, other_units, strict=True):
         means = np.square(unit - other).mean((0, 1), dtype=np.float64)
         distance += float((means * weights).sum())
     return distance

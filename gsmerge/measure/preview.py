@@ -93,7 +93,7 @@ def outside_pictures(
     Every render ``[h,w,3]`` comes with its name. With ``photos`` a white picture comes first, in the photos' column.
     """
     camera, _ = outside_camera(cameras, scenes[0][1].means)
-    renders = [(f"{name}: {OUTSIDE}", render(some, camera, **drawing).images[0].clip(0, 1)) for name, some in scenes]
+    renders = [(f"{name}: {OUTSIDE}", render(scene, camera, **drawing).images[0].clip(0, 1)) for name, scene in scenes]
     return [(f"{OUTSIDE}: no photo", np.ones_like(renders[0][1]))] * photos + renders
 
 

@@ -44,21 +44,21 @@ def evaluation_document(
         **({"photo_side": evaluation.options.photo_side} if evaluation.options.photo_side else {}),
         **({"antialiased": True} if evaluation.options.antialiased else {}),
         "num_views": dict(evaluation.num_views),
-        "results": [_result(one, evaluation, facts.get(one.name, {})) for one in evaluation.results],
+        "results": [_result(result, evaluation, facts.get(result.name, {})) for result in evaluation.results],
         "notes": [*notes, *evaluation.notes],
     }
 
 
-def _result(one: ResultScores, evaluation: Evaluation, facts: Mapping[str, Any]) -> dict[str, Any]:
+def _result(result: ResultScores, evaluation: Evaluation, facts: Mapping[str, Any]) -> dict[str, Any]:
     return {
-        "name": one.name,
+        "name": result.name,
         **facts,
-        "num_gaussians": one.num_gaussians,
-        "ratio": one.ratio,
-        "render_seconds": round(one.render_seconds, 5),
-        **asdict(one.fog.get(ALL, Fog())),
-        "fog_by_kind": {kind: asdict(fog) for kind, fog in one.fog.items() if kind != ALL},
-        "mean": {split: _mean(one, split, evaluation) for split in evaluation.num_views},
+        "num_gaussians": result.num_gaussians,
+        "ratio": result.ratio,
+        "render_seconds": round(result.render_seconds, 5),
+        **asdict(result.fog.get(ALL, Fog())),
+        "fog_by_kind": {kind: asdict(fog) for kind, fog in result.fog.items() if kind != ALL},
+        "mean": {split: _mean(result, split, evaluation) for split in evaluation.num_views},
         "views": [
             {
                 "split": s.split,
@@ -68,19 +68,19 @@ def _result(one: ResultScores, evaluation: Evaluation, facts: Mapping[str, Any])
                 **_zooms(s.zooms),
                 **_aligned(s.aligned, s.pose_change),
             }
-            for s in one.scores
+            for s in result.scores
         ],
     }
 
 
-def _mean(one: ResultScores, split: str, evaluation: Evaluation) -> dict[str, Any]:
+def _mean(result: ResultScores, split: str, evaluation: Evaluation) -> dict[str, Any]:
     options = evaluation.options
     sizes = () if options.zoom == (1,) else options.zoom
     ways = options.alignments if split == "target" else ()
     return {
-        **_flat(one.mean(split)),
-        **_zooms({zoom: one.mean(split, zoom=zoom) for zoom in sizes}),
-        **_aligned({way: one.mean(split, align=way) for way in ways}, one.mean_pose_change(split)),
+        **_flat(result.mean(split)),
+        **_zooms({zoom: result.mean(split, zoom=zoom) for zoom in sizes}),
+        **_aligned({way: result.mean(split, align=way) for way in ways}, result.mean_pose_change(split)),
     }
 
 
@@ -146,10 +146,10 @@ def evaluation_tables(document: Mapping[str, Any]) -> Iterator[Table]:
     )
     outside = [(result["name"], *(_number(result[name]) for name in OUTSIDE)) for result in results]
     yield "Seen from outside, against the input", ("", *OUTSIDE.values()), [row for row in outside if any(row[1:])]
-    sizes = [one["zoom"] for one in means[0][2].get("zooms", ())]
+    sizes = [entry["zoom"] for entry in means[0][2].get("zooms", ())]
     heads = [f"{name.upper()} {zoom:g}x" for zoom in sizes for name in ZOOMED]
     yield "At other sizes, photos resized", ("", "views", *heads), [
-        (name, split, *(cell for one in mean["zooms"] for cell in _cells(one, ZOOMED)))
+        (name, split, *(cell for entry in mean["zooms"] for cell in _cells(entry, ZOOMED)))
         for name, split, mean in means if sizes
     ]  # fmt: skip
     yield (

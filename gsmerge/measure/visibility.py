@@ -55,8 +55,8 @@ def visible_pixels(points: Points, cameras: Cameras, near: float, sources: Camer
     def one_view(view: int) -> NDArray[np.bool_]:
         hit = np.zeros((cameras.height, cameras.width), np.uint8)
         for first in range(0, len(points), _CHUNK):
-            some = points[first : first + _CHUNK]
-            image = matmul(matmul(some, viewmats[view, :3, :3].T) + viewmats[view, :3, 3], Ks[view].T)
+            chunk = points[first : first + _CHUNK]
+            image = matmul(matmul(chunk, viewmats[view, :3, :3].T) + viewmats[view, :3, 3], Ks[view].T)
             image = image[image[:, 2] > near]
             pixels = np.floor(image[:, :2] / image[:, 2:])
             pixels = pixels[((pixels >= 0) & (pixels < size)).all(1)].astype(np.int64)
@@ -71,7 +71,7 @@ def _side(K: np.ndarray, sources: Cameras | None) -> int:
     """Choose the side, an odd number of pixels, of the square that a sample marks under the intrinsics ``K [3,3]``."""
     if sources is None:
         return _DILATION
-    focals = [np.sqrt(one[..., 0, 0] * one[..., 1, 1]) for one in (K, sources.Ks.astype(np.float64))]  # pixels
+    focals = [np.sqrt(Ks[..., 0, 0] * Ks[..., 1, 1]) for Ks in (K, sources.Ks.astype(np.float64))]  # pixels
     return max(_DILATION, 2 * round((_DILATION * float(focals[0] / np.median(focals[1])) - 1) / 2) + 1)
 
 

@@ -108,19 +108,19 @@ def encode_features(features: FeatureGaussians, context: NetworkContext) -> Feat
         return context.networks.run("encoder", table, mask, group_features.group[rows])
 
     encoded = context.run_tables(sizes, options.members, options.latent + 3, run)
-    others = np.zeros((len(features), FEATURE - 3), np.float32)
-    residuals = scale_outputs(concat_columns([encoded[:, -3:], others]), options.bounds, HALF)
+    zeros = np.zeros((len(features), FEATURE - 3), np.float32)
+    residuals = scale_outputs(concat_columns([encoded[:, -3:], zeros]), options.bounds, HALF)
     return replace(context.correct_features(group_features, residuals), latents=encoded[:, :-3])
 
 
 def match_geometry(features: FeatureGaussians, context: NetworkContext) -> FeatureGaussians:
     """Replace means and covariances by those that the K = 1 head decodes, for matching (paper section 4.3)."""
-    group_features, own = context.describe(features), np.arange(len(features))
+    group_features, rows = context.describe(features), np.arange(len(features))
     base = group_features.base
     if context.options.outputs == "residual":  # of the moments themselves, exactly
-        residuals = as_array(run_heads(base, own, group_features, context))
+        residuals = as_array(run_heads(base, rows, group_features, context))
         return context.correct_features(group_features, np.pad(residuals, ((0, 0), (0, 1))))
-    decoded = decode_with_group_features(base, own, group_features, context)
+    decoded = decode_with_group_features(base, rows, group_features, context)
     return replace(features, means=decoded.means, covars=covariances(decoded.quats, decoded.scales))
 
 
@@ -166,11 +166,11 @@ def refine_features(features: FeatureGaussians, context: NetworkContext) -> Feat
     table = np.concatenate([np.arange(count)[:, None], neighbors], 1)
 
     def run(rows: np.ndarray, _: int) -> Array:
-        ids, own = table[rows].reshape(-1), np.repeat(rows, width)
+        ids, owners = table[rows].reshape(-1), np.repeat(rows, width)
         mask = ids >= 0
-        ids = np.where(mask, ids, own)
-        relative = context.make_tokens(group_features.base, ids, own, group_features)
-        same = (views[ids] == views[own]).astype(np.float32)[:, None]
+        ids = np.where(mask, ids, owners)
+        relative = context.make_tokens(group_features.base, ids, owners, group_features)
+        same = (views[ids] == views[owners]).astype(np.float32)[:, None]
         tokens = concat_columns([relative, same, features.latents[ids]]).reshape(len(rows), width, -1)
         return context.networks.run("refiner", tokens, mask.reshape(len(rows), width), group_features.group[rows])
 
@@ -286,10 +286,10 @@ def _run_head(
     slots, latents = mask.shape[1], group_features.features.latents
 
     def run(rows: np.ndarray, _: int) -> Array:
-        own = parents[rows]
-        tokens = context.make_tokens(children, ids[rows].reshape(-1), np.repeat(own, slots), group_features)
-        children_of = tokens.reshape(len(rows), slots, PART)
-        return context.networks.run(f"heads.{slots}", latents[own], group_features.group[own], children_of, mask[rows])
+        owners = parents[rows]
+        tokens = context.make_tokens(children, ids[rows].reshape(-1), np.repeat(owners, slots), group_features)
+        table = tokens.reshape(len(rows), slots, PART)
+        return context.networks.run(f"heads.{slots}", latents[owners], group_features.group[owners], table, mask[rows])
 
     outputs = context.run_tables(np.full(len(parents), slots), slots, slots * RESIDUAL, run)
     return outputs.reshape(-1, RESIDUAL)

@@ -65,8 +65,8 @@ class NetworkWeights:
         last = self.options.refine_blocks - 1
         for i in range(last + 1):
             x = self._block(f"refiner.blocks.{i}", x, mask, first=i == last)
-        own = self._norm("refiner.norm", x[:, 0])
-        hidden = self._mlp("refiner.join", np.concatenate([own, group], 1), GELU)
+        first_token = self._norm("refiner.norm", x[:, 0])
+        hidden = self._mlp("refiner.join", np.concatenate([first_token, group], 1), GELU)
         return self._dense("refiner.out", hidden, TANH)
 
     def _run_head(

@@ -105,11 +105,11 @@ class StateKind:
     join: Callable[[GroupSet, np.ndarray, BatchFeatures, Batch], tuple[GroupSet, dict[str, int]]]
 
 
-def view_ids(known: Cameras, cameras: Cameras) -> np.ndarray:
+def view_ids(known_cameras: Cameras, cameras: Cameras) -> np.ndarray:
     """Return the index ``[v]`` of each view: of the known view with an identical camera, or a new index."""
-    known_ids = {row: i for i, row in reversed(list(enumerate(_rows(known))))}
+    known_ids = {row: i for i, row in reversed(list(enumerate(_rows(known_cameras))))}
     ids = np.array([known_ids.get(row, -1) for row in _rows(cameras)], np.int64)
-    ids[ids < 0] = len(known) + np.arange(np.count_nonzero(ids < 0))
+    ids[ids < 0] = len(known_cameras) + np.arange(np.count_nonzero(ids < 0))
     return ids
 
 

@@ -117,7 +117,7 @@ def _add_batch(
     if new.networks is not None and batch.plan.checkpoint is not None:
         choose(groups=counts["num_new"], clusters=len(groups), networks=batch.plan.checkpoint.facts())
     state = replace(_with_views(state, groups, batch), networks=new.networks)
-    if batch.prepared.given.images is None:
+    if batch.prepared.input_scene.images is None:
         return state, counts
     if batch.online.fit_colors and new.networks is None:
         with stage("fit"):
@@ -129,17 +129,17 @@ def _add_batch(
 
 def _with_views(state: OnlineState | None, groups: GroupSet, batch: Batch) -> OnlineState:
     """Return the state with other groups, and with the views and unseen Gaussians of a batch."""
-    plan, given, cameras = batch.plan, batch.prepared.given, batch.photos.cameras[batch.is_new]
+    plan, input_scene, cameras = batch.plan, batch.prepared.input_scene, batch.photos.cameras[batch.is_new]
     k = AUTO if plan.auto_count else plan.decode.k
     if state is None:
-        least = plan.fit.min_contribution if given.images is not None else 0.0
+        least = plan.fit.min_contribution if input_scene.images is not None else 0.0
         return OnlineState(
             groups=groups,
             kept=plan.unseen,
             frame=batch.prepared.frame,
             cameras=in_float64(cameras),
             replay=no_photos(cameras),
-            settings=StoredSettings(given.num_gaussians, k, batch.max_k, plan.decode.min_opacity, least),
+            settings=StoredSettings(input_scene.num_gaussians, k, batch.max_k, plan.decode.min_opacity, least),
             about={},
         )
     kept = [gaussians for gaussians in (state.kept, plan.unseen) if gaussians is not None]
@@ -148,7 +148,7 @@ def _with_views(state: OnlineState | None, groups: GroupSet, batch: Batch) -> On
         groups=groups,
         kept=Gaussians.concat(kept) if kept else None,
         cameras=concat_cameras(state.cameras, cameras),
-        settings=replace(state.settings, num_input=state.settings.num_input + given.num_gaussians, k=k),
+        settings=replace(state.settings, num_input=state.settings.num_input + input_scene.num_gaussians, k=k),
     )
 
 

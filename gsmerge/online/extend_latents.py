@@ -91,30 +91,30 @@ def own_checkpoint(state: OnlineState, options: CompactOptions) -> Checkpoint | 
     """
     if state.networks is None:
         return None
-    name, known = options.checkpoint, str(state.about["options"].get("checkpoint"))
+    name, stored = options.checkpoint, str(state.about["options"].get("checkpoint"))
     path = IN_PACKAGE.get(name, name)
-    expected = f"checkpoint {name}: expected the networks that made the state ({known}), whose latents it holds"
+    expected = f"checkpoint {name}: expected the networks that made the state ({stored}), whose latents it holds"
     remedy = "leave the checkpoint out, or begin a new state"
     if name in ("auto", "none"):
         raise UsageError(f"{expected}; {remedy}")
     try:
         same = _same(load_checkpoint(path).networks, state.networks.weights)
     except SceneError:
-        if name != known:
+        if name != stored:
             raise
         same = True  # the state has its own
-    if not same and name != known:
+    if not same and name != stored:
         raise UsageError(f"{expected}, found others; {remedy}")
     if not same:
         note(f"checkpoint {name}: not the networks that made the state any more; the state's own go on")
     return Checkpoint(state.networks.weights, Path(path), state.about["gsmerge"], {})
 
 
-def _same(one: NetworkWeights, other: NetworkWeights) -> bool:
+def _same(networks: NetworkWeights, other: NetworkWeights) -> bool:
     """Return whether networks are the same to the bit."""
-    if one.options != other.options or one.arrays.keys() != other.arrays.keys():
+    if networks.options != other.options or networks.arrays.keys() != other.arrays.keys():
         return False
-    return all(np.array_equal(array, other.arrays[name]) for name, array in one.arrays.items())
+    return all(np.array_equal(array, other.arrays[name]) for name, array in networks.arrays.items())
 
 
 def _encode(state: OnlineState | None, batch: Batch, count: int | None) -> BatchFeatures:

@@ -179,9 +179,9 @@ def extend_file(
         raise UsageError(str(error)) from error
     with atomic_output(path, overwrite=identity is not None) as temporary:
         loaded = perf_counter()
-        given = read_input(files, opacity=opacity, hints=hints)
+        load = read_input(files, opacity=opacity, hints=hints)
         read = perf_counter()
-        state, report = extend(state, given.scene, options, online, progress=progress)
+        state, report = extend(state, load.scene, options, online, progress=progress)
         done = perf_counter()
         save_state(temporary, state, overwrite=True)
         if _file_identity(path) != identity:
@@ -191,13 +191,13 @@ def extend_file(
     numbers = {name: value for name, value in asdict(report).items() if name not in ("seconds", "notes", "options")}
     return {
         **document_head(),
-        "input": {"path": str(files.ply), **given.recognised},
+        "input": {"path": str(files.ply), **load.recognised},
         **numbers,
         "state": {"path": str(path), "bytes": path.stat().st_size, "num_batches": len(state.about["batches"])},
         "options": dict(report.options),
         **seconds_document(seconds | {"write": perf_counter() - done}),
         "peak_memory_bytes": peak_memory(),
-        "notes": [*given.notes, *report.notes],
+        "notes": [*load.notes, *report.notes],
     }
 
 

@@ -41,9 +41,9 @@ def merge_settings(
 ) -> tuple[CompactOptions, OnlineOptions]:
     """Merge settings: given, else those of the state, else the defaults, without a full fit."""
     names = OnlineOptions.__dataclass_fields__.keys()
-    known = names | CompactOptions().to_dict().keys()
+    all_names = names | CompactOptions().to_dict().keys()
     stored = {} if state is None else state.about["options"]
-    before = {name: value for name, value in stored.items() if name in known}
+    before = {name: value for name, value in stored.items() if name in all_names}
     recipe = settings.get("recipe", before.get("recipe"))
     merged = {"fit": "none"} | dict(RECIPES.get(str(recipe), {})) | before | dict(settings)
     online = OnlineOptions(**{name: merged.pop(name) for name in names if name in merged})

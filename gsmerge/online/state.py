@@ -284,11 +284,11 @@ def limit_children(groups: GroupSet, max_k: int) -> GroupSet:
     return replace_groups(groups, rows, pooled)
 
 
-def replace_groups(groups: GroupSet, rows: np.ndarray, others: GroupSet) -> GroupSet:
+def replace_groups(groups: GroupSet, rows: np.ndarray, new_groups: GroupSet) -> GroupSet:
     """Replace some groups by others, one for one, at their rows."""
     index = np.arange(len(groups))
     index[rows] = len(groups) + np.arange(len(rows))
-    return select_groups(concat_groups([groups, others]), index)
+    return select_groups(concat_groups([groups, new_groups]), index)
 
 
 def with_fitted_colors(groups: GroupSet) -> GroupSet:

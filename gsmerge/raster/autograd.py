@@ -113,7 +113,7 @@ class _Draw(torch.autograd.Function):
 
         g = gradients
         rows = g.means, g.quats, g.scales, g.opacities, g.colors
-        return None, None, *(spread(one) for one in rows)
+        return None, None, *(spread(values) for values in rows)
 
 
 def draw_colored(shape: Shape, colors: Tensor, camera: dict[str, Any], background: np.ndarray) -> tuple[Tensor, Tensor]:

@@ -67,15 +67,15 @@ class StressScene:
     views: Views | None  # held-out views in its world; None: its own views
 
 
-def keep_views(given: StressScene, choose: Callable[[int], Sequence[int]]) -> StressScene:
+def keep_views(setup: StressScene, choose: Callable[[int], Sequence[int]]) -> StressScene:
     """Keep the views that ``choose`` lists, given their number."""
-    return replace(given, scene=subset(given.scene, choose(len(given.scene))))
+    return replace(setup, scene=subset(setup.scene, choose(len(setup.scene))))
 
 
-def move(given: StressScene, factor: float, shift: Sequence[float]) -> StressScene:
+def move(setup: StressScene, factor: float, shift: Sequence[float]) -> StressScene:
     """Scale the world, and move it by ``shift`` in units of its own size."""
-    offset = np.array(shift, np.float64) * scene_frame(given.scene).unit * factor
-    scene, views = given.scene, given.views
+    offset = np.array(shift, np.float64) * scene_frame(setup.scene).unit * factor
+    scene, views = setup.scene, setup.views
     means = factor * scene.gaussians.means.astype(np.float64) + offset
     gaussians = replace(scene.gaussians, means=means, scales=scene.gaussians.scales * factor)
     scene = replace(scene, gaussians=gaussians, cameras=_move_cameras(scene.cameras, factor, offset))
@@ -90,20 +90,20 @@ def _move_cameras(cameras: Cameras, factor: float, offset: np.ndarray) -> Camera
     return replace(cameras, viewmats=viewmats)
 
 
-def perturb_poses(given: StressScene, degrees: float) -> StressScene:
+def perturb_poses(setup: StressScene, degrees: float) -> StressScene:
     """Rotate every view, with its Gaussians, about its camera centre by a random axis."""
-    scene = given.scene
+    scene = setup.scene
     viewmats = turn_cameras(scene.cameras.viewmats.astype(np.float64), degrees, slice(None))
-    return replace(given, scene=move_views(scene, viewmats))
+    return replace(setup, scene=move_views(scene, viewmats))
 
 
-def move_view(given: StressScene, share: float) -> StressScene:
+def move_view(setup: StressScene, share: float) -> StressScene:
     """Move the middle view, with its Gaussians, sideways by a share of the scene's size."""
-    scene = given.scene
+    scene = setup.scene
     view, viewmats = len(scene) // 2, scene.cameras.viewmats.astype(np.float64)
     step = viewmats[view, 0, :3] * share * scene_frame(scene).unit
     viewmats[view, :3, 3] -= viewmats[view, :3, :3] @ step
-    return replace(given, scene=move_views(scene, viewmats))
+    return replace(setup, scene=move_views(scene, viewmats))
 
 
 def turn_cameras(viewmats: np.ndarray, degrees: float, views: slice) -> np.ndarray:
@@ -115,9 +115,9 @@ def turn_cameras(viewmats: np.ndarray, degrees: float, views: slice) -> np.ndarr
     return turned
 
 
-def change_exposure(given: StressScene, share: float) -> StressScene:
+def change_exposure(setup: StressScene, share: float) -> StressScene:
     """Make photos, and the Gaussians of their views, alternately brighter and darker."""
-    scene = given.scene
+    scene = setup.scene
     assert scene.images is not None
     gains = np.array([1 + share if view % 2 else 1 - share for view in range(len(scene))], np.float32)
     rows = gains.repeat(scene.pixels_per_view)[:, None, None]
@@ -125,34 +125,34 @@ def change_exposure(given: StressScene, share: float) -> StressScene:
     sh0 = ((0.5 + SH_C0 * g.sh0) * rows - 0.5) / SH_C0
     gaussians = replace(g, sh0=sh0, shN=g.shN * rows)
     images = (scene.images * gains[:, None, None, None]).clip(0, 1)
-    return replace(given, scene=replace(scene, gaussians=gaussians, images=images, large_photos=None))
+    return replace(setup, scene=replace(scene, gaussians=gaussians, images=images, large_photos=None))
 
 
-def break_rows(given: StressScene) -> StressScene:
+def break_rows(setup: StressScene) -> StressScene:
     """Take away the finite numbers of some rows, which the reader leaves out."""
-    scene = given.scene
+    scene = setup.scene
     chosen = _choose(len(scene.gaussians), BROKEN_SHARE)
     if not scene.aligned:
-        return replace(given, scene=replace(scene, gaussians=scene.gaussians[~chosen]))
+        return replace(setup, scene=replace(scene, gaussians=scene.gaussians[~chosen]))
     gaussians = replace(scene.gaussians, opacities=np.where(chosen, np.float32(0), scene.gaussians.opacities))
     valid = scene.valid & ~chosen.reshape(scene.valid.shape)
-    return replace(given, scene=replace(scene, gaussians=gaussians, pixel_ids=grid_ids(valid)))
+    return replace(setup, scene=replace(scene, gaussians=gaussians, pixel_ids=grid_ids(valid)))
 
 
-def throw_away(given: StressScene) -> StressScene:
+def throw_away(setup: StressScene) -> StressScene:
     """Move a few Gaussians a thousand times as far away."""
-    scene = given.scene
+    scene = setup.scene
     chosen = _choose(len(scene.gaussians), FAR_SHARE)[:, None]
     means = np.where(chosen, 1000 * scene.gaussians.means, scene.gaussians.means)
-    return replace(given, scene=replace(scene, gaussians=replace(scene.gaussians, means=means)))
+    return replace(setup, scene=replace(scene, gaussians=replace(scene.gaussians, means=means)))
 
 
-def enlarge(given: StressScene) -> StressScene:
+def enlarge(setup: StressScene) -> StressScene:
     """Make some Gaussians many times as large."""
-    gaussians = given.scene.gaussians
+    gaussians = setup.scene.gaussians
     chosen = _choose(len(gaussians), LARGE_SHARE)[:, None]
     scales = np.where(chosen, LARGE_FACTOR * gaussians.scales, gaussians.scales)
-    return replace(given, scene=replace(given.scene, gaussians=replace(gaussians, scales=scales)))
+    return replace(setup, scene=replace(setup.scene, gaussians=replace(gaussians, scales=scales)))
 
 
 def _choose(count: int, share: float) -> np.ndarray:
@@ -273,13 +273,13 @@ def stress(
     options = options or CompactOptions()
     report, slack = progress or (lambda *_: None), _slack(options)
     limits = {"same": MAX_SAME + slack, "near": MAX_NEAR + slack, "worse": MAX_WORSE}
-    given = StressScene(load.scene, targets)
-    base = _run(given, options) if any(CASES[name].needs not in ("file", "pixel-file") for name in names) else None
+    setup = StressScene(load.scene, targets)
+    base = _run(setup, options) if any(CASES[name].needs not in ("file", "pixel-file") for name in names) else None
     out = []
     for i, name in enumerate(names):
         case, start = CASES[name], time.perf_counter()
         report(case.words, i, len(names))
-        passed, measured = _check_case(case, load, given, base, options, hints)
+        passed, measured = _check_case(case, load, setup, base, options, hints)
         seconds, expected = time.perf_counter() - start, PROPERTIES[case.check].format(**limits)
         out.append(StressOutcome(name, case.words, expected, passed, measured, seconds))
     report("done", len(names), len(names))
@@ -287,7 +287,7 @@ def stress(
 
 
 def _check_case(
-    case: Case, load: Loaded, given: StressScene, base: _Result | None, options: CompactOptions, hints: ReadHints
+    case: Case, load: Loaded, setup: StressScene, base: _Result | None, options: CompactOptions, hints: ReadHints
 ) -> tuple[bool | None, str]:
     """Check whether the case's property holds, and return that with the figures."""
     problem = _inapplicable(case, load)
@@ -300,8 +300,8 @@ def _check_case(
     assert base is not None
     try:
         if case.check == "again":
-            return _check_again(given, base, options)
-        changed = given if case.change is None else case.change(given)
+            return _check_again(setup, base, options)
+        changed = setup if case.change is None else case.change(setup)
         settings = options if case.threads is None else replace(options, threads=case.threads)
         result = base if case.name == "unchanged" else _run(changed, settings)
     except (GsmergeError, ValueError) as error:  # a case that fails must not end the others
@@ -325,16 +325,16 @@ def _inapplicable(case: Case, load: Loaded) -> str | None:
     return None
 
 
-def _run(given: StressScene, options: CompactOptions) -> _Result:
-    result = compact(given.scene, options)
-    return _Result(result.gaussians, *_quality(given, result.gaussians))
+def _run(setup: StressScene, options: CompactOptions) -> _Result:
+    result = compact(setup.scene, options)
+    return _Result(result.gaussians, *_quality(setup, result.gaussians))
 
 
-def _quality(given: StressScene, gaussians: Gaussians) -> tuple[float, float]:
+def _quality(setup: StressScene, gaussians: Gaussians) -> tuple[float, float]:
     """Measure the PSNR (dB) of the input and of a result on the views; infinite for an input that is the reference."""
-    evaluation = evaluate(given.scene, {"result": gaussians}, given.views, replace(_QUICK, context=given.views is None))
-    split = "context" if given.views is None else "target"
-    before, after = (one.mean(split)[1].psnr for one in evaluation.results)
+    evaluation = evaluate(setup.scene, {"result": gaussians}, setup.views, replace(_QUICK, context=setup.views is None))
+    split = "context" if setup.views is None else "target"
+    before, after = (result.mean(split)[1].psnr for result in evaluation.results)
     return (math.inf if before is None else before), (math.nan if after is None else after)
 
 
@@ -361,12 +361,12 @@ def _check_result(case: Case, base: _Result, result: _Result, slack: float) -> t
     return near and abs(count - former) <= max(1, SAME_COUNT * former), both
 
 
-def _check_again(given: StressScene, base: _Result, options: CompactOptions) -> tuple[bool, str]:
+def _check_again(setup: StressScene, base: _Result, options: CompactOptions) -> tuple[bool, str]:
     """Compact the result as a scene of its own to as many Gaussians as it has."""
-    scene = given.scene
+    scene = setup.scene
     unaligned = Scene(base.gaussians, scene.cameras, scene.images, None, scene.names)
     once = replace(options, budget=BudgetOptions(budget=len(base.gaussians)), decode=replace(options.decode, k=1))
-    after = _quality(given, compact(unaligned, once).gaussians)[1]
+    after = _quality(setup, compact(unaligned, once).gaussians)[1]
     return after >= base.after - MAX_SAME - _slack(options), f"{after:.2f} dB; before {base.after:.2f} dB"
 
 

@@ -62,8 +62,8 @@ def wall_seconds(pixels: int, num_views: int, options: Mapping[str, Any], *, thr
 
 def fit_of(options: Mapping[str, Any], *, photos: bool) -> str:
     """Return the fit to the photos: ``"full"`` or ``"none"``."""
-    own = {"gsmerge": options["fit"], "unmerged-fit": "full"}
-    return own.get(options["method"], "none") if photos else "none"
+    fits = {"gsmerge": options["fit"], "unmerged-fit": "full"}
+    return fits.get(options["method"], "none") if photos else "none"
 
 
 def memory_bytes(pixels: int, *, photos: bool, num_rest: int = 0, num_elsewhere: int = 0) -> int:

@@ -184,9 +184,9 @@ class RayPool:
 
     def wait(self, seconds: float | None) -> list[tuple[Any, Any]]:
         """Wait for at most so many seconds (None: any); return keys of calls that ended, with a result or Lost each."""
-        ready, rest = self.ray.wait(list(self.keys), num_returns=1, timeout=seconds)
-        if ready and rest:
-            ready += self.ray.wait(rest, num_returns=len(rest), timeout=0)[0]
+        ready, pending = self.ray.wait(list(self.keys), num_returns=1, timeout=seconds)
+        if ready and pending:
+            ready += self.ray.wait(pending, num_returns=len(pending), timeout=0)[0]
         return [(self.keys.pop(ref), self._result(ref)) for ref in ready]
 
     def _result(self, ref: Any) -> Any:

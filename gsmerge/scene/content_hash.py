@@ -28,10 +28,10 @@ def digest(value: Mapping[str, Any]) -> str:
 def content_hash(files: Sequence[Path]) -> str:
     """Compute SHA-256 over the names and contents of files; of folders, over everything in them."""
     state = hashlib.sha256()
-    for given in files:
-        inside = sorted(p for p in walk_files(given) if p.is_file()) if given.is_dir() else [given]
+    for root in files:
+        inside = sorted(p for p in walk_files(root) if p.is_file()) if root.is_dir() else [root]
         for path in inside:
-            name = path.relative_to(given).as_posix() if given.is_dir() else path.name
+            name = path.relative_to(root).as_posix() if root.is_dir() else path.name
             with read_errors(path), path.open("rb") as file:
                 state.update(f"{len(name)}:{name}:{path.stat().st_size}:".encode())
                 while block := file.read(1 << 20):

@@ -24,10 +24,10 @@ AUTO = ReadHints()
 
 def make_hints(values: dict[str, Any]) -> ReadHints:
     """Make hints from keyword arguments; ValueError if a name or a value is unknown."""
-    known = {field.name for field in fields(ReadHints)}
-    unknown = sorted(values.keys() - known)
+    names = {field.name for field in fields(ReadHints)}
+    unknown = sorted(values.keys() - names)
     if unknown:
-        raise ValueError(f"expected {_listed(sorted(known))}, got {unknown[0]!r}")
+        raise ValueError(f"expected {_listed(sorted(names))}, got {unknown[0]!r}")
     return ReadHints(**values)
 
 

@@ -89,14 +89,14 @@ def find_scene_files(
     path = Path(path)
     plys = _find_plys(path, _named(cameras)) if os.path.isdir(path) else [path]
     ply = plys[0]
-    for one in plys:
-        check_file(one)
-    given = path if ply != path else ply.parent
+    for part in plys:
+        check_file(part)
+    base = path if ply != path else ply.parent
     folder = Path(os.path.realpath(ply.parent))
     above = [folder.parent] * (folder.name in ("gs_ply", SCENES_PLACE))
     if folder.name.startswith("iteration_") and folder.parent.name == "point_cloud":
         above = [folder.parent.parent]
-    roots = list(dict.fromkeys((Path(os.path.realpath(given)), folder, *above)))
+    roots = list(dict.fromkeys((Path(os.path.realpath(base)), folder, *above)))
     places = (find(root) for find in (find_cameras, find_other_cameras) for root in roots)
     camera_path = _named(cameras) or (ply if holds_cameras(ply) else None)
     camera_path = camera_path or next((place for place in places if place is not None), None)

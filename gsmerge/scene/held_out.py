@@ -78,12 +78,12 @@ def place_camera_file(load: Loaded, path: Path) -> tuple[CameraFile, dict[int, i
 
     Which frame they are in, and in which convention, is decided as :func:`read_held_out` says.
     """
-    stored, own = read_cameras(path, scene=load.files.ply.stem), load.cameras
+    stored, cameras = read_cameras(path, scene=load.files.ply.stem), load.cameras
     readings = [stored]
-    if own is not None and own.source == stored.source and own.convention != stored.convention:
-        readings.insert(0, with_convention(stored, own.convention))  # as the scene's own had to be read
-    worlds = [(one, *_find_world(one, _shared_views(one, load.scene.names), load)) for one in readings]
-    camera_file, world, shared = next((one for one in worlds if one[2]), worlds[0])
+    if cameras is not None and cameras.source == stored.source and cameras.convention != stored.convention:
+        readings.insert(0, with_convention(stored, cameras.convention))  # as the scene's own had to be read
+    worlds = [(reading, *_find_world(reading, _shared_views(reading, load.scene.names), load)) for reading in readings]
+    camera_file, world, shared = next((reading for reading in worlds if reading[2]), worlds[0])
     return replace(camera_file, viewmats=world.move_viewmats(camera_file.viewmats)), shared
 
 
@@ -102,13 +102,13 @@ def _folder(path: Path, cameras: CameraFile, images: StrPath | None) -> Path | N
 
 def _shared_views(camera_file: CameraFile, names: tuple[str, ...]) -> dict[int, int]:
     """Map indices in the file to views of the scene that have the same name; empty if stems are not unique."""
-    place, own = (
-        {PurePosixPath(name.replace("\\", "/")).stem: i for i, name in enumerate(some)}
-        for some in (camera_file.names, names)
+    place, views = (
+        {PurePosixPath(name.replace("\\", "/")).stem: i for i, name in enumerate(view_names)}
+        for view_names in (camera_file.names, names)
     )
-    if len(place) < len(camera_file) or len(own) < len(names):
+    if len(place) < len(camera_file) or len(views) < len(names):
         return {}
-    return {place[stem]: view for stem, view in own.items() if stem in place}
+    return {place[stem]: view for stem, view in views.items() if stem in place}
 
 
 def _find_world(camera_file: CameraFile, named: dict[int, int], load: Loaded) -> tuple[Similarity, dict[int, int]]:
@@ -136,12 +136,12 @@ def _stored_world(load: Loaded) -> Similarity:
         return load.recovery.best.frame
     if load.cameras is None or load.files.cameras is None:
         return IDENTITY
-    own = read_cameras(load.files.cameras, scene=load.files.ply.stem, folder=load.files.ply.parent)
-    if (own.names, own.convention) != (load.cameras.names, load.cameras.convention):
+    camera_file = read_cameras(load.files.cameras, scene=load.files.ply.stem, folder=load.files.ply.parent)
+    if (camera_file.names, camera_file.convention) != (load.cameras.names, load.cameras.convention):
         return IDENTITY
-    if np.array_equal(own.viewmats, load.cameras.viewmats):
+    if np.array_equal(camera_file.viewmats, load.cameras.viewmats):
         return IDENTITY  # to the bit
-    return fit_similarity(own.viewmats, load.cameras.viewmats)
+    return fit_similarity(camera_file.viewmats, load.cameras.viewmats)
 
 
 def fit_similarity(theirs: np.ndarray, ours: np.ndarray, scale: float = 1.0) -> Similarity:

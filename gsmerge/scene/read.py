@@ -104,12 +104,12 @@ class Loaded:
         """Facts about the input for a report."""
         cameras, recovery, info = self.scene.cameras, self.recovery, self.info
         facts: dict[str, Any] = {"num_views": len(cameras), "height": cameras.height, "width": cameras.width}
-        facts |= {"exporters": [one.name for one in self.exporters], "rows": recovery and recovery.description}
+        facts |= {"exporters": [entry.name for entry in self.exporters], "rows": recovery and recovery.description}
         facts["moved_cameras"] = list(self.moves)
         if self.files.parts:
             facts["parts"] = [str(path) for path in self.files.parts]
         if self.joined:
-            num_bytes = sum(os.stat(one["path"]).st_size for one in self.joined if one["joined"])
+            num_bytes = sum(os.stat(file["path"]).st_size for file in self.joined if file["joined"])
             facts |= {"files": list(self.joined), "bytes": num_bytes}
         facts |= {"layout": info.layout, "sh_degree": info.sh_degree, "opacity_encoding": info.opacity_encoding}
         return facts | {"num_nonfinite": info.num_nonfinite}
@@ -177,7 +177,7 @@ def load_scene(
     """Read a scene as :func:`read_scene` does, with all facts about its files."""
     read_hints = make_hints(hints)
     named = {"cameras": cameras, "images": images, "masks": masks}
-    first, *others = (find_scene_files(one, **named) for one in (path, *more))
+    first, *others = (find_scene_files(scene_path, **named) for scene_path in (path, *more))
     return load_files(replace(first, more=tuple(others)), opacity=opacity, hints=read_hints)
 
 
@@ -185,7 +185,7 @@ def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: Rea
     """Read the scene of given files as :func:`load_scene` does."""
     with use_threads():
         each = (replace(files, more=()), *files.more)
-        loads = [align_scene(read_rows(one, opacity=opacity, hints=hints), one, hints=hints) for one in each]
+        loads = [align_scene(read_rows(source, opacity=opacity, hints=hints), source, hints=hints) for source in each]
     return loads[0] if len(loads) == 1 else _join_loads(loads, files)
 
 
@@ -234,8 +234,8 @@ def align_scene(
         return _make_load(ply, files, hints, AlignmentResult(None, NO_CAMERAS, None, None, problem=problem), [])
     exporter = find_exporter(hints.exporter)
     camera_file = read_scene_cameras(ply, files) if camera_file is None else camera_file
-    known = camera_file.order if exporter is None else exporter.order
-    order = known if hints.order == "auto" else hints.order
+    default_order = camera_file.order if exporter is None else exporter.order
+    order = default_order if hints.order == "auto" else hints.order
     pinholes, pictures, notes = as_pinholes(camera_file, stored_photos(files, camera_file) if photos else None)
     notes += [camera_file.focal] if camera_file.focal else []
     whole, (pictures, cut) = pictures, cut_bars(pictures, camera_file)

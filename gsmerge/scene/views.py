@@ -106,9 +106,9 @@ def _stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos | None:
     paths = _photo_paths(files, camera_file)
     if paths is not None or files.images is None:
         return decode_images(paths) if paths else None
-    own = files.cameras is not None and os.path.realpath(files.cameras) == os.path.realpath(files.images)
-    stored = (camera_file if own else read_cameras(files.images, scene=files.ply.stem)).images
-    if own and stored is None and files.images.suffix == CHUNK:
+    same_file = files.cameras is not None and os.path.realpath(files.cameras) == os.path.realpath(files.images)
+    stored = (camera_file if same_file else read_cameras(files.images, scene=files.ply.stem)).images
+    if same_file and stored is None and files.images.suffix == CHUNK:
         return None
     if stored is None or len(stored) != len(camera_file):
         count = 0 if stored is None else len(stored)
@@ -178,9 +178,9 @@ def find_larger_and_masks(
     if photos is None or size is None:
         return None, None, []
     paths = _photo_paths(files, camera_file)
-    own = photo_size(photos) if paths is None else image_size(paths[0])
+    file_size = photo_size(photos) if paths is None else image_size(paths[0])
     turns = 0 if paths is None else _photo_turns(files, camera_file)
-    stored = own[::-1] if turns % 2 else own
+    stored = file_size[::-1] if turns % 2 else file_size
     window = _file_window(stored, size, transform, cameras)
     lenses = () if paths is None else camera_file.lenses
     Ks = to_cameras(replace(camera_file, lenses=()), stored).Ks if lenses else None
@@ -192,7 +192,7 @@ def find_larger_and_masks(
         return np.ascontiguousarray(np.rot90(picture, turns)[window.rows, window.columns])
 
     def read(view: int) -> np.ndarray:
-        return cut(view, photos[view] if paths is None else decode_image(paths[view], own))
+        return cut(view, photos[view] if paths is None else decode_image(paths[view], file_size))
 
     large = None
     if window.is_larger:
@@ -209,7 +209,7 @@ def find_larger_and_masks(
         parts += [None if mask is None else np.rot90(decode_mask(mask), -turns)]
         return [part for part in parts if part is not None]
 
-    return large, _read_masks(read_parts, len(names), own, cameras, cut), notes
+    return large, _read_masks(read_parts, len(names), file_size, cameras, cut), notes
 
 
 def _match_masks(folder: Path | None, names: Sequence[str]) -> tuple[Sequence[Path | None], list[str]]:
@@ -291,12 +291,12 @@ def cut_bars(photos: Photos | None, camera_file: CameraFile) -> tuple[Photos | N
     """Cut off the bars around photos that have the cameras' shape without them, with a note; or return them as is."""
     size = photo_size(photos)
     shapes = sizes_of(camera_file)
-    if photos is None or size is None or not shapes or any(same_shape(one, size) for one in shapes):
+    if photos is None or size is None or not shapes or any(same_shape(shape, size) for shape in shapes):
         return photos, []
     counts = [count_bars(photos[view], _BAR_SPREAD) for view in range(len(photos))]
     above, below, left, right = (int(count) for count in np.median(counts, 0))
     inner = size[0] - left - right, size[1] - above - below
-    if inner == size or not any(same_shape(one, inner) for one in shapes):
+    if inner == size or not any(same_shape(shape, inner) for shape in shapes):
         return photos, []
 
     def cut(_: int, photo: np.ndarray) -> np.ndarray:

@@ -129,7 +129,7 @@ class CompactOptions(Settings):
 
     def with_settings(self, settings: Mapping[str, Any]) -> CompactOptions:
         """Change settings by flat name (``k=2``), on top of a recipe's; raise ValueError for unknown names."""
-        known, changes = flat_settings(CompactOptions), dict[str, Any]()
+        all_settings, changes = flat_settings(CompactOptions), dict[str, Any]()
         settings = {**RECIPES.get(str(settings.get("recipe")), {}), **settings}
         for name, declared in settings_of(CompactOptions).items():
             if declared.is_group:
@@ -137,7 +137,7 @@ class CompactOptions(Settings):
                 changes[name] = replace(getattr(self, name), **chosen)
             elif name in settings:
                 changes[name] = settings[name]
-        unknown = sorted(settings.keys() - known.keys())
+        unknown = sorted(settings.keys() - all_settings.keys())
         if unknown:
-            raise ValueError(f"unknown setting {unknown[0]!r}; known: {', '.join(sorted(known))}")
+            raise ValueError(f"unknown setting {unknown[0]!r}; known: {', '.join(sorted(all_settings))}")
         return replace(self, **changes)

@@ -127,8 +127,8 @@ class Setting:
         if self.is_list:
             if self.filled and not value:
                 raise ValueError(f"{self.name}: expected at least one value, got none")
-            for one in value:
-                self._check(one)
+            for element in value:
+                self._check(element)
             if self.unique and len(set(value)) < len(value):
                 raise ValueError(f"{self.name}: expected every value once, got {','.join(map(str, value))}")
         else:
@@ -151,8 +151,8 @@ class Settings:
 
     def __init_subclass__(cls) -> None:
         """Write what is declared of the fields into the docstring."""
-        own = [(name, f) for name, f in vars(cls).items() if isinstance(f, Field) and "setting" in f.metadata]
-        lines = [f"    {name}: {f.metadata['setting'].text}" for name, f in own]
+        declared = [(name, f) for name, f in vars(cls).items() if isinstance(f, Field) and "setting" in f.metadata]
+        lines = [f"    {name}: {f.metadata['setting'].text}" for name, f in declared]
         cls.__doc__ = "\n".join([cleandoc(cls.__doc__ or ""), "", "Args:", *lines])
 
     def __post_init__(self) -> None:
@@ -168,7 +168,7 @@ def settings_of(options: type) -> dict[str, Setting]:
     if options not in _declared:
         kinds = get_type_hints(options)
         made = {f.name: f.metadata["setting"] for f in fields(options) if "setting" in f.metadata}
-        _declared[options] = {name: replace(one, name=one.name or name, kind=kinds[name]) for name, one in made.items()}
+        _declared[options] = {n: replace(entry, name=entry.name or n, kind=kinds[n]) for n, entry in made.items()}
     return _declared[options]
 
 
@@ -190,7 +190,7 @@ def join_words(words: Iterable[str]) -> str:
 def _parts(kind: Any) -> list[Any]:
     """List the types of which a value, or an element of a list, may be one."""
     if get_origin(kind) in (Union, UnionType):
-        return [part for one in get_args(kind) for part in _parts(one)]
+        return [part for member in get_args(kind) for part in _parts(member)]
     return _parts(get_args(kind)[0]) if get_origin(kind) is tuple else [kind]
 
 

@@ -83,8 +83,8 @@ class SegmentOptions(Settings):
     @property
     def share(self) -> float:
         """Superpixels per pixel; the default where a number is asked for, or the scene decides."""
-        given = self.per_view is None and self.superpixels != AUTO_SHARE
-        return parse_share(str(self.superpixels) if given else SHARE)
+        is_share = self.per_view is None and self.superpixels != AUTO_SHARE
+        return parse_share(str(self.superpixels) if is_share else SHARE)
 
     @property
     def adapts(self) -> bool:

@@ -120,9 +120,9 @@ def clean_to_count(make: Make, count: int | None, options: CleanOptions, prepare
     if not options.asked:
         return make(count)
     scene, to_world = prepared.scene, prepared.frame.leave
-    given = scene.gaussians[scene.valid.reshape(-1)] if scene.aligned else scene.gaussians
-    most, asked = len(given), count
-    share = 1.0 if options.crop is None else float(inside_crop(to_world(given).means, options.crop).mean())
+    input_gaussians = scene.gaussians[scene.valid.reshape(-1)] if scene.aligned else scene.gaussians
+    most, asked = len(input_gaussians), count
+    share = 1.0 if options.crop is None else float(inside_crop(to_world(input_gaussians).means, options.crop).mean())
     if share == 0:
         remedy = "gsmerge inspect says where the scene is"
         raise UsageError(f"crop: expected Gaussians of the scene in {options.crop}, found none; {remedy}")
@@ -130,21 +130,21 @@ def clean_to_count(make: Make, count: int | None, options: CleanOptions, prepare
         asked = min(most, math.ceil(SURPLUS * count / share))
     best: tuple[Fitted, dict[str, int], Record] | None = None
     for _ in range(MAX_BUILDS):
-        with record_part() as own:
+        with record_part() as record:
             made = make(asked)
             gaussians, counts = clean(made.gaussians, options, scene, to_world)
-        add_seconds(own.seconds)
+        add_seconds(record.seconds)
         if best is None or count is None or len(best[0].gaussians) < len(gaussians):
-            best = replace(made, gaussians=gaussians), counts, own
+            best = replace(made, gaussians=gaussians), counts, record
         if count is None or asked is None or len(gaussians) >= count or asked == most:
             break
         asked = min(most, math.ceil(SURPLUS * asked * count / max(1, len(gaussians))))
     assert best is not None
-    fitted, counts, own = best
+    fitted, counts, record = best
     gaussians = fitted.gaussians
     if count is not None and len(gaussians) > count:
         gaussians, counts = faintest_dropped(gaussians, count), counts | {"surplus": len(gaussians) - count}
-    adopt(own)
+    adopt(record)
     choose(clean=counts)
     for text in _clean_notes(counts, len(gaussians), count):
         note(text)

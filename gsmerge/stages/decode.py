@@ -181,10 +181,10 @@ def halve(
     centres, footprints = features.means.astype(np.float64), features.footprints.astype(np.float64)
 
     def run(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        local, own = gather_groups(starts, ids, rows)
+        local, group = gather_groups(starts, ids, rows)
         m = members
         child_starts, child_ids, parents = bisect(
-            local, own, m.means, m.sh0, m.opacities, centres[rows], footprints[rows], counts[rows]
+            local, group, m.means, m.sh0, m.opacities, centres[rows], footprints[rows], counts[rows]
         )
         return np.diff(child_starts), child_ids, rows[parents]
 
@@ -238,10 +238,10 @@ def _child_errors(features: FeatureGaussians, members: Members, max_children: in
     centres, footprints = features.means.astype(np.float64), features.footprints.astype(np.float64)
 
     def run(rows: np.ndarray) -> np.ndarray:
-        local, own = gather_groups(starts, ids, rows)
+        local, group = gather_groups(starts, ids, rows)
         m = members
         return split_errors(
-            local, own, m.means, m.sh0, m.opacities, centres[rows], footprints[rows], max_children, PLANE_WEIGHT
+            local, group, m.means, m.sh0, m.opacities, centres[rows], footprints[rows], max_children, PLANE_WEIGHT
         )
 
     every = np.arange(len(features))

@@ -48,8 +48,8 @@ def _clusters(features: FeatureGaussians, rows: np.ndarray, options: MatchOption
     neighbors = nearest_of_other_views(means, views, options.num_neighbors)
     boxes = options.match == "aabb"
     latents = as_array(features.latents)
-    known = boxes and bool(latents.any())  # networks without an encoder leave them zero
-    latents = normalize(latents[rows] if known else latents[rows, :0])
+    has_latents = boxes and bool(latents.any())  # networks without an encoder leave them zero
+    latents = normalize(latents[rows] if has_latents else latents[rows, :0])
     scores = np.empty(neighbors.shape)
     limits = options.max_color, options.similarity
     edge_scores(neighbors, means, np.ascontiguousarray(covars), colors, latents, views, *limits, boxes, scores)

@@ -238,8 +238,8 @@ def pixel_depths(scene: Scene) -> np.ndarray:
     height, width, pixels = cameras.height, cameras.width, scene.pixels_per_view
 
     def one_view(view: int) -> np.ndarray:
-        own = means[view * pixels : (view + 1) * pixels]
-        depths = camera_depths(own, cameras.viewmats[view].astype(means.dtype))
+        view_means = means[view * pixels : (view + 1) * pixels]
+        depths = camera_depths(view_means, cameras.viewmats[view].astype(means.dtype))
         return depths.astype(np.float32).reshape(height, width)
 
     return np.stack(parallel_map(one_view, range(len(scene))))
@@ -307,10 +307,10 @@ def cut_tree(tree: RegionTree, budget: int) -> Groups:
     keep[tree.order[: max(0, len(tree) - budget)]] = True
 
     def one_view(view: int) -> tuple[np.ndarray, int]:
-        own = keep[tree.first[view] : tree.first[view + 1]]
+        view_keep = keep[tree.first[view] : tree.first[view + 1]]
         leaves = tree.groups.counts[view]
-        of_leaf = cut_labels(tree.parents[view], own, leaves)
-        return of_leaf[tree.groups.labels[view]], leaves - int(own.sum())
+        of_leaf = cut_labels(tree.parents[view], view_keep, leaves)
+        return of_leaf[tree.groups.labels[view]], leaves - int(view_keep.sum())
 
     labels, counts = zip(*parallel_map(one_view, range(num_views)), strict=True)
     return Groups(np.stack(labels), counts)

@@ -77,7 +77,7 @@ def segment(
     )  # fmt: skip
     labels = parallel_map(cut, images)
     stacked = np.stack(labels) if labels else np.empty((0, height, width), np.int32)
-    return Groups(stacked, tuple(int(one.max()) + 1 for one in labels))
+    return Groups(stacked, tuple(int(view_labels.max()) + 1 for view_labels in labels))
 
 
 def superpixels(

@@ -128,10 +128,10 @@ def collect(
     options = EvaluateOptions((), threads=threads)
     evaluation = evaluate(scene, results, held_out, options, cameras=cameras, progress=progress, on_image=keep)
     frame = scene_frame(scene)
-    named = {INPUT: scene.file_gaussians, **{name: some.numpy() for name, some in results.items()}}
+    named = {INPUT: scene.file_gaussians, **{name: gaussians.numpy() for name, gaussians in results.items()}}
     sides = [
-        _side(one, frame.enter(named[one.name]), size, "context" if held_out is None else "target")
-        for one, size in zip(evaluation.results, file_bytes, strict=True)
+        _side(result, frame.enter(named[result.name]), size, "context" if held_out is None else "target")
+        for result, size in zip(evaluation.results, file_bytes, strict=True)
     ]
     means = frame.enter(named[evaluation.results[:2][-1].name]).means
     views: list[PageView] = []
@@ -145,8 +145,8 @@ def collect(
                 camera=camera,
                 distance=middle_depth(means, camera),
                 photo=None if photos is None else encode_still(to_picture(photos[i])),
-                stills=tuple(stills[one.name, split, i] for one in evaluation.results),
-                scores=tuple(one.scores[len(views)].masked for one in evaluation.results),
+                stills=tuple(stills[result.name, split, i] for result in evaluation.results),
+                scores=tuple(result.scores[len(views)].masked for result in evaluation.results),
             ))  # fmt: skip
     with use_threads(threads):
         outside = _outside_view(scene, named, frame, len(views))
@@ -159,7 +159,7 @@ def collect(
 def _outside_view(scene: Scene, named: Mapping[str, Gaussians], frame: Frame, place: int) -> PageView:
     """Draw Gaussians of a scene's world from outside of its capture."""
     camera, distance = outside_camera(scene.cameras.numpy(), scene.file_gaussians.means)
-    renders = (render(some, camera, near=near_plane(scene)) for some in named.values())
+    renders = (render(gaussians, camera, near=near_plane(scene)) for gaussians in named.values())
     return PageView(
         name=OUTSIDE,
         place=place,
@@ -167,7 +167,7 @@ def _outside_view(scene: Scene, named: Mapping[str, Gaussians], frame: Frame, pl
         camera=frame.enter_cameras(camera),
         distance=distance / frame.unit,
         photo=None,
-        stills=tuple(encode_still(to_picture(one.images[0])) for one in renders),
+        stills=tuple(encode_still(to_picture(drawing.images[0])) for drawing in renders),
         scores=(),
         outside=True,
     )

@@ -85,16 +85,16 @@ def report_page(document: Mapping[str, Any], pictures: Sequence[Sequence[tuple[s
     if len(results) > 1:
         before, after = results[:2]
         split = "target" if "target" in before["mean"] else "context"
-        psnrs = [one["mean"][split]["psnr_visible"] for one in (before, after)]
+        psnrs = [result["mean"][split]["psnr_visible"] for result in (before, after)]
         headline = headline_of(before["num_gaussians"], after["num_gaussians"], *psnrs)
-        milliseconds = [1000 * one["render_seconds"] for one in (before, after)]
+        milliseconds = [1000 * result["render_seconds"] for result in (before, after)]
         tiles = [
             ("Gaussians", f"{before['num_gaussians']:,}", f"{after['num_gaussians']:,}"),
             ("File", human_bytes(before["bytes"]), human_bytes(after["bytes"])),
             ("Render time", f"{milliseconds[0]:.1f}", f"{milliseconds[1]:.1f} ms"),
         ]
     views = [
-        [(text, data_uri(encode_still(to_picture(image)), "image/webp")) for text, image in one] for one in pictures
+        [(text, data_uri(encode_still(to_picture(image)), "image/webp")) for text, image in row] for row in pictures
     ]
     return render_template(
         "report.html", policy=PICTURES, title=title, views=views, headline=headline, tiles=tiles,
@@ -106,8 +106,8 @@ def headline(before: Side, after: Side | None = None) -> str:
     """Write the share of Gaussians and the change of quality in one line; of one scene what it has."""
     if after is None:
         quality = before.mean.psnr
-        known = quality is not None and np.isfinite(quality)
-        return f"{before.num_gaussians:,} Gaussians" + (f", {quality:.1f} dB" if known else "")
+        has_quality = quality is not None and np.isfinite(quality)
+        return f"{before.num_gaussians:,} Gaussians" + (f", {quality:.1f} dB" if has_quality else "")
     return headline_of(before.num_gaussians, after.num_gaussians, before.mean.psnr, after.mean.psnr)
 
 

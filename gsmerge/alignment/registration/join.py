@@ -43,23 +43,23 @@ def join_scenes(scenes: Sequence[Scene], paths: Sequence[Path]) -> JoinedScene:
     of their views or in their harmonics, or no two show the same surfaces.
     """
     _check(scenes, paths)
-    found = register(scenes)
+    registration = register(scenes)
     names = _names(paths)
-    used = [i for i, place in enumerate(found.places) if place is not None]
+    used = [i for i, place in enumerate(registration.places) if place is not None]
     if len(used) < 2:
         problem = f"expected files that show one place, found no two of {len(paths)}"
         remedy = "give photos that overlap by half, name their folder with --images"
         remedy += ", or compact each file by itself"
         raise SceneError(paths[0], f"{problem} whose photos share enough of it", remedy)
-    moved = [move_scene(scenes[i], place) for i in used if (place := found.places[i]) is not None]
-    counts = [found.matches[i] for i in used]
+    moved = [move_scene(scenes[i], place) for i in used if (place := registration.places[i]) is not None]
+    counts = [registration.matches[i] for i in used]
     joined = f"{len(used)} of {len(scenes)} files are joined in the frame of {names[used[0]]}"
     notes = [f"{joined}, by {min(counts)} to {max(counts)} keypoints each"]
     left_out = "is left out: too little of what its photo shows is found in the others"
     notes += [f"{name} {left_out}" for i, name in enumerate(names) if i not in used]
     if len({scene.images is None for scene in moved}) > 1:
         notes.append("some files have no photos, so none are used; name the folder of all with --images")
-    facts = [_facts(*one) for one in zip(paths, found.places, found.matches, strict=True)]
+    facts = [_facts(*entry) for entry in zip(paths, registration.places, registration.matches, strict=True)]
     return JoinedScene(concat_scenes(moved), tuple(used), tuple(names), tuple(notes), tuple(facts))
 
 
@@ -75,7 +75,7 @@ def _check(scenes: Sequence[Scene], paths: Sequence[Path]) -> None:
     degree = first.gaussians.sh_degree
     for scene, path in zip(scenes, paths, strict=True):
         other = scene.cameras.width, scene.cameras.height
-        own = scene.gaussians.sh_degree
+        sh_degree = scene.gaussians.sh_degree
         if not scene.aligned:
             problem = "expected one Gaussian per pixel and a camera, to be joined, found none"
             raise SceneError(path, problem, "compact it by itself; a result is named with -o")
@@ -83,8 +83,8 @@ def _check(scenes: Sequence[Scene], paths: Sequence[Path]) -> None:
             problem = f"expected views of {size[0]} x {size[1]} as in {paths[0].name}"
             problem += f", found {other[0]} x {other[1]}"
             raise SceneError(path, problem, "export all at one size")
-        if own != degree:
-            problem = f"expected harmonics of degree {degree} as in {paths[0].name}, found {own}"
+        if sh_degree != degree:
+            problem = f"expected harmonics of degree {degree} as in {paths[0].name}, found {sh_degree}"
             raise SceneError(path, problem, "export all with one degree")
 
 
@@ -143,9 +143,9 @@ def _basis(directions: np.ndarray, num: int) -> np.ndarray:
     view_colors(means, sh0, np.zeros((count, num, 3), np.float32), ids, eye, 0, count, plain)
     columns = []
     for base in range(num):
-        one = np.zeros((count, num, 3), np.float32)
-        one[:, base] = 1
-        view_colors(means, sh0, one, ids, eye, 0, count, colors)
+        shN = np.zeros((count, num, 3), np.float32)
+        shN[:, base] = 1
+        view_colors(means, sh0, shN, ids, eye, 0, count, colors)
         columns.append((colors - plain)[:, 0].astype(np.float64))
     return np.stack(columns, 1)
 
@@ -160,8 +160,8 @@ def concat_scenes(scenes: Sequence[Scene]) -> Scene:
     )
     images = [scene.images for scene in scenes if scene.images is not None]
     gaps = [scene.missing for scene in scenes]
-    incomplete = any(one is not None for one in gaps)
-    filled = [np.zeros(_grid(scene), bool) if one is None else one for scene, one in zip(scenes, gaps, strict=True)]
+    incomplete = any(gap is not None for gap in gaps)
+    filled = [np.zeros(_grid(scene), bool) if gap is None else gap for scene, gap in zip(scenes, gaps, strict=True)]
     aligned = all(scene.aligned for scene in scenes)
     return Scene(
         gaussians=Gaussians.concat([scene.gaussians for scene in scenes]),
@@ -188,14 +188,14 @@ def _grid(scene: Scene) -> tuple[int, int, int]:
 
 def _concat_large(photos: Sequence[LargePhotos | None]) -> LargePhotos | None:
     """Put large photos one after the other; None where some are missing or sizes differ."""
-    given = [one for one in photos if one is not None]
-    if len(given) < len(photos) or len({(one.width, one.height) for one in given}) > 1:
+    sources = [source for source in photos if source is not None]
+    if len(sources) < len(photos) or len({(source.width, source.height) for source in sources}) > 1:
         return None
-    readers = [(one, number) for one in given for number in one.ids]
+    readers = [(source, number) for source in sources for number in source.ids]
 
     def read(view: int) -> np.ndarray:
-        one, number = readers[view]
-        return one.read(number)
+        source, number = readers[view]
+        return source.read(number)
 
-    Ks = np.concatenate([one.Ks for one in given])
-    return LargePhotos(Ks, given[0].width, given[0].height, tuple(range(len(readers))), read)
+    Ks = np.concatenate([source.Ks for source in sources])
+    return LargePhotos(Ks, sources[0].width, sources[0].height, tuple(range(len(readers))), read)

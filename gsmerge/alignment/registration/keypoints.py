@@ -44,9 +44,9 @@ class End:
     viewmats: np.ndarray  # [m,4,4] cameras that see them
     Ks: np.ndarray  # [m,3,3]
 
-    def select(self, some: np.ndarray) -> End:
+    def select(self, mask: np.ndarray) -> End:
         """Select matches by a mask."""
-        return End(*(getattr(self, field.name)[some] for field in fields(self)))
+        return End(*(getattr(self, field.name)[mask] for field in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,10 +60,10 @@ class Matches:
     def __len__(self) -> int:
         return len(self.ends[0].points)
 
-    def select(self, some: np.ndarray) -> Matches:
+    def select(self, mask: np.ndarray) -> Matches:
         """Select matches by a mask."""
         first, second = self.ends
-        return replace(self, ends=(first.select(some), second.select(some)))
+        return replace(self, ends=(first.select(mask), second.select(mask)))
 
 
 def find_keypoints(scene: Scene) -> list[Photo]:
@@ -168,13 +168,13 @@ def _depths_at(depths: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def match_photos(
-    scenes: tuple[int, int], one: Sequence[Photo], other: Sequence[Photo], size: tuple[int, int]
+    scenes: tuple[int, int], photos: Sequence[Photo], other_photos: Sequence[Photo], size: tuple[int, int]
 ) -> Matches:
     """Match the keypoints of all photos of two scenes, whose grids have a ``size``."""
-    pairs = [(a, b) for a in one for b in other]
+    pairs = [(a, b) for a in photos for b in other_photos]
     rows = [_match(a.descriptors, b.descriptors) for a, b in pairs]
-    first = _make_end([a for a, _ in pairs], [some for some, _ in rows])
-    second = _make_end([b for _, b in pairs], [some for _, some in rows])
+    first = _make_end([a for a, _ in pairs], [ids for ids, _ in rows])
+    second = _make_end([b for _, b in pairs], [ids for _, ids in rows])
     diagonal = float(np.sqrt(size[0] ** 2 + size[1] ** 2))
     return Matches(scenes, (first, second), PIXEL_SPREAD * diagonal)
 
@@ -182,10 +182,10 @@ def match_photos(
 def _make_end(photos: Sequence[Photo], rows: Sequence[np.ndarray]) -> End:
     """Collect the keypoints of these rows of each photo."""
     chosen = list(zip(photos, rows, strict=True))
-    counts = [len(some) for some in rows]
+    counts = [len(ids) for ids in rows]
     return End(
-        points=np.concatenate([photo.points[some] for photo, some in chosen]),
-        pixels=np.concatenate([photo.pixels[some] for photo, some in chosen]),
+        points=np.concatenate([photo.points[ids] for photo, ids in chosen]),
+        pixels=np.concatenate([photo.pixels[ids] for photo, ids in chosen]),
         viewmats=np.repeat([photo.viewmat for photo in photos], counts, 0),
         Ks=np.repeat([photo.K for photo in photos], counts, 0),
     )

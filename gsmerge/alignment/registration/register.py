@@ -71,14 +71,14 @@ def register(scenes: Sequence[Scene]) -> Registration:
     pairs = [match_photos((a, b), photos[a], photos[b], size) for a, b in ids]
     links = [link for link in parallel_map(connect, pairs) if link is not None]
     places = _chain(links, count)
-    inside = [some for _, some in links if all(places[scene] is not None for scene in some.scenes)]
+    inside = [pair for _, pair in links if all(places[scene] is not None for scene in pair.scenes)]
     spread = DEPTH_SPREAD
     for loose in LOOSE if inside else ():
-        kept = [some.select(_squares(places, some, spread) < loose * AGREE) for some in inside]
+        kept = [pair.select(_squares(places, pair, spread) < loose * AGREE) for pair in inside]
         places = _refine(places, kept, spread)
         inside, spread = _measure_spreads(places, inside)
-    agreeing = [some.select(_squares(places, some, spread) < AGREE) for some in inside]
-    matches = [sum(len(some) for some in agreeing if i in some.scenes) for i in range(count)]
+    agreeing = [pair.select(_squares(places, pair, spread) < AGREE) for pair in inside]
+    matches = [sum(len(pair) for pair in agreeing if i in pair.scenes) for i in range(count)]
     unit = _unit(photos, places)
     rounded = tuple(None if place is None else round_place(place, unit) for place in places)
     return Registration(rounded, tuple(matches))
@@ -96,7 +96,7 @@ def connect(matches: Matches) -> tuple[Similarity, Matches] | None:
         return None
     pair = replace(matches, scenes=(0, 1))
     trials = _sample_places(matches)
-    misses = [_squares((one, IDENTITY), pair, DEPTH_SPREAD) for one in trials]
+    misses = [_squares((trial, IDENTITY), pair, DEPTH_SPREAD) for trial in trials]
     scores = [(1 - squares / AGREE).clip(0).sum() for squares in misses]
     places: Places = (trials[int(np.argmax(scores))], IDENTITY)
     agree = misses[int(np.argmax(scores))] < AGREE
@@ -105,10 +105,10 @@ def connect(matches: Matches) -> tuple[Similarity, Matches] | None:
             return None
         places = _refine(places, [pair.select(agree)], DEPTH_SPREAD, fixed=1)
         agree = _squares(places, pair, DEPTH_SPREAD) < AGREE
-    found = places[0]
-    if found is None or agree.sum() < max(MIN_MATCHES, MIN_SHARE * len(matches)):
+    place = places[0]
+    if place is None or agree.sum() < max(MIN_MATCHES, MIN_SHARE * len(matches)):
         return None
-    return found, matches.select(agree)
+    return place, matches.select(agree)
 
 
 def _sample_places(matches: Matches) -> list[Similarity]:
@@ -146,22 +146,22 @@ class _Residuals:
     slopes: np.ndarray  # [m,3,3] their derivatives by ``moved``
 
 
-def _residuals(place: Similarity, own: End, other: End, pixels: float, spread: float) -> _Residuals:
+def _residuals(place: Similarity, end: End, other: End, pixels: float, spread: float) -> _Residuals:
     """Project one end's points into the other's photos, by the similarity between their frames.
 
     ``pixels``, ``spread``: standard deviations of a keypoint and of the logarithm of a depth.
     """
     turns = other.viewmats[:, :3, :3]
-    moved = move_points(place, own.points)
+    moved = move_points(place, end.points)
     camera = _times(turns, moved) + other.viewmats[:, :3, 3]
     z = np.maximum(camera[:, 2], 1e-9 * np.abs(camera).max(1) + 1e-30)
     projected = _times(other.Ks, camera)[:, :2] / z[:, None]
     by_camera = np.zeros((len(moved), 3, 3))
     by_camera[:, :2] = (other.Ks[:, :2] - projected[..., None] * np.eye(3)[2]) / z[:, None, None]
     # how the place in the photo moves where a depth is wrong by one standard deviation
-    poses = own.viewmats[:, :3, :3]
-    eyes = -_times(poses.swapaxes(1, 2), own.viewmats[:, :3, 3])
-    along = place.scale * _times(turns, matmul(own.points - eyes, place.rotation.T))
+    poses = end.viewmats[:, :3, :3]
+    eyes = -_times(poses.swapaxes(1, 2), end.viewmats[:, :3, 3])
+    along = place.scale * _times(turns, matmul(end.points - eyes, place.rotation.T))
     streaks = spread * _times(by_camera[:, :2], along)
     lengths = np.maximum((streaks * streaks).sum(1), 1e-30)
     shrink = (1 - pixels / np.sqrt(pixels**2 + lengths)) / lengths
@@ -184,7 +184,7 @@ def _times(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
 
 def _squares(places: Places, matches: Matches, spread: float) -> np.ndarray:
     """Return the squared residual ``[m]`` of each match, the larger of both ways."""
-    both = [(one.values**2).sum(1) for one in _both_ways(places, matches, spread)]
+    both = [(residuals.values**2).sum(1) for residuals in _both_ways(places, matches, spread)]
     return np.asarray(np.maximum(*both))
 
 
@@ -202,12 +202,12 @@ def _measure_spreads(places: Places, matches: Sequence[Matches]) -> tuple[list[M
 
     Returns the matches with the former, and the latter.
     """
-    values = [_both_ways(places, some, DEPTH_SPREAD)[0].values for some in matches]
-    lengths = [some.spread * np.sqrt((one[:, :2] ** 2).sum(1)) for some, one in zip(matches, values, strict=True)]
+    values = [_both_ways(places, pair, DEPTH_SPREAD)[0].values for pair in matches]
+    lengths = [pair.spread * np.sqrt((errors[:, :2] ** 2).sum(1)) for pair, errors in zip(matches, values, strict=True)]
     ratios = np.abs(np.concatenate(values)[:, 2]) * DEPTH_SPREAD
     spread = NORMAL * float(lower_median(ratios))
     pixels = max(NORMAL_2D * float(lower_median(np.concatenate(lengths))), MIN_PIXELS)
-    measured = [replace(some, spread=min(pixels, some.spread)) for some in matches]
+    measured = [replace(pair, spread=min(pixels, pair.spread)) for pair in matches]
     return measured, min(max(spread, MIN_DEPTH_SPREAD), DEPTH_SPREAD)
 
 
@@ -217,9 +217,9 @@ def _measure_spreads(places: Places, matches: Sequence[Matches]) -> tuple[list[M
 def _chain(links: Sequence[tuple[Similarity, Matches]], count: int) -> Places:
     """Place the largest connected set by its strongest links, in the frame of its first scene."""
     strength = [0] * count
-    for _, some in links:
-        for scene in some.scenes:
-            strength[scene] += len(some)
+    for _, pair in links:
+        for scene in pair.scenes:
+            strength[scene] += len(pair)
     best: Places = []
     for start in sorted(range(count), key=lambda scene: -strength[scene]):
         places = _chain_from(start, links, count)
@@ -242,8 +242,8 @@ def _chain_from(start: int, links: Sequence[tuple[Similarity, Matches]], count: 
         ends = [link for link in links if sum(places[scene] is not None for scene in link[1].scenes) == 1]
         if not ends:
             return places
-        place, some = max(ends, key=lambda link: len(link[1]))
-        a, b = some.scenes
+        place, pair = max(ends, key=lambda link: len(link[1]))
+        a, b = pair.scenes
         first = places[a]
         second = places[b]
         if second is not None:
@@ -264,14 +264,14 @@ def _refine(places: Places, matches: Sequence[Matches], spread: float, fixed: in
         return near, _normal_equations(near, matches, spread, free)
 
     def step(state: _Fit, damping: float) -> _Fit | None:
-        own, (_, curvature, slope) = state
+        current_places, (_, curvature, slope) = state
         scale = damping * np.diag(curvature) + 1e-12 * curvature.trace() + 1e-30
         steps = -solve(curvature + np.diag(scale), slope).reshape(-1, SIZE)
         if not np.isfinite(steps).all():
             return None
-        moved = list(own)
+        moved = list(current_places)
         for i, vector in zip(free, steps, strict=True):
-            moved[i] = apply_after(own[i] or IDENTITY, _make_step(vector))
+            moved[i] = apply_after(current_places[i] or IDENTITY, _make_step(vector))
         return fit(moved)
 
     return descend(fit(places), lambda state: state[1][0], step, SCHEDULE)[0]
@@ -293,20 +293,20 @@ def _normal_equations(
     slope = np.zeros(size)
     cost = 0.0
     columns = {scene: slice(i * SIZE, (i + 1) * SIZE) for i, scene in enumerate(free)}
-    for some in matches:
-        there = _between(places, some.scenes)
-        ways = _both_ways(places, some, spread)
-        for way, place, found in zip((0, 1), (there, invert_place(there)), ways, strict=True):
-            squares = (found.values**2).sum(1)
+    for pair in matches:
+        there = _between(places, pair.scenes)
+        ways = _both_ways(places, pair, spread)
+        for way, place, residuals in zip((0, 1), (there, invert_place(there)), ways, strict=True):
+            squares = (residuals.values**2).sum(1)
             weights = 1 / (1 + squares / DOUBT)
             cost += DOUBT * float(log1p(squares / DOUBT).sum())
-            own = _by_step(found.slopes, some.ends[way].points, place)
-            other = -_by_step(found.slopes, found.moved, IDENTITY)
-            parts = {some.scenes[way]: own, some.scenes[1 - way]: other}
+            jacobian = _by_step(residuals.slopes, pair.ends[way].points, place)
+            other_jacobian = -_by_step(residuals.slopes, residuals.moved, IDENTITY)
+            parts = {pair.scenes[way]: jacobian, pair.scenes[1 - way]: other_jacobian}
             parts = {scene: part for scene, part in parts.items() if scene in columns}
             for scene, part in parts.items():
                 weighted = (weights[:, None, None] * part).reshape(-1, SIZE).T
-                slope[columns[scene]] += matmul(weighted, found.values.reshape(-1))
+                slope[columns[scene]] += matmul(weighted, residuals.values.reshape(-1))
                 for second, more in parts.items():
                     block = matmul(weighted, more.reshape(-1, SIZE))
                     curvature[columns[scene], columns[second]] += block
@@ -325,6 +325,6 @@ def _by_step(slopes: np.ndarray, points: np.ndarray, place: Similarity) -> np.nd
 
 def _unit(photos: Sequence[Sequence[Photo]], places: Places) -> float:
     """Return the power of two next to the median depth of the first placed scene's points."""
-    first = next(some for some, place in zip(photos, places, strict=True) if place is not None)
+    first = next(scene_photos for scene_photos, place in zip(photos, places, strict=True) if place is not None)
     depths = np.concatenate([camera_depths(photo.points, photo.viewmat) for photo in first])
     return float(2.0 ** np.frexp(lower_median(depths))[1]) if len(depths) else 1.0

@@ -280,9 +280,9 @@ def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> 
             raise SceneError(path, "expected the image size (w, h) of the cameras, found none")
     check_pixels(path, *size)
     sides = np.stack([camera_file.widths, camera_file.heights], 1)
-    known = (sides > 0).all(1, keepdims=True)
+    has_size = (sides > 0).all(1, keepdims=True)
     Ks = camera_file.Ks.copy()
-    Ks[:, :2] *= np.where(known, size / np.maximum(sides, 1), 1.0)[:, :, None]
+    Ks[:, :2] *= np.where(has_size, size / np.maximum(sides, 1), 1.0)[:, :, None]
     return Cameras(camera_file.viewmats, Ks, *size)
 
 

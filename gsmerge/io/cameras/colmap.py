@@ -92,9 +92,9 @@ def _camera(path: Path, camera_id: int, model: str, size: tuple[int, int], param
     if model not in _PERSPECTIVE | _FISHEYE:
         problem = f"camera {camera_id}: expected a pinhole, a perspective or a fisheye camera, found {model}"
         raise SceneError(path, problem, "undistort the images first")
-    one = model in _ONE_FOCAL
-    K = make_pinhole(params[0], *params[:3]) if one else make_pinhole(*params[:4])
-    distortion = params[3 if one else 4 : _NUM_PARAMS[model]]
+    one_focal = model in _ONE_FOCAL
+    K = make_pinhole(params[0], *params[:3]) if one_focal else make_pinhole(*params[:4])
+    distortion = params[3 if one_focal else 4 : _NUM_PARAMS[model]]
     lens = make_lens(model, "fisheye" if model in _FISHEYE else "perspective", distortion)
     return View("", np.eye(4), K, size, lens)
 

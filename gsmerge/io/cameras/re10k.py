@@ -152,7 +152,7 @@ def read_torch_file(path: Path) -> Any:
     try:
         with zipfile.ZipFile(path) as archive:
             members = {member.filename: member for member in archive.infolist()}
-            if any(one.compress_type != zipfile.ZIP_STORED for one in members.values()):
+            if any(member.compress_type != zipfile.ZIP_STORED for member in members.values()):
                 raise SceneError(path, f"{problem} packed members")
             (name,) = (name for name in members if name.split("/")[1:] == ["data.pkl"])
             if members[name].file_size > MAX_PICKLE:
@@ -184,16 +184,16 @@ class _Structure(pickle._Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         """Return what stands for a name: of a storage the type of its numbers."""
-        known = {
+        objects = {
             ("collections", "OrderedDict"): OrderedDict,
             ("torch._utils", "_rebuild_tensor_v2"): self._make_tensor,
             ("torch._utils", "_rebuild_parameter"): lambda tensor, *_: tensor,
         }
         if module == "torch" and name.endswith("Storage"):
             return np.dtype(_DTYPES[name]) if name in _DTYPES else None
-        if (module, name) not in known:
+        if (module, name) not in objects:
             raise pickle.UnpicklingError(f"refused to load {module}.{name}")
-        return known[module, name]
+        return objects[module, name]
 
     def persistent_load(self, pid: Any) -> Any:
         """Find the numbers of a storage."""
@@ -203,7 +203,7 @@ class _Structure(pickle._Unpickler):
     def _make_tensor(self, storage: Any, offset: int, shape: Any, strides: Any, *_: object) -> Any:
         member, dtype = storage
         numbers = (offset, *shape, *strides)
-        if not all(type(one) is int and 0 <= one < MAX_INDEX for one in numbers):
+        if not all(type(number) is int and 0 <= number < MAX_INDEX for number in numbers):
             raise pickle.UnpicklingError("a tensor of an impossible shape")
         if len(shape) != len(strides) or not isinstance(member, zipfile.ZipInfo):
             raise pickle.UnpicklingError("a tensor of another form")

@@ -54,8 +54,8 @@ def find_other_cameras(folder: Path) -> Path | None:
     """Find the only ``.json`` or ``.npz`` in a folder that holds cameras, whatever its name; None without one."""
     files = sorted(path for path in folder.glob("[!.]*") if path.suffix in (".json", ".npz"))
     files = [path for path in files if path.is_file() and not path.name.endswith(VIEWER_CAMERAS)]
-    found = [path for path in files[:_MAX_OTHERS] if _holds_cameras(path)]
-    return found[0] if len(found) == 1 else None
+    camera_files = [path for path in files[:_MAX_OTHERS] if _holds_cameras(path)]
+    return camera_files[0] if len(camera_files) == 1 else None
 
 
 def _holds_cameras(path: Path) -> bool:

@@ -143,12 +143,12 @@ def to_bytes(values: np.ndarray) -> np.ndarray:
     return np.clip(np.floor(values + 0.5), 0, 255).astype(np.uint8)
 
 
-def from_smallest_three(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
+def from_smallest_three(largest: np.ndarray, smallest: np.ndarray) -> np.ndarray:
     """Invert :func:`smallest_three`: restore unit quaternions ``[n,4]``."""
     quats = np.empty((len(largest), 4))
     is_largest = np.arange(4) == largest[:, None]
-    quats[~is_largest] = others.reshape(-1)
-    quats[is_largest] = np.sqrt(np.clip(1 - (others**2).sum(1), 0, None))
+    quats[~is_largest] = smallest.reshape(-1)
+    quats[is_largest] = np.sqrt(np.clip(1 - (smallest**2).sum(1), 0, None))
     return quats
 
 

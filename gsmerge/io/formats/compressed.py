@@ -59,8 +59,8 @@ def unpack(path: Path, data: PlyData) -> np.ndarray:
         _fill_between(rows, arrays.SH0, colors, chunk, COLORS)
         rows["opacity"] = log(alpha) - log1p(-alpha)  # infinite for 0 and 1, which the reader takes as such
     largest = (words["packed_rotation"] >> np.uint32(30)).astype(np.int64)  # of wxyz
-    others = np.stack(_shares(words["packed_rotation"], (10, 10, 10)), 1) - 0.5  # within +-sqrt(1/2)
-    quats = arrays.from_smallest_three(largest, others * np.sqrt(2.0))
+    smallest = np.stack(_shares(words["packed_rotation"], (10, 10, 10)), 1) - 0.5  # within +-sqrt(1/2)
+    quats = arrays.from_smallest_three(largest, smallest * np.sqrt(2.0))
     for i, name in enumerate(arrays.QUATS):
         rows[name] = quats[:, i]
     for i in range(num_rest):
@@ -111,8 +111,8 @@ def compressed_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> byte
     means, scales, colors = (shares for _, _, shares in ranged)
     words = np.empty((count, 4), "<u4")
     words[:, 0], words[:, 2] = _packed(means, (11, 10, 11)), _packed(scales, (11, 10, 11))
-    largest, others = arrays.smallest_three(columns.quats)
-    words[:, 1] = largest.astype(np.uint32) << np.uint32(30) | _packed(others / np.sqrt(2.0) + 0.5, (10, 10, 10))
+    largest, smallest = arrays.smallest_three(columns.quats)
+    words[:, 1] = largest.astype(np.uint32) << np.uint32(30) | _packed(smallest / np.sqrt(2.0) + 0.5, (10, 10, 10))
     words[:, 3] = _packed(np.concatenate([colors, columns.opacities[:, None]], 1), (8, 8, 8, 8))
     harmonics = np.floor((columns.harmonics / SH_RANGE + 0.5) * 256).transpose(0, 2, 1)
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]

@@ -160,11 +160,11 @@ def _convert_files(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: 
     out |= {name: make_array(shape, np.float32) for name, shape in shapes.items()}
     num_clipped = num_zero_quats = first = 0
     for name, part in zip(paths, parts, strict=True):
-        some = slice(first, first + len(part.rows))
-        clipped, zero = _convert_file(name, part, {key: column[some] for key, column in out.items()})
-        num_clipped, num_zero_quats, first = num_clipped + clipped, num_zero_quats + zero, some.stop
-    known = opacity if opacity != "auto" else stored.encoding
-    encoding = _activate(out["opacities"], out["valid"], known)
+        part_rows = slice(first, first + len(part.rows))
+        clipped, zero = _convert_file(name, part, {key: column[part_rows] for key, column in out.items()})
+        num_clipped, num_zero_quats, first = num_clipped + clipped, num_zero_quats + zero, part_rows.stop
+    declared_encoding = opacity if opacity != "auto" else stored.encoding
+    encoding = _activate(out["opacities"], out["valid"], declared_encoding)
     num_bad = clear_invalid(path, out)
     byte_columns = tuple(name for name in names if dtype[name].itemsize == 1)
     if byte_columns == arrays.NORMALS:
@@ -185,7 +185,7 @@ def _convert_files(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: 
         comments=stored.comments,
         sh_degree=arrays.sh_degree(num_higher),
         opacity_encoding=encoding,
-        opacity_guessed=known is None,
+        opacity_guessed=declared_encoding is None,
         num_nonfinite=num_bad,
         num_clipped_scales=num_clipped,
         num_zero_quats=num_zero_quats,
@@ -287,25 +287,25 @@ def _normalise(quats: list[np.ndarray], out: np.ndarray) -> np.ndarray:
     return zero
 
 
-def _activate(opacities: np.ndarray, valid: np.ndarray, known: str | None) -> str:
+def _activate(opacities: np.ndarray, valid: np.ndarray, encoding: str | None) -> str:
     """Convert stored opacities to [0, 1] in place, and return their encoding, guessed where it is not known.
 
     They are raw if all finite ones lie in [0, 1]. An infinite raw one makes its row invalid.
     """
     finite = np.isfinite(opacities)
-    if known is None:
+    if encoding is None:
         low = opacities.min(where=finite, initial=np.inf)
         high = opacities.max(where=finite, initial=-np.inf)
-        known = "raw" if 0 <= low <= high <= 1 else "logit"
-    if known == "raw":
+        encoding = "raw" if 0 <= low <= high <= 1 else "logit"
+    if encoding == "raw":
         valid &= finite
         np.clip(opacities, 0, 1, out=opacities)
-        return known
+        return encoding
     with np.errstate(all="ignore"):
         opacities[:] = exp(np.negative(opacities, out=opacities))
         np.add(opacities, 1, out=opacities)
         np.reciprocal(opacities, out=opacities)
-    return known
+    return encoding
 
 
 def _describe_odd_scales(means: np.ndarray, scales: np.ndarray, valid: np.ndarray) -> str:
@@ -313,10 +313,10 @@ def _describe_odd_scales(means: np.ndarray, scales: np.ndarray, valid: np.ndarra
     rows = np.flatnonzero(valid)
     if len(rows) < _MIN_JUDGED:
         return ""
-    some = rows[:: max(1, len(rows) // _SCALE_SAMPLES)]
-    low, high = np.quantile(means[some].astype(np.float64), (0.05, 0.95), axis=0)
+    sample = rows[:: max(1, len(rows) // _SCALE_SAMPLES)]
+    low, high = np.quantile(means[sample].astype(np.float64), (0.05, 0.95), axis=0)
     width = float((high - low).max())
-    size = float(np.median(scales[some].max(1)))
+    size = float(np.median(scales[sample].max(1)))
     text = f"half of the Gaussians have a standard deviation above {size:.3g}"
     text += f" in a scene of a width of {width:.3g}"
     most = _MAX_SPACINGS * width / float(np.sqrt(len(rows)))

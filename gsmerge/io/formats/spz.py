@@ -189,8 +189,8 @@ def _read_rotations(stored: np.ndarray, version: int) -> np.ndarray:
         return np.concatenate([w, xyz], 1)
     words = stored.view("<u4")[:, 0]  # the top two bits name the largest of xyzw
     parts = np.stack([words >> np.uint32(shift) & np.uint32(1023) for shift in (20, 10, 0)], 1)
-    others = np.where(parts & 512, -1.0, 1.0) * (parts & 511) / (511 * np.sqrt(2.0))
-    return np.roll(arrays.from_smallest_three((words >> np.uint32(30)).astype(int), others), 1, axis=1)
+    smallest = np.where(parts & 512, -1.0, 1.0) * (parts & 511) / (511 * np.sqrt(2.0))
+    return np.roll(arrays.from_smallest_three((words >> np.uint32(30)).astype(int), smallest), 1, axis=1)
 
 
 @dataclass(frozen=True)
@@ -233,9 +233,9 @@ def spz_columns(gaussians: Gaussians, max_degree: int, *, mip: bool = False, fin
     steps = np.where(np.arange(columns.harmonics.shape[1]) < 3, 8, 16)[:, None]  # of degree 1, and above
     stepped = (np.round(np.clip(columns.harmonics, -2, 2) * 128) + 128 + steps // 2) // steps * steps
     # rotations from the top: index of the largest of xyzw, then sign and magnitude of the others
-    largest, others = arrays.smallest_three(np.roll(columns.quats, -1, axis=1))
-    codes = np.minimum(np.floor(511 * np.abs(others) * np.sqrt(2.0) + 0.5), 511).astype(np.uint32)
-    codes |= (others < 0).astype(np.uint32) << np.uint32(9)
+    largest, smallest = arrays.smallest_three(np.roll(columns.quats, -1, axis=1))
+    codes = np.minimum(np.floor(511 * np.abs(smallest) * np.sqrt(2.0) + 0.5), 511).astype(np.uint32)
+    codes |= (smallest < 0).astype(np.uint32) << np.uint32(9)
     words = largest.astype(np.uint32) << np.uint32(30)
     for i, shift in enumerate((20, 10, 0)):
         words |= codes[:, i] << np.uint32(shift)

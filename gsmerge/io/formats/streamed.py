@@ -60,18 +60,18 @@ def streamed_files(levels: Sequence[Gaussians], *, mip: bool = False) -> dict[st
     tree = _Boxes(columns).split(leaves)
     files: dict[str, bytes] = {}
     names: list[str] = []
-    for level, own in enumerate(columns):
+    for level, level_columns in enumerate(columns):
         for number, members in enumerate(_pack([len(leaf.rows[level]) for leaf in leaves])):
-            parts = [_along_curve(own.means, leaves[i].rows[level]) for i in members]
+            parts = [_along_curve(level_columns.means, leaves[i].rows[level]) for i in members]
             offsets = np.cumsum([0, *map(len, parts)])
             for i, part, offset in zip(members, parts, offsets, strict=False):
                 run = {"file": len(names), "offset": int(offset), "count": len(part)}
                 leaves[i].node["lods"][str(level)] = run
-            chunk = sog.sog_files(own.take(np.concatenate(parts)), mip=mip)
+            chunk = sog.sog_files(level_columns.take(np.concatenate(parts)), mip=mip)
             folder = f"{level}_{number}-{_hash(chunk)}"
             files |= {f"{folder}/{name}": data for name, data in chunk.items()}
             names.append(f"{folder}/{sog.META}")
-    counts = [len(one) for one in columns]
+    counts = [len(level_columns) for level_columns in columns]
     index = {"version": VERSION, "asset": {"generator": sog.GENERATOR}, "count": sum(counts), "counts": counts}
     index |= {"lodLevels": len(counts), "filenames": names, "tree": tree}
     return files | {INDEX: json.dumps(index).encode("ascii")}
@@ -81,10 +81,10 @@ class _Boxes:
     """The centres of all levels, and the boxes of what they show."""
 
     def __init__(self, columns: Sequence[arrays.Columns]) -> None:
-        self.means = np.concatenate([one.means for one in columns])
+        self.means = np.concatenate([level.means for level in columns])
         self.starts = np.cumsum([0, *map(len, columns)])  # first row of each level
-        rotations = quat_to_rotmat(np.concatenate([one.quats for one in columns]))
-        scales = exp(np.concatenate([one.log_scales for one in columns]))
+        rotations = quat_to_rotmat(np.concatenate([level.quats for level in columns]))
+        scales = exp(np.concatenate([level.log_scales for level in columns]))
         widths = (np.abs(rotations) * scales[:, None]).sum(-1)  # of the box about the turned ellipsoid
         logs = log1p(np.abs(self.means).max(0))
         rounding = (1 + np.abs(self.means)) * 2 * logs / 65535  # as far as a .sog moves a centre
@@ -104,8 +104,8 @@ class _Boxes:
         }
         if len(rows) <= LEAF_SIZE or not extent.max() > 0:
             ends = np.searchsorted(rows, self.starts)
-            own = [rows[a:b] - start for a, b, start in zip(ends, ends[1:], self.starts, strict=False)]
-            leaves.append(_Leaf(node | {"lods": {}}, own))
+            level_rows = [rows[a:b] - start for a, b, start in zip(ends, ends[1:], self.starts, strict=False)]
+            leaves.append(_Leaf(node | {"lods": {}}, level_rows))
             return leaves[-1].node
         places = inside[:, int(extent.argmax())]
         middle = np.partition(places, len(rows) // 2)[len(rows) // 2]
@@ -229,10 +229,10 @@ def _cover(chunks: Sequence[Path], runs: Sequence[tuple[int, int, int]]) -> dict
     """Return the number of Gaussians of each chunk; ValueError where runs leave a gap or overlap."""
     counts: dict[Path, int] = {}
     for file, offset, count in sorted(runs):
-        known = counts.get(chunks[file], 0)
-        if offset != known:
-            raise ValueError(f"runs of file {file}: expected one from {known} on, found one from {offset}")
-        counts[chunks[file]] = known + count
+        end = counts.get(chunks[file], 0)
+        if offset != end:
+            raise ValueError(f"runs of file {file}: expected one from {end} on, found one from {offset}")
+        counts[chunks[file]] = end + count
     return counts
 
 

@@ -117,14 +117,14 @@ def neighbor_pairs(cloud: Cloud) -> tuple[Ints, Ints, Floats]:
     near = near.astype(np.int32)
 
     def piece(first: int) -> tuple[Ints, Ints, Floats]:
-        own = near[first : first + CHUNK]
-        rows = np.repeat(np.arange(first, first + len(own)), own.shape[1])
-        others = own.reshape(-1).astype(np.int64)
-        known = (others <= rows).nonzero()[0]  # itself, or a pair that the other one may list too
-        twice = (near[others[known]] == rows[known, None]).any(1)
+        chunk = near[first : first + CHUNK]
+        rows = np.repeat(np.arange(first, first + len(chunk)), chunk.shape[1])
+        neighbors = chunk.reshape(-1).astype(np.int64)
+        candidates = (neighbors <= rows).nonzero()[0]  # itself, or a pair that the other one may list too
+        twice = (near[neighbors[candidates]] == rows[candidates, None]).any(1)
         keep = np.ones(len(rows), bool)
-        keep[known[twice | (others[known] == rows[known])]] = False
-        left, right = np.minimum(rows, others)[keep], np.maximum(rows, others)[keep]
+        keep[candidates[twice | (neighbors[candidates] == rows[candidates])]] = False
+        left, right = np.minimum(rows, neighbors)[keep], np.maximum(rows, neighbors)[keep]
         return left, right, pair_costs(cloud, left, right)
 
     parts = parallel_map(piece, range(0, len(cloud), CHUNK))

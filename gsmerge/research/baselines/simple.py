@@ -125,7 +125,7 @@ def merge_blocks(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
     height, width = scene.cameras.height, scene.cameras.width
     with stage("segment"):
         counts = view_shares(count, len(scene), height * width)
-        labels = np.stack([grid_labels(height, width, own) for own in counts])
+        labels = np.stack([grid_labels(height, width, view_count) for view_count in counts])
     return merge_groups(prepared, Groups(labels, tuple(counts)))
 
 

@@ -61,8 +61,8 @@ def _interval(value: Interval, digits: int) -> str:
 
 
 def _mean(group: Sequence[RunRecord], name: str) -> float | None:
-    known = [value for record in group if (value := record.value(name)) is not None]
-    return sum(known) / len(known) if known else None
+    values = [value for record in group if (value := record.value(name)) is not None]
+    return sum(values) / len(values) if values else None
 
 
 def _number(value: float | None, digits: int) -> str:
@@ -89,9 +89,9 @@ def _results(results: Results) -> Table:
         row = [name, size, str(len(group)), _number(count, 0), "" if kept is None else f"{kept:.2f} %"]
         row += ["" if num_bytes is None else human_bytes(num_bytes), _number(seconds or None, 2), _number(ms, 1)]
         for metric in results.metrics:
-            known, digits = intervals.get((metric, name, size)), METRICS[metric].digits
+            interval, digits = intervals.get((metric, name, size)), METRICS[metric].digits
             mean = _number(_mean(group, f"{metric}_{results.part}"), digits)
-            row.append(mean if known is None else _interval(known, digits))
+            row.append(mean if interval is None else _interval(interval, digits))
         rows.append(row)
     return ("Method", "Size", "Scenes", *COSTS, *(METRICS[metric].label for metric in results.metrics)), rows
 
@@ -110,10 +110,10 @@ def _verdicts(results: Results) -> list[tuple[str, Table]]:
             " ours, so not compared)."
         )
         rows = []
-        for label, one in compared.rows:
-            ahead = "" if one.ahead is None else _interval(one.ahead, digits)
-            quality = f"{one.quality:.{digits}f}", _number(one.ours, digits), ahead
-            rows.append((one.baseline, label, f"{one.cost:.4g}", *quality, one.words))
+        for label, verdict in compared.rows:
+            ahead = "" if verdict.ahead is None else _interval(verdict.ahead, digits)
+            quality = f"{verdict.quality:.{digits}f}", _number(verdict.ours, digits), ahead
+            rows.append((verdict.baseline, label, f"{verdict.cost:.4g}", *quality, verdict.words))
         tables.append((sentence, (head, rows)))
     return tables
 
@@ -122,9 +122,9 @@ def _views(results: Results, folder: Path) -> list[tuple[str, list[tuple[str, st
     """List views with their title, named pictures of input and results, and the number of ours among these."""
     views = []
     for scene in list(dict.fromkeys(record.scene for record in results.runs))[:MAX_SCENES]:
-        own = [r for r in results.runs if r.scene == scene and r.views_asked == results.views and r.pictures]
-        typical = ours_first(r for r in own if results.is_typical(r))[:MAX_RESULTS]
-        chosen = [*(r for r in own if r.method == INPUT), *typical]
+        records = [r for r in results.runs if r.scene == scene and r.views_asked == results.views and r.pictures]
+        typical = ours_first(r for r in records if results.is_typical(r))[:MAX_RESULTS]
+        chosen = [*(r for r in records if r.method == INPUT), *typical]
         for i, view in enumerate(chosen[0].pictures if chosen else ()):
             files = [("photo", picture_path(folder, f"{scene}/photo", i, "photo"))]
             files += [(results.name(r), picture_path(folder, r.output, i, "render")) for r in chosen]

@@ -157,16 +157,16 @@ def _stages(results: Results) -> Figure | None:
     rows = results.typical_runs()
     if not rows:
         return None
-    known = {stage for group in rows.values() for record in group for stage in record.stages} - set(SCORING)
-    order = sorted(known, key=lambda stage: (STAGES.index(stage) if stage in STAGES else len(STAGES), stage))
+    stages = {stage for group in rows.values() for record in group for stage in record.stages} - set(SCORING)
+    order = sorted(stages, key=lambda stage: (STAGES.index(stage) if stage in STAGES else len(STAGES), stage))
     table = {
         stage: [float(np.mean([record.stages.get(stage, 0.0) for record in group])) for group in rows.values()]
         for stage in order
     }
     totals = np.sum(list(table.values()), 0) if table else np.zeros(len(rows))
     bars = {stage: values for stage, values in table.items() if max(values) > MIN_STAGE * totals.max()}
-    others = totals - np.sum(list(bars.values()), 0) if bars else totals
-    bars |= {"other": others.tolist()} if others.max() > 1e-9 else {}
+    remainder = totals - np.sum(list(bars.values()), 0) if bars else totals
+    bars |= {"other": remainder.tolist()} if remainder.max() > 1e-9 else {}
     cells = [(name, *(f"{values[i]:.3g}" for values in bars.values())) for i, name in enumerate(rows)]
     scenes = len({record.scene for group in rows.values() for record in group})
     caption = f"Seconds by stage, scoring left out, means over {scenes} scene(s). {_size_words(results)}"
@@ -262,7 +262,7 @@ Style = dict[str, Any]  # arguments of a line
 def line_styles(names: Iterable[tuple[str, bool]]) -> dict[str, Style]:
     """Make a style for every line by its name and whether it is ours: ours are broader and in front."""
     styles: dict[str, Style] = {INPUT: {"color": "#555555", "ls": (0, (2, 2)), "marker": "s", "lw": 1.0, "zorder": 2}}
-    for i, (name, ours) in enumerate(one for one in names if one[0] != INPUT):
+    for i, (name, ours) in enumerate(line for line in names if line[0] != INPUT):
         dash = DASHES[i // len(COLORS) % len(DASHES)]
         look = {"color": COLORS[i % len(COLORS)], "ls": dash, "marker": MARKERS[i % len(MARKERS)]}
         styles[name] = {**look, "lw": 1.5 if ours else 1.1, "zorder": 4 + ours}

@@ -90,10 +90,10 @@ def read_grid(path: Path) -> Grid:
 
     A SceneError if the file cannot be read, or holds anything else.
     """
-    values, known = read_table(path), settings_of(Grid).keys()
-    if values.keys() - known:
-        odd = ", ".join(sorted(values.keys() - known))
-        raise SceneError(path, f"expected lists named {', '.join(sorted(known))}, found {odd}")
+    values, names = read_table(path), settings_of(Grid).keys()
+    if values.keys() - names:
+        odd = ", ".join(sorted(values.keys() - names))
+        raise SceneError(path, f"expected lists named {', '.join(sorted(names))}, found {odd}")
     try:
         return Grid(**{name: tuple(value) if isinstance(value, list) else (value,) for name, value in values.items()})
     except (TypeError, ValueError) as error:
@@ -112,10 +112,10 @@ def list_settings(grid: Grid) -> tuple[list[tuple[str, dict[str, Any]]], list[st
     for method, *values, size in product(
         grid.methods, *(getattr(grid, name) for name in SETTINGS.values()), sizes or [{}]
     ):
-        own = SETTINGS if method == OURS else FITTED.get(method, ())
+        names = SETTINGS if method == OURS else FITTED.get(method, ())
         chosen = dict(zip(SETTINGS, values, strict=True))
         settings = {} if method in (INPUT, *ONE_SIZE) else dict(size)
-        settings |= {name: chosen[name] for name in own if chosen[name] != getattr(Grid, SETTINGS[name])[0]}
+        settings |= {name: chosen[name] for name in names if chosen[name] != getattr(Grid, SETTINGS[name])[0]}
         settings |= grid.settings if method == OURS else {}
         label = describe(method, settings, None)
         repeated += label in runs
@@ -128,14 +128,14 @@ def _options_of(method: str, settings: Mapping[str, Any], seed: int) -> CompactO
     """Make the options of a run; a UsageError if the library does not take a setting, or a program is missing."""
     from gsmerge.compaction.methods import find_method
 
-    own = {} if method in (OURS, INPUT) else {"method": method}
+    choice = {} if method in (OURS, INPUT) else {"method": method}
     try:
-        options = CompactOptions().with_settings({**settings, **own, "seed": seed})
+        options = CompactOptions().with_settings({**settings, **choice, "seed": seed})
     except ValueError as error:
         raise UsageError(str(error)) from error
     except TypeError as error:  # text instead of a number
-        given = ", ".join(f"{name}={value}" for name, value in settings.items())
-        raise UsageError(f"{method}: expected settings that compact takes, got {given}") from error
+        words = ", ".join(f"{name}={value}" for name, value in settings.items())
+        raise UsageError(f"{method}: expected settings that compact takes, got {words}") from error
     find_method(options)
     return options
 
@@ -153,7 +153,7 @@ class Source:
 
 
 def find_sources(
-    given: Sequence[str], out: Path, targets: str | None = None, target_images: str | None = None
+    arguments: Sequence[str], out: Path, targets: str | None = None, target_images: str | None = None
 ) -> list[Source]:
     """Find the scenes that ``gsmerge batch`` would find, and hash everything that is read of each.
 
@@ -161,7 +161,7 @@ def find_sources(
     template with ``{scene}`` (as given), ``{parent}`` (its folder) and ``{stem}`` (its name without extension) in it. A
     SceneError if a file is missing, a UsageError if a template holds another name.
     """
-    scenes = list({main_file(scene).resolve(): scene for scene in find_scenes(given, out)}.values())
+    scenes = list({main_file(scene).resolve(): scene for scene in find_scenes(arguments, out)}.values())
     sources = []
     for scene, name in zip(scenes, scene_names(scenes), strict=True):
         files, cameras = find_scene_files(scene), filled(targets, scene)
@@ -174,8 +174,8 @@ def find_sources(
             inside = find_cameras(cameras) if cameras.is_dir() and not is_colmap(cameras) else None
             read += [inside or cameras, *photos_of(cameras)]
         read += [] if photos is None else [photos]
-        known = None if files.cameras is None else cameras_of(files.cameras, files.ply.stem)
-        num_views = None if known is None else len(known)
+        scene_cameras = None if files.cameras is None else cameras_of(files.cameras, files.ply.stem)
+        num_views = None if scene_cameras is None else len(scene_cameras)
         sha256 = content_hash(list(dict.fromkeys(read)))
         sources.append(Source(scene, name, cameras, photos, num_views, sha256))
     return sources
@@ -216,12 +216,12 @@ def make_jobs(
     jobs: list[Job] = []
     for source in sources:
         most = source.num_views or math.inf
-        some = [one for one in chosen if one[0] == SUPERPIXELS or (one[2] or 0) <= most]
-        if len(some) < len(chosen):
-            few = len(chosen) - len(some)
+        runs = [choice for choice in chosen if choice[0] == SUPERPIXELS or (choice[2] or 0) <= most]
+        if len(runs) < len(chosen):
+            few = len(chosen) - len(runs)
             notes.append(f"{source.name} has fewer views than asked for: {few} run(s) left out")
         num_gaussians, num_rest = header_counts(main_file(source.path))
-        for method, settings, views, options in some:
+        for method, settings, views, options in runs:
             label = describe(method, settings, views)
             name = re.sub(r"[^\w.%+=, -]", "_", label)[:MAX_NAME]  # which file systems and shells take
             name = name if name == label else f"{name} {digest({'label': label})[:6]}"

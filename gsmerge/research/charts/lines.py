@@ -130,7 +130,7 @@ def paired_intervals(values: NDArray[np.float64]) -> list[Interval]:
         return [mean_interval(column) for column in values.T.tolist()]
     centred = values - values.mean(1, keepdims=True)
     factor = math.sqrt(num_conditions / (num_conditions - 1))
-    halves = [factor * (one.high - one.mean) for one in map(mean_interval, centred.T.tolist())]
+    halves = [factor * (interval.high - interval.mean) for interval in map(mean_interval, centred.T.tolist())]
     means = values.mean(0).tolist()
     return [Interval(mean, mean - half, mean + half, num_scenes) for mean, half in zip(means, halves, strict=True)]
 
@@ -158,21 +158,21 @@ def judge(
     side is named only where zero lies outside the interval of the difference, or the baseline has only one scene.
     """
     sign = 1.0 if higher else -1.0
-    known: dict[str, float] = {}
+    our_qualities: dict[str, float] = {}
     for scene, (cost, _) in points.items():
         curve = ours.get(scene, ())
         best = quality_at([c for c, _ in curve], [sign * q for _, q in curve], cost)
         if best is not None:
-            known[scene] = best
+            our_qualities[scene] = best
     cost = _mean_cost(points)
-    quality = float(np.mean([points[scene][1] for scene in known or points]))
-    if not known:
+    quality = float(np.mean([points[scene][1] for scene in our_qualities or points]))
+    if not our_qualities:
         return Verdict(baseline, cost, quality, None, None, "ours has none so cheap")
-    ahead = paired_difference(known, {scene: sign * points[scene][1] for scene in known})
+    ahead = paired_difference(our_qualities, {scene: sign * points[scene][1] for scene in our_qualities})
     words = "ours above" if ahead.low > 0 else "baseline above" if ahead.high < 0 else "undecided"
-    if len(known) == 1 < len(points):  # one scene of several is no evidence for the others
+    if len(our_qualities) == 1 < len(points):  # one scene of several is no evidence for the others
         words = "undecided"
-    return Verdict(baseline, cost, quality, sign * float(np.mean(list(known.values()))), ahead, words)
+    return Verdict(baseline, cost, quality, sign * float(np.mean(list(our_qualities.values()))), ahead, words)
 
 
 def line_key(record: RunRecord) -> LineKey:
@@ -195,8 +195,8 @@ def line_names(keys: Sequence[LineKey]) -> dict[LineKey, str]:
     """Name every line by its method, and those of its settings that differ between its lines."""
     names = {}
     for method, settings in keys:
-        others = [dict(other) for name, other in keys if name == method]
-        differ = [(n, v) for n, v in settings if len(others) == 1 or any(other.get(n) != v for other in others)]
+        variants = [dict(other) for name, other in keys if name == method]
+        differ = [(n, v) for n, v in settings if len(variants) == 1 or any(other.get(n) != v for other in variants)]
         names[method, settings] = ", ".join([method, *(_setting_label(name, value) for name, value in differ)])
     return names
 
@@ -232,8 +232,8 @@ class Results:
         keys = dict.fromkeys(map(line_key, ours_first(self.runs)))
         self.names = {key: INPUT for key in keys if key[0] == INPUT}
         self.names |= line_names([key for key in keys if key[0] != INPUT])
-        known = {part: sum(r.value(f"psnr_{part}") is not None for r in self.runs) for part in PARTS}
-        self.part = next((p for p in known if self.runs and known[p] >= 0.9 * len(self.runs)), "context")
+        counts = {part: sum(r.value(f"psnr_{part}") is not None for r in self.runs) for part in PARTS}
+        self.part = next((p for p in counts if self.runs and counts[p] >= 0.9 * len(self.runs)), "context")
         names = [m for m in METRICS if any(r.value(f"{m}_{self.part}") is not None for r in self.runs)]
         self.metrics = [m for m in names if m != "lpips_alex" or "lpips_vgg" not in names]
         asked = {record.views_asked for record in self.runs}
@@ -276,8 +276,8 @@ class Results:
         """Average a value of the unmerged input over some scenes; None where one does not have it."""
         inputs = {r.scene: r.value(name) for r in self.runs if r.method == INPUT and r.views_asked == self.views}
         values = [inputs.get(scene) for scene in scenes]
-        known = [one for one in values if one is not None]
-        return float(np.mean(known)) if known and len(known) == len(values) else None
+        numbers = [value for value in values if value is not None]
+        return float(np.mean(numbers)) if numbers and len(numbers) == len(values) else None
 
 
 def make_lines(
@@ -314,9 +314,9 @@ def keep_common(scenes: Mapping[K, set[str]], min_share: float) -> dict[K, set[s
     Those that have too few of the scenes are left out first, so that a few failed runs do not remove the others.
     """
     fewest = min_share * len(set().union(*scenes.values()))
-    kept = {name: own for name, own in scenes.items() if len(own) >= fewest}
+    kept = {name: scene_names for name, scene_names in scenes.items() if len(scene_names) >= fewest}
     common = set.intersection(*kept.values()) if kept else set()
-    return {name: common or own for name, own in kept.items()}
+    return {name: common or scene_names for name, scene_names in kept.items()}
 
 
 def _mean_cost(points: ByScene) -> float:

@@ -117,9 +117,9 @@ def _is_sound(name: str, value: Any) -> bool:
     default = getattr(BLANK, name)
     if isinstance(default, Mapping):
         words = () if name in ("stages", "scores") else (str, bool, NoneType)
-        return isinstance(value, dict) and all(_is_number(one) or isinstance(one, words) for one in value.values())
+        return isinstance(value, dict) and all(_is_number(item) or isinstance(item, words) for item in value.values())
     if isinstance(default, tuple):
-        return isinstance(value, list) and all(isinstance(one, str) for one in value)
+        return isinstance(value, list) and all(isinstance(item, str) for item in value)
     return isinstance(value, str) if isinstance(default, str) else value is None or _is_number(value)
 
 
@@ -255,7 +255,7 @@ class ChartRun:
         pixels, points = photos.shape[1] * photos.shape[2], dict[str, float]()
         for name, share in product(SEGMENTATIONS, SHARES):
             score = partial(proxy_psnr, count=max(1, round(share * pixels)), segmentation=name)
-            points[f"{name} {share:g}"] = float(np.mean([min(one, MAX_DB) for one in parallel_map(score, photos)]))
+            points[f"{name} {share:g}"] = float(np.mean([min(value, MAX_DB) for value in parallel_map(score, photos)]))
         shown = draw_means(photos[0], superpixels(photos[0], max(1, round(SHARES[-2] * pixels)), SEGMENTATIONS[0]))
         path = picture_path(out.parent, out.name, 0, "render")
         _write(path, shown)

@@ -124,8 +124,8 @@ def _make_jobs(args: opt.Args, scenes: Sequence[str]) -> tuple[list[Job], BatchO
     names = [*LISTS, "fixed", "grid", "targets", "target_images", "hint"]
     names += ["photo_side", "lpips", "lpips_views", "proxy_views"]
     for name, value in args.given([*names, "seed", "threads"]).items():
-        for one in value if isinstance(value, list) else [value]:
-            words += [f"--{name.replace('_', '-')}", str(one)]
+        for element in value if isinstance(value, list) else [value]:
+            words += [f"--{name.replace('_', '-')}", str(element)]
     more: dict[str, Any] = {"seed": settings.seed, "proxy_views": args.proxy_views, "command": shlex.join(words)}
     jobs, left_out = make_jobs(sources, grid, measured, **more)
     return jobs, options, [*notes, *left_out]

@@ -74,8 +74,8 @@ def train(args: opt.Args) -> None:
     print_document(document, line, as_json=args.json, quiet=args.quiet)
 
 
-def find_training_scenes(given: Sequence[Path], out: Path, apart: Collection[Path] = ()) -> list[Path]:
-    """Find the scenes in ``given`` files and folders, each once; the folder ``out`` of the run is not searched.
+def find_training_scenes(paths: Sequence[Path], out: Path, apart: Collection[Path] = ()) -> list[Path]:
+    """Find the scenes in files and folders ``paths``, each once; the folder ``out`` of the run is not searched.
 
     Scenes of ``apart``, for validation, are left out where a folder holds them, and kept where they are named.
     SceneError if a path does not exist or has no scene, UsageError if no scene is left.
@@ -84,11 +84,11 @@ def find_training_scenes(given: Sequence[Path], out: Path, apart: Collection[Pat
     from gsmerge.errors import UsageError
 
     kept, excluded = dict[str, Path](), {os.path.realpath(scene) for scene in apart}
-    for path in given:
+    for path in paths:
         for scene in find_scenes([str(path)], out):
             real = os.path.realpath(scene)
             if real not in excluded or os.path.realpath(path) == real:
                 kept.setdefault(real, scene)
-    if given and not kept:
-        raise UsageError(f"{given[0]}: expected scenes besides those of --validation, found none")
+    if paths and not kept:
+        raise UsageError(f"{paths[0]}: expected scenes besides those of --validation, found none")
     return list(kept.values())

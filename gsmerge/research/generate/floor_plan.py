@@ -146,8 +146,8 @@ def _unit(vectors: Array) -> Array:
     return vectors / np.sqrt((vectors * vectors).sum(1, keepdims=True))
 
 
-def _along(at: Array, known: Array, values: Array) -> Array:
-    return np.stack([np.interp(at, known, column) for column in values.T], 1)
+def _along(at: Array, places: Array, values: Array) -> Array:
+    return np.stack([np.interp(at, places, column) for column in values.T], 1)
 
 
 def draw_walk(rng: np.random.Generator, plan: FloorPlan, num_views: int) -> Callable[[float], tuple[Array, Array]]:

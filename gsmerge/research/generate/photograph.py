@@ -187,8 +187,8 @@ def find_windows(scene: LitScene, c2w: Array, lens: Pinhole, samples: int) -> di
     out: dict[int, NDArray[np.int32]] = {}
 
     def enter(zone: int, window: NDArray[np.int32], way: tuple[int, ...]) -> None:
-        known = out.get(zone, window)
-        out[zone] = np.concatenate([np.minimum(known[:2], window[:2]), np.maximum(known[2:], window[2:])])
+        stored = out.get(zone, window)
+        out[zone] = np.concatenate([np.minimum(stored[:2], window[:2]), np.maximum(stored[2:], window[2:])])
         for portal, rect in zip(scene.portals, rects, strict=True):
             if zone in portal.zones:
                 beyond = sum(portal.zones) - zone

@@ -166,11 +166,11 @@ def concat(parts: Sequence[ShapeArrays]) -> ShapeArrays:
     return ShapeArrays(tuple(s for a in parts for s in a.shapes), *(np.concatenate(column) for column in columns))
 
 
-def bounds(given: ShapeArrays) -> Array:
+def bounds(shapes: ShapeArrays) -> Array:
     """Compute half sizes ``[m,3]`` of the shapes' bounding boxes, in their frames."""
-    half = given.sizes[:, :3].copy()
-    reach = np.abs(given.waves[:, :, 4]).sum(1)
-    half[given.kinds == BLOB] *= 1 + reach[given.kinds == BLOB, None]
-    wide = np.maximum(given.sizes[:, 3], 1)[given.kinds == CONE]
-    half[given.kinds == CONE] *= np.stack([wide, np.ones_like(wide), wide], 1)
+    half = shapes.sizes[:, :3].copy()
+    reach = np.abs(shapes.waves[:, :, 4]).sum(1)
+    half[shapes.kinds == BLOB] *= 1 + reach[shapes.kinds == BLOB, None]
+    wide = np.maximum(shapes.sizes[:, 3], 1)[shapes.kinds == CONE]
+    half[shapes.kinds == CONE] *= np.stack([wide, np.ones_like(wide), wide], 1)
     return half

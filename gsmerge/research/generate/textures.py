@@ -387,11 +387,11 @@ class Palette:
         none.
         """
         kind = kinds[self.rng.integers(len(kinds))]
-        known = self.by_kind.setdefault(kind, [])
-        if len(known) < MAX_TEXTURES.get(kind, 3):
-            known.append(len(self.textures))
+        ids = self.by_kind.setdefault(kind, [])
+        if len(ids) < MAX_TEXTURES.get(kind, 3):
+            ids.append(len(self.textures))
             self.textures.append(KINDS[kind](self.rng, self.size).astype(np.float32))
-        texture = known[self.rng.integers(len(known))] if len(known) == MAX_TEXTURES.get(kind, 3) else known[-1]
+        texture = ids[self.rng.integers(len(ids))] if len(ids) == MAX_TEXTURES.get(kind, 3) else ids[-1]
         shift = self.rng.uniform(0, 1, 2) if repeat else np.zeros(2)
         gloss = max(0.0, float(self.rng.uniform(-0.5, 0.5))) if gloss is None else gloss
         return Material(texture, repeat, gloss, (float(shift[0]), float(shift[1])))

@@ -189,8 +189,8 @@ def recolor(example: Example, rng: np.random.Generator) -> Example:
         shN = part.shN.take(colors.order, -1) * np.float32(colors.gain)
         changed[name] = replace(part, sh0=colors.change_sh0(part.sh0), shN=shN)
     targets = {}
-    for k, one in example.targets.items():
-        corrections = one.corrections.copy()
+    for k, target in example.targets.items():
+        corrections = target.corrections.copy()
         corrections[:, COLOR] = corrections[:, COLOR][:, colors.order] * colors.gain
-        targets[k] = replace(one, corrections=corrections)
+        targets[k] = replace(target, corrections=corrections)
     return replace(example, **changed, targets=targets, colors=colors)

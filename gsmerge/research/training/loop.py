@@ -78,7 +78,7 @@ def validate(networks: Networks, shards: Sequence[Shard], run: TrainingRun, out:
     every = run.processes.gather(scores)
     analytic, learned, matched = np.mean([window for windows, _ in every for window in windows], 0).tolist()
     row = {"psnr_analytic": analytic, "psnr_learned": learned, "matched": matched}
-    crops = [crop for _, some in every for crop in some]
+    crops = [crop for _, scene_crops in every for crop in scene_crops]
     if not crops:
         return row
     losses, errors, squares = zip(*crops, strict=True)
@@ -320,8 +320,8 @@ def _step(state: TrainingState, streams: ExampleStreams, run: TrainingRun, step:
     rows = run.processes.gather_rows(torch.stack(parallel_map(work, streams.crops)))
     mean = rows.sum(0) / options.crops
     sizes = [parameter.numel() for parameter in parameters]
-    own, loss, apart = mean.split([sum(sizes), 1, len(mean) - sum(sizes) - 1])
-    for parameter, gradient in zip(parameters, own.split(sizes), strict=True):
+    gradients, loss, apart = mean.split([sum(sizes), 1, len(mean) - sum(sizes) - 1])
+    for parameter, gradient in zip(parameters, gradients.split(sizes), strict=True):
         parameter.grad = gradient.view_as(parameter)
     torch.nn.utils.clip_grad_norm_(parameters, options.clip)
     for group in state.optimizer.param_groups:
@@ -331,7 +331,7 @@ def _step(state: TrainingState, streams: ExampleStreams, run: TrainingRun, step:
     with torch.no_grad():
         for _, parameter, smooth in state.pairs():
             smooth.lerp_(parameter, 1 - share)
-    return loss[0].cpu(), float(apart.norm() / own.norm().clamp_min(1e-30)) if shares else 0.0
+    return loss[0].cpu(), float(apart.norm() / gradients.norm().clamp_min(1e-30)) if shares else 0.0
 
 
 def _loss(networks: Networks, example: Example, run: TrainingRun, step: int, rng: np.random.Generator) -> WindowLoss:

@@ -48,7 +48,7 @@ def lpips_loss(image: Tensor, reference: Tensor, mask: Tensor, net: str = "vgg")
     with torch.no_grad():
         features = list(_unit_features(reference, layers, kernels))
     seen = torch.where(mask[..., None], image, reference)
-    compared = [torch.from_numpy(one.weights) for one in layers if one.weights is not None]
+    compared = [torch.from_numpy(layer.weights) for layer in layers if layer.weights is not None]
     distance = torch.zeros((), dtype=torch.float64)
     units = _unit_features(seen, layers, kernels)
     for weights, unit, other in zip(compared, units, features, strict=True):
@@ -244,14 +244,14 @@ def diversity_loss(gaussians: Gaussians, parents: Tensor, sizes: Tensor, unit: f
     units; in a scene's ``unit`` of length, those of a million small Gaussians leave nothing of the loss. None: in the
     ``sizes [n]`` of their groups, which start near 1, and without a gradient: small siblings are no goal.
     """
-    one, other = sibling_pairs(parents)
-    if len(one) == 0:
+    left, right = sibling_pairs(parents)
+    if len(left) == 0:
         return gaussians.means.new_zeros(())
     scales = gaussians.scales.detach() / sizes.detach()[:, None] if unit is None else gaussians.scales / unit
     volumes = scales.prod(1)
-    weights = (volumes[one] * volumes[other]).clamp_min(1e-30).sqrt()
-    profile = overlap_profile(gaussians, one, other)
-    opacity = (gaussians.opacities[one] - gaussians.opacities[other]).square()
+    weights = (volumes[left] * volumes[right]).clamp_min(1e-30).sqrt()
+    profile = overlap_profile(gaussians, left, right)
+    opacity = (gaussians.opacities[left] - gaussians.opacities[right]).square()
     return (weights * (GEOMETRY * profile + OPACITY * opacity)).mean()
 
 
@@ -262,19 +262,19 @@ def sibling_pairs(parents: Tensor) -> tuple[Tensor, Tensor]:
     firsts = [rows[: len(rows) - gap][parents[: len(rows) - gap] == parents[gap:]] for gap in range(1, count)]
     gaps = [torch.full_like(first, gap) for gap, first in enumerate(firsts, 1)]
     empty = rows[:0]
-    one = torch.cat([empty, *firsts])
-    return one, one + torch.cat([empty, *gaps])
+    left = torch.cat([empty, *firsts])
+    return left, left + torch.cat([empty, *gaps])
 
 
-def overlap_profile(gaussians: Gaussians, one: Tensor, other: Tensor) -> Tensor:
+def overlap_profile(gaussians: Gaussians, left: Tensor, right: Tensor) -> Tensor:
     """Compute the paper's U-shaped profile of pairs ``[p]``: 0 where their boxes overlap by half.
 
     Boxes are those of one standard deviation along the world's axes, as in matching.
     """
     axes = quat_to_rotmat(gaussians.quats) * gaussians.scales[:, None]
     halves = axes.norm(dim=2)
-    away = (gaussians.means[one] - gaussians.means[other]).abs()
-    a, b = halves[one], halves[other]
+    away = (gaussians.means[left] - gaussians.means[right]).abs()
+    a, b = halves[left], halves[right]
     shared = torch.minimum(torch.minimum(a + b - away, 2 * a), 2 * b).clamp_min(0).prod(1)
     union = (8 * a.prod(1) + 8 * b.prod(1) - shared).clamp_min(1e-30)
     overlaps = shared / union

@@ -91,12 +91,12 @@ def differentiate_base(features: FeatureGaussians) -> Gaussians:
     return Gaussians(features.means, quats, scales, opacities, features.sh0, as_tensor(features.shN))
 
 
-def differentiate_groups(features: FeatureGaussians, known: GroupFeatures, viewmats: np.ndarray) -> GroupFeatures:
-    """Compute what networks read of groups, differentiable, from the ``known`` values of the same groups."""
-    chosen = torch.from_numpy(viewmats[known.views]).float()
-    base, frames = differentiate_base(features), _differentiate_frames(features.means, chosen, known.frames)
+def differentiate_groups(features: FeatureGaussians, inputs: GroupFeatures, viewmats: np.ndarray) -> GroupFeatures:
+    """Compute what networks read of groups, differentiable, from the ``inputs`` of the same groups as arrays."""
+    chosen = torch.from_numpy(viewmats[inputs.views]).float()
+    base, frames = differentiate_base(features), _differentiate_frames(features.means, chosen, inputs.frames)
     sizes = gaussian_sizes(base.scales).clamp_min(TINY)
-    pixels = torch.from_numpy(known.footprints).clamp_min(TINY)
+    pixels = torch.from_numpy(inputs.footprints).clamp_min(TINY)
     covars = frames.transpose(1, 2) @ features.covars @ frames / sizes.square()[:, None, None]
     places = rotate_vectors(chosen[:, :3, :3], features.means) + chosen[:, :3, 3]
     numbers = [
@@ -104,18 +104,18 @@ def differentiate_groups(features: FeatureGaussians, known: GroupFeatures, viewm
         _logits(base.opacities)[:, None],
         _log_ratio(features.masses, pixels**3)[:, None],
         _log_ratio(features.extinctions, pixels**2)[:, None],
-        torch.from_numpy(known.group[:, 6:8]),
+        torch.from_numpy(inputs.group[:, 6:8]),
         SH_C0 * features.sh0[:, 0],
         torch.asinh(torch.stack([covars[:, i, j] for i in range(3) for j in range(i, 3)], 1)),
         (places[:, :2] / places[:, 2:].clamp_min(1e-6)).clamp(-3, 3),
     ]
-    group = torch.cat([torch.cat(numbers, 1).nan_to_num(), torch.from_numpy(known.group[:, 19:])], 1)
-    return replace(known, features=features, base=base, frames=frames, sizes=sizes, group=group)
+    group = torch.cat([torch.cat(numbers, 1).nan_to_num(), torch.from_numpy(inputs.group[:, 19:])], 1)
+    return replace(inputs, features=features, base=base, frames=frames, sizes=sizes, group=group)
 
 
-def _differentiate_frames(means: Tensor, viewmats: Tensor, known: np.ndarray) -> Tensor:
+def _differentiate_frames(means: Tensor, viewmats: Tensor, values: np.ndarray) -> Tensor:
     """Compute the frames of points in views ``[g,4,4]``, differentiable where the ray is not the image's right."""
-    frames = torch.from_numpy(known)
+    frames = torch.from_numpy(values)
     if not means.requires_grad:
         return frames
     centres = -rotate_vectors(viewmats[:, :3, :3].transpose(1, 2), viewmats[:, :3, 3])
@@ -130,16 +130,16 @@ def differentiate_tokens(
     parts: Gaussians, ids: np.ndarray, owners: np.ndarray, group_features: GroupFeatures
 ) -> Tensor:
     """Describe Gaussians relative to groups, ``[n,13]``, as :func:`gsmerge.networks.tokens.part_tokens` does."""
-    g, own = group_features, torch.from_numpy(owners)
+    g, owner_ids = group_features, torch.from_numpy(owners)
     chosen = parts[torch.from_numpy(ids)]
-    back = g.frames[own].transpose(1, 2)
-    pixels = torch.from_numpy(g.footprints)[own].clamp_min(TINY)
-    local = rotate_vectors(back, chosen.means - g.base.means[own]) / g.sizes[own, None]
+    back = g.frames[owner_ids].transpose(1, 2)
+    pixels = torch.from_numpy(g.footprints)[owner_ids].clamp_min(TINY)
+    local = rotate_vectors(back, chosen.means - g.base.means[owner_ids]) / g.sizes[owner_ids, None]
     ordered = chosen.scales.sort(-1).values.clamp_min(TINY)
     normals = quat_to_rotmat(chosen.quats).gather(2, chosen.scales.argmin(1)[:, None, None].expand(-1, 3, 1))[..., 0]
     facing = rotate_vectors(back, normals)
     flat = -(1 - ordered[:, 0] / ordered[:, 1]) * facing[:, 2].sign()
-    colors = SH_C0 * (chosen.sh0 - g.base.sh0[own])[:, 0]
+    colors = SH_C0 * (chosen.sh0 - g.base.sh0[owner_ids])[:, 0]
     numbers = [torch.asinh(local), _log_scales(ordered, pixels), _logits(chosen.opacities)[:, None], colors]
     tokens = torch.cat([*numbers, flat[:, None] * facing], 1)
     assert tokens.shape[1] == PART
@@ -207,20 +207,20 @@ def pool_tensors(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray
     return replace(pooled, **columns, latents=average(features.latents[order]))
 
 
-def make_round_tensors(parents: np.ndarray, group_features: GroupFeatures, known: Gaussians) -> Gaussians:
+def make_round_tensors(parents: np.ndarray, group_features: GroupFeatures, children: Gaussians) -> Gaussians:
     """Make the Gaussians that absolute heads correct, see :func:`gsmerge.networks.apply.prepare_children`.
 
-    ``known`` are the same ``n`` Gaussians as arrays.
+    ``children`` are the same ``n`` Gaussians as arrays.
     """
-    own, base, same = torch.from_numpy(parents), group_features.base, known.to("cpu")
-    frames = group_features.frames[own]
+    parent_ids, base, same = torch.from_numpy(parents), group_features.base, children.to("cpu")
+    frames = group_features.frames[parent_ids]
     turns = (frames - frames.detach()) @ frames.detach().transpose(1, 2)  # zero, with a gradient
     return replace(
         same,
-        means=base.means[own],
+        means=base.means[parent_ids],
         quats=rotate_quats(skew_vectors(turns), same.quats),
-        scales=group_features.sizes[own, None].expand(-1, 3),
-        sh0=base.sh0[own],
+        scales=group_features.sizes[parent_ids, None].expand(-1, 3),
+        sh0=base.sh0[parent_ids],
     )
 
 
@@ -233,8 +233,8 @@ class TrainingContext(NetworkContext):
 
     def describe(self, features: FeatureGaussians) -> GroupFeatures:
         """Compute the networks' inputs as tensors."""
-        known = super().describe(features_to_arrays(features))
-        return differentiate_groups(features, known, np.asarray(self.cameras.viewmats))
+        inputs = super().describe(features_to_arrays(features))
+        return differentiate_groups(features, inputs, np.asarray(self.cameras.viewmats))
 
     def make_tokens(
         self, parts: Gaussians | Members, ids: np.ndarray, owners: np.ndarray, group_features: GroupFeatures
@@ -277,12 +277,12 @@ def predict(crop: Crop, networks: Networks, options: TrainOptions, seed: int) ->
     group_features, arrays = context.describe(refined), features_to_arrays(refined)
     children, parents = _make_children(crop, arrays, group_features, networks)
     corrections = as_tensor(run_heads(children, parents, group_features, context))
-    own = torch.from_numpy(parents)
-    frames, sizes = group_features.frames[own], group_features.sizes[own]
+    parent_ids = torch.from_numpy(parents)
+    frames, sizes = group_features.frames[parent_ids], group_features.sizes[parent_ids]
     gaussians = move_tensors(children, corrections, frames)
     counts = np.bincount(matches.clusters, minlength=matches.count)
     matched = float(counts[counts > 1].sum()) / max(1, len(matches.clusters))
-    return Prediction(gaussians, own, arrays, frames, sizes, matches, matched)
+    return Prediction(gaussians, parent_ids, arrays, frames, sizes, matches, matched)
 
 
 def _merge(encoded: FeatureGaussians, matches: Matches, context: TrainingContext) -> FeatureGaussians:
@@ -317,9 +317,9 @@ def match_crop(
     crop: Crop, parts: FeatureGaussians, options: TrainOptions, networks: Networks | None = None, seed: int = 0
 ) -> Matches:
     """Match the r Feature Gaussians ``parts`` of a crop, unless its clusters were fitted and so are known."""
-    known = crop.example.matches
-    if known is not None:
-        ids, local = np.unique(known.clusters[crop.rows], return_inverse=True)
+    matches = crop.example.matches
+    if matches is not None:
+        ids, local = np.unique(matches.clusters[crop.rows], return_inverse=True)
         return Matches(local, len(ids))
     example = crop.example
     context = None if networks is None else NetworkContext(networks, example.members, example.cameras, seed)
@@ -334,9 +334,9 @@ def crop_targets(crop: Crop) -> tuple[Tensor, Tensor]:
     rows, targets = merged_rows(matches), crop.example.targets[crop.k]
     inside, inner = np.zeros((2, matches.count), bool)
     inside[rows[crop.rows]], inner[rows[crop.rows[crop.inner]]] = True, True
-    own = np.flatnonzero(inside[targets.parents])
-    scored = targets.mask[own] & inner[targets.parents[own]]
-    return torch.from_numpy(targets.corrections[own]), torch.from_numpy(scored)
+    ids = np.flatnonzero(inside[targets.parents])
+    scored = targets.mask[ids] & inner[targets.parents[ids]]
+    return torch.from_numpy(targets.corrections[ids]), torch.from_numpy(scored)
 
 
 def merged_rows(matches: Matches) -> np.ndarray:

@@ -51,8 +51,8 @@ def make_training_scene(scene: Scene, ids: Sequence[int], held_out: Views | None
     assert scene.images is not None
     part = subset(scene, ids)
     canonical, frame = canonicalise(part)
-    rest = [view for view in range(len(scene)) if view not in set(ids)]
-    order = [*ids, *rest]
+    other_views = [view for view in range(len(scene)) if view not in set(ids)]
+    order = [*ids, *other_views]
     cameras, images = scene.cameras[order], scene.images[order]
     if held_out is not None:
         width, height = cameras.width, cameras.height

@@ -77,19 +77,19 @@ def prepare_shards(
     except OSError as error:
         raise SceneError(folder, f"cannot be written ({error.strerror})", "choose another folder") from error
     lists = []
-    for number, scene in enumerate(own := processes.share(scenes)):
+    for number, scene in enumerate(part := processes.share(scenes)):
         lists.append(_scene_shards(scene, options, folder, report))
         if report:
-            report("prepare", number + 1, len(own))
+            report("prepare", number + 1, len(part))
     return [shard for shards in processes.gather(lists) for shard in shards]
 
 
 def _scene_shards(scene: Path, options: TrainOptions, folder: Path, report: Report | None) -> list[Shard]:
     key, name = scene_key(scene, options), scene_name(scene)
     record = folder / f"{key[:32]}.json"
-    known = _read_record(record)
-    if known is None:
-        known = {}
+    hashes = _read_record(record)
+    if hashes is None:
+        hashes = {}
 
         def fitted(step: int, steps: int) -> None:
             if report:
@@ -97,10 +97,10 @@ def _scene_shards(scene: Path, options: TrainOptions, folder: Path, report: Repo
 
         for label, make in make_examples(scene, options, fitted):
             path = folder / f"{key[:32]}-{label}.safetensors"
-            known[path.name] = _content_hash(path) or write_shard(path, make())
+            hashes[path.name] = _content_hash(path) or write_shard(path, make())
         with atomic_output(record, overwrite=True) as temporary:
-            temporary.write_text(json.dumps(known, indent=1) + "\n")
-    return [Shard(folder / file, name, sha256) for file, sha256 in known.items()]
+            temporary.write_text(json.dumps(hashes, indent=1) + "\n")
+    return [Shard(folder / file, name, sha256) for file, sha256 in hashes.items()]
 
 
 def scene_key(scene: Path, options: TrainOptions) -> str:
@@ -117,11 +117,11 @@ def scene_key(scene: Path, options: TrainOptions) -> str:
 def _read_record(path: Path) -> dict[str, str] | None:
     """Read the hash of each shard of a scene; None if the scene is not complete."""
     try:
-        known = json.loads(path.read_text())
-        complete = all(_content_hash(path.with_name(file)) == sha256 for file, sha256 in known.items())
+        hashes = json.loads(path.read_text())
+        complete = all(_content_hash(path.with_name(file)) == sha256 for file, sha256 in hashes.items())
     except (OSError, ValueError, AttributeError):
         return None
-    return known if complete else None
+    return hashes if complete else None
 
 
 def _content_hash(path: Path) -> str | None:
@@ -242,8 +242,8 @@ class ExampleStreams:
     def shard_id(self, step: int, crop: int, slot: int) -> int:
         """Return the number of the shard that a crop's stream has in a slot: 0 is the oldest."""
         position = (step // self.options.refresh + slot) * self.options.crops + crop
-        epoch, rest = divmod(position, len(self.shards))
-        return int(_order(self.options.seed, epoch, len(self.shards))[rest])
+        epoch, index = divmod(position, len(self.shards))
+        return int(_order(self.options.seed, epoch, len(self.shards))[index])
 
     def _read(self, number: int) -> Example:
         example = read_shard(self.shards[number], check=number not in self.checked)

@@ -96,8 +96,8 @@ def sample_window(
     are any.
     """
     k = levels[int(rng.integers(len(levels)))]
-    own = len(example.cameras)
-    kinds = [rng.permutation(own), own + rng.permutation(len(example.photos) - own)]
+    num_views = len(example.cameras)
+    kinds = [rng.permutation(num_views), num_views + rng.permutation(len(example.photos) - num_views)]
     order = np.concatenate(kinds[::-1] if rng.random() < novel else kinds)
     photo, pixels = int(order[0]), np.zeros(0, np.int64)
     for photo in map(int, order):

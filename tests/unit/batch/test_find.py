@@ -32,8 +32,8 @@ def actual(*given: str, out: Path = OUT) -> list[str]:
     return [str(scene) for scene in find_scenes(given, out)]
 
 
-def outputs(*given: str, options: BatchOptions | None = None, own: set[str] | None = None) -> dict[str, str]:
-    return {job.output: job.scene for job in find_jobs(given, OUT, options or BatchOptions(), own or set())}
+def outputs(*arguments: str, options: BatchOptions | None = None, results: set[str] | None = None) -> dict[str, str]:
+    return {job.output: job.scene for job in find_jobs(arguments, OUT, options or BatchOptions(), results or set())}
 
 
 def test_folders_are_searched() -> None:
@@ -64,7 +64,7 @@ def test_the_output_folder_is_not_searched() -> None:
 
 def test_results_of_former_runs_are_no_scenes() -> None:
     touch("a.ply", "b.ply")
-    assert outputs("*.ply", own={os.path.realpath("b.ply")}) == {"a.ply": "a.ply"}
+    assert outputs("*.ply", results={os.path.realpath("b.ply")}) == {"a.ply": "a.ply"}
 
 
 def test_patterns_and_lists() -> None:
