@@ -167,7 +167,7 @@ def read_input(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: Rea
 
 
 def check_saved_cameras(scene: Scene, path: Path | None, *, embed: bool = False) -> None:
-    """Refuse a file for the cameras of a scene without any, or to embed them."""
+    """Raise UsageError if cameras are to be written and the scene has none, or too many to embed."""
     if len(scene) == 0 and (path is not None or embed):
         option = "--embed-cameras" if path is None else f"--save-cameras {path}"
         raise UsageError(f"{option}: expected a scene with cameras, got none")
