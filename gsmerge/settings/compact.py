@@ -34,7 +34,7 @@ RECIPES: Mapping[str, Mapping[str, Any]] = {
 
 
 def method_names() -> tuple[str, ...]:
-    """Return the names of all methods: ours, and those that installed packages add."""
+    """Return the names of all methods: ours, and those of installed plugins."""
     return (OURS, *find_plugins(METHODS))
 
 
@@ -105,7 +105,7 @@ class CompactOptions(Settings):
 
     @property
     def whole_only(self) -> list[str]:
-        """Names of the settings in use that need a scene in one piece."""
+        """Names of the settings in use that need the scene in one piece."""
         budget = self.budget
         asked = {f"method {self.method}": self.method != "gsmerge", "levels": budget.levels > 1}
         asked |= {f"quality {budget.quality}": budget.quality is not None, "crop": self.clean.crop is not None}

@@ -13,7 +13,7 @@ MAX_ZOOM = 16.0  # and its inverse the least: beyond, pictures have no pixels le
 
 @dataclass(frozen=True)
 class EvaluateOptions(Settings):
-    """Settings of an evaluation.
+    """Settings of :func:`gsmerge.evaluate`.
 
     Example:
         >>> gsmerge.EvaluateOptions(lpips=(), photo_side=476).photo_side

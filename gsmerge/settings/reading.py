@@ -32,7 +32,7 @@ class ReadHints(Settings):
 
 @dataclass(frozen=True)
 class FileHints(ReadHints):
-    """All that ``--hint`` may say of a file."""
+    """Hints that ``--hint`` accepts: those of :class:`ReadHints`, and the opacity's encoding."""
 
     opacity: OpacityChoice = setting("auto", "How the file stores opacity: as logits, or raw in [0, 1]; auto decides "
         "by the values.")  # fmt: skip
