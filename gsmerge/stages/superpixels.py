@@ -45,7 +45,7 @@ MAX_FACTOR = 4  # most times more or fewer superpixels than bass-adaptive starts
 
 
 def count_for(options: SegmentOptions, height: int, width: int) -> int:
-    """Return the superpixels that the options ask for in a view; raise UsageError for more than pixels."""
+    """Return the number of superpixels per view; UsageError if it exceeds the number of pixels."""
     if options.per_view is not None:
         if options.per_view > height * width:
             limit = f"{height * width}, one per pixel of {width} x {height}"
