@@ -178,7 +178,7 @@ def encode_files(
 
 
 def encoding_line(document: Mapping[str, Any]) -> str:
-    """Write the report of an encoding in a line."""
+    """Describe the report of an encoding in one line."""
     scene, file = document["input"], document["output"]
     line = f"{file['path']}: {scene['num_gaussians']:,} Gaussians -> {file['num_groups']:,} groups, "
     line += f"{human_bytes(scene['bytes'])} -> {human_bytes(file['bytes'])} ({100 * document['ratio_bytes']:.0f} %); "
