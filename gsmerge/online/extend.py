@@ -38,7 +38,7 @@ from gsmerge.types import Gaussians, Scene
 
 @dataclass(frozen=True)
 class BatchReport:
-    """Report of a batch of views: numbers of its groups, and the record of the run."""
+    """Report of one batch: numbers of views and groups, and the record of the run."""
 
     num_views: int
     num_input: int  # Gaussians of the batch
