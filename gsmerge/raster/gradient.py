@@ -79,7 +79,7 @@ def gradients_of(
     grad_left: Array | None,
     with_viewmat: bool,
 ) -> Gradients:
-    """Return the gradients of :func:`plan_gradients` for unchecked contiguous float32 arrays; colours ``[m,3]``."""
+    """Return the gradients of :func:`plan_gradients`, given contiguous float32 arrays that are not checked."""
     m, splats = len(plan.ids), plan.splats
     slots = np.empty((len(plan.flatten_ids), SUMS), np.float32)
     sums = np.zeros((m, SUMS), np.float32)
@@ -167,7 +167,7 @@ def color_gradients(
 
 
 def pose_gradient(plan: ViewPlan, gradients: Gradients, shade: ColorGradients | None = None) -> Array:
-    """Return the gradient ``[4,4]`` float64 of the world-to-camera matrix, through geometry and, if given, colours."""
+    """Return the gradient ``[4,4]`` float64 of the viewmat, through geometry and, with ``shade``, through colours."""
     assert gradients.viewmat is not None
     viewmat = gradients.viewmat.copy()
     if shade is not None:
