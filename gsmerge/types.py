@@ -56,12 +56,12 @@ def to_float32(values: np.ndarray) -> np.ndarray:
 
 
 def like(values: np.ndarray, given: Array) -> Array:
-    """Return an array in the kind of another: an array, or a tensor on the same device."""
+    """Convert ``values`` to the type of ``given``: a NumPy array, or a tensor on the same device."""
     return as_tensor(values, given.device) if hasattr(given, "detach") else values
 
 
 def concat_rows(parts: Sequence[Array], axis: int = 0) -> Array:
-    """Concatenate rows, or what another axis counts, of arrays or of tensors."""
+    """Concatenate arrays, or tensors, along ``axis``."""
     if all(isinstance(part, np.ndarray) for part in parts):
         return np.concatenate(parts, axis)
     import torch
@@ -346,7 +346,7 @@ def grid_ids(valid: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Groups:
-    """A partition of the pixels of every view into superpixels."""
+    """Superpixels of every view: a label for each pixel, and the number of superpixels of each view."""
 
     labels: np.ndarray  # [v,h,w] int32, the superpixel of each pixel, 0 to `counts[v] - 1` within its view
     counts: tuple[int, ...]  # Superpixels of each view
@@ -369,7 +369,7 @@ class Segmentation:
 
 @dataclass(frozen=True)
 class Matches:
-    """Clusters of Feature Gaussians that show the same piece of surface."""
+    """Clusters of Feature Gaussians that show the same surface."""
 
     clusters: np.ndarray  # [g] int64, the cluster of each Feature Gaussian, dense from 0
     count: int  # Number of clusters
@@ -422,7 +422,7 @@ class FeatureGaussians:
 
 @dataclass(frozen=True, eq=False)
 class Decoded:
-    """Start of a fit."""
+    """Canonical Gaussians that a fit starts from."""
 
     gaussians: Gaussians  # Canonical Gaussians
     count: int  # Number to which the fit may grow
