@@ -69,4 +69,4 @@ def _parameters(function: Any) -> str:
     signature = inspect.signature(function)
     bare = [one.replace(annotation=inspect.Parameter.empty) for one in signature.parameters.values()]
     text = str(signature.replace(parameters=bare, return_annotation=inspect.Signature.empty))
-    return re.sub(r"<function .*?>", "...", text)
+    return re.sub(r"<function \S+ at \w+>", "...", text).replace("'", '"')

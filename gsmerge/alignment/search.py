@@ -140,7 +140,7 @@ def align(
         ply: The file's rows.
         camera_file: Its cameras.
         photos: c uint8 photos of one size.
-        order: The order of the rows where it is known, see :class:`gsmerge.io.ReadHints`.
+        order: The order of the rows where it is known, see :class:`gsmerge.settings.reading.ReadHints`.
         scale: Size of the Gaussians' world in units of the cameras', where it is given.
         depths: Reads ``[c,h,w]`` depth maps next to the cameras; None where there are none.
         frames: Reads the frames that a file names in which the cameras may see rows without pixels.

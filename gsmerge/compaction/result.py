@@ -66,7 +66,7 @@ class CompactResult:
         gaussians: The Gaussians.
         report: What was done.
         cameras: The given views as the Gaussians were made from them, in the same frame: moved where their poses were
-            wrong, see ``poses`` of :class:`gsmerge.PrepareOptions`.
+            wrong, see ``poses`` of :class:`gsmerge.settings.stages.PrepareOptions`.
         coarser: Further levels of detail, each with a quarter of the Gaussians of the one before.
 
     Example:

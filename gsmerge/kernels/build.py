@@ -61,7 +61,7 @@ class Platform:
     def triple(self) -> str:
         """The platform in words of the compiler; a C library is named, none is linked."""
         kind = "x86_64" if self.machine == "x86_64" else "aarch64"
-        system = {"macosx": "macos", "win": "windows-gnu"}.get(self.system, "linux-gnu.2.17")
+        system = {"macosx": "macos.11.0", "win": "windows-gnu"}.get(self.system, "linux-gnu.2.17")
         return f"{kind}-{system}"
 
     @property
@@ -98,9 +98,10 @@ def compiler() -> list[str]:
     """Return the command of the compiler; OSError if there is none."""
     given = shlex.split(os.environ.get("GSMERGE_CC", ""))
     if given:
-        if shutil.which(given[0]) is None:
+        program = shutil.which(given[0])
+        if program is None:
             raise OSError(f"GSMERGE_CC: expected a compiler, found no program {given[0]!r}")
-        return given
+        return [os.path.abspath(program), *given[1:]]
     try:
         import ziglang
     except ImportError:
@@ -121,9 +122,9 @@ def build_target(
         call = [
             *command, *options, *FLAGS, f'-DSOURCES_HASH="{hash_sources()}"', *extra, *link,
             *(f"-I{folder}" for folder in sorted({path.parent for path in source_files()})),
-            *(str(path) for path in source_files() if path.suffix == ".c"), "-o", str(whole),
+            *(str(path) for path in source_files() if path.suffix == ".c"), "-o", whole.name,  # macOS keeps it
         ]  # fmt: skip
-        run = subprocess.run(call, env={**os.environ, **caches}, capture_output=True, text=True, check=False)
+        run = subprocess.run(call, cwd=cache, env={**os.environ, **caches}, capture_output=True, text=True, check=False)
         if run.returncode:
             raise OSError(f"{command[0]}: building {path.name} failed\n{run.stderr[-4000:]}")
         folder.mkdir(parents=True, exist_ok=True)

@@ -164,10 +164,10 @@ def evaluate(
     """Measure compact results, and the scene itself, on its input views and on held-out views.
 
     ``results`` are Gaussians by name, in the scene's world; without photos they are compared with renders of the scene.
-    ``targets`` are held-out views in that world, see :func:`gsmerge.io.read_held_out`; ``cameras`` those of the input
-    views by name of a result that was made with other poses, as ``CompactResult.cameras``; ``progress`` is called with
-    ("evaluate", done, total) after each result, ``on_image`` with (result, split, number of the view in it, render
-    ``[h,w,3]`` in [0, 1]) for each picture that is scored.
+    ``targets`` are held-out views in that world, see :func:`gsmerge.scene.held_out.read_held_out`; ``cameras``
+    those of the input views by name of a result that was made with other poses, as ``CompactResult.cameras``;
+    ``progress`` is called with ("evaluate", done, total) after each result, ``on_image`` with (result, split, number of
+    the view in it, render ``[h,w,3]`` in [0, 1]) for each picture that is scored.
 
     Raises:
         UsageError: If the scene has no views, a result is called "input", or alignment is asked for without targets.

@@ -64,8 +64,8 @@ def inspect(
         images: A folder or an ``.npz``.
         masks: A folder of images named as the photos, dark where a photo does not count.
         opacity: As of :func:`gsmerge.io.read_ply`.
-        hints: Fields of :class:`gsmerge.io.ReadHints`: ``exporter``, ``quats``, ``order``, ``scene_scale``,
-            ``max_side``.
+        hints: ``exporter``, ``quats``, ``order``, ``scene_scale``, ``max_side``, see
+            :class:`gsmerge.settings.reading.ReadHints`.
 
     Returns:
         Plain JSON types, None for what is not finite or not known. Of the file: ``path``, ``bytes``,

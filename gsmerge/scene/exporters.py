@@ -45,7 +45,7 @@ class Exporter:
     opacity: Literal["logit", "raw"]  # how it stores opacities
     order: str  # order of its rows; "unordered": none, but each is made of a pixel; "none": they belong to no pixels
     kinds: tuple[str, ...] = ("full",)  # which pixels it keeps; see ``gsmerge/alignment/layouts.py``
-    # where its Gaussians may lie in the frame of the cameras; see :class:`gsmerge.alignment.Similarity`
+    # where its Gaussians may lie in the frame of the cameras; see :class:`gsmerge.geometry.Similarity`
     frames: tuple[FrameKind, ...] = ("same",)
     per_pixel: tuple[int, ...] = (1,)  # Gaussians per pixel
     degrees: tuple[int, ...] = (0,)  # SH degrees that it writes

@@ -137,8 +137,8 @@ def read_scene(
         masks: Folder of masks, images named as the photos, dark where a photo does not count; None: ``masks`` beside
             the photos. Where a photo is transparent, it does not count either.
         opacity: How opacities are stored; see :func:`gsmerge.io.read_gaussians`.
-        **hints: Fields of :class:`gsmerge.io.ReadHints`: ``exporter``, ``quats``, ``order``, ``scene_scale``,
-            ``max_side``.
+        **hints: ``exporter``, ``quats``, ``order``, ``scene_scale``, ``max_side``, see
+            :class:`gsmerge.settings.reading.ReadHints`.
 
     Returns:
         The scene; its ``pixel_ids`` are None where the rows belong to no pixels.

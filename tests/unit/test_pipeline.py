@@ -176,7 +176,7 @@ def test_input_is_left_alone(scene: Scene) -> None:
 def test_wrong_settings_are_refused(scene: Scene) -> None:
     with refuses(ValueError, "superpixels", 768, 769):
         compact(scene, superpixels=32 * 24 + 1)
-    with refuses(ValueError, "", "thread", 0):
+    with refuses(ValueError, "threads", 0):
         compact(scene, threads=0)
 
 
