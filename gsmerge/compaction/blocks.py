@@ -54,9 +54,9 @@ SURPLUS = 1.03  # times an exact number of Gaussians: the faintest of what is to
 def compact_in_blocks(given: Scene, options: CompactOptions, whole: WholePlan) -> CompactResult:
     """Compact an aligned scene in blocks of views; the plan of the whole scene sets how many.
 
-    The views of each block are merged first, and of the Gaussians those are kept that belong to it, so that all blocks
-    together have one set of Gaussians to start with. Then each block fits what its views see, its neighbours'
-    Gaussians included, and keeps its own: where two blocks meet, both fit the same Gaussians to the same photos.
+    The views of each block are merged first, and only the Gaussians that belong to the block are kept, so that all
+    blocks together start from one set of Gaussians. Then each block fits what its views see, its neighbours' Gaussians
+    included, and keeps its own: where two blocks meet, both fit the same Gaussians to the same photos.
     """
     device, given = given.gaussians.device, given.numpy()
     count, most = whole.blocks, whole.limits.count
@@ -146,9 +146,10 @@ def without_gaussians(prepared: Prepared) -> Prepared:
 
 
 def fit_part(part: Part, everything: tuple[Gaussians, np.ndarray], own: int, growth: float) -> Gaussians:
-    """Fit the canonical Gaussians of all blocks that a block's views may see, and return those of block ``own``.
+    """Fit all Gaussians that a block's views may see, and return the fitted ones that belong to block ``own``.
 
-    ``everything``: the Gaussians and the number of each one's block. ``growth``: of their number in the fit.
+    ``everything``: canonical Gaussians of all blocks, and the block of each. ``growth``: final number of Gaussians, as
+    a multiple of the number at the start.
     """
     (joined, owners), scene, plan = everything, part.prepared.scene, part.plan
     used = owners == own
@@ -270,7 +271,7 @@ def block_options(
 def belongs_to_block(means: np.ndarray, block: Block, covisibility: Covisibility) -> np.ndarray:
     """Return a mask ``[n]`` of means ``[n,3]`` whose nearest seeing view is one of the block's own views.
 
-    Every view that sees something of the block counts.
+    The views considered are those that share surfaces with the block.
     """
     sees = covisibility.weights[list(block.own)].sum(0) > 0
     sees[list(block.own)] = True

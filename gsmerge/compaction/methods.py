@@ -61,7 +61,7 @@ def find_method(options: CompactOptions) -> Method | None:
 def check_method(options: CompactOptions, scene: Scene) -> tuple[Method | None, list[str]]:
     """Load the method that the options name, and note changed settings that the method ignores.
 
-    A UsageError if the scene does not have what it needs, or a program is missing.
+    Raises UsageError if the scene lacks what the method needs, or a program is missing.
     """
     method = find_method(options)
     if method is None:
