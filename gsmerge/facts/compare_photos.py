@@ -363,9 +363,9 @@ def odd_photos(shown: Shown) -> list[int]:
 
 
 def gradient_correlations(shown: Shown) -> tuple[np.ndarray, np.ndarray]:
-    """Correlate the gradients of each view's Gaussians with those of every photo: ``[v,v]``, -1 to 1.
+    """Correlate the image gradients of each view's Gaussians with those of every photo: ``[v,v]``, -1 to 1.
 
-    No exposure changes it. Also returns a mask ``[v]`` of views with enough structure.
+    Exposure does not change the correlation. Also returns a mask ``[v]`` of views with enough structure.
     """
     height, width = shown.weights.shape[1:]
     level = max(1.0, max(width, height) / SIDE)

@@ -122,7 +122,7 @@ def share_left(pairs: Sequence[_Pair], gains: np.ndarray) -> float:
 def is_metered(brightness: np.ndarray, gains: np.ndarray) -> bool:
     """Return whether the gains come from metering: whether they offset the brightness of what each photo shows.
 
-    Brightness grows as gains do where these are independent of the places; metered photos are all equally bright.
+    With fixed exposure, photos are brighter where gains are larger; metering makes all photos equally bright.
     """
     gains, brightness = gains - gains.mean(0), brightness - brightness.mean(0)
     slope = float((gains * brightness).sum() / max((gains * gains).sum(), 1e-12))

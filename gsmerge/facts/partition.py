@@ -126,8 +126,8 @@ def count_factors(blocks: Sequence[Block], covisibility: Covisibility) -> np.nda
 def partition_views(weights: np.ndarray, count: int, shared: float = SHARED) -> list[Block]:
     """Cluster v views into ``count`` blocks of similar size with weak edges between them; add views of neighbours.
 
-    ``weights [v,v]`` are symmetric, at least 0. Every view is in one block; a block's further views are those of the
-    others that share most with it, a share ``shared`` of its own, as far as they share anything.
+    ``weights [v,v]`` are symmetric, at least 0. Every view belongs to one block. A block also shares views of other
+    blocks, those with the largest weights, up to ``shared`` times the number of its own.
     """
     labels = exchange(weights, grow_blocks(weights, count))
     blocks = []
@@ -142,7 +142,8 @@ def partition_views(weights: np.ndarray, count: int, shared: float = SHARED) -> 
 def grow_blocks(weights: np.ndarray, count: int) -> np.ndarray:
     """Label views ``[v]`` with 0 to ``count - 1``, growing one block after the other from the rim of the views left.
 
-    The first view of a block shares least with those that no block has, the next ones most with the block.
+    A block starts with the view that has the weakest edges to the views left, and grows by the view that shares most
+    with the block.
     """
     num_views = len(weights)
     labels, left = np.full(num_views, -1), np.ones(num_views, bool)
@@ -184,7 +185,7 @@ def exchange(weights: np.ndarray, labels: np.ndarray) -> np.ndarray:
 def owning_views(points: np.ndarray, covisibility: Covisibility, views: Sequence[int]) -> np.ndarray:
     """Return the owner ``[n]`` of each point ``[n,3]``: the nearest of the ``views`` that sees the point.
 
-    Where none does, the nearest with the point in its picture counts, and where there is none either, the nearest.
+    If no view sees the point, the owner is the nearest view with the point in its picture, else the nearest view.
     """
     cameras, depths = covisibility.cameras[list(views)], covisibility.depths[list(views)]
     centres = camera_centres(cameras.viewmats.astype(np.float64))

@@ -26,8 +26,7 @@ def even_views(num_views: int, count: int) -> list[int]:
 def scored_views(num_views: int) -> list[int]:
     """Return view ids for scoring a whole scene: all, or ``MAX_SCORED_VIEWS`` evenly spaced.
 
-    Rendering the unmerged input costs as many views as Gaussians, so with all of many views it
-    would be most of a run.
+    Rendering the unmerged input takes time in proportion to views and Gaussians: all views would be most of a run.
     """
     return even_views(num_views, min(num_views, MAX_SCORED_VIEWS))
 
