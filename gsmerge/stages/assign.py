@@ -50,7 +50,7 @@ def merge_unseen(gaussians: Gaussians, scene: Scene, count: int) -> Gaussians:
 
 @dataclass(frozen=True)
 class Owners:
-    """Superpixel with the largest contribution of each of n Gaussians."""
+    """The superpixel to which each of n Gaussians contributes most."""
 
     values: np.ndarray  # [n] float32 blending weights summed over the superpixel, pixels; or 0
     views: np.ndarray  # [n] int32, -1 if unseen

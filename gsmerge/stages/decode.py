@@ -141,9 +141,9 @@ def mixed_counts(
 def merged_count(merged: MergedViews, options: DecodeOptions, *, grows: bool) -> int | None:
     """Return the number of Gaussians to decode merged views into; None: K for each Feature Gaussian.
 
-    A number where one is to be met and no fit grows to it; and for unaligned scenes: what a near
-    and a far view both show belongs to the near one, so many superpixels of the far one stay empty,
-    and their Gaussians are spent on the others.
+    The result is a number if an exact count is asked for and no fit grows to it, and for unaligned scenes. There, what
+    a near and a far view both show belongs to the near one, so many superpixels of the far one stay empty, and their
+    Gaussians go to other groups.
     """
     segmentation, members = merged.segmentation, merged.members
     if segmentation.exact and not grows:
@@ -252,8 +252,7 @@ def _child_errors(features: FeatureGaussians, members: Members, max_children: in
 def hull_gains(errors: np.ndarray) -> np.ndarray:
     """Return the gain ``[f,c-1]`` of each further child, along the lower convex hull of the errors ``[f,c]``.
 
-    -inf where there is none. Gains fall from child to child: the mean gain up to the farthest point
-    of steepest descent, again and again.
+    It is -inf where there is no child. Along the hull the gains fall from child to child.
     """
     num_groups, num_children = errors.shape
     gains = np.full((num_groups, num_children - 1), -np.inf)

@@ -58,8 +58,8 @@ def correct(
 ) -> FeatureGaussians:
     """Correct pooled Feature Gaussians with the encoder network, which also adds latents.
 
-    ``weaken``: without networks, lower the optical depth of groups that other views see through; a
-    long fit closes the holes that this leaves, and moves what stands before other views less.
+    ``weaken``: without networks, lower the optical depth of groups that other views see through. A long fit closes the
+    holes that this leaves.
     """
     if networks is None:
         return weaken_contradicted(features, members, cameras) if weaken else features

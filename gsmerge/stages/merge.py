@@ -59,7 +59,7 @@ def refine(features: FeatureGaussians, networks: NetworkContext | None) -> Featu
 
 
 def cluster_runs(matches: Matches) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return rows alone in their cluster, the others sorted by cluster, and where each cluster starts among these."""
+    """Split rows by cluster: those alone in theirs, the others sorted by cluster, and where each cluster starts."""
     clusters = matches.clusters
     alone = np.bincount(clusters, minlength=matches.count)[clusters] == 1
     order = np.flatnonzero(~alone)

@@ -61,9 +61,9 @@ class SuperpixelPlan:
 def segment_scene(scene: Scene, plan: SuperpixelPlan, count: int | None) -> Segmentation:
     """Cut every view into superpixels: as the options say, or as many as become exactly ``count`` Gaussians.
 
-    A count is cut from the region tree, in which a plain wall ends up with few superpixels and a fern with many; from
-    a finer tree where the scene's own does not reach it. Superpixels that adapt change the number of Gaussians as
-    they change their own; where that is above what a budget allows, it is cut to the largest one allowed.
+    An exact count is cut from the region tree, which gives a plain wall few superpixels and a fern many; a finer tree
+    is built if the scene's own is too coarse. Adaptive superpixels change the number of Gaussians; if it exceeds the
+    budget, the largest allowed count is cut instead.
     """
     limits, options, views = plan.limits, plan.options, len(scene)
     if count is None:
@@ -297,8 +297,8 @@ def _usable_depths(depths: np.ndarray, valid: np.ndarray) -> np.ndarray:
 def cut_tree(tree: RegionTree, budget: int) -> Groups:
     """Cut the tree into exactly ``budget`` regions over all views, at least one in each.
 
-    There are at most as many as superpixels. The regions of a smaller budget are unions of those of
-    a larger one. Raises ValueError if ``budget`` is below the number of views.
+    ``budget`` is limited to the number of superpixels. The regions of a smaller budget are unions of those of a larger
+    one. Raises ValueError if ``budget`` is below the number of views.
     """
     num_views = len(tree.parents)
     if budget < num_views:
@@ -323,12 +323,11 @@ def auto_count(tree: RegionTree) -> int:
 
 
 def knee(counts: np.ndarray, distortions: np.ndarray) -> int:
-    """Return the count beyond which more Gaussians are not worth it.
+    """Return the count beyond which more Gaussians add little quality.
 
-    Predicted quality is q(N) = -10 log10(floor + D(N)) dB. The knee is the largest count from whose
-    surroundings (a factor of 1.25) q still grows by ``KNEE_SLOPE`` dB per relative increase; the
-    least count if there is none. ``counts [m]`` are all different; ``distortions [m]`` are mean
-    squared errors per pixel and channel.
+    Predicted quality is q(N) = -10 log10(floor + D(N)) dB. The knee is the largest N around which, within a factor of
+    1.25, q still grows by ``KNEE_SLOPE`` dB per relative increase of N; the least N if there is none. ``counts [m]``
+    are all different; ``distortions [m]`` are mean squared errors per pixel and channel.
     """
     counts, distortions = np.asarray(counts), np.asarray(distortions, dtype=float)
     if len(counts) == 0 or counts.shape != distortions.shape:

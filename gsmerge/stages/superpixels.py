@@ -59,9 +59,8 @@ def segment(
 ) -> Groups:
     """Cut every view into superpixels: the same number in each, unless they adapt.
 
-    ``images [v,h,w,3]`` are float in [0, 1] or uint8; ``count`` is the number in each view, None:
-    that of the options. With ``adapt`` it is only where ``bass-adaptive`` starts from; see
-    :func:`superpixels`.
+    ``images [v,h,w,3]`` are float in [0, 1] or uint8; ``count`` is the number per view, None: the options' number. With
+    ``adapt``, ``bass-adaptive`` starts from ``count`` and may change it; see :func:`superpixels`.
     """
     if images.ndim != 4 or images.shape[3] != 3:
         raise ValueError(f"images: expected shape [v, h, w, 3], got {list(images.shape)}")
@@ -134,7 +133,7 @@ def superpixels(
 
 
 def grid_labels(height: int, width: int, count: int) -> np.ndarray:
-    """Return labels ``[h,w]`` int32 of ``count`` rectangles in rows whose lengths differ by at most one."""
+    """Return labels ``[h,w]`` int32 of ``count`` rectangles, arranged in rows of as equal numbers of rectangles as possible."""
     min_rows = -(-count // width)  # rows of blocks that can hold them all
     lines = min(height, count, max(min_rows, round((count * height / width) ** 0.5)))
     first = np.arange(lines + 1) * count // lines  # first label of each row of blocks
