@@ -56,9 +56,9 @@ def fit_colors(
 ) -> FitResult:
     """Fit base colours to the photos, and keep them only if held-out blocks get better.
 
-    ``drawn`` are the same Gaussians in the photos, see :func:`draw`; ``seed`` chooses the held-out
-    blocks; ``color_precision [n]`` counts pixels of photos that are gone which each colour was
-    fitted to. Geometry, opacities and higher harmonics stay.
+    ``drawn`` are the same Gaussians in the photos, see :func:`draw`; ``seed`` chooses the held-out blocks.
+    ``color_precision [n]`` weighs each present colour as a prior, by the pixels of earlier photos that it was fitted
+    to. Geometry, opacities and higher harmonics stay.
     """
     train = color_weights(photos, options, seed)
     precision = 0.0 if color_precision is None else color_precision[:, None].astype(np.float64)

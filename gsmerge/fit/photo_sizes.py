@@ -67,9 +67,8 @@ def largest_scale(scene: Scene) -> float:
 def large_photos(scene: Scene, scale: float) -> Photos:
     """Read the photos at ``scale`` times the views' size, at most :func:`largest_scale`, one by one.
 
-    As uint8, because they may be as large as the scene. Their low-pass is that of a viewer of this
-    size: the views' own size is seen with its own in the steps between. Raises ValueError if the
-    scene has no larger photos.
+    They are uint8, because they may take as much memory as the scene. Their low-pass is that of a viewer of this size.
+    Raises ValueError if the scene has no larger photos.
     """
     large, cameras = scene.large_photos, scene.cameras
     if large is None:

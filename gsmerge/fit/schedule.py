@@ -79,7 +79,7 @@ class FitPlan:
     half_part: float  # Share of the steps, the first ones, on half-size photos
 
     def outside_view(self, step: int, progress: float) -> int | None:
-        """Return the view from outside that step ``step`` (from 1) is followed by; None: none."""
+        """Return the index of the view from outside that is fitted after step ``step`` (from 1); None: none."""
         outside, rates = self.job.outside, self.job.options.tuning
         if outside is None or progress < rates.outside_from or step % rates.outside_every:
             return None
@@ -88,8 +88,8 @@ class FitPlan:
     def draw_mode(self, step: int, progress: float) -> DrawMode:
         """Return how step ``step`` (from 1) draws the scene.
 
-        Half-size photos come first. Then photos are drawn in turn in the ways of viewers; larger
-        ones in between show what an enlarged view shows.
+        Half-size photos come first, then full-size ones, drawn in turn in the ways of different viewers. Larger photos
+        in between show what an enlarged view shows.
         """
         photos = self.job.photos
         if progress < self.half_part:
