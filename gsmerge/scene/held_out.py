@@ -39,10 +39,10 @@ class HeldOutViews(Views):
 def read_held_out(load: Loaded, cameras: StrPath, images: StrPath | None = None) -> HeldOutViews:
     """Read held-out photos and their cameras, in any of the forms that scenes may have.
 
-    Views that the scene was made of are left out. Where the file has those too, under the same names, their poses
-    determine how its world lies to that of the Gaussians; otherwise it is assumed to be the world of the scene's
-    own cameras. Poses are read in the scene's convention if it is not its format's. ``images`` is the folder of the
-    photos; None: where the camera file says. SceneError if a file is missing or damaged, or no view is left.
+    Views that the scene was made of are left out. If the file has those too, under the same names, their poses tell how
+    its world lies to that of the Gaussians; otherwise it is taken for the world of the scene's own cameras. Poses are
+    read in the convention that the scene's cameras needed. ``images``: folder of the photos; None: where the camera
+    file says. SceneError if a file is missing or damaged, or no view is left.
     """
     path = Path(cameras)
     if not path.exists():

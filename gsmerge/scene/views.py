@@ -170,10 +170,10 @@ def find_larger_and_masks(
 ) -> tuple[LargePhotos | None, np.ndarray | None, list[str]]:
     """Find the photos at full file size, if that is larger than the scene's, and masks of the pixels that count.
 
-    Files are read again when a photo is asked for; photos inside other files stay in memory. ``photos`` are those
-    of :func:`stored_photos`, undistorted; ``size`` is theirs when they were fitted to the rows by ``transform``;
-    ``cameras`` are those of the scene's grid, in the order of the camera file. The masks ``[c,h,w]`` bool come from
-    files and from transparency; None where all photos count wholly. With notes.
+    Files are read again when a photo is asked for; photos inside other files stay in memory. ``photos`` are the
+    undistorted photos of :func:`stored_photos`; ``size`` is their size and ``transform`` how they were fitted to the
+    rows; ``cameras`` are the scene's, in the order of the camera file. Masks ``[c,h,w]`` bool come from files and from
+    transparency; None if all pixels count. Also returns notes.
     """
     if photos is None or size is None:
         return None, None, []
@@ -249,7 +249,7 @@ def _read_masks(
 
 
 def check_masks(masks: np.ndarray | None, files: SceneFiles) -> tuple[np.ndarray | None, list[str]]:
-    """Note what share of the photos masks leave out; nearly all is a SceneError, or no mask if it is transparency."""
+    """Note the share of the photos that masks leave out; SceneError if masks from files leave out nearly all."""
     if masks is None:
         return None, []
     share = float(1 - masks.mean())
@@ -311,8 +311,7 @@ def limit_photo_size(
 ) -> tuple[Photos | None, list[str]]:
     """Resize photos that are too large for memory to at most ``max_side`` pixels per side, with notes.
 
-    Where the file's Gaussians (``rows``) may be the photos' pixels, the photos stay; not where they are known to be
-    unaligned.
+    Photos whose pixels may be the file's ``rows`` Gaussians keep their size, unless they are known to be ``unaligned``.
     """
     size = photo_size(photos)
     if photos is None or size is None:
