@@ -39,8 +39,9 @@ _written: set[str] = set()  # the temporary files of this process
 def atomic_output(path: StrPath, *, overwrite: bool = False) -> Iterator[Path]:
     """Yield an empty temporary file beside ``path`` that is renamed to ``path`` when the block succeeds.
 
-    The folder must exist. A link stays one: the file that it leads to is replaced. For a path that came from an outer
-    block, that file itself. SceneError if the file exists and ``overwrite`` is False, or it cannot be written.
+    The folder must exist. A link stays a link; the file that it leads to is replaced. Inside an outer block that
+    yielded ``path``, ``path`` itself is yielded. SceneError if the file exists and ``overwrite`` is False, or cannot be
+    written.
     """
     with atomic_outputs(overwrite=overwrite) as add:
         yield add(Path(path))

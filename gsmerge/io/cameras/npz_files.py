@@ -30,7 +30,7 @@ _KINDS = "biufU"
 
 
 def is_da3(path: Path) -> bool:
-    """Return whether an npz has Depth Anything 3's names of poses."""
+    """Return whether an npz has poses under the names that Depth Anything 3 uses."""
     return not array_names(path).isdisjoint(_EXTRINSICS[:2])
 
 

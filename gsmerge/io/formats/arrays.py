@@ -79,7 +79,7 @@ def concatenate(parts: Sequence[Columns]) -> Columns:
 
 @dataclass(frozen=True)
 class StoredRows:
-    """Gaussians as a file stores them: ``rows`` has the columns of a PLY file, ``REQUIRED`` and more."""
+    """Gaussians as a file stores them; ``rows`` has the columns of a PLY file, at least ``REQUIRED``."""
 
     rows: np.ndarray
     layout: str  # for people

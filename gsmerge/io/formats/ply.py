@@ -177,7 +177,7 @@ class _BinaryRows(BufferedReader):
 def open_rows(path: Path, rows: np.ndarray) -> Iterator[Callable[[slice], np.ndarray]]:
     """Yield a thread-safe function that returns blocks of a PLY file's rows.
 
-    Mapped pages of a file that shrinks would end the process; reading such a file is a SceneError.
+    A mapped file that becomes shorter would end the process; here it raises SceneError.
     """
     if not isinstance(rows, np.memmap):
         yield rows.__getitem__

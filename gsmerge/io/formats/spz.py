@@ -114,10 +114,10 @@ def _gzip_parts(path: Path, packed: bytes) -> tuple[_Header, list[np.ndarray]]:
 
 
 def problem_at_end(path: Path) -> str | None:
-    """Describe errors at the end of a ``.spz`` that readers skip: a wrong checksum or surplus bytes; None without.
+    """Describe errors at the end of a ``.spz`` that readers skip; None without any.
 
-    That is the checksum of its stream, and bytes that its header does not promise, as under a wrong
-    version; None if both are right, and for version 4, which has neither.
+    These are a wrong checksum of the stream, and bytes beyond what the header promises, as under a wrong version.
+    Version 4 has neither.
     """
     packed = path.read_bytes()
     if packed[:2] != GZIP_MAGIC:

@@ -267,7 +267,7 @@ def read_rows(path: Path, level: int = 0) -> arrays.StoredRows:
 def remove_unused_chunks(path: Path) -> None:
     """Remove chunks beside an index that the index does not name and that :func:`streamed_files` once made.
 
-    Files of other names in their folders stay, and so do these; what cannot be removed stays, too.
+    Other files in the chunks' folders stay, with their folders; so does what cannot be removed.
     """
     used = {chunk.parent.name for level in read_index(path).levels for chunk in level}
     with suppress(OSError), os.scandir(path.parent) as entries:

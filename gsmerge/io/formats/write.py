@@ -100,7 +100,7 @@ def add_levels(
 ) -> list[tuple[Path, list[Path]]]:
     """Write the files of a Streamed SOG as part of :func:`atomic_outputs`; ``index`` is the temporary file of ``path``.
 
-    Returns of each level the ``meta.json`` of its first chunk, as it will be named, and all files as they are now.
+    Returns, for each level, the final path of its first chunk's ``meta.json``, and the present paths of all its files.
     """
     _check_comments(comments)
     firsts: dict[str, Path] = {}
