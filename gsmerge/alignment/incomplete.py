@@ -54,7 +54,7 @@ _BETTER = 2.0  # times nearer to the pixels: another scale, where the same fits 
 
 
 def read_incomplete(inputs: AlignmentInput) -> Iterator[Reading | None]:
-    """Yield readings with missing pixels, the likely order first; None for an order that is impossible."""
+    """Yield readings with missing pixels, the likely order first; None for each order that is impossible."""
     cameras = inputs.cameras
     missing = len(cameras) * cameras.width * cameras.height - len(inputs.gaussians)
     if missing < 0:

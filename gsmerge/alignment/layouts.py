@@ -196,7 +196,7 @@ def spread_step(step: int, width: int) -> int:
 
 @dataclass(frozen=True)
 class GridFit:
-    """One assumption about the size of the pixel grid, with cameras and photo transform of that size."""
+    """One assumption about the size of the pixel grid, with the cameras and the photo transform for that size."""
 
     camera_file: CameraFile  # the cameras as they are read, in one convention of the poses
     cameras: Cameras  # the same at the grid's size

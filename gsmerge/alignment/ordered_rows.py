@@ -40,8 +40,7 @@ MAX_CELLS = 300_000_000  # rows times views that are worth the memory
 class ProjectedRows:
     """n finite rows of a file, and the cameras of the c views that they may belong to.
 
-    Searches take these and return a layout whose pixels still have to be measured, or None if the rows do not look
-    like it.
+    Searches take these and return a layout that is not scored yet, or None if the rows do not look like it.
     """
 
     points: np.ndarray  # ``[n,3]`` float64 means

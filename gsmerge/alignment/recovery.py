@@ -91,8 +91,7 @@ class Recovery:
 def recover(inputs: AlignmentInput, *, exact_frames: bool = False) -> Recovery | None:
     """Find the reading under which every Gaussian projects into its own pixel; None if no reading stands out.
 
-    With ``exact_frames`` only cameras in the frame of their file and files without missing pixels are considered:
-    quick.
+    ``exact_frames``: only try cameras in the frame of their file and files without missing pixels, which is quick.
     """
     finite = int(inputs.valid.sum())
     if inputs.order == "none" or (finite < ENOUGH and finite < FEW * len(inputs.gaussians)):

@@ -88,10 +88,10 @@ def candidate_similarities(
 ) -> Iterator[Similarity]:
     """Yield similarities that may map the cameras' frame to the Gaussians' frame, the most plausible first.
 
-    They are: the same frame; a scale; rotated by the first or the middle camera, alone, scaled, or scaled and
-    shifted, as exporters do; any, from the poses that the pixels ask for. ``scale`` is the size of the Gaussians'
-    world in units of the cameras', where it is given. Effort 0 solves for nothing (then there may be no pairs), 1
-    for scale and shift, 2 for the rotation as well.
+    They are: the same frame; a scale; the frame of the first or the middle camera, alone, scaled, or scaled and
+    shifted, as exporters write; any similarity, from poses solved from the pixels. ``scale``: size of the Gaussians'
+    world in units of the cameras', if known. ``effort`` 0 solves for nothing (``pairs`` may be None), 1 for scale and
+    shift, 2 also for the rotation.
     """
     yield IDENTITY if scale is None else scale_by(scale, ", as given")
     rays = None if pairs is None or effort == 0 else _ray_directions(pairs, cameras)

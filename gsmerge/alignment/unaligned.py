@@ -90,9 +90,9 @@ def choose_poses(
 ) -> tuple[Poses | None, CameraCheck, str | None]:
     """Choose the pose convention under which the cameras see most Gaussians, with colours nearest to the photos.
 
-    Arguments are as for :func:`check_cameras`, with the cameras under the usual convention. Returns the poses if
-    they are clearly better than the usual ones and all others, otherwise None; the check of the chosen ones; and a
-    note where others see as much as the usual ones.
+    ``cameras`` are in the usual convention; other arguments as for :func:`check_cameras`. Returns the poses, or None if
+    no other convention is clearly better than the usual one; the check of the chosen poses; and a note if others see as
+    much.
     """
     usual = check_cameras(gaussians, valid, cameras, images)
     others = [
@@ -127,8 +127,8 @@ def choose_cameras(
 ) -> tuple[Cameras, CameraFile, list[str]]:
     """Choose cameras that see the Gaussians: unchanged, in another frame, or in another convention; with notes.
 
-    ``frames`` are those that a file names; next come those of exporters. SceneError if none of these sees
-    them, with the reason ``why`` there are no pixels.
+    ``frames`` are those that a file names; exporters' usual frames are tried next. If none sees the Gaussians, a
+    SceneError gives ``why`` there are no pixels.
     """
     inputs = replace(inputs, valid=inputs.valid & ~find_padding(inputs.gaussians))
     rows = inputs.gaussians, inputs.valid

@@ -118,7 +118,7 @@ def move_scene(scene: Scene, place: Similarity) -> Scene:
 def turn_harmonics(shN: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """Rotate spherical harmonics ``[n,k-1,3]`` by ``rotation [3,3]``, as their Gaussians rotate.
 
-    They are fitted to the same colours in turned directions, which those of a degree show exactly.
+    Each degree is fitted to the same colours in rotated directions, which is exact.
     """
     num = shN.shape[1]
     if num == 0 or len(shN) == 0:

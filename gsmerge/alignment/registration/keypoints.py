@@ -69,7 +69,7 @@ class Matches:
 def find_keypoints(scene: Scene) -> list[Photo]:
     """Find the keypoints of every camera of an aligned scene that lie on a single surface.
 
-    Views with one camera are layers of one photo.
+    Views from the same camera are layers of one photo.
     """
     cameras = scene.cameras.numpy()
     poses = cameras.viewmats.reshape(len(scene), -1)

@@ -62,7 +62,7 @@ class Registration:
 def register(scenes: Sequence[Scene]) -> Registration:
     """Find the similarities that map aligned scenes, with grids of one size, into the frame of the first.
 
-    Of several connected sets the largest is used.
+    If the scenes form several connected sets, the largest is used.
     """
     count, cameras = len(scenes), scenes[0].cameras
     photos = [find_keypoints(scene) for scene in scenes]
