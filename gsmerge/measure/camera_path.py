@@ -133,9 +133,9 @@ def median_camera(cameras: Cameras) -> int:
 def orbit(cameras: Cameras, depth: float, count: int) -> Cameras:
     """Move around the middle camera on an ellipse in its image plane, looking at the point ``depth`` in front of it.
 
-    Frames are equally far apart, and the one after the last is the first. The picture's vertical stays that of the
-    middle camera. The ellipse has no larger half axes than half of the cameras are away from that one, within
-    ``ACROSS`` and ``UPRIGHT`` of the depth.
+    Frames are evenly spaced and form a loop; the picture's vertical stays that of the middle camera. The half axes are
+    the median distances of the cameras from the middle one, clipped to the shares ``ACROSS`` and ``UPRIGHT`` of the
+    depth.
     """
     middle = median_camera(cameras)
     viewmat = cameras.viewmats[middle].astype(np.float64)
@@ -162,8 +162,8 @@ def orbit(cameras: Cameras, depth: float, count: int) -> Cameras:
 def wide_orbit(cameras: Cameras, depth: float, count: int, turn: float) -> Cameras:
     """Turn about the point ``depth`` in front of the middle camera, by ``turn`` degrees to each side.
 
-    By half of that upwards and downwards, always as far from the point as that camera. Frames are equally far apart,
-    and the one after the last is the first. The picture's vertical stays that of the middle camera.
+    It also moves up and down by half of that, at a constant distance from the point. Frames are evenly spaced and form
+    a loop; the picture's vertical stays that of the middle camera.
     """
     middle = median_camera(cameras)
 
@@ -179,9 +179,9 @@ def wide_orbit(cameras: Cameras, depth: float, count: int, turn: float) -> Camer
 def spline(cameras: Cameras, depth: float, count: int) -> Cameras:
     """Pass through all cameras in their order on a smooth curve, from the first to the last.
 
-    Frames are equally far apart, where a turn counts as far as it moves what lies ``depth`` away. The curve is a
-    centripetal Catmull-Rom spline (Barry and Goldman 1988) of places and quaternions, in its form by tangents;
-    intrinsics change linearly. ValueError if there are no two different cameras.
+    Frames are evenly spaced, a turn counting as far as it moves a point ``depth`` away. The curve is a centripetal
+    Catmull-Rom spline (Barry and Goldman 1988) of positions and quaternions; intrinsics change linearly. ValueError if
+    there are no two different cameras.
     """
     rows, kept = _pose_rows(cameras, depth)
     origin, rows, Ks = rows[0, :3].copy(), rows[kept], cameras.Ks[kept].astype(np.float64)

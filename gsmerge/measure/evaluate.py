@@ -78,9 +78,9 @@ class ResultScores:
     fog: Mapping[str, Fog] = field(default_factory=dict)  # by kind of camera; empty of the input or if not asked for
 
     def mean(self, split: str, *, zoom: float | None = None, align: str | None = None) -> Pair:
-        """Average the scores of a split's views over all pixels and over visible ones: plain, zoomed or aligned.
+        """Average the scores of a split's views: as they are, at one ``zoom``, or after one alignment ``align``.
 
-        Over all pixels, and over the visible ones.
+        Returns the mean over all pixels and the mean over visible pixels.
         """
         views = [score for score in self.scores if score.split == split]
         pairs = [(score.full, score.masked) for score in views]

@@ -100,7 +100,7 @@ def outside_pictures(
 def contact_sheet(views: Sequence[Sequence[tuple[str, np.ndarray]]], *, min_width: int = 320) -> Picture:
     """Arrange pictures in a sheet: one labelled row per view.
 
-    Small ones are enlarged by a whole factor until a tile has ``min_width`` columns.
+    Small pictures are enlarged by a whole factor so that a tile has at least ``min_width`` columns.
     """
     factor = max(1, -(-min_width // views[0][0][1].shape[1]))
     rows = []

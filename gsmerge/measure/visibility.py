@@ -24,8 +24,8 @@ _DILATION = 3  # pixels of the input views per side of the square that every sam
 def context_points(scene: Scene, near: float, cameras: Cameras | None = None) -> Points:
     """Return the surface points ``[n,3]``, world, that the pixels of the input views show.
 
-    Of a scene with pixels the Gaussians are the samples; otherwise depth beyond ``near``, world units, is rendered
-    into the ``cameras``; None: those of the scene.
+    In a scene with pixels these are the Gaussians; otherwise depth beyond ``near``, world units, is rendered into the
+    ``cameras``; None: those of the scene.
     """
     if scene.aligned:
         return scene.gaussians.means[scene.valid.reshape(-1)].astype(np.float64)
