@@ -39,7 +39,7 @@ class Division:
 
     @property
     def num_splits(self) -> int:
-        """Number of splits of all groups, one further Gaussian each."""
+        """Number of splits in all groups; each adds one Gaussian."""
         return int(self.splits.sum(dtype=np.int64))
 
 

@@ -180,7 +180,7 @@ def divide_all(features: FeatureGaussians, members: Members, max_k: int) -> Divi
 def divide_by_heads(features: FeatureGaussians, num_members: np.ndarray, max_k: int) -> Division:
     """Divide every group into up to ``max_k`` children, at most one per member, for heads with absolute outputs.
 
-    Further Gaussians go where each stands for the most pixels, by the opacity of the groups' members.
+    Further children go where a child stands for most pixels, weighted by the opacity of the group's members.
     """
     splits = np.minimum(num_members, max_k) - 1
     steps = np.arange(1, max_k)
