@@ -143,8 +143,8 @@ def fit_batch_colors(
     """Fit base colours to new photos; earlier photos enter as a prior.
 
     The normal equations of earlier photos are stored as their diagonal (``GroupSet.color_precision``) about the colours
-    that solve them: ``color_precision |colour - fitted colour|^2`` is added to the equations of the new photos, so that
-    no earlier photo is needed again.
+    that solve them. The new photos' equations get ``color_precision |colour - fitted colour|^2`` added, so earlier
+    photos are not needed again.
     """
     rows = rows_in_view(groups.features, batch_photos.cameras)
     in_view, photos = select_groups(groups, rows), batch_photos.photos(2)
@@ -162,10 +162,8 @@ def fit_batch_colors(
 def groups_in_view(features: FeatureGaussians, cameras: Cameras, reach: float = REACH) -> np.ndarray:
     """Return a mask ``[v,g]`` of groups that may be visible in each view, by position and size.
 
-    ``reach``: how far a group shows, in standard deviations of all its axes together.
-
-    The only step that goes through all groups: the time of those after it depends on what the views
-    see.
+    ``reach``: how far a group is visible, in standard deviations of all its axes together. This is the only step that
+    goes through all groups; later steps take time only for what the views see.
     """
     means = features.means.astype(np.float64)
     radii = reach * np.sqrt(np.trace(features.covars, axis1=1, axis2=2, dtype=np.float64))

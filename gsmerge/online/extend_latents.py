@@ -52,8 +52,8 @@ SAMPLE_STEP = 8  # pixels between the samples of a view along each axis
 class StateContext(NetworkContext):
     """The networks' inputs for groups of a batch and of a state; ``cameras`` are those of all views.
 
-    Rows in the place of members name the parts that a Feature Gaussian was pooled from: Gaussians of the batch, or
-    groups. The members of earlier batches are gone.
+    Each Feature Gaussian lists, in place of its members, the rows of the parts it was pooled from: Gaussians of the
+    batch, or groups. Members of earlier batches are not stored.
     """
 
     samples: ViewSamples  # Of all views

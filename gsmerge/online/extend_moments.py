@@ -69,8 +69,8 @@ MOMENTS = StateKind(REACH, _encode, _decode, _first, _join)
 def find_partners(features: FeatureGaussians, new: FeatureGaussians, options: MatchOptions) -> np.ndarray:
     """Return, for each of n new groups, the state's group with the same surface, ``[n]`` int64; -1 for none.
 
-    No group gets two: of several in a cluster by boxes, the first. Matched as across the views of one batch, the state
-    being one view and the batch another.
+    Matching is that across the views of one batch, with the state as one view and the batch as another. A group gets
+    one partner at most: the first of several in a cluster.
     """
     both = FeatureGaussians.concat([features, new])
     sides = (np.arange(len(both)) >= len(features)).astype(np.int64)

@@ -100,7 +100,7 @@ def sample_views(members: Members, cameras: Cameras, shape: tuple[int, int]) -> 
 
 @dataclass(frozen=True, eq=False)
 class Learned:
-    """What the networks made of g groups, and what they need to process them further."""
+    """Output of the networks for g groups, with the views and numbers of members that later batches need."""
 
     refined: FeatureGaussians  # The groups after the refiner, without members: what the heads read
     views: np.ndarray  # [g] int64, the view that each group's frame belongs to
@@ -152,8 +152,8 @@ class StateNetworks:
 class OnlineState(StoredScene):
     """State to which new views are added; its size grows with the scene, not with the number of views.
 
-    The frame is that of the first batch; the cameras are those of all views so far, at the size of
-    the first batch's; ``about`` also has the numbers of every batch.
+    The frame is that of the first batch. The cameras are those of all views so far, at the first batch's size.
+    ``about`` also holds the report of every batch.
     """
 
     groups: GroupSet
@@ -238,7 +238,7 @@ def moments_of(gaussians: Gaussians) -> dict[str, np.ndarray]:
 
 
 def with_child_rows(features: FeatureGaussians, parents: np.ndarray) -> FeatureGaussians:
-    """Number the members of Feature Gaussians as the rows 0, 1, ... of their children; ``parents`` rise."""
+    """Return Feature Gaussians whose members are rows 0, 1, ... of their children; ``parents`` rise."""
     starts = np.concatenate([[0], np.bincount(parents, minlength=len(features)).cumsum()])
     return replace(features, starts=starts, members=np.arange(len(parents)))
 
@@ -303,7 +303,7 @@ def with_fitted_colors(groups: GroupSet) -> GroupSet:
 def to_encoded(state: OnlineState, *, fitted_colors: bool = True) -> Encoded:
     """Convert a state to an encoded scene, in fitted colours or in those of the input files.
 
-    With networks, the colours are those of the heads.
+    With networks, decoder heads set the colours instead.
     """
     groups, heads, max_k = state.groups, None, state.settings.max_k
     if fitted_colors and state.networks is None:
