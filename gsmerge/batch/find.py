@@ -68,11 +68,10 @@ def find_jobs(
 ) -> list[Job]:
     """List all scenes, each once, with the names of their results in the output folder.
 
-    ``given`` are folders, which are searched except for ``out``; patterns; ``.ply`` files; text files with one of
-    these per line. ``own`` has the real paths of former results, which are no scenes. ``unreadable`` receives the
-    errors of folders inside the given ones that cannot be read. SceneError if something does not exist, has no scene
-    or, without ``unreadable``, cannot be read; UsageError if two scenes would be written to one file, or one over
-    another.
+    ``given`` are folders (``out`` is not searched), patterns, ``.ply`` files, and text files with one of these per
+    line. ``own`` has the real paths of former results, which are not scenes. ``unreadable`` collects the errors of
+    sub-folders that cannot be read; without it they are raised. SceneError if something does not exist or has no scene;
+    UsageError if two scenes would be written to one file, or one over another.
     """
     jobs: list[Job] = []
     owners: dict[str, str] = {}

@@ -100,10 +100,10 @@ def run_batch(
 ) -> Generator[dict[str, Any], None, None]:
     """Compact scenes one by one or in parallel, skipping finished ones; yield a record for each.
 
-    Each is recorded in ``folder/batch.jsonl`` before its record is yielded, in any order, so that a run that ends
-    at any moment can be continued. Runs with the same settings may share a folder. ``index``, the folder's records,
-    and ``schedule`` are made if they are not given. SceneError if the folder cannot be written, UsageError if a
-    batch with other settings uses it, or the engine is not installed.
+    Each record is appended to ``folder/batch.jsonl`` before it is yielded, in any order, so that an interrupted run can
+    be continued. Runs with the same settings may share a folder. ``index``, the folder's records, and ``schedule`` are
+    made if they are not given. SceneError if the folder cannot be written, UsageError if a batch with other settings
+    uses it, or the engine is not installed.
     """
     schedule = schedule or make_schedule(jobs, options)
     check_folder(folder)

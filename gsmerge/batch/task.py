@@ -67,7 +67,7 @@ class BatchContext:
 def run_task(task: Task, context: BatchContext, new_records: RecordIndex) -> dict[str, Any]:
     """Compact a scene, unless it is done, and return its record; ``new_records``: those since the run began.
 
-    A record that is not written has the ``status`` skipped, busy (another process has the scene), or stuck (records
+    The ``status`` of a record that is not written is skipped, busy (another process has the scene), or stuck (records
     cannot be written).
     """
     job = task.job
@@ -219,7 +219,7 @@ class BusyError(Exception):
 def scene_lock(folder: Path, output: str) -> Iterator[Path]:
     """Lock a result against other processes in the block; BusyError if it is locked, SceneError if locking fails.
 
-    Yields the file whose presence says that a batch has begun to write the result: a killed one leaves it.
+    Yields the path of a file that marks a result as begun; a killed process leaves it behind.
     """
     name = hashlib.sha256(output.encode(errors="surrogateescape")).hexdigest()[:32]
     with _lock(folder / f"{PREFIX}{name}.lock"):
