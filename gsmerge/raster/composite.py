@@ -71,9 +71,8 @@ def composite(plan: ViewPlan, colors: Array | None = None, background: ArrayLike
 def splat_adjoint(plan: ViewPlan, image: Array) -> Array:
     """Sum blending weight times ``image [h,w,c]`` over the pixels, for each Gaussian: ``[n,c]`` float32.
 
-    The transpose of :func:`composite` (without background) as a linear map from colours to images.
-    Four channels cost little more than one. Raises ValueError if the image has another size than
-    the view.
+    This is the transpose of :func:`composite` (without background) as a linear map from colours to images. Four
+    channels cost little more than one. Raises ValueError if the image has another size than the view.
     """
     if image.ndim != 3 or image.shape[:2] != (plan.height, plan.width):
         raise ValueError(f"image: expected shape {[plan.height, plan.width, 'c']}, got {list(image.shape)}")
@@ -148,7 +147,7 @@ def draw_views(
 ) -> Rendering:
     """Draw the plans of all views; ``shape`` is (views, height, width).
 
-    The views' numbers begin with ``first``.
+    View numbers start at ``first``.
     """
     images, alphas = np.empty((*shape, 3), np.float32), np.empty((*shape, 1), np.float32)
     depths = np.empty((*shape, 1), np.float32) if with_depths else None

@@ -132,8 +132,8 @@ def _no_zero(quats: Tensor) -> Tensor:
 def peak_weights(shape: Shape, camera: Camera, *, eps2d: float = EPS2D) -> tuple[Tensor, Tensor]:
     """Return each Gaussian's largest blending weight ``[n]`` in a view, and a mask ``[n]`` of Gaussians drawn there.
 
-    gsplat lists the Gaussians of every pixel, nearest first; their weights follow from its
-    footprints. That takes about 150 bytes for each of them.
+    gsplat lists the Gaussians of every pixel, nearest first; the weights follow from their footprints. Each listed pair
+    takes about 150 bytes.
     """
     means, quats, scales, opacities = (tensor.float() for tensor in shape)
     viewmat, K, width, height = camera
@@ -177,10 +177,9 @@ def render_cuda(
 ) -> Rendering:
     """Render CUDA tensors with gsplat; see :func:`gsmerge.render`. ``background [3]`` is checked already.
 
-    View by view: in one call of several views gsplat copies all harmonics for each of them, which
-    for 84 views of 14 million Gaussians of degree 4 would take 350 GB. Positions are taken relative
-    to the cameras' own centre in float64 first, so that scenes in geographic coordinates keep their
-    detail.
+    Views are drawn one by one: in one call for several views gsplat copies all harmonics for each, 350 GB for 84 views
+    of 14 million Gaussians of degree 4. Positions are first taken relative to the cameras' mean centre in float64, so
+    that scenes in geographic coordinates keep their detail.
     """
     check_range(near, far, EPS2D)
     viewmats = cameras.viewmats.double()

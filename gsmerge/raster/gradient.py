@@ -142,11 +142,10 @@ def color_gradients(
 ) -> ColorGradients:
     """Return the gradients of a loss through the spherical harmonics of a plan's Gaussians in its view.
 
-    ``grad_colors [m,3]`` are such as :attr:`Gradients.colors`. ``colors [m,3]`` float32 are the
-    colours themselves, where they are at hand; no gradient passes where they are cut at 0.
-    ``used``: an earlier answer of as many coefficients that nobody needs any more, whose memory is
-    written again if it is large enough: new memory costs a quarter of the time, and where pages are
-    small several times all of it. The gradient of the eye is minus the sum of those of the means.
+    ``grad_colors [m,3]`` are such as :attr:`Gradients.colors`. ``colors [m,3]`` float32 are the colours, if computed
+    already; no gradient passes where they are clipped at 0. ``used``: a result with as many coefficients that is no
+    longer needed, whose memory is reused if large enough, since new memory costs a quarter of the time or more. The
+    gradient of the eye is minus the sum of those of the means.
     """
     m, splats = len(plan.ids), plan.splats
     grad_colors = _expect("grad_colors", grad_colors, (m, 3))
