@@ -129,8 +129,8 @@ def merge_features(
 ) -> FeatureGaussians:
     """Correct c merged Feature Gaussians with the merger (paper section 4.4).
 
-    Cluster i was pooled from the rows ``order[cuts[i] : cuts[i + 1]]`` of the n Feature Gaussians ``parts``. The
-    paper's merger corrects the first of these rows instead; members and weights are the whole cluster's.
+    Cluster i was pooled from the rows ``order[cuts[i] : cuts[i + 1]]`` of the n Feature Gaussians ``parts``. In the
+    paper the merger corrects the first of these rows instead of the pooled one.
     """
     options = context.options
     if not options.merger:
@@ -200,9 +200,9 @@ def decode_gaussians(
 ) -> Gaussians:
     """Correct the children of Feature Gaussians with the decoder head for their number (paper section 4.3).
 
-    Those of one Feature Gaussian are next to each other; ``parents [n]`` are its rows, ascending. Three children take
-    three slots of the head for four. Five to eight are corrected in two halves, each like the children of a group of
-    its own; heads with absolute outputs know only one group, and leave them unchanged.
+    Children of one Feature Gaussian are adjacent; ``parents [n]`` are rows of ``features``, ascending. Three children
+    use three slots of the head for four. Five to eight are corrected in two halves, each as a group of its own; heads
+    with absolute outputs leave them unchanged.
     """
     return decode_with_group_features(children, parents, context.describe(features), context)
 

@@ -51,8 +51,8 @@ def move_features(
 ) -> FeatureGaussians:
     """Apply corrections ``[g,14]`` to Feature Gaussians; opacity depends only on its own column, not on the scales.
 
-    ``base`` has the Gaussian of each, ``frames [g,3,3]`` the axes of each group as columns, world. The tenth correction
-    is added to the logarithms of integrated optical depth and mass, the last to that of the mass alone.
+    ``base``: one Gaussian for each group; ``frames [g,3,3]``: axes of each group as columns, world. The tenth
+    correction is added to the logarithms of integrated optical depth and of mass, the last to that of mass alone.
     """
     names = ("means", "covars", "masses", "extinctions", "sh0")
     columns = {name: np.array(getattr(features, name), np.float32, order="C") for name in names}

@@ -46,7 +46,7 @@ def describe_features(
 ) -> GroupFeatures:
     """Compute the networks' inputs from Feature Gaussians, their views, numbers of members and statistics.
 
-    These are their ``views [g]``, ``num_members [g]`` and the agreement ``stats [g,7]`` of other views.
+    ``views [g]``: view of each Feature Gaussian; ``num_members [g]``; ``stats [g,7]``: agreement with other views.
     """
     bare = make_group_features(features, views, np.zeros((len(features), GROUP), np.float32), cameras)
     base, group = bare.base, np.empty((len(features), GROUP), np.float32)
@@ -103,7 +103,8 @@ def part_tokens(
 ) -> np.ndarray:
     """Make tokens that describe the Gaussians ``ids [n]`` relative to the groups ``owners [n]`` they belong to.
 
-    Returned are ``[n,columns]``; of the columns after the first PART ones, MEMBER describes members, others are zero.
+    Returns ``[n,columns]``: PART columns for every Gaussian, then MEMBER columns that only members fill; the rest is
+    zero.
     """
     g, out = group_features, np.zeros((len(ids), columns), np.float32)
     describe_parts(
