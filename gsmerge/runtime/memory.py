@@ -43,8 +43,8 @@ def machine_memory() -> int | None:
 def release_memory() -> None:
     """Return freed memory to the operating system.
 
-    glibc keeps what a thread has freed for that thread; between stages that each need a lot of it, in other
-    threads, this is a tenth of the peak. Does nothing on other systems.
+    glibc keeps memory that a thread has freed for that thread; across stages that use different threads this adds up to
+    a tenth of the peak. Does nothing on other systems.
     """
     if sys.platform == "linux":
         with suppress(OSError, AttributeError):
@@ -54,8 +54,8 @@ def release_memory() -> None:
 def make_array(shape: tuple[int, ...], dtype: type[np.generic]) -> np.ndarray:
     """Make an uninitialised array; a large one is mapped from an unnamed temporary file, if there is room.
 
-    What is in a file takes memory only where it is in use, and after :func:`free_pages` not even there. The file is in
-    the system's folder for temporary ones (``TMPDIR``), and goes with the array.
+    A mapped array takes memory only while it is in use, and none after :func:`free_pages`. The file is in the system's
+    temporary folder (``TMPDIR``), and goes with the array.
     """
     size = prod(shape) * np.dtype(dtype).itemsize
     if size >= MAPPED_BYTES and hasattr(os, "posix_fallocate"):

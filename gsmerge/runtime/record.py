@@ -55,7 +55,7 @@ def current_record() -> Record:
 def record_part(*, silent: bool = False, title: str | None = None) -> Iterator[Record]:
     """Start a separate record for a part of the current run; ``silent``: do not report its progress.
 
-    With a ``title`` all its stages are steps of one, which has it as its name.
+    With a ``title``, all its stages are reported as steps of one stage of that name.
     """
     outer = _current.get()
     progress = None if silent or outer is None else outer.progress

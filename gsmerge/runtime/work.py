@@ -63,7 +63,7 @@ class Cluster:
     def needs(self, threads: int, memory: int) -> dict[str, float]:
         """Return the resources that a task asks for, at most those of the largest node; UsageError without processors.
 
-        A task that needs more waits forever.
+        Ray would let a task that asks for more wait forever.
         """
         nodes = [node["Resources"] for node in self.ray.nodes() if node["Alive"] and node["Resources"].get("CPU")]
         if not nodes:
@@ -93,7 +93,7 @@ class Work:
     ) -> Iterator[tuple[T, Record]]:
         """Make ``count`` calls of a picklable function; yield (result, record) of each, in order.
 
-        On a cluster as many are made at once as there are processors, here one after the other.
+        A cluster makes as many at once as it has processors; this process makes one after the other.
         """
         if self.cluster is not None:
             yield from self._run_there(self.cluster, title, function, count, calls)
