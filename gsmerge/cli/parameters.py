@@ -163,8 +163,8 @@ def option(
 ) -> Parameter:  # fmt: skip
     """Declare an option of a command; ``kind`` bool makes a switch, a tuple lists the possible values.
 
-    ``flags`` are needed where they are not made of the name. ``wording`` is the default in help, where the library
-    decides it; ``more`` goes to Typer.
+    ``flags``: needed if they cannot be derived from the name. ``wording``: the default in words, if the library decides
+    it; ``more`` goes to Typer.
     """
     flags = flags or (f"--{name.replace('_', '-')}",)
     if isinstance(kind, tuple):
