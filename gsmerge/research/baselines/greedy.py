@@ -135,9 +135,9 @@ def neighbor_pairs(cloud: Cloud) -> tuple[Ints, Ints, Floats]:
 def cheapest_disjoint(left: Ints, right: Ints, costs: Floats, limit: int) -> Ints:
     """Choose at most ``limit`` disjoint pairs greedily, by rising cost ``[m]``.
 
-    A pair that is the cheapest of both of its members is taken sooner or later, whatever comes before it; so all of
-    those are taken at once, and again among the rest. Of equal costs the first pair counts as cheaper. The result is
-    indices of pairs, by rising cost.
+    A pair that is the cheapest of both its members is taken whatever comes before it; so all such pairs are taken at
+    once, and again among the rest. Of equal costs the first pair counts as cheaper. Returns indices of pairs, by rising
+    cost.
     """
     order = np.argsort(costs, kind="stable")
     left, right, ranks = left[order], right[order], np.arange(len(order))
@@ -173,8 +173,8 @@ def merge_pairs(cloud: Cloud, left: Ints, right: Ints) -> Cloud:
 def reduce_to(cloud: Cloud, count: int) -> Cloud:
     """Merge pairs in rounds until at most ``count`` Gaussians are left.
 
-    A round takes every pair that it can. Fewer at a time keep cheap regions growing while the rest stays unmerged, and
-    render worse: on a real capture by 0.6 dB at a third of the Gaussians a round, by 1.6 dB at a sixth.
+    A round takes as many pairs as possible. Taking fewer lets cheap regions grow while the rest stays unmerged, and
+    renders worse: on a real capture by 0.6 dB at a third of the Gaussians a round, by 1.6 dB at a sixth.
     """
     while len(cloud) > max(count, 1):
         left, right, costs = neighbor_pairs(cloud)

@@ -81,7 +81,7 @@ def fuse(gaussians: Gaussians, keys: np.ndarray) -> Gaussians:
 
 
 def run(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """Merge the Gaussians of voxels, as small as ``count`` results allow."""
+    """Merge the Gaussians of each voxel into one, with the smallest voxels that leave at most ``count``."""
     gaussians = own_gaussians(prepared.scene)
     with stage("reduce"):
         means = gaussians.means.astype(np.float64)

@@ -311,7 +311,7 @@ def make_lines(
 def keep_common(scenes: Mapping[K, set[str]], min_share: float) -> dict[K, set[str]]:
     """Restrict every key to the scenes that all keys share, so that means compare; without any, keep each key's own.
 
-    Those that have too few of the scenes are left out first, so that a few failed runs do not remove the others.
+    Keys that have too few of the scenes are left out first, so that a few failed runs do not remove the others.
     """
     fewest = min_share * len(set().union(*scenes.values()))
     kept = {name: own for name, own in scenes.items() if len(own) >= fewest}

@@ -285,7 +285,7 @@ def _load(
 def choose_views(scene: Scene, held_out: HeldOutViews | None, count: int | None) -> tuple[Scene, Views | None]:
     """Choose ``count`` evenly spread views of the scene, and the held-out views nearest to the middle between these.
 
-    Without ``count`` all views are kept, and where their places along the trajectory are not known all held-out views.
+    Without ``count`` all views are kept. All held-out views are kept if their order along the trajectory is unknown.
     """
     if count is None or count >= len(scene):
         return scene, held_out
@@ -320,8 +320,8 @@ def keep_pictures(
 ) -> tuple[list[Path], tuple[str, ...]]:
     """Write renders and error maps of a few views, and the photos; return the paths of the first two, and view names.
 
-    The views are the held-out ones, or the scene's without any; ``scene`` and ``held_out`` have all of them, so that
-    all runs of a scene have pictures of the same ones.
+    The views are held-out ones or, without any, the scene's. ``scene`` and ``held_out`` have all views, so that all
+    runs of a scene have pictures of the same ones.
     """
     views = scene if held_out is None else held_out
     photos, names = views.images, views.names

@@ -231,7 +231,7 @@ def cloth(rng: np.random.Generator, size: int) -> Picture:
 
 
 def carpet(rng: np.random.Generator, size: int) -> Picture:
-    """Draw pile, or an ornament of a few colours."""
+    """Draw a carpet: plain pile, or an ornament of a few colours."""
     base = color(rng, strength=(0.1, 0.7), light=(0.2, 0.6))
     out = mix(*shades(rng, base, 0.4), noise(rng, size, first=32, fade=0.95))
     if rng.random() < 0.5:

@@ -240,9 +240,9 @@ GEOMETRY, OPACITY = 0.75, 0.25  # weights of the two terms of the diversificatio
 def diversity_loss(gaussians: Gaussians, parents: Tensor, sizes: Tensor, unit: float | None = None) -> Tensor:
     """Penalise siblings that overlap too much or too little, or differ in opacity (paper supplement D).
 
-    ``parents [n]`` are those of n children, ascending. Pairs are weighted by their volumes, in the paper in the world's
-    units; in a scene's ``unit`` of length, those of a million small Gaussians leave nothing of the loss. None: in the
-    ``sizes [n]`` of their groups, which start near 1, and without a gradient: small siblings are no goal.
+    ``parents [n]`` of the children are ascending. Pairs are weighted by their volumes: in ``unit``, a length of the
+    scene, or, if None, in the ``sizes [n]`` of their groups, without a gradient, since small siblings are no goal. In
+    the paper's world units the weights of a million small Gaussians leave nothing of the loss.
     """
     one, other = sibling_pairs(parents)
     if len(one) == 0:

@@ -265,8 +265,8 @@ class Prediction:
 def predict(crop: Crop, networks: Networks, options: TrainOptions, seed: int) -> Prediction:
     """Run a crop through all networks with gradients; each stage reads the results of the stages before.
 
-    Analytic children of K > 1 are pooled again from the members, so earlier stages reach those of residual heads
-    through what the heads read alone.
+    Analytic children of K > 1 are pooled again from the members, so gradients reach earlier stages only through what
+    residual heads read.
     """
     example = crop.example
     context = TrainingContext(networks, example.members, example.cameras, seed)

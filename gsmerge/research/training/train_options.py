@@ -121,7 +121,7 @@ class TrainOptions(Settings):
 
     @property
     def example_views(self) -> tuple[int, ...]:
-        """Return the numbers of views of the examples made of each scene; 0: all views."""
+        """Numbers of views of the examples made of each scene; 0: all views."""
         return (0,) if self.random_views else self.views
 
     def match_options(self) -> MatchOptions:

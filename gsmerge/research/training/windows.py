@@ -77,7 +77,7 @@ class Window:
 
 
 def sample_crop(example: Example, levels: tuple[int, ...], count: int, inner: float, rng: np.random.Generator) -> Crop:
-    """Sample a random Feature Gaussian and the ``count`` nearest to it; the nearest share ``inner`` is scored."""
+    """Sample the ``count`` Feature Gaussians nearest to a random one; the nearest share ``inner`` of them is scored."""
     k, means = levels[int(rng.integers(len(levels)))], example.features.means
     order = np.argsort(np.square(means - means[rng.integers(len(means))]).sum(1), kind="stable")[:count]
     near, close = np.zeros((2, len(means)), bool)
@@ -91,9 +91,8 @@ def sample_window(
 ) -> Window:
     """Sample a window around a random pixel that the example's views cover.
 
-    One of the ``levels`` is drawn as K. The window is ``side`` pixels wide, less where the photo is, and is halved
-    while more than ``most`` Feature Gaussians reach into it. ``novel`` is the share of windows in novel views, if there
-    are any.
+    K is drawn from ``levels``. The window is ``side`` pixels wide, or as wide as the photo, and is halved while more
+    than ``most`` Feature Gaussians reach into it. ``novel`` is the share of windows in novel views, if there are any.
     """
     k = levels[int(rng.integers(len(levels)))]
     own = len(example.cameras)
