@@ -42,8 +42,8 @@ def method_names() -> tuple[str, ...]:
 class CompactOptions(Settings):
     """Every setting of :func:`gsmerge.compact`, stage by stage.
 
-    A ValueError besides: a PSNR is asked for of a crop, or without the sky; another method than ``"gsmerge"`` is asked
-    to find the number of Gaussians; a checkpoint is required and none is named.
+    Raises ValueError also for settings that exclude each other: a PSNR target with a crop or without the sky, a method
+    other than ``"gsmerge"`` that is to find the number of Gaussians, or a required checkpoint that is not named.
 
     Example:
         >>> options = gsmerge.CompactOptions().with_settings({"k": 2, "effort": "draft"})

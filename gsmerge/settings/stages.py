@@ -225,7 +225,7 @@ class Engine(Settings):
 
 @dataclass(frozen=True)
 class BlockOptions(Settings):
-    """Settings of scenes with many views."""
+    """Settings for compacting scenes with many views in blocks."""
 
     blocks: int | Literal["auto", "none"] = setting("auto", "Blocks of views that are compacted one by one, for scenes "
         "of hundreds of views; auto: from 20 million Gaussians on, one for every 8 million.",
