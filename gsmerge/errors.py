@@ -113,7 +113,7 @@ def is_out_of_memory(error: BaseException | None) -> bool:
 def file_problem(error: BaseException, unnamed: str = "a file") -> str | None:
     """Describe an error of the file system in one line; None for another error.
 
-    ``unnamed`` says what was written where the error does not name it.
+    ``unnamed``: what to call the file if the error does not name it.
     """
     if not isinstance(error, OSError) or error.strerror is None:
         return None

@@ -204,7 +204,7 @@ def rgb_to_sh0(rgb: np.ndarray) -> np.ndarray:
 def robust_weights(errors: np.ndarray, doubt: float, least: float, sizes: np.ndarray | float = 1.0) -> np.ndarray:
     """Return Cauchy's weights ``[n]`` for reweighted least squares: small where errors exceed their median by far.
 
-    The weight is halved at ``doubt`` medians and ``least`` more, and divided by the square of ``sizes``.
+    The weights are 1 / (sizes^2 (1 + (errors / (doubt * median + least))^2)).
     """
     return np.asarray(1 / (sizes**2 * (1 + (errors / (doubt * np.median(errors) + least)) ** 2)))
 

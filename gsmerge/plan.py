@@ -112,7 +112,7 @@ class Plan:
 def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoint | None = None) -> Plan:
     """Decide everything that the options leave open; raise UsageError if scene or checkpoint cannot do it.
 
-    ``checkpoint``: in the place of the one that the options name.
+    ``checkpoint``: networks to use instead of those that the options name.
     """
     given, scene, effort = prepared.given, prepared.scene, EFFORTS[options.effort]
     _check_photos(given, options)
@@ -261,9 +261,8 @@ def _check_photos(scene: Scene, options: CompactOptions) -> None:
 def choose_networks(options: CompactOptions, *, photos: bool, aligned: bool = True) -> str:
     """Return the name of the checkpoint to load: as asked, or the shipped one where it improves results.
 
-    That is where no fit follows, or a short one of an effort that has the time for both, on scenes
-    with one Gaussian per pixel (``aligned``), which the shipped networks learnt from
-    (docs/laboratory/networks.md). ``photos``: whether there are any to fit to.
+    The shipped networks improve scenes with one Gaussian per pixel (``aligned``) if no fit follows, or a short one
+    under an effort that has time for both (docs/laboratory/networks.md). ``photos``: whether there are any to fit to.
     """
     if options.checkpoint != "auto":
         return options.checkpoint

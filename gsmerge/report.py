@@ -209,7 +209,7 @@ def summary_line(document: Mapping[str, Any]) -> str:
 
 
 def seconds_document(seconds: Mapping[str, float]) -> dict[str, Any]:
-    """Return wall time by stage and in all, as every report has it."""
+    """Return the wall time by stage and in total, in the form that all reports share."""
     total = round(sum(seconds.values()), 4)
     return {"seconds": {name: round(value, 4) for name, value in seconds.items()}, "total_seconds": total}
 

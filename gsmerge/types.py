@@ -200,7 +200,7 @@ class Cameras:
 
 @dataclass(frozen=True, eq=False)
 class LargePhotos:
-    """Photos of V views with more pixels than the scene's own, read one at a time; poses are those of its cameras."""
+    """Photos larger than the scene's views, read one at a time; their poses are those of the scene's cameras."""
 
     Ks: np.ndarray  # [v,3,3] intrinsics at their size
     width: int
@@ -308,7 +308,7 @@ class Scene:
 
     @cached_property
     def valid(self) -> np.ndarray:
-        """``[v,h,w]`` bool of an aligned scene: pixels that have a finite Gaussian."""
+        """Mask ``[v,h,w]`` of an aligned scene's pixels that have a finite Gaussian."""
         assert self.pixel_ids is not None
         return np.asarray(self.pixel_ids >= 0).reshape(len(self.cameras), self.cameras.height, self.cameras.width)
 
@@ -319,17 +319,17 @@ class Scene:
 
     @property
     def num_gaussians(self) -> int:
-        """Number of Gaussians in the file, to which budgets and ratios refer."""
+        """Number of Gaussians in the file; budgets and ratios refer to it."""
         return len(self.gaussians) - self.num_missing
 
     @property
     def stored(self) -> np.ndarray:
-        """``[v,h,w]`` bool of an aligned scene: pixels whose Gaussian is a finite one of the file."""
+        """Mask ``[v,h,w]`` of an aligned scene's pixels whose Gaussian is finite and comes from the file."""
         return self.valid if self.missing is None else self.valid & ~self.missing
 
     @property
     def file_gaussians(self) -> Gaussians:
-        """Gaussians of the file, without those that fill it up."""
+        """Gaussians that come from the file, without those added for missing pixels."""
         return self.gaussians if self.missing is None else self.gaussians[~self.missing.reshape(-1)]
 
     @property
