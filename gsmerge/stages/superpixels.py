@@ -98,8 +98,8 @@ def superpixels(
         rectangles: Of ``rdseg``: rectangles per superpixel that it begins with, at least 1. More take longer.
         early_sweeps: Of ``rdseg``: sweeps over border pixels before rectangles are merged.
         compactness: Weight of squared pixels against squared colours, in [0, 1] (not for the BASS methods).
-        adapt: Of ``bass-adaptive`` only: the share that is left of the number that it comes to from ``count``, which
-            is a quarter to four times as many, at most one per pixel; 1 keeps it. None: exactly ``count``.
+        adapt: Of ``bass-adaptive`` only, which changes ``count`` by a factor of a quarter to four (at most one per
+            pixel): share of the changed number to return, 1 for all. None: exactly ``count``.
 
     Returns:
         ``[h,w]`` int32, dense from 0, a tensor for a tensor; the same on every run.

@@ -207,10 +207,10 @@ def _matrices(path: Path, data: Mapping[str, Any], key: str, side: int) -> dict[
 def read_long_lrm(source: CameraSource) -> StoredCameras:
     """Read the cameras of a dataset file: ``frames`` of ``fx fy cx cy w h`` and ``w2c``.
 
-    Next to its Gaussians (or copied next to the dataset file) Long-LRM writes which frames it took
-    (``input_frame_idx.txt``) and how the Gaussians' world lies in the cameras': X = scene_scale (pos_avg_inv
-    X_cameras); some versions write the frames alone, from which the rest follows. The cameras are moved into the
-    Gaussians' world. SceneError if an entry is missing or no number, or a frame does not exist.
+    Next to its Gaussians (or copied next to the dataset file) Long-LRM writes which frames it took, in
+    ``input_frame_idx.txt``, and how the cameras' world maps to the Gaussians': X = scene_scale (pos_avg_inv X_cameras).
+    Some versions write the frames alone, from which the rest follows. The cameras are moved into the Gaussians' world.
+    SceneError if an entry is missing or no number, or a frame does not exist.
     """
     frames, path, folder = [], source.path, source.folder
     for i, frame in enumerate(source.json["frames"]):
