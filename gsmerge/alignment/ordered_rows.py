@@ -87,7 +87,7 @@ class ProjectedRows:
 
 
 def read_view_major(rows: ProjectedRows) -> Layout | None:
-    """Find the pixel of every row in a file that stores view after view; None if the rows of each view cannot be found."""
+    """Find the pixel of every row in a file that stores view after view; None if the views' rows cannot be found."""
     blocks = _find_blocks(rows)
     if blocks is None:
         return None
