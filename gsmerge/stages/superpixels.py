@@ -133,7 +133,7 @@ def superpixels(
 
 
 def grid_labels(height: int, width: int, count: int) -> np.ndarray:
-    """Return labels ``[h,w]`` int32 of ``count`` rectangles, in rows whose numbers of rectangles differ by at most one."""
+    """Return labels ``[h,w]`` int32 of ``count`` rectangles, in rows of equally many rectangles, up to one."""
     min_rows = -(-count // width)  # rows of blocks that can hold them all
     lines = min(height, count, max(min_rows, round((count * height / width) ** 0.5)))
     first = np.arange(lines + 1) * count // lines  # first label of each row of blocks
