@@ -61,7 +61,7 @@ class TargetError(GsmergeError):
 
 
 class BatchError(GsmergeError):
-    """Some scenes of a batch failed."""
+    """At least one scene of a batch failed."""
 
     exit_code = 5
 
@@ -88,7 +88,7 @@ def is_torch_missing(error: BaseException) -> bool:
 
 @contextmanager
 def refuse_without_torch() -> Iterator[None]:
-    """Raise a UsageError that says how to install torch where a block does not find it."""
+    """Raise UsageError, with the command that installs torch, if the block fails because torch is missing."""
     try:
         yield
     except ModuleNotFoundError as error:
@@ -113,7 +113,7 @@ def is_out_of_memory(error: BaseException | None) -> bool:
 def file_problem(error: BaseException, unnamed: str = "a file") -> str | None:
     """Describe an error of the file system in one line; None for another error.
 
-    ``unnamed`` says what was written where the error does not name it.
+    ``unnamed``: what to call the file if the error does not name it.
     """
     if not isinstance(error, OSError) or error.strerror is None:
         return None
@@ -124,7 +124,7 @@ def file_problem(error: BaseException, unnamed: str = "a file") -> str | None:
 
 
 def error_line(error: BaseException, unnamed: str = "a file") -> str:
-    """Describe an error in one line; ``unnamed`` as of :func:`file_problem`."""
+    """Describe an error in one line; ``unnamed`` is used as in :func:`file_problem`."""
     if is_out_of_memory(error):
         return OUT_OF_MEMORY
     if is_opencv_damaged(error):

@@ -26,7 +26,7 @@ ARCHIVES = (".sog", ".npz")
 
 @dataclass(frozen=True)
 class FileCheck:
-    """What a file holds, and what is wrong with it."""
+    """Content of a file and the problems found in it."""
 
     path: str
     # "Gaussians", "cameras", "networks", "encoded scene" or "state"; "" where it cannot be read

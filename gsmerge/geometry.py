@@ -110,7 +110,7 @@ def motion_matrices(vectors: np.ndarray) -> np.ndarray:
 
 
 def motion_vectors(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Return world motions ``[v,6]`` from viewmats to others: ``end = start @ motion_matrices(...)``."""
+    """Return the rigid motions ``[v,6]`` between viewmats: ``end = start @ motion_matrices(...)``."""
     motions = matmul(invert(start), end)
     quats = rotmat_to_quat(motions[:, :3, :3])
     quats *= np.where(quats[:, :1] < 0, -1, 1)  # the angle is at most half a turn
@@ -120,7 +120,7 @@ def motion_vectors(start: np.ndarray, end: np.ndarray) -> np.ndarray:
 
 
 def without_common_motion(start: np.ndarray, end: np.ndarray, middle: Callable[..., np.ndarray]) -> np.ndarray:
-    """Return viewmats ``end [v,4,4]`` less the middle (mean, median) of all motions since ``start``."""
+    """Return viewmats ``end [v,4,4]`` with the common part (mean, median) of all motions since ``start`` taken out."""
     common = middle(motion_vectors(start, end), axis=0)
     return matmul(end, invert(motion_matrices(common[None])))
 
@@ -131,7 +131,7 @@ def camera_centres(viewmats: np.ndarray) -> np.ndarray:
 
 
 def middle_depth(means: np.ndarray, camera: Cameras) -> float:
-    """Measure the median depth of the points ``[n,3]`` that one camera has in its picture; 1 without any."""
+    """Measure the median depth of the points ``[n,3]`` in one camera's picture; 1 without any."""
     points = means[:: max(1, len(means) // DEPTH_SAMPLE)]
     (pixels,), (depths,) = project(points, camera)
     inside = (depths > 0) & ((pixels >= 0) & (pixels <= (camera.width, camera.height))).all(1)
@@ -141,7 +141,7 @@ def middle_depth(means: np.ndarray, camera: Cameras) -> float:
 def step_outside(
     viewmat: np.ndarray, depth: float, back: float, azimuth: float = 0.0, elevation: float = 0.0
 ) -> np.ndarray:
-    """Return the viewmat ``[4,4]`` float64 of a camera that circles about what it sees and steps back from it.
+    """Return the viewmat ``[4,4]`` float64 of a camera that turns about the point in front of it and steps back.
 
     It keeps looking at the point ``depth`` in front of it, world units. ``azimuth`` moves it to the right and
     ``elevation`` upwards, in degrees; ``back`` is the step away from the point as a share of ``depth``.
@@ -156,7 +156,7 @@ def step_outside(
 
 
 def pose_changes(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Measure how far cameras moved between viewmats ``[v,4,4]``: ``[v]`` degrees, and distances of the centres."""
+    """Measure how far cameras moved between viewmats ``[v,4,4]``: degrees ``[v]``, distances of centres ``[v]``."""
     chords = (np.linalg.norm(end[:, :3, :3] - start[:, :3, :3], axis=(1, 2)) / np.sqrt(8)).clip(0, 1)
     distances = _lengths(camera_centres(end) - camera_centres(start))[:, 0]
     return np.degrees(2 * arctan2(chords, np.sqrt((1 - chords) * (1 + chords)))), distances
@@ -167,7 +167,7 @@ def _lengths(vectors: np.ndarray) -> np.ndarray:
 
 
 def lower_median(values: np.ndarray) -> np.ndarray:
-    """Return the median of each column of ``[n,...]`` rows, n >= 1; of an even number, the lower middle value."""
+    """Return the median of each column of ``[n,...]`` rows, n >= 1; the lower middle value if n is even."""
     middle = (len(values) - 1) // 2
     return np.partition(values, middle, axis=0)[middle]
 
@@ -179,7 +179,7 @@ def correlation(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def morton_codes(points: np.ndarray) -> np.ndarray:
-    """Return the places ``[n]`` int64 of points ``[n,3]`` along Morton's space-filling curve: interleaved bits."""
+    """Return Morton codes ``[n]`` int64 of points ``[n,3]``: interleaved bits, an order along a space-filling curve."""
     codes = np.zeros(len(points), np.int64)
     if len(points) == 0:
         return codes
@@ -204,7 +204,7 @@ def rgb_to_sh0(rgb: np.ndarray) -> np.ndarray:
 def robust_weights(errors: np.ndarray, doubt: float, least: float, sizes: np.ndarray | float = 1.0) -> np.ndarray:
     """Return Cauchy's weights ``[n]`` for reweighted least squares: small where errors exceed their median by far.
 
-    The weight is halved at ``doubt`` medians and ``least`` more, and divided by the square of ``sizes``.
+    The weights are 1 / (sizes^2 (1 + (errors / (doubt * median + least))^2)).
     """
     return np.asarray(1 / (sizes**2 * (1 + (errors / (doubt * np.median(errors) + least)) ** 2)))
 

@@ -22,7 +22,7 @@ _BYTES = 255.0  # largest value of an image of bytes
 
 
 def depth_anything_3(prediction: Any, *, sh_degree: int = 0) -> dict[str, Any]:
-    """Take all Gaussians, one per pixel, of a ``Prediction`` of Depth Anything 3, made with ``infer_gs=True``.
+    """Convert a ``Prediction`` of Depth Anything 3 with ``infer_gs=True``: all Gaussians, one per pixel, and its views.
 
     Its files lack those at borders and far away. The nested models' poses are brought to the scale of the Gaussians.
 
@@ -54,7 +54,7 @@ def depth_anything_3(prediction: Any, *, sh_degree: int = 0) -> dict[str, Any]:
 
 
 def anysplat(gaussians: Any, poses: Mapping[str, Array], images: Array, *, sh_degree: int = 0) -> dict[str, Any]:
-    """Take what AnySplat's ``model.inference`` returns: Gaussians of voxels, which belong to no pixels, and cameras.
+    """Convert what AnySplat's ``model.inference`` returns: Gaussians of voxels, which belong to no pixels, and cameras.
 
     Its files have no cameras.
 
@@ -78,7 +78,7 @@ def anysplat(gaussians: Any, poses: Mapping[str, Array], images: Array, *, sh_de
 
 
 def depthsplat(output: Any, context: Mapping[str, Array], *, sh_degree: int = 0) -> dict[str, Any]:
-    """Take what DepthSplat's encoder returns, one Gaussian per pixel; MVSplat and pixelSplat (with one) have the same.
+    """Convert what DepthSplat's encoder returns, one Gaussian per pixel; MVSplat and pixelSplat (with one) are alike.
 
     Its files lack the pixels at borders. Scales and rotations come from the covariances, because the rotations it
     keeps beside them are the cameras'.

@@ -22,7 +22,7 @@ ROWS_PER_TASK = 4096
 
 @dataclass(frozen=True)
 class Members:
-    """Gaussians of a scene as contiguous float32 arrays for the kernels."""
+    """Input Gaussians as contiguous float32 arrays for the kernels, with their footprints and pixels."""
 
     means: np.ndarray  # [n,3]
     quats: np.ndarray  # [n,4] wxyz
@@ -41,7 +41,7 @@ def _array(values: np.ndarray) -> np.ndarray:
 
 
 def scene_members(scene: Scene) -> Members:
-    """Return the members of a canonical aligned scene, with pixel footprints in their own views."""
+    """Return the Gaussians of a canonical aligned scene as members, with pixel footprints in their own views."""
     g, cameras = scene.gaussians, scene.cameras
     means = _array(g.means)
     footprints = np.empty(len(g), np.float32)
@@ -58,7 +58,7 @@ def scene_members(scene: Scene) -> Members:
 
 
 def unaligned_members(scene: Scene, pixels: np.ndarray) -> Members:
-    """Return the members of an unaligned scene by pixel ``[n]`` int64; without one, the nearest camera counts."""
+    """Return the Gaussians of an unaligned scene as members, given their pixels ``[n]`` int64 (-1: none)."""
     means, cameras = _array(scene.gaussians.means), scene.cameras
     focals = np.sqrt(np.abs(cameras.Ks[:, 0, 0] * cameras.Ks[:, 1, 1])).astype(np.float64)
     views = pixels // scene.pixels_per_view
@@ -74,7 +74,7 @@ def unaligned_members(scene: Scene, pixels: np.ndarray) -> Members:
 
 
 def gaussian_members(g: Gaussians, footprints: np.ndarray, pixels: np.ndarray | None = None) -> Members:
-    """Return Gaussians as members with given footprints and pixels."""
+    """Return Gaussians as members with the given footprints ``[n]`` and pixels ``[n]``."""
     return Members(**{name: _array(column) for name, column in vars(g).items()}, footprints=footprints, pixels=pixels)
 
 
@@ -96,7 +96,7 @@ class Moments:
 
 
 def pool_members(members: Members, starts: np.ndarray, ids: np.ndarray, rule: Rule = "depth") -> Moments:
-    """Pool every group of members into its moments: opacity weights, total covariance, winsorised members.
+    """Pool every group of members into moments, weighted by opacity.
 
     ``ids [m]`` int32 are rows of ``members``, ``starts [g+1]`` int64 point into them. ``rule``
     ``"depth"``: members' own covariances are added to the spread of their means, and their
@@ -138,7 +138,7 @@ def principal_axes(covars: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def to_gaussians(covars: np.ndarray, extinctions: np.ndarray, means: np.ndarray, sh: np.ndarray) -> Gaussians:
-    """Return Gaussians of given moments; opacity comes from the conserved optical depth over the disc."""
+    """Convert moments to Gaussians; the opacity spreads the conserved optical depth over the Gaussian's disc."""
     scales, quats = principal_axes(covars)
     opacities = 1 - exp(-extinctions / (scales[:, 1] * scales[:, 2]))
     return Gaussians(

@@ -16,20 +16,20 @@ from gsmerge.types import Decoded
 
 
 def build(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
-    """Build ``count`` fitted canonical Gaussians; None: as many as ``superpixels`` and K give."""
+    """Build and fit ``count`` canonical Gaussians; None: as many as ``superpixels`` and K give."""
     decoded = start(prepared, plan, count)
     return fit_scene(decoded, prepared.scene, prepared.photo_views, plan.fit, plan.seed, plan.backend)
 
 
 def start(prepared: Prepared, plan: Plan, count: int | None) -> Decoded:
-    """Build the canonical Gaussians that a fit starts with."""
+    """Build the canonical Gaussians that the fit starts from."""
     scene, decode = prepared.scene, plan.decode
     kept = keep_all(scene, count)
     return kept or decode_merged(merge_views(prepared, plan, count), scene, decode, grows=plan.fit.grows)
 
 
 def merge_views(prepared: Prepared, plan: Plan, count: int | None) -> MergedViews:
-    """Merge superpixels across views, the half of the pipeline that encoding and views in batches share."""
+    """Merge the superpixels of all views; compacting, encoding and adding views in batches share this part."""
     scene = prepared.scene
     segmentation = segment_scene(scene, plan.superpixels, count)
     members = assign(scene, segmentation.groups)

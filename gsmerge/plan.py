@@ -50,7 +50,7 @@ LONE_K = 4  # where all views have one camera: no other adds Gaussians of its ow
 
 @dataclass(frozen=True)
 class Effort:
-    """Meaning of an effort for the stages."""
+    """What an effort, such as "draft", means for the stages."""
 
     steps: int  # Steps of the full fit
     rectangles: float  # Rectangles per superpixel of `rdseg`
@@ -71,7 +71,7 @@ EFFORTS = {
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Decisions that are made before the first superpixel is cut."""
+    """All decisions about a run, made before the first superpixel is cut."""
 
     superpixels: SuperpixelPlan  # How each view is cut, and into how many
     networks: tuple[NetworkWeights | None, ...]  # Networks, None for the analytic start, or both
@@ -92,7 +92,7 @@ class Plan:
 
     @property
     def weakens(self) -> bool:
-        """Whether groups that other views see through start fainter, because a long fit follows."""
+        """Whether groups that other views see through start with less opacity, because a long fit follows."""
         return self.superpixels.start_share < 1
 
     @property
@@ -101,18 +101,18 @@ class Plan:
         return self.superpixels.limits
 
     def with_fixed_cameras(self) -> Plan:
-        """Return the plan with cameras that the fit does not move."""
+        """Return the plan with cameras that the fit leaves in place."""
         return replace(self, fit=replace(self.fit, move_cameras=False))
 
     def with_fit(self, fit: FitOptions, *, start_share: float = 1.0) -> Plan:
-        """Return the plan with another fit and another share of the Gaussians to start from."""
+        """Return the plan with another fit, which starts with ``start_share`` of the Gaussians."""
         return replace(self, fit=fit, superpixels=replace(self.superpixels, start_share=start_share))
 
 
 def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoint | None = None) -> Plan:
     """Decide everything that the options leave open; raise UsageError if scene or checkpoint cannot do it.
 
-    ``checkpoint``: in the place of the one that the options name.
+    ``checkpoint``: networks to use instead of those that the options name.
     """
     input_scene, scene, effort = prepared.input_scene, prepared.scene, EFFORTS[options.effort]
     _check_photos(input_scene, options)
@@ -169,7 +169,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
 
 @dataclass(frozen=True)
 class WholePlan:
-    """Decisions that take no work, about a scene as a whole: what a run, its estimate and its blocks share."""
+    """Decisions about a whole scene that cost no computation; a run, its estimate and its blocks share them."""
 
     blocks: int  # Parts in which the scene is compacted
     decode: DecodeOptions  # Gaussians per group
@@ -179,14 +179,14 @@ class WholePlan:
     fit: FitOptions  # With the steps that are taken
 
     def settings(self, options: CompactOptions) -> dict[str, Any]:
-        """Return all settings by flat name, with those that the plan decides."""
+        """Return all settings by flat name, with the values that the plan chose."""
         return options.to_dict() | {"k": self.decode.k, "match": self.match, "checkpoint": self.checkpoint}
 
 
 def plan_whole(
     scene: SceneSize, options: CompactOptions, *, num_input: int | None = None, num_reserved: int = 0
 ) -> WholePlan:
-    """Decide what numbers of a scene can decide; UsageError where it cannot be done as asked.
+    """Make the decisions that follow from the scene's size and the options; UsageError for impossible options.
 
     ``num_input``, ``num_reserved``: as of :func:`gsmerge.stages.segment.count_limits`.
     """
@@ -205,7 +205,7 @@ def plan_whole(
 
 
 def choose_blocks(scene: SceneSize, options: CompactOptions) -> int:
-    """Return the number of blocks in which a scene is compacted; UsageError where it cannot be in as many as asked."""
+    """Return the number of blocks for a scene; UsageError if the scene cannot be cut into as many as asked."""
     problems = blocks_problems(scene, options)
     asked = wanted_blocks(options, scene.num_gaussians if scene.aligned else 0)
     if options.blocks.blocks == "auto":
@@ -220,7 +220,7 @@ def choose_blocks(scene: SceneSize, options: CompactOptions) -> int:
 
 
 def note_engine(scene: SceneSize, options: CompactOptions, blocks: int) -> None:
-    """Say that a cluster has nothing to do where a scene is compacted in one piece."""
+    """Note that a cluster brings nothing when the scene is compacted in one piece."""
     if blocks == 1 and options.blocks.engine.name != "local":
         problems = blocks_problems(scene, options)
         remedy = f"which {problems[0]} needs" if problems else "--blocks NUMBER makes several"
@@ -228,12 +228,12 @@ def note_engine(scene: SceneSize, options: CompactOptions, blocks: int) -> None:
 
 
 def blocks_problems(scene: SceneSize, options: CompactOptions) -> list[str]:
-    """Name what keeps a scene from being cut into blocks."""
+    """List the reasons why a scene cannot be cut into blocks."""
     return [*_whole_needed(options), *([] if scene.aligned else ["a scene without one Gaussian per pixel"])]
 
 
 def wanted_blocks(options: CompactOptions, num_gaussians: int) -> int:
-    """Return the number of blocks that options want for an aligned scene of so many Gaussians, 1 for one piece."""
+    """Return the number of blocks that the options ask for, given ``num_gaussians``; 1: one piece."""
     asked = options.blocks.blocks
     if asked == "auto":
         return 1 if _whole_needed(options) else usual_blocks(num_gaussians)
@@ -261,9 +261,8 @@ def _check_photos(scene: Scene, options: CompactOptions) -> None:
 def choose_networks(options: CompactOptions, *, photos: bool, aligned: bool = True) -> str:
     """Return the name of the checkpoint to load: as asked, or the shipped one where it improves results.
 
-    That is where no fit follows, or a short one of an effort that has the time for both, on scenes
-    with one Gaussian per pixel (``aligned``), which the shipped networks learnt from
-    (docs/laboratory/networks.md). ``photos``: whether there are any to fit to.
+    The shipped networks improve scenes with one Gaussian per pixel (``aligned``) if no fit follows, or a short one
+    under an effort that has time for both (docs/laboratory/networks.md). ``photos``: whether there are any to fit to.
     """
     if options.checkpoint != "auto":
         return options.checkpoint
@@ -302,7 +301,7 @@ def load_networks(options: CompactOptions, scene: Scene, *, photos: bool) -> Che
 
 
 def require_children(name: str, count: int, checkpoint: Checkpoint | None) -> None:
-    """Raise UsageError where the heads of a checkpoint know fewer children than option ``name`` asks for."""
+    """Raise UsageError if the option ``name`` asks for more children per group than the checkpoint's heads make."""
     if checkpoint is not None and count > checkpoint.networks.options.max_children:
         raise UsageError(
             f"{name}: expected at most {checkpoint.networks.options.max_children} with the absolute outputs of"
@@ -342,7 +341,7 @@ def _merge_unseen(
 
 
 def resolve_decode(options: CompactOptions, scene: SceneSize) -> DecodeOptions:
-    """Fill in K: more where one camera sees a surface once, and no fit or a short one follows.
+    """Choose K where it is "auto": more where one camera sees the scene and no fit, or a short one, follows.
 
     With K = 1, 4.4 % of the pixels of one photo are too few to show it; of more views each has
     Gaussians of its own.
@@ -358,7 +357,7 @@ def resolve_decode(options: CompactOptions, scene: SceneSize) -> DecodeOptions:
 
 
 def resolve_fit(options: CompactOptions) -> FitOptions:
-    """Fill in the steps of the fit by effort, and whether to leave out Gaussians that no photo shows."""
+    """Choose the number of fit steps by effort, and whether to leave out Gaussians that no photo shows."""
     fit, effort = options.fit, EFFORTS[options.effort]
     steps = effort.steps if fit.fit_steps is None else fit.fit_steps
     prunes = fit.fit != "none" or effort.prunes
@@ -366,7 +365,7 @@ def resolve_fit(options: CompactOptions) -> FitOptions:
 
 
 def steps_for(options: CompactOptions, num_views: int, share: float = USUAL_SHARE) -> int:
-    """Return the steps of the full fit: as given, or by effort and more with the roots of views and ``share``.
+    """Return the number of steps of the full fit: as set, or by effort, views and ``share``.
 
     ``share``: Gaussians of the result for each pixel. A step looks at one view. Measurements are in
     docs/laboratory/large-scenes.md.

@@ -50,7 +50,7 @@ def report_document(
     written_at: Mapping[Path, Sequence[Path]] | None = None,
     cameras_path: Path | None = None,
 ) -> dict[str, Any]:
-    """Return the report of one ``compact`` as plain JSON types.
+    """Return the report of one ``compact`` run as plain JSON types.
 
     ``seconds_before`` and ``seconds_after``: wall time by name before the report's stages (imports,
     reading) and after them (writing). ``coarser``: file and report of each further level of detail.
@@ -120,14 +120,14 @@ def finite(value: Any) -> Any:
 
 
 def csv_cell(value: Any) -> Any:
-    """Return a value for a CSV table: empty for None, a quote before text that a spreadsheet would run."""
+    """Return a value for a CSV table: "" for None; a quote comes before text that a spreadsheet would run."""
     if value is None:
         return ""
     return f"'{value}" if isinstance(value, str) and value[:1] in ("=", "+", "-", "@", "\t", "\r", "\n") else value
 
 
 def csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
-    """Write rows as comma-separated values under a line of the columns; other keys are left out."""
+    """Write rows as comma-separated values under a line of column names; keys that are no columns are ignored."""
     out = io.StringIO()
     writer = csv.DictWriter(out, columns, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
@@ -142,7 +142,7 @@ def text_table(rows: Sequence[Sequence[str]], indent: str = "") -> list[str]:
 
 
 def summary_lines(document: Mapping[str, Any]) -> list[str]:
-    """Return the closing lines of ``compact``: the result, each further level, and the curve if measured."""
+    """Return the closing lines of ``compact``: the result, each coarser level, and the curve if it was measured."""
     return [summary_line(document), *level_lines(document), *curve_lines(document["choices"].get("curve", []))]
 
 
@@ -169,7 +169,7 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None) -> l
 
 
 def level_lines(document: Mapping[str, Any]) -> list[str]:
-    """Return a line for each further level of detail."""
+    """Return one line of text for each coarser level of detail."""
     return [
         f"{level['path']}: {level['num_gaussians']:,} Gaussians, {human_bytes(level['bytes'])}"
         + (f"; input views {level['psnr_input_views']:.2f} dB" if level["psnr_input_views"] is not None else "")
@@ -209,12 +209,12 @@ def summary_line(document: Mapping[str, Any]) -> str:
 
 
 def seconds_document(seconds: Mapping[str, float]) -> dict[str, Any]:
-    """Return wall time by stage and in all, as every report has it."""
+    """Return the wall time by stage and in total, in the form that all reports share."""
     total = round(sum(seconds.values()), 4)
     return {"seconds": {name: round(value, 4) for name, value in seconds.items()}, "total_seconds": total}
 
 
 def seconds_line(document: Mapping[str, Any]) -> str:
-    """Return ``2.3 s (read 0.70, ...)`` of a report."""
+    """Return a report's seconds as text: ``2.3 s (read 0.70, ...)``."""
     stages = ", ".join(f"{name} {value:.2f}" for name, value in document["seconds"].items())
     return f"{document['total_seconds']:.1f} s ({stages})"

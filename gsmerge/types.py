@@ -56,12 +56,12 @@ def to_float32(values: np.ndarray) -> np.ndarray:
 
 
 def like(values: np.ndarray, template: Array) -> Array:
-    """Return an array in the kind of another: an array, or a tensor on the same device."""
+    """Convert ``values`` to the type of ``given``: a NumPy array, or a tensor on the same device."""
     return as_tensor(values, template.device) if hasattr(template, "detach") else values
 
 
 def concat_rows(parts: Sequence[Array], axis: int = 0) -> Array:
-    """Concatenate rows, or what another axis counts, of arrays or of tensors."""
+    """Concatenate arrays, or tensors, along ``axis``."""
     if all(isinstance(part, np.ndarray) for part in parts):
         return np.concatenate(parts, axis)
     import torch
@@ -200,7 +200,7 @@ class Cameras:
 
 @dataclass(frozen=True, eq=False)
 class LargePhotos:
-    """Photos of V views with more pixels than the scene's own, read one at a time; poses are those of its cameras."""
+    """Photos larger than the scene's views, read one at a time; their poses are those of the scene's cameras."""
 
     Ks: np.ndarray  # [v,3,3] intrinsics at their size
     width: int
@@ -308,7 +308,7 @@ class Scene:
 
     @cached_property
     def valid(self) -> np.ndarray:
-        """``[v,h,w]`` bool of an aligned scene: pixels that have a finite Gaussian."""
+        """Mask ``[v,h,w]`` of an aligned scene's pixels that have a finite Gaussian."""
         assert self.pixel_ids is not None
         return np.asarray(self.pixel_ids >= 0).reshape(len(self.cameras), self.cameras.height, self.cameras.width)
 
@@ -319,17 +319,17 @@ class Scene:
 
     @property
     def num_gaussians(self) -> int:
-        """Number of Gaussians in the file, to which budgets and ratios refer."""
+        """Number of Gaussians in the file; budgets and ratios refer to it."""
         return len(self.gaussians) - self.num_missing
 
     @property
     def stored(self) -> np.ndarray:
-        """``[v,h,w]`` bool of an aligned scene: pixels whose Gaussian is a finite one of the file."""
+        """Mask ``[v,h,w]`` of an aligned scene's pixels whose Gaussian is finite and comes from the file."""
         return self.valid if self.missing is None else self.valid & ~self.missing
 
     @property
     def file_gaussians(self) -> Gaussians:
-        """Gaussians of the file, without those that fill it up."""
+        """Gaussians that come from the file, without those added for missing pixels."""
         return self.gaussians if self.missing is None else self.gaussians[~self.missing.reshape(-1)]
 
     @property
@@ -346,7 +346,7 @@ def grid_ids(valid: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Groups:
-    """A partition of the pixels of every view into superpixels."""
+    """Superpixels of every view: a label for each pixel, and the number of superpixels of each view."""
 
     labels: np.ndarray  # [v,h,w] int32, the superpixel of each pixel, 0 to `counts[v] - 1` within its view
     counts: tuple[int, ...]  # Superpixels of each view
@@ -369,7 +369,7 @@ class Segmentation:
 
 @dataclass(frozen=True)
 class Matches:
-    """Clusters of Feature Gaussians that show the same piece of surface."""
+    """Clusters of Feature Gaussians that show the same surface."""
 
     clusters: np.ndarray  # [g] int64, the cluster of each Feature Gaussian, dense from 0
     count: int  # Number of clusters
@@ -422,7 +422,7 @@ class FeatureGaussians:
 
 @dataclass(frozen=True, eq=False)
 class Decoded:
-    """Start of a fit."""
+    """Canonical Gaussians that a fit starts from."""
 
     gaussians: Gaussians  # Canonical Gaussians
     count: int  # Number to which the fit may grow

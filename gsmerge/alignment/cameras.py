@@ -43,23 +43,23 @@ class Poses:
 
     @property
     def description(self) -> str:
-        """Words for the convention."""
+        """Description of the convention in words."""
         return describe_convention(self.convention)
 
 
 def describe_convention(convention: Convention) -> str:
-    """Return words for a convention."""
+    """Describe a pose convention in words."""
     return f"{convention[0]} matrices with {convention[1]} axes"
 
 
 def describe_reading(convention: Convention, usual: Convention) -> str:
-    """Write that poses fit in one convention, in place of the format's ``usual`` one."""
+    """Describe in words that poses fit in another convention than the format's ``usual`` one."""
     words = describe_convention(convention)
     return f"the poses fit when read as {words}, where this format has {usual[0]} with {usual[1]} axes"
 
 
 def other_conventions(viewmats: np.ndarray, convention: Convention) -> list[Poses]:
-    """Read poses ``viewmats [c,4,4]`` in all other conventions, without repetitions."""
+    """List the poses ``viewmats [c,4,4]`` as read in all other conventions, without repetitions."""
     stored, readings = from_viewmats(viewmats, convention), [Poses(convention, viewmats)]
     for other in CONVENTIONS:
         read = to_viewmats(stored, other)
@@ -71,7 +71,7 @@ def other_conventions(viewmats: np.ndarray, convention: Convention) -> list[Pose
 
 @dataclass(frozen=True)
 class MovedCameras:
-    """Cameras in their new places, and how far they were moved."""
+    """Cameras moved to fit their Gaussians, and how far each was moved."""
 
     cameras: Cameras
     worst_px: float  # the largest median distance of a view's Gaussians from their pixels before
@@ -79,7 +79,7 @@ class MovedCameras:
 
     @property
     def note(self) -> str:
-        """A sentence on the move."""
+        """Sentence for the user about the move."""
         return (
             f"the cameras are off by a median of up to {self.worst_px:.1f} px: each was moved to where its Gaussians"
             f" lie in their pixels, {describe_moves(self.moves)}"
@@ -87,14 +87,14 @@ class MovedCameras:
 
 
 def max_pixels(width: int, height: int) -> float:
-    """Return the median distance in pixels up to which cameras are moved; beyond it a scene is refused."""
+    """Return the largest median distance, pixels, that cameras may be moved by; beyond it a scene is refused."""
     return max(pixel_limit(width, height), min(MAX_PX, MAX_SHARE * math.sqrt(width * height)))
 
 
 def move_cameras(
     pairs: Correspondences, cameras: Cameras, names: tuple[str, ...], source: str = "Ks"
 ) -> MovedCameras | None:
-    """Move cameras to where the Gaussians of a sample project into their pixels; None where some are too far off.
+    """Move cameras so that sampled Gaussians project into their pixels; None if some cameras are too far off.
 
     SceneError, which names ``source``, where the intrinsics are wrong rather than the poses.
     """

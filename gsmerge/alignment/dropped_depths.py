@@ -20,11 +20,11 @@ _AROUND = 6  # pixels on either side over which colours are compared
 
 
 def fill_from_depths(scene: Scene, depths: np.ndarray) -> Scene:
-    """Add a Gaussian for each pixel that the file has no row for, at the depth of the maps ``depths [v,h,w]``.
+    """Add a Gaussian at the depth of ``depths [v,h,w]`` for each pixel that the file has no row for.
 
-    Units, and depth along z or distance, follow from the other pixels. The colour is the photo's; opacity, rotation
-    and size in pixels are those of the pixel before it in the row. The scene is unchanged if it has no photos,
-    lacks nothing, or its Gaussians do not lie at the maps' depths.
+    Units, and whether depth is along z or a distance, follow from the other pixels. The colour is the photo's; opacity,
+    rotation and size in pixels are copied from the pixel before it in the row. The scene is unchanged if it has no
+    photos, lacks nothing, or its Gaussians do not lie at the maps' depths.
     """
     if scene.images is None or scene.missing is None:
         return scene
@@ -70,10 +70,10 @@ def fill_from_depths(scene: Scene, depths: np.ndarray) -> Scene:
 
 
 def guess_depths(scene: Scene) -> np.ndarray:
-    """Guess depth maps ``[v,h,w]`` along z of a scene without borders and the farthest pixels.
+    """Guess depth maps ``[v,h,w]`` along z of a scene whose file lacks borders and far pixels.
 
-    Where rows are, the maps have their depths. Far pixels get the depth at which the nearest other
-    photos have their colours, and a border that of the pixel beside it.
+    Pixels with rows keep their depths. Far pixels get the depth at which the nearest other photos have the same
+    colours, and border pixels the depth of the pixel beside them.
     """
     views, height, width = scene.valid.shape
     box = da3_box(width, height)

@@ -43,7 +43,7 @@ _OUTSIDE = 999  # a colour that no pixel has
 def estimate_cameras(
     path: Path, gaussians: Gaussians, valid: np.ndarray, names: Sequence[str], width: int, height: int
 ) -> CameraFile | None:
-    """Estimate poses and one focal length under which rows of a full or trimmed grid project into their own pixels.
+    """Estimate poses and one focal length so that the rows of a full or trimmed grid project into their own pixels.
 
     ``names`` are those of the views, all ``width`` x ``height`` pixels; ``valid [n]`` bool; ``path`` is for
     messages. None if no order of the rows fits at least twice as well as all others.
@@ -64,7 +64,7 @@ def estimate_cameras(
 def calibrate(
     means: np.ndarray, valid: np.ndarray, layout: Layout, aspect: float = 1.0
 ) -> tuple[float, float, list[np.ndarray]]:
-    """Solve for (largest median distance in pixels, focal length, poses) of one order of the rows; inf on failure.
+    """Calibrate cameras for one row order: (largest median distance in pixels, focal length, poses); inf on failure.
 
     The vertical focal length is ``aspect`` times the horizontal one; the principal point is the middle.
     """
@@ -132,7 +132,7 @@ def estimate_with_photos(
     size: Size,
     read_photos: Callable[[], Photos],
 ) -> CameraFile | None:
-    """Estimate the cameras of a file that lacks unknown pixels, from the colours of its photos.
+    """Estimate the cameras of a file with unknown missing pixels, from the colours of its photos.
 
     ``names`` are those of the photos, which have one ``size``; ``valid [n]`` bool; ``path`` is for
     messages. None where colours and rows do not agree.

@@ -58,7 +58,7 @@ class _Pictures:
 
 
 def estimate_focal(ply: GaussianFile, camera_file: CameraFile, photos: Photos | None) -> CameraFile | None:
-    """Return the cameras with the intrinsics that fit the Gaussians, and a note; None without any.
+    """Estimate the intrinsics of cameras that have poses alone; return cameras with a note, or None if that fails.
 
     ``camera_file`` has poses alone; ``photos`` are its c ``[h,w,3]`` uint8. Where only they show
     the focal length, pixels are taken to be square, and the principal point to be in the middle.

@@ -54,7 +54,7 @@ _BETTER = 2.0  # times nearer to the pixels: another scale, where the same fits 
 
 
 def read_incomplete(inputs: AlignmentInput) -> Iterator[Reading | None]:
-    """Yield readings with missing pixels in the possible orders, the likely first; None where an order cannot be."""
+    """Yield readings with missing pixels, the likely order first; None for each order that is impossible."""
     cameras = inputs.cameras
     missing = len(cameras) * cameras.width * cameras.height - len(inputs.gaussians)
     if missing < 0:
@@ -125,7 +125,7 @@ def _photo_colors(inputs: AlignmentInput, ids: np.ndarray) -> ColorOf | None:
 
 
 def read_unordered(rows: ProjectedRows, *, color_of: ColorOf | None = None) -> Layout | None:
-    """Find the pixel of every row in a file without an order; None unless nearly all are at centres, not by chance.
+    """Find the pixel of every row in a file without an order; None unless nearly all rows lie at pixel centres.
 
     Each row goes to the view in which it is nearest to a pixel's centre; between several near ones, the colours of
     the photos count as well. A pixel keeps the row that fits it best, the others go to their second choice.

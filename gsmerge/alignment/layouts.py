@@ -28,7 +28,7 @@ _MAX_ENLARGED = 1.5  # times the side of a photo; some networks enlarge small on
 
 @dataclass(frozen=True)
 class Layout:
-    """Rows and their pixels, block by block; a block is one view, or one layer of a view."""
+    """The pixel of each row, block by block; a block is one view, or one layer of a view."""
 
     description: str  # what it is, for people
     kind: str  # "full", "trim", "box", "box+depth" or "pruned": which pixels there are
@@ -41,13 +41,13 @@ class Layout:
     per_pixel: int = 1  # Gaussians per pixel; above 1 each layer is a block
 
     def with_views_in(self, orders: Iterable[Sequence[int]]) -> Iterator[Layout]:
-        """Yield the same rows and pixels with the views in each of some orders."""
+        """Yield copies of the layout with the views permuted by each of the ``orders``."""
         labellings = dict.fromkeys(tuple(order[view] for view in self.views) for order in orders)
         return (replace(self, views=labelling) for labelling in labellings)
 
     @property
     def is_plain(self) -> bool:
-        """Whether the rows are the grid in order: nothing to move, nothing missing."""
+        """Whether the rows are the full grid in order: nothing moves, nothing is missing."""
         return self.kind == "full" and self.order == "view-major" and self.per_pixel == 1
 
     def pixel_ids(self, count: int) -> np.ndarray:
@@ -70,13 +70,13 @@ class KeptBox:
     left: int
 
     def pixels(self, width: int, height: int) -> np.ndarray:
-        """Return the pixels of the box, row by row."""
+        """Return the pixel indices inside the box, row by row."""
         grid = np.arange(width * height, dtype=np.int64).reshape(height, width)
         return grid[self.top : height - self.top, self.left : width - self.left]
 
 
 def boxes(width: int, height: int) -> list[KeptBox]:
-    """List possible borders: none, 8 pixels, or 8/256 of each side as Depth Anything 3 trims."""
+    """List the borders that exporters may have trimmed: none, 8 pixels, or 8/256 of each side (Depth Anything 3)."""
     out = [KeptBox("full", "every pixel", 0, 0)]
     if min(width, height) > 2 * TRIM:
         out.append(KeptBox("trim", f"{TRIM} pixels trimmed at every border", TRIM, TRIM))
@@ -87,19 +87,19 @@ def boxes(width: int, height: int) -> list[KeptBox]:
 
 
 def da3_box(width: int, height: int) -> KeptBox:
-    """Return the box that Depth Anything 3 keeps."""
+    """Return the box of pixels that Depth Anything 3 keeps."""
     top, left = int(8 / 256 * height), int(8 / 256 * width)
     return KeptBox("box", f"{top} rows and {left} columns trimmed at every border", top, left)
 
 
 def view_orders(names: Sequence[str]) -> list[tuple[int, ...]]:
-    """List the orders that a file's views may be in: that of their cameras, that of their names."""
+    """List the possible orders of a file's views: the order of the cameras, and the order of the names."""
     views = range(len(names))
     return [tuple(views), tuple(sorted(views, key=lambda view: natural_key(names[view])))]
 
 
 def every_nth(views: int) -> list[tuple[int, ...]]:
-    """List the choices of every n-th view, for all n."""
+    """List the selections of every n-th view, for all n."""
     return [tuple(range(0, views, step)) for step in range(1, views + 1)]
 
 
@@ -109,7 +109,7 @@ def plain_layout(views: int, width: int, height: int) -> Layout:
 
 
 def exact_layouts(count: int, views: int, width: int, height: int) -> Iterator[Layout]:
-    """Yield the layouts with exactly ``count`` rows, for every number of views up to ``views``.
+    """Yield the layouts with exactly ``count`` rows and at most ``views`` views.
 
     The cameras of the blocks are a first guess: in order, or every n-th of them.
     """
@@ -151,7 +151,7 @@ def _orders(
 
 
 def depth_layouts(count: int, depths: np.ndarray) -> list[Layout]:
-    """Make the layout of Depth Anything 3 from its depth maps: border, nearest 90 % of each view, every n-th view.
+    """List the layouts that Depth Anything 3 may have made, by its depth maps: border, nearest 90 %, every n-th view.
 
     Only the order of ``depths [v,h,w]`` matters, so any scale will do. Empty if no choice of views has ``count``
     pixels.
@@ -187,7 +187,7 @@ def subsample(layout: Layout, per_block: int) -> Layout:
 
 
 def spread_step(step: int, width: int) -> int:
-    """Enlarge a step until it shares no divisor with the width, so that samples spread over all columns."""
+    """Enlarge a sampling step until it is coprime to the width, so that samples spread over all columns."""
     step = max(1, step)
     while step > 1 and np.gcd(step, width) > 1:
         step += 1
@@ -196,7 +196,7 @@ def spread_step(step: int, width: int) -> int:
 
 @dataclass(frozen=True)
 class GridFit:
-    """One way to bring cameras and photos to the size of the grid."""
+    """One assumption about the size of the pixel grid, with the cameras and the photo transform for that size."""
 
     camera_file: CameraFile  # the cameras as they are read, in one convention of the poses
     cameras: Cameras  # the same at the grid's size
@@ -214,12 +214,12 @@ class GridFit:
 
     @property
     def guessed(self) -> bool:
-        """Whether the number of rows allows many others."""
+        """Whether the size was guessed from the number of rows, which many other sizes would fit as well."""
         return self.rank in (1, 2)
 
 
 def photo_grid(camera_file: CameraFile, size: Size | None) -> GridFit:
-    """Assume that the grid has the photos' size, or the cameras' without photos; SceneError if the two disagree."""
+    """Assume a grid of the photos' size, or of the cameras' size without photos; SceneError if the two disagree."""
     if size is None:
         return GridFit(camera_file, to_cameras(camera_file), None, ())
     width, height = size
@@ -245,7 +245,7 @@ def _are_stretched(camera_file: CameraFile, size: Size) -> bool:
 
 
 def other_grids(ply: FileInfo, camera_file: CameraFile, size: Size | None) -> Iterator[GridFit]:
-    """Yield all other grids that the files and the number of rows allow, the likely first; ``size`` is the photos'."""
+    """Yield all other grid sizes that fit files and number of rows, the likely first; ``size``: of the photos."""
     sizes = sizes_of(camera_file)
     camera_size = sizes[0] if len(sizes) == 1 else None
     if size is not None and camera_size is not None and camera_size != size:
@@ -281,7 +281,7 @@ def _between(camera_file: CameraFile, size: Size, camera_size: Size) -> Iterator
 
 
 def grids_of_count(count: int, views: int, size: Size) -> Iterator[PhotoTransform]:
-    """Yield transforms of photos to smaller grids of which ``views`` have ``count`` rows."""
+    """Yield the ways to shrink the photos so that ``views`` of them have ``count`` pixels in all."""
     crops: list[PhotoTransform] = []
     for trim in (0, TRIM):
         for per_pixel in PER_PIXEL:
@@ -308,7 +308,7 @@ def _sizes_of_area(pixels: int, trim: int, size: Size) -> Iterator[Size]:
 
 
 def patch_grids(size: Size) -> list[PhotoTransform]:
-    """List transforms for networks that take multiples of 14: each side to the nearest one, or cropped to it."""
+    """List photo transforms of networks that take multiples of 14: each side rounded, or cropped, to a multiple."""
     transforms = []
     for side in SIDES:
         for scale in (side / max(size), side / min(size)):
@@ -321,7 +321,7 @@ def patch_grids(size: Size) -> list[PhotoTransform]:
 
 
 def small_photos_error(ply: FileInfo, camera_file: CameraFile, size: Size | None) -> SceneError | None:
-    """Make the SceneError for photos smaller than the cameras' size, of which the rows are the pixels; or None."""
+    """Make the SceneError for photos smaller than a pixel grid of the cameras' size; None if they are not."""
     grid_size = next((s for s in sizes_of(camera_file) if ply.count == len(camera_file) * s[0] * s[1]), None)
     if size is None or grid_size is None or grid_size == size:
         return None

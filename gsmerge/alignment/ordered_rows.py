@@ -38,10 +38,9 @@ MAX_CELLS = 300_000_000  # rows times views that are worth the memory
 
 @dataclass(frozen=True)
 class ProjectedRows:
-    """n finite rows of a file and the cameras of the c views to which they may belong.
+    """n finite rows of a file, and the cameras of the c views that they may belong to.
 
-    Searches take these and return a layout whose pixels still have to be measured, or None if the rows do not look
-    like it.
+    Searches take these and return a layout that is not scored yet, or None if the rows do not look like it.
     """
 
     points: np.ndarray  # ``[n,3]`` float64 means
@@ -52,18 +51,18 @@ class ProjectedRows:
         return len(self.points)
 
     def with_frame(self, frame: Similarity) -> ProjectedRows:
-        """Return the same rows with the cameras moved to another frame."""
+        """Return the same rows with the cameras moved into another frame."""
         return replace(self, cameras=frame.move(self.cameras))
 
     def project(self, rows: np.ndarray | slice, view: int) -> tuple[np.ndarray, np.ndarray]:
-        """Project some rows to columns and rows ``[r]`` of the image, pixels; NaN behind the camera."""
+        """Project rows to image coordinates x ``[r]`` and y ``[r]``, pixels; NaN behind the camera."""
         with np.errstate(all="ignore"):
             xy, depth = project_points(self.points[rows], self.cameras.viewmats[view], self.cameras.Ks[view])
         xy[depth <= 0] = np.nan
         return xy[:, 0], xy[:, 1]
 
     def pixels(self, rows: np.ndarray | slice, view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Find the pixels ``y·W + x`` of some rows, ``[r]`` int32, -1 outside; and their projections."""
+        """Find the pixels ``y·W + x`` that rows project into, ``[r]`` int32, -1 outside; also the projections."""
         u, v = self.project(rows, view)
         inside = (u >= 0) & (v >= 0) & (u < self.cameras.width) & (v < self.cameras.height)
         pixels = np.full(len(u), -1, np.int32)
@@ -73,7 +72,7 @@ class ProjectedRows:
     def layout(
         self, order: str, parts: Sequence[tuple[int, np.ndarray, np.ndarray]], *, missing: int, note: str = ""
     ) -> Layout:
-        """Make a layout from parts of (view, some of these rows, their pixels); ``missing`` pixels have no row."""
+        """Make a layout from parts of (view, rows, pixels of the rows); ``missing``: number of pixels without a row."""
         words = "in no order" if order == "unordered" else order
         return Layout(
             description=f"{missing:,} pixels of {len(parts)} views dropped, {words}{note}",
@@ -88,7 +87,7 @@ class ProjectedRows:
 
 
 def read_view_major(rows: ProjectedRows) -> Layout | None:
-    """Find the pixel of every row in a file of one view after the other; None if blocks cannot be found."""
+    """Find the pixel of every row in a file that stores view after view; None if the views' rows cannot be found."""
     blocks = _find_blocks(rows)
     if blocks is None:
         return None
@@ -217,7 +216,7 @@ def _never_falling(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def rough_scale(rows: ProjectedRows) -> float | None:
-    """Find the scale of the cameras' positions under which rows step by single pixels; no pixel is known yet.
+    """Find the scale of the camera positions at which rows step by single pixels, without knowing any pixel.
 
     None where they do in no view at any scale.
     """
@@ -242,7 +241,7 @@ def rough_scale(rows: ProjectedRows) -> float | None:
 
 
 def finer_scale(rows: ProjectedRows, layout: Layout, rough: float) -> float:
-    """Find the scale, up to a quarter off ``rough``, under which rows lie nearest to their assigned pixels.
+    """Refine the scale, within a quarter of ``rough``, so that rows lie nearest to their assigned pixels.
 
     The assignment hides small moves: so scales are tried in steps that move most rows by a quarter of a pixel at
     most.
@@ -276,7 +275,7 @@ def finer_scale(rows: ProjectedRows, layout: Layout, rough: float) -> float:
 
 
 def read_view_fastest(rows: ProjectedRows) -> Layout | None:
-    """Find the pixel of every row in a file of one pixel after the other, if means lie inside their pixels.
+    """Find the pixel of every row in a file that stores all views of a pixel together, if means lie in their pixels.
 
     Every row lies in some pixel of every view. In the order of the file the true pixels only go forward, and within
     a pixel the views do. The path through the views with the smallest steps wins; None if it goes back, or hardly

@@ -63,7 +63,7 @@ _ORDERS = {  # in which rows may be instead, by the order of their layout
 
 @dataclass(frozen=True)
 class Recovery:
-    """The winning reading of the rows, with its margin."""
+    """The best reading of the rows, and how clearly it beats the next best."""
 
     best: Reading
     runner_up: Reading | None  # the next best; None where the count allows no other
@@ -77,7 +77,7 @@ class Recovery:
 
     @property
     def description(self) -> str:
-        """Words for the reading and its margin."""
+        """Description of the reading and its margin in words."""
         other = "shuffled pixels" if self.runner_up is None else self.runner_up.description
         text = f"{self.best.description}: median {self.best.median_px:.2f} px from the pixels, "
         if self.color_margin is None:
@@ -89,10 +89,9 @@ class Recovery:
 
 
 def recover(inputs: AlignmentInput, *, exact_frames: bool = False) -> Recovery | None:
-    """Find the reading under which every Gaussian projects into its own pixel; None where none stands out.
+    """Find the reading under which every Gaussian projects into its own pixel; None if no reading stands out.
 
-    With ``exact_frames`` only cameras in the frame of their file and files without missing pixels are considered:
-    quick.
+    ``exact_frames``: only try cameras in the frame of their file and files without missing pixels, which is quick.
     """
     finite = int(inputs.valid.sum())
     if inputs.order == "none" or (finite < ENOUGH and finite < FEW * len(inputs.gaussians)):
@@ -164,7 +163,7 @@ def _accept(inputs: AlignmentInput, readings: Sequence[Reading]) -> Recovery | N
 
 
 def is_seen(inputs: AlignmentInput, layouts: Sequence[Layout]) -> bool:
-    """Return whether any camera at all, in any frame, could show the rows of one of the layouts in their pixels."""
+    """Return whether some camera, in any frame, could show the rows of one of the layouts in their pixels."""
     return any(_is_seen(inputs, layout) for layout in layouts)
 
 
@@ -193,7 +192,7 @@ def _without_same_labellings(inputs: AlignmentInput) -> AlignmentInput:
 
 
 def possible_layouts(inputs: AlignmentInput) -> list[Layout]:
-    """List the layouts that the number of rows allows, or the depth maps next to the cameras."""
+    """List the layouts that fit the number of rows, or the depth maps next to the cameras."""
     cameras, count = inputs.cameras, len(inputs.gaussians)
     layouts = list(exact_layouts(count, len(cameras), cameras.width, cameras.height))
     if count < len(cameras) * cameras.width * cameras.height and inputs.order in ("auto", "view-major"):
@@ -253,7 +252,7 @@ def _differs(layout: Layout, other: Layout) -> bool:
 
 
 def explain_count(ply: FileInfo, inputs: AlignmentInput, camera_file: CameraFile) -> SceneError:
-    """Make the SceneError of rows that are no pixels; raise it where other cameras would make pixels of them."""
+    """Return the SceneError for rows that are not pixels; raise it at once if the cameras are wrong, not the rows."""
     cameras, count = inputs.cameras, len(inputs.gaussians)
     views, width, height = len(cameras), cameras.width, cameras.height
     expected = f"{views} x {height} x {width} = {views * height * width} (views x height x width)"
@@ -302,7 +301,7 @@ def _count_remedy(count: int, cameras: Cameras) -> str:
 
 
 def misalignment_error(path: str, alignment: Alignment, reason: str | None) -> SceneError:
-    """Make the SceneError of enough rows that lie on no pixels' rays, or as well on those of others."""
+    """Make the SceneError for rows as many as pixels, that fit no pixels or fit in several ways."""
     if alignment.ok:
         problem = f"expected rows that fit the pixels in one way, found several that do, to {alignment.worst_px:.1f} px"
         return SceneError(path, problem, "name the order of the rows with --hint order=NAME")
@@ -318,7 +317,7 @@ def misalignment_error(path: str, alignment: Alignment, reason: str | None) -> S
 def explain_misalignment(
     gaussians: Gaussians, cameras: Cameras, valid: np.ndarray, convention: Convention
 ) -> str | None:
-    """Name another reading of cameras or row order under which the scene fits; None without one."""
+    """Name another reading of cameras or row order that fits the scene; None if none does."""
     pairs = sample_pixels(gaussians, cameras, valid)
     input_viewmats = cameras.viewmats
     frames = candidate_similarities(pairs, cameras, effort=1)

@@ -20,7 +20,7 @@ _SMALLEST_ERROR = 1e-6  # of the pixels' spread
 
 
 def start_pose(points: np.ndarray, pixels: np.ndarray, K: np.ndarray) -> np.ndarray | None:
-    """Solve for the motion ``[4,4]`` into the camera of points ``[n,3]`` shown at ``pixels [n,2]``; None if it fails.
+    """Solve for the pose ``[4,4]``, world to camera, that shows points ``[n,3]`` at ``pixels [n,2]``; None if it fails.
 
     By SQPnP (Terzakis and Lourakis 2020), near the best; the points must be at least three and lie near zero.
     """
@@ -41,7 +41,7 @@ def projection_errors(points: np.ndarray, pixels: np.ndarray, K: np.ndarray, pos
 def refine_poses(
     points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], K: np.ndarray, poses: np.ndarray, *, focal: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Move cameras to where their points ``[n,3]`` project nearest to their ``pixels [n,2]``, by least squares.
+    """Refine poses by least squares so that points ``[n,3]`` of each view project to their ``pixels [n,2]``.
 
     With ``focal`` the common focal length of the views is solved for as well. Returns intrinsics ``[3,3]`` and poses
     ``[v,4,4]``; numpy.linalg.LinAlgError where the points do not determine them.
@@ -101,7 +101,7 @@ def _step(curvature: np.ndarray, slope: np.ndarray, damping: float, *, focal: bo
 
 
 def projective_error(points: np.ndarray, pixels: np.ndarray) -> float:
-    """Measure the median distance of points ``[n,3]`` from their ``pixels [n,2]`` under the best projective camera.
+    """Measure the median distance, pixels, of points ``[n,3]`` from ``pixels [n,2]`` under the best projective camera.
 
     Any 3 x 4 matrix is such a camera, with any intrinsics, in any frame. It is solved by the direct linear transform
     with reweighting (Hartley and Zisserman 2004, section 7.1). 0 where there are too few points to decide.

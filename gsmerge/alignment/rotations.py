@@ -30,7 +30,7 @@ _DESCRIPTIONS = {
 
 
 def read_rotations(scene: Scene, quats: QuatChoice) -> Scene:
-    """Read a scene's stored rotations, which were read as wxyz, in another way; see :class:`ReadHints`.
+    """Reinterpret a scene's rotations, read as wxyz so far, in another way; see :class:`ReadHints`.
 
     Of the two square roots that "xyzw-root" has, the one whose thinnest axis follows the surface better is taken.
     Where rows belong to no pixels, only "xyzw" changes anything.
@@ -51,12 +51,12 @@ def read_rotations(scene: Scene, quats: QuatChoice) -> Scene:
 
 
 def from_xyzw(quats: np.ndarray) -> np.ndarray:
-    """Bring ``[n,4]`` xyzw into the order wxyz."""
+    """Reorder quaternions ``[n,4]`` from xyzw to wxyz."""
     return quats[:, [3, 0, 1, 2]]
 
 
 def square_roots(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute both rotations that, applied twice, give ``quats [n,4]`` wxyz: half the angle, and half a turn more."""
+    """Compute both square roots of rotations ``[n,4]`` wxyz: half the angle, and half a turn more."""
     unit = normalize(quats)
     unit = np.where(unit[:, :1] < 0, -unit, unit)
     half = normalize(unit + np.array((1, 0, 0, 0), unit.dtype))
@@ -64,7 +64,7 @@ def square_roots(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def choose_rotations(scene: Scene) -> tuple[QuatChoice, str]:
-    """Choose the reading whose thinnest axes follow the surface's normals, with a note; "wxyz" and "" in doubt."""
+    """Choose the reading of rotations whose thinnest axes follow the surface normals, with a note; in doubt "wxyz"."""
     normals, rows, views = _normals(scene)
     scales = scene.gaussians.scales[rows]
     free_pages(vars(scene.gaussians).values())

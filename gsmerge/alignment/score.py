@@ -43,7 +43,7 @@ def scale_by(scale: float, note: str = "") -> Similarity:
 
 @dataclass(frozen=True)
 class Correspondences:
-    """t Gaussians, each with the pixel and the view to which it is assumed to belong."""
+    """t Gaussians with the view and the pixel that each is assumed to belong to."""
 
     points: np.ndarray  # ``[t,3]`` float64 means
     pixels: np.ndarray  # ``[t,2]`` pixel centres (x, y)
@@ -52,16 +52,16 @@ class Correspondences:
     rows: np.ndarray  # ``[t]`` of the file
 
     def select(self, index: np.ndarray) -> Correspondences:
-        """Select some rows."""
+        """Select rows by a mask or indices."""
         return Correspondences(*(column[index] for column in vars(self).values()))
 
     def split(self, values: np.ndarray, blocks: int) -> list[np.ndarray]:
-        """Split values ``[t,...]`` by block."""
+        """Split ``values [t,...]`` into one array per block."""
         return np.split(values, np.cumsum(np.bincount(self.blocks, minlength=blocks))[:-1])
 
 
 def pixel_errors(pairs: Correspondences, cameras: Cameras) -> np.ndarray:
-    """Measure the distances ``[t]`` of projected Gaussians from their pixels' centres, pixels; inf behind a camera."""
+    """Measure the distances ``[t]``, pixels, of projected Gaussians from their pixel centres; inf behind a camera."""
     with np.errstate(all="ignore"):
         viewmats, Ks = cameras.viewmats[pairs.views], cameras.Ks[pairs.views]
         xy, depth = project_points(pairs.points[:, None], viewmats, Ks)
@@ -86,12 +86,12 @@ def _apply(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
 def candidate_similarities(
     pairs: Correspondences | None, cameras: Cameras, *, scale: float | None = None, effort: int = 2
 ) -> Iterator[Similarity]:
-    """Yield similarities from the frame of cameras to that of Gaussians, the simplest and most plausible first.
+    """Yield similarities that may map the cameras' frame to the Gaussians' frame, the most plausible first.
 
-    They are: the same frame; a scale; rotated by the first or the middle camera, alone, scaled, or scaled and
-    shifted, as exporters do; any, from the poses that the pixels ask for. ``scale`` is the size of the Gaussians'
-    world in units of the cameras', where it is given. Effort 0 solves for nothing (then there may be no pairs), 1
-    for scale and shift, 2 for the rotation as well.
+    They are: the same frame; a scale; the frame of the first or the middle camera, alone, scaled, or scaled and
+    shifted, as exporters write; any similarity, from poses solved from the pixels. ``scale``: size of the Gaussians'
+    world in units of the cameras', if known. ``effort`` 0 solves for nothing (``pairs`` may be None), 1 for scale and
+    shift, 2 also for the rotation.
     """
     yield IDENTITY if scale is None else scale_by(scale, ", as given")
     rays = None if pairs is None or effort == 0 else _ray_directions(pairs, cameras)
@@ -167,7 +167,7 @@ def _mean_rotation(poses: dict[int, np.ndarray], viewmats: np.ndarray) -> np.nda
 
 
 def fits_all_cameras(frame: Similarity, pairs: Correspondences, cameras: Cameras) -> bool:
-    """Return whether one similarity does about as well as a pose for each camera: otherwise the cameras are wrong."""
+    """Return whether one similarity fits about as well as a separate pose per camera; if not, the cameras are wrong."""
     viewmats = cameras.viewmats.copy()
     for view, pose in _solve_poses(pairs, cameras.Ks).items():
         viewmats[view] = pose
@@ -176,7 +176,7 @@ def fits_all_cameras(frame: Similarity, pairs: Correspondences, cameras: Cameras
 
 
 def solve_pose(pairs: Correspondences, view: int, K: np.ndarray) -> np.ndarray | None:
-    """Solve for world-to-camera ``[4,4]`` of one view in the frame of the Gaussians, from its pixels alone."""
+    """Solve for one view's world-to-camera ``[4,4]`` in the Gaussians' frame, from its pixels alone."""
     rows = np.flatnonzero(pairs.views == view)
     rows = rows[:: max(1, len(rows) // _MAX_POINTS)]
     if len(rows) < 6:
@@ -202,7 +202,7 @@ def solve_pose(pairs: Correspondences, view: int, K: np.ndarray) -> np.ndarray |
 
 @dataclass(frozen=True)
 class AlignmentInput:
-    """Rows, cameras and photos from which the pixels are recovered."""
+    """Input of the search for pixels: rows, cameras, photos and hints."""
 
     gaussians: Gaussians  # the file's n rows
     valid: np.ndarray  # ``[n]`` bool
@@ -232,7 +232,7 @@ def find_correspondences(means: np.ndarray, valid: np.ndarray, layout: Layout) -
 
 @dataclass(frozen=True)
 class Reading:
-    """One way to read the rows of a file as pixels, and how well it fits."""
+    """One assumption about which pixel each row belongs to, and how well it fits."""
 
     layout: Layout  # which row belongs to which pixel
     frame: Similarity  # from the frame of the cameras to that of the Gaussians
@@ -243,24 +243,24 @@ class Reading:
 
     @property
     def description(self) -> str:
-        """Words for the reading."""
+        """Description of the reading in words."""
         return ", ".join(part for part in (self.layout.description, self.frame.description) if part)
 
 
 def pixel_limit(width: int, height: int) -> float:
-    """Return the median distance in pixels up to which Gaussians count as those of their pixels."""
+    """Return the largest median distance, pixels, at which Gaussians count as those of their pixels."""
     return max(0.5, min(MAX_MEDIAN_PX, 0.1 * math.sqrt(width * height)))
 
 
 def sample_layout(layout: Layout, samples: int = SAMPLES) -> Layout:
-    """Thin a layout to the rows that its reading is scored on."""
+    """Thin a layout to a sample of rows for scoring."""
     return subsample(layout, max(MIN_SAMPLES, samples // len(layout.views)))
 
 
 def score_layout(
     inputs: AlignmentInput, layout: Layout, frame: Similarity, pairs: Correspondences | None = None
 ) -> Reading:
-    """Score a layout in a frame, on a sample of its rows or on ``pairs`` that are at hand."""
+    """Score how well a layout fits in a frame, on a sample of its rows or on the given ``pairs``."""
     if pairs is None:
         pairs = inputs.pairs(sample_layout(layout))
     errors = pixel_errors(pairs, frame.move(inputs.cameras))
@@ -271,7 +271,7 @@ def score_layout(
 
 
 def score_shuffled(inputs: AlignmentInput, best: Reading) -> tuple[float, float]:
-    """Measure the median distance, pixels, and the mean colour distance, with pixels shuffled within each block."""
+    """Measure median distance (pixels) and mean colour distance with pixels shuffled in each block, for comparison."""
     rng, layout = np.random.default_rng(0), sample_layout(best.layout)
     pairs = inputs.pairs(replace(layout, pixels=tuple(rng.permutation(pixels) for pixels in layout.pixels)))
     errors = pixel_errors(pairs, best.frame.move(inputs.cameras))
@@ -279,7 +279,7 @@ def score_shuffled(inputs: AlignmentInput, best: Reading) -> tuple[float, float]
 
 
 def color_error(inputs: AlignmentInput, layout: Layout) -> float:
-    """Measure the mean distance of base colours from the photos at a layout's pixels, 0 to 1; NaN without photos."""
+    """Measure the mean distance, 0 to 1, between base colours and photos at a layout's pixels; NaN without photos."""
     return _color_distance(inputs, inputs.pairs(sample_layout(layout)))
 
 
@@ -293,7 +293,7 @@ def _color_distance(inputs: AlignmentInput, pairs: Correspondences) -> float:
 
 @dataclass(frozen=True)
 class Alignment:
-    """Distances of every view's own Gaussians from their own pixels."""
+    """How far each view's own Gaussians project from their own pixels."""
 
     # median distance from the pixel centre per view, pixels; inf where most are behind the camera, NaN where a view has
     # no finite Gaussian
@@ -305,12 +305,12 @@ class Alignment:
 
     @property
     def worst_px(self) -> float:
-        """Largest median of a view, pixels."""
+        """Largest of the views' median distances, pixels."""
         return max((m for m in self.median_px if not math.isnan(m)), default=math.nan)
 
 
 def check_alignment(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray) -> Alignment:
-    """Project a sample of every view's own Gaussians into that view.
+    """Measure how far a sample of every view's own Gaussians projects from their pixels.
 
     ``gaussians`` are V·H·W rows, assumed to be in view-major, row-major order; rows that are False in ``valid
     [V·H·W]`` (or ``[V,H,W]``) are left out. ValueError for another number of rows.
@@ -320,7 +320,7 @@ def check_alignment(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray) -
 
 
 def sample_pixels(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray) -> Correspondences:
-    """Take the sample of :func:`check_alignment`."""
+    """Return the sample of Gaussians and pixels that :func:`check_alignment` measures."""
     views, width, height = len(cameras), cameras.width, cameras.height
     if len(gaussians) != views * height * width:
         raise ValueError(f"expected {views} x {height} x {width} Gaussians, got {len(gaussians)}")
@@ -329,7 +329,7 @@ def sample_pixels(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray) -> 
 
 
 def check_pairs(pairs: Correspondences, cameras: Cameras) -> Alignment:
-    """Check a sample under any cameras; see :func:`check_alignment`."""
+    """Measure a sample with other cameras, as :func:`check_alignment` does."""
     limit = pixel_limit(cameras.width, cameras.height)
     errors = pixel_errors(pairs, cameras)
     medians = tuple(

@@ -42,7 +42,7 @@ _MOVED_SAMPLES = 2000  # Gaussians of a view that its moved pose is solved from
 
 @dataclass(frozen=True)
 class AlignmentResult:
-    """The pixel of every row, or the cameras that see rows without pixels, with a description of the search."""
+    """Result of :func:`align`: the pixel of every row, or for rows without pixels the cameras that see them."""
 
     # ``[n]`` int64, the pixel ``(block·H + y)·W + x`` of each row, -1: none; None where the rows belong to no pixels.
     # A block is a view, or one layer of a view with several Gaussians per pixel
@@ -58,12 +58,12 @@ class AlignmentResult:
 
     @property
     def layout(self) -> Layout | None:
-        """Layout of the rows, block by block; None without pixels."""
+        """Pixel of each row, block by block; None for rows without pixels."""
         return None if self.recovery is None else self.recovery.best.layout
 
     @property
     def views(self) -> tuple[int, ...]:
-        """Camera of each block; all cameras without pixels."""
+        """Camera of each block; for rows without pixels, all cameras."""
         return tuple(range(len(self.cameras))) if self.layout is None else self.layout.views
 
 
@@ -131,7 +131,7 @@ def align(
     depths: Callable[[], np.ndarray | None] = lambda: None,
     frames: Callable[[], Sequence[Similarity]] = tuple,
 ) -> AlignmentResult:
-    """Find the pixel of every row; for rows that belong to none, the poses from which the cameras see them.
+    """Find the pixel of every row; for rows without pixels, choose the camera poses that see them.
 
     The size of the grid, the frame and the convention of the poses, and the transform of the photos are searched
     too.

@@ -32,7 +32,7 @@ _MIN_PADDING = 16  # equal rows at the origin: fewer may be Gaussians
 
 @dataclass(frozen=True)
 class CameraCheck:
-    """Measures of how well cameras see some Gaussians."""
+    """How well cameras see unaligned Gaussians."""
 
     share_seen: float  # share of the Gaussians inside at least one picture
     # distance of their colours from the photos where they are seen, over the distance from the same pixels shuffled;
@@ -42,12 +42,12 @@ class CameraCheck:
 
     @property
     def score(self) -> float:
-        """0 to 1, to rank cameras by: the share that is seen, reduced where colours fit little better than random."""
+        """Score in [0, 1] to rank cameras by: the share seen, less where colours fit little better than at random."""
         return self.share_seen * (1.0 if np.isnan(self.color_ratio) else max(0.0, 1 - self.color_ratio))
 
     @property
     def description(self) -> str:
-        """The figures in one sentence."""
+        """Description of the measures in one sentence."""
         seen = f"the cameras see {100 * self.share_seen:.0f} % of the Gaussians"
         if np.isnan(self.color_ratio):
             return seen
@@ -61,7 +61,7 @@ def check_cameras(
     images: np.ndarray | None,
     samples: int = _SEEN_SAMPLES,
 ) -> CameraCheck:
-    """Project some valid Gaussians into all views, and compare their colours with ``images [c,h,w,3]``, if any."""
+    """Measure the share of sampled Gaussians that views see, and how well colours fit ``images [c,h,w,3]``, if any."""
     rows = np.flatnonzero(valid)
     rows = rows[:: max(1, len(rows) // samples)]
     points = gaussians.means[rows].astype(np.float64)
@@ -88,11 +88,11 @@ def check_cameras(
 def choose_poses(
     gaussians: Gaussians, valid: np.ndarray, cameras: Cameras, images: np.ndarray | None, convention: Convention
 ) -> tuple[Poses | None, CameraCheck, str | None]:
-    """Choose the convention of the poses that sees most unaligned Gaussians, with colours nearest to the photos.
+    """Choose the pose convention under which the cameras see most Gaussians, with colours nearest to the photos.
 
-    Arguments are as for :func:`check_cameras`, with the cameras under the usual convention. Returns the poses if
-    they are clearly better than the usual ones and all others, otherwise None; the check of the chosen ones; and a
-    note where others see as much as the usual ones.
+    ``cameras`` are in the usual convention; other arguments as for :func:`check_cameras`. Returns the poses, or None if
+    no other convention is clearly better than the usual one; the check of the chosen poses; and a note if others see as
+    much.
     """
     usual = check_cameras(gaussians, valid, cameras, images)
     candidates = [
@@ -112,7 +112,7 @@ def choose_poses(
 
 
 def find_padding(gaussians: Gaussians) -> np.ndarray:
-    """Find equal rows at the origin ``[n]`` bool, with which VolSplat fills its files up."""
+    """Return a mask ``[n]`` of equal rows at the origin, with which VolSplat pads its files."""
     padding = np.zeros(len(gaussians), bool)
     rows = np.flatnonzero((gaussians.means == 0).all(1))
     if len(rows) >= _MIN_PADDING:
@@ -125,10 +125,10 @@ def find_padding(gaussians: Gaussians) -> np.ndarray:
 def choose_cameras(
     inputs: AlignmentInput, camera_file: CameraFile, frames: Sequence[Similarity], why: SceneError
 ) -> tuple[Cameras, CameraFile, list[str]]:
-    """Choose cameras that see the Gaussians: as given, in another frame, or in another convention; with notes.
+    """Choose cameras that see the Gaussians: unchanged, in another frame, or in another convention; with notes.
 
-    ``frames`` are those that a file names; next come those of exporters. SceneError if none of these sees
-    them, with the reason ``why`` there are no pixels.
+    ``frames`` are those that a file names; exporters' usual frames are tried next. If none sees the Gaussians, a
+    SceneError gives ``why`` there are no pixels.
     """
     inputs = replace(inputs, valid=inputs.valid & ~find_padding(inputs.gaussians))
     rows = inputs.gaussians, inputs.valid

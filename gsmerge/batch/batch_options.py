@@ -67,18 +67,18 @@ class BatchOptions(Settings):
             raise ValueError("max_memory: expected engine local; Ray knows the memory of its nodes")
 
     def result_settings(self) -> dict[str, Any]:
-        """Return everything that a result depends on besides the scene's files, as plain values."""
+        """Return all settings that a result depends on, apart from the scene's files, as plain values."""
         settings = self.settings.to_dict()
         del settings["threads"]
         return {"settings": settings, "opacity": self.opacity, "reading": vars(self.hints)}
 
     def name(self) -> str:
-        """Return a digest that is equal for runs that make the same results."""
+        """Return a digest that is equal for runs whose results are the same."""
         return digest({**self.result_settings(), "output": self.output, "cameras": self.cameras, "images": self.images})
 
 
 def with_whole_paths(options: BatchOptions) -> BatchOptions:
-    """Return the options with absolute paths, which mean the same on every node."""
+    """Return the options with absolute paths, which are valid on every node."""
     settings = options.settings
     if settings.checkpoint not in CHECKPOINTS:
         settings = replace(settings, checkpoint=os.path.abspath(settings.checkpoint))

@@ -29,17 +29,17 @@ SCENE_PARTS = SCENE_NAMES | set(IMAGE_PLACES)
 
 
 class Work(Protocol):
-    """Work on a scene other than compacting it with the settings of the batch."""
+    """Other work on a scene than compacting it with the batch's settings."""
 
     @property
     def settings(self) -> CompactOptions:
-        """Settings that the time is estimated from."""
+        """Settings from which the time is estimated."""
 
     def key(self, options: BatchOptions) -> str:
-        """Digest everything that the result depends on."""
+        """Return a digest of everything that the result depends on."""
 
     def run(self, files: SceneFiles, options: BatchOptions, out: Path) -> tuple[dict[str, Any], list[Path]]:
-        """Do the work, and return the report, with the keys of a record's, and the written files."""
+        """Do the work; return the report, with the keys of a record, and the files written."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Job:
 
     @property
     def memory(self) -> int:
-        """Bytes that the scene may take, within a factor of about two."""
+        """Estimated memory of the scene in bytes, within a factor of about two."""
         return memory_bytes(self.num_gaussians, photos=True, num_rest=self.num_rest)
 
 
@@ -66,13 +66,12 @@ def find_jobs(
     results: Collection[str] = (),
     unreadable: list[SceneError] | None = None,
 ) -> list[Job]:
-    """List all scenes, each once, and where their results go in the output folder.
+    """List all scenes, each once, with the names of their results in the output folder.
 
-    ``arguments`` are folders, which are searched except for ``out``; patterns; ``.ply`` files; text files with one of
-    these per line. ``results`` are the real paths of former results, which are no scenes. ``unreadable`` receives the
-    errors of folders inside the given ones that cannot be read. SceneError if something does not exist, has no scene
-    or, without ``unreadable``, cannot be read; UsageError if two scenes would be written to one file, or one over
-    another.
+    ``given`` are folders (``out`` is not searched), patterns, ``.ply`` files, and text files with one of these per
+    line. ``own`` has the real paths of former results, which are not scenes. ``unreadable`` collects the errors of
+    sub-folders that cannot be read; without it they are raised. SceneError if something does not exist or has no scene;
+    UsageError if two scenes would be written to one file, or one over another.
     """
     jobs: list[Job] = []
     owners: dict[str, str] = {}
@@ -99,12 +98,12 @@ def find_jobs(
 
 
 def result_names(output: str, options: BatchOptions) -> list[str]:
-    """Return the names of a result and of its further levels of detail."""
+    """Return the file names of a result and of its coarser levels."""
     return [output, *(str(level_output(Path(output), level)) for level in range(1, options.settings.budget.levels))]
 
 
 def main_file(scene: Path) -> Path:
-    """Find the file that identifies a scene; the folder itself where several files could."""
+    """Find the file that identifies a scene; the folder itself if several files could."""
     if not os.path.isdir(scene):
         return scene
     plys = other_plys(scene)
@@ -129,7 +128,7 @@ def find_scenes(
     out: Path,
     unreadable: list[SceneError] | None = None,
 ) -> Iterator[Path]:
-    """Yield the scenes of the arguments, in their order and sorted within each; some may come twice.
+    """Yield the scenes among the arguments, in order, sorted within each; a scene may come twice.
 
     ``unreadable`` receives the errors of folders inside the arguments that cannot be read; without
     it, the first of them is raised. SceneError if an argument does not exist, has no scene or too

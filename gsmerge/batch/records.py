@@ -36,7 +36,7 @@ class DoneResult:
     worse: str | None = None  # that it shows its photos worse than its input
 
     def holds(self, folder: Path, key: str) -> bool:
-        """Return whether content and settings are the same, and every file is unchanged."""
+        """Return whether the key is the same and every file of the result is unchanged."""
         paths = [folder / name for name, _ in self.files]
         try:
             if self.key != key or not paths or not all(path.is_file() for path in paths):  # a pipe would never end
@@ -48,7 +48,7 @@ class DoneResult:
 
 @dataclass
 class RecordIndex:
-    """The results in a folder, updated by reading the lines that any process has added."""
+    """Index of the finished results in a folder, updated with records that any process has added."""
 
     folder: Path  # the output folder
     end: int = 0  # byte up to which its records are read
@@ -56,7 +56,7 @@ class RecordIndex:
     damaged: int = 0  # lines that could not be read
 
     def read_on(self) -> None:
-        """Read the lines that were added since the last call."""
+        """Read the records added since the last call."""
         for end, value in each_line(self.folder / RECORDS, self.end):
             self.end = end
             if value is None or not is_record(value):
@@ -76,7 +76,7 @@ class RecordIndex:
 
 
 def is_record(value: Mapping[str, Any]) -> bool:
-    """Return whether a line is a valid record: anybody may have written it."""
+    """Return whether a parsed line is a valid record."""
     try:
         texts = [value["scene"], value["output"]]
         texts += [text for file in value["files"] for text in (file["path"], file["sha256"])]
@@ -118,14 +118,14 @@ def row_of(record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def record(status: str, scene: str, output: str, **facts: Any) -> dict[str, Any]:
-    """Make a record with the keys of every line, and ``facts``."""
+    """Make a record: the keys of every record, and ``facts``."""
     blank: dict[str, Any] = {"key": None, "files": [], "attempt": 1, "error": None, "report": None}
     place = {"host": socket.gethostname(), "pid": os.getpid()}
     return {**document_head(), "status": status, "scene": scene, "output": output, **blank, **place, **facts}
 
 
 def check_folder(folder: Path) -> None:
-    """Make the output folder; SceneError if records cannot be written to it."""
+    """Make the output folder, and check that records can be written to it; SceneError if not."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with (folder / RECORDS).open("ab"):
@@ -153,7 +153,7 @@ class Totals:
     failures: list[tuple[str, str]] = field(default_factory=list)  # the first scenes that failed, and why
 
     def add(self, record: Mapping[str, Any]) -> None:
-        """Count a scene."""
+        """Count the record of one scene."""
         self.counts[record["status"]] += 1
         row = row_of(record)
         worse = row["worse"] or record.get("worse")
@@ -172,12 +172,12 @@ class Totals:
 
     @property
     def ended(self) -> int:
-        """Number of scenes that have ended."""
+        """Number of scenes that have finished or failed."""
         return sum(self.counts.values())
 
 
 def write_summary(folder: Path) -> Path:
-    """Write the newest state of every scene in the folder; SceneError if that fails."""
+    """Write the CSV summary with the newest record of every scene; SceneError if that fails."""
     records, read = folder / RECORDS, -1
     while (size := records.stat().st_size if records.exists() else 0) != read:  # other runs may add to them meanwhile
         rows = [row for _, row in sorted(newest_records(folder, row_of).items())]
@@ -188,7 +188,7 @@ def write_summary(folder: Path) -> Path:
 
 
 def newest_records(folder: Path, keep: Callable[[dict[str, Any]], T]) -> dict[str, T]:
-    """Apply ``keep`` to the newest record of every result, but for a skipped one to its finished record."""
+    """Return ``keep(record)`` of every result's newest record; for a skipped result, of its finished record."""
     newest: dict[str, T] = {}
     done: dict[str, T] = {}
     for _, record in each_line(folder / RECORDS):
@@ -203,7 +203,7 @@ def newest_records(folder: Path, keep: Callable[[dict[str, Any]], T]) -> dict[st
 
 
 def summary_lines(totals: Totals, path: Path | None) -> list[str]:
-    """Format the totals of a run as a table for people."""
+    """Format the totals of a run as lines of a table."""
     worse = [f"worse: {scene}: {why}" for scene, why in totals.worse]
     failed = [f"failed: {scene}: {error}" for scene, error in totals.failures]
     lines = list[str]()

@@ -33,7 +33,7 @@ BUSY_RETRY_SECONDS = 1.0  # until a scene that another run works on is tried aga
 
 @dataclass(frozen=True)
 class Schedule:
-    """The number of scenes that are compacted at once, with their threads and memory."""
+    """How many scenes are compacted at once, with which threads and memory."""
 
     jobs: int  # scenes at once; 0: as many as the cluster has processors for
     threads: int  # of each
@@ -42,7 +42,7 @@ class Schedule:
 
 
 def make_schedule(jobs: Sequence[Job], options: BatchOptions, *, processors: int | None = None) -> Schedule:
-    """Distribute scenes over processors (None: all), one thread each if enough, as many as memory allows."""
+    """Plan how many scenes run at once: one thread each if there are enough scenes, as many as memory allows."""
     processors = available_threads() if processors is None else processors
     threads = options.settings.threads
     if options.engine == "ray":
@@ -61,7 +61,7 @@ def make_schedule(jobs: Sequence[Job], options: BatchOptions, *, processors: int
 
 
 def free_memory() -> int | None:
-    """Return most of the free memory in bytes, for a run to use by default; None if unknown."""
+    """Return the share of free memory, in bytes, that a run uses by default; None if unknown."""
     with suppress(OSError, KeyError, ValueError), open("/proc/meminfo", encoding="ascii") as file:
         values = dict(line.split(":", 1) for line in file)
         return int(FREE_MEMORY_SHARE * int(values["MemAvailable"].split()[0]) * 1024)
@@ -70,7 +70,7 @@ def free_memory() -> int | None:
 
 
 def estimate_seconds(jobs: Sequence[Job], options: BatchOptions, schedule: Schedule) -> float:
-    """Estimate the wall time of scenes, within a factor of about two."""
+    """Estimate the wall time of all scenes in seconds, within a factor of about two."""
 
     total = 0.0
     for job in jobs:
@@ -98,12 +98,12 @@ def run_batch(
     index: RecordIndex | None = None,
     schedule: Schedule | None = None,
 ) -> Generator[dict[str, Any], None, None]:
-    """Compact scenes, each on its own, and skip those that are finished.
+    """Compact scenes one by one or in parallel, skipping finished ones; yield a record for each.
 
-    Each is recorded in ``folder/batch.jsonl`` before its record is yielded, in any order, so that a run that ends
-    at any moment can be continued. Runs with the same settings may share a folder. ``index``, the folder's records,
-    and ``schedule`` are made if they are not given. SceneError if the folder cannot be written, UsageError if a
-    batch with other settings uses it, or the engine is not installed.
+    Each record is appended to ``folder/batch.jsonl`` before it is yielded, in any order, so that an interrupted run can
+    be continued. Runs with the same settings may share a folder. ``index``, the folder's records, and ``schedule`` are
+    made if they are not given. SceneError if the folder cannot be written, UsageError if a batch with other settings
+    uses it, or the engine is not installed.
     """
     schedule = schedule or make_schedule(jobs, options)
     check_folder(folder)
@@ -124,7 +124,7 @@ def run_batch(
 
 
 def dispatch(tasks: Iterator[Task], pool: ProcessPool | RayPool, context: BatchContext) -> Iterator[dict[str, Any]]:
-    """Keep a pool busy until every scene has ended; SceneError if nothing can be recorded."""
+    """Keep a pool busy until all scenes have ended; SceneError if no record can be written."""
     retried: deque[Task] = deque()  # their process died
     busy: deque[tuple[float, Task]] = deque()  # another run works on them; when to try again, and the task
     active = 0

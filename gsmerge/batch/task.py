@@ -48,7 +48,7 @@ RUN_TIMEOUT = 10.0  # seconds: other runs look at the lock of a run for an insta
 
 @dataclass(frozen=True)
 class Task:
-    """A scene to compact, and how often that was tried."""
+    """A scene to compact, with its former result and the number of the attempt."""
 
     job: Job  # the scene
     known: DoneResult | None  # its result of former runs; None without one
@@ -65,9 +65,9 @@ class BatchContext:
 
 
 def run_task(task: Task, context: BatchContext, new_records: RecordIndex) -> dict[str, Any]:
-    """Compact a scene, unless it is done, and return its record; ``new_records`` are those since the run began.
+    """Compact a scene, unless it is done, and return its record; ``new_records``: those since the run began.
 
-    A record that is not written has the ``status`` skipped, busy (another process has the scene), or stuck (records
+    The ``status`` of a record that is not written is skipped, busy (another process has the scene), or stuck (records
     cannot be written).
     """
     job = task.job
@@ -88,13 +88,13 @@ def run_task(task: Task, context: BatchContext, new_records: RecordIndex) -> dic
 
 
 def run_recorded(task: Task, context: BatchContext) -> dict[str, Any]:
-    """Compact a scene in a process that keeps the index of new records from call to call, see :func:`run_task`."""
+    """Compact a scene with an index of new records that the process keeps between calls; see :func:`run_task`."""
     return run_task(task, context, make_index(context.folder, context.start))
 
 
 @lru_cache(maxsize=1)
 def make_index(folder: Path, start: int) -> RecordIndex:
-    """Return the index of records since the run began, one for all calls in a process."""
+    """Return the index of records since the run began; one per process."""
     return RecordIndex(folder, start)
 
 
@@ -167,7 +167,7 @@ def _key_of(job: Job, files: SceneFiles, options: BatchOptions) -> str:
 
 
 def scene_key(files: SceneFiles, options: BatchOptions) -> str:
-    """Digest everything that a result depends on: files, settings, version."""
+    """Return a digest of everything a result depends on: files, settings, version."""
     content: dict[str, Any] = {"scene": content_hash(read_files(files)), **options.result_settings()}
     checkpoint = Path(options.settings.checkpoint)
     if options.settings.checkpoint not in CHECKPOINTS and checkpoint.is_file():  # by its content, wherever it is
@@ -176,7 +176,7 @@ def scene_key(files: SceneFiles, options: BatchOptions) -> str:
 
 
 def is_done(job: Job, done: DoneResult, context: BatchContext) -> bool:
-    """Return whether a result would be skipped."""
+    """Return whether a result is up to date, so that its scene is skipped."""
     try:
         return done.holds(context.folder, _key_of(job, _files_of(job, context.options), context.options))
     except SceneError:
@@ -184,7 +184,7 @@ def is_done(job: Job, done: DoneResult, context: BatchContext) -> bool:
 
 
 def record_failure(task: Task, context: BatchContext, error: str) -> dict[str, Any]:
-    """Record a scene whose process died or took too long, after all retries."""
+    """Record a scene whose process died or timed out, after all retries."""
     failed = record(FAILED, task.job.scene, task.job.output, error=error, attempt=task.attempt)
 
     def work(begun: Path) -> dict[str, Any]:
@@ -196,7 +196,7 @@ def record_failure(task: Task, context: BatchContext, error: str) -> dict[str, A
 
 
 def clean_up(tasks: Iterable[Task], context: BatchContext) -> None:
-    """Remove unfinished files of scenes whose processes were ended on purpose; the next run may where that fails."""
+    """Remove the unfinished files of scenes whose processes were ended on purpose."""
     for task in tasks:
         with suppress(BusyError, SceneError, OSError), scene_lock(context.folder, task.job.output) as begun:
             _clean(task.job, context, begun)
@@ -212,14 +212,14 @@ def _clean(job: Job, context: BatchContext, begun: Path) -> None:
 
 
 class BusyError(Exception):
-    """Another process has the lock."""
+    """Another process holds the lock of the scene."""
 
 
 @contextmanager
 def scene_lock(folder: Path, output: str) -> Iterator[Path]:
-    """Keep other processes from a result while the block runs; BusyError, or SceneError if the lock cannot be made.
+    """Lock a result against other processes in the block; BusyError if it is locked, SceneError if locking fails.
 
-    Yields the file whose presence says that a batch has begun to write the result: a killed one leaves it.
+    Yields the path of a file that marks a result as begun; a killed process leaves it behind.
     """
     name = hashlib.sha256(output.encode(errors="surrogateescape")).hexdigest()[:32]
     with _lock(folder / f"{PREFIX}{name}.lock"):
@@ -228,7 +228,7 @@ def scene_lock(folder: Path, output: str) -> Iterator[Path]:
 
 @contextmanager
 def run_lock(folder: Path, name: str) -> Iterator[None]:
-    """Share the folder only with runs of the same :meth:`BatchOptions.name` in the block.
+    """Lock the folder in the block against runs of another :meth:`BatchOptions.name`.
 
     UsageError if a run of another name uses the folder, SceneError if the lock cannot be made.
     """

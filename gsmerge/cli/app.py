@@ -64,7 +64,7 @@ RESEARCH, ADDED = "Research", "Added by other packages"
 
 
 def make_app(only: str | None = None) -> typer.Typer:
-    """Make the application with all commands, or with one alone, which imports no other."""
+    """Make the application with all commands, or with ``only`` one, which imports no other."""
     made = typer.Typer(
         name=PROGRAM, pretty_exceptions_enable=False, context_settings={"help_option_names": ["-h", "--help"]}
     )

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 def parse_jobs(text: str) -> int:
-    """Parse ``--jobs``: a number, or auto (0)."""
+    """Parse ``--jobs``: a number, or "auto", which gives 0."""
     if text == "auto":
         return 0
     if not text.isdecimal() or int(text) < 1:
@@ -161,7 +161,7 @@ def run_jobs(
     schedule: Schedule,
     lines: TextIO | None = None,
 ) -> None:
-    """Run jobs with progress, count them, and print their records as JSON to ``lines``."""
+    """Run jobs, show progress, count results in ``totals``, and print records as JSON to ``lines``."""
     from gsmerge.batch import run_batch
 
     with (
@@ -179,7 +179,7 @@ def run_jobs(
 
 
 def check_failures(totals: Totals, unit: str) -> None:
-    """Raise a BatchError if a job failed."""
+    """Raise BatchError, with the first reason, if a job failed."""
     num_failed = totals.counts["failed"]
     if num_failed:
         scene, why = totals.failures[0]
@@ -187,7 +187,7 @@ def check_failures(totals: Totals, unit: str) -> None:
 
 
 def pending_jobs(jobs: Sequence[Job], out: Path, options: BatchOptions, index: RecordIndex) -> list[Job]:
-    """List the jobs whose results are not in the folder, or whatever is there if they are to be run again."""
+    """List the jobs without an up-to-date result in the folder; all jobs if results are to be made again."""
     from gsmerge.batch.task import BatchContext, is_done
 
     shared = BatchContext(out, options, 0)
@@ -204,7 +204,7 @@ def print_plan(
     notes: Sequence[str],
     unit: str = "scenes",
 ) -> None:
-    """Print what would be done and how long it would take; ``unit`` says what the jobs are called."""
+    """Print what a run would do and how long it would take; ``unit``: word for the jobs."""
     from gsmerge.batch.schedule import estimate_seconds
     from gsmerge.report import document_head, human_bytes
 

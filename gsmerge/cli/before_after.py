@@ -22,7 +22,7 @@ SAME = 1e-5  # difference of two poses, of 1 and of their numbers, that writing 
 
 
 def lpips_networks(choice: str | None) -> tuple[tuple[str, ...], list[str]]:
-    """Choose the networks of ``--lpips``, or those that are installed, with a note where none is."""
+    """Choose LPIPS networks by ``--lpips``, by default those installed; with a note if none is."""
     from gsmerge.measure.lpips import INSTALL, lpips_available
 
     if choice is None:
@@ -52,7 +52,7 @@ class BeforeAfter:
 
 
 def read_before_after(args: Args, files: SceneFiles, *, alone: bool = False) -> BeforeAfter:
-    """Read the scenes that BEFORE (``files``) and AFTER name, and the views of ``--targets``.
+    """Read the scenes of BEFORE (``files``) and AFTER, and the views of ``--targets``.
 
     A scene that is looked at ``alone`` needs no cameras: views are placed about it.
     """
@@ -88,7 +88,7 @@ def _load(args: Args, files: SceneFiles, alone: bool) -> Loaded:
 
 
 def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras], list[str]]:
-    """Read the moved cameras that ``compact`` wrote into results or beside them, by result; with notes."""
+    """Read the cameras, moved by the fit, that ``compact`` wrote into results or beside them; with notes."""
     import numpy as np
 
     from gsmerge.facts.prepare import scene_depth
@@ -113,7 +113,7 @@ def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras]
 
 
 def require_views(load: Loaded) -> None:
-    """Raise a SceneError for a scene without cameras."""
+    """Raise SceneError if a scene has no cameras."""
     if len(load.scene) == 0:
         problem = "expected cameras to measure from, found none beside it"
         raise SceneError(load.files.ply, problem, "name them with --cameras")
@@ -122,7 +122,7 @@ def require_views(load: Loaded) -> None:
 def held_out_views(
     load: Loaded, targets: Path | None, target_images: Path | None, views: int | None
 ) -> tuple[Scene, Views | None, tuple[str, ...]]:
-    """Choose the context views of ``--views`` and the unseen views; return the scene, the views, and notes."""
+    """Choose the context views of ``--views``, and the held-out views; return scene, held-out views and notes."""
     from gsmerge.facts.views import even_views, midpoint_views, subset
     from gsmerge.scene.held_out import read_held_out
 
@@ -147,7 +147,7 @@ def held_out_views(
 
 
 def file_names(paths: Sequence[Path]) -> list[str]:
-    """Name each file by its own name where no two are alike, otherwise by its path; UsageError on repetitions."""
+    """Name each file uniquely: by file name if all differ, otherwise by path; UsageError for repeated files."""
     if len(set(paths)) < len(paths):
         raise UsageError(f"expected every result once, got {max(paths, key=paths.count)} twice")
     short = [path.name for path in paths]

@@ -147,7 +147,7 @@ def _warn_of_memory(files: SceneFiles, settings: CompactOptions, *, quiet: bool)
 
 
 def print_plan(args: opt.Args, files: SceneFiles, settings: CompactOptions, out: Path, hints: ReadHints) -> None:
-    """Print an estimate of what compact or encode would make of a scene."""
+    """Print an estimate of what ``compact`` or ``encode`` would make of a scene."""
     from gsmerge.compaction.files import check_saved_cameras, read_input
     from gsmerge.compaction.methods import check_method
     from gsmerge.fit.gpu import choose_backend

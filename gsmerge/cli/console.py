@@ -18,13 +18,13 @@ MAX_LINE = 5000  # characters
 
 
 def one_line(text: str) -> str:
-    """Escape what a terminal cannot print in text from files or names, and shorten it to one line."""
+    """Escape text from files or names for a terminal, and shorten it to one line."""
     clean = text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
     return clean if len(clean) <= MAX_LINE else f"{clean[: MAX_LINE // 2]} ... {clean[-MAX_LINE // 2 :]}"
 
 
 def say(message: str, *, quiet: bool = False) -> None:
-    """Print one status line on stderr unless ``quiet``; a closed stderr is no reason to stop."""
+    """Print one status line on stderr unless ``quiet``; ignore a closed stderr."""
     if not quiet:
         with suppress(OSError):
             print(one_line(message), file=sys.stderr, flush=True)
@@ -56,7 +56,7 @@ def _columns(stream: Any) -> int | None:
 
 
 def wrap_line(line: str, columns: int | None) -> list[str]:
-    """Break a line between words at ``columns`` (None: not at all), with further lines below its first value."""
+    """Break a line between words at ``columns`` (None: never), indenting the further lines to the first value."""
     if columns is None or len(line) <= columns:
         return [line]
     label = re.match(r" *\S+(?: \S+)?  +|note: ", line)
@@ -67,7 +67,7 @@ def wrap_line(line: str, columns: int | None) -> list[str]:
 def print_document(
     document: Mapping[str, Any], lines: Sequence[str] | str, *, as_json: bool, quiet: bool = False, wrap: bool = False
 ) -> None:
-    """Print a result on stdout: as JSON, or as lines for people unless ``quiet``; ``wrap`` fits them to a terminal."""
+    """Print a result on stdout as JSON or, unless ``quiet``, as lines; ``wrap``: break lines for a terminal."""
     from gsmerge.report import to_json
 
     if as_json:
@@ -80,7 +80,7 @@ def print_document(
 
 @contextmanager
 def plain_warnings() -> Iterator[None]:
-    """Print warnings as one line each in a block, without the place in the code that raised them."""
+    """Print warnings in the block as one line each, without their place in the code."""
 
     def show(message: Warning | str, *_: Any, **__: Any) -> None:
         say(f"gsmerge: warning: {message}")
@@ -103,7 +103,7 @@ def _terminal(*, quiet: bool) -> Any:
 
 @contextmanager
 def stage_progress(*, quiet: bool) -> Iterator[Progress]:
-    """Show a progress bar per stage on stderr, unless quiet or without a terminal (``FORCE_COLOR`` makes one).
+    """Show a progress bar per stage on stderr, if it is a terminal (or ``FORCE_COLOR`` is set) and not ``quiet``.
 
     Yields ``(stage, done, total) -> None``; a stage is done when the next one begins.
     """
@@ -147,7 +147,7 @@ def stage_progress(*, quiet: bool) -> Iterator[Progress]:
 
 @contextmanager
 def separate_stdout(engine: str, *, quiet: bool) -> Iterator[None]:
-    """Keep Ray's own lines on stdout, about processes that were lost, apart from our lines in a block."""
+    """Keep Ray's messages about lost processes on separate lines of stdout in the block."""
     if engine != "ray":
         yield
         return

@@ -48,22 +48,20 @@ SETTINGS = {
 
 
 class Args(SimpleNamespace):
-    """The arguments and options of a command by name; values of choices are plain strings."""
+    """Arguments and options of a command, by name; values of choices are plain strings."""
 
     @property
     def silent(self) -> bool:
-        """Whether only data may be printed."""
+        """Whether to print data only."""
         return bool(self.quiet or self.json)
 
     def given(self, names: Iterable[str]) -> dict[str, Any]:
-        """Return the named options that were given."""
+        """Return those of the named options that the user gave."""
         values = vars(self)
         return {name: values[name] for name in names if values.get(name) is not None}
 
     def make(self, *kinds: type, **changes: Any) -> list[Any]:
-        """Make settings of the dataclasses ``kinds`` from options, ``--set`` and fixed ``changes``; UsageError if
-        wrong.
-        """
+        """Make settings of the classes ``kinds`` from options, ``--set`` and ``changes``; UsageError for wrong ones."""
         values = self.values(*kinds, but=changes) | changes
         settings = [{name: values[name] for name in flat_settings(kind) if name in values} for kind in kinds]
         with usage_errors():
@@ -73,7 +71,7 @@ class Args(SimpleNamespace):
             ]
 
     def values(self, *kinds: type, but: Collection[str] = ()) -> dict[str, Any]:
-        """Collect the settings of these kinds that were given, by flat name, without the names in ``but``."""
+        """Collect the user's settings of the classes ``kinds`` by flat name, leaving out the names in ``but``."""
         settings = {name: setting for kind in kinds for name, setting in flat_settings(kind).items() if name not in but}
         options = self.given(settings)
         chosen = parse_pairs("--set", vars(self).get("set") or (), settings)
@@ -82,18 +80,18 @@ class Args(SimpleNamespace):
         return options | chosen
 
     def settings(self, **changes: Any) -> CompactOptions:
-        """Make the library's options, as :meth:`make` does."""
+        """Make the options of :func:`gsmerge.compact`, as :meth:`make` does."""
         made: CompactOptions = self.make(CompactOptions, **changes)[0]
         return made
 
     @property
     def opacity(self) -> OpacityChoice:
-        """Storage of opacities in the file, from ``--hint``."""
+        """Encoding of opacities in the file, from ``--hint``."""
         choice: OpacityChoice = self._parse_hints().get("opacity", "auto")
         return choice
 
     def hints(self, **defaults: Any) -> ReadHints:
-        """Make the hints on how to read the scene, on top of ``defaults``; UsageError for an unknown name or value."""
+        """Make the hints for reading the scene, on top of ``defaults``; UsageError for an unknown name or value."""
         from gsmerge.scene.exporters import find_exporter
 
         values = {name: value for name, value in self._parse_hints().items() if name != "opacity"}
@@ -105,7 +103,7 @@ class Args(SimpleNamespace):
         return parse_pairs("--hint", self.hint or (), flat_settings(FileHints))
 
     def files(self, scene: Path, *more: Path) -> SceneFiles:
-        """Find the .ply, cameras and photos of a scene, and of others to join with it.
+        """Find the .ply, cameras and photos of a scene, and of further scenes to join with it.
 
         Cameras and photos are the named ones, or those beside each.
         """
@@ -116,14 +114,14 @@ class Args(SimpleNamespace):
         return replace(first, more=tuple(others))
 
     def load(self, files: SceneFiles, **defaults: Any) -> Loaded:
-        """Read the scene of these files; ``defaults`` are hints that the user may override."""
+        """Read the scene of ``files``; ``defaults``: hints that the user may override."""
         from gsmerge.scene.read import load_files
 
         return load_files(files, opacity=self.opacity, hints=self.hints(**defaults))
 
 
 def parse_pairs(flag: str, pairs: Iterable[str], settings: Mapping[str, Setting]) -> dict[str, Any]:
-    """Parse the NAME=VALUE of ``--set`` or ``--hint``, as JSON where that fits; UsageError if one is wrong."""
+    """Parse NAME=VALUE pairs of ``--set`` or ``--hint``, values as JSON where possible; UsageError if one is wrong."""
     values: dict[str, Any] = {}
     for pair in pairs:
         name, sign, text = pair.partition("=")
@@ -147,7 +145,7 @@ def parse_pairs(flag: str, pairs: Iterable[str], settings: Mapping[str, Setting]
 
 @contextmanager
 def usage_errors() -> Iterator[None]:
-    """Turn a value that the library refuses into wrong usage of the command."""
+    """Turn a ValueError of the library in the block into a UsageError."""
     try:
         yield
     except ValueError as error:
@@ -163,10 +161,10 @@ def argument(name: str, kind: Any, metavar: str, help: str, default: Any = REQUI
 def option(
     name: str, kind: Any, help: str, *flags: str, default: Any = None, wording: str | None = None, **more: Any,
 ) -> Parameter:  # fmt: skip
-    """Declare an option; ``kind`` bool is a switch, a tuple lists the possible values.
+    """Declare an option of a command; ``kind`` bool makes a switch, a tuple lists the possible values.
 
-    ``flags`` are needed where they are not made of the name. ``wording`` is the default in help, where the library
-    decides it; ``more`` goes to Typer.
+    ``flags``: needed if they cannot be derived from the name. ``wording``: the default in words, if the library decides
+    it; ``more`` goes to Typer.
     """
     flags = flags or (f"--{name.replace('_', '-')}",)
     if isinstance(kind, tuple):
@@ -179,7 +177,7 @@ def option(
 
 
 def setting_option(name: str, *flags: str, **more: Any) -> Parameter:
-    """Declare an option that is a setting of the library, as it is declared there; ``more`` goes to :func:`option`."""
+    """Declare an option for a setting of the library, with its help and values; ``more`` goes to :func:`option`."""
     declared = SETTINGS[name]
     kinds = [kind for kind in declared.kinds if kind is not NoneType]
     kind: Any = str if len(kinds) > 1 or (kinds and declared.words) else kinds[0] if kinds else declared.words
@@ -193,19 +191,19 @@ def setting_option(name: str, *flags: str, **more: Any) -> Parameter:
 
 
 def switch(name: str, help: str, *short: str, **more: Any) -> Parameter:
-    """Declare an option without a value, off where it is not given."""
+    """Declare a switch: an option without a value, off by default."""
     return option(name, bool, help, f"--{name.replace('_', '-')}", *short, default=False, **more)
 
 
 def panel(title: str, *parameters: Parameter) -> tuple[Parameter, ...]:
-    """Group options under a title in help."""
+    """Group options under a title in the help."""
     for parameter in parameters:
         get_args(parameter.annotation)[1].rich_help_panel = title
     return parameters
 
 
 def changed(name: str, default: Any = None, **changes: Any) -> Parameter:
-    """Change a declared option for one command: its default, ``help``, ``show_default``, ``hidden``, ..."""
+    """Copy a declared option with changes for one command: default, ``help``, ``show_default``, ``hidden``, ..."""
     return _change(OPTIONS[name], **changes).replace(default=default)
 
 
@@ -223,7 +221,7 @@ def _escape(help: str) -> str:
 
 
 def command(*parameters: str | Parameter, rare: str = "") -> Callable[[Callable[[Args], None]], Callable[..., None]]:
-    """Give a command its parameters in the order of help; ``rare`` names are shown by ``--help-all`` alone."""
+    """Decorate a command with its parameters in the order of the help; ``rare`` ones show only in ``--help-all``."""
     listed: dict[str, Parameter] = {}
     for parameter in (*parameters, "json quiet", *(["help_all"] if rare else [])):
         for name in parameter.split() if isinstance(parameter, str) else [parameter.name]:
@@ -254,7 +252,7 @@ def _show_all(context: typer.Context, value: bool) -> None:
 
 
 def number_or_text(text: str) -> int | str:
-    """Parse ``--k`` or ``--superpixels``: a number, or a word that the library knows."""
+    """Parse ``--k`` or ``--superpixels``: a number, or a word such as "auto"."""
     return int(text) if text.isdecimal() else text
 
 
@@ -339,5 +337,5 @@ OPTIONS = {parameter.name: parameter for parameters in _TABLE for parameter in p
 
 
 def output(help: str, wording: str | None = None, default: Any = None) -> Parameter:
-    """Declare ``-o/--output`` of a command: its result, a file or a folder; ``default`` may be REQUIRED."""
+    """Declare ``-o/--output`` of a command, a file or a folder; ``default`` may be REQUIRED."""
     return changed("output", default, help=help, show_default=wording or default is not REQUIRED)

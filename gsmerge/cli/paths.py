@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FileOptions(Settings):
-    """How a result is written."""
+    """Options for writing a result."""
 
     normals: bool = setting(True, "Write the three columns of zeros that some viewers want of a `.ply`, 12 of its 68 "
         "bytes per Gaussian; a `budget` in bytes counts them.")  # fmt: skip
@@ -31,12 +31,12 @@ class FileOptions(Settings):
 
 
 def default_output(ply: Path) -> Path:
-    """Name the result of a scene: ``scene.ply`` -> ``scene.compact.ply`` beside it."""
+    """Return the default path of a result: ``scene.ply`` -> ``scene.compact.ply`` beside it."""
     return ply.with_name(f"{ply.stem}.compact.ply")
 
 
 def is_index(output: Path) -> bool:
-    """Return whether an output is the index of levels that stream, whose folder is made for it."""
+    """Return whether an output is the index of a Streamed SOG, whose folder is made if missing."""
     from gsmerge.io.formats.streamed import INDEX
 
     return output.name == INDEX
@@ -45,7 +45,7 @@ def is_index(output: Path) -> bool:
 def check_format(
     output: Path, options: FileOptions, budget: BudgetOptions | None = None, *, levels: bool = False
 ) -> None:
-    """Refuse an output in a format that cannot be written, or that the options or a budget in bytes do not fit.
+    """Raise UsageError if an output's format cannot be written, or does not fit the options or a budget in bytes.
 
     ``levels``: it may be an index of levels. UsageError for an unknown ending, a missing package, a version of
     ``.spz`` or a size in bytes for another format.
@@ -60,7 +60,7 @@ def check_format(
 
 
 def check_embedding(output: Path, budget: BudgetOptions) -> None:
-    """Refuse cameras in a format without comments, or on top of a size in bytes."""
+    """Raise UsageError for embedding cameras in a format without comments, or together with a size in bytes."""
     if output.suffix.lower() != ".ply":
         raise UsageError(f"--embed-cameras: expected an output as .ply, got {output.name}; use --save-cameras FILE")
     if budget.in_bytes:
@@ -72,7 +72,7 @@ def check_embedding(output: Path, budget: BudgetOptions) -> None:
 def check_outputs(
     outputs: Sequence[Path | None], inputs: Sequence[Path | None], *, overwrite: bool, made: Path | None = None
 ) -> None:
-    """Refuse an output file that is an input, exists without ``overwrite``, is named twice, or has no folder.
+    """Raise UsageError for an output that is an input, exists without ``overwrite``, comes twice, or has no folder.
 
     ``inputs`` are files that are read, and folders of photos: no photo is replaced. ``made``: a folder that is made
     for the outputs if it is missing.
@@ -115,7 +115,7 @@ def _check_output(output: Path, inputs: set[str], *, overwrite: bool, made: Path
 
 
 def is_camera_file(path: Path) -> bool:
-    """Return whether a file has cameras, as the one beside a result in another format has."""
+    """Return whether a file holds cameras, such as ``compact`` writes beside a result."""
     from gsmerge.io.cameras.read import read_cameras
 
     try:
@@ -125,18 +125,18 @@ def is_camera_file(path: Path) -> bool:
 
 
 def input_files(files: SceneFiles) -> tuple[Path, ...]:
-    """List the files of Gaussians, cameras and photos that are read."""
+    """List the files of Gaussians, cameras and photos that reading the scene uses."""
     paths = tuple(path for path in (*files.plys, files.cameras, files.images, files.masks) if path is not None)
     return (*paths, *(path for scene_files in files.more for path in input_files(scene_files)))
 
 
 def checkpoint_files(checkpoint: str) -> tuple[Path, ...]:
-    """Return the file that ``checkpoint`` names; none where it is one of the package's own names."""
+    """Return the file of a checkpoint; empty if ``checkpoint`` is a name from the package."""
     return () if checkpoint in CHECKPOINTS else (Path(checkpoint),)
 
 
 def write_texts(texts: Mapping[Path, str], *, overwrite: bool) -> None:
-    """Write text files, all of them or none."""
+    """Write text files: all of them, or none."""
     from gsmerge.io import atomic_outputs
 
     with atomic_outputs(overwrite=overwrite) as add:
@@ -145,7 +145,7 @@ def write_texts(texts: Mapping[Path, str], *, overwrite: bool) -> None:
 
 
 def check_folder(folder: Path, inputs: tuple[Path, ...], *, overwrite: bool) -> None:
-    """Refuse an output folder that holds files, unless ``overwrite``, or the photos, or that cannot be written.
+    """Raise UsageError for an output folder that holds files (unless ``overwrite``) or photos, or is not writable.
 
     The folder is made with the first file in it, so that a run that fails before leaves none.
     """

@@ -52,11 +52,11 @@ SURPLUS = 1.03  # times an exact number of Gaussians: the faintest of what is to
 
 
 def compact_in_blocks(scene: Scene, options: CompactOptions, whole: WholePlan) -> CompactResult:
-    """Compact an aligned scene in blocks of views, as many as its plan says.
+    """Compact an aligned scene in blocks of views; the plan of the whole scene sets how many.
 
-    The views of each block are merged first, and of the Gaussians those are kept that belong to it, so that all blocks
-    together have one set of Gaussians to start with. Then each block fits what its views see, its neighbours'
-    Gaussians included, and keeps its own: where two blocks meet, both fit the same Gaussians to the same photos.
+    The views of each block are merged first, and only the Gaussians that belong to the block are kept, so that all
+    blocks together start from one set of Gaussians. Then each block fits what its views see, its neighbours' Gaussians
+    included, and keeps its own: where two blocks meet, both fit the same Gaussians to the same photos.
     """
     device, scene = scene.gaussians.device, scene.numpy()
     count, most = whole.blocks, whole.limits.count
@@ -105,7 +105,7 @@ def compact_in_blocks(scene: Scene, options: CompactOptions, whole: WholePlan) -
 
 
 def adopt_records(outcomes: Iterable[tuple[T, Record]]) -> Iterator[tuple[T, dict[str, Any]]]:
-    """Yield the values and choices of parts of the work, whose seconds and notes enter the current record."""
+    """Yield each value with the choices of its record; add the record's seconds and notes to the current record."""
     for value, record in outcomes:
         add_seconds(record.seconds)
         for text in record.notes:
@@ -115,7 +115,7 @@ def adopt_records(outcomes: Iterable[tuple[T, Record]]) -> Iterator[tuple[T, dic
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A block between merging and fit."""
+    """A block whose views are merged but whose Gaussians are not fitted yet."""
 
     block: Block
     gaussians: Gaussians  # canonical ones that belong to it
@@ -126,7 +126,7 @@ class Part:
 
 
 def start_part(piece: Scene, block: Block, covisibility: Covisibility, options: CompactOptions, frame: Frame) -> Part:
-    """Merge the views of a block, and keep what belongs to it of the Gaussians that its fit starts with."""
+    """Merge the views of a block, and keep the start Gaussians that belong to the block."""
     prepared = prepare(piece, options.prepare, frame)
     plan = make_plan(prepared, options)
     decoded = start(prepared, plan, plan.limits.count)
@@ -137,7 +137,7 @@ def start_part(piece: Scene, block: Block, covisibility: Covisibility, options: 
 
 
 def without_gaussians(prepared: Prepared) -> Prepared:
-    """Return a prepared scene without the Gaussians of its pixels."""
+    """Return a prepared scene without Gaussians, to free their memory."""
 
     def bare(scene: Scene) -> Scene:
         return replace(scene, gaussians=scene.gaussians[np.zeros(0, int)], pixel_ids=None, missing=None)
@@ -146,9 +146,10 @@ def without_gaussians(prepared: Prepared) -> Prepared:
 
 
 def fit_part(part: Part, everything: tuple[Gaussians, np.ndarray], number: int, growth: float) -> Gaussians:
-    """Fit the canonical Gaussians of all blocks that a block's views may see, and return those of block ``number``.
+    """Fit all Gaussians that a block's views may see, and return the fitted ones that belong to block ``own``.
 
-    ``everything``: the Gaussians and the number of each one's block. ``growth``: of their number in the fit.
+    ``everything``: canonical Gaussians of all blocks, and the block of each. ``growth``: final number of Gaussians, as
+    a multiple of the number at the start.
     """
     (joined, owners), scene, plan = everything, part.prepared.scene, part.plan
     used = owners == number
@@ -164,14 +165,15 @@ def fit_part(part: Part, everything: tuple[Gaussians, np.ndarray], number: int, 
 
 
 def score_part(part: Part, gaussians: Gaussians) -> float | None:
-    """Measure the PSNR of some of a block's photos from the whole result; None without photos."""
+    """Measure the PSNR (dB) of the whole result on a block's scored photos; None without photos."""
     return measure_psnr("score", gaussians, part.prepared.result_views(), part.prepared, part.plan)
 
 
 def fit_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[Part], seed: int) -> Gaussians:
-    """Fit what views of several blocks show, once more, to all photos that show it; all else stays as it is.
+    """Fit the Gaussians at seams, which views of several blocks show, once more to the photos that show them.
 
-    Until here each Gaussian was fitted beside its neighbours as its own block has them, not as they are.
+    The other Gaussians stay as they are. Before this step a Gaussian was fitted beside its own block's version of the
+    neighbouring Gaussians, not beside the final ones.
     """
     plan = next((part.plan for part in parts if part.plan.fit.fit != "none"), None)
     if plan is None:
@@ -202,7 +204,7 @@ def fit_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[Part], seed
 
 
 def find_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[Part]) -> tuple[np.ndarray, list[list[int]]]:
-    """Return which of n Gaussians are at seams, ``[n]``, and for each block its own views whose photos show many."""
+    """Return a mask ``[n]`` of Gaussians at seams and, for each block, its own views whose photos show many of them."""
     total, foreign, seen = np.zeros(len(joined)), np.zeros(len(joined)), []
     splats = prepare_splats(joined)
     for number, part in enumerate(parts):
@@ -228,12 +230,12 @@ def find_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[Part]) -> 
 
 
 def free_scene(scene: Scene) -> None:
-    """Take what is in files of a scene's arrays out of memory."""
+    """Release the memory of a scene's arrays that :func:`gsmerge.runtime.memory.make_array` keeps in files."""
     free_pages([*vars(scene.gaussians).values(), *([] if scene.images is None else [scene.images])])
 
 
 def with_whole_choices(options: CompactOptions, whole: WholePlan) -> CompactOptions:
-    """Return the options with the steps of a fit of the whole, which blocks share by their views, and its networks."""
+    """Return options with the fit steps and the networks that the plan of the whole scene chose."""
     checkpoint = options.checkpoint if whole.checkpoint != "none" else "none"
     settings: dict[str, Any] = {"fit_steps": whole.fit.steps, "checkpoint": checkpoint}
     if options.blocks.engine.name != "local" and os.path.isfile(options.checkpoint):
@@ -245,10 +247,10 @@ def with_whole_choices(options: CompactOptions, whole: WholePlan) -> CompactOpti
 def block_options(
     options: CompactOptions, scene: Scene, block: Block, factor: float, most: int | None
 ) -> CompactOptions:
-    """Return the options of a block: cameras and exposures stay, and ``factor`` times its share of the Gaussians.
+    """Return the options of one block: the whole scene's, with ``factor`` times the block's share of the Gaussians.
 
-    It has a share of the steps, too, so that each view is looked at as often as in one piece, and as many of them on
-    half-size photos. ``most``: Gaussians of all blocks together, None: as many as
+    Cameras and exposures stay fixed. The block gets its share of the steps, too, and of those on half-size photos, so
+    that each view is fitted as often as in one piece. ``most``: Gaussians of all blocks together; None: as many as
     ``superpixels`` and K give.
     """
     settings: dict[str, Any] = {"poses": "fixed", "exposure": "fixed", "blocks": "none", "budget": None}
@@ -267,9 +269,9 @@ def block_options(
 
 
 def belongs_to_block(means: np.ndarray, block: Block, covisibility: Covisibility) -> np.ndarray:
-    """Return which of n means ``[n,3]`` belong to a block: of all views that see one, its nearest is the block's own.
+    """Return a mask ``[n]`` of means ``[n,3]`` whose nearest seeing view is one of the block's own views.
 
-    Every view that sees something of the block counts.
+    The views considered are those that share surfaces with the block.
     """
     sees = covisibility.weights[list(block.own)].sum(0) > 0
     sees[list(block.own)] = True
@@ -280,7 +282,7 @@ def belongs_to_block(means: np.ndarray, block: Block, covisibility: Covisibility
 def join_reports(
     scene: Scene, gaussians: Gaussians, parts: Sequence[Part], scores: Sequence[float | None], options: CompactOptions
 ) -> CompactReport:
-    """Report the whole: PSNR of the blocks weighted by their views, seconds added up, notes of all."""
+    """Report the whole scene: PSNR as the mean over blocks weighted by views, sums of seconds, all notes."""
     run, sizes = current_record(), [len(part.block.own) for part in parts]
 
     def mean(values: Sequence[float | None]) -> float | None:

@@ -49,7 +49,7 @@ def compact(
 
 
 def compact_piece(scene: Scene, options: CompactOptions) -> CompactResult:
-    """Compact a scene as a whole."""
+    """Compact a scene in one piece."""
     method = choose_method(options, scene, build)  # ours, or a baseline
     prepared = prepare(scene.numpy(), options.prepare)  # facts: frame, photos, poses, unseen
     plan = make_plan(prepared, options)  # every "auto" is decided once; options end here
@@ -63,6 +63,6 @@ def compact_piece(scene: Scene, options: CompactOptions) -> CompactResult:
 
 @record_part()
 def build_scored(method: Build, prepared: Prepared, plan: Plan, count: int | None) -> Candidate:
-    """Build the given number of Gaussians, clean them as asked, and score them, with their own record."""
+    """Build ``count`` Gaussians with a method, clean them up as the plan says, and score them."""
     fitted = clean_to_count(partial(method, prepared, plan), count, plan.clean, prepared)
     return score(count, fitted, prepared, plan)

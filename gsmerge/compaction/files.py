@@ -52,14 +52,14 @@ def compact_files(
 ) -> dict[str, Any]:
     """Read a scene, compact it, and write result, levels, cameras and report: all files or none.
 
-    ``out``: its name chooses the format; a ``lod-meta.json`` has all levels, in chunks beside it.
-    ``hashed``: hash the input for the report. ``seconds_before``: wall time by name of the caller's
-    earlier steps. ``cameras_path``, ``saved_cameras``: files for the views, for viewers and as
-    ``transforms.json`` with all intrinsics; the former may be there with the same content, beside
-    a result in another format. ``embed_cameras``: also write them into the header of a ``.ply``.
-    Returns the report, see :func:`gsmerge.report.report_document`. Raises SceneError if the scene
-    cannot be read or the result cannot be written, UsageError if the settings need what the scene
-    does not have.
+    The name of ``out`` chooses the format; a ``lod-meta.json`` holds all levels, in chunks beside it. ``hashed``: hash
+    the input for the report. ``seconds_before``: wall time by name of the caller's earlier steps. ``cameras_path``:
+    camera file for viewers; it may exist already with the same content, beside a result in another format.
+    ``saved_cameras``: ``transforms.json`` with all intrinsics. ``embed_cameras``: also write the cameras into the
+    header of a ``.ply``.
+
+    Returns the report, see :func:`gsmerge.report.report_document`. Raises SceneError if the scene cannot be read or the
+    result cannot be written, UsageError if the settings need what the scene does not have.
     """
     start = perf_counter()
     streamed = output_format(out, spz_version, levels=True).ending == INDEX
@@ -167,7 +167,7 @@ def read_input(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: Rea
 
 
 def check_saved_cameras(scene: Scene, path: Path | None, *, embed: bool = False) -> None:
-    """Refuse a file for the cameras of a scene without any, or to embed them."""
+    """Raise UsageError if cameras are to be written and the scene has none, or too many to embed."""
     if len(scene) == 0 and (path is not None or embed):
         option = "--embed-cameras" if path is None else f"--save-cameras {path}"
         raise UsageError(f"{option}: expected a scene with cameras, got none")

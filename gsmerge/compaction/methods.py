@@ -26,7 +26,7 @@ COMMON_SETTINGS = {"method", "seed", "threads", "crop", "drop_floaters", "drop_s
 
 @dataclass(frozen=True)
 class Method:
-    """One other method.
+    """A method besides our own, such as a baseline.
 
     Args:
         name: As on the command line.
@@ -50,7 +50,7 @@ class Method:
 
 
 def find_method(options: CompactOptions) -> Method | None:
-    """Load the method of the options; None for our own. A UsageError if a program is missing."""
+    """Load the method that the options name; None for our own. Raises UsageError if a program is missing."""
     if options.method == "gsmerge":
         return None
     method: Method = load_plugin(METHODS, options.method)
@@ -59,9 +59,9 @@ def find_method(options: CompactOptions) -> Method | None:
 
 
 def check_method(options: CompactOptions, scene: Scene) -> tuple[Method | None, list[str]]:
-    """Find the method of the options, and a note on changed settings that it does not use.
+    """Load the method that the options name, and note changed settings that the method ignores.
 
-    A UsageError if the scene does not have what it needs, or a program is missing.
+    Raises UsageError if the scene lacks what the method needs, or a program is missing.
     """
     method = find_method(options)
     if method is None:
@@ -77,7 +77,7 @@ def check_method(options: CompactOptions, scene: Scene) -> tuple[Method | None, 
 
 
 def choose_method(options: CompactOptions, scene: Scene, ours: Build) -> Build:
-    """Choose the builder of the Gaussians: ``ours`` or another method's, with a note on settings it does not use.
+    """Choose the function that builds the Gaussians: ``ours`` or another method's, with a note on ignored settings.
 
     Raises as :func:`check_method` does.
     """

@@ -101,7 +101,7 @@ class Candidate:
 
 
 def score(count: int | None, fitted: Fitted, prepared: Prepared, plan: Plan) -> Candidate:
-    """Move canonical Gaussians into the world, add the unseen, and score them on the input photos."""
+    """Move canonical Gaussians into the world, add Gaussians that no view sees, and measure the PSNR on the photos."""
     gaussians, prepared = fitted.gaussians, prepared.with_cameras(fitted.cameras)
     if plan.unseen is not None:
         gaussians = Gaussians.concat([gaussians, plan.unseen])
@@ -127,9 +127,9 @@ def _note_moves(prepared: Prepared, cameras: Cameras, plan: Plan) -> None:
 
 
 def measure_psnr(name: str, gaussians: Gaussians, views: Scene, prepared: Prepared, plan: Plan) -> float | None:
-    """Measure the mean PSNR (dB) of the scored photos, of a quarter of each unless a quality was asked for.
+    """Measure the mean PSNR (dB) of Gaussians on the scored photos; None where no photo shows the scene.
 
-    None where there are no photos that show the scene. ``name``: of the stage that this is.
+    Only a quarter of each photo is scored unless a quality was asked for. ``name``: of the stage in the record.
     """
     if views.images is None or not prepared.photo_views:
         return None
@@ -149,7 +149,7 @@ def make_result(
     plan: Plan,
     search: Mapping[str, Any],
 ) -> CompactResult:
-    """Report the best candidate and its coarser levels of detail, with the input's PSNR beside their own.
+    """Make the result from the best candidate and its coarser levels of detail, with a report.
 
     ``search`` are the facts of :meth:`gsmerge.compaction.search.CountSearch.facts`. The input is scored last,
     when the kernels are compiled and memory is free again. The seconds, choices and notes of the

@@ -45,7 +45,7 @@ MAX_FACTOR = 4  # times the usual count is the most that a quality target may ta
 
 @dataclass(frozen=True)
 class CurvePoint:
-    """Quality of a number of Gaussians after a short fit, on parts of the photos that were held out."""
+    """Quality of a short fit with ``count`` Gaussians, measured on held-out parts of the photos."""
 
     count: int  # Gaussians
     psnr: float  # dB
@@ -74,11 +74,11 @@ class CountSearch:
 
     @property
     def tried(self) -> dict[int, float]:
-        """PSNR (dB) of the counts so far, in the order of the runs."""
+        """PSNR (dB) by count, in the order of the runs."""
         return {candidate.count: candidate.psnr or 0.0 for candidate in self.candidates if candidate.count is not None}
 
     def add(self, candidate: Candidate) -> None:
-        """Add the result of the last count."""
+        """Add the candidate built for the last count."""
         self.candidates.append(candidate)
 
     @property
@@ -93,7 +93,7 @@ class CountSearch:
 
     @property
     def unmet(self) -> str | None:
-        """Why the target is not met; None if it is."""
+        """Reason why the target is not met; None if it is met."""
         if self.plan.target_psnr is None or max(self.tried.values()) >= self.plan.target_psnr:
             return None
         psnr, count = self.best.psnr or 0.0, len(self.best.gaussians)
@@ -101,7 +101,7 @@ class CountSearch:
         return f"quality: {self.plan.target_psnr:g} dB was asked for, {reached}"
 
     def facts(self) -> dict[str, Any]:
-        """Return the search's part of a report: ``seconds`` of all candidates, ``choices``, ``unmet``."""
+        """Return the search's entries of a report: ``seconds`` of all candidates, ``choices``, ``unmet``."""
         names = dict.fromkeys(name for run in self.candidates for name in run.record.seconds)
         seconds = {name: sum(run.record.seconds.get(name, 0.0) for run in self.candidates) for name in names}
         choices: dict[str, Any] = {}
@@ -134,7 +134,7 @@ def choose_count(prepared: Prepared, plan: Plan) -> int | None:
 
 
 def measure_curve(prepared: Prepared, plan: Plan, steps: int, counts: Sequence[int]) -> list[CurvePoint]:
-    """Measure PSNR, SSIM and, where its weights are installed, LPIPS (AlexNet) of the photos at some counts.
+    """Measure PSNR, SSIM and, where its weights are installed, LPIPS (AlexNet) of fits with each of the ``counts``.
 
     The fits take ``steps``, whatever the plan says. PSNR and SSIM are those of blocks that the fits leave out, at
     full size; LPIPS needs whole pictures.
@@ -176,12 +176,12 @@ def _similarity(image: np.ndarray, photo: np.ndarray, mask: np.ndarray) -> float
 
 
 def rungs(shares: Sequence[float], usual: int, least: int, most: int) -> list[int]:
-    """Return rising counts for measuring a curve: shares of the usual count, clipped to least and most."""
+    """Return rising counts for measuring a curve: ``shares`` of the usual count, clipped to ``least`` and ``most``."""
     return sorted({min(max(round(usual * share), least), most) for share in shares})
 
 
 def level_counts(finest: int, plan: Plan) -> list[int]:
-    """Return the Gaussians of the levels of detail after the finest, as long as a coarser one has one for each view."""
+    """Return the numbers of Gaussians of the coarser levels of detail; a level has at least the least allowed count."""
     counts = [finest // LEVEL_FACTOR**i for i in range(1, plan.levels)]
     return [count for count in counts if count >= plan.limits.min_count]
 
@@ -204,7 +204,7 @@ def count_within(points: Sequence[CurvePoint], max_drop: float) -> int:
 
 
 def curve_knee(points: Sequence[CurvePoint]) -> int:
-    """Return the count beyond which more Gaussians are not worth it, by PSNR and structure together.
+    """Return the count beyond which more Gaussians add little quality.
 
     The quality is PSNR + 40 SSIM, in dB. The knee is the last count up to which it grows by 0.15 dB
     per doubling, on a straight line between the slopes that lie midway between the points, which
@@ -229,7 +229,7 @@ def curve_knee(points: Sequence[CurvePoint]) -> int:
 
 
 def next_count(tried: Mapping[int, float], target: float, least: int, most: int) -> int:
-    """Choose the next count to try for the fewest Gaussians that reach a PSNR, within 15 %.
+    """Choose the next count to try in the search for the fewest Gaussians that reach a PSNR, within 15 %.
 
     ``tried`` has the PSNR (dB) of at least one count, taken to rise with the count. A count that
     was tried already ends the search.

@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Division:
-    """The children of every Feature Gaussian, for every K up to a limit, as the splits that lead to them.
+    """The children of every Feature Gaussian for all K up to a limit, stored as a sequence of splits.
 
-    The members of a group are halved again and again (:mod:`gsmerge.stages.decode`), so the children of K are those of
-    K - 1 with one of them replaced by its halves. A third of the members' bytes, and nothing to pool when decoding.
+    Each split halves one child (:mod:`gsmerge.stages.decode`), so the children for K are those for K - 1 with one
+    replaced by its two halves. This takes a third of the members' bytes, and decoding has nothing to pool.
     """
 
     # [g] uint8, times that each group is split. Where heads make the children of nothing, that is all there is, and
@@ -34,18 +34,18 @@ class Division:
 
     @property
     def by_heads(self) -> bool:
-        """Whether heads make the children of nothing."""
+        """Whether decoder heads make the children alone, without stored ones."""
         return len(self.slots) < self.num_splits
 
     @property
     def num_splits(self) -> int:
-        """Number of further Gaussians that all groups give together."""
+        """Number of splits in all groups; each adds one Gaussian."""
         return int(self.splits.sum(dtype=np.int64))
 
 
 @dataclass(frozen=True, eq=False)
 class StoredHeads:
-    """Networks whose decoder heads correct the children, and the numbers that describe each group to them."""
+    """Networks whose decoder heads correct the children, and the numbers of each group that the heads read."""
 
     networks: NetworkWeights  # All of a checkpoint's networks
     views: np.ndarray  # [g] int64, the view that each group's frame belongs to
@@ -54,7 +54,7 @@ class StoredHeads:
 
 @dataclass(frozen=True)
 class StoredSettings:
-    """Settings of the encoding that decoding needs."""
+    """Settings of the encoding on which decoding depends."""
 
     num_input: int  # Gaussians of the scene
     k: int | str  # Gaussians of each group by default, or `"auto"` where the budget was: `target_count` in all
@@ -72,7 +72,7 @@ class StoredSettings:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StoredScene:
-    """Common fields of encoded scenes and states."""
+    """Base of encoded scenes and of online states: frame, cameras, settings and kept Gaussians."""
 
     kept: Gaussians | None  # Unseen Gaussians, canonical, merged; None without any
     frame: Frame  # From canonical to world
@@ -107,12 +107,12 @@ class Encoded(StoredScene):
 
     @property
     def sh_degree(self) -> int:
-        """Degree of the harmonics."""
+        """Degree of the spherical harmonics."""
         return self.division.children.sh_degree
 
     @property
     def num_kept(self) -> int:
-        """Number of Gaussians that no view sees."""
+        """Number of kept Gaussians that no view sees."""
         return 0 if self.kept is None else len(self.kept)
 
     @property

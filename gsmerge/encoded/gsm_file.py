@@ -77,7 +77,7 @@ def write_gsm(
     *,
     overwrite: bool,
 ) -> None:
-    """Write a ``.gsm`` file: what both kinds have, and header ``entries`` and ``arrays`` by key of one kind.
+    """Write a ``.gsm`` file: the fields common to all kinds, and ``entries`` and ``arrays`` of one kind.
 
     ``children``: the prefix of the children's keys, and the children.
     """
@@ -116,7 +116,7 @@ def _checksums(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> d
 
 
 def wrong_checksums(file: GsmFile) -> list[str] | None:
-    """List the arrays, or the header, that are not what was written; None without checksums."""
+    """List the arrays, or the header, whose checksum is wrong; None for a file without checksums."""
     stored = file.header.get("checksums")
     if not isinstance(stored, dict):
         return None
@@ -135,7 +135,7 @@ def _float32(values: Array) -> np.ndarray:
 def save_encoded(
     path: str | PathLike[str], encoded: Encoded, *, overwrite: bool = False, source: Mapping[str, Any] | None = None
 ) -> None:
-    """Write an encoded scene.
+    """Write an encoded scene to a file.
 
     Args:
         path: The file, ``.gsm`` by convention; complete or not there at all.
@@ -179,11 +179,11 @@ class GsmFile:
     arrays: Mapping[str, np.ndarray]
 
     def error(self, problem: str) -> SceneError:
-        """Return the error for a damaged file."""
+        """Make the SceneError for a damaged file."""
         return SceneError(self.path, problem, REMEDY)
 
     def array(self, key: str, dtype: type[np.generic], *shape: int | None) -> np.ndarray:
-        """Return an array of a type and shape (None: any size), if it is finite and in range."""
+        """Return an array, checked for type, shape (None: any size), finite values and range."""
         array = self.arrays.get(key)
         expected = f"{key}: expected {dtype.__name__} {['n' if n is None else n for n in shape]}"
         if array is None:
@@ -215,13 +215,13 @@ class GsmFile:
         )
 
     def gaussians(self, prefix: str, count: int | None, num_higher: int) -> Gaussians:
-        """Return ``count`` Gaussians (None: any number) with ``num_higher`` bases of higher harmonics."""
+        """Return ``count`` Gaussians (None: any number) stored under ``prefix``; ``num_higher``: higher harmonics."""
         n = len(self.array(f"{prefix}.means", np.float32, count, 3))
         shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (num_higher, 3)}
         return Gaussians(*(self.array(f"{prefix}.{name}", np.float32, n, *shape) for name, shape in shapes.items()))
 
     def common(self, num_higher: int) -> dict[str, Any]:
-        """Return the fields that encoded scenes and states share: kept, frame, cameras."""
+        """Return the fields common to encoded scenes and states: kept, frame, cameras."""
         kept = self.gaussians("kept", None, num_higher)
         unit, width, height = (self.header[name] for name in ("unit", "width", "height"))
         origin = self.array("frame.origin", np.float64, 3)
@@ -262,7 +262,7 @@ class GsmFile:
         return build_networks(self.path, options, arrays, REMEDY)
 
     def settings(self) -> StoredSettings:
-        """Return the settings that this version knows, each within its range."""
+        """Return the settings, each checked for its range."""
         values: dict[str, Any] = {}
         for f in fields(StoredSettings):
             value, is_share = self.header["settings"].get(f.name), f.name in ("min_opacity", "min_contribution")
@@ -277,7 +277,7 @@ class GsmFile:
 
 
 def read_gsm(path: str | PathLike[str], *kinds: str) -> GsmFile:
-    """Read a ``.gsm`` file of one of some kinds."""
+    """Read a ``.gsm`` file that has one of the ``kinds``; SceneError for other files."""
     path = Path(path)
     check_file(path)
     try:
@@ -313,7 +313,7 @@ def _read_header(path: Path, text: str, entries: Mapping[str, Any]) -> dict[str,
 
 
 def load_encoded(path: str | PathLike[str]) -> Encoded:
-    """Read an encoded scene from a file; nothing in it is ever executed.
+    """Read an encoded scene from a file; nothing in the file is executed.
 
     Raises:
         SceneError: If the file is missing or damaged, of another format or a newer schema, lacks an array, or holds
@@ -328,7 +328,7 @@ def load_encoded(path: str | PathLike[str]) -> Encoded:
 
 
 def read_encoded(file: GsmFile) -> Encoded:
-    """Return the encoded scene of a file of that kind."""
+    """Read the encoded scene from an open ``.gsm`` file."""
     features, settings = file.features(), file.settings()
     common = file.common(features.shN.shape[1])
     heads = _read_heads(file, features, len(common["cameras"]))

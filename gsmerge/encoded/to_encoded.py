@@ -46,10 +46,9 @@ def encode_scene(
 ) -> Encoded:
     """Encode a scene: all stages of :func:`gsmerge.compact` up to decoding, without a fit.
 
-    ``decode_scene(encode_scene(scene, **settings))`` is ``compact(scene, fit="none", poses="fixed",
-    **settings)``, bit for bit; so is any other ``k`` at decoding, unless a budget or the size of
-    the input limits the number of superpixels of either, or Gaussians that no view sees are kept:
-    these are merged for one K.
+    ``decode_scene(encode_scene(scene, **settings))`` equals ``compact(scene, fit="none", poses="fixed", **settings)``
+    bit for bit. So does any other ``k`` at decoding, with two exceptions: a budget or the size of the input limits the
+    number of superpixels; or Gaussians that no view sees are kept, since these are merged for one K when encoding.
 
     Args:
         scene: See :func:`gsmerge.compact`; tensors become arrays.
@@ -178,7 +177,7 @@ def encode_files(
 
 
 def encoding_line(document: Mapping[str, Any]) -> str:
-    """Write the report of an encoding in a line."""
+    """Describe the report of an encoding in one line."""
     scene, file = document["input"], document["output"]
     line = f"{file['path']}: {scene['num_gaussians']:,} Gaussians -> {file['num_groups']:,} groups, "
     line += f"{human_bytes(scene['bytes'])} -> {human_bytes(file['bytes'])} ({100 * document['ratio_bytes']:.0f} %); "

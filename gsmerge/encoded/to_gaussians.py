@@ -22,7 +22,7 @@ from gsmerge.types import FeatureGaussians, Gaussians
 
 @dataclass(frozen=True, eq=False)
 class DecodePlan:
-    """Numbers of Gaussians to decode, by group and in all."""
+    """Number of Gaussians to decode, per group and in all."""
 
     counts: np.ndarray  # [g] most Gaussians of each group
     min_contribution: float  # See StoredSettings; 0: contributions are not measured
@@ -31,7 +31,7 @@ class DecodePlan:
 
 
 def plan_decode(encoded: Encoded, *, k: int | None = None, budget: int | str | None = None) -> DecodePlan:
-    """Plan how many Gaussians each group becomes, see :func:`decode_scene`."""
+    """Plan how many Gaussians each group becomes; see :func:`decode_scene`."""
     s = encoded.settings
     if budget is not None and k is not None:
         raise UsageError("expected one of k and budget, got both")
@@ -119,7 +119,7 @@ def decode_scene(
 
 
 def children_of(encoded: Encoded, counts: np.ndarray) -> tuple[Gaussians, np.ndarray]:
-    """Return at most ``counts [g]`` canonical Gaussians of each group, also faint, and the rising group of each."""
+    """Return at most ``counts [g]`` canonical Gaussians per group, faint ones included, and the group of each."""
     features, heads, division = encoded.features, encoded.heads, encoded.division
     if division.by_heads:
         sizes = np.minimum(counts, division.splits.astype(np.int64) + 1)
@@ -140,7 +140,7 @@ def children_of(encoded: Encoded, counts: np.ndarray) -> tuple[Gaussians, np.nda
 
 
 def divide_all(features: FeatureGaussians, members: Members, max_k: int) -> Division:
-    """Return all children of every group, up to ``max_k`` of each."""
+    """Divide every group into up to ``max_k`` children."""
     count = len(features)
     rows = np.arange(count)
     sizes = np.diff(features.starts)[rows][:, None]
@@ -178,9 +178,9 @@ def divide_all(features: FeatureGaussians, members: Members, max_k: int) -> Divi
 
 
 def divide_by_heads(features: FeatureGaussians, num_members: np.ndarray, max_k: int) -> Division:
-    """Return up to ``max_k`` children of every group that heads with absolute outputs make, no more than its members.
+    """Divide every group into up to ``max_k`` children, at most one per member, for heads with absolute outputs.
 
-    Further Gaussians go where each stands for the most pixels, by the opacity of the groups' members.
+    Further children go where a child stands for most pixels, weighted by the opacity of the group's members.
     """
     splits = np.minimum(num_members, max_k) - 1
     steps = np.arange(1, max_k)
@@ -196,7 +196,7 @@ def divide_by_heads(features: FeatureGaussians, num_members: np.ndarray, max_k: 
 
 
 def pick_children(division: Division, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Choose at most ``counts [g]`` rows of each group, among groups and then children; return rows, groups."""
+    """Choose at most ``counts [g]`` children per group; return their rows and groups."""
     splits, slots = division.splits.astype(np.int64), division.slots.astype(np.int64)
     count, uniform = len(splits), division.uniform
     sizes, first = np.minimum(counts, splits + 1), np.cumsum(splits) - splits

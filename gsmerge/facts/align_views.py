@@ -83,7 +83,7 @@ class _Pair:
 
 
 def align_views(scene: Scene, views: Sequence[int], *, always: bool = False) -> Scene | None:
-    """Move every camera, and the Gaussians of its pixels, to where the photos agree.
+    """Move every camera, with the Gaussians of its pixels, so that the photos agree with each other.
 
     ``views`` are those whose photos show the scene; the others stay. With ``always`` even small
     errors are corrected. The median motion of the views is taken out. Returns None where no pose is
@@ -109,7 +109,7 @@ def align_views(scene: Scene, views: Sequence[int], *, always: bool = False) -> 
 
 
 def move_views(scene: Scene, viewmats: np.ndarray) -> Scene:
-    """Return the scene with other poses ``[v,4,4]``, and each view's Gaussians moved along.
+    """Return the scene with the cameras at poses ``[v,4,4]``, and each view's Gaussians moved with its camera.
 
     Higher harmonics are not turned: poses are off by a degree or two, and colours hardly change
     with that.

@@ -69,7 +69,7 @@ MAX_COVER = 0.9  # share of a photo from which on nothing can be said of the res
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """Small pictures of the photos and of what the Gaussians show."""
+    """Small pictures of each photo and of the Gaussians from the same camera."""
 
     photos: np.ndarray  # [v,h,w,3]
     pictures: np.ndarray  # [v,h,w,3]
@@ -78,15 +78,15 @@ class Shown:
 
     @property
     def clear(self) -> np.ndarray:
-        """``[v,h,w]`` bool: pixels whose colour in ``pictures`` can be compared."""
+        """Mask ``[v,h,w]`` of pixels where the Gaussians are opaque enough for their colour ``own`` to be compared."""
         return self.weights > (0.5 if self.drawn else 0.05)
 
 
 def compare_photos(scene: Scene) -> tuple[Scene, tuple[int, ...]]:
-    """Mend the photos of a canonical scene, and replace or remove those that do not show it.
+    """Mend the photos of a canonical scene; replace or remove photos that do not show the scene.
 
-    All are removed where most do not show it. Returns the scene, and the views whose pictures a fit
-    may use. The record gets notes and the choices ``photos_changed`` and ``photos_left_out``.
+    All photos are removed where most do not show the scene. Returns the scene and the views whose photos a fit may use.
+    The record gets notes and the choices ``photos_changed`` and ``photos_left_out``.
     """
     if scene.images is None:
         return scene, tuple(range(len(scene)))
@@ -97,7 +97,7 @@ def compare_photos(scene: Scene) -> tuple[Scene, tuple[int, ...]]:
 
 
 def find_changes(scene: Scene, shown: Shown) -> list[PhotoChange]:
-    """Find what is to be mended in every photo; notes say what was found."""
+    """Find what needs mending in each photo; add notes about it."""
     views = range(len(scene))
     changes = [replace(UNCHANGED, bars=_find_bars(scene, shown))] * len(scene)
     small = _change_small(shown, changes)
@@ -344,7 +344,7 @@ def _leave_out(scene: Scene, shown: Shown) -> tuple[Scene, tuple[int, ...]]:
 
 
 def odd_photos(shown: Shown) -> list[int]:
-    """Return the views whose photos do not show the scene, judged by the Gaussians."""
+    """Return the views whose photos show something else than the Gaussians."""
     height, width = shown.weights.shape[1:]
     least = LEAST_DRAWN if shown.drawn else LEAST
     level = max(1.0, max(width, height) / SIDE)
@@ -363,9 +363,9 @@ def odd_photos(shown: Shown) -> list[int]:
 
 
 def gradient_correlations(shown: Shown) -> tuple[np.ndarray, np.ndarray]:
-    """Correlate the gradients of each view's Gaussians with those of every photo, small: ``[v,v]``, -1 to 1.
+    """Correlate the image gradients of each view's Gaussians with those of every photo: ``[v,v]``, -1 to 1.
 
-    No exposure changes it. Also returns a mask ``[v]`` of views with enough structure.
+    Exposure does not change the correlation. Also returns a mask ``[v]`` of views with enough structure.
     """
     height, width = shown.weights.shape[1:]
     level = max(1.0, max(width, height) / SIDE)

@@ -63,7 +63,7 @@ class _Pair:
 
 
 def equalise_exposure(scene: Scene, views: Sequence[int], exposure: Exposure) -> Scene:
-    """Divide the photos, and the Gaussians of their pixels, by the gains of their views, if that is called for.
+    """Equalise the exposure: divide each view's photo and its pixels' Gaussians by the view's gain, where needed.
 
     ``views`` are those whose photos show the scene. Clipped pixels of brighter photos no longer count where another
     photo shows more. The record gets a note, and the choice ``exposure``: the gain of each view, red, green and blue;
@@ -107,22 +107,22 @@ def _find_objection(scene: Scene, views: Sequence[int], pairs: Sequence[_Pair], 
 
 
 def root_mean_square(gains: np.ndarray) -> float:
-    """Compute how far logarithmic gains ``[v,3]`` are from their mean."""
+    """Compute the root mean square of logarithmic gains ``[v,3]`` about their mean."""
     away = gains - gains.mean(0)
     return float(np.sqrt((away * away).mean()))
 
 
 def share_left(pairs: Sequence[_Pair], gains: np.ndarray) -> float:
-    """Divide the differences of colours that logarithmic gains ``[v,3]`` leave between views by those before."""
+    """Return the share of the views' colour differences that remains after applying logarithmic gains ``[v,3]``."""
     before = sum(float(np.median(np.abs(pair.sample))) for pair in pairs)
     after = sum(float(np.median(np.abs(pair.sample - gains[pair.other] + gains[pair.view]))) for pair in pairs)
     return after / max(before, 1e-9)
 
 
 def is_metered(brightness: np.ndarray, gains: np.ndarray) -> bool:
-    """Return whether gains make up for how bright the places are that photos show; both logarithms ``[v,3]``.
+    """Return whether the gains come from metering: whether they offset the brightness of what each photo shows.
 
-    Brightness grows as gains do where these are independent of the places; metered photos are all equally bright.
+    With fixed exposure, photos are brighter where gains are larger; metering makes all photos equally bright.
     """
     gains, brightness = gains - gains.mean(0), brightness - brightness.mean(0)
     slope = float((gains * brightness).sum() / max((gains * gains).sum(), 1e-12))
@@ -130,7 +130,7 @@ def is_metered(brightness: np.ndarray, gains: np.ndarray) -> bool:
 
 
 def share_unexpected(gains: np.ndarray, distances: np.ndarray) -> float:
-    """Measure how far gains are from the mean of the two nearest views', root mean square; 1 for random ones.
+    """Measure how far each view's gains are from the mean of its two nearest views, RMS; 1 for random gains.
 
     ``gains [v,3]`` are logarithms, ``distances [v,v]`` those of the cameras.
     """
@@ -141,7 +141,7 @@ def share_unexpected(gains: np.ndarray, distances: np.ndarray) -> float:
 
 
 def camera_distances(cameras: Cameras) -> np.ndarray:
-    """Compute distances ``[v,v]``: between centres, canonical units, plus between unit vectors along their views."""
+    """Compute distances ``[v,v]`` between cameras: of the centres, canonical units, plus of the viewing directions."""
     viewmats = cameras.viewmats.astype(np.float64)
     both = (camera_centres(viewmats), viewmats[:, 2, :3])
     differences = [vectors[:, None] - vectors[None] for vectors in both]

@@ -20,7 +20,7 @@ NAMED = 4  # views that a note names
 
 @dataclass(frozen=True, eq=False)
 class PhotoChange:
-    """What is mended in one photo."""
+    """Changes that mend one photo."""
 
     bars: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)  # top, bottom, left, right: shares of the sides
     reversed: bool = False  # whether red and blue change places
@@ -28,7 +28,7 @@ class PhotoChange:
     cover: np.ndarray | None = None  # [h,w] bool at a small size, what is replaced
 
     def __call__(self, photo: np.ndarray, fill: np.ndarray | None) -> np.ndarray:
-        """Mend a photo ``[h,w,3]`` in [0, 1] of any size; ``fill [h,w,3]`` is what replaces covered pixels."""
+        """Mend a photo ``[h,w,3]`` in [0, 1] of any size; ``own [h,w,3]`` is what replaces covered pixels."""
         if any(self.bars):  # as whole numbers, which OpenCV resizes alike on every processor
             levels = np.rint(255 * photo.clip(0, 1)).astype(np.uint8)
             photo = self.without_bars(levels, cv2.INTER_LINEAR) / np.float32(255)
@@ -41,13 +41,13 @@ class PhotoChange:
         return np.ascontiguousarray(photo, np.float32)
 
     def without_bars(self, picture: np.ndarray, interpolation: int) -> np.ndarray:
-        """Cut the bars off a picture ``[h,w]`` or ``[h,w,c]`` of uint8, and enlarge the rest to its size."""
+        """Cut the bars off a picture ``[h,w]`` or ``[h,w,c]`` uint8, and enlarge the rest to the size before."""
         height, width = picture.shape[:2]
         inner = picture[self.inside(height, width)]
         return np.asarray(cv2.resize(inner, (width, height), interpolation=interpolation))
 
     def inside(self, height: int, width: int) -> tuple[slice, slice]:
-        """Return the rows and columns between the bars, of a picture of that size."""
+        """Return the slices of rows and columns between the bars, for a picture of ``height`` x ``width`` pixels."""
         top, bottom, left, right = self.bars
         rows = slice(round(top * height), height - round(bottom * height))
         return rows, slice(round(left * width), width - round(right * width))
@@ -57,12 +57,12 @@ UNCHANGED = PhotoChange()
 
 
 def is_change(change: PhotoChange) -> bool:
-    """Return whether anything is mended."""
+    """Return whether a change alters the photo at all."""
     return any(change.bars) or change.reversed or change.tones is not None or change.cover is not None
 
 
 def look_up(tones: np.ndarray, photo: np.ndarray) -> np.ndarray:
-    """Map the levels of a photo ``[...,3]`` in [0, 1] by a curve ``[3,256]`` for each channel."""
+    """Map the colours of a photo ``[...,3]`` in [0, 1] by a tone curve ``[3,256]``, one row per channel."""
     places = photo.astype(np.float32) * np.float32(255)
     first = np.clip(places.astype(np.int64), 0, 254)
     part, channel = places - first, np.arange(3)
@@ -76,7 +76,7 @@ def _enlarge(mask: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def mend_photos(scene: Scene, changes: Sequence[PhotoChange]) -> Scene:
-    """Mend the photos of a scene at both of their sizes; pixels outside masks get the Gaussians' colours."""
+    """Mend the photos at view size and at full size; masked pixels get the Gaussians' colours."""
     assert scene.images is not None
     masks = scene.masks
     if masks is not None and any(changes[0].bars):  # which all photos have alike
@@ -101,7 +101,7 @@ def mend_photos(scene: Scene, changes: Sequence[PhotoChange]) -> Scene:
 
 
 def change_large(large: LargePhotos, changes: Sequence[PhotoChange], fills: dict[int, np.ndarray]) -> LargePhotos:
-    """Mend larger photos when they are read; ``fills`` are what replaces covered pixels, by view."""
+    """Return larger photos that are mended at each read; ``own`` has the colours for covered pixels, by view."""
 
     def read(view: int) -> np.ndarray:
         photo = large.read(large.ids[view])
@@ -140,13 +140,13 @@ def _note_changes(changes: Sequence[PhotoChange], names: Sequence[str]) -> None:
 
 
 def list_names(names: Sequence[str], views: Sequence[int]) -> str:
-    """List the names of some views, or of the first ones."""
+    """List the names of views for a message, shortened if there are many."""
     more = f" and {len(views) - NAMED} more" if len(views) > NAMED else ""
     return ", ".join(names[view] for view in views[:NAMED]) + more
 
 
 def own_pictures(scene: Scene, views: list[int]) -> np.ndarray:
-    """Return some views of a scene in the colours of its Gaussians, ``[n,h,w,3]``."""
+    """Draw pictures ``[n,h,w,3]`` of the given views in the colours of the scene's Gaussians."""
     if not scene.aligned:
         return np.asarray(render(scene.gaussians, scene.cameras[views]).images).clip(0, 1)
     part = subset(scene, views)
@@ -156,7 +156,7 @@ def own_pictures(scene: Scene, views: list[int]) -> np.ndarray:
 
 
 def _fill_gaps(picture: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Give pixels ``[h,w]`` that are not ``valid`` the colour of the nearest one that is."""
+    """Give pixels ``[h,w]`` that are not known the colour of the nearest one that is."""
     if valid.all() or not valid.any():
         return picture
     _, labels = cv2.distanceTransformWithLabels(

@@ -27,18 +27,18 @@ WHOLE_GAUSSIANS = 20_000_000  # up to which a scene is in one piece
 
 
 def usual_blocks(num_gaussians: int) -> int:
-    """Return the number of blocks for an aligned scene of so many Gaussians."""
+    """Return the usual number of blocks for an aligned scene of ``num_gaussians``."""
     return 1 if num_gaussians <= WHOLE_GAUSSIANS else -(-num_gaussians // BLOCK_GAUSSIANS)
 
 
 def gaussians_at_once(num_gaussians: int, blocks: int) -> int:
-    """Return how many Gaussians of a scene are in memory at once when it is compacted in so many blocks."""
+    """Return how many Gaussians are in memory at once when a scene is compacted in ``blocks`` blocks."""
     return num_gaussians if blocks == 1 else round(num_gaussians * (1 + SHARED) / blocks)
 
 
 @dataclass(frozen=True)
 class Block:
-    """Some views of a scene that are compacted together."""
+    """Views that are compacted together: the block's own, and further ones shared with neighbouring blocks."""
 
     own: tuple[int, ...]  # its views, ascending
     shared: tuple[int, ...]  # views of other blocks that see the same surfaces, ascending
@@ -51,7 +51,7 @@ class Block:
 
 @dataclass(frozen=True, eq=False)
 class Covisibility:
-    """What each of v views sees of the others, from coarse depth maps."""
+    """How much of its surface each of v views shares with the others, from coarse depth maps."""
 
     cameras: Cameras
     depths: np.ndarray  # [v,h,w] float64 depths of a coarse grid of each view, infinite where nothing is
@@ -61,14 +61,14 @@ class Covisibility:
 
     @property
     def weights(self) -> np.ndarray:
-        """Weights ``[v,v]`` of the edges between views, the same in both directions."""
+        """Symmetric edge weights ``[v,v]`` between views."""
         both = self.shares + self.shares.T
         np.fill_diagonal(both, 0)
         return both
 
 
 def measure_covisibility(scene: Scene) -> Covisibility:
-    """Measure how much of every view of an aligned scene each other one sees, hidden surfaces left out."""
+    """Measure which share of every view of an aligned scene each other view sees, occlusion considered."""
     cameras, step = scene.cameras, max(1, -(-max(scene.cameras.height, scene.cameras.width) // GRID))
     rows, columns = (np.arange(step // 2, side, step) for side in (cameras.height, cameras.width))
     picked = (rows[:, None] * cameras.width + columns).reshape(-1)
@@ -93,9 +93,9 @@ def measure_covisibility(scene: Scene) -> Covisibility:
 
 
 def see(points: np.ndarray, cameras: Cameras, depths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return which of n points ``[n,3]`` are seen in each of c cameras, ``[c,n]``, and which lie in its frustum.
+    """Return masks ``[c,n]`` of points ``[n,3]``: seen by each camera, and inside each camera's frustum.
 
-    ``depths [c,h,w]`` are those of surfaces on a coarse grid: what lies behind them is not seen.
+    Points behind the surfaces of ``depths [c,h,w]``, a coarse grid, are not seen.
     """
     pixels, z = project(points, cameras)
     inside = (z > 0) & (pixels > 0).all(-1) & (pixels < (cameras.width, cameras.height)).all(-1)
@@ -107,9 +107,9 @@ def see(points: np.ndarray, cameras: Cameras, depths: np.ndarray) -> tuple[np.nd
 
 
 def count_factors(blocks: Sequence[Block], covisibility: Covisibility) -> np.ndarray:
-    """Return for each block by how much more Gaussians it needs than its views have, so that the parts are as dense.
+    """Return a factor for each block's number of Gaussians that makes all blocks equally dense.
 
-    What belongs to a block is seen by other blocks' views, too, whose Gaussians are left out.
+    Views of other blocks also see what belongs to a block, but their Gaussians there are left out.
     """
     views = range(len(covisibility.cameras))
     owners = owning_views(covisibility.samples, covisibility, views)
@@ -124,10 +124,10 @@ def count_factors(blocks: Sequence[Block], covisibility: Covisibility) -> np.nda
 
 
 def partition_views(weights: np.ndarray, count: int, shared: float = SHARED) -> list[Block]:
-    """Cluster v views into ``count`` blocks of similar size that share little, with some views of the neighbours.
+    """Cluster v views into ``count`` blocks of similar size with weak edges between them; add views of neighbours.
 
-    ``weights [v,v]`` are symmetric, at least 0. Every view is in one block; a block's further views are those of the
-    others that share most with it, a share ``shared`` of its own, as far as they share anything.
+    ``weights [v,v]`` are symmetric, at least 0. Every view belongs to one block. A block also shares views of other
+    blocks, those with the largest weights, up to ``shared`` times the number of its own.
     """
     labels = exchange(weights, grow_blocks(weights, count))
     blocks = []
@@ -140,9 +140,10 @@ def partition_views(weights: np.ndarray, count: int, shared: float = SHARED) -> 
 
 
 def grow_blocks(weights: np.ndarray, count: int) -> np.ndarray:
-    """Label v views ``[v]`` with 0 to ``count - 1``: blocks that grow one after the other from the rim of what is left.
+    """Label views ``[v]`` with 0 to ``count - 1``, growing one block after the other from the rim of the views left.
 
-    The first view of a block shares least with those that no block has, the next ones most with the block.
+    A block starts with the view that has the weakest edges to the views left, and grows by the view that shares most
+    with the block.
     """
     num_views = len(weights)
     labels, left = np.full(num_views, -1), np.ones(num_views, bool)
@@ -163,7 +164,7 @@ def grow_blocks(weights: np.ndarray, count: int) -> np.ndarray:
 
 
 def exchange(weights: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Move views ``[v]`` between blocks while less is cut, and sizes stay within ``SLACK`` of equal ones."""
+    """Move views ``[v]`` between blocks while that weakens the edges between blocks, and keep sizes nearly equal."""
     labels, count = labels.copy(), int(labels.max()) + 1
     mean = len(labels) / count
     least, most = int(np.floor((1 - SLACK) * mean)), int(np.ceil((1 + SLACK) * mean))
@@ -182,9 +183,9 @@ def exchange(weights: np.ndarray, labels: np.ndarray) -> np.ndarray:
 
 
 def owning_views(points: np.ndarray, covisibility: Covisibility, views: Sequence[int]) -> np.ndarray:
-    """Return for n points ``[n,3]`` the one of the ``views`` that each belongs to: the nearest that sees it.
+    """Return the owner ``[n]`` of each point ``[n,3]``: the nearest of the ``views`` that sees the point.
 
-    Where none does, the nearest with the point in its picture counts, and where there is none either, the nearest.
+    If no view sees the point, the owner is the nearest view with the point in its picture, else the nearest view.
     """
     cameras, depths = covisibility.cameras[list(views)], covisibility.depths[list(views)]
     centres = camera_centres(cameras.viewmats.astype(np.float64))

@@ -50,7 +50,7 @@ def add_views(scene: Scene) -> Scene:
 
 
 def add_pictures(scene: Scene) -> Scene:
-    """Add renders of the canonical scene itself in place of photos where it has none."""
+    """Render the canonical scene in place of photos where it has none."""
     if scene.images is not None:
         return scene
     note("no photos: views rendered from the scene itself stand in for them")
@@ -82,7 +82,7 @@ def _lens(size: int) -> np.ndarray:
 
 
 def sampled(gaussians: Gaussians, count: int = SAMPLES) -> Gaussians:
-    """Return evenly spaced Gaussians, at most ``count``, enlarged so that they cover the same area."""
+    """Return every k-th Gaussian, at most ``count``, enlarged so that the total area stays the same."""
     step = max(1, -(-len(gaussians) // count))
     few = gaussians[::step]
     return Gaussians(few.means, few.quats, few.scales * math.sqrt(step), few.opacities, few.sh0, few.shN)

@@ -80,7 +80,7 @@ def scene_frame(scene: Scene) -> Frame:
 
 
 def scene_depth(scene: Scene) -> float:
-    """Measure the median depth of some Gaussians, each in its own view, or in all that see it; 0 where none does."""
+    """Measure the median depth of sampled Gaussians, each in its own view or in all that see it; 0 if none is seen."""
     rows = _sample_rows(scene)
     means = scene.gaussians.means[rows].astype(np.float64)
     if scene.aligned:
@@ -101,14 +101,14 @@ def _sample_rows(scene: Scene) -> np.ndarray:
 
 
 def canonicalise(scene: Scene, frame: Frame | None = None) -> tuple[Scene, Frame]:
-    """Move a scene into its canonical frame, or into a given one; return it and the frame."""
+    """Move a scene into the canonical ``frame``, by default its own; return the scene and the frame."""
     frame = frame or scene_frame(scene)
     return replace(scene, gaussians=frame.enter(scene.gaussians), cameras=frame.enter_cameras(scene.cameras)), frame
 
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """Facts about a scene, and the scene as the stages work on it."""
+    """A scene in its canonical frame, as the stages use it, with facts about it."""
 
     input_scene: Scene  # The scene as it was given, in its own world frame, with photos that look as its Gaussians
     # The canonical scene: every view once, photos that do not show it replaced; an unaligned one
@@ -121,17 +121,17 @@ class Prepared:
     unseen: Gaussians | None  # Canonical Gaussians that no view sees, if kept
 
     def with_cameras(self, cameras: Cameras) -> Prepared:
-        """Replace the canonical cameras by those of a fit; the scene's own change nothing."""
+        """Return a copy with the canonical cameras that a fit has moved."""
         if cameras is self.scene.cameras:
             return self
         return replace(self, scene=replace(self.scene, cameras=cameras), moved=True)
 
     def result_views(self) -> Scene:
-        """Return the given scene with the photos as a result is to show them: in one exposure, if they were changed."""
+        """Return the input scene with the photos that a result should match: mended and in one exposure."""
         return _with_photos(self.input_scene, self.scene, self.repeated)
 
     def final_cameras(self) -> Cameras:
-        """Return the given views' cameras as the result was made from them, in the world."""
+        """Return the input views' cameras in the world, as the fit has moved them."""
         cameras = self.input_scene.cameras
         if not self.moved:
             return cameras
@@ -140,7 +140,7 @@ class Prepared:
 
 @stage("prepare")
 def prepare(scene: Scene, options: PrepareOptions | None = None, frame: Frame | None = None) -> Prepared:
-    """Collect the facts of a scene before anything is decided; notes say what was missing and replaced.
+    """Collect the facts about a scene that the plan needs; notes tell what was missing and replaced.
 
     ``frame``: canonical frame; None: the scene's own. Raises ValueError if there is no finite
     Gaussian, or there are images without cameras.
@@ -164,7 +164,7 @@ def prepare(scene: Scene, options: PrepareOptions | None = None, frame: Frame | 
 
 
 def photos_count_as_they_are(scene: Scene) -> bool:
-    """Return whether :func:`prepare` would leave the photos of a scene and their exposure as they are."""
+    """Return whether :func:`prepare` would leave the photos of a scene unchanged."""
     if scene.images is None or len(scene) == 0 or len(scene.gaussians) == 0:
         return True
     with record_part(silent=True):

@@ -15,7 +15,7 @@ REPORT_VIEWS = 4  # views that input and result are scored on for the report alo
 
 
 def even_views(num_views: int, count: int) -> list[int]:
-    """Return ``count`` view ids at equal intervals, with first and last (the middle one for ``count = 1``)."""
+    """Return ``count`` view ids at equal intervals, first and last included (the middle one for ``count = 1``)."""
     if not 1 <= count <= num_views:
         raise ValueError(f"views: expected 1 to {num_views}, got {count}")
     if count == 1:
@@ -26,25 +26,24 @@ def even_views(num_views: int, count: int) -> list[int]:
 def scored_views(num_views: int) -> list[int]:
     """Return view ids for scoring a whole scene: all, or ``MAX_SCORED_VIEWS`` evenly spaced.
 
-    Rendering the unmerged input costs as many views as Gaussians, so with all of many views it
-    would be most of a run.
+    Rendering the unmerged input takes time in proportion to views and Gaussians: all views would be most of a run.
     """
     return even_views(num_views, min(num_views, MAX_SCORED_VIEWS))
 
 
 def report_views(num_views: int) -> list[int]:
-    """Return view ids for scores that only the report needs."""
+    """Return view ids for PSNR values that only the report shows."""
     return pick_views(num_views, REPORT_VIEWS)
 
 
 def pick_views(num_views: int, most: int) -> list[int]:
-    """Return at most ``most`` view ids, evenly spread, and where possible without first and last."""
+    """Return at most ``most`` evenly spread view ids, where possible without the first and the last view."""
     count = min(num_views, most)
     return [int((i + 0.5) * num_views / count) for i in range(count)]
 
 
 def midpoint_views(contexts: Sequence[float], candidates: Sequence[float]) -> list[int]:
-    """Return, for each two consecutive contexts, the index of the candidate nearest the middle between them, if any."""
+    """Return, for each pair of consecutive ``contexts``, the index of the candidate nearest to their middle, if any."""
     chosen = []
     for low, high in pairwise(sorted(contexts)):
         inside = [i for i, place in enumerate(candidates) if low < place < high]
@@ -54,13 +53,13 @@ def midpoint_views(contexts: Sequence[float], candidates: Sequence[float]) -> li
 
 
 def camera_kinds(cameras: Cameras) -> np.ndarray:
-    """Number the cameras from 0, ``[c]``: the same number for equal poses and intrinsics."""
+    """Number the cameras ``[c]`` from 0, with equal numbers for equal poses and intrinsics."""
     rows = np.concatenate([cameras.viewmats.reshape(-1, 16), cameras.Ks.reshape(-1, 9)], 1)
     return np.unique(rows, axis=0, return_inverse=True)[1].reshape(-1)
 
 
 def distinct_views(scene: Scene) -> tuple[list[int], list[int]]:
-    """Return the ids of views that repeat no earlier view, and for every view its place among them.
+    """Return the ids of views that repeat no earlier view and, for every view, its index among these.
 
     A view repeats another if camera, photo and Gaussians are the same; it then has that view's
     place.
@@ -88,7 +87,7 @@ def _equal_views(scene: Scene, first: int, second: int) -> bool:
 
 
 def subset(scene: Scene, view_ids: Sequence[int]) -> Scene:
-    """Return the scene with only some of its views and their Gaussians; unaligned Gaussians all stay."""
+    """Return the scene with only the views ``view_ids`` and their Gaussians; unaligned Gaussians all stay."""
     ids = list(view_ids)
     images = None if scene.images is None else scene.images[ids]
     names = tuple(scene.names[i] for i in ids)
@@ -117,7 +116,7 @@ def in_float64(cameras: Cameras) -> Cameras:
 
 
 def resize_cameras(cameras: Cameras, width: int, height: int) -> Cameras:
-    """Return the same views in pictures of another size, with intrinsics of that size."""
+    """Resize the cameras' images, and scale their intrinsics to match."""
     scale = np.array([width / cameras.width, height / cameras.height, 1.0], cameras.Ks.dtype)
     return replace(cameras, Ks=cameras.Ks * scale[:, None], width=width, height=height)
 

@@ -28,7 +28,7 @@ HOLDOUT = 4  # times the share: the last steps see everything, and a small sampl
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """Blending weights and renders of one set of Gaussians in every photo."""
+    """A set of Gaussians drawn into every photo: blending weights and images."""
 
     views: list[ViewWeights]  # Blending weights of every view
     images: list[np.ndarray]  # [h,w,3] renders
@@ -56,9 +56,9 @@ def fit_colors(
 ) -> FitResult:
     """Fit base colours to the photos, and keep them only if held-out blocks get better.
 
-    ``drawn`` are the same Gaussians in the photos, see :func:`draw`; ``seed`` chooses the held-out
-    blocks; ``color_precision [n]`` counts pixels of photos that are gone which each colour was
-    fitted to. Geometry, opacities and higher harmonics stay.
+    ``drawn`` are the same Gaussians in the photos, see :func:`draw`; ``seed`` chooses the held-out blocks.
+    ``color_precision [n]`` weighs each present colour as a prior, by the pixels of earlier photos that it was fitted
+    to. Geometry, opacities and higher harmonics stay.
     """
     train = color_weights(photos, options, seed)
     precision = 0.0 if color_precision is None else color_precision[:, None].astype(np.float64)
@@ -67,12 +67,12 @@ def fit_colors(
 
 
 def color_weights(photos: Photos, options: FitOptions, seed: int) -> list[np.ndarray]:
-    """Return the training weights ``[h,w]`` of the photos in a fit of the colours alone."""
+    """Return training weights ``[h,w]`` of every photo for a fit of colours alone."""
     return training_weights(photos, min(0.5, HOLDOUT * options.holdout), seed)
 
 
 def fit_offsets(gaussians: Gaussians, system: ColorSystem, start: Array, options: FitOptions) -> FitResult:
-    """Add the offsets that solve a system from ``start [n,3]`` on to base colours, if held-out blocks get better."""
+    """Solve for colour offsets, starting from ``start [n,3]``, and add them if held-out blocks get better."""
     offsets, report = solve_colors(system, start, options)
     if not report.accepted:
         return gaussians, report
@@ -85,7 +85,7 @@ class ColorSystem(Protocol):
 
     @property
     def precision(self) -> Array:
-        """Addition ``[n,1]``, or a number, to the diagonal, with 0 as its solution."""
+        """Prior added to the diagonal, ``[n,1]`` or a number; it pulls offsets to 0."""
 
     def score(self, x: Array = None) -> float:
         """Return the PSNR (dB) of the held-out blocks; None: with the colours before the fit."""
@@ -97,11 +97,11 @@ class ColorSystem(Protocol):
         """Return the normal matrix of the data term times ``x``, ``[n,3]``."""
 
     def reweigh(self, x: Array, *, everywhere: bool = False) -> ColorSystem:
-        """Return the system with Huber weights and exposure gains, on the training pixels or on all."""
+        """Return the system with Huber weights and exposure gains at ``x``, on training pixels or ``everywhere``."""
 
 
 def solve_colors(system: ColorSystem, start: Array, options: FitOptions) -> tuple[Array, FitReport]:
-    """Solve for offsets ``[n,3]`` of the base colours; return ``start`` where the held-out blocks got worse.
+    """Solve for offsets ``[n,3]`` of the base colours; return ``start`` if the held-out blocks get worse.
 
     A third of the steps with plain weights; then pixels that still fit badly count less, exposure
     is compensated, and another third follows. The last ones are on all pixels.

@@ -148,7 +148,7 @@ ON_CPU = FitBackend("cpu", lambda plan: _CpuEngine(plan, plan.job.photos), photo
 
 @dataclass(eq=False)
 class PoseState:
-    """Motions of the views under optimisation; their mean stays zero, so that the scene stays where it is."""
+    """Motions of the cameras under optimisation; their mean stays zero, so that the scene does not drift."""
 
     start: np.ndarray  # [v,4,4] viewmats before the fit
     viewmats: np.ndarray  # [v,4,4] float64, updated by steps, shared with all photos
@@ -176,7 +176,7 @@ class PoseState:
 
 
 def start_poses(photos: tuple[Photos, ...]) -> tuple[PoseState, tuple[Photos, ...]]:
-    """Return zero motions at the poses of some photos, and the photos with viewmats shared with them."""
+    """Return motions of zero for the photos' cameras, and the photos with viewmats that the motions update."""
     start = photos[0].viewmats.astype(np.float64)
     zero, shared = np.zeros((len(start), 6)), start.copy()
     pixel = 1 / float(photos[0].Ks[:, [0, 1], [0, 1]].mean())

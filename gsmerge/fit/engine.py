@@ -16,7 +16,7 @@ from gsmerge.types import Array, Gaussians
 
 
 class Engine(Protocol):
-    """Photos of one fit with what draws into them; states and images are an engine's own, arrays or tensors."""
+    """Draws and fits the photos of one fit on one device; states and images are arrays or tensors of the engine."""
 
     @property
     def plan(self) -> FitPlan:
@@ -24,35 +24,35 @@ class Engine(Protocol):
 
     @property
     def viewmats(self) -> np.ndarray | None:
-        """Poses ``[v,4,4]`` that steps have moved to; None: fixed."""
+        """Poses ``[v,4,4]`` that the fit has moved; None if cameras are fixed."""
 
     @property
     def read_every(self) -> int:
-        """Steps from one report of progress to the next."""
+        """Number of steps between two reports of progress."""
 
     def survey(self, gaussians: Gaussians) -> Survey:
-        """Look once at all half-size photos; without a fit the score is not measured, NaN."""
+        """Draw all half-size photos and collect what they show of each Gaussian; without a fit the score is NaN."""
 
     def start(self, state: State) -> Any:
-        """Bring a state to the engine; its parameters are in ``x``."""
+        """Copy a state to the engine's device; its parameters are in ``x``."""
 
     def read(self, state: Any) -> State:
-        """Bring a state back."""
+        """Copy a state back from the engine's device."""
 
     def warm_up(self, state: Any) -> None:
-        """Load what steps need, before they are timed."""
+        """Load and compile what steps need, so that their timing is not disturbed."""
 
     def step(self, state: Any, step: Step) -> Array:
         """Take one Adam step on one view, in place; return the mean squared error of its training pixels."""
 
     def clear_fog(self, state: Any, step: Step, view: int) -> None:
-        """Take one Adam step against what shows in a view from outside where the start shows nothing."""
+        """Take one Adam step against fog: opacity that a view from outside shows where the start was empty."""
 
     def score(self, state: Any) -> float:
         """Return the PSNR (dB) of the held-out blocks of the half-size photos."""
 
     def error_masses(self, state: State) -> np.ndarray:
-        """Sum ``[n]`` each Gaussian's blending weight times the pixel's absolute error over all half-size photos."""
+        """Sum ``[n]`` blending weight times absolute pixel error of each Gaussian over all half-size photos."""
 
     def fit_colors(self, gaussians: Gaussians) -> FitResult:
         """Fit base colours alone to the half-size photos, see :func:`gsmerge.fit.color.fit_colors`."""
@@ -61,12 +61,12 @@ class Engine(Protocol):
         """Return the mean squared error of all full-size photos."""
 
     def at_poses(self, viewmats: np.ndarray) -> Engine:
-        """Return the engine with its views at poses ``[v,4,4]``, which steps move on; only the CPU does that."""
+        """Return the engine with cameras at poses ``[v,4,4]`` that the fit moves; only the CPU does that."""
 
 
 @dataclass(frozen=True)
 class FitBackend:
-    """Where the fit and the scores run: on the CPU (``gsmerge.fit.ON_CPU``) or on a GPU."""
+    """A device for the fit and the scores: the CPU (``gsmerge.fit.ON_CPU``) or a GPU."""
 
     device: str  # "cpu" or "cuda"
     make_engine: Callable[[FitPlan], Engine]

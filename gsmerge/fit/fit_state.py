@@ -44,7 +44,7 @@ class State:
         return kept
 
     def view_colors(self) -> np.ndarray | None:
-        """Return the colours for the rasterizer; None after updating the harmonics that it shall use instead."""
+        """Return the colours for the rasterizer; None if it evaluates the harmonics, which are updated first."""
         if self.splats.shN.shape[1] == 0:
             return self.colors
         np.divide(self.colors[:, None] - np.float32(0.5), np.float32(SH_C0), out=self.splats.sh0)
@@ -64,7 +64,7 @@ def start_state(gaussians: Gaussians) -> State:
 
 
 def state_of(x: np.ndarray, shN: np.ndarray) -> State:
-    """Start the optimiser's state from parameters ``[n,14]`` and higher harmonics ``[n,k-1,3]``."""
+    """Start the optimiser's state at parameters ``x [n,14]`` and higher harmonics ``[n,k-1,3]``."""
     sizes = np.sort(x[:, SIZE:QUAT], 1)
     colors = np.ascontiguousarray(x[:, COLOR:])
     splats = Splats(
@@ -83,7 +83,7 @@ def state_of(x: np.ndarray, shN: np.ndarray) -> State:
 
 
 def gaussians_of(x: np.ndarray, shN: np.ndarray) -> Gaussians:
-    """Return the Gaussians of parameters ``[n,14]`` and higher harmonics ``[n,k-1,3]``."""
+    """Convert parameters ``x [n,14]`` and higher harmonics ``[n,k-1,3]`` to Gaussians."""
     return Gaussians(
         means=x[:, :3].copy(),
         quats=x[:, QUAT:LOGIT].copy(),
@@ -95,7 +95,7 @@ def gaussians_of(x: np.ndarray, shN: np.ndarray) -> Gaussians:
 
 
 def grow_to(state: State, error_masses: Callable[[State], np.ndarray], count: int) -> State:
-    """Leave out what has faded, and halve others until there are ``count`` or nothing that photos show is left."""
+    """Drop faded Gaussians, then halve others until there are ``count``, or no visible one is left to halve."""
     before, opacities = 0, state.splats.opacities
     if len(opacities):
         state = state[opacities >= min(FADED, float(lower_median(opacities)))]  # of a faint scene most stay

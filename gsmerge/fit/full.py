@@ -27,12 +27,11 @@ from gsmerge.types import Array, Gaussians, as_array
 def fit_full(
     gaussians: Gaussians, engine: Engine, survey: Survey | None = None, fixed: np.ndarray | None = None
 ) -> FitResult:
-    """Fit all parameters to the photos of an engine, by its plan.
+    """Fit all parameters of Gaussians to the photos of an engine, following the engine's plan.
 
-    Two states can be returned, judged by blocks of the photos that the half-size steps leave out:
-    the start, or the end if the blocks were better after those steps. The full-size steps then use
-    every block. ``survey``: of the Gaussians, where there is one already; ``fixed [n]``: those that
-    stay as they are.
+    The result is the fitted Gaussians if they beat the start on held-out blocks after the half-size steps, otherwise it
+    is the start. The full-size steps then use every block. ``survey``: of the Gaussians, if made already; ``fixed``:
+    mask ``[n]`` of Gaussians that stay as they are.
     """
     plan, start = engine.plan, start_state(gaussians)
     job, options, schedule, tail = plan.job, plan.job.options, Schedule(plan), TailMean()
@@ -82,7 +81,7 @@ def fit_full(
 
 
 def limit_moves(survey: Survey, rates: Tuning) -> tuple[np.ndarray, np.ndarray]:
-    """Return the share ``[n]`` of its box that each Gaussian may use, and its least log scale ``[n]``.
+    """Return how much of its box each Gaussian may use, ``[n]`` in [0, 1], and its least log scale ``[n]``.
 
     The share is ``single_view_share`` to 1, by how many photos show the Gaussian: the effective
     number of them, (sum w)^2 / sum w^2 of its blending weights w in them. The least scale is
@@ -96,12 +95,11 @@ def limit_moves(survey: Survey, rates: Tuning) -> tuple[np.ndarray, np.ndarray]:
 
 
 def judge(state: Array, start_score: float, engine: Engine, moving: Engine) -> tuple[float, float]:
-    """Return the PSNR (dB) of the held-out blocks that a fit has to beat, and its own.
+    """Return the PSNR (dB) on held-out blocks that the fit has to beat, and the one that it reached.
 
-    To beat are ``start_score``, of its start, or a worse baseline: networks learn to show whole photos, and a
-    fit to the other blocks then makes the held-out ones worse and new views better. The baseline is
-    looked at only where the fit does not beat its start, with the cameras as they were: those of
-    ``engine``, not those of ``moving``.
+    The fit has to beat ``own``, the score of its start, or a baseline that scores worse: networks learn from whole
+    photos, so a fit to the other blocks makes held-out blocks worse even where it makes new views better. The baseline
+    is scored only if the fit does not beat its start, with the cameras of ``engine``, not those that ``moving`` moved.
     """
     after, baseline_start = moving.score(state), engine.plan.job.baseline_start
     if baseline_start is None or after > start_score:
@@ -110,26 +108,26 @@ def judge(state: Array, start_score: float, engine: Engine, moving: Engine) -> t
 
 
 def grow_state(state: Array, engine: Engine) -> Array:
-    """Grow an engine's state to the number of Gaussians of its job."""
+    """Grow an engine's state to the number of Gaussians that the job asks for."""
     return engine.start(grow_to(engine.read(state), engine.error_masses, engine.plan.job.count))
 
 
 @dataclass
 class TailMean:
-    """Mean of parameters ``[n,14]``, an array or a tensor, over the last steps, which are noisy one by one."""
+    """Mean of the parameters ``[n,14]`` over the last steps, which are noisy."""
 
     total: Array = None
     count: int = 0
 
     def add(self, x: Array) -> None:
-        """Add one more step; the first one after Gaussians were added starts anew."""
+        """Add the parameters after a step; start anew if the number of Gaussians has changed."""
         if self.total is None or len(self.total) != len(x):
             self.total, self.count = 0 * x, 0
         self.count += 1
         self.total += x
 
     def of(self, x: Array) -> Array:
-        """Return the mean with unit quaternions; ``x`` itself without a step of as many Gaussians."""
+        """Return the mean with normalised quaternions; ``x`` itself if no steps with as many Gaussians were added."""
         if self.total is None or len(self.total) != len(x):
             return x
         mean = self.total / self.count

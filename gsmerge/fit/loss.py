@@ -23,7 +23,7 @@ LOSS_WINDOW = image_loss.SIDE  # pixels per side of the windows of loss_ssim
 
 
 def loss_ssim(image: Tensor, photo: Tensor) -> Tensor:
-    """Return the differentiable structural similarity ``[h,w,3]`` of the loss about every pixel.
+    """Compute the structural similarity ``[h,w,3]`` around every pixel, differentiable, as the loss uses it.
 
     Uniform windows of 7 x 7 pixels, zero beyond the border, population covariances, K1 = .01, K2 =
     .03.

@@ -44,7 +44,7 @@ SCORED = 12  # views, at most, that the fog of a result is measured in
 
 
 def outside_views(start: Splats, photos: Photos, options: FitOptions) -> Photos | None:
-    """Place the views of a fit outside; their weights are above 0 on pixels where the start shows nothing.
+    """Place views outside the capture for a fit; only pixels where the start shows nothing have weights above 0.
 
     They step back from the cameras of ``photos``, and are black and half as large, at least ``LEAST_WIDTH`` wide. None
     where the start fills all of them.
@@ -77,7 +77,7 @@ def _place_cameras(means: np.ndarray, cameras: Cameras, count: int) -> Cameras:
 
 
 def mark_empty(opacities: np.ndarray) -> np.ndarray:
-    """Mark the pixels of a picture's ``opacities [h,w]`` that are empty, and farther than the rim from all others."""
+    """Mark the empty pixels of ``opacities [h,w]``, except for a rim around pixels that are not empty."""
     side = 2 * round(RIM * opacities.shape[1]) + 1
     empty = cv2.erode((opacities < EMPTY).astype(np.uint8), np.ones((side, side), np.uint8))
     return np.asarray(empty, bool)
@@ -99,7 +99,7 @@ def _tiles_of(weights: np.ndarray) -> np.ndarray:
 
 
 def fog_gradients(splats: Splats, views: Photos, view: int) -> Gradients:
-    """Return the gradients of a view's mean of weight times opacity, of the Gaussians that take part in it."""
+    """Return the gradients, by Gaussian, of a view's fog: the weighted mean of its opacity."""
     assert views.weights is not None
     weights = views.weights[view]
     plan, transmittance = _blend_black(splats, views, view, _tiles_of(weights))
@@ -110,7 +110,7 @@ def fog_gradients(splats: Splats, views: Photos, view: int) -> Gradients:
 
 
 def score_fog(splats: Splats, views: Photos) -> float:
-    """Measure the mean opacity, in [0, 1], of Gaussians where views have pixels that count, in some of the views."""
+    """Measure the weighted mean opacity, in [0, 1], of the Gaussians over a sample of the views from outside."""
     assert views.weights is not None
     fog, count = 0.0, 0.0
     for view in range(0, len(views), -(-len(views) // SCORED)):

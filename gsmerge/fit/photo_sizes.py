@@ -40,7 +40,7 @@ def fit_photos(scene: Scene, options: FitOptions, views: Sequence[int] | None = 
 
 
 def photo_scale(scene: Scene, options: FitOptions, *, auto: bool) -> tuple[float, str | None]:
-    """Choose the multiple of the views' size for photos in a fit, 1 or more; say why it is less than asked."""
+    """Choose the size of photos in a fit as a multiple of the views' size, at least 1; also say why it is reduced."""
     wanted, largest = options.photo_scale, largest_scale(scene)
     covered = options.fit == "full" and options.half_res_part < 1
     if wanted == "auto":
@@ -56,7 +56,7 @@ def photo_scale(scene: Scene, options: FitOptions, *, auto: bool) -> tuple[float
 
 
 def largest_scale(scene: Scene) -> float:
-    """Return how many times the views' size the photos have, at least 1."""
+    """Return the size of the photos as a multiple of the views' size, at least 1."""
     large = scene.large_photos
     if large is None or scene.images is None or len(scene) == 0:
         return 1.0
@@ -67,9 +67,8 @@ def largest_scale(scene: Scene) -> float:
 def large_photos(scene: Scene, scale: float) -> Photos:
     """Read the photos at ``scale`` times the views' size, at most :func:`largest_scale`, one by one.
 
-    As uint8, because they may be as large as the scene. Their low-pass is that of a viewer of this
-    size: the views' own size is seen with its own in the steps between. Raises ValueError if the
-    scene has no larger photos.
+    They are uint8, because they may take as much memory as the scene. Their low-pass is that of a viewer of this size.
+    Raises ValueError if the scene has no larger photos.
     """
     large, cameras = scene.large_photos, scene.cameras
     if large is None:
@@ -87,7 +86,7 @@ def large_photos(scene: Scene, scale: float) -> Photos:
 
 
 def training_weights(photos: Photos, share: float, seed: int) -> list[np.ndarray]:
-    """Return weights ``[h,w]`` float32 per view: 0 on held-out blocks, at least one a view, the photos' elsewhere.
+    """Return training weights ``[h,w]`` float32 per view: 0 on held-out blocks, the photo's weights elsewhere.
 
     Pixels that count less are not held out; those that do not count at all have the weight ``HIDDEN``.
     """
@@ -109,7 +108,7 @@ def training_weights(photos: Photos, share: float, seed: int) -> list[np.ndarray
 
 
 def reduced(weights: list[np.ndarray], photos: Photos) -> list[np.ndarray]:
-    """Reduce weights of full-size photos to half size."""
+    """Subsample weights of full-size photos to half size."""
     return [np.ascontiguousarray(weight[::2, ::2][: photos.height, : photos.width]) for weight in weights]
 
 

@@ -15,7 +15,7 @@ HAZE = 0.05  # far fog above which a result gets a note: plain to see in a viewe
 
 @dataclass(frozen=True)
 class FitReport:
-    """Report of a fit."""
+    """What a fit did, and how well."""
 
     method: str  # `"none"`, `"color"` or `"full"`: what the result comes from
     accepted: bool  # Whether the held-out blocks got better; if not, nothing was changed
@@ -48,7 +48,7 @@ class Fitted:
 
 
 def record_fit(report: FitReport | None) -> None:
-    """Add what a fit did to the current record; None: nothing was fitted."""
+    """Add the report of a fit to the current record; None: there was no fit."""
     if report is None:
         return
     choose(fit=report.to_dict())
@@ -60,5 +60,5 @@ def record_fit(report: FitReport | None) -> None:
 
 
 def report_steps(step: int, steps: int, photos: float, held_out: float) -> None:
-    """Report a step of the fit and the PSNR (dB) of the photos and of their held-out blocks."""
+    """Report progress of the fit: step, and PSNR (dB) of the photos and of their held-out blocks."""
     report_progress(f"fit: photos {photos:.1f} dB, held out {held_out:.1f} dB", step, steps)

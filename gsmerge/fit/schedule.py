@@ -43,7 +43,7 @@ Progress = Callable[[int, int, float, float], None]  # step, steps, PSNR of the 
 
 @dataclass(frozen=True, eq=False)
 class FitJob:
-    """What to fit to, and how."""
+    """Photos to fit to, with options and start conditions."""
 
     photos: tuple[Photos, ...]  # At full and at half size, and larger if the fit is to see them
     options: FitOptions
@@ -57,7 +57,7 @@ class FitJob:
 
 @dataclass(frozen=True)
 class DrawMode:
-    """How a step draws the scene."""
+    """Size of the photos and low-pass with which a step draws the scene."""
 
     size: int  # Of the photos: 0 full, 1 half, 2 larger
     eps2d: float  # Low-pass, pixels squared
@@ -66,7 +66,7 @@ class DrawMode:
 
 @dataclass(frozen=True)
 class FitPlan:
-    """Plan of a full fit: weights and shares of the steps."""
+    """Plan of a full fit: weights of the pixels, dropout, and the share of steps at half size."""
 
     job: FitJob
     # [h,w] float32 of each photo at full and at half size: 0 on held-out blocks, `HIDDEN` on pixels
@@ -79,17 +79,17 @@ class FitPlan:
     half_part: float  # Share of the steps, the first ones, on half-size photos
 
     def outside_view(self, step: int, progress: float) -> int | None:
-        """Return the view from outside that is looked at after a step, from 1; None: none."""
+        """Return the index of the view from outside that is fitted after step ``step`` (from 1); None: none."""
         outside, rates = self.job.outside, self.job.options.tuning
         if outside is None or progress < rates.outside_from or step % rates.outside_every:
             return None
         return step // rates.outside_every % len(outside)
 
     def draw_mode(self, step: int, progress: float) -> DrawMode:
-        """Return how a step, from 1, draws the scene.
+        """Return how step ``step`` (from 1) draws the scene.
 
-        Half-size photos come first. Then photos are drawn in turn in the ways of viewers; larger
-        ones in between show what an enlarged view shows.
+        Half-size photos come first, then full-size ones, drawn in turn in the ways of different viewers. Larger photos
+        in between show what an enlarged view shows.
         """
         photos = self.job.photos
         if progress < self.half_part:
@@ -132,7 +132,7 @@ def _weights_of(photos: Photos) -> list[np.ndarray]:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """What a step does."""
+    """One step of the fit: view, background, draw mode, and the Gaussians kept."""
 
     number: int  # From 1
     progress: float  # Share of the steps before it
@@ -143,7 +143,7 @@ class Step:
 
 
 class Schedule:
-    """Draws the order of the views, the backgrounds and the Gaussians that steps leave out.
+    """Draws the order of views, the backgrounds and the dropped Gaussians of all steps from one seed.
 
     All engines follow it, so they take the same steps. One generator draws everything, a step's
     dropout after its background: a generator of its own for dropout would change all results of
@@ -155,7 +155,7 @@ class Schedule:
         self.queue: list[int] = []
 
     def draw(self, number: int, progress: float, count: int) -> Step:
-        """Draw a step, from 1, of ``count`` Gaussians; every view comes once before any comes again."""
+        """Draw the plan of step ``number`` (from 1) for ``count`` Gaussians; every view comes once per round."""
         if not self.queue:
             self.queue = self.rng.permutation(len(self.plan.job.photos[0])).tolist()
         view, background, kept = self.queue.pop(), self.rng.random(3, dtype=np.float32), None
@@ -165,19 +165,19 @@ class Schedule:
 
 
 def loss_weights(rates: Tuning, progress: float) -> tuple[float, float]:
-    """Return the weights of structural similarity and of edges in the loss of a step."""
+    """Return the loss weights of structural similarity and of edges at a point of the run."""
     return rates.ssim_lambda, rates.edge_weight * progress
 
 
 def step_sizes(rates: Tuning, progress: float, steps: int) -> np.ndarray:
-    """Return the step of each of the fourteen columns, decaying geometrically, and farther in longer runs."""
+    """Return the step size of each of the fourteen parameters; it decays geometrically, and further in longer runs."""
     decay = rates.decay * min(1.0, LONG_RUN / steps)
     each = [rates.means_lr, rates.scales_lr, rates.quats_lr, rates.opacities_lr, rates.colors_lr]
     return (np.repeat(each, [3, 3, 4, 1, 3]) * power(decay, progress)).astype(np.float32)
 
 
 def affordable_steps(seconds: float, plan: FitPlan) -> int:
-    """Return the steps that fit into the time budget, from the time of the first PROBE steps at half size.
+    """Return how many steps fit into the time budget, given the ``seconds`` of the first PROBE steps at half size.
 
     A step at full size costs up to three times as much, one on larger photos more by their pixels.
     """

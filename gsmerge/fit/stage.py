@@ -30,7 +30,7 @@ START = 0.57  # share of the Gaussians that a run which grows begins with
 def fit_scene(
     decoded: Decoded, scene: Scene, views: Sequence[int], options: FitOptions, seed: int, backend: FitBackend
 ) -> Fitted:
-    """Fit decoded Gaussians to the photos of some views of a canonical scene, if there are any and it is asked for."""
+    """Fit decoded Gaussians to the photos of ``views`` of a canonical scene, if it has any and a fit is asked for."""
     if scene.images is None or not options.needs_photos:
         return Fitted(decoded.gaussians, scene.cameras, None)
     with stage("fit"):
@@ -50,7 +50,7 @@ def fit_scene(
 
 
 def fit(gaussians: Gaussians, job: FitJob, backend: FitBackend = ON_CPU) -> tuple[Gaussians, FitReport | None]:
-    """Leave out what no photo shows, and fit the rest to the photos; a draft without a fit leaves out nothing.
+    """Leave out Gaussians that no photo shows, and fit the rest to the photos; without a fit in a draft, keep all.
 
     Where the full fit does not make held-out parts of the photos better, the colour fit is tried.
     The CPU alone fits to photos larger than the views, moves cameras, and leaves Gaussians that are
@@ -75,7 +75,7 @@ def fit(gaussians: Gaussians, job: FitJob, backend: FitBackend = ON_CPU) -> tupl
 
 
 def run_on(backend: FitBackend, name: str, work: Callable[[FitBackend], ResultT]) -> ResultT:
-    """Do some work on a back end, or on the CPU with a note if the back end's memory does not suffice."""
+    """Run ``work`` on a back end, or on the CPU, with a note, if the back end runs out of memory."""
     try:
         return work(backend)
     except backend.memory_errors:
@@ -126,5 +126,5 @@ def _better_of(engine: Engine, before: Gaussians, after: Gaussians, report: FitR
 
 
 def start_share(options: FitOptions) -> float:
-    """Return the share of the requested Gaussians with which the fit starts."""
+    """Return the share of the final number of Gaussians with which the fit starts."""
     return START if options.grows else 1.0

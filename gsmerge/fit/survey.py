@@ -17,7 +17,7 @@ from gsmerge.types import Array, Gaussians
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """What half-size pictures of a start show of its n Gaussians."""
+    """What the half-size photos show of each of the n Gaussians that a fit starts from."""
 
     score: float  # PSNR (dB) of the held-out blocks of these pictures
     inside: Array  # [n] bool, whether some photo's frustum may hold it
@@ -27,7 +27,7 @@ class Survey:
     pixels: Array  # [n] float32 size of the finest pixel that shows it, world units; inf if none does
 
     def visible(self, min_weight: float) -> Array:
-        """Return a mask ``[n]``: a weight of ``min_weight`` in some photo, or in no photo's frustum."""
+        """Return a mask ``[n]`` of Gaussians with a weight of ``min_weight`` in some photo, or outside all frustums."""
         return ~self.inside | (self.peaks >= min_weight)
 
     def __getitem__(self, rows: Array) -> Survey:
@@ -38,9 +38,10 @@ class Survey:
 def survey_photos(
     gaussians: Gaussians, photos: Sequence[Photos], score: Callable[[Sequence[np.ndarray]], float]
 ) -> Survey:
-    """Look once at the half-size photos, ``photos[1]``; the others, full size first, say how fine their pixels are.
+    """Draw Gaussians into the half-size photos, ``photos[1]``, and collect what they show of each.
 
-    ``score``: of half-size pictures over black.
+    The other sizes, full size first, tell the size of the finest pixel. ``score``: computes the score of the drawn
+    half-size pictures over black.
     """
     state, half, count = start_state(gaussians), photos[1], len(gaussians)
     colors = state.view_colors()
@@ -63,13 +64,13 @@ def survey_photos(
 
 
 def visible_mask(gaussians: Gaussians, photos: Photos, min_weight: float) -> np.ndarray:
-    """Return a mask ``[n]`` of Gaussians with a weight of ``min_weight`` in some photo, or in no photo's frustum."""
+    """Return a mask ``[n]`` of Gaussians with a weight of ``min_weight`` in some photo, or outside all frustums."""
     peaks, inside = peak_weights(gaussians, photos)
     return ~inside | (peaks >= min_weight)
 
 
 def peak_weights(gaussians: Gaussians, photos: Photos) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest blending weights of n Gaussians in some photos, ``[n]``, and which lie in some frustum."""
+    """Return each Gaussian's largest blending weight ``[n]`` over photos, and whether it is in some frustum ``[n]``."""
     splats = prepare(gaussians)
 
     def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:

@@ -37,17 +37,18 @@ _written: set[str] = set()  # the temporary files of this process
 
 @contextmanager
 def atomic_output(path: StrPath, *, overwrite: bool = False) -> Iterator[Path]:
-    """Yield an empty file beside ``path``, of the same suffix, that is renamed to it when the block succeeds.
+    """Yield an empty temporary file beside ``path`` that is renamed to ``path`` when the block succeeds.
 
-    The folder must exist. A link stays one: the file that it leads to is replaced. For a path that came from an outer
-    block, that file itself. SceneError if the file exists and ``overwrite`` is False, or it cannot be written.
+    The folder must exist. A link stays a link; the file that it leads to is replaced. Inside an outer block that
+    yielded ``path``, ``path`` itself is yielded. SceneError if the file exists and ``overwrite`` is False, or cannot be
+    written.
     """
     with atomic_outputs(overwrite=overwrite) as add:
         yield add(Path(path))
 
 
 class AddOutput(Protocol):
-    """Make a file of :func:`atomic_outputs`, and its folder where ``make_folder`` asks for it."""
+    """Function that opens one more file of :func:`atomic_outputs`; ``make_folder``: make its folder, too."""
 
     def __call__(self, path: Path, *, make_folder: bool = False) -> Path:
         """Return the temporary file to write."""
@@ -55,7 +56,7 @@ class AddOutput(Protocol):
 
 @contextmanager
 def atomic_outputs(*, overwrite: bool = False) -> Iterator[AddOutput]:
-    """Write several files and then rename all; a block that fails leaves none of them.
+    """Write several files and rename all of them at the end; if the block fails, none is left.
 
     Yields a function that makes each file, as :func:`atomic_output`. A process that is killed between two renames,
     or a disk that fails there, leaves each file whole, old or new. Files in deeper folders are renamed first, so that
@@ -146,7 +147,7 @@ def _flush(path: str | Path) -> None:
 
 
 def temporary_path(path: Path) -> Path:
-    """Return a name beside ``path``, of the same suffix, with the process that writes it and its place."""
+    """Return a temporary name beside ``path``, of the same suffix, with a hash of the machine and the process id."""
     suffix = path.suffix if len(os.fsencode(path.suffix)) <= _MAX_SUFFIX else ""
     return path.with_name(f".gsmerge-{_place()}-{os.getpid()}-{secrets.token_hex(4)}{suffix}")
 

@@ -47,7 +47,7 @@ def check_file(path: Path) -> int:
 
 
 def walk_files(folder: Path) -> list[Path]:
-    """List all files below a folder without following links to folders; SceneError if too many."""
+    """List all files below a folder, without following links to folders; SceneError if there are too many."""
     files: list[Path] = []
     for num_folders, (base, _, names) in enumerate(os.walk(folder), 1):
         files += [Path(base) / name for name in names]

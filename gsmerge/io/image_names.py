@@ -67,7 +67,7 @@ def _lookup(root: Path, by_ending: dict[str, list[Path]], name: str, option: str
 
 
 def match_masks(folder: Path, names: Sequence[str]) -> list[Path | None]:
-    """Find the mask of every view by the name of its photo, with or without the photo's extension; None without one.
+    """Find the mask of every view by its photo's name, with or without the photo's extension; None for a view without.
 
     SceneError if the folder has no mask of any view, or two of one.
     """
@@ -80,7 +80,7 @@ def match_masks(folder: Path, names: Sequence[str]) -> list[Path | None]:
 
 
 def list_images(folder: Path) -> list[Path]:
-    """List all images below a folder, sorted with numbers in names as numbers; SceneError if too many files."""
+    """List all images below a folder in natural order ("2" before "10"); SceneError for too many files."""
     images = [f for f in walk_files(folder) if f.suffix.lower() in IMAGE_SUFFIXES and not f.name.startswith(".")]
     return sorted(images, key=lambda f: natural_key(f.relative_to(folder).as_posix()))
 
@@ -92,7 +92,7 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
 
 
 def find_image(folder: Path, name: str) -> Path | None:
-    """Find the image that a camera file in the folder names, with or without extension; None without one."""
+    """Find the image that a camera file in the folder names, with or without extension; None if there is none."""
     path = os.path.join(folder, name)
     candidates = [path, *(path + suffix for suffix in sorted(IMAGE_SUFFIXES))]
     return next((Path(c) for c in candidates if os.path.isfile(c)), None)

@@ -40,7 +40,7 @@ _AT_ONCE = 128 << 20  # bytes of decoded photos; more are decoded one by one, wh
 
 @dataclass(frozen=True)
 class PhotoReader:
-    """c photos of one size ``(width, height)`` that are decoded at each use, and not kept in memory."""
+    """c photos of one size ``(width, height)`` that are decoded at each use and not kept in memory."""
 
     count: int
     size: Size
@@ -83,7 +83,7 @@ def decode_images(paths: Sequence[Path]) -> Photos:
 
 
 def change_photos(photos: Photos, size: Size, change: Callable[[int, np.ndarray], np.ndarray]) -> Photos:
-    """Apply ``change(number, photo)`` to every photo, which has ``size`` then; to a reader's photos at each use."""
+    """Apply ``change(number, photo)`` to every photo, at each use for a reader; ``size`` is the new size."""
     if isinstance(photos, PhotoReader):
         return PhotoReader(len(photos), size, lambda photo: change(photo, photos[photo]))
     return parallel_map(lambda photo: change(photo, photos[photo]), range(len(photos)))
@@ -95,7 +95,7 @@ def keep_photos(photos: Photos) -> Photos:
 
 
 def decode_image(path: Path, size: Size) -> np.ndarray:
-    """Decode a file whose header has that size to ``[h,w,3]`` uint8 sRGB; SceneError if it cannot be read."""
+    """Decode an image file of known size to ``[h,w,3]`` uint8 sRGB; SceneError if it cannot be read."""
     with read_errors(path):
         return _decode(path, np.fromfile(path, np.uint8), size)
 
@@ -129,12 +129,12 @@ def photo_size(photos: Photos | None) -> Size | None:
 
 
 def same_shape(size: Size, other: Size) -> bool:
-    """Return whether two sizes have the same shape, except for rounding."""
+    """Return whether two sizes have the same aspect ratio, up to rounding."""
     return abs(size[0] * other[1] / (size[1] * other[0]) - 1) <= ASPECT_TOLERANCE
 
 
 def decode_mask(path: Path) -> np.ndarray:
-    """Decode a mask to ``[h,w]`` bool, True where the photo counts: brighter than half of its brightest pixel."""
+    """Decode a mask to ``[h,w]`` bool: True, the photo counts, where it is brighter than half of its maximum."""
 
     def brightness(image: Image.Image) -> np.ndarray:
         if image.mode[0] in "IF":  # more than 8 bits
@@ -148,7 +148,7 @@ def decode_mask(path: Path) -> np.ndarray:
 
 
 def decode_alpha(path: Path) -> np.ndarray | None:
-    """Decode where a photo is opaque, ``[h,w]`` bool; None where it is everywhere."""
+    """Decode a photo's transparency to ``[h,w]`` bool, True where it is opaque; None if it is opaque everywhere."""
     if path.suffix.lower() in _OPAQUE_SUFFIXES:
         return None
 
@@ -187,7 +187,7 @@ def image_size(path: Path) -> Size:
 
 
 def quarter_turns(path: Path) -> int:
-    """Return by how many quarter turns, counterclockwise, a photo's orientation tag turns it."""
+    """Return the number of counterclockwise quarter turns in a photo's orientation tag."""
     with read_errors(path), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -219,7 +219,7 @@ def _header_size(path: Path, file: BinaryIO) -> Size:
 
 
 def decode_embedded(path: Path, names: Sequence[str], files: Sequence[np.ndarray], limit: int) -> np.ndarray:
-    """Decode images that the file ``path`` holds as bytes of image files (``[b]`` uint8) to ``[c,h,w,3]`` uint8.
+    """Decode images that the file ``path`` holds as image files in bytes (``[b]`` uint8) to ``[c,h,w,3]`` uint8.
 
     SceneError if one cannot be decoded, two differ in size, or they have more than ``limit`` bytes when decoded.
     """
@@ -275,7 +275,7 @@ def _png_pixels(data: np.ndarray) -> np.ndarray | None:
 
 
 def encode_indexed(indices: np.ndarray, colors: np.ndarray) -> bytes:
-    """Encode ``indices [h,w]`` uint8 of ``colors [n,3]`` uint8, sRGB, as a PNG; index 0 is transparent."""
+    """Encode ``indices [h,w]`` uint8 into a palette ``colors [n,3]`` uint8 sRGB as a PNG; index 0 is transparent."""
     image = Image.fromarray(indices).convert("P")
     image.putpalette(colors.tobytes())
     content = io.BytesIO()
@@ -301,7 +301,7 @@ class PhotoTransform:
 
     @property
     def description(self) -> str:
-        """Words for the transform of a photo."""
+        """Description of the transform in words."""
         return f"resized{' and centre-cropped' if self.crops else ''} to {self.width} x {self.height}"
 
     def cameras(self, cameras: Cameras) -> Cameras:
@@ -323,12 +323,12 @@ class PhotoTransform:
 
 
 def resize_to(size: Size, to: Size) -> PhotoTransform:
-    """Make the transform that scales each side by itself."""
+    """Make the transform that resizes photos to a size, width and height independently."""
     return PhotoTransform(*to, to[0] / size[0], to[1] / size[1])
 
 
 def resize_and_crop(size: Size, to: Size, scale: float | None = None) -> PhotoTransform:
-    """Make the transform that scales both sides alike, by default to cover ``to``, and crops the centre."""
+    """Make the transform that resizes photos in proportion, by default to cover ``to``, and crops the centre."""
     if scale is None:
         scale = max(to[0] / size[0], to[1] / size[1])
     width, height = (max(side, round(whole * scale)) for side, whole in zip(to, size, strict=True))

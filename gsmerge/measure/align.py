@@ -35,14 +35,14 @@ OPAQUE = 0.5  # alpha from which a rendered depth is that of a surface
 
 @dataclass(frozen=True)
 class PoseChange:
-    """Distance that a camera was moved."""
+    """How far a camera was moved."""
 
     degrees: float  # that it turned
     shift: float  # of its centre, as a share of the median depth of what it sees
 
 
 def fit_colors(image: np.ndarray, photo: np.ndarray, mask: NDArray[np.bool_]) -> np.ndarray:
-    """Map a render's colours ``[h,w,3]`` by the affine map (3 x 4) that brings it closest to its photo.
+    """Apply the affine colour map (3 x 4) that brings a render ``[h,w,3]`` closest to its photo.
 
     Least squares over the pixels ``[h,w]`` of the mask, clipped to [0, 1]; the render itself where there are none.
     """
@@ -116,7 +116,7 @@ def refine_pose(
     near: float,
     antialiased: bool = False,
 ) -> tuple[Cameras, PoseChange]:
-    """Move a camera to where its render is closest to its photo; it stays where the squared error does not fall.
+    """Move a camera so that its render fits its photo best; it stays where the squared error does not fall.
 
     The photo ``[h,w,3]``, sRGB in [0, 1], is compared within ``mask [h,w]`` at a quarter, at half and at its full size.
     Pixels whose error is large count less, so that the camera is not moved to get a flaw of the scene out of the

@@ -33,7 +33,7 @@ SAME = 1e-9  # of a path's length: cameras that are no farther apart are one
 
 @dataclass(frozen=True)
 class CameraPath:
-    """An orbit or a spline.
+    """Path of a camera for a video: an orbit or a spline.
 
     Args:
         kind: "orbit" or "spline".
@@ -47,7 +47,7 @@ class CameraPath:
 
 
 def parse_path(text: str) -> CameraPath | None:
-    """Read a path, such as ``orbit``, ``orbit:45`` or ``spline,back:0.5``; None for the name of a file.
+    """Parse a path, such as ``orbit``, ``orbit:45`` or ``spline,back:0.5``; None for a file name.
 
     Raises:
         ValueError: If the text begins as a path does and goes on otherwise, or a number is out of range.
@@ -98,14 +98,14 @@ def plan_path(path: CameraPath, cameras: Cameras, depth: float, count: int) -> C
 
 
 def step_back(cameras: Cameras, depth: float, back: float) -> Cameras:
-    """Move cameras backwards by a share ``back`` of the ``depth`` of what they show, world units."""
+    """Move cameras backwards by ``back`` times ``depth``, world units."""
     if not back:
         return cameras
     return replace(cameras, viewmats=np.stack([step_outside(viewmat, depth, back) for viewmat in cameras.viewmats]))
 
 
 def outside_camera(cameras: Cameras, means: np.ndarray) -> tuple[Cameras, float]:
-    """Step back from the middle camera and turn, to where a viewer sees points ``[n,3]`` as no photo does.
+    """Place a camera outside the capture: turn the middle camera about points ``[n,3]`` and step back.
 
     Returns one camera, one of those that :mod:`gsmerge.measure.fog` measures with, and its distance from the point
     about which it turned, world units.
@@ -117,12 +117,12 @@ def outside_camera(cameras: Cameras, means: np.ndarray) -> tuple[Cameras, float]
 
 
 def viewing_depth(cameras: Cameras, means: np.ndarray) -> float:
-    """Measure how far away what the middle camera shows of points ``[n,3]`` lies: the median depth, world units."""
+    """Measure the median depth, world units, of the points ``[n,3]`` that the middle camera shows."""
     return middle_depth(means, cameras[[median_camera(cameras)]])
 
 
 def median_camera(cameras: Cameras) -> int:
-    """Return the index of the camera nearest to the middle of all, in place and direction."""
+    """Return the index of the camera nearest to the median centre and the mean viewing direction."""
     centres = camera_centres(cameras.viewmats)
     forward = cameras.viewmats[:, 2, :3]
     away = _lengths(centres - lower_median(centres))
@@ -131,11 +131,11 @@ def median_camera(cameras: Cameras) -> int:
 
 
 def orbit(cameras: Cameras, depth: float, count: int) -> Cameras:
-    """Move around the middle camera on an ellipse in its picture's plane, towards the point ``depth`` in front of it.
+    """Move around the middle camera on an ellipse in its image plane, looking at the point ``depth`` in front of it.
 
-    Frames are equally far apart, and the one after the last is the first. The picture's vertical stays that of the
-    middle camera. The ellipse has no larger half axes than half of the cameras are away from that one, within
-    ``ACROSS`` and ``UPRIGHT`` of the depth.
+    Frames are evenly spaced and form a loop; the picture's vertical stays that of the middle camera. The half axes are
+    the median distances of the cameras from the middle one, clipped to the shares ``ACROSS`` and ``UPRIGHT`` of the
+    depth.
     """
     middle = median_camera(cameras)
     viewmat = cameras.viewmats[middle].astype(np.float64)
@@ -160,10 +160,10 @@ def orbit(cameras: Cameras, depth: float, count: int) -> Cameras:
 
 
 def wide_orbit(cameras: Cameras, depth: float, count: int, turn: float) -> Cameras:
-    """Turn about the point ``depth`` in front of the middle camera, by ``turn`` degrees to each side of it.
+    """Turn about the point ``depth`` in front of the middle camera, by ``turn`` degrees to each side.
 
-    By half of that upwards and downwards, always as far from the point as that camera. Frames are equally far apart,
-    and the one after the last is the first. The picture's vertical stays that of the middle camera.
+    It also moves up and down by half of that, at a constant distance from the point. Frames are evenly spaced and form
+    a loop; the picture's vertical stays that of the middle camera.
     """
     middle = median_camera(cameras)
 
@@ -179,9 +179,9 @@ def wide_orbit(cameras: Cameras, depth: float, count: int, turn: float) -> Camer
 def spline(cameras: Cameras, depth: float, count: int) -> Cameras:
     """Pass through all cameras in their order on a smooth curve, from the first to the last.
 
-    Frames are equally far apart, where a turn counts as far as it moves what lies ``depth`` away. The curve is a
-    centripetal Catmull-Rom spline (Barry and Goldman 1988) of places and quaternions, in its form by tangents;
-    intrinsics change linearly. ValueError if there are no two different cameras.
+    Frames are evenly spaced, a turn counting as far as it moves a point ``depth`` away. The curve is a centripetal
+    Catmull-Rom spline (Barry and Goldman 1988) of positions and quaternions; intrinsics change linearly. ValueError if
+    there are no two different cameras.
     """
     rows, kept = _pose_rows(cameras, depth)
     origin, rows, Ks = rows[0, :3].copy(), rows[kept], cameras.Ks[kept].astype(np.float64)

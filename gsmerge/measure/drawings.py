@@ -53,7 +53,7 @@ KINDS = ("borders", "means", "saliency")  # pictures of the superpixels of a vie
 
 @dataclass(frozen=True)
 class DrawOptions:
-    """What is drawn of scenes, how they are read, and where pictures are written."""
+    """What to draw of which scenes, how to read them, and where to write the pictures."""
 
     files: SceneFiles  # Of the first scene
     paths: Sequence[Path]  # Of all scenes, as they are called
@@ -70,13 +70,13 @@ class DrawOptions:
     segmentation: SegmentOptions | None = None  # How superpixels are cut
 
     def choose(self, count: int, most: int | None = None) -> list[int]:
-        """Choose at most ``views`` of so many views, or at most ``most``; None: all."""
+        """Choose ids of ``count`` views, at most the option ``views``, else ``most``; None: all."""
         return pick_views(count, self.views or most or count)
 
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """Pictures that are drawn one after the other."""
+    """A planned drawing: paths, facts, and a function that yields the pictures one by one."""
 
     paths: list[Path]  # Of the pictures, or that of the video
     facts: dict[str, Any]  # About them, for the report
@@ -85,7 +85,7 @@ class Drawing:
 
 @dataclass(frozen=True, eq=False)
 class Framed:
-    """Scenes by the paths that they are called by, and the views of one of them."""
+    """Scenes to draw together, and the scene whose frame and views they share."""
 
     scenes: list[tuple[Path, Gaussians]]
     notes: list[str]
@@ -98,7 +98,7 @@ class Framed:
     def draw(
         self, cameras: Cameras, options: DrawOptions, threads: int, near: float = 0.01
     ) -> Iterator[tuple[np.ndarray, ...]]:
-        """Yield the pictures ``[h,w,3]`` of all scenes from each camera, with as many views in memory as threads."""
+        """Yield the pictures ``[h,w,3]`` of all scenes for each camera; memory holds one view per thread."""
         grey, antialiased = options.background, options.antialiased
         drawn = (
             render_in_turn(gaussians, cameras, grey, at_once=threads, antialiased=antialiased, near=near)
@@ -108,7 +108,7 @@ class Framed:
 
 
 def frame_files(files: SceneFiles, source: Path | None, cameras: Path | None, images: Path | None) -> SceneFiles:
-    """Find the files of the scene whose frame cameras are moved into: ``source``, else what it was compacted from."""
+    """Find the files of the scene that gives the cameras' frame: ``source``, else the scene it was compacted from."""
     match = re.fullmatch(r"(.+)\.compact(\.level\d+)?(\.compressed)?\.(ply|spz|sog|splat)", files.ply.name)
     if source is None and match is not None and (beside := files.ply.with_name(f"{match[1]}.ply")).is_file():
         source = beside
@@ -116,7 +116,7 @@ def frame_files(files: SceneFiles, source: Path | None, cameras: Path | None, im
 
 
 def plan_panel(options: DrawOptions) -> Drawing:
-    """Plan a picture of photo, before, after, ... of some views, one row each, and of all scenes from outside."""
+    """Plan one picture of photo, before, after, ... with a row for each of some views and one from outside."""
     framed = _read(options, photos=True)
     used = list(framed.load.views.used)
     cameras, photos = framed.load.views.cameras[used], framed.load.views.images
@@ -147,7 +147,7 @@ def plan_pictures(options: DrawOptions) -> Drawing:
 
 
 def plan_frames(options: DrawOptions) -> Drawing:
-    """Plan a video, or its frames as pictures, of the scenes side by side along a path."""
+    """Plan a video, or its frames as pictures, of the scenes side by side along a camera path."""
     framed, cameras, near, ids = _path_cameras(options)
     labels = [f"{path.name}: {len(gaussians):,}" for path, gaussians in framed.scenes]
 
@@ -196,7 +196,7 @@ def _place_file(file: Path, load: Loaded) -> Cameras:
 
 
 def plan_superpixels(options: DrawOptions) -> Drawing:
-    """Plan the pictures of every photo's superpixels: borders, mean colours, and the saliency that seeds them."""
+    """Plan pictures of each photo's superpixels: borders, mean colours, and saliency."""
     load, cut = load_files(options.files, opacity=options.opacity, hints=options.hints), options.segmentation
     assert cut is not None
     scene = load.pixel_scene()
@@ -219,7 +219,7 @@ PLANS = {"panel": plan_panel, "views": plan_pictures, "path": plan_frames, "supe
 
 
 def check_cameras(files: SceneFiles) -> None:
-    """Refuse a scene with neither cameras, beside it or inside, nor photos that they can be estimated for."""
+    """Raise an error if a scene has no cameras and no photos from which they can be estimated."""
     if files.cameras is None and files.images is None and read_sharp_camera(files.ply) is None:
         raise SceneError(files.ply, "no cameras beside it", "name them with --cameras")
 
@@ -240,7 +240,7 @@ def _read(options: DrawOptions, *, photos: bool) -> Framed:
 
 
 def picture_stems(names: Sequence[str]) -> list[str]:
-    """Choose a different file name per view: the image's name, its path joined by ``_``, or the view's number."""
+    """Choose unique file names for the views: image names, else paths joined by ``_``, else numbers."""
     paths = []
     for name in names:
         parts = [part for part in re.split(r"[\\/]+", name) if part not in ("", ".", "..")] or ["view"]
@@ -262,7 +262,7 @@ def drawing_document(drawing: Drawing, output: Path, *, dry_run: bool) -> dict[s
 
 
 def write_drawing(drawing: Drawing, *, overwrite: bool, threads: int | None, progress: Progress) -> dict[str, Any]:
-    """Draw the pictures and write them, in folders that are made; return what is known only then."""
+    """Draw the pictures and write them, making folders as needed; return the facts that only drawing tells."""
     total, fps = drawing.facts.get("frames", len(drawing.paths)), drawing.facts.get("fps")
 
     def count(pictures: Iterator[Picture]) -> Iterator[Picture]:
@@ -285,7 +285,7 @@ def write_drawing(drawing: Drawing, *, overwrite: bool, threads: int | None, pro
 
 
 def drawing_line(document: Mapping[str, Any]) -> str:
-    """Write in a line what was drawn."""
+    """Describe a finished drawing in one line."""
     if "frames" in document:
         line = f"{document['frames']} frames of {document['width']} x {document['height']}"
         line += f", {document['frames'] / document['fps']:.1f} s" if "fps" in document else ""

@@ -37,7 +37,7 @@ OnImage = Callable[[str, str, int, np.ndarray], None]
 
 @dataclass(frozen=True)
 class Quality:
-    """Closeness of an image to another one; None where it was not measured."""
+    """Similarity of an image to a reference; None for measures not taken."""
 
     psnr: float | None = None  # dB; inf for equal pictures
     ssim: float | None = None  # at most 1
@@ -78,9 +78,9 @@ class ResultScores:
     fog: Mapping[str, Fog] = field(default_factory=dict)  # by kind of camera; empty of the input or if not asked for
 
     def mean(self, split: str, *, zoom: float | None = None, align: str | None = None) -> Pair:
-        """Average over the views of a split, or over their scores at one size or after one alignment.
+        """Average the scores of a split's views: as they are, at one ``zoom``, or after one alignment ``align``.
 
-        Over all pixels, and over the visible ones.
+        Returns the mean over all pixels and the mean over visible pixels.
         """
         views = [score for score in self.scores if score.split == split]
         pairs = [(score.full, score.masked) for score in views]
@@ -91,14 +91,14 @@ class ResultScores:
         return _mean([full for full, _ in pairs]), _mean([masked for _, masked in pairs])
 
     def mean_pose_change(self, split: str) -> PoseChange | None:
-        """Average over the views of a split; None where no camera was aligned."""
+        """Average the cameras' moves over the views of a split; None if no camera was aligned."""
         moves = [score.pose_change for score in self.scores if score.split == split and score.pose_change]
         return PoseChange(*np.mean([(m.degrees, m.shift) for m in moves], axis=0).tolist()) if moves else None
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """All results on the same views.
+    """Scores of several results on the same views.
 
     Args:
         results: The scene itself first, as "input", if it was measured.
@@ -161,7 +161,7 @@ def evaluate(
     progress: Progress | None = None,
     on_image: OnImage = lambda *_: None,
 ) -> Evaluation:
-    """Measure compact results, and the scene itself, on its input views and on held-out ones.
+    """Measure compact results, and the scene itself, on its input views and on held-out views.
 
     ``results`` are Gaussians by name, in the scene's world; without photos they are compared with renders of the scene.
     ``targets`` are held-out views in that world, see :func:`gsmerge.scene.held_out.read_held_out`; ``cameras``
@@ -214,7 +214,7 @@ def evaluate(
 
 
 def near_plane(scene: Scene) -> float:
-    """Choose the near plane for comparing a scene and its results, world units; there must be a Gaussian and a view."""
+    """Choose the near plane, world units, for comparing a scene with its results."""
     return NEAR * scene_frame(scene).unit
 
 

@@ -33,7 +33,7 @@ FAR = 0.1  # of the width: distance from what the input shows from which fog is 
 
 @dataclass(frozen=True)
 class Fog:
-    """What a result shows from outside that its input does not; None where there is nothing to measure on.
+    """Fog and holes that a result shows from outside and its input does not; None where there is nothing to measure.
 
     Args:
         fog_near: Mean opacity, in [0, 1], where the input is empty.
@@ -49,7 +49,7 @@ class Fog:
 def measure_fog(
     reference: Gaussians, results: Mapping[str, Gaussians], cameras: Cameras, near: float = 0.01
 ) -> dict[str, dict[str, Fog]]:
-    """Measure fog and holes of the results of a scene, ``reference``, by name, from outside of its ``cameras``.
+    """Measure fog and holes of results, by name, seen from outside the ``cameras`` of the scene ``given``.
 
     Returns one :class:`Fog` by name of the result and kind of camera, of :data:`CAMERAS` and "all"; its figures are
     means over the pixels of all pictures of the kind. ``near`` is the near plane of the pictures, world units.
@@ -66,7 +66,7 @@ def measure_fog(
 
 
 def describe_fog(name: str, fog: Fog) -> str | None:
-    """Say that a result shows haze from outside; None up to a far fog of 0.05."""
+    """Describe the haze that a result shows from outside; None up to a far fog of 0.05."""
     if fog.fog_far is None or fog.fog_far <= HAZE:
         return None
     return (
@@ -76,7 +76,7 @@ def describe_fog(name: str, fog: Fog) -> str | None:
 
 
 def outside_cameras(gaussians: Gaussians, cameras: Cameras) -> Iterator[tuple[str, Cameras]]:
-    """Yield kind and camera of each picture."""
+    """Yield (kind, camera) of each picture from outside."""
     cameras = shrink_cameras(cameras, SIDE)
     for view in pick_views(len(cameras), VIEWS):
         camera = cameras[[view]]
@@ -88,14 +88,14 @@ def outside_cameras(gaussians: Gaussians, cameras: Cameras) -> Iterator[tuple[st
 
 
 def draw_opacity(splats: Splats, camera: Cameras, near: float) -> np.ndarray:
-    """Draw the opacity ``[h,w]`` of what one camera sees."""
+    """Draw the opacity ``[h,w]`` of a scene in one camera."""
     plan = plan_view(splats, camera.viewmats[0], camera.Ks[0], camera.width, camera.height, near=near)
     black = np.zeros((len(plan.ids) + 1, 3), np.float32)
     return 1 - blend(plan, black[1:], black[0])[1]
 
 
 def fog_sums(reference: np.ndarray, result: np.ndarray) -> np.ndarray:
-    """Return sum and number of pixels ``[3,2]`` of near fog, far fog and holes, of opacities ``[h,w]``."""
+    """Return (sum, number of pixels) ``[3,2]`` of near fog, far fog and holes, given opacities ``[h,w]``."""
     empty, solid = (reference < EMPTY).astype(np.uint8), reference > SOLID
     sides = MARGIN, max(MARGIN, 2 * round(FAR * reference.shape[1]) + 1)
     masks = [cv2.erode(empty, np.ones((side, side), np.uint8)) > 0 for side in sides]
@@ -104,5 +104,5 @@ def fog_sums(reference: np.ndarray, result: np.ndarray) -> np.ndarray:
 
 
 def mean_fog(sums: np.ndarray) -> Fog:
-    """Divide sums by numbers of pixels ``[3,2]``, as of :func:`fog_sums`."""
+    """Divide the sums by the pixel counts of :func:`fog_sums`, ``[3,2]``, to get mean fog and holes."""
     return Fog(*(above / count if count else None for above, count in sums.tolist()))

@@ -56,7 +56,7 @@ def inspect(
     opacity: OpacityChoice = "auto",
     **hints: Any,
 ) -> dict[str, Any]:
-    """Describe a scene, a ``.ply`` or the folder of one, and measure whether it has one Gaussian per pixel.
+    """Describe a scene, and measure whether it has one Gaussian per pixel.
 
     Args:
         path: The scene.
@@ -162,7 +162,7 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
 
 
 def extents(gaussians: Gaussians) -> dict[str, Any]:
-    """Measure where finite Gaussians lie and how large they are, in world units; of many, some are measured.
+    """Measure where finite Gaussians lie and how large they are, world units, on a sample if there are many.
 
     Returns:
         ``box_low`` and ``box_high``: 1 % and 99 % of the positions per axis; ``diagonal`` of that box;
@@ -186,7 +186,7 @@ def extents(gaussians: Gaussians) -> dict[str, Any]:
 
 
 def coverage(scene: Scene) -> list[dict[str, Any]]:
-    """Measure the share of its picture that every view shows; of several Gaussians per pixel each layer is a view.
+    """Measure, for each view, the share of its pixels with a visible Gaussian. Layers count as views.
 
     For each view: its ``name``, ``share_of_pixels`` that have a visible Gaussian of their own (None without pixels),
     and ``share_of_gaussians`` whose centre is inside the picture.
@@ -203,7 +203,7 @@ def coverage(scene: Scene) -> list[dict[str, Any]]:
 
 
 def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
-    """Estimate the result of a run on a scene, without working on it.
+    """Estimate size, time and memory of a run without running it.
 
     Returns:
         ``num_gaussians``: the most that the result can have; ``ratio`` to the input, ``bytes`` as a ``.ply``;
@@ -252,7 +252,7 @@ def _shares_inside(scene: Scene, most: int) -> list[float]:
 
 
 def estimate_lines(run: Mapping[str, Any]) -> list[str]:
-    """Write an estimate as lines for people."""
+    """Describe an estimate in lines of text."""
     per_view = run["superpixels_per_view"]
     superpixels = "superpixels where the scene needs them"
     if per_view is not None:
@@ -268,7 +268,7 @@ def estimate_lines(run: Mapping[str, Any]) -> list[str]:
 
 
 def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
-    """Write the document of :func:`inspect` as lines for people."""
+    """Describe the document of :func:`inspect` in lines of text."""
     parts = ", ".join(f"{name} {human_bytes(size)}" for name, size in scene["bytes_by_attribute"].items())
     ignored, size = _ignored(scene), scene["extents"]
     low, high = (" ".join(f"{value:.4g}" for value in size[key]) for key in ("box_low", "box_high"))

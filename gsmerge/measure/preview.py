@@ -37,19 +37,19 @@ FOLDER = "name a folder instead, for one picture a frame, or install opencv-cont
 
 
 def to_picture(image: np.ndarray) -> Picture:
-    """Round a picture ``[h,w,3]``, float in [0, 1], to 8 bit RGB."""
+    """Convert a picture ``[h,w,3]``, float in [0, 1], to 8 bit RGB."""
     return (image.clip(0, 1) * 255).round().astype(np.uint8)
 
 
 def save_picture(path: Path, picture: Picture, *settings: int, overwrite: bool = True) -> None:
-    """Write a picture in the format of the name, with settings of :func:`cv2.imencode`."""
+    """Write a picture in the format of the file name; ``settings`` go to :func:`cv2.imencode`."""
     _, data = cv2.imencode(path.suffix, picture[..., ::-1], settings)
     with atomic_output(path, overwrite=overwrite) as temporary:
         temporary.write_bytes(data.tobytes())
 
 
 def label(picture: Picture, text: str) -> Picture:
-    """Put a picture under a dark band with a line of text, shortened until it fits."""
+    """Put a dark band with one line of text above a picture, shortening the text to fit."""
     text = text.encode("utf-8", "replace").decode()  # OpenCV does not survive halves of characters
     face, scale = cv2.FONT_HERSHEY_SIMPLEX, 0.42
     while len(text) > 1 and cv2.getTextSize(text, face, scale, 1)[0][0] > picture.shape[1] - 8:
@@ -67,7 +67,7 @@ def view_pictures(
     max_views: int = 4,
     **drawing: Any,
 ) -> list[list[tuple[str, np.ndarray]]]:
-    """Render each scene from at most ``max_views`` views, after the photo where there is one.
+    """Render each scene in at most ``max_views`` views, in rows that begin with the photo if there is one.
 
     Every render ``[h,w,3]`` comes with a line of text: its name, its number of Gaussians, and its PSNR against the
     photo ``[c,h,w,3]``, or without photos against the first scene. ``drawing`` is passed on to :func:`gsmerge.render`.
@@ -88,7 +88,7 @@ def view_pictures(
 def outside_pictures(
     scenes: Sequence[tuple[str, Gaussians]], cameras: Cameras, *, photos: bool, **drawing: Any
 ) -> list[tuple[str, np.ndarray]]:
-    """Render each scene from outside of the capture, where no photo is: a row like those of :func:`view_pictures`.
+    """Render each scene from outside the capture, as one row like those of :func:`view_pictures`.
 
     Every render ``[h,w,3]`` comes with its name. With ``photos`` a white picture comes first, in the photos' column.
     """
@@ -98,9 +98,9 @@ def outside_pictures(
 
 
 def contact_sheet(views: Sequence[Sequence[tuple[str, np.ndarray]]], *, min_width: int = 320) -> Picture:
-    """Put the pictures of each view in a row, under their labels.
+    """Arrange pictures in a sheet: one labelled row per view.
 
-    Small ones are enlarged by a whole factor until a tile has ``min_width`` columns.
+    Small pictures are enlarged by a whole factor so that a tile has at least ``min_width`` columns.
     """
     factor = max(1, -(-min_width // views[0][0][1].shape[1]))
     rows = []
@@ -127,7 +127,7 @@ def draw_borders(image: np.ndarray, labels: np.ndarray) -> Picture:
 
 
 def borders(labels: np.ndarray) -> np.ndarray:
-    """Mark the pixels, ``[h,w]`` bool, whose left or upper neighbour belongs to another superpixel ``[h,w]``."""
+    """Return a mask ``[h,w]`` of pixels whose left or upper neighbour has another label ``[h,w]``."""
     border = np.zeros(labels.shape, bool)
     border[:, 1:] |= labels[:, 1:] != labels[:, :-1]
     border[1:] |= labels[1:] != labels[:-1]
@@ -135,12 +135,12 @@ def borders(labels: np.ndarray) -> np.ndarray:
 
 
 def draw_means(image: np.ndarray, labels: np.ndarray) -> Picture:
-    """Fill every superpixel ``[h,w]`` (from 0) with its mean colour of ``[h,w,3]``, sRGB in [0, 1]."""
+    """Fill each superpixel of ``labels [h,w]`` with its mean colour in ``image [h,w,3]``, sRGB in [0, 1]."""
     return to_picture(mean_colors(image, labels)[labels])
 
 
 def mean_colors(image: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Return the mean colour ``[k,3]`` of each superpixel ``[h,w]`` (from 0) in a picture ``[h,w,3]``."""
+    """Return the mean colour ``[k,3]`` of each superpixel of ``labels [h,w]`` in ``image [h,w,3]``."""
     flat = labels.reshape(-1)
     sizes = np.maximum(np.bincount(flat), 1)
     return np.stack([np.bincount(flat, channel) / sizes for channel in image.reshape(-1, 3).T], 1)
@@ -153,13 +153,13 @@ def draw_heat(values: np.ndarray) -> Picture:
 
 
 def heat_map(levels: np.ndarray) -> Picture:
-    """Draw levels ``[h,w]`` in [0, 1] from black through red to yellow."""
+    """Colour levels ``[h,w]`` in [0, 1] from black through red to yellow."""
     colored = cv2.applyColorMap((levels * 255).round().astype(np.uint8), cv2.COLORMAP_INFERNO)
     return np.ascontiguousarray(colored[..., ::-1], np.uint8)
 
 
 def is_video(path: Path) -> bool:
-    """Return whether a name ends as a video does that can be written."""
+    """Return whether a file name has the ending of a video format that can be written."""
     return path.suffix.lower() in ENCODERS
 
 

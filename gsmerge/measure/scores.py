@@ -30,7 +30,7 @@ CSV_COLUMNS = (
 def evaluation_document(
     evaluation: Evaluation, facts: Mapping[str, Mapping[str, Any]], notes: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Write an evaluation as plain JSON types, with further facts on each result, such as its file's path and bytes.
+    """Convert an evaluation to plain JSON types, with further facts on each result, such as path and bytes.
 
     ``schema_version`` 1: tool, reference, views, results (facts, count, ratio, render seconds, fog and holes, which are
     null of the input, means by split, a score for each view), notes. Means and scores have ``zooms`` where other sizes
@@ -103,7 +103,7 @@ def _flat(pair: Pair) -> dict[str, float | None]:
 
 
 def evaluation_csv(document: Mapping[str, Any]) -> str:
-    """Write one row for each result and view; a cell is empty where something was not measured.
+    """Write an evaluation as CSV with one row per result and view; cells without a measurement are empty.
 
     Columns such as ``psnr_zoom_0.5`` and ``psnr_visible_zoom_0.5`` follow where other sizes were measured, and such as
     ``psnr_align_pose``, ``pose_degrees`` and ``pose_shift`` where held-out views were aligned.
@@ -128,7 +128,7 @@ def _more_columns(view: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def evaluation_tables(document: Mapping[str, Any]) -> Iterator[Table]:
-    """Make the tables of an evaluation for people: heading, columns, and rows of text."""
+    """Make text tables of an evaluation: heading, columns and rows."""
     results = document["results"]
     yield (
         "Size",
@@ -208,7 +208,7 @@ def _move(mean: Mapping[str, Any]) -> str:
 
 
 def filled_tables(document: Mapping[str, Any]) -> Iterator[Table]:
-    """Make the tables as of :func:`evaluation_tables`, without columns and tables in which nothing was measured."""
+    """Make the tables of :func:`evaluation_tables` without empty columns and tables."""
     for heading, head, rows in evaluation_tables(document):
         kept = [i for i in range(len(head)) if i == 0 or any(row[i] for row in rows)]
         if rows:
@@ -216,13 +216,13 @@ def filled_tables(document: Mapping[str, Any]) -> Iterator[Table]:
 
 
 def evaluation_lines(document: Mapping[str, Any]) -> list[str]:
-    """Write the tables as lines for a terminal."""
+    """Write the tables of an evaluation as lines for a terminal."""
     tables = filled_tables(document)
     return [line for heading, head, rows in tables for line in (heading, *text_table([head, *rows], "  "))]
 
 
 def evaluation_markdown(document: Mapping[str, Any]) -> str:
-    """Write the tables in Markdown, and the notes below them."""
+    """Write the tables and notes of an evaluation in Markdown."""
     lines = [f"# {_plain(page_title(document))}", ""]
     for title, head, rows in filled_tables(document):
         lines += [f"## {title}", "", _line(head), _line(["---", *["---:"] * (len(head) - 1)]), *map(_line, rows), ""]
@@ -231,14 +231,14 @@ def evaluation_markdown(document: Mapping[str, Any]) -> str:
 
 
 def page_title(document: Mapping[str, Any]) -> str:
-    """Name the scene of an evaluation, and the results that it is compared with."""
+    """Make the title of a page: the scene's name and its results."""
     first, *others = document["results"]
     path = Path(first.get("path", first["name"]))
     return "/".join(path.parts[-2:]) + (": before and after" if others else "")
 
 
 def page_notes(document: Mapping[str, Any]) -> list[str]:
-    """Return the notes without the folders above those of the files: a page is for others to read."""
+    """Return the notes with file paths cut to folder and name, for a page that others read."""
     paths = [Path(result["path"]).absolute() for result in document["results"] if "path" in result]
     above = {f"{path.parent.parent}/" for path in paths} - {"/"}
     notes = document["notes"]

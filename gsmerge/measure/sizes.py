@@ -25,13 +25,13 @@ def zoom_cameras(cameras: Cameras, zoom: float) -> Cameras:
 
 
 def shrink_cameras(cameras: Cameras, side: int) -> Cameras:
-    """Resize the cameras' images to ``side`` pixels on the longer side where they have more; 0: leave them."""
+    """Shrink the cameras' images to at most ``side`` pixels on the longer side; 0: leave them."""
     long_side = max(cameras.width, cameras.height)
     return zoom_cameras(cameras, side / long_side) if 0 < side < long_side else cameras
 
 
 def shrink_views(views: SomeViews, side: int) -> SomeViews:
-    """Resize photos and cameras together to ``side`` pixels on the longer side where they have more; 0: leave them."""
+    """Shrink photos and cameras together to at most ``side`` pixels on the longer side; 0: leave them."""
     cameras = shrink_cameras(views.cameras, side)
     if cameras is views.cameras:
         return views
@@ -41,7 +41,7 @@ def shrink_views(views: SomeViews, side: int) -> SomeViews:
 
 
 def resize_photo(photo: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Resize a photo ``[h,w,3]`` to a size in pixels: area averages where it is smaller, cubic where it is larger."""
+    """Resize a photo ``[h,w,3]`` in pixels: area averages to shrink, cubic interpolation to enlarge."""
     if width * height < photo.shape[0] * photo.shape[1]:
         resized = cv2.resize(photo, (width, height), interpolation=cv2.INTER_AREA)
     else:
@@ -50,7 +50,7 @@ def resize_photo(photo: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def resize_mask(mask: NDArray[np.bool_], width: int, height: int) -> NDArray[np.bool_]:
-    """Resize a mask ``[h,w]``: ``[height,width]``, of which every part of a pixel lies in the mask."""
+    """Resize a mask ``[h,w]`` to ``[height,width]``; a new pixel is True if all of it lies in the mask."""
     holes = np.pad(np.cumsum(np.cumsum(~mask, 0, dtype=np.int64), 1), ((1, 0), (1, 0)))
     (top, bottom), (left, right) = (
         _covered(old, new) for old, new in zip(mask.shape, (height, width), strict=True)

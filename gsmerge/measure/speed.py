@@ -77,7 +77,7 @@ def _time_in_turns(scenes: Mapping[str, Gaussians], views: Cameras, near: float)
 
 
 def time_render(gaussians: Gaussians, view: Cameras, near: float) -> float:
-    """Time the rendering of a view, seconds."""
+    """Measure the seconds that rendering a view takes."""
     start = time.perf_counter()
     image = render(gaussians, view, near=near).images
     if not isinstance(image, np.ndarray) and image.is_cuda:
@@ -88,7 +88,7 @@ def time_render(gaussians: Gaussians, view: Cameras, near: float) -> float:
 
 
 def break_even(merge_seconds: float, before: float, after: float) -> float | None:
-    """Count the frames after which merging has paid for itself in render time (paper, supplement: timing).
+    """Compute after how many frames merging has paid for itself in render time (paper, supplement: timing).
 
     ``before`` and ``after`` are seconds per frame; None where the result does not render faster.
     """
@@ -96,7 +96,7 @@ def break_even(merge_seconds: float, before: float, after: float) -> float | Non
 
 
 def overdraw(gaussians: Gaussians, cameras: Cameras, near: float) -> float:
-    """Count the Gaussians blended into a pixel, on average over the views: render time depends on it."""
+    """Measure the mean number of Gaussians blended into a pixel, which render time depends on."""
     splats, entries = prepare(gaussians), 0
     viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
     for view in range(len(cameras)):

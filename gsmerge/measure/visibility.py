@@ -22,10 +22,10 @@ _DILATION = 3  # pixels of the input views per side of the square that every sam
 
 
 def context_points(scene: Scene, near: float, cameras: Cameras | None = None) -> Points:
-    """Find a point in the world for every pixel of the input views, ``[n,3]``: their depth samples.
+    """Return the surface points ``[n,3]``, world, that the pixels of the input views show.
 
-    Of a scene with pixels the Gaussians are the samples; otherwise depth beyond ``near``, world units, is rendered
-    into the ``cameras``; None: those of the scene.
+    In a scene with pixels these are the Gaussians; otherwise depth beyond ``near``, world units, is rendered into the
+    ``cameras``; None: those of the scene.
     """
     if scene.aligned:
         return scene.gaussians.means[scene.valid.reshape(-1)].astype(np.float64)
@@ -44,7 +44,7 @@ def _rendered_points(gaussians: Gaussians, camera: Cameras, near: float) -> Poin
 
 
 def visible_pixels(points: Points, cameras: Cameras, near: float, sources: Cameras | None = None) -> NDArray[np.bool_]:
-    """Mark the pixels ``[c,h,w]`` on or next to which at least one of the points ``[n,3]`` falls, occluded or not.
+    """Return masks ``[c,h,w]`` of pixels on or next to which a point ``[n,3]`` falls, occluded or not.
 
     Points nearer than ``near``, world units, do not count. Where the views have smaller pixels than those that the
     points come from (``sources``), a point marks proportionally more of them, as there would be gaps otherwise.
@@ -76,7 +76,7 @@ def _side(K: np.ndarray, sources: Cameras | None) -> int:
 
 
 def share_outside(gaussians: Gaussians, cameras: Cameras) -> float:
-    """Measure the share of the Gaussians, of many some, whose centres no view's picture shows; 0 without any."""
+    """Measure the share of Gaussians, on a sample, whose centres are outside every view's picture; 0 without any."""
     points = gaussians.means[:: max(1, -(-len(gaussians) // MAX_SAMPLES))].astype(np.float64)
     seen = np.zeros(len(points), bool)
     for inside in inside_views(points, cameras):
@@ -85,7 +85,7 @@ def share_outside(gaussians: Gaussians, cameras: Cameras) -> float:
 
 
 def inside_views(points: np.ndarray, cameras: Cameras) -> Iterator[np.ndarray]:
-    """Yield for each view which points ``[n,3]`` its picture shows, ``[n]`` bool."""
+    """Yield for each view a mask ``[n]`` of the points ``[n,3]`` inside its picture."""
     for view in range(len(cameras)):
         (pixels,), (depths,) = project(points, cameras[[view]])
         yield (depths > 0) & ((pixels >= 0) & (pixels < (cameras.width, cameras.height))).all(1)

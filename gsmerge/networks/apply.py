@@ -41,7 +41,7 @@ RunTable = Callable[[np.ndarray, int], Array]  # rows and width of a table -> [r
 
 @dataclass(frozen=True, eq=False)
 class NetworkContext:
-    """The networks, and their inputs besides the Feature Gaussians."""
+    """Networks, with the inputs that they read besides Feature Gaussians."""
 
     networks: NetworkWeights | Networks  # encoder, merger, refiner and decoder heads; the modules of training
     members: Members  # the scene's Gaussians
@@ -50,7 +50,7 @@ class NetworkContext:
 
     @property
     def options(self) -> NetworkOptions:
-        """Sizes of the networks."""
+        """Options of the networks."""
         return self.networks.options
 
     def make_base(self, features: FeatureGaussians) -> Gaussians:
@@ -64,7 +64,7 @@ class NetworkContext:
     def make_tokens(
         self, parts: Gaussians | Members, ids: np.ndarray, owners: np.ndarray, group_features: GroupFeatures
     ) -> Array:
-        """Describe Gaussians relative to Feature Gaussians, see :func:`gsmerge.networks.tokens.part_tokens`."""
+        """Make tokens of Gaussians relative to their groups; see :func:`gsmerge.networks.tokens.part_tokens`."""
         return part_tokens(parts, ids, owners, group_features, MEMBER if isinstance(parts, Members) else PART)
 
     def correct_features(self, group_features: GroupFeatures, residuals: Array) -> FeatureGaussians:
@@ -73,7 +73,7 @@ class NetworkContext:
         return move_features(g.features, g.base, as_array(residuals), g.frames)
 
     def run_tables(self, sizes: np.ndarray, max_width: int, columns: int, run: RunTable) -> Array:
-        """Run all groups, ``[g,columns]``, table by table."""
+        """Run a network on all groups, table by table; return outputs ``[g,columns]``."""
         tables = list(split_tables(sizes, max_width))
         if not tables:
             return np.zeros((0, columns), np.float32)
@@ -87,7 +87,7 @@ class NetworkContext:
 
 
 def encode_features(features: FeatureGaussians, context: NetworkContext) -> FeatureGaussians:
-    """Add latents to Feature Gaussians, and move their means by the encoder (paper section 4.2)."""
+    """Add latents to Feature Gaussians and correct their means with the encoder (paper section 4.2)."""
     options = context.options
     if not options.encoder:
         return replace(features, latents=np.zeros((len(features), options.latent), np.float32))
@@ -114,7 +114,7 @@ def encode_features(features: FeatureGaussians, context: NetworkContext) -> Feat
 
 
 def match_geometry(features: FeatureGaussians, context: NetworkContext) -> FeatureGaussians:
-    """Replace means and covariances by those that the K = 1 head decodes, for matching (paper section 4.3)."""
+    """Replace means and covariances by those of the K = 1 head, for matching (paper section 4.3)."""
     group_features, rows = context.describe(features), np.arange(len(features))
     base = group_features.base
     if context.options.outputs == "residual":  # of the moments themselves, exactly
@@ -127,10 +127,10 @@ def match_geometry(features: FeatureGaussians, context: NetworkContext) -> Featu
 def merge_features(
     pooled: FeatureGaussians, parts: FeatureGaussians, order: np.ndarray, cuts: np.ndarray, context: NetworkContext
 ) -> FeatureGaussians:
-    """Correct c merged Feature Gaussians by the merger (paper section 4.4).
+    """Correct c merged Feature Gaussians with the merger (paper section 4.4).
 
-    Cluster i was pooled from the rows ``order[cuts[i] : cuts[i + 1]]`` of the n Feature Gaussians ``parts``. The
-    paper's merger corrects the first of these rows instead; members and weights are the whole cluster's.
+    Cluster i was pooled from the rows ``order[cuts[i] : cuts[i + 1]]`` of the n Feature Gaussians ``parts``. In the
+    paper the merger corrects the first of these rows instead of the pooled one.
     """
     options = context.options
     if not options.merger:
@@ -156,7 +156,7 @@ def merge_features(
 
 
 def refine_features(features: FeatureGaussians, context: NetworkContext) -> FeatureGaussians:
-    """Correct Feature Gaussians by the refiner, which reads their neighbours (paper section 4.5)."""
+    """Correct Feature Gaussians with the refiner, which reads their neighbours (paper section 4.5)."""
     options = context.options
     if len(features) == 0 or not options.refiner:
         return features
@@ -180,7 +180,7 @@ def refine_features(features: FeatureGaussians, context: NetworkContext) -> Feat
 
 
 def find_neighbors(means: np.ndarray, count: int) -> np.ndarray:
-    """Find the nearest others of points ``[g,3]``, ``[g,count]`` int64; -1 where there are fewer."""
+    """Find the nearest neighbours ``[g,count]`` int64 of points ``[g,3]``; -1 where there are fewer."""
     means, neighbors = means.astype(np.float64), np.full((len(means), count), -1, np.int64)
     rows = np.flatnonzero(np.isfinite(means).all(1))
     near = nearest_of_other_views(means[rows], np.full(len(rows), -1, np.int64), count)  # all of another view
@@ -198,11 +198,11 @@ def _apply_outputs(group_features: GroupFeatures, outputs: Array, context: Netwo
 def decode_gaussians(
     children: Gaussians, parents: np.ndarray, features: FeatureGaussians, context: NetworkContext
 ) -> Gaussians:
-    """Correct the children of Feature Gaussians by the head for their number (paper section 4.3).
+    """Correct the children of Feature Gaussians with the decoder head for their number (paper section 4.3).
 
-    Those of one Feature Gaussian are next to each other; ``parents [n]`` are its rows, ascending. Three children take
-    three slots of the head for four. Five to eight are corrected in two halves, each like the children of a group of
-    its own; heads with absolute outputs know only one group, and leave them unchanged.
+    Children of one Feature Gaussian are adjacent; ``parents [n]`` are rows of ``features``, ascending. Three children
+    use three slots of the head for four. Five to eight are corrected in two halves, each as a group of its own; heads
+    with absolute outputs leave them unchanged.
     """
     return decode_with_group_features(children, parents, context.describe(features), context)
 
@@ -210,7 +210,7 @@ def decode_gaussians(
 def decode_with_group_features(
     children: Gaussians, parents: np.ndarray, group_features: GroupFeatures, context: NetworkContext
 ) -> Gaussians:
-    """Correct children as :func:`decode_gaussians` does, from known group features without members."""
+    """Correct children as :func:`decode_gaussians` does, from group features that were computed before."""
     children = prepare_children(children, parents, group_features, context.options)
     residuals = as_array(run_heads(contiguous(children), parents, group_features, context))
     return move_gaussians(children, residuals, parents, group_features.frames)
@@ -219,7 +219,7 @@ def decode_with_group_features(
 def prepare_children(
     children: Gaussians, parents: np.ndarray, group_features: GroupFeatures, options: NetworkOptions
 ) -> Gaussians:
-    """Replace children by the Gaussians that the heads correct: themselves, or round Gaussians for absolute outputs.
+    """Prepare the children that heads correct: unchanged, or round Gaussians for heads with absolute outputs.
 
     A round Gaussian lies at its group's mean, with its base colour and the axes of its frame, from which the head's
     outputs are offsets (paper section 4.3). It is as large as the group and half transparent. Five or more children of
@@ -246,7 +246,7 @@ def prepare_children(
 def run_heads(
     children: Gaussians, parents: np.ndarray, group_features: GroupFeatures, context: NetworkContext
 ) -> Array:
-    """Compute bounded corrections ``[n,13]`` of children; zero where there is no head for their number."""
+    """Compute bounded corrections ``[n,13]`` of children; zero where no head exists for their number."""
     options = context.options
     count, halves = len(group_features.features), options.max_children > SLOTS[-1]
     first, sizes, owners = _families(parents, count, halves=halves)

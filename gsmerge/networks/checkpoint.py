@@ -36,7 +36,7 @@ class Checkpoint:
     training: Mapping[str, Any]  # facts about the training, as the trainer wrote them
 
     def facts(self) -> dict[str, Any]:
-        """Describe the checkpoint for a report."""
+        """Return facts about the checkpoint for a report."""
         sizes = {"num_parameters": self.networks.num_parameters, "options": asdict(self.networks.options)}
         name = next((name for name, path in IN_PACKAGE.items() if path == self.path), str(self.path))
         head = {"checkpoint": name, "schema": SCHEMA, "gsmerge": self.version}
@@ -44,7 +44,7 @@ class Checkpoint:
 
 
 def save_checkpoint(path: str | PathLike[str], networks: NetworkWeights, training: Mapping[str, Any]) -> None:
-    """Write networks and facts about their training in place of an existing file; a SceneError if that fails."""
+    """Write networks and facts about their training to a file, replacing it; SceneError if that fails."""
     header = {"schema": SCHEMA, "gsmerge": __version__, "options": asdict(networks.options), "training": dict(training)}
     with atomic_output(path, overwrite=True) as temporary:
         temporary.write_bytes(
@@ -53,7 +53,7 @@ def save_checkpoint(path: str | PathLike[str], networks: NetworkWeights, trainin
 
 
 def load_checkpoint(path: str | PathLike[str]) -> Checkpoint:
-    """Read networks from a file; nothing in it is ever executed.
+    """Read networks from a file; nothing in the file is executed.
 
     Raises:
         SceneError: If the file is missing or damaged, of another format or version, or its tensors do not fit the
@@ -76,7 +76,7 @@ def load_checkpoint(path: str | PathLike[str]) -> Checkpoint:
 def build_networks(
     path: Path, options: Mapping[str, Any], arrays: Mapping[str, np.ndarray], remedy: str = REMEDY
 ) -> NetworkWeights:
-    """Build networks from sizes, see ``NetworkOptions.from_dict``, and weights by name.
+    """Build networks from options, as ``NetworkOptions.from_dict`` takes them, and weights by name.
 
     A SceneError with ``path`` and ``remedy`` if the sizes are out of range, or the weights do not fit them.
     """
@@ -120,7 +120,7 @@ def _header_error(path: Path, error: Exception, remedy: str) -> SceneError:
 
 
 def find_checkpoint(name: str, *, required: bool) -> tuple[Checkpoint | None, list[str]]:
-    """Find a checkpoint, and notes for the user; None for the analytic stages alone.
+    """Load a checkpoint by name, with notes for the user; None for the analytic stages alone.
 
     ``name`` is a file, ``"shipped"`` or ``"paper"`` in the package, or ``"none"``. A checkpoint that cannot be used is
     a SceneError where it is ``required``, otherwise a note, and the stages run without it.

@@ -23,18 +23,18 @@ ROWS = 8192  # per task
 
 
 def residual_limits(bounds: Bounds) -> np.ndarray:
-    """Return the largest correction of every column of a Feature Gaussian's, ``[14]`` float32."""
+    """Return the largest correction of each of a Feature Gaussian's 14 columns, ``[14]`` float32."""
     b = bounds
     return np.array([b.mean] * 3 + [b.size] * 3 + [b.turn] * 3 + [b.logit] + [b.color] * 3 + [b.logit], np.float32)
 
 
 def scale_outputs(outputs: Array, bounds: Bounds, share: float = 1.0) -> Array:
-    """Convert outputs of networks ``[...,13 or 14]`` within 1 to corrections within ``share`` of the bounds."""
+    """Scale network outputs ``[...,13 or 14]`` in [-1, 1] to corrections within ``share`` of the bounds."""
     return outputs * like(np.float32(share) * residual_limits(bounds)[: outputs.shape[-1]], outputs)
 
 
 def move_gaussians(gaussians: Gaussians, residuals: np.ndarray, owners: np.ndarray, frames: np.ndarray) -> Gaussians:
-    """Apply corrections ``[n,13]`` to n Gaussians in the frames ``[g,3,3]`` of their groups ``owners [n]``."""
+    """Apply corrections ``[n,13]`` to Gaussians, in the frames ``[g,3,3]`` of their groups ``owners [n]``."""
     names = ("means", "quats", "scales", "opacities", "sh0")
     columns = {name: np.array(getattr(gaussians, name), np.float32, order="C") for name in names}
 
@@ -51,8 +51,8 @@ def move_features(
 ) -> FeatureGaussians:
     """Apply corrections ``[g,14]`` to Feature Gaussians; opacity depends only on its own column, not on the scales.
 
-    ``base`` has the Gaussian of each, ``frames [g,3,3]`` the axes of each group as columns, world. The tenth correction
-    is added to the logarithms of integrated optical depth and mass, the last to that of the mass alone.
+    ``base``: one Gaussian for each group; ``frames [g,3,3]``: axes of each group as columns, world. The tenth
+    correction is added to the logarithms of integrated optical depth and of mass, the last to that of mass alone.
     """
     names = ("means", "covars", "masses", "extinctions", "sh0")
     columns = {name: np.array(getattr(features, name), np.float32, order="C") for name in names}

@@ -25,7 +25,7 @@ FEW = 16
 def cross_view_stats(
     means: np.ndarray, sh0: np.ndarray, views: np.ndarray, members: Members, cameras: Cameras
 ) -> np.ndarray:
-    """Measure agreement with the Gaussian of the pixel that each point projects to in every other view.
+    """Measure how well points agree with the Gaussians that they project onto in every other view.
 
     Points ``means [g,3]`` with base colours ``sh0 [g,1,3]`` belong to ``views [g]`` int64, which are left out. The
     statistics ``[g,7]`` float32 are the logarithm of the number of views that see the point; the shares of these views

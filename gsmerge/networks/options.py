@@ -24,7 +24,7 @@ PAPER_NUMBERS = (4, 8, 9, 10)  # columns of a group that the paper's decoder rea
 
 @dataclass(frozen=True)
 class Bounds(Settings):
-    """Largest correction that the decoder may make, 0: none; merger, refiner and encoder may each make half of it."""
+    """Largest corrections by the decoder, 0: none; merger, refiner and encoder may each correct by half of that."""
 
     mean: float = setting(1.0, "Shift along each axis of the group's frame, in units of the Gaussian's size.", least=0,
         most=8)  # fmt: skip
@@ -40,7 +40,7 @@ WIDE = Bounds(mean=4.0, size=6.0, turn=3.2, logit=8.0, color=0.75)  # of absolut
 
 @dataclass(frozen=True)
 class NetworkOptions(Settings):
-    """Sizes of the networks, and the kind of their heads' output."""
+    """Sizes and variants of the networks."""
 
     width: int = setting(48, "Width of the tokens, a multiple of `heads`.", least=1, most=512)
     heads: int = setting(4, "Attention heads.", least=1, most=16)
@@ -64,17 +64,17 @@ class NetworkOptions(Settings):
 
     @property
     def head_numbers(self) -> tuple[int, ...]:
-        """Columns of a group that the heads read."""
+        """Indices of the group numbers that the heads read."""
         return tuple(range(GROUP)) if self.group_numbers else PAPER_NUMBERS
 
     @property
     def reads_children(self) -> bool:
-        """Whether the heads read the Gaussians that they correct, which tell absolute ones the group's size alone."""
+        """Whether the heads read the Gaussians that they correct; absolute heads read only the group's size."""
         return self.group_numbers or self.outputs == "residual"
 
     @property
     def max_children(self) -> int:
-        """Largest number of children that the heads correct; five or more in two halves, not for absolute outputs."""
+        """Largest number of children that heads correct: five or more in two halves, not with absolute outputs."""
         return SLOTS[-1] if self.outputs == "absolute" else 2 * SLOTS[-1]
 
     @property
@@ -89,7 +89,7 @@ class NetworkOptions(Settings):
 
     @staticmethod
     def from_dict(values: Mapping[str, Any]) -> NetworkOptions:
-        """Read options from what ``dataclasses.asdict`` gave; a ValueError if a name or a value is impossible."""
+        """Make options from the values of ``dataclasses.asdict``; ValueError for an unknown name or a wrong value."""
         unknown = sorted(values.keys() - {f.name for f in fields(NetworkOptions)})
         bounds = values.get("bounds", {})
         if not isinstance(bounds, Mapping):

@@ -14,7 +14,7 @@ from gsmerge.types import SH_C0, Gaussians
 
 
 def gaussian_sizes(scales: Tensor) -> Tensor:
-    """Compute the sizes ``[n]`` of Gaussians: geometric mean of the two largest of ``scales [n,3]``."""
+    """Compute sizes ``[n]`` of Gaussians: the geometric mean of the two largest of ``scales [n,3]``."""
     top = scales.sort(-1).values
     return (top[..., 1] * top[..., 2]).sqrt()
 
@@ -26,7 +26,7 @@ def quat_to_rotmat(quats: Tensor) -> Tensor:
 
 
 def rotate_quats(vectors: Tensor, quats: Tensor) -> Tensor:
-    """Rotate quaternions ``[n,4]`` by rotation vectors ``[n,3]`` in the world."""
+    """Rotate quaternions ``[n,4]`` by rotation vectors ``[n,3]`` in world axes."""
     half = (vectors.square().sum(-1, keepdim=True) + 1e-20).sqrt() / 2  # has a gradient at zero, too
     w, (x, y, z) = half.cos()[:, 0], (half.sin() / (2 * half) * vectors).unbind(-1)
     a, b, c, d = quats.unbind(-1)
@@ -37,18 +37,18 @@ def rotate_quats(vectors: Tensor, quats: Tensor) -> Tensor:
 
 
 def rotate_vectors(frames: Tensor, vectors: Tensor) -> Tensor:
-    """Convert vectors ``[n,3]`` from frames ``[n,3,3]`` to the world."""
+    """Rotate vectors ``[n,3]`` from frames ``[n,3,3]`` into the world."""
     return (frames @ vectors[:, :, None])[:, :, 0]
 
 
 def skew_vectors(matrices: Tensor) -> Tensor:
-    """Return the vectors ``[n,3]`` whose cross product the skew part of matrices ``[n,3,3]`` is."""
+    """Return the axial vectors ``[n,3]`` of the skew-symmetric parts of matrices ``[n,3,3]``."""
     skew = (matrices - matrices.transpose(1, 2)) / 2
     return torch.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], 1)
 
 
 def move_tensors(gaussians: Gaussians, residuals: Tensor, frames: Tensor) -> Gaussians:
-    """Apply corrections ``[n,13]`` to n Gaussians, tensors, in frames ``[n,3,3]`` with axes as columns, world."""
+    """Apply corrections ``[n,13]`` to Gaussians of tensors, in frames ``[n,3,3]`` (axes as columns, world)."""
     g = gaussians
     odds, factor = g.opacities, torch.exp(residuals[:, LOGIT])
     return replace(

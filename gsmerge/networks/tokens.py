@@ -23,7 +23,7 @@ TOKENS = 4096  # tokens of one table: a megabyte of activations, which stay in a
 
 @dataclass(frozen=True, eq=False)
 class GroupFeatures:
-    """Feature Gaussians as the networks read them, float32; in training, numbers are tensors."""
+    """Feature Gaussians in the form that networks read, float32; in training, numbers are tensors."""
 
     features: FeatureGaussians  # g of them
     base: Gaussians  # g Gaussians without corrections
@@ -44,9 +44,9 @@ def compute_group_features(features: FeatureGaussians, members: Members, cameras
 def describe_features(
     features: FeatureGaussians, views: np.ndarray, num_members: np.ndarray, stats: np.ndarray, cameras: Cameras
 ) -> GroupFeatures:
-    """Compute the networks' inputs from what the Feature Gaussians do not have themselves.
+    """Compute the networks' inputs from Feature Gaussians, their views, numbers of members and statistics.
 
-    These are their ``views [g]``, ``num_members [g]`` and the agreement ``stats [g,7]`` of other views.
+    ``views [g]``: view of each Feature Gaussian; ``num_members [g]``; ``stats [g,7]``: agreement with other views.
     """
     bare = make_group_features(features, views, np.zeros((len(features), GROUP), np.float32), cameras)
     base, group = bare.base, np.empty((len(features), GROUP), np.float32)
@@ -62,7 +62,7 @@ def describe_features(
 def make_group_features(
     features: FeatureGaussians, views: np.ndarray, group: np.ndarray, cameras: Cameras
 ) -> GroupFeatures:
-    """Make the networks' inputs from known ``views [g]`` and numbers ``group [g,GROUP]``, without the members."""
+    """Assemble the networks' inputs from ``views [g]`` and numbers ``group [g,GROUP]`` that are known already."""
     base = contiguous(feature_to_gaussians(features))
     frames, sizes = np.empty((len(features), 3, 3), np.float32), np.empty(len(features), np.float32)
     place_frames(base.means, base.scales, _viewmats(cameras), views, frames, sizes)
@@ -70,12 +70,12 @@ def make_group_features(
 
 
 def contiguous(gaussians: Gaussians) -> Gaussians:
-    """Return Gaussians as float32 arrays in C order, as the kernels read them."""
+    """Convert Gaussians to float32 arrays in C order, as the kernels read them."""
     return Gaussians(*(in_order(column) for column in vars(gaussians).values()))
 
 
 def in_order(values: np.ndarray) -> np.ndarray:
-    """Return an array as float32 in C order."""
+    """Convert an array to float32 in C order."""
     return np.ascontiguousarray(values, np.float32)
 
 
@@ -84,7 +84,7 @@ def _viewmats(cameras: Cameras) -> np.ndarray:
 
 
 def choose_views(features: FeatureGaussians, members: Members, cameras: Cameras) -> np.ndarray:
-    """Choose the view of each Feature Gaussian, ``[g]`` int64: its own, or if merged the one with most opacity."""
+    """Choose a view ``[g]`` int64 for each Feature Gaussian: its own or, if merged, the one with most opacity."""
     views = features.views.copy()
     merged = np.flatnonzero(views < 0)
     if len(merged) == 0:
@@ -101,9 +101,10 @@ def choose_views(features: FeatureGaussians, members: Members, cameras: Cameras)
 def part_tokens(
     parts: Gaussians | Members, ids: np.ndarray, owners: np.ndarray, group_features: GroupFeatures, columns: int = PART
 ) -> np.ndarray:
-    """Describe Gaussians ``ids [n]`` of some relative to the Feature Gaussians ``owners [n]`` that they belong to.
+    """Make tokens that describe the Gaussians ``ids [n]`` relative to the groups ``owners [n]`` they belong to.
 
-    Returned are ``[n,columns]``; of the columns after the first PART ones, MEMBER describes members, others are zero.
+    Returns ``[n,columns]``: PART columns for every Gaussian, then MEMBER columns that only members fill; the rest is
+    zero.
     """
     g, out = group_features, np.zeros((len(ids), columns), np.float32)
     describe_parts(
@@ -114,7 +115,7 @@ def part_tokens(
 
 
 def split_tables(sizes: np.ndarray, max_width: int) -> Iterator[tuple[np.ndarray, int]]:
-    """Split groups of ``sizes [g]`` into tables of similar size: rows of ``sizes``, and a width, a power of two.
+    """Split groups of ``sizes [g]`` into tables of similar size: yield rows of ``sizes`` and a width (power of two).
 
     Which groups share a table depends only on the sizes. Groups larger than ``max_width`` are sampled.
     """
@@ -128,14 +129,14 @@ def split_tables(sizes: np.ndarray, max_width: int) -> Iterator[tuple[np.ndarray
 
 
 def group_rows(begins: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Find the positions of all members of groups that begin at ``begins [g]``, and the group of each."""
+    """Return the positions of all members of groups that start at ``begins [g]``, and the group of each."""
     owners = np.repeat(np.arange(len(sizes)), sizes)
     first = np.cumsum(sizes) - sizes
     return np.arange(len(owners)) - first[owners] + begins[owners], owners
 
 
 def sample_members(keys: np.ndarray, sizes: np.ndarray, width: int, seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Choose at most ``width`` members of every group, sorted by their ``keys [m]``, whatever their order.
+    """Sample at most ``width`` members of every group, evenly along their ``keys [m]``, independent of order.
 
     Keys come group by group, ``sizes [g]`` of each. A group that is too large is cut along its key into ``width`` runs
     as equal as possible, and one member of each is taken at random from ``seeds [g]`` uint64: the sample covers the
@@ -155,12 +156,12 @@ def sample_members(keys: np.ndarray, sizes: np.ndarray, width: int, seeds: np.nd
 
 
 def hash_uniform(seeds: np.ndarray, salts: np.ndarray) -> np.ndarray:
-    """Draw numbers in [0, 1) that depend only on seeds and salts (splitmix64, Steele et al. 2014)."""
+    """Draw numbers in [0, 1) by hashing seeds and salts (splitmix64, Steele et al. 2014)."""
     return (hash_pairs(seeds, salts) >> np.uint64(11)).astype(np.float64) * 2.0**-53
 
 
 def hash_pairs(seeds: np.ndarray, salts: np.ndarray) -> np.ndarray:
-    """Hash pairs of uint64 to uint64."""
+    """Hash pairs of uint64 values to uint64."""
     x = seeds + (salts + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -168,7 +169,7 @@ def hash_pairs(seeds: np.ndarray, salts: np.ndarray) -> np.ndarray:
 
 
 def point_seeds(points: np.ndarray, seed: int) -> np.ndarray:
-    """Hash float32 positions ``[n,3]`` with a seed to ``[n]`` uint64, whatever the order of the points."""
+    """Hash float32 positions ``[n,3]`` and a seed to ``[n]`` uint64, independent of the order of the points."""
     bits = np.ascontiguousarray(points, np.float32).view(np.uint32).astype(np.uint64)
     hashes = np.full(len(points), seed & (2**64 - 1), np.uint64)
     for column in bits.T:

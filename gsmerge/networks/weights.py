@@ -21,7 +21,7 @@ Layer = tuple[np.ndarray, np.ndarray, int]  # packed weights, packed bias, outpu
 
 @dataclass(frozen=True, eq=False)
 class NetworkWeights:
-    """The networks of a checkpoint: their sizes, and their weights by name, float32."""
+    """Networks of a checkpoint: options, and float32 weights by name."""
 
     options: NetworkOptions
     arrays: Mapping[str, np.ndarray]
@@ -30,11 +30,11 @@ class NetworkWeights:
 
     @property
     def num_parameters(self) -> int:
-        """Number of weights in the checkpoint."""
+        """Number of weights."""
         return sum(array.size for array in self.arrays.values())
 
     def heads_alone(self) -> NetworkWeights:
-        """Return the decoder heads without the other networks, which take ten times as long."""
+        """Return a copy with the decoder heads alone; the other networks take ten times as long."""
         options = replace(self.options, encoder=False, merger=False, refiner=False)
         return NetworkWeights(
             options, {name: array for name, array in self.arrays.items() if name.startswith("heads.")}

@@ -34,7 +34,7 @@ MARGIN = 2.0  # pixels that the rasterizer's low-pass adds to that
 
 @dataclass(frozen=True, eq=False)
 class BatchPhotos:
-    """Photos ``images [v,h,w,3]`` float32, sRGB in [0, 1], and cameras of the same size."""
+    """Photos ``images [v,h,w,3]`` float32, sRGB in [0, 1], and cameras of the same size, of one batch."""
 
     images: np.ndarray
     cameras: Cameras
@@ -43,12 +43,12 @@ class BatchPhotos:
         return len(self.images)
 
     def photos(self, level: int = 1) -> Photos:
-        """Return the photos for rendering against them, each side divided by ``level``."""
+        """Return the photos for rendering, with sides divided by ``level``."""
         return photos_of(self.images, self.cameras, level)
 
 
 def resize_photos(images: np.ndarray, cameras: Cameras, width: int, height: int) -> BatchPhotos:
-    """Resize photos by area averages."""
+    """Resize photos by area averaging, and their cameras to match."""
     size = width, height
     if size == (cameras.width, cameras.height):
         return BatchPhotos(images, cameras)
@@ -58,7 +58,7 @@ def resize_photos(images: np.ndarray, cameras: Cameras, width: int, height: int)
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """A batch of views, and how it enters a state."""
+    """A batch of views, prepared to enter a state."""
 
     prepared: Prepared
     plan: Plan
@@ -70,12 +70,12 @@ class Batch:
 
     @property
     def scene(self) -> Scene:
-        """The views."""
+        """The canonical scene of the batch."""
         return self.prepared.scene
 
 
 def make_batch(state: OnlineState | None, prepared: Prepared, plan: Plan, online: OnlineOptions, max_k: int) -> Batch:
-    """Bring the photos of views to the size of the state's; without a state these views are the first."""
+    """Make a batch: resize its photos to those of the state, and find out which views are new."""
     cameras = prepared.scene.cameras
     before = cameras[:0] if state is None else state.cameras
     photos = resize_photos(scene_pictures(prepared.scene), cameras, before.width, before.height)
@@ -85,7 +85,7 @@ def make_batch(state: OnlineState | None, prepared: Prepared, plan: Plan, online
 
 @dataclass(frozen=True, eq=False)
 class BatchFeatures:
-    """Feature Gaussians of a batch."""
+    """Feature Gaussians of a batch, with members and networks."""
 
     features: FeatureGaussians
     members: Members  # The batch's Gaussians, which `features.members` are rows of
@@ -95,7 +95,7 @@ class BatchFeatures:
 
 @dataclass(frozen=True)
 class StateKind:
-    """What differs between states of moments and of latents."""
+    """The functions and constants that differ between states of moments and of latents."""
 
     reach: float  # Standard deviations of a group, to where a view touches it
     encode: Callable[[OnlineState | None, Batch, int | None], BatchFeatures]  # Make about so many Gaussians
@@ -106,7 +106,7 @@ class StateKind:
 
 
 def view_ids(known_cameras: Cameras, cameras: Cameras) -> np.ndarray:
-    """Return the index ``[v]`` of each view: of the known view with an identical camera, or a new index."""
+    """Return the index ``[v]`` of each view: that of a known view with the same camera, or a new one."""
     known_ids = {row: i for i, row in reversed(list(enumerate(_rows(known_cameras))))}
     ids = np.array([known_ids.get(row, -1) for row in _rows(cameras)], np.int64)
     ids[ids < 0] = len(known_cameras) + np.arange(np.count_nonzero(ids < 0))
@@ -122,7 +122,7 @@ def _rows(cameras: Cameras) -> list[bytes]:
 def update_replay(
     replay: Replay, batch_photos: BatchPhotos, view_ids: np.ndarray, num_views: int, max_photos: int
 ) -> Replay:
-    """Add photos of views ``view_ids [s]`` to the stored ones, and keep every n-th of all views, n a power of two."""
+    """Add photos of the views ``view_ids [s]`` to those stored, then keep every n-th of all views, n a power of two."""
     ids, rows = np.unique(view_ids, return_index=True)
     new = ~np.isin(ids, replay.views)
     views, step = np.concatenate([replay.views, ids[new]]), 1
@@ -140,11 +140,11 @@ def update_replay(
 def fit_batch_colors(
     groups: GroupSet, batch_photos: BatchPhotos, options: FitOptions, seed: int = 0
 ) -> tuple[GroupSet, FitReport]:
-    """Fit base colours to new photos, with earlier photos as a prior.
+    """Fit base colours to new photos; earlier photos enter as a prior.
 
     The normal equations of earlier photos are stored as their diagonal (``GroupSet.color_precision``) about the colours
-    that solve them: ``color_precision |colour - fitted colour|^2`` is added to the equations of the new photos, so that
-    no earlier photo is needed again.
+    that solve them. The new photos' equations get ``color_precision |colour - fitted colour|^2`` added, so earlier
+    photos are not needed again.
     """
     rows = rows_in_view(groups.features, batch_photos.cameras)
     in_view, photos = select_groups(groups, rows), batch_photos.photos(2)
@@ -160,12 +160,10 @@ def fit_batch_colors(
 
 
 def groups_in_view(features: FeatureGaussians, cameras: Cameras, reach: float = REACH) -> np.ndarray:
-    """Return a mask ``[v,g]`` of groups that may show in each view, by their position and size.
+    """Return a mask ``[v,g]`` of groups that may be visible in each view, by position and size.
 
-    ``reach``: how far a group shows, in standard deviations of all its axes together.
-
-    The only step that goes through all groups: the time of those after it depends on what the views
-    see.
+    ``reach``: how far a group is visible, in standard deviations of all its axes together. This is the only step that
+    goes through all groups; later steps take time only for what the views see.
     """
     means = features.means.astype(np.float64)
     radii = reach * np.sqrt(np.trace(features.covars, axis1=1, axis2=2, dtype=np.float64))
@@ -186,12 +184,12 @@ def groups_in_view(features: FeatureGaussians, cameras: Cameras, reach: float = 
 
 
 def rows_in_view(features: FeatureGaussians, cameras: Cameras, reach: float = REACH) -> np.ndarray:
-    """Return the rising rows of the groups that may show in some view, see :func:`groups_in_view`."""
+    """Return the rising rows of groups that may be visible in some view; see :func:`groups_in_view`."""
     return np.flatnonzero(groups_in_view(features, cameras, reach).any(0))
 
 
 def pixel_errors(gaussians: Gaussians, photos: Photos, height: int, width: int) -> np.ndarray:
-    """Return squared colour errors of pixels ``[v,h,w]``, plus squared transmittance: black photos would hide holes."""
+    """Return squared colour errors ``[v,h,w]`` plus squared transmittance, so that holes count in black photos, too."""
 
     def score(view: int, image: np.ndarray, transmittance: np.ndarray) -> np.ndarray:
         errors = ((np.clip(image, 0, 1) - photos.images[view]) ** 2).mean(-1) + transmittance**2
@@ -201,7 +199,7 @@ def pixel_errors(gaussians: Gaussians, photos: Photos, height: int, width: int) 
 
 
 def group_errors(features: FeatureGaussians, members: Members, errors: np.ndarray) -> np.ndarray:
-    """Average the pixels' errors ``[v,h,w]`` over each group's members, ``[g]``; members without a pixel count as 1."""
+    """Average pixel errors ``[v,h,w]`` over each group's members, ``[g]``; a member without a pixel counts as 1."""
     starts, rows = features.starts, features.members
     pixels = rows if members.pixels is None else members.pixels[rows]
     each = np.where(pixels >= 0, errors.reshape(-1)[pixels], 1.0)
@@ -209,7 +207,7 @@ def group_errors(features: FeatureGaussians, members: Members, errors: np.ndarra
 
 
 def novel_rows(new: BatchFeatures, batch: Batch, state_gaussians: Gaussians, batch_gaussians: Gaussians) -> np.ndarray:
-    """Return the rows of a batch's Feature Gaussians that show half-size photos better than the state does."""
+    """Return the rows of a batch's Feature Gaussians that explain the photos clearly better than the state does."""
     photos, cameras, online = batch.photos.photos(2), batch.scene.cameras, batch.online
     state_errors, batch_errors = (
         group_errors(new.features, new.members, pixel_errors(gaussians, photos, cameras.height, cameras.width))

@@ -18,7 +18,7 @@ from gsmerge.types import Gaussians, Scene
 
 
 class Compactor:
-    """Compactor of views that arrive in batches of any size (paper section 4.5, "Online reconstruction").
+    """Compact views that arrive in batches of any size (paper section 4.5, "Online reconstruction").
 
     Args:
         **settings: Settings by name, those of :class:`gsmerge.CompactOptions` and of
@@ -63,7 +63,7 @@ class Compactor:
 
     @property
     def batches(self) -> Sequence[Mapping[str, Any]]:
-        """Numbers of every batch so far, see :class:`gsmerge.online.extend.BatchReport`."""
+        """Report of every batch so far; see :class:`gsmerge.online.extend.BatchReport`."""
         return () if self._state is None else tuple(self._state.about["batches"])
 
     def extend(self, scene: Scene, *, progress: Progress | None = None) -> BatchReport:
@@ -74,7 +74,7 @@ class Compactor:
     def decode(
         self, *, k: int | None = None, budget: int | str | None = None, progress: Progress | None = None, **fit: Any
     ) -> Gaussians:
-        """Decode the Gaussians so far, see :func:`gsmerge.online.decode_stored.decode_stored`.
+        """Decode the current state into Gaussians; see :func:`gsmerge.online.decode_stored.decode_stored`.
 
         Args:
             k: Gaussians of each group; None: that of the settings.
@@ -94,7 +94,7 @@ class Compactor:
         ).gaussians
 
     def save(self, path: str | PathLike[str], *, overwrite: bool = False) -> None:
-        """Write the state, see :func:`gsmerge.online.file.save_state`.
+        """Write the state to a file; see :func:`gsmerge.online.file.save_state`.
 
         Raises:
             ValueError: If there was no batch yet.

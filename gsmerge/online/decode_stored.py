@@ -30,7 +30,7 @@ from gsmerge.types import Gaussians
 
 @dataclass(frozen=True)
 class DecodeResult:
-    """Gaussians of a state in the world frame, a report of the fit (None without one), and notes."""
+    """Result of decoding: Gaussians in the world frame, report of the fit (None without a fit), and notes."""
 
     gaussians: Gaussians
     fit: FitReport | None
@@ -38,17 +38,17 @@ class DecodeResult:
 
 
 def decodable(stored: Encoded | OnlineState, *, fitted_colors: bool = True) -> Encoded:
-    """Return the encoded scene, or the state as one, see :func:`gsmerge.online.state.to_encoded`."""
+    """Return an encoded scene unchanged, and a state converted to one; see :func:`gsmerge.online.state.to_encoded`."""
     return stored if isinstance(stored, Encoded) else to_encoded(stored, fitted_colors=fitted_colors)
 
 
 def num_photos(stored: Encoded | OnlineState) -> int:
-    """Return the number of photos that a fit can use."""
+    """Return the number of stored photos, to which a fit is possible."""
     return 0 if isinstance(stored, Encoded) else len(stored.replay)
 
 
 def check_fit(stored: Encoded | OnlineState, options: FitOptions) -> None:
-    """Refuse a fit without photos."""
+    """Raise UsageError if a fit is asked for and no photos are stored."""
     if options.fit != "none" and not num_photos(stored):
         raise UsageError(f"fit {options.fit}: expected a state with photos, found none; extend one with photos")
 
@@ -64,7 +64,7 @@ def decode_stored(
     device: str = "cpu",
     progress: Progress | None = None,
 ) -> DecodeResult:
-    """Decode a state, fitted to its photos, or an encoded scene, into Gaussians in the world frame.
+    """Decode an encoded scene, or a state, into Gaussians in the world frame; fit them to stored photos, if any.
 
     ``k`` and ``budget`` are those of :func:`gsmerge.decode_scene`; a full fit begins with fewer
     Gaussians and grows to the number. ``options`` of the fit: None: the full one at its defaults
@@ -117,7 +117,7 @@ def decode_file(
     progress: Progress | None = None,
     seconds_before: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
-    """Decode what a ``.gsm`` file holds, write it to a file, and return the report as plain JSON types.
+    """Decode a ``.gsm`` file, write the Gaussians to a file, and return the report as plain JSON types.
 
     ``settings``: of the fit and the run; ``always_fit``: refuse a file without photos, which otherwise is not fitted.
     ``dry_run``: write nothing. Other arguments and errors are those of :func:`decode_stored` and
@@ -176,7 +176,7 @@ def _comments(stored: Encoded | OnlineState) -> list[str]:
 
 
 def decoding_line(document: Mapping[str, Any]) -> str:
-    """Write the report of a decoding in a line."""
+    """Describe the report of a decoding in one line."""
     before, after = document["input"], document["output"]
     if "dry_run" in document:
         return f"would write  {after['path']}: at most {after['num_gaussians_at_most']:,} Gaussians"

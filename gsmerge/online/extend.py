@@ -38,7 +38,7 @@ from gsmerge.types import Gaussians, Scene
 
 @dataclass(frozen=True)
 class BatchReport:
-    """Report of a batch of views: numbers of its groups, and the record of the run."""
+    """Report of one batch: numbers of views and groups, and the record of the run."""
 
     num_views: int
     num_input: int  # Gaussians of the batch
@@ -63,10 +63,10 @@ def extend(
 ) -> tuple[OnlineState, BatchReport]:
     """Add a batch of views to a state (paper section 4.5, "Online reconstruction").
 
-    ``state``: what earlier batches left, unchanged; None: this is the first one. ``scene``: the new
-    views, in the same world as the earlier ones; tensors become arrays. ``online``: which part of
-    the batch enters the state, and how. Raises ValueError if a setting is out of range or asks for
-    what a state cannot have, or the degree of the harmonics is not that of the state.
+    ``state``: what earlier batches left, which is not changed; None: this is the first batch. ``scene``: the new views,
+    in the same world as the earlier ones; tensors become arrays. ``online``: which part of the batch enters the state,
+    and how. Raises ValueError if a setting is out of range or not possible for a state, or the SH degree differs from
+    the state's.
     """
     options, online = options or CompactOptions().with_settings({"fit": "none"}), online or OnlineOptions()
     if options.decode.k == AUTO:

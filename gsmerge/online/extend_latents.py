@@ -50,10 +50,10 @@ SAMPLE_STEP = 8  # pixels between the samples of a view along each axis
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StateContext(NetworkContext):
-    """The networks for groups of a batch, and of a state, whose ``cameras`` are those of all views.
+    """The networks' inputs for groups of a batch and of a state; ``cameras`` are those of all views.
 
-    Rows in the place of members name the parts that a Feature Gaussian was pooled from: Gaussians of the batch, or
-    groups. The members of earlier batches are gone.
+    Each Feature Gaussian lists, in place of its members, the rows of the parts it was pooled from: Gaussians of the
+    batch, or groups. Members of earlier batches are not stored.
     """
 
     samples: ViewSamples  # Of all views
@@ -66,7 +66,7 @@ class StateContext(NetworkContext):
         return self.samples.describe(self.learn(features), self.cameras)
 
     def learn(self, features: FeatureGaussians) -> Learned:
-        """Find the view that most of each Feature Gaussian belongs to, by weight, and the number of its members."""
+        """Find each Feature Gaussian's view, the one with most of its weight, and its number of members."""
         starts, rows = features.starts, features.members
         owners = np.repeat(np.arange(len(features)), np.diff(starts))
         keys, places = np.unique(owners * len(self.cameras) + self.part_views[rows], return_inverse=True)
@@ -79,13 +79,13 @@ class StateContext(NetworkContext):
 
 
 def keeps_latents(plan: Plan) -> bool:
-    """Return whether later batches go on with what the networks make of this one: where an encoder makes latents."""
+    """Return whether the state keeps latents, which later batches need: where an encoder makes them."""
     networks = plan.networks[0]
     return len(plan.networks) == 1 and networks is not None and networks.options.encoder
 
 
 def own_checkpoint(state: OnlineState, options: CompactOptions) -> Checkpoint | None:
-    """Return the networks of a state as a checkpoint; None for a state without.
+    """Return the networks of a state as a checkpoint; None for a state without networks.
 
     Raises UsageError if the options name others, SceneError if they name a file that cannot be read.
     """

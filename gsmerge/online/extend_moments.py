@@ -67,10 +67,10 @@ MOMENTS = StateKind(REACH, _encode, _decode, _first, _join)
 
 
 def find_partners(features: FeatureGaussians, new: FeatureGaussians, options: MatchOptions) -> np.ndarray:
-    """Return the state's group with the same surface as each new one, ``[n]`` int64, -1 for none.
+    """Return, for each of n new groups, the state's group with the same surface, ``[n]`` int64; -1 for none.
 
-    No group gets two: of several in a cluster by boxes, the first. Matched as across the views of one batch, the state
-    being one view and the batch another.
+    Matching is that across the views of one batch, with the state as one view and the batch as another. A group gets
+    one partner at most: the first of several in a cluster.
     """
     both = FeatureGaussians.concat([features, new])
     sides = (np.arange(len(both)) >= len(features)).astype(np.int64)
@@ -85,7 +85,7 @@ def find_partners(features: FeatureGaussians, new: FeatureGaussians, options: Ma
 
 
 def merge_into(groups: GroupSet, new: GroupSet, rows: np.ndarray, max_k: int) -> GroupSet:
-    """Merge n new groups into those of the state at ``rows [n]`` int64, all different: moments add up, in place."""
+    """Merge n new groups into the state's groups at ``rows [n]`` int64, all different: moments add up."""
     if len(rows) == 0:
         return groups
     old = select_groups(groups, rows)

@@ -45,7 +45,7 @@ HEAD_COUNTS = ("views", "num_members")
 
 
 def save_state(path: str | PathLike[str], state: OnlineState, *, overwrite: bool = False) -> None:
-    """Write a state to a file, bit for bit."""
+    """Write a state to a file; :func:`load_state` restores it bit for bit."""
     groups, replay = state.groups, state.replay
     arrays = {
         "children.counts": np.diff(groups.features.starts).astype(np.uint8),
@@ -72,7 +72,7 @@ def _learned_parts(networks: StateNetworks, learned: Learned) -> tuple[dict[str,
 
 
 def load_state(path: str | PathLike[str]) -> OnlineState:
-    """Read a state from a file; an encoded scene (:func:`gsmerge.save_encoded`) becomes a state."""
+    """Read a state from a file; an encoded scene (:func:`gsmerge.save_encoded`) is converted to a state."""
     stored = load_stored(path)
     return from_encoded(stored) if isinstance(stored, Encoded) else stored
 
@@ -163,7 +163,7 @@ def extend_file(
     progress: Progress | None = None,
     seconds_before: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
-    """Add a batch of views to the state in a file, made if missing, and return the report as plain JSON types.
+    """Add a batch of views to the state in a file, or to a new file, and return the report as plain JSON types.
 
     The file is replaced when all is done, and not at all if anything goes wrong or another process
     has changed it. ``settings``: see :class:`gsmerge.Compactor`; by default the state's own.
@@ -202,7 +202,7 @@ def extend_file(
 
 
 def batch_line(document: Mapping[str, Any]) -> str:
-    """Write the report of a batch in a line."""
+    """Describe the report of a batch in one line."""
     state, dropped = document["state"], document["num_covered"] + document["num_hidden"]
     return (
         f"{state['path']}: batch {state['num_batches']}, {document['num_views']} views,"

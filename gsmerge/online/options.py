@@ -19,7 +19,7 @@ RECIPES: Mapping[str, Mapping[str, Any]] = {"paper": {"tolerance": 0.0, "replay"
 
 @dataclass(frozen=True)
 class OnlineOptions(Settings):
-    """Settings of the way in which new views enter a state."""
+    """Settings of how new views enter a state."""
 
     max_k: int = setting(4, "Most Gaussians per superpixel that can be decoded later: fixed by the first batch.",
         "More take more space.", least=1, most=MAX_CHILDREN)  # fmt: skip
@@ -39,7 +39,7 @@ class OnlineOptions(Settings):
 def merge_settings(
     settings: Mapping[str, Any], state: StoredScene | None = None
 ) -> tuple[CompactOptions, OnlineOptions]:
-    """Merge settings: given, else those of the state, else the defaults, without a full fit."""
+    """Combine settings: those given, else the state's, else the defaults without a full fit."""
     names = OnlineOptions.__dataclass_fields__.keys()
     all_names = names | CompactOptions().to_dict().keys()
     stored = {} if state is None else state.about["options"]

@@ -28,7 +28,7 @@ CHILD_FOOTPRINT = 1e-3  # of the group's: children need no least size, as it is 
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """Stored photos of earlier views."""
+    """Stored photos of earlier views, to which decoding fits."""
 
     images: np.ndarray  # [r,h,w,3] uint8, of the size of the state's cameras
     views: np.ndarray  # [r] int64, rising: which of the state's views they are
@@ -38,13 +38,13 @@ class Replay:
 
 
 def no_photos(cameras: Cameras) -> Replay:
-    """Return no photos, of the size of some views."""
+    """Return an empty store of photos of the cameras' size."""
     return Replay(np.zeros((0, cameras.height, cameras.width, 3), np.uint8), np.zeros(0, np.int64))
 
 
 @dataclass(frozen=True, eq=False)
 class ViewSamples:
-    """Gaussians of some pixels of every view, on a grid: what the views say of groups of other views."""
+    """Gaussians of every view on a coarse grid of pixels, with which groups of other views are compared."""
 
     means: np.ndarray  # [v,h,w,3] float32, canonical
     opacities: np.ndarray  # [v,h,w] float32, 0 where the pixel has no Gaussian
@@ -57,7 +57,7 @@ class ViewSamples:
         return ViewSamples(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
     def describe(self, learned: Learned, cameras: Cameras) -> GroupFeatures:
-        """Compute the networks' inputs for groups; ``cameras``: of all views."""
+        """Compute the networks' inputs for groups; ``cameras`` are those of all views."""
         from gsmerge.networks.cross_view_stats import cross_view_stats
         from gsmerge.networks.tokens import describe_features
 
@@ -79,7 +79,7 @@ class ViewSamples:
 
 
 def sample_views(members: Members, cameras: Cameras, shape: tuple[int, int]) -> ViewSamples:
-    """Take the Gaussians of the pixels in the middles of a grid of ``shape``; of an unaligned scene there are none."""
+    """Sample the Gaussians at the centres of a grid of ``shape``; none of an unaligned scene."""
     (height, width), num_views = shape, len(cameras)
     rows = ((2 * np.arange(height) + 1) * cameras.height) // (2 * height)
     columns = ((2 * np.arange(width) + 1) * cameras.width) // (2 * width)
@@ -100,7 +100,7 @@ def sample_views(members: Members, cameras: Cameras, shape: tuple[int, int]) -> 
 
 @dataclass(frozen=True, eq=False)
 class Learned:
-    """What the networks made of g groups, and what they need to go on with them."""
+    """Output of the networks for g groups, with the views and numbers of members that later batches need."""
 
     refined: FeatureGaussians  # The groups after the refiner, without members: what the heads read
     views: np.ndarray  # [g] int64, the view that each group's frame belongs to
@@ -112,7 +112,7 @@ class Learned:
 
     @staticmethod
     def concat(parts: list[Learned]) -> Learned:
-        """Concatenate that of all parts."""
+        """Concatenate the groups of all parts."""
         refined = FeatureGaussians.concat([part.refined for part in parts])
         views, num_members = ([getattr(part, name) for part in parts] for name in ("views", "num_members"))
         return Learned(refined, np.concatenate(views), np.concatenate(num_members))
@@ -120,7 +120,7 @@ class Learned:
 
 @dataclass(frozen=True, eq=False)
 class GroupSet:
-    """Groups with the Gaussians that they divide into."""
+    """Groups of a state, with the Gaussians (children) into which each divides."""
 
     # g Feature Gaussians, canonical. Their members are rows of `children`. Of states with networks, as encoder and
     # merger left them, with latents. Otherwise with gains of one and without latents: what gains and networks did to
@@ -142,7 +142,7 @@ class GroupSet:
 
 @dataclass(frozen=True, eq=False)
 class StateNetworks:
-    """The networks of a state whose groups are as these left them."""
+    """Networks of a state, with samples of its views; the groups are as these networks left them."""
 
     weights: NetworkWeights  # All networks of a checkpoint
     samples: ViewSamples  # Of all views
@@ -150,10 +150,10 @@ class StateNetworks:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class OnlineState(StoredScene):
-    """State to which new views are added; its size depends on the scene, not on the number of views.
+    """State to which new views are added; its size grows with the scene, not with the number of views.
 
-    The frame is that of the first batch; the cameras are those of all views so far, at the size of
-    the first batch's; ``about`` also has the numbers of every batch.
+    The frame is that of the first batch. The cameras are those of all views so far, at the first batch's size.
+    ``about`` also holds the report of every batch.
     """
 
     groups: GroupSet
@@ -170,7 +170,7 @@ class OnlineState(StoredScene):
 
 
 def bake(features: FeatureGaussians, members: Members, networks: NetworkContext | None, max_k: int) -> GroupSet:
-    """Decode groups into moments and children, so that gains, latents and decoder heads are needed no more."""
+    """Decode groups into moments and children, so that gains, latents and decoder heads are no longer needed."""
     ones = feature_to_gaussians(features)
     children, parents = ones, np.arange(len(features))
     if max_k > 1:
@@ -186,7 +186,7 @@ def bake(features: FeatureGaussians, members: Members, networks: NetworkContext 
 def make_groups(
     features: FeatureGaussians, children: Gaussians, parents: np.ndarray, learned: Learned | None = None
 ) -> GroupSet:
-    """Make groups that no photo was fitted to; ``parents``: the rising group of each child."""
+    """Make groups without fitted colours; ``parents``: rising group of each child."""
     if learned is not None:
         learned = replace(learned, refined=without_members(learned.refined))
     precision = np.zeros(len(features), np.float32)
@@ -194,13 +194,13 @@ def make_groups(
 
 
 def decoding_to(ones: Gaussians, features: FeatureGaussians) -> FeatureGaussians:
-    """Return Feature Gaussians with the moments of ``ones``, to which they decode without gains and latents."""
+    """Return Feature Gaussians that decode to the Gaussians ``ones``, without gains and latents."""
     neutral, no_latents = np.ones(len(ones), np.float32), np.zeros((len(ones), 0), np.float32)
     return replace(features, gains=neutral, latents=no_latents, **moments_of(ones))
 
 
 def from_encoded(encoded: Encoded) -> OnlineState:
-    """Make a state of one batch, without photos, of an encoded scene."""
+    """Convert an encoded scene to a state of one batch without photos."""
     ones, _ = children_of(encoded, np.ones(len(encoded), np.int64))
     children, parents = children_of(encoded, np.full(len(encoded), encoded.settings.max_k))
     groups = make_groups(decoding_to(ones, encoded.features), children, parents)
@@ -224,7 +224,7 @@ def from_encoded(encoded: Encoded) -> OnlineState:
 
 
 def moments_of(gaussians: Gaussians) -> dict[str, np.ndarray]:
-    """Return the fields of Feature Gaussians that decode to given Gaussians, at gains of one."""
+    """Return the fields of Feature Gaussians with gains of one that decode to the given Gaussians."""
     scales = gaussians.scales.astype(np.float64)
     _, middle, largest = np.sort(scales, -1).T
     opacities = gaussians.opacities.astype(np.float64).clip(0, MAX_OPACITY)
@@ -238,19 +238,19 @@ def moments_of(gaussians: Gaussians) -> dict[str, np.ndarray]:
 
 
 def with_child_rows(features: FeatureGaussians, parents: np.ndarray) -> FeatureGaussians:
-    """Return Feature Gaussians whose members are the rows 0, 1, ... of their children; ``parents`` rise."""
+    """Return Feature Gaussians whose members are rows 0, 1, ... of their children; ``parents`` rise."""
     starts = np.concatenate([[0], np.bincount(parents, minlength=len(features)).cumsum()])
     return replace(features, starts=starts, members=np.arange(len(parents)))
 
 
 def child_members(groups: GroupSet) -> Members:
-    """Return the children as members of their groups."""
+    """Return the children of groups as members."""
     footprints = CHILD_FOOTPRINT * groups.features.footprints.repeat(np.diff(groups.features.starts))
     return gaussian_members(groups.children, footprints)
 
 
 def select_groups(groups: GroupSet, rows: np.ndarray) -> GroupSet:
-    """Return some of the groups, with their children."""
+    """Select groups by ``rows``, with their children."""
     features = take(groups.features, rows)
     children = groups.children[features.members]
     members = np.arange(len(children))
@@ -274,7 +274,7 @@ def concat_groups(sets: list[GroupSet]) -> GroupSet:
 
 
 def limit_children(groups: GroupSet, max_k: int) -> GroupSet:
-    """Pool the children of groups with more than ``max_k`` to this number."""
+    """Pool children in groups that have more than ``max_k``."""
     rows = np.flatnonzero(np.diff(groups.features.starts) > max_k)
     if len(rows) == 0:
         return groups
@@ -285,14 +285,14 @@ def limit_children(groups: GroupSet, max_k: int) -> GroupSet:
 
 
 def replace_groups(groups: GroupSet, rows: np.ndarray, new_groups: GroupSet) -> GroupSet:
-    """Replace some groups by others, one for one, at their rows."""
+    """Replace the groups at ``rows`` by as many others."""
     index = np.arange(len(groups))
     index[rows] = len(groups) + np.arange(len(rows))
     return select_groups(concat_groups([groups, new_groups]), index)
 
 
 def with_fitted_colors(groups: GroupSet) -> GroupSet:
-    """Return groups and children in the colours that fit the photos."""
+    """Return groups and children in the colours fitted to the photos."""
     offsets = groups.fitted_sh0 - groups.features.sh0
     sizes = np.diff(groups.features.starts)
     features = replace(groups.features, sh0=groups.fitted_sh0)
@@ -301,9 +301,9 @@ def with_fitted_colors(groups: GroupSet) -> GroupSet:
 
 
 def to_encoded(state: OnlineState, *, fitted_colors: bool = True) -> Encoded:
-    """Return the state as an encoded scene, in the fitted colours or in those of the exports.
+    """Convert a state to an encoded scene, in fitted colours or in those of the input files.
 
-    With networks, the colours are those of the heads.
+    With networks, decoder heads set the colours instead.
     """
     groups, heads, max_k = state.groups, None, state.settings.max_k
     if fitted_colors and state.networks is None:

@@ -78,7 +78,7 @@ class _Render(torch.autograd.Function):
 def render_tensors(
     gaussians: Gaussians, cameras: Cameras, background: Array, *, with_depths: bool, **options: Any
 ) -> Rendering:
-    """Render tensors on the CPU with a backward pass, as :func:`gsmerge.render` does with a checked background."""
+    """Render tensors on the CPU with a backward pass; see :func:`gsmerge.render`."""
     tensors = (*vars(gaussians).values(), cameras.viewmats)
     cameras = replace(cameras, viewmats=cameras.viewmats.detach())
     drawn = _Render.apply(cameras, background, options, with_depths, *tensors)
@@ -117,7 +117,7 @@ class _Draw(torch.autograd.Function):
 
 
 def draw_colored(shape: Shape, colors: Tensor, camera: dict[str, Any], background: np.ndarray) -> tuple[Tensor, Tensor]:
-    """Draw one view by the kernels; on a GPU there is :func:`gsmerge.raster.cuda.rasterize`.
+    """Draw one view from colours, differentiable, on the CPU; on a GPU: :func:`gsmerge.raster.cuda.rasterize`.
 
     ``shape`` are means ``[n,3]``, quaternions ``[n,4]``, scales ``[n,3]`` and opacities ``[n]``,
     ``colors [n,3]`` of any sign, all float32. Returns the image ``[h,w,3]``, differentiable in all
@@ -127,7 +127,7 @@ def draw_colored(shape: Shape, colors: Tensor, camera: dict[str, Any], backgroun
 
 
 def seen_colors(means: Tensor, sh0: Tensor, shN: Tensor, viewmat: np.ndarray) -> Tensor:
-    """Return the colours ``[n,3]`` of harmonics in a view, not below 0, without gradient."""
+    """Evaluate the colours ``[n,3]`` of spherical harmonics in a view, clipped at 0, without gradient."""
     eye = camera_centres(viewmat).astype(np.float32)
     count, arrays = len(means), [tensor.detach().contiguous().numpy() for tensor in (means, sh0, shN)]
     colors = np.empty((count, 3), np.float32)

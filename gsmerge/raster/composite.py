@@ -17,7 +17,7 @@ from gsmerge.types import Cameras, Gaussians
 
 
 def background_color(background: ArrayLike) -> Array:
-    """Return three numbers for one or three."""
+    """Expand a background of one or three numbers to ``[3]``."""
     try:
         return np.broadcast_to(np.asarray(background, np.float32), (3,)).copy()
     except (TypeError, ValueError):
@@ -25,7 +25,7 @@ def background_color(background: ArrayLike) -> Array:
 
 
 def view_colors(plan: ViewPlan) -> Array:
-    """Return the colours ``[m,3]`` of the plan's Gaussians seen from its view, not below 0."""
+    """Evaluate the colours ``[m,3]`` of the plan's Gaussians as seen from its view, clipped at 0."""
     colors, splats = np.empty((len(plan.ids), 3), np.float32), plan.splats
     with use_threads() as threads:
         parallel_map(
@@ -36,7 +36,7 @@ def view_colors(plan: ViewPlan) -> Array:
 
 
 def blend(plan: ViewPlan, colors: Array, background: Array) -> tuple[Array, Array]:
-    """Blend the ``[m,3]`` colours of the plan's Gaussians into an image and its remaining transmittance."""
+    """Blend ``colors [m,3]`` of the plan's Gaussians; return the image ``[h,w,3]`` and its transmittance ``[h,w]``."""
     image = np.empty((plan.height, plan.width, 3), np.float32)
     transmittance = np.empty((plan.height, plan.width), np.float32)
 
@@ -49,13 +49,13 @@ def blend(plan: ViewPlan, colors: Array, background: Array) -> tuple[Array, Arra
 
 
 def mean_depths(plan: ViewPlan, alphas: Array, least_alpha: float = 0.0) -> Array:
-    """Return the mean camera z of what is blended, ``[h,w]``; 0 where ``alphas [h,w]`` are at most ``least_alpha``."""
+    """Return the mean blended depth ``[h,w]``, camera z; 0 where ``alphas [h,w]`` are at most ``least_alpha``."""
     weighted = blend(plan, np.repeat(plan.depths[:, None], 3, 1), np.zeros(3, np.float32))[0][..., 0]
     return np.divide(weighted, alphas, out=np.zeros_like(weighted), where=alphas > least_alpha)
 
 
 def composite(plan: ViewPlan, colors: Array | None = None, background: ArrayLike = 0.0) -> tuple[Array, Array]:
-    """Blend the Gaussians of a view front to back.
+    """Blend the Gaussians of a view front to back into an image.
 
     ``colors [n,3]`` of all Gaussians may have any sign; None: their spherical harmonics seen from
     this view, not below 0. ``background``: 1 or 3 numbers. Returns the image ``[h,w,3]`` and the
@@ -69,11 +69,10 @@ def composite(plan: ViewPlan, colors: Array | None = None, background: ArrayLike
 
 
 def splat_adjoint(plan: ViewPlan, image: Array) -> Array:
-    """Sum every Gaussian's blending weight times an image ``[h,w,c]`` over the pixels, ``[n,c]`` float32.
+    """Sum blending weight times ``image [h,w,c]`` over the pixels, for each Gaussian: ``[n,c]`` float32.
 
-    The transpose of :func:`composite` (without background) as a linear map from colours to images.
-    Four channels cost little more than one. Raises ValueError if the image has another size than
-    the view.
+    This is the transpose of :func:`composite` (without background) as a linear map from colours to images. Four
+    channels cost little more than one. Raises ValueError if the image has another size than the view.
     """
     if image.ndim != 3 or image.shape[:2] != (plan.height, plan.width):
         raise ValueError(f"image: expected shape {[plan.height, plan.width, 'c']}, got {list(image.shape)}")
@@ -100,7 +99,7 @@ def survey(plan: ViewPlan, colors: Array | None = None) -> tuple[Array, Array, A
 
 
 def contributions(plan: ViewPlan) -> tuple[Array, Array]:
-    """Return sum (pixels) and maximum of every Gaussian's blending weight, both ``[n]`` float32; 0 if unseen."""
+    """Return the sum (pixels) and the maximum of each Gaussian's blending weights, ``[n]`` float32; 0 if unseen."""
     totals = np.zeros((len(plan.ids), 2), np.float32)
     kernels.contributions(*plan.lists, plan.height, plan.width, totals)
     mass, peak = np.zeros((2, len(plan.splats)), np.float32)
@@ -110,7 +109,7 @@ def contributions(plan: ViewPlan) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """Images of c views.
+    """Rendered images of c views.
 
     Args:
         images: ``[c,h,w,3]`` float32 over the background, not clamped at 1.
@@ -130,7 +129,7 @@ class Rendering:
 
 
 def prepare_views(gaussians: Gaussians, cameras: Cameras) -> tuple[Splats, Array, Array]:
-    """Return splats around the cameras' own centre, and view matrices and intrinsics in float64.
+    """Return splats relative to the cameras' mean centre, and viewmats and intrinsics in float64.
 
     The centre is taken off in float64, so that scenes in geographic coordinates keep their detail.
     """
@@ -146,9 +145,9 @@ def draw_views(
     with_depths: bool,
     first: int = 0,
 ) -> Rendering:
-    """Draw the plans, one for the number of each view, of images of ``shape`` (views, height, width).
+    """Draw the plans of all views; ``shape`` is (views, height, width).
 
-    The views' numbers begin with ``first``.
+    View numbers start at ``first``.
     """
     images, alphas = np.empty((*shape, 3), np.float32), np.empty((*shape, 1), np.float32)
     depths = np.empty((*shape, 1), np.float32) if with_depths else None

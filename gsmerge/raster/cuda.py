@@ -46,7 +46,7 @@ Camera = tuple[Tensor, Tensor, int, int]  # world to camera [4,4], intrinsics [3
 
 @cache
 def gsplat_problem() -> str | None:
-    """Say what keeps gsplat from being used, as a clause; None where nothing does.
+    """Describe in a clause why gsplat cannot be used; None if it can.
 
     The first call imports gsplat and compiles it where that is needed, which takes minutes. What it
     prints goes to standard error, so that documents on standard output stay whole.
@@ -64,7 +64,7 @@ def gsplat_problem() -> str | None:
 
 
 def first_line(error: BaseException) -> str:
-    """Return the class of an exception and the first line of its message."""
+    """Return the class of an exception and the first line of its message as text."""
     lines = str(error).strip().splitlines()
     return f"{type(error).__name__}: {lines[0].strip()}" if lines else type(error).__name__
 
@@ -90,7 +90,7 @@ def rasterize(
     far: float = 1e10,
     with_depths: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
-    """Draw Gaussians into one view, by one call of gsplat's ``rasterization``.
+    """Draw Gaussians into one view by one call of gsplat's ``rasterization``.
 
     ``colors`` are ``[n,3]``, or with ``sh_degree`` spherical harmonics ``[n,k,3]``; ``background``
     is ``[3]``. Returns the image ``[h,w,3]``, alpha ``[h,w,1]``, mean depth ``[h,w,1]`` without
@@ -130,10 +130,10 @@ def _no_zero(quats: Tensor) -> Tensor:
 
 
 def peak_weights(shape: Shape, camera: Camera, *, eps2d: float = EPS2D) -> tuple[Tensor, Tensor]:
-    """Return the largest blending weight ``[n]`` of every Gaussian in a view, and a mask ``[n]`` of footprints.
+    """Return each Gaussian's largest blending weight ``[n]`` in a view, and a mask ``[n]`` of Gaussians drawn there.
 
-    gsplat lists the Gaussians of every pixel, nearest first; their weights follow from its
-    footprints. That takes about 150 bytes for each of them.
+    gsplat lists the Gaussians of every pixel, nearest first; the weights follow from their footprints. Each listed pair
+    takes about 150 bytes.
     """
     means, quats, scales, opacities = (tensor.float() for tensor in shape)
     viewmat, K, width, height = camera
@@ -175,12 +175,11 @@ def render_cuda(
     antialiased: bool,
     with_depths: bool,
 ) -> Rendering:
-    """Render CUDA tensors by gsplat, as :func:`gsmerge.render` does; the ``[3]`` background is checked already.
+    """Render CUDA tensors with gsplat; see :func:`gsmerge.render`. ``background [3]`` is checked already.
 
-    View by view: in one call of several views gsplat copies all harmonics for each of them, which
-    for 84 views of 14 million Gaussians of degree 4 would take 350 GB. Positions are taken relative
-    to the cameras' own centre in float64 first, so that scenes in geographic coordinates keep their
-    detail.
+    Views are drawn one by one: in one call for several views gsplat copies all harmonics for each, 350 GB for 84 views
+    of 14 million Gaussians of degree 4. Positions are first taken relative to the cameras' mean centre in float64, so
+    that scenes in geographic coordinates keep their detail.
     """
     check_range(near, far, EPS2D)
     viewmats = cameras.viewmats.double()
@@ -208,6 +207,6 @@ def render_cuda(
 
 
 def harmonic_colors(means: Tensor, sh: Tensor, eye: Tensor) -> Tensor:
-    """Evaluate the colours ``[n,3]`` of ``sh [n,k,3]`` seen from ``eye [3]``, not below 0."""
+    """Evaluate the colours ``[n,3]`` of harmonics ``sh [n,k,3]`` seen from ``eye [3]``, clipped at 0."""
     degree = round(sh.shape[1] ** 0.5) - 1
     return (_gsplat().spherical_harmonics(degree, means - eye, sh) + 0.5).clamp_min(0)

@@ -79,7 +79,7 @@ def gradients_of(
     grad_left: Array | None,
     with_viewmat: bool,
 ) -> Gradients:
-    """Return the gradients of :func:`plan_gradients` for unchecked contiguous float32 arrays; colours ``[m,3]``."""
+    """Return the gradients of :func:`plan_gradients`, given contiguous float32 arrays that are not checked."""
     m, splats = len(plan.ids), plan.splats
     slots = np.empty((len(plan.flatten_ids), SUMS), np.float32)
     sums = np.zeros((m, SUMS), np.float32)
@@ -142,11 +142,10 @@ def color_gradients(
 ) -> ColorGradients:
     """Return the gradients of a loss through the spherical harmonics of a plan's Gaussians in its view.
 
-    ``grad_colors [m,3]`` are such as :attr:`Gradients.colors`. ``colors [m,3]`` float32 are the
-    colours themselves, where they are at hand; no gradient passes where they are cut at 0.
-    ``used``: an earlier answer of as many coefficients that nobody needs any more, whose memory is
-    written again if it is large enough: new memory costs a quarter of the time, and where pages are
-    small several times all of it. The gradient of the eye is minus the sum of those of the means.
+    ``grad_colors [m,3]`` are such as :attr:`Gradients.colors`. ``colors [m,3]`` float32 are the colours, if computed
+    already; no gradient passes where they are clipped at 0. ``used``: a result with as many coefficients that is no
+    longer needed, whose memory is reused if large enough, since new memory costs a quarter of the time or more. The
+    gradient of the eye is minus the sum of those of the means.
     """
     m, splats = len(plan.ids), plan.splats
     grad_colors = _expect("grad_colors", grad_colors, (m, 3))
@@ -167,7 +166,7 @@ def color_gradients(
 
 
 def pose_gradient(plan: ViewPlan, gradients: Gradients, shade: ColorGradients | None = None) -> Array:
-    """Return the gradient ``[4,4]`` float64 of the world-to-camera matrix, through geometry and, if given, colours."""
+    """Return the gradient ``[4,4]`` float64 of the viewmat, through geometry and, with ``shade``, through colours."""
     assert gradients.viewmat is not None
     viewmat = gradients.viewmat.copy()
     if shade is not None:

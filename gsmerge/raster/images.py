@@ -22,7 +22,7 @@ MIN_ALPHA = 0.5  # opacity of a pixel from which it counts when superpixels are 
 
 
 def one_device(gaussians: Gaussians, cameras: Cameras) -> torch.device | None:
-    """Return the device of all tensors, None for arrays; refuse several devices."""
+    """Return the device of all tensors, None for arrays; raise ValueError for several devices."""
     values = (*vars(gaussians).values(), cameras.viewmats, cameras.Ks)
     devices = {value.device for value in values if not isinstance(value, np.ndarray)}
     if len(devices) > 1:
@@ -107,7 +107,7 @@ def render_in_turn(
     antialiased: bool = False,
     near: float = 0.01,
 ) -> Iterator[np.ndarray]:
-    """Yield the images ``[h,w,3]`` that :func:`render` makes of arrays, to the bit, with ``at_once`` in memory."""
+    """Yield the images ``[h,w,3]`` of :func:`render`, bit for bit, with at most ``at_once`` in memory."""
     under = background_color(background)
     plan_one = _planner(gaussians, cameras, {"antialiased": antialiased, "near": near})
     for first in range(0, len(cameras), at_once):
@@ -127,7 +127,7 @@ def _planner(gaussians: Gaussians, cameras: Cameras, options: Mapping[str, Any])
 
 
 def seen_weights(scene: Scene) -> np.ndarray:
-    """Measure the largest blending weight ``[n]`` float32 of each Gaussian in one view, pixels."""
+    """Measure each Gaussian's largest summed blending weight in one view, ``[n]`` float32, pixels."""
     most, lock = np.zeros(len(scene.gaussians), np.float32), Lock()
 
     def one_view(_: int, plan: ViewPlan) -> None:
@@ -140,7 +140,7 @@ def seen_weights(scene: Scene) -> np.ndarray:
 
 
 def plan_views(scene: Scene, use: Callable[[int, ViewPlan], None]) -> None:
-    """Plan every view and use it, in parallel unless the plans would fill the memory."""
+    """Call ``use(view, plan)`` with the plan of every view, in parallel if memory allows."""
     splats, cameras = prepare(scene.gaussians), scene.cameras
     viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
 

@@ -14,7 +14,7 @@ MAX_LOSS = 0.5  # dB that a result may show the photos worse than its input with
 
 
 def image_pair(image: Array, reference: Array) -> tuple[Array, Array]:
-    """Return two images ``[h,w,c]`` as arrays; raise ValueError if their shapes differ."""
+    """Convert two images ``[h,w,c]`` to arrays; raise ValueError if their shapes differ."""
     first, second = as_array(image), as_array(reference)
     if first.ndim != 3 or first.shape != second.shape:
         raise ValueError(f"expected two images [h,w,c] of one shape, got {list(first.shape)} and {list(second.shape)}")
@@ -22,7 +22,7 @@ def image_pair(image: Array, reference: Array) -> tuple[Array, Array]:
 
 
 def pixel_mask(mask: Array, image: Array) -> Array:
-    """Return a mask as ``[h,w]`` bool; raise ValueError if its shape differs from the image's or it is empty."""
+    """Convert a mask to ``[h,w]`` bool; raise ValueError if its shape differs from the image's or it is empty."""
     chosen = as_array(mask).astype(bool)
     if chosen.ndim == 3 and chosen.shape[2] == 1:
         chosen = chosen[..., 0]
@@ -34,7 +34,7 @@ def pixel_mask(mask: Array, image: Array) -> Array:
 
 
 def psnr(image: Array, reference: Array, mask: Array | None = None) -> float:
-    """Return the peak signal-to-noise ratio in dB of images ``[h,w,c]`` in [0, 1], in a mask ``[h,w]`` if given."""
+    """Return the PSNR (dB) of images ``[h,w,c]`` in [0, 1], within ``mask [h,w]`` if given."""
     first, second = image_pair(image, reference)
     if mask is not None:  # first, as float64 of a whole photo is more than all else that is known of it
         chosen = pixel_mask(mask, first)
@@ -45,12 +45,12 @@ def psnr(image: Array, reference: Array, mask: Array | None = None) -> float:
 
 
 def decibels(error: float) -> float:
-    """Return the peak signal-to-noise ratio, dB, of a mean squared error of values in [0, 1]; at most 120."""
+    """Convert a mean squared error of values in [0, 1] to PSNR, dB; at most 120."""
     return -10 * float(log10(max(error, 1e-12)))
 
 
 def describe_loss(name: str, before: float | None, after: float | None) -> str | None:
-    """Say that a result shows its scene's own photos worse than the input; None up to ``MAX_LOSS``.
+    """Describe that a result shows the scene's own photos worse than the input does; None up to ``MAX_LOSS``.
 
     ``before``, ``after``: PSNR (dB) of the photos from the input and from the result; None without
     photos.

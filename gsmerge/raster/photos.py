@@ -28,7 +28,7 @@ EPS2D = 0.3  # low-pass of the rasterizer, square pixels of the full-size image
 
 @dataclass(frozen=True)
 class Photos:
-    """V photos of one size."""
+    """V photos of one size, with their cameras and pixel weights."""
 
     images: np.ndarray  # [v,h,w,3] float32, sRGB in [0, 1]; uint8 of photos larger than the grid, see image()
     viewmats: np.ndarray  # [v,4,4] world to camera
@@ -86,7 +86,7 @@ def scene_pictures(scene: Scene) -> np.ndarray:
 
 
 def scene_photos(scene: Scene, level: float = 1) -> Photos:
-    """Return the scene's photos, each side divided by ``level`` (area averages)."""
+    """Return the scene's photos with sides divided by ``level`` (area averages)."""
     if scene.images is None:
         raise ValueError("expected a scene with images")
     photos = photos_of(scene.images, scene.cameras, level)
@@ -94,7 +94,7 @@ def scene_photos(scene: Scene, level: float = 1) -> Photos:
 
 
 def pixel_weights(masks: np.ndarray | None, width: int, height: int) -> np.ndarray | None:
-    """Return weights ``[v,height,width]`` float32 of photos with masks ``[v,h,w]``: 1 inside, little outside."""
+    """Convert masks ``[v,h,w]`` to pixel weights ``[v,height,width]`` float32: 1 inside, little outside."""
     if masks is None:
         return None
     size = width, height
@@ -103,7 +103,7 @@ def pixel_weights(masks: np.ndarray | None, width: int, height: int) -> np.ndarr
 
 
 def photos_of(images: np.ndarray, cameras: Cameras, level: float = 1) -> Photos:
-    """Return photos ``[v,h,w,3]`` of the cameras' size, each side divided by ``level`` (area averages)."""
+    """Return photos ``[v,h,w,3]`` with their cameras, sides divided by ``level`` (area averages)."""
     blank = blank_photos(cameras, level)
     if level == 1:
         return replace(blank, images=images)
@@ -113,7 +113,7 @@ def photos_of(images: np.ndarray, cameras: Cameras, level: float = 1) -> Photos:
 
 
 def blank_photos(cameras: Cameras, level: float = 1) -> Photos:
-    """Return black photos, which take no memory, where only cameras matter; each side divided by ``level``."""
+    """Return black photos that take no memory, for uses where only cameras matter; sides divided by ``level``."""
     viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
     w, h = cameras.width, cameras.height
     width, height = max(1, round(w / level)), max(1, round(h / level))
@@ -157,7 +157,7 @@ def photo_errors(
 def photo_psnr(
     gaussians: Gaussians | Splats, photos: Photos, views: Iterable[int], *, quarter: bool = False, **settings: Any
 ) -> float:
-    """Return the mean PSNR (dB) of some photos, or of a ``quarter`` of each; ``settings``: see :func:`photo_errors`."""
+    """Return the mean PSNR (dB) on the photos of ``views``, or on a ``quarter`` of each; see :func:`photo_errors`."""
 
     def tiles(view: int) -> np.ndarray | None:
         return scored_tiles(view, photos.width, photos.height) if quarter else None
@@ -169,7 +169,7 @@ def photo_psnr(
 
 
 def view_psnr(image: np.ndarray, photos: Photos, view: int, *, quarter: bool) -> float:
-    """Return the PSNR (dB) of a photo, or a quarter of it, and its render ``[h,w,3]``, clipped in place."""
+    """Return the PSNR (dB) of a render ``[h,w,3]``, clipped in place, against a photo or a quarter of it."""
     tiles = scored_tiles(view, photos.width, photos.height) if quarter else None
     mask = None if tiles is None else tiles.repeat(TILE, 0).repeat(TILE, 1)[: photos.height, : photos.width]
     if photos.weights is not None:
@@ -180,7 +180,7 @@ def view_psnr(image: np.ndarray, photos: Photos, view: int, *, quarter: bool) ->
 
 
 def scored_tiles(view: int, width: int, height: int) -> np.ndarray | None:
-    """Return a mask ``[tile_height,tile_width]`` of a quarter of a view's tiles, in blocks; None for small views."""
+    """Return a mask ``[tile_height,tile_width]`` that selects a quarter of a view's tiles; None for small views."""
     tile_height, tile_width = -(-height // TILE), -(-width // TILE)
     if min(tile_height, tile_width) <= 3 * BLOCK:
         return None

@@ -41,7 +41,7 @@ class Splats:
 
 @dataclass(frozen=True, eq=False)
 class ViewPlan:
-    """Projected Gaussians of one view, in the order of depth, by tile."""
+    """Gaussians projected into one view, sorted by depth and listed by tile."""
 
     splats: Splats
     ids: Array  # [m] int32, ascending: the Gaussians that may touch the image. (A few at its border may miss it.)
@@ -58,7 +58,7 @@ class ViewPlan:
 
     @property
     def lists(self) -> tuple[Array, Array, Array, int]:
-        """The first arguments of the kernels that walk the tiles' lists; the last is the number of tiles per row."""
+        """First arguments of the kernels that walk the tiles' lists; the last is the number of tiles per row."""
         return self.conics, self.flatten_ids, self.isect_offsets, -(-self.width // projection.TILE)
 
 
@@ -78,7 +78,7 @@ def _spread_origin(means: Array) -> Array:
 
 
 def prepare(gaussians: Gaussians, origin: ArrayLike | None = None) -> Splats:
-    """Return Gaussians as float32 splats, without copying what already is.
+    """Convert Gaussians to float32 splats for the kernels, copying only what needs conversion.
 
     Means may be float64, for scenes in geographic coordinates: ``origin [3]`` is the world point
     that becomes the arrays' zero. None: the world's zero, unless the scene is far away from it
@@ -91,18 +91,18 @@ def prepare(gaussians: Gaussians, origin: ArrayLike | None = None) -> Splats:
 
 
 def num_pieces(count: int, threads: int, least: int = PIECE) -> int:
-    """Return the number of pieces of work for the pool, several per thread, each of about ``least`` or more."""
+    """Return the number of pieces to split work into: several per thread, each of about ``least`` items or more."""
     return 1 if threads == 1 else max(1, min(4 * threads, count // least))
 
 
 def pieces(count: int, threads: int) -> list[tuple[int, int]]:
-    """Return ranges for the pool; no result depends on where they end."""
+    """Split ``count`` items into ranges for the pool; results do not depend on the cuts."""
     num = num_pieces(count, threads)
     return [(count * i // num, count * (i + 1) // num) for i in range(num)]
 
 
 def tile_ranges(plan: ViewPlan, threads: int, least: int = PIECE) -> list[tuple[int, int]]:
-    """Return ranges of tiles with about equally many intersections, at least about ``least``, for the pool."""
+    """Split tiles into ranges with about equally many intersections, at least about ``least``, for the pool."""
     count = len(plan.flatten_ids)
     num = num_pieces(count, threads, least)
     cuts = np.searchsorted(plan.isect_offsets, count * np.arange(1, num) / num)
@@ -202,7 +202,7 @@ def _check_view(viewmat: Array, K: Array, width: int, height: int) -> None:
 
 
 def check_range(near: float, far: float, eps2d: float) -> None:
-    """Refuse a depth range or a dilation that makes no sense."""
+    """Raise ValueError for an impossible depth range or dilation."""
     if not (0 < near < far and eps2d >= 0):
         raise ValueError(f"expected 0 < near < far and eps2d >= 0, got {near}, {far} and {eps2d}")
 

@@ -20,7 +20,7 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True, eq=False)
 class ViewWeights:
-    """Matrix W of one view, stored by tile and Gaussian."""
+    """Sparse matrix W of one view's blending weights (pixels x Gaussians), stored by tile and Gaussian."""
 
     ids: Array  # [m] int32: the Gaussians that may touch the image
     flatten_ids: Array  # [intersections] int32 rows of `ids`
@@ -34,18 +34,18 @@ class ViewWeights:
 
     @property
     def entries(self) -> tuple[Array, Array, Array, Array, Array, int]:
-        """The first arguments of the kernels that go over the entries."""
+        """First arguments of the kernels that go over the entries of W."""
         return self.starts, self.lanes, self.weights, self.flatten_ids, self.isect_offsets, self.tile_width
 
 
 def view_weights(plan: ViewPlan) -> ViewWeights:
-    """Write out the weights of a planned view."""
+    """Compute the blending weights of a planned view."""
     starts, lanes, weights = kernels.list_weights(*plan.lists, plan.height, plan.width)
     return ViewWeights(plan.ids, *plan.lists[1:], starts, lanes, weights, plan.height, plan.width)
 
 
 def apply(view: ViewWeights, colors: Array) -> Array:
-    """Multiply W with ``colors [n,c]``, up to four channels: image ``[h,w,c]`` float32."""
+    """Render ``colors [n,c]``, up to four channels, by the stored weights: image ``[h,w,c]`` float32."""
     channels = colors.shape[1]
     rows = np.zeros((len(view.ids), kernels.LANES), np.float32)
     rows[:, :channels] = colors[view.ids]

@@ -68,12 +68,12 @@ class StressScene:
 
 
 def keep_views(setup: StressScene, choose: Callable[[int], Sequence[int]]) -> StressScene:
-    """Keep the views that ``choose`` lists, given their number."""
+    """Keep the views that ``choose(number of views)`` returns."""
     return replace(setup, scene=subset(setup.scene, choose(len(setup.scene))))
 
 
 def move(setup: StressScene, factor: float, shift: Sequence[float]) -> StressScene:
-    """Scale the world, and move it by ``shift`` in units of its own size."""
+    """Scale the world by ``factor``, and shift it by ``shift`` in units of its own size."""
     offset = np.array(shift, np.float64) * scene_frame(setup.scene).unit * factor
     scene, views = setup.scene, setup.views
     means = factor * scene.gaussians.means.astype(np.float64) + offset
@@ -91,7 +91,7 @@ def _move_cameras(cameras: Cameras, factor: float, offset: np.ndarray) -> Camera
 
 
 def perturb_poses(setup: StressScene, degrees: float) -> StressScene:
-    """Rotate every view, with its Gaussians, about its camera centre by a random axis."""
+    """Rotate every view with its Gaussians about the camera centre, by a random axis."""
     scene = setup.scene
     viewmats = turn_cameras(scene.cameras.viewmats.astype(np.float64), degrees, slice(None))
     return replace(setup, scene=move_views(scene, viewmats))
@@ -107,7 +107,7 @@ def move_view(setup: StressScene, share: float) -> StressScene:
 
 
 def turn_cameras(viewmats: np.ndarray, degrees: float, views: slice) -> np.ndarray:
-    """Turn some cameras, without their Gaussians, about their centres, each about another axis."""
+    """Rotate some cameras, but not their Gaussians, about their centres by random axes."""
     turned, rng = viewmats.copy(), np.random.default_rng(SEED)
     for view in range(len(viewmats))[views]:
         axis = rng.normal(size=3)
@@ -116,7 +116,7 @@ def turn_cameras(viewmats: np.ndarray, degrees: float, views: slice) -> np.ndarr
 
 
 def change_exposure(setup: StressScene, share: float) -> StressScene:
-    """Make photos, and the Gaussians of their views, alternately brighter and darker."""
+    """Make photos and their views' Gaussians alternately brighter and darker."""
     scene = setup.scene
     assert scene.images is not None
     gains = np.array([1 + share if view % 2 else 1 - share for view in range(len(scene))], np.float32)
@@ -129,7 +129,7 @@ def change_exposure(setup: StressScene, share: float) -> StressScene:
 
 
 def break_rows(setup: StressScene) -> StressScene:
-    """Take away the finite numbers of some rows, which the reader leaves out."""
+    """Break some rows, as if the file had NaN there."""
     scene = setup.scene
     chosen = _choose(len(scene.gaussians), BROKEN_SHARE)
     if not scene.aligned:
@@ -140,7 +140,7 @@ def break_rows(setup: StressScene) -> StressScene:
 
 
 def throw_away(setup: StressScene) -> StressScene:
-    """Move a few Gaussians a thousand times as far away."""
+    """Move a few Gaussians a thousand times as far from the origin."""
     scene = setup.scene
     chosen = _choose(len(scene.gaussians), FAR_SHARE)[:, None]
     means = np.where(chosen, 1000 * scene.gaussians.means, scene.gaussians.means)
@@ -164,7 +164,7 @@ def _choose(count: int, share: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Case:
-    """One bad condition."""
+    """One bad condition to test compaction under."""
 
     name: str  # on the command line
     words: str  # the change in words
@@ -255,7 +255,7 @@ def stress(
     hints: ReadHints = AUTO,
     progress: Progress | None = None,
 ) -> tuple[StressOutcome, ...]:
-    """Compact a scene under bad conditions: all ``CASES``, or those with some names.
+    """Compact a scene under bad conditions, all ``CASES`` or the named ones, and check each result.
 
     Results are compared on held-out views (``targets``), or on the input views with their photos, or with renders of
     the input where there are none. ``hints`` are those that the scene was read with; ``progress`` is called with (case,

@@ -37,7 +37,7 @@ def work_seconds(
     fit_steps: int,
     num_drawn: float | None = None,
 ) -> float:
-    """Estimate the processor seconds that a scene takes, without imports.
+    """Estimate the processor seconds of compacting a scene, without imports.
 
     ``pixels`` of all views together, or Gaussians where they are more; ``view_pixels`` of one view;
     ``options``: all settings by flat name, with the checkpoint that is used; ``photos``: whether
@@ -55,19 +55,19 @@ def work_seconds(
 
 
 def wall_seconds(pixels: int, num_views: int, options: Mapping[str, Any], *, threads: int, **facts: Any) -> float:
-    """Estimate the wall time of a run on so many threads, imports included; arguments as of :func:`work_seconds`."""
+    """Estimate the wall time of a run on ``threads`` threads with imports; other arguments: :func:`work_seconds`."""
     work = work_seconds(pixels, pixels / max(num_views, 1), options, **facts)
     return IMPORT_SECONDS + work / max(1, min(threads, num_views))
 
 
 def fit_of(options: Mapping[str, Any], *, photos: bool) -> str:
-    """Return the fit to the photos: ``"full"`` or ``"none"``."""
+    """Return the kind of fit that will run: ``"full"`` or ``"none"``."""
     fits = {"gsmerge": options["fit"], "unmerged-fit": "full"}
     return fits.get(options["method"], "none") if photos else "none"
 
 
 def memory_bytes(pixels: int, *, photos: bool, num_rest: int = 0, num_elsewhere: int = 0) -> int:
-    """Estimate the memory of a run, imports included.
+    """Estimate the memory of a run in bytes, imports included.
 
     ``num_rest``: columns of higher harmonics; ``num_elsewhere``: Gaussians of a scene beyond the ``pixels`` of the
     block that is worked on.
@@ -77,7 +77,7 @@ def memory_bytes(pixels: int, *, photos: bool, num_rest: int = 0, num_elsewhere:
 
 
 def memory_problem(needed: int) -> str | None:
-    """Return why a run of so many bytes is not likely to fit into this machine; None if it is."""
+    """Describe why a run of ``needed`` bytes may not fit into this machine; None if it should."""
     available = machine_memory()
     if available is None or needed <= available:
         return None

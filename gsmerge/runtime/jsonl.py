@@ -16,7 +16,7 @@ from gsmerge.errors import SceneError
 
 
 def each_line(path: Path, start: int = 0) -> Iterator[tuple[int, dict[str, Any] | None]]:
-    """Yield the byte after each complete line from a byte on, and its value, None if damaged."""
+    """Yield, for each complete line from byte ``start`` on, the position after it and its value (None if damaged)."""
     if not path.exists():
         return
     try:
@@ -39,7 +39,7 @@ def _parse(line: bytes) -> dict[str, Any] | None:
 
 
 def append_line(path: Path, value: Mapping[str, Any]) -> None:
-    """Append one JSON line: on the disk when this returns, and in place of a half-written one.
+    """Append one JSON line durably, replacing a half-written last line.
 
     A line that does not fit on the disk leaves the file as it was. Raises SceneError if the file
     cannot be written, ValueError if there is NaN or inf among the values.

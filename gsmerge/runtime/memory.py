@@ -21,7 +21,7 @@ _own_pages: WeakSet[mmap.mmap] = WeakSet()  # pages of others may be private, an
 
 
 def peak_memory() -> int:
-    """Return the largest resident memory of this process so far, bytes; 0 where it is unknown."""
+    """Return the peak resident memory of this process in bytes; 0 if unknown."""
     try:
         import resource
     except ImportError:
@@ -30,7 +30,7 @@ def peak_memory() -> int:
 
 
 def machine_memory() -> int | None:
-    """Return the bytes that this machine has, or that its control group may take; None where unknown."""
+    """Return the memory of this machine, or the limit of its control group, in bytes; None if unknown."""
     limits = []
     with suppress(AttributeError, OSError, ValueError):
         limits.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
@@ -41,10 +41,10 @@ def machine_memory() -> int | None:
 
 
 def release_memory() -> None:
-    """Return freed memory to the system.
+    """Return freed memory to the operating system.
 
-    glibc keeps what a thread has freed for that thread; between stages that each need a lot of it, in other
-    threads, this is a tenth of the peak. Does nothing on other systems.
+    glibc keeps memory that a thread has freed for that thread; across stages that use different threads this adds up to
+    a tenth of the peak. Does nothing on other systems.
     """
     if sys.platform == "linux":
         with suppress(OSError, AttributeError):
@@ -52,10 +52,10 @@ def release_memory() -> None:
 
 
 def make_array(shape: tuple[int, ...], dtype: type[np.generic]) -> np.ndarray:
-    """Make an array whose values are not set; a large one in a file without a name, where there is room for it.
+    """Make an uninitialised array; a large one is mapped from an unnamed temporary file, if there is room.
 
-    What is in a file takes memory only where it is in use, and after :func:`free_pages` not even there. The file is in
-    the system's folder for temporary ones (``TMPDIR``), and goes with the array.
+    A mapped array takes memory only while it is in use, and none after :func:`free_pages`. The file is in the system's
+    temporary folder (``TMPDIR``), and goes with the array.
     """
     size = prod(shape) * np.dtype(dtype).itemsize
     if size >= MAPPED_BYTES and hasattr(os, "posix_fallocate"):
@@ -68,7 +68,7 @@ def make_array(shape: tuple[int, ...], dtype: type[np.generic]) -> np.ndarray:
 
 
 def free_pages(arrays: Iterable[np.ndarray]) -> None:
-    """Take the pages of arrays that :func:`make_array` put into files out of memory; their values stay."""
+    """Release the memory of arrays that :func:`make_array` mapped from files; their values stay."""
     for array in arrays:
         base = array
         while isinstance(base, np.ndarray) and base.base is not None:

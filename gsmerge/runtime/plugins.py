@@ -13,7 +13,7 @@ COMMANDS, METHODS = "gsmerge.commands", "gsmerge.methods"  # groups of entry poi
 
 @cache
 def find_plugins(group: str) -> dict[str, EntryPoint]:
-    """Find the entry points of a group by name, sorted, without importing any; the first of equal names wins."""
+    """Find the entry points of a group by name without importing any; sorted, the first of equal names wins."""
     plugins: dict[str, EntryPoint] = {}
     for entry in sorted(entry_points(group=group), key=lambda entry: entry.name):
         plugins.setdefault(entry.name, entry)
@@ -21,7 +21,7 @@ def find_plugins(group: str) -> dict[str, EntryPoint]:
 
 
 def load_plugin(group: str, name: str) -> Any:
-    """Import the object of an entry point; a UsageError that names the package where that fails."""
+    """Import the object of an entry point; UsageError with the package's name if that fails."""
     entry = find_plugins(group)[name]
     try:
         return entry.load()

@@ -26,7 +26,7 @@ STAGES = (
 
 @dataclass
 class Record:
-    """Record of a run so far."""
+    """Record of a run: seconds, choices, notes and progress."""
 
     progress: Progress | None = None  # Called with (stage, done, total)
     seconds: dict[str, float] = field(default_factory=dict)  # Wall time of each stage
@@ -40,22 +40,22 @@ _current: ContextVar[Record | None] = ContextVar("record", default=None)
 
 @contextmanager
 def record_run(progress: Progress | None = None) -> Iterator[Record]:
-    """Begin a record, to which everything in the block reports; ``progress`` hears of its end as "done"."""
+    """Start a record for everything that the block reports; ``progress`` is called with "done" at its end."""
     with _write_to(Record(progress)) as record:
         yield record
         report_progress("done", len(STAGES), len(STAGES))
 
 
 def current_record() -> Record:
-    """Return the record of the current run; an empty one outside of any."""
+    """Return the record of the current run; outside of any run, an empty one."""
     return _current.get() or Record()
 
 
 @contextmanager
 def record_part(*, silent: bool = False, title: str | None = None) -> Iterator[Record]:
-    """Begin a record of its own for a part of the current run; ``silent``: without its progress.
+    """Start a separate record for a part of the current run; ``silent``: do not report its progress.
 
-    With a ``title`` all its stages are steps of one, which has it as its name.
+    With a ``title``, all its stages are reported as steps of one stage of that name.
     """
     outer = _current.get()
     progress = None if silent or outer is None else outer.progress
@@ -80,7 +80,7 @@ def _write_to(record: Record) -> Iterator[Record]:
 
 @contextmanager
 def stage(name: str) -> Iterator[None]:
-    """Time a block, or a function that this decorates, as one of ``STAGES``; inside another stage, as part of that."""
+    """Time a block or function as one of ``STAGES``; inside another stage its time counts for that one."""
     record = _current.get()
     if record is None or record.running is not None:
         yield
@@ -105,7 +105,7 @@ def note(text: str) -> None:
 
 
 def choose(**choices: Any) -> None:
-    """Add what a stage decided to the current record, by name."""
+    """Add decisions of a stage to the current record, by name."""
     record = _current.get()
     if record is not None:
         record.choices |= choices
@@ -120,14 +120,14 @@ def add_seconds(seconds: Mapping[str, float]) -> None:
 
 
 def adopt(part: Record) -> None:
-    """Take the choices and notes of a part of the current run over into its record."""
+    """Copy choices and notes of a part's record into the current record."""
     choose(**part.choices)
     for text in part.notes:
         note(text)
 
 
 def report_progress(text: str, done: int, total: int) -> None:
-    """Report a stage, or a step of one as ``"stage: detail"``, to whoever watches the current run."""
+    """Report progress of a stage, or of a step as ``"stage: detail"``, to the caller of the current run."""
     record = _current.get()
     if record is not None and record.progress is not None:
         record.progress(text, done, total)

@@ -47,7 +47,7 @@ _local, _libraries = _Local(), _Libraries()
 
 
 def available_threads() -> int:
-    """Return the number of processors that this process may run on."""
+    """Return the number of processors available to this process."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -89,10 +89,10 @@ def _hold_opencv() -> None:
 
 
 def hold_torch() -> None:
-    """Hold torch to one thread until the calling thread's pool goes, if there is one and torch is imported.
+    """Limit torch to one thread while the calling thread has a pool, if torch is imported.
 
-    :func:`use_threads` and :func:`parallel_map` do so; who imports torch while a pool is in use does it before the
-    first computation.
+    :func:`use_threads` and :func:`parallel_map` call it; code that imports torch while a pool is in use calls it before
+    its first computation.
     """
     torch = sys.modules.get("torch")
     if _local.pool is None or _local.holds_torch or torch is None or not hasattr(torch, "set_num_threads"):
@@ -131,10 +131,10 @@ def parallel_map(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
 
 
 def in_turn(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-    """Yield the results of :func:`parallel_map` in order, a few of them in memory at a time.
+    """Yield the results of :func:`parallel_map` in order, with only a few in memory at a time.
 
-    For what is as large as all Gaussians for every view, and only added up: memory does not go with
-    the views.
+    This suits results as large as all Gaussians for every view that are only added up: memory does not grow with the
+    views.
     """
     items = list(items)
     for first in range(0, len(items), AT_ONCE):

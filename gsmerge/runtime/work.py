@@ -39,7 +39,7 @@ CLUSTER_SIZE_SECONDS = 5.0  # between two queries of the cluster's size
 
 @contextmanager
 def start_work(engine: str, address: str | None = None, *, threads: int | None, memory: int) -> Iterator[Work]:
-    """Begin work whose calls take so many threads (None: as fit beside each other) and bytes of memory.
+    """Open an engine for calls that each need ``threads`` (None: chosen) and ``memory`` bytes.
 
     ``engine``: ``"local"``: in this process, one call after the other; ``"ray"``: on the Ray cluster at ``address``.
     """
@@ -61,9 +61,9 @@ class Cluster:
         return int(self.ray.cluster_resources().get("CPU", 1.0))
 
     def needs(self, threads: int, memory: int) -> dict[str, float]:
-        """Return what a task asks for, at most what some node has; UsageError if none has a processor.
+        """Return the resources that a task asks for, at most those of the largest node; UsageError without processors.
 
-        A task that needs more waits forever.
+        Ray would let a task that asks for more wait forever.
         """
         nodes = [node["Resources"] for node in self.ray.nodes() if node["Alive"] and node["Resources"].get("CPU")]
         if not nodes:
@@ -78,22 +78,22 @@ class Cluster:
 
 @dataclass(frozen=True)
 class Work:
-    """Work that is under way, in this process or on a cluster: calls are made in it, and objects shared."""
+    """An engine that makes calls in this process or on a cluster."""
 
     cluster: Cluster | None
     threads: int | None
     memory: int
 
     def share(self, value: Any) -> Any:
-        """Return what to pass in place of a large argument of several calls."""
+        """Return a reference to a large argument, so that several calls can share it."""
         return value if self.cluster is None else self.cluster.ray.put(value)
 
     def run(
         self, title: str, function: Callable[..., T], count: int, calls: Iterable[tuple[Any, ...]]
     ) -> Iterator[tuple[T, Record]]:
-        """Make ``count`` calls of a function that can be pickled; yield results and records in their order.
+        """Make ``count`` calls of a picklable function; yield (result, record) of each, in order.
 
-        On a cluster as many are made at once as there are processors, here one after the other.
+        A cluster makes as many at once as it has processors; this process makes one after the other.
         """
         if self.cluster is not None:
             yield from self._run_there(self.cluster, title, function, count, calls)
@@ -149,14 +149,14 @@ def _cause(error: Any, title: str, cluster: Cluster) -> Exception:
 
 @dataclass(frozen=True)
 class Lost:
-    """In place of the result of a call: how its process or node was lost."""
+    """Result of a call whose process or node was lost, with the reason."""
 
     reason: str
     error: Any = None  # Ray's
 
 
 class RayPool:
-    """A pool of ``jobs`` calls on a Ray cluster; 0: as many as it has processors for."""
+    """A pool of up to ``jobs`` calls on a Ray cluster; 0: as many as it has processors."""
 
     def __init__(
         self, cluster: Cluster, threads: int, *, jobs: int = 0, retries: int = 0, timeout: float | None = None
@@ -169,7 +169,7 @@ class RayPool:
 
     @property
     def has_room(self) -> bool:
-        """Whether another call can be taken."""
+        """Whether the pool can take another call."""
         if self.jobs:
             return len(self.keys) < self.jobs
         if time.monotonic() > self.counted + CLUSTER_SIZE_SECONDS:
@@ -178,12 +178,12 @@ class RayPool:
         return len(self.keys) < self.capacity
 
     def submit(self, key: Any, function: Callable[..., Any], *arguments: Any, memory: int = 0) -> None:
-        """Take a call of a function that can be pickled, which may need so many bytes."""
+        """Start a call of a picklable function that may need ``memory`` bytes."""
         needs = self.cluster.needs(self.threads, memory)
         self.keys[self.function.options(**needs).remote(self.timeout, function, *arguments)] = key
 
     def wait(self, seconds: float | None) -> list[tuple[Any, Any]]:
-        """Wait for at most so many seconds (None: any); return keys of calls that ended, with a result or Lost each."""
+        """Wait up to ``seconds`` (None: forever) for calls to end; return (key, result or Lost) of each."""
         ready, pending = self.ray.wait(list(self.keys), num_returns=1, timeout=seconds)
         if ready and pending:
             ready += self.ray.wait(pending, num_returns=len(pending), timeout=0)[0]
@@ -197,7 +197,7 @@ class RayPool:
             return Lost(f"its process or node was lost ({type(error).__name__}){late}", error)
 
     def close(self) -> list[Any]:
-        """End unfinished calls; return no keys, as what these calls left may be anywhere."""
+        """Cancel unfinished calls; return an empty list, since what they left may be on any node."""
         for ref in self.keys:
             with suppress(self.ray.exceptions.RayError, ValueError):
                 self.ray.cancel(ref, force=True)
@@ -248,7 +248,7 @@ def _join(ray: ModuleType, address: str | None, store_bytes: int | None) -> None
 
 
 class Worker:
-    """A process, and the call that it makes."""
+    """A process of the pool, with its current call."""
 
     def __init__(self, threads: int) -> None:
         spawn = multiprocessing.get_context("spawn")
@@ -262,7 +262,7 @@ class Worker:
         self.count = 0
 
     def stop(self, *, now: bool) -> None:
-        """End the process: at once, or as soon as it reads that the pipe is closed."""
+        """End the process: ``now``, or when it finds the pipe closed."""
         self.pipe.close()
         if now:
             self.process.kill()
@@ -273,18 +273,18 @@ class Worker:
 
 
 class ProcessPool:
-    """A pool of up to ``jobs`` processes of this machine, each of which makes call after call."""
+    """A pool of up to ``jobs`` processes on this machine; each makes one call after the other."""
 
     def __init__(self, jobs: int, threads: int, *, timeout: float | None = None) -> None:
         self.jobs, self.threads, self.timeout, self.workers = jobs, threads, timeout, list[Worker]()
 
     @property
     def has_room(self) -> bool:
-        """Whether another call can be taken."""
+        """Whether the pool can take another call."""
         return sum(worker.key is not None for worker in self.workers) < self.jobs
 
     def submit(self, key: Any, function: Callable[..., Any], *arguments: Any, memory: int = 0) -> None:
-        """Take a call of a function that can be pickled."""
+        """Start a call of a picklable function."""
         idle = next((worker for worker in self.workers if worker.key is None), None)
         if idle is None:
             idle = Worker(self.threads)
@@ -295,7 +295,7 @@ class ProcessPool:
             idle.pipe.send((function, arguments))
 
     def wait(self, seconds: float | None) -> list[tuple[Any, Any]]:
-        """Wait for at most so many seconds (None: any); return keys of calls that ended, with a result or Lost each."""
+        """Wait up to ``seconds`` (None: forever) for calls to end; return (key, result or Lost) of each."""
         busy = [worker for worker in self.workers if worker.key is not None]
         wait([worker.pipe for worker in busy] + [worker.process.sentinel for worker in busy], seconds)
         ended = []
@@ -362,7 +362,7 @@ def _library_threads(count: int) -> Iterator[None]:
 
 
 def run_worker(pipe: Connection) -> None:
-    """Make the calls from the pipe until it is closed, as the main function of a process."""
+    """Make the calls that come through the pipe until it closes; main function of a worker process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run handles it, and ends its processes
     os.dup2(2, 1)  # only the run itself prints to stdout
     parent = multiprocessing.parent_process()

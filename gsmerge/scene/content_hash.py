@@ -26,7 +26,7 @@ def digest(value: Mapping[str, Any]) -> str:
 
 
 def content_hash(files: Sequence[Path]) -> str:
-    """Compute SHA-256 over the names and contents of files; of folders, over everything in them."""
+    """Compute one SHA-256 over the names and contents of files and of everything in folders."""
     state = hashlib.sha256()
     for root in files:
         inside = sorted(p for p in walk_files(root) if p.is_file()) if root.is_dir() else [root]
@@ -40,7 +40,7 @@ def content_hash(files: Sequence[Path]) -> str:
 
 
 def read_files(files: SceneFiles) -> list[Path]:
-    """List everything that is read of a scene, each once: files, and folders that are read as a whole."""
+    """List all files and folders that reading a scene would read, each once."""
     paths = [path for path in (*files.plys, files.cameras, files.images, files.masks) if path is not None]
     if files.cameras is not None:
         root = files.cameras if files.cameras.is_dir() else files.cameras.parent
@@ -51,7 +51,7 @@ def read_files(files: SceneFiles) -> list[Path]:
 
 
 def photos_of(cameras: Path) -> list[Path]:
-    """List where the photos of a camera file may be, by its names or next to it."""
+    """List the photos of a camera file: files that it names, otherwise image folders next to it."""
     camera_file = cameras_of(cameras)
     root = cameras if cameras.is_dir() else cameras.parent
     names = () if camera_file is None else camera_file.names
@@ -60,7 +60,7 @@ def photos_of(cameras: Path) -> list[Path]:
 
 
 def cameras_of(path: Path, scene: str | None = None) -> CameraFile | None:
-    """Read the cameras of a file; None where they cannot be read, which reading the scene reports."""
+    """Read the cameras of a file; None if that fails, since reading the scene reports the reason."""
     try:
         return read_cameras(path, scene=scene)
     except SceneError:
@@ -68,12 +68,12 @@ def cameras_of(path: Path, scene: str | None = None) -> CameraFile | None:
 
 
 def stem_of(scene: Path) -> str:
-    """Return a scene's name: of a file without the extension, of a folder as it stands."""
+    """Return a scene's name: a file's name without extension, a folder's name unchanged."""
     return scene.stem if scene.suffix in SCENE_SUFFIXES else scene.name
 
 
 def filled(template: str | None, scene: Path) -> Path | None:
-    """Fill ``{scene}``, ``{parent}`` (its folder) and ``{stem}`` (its name) into a path; UsageError on other names."""
+    """Fill ``{scene}``, ``{parent}`` (its folder) and ``{stem}`` (its name) into a path; UsageError on other fields."""
     if template is None:
         return None
     parent = scene if scene.is_dir() else scene.parent

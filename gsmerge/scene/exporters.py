@@ -38,7 +38,7 @@ def _listed(names: Iterable[str]) -> str:
 
 @dataclass(frozen=True)
 class Exporter:
-    """A program that writes files of Gaussians, and how it writes them."""
+    """A program that writes files of Gaussians, and the properties by which its files are known."""
 
     name: str  # as on the command line
     title: str  # as people call it
@@ -58,7 +58,7 @@ class Exporter:
     cameras: tuple[str, ...] = ()  # formats of cameras that it writes; empty: none, any may be given
 
     def may_have_written(self, info: FileInfo, layout: Layout | None, frame: Similarity | None, cameras: str) -> bool:
-        """Return whether a file looks like one of this exporter; see :func:`choose_exporters`."""
+        """Return whether a file looks as if this exporter had written it; see :func:`choose_exporters`."""
         header = (
             info.sh_degree in self.degrees
             and self.normals == ("nx" in info.columns)
@@ -147,7 +147,7 @@ def find_exporter(name: str) -> Exporter | None:
 def choose_exporters(
     name: str, info: FileInfo, layout: Layout | None, frame: Similarity | None, cameras: str
 ) -> tuple[Exporter, ...]:
-    """Return the exporter with a name; for "auto", all that may have written a file with cameras of a format.
+    """Return the exporter with a name; for "auto", all exporters that may have written the file.
 
     Exporters that leave a mark of their own in the header go before those that leave none. ``layout`` and ``frame``
     are those of the rows; None where the rows belong to no pixels.
@@ -161,7 +161,7 @@ def choose_exporters(
 
 
 def exporter_names(exporters: Sequence[Exporter]) -> str:
-    """Write the exporter's title for people, or the titles of all that are possible."""
+    """Join the titles of exporters for a message."""
     if not exporters:
         return "none that is known by name"
     titles = [exporter.title for exporter in exporters]

@@ -49,17 +49,17 @@ class SceneFiles:
 
     @property
     def plys(self) -> tuple[Path, ...]:
-        """Files of Gaussians, in the order of their rows."""
+        """Paths of the Gaussians, in the order of their rows."""
         return self.parts or (self.ply,)
 
     @property
     def base(self) -> Path:
-        """Path that results are named after: the file, or ``scene.ply`` in the folder of parts."""
+        """Path from which names of results are derived: the file, or ``scene.ply`` in the folder of parts."""
         return self.ply.with_name("scene.ply") if self.parts else self.ply
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """That several files are read as one scene."""
+        """Notes that several files are read as one scene."""
         if not self.parts:
             return ()
         return (f"{len(self.parts)} files are read as one scene: {self.ply.name} to {self.parts[-1].name}",)
@@ -72,7 +72,7 @@ def find_scene_files(
     images: StrPath | None = None,
     masks: StrPath | None = None,
 ) -> SceneFiles:
-    """Find a scene's files; those that the user names are used instead of searching.
+    """Find a scene's files from its path; files that the caller names are not searched.
 
     Cameras inside the ``.ply`` go before others beside it.
 
@@ -179,7 +179,7 @@ def _has_camera_each(plys: Sequence[Path], cameras: Path | None) -> bool:
 
 
 def named_ply(folder: Path) -> Path | None:
-    """Find the file in a folder that is the scene by its name; None without one."""
+    """Find the file in a folder that has a usual name of a scene; None without one."""
     for place in PLY_PLACES:
         if (folder / place).is_file():
             return folder / place

@@ -29,7 +29,7 @@ _SAME_POSE = 1e-4  # of the distance to the scene, and in entries of the rotatio
 
 @dataclass(frozen=True)
 class HeldOutViews(Views):
-    """t views that were no input, in the frame of the scene's Gaussians, named as in their camera file."""
+    """Held-out views: t views that the scene was not made of, in the frame of its Gaussians."""
 
     places: tuple[int, ...]  # of each along the trajectory: its index in the camera file
     context_places: tuple[int, ...] | None  # the same of the scene's views; None where they are not all in the file
@@ -37,12 +37,12 @@ class HeldOutViews(Views):
 
 
 def read_held_out(load: Loaded, cameras: StrPath, images: StrPath | None = None) -> HeldOutViews:
-    """Read unseen photos and their cameras, in any of the forms that scenes may have.
+    """Read held-out photos and their cameras, in any of the forms that scenes may have.
 
-    Views that the scene was made of are left out. Where the file has those too, under the same names, their poses
-    determine how its world lies to that of the Gaussians; otherwise it is assumed to be the world of the scene's
-    own cameras. Poses are read in the scene's convention if it is not its format's. ``images`` is the folder of the
-    photos; None: where the camera file says. SceneError if a file is missing or damaged, or no view is left.
+    Views that the scene was made of are left out. If the file has those too, under the same names, their poses tell how
+    its world lies to that of the Gaussians; otherwise it is taken for the world of the scene's own cameras. Poses are
+    read in the convention that the scene's cameras needed. ``images``: folder of the photos; None: where the camera
+    file says. SceneError if a file is missing or damaged, or no view is left.
     """
     path = Path(cameras)
     if not path.exists():
@@ -74,7 +74,7 @@ def read_held_out(load: Loaded, cameras: StrPath, images: StrPath | None = None)
 
 
 def place_camera_file(load: Loaded, path: Path) -> tuple[CameraFile, dict[int, int]]:
-    """Read cameras into the frame of a scene's Gaussians; also map those of the scene, if any, to its views.
+    """Read a camera file into the frame of a scene's Gaussians; also map its views to those of the scene.
 
     Which frame they are in, and in which convention, is decided as :func:`read_held_out` says.
     """
@@ -145,9 +145,9 @@ def _stored_world(load: Loaded) -> Similarity:
 
 
 def fit_similarity(theirs: np.ndarray, ours: np.ndarray, scale: float = 1.0) -> Similarity:
-    """Fit the similarity that moves cameras ``theirs [c,4,4]`` (world to camera) onto their poses ``ours``.
+    """Fit the similarity that maps cameras ``theirs [c,4,4]`` (world to camera) to ``ours``, by least squares.
 
-    By least squares; with the given scale where all stand in one place and do not determine it.
+    The scale is ``scale`` where all cameras stand in one place and do not determine it.
     """
     rotation = closest_rotation(matmul(ours[:, :3, :3].swapaxes(1, 2), theirs[:, :3, :3]).sum(0))
     a, b = matmul(camera_centres(theirs), rotation.T), camera_centres(ours)

@@ -64,7 +64,7 @@ class SceneViews:
 
 @dataclass(frozen=True)
 class Loaded:
-    """A scene and how it was read."""
+    """A scene, and all facts about its files and how they were read."""
 
     # the scene: one Gaussian per pixel, or an unaligned one where the rows belong to no pixels
     scene: Scene
@@ -84,19 +84,19 @@ class Loaded:
     joined: Sequence[dict[str, Any]] = ()  # where each of several scenes lies; empty for one
 
     def pixel_scene(self) -> Scene:
-        """Return the scene if it has one Gaussian per pixel; otherwise raise a SceneError with the reason."""
+        """Return the scene; SceneError with the reason if it has not one Gaussian per pixel."""
         if self.scene.aligned:
             return self.scene
         raise SceneError(self.info.path, self.problem or "expected one Gaussian per pixel")
 
     def without_photos(self) -> Loaded:
-        """Drop the photos that are not the scene's own, which may take as much memory."""
+        """Return a copy without the photos of the camera file, to free their memory; the scene keeps its photos."""
         cameras = None if self.cameras is None else replace(self.cameras, images=None)
         return replace(self, cameras=cameras, views=replace(self.views, images=None))
 
     @property
     def comments(self) -> tuple[str, ...]:
-        """Comments of the file's header that a result keeps."""
+        """Comments of the file's header that a result copies."""
         return kept_comments(self.info)
 
     @property
@@ -156,7 +156,7 @@ def read_scene(
 
 
 def as_scene(scene: Scene | StrPath) -> Scene:
-    """Return a scene, or read it from a path and note what is odd about the file."""
+    """Return a scene as it is, or read it from a path; notes tell what is odd about the file."""
     if isinstance(scene, Scene):
         return scene
     load = load_scene(scene)
@@ -174,7 +174,7 @@ def load_scene(
     opacity: OpacityChoice = "auto",
     **hints: Any,
 ) -> Loaded:
-    """Read a scene as :func:`read_scene` does, with all facts about its files."""
+    """Read a scene as :func:`read_scene` does, and return it with all facts about its files."""
     read_hints = make_hints(hints)
     named = {"cameras": cameras, "images": images, "masks": masks}
     first, *others = (find_scene_files(scene_path, **named) for scene_path in (path, *more))
@@ -182,7 +182,7 @@ def load_scene(
 
 
 def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = AUTO) -> Loaded:
-    """Read the scene of given files as :func:`load_scene` does."""
+    """Read a scene from files that were found already, as :func:`load_scene` does."""
     with use_threads():
         each = (replace(files, more=()), *files.more)
         loads = [align_scene(read_rows(source, opacity=opacity, hints=hints), source, hints=hints) for source in each]
@@ -209,7 +209,7 @@ def _join_loads(loads: Sequence[Loaded], files: SceneFiles) -> Loaded:
 
 
 def read_rows(files: SceneFiles, *, opacity: OpacityChoice, hints: ReadHints) -> GaussianFile:
-    """Read the rows of a scene's files, with opacities as given, or as the given exporter stores them."""
+    """Read the Gaussians of a scene's files; the opacity's encoding comes from the option or the exporter."""
     exporter = find_exporter(hints.exporter)
     if exporter is not None and exporter.opacity == "logit" and opacity == "auto":
         opacity = "logit"  # activated ones show themselves, and some versions write logits in their place
@@ -224,7 +224,7 @@ def align_scene(
     hints: ReadHints = AUTO,
     photos: bool = True,
 ) -> Loaded:
-    """Put Gaussians, cameras and photos together, with the pixel of every row where it has one.
+    """Combine Gaussians, cameras and photos to a scene; find the pixel of every row if there is one.
 
     Raises as :func:`read_scene`. ``camera_file`` has the cameras if they are read already; without ``photos`` none
     are searched.
@@ -369,7 +369,7 @@ def _with_rotations(scene: Scene, hints: ReadHints, exporters: Sequence[Exporter
 
 
 def place_cameras_in_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints, photos: bool) -> Loaded:
-    """Move views into the frame of the Gaussians, if pixels or colours show it; otherwise keep their file's.
+    """Move a file's cameras into the frame of the Gaussians if pixels or colours show it; otherwise keep them.
 
     ``photos`` that cannot be read are an error; with False they are left out. SceneError if there are no cameras, or
     they have no size.

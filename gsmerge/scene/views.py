@@ -57,7 +57,7 @@ _MASK_LEVEL = 191  # of 255: a pixel of a view counts if three quarters of its p
 
 
 def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile:
-    """Read the cameras from their file or the ``.ply``, or estimate them for the images; SceneError if all fail.
+    """Read a scene's cameras from their file or the ``.ply``, or estimate them; SceneError if all fail.
 
     Where a file has poses alone, the focal length is estimated.
     """
@@ -93,7 +93,7 @@ def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile:
 
 
 def stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos | None:
-    """Read the photos of the cameras from a folder, a file that holds them, or where the camera file says; or None."""
+    """Read the photos of the cameras from a folder, from a file that holds them, or from where the camera file says."""
     photos = _stored_photos(files, camera_file)
     photos = photos if photos is None else _turn_photos(photos, _photo_turns(files, camera_file))
     old, size = photo_size(photos), (int(camera_file.widths[0]), int(camera_file.heights[0]))
@@ -155,7 +155,7 @@ def _photo_paths(files: SceneFiles, camera_file: CameraFile) -> list[Path] | Non
 
 
 def images_beside(ply: Path) -> list[Path]:
-    """List the images in the folder of a ``.ply``, without those below it, in the order of :func:`list_images`."""
+    """List the images directly in the folder of a ``.ply``, in the order of :func:`list_images`."""
     named = (path for path in ply.parent.glob("[!.]*") if path.suffix.lower() in IMAGE_SUFFIXES)
     return sorted((path for path in named if path.is_file()), key=lambda path: natural_key(path.name))
 
@@ -168,12 +168,12 @@ def find_larger_and_masks(
     transform: PhotoTransform | None,
     cameras: Cameras,
 ) -> tuple[LargePhotos | None, np.ndarray | None, list[str]]:
-    """Find the photos at the size of their files, where that is larger than the scene's, and where they count.
+    """Find the photos at full file size, if that is larger than the scene's, and masks of the pixels that count.
 
-    Files are read again when a photo is asked for; photos inside other files stay in memory. ``photos`` are those
-    of :func:`stored_photos`, undistorted; ``size`` is theirs when they were fitted to the rows by ``transform``;
-    ``cameras`` are those of the scene's grid, in the order of the camera file. The masks ``[c,h,w]`` bool come from
-    files and from transparency; None where all photos count wholly. With notes.
+    Files are read again when a photo is asked for; photos inside other files stay in memory. ``photos`` are the
+    undistorted photos of :func:`stored_photos`; ``size`` is their size and ``transform`` how they were fitted to the
+    rows; ``cameras`` are the scene's, in the order of the camera file. Masks ``[c,h,w]`` bool come from files and from
+    transparency; None if all pixels count. Also returns notes.
     """
     if photos is None or size is None:
         return None, None, []
@@ -249,7 +249,7 @@ def _read_masks(
 
 
 def check_masks(masks: np.ndarray | None, files: SceneFiles) -> tuple[np.ndarray | None, list[str]]:
-    """Say how much of the photos masks leave out; SceneError if that is nearly all, which transparency may not be."""
+    """Note the share of the photos that masks leave out; SceneError if masks from files leave out nearly all."""
     if masks is None:
         return None, []
     share = float(1 - masks.mean())
@@ -288,7 +288,7 @@ def _file_window(stored: Size, size: Size, transform: PhotoTransform | None, cam
 
 
 def cut_bars(photos: Photos | None, camera_file: CameraFile) -> tuple[Photos | None, list[str]]:
-    """Cut off the bars around photos that have the cameras' shape without them, with a note; or return them as is."""
+    """Cut off bars around photos if the rest has the cameras' shape, with a note; otherwise change nothing."""
     size = photo_size(photos)
     shapes = sizes_of(camera_file)
     if photos is None or size is None or not shapes or any(same_shape(shape, size) for shape in shapes):
@@ -309,10 +309,9 @@ def cut_bars(photos: Photos | None, camera_file: CameraFile) -> tuple[Photos | N
 def limit_photo_size(
     photos: Photos | None, rows: int, max_side: int, *, unaligned: bool
 ) -> tuple[Photos | None, list[str]]:
-    """Resize photos that are too large for memory to at most ``max_side`` pixels a side, with notes about it.
+    """Resize photos that are too large for memory to at most ``max_side`` pixels per side, with notes.
 
-    Where the file's Gaussians (``rows``) may be the photos' pixels, the photos stay; not where they are known to be
-    unaligned.
+    Photos whose pixels may be the file's ``rows`` Gaussians keep their size, unless they are known to be ``unaligned``.
     """
     size = photo_size(photos)
     if photos is None or size is None:
@@ -327,7 +326,7 @@ def limit_photo_size(
 def limit_view_size(
     cameras: Cameras, images: np.ndarray | None, max_side: int
 ) -> tuple[Cameras, np.ndarray | None, list[str]]:
-    """Resize cameras and photos ``[c,h,w,3]`` to sides of at most ``max_side`` pixels; with a note."""
+    """Resize cameras and photos ``[c,h,w,3]`` to at most ``max_side`` pixels per side; with a note."""
     transform, notes = _limit((cameras.width, cameras.height), max_side)
     if transform is not None:
         cameras = transform.cameras(cameras)

@@ -34,7 +34,7 @@ RECIPES: Mapping[str, Mapping[str, Any]] = {
 
 
 def method_names() -> tuple[str, ...]:
-    """Return the names of all methods: ours, and those that installed packages add."""
+    """Return the names of all methods: ours, and those of installed plugins."""
     return (OURS, *find_plugins(METHODS))
 
 
@@ -42,8 +42,8 @@ def method_names() -> tuple[str, ...]:
 class CompactOptions(Settings):
     """Every setting of :func:`gsmerge.compact`, stage by stage.
 
-    A ValueError besides: a PSNR is asked for of a crop, or without the sky; another method than ``"gsmerge"`` is asked
-    to find the number of Gaussians; a checkpoint is required and none is named.
+    Raises ValueError also for settings that exclude each other: a PSNR target with a crop or without the sky, a method
+    other than ``"gsmerge"`` that is to find the number of Gaussians, or a required checkpoint that is not named.
 
     Example:
         >>> options = gsmerge.CompactOptions().with_settings({"k": 2, "effort": "draft"})
@@ -105,7 +105,7 @@ class CompactOptions(Settings):
 
     @property
     def whole_only(self) -> list[str]:
-        """Names of the settings in use that need a scene in one piece."""
+        """Names of the settings in use that need the scene in one piece."""
         budget = self.budget
         asked = {f"method {self.method}": self.method != "gsmerge", "levels": budget.levels > 1}
         asked |= {f"quality {budget.quality}": budget.quality is not None, "crop": self.clean.crop is not None}

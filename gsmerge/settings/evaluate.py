@@ -13,7 +13,7 @@ MAX_ZOOM = 16.0  # and its inverse the least: beyond, pictures have no pixels le
 
 @dataclass(frozen=True)
 class EvaluateOptions(Settings):
-    """Settings of an evaluation.
+    """Settings of :func:`gsmerge.evaluate`.
 
     Example:
         >>> gsmerge.EvaluateOptions(lpips=(), photo_side=476).photo_side
@@ -46,6 +46,6 @@ class EvaluateOptions(Settings):
 
     @property
     def alignments(self) -> tuple[str, ...]:
-        """Names of the aligned scores, of "color", "pose" and "both"."""
+        """Names of the aligned scores to compute: of "color", "pose", and "both" if both are asked for."""
         chosen = tuple(name for name in ALIGNMENTS if name in self.align)
         return (*chosen, "both") if chosen == ALIGNMENTS else chosen

@@ -60,7 +60,7 @@ class Tuning:
     max_gain: float = 2.0  # Largest exposure factor that is believed
 
     def scaled(self, factor: float) -> Tuning:
-        """Return the same constants with all steps of Gaussians ``factor`` times as large."""
+        """Return the same constants with ``factor`` times the step sizes of Gaussians."""
         names = ("means_lr", "scales_lr", "quats_lr", "opacities_lr", "colors_lr")
         return replace(self, **{name: factor * getattr(self, name) for name in names})
 

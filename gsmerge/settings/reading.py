@@ -15,7 +15,7 @@ Order = Literal["auto", "view-major", "view-fastest", "layer-major", "column-maj
 
 @dataclass(frozen=True)
 class ReadHints(Settings):
-    """Hints on how to read a file whose values do not show it, or mislead."""
+    """Hints for reading files whose values do not tell, or mislead about, how they are meant."""
 
     exporter: str = setting("auto", "The program that wrote the file, such as da3 or depthsplat; auto recognises it.")
     quats: QuatChoice = setting("auto", "How the file stores rotations: w first, w last, w last and applied twice, or "
@@ -32,7 +32,7 @@ class ReadHints(Settings):
 
 @dataclass(frozen=True)
 class FileHints(ReadHints):
-    """All that ``--hint`` may say of a file."""
+    """Hints that ``--hint`` accepts: those of :class:`ReadHints`, and the opacity's encoding."""
 
     opacity: OpacityChoice = setting("auto", "How the file stores opacity: as logits, or raw in [0, 1]; auto decides "
         "by the values.")  # fmt: skip

@@ -20,7 +20,7 @@ PLAIN = {int: "a whole number", float: "a number", bool: "true or false", str: "
 
 @dataclass(frozen=True)
 class Setting:
-    """What is declared of a setting; :func:`setting` makes it, and the class of the field adds name, kind, default."""
+    """Declaration of one setting: default, help and range. :func:`setting` makes it; the class adds its name."""
 
     help: str  # one sentence, as the command line shows it; names of values in single backticks
     more: str = ""  # sentences that Python's help and docs/reference show besides
@@ -41,34 +41,34 @@ class Setting:
 
     @property
     def text(self) -> str:
-        """All that is said about the setting."""
+        """Full help text of the setting."""
         return f"{self.help} {self.more}".strip()
 
     @property
     def is_group(self) -> bool:
-        """Whether the value is a dataclass of settings, as those of a stage are."""
+        """Whether the value is itself a dataclass of settings, such as those of one stage."""
         return is_dataclass(self.kind)
 
     @property
     def is_list(self) -> bool:
-        """Whether the value is a list, of whose elements choices and range are."""
+        """Whether the value is a list; choices and range then apply to its elements."""
         return get_origin(self.kind) is tuple
 
     @property
     def kinds(self) -> list[Any]:
-        """Types whose values are all possible, as far as the range goes."""
+        """Types that a value may have."""
         kinds = [kind for kind in _parts(self.kind) if get_origin(kind) is not Literal]
         return [kind for kind in kinds if kind is NoneType] if self.choices else kinds
 
     @property
     def words(self) -> tuple[Any, ...]:
-        """Possible values that are listed one by one."""
+        """Values that are listed one by one: the choices."""
         listed = self.choices() if callable(self.choices) else self.choices
         literals = [kind for kind in _parts(self.kind) if get_origin(kind) is Literal]
         return (*listed, *(word for kind in literals for word in get_args(kind)))
 
     def fits(self, value: Any) -> bool:
-        """Return whether a value is of the type; it may still be out of range, or none of the choices."""
+        """Return whether a value has one of the types; choices and range are not checked."""
         if self.is_list:
             return isinstance(value, list | tuple) and all(map(self._fits, value))
         return self._fits(value)
@@ -96,14 +96,14 @@ class Setting:
         return all(bool(holds(value, limit)) for limit, holds in limits if is_number and limit is not None)
 
     def values(self, *, null: bool = True) -> str:
-        """Describe the possible values: listed ones, a range, or a kind of value; ``null``: whether None is one."""
+        """Describe the possible values: choices, a range, or a type; ``null``: also mention None."""
         kinds = [kind for kind in self.kinds if kind is not NoneType]
         texts = [self._describe_range(kind) if kind in (int, float) else PLAIN.get(kind, "") for kind in kinds]
         texts += [str(word) for word in self.words]
         return join_words([*texts, PLAIN[NoneType]] if null and NoneType in self.kinds else texts)
 
     def expected(self, value: Any, *, null: bool = False) -> str:
-        """Describe the possible values to who gave another one."""
+        """Describe the expected values for an error message about ``value``."""
         values = self.values(null=null)
         needs_whole = isinstance(value, float) and int in self.kinds and float not in self.kinds
         return f"{PLAIN[int]}, {values}" if needs_whole and not values.startswith(PLAIN[int]) else values
@@ -121,7 +121,7 @@ class Setting:
         return f"{text} {self.unit}".strip()
 
     def check(self, value: Any) -> None:
-        """Raise a ValueError that says what was expected if a value is impossible."""
+        """Raise ValueError, with the expected values, if a value is not allowed."""
         if value is self.default:
             return
         if self.is_list:
@@ -142,12 +142,12 @@ class Setting:
 
 
 def setting(default: Any, help: str, more: str = "", **declared: Any) -> Any:
-    """Declare a field of a class of settings; ``declared`` are fields of :class:`Setting`."""
+    """Declare a setting as a field of a :class:`Settings` class; ``declared`` are fields of :class:`Setting`."""
     return field(default=default, metadata={"setting": Setting(help, more, default=default, **declared)})
 
 
 class Settings:
-    """Base of the frozen dataclasses whose fields are settings; impossible values are a ValueError."""
+    """Base class of frozen dataclasses whose fields are settings; values that are not allowed raise ValueError."""
 
     def __init_subclass__(cls) -> None:
         """Write what is declared of the fields into the docstring."""
@@ -164,7 +164,7 @@ _declared: dict[type, dict[str, Setting]] = {}  # by class, whose types are reso
 
 
 def settings_of(options: type) -> dict[str, Setting]:
-    """Return what is declared of the fields of a class of settings, by the fields' names."""
+    """Return the declarations of a class of settings by field name."""
     if options not in _declared:
         kinds = get_type_hints(options)
         made = {f.name: f.metadata["setting"] for f in fields(options) if "setting" in f.metadata}
@@ -173,7 +173,7 @@ def settings_of(options: type) -> dict[str, Setting]:
 
 
 def flat_settings(options: type) -> dict[str, Setting]:
-    """Return the settings that a user may set by name; those of a stage stand in the place of the stage."""
+    """Return all settings by flat name; a stage's settings stand in the place of the stage."""
     flat: dict[str, Setting] = {}
     for name, declared in settings_of(options).items():
         if not declared.internal:

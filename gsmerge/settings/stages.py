@@ -30,7 +30,7 @@ CROP_NUMBERS = {"sphere": 4, "box": 6}
 
 @dataclass(frozen=True)
 class PrepareOptions(Settings):
-    """Settings of the preparation, before anything is merged."""
+    """Settings of the preparation: poses, exposure and unseen Gaussians."""
 
     poses: Poses = setting("auto", "Whether cameras may move: where they are off, never, or always.",
         "`free`: views of one Gaussian per pixel are moved to where their photos agree, and the full fit moves the "
@@ -48,7 +48,7 @@ class PrepareOptions(Settings):
 
 @dataclass(frozen=True)
 class SegmentOptions(Settings):
-    """Settings of the superpixels of a view."""
+    """Settings of cutting views into superpixels."""
 
     superpixels: int | str = setting(SHARE, "Superpixels per view: a number such as 3000, a share of its pixels, or "
         "auto: 1.5 to 8 %, the more the better the depths of the views agree.",
@@ -82,19 +82,19 @@ class SegmentOptions(Settings):
 
     @property
     def share(self) -> float:
-        """Superpixels per pixel; the default where a number is asked for, or the scene decides."""
+        """Superpixels per pixel; the default share where the option gives a number or "auto"."""
         is_share = self.per_view is None and self.superpixels != AUTO_SHARE
         return parse_share(str(self.superpixels) if is_share else SHARE)
 
     @property
     def adapts(self) -> bool:
-        """Whether views choose their number of superpixels: ``bass-adaptive`` from a share of the pixels."""
+        """Whether each view adapts its number of superpixels: ``bass-adaptive`` with a share of the pixels."""
         return self.segmentation == "bass-adaptive" and self.per_view is None
 
 
 @dataclass(frozen=True)
 class MatchOptions(Settings):
-    """Conditions under which two Feature Gaussians are merged."""
+    """Conditions under which Feature Gaussians of different views are merged."""
 
     match: Method | None = setting(None, "How Feature Gaussians of different views are merged.",
         "`overlap`: Bhattacharyya coefficient (does not depend on the world's axes), similar colours, and star "
@@ -118,13 +118,13 @@ class MatchOptions(Settings):
 
     @property
     def num_neighbors(self) -> int:
-        """Nearest neighbours of other views that are compared."""
+        """Number of nearest neighbours in other views that each Feature Gaussian is compared with."""
         return self.neighbors or NEIGHBORS["aabb" if self.match == "aabb" else "overlap"]
 
 
 @dataclass(frozen=True)
 class DecodeOptions(Settings):
-    """Number of Gaussians that a Feature Gaussian becomes."""
+    """Settings of decoding: how many Gaussians each Feature Gaussian becomes."""
 
     k: int | Literal["mixed", "auto"] = setting(AUTO, "Gaussians per superpixel: finer with more; mixed: 1, 2 or 4 by "
         "its saliency; auto: 1, and 4 for one photo without a long fit.",
@@ -148,13 +148,13 @@ class DecodeOptions(Settings):
 
     @property
     def mean_k(self) -> float:
-        """Mean number of children of a group."""
+        """Mean number of Gaussians per group."""
         mixed = 1 + (100 - self.k_low + 2 * (100 - self.k_high)) / 100
         return mixed if self.k == MIXED else float(self.max_k)
 
     @property
     def max_k(self) -> int:
-        """Largest number of children of a group."""
+        """Largest number of Gaussians per group."""
         return {MIXED: MIXED_COUNTS[-1], AUTO: USUAL_K}.get(str(self.k)) or int(self.k)
 
 
@@ -178,17 +178,17 @@ class CleanOptions(Settings):
 
     @property
     def asked(self) -> bool:
-        """Whether anything is to be left out."""
+        """Whether any clean-up is asked for."""
         return self.crop is not None or self.drop_floaters or self.drop_sky
 
     @property
     def hides(self) -> bool:
-        """Whether what photos show is left out on purpose."""
+        """Whether the clean-up removes things that photos show."""
         return self.crop is not None or self.drop_sky
 
 
 def parse_crop(text: str) -> tuple[str, tuple[float, ...]]:
-    """Parse the shape of a crop and its numbers.
+    """Parse a crop into its shape and numbers.
 
     Example:
         >>> parse_crop("sphere:0,0,2,1.5")
@@ -225,7 +225,7 @@ class Engine(Settings):
 
 @dataclass(frozen=True)
 class BlockOptions(Settings):
-    """Settings of scenes with many views."""
+    """Settings for compacting scenes with many views in blocks."""
 
     blocks: int | Literal["auto", "none"] = setting("auto", "Blocks of views that are compacted one by one, for scenes "
         "of hundreds of views; auto: from 20 million Gaussians on, one for every 8 million.",

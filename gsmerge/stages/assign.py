@@ -27,7 +27,7 @@ from gsmerge.types import Gaussians, Groups, Scene
 
 @stage("members")
 def assign(scene: Scene, groups: Groups) -> Members:
-    """Assign a pixel to every Gaussian of a canonical scene; raise UsageError if no view sees any."""
+    """Return all Gaussians of a canonical scene as members with a pixel each; UsageError if no view sees any."""
     if scene.aligned:
         return scene_members(scene)
     pixels = owner_pixels(find_owners(scene, groups), groups)
@@ -40,7 +40,7 @@ def assign(scene: Scene, groups: Groups) -> Members:
 
 
 def merge_unseen(gaussians: Gaussians, scene: Scene, count: int) -> Gaussians:
-    """Merge n unseen Gaussians of a canonical scene into ``count`` by runs along Morton's curve."""
+    """Merge n Gaussians that no view sees into ``count``, by runs along Morton's curve."""
     order = np.argsort(morton_codes(gaussians.means.astype(np.float64)), kind="stable")
     members = unaligned_members(replace(scene, gaussians=gaussians), np.full(len(gaussians), -1, np.int64))
     starts = np.linspace(0, len(order), count + 1).astype(np.int64)
@@ -50,7 +50,7 @@ def merge_unseen(gaussians: Gaussians, scene: Scene, count: int) -> Gaussians:
 
 @dataclass(frozen=True)
 class Owners:
-    """Dominant superpixel of each of n Gaussians."""
+    """The superpixel to which each of n Gaussians contributes most."""
 
     values: np.ndarray  # [n] float32 blending weights summed over the superpixel, pixels; or 0
     views: np.ndarray  # [n] int32, -1 if unseen
@@ -58,7 +58,7 @@ class Owners:
 
 
 def find_owners(scene: Scene, groups: Groups) -> Owners:
-    """Find the dominant superpixel of every Gaussian over all views; the first view wins ties."""
+    """Find the superpixel to which each Gaussian contributes most, over all views; the first view wins ties."""
     count, lock = len(scene.gaussians), Lock()
     best = Owners(np.zeros(count, np.float32), np.full(count, -1, np.int32), np.full(count, -1, np.int32))
 
@@ -75,7 +75,7 @@ def find_owners(scene: Scene, groups: Groups) -> Owners:
 
 
 def view_owners(plan: ViewPlan, labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Find contribution ``[m]`` to, and label ``[m]`` of, the dominant superpixel of each of a plan's Gaussians."""
+    """Return each Gaussian's largest contribution ``[m]`` to a superpixel of one view, and that superpixel ``[m]``."""
     labels = np.ascontiguousarray(labels, np.int32)
     return dominant_labels(*plan.lists, labels, count)
 
@@ -93,7 +93,7 @@ def owner_pixels(owners: Owners, groups: Groups) -> np.ndarray:
 
 
 def middle_pixels(labels: np.ndarray, count: int) -> np.ndarray:
-    """Return the pixel of each superpixel nearest to its centroid, ``[count]`` int64, 0 without pixels."""
+    """Return the pixel ``[count]`` int64 nearest to the centroid of each superpixel; 0 for an empty one."""
     height, width = labels.shape
     flat = labels.reshape(-1)
     y, x = np.divmod(np.arange(height * width), width)

@@ -28,7 +28,7 @@ MAX_VIEWS = 6  # that a start is judged by
 def choose_start(
     starts: Sequence[MergedViews], scene: Scene, options: DecodeOptions, checkpoint: Checkpoint | None
 ) -> MergedViews:
-    """Choose the start, with or without networks, whose Gaussians at K = 1 show the views better.
+    """Choose between the merges with and without networks by which shows the views better at K = 1.
 
     The choice does not depend on K, so what is encoded once is what every K begins with. Networks
     learn what real exports suffer from; a scene without those errors is better left alone.

@@ -40,7 +40,7 @@ Counts = dict[str, int]
 
 
 def inside_crop(means: np.ndarray, crop: str) -> np.ndarray:
-    """Return a mask ``[n]`` of the world-frame centres ``[n,3]`` inside a crop or on its border."""
+    """Return a mask ``[n]`` of the world-frame centres ``[n,3]`` inside a crop, border included."""
     shape, parsed = parse_crop(crop)
     numbers = np.array(parsed)
     if shape == "sphere":
@@ -49,7 +49,7 @@ def inside_crop(means: np.ndarray, crop: str) -> np.ndarray:
 
 
 def beyond_scene(means: np.ndarray, samples: np.ndarray | None = None) -> np.ndarray:
-    """Return a mask ``[n]`` of centres outside ten times the box of 1 % to 99 % of them, or of ``samples``."""
+    """Return a mask ``[n]`` of centres ``[n,3]`` outside ten times the box of 1 % to 99 % of them or of ``samples``."""
     low, high = np.percentile(means if samples is None else samples, BOX_QUANTILES, axis=0)
     half = np.maximum((high - low) / 2, 1e-3 * max(float(np.sqrt(((high - low) ** 2).sum())), 1e-30))
     return np.asarray((np.abs(means - (low + high) / 2) > OUTLIER_BOX * half).any(1))
@@ -77,7 +77,7 @@ def floaters(gaussians: Gaussians, rows: np.ndarray | None = None) -> np.ndarray
 
 
 def curtains(gaussians: Gaussians, rows: np.ndarray) -> np.ndarray:
-    """Return a mask ``[m]`` of Gaussians ``rows [m]`` that hang across the scene: as large as it, and unlike others."""
+    """Return a mask ``[m]`` of the Gaussians ``rows [m]`` that hang across the scene: huge and unlike others."""
     low, high = np.percentile(gaussians.means.astype(np.float64), BOX_QUANTILES, axis=0)
     radius = np.sqrt(((high - low) ** 2).sum()) / 2
     scales = np.sort(gaussians.scales, axis=1)[:, 1:]
@@ -92,7 +92,7 @@ def floater_share(gaussians: Gaussians) -> float:
 
 
 def clean(gaussians: Gaussians, options: CleanOptions, scene: Scene, to_world: ToWorld) -> tuple[Gaussians, Counts]:
-    """Leave unwanted Gaussians out; return the rest and numbers by reason (``cropped``, ``sky``, ``floaters``).
+    """Remove unwanted Gaussians; return the rest and the numbers removed (``cropped``, ``sky``, ``floaters``).
 
     Gaussians and scene are canonical; ``to_world`` leads to the frame of the crop. The sky is found
     in the scene's photos.
@@ -112,7 +112,7 @@ def clean(gaussians: Gaussians, options: CleanOptions, scene: Scene, to_world: T
 
 
 def clean_to_count(make: Make, count: int | None, options: CleanOptions, prepared: Prepared) -> Fitted:
-    """Make Gaussians and clean them, so that exactly ``count`` are left if the scene holds so many.
+    """Build Gaussians and clean them up so that exactly ``count`` remain, if the scene holds that many.
 
     ``make`` builds a given number of Gaussians before clean-up. Raises UsageError if the crop holds
     none of the scene.
@@ -152,7 +152,7 @@ def clean_to_count(make: Make, count: int | None, options: CleanOptions, prepare
 
 
 def faintest_dropped(gaussians: Gaussians, count: int) -> Gaussians:
-    """Keep the ``count`` Gaussians with the largest opacity times area of the two largest axes, in order."""
+    """Keep the ``count`` Gaussians with the largest opacity times area (of the two largest axes), in their order."""
     area = np.sort(gaussians.scales, axis=1)[:, 1:].prod(1)
     return gaussians[np.sort(np.argsort(-gaussians.opacities * area, kind="stable")[:count])]
 

@@ -53,7 +53,7 @@ def decode(
 
 
 def keep_all(scene: Scene, count: int | None) -> Decoded | None:
-    """Return all Gaussians of an unaligned scene where as many are asked for: merging some would only blur."""
+    """Return all Gaussians of an unaligned scene if at least as many are asked for; otherwise None."""
     if count is None or scene.aligned or count < len(scene.gaussians):
         return None
     return Decoded(scene.gaussians, len(scene.gaussians), exact=True)
@@ -61,7 +61,7 @@ def keep_all(scene: Scene, count: int | None) -> Decoded | None:
 
 @stage("decode")
 def decode_merged(merged: MergedViews, scene: Scene, options: DecodeOptions, *, grows: bool) -> Decoded:
-    """Decode merged views into the exact number asked for, unless the fit ``grows`` to it, or K for each group."""
+    """Decode merged views into the exact count, unless the fit ``grows`` to it, or into K per group."""
     asked = merged.segmentation
     if asked.exact and not grows:
         gaussians = _decode_exactly(merged, asked.count, options)
@@ -104,7 +104,7 @@ def _decode_exactly(merged: MergedViews, count: int, options: DecodeOptions) -> 
 def deal_visible(
     order: np.ndarray, num_groups: int, total: int, min_opacity: float, make: Callable[[np.ndarray], Gaussians]
 ) -> Gaussians:
-    """Make ``total`` Gaussians, replacing those below ``min_opacity`` by further children.
+    """Make ``total`` visible Gaussians: those fainter than ``min_opacity`` are replaced by further children elsewhere.
 
     ``order [d]`` are the groups of further Gaussians, see :func:`deal_order`; each group gets at
     least one. ``make`` makes Gaussians from the number of each group ``[g]``, however faint. There
@@ -139,11 +139,11 @@ def mixed_counts(
 
 
 def merged_count(merged: MergedViews, options: DecodeOptions, *, grows: bool) -> int | None:
-    """Return the number of Gaussians for merged views; None: K for each Feature Gaussian.
+    """Return the number of Gaussians to decode merged views into; None: K for each Feature Gaussian.
 
-    A number where one is to be met and no fit grows to it; and for unaligned scenes: what a near
-    and a far view both show belongs to the near one, so many superpixels of the far one stay empty,
-    and their Gaussians are spent on the others.
+    The result is a number if an exact count is asked for and no fit grows to it, and for unaligned scenes. There, what
+    a near and a far view both show belongs to the near one, so many superpixels of the far one stay empty, and their
+    Gaussians go to other groups.
     """
     segmentation, members = merged.segmentation, merged.members
     if segmentation.exact and not grows:
@@ -159,7 +159,7 @@ def merged_count(merged: MergedViews, options: DecodeOptions, *, grows: bool) ->
 
 
 def divide(features: FeatureGaussians, members: Members, counts: np.ndarray) -> tuple[Gaussians, np.ndarray]:
-    """Return the analytic children of :func:`decode`, however faint, and the rising group ``[n]`` of each."""
+    """Return the children that :func:`decode` makes without networks, however faint, and the group ``[n]`` of each."""
     divided = counts > 1
     gaussians, parents = feature_to_gaussians(features), np.arange(len(features))
     if divided.any():
@@ -176,7 +176,7 @@ def divide(features: FeatureGaussians, members: Members, counts: np.ndarray) -> 
 def halve(
     features: FeatureGaussians, members: Members, groups: np.ndarray, counts: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Halve groups' members into ``counts [g]`` children: ``starts [n+1]``, member rows ``[m]``, groups ``[n]``."""
+    """Halve the members of groups into ``counts [g]`` children: starts ``[n+1]``, members ``[m]``, groups ``[n]``."""
     starts, ids = features.starts, features.members
     centres, footprints = features.means.astype(np.float64), features.footprints.astype(np.float64)
 
@@ -200,14 +200,14 @@ def pool_children(
     ids: np.ndarray,
     parents: np.ndarray,
 ) -> Gaussians:
-    """Pool each run of members into one Gaussian, with the gain of its Feature Gaussian."""
+    """Pool each run of members into one Gaussian, with the gain of its parent Feature Gaussian."""
     moments = pool_members(members, starts, ids)
     extinctions = moments.extinctions * features.gains[parents]
     return to_gaussians(moments.covars, extinctions, moments.means, moments.sh)
 
 
 def split_counts(features: FeatureGaussians, members: Members, extra: int, max_children: int = 8) -> np.ndarray:
-    """Spend ``extra`` Gaussians where they lower distortion most; return the children ``[g]`` int64 of each group.
+    """Give ``extra`` Gaussians to the groups where they lower distortion most; return the children ``[g]`` per group.
 
     A step that only pays together with the next one is judged by the two together (the convex hull
     of the group's distortion), so a larger ``extra`` never takes a child away. The sum is ``g +
@@ -223,7 +223,7 @@ def split_counts(features: FeatureGaussians, members: Members, extra: int, max_c
 
 
 def deal_order(features: FeatureGaussians, members: Members, max_children: int = 8) -> np.ndarray:
-    """Return the Feature Gaussian ``[d]`` of each further Gaussian, largest gain first; see :func:`split_counts`."""
+    """Return the order in which groups get further Gaussians: the group ``[d]`` of each, largest gain first."""
     if max_children == 1 or len(features) == 0:
         return np.zeros(0, np.int64)
     gains = hull_gains(_child_errors(features, members, max_children))
@@ -250,10 +250,9 @@ def _child_errors(features: FeatureGaussians, members: Members, max_children: in
 
 
 def hull_gains(errors: np.ndarray) -> np.ndarray:
-    """Return the gain ``[f,c-1]`` of each further child along the lower convex hull of the errors.
+    """Return the gain ``[f,c-1]`` of each further child, along the lower convex hull of the errors ``[f,c]``.
 
-    -inf where there is none. Gains fall from child to child: the mean gain up to the farthest point
-    of steepest descent, again and again.
+    It is -inf where there is no child. Along the hull the gains fall from child to child.
     """
     num_groups, num_children = errors.shape
     gains = np.full((num_groups, num_children - 1), -np.inf)

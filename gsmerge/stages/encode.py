@@ -33,7 +33,7 @@ MOST, FEWEST, WRONG = 0.08, 0.015, 0.38
 def make_context(
     networks: NetworkWeights | None, members: Members, cameras: Cameras, seed: int
 ) -> NetworkContext | None:
-    """Return networks with the facts of a scene that they read; None without networks."""
+    """Bundle networks with the facts about a scene that they read; None without networks."""
     if networks is None:
         return None
     from gsmerge.networks.apply import NetworkContext
@@ -56,10 +56,10 @@ def encode(scene: Scene, members: Members, groups: Groups, rule: Rule = "depth")
 def correct(
     features: FeatureGaussians, members: Members, cameras: Cameras, networks: NetworkContext | None, *, weaken: bool
 ) -> FeatureGaussians:
-    """Correct pooled Feature Gaussians by the encoder, which adds their latents, too.
+    """Correct pooled Feature Gaussians with the encoder network, which also adds latents.
 
-    ``weaken``: without networks, lower the optical depth of groups that other views see through; a
-    long fit closes the holes that this leaves, and moves what stands before other views less.
+    ``weaken``: without networks, lower the optical depth of groups that other views see through. A long fit closes the
+    holes that this leaves.
     """
     if networks is None:
         return weaken_contradicted(features, members, cameras) if weaken else features
@@ -113,7 +113,7 @@ def from_moments(moments: Moments, starts: np.ndarray, ids: np.ndarray, views: n
 
 
 def measured_share(scene: Scene) -> tuple[float | None, str]:
-    """Choose superpixels per pixel by the agreement of the views' depths, None if unknown; and say why."""
+    """Choose superpixels per pixel by how well the depths of the views agree (None: unknown); also say why."""
     if not scene.aligned or len(scene) < 2:
         return None, "depths of several views cannot be compared"
     wrong = contradicted_share(scene, scene_members(scene))
@@ -123,7 +123,7 @@ def measured_share(scene: Scene) -> tuple[float | None, str]:
 
 
 def contradicted_share(scene: Scene, members: Members) -> float:
-    """Return the share of sampled valid pixels that more views see through than have a surface there."""
+    """Return the share of sampled pixels whose Gaussian more views see through than confirm."""
     rows = np.flatnonzero(scene.valid)
     rows = rows[:: max(1, len(rows) // SAMPLES)]
     views = rows // scene.pixels_per_view
@@ -140,7 +140,7 @@ def weaken_contradicted(features: FeatureGaussians, members: Members, cameras: C
 def agreement_factors(
     means: np.ndarray, sh0: np.ndarray, views: np.ndarray, members: Members, cameras: Cameras
 ) -> np.ndarray:
-    """Return the factor ``[g]`` float32, at most 1, on the optical depth of each point.
+    """Return factors ``[g]`` float32, at most 1, on the optical depth of points: lower where other views see through.
 
     Arguments are those of :func:`gsmerge.networks.cross_view_stats.cross_view_stats`; unaligned
     scenes get ones.

@@ -30,7 +30,7 @@ class MergedViews:
 
 @stage("match")
 def merge(features: FeatureGaussians, matches: Matches, networks: NetworkContext | None = None) -> FeatureGaussians:
-    """Pool each cluster into one Feature Gaussian; those alone come first, unchanged and in order.
+    """Pool each cluster into one Feature Gaussian; members that are alone in their cluster come first, unchanged.
 
     Members are weighted with their opacities times what the photos say of them (gains); masses and
     integrated optical depths add, so equal ones stacked on each other become 1 - prod(1 - alpha).
@@ -59,7 +59,7 @@ def refine(features: FeatureGaussians, networks: NetworkContext | None) -> Featu
 
 
 def cluster_runs(matches: Matches) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return rows alone in their cluster, the other rows by cluster, and where each cluster starts among these."""
+    """Split rows by cluster: those alone in theirs, the others sorted by cluster, and where each cluster starts."""
     clusters = matches.clusters
     alone = np.bincount(clusters, minlength=matches.count)[clusters] == 1
     order = np.flatnonzero(~alone)
@@ -70,7 +70,7 @@ def cluster_runs(matches: Matches) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def take(features: FeatureGaussians, index: np.ndarray) -> FeatureGaussians:
-    """Return the Feature Gaussians that an integer ``index`` selects, with their members."""
+    """Select Feature Gaussians by an integer ``index``, with their members."""
     starts, members = _gather(features, index)
     names = [n for n in features.__dataclass_fields__ if n not in ("starts", "members")]
     return FeatureGaussians(starts=starts, members=members, **{n: getattr(features, n)[index] for n in names})
@@ -86,7 +86,7 @@ def _gather(features: FeatureGaussians, index: np.ndarray) -> tuple[np.ndarray, 
 
 
 def pool_runs(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray) -> FeatureGaussians:
-    """Pool each run of rows in ``order`` that begins at ``cuts`` into one Feature Gaussian."""
+    """Pool each run of rows in ``order`` into one Feature Gaussian; runs start at ``cuts``."""
 
     def rows(array: np.ndarray) -> np.ndarray:
         return array[order].astype(np.float64)

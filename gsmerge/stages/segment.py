@@ -49,7 +49,7 @@ KNEE_FLOOR = 3e-4  # squared error per pixel and channel that no count removes (
 
 @dataclass(frozen=True, eq=False)
 class SuperpixelPlan:
-    """Method and numbers for cutting a scene into superpixels."""
+    """How to cut a scene into superpixels: method, limits and numbers."""
 
     options: SegmentOptions  # Method and number
     limits: CountLimits  # Limits of the number of Gaussians
@@ -59,11 +59,11 @@ class SuperpixelPlan:
 
 @stage("segment")
 def segment_scene(scene: Scene, plan: SuperpixelPlan, count: int | None) -> Segmentation:
-    """Cut every view into as many superpixels as the plan says, or into those that become exactly ``count`` Gaussians.
+    """Cut every view into superpixels: as the options say, or as many as become exactly ``count`` Gaussians.
 
-    A count is cut from the region tree, in which a plain wall ends up with few superpixels and a fern with many; from
-    a finer tree where the scene's own does not reach it. Superpixels that adapt change the number of Gaussians as
-    they change their own; where that is above what a budget allows, it is cut to the largest one allowed.
+    An exact count is cut from the region tree, which gives a plain wall few superpixels and a fern many; a finer tree
+    is built if the scene's own is too coarse. Adaptive superpixels change the number of Gaussians; if it exceeds the
+    budget, the largest allowed count is cut instead.
     """
     limits, options, views = plan.limits, plan.options, len(scene)
     if count is None:
@@ -85,7 +85,7 @@ def segment_scene(scene: Scene, plan: SuperpixelPlan, count: int | None) -> Segm
 
 @stage("segment")
 def scene_tree(scene: Scene, options: SegmentOptions, limits: CountLimits, count: int) -> RegionTree:
-    """Build the tree of all coarser superpixels of a scene, fine enough for ``count`` Gaussians."""
+    """Build the tree of all coarser segmentations of a scene, fine enough for ``count`` Gaussians."""
     pictures = scene_pictures(scene)
     leaves = min(max(limits.per_view, -(-count // len(scene))), scene.pixels_per_view)
     depths, valid = (pixel_depths(scene), scene.valid) if scene.aligned else seen_depths(scene)
@@ -93,7 +93,7 @@ def scene_tree(scene: Scene, options: SegmentOptions, limits: CountLimits, count
 
 
 def knee_count(scene: Scene, plan: SuperpixelPlan) -> int:
-    """Find the knee of the scene's own curve of distortion, at most what is allowed."""
+    """Find the number of Gaussians at the knee of the scene's distortion curve, within the limits."""
     limits = plan.limits
     tree = plan.tree or scene_tree(scene, plan.options, limits, limits.default)
     return max(limits.min_count, min(auto_count(tree), limits.max_count))
@@ -101,7 +101,7 @@ def knee_count(scene: Scene, plan: SuperpixelPlan) -> int:
 
 @dataclass(frozen=True)
 class CountLimits:
-    """Limits that the options set for the number of Gaussians."""
+    """Limits on the number of Gaussians that follow from the options."""
 
     per_view: int  # Superpixels of each view that the options ask for
     default: int  # Gaussians that `superpixels` and K ask for
@@ -112,20 +112,20 @@ class CountLimits:
 
     @property
     def count(self) -> int | None:
-        """Number that a budget, a size or a device sets; None where ``superpixels`` and K decide."""
+        """Number of Gaussians that a budget, a size or a device sets; None where ``superpixels`` and K decide."""
         if self.exact is not None:
             return self.exact
         return self.max_count if self.default > self.max_count else None
 
     @property
     def share(self) -> float:
-        """Gaussians for each pixel."""
+        """Gaussians per pixel."""
         return (self.count or self.default) / max(1, self.num_pixels)
 
 
 @dataclass(frozen=True)
 class SceneSize:
-    """Numbers of a scene, read or not, that a plan is made of."""
+    """Sizes of a scene that a plan depends on, known before the scene is read in full."""
 
     num_gaussians: int  # without rows that stand in for missing ones
     num_views: int
@@ -143,7 +143,7 @@ class SceneSize:
 
 
 def measure_size(scene: Scene, *, photos: bool | None = None) -> SceneSize:
-    """Return the numbers of a scene; ``photos``: whether there are any to fit to, None: as the scene has them."""
+    """Return the sizes of a scene; ``photos``: whether there are any to fit to, None: whether the scene has images."""
     cameras = scene.cameras
     return SceneSize(
         scene.num_gaussians, len(scene), cameras.height, cameras.width, scene.aligned,
@@ -162,7 +162,7 @@ def count_limits(
     num_input: int | None = None,
     num_reserved: int = 0,
 ) -> CountLimits:
-    """Compute the limits of the number of Gaussians.
+    """Compute the limits on the number of Gaussians.
 
     ``num_input``: Gaussians that shares of a budget refer to; None: the scene's. ``num_reserved``:
     Gaussians of the result that are settled already, such as those that no view sees. Raises
@@ -187,7 +187,7 @@ def count_limits(
 
 
 def superpixels_per_view(scene: SceneSize, segment: SegmentOptions) -> int:
-    """Return the superpixels of each view; where Gaussians are fewer than pixels, a share is taken of the Gaussians."""
+    """Return the superpixels per view; a share refers to the Gaussians where they are fewer than the pixels."""
     per_view = count_for(segment, scene.height, scene.width)
     if scene.aligned or segment.per_view is not None:
         return per_view
@@ -195,7 +195,7 @@ def superpixels_per_view(scene: SceneSize, segment: SegmentOptions) -> int:
 
 
 def default_count(scene: SceneSize, segment: SegmentOptions, decode: DecodeOptions) -> int:
-    """Return the Gaussians that ``superpixels`` and K ask for; of a scene without views, a share of its Gaussians."""
+    """Return the number of Gaussians that ``superpixels`` and K give; without views, a share of the Gaussians."""
     count, views = scene.num_gaussians, scene.num_views
     if views == 0:
         return round(max(1, int(segment.share * count)) * decode.mean_k)
@@ -205,7 +205,7 @@ def default_count(scene: SceneSize, segment: SegmentOptions, decode: DecodeOptio
 
 
 def largest_count(limits: CountLimits, segment: SegmentOptions) -> int:
-    """Return the most Gaussians that a run can give: superpixels that adapt may become more than are asked for."""
+    """Return the most Gaussians that a run can give; adaptive superpixels may become more than asked for."""
     if limits.count is not None:
         return limits.count
     return min(MAX_FACTOR * limits.default, limits.max_count) if segment.adapts else limits.default
@@ -213,7 +213,7 @@ def largest_count(limits: CountLimits, segment: SegmentOptions) -> int:
 
 @dataclass(frozen=True, eq=False)
 class RegionTree:
-    """All merges of the superpixels of all views, from the finest to one per view, and their order."""
+    """Hierarchy of superpixels: all merges in every view, from the finest cut to one region per view, in order."""
 
     groups: Groups  # The superpixels that it starts from
     parents: tuple[np.ndarray, ...]  # Per view [2·leaves-1] int32: union of a region, or -1
@@ -228,7 +228,7 @@ class RegionTree:
 
     @property
     def counts(self) -> np.ndarray:
-        """Number of regions ``[m+1]`` left after the first i merges."""
+        """Number of regions ``[m+1]`` after 0 to m merges."""
         return len(self) - np.arange(len(self.distortions))
 
 
@@ -246,7 +246,7 @@ def pixel_depths(scene: Scene) -> np.ndarray:
 
 
 def region_tree(images: np.ndarray, depths: np.ndarray, groups: Groups, valid: np.ndarray) -> RegionTree:
-    """Merge neighbouring superpixels by added distortion, each view down to a single region.
+    """Merge neighbouring superpixels in order of added distortion, until each view is a single region.
 
     ``images [v,h,w,3]`` sRGB in [0, 1]; ``depths [v,h,w]``, of which those of at most 0 count as
     very near; ``groups`` are 4-connected, none empty; pixels outside of ``valid [v,h,w]`` do not
@@ -297,8 +297,8 @@ def _usable_depths(depths: np.ndarray, valid: np.ndarray) -> np.ndarray:
 def cut_tree(tree: RegionTree, budget: int) -> Groups:
     """Cut the tree into exactly ``budget`` regions over all views, at least one in each.
 
-    There are at most as many as superpixels. The regions of a smaller budget are unions of those of
-    a larger one. Raises ValueError if ``budget`` is below the number of views.
+    ``budget`` is limited to the number of superpixels. The regions of a smaller budget are unions of those of a larger
+    one. Raises ValueError if ``budget`` is below the number of views.
     """
     num_views = len(tree.parents)
     if budget < num_views:
@@ -323,12 +323,11 @@ def auto_count(tree: RegionTree) -> int:
 
 
 def knee(counts: np.ndarray, distortions: np.ndarray) -> int:
-    """Return the count beyond which more Gaussians are not worth it.
+    """Return the count beyond which more Gaussians add little quality.
 
-    Predicted quality is q(N) = -10 log10(floor + D(N)) dB. The knee is the largest count from whose
-    surroundings (a factor of 1.25) q still grows by ``KNEE_SLOPE`` dB per relative increase; the
-    least count if there is none. ``counts [m]`` are all different; ``distortions [m]`` are mean
-    squared errors per pixel and channel.
+    Predicted quality is q(N) = -10 log10(floor + D(N)) dB. The knee is the largest N around which, within a factor of
+    1.25, q still grows by ``KNEE_SLOPE`` dB per relative increase of N; the least N if there is none. ``counts [m]``
+    are all different; ``distortions [m]`` are mean squared errors per pixel and channel.
     """
     counts, distortions = np.asarray(counts), np.asarray(distortions, dtype=float)
     if len(counts) == 0 or counts.shape != distortions.shape:

@@ -34,7 +34,7 @@ MAX_SAMPLES = 200_000  # Gaussians that depths are taken from
 
 
 def sky(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray) -> np.ndarray:
-    """Return a mask ``[n]`` of the canonical Gaussians that add most of their weight to the sky of the photos."""
+    """Return a mask ``[n]`` of canonical Gaussians that contribute mostly to the sky of the photos."""
     regions, mask = sky_regions(gaussians.means, cameras, photos), np.zeros(len(gaussians), bool)
     if not regions:
         return mask
@@ -48,7 +48,7 @@ def sky(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray) -> np.ndarra
 
 
 def sky_regions(means: np.ndarray, cameras: Cameras, photos: np.ndarray) -> dict[int, np.ndarray]:
-    """Return the sky ``[h,w]`` bool of the views that show any, by view; none if too few do."""
+    """Return a mask ``[h,w]`` of the sky for each view that shows any, by view; empty if too few do."""
     regions = {view: region for view, photo in enumerate(photos) if (region := sky_region(photo)).any()}
     shown = {
         view: region
@@ -81,7 +81,7 @@ def _is_far(means: np.ndarray, camera: Cameras, region: np.ndarray) -> bool:
 
 
 def sky_region(photo: np.ndarray) -> np.ndarray:
-    """Return the smooth blue or white regions ``[h,w]`` bool that start at a photo's upper border, if large."""
+    """Return a mask ``[h,w]`` of smooth blue or white regions at a photo's upper border; empty if they are small."""
     height, width = photo.shape[:2]
     scale = max(height, width) / SIDE
     soft = blur(photo, max(1.5 * scale, 0.5))

@@ -45,7 +45,7 @@ MAX_FACTOR = 4  # most times more or fewer superpixels than bass-adaptive starts
 
 
 def count_for(options: SegmentOptions, height: int, width: int) -> int:
-    """Return the superpixels that the options ask for in a view; raise UsageError for more than pixels."""
+    """Return the number of superpixels per view; UsageError if it exceeds the number of pixels."""
     if options.per_view is not None:
         if options.per_view > height * width:
             limit = f"{height * width}, one per pixel of {width} x {height}"
@@ -59,9 +59,8 @@ def segment(
 ) -> Groups:
     """Cut every view into superpixels: the same number in each, unless they adapt.
 
-    ``images [v,h,w,3]`` are float in [0, 1] or uint8; ``count`` is the number in each view, None:
-    that of the options. With ``adapt`` it is only where ``bass-adaptive`` starts from; see
-    :func:`superpixels`.
+    ``images [v,h,w,3]`` are float in [0, 1] or uint8; ``count`` is the number per view, None: the options' number. With
+    ``adapt``, ``bass-adaptive`` starts from ``count`` and may change it; see :func:`superpixels`.
     """
     if images.ndim != 4 or images.shape[3] != 3:
         raise ValueError(f"images: expected shape [v, h, w, 3], got {list(images.shape)}")
@@ -99,8 +98,8 @@ def superpixels(
         rectangles: Of ``rdseg``: rectangles per superpixel that it begins with, at least 1. More take longer.
         early_sweeps: Of ``rdseg``: sweeps over border pixels before rectangles are merged.
         compactness: Weight of squared pixels against squared colours, in [0, 1] (not for the BASS methods).
-        adapt: Of ``bass-adaptive`` only: the share that is left of the number that it comes to from ``count``, which
-            is a quarter to four times as many, at most one per pixel; 1 keeps it. None: exactly ``count``.
+        adapt: Of ``bass-adaptive`` only, which changes ``count`` by a factor of a quarter to four (at most one per
+            pixel): share of the changed number to return, 1 for all. None: exactly ``count``.
 
     Returns:
         ``[h,w]`` int32, dense from 0, a tensor for a tensor; the same on every run.
@@ -134,7 +133,7 @@ def superpixels(
 
 
 def grid_labels(height: int, width: int, count: int) -> np.ndarray:
-    """Return labels ``[h,w]`` int32 of ``count`` rectangles in rows whose lengths differ by at most one."""
+    """Return labels ``[h,w]`` int32 of ``count`` rectangles, in rows of equally many rectangles, up to one."""
     min_rows = -(-count // width)  # rows of blocks that can hold them all
     lines = min(height, count, max(min_rows, round((count * height / width) ** 0.5)))
     first = np.arange(lines + 1) * count // lines  # first label of each row of blocks

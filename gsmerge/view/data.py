@@ -39,7 +39,7 @@ FINE = 11  # bits of a position within the scene: the browser keeps 10 and the s
 
 @dataclass(frozen=True)
 class Side:
-    """The scene itself or one of its results."""
+    """One side of the comparison: the scene itself or a result."""
 
     name: str
     num_gaussians: int
@@ -69,7 +69,7 @@ class PageView:
 
 @dataclass(frozen=True)
 class ViewData:
-    """The content of a page."""
+    """Content of a page: scenes, views, scores and notes."""
 
     title: str  # name of the scene
     sides: tuple[Side, ...]  # the scene itself, then its results
@@ -82,22 +82,22 @@ class ViewData:
 
     @property
     def shown(self) -> tuple[PageView, ...]:
-        """The views, and behind them the one from outside."""
+        """The views, followed by the one from outside."""
         return (*self.views, self.outside)
 
     @property
     def start(self) -> int:
-        """Number of the view that the page opens on: the one of the middle score."""
+        """Index of the view on which the page opens: the one of median score, or the first without scores."""
         return (len(self.views) - 1) // 2 if self.scored else 0
 
     @property
     def scored(self) -> bool:
-        """Whether there is something to compare with: a scene alone has nothing without photos."""
+        """Whether views have scores: there are photos, or several scenes to compare."""
         return len(self.sides) > 1 or any(view.photo is not None for view in self.views)
 
     @property
     def held_out(self) -> bool:
-        """Whether the means are over unseen views."""
+        """Whether the means are over held-out views."""
         return any(view.held_out for view in self.views)
 
 
@@ -113,7 +113,7 @@ def collect(
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> ViewData:
-    """Draw and measure a scene, which has at least one view, and its results, if any, in all views.
+    """Draw and score a scene, which has at least one view, and its results, if any, in all views.
 
     ``results`` are Gaussians by name in the scene's world, ``file_bytes`` the sizes of the scene's file and of
     theirs. Stills and scores are from ``cameras`` (as of :func:`gsmerge.evaluate`), 3D from the scene's own.
@@ -176,7 +176,7 @@ def _outside_view(scene: Scene, named: Mapping[str, Gaussians], frame: Frame, pl
 def with_outlines(
     views: Sequence[PageView], photos: np.ndarray | None, options: SegmentOptions
 ) -> tuple[tuple[PageView, ...], tuple[int, int] | None]:
-    """Add outlines of the superpixels of the input photos ``[v,h,w,3]``; also return their least and most number."""
+    """Add outlines of superpixels to the input views; also return the least and largest number of superpixels."""
     places = [i for i, view in enumerate(views) if not view.held_out]
     if photos is None or not places:
         return tuple(views), None
@@ -189,7 +189,7 @@ def with_outlines(
 
 
 def short_names(names: Sequence[str]) -> list[str]:
-    """Shorten names of photos to those without folders and endings, where that tells them apart."""
+    """Shorten photo names by folders and endings, where the short names still differ."""
     stems = [PurePosixPath(name.replace("\\", "/")).stem or name for name in names]
     return stems if len(set(stems)) == len(stems) else list(names)
 
@@ -201,7 +201,7 @@ def encode_still(picture: Picture) -> bytes:
 
 
 def encode_outlines(photo: np.ndarray, labels: np.ndarray) -> bytes:
-    """Encode the borders of superpixels ``[h,w]`` as a transparent PNG several times as large.
+    """Encode the borders of superpixels ``[h,w]`` as an enlarged, transparent PNG.
 
     Each is in the mean colour that its superpixel has in ``photo [h,w,3]``, a little lighter or,
     where that is light, darker.
@@ -255,7 +255,7 @@ def _limits(sides: Sequence[Side], num_shown: int, num_views: int) -> list[str]:
 
 
 def pack_splats(gaussians: Gaussians) -> tuple[bytes | None, int]:
-    """Pack the visible Gaussians with as many harmonics as fit, and return their degree; None for too many.
+    """Pack the visible Gaussians with as many harmonics as fit; return bytes (None if too many) and SH degree.
 
     Neighbouring rows are alike, so the bytes of a ``.spz`` are stored as differences from the row before, column by
     column, in 60 % of its size. The gzip stream has the header of an uncompressed ``.spz`` of version 3, the checksum
@@ -280,6 +280,6 @@ def pack_splats(gaussians: Gaussians) -> tuple[bytes | None, int]:
 
 
 def highest_degree(harmonics: np.ndarray) -> int:
-    """Return the highest degree of harmonics ``[n,k-1,3]`` that is not zero everywhere."""
+    """Return the highest degree at which harmonics ``[n,k-1,3]`` are not all zero."""
     used = np.flatnonzero(harmonics.any((0, 2)))
     return int(np.sqrt(used[-1] + 1)) if len(used) else 0

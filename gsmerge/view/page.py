@@ -32,7 +32,7 @@ ENGINE = "vendor/spark-three.js.gz"
 
 
 def view_page(data: ViewData) -> str:
-    """Make the page of a scene, before and after where it has results, as HTML."""
+    """Make the HTML page of a scene and its results."""
     photos = any(view.photo is not None for view in data.views)
     sources: list[dict[str, Any]] = [{"name": "photo", "splats": None, "count": 0}] if photos else []
     sources += [
@@ -73,7 +73,7 @@ def view_page(data: ViewData) -> str:
 
 
 def report_page(document: Mapping[str, Any], pictures: Sequence[Sequence[tuple[str, np.ndarray]]]) -> str:
-    """Make the page of an evaluation: headline, pictures with a swipe, tables.
+    """Make the HTML page of an evaluation: headline, pictures with a swipe, tables.
 
     Args:
         document: As of :func:`gsmerge.measure.scores.evaluation_document`.
@@ -103,7 +103,7 @@ def report_page(document: Mapping[str, Any], pictures: Sequence[Sequence[tuple[s
 
 
 def headline(before: Side, after: Side | None = None) -> str:
-    """Write the share of Gaussians and the change of quality in one line; of one scene what it has."""
+    """Write the headline: share of Gaussians and change of quality; for one scene alone its size."""
     if after is None:
         quality = before.mean.psnr
         has_quality = quality is not None and np.isfinite(quality)
@@ -112,7 +112,7 @@ def headline(before: Side, after: Side | None = None) -> str:
 
 
 def headline_of(num_before: int, num_after: int, old: float | None, new: float | None) -> str:
-    """Write the same line from numbers; ``old`` and ``new`` are PSNR in dB, ``old`` is infinite for the reference."""
+    """Write the :func:`headline` from counts and PSNR (dB) before and after; infinite ``old``: the reference."""
     share = 100 * num_after / max(num_before, 1)
     said = f"{share:.{1 if share >= 1 else 2}f} % of the Gaussians"
     if new is None or old is None or not np.isfinite(new):
@@ -144,17 +144,17 @@ def _finite(value: float | None) -> float | None:
 
 
 def data_uri(content: bytes, kind: str) -> str:
-    """Make an address that holds the content of a file."""
+    """Encode content as a ``data:`` address."""
     return f"data:{kind};base64,{base64_text(content)}"
 
 
 def base64_text(content: bytes) -> str:
-    """Encode bytes in the 64 characters that HTML leaves alone."""
+    """Encode bytes in base64."""
     return base64.b64encode(content).decode("ascii")
 
 
 def render_template(name: str, policy: str, **values: Any) -> str:
-    """Fill a template with values, which are escaped unless it says otherwise.
+    """Fill a template with values, escaped except where the template says otherwise.
 
     ``policy`` is what the page may load; hashes of its elements take the places of ``{script}`` and
     ``{style}``.

@@ -25,7 +25,7 @@ BRIGHT = np.float32(20.0)  # harmonic of degree 0 with which no colour is cut of
 
 @dataclass(frozen=True)
 class JoinedScene:
-    """Several scenes as one, in the frame of the first that is in it."""
+    """Several scenes joined into one, in the frame of the first scene used."""
 
     scene: Scene
     used: tuple[int, ...]  # which of the given scenes are in it
@@ -37,7 +37,7 @@ class JoinedScene:
 
 
 def join_scenes(scenes: Sequence[Scene], paths: Sequence[Path]) -> JoinedScene:
-    """Put aligned scenes of one place, each in a frame and a scale of its own, into one.
+    """Join aligned scenes of one place, each with its own frame and scale, into one scene.
 
     ``paths`` are their files, for messages. SceneError if one has no pixels, two differ in the size
     of their views or in their harmonics, or no two show the same surfaces.
@@ -99,7 +99,7 @@ def _facts(path: Path, place: Similarity | None, matches: int) -> dict[str, Any]
 
 
 def move_scene(scene: Scene, place: Similarity) -> Scene:
-    """Move Gaussians and cameras of a scene by a similarity; pictures stay the same."""
+    """Move a scene's Gaussians and cameras by a similarity; photos stay."""
     g = scene.gaussians
     if place.scale == 1 and np.array_equal(place.rotation, np.eye(3)) and not place.shift.any():
         return scene
@@ -116,9 +116,9 @@ def move_scene(scene: Scene, place: Similarity) -> Scene:
 
 
 def turn_harmonics(shN: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """Turn spherical harmonics ``[n,k-1,3]`` with their Gaussians, by ``rotation [3,3]``.
+    """Rotate spherical harmonics ``[n,k-1,3]`` by ``rotation [3,3]``, as their Gaussians rotate.
 
-    They are fitted to the same colours in turned directions, which those of a degree show exactly.
+    Each degree is fitted to the same colours in rotated directions, which is exact.
     """
     num = shN.shape[1]
     if num == 0 or len(shN) == 0:
@@ -151,7 +151,7 @@ def _basis(directions: np.ndarray, num: int) -> np.ndarray:
 
 
 def concat_scenes(scenes: Sequence[Scene]) -> Scene:
-    """Put the views of scenes of one size and in one frame one after the other; all are aligned, or none is."""
+    """Concatenate the views of scenes of one size and frame; either all are aligned, or none is."""
     cameras = Cameras(
         np.concatenate([scene.cameras.viewmats for scene in scenes]),
         np.concatenate([scene.cameras.Ks for scene in scenes]),

@@ -26,7 +26,7 @@ PIXEL_SPREAD = 0.003  # standard deviation of a keypoint, share of the picture's
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """The keypoints of one photo, and the scene's points under them."""
+    """Keypoints of one photo, and the points of the scene under them."""
 
     pixels: np.ndarray  # [n,2] of the scene's grid
     points: np.ndarray  # [n,3] float64, in the scene's frame
@@ -37,7 +37,7 @@ class Photo:
 
 @dataclass(frozen=True, eq=False)
 class End:
-    """One scene's side of m matches."""
+    """One scene's half of m keypoint matches: pixels, points and cameras."""
 
     points: np.ndarray  # [m,3] in the scene's frame
     pixels: np.ndarray  # [m,2] of the scene's grid
@@ -51,7 +51,7 @@ class End:
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """Keypoints of two scenes that look alike, row by row."""
+    """Matches between the keypoints of two scenes, row by row."""
 
     scenes: tuple[int, int]
     ends: tuple[End, End]
@@ -67,9 +67,9 @@ class Matches:
 
 
 def find_keypoints(scene: Scene) -> list[Photo]:
-    """Find the keypoints of every camera of an aligned scene that lie on one surface.
+    """Find the keypoints of every camera of an aligned scene that lie on a single surface.
 
-    Views with one camera are layers of one photo.
+    Views from the same camera are layers of one photo.
     """
     cameras = scene.cameras.numpy()
     poses = cameras.viewmats.reshape(len(scene), -1)
@@ -170,7 +170,7 @@ def _depths_at(depths: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.n
 def match_photos(
     scenes: tuple[int, int], photos: Sequence[Photo], other_photos: Sequence[Photo], size: tuple[int, int]
 ) -> Matches:
-    """Match the keypoints of all photos of two scenes, whose grids have a ``size``."""
+    """Match the keypoints of all photos of two scenes; ``size``: width and height of their grids."""
     pairs = [(a, b) for a in photos for b in other_photos]
     rows = [_match(a.descriptors, b.descriptors) for a, b in pairs]
     first = _make_end([a for a, _ in pairs], [ids for ids, _ in rows])

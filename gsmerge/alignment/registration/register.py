@@ -53,16 +53,16 @@ _Fit = tuple[Places, tuple[float, np.ndarray, np.ndarray]]  # with the cost ther
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """Where the scenes lie in the frame of the first one that is connected."""
+    """Similarity from each scene's frame to that of the first scene of the largest connected set."""
 
     places: tuple[Similarity | None, ...]  # of each scene; None where it is not connected
     matches: tuple[int, ...]  # keypoints of each that agree with those of others
 
 
 def register(scenes: Sequence[Scene]) -> Registration:
-    """Find where aligned scenes, with grids of one size, lie in the frame of the first.
+    """Find the similarities that map aligned scenes, with grids of one size, into the frame of the first.
 
-    Of several connected sets the largest is used.
+    If the scenes form several connected sets, the largest is used.
     """
     count, cameras = len(scenes), scenes[0].cameras
     photos = [find_keypoints(scene) for scene in scenes]

@@ -45,20 +45,20 @@ def move_points(place: Similarity, points: np.ndarray) -> np.ndarray:
 
 
 def apply_after(second: Similarity, first: Similarity) -> Similarity:
-    """Return the similarity that applies ``first``, then ``second``."""
+    """Compose two similarities: first ``first``, then ``second``."""
     rotation = matmul(second.rotation, first.rotation)
     shift = move_points(second, first.shift)
     return Similarity(rotation, second.scale * first.scale, shift, kind="other")
 
 
 def invert_place(place: Similarity) -> Similarity:
-    """Return the similarity that undoes another."""
+    """Invert a similarity."""
     shift = -matmul(place.rotation.T, place.shift) / place.scale
     return Similarity(place.rotation.T, 1 / place.scale, shift, kind="other")
 
 
 def round_place(place: Similarity, unit: float) -> Similarity:
-    """Round a similarity to so many digits, so that the last bits of keypoints do not matter."""
+    """Round a similarity so that rounding errors in keypoints do not change results; ``unit``: of the shift."""
     quat = normalize(rotmat_to_quat(place.rotation[None]).round(DIGITS))
     shift = unit * (place.shift / unit).round(DIGITS)
     return Similarity(quat_to_rotmat(quat)[0], round(place.scale, DIGITS), shift, kind="other")

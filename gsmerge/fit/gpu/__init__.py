@@ -24,7 +24,7 @@ NO_TORCH = 'torch is not installed; pip install "torch>=2.4,<3" "gsplat>=1.5,<1.
 
 
 def choose_backend(device: str, num_pixels: int) -> tuple[FitBackend, str | None]:
-    """Choose where the fit and the scores run; a note says why CUDA was asked for and cannot be used.
+    """Choose the device for the fit and the scores; a note says why CUDA cannot be used if it was asked for.
 
     ``"auto"`` takes CUDA where it can be used and ``num_pixels`` of all views are enough; on a
     computer without torch or a CUDA device it gives no note, and without a CUDA driver torch is not
@@ -45,7 +45,7 @@ def choose_backend(device: str, num_pixels: int) -> tuple[FitBackend, str | None
 
 @cache
 def has_driver() -> bool:
-    """Return whether the computer has a CUDA driver; asking torch would take half a second to load it."""
+    """Return whether a CUDA driver is installed, without loading torch, which takes half a second."""
     try:
         ctypes.CDLL("nvcuda.dll" if os.name == "nt" else "libcuda.so.1")
     except OSError:
@@ -55,7 +55,7 @@ def has_driver() -> bool:
 
 @cache
 def cuda_problem() -> str | None:
-    """Say what keeps CUDA devices from being used, as a clause; None where nothing does.
+    """Describe in a clause why CUDA devices cannot be used; None if they can.
 
     The first call of a process loads gsplat and compares what the device computes with the CPU, see
     :mod:`gsmerge.fit.gpu.self_check`.

@@ -22,7 +22,7 @@ from gsmerge.types import as_array
 
 @dataclass(eq=False)
 class DeviceState:
-    """Parameters under optimisation on a device, and their meaning for the rasterizer."""
+    """Optimiser's state on a device, with the values that the rasterizer reads."""
 
     host: State  # What was brought to the device, with all that steps do not change
     x: Tensor  # [n,14], as the next three, like the columns of the same names of the host's state
@@ -44,13 +44,13 @@ class DeviceState:
 
     @property
     def shape(self) -> Shape:
-        """What the rasterizer takes."""
+        """Means, quaternions, scales and opacities."""
         return self.means, self.quats, self.scales, self.opacities
 
 
 @dataclass(frozen=True, eq=False)
 class StepGradients:
-    """Gradients of a loss in the rasterizer's inputs; ``reached [n]`` bool: drawn in the view."""
+    """Gradients of the loss with respect to the rasterizer's inputs; ``reached [n]`` bool: drawn in the view."""
 
     means: Tensor
     quats: Tensor
@@ -78,7 +78,7 @@ def download_state(state: DeviceState) -> State:
 
 
 def adam_step(state: DeviceState, gradients: StepGradients, options: FitOptions, rates: Tensor, step: int) -> None:
-    """Take an Adam step by a view's gradients, in place, within the box about the start.
+    """Take an Adam step by a view's gradients, in place; parameters stay within a box about the start.
 
     Gaussians that the view does not show stay unchanged. The pulls on opacity and size are added to
     the gradients of the image loss here. ``rates [14]``: see
@@ -94,7 +94,7 @@ def adam_step(state: DeviceState, gradients: StepGradients, options: FitOptions,
 
 @cache
 def has_triton() -> bool:
-    """Return whether Triton is there; CUDA builds of torch for Linux bring it."""
+    """Return whether Triton is installed; CUDA builds of torch for Linux bring it."""
     return find_spec("triton") is not None
 
 
@@ -120,7 +120,7 @@ def step_in_torch(state: DeviceState, gradients: StepGradients, options: FitOpti
 
 
 def parameter_gradient(state: DeviceState, gradients: StepGradients, options: FitOptions) -> Tensor:
-    """Return the gradient ``[n,14]`` in the optimiser's parameters: means in units of each size, log, logit."""
+    """Return the gradient ``[n,14]`` in optimiser parameters: means in units of size, log scales, logit opacities."""
     units, each = state.units[:, None], gradients.reached[:, None] / max(len(state), 1)
     slope = (state.opacities * (1 - state.opacities))[:, None]
     fade = gradients.opacities[:, None] + options.tuning.opacity_reg * each
@@ -131,7 +131,7 @@ def parameter_gradient(state: DeviceState, gradients: StepGradients, options: Fi
 
 
 def confine(state: DeviceState, x: Tensor, options: FitOptions) -> Tensor:
-    """Bring new parameters ``[n,14]`` into the box about the start, with unit quaternions."""
+    """Clip new parameters ``[n,14]`` to the box about the start, and normalise quaternions."""
     x0, rates, shares = state.x0, options.tuning, state.box_shares[:, None]
     offset = x[:, :SIZE] - x0[:, :SIZE]
     far, reach = offset.norm(dim=1, keepdim=True), shares * rates.max_mean_shift * state.units[:, None]

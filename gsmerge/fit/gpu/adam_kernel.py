@@ -126,7 +126,7 @@ def _step(
 
 
 def launch(state: DeviceState, gradients: StepGradients, limits: Tuning, rates: Tensor, step: int) -> None:
-    """Take one step on tensors of one device, in place; :func:`gsmerge.fit.gpu.adam.adam_step` says what they are."""
+    """Take the step of :func:`gsmerge.fit.gpu.adam.adam_step` with the Triton kernel, in place."""
     count, g = len(state), gradients
     if count == 0:
         return

@@ -26,7 +26,7 @@ from gsmerge.types import Gaussians
 
 
 def color_system(gaussians: Gaussians, photos: DevicePhotos, options: FitOptions, seed: int) -> _DeviceSystem:
-    """Make the system of the base colours; ``seed`` chooses the held-out blocks."""
+    """Make the least-squares system of the base colours; ``seed`` chooses the held-out blocks."""
     device = gaussians.means.device
     weights = torch.from_numpy(np.stack(color_weights(photos.host, options, seed))).to(device)
     images = torch.stack([draw_gaussians(gaussians, photos, view) for view in range(len(photos))])

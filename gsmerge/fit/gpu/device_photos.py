@@ -43,19 +43,19 @@ class DevicePhotos:
         return self.images.shape[2]
 
     def camera(self, view: int) -> tuple[Tensor, Tensor, int, int]:
-        """Return a view's camera as :func:`gsmerge.raster.cuda.rasterize` takes it."""
+        """Return a view's viewmat, intrinsics, width and height, for :func:`gsmerge.raster.cuda.rasterize`."""
         return self.viewmats[view], self.Ks[view], self.width, self.height
 
 
 def to_device(array: Array, device: torch.device, dtype: torch.dtype | None = None) -> Tensor:
-    """Bring an array of a core type, or a tensor, to a device."""
+    """Copy an array or a tensor to a device."""
     if isinstance(array, np.ndarray) and not array.flags.writeable:  # torch warns of those, though none is written to
         array = array.copy()
     return torch.as_tensor(array).to(device, dtype)
 
 
 def upload_photos(photos: Photos, device: torch.device) -> DevicePhotos:
-    """Bring photos and their cameras to a device."""
+    """Copy photos and their cameras to a device."""
     rotations, shifts = photos.viewmats[:, :3, :3], photos.viewmats[:, :3, 3]
     eyes = -np.einsum("vji,vj->vi", rotations, shifts)
     arrays = np.ascontiguousarray(photos.images), photos.viewmats, photos.Ks, eyes
@@ -66,7 +66,7 @@ def upload_photos(photos: Photos, device: torch.device) -> DevicePhotos:
 def upload_gaussians(
     gaussians: Gaussians, device: torch.device, dtype: torch.dtype | None = torch.float32
 ) -> Gaussians:
-    """Bring Gaussians to a device; None keeps the dtypes that they have."""
+    """Copy Gaussians to a device; with ``dtype`` None each array keeps its dtype."""
     arrays = (getattr(gaussians, f.name) for f in fields(Gaussians))
     return Gaussians(*(to_device(array, device, dtype) for array in arrays))
 
@@ -81,7 +81,7 @@ def draw_view(
     eps2d: float | None = None,
     antialiased: bool = False,
 ) -> tuple[Tensor, Tensor]:
-    """Draw Gaussians into one view; return the image ``[h,w,3]`` and a mask ``[n]`` of footprints there.
+    """Draw Gaussians into one view; return the image ``[h,w,3]`` and a mask ``[n]`` of Gaussians drawn there.
 
     ``shape`` are means, quaternions, scales and opacities, float32; ``colors [n,3]`` may have any
     sign, ``background`` is ``[3]``. The image is differentiable in shape and colours. ``eps2d`` is
@@ -119,7 +119,7 @@ def shape_of(gaussians: Gaussians) -> Shape:
 
 
 def harmonic_colors(means: Tensor, sh0: Tensor, shN: Tensor, photos: DevicePhotos, view: int) -> Tensor:
-    """Evaluate the colours ``[n,3]`` of harmonics in a view, not below 0, without gradient."""
+    """Evaluate the colours ``[n,3]`` of spherical harmonics in a view, clipped at 0, without gradient."""
     if means.device.type == "cpu":
         return seen_colors(means, sh0, shN, photos.host.viewmats[view])
     from gsmerge.raster import cuda
@@ -131,7 +131,7 @@ def harmonic_colors(means: Tensor, sh0: Tensor, shN: Tensor, photos: DevicePhoto
 def draw_and_transpose(
     shape: Shape, colors: Tensor, photos: DevicePhotos, view: int
 ) -> tuple[Tensor, Callable[[Tensor], Tensor], Tensor]:
-    """Draw a view over black: the image, its transpose, and a mask ``[n]`` of footprints in it.
+    """Draw a view over black; return the image, a function for its transpose, and a mask ``[n]`` of Gaussians drawn.
 
     The transpose takes an image ``[h,w,3]`` to sums ``[n,3]`` of each Gaussian's blending weight times the image.
     """

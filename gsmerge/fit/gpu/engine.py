@@ -192,14 +192,14 @@ class _GpuEngine:
 
 
 def make_backend(device: torch.device) -> FitBackend:
-    """Return the engine and the scores of one device."""
+    """Return the back end of one CUDA device."""
     name = "cuda" if device.type == "cuda" else "cpu"
     scores = partial(measure_photos, device=device)
     return FitBackend(name, partial(_GpuEngine, device=device), scores, (torch.cuda.OutOfMemoryError,))
 
 
 def state_colors(state: DeviceState, photos: DevicePhotos, view: int) -> Tensor:
-    """Return the colours ``[n,3]`` of a state in a view: its own, or through the harmonics."""
+    """Return the colours ``[n,3]`` of a state's Gaussians in a view."""
     if state.shN.shape[1] == 0:
         return state.colors
     return harmonic_colors(state.means, ((state.colors - 0.5) / SH_C0)[:, None], state.shN, photos, view)
@@ -214,7 +214,7 @@ def measure_photos(
     near: float,
     device: torch.device,
 ) -> float:
-    """Return the mean over some views of the PSNR (dB) of their photos, rendered on a device.
+    """Measure the mean PSNR (dB) of Gaussians on the photos of ``views``, rendered on a device.
 
     Gaussians and full-size photos are on the host, in one frame, whose unit ``near`` is in.
     ``quarter``: score the tiles of :func:`gsmerge.raster.photos.scored_tiles` alone.

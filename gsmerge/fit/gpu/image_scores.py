@@ -16,12 +16,12 @@ from gsmerge.kernels.raster.image_loss import C1, C2, SIDE
 
 
 def window_means(planes: Tensor) -> Tensor:
-    """Take means over windows of 7 x 7 pixels about every pixel of planes ``[...,h,w]``, zero beyond."""
+    """Average over windows of 7 x 7 pixels around every pixel of planes ``[...,h,w]``; zero outside the planes."""
     return avg_pool2d(planes, SIDE, 1, SIDE // 2)
 
 
 def photo_means(images: Tensor) -> Tensor:
-    """Take the window means ``[v,2,3,h,w]`` of photos ``[v,h,w,3]`` and of their squares."""
+    """Compute the window means ``[v,2,3,h,w]`` of photos ``[v,h,w,3]`` and of their squares."""
     planes = images.permute(0, 3, 1, 2)
     return torch.stack([window_means(planes), window_means(planes * planes)], 1)
 
@@ -29,7 +29,7 @@ def photo_means(images: Tensor) -> Tensor:
 def loss_gradient(
     image: Tensor, photo: Tensor, means: Tensor, weight: Tensor, ssim_lambda: float, edge_weight: float = 0.0
 ) -> tuple[Tensor, Tensor]:
-    """Differentiate the loss of :func:`gsmerge.fit.loss.image_gradient`; sum the squared errors.
+    """Return the gradient of :func:`gsmerge.fit.loss.image_gradient`'s loss, and the sum of squared errors.
 
     SSIM's windows are uniform, of 7 x 7 pixels, with population covariances, K1 = .01, K2 = .03
     (Wang et al. 2004). Images are ``[h,w,3]``, ``means [2,3,h,w]`` those of :func:`photo_means`,
@@ -74,7 +74,7 @@ def _ssim_gradient(x: Tensor, y: Tensor, means: Tensor, weight: Tensor) -> Tenso
 
 
 def score_blocks(images: Tensor, photos: Tensor, weights: Tensor, min_gain: float) -> float:
-    """Return the PSNR (dB) of held-out blocks; see :func:`gsmerge.fit.photo_sizes.holdout_psnr`."""
+    """Return the PSNR (dB) on held-out blocks, as :func:`gsmerge.fit.photo_sizes.holdout_psnr` does on the CPU."""
     clipped = images.clamp(0, 1)
     gains = match_exposures(clipped, photos, weights, min_gain)
     mask = weights == 0
@@ -84,7 +84,7 @@ def score_blocks(images: Tensor, photos: Tensor, weights: Tensor, min_gain: floa
 
 
 def match_exposures(images: Tensor, photos: Tensor, weights: Tensor, min_gain: float, max_gain: float = 2.0) -> Tensor:
-    """Return factors ``[v,3]`` to the exposure; see :func:`gsmerge.fit.photo_sizes.exposure_gains`."""
+    """Return exposure factors ``[v,3]``, as :func:`gsmerge.fit.photo_sizes.exposure_gains` does on the CPU."""
     weighted = weights[..., None] * images
     with_photo, with_image = ((weighted * other).sum((1, 2), dtype=torch.float64) for other in (photos, images))
     gains = (with_photo / with_image.clamp_min(1e-9)).clamp(1 / max_gain, max_gain)

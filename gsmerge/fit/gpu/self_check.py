@@ -40,7 +40,7 @@ GRADIENTS = ("means", "quats", "scales", "opacities", "colors")
 
 
 def find_difference(device: torch.device) -> str | None:
-    """Say what a device computes otherwise than the CPU, or what fails, as a clause; None if all is well."""
+    """Describe in a clause what a device computes differently from the CPU, or what fails; None if all agrees."""
     try:
         sizes = measure_errors(device)
     except Exception as error:  # of a driver, a compiler or an extension; lack of memory, too
@@ -52,7 +52,7 @@ def find_difference(device: torch.device) -> str | None:
 
 
 def measure_errors(device: torch.device) -> dict[str, float]:
-    """Measure by how much a device differs from the CPU in each of ``MAX_ERRORS``; gsplat draws there."""
+    """Measure how much a device differs from the CPU in each quantity of ``MAX_ERRORS``."""
     gaussians, photos = make_scene()
     host = upload_gaussians(gaussians, CPU)
     placed = host.to(device)
@@ -87,7 +87,7 @@ def measure_errors(device: torch.device) -> dict[str, float]:
 
 
 def make_scene() -> tuple[Gaussians, Photos]:
-    """Make Gaussians before a camera, a few behind it, to which neither clamp of alpha matters."""
+    """Make random Gaussians, a few of them behind the camera, for comparing devices; no alpha is clamped."""
     rng = np.random.default_rng(0)
     means = rng.uniform(-0.9, 0.9, (COUNT, 3)).astype(np.float32)
     means[::16, 2] -= 6
@@ -110,7 +110,7 @@ def make_scene() -> tuple[Gaussians, Photos]:
 def differentiate(
     draw: Callable[[Shape, Tensor], tuple[Tensor, Tensor]], gaussians: Gaussians
 ) -> tuple[Tensor, StepGradients]:
-    """Draw Gaussians in their base colours: the image, and gradients of a random sum of its values."""
+    """Draw Gaussians in base colours; return the image and the gradients of a random weighted sum of its values."""
     with torch.enable_grad():
         colors = 0.5 + 0.5 * gaussians.sh0[:, 0]
         means, quats, scales, opacities, colors = (
@@ -125,7 +125,7 @@ def differentiate(
 
 
 def compare_steps(gaussians: Gaussians, gradients: StepGradients, device: torch.device) -> float:
-    """Take an optimiser step by the same gradients on the CPU and on a device; the largest difference."""
+    """Take one optimiser step on the CPU and on a device; return the largest difference."""
     options, start = FitOptions(), start_state(gaussians)
     rates = torch.from_numpy(step_sizes(options.tuning, 0.0, options.steps))
     state, other = upload_state(start, CPU), upload_state(start, device)
@@ -136,5 +136,5 @@ def compare_steps(gaussians: Gaussians, gradients: StepGradients, device: torch.
 
 
 def largest(values: Tensor, expected: Tensor) -> float:
-    """Return the largest difference of a tensor on a device from one on the CPU."""
+    """Return the largest absolute difference between a tensor on a device and one on the CPU."""
     return float((values.cpu() - expected).abs().max())

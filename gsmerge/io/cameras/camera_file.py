@@ -53,7 +53,7 @@ _GRID = 32  # pixels a side on which that is measured
 
 @dataclass(frozen=True)
 class Lens:
-    """A lens with distortion, or a fisheye."""
+    """A lens: perspective with distortion, or fisheye."""
 
     name: str  # as the camera file calls the model
     model: Literal["perspective", "fisheye"]  # radial and tangential, as ``cv2.undistort``; as ``cv2.fisheye``
@@ -61,7 +61,7 @@ class Lens:
 
 
 def make_lens(name: str, model: Literal["perspective", "fisheye"], coefficients: Sequence[float]) -> Lens | None:
-    """Make a lens; None for a perspective one without distortion, which is a pinhole."""
+    """Make a lens; None for a perspective lens without distortion, which is a pinhole."""
     return Lens(name, model, tuple(coefficients)) if model == "fisheye" or any(coefficients) else None
 
 
@@ -88,7 +88,7 @@ class CameraFile:
 
 
 class View(NamedTuple):
-    """One camera in the convention of its file."""
+    """One camera of a file, in the convention of the file."""
 
     name: str  # of its image
     pose: np.ndarray  # 3x4 or 4x4, in the file's convention
@@ -99,7 +99,7 @@ class View(NamedTuple):
 
 
 def make_pinhole(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
-    """Make intrinsics ``[3,3]``."""
+    """Make pinhole intrinsics ``[3,3]`` from focal lengths and principal point, pixels."""
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)
 
 
@@ -111,7 +111,7 @@ def make_camera_file(
     images: np.ndarray | None = None,
     order: str = "auto",
 ) -> CameraFile:
-    """Translate poses to world-to-camera with OpenCV axes, and check that they are poses.
+    """Make a camera file from poses in any convention: convert them to OpenCV world-to-camera, and check them.
 
     ``images [c,h,w,3]`` and the ``order`` of rows are given if the file holds them. SceneError if there is no camera, a
     number is infinite or too large, a rotation is not orthonormal, or a focal length is not positive.
@@ -161,7 +161,7 @@ def make_camera_file(
 
 
 def missing_intrinsics(path: StrPath, reason: str = "") -> SceneError:
-    """Make the SceneError of cameras without a focal length; ``reason`` says why none was estimated."""
+    """Make the SceneError for cameras without a focal length; ``reason`` says why none was estimated."""
     problem = f"expected intrinsics of the cameras (fx, fy, cx, cy), found none{reason}"
     return SceneError(path, problem, "add them in pixels, for all views or for each")
 
@@ -177,7 +177,7 @@ def _in_pixels(Ks: np.ndarray, sizes: list[tuple[int, int]]) -> tuple[np.ndarray
 
 
 def check_camera(path: StrPath, name: str, pose: np.ndarray, K: np.ndarray) -> None:
-    """Raise a SceneError for a pose ``[4,4]`` or intrinsics ``[3,3]`` that no camera has."""
+    """Raise SceneError if a pose ``[4,4]`` or intrinsics ``[3,3]`` are impossible."""
     if not (np.isfinite(pose).all() and np.isfinite(K).all()):
         raise SceneError(path, f"view {name}: expected finite numbers, found NaN or inf")
     largest = max(np.abs(pose).max(), np.abs(K).max())
@@ -196,12 +196,12 @@ def check_camera(path: StrPath, name: str, pose: np.ndarray, K: np.ndarray) -> N
 
 
 def is_orthonormal(axes: np.ndarray) -> bool:
-    """Return whether the axes ``[3,3]`` of a rotation, maybe a mirrored one, are orthonormal but for rounding."""
+    """Return whether axes ``[3,3]`` are orthonormal up to rounding; mirrored ones are, too."""
     return bool(np.abs(matmul(axes, axes.T) - np.eye(3)).max() <= _MAX_ROTATION_ERROR)
 
 
 def check_size(path: StrPath, name: str, K: np.ndarray, size: tuple[int, int]) -> None:
-    """Raise a SceneError for intrinsics ``[3,3]`` in pixels that do not fit an image of (width, height)."""
+    """Raise SceneError if intrinsics ``[3,3]`` in pixels do not fit an image of (width, height)."""
     if min(size) <= 1:  # not known
         return
     for what, value, sides in (
@@ -229,7 +229,7 @@ def from_viewmats(viewmats: np.ndarray, convention: Convention) -> np.ndarray:
 
 
 def with_convention(camera_file: CameraFile, convention: Convention) -> CameraFile:
-    """Read the poses of a file in another convention."""
+    """Reinterpret the poses of a file in another convention."""
     stored = from_viewmats(camera_file.viewmats, camera_file.convention)
     return replace(camera_file, viewmats=to_viewmats(stored, convention), convention=convention)
 
@@ -249,12 +249,12 @@ def _stored_sizes(camera_file: CameraFile) -> list[tuple[int, int]]:
 
 
 def sizes_of(camera_file: CameraFile) -> list[tuple[int, int]]:
-    """List every (width, height) that the file's cameras are known to have."""
+    """List the different (width, height) of a file's cameras, as far as they are known."""
     return [(w, h) for w, h in _stored_sizes(camera_file) if min(w, h) > 0 and (w, h) != (1, 1)]
 
 
 def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> Cameras:
-    """Convert to cameras of one image size (width, height) in pixels, None: the file's.
+    """Convert to cameras of one image size (width, height) in pixels; None: the file's size.
 
     Intrinsics of another size are scaled, each axis by itself. SceneError if no size is given and the file's
     cameras have none, or several; or a lens is no pinhole.
@@ -321,7 +321,7 @@ def as_pinholes(camera_file: CameraFile, photos: Photos | None) -> tuple[CameraF
 
 
 def undistort_photos(photos: Photos, Ks: np.ndarray, lenses: Sequence[Lens | None]) -> Photos:
-    """Make the photos that pinholes with the same intrinsics would have taken; their borders repeat the lens's.
+    """Undistort photos to those of pinholes with the same intrinsics; borders repeat the nearest pixels.
 
     ``photos`` are uint8 ``[h,w,3]``; ``Ks [c,3,3]`` at their size, the top-left pixel's centre at (0.5, 0.5).
     """
@@ -360,7 +360,7 @@ def list_moves(names: Sequence[str], start: np.ndarray, end: np.ndarray, depth: 
 
 
 def describe_moves(moves: Sequence[dict[str, Any]]) -> str:
-    """Describe the mean and the largest of some moves."""
+    """Describe the mean and the largest of camera moves in words."""
     turns, shifts = ([move[key] for move in moves] for key in ("degrees", "shift"))
     mean, most = (f"{f(turns):.2g} degrees and {100 * f(shifts):.2g} % of the depth" for f in (np.mean, max))
     return f"{mean} on average, {most} at most"

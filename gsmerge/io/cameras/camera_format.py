@@ -18,7 +18,7 @@ from gsmerge.io.formats.ply import open_ply
 
 @dataclass(frozen=True)
 class CameraSource:
-    """A file or a COLMAP folder of cameras, whose content is read when it is asked for, once."""
+    """A camera file or COLMAP folder, whose content is read once, at the first use."""
 
     path: Path
     scene: str | None = None  # which one, where a file holds several
@@ -26,17 +26,17 @@ class CameraSource:
 
     @cached_property
     def json(self) -> Any:
-        """Content of a JSON file."""
+        """Parsed content of a JSON file."""
         return read_json(self.path)
 
     @property
     def object(self) -> dict[str, Any]:
-        """Content of a JSON file that is one object; empty for another file."""
+        """Parsed content of a JSON file that holds one object; empty for other files."""
         return self.json if isinstance(self.json, dict) else {}
 
     @property
     def first(self) -> dict[str, Any]:
-        """First entry of a JSON file that is a list of objects; empty for another file."""
+        """First entry of a JSON file that holds a list of objects; empty for other files."""
         entries = self.json if isinstance(self.json, list) else []
         return entries[0] if entries and all(isinstance(entry, dict) for entry in entries) else {}
 
@@ -47,7 +47,7 @@ class CameraSource:
 
 
 class StoredCameras(NamedTuple):
-    """What a file holds, as it stands there."""
+    """Cameras as a file stores them, before conversion."""
 
     views: list[View]
     images: np.ndarray | None = None  # ``[c,h,w,3]`` uint8 sRGB
@@ -57,7 +57,7 @@ class StoredCameras(NamedTuple):
 
 @dataclass(frozen=True)
 class CameraFormat:
-    """A format of cameras."""
+    """A format of camera files: how to recognise and read it, and its conventions."""
 
     name: str  # the ``source`` of its cameras
     files: str  # for people

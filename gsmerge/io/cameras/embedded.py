@@ -49,12 +49,12 @@ def camera_comments(cameras: Cameras, names: Sequence[str]) -> list[str]:
 
 
 def holds_cameras(path: Path) -> bool:
-    """Return whether a file is a ``.ply`` with cameras in the comments of its header."""
+    """Return whether a file is a ``.ply`` with cameras in its header."""
     return path.suffix.lower() == ".ply" and bool(camera_lines(path))
 
 
 def camera_lines(path: Path) -> list[bytes]:
-    """Read the comments of a ``.ply`` that :func:`camera_comments` made; none without any."""
+    """Return the comment lines of a ``.ply`` that hold cameras; empty without any."""
     with read_errors(path), path.open("rb") as file:
         header = file.read(MAX_HEADER_BYTES if file.peek(3)[:3] == b"ply" else 0).partition(b"\nend_header")[0]
     start = f"comment {PREFIX}".encode()

@@ -46,7 +46,7 @@ _CENTRED = 1e-3  # pixels by which twice a principal point in the middle may dif
 
 
 def is_long_lrm(source: CameraSource) -> bool:
-    """Return whether a JSON file has ``frames`` with ``w2c``, as no other format."""
+    """Return whether a JSON file has ``frames`` with ``w2c``, which only Long-LRM writes."""
     frames = source.object.get("frames")
     return bool(frames) and isinstance(frames, list) and all(isinstance(f, dict) and "w2c" in f for f in frames)
 
@@ -207,10 +207,10 @@ def _matrices(path: Path, data: Mapping[str, Any], key: str, side: int) -> dict[
 def read_long_lrm(source: CameraSource) -> StoredCameras:
     """Read the cameras of a dataset file: ``frames`` of ``fx fy cx cy w h`` and ``w2c``.
 
-    Next to its Gaussians (or copied next to the dataset file) Long-LRM writes which frames it took
-    (``input_frame_idx.txt``) and how the Gaussians' world lies in the cameras': X = scene_scale (pos_avg_inv
-    X_cameras); some versions write the frames alone, from which the rest follows. The cameras are moved into the
-    Gaussians' world. SceneError if an entry is missing or no number, or a frame does not exist.
+    Next to its Gaussians (or copied next to the dataset file) Long-LRM writes which frames it took, in
+    ``input_frame_idx.txt``, and how the cameras' world maps to the Gaussians': X = scene_scale (pos_avg_inv X_cameras).
+    Some versions write the frames alone, from which the rest follows. The cameras are moved into the Gaussians' world.
+    SceneError if an entry is missing or no number, or a frame does not exist.
     """
     frames, path, folder = [], source.path, source.folder
     for i, frame in enumerate(source.json["frames"]):
@@ -271,7 +271,7 @@ def _numbers(path: Path) -> np.ndarray | None:
 
 
 def viewer_cameras_path(output: Path) -> Path:
-    """Return the path of the cameras for viewers: ``out.ply`` -> ``out.cameras.json``."""
+    """Return the path of the camera file for viewers: ``out.ply`` -> ``out.cameras.json``."""
     name = output.name
     stem = name[: -len(".compressed.ply")] if name.lower().endswith(".compressed.ply") else output.stem
     stem = os.fsencode(stem)[: _MAX_NAME - len(VIEWER_CAMERAS)].decode("utf-8", "ignore")
@@ -279,7 +279,7 @@ def viewer_cameras_path(output: Path) -> Path:
 
 
 def transforms_document(cameras: Cameras, names: Sequence[str], *, digits: int = 17) -> dict[str, Any]:
-    """Make nerfstudio's ``transforms.json`` with all intrinsics, its numbers rounded to so many digits."""
+    """Make nerfstudio's ``transforms.json`` with all intrinsics, rounded to ``digits`` significant digits."""
 
     def rounded(value: float) -> float:
         return float(f"{value:.{digits}g}")
@@ -319,7 +319,7 @@ def viewer_cameras(cameras: Cameras, names: Sequence[str]) -> str:
 
 
 def read_dataparser(ply: Path, cameras: Path | None) -> list[Similarity]:
-    """Read the similarities that nerfstudio's file next to a ``.ply`` or its cameras may mean; none without the file.
+    """Read the similarities that a nerfstudio ``dataparser_transforms.json`` may mean; empty without the file.
 
     It says how cameras were moved into the Gaussians' world: X' = scale (transform [X; 1]).
     ``transform`` starts from the capture's own world. The poses of a ``transforms.json`` with ``applied_transform``

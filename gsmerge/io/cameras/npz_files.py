@@ -30,7 +30,7 @@ _KINDS = "biufU"
 
 
 def is_da3(path: Path) -> bool:
-    """Return whether an npz has the poses of Depth Anything 3 by their names."""
+    """Return whether an npz has poses under the names that Depth Anything 3 uses."""
     return not array_names(path).isdisjoint(_EXTRINSICS[:2])
 
 
@@ -82,18 +82,18 @@ def read_dump(source: CameraSource) -> StoredCameras:
 
 
 def holds_images(path: Path) -> bool:
-    """Return whether an npz has the images themselves; False if it cannot be read."""
+    """Return whether an npz holds images; False if it cannot be read."""
     return not array_names(path).isdisjoint(_IMAGES)
 
 
 def holds_poses(path: Path) -> bool:
-    """Return whether an npz has poses and intrinsics; False if it cannot be read."""
+    """Return whether an npz holds poses and intrinsics; False if it cannot be read."""
     names = array_names(path)
     return {"c2w", "K"} <= names or not (names.isdisjoint(_EXTRINSICS) or names.isdisjoint(_INTRINSICS))
 
 
 def read_depths(path: Path) -> np.ndarray | None:
-    """Read the depth maps ``[c,h,w]`` of the cameras' file; None without any."""
+    """Read the depth maps ``[c,h,w]`` stored in a camera file; None without any."""
     if path.suffix != ".npz" or array_names(path).isdisjoint(_DEPTHS):
         return None
     depths = _first(read_arrays(path, _DEPTHS), _DEPTHS)
@@ -167,7 +167,7 @@ def array_names(path: Path) -> frozenset[str]:
 
 
 def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
-    """Read those of the named arrays that an ``.npz`` has, in its order.
+    """Read arrays from an ``.npz`` by name; names that it lacks are left out.
 
     SceneError if it cannot be read, an array has anything but numbers and text, or is larger than its bytes in the
     archive allow.

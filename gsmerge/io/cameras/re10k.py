@@ -39,7 +39,7 @@ _LOCAL_HEADER = struct.Struct("<4s22xHH")  # mark, and the bytes of the name and
 
 
 def read_re10k(source: CameraSource) -> StoredCameras:
-    """Read the cameras and photos of one scene of a chunk by its key, which a chunk of one scene need not have.
+    """Read the cameras and photos of one scene from a chunk; a chunk with one scene needs no key.
 
     A chunk is a list of ``{key, cameras, images}``: ``cameras [v,18]`` are fx, fy, cx, cy divided by the image's
     size, two zeros and a world-to-camera 3x4 (OpenCV axes); ``images`` are v JPEG files as tensors of bytes.
@@ -101,7 +101,7 @@ def _photos(path: Path, images: Any, names: list[str]) -> np.ndarray | None:
 
 @dataclass(frozen=True)
 class StoredTensor:
-    """A tensor in a file, whose numbers are read when they are asked for."""
+    """A tensor in a file whose values are read on request."""
 
     path: Path
     member: zipfile.ZipInfo  # with the bytes of its storage
@@ -112,11 +112,11 @@ class StoredTensor:
 
     @property
     def size(self) -> int:
-        """Number of its numbers."""
+        """Number of values."""
         return prod(self.shape)
 
     def read(self) -> np.ndarray:
-        """Read the numbers; SceneError if the file does not hold them."""
+        """Read the values; SceneError if the file does not hold them."""
         if self.dtype is None:
             raise SceneError(self.path, "expected plain numbers, found another type")
         lengths = zip(self.shape, self.strides, strict=True)

@@ -25,18 +25,18 @@ REQUIRED = (*MEANS, *SH0, "opacity", *SCALES, *QUATS)
 
 
 def sh_degree(num_higher: int) -> int:
-    """Return the degree of so many harmonics above degree 0."""
+    """Return the SH degree for ``num_higher`` coefficients above degree 0."""
     return round((num_higher + 1) ** 0.5) - 1
 
 
 def color_columns(names: tuple[str, ...] | None) -> tuple[str, ...]:
-    """Name the columns of the base colour."""
+    """Return the column names of the base colour: ``f_dc_*``, or red, green, blue where a file has no ``f_dc_*``."""
     return SH0 if names is None or SH0[0] in names else RGB
 
 
 @dataclass(frozen=True)
 class Columns:
-    """The columns of n Gaussians in a file's units.
+    """Columns of n Gaussians as files store them.
 
     ``means [n,3]``, unit ``quats [n,4]`` wxyz, ``log_scales [n,3]``, ``opacities [n]``, ``sh0
     [n,3]``, ``harmonics [n,k-1,3]``.
@@ -58,16 +58,16 @@ class Columns:
         return sh0_to_rgb(self.sh0)
 
     def along_curve(self) -> Columns:
-        """Sort the rows along a space-filling curve, so that neighbours are close in the file."""
+        """Sort the rows along a space-filling curve, so that neighbours in space are near in the file."""
         return self.take(np.argsort(morton_codes(self.means), kind="stable"))
 
     def take(self, rows: np.ndarray) -> Columns:
-        """Return the rows of these indices, in their order."""
+        """Return the rows with the given indices, in that order."""
         return Columns(*(column[rows] for column in vars(self).values()))
 
 
 def concatenate(parts: Sequence[Columns]) -> Columns:
-    """Join rows; those of a lower degree of harmonics have zeros above it."""
+    """Concatenate rows; missing higher harmonics become zeros."""
     most = max(part.harmonics.shape[1] for part in parts)
 
     def widen(harmonics: np.ndarray) -> np.ndarray:
@@ -79,7 +79,7 @@ def concatenate(parts: Sequence[Columns]) -> Columns:
 
 @dataclass(frozen=True)
 class StoredRows:
-    """Gaussians as a file stores them: ``rows`` has the columns of a PLY file, ``REQUIRED`` and more."""
+    """Gaussians as a file stores them; ``rows`` has the columns of a PLY file, at least ``REQUIRED``."""
 
     rows: np.ndarray
     layout: str  # for people
@@ -92,7 +92,7 @@ class StoredRows:
 
 
 def to_rows(columns: Columns, name: str, sizes: dict[str, int], *, mip: bool = False) -> StoredRows:
-    """Convert columns to rows of a PLY file; ``sizes`` are bytes by attribute, ``mip`` says antialiased."""
+    """Convert columns to rows of a PLY file; ``sizes``: bytes by attribute, ``mip``: antialiased."""
     count, num_higher = columns.harmonics.shape[:2]
     names = (*MEANS, *SH0, *(f"f_rest_{i}" for i in range(3 * num_higher)), "opacity", *SCALES, *QUATS)
     harmonics = columns.harmonics.transpose(0, 2, 1).reshape(count, 3 * num_higher)
@@ -110,7 +110,7 @@ def to_rows(columns: Columns, name: str, sizes: dict[str, int], *, mip: bool = F
 
 
 def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Columns:
-    """Convert Gaussians up to a degree to columns; ValueError that names the row if one is not finite."""
+    """Convert Gaussians to columns with harmonics up to ``max_degree``; ValueError if a row is not finite."""
 
     def check(values: np.ndarray) -> np.ndarray:
         with np.errstate(over="ignore"):
@@ -139,7 +139,7 @@ def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Col
 
 
 def to_bytes(values: np.ndarray) -> np.ndarray:
-    """Round to the nearest of 0 to 255, as uint8."""
+    """Round to the nearest integer from 0 to 255, as uint8."""
     return np.clip(np.floor(values + 0.5), 0, 255).astype(np.uint8)
 
 

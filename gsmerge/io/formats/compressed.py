@@ -30,12 +30,12 @@ MAX_DEGREE = 3  # of the harmonics that are written
 
 
 def is_compressed(data: PlyData) -> bool:
-    """Return whether a PLY file has packed Gaussians."""
+    """Return whether a PLY file holds packed Gaussians (``.compressed.ply``)."""
     return "chunk" in data and "vertex" in data and {p.name for p in data["vertex"].properties} >= set(PACKED)
 
 
 def unpack(path: Path, data: PlyData) -> np.ndarray:
-    """Unpack a compressed file to the rows of an ordinary one, with opacities as logits."""
+    """Unpack a compressed PLY to the rows of an ordinary one, with opacities as logits."""
     vertex, chunk = data["vertex"], data["chunk"]
     for element, needed, types in ((vertex, PACKED, ("u4", "i4")), (chunk, RANGES, ("f4", "f8"))):
         dtypes = {p.name: p.val_dtype for p in element.properties if not isinstance(p, PlyListProperty)}

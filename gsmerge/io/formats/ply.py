@@ -38,7 +38,7 @@ _SIZES = {
 
 
 def read_rows(path: Path) -> arrays.StoredRows:
-    """Read the rows of a PLY file, whose values :func:`open_rows` reads; SceneError if there are none of Gaussians."""
+    """Open the rows of a PLY file, to be read by :func:`open_rows`; SceneError if it holds no Gaussians."""
     data = open_ply(path)
     compressed = is_compressed(data)
     rows = unpack(path, data) if compressed else _vertex(path, data).data
@@ -175,9 +175,9 @@ class _BinaryRows(BufferedReader):
 
 @contextmanager
 def open_rows(path: Path, rows: np.ndarray) -> Iterator[Callable[[slice], np.ndarray]]:
-    """Yield a function that returns blocks of a PLY file's rows; several threads may call it.
+    """Yield a thread-safe function that returns blocks of a PLY file's rows.
 
-    Mapped pages of a file that shrinks would end the process; reading such a file is a SceneError.
+    A mapped file that becomes shorter would end the process; here it raises SceneError.
     """
     if not isinstance(rows, np.memmap):
         yield rows.__getitem__
@@ -200,7 +200,7 @@ def open_rows(path: Path, rows: np.ndarray) -> Iterator[Callable[[slice], np.nda
 
 
 def bytes_after_rows(path: Path) -> int:
-    """Count the bytes of a binary PLY file after its last row; 0 where rows are text or have lists."""
+    """Count the bytes of a binary PLY file after its last row; 0 for text or list rows."""
     data = open_ply(path)
     if data.text or any(isinstance(p, PlyListProperty) for element in data.elements for p in element.properties):
         return 0

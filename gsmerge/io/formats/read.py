@@ -74,13 +74,13 @@ class GaussianFile:
 
 
 def kept_comments(info: FileInfo) -> tuple[str, ...]:
-    """Return the comments of a file's header that tell viewers how to render its Gaussians."""
+    """Return the header comments that tell viewers how to render the Gaussians."""
     lines = (comment for comment in info.comments if comment.isascii() and comment.isprintable())
     return tuple(comment for comment in lines if comment.startswith(arrays.RENDER_COMMENT))
 
 
 def file_notes(info: FileInfo) -> tuple[str, ...]:
-    """Describe what was adapted or looks odd in a file, one sentence each, without a full stop."""
+    """Describe what was adapted, or looks odd, in a file: one sentence each, without a full stop."""
     counted = {
         "row(s) with NaN or inf, set aside": info.num_nonfinite,
         "Gaussian(s) with extreme scales or colours, clipped": info.num_clipped_scales,
@@ -114,7 +114,7 @@ def read_ply(path: StrPath, *, opacity: OpacityChoice = "auto") -> GaussianFile:
 
 
 def read_parts(paths: Sequence[Path], *, opacity: OpacityChoice = "auto") -> GaussianFile:
-    """Read one PLY file, or several with the same columns as if they were one, in their order, see :func:`read_ply`."""
+    """Read one PLY file, or several with the same columns as one, in their order; see :func:`read_ply`."""
     if opacity not in ("auto", "logit", "raw"):
         raise ValueError(f"opacity: expected 'auto', 'logit' or 'raw', got {opacity!r}")
     parts = [ply.read_rows(path) for path in paths]
@@ -126,7 +126,7 @@ def read_parts(paths: Sequence[Path], *, opacity: OpacityChoice = "auto") -> Gau
 
 
 def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto") -> GaussianFile:
-    """Read a file of Gaussians in the format of its ending.
+    """Read a file of Gaussians; the ending of its name tells the format.
 
     Endings are ``.spz`` (versions 1 to 4), ``.splat`` and ``.sog`` (version 2); of a ``lod-meta.json``, it is
     the finest level. Everything else is read by :func:`read_ply`, for which ``opacity`` is. SceneError if the file
@@ -144,7 +144,7 @@ def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto") -> Gaussia
 
 
 def read_level(path: Path, level: int) -> GaussianFile:
-    """Read one level of detail of a ``lod-meta.json``, 0 the finest; SceneError as of :func:`read_gaussians`."""
+    """Read one level of detail of a ``lod-meta.json``; 0 is the finest. SceneError as in :func:`read_gaussians`."""
     return _convert_files([path], [streamed.read_rows(path, level)], "auto")
 
 
@@ -346,7 +346,7 @@ def _spread_low_degree(shN: np.ndarray) -> None:
 
 
 def clear_invalid(path: str | Path, out: dict[str, np.ndarray]) -> int:
-    """Make the invalid rows transparent, in place; return their number."""
+    """Make rows with NaN or infinities transparent, in place; return their number."""
     valid = out["valid"]
     bad = np.flatnonzero(~valid)
     if len(bad) == 0:

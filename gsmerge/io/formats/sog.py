@@ -106,7 +106,7 @@ class _Folder:
 
 @dataclass(frozen=True)
 class SogContent:
-    """What one ``.sog`` holds."""
+    """Content of one ``.sog``."""
 
     columns: arrays.Columns
     sizes: dict[str, int]  # bytes of the textures by attribute
@@ -235,7 +235,7 @@ def _read_harmonics(files: _Files, part: dict[str, Any], count: int) -> np.ndarr
 
 
 def sog_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
-    """Encode a ``.sog`` along a space-filling curve, marked as the ``comments`` say; ValueError if there is NaN."""
+    """Encode a ``.sog`` along a space-filling curve; ``comments`` may mark it as antialiased. ValueError for NaN."""
     columns = arrays.to_columns(gaussians, MAX_DEGREE).along_curve()
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
@@ -245,7 +245,7 @@ def sog_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
 
 
 def sog_files(columns: arrays.Columns, *, mip: bool = False) -> dict[str, bytes]:
-    """Encode the files of a ``.sog`` by their names: textures of the rows in their order, then ``meta.json``."""
+    """Encode the files of a ``.sog`` by name: textures with the rows in their order, then ``meta.json``."""
     count = len(columns)
     meta: dict[str, Any] = {"version": VERSION, "asset": {"generator": GENERATOR}, "count": count, "antialias": mip}
     if mip:
@@ -357,12 +357,12 @@ def _merge_cells(numbers: np.ndarray, means: np.ndarray) -> np.ndarray:
 
 
 def nearest_codes(codebook: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the index of the nearest code of each value, uint8, in the shape of ``values``."""
+    """Return the index (uint8) of the code nearest to each value, in the shape of ``values``."""
     return np.searchsorted((codebook[1:] + codebook[:-1]) / 2, values).astype(np.uint8)
 
 
 def fit_palette(vectors: np.ndarray, max_bits: int) -> tuple[np.ndarray, np.ndarray]:
-    """Choose at most ``2**max_bits`` vectors that represent ``vectors [n,d]``, and the index ``[n]`` of each.
+    """Choose a palette of at most ``2**max_bits`` vectors for ``vectors [n,d]``, and each vector's index ``[n]`` in it.
 
     Groups are halved at the median of the coordinate in which they differ most; the means of the last groups are the
     palette. Where there are few enough vectors, each is its own.

@@ -32,7 +32,7 @@ def splat_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
 
 
 def read_rows(path: Path) -> StoredRows:
-    """Read the Gaussians of a ``.splat``; SceneError if it has no whole rows of 32 bytes."""
+    """Read the Gaussians of a ``.splat``; SceneError unless it consists of whole rows of 32 bytes."""
     size = check_file(path)
     if size == 0 or size % ROW.itemsize:
         problem = f"expected a .splat of {ROW.itemsize} bytes per Gaussian, found {size} bytes"

@@ -114,10 +114,10 @@ def _gzip_parts(path: Path, packed: bytes) -> tuple[_Header, list[np.ndarray]]:
 
 
 def problem_at_end(path: Path) -> str | None:
-    """Describe what is wrong after the columns of a ``.spz``, which readers do not look at.
+    """Describe errors at the end of a ``.spz`` that readers skip; None without any.
 
-    That is the checksum of its stream, and bytes that its header does not promise, as under a wrong
-    version; None if both are right, and for version 4, which has neither.
+    These are a wrong checksum of the stream, and bytes beyond what the header promises, as under a wrong version.
+    Version 4 has neither.
     """
     packed = path.read_bytes()
     if packed[:2] != GZIP_MAGIC:
@@ -204,13 +204,13 @@ class SpzColumns:
     parts: tuple[np.ndarray, ...]
 
     def header(self, version: int) -> bytes:
-        """Return the first 16 bytes; in version 3 they are compressed with the rest."""
+        """Return the 16 bytes of the header; version 3 compresses them with the rest."""
         last = len(self.streams) if version == 4 else 0
         return HEADER.pack(MAGIC, version, self.count, self.degree, self.fraction, MIP_FLAG * self.mip, last)
 
     @property
     def streams(self) -> list[bytes]:
-        """Bytes of each part, without harmonics where there are none."""
+        """Return the bytes of each part, without harmonics if there are none."""
         return [part.tobytes() for part in self.parts if part.shape[1]]
 
 
@@ -270,7 +270,7 @@ def spz_bytes(gaussians: Gaussians, comments: Sequence[str] = (), *, version: in
 
 
 def zstandard() -> ModuleType:
-    """Import the compression of version 4; UsageError if it is not installed."""
+    """Import the package ``zstandard``, which version 4 needs; UsageError if it is not installed."""
     try:
         import zstandard
     except ImportError as error:

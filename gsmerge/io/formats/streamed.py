@@ -47,7 +47,7 @@ class _Leaf:
 
 
 def streamed_files(levels: Sequence[Gaussians], *, mip: bool = False) -> dict[str, bytes]:
-    """Encode levels of detail, the finest first, as files by their paths below one folder; the index is the last.
+    """Encode levels of detail, the finest first, as files by path below one folder; the index comes last.
 
     A chunk's folder has its level, its number and a hash of its content in its name, so that chunks of
     two results are never mixed: neither where one replaces the other, nor in a browser's cache. ``mip``
@@ -142,19 +142,19 @@ def _hash(files: dict[str, bytes]) -> str:
 
 @dataclass(frozen=True)
 class StreamedIndex:
-    """What an index says: the chunks of each level, each with its number of Gaussians."""
+    """Content of an index: the chunks of each level, with their numbers of Gaussians."""
 
     levels: tuple[dict[Path, int], ...]
     environment: Path | None  # the ``meta.json`` of what is shown with every level
 
     @property
     def counts(self) -> list[int]:
-        """Gaussians of each level."""
+        """Number of Gaussians of each level."""
         return [sum(chunks.values()) for chunks in self.levels]
 
 
 def read_index(path: Path) -> StreamedIndex:
-    """Read a ``lod-meta.json``, and check that its parts agree; SceneError if they do not."""
+    """Read a ``lod-meta.json``; SceneError if its parts contradict each other."""
     document = read_json(path)
     try:
         return _check_index(path, document)
@@ -237,7 +237,7 @@ def _cover(chunks: Sequence[Path], runs: Sequence[tuple[int, int, int]]) -> dict
 
 
 def read_rows(path: Path, level: int = 0) -> arrays.StoredRows:
-    """Read the Gaussians of a level; of the finest, which is 0, with those of the environment.
+    """Read the Gaussians of one level; level 0, the finest, comes with those of the environment.
 
     SceneError if the index or a chunk cannot be read, or they do not agree.
     """
@@ -265,9 +265,9 @@ def read_rows(path: Path, level: int = 0) -> arrays.StoredRows:
 
 
 def remove_unused_chunks(path: Path) -> None:
-    """Remove the chunks beside an index that it does not name: those that :func:`streamed_files` made before.
+    """Remove chunks beside an index that the index does not name and that :func:`streamed_files` once made.
 
-    Files of other names in their folders stay, and so do these; what cannot be removed stays, too.
+    Other files in the chunks' folders stay, with their folders; so does what cannot be removed.
     """
     used = {chunk.parent.name for level in read_index(path).levels for chunk in level}
     with suppress(OSError), os.scandir(path.parent) as entries:

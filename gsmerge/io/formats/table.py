@@ -15,7 +15,7 @@ from gsmerge.types import Gaussians, StrPath
 
 @dataclass(frozen=True)
 class Format:
-    """A format of Gaussians."""
+    """A format of files of Gaussians: its ending and how to read and write it."""
 
     ending: str  # of files' names, in lower case; without a dot, the whole name of an index
     read: Callable[[Path], StoredRows] | None  # None: it is only written
@@ -26,7 +26,7 @@ class Format:
     require: Callable[[], object] = lambda: None  # raises UsageError where the writer's package is missing
 
     def names(self, path: StrPath) -> bool:
-        """Return whether a file of this name has the format."""
+        """Return whether a path ends as files of this format do."""
         name = Path(path).name
         return name.lower().endswith(self.ending) if self.ending[0] == "." else name == self.ending
 
@@ -47,12 +47,12 @@ SCENE_SUFFIXES = tuple(dict.fromkeys(Path(f"_{row.ending}").suffix for row in FO
 
 
 def input_format(path: StrPath) -> Format:
-    """Return the format of a name to read; PLY for a name that is none's."""
+    """Return the format in which to read a path; PLY for unknown endings."""
     return next((row for row in FORMATS if row.read is not None and row.names(path)), PLY)
 
 
 def output_format(path: StrPath, spz_version: int = 3, *, levels: bool = False) -> Format:
-    """Return the format that a name asks for; UsageError if there is none or a package is missing.
+    """Return the format in which to write a path; UsageError for an unknown ending or a missing package.
 
     ``levels``: the name may be that of an index of levels of detail. ValueError if there is no such version.
     """

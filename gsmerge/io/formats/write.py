@@ -14,7 +14,7 @@ from gsmerge.types import Gaussians, StrPath
 
 
 def lost_harmonics(path: StrPath, sh_degree: int, spz_version: int = 3) -> str | None:
-    """Describe the harmonics that a format has no room for; None if it holds all, UsageError on an unknown one."""
+    """Describe the harmonics that a format cannot store; None if it stores all. UsageError for an unknown ending."""
     chosen = output_format(path, spz_version, levels=True)
     if sh_degree <= chosen.max_degree:
         return None
@@ -31,7 +31,7 @@ def write_gaussians(
     normals: bool = True,
     spz_version: int = 3,
 ) -> None:
-    """Write Gaussians in one of ``OUTPUT_FORMATS``, by the ending of the name.
+    """Write Gaussians to a file; the ending of its name, one of ``OUTPUT_FORMATS``, chooses the format.
 
     All but ``.ply`` and ``.glb`` quantise; none of them changes the frame of the Gaussians.
 
@@ -98,9 +98,9 @@ def write_levels(
 def add_levels(
     add: AddOutput, path: Path, index: Path, levels: Sequence[Gaussians], comments: Sequence[str] = ()
 ) -> list[tuple[Path, list[Path]]]:
-    """Write levels of detail as some of several outputs, ``index`` in place of ``path``.
+    """Write the files of a Streamed SOG as part of :func:`atomic_outputs`; ``index`` is the temporary file of ``path``.
 
-    Returns of each level the ``meta.json`` of its first chunk, as it will be named, and all files as they are now.
+    Returns, for each level, the final path of its first chunk's ``meta.json``, and the present paths of all its files.
     """
     _check_comments(comments)
     firsts: dict[str, Path] = {}

@@ -38,7 +38,7 @@ UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """n Gaussians as moments, the form that is merged."""
+    """Moments of n Gaussians, the form in which they are merged."""
 
     means: Floats  # ``[n,3]``
     covars: Floats  # ``[n,6]`` upper triangles: xx, xy, xz, yy, yz, zz
@@ -51,13 +51,13 @@ class Cloud:
 
 
 def area(scales: Floats) -> Floats:
-    """Compute the surfaces ``[n]`` of ellipsoids with half axes ``[n,3]``, within 1 % (Knud Thomsen's formula)."""
+    """Compute the surface areas ``[n]`` of ellipsoids with half axes ``[n,3]``, within 1 % (Knud Thomsen's formula)."""
     a, b, c = power(scales, AREA_EXPONENT).T
     return np.asarray(4 * np.pi * power((a * b + a * c + b * c) / 3, 1 / AREA_EXPONENT))
 
 
 def log_determinants(covars: Floats) -> Floats:
-    """Compute the logarithms ``[n]`` of the determinants of upper triangles ``[n,6]``."""
+    """Compute the log-determinants ``[n]`` of symmetric matrices given as upper triangles ``[n,6]``."""
     xx, xy, xz, yy, yz, zz = covars.T
     values = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
     return np.asarray(log(np.maximum(values, 1e-300)))
@@ -77,7 +77,7 @@ def cloud_of(gaussians: Gaussians) -> Cloud:
 
 
 def gaussians_of(cloud: Cloud) -> Gaussians:
-    """Convert moments back to Gaussians; opacity is mass over area, at most just below 1."""
+    """Convert moments to Gaussians; opacity is mass over area, clipped below 1."""
     scales, quats = principal_axes(cloud.covars[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3))
     sh = cloud.sh.reshape(len(cloud), -1, 3)
     return Gaussians(
@@ -91,7 +91,7 @@ def gaussians_of(cloud: Cloud) -> Gaussians:
 
 
 def merge_moments(cloud: Cloud, left: Ints, right: Ints) -> tuple[Floats, Floats, Floats]:
-    """Compute shares ``[m]`` of the left members, means ``[m,3]`` and covariances ``[m,6]`` of merged pairs."""
+    """Compute weights ``[m]`` of the left members, means ``[m,3]`` and covariances ``[m,6]`` of merged pairs."""
     share = cloud.masses[left] / (cloud.masses[left] + cloud.masses[right])
     p, q = share[:, None], 1 - share[:, None]
     apart = cloud.means[left] - cloud.means[right]
@@ -101,14 +101,14 @@ def merge_moments(cloud: Cloud, left: Ints, right: Ints) -> tuple[Floats, Floats
 
 
 def pair_costs(cloud: Cloud, left: Ints, right: Ints) -> Floats:
-    """Compute the costs ``[m]`` of merging: Runnalls' bound over the common weight, and the distance of harmonics."""
+    """Compute the costs ``[m]`` of merging pairs: Runnalls' bound per weight plus the distance of harmonics."""
     share, _, covars = merge_moments(cloud, left, right)
     lost = log_determinants(covars) - share * cloud.logdets[left] - (1 - share) * cloud.logdets[right]
     return 0.5 * lost + COLOR_WEIGHT * ((cloud.sh[left] - cloud.sh[right]) ** 2).sum(1)
 
 
 def neighbor_pairs(cloud: Cloud) -> tuple[Ints, Ints, Floats]:
-    """List every two of which one is among the other's nearest, once: the lower row, the higher one, the cost."""
+    """List each pair of near neighbours once: lower row, higher row, cost."""
     from scipy.spatial import cKDTree
 
     with use_threads() as threads:
@@ -133,11 +133,11 @@ def neighbor_pairs(cloud: Cloud) -> tuple[Ints, Ints, Floats]:
 
 
 def cheapest_disjoint(left: Ints, right: Ints, costs: Floats, limit: int) -> Ints:
-    """Choose at most ``limit`` pairs without a common member, one by one in the order of their costs ``[m]``.
+    """Choose at most ``limit`` disjoint pairs greedily, by rising cost ``[m]``.
 
-    A pair that is the cheapest of both of its members is taken sooner or later, whatever comes before it; so all of
-    those are taken at once, and again among the rest. Of equal costs the first pair counts as cheaper. The result is
-    indices of pairs, by rising cost.
+    A pair that is the cheapest of both its members is taken whatever comes before it; so all such pairs are taken at
+    once, and again among the rest. Of equal costs the first pair counts as cheaper. Returns indices of pairs, by rising
+    cost.
     """
     order = np.argsort(costs, kind="stable")
     left, right, ranks = left[order], right[order], np.arange(len(order))
@@ -156,7 +156,7 @@ def cheapest_disjoint(left: Ints, right: Ints, costs: Floats, limit: int) -> Int
 
 
 def merge_pairs(cloud: Cloud, left: Ints, right: Ints) -> Cloud:
-    """Merge pairs, and put them after the Gaussians in no pair, which keep their order."""
+    """Merge pairs; put the results after the Gaussians in no pair, which keep their order."""
     share, means, covars = merge_moments(cloud, left, right)
     alone = np.ones(len(cloud), bool)
     alone[left] = alone[right] = False
@@ -171,10 +171,10 @@ def merge_pairs(cloud: Cloud, left: Ints, right: Ints) -> Cloud:
 
 
 def reduce_to(cloud: Cloud, count: int) -> Cloud:
-    """Merge in rounds until ``count`` are left; nothing is done where there are no more.
+    """Merge pairs in rounds until at most ``count`` Gaussians are left.
 
-    A round takes every pair that it can. Fewer at a time keep cheap regions growing while the rest stays unmerged, and
-    render worse: on a real capture by 0.6 dB at a third of the Gaussians a round, by 1.6 dB at a sixth.
+    A round takes as many pairs as possible. Taking fewer lets cheap regions grow while the rest stays unmerged, and
+    renders worse: on a real capture by 0.6 dB at a third of the Gaussians a round, by 1.6 dB at a sixth.
     """
     while len(cloud) > max(count, 1):
         left, right, costs = neighbor_pairs(cloud)
@@ -184,7 +184,7 @@ def reduce_to(cloud: Cloud, count: int) -> Cloud:
 
 
 def run(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """Merge to exactly ``count`` Gaussians; the input itself where it has no more."""
+    """Merge to exactly ``count`` Gaussians; return the input if it has no more."""
     gaussians = own_gaussians(prepared.scene)
     if len(gaussians) <= count:
         return gaussians

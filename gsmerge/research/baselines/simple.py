@@ -36,19 +36,19 @@ MAX_PLANNED = 2_000_000  # Gaussians in the plans of the views under way: each p
 
 
 def own_gaussians(scene: Scene) -> Gaussians:
-    """Return the Gaussians of the file, without rows that only stand in for missing or broken Gaussians."""
+    """Return the Gaussians of the file, without rows that stand in for missing or broken ones."""
     if scene.aligned and not bool(scene.stored.all()):
         return scene.gaussians[scene.stored.reshape(-1)]
     return scene.gaussians
 
 
 def view_shares(count: int, num_views: int, max_per_view: int) -> list[int]:
-    """Divide a number evenly among the views, at most ``max_per_view`` each; the first views get the rest."""
+    """Divide ``count`` evenly among the views, at most ``max_per_view`` each; the first views get the rest."""
     return [min(max_per_view, count // num_views + (view < count % num_views)) for view in range(num_views)]
 
 
 def most_important(importance: np.ndarray, count: int) -> np.ndarray:
-    """Find the rising indices of the ``count`` most important Gaussians, or all; the first of equals.
+    """Return the rising indices of the ``count`` most important Gaussians; the first of equals.
 
     ``importance [n]`` is for instance the summed blending weight over all photos. A ValueError if ``count`` is below 0.
     """
@@ -59,7 +59,7 @@ def most_important(importance: np.ndarray, count: int) -> np.ndarray:
 
 
 def merge_groups(prepared: Prepared, groups: Groups, rule: Literal["depth", "paper"] = "depth") -> Gaussians:
-    """Make one Gaussian for each group, without matching across views; empty groups are left out."""
+    """Merge each group into one Gaussian, without matching across views; empty groups are left out."""
     members = assign(prepared.scene, groups)
     features = encode(prepared.scene, members, groups, rule=rule)
     with stage("decode"):
@@ -72,7 +72,7 @@ def unmerged(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
 
 
 def unmerged_fit(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """Run the full fit on the input, with as many steps or as much time as ours: what merging has to beat.
+    """Run the full fit on the input without merging, with our number of steps or time, for comparison.
 
     Gaussians that no photo shows are replaced by others, so the number stays, whatever the count.
     """
@@ -82,21 +82,21 @@ def unmerged_fit(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
 
 
 def prune_by_opacity(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """Keep the most opaque Gaussians, unchanged and in their order; the first of equals."""
+    """Keep the ``count`` most opaque Gaussians, unchanged and in order; the first of equals."""
     gaussians = own_gaussians(prepared.scene)
     with stage("reduce"):
         return gaussians[most_important(gaussians.opacities, count)]
 
 
 def prune_by_contribution(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """Keep the Gaussians that add most to the views (Mini-Splatting), unchanged and in their order."""
+    """Keep the ``count`` Gaussians with the largest contribution to the views (Mini-Splatting), unchanged, in order."""
     gaussians = own_gaussians(prepared.scene)
     with stage("reduce"):
         return gaussians[most_important(summed_weights(gaussians, prepared.scene.cameras), count)]
 
 
 def summed_weights(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
-    """Sum the blending weights ``[n]`` float64 over the pixels of all views; the same on any number of threads."""
+    """Sum each Gaussian's blending weights over the pixels of all views, ``[n]`` float64, independent of threads."""
     splats = prepare(gaussians)
     viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
 
@@ -112,7 +112,7 @@ def summed_weights(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
 
 
 def prune_at_random(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """Keep a random choice that depends only on the seed, unchanged and in their order."""
+    """Keep ``count`` random Gaussians, unchanged and in order; the seed decides which."""
     gaussians = own_gaussians(prepared.scene)
     with stage("reduce"):
         rng = np.random.default_rng(plan.seed)
@@ -120,7 +120,7 @@ def prune_at_random(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
 
 
 def merge_blocks(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """Merge as many blocks as Gaussians, the same number in every view; blocks without a valid pixel are left out."""
+    """Merge the Gaussians of rectangular pixel blocks, as many per view; blocks without a valid pixel are left out."""
     scene = prepared.scene
     height, width = scene.cameras.height, scene.cameras.width
     with stage("segment"):
@@ -145,7 +145,7 @@ def match_moments(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
 
 
 def find_program() -> str:
-    """Find the path of splat-transform; a UsageError if there is none."""
+    """Find the path of the program splat-transform; UsageError if it is not installed."""
     named = os.environ.get(VARIABLE)
     program = shutil.which(named or PROGRAM)
     if program is None:

@@ -26,14 +26,14 @@ MIN_OPACITY, MIN_SCALE = 1e-6, 1e-12  # least that logits and logarithms are tak
 
 
 def voxel_keys(means: np.ndarray, size: float) -> np.ndarray:
-    """Number the voxel of each mean ``[n,3]``, ``[n]`` int64, by the nearest multiple of ``size``."""
+    """Number the voxels that means ``[n,3]`` round to, ``[n]`` int64; voxels are ``size`` wide."""
     half = 1 << (BITS - 1)
     index = np.clip(np.rint(means / size), -half, half - 1).astype(np.int64) + half
     return (index[:, 0] << 2 * BITS) | (index[:, 1] << BITS) | index[:, 2]
 
 
 def voxel_size(means: np.ndarray, count: int) -> float:
-    """Find the smallest size, within a ten-thousandth octave, that leaves at most ``count`` voxels occupied."""
+    """Find the smallest voxel size that leaves at most ``count`` voxels occupied, to a ten-thousandth of an octave."""
 
     def occupied(octave: float) -> int:
         keys = np.sort(voxel_keys(means, power(2, octave)))
@@ -50,7 +50,7 @@ def voxel_size(means: np.ndarray, count: int) -> float:
 
 
 def fuse(gaussians: Gaussians, keys: np.ndarray) -> Gaussians:
-    """Make one Gaussian for each voxel, in the order of the keys ``[n]``: means with weights exp(opacity).
+    """Merge the Gaussians of each voxel into one, weighted by exp(opacity), in the order of the keys ``[n]``.
 
     Rotations are averaged whatever the sign of their quaternions (Markley et al. 2007).
     """
@@ -81,7 +81,7 @@ def fuse(gaussians: Gaussians, keys: np.ndarray) -> Gaussians:
 
 
 def run(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """Merge to at most ``count`` voxels, and hardly fewer."""
+    """Merge the Gaussians of each voxel into one, with the smallest voxels that leave at most ``count``."""
     gaussians = own_gaussians(prepared.scene)
     with stage("reduce"):
         means = gaussians.means.astype(np.float64)

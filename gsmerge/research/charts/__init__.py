@@ -8,6 +8,6 @@ INSTALL_HINT = 'pip install "matplotlib>=3.8,<4"'  # as the extra chart asks for
 
 
 def require_matplotlib() -> None:
-    """Raise a GsmergeError that says how to install matplotlib where it is missing."""
+    """Raise GsmergeError, with the install command, if matplotlib is missing."""
     if find_spec("matplotlib") is None:
         raise GsmergeError(f"charts need matplotlib, which is not installed: {INSTALL_HINT}")

@@ -29,7 +29,7 @@ Table = tuple[Sequence[str], Sequence[Sequence[str]]]  # head and rows
 def make_page(
     records: Sequence[RunRecord], figures: Sequence[Figure], drawings: Mapping[str, bytes], folder: Path, command: str
 ) -> str:
-    """Make the whole page; it loads nothing from the network, and its policy forbids that.
+    """Make the HTML page of charts; it loads nothing from the network.
 
     ``drawings`` are the SVG of each figure by name; ``command`` is the command line that draws the page again.
     """
@@ -137,6 +137,6 @@ def _views(results: Results, folder: Path) -> list[tuple[str, list[tuple[str, st
 
 
 def make_table(records: Sequence[RunRecord]) -> str:
-    """Make a table of all runs and scores as comma-separated values."""
+    """Write all runs and scores as comma-separated values."""
     names = ("scene", "label", "method", "views", "num_input", "count", "ratio", "bytes", "seconds", "render_ms")
     return csv_text((*names, *SCORES, "error"), (record.to_dict() for record in records))

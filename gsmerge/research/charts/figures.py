@@ -58,7 +58,7 @@ RC: dict[Any, Any] = {
 
 @dataclass(frozen=True)
 class Panel:
-    """One pair of axes."""
+    """One pair of axes with lines."""
 
     y_label: str  # with unit
     higher: bool | None  # whether higher is better; None: neither is
@@ -68,7 +68,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class Figure:
-    """Lines over one x, or bars."""
+    """A chart and its table: lines over a common x, or bars."""
 
     name: str  # of its files
     title: str  # of the section
@@ -82,7 +82,7 @@ class Figure:
 
 
 def make_figures(results: Results) -> list[Figure]:
-    """Make all figures that there are data for."""
+    """Make all figures for which there are data."""
     time = "Quality against time", "the wall time of the merge (reading and writing not counted)", "Seconds"
     size = "Quality against size", "the share of the input's Gaussians that is kept", "Gaussians kept (%)"
     figures = [
@@ -119,7 +119,7 @@ def _curves(name: str, title: str, caption: str, x_label: str, panels: Sequence[
 
 
 def choose_lines(panel: Panel) -> set[str]:
-    """Name the lines to draw: all, or if there are many the best mean of each method, of several points if any."""
+    """Choose the lines to draw in a panel: all or, if there are many, the best one of each method."""
     if len(panel.lines) <= MAX_LINES:
         return {line.name for line in panel.lines}
     sign = 1 if panel.higher else -1
@@ -235,7 +235,7 @@ def _break_even(results: Results) -> Figure | None:
 
 
 def draw_figures(figures: Sequence[Figure], folder: Path) -> dict[str, bytes]:
-    """Draw figures into a folder, each as ``NAME.png`` and ``NAME.svg``, and return the SVG of each by name.
+    """Draw figures as ``NAME.png`` and ``NAME.svg`` in a folder; return the SVG by name.
 
     The same numbers give the same bytes.
     """
@@ -260,7 +260,7 @@ Style = dict[str, Any]  # arguments of a line
 
 
 def line_styles(names: Iterable[tuple[str, bool]]) -> dict[str, Style]:
-    """Make a style for every line by its name and whether it is ours: ours are broader and in front."""
+    """Make a style for each line by name; our own lines are broader and in front."""
     styles: dict[str, Style] = {INPUT: {"color": "#555555", "ls": (0, (2, 2)), "marker": "s", "lw": 1.0, "zorder": 2}}
     for i, (name, ours) in enumerate(line for line in names if line[0] != INPUT):
         dash = DASHES[i // len(COLORS) % len(DASHES)]
@@ -276,7 +276,7 @@ def _subplots(num_panels: int, height: float = HEIGHT) -> tuple[Drawing, list[Ax
 
 
 def draw_curves(figure: Figure, styles: Mapping[str, Style]) -> Drawing:
-    """Draw lines in panels side by side, with one key of their names beside them, by which the drawing grows."""
+    """Draw a figure's panels side by side, with one legend beside them."""
     drawing, all_axes = _subplots(len(figure.panels))
     for axes, panel in zip(all_axes, figure.panels, strict=True):
         for line in panel.lines:
@@ -323,7 +323,7 @@ def _draw_line(axes: Axes, line: Line, style: Style) -> None:
 
 
 def draw_bars(figure: Figure) -> Drawing:
-    """Draw one stacked bar for each row."""
+    """Draw one stacked bar per row of a figure."""
     names = [row[0] for row in figure.rows]
     drawing, (axes,) = _subplots(1, 0.75 + 0.3 * max(len(names), 2))
     left = np.zeros(len(names))

@@ -37,7 +37,7 @@ MAX_NAME = 100  # characters of a run in names of files
 
 @dataclass(frozen=True)
 class Grid(Settings):
-    """Lists whose product is run."""
+    """Lists of values for settings; every combination is run."""
 
     methods: tuple[str, ...] = setting((OURS,), "Methods: gsmerge and baselines.", **NEEDED)
     k: tuple[int, ...] = setting((1,), "Gaussians per superpixel: 1 to 8.", **NEEDED)
@@ -55,7 +55,7 @@ class Grid(Settings):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The fixed settings by name; a UsageError if one is not "name=value", or a setting that cannot be fixed."""
+        """Settings that all runs share, by name; UsageError if one is not "name=value" or cannot be fixed."""
         settings: dict[str, Any] = {}
         for text in self.fixed:
             name, sign, value = str(text).partition("=")
@@ -73,7 +73,7 @@ class Grid(Settings):
 
 
 def parse_grid(lists: Mapping[str, str | None], base: Grid | None = None) -> Grid:
-    """Make a grid from comma-separated lists; None leaves the base's. A UsageError if a value is impossible."""
+    """Make a grid from comma-separated lists; None keeps the list of ``base``. UsageError for impossible values."""
     values: dict[str, tuple[Any, ...]] = {}
     for name, text in lists.items():
         if text is not None:
@@ -101,7 +101,7 @@ def read_grid(path: Path) -> Grid:
 
 
 def list_settings(grid: Grid) -> tuple[list[tuple[str, dict[str, Any]]], list[str]]:
-    """List method and settings of every run on one scene, the unmerged input first, and notes on what was left out.
+    """List (method, settings) of every run on one scene, the unmerged input first; also notes on combinations left out.
 
     Only settings that differ from the defaults are set. Baselines do not have most settings and run once per size, or
     once where they keep all Gaussians.
@@ -142,7 +142,7 @@ def _options_of(method: str, settings: Mapping[str, Any], seed: int) -> CompactO
 
 @dataclass(frozen=True)
 class Source:
-    """A scene before it is read."""
+    """A scene to run, before it is read."""
 
     path: Path  # the ``.ply``, or the folder that it is in
     name: str  # short name, different for every scene of a grid
@@ -155,7 +155,7 @@ class Source:
 def find_sources(
     arguments: Sequence[str], out: Path, targets: str | None = None, target_images: str | None = None
 ) -> list[Source]:
-    """Find the scenes that ``gsmerge batch`` would find, and hash everything that is read of each.
+    """Find scenes as ``gsmerge batch`` does, and hash all files of each.
 
     ``targets``, cameras of held-out views, and ``target_images``, the folder of their photos, are one path for all or a
     template with ``{scene}`` (as given), ``{parent}`` (its folder) and ``{stem}`` (its name without extension) in it. A
@@ -182,7 +182,7 @@ def find_sources(
 
 
 def scene_names(scenes: Sequence[Path]) -> list[str]:
-    """Name each scene as its file or folder, with as many folders before it as it takes to tell them apart."""
+    """Name each scene by its file or folder, with as many parent folders as make the names differ."""
     parts = [(*scene.absolute().parent.parts[1:], stem_of(scene.absolute())) for scene in scenes]
     for depth in range(1, max(map(len, parts), default=0)):
         names = ["/".join(part[-depth:]) for part in parts]
@@ -200,7 +200,7 @@ def make_jobs(
     proxy_views: int = 0,
     command: str = "",
 ) -> tuple[list[Job], list[str]]:
-    """Make the jobs of a grid, scene by scene, and notes on what was left out.
+    """Make the jobs of a grid, scene by scene, and notes on combinations left out.
 
     ``proxy_views``: photos of each scene on which superpixels alone are measured; 0: none. ``command``: the command
     line, for the records. A UsageError if the library does not take a setting.

@@ -34,7 +34,7 @@ K = TypeVar("K")
 
 @dataclass(frozen=True)
 class Metric:
-    """Label, direction and decimals of a score."""
+    """How a score is shown: label, direction and decimals."""
 
     label: str
     higher: bool  # whether higher is better
@@ -61,7 +61,7 @@ class Interval:
 
 @dataclass(frozen=True)
 class Point:
-    """A method at one size or number of views, over all scenes."""
+    """Values of one method at one size, or number of views, over all scenes."""
 
     label: str  # size or number of views
     x: float  # mean cost over the scenes (geometric)
@@ -71,7 +71,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Line:
-    """A method with its settings, from size to size."""
+    """Points of one method with fixed settings, over sizes."""
 
     name: str  # of the method and its settings
     ours: bool  # whether it is ours, not a baseline's
@@ -80,7 +80,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Verdict:
-    """A point of a baseline compared with our curve at the same cost."""
+    """Comparison of one baseline point with our curve at the same cost."""
 
     baseline: str  # name of the baseline's line
     cost: float  # mean cost of the point
@@ -92,7 +92,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class VerdictTable:
-    """Points of baselines compared with ours at equal cost."""
+    """Comparisons of baseline points with our curve at equal cost."""
 
     title: str  # metric and cost
     rows: tuple[tuple[str, Verdict], ...]  # one per point of a baseline, with the label of its size
@@ -115,12 +115,12 @@ def mean_interval(values: Sequence[float]) -> Interval:
 
 
 def paired_difference(ours: Mapping[str, float], theirs: Mapping[str, float]) -> Interval:
-    """Subtract over the scenes that both have, at least one, so that the difficulty of a scene cancels."""
+    """Compute the mean difference over the scenes that both have, so that the difficulty of scenes cancels."""
     return mean_interval([ours[scene] - theirs[scene] for scene in ours if scene in theirs])
 
 
 def paired_intervals(values: NDArray[np.float64]) -> list[Interval]:
-    """Compute intervals of ``values [scenes, conditions]``, neither of them 0, without differences between scenes.
+    """Compute confidence intervals of the columns of ``values [scenes, conditions]``, with scene differences removed.
 
     Scenes differ by several dB and conditions by tenths, so plain intervals would hide the conditions. Here every
     scene's own mean is subtracted first (Cousineau 2005), with the correction for it (Morey 2008).
@@ -136,7 +136,7 @@ def paired_intervals(values: NDArray[np.float64]) -> list[Interval]:
 
 
 def quality_at(costs: Sequence[float], qualities: Sequence[float], cost: float) -> float | None:
-    """Interpolate the best quality at a cost, over the logarithm of the cost; None below a method's cheapest point.
+    """Interpolate the best quality at a cost, linearly in log cost; None below the cheapest point.
 
     Costs are positive, and a higher quality is better. Points that are dearer and no better than another do not count.
     Beyond the most expensive point the quality is constant.
@@ -176,13 +176,13 @@ def judge(
 
 
 def line_key(record: RunRecord) -> LineKey:
-    """Make the key of a record's line."""
+    """Return the key of a record's line: method, and settings other than the size."""
     settings = {name: value for name, value in record.settings.items() if name not in SIZES}
     return record.method, tuple(sorted(settings.items()))
 
 
 def size_label(record: RunRecord) -> str:
-    """Name the size that was set; empty for the default one."""
+    """Return the size that a run asked for as text; empty for the default."""
     for name in SIZES:
         if name in record.settings:
             value = record.settings[name]
@@ -192,7 +192,7 @@ def size_label(record: RunRecord) -> str:
 
 
 def line_names(keys: Sequence[LineKey]) -> dict[LineKey, str]:
-    """Name every line by its method, and those of its settings that differ between its lines."""
+    """Name every line by its method and the settings that tell the method's lines apart."""
     names = {}
     for method, settings in keys:
         variants = [dict(other) for name, other in keys if name == method]
@@ -208,12 +208,12 @@ def _setting_label(name: str, value: Any) -> str:
 
 
 def ours_first(records: Iterable[RunRecord]) -> list[RunRecord]:
-    """Sort runs: ours, then those of baselines; those with the fewest settings first."""
+    """Sort runs: our own first, then baselines, each by number of settings."""
     return sorted(records, key=lambda record: (record.method != OURS, len(line_key(record)[1])))
 
 
 class Results:
-    """Runs that did not fail, with what tables and figures of them have in common.
+    """Successful runs, with what tables and figures have in common.
 
     Attributes:
         runs: The runs.
@@ -245,15 +245,15 @@ class Results:
         self.size = min(ratios, key=lambda size: (abs(float(np.mean(ratios[size]))), size), default="")
 
     def name(self, record: RunRecord) -> str:
-        """Name the line of a run."""
+        """Return the name of a run's line."""
         return self.names[line_key(record)]
 
     def is_typical(self, record: RunRecord) -> bool:
-        """Return whether a run has the typical size, or a method that has only one size."""
+        """Return whether a run has the typical size, or its method only one size."""
         return record.method != INPUT and (size_label(record) == self.size or record.method in ONE_SIZE)
 
     def typical_runs(self) -> dict[str, list[RunRecord]]:
-        """Group runs of the typical size and number of views by their line, ours first, all over the same scenes."""
+        """Group the runs of typical size and number of views by line, ours first, over the same scenes."""
         rows = dict[str, list[RunRecord]]()
         for record in ours_first(self.runs):
             if self.is_typical(record) and record.views_asked == self.views:
@@ -262,18 +262,18 @@ class Results:
         return {name: [record for record in rows[name] if record.scene in scenes] for name, scenes in kept.items()}
 
     def by_size(self, x: str, y: str) -> list[Line]:
-        """Make lines of two values over the size, at the typical number of views."""
+        """Make lines of value ``y`` against value ``x``, one point per size, at the typical number of views."""
         merged = [r for r in self.runs if r.method != INPUT and r.views_asked == self.views]
         return make_lines(merged, size_label, "ratio", x, y)
 
     def by_views(self, y: str) -> list[Line]:
-        """Make lines of a value over the number of views, at the typical size; empty with only one number."""
+        """Make lines of value ``y`` against the number of views at the typical size; a line has at least two points."""
         chosen = [r for r in self.runs if r.method == INPUT or self.is_typical(r)]
         lines = make_lines(chosen, lambda r: str(r.views), "views", "views", y, MIN_SHARE_VIEWS)
         return [line for line in lines if len(line.points) > 1]
 
     def input_mean(self, name: str, scenes: Iterable[str]) -> float | None:
-        """Average a value of the unmerged input over some scenes; None where one does not have it."""
+        """Average a value of the unmerged input over ``scenes``; None if a scene lacks it."""
         inputs = {r.scene: r.value(name) for r in self.runs if r.method == INPUT and r.views_asked == self.views}
         values = [inputs.get(scene) for scene in scenes]
         numbers = [value for value in values if value is not None]
@@ -288,7 +288,7 @@ def make_lines(
     y: str,
     min_share: float = MIN_SHARE,
 ) -> list[Line]:
-    """Make lines of points that have at least a share of the scenes, all over the same scenes.
+    """Make lines from records, with points that cover at least ``min_share`` of the scenes, all the same scenes.
 
     ``order``, ``x`` and ``y`` are names of values of a record; costs x must be positive.
     """
@@ -309,9 +309,9 @@ def make_lines(
 
 
 def keep_common(scenes: Mapping[K, set[str]], min_share: float) -> dict[K, set[str]]:
-    """Keep the scenes that all have, so that all means are over the same scenes; each its own, if there are none.
+    """Restrict every key to the scenes that all keys share, so that means compare; without any, keep each key's own.
 
-    Those that have too few of the scenes are left out first, so that a few failed runs do not remove the others.
+    Keys that have too few of the scenes are left out first, so that a few failed runs do not remove the others.
     """
     fewest = min_share * len(set().union(*scenes.values()))
     kept = {name: scene_names for name, scene_names in scenes.items() if len(scene_names) >= fewest}
@@ -338,7 +338,7 @@ def _intervals(columns: Sequence[ByScene]) -> list[Interval]:
 
 
 def make_verdict_tables(results: Results) -> list[VerdictTable]:
-    """Compare points of baselines with ours at equal seconds, and at an equal share of the Gaussians."""
+    """Compare baseline points with ours at equal time and at equal size, one table each."""
     tables = []
     for (cost, words), metric in product((("seconds", "time"), ("ratio", "size")), results.metrics):
         score, ours = f"{metric}_{results.part}", dict[str, list[tuple[float, float]]]()

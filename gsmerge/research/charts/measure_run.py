@@ -61,7 +61,7 @@ _tried: set[tuple[Any, ...]] = set()  # kinds of runs that this process has done
 
 @dataclass(frozen=True)
 class RunRecord:
-    """One finished run, successful or not.
+    """Record of one finished run, successful or not.
 
     ``scores`` are means over the views of a split, by names such as ``psnr_target_visible``: ``context`` are the views
     that the scene was made of, ``target`` held-out ones; ``_visible`` counts only pixels that the context views see.
@@ -91,20 +91,20 @@ class RunRecord:
 
     @property
     def ratio(self) -> float | None:
-        """Share of the input's Gaussians that is kept."""
+        """Share of the input's Gaussians that the result keeps."""
         return None if self.count is None or self.num_input is None else self.count / max(self.num_input, 1)
 
     @property
     def percent(self) -> float | None:
-        """Share of the input's Gaussians that is kept, per cent."""
+        """Share of the input's Gaussians that the result keeps, in per cent."""
         return None if self.ratio is None else 100 * self.ratio
 
     def value(self, name: str) -> float | None:
-        """Look up a score, or a field that is a number; None where it was not measured."""
+        """Return a score or a numeric field by name; None if it was not measured."""
         return self.scores.get(name) if name in SCORES else getattr(self, name)
 
     def to_dict(self) -> dict[str, Any]:
-        """Convert the record to plain JSON types, with every score by its own name."""
+        """Convert the record to plain JSON types, with each score under its own name."""
         return {**asdict(self), "ratio": self.ratio, **{name: self.value(name) for name in SCORES}}
 
 
@@ -127,10 +127,9 @@ BLANK = RunRecord("", "")
 
 
 def read_runs(folder: Path) -> tuple[list[RunRecord], list[str]]:
-    """Read the newest record of each run in a folder, and notes on those that were left out.
+    """Read the newest record of each run in a folder; also return notes on records left out.
 
-    Left out are records of another version, and those of other content of a scene's files than that of the last run of
-    the scene, so that no two scenes are taken for one.
+    Skip records of other versions, and of scenes whose files have changed since.
     """
     newest = newest_records(folder, _read_record).items()
     records = [record for _, record in newest if record is not None]
@@ -158,19 +157,19 @@ def _read_record(record: Mapping[str, Any]) -> RunRecord | None:
 
 
 def picture_path(folder: Path, output: str, view: int, kind: str) -> Path:
-    """Name a picture of a run or, with the output ``SCENE/photo``, of a scene; ``kind``: photo, render or error."""
+    """Return the path of a picture of a run or, with the output ``SCENE/photo``, of a scene; ``kind``: its type."""
     return folder / f"{output}.{view}.{kind}.{'png' if kind == 'error' else 'jpg'}"
 
 
 def describe(method: str, settings: Mapping[str, Any], views: int | None) -> str:
-    """Describe a run in a few words."""
+    """Describe a run in a few words: method, settings, number of views."""
     words = [f"{name} {value}" for name, value in settings.items()]
     return ", ".join([method, *words, *([] if views is None else [f"{views} views"])])
 
 
 @dataclass(frozen=True)
 class ChartRun:
-    """Work on one scene, see :class:`gsmerge.batch.find.Work`."""
+    """Run and measurement of one grid point on one scene; see :class:`gsmerge.batch.find.Work`."""
 
     record: RunRecord  # what is known beforehand
     settings: CompactOptions  # all settings
@@ -179,13 +178,13 @@ class ChartRun:
     target_images: Path | None = None  # folder of their photos; None: found by their cameras
 
     def key(self, options: BatchOptions) -> str:
-        """Digest everything that the measurements depend on."""
+        """Return a digest of everything that the measurements depend on."""
         run = asdict(replace(self.record, command=""))
         how = {"measured": asdict(self.measured), "seed": self.settings.seed, "tool_version": __version__}
         return digest({"run": run, **how, "opacity": options.opacity, "reading": vars(options.hints)})
 
     def run(self, files: SceneFiles, options: BatchOptions, out: Path) -> tuple[dict[str, Any], list[Path]]:
-        """Merge, score, time and keep pictures; return a report with the keys of batch records, and the pictures."""
+        """Merge, score and time a scene, and save pictures; return a batch record's report and the picture files."""
         threads = options.settings.threads
         with use_threads(threads):
             source = files, self.targets, self.target_images, self.record.scene_sha256
@@ -284,9 +283,9 @@ def _load(
 
 
 def choose_views(scene: Scene, held_out: HeldOutViews | None, count: int | None) -> tuple[Scene, Views | None]:
-    """Choose ``count`` of the scene's views, evenly spread, and held-out views nearest the middle between them.
+    """Choose ``count`` evenly spread views of the scene, and the held-out views nearest to the middle between these.
 
-    Without ``count`` all views are kept, and where their places along the trajectory are not known all held-out views.
+    Without ``count`` all views are kept. All held-out views are kept if their order along the trajectory is unknown.
     """
     if count is None or count >= len(scene):
         return scene, held_out
@@ -300,7 +299,7 @@ def choose_views(scene: Scene, held_out: HeldOutViews | None, count: int | None)
 def measure(
     scene: Scene, gaussians: Gaussians | None, targets: Views | None, options: EvaluateOptions
 ) -> dict[str, float]:
-    """Measure scores by name (``psnr_target_visible``, ...), means over the views, without those that do not exist.
+    """Measure mean scores by name (``psnr_target_visible``, ...); names without a measurement are left out.
 
     Without ``gaussians`` the scene's own are measured.
     """
@@ -319,10 +318,10 @@ def measure(
 def keep_pictures(
     out: Path, gaussians: Gaussians, scene: Scene, held_out: HeldOutViews | None
 ) -> tuple[list[Path], tuple[str, ...]]:
-    """Write renders and error maps of a few views of a run, and the photos; returns paths of the former and view names.
+    """Write renders and error maps of a few views, and the photos; return the paths of the first two, and view names.
 
-    The views are the held-out ones, or the scene's without any; ``scene`` and ``held_out`` have all of them, so that
-    all runs of a scene have pictures of the same ones.
+    The views are held-out ones or, without any, the scene's. ``scene`` and ``held_out`` have all views, so that all
+    runs of a scene have pictures of the same ones.
     """
     views = scene if held_out is None else held_out
     photos, names = views.images, views.names
@@ -348,7 +347,7 @@ def _write(path: Path, picture: Picture) -> None:
 
 
 def environment(threads: int | None) -> dict[str, str]:
-    """List processor, threads and versions, which results and times depend on."""
+    """Return processor, threads and versions, on which results and times depend."""
     processor = platform.processor() or platform.machine()
     with suppress(OSError), open("/proc/cpuinfo", encoding="utf-8") as file:  # only Linux has it
         models = (line.split(":", 1)[1].strip() for line in file if line.startswith("model name"))

@@ -51,7 +51,7 @@ Opening = tuple[float, float, float]  # of a wall: left, right, height
 
 @dataclass(frozen=True)
 class Wall:
-    """A wall in a frame of its own: its room lies at z < 0."""
+    """A wall in its own frame: the room is at z < 0."""
 
     at: Array  # [3] of the middle of its foot
     turn: int  # index into TURNS
@@ -61,7 +61,7 @@ class Wall:
 
 
 def build_building(rng: np.random.Generator, size: int, plan: FloorPlan) -> tuple[list[Zone], list[Portal]]:
-    """Build all rooms, corridors and stairs with their own colours and things, and the openings between them.
+    """Build all rooms, corridors and stairs with their colours and furniture, and the openings between them.
 
     ``size`` is that of the textures. Corridors come first, then the stairs, if there are any, and the rooms.
     """

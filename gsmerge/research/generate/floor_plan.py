@@ -48,7 +48,7 @@ Maker = Callable[[Palette], Shapes]
 
 @dataclass(frozen=True)
 class RoomPlan:
-    """One room."""
+    """Position and size of one room."""
 
     storey: int
     width: float
@@ -64,7 +64,7 @@ class RoomPlan:
 
 @dataclass(frozen=True)
 class FloorPlan:
-    """A building."""
+    """Rooms of a building."""
 
     rooms: tuple[RoomPlan, ...]  # in the order of the walk
     storeys: int
@@ -72,7 +72,7 @@ class FloorPlan:
 
 
 def draw_plan(rng: np.random.Generator, num_views: int) -> FloorPlan:
-    """Draw a building with one room for every 28 views."""
+    """Draw a random building with one room for every 28 views."""
     count = max(1, num_views // VIEWS_PER_ROOM)
     storeys = 2 if count >= TWO_STOREYS else 1
     rooms, length = [], 7.0
@@ -94,7 +94,7 @@ def draw_plan(rng: np.random.Generator, num_views: int) -> FloorPlan:
 
 
 def room_loop(room: RoomPlan) -> Array:
-    """List points ``[n,3]`` of the walk inside a room, in its frame: in, round the middle, and out again."""
+    """Return points ``[n,3]`` of a walk inside a room, in the room's frame: in, round the middle, and out."""
     half_x, half_z, middle = room.width / 2 - ASIDE, room.depth / 2 - ASIDE, room.depth / 2
     first = np.clip(room.door / half_x, -0.9, 0.9)  # the sine of the angle at which it begins
     way = -1.0 if first > 0 else 1.0  # the longer way comes first
@@ -151,7 +151,7 @@ def _along(at: Array, places: Array, values: Array) -> Array:
 
 
 def draw_walk(rng: np.random.Generator, plan: FloorPlan, num_views: int) -> Callable[[float], tuple[Array, Array]]:
-    """Draw a walk through every room, as far as so many views reach: position and direction of view at 0 to 1."""
+    """Draw a walk through the rooms: a function from 0 to 1 to position and viewing direction."""
     points, middles = _way_points(plan)
     lengths = np.concatenate([[0.0], np.cumsum([norm(b - a) for a, b in itertools.pairwise(points)])])
     at = np.arange(0.0, lengths[-1], SPACING)
@@ -243,7 +243,7 @@ def _plant(pal: Palette) -> Shapes:
 
 
 def small_plant(pal: Palette) -> Shapes:
-    """Build a plant that leaves room in a corridor."""
+    """Build a plant narrow enough for a corridor."""
     return plant(pal, pal.rng.uniform(0.4, 0.6), 20)
 
 
@@ -266,7 +266,7 @@ KINDS: tuple[tuple[Maker, ...], ...] = (  # what stands at the walls of a room; 
 
 
 def furnish(pal: Palette, plan: RoomPlan) -> Shapes:
-    """Put furniture at the walls and in the middle, clear of the walk; in the room's frame."""
+    """Place furniture along the walls and in the middle, clear of the walk; in the room's frame."""
     rng, w, d = pal.rng, plan.width / 2, plan.depth
     walk = np.concatenate([np.linspace(a, b, 12)[:, [0, 2]] for a, b in itertools.pairwise(room_loop(plan))])
     half = (rng.uniform(0.5, 0.8) * w, rng.uniform(0.25, 0.4) * d)
@@ -281,9 +281,9 @@ def furnish(pal: Palette, plan: RoomPlan) -> Shapes:
 def stand(
     rng: np.random.Generator, pieces: Sequence[Shapes], space: Array, turns: Sequence[int], walk: Array
 ) -> Shapes:
-    """Put pieces with their backs to walls of a space ``[2,3]`` where they touch neither one another nor the walk.
+    """Place pieces against the walls of a space ``[2,3]``, clear of each other and of the walk.
 
-    ``turns`` are the walls, from which one is drawn at each try; a piece that fits nowhere is left out.
+    ``turns`` are the walls; each try draws one. A piece that fits nowhere is left out.
     """
     out: Shapes = []
     taken: list[tuple[Array, Array]] = []

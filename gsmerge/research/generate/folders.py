@@ -26,7 +26,7 @@ from gsmerge.types import Cameras
 
 @dataclass(frozen=True)
 class SceneFolder:
-    """Folder of one scene of a series, and whether the scene existed already."""
+    """Folder of one scene of a series; ``kept``: the scene existed already."""
 
     folder: Path
     kept: bool
@@ -35,7 +35,7 @@ class SceneFolder:
 def plan(
     out: Path, count: int, options: GenerateOptions, *, seed: int = 0, overwrite: bool = False
 ) -> list[SceneFolder]:
-    """List the folders that :func:`generate` would write; nothing is written.
+    """List the folders that :func:`generate` would write, without writing.
 
     A ValueError if ``count`` or ``seed`` is out of range, a UsageError if a folder holds something else.
     """
@@ -53,7 +53,7 @@ def plan(
 def generate_scene(
     folder: Path, options: GenerateOptions | None = None, *, seed: int = 0, index: int = 0, overwrite: bool = False
 ) -> Path:
-    """Make scene ``index`` of the series of ``seed`` in a folder, as :func:`generate` does, and return the folder.
+    """Generate scene ``index`` of the series of ``seed`` into a folder, and return the folder.
 
     A UsageError if the folder holds something else, a SceneError if it cannot be written.
     """
@@ -88,7 +88,7 @@ def generate(
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[SceneFolder]:
-    """Make scenes ``out/scene_0000`` and so on, each different; the same arguments give the same bytes.
+    """Generate scenes ``out/scene_0000`` and so on, all different; the same arguments give the same bytes.
 
     Every folder gets ``scene.ply``, ``transforms.json``, ``images/``, held-out views in ``targets/``, and
     ``generated.json`` with the random settings. A folder that holds the same scene already is left as it is, so an
@@ -121,12 +121,12 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL camera axes <-> OpenCV camera a
 
 
 def scene_key(seed: int, index: int, options: GenerateOptions) -> dict[str, Any]:
-    """List everything that a scene depends on."""
+    """Return everything that a scene depends on, as plain values."""
     return {"record_version": RECORD_VERSION, "seed": seed, "index": index, "options": options.to_dict()}
 
 
 def is_complete(folder: Path, key: Mapping[str, Any]) -> bool:
-    """Return whether a folder holds this scene."""
+    """Return whether a folder holds the scene with this key, complete."""
     try:
         record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -135,7 +135,7 @@ def is_complete(folder: Path, key: Mapping[str, Any]) -> bool:
 
 
 def check_replaceable(folder: Path, *, overwrite: bool) -> None:
-    """Raise a UsageError where a folder holds no synthetic scene, or one of other options without ``overwrite``."""
+    """Raise UsageError if a folder holds other files, or a scene of other options without ``overwrite``."""
     if os.path.lexists(folder) and not (folder / RECORD).is_file():
         problem = "expected no folder, or a synthetic scene, found something else; choose another OUT"
         raise UsageError(f"{folder}: {problem}")

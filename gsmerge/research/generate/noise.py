@@ -30,7 +30,7 @@ POSITIVE = (*SPREAD, "far", "scale", "bleed_width", "flatness", "blur")
 
 @dataclass(frozen=True)
 class NoiseOptions:
-    """Ranges of every error and habit of an exporter, from which each scene draws its values.
+    """Ranges of an exporter's errors and habits; each scene draws its values from them.
 
     Depth errors are deviations of the logarithm of depth, so about parts of the depth. docs/laboratory/generator.md
     compares them with real exports. A ValueError if a range is empty or impossible.
@@ -85,7 +85,7 @@ class NoiseOptions:
 
 
 def read_ranges(path: Path) -> NoiseOptions:
-    """Read ranges from a TOML or JSON file: a table with some of the names, and two numbers for each.
+    """Read ranges from a TOML or JSON file: a table of names with two numbers each.
 
     A SceneError if the file cannot be read, or holds an unknown name or an impossible range.
     """
@@ -108,7 +108,7 @@ else:  # the values that one scene drew, under the names of their ranges
 
 
 def draw_noise(options: NoiseOptions, rng: np.random.Generator, factor: float = 1.0) -> Noise:
-    """Draw values for one scene, all errors but no habits times ``factor``; shares and ``bleed`` are at most 1."""
+    """Draw one scene's values; ``factor`` multiplies errors, not habits. Shares and ``bleed`` are at most 1."""
     drawn: dict[str, float] = {}
     for name in RANGES:
         low, high = getattr(options, name)
@@ -126,7 +126,7 @@ def draw_noise(options: NoiseOptions, rng: np.random.Generator, factor: float = 
 
 @dataclass(frozen=True)
 class TrueView:
-    """Photo of a view, exact geometry at the pixels' centres, and the network's estimate of the pose."""
+    """A rendered view with exact depth and normals, and the pose that a network would estimate."""
 
     image: Float  # [h,w,3] sRGB
     depth: Array  # [h,w] along z
@@ -135,14 +135,14 @@ class TrueView:
 
 
 def smooth_noise(rng: np.random.Generator, height: int, width: int, cells: int) -> Float:
-    """Draw smooth noise ``[height,width]`` of deviation about 1, ``cells`` cells along the longer side."""
+    """Draw smooth noise ``[height,width]`` of standard deviation 1, with ``cells`` cells along the longer side."""
     side = max(height, width)
     field = enlarge(rng.normal(0, 1, (cells, cells)), side)[:height, :width]
     return field / max(float(field.std()), 1e-3)
 
 
 def edge_mask(depth: Array) -> Float:
-    """Rate pixels ``[h,w]`` from 0 on smooth surfaces to 1 where depth jumps by a tenth or more between neighbours."""
+    """Rate pixels ``[h,w]`` by depth edges: 0 on smooth surfaces, 1 where neighbours differ by a tenth or more."""
     inverse = (1 / depth).astype(np.float32)
     square = np.ones((3, 3), np.uint8)
     jump = log(cv2.dilate(inverse, square) / cv2.erode(inverse, square))
@@ -152,7 +152,7 @@ def edge_mask(depth: Array) -> Float:
 
 
 def texture_mask(image: Float) -> Float:
-    """Rate pixels ``[h,w]`` from 0 where a photo has no texture to 1 where it has detail."""
+    """Rate pixels ``[h,w]`` by texture: 0 in flat areas of a photo, 1 where it has detail."""
     grey = image.mean(2)
     mean = cv2.blur(grey, (7, 7))
     deviation = np.sqrt(np.maximum(cv2.blur(grey * grey, (7, 7)) - mean * mean, 0))
@@ -160,7 +160,7 @@ def texture_mask(image: Float) -> Float:
 
 
 def predict_depth(seen: TrueView, noise: Noise, rng: np.random.Generator) -> tuple[Float, Float]:
-    """Predict depth as a network does, and its confidence in [0, 1], both ``[h,w]``.
+    """Simulate a network's depth ``[h,w]`` and its confidence ``[h,w]`` in [0, 1].
 
     Errors are of the logarithm of depth: a bias of the view, a slow drift, wrong patches, and fine grain, all larger
     where the photo has no texture; inverse depth bleeds over edges; depth is limited; and some pixels float in front
@@ -190,7 +190,7 @@ def predict_depth(seen: TrueView, noise: Noise, rng: np.random.Generator) -> tup
 
 
 def quats_facing(normals: Array) -> Array:
-    """Compute quats ``[n,4]``, wxyz: the shortest rotations of +z onto normals or their opposites."""
+    """Return quats ``[n,4]`` wxyz of the shortest rotations of +z onto normals or their opposites."""
     z = normals * np.where(normals[:, 2:] < 0, -1, 1)
     quats = np.stack([1 + z[:, 2], -z[:, 1], z[:, 0], np.zeros(len(z))], 1)
     return quats / np.linalg.norm(quats, axis=1, keepdims=True)

@@ -31,7 +31,7 @@ Shapes = list[Shape]
 
 
 def table(pal: Palette, width: float, depth: float, height: float) -> Shapes:
-    """Build a table with four legs, or a round one with one."""
+    """Build a table with four legs, or a round table with one."""
     rng, top = pal.rng, pal.material("wood", "wood", "plain", "plain", "marble", "granite", repeat=0.8)
     legs = pal.material("wood", "plain")
     thick = rng.uniform(0.02, 0.06)
@@ -63,7 +63,7 @@ def chair(pal: Palette) -> Shapes:
 
 
 def shelf(pal: Palette, width: float, height: float) -> Shapes:
-    """Build boards with books and objects on them, its back at z = 0."""
+    """Build shelves with books and objects, back at z = 0."""
     rng, board, depth = pal.rng, pal.material("wood", "plain", "plaster", repeat=0.7), 0.3
     out = [box((x - 0.012, -height, -depth), (x + 0.012, 0, 0), board) for x in (-width / 2, width / 2)]
     out.append(box((-width / 2, -height, -0.01), (width / 2, 0, 0), board))
@@ -217,7 +217,7 @@ def wire(pal: Palette, start: Array, end: Array, sag: float, radius: float) -> S
 
 
 def window(pal: Palette, width: float, height: float, material: Material, *, glow: bool) -> Shapes:
-    """Build a pane with a frame and bars, in the plane z = 0, its foot at the origin."""
+    """Build a window with frame and bars in the plane z = 0, foot at the origin."""
     pane = replace(quad((0, -height / 2, -0.01), (width / 2, height / 2), material), shell=glow, glow=glow)
     frame, t = pal.material("plain", "wood"), pal.rng.uniform(0.03, 0.07)
     w, h = width / 2, height
@@ -227,7 +227,7 @@ def window(pal: Palette, width: float, height: float, material: Material, *, glo
 
 
 def picture(pal: Palette, width: float, height: float) -> Shapes:
-    """Build a framed print, its back at z = 0, its foot at the origin."""
+    """Build a framed print, back at z = 0, foot at the origin."""
     material = pal.material("label", "printed", "marble", "crown", "spines", "sky", "cloth")
     t = pal.rng.uniform(0.01, 0.03)
     frame = box((-width / 2 - t, -height - t, -0.02), (width / 2 + t, t, 0), pal.material("plain", "wood"))
@@ -238,12 +238,12 @@ SMALL: tuple[Callable[[Palette], Shapes], ...] = (carton, carton, can, bottle, b
 
 
 def small_object(pal: Palette) -> Shapes:
-    """Build a random object of those that stand on tables."""
+    """Build a random small object, such as stands on tables."""
     return SMALL[pal.rng.integers(len(SMALL))](pal)
 
 
 def clutter(pal: Palette, count: int, half: tuple[float, float], height: float) -> Shapes:
-    """Spread small objects over a rectangle without touching, with papers and cables between them."""
+    """Spread small objects over a rectangle without contact, with papers and cables between them."""
     rng, out = pal.rng, []
     taken: list[Array] = []
     for _ in range(count * 4):
@@ -269,7 +269,7 @@ def _shell(shapes: list[Shape], *, glow: bool = False) -> list[Shape]:
 
 
 def light(rng: np.random.Generator, lamp_at: Array | None) -> Light:
-    """Draw a sun or a lamp from above and somewhere in front, warm or cool."""
+    """Draw a sun or a lamp above and in front of the scene, warm or cool."""
     side, up = rng.uniform(-1.2, 1.2), rng.uniform(0.5, 1.3)
     towards = np.array([np.sin(side), -up, -np.cos(side)])
     key = rng.uniform(0.8, 4.0) * (1 + (0.4 * color(rng, strength=(0, 0.4), light=(0.9, 1)) - 0.4))

@@ -51,7 +51,7 @@ class Light:
 
 @dataclass(frozen=True)
 class Stage:
-    """A scene before it is photographed; y points down, the middle of the views is along +z."""
+    """Shapes, textures and light of a scene; y points down, and the cameras look along +z."""
 
     shapes: tuple[Shape, ...]
     textures: tuple[Picture, ...]  # indexed by the shapes' materials
@@ -64,7 +64,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class Zone:
-    """A part of a scene that has lights of its own, in a box whose walls hide the rest."""
+    """A part of a scene in a box of opaque walls, with its own lights."""
 
     stage: Stage
     low: Array  # [3] lowest corner of the box
@@ -82,7 +82,7 @@ class Portal:
 
 @dataclass(frozen=True)
 class Pinhole:
-    """An image size and focal length, pixels."""
+    """Image size and focal length of a camera, pixels."""
 
     width: int
     height: int
@@ -96,7 +96,7 @@ class Pinhole:
 
 @dataclass(frozen=True)
 class Hits:
-    """Hits of the rays of a view; h x w samples."""
+    """First hits of a view's rays, h x w samples."""
 
     depth: Array  # [h,w] along the camera's z
     ids: NDArray[np.int32]  # [h,w] shape, -1 where there is none
@@ -106,7 +106,7 @@ class Hits:
 
 @dataclass(frozen=True)
 class LitStage:
-    """A stage with its shadow maps, ready to be photographed."""
+    """A stage with shadow maps, ready to be rendered."""
 
     stage: Stage
     shapes: ShapeArrays
@@ -121,7 +121,7 @@ class LitStage:
 
 @dataclass(frozen=True)
 class LitScene:
-    """Stages that are photographed together: zones of a building, or one alone."""
+    """Stages that are rendered together: the zones of a building, or a single stage."""
 
     stages: tuple[LitStage, ...]
     zones: tuple[Zone, ...] = ()  # none where there is one stage
@@ -129,7 +129,7 @@ class LitScene:
 
 
 def screen_boxes(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -> NDArray[np.int32]:
-    """Compute x0, y0, x1, y1 ``[m,4]`` of the samples that may see each shape."""
+    """Compute boxes x0, y0, x1, y1 ``[m,4]``, in samples, that contain each shape's image."""
     half = bounds(shapes)
     signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), -1).reshape(-1, 3)
     corners = np.einsum("mij,mcj->mci", shapes.rotations, half[:, None] * signs) + shapes.centres[:, None]
@@ -174,7 +174,7 @@ def _overlap(a: NDArray[np.int32], b: NDArray[np.int32]) -> NDArray[np.int32]:
 
 
 def find_windows(scene: LitScene, c2w: Array, lens: Pinhole, samples: int) -> dict[int, NDArray[np.int32]]:
-    """Find the stages that a view may see, and x0, y0, x1, y1 ``[4]`` of the samples in which it may.
+    """Find the stages that a view may see, each with the box x0, y0, x1, y1 ``[4]`` of its samples.
 
     A straight line enters and leaves a zone, which is a box, through portals and no more than once.
     """
@@ -203,7 +203,7 @@ def find_windows(scene: LitScene, c2w: Array, lens: Pinhole, samples: int) -> di
 
 
 def trace_scene(scene: LitScene, c2w: Array, lens: Pinhole, samples: int) -> tuple[Hits, dict[int, int]]:
-    """Cast rays as :func:`trace` does against the stages that a view may see; and the first id of each of these."""
+    """Cast rays against the stages that a view may see; return the hits and each stage's first shape id."""
     windows = find_windows(scene, c2w, lens, samples)
     parts = [scene.stages[zone].shapes for zone in windows]
     counts = [len(part.kinds) for part in parts]
@@ -229,7 +229,7 @@ def _shadow_map(shapes: ShapeArrays, axes: Array, middle: Array, radius: float, 
 
 
 def light_stage(stage: Stage, mips: tuple[list[Picture], ...] | None = None) -> LitStage:
-    """Prepare a stage: its arrays, smaller textures (``mips`` where they are known), and shadow maps."""
+    """Prepare a stage for rendering: arrays, smaller textures (``mips``, if made already), shadow maps."""
     opaque = pack([s for s in stage.shapes if not s.shell and not s.glow] or stage.shapes[:1])
     extent = bounds(opaque)
     reach = np.linalg.norm(extent, axis=1)
@@ -256,7 +256,7 @@ def light_stage(stage: Stage, mips: tuple[list[Picture], ...] | None = None) -> 
 
 
 def coordinates(shapes: ShapeArrays, ids: NDArray[np.int32], points: Float) -> tuple[Float, Float]:
-    """Compute texture coordinates ``[n,2]`` of points in the shapes' frames, and repeats per world unit ``[n]``."""
+    """Compute texture coordinates ``[n,2]`` of points in shape frames, and texture repeats per world unit ``[n]``."""
     kinds, half = shapes.kinds[ids], shapes.sizes[ids, :3].astype(np.float32)
     x, y, z = points.T
     a, b, c = (np.abs(points) / np.maximum(half, 1e-9)).T
@@ -279,7 +279,7 @@ def coordinates(shapes: ShapeArrays, ids: NDArray[np.int32], points: Float) -> t
 
 
 def paint(view: LitStage, ids: NDArray[np.int32], points: Float, spread: Float) -> Float:
-    """Look up the textures' colours ``[n,3]``, sRGB; ``spread`` is the size of a sample on the surface, world units."""
+    """Look up texture colours ``[n,3]``, sRGB; ``spread``: size of a sample on the surface, world units."""
     uv, repeat = coordinates(view.shapes, ids, points)
     textures = np.array([s.material.texture for s in view.shapes.shapes])[ids]
     size = len(view.mips[0][0])
@@ -308,7 +308,7 @@ def _lookup(texture: Picture, uv: Float) -> Float:
 
 
 def radiance(scene: LitScene, c2w: Array, lens: Pinhole, samples: int) -> Float:
-    """Compute the linear light ``[h,w,3]`` of every pixel."""
+    """Render the linear light ``[h,w,3]`` of a view."""
     hits, firsts = trace_scene(scene, c2w, lens, samples)
     h, w = hits.depth.shape
     out = np.zeros((h * w, 3), np.float32)
@@ -366,7 +366,7 @@ def _shade(view: LitStage, ids: NDArray[np.int32], albedo: Float, world: Float, 
 
 
 def find_exposure(pictures: Sequence[Float], brightness: float) -> float:
-    """Find the factor on linear light that makes the pictures' mean about ``brightness``, sRGB."""
+    """Find the exposure factor at which the pictures' mean is about ``brightness``, sRGB."""
     values = np.concatenate([p.reshape(-1) for p in pictures])
     low, high = 1e-3, 1e3
     for _ in range(30):

@@ -43,17 +43,17 @@ class Shape:
 
 
 def norm(vector: Array) -> float:
-    """Compute the length of a vector, by a sum whose order does not depend on the processor."""
+    """Compute the length of a vector, with the same bits on every processor."""
     return float(np.sqrt((vector * vector).sum()))
 
 
 def rotate(points: Array, rotation: Array) -> Array:
-    """Rotate points ``[n,3]``, by sums whose order does not depend on the processor."""
+    """Rotate points ``[n,3]``, with the same bits on every processor."""
     return np.einsum("nk,ik->ni", points, rotation)
 
 
 def compose(a: Array, b: Array) -> Array:
-    """Multiply two small matrices, by sums whose order does not depend on the processor."""
+    """Multiply two small matrices, with the same bits on every processor."""
     return np.einsum("ik,kj->ij", a, b)
 
 
@@ -95,7 +95,7 @@ def ball(centre: Vector, radii: Vector, material: Material) -> Shape:
 
 
 def column(foot: Vector, height: float, radius: float, material: Material, *, top: float = 1.0) -> Shape:
-    """Make an upright cylinder that stands on ``foot``; its radius at the top is ``top`` times that at the foot."""
+    """Make an upright cylinder or cone on ``foot``; its top radius is ``top`` times ``radius``."""
     x, y, z = foot
     size = (radius * top, height / 2, radius * top, 1 / top)  # the kernel's radii are those at -y, which is up
     return Shape(CONE, size, material, np.array([x, y - height / 2, z]))
@@ -126,7 +126,7 @@ def blob(centre: Vector, radii: Vector, material: Material, rng: np.random.Gener
 def place(
     shapes: Iterable[Shape], at: Vector = (0, 0, 0), *, yaw: float = 0.0, rotation: Array | None = None
 ) -> list[Shape]:
-    """Rotate shapes about the origin, about y by ``yaw`` or by ``rotation``, then move them to ``at``."""
+    """Rotate shapes about the origin, by ``yaw`` about y or by ``rotation``, then move them to ``at``."""
     rotation = axis_rotation(1, yaw) if rotation is None else rotation
     offset = np.asarray(at, float)
     return [
@@ -136,7 +136,7 @@ def place(
 
 @dataclass(frozen=True)
 class ShapeArrays:
-    """m shapes as arguments of the kernel."""
+    """Arrays of m shapes, as the kernel takes them."""
 
     shapes: tuple[Shape, ...]
     kinds: NDArray[np.int32]  # [m]
@@ -147,7 +147,7 @@ class ShapeArrays:
 
 
 def pack(shapes: Sequence[Shape]) -> ShapeArrays:
-    """Put shapes into arrays."""
+    """Convert shapes to arrays."""
     return ShapeArrays(
         tuple(shapes),
         np.array([s.kind for s in shapes], np.int32),
@@ -159,7 +159,7 @@ def pack(shapes: Sequence[Shape]) -> ShapeArrays:
 
 
 def concat(parts: Sequence[ShapeArrays]) -> ShapeArrays:
-    """Put arrays of shapes together."""
+    """Concatenate arrays of shapes."""
     if len(parts) == 1:
         return parts[0]
     columns = zip(*((a.kinds, a.rotations, a.centres, a.sizes, a.waves) for a in parts), strict=True)
@@ -167,7 +167,7 @@ def concat(parts: Sequence[ShapeArrays]) -> ShapeArrays:
 
 
 def bounds(shapes: ShapeArrays) -> Array:
-    """Compute half sizes ``[m,3]`` of the shapes' bounding boxes, in their frames."""
+    """Compute half sizes ``[m,3]`` of the shapes' bounding boxes in shape frames."""
     half = shapes.sizes[:, :3].copy()
     reach = np.abs(shapes.waves[:, :, 4]).sum(1)
     half[shapes.kinds == BLOB] *= 1 + reach[shapes.kinds == BLOB, None]

@@ -53,7 +53,7 @@ Path = Callable[[Stage, np.random.Generator, int], Pose]
 
 
 def look_at(eye: Array, target: Array, roll: float = 0.0) -> Array:
-    """Compute camera to world ``[4,4]``, OpenCV axes, the image's down near +y, rotated by ``roll`` radians."""
+    """Compute camera to world ``[4,4]``, OpenCV axes, upright (y down) but for ``roll`` radians."""
     forward = (target - eye) / norm(target - eye)
     right = np.cross([0.0, 1.0, 0.0], forward)
     right /= norm(right)
@@ -72,7 +72,7 @@ def _orbit_point(stage: Stage, angle: float, distance: float, height: float) -> 
 
 
 def arc(stage: Stage, rng: np.random.Generator, num_views: int, low: float, high: float) -> Pose:
-    """Move along an arc of ``low`` to ``high`` degrees about the focus, or as far as there is room, and up and down."""
+    """Move along an arc of ``low`` to ``high`` degrees around the focus, swaying up and down."""
     limit = MAX_TURN * max(1, num_views - 1)
     span = min(rng.uniform(min(low, limit), min(high, limit)), 2 * stage.swing)
     start = rng.uniform(-stage.swing, stage.swing - span) if span < 2 * stage.swing else -span / 2
@@ -88,7 +88,7 @@ def arc(stage: Stage, rng: np.random.Generator, num_views: int, low: float, high
 
 
 def forward(stage: Stage, rng: np.random.Generator, num_views: int) -> Pose:
-    """Move back and forth in a plane, in one direction of view."""
+    """Move back and forth in a plane with a constant viewing direction."""
     angle, distance = rng.uniform(-0.5, 0.5) * min(stage.swing, 40), rng.uniform(*stage.distance)
     eye = _orbit_point(stage, angle, distance, rng.uniform(*stage.height))
     axes, reach = look_at(eye, stage.focus), rng.uniform(0.06, 0.2) * distance
@@ -103,7 +103,7 @@ def forward(stage: Stage, rng: np.random.Generator, num_views: int) -> Pose:
 
 
 def walk(stage: Stage, rng: np.random.Generator, num_views: int) -> Pose:
-    """Walk from one position towards another, the direction of view varying."""
+    """Walk in a line from one position towards another while the viewing direction varies."""
     side = min(stage.swing, 40)
     a, b = (_orbit_point(stage, rng.uniform(-side, side), d, rng.uniform(*stage.height)) for d in stage.distance[::-1])
     b = a + rng.uniform(0.3, 0.9) * (b - a)
@@ -126,7 +126,7 @@ PATHS: dict[str, Path] = {
 
 
 def is_usable(hits: Hits) -> bool:
-    """Return whether a view is neither inside a shape nor too close to one."""
+    """Return whether a view is outside all shapes and not too close to one."""
     depth = hits.depth[hits.depth < FAR]
     if depth.size < 0.6 * hits.depth.size:
         return False
@@ -164,7 +164,7 @@ class GenerateOptions(Settings):
 
 @dataclass(frozen=True)
 class SyntheticScene:
-    """A scene as a network would export it, with held-out views."""
+    """A scene as a feed-forward network would export it, with held-out views."""
 
     gaussians: Gaussians  # one for each pixel, view-major and row-major
     cameras: Cameras  # as the network estimates them
@@ -177,7 +177,7 @@ class SyntheticScene:
 
 
 def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScene:
-    """Make scene ``index`` of a series; the same arguments give the same bits, on any number of threads."""
+    """Generate scene ``index`` of a series; the same arguments give the same bits on any number of threads."""
     rng = np.random.default_rng([seed, index])
     num_views = int(rng.integers(options.views[0], options.views[1] + 1))
     style = options.style if options.style != MIXED else list(STYLES)[(seed + index) % len(STYLES)]

@@ -22,7 +22,7 @@ Grey: TypeAlias = NDArray[Any]  # float32: square, repeating without a seam, 0 t
 
 
 def enlarge(cells: NDArray[np.float64], size: int) -> Grey:
-    """Enlarge a small repeating picture smoothly to ``[size,size]``."""
+    """Enlarge a small periodic picture smoothly to ``[size,size]``."""
     rows, columns = cells.shape
     pad = 3
     wide = np.pad(cells, pad, mode="wrap").astype(np.float32)
@@ -35,7 +35,7 @@ def enlarge(cells: NDArray[np.float64], size: int) -> Grey:
 def noise(
     rng: np.random.Generator, size: int, *, first: int = 4, fade: float = 0.6, stretch: int = 1, ridged: bool = False
 ) -> Grey:
-    """Add octaves of random cells, each ``fade`` times as strong as the previous one: 0.3 gives clouds, 0.9 grit.
+    """Draw noise as a sum of octaves, each ``fade`` times as strong as the one before: 0.3 gives clouds, 0.9 grit.
 
     ``first`` is the number of cells of the coarsest octave along a side, ``stretch`` the ratio of their length to their
     height; ``ridged`` gives sharp crests, as of rock and bark.
@@ -50,7 +50,7 @@ def noise(
 
 
 def grid(size: int) -> tuple[Grey, Grey]:
-    """Compute x and y of every pixel, 0 to 1."""
+    """Return x and y of every pixel, 0 to 1."""
     at = (np.arange(size, dtype=np.float32) + 0.5) / size
     x, y = np.meshgrid(at, at)
     return x, y
@@ -59,7 +59,7 @@ def grid(size: int) -> tuple[Grey, Grey]:
 def courses(
     rng: np.random.Generator, size: int, rows: int, columns: int, *, joint: float, offset: float
 ) -> tuple[Grey, Grey]:
-    """Draw ``rows`` courses of ``columns`` bricks or tiles: a random tone for each, and 1 on the joints.
+    """Draw ``rows`` courses of ``columns`` bricks or tiles; return a random tone per brick, and a mask of the joints.
 
     ``joint`` is the width of the joints, as a share of a stone's height, and ``offset`` that of each second course, as
     a share of a stone's width.
@@ -75,7 +75,7 @@ def courses(
 
 
 def cells(rng: np.random.Generator, size: int, count: int) -> tuple[Grey, Grey]:
-    """Draw pebbles: a random tone for each of ``count``² cells, and the distance of a pixel from the cell's edge."""
+    """Draw pebbles; return a random tone for each of ``count``² cells, and each pixel's distance to its cell's edge."""
     at = (np.stack(np.meshgrid(np.arange(count), np.arange(count)), -1) + rng.uniform(0, 1, (count, count, 2))) / count
     tones = rng.uniform(0, 1, (count, count)).astype(np.float32)
     x, y = grid(size)
@@ -125,7 +125,7 @@ def color(
     strength: tuple[float, float] = (0.05, 0.6),
     light: tuple[float, float] = (0.2, 0.85),
 ) -> Color:
-    """Draw a random colour ``[3]``: hue 0 to 1 around the circle (None: all, mostly warm ones), saturation, value."""
+    """Draw a random colour ``[3]`` from ranges of hue (0 to 1; None: all, mostly warm), saturation and value."""
     h = rng.uniform(*hue) % 1 if hue is not None else rng.normal(0.08, 0.06) % 1 if rng.random() < 0.5 else rng.random()
     s, v = strength[0] + (strength[1] - strength[0]) * rng.random() ** 1.5, rng.uniform(*light)
     ramp = np.clip(np.abs(np.mod(6 * h + np.array([0, 4, 2]), 6) - 3) - 1, 0, 1)
@@ -139,7 +139,7 @@ def shades(rng: np.random.Generator, base: Color, contrast: float) -> tuple[Colo
 
 
 def mix(low: Color, high: Color, amount: Grey) -> Picture:
-    """Mix two colours, by an amount for each pixel."""
+    """Mix two colours by an ``amount`` per pixel."""
     return low + (high - low) * amount[..., None].astype(np.float32)
 
 
@@ -231,7 +231,7 @@ def cloth(rng: np.random.Generator, size: int) -> Picture:
 
 
 def carpet(rng: np.random.Generator, size: int) -> Picture:
-    """Draw pile, or an ornament of a few colours."""
+    """Draw a carpet: plain pile, or an ornament of a few colours."""
     base = color(rng, strength=(0.1, 0.7), light=(0.2, 0.6))
     out = mix(*shades(rng, base, 0.4), noise(rng, size, first=32, fade=0.95))
     if rng.random() < 0.5:
@@ -360,7 +360,7 @@ KINDS: dict[str, Callable[[np.random.Generator, int], Picture]] = {
 
 
 def pyramid(texture: Picture) -> list[Picture]:
-    """Halve a texture down to 8 pixels, again and again, so that far surfaces do not alias."""
+    """Make mipmaps: halve a texture repeatedly, down to 8 pixels."""
     out: list[Picture] = [np.ascontiguousarray(texture, np.float32)]
     while len(out[-1]) > 8:
         half = len(out[-1]) // 2
@@ -381,7 +381,7 @@ class Palette:
     by_kind: dict[str, list[int]] = field(default_factory=dict)  # their indices
 
     def material(self, *kinds: str, repeat: float = 0.0, gloss: float | None = None) -> Material:
-        """Make a material of one of the kinds: with a new texture, or an old one if the scene has enough of the kind.
+        """Make a material of one of the kinds, with a new texture, or an old one if the kind has enough.
 
         ``repeat`` is in repeats per world unit, 0: once over every face. ``gloss`` None is drawn at random, mostly
         none.

@@ -42,7 +42,7 @@ from gsmerge.types import SH_C0, Cameras, FeatureGaussians, Gaussians, Matches
 
 @dataclass(frozen=True)
 class ColorMap:
-    """A change of all colours of a scene and of its photos, under which renders change as photos do."""
+    """A linear change of colours, applied alike to a scene and its photos."""
 
     order: tuple[int, ...] = (0, 1, 2)  # channel that each channel takes
     gain: float = 1.0  # below 0: the negative
@@ -60,7 +60,7 @@ class ColorMap:
 
 @dataclass(frozen=True, eq=False)
 class Example:
-    """A scene to learn from, or some of its views."""
+    """A scene to learn from, or a subset of its views."""
 
     name: str  # of the scene
     unit: float  # median depth of the Feature Gaussians: the scene's unit of length, in canonical units
@@ -76,11 +76,11 @@ class Example:
     colors: ColorMap = ColorMap()  # of the photos, whose bytes stay as they are
 
     def mask(self, photo: int) -> np.ndarray:
-        """Mark the pixels ``[h,w]`` of a photo that the views cover."""
+        """Return a mask ``[h,w]`` of a photo's pixels that the views cover."""
         return covered_pixels(self.covers[:, photo])
 
     def photo_ids(self, *, novel: bool) -> list[int]:
-        """List the photos with a pixel that the views cover: their own, or those of novel views."""
+        """List the photos that the views cover in part: the views' own photos, or those of ``novel`` views."""
         span = range(len(self.cameras), len(self.photos)) if novel else range(len(self.cameras))
         return [photo for photo in span if self.mask(photo).any()]
 
@@ -88,7 +88,7 @@ class Example:
 def make_examples(
     path: Path, options: TrainOptions, progress: Progress | None = None
 ) -> Iterator[tuple[str, Callable[[], Example]]]:
-    """Yield a short name, unique in the scene, and a maker of each example, see :func:`make_example`.
+    """Yield (name, maker) of each example of a scene; see :func:`make_example`.
 
     There is one for each number of views and every density of the ``options``. Photos of a folder ``targets`` next to
     the ``.ply``, with their cameras, are novel views. A SceneError if the scene cannot be read, is not one Gaussian per
@@ -110,7 +110,7 @@ def make_examples(
 
 
 def scene_name(path: Path) -> str:
-    """Name a scene as its folder, with the name of the file if the path is a file."""
+    """Name a scene after its folder, and its file if the path is a file."""
     path = path.absolute()
     return f"{path.parent.name}-{path.stem}" if path.is_file() else path.name
 
@@ -118,7 +118,7 @@ def scene_name(path: Path) -> str:
 def make_example(
     training: TrainingScene, options: TrainOptions, density: float, name: str, progress: Progress | None = None
 ) -> Example:
-    """Segment and encode a scene without networks; where a loss uses a fit, match, merge and fit it too.
+    """Make an example: segment and encode a scene without networks; if a loss uses a fit, merge and fit it as well.
 
     ``density`` is in superpixels per pixel; ``progress`` is called with (step, steps) of the fit. A SceneError if the
     fit does not improve held-out parts of the photos.
@@ -144,7 +144,7 @@ def make_example(
 
 
 def select_views(example: Example, ids: Sequence[int]) -> Example:
-    """Keep the views ``ids``, ascending, of an example without a fit; the photos of the others become novel views."""
+    """Keep the views ``ids`` (ascending) of an example without a fit; photos of other views become novel ones."""
     views, pixels = len(example.cameras), example.cameras.width * example.cameras.height
     if len(ids) == views:
         return example
@@ -170,7 +170,7 @@ def select_views(example: Example, ids: Sequence[int]) -> Example:
 
 
 def draw_views(example: Example, options: TrainOptions, rng: np.random.Generator) -> Example:
-    """Draw a random subset of the views, see ``options.random_views`` (paper supplement C); the example without it."""
+    """Draw a random subset of an example's views, as ``options.random_views`` says (paper supplement C)."""
     if not options.random_views:
         return example
     least, most = (min(count, len(example.cameras)) for count in options.random_views)
@@ -179,7 +179,7 @@ def draw_views(example: Example, options: TrainOptions, rng: np.random.Generator
 
 
 def recolor(example: Example, rng: np.random.Generator) -> Example:
-    """Draw other colours for a scene and its photos: channels in any order, less contrast, or the negative."""
+    """Change the colours of a scene and its photos at random: channels permuted, contrast reduced, or inverted."""
     gain = float(rng.uniform(0.6, 1))
     low, inverted = float(rng.uniform(0, 1 - gain)), bool(rng.random() < 0.5)
     colors = ColorMap(tuple(rng.permutation(3).tolist()), -gain if inverted else gain, low + gain * inverted)

@@ -69,7 +69,7 @@ class TrainingRun:
 
 
 def validate(networks: Networks, shards: Sequence[Shard], run: TrainingRun, out: Path) -> Row:
-    """Measure the PSNR of renders without and with networks, and the share of Feature Gaussians that these merged.
+    """Measure the PSNR of renders with and without networks, and the share of Feature Gaussians that were merged.
 
     Where a loss uses the fit, also the loss of corrections, and the explained share of the targets' squares for each
     kind of correction. A ``validation-NAME.png`` for each scene shows a photo, its analytic and its learned render.
@@ -129,7 +129,7 @@ def _write_picture(path: Path, networks: Networks, example: Example, options: Tr
 
 @dataclass(frozen=True, eq=False)
 class TrainingState:
-    """Everything that a step changes: networks, running mean of their weights, and the optimiser's moments."""
+    """What a training step changes: networks, running means of their weights, and the optimiser's moments."""
 
     networks: Networks
     smooth: Networks
@@ -143,7 +143,7 @@ class TrainingState:
 
 @dataclass(frozen=True)
 class TrainResult:
-    """Files and figures of a run."""
+    """Files and figures of a training run."""
 
     best: Path  # checkpoint with the highest PSNR of validation; before renders are compared, with the least loss
     last: Path  # checkpoint of the last step
@@ -167,7 +167,7 @@ def train(
     processes: Processes = ALONE,
     progress: Progress | None = None,
 ) -> TrainResult:
-    """Train networks, or resume the run in the folder.
+    """Train networks, or continue the run in the folder.
 
     Args:
         shards: Examples to learn from, at least one.
@@ -202,7 +202,7 @@ def train(
 
 
 def choose_device(name: str) -> str:
-    """Choose the device that ``"cpu"``, ``"cuda"`` or ``"auto"`` (CUDA if torch finds it) means on this machine.
+    """Choose the torch device for ``"cpu"``, ``"cuda"`` or ``"auto"`` (CUDA if torch finds it).
 
     A ValueError if the name is unknown, or is "cuda" and torch finds no CUDA device.
     """
@@ -273,7 +273,7 @@ def _save(out: Path, state: TrainingState, rows: Sequence[Row], head: Mapping[st
 
 
 def is_best(rows: Sequence[Row], options: TrainOptions) -> bool:
-    """Return whether the last row is the best one: among the rows that compared renders, if it did."""
+    """Return whether the last row is the best, counting only rows with render scores once there are any."""
     *before, last = rows
     if last["step"] > options.photo_step:
         earlier = [row["psnr_learned"] for row in before if row["step"] > options.photo_step]
@@ -351,7 +351,7 @@ def _loss(networks: Networks, example: Example, run: TrainingRun, step: int, rng
 
 
 def save_state(path: Path, state: TrainingState, facts: Mapping[str, Any]) -> None:
-    """Write weights, their means, moments and facts about the run in place of an existing file."""
+    """Write weights, running means, moments and facts about the run to a file, replacing it."""
     tensors: dict[str, torch.Tensor] = {}
     for name, parameter, mean in state.pairs():
         moments = state.optimizer.state[parameter]
@@ -362,7 +362,7 @@ def save_state(path: Path, state: TrainingState, facts: Mapping[str, Any]) -> No
 
 
 def load_state(path: Path, state: TrainingState) -> dict[str, Any]:
-    """Read weights, means and moments into ``state``, and return the facts about the run.
+    """Read weights, running means and moments into ``state``; return the facts about the run.
 
     A SceneError if the file is damaged or of other networks.
     """

@@ -78,7 +78,7 @@ def _unit_features(image: Tensor, layers: tuple[Layer, ...], kernels: list[Tenso
 
 
 def target_scales(every: Iterable[Mapping[int, Targets]]) -> dict[int, Tensor]:
-    """Compute the standard deviation of every column of the targets of each K, ``[13]``, at least a thousandth."""
+    """Compute the standard deviation ``[13]`` of the targets' columns for each K, at least a thousandth."""
     sums: dict[int, Tensor] = {}
     for levels in every:
         for k, targets in levels.items():
@@ -92,7 +92,7 @@ def target_scales(every: Iterable[Mapping[int, Targets]]) -> dict[int, Tensor]:
 def scaled_corrections(
     crop: Crop, prediction: Prediction, scales: Mapping[int, Tensor], options: TrainOptions
 ) -> tuple[Tensor, Tensor]:
-    """Compute corrections and targets of the scored children, both ``[j,13]``, in standard deviations of the targets.
+    """Compute corrections and targets of the scored children, both ``[j,13]``, in units of the targets' deviations.
 
     Corrections are those of all stages together, from the analytic children. Targets are clamped to the bounds of the
     networks, and to a few standard deviations.
@@ -106,7 +106,7 @@ def scaled_corrections(
 
 
 def correction_loss(corrections: Tensor, targets: Tensor, options: TrainOptions) -> Tensor:
-    """Compute the mean smooth L1 of corrections ``[j,13]``; 0 of none."""
+    """Compute the mean smooth L1 of corrections ``[j,13]`` against targets; 0 if there are none."""
     weights = torch.ones(RESIDUAL)
     weights[ROTATION] = options.turn_weight
     losses = torch.nn.functional.smooth_l1_loss(corrections, targets, reduction="none") * weights
@@ -115,7 +115,7 @@ def correction_loss(corrections: Tensor, targets: Tensor, options: TrainOptions)
 
 @dataclass(frozen=True, eq=False)
 class WindowLoss:
-    """The loss of a window, and the part of it that holds siblings apart, each with its weight."""
+    """Loss of a window; ``diversity`` is the part that keeps siblings apart. Weights are included."""
 
     total: Tensor
     diversity: Tensor
@@ -129,7 +129,7 @@ def window_loss(
     step: int,
     rng: np.random.Generator,
 ) -> WindowLoss:
-    """Compute the loss of a window of a photo: its render on a random background, and the regularizers.
+    """Compute the loss of a window: its render on a random background against the photo, plus regularizers.
 
     ``scales`` are the standard deviations of the targets of each K, see :func:`target_scales`.
     """
@@ -154,7 +154,7 @@ MAX_DB = 100.0  # PSNR of windows without an error
 
 
 def draw_window(gaussians: Gaussians, window: Window, background: np.ndarray) -> Tensor:
-    """Render a window ``[h,w,3]``, differentiable."""
+    """Render a window ``[h,w,3]``, differentiable in the Gaussians."""
     eps2d = window.crop.example.photos.eps2d
     camera = window.camera.to("cpu")
     return render_tensors(gaussians, camera, background, with_depths=False, eps2d=eps2d, near=NEAR).images[0]
@@ -184,7 +184,7 @@ def photometric_loss(image: Tensor, window: Window, options: TrainOptions, step:
 
 
 def render_window(window: Window, networks: Networks | None, options: TrainOptions) -> tuple[Tensor, float]:
-    """Render a window ``[h,w,3]`` on black within [0, 1], and return it with the share of Feature Gaussians merged.
+    """Render a window ``[h,w,3]`` on black, clipped to [0, 1]; also return the share of Feature Gaussians merged.
 
     Without networks the analytic stages alone are used, and the share is 0.
     """
@@ -206,7 +206,7 @@ def window_psnr(window: Window, image: Tensor) -> float:
 
 
 def teacher_loss(prediction: Prediction, members: Members) -> Tensor:
-    """Measure the distance of Gaussians from the moments of the groups that they stand for (paper section 4.6).
+    """Compute the distance of Gaussians from the moments of their groups (paper section 4.6).
 
     The teacher of a group is one Gaussian with the opacity-weighted mean and covariance of its members' means (eq.
     teacher_mean, teacher_cov). The loss is the angle between the rotations, and the L1 distance of the means, in
@@ -240,9 +240,9 @@ GEOMETRY, OPACITY = 0.75, 0.25  # weights of the two terms of the diversificatio
 def diversity_loss(gaussians: Gaussians, parents: Tensor, sizes: Tensor, unit: float | None = None) -> Tensor:
     """Penalise siblings that overlap too much or too little, or differ in opacity (paper supplement D).
 
-    ``parents [n]`` are those of n children, ascending. Pairs are weighted by their volumes, in the paper in the world's
-    units; in a scene's ``unit`` of length, those of a million small Gaussians leave nothing of the loss. None: in the
-    ``sizes [n]`` of their groups, which start near 1, and without a gradient: small siblings are no goal.
+    ``parents [n]`` of the children are ascending. Pairs are weighted by their volumes: in ``unit``, a length of the
+    scene, or, if None, in the ``sizes [n]`` of their groups, without a gradient, since small siblings are no goal. In
+    the paper's world units the weights of a million small Gaussians leave nothing of the loss.
     """
     left, right = sibling_pairs(parents)
     if len(left) == 0:
@@ -267,7 +267,7 @@ def sibling_pairs(parents: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def overlap_profile(gaussians: Gaussians, left: Tensor, right: Tensor) -> Tensor:
-    """Compute the paper's U-shaped profile of pairs ``[p]``: 0 where their boxes overlap by half.
+    """Compute the paper's U-shaped overlap penalty of pairs ``[p]``: 0 where their boxes overlap by half.
 
     Boxes are those of one standard deviation along the world's axes, as in matching.
     """

@@ -30,7 +30,7 @@ def mlp(*widths: int) -> nn.Sequential:
 
 
 def zero_init(layer: nn.Linear) -> nn.Linear:
-    """Set a layer's weights and bias to zero: until trained, it corrects nothing."""
+    """Set a layer's weights and bias to zero, so that it corrects nothing before training."""
     nn.init.zeros_(layer.weight)
     nn.init.zeros_(layer.bias)
     return layer
@@ -45,7 +45,7 @@ class Attention(nn.Module):
         self.query, self.pair, self.out = nn.Linear(width, width), nn.Linear(width, 2 * width), nn.Linear(width, width)
 
     def forward(self, x: Tensor, context: Tensor, mask: Tensor) -> Tensor:
-        """Return the mixed values ``[b,q,w]``."""
+        """Return the attended values ``[b,q,w]``."""
         key, value = self.pair(context).chunk(2, -1)
         split = [t.unflatten(-1, (self.heads, -1)).transpose(1, 2) for t in (self.query(x), key, value)]
         mixed = scaled_dot_product_attention(split[0], split[1], split[2], attn_mask=mask[:, None, None])
@@ -74,7 +74,7 @@ class AttentionBlock(nn.Module):
 
 
 class Pooling(nn.Module):
-    """Reduction of a set to one token by a learned query (paper fig. architecture: PMA)."""
+    """Reduce a set to one token by attention from a learned query (paper fig. architecture: PMA)."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -108,7 +108,7 @@ class SetNetwork(nn.Module):
 
 
 class Encoder(nn.Module):
-    """Network from the members of a group to its latent and a shift of its mean."""
+    """Network from a group's members to the group's latent and a shift of its mean."""
 
     def __init__(self, options: NetworkOptions) -> None:
         super().__init__()
@@ -116,7 +116,7 @@ class Encoder(nn.Module):
         self.latent, self.shift = nn.Linear(options.width, options.latent), zero_init(nn.Linear(options.width, 3))
 
     def forward(self, tokens: Tensor, mask: Tensor, group: Tensor) -> tuple[Tensor, Tensor]:
-        """Return raw latent ``[b,latent]`` and raw shift ``[b,3]``."""
+        """Return the raw latent ``[b,latent]`` and the raw shift ``[b,3]``."""
         hidden = nn.functional.gelu(self.set(tokens, mask, group))
         return self.latent(hidden), self.shift(hidden)
 
@@ -141,7 +141,7 @@ class Head(nn.Module):
 
 
 class Merger(nn.Module):
-    """Network from the Feature Gaussians of a cluster to corrections of its start, and of that one's latent."""
+    """Network from the Feature Gaussians of a cluster to corrections of the pooled one and its latent."""
 
     def __init__(self, options: NetworkOptions) -> None:
         super().__init__()
@@ -154,7 +154,7 @@ class Merger(nn.Module):
 
 
 class Refiner(nn.Module):
-    """Network from a Feature Gaussian and its nearest neighbours to corrections of it and of its latent."""
+    """Network from a Feature Gaussian and its nearest neighbours to corrections of it and its latent."""
 
     def __init__(self, options: NetworkOptions) -> None:
         super().__init__()
@@ -176,7 +176,7 @@ class Refiner(nn.Module):
 
 
 class Networks(nn.Module):
-    """The networks of a checkpoint, None for each that the options leave out."""
+    """The torch modules of a checkpoint; None for networks that the options leave out."""
 
     def __init__(self, options: NetworkOptions | None = None) -> None:
         super().__init__()

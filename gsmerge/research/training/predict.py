@@ -48,24 +48,24 @@ MIN_GAP = 1e-3  # least difference of two squared scales that turns axes, as a s
 
 
 def features_to_tensors(features: FeatureGaussians) -> FeatureGaussians:
-    """Return Feature Gaussians whose columns that networks change are tensors."""
+    """Convert the columns of Feature Gaussians that networks change to tensors."""
     columns: dict[str, Array] = {name: as_tensor(getattr(features, name)) for name in CORRECTED}
     return replace(features, **columns)
 
 
 def features_to_arrays(features: FeatureGaussians) -> FeatureGaussians:
-    """Return Feature Gaussians without gradients."""
+    """Convert the columns of Feature Gaussians that are tensors to arrays, without gradients."""
     return replace(features, **{name: as_array(getattr(features, name)) for name in CORRECTED})
 
 
 def groups_to_arrays(groups: GroupFeatures) -> GroupFeatures:
-    """Return what networks read of groups without gradients."""
+    """Convert the networks' inputs to arrays, without gradients."""
     numbers = {name: as_array(getattr(groups, name)) for name in ("frames", "sizes", "group")}
     return replace(groups, features=features_to_arrays(groups.features), base=groups.base.numpy(), **numbers)
 
 
 def differentiate_axes(covars: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute scales ``[g,3]``, rising, and quaternions ``[g,4]`` of covariances ``[g,3,3]``, differentiable.
+    """Compute scales ``[g,3]`` (rising) and quaternions ``[g,4]`` of covariances ``[g,3,3]``, differentiable.
 
     Values are those of :func:`gsmerge.moments.principal_axes`; gradients are of first-order perturbation theory. Axes
     of nearly equal scales have no direction, so their turn is held back.
@@ -84,7 +84,7 @@ def differentiate_axes(covars: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def differentiate_base(features: FeatureGaussians) -> Gaussians:
-    """Decode Feature Gaussians as :func:`gsmerge.moments.feature_to_gaussians` does, differentiable."""
+    """Decode Feature Gaussians like :func:`gsmerge.moments.feature_to_gaussians`, differentiable."""
     scales, quats = differentiate_axes(features.covars)
     depths = features.extinctions * as_tensor(features.gains) / (scales[:, 1] * scales[:, 2])
     opacities = (1 - torch.exp(-depths)).clamp(0, MAX_OPACITY)
@@ -92,7 +92,7 @@ def differentiate_base(features: FeatureGaussians) -> Gaussians:
 
 
 def differentiate_groups(features: FeatureGaussians, inputs: GroupFeatures, viewmats: np.ndarray) -> GroupFeatures:
-    """Compute what networks read of groups, differentiable, from the ``inputs`` of the same groups as arrays."""
+    """Compute the networks' inputs for groups, differentiable, given the same inputs as arrays (``known``)."""
     chosen = torch.from_numpy(viewmats[inputs.views]).float()
     base, frames = differentiate_base(features), _differentiate_frames(features.means, chosen, inputs.frames)
     sizes = gaussian_sizes(base.scales).clamp_min(TINY)
@@ -129,7 +129,7 @@ def _differentiate_frames(means: Tensor, viewmats: Tensor, values: np.ndarray) -
 def differentiate_tokens(
     parts: Gaussians, ids: np.ndarray, owners: np.ndarray, group_features: GroupFeatures
 ) -> Tensor:
-    """Describe Gaussians relative to groups, ``[n,13]``, as :func:`gsmerge.networks.tokens.part_tokens` does."""
+    """Make tokens ``[n,13]`` like :func:`gsmerge.networks.tokens.part_tokens`, differentiable."""
     g, owner_ids = group_features, torch.from_numpy(owners)
     chosen = parts[torch.from_numpy(ids)]
     back = g.frames[owner_ids].transpose(1, 2)
@@ -159,7 +159,7 @@ def _log_ratio(values: Tensor, units: Tensor) -> Tensor:
 
 
 def move_feature_tensors(group_features: GroupFeatures, residuals: Tensor) -> FeatureGaussians:
-    """Apply corrections ``[g,14]`` as :func:`gsmerge.networks.corrections.move_features` does, differentiable."""
+    """Apply corrections ``[g,14]`` like :func:`gsmerge.networks.corrections.move_features`, differentiable."""
     g, f = group_features, group_features.features
     turns = _rotations(rotate_vectors(g.frames, residuals[:, ROTATION]))
     axes, logs = quat_to_rotmat(g.base.quats), residuals[:, SIZE]
@@ -187,7 +187,7 @@ def _rotations(vectors: Tensor) -> Tensor:
 
 
 def pool_tensors(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray) -> FeatureGaussians:
-    """Pool runs of rows as :func:`gsmerge.stages.merge.pool_runs` does, differentiable."""
+    """Pool runs of rows like :func:`gsmerge.stages.merge.pool_runs`, differentiable."""
     pooled = pool_runs(features_to_arrays(features), order, cuts)
     run = torch.from_numpy(np.repeat(np.arange(len(cuts)), np.diff(np.append(cuts, len(order)))))
     weights = torch.from_numpy(np.maximum(features.weights[order].astype(np.float64) * features.gains[order], 1e-12))
@@ -208,9 +208,9 @@ def pool_tensors(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray
 
 
 def make_round_tensors(parents: np.ndarray, group_features: GroupFeatures, children: Gaussians) -> Gaussians:
-    """Make the Gaussians that absolute heads correct, see :func:`gsmerge.networks.apply.prepare_children`.
+    """Make the round Gaussians that absolute heads correct; see :func:`gsmerge.networks.apply.prepare_children`.
 
-    ``children`` are the same ``n`` Gaussians as arrays.
+    ``known`` are the same ``n`` Gaussians as arrays.
     """
     parent_ids, base, same = torch.from_numpy(parents), group_features.base, children.to("cpu")
     frames = group_features.frames[parent_ids]
@@ -225,7 +225,7 @@ def make_round_tensors(parents: np.ndarray, group_features: GroupFeatures, child
 
 
 class TrainingContext(NetworkContext):
-    """The networks and their inputs, with the stages' formulas on tensors."""
+    """Networks and their inputs for training: the stages' formulas on tensors, with gradients."""
 
     def make_base(self, features: FeatureGaussians) -> Gaussians:
         """Decode every Feature Gaussian into one Gaussian of tensors."""
@@ -239,7 +239,7 @@ class TrainingContext(NetworkContext):
     def make_tokens(
         self, parts: Gaussians | Members, ids: np.ndarray, owners: np.ndarray, group_features: GroupFeatures
     ) -> Array:
-        """Describe Gaussians as tensors; members as arrays, since no network comes before the encoder."""
+        """Make tokens of Gaussians as tensors; those of members are arrays, as no network comes before the encoder."""
         if isinstance(parts, Gaussians):
             return differentiate_tokens(parts, ids, owners, group_features)
         return super().make_tokens(parts, ids, owners, groups_to_arrays(group_features))
@@ -251,7 +251,7 @@ class TrainingContext(NetworkContext):
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """A crop's children, corrected by the networks."""
+    """The children of a crop, corrected by the networks."""
 
     gaussians: Gaussians  # n corrected children, tensors with gradients
     parents: Tensor  # [n] int64, the merged Feature Gaussian of each, ascending
@@ -263,10 +263,10 @@ class Prediction:
 
 
 def predict(crop: Crop, networks: Networks, options: TrainOptions, seed: int) -> Prediction:
-    """Run a crop through all networks; each stage reads the results of those before it, and passes gradients on.
+    """Run a crop through all networks with gradients; each stage reads the results of the stages before.
 
-    Analytic children of K > 1 are pooled again from the members, so earlier stages reach those of residual heads
-    through what the heads read alone.
+    Analytic children of K > 1 are pooled again from the members, so gradients reach earlier stages only through what
+    residual heads read.
     """
     example = crop.example
     context = TrainingContext(networks, example.members, example.cameras, seed)
@@ -308,7 +308,7 @@ def _make_children(
 
 
 def analytic_gaussians(crop: Crop, matches: Matches) -> Gaussians:
-    """Decode a crop's children without networks."""
+    """Decode the children of a crop without networks."""
     merged = merge(take(crop.example.features, crop.rows), matches)
     return divide(merged, crop.example.members, np.full(len(merged), crop.k))[0]
 
@@ -316,7 +316,7 @@ def analytic_gaussians(crop: Crop, matches: Matches) -> Gaussians:
 def match_crop(
     crop: Crop, parts: FeatureGaussians, options: TrainOptions, networks: Networks | None = None, seed: int = 0
 ) -> Matches:
-    """Match the r Feature Gaussians ``parts`` of a crop, unless its clusters were fitted and so are known."""
+    """Match the Feature Gaussians ``parts`` of a crop, or return the clusters that its example was fitted with."""
     matches = crop.example.matches
     if matches is not None:
         ids, local = np.unique(matches.clusters[crop.rows], return_inverse=True)
@@ -328,7 +328,7 @@ def match_crop(
 
 
 def crop_targets(crop: Crop) -> tuple[Tensor, Tensor]:
-    """Return the fit's corrections of a crop's children, ``[n,13]``, and a mask ``[n]`` of those that count."""
+    """Return target corrections ``[n,13]`` of a crop's children, and a mask ``[n]`` of children that count."""
     matches = crop.example.matches
     assert matches is not None
     rows, targets = merged_rows(matches), crop.example.targets[crop.k]
@@ -340,7 +340,7 @@ def crop_targets(crop: Crop) -> tuple[Tensor, Tensor]:
 
 
 def merged_rows(matches: Matches) -> np.ndarray:
-    """Find the row after merging of every Feature Gaussian before merging, ``[g]``."""
+    """Return the row ``[g]`` after merging of each Feature Gaussian before merging."""
     alone, order, cuts = cluster_runs(matches)
     rows = np.empty(len(matches.clusters), np.int64)
     rows[alone] = np.arange(len(alone))

@@ -19,22 +19,22 @@ TIMEOUT = timedelta(days=2)  # of waiting for a process that still prepares exam
 
 @dataclass(frozen=True)
 class Processes:
-    """The processes of a run, of which one takes every ``count``-th item; alone without ``torchrun``."""
+    """The processes of a training run, each taking every ``count``-th item; one process without ``torchrun``."""
 
     rank: int = 0  # of this process
     count: int = 1
 
     def require_even(self, crops: int) -> None:
-        """Raise a ValueError for a number of crops per step that the processes cannot share evenly."""
+        """Raise ValueError if the processes cannot share ``crops`` per step evenly."""
         if crops % self.count:
             raise ValueError(f"crops: expected a multiple of the {self.count} processes, got {crops}")
 
     def share(self, items: Sequence[T]) -> Sequence[T]:
-        """Return the items of this process."""
+        """Return this process's share of the items."""
         return items[self.rank :: self.count]
 
     def gather(self, results: list[T]) -> list[T]:
-        """Collect the results for all items, in their order, from those for each process's share."""
+        """Collect the results of all processes, in the order of the items."""
         if self.count == 1:
             return results
         parts: list[Any] = [None] * self.count
@@ -45,7 +45,7 @@ class Processes:
         return merged  # type: ignore[return-value]
 
     def gather_rows(self, rows: Tensor) -> Tensor:
-        """Collect the rows ``[n,d]`` for all items, in their order, from ``[n/count,d]`` of each process's share."""
+        """Collect rows ``[n/count,d]`` of all processes to ``[n,d]``, in the order of the items."""
         if self.count == 1:
             return rows
         parts = [torch.empty_like(rows) for _ in range(self.count)]
@@ -58,7 +58,7 @@ ALONE = Processes()
 
 @contextmanager
 def join_processes(device: str) -> Iterator[Processes]:
-    """Meet the other processes that ``torchrun`` has started, if any, over gloo or, on ``"cuda"``, NCCL."""
+    """Connect to the other processes that ``torchrun`` started, if any, over gloo or, on ``"cuda"``, NCCL."""
     if not {"RANK", "WORLD_SIZE", "MASTER_ADDR"} <= os.environ.keys() or os.environ["WORLD_SIZE"] == "1":
         yield ALONE
         return
@@ -72,5 +72,5 @@ def join_processes(device: str) -> Iterator[Processes]:
 
 
 def local_count() -> int:
-    """Return the number of processes of the run on this machine; 1 without ``torchrun``."""
+    """Return the number of this run's processes on this machine; 1 without ``torchrun``."""
     return int(os.environ.get("LOCAL_WORLD_SIZE", "1"))

@@ -23,7 +23,7 @@ OPAQUE = 0.5  # alpha from which the Gaussians cover a pixel
 
 @dataclass(frozen=True, eq=False)
 class TrainingScene:
-    """Some views of a scene, in the canonical frame, and the photos of all."""
+    """The chosen views of a scene, in the canonical frame, with all photos of the scene."""
 
     scene: Scene  # the chosen views
     members: Members  # its Gaussians
@@ -31,20 +31,20 @@ class TrainingScene:
     images: np.ndarray  # [p,h,w,3] float32, at the size of the scene's own
 
     def photos(self, level: float = 1) -> Photos:
-        """Prepare all photos, each side divided by ``level``."""
+        """Return all photos with sides divided by ``level``."""
         names = tuple(map(str, range(len(self.cameras))))
         unaligned = Scene(self.scene.gaussians[:0], self.cameras, self.images, None, names)
         return scene_photos(unaligned, level)
 
 
 def view_subsets(num_views: int, counts: Sequence[int]) -> list[list[int]]:
-    """Choose views of each count, evenly spread; 0, or more than there are, means all. Each selection comes once."""
+    """Choose evenly spread views for each of the ``counts`` (0 or too many: all), without repeated selections."""
     chosen = [even_views(num_views, count if 0 < count < num_views else num_views) for count in counts]
     return [ids for i, ids in enumerate(chosen) if ids not in chosen[:i]]
 
 
 def make_training_scene(scene: Scene, ids: Sequence[int], held_out: Views | None = None) -> TrainingScene:
-    """Prepare the views ``ids`` of a scene with one Gaussian per pixel, with all its photos.
+    """Prepare the views ``ids`` of an aligned scene for training, with all photos of the scene.
 
     Photos of ``held_out`` views are added, resized to the scene's own.
     """
@@ -63,7 +63,7 @@ def make_training_scene(scene: Scene, ids: Sequence[int], held_out: Views | None
 
 
 def coverage(training: TrainingScene, level: float = 1) -> np.ndarray:
-    """Measure how much of every photo each chosen view covers, ``[v,p,h,w]`` uint8.
+    """Measure the share of each photo's pixels that each chosen view covers, ``[v,p,h,w]`` uint8.
 
     Values are the opacity of the view's Gaussians times 255, and 0 on surfaces that the view does not see. The
     transmittances of views multiply, so this tells what any subset of them covers. ``level`` divides the photos' sides.
@@ -84,7 +84,7 @@ def coverage(training: TrainingScene, level: float = 1) -> np.ndarray:
 
 
 def covered_pixels(covers: np.ndarray) -> np.ndarray:
-    """Mark the pixels that views cover together, from ``covers [v,...]`` of :func:`coverage`."""
+    """Return a mask of the pixels that the views cover together, given ``covers [v,...]`` of :func:`coverage`."""
     left = np.ones(covers.shape[1:], np.float32)
     for cover in covers:
         left *= 1 - cover.astype(np.float32) / 255
@@ -92,7 +92,7 @@ def covered_pixels(covers: np.ndarray) -> np.ndarray:
 
 
 def reduced_masks(masks: np.ndarray, photos: Photos) -> np.ndarray:
-    """Reduce masks ``[p,h,w]`` to the size of smaller photos: pixels of which more than half is in the mask."""
+    """Shrink masks ``[p,h,w]`` to the size of ``photos``; a pixel is True if more than half of it is."""
     size = photos.width, photos.height
     small = [cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5 for mask in masks]
     return np.stack(small)

@@ -53,7 +53,7 @@ ORDER = 2**32 + 1  # takes the place of the step in the seed of the order's rand
 
 @dataclass(frozen=True)
 class Shard:
-    """A file with an example."""
+    """File that stores one example."""
 
     path: Path
     scene: str  # name of the scene
@@ -67,7 +67,7 @@ def prepare_shards(
     processes: Processes = ALONE,
     report: Report | None = None,
 ) -> list[Shard]:
-    """Return the shards of all scenes, in their order, and make those that are missing, shared by all processes.
+    """Return the shards of all scenes in order; missing ones are made, the work shared by all processes.
 
     ``scenes`` are folders or ``.ply`` files; ``report`` is called with (words, step, steps). A SceneError if a scene
     cannot be used, or the folder cannot be written.
@@ -104,7 +104,7 @@ def _scene_shards(scene: Path, options: TrainOptions, folder: Path, report: Repo
 
 
 def scene_key(scene: Path, options: TrainOptions) -> str:
-    """Hash a scene's files and the settings that its examples depend on; a SceneError if there is no scene."""
+    """Return a hash of a scene's files and the settings that its examples depend on; SceneError without a scene."""
     names = (*SETTINGS, *FIT_SETTINGS) if options.uses_fit else SETTINGS
     head = {"layout": LAYOUT, "gsmerge": __version__, "fit": options.uses_fit, "views": options.example_views}
     head |= {name: getattr(options, name) for name in names}
@@ -133,7 +133,7 @@ def _content_hash(path: Path) -> str | None:
 
 
 def write_shard(path: Path, example: Example) -> str:
-    """Write an example, in place of an existing file, and return the hash of its arrays; a SceneError if that fails."""
+    """Write an example to a file, replacing it, and return the hash of its arrays; SceneError if that fails."""
     arrays = dict(_arrays(example))
     facts = {"layout": LAYOUT, "sha256": hash_arrays(arrays), "unit": example.unit, "eps2d": example.photos.eps2d}
     facts |= {"size": [example.cameras.width, example.cameras.height], "levels": list(example.targets)}
@@ -169,7 +169,7 @@ def hash_arrays(arrays: Mapping[str, np.ndarray]) -> str:
 
 
 def read_shard(shard: Shard, *, check: bool = True) -> Example:
-    """Read the example of a shard; ``check`` compares the arrays with their hash.
+    """Read the example of a shard; ``check``: compare the arrays with their hash.
 
     A SceneError if the file is missing, damaged, or another than when the run began.
     """
@@ -209,14 +209,14 @@ def _read(path: Path, prefix: str = "") -> tuple[dict[str, np.ndarray], dict[str
 
 
 def read_targets(shard: Shard) -> dict[int, Targets]:
-    """Read the targets alone of a shard's example; a SceneError if the file is missing or damaged."""
+    """Read only the targets of a shard's example; SceneError if the file is missing or damaged."""
     arrays, facts = _read(shard.path, "targets.")
     names = [f.name for f in fields(Targets)]
     return {k: Targets(*(arrays[f"targets.{k}.{n}"] for n in names)) for k in facts["levels"]}
 
 
 class ExampleStreams:
-    """Streams of examples, one for each of some of a step's crops."""
+    """Streams of examples from shards, one stream for each crop that this process draws per step."""
 
     def __init__(self, shards: Sequence[Shard], options: TrainOptions, crops: Sequence[int]) -> None:
         self.shards, self.options, self.crops = shards, options, crops
@@ -225,7 +225,7 @@ class ExampleStreams:
         self.checked: set[int] = set()
 
     def move_to(self, step: int) -> None:
-        """Read what the step may draw, and what comes next; forget everything else."""
+        """Load the shards that ``step`` may draw from and the next ones; forget all others."""
         ahead = self.options.buffer + 1
         ids = [self.shard_id(step, crop, slot) for slot in range(ahead) for crop in self.crops]
         for number in self.examples.keys() - set(ids):
@@ -235,12 +235,12 @@ class ExampleStreams:
                 self.examples[number] = self.pool.submit(self._read, number)
 
     def draw(self, step: int, crop: int, rng: np.random.Generator) -> Example:
-        """Draw one of the examples of a crop of the step that was moved to."""
+        """Return a random example for crop number ``crop`` of the current step."""
         slot = int(rng.integers(self.options.buffer))
         return self.examples[self.shard_id(step, crop, slot)].result()
 
     def shard_id(self, step: int, crop: int, slot: int) -> int:
-        """Return the number of the shard that a crop's stream has in a slot: 0 is the oldest."""
+        """Return the number of the shard in one slot of a crop's stream; slot 0 is the oldest."""
         position = (step // self.options.refresh + slot) * self.options.crops + crop
         epoch, index = divmod(position, len(self.shards))
         return int(_order(self.options.seed, epoch, len(self.shards))[index])
@@ -253,7 +253,7 @@ class ExampleStreams:
 
 @contextmanager
 def open_streams(shards: Sequence[Shard], options: TrainOptions, crops: Sequence[int]) -> Iterator[ExampleStreams]:
-    """Open streams whose threads end with the block."""
+    """Open streams of examples; their threads end with the block."""
     streams = ExampleStreams(shards, options, crops)
     try:
         yield streams

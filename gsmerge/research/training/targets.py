@@ -34,7 +34,7 @@ Progress = Callable[[int, int], None]  # step, steps
 
 @dataclass(frozen=True, eq=False)
 class Targets:
-    """Corrections by the fit of the n analytic Gaussians of one K."""
+    """Target corrections of the n analytic Gaussians for one K, taken from a fit."""
 
     parents: np.ndarray  # [n] int64, the merged Feature Gaussian of each, ascending
     corrections: np.ndarray  # [n,13] float32
@@ -48,7 +48,7 @@ def fit_targets(
     name: str,
     progress: Progress | None = None,
 ) -> dict[int, Targets]:
-    """Compute the targets of every K of ``options.levels`` from analytic Feature Gaussians, merged across views.
+    """Compute the targets for every K of ``options.levels`` by fitting analytic Feature Gaussians to photos.
 
     ``name`` is the scene's, for errors; ``progress`` is called with (step, steps) of the fits. A SceneError if the fit
     does not improve held-out parts of the photos.
@@ -94,7 +94,7 @@ def _fit_level(
 
 
 def corrections_between(start: Gaussians, end: Gaussians, frames: Tensor) -> Tensor:
-    """Compute the corrections ``[n,13]`` in frames ``[n,3,3]`` that turn ``start`` into ``end``, all tensors.
+    """Compute the corrections ``[n,13]`` in ``frames [n,3,3]`` that turn Gaussians ``start`` into ``end``, all tensors.
 
     Of the equal pairs of rotation and scales of ``end``, the one nearest to ``start`` counts.
     """
@@ -114,7 +114,7 @@ def corrections_between(start: Gaussians, end: Gaussians, frames: Tensor) -> Ten
 
 
 def nearest_axes(quats: Tensor, reference: Tensor) -> Tensor:
-    """Return the order and signs ``[n,3,3]`` of the axes of ``quats [n,4]`` that are nearest to those of a reference.
+    """Return the axis permutations with signs ``[n,3,3]`` that bring ``quats [n,4]`` nearest to a reference.
 
     A Gaussian has 24 equal pairs of rotation and scales: rotations times the result, and scales in that order.
     """
@@ -128,7 +128,7 @@ def nearest_axes(quats: Tensor, reference: Tensor) -> Tensor:
 
 
 def rotation_vectors(rotations: Tensor) -> Tensor:
-    """Convert rotations ``[n,3,3]`` well below half a turn to rotation vectors ``[n,3]``."""
+    """Convert rotations ``[n,3,3]`` by less than half a turn to rotation vectors ``[n,3]``."""
     axis = skew_vectors(rotations)
     sine, cosine = (axis.square().sum(1) + 1e-14).sqrt(), (rotations.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
     return axis * (torch.atan2(sine, cosine) / sine.clamp_min(1e-12))[:, None]

@@ -26,7 +26,7 @@ LISTS = ("levels", "densities", "views", "random_views")
 
 @dataclass(frozen=True)
 class TrainOptions(Settings):
-    """Settings of a training run: what networks are trained on, and how."""
+    """Settings of a training run: data, networks and losses."""
 
     network: NetworkOptions = setting(NetworkOptions(), "Sizes of the networks.")
     views: tuple[int, ...] = setting((3, 6, 0), "Numbers of views, evenly spread; 0 means all.",
@@ -121,20 +121,20 @@ class TrainOptions(Settings):
 
     @property
     def example_views(self) -> tuple[int, ...]:
-        """Numbers of views of a scene's examples; random subsets are drawn from all."""
+        """Numbers of views of the examples made of each scene; 0: all views."""
         return (0,) if self.random_views else self.views
 
     def match_options(self) -> MatchOptions:
-        """Return the options of matching Feature Gaussians across views."""
+        """Return the options for matching Feature Gaussians across views."""
         names = ("match", "overlap", "iou", "similarity", "geometry")
         return MatchOptions(**{name: getattr(self, name) for name in names})
 
     def photo_level(self, width: int, height: int) -> float:
-        """Return the factor by which the sides of photos of ``width`` by ``height`` pixels are divided."""
+        """Return the factor that divides the sides of photos of ``width`` x ``height`` pixels."""
         return max(1.0, max(width, height) / self.photo_side) if self.photo_side else self.photo_scale
 
     def require_weights(self) -> None:
-        """Raise a GsmergeError if LPIPS has a weight, and its weights are not installed."""
+        """Raise GsmergeError if LPIPS has a weight in the loss but its network weights are not installed."""
         if self.lpips_weight:
             require_lpips("vgg")
 
@@ -144,11 +144,11 @@ class TrainOptions(Settings):
 
     @property
     def photo_step(self) -> int:
-        """Number of the first step, counted from 0, that compares renders with photos."""
+        """First step, counted from 0, whose loss compares renders with photos."""
         return math.ceil(self.photo_start * self.steps)
 
     def regularizer_weights(self, step: int) -> tuple[float, float, float]:
-        """Return the weights of regression, teacher and diversification in a step that compares renders."""
+        """Return the weights of the regression, teacher and diversity losses in a step that compares renders."""
         done = step - self.photo_step
 
         def left(steps: int) -> float:
@@ -161,7 +161,7 @@ class TrainOptions(Settings):
         )
 
     def rate_at(self, step: int) -> float:
-        """Return the learning rate of a step, counted from 0: a linear increase, then half a cosine."""
+        """Return the learning rate of a step, counted from 0: linear warm-up, then a half cosine."""
         if step < self.warmup:
             return self.rate * (step + 1) / self.warmup
         part = (step - self.warmup) / max(1, self.steps - self.warmup)
@@ -172,7 +172,7 @@ class TrainOptions(Settings):
         return asdict(self) | {name: list(getattr(self, name)) for name in LISTS}
 
     def with_settings(self, values: Mapping[str, Any]) -> TrainOptions:
-        """Change some settings by name, also those in the tables ``network`` and ``bounds``.
+        """Change settings by name, including those in the tables ``network`` and ``bounds``.
 
         A ValueError if a name is unknown or a value out of range.
         """
@@ -189,7 +189,7 @@ class TrainOptions(Settings):
 
 
 def read_config(path: Path, start: TrainOptions | None = None) -> TrainOptions:
-    """Change ``start``, or the defaults, by settings of a TOML or JSON file, named as in :class:`TrainOptions`.
+    """Change ``start``, or the defaults, by the settings in a TOML or JSON file, named as in :class:`TrainOptions`.
 
     A SceneError if the file cannot be read or a setting is unknown or out of range.
     """
@@ -271,7 +271,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
 
 
 def preset_options(name: str) -> TrainOptions:
-    """Return the settings under a name; a ValueError if it is unknown."""
+    """Return the settings of a named preset; ValueError if the name is unknown."""
     if name not in PRESETS:
         raise ValueError(f"preset: expected {' or '.join(PRESETS)}, got {name!r}")
     return TrainOptions().with_settings(PRESETS[name])

@@ -20,7 +20,7 @@ BORDER = 4  # pixels around a window, from which corrections may move Gaussians 
 
 @dataclass(frozen=True, eq=False)
 class Crop:
-    """Some Feature Gaussians of an example, in whole clusters where these are known, with K children each."""
+    """A subset of an example's Feature Gaussians, in whole clusters if these are known, with K children each."""
 
     example: Example
     k: int  # Gaussians that each becomes
@@ -30,7 +30,7 @@ class Crop:
 
 @dataclass(frozen=True)
 class Box:
-    """A part of a photo: first column and row, width and height, pixels."""
+    """A rectangle of a photo: first column and row, width and height, pixels."""
 
     left: int
     top: int
@@ -38,7 +38,7 @@ class Box:
     height: int
 
     def halved(self) -> Box:
-        """Return the middle half of the longer side, at least ``MIN_SIDE`` pixels."""
+        """Return the box with its longer side halved about the middle, at least ``MIN_SIDE`` pixels."""
         if self.width >= self.height:
             width = max(min(MIN_SIDE, self.width), self.width // 2)
             return Box(self.left + (self.width - width) // 2, self.top, width, self.height)
@@ -48,7 +48,7 @@ class Box:
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """A part of a photo, and the Feature Gaussians whose render is compared with it."""
+    """A rectangle of a photo, with the Feature Gaussians that are rendered and compared with it."""
 
     photo: int  # which of the example's photos
     box: Box  # which part of it
@@ -56,19 +56,19 @@ class Window:
 
     @property
     def camera(self) -> Cameras:
-        """Camera whose image is the box."""
+        """Camera whose image is the window."""
         c = box_camera(self.crop.example.photos, self.photo, self.box)
         return Cameras(c["viewmat"][None], c["K"][None], c["width"], c["height"])
 
     @property
     def image(self) -> Tensor:
-        """Part of the photo, ``[h,w,3]`` sRGB in [0, 1]."""
+        """The window's part of the photo, ``[h,w,3]`` sRGB in [0, 1]."""
         example = self.crop.example
         return torch.from_numpy(example.colors.change(self._part(example.images[self.photo]) / np.float32(255)))
 
     @property
     def mask(self) -> Tensor:
-        """Pixels that the example's views cover, ``[h,w]`` bool."""
+        """Mask ``[h,w]`` of the window's pixels that the example's views cover."""
         return torch.from_numpy(self._part(self.crop.example.mask(self.photo)))
 
     def _part(self, picture: np.ndarray) -> np.ndarray:
@@ -77,7 +77,7 @@ class Window:
 
 
 def sample_crop(example: Example, levels: tuple[int, ...], count: int, inner: float, rng: np.random.Generator) -> Crop:
-    """Choose the ``count`` Feature Gaussians nearest to a random one; the share ``inner`` nearest to it is scored."""
+    """Sample the ``count`` Feature Gaussians nearest to a random one; the nearest share ``inner`` of them is scored."""
     k, means = levels[int(rng.integers(len(levels)))], example.features.means
     order = np.argsort(np.square(means - means[rng.integers(len(means))]).sum(1), kind="stable")[:count]
     near, close = np.zeros((2, len(means)), bool)
@@ -89,11 +89,10 @@ def sample_crop(example: Example, levels: tuple[int, ...], count: int, inner: fl
 def sample_window(
     example: Example, levels: tuple[int, ...], side: int, most: int, novel: float, rng: np.random.Generator
 ) -> Window:
-    """Choose a window around a random pixel that the example's views cover.
+    """Sample a window around a random pixel that the example's views cover.
 
-    One of the ``levels`` is drawn as K. The window is ``side`` pixels wide, less where the photo is, and is halved
-    while more than ``most`` Feature Gaussians reach into it. ``novel`` is the share of windows in novel views, if there
-    are any.
+    K is drawn from ``levels``. The window is ``side`` pixels wide, or as wide as the photo, and is halved while more
+    than ``most`` Feature Gaussians reach into it. ``novel`` is the share of windows in novel views, if there are any.
     """
     k = levels[int(rng.integers(len(levels)))]
     num_views = len(example.cameras)
@@ -117,7 +116,7 @@ def sample_window(
 
 
 def whole_photo(example: Example, photo: int, k: int = 1) -> Window:
-    """Take a whole photo, with all Feature Gaussians."""
+    """Return a window of a whole photo, with all Feature Gaussians."""
     height, width = example.images.shape[1:3]
     rows = np.arange(len(example.features))
     return Window(photo, Box(0, 0, width, height), Crop(example, k, rows, np.ones(len(rows), bool)))
@@ -142,7 +141,7 @@ def _whole_clusters(example: Example, chosen: np.ndarray) -> np.ndarray:
 
 
 def box_camera(photos: Photos, photo: int, box: Box) -> dict[str, Any]:
-    """Make the camera whose image is a part of a photo, as arguments of :func:`gsmerge.raster.plan_view`."""
+    """Return the camera of a rectangle of a photo, as arguments of :func:`gsmerge.raster.plan_view`."""
     K = photos.Ks[photo].copy()
     K[:2, 2] -= box.left, box.top
     return {**photos.camera(photo), "K": K, "width": box.width, "height": box.height}
