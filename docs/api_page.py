@@ -51,7 +51,7 @@ def _describe(name: str, value: Any) -> list[str]:
     about, *parts = re.split(r"^(Args|Returns|Raises|Example):\n", text, flags=re.MULTILINE)
     lines = [about.strip()]
     if not inspect.isclass(value):
-        lines = ["```python", f"gsmerge.{name}{_parameters(value)}", "```", "", *lines]
+        lines = ["```text", f"gsmerge.{name}{_parameters(value)}", "```", "", *lines]
     for title, body in zip(parts[::2], parts[1::2], strict=True):
         body = textwrap.dedent(body).strip()
         if title == "Example":

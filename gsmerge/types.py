@@ -56,7 +56,7 @@ def to_float32(values: np.ndarray) -> np.ndarray:
 
 
 def like(values: np.ndarray, template: Array) -> Array:
-    """Convert ``values`` to the type of ``given``: a NumPy array, or a tensor on the same device."""
+    """Convert ``values`` to the type of ``template``: a NumPy array, or a tensor on the same device."""
     return as_tensor(values, template.device) if hasattr(template, "detach") else values
 
 

@@ -68,8 +68,8 @@ def find_jobs(
 ) -> list[Job]:
     """List all scenes, each once, with the names of their results in the output folder.
 
-    ``given`` are folders (``out`` is not searched), patterns, ``.ply`` files, and text files with one of these per
-    line. ``own`` has the real paths of former results, which are not scenes. ``unreadable`` collects the errors of
+    ``arguments`` are folders (``out`` is not searched), patterns, ``.ply`` files, and text files with one of these per
+    line. ``results`` has the real paths of former results, which are not scenes. ``unreadable`` collects the errors of
     sub-folders that cannot be read; without it they are raised. SceneError if something does not exist or has no scene;
     UsageError if two scenes would be written to one file, or one over another.
     """

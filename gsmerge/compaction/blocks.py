@@ -146,7 +146,7 @@ def without_gaussians(prepared: Prepared) -> Prepared:
 
 
 def fit_part(part: Part, everything: tuple[Gaussians, np.ndarray], number: int, growth: float) -> Gaussians:
-    """Fit all Gaussians that a block's views may see, and return the fitted ones that belong to block ``own``.
+    """Fit all Gaussians that a block's views may see, and return the fitted ones that belong to block ``number``.
 
     ``everything``: canonical Gaussians of all blocks, and the block of each. ``growth``: final number of Gaussians, as
     a multiple of the number at the start.

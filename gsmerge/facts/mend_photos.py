@@ -28,7 +28,7 @@ class PhotoChange:
     cover: np.ndarray | None = None  # [h,w] bool at a small size, what is replaced
 
     def __call__(self, photo: np.ndarray, fill: np.ndarray | None) -> np.ndarray:
-        """Mend a photo ``[h,w,3]`` in [0, 1] of any size; ``own [h,w,3]`` is what replaces covered pixels."""
+        """Mend a photo ``[h,w,3]`` in [0, 1] of any size; ``fill [h,w,3]`` is what replaces covered pixels."""
         if any(self.bars):  # as whole numbers, which OpenCV resizes alike on every processor
             levels = np.rint(255 * photo.clip(0, 1)).astype(np.uint8)
             photo = self.without_bars(levels, cv2.INTER_LINEAR) / np.float32(255)
@@ -101,7 +101,7 @@ def mend_photos(scene: Scene, changes: Sequence[PhotoChange]) -> Scene:
 
 
 def change_large(large: LargePhotos, changes: Sequence[PhotoChange], fills: dict[int, np.ndarray]) -> LargePhotos:
-    """Return larger photos that are mended at each read; ``own`` has the colours for covered pixels, by view."""
+    """Return larger photos that are mended at each read; ``fills`` has the colours for covered pixels, by view."""
 
     def read(view: int) -> np.ndarray:
         photo = large.read(large.ids[view])

@@ -97,9 +97,10 @@ def limit_moves(survey: Survey, rates: Tuning) -> tuple[np.ndarray, np.ndarray]:
 def judge(state: Array, start_score: float, engine: Engine, moving: Engine) -> tuple[float, float]:
     """Return the PSNR (dB) on held-out blocks that the fit has to beat, and the one that it reached.
 
-    The fit has to beat ``own``, the score of its start, or a baseline that scores worse: networks learn from whole
-    photos, so a fit to the other blocks makes held-out blocks worse even where it makes new views better. The baseline
-    is scored only if the fit does not beat its start, with the cameras of ``engine``, not those that ``moving`` moved.
+    The fit has to beat ``start_score``, the score of its start, or a baseline that scores worse: networks learn from
+    whole photos, so a fit to the other blocks makes held-out blocks worse even where it makes new views better. The
+    baseline is scored only if the fit does not beat its start, with the cameras of ``engine``, not those that
+    ``moving`` moved.
     """
     after, baseline_start = moving.score(state), engine.plan.job.baseline_start
     if baseline_start is None or after > start_score:

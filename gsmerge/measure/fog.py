@@ -49,7 +49,7 @@ class Fog:
 def measure_fog(
     reference: Gaussians, results: Mapping[str, Gaussians], cameras: Cameras, near: float = 0.01
 ) -> dict[str, dict[str, Fog]]:
-    """Measure fog and holes of results, by name, seen from outside the ``cameras`` of the scene ``given``.
+    """Measure fog and holes of results, by name, seen from outside the ``cameras`` of the scene ``reference``.
 
     Returns one :class:`Fog` by name of the result and kind of camera, of :data:`CAMERAS` and "all"; its figures are
     means over the pixels of all pictures of the kind. ``near`` is the near plane of the pictures, world units.

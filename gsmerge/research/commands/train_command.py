@@ -75,7 +75,7 @@ def train(args: opt.Args) -> None:
 
 
 def find_training_scenes(paths: Sequence[Path], out: Path, apart: Collection[Path] = ()) -> list[Path]:
-    """Find the scenes in ``given`` files and folders, each once; skip the output folder ``out``.
+    """Find the scenes in files and folders, each once; skip the output folder ``out``.
 
     Scenes of ``apart``, for validation, are left out where a folder holds them, and kept where they are named.
     SceneError if a path does not exist or has no scene, UsageError if no scene is left.

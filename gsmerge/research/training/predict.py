@@ -92,7 +92,7 @@ def differentiate_base(features: FeatureGaussians) -> Gaussians:
 
 
 def differentiate_groups(features: FeatureGaussians, inputs: GroupFeatures, viewmats: np.ndarray) -> GroupFeatures:
-    """Compute the networks' inputs for groups, differentiable, given the same inputs as arrays (``known``)."""
+    """Compute the networks' inputs for groups, differentiable, given the same inputs as arrays (``inputs``)."""
     chosen = torch.from_numpy(viewmats[inputs.views]).float()
     base, frames = differentiate_base(features), _differentiate_frames(features.means, chosen, inputs.frames)
     sizes = gaussian_sizes(base.scales).clamp_min(TINY)
@@ -210,7 +210,7 @@ def pool_tensors(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray
 def make_round_tensors(parents: np.ndarray, group_features: GroupFeatures, children: Gaussians) -> Gaussians:
     """Make the round Gaussians that absolute heads correct; see :func:`gsmerge.networks.apply.prepare_children`.
 
-    ``known`` are the same ``n`` Gaussians as arrays.
+    ``children`` are the same ``n`` Gaussians as arrays.
     """
     parent_ids, base, same = torch.from_numpy(parents), group_features.base, children.to("cpu")
     frames = group_features.frames[parent_ids]
