@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
-from functools import partial
+import math
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from gsmerge.compaction.blocks import compact_in_blocks
 from gsmerge.compaction.methods import Build, choose_method
 from gsmerge.compaction.result import Candidate, CompactResult, make_result, score
 from gsmerge.compaction.search import level_counts, search_count
+from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import Prepared, prepare
+from gsmerge.fit import Fitted
 from gsmerge.pipeline import build
 from gsmerge.plan import Plan, make_plan, note_engine, plan_whole
-from gsmerge.runtime.record import Progress, record_part, record_run
+from gsmerge.runtime.record import Progress, Record, add_seconds, adopt, choose, note, record_part, record_run
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.read import as_scene
 from gsmerge.settings.compact import CompactOptions
-from gsmerge.stages.clean import clean_to_count
+from gsmerge.stages.clean import clean, faintest_dropped, inside_crop
 from gsmerge.stages.segment import measure_size
 from gsmerge.types import Scene, StrPath
+
+MAX_BUILDS, SURPLUS = 3, 1.05  # tries to meet a count after clean-up; more than it by so much at first
 
 
 def compact(
@@ -64,5 +70,61 @@ def compact_piece(scene: Scene, options: CompactOptions) -> CompactResult:
 @record_part()
 def build_scored(method: Build, prepared: Prepared, plan: Plan, count: int | None) -> Candidate:
     """Build ``count`` Gaussians with a method, clean them up as the plan says, and score them."""
-    fitted = clean_to_count(partial(method, prepared, plan), count, plan.clean, prepared)
-    return score(count, fitted, prepared, plan)
+    return score(count, build_cleaned(method, prepared, plan, count), prepared, plan)
+
+
+def build_cleaned(method: Build, prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
+    """Build Gaussians and clean them up so that exactly ``count`` remain, if the scene holds that many.
+
+    More are built than are asked for, and the faintest of what is too many are left out. UsageError if the crop holds
+    none of the scene.
+    """
+    options = plan.clean
+    if not options.asked:
+        return method(prepared, plan, count)
+    scene, to_world = prepared.scene, prepared.frame.leave
+    input_gaussians = scene.gaussians[scene.valid.reshape(-1)] if scene.aligned else scene.gaussians
+    most, asked = len(input_gaussians), count
+    share = 1.0 if options.crop is None else float(inside_crop(to_world(input_gaussians).means, options.crop).mean())
+    if share == 0:
+        remedy = "gsmerge inspect says where the scene is"
+        raise UsageError(f"crop: expected Gaussians of the scene in {options.crop}, found none; {remedy}")
+    if count is not None:
+        asked = min(most, math.ceil(SURPLUS * count / share))
+    best: tuple[Fitted, dict[str, int], Record] | None = None
+    for _ in range(MAX_BUILDS):
+        with record_part() as record:
+            fitted = method(prepared, plan, asked)
+            gaussians, counts = clean(fitted.gaussians, options, scene, to_world)
+        add_seconds(record.seconds)
+        if best is None or count is None or len(best[0].gaussians) < len(gaussians):
+            best = replace(fitted, gaussians=gaussians), counts, record
+        if count is None or asked is None or len(gaussians) >= count or asked == most:
+            break
+        asked = min(most, math.ceil(SURPLUS * asked * count / max(1, len(gaussians))))
+    assert best is not None
+    fitted, counts, record = best
+    gaussians = fitted.gaussians
+    if count is not None and len(gaussians) > count:
+        gaussians, counts = faintest_dropped(gaussians, count), counts | {"surplus": len(gaussians) - count}
+    adopt(record)
+    choose(clean=counts)
+    for text in _clean_notes(counts, len(gaussians), count):
+        note(text)
+    return replace(fitted, gaussians=gaussians)
+
+
+def _clean_notes(counts: Mapping[str, Any], left: int, count: int | None) -> list[str]:
+    words = {
+        "cropped": "outside of the crop",
+        "sky": "sky",
+        "floaters": "floater(s)",
+        "surplus": "more than the budget",
+    }
+    parts = ", ".join(f"{number:,} {words[name]}" for name, number in counts.items())
+    shown = [name for name in ("cropped", "sky") if counts.get(name)]
+    scores = ["PSNR of the input views counts what is left out as errors"] * bool(shown)
+    short = []
+    if count is not None and left < count:
+        short = [f"budget: {count:,} Gaussians were asked for, {left:,} are left after clean-up"]
+    return [f"left out by clean-up: {parts}", *scores, *short]

@@ -78,7 +78,7 @@ class Shown:
 
     @property
     def clear(self) -> np.ndarray:
-        """Mask ``[v,h,w]`` of pixels where the Gaussians are opaque enough for their colour ``pictures`` to be compared."""
+        """Mask ``[v,h,w]`` of pixels where the Gaussians are opaque enough for ``pictures`` to be compared."""
         return self.weights > (0.5 if self.drawn else 0.05)
 
 

@@ -1,27 +1,18 @@
-"""Fitted Gaussians -> wanted Gaussians: cropped to a box or a sphere, without floaters or sky.
-
-A budget is met after clean-up: more Gaussians are made than are asked for, and the faintest of what
-is too many are left out (:func:`clean_to_count`).
-"""
+"""Fitted Gaussians -> wanted Gaussians: cropped to a box or a sphere, without floaters or sky."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gsmerge.errors import UsageError
-from gsmerge.fit import Fitted
-from gsmerge.runtime.record import Record, add_seconds, adopt, choose, note, record_part
 from gsmerge.settings.stages import CleanOptions, parse_crop
 from gsmerge.stages.sky import sky
 from gsmerge.types import Gaussians, Scene
 
 if TYPE_CHECKING:
-    from gsmerge.facts.prepare import Prepared
+    pass
 
 BOX_QUANTILES = (1, 99)  # % of the positions along each axis: the scene's box
 OUTLIER_BOX = 10.0  # times that box: what lies beyond is far from the scene
@@ -32,9 +23,7 @@ APART = 3.0  # times the median distance of nearest Gaussians: a floater's own i
 # scene if it is also so many times as large as the median one. Exports, and results without a fit, have none
 CURTAIN, WIDER = (0.1, 0.33), 8.0
 MAX_SAMPLES = 200_000  # Gaussians that a share is estimated from
-MAX_BUILDS, SURPLUS = 3, 1.05  # tries to meet a count; more than it by so much at first
 
-Make = Callable[[int | None], Fitted]
 ToWorld = Callable[[Gaussians], Gaussians]
 Counts = dict[str, int]
 
@@ -102,72 +91,16 @@ def clean(gaussians: Gaussians, options: CleanOptions, scene: Scene, to_world: T
         inside = inside_crop(to_world(gaussians).means, options.crop)
         gaussians, counts["cropped"] = gaussians[inside], int((~inside).sum())
     if options.drop_sky:
-        assert scene.images is not None, "prepare refuses scenes without photos"
+        assert scene.images is not None, "the plan refuses drop_sky without photos"
         above = sky(gaussians, scene.cameras, scene.images)
         gaussians, counts["sky"] = gaussians[~above], int(above.sum())
     if options.drop_floaters:
-        loose = floaters(gaussians)
-        gaussians, counts["floaters"] = gaussians[~loose], int(loose.sum())
+        isolated = floaters(gaussians)
+        gaussians, counts["floaters"] = gaussians[~isolated], int(isolated.sum())
     return gaussians, counts
-
-
-def clean_to_count(make: Make, count: int | None, options: CleanOptions, prepared: Prepared) -> Fitted:
-    """Build Gaussians and clean them up so that exactly ``count`` remain, if the scene holds that many.
-
-    ``make`` builds a given number of Gaussians before clean-up. Raises UsageError if the crop holds
-    none of the scene.
-    """
-    if not options.asked:
-        return make(count)
-    scene, to_world = prepared.scene, prepared.frame.leave
-    input_gaussians = scene.gaussians[scene.valid.reshape(-1)] if scene.aligned else scene.gaussians
-    most, asked = len(input_gaussians), count
-    share = 1.0 if options.crop is None else float(inside_crop(to_world(input_gaussians).means, options.crop).mean())
-    if share == 0:
-        remedy = "gsmerge inspect says where the scene is"
-        raise UsageError(f"crop: expected Gaussians of the scene in {options.crop}, found none; {remedy}")
-    if count is not None:
-        asked = min(most, math.ceil(SURPLUS * count / share))
-    best: tuple[Fitted, dict[str, int], Record] | None = None
-    for _ in range(MAX_BUILDS):
-        with record_part() as record:
-            made = make(asked)
-            gaussians, counts = clean(made.gaussians, options, scene, to_world)
-        add_seconds(record.seconds)
-        if best is None or count is None or len(best[0].gaussians) < len(gaussians):
-            best = replace(made, gaussians=gaussians), counts, record
-        if count is None or asked is None or len(gaussians) >= count or asked == most:
-            break
-        asked = min(most, math.ceil(SURPLUS * asked * count / max(1, len(gaussians))))
-    assert best is not None
-    fitted, counts, record = best
-    gaussians = fitted.gaussians
-    if count is not None and len(gaussians) > count:
-        gaussians, counts = faintest_dropped(gaussians, count), counts | {"surplus": len(gaussians) - count}
-    adopt(record)
-    choose(clean=counts)
-    for text in _clean_notes(counts, len(gaussians), count):
-        note(text)
-    return replace(fitted, gaussians=gaussians)
 
 
 def faintest_dropped(gaussians: Gaussians, count: int) -> Gaussians:
     """Keep the ``count`` Gaussians with the largest opacity times area (of the two largest axes), in their order."""
     area = np.sort(gaussians.scales, axis=1)[:, 1:].prod(1)
     return gaussians[np.sort(np.argsort(-gaussians.opacities * area, kind="stable")[:count])]
-
-
-def _clean_notes(counts: Mapping[str, Any], left: int, count: int | None) -> list[str]:
-    words = {
-        "cropped": "outside of the crop",
-        "sky": "sky",
-        "floaters": "floater(s)",
-        "surplus": "more than the budget",
-    }
-    parts = ", ".join(f"{number:,} {words[name]}" for name, number in counts.items())
-    shown = [name for name in ("cropped", "sky") if counts.get(name)]
-    scores = ["PSNR of the input views counts what is left out as errors"] * bool(shown)
-    short = []
-    if count is not None and left < count:
-        short = [f"budget: {count:,} Gaussians were asked for, {left:,} are left after clean-up"]
-    return [f"left out by clean-up: {parts}", *scores, *short]

@@ -10,6 +10,7 @@ import pytest
 import scenes
 
 from gsmerge import CompactOptions, Scene, compact
+from gsmerge.compaction.compact import build_cleaned
 from gsmerge.facts.align_views import align_views
 from gsmerge.facts.prepare import prepare
 from gsmerge.fit import Fitted
@@ -17,8 +18,6 @@ from gsmerge.geometry import motion_matrices, motion_vectors, pose_changes, proj
 from gsmerge.geometry import without_common_motion as without_common
 from gsmerge.plan import make_plan
 from gsmerge.runtime.threads import use_threads
-from gsmerge.settings.stages import CleanOptions
-from gsmerge.stages.clean import clean_to_count
 
 VIEWS = range(5)
 
@@ -108,11 +107,11 @@ def test_all_levels_have_the_cameras_of_the_finest(scene: Scene) -> None:
 def test_clean_up_keeps_the_poses_of_the_fit(scene: Scene) -> None:
     moved = replace(scene.cameras, viewmats=scene.cameras.viewmats + 0.01)
 
-    def make(count: int | None) -> Fitted:
+    def method(*_: object) -> Fitted:
         return Fitted(scene.gaussians, moved, None)
 
-    cleaned = clean_to_count(make, None, CleanOptions(drop_floaters=True), prepare(scene))
-    assert cleaned.cameras is moved
+    options, prepared = CompactOptions().with_settings({"drop_floaters": True}), prepare(scene)
+    assert build_cleaned(method, prepared, make_plan(prepared, options), None).cameras is moved
 
 
 def test_the_same_with_one_thread(scene: Scene) -> None:
