@@ -33,7 +33,7 @@ from gsmerge.batch.records import (
     RecordIndex,
     record,
 )
-from gsmerge.compaction.files import compact_files
+from gsmerge.compaction.files import Outputs, compact_files
 from gsmerge.errors import SceneError, UsageError, error_line
 from gsmerge.io.atomic import remove_stale
 from gsmerge.report import SCHEMA_VERSION, file_sha256, finite
@@ -141,7 +141,12 @@ def _compact(task: Task, context: BatchContext, files: SceneFiles, key: str) -> 
         warnings.simplefilter("default")
         if job.work is None:
             document = compact_files(
-                files, options.settings, out, opacity=options.opacity, hints=options.hints, overwrite=True, hashed=True
+                files,
+                options.settings,
+                Outputs(out, overwrite=True),
+                opacity=options.opacity,
+                hints=options.hints,
+                hashed=True,
             )
             written = [out, *(Path(level["path"]) for level in document["levels"])]
         else:

@@ -76,16 +76,19 @@ def compact(args: opt.Args) -> None:
         print_plan(args, files, settings, out, hints)
         return
     _warn_of_memory(files, settings, quiet=args.silent)
-    from gsmerge.compaction.files import compact_files
+    from gsmerge.compaction.files import Outputs, compact_files
     from gsmerge.report import result_table, summary_lines
 
+    outputs = Outputs(
+        out, report=args.report, viewer_cameras=cameras, saved_cameras=args.save_cameras,
+        embed_cameras=args.embed_cameras, overwrite=args.overwrite, normals=writing.normals,
+        spz_version=writing.spz_version,
+    )  # fmt: skip
     seconds_before = {"import": perf_counter() - start}
     with separate_stdout(args.engine, quiet=args.silent), stage_progress(quiet=args.silent) as progress:
         document = compact_files(
-            files, settings, out, opacity=args.opacity, hints=hints, overwrite=args.overwrite, progress=progress,
-            hashed=args.json or args.report is not None, seconds_before=seconds_before, report_path=args.report,
-            normals=writing.normals, spz_version=writing.spz_version, cameras_path=cameras,
-            saved_cameras=args.save_cameras, embed_cameras=args.embed_cameras,
+            files, settings, outputs, opacity=args.opacity, hints=hints, progress=progress,
+            hashed=args.json or args.report is not None, seconds_before=seconds_before,
         )  # fmt: skip
 
     say_notes([note for note in document["notes"] if note != document["worse"]], quiet=args.silent)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -32,104 +32,93 @@ from gsmerge.types import Scene
 NO_PHOTOS = "no photos found, so nothing is fitted and no PSNR measured; name their folder with --images"
 
 
+@dataclass(frozen=True)
+class Outputs:
+    """Files that a run writes: all, or none."""
+
+    result: Path  # its name chooses the format; a ``lod-meta.json`` holds all levels, in chunks beside it
+    report: Path | None = None  # JSON document
+    viewer_cameras: Path | None = None  # it may exist already with the same content, beside a result in another format
+    saved_cameras: Path | None = None  # ``transforms.json`` with all intrinsics
+    embed_cameras: bool = False  # also write the cameras into the header of a ``.ply``
+    overwrite: bool = False
+    normals: bool = True  # write the three columns of zeros that some viewers want of a ``.ply``
+    spz_version: int = 3
+
+
 def compact_files(
     files: SceneFiles,
     settings: CompactOptions,
-    out: Path,
+    outputs: Outputs,
     *,
     opacity: OpacityChoice = "auto",
     hints: ReadHints = AUTO,
-    overwrite: bool = False,
     progress: Progress | None = None,
     hashed: bool = False,
     seconds_before: Mapping[str, float] | None = None,
-    report_path: Path | None = None,
-    normals: bool = True,
-    spz_version: int = 3,
-    cameras_path: Path | None = None,
-    saved_cameras: Path | None = None,
-    embed_cameras: bool = False,
 ) -> dict[str, Any]:
     """Read a scene, compact it, and write result, levels, cameras and report: all files or none.
 
-    The name of ``out`` chooses the format; a ``lod-meta.json`` holds all levels, in chunks beside it. ``hashed``: hash
-    the input for the report. ``seconds_before``: wall time by name of the caller's earlier steps. ``cameras_path``:
-    camera file for viewers; it may exist already with the same content, beside a result in another format.
-    ``saved_cameras``: ``transforms.json`` with all intrinsics. ``embed_cameras``: also write the cameras into the
-    header of a ``.ply``.
+    ``hashed``: hash the input for the report. ``seconds_before``: wall time by name of the caller's earlier steps.
 
     Returns the report, see :func:`gsmerge.report.report_document`. Raises SceneError if the scene cannot be read or the
     result cannot be written, UsageError if the settings need what the scene does not have.
     """
-    start = perf_counter()
-    streamed = output_format(out, spz_version, levels=True).ending == INDEX
-    with atomic_outputs(overwrite=overwrite) as add:
+    start, out = perf_counter(), outputs.result
+    streamed = output_format(out, outputs.spz_version, levels=True).ending == INDEX
+    with atomic_outputs(overwrite=outputs.overwrite) as add:
         at = {out: add(out, make_folder=streamed)}
-        at |= {path: add(path) for path in (report_path, saved_cameras) if path is not None}
+        at |= {path: add(path) for path in (outputs.report, outputs.saved_cameras) if path is not None}
         load = read_input(files, opacity=opacity, hints=hints)
-        check_saved_cameras(load.scene, saved_cameras, embed=embed_cameras)
-        shared = None if cameras_path is None or overwrite or not cameras_path.exists() else cameras_path
+        check_saved_cameras(load.scene, outputs.saved_cameras, embed=outputs.embed_cameras)
         views = _views_once(load.scene)
         names = [load.scene.names[view] for view in views]
-        if shared is not None and list(read_cameras(shared).names) != names:
-            raise _other_cameras(shared)
+        cameras_path = outputs.viewer_cameras
+        shared = cameras_path is not None and not outputs.overwrite and cameras_path.exists()
+        if cameras_path is not None and shared and list(read_cameras(cameras_path).names) != names:
+            raise _other_cameras(cameras_path)
+        cameras_path = cameras_path if len(load.scene) else None
         read = perf_counter()
         result = compact(load.scene, settings, progress=progress)
         if len(result.gaussians) == 0:
             problem = "expected Gaussians that show something, found none that is left once they are merged"
             raise SceneError(files.ply, problem, "look at its scales and opacities with gsmerge inspect")
-        compacted = perf_counter()
-        results = (result, *result.coarser)
-        embedded = [camera_comments(level.cameras[views], names) if embed_cameras else [] for level in results]
-        written = _write_results(
-            add, out, at[out], results, [[*load.comments, *lines] for lines in embedded],
-            spz_version=spz_version, normals=normals,
-        )  # fmt: skip
-        cameras_path = cameras_path if len(load.scene) else None
+        compacted, results = perf_counter(), (result, *result.coarser)
+        embedded = [camera_comments(level.cameras[views], names) if outputs.embed_cameras else [] for level in results]
+        written = _write_results(add, outputs, at[out], results, [[*load.comments, *lines] for lines in embedded])
         if cameras_path is not None:
             text = viewer_cameras(result.cameras[views], names)
-            if shared is None:
+            if not shared:
                 add(cameras_path).write_text(text, encoding="utf-8")
-            elif shared.read_text(encoding="utf-8", errors="replace") != text:
-                raise _other_cameras(shared)
-        if saved_cameras is not None:
-            write_transforms(at[saved_cameras], result.cameras[views], names)
-        lost = lost_harmonics(out, result.gaussians.sh_degree, spz_version)
+            elif cameras_path.read_text(encoding="utf-8", errors="replace") != text:
+                raise _other_cameras(cameras_path)
+        if outputs.saved_cameras is not None:
+            write_transforms(at[outputs.saved_cameras], result.cameras[views], names)
+        lost = lost_harmonics(out, result.gaussians.sh_degree, outputs.spz_version)
         document = report_document(
-            result.report,
-            input_paths=files.plys,
-            output_path=out,
+            result.report, input_paths=files.plys, output_path=out,
             seconds_before={**(seconds_before or {}), "read": read - start},
             seconds_after={"write": perf_counter() - compacted},
             coarser=[(path, level.report) for path, level in zip([*written][1:], result.coarser, strict=True)],
-            recognised=load.recognised,
-            notes=[*load.notes, *([lost] if lost else [])],
-            hashed=hashed,
-            written_at=written,
-            cameras_path=cameras_path,
-        )
-        if report_path is not None:
-            at[report_path].write_text(to_json(document), encoding="utf-8", errors="replace")
+            recognised=load.recognised, notes=[*load.notes, *([lost] if lost else [])], hashed=hashed,
+            written_at=written, cameras_path=cameras_path,
+        )  # fmt: skip
+        if outputs.report is not None:
+            at[outputs.report].write_text(to_json(document), encoding="utf-8", errors="replace")
     if streamed:
         remove_unused_chunks(out)
     return document
 
 
 def _write_results(
-    add: AddOutput,
-    out: Path,
-    first: Path,
-    results: Sequence[CompactResult],
-    comments: Sequence[Sequence[str]],
-    *,
-    normals: bool,
-    spz_version: int,
+    add: AddOutput, outputs: Outputs, first: Path, results: Sequence[CompactResult], comments: Sequence[Sequence[str]]
 ) -> dict[Path, list[Path]]:
     """Write a result, whose file is ``first`` now, and its coarser levels, each with its lines of the header.
 
     Returns the path of each, in their order, with its files as they are before they are renamed.
     """
-    ending = output_format(out, spz_version, levels=True).ending
+    out = outputs.result
+    ending = output_format(out, outputs.spz_version, levels=True).ending
     if ending == INDEX:
         (_, finest), *coarser = add_levels(add, out, first, [result.gaussians for result in results], comments[0])
         return {out: [first, *finest], **dict(coarser)}
@@ -139,8 +128,8 @@ def _write_results(
         written[path] = [add(path)]
     for (file,), result, lines in zip(written.values(), results, comments, strict=True):
         write_gaussians(
-            file, result.gaussians, overwrite=True, comments=lines, ending=ending, normals=normals,
-            spz_version=spz_version,
+            file, result.gaussians, overwrite=True, comments=lines, ending=ending, normals=outputs.normals,
+            spz_version=outputs.spz_version,
         )  # fmt: skip
     return written
 

@@ -146,21 +146,22 @@ def prepare(scene: Scene, options: PrepareOptions | None = None, frame: Frame | 
     Gaussian, or there are images without cameras.
     """
     options = options or PrepareOptions()
-    views, repeated = distinct_views(scene)
-    distinct = scene
+    input_scene, (views, repeated) = scene, distinct_views(scene)
     if len(views) < len(scene):
-        distinct = subset(scene, views)
         note(f"{len(scene) - len(views)} views repeat others in every pixel and count once")
-    canonical, frame = canonicalise(add_views(distinct), frame)
-    compared, photo_views = compare_photos(canonical)
-    input_scene = _with_photos(scene, compared, repeated)
-    checked = equalise_exposure(compared, photo_views, options.exposure)
-    placed = checked
-    if checked.aligned and checked.images is not None and options.poses != "fixed":
-        placed = align_views(checked, photo_views, always=options.poses == "free") or checked
-    seen, unseen = _split_unseen(placed) if options.unseen == "keep" else (placed, None)
-    shown = seen if seen.aligned else add_pictures(seen)  # pixels that are known have colours of their own
-    return Prepared(input_scene, shown, frame, photo_views, tuple(repeated), placed is not checked, unseen)
+        scene = subset(scene, views)
+    scene, frame = canonicalise(add_views(scene), frame)
+    scene, photo_views = compare_photos(scene)
+    input_scene = _with_photos(input_scene, scene, repeated)
+    scene, moved, unseen = equalise_exposure(scene, photo_views, options.exposure), None, None
+    if scene.aligned and scene.images is not None and options.poses != "fixed":
+        moved = align_views(scene, photo_views, always=options.poses == "free")
+        scene = moved or scene
+    if options.unseen == "keep":
+        scene, unseen = _split_unseen(scene)
+    if not scene.aligned:  # pixels that are known have colours of their own
+        scene = add_pictures(scene)
+    return Prepared(input_scene, scene, frame, photo_views, tuple(repeated), moved is not None, unseen)
 
 
 def photos_count_as_they_are(scene: Scene) -> bool:

@@ -12,7 +12,7 @@ from tiny_scene import Tiny
 
 import gsmerge
 from gsmerge.cli import main
-from gsmerge.compaction.files import compact_files
+from gsmerge.compaction.files import Outputs, compact_files
 from gsmerge.errors import SceneError
 from gsmerge.io import write_ply
 from gsmerge.scene.content_hash import read_files
@@ -105,7 +105,7 @@ def test_the_report_has_all_parts(tmp_path: Path, tiny: Tiny) -> None:
     folder = split(tmp_path, tiny, ["view_0.ply", "view_1.ply", "view_2.ply"], [280, 560])
     settings = CompactOptions().with_settings({"superpixels": "20%", "fit": "none", "threads": 1})
     files = find_scene_files(folder)
-    document = compact_files(files, settings, tmp_path / "out.ply", hashed=True)
+    document = compact_files(files, settings, Outputs(tmp_path / "out.ply"), hashed=True)
     assert document["input"]["parts"] == [str(path) for path in files.plys]
     assert document["input"]["bytes"] == sum(path.stat().st_size for path in files.plys)
     assert gsmerge.read_ply(tmp_path / "out.ply").info.count == document["output"]["num_gaussians"]
