@@ -151,43 +151,11 @@ def _warn_of_memory(files: SceneFiles, settings: CompactOptions, *, quiet: bool)
 
 def print_plan(args: opt.Args, files: SceneFiles, settings: CompactOptions, out: Path, hints: ReadHints) -> None:
     """Print an estimate of what ``compact`` or ``encode`` would make of a scene."""
-    from gsmerge.compaction.files import check_saved_cameras, read_input
-    from gsmerge.compaction.methods import check_method
-    from gsmerge.fit.gpu import choose_backend
-    from gsmerge.measure.inspect import estimate, estimate_lines
-    from gsmerge.plan import load_networks
-    from gsmerge.report import document_head
-    from gsmerge.runtime.record import record_run
+    from gsmerge.compaction.files import Outputs, plan_files, plan_lines, read_input
 
-    load = read_input(files, opacity=args.opacity, hints=hints)
-    scene = load.scene
-    paths = {name: path and str(path) for name, path in vars(files).items() if name != "more"}
-    check_saved_cameras(scene, vars(args).get("save_cameras"), embed=bool(vars(args).get("embed_cameras")))
-    _, unused = check_method(settings, scene)
-    backend, problem = choose_backend(settings.device, scene.num_gaussians)
-    settings = replace(settings, device=backend.device)
-    notes = [*load.notes, *unused, *([] if problem is None else [problem])]
-    if os.path.lexists(out) and not args.overwrite:
-        notes.append(f"{out} exists already: --overwrite would replace it")
-    with opt.usage_errors(), record_run() as record:
-        if settings.method == "gsmerge" and settings.checkpoint != "auto":  # which the run may refuse
-            load_networks(settings, scene, photos=scene.images is not None)
-        run = estimate(scene, settings)
-    notes += record.notes
-    document = {
-        **document_head(),
-        "dry_run": True,
-        "input": {**paths, "num_gaussians": scene.num_gaussians, **load.recognised},
-        "output": {"path": str(out)},
-        "compact": run,
-        "options": settings.to_dict(),
-        "notes": notes,
-    }
-    lines = [
-        f"would read {files.ply}: {len(scene)} views of {scene.cameras.width} x {scene.cameras.height}",
-        f"would write {out}"
-        + (f", and {settings.budget.levels} level(s) in chunks beside it" if is_index(out) else ""),
-        *estimate_lines(run),
-        *(f"note       {note}" for note in notes),
-    ]
-    print_document(document, lines, as_json=args.json, wrap=True)
+    load, embeds = read_input(files, opacity=args.opacity, hints=hints), bool(vars(args).get("embed_cameras"))
+    saved = vars(args).get("save_cameras")
+    with opt.usage_errors():
+        outputs = Outputs(out, saved_cameras=saved, embed_cameras=embeds, overwrite=args.overwrite)
+        document = plan_files(load, settings, outputs)
+    print_document(document, plan_lines(document), as_json=args.json, wrap=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,8 +10,10 @@ from time import perf_counter
 from typing import Any
 
 from gsmerge.compaction.compact import compact
+from gsmerge.compaction.methods import check_method
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import SceneError, UsageError
+from gsmerge.fit.gpu import choose_backend
 from gsmerge.io import atomic_outputs, lost_harmonics, output_format, write_gaussians
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.cameras.embedded import camera_comments
@@ -19,9 +22,11 @@ from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.formats.arrays import LOGIT_COMMENT
 from gsmerge.io.formats.streamed import INDEX, remove_unused_chunks
 from gsmerge.io.formats.write import add_levels
-from gsmerge.report import report_document, to_json
+from gsmerge.measure.inspect import estimate, estimate_lines
+from gsmerge.plan import load_networks
+from gsmerge.report import document_head, report_document, to_json
 from gsmerge.runtime.memory import release_memory
-from gsmerge.runtime.record import Progress
+from gsmerge.runtime.record import Progress, record_run
 from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import SceneFiles
 from gsmerge.scene.read import Loaded, load_files
@@ -108,6 +113,44 @@ def compact_files(
     if streamed:
         remove_unused_chunks(out)
     return document
+
+
+def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict[str, Any]:
+    """Return as a document what :func:`compact_files`, or an encoding, would make of a scene."""
+    scene, out = load.scene, outputs.result
+    check_saved_cameras(scene, outputs.saved_cameras, embed=outputs.embed_cameras)
+    _, unused = check_method(settings, scene)
+    backend, problem = choose_backend(settings.device, scene.num_gaussians)
+    settings = replace(settings, device=backend.device)
+    notes = [*load.notes, *unused, *([] if problem is None else [problem])]
+    if os.path.lexists(out) and not outputs.overwrite:
+        notes.append(f"{out} exists already: --overwrite would replace it")
+    with record_run() as record:
+        if settings.method == "gsmerge" and settings.checkpoint != "auto":  # which the run may refuse
+            load_networks(settings, scene, photos=scene.images is not None)
+        run = estimate(scene, settings)
+    paths = {name: path and str(path) for name, path in vars(load.files).items() if name != "more"}
+    return {
+        **document_head(),
+        "dry_run": True,
+        "input": {**paths, "num_gaussians": scene.num_gaussians, **load.recognised},
+        "output": {"path": str(out)},
+        "compact": run,
+        "options": settings.to_dict(),
+        "notes": [*notes, *record.notes],
+    }
+
+
+def plan_lines(document: Mapping[str, Any]) -> list[str]:
+    """Write the document of :func:`plan_files` as lines for people."""
+    scene, out = document["input"], document["output"]["path"]
+    levels = f", and {document['options']['levels']} level(s) in chunks beside it" if Path(out).name == INDEX else ""
+    return [
+        f"would read {scene['ply']}: {scene['num_views']} views of {scene['width']} x {scene['height']}",
+        f"would write {out}{levels}",
+        *estimate_lines(document["compact"]),
+        *(f"note       {note}" for note in document["notes"]),
+    ]
 
 
 def _write_results(
