@@ -50,7 +50,7 @@ LONE_K = 4  # where all views have one camera: no other adds Gaussians of its ow
 
 @dataclass(frozen=True)
 class Effort:
-    """What an effort, such as "draft", means for the stages."""
+    """Settings of the stages that an effort such as "draft" stands for."""
 
     steps: int  # Steps of the full fit
     rectangles: float  # Rectangles per superpixel of `rdseg`

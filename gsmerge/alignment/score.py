@@ -293,7 +293,7 @@ def _color_distance(inputs: AlignmentInput, pairs: Correspondences) -> float:
 
 @dataclass(frozen=True)
 class Alignment:
-    """How far each view's own Gaussians project from their own pixels."""
+    """Distances between the pixels of each view and the projections of their Gaussians."""
 
     # median distance from the pixel centre per view, pixels; inf where most are behind the camera, NaN where a view has
     # no finite Gaussian

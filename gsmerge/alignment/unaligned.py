@@ -32,7 +32,7 @@ _MIN_PADDING = 16  # equal rows at the origin: fewer may be Gaussians
 
 @dataclass(frozen=True)
 class CameraCheck:
-    """How well cameras see unaligned Gaussians."""
+    """Check of cameras against unaligned Gaussians: the share they see, and how well colours agree."""
 
     share_seen: float  # share of the Gaussians inside at least one picture
     # distance of their colours from the photos where they are seen, over the distance from the same pixels shuffled;

@@ -33,7 +33,7 @@ BUSY_RETRY_SECONDS = 1.0  # until a scene that another run works on is tried aga
 
 @dataclass(frozen=True)
 class Schedule:
-    """How many scenes are compacted at once, with which threads and memory."""
+    """Number of scenes compacted at once, with their threads and memory."""
 
     jobs: int  # scenes at once; 0: as many as the cluster has processors for
     threads: int  # of each

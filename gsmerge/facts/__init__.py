@@ -1,1 +1,1 @@
-"""What is known of a scene before the first stage: its frame, photos, exposures, poses and views."""
+"""Facts about a scene before the first stage: its frame, photos, exposures, poses and views."""

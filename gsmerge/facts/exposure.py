@@ -157,7 +157,7 @@ def _order_others(distances: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Pixels:
-    """Where every pixel's Gaussian is, and which pixels count."""
+    """Position of every pixel's Gaussian, and the pixels that count."""
 
     cameras: Cameras
     means: np.ndarray  # [v,h*w,3] canonical units

@@ -51,7 +51,7 @@ class Block:
 
 @dataclass(frozen=True, eq=False)
 class Covisibility:
-    """How much of its surface each of v views shares with the others, from coarse depth maps."""
+    """Shares of its surface that each of v views has in common with the others, from coarse depth maps."""
 
     cameras: Cameras
     depths: np.ndarray  # [v,h,w] float64 depths of a coarse grid of each view, infinite where nothing is

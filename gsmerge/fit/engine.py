@@ -1,4 +1,4 @@
-"""Where a fit runs: what its loop (:mod:`gsmerge.fit.full`) asks of an engine, on the CPU or on a GPU."""
+"""The engine of a fit, on the CPU or on a GPU: what the loop (:mod:`gsmerge.fit.full`) asks of it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a fit reports, and its result."""
+"""The report and the result of a fit."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ HAZE = 0.05  # far fog above which a result gets a note: plain to see in a viewe
 
 @dataclass(frozen=True)
 class FitReport:
-    """What a fit did, and how well."""
+    """Facts about a fit and its scores."""
 
     method: str  # `"none"`, `"color"` or `"full"`: what the result comes from
     accepted: bool  # Whether the held-out blocks got better; if not, nothing was changed

@@ -1,4 +1,4 @@
-"""What each step of a full fit does: how it draws, which view, background and Gaussians it takes, how far it goes.
+"""The steps of a full fit: how each draws, which view, background and Gaussians it takes, how far it goes.
 
 An engine does the steps (:class:`gsmerge.fit.engine.Engine`); here is what engines have in common.
 """

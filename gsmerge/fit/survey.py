@@ -1,4 +1,4 @@
-"""What photos show of each Gaussian: what the fit has to know about its start before it begins."""
+"""Survey of the start of a fit: what the photos show of each Gaussian."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gsmerge.types import Array, Gaussians
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """What the half-size photos show of each of the n Gaussians that a fit starts from."""
+    """Facts that half-size photos show about each of the n Gaussians that a fit starts from."""
 
     score: float  # PSNR (dB) of the held-out blocks of these pictures
     inside: Array  # [n] bool, whether some photo's frustum may hold it

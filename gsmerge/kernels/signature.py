@@ -32,7 +32,7 @@ Size = int | str  # a number, or the name of a size or of an integer argument
 
 @dataclass(frozen=True)
 class Argument:
-    """What a function takes: an array in C order, or a scalar where there is no shape.
+    """Argument of a native function: an array in C order, or a scalar where there is no shape.
 
     Args:
         code: NumPy's name of the type.

@@ -35,7 +35,7 @@ OPAQUE = 0.5  # alpha from which a rendered depth is that of a surface
 
 @dataclass(frozen=True)
 class PoseChange:
-    """How far a camera was moved."""
+    """Distance and angle by which a camera was moved."""
 
     degrees: float  # that it turned
     shift: float  # of its centre, as a share of the median depth of what it sees

@@ -53,7 +53,7 @@ KINDS = ("borders", "means", "saliency")  # pictures of the superpixels of a vie
 
 @dataclass(frozen=True)
 class DrawOptions:
-    """What to draw of which scenes, how to read them, and where to write the pictures."""
+    """Options of a drawing: the scenes, how to read them, the kind of pictures, and where they go."""
 
     files: SceneFiles  # Of the first scene
     paths: Sequence[Path]  # Of all scenes, as they are called

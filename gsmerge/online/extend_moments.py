@@ -1,4 +1,4 @@
-"""How a batch enters a state whose groups are decoded: as moments, which add up, and children."""
+"""Batches for a state whose groups are decoded: they enter as moments, which add up, and children."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where calls are made: in this process, in others of this machine, or in those of a Ray cluster.
+"""Engines that make calls: in this process, in others of this machine, or in those of a Ray cluster.
 
 Ray is an extra, which schedules by threads and memory. A process that dies takes one call with it. Of work in parts,
 such a call is made again, elsewhere, and gives the same.

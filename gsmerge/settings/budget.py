@@ -1,4 +1,4 @@
-"""How many Gaussians a result has: budgets, file sizes, devices and quality targets, and their texts."""
+"""Settings of the number of Gaussians: budgets, file sizes, devices and quality targets, and their texts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How to read a file of Gaussians whose values do not show it, or mislead."""
+"""Hints on reading a file of Gaussians whose values do not show how, or mislead."""
 
 from __future__ import annotations
 

@@ -210,7 +210,7 @@ def parse_crop(text: str) -> tuple[str, tuple[float, ...]]:
 
 @dataclass(frozen=True)
 class Engine(Settings):
-    """Where the blocks of a scene are compacted; the result does not depend on it."""
+    """Place where the blocks of a scene are compacted; the result does not depend on it."""
 
     name: str = setting("local", "Where scenes, or the blocks of one, are compacted. local: on this machine; ray: a "
         "Ray cluster, gsmerge[ray].", name="engine", choices=("local", "ray"))  # fmt: skip

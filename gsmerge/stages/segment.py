@@ -49,7 +49,7 @@ KNEE_FLOOR = 3e-4  # squared error per pixel and channel that no count removes (
 
 @dataclass(frozen=True, eq=False)
 class SuperpixelPlan:
-    """How to cut a scene into superpixels: method, limits and numbers."""
+    """Method, limits and numbers for cutting a scene into superpixels."""
 
     options: SegmentOptions  # Method and number
     limits: CountLimits  # Limits of the number of Gaussians

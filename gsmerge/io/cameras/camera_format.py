@@ -1,4 +1,4 @@
-"""What a format of cameras is: how its files are recognised and read, and how they store poses."""
+"""Camera formats as records: how the files of one are recognised and read, and how they store poses."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ K = TypeVar("K")
 
 @dataclass(frozen=True)
 class Metric:
-    """How a score is shown: label, direction and decimals."""
+    """Label, direction and decimals of a score."""
 
     label: str
     higher: bool  # whether higher is better

@@ -129,7 +129,7 @@ def _write_picture(path: Path, networks: Networks, example: Example, options: Tr
 
 @dataclass(frozen=True, eq=False)
 class TrainingState:
-    """What a training step changes: networks, running means of their weights, and the optimiser's moments."""
+    """State that a training step changes: networks, running means of their weights, and the optimiser's moments."""
 
     networks: Networks
     smooth: Networks
