@@ -19,7 +19,7 @@ from gsmerge.fit import FitBackend, photo_scale, start_share
 from gsmerge.fit.gpu import choose_backend
 from gsmerge.runtime.record import note, stage
 from gsmerge.settings.budget import AUTO, BudgetOptions
-from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.settings.fit import USUAL_SHARE, FitOptions
 from gsmerge.settings.stages import (
     AUTO_SHARE,
@@ -116,7 +116,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
     """
     input_scene, scene, effort = prepared.input_scene, prepared.scene, EFFORTS[options.effort]
     _check_photos(input_scene, options)
-    is_ours = options.method == "gsmerge"
+    is_ours = options.method == OURS
     with stage("prepare"):
         has_photos = scene.images is not None and bool(prepared.photo_views)
         if checkpoint is None and is_ours:  # baselines learn nothing
@@ -126,14 +126,15 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         if clean_options.drop_sky and not prepared.photo_views:
             note("drop_sky: no photo is used that could say where the sky is, so it stays")
             clean_options = replace(clean_options, drop_sky=False)
-        decode = resolve_decode(options, measure_size(scene, photos=has_photos))
+        size = measure_size(scene, photos=has_photos)
+        decode = resolve_decode(options, size)
         if decode.k != options.decode.k and decode.max_k > USUAL_K:
             note(f"k: {decode.k}, because one camera shows the scene, and no long fit follows")
         options = replace(options, decode=decode)
         unseen, num_input = _merge_unseen(prepared, options, segment, clean_options)
         whole = plan_whole(
-            measure_size(scene, photos=has_photos), replace(options, segment=segment),
-            num_input=num_input, num_reserved=0 if unseen is None else len(unseen),
+            size, replace(options, segment=segment), num_input=num_input,
+            num_reserved=0 if unseen is None else len(unseen),
         )  # fmt: skip
         limits = whole.limits
         backend, problem = choose_backend(options.device, input_scene.num_gaussians)
@@ -350,7 +351,7 @@ def resolve_decode(options: CompactOptions, scene: SceneSize) -> DecodeOptions:
     if decode.k != AUTO:
         return decode
     asked = budget != BudgetOptions() or segment.superpixels != SHARE
-    other = options.method != "gsmerge" or options.recipe is not None or options.checkpoint not in ("auto", "none")
+    other = options.method != OURS or options.recipe is not None or options.checkpoint not in ("auto", "none")
     fits = scene.photos and options.fit.fit != "none" and resolve_fit(options).steps > SHORT_STEPS
     lone = scene.aligned and scene.num_cameras == 1
     return replace(decode, k=LONE_K if lone and not (asked or other or fits) else USUAL_K)

@@ -48,7 +48,7 @@ def compact(
     options = (options or CompactOptions()).with_settings(settings)
     with use_threads(options.threads), record_run(progress):
         scene = as_scene(scene)
-        size = measure_size(scene.numpy())
+        size = measure_size(scene)
         whole = plan_whole(size, options)  # what needs no work to decide
         note_engine(size, options, whole.blocks)
         return compact_in_blocks(scene, options, whole) if whole.blocks > 1 else compact_piece(scene, options)

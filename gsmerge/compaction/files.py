@@ -30,7 +30,7 @@ from gsmerge.runtime.record import Progress, record_run
 from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import SceneFiles
 from gsmerge.scene.read import Loaded, load_files
-from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Scene
 
@@ -126,7 +126,7 @@ def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict
     if os.path.lexists(out) and not outputs.overwrite:
         notes.append(f"{out} exists already: --overwrite would replace it")
     with record_run() as record:
-        if settings.method == "gsmerge" and settings.checkpoint != "auto":  # which the run may refuse
+        if settings.method == OURS and settings.checkpoint != "auto":  # which the run may refuse
             load_networks(settings, scene, photos=scene.images is not None)
         run = estimate(scene, settings)
     paths = {name: path and str(path) for name, path in vars(load.files).items() if name != "more"}

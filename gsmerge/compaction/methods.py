@@ -15,7 +15,7 @@ from gsmerge.fit import Fitted
 from gsmerge.plan import Plan
 from gsmerge.runtime.plugins import METHODS, load_plugin
 from gsmerge.runtime.record import note
-from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.types import Gaussians, Scene
 
 Build = Callable[[Prepared, Plan, int | None], Fitted]
@@ -51,7 +51,7 @@ class Method:
 
 def find_method(options: CompactOptions) -> Method | None:
     """Load the method that the options name; None for our own. Raises UsageError if a program is missing."""
-    if options.method == "gsmerge":
+    if options.method == OURS:
         return None
     method: Method = load_plugin(METHODS, options.method)
     method.check()

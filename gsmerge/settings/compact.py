@@ -107,7 +107,7 @@ class CompactOptions(Settings):
     def whole_only(self) -> list[str]:
         """Names of the settings in use that need the scene in one piece."""
         budget = self.budget
-        asked = {f"method {self.method}": self.method != "gsmerge", "levels": budget.levels > 1}
+        asked = {f"method {self.method}": self.method != OURS, "levels": budget.levels > 1}
         asked |= {f"quality {budget.quality}": budget.quality is not None, "crop": self.clean.crop is not None}
         asked |= {"drop_floaters": self.clean.drop_floaters, "drop_sky": self.clean.drop_sky}
         return [name for name, wanted in asked.items() if wanted]

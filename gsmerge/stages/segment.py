@@ -144,7 +144,7 @@ class SceneSize:
 
 def measure_size(scene: Scene, *, photos: bool | None = None) -> SceneSize:
     """Return the sizes of a scene; ``photos``: whether there are any to fit to, None: whether the scene has images."""
-    cameras = scene.cameras
+    cameras = scene.cameras.numpy()  # the Gaussians may stay on a GPU: only their number counts
     return SceneSize(
         scene.num_gaussians, len(scene), cameras.height, cameras.width, scene.aligned,
         photos=scene.images is not None if photos is None else photos,

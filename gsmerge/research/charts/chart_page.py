@@ -17,7 +17,8 @@ from gsmerge.research.charts.lines import (
     ours_first,
     size_label,
 )
-from gsmerge.research.charts.measure_run import INPUT, MAX_ERROR, OURS, SCORES, RunRecord, picture_path
+from gsmerge.research.charts.measure_run import INPUT, MAX_ERROR, SCORES, RunRecord, picture_path
+from gsmerge.settings.compact import OURS
 from gsmerge.view.page import PICTURES, data_uri, render_template
 
 MAX_SCENES = 6  # with pictures on the page

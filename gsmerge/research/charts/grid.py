@@ -19,10 +19,10 @@ from gsmerge.io.cameras.read import find_cameras
 from gsmerge.io.formats.ply import header_counts
 from gsmerge.measure.evaluate import EvaluateOptions
 from gsmerge.research.charts.lines import ONE_SIZE
-from gsmerge.research.charts.measure_run import INPUT, OURS, SUPERPIXELS, ChartRun, RunRecord, describe
+from gsmerge.research.charts.measure_run import INPUT, SUPERPIXELS, ChartRun, RunRecord, describe
 from gsmerge.scene.content_hash import cameras_of, content_hash, digest, filled, photos_of, read_files, stem_of
 from gsmerge.scene.files import find_scene_files
-from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.settings.setting import Settings, setting, settings_of
 
 ALL = "all"  # word for all views

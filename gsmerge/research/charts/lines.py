@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from gsmerge.research.charts.measure_run import INPUT, OURS, SUPERPIXELS, RunRecord
+from gsmerge.research.charts.measure_run import INPUT, SUPERPIXELS, RunRecord
+from gsmerge.settings.compact import OURS
 
 LEVEL = 0.95  # confidence of the intervals
 MIN_SHARE = 0.5  # of the scenes that a point of a line must have

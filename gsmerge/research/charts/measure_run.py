@@ -45,7 +45,7 @@ from gsmerge.stages.superpixels import superpixels
 from gsmerge.types import Gaussians, Scene, Views
 
 RECORD_VERSION = 1  # of what a run records; another version is run again
-OURS, SUPERPIXELS = "gsmerge", "superpixels"  # methods of runs, as INPUT (nothing is merged) and baselines
+SUPERPIXELS = "superpixels"  # a method of runs, as OURS, INPUT (nothing is merged) and baselines
 SCORING = ("score", "input")  # stages of a run that only measure
 MEASURES = ("psnr", "ssim", "lpips_vgg", "lpips_alex")
 SCORES = tuple(map("".join, product(MEASURES, ("_context", "_target"), ("", "_visible"))))
