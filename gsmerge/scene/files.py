@@ -28,6 +28,7 @@ TRAINED_PLACES = ("point_cloud/iteration_*/point_cloud.ply", "ply/point_cloud_*.
 SCENES_PLACE = "gaussians"  # where DepthSplat and its relatives write NAME.ply, with the photos in images/NAME
 IMAGE_PLACES = ("images", "input", "context", "rgb", "input_images")
 MASK_PLACES = ("masks",)
+_POINT_CLOUDS = {"input.ply", "points3D.ply", "points.ply", "sparse_pc.ply"}  # of other programs
 _NUMBERED = re.compile(r"(.*?)[-_. ]?(\d+)\.ply")
 _STEPS = re.compile(r"(?:iteration|point_cloud)_(\d+)(?:\.ply|[\\/]point_cloud\.ply)$")
 # what files are called that have a view or a part each
@@ -243,4 +244,5 @@ def _results_in(folder: Path) -> list[Path]:
 
 def _is_scene(path: Path) -> bool:
     """Return whether a file may be a scene: its name and header say neither result nor point cloud."""
-    return not _RESULT.search(path.name) and header_content(path) == "Gaussians"
+    named = path.name in _POINT_CLOUDS or _RESULT.search(path.name)
+    return not named and header_content(path) == "Gaussians"

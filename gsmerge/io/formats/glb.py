@@ -259,9 +259,8 @@ def _move(columns: Columns, place: np.ndarray) -> Columns:
         scale = float(np.sqrt((place[:3, :3] ** 2).sum(0)).mean())
         rotation = place[:3, :3] / scale
         oblique = np.abs(matmul(rotation.T, rotation) - np.eye(3)).max()
-    if not (
-        np.isfinite(place).all() and oblique < _EVEN and (np.cross(rotation[0], rotation[1]) * rotation[2]).sum() > 0
-    ):
+        mirrored = (np.cross(rotation[0], rotation[1]) * rotation[2]).sum() < 0
+    if mirrored or not (np.isfinite(place).all() and oblique < _EVEN):
         raise _FoundError("one with a node that stretches or mirrors its Gaussians")
     return replace(
         columns,

@@ -228,7 +228,7 @@ def header_counts(path: Path) -> tuple[int, int]:
 
 
 def header_content(path: Path) -> Literal["result", "Gaussians", "other"]:
-    """Tell from its first 4 KiB what a PLY file holds: a result of gsmerge, Gaussians, or anything else.
+    """Tell from its first 4 KiB what a PLY file holds: a result of gsmerge, Gaussians, or columns of anything else.
 
     What cannot be read, or has a longer header, may hold Gaussians, too.
     """
@@ -240,8 +240,9 @@ def header_content(path: Path) -> Literal["result", "Gaussians", "other"]:
         return "Gaussians"
     if re.search(rb"^comment %s\s*$" % arrays.RESULT_COMMENT.encode(), header, re.MULTILINE):
         return "result"
-    known = not end or re.search(rb"^property \S+ (scale|rot|f_dc|packed)_\w+\s*$", header, re.MULTILINE)
-    return "Gaussians" if known else "other"
+    columns = re.findall(rb"^property .*?(\w+)\s*$", header, re.MULTILINE) if end else []
+    expected = (b"scale_", b"rot_", b"f_dc_", b"packed_")
+    return "Gaussians" if not columns or any(name.startswith(expected) for name in columns) else "other"
 
 
 def _check_header(path: Path, start: bytes, size: int) -> tuple[int, bool]:
