@@ -23,7 +23,7 @@ class PointsOnly:
     remedy: str
 
 
-_TRAIN = "name the .ply of a model, and this for its --cameras, or train Gaussians on it"
+_TRAIN = "name a model's .ply, and this with --cameras, or train Gaussians on it"
 # In the order of trial
 POINTS_ONLY = (
     PointsOnly(
@@ -74,7 +74,7 @@ def _content(folder: Path) -> tuple[str, str] | None:
     files = (path for path in sorted(folder.glob("[!.]*")) if path.is_file() and _holds_gaussians(path))
     named = next(files, None)
     if named is not None:
-        return named.name, f"name it: {named}"
+        return named.name, "name that file"
     for row in POINTS_ONLY:
         file = next((path for pattern in row.files for path in sorted(folder.glob(pattern))), None)
         if file is not None:

@@ -40,9 +40,9 @@ def read_da3(source: CameraSource) -> StoredCameras:
     """Read the cameras (and images, if stored) of an npz: world-to-camera 3x4 or 4x4, intrinsics in pixels.
 
     Intrinsics of another image size than the depth maps' (a COLMAP export in the same call writes those), or
-    normalised ones, are scaled to it. ``cameras.npz`` of Lyra 2, and what VGGT (``extrinsic``, world to camera) and AnySplat (the same, camera to
-    world, normalised, in a batch of one) return are read as well. SceneError if the file cannot be read or lacks an
-    array.
+    normalised ones, are scaled to it. ``cameras.npz`` of Lyra 2, and what VGGT (``extrinsic``, world to camera) and
+    AnySplat (the same, camera to world, normalised, in a batch of one) return are read as well. SceneError if the file
+    cannot be read or lacks an array.
     """
     path = source.path
     sizes = () if holds_images(path) else _DEPTHS  # of depths only the shape counts, the confidence is never read

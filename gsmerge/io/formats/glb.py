@@ -104,7 +104,8 @@ def read_rows(path: Path) -> StoredRows:
     """Read all Gaussians of a ``.glb`` in the frame of a ``.ply``; SceneError if there are none, or it is damaged."""
     size = check_file(path)
     sizes: dict[str, int] = {}
-    with _damage(path), path.open("rb") as file:
+    # a scale of 0 is a value, what is not finite is set aside later
+    with _damage(path), path.open("rb") as file, np.errstate(all="ignore"):
         content = _Content(file, _read_document(file, size), file.tell(), size)
         parts = [_move(_read_splats(content, mesh, sizes), place) for mesh, place in _walk_splats(content.document)]
     if not parts:
@@ -152,8 +153,10 @@ class _Content:
         span, at = (count - 1) * stride + each, self.start + view.get("byteOffset", 0) + first
         self.num_read.append(count * each)
         inside = first >= 0 and first + span <= view["byteLength"] and self.start <= at and at + span <= self.end
-        if count < 1 or stride < each or not inside or sum(self.num_read) > self.end - self.start:
+        if count < 1 or stride < each or not inside:
             raise _FoundError(f"one that is cut: {count} values of {each} bytes are not in its {self.end} bytes")
+        if sum(self.num_read) > self.end - self.start:
+            raise _FoundError("one that shows the same values in several places")
         self.file.seek(at)
         rows = np.ndarray((count, width), dtype, self.file.read(span), strides=(stride, dtype.itemsize))
         most = np.iinfo(dtype).max if accessor.get("normalized") else 1
@@ -165,11 +168,11 @@ def _read_document(file: IO[bytes], size: int) -> dict[str, Any]:
     start = file.read(_HEADER.size + _CHUNK.size)
     if len(start) < _HEADER.size + _CHUNK.size:
         raise _FoundError("an early end of file")
-    (magic, version, _), (length, kind) = _HEADER.unpack_from(start), _CHUNK.unpack_from(start, _HEADER.size)
+    (magic, version, total), (length, kind) = _HEADER.unpack_from(start), _CHUNK.unpack_from(start, _HEADER.size)
     if (magic, version, kind) != (b"glTF", 2, b"JSON"):
         raise _FoundError("a file that is no binary glTF 2.0")
-    if length > min(size - len(start), MAX_TEXT_BYTES):
-        raise _FoundError(f"one that is cut: {length} bytes of JSON are not in its {size} bytes")
+    if total > size or length > min(total - len(start), MAX_TEXT_BYTES):
+        raise _FoundError(f"one that is cut: {max(total, length)} bytes are not in its {size}, or of JSON too many")
     document = json.loads(file.read(length))
     if not isinstance(document, dict):
         raise _FoundError("one without an object of JSON")
@@ -214,35 +217,36 @@ def _read_splats(content: _Content, primitive: dict[str, Any], sizes: dict[str, 
         more = ", ".join(map(str, splats.get("extensions") or (kernel, space)))
         raise _FoundError(f"Gaussians of another kind ({more})")
 
-    def read(kind: str, *names: str) -> np.ndarray:
+    def read(kind: str, width: int, *names: str) -> np.ndarray:
         name = next((name for name in names if name in attributes), None)
         if name is None:
             raise _FoundError(f"one whose Gaussians have no {names[0]}")
         before = sum(content.num_read)
         values = content.values(attributes[name])
+        if values.shape[1] != width:
+            raise _FoundError(f"one with {values.shape[1]} numbers of {name} each")
         sizes[kind] = sizes.get(kind, 0) + sum(content.num_read) - before
         return values
 
-    means, quats = read("means", "POSITION"), np.roll(read("quats", f"{NAME}:ROTATION", "_ROTATION"), 1, axis=1)
-    scales, degrees = read("scales", f"{NAME}:SCALE", "_SCALE"), _harmonic_names(attributes)
-    if degrees:
-        sh0, *harmonics = [read("shN" if i else "sh0", name) for i, name in enumerate(degrees)]
-        opacities = read("opacities", f"{NAME}:OPACITY")
+    means, scales = read("means", 3, "POSITION"), read("scales", 3, f"{NAME}:SCALE", "_SCALE")
+    quats, names = np.roll(read("quats", 4, f"{NAME}:ROTATION", "_ROTATION"), 1, axis=1), _harmonic_names(attributes)
+    if names:
+        sh0, *harmonics = [read("shN" if i else "sh0", 3, name) for i, name in enumerate(names)]
+        opacities = read("opacities", 1, f"{NAME}:OPACITY")
     else:
-        colors, harmonics = read("sh0", "COLOR_0"), []
+        colors, harmonics = read("sh0", 4, "COLOR_0"), []
         sh0, opacities = rgb_to_sh0(colors[:, :3]), colors[:, 3:]
     count = len(means)
     if any(len(column) != count for column in (quats, scales, sh0, opacities, *harmonics)):
         raise _FoundError(f"one with values for others than its {count} Gaussians")
-    with np.errstate(all="ignore"):  # a scale of 0 is a value, what is not finite is set aside later
-        return Columns(
-            means=means,
-            quats=quats,
-            log_scales=scales if scales.min() < 0 else log(scales),
-            opacities=opacities[:, 0],
-            sh0=sh0,
-            harmonics=np.stack(harmonics, 1) if harmonics else np.zeros((count, 0, 3)),
-        )
+    return Columns(
+        means=means,
+        quats=quats,
+        log_scales=scales if scales.min() < 0 else log(scales),
+        opacities=opacities[:, 0],
+        sh0=sh0,
+        harmonics=np.stack(harmonics, 1) if harmonics else np.zeros((count, 0, 3)),
+    )
 
 
 def _harmonic_names(attributes: dict[str, Any]) -> list[str]:
@@ -255,17 +259,16 @@ def _move(columns: Columns, place: np.ndarray) -> Columns:
     """Move Gaussians by the matrix of their node ``[4,4]``, which has to be a similarity."""
     if np.array_equal(place, np.eye(4)):
         return columns
-    with np.errstate(all="ignore"):
-        scale = float(np.sqrt((place[:3, :3] ** 2).sum(0)).mean())
-        rotation = place[:3, :3] / scale
-        oblique = np.abs(matmul(rotation.T, rotation) - np.eye(3)).max()
-        mirrored = (np.cross(rotation[0], rotation[1]) * rotation[2]).sum() < 0
+    scale = np.sqrt((place[:3, :3] ** 2).sum(0)).mean()
+    rotation = place[:3, :3] / scale
+    oblique = np.abs(matmul(rotation.T, rotation) - np.eye(3)).max()
+    mirrored = (np.cross(rotation[0], rotation[1]) * rotation[2]).sum() < 0
     if mirrored or not (np.isfinite(place).all() and oblique < _EVEN):
         raise _FoundError("one with a node that stretches or mirrors its Gaussians")
     return replace(
         columns,
         means=scale * matmul(columns.means, rotation.T) + place[:3, 3],
         quats=multiply_quats(rotmat_to_quat(rotation[None])[0], columns.quats),
-        log_scales=columns.log_scales + float(log(np.array(scale))),
+        log_scales=columns.log_scales + float(log(scale)),
         harmonics=turn_harmonics(columns.harmonics, rotation),
     )
