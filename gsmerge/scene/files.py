@@ -172,10 +172,10 @@ def _scenes_below(folder: Path) -> list[Path]:
     """List the folders of scenes below one, down to a depth; none where there are too many entries."""
     scenes, places, num_entries = [], [(folder, 0)], 0
     for place, depth in places:  # which grows
-        if depth and _plys_in(place):
-            scenes.append(place)
-            continue
         with suppress(OSError), os.scandir(place) as entries:
+            if depth and _plys_in(place):
+                scenes.append(place)
+                continue
             for entry in entries:
                 num_entries += 1
                 if num_entries > _MAX_ENTRIES:

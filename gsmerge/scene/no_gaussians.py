@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -9,9 +10,11 @@ from pathlib import Path
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file
 from gsmerge.io.formats import glb
+from gsmerge.io.formats.ply import header_content
 from gsmerge.io.formats.table import SCENE_SUFFIXES
 
 MAX_FOLDERS = 100  # in a folder of scenes that are looked into
+NAME = "name the .ply of the Gaussians, or the folder that it is in"
 
 
 @dataclass(frozen=True)
@@ -31,7 +34,7 @@ POINTS_ONLY = (
         ("exports/npz/results.npz", "exports/mini_npz/results.npz", "results.npz", "scene.glb"),
         'ask it for export_format="npz-gs_ply" or "mini_npz-gs_ply" with infer_gs=True and a giant model',
     ),
-    PointsOnly("gsplat's trainer", ("ckpts/ckpt_*.pt",), "run it with --save_ply"),
+    PointsOnly("gsplat's trainer", ("ckpts/ckpt_*.pt",), "run it with its option save_ply"),
     PointsOnly("nerfstudio", ("nerfstudio_models/*.ckpt",), "write them with ns-export gaussian-splat"),
     PointsOnly("FLARE", ("pred.npz",), f"it has no Gaussians to write: {_TRAIN}"),
     PointsOnly(
@@ -54,18 +57,19 @@ POINTS_ONLY = (
 
 def no_gaussians(folder: Path) -> SceneError:
     """Make the error of a folder without a scene: what is there instead, and what to do."""
-    content, remedy = _content(folder) or ("", "name the .ply, or the folder that it is in")
+    content, remedy = _content(folder) or ("", NAME)
     problem = "expected a .ply of Gaussians in the folder, found none"
     return SceneError(folder, f"{problem} but {content}" if content else problem, remedy)
 
 
 def find_remedy(folder: Path) -> str:
     """Return what to do about a folder of folders without a scene; empty where nothing in them is known."""
-    inside = (path for path in sorted(folder.iterdir()) if path.is_dir() and path.name[0] != ".")
-    for place in (folder, *islice(inside, MAX_FOLDERS)):
-        known = _content(place)
-        if known is not None:
-            return f"{place} has {known[0]}: {known[1]}"
+    with suppress(OSError):
+        inside = (path for path in sorted(folder.iterdir()) if path.is_dir() and path.name[0] != ".")
+        for place in (folder, *islice(inside, MAX_FOLDERS)):
+            known = _content(place)
+            if known is not None:
+                return f"{place} has {known[0]}: {known[1]}"
     return ""
 
 
@@ -79,7 +83,8 @@ def _content(folder: Path) -> tuple[str, str] | None:
         file = next((path for pattern in row.files for path in sorted(folder.glob(pattern))), None)
         if file is not None:
             return f"{file.relative_to(folder).as_posix()} of {row.title}", row.remedy
-    return None
+    points = next((path for path in sorted(folder.glob("[!.]*.ply")) if header_content(path) == "other"), None)
+    return None if points is None else (f"points or a mesh in {points.name}", NAME)
 
 
 def check_scene_file(path: Path) -> None:

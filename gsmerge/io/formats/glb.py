@@ -250,9 +250,10 @@ def _read_splats(content: _Content, primitive: dict[str, Any], sizes: dict[str, 
 
 
 def _harmonic_names(attributes: dict[str, Any]) -> list[str]:
-    """List the attributes of harmonics up to the highest degree that a primitive has; none in drafts."""
+    """List the attributes of harmonics up to the highest degree of which a primitive has some; none in drafts."""
     names = [[f"{NAME}:SH_DEGREE_{degree}_COEF_{i}" for i in range(2 * degree + 1)] for degree in range(MAX_DEGREE + 1)]
-    return [name for degree in names if degree[0] in attributes for name in degree]
+    num_degrees = max((i for i, degree in enumerate(names, 1) if degree[0] in attributes), default=0)
+    return [name for degree in names[:num_degrees] for name in degree]
 
 
 def _move(columns: Columns, place: np.ndarray) -> Columns:

@@ -62,11 +62,12 @@ def leave(folder: Path, tiny: Tiny, name: str) -> None:
         (("predictions.npz", "glbscene_50.glb"), "glbscene_50.glb", ("VGGT", "--cameras")),
         (("sparse/0/cameras.bin",), "sparse/0/cameras.bin", ("COLMAP", "--cameras")),
         (("cameras.bin",), "cameras.bin", ("COLMAP", "--cameras")),
-        (("cfg.yml", "ckpts/ckpt_29999_rank0.pt"), "ckpts/ckpt_29999_rank0.pt", ("gsplat", "--save_ply")),
+        (("cfg.yml", "ckpts/ckpt_29999_rank0.pt"), "ckpts/ckpt_29999_rank0.pt", ("gsplat", "save_ply")),
         (("config.yml", "nerfstudio_models/step-000029999.ckpt"), "nerfstudio_models", ("ns-export",)),
         (("pred.npz",), "pred.npz", ("FLARE",)),
         (("output.glb",), "output.glb", ("npz-gs_ply", "VGGT", "MapAnything")),
-        (("mesh.ply",), "none", ("name",)),
+        (("mesh.ply",), "mesh.ply", ("points", "name")),
+        (("notes.txt",), "none", ()),
     ],
 )
 def test_a_folder_without_gaussians(
@@ -82,7 +83,7 @@ def test_a_folder_without_gaussians(
     assert found in str(raised.value)
     for command in ("compact", "inspect"):
         assert main([command, str(folder)]) == 3
-    with refuses(SceneError, tmp_path / "scenes", "none", *(said if said != ("name",) else ())):
+    with refuses(SceneError, tmp_path / "scenes", "none", *said):
         list(find_scenes([str(tmp_path / "scenes")], tmp_path / "out"))
 
 

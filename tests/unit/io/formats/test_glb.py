@@ -187,6 +187,7 @@ def of_splats(**values: Any) -> Callable[[Document], object]:
         (of_splats(extensions={f"{NAME}_spz_2": {}}), (f"{NAME}_spz_2",)),
         (of_primitive(lambda p: p["attributes"].pop(f"{NAME}:SCALE")), (f"{NAME}:SCALE",)),
         (of_primitive(lambda p: p["attributes"].pop(f"{NAME}:SH_DEGREE_1_COEF_2")), ("SH_DEGREE_1_COEF_2",)),
+        (of_primitive(lambda p: p["attributes"].pop(f"{NAME}:SH_DEGREE_0_COEF_0")), ("SH_DEGREE_0_COEF_0",)),
         (lambda d: d.update(extensionsRequired=["EXT_meshopt_compression"]), ("EXT_meshopt_compression",)),
         (lambda d: d["buffers"][0].update(uri="b.bin"), ("another file",)),
         (lambda d: d["accessors"][2].update(sparse={}), ("sparse",)),
