@@ -20,7 +20,7 @@ from gsmerge.io.cameras.embedded import camera_comments
 from gsmerge.io.cameras.json_files import viewer_cameras, write_transforms
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.formats.arrays import RESULT_COMMENT
-from gsmerge.io.formats.ply import is_written_here
+from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.streamed import INDEX, remove_unused_chunks
 from gsmerge.io.formats.write import add_levels
 from gsmerge.measure.inspect import estimate, estimate_lines
@@ -214,7 +214,7 @@ def _compact_notes(loaded: Loaded) -> tuple[str, ...]:
     """Return a note if the scene is a result of gsmerge, by its header or with far fewer Gaussians than pixels."""
     scene, comments = loaded.scene, loaded.info.comments
     pixels = len(scene) * scene.cameras.height * scene.cameras.width
-    few = is_written_here(comments) and not scene.aligned and scene.num_gaussians <= pixels / 2
+    few = is_from_gsmerge(comments) and not scene.aligned and scene.num_gaussians <= pixels / 2
     if not few and RESULT_COMMENT not in comments:
         return ()
     count = f"{scene.num_gaussians:,} Gaussians for {pixels:,} pixels" if pixels else "no Gaussian per pixel"

@@ -87,7 +87,7 @@ def find_scene_files(
     ``gaussians/``, and two above it for ``point_cloud/iteration_n/``; in each the places of ``PLY_PLACES``,
     ``CAMERA_PLACES``, ``IMAGE_PLACES`` and ``MASK_PLACES`` in their order. Without any of these cameras the only file
     of any name that holds some will do. Images inside the cameras' ``.npz`` or ``.torch`` go before a folder, because
-    they are those that the model saw.
+    they are those that the model saw. A result of gsmerge is taken where a folder has nothing else.
 
     Raises:
         SceneError: If there is no ``.ply``, several to choose from, or a named file does not exist. Several are one
@@ -233,7 +233,7 @@ def named_ply(folder: Path) -> Path | None:
 
 def other_plys(folder: Path) -> list[Path]:
     """List the other files directly in a folder that may be scenes: no results of gsmerge, no point clouds."""
-    plys = sorted(path for path in folder.glob("[!.]*.ply"))
+    plys = sorted(folder.glob("[!.]*.ply"))
     return [*(path for path in plys[:_MAX_HEADERS] if _is_scene(path)), *plys[_MAX_HEADERS:]]
 
 

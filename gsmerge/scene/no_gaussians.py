@@ -14,7 +14,7 @@ from gsmerge.io.formats.ply import header_content
 from gsmerge.io.formats.table import SCENE_SUFFIXES
 
 MAX_FOLDERS = 100  # in a folder of scenes that are looked into
-NAME = "name the .ply of the Gaussians, or the folder that it is in"
+_NAME = "name the .ply of the Gaussians, or the folder that it is in"
 
 
 @dataclass(frozen=True)
@@ -50,14 +50,14 @@ POINTS_ONLY = (
     PointsOnly(
         "a model of points",
         ("*.glb", "*.npz"),
-        'Depth Anything 3 writes Gaussians with export_format="npz-gs_ply", VGGT and MapAnything have none',
+        'Depth Anything 3 writes Gaussians with export_format="npz-gs_ply" and infer_gs=True, VGGT has none',
     ),
 )
 
 
 def no_gaussians(folder: Path) -> SceneError:
     """Make the error of a folder without a scene: what is there instead, and what to do."""
-    content, remedy = _content(folder) or ("", NAME)
+    content, remedy = _content(folder) or ("", _NAME)
     problem = "expected a .ply of Gaussians in the folder, found none"
     return SceneError(folder, f"{problem} but {content}" if content else problem, remedy)
 
@@ -67,9 +67,9 @@ def find_remedy(folder: Path) -> str:
     with suppress(OSError):
         inside = (path for path in sorted(folder.iterdir()) if path.is_dir() and path.name[0] != ".")
         for place in (folder, *islice(inside, MAX_FOLDERS)):
-            known = _content(place)
-            if known is not None:
-                return f"{place} has {known[0]}: {known[1]}"
+            content = _content(place)
+            if content is not None:
+                return f"{place} has {content[0]}: {content[1]}"
     return ""
 
 
@@ -84,7 +84,7 @@ def _content(folder: Path) -> tuple[str, str] | None:
         if file is not None:
             return f"{file.relative_to(folder).as_posix()} of {row.title}", row.remedy
     points = next((path for path in sorted(folder.glob("[!.]*.ply")) if header_content(path) == "other"), None)
-    return None if points is None else (f"points or a mesh in {points.name}", NAME)
+    return None if points is None else (f"points or a mesh in {points.name}", _NAME)
 
 
 def check_scene_file(path: Path) -> None:

@@ -121,12 +121,12 @@ def _damage(path: Path) -> Iterator[None]:
         with read_errors(path):
             yield
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError, struct.error) as error:
-        text = str(error) if isinstance(error, _FoundError) else f"a damaged one ({error!r:.200})"
+        text = str(error) if isinstance(error, _ForeignError) else f"a damaged one ({error!r:.200})"
         raise SceneError(path, f"expected a .glb of Gaussians, found {text}", "export it again, or as .ply") from error
 
 
-class _FoundError(ValueError):
-    """What was found in the place of a ``.glb`` that can be read."""
+class _ForeignError(ValueError):
+    """What a file has in the place of Gaussians that can be read."""
 
 
 @dataclass(frozen=True)
@@ -143,10 +143,10 @@ class _Content:
         """Read the values ``[n,width]`` of an accessor as float64, which have to be in the chunk."""
         accessor = self.document["accessors"][accessor_id]
         if "sparse" in accessor or "bufferView" not in accessor:
-            raise _FoundError("one with sparse values")
+            raise _ForeignError("one with sparse values")
         view = self.document["bufferViews"][accessor["bufferView"]]
         if view.get("extensions") or view["buffer"] != 0 or "uri" in self.document["buffers"][0]:
-            raise _FoundError(f"one with compressed values or values in another file ({list(view)})")
+            raise _ForeignError(f"one with compressed values or values in another file ({list(view)})")
         dtype, width = np.dtype(_DTYPES[accessor["componentType"]]), _WIDTHS[accessor["type"]]
         each, count, first = dtype.itemsize * width, accessor["count"], accessor.get("byteOffset", 0)
         stride = view.get("byteStride", each)
@@ -154,9 +154,9 @@ class _Content:
         self.num_read.append(count * each)
         inside = first >= 0 and first + span <= view["byteLength"] and self.start <= at and at + span <= self.end
         if count < 1 or stride < each or not inside:
-            raise _FoundError(f"one that is cut: {count} values of {each} bytes are not in its {self.end} bytes")
+            raise _ForeignError(f"one that is cut: {count} values of {each} bytes are not in its {self.end} bytes")
         if sum(self.num_read) > self.end - self.start:
-            raise _FoundError("one that shows the same values in several places")
+            raise _ForeignError("one that shows the same values in several places")
         self.file.seek(at)
         rows = np.ndarray((count, width), dtype, self.file.read(span), strides=(stride, dtype.itemsize))
         most = np.iinfo(dtype).max if accessor.get("normalized") else 1
@@ -167,18 +167,18 @@ def _read_document(file: IO[bytes], size: int) -> dict[str, Any]:
     """Read the JSON of a ``.glb``, and go to the start of its binary chunk."""
     start = file.read(_HEADER.size + _CHUNK.size)
     if len(start) < _HEADER.size + _CHUNK.size:
-        raise _FoundError("an early end of file")
+        raise _ForeignError("an early end of file")
     (magic, version, total), (length, kind) = _HEADER.unpack_from(start), _CHUNK.unpack_from(start, _HEADER.size)
     if (magic, version, kind) != (b"glTF", 2, b"JSON"):
-        raise _FoundError("a file that is no binary glTF 2.0")
+        raise _ForeignError("a file that is no binary glTF 2.0")
     if total > size or length > min(total - len(start), MAX_TEXT_BYTES):
-        raise _FoundError(f"one that is cut: {max(total, length)} bytes are not in its {size}, or of JSON too many")
+        raise _ForeignError(f"one that is cut: {max(total, length)} bytes are not in its {size}, or of JSON too many")
     document = json.loads(file.read(length))
     if not isinstance(document, dict):
-        raise _FoundError("one without an object of JSON")
+        raise _ForeignError("one without an object of JSON")
     missing = set(document.get("extensionsRequired", ())) - READ_EXTENSIONS
     if missing and NAME in str(document.get("extensionsUsed")):
-        raise _FoundError(f"one that needs {', '.join(sorted(map(str, missing)))}, which is not read")
+        raise _ForeignError(f"one that needs {', '.join(sorted(map(str, missing)))}, which is not read")
     file.read(_CHUNK.size)
     return document
 
@@ -190,7 +190,7 @@ def _walk_splats(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.
     while stack:
         node_id, above = stack.pop()
         if node_id in seen:
-            raise _FoundError(f"one with node {node_id} in two places")
+            raise _ForeignError(f"one with node {node_id} in two places")
         seen.add(node_id)
         node = nodes[node_id]
         place = matmul(above, _node_matrix(node))
@@ -215,16 +215,16 @@ def _read_splats(content: _Content, primitive: dict[str, Any], sizes: dict[str, 
     kernel, space = splats.get("kernel", "ellipse"), splats.get("colorSpace", COLOR_SPACE)
     if splats.get("extensions") or (kernel, space) != ("ellipse", COLOR_SPACE):
         more = ", ".join(map(str, splats.get("extensions") or (kernel, space)))
-        raise _FoundError(f"Gaussians of another kind ({more})")
+        raise _ForeignError(f"Gaussians of another kind ({more})")
 
     def read(kind: str, width: int, *names: str) -> np.ndarray:
         name = next((name for name in names if name in attributes), None)
         if name is None:
-            raise _FoundError(f"one whose Gaussians have no {names[0]}")
+            raise _ForeignError(f"one whose Gaussians have no {names[0]}")
         before = sum(content.num_read)
         values = content.values(attributes[name])
         if values.shape[1] != width:
-            raise _FoundError(f"one with {values.shape[1]} numbers of {name} each")
+            raise _ForeignError(f"one with {values.shape[1]} numbers of {name} each")
         sizes[kind] = sizes.get(kind, 0) + sum(content.num_read) - before
         return values
 
@@ -238,7 +238,7 @@ def _read_splats(content: _Content, primitive: dict[str, Any], sizes: dict[str, 
         sh0, opacities = rgb_to_sh0(colors[:, :3]), colors[:, 3:]
     count = len(means)
     if any(len(column) != count for column in (quats, scales, sh0, opacities, *harmonics)):
-        raise _FoundError(f"one with values for others than its {count} Gaussians")
+        raise _ForeignError(f"one with values for others than its {count} Gaussians")
     return Columns(
         means=means,
         quats=quats,
@@ -265,7 +265,7 @@ def _move(columns: Columns, place: np.ndarray) -> Columns:
     oblique = np.abs(matmul(rotation.T, rotation) - np.eye(3)).max()
     mirrored = (np.cross(rotation[0], rotation[1]) * rotation[2]).sum() < 0
     if mirrored or not (np.isfinite(place).all() and oblique < _EVEN):
-        raise _FoundError("one with a node that stretches or mirrors its Gaussians")
+        raise _ForeignError("one with a node that stretches or mirrors its Gaussians")
     return replace(
         columns,
         means=scale * matmul(columns.means, rotation.T) + place[:3, 3],

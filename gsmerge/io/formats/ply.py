@@ -49,14 +49,14 @@ def read_rows(path: Path) -> arrays.StoredRows:
         rows=rows,
         layout=_layout_name(names, _num_rest(path, names), compressed=compressed),
         format="ascii" if data.text else "binary big-endian" if data.byte_order == ">" else "binary little-endian",
-        encoding="logit" if compressed or is_written_here(comments) else None,
+        encoding="logit" if compressed or is_from_gsmerge(comments) else None,
         sizes=_bytes_by_attribute(rows.dtype, len(rows)),
         comments=comments,
         extra_elements=tuple(e.name for e in data.elements if e.name != "vertex"),
     )
 
 
-def is_written_here(comments: Sequence[str]) -> bool:
+def is_from_gsmerge(comments: Sequence[str]) -> bool:
     """Return whether comments of a header say that gsmerge wrote the file: a result, or Gaussians of any origin."""
     return arrays.LOGIT_COMMENT in comments or arrays.RESULT_COMMENT in comments
 

@@ -65,7 +65,7 @@ def leave(folder: Path, tiny: Tiny, name: str) -> None:
         (("cfg.yml", "ckpts/ckpt_29999_rank0.pt"), "ckpts/ckpt_29999_rank0.pt", ("gsplat", "save_ply")),
         (("config.yml", "nerfstudio_models/step-000029999.ckpt"), "nerfstudio_models", ("ns-export",)),
         (("pred.npz",), "pred.npz", ("FLARE",)),
-        (("output.glb",), "output.glb", ("npz-gs_ply", "VGGT", "MapAnything")),
+        (("output.glb",), "output.glb", ("npz-gs_ply", "VGGT")),
         (("mesh.ply",), "mesh.ply", ("points", "name")),
         (("notes.txt",), "none", ()),
     ],
@@ -92,7 +92,7 @@ def test_a_folder_without_gaussians(
     [
         ("results.npz", ("Depth Anything 3", "npz-gs_ply")),
         ("predictions.npz", ("VGGT", "--cameras")),
-        ("any.npz", ("npz-gs_ply", "MapAnything")),
+        ("any.npz", ("npz-gs_ply", "VGGT")),
         ("scene.glb", ("Depth Anything 3", "infer_gs=True")),
         ("OUTPUT.GLB", ("npz-gs_ply", "VGGT")),
     ],
