@@ -208,7 +208,7 @@ def summary_line(document: Mapping[str, Any]) -> str:
         else ""
     )
     if covered := document["psnr_covered"]:
-        share = f"on the {100 * covered['share']:.0f} % of them that the input covers"
+        share = f"on the {100 * covered['share']:.0f} % of their pixels that the input covers"
         quality += f", {covered['before']:.2f} -> {covered['after']:.2f} dB {share}"
     return (
         f"{after['path']}: {before['num_gaussians']:,} -> {after['num_gaussians']:,} Gaussians"
