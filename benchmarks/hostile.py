@@ -94,8 +94,8 @@ def change_any(rng: random.Random, data: bytes) -> bytes:
 
 CHECKED = (
     "scene.ply", "ascii.ply", "a.compressed.ply", "a.spz", "a.splat", "a.sog", "a.glb", "a.gsm", "state.gsm",
-    "transforms.json", "cameras/views.npz", "cameras/cameras.json", "cameras/text/cameras.txt", "cameras/binary/images.bin",
-    "checkpoint.safetensors",
+    "transforms.json", "cameras/views.npz", "cameras/cameras.json", "cameras/text/cameras.txt",
+    "cameras/binary/images.bin", "checkpoint.safetensors",
 )  # fmt: skip
 KINDS = {
     "ply": Kind(120, ("scene.ply",), any_of(change_bytes, change_words, change_ply_head), compact()),
