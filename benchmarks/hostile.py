@@ -93,9 +93,9 @@ def change_any(rng: random.Random, data: bytes) -> bytes:
 
 
 CHECKED = (
-    "scene.ply", "ascii.ply", "a.compressed.ply", "a.spz", "a.splat", "a.sog", "a.gsm", "state.gsm", "transforms.json",
-    "cameras/views.npz", "cameras/cameras.json", "cameras/text/cameras.txt", "cameras/binary/images.bin",
-    "checkpoint.safetensors",
+    "scene.ply", "ascii.ply", "a.compressed.ply", "a.spz", "a.splat", "a.sog", "a.glb", "a.gsm", "state.gsm",
+    "transforms.json", "cameras/views.npz", "cameras/cameras.json", "cameras/text/cameras.txt",
+    "cameras/binary/images.bin", "checkpoint.safetensors",
 )  # fmt: skip
 KINDS = {
     "ply": Kind(120, ("scene.ply",), any_of(change_bytes, change_words, change_ply_head), compact()),
@@ -106,6 +106,7 @@ KINDS = {
                 compact("a.spz")),
     "splat": Kind(40, ("a.splat",), any_of(change_bytes, change_words), compact("a.splat")),
     "sog": Kind(90, ("a.sog",), any_of(change_bytes, inside_zip(member), inside_zip(member)), compact("a.sog")),
+    "glb": Kind(60, ("a.glb",), any_of(change_bytes, change_words), compact("a.glb")),
     "gsm, encoded": Kind(70, ("a.gsm",), any_of(change_bytes, in_safetensors, in_safetensors),
                          lambda folder, out: ["decode", str(folder / "a.gsm"), "-o", str(out / "a.ply"),
                                               "--threads", "1"]),
@@ -155,7 +156,7 @@ def make_inputs(folder: Path) -> Path:
     """A sound file of every kind."""
     make_scene(folder)
     gaussians = gsmerge.read_ply(folder / "scene.ply").gaussians
-    for name in ("a.spz", "a.splat", "a.sog", "a.compressed.ply"):
+    for name in ("a.spz", "a.splat", "a.sog", "a.glb", "a.compressed.ply"):
         gsmerge.write_gaussians(folder / name, gaussians)
     _write_ascii(folder)
     _write_cameras(folder)

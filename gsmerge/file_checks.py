@@ -12,12 +12,12 @@ from gsmerge.errors import SceneError
 from gsmerge.io import file_notes, read_cameras, read_gaussians
 from gsmerge.io.cameras.read import CAMERA_ENDINGS, find_cameras, read_sharp_camera
 from gsmerge.io.formats import ply, spz, streamed
-from gsmerge.io.formats.read import FileInfo, read_level
+from gsmerge.io.formats.read import FileInfo, degree_notes, read_level
 from gsmerge.io.formats.table import SCENE_SUFFIXES
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.online.file import load_stored
 from gsmerge.report import human_bytes
-from gsmerge.scene.files import named_ply, other_plys
+from gsmerge.scene.files import find_plys, list_plys
 
 NETWORKS = ".safetensors"
 CAMERAS = (*CAMERA_ENDINGS, ".bin")
@@ -74,12 +74,8 @@ def _read(path: Path) -> FileCheck:
         return _read_levels(path)
     if suffix == NETWORKS:
         return FileCheck(str(path), "networks", load_checkpoint(path).networks.num_parameters)
-    gaussians = named_ply(path) or next(iter(other_plys(path)), None) if path.is_dir() else None
-    if gaussians is not None:  # a scene
-        cameras_path = find_cameras(path)
-        if cameras_path is not None:
-            read_cameras(cameras_path, scene=gaussians.stem)
-        return replace(_read(gaussians), path=str(path))
+    if path.is_dir() and list_plys(path):  # a scene
+        return _read_scene(path)
     if path.is_dir() or suffix in CAMERAS:
         cameras = read_cameras(path)
         return FileCheck(str(path), "cameras", len(cameras), cameras.source)
@@ -95,9 +91,21 @@ def _read(path: Path) -> FileCheck:
         left = ply.bytes_after_rows(path)
         behind = f"{left:,} bytes after the last of {info.count:,} rows, which nothing reads"
         problems += [behind] if left else []
-    notes = [note for note in file_notes(info) if "opacit" in note]
+    notes = [*(note for note in file_notes(info) if "opacit" in note), *degree_notes(info)]
     facts = (str(path), "Gaussians", info.count, info.layout)
     return FileCheck(*facts, problems=tuple(problems), notes=tuple(notes))
+
+
+def _read_scene(path: Path) -> FileCheck:
+    """Read the Gaussians of a folder, of all parts if it has several, and its cameras."""
+    cameras_path, plys = find_cameras(path), find_plys(path)
+    if cameras_path is not None:
+        read_cameras(cameras_path, scene=plys[0].stem)
+    parts = [_read(ply) for ply in plys]
+    starts = [f"{ply.name}: " if len(plys) > 1 else "" for ply in plys]
+    problems = [start + text for start, part in zip(starts, parts, strict=True) for text in part.problems]
+    count, notes = sum(part.count for part in parts), tuple(dict.fromkeys(note for p in parts for note in p.notes))
+    return replace(parts[0], path=str(path), count=count, problems=tuple(problems), notes=notes)
 
 
 def _read_levels(path: Path) -> FileCheck:

@@ -1,4 +1,4 @@
-"""Quaternions, covariances, projection, similarities, motions, medians, on batches; descent by damped steps."""
+"""Quaternions, covariances, projection, harmonics, similarities, motions, medians, on batches; damped descent."""
 
 from __future__ import annotations
 
@@ -9,12 +9,15 @@ from typing import TypeVar
 import numpy as np
 
 from gsmerge.kernels.elementary import arctan2, cos, sin
-from gsmerge.kernels.matrices import invert, matmul
+from gsmerge.kernels.matrices import invert, matmul, solve
+from gsmerge.kernels.raster.sh import view_colors
 from gsmerge.types import SH_C0, Array, Cameras
 
 State = TypeVar("State")  # what a descent moves
 MORTON_BITS = 21  # per axis: three fit into 63 bits
 DEPTH_SAMPLE = 50_000  # points that say how far away the middle of a view lies
+DIRECTIONS = 96  # in which harmonics are compared before and after a turn
+BRIGHT = np.float32(20.0)  # harmonic of degree 0 with which no colour is cut off below 0
 
 
 def quat_to_rotmat(quats: np.ndarray) -> np.ndarray:
@@ -189,6 +192,41 @@ def morton_codes(points: np.ndarray) -> np.ndarray:
         for bit in range(MORTON_BITS):
             codes |= (column >> bit & 1) << (3 * bit + axis)
     return codes
+
+
+def turn_harmonics(shN: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """Rotate spherical harmonics ``[n,k-1,3]`` by ``rotation [3,3]``, as their Gaussians rotate.
+
+    Each degree is fitted to the same colours in rotated directions, which is exact.
+    """
+    num = shN.shape[1]
+    if num == 0 or len(shN) == 0:
+        return shN
+    directions = normalize(np.random.default_rng(0).normal(size=(DIRECTIONS, 3)))
+    before = _harmonics_in(matmul(directions, rotation), num)
+    after = _harmonics_in(directions, num)
+    turn = solve(matmul(after.T, after), matmul(after.T, before))
+    rows = matmul(shN.swapaxes(1, 2).reshape(-1, num), turn.T)
+    return np.ascontiguousarray(rows.reshape(-1, 3, num).swapaxes(1, 2), shN.dtype)
+
+
+def _harmonics_in(directions: np.ndarray, num: int) -> np.ndarray:
+    """Evaluate the higher harmonics in directions ``[d,3]``: ``[d,num]`` float64."""
+    means = directions.astype(np.float32)
+    count = len(means)
+    sh0 = np.full((count, 1, 3), BRIGHT)
+    ids = np.arange(count, dtype=np.int32)
+    plain = np.empty((count, 3), np.float32)
+    colors = np.empty((count, 3), np.float32)
+    eye = np.zeros(3, np.float32)
+    view_colors(means, sh0, np.zeros((count, num, 3), np.float32), ids, eye, 0, count, plain)
+    columns = []
+    for base in range(num):
+        shN = np.zeros((count, num, 3), np.float32)
+        shN[:, base] = 1
+        view_colors(means, sh0, shN, ids, eye, 0, count, colors)
+        columns.append((colors - plain)[:, 0].astype(np.float64))
+    return np.stack(columns, 1)
 
 
 def sh0_to_rgb(sh0: np.ndarray) -> np.ndarray:

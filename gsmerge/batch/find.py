@@ -14,17 +14,27 @@ from gsmerge.compaction.files import level_output
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import SCENE_SUFFIXES
 from gsmerge.io.bounds import read_text
+from gsmerge.io.formats.glb import holds_gaussians
 from gsmerge.io.formats.ply import header_counts
 from gsmerge.runtime.estimate import memory_bytes
 from gsmerge.scene.content_hash import stem_of
-from gsmerge.scene.files import IMAGE_PLACES, PLY_PLACES, SceneFiles, named_ply, other_plys
+from gsmerge.scene.files import (
+    IMAGE_PLACES,
+    PLY_PLACES,
+    TRAINED_PLACES,
+    SceneFiles,
+    list_plys,
+    named_ply,
+    other_plys,
+)
+from gsmerge.scene.no_gaussians import find_remedy
 from gsmerge.settings.budget import AUTO
 from gsmerge.settings.compact import CompactOptions
 
 MAX_FOLDERS = 100_000  # without a scene; a link to a system's folders leads to more
 FOLDERS_PER_SCENE = 5  # that are not counted for it
 MAX_LISTED = 1_000_000  # lines of a list
-SCENE_NAMES = {Path(place).parts[0] for place in PLY_PLACES} | {"point_cloud"}
+SCENE_NAMES = {Path(place).parts[0] for place in (*PLY_PLACES, *TRAINED_PLACES)}
 SCENE_PARTS = SCENE_NAMES | set(IMAGE_PLACES)
 
 
@@ -161,9 +171,17 @@ def _require_some(scenes: Iterator[Path], search: _Search, argument: str, where:
     if first is None and search.unreadable:
         raise search.unreadable[0]
     if first is None:
-        raise SceneError(argument, f"expected scenes {where}, found none")
+        raise SceneError(argument, f"expected scenes {where}, found none", _remedy(Path(argument)))
     yield first
     yield from scenes
+
+
+def _remedy(folder: Path) -> str:
+    """Return what to do about a folder in which no scene was found."""
+    if not os.path.isdir(folder):
+        return ""
+    results = list_plys(folder)
+    return f"{results[0]} is a result of gsmerge: name it" if results else find_remedy(folder)
 
 
 @dataclass
@@ -238,7 +256,7 @@ def _matches(pattern: str, search: _Search) -> Iterator[Path]:
         path = Path(name)
         if os.path.isdir(path):
             yield from search.walk(path)
-        elif path.suffix in SCENE_SUFFIXES:
+        elif path.suffix in SCENE_SUFFIXES and (path.suffix != ".glb" or holds_gaussians(path)):
             yield path
 
 

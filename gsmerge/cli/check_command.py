@@ -11,7 +11,7 @@ from gsmerge.errors import SceneError
 
 
 @opt.command(
-    opt.argument("paths", list[Path], "FILE...", "Files of Gaussians (.ply, .spz, .sog, .splat), "
+    opt.argument("paths", list[Path], "FILE...", "Files of Gaussians (.ply, .spz, .sog, .splat, .glb), "
                  "cameras (.json, .npz, ..., a COLMAP folder), .gsm files, and networks "
                  "(.safetensors)."),
 )  # fmt: skip

@@ -258,7 +258,7 @@ def number_or_text(text: str) -> int | str:
 
 BEFORE = argument("before", Path, "BEFORE", "The scene: a .ply or its folder.")
 AFTER = argument(
-    "after", list[Path] | None, "[AFTER]...", "Compact files of that scene: .ply, .spz, .sog or .splat.", default=None
+    "after", list[Path] | None, "[AFTER]...", "Compact files of it: .ply, .spz, .sog, .splat or .glb.", default=None
 )
 SCENE = argument("scene", Path, "SCENE", "A .ply with one Gaussian per pixel and view, or the folder it is in.")
 

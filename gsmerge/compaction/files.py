@@ -19,7 +19,8 @@ from gsmerge.io.atomic import AddOutput
 from gsmerge.io.cameras.embedded import camera_comments
 from gsmerge.io.cameras.json_files import viewer_cameras, write_transforms
 from gsmerge.io.cameras.read import read_cameras
-from gsmerge.io.formats.arrays import LOGIT_COMMENT
+from gsmerge.io.formats.arrays import RESULT_COMMENT
+from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.streamed import INDEX, remove_unused_chunks
 from gsmerge.io.formats.write import add_levels
 from gsmerge.measure.inspect import estimate, estimate_lines
@@ -90,7 +91,8 @@ def compact_files(
             raise SceneError(files.ply, problem, "look at its scales and opacities with gsmerge inspect")
         compacted, results = perf_counter(), (result, *result.coarser)
         embedded = [camera_comments(level.cameras[views], names) if outputs.embed_cameras else [] for level in results]
-        written = _write_results(add, outputs, at[out], results, [[*load.comments, *lines] for lines in embedded])
+        comments = [[RESULT_COMMENT, *load.comments, *lines] for lines in embedded]
+        written = _write_results(add, outputs, at[out], results, comments)
         if cameras_path is not None:
             text = viewer_cameras(result.cameras[views], names)
             if not shared:
@@ -209,10 +211,11 @@ def check_saved_cameras(scene: Scene, path: Path | None, *, embed: bool = False)
 
 
 def _compact_notes(loaded: Loaded) -> tuple[str, ...]:
-    """Return a note if the scene is a result of gsmerge, with far fewer Gaussians than pixels."""
-    scene = loaded.scene
+    """Return a note if the scene is a result of gsmerge, by its header or with far fewer Gaussians than pixels."""
+    scene, comments = loaded.scene, loaded.info.comments
     pixels = len(scene) * scene.cameras.height * scene.cameras.width
-    if scene.aligned or LOGIT_COMMENT not in loaded.info.comments or scene.num_gaussians > pixels / 2:
+    few = is_from_gsmerge(comments) and not scene.aligned and scene.num_gaussians <= pixels / 2
+    if not few and RESULT_COMMENT not in comments:
         return ()
     count = f"{scene.num_gaussians:,} Gaussians for {pixels:,} pixels" if pixels else "no Gaussian per pixel"
     return (f"the scene is compact already ({count}, written by gsmerge): start from the original for more detail",)

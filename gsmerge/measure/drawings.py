@@ -109,7 +109,7 @@ class Framed:
 
 def frame_files(files: SceneFiles, source: Path | None, cameras: Path | None, images: Path | None) -> SceneFiles:
     """Find the files of the scene that gives the cameras' frame: ``source``, else the scene it was compacted from."""
-    match = re.fullmatch(r"(.+)\.compact(\.level\d+)?(\.compressed)?\.(ply|spz|sog|splat)", files.ply.name)
+    match = re.fullmatch(r"(.+)\.compact(\.level\d+)?(\.compressed)?\.(ply|spz|sog|splat|glb)", files.ply.name)
     if source is None and match is not None and (beside := files.ply.with_name(f"{match[1]}.ply")).is_file():
         source = beside
     return files if source is None else find_scene_files(source, cameras=cameras or files.cameras, images=images)

@@ -14,8 +14,8 @@ from gsmerge.facts.compare_photos import compare_photos
 from gsmerge.facts.partition import gaussians_at_once
 from gsmerge.facts.prepare import canonicalise
 from gsmerge.io import GaussianFile, file_notes
-from gsmerge.io.formats.arrays import LOGIT_COMMENT
-from gsmerge.io.formats.ply import file_bytes
+from gsmerge.io.formats.ply import file_bytes, is_from_gsmerge
+from gsmerge.io.formats.read import degree_notes
 from gsmerge.measure.visibility import MAX_SAMPLES, inside_views
 from gsmerge.plan import plan_whole
 from gsmerge.report import finite, human_bytes
@@ -93,6 +93,7 @@ def inspect(
     with use_threads():
         ply = read_rows(files, opacity=opacity, hints=read_hints)
         document: dict[str, Any] = finite(_describe_file(ply) | _describe_views(ply, files, read_hints))
+        document["notes"] = [*document["notes"], *degree_notes(ply.info)]
     return document
 
 
@@ -117,7 +118,7 @@ def _photo_notes(scene: Scene) -> list[str]:
 
 
 def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> dict[str, Any]:
-    is_result = LOGIT_COMMENT in ply.info.comments
+    is_result = is_from_gsmerge(ply.info.comments)
     facts: dict[str, Any] = {
         "cameras": files.cameras and str(files.cameras),
         "images": files.images and str(files.images),

@@ -16,20 +16,27 @@ from gsmerge.io.cameras.embedded import holds_cameras
 from gsmerge.io.cameras.npz_files import holds_images
 from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
 from gsmerge.io.cameras.read import find_cameras, find_other_cameras, read_cameras, read_sharp_camera
-from gsmerge.io.formats.ply import header_counts
+from gsmerge.io.formats.ply import header_content, header_counts
 from gsmerge.io.image_names import list_images
+from gsmerge.scene.no_gaussians import check_scene_file, no_gaussians
 from gsmerge.types import StrPath
 
-# The first that exists wins; then the folder's only .ply.
+# The first that exists and is no result wins; then the folder's only .ply.
 PLY_PLACES = ("scene.ply", "gaussians.ply", "gs_ply/0000.ply", "point_cloud.ply")
+# Of trained scenes, the one of the most steps: INRIA's, and gsplat's
+TRAINED_PLACES = ("point_cloud/iteration_*/point_cloud.ply", "ply/point_cloud_*.ply")
 SCENES_PLACE = "gaussians"  # where DepthSplat and its relatives write NAME.ply, with the photos in images/NAME
 IMAGE_PLACES = ("images", "input", "context", "rgb", "input_images")
 MASK_PLACES = ("masks",)
 _POINT_CLOUDS = {"input.ply", "points3D.ply", "points.ply", "sparse_pc.ply"}  # of other programs
 _NUMBERED = re.compile(r"(.*?)[-_. ]?(\d+)\.ply")
+_STEPS = re.compile(r"(?:iteration|point_cloud)_(\d+)(?:\.ply|[\\/]point_cloud\.ply)$")
 # what files are called that have a view or a part each
 _PARTS = {"view", "chunk", "part", "block", "tile"}
 _RESULT = re.compile(r"\.compact(\.level\d+)?(\.compressed)?\.ply$")
+_MAX_HEADERS = 1_000  # of a folder that are read; the other files are taken for scenes
+_MAX_DEPTH = 3  # of the folders that are searched below one without a scene
+_MAX_ENTRIES = 10_000  # in them
 
 
 @dataclass(frozen=True)
@@ -76,24 +83,25 @@ def find_scene_files(
 
     Cameras inside the ``.ply`` go before others beside it.
 
-    The given folder is searched, then the ``.ply``'s own, then the one above it for ``gs_ply/`` and ``gaussians/``,
-    and two above it for ``point_cloud/iteration_n/``; in each the places of ``PLY_PLACES``, ``CAMERA_PLACES``,
-    ``IMAGE_PLACES`` and ``MASK_PLACES`` in their order. Without any of these cameras the only file of any name that
-    holds some will do. Images inside the cameras' ``.npz`` or ``.torch`` go before a folder, because they are those
-    that the model saw.
+    The given folder is searched, then the ``.ply``'s own, then the one above it for ``gs_ply/``, ``ply/`` and
+    ``gaussians/``, and two above it for ``point_cloud/iteration_n/``; in each the places of ``PLY_PLACES``,
+    ``CAMERA_PLACES``, ``IMAGE_PLACES`` and ``MASK_PLACES`` in their order. Without any of these cameras the only file
+    of any name that holds some will do. Images inside the cameras' ``.npz`` or ``.torch`` go before a folder, because
+    they are those that the model saw. A result of gsmerge is taken where a folder has nothing else.
 
     Raises:
         SceneError: If there is no ``.ply``, several to choose from, or a named file does not exist. Several are one
             scene if they are numbered views or parts, see ``docs/guide/formats.md``.
     """
     path = Path(path)
-    plys = _find_plys(path, _named(cameras)) if os.path.isdir(path) else [path]
+    plys = find_plys(path, _named(cameras)) if os.path.isdir(path) else [path]
     ply = plys[0]
     for part in plys:
         check_file(part)
+        check_scene_file(part)
     base = path if ply != path else ply.parent
     folder = Path(os.path.realpath(ply.parent))
-    above = [folder.parent] * (folder.name in ("gs_ply", SCENES_PLACE))
+    above = [folder.parent] * (folder.name in ("gs_ply", "ply", SCENES_PLACE))
     if folder.name.startswith("iteration_") and folder.parent.name == "point_cloud":
         above = [folder.parent.parent]
     roots = list(dict.fromkeys((Path(os.path.realpath(base)), folder, *above)))
@@ -129,18 +137,52 @@ def _named(path: StrPath | None) -> Path | None:
     return Path(path)
 
 
-def _find_plys(folder: Path, cameras: Path | None) -> list[Path]:
-    named = named_ply(folder)
-    plys = other_plys(folder) or other_plys(folder / SCENES_PLACE) if named is None else [named]
+def find_plys(folder: Path, cameras: Path | None = None) -> list[Path]:
+    """Find the files of a folder's only scene, as :func:`find_scene_files`; several are its parts, in their order."""
+    plys = list_plys(folder)
     if len(plys) == 1:
         return plys
     if not plys:
-        raise SceneError(folder, "expected a .ply file in the folder, found none")
-    parts = _order_parts(folder, plys, cameras or find_cameras(folder))
+        raise no_gaussians(folder)
+    places = {path.parent for path in plys}
+    parts = _order_parts(folder, plys, cameras or find_cameras(folder)) if len(places) == 1 else None
     if parts is None:
-        names = ", ".join(p.name for p in plys[:4])
-        raise SceneError(folder, f"expected one .ply file in the folder, found {len(plys)} ({names})", "name one")
+        start = places.pop() if len(places) == 1 else folder
+        names = ", ".join(path.relative_to(start).as_posix() for path in plys[:4])
+        problem = f"expected one .ply file in the folder, found {len(plys)} ({names})"
+        raise SceneError(folder, problem, "name one, or give the folder to gsmerge batch")
     return parts
+
+
+def list_plys(folder: Path) -> list[Path]:
+    """List the files that may be a folder's scene.
+
+    That is the one of a usual name, those in the folder, in ``gaussians/`` or further down, or only results of gsmerge.
+    """
+    plys = _plys_in(folder) or other_plys(folder / SCENES_PLACE)
+    return plys or [ply for place in _scenes_below(folder) for ply in _plys_in(place)] or _results_in(folder)
+
+
+def _plys_in(folder: Path) -> list[Path]:
+    named = named_ply(folder)
+    return other_plys(folder) if named is None else [named]
+
+
+def _scenes_below(folder: Path) -> list[Path]:
+    """List the folders of scenes below one, down to a depth; none where there are too many entries."""
+    scenes, places, num_entries = [], [(folder, 0)], 0
+    for place, depth in places:  # which grows
+        with suppress(OSError), os.scandir(place) as entries:
+            if depth and _plys_in(place):
+                scenes.append(place)
+                continue
+            for entry in entries:
+                num_entries += 1
+                if num_entries > _MAX_ENTRIES:
+                    return []
+                if depth < _MAX_DEPTH and entry.name[0] != "." and entry.is_dir(follow_symlinks=False):
+                    places.append((place / entry.name, depth + 1))
+    return sorted(scenes)
 
 
 def _order_parts(folder: Path, plys: Sequence[Path], cameras: Path | None) -> list[Path] | None:
@@ -179,15 +221,28 @@ def _has_camera_each(plys: Sequence[Path], cameras: Path | None) -> bool:
 
 
 def named_ply(folder: Path) -> Path | None:
-    """Find the file in a folder that has a usual name of a scene; None without one."""
+    """Find the scene in a folder that has a usual name; of trained ones, that of the most steps. None without one."""
     for place in PLY_PLACES:
-        if (folder / place).is_file():
+        if (folder / place).is_file() and _is_scene(folder / place):
             return folder / place
-    trained = [p for p in folder.glob("point_cloud/iteration_*/point_cloud.ply") if p.parent.name[10:].isdecimal()]
-    return max(trained, key=lambda p: int(p.parent.name[10:]), default=None)
+    patterns = (*TRAINED_PLACES, *(["point_cloud_*.ply"] if folder.name == "ply" else []))
+    trained = {path: _STEPS.search(str(path)) for pattern in patterns for path in folder.glob(pattern)}
+    steps = {path: int(match[1]) for path, match in trained.items() if match is not None}
+    return next((path for path in sorted(steps, key=lambda path: -steps[path]) if _is_scene(path)), None)
 
 
 def other_plys(folder: Path) -> list[Path]:
     """List the other files directly in a folder that may be scenes: no results of gsmerge, no point clouds."""
-    plys = (p for p in folder.glob("*.ply") if not p.name.startswith(".") and p.name not in _POINT_CLOUDS)
-    return sorted(p for p in plys if not _RESULT.search(p.name))
+    plys = sorted(folder.glob("[!.]*.ply"))
+    return [*(path for path in plys[:_MAX_HEADERS] if _is_scene(path)), *plys[_MAX_HEADERS:]]
+
+
+def _results_in(folder: Path) -> list[Path]:
+    plys = sorted(folder.glob("[!.]*.ply"))[:_MAX_HEADERS]
+    return [path for path in plys if _RESULT.search(path.name) or header_content(path) == "result"]
+
+
+def _is_scene(path: Path) -> bool:
+    """Return whether a file may be a scene: its name and header say neither result nor point cloud."""
+    named = path.name in _POINT_CLOUDS or _RESULT.search(path.name)
+    return not named and header_content(path) == "Gaussians"

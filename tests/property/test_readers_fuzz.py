@@ -21,11 +21,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from gsmerge.errors import SceneError
-from gsmerge.io import read_cameras, read_images, read_ply
+from gsmerge.io import read_cameras, read_gaussians, read_images
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.cameras.npz_files import read_depths
 from gsmerge.io.cameras.read import read_sharp_camera
 from gsmerge.io.formats.arrays import REQUIRED
+from gsmerge.io.formats.glb import glb_bytes
+from gsmerge.types import Gaussians
 
 EXAMPLES = int(os.environ.get("GSMERGE_FUZZ_EXAMPLES", "40"))
 ROWS = 3
@@ -97,11 +99,17 @@ def sharp_seed() -> bytes:
     return "\n".join([*lines, "end_header\n"]).encode() + np.array([0, 0, *camera], "<f4").tobytes()
 
 
+def glb_seed() -> bytes:
+    values = np.linspace(0.1, 0.9, 4 * ROWS, dtype=np.float32).reshape(ROWS, 4)
+    means, sh0 = values[:, :3], values[:, None, :3]
+    return glb_bytes(Gaussians(means, values, means, values[:, 3], sh0, np.repeat(sh0, 3, axis=1)))
+
+
 PLY_SEEDS = [*(ply_seed(form) for form in ("binary_little_endian", "binary_big_endian", "ascii")), packed_seed()]
 
 
 def check_gaussians(path: Path) -> None:
-    actual = read_ply(path)
+    actual = read_gaussians(path)
     gaussians, count = actual.gaussians, len(actual.gaussians)
     assert 0 < count <= path.stat().st_size
     assert np.isfinite(gaussians.means).all()
@@ -115,6 +123,12 @@ def check_gaussians(path: Path) -> None:
 @fuzzed
 def test_mutated_ply_files(data: bytes) -> None:
     attempt("a.ply", data, check_gaussians)
+
+
+@given(mutated(glb_seed()))
+@fuzzed
+def test_mutated_glb_files(data: bytes) -> None:
+    attempt("a.glb", data, check_gaussians)
 
 
 words = st.sampled_from(["vertex", "chunk", "sh", "list", "float", "uchar", "int", "double", "x", "y", "0", "1", "-1",

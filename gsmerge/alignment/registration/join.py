@@ -13,14 +13,9 @@ import numpy as np
 from gsmerge.alignment.registration.register import register
 from gsmerge.alignment.registration.similarities import move_points
 from gsmerge.errors import SceneError
-from gsmerge.geometry import Similarity, multiply_quats, normalize, rotmat_to_quat
+from gsmerge.geometry import Similarity, multiply_quats, rotmat_to_quat, turn_harmonics
 from gsmerge.kernels.elementary import arccos
-from gsmerge.kernels.matrices import matmul, solve
-from gsmerge.kernels.raster.sh import view_colors
 from gsmerge.types import Cameras, Gaussians, LargePhotos, Scene, grid_ids
-
-DIRECTIONS = 96  # in which harmonics are compared before and after a turn
-BRIGHT = np.float32(20.0)  # harmonic of degree 0 with which no colour is cut off below 0
 
 
 @dataclass(frozen=True)
@@ -113,41 +108,6 @@ def move_scene(scene: Scene, place: Similarity) -> Scene:
         shN=turn_harmonics(g.shN, place.rotation),
     )
     return replace(scene, gaussians=gaussians, cameras=place.move(scene.cameras))
-
-
-def turn_harmonics(shN: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """Rotate spherical harmonics ``[n,k-1,3]`` by ``rotation [3,3]``, as their Gaussians rotate.
-
-    Each degree is fitted to the same colours in rotated directions, which is exact.
-    """
-    num = shN.shape[1]
-    if num == 0 or len(shN) == 0:
-        return shN
-    directions = normalize(np.random.default_rng(0).normal(size=(DIRECTIONS, 3)))
-    before = _basis(matmul(directions, rotation), num)
-    after = _basis(directions, num)
-    turn = solve(matmul(after.T, after), matmul(after.T, before))
-    rows = matmul(shN.swapaxes(1, 2).reshape(-1, num), turn.T)
-    return np.ascontiguousarray(rows.reshape(-1, 3, num).swapaxes(1, 2), shN.dtype)
-
-
-def _basis(directions: np.ndarray, num: int) -> np.ndarray:
-    """Evaluate the higher harmonics in directions ``[d,3]``: ``[d,num]`` float64."""
-    means = directions.astype(np.float32)
-    count = len(means)
-    sh0 = np.full((count, 1, 3), BRIGHT)
-    ids = np.arange(count, dtype=np.int32)
-    plain = np.empty((count, 3), np.float32)
-    colors = np.empty((count, 3), np.float32)
-    eye = np.zeros(3, np.float32)
-    view_colors(means, sh0, np.zeros((count, num, 3), np.float32), ids, eye, 0, count, plain)
-    columns = []
-    for base in range(num):
-        shN = np.zeros((count, num, 3), np.float32)
-        shN[:, base] = 1
-        view_colors(means, sh0, shN, ids, eye, 0, count, colors)
-        columns.append((colors - plain)[:, 0].astype(np.float64))
-    return np.stack(columns, 1)
 
 
 def concat_scenes(scenes: Sequence[Scene]) -> Scene:

@@ -21,7 +21,9 @@ from gsmerge.io.bounds import check_file, check_pixels
 from gsmerge.io.cameras.camera_file import C2W_OPENCV, ORDERS, View
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
 
-_EXTRINSICS, _INTRINSICS = ("extrinsics", "exts", "extrinsic"), ("intrinsics", "ixts", "intrinsic")
+_LYRA = ("recon_sampled", "da3", "da3_pred")  # ends of names in ``cameras.npz`` of Lyra 2, by its scripts
+_EXTRINSICS = ("extrinsics", "exts", "extrinsic", *(f"w2c_{name}" for name in _LYRA))
+_INTRINSICS = ("intrinsics", "ixts", "intrinsic", *(f"intrinsics_{name}" for name in _LYRA))
 _IMAGES, _DEPTHS = ("image", "images"), ("depth", "depths")
 _MAX_INTRINSIC, _SMALL = 1e12, 1e-9
 _FREE_BYTES = 64 << 20  # an array of that size is read however well it is compressed
@@ -38,9 +40,9 @@ def read_da3(source: CameraSource) -> StoredCameras:
     """Read the cameras (and images, if stored) of an npz: world-to-camera 3x4 or 4x4, intrinsics in pixels.
 
     Intrinsics of another image size than the depth maps' (a COLMAP export in the same call writes those), or
-    normalised ones, are scaled to it. What VGGT (``extrinsic``, world to camera) and AnySplat (the same, camera to
-    world, normalised, in a batch of one) return is read as well. SceneError if the file cannot be read or lacks an
-    array.
+    normalised ones, are scaled to it. ``cameras.npz`` of Lyra 2, and what VGGT (``extrinsic``, world to camera) and
+    AnySplat (the same, camera to world, normalised, in a batch of one) return are read as well. SceneError if the file
+    cannot be read or lacks an array.
     """
     path = source.path
     sizes = () if holds_images(path) else _DEPTHS  # of depths only the shape counts, the confidence is never read

@@ -33,7 +33,7 @@ from gsmerge.types import StrPath
 CAMERA_PLACES = (
     "views.npz", "transforms.json", "cameras.json", "camera_params.json", "sparse/0", "sparse",
     "colmap/sparse/0", "colmap", "exports/npz/results.npz", "exports/mini_npz/results.npz",
-    "results.npz", "camera_poses.txt", "0", ".",
+    "results.npz", "cameras.npz", "camera_poses.txt", "0", ".",
 )  # fmt: skip
 INTRINSICS = ("intrinsic.txt", "intrinsics.txt")
 _POSE_COLUMNS = (12, 16)  # numbers of a pose in a line

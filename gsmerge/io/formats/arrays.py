@@ -13,6 +13,7 @@ from gsmerge.types import Array, Gaussians, as_array
 
 MAX_LOG_SCALE = 30.0  # exp(30) squared and exp(-30) squared are still normal float32 numbers
 LOGIT_COMMENT = "opacity: logit"  # so that our own files are never guessed at
+RESULT_COMMENT = "gsmerge result"  # in its place in results of commands; as long, so that sizes stay the same
 RENDER_COMMENT = "SplatRenderMode"  # brush writes it: plain, or mip for Gaussians with a filter of their own
 MIP_COMMENT = f"{RENDER_COMMENT}: mip"
 

@@ -1,26 +1,41 @@
 """Binary glTF 2.0 (``.glb``) with the extension ``KHR_gaussian_splatting`` of github.com/KhronosGroup/glTF.
 
-Its axis y points up, that of a ``.ply`` down: a node turns the Gaussians by half a turn about z. Viewers that do not
-know the extension show points in the base colours.
+Its axis y points up, that of a ``.ply`` down: a node turns the Gaussians by half a turn about z, and the reader turns
+them back. Viewers that do not know the extension show points in the base colours. Drafts of the extension are read,
+too: scales as logarithms, of which some are negative, and ``_ROTATION``, ``_SCALE`` and ``COLOR_0``.
 """
 
 from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
 
-from gsmerge.io.formats.arrays import to_bytes, to_columns
-from gsmerge.kernels.elementary import exp
+from gsmerge.errors import SceneError
+from gsmerge.geometry import multiply_quats, quat_to_rotmat, rgb_to_sh0, rotmat_to_quat, turn_harmonics
+from gsmerge.io.bounds import MAX_TEXT_BYTES, check_file, read_errors
+from gsmerge.io.formats.arrays import Columns, StoredRows, concatenate, to_bytes, to_columns, to_rows
+from gsmerge.kernels.elementary import exp, log
+from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Gaussians
 
 MAX_DEGREE = 3
 NAME = "KHR_gaussian_splatting"
+COLOR_SPACE = "srgb_rec709_display"
+READ_EXTENSIONS = {NAME, "KHR_mesh_quantization", "KHR_materials_unlit"}
 _FLOAT, _BYTE, _VERTICES, _POINTS = 5126, 5121, 34962, 0  # numbers of glTF
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+_WIDTHS = {name: width for width, name in _TYPES.items()}
+_DTYPES = {5120: "<i1", _BYTE: "<u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
+_HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
+_HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
+_EVEN = 1e-3  # by how much the scales of a node's axes may differ, and its axes be oblique
 
 
 def glb_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
@@ -54,7 +69,7 @@ def glb_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
         for name, end in (("min", np.min), ("max", np.max)):  # of the positions, which glTF asks for
             accessors[0][name] = end(attributes["POSITION"], axis=0).tolist()
         content = b"".join(array.tobytes() for array in attributes.values())
-        splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+        splats = {"kernel": "ellipse", "colorSpace": COLOR_SPACE}
         splats |= {"sortingMethod": "cameraDistance", "projection": "perspective"}
         places = {name: i for i, name in enumerate(attributes)}
         document |= {
@@ -68,9 +83,193 @@ def glb_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
         }
     text = json.dumps(document, separators=(",", ":")).encode("ascii")
     chunks = _chunk(b"JSON", text, b" ") + (_chunk(b"BIN\0", content, b"\0") if content else b"")
-    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+    return _HEADER.pack(b"glTF", 2, _HEADER.size + len(chunks)) + chunks
 
 
 def _chunk(kind: bytes, content: bytes, padding: bytes) -> bytes:
     content += padding * (-len(content) % 4)
-    return struct.pack("<I4s", len(content), kind) + content
+    return _CHUNK.pack(len(content), kind) + content
+
+
+def holds_gaussians(path: Path) -> bool:
+    """Return whether a ``.glb`` names the extension; True for one that cannot be read, so that its reader says why."""
+    try:
+        with _damage(path), path.open("rb") as file:
+            return NAME in str(_read_document(file, check_file(path)).get("extensionsUsed"))
+    except SceneError:
+        return True
+
+
+def read_rows(path: Path) -> StoredRows:
+    """Read all Gaussians of a ``.glb`` in the frame of a ``.ply``; SceneError if there are none, or it is damaged."""
+    size = check_file(path)
+    sizes: dict[str, int] = {}
+    # a scale of 0 is a value, what is not finite is set aside later
+    with _damage(path), path.open("rb") as file, np.errstate(all="ignore"):
+        content = _Content(file, _read_document(file, size), file.tell(), size)
+        parts = [_move(_read_splats(content, mesh, sizes), place) for mesh, place in _walk_splats(content.document)]
+    if not parts:
+        problem = f"expected Gaussians ({NAME}), found a .glb of points or a mesh"
+        raise SceneError(path, problem, "name the .ply that the model wrote with it")
+    return replace(to_rows(concatenate(parts), ".glb", sizes), format="binary little-endian")
+
+
+@contextmanager
+def _damage(path: Path) -> Iterator[None]:
+    """Turn whatever damaged or foreign files make the reader raise into a SceneError."""
+    try:
+        with read_errors(path):
+            yield
+    except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError, struct.error) as error:
+        text = str(error) if isinstance(error, _ForeignError) else f"a damaged one ({error!r:.200})"
+        raise SceneError(path, f"expected a .glb of Gaussians, found {text}", "export it again, or as .ply") from error
+
+
+class _ForeignError(ValueError):
+    """What a file has in the place of Gaussians that can be read."""
+
+
+@dataclass(frozen=True)
+class _Content:
+    """The content of a ``.glb`` whose binary chunk, of ``end - start`` bytes, is read part by part."""
+
+    file: IO[bytes]
+    document: dict[str, Any]
+    start: int
+    end: int
+    num_read: list[int] = field(default_factory=list)  # bytes of all parts so far, which are different ones
+
+    def values(self, accessor_id: int) -> np.ndarray:
+        """Read the values ``[n,width]`` of an accessor as float64, which have to be in the chunk."""
+        accessor = self.document["accessors"][accessor_id]
+        if "sparse" in accessor or "bufferView" not in accessor:
+            raise _ForeignError("one with sparse values")
+        view = self.document["bufferViews"][accessor["bufferView"]]
+        if view.get("extensions") or view["buffer"] != 0 or "uri" in self.document["buffers"][0]:
+            raise _ForeignError(f"one with compressed values or values in another file ({list(view)})")
+        dtype, width = np.dtype(_DTYPES[accessor["componentType"]]), _WIDTHS[accessor["type"]]
+        each, count, first = dtype.itemsize * width, accessor["count"], accessor.get("byteOffset", 0)
+        stride = view.get("byteStride", each)
+        span, at = (count - 1) * stride + each, self.start + view.get("byteOffset", 0) + first
+        self.num_read.append(count * each)
+        inside = first >= 0 and first + span <= view["byteLength"] and self.start <= at and at + span <= self.end
+        if count < 1 or stride < each or not inside:
+            raise _ForeignError(f"one that is cut: {count} values of {each} bytes are not in its {self.end} bytes")
+        if sum(self.num_read) > self.end - self.start:
+            raise _ForeignError("one that shows the same values in several places")
+        self.file.seek(at)
+        rows = np.ndarray((count, width), dtype, self.file.read(span), strides=(stride, dtype.itemsize))
+        most = np.iinfo(dtype).max if accessor.get("normalized") else 1
+        return np.maximum(rows / most, -1) if most > 1 else rows.astype(np.float64)
+
+
+def _read_document(file: IO[bytes], size: int) -> dict[str, Any]:
+    """Read the JSON of a ``.glb``, and go to the start of its binary chunk."""
+    start = file.read(_HEADER.size + _CHUNK.size)
+    if len(start) < _HEADER.size + _CHUNK.size:
+        raise _ForeignError("an early end of file")
+    (magic, version, total), (length, kind) = _HEADER.unpack_from(start), _CHUNK.unpack_from(start, _HEADER.size)
+    if (magic, version, kind) != (b"glTF", 2, b"JSON"):
+        raise _ForeignError("a file that is no binary glTF 2.0")
+    if total > size or length > min(total - len(start), MAX_TEXT_BYTES):
+        raise _ForeignError(f"one that is cut: {max(total, length)} bytes are not in its {size}, or of JSON too many")
+    document = json.loads(file.read(length))
+    if not isinstance(document, dict):
+        raise _ForeignError("one without an object of JSON")
+    missing = set(document.get("extensionsRequired", ())) - READ_EXTENSIONS
+    if missing and NAME in str(document.get("extensionsUsed")):
+        raise _ForeignError(f"one that needs {', '.join(sorted(map(str, missing)))}, which is not read")
+    file.read(_CHUNK.size)
+    return document
+
+
+def _walk_splats(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
+    """Yield the primitives of Gaussians, and the matrix ``[4,4]`` of each into the frame of a ``.ply``."""
+    scenes, nodes, seen = document.get("scenes") or [{}], document.get("nodes", []), set[int]()
+    stack = [(node_id, _HALF_TURN) for node_id in scenes[document.get("scene", 0)].get("nodes", [])]
+    while stack:
+        node_id, above = stack.pop()
+        if node_id in seen:
+            raise _ForeignError(f"one with node {node_id} in two places")
+        seen.add(node_id)
+        node = nodes[node_id]
+        place = matmul(above, _node_matrix(node))
+        primitives = document["meshes"][node["mesh"]]["primitives"] if "mesh" in node else []
+        yield from ((primitive, place) for primitive in primitives if NAME in primitive.get("extensions", {}))
+        stack += [(child, place) for child in reversed(node.get("children", []))]
+
+
+def _node_matrix(node: dict[str, Any]) -> np.ndarray:
+    if "matrix" in node:
+        return np.ascontiguousarray(np.array(node["matrix"], np.float64).reshape(4, 4).T)
+    x, y, z, w = node.get("rotation", (0, 0, 0, 1))
+    matrix = np.eye(4)
+    matrix[:3, :3] = quat_to_rotmat(np.array([[w, x, y, z]], np.float64))[0] * np.array(node.get("scale", (1, 1, 1)))
+    matrix[:3, 3] = node.get("translation", (0, 0, 0))
+    return matrix
+
+
+def _read_splats(content: _Content, primitive: dict[str, Any], sizes: dict[str, int]) -> Columns:
+    """Read the columns of one primitive, and add their bytes to ``sizes`` by attribute."""
+    splats, attributes = primitive["extensions"][NAME], primitive["attributes"]
+    kernel, space = splats.get("kernel", "ellipse"), splats.get("colorSpace", COLOR_SPACE)
+    if splats.get("extensions") or (kernel, space) != ("ellipse", COLOR_SPACE):
+        more = ", ".join(map(str, splats.get("extensions") or (kernel, space)))
+        raise _ForeignError(f"Gaussians of another kind ({more})")
+
+    def read(kind: str, width: int, *names: str) -> np.ndarray:
+        name = next((name for name in names if name in attributes), None)
+        if name is None:
+            raise _ForeignError(f"one whose Gaussians have no {names[0]}")
+        before = sum(content.num_read)
+        values = content.values(attributes[name])
+        if values.shape[1] != width:
+            raise _ForeignError(f"one with {values.shape[1]} numbers of {name} each")
+        sizes[kind] = sizes.get(kind, 0) + sum(content.num_read) - before
+        return values
+
+    means, scales = read("means", 3, "POSITION"), read("scales", 3, f"{NAME}:SCALE", "_SCALE")
+    quats, names = np.roll(read("quats", 4, f"{NAME}:ROTATION", "_ROTATION"), 1, axis=1), _harmonic_names(attributes)
+    if names:
+        sh0, *harmonics = [read("shN" if i else "sh0", 3, name) for i, name in enumerate(names)]
+        opacities = read("opacities", 1, f"{NAME}:OPACITY")
+    else:
+        colors, harmonics = read("sh0", 4, "COLOR_0"), []
+        sh0, opacities = rgb_to_sh0(colors[:, :3]), colors[:, 3:]
+    count = len(means)
+    if any(len(column) != count for column in (quats, scales, sh0, opacities, *harmonics)):
+        raise _ForeignError(f"one with values for others than its {count} Gaussians")
+    return Columns(
+        means=means,
+        quats=quats,
+        log_scales=scales if scales.min() < 0 else log(scales),
+        opacities=opacities[:, 0],
+        sh0=sh0,
+        harmonics=np.stack(harmonics, 1) if harmonics else np.zeros((count, 0, 3)),
+    )
+
+
+def _harmonic_names(attributes: dict[str, Any]) -> list[str]:
+    """List the attributes of harmonics up to the highest degree of which a primitive has some; none in drafts."""
+    names = [[f"{NAME}:SH_DEGREE_{degree}_COEF_{i}" for i in range(2 * degree + 1)] for degree in range(MAX_DEGREE + 1)]
+    num_degrees = max((i for i, degree in enumerate(names, 1) if degree[0] in attributes), default=0)
+    return [name for degree in names[:num_degrees] for name in degree]
+
+
+def _move(columns: Columns, place: np.ndarray) -> Columns:
+    """Move Gaussians by the matrix of their node ``[4,4]``, which has to be a similarity."""
+    if np.array_equal(place, np.eye(4)):
+        return columns
+    scale = np.sqrt((place[:3, :3] ** 2).sum(0)).mean()
+    rotation = place[:3, :3] / scale
+    oblique = np.abs(matmul(rotation.T, rotation) - np.eye(3)).max()
+    mirrored = (np.cross(rotation[0], rotation[1]) * rotation[2]).sum() < 0
+    if mirrored or not (np.isfinite(place).all() and oblique < _EVEN):
+        raise _ForeignError("one with a node that stretches or mirrors its Gaussians")
+    return replace(
+        columns,
+        means=scale * matmul(columns.means, rotation.T) + place[:3, 3],
+        quats=multiply_quats(rotmat_to_quat(rotation[None])[0], columns.quats),
+        log_scales=columns.log_scales + float(log(scale)),
+        harmonics=turn_harmonics(columns.harmonics, rotation),
+    )

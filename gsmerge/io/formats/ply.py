@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from io import BufferedReader, FileIO, TextIOWrapper
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Literal
 
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyElementParseError, PlyListProperty, PlyParseError
@@ -23,7 +23,8 @@ from gsmerge.io.formats.compressed import is_compressed, unpack
 from gsmerge.kernels.elementary import log, log1p
 from gsmerge.types import Gaussians
 
-MAX_DEGREE = 4
+MAX_DEGREE = 3  # of the harmonics that results have: splat-transform 3.7 and gsply refuse a .ply with more
+MAX_READ_DEGREE = 4
 MAX_LOGIT = 16.0  # from 16.6 on the sigmoid is 1 in float32, and its logit infinite
 BLOCK_BYTES = 1 << 19  # of file rows converted at a time: they stay in the cache from the first column to the last
 
@@ -48,11 +49,16 @@ def read_rows(path: Path) -> arrays.StoredRows:
         rows=rows,
         layout=_layout_name(names, _num_rest(path, names), compressed=compressed),
         format="ascii" if data.text else "binary big-endian" if data.byte_order == ">" else "binary little-endian",
-        encoding="logit" if compressed or arrays.LOGIT_COMMENT in comments else None,
+        encoding="logit" if compressed or is_from_gsmerge(comments) else None,
         sizes=_bytes_by_attribute(rows.dtype, len(rows)),
         comments=comments,
         extra_elements=tuple(e.name for e in data.elements if e.name != "vertex"),
     )
+
+
+def is_from_gsmerge(comments: Sequence[str]) -> bool:
+    """Return whether comments of a header say that gsmerge wrote the file: a result, or Gaussians of any origin."""
+    return arrays.LOGIT_COMMENT in comments or arrays.RESULT_COMMENT in comments
 
 
 def _vertex(path: Path, data: PlyData) -> PlyElement:
@@ -221,6 +227,24 @@ def header_counts(path: Path) -> tuple[int, int]:
     return int(match[1]) if match else 0, len(re.findall(rb"^property \S+ f_rest_\d+\s*$", header, re.MULTILINE))
 
 
+def header_content(path: Path) -> Literal["result", "Gaussians", "other"]:
+    """Tell from its first 4 KiB what a PLY file holds: a result of gsmerge, Gaussians, or columns of anything else.
+
+    What cannot be read, or has a longer header, may hold Gaussians, too.
+    """
+    try:
+        check_file(path)
+        with path.open("rb") as file:
+            header, end, _ = file.read(1 << 12).partition(b"end_header")
+    except (OSError, SceneError):
+        return "Gaussians"
+    if re.search(rb"^comment %s\s*$" % arrays.RESULT_COMMENT.encode(), header, re.MULTILINE):
+        return "result"
+    columns = re.findall(rb"^property .*?(\w+)\s*$", header, re.MULTILINE) if end else []
+    expected = (b"scale_", b"rot_", b"f_dc_", b"packed_")
+    return "Gaussians" if not columns or any(name.startswith(expected) for name in columns) else "other"
+
+
 def _check_header(path: Path, start: bytes, size: int) -> tuple[int, bool]:
     """Return the size of a header and whether rows are text; SceneError if the file is too short for it.
 
@@ -298,22 +322,23 @@ def _header(count: int, sh_degree: int, comments: Sequence[str] = (), *, normals
         *(f"f_rest_{i}" for i in range(num_rest)),
     ]
     names += ["opacity", *arrays.SCALES, *arrays.QUATS]
-    lines = ["ply", "format binary_little_endian 1.0", f"comment {arrays.LOGIT_COMMENT}"]
+    comments = comments if arrays.RESULT_COMMENT in comments else (arrays.LOGIT_COMMENT, *comments)
+    lines = ["ply", "format binary_little_endian 1.0"]
     lines += [*(f"comment {comment}" for comment in comments), f"element vertex {count}"]
     lines += [*(f"property float {name}" for name in names), "end_header", ""]
     return "\n".join(lines).encode("ascii"), len(names)
 
 
 def file_bytes(count: int, sh_degree: int) -> int:
-    """Return the size in bytes of the ``.ply`` of ``count`` Gaussians, without comments."""
-    header, num_columns = _header(count, sh_degree)
+    """Return the size in bytes of the result of ``count`` Gaussians as a ``.ply``, without further comments."""
+    header, num_columns = _header(count, min(sh_degree, MAX_DEGREE))
     return len(header) + 4 * num_columns * count
 
 
 def count_for_bytes(max_bytes: int, sh_degree: int) -> int:
     """Return the largest number of Gaussians whose ``.ply`` has at most ``max_bytes``; UsageError if none fits."""
-    if not 0 <= sh_degree <= MAX_DEGREE:
-        raise ValueError(f"sh_degree: expected 0 to {MAX_DEGREE}, got {sh_degree}")
+    if not 0 <= sh_degree <= MAX_READ_DEGREE:
+        raise ValueError(f"sh_degree: expected 0 to {MAX_READ_DEGREE}, got {sh_degree}")
     least = file_bytes(1, sh_degree)
     if max_bytes < least:
         raise UsageError(f"budget: expected at least {least} bytes for one Gaussian, got {max_bytes}")

@@ -13,7 +13,7 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry import rgb_to_sh0
 from gsmerge.io.formats import arrays, ply, streamed
 from gsmerge.io.formats.arrays import StoredRows
-from gsmerge.io.formats.table import input_format
+from gsmerge.io.formats.table import PLY, input_format
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.runtime.memory import free_pages, make_array
 from gsmerge.runtime.threads import parallel_map
@@ -92,6 +92,13 @@ def file_notes(info: FileInfo) -> tuple[str, ...]:
     return (*notes, *odd, *(f"{count:,} {what}" for what, count in counted.items() if count))
 
 
+def degree_notes(info: FileInfo) -> tuple[str, ...]:
+    """Describe harmonics of a degree that few programs read in a ``.ply``, as :func:`file_notes`."""
+    if info.sh_degree <= ply.MAX_DEGREE or not PLY.names(info.path):
+        return ()
+    return (f"harmonics of degree {info.sh_degree}: splat-transform 3.7 and gsply refuse a .ply with them",)
+
+
 def read_ply(path: StrPath, *, opacity: OpacityChoice = "auto") -> GaussianFile:
     """Read a PLY file of Gaussians: binary or ascii, any SH degree up to 4, extra columns and elements ignored.
 
@@ -128,7 +135,7 @@ def read_parts(paths: Sequence[Path], *, opacity: OpacityChoice = "auto") -> Gau
 def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto") -> GaussianFile:
     """Read a file of Gaussians; the ending of its name tells the format.
 
-    Endings are ``.spz`` (versions 1 to 4), ``.splat`` and ``.sog`` (version 2); of a ``lod-meta.json``, it is
+    Endings are ``.spz`` (versions 1 to 4), ``.splat``, ``.sog`` (version 2) and ``.glb``; of a ``lod-meta.json``, it is
     the finest level. Everything else is read by :func:`read_ply`, for which ``opacity`` is. SceneError if the file
     cannot be read, is damaged, or holds no finite Gaussian; ValueError for another ``opacity``.
 

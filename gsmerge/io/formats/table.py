@@ -39,7 +39,7 @@ FORMATS = (  # of endings that end alike the longest first
     Format(".spz", spz.read_rows, partial(spz.spz_bytes, version=4), spz.MAX_DEGREES[4], 4, spz.zstandard),
     Format(".sog", sog.read_rows, sog.sog_bytes, sog.MAX_DEGREE),
     Format(".splat", splat.read_rows, splat.splat_bytes, splat.MAX_DEGREE),
-    Format(".glb", None, glb.glb_bytes, glb.MAX_DEGREE),
+    Format(".glb", glb.read_rows, glb.glb_bytes, glb.MAX_DEGREE),
     Format(streamed.INDEX, streamed.read_rows, None, streamed.MAX_DEGREE),
 )
 OUTPUT_FORMATS = tuple(dict.fromkeys(row.ending for row in FORMATS[:-1]))

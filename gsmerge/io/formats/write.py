@@ -9,15 +9,17 @@ from gsmerge.errors import UsageError
 from gsmerge.io.atomic import AddOutput, atomic_output, atomic_outputs
 from gsmerge.io.formats import ply, sog, streamed
 from gsmerge.io.formats.arrays import MIP_COMMENT
-from gsmerge.io.formats.table import output_format
+from gsmerge.io.formats.table import PLY, output_format
 from gsmerge.types import Gaussians, StrPath
 
 
 def lost_harmonics(path: StrPath, sh_degree: int, spz_version: int = 3) -> str | None:
-    """Describe the harmonics that a format cannot store; None if it stores all. UsageError for an unknown ending."""
+    """Describe the harmonics that are not written in a format; None if all are. UsageError for an unknown ending."""
     chosen = output_format(path, spz_version, levels=True)
     if sh_degree <= chosen.max_degree:
         return None
+    if chosen is PLY:
+        return f"harmonics above degree {chosen.max_degree} are left out: few programs read a .ply with them"
     return f"{chosen.ending} has no room for harmonics above degree {chosen.max_degree}: left out"
 
 
@@ -33,7 +35,8 @@ def write_gaussians(
 ) -> None:
     """Write Gaussians to a file; the ending of its name, one of ``OUTPUT_FORMATS``, chooses the format.
 
-    All but ``.ply`` and ``.glb`` quantise; none of them changes the frame of the Gaussians.
+    All but ``.ply`` and ``.glb`` quantise; none of them changes the frame of the Gaussians. Harmonics of degree 4 are
+    left out, except in a ``.spz`` of version 4 and by :func:`write_ply`.
 
     Args:
         path: The file; complete or not there at all.
@@ -56,7 +59,8 @@ def write_gaussians(
     """
     chosen = output_format(ending or path, spz_version)
     if chosen.encode is None:
-        write_ply(path, gaussians, overwrite=overwrite, comments=comments, normals=normals)
+        degree = min(gaussians.sh_degree, chosen.max_degree)
+        write_ply(path, gaussians, overwrite=overwrite, sh_degree=degree, comments=comments, normals=normals)
         return
     _check_comments(comments)
     with atomic_output(path, overwrite=overwrite) as temporary:

@@ -13,8 +13,10 @@ from exports import export_rows, home, save_export, smooth_scene, turned
 from messages import noted, refuses
 from tiny_scene import frames_of, save_json, write_images, write_npz
 
+from gsmerge.batch.find import find_scenes, main_file
 from gsmerge.errors import SceneError
-from gsmerge.io import read_cameras
+from gsmerge.file_checks import check_content
+from gsmerge.io import read_cameras, to_cameras
 from gsmerge.scene.content_hash import read_files
 from gsmerge.scene.files import find_scene_files
 from gsmerge.scene.read import load_scene
@@ -47,6 +49,79 @@ def test_depthsplat_s_folders(tmp_path: Path) -> None:
     assert find_scene_files(tmp_path / "gaussians/hall.ply").images == tmp_path / "images/hall"
     with refuses(SceneError, tmp_path, "2 (hall.ply, room.ply)"):
         find_scene_files(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("ply", "beside"),
+    [
+        ("gaussians.ply", ("images/0.png", "cameras_path.json")),  # AnySplat's demo
+        ("re10k_room_gaussians.ply", ("re10k_room_input_0.png", "re10k_room_angle_000_raw.png")),  # SPFSplat
+        ("point_clouds/re10k/room/re10k_room_gaussians.ply", ()),  # SPFSplat, from the folder where it ran
+        ("gaussians/room.ply", ("metrics/scores.json",)),  # VolSplat
+        ("scene.ply", ("turntable.mp4",)),  # ZipSplat
+        ("anya_rgba.ply", ("anya_rgba.mp4",)),  # LGM
+        ("reconstructed_scene.ply", ("gs_trajectory.mp4", "done.txt")),  # Lyra 2
+        ("ply/point_cloud_29999.ply", ("cfg.yml", "ckpts/ckpt_29999_rank0.pt", "stats/val_step29999.json")),  # gsplat
+        ("room/20261120_101500/gaussians.ply", ()),  # WorldMirror 2, from the folder of all its results
+        ("exports/splat/splat.ply", ("config.yml",)),  # nerfstudio
+    ],
+)
+def test_the_scene_of_a_folder(tmp_path: Path, ply: str, beside: tuple[str, ...]) -> None:
+    """Files of other kinds and point clouds are beside it, and hidden folders."""
+    path = save_export(tmp_path / Path(ply).parent, SMOOTH, export_rows(SMOOTH), cameras=False, name=Path(ply).name)
+    points = np.zeros(7, [*((name, "f4") for name in "xyz"), *((name, "u1") for name in ("red", "green", "blue"))])
+    for name in ("mesh.ply", "sparse/points.ply"):
+        save_export(tmp_path / Path(name).parent, SMOOTH, points, cameras=False, name=Path(name).name)
+    for name in (*beside, ".trash/scene.ply"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    for start in dict.fromkeys((tmp_path, path)):
+        assert find_scene_files(start).ply == tmp_path / ply
+    assert [main_file(scene) for scene in find_scenes([str(tmp_path)], tmp_path / "out")] == [tmp_path / ply]
+    assert check_content(tmp_path).count == len(SMOOTH.gaussians)
+
+
+def test_the_most_steps_of_gsplat_s_trainer(tmp_path: Path) -> None:
+    for name in ("ply/point_cloud_6999.ply", "ply/point_cloud_29999.ply"):
+        save_export(tmp_path / "ply", SMOOTH, export_rows(SMOOTH), cameras=False, name=Path(name).name)
+    save_json(tmp_path / "transforms.json", frames_of(SMOOTH))
+    write_images(tmp_path / "images", SMOOTH)
+    for start in (tmp_path, tmp_path / "ply"):
+        files = find_scene_files(start)
+        assert (files.ply.name, files.images) == ("point_cloud_29999.ply", tmp_path / "images")
+        assert files.cameras == tmp_path / "transforms.json"
+    assert list(find_scenes([str(tmp_path)], tmp_path / "out")) == [tmp_path]
+
+
+def test_several_scenes_further_down_are_named(tmp_path: Path) -> None:
+    for name in ("b", "a", "c/d/e/too-deep"):
+        save_export(tmp_path / name, SMOOTH, export_rows(SMOOTH), cameras=False, name="gaussians.ply")
+    with refuses(SceneError, tmp_path, "2 (a/gaussians.ply, b/gaussians.ply)", "batch"):
+        find_scene_files(tmp_path)
+
+
+def test_a_folder_of_too_many_files_is_not_searched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    save_export(tmp_path / "a", SMOOTH, export_rows(SMOOTH), cameras=False, name="gaussians.ply")
+    monkeypatch.setattr("gsmerge.scene.files._MAX_ENTRIES", 3)
+    assert find_scene_files(tmp_path).ply == tmp_path / "a/gaussians.ply"
+    for i in range(3):
+        (tmp_path / f"{i}.txt").touch()
+    with refuses(SceneError, tmp_path, "none"):
+        find_scene_files(tmp_path)
+
+
+@pytest.mark.parametrize("ends", ["recon_sampled", "da3", "da3_pred"])
+def test_lyra_2_s_cameras(tmp_path: Path, ends: str) -> None:
+    """Its scripts name the poses of the reconstruction by what made them, with those of the video beside them."""
+    tiny = SMOOTH
+    save_export(tmp_path, tiny, export_rows(tiny), cameras=False, name="reconstructed_scene.ply")
+    video = {"w2c_render": np.tile(np.eye(4), (9, 1, 1)), "intrinsics_render": np.tile(np.eye(3), (9, 1, 1))}
+    Ks = np.tile(np.array([[40.0, 0, 24], [0, 40, 18], [0, 0, 1]]), (3, 1, 1))
+    np.savez(tmp_path / "cameras.npz", **video, **{f"w2c_{ends}": tiny.w2c, f"intrinsics_{ends}": Ks})
+    np.savez(tmp_path / "vipe_predictions.npz", w2c_da3=tiny.w2c, intrinsics_da3=Ks)
+    files = find_scene_files(tmp_path)
+    assert files.cameras == tmp_path / "cameras.npz"
+    np.testing.assert_allclose(to_cameras(read_cameras(files.cameras)).viewmats, tiny.w2c, atol=1e-6)
 
 
 @pytest.mark.parametrize("written", ["AnySplat", "VGGT"])

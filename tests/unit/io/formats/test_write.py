@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scenes
-from messages import refuses
+from messages import noted, refuses
 from plyfile import PlyData
 from slow_readers import corners, drawn, read_back
 from tiny_scene import Tiny
@@ -117,7 +117,8 @@ def test_rotations_are_the_same_up_to_a_sign(ending: str, tmp_path: Path) -> Non
 
 
 def test_harmonics_without_room_are_noted() -> None:
-    assert lost_harmonics("a.ply", 4) is None
+    assert lost_harmonics("a.ply", 3) is None
+    assert noted([str(lost_harmonics("a.ply", 4))], "above degree 3", ".ply")
     assert lost_harmonics("a.spz", 3) is None
     note = lost_harmonics("a.splat", 1)
     assert note == ".splat has no room for harmonics above degree 0: left out"
@@ -125,7 +126,7 @@ def test_harmonics_without_room_are_noted() -> None:
 
 
 def test_a_higher_degree_loses_its_top(scene: Scene, tmp_path: Path) -> None:
-    for ending, degree in ((".spz", 3), (".sog", 3), (".compressed.ply", 3), (".splat", 0)):
+    for ending, degree in ((".ply", 3), (".spz", 3), (".sog", 3), (".compressed.ply", 3), (".splat", 0)):
         write_gaussians(tmp_path / f"a{ending}", drawn(scene, 4))
         assert read_back(tmp_path / f"a{ending}").sh_degree == degree
 

@@ -1,0 +1,104 @@
+"""What models and programs leave without Gaussians, and how each is made to write some."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+from gsmerge.errors import SceneError
+from gsmerge.io.bounds import check_file
+from gsmerge.io.formats import glb
+from gsmerge.io.formats.ply import header_content
+from gsmerge.io.formats.table import SCENE_SUFFIXES
+
+MAX_FOLDERS = 100  # in a folder of scenes that are looked into
+_NAME = "name the .ply of the Gaussians, or the folder that it is in"
+
+
+@dataclass(frozen=True)
+class PointsOnly:
+    """A model or program that left files without Gaussians, and what makes it, or another, write them."""
+
+    title: str  # as people call it
+    files: tuple[str, ...]  # patterns of what it leaves in a folder, one of which is enough
+    remedy: str
+
+
+_TRAIN = "name a model's .ply, and this with --cameras, or train Gaussians on it"
+# In the order of trial
+POINTS_ONLY = (
+    PointsOnly(
+        "Depth Anything 3",
+        ("exports/npz/results.npz", "exports/mini_npz/results.npz", "results.npz", "scene.glb"),
+        'ask it for export_format="npz-gs_ply" or "mini_npz-gs_ply" with infer_gs=True and a giant model',
+    ),
+    PointsOnly("gsplat's trainer", ("ckpts/ckpt_*.pt",), "run it with its option save_ply"),
+    PointsOnly("nerfstudio", ("nerfstudio_models/*.ckpt",), "write them with ns-export gaussian-splat"),
+    PointsOnly("FLARE", ("pred.npz",), f"it has no Gaussians to write: {_TRAIN}"),
+    PointsOnly(
+        "VGGT or MapAnything",
+        ("sparse/points.ply", "dense_mesh.glb", "glbscene_*.glb", "predictions.npz", "points.ply"),
+        f"they have no Gaussians to write: {_TRAIN}",
+    ),
+    PointsOnly(
+        "COLMAP",
+        tuple(f"{folder}cameras.{kind}" for folder in ("sparse/0/", "sparse/", "0/", "") for kind in ("bin", "txt")),
+        _TRAIN,
+    ),
+    PointsOnly(
+        "a model of points",
+        ("*.glb", "*.npz"),
+        'Depth Anything 3 writes Gaussians with export_format="npz-gs_ply" and infer_gs=True, VGGT has none',
+    ),
+)
+
+
+def no_gaussians(folder: Path) -> SceneError:
+    """Make the error of a folder without a scene: what is there instead, and what to do."""
+    content, remedy = _content(folder) or ("", _NAME)
+    problem = "expected a .ply of Gaussians in the folder, found none"
+    return SceneError(folder, f"{problem} but {content}" if content else problem, remedy)
+
+
+def find_remedy(folder: Path) -> str:
+    """Return what to do about a folder of folders without a scene; empty where nothing in them is known."""
+    with suppress(OSError):
+        inside = (path for path in sorted(folder.iterdir()) if path.is_dir() and path.name[0] != ".")
+        for place in (folder, *islice(inside, MAX_FOLDERS)):
+            content = _content(place)
+            if content is not None:
+                return f"{place} has {content[0]}: {content[1]}"
+    return ""
+
+
+def _content(folder: Path) -> tuple[str, str] | None:
+    """Describe what a folder has in the place of a .ply, and what to do about it; None if nothing in it is known."""
+    files = (path for path in sorted(folder.glob("[!.]*")) if path.is_file() and _holds_gaussians(path))
+    named = next(files, None)
+    if named is not None:
+        return named.name, "name that file"
+    for row in POINTS_ONLY:
+        file = next((path for pattern in row.files for path in sorted(folder.glob(pattern))), None)
+        if file is not None:
+            return f"{file.relative_to(folder).as_posix()} of {row.title}", row.remedy
+    points = next((path for path in sorted(folder.glob("[!.]*.ply")) if header_content(path) == "other"), None)
+    return None if points is None else (f"points or a mesh in {points.name}", _NAME)
+
+
+def check_scene_file(path: Path) -> None:
+    """Raise SceneError with the remedy for a file that is known to hold no Gaussians, such as ``results.npz``."""
+    suffix = path.suffix.lower()
+    if suffix not in (".npz", ".glb") or not check_file(path) or (suffix == ".glb" and glb.holds_gaussians(path)):
+        return
+    matching = (row for row in POINTS_ONLY if any(path.match(Path(file).name) for file in row.files))
+    row = next(matching, POINTS_ONLY[-1])
+    problem = f"expected a file of Gaussians, found {suffix[1:]} without any, as {row.title} writes it"
+    raise SceneError(path, problem, row.remedy)
+
+
+def _holds_gaussians(path: Path) -> bool:
+    """Return whether a file other than a .ply has Gaussians by its ending; a .glb is looked into."""
+    suffix = path.suffix.lower()
+    return suffix != ".ply" and suffix in SCENE_SUFFIXES and (suffix != ".glb" or glb.holds_gaussians(path))

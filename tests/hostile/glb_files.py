@@ -1,0 +1,126 @@
+"""Binary glTF of Gaussians that is cut, that lies, or that is absurd."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from .case import EITHER, NUMBERS, READ, Case, Spoil
+
+NAME = "KHR_gaussian_splatting"
+DEEP = 100_000  # brackets, or nodes in one another
+
+
+def bytes_of(change: Callable[[bytes], bytes]) -> Spoil:
+    """The scene as a ``.glb`` of other bytes."""
+
+    def spoil(folder: Path) -> Sequence[object]:
+        from gsmerge.io import read_ply, write_gaussians
+
+        path = folder / "scene.glb"
+        write_gaussians(path, read_ply(folder / "scene.ply").gaussians)
+        path.write_bytes(change(path.read_bytes()))
+        return [path]
+
+    return spoil
+
+
+def text(change: Callable[[bytes], bytes]) -> Spoil:
+    """The same with other JSON before the same numbers."""
+
+    def replace(data: bytes) -> bytes:
+        (length,) = struct.unpack_from("<I", data, 12)
+        changed = change(data[20 : 20 + length])
+        changed += b" " * (-len(changed) % 4)
+        rest = struct.pack("<I4s", len(changed), b"JSON") + changed + data[20 + length :]
+        return struct.pack("<4sII", b"glTF", 2, 12 + len(rest)) + rest
+
+    return bytes_of(replace)
+
+
+def document(change: Callable[[dict[str, Any]], object]) -> Spoil:
+    def edit(data: bytes) -> bytes:
+        parsed = json.loads(data)
+        change(parsed)
+        return json.dumps(parsed).encode()
+
+    return text(edit)
+
+
+def placed(*path: str | int, value: Any) -> Spoil:
+    """Another value at a place of the document."""
+
+    def change(parsed: Any) -> None:
+        for key in path[:-1]:
+            parsed = parsed[key]
+        parsed[path[-1]] = value
+
+    return document(change)
+
+
+def head(at: int, form: str, value: int) -> Spoil:
+    return bytes_of(lambda data: data[:at] + struct.pack(form, value) + data[at + struct.calcsize(form) :])
+
+
+def chain(parsed: dict[str, Any]) -> None:
+    """Nodes in one another, of which the last has the Gaussians."""
+    parsed["nodes"] = [{"children": [i + 1], "scale": [2, 2, 2]} for i in range(DEEP)] + parsed["nodes"]
+
+
+def copies(parsed: dict[str, Any]) -> None:
+    """As many nodes that show the same Gaussians."""
+    parsed["nodes"] = [{"children": list(range(1, DEEP))}, *([{"mesh": 0}] * DEEP)]
+
+
+def shared(parsed: dict[str, Any]) -> None:
+    """All harmonics are the positions."""
+    names = [f"{NAME}:SH_DEGREE_{d}_COEF_{i}" for d in (1, 2, 3) for i in range(2 * d + 1)]
+    parsed["meshes"][0]["primitives"][0]["attributes"] |= dict.fromkeys(names, 0)
+
+
+def _cases() -> dict[str, Case]:
+    sizes = (0, 1, 11, 12, 19, 20, 100, 2000, -1, -4, -20_000)
+    cases = {f"cut to {size} bytes": Case(bytes_of(lambda data, size=size: data[:size])) for size in sizes}
+    cases |= {f"{name} cut": Case(bytes_of(lambda data, at=at: data[:at]), says=("scene.glb",)) for name, at in (
+        ("header", 10), ("JSON", 60), ("numbers", -8),
+    )}  # fmt: skip
+    for value in (0, 1, 19, 2**31, 2**32 - 1):
+        cases[f"JSON of {value} bytes"] = Case(head(12, "<I", value))
+        cases[f"version {value}"] = Case(head(4, "<I", value))
+    cases["another length in the header"] = Case(head(8, "<I", 2**32 - 1), says=("scene.glb", "4294967295"))
+    cases["the same bytes"] = Case(text(lambda data: data), READ)
+    contents = {
+        "nothing": b"", "a list": b"[]", "a number": b"1e999", "brackets": b"[" * DEEP, "objects": b'{"a":' * DEEP,
+        "no UTF-8": b"\xff\xfe{}", "another text": b"notes", "an empty object": b"{}",
+    }  # fmt: skip
+    cases |= {f"JSON with {name}": Case(text(lambda _, data=data: data)) for name, data in contents.items()}
+    primitive = ("meshes", 0, "primitives", 0)
+    places: dict[str, tuple[str | int, ...]] = {
+        "count": ("accessors", 0, "count"), "type of numbers": ("accessors", 1, "componentType"),
+        "type": ("accessors", 2, "type"), "view": ("accessors", 3, "bufferView"), "accessors": ("accessors",),
+        "buffer": ("bufferViews", 0, "buffer"), "start": ("bufferViews", 1, "byteOffset"),
+        "length": ("bufferViews", 0, "byteLength"), "stride": ("bufferViews", 0, "byteStride"),
+        "scene": ("scene",), "roots": ("scenes", 0, "nodes"), "nodes": ("nodes",), "mesh": ("nodes", 0, "mesh"),
+        "children": ("nodes", 0, "children"), "rotation": ("nodes", 0, "rotation"), "matrix": ("nodes", 0, "matrix"),
+        "scale": ("nodes", 0, "scale"), "translation": ("nodes", 0, "translation"), "meshes": ("meshes",),
+        "primitives": primitive[:3], "attributes": (*primitive, "attributes"),
+        "accessor": (*primitive, "attributes", "POSITION"), "extension": (*primitive, "extensions"),
+        "used": ("extensionsUsed",), "needed": ("extensionsRequired",),
+    }  # fmt: skip
+    for name, path in places.items():
+        cases |= {f"{name} {word}": Case(placed(*path, value=value), EITHER) for word, value in NUMBERS.items()}
+    for value in (float("nan"), float("inf"), 1e300, 0.0):
+        for part in ("translation", "scale"):
+            cases[f"{part} of {value}"] = Case(placed("nodes", 0, part, value=[value] * 3), EITHER)
+    cases["nodes in one another"] = Case(document(chain))
+    cases["a node in itself"] = Case(placed("nodes", 0, "children", value=[0]), says=("scene.glb", "node 0"))
+    cases["copies without end"] = Case(document(copies), says=("scene.glb", "same values"))
+    cases["values for many attributes"] = Case(document(shared), says=("scene.glb", "same values"))
+    cases["a promise"] = Case(placed("accessors", 0, "count", value=10**9), says=("scene.glb", "1000000000"))
+    return cases
+
+
+CASES = {f"glb: {name}": case for name, case in _cases().items()}

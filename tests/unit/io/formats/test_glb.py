@@ -1,0 +1,221 @@
+"""``.glb`` of Gaussians are read: gsmerge's own as they were written, and those of other writers and drafts."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scenes
+from messages import refuses
+from slow_readers import drawn
+
+from gsmerge import Gaussians, Scene
+from gsmerge.errors import SceneError
+from gsmerge.geometry import multiply_quats, quat_to_rotmat
+from gsmerge.io import read_gaussians, write_gaussians
+from gsmerge.io.formats.glb import holds_gaussians
+from gsmerge.types import SH_C0
+
+NAME = "KHR_gaussian_splatting"
+NUMBERS = {"<f4": 5126, "|i1": 5120, "|u1": 5121, "<i2": 5122, "<u2": 5123}
+Document = dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return scenes.make_scene(scenes.room(), scenes.arc(3, 48, 36))
+
+
+def attributes_of(g: Gaussians) -> dict[str, np.ndarray]:
+    """Name the columns of Gaussians, as in the specification."""
+    columns = {"POSITION": g.means, f"{NAME}:ROTATION": g.quats[:, [1, 2, 3, 0]], f"{NAME}:SCALE": g.scales}
+    columns |= {f"{NAME}:OPACITY": g.opacities[:, None], f"{NAME}:SH_DEGREE_0_COEF_0": g.sh0[:, 0]}
+    places = [(d, i) for d in range(1, g.sh_degree + 1) for i in range(2 * d + 1)]
+    columns |= {f"{NAME}:SH_DEGREE_{d}_COEF_{i}": g.shN[:, d * d - 1 + i] for d, i in places}
+    return {name: values.astype("<f4") for name, values in columns.items()}
+
+
+def save_glb(
+    path: Path, columns: dict[str, np.ndarray], nodes: list[Document] | None = None, **splats: Any
+) -> Document:
+    """Write columns as one primitive of a ``.glb``; integers are normalised. Returns the document."""
+    values = [np.ascontiguousarray(array) for array in columns.values()]
+    starts = np.cumsum([0, *(array.nbytes + -array.nbytes % 4 for array in values)]).tolist()
+    content = b"".join(array.tobytes() + bytes(-array.nbytes % 4) for array in values)
+    views = [
+        {"buffer": 0, "byteOffset": at, "byteLength": array.nbytes} for at, array in zip(starts, values, strict=False)
+    ]
+    accessors = [
+        {"bufferView": i, "componentType": NUMBERS[array.dtype.str], "count": len(array),
+         "normalized": array.dtype != "<f4", "type": {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[array.shape[1]]}
+        for i, array in enumerate(values)
+    ]  # fmt: skip
+    primitive = {"attributes": {name: i for i, name in enumerate(columns)}, "mode": 0, "extensions": {NAME: splats}}
+    document = {
+        "asset": {"version": "2.0"}, "extensionsUsed": [NAME], "scene": 0, "scenes": [{"nodes": [0]}],
+        "nodes": nodes or [{"mesh": 0}], "meshes": [{"primitives": [primitive]}], "accessors": accessors,
+        "bufferViews": views, "buffers": [{"byteLength": len(content)}],
+    }  # fmt: skip
+    put(path, document, content)
+    return document
+
+
+def put(path: Path, document: Document, content: bytes) -> None:
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(content), b"BIN\0") + content
+    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+
+
+def same(actual: Gaussians, expected: Gaussians, atol: float = 2e-6) -> None:
+    """Compare all columns, rotations up to their sign, and scales and sizes relative to their own."""
+    sign = np.where((actual.quats * expected.quats).sum(1) < 0, -1, 1)[:, None]
+    np.testing.assert_allclose(actual.quats * sign, expected.quats, atol=atol)
+    np.testing.assert_allclose(actual.scales, expected.scales, rtol=5 * atol)
+    for name in ("means", "opacities", "sh0", "shN"):
+        np.testing.assert_allclose(getattr(actual, name), getattr(expected, name), atol=atol, err_msg=name)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_what_is_written_is_read_back(degree: int, scene: Scene, tmp_path: Path) -> None:
+    gaussians = drawn(scene, degree)
+    write_gaussians(tmp_path / "a.glb", gaussians)
+    actual = read_gaussians(tmp_path / "a.glb")
+    same(actual.gaussians, gaussians, 2e-7)
+    np.testing.assert_array_equal(actual.gaussians.means, gaussians.means)
+    np.testing.assert_array_equal(actual.gaussians.shN, gaussians.shN)
+    info = actual.info
+    assert (info.count, info.sh_degree, info.opacity_encoding) == (len(gaussians), degree, "raw")
+    assert sum(info.bytes_by_attribute.values()) == len(gaussians) * (4 * 14 + 12 * gaussians.shN.shape[1])
+
+
+def test_axis_y_of_other_writers_points_up(scene: Scene, tmp_path: Path) -> None:
+    """Half a turn about z: harmonics of odd order change their sign, which is how splat-transform writes them."""
+    gaussians = drawn(scene, 3)
+    save_glb(tmp_path / "a.glb", attributes_of(gaussians))
+    orders = [order for degree in range(1, 4) for order in range(-degree, degree + 1)]
+    signs = np.array([-1 if order % 2 else 1 for order in orders], np.float32)[:, None]
+    half_turn = np.array([0, 0, 0, 1], np.float32)
+    expected = Gaussians(
+        gaussians.means * np.array([-1, -1, 1], np.float32), multiply_quats(half_turn, gaussians.quats),
+        gaussians.scales, gaussians.opacities, gaussians.sh0, gaussians.shN * signs,
+    )  # fmt: skip
+    same(read_gaussians(tmp_path / "a.glb").gaussians, expected)
+
+
+def test_nodes_move_their_gaussians(scene: Scene, tmp_path: Path) -> None:
+    """Two copies, of which one is moved by its node's parts, and one by the matrices of two nodes."""
+    gaussians = drawn(scene, 0)
+    turn = np.array([0.5, 0.1, -0.7, 0.2])
+    turn /= np.linalg.norm(turn)
+    matrix = np.eye(4)
+    matrix[:3, :3] = quat_to_rotmat(turn[None])[0]
+    nodes: list[Document] = [
+        {"children": [1, 2]},
+        {"mesh": 0, "rotation": np.roll(turn, -1).tolist(), "scale": [2, 2, 2], "translation": [1, 2, 3]},
+        {"scale": [2, 2, 2], "translation": [1, 2, 3], "children": [3]},
+        {"mesh": 1, "matrix": matrix.T.reshape(-1).tolist()},
+    ]
+    both = {f"{name}{i}": values for i in "01" for name, values in attributes_of(gaussians).items()}
+    document = save_glb(tmp_path / "a.glb", both, nodes)
+    (primitive,) = document["meshes"][0]["primitives"]
+    parts = [{name[:-1]: at for name, at in primitive["attributes"].items() if name[-1] == i} for i in "01"]
+    document["meshes"] = [{"primitives": [primitive | {"attributes": part}]} for part in parts]
+    content = (tmp_path / "a.glb").read_bytes()[-document["buffers"][0]["byteLength"] :]
+    put(tmp_path / "a.glb", document, content)
+    actual = read_gaussians(tmp_path / "a.glb").gaussians
+    count = len(gaussians)
+    means = (2 * gaussians.means @ matrix[:3, :3].T + [1, 2, 3]) * [-1, -1, 1]
+    same(actual[:count], actual[count:])
+    np.testing.assert_allclose(actual.means[:count], means, atol=1e-5)
+    np.testing.assert_allclose(actual.scales[:count], 2 * gaussians.scales, rtol=1e-5)
+
+
+def test_drafts_of_the_extension(scene: Scene, tmp_path: Path) -> None:
+    """Scales as logarithms; and names with an underscore, colours and opacities in those of the points."""
+    gaussians = drawn(scene, 0)
+    columns = attributes_of(gaussians)
+    save_glb(tmp_path / "plain.glb", columns)
+    expected = read_gaussians(tmp_path / "plain.glb").gaussians
+    columns[f"{NAME}:SCALE"] = np.log(columns[f"{NAME}:SCALE"])
+    save_glb(tmp_path / "log.glb", columns)
+    same(read_gaussians(tmp_path / "log.glb").gaussians, expected)
+    colors = np.concatenate([0.5 + SH_C0 * gaussians.sh0[:, 0], gaussians.opacities[:, None]], 1)
+    early = {"POSITION": columns["POSITION"], "COLOR_0": np.round(255 * colors.clip(0, 1)).astype(np.uint8)}
+    early |= {f"_{part}": columns[f"{NAME}:{part}"] for part in ("ROTATION", "SCALE")}
+    save_glb(tmp_path / "early.glb", early)
+    actual = read_gaussians(tmp_path / "early.glb").gaussians
+    np.testing.assert_allclose(actual.opacities, expected.opacities, atol=0.5 / 255)
+    inside = ((colors[:, :3] > 0) & (colors[:, :3] < 1)).all(1)
+    np.testing.assert_allclose(actual.sh0[inside], expected.sh0[inside], atol=0.51 / 255 / SH_C0)
+
+
+def test_quantised_values(scene: Scene, tmp_path: Path) -> None:
+    gaussians = drawn(scene, 0)
+    columns = attributes_of(gaussians)
+    save_glb(tmp_path / "plain.glb", columns)
+    expected = read_gaussians(tmp_path / "plain.glb").gaussians
+    columns[f"{NAME}:ROTATION"] = np.round(127 * columns[f"{NAME}:ROTATION"]).astype(np.int8)
+    columns[f"{NAME}:SCALE"] = np.round(65535 * columns[f"{NAME}:SCALE"].clip(0, 1)).astype(np.uint16)
+    columns[f"{NAME}:OPACITY"] = np.round(255 * columns[f"{NAME}:OPACITY"]).astype(np.uint8)
+    save_glb(tmp_path / "small.glb", columns)
+    actual = read_gaussians(tmp_path / "small.glb").gaussians
+    assert np.abs((actual.quats * expected.quats).sum(1)).min() > 0.9998
+    np.testing.assert_allclose(actual.scales, expected.scales.clip(0, 1), atol=1 / 65535)
+    np.testing.assert_allclose(actual.opacities, expected.opacities, atol=0.5 / 255 + 1e-6)
+
+
+def of_primitive(change: Callable[[Document], object]) -> Callable[[Document], object]:
+    return lambda document: change(document["meshes"][0]["primitives"][0])
+
+
+def of_splats(**values: Any) -> Callable[[Document], object]:
+    return of_primitive(lambda primitive: primitive["extensions"][NAME].update(values))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (of_primitive(lambda p: p["extensions"].clear()), (NAME, "mesh")),
+        (of_splats(colorSpace="lin_rec709_display"), ("lin_rec709_display",)),
+        (of_splats(kernel="customShape"), ("customShape",)),
+        (of_splats(extensions={f"{NAME}_spz_2": {}}), (f"{NAME}_spz_2",)),
+        (of_primitive(lambda p: p["attributes"].pop(f"{NAME}:SCALE")), (f"{NAME}:SCALE",)),
+        (of_primitive(lambda p: p["attributes"].pop(f"{NAME}:SH_DEGREE_1_COEF_2")), ("SH_DEGREE_1_COEF_2",)),
+        (of_primitive(lambda p: p["attributes"].pop(f"{NAME}:SH_DEGREE_0_COEF_0")), ("SH_DEGREE_0_COEF_0",)),
+        (lambda d: d.update(extensionsRequired=["EXT_meshopt_compression"]), ("EXT_meshopt_compression",)),
+        (lambda d: d["buffers"][0].update(uri="b.bin"), ("another file",)),
+        (lambda d: d["accessors"][2].update(sparse={}), ("sparse",)),
+        (lambda d: d["accessors"][2].update(count=10**12), ("cut",)),
+        (lambda d: d["accessors"][2].update(count=5), ("others",)),
+        (lambda d: d["nodes"][0].update(children=[0]), ("node 0",)),
+        (lambda d: d["nodes"][0].update(scale=[1, 2, 1]), ("stretches",)),
+        (lambda d: d["nodes"][0].update(scale=[-1, -1, -1]), ("mirrors",)),
+        (lambda d: d.update(nodes=[{"children": [1, 2]}, {"mesh": 0}, {"mesh": 0}]), ("same values",)),
+    ],
+)  # fmt: skip
+def test_what_is_refused(
+    change: Callable[[Document], object], said: tuple[str, ...], scene: Scene, tmp_path: Path
+) -> None:
+    path = tmp_path / "a.glb"
+    document = save_glb(path, attributes_of(drawn(scene, 1)))
+    content = path.read_bytes()[-document["buffers"][0]["byteLength"] :]
+    change(document)
+    put(path, document, content)
+    with refuses(SceneError, "a.glb", *said):
+        read_gaussians(path)
+
+
+def test_whether_it_holds_gaussians(scene: Scene, tmp_path: Path) -> None:
+    document = save_glb(tmp_path / "a.glb", attributes_of(drawn(scene, 0)))
+    assert holds_gaussians(tmp_path / "a.glb")
+    document["extensionsUsed"] = []
+    put(tmp_path / "a.glb", document, b"")
+    assert not holds_gaussians(tmp_path / "a.glb")
+    (tmp_path / "a.glb").write_bytes(b"glTF")
+    assert holds_gaussians(tmp_path / "a.glb")  # its reader says what is wrong with it

@@ -1,0 +1,120 @@
+"""Folders and files without Gaussians are refused in one line that says what to do."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from messages import names, refuses
+from plyfile import PlyData, PlyElement
+from tiny_scene import Tiny, write_colmap_binary, write_images, write_npz
+
+from gsmerge.batch.find import find_scenes
+from gsmerge.cli import main
+from gsmerge.errors import SceneError
+from gsmerge.io import write_gaussians
+from gsmerge.scene.files import find_scene_files
+from gsmerge.scene.no_gaussians import POINTS_ONLY
+
+
+def write_points(path: Path) -> None:
+    """Write a coloured point cloud, as VGGT and MapAnything do into ``sparse/``."""
+    columns = [*((name, "f4") for name in "xyz"), *((name, "u1") for name in ("red", "green", "blue"))]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    PlyData([PlyElement.describe(np.zeros(5, columns), "vertex")]).write(str(path))
+
+
+def write_mesh(path: Path) -> None:
+    """Write a ``.glb`` with a node and nothing else."""
+    text = json.dumps({"asset": {"version": "2.0"}, "scenes": [{"nodes": [0]}], "nodes": [{}]}).encode()
+    text += b" " * (-len(text) % 4)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text), len(text), b"JSON") + text)
+
+
+def leave(folder: Path, tiny: Tiny, name: str) -> None:
+    """Leave a file of the kind that its name says."""
+    path = folder / name
+    if path.suffix == ".npz":
+        write_npz(path, tiny)
+    elif path.suffix == ".glb":
+        write_mesh(path)
+    elif path.suffix == ".ply":
+        write_points(path)
+    elif path.suffix == ".bin":
+        write_colmap_binary(path.parent, tiny)
+    else:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+
+
+@pytest.mark.parametrize(
+    ("left", "found", "said"),
+    [
+        (("exports/npz/results.npz", "scene.glb"), "exports/npz/results.npz", ("Depth Anything 3", "infer_gs=True")),
+        (("exports/mini_npz/results.npz",), "exports/mini_npz/results.npz", ("mini_npz-gs_ply", "giant")),
+        (("scene.glb", "scene.jpg"), "scene.glb", ("Depth Anything 3", "npz-gs_ply")),
+        (("results.npz",), "results.npz", ("Depth Anything 3", "npz-gs_ply")),
+        (("sparse/cameras.bin", "sparse/points.ply"), "sparse/points.ply", ("MapAnything", "--cameras")),
+        (("predictions.npz", "glbscene_50.glb"), "glbscene_50.glb", ("VGGT", "--cameras")),
+        (("sparse/0/cameras.bin",), "sparse/0/cameras.bin", ("COLMAP", "--cameras")),
+        (("cameras.bin",), "cameras.bin", ("COLMAP", "--cameras")),
+        (("cfg.yml", "ckpts/ckpt_29999_rank0.pt"), "ckpts/ckpt_29999_rank0.pt", ("gsplat", "save_ply")),
+        (("config.yml", "nerfstudio_models/step-000029999.ckpt"), "nerfstudio_models", ("ns-export",)),
+        (("pred.npz",), "pred.npz", ("FLARE",)),
+        (("output.glb",), "output.glb", ("npz-gs_ply", "VGGT")),
+        (("mesh.ply",), "mesh.ply", ("points", "name")),
+        (("notes.txt",), "none", ()),
+    ],
+)
+def test_a_folder_without_gaussians(
+    tmp_path: Path, tiny: Tiny, left: tuple[str, ...], found: str, said: tuple[str, ...]
+) -> None:
+    """As ``compact`` and ``inspect`` say it; ``batch`` has the same remedy for a folder of such folders."""
+    folder = tmp_path / "scenes/room"
+    write_images(folder / "images", tiny)
+    for name in left:
+        leave(folder, tiny, name)
+    with refuses(SceneError, folder, ".ply", "none", *said) as raised:
+        find_scene_files(folder)
+    assert found in str(raised.value)
+    for command in ("compact", "inspect"):
+        assert main([command, str(folder)]) == 3
+    with refuses(SceneError, tmp_path / "scenes", "none", *said):
+        list(find_scenes([str(tmp_path / "scenes")], tmp_path / "out"))
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("results.npz", ("Depth Anything 3", "npz-gs_ply")),
+        ("predictions.npz", ("VGGT", "--cameras")),
+        ("any.npz", ("npz-gs_ply", "VGGT")),
+        ("scene.glb", ("Depth Anything 3", "infer_gs=True")),
+        ("OUTPUT.GLB", ("npz-gs_ply", "VGGT")),
+    ],
+)
+def test_a_file_that_holds_no_gaussians(tmp_path: Path, tiny: Tiny, name: str, said: tuple[str, ...]) -> None:
+    leave(tmp_path, tiny, name)
+    if name.endswith("GLB"):
+        write_mesh(tmp_path / name)
+    with refuses(SceneError, name, "Gaussians", *said):
+        find_scene_files(tmp_path / name)
+
+
+@pytest.mark.parametrize("ending", [".spz", ".sog", ".splat", ".glb"])
+def test_a_scene_in_another_format_is_named(tmp_path: Path, tiny: Tiny, ending: str) -> None:
+    path = tmp_path / f"room{ending}"
+    write_gaussians(path, tiny.gaussians)
+    with refuses(SceneError, tmp_path, path.name, "name"):
+        find_scene_files(tmp_path)
+    assert find_scene_files(path).ply == path
+
+
+def test_no_pattern_is_in_two_rows() -> None:
+    patterns = [pattern for row in POINTS_ONLY for pattern in row.files]
+    assert len(set(patterns)) == len(patterns)
+    assert all(row.title and row.remedy and not names(row.remedy, "None") for row in POINTS_ONLY)

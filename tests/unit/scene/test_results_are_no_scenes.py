@@ -1,0 +1,121 @@
+"""Results of gsmerge say so in their headers, and are not taken for the scene of a folder, whatever they are called."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+from exports import export_rows, save_export
+from messages import noted, refuses
+from plyfile import PlyData
+from tiny_scene import Tiny
+
+from gsmerge.batch.find import find_scenes
+from gsmerge.cli import main
+from gsmerge.compaction.files import Outputs, compact_files, read_input
+from gsmerge.errors import SceneError
+from gsmerge.file_checks import check_content
+from gsmerge.io import read_ply, write_gaussians, write_ply
+from gsmerge.io.formats.arrays import RESULT_COMMENT
+from gsmerge.io.formats.ply import file_bytes, header_content
+from gsmerge.scene.files import find_scene_files
+from gsmerge.settings.compact import CompactOptions
+
+PLAIN = CompactOptions().with_settings({"superpixels": "20%", "fit": "none", "threads": 1, "levels": 2})
+
+
+def save_result(path: Path, tiny: Tiny) -> Path:
+    """Write every fifth Gaussian as a command writes its result."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_gaussians(path, tiny.gaussians[::5], comments=[RESULT_COMMENT])
+    return path
+
+
+@pytest.fixture
+def folder(tmp_path: Path, tiny: Tiny) -> Path:
+    """The tiny scene as another program writes it, called ``room.ply``."""
+    return save_export(tmp_path / "scene", tiny, export_rows(tiny), name="room.ply")
+
+
+@pytest.mark.parametrize("ending", [".ply", ".compressed.ply"])
+def test_results_of_commands_say_so(folder: Path, tmp_path: Path, ending: str) -> None:
+    compact_files(find_scene_files(folder), PLAIN, Outputs(folder / f"x{ending}"))
+    assert main(["encode", str(folder), "-o", str(tmp_path / "x.gsm"), "--superpixels", "20%", "-q"]) == 0
+    assert main(["decode", str(tmp_path / "x.gsm"), "-o", str(folder / f"y{ending}"), "-q"]) == 0
+    results = [folder / f"x{ending}", folder / f"x.level1{ending}", folder / f"y{ending}"]
+    assert sorted(folder.glob("*.ply")) == sorted([folder / "room.ply", *results])
+    for path in results:
+        assert header_content(path) == "result"
+        assert RESULT_COMMENT in PlyData.read(path).comments
+        assert read_ply(path).info.opacity_encoding == "logit"
+    assert find_scene_files(folder).ply == folder / "room.ply"
+
+
+def test_a_result_is_as_large_as_a_budget_in_bytes_counts(tmp_path: Path, tiny: Tiny) -> None:
+    path = save_result(tmp_path / "x.ply", tiny)
+    assert path.stat().st_size == file_bytes(len(tiny.gaussians[::5]), 0)
+
+
+@pytest.mark.parametrize(
+    "name", ["x.ply", "scene.ply", "gaussians.ply", "gs_ply/0000.ply", "a.compressed.ply", "room2.ply"]
+)
+def test_a_result_beside_the_scene_is_not_taken(folder: Path, tiny: Tiny, name: str) -> None:
+    save_result(folder / name, tiny)
+    assert find_scene_files(folder).ply == folder / "room.ply"
+    assert list(find_scenes([str(folder)], Path("out"))) == [folder / "room.ply"]
+    assert check_content(folder).count == len(tiny.gaussians)
+    assert find_scene_files(folder / name).ply == folder / name  # where it is named
+
+
+def test_a_result_among_parts_or_steps_is_not_taken(tmp_path: Path, tiny: Tiny) -> None:
+    for i in range(2):
+        write_ply(tmp_path / f"view_{i}.ply", tiny.gaussians[i * 280 : (i + 1) * 280])
+    save_result(tmp_path / "view_2.ply", tiny)
+    assert [path.name for path in find_scene_files(tmp_path).plys] == ["view_0.ply", "view_1.ply"]
+    assert check_content(tmp_path).count == 560
+    steps = tmp_path / "run/ply"
+    save_export(steps, tiny, export_rows(tiny), cameras=False, name="point_cloud_6999.ply")
+    save_result(steps / "point_cloud_29999.ply", tiny)
+    assert find_scene_files(tmp_path / "run").ply == steps / "point_cloud_6999.ply"
+
+
+def test_what_the_library_writes_may_be_a_scene(tmp_path: Path, tiny: Tiny) -> None:
+    """Generated scenes, too, are written without the comment of results."""
+    tiny.save(tmp_path)
+    assert header_content(tmp_path / "scene.ply") == "Gaussians"
+    size = ["--scenes", "1", "--views", "2", "--size", "32x24"]
+    assert main(["generate", "-o", str(tmp_path / "made"), *size, "--quiet"]) == 0
+    assert header_content(tmp_path / "made/scene_0000/scene.ply") == "Gaussians"
+
+
+def test_a_folder_of_results_alone(folder: Path, tiny: Tiny, tmp_path: Path) -> None:
+    """The only one is taken with a note; several are named, and batch takes none."""
+    (folder / "room.ply").unlink()
+    path = save_result(folder / "x.ply", tiny)
+    files = find_scene_files(folder)
+    assert (files.ply, files.cameras) == (path, folder / "transforms.json")
+    assert noted(read_input(files).notes, "gsmerge", f"{len(tiny.gaussians[::5])} Gaussians")
+    with refuses(SceneError, folder, "none", str(path)):
+        list(find_scenes([str(folder)], tmp_path / "out"))
+    assert main(["inspect", str(folder), "-q"]) == 0
+    save_result(folder / "y.ply", tiny)
+    with refuses(SceneError, folder, "2 (x.ply, y.ply)"):
+        find_scene_files(folder)
+
+
+def test_a_result_without_cameras_is_noted(tmp_path: Path, tiny: Tiny) -> None:
+    from gsmerge.scene.exporters import make_hints
+
+    files = find_scene_files(save_result(tmp_path / "x.ply", tiny))
+    assert noted(read_input(files, hints=make_hints({"order": "none"})).notes, "gsmerge", "no Gaussian per pixel")
+
+
+def test_headers_of_many_files_are_read_up_to_a_bound(
+    folder: Path, tiny: Tiny, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save_result(folder / "a.ply", tiny)
+    shutil.copy(folder / "a.ply", folder / "z.ply")
+    monkeypatch.setattr("gsmerge.scene.files._MAX_HEADERS", 1)
+    with refuses(SceneError, folder, "2 (room.ply, z.ply)"):
+        find_scene_files(folder)
