@@ -122,6 +122,12 @@ def exact_layouts(count: int, views: int, width: int, height: int) -> Iterator[L
             yield from _orders(count, box, per_pixel, chosen, width, height)
 
 
+def full_layouts(views: int, per_pixel: int, width: int, height: int) -> Iterator[Layout]:
+    """Yield the layouts of every pixel of all ``views``."""
+    whole, *_ = boxes(width, height)
+    return _orders(views * per_pixel * width * height, whole, per_pixel, tuple(range(views)), width, height)
+
+
 def _orders(
     count: int, box: KeptBox, per_pixel: int, views: tuple[int, ...], width: int, height: int
 ) -> Iterator[Layout]:
