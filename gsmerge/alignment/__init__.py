@@ -9,7 +9,13 @@ reads or moves poses, ``unaligned`` chooses those of rows without pixels, ``esti
 
 from gsmerge.alignment.cameras import move_cameras, other_conventions
 from gsmerge.alignment.dropped_depths import fill_from_depths, guess_depths
-from gsmerge.alignment.estimate import WITH_PHOTOS, estimate_cameras, estimate_with_photos
+from gsmerge.alignment.estimate import (
+    ESTIMATED,
+    WITH_PHOTOS,
+    estimate_cameras,
+    estimate_from_rows,
+    estimate_with_photos,
+)
 from gsmerge.alignment.focal import estimate_focal
 from gsmerge.alignment.layouts import MAY_BE_UNALIGNED, Layout
 from gsmerge.alignment.recovery import Recovery, explain_misalignment, misalignment_error

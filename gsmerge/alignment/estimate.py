@@ -1,4 +1,4 @@
-"""Estimate cameras where no file gives any: from a full grid alone, or, with pixels dropped, from photos as well.
+"""Estimate cameras where no file gives any: from a grid alone, or, with pixels dropped, from photos as well.
 
 Depth Anything 3 drops unknown pixels. Its rows come view by view and row by row, so every stretch of them without a
 gap shows the colours of a stretch of the photo. Its place there says which pixels these rows are; they give the
@@ -7,25 +7,23 @@ cameras, the cameras all others.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from gsmerge.alignment.calibration import calibrate
 from gsmerge.alignment.layouts import DEPTH_SHARE, Layout, da3_box, every_nth, exact_layouts, patch_grids, subsample
-from gsmerge.alignment.resection import projection_errors, refine_poses, start_pose
-from gsmerge.alignment.score import MARGIN, Correspondences, find_correspondences, pixel_limit
-from gsmerge.geometry import project_points, sh0_to_rgb
-from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, View, make_camera_file, make_pinhole
+from gsmerge.alignment.row_grid import find_grid
+from gsmerge.alignment.score import MARGIN, find_correspondences
+from gsmerge.geometry import sh0_to_rgb
+from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, View, make_camera_file
 from gsmerge.io.photo_files import Photos, PhotoTransform, Size, resize_to
-from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Cameras, Gaussians
 
 ESTIMATED = "estimated from the grid"  # source of estimated cameras
 _GRID_SAMPLES = 300  # Gaussians per view that cameras are estimated from
-_CALIBRATIONS = 2  # each time without the Gaussians that lie far from their pixels
 WITH_PHOTOS = "estimated from rows and photos"  # of the cameras
 _STRETCH, _STEP = 96, 2  # rows that are compared with a photo, and every how many of them
 _STRETCHES = 60  # of a view
@@ -35,63 +33,50 @@ _UNIQUE = 1.1  # times as far as the nearest place is the next one, at least
 _MAX_COST = 3.0  # times the distance of the nearest quarter of a view's stretches
 _BACK = 1  # pixels that one stretch may lie too far ahead of the next
 _MIN_STRETCHES, _MIN_AGREEING = 8, 0.5  # of a view that agree, and share of the unique ones
-_ROUNDS = 4  # of cameras and of the shape of their pixels
-_OWN_FOCALS = 1.3  # times nearer with a focal length for each view
 _OUTSIDE = 999  # a colour that no pixel has
 
 
 def estimate_cameras(
     path: Path, gaussians: Gaussians, valid: np.ndarray, names: Sequence[str], width: int, height: int
 ) -> CameraFile | None:
-    """Estimate poses and one focal length so that the rows of a full or trimmed grid project into their own pixels.
+    """Estimate cameras so that the rows of a full or trimmed grid project into their own pixels.
 
     ``names`` are those of the views, all ``width`` x ``height`` pixels; ``valid [n]`` bool; ``path`` is for
     messages. None if no order of the rows fits at least twice as well as all others.
     """
     layouts = exact_layouts(len(gaussians), len(names), width, height)
     possible = [layout for layout in layouts if layout.per_pixel == 1 and len(layout.views) == len(names)]
-    fits = [calibrate(gaussians.means, valid, subsample(layout, _GRID_SAMPLES)) for layout in possible]
-    fits.sort(key=lambda fit: fit[0])
-    limit = pixel_limit(width, height)
-    if not fits or fits[0][0] > limit or (len(fits) > 1 and fits[1][0] < MARGIN * fits[0][0]):
+    samples = (find_correspondences(gaussians.means, valid, subsample(layout, _GRID_SAMPLES)) for layout in possible)
+    fits = [fit for pairs in samples if (fit := calibrate(pairs, width, height)) is not None]
+    fits.sort(key=lambda fit: fit.worst_px)
+    if not fits or (len(fits) > 1 and fits[1].worst_px < MARGIN * fits[0].worst_px):
         return None
-    _, focal, poses = fits[0]
-    K = make_pinhole(focal, focal, width / 2, height / 2)
-    views = [View(name, pose, K, (width, height)) for name, pose in zip(names, poses, strict=True)]
-    return make_camera_file(path, ESTIMATED, W2C_OPENCV, views)
+    return _make_cameras(path, ESTIMATED, names, fits[0].cameras)
 
 
-def calibrate(
-    means: np.ndarray, valid: np.ndarray, layout: Layout, aspect: float = 1.0
-) -> tuple[float, float, list[np.ndarray]]:
-    """Calibrate cameras for one row order: (largest median distance in pixels, focal length, poses); inf on failure.
+def estimate_from_rows(path: Path, gaussians: Gaussians, valid: np.ndarray) -> tuple[CameraFile, np.ndarray] | None:
+    """Estimate the cameras of rows that are a grid, of which nothing else is known; None where they are none.
 
-    The vertical focal length is ``aspect`` times the horizontal one; the principal point is the middle.
+    ``valid [n]`` bool; ``path`` is for messages. Returns the base colours ``[v,h,w,3]`` of the views' pixels as well,
+    0 to 1.
     """
-    pairs = find_correspondences(means, valid, layout)
-    middle = np.median(pairs.points, 0)
-    unit = float(np.median(np.abs(pairs.points - middle))) or 1.0
-    points = pairs.split((pairs.points - middle) / unit, len(layout.views))
-    pixels = pairs.split(pairs.pixels, len(layout.views))
-    focal = 1.2 * max(layout.width, layout.height)
-    K = make_pinhole(focal, aspect * focal, layout.width / 2, layout.height / 2)
-    kept = [np.ones(len(p), bool) for p in points]
-    starts = [start_pose(p, q, K) for p, q in zip(points, pixels, strict=True)]
-    start_poses = [pose for pose in starts if pose is not None]
-    if len(start_poses) < len(starts):
-        return math.inf, 0.0, []
-    poses = np.stack(start_poses)
-    for _ in range(_CALIBRATIONS):
-        near, where = ([p[k] for p, k in zip(values, kept, strict=True)] for values in (points, pixels))
-        try:
-            K, poses = refine_poses(near, where, K, poses, focal=True)
-        except np.linalg.LinAlgError:
-            return math.inf, 0.0, []
-        errors = [projection_errors(p, q, K, pose) for p, q, pose in zip(points, pixels, poses, strict=True)]
-        kept = [e <= max(1.0, 3 * float(np.median(e))) for e in errors]
-    poses[:, :3, 3] = unit * poses[:, :3, 3] - matmul(poses[:, :3, :3], middle)
-    worst = max(float(np.median(e)) for e in errors)
-    return (worst if np.isfinite(worst) else math.inf), float(K[0, 0]), list(poses[:, :3])
+    grid = find_grid(gaussians, valid)
+    if grid is None:
+        return None
+    layout, calibration = grid
+    names = [f"view {view}" for view in range(len(calibration.cameras))]
+    with np.errstate(invalid="ignore"):
+        base = np.nan_to_num(sh0_to_rgb(gaussians.sh0[:, 0])).clip(0, 1)
+    firsts = [layout.views.index(view) for view in range(len(names))]
+    pictures = np.stack([base[layout.rows[first]].reshape(layout.height, layout.width, 3) for first in firsts])
+    return _make_cameras(path, ESTIMATED, names, calibration.cameras), pictures
+
+
+def _make_cameras(path: Path, source: str, names: Sequence[str], cameras: Cameras) -> CameraFile:
+    """Make the camera file of estimated cameras."""
+    posed = zip(names, cameras.viewmats[:, :3], cameras.Ks, strict=True)
+    views = [View(name, pose, K, (cameras.width, cameras.height)) for name, pose, K in posed]
+    return make_camera_file(path, source, W2C_OPENCV, views)
 
 
 @dataclass(frozen=True)
@@ -146,14 +131,11 @@ def estimate_with_photos(
     colors = np.ascontiguousarray(np.rint(255 * base).astype(np.int16).T)
     for grid in grids:
         layout = _match_colors(colors, grid, grid.transform.photos(photos))
-        cameras = None if layout is None else _solve(gaussians, valid, layout, grid)
-        if cameras is not None:
-            size = cameras.width, cameras.height
-            views = [
-                View(names[view], cameras.viewmats[block, :3], cameras.Ks[block], size)
-                for block, view in enumerate(grid.views)
-            ]
-            return make_camera_file(path, WITH_PHOTOS, W2C_OPENCV, views)
+        if layout is not None:
+            pairs = find_correspondences(gaussians.means, valid, layout)
+            solved = calibrate(pairs, layout.width, layout.height)
+            if solved is not None:
+                return _make_cameras(path, WITH_PHOTOS, [names[view] for view in grid.views], solved.cameras)
     return None
 
 
@@ -228,55 +210,3 @@ def _agreeing(stretches: np.ndarray) -> np.ndarray:
         i = int(before[i])
     enough = max(_MIN_STRETCHES, _MIN_AGREEING * len(stretches))
     return stretches[chain[::-1]] if len(chain) >= enough else stretches[:0]
-
-
-def _solve(gaussians: Gaussians, valid: np.ndarray, layout: Layout, grid: _Grid) -> Cameras | None:
-    """Solve for the cameras from the rows whose pixels are known; None where they do not fit."""
-    aspect = grid.transform.scale_y / grid.transform.scale_x
-    pairs = find_correspondences(gaussians.means, valid, layout)
-    for _ in range(_ROUNDS):
-        _, cameras = _calibrate(gaussians, valid, layout, aspect, alone=False)
-        if cameras is None:
-            return None
-        aspect *= _stretch(pairs, cameras)
-    worst, cameras = _calibrate(gaussians, valid, layout, aspect, alone=True)
-    return cameras if worst <= pixel_limit(layout.width, layout.height) else None
-
-
-def _calibrate(
-    gaussians: Gaussians, valid: np.ndarray, layout: Layout, aspect: float, *, alone: bool
-) -> tuple[float, Cameras | None]:
-    """Solve for the cameras of some rows, with one focal length.
-
-    With ``alone`` each view gets its own where that is clearly better. Returns the largest median
-    distance in pixels as well, inf where there are no cameras.
-    """
-    worst, focal, poses = calibrate(gaussians.means, valid, layout, aspect)
-    focals = [focal] * len(poses)
-    views = [
-        replace(layout, views=(0,), rows=(rows,), pixels=(pixels,))
-        for rows, pixels in zip(layout.rows, layout.pixels, strict=True)
-    ]
-    fits = [calibrate(gaussians.means, valid, view, aspect) for view in views] if alone else []
-    largest = max((fit[0] for fit in fits), default=math.inf)
-    if largest * _OWN_FOCALS < worst:
-        worst, focals, poses = largest, [fit[1] for fit in fits], [fit[2][0] for fit in fits]
-    if not math.isfinite(worst):
-        return math.inf, None
-    width, height = layout.width, layout.height
-    Ks = np.stack([make_pinhole(focal, aspect * focal, width / 2, height / 2) for focal in focals])
-    viewmats = np.stack([np.vstack([pose, [0, 0, 0, 1]]) for pose in poses])
-    return worst, Cameras(viewmats, Ks, width, height)
-
-
-def _stretch(pairs: Correspondences, cameras: Cameras) -> float:
-    """Measure how much taller the pixels of pictures must be to fit the rows."""
-    viewmats, Ks = cameras.viewmats[pairs.views], cameras.Ks[pairs.views]
-    with np.errstate(all="ignore"):  # rows in a camera's plane, which are left out
-        xy, _ = project_points(pairs.points[:, None], viewmats, Ks)
-    middle = np.array([cameras.width, cameras.height]) / 2
-    seen, wanted = xy[:, 0] - middle, pairs.pixels - middle
-    error = np.linalg.norm(seen - wanted, axis=1)
-    near = error <= max(1.0, 3 * float(np.nanmedian(error)))
-    x, y = (seen[near] * wanted[near]).sum(0) / (seen[near] ** 2).sum(0)
-    return float(y / x)

@@ -122,6 +122,12 @@ def exact_layouts(count: int, views: int, width: int, height: int) -> Iterator[L
             yield from _orders(count, box, per_pixel, chosen, width, height)
 
 
+def full_layouts(views: int, per_pixel: int, width: int, height: int) -> Iterator[Layout]:
+    """Yield the layouts of every pixel of all ``views``."""
+    whole, *_ = boxes(width, height)
+    return _orders(views * per_pixel * width * height, whole, per_pixel, tuple(range(views)), width, height)
+
+
 def _orders(
     count: int, box: KeptBox, per_pixel: int, views: tuple[int, ...], width: int, height: int
 ) -> Iterator[Layout]:
@@ -222,6 +228,8 @@ def photo_grid(camera_file: CameraFile, size: Size | None) -> GridFit:
     """Assume a grid of the photos' size, or of the cameras' size without photos; SceneError if the two disagree."""
     if size is None:
         return GridFit(camera_file, to_cameras(camera_file), None, ())
+    if camera_file.photo_map is not None:
+        return _mapped_grid(camera_file, size, *camera_file.photo_map)
     width, height = size
     for w, h in sizes_of(camera_file):
         if not same_shape((w, h), size) and not _are_stretched(camera_file, size):
@@ -232,6 +240,14 @@ def photo_grid(camera_file: CameraFile, size: Size | None) -> GridFit:
     other = [s for s in sizes_of(camera_file) if s != size]
     notes = tuple(f"intrinsics scaled from {w} x {h} to the images' {width} x {height}" for w, h in other)
     return GridFit(camera_file, to_cameras(camera_file, size), None, notes)
+
+
+def _mapped_grid(camera_file: CameraFile, size: Size, file_size: Size, transform: PhotoTransform) -> GridFit:
+    """Return the grid of photos that show it in a known way, at their ``size`` in memory."""
+    x, y = (whole / part for whole, part in zip(file_size, size, strict=True))
+    transform = replace(transform, scale_x=x * transform.scale_x, scale_y=y * transform.scale_y)
+    note = f"photos of {file_size[0]} x {file_size[1]} are {transform.description}, the Gaussian grid's size"
+    return GridFit(camera_file, to_cameras(camera_file), transform, (note,))
 
 
 def _are_stretched(camera_file: CameraFile, size: Size) -> bool:

@@ -1,7 +1,8 @@
-"""Solve for the poses of cameras, and for a focal length, from points and the pixels that show them."""
+"""Solve for the poses of cameras, and for their intrinsics, from points and the pixels that show them."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import cv2
@@ -12,8 +13,9 @@ from gsmerge.kernels.matrices import eigh, matmul, solve
 
 SCHEDULE = Schedule(steps=30, first=1e-3, ease=0.1, brake=10.0, most=1e8, min_gain=1e-10)
 MAX_STRETCH = 0.5  # of the focal length, in a step
+ONE_FOCAL, TWO_FOCALS, ALL_INTRINSICS = 1, 2, 4  # numbers of the intrinsics: fx = fy; fx, fy; fx, fy, cx, cy
 _Fit = tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray, float]]  # intrinsics, poses, equations
-_MIN_POINTS = 24  # fewer fit any camera
+MIN_POINTS = 24  # fewer fit any camera
 _FLAT = 1e-10  # of the largest second moment: an axis along which points do not differ
 _PROJECTIVE_ROUNDS = 8  # of reweighted least squares
 _SMALLEST_ERROR = 1e-6  # of the pixels' spread
@@ -39,65 +41,102 @@ def projection_errors(points: np.ndarray, pixels: np.ndarray, K: np.ndarray, pos
 
 
 def refine_poses(
-    points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], K: np.ndarray, poses: np.ndarray, *, focal: bool = False
+    points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], K: np.ndarray, poses: np.ndarray, *, free: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Refine poses by least squares so that points ``[n,3]`` of each view project to their ``pixels [n,2]``.
 
-    With ``focal`` the common focal length of the views is solved for as well. Returns intrinsics ``[3,3]`` and poses
-    ``[v,4,4]``; numpy.linalg.LinAlgError where the points do not determine them.
+    Common intrinsics of the views are solved for as well, as many as ``free`` says: ONE_FOCAL, TWO_FOCALS or
+    ALL_INTRINSICS. Returns intrinsics ``[3,3]`` and poses ``[v,4,4]``; numpy.linalg.LinAlgError where the points do
+    not determine them.
     """
 
     def fit(near_K: np.ndarray, near: np.ndarray) -> _Fit:
-        return near_K, near, _linearise(points, pixels, near_K, near)
+        return near_K, near, _linearise(points, pixels, near_K, near, free)
 
     def step(state: _Fit, damping: float) -> _Fit:
         current_K, current_poses, (curvature, slope, _) = state
-        stretch, motions = _step(curvature, slope, damping, focal=focal)
-        near_K = np.concatenate([current_K[:2, :2] * stretch, current_K[:2, 2:]], 1)
-        return fit(np.concatenate([near_K, current_K[2:]]), matmul(motion_matrices(motions), current_poses))
+        change, motions = _step(curvature, slope, damping)
+        return fit(_change_intrinsics(current_K, change), matmul(motion_matrices(motions), current_poses))
 
     K, poses, _ = descend(fit(K, poses), lambda state: state[2][2], step, SCHEDULE)
     return K, poses
 
 
 def _linearise(
-    points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], K: np.ndarray, poses: np.ndarray
+    points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], K: np.ndarray, poses: np.ndarray, free: int
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return Gauss-Newton's curvature ``[v,7,7]`` and slope ``[v,7]`` of the squared error, and the error.
+    """Return Gauss-Newton's curvature ``[v,6+f,6+f]`` and slope ``[v,6+f]`` of the squared error, and the error.
 
-    By the turn and the shift of each camera, and by the logarithm of the focal length.
+    By the turn and the shift of each camera, by the logarithms of focal lengths, and by the principal point.
     """
-    curvature, slope, error = np.empty((len(poses), 7, 7)), np.empty((len(poses), 7)), 0.0
+    size = 6 + free
+    curvature, slope, error = np.empty((len(poses), size, size)), np.empty((len(poses), size)), 0.0
     fx, fy, (cx, cy) = K[0, 0], K[1, 1], K[:2, 2]
     for view, pose in enumerate(poses):
         camera = matmul(points[view], pose[:3, :3].T) + pose[:3, 3]
         with np.errstate(all="ignore"):  # points in the camera's plane
             x, y, inverse = camera[:, 0] / camera[:, 2], camera[:, 1] / camera[:, 2], 1 / camera[:, 2]
-            zero = np.zeros_like(x)
+            zero, one = np.zeros_like(x), np.ones_like(x)
             right = np.stack([fx * inverse, zero, -fx * x * inverse], 1)
             down = np.stack([zero, fy * inverse, -fy * y * inverse], 1)
-            columns = [
-                np.concatenate([np.cross(camera, way), way, along[:, None]], 1)
-                for way, along in ((right, fx * x), (down, fy * y))
-            ]
+            by_K = {
+                0: ([], []),
+                ONE_FOCAL: ([fx * x], [fy * y]),
+                TWO_FOCALS: ([fx * x, zero], [zero, fy * y]),
+                ALL_INTRINSICS: ([fx * x, zero, one, zero], [zero, fy * y, zero, one]),
+            }[free]
+            jacobian = np.concatenate(
+                [
+                    np.concatenate([np.cross(camera, way), way, *(column[:, None] for column in columns)], 1)
+                    for way, columns in zip((right, down), by_K, strict=True)
+                ]
+            )
             residual = np.concatenate([fx * x + cx - pixels[view][:, 0], fy * y + cy - pixels[view][:, 1]])
-            jacobian = np.concatenate(columns)
             curvature[view], slope[view] = matmul(jacobian.T, jacobian), matmul(jacobian.T, residual)
             error += float((residual * residual).sum())
     return curvature, slope, error
 
 
-def _step(curvature: np.ndarray, slope: np.ndarray, damping: float, *, focal: bool) -> tuple[float, np.ndarray]:
-    """Return a factor on the focal length, 1 where it is fixed, and motions ``[v,6]`` of the cameras."""
-    damped = curvature + damping * np.eye(7) * curvature
-    across, down = damped[:, :6, 6], slope[:, :6]
-    if not focal:
-        return 1.0, -solve(damped[:, :6, :6], down[..., None])[..., 0]
-    solved = solve(damped[:, :6, :6], np.stack([down, across], 2))  # the cameras' unknowns are eliminated
-    left = damped[:, 6, 6].sum() - (across * solved[..., 1]).sum()
-    stretch = -(slope[:, 6].sum() - (across * solved[..., 0]).sum()) / left
-    stretch = float(np.clip(stretch, -MAX_STRETCH, MAX_STRETCH))
-    return 1 + stretch, -solved[..., 0] - stretch * solved[..., 1]
+def _step(curvature: np.ndarray, slope: np.ndarray, damping: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return changes ``[f]`` of the common intrinsics and motions ``[v,6]`` of the cameras."""
+    size = curvature.shape[1]
+    damped = curvature + damping * np.eye(size) * curvature
+    down, across = slope[:, :6, None], damped[:, :6, 6:]
+    if size == 6:
+        return np.empty(0), -solve(damped, down)[..., 0]
+    solved = solve(damped[:, :6, :6], np.concatenate([down, across], 2))  # the cameras' unknowns are eliminated
+    reduced = (np.concatenate([slope[:, 6:, None], damped[:, 6:, 6:]], 2) - matmul(across.swapaxes(1, 2), solved)).sum(
+        0
+    )
+    change = -solve(reduced[:, 1:], reduced[:, 0])
+    change[:TWO_FOCALS] = change[:TWO_FOCALS].clip(-MAX_STRETCH, MAX_STRETCH)
+    return change, -solved[..., 0] - matmul(solved[..., 1:], change)
+
+
+def _change_intrinsics(K: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """Apply changes of the logarithms of focal lengths, and of the principal point, as :func:`_linearise` has them."""
+    K = K.copy()
+    if len(change):
+        K[(0, 1), (0, 1)] *= 1 + change[:TWO_FOCALS]
+        K[:2, 2] += change[TWO_FOCALS:] if len(change) == ALL_INTRINSICS else 0
+    return K
+
+
+def focal_uncertainty(
+    points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], Ks: np.ndarray, poses: np.ndarray
+) -> float:
+    """Estimate the standard error of a focal length, as a share of it, if pixels were off by one; inf for a plane.
+
+    ``points [n,3]`` and ``pixels [n,2]`` are those of each view; that of the views with one focal length together.
+    """
+    weight = 0.0
+    for view in zip(points, pixels, Ks, poses, strict=True):
+        p, q, K, pose = view
+        curvature, _, _ = _linearise([p], [q], K, pose[None], ONE_FOCAL)
+        weight += float(
+            curvature[0, 6, 6] - matmul(curvature[0, 6, :6], solve(curvature[0, :6, :6], curvature[0, :6, 6]))
+        )
+    return 1 / math.sqrt(weight) if weight > 0 else math.inf
 
 
 def projective_error(points: np.ndarray, pixels: np.ndarray) -> float:
@@ -106,7 +145,7 @@ def projective_error(points: np.ndarray, pixels: np.ndarray) -> float:
     Any 3 x 4 matrix is such a camera, with any intrinsics, in any frame. It is solved by the direct linear transform
     with reweighting (Hartley and Zisserman 2004, section 7.1). 0 where there are too few points to decide.
     """
-    if len(points) < _MIN_POINTS:
+    if len(points) < MIN_POINTS:
         return 0.0
     middle = np.median(points, 0)
     unit = float(np.median(np.abs(points - middle))) or 1.0

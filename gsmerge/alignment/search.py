@@ -304,7 +304,9 @@ def _make_result(source: _Source, fit: _Fit) -> AlignmentResult:
         notes.append(f"{describe_reading(grid.camera_file.convention, usual.convention)}: read so")
     if usual.source in (ESTIMATED, WITH_PHOTOS):
         from_what = "own grid" if usual.source == ESTIMATED else "order and the photos' colours"
-        notes.append(f"no cameras were given: poses and focal length are estimated from the Gaussians' {from_what}")
+        separate = len(set(map(bytes, usual.Ks))) > 1
+        what = "poses, and focal lengths that differ between the views," if separate else "poses and focal length"
+        notes.append(f"no cameras were given: {what} are estimated from the Gaussians' {from_what}")
     in_order = layout.is_plain and frame is IDENTITY and len(layout.views) == count
     if in_order and layout.views == inputs.labellings[1] != inputs.labellings[0]:
         notes.append("views are in the order of the image names, not of the camera file")

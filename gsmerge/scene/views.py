@@ -11,7 +11,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gsmerge.alignment import estimate_cameras, estimate_focal, estimate_with_photos
+from gsmerge.alignment import (
+    ESTIMATED,
+    estimate_cameras,
+    estimate_focal,
+    estimate_from_rows,
+    estimate_with_photos,
+)
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import CameraFile, missing_intrinsics, sizes_of, to_cameras, undistort_photos
 from gsmerge.io.cameras.embedded import SHARP
@@ -46,6 +52,7 @@ from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.pictures import count_bars
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.scene.files import MASK_PLACES, SceneFiles
+from gsmerge.scene.grid_photos import match_photos
 from gsmerge.types import Cameras, LargePhotos
 
 _MAX_BYTES = 2 << 30  # of all photos as floats, before it is known whether the Gaussians belong to pixels
@@ -78,9 +85,12 @@ def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile:
         names = [path.relative_to(files.images).as_posix() for path in paths]
         rows = ply.gaussians, ply.valid
         cameras = estimate_cameras(files.ply, *rows, names, width, height)
+        cameras = _read_grid(ply, files, paths) if cameras is None else cameras
         if cameras is None:
             size, read = (width, height), partial(decode_images, paths)
             cameras = estimate_with_photos(files.ply, *rows, names, size, read)
+    elif cameras is None:
+        cameras = _read_grid(ply, files, images_beside(files.ply) if files.images is None else [])
     if cameras is None:
         places = ", ".join(place for place in CAMERA_PLACES if len(place) > 1)
         problem = f"no cameras found next to it (looked for {places}, one .torch chunk)"
@@ -90,6 +100,27 @@ def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile:
             remedy = f"export them as well, by {formats}, {remedy}"
         raise SceneError(files.ply, problem, remedy)
     return cameras
+
+
+def _read_grid(ply: GaussianFile, files: SceneFiles, paths: Sequence[Path]) -> CameraFile | None:
+    """Estimate the cameras of rows that are a grid, and find the photos of its views; None where they are none.
+
+    SceneError where a folder of images has none of them.
+    """
+    grid = estimate_from_rows(files.ply, ply.gaussians, ply.valid)
+    if grid is None:
+        return None
+    cameras, pictures = grid
+    match = match_photos(pictures, paths)
+    if match is not None:
+        chosen, transform, size = match
+        names = tuple(paths[photo].relative_to(files.images or files.ply.parent).as_posix() for photo in chosen)
+        return replace(cameras, names=names, photo_map=(size, transform))
+    if files.images is None or not paths:
+        return cameras
+    views, height, width = pictures.shape[:3]
+    problem = f"expected photos of the {views} views of {width} x {height} pixels whose grid the Gaussians are"
+    raise SceneError(files.images, f"{problem}, found {len(paths)} images that do not show them", "name another folder")
 
 
 def stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos | None:
@@ -148,7 +179,7 @@ def _photo_paths(files: SceneFiles, camera_file: CameraFile) -> list[Path] | Non
     if files.images is None:
         folder = Path(camera_file.path).parent
         paths = [path for path in (find_image(folder, name) for name in camera_file.names) if path is not None]
-        if not paths and all(name.removeprefix("view ").isdecimal() for name in camera_file.names):
+        if not paths and camera_file.source != ESTIMATED and all(name.removeprefix("view ").isdecimal() for name in camera_file.names):
             paths = images_beside(files.ply)  # the format has no names; AnySplat writes its Gaussians among the photos
         return paths if len(paths) == len(camera_file) else None
     return None if files.images.suffix in (".npz", CHUNK) else match_images(files.images, camera_file.names)
@@ -291,7 +322,8 @@ def cut_bars(photos: Photos | None, camera_file: CameraFile) -> tuple[Photos | N
     """Cut off bars around photos if the rest has the cameras' shape, with a note; otherwise change nothing."""
     size = photo_size(photos)
     shapes = sizes_of(camera_file)
-    if photos is None or size is None or not shapes or any(same_shape(shape, size) for shape in shapes):
+    fits = camera_file.photo_map is not None or any(same_shape(shape, size) for shape in shapes if size is not None)
+    if photos is None or size is None or not shapes or fits:
         return photos, []
     counts = [count_bars(photos[view], _BAR_SPREAD) for view in range(len(photos))]
     above, below, left, right = (int(count) for count in np.median(counts, 0))

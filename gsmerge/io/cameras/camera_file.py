@@ -14,6 +14,7 @@ from gsmerge.geometry import pose_changes
 from gsmerge.io.bounds import MAX_VIEWS, check_pixels
 from gsmerge.io.photo_files import (
     Photos,
+    PhotoTransform,
     Size,
     change_photos,
     photo_size,
@@ -82,6 +83,8 @@ class CameraFile:
     lenses: tuple[Lens | None, ...] = ()  # of each camera where one of them is no pinhole; empty where all are
     # how a focal length was estimated that the file lacks, one sentence; "" where it has one, None where that is to do
     focal: str | None = ""
+    # how photos of a size are brought to the cameras' where the photos have shown it; None where that is to be found
+    photo_map: tuple[Size, PhotoTransform] | None = None
 
     def __len__(self) -> int:
         return len(self.names)

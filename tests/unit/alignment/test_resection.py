@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from gsmerge.alignment.resection import (
+    ONE_FOCAL,
     projection_errors,
     projective_error,
     refine_poses,
@@ -42,7 +43,7 @@ def test_the_focal_length_is_found():
     guess = np.diag([1.4, 1.4, 1]) @ (K * [[1], [1], [1]])
     guess[:2, 2] = K[:2, 2]
     starts = np.stack([start_pose(p, q, guess) for p, q in zip(points, pixels, strict=True)])
-    near_K, poses = refine_poses(points, pixels, guess, starts, focal=True)
+    near_K, poses = refine_poses(points, pixels, guess, starts, free=ONE_FOCAL)
     np.testing.assert_allclose(near_K, K, atol=1e-6)
     np.testing.assert_allclose(poses, TRUE, atol=1e-7)
 
@@ -60,7 +61,7 @@ def test_poses_of_noisy_pixels_are_opencvs(seed):
 
 def test_the_error_is_least():
     points, pixels = shown(1.0)
-    near_K, poses = refine_poses(points, pixels, K, TRUE, focal=True)
+    near_K, poses = refine_poses(points, pixels, K, TRUE, free=ONE_FOCAL)
 
     def error(K: np.ndarray, poses: np.ndarray) -> float:
         views = zip(points, pixels, poses, strict=True)
@@ -86,7 +87,7 @@ def test_a_start_behind_the_points_ends():
     points, pixels = shown(1.0)
     behind = TRUE.copy()
     behind[:, 2, 3] = 0.5  # points lie in front of the camera, beside it and behind
-    near_K, poses = refine_poses(points, pixels, K, behind, focal=True)
+    near_K, poses = refine_poses(points, pixels, K, behind, free=ONE_FOCAL)
     assert np.isfinite(near_K).all()
     assert np.isfinite(poses).all()
 

@@ -1,0 +1,140 @@
+"""Calibrate cameras from points and the pixels that show them: poses, and common or separate intrinsics.
+
+Intrinsics are as simple as the points allow: of several models that with the smallest Bayesian information criterion
+(Schwarz 1978) is chosen.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gsmerge.alignment.resection import (
+    ALL_INTRINSICS,
+    ONE_FOCAL,
+    TWO_FOCALS,
+    focal_uncertainty,
+    projection_errors,
+    projective_error,
+    refine_poses,
+    start_pose,
+)
+from gsmerge.alignment.score import Correspondences, pixel_limit
+from gsmerge.io.cameras.camera_file import make_pinhole
+from gsmerge.io.photo_files import Size
+from gsmerge.kernels.elementary import log
+from gsmerge.kernels.matrices import matmul
+from gsmerge.types import Cameras
+
+_FOCALS = (1.2, 4.8)  # of the longer side, with which the search for a focal length begins
+_FREE = (ONE_FOCAL, TWO_FOCALS, ALL_INTRINSICS)
+_ROUNDS = 2  # each time without the points that lie far from their pixels
+_FAR, _FAR_PX = 3.0, 1.0  # times the median, and pixels, from which a point is far
+_AS_NEAR, _AS_NEAR_PX = 1.15, 0.01  # of the distance under any projective cameras: a model leaves nothing to explain
+_SMALLEST_PX = 1e-3  # distances are compared as if none were smaller: means have 24 bits
+_MAX_UNCERTAINTY = 0.05  # of the focal length: points that are nearly a plane in front of the camera
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Cameras of v views, and how near points lie to the pixels that show them."""
+
+    cameras: Cameras
+    worst_px: float  # largest median distance of a view, pixels
+    separate: bool  # whether the views have intrinsics of their own
+
+
+@dataclass(frozen=True)
+class _Model:
+    """Intrinsics ``Ks [v,3,3]`` and poses ``[v,4,4]``, how many intrinsics are free, and what is left to explain."""
+
+    Ks: np.ndarray
+    poses: np.ndarray
+    free: int
+    errors: tuple[np.ndarray, ...]  # distances from the pixels, of each view
+
+    @property
+    def worst_px(self) -> float:
+        """Largest median distance of a view, pixels."""
+        worst = max(float(np.median(errors)) for errors in self.errors)
+        return worst if math.isfinite(worst) else math.inf
+
+    def criterion(self, far: float) -> float:
+        """Compute the Bayesian information criterion, with distances cut off at ``far`` pixels."""
+        with np.errstate(invalid="ignore"):
+            errors = np.nan_to_num(np.concatenate(self.errors), nan=far).clip(_SMALLEST_PX, far)
+        count = 2.0 * len(errors)
+        return count * float(log((errors * errors).mean())) + self.free * float(log(count))
+
+
+def calibrate(pairs: Correspondences, width: int, height: int) -> Calibration | None:
+    """Calibrate the cameras of views of ``width`` x ``height`` pixels; ``pairs`` name their pixels.
+
+    None where the points do not determine cameras, or lie farther from their pixels than the Gaussians of a view may.
+    """
+    views = [pairs.select(pairs.views == view) for view in range(int(pairs.views.max(initial=-1)) + 1)]
+    middle = np.median(pairs.points, 0)
+    unit = float(np.median(np.abs(pairs.points - middle))) or 1.0
+    points, pixels = [(view.points - middle) / unit for view in views], [view.pixels for view in views]
+    limit, bound = pixel_limit(width, height), max(map(projective_error, points, pixels), default=math.inf)
+    model = _choose_model(points, pixels, (width, height), bound) if bound <= limit else None
+    if model is None or model.worst_px > limit:
+        return None
+    if focal_uncertainty(points, pixels, model.Ks, model.poses) > _MAX_UNCERTAINTY:
+        return None
+    viewmats = model.poses.copy()
+    viewmats[:, :3, 3] = unit * viewmats[:, :3, 3] - matmul(viewmats[:, :3, :3], middle)
+    separate = bool((model.Ks != model.Ks[0]).any())
+    return Calibration(Cameras(viewmats, model.Ks, width, height), model.worst_px, separate)
+
+
+def _choose_model(
+    points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: Size, bound: float
+) -> _Model | None:
+    """Choose the simplest intrinsics that explain the pixels; ``bound`` is what any projective cameras leave, pixels."""
+    models: list[_Model] = []
+    with suppress(np.linalg.LinAlgError):  # of a model that the points do not determine; the simple ones come first
+        models.extend(_models(points, pixels, size, bound))
+    far = max(_FAR_PX, _FAR * min((model.worst_px for model in models), default=math.inf))
+    return min(models, key=lambda model: model.criterion(far), default=None)
+
+
+def _models(points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: Size, bound: float) -> Iterator[_Model]:
+    """Yield models with common intrinsics, and with separate ones where those leave something to explain."""
+    simple = []
+    for share in _FOCALS:
+        focal = share * max(size)
+        K = make_pinhole(focal, focal, size[0] / 2, size[1] / 2)
+        starts = [start_pose(p, q, K) for p, q in zip(points, pixels, strict=True)]
+        poses = np.stack([pose for pose in starts if pose is not None] or [np.eye(4)])
+        if len(poses) < len(starts):
+            return
+        model = _Model(np.tile(K, (len(starts), 1, 1)), poses, 0, ())
+        for free in _FREE:
+            model = _solve(points, pixels, model, free)
+            simple += [model] if free == ONE_FOCAL else []
+            yield model
+        if model.worst_px <= max(_AS_NEAR * bound, bound + _AS_NEAR_PX):
+            return
+    model = min(simple, key=lambda model: model.worst_px)
+    for free in _FREE if len(points) > 1 else ():
+        alone = (replace(model, Ks=model.Ks[v : v + 1], poses=model.poses[v : v + 1]) for v in range(len(points)))
+        each = [_solve([p], [q], start, free) for p, q, start in zip(points, pixels, alone, strict=True)]
+        Ks, poses = (np.concatenate([getattr(part, name) for part in each]) for name in ("Ks", "poses"))
+        model = _Model(Ks, poses, free * len(each), tuple(part.errors[0] for part in each))
+        yield model
+
+
+def _solve(points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], start: _Model, free: int) -> _Model:
+    """Solve for poses and ``free`` common intrinsics; numpy.linalg.LinAlgError where the points do not determine them."""
+    K, poses, near, where = start.Ks[0], start.poses, points, pixels
+    for _ in range(_ROUNDS):
+        K, poses = refine_poses(near, where, K, poses, free=free)
+        errors = [projection_errors(p, q, K, pose) for p, q, pose in zip(points, pixels, poses, strict=True)]
+        kept = [e <= max(_FAR_PX, _FAR * float(np.median(e))) for e in errors]
+        near, where = ([part[k] for part, k in zip(parts, kept, strict=True)] for parts in (points, pixels))
+    return _Model(np.tile(K, (len(poses), 1, 1)), poses, free, tuple(errors))

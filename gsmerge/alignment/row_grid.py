@@ -1,0 +1,182 @@
+"""Find the grid of a file's rows from the rows alone: the period of its lines, and where views begin.
+
+Steps from pixel to pixel are alike in neighbouring lines, so those from row to row repeat after a line. Lines belong to
+one view as long as a projective camera shows them in their pixels: any camera does, whatever its pose and focal length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from gsmerge.alignment.calibration import Calibration, calibrate
+from gsmerge.alignment.layouts import PER_PIXEL, Layout, full_layouts
+from gsmerge.alignment.resection import MIN_POINTS, projective_error
+from gsmerge.alignment.score import find_correspondences, pixel_limit
+from gsmerge.types import Gaussians
+
+_MIN_SIDE = 16  # pixels of a grid
+_MAX_FASTEST = 512  # rows from a pixel to the next, at most: its views and layers, where those are side by side
+_STEPS = 2000  # steps over as many rows that are measured
+_AS_SHORT = 1.5  # times the shortest median step
+_SEGMENT, _SEGMENTS = 1 << 17, 8  # rows whose steps are compared with each other, and how many such parts
+_MAX_STEP = 8.0  # times the median; longer steps, at the edges of things, count as that
+_MIN_PEAK = 8.0  # times the median correlation of steps: a period
+_PERIODS = 4  # that are tried
+_SAMPLES, _MIN_SAMPLES, _MAX_SAMPLES = 200, 60, 10_000  # Gaussians of a view to look at, to solve from, of all views
+_RECURRENCE = 0.7548776662466927, 0.5698402909980532  # powers of the plastic number's inverse
+_SAME, _SAME_PX = 1.3, 0.05  # times as far, and pixels farther: as near
+
+_Size = tuple[int, int, int]  # rows from pixel to pixel, pixels of a line, lines of a view
+
+
+def find_grid(gaussians: Gaussians, valid: np.ndarray) -> tuple[Layout, Calibration] | None:
+    """Find the grid that all rows are the pixels of, and the cameras of its views; None where there is none.
+
+    ``valid [n]`` bool. What an exporter trimmed is no part of the grid.
+    """
+    size = _find_size(gaussians, valid)
+    if size is None:
+        return None
+    rows = gaussians.means, valid
+    fastest, width, height = size
+    by_row, by_column = (_layouts(len(valid), *lines) for lines in ((width, height, False), (height, width, True)))
+    fits = _calibrate_layouts(*rows, by_row) or _calibrate_layouts(*rows, by_column)
+    nearest = min((calibration.worst_px for _, calibration in fits), default=0.0)
+    near = [fit for fit in fits if fit[1].worst_px <= max(_SAME * nearest, nearest + _SAME_PX)]
+    return min(near, key=lambda fit: len(set(fit[0].views)), default=None)
+
+
+def _calibrate_layouts(
+    means: np.ndarray, valid: np.ndarray, layouts: Iterable[Layout]
+) -> list[tuple[Layout, Calibration]]:
+    """Calibrate the cameras of layouts; leave out those whose pixels the rows are not."""
+    fits = []
+    for layout in layouts:
+        count = len(layout.views)
+        if all(_fits(means, valid, layout, block) for block in {0, count // 2, count - 1}):
+            samples = max(_MIN_SAMPLES, min(_MAX_SAMPLES // count, _MAX_SAMPLES // 10))
+            pairs = find_correspondences(means, valid, _thin(layout, samples))
+            calibration = calibrate(pairs, layout.width, layout.height)
+            fits += [] if calibration is None else [(layout, calibration)]
+    return fits
+
+
+def _fits(means: np.ndarray, valid: np.ndarray, layout: Layout, block: int) -> bool:
+    """Return whether a projective camera shows the rows of a block in their pixels."""
+    rows, pixels = (part[block : block + 1] for part in (layout.rows, layout.pixels))
+    part = _thin(replace(layout, views=(0,), rows=rows, pixels=pixels), _SAMPLES)
+    pairs = find_correspondences(means, valid, part)
+    return projective_error(pairs.points, pairs.pixels) <= pixel_limit(layout.width, layout.height)
+
+
+def _thin(layout: Layout, samples: int) -> Layout:
+    """Thin a layout of every pixel to some pixels of each block."""
+    chosen = _spread(samples, layout.width, layout.height)
+    rows = tuple(block_rows.flat[chosen] for block_rows in layout.rows)
+    return replace(layout, rows=rows, pixels=(chosen,) * len(rows))
+
+
+def _spread(count: int, width: int, height: int) -> np.ndarray:
+    """Choose about ``count`` pixels ``y·W + x`` evenly, by the additive recurrence of the plastic number."""
+    places = (np.arange(1, count + 1)[:, None] * _RECURRENCE) % 1
+    x, y = (places * (width, height)).astype(np.int64).T
+    return np.unique(y * width + x)
+
+
+def _layouts(count: int, width: int, height: int, by_column: bool) -> Iterator[Layout]:
+    """Yield the layouts of grids of a size without borders."""
+    blocks = count // (width * height)
+    for per_pixel in PER_PIXEL:
+        if blocks % per_pixel == 0:
+            layouts = full_layouts(blocks // per_pixel, per_pixel, width, height)
+            yield from (layout for layout in layouts if by_column == (layout.order == "column-major"))
+
+
+def _find_size(gaussians: Gaussians, valid: np.ndarray) -> _Size | None:
+    """Find the size of the grid; None where rows have no period, or no camera shows them in their pixels."""
+    fastest, periods = _find_periods(gaussians, valid)
+    sizes: list[tuple[float, _Size]] = []
+    for period in periods:
+        for step in sorted({*PER_PIXEL, *(fastest * layers for layers in PER_PIXEL)}):
+            width, remainder = divmod(period, step)
+            if remainder == 0 and width >= _MIN_SIDE:
+                sizes += _find_height(gaussians.means, valid, step, width)
+        if sizes:
+            break
+    return min(sizes, default=(0, None))[1]
+
+
+def _find_height(means: np.ndarray, valid: np.ndarray, step: int, width: int) -> list[tuple[float, _Size]]:
+    """Find the most lines that a projective camera shows in their pixels, in every view.
+
+    Also returns how far they lie from them: every other pixel of a line would do as well, but not be nearer.
+    """
+    lines = len(means) // (step * width)
+    for views in _divisors(lines):
+        height = lines // views
+        if height < _MIN_SIDE:
+            break
+        limit, errors = pixel_limit(width, height), []
+        for view, layer in dict.fromkeys(((0, 0), (views // 2, step // 2), (views - 1, step - 1))):
+            pixels = _spread(_SAMPLES, width, height)
+            rows = (view * width * height + pixels) * step + layer
+            rows, pixels = rows[valid[rows]], pixels[valid[rows]]
+            if len(rows) >= MIN_POINTS:
+                y, x = np.divmod(pixels, width)
+                errors.append(projective_error(means[rows].astype(np.float64), np.stack([x, y], 1) + 0.5))
+                if not errors[-1] <= limit:
+                    break
+        if errors and errors[-1] <= limit:
+            return [(step * max(errors), (step, width, height))]
+    return []
+
+
+def _divisors(number: int) -> list[int]:
+    small = [part for part in range(1, int(number**0.5) + 1) if number % part == 0]
+    return sorted({*small, *(number // part for part in small)})
+
+
+def _find_periods(gaussians: Gaussians, valid: np.ndarray) -> tuple[int, list[int]]:
+    """Find after how many rows the next pixel comes, and the likeliest periods of lines that divide the rows."""
+    means, count = gaussians.means, len(gaussians)
+    lags = np.arange(1, min(_MAX_FASTEST, count // _MIN_SIDE**2) + 1)
+    if not len(lags):
+        return 1, []
+    starts = np.linspace(0, count - lags[-1] - 1, _STEPS).astype(int)
+    starts = starts[valid[starts]]
+    lengths = np.array([_median(np.abs(means[starts + lag] - means[starts]).sum(1)) for lag in lags])
+    fastest = int(lags[np.argmax(lengths <= _AS_SHORT * lengths.min())])
+    segment = 1 << min(_SEGMENT, count - fastest).bit_length() - 1
+    places = np.linspace(0, count - fastest - segment, min(_SEGMENTS, -(-count // segment))).astype(int)
+    power = np.zeros(segment + 1)
+    for place in places:
+        for values in (*means.T, gaussians.sh0[:, 0, 1]):
+            power += _power(values[place : place + segment + fastest], fastest)
+    alike = np.fft.irfft(power)[:segment] / np.arange(segment, 0, -1)  # steps that are so many rows apart
+    alike = alike[: segment // 2 + fastest]
+    peaks = np.zeros(len(alike))
+    peaks[fastest:-fastest] = alike[fastest:-fastest] - (alike[: -2 * fastest] + alike[2 * fastest :]) / 2
+    likely = [lag for lag in _divisors(count) if _MIN_SIDE <= lag < len(peaks)]
+    high = _MIN_PEAK * float(np.median(np.abs(peaks)))
+    return fastest, sorted((lag for lag in likely if peaks[lag] > high), key=lambda lag: -peaks[lag])[:_PERIODS]
+
+
+def _power(values: np.ndarray, lag: int) -> np.ndarray:
+    """Compute the spectrum of steps over ``lag`` rows, as a share of all, of values ``[n]`` that may be no numbers."""
+    values = values.astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        steps = np.nan_to_num(values[lag:] - values[:-lag], posinf=0.0, neginf=0.0)
+    most = _MAX_STEP * _median(np.abs(steps))
+    steps = steps.clip(-most, most)
+    spectrum = np.fft.rfft(steps - steps.mean(), 2 * len(steps))
+    power = spectrum.real**2 + spectrum.imag**2
+    return np.asarray(power / max(power.sum(), np.finfo(float).tiny))
+
+
+def _median(values: np.ndarray) -> float:
+    """Return the median of the numbers among values; 0 where there are none."""
+    values = values[np.isfinite(values)]
+    return float(np.median(values)) if len(values) else 0.0
