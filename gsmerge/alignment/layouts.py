@@ -16,7 +16,8 @@ from gsmerge.io.photo_files import ASPECT_TOLERANCE, PhotoTransform, Size, resiz
 from gsmerge.types import Cameras
 
 MAY_BE_UNALIGNED: tuple[str, ...] = ("unordered", "none")  # orders of files whose rows need not belong to pixels
-TRIM = 8  # pixels that DepthSplat and its relatives cut off at every side
+TRIMS = (8, 4, 2)  # pixels that DepthSplat, ZPressor and ReSplat cut off at every side
+_MAX_TRIM = 0.25  # of the shorter side, cut off at every side
 PER_PIXEL = (1, 2, 3, 4, 16)  # Gaussians per pixel that backbones write
 DEPTH_SHARE = 0.9  # of each view's pixels, the nearest ones, that Depth Anything 3 keeps
 PATCH = 14  # sides of vision transformers' inputs are multiples of it
@@ -75,15 +76,24 @@ class KeptBox:
         return grid[self.top : height - self.top, self.left : width - self.left]
 
 
-def boxes(width: int, height: int) -> list[KeptBox]:
-    """List the borders that exporters may have trimmed: none, 8 pixels, or 8/256 of each side (Depth Anything 3)."""
-    out = [KeptBox("full", "every pixel", 0, 0)]
-    if min(width, height) > 2 * TRIM:
-        out.append(KeptBox("trim", f"{TRIM} pixels trimmed at every border", TRIM, TRIM))
+def boxes(width: int, height: int) -> Iterator[KeptBox]:
+    """Yield the boxes that exporters may keep: all, without 8 pixels or 8/256 of each side, without any other border.
+
+    Depth Anything 3 cuts off 8/256. The likely come first.
+    """
+    yield KeptBox("full", "every pixel", 0, 0)
+    usual, side = TRIMS[0], min(width, height)
+    if side > 2 * usual:
+        yield trim_box(usual)
     da3 = da3_box(width, height)
-    if (da3.top or da3.left) and (da3.top, da3.left) != (TRIM, TRIM):
-        out.append(da3)
-    return out
+    if (da3.top or da3.left) and (da3.top, da3.left) != (usual, usual):
+        yield da3
+    yield from (trim_box(trim) for trim in range(1, int(_MAX_TRIM * side) + 1) if trim != usual)
+
+
+def trim_box(trim: int) -> KeptBox:
+    """Return the box without ``trim`` pixels at every border."""
+    return KeptBox("trim", f"{trim} pixels trimmed at every border", trim, trim)
 
 
 def da3_box(width: int, height: int) -> KeptBox:
@@ -283,7 +293,7 @@ def _between(camera_file: CameraFile, size: Size, camera_size: Size) -> Iterator
 def grids_of_count(count: int, views: int, size: Size) -> Iterator[PhotoTransform]:
     """Yield the ways to shrink the photos so that ``views`` of them have ``count`` pixels in all."""
     crops: list[PhotoTransform] = []
-    for trim in (0, TRIM):
+    for trim in (0, *TRIMS):
         for per_pixel in PER_PIXEL:
             pixels, remainder = divmod(count, views * per_pixel)
             if remainder:

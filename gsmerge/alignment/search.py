@@ -37,6 +37,7 @@ from gsmerge.types import Cameras
 _LARGE = 2  # times as many pixels as rows: likely photos of another size than the grid's
 _ALIKE, _ALIKE_PX = 1.15, 0.02  # two fits of one grid between which only the photos' colours can decide
 _MAX_TRIED = 6  # grids that only the number of rows speaks for and that are tried with all frames
+_CERTAIN_PX = 0.3  # median distance that a grid of a wrong size does not reach at any scale
 _MOVED_SAMPLES = 2000  # Gaussians of a view that its moved pose is solved from
 
 
@@ -120,6 +121,12 @@ class _Fit:
         """Median distance of the Gaussians from their pixels in the worst view, pixels."""
         return self.recovery.best.worst_px
 
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether a grid of another size may fit as well: borders are cut off, and the scale was solved for."""
+        best = self.recovery.best
+        return best.layout.kind == "trim" and best.frame.scale != 1 and self.px > _CERTAIN_PX
+
 
 def align(
     ply: GaussianFile,
@@ -179,7 +186,10 @@ def _fits(source: _Source, grid: GridFit) -> Iterator[list[_Fit]]:
     large = len(grid.cameras) * math.prod(grid.size) > _LARGE * len(source.ply.gaussians)
     if large:
         yield next(other_sizes, [])
-    yield _fit_all(source, [grid])
+    fits = _fit_all(source, [grid])
+    if fits and fits[0].is_doubtful:
+        fits = [min((*fits, *next(other_sizes, [])), key=lambda fit: fit.px)]
+    yield fits
     if source.order not in MAY_BE_UNALIGNED:
         yield _fit_moved(source, grid)
     if not large:
