@@ -26,6 +26,7 @@ from gsmerge.alignment.layouts import (
 from gsmerge.alignment.recovery import SMALLEST_PX, Recovery, explain_count, is_seen, possible_layouts, recover
 from gsmerge.alignment.score import MARGIN, AlignmentInput, color_error, scale_by, score_layout
 from gsmerge.alignment.unaligned import check_cameras, choose_cameras
+from gsmerge.alignment.upright import solve_upright, upright_error, upright_rotation
 from gsmerge.errors import SceneError
 from gsmerge.geometry import IDENTITY, Similarity
 from gsmerge.io.cameras.camera_file import CameraFile
@@ -171,6 +172,9 @@ def align(
     if small is not None:
         raise small
     inputs = source.inputs(grid)
+    rotation = upright_rotation(inputs)
+    if rotation is not None:
+        return _align_upright(source, inputs, grid, rotation)
     why = explain_count(ply.info, inputs, camera_file)
     if scale is not None:
         inputs = replace(inputs, cameras=scale_by(scale).move(inputs.cameras))
@@ -178,6 +182,22 @@ def align(
     return AlignmentResult(
         None, cameras, inputs.images, camera_file, (*grid.notes, *notes), grid.transform, problem=why.problem
     )
+
+
+def _align_upright(source: _Source, inputs: AlignmentInput, grid: GridFit, rotation: Similarity) -> AlignmentResult:
+    """Find pixels or cameras of rows that an exporter has centred, rescaled and turned; SceneError where that fails."""
+    frame = solve_upright(inputs, rotation)
+    if frame is None:
+        raise upright_error(source.ply.info, inputs)
+    moved = replace(inputs, cameras=frame.move(inputs.cameras), scale=None)
+    recovery = recover(moved)
+    if recovery is not None:
+        best = replace(recovery.best, frame=frame)
+        return _make_result(source, _Fit(grid, replace(recovery, best=best)))
+    notes = *grid.notes, f"the cameras are {frame.description}, as rows in the order of the photos show"
+    problem = "expected one Gaussian per pixel, found rows that were merged or dropped"
+    camera_file = replace(source.camera_file, viewmats=moved.cameras.viewmats)
+    return AlignmentResult(None, moved.cameras, inputs.images, camera_file, notes, grid.transform, problem=problem)
 
 
 def _fits(source: _Source, grid: GridFit) -> Iterator[list[_Fit]]:
