@@ -313,7 +313,7 @@ def _put_back(scene: Scene, camera_file: CameraFile, layout: Layout, views: Sequ
     source = "from the depth maps"
     if depths is not None:
         full = fill_from_depths(scene, depths[views])
-    elif camera_file.source == WITH_PHOTOS and scene.missing is not None:
+    elif layout.kind == "pruned" and layout.per_pixel == 1 and scene.missing is not None:
         full = fill_from_depths(scene, guess_depths(scene))
         source = "at depths where the photos agree"
     else:
