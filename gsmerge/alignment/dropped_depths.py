@@ -7,6 +7,7 @@ from dataclasses import fields, replace
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
+from gsmerge.alignment.layouts import TRIMS, da3_trim
 from gsmerge.geometry import camera_depths, project_points, rgb_to_sh0
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.types import Gaussians, Scene, grid_ids
@@ -76,9 +77,7 @@ def guess_depths(scene: Scene) -> np.ndarray:
     photos have the same colours; border pixels the depth of the pixel beside them.
     """
     views, height, width = scene.valid.shape
-    stored = scene.valid if scene.missing is None else ~scene.missing
-    (top, bottom), (left, right) = (np.flatnonzero(stored.any((0, 3 - axis)))[[0, -1]] for axis in (1, 2))
-    y, x = np.arange(height).clip(top, bottom), np.arange(width).clip(left, right)
+    y, x = (_without_borders(scene.valid.any((0, 3 - axis))) for axis in (1, 2))
     means = scene.gaussians.means.astype(np.float64).reshape(views, -1, 3)
     maps = np.empty((views, height, width))
     for view in range(views):
@@ -87,7 +86,7 @@ def guess_depths(scene: Scene) -> np.ndarray:
         depth = camera_depths(points, np.broadcast_to(scene.cameras.viewmats[view], (len(points), 4, 4)))
         depth = depth.reshape(height, width)
         inner = np.zeros_like(kept)
-        inner[top : bottom + 1, left : right + 1] = ~kept[top : bottom + 1, left : right + 1]
+        inner[np.ix_(y, x)] = ~kept[np.ix_(y, x)]
         if kept.any():
             nearest = distance_transform_edt(~kept, return_distances=False, return_indices=True)
             beside = depth[tuple(nearest)][inner]
@@ -96,6 +95,13 @@ def guess_depths(scene: Scene) -> np.ndarray:
             depth[inner] = _agreeing_depths(scene, view, inner, depths)
         maps[view] = np.where(kept, depth, depth[np.ix_(y, x)])
     return maps
+
+
+def _without_borders(stored: np.ndarray) -> np.ndarray:
+    """Return for each of some lines ``[l]`` of pixels itself, or for a trimmed border the nearest line inside it."""
+    lines, first, last = len(stored), int(stored.argmax()), int(stored[::-1].argmax())
+    most = max(TRIMS[0], da3_trim(lines))  # beyond, a line lacks pixels for another reason
+    return np.arange(lines).clip(min(first, most), lines - 1 - min(last, most))
 
 
 def _agreeing_depths(scene: Scene, view: int, pixels: np.ndarray, depths: np.ndarray) -> np.ndarray:

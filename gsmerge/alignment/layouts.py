@@ -98,8 +98,13 @@ def trim_box(trim: int) -> KeptBox:
 
 def da3_box(width: int, height: int) -> KeptBox:
     """Return the box of pixels that Depth Anything 3 keeps."""
-    top, left = int(8 / 256 * height), int(8 / 256 * width)
+    top, left = da3_trim(height), da3_trim(width)
     return KeptBox("box", f"{top} rows and {left} columns trimmed at every border", top, left)
+
+
+def da3_trim(side: int) -> int:
+    """Return the pixels that Depth Anything 3 cuts off at both ends of a side."""
+    return int(8 / 256 * side)
 
 
 def view_orders(names: Sequence[str]) -> list[tuple[int, ...]]:

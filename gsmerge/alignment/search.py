@@ -290,7 +290,8 @@ def _fit_sizes(source: _Source, camera_file: CameraFile, *, exact_frames: bool =
         fits = _fit_all(source, grids, photos=False, exact_frames=exact)
         if fits:
             return fits
-    return [] if exact_frames else _fit_all(source, guesses[:_MAX_TRIED], photos=False)
+    fits = [] if exact_frames else _fit_all(source, guesses[:_MAX_TRIED], photos=False)
+    return [fit for fit in fits if fit.recovery.best.layout.kind != "pruned"]  # the number of rows leaves none out
 
 
 def _choose_first(source: _Source, rivals: Iterable[list[_Fit]]) -> _Fit | None:
