@@ -77,7 +77,7 @@ def guess_depths(scene: Scene) -> np.ndarray:
     photos have the same colours; border pixels the depth of the pixel beside them.
     """
     views, height, width = scene.valid.shape
-    y, x = (_without_borders(scene.valid.any((0, 3 - axis))) for axis in (1, 2))
+    y, x = (_without_borders(np.asarray(scene.valid.any((0, 3 - axis)))) for axis in (1, 2))
     means = scene.gaussians.means.astype(np.float64).reshape(views, -1, 3)
     maps = np.empty((views, height, width))
     for view in range(views):

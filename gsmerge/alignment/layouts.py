@@ -22,6 +22,7 @@ PER_PIXEL = (1, 2, 3, 4, 16)  # Gaussians per pixel that backbones write
 DEPTH_SHARE = 0.9  # of each view's pixels, the nearest ones, that Depth Anything 3 keeps
 PATCH = 14  # sides of vision transformers' inputs are multiples of it
 SIDES = (504, 518)  # to which Depth Anything 3 and others resize the longer or the shorter side, pixels
+SQUARE = 256  # side of the pictures of pixelSplat and its relatives, pixels
 _ROUND = (8, PATCH)  # sides of grids that photos are cropped to are multiples of one of them
 _MIN_KEPT = 0.5  # of a photo's area, when it is cropped
 _MAX_ENLARGED = 1.5  # times the side of a photo; some networks enlarge small ones
@@ -247,6 +248,15 @@ def photo_grid(camera_file: CameraFile, size: Size | None) -> GridFit:
     other = [s for s in sizes_of(camera_file) if s != size]
     notes = tuple(f"intrinsics scaled from {w} x {h} to the images' {width} x {height}" for w, h in other)
     return GridFit(camera_file, to_cameras(camera_file, size), None, notes)
+
+
+def square_grids(grid: GridFit) -> Iterator[GridFit]:
+    """Yield the square that pixelSplat and its relatives crop photos to, unless the grid is no larger."""
+    width, height = grid.size
+    if min(width, height) >= SQUARE and (width, height) != (SQUARE, SQUARE):
+        transform = resize_and_crop((width, height), (SQUARE, SQUARE))
+        note = f"photos and cameras of {width} x {height} are {transform.description}, the Gaussian grid's size"
+        yield replace(grid, cameras=transform.cameras(grid.cameras), transform=transform, notes=(*grid.notes, note))
 
 
 def _are_stretched(camera_file: CameraFile, size: Size) -> bool:

@@ -20,6 +20,7 @@ from gsmerge.alignment.layouts import (
     other_grids,
     photo_grid,
     small_photos_error,
+    square_grids,
     subsample,
     view_orders,
 )
@@ -174,7 +175,7 @@ def align(
     inputs = source.inputs(grid)
     rotation = upright_rotation(inputs)
     if rotation is not None:
-        return _align_upright(source, inputs, grid, rotation)
+        return _align_upright(source, grid, rotation)
     why = explain_count(ply.info, inputs, camera_file)
     if scale is not None:
         inputs = replace(inputs, cameras=scale_by(scale).move(inputs.cameras))
@@ -184,20 +185,28 @@ def align(
     )
 
 
-def _align_upright(source: _Source, inputs: AlignmentInput, grid: GridFit, rotation: Similarity) -> AlignmentResult:
+def _align_upright(source: _Source, grid: GridFit, rotation: Similarity) -> AlignmentResult:
     """Find pixels or cameras of rows that an exporter has centred, rescaled and turned; SceneError where that fails."""
-    frame = solve_upright(inputs, rotation)
-    if frame is None:
-        raise upright_error(source.ply.info, inputs)
+    for fitted in (grid, *square_grids(grid)):
+        inputs = source.inputs(fitted)
+        frame = solve_upright(inputs, rotation)
+        if frame is not None:
+            break
+    else:
+        raise upright_error(source.ply.info, source.photos is not None)
     moved = replace(inputs, cameras=frame.move(inputs.cameras), scale=None)
     recovery = recover(moved)
     if recovery is not None:
-        best = replace(recovery.best, frame=frame)
-        return _make_result(source, _Fit(grid, replace(recovery, best=best)))
-    notes = *grid.notes, f"the cameras are {frame.description}, as rows in the order of the photos show"
-    problem = "expected one Gaussian per pixel, found rows that were merged or dropped"
-    camera_file = replace(source.camera_file, viewmats=moved.cameras.viewmats)
-    return AlignmentResult(None, moved.cameras, inputs.images, camera_file, notes, grid.transform, problem=problem)
+        return _make_result(source, _Fit(fitted, replace(recovery, best=replace(recovery.best, frame=frame))))
+    return AlignmentResult(
+        None,
+        moved.cameras,
+        inputs.images,
+        replace(source.camera_file, viewmats=moved.cameras.viewmats),
+        (*fitted.notes, f"the cameras are {frame.description}, as the photos' colours show"),
+        fitted.transform,
+        problem="expected one Gaussian per pixel, found rows that were merged",
+    )
 
 
 def _fits(source: _Source, grid: GridFit) -> Iterator[list[_Fit]]:

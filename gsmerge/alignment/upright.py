@@ -88,7 +88,7 @@ def solve_upright(inputs: AlignmentInput, rotation: Similarity) -> Similarity | 
 
 
 def _possible_orders(count: int, cameras: Cameras) -> Iterator[tuple[np.ndarray, list[_Try]]]:
-    """Yield pixels ``[p]`` of pictures, and the places among them to search, for orders that ``count`` rows may have."""
+    """Yield pixels ``[p]`` of a picture, and places among them to search, for orders that ``count`` rows may have."""
     views = len(cameras)
     inner, every = (trim_box(trim).pixels(cameras.width, cameras.height).reshape(-1) for trim in (TRIMS[0], 0))
     for per_pixel in _PER_PIXEL:  # row, column, layer, view, with pixels dropped
@@ -166,12 +166,12 @@ def _agreed_frame(inputs: AlignmentInput, pairs: Correspondences, rotation: Simi
     return replace(frame, description=text, kind=rotation.kind)
 
 
-def upright_error(ply: FileInfo, inputs: AlignmentInput) -> SceneError:
+def upright_error(ply: FileInfo, has_photos: bool) -> SceneError:
     """Make the SceneError for upright rows whose place no photo shows."""
-    why = "no photos that show their place" if inputs.images is None else "photos that do not show their place"
+    photos = "photos that do not show" if has_photos else "no photos that show"
     return SceneError(
         ply.path,
-        "expected cameras in the frame of the rows, found rows that were centred, rescaled and turned upright by amounts"
-        f" that are saved nowhere, and {why}",
-        "give cameras in the file's frame, or the photos that the model saw; or export all pixels, without a far cut",
+        "expected cameras in the frame of the rows, found rows that were centred, rescaled and turned upright (by how"
+        f" much, no file says), and {photos} where they lie",
+        "give the photos that the model saw, or cameras in the file's frame; or export all pixels, without a far cut",
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gsmerge.alignment import estimate_cameras, estimate_focal, estimate_with_photos
+from gsmerge.alignment import check_cameras, estimate_cameras, estimate_focal, estimate_with_photos
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import CameraFile, missing_intrinsics, sizes_of, to_cameras, undistort_photos
 from gsmerge.io.cameras.embedded import SHARP
@@ -30,6 +31,7 @@ from gsmerge.io.photo_files import (
     Photos,
     PhotoTransform,
     Size,
+    as_floats,
     change_photos,
     decode_alpha,
     decode_image,
@@ -48,6 +50,8 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.scene.files import MASK_PLACES, SceneFiles
 from gsmerge.types import Cameras, LargePhotos
 
+_SEEN_PLACE = "images_resized"  # where WorldMirror writes what it saw
+_SHOWS_BETTER = 0.8  # of the colours' distance from other photos
 _MAX_BYTES = 2 << 30  # of all photos as floats, before it is known whether the Gaussians belong to pixels
 _FLOAT_PIXEL = 12  # bytes
 _BAR_SPREAD = 8  # of 255, range of a bar's colours
@@ -90,6 +94,32 @@ def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile:
             remedy = f"export them as well, by {formats}, {remedy}"
         raise SceneError(files.ply, problem, remedy)
     return cameras
+
+
+def choose_photos(ply: GaussianFile, files: SceneFiles, camera_file: CameraFile) -> tuple[SceneFiles, list[str]]:
+    """Take the photos that the model saw where those beside them do not show the scene, with a note.
+
+    WorldMirror squeezes what is too tall into ``images``, and cuts it in ``images_resized``.
+    """
+    seen = None if files.images is None else files.images.parent / _SEEN_PLACE
+    if files.images is None or seen is None or files.images.name == _SEEN_PLACE or not seen.is_dir():
+        return files, []
+
+    def ratio(images: Path) -> float:
+        photos = stored_photos(replace(files, images=images), camera_file)
+        if photos is None:
+            return math.nan
+        cameras = to_cameras(camera_file, photo_size(photos))
+        return check_cameras(ply.gaussians, ply.valid, cameras, as_floats(photos)).color_ratio
+
+    try:
+        better = ratio(seen) < _SHOWS_BETTER * ratio(files.images)
+    except SceneError:  # photos of other views
+        return files, []
+    note = (
+        f"photos are those of {_SEEN_PLACE}: their colours are those of the rows, those of {files.images.name} are not"
+    )
+    return (replace(files, images=seen), [note]) if better else (files, [])
 
 
 def stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos | None:
