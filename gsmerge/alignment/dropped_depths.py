@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import fields, replace
 
 import numpy as np
+from scipy.ndimage import distance_transform_edt
 
-from gsmerge.alignment.layouts import da3_box
+from gsmerge.alignment.layouts import TRIMS, da3_trim
 from gsmerge.geometry import camera_depths, project_points, rgb_to_sh0
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.types import Gaussians, Scene, grid_ids
@@ -70,68 +71,69 @@ def fill_from_depths(scene: Scene, depths: np.ndarray) -> Scene:
 
 
 def guess_depths(scene: Scene) -> np.ndarray:
-    """Guess depth maps ``[v,h,w]`` along z of a scene whose file lacks borders and far pixels.
+    """Guess depth maps ``[v,h,w]`` along z of a scene whose file lacks borders and other pixels.
 
-    Pixels with rows keep their depths. Far pixels get the depth at which the nearest other photos have the same
-    colours, and border pixels the depth of the pixel beside them.
+    Pixels with rows keep their depths. Others get the depth beside them, or that of the far, at which the nearest other
+    photos have the same colours; border pixels the depth of the pixel beside them.
     """
     views, height, width = scene.valid.shape
-    box = da3_box(width, height)
-    y = np.arange(height).clip(box.top, height - 1 - box.top)
-    x = np.arange(width).clip(box.left, width - 1 - box.left)
+    y, x = (_without_borders(np.asarray(scene.valid.any((0, 3 - axis)))) for axis in (1, 2))
     means = scene.gaussians.means.astype(np.float64).reshape(views, -1, 3)
     maps = np.empty((views, height, width))
     for view in range(views):
         kept = scene.valid[view]
-        viewmat = scene.cameras.viewmats[view]
         points = means[view]
-        depth = camera_depths(points, np.broadcast_to(viewmat, (len(points), 4, 4)))
+        depth = camera_depths(points, np.broadcast_to(scene.cameras.viewmats[view], (len(points), 4, 4)))
         depth = depth.reshape(height, width)
-        far = ~kept
-        far[: box.top] = far[height - box.top :] = False
-        far[:, : box.left] = far[:, width - box.left :] = False
+        inner = np.zeros_like(kept)
+        inner[np.ix_(y, x)] = ~kept[np.ix_(y, x)]
         if kept.any():
-            largest = float(np.quantile(depth[kept], _LARGEST))
-            depth[far] = largest * _far_factors(scene, view, far, largest)
+            nearest = distance_transform_edt(~kept, return_distances=False, return_indices=True)
+            beside = depth[tuple(nearest)][inner]
+            farthest = float(np.quantile(depth[kept], _LARGEST))
+            depths = np.concatenate([beside[None], np.repeat(farthest * _FACTORS[:, None], len(beside), 1)])
+            depth[inner] = _agreeing_depths(scene, view, inner, depths)
         maps[view] = np.where(kept, depth, depth[np.ix_(y, x)])
     return maps
 
 
-def _far_factors(scene: Scene, view: int, far: np.ndarray, depth: float) -> np.ndarray:
-    """Choose factors ``[p]`` on a depth under which photos agree, for pixels ``far [h,w]``."""
-    images = scene.images
-    cameras = scene.cameras
-    if images is None or not far.any():
-        return np.ones(int(far.sum()))
-    y, x = np.nonzero(far)
-    pixels = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1)
-    viewmat = cameras.viewmats[view]
-    rays = matmul(matmul(pixels, invert(cameras.Ks[view]).T), viewmat[:3, :3])
+def _without_borders(stored: np.ndarray) -> np.ndarray:
+    """Return for each of some lines ``[l]`` of pixels itself, or for a trimmed border the nearest line inside it."""
+    lines, first, last = len(stored), int(stored.argmax()), int(stored[::-1].argmax())
+    most = max(TRIMS[0], da3_trim(lines))  # beyond, a line lacks pixels for another reason
+    return np.arange(lines).clip(min(first, most), lines - 1 - min(last, most))
+
+
+def _agreeing_depths(scene: Scene, view: int, pixels: np.ndarray, depths: np.ndarray) -> np.ndarray:
+    """Choose of ``depths [d,p]`` those under which photos agree, for some ``pixels [h,w]``; the first in doubt."""
+    images, cameras = scene.images, scene.cameras
+    if images is None or not pixels.any():
+        return depths[0]
+    y, x = np.nonzero(pixels)
+    places = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1)
+    rays = matmul(matmul(places, invert(cameras.Ks[view]).T), cameras.viewmats[view, :3, :3])
     centres = cameras.centres
     away = np.linalg.norm(centres - centres[view], axis=1)
     neighbours = np.argsort(away, kind="stable")[1 : 1 + _OTHERS]
     colors = images[view, y, x]
-    costs = np.empty((len(_FACTORS), len(x)))
-    for i, factor in enumerate(_FACTORS):
-        points = centres[view] + factor * depth * rays
-        total, count = np.zeros(len(x)), np.zeros(len(x))
+    costs = np.empty(depths.shape)
+    for i, depth in enumerate(depths):
+        points = centres[view] + depth[:, None] * rays
+        seen = np.zeros((2, *pixels.shape))
         for neighbour in neighbours:
             with np.errstate(all="ignore"):
                 xy, z = project_points(points, cameras.viewmats[neighbour], cameras.Ks[neighbour])
             inside = (z > 0) & (xy >= 0).all(1) & (xy < (cameras.width, cameras.height)).all(1)
             column, row = xy[inside].astype(np.int64).T
-            total[inside] += np.abs(colors[inside] - images[neighbour, row, column]).mean(1)
-            count[inside] += 1
-        seen = np.zeros((2, *far.shape))
-        seen[0, y, x] = total
-        seen[1, y, x] = count
+            seen[0, y[inside], x[inside]] += np.abs(colors[inside] - images[neighbour, row, column]).mean(1)
+            seen[1, y[inside], x[inside]] += 1
         total, count = _sums_around(seen)[:, y, x]
         costs[i] = np.where(count > 0, total / np.maximum(count, 1), np.inf)
     finite = np.isfinite(costs).all(0)
-    chosen = (costs + _FARTHER * np.arange(len(_FACTORS))[:, None]).argmin(0)
+    chosen = (costs + _FARTHER * np.arange(len(depths))[:, None]).argmin(0)
     if finite.any():
         chosen[~finite] = int(np.median(chosen[finite]))
-    return _FACTORS[chosen]
+    return depths[chosen, np.arange(len(x))]
 
 
 def _sums_around(pictures: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ from gsmerge.alignment.calibration import calibrate
 from gsmerge.alignment.layouts import DEPTH_SHARE, Layout, da3_box, every_nth, exact_layouts, patch_grids, subsample
 from gsmerge.alignment.row_grid import find_grid
 from gsmerge.alignment.score import MARGIN, find_correspondences
-from gsmerge.geometry import sh0_to_rgb
+from gsmerge.alignment.stretches import UNIQUE, byte_colors, place_stretch, shown_colors
 from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, View, make_camera_file
 from gsmerge.io.photo_files import Photos, PhotoTransform, Size, resize_to
 from gsmerge.types import Cameras, Gaussians
@@ -25,15 +25,13 @@ from gsmerge.types import Cameras, Gaussians
 ESTIMATED = "estimated from the grid"  # source of estimated cameras
 _GRID_SAMPLES = 300  # Gaussians per view that cameras are estimated from
 WITH_PHOTOS = "estimated from rows and photos"  # of the cameras
-_STRETCH, _STEP = 96, 2  # rows that are compared with a photo, and every how many of them
+_STRETCH = 96  # rows that are compared with a photo
 _STRETCHES = 60  # of a view
 _PER_STRETCH = 12  # rows of each that cameras are estimated from
 _SLACK = 8  # pixels more than the bounds on both sides that are searched
-_UNIQUE = 1.1  # times as far as the nearest place is the next one, at least
 _MAX_COST = 3.0  # times the distance of the nearest quarter of a view's stretches
 _BACK = 1  # pixels that one stretch may lie too far ahead of the next
 _MIN_STRETCHES, _MIN_AGREEING = 8, 0.5  # of a view that agree, and share of the unique ones
-_OUTSIDE = 999  # a colour that no pixel has
 
 
 def estimate_cameras(
@@ -126,9 +124,7 @@ def estimate_with_photos(
     if not grids:
         return None
     photos = read_photos()
-    with np.errstate(invalid="ignore"):
-        base = np.nan_to_num(sh0_to_rgb(gaussians.sh0[:, 0])).clip(0, 1)
-    colors = np.ascontiguousarray(np.rint(255 * base).astype(np.int16).T)
+    colors = byte_colors(gaussians)
     for grid in grids:
         layout = _match_colors(colors, grid, grid.transform.photos(photos))
         if layout is not None:
@@ -147,15 +143,14 @@ def _match_colors(colors: np.ndarray, grid: _Grid, photos: Photos) -> Layout | N
     first, unsure = 0, 0  # row that the view begins with, and by how many that may be wrong
     rows, pixels = [], []
     for view in grid.views:
-        shown = photos[view].reshape(-1, 3)[inside].T.astype(np.int16)
-        shown = np.concatenate([shown, np.full((3, length), _OUTSIDE, np.int16)], 1)
+        shown = shown_colors(photos[view], inside, length)
         last = min(first + len(inside), colors.shape[1]) - length
         matches = []
         for start in np.unique(np.linspace(first + unsure // 2, last, _STRETCHES).astype(int)):
             low = max(0, start - first - unsure - _SLACK)
             high = min(len(inside), start - first + unsure + dropped + _SLACK)
             if start >= 0 and low < high:
-                matches.append((start, *_place(shown, colors[:, start : start + length], low, high)))
+                matches.append((start, *place_stretch(shown, colors[:, start : start + length], low, high)))
         placed = _agreeing(np.array(matches, np.int64).reshape(-1, 4))
         if not len(placed):
             return None
@@ -171,23 +166,6 @@ def _match_colors(colors: np.ndarray, grid: _Grid, photos: Photos) -> Layout | N
     return Layout("", "pruned", "view-major", width, height, blocks, tuple(rows), tuple(pixels))
 
 
-def _place(shown: np.ndarray, wanted: np.ndarray, low: int, high: int) -> tuple[int, int, int]:
-    """Find where the colours ``wanted [3,l]`` lie in ``shown [3,m]``, by absolute differences.
-
-    Returns the place, from ``low`` on and below ``high``, its sum, and that of the next best place.
-    """
-    sums, difference = np.zeros(high - low, np.int32), np.empty(high - low, np.int16)
-    for offset in range(0, wanted.shape[1], _STEP):
-        for channel in range(3):
-            values = shown[channel, low + offset : high + offset]
-            np.subtract(values, wanted[channel, offset], out=difference)
-            np.abs(difference, out=difference)
-            sums += difference
-    best = int(sums.argmin())
-    other_sums = np.concatenate([sums[: max(0, best - 2)], sums[best + 3 :]])
-    return low + best, int(sums[best]), int(other_sums.min(initial=np.iinfo(np.int32).max))
-
-
 def _agreeing(stretches: np.ndarray) -> np.ndarray:
     """Choose the stretches ``[s,4]`` that are unique and in order; none if few are.
 
@@ -196,7 +174,7 @@ def _agreeing(stretches: np.ndarray) -> np.ndarray:
     if not len(stretches):
         return stretches
     near = stretches[:, 2] <= _MAX_COST * max(1.0, float(np.quantile(stretches[:, 2], 0.25)))
-    stretches = stretches[near & (stretches[:, 3] > _UNIQUE * stretches[:, 2])]
+    stretches = stretches[near & (stretches[:, 3] > UNIQUE * stretches[:, 2])]
     gaps = stretches[:, 1] - stretches[:, 0]  # pixels dropped so far and a constant: never fewer
     longest, before = np.ones(len(stretches), int), np.full(len(stretches), -1)
     for i in range(len(stretches)):

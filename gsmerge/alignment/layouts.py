@@ -16,11 +16,13 @@ from gsmerge.io.photo_files import ASPECT_TOLERANCE, PhotoTransform, Size, resiz
 from gsmerge.types import Cameras
 
 MAY_BE_UNALIGNED: tuple[str, ...] = ("unordered", "none")  # orders of files whose rows need not belong to pixels
-TRIM = 8  # pixels that DepthSplat and its relatives cut off at every side
+TRIMS = (8, 4, 2)  # pixels that DepthSplat, ZPressor and ReSplat cut off at every side
+_MAX_TRIM = 0.25  # of the shorter side, cut off at every side
 PER_PIXEL = (1, 2, 3, 4, 16)  # Gaussians per pixel that backbones write
 DEPTH_SHARE = 0.9  # of each view's pixels, the nearest ones, that Depth Anything 3 keeps
 PATCH = 14  # sides of vision transformers' inputs are multiples of it
 SIDES = (504, 518)  # to which Depth Anything 3 and others resize the longer or the shorter side, pixels
+SQUARE = 256  # side of the pictures of pixelSplat and its relatives, pixels
 _ROUND = (8, PATCH)  # sides of grids that photos are cropped to are multiples of one of them
 _MIN_KEPT = 0.5  # of a photo's area, when it is cropped
 _MAX_ENLARGED = 1.5  # times the side of a photo; some networks enlarge small ones
@@ -75,21 +77,35 @@ class KeptBox:
         return grid[self.top : height - self.top, self.left : width - self.left]
 
 
-def boxes(width: int, height: int) -> list[KeptBox]:
-    """List the borders that exporters may have trimmed: none, 8 pixels, or 8/256 of each side (Depth Anything 3)."""
-    out = [KeptBox("full", "every pixel", 0, 0)]
-    if min(width, height) > 2 * TRIM:
-        out.append(KeptBox("trim", f"{TRIM} pixels trimmed at every border", TRIM, TRIM))
+def boxes(width: int, height: int) -> Iterator[KeptBox]:
+    """Yield the boxes that exporters may keep: all, without 8 pixels or 8/256 of each side, without any other border.
+
+    Depth Anything 3 cuts off 8/256. The likely come first.
+    """
+    yield KeptBox("full", "every pixel", 0, 0)
+    usual, side = TRIMS[0], min(width, height)
+    if side > 2 * usual:
+        yield trim_box(usual)
     da3 = da3_box(width, height)
-    if (da3.top or da3.left) and (da3.top, da3.left) != (TRIM, TRIM):
-        out.append(da3)
-    return out
+    if (da3.top or da3.left) and (da3.top, da3.left) != (usual, usual):
+        yield da3
+    yield from (trim_box(trim) for trim in range(1, int(_MAX_TRIM * side) + 1) if trim != usual)
+
+
+def trim_box(trim: int) -> KeptBox:
+    """Return the box without ``trim`` pixels at every border."""
+    return KeptBox("trim", f"{trim} pixels trimmed at every border", trim, trim)
 
 
 def da3_box(width: int, height: int) -> KeptBox:
     """Return the box of pixels that Depth Anything 3 keeps."""
-    top, left = int(8 / 256 * height), int(8 / 256 * width)
+    top, left = da3_trim(height), da3_trim(width)
     return KeptBox("box", f"{top} rows and {left} columns trimmed at every border", top, left)
+
+
+def da3_trim(side: int) -> int:
+    """Return the pixels that Depth Anything 3 cuts off at both ends of a side."""
+    return int(8 / 256 * side)
 
 
 def view_orders(names: Sequence[str]) -> list[tuple[int, ...]]:
@@ -250,6 +266,15 @@ def _mapped_grid(camera_file: CameraFile, size: Size, file_size: Size, transform
     return GridFit(camera_file, to_cameras(camera_file), transform, (note,))
 
 
+def square_grids(grid: GridFit) -> Iterator[GridFit]:
+    """Yield the square that pixelSplat and its relatives crop photos to, unless the grid is no larger."""
+    width, height = grid.size
+    if min(width, height) >= SQUARE and (width, height) != (SQUARE, SQUARE):
+        transform = resize_and_crop((width, height), (SQUARE, SQUARE))
+        note = f"photos and cameras of {width} x {height} are {transform.description}, the Gaussian grid's size"
+        yield replace(grid, cameras=transform.cameras(grid.cameras), transform=transform, notes=(*grid.notes, note))
+
+
 def _are_stretched(camera_file: CameraFile, size: Size) -> bool:
     """Return whether cameras of oblong pixels have square ones at the photos' size, which a model has stretched."""
     if camera_file.focal is None:
@@ -299,7 +324,7 @@ def _between(camera_file: CameraFile, size: Size, camera_size: Size) -> Iterator
 def grids_of_count(count: int, views: int, size: Size) -> Iterator[PhotoTransform]:
     """Yield the ways to shrink the photos so that ``views`` of them have ``count`` pixels in all."""
     crops: list[PhotoTransform] = []
-    for trim in (0, TRIM):
+    for trim in (0, *TRIMS):
         for per_pixel in PER_PIXEL:
             pixels, remainder = divmod(count, views * per_pixel)
             if remainder:

@@ -296,7 +296,7 @@ def _count_remedy(count: int, cameras: Cameras) -> str:
         if h == round(h) and h and abs(w * height / (h * width) - 1) < ASPECT_TOLERANCE:
             return f"that is {round(h)} x {w} per view: give cameras and images of that size"
     if count < views * pixels:
-        return "pixels were dropped or merged by the exporter, which is not supported"
+        return "pixels were dropped or merged: give cameras in the frame of the file, or export all pixels"
     return "give the cameras and images that belong to it"
 
 

@@ -32,7 +32,7 @@ _AS_GOOD, _AS_GOOD_PX = 1.5, 0.05  # one similarity for all cameras, compared wi
 
 _HALF = np.sqrt(0.5)
 # As the pixelSplat family turns its world: axes swapped, then an eighth of a turn about the last one.
-_UPRIGHT = np.array([[-_HALF, 0, _HALF], [-_HALF, 0, -_HALF], [0, -1, 0]])
+UPRIGHT = np.array([[-_HALF, 0, _HALF], [-_HALF, 0, -_HALF], [0, -1, 0]])
 
 
 def scale_by(scale: float, note: str = "") -> Similarity:
@@ -69,7 +69,7 @@ def pixel_errors(pairs: Correspondences, cameras: Cameras) -> np.ndarray:
     return np.where((depth[:, 0] > 0) & np.isfinite(error), error, np.inf)
 
 
-def _ray_directions(pairs: Correspondences, cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
+def ray_directions(pairs: Correspondences, cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
     """Compute unit directions ``[t,3]`` and origins ``[t,3]`` of the pixels' rays in the cameras' world."""
     ones = np.ones((len(pairs.pixels), 1))
     inverse = invert(cameras.Ks)[pairs.views]
@@ -94,13 +94,13 @@ def candidate_similarities(
     shift, 2 also for the rotation.
     """
     yield IDENTITY if scale is None else scale_by(scale, ", as given")
-    rays = None if pairs is None or effort == 0 else _ray_directions(pairs, cameras)
+    rays = None if pairs is None or effort == 0 else ray_directions(pairs, cameras)
     first, middle = cameras.viewmats[0, :3, :3], cameras.viewmats[len(cameras) // 2, :3, :3]
     rotations = (
         (np.eye(3), "", ""),
         (first, "rotated into the first camera", "first"),
         (middle, "rotated into the middle camera", "middle"),
-        (matmul(_UPRIGHT, first), "rotated upright from the first camera", "upright"),
+        (matmul(UPRIGHT, first), "rotated upright from the first camera", "upright"),
     )
     for rotation, name, kind in rotations:
         if name:
@@ -108,7 +108,7 @@ def candidate_similarities(
         if pairs is None or rays is None:
             continue
         for shifted in (False, True) if scale is None else (True,):
-            frame = _solve(pairs.points, rays, rotation, shifted=shifted)
+            frame = solve_frame(pairs.points, rays, rotation, shifted=shifted)
             if frame is not None:
                 text = f"positions scaled by {frame.scale:.4g}" + (" and shifted" if shifted else "")
                 text = f"{name}, {text}" if name else text
@@ -116,7 +116,7 @@ def candidate_similarities(
     if pairs is None or rays is None or effort < 2:
         return
     free = _mean_rotation(_solve_poses(pairs, cameras.Ks), cameras.viewmats)
-    frame = None if free is None else _solve(pairs.points, rays, free, shifted=True)
+    frame = None if free is None else solve_frame(pairs.points, rays, free, shifted=True)
     if frame is not None:
         angle = np.degrees(arccos(np.clip((np.trace(frame.rotation) - 1) / 2, -1, 1)))
         if angle < _SMALL_ROTATION and abs(log(frame.scale)) < _SMALL_SCALE:
@@ -125,7 +125,7 @@ def candidate_similarities(
         yield replace(frame, description=text, kind="other")
 
 
-def _solve(
+def solve_frame(
     points: np.ndarray, rays_and_centres: tuple[np.ndarray, np.ndarray], rotation: np.ndarray, *, shifted: bool
 ) -> Similarity | None:
     """Solve robustly for the scale (None if not positive) and shift that bring rotated points nearest to their rays."""

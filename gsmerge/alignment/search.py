@@ -20,12 +20,14 @@ from gsmerge.alignment.layouts import (
     other_grids,
     photo_grid,
     small_photos_error,
+    square_grids,
     subsample,
     view_orders,
 )
 from gsmerge.alignment.recovery import SMALLEST_PX, Recovery, explain_count, is_seen, possible_layouts, recover
 from gsmerge.alignment.score import MARGIN, AlignmentInput, color_error, scale_by, score_layout
 from gsmerge.alignment.unaligned import check_cameras, choose_cameras
+from gsmerge.alignment.upright import solve_upright, upright_error, upright_rotation
 from gsmerge.errors import SceneError
 from gsmerge.geometry import IDENTITY, Similarity
 from gsmerge.io.cameras.camera_file import CameraFile
@@ -37,6 +39,7 @@ from gsmerge.types import Cameras
 _LARGE = 2  # times as many pixels as rows: likely photos of another size than the grid's
 _ALIKE, _ALIKE_PX = 1.15, 0.02  # two fits of one grid between which only the photos' colours can decide
 _MAX_TRIED = 6  # grids that only the number of rows speaks for and that are tried with all frames
+_CERTAIN_PX = 0.3  # median distance that a grid of a wrong size does not reach at any scale
 _MOVED_SAMPLES = 2000  # Gaussians of a view that its moved pose is solved from
 
 
@@ -120,6 +123,12 @@ class _Fit:
         """Median distance of the Gaussians from their pixels in the worst view, pixels."""
         return self.recovery.best.worst_px
 
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether a grid of another size may fit as well: borders are cut off, and the scale was solved for."""
+        best = self.recovery.best
+        return best.layout.kind == "trim" and best.frame.scale != 1 and self.px > _CERTAIN_PX
+
 
 def align(
     ply: GaussianFile,
@@ -164,6 +173,9 @@ def align(
     if small is not None:
         raise small
     inputs = source.inputs(grid)
+    rotation = upright_rotation(inputs)
+    if rotation is not None:
+        return _align_upright(source, grid, rotation)
     why = explain_count(ply.info, inputs, camera_file)
     if scale is not None:
         inputs = replace(inputs, cameras=scale_by(scale).move(inputs.cameras))
@@ -173,13 +185,40 @@ def align(
     )
 
 
+def _align_upright(source: _Source, grid: GridFit, rotation: Similarity) -> AlignmentResult:
+    """Find pixels or cameras of rows that an exporter has centred, rescaled and turned; SceneError where that fails."""
+    for fitted in (grid, *square_grids(grid)):
+        inputs = source.inputs(fitted)
+        frame = solve_upright(inputs, rotation)
+        if frame is not None:
+            break
+    else:
+        raise upright_error(source.ply.info, source.photos is not None)
+    moved = replace(inputs, cameras=frame.move(inputs.cameras), scale=None)
+    recovery = recover(moved)
+    if recovery is not None:
+        return _make_result(source, _Fit(fitted, replace(recovery, best=replace(recovery.best, frame=frame))))
+    return AlignmentResult(
+        None,
+        moved.cameras,
+        inputs.images,
+        replace(source.camera_file, viewmats=moved.cameras.viewmats),
+        (*fitted.notes, f"the cameras are {frame.description}, as the photos' colours show"),
+        fitted.transform,
+        problem="expected one Gaussian per pixel, found rows that were merged",
+    )
+
+
 def _fits(source: _Source, grid: GridFit) -> Iterator[list[_Fit]]:
     """Yield fits of the photos' size and others, with poses as stored, moved and in other conventions; likely first."""
     other_sizes = _fit_other_sizes(source)
     large = len(grid.cameras) * math.prod(grid.size) > _LARGE * len(source.ply.gaussians)
     if large:
         yield next(other_sizes, [])
-    yield _fit_all(source, [grid])
+    fits = _fit_all(source, [grid])
+    if fits and fits[0].is_doubtful:
+        fits = [min((*fits, *next(other_sizes, [])), key=lambda fit: fit.px)]
+    yield fits
     if source.order not in MAY_BE_UNALIGNED:
         yield _fit_moved(source, grid)
     if not large:
@@ -260,7 +299,8 @@ def _fit_sizes(source: _Source, camera_file: CameraFile, *, exact_frames: bool =
         fits = _fit_all(source, grids, photos=False, exact_frames=exact)
         if fits:
             return fits
-    return [] if exact_frames else _fit_all(source, guesses[:_MAX_TRIED], photos=False)
+    fits = [] if exact_frames else _fit_all(source, guesses[:_MAX_TRIED], photos=False)
+    return [fit for fit in fits if fit.recovery.best.layout.kind != "pruned"]  # the number of rows leaves none out
 
 
 def _choose_first(source: _Source, rivals: Iterable[list[_Fit]]) -> _Fit | None:

@@ -19,6 +19,8 @@ _SEEN_AS_MUCH = 0.98  # of the score of what the cameras see: no difference
 _SEEN_SAMPLES = 20_000  # Gaussians that are projected to see whether cameras see them
 _MIN_SEEN = 0.5  # share of them that some camera sees
 _MAX_COLOR_RATIO = 0.85  # of their colours' distance from the photos, over that from random pixels
+_MAX_FRONT_RATIO = 0.5  # the same of the foremost ones alone, in a frame that colours chose
+_FRONT, _PER_CELL = 1.05, 3  # times the depth of the nearest one of its cell; Gaussians of a cell
 _SAME_COLORS = 0.01  # mean distance of the colours from random pixels below which photos say nothing
 _FRAME_GAIN = 1.1  # times the score of the cameras as given, for another frame
 # a scale stands out whose score is so many times that of a scale which is this factor off
@@ -60,8 +62,13 @@ def check_cameras(
     cameras: Cameras,
     images: np.ndarray | None,
     samples: int = _SEEN_SAMPLES,
+    *,
+    foremost: bool = False,
 ) -> CameraCheck:
-    """Measure the share of sampled Gaussians that views see, and how well colours fit ``images [c,h,w,3]``, if any."""
+    """Measure the share of sampled Gaussians that views see, and how well colours fit ``images [c,h,w,3]``, if any.
+
+    With ``foremost`` only the colours of those count that no other one hides.
+    """
     rows = np.flatnonzero(valid)
     rows = rows[:: max(1, len(rows) // samples)]
     points = gaussians.means[rows].astype(np.float64)
@@ -74,6 +81,8 @@ def check_cameras(
             xy = np.floor(xy)
         inside = (depth > 0) & (xy >= 0).all(1) & (xy < (cameras.width, cameras.height)).all(1)
         visible |= inside
+        if foremost:
+            inside[inside] = _are_foremost(xy[inside], depth[inside], cameras.width * cameras.height)
         if images is not None and inside.any():
             x, y = xy[inside].astype(np.int64).T
             photo = images[view, y, x]
@@ -83,6 +92,17 @@ def check_cameras(
     if errors and (other := float(np.concatenate(shuffled_errors).mean())) > _SAME_COLORS:
         ratio = float(np.concatenate(errors).mean()) / other
     return CameraCheck(share, ratio, share >= _MIN_SEEN and not ratio > _MAX_COLOR_RATIO)
+
+
+def _are_foremost(xy: np.ndarray, depth: np.ndarray, area: int) -> np.ndarray:
+    """Return which of points ``[n]`` at pixels ``xy [n,2]`` are about as near as the nearest one of their cell."""
+    if not len(xy):
+        return np.zeros(0, bool)
+    column, row = (xy // max(1, int(np.sqrt(_PER_CELL * area / len(xy))))).astype(np.int64).T
+    cells = row * (column.max() + 1) + column
+    nearest = np.full(cells.max() + 1, np.inf)
+    np.minimum.at(nearest, cells, depth)
+    return np.asarray(depth <= _FRONT * nearest[cells])
 
 
 def choose_poses(
@@ -143,6 +163,7 @@ def choose_cameras(
     other = _choose_frame(inputs, check)
     if other is not None:
         cameras = other.move(inputs.cameras)
+        _check_colors(inputs, cameras, other.description, why)
         note = f"the cameras are {other.description}, as the photos' colours show"
         return cameras, replace(camera_file, viewmats=cameras.viewmats), [note]
     if not check.ok:
@@ -150,8 +171,20 @@ def choose_cameras(
     if poses is None:
         return inputs.cameras, camera_file, [note] if note else []
     cameras = replace(inputs.cameras, viewmats=poses.viewmats)
+    _check_colors(inputs, cameras, f"read as {poses.description}", why)
     note = f"{describe_reading(poses.convention, camera_file.convention)}: read so"
     return cameras, with_convention(camera_file, poses.convention), [note]
+
+
+def _check_colors(inputs: AlignmentInput, cameras: Cameras, name: str, why: SceneError) -> None:
+    """Raise the SceneError ``why`` where photos are far from the colours of the rows that they should show."""
+    ratio = check_cameras(inputs.gaussians, inputs.valid, cameras, inputs.images, foremost=True).color_ratio
+    if ratio > _MAX_FRONT_RATIO:
+        found = (
+            f"even with cameras {name} the foremost rows' colours are {ratio:.2f} times as far from the photos as any"
+        )
+        remedy = "name the exporter with --hint exporter, export all pixels, or give cameras in the file's frame"
+        raise SceneError(why.path, f"{why.problem}; {found} others", remedy)
 
 
 def _exporter_frames(inputs: AlignmentInput) -> Iterator[Similarity]:
@@ -202,7 +235,7 @@ def _scaled(frame: Similarity, factor: float) -> Similarity:
     """Return a frame with another scale, about the origin of the Gaussians."""
     scale = factor * frame.scale
     text = f"positions scaled by {scale:.4g}"
-    name = frame.description.partition(", positions scaled")[0]
+    name = frame.description.partition("positions scaled")[0].removesuffix(", ")
     words = f"{name}, {text}" if name else text
     return replace(frame, scale=scale, shift=factor * frame.shift, description=words)
 

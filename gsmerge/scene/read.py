@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from gsmerge.alignment import (
-    WITH_PHOTOS,
     Alignment,
     AlignmentResult,
     Layout,
@@ -39,6 +38,7 @@ from gsmerge.scene.exporters import AUTO, Exporter, ReadHints, choose_exporters,
 from gsmerge.scene.files import SceneFiles, find_scene_files
 from gsmerge.scene.views import (
     check_masks,
+    choose_photos,
     cut_bars,
     find_larger_and_masks,
     limit_photo_size,
@@ -236,6 +236,7 @@ def align_scene(
     camera_file = read_scene_cameras(ply, files) if camera_file is None else camera_file
     default_order = camera_file.order if exporter is None else exporter.order
     order = default_order if hints.order == "auto" else hints.order
+    files, chosen = choose_photos(ply, files, camera_file) if photos else (files, [])
     pinholes, pictures, notes = as_pinholes(camera_file, stored_photos(files, camera_file) if photos else None)
     notes += [camera_file.focal] if camera_file.focal else []
     whole, (pictures, cut) = pictures, cut_bars(pictures, camera_file)
@@ -243,7 +244,7 @@ def align_scene(
 
     depths, frames = partial(read_depths, Path(camera_file.path)), partial(read_dataparser, files.ply, files.cameras)
     result = align(ply, pinholes, limited, order=order, scale=hints.scene_scale, depths=depths, frames=frames)
-    notes += [*cut, *smaller, *result.notes]
+    notes += [*chosen, *cut, *smaller, *result.notes]
     if result.pixel_ids is None:
         cameras, images, smaller = limit_view_size(result.cameras, result.images, hints.max_side)
         result = replace(result, cameras=cameras, images=images)
@@ -313,7 +314,7 @@ def _put_back(scene: Scene, camera_file: CameraFile, layout: Layout, views: Sequ
     source = "from the depth maps"
     if depths is not None:
         full = fill_from_depths(scene, depths[views])
-    elif camera_file.source == WITH_PHOTOS and scene.missing is not None:
+    elif layout.kind == "pruned" and layout.per_pixel == 1 and scene.missing is not None:
         full = fill_from_depths(scene, guess_depths(scene))
         source = "at depths where the photos agree"
     else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -13,6 +14,7 @@ import numpy as np
 
 from gsmerge.alignment import (
     ESTIMATED,
+    check_cameras,
     estimate_cameras,
     estimate_focal,
     estimate_from_rows,
@@ -36,6 +38,7 @@ from gsmerge.io.photo_files import (
     Photos,
     PhotoTransform,
     Size,
+    as_floats,
     change_photos,
     decode_alpha,
     decode_image,
@@ -55,6 +58,8 @@ from gsmerge.scene.files import MASK_PLACES, SceneFiles
 from gsmerge.scene.grid_photos import match_photos
 from gsmerge.types import Cameras, LargePhotos
 
+_SEEN_PLACE = "images_resized"  # where WorldMirror writes what it saw
+_SHOWS_BETTER = 0.8  # of the colours' distance from other photos
 _MAX_BYTES = 2 << 30  # of all photos as floats, before it is known whether the Gaussians belong to pixels
 _FLOAT_PIXEL = 12  # bytes
 _BAR_SPREAD = 8  # of 255, range of a bar's colours
@@ -123,6 +128,32 @@ def _read_grid(ply: GaussianFile, files: SceneFiles, paths: Sequence[Path]) -> C
     raise SceneError(files.images, f"{problem}, found {len(paths)} images that do not show them", "name another folder")
 
 
+def choose_photos(ply: GaussianFile, files: SceneFiles, camera_file: CameraFile) -> tuple[SceneFiles, list[str]]:
+    """Take the photos that the model saw where those beside them do not show the scene, with a note.
+
+    WorldMirror squeezes what is too tall into ``images``, and cuts it in ``images_resized``.
+    """
+    seen = None if files.images is None else files.images.parent / _SEEN_PLACE
+    if files.images is None or seen is None or files.images.name == _SEEN_PLACE or not seen.is_dir():
+        return files, []
+
+    def ratio(images: Path) -> float:
+        photos = stored_photos(replace(files, images=images), camera_file)
+        if photos is None:
+            return math.nan
+        cameras = to_cameras(camera_file, photo_size(photos))
+        return check_cameras(ply.gaussians, ply.valid, cameras, as_floats(photos)).color_ratio
+
+    try:
+        better = ratio(seen) < _SHOWS_BETTER * ratio(files.images)
+    except SceneError:  # photos of other views
+        return files, []
+    note = (
+        f"photos are those of {_SEEN_PLACE}: their colours are those of the rows, those of {files.images.name} are not"
+    )
+    return (replace(files, images=seen), [note]) if better else (files, [])
+
+
 def stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos | None:
     """Read the photos of the cameras from a folder, from a file that holds them, or from where the camera file says."""
     photos = _stored_photos(files, camera_file)
@@ -179,7 +210,11 @@ def _photo_paths(files: SceneFiles, camera_file: CameraFile) -> list[Path] | Non
     if files.images is None:
         folder = Path(camera_file.path).parent
         paths = [path for path in (find_image(folder, name) for name in camera_file.names) if path is not None]
-        if not paths and camera_file.source != ESTIMATED and all(name.removeprefix("view ").isdecimal() for name in camera_file.names):
+        if (
+            not paths
+            and camera_file.source != ESTIMATED
+            and all(name.removeprefix("view ").isdecimal() for name in camera_file.names)
+        ):
             paths = images_beside(files.ply)  # the format has no names; AnySplat writes its Gaussians among the photos
         return paths if len(paths) == len(camera_file) else None
     return None if files.images.suffix in (".npz", CHUNK) else match_images(files.images, camera_file.names)

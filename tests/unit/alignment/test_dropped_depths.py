@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_scene import make_tiny
+from exports import da3_rows, export_rows, save_export, smooth_scene
+from messages import noted
+from tiny_scene import make_tiny, write_colmap_text, write_images
 
 from gsmerge.alignment import guess_depths
+from gsmerge.scene.read import load_scene
 from gsmerge.types import Cameras, Scene, grid_ids
 
 WIDTH, HEIGHT, NEAR, FAR, FLOOR = 96, 64, 3.0, 6.0, 32
@@ -55,3 +59,34 @@ def test_far_pixels_are_no_nearer_than_the_farthest_row(without: str) -> None:
     scene = scene_of(moved=0.0)
     maps = guess_depths(scene if without == "parallax" else replace(scene, images=None))
     assert np.allclose(maps[:, 2:FLOOR], NEAR, rtol=1e-5)
+
+
+def test_holes_between_rows_have_the_depth_beside_them() -> None:
+    """Single pixels missing from the near wall: the photos do not speak for another depth."""
+    scene = scene_of(moved=0.5)
+    holes = np.random.default_rng(0).random(scene.valid.shape) < 0.1
+    holes[:, :FLOOR] = False
+    kept = scene.valid & ~holes
+    maps = guess_depths(replace(scene, pixel_ids=grid_ids(kept), missing=~kept))
+    assert (np.abs(np.log(maps[:, FLOOR + 8 : -8, 8:-8] / NEAR)) < 0.01).mean() > 0.98
+
+
+@pytest.mark.parametrize("photos", [True, False])
+def test_dropped_pixels_come_back_with_cameras_and_photos(tmp_path: Path, photos: bool) -> None:
+    """Rows of Depth Anything 3 with COLMAP's cameras in the place of its depth maps."""
+    tiny = smooth_scene(96, 72)
+    folder = save_export(tmp_path, tiny, export_rows(tiny, da3_rows(tiny)), cameras=False)
+    write_colmap_text(folder / "sparse" / "0", tiny)
+    if photos:
+        write_images(folder / "images", tiny)
+    loaded = load_scene(folder)
+    scene = loaded.pixel_scene()
+    back = scene.valid & scene.missing
+    assert np.array_equal(np.flatnonzero(scene.stored.reshape(-1)), da3_rows(tiny))
+    assert back.any() == photos
+    assert noted(loaded.notes, "put back") == photos
+    if photos:
+        assert scene.valid.all()
+        c2w = np.repeat(tiny.c2w, 96 * 72, axis=0)
+        depths = ((scene.gaussians.means - c2w[:, :3, 3]) * c2w[:, :3, 2]).sum(1)
+        assert np.median(np.abs(np.log(depths / tiny.depths.reshape(-1)))[back.reshape(-1)]) < 0.1

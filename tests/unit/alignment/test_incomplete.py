@@ -148,7 +148,7 @@ def test_rows_without_finite_positions(tmp_path: Path) -> None:
     loaded = load_scene(save_export(tmp_path, tiny, rows))
     finite = np.isfinite(rows["x"])
     assert share_at_home(loaded, tiny, kept) >= 0.99 * finite.mean()
-    assert int(loaded.pixel_scene().valid.sum()) >= 0.99 * finite.sum()
+    assert int(loaded.pixel_scene().stored.sum()) >= 0.99 * finite.sum()
 
 
 @pytest.mark.parametrize("names", [("a", "b"), ("b", "a")])  # in the order of the file, and not
@@ -186,7 +186,7 @@ def test_nearly_every_row_comes_to_its_pixel(tmp_path: Path, smooth: Smooth, dro
     loaded = load_scene(save_export(tmp_path, smooth, export_rows(smooth, kept)))
     scene = loaded.pixel_scene()
     assert loaded.recovery.best.layout.order == "view-fastest"
-    actual = np.flatnonzero(scene.valid.reshape(-1))
+    actual = np.flatnonzero(scene.stored.reshape(-1))
     wrong = np.setxor1d(actual, kept)
     assert len(wrong) <= 0.02 * len(kept)  # a row in a wrong place is missing in another
     same = np.intersect1d(actual, kept)
@@ -218,8 +218,8 @@ def test_dropped_pixels(tmp_path: Path, nested: float, dropped: float | str, siz
     assert loaded.recovery.best.layout.kind == "pruned"
     assert loaded.recovery.best.frame.scale == pytest.approx(1 / nested, rel=2e-3)
     scene = loaded.pixel_scene()
-    assert np.mean(np.flatnonzero(scene.valid.reshape(-1)) == kept) > 0.99
-    right = np.abs((scene.gaussians.opacities - tiny.gaussians.opacities)[scene.valid.reshape(-1)]) < 1e-5
+    assert np.mean(np.flatnonzero(scene.stored.reshape(-1)) == kept) > 0.99
+    right = np.abs((scene.gaussians.opacities - tiny.gaussians.opacities)[scene.stored.reshape(-1)]) < 1e-5
     assert float(right.mean()) > 0.99
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from exports import export_rows, save_export, smooth_scene
+from exports import Smooth, export_rows, save_export, smooth_scene, turned
 from messages import names, noted, refuses
 from tiny_scene import Tiny, edited_json, frames_of, write_colmap_text, write_npz
 
@@ -128,6 +129,34 @@ def test_cameras_larger_than_the_grid_and_no_photos(tmp_path: Path) -> None:
     loaded = load_scene(tmp_path)
     assert np.allclose(loaded.pixel_scene().cameras.Ks, SMOOTH.K)
     assert loaded.notes == ("cameras of 96 x 72 are resized to 48 x 36, the Gaussian grid's size",)
+
+
+def trimmed(tiny: Smooth, trim: int) -> np.ndarray:
+    """Indices of the inner pixels, view by view."""
+    index = np.arange(3 * tiny.height * tiny.width).reshape(3, tiny.height, tiny.width)
+    return index[:, trim : tiny.height - trim, trim : tiny.width - trim].reshape(-1)
+
+
+@pytest.mark.parametrize("trim", [2, 4, 7, 11])
+def test_borders_of_any_width(tmp_path: Path, trim: int) -> None:
+    """A resize with another scale and a shift would fit as well, to a fraction of a pixel."""
+    tiny = smooth_scene(96, 72)
+    rows = turned(export_rows(tiny, trimmed(tiny, trim)), tiny.w2c[0, :3, :3])
+    loaded = load_scene(save_export(tmp_path, tiny, rows))
+    assert loaded.recovery.best.layout.description.startswith(f"{trim} pixels trimmed")
+    assert loaded.recovery.best.frame.kind == "first"
+    assert np.array_equal(np.flatnonzero(loaded.pixel_scene().stored.reshape(-1)), trimmed(tiny, trim))
+
+
+def test_a_resize_that_looks_like_a_trim(tmp_path: Path) -> None:
+    """Photos of 96 x 72 shrunk and cropped to 88 x 64, in another scale: four pixels less at every border."""
+    tiny, mapping = smooth_scene(88, 64), resize_and_crop((96, 72), (88, 64))
+    K, photos = original(tiny, mapping, (96, 72))
+    wide = replace(tiny, K=K, width=96, height=72, images=np.stack(photos))
+    rows = turned(export_rows(tiny), np.eye(3), scale=1.7, shift=np.array([0.3, 0.1, -0.2]))
+    loaded = load_scene(save_export(tmp_path, wide, rows))
+    assert noted(loaded.notes, "96 x 72", "88 x 64")
+    assert np.allclose(loaded.pixel_scene().cameras.Ks, tiny.K)
 
 
 def test_a_trimmed_grid_of_another_size(tmp_path: Path) -> None:

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from exports import export_rows, save_export, smooth_scene, turned
-from messages import refuses
+from messages import noted, refuses
+from tiny_scene import make_tiny, write_images
 
-from gsmerge.alignment import recovery
+from gsmerge.alignment import recovery, unaligned
 from gsmerge.errors import SceneError
+from gsmerge.geometry import Similarity
 from gsmerge.scene.read import load_scene
+from gsmerge.types import SH_C0, Cameras
 
 WIDTH, HEIGHT = 64, 48
 SMOOTH = smooth_scene(WIDTH, HEIGHT)
@@ -89,3 +94,45 @@ def test_no_frame_is_solved_for_rows_that_no_camera_shows(tmp_path: Path, monkey
     monkeypatch.setattr(recovery, "candidate_similarities", count)
     load_scene(save_export(tmp_path, SMOOTH, turned(padded(voxels()), SMOOTH.w2c[0, :3, :3])))
     assert set(efforts) == {0}
+
+
+def test_no_other_frame_stands_against_the_foremost_colours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever chooses a frame: where the photos are far from what they should show, it is refused."""
+    wrong = Similarity(np.eye(3), 1.0, np.array([0.9, 0.4, 0.0]), "somewhere else", "shifted")
+    folder = save_export(tmp_path, SMOOTH, voxels())
+    monkeypatch.setattr(unaligned, "_choose_frame", lambda inputs, usual: wrong)
+    with refuses(SceneError, "scene.ply", "somewhere else", "colours", "--hint exporter"):
+        load_scene(folder)
+
+
+def test_hidden_gaussians_say_nothing_about_the_foremost() -> None:
+    cameras = Cameras(np.eye(4)[None], np.array([[[50.0, 0, 50], [0, 50, 50], [0, 0, 1]]]), 100, 100)
+    rng = np.random.default_rng(0)
+    photo = rng.random((1, 10, 10, 3)).repeat(10, 1).repeat(10, 2).astype(np.float32)
+    xy = rng.uniform(-1, 1, (4000, 2))
+    places = np.floor(50 * xy + 50).astype(int)
+    colors = photo[0, places[:, 1], places[:, 0]]
+    front = np.concatenate([xy, np.ones((4000, 1))], 1)
+    means = np.concatenate([front, 3 * front]).astype(np.float32)
+    shown = (np.concatenate([colors, rng.random((4000, 3))]) - 0.5) / SH_C0
+    tiny = make_tiny().gaussians[np.zeros(8000, int)]
+    gaussians = replace(tiny, means=means, sh0=shown[:, None].astype(np.float32))
+    every, foremost = (
+        unaligned.check_cameras(gaussians, np.ones(8000, bool), cameras, photo, foremost=foremost).color_ratio
+        for foremost in (False, True)
+    )
+    assert every > 0.4
+    assert foremost < 0.1
+
+
+@pytest.mark.parametrize("shows", ["images_resized", "images"])
+def test_photos_that_the_model_saw_where_others_do_not_show_the_scene(tmp_path: Path, shows: str) -> None:
+    """As WorldMirror leaves a portrait: whole photos squeezed to the shape of what was cut out of them."""
+    folder = save_export(tmp_path, SMOOTH, voxels())
+    squeezed = [cv2.resize(np.pad(i, ((16, 16), (0, 0), (0, 0)), "reflect"), (WIDTH, HEIGHT)) for i in SMOOTH.images]
+    for place in ("images", "images_resized"):
+        write_images(folder / place, SMOOTH if place == shows else replace(SMOOTH, images=np.stack(squeezed)))
+    loaded = load_scene(folder)
+    assert np.abs(loaded.scene.images - SMOOTH.images / 255).mean() < 0.01
+    assert noted(loaded.notes, "images_resized") == (shows == "images_resized")
+    assert loaded.files.images.name == shows

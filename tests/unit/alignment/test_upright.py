@@ -1,0 +1,129 @@
+"""Rows that were centred, rescaled and turned upright by amounts that no file says, with pixels dropped or fused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from exports import Smooth, export_rows, save_export, smooth_scene, turned
+from messages import noted, refuses
+
+from gsmerge.alignment.score import UPRIGHT
+from gsmerge.errors import SceneError
+from gsmerge.scene.read import Loaded, load_scene
+from gsmerge.types import SH_C0
+
+WIDTH, HEIGHT, VIEWS, TRIM = 128, 96, 3, 8
+
+
+def with_texture(tiny: Smooth) -> Smooth:
+    """The same surface in colours by which each stretch of pixels is known."""
+    noise = np.random.default_rng(1).integers(0, 256, tiny.images.shape).astype(np.float32)
+    images = np.stack([cv2.GaussianBlur(image, (0, 0), 1.0) for image in noise])
+    images = (128 + 2 * (images - 128)).clip(0, 255).astype(np.uint8)
+    colors = (images.reshape(-1, 1, 3) / np.float32(255) - 0.5) / SH_C0
+    return replace(tiny, images=images, gaussians=replace(tiny.gaussians, sh0=colors.astype(np.float32)))
+
+
+@pytest.fixture(scope="module")
+def textured() -> Smooth:
+    return with_texture(smooth_scene(WIDTH, HEIGHT))
+
+
+def far_cut(tiny: Smooth, share: float = 0.9) -> np.ndarray:
+    """Indices in the order row, column, view, without borders and the farthest."""
+    index = np.arange(tiny.depths.size).reshape(tiny.depths.shape)
+    limit = np.quantile(tiny.depths, share)
+    kept = np.zeros(index.shape, bool)
+    kept[:, TRIM:-TRIM, TRIM:-TRIM] = True
+    kept &= tiny.depths < limit
+    return index.transpose(1, 2, 0)[kept.transpose(1, 2, 0)]
+
+
+def fused(tiny: Smooth) -> np.ndarray:
+    """Rows of views that were fused: the rest of the first one, means of two views, the rest of the last one."""
+    size = HEIGHT * WIDTH
+    ids = np.arange(VIEWS * size).reshape(VIEWS, HEIGHT, WIDTH)
+    same = np.zeros((HEIGHT, WIDTH), bool)
+    same[20:-20, 70:] = True
+    rows = export_rows(tiny)
+    merged = rows[ids[0][same]].copy()
+    for name in rows.dtype.names:
+        merged[name] = (rows[name][ids[0][same]] + rows[name][ids[1][same]]) / 2
+    merged["x"] += 0.05
+    middle = ids[1][~same][::3]
+    return np.concatenate([rows[ids[0][~same]], merged, rows[middle], rows[ids[2].reshape(-1)]])
+
+
+def upright(tiny: Smooth, rows: np.ndarray, first: int = 0) -> tuple[np.ndarray, float, np.ndarray]:
+    """Rows as pixelSplat's exporter leaves them; also its scale, and the centres of the cameras there."""
+    means = np.stack([rows[name] for name in "xyz"], 1).astype(np.float64)
+    middle = np.median(means, 0)
+    scale = 1 / np.quantile(np.abs(means - middle), 0.95, axis=0).max()
+    turn = UPRIGHT @ tiny.w2c[first, :3, :3]
+    moved = turned(rows, turn, scale=scale, shift=-scale * turn @ middle)
+    moved["opacity"] = 1 / (1 + np.exp(-rows["opacity"]))
+    return moved, scale, scale * (tiny.c2w[:, :3, 3] - middle) @ turn.T
+
+
+def check_centres(loaded: Loaded, centres: np.ndarray, scale: float) -> None:
+    assert np.allclose(loaded.scene.cameras.centres, centres, atol=0.01 * scale)
+    assert any("rotated upright" in note for note in loaded.notes)
+
+
+@pytest.mark.parametrize("first", [0, 2])
+def test_far_pixels_dropped_before_the_world_was_turned(tmp_path: Path, textured: Smooth, first: int) -> None:
+    kept = far_cut(textured)
+    rows, scale, centres = upright(textured, export_rows(textured, kept), first)
+    loaded = load_scene(save_export(tmp_path, textured, rows))
+    scene = loaded.pixel_scene()
+    check_centres(loaded, centres, scale)
+    wrong = np.setxor1d(np.flatnonzero(scene.stored.reshape(-1)), kept)
+    assert len(wrong) <= 0.02 * len(kept)
+    assert loaded.recovery.best.frame.kind == "upright"
+    assert "mvsplat" in [exporter.name for exporter in loaded.exporters]
+
+
+def test_fused_views_are_seen_by_cameras_in_their_frame(tmp_path: Path, textured: Smooth) -> None:
+    rows, scale, centres = upright(textured, fused(textured))
+    loaded = load_scene(save_export(tmp_path, textured, rows))
+    assert not loaded.scene.aligned
+    check_centres(loaded, centres, scale)
+
+
+def test_larger_photos_are_cropped_to_the_square_of_the_family(tmp_path: Path) -> None:
+    """The model saw the middle square of photos of 400 x 320, at 256 x 256."""
+    tiny = with_texture(smooth_scene(256, 256))
+    rows, scale, centres = upright(tiny, export_rows(tiny, far_cut(tiny)))
+    K = np.diag([1.25, 1.25, 1]) @ tiny.K
+    K[0, 2] += 40
+    photos = [cv2.copyMakeBorder(cv2.resize(i, (320, 320)), 0, 0, 40, 40, cv2.BORDER_REFLECT) for i in tiny.images]
+    wide = replace(tiny, K=K, width=400, height=320, images=np.stack(photos))
+    loaded = load_scene(save_export(tmp_path, wide, rows))
+    scene = loaded.pixel_scene()
+    assert (scene.cameras.width, scene.cameras.height) == (256, 256)
+    assert noted(loaded.notes, "400 x 320", "centre-cropped", "256 x 256")
+    check_centres(loaded, centres, scale)
+
+
+@pytest.mark.parametrize("photos", ["none", "of another scene"])
+def test_without_photos_that_show_them_they_are_refused(tmp_path: Path, textured: Smooth, photos: str) -> None:
+    rows, _, _ = upright(textured, export_rows(textured, far_cut(textured)))
+    strange = np.random.default_rng(5).integers(0, 256, textured.images.shape, np.uint8)
+    folder = save_export(tmp_path, replace(textured, images=strange), rows)
+    if photos == "none":
+        for photo in (folder / "images").rglob("*.png"):
+            photo.unlink()
+    with refuses(SceneError, "scene.ply", "upright", "photos", "far cut"):
+        load_scene(folder)
+
+
+def test_no_frame_is_chosen_in_which_photos_are_far_from_the_rows(tmp_path: Path, textured: Smooth) -> None:
+    """The same rows scaled and shifted again do not show themselves, and fit nowhere."""
+    rows, _, _ = upright(textured, export_rows(textured, far_cut(textured)))
+    moved = turned(rows, np.eye(3), scale=1.3, shift=np.array([0.3, -0.2, 0.4]))
+    with refuses(SceneError, "scene.ply", "cameras"):
+        load_scene(save_export(tmp_path, textured, moved))
