@@ -11,6 +11,7 @@ from gsmerge.stages.decode import decode_merged, keep_all
 from gsmerge.stages.encode import correct, encode, make_context
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import MergedViews, merge, refine
+from gsmerge.stages.pair_merge import merge_neighbors
 from gsmerge.stages.segment import segment_scene
 from gsmerge.types import Decoded
 
@@ -24,6 +25,9 @@ def build(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
 def start(prepared: Prepared, plan: Plan, count: int | None) -> Decoded:
     """Build the canonical Gaussians that the fit starts from."""
     scene, decode = prepared.scene, plan.decode
+    if prepared.judges is not None:  # without views there are no superpixels
+        count = plan.limits.default if count is None else count
+        return Decoded(merge_neighbors(scene.gaussians, count), count, exact=True)
     kept = keep_all(scene, count)
     return kept or decode_merged(merge_views(prepared, plan, count), scene, decode, grows=plan.fit.grows)
 

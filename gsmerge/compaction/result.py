@@ -96,7 +96,7 @@ class Candidate:
     fitted: Fitted  # Fitted canonical Gaussians
     gaussians: Gaussians  # The same in the world, with those that no view sees
     cameras: Cameras  # The given views as the Gaussians were made from them, in the world
-    psnr: float | None  # Mean PSNR (dB) of the scored views; None without photos
+    psnr: float | None  # Mean PSNR (dB) of the scored views, or of the views that judge; None without either
     record: Record  # Seconds, choices and notes of building and scoring it
 
 
@@ -109,10 +109,22 @@ def score(count: int | None, fitted: Fitted, prepared: Prepared, plan: Plan) -> 
     if cameras is not prepared.input_scene.cameras:
         _note_moves(prepared, cameras, plan)
         prepared = replace(prepared, input_scene=replace(prepared.input_scene, cameras=cameras))
+    if prepared.judges is not None:
+        psnr = _fidelity(fitted.gaussians, prepared.judges, plan)
+        choose(fidelity={"psnr": psnr, "views": len(prepared.judges)})
+        return Candidate(count, fitted, gaussians, cameras, psnr, current_record())
     psnr = measure_psnr("score", gaussians, prepared.result_views(), prepared, plan)
     if psnr is not None:
         choose(scored_views=len(plan.scored_views))
     return Candidate(count, fitted, gaussians, cameras, psnr, current_record())
+
+
+@stage("score")
+def _fidelity(gaussians: Gaussians, judges: Scene, plan: Plan) -> float:
+    """Measure the mean PSNR (dB) of canonical Gaussians against the pictures of the input that judge them."""
+    return run_on(
+        plan.backend, "scores", lambda backend: backend.photo_psnr(gaussians, scene_photos(judges), plan.scored_views)
+    )
 
 
 def _note_moves(prepared: Prepared, cameras: Cameras, plan: Plan) -> None:
@@ -161,8 +173,9 @@ def make_result(
 
     def report(candidate: Candidate, seconds: Mapping[str, float], name: str) -> CompactReport:
         counts, record = (prepared.input_scene.num_gaussians, len(candidate.gaussians)), candidate.record
+        shown = candidate.psnr if prepared.judges is None else None
         made = CompactReport(
-            *counts, dict(seconds), before, candidate.psnr, record.choices, record.notes, plan.settings, peak_memory()
+            *counts, dict(seconds), before, shown, record.choices, record.notes, plan.settings, peak_memory()
         )
         worse = describe_loss(name, before, candidate.psnr) if comparable else None
         return made if worse is None else replace(made, notes=[*made.notes, worse], worse=worse)

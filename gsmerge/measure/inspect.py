@@ -131,6 +131,7 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
     try:
         if files.cameras is not None:
             camera_file = read_scene_cameras(ply, files)
+            assert camera_file is not None, "a file has cameras, or is refused"
             facts |= {"num_views": len(camera_file), "camera_format": camera_file.source}
         load = align_scene(ply, files, camera_file, hints=hints)
     except SceneError as error:
@@ -143,7 +144,8 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
         if scene.images is not None:
             means = gaussians.means[stored & np.isfinite(gaussians.means).all(1)]
             num_sky_views = len(sky_regions(means, scene.cameras, scene.images))
-    facts |= {"notes": [*load.notes, *_photo_notes(scene)], "num_views": len(load.views.used)}
+    placed = [] if len(scene) else [NO_VIEWS]
+    facts |= {"notes": [*load.notes, *placed, *_photo_notes(scene)], "num_views": len(load.views.used)}
     facts |= {"camera_format": load.cameras and load.cameras.source}
     facts |= {"coverage": coverage(scene), "sight": sight and asdict(sight)}
     facts |= {"num_sky_views": num_sky_views, "compact": estimate(scene, CompactOptions())}
