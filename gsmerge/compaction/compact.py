@@ -57,10 +57,8 @@ def compact(
 def compact_piece(scene: Scene, options: CompactOptions) -> CompactResult:
     """Compact a scene in one piece."""
     method = choose_method(options, scene, build)  # ours, or a baseline
-    if stands_alone(scene, options):
-        prepared = prepare_alone(scene.numpy())
-    else:
-        prepared = prepare(scene.numpy(), options.prepare)  # facts: frame, photos, poses, unseen
+    alone = stands_alone(scene, options)  # facts: frame, photos, poses, unseen
+    prepared = prepare_alone(scene.numpy()) if alone else prepare(scene.numpy(), options.prepare)
     plan = make_plan(prepared, options)  # every "auto" is decided once; options end here
     search = search_count(prepared, plan)  # one count, or counts until a quality is met
     for count in search:

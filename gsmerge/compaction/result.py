@@ -110,9 +110,9 @@ def score(count: int | None, fitted: Fitted, prepared: Prepared, plan: Plan) -> 
         _note_moves(prepared, cameras, plan)
         prepared = replace(prepared, input_scene=replace(prepared.input_scene, cameras=cameras))
     if prepared.judges is not None:
-        psnr = _fidelity(fitted.gaussians, prepared.judges, plan)
-        choose(fidelity={"psnr": psnr, "views": len(prepared.judges)})
-        return Candidate(count, fitted, gaussians, cameras, psnr, current_record())
+        fidelity = _fidelity(fitted.gaussians, prepared.judges, plan)
+        choose(fidelity={"psnr": fidelity, "views": len(prepared.judges)})
+        return Candidate(count, fitted, gaussians, cameras, fidelity, current_record())
     psnr = measure_psnr("score", gaussians, prepared.result_views(), prepared, plan)
     if psnr is not None:
         choose(scored_views=len(plan.scored_views))

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import SceneError, UsageError
+from gsmerge.facts.place_cameras import add_views
 from gsmerge.facts.views import pick_views
 from gsmerge.io import file_notes, read_cameras, read_gaussians, to_cameras
 from gsmerge.io.cameras.camera_file import sizes_of
@@ -33,7 +34,7 @@ from gsmerge.measure.preview import (
 from gsmerge.raster import render_in_turn
 from gsmerge.raster.photos import NEAR, scene_pictures
 from gsmerge.report import document_head
-from gsmerge.runtime.record import Progress
+from gsmerge.runtime.record import Progress, record_run
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import SceneFiles, find_scene_files

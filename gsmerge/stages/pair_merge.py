@@ -1,12 +1,12 @@
 """Gaussians -> fewer Gaussians by their positions and colours alone: for scenes of which no view is known.
 
-Cells of a k-d tree are merged pair by pair, the cheapest pairs of all cells first, in rounds whose cells differ. Masses,
-opacity times the area of the ellipse of the two largest scales, add up, so a surface stays as opaque as it was.
+Cells of a k-d tree are merged pair by pair, the cheapest pairs of all cells first, in rounds whose cells differ. Masses
+add up, opacity times the area of the ellipse of the two largest scales, so a surface stays as opaque as it was.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from gsmerge.types import Gaussians, to_float32
 
 LEFT = 0.25  # share of the Gaussians that a round leaves, at least
 LEAST_LEFT = 0.2  # the same in each cell: longer chains of merges end in haze
-# Constants chosen on training scenes (docs/laboratory/bare-files.md)
+# Chosen on training scenes by the PSNR of views from cameras at random (docs/laboratory/notebook.md#bare-files)
 COLOR_WEIGHT = 3.0  # of squared distances of harmonics of degree 0 against nats
 MASS_POWER = 0.7  # of the cost
 FLATNESS = 0.01  # least scale over the largest, so that the logarithm of the volume stays finite
