@@ -210,9 +210,10 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
 
     Returns:
         ``num_gaussians``: the most that the result can have; ``ratio`` to the input, ``bytes`` as a ``.ply``;
-        ``blocks``, ``method``, ``superpixels_per_view`` (None where a budget distributes them, 0 where no view
-        is known), ``k``, ``match``, ``checkpoint``, ``fit`` and ``fit_steps`` as they are used; ``seconds`` and ``memory_bytes``, to two digits and
-        right within a factor of about two; ``memory_problem``, None where this machine has enough.
+        ``blocks``, ``method``, ``superpixels_per_view`` (None where a budget distributes them, 0 where no view is
+        known), ``k``, ``match``, ``checkpoint``, ``fit`` and ``fit_steps`` as they are used; ``seconds`` and
+        ``memory_bytes``, to two digits and right within a factor of about two; ``memory_problem``, None where this
+        machine has enough.
     """
     size = measure_size(scene)
     whole = plan_whole(size, options)

@@ -92,12 +92,11 @@ def _merge_round(cloud: _Cloud, count: int) -> _Cloud:
 
 def _divide(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Divide means ``[n,3]`` into cells of neighbours: their order ``[n]`` and where each cell starts ``[c+1]``."""
-    count, depth = len(means), 0
+    count = len(means)
     starts = np.array([0, count])
     while (starts[1:] - starts[:-1]).max() > CELL:  # as the tree halves its runs
         starts = np.sort(np.concatenate([starts, (starts[1:] + starts[:-1]) // 2]))
-        depth += 1
-    nodes = 1 << max(0, int(np.ceil(np.log2(max(1, count / LEAF)))) + 2)
+    nodes = 4 << (count // LEAF).bit_length()
     order = np.arange(count)
     build_tree(means, order, np.zeros(nodes, np.int8), np.zeros(nodes))
     return order, starts
