@@ -92,11 +92,11 @@ def place_cameras(
     looking everywhere. They are taken one by one, each time the one that shows most opacity which
     none has shown so far, in pictures of a sample of the Gaussians. There are at most
     ``num_views``, of square images that are larger for more Gaussians, at most ``largest`` pixels
-    per side; only every ``step``-th candidate is tried. Raises ValueError if there is no Gaussian.
+    per side; only every ``step``-th candidate is tried, on a smaller sample. Raises ValueError if there is no Gaussian.
     """
     if len(gaussians) == 0:
         raise ValueError("expected at least one Gaussian, got none")
-    sample = sampled(gaussians)
+    sample = sampled(gaussians, SAMPLES // step)
     centre, half = _extent(sample.means.astype(np.float64))
     viewmats = _candidates(centre, half)[::step]
     shares = _shares_seen(sample, viewmats, CLEAR * float(np.sqrt((half * half).sum())))

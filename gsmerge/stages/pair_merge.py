@@ -49,7 +49,8 @@ class _Cloud:
 
 @stage("reduce")
 def merge_neighbors(gaussians: Gaussians, count: int) -> Gaussians:
-    """Merge finite Gaussians of any frame into ``count``; return all if there are no more. None is dropped."""
+    """Merge finite Gaussians of any frame into ``count``, at least one; none is dropped. All if there are no more."""
+    count = max(1, count)
     if len(gaussians) <= count:
         return gaussians
     cloud = _cloud_of(gaussians)

@@ -96,6 +96,26 @@ def test_counts_are_judged_by_views_that_nothing_was_fitted_to(bare: Path, tmp_p
     assert points[0]["psnr"] < points[-1]["psnr"]
 
 
+def test_settings_of_stages_that_are_left_out_are_named(bare: Path, tmp_path: Path, run: Any) -> None:
+    words = (
+        "--set",
+        "fit_steps=50",
+        "--set",
+        "unseen=keep",
+        "--levels",
+        "3",
+        "--set",
+        "drop_floaters=true",
+        "--k",
+        "2",
+    )
+    report = report_of(run, "compact", bare, "-o", tmp_path / "a.ply", *words)
+    assert noted(report["notes"], "not used", "fit_steps", "unseen")
+    assert not noted(report["notes"], "not used", "k")
+    assert len(report["levels"]) == 2
+    assert all(level["choices"]["fidelity"]["psnr"] > 5 for level in report["levels"])
+
+
 def test_photos_without_cameras(bare: Path, small_scene: Path, tmp_path: Path, run: Any) -> None:
     photos = small_scene / "images"
     refused = run("compact", bare, "--images", photos, "-o", tmp_path / "a.ply", code=3).err
