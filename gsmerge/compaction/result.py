@@ -31,7 +31,8 @@ class CompactReport:
         psnr_before: Mean PSNR (dB) of the input views rendered from the input, of many views some, and in a fixed
             quarter of each unless a quality was asked for; None without photos. :func:`gsmerge.evaluate` is exact.
         psnr_after: The same from the result.
-        choices: Decisions of the stages (count, curve, merge, scores, clusters, fit).
+        choices: Decisions of the stages (count, curve, merge, scores, clusters, fit); `fidelity` is the PSNR (dB) against
+            the input from so many held-out views, of a scene without cameras.
         notes: Warnings about the input and adaptations to it, one sentence each.
         options: All settings by flat name.
         peak_memory_bytes: Largest resident memory of the process so far.

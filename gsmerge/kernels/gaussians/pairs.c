@@ -179,7 +179,7 @@ API int32_t merge_pairs(const int32_t *restrict pairs, double *restrict means,
   return 0;
 }
 
-// Square of a matrix given by its columns' lengths and a quaternion of any length.
+// Covariances, and masses: opacity times the two largest scales.
 API void gaussian_moments(const float *restrict quats, const float *restrict scales,
                           const float *restrict opacities, double flatness, float *restrict covars,
                           float *restrict masses, int64_t n) {
