@@ -18,6 +18,9 @@ from gsmerge.types import Decoded
 
 def build(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
     """Build and fit ``count`` canonical Gaussians; None: as many as ``superpixels`` and K give."""
+    if prepared.alone:  # no view to cut into superpixels, and no photo to fit to
+        scene, most = prepared.scene, plan.limits.default if count is None else count
+        return Fitted(merge_neighbors(scene.gaussians, most), scene.cameras, None)
     decoded = start(prepared, plan, count)
     return fit_scene(decoded, prepared.scene, prepared.photo_views, plan.fit, plan.seed, plan.backend)
 
@@ -25,9 +28,6 @@ def build(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
 def start(prepared: Prepared, plan: Plan, count: int | None) -> Decoded:
     """Build the canonical Gaussians that the fit starts from."""
     scene, decode = prepared.scene, plan.decode
-    if prepared.judges is not None:  # without views there are no superpixels
-        count = plan.limits.default if count is None else count
-        return Decoded(merge_neighbors(scene.gaussians, count), count, exact=True)
     kept = keep_all(scene, count)
     return kept or decode_merged(merge_views(prepared, plan, count), scene, decode, grows=plan.fit.grows)
 

@@ -115,7 +115,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
     ``checkpoint``: networks to use instead of those that the options name.
     """
     input_scene, scene, effort = prepared.input_scene, prepared.scene, EFFORTS[options.effort]
-    alone = prepared.judges is not None
+    alone = prepared.alone
     _check_photos(input_scene, options, judged=alone)
     cuts = options.method == OURS and not alone  # views into superpixels
     with stage("prepare"):
@@ -127,7 +127,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         if clean_options.drop_sky and not prepared.photo_views:
             note("drop_sky: no photo is used that could say where the sky is, so it stays")
             clean_options = replace(clean_options, drop_sky=False)
-        size = measure_size(scene, photos=has_photos)
+        size = measure_size(input_scene if alone else scene, photos=has_photos)
         decode = resolve_decode(options, size)
         if decode.k != options.decode.k and decode.max_k > USUAL_K:
             note(f"k: {decode.k}, because one camera shows the scene, and no long fit follows")
@@ -401,8 +401,8 @@ def _fit_photos(prepared: Prepared, options: CompactOptions, fit: FitOptions, ba
 
 def _choose_scored_views(prepared: Prepared, options: CompactOptions) -> tuple[int, ...]:
     """Choose views, whose photos show the scene, for scoring; more where they decide a quality search."""
-    if prepared.judges is not None:
-        return tuple(range(len(prepared.judges)))
+    if prepared.alone:
+        return tuple(range(len(prepared.scene)))
     views = prepared.photo_views or range(len(prepared.scene))
     candidates = [view for view, place in enumerate(prepared.repeated) if place in views]
     choose_some = report_views if options.budget.target_psnr is None else scored_views

@@ -61,6 +61,7 @@ def report_document(
 
     Returns:
         ``schema_version`` 1, within which keys are only ever added. ``unmet``: why a target is not met, or null.
+        ``psnr_covered``: ``share``, ``before``, ``after`` over the pixels that the input covers, where it lacks some.
         ``worse``: that the result, or the first level that does, shows the photos worse than the input, or null.
     """
     numbers, at = asdict(report), written_at or {}
@@ -78,6 +79,7 @@ def report_document(
             {
                 **_file_facts(path, level, at),
                 "psnr_input_views": level.psnr_after,
+                "psnr_covered": level.covered and asdict(level.covered),
                 "seconds": round(sum(level.seconds.values()), 4),
                 "choices": level.choices,
                 "notes": level.notes,
@@ -91,6 +93,7 @@ def report_document(
         "choices": numbers["choices"],
         **seconds_document({**seconds_before, **report.seconds, **seconds_after}),
         "psnr_input_views": {"before": numbers["psnr_before"], "after": numbers["psnr_after"]},
+        "psnr_covered": numbers["covered"],
         "peak_memory_bytes": numbers["peak_memory_bytes"],
         "notes": [*notes, *numbers["notes"]],
         "unmet": numbers["unmet"],
@@ -157,6 +160,9 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None) -> l
     if psnr["before"] is not None and psnr["after"] is not None:
         views = f"in {document['choices']['scored_views']} of the input views"
         rows += [("PSNR", f"{psnr['before']:.2f} dB", f"{psnr['after']:.2f} dB", views)]
+    if covered := document["psnr_covered"]:
+        share = f"on the {100 * covered['share']:.0f} % that the input covers"
+        rows += [("", f"{covered['before']:.2f} dB", f"{covered['after']:.2f} dB", share)]
     judged = document["choices"].get("fidelity")
     if judged:
         rows += [("PSNR", "", f"{judged['psnr']:.2f} dB", _judged_by(judged))]
@@ -211,6 +217,9 @@ def summary_line(document: Mapping[str, Any]) -> str:
         if judged
         else ""
     )
+    if covered := document["psnr_covered"]:
+        share = f"on the {100 * covered['share']:.0f} % of their pixels that the input covers"
+        quality += f", {covered['before']:.2f} -> {covered['after']:.2f} dB {share}"
     return (
         f"{after['path']}: {before['num_gaussians']:,} -> {after['num_gaussians']:,} Gaussians"
         f" ({100 * document['ratio']:.2f} %), {human_bytes(before['bytes'])} -> {human_bytes(after['bytes'])}"

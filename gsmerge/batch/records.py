@@ -20,7 +20,8 @@ DONE, FAILED, SKIPPED = "done", "failed", "skipped"  # of records
 BUSY, STUCK = "busy", "stuck"
 COLUMNS = (
     "scene", "output", "status", "num_input", "num_output", "ratio", "bytes_input", "bytes_output", "psnr_before",
-    "psnr_after", "seconds", "peak_memory_bytes", "attempt", "unmet", "worse", "error",
+    "psnr_after", "covered_share", "psnr_covered_before", "psnr_covered_after", "seconds", "peak_memory_bytes",
+    "attempt", "unmet", "worse", "error",
 )  # fmt: skip
 T = TypeVar("T")
 MAX_LISTED = 20  # scenes in the table, and failures below it
@@ -100,7 +101,10 @@ def row_of(record: Mapping[str, Any]) -> dict[str, Any]:
     report = record.get("report")
     if not report:
         return row
-    psnr = report["psnr_input_views"]
+    psnr, covered = (
+        report["psnr_input_views"],
+        report.get("psnr_covered") or {},
+    )  # which records of former versions lack
     files = [*report["levels"], report["output"]]
     return row | {
         "num_input": report["input"]["num_gaussians"],
@@ -110,6 +114,9 @@ def row_of(record: Mapping[str, Any]) -> dict[str, Any]:
         "bytes_output": sum(file["bytes"] for file in files),
         "psnr_before": psnr["before"],
         "psnr_after": psnr["after"],
+        "covered_share": covered.get("share"),
+        "psnr_covered_before": covered.get("before"),
+        "psnr_covered_after": covered.get("after"),
         "seconds": report["total_seconds"],
         "peak_memory_bytes": report["peak_memory_bytes"],
         "unmet": report["unmet"],

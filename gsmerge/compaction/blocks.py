@@ -4,13 +4,20 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import astuple, dataclass, fields, replace
 from typing import Any, TypeVar
 
 import numpy as np
 
 from gsmerge.alignment.registration.join import concat_scenes
-from gsmerge.compaction.result import CompactReport, CompactResult, measure_psnr
+from gsmerge.compaction.result import (
+    CompactReport,
+    CompactResult,
+    Covered,
+    measure_covered,
+    measure_input,
+    measure_psnr,
+)
 from gsmerge.facts.partition import (
     Block,
     Covisibility,
@@ -28,7 +35,7 @@ from gsmerge.plan import Plan, WholePlan, make_plan
 from gsmerge.raster import contributions, plan_view
 from gsmerge.raster import prepare as prepare_splats
 from gsmerge.raster.metrics import describe_loss
-from gsmerge.raster.photos import Photos, blank_photos
+from gsmerge.raster.photos import Photos, PhotoScore, blank_photos
 from gsmerge.runtime.estimate import memory_bytes
 from gsmerge.runtime.memory import free_pages, peak_memory
 from gsmerge.runtime.record import Record, add_seconds, choose, current_record, note, record_part, stage
@@ -92,13 +99,13 @@ def compact_in_blocks(scene: Scene, options: CompactOptions, whole: WholePlan) -
             result = faintest_dropped(result, most)
         everything = work.share(result)
         views = ((part, everything) for part in parts)
-        scores = [psnr for psnr, _ in adopt_records(work.run("score", score_part, count, views))]
+        scores = [score for score, _ in adopt_records(work.run("score", score_part, count, views))]
     facts = [
         {
             "views": len(part.block.own), "shared_views": len(part.block.shared), "num_start": len(part.gaussians),
-            "psnr_input_views": score, "fit": choices.get("fit"),
+            "psnr_input_views": psnr, "fit": choices.get("fit"),
         }
-        for part, (_, choices), score in zip(parts, fitted, scores, strict=True)
+        for part, (_, choices), (psnr, _) in zip(parts, fitted, scores, strict=True)
     ]  # fmt: skip
     choose(blocks=facts)
     return CompactResult(result, join_reports(scene, result, parts, scores, options), scene.cameras).to(device)
@@ -122,7 +129,7 @@ class Part:
     count: int  # Gaussians that it is to have in the end
     prepared: Prepared  # its views, without the Gaussians of their pixels
     plan: Plan
-    psnr_before: float | None  # of the scored views
+    before: PhotoScore | None  # of the input on the scored views
 
 
 def start_part(piece: Scene, block: Block, covisibility: Covisibility, options: CompactOptions, frame: Frame) -> Part:
@@ -131,7 +138,7 @@ def start_part(piece: Scene, block: Block, covisibility: Covisibility, options: 
     plan = make_plan(prepared, options)
     decoded = start(prepared, plan, plan.limits.count)
     keep = belongs_to_block(frame.leave(decoded.gaussians).means, block, covisibility)
-    before = measure_psnr("input", prepared.input_scene.file_gaussians, prepared.input_scene, prepared, plan)
+    before = measure_input(prepared, plan)
     share = keep.sum() / max(1, len(keep))
     return Part(block, decoded.gaussians[keep], round(share * decoded.count), without_gaussians(prepared), plan, before)
 
@@ -164,9 +171,10 @@ def fit_part(part: Part, everything: tuple[Gaussians, np.ndarray], number: int, 
     return fitted.gaussians[owners[rows[fitted.report.origins]] == number]
 
 
-def score_part(part: Part, gaussians: Gaussians) -> float | None:
-    """Measure the PSNR (dB) of the whole result on a block's scored photos; None without photos."""
-    return measure_psnr("score", gaussians, part.prepared.result_views(), part.prepared, part.plan)
+def score_part(part: Part, gaussians: Gaussians) -> tuple[float | None, Covered | None]:
+    """Measure the PSNR (dB) of the whole result on a block's scored photos, and where the input covers them."""
+    psnr = measure_psnr("score", gaussians, part.prepared.result_views(), part.prepared, part.plan)
+    return psnr, measure_covered(part.before, gaussians, part.prepared, part.plan)
 
 
 def fit_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[Part], seed: int) -> Gaussians:
@@ -280,7 +288,11 @@ def belongs_to_block(means: np.ndarray, block: Block, covisibility: Covisibility
 
 
 def join_reports(
-    scene: Scene, gaussians: Gaussians, parts: Sequence[Part], scores: Sequence[float | None], options: CompactOptions
+    scene: Scene,
+    gaussians: Gaussians,
+    parts: Sequence[Part],
+    scores: Sequence[tuple[float | None, Covered | None]],
+    options: CompactOptions,
 ) -> CompactReport:
     """Report the whole scene: PSNR as the mean over blocks weighted by views, sums of seconds, all notes."""
     run, sizes = current_record(), [len(part.block.own) for part in parts]
@@ -289,13 +301,33 @@ def join_reports(
         numbers = [value for value in values if value is not None]
         return None if len(numbers) < len(values) else float(np.average(numbers, weights=sizes))
 
-    scored = sum(len(part.plan.scored_views) for part, score in zip(parts, scores, strict=True) if score is not None)
-    before, after = mean([part.psnr_before for part in parts]), mean(scores)
-    worse = describe_loss("the result", before, after)
+    scored = sum(len(part.plan.scored_views) for part, (psnr, _) in zip(parts, scores, strict=True) if psnr is not None)
+    before, after = (
+        mean([None if part.before is None else part.before.psnr for part in parts]),
+        mean([psnr for psnr, _ in scores]),
+    )
+    covered = _join_covered(parts, scores, sizes)
+    worse = describe_loss("the result", *((covered.before, covered.after) if covered else (before, after)))
     notes = list(dict.fromkeys(run.notes))
     return CompactReport(
         num_input=scene.num_gaussians, num_output=len(gaussians), seconds=dict(run.seconds), psnr_before=before,
-        psnr_after=after, choices=run.choices | {"scored_views": scored},
+        psnr_after=after, covered=covered, choices=run.choices | {"scored_views": scored},
         notes=notes if worse is None else [*notes, worse], options=options.to_dict(),
         peak_memory_bytes=peak_memory(), worse=worse,
     )  # fmt: skip
+
+
+def _join_covered(
+    parts: Sequence[Part], scores: Sequence[tuple[float | None, Covered | None]], sizes: Sequence[int]
+) -> Covered | None:
+    """Average over blocks what their inputs cover; a block that is covered as a whole counts with all its pixels."""
+    if all(covered is None for _, covered in scores):
+        return None
+    each = [
+        covered or Covered(1.0, part.before.psnr, psnr)
+        for part, (psnr, covered) in zip(parts, scores, strict=True)
+        if part.before is not None and psnr is not None
+    ]
+    if len(each) < len(sizes):
+        return None
+    return Covered(*np.average([astuple(covered) for covered in each], axis=0, weights=sizes).tolist())

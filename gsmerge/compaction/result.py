@@ -2,22 +2,41 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from gsmerge.facts.prepare import Prepared, scene_depth
 from gsmerge.fit import FitBackend, Fitted, run_on
 from gsmerge.io.cameras.camera_file import describe_moves, list_moves
 from gsmerge.plan import Plan
 from gsmerge.raster.metrics import describe_loss
-from gsmerge.raster.photos import NEAR, scene_photos
+from gsmerge.raster.photos import NEAR, WHOLE, PhotoScore, scene_photos
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.record import Record, choose, current_record, note, stage
 from gsmerge.types import Cameras, Gaussians, Scene
 
 if TYPE_CHECKING:
     import torch
+
+
+@dataclass(frozen=True)
+class Covered:
+    """PSNR where the input covers the input views, which lacks some of their pixels.
+
+    Args:
+        share: Share of the scored pixels that the input covers: those that have a row of the file or, where pixels are
+            not known, in which it is opaque by half.
+        before: Mean PSNR (dB) of these pixels rendered from the input.
+        after: The same from the result.
+    """
+
+    share: float
+    before: float
+    after: float
 
 
 @dataclass(frozen=True)
@@ -31,14 +50,16 @@ class CompactReport:
         psnr_before: Mean PSNR (dB) of the input views rendered from the input, of many views some, and in a fixed
             quarter of each unless a quality was asked for; None without photos. :func:`gsmerge.evaluate` is exact.
         psnr_after: The same from the result.
-        choices: Decisions of the stages (count, curve, merge, scores, clusters, fit); `fidelity` is the PSNR (dB) against
-            the input from so many held-out views, of a scene without cameras.
+        choices: Decisions of the stages (count, curve, merge, scores, clusters, fit). Of a scene without cameras,
+            ``fidelity`` is the PSNR (dB) against the input from so many held-out ``views``.
         notes: Warnings about the input and adaptations to it, one sentence each.
         options: All settings by flat name.
         peak_memory_bytes: Largest resident memory of the process so far.
         unmet: Why a target that was asked for is not met, and how far the result got; None if it is.
         worse: That the result shows the scene's own photos by more than .5 dB worse than the input does, a sentence
             that is among the notes, too; None where it does not, or photos cannot say it: none, odd ones, or a crop.
+        covered: PSNR over the pixels that the input covers, where it lacks more than 2 % of them; None where it does
+            not.
 
     Example:
         >>> report = gsmerge.compact("demo", effort="draft", budget=300).report
@@ -57,6 +78,7 @@ class CompactReport:
     peak_memory_bytes: int
     unmet: str | None = None
     worse: str | None = None
+    covered: Covered | None = None
 
 
 @dataclass(frozen=True)
@@ -103,18 +125,17 @@ class Candidate:
 
 def score(count: int | None, fitted: Fitted, prepared: Prepared, plan: Plan) -> Candidate:
     """Move canonical Gaussians into the world, add Gaussians that no view sees, and measure the PSNR on the photos."""
-    gaussians, prepared = fitted.gaussians, prepared.with_cameras(fitted.cameras)
+    gaussians, moved = fitted.gaussians, _move_views(prepared, fitted.cameras)
     if plan.unseen is not None:
         gaussians = Gaussians.concat([gaussians, plan.unseen])
-    gaussians, cameras = prepared.frame.leave(gaussians), prepared.final_cameras()
+    gaussians, cameras = moved.frame.leave(gaussians), moved.input_scene.cameras
     if cameras is not prepared.input_scene.cameras:
         _note_moves(prepared, cameras, plan)
-        prepared = replace(prepared, input_scene=replace(prepared.input_scene, cameras=cameras))
-    if prepared.judges is not None:
-        fidelity = _fidelity(fitted.gaussians, prepared.judges, plan)
-        choose(fidelity={"psnr": fidelity, "views": len(prepared.judges)})
+    if prepared.alone:
+        fidelity = _fidelity(fitted.gaussians, prepared.scene, plan)
+        choose(fidelity={"psnr": fidelity, "views": len(prepared.scene)})
         return Candidate(count, fitted, gaussians, cameras, fidelity, current_record())
-    psnr = measure_psnr("score", gaussians, prepared.result_views(), prepared, plan)
+    psnr = measure_psnr("score", gaussians, moved.result_views(), moved, plan)
     if psnr is not None:
         choose(scored_views=len(plan.scored_views))
     return Candidate(count, fitted, gaussians, cameras, psnr, current_record())
@@ -123,9 +144,20 @@ def score(count: int | None, fitted: Fitted, prepared: Prepared, plan: Plan) -> 
 @stage("score")
 def _fidelity(gaussians: Gaussians, judges: Scene, plan: Plan) -> float:
     """Measure the mean PSNR (dB) of canonical Gaussians against the pictures of the input that judge them."""
-    return run_on(
-        plan.backend, "scores", lambda backend: backend.photo_psnr(gaussians, scene_photos(judges), plan.scored_views)
-    )
+
+    def score_on(backend: FitBackend) -> PhotoScore:
+        return backend.score_photos(gaussians, scene_photos(judges), plan.scored_views)
+
+    return run_on(plan.backend, "scores", score_on).psnr
+
+
+def _move_views(prepared: Prepared, cameras: Cameras) -> Prepared:
+    """Move the input views to the canonical ``cameras`` of a fit; themselves where it moved none."""
+    prepared = prepared.with_cameras(cameras)
+    final = prepared.final_cameras()
+    if final is prepared.input_scene.cameras:
+        return prepared
+    return replace(prepared, input_scene=replace(prepared.input_scene, cameras=final))
 
 
 def _note_moves(prepared: Prepared, cameras: Cameras, plan: Plan) -> None:
@@ -140,7 +172,20 @@ def _note_moves(prepared: Prepared, cameras: Cameras, plan: Plan) -> None:
 
 
 def measure_psnr(name: str, gaussians: Gaussians, views: Scene, prepared: Prepared, plan: Plan) -> float | None:
-    """Measure the mean PSNR (dB) of Gaussians on the scored photos; None where no photo shows the scene.
+    """Measure the mean PSNR (dB) of Gaussians on the scored photos; see :func:`measure_score`."""
+    measured = measure_score(name, gaussians, views, prepared, plan)
+    return None if measured is None else measured.psnr
+
+
+def measure_score(
+    name: str,
+    gaussians: Gaussians,
+    views: Scene,
+    prepared: Prepared,
+    plan: Plan,
+    covered: Sequence[np.ndarray] | None = None,
+) -> PhotoScore | None:
+    """Score Gaussians on the scored photos, and over ``covered`` pixels of each; None where no photo shows the scene.
 
     Only a quarter of each photo is scored unless a quality was asked for. ``name``: of the stage in the record.
     """
@@ -149,10 +194,26 @@ def measure_psnr(name: str, gaussians: Gaussians, views: Scene, prepared: Prepar
     with stage(name):
         photos, near, quarter = scene_photos(views), NEAR * prepared.frame.unit, plan.target_psnr is None
 
-        def score_on(backend: FitBackend) -> float:
-            return backend.photo_psnr(gaussians, photos, plan.scored_views, quarter=quarter, near=near)
+        def score_on(backend: FitBackend) -> PhotoScore:
+            settings = {"quarter": quarter, "near": near, "covered": covered}
+            return backend.score_photos(gaussians, photos, plan.scored_views, **settings)
 
         return run_on(plan.backend, "scores", score_on)
+
+
+def measure_input(prepared: Prepared, plan: Plan) -> PhotoScore | None:
+    """Score the input's own Gaussians; they cover the pixels that have a row where those are known."""
+    scene = prepared.input_scene
+    covered = None if scene.missing is None else list(scene.stored[list(plan.scored_views)])
+    return measure_score("input", scene.file_gaussians, scene, prepared, plan, covered)
+
+
+def measure_covered(before: PhotoScore | None, gaussians: Gaussians, prepared: Prepared, plan: Plan) -> Covered | None:
+    """Score a result where the input, whose score is ``before``, covers the views; None where it covers them all."""
+    if before is None or before.share >= WHOLE or not math.isfinite(before.covered_psnr):
+        return None
+    after = measure_score("score", gaussians, prepared.result_views(), prepared, plan, before.covered)
+    return None if after is None else Covered(before.share, before.covered_psnr, after.covered_psnr)
 
 
 def make_result(
@@ -169,27 +230,38 @@ def make_result(
     current record, which come before those of the candidates, enter the report.
     """
     run, seconds = current_record(), search["seconds"]
-    before = measure_psnr("input", prepared.input_scene.file_gaussians, prepared.input_scene, prepared, plan)
+    input_score = measure_input(prepared, plan)
+    before = None if input_score is None else input_score.psnr
     comparable = prepared.photo_views and not plan.clean.hides  # or photos show something else
+    covered = [
+        measure_covered(input_score, candidate.gaussians, _move_views(prepared, candidate.fitted.cameras), plan)
+        for candidate in (best, *levels)
+    ]
 
-    def report(candidate: Candidate, seconds: Mapping[str, float], name: str) -> CompactReport:
+    def report(candidate: Candidate, covered: Covered | None, seconds: Mapping[str, float], name: str) -> CompactReport:
         counts, record = (prepared.input_scene.num_gaussians, len(candidate.gaussians)), candidate.record
-        shown = candidate.psnr if prepared.judges is None else None
+        shown = None if prepared.alone else candidate.psnr
         made = CompactReport(
-            *counts, dict(seconds), before, shown, record.choices, record.notes, plan.settings, peak_memory()
-        )
-        worse = describe_loss(name, before, candidate.psnr) if comparable else None
+            *counts, dict(seconds), before, shown, record.choices, record.notes, plan.settings, peak_memory(),
+            covered=covered,
+        )  # fmt: skip
+        compared = (covered.before, covered.after) if covered else (before, shown)
+        worse = describe_loss(name, *compared) if comparable else None
         return made if worse is None else replace(made, notes=[*made.notes, worse], worse=worse)
 
     names = {**run.seconds, **seconds}
     seconds = {name: run.seconds.get(name, 0.0) + seconds.get(name, 0.0) for name in names}
     if "input" in seconds:
         seconds["input"] = seconds.pop("input")  # the last stage, after those of the candidates
-    main = report(best, seconds, "the result")
+    main = report(best, covered[0], seconds, "the result")
     choices, notes = run.choices | main.choices | search["choices"], [*run.notes, *main.notes]
     main = replace(main, choices=choices, notes=notes, unmet=search["unmet"])
     coarser = tuple(
-        CompactResult(candidate.gaussians, report(candidate, candidate.record.seconds, f"level {i}"), candidate.cameras)
+        CompactResult(
+            candidate.gaussians,
+            report(candidate, covered[i], candidate.record.seconds, f"level {i}"),
+            candidate.cameras,
+        )
         for i, candidate in enumerate(levels, 1)
     )
     return CompactResult(best.gaussians, main, best.cameras, coarser)

@@ -119,8 +119,11 @@ class Prepared:
     repeated: tuple[int, ...]  # Place in the scene of every given view
     moved: bool  # Whether views were moved to where their photos agree, before a fit or by it
     unseen: Gaussians | None  # Canonical Gaussians that no view sees, if kept
-    # Canonical pictures of the input by which results are judged where no view is known; the scene has none then
-    judges: Scene | None = None
+
+    @property
+    def alone(self) -> bool:
+        """Whether no view is known, and those of the canonical scene only judge results."""
+        return not self.photo_views and len(self.input_scene) == 0
 
     def with_cameras(self, cameras: Cameras) -> Prepared:
         """Return a copy with the canonical cameras that a fit has moved."""
@@ -168,16 +171,15 @@ def prepare(scene: Scene, options: PrepareOptions | None = None, frame: Frame | 
 
 @stage("prepare")
 def prepare_alone(scene: Scene) -> Prepared:
-    """Bring a scene without views into its canonical frame, with pictures of it from cameras that judge results.
+    """Bring a scene without views into its canonical frame, and add pictures of it by which results are judged.
 
     Nothing is fitted to these pictures: a fit to renders of the input shows other views worse. Raises ValueError if
     there is no finite Gaussian.
     """
     finite = keep_finite(scene)
     note(NO_VIEWS)
-    judges, frame = canonicalise(add_judges(finite))
-    pictured, bare = draw_pictures(judges), replace(finite, gaussians=judges.gaussians)
-    return Prepared(scene, bare, frame, (), (), moved=False, unseen=None, judges=pictured)
+    judged, frame = canonicalise(add_judges(finite))
+    return Prepared(scene, draw_pictures(judged), frame, photo_views=(), repeated=(), moved=False, unseen=None)
 
 
 def photos_count_as_they_are(scene: Scene) -> bool:

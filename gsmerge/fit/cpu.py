@@ -24,7 +24,7 @@ from gsmerge.kernels.raster.blend import MAX_ALPHA
 from gsmerge.raster import composite, plan_view, splat_adjoint
 from gsmerge.raster.composite import blend, view_colors
 from gsmerge.raster.gradient import Gradients, gradients_of
-from gsmerge.raster.photos import Photos, photo_errors, photo_psnr, render_photos
+from gsmerge.raster.photos import Photos, photo_errors, render_photos, score_photos
 from gsmerge.runtime.threads import in_turn, parallel_map
 from gsmerge.settings.fit import Tuning
 from gsmerge.types import Gaussians
@@ -143,7 +143,7 @@ class _CpuEngine:
         return float(np.mean(photo_errors(gaussians, photos, score)))
 
 
-ON_CPU = FitBackend("cpu", lambda plan: _CpuEngine(plan, plan.job.photos), photo_psnr)
+ON_CPU = FitBackend("cpu", lambda plan: _CpuEngine(plan, plan.job.photos), score_photos)
 
 
 @dataclass(eq=False)

@@ -12,6 +12,7 @@ from gsmerge.fit.fit_state import State
 from gsmerge.fit.report import FitResult
 from gsmerge.fit.schedule import FitPlan, Step
 from gsmerge.fit.survey import Survey
+from gsmerge.raster.photos import PhotoScore
 from gsmerge.types import Array, Gaussians
 
 
@@ -70,5 +71,5 @@ class FitBackend:
 
     device: str  # "cpu" or "cuda"
     make_engine: Callable[[FitPlan], Engine]
-    photo_psnr: Callable[..., float]  # see gsmerge.raster.photos.photo_psnr
+    score_photos: Callable[..., PhotoScore]  # see gsmerge.raster.photos.score_photos
     memory_errors: tuple[type[Exception], ...] = ()  # of a device whose memory does not suffice

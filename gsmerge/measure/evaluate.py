@@ -19,7 +19,7 @@ from gsmerge.measure.sizes import resize_mask, resize_photo, shrink_cameras, shr
 from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.raster import prepare, render
 from gsmerge.raster.metrics import describe_loss, psnr, ssim
-from gsmerge.raster.photos import NEAR
+from gsmerge.raster.photos import COVERED, NEAR, WHOLE
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.evaluate import EvaluateOptions
 from gsmerge.types import Cameras, Gaussians, Scene, Views, as_array
@@ -57,6 +57,10 @@ class ViewScore:
     visible: float  # share of the pixels that the input views have seen
     full: Quality  # over all pixels
     masked: Quality  # over those that the input views have seen (supplement A)
+    # Share of the pixels that the input covers, which has a row of them or is opaque by half there, and PSNR and SSIM
+    # over these; None where the input was not measured.
+    covered_share: float | None = None
+    covered: Quality = Quality()
     # By pixels per side in units of the photo's, where other sizes than 1 were asked for: scores without LPIPS over all
     # pixels, and over those of which the input views have seen every part.
     zooms: Mapping[float, Pair] = field(default_factory=dict)
@@ -89,6 +93,12 @@ class ResultScores:
         if align is not None:
             pairs = [score.aligned[align] for score in views if align in score.aligned]
         return _mean([full for full, _ in pairs]), _mean([masked for _, masked in pairs])
+
+    def mean_covered(self, split: str) -> tuple[float | None, Quality]:
+        """Average, over the views of a split, the share of pixels that the input covers and the scores over these."""
+        views = [score for score in self.scores if score.split == split]
+        shares = [score.covered_share for score in views if score.covered_share is not None]
+        return float(np.mean(shares)) if shares else None, _mean([score.covered for score in views])
 
     def mean_pose_change(self, split: str) -> PoseChange | None:
         """Average the cameras' moves over the views of a split; None if no camera was aligned."""
@@ -129,7 +139,12 @@ class _Split:
 
     views: Views
     visible: NDArray[np.bool_]  # [v,h,w] pixels that the input views have seen
+    covered: NDArray[np.bool_] | None  # [v,h,w] pixels that the input covers; None until its renders show them
     drawn: Gaussians | None  # the input, whose renders stand in for photos; None where there are photos
+
+    def with_covered(self, masks: NDArray[np.bool_]) -> _Split:
+        """Fill in the pixels ``[v,h,w]`` that the input covers, if they are not known."""
+        return self if self.covered is not None else replace(self, covered=masks)
 
     def under(self, cameras: Cameras | None) -> _Split:
         """Move the views to a result's own cameras; renders of the input are shown from the given cameras."""
@@ -145,10 +160,17 @@ class _Renderer:
     centre: np.ndarray  # [3] the scene's middle in the world
     options: EvaluateOptions
 
-    def image(self, gaussians: Gaussians, cameras: Cameras, view: int) -> np.ndarray:
-        """Render one view ``[h,w,3]``, by the one call that renders here: equal Gaussians give equal images."""
+    def draw(self, gaussians: Gaussians, cameras: Cameras, view: int) -> tuple[np.ndarray, np.ndarray]:
+        """Render one view ``[h,w,3]``, by the one call that renders here: equal Gaussians give equal images.
+
+        Also returns a mask ``[h,w]`` of the pixels in which the Gaussians are opaque by half.
+        """
         drawn = render(gaussians, cameras[[view]], near=self.near, antialiased=self.options.antialiased)
-        return np.asarray(drawn.images[0].clip(0, 1))
+        return np.asarray(drawn.images[0].clip(0, 1)), np.asarray(1 - drawn.alphas[0, ..., 0] < COVERED)
+
+    def image(self, gaussians: Gaussians, cameras: Cameras, view: int) -> np.ndarray:
+        """Render one view ``[h,w,3]``."""
+        return self.draw(gaussians, cameras, view)[0]
 
 
 def evaluate(
@@ -202,7 +224,9 @@ def evaluate(
         renderer.image(inputs[:1], scene.cameras, 0)  # loads the kernels, so that no result's time contains that
         for i, (name, gaussians) in enumerate(named.items()):
             mine = {kind: part.under(cameras.get(name)) if kind == "context" else part for kind, part in splits.items()}
-            score = _score_result(name, gaussians, len(inputs), mine, renderer, on_image)
+            score, opaque = _score_result(name, gaussians, len(inputs), mine, renderer, on_image)
+            if name == INPUT:
+                splits = {kind: part.with_covered(opaque[kind]) for kind, part in splits.items()}
             scores.append(replace(score, fog=fog.get(name, {})))
             if progress:
                 progress("evaluate", i + 1, len(named))
@@ -245,7 +269,7 @@ def _splits(scene: Scene, inputs: Gaussians, targets: Views | None, renderer: _R
         visible = visible_pixels(points, views.cameras, renderer.near, sources)
         if masks is not None:
             visible &= [resize_mask(mask, cameras.width, cameras.height) for mask in masks]
-        return _Split(views, visible, drawn)
+        return _Split(views, visible, None, drawn)
 
     target = {} if targets is None else {"target": split(targets, None)}
     if targets is not None and not renderer.options.context:
@@ -254,7 +278,11 @@ def _splits(scene: Scene, inputs: Gaussians, targets: Views | None, renderer: _R
         views = shrink_views(Views(scene.cameras, scene.images, scene.names), side)
     else:
         views = Views(cameras, np.stack([renderer.image(inputs, cameras, i) for i in range(len(scene))]), scene.names)
-    return {"context": split(views, inputs if scene.images is None else None, scene.masks), **target}
+    context = split(views, inputs if scene.images is None else None, scene.masks)
+    if scene.missing is not None:
+        stored = np.stack([resize_mask(mask, cameras.width, cameras.height) for mask in scene.stored])
+        context = context.with_covered(stored)
+    return {"context": context, **target}
 
 
 def _score_result(
@@ -264,16 +292,19 @@ def _score_result(
     splits: Mapping[str, _Split],
     renderer: _Renderer,
     on_image: OnImage,
-) -> ResultScores:
+) -> tuple[ResultScores, dict[str, NDArray[np.bool_]]]:
+    """Score a result in all views; also return by split a mask ``[v,h,w]`` of the pixels in which it is opaque."""
     scores, seconds, options = list[ViewScore](), 0.0, renderer.options
+    opaque: dict[str, list[np.ndarray]] = {kind: [] for kind in splits}
     for kind, split in splits.items():
         views = split.views
         perceptual = pick_views(len(views.names), options.lpips_views or len(views.names))
         for i, view in enumerate(views.names):
             start = time.perf_counter()
-            image = renderer.image(gaussians, views.cameras, i)
+            image, solid = renderer.draw(gaussians, views.cameras, i)
             seconds += time.perf_counter() - start
             on_image(name, kind, i, image)
+            opaque[kind].append(solid)
             seen, nets = split.visible[i], options.lpips if i in perceptual else ()
             both = _both(image, views.images[i], seen, nets)
             sizes = () if options.zoom == (1,) else options.zoom
@@ -282,12 +313,22 @@ def _score_result(
                 zoom: (full, masked) if zoom == 1 else _score_zoom(gaussians, split, i, zoom, renderer)
                 for zoom in sizes
             }
-            score = ViewScore(kind, view, float(seen.mean()), *both, zooms)
+            score = ViewScore(kind, view, float(seen.mean()), *both, zooms=zooms)
+            if split.covered is not None or name == INPUT:
+                share, covered = _covered(image, views.images[i], solid if split.covered is None else split.covered[i])
+                score = replace(score, covered_share=share, covered=covered or full)
             if options.align and kind == "target":
                 score = _align_score(score, gaussians, image, split, i, nets, renderer)
             scores.append(score)
     ratio = len(gaussians) / max(num_input, 1)
-    return ResultScores(name, len(gaussians), ratio, seconds / max(len(scores), 1), tuple(scores))
+    result = ResultScores(name, len(gaussians), ratio, seconds / max(len(scores), 1), tuple(scores))
+    return result, {kind: np.stack(masks) for kind, masks in opaque.items()}
+
+
+def _covered(image: np.ndarray, photo: np.ndarray, mask: NDArray[np.bool_]) -> tuple[float, Quality | None]:
+    """Measure the share of pixels in a mask, and PSNR and SSIM over these; None where they are nearly all."""
+    share = float(mask.mean())
+    return share, None if share >= WHOLE else _quality(image, photo, mask, ()) if share > 0 else Quality()
 
 
 def _score_zoom(gaussians: Gaussians, split: _Split, view: int, zoom: float, renderer: _Renderer) -> Pair:

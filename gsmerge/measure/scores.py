@@ -11,6 +11,7 @@ from typing import Any
 from gsmerge.measure.align import PoseChange
 from gsmerge.measure.evaluate import Evaluation, Pair, Quality, ResultScores
 from gsmerge.measure.fog import ALL, Fog
+from gsmerge.raster.photos import WHOLE
 from gsmerge.report import csv_text, document_head, human_bytes, text_table
 
 Row = Sequence[str]
@@ -21,9 +22,10 @@ COLUMNS = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips_vgg": "LPIPS VGG", "lpips
 METRICS = tuple(field.name for field in fields(Quality))
 OUTSIDE = {"fog_near": "near fog", "fog_far": "far fog", "holes": "holes"}  # fields of Fog
 MASKED = "_visible"  # suffix of what is measured over the pixels that the input views have seen
+COVERED = "_covered"  # and over those that the input covers
 CSV_COLUMNS = (
     "schema_version", "result", "num_gaussians", "ratio", "split", "view", "visible_share",
-    *METRICS, *(name + MASKED for name in METRICS), *OUTSIDE,
+    *METRICS, *(name + MASKED for name in METRICS), *(name + COVERED for name in ("share", *ZOOMED)), *OUTSIDE,
 )  # fmt: skip
 
 
@@ -65,6 +67,7 @@ def _result(result: ResultScores, evaluation: Evaluation, facts: Mapping[str, An
                 "view": s.view,
                 "visible_share": s.visible,
                 **_flat((s.full, s.masked)),
+                **_covered(s.covered_share, s.covered),
                 **_zooms(s.zooms),
                 **_aligned(s.aligned, s.pose_change),
             }
@@ -79,6 +82,7 @@ def _mean(result: ResultScores, split: str, evaluation: Evaluation) -> dict[str,
     ways = options.alignments if split == "target" else ()
     return {
         **_flat(result.mean(split)),
+        **_covered(*result.mean_covered(split)),
         **_zooms({zoom: result.mean(split, zoom=zoom) for zoom in sizes}),
         **_aligned({way: result.mean(split, align=way) for way in ways}, result.mean_pose_change(split)),
     }
@@ -95,6 +99,10 @@ def _zooms(scores: Mapping[float, Pair]) -> dict[str, Any]:
     names = [name + suffix for suffix in ("", MASKED) for name in ZOOMED]
     flat = [(zoom, _flat(pair)) for zoom, pair in scores.items()]
     return {"zooms": [{"zoom": zoom, **{name: score[name] for name in names}} for zoom, score in flat]} if flat else {}
+
+
+def _covered(share: float | None, quality: Quality) -> dict[str, float | None]:
+    return {"share" + COVERED: share} | {name + COVERED: getattr(quality, name) for name in ZOOMED}
 
 
 def _flat(pair: Pair) -> dict[str, float | None]:
@@ -144,6 +152,11 @@ def evaluation_tables(document: Mapping[str, Any]) -> Iterator[Table]:
         ("", "views", *COLUMNS.values()),
         [(name, f"{split} ({document['num_views'][split]})", *_cells(mean)) for name, split, mean in means],
     )
+    lacks = (means[0][2]["share" + COVERED] or 1) < WHOLE  # of the input's own views, where they are measured
+    yield "Over the pixels that the input covers", ("", "views", "of all", *(COLUMNS[name] for name in ZOOMED)), [
+        (name, split, f"{100 * mean['share' + COVERED]:.0f} %", *_cells(mean, ZOOMED, COVERED))
+        for name, split, mean in means if lacks
+    ]  # fmt: skip
     outside = [(result["name"], *(_number(result[name]) for name in OUTSIDE)) for result in results]
     yield "Seen from outside, against the input", ("", *OUTSIDE.values()), [row for row in outside if any(row[1:])]
     sizes = [entry["zoom"] for entry in means[0][2].get("zooms", ())]
@@ -192,10 +205,10 @@ def _speed_row(result: Mapping[str, Any], speed: Mapping[str, Any]) -> Row:
     return result["name"], speed["device"] + threads, size, f"{1000 * speed['seconds']:.1f}", faster, earned
 
 
-def _cells(score: Mapping[str, Any], names: Iterable[str] = METRICS) -> Iterator[str]:
-    """Format the figures of the visible pixels; empty where one was not measured."""
+def _cells(score: Mapping[str, Any], names: Iterable[str] = METRICS, suffix: str = MASKED) -> Iterator[str]:
+    """Format the figures of the visible pixels, or of others; empty where one was not measured."""
     for name in names:
-        yield _number(score[name + MASKED], 2 if name == "psnr" else 3)
+        yield _number(score[name + suffix], 2 if name == "psnr" else 3)
 
 
 def _number(value: float | None, digits: int = 3) -> str:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -23,7 +24,28 @@ NEAR = 0.01  # near plane of every render that is scored, in canonical units
 ONE_AT_A_TIME = 400_000  # Gaussians; the plan of a view is as large as they are, so threads share one view instead
 BLOCK = 2  # tiles per side of the blocks that scored_tiles chooses among
 MASKED = np.float32(0.1)  # weight of pixels outside masks, which show the Gaussians' colours: none would let them drift
+COVERED = np.float32(0.5)  # transmittance below which a pixel shows Gaussians
+WHOLE = 0.98  # share of the pixels from which on Gaussians cover a view as a whole
 EPS2D = 0.3  # low-pass of the rasterizer, square pixels of the full-size image
+
+
+class ViewScore(NamedTuple):
+    """Score of one render against a photo."""
+
+    psnr: float  # dB over the pixels that count
+    covered_psnr: float  # dB over those of them that are covered; of nearly all, over all of them, NaN of none
+    share: float  # of the pixels that count, covered
+    covered: np.ndarray  # [h,w] bool, the pixels that count and are covered
+
+
+@dataclass(frozen=True)
+class PhotoScore:
+    """Mean score of renders against photos; see :class:`ViewScore`."""
+
+    psnr: float  # dB
+    covered_psnr: float  # dB; NaN where nothing is covered
+    share: float  # covered
+    covered: tuple[np.ndarray, ...]  # [h,w] bool for each view
 
 
 @dataclass(frozen=True)
@@ -154,29 +176,52 @@ def photo_errors(
     return parallel_map(one_view, chosen)
 
 
-def photo_psnr(
-    gaussians: Gaussians | Splats, photos: Photos, views: Iterable[int], *, quarter: bool = False, **settings: Any
-) -> float:
-    """Return the mean PSNR (dB) on the photos of ``views``, or on a ``quarter`` of each; see :func:`photo_errors`."""
+def score_photos(
+    gaussians: Gaussians | Splats,
+    photos: Photos,
+    views: Sequence[int],
+    *,
+    quarter: bool = False,
+    covered: Sequence[np.ndarray] | None = None,
+    **settings: Any,
+) -> PhotoScore:
+    """Score renders against the photos of ``views``, or a ``quarter`` of each; see :func:`photo_errors`.
+
+    ``covered``: a mask ``[h,w]`` for each of the views; None: where the Gaussians are opaque by half.
+    """
+    masks = {} if covered is None else dict(zip(views, covered, strict=True))
 
     def tiles(view: int) -> np.ndarray | None:
         return scored_tiles(view, photos.width, photos.height) if quarter else None
 
-    def score(view: int, image: np.ndarray, _: np.ndarray) -> float:
-        return view_psnr(image, photos, view, quarter=quarter)
+    def score(view: int, image: np.ndarray, transmittance: np.ndarray) -> ViewScore:
+        return score_view(image, masks.get(view, transmittance < COVERED), photos, view, quarter=quarter)
 
-    return float(np.mean(photo_errors(gaussians, photos, score, views, tiles=tiles, **settings)))
+    return mean_score(photo_errors(gaussians, photos, score, views, tiles=tiles, **settings))
 
 
-def view_psnr(image: np.ndarray, photos: Photos, view: int, *, quarter: bool) -> float:
-    """Return the PSNR (dB) of a render ``[h,w,3]``, clipped in place, against a photo or a quarter of it."""
+def mean_score(scores: Sequence[ViewScore]) -> PhotoScore:
+    """Average the scores of views."""
+    inside = [score.covered_psnr for score in scores if score.share > 0]
+    share = float(np.mean([score.share for score in scores]))
+    mean = float(np.mean([score.psnr for score in scores]))
+    return PhotoScore(mean, float(np.mean(inside)) if inside else math.nan, share, tuple(s.covered for s in scores))
+
+
+def score_view(image: np.ndarray, covered: np.ndarray, photos: Photos, view: int, *, quarter: bool) -> ViewScore:
+    """Score a render ``[h,w,3]``, clipped in place, also over ``covered [h,w]``; see :func:`score_photos`."""
     tiles = scored_tiles(view, photos.width, photos.height) if quarter else None
     mask = None if tiles is None else tiles.repeat(TILE, 0).repeat(TILE, 1)[: photos.height, : photos.width]
     if photos.weights is not None:
         counts = photos.weights[view] == 1
         both = counts if mask is None or not (mask & counts).any() else mask & counts
         mask = both if both.any() else mask
-    return psnr(np.clip(image, 0, 1, out=image), photos.images[view], mask)
+    covered = covered if mask is None else covered & mask
+    share = float(covered.sum() / (covered.size if mask is None else max(1, mask.sum())))
+    psnr_of_all = psnr(np.clip(image, 0, 1, out=image), photos.images[view], mask)
+    if share >= WHOLE or share == 0:
+        return ViewScore(psnr_of_all, psnr_of_all if share else math.nan, share, covered)
+    return ViewScore(psnr_of_all, psnr(image, photos.images[view], covered), share, covered)
 
 
 def scored_tiles(view: int, width: int, height: int) -> np.ndarray | None:

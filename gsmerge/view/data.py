@@ -21,6 +21,7 @@ from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Progress, Quality, 
 from gsmerge.measure.fog import ALL, Fog
 from gsmerge.measure.preview import OUTSIDE, Picture, borders, mean_colors, to_picture
 from gsmerge.raster import render
+from gsmerge.raster.photos import WHOLE
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.stages import SegmentOptions
 from gsmerge.stages.superpixels import segment
@@ -49,6 +50,8 @@ class Side:
     sh_degree: int  # of the harmonics that the page has
     file_sh_degree: int  # of those in the file
     fog: Fog | None  # of a result
+    covered_share: float | None  # of the pixels of these views, covered by the input
+    covered: Quality  # over those
 
 
 @dataclass(frozen=True)
@@ -79,6 +82,7 @@ class ViewData:
     reference: str  # words for the pictures that scores compare with
     notes: tuple[str, ...]  # warnings and limits, one sentence each
     num_superpixels: tuple[int, int] | None = None  # least and most of a photo; None without outlines
+    lacks_pixels: bool = False  # whether the scene itself covers less than the input views
 
     @property
     def shown(self) -> tuple[PageView, ...]:
@@ -153,7 +157,11 @@ def collect(
         shown, num_superpixels = with_outlines(_shown(views), scene.images, segmentation or SegmentOptions())
     measured = evaluation.notes if results else ()  # which are about what was fitted
     notes = (*measured, *_limits(sides, len(shown), len(views)))
-    return ViewData(title, tuple(sides), shown, outside, len(views), evaluation.reference, notes, num_superpixels)
+    share, _ = evaluation.results[0].mean_covered("context")
+    lacks_pixels = share is not None and share < WHOLE
+    return ViewData(
+        title, tuple(sides), shown, outside, len(views), evaluation.reference, notes, num_superpixels, lacks_pixels
+    )
 
 
 def _outside_view(scene: Scene, named: Mapping[str, Gaussians], frame: Frame, place: int) -> PageView:
@@ -223,7 +231,8 @@ def _side(result: ResultScores, gaussians: Gaussians, file_bytes: int, split: st
     splats, degree = pack_splats(gaussians)
     mean, highest = result.mean(split)[1], highest_degree(gaussians.shN)
     fog = result.fog.get(ALL)
-    return Side(result.name, result.num_gaussians, file_bytes, mean, splats, degree, highest, fog)
+    covered = result.mean_covered(split)
+    return Side(result.name, result.num_gaussians, file_bytes, mean, splats, degree, highest, fog, *covered)
 
 
 def _shown(views: Sequence[PageView]) -> tuple[PageView, ...]:

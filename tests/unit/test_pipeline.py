@@ -45,6 +45,24 @@ def test_the_input_is_scored_as_its_file_has_it(scene: Scene) -> None:
     assert before.psnr_before == pytest.approx(scenes.psnr_of(some.file_gaussians, scene), abs=0.1)
     assert before.psnr_before < scenes.psnr_of(scene.gaussians, scene) - 3
     assert before.psnr_after > before.psnr_before
+    assert before.covered is not None
+    assert before.covered.share == pytest.approx(some.stored.mean(), abs=0.02)
+    images = scenes.images_of(some.file_gaussians, some.cameras)[0].clip(0, 1)
+    inside = -10 * np.log10(np.square(images - some.images)[some.stored].mean())
+    assert before.covered.before == pytest.approx(inside, abs=0.5)  # the mean over views, not over pixels
+    assert before.covered.before > before.psnr_before + 3
+    assert scenes.compacted(scene, fit="none").report.covered is None
+
+
+def test_a_result_that_loses_what_the_input_covers_is_worse(scene: Scene) -> None:
+    """Over all pixels it gains, as it fills the gap."""
+    missing = np.zeros_like(scene.valid)
+    missing[:, 6:18, 8:24] = True
+    report = scenes.compacted(replace(scene, missing=missing), fit="none", budget=40).report
+    assert report.covered is not None
+    assert report.psnr_after > report.psnr_before
+    assert report.covered.after < report.covered.before - 1
+    assert report.worse is not None
 
 
 def test_many_views_are_scored_by_some(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from gsmerge import report
-from gsmerge.compaction.result import CompactReport
+from gsmerge.compaction.result import CompactReport, Covered
 from gsmerge.settings.compact import CompactOptions
 
 
@@ -49,6 +49,14 @@ def test_document_is_strict_json(files: tuple[Path, Path]) -> None:
     assert list(document["seconds"]) == ["read", "segment", "encode", "write"]
     assert document["total_seconds"] == 1.875
     assert document["seed"] == 5
+
+
+def test_what_the_input_covers_stands_beside_all_pixels(files: tuple[Path, Path]) -> None:
+    document = make_document(files, covered=Covered(0.79, 26.1, 25.9))
+    assert document["psnr_covered"] == {"share": 0.79, "before": 26.1, "after": 25.9}
+    for text in (report.summary_line(document), "\n".join(report.result_table(document))):
+        assert all(part in text for part in ("79 %", "26.10", "25.90", "20.00", "24.50"))
+    assert make_document(files)["psnr_covered"] is None
 
 
 def test_summary_line(files: tuple[Path, Path]) -> None:

@@ -40,7 +40,7 @@ from gsmerge.fit.schedule import FitPlan, Step, loss_weights, step_sizes
 from gsmerge.fit.survey import Survey
 from gsmerge.kernels.raster.blend import MAX_ALPHA
 from gsmerge.raster import render
-from gsmerge.raster.photos import Photos, view_psnr
+from gsmerge.raster.photos import COVERED, Photos, PhotoScore, mean_score, score_view
 from gsmerge.types import SH_C0, Cameras, Gaussians, as_array
 
 READ_EVERY = 20  # steps; each reading waits for the device
@@ -210,19 +210,20 @@ def measure_photos(
     photos: Photos,
     views: Sequence[int],
     *,
-    quarter: bool,
+    quarter: bool = False,
+    covered: Sequence[np.ndarray] | None = None,
     near: float,
     device: torch.device,
-) -> float:
-    """Measure the mean PSNR (dB) of Gaussians on the photos of ``views``, rendered on a device.
+) -> PhotoScore:
+    """Score Gaussians on the photos of ``views``, rendered on a device; see :func:`gsmerge.raster.photos.score_photos`.
 
     Gaussians and full-size photos are on the host, in one frame, whose unit ``near`` is in.
-    ``quarter``: score the tiles of :func:`gsmerge.raster.photos.scored_tiles` alone.
     """
     uploaded = upload_gaussians(gaussians, device, dtype=None)  # float32 is too coarse far from the origin
     cameras = Cameras(photos.viewmats, photos.Ks, photos.width, photos.height)
-    values = []
-    for view in views:
-        image = render(uploaded, cameras[[view]].to(device), near=near).images[0]
-        values.append(view_psnr(as_array(image), photos, view, quarter=quarter))
-    return float(np.mean(values))
+    scores = []
+    for i, view in enumerate(views):
+        drawn = render(uploaded, cameras[[view]].to(device), near=near)
+        opaque = 1 - as_array(drawn.alphas[0])[..., 0] < COVERED if covered is None else covered[i]
+        scores.append(score_view(as_array(drawn.images[0]), opaque, photos, view, quarter=quarter))
+    return mean_score(scores)

@@ -18,7 +18,7 @@ from gsmerge.fit.full import fit_full
 from gsmerge.fit.photo_sizes import large_photos, largest_scale, photo_scale
 from gsmerge.fit.schedule import affordable_steps, plan_run
 from gsmerge.geometry import project
-from gsmerge.raster.photos import EPS2D, photo_psnr
+from gsmerge.raster.photos import EPS2D, score_photos
 from gsmerge.runtime.record import record_run
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import LargePhotos
@@ -182,7 +182,7 @@ def test_result_shows_larger_photos_better(truth: Gaussians, scene: Scene) -> No
     )
     assert scenes.identical(usual, fit_full(start, scenes.engine_for(scenes.pair_of(scene), LONG))[0])
     views = range(len(near))
-    assert photo_psnr(sharp, near, views) > photo_psnr(usual, near, views) + 0.3
+    assert score_photos(sharp, near, views).psnr > score_photos(usual, near, views).psnr + 0.3
 
 
 def test_result_does_not_depend_on_threads(truth: Gaussians, scene: Scene) -> None:

@@ -73,6 +73,28 @@ def test_masked_figures_count_visible_pixels_alone(actual: Evaluation) -> None:
     assert all(s.masked == s.full for s in actual.results[0].scores if s.split == "context")
 
 
+def test_what_the_input_covers_is_measured_apart(scene: Scene, half: Gaussians) -> None:
+    """Of the input's own views by the rows of the file, of the others by its renders."""
+    missing = np.zeros_like(scene.valid)
+    missing[:, :12] = True
+    lacking = evaluate(replace(scene, missing=missing), {"half": half}, held_out(), PLAIN)
+    for result in lacking.results:
+        share, covered = result.mean_covered("context")
+        assert share == pytest.approx(1 - missing.mean())
+        assert covered.psnr is not None
+        assert covered.psnr != result.mean("context")[0].psnr
+    before = lacking.results[0]
+    assert before.mean_covered("context")[1].psnr > before.mean("context")[0].psnr + 3
+    assert 0.1 < before.mean_covered("target")[0] < 0.95
+    document = document_of(lacking)
+    assert "input covers" in evaluation_markdown(document)
+    row = next(csv.DictReader(io.StringIO(evaluation_csv(document))))
+    assert float(row["share_covered"]) == pytest.approx(1 - missing.mean())
+    assert float(row["psnr_covered"]) > float(row["psnr"])
+    whole = evaluate(scene, {"half": half}, options=replace(PLAIN, own=False))
+    assert whole.results[0].mean_covered("context")[0] is None
+
+
 def test_what_is_counted(actual: Evaluation, scene: Scene, half: Gaussians) -> None:
     assert [r.name for r in actual.results] == [INPUT, "half"]
     assert actual.results[1].num_gaussians == len(half)

@@ -8,7 +8,7 @@ import scenes
 
 from gsmerge import Scene
 from gsmerge.raster.composite import composite
-from gsmerge.raster.photos import NEAR, photo_psnr, scene_photos, scored_tiles
+from gsmerge.raster.photos import NEAR, scene_photos, score_photos, scored_tiles
 from gsmerge.raster.view_plan import plan_view, prepare
 
 
@@ -52,6 +52,8 @@ def test_odd_sizes_have_about_a_quarter(width: int, height: int) -> None:
 
 def test_quarter_is_near_the_whole(scene: Scene) -> None:
     photos, views = scene_photos(scene), range(len(scene))
-    whole, quarter = (photo_psnr(scene.gaussians, photos, views, near=NEAR, quarter=part) for part in (False, True))
+    whole, quarter = (
+        score_photos(scene.gaussians, photos, views, near=NEAR, quarter=part).psnr for part in (False, True)
+    )
     assert quarter == pytest.approx(whole, abs=0.5)
     assert quarter != whole

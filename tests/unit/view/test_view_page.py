@@ -121,6 +121,14 @@ def test_fog_and_holes_are_in_a_table(data: ViewData, alone: ViewData) -> None:
     assert 'class="outside"' not in view_page(alone)
 
 
+def test_what_the_input_covers_stands_beside_all_pixels(data: ViewData) -> None:
+    """Where the scene itself lacks pixels."""
+    before, after = (replace(side, covered_share=0.79, covered=Quality(26.1)) for side in data.sides[:2])
+    lacking = replace(data, sides=(before, after, *data.sides[2:]))
+    assert "79 %" in view_page(replace(lacking, lacks_pixels=True))
+    assert "79 %" not in view_page(lacking)
+
+
 def test_the_view_from_outside_has_neither_photo_nor_score(page: str, data: ViewData) -> None:
     *views, outside = json.loads(block(page, "data"))["views"]
     assert [view["outside"] for view in views] == [False] * len(data.views)

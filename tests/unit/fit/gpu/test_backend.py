@@ -81,9 +81,11 @@ def test_scores_are_the_renderers(
     for views, quarter in (([0, 1], True), ([1], False)):
         actual, expected = (
             score(moved, there, views, quarter=quarter, near=NEAR)
-            for score in (ON_TORCH.photo_psnr, render_photos.photo_psnr)
+            for score in (ON_TORCH.score_photos, render_photos.score_photos)
         )
-        assert actual == pytest.approx(expected, abs=1e-4)
+        assert actual.psnr == pytest.approx(expected.psnr, abs=1e-4)
+        assert actual.covered_psnr == pytest.approx(expected.covered_psnr, abs=1e-2)
+        assert actual.share == pytest.approx(expected.share, abs=1e-3)
     errors = [scenes.engine_for(photos, QUICK, backend=one).photo_error(start) for one in (ON_TORCH, ON_CPU)]
     assert errors[0] == pytest.approx(errors[1], rel=1e-4)
 
@@ -133,7 +135,7 @@ def test_mask_and_scores_of_a_gpu_are_the_cpus(scene: Scene, start: Gaussians, p
     backends = make_backend(cuda), ON_CPU
     masks = [scenes.engine_for(photos, QUICK, backend=one).survey(start).visible(1 / 255) for one in backends]
     assert (masks[0] == masks[1]).mean() > 0.99
-    scores = [one.photo_psnr(start, photos[0], [0, 2], quarter=False, near=NEAR) for one in backends]
+    scores = [one.score_photos(start, photos[0], [0, 2], near=NEAR).psnr for one in backends]
     assert scores[0] == pytest.approx(scores[1], abs=0.05)
 
 
