@@ -63,7 +63,7 @@ def _with_fog(gaussians: Gaussians) -> Gaussians:
     one = gaussians[:1]
     fog = replace(
         one,
-        means=(middle + [0, spread / 2, 0])[None].astype(one.means.dtype),
+        means=(middle + np.array([0, spread / 2, 0]))[None].astype(one.means.dtype),
         scales=np.full((1, 3), spread / 4, np.float32),
         opacities=np.full(1, 0.7, np.float32),
         sh0=np.full((1, 1, 3), 1.5, np.float32),
