@@ -11,12 +11,16 @@ from gsmerge.stages.decode import decode_merged, keep_all
 from gsmerge.stages.encode import correct, encode, make_context
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import MergedViews, merge, refine
+from gsmerge.stages.pair_merge import merge_neighbors
 from gsmerge.stages.segment import segment_scene
 from gsmerge.types import Decoded
 
 
 def build(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
     """Build and fit ``count`` canonical Gaussians; None: as many as ``superpixels`` and K give."""
+    if prepared.alone:  # no view to cut into superpixels, and no photo to fit to
+        scene, most = prepared.scene, plan.limits.default if count is None else count
+        return Fitted(merge_neighbors(scene.gaussians, most), scene.cameras, None)
     decoded = start(prepared, plan, count)
     return fit_scene(decoded, prepared.scene, prepared.photo_views, plan.fit, plan.seed, plan.backend)
 

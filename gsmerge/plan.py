@@ -115,18 +115,19 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
     ``checkpoint``: networks to use instead of those that the options name.
     """
     input_scene, scene, effort = prepared.input_scene, prepared.scene, EFFORTS[options.effort]
-    _check_photos(input_scene, options)
-    is_ours = options.method == OURS
+    alone = prepared.alone
+    _check_photos(input_scene, options, judged=alone)
+    cuts = options.method == OURS and not alone  # views into superpixels
     with stage("prepare"):
         has_photos = scene.images is not None and bool(prepared.photo_views)
-        if checkpoint is None and is_ours:  # baselines learn nothing
+        if checkpoint is None and cuts:  # baselines learn nothing
             checkpoint = load_networks(options, input_scene, photos=has_photos)
-        segment = _resolve_superpixels(options.segment, scene, effort)
+        segment = options.segment if alone else _resolve_superpixels(options.segment, scene, effort)
         clean_options = options.clean
         if clean_options.drop_sky and not prepared.photo_views:
             note("drop_sky: no photo is used that could say where the sky is, so it stays")
             clean_options = replace(clean_options, drop_sky=False)
-        size = measure_size(scene, photos=has_photos)
+        size = measure_size(input_scene if alone else scene, photos=has_photos)
         decode = resolve_decode(options, size)
         if decode.k != options.decode.k and decode.max_k > USUAL_K:
             note(f"k: {decode.k}, because one camera shows the scene, and no long fit follows")
@@ -143,7 +144,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         fit = _fit_photos(prepared, options, whole.fit, backend)
     tree = None
     searches = options.budget.quality is not None or options.budget.auto or options.budget.levels > 1
-    if is_ours and (searches or limits.count is not None):
+    if cuts and (searches or limits.count is not None):
         tree = scene_tree(scene, segment, limits, limits.exact or limits.default)
     networks: tuple[NetworkWeights | None, ...] = (None,)
     if checkpoint is not None:
@@ -251,12 +252,17 @@ def _whole_needed(options: CompactOptions) -> list[str]:
     return [*options.whole_only, *(name for name, holds in whole.items() if holds)]
 
 
-def _check_photos(scene: Scene, options: CompactOptions) -> None:
+def _check_photos(scene: Scene, options: CompactOptions, *, judged: bool) -> None:
     """Refuse settings that need photos where there are none."""
-    if scene.images is None and options.budget.quality is not None:
+    if scene.images is None and options.budget.quality is not None and not judged:
         raise UsageError("a quality target needs photos, and the scene has none; give --images, or a --budget")
     if scene.images is None and options.clean.drop_sky:
         raise UsageError("drop_sky: expected photos, which say where the sky is; name them with --images")
+
+
+def stands_alone(scene: Scene, options: CompactOptions) -> bool:
+    """Return whether a scene is merged by positions and colours alone: no view is known, and nothing asks for one."""
+    return len(scene) == 0 and options.method == OURS and options.checkpoint in ("auto", "none")
 
 
 def choose_networks(options: CompactOptions, *, photos: bool, aligned: bool = True) -> str:
@@ -395,6 +401,8 @@ def _fit_photos(prepared: Prepared, options: CompactOptions, fit: FitOptions, ba
 
 def _choose_scored_views(prepared: Prepared, options: CompactOptions) -> tuple[int, ...]:
     """Choose views, whose photos show the scene, for scoring; more where they decide a quality search."""
+    if prepared.alone:
+        return tuple(range(len(prepared.scene)))
     views = prepared.photo_views or range(len(prepared.scene))
     candidates = [view for view, place in enumerate(prepared.repeated) if place in views]
     choose_some = report_views if options.budget.target_psnr is None else scored_views

@@ -163,6 +163,9 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None) -> l
     if covered := document["psnr_covered"]:
         share = f"on the {100 * covered['share']:.0f} % that the input covers"
         rows += [("", f"{covered['before']:.2f} dB", f"{covered['after']:.2f} dB", share)]
+    judged = document["choices"].get("fidelity")
+    if judged:
+        rows += [("PSNR", "", f"{judged['psnr']:.2f} dB", _judged_by(judged))]
     longest = sorted(document["seconds"].items(), key=lambda item: -item[1])[:2]
     stages = ", ".join(f"{name} {seconds:.1f}" for name, seconds in longest)
     rows += [("time", "", f"{document['total_seconds']:.1f} s", f"most in {stages}")]
@@ -172,6 +175,10 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None) -> l
     last = [] if cameras is None else [f"  cameras    {cameras}"]
     last += [] if next_step is None else [f"  next       {next_step}"]
     return [after["path"], *table, *level_lines(document), *curve, *last]
+
+
+def _judged_by(fidelity: Mapping[str, Any]) -> str:
+    return f"against the input from {fidelity['views']} held-out views"
 
 
 def level_lines(document: Mapping[str, Any]) -> list[str]:
@@ -202,9 +209,12 @@ def summary_line(document: Mapping[str, Any]) -> str:
     before, after = document["input"], document["output"]
     psnr, path = document["psnr_input_views"], document.get("viewer_cameras")
     cameras = f"; cameras for viewers in {os.path.basename(path)}" if path else ""
+    judged = document["choices"].get("fidelity")
     quality = (
         f"; input views {psnr['before']:.2f} -> {psnr['after']:.2f} dB"
         if psnr["before"] is not None and psnr["after"] is not None
+        else f"; {judged['psnr']:.2f} dB {_judged_by(judged)}"
+        if judged
         else ""
     )
     if covered := document["psnr_covered"]:

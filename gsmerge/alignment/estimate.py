@@ -18,6 +18,7 @@ from gsmerge.alignment.layouts import DEPTH_SHARE, Layout, da3_box, every_nth, e
 from gsmerge.alignment.row_grid import find_grid
 from gsmerge.alignment.score import MARGIN, find_correspondences
 from gsmerge.alignment.stretches import UNIQUE, byte_colors, place_stretch, shown_colors
+from gsmerge.geometry import sh0_to_rgb
 from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, View, make_camera_file
 from gsmerge.io.photo_files import Photos, PhotoTransform, Size, resize_to
 from gsmerge.types import Cameras, Gaussians

@@ -51,11 +51,8 @@ class BeforeAfter:
         return {name: ply.gaussians for name, ply in self.plys.items()}
 
 
-def read_before_after(args: Args, files: SceneFiles, *, alone: bool = False) -> BeforeAfter:
-    """Read the scenes of BEFORE (``files``) and AFTER, and the views of ``--targets``.
-
-    A scene that is looked at ``alone`` needs no cameras: views are placed about it.
-    """
+def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
+    """Read the scenes of BEFORE (``files``) and AFTER, and the views of ``--targets``; place views where none are."""
     from gsmerge.facts.place_cameras import add_views
     from gsmerge.io import read_gaussians
     from gsmerge.io.cameras.embedded import holds_cameras
@@ -63,7 +60,7 @@ def read_before_after(args: Args, files: SceneFiles, *, alone: bool = False) -> 
 
     if files.cameras is None:  # a result may know those that its scene has lost
         files = replace(files, cameras=next(filter(holds_cameras, args.after), None))
-    load, notes = _load(args, files, alone), list[str]()
+    load, notes = args.load(files), list[str]()
     views = vars(args).get("views")
     if args.targets is not None or views is not None:
         require_views(load)
@@ -75,16 +72,6 @@ def read_before_after(args: Args, files: SceneFiles, *, alone: bool = False) -> 
     plys = {name: read_gaussians(path) for name, path in zip(file_names(args.after), args.after, strict=True)}
     cameras, moved = own_cameras(args.after, scene)
     return BeforeAfter(load, scene, held_out, plys, cameras, [*load.notes, *adapted, *notes, *moved])
-
-
-def _load(args: Args, files: SceneFiles, alone: bool) -> Loaded:
-    """Read the scene, without cameras where there are none and it is looked at alone."""
-    try:
-        return args.load(files)
-    except SceneError:
-        if not alone or files.cameras or files.images:
-            raise
-    return args.load(files, order="none")
 
 
 def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras], list[str]]:

@@ -12,10 +12,10 @@ from gsmerge.compaction.methods import Build, choose_method
 from gsmerge.compaction.result import Candidate, CompactResult, make_result, score
 from gsmerge.compaction.search import level_counts, search_count
 from gsmerge.errors import UsageError
-from gsmerge.facts.prepare import Prepared, prepare
+from gsmerge.facts.prepare import Prepared, prepare, prepare_alone
 from gsmerge.fit import Fitted
 from gsmerge.pipeline import build
-from gsmerge.plan import Plan, make_plan, note_engine, plan_whole
+from gsmerge.plan import Plan, make_plan, note_engine, plan_whole, stands_alone
 from gsmerge.runtime.record import Progress, Record, add_seconds, adopt, choose, note, record_part, record_run
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.read import as_scene
@@ -57,7 +57,8 @@ def compact(
 def compact_piece(scene: Scene, options: CompactOptions) -> CompactResult:
     """Compact a scene in one piece."""
     method = choose_method(options, scene, build)  # ours, or a baseline
-    prepared = prepare(scene.numpy(), options.prepare)  # facts: frame, photos, poses, unseen
+    alone = stands_alone(scene, options)  # facts: frame, photos, poses, unseen
+    prepared = prepare_alone(scene.numpy()) if alone else prepare(scene.numpy(), options.prepare)
     plan = make_plan(prepared, options)  # every "auto" is decided once; options end here
     search = search_count(prepared, plan)  # one count, or counts until a quality is met
     for count in search:

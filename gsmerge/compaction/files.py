@@ -13,6 +13,7 @@ from gsmerge.compaction.compact import compact
 from gsmerge.compaction.methods import check_method
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import SceneError, UsageError
+from gsmerge.facts.place_cameras import NO_VIEWS
 from gsmerge.fit.gpu import choose_backend
 from gsmerge.io import atomic_outputs, lost_harmonics, output_format, write_gaussians
 from gsmerge.io.atomic import AddOutput
@@ -124,7 +125,8 @@ def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict
     _, unused = check_method(settings, scene)
     backend, problem = choose_backend(settings.device, scene.num_gaussians)
     settings = replace(settings, device=backend.device)
-    notes = [*load.notes, *unused, *([] if problem is None else [problem])]
+    placed = [] if len(scene) else [NO_VIEWS]
+    notes = [*load.notes, *placed, *unused, *([] if problem is None else [problem])]
     if os.path.lexists(out) and not outputs.overwrite:
         notes.append(f"{out} exists already: --overwrite would replace it")
     with record_run() as record:

@@ -6,13 +6,13 @@ A package adds one by an entry point of the group ``gsmerge.methods`` that names
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal
 
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import Prepared
 from gsmerge.fit import Fitted
-from gsmerge.plan import Plan
+from gsmerge.plan import Plan, stands_alone
 from gsmerge.runtime.plugins import METHODS, load_plugin
 from gsmerge.runtime.record import note
 from gsmerge.settings.compact import OURS, CompactOptions
@@ -65,7 +65,7 @@ def check_method(options: CompactOptions, scene: Scene) -> tuple[Method | None, 
     """
     method = find_method(options)
     if method is None:
-        return None, []
+        return None, _unused_alone(options) if stands_alone(scene, options) else []
     place = f"method {method.name}"
     if "photos" in method.needs and scene.images is None:
         raise UsageError(f"{place}: expected photos, found none; give --images, or another --method")
@@ -74,6 +74,15 @@ def check_method(options: CompactOptions, scene: Scene) -> tuple[Method | None, 
     default, used = CompactOptions().to_dict(), {*method.uses, *COMMON_SETTINGS}
     unused = [name for name, value in options.to_dict().items() if name not in used and value != default[name]]
     return method, [f"{place} does not use {', '.join(unused)}"] if unused else []
+
+
+def _unused_alone(options: CompactOptions) -> list[str]:
+    """Note changed settings of the stages that a scene without views does not go through."""
+    parts = (options.prepare, options.segment, options.match, options.decode, options.fit)
+    names = {field.name for part in parts for field in fields(part)} - {*COUNTS}
+    default, given = CompactOptions().to_dict(), options.to_dict()
+    unused = [name for name in given if name in names and given[name] not in (default[name], "none")]
+    return [f"without cameras these are not used: {', '.join(unused)}"] if unused else []
 
 
 def choose_method(options: CompactOptions, scene: Scene, ours: Build) -> Build:

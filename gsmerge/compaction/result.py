@@ -50,7 +50,8 @@ class CompactReport:
         psnr_before: Mean PSNR (dB) of the input views rendered from the input, of many views some, and in a fixed
             quarter of each unless a quality was asked for; None without photos. :func:`gsmerge.evaluate` is exact.
         psnr_after: The same from the result.
-        choices: Decisions of the stages (count, curve, merge, scores, clusters, fit).
+        choices: Decisions of the stages (count, curve, merge, scores, clusters, fit). Of a scene without cameras,
+            ``fidelity`` is the PSNR (dB) against the input from so many held-out ``views``.
         notes: Warnings about the input and adaptations to it, one sentence each.
         options: All settings by flat name.
         peak_memory_bytes: Largest resident memory of the process so far.
@@ -118,7 +119,7 @@ class Candidate:
     fitted: Fitted  # Fitted canonical Gaussians
     gaussians: Gaussians  # The same in the world, with those that no view sees
     cameras: Cameras  # The given views as the Gaussians were made from them, in the world
-    psnr: float | None  # Mean PSNR (dB) of the scored views; None without photos
+    psnr: float | None  # Mean PSNR (dB) of the scored views, or of the views that judge; None without either
     record: Record  # Seconds, choices and notes of building and scoring it
 
 
@@ -130,10 +131,24 @@ def score(count: int | None, fitted: Fitted, prepared: Prepared, plan: Plan) -> 
     gaussians, cameras = moved.frame.leave(gaussians), moved.input_scene.cameras
     if cameras is not prepared.input_scene.cameras:
         _note_moves(prepared, cameras, plan)
+    if prepared.alone:
+        fidelity = _fidelity(fitted.gaussians, prepared.scene, plan)
+        choose(fidelity={"psnr": fidelity, "views": len(prepared.scene)})
+        return Candidate(count, fitted, gaussians, cameras, fidelity, current_record())
     psnr = measure_psnr("score", gaussians, moved.result_views(), moved, plan)
     if psnr is not None:
         choose(scored_views=len(plan.scored_views))
     return Candidate(count, fitted, gaussians, cameras, psnr, current_record())
+
+
+@stage("score")
+def _fidelity(gaussians: Gaussians, judges: Scene, plan: Plan) -> float:
+    """Measure the mean PSNR (dB) of canonical Gaussians against the pictures of the input that judge them."""
+
+    def score_on(backend: FitBackend) -> PhotoScore:
+        return backend.score_photos(gaussians, scene_photos(judges), plan.scored_views)
+
+    return run_on(plan.backend, "scores", score_on).psnr
 
 
 def _move_views(prepared: Prepared, cameras: Cameras) -> Prepared:
@@ -225,11 +240,12 @@ def make_result(
 
     def report(candidate: Candidate, covered: Covered | None, seconds: Mapping[str, float], name: str) -> CompactReport:
         counts, record = (prepared.input_scene.num_gaussians, len(candidate.gaussians)), candidate.record
+        shown = None if prepared.alone else candidate.psnr
         made = CompactReport(
-            *counts, dict(seconds), before, candidate.psnr, record.choices, record.notes, plan.settings, peak_memory(),
+            *counts, dict(seconds), before, shown, record.choices, record.notes, plan.settings, peak_memory(),
             covered=covered,
         )  # fmt: skip
-        compared = (covered.before, covered.after) if covered else (before, candidate.psnr)
+        compared = (covered.before, covered.after) if covered else (before, shown)
         worse = describe_loss(name, *compared) if comparable else None
         return made if worse is None else replace(made, notes=[*made.notes, worse], worse=worse)
 

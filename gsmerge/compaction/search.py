@@ -124,7 +124,7 @@ def choose_count(prepared: Prepared, plan: Plan) -> int | None:
     limits, drop = plan.limits, plan.max_drop
     if drop is None and not plan.auto_count:
         return limits.count
-    if prepared.input_scene.images is None or not prepared.photo_views:
+    if not prepared.alone and (prepared.input_scene.images is None or not prepared.photo_views):
         return knee_count(prepared.scene, plan.superpixels)
     with stage("curve"):
         counts = rungs(AUTO_RUNGS if drop is None else RUNGS, limits.default, limits.min_count, limits.max_count)
@@ -137,12 +137,16 @@ def measure_curve(prepared: Prepared, plan: Plan, steps: int, counts: Sequence[i
     """Measure PSNR, SSIM and, where its weights are installed, LPIPS (AlexNet) of fits with each of the ``counts``.
 
     The fits take ``steps``, whatever the plan says. PSNR and SSIM are those of blocks that the fits leave out, at
-    full size; LPIPS needs whole pictures.
+    full size, or of the whole pictures that judge a scene without views; LPIPS needs whole pictures.
     """
     short = FitOptions(fit="full", fit_steps=steps, half_res_share=1.0, holdout=HOLDOUT, tuning=plan.fit.tuning)
     quick = replace(plan.with_fit(short), networks=(None,), checkpoint=None, clean=CleanOptions())  # nothing grows
-    photos = scene_photos(prepared.scene)[prepared.photo_views]
-    weights = training_weights(photos, HOLDOUT, plan.seed)
+    photos = scene_photos(prepared.scene)
+    if prepared.alone:  # nothing is fitted to them
+        weights = [np.zeros((photos.height, photos.width), np.float32)] * len(photos)
+    else:
+        photos = photos[prepared.photo_views]
+        weights = training_weights(photos, HOLDOUT, plan.seed)
     points: list[CurvePoint] = []
     for count in counts:
         report_progress("curve: what each count brings", len(points), len(counts))

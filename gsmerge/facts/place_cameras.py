@@ -1,4 +1,4 @@
-"""Unaligned scene -> the same with views: cameras that show most of it, and renders in place of photos."""
+"""Scene without views -> cameras that show most of it, and renders in place of photos."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, Scene
 
 NUM_VIEWS = 24
+JUDGES, JUDGE_SIZE = 8, 320  # views that judge a result, and their pixels per side, at most
+FEWER = 3  # of the candidates every third is tried where views only judge
 SAMPLES = 40_000  # Gaussians that candidates are judged by
 EXTENT = (0.05, 0.95)  # quantiles of the positions, per axis, that the scene is taken to span
 AROUND = 40  # candidate cameras around the scene
@@ -27,8 +29,23 @@ CLEAR = 0.02  # near plane, as a share of the scene's radius
 ENOUGH = 1.0  # pixels of blending weight at which a Gaussian counts as seen
 
 
+NO_VIEWS = (
+    "no cameras: views are placed around and inside the scene; with cameras and photos the result is fitted to them"
+    ' (--cameras, --images; export_format="npz-gs_ply" in Depth Anything 3)'
+)
+
+
 def add_views(scene: Scene) -> Scene:
     """Keep the finite Gaussians, at least one, and place cameras where there are none; a note says what was done."""
+    scene = keep_finite(scene)
+    if len(scene) == 0:
+        scene = _with_cameras(scene, place_cameras(scene.gaussians))
+        note(NO_VIEWS)
+    return scene
+
+
+def keep_finite(scene: Scene) -> Scene:
+    """Keep the finite Gaussians, with a note; ValueError if there is none."""
     g = scene.gaussians
     finite = np.ones(len(g), bool)
     for array in vars(g).values():
@@ -41,12 +58,16 @@ def add_views(scene: Scene) -> Scene:
     if count:
         note(f"{count} Gaussians are not finite and were left out")
         scene = replace(scene, gaussians=g[finite])
-    if len(scene) == 0:
-        cameras = place_cameras(scene.gaussians)
-        names = tuple(f"placed {view}" for view in range(len(cameras)))
-        scene = Scene(scene.gaussians, cameras, None, None, names)
-        note(f"no cameras: {len(cameras)} placed around and inside the scene, where they show most of it")
     return scene
+
+
+def _with_cameras(scene: Scene, cameras: Cameras) -> Scene:
+    return Scene(scene.gaussians, cameras, None, None, tuple(f"placed {view}" for view in range(len(cameras))))
+
+
+def add_judges(scene: Scene) -> Scene:
+    """Place a few small views by which results of a scene without views are judged."""
+    return _with_cameras(scene, place_cameras(scene.gaussians, JUDGES, largest=JUDGE_SIZE, step=FEWER))
 
 
 def add_pictures(scene: Scene) -> Scene:
@@ -54,26 +75,33 @@ def add_pictures(scene: Scene) -> Scene:
     if scene.images is not None:
         return scene
     note("no photos: views rendered from the scene itself stand in for them")
+    return draw_pictures(scene)
+
+
+def draw_pictures(scene: Scene) -> Scene:
+    """Render a canonical scene into its views, as its images."""
     return replace(scene, images=render(scene.gaussians, scene.cameras).images.clip(0, 1))
 
 
-def place_cameras(gaussians: Gaussians, num_views: int = NUM_VIEWS) -> Cameras:
+def place_cameras(
+    gaussians: Gaussians, num_views: int = NUM_VIEWS, *, largest: int = LARGEST, step: int = 1
+) -> Cameras:
     """Place cameras that see as much of the scene as possible.
 
     Candidates stand on a sphere around the robust extent, looking in, and on a grid inside it,
     looking everywhere. They are taken one by one, each time the one that shows most opacity which
     none has shown so far, in pictures of a sample of the Gaussians. There are at most
-    ``num_views``, of square images that are larger for more Gaussians. Raises ValueError if there
-    is no Gaussian.
+    ``num_views``, of square images that are larger for more Gaussians, at most ``largest`` pixels
+    per side; only every ``step``-th candidate is tried, on a smaller sample. Raises ValueError if there is no Gaussian.
     """
     if len(gaussians) == 0:
         raise ValueError("expected at least one Gaussian, got none")
-    sample = sampled(gaussians)
+    sample = sampled(gaussians, SAMPLES // step)
     centre, half = _extent(sample.means.astype(np.float64))
-    viewmats = _candidates(centre, half)
+    viewmats = _candidates(centre, half)[::step]
     shares = _shares_seen(sample, viewmats, CLEAR * float(np.sqrt((half * half).sum())))
     chosen = _most_seen(shares, num_views)
-    size = int(np.clip(round(math.sqrt(len(gaussians))), SMALLEST, LARGEST))
+    size = int(np.clip(round(math.sqrt(len(gaussians))), SMALLEST, largest))
     return Cameras(viewmats[chosen], np.repeat(_lens(size)[None], len(chosen), 0), size, size)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from gsmerge.facts.align_views import align_views
 from gsmerge.facts.compare_photos import compare_photos
 from gsmerge.facts.exposure import equalise_exposure
-from gsmerge.facts.place_cameras import add_pictures, add_views
+from gsmerge.facts.place_cameras import NO_VIEWS, add_judges, add_pictures, add_views, draw_pictures, keep_finite
 from gsmerge.facts.views import distinct_views, subset
 from gsmerge.geometry import camera_depths, lower_median, project
 from gsmerge.kernels.matrices import matmul
@@ -120,6 +120,11 @@ class Prepared:
     moved: bool  # Whether views were moved to where their photos agree, before a fit or by it
     unseen: Gaussians | None  # Canonical Gaussians that no view sees, if kept
 
+    @property
+    def alone(self) -> bool:
+        """Whether no view is known, and those of the canonical scene only judge results."""
+        return not self.photo_views and len(self.input_scene) == 0
+
     def with_cameras(self, cameras: Cameras) -> Prepared:
         """Return a copy with the canonical cameras that a fit has moved."""
         if cameras is self.scene.cameras:
@@ -162,6 +167,19 @@ def prepare(scene: Scene, options: PrepareOptions | None = None, frame: Frame | 
     if not scene.aligned:  # pixels that are known have colours of their own
         scene = add_pictures(scene)
     return Prepared(input_scene, scene, frame, photo_views, tuple(repeated), moved is not None, unseen)
+
+
+@stage("prepare")
+def prepare_alone(scene: Scene) -> Prepared:
+    """Bring a scene without views into its canonical frame, and add pictures of it by which results are judged.
+
+    Nothing is fitted to these pictures: a fit to renders of the input shows other views worse. Raises ValueError if
+    there is no finite Gaussian.
+    """
+    finite = keep_finite(scene)
+    note(NO_VIEWS)
+    judged, frame = canonicalise(add_judges(finite))
+    return Prepared(scene, draw_pictures(judged), frame, photo_views=(), repeated=(), moved=False, unseen=None)
 
 
 def photos_count_as_they_are(scene: Scene) -> bool:

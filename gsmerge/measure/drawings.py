@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import SceneError, UsageError
+from gsmerge.facts.place_cameras import add_views
 from gsmerge.facts.views import pick_views
 from gsmerge.io import file_notes, read_cameras, read_gaussians, to_cameras
 from gsmerge.io.cameras.camera_file import sizes_of
@@ -33,12 +34,12 @@ from gsmerge.measure.preview import (
 from gsmerge.raster import render_in_turn
 from gsmerge.raster.photos import NEAR, scene_pictures
 from gsmerge.report import document_head
-from gsmerge.runtime.record import Progress
+from gsmerge.runtime.record import Progress, record_run
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import SceneFiles, find_scene_files
 from gsmerge.scene.held_out import place_camera_file
-from gsmerge.scene.read import Loaded, load_files, place_cameras_in_scene, read_rows
+from gsmerge.scene.read import Loaded, SceneViews, load_files, place_cameras_in_scene, read_rows
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.settings.stages import SegmentOptions
 from gsmerge.stages.superpixels import count_for, saliency, segment
@@ -167,11 +168,7 @@ def _path_cameras(options: DrawOptions) -> tuple[Framed, Cameras, float, list[in
     assert options.path is not None
     path = parse_path(options.path)
     file, separate = None if path else Path(options.path), True
-    try:
-        check_cameras(options.like)
-    except SceneError:
-        if file is None:
-            raise
+    if file is not None and _lacks_cameras(options.like):
         options, separate = replace(options, like=replace(options.like, cameras=file)), False
     framed = _read(options, photos=False)
     placed = framed.load.views.cameras
@@ -218,25 +215,33 @@ def plan_superpixels(options: DrawOptions) -> Drawing:
 PLANS = {"panel": plan_panel, "views": plan_pictures, "path": plan_frames, "superpixels": plan_superpixels}
 
 
-def check_cameras(files: SceneFiles) -> None:
-    """Raise an error if a scene has no cameras and no photos from which they can be estimated."""
-    if files.cameras is None and files.images is None and read_sharp_camera(files.ply) is None:
-        raise SceneError(files.ply, "no cameras beside it", "name them with --cameras")
+def _lacks_cameras(files: SceneFiles) -> bool:
+    """Return whether a scene has no cameras and no photos from which they can be estimated."""
+    return files.cameras is None and files.images is None and read_sharp_camera(files.ply) is None
 
 
 def _read(options: DrawOptions, *, photos: bool) -> Framed:
     """Read the scenes, and place the cameras in the frame of ``options.like``."""
     files, like, paths = options.files, options.like, options.paths
-    check_cameras(like)
     first = read_rows(files, opacity=options.opacity, hints=options.hints)
     plys = [read_gaussians(path, opacity=options.opacity) for path in paths[1:]]
     same_file = like.ply == files.ply
     framed = first if same_file else read_rows(like, opacity="auto", hints=AUTO)
-    load = place_cameras_in_scene(framed, like, hints=options.hints, photos=photos)
+    load = _with_views(place_cameras_in_scene(framed, like, hints=options.hints, photos=photos))
     scenes = [load.scene.file_gaussians if same_file else first.gaussians, *(ply.gaussians for ply in plys)]
     notes = [[*([] if same_file else file_notes(first.info)), *load.notes], *(file_notes(ply.info) for ply in plys)]
     named = [f"{path}: {note}" for path, texts in zip(paths, notes, strict=True) for note in texts]
     return Framed(list(zip(paths, scenes, strict=True)), named if plys else list(notes[0]), load)
+
+
+def _with_views(load: Loaded) -> Loaded:
+    """Place views about a scene that has none."""
+    if len(load.scene):
+        return load
+    with record_run() as record:
+        scene = add_views(load.scene)
+    views = SceneViews(scene.cameras, None, scene.names, tuple(range(len(scene))))
+    return replace(load, scene=scene, views=views, notes=(*load.notes, *record.notes))
 
 
 def picture_stems(names: Sequence[str]) -> list[str]:

@@ -12,12 +12,13 @@ from gsmerge.alignment import check_cameras
 from gsmerge.errors import SceneError
 from gsmerge.facts.compare_photos import compare_photos
 from gsmerge.facts.partition import gaussians_at_once
+from gsmerge.facts.place_cameras import NO_VIEWS
 from gsmerge.facts.prepare import canonicalise
 from gsmerge.io import GaussianFile, file_notes
 from gsmerge.io.formats.ply import file_bytes, is_from_gsmerge
 from gsmerge.io.formats.read import degree_notes
 from gsmerge.measure.visibility import MAX_SAMPLES, inside_views
-from gsmerge.plan import plan_whole
+from gsmerge.plan import plan_whole, stands_alone
 from gsmerge.report import finite, human_bytes
 from gsmerge.runtime.estimate import fit_of, memory_bytes, memory_problem, wall_seconds
 from gsmerge.runtime.record import record_part
@@ -132,6 +133,7 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
     try:
         if files.cameras is not None:
             camera_file = read_scene_cameras(ply, files)
+            assert camera_file is not None, "a file has cameras, or is refused"
             facts |= {"num_views": len(camera_file), "camera_format": camera_file.source}
         load = align_scene(ply, files, camera_file, hints=hints)
     except SceneError as error:
@@ -144,7 +146,8 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
         if scene.images is not None:
             means = gaussians.means[stored & np.isfinite(gaussians.means).all(1)]
             num_sky_views = len(sky_regions(means, scene.cameras, scene.images))
-    facts |= {"notes": [*load.notes, *_photo_notes(scene)], "num_views": len(load.views.used)}
+    placed = [] if len(scene) else [NO_VIEWS]
+    facts |= {"notes": [*load.notes, *placed, *_photo_notes(scene)], "num_views": len(load.views.used)}
     facts |= {"camera_format": load.cameras and load.cameras.source}
     facts |= {"coverage": coverage(scene), "sight": sight and asdict(sight)}
     facts |= {"num_sky_views": num_sky_views, "compact": estimate(scene, CompactOptions())}
@@ -208,9 +211,10 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
 
     Returns:
         ``num_gaussians``: the most that the result can have; ``ratio`` to the input, ``bytes`` as a ``.ply``;
-        ``blocks``, ``method``, ``superpixels_per_view`` (None where a budget distributes them), ``k``, ``match``,
-        ``checkpoint``, ``fit`` and ``fit_steps`` as they are used; ``seconds`` and ``memory_bytes``, to two digits and
-        right within a factor of about two; ``memory_problem``, None where this machine has enough.
+        ``blocks``, ``method``, ``superpixels_per_view`` (None where a budget distributes them, 0 where no view is
+        known), ``k``, ``match``, ``checkpoint``, ``fit`` and ``fit_steps`` as they are used; ``seconds`` and
+        ``memory_bytes``, to two digits and right within a factor of about two; ``memory_problem``, None where this
+        machine has enough.
     """
     size = measure_size(scene)
     whole = plan_whole(size, options)
@@ -233,7 +237,7 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
         "bytes": file_bytes(count, scene.gaussians.sh_degree),
         "blocks": whole.blocks,
         "method": options.method,
-        "superpixels_per_view": None if distributed else limits.per_view,
+        "superpixels_per_view": 0 if stands_alone(scene, options) else None if distributed else limits.per_view,
         **{name: settings[name] for name in ("k", "match", "checkpoint")},
         "fit": fit_of(settings, photos=size.photos),
         "fit_steps": whole.fit.steps,
@@ -259,6 +263,8 @@ def estimate_lines(run: Mapping[str, Any]) -> list[str]:
     if per_view is not None:
         superpixels = f"{per_view:,} superpixels per view, {run['k']} Gaussian(s) each"
     method = f"{superpixels}; merging across views: {run['match']}; networks: {run['checkpoint']}"
+    if per_view == 0:
+        method = "neighbours merged pair by pair, because no view is known"
     return [
         f"compact    at most {run['num_gaussians']:,} Gaussians ({100 * run['ratio']:.1f} %),"
         f" {human_bytes(run['bytes'])} as .ply, in about {run['seconds']:g} s with {run['memory_bytes'] / 1e9:g} GB of"

@@ -43,6 +43,7 @@ from gsmerge.scene.views import (
     find_larger_and_masks,
     limit_photo_size,
     limit_view_size,
+    photos_without_cameras,
     read_scene_cameras,
     stored_photos,
 )
@@ -229,11 +230,10 @@ def align_scene(
     Raises as :func:`read_scene`. ``camera_file`` has the cameras if they are read already; without ``photos`` none
     are searched.
     """
-    if camera_file is None and files.cameras is None and hints.order == "none":  # cameras are placed later
-        problem = "expected one Gaussian per pixel, found no cameras that have any"
-        return _make_load(ply, files, hints, AlignmentResult(None, NO_CAMERAS, None, None, problem=problem), [])
-    exporter = find_exporter(hints.exporter)
     camera_file = read_scene_cameras(ply, files) if camera_file is None else camera_file
+    if camera_file is None:
+        return _without_cameras(ply, files, hints)
+    exporter = find_exporter(hints.exporter)
     default_order = camera_file.order if exporter is None else exporter.order
     order = default_order if hints.order == "auto" else hints.order
     files, chosen = choose_photos(ply, files, camera_file) if photos else (files, [])
@@ -256,6 +256,15 @@ def align_scene(
         return _make_load(ply, files, hints, result, notes)
     large, masks, more = find_larger_and_masks(files, camera_file, pictures, size, result.transform, result.cameras)
     return _make_load(ply, files, hints, result, [*notes, *more], large, masks)
+
+
+def _without_cameras(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> Loaded:
+    """Make a scene without views, in which some are placed later; SceneError if there are photos to use."""
+    if files.images is not None and hints.order != "none":
+        raise photos_without_cameras(files)
+    notes = [] if files.images is None else [f"the photos in {files.images} are not used: no cameras fit them"]
+    problem = "expected one Gaussian per pixel, found no cameras that have any"
+    return _make_load(ply, files, hints, AlignmentResult(None, NO_CAMERAS, None, None, problem=problem), notes)
 
 
 def _make_load(
@@ -372,10 +381,12 @@ def _with_rotations(scene: Scene, hints: ReadHints, exporters: Sequence[Exporter
 def place_cameras_in_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints, photos: bool) -> Loaded:
     """Move a file's cameras into the frame of the Gaussians if pixels or colours show it; otherwise keep them.
 
-    ``photos`` that cannot be read are an error; with False they are left out. SceneError if there are no cameras, or
-    they have no size.
+    ``photos`` that cannot be read are an error; with False they are left out. SceneError if cameras have no size, or
+    there are photos without any.
     """
     camera_file = read_scene_cameras(ply, files)
+    if camera_file is None:
+        return _without_cameras(ply, files, hints)
     for with_photos in (True,) if photos else (True, False):
         with suppress(SceneError):
             load = align_scene(ply, files, camera_file, hints=hints, photos=with_photos)

@@ -68,10 +68,10 @@ _MAX_MASKED = 0.98  # share of the pixels of photos that masks may leave out
 _MASK_LEVEL = 191  # of 255: a pixel of a view counts if three quarters of its pixels in the file do
 
 
-def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile:
-    """Read a scene's cameras from their file or the ``.ply``, or estimate them; SceneError if all fail.
+def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile | None:
+    """Read a scene's cameras from their file or the ``.ply``, or estimate them; None if there are none.
 
-    Where a file has poses alone, the focal length is estimated.
+    Where a file has poses alone, the focal length is estimated; SceneError if that fails.
     """
     if files.cameras is not None:
         stored = read_cameras(files.cameras, scene=files.ply.stem, folder=files.ply.parent)
@@ -96,14 +96,6 @@ def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile:
             cameras = estimate_with_photos(files.ply, *rows, names, size, read)
     elif cameras is None:
         cameras = _read_grid(ply, files, images_beside(files.ply) if files.images is None else [])
-    if cameras is None:
-        places = ", ".join(place for place in CAMERA_PLACES if len(place) > 1)
-        problem = f"no cameras found next to it (looked for {places}, one .torch chunk)"
-        remedy = "name them with --cameras, or have views placed with --hint order=none"
-        if files.ply.parent.name == "gs_ply" or files.ply.name == "0000.ply":
-            formats = 'export_format="npz-gs_ply" or "mini_npz-gs_ply" in Depth Anything 3'
-            remedy = f"export them as well, by {formats}, {remedy}"
-        raise SceneError(files.ply, problem, remedy)
     return cameras
 
 
@@ -152,6 +144,17 @@ def choose_photos(ply: GaussianFile, files: SceneFiles, camera_file: CameraFile)
         f"photos are those of {_SEEN_PLACE}: their colours are those of the rows, those of {files.images.name} are not"
     )
     return (replace(files, images=seen), [note]) if better else (files, [])
+
+
+def photos_without_cameras(files: SceneFiles) -> SceneError:
+    """Make the error of photos of which no cameras are known."""
+    places = ", ".join(place for place in CAMERA_PLACES if len(place) > 1)
+    problem = f"the photos in {files.images} are there, but no cameras that fit them (looked for {places})"
+    remedy = "name the cameras with --cameras, or do without cameras and photos by --hint order=none"
+    if files.ply.parent.name == "gs_ply" or files.ply.name == "0000.ply":
+        formats = 'export_format="npz-gs_ply" or "mini_npz-gs_ply" in Depth Anything 3'
+        remedy = f"export the cameras as well, by {formats}, {remedy}"
+    return SceneError(files.ply, problem, remedy)
 
 
 def stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos | None:

@@ -179,7 +179,7 @@ def count_limits(
     return CountLimits(
         per_view=superpixels_per_view(scene, segment) if views else 0,
         default=default_count(scene, segment, decode),
-        min_count=views,
+        min_count=max(1, views),
         max_count=max_count,
         exact=exact,
         num_pixels=views * scene.pixels_per_view,

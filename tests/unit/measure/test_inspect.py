@@ -221,11 +221,18 @@ def test_rows_in_no_order(tmp_path: Path) -> None:
     assert "rows" not in lines
 
 
-@pytest.mark.parametrize("cameras", [False, True])
-def test_what_compact_would_refuse(tmp_path: Path, cameras: bool) -> None:
-    save_export(tmp_path, SMOOTH, export_rows(SMOOTH), cameras=cameras)
-    if cameras:
-        (tmp_path / "transforms.json").write_text("nonsense")
+def test_no_cameras(tmp_path: Path) -> None:
+    save_export(tmp_path, SMOOTH, export_rows(SMOOTH), cameras=False)
+    lines = said(tmp_path)
+    assert names(lines["alignment"], "not", "no cameras")
+    assert names(lines["compact"], 228, "4.4 %")
+    assert names(lines["method"], "pair by pair", "fit: none")
+    assert names(lines["note"], "no cameras", "--cameras", "--images")
+
+
+def test_what_compact_would_refuse(tmp_path: Path) -> None:
+    save_export(tmp_path, SMOOTH, export_rows(SMOOTH))
+    (tmp_path / "transforms.json").write_text("nonsense")
     lines = said(tmp_path)
     assert lines["alignment"].startswith("not ")
     assert "refuse" in lines["compact"]

@@ -1,0 +1,79 @@
+"""Merge Gaussians pair by pair, the cheapest pair of a cell of neighbours first."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsmerge.kernels.signature import STATUS, declare, f4, f8, i4, i8, native
+
+CELL = 64  # Gaussians, at most
+WORK = 16  # rows of the work space
+
+
+@native(
+    quats=f4("n", 4), scales=f4("n", 3), opacities=f4("n"), flatness=f8(), covars=f4("n", 6, out=True),
+    masses=f4("n", out=True),
+)  # fmt: skip
+def gaussian_moments(quats, scales, opacities, flatness, covars, masses):
+    """Write covariances ``[n,6]`` (xx, xy, xz, yy, yz, zz) and masses ``[n]``: opacity times the two largest scales.
+
+    Args:
+        quats: ``[n,4]`` wxyz of any length.
+        scales: ``[n,3]`` standard deviations.
+        opacities: ``[n]``.
+        flatness: Least scale, as a share of the largest.
+        covars: Written.
+        masses: Written.
+    """
+
+
+# work and spare are work space for a cell
+_agglomerate = declare(
+    "agglomerate", STATUS, means=f8("n", 3), covars=f4("n", 6), masses=f4("n"), colors=f4("n", 3),
+    order=i8("n", least=0, below="n"), starts=i8("ends", least=0, ascending=True), color_weight=f8(), exponent=f8(),
+    least_share=f8(), first=i8(), last=i8(), work=f4(WORK, CELL, out=True), spare=i4(3, CELL, out=True),
+    pairs=i4("n", 2, out=True), costs=f4("n", out=True),
+)  # fmt: skip
+
+
+def agglomerate(
+    means, covars, masses, colors, order, starts, color_weight, exponent, least_share, first, last, pairs, costs
+):
+    """Write the merges of cells ``first`` to ``last``, in each the cheapest pair that is left, one after the other.
+
+    A pair costs Runnalls' bound (2007) on the divergence that its merging brings, per mass, plus the squared distance
+    of colours, times a power of its mass. Sizes and masses are in units of the cell's means, so the costs of cells
+    compare. A merge counts at least as much as those before it in its cell, so merges up to any cost are the first
+    ones of every cell.
+
+    Args:
+        means: ``[n,3]`` float64.
+        covars: ``[n,6]`` float32, upper triangles.
+        masses: ``[n]`` float32.
+        colors: ``[n,3]`` float32.
+        order: ``[n]`` int64 rows, cell by cell.
+        starts: ``[c+1]`` int64 into the order, at most ``CELL`` apart.
+        color_weight: Of squared distances of colours against nats.
+        exponent: Power of the mass.
+        least_share: Share of a cell's Gaussians that is left in the end; one, at least.
+        first: First cell.
+        last: The cell after the last one.
+        pairs: ``[n,2]`` int32, written from each cell's start on: the row that a merge keeps, and the other.
+        costs: ``[n]`` float32, written alike. Both keep what they hold where there is no merge.
+    """
+    work, spare = np.empty((WORK, CELL), np.float32), np.empty((3, CELL), np.int32)
+    _agglomerate(
+        means, covars, masses, colors, order, starts, color_weight, exponent, least_share, first, last, work, spare,
+        pairs, costs,
+    )  # fmt: skip
+
+
+@native(
+    STATUS, pairs=i4("m", 2), means=f8("n", 3, out=True), covars=f4("n", 6, out=True), masses=f4("n", out=True),
+    sh=f4("n", "columns", out=True), sizes=i4("n", out=True),
+)  # fmt: skip
+def merge_pairs(pairs, means, covars, masses, sh, sizes):
+    """Replace the first row of each pair by the Gaussian with the moments of both, one pair after the other.
+
+    Masses and ``sizes``, how many were merged, add up; harmonics are means by mass. The second rows stay as they are.
+    """

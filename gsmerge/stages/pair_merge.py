@@ -1,0 +1,129 @@
+"""Gaussians -> fewer Gaussians by their positions and colours alone: for scenes of which no view is known.
+
+Cells of a k-d tree are merged pair by pair, the cheapest pairs of all cells first, in rounds whose cells differ. Masses
+add up, opacity times the area of the ellipse of the two largest scales, so a surface stays as opaque as it was.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmerge.kernels.elementary import log
+from gsmerge.kernels.gaussians.cross_view import LEAF, build_tree
+from gsmerge.kernels.gaussians.pairs import CELL, agglomerate, gaussian_moments, merge_pairs
+from gsmerge.moments import MAX_OPACITY, principal_axes
+from gsmerge.runtime.record import stage
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.types import Gaussians, to_float32
+
+LEFT = 0.25  # share of the Gaussians that a round leaves, at least
+LEAST_LEFT = 0.2  # the same in each cell: longer chains of merges end in haze
+# Chosen on training scenes by the PSNR of views from cameras at random (docs/laboratory/notebook.md#bare-files)
+COLOR_WEIGHT = 3.0  # of squared distances of harmonics of degree 0 against nats
+MASS_POWER = 0.7  # of the cost
+FLATNESS = 0.01  # least scale over the largest, so that the logarithm of the volume stays finite
+MIN_OPACITY = 1e-4  # of what is merged, so that masses stay positive
+WIDER = 0.05  # by how much scales grow for each doubling of what was merged: fewer Gaussians leave more gaps
+CELLS_PER_TASK = 256
+
+
+@dataclass(eq=False)
+class _Cloud:
+    """Moments of n Gaussians, the form in which they are merged."""
+
+    means: np.ndarray  # [n,3] float64
+    covars: np.ndarray  # [n,6] float32 upper triangles
+    masses: np.ndarray  # [n] float32
+    sh: np.ndarray  # [n,3k] float32
+    sizes: np.ndarray  # [n] int32, Gaussians merged
+    rows: np.ndarray  # [n] int64, of the first of them in the input
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def __getitem__(self, rows: np.ndarray) -> _Cloud:
+        return _Cloud(**{name: column[rows] for name, column in vars(self).items()})
+
+
+@stage("reduce")
+def merge_neighbors(gaussians: Gaussians, count: int) -> Gaussians:
+    """Merge finite Gaussians of any frame into ``count``, at least one; none is dropped. All if there are no more."""
+    count = max(1, count)
+    if len(gaussians) <= count:
+        return gaussians
+    cloud = _cloud_of(gaussians)
+    while len(cloud) > count:
+        cloud = _merge_round(cloud, max(count, int(LEFT * len(cloud))))
+    return _gaussians_of(cloud, gaussians)
+
+
+def _cloud_of(g: Gaussians) -> _Cloud:
+    count = len(g)
+    covars, masses = np.empty((count, 6), np.float32), np.empty(count, np.float32)
+    quats, scales = (np.ascontiguousarray(column, np.float32) for column in (g.quats, g.scales))
+    gaussian_moments(quats, scales, g.opacities.astype(np.float32).clip(MIN_OPACITY, 1), FLATNESS, covars, masses)
+    sh = np.concatenate([g.sh0, g.shN], 1, dtype=np.float32).reshape(count, -1)
+    return _Cloud(g.means.astype(np.float64), covars, masses, sh, np.ones(count, np.int32), np.arange(count))
+
+
+def _merge_round(cloud: _Cloud, count: int) -> _Cloud:
+    """Merge the cheapest pairs of all cells until ``count`` Gaussians are left, or as few as the cells give."""
+    order, starts = _divide(cloud.means)
+    pairs, costs = np.zeros((len(cloud), 2), np.int32), np.full(len(cloud), np.inf, np.float32)
+    colors = np.ascontiguousarray(cloud.sh[:, :3])
+
+    def work(first: int) -> None:
+        last = min(first + CELLS_PER_TASK, len(starts) - 1)
+        agglomerate(
+            cloud.means, cloud.covars, cloud.masses, colors, order, starts, COLOR_WEIGHT, MASS_POWER,
+            LEAST_LEFT, first, last, pairs, costs,
+        )  # fmt: skip
+
+    parallel_map(work, range(0, len(starts) - 1, CELLS_PER_TASK))
+    chosen = pairs[_cheapest(costs, len(cloud) - count)]
+    if len(chosen) == 0:  # costs that are no numbers: what weighs most stays
+        return cloud[np.sort(np.argsort(-cloud.masses, kind="stable")[:count])]
+    merge_pairs(chosen, cloud.means, cloud.covars, cloud.masses, cloud.sh, cloud.sizes)
+    left = np.ones(len(cloud), bool)
+    left[chosen[:, 1]] = False
+    return cloud[left]
+
+
+def _divide(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Divide means ``[n,3]`` into cells of neighbours: their order ``[n]`` and where each cell starts ``[c+1]``."""
+    count = len(means)
+    starts = np.array([0, count])
+    while (starts[1:] - starts[:-1]).max() > CELL:  # as the tree halves its runs
+        starts = np.sort(np.concatenate([starts, (starts[1:] + starts[:-1]) // 2]))
+    nodes = 4 << (count // LEAF).bit_length()
+    order = np.arange(count)
+    build_tree(means, order, np.zeros(nodes, np.int8), np.zeros(nodes))
+    return order, starts
+
+
+def _cheapest(costs: np.ndarray, count: int) -> np.ndarray:
+    """Return the rising places of the ``count`` lowest finite costs ``[n]``; of equals the first."""
+    finite = np.isfinite(costs)
+    count = min(count, int(finite.sum()))
+    if count == 0:
+        return np.zeros(0, np.int64)
+    highest = np.partition(costs, count - 1)[count - 1]
+    below, equal = np.flatnonzero(costs < highest), np.flatnonzero(costs == highest)
+    return np.sort(np.concatenate([below, equal[: count - len(below)]]))
+
+
+def _gaussians_of(cloud: _Cloud, source: Gaussians) -> Gaussians:
+    """Convert moments to Gaussians; what was merged with nothing stays as it was."""
+    scales, quats = principal_axes(cloud.covars[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3))
+    opacities = np.minimum(cloud.masses / (scales[:, 1] * scales[:, 2]), MAX_OPACITY)
+    scales *= 1 + WIDER * log(cloud.sizes.astype(np.float64))[:, None] / float(log(2.0))
+    sh = cloud.sh.reshape(len(cloud), -1, 3)
+    out = Gaussians(
+        to_float32(cloud.means), to_float32(quats), to_float32(scales), to_float32(opacities), sh[:, :1], sh[:, 1:]
+    )
+    alone = np.flatnonzero(cloud.sizes == 1)
+    for name, column in vars(out).items():
+        column[alone] = getattr(source, name)[cloud.rows[alone]]
+    return out

@@ -1,0 +1,94 @@
+"""A scene of which no view is known: the views that judge its results."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+import unaligned_scenes
+from messages import noted
+
+from gsmerge import CompactOptions, Gaussians, Scene, compact, render
+from gsmerge.facts.place_cameras import JUDGES
+from gsmerge.facts.prepare import Prepared, prepare_alone
+from gsmerge.geometry import project
+from gsmerge.plan import stands_alone
+from gsmerge.runtime.record import record_run
+
+
+@pytest.fixture(scope="module")
+def bare() -> Scene:
+    room = scenes.make_scene(scenes.room(), scenes.arc(3), noise=0.01)
+    return Scene(room.gaussians, unaligned_scenes.NO_CAMERAS, None, None, ())
+
+
+@pytest.fixture(scope="module")
+def prepared(bare: Scene) -> Prepared:
+    return prepare_alone(bare)
+
+
+def test_views_show_the_input_and_nothing_is_fitted_to_them(prepared: Prepared) -> None:
+    assert prepared.alone
+    assert prepared.photo_views == ()
+    scene = prepared.scene
+    assert 1 <= len(scene) <= JUDGES
+    np.testing.assert_array_equal(scene.images, render(scene.gaussians, scene.cameras).images.clip(0, 1))
+    assert scene.images.std() > 0.05
+
+
+def test_views_together_show_most(prepared: Prepared) -> None:
+    cameras = prepared.scene.cameras
+    pixels, depths = project(prepared.scene.gaussians.means.astype(np.float64), cameras)
+    seen = (depths > 0) & ((pixels > 0) & (pixels < (cameras.width, cameras.height))).all(-1)
+    assert seen.any(0).mean() > 0.95
+
+
+def test_fog_and_holes_are_seen(bare: Scene) -> None:
+    """A result that lacks a part, or has a cloud beside the scene, is judged worse than one that has neither."""
+    result = compact(bare, budget="30%")
+    judged = result.report.choices["fidelity"]["psnr"]
+    g = bare.gaussians
+    half = Scene(g[g.means[:, 0] < np.median(g.means[:, 0])], unaligned_scenes.NO_CAMERAS, None, None, ())
+    for spoilt in (_with_fog(result.gaussians), compact(half, budget="30%").gaussians):
+        prepared = prepare_alone(bare)
+        shown = render(prepared.frame.enter(spoilt), prepared.scene.cameras).images.clip(0, 1)
+        error = np.square(shown - prepared.scene.images).mean((1, 2, 3))
+        assert -10 * np.log10(error).mean() < judged - 3
+
+
+def _with_fog(gaussians: Gaussians) -> Gaussians:
+    middle, spread = np.median(gaussians.means, 0), np.ptp(gaussians.means, 0).max()
+    one = gaussians[:1]
+    fog = replace(
+        one,
+        means=(middle + np.array([0, spread / 2, 0]))[None].astype(one.means.dtype),
+        scales=np.full((1, 3), spread / 4, np.float32),
+        opacities=np.full(1, 0.7, np.float32),
+        sh0=np.full((1, 1, 3), 1.5, np.float32),
+    )
+    return Gaussians.concat([gaussians, fog])
+
+
+def test_one_note(bare: Scene) -> None:
+    with record_run() as record:
+        prepare_alone(bare)
+    assert len(record.notes) == 1
+    assert noted(record.notes, "no cameras", "--cameras", "--images")
+
+
+def test_networks_and_other_methods_ask_for_views(bare: Scene) -> None:
+    options = CompactOptions()
+    assert stands_alone(bare, options)
+    assert not stands_alone(bare, options.with_settings({"checkpoint": "shipped"}))
+    assert not stands_alone(bare, options.with_settings({"method": "random"}))
+    assert not stands_alone(unaligned_scenes.without_order(scenes.make_scene(scenes.room(), scenes.arc(2))), options)
+
+
+def test_nothing_is_left_out(bare: Scene) -> None:
+    """Also what lies behind all views takes part."""
+    far = unaligned_scenes.far_behind(bare.gaussians, 40)
+    result = compact(replace(bare, gaussians=Gaussians.concat([bare.gaussians, far])), budget="20%")
+    middle = far.means.mean(0)
+    assert (np.abs(result.gaussians.means - middle) < np.ptp(far.means, 0) + 1).all(1).any()
