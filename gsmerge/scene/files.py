@@ -157,10 +157,12 @@ def find_plys(folder: Path, cameras: Path | None = None) -> list[Path]:
 def list_plys(folder: Path) -> list[Path]:
     """List the files that may be a folder's scene.
 
-    That is the one of a usual name, those in the folder, in ``gaussians/`` or further down, or only results of gsmerge.
+    That is the one of a usual name, those in the folder, in ``gaussians/`` or further down, or only results of gsmerge;
+    at last one of a usual name that holds no Gaussians, so that its reader says what it lacks.
     """
     plys = _plys_in(folder) or other_plys(folder / SCENES_PLACE)
-    return plys or [ply for place in _scenes_below(folder) for ply in _plys_in(place)] or _results_in(folder)
+    plys = plys or [ply for place in _scenes_below(folder) for ply in _plys_in(place)] or _results_in(folder)
+    return plys or [folder / place for place in PLY_PLACES if (folder / place).is_file()][:1]
 
 
 def _plys_in(folder: Path) -> list[Path]:

@@ -81,6 +81,16 @@ def test_the_scene_of_a_folder(tmp_path: Path, ply: str, beside: tuple[str, ...]
     assert check_content(tmp_path).count == len(SMOOTH.gaussians)
 
 
+def test_points_of_a_usual_name(tmp_path: Path) -> None:
+    """Gaussians beside them are the scene; alone, the reader says what they lack."""
+    points = np.zeros(7, [(name, "f4") for name in "xyz"])
+    save_export(tmp_path, SMOOTH, points, cameras=False, name="scene.ply")
+    with refuses(SceneError, "scene.ply", "opacity", "rot_0"):
+        load_scene(tmp_path)
+    save_export(tmp_path, SMOOTH, export_rows(SMOOTH), cameras=False, name="room.ply")
+    assert find_scene_files(tmp_path).ply == tmp_path / "room.ply"
+
+
 def test_the_most_steps_of_gsplat_s_trainer(tmp_path: Path) -> None:
     for name in ("ply/point_cloud_6999.ply", "ply/point_cloud_29999.ply"):
         save_export(tmp_path / "ply", SMOOTH, export_rows(SMOOTH), cameras=False, name=Path(name).name)
