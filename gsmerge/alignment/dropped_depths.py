@@ -13,7 +13,7 @@ from gsmerge.types import Gaussians, Scene, grid_ids
 
 _MAX_SPREAD = 0.15  # of the Gaussians' depth over a depth map's: above it the map is not that of the Gaussians
 _FACTORS = np.geomspace(1, 8, 13)  # of the largest depth that was kept: those of far pixels
-_FARTHER = 0.003  # distance of colours, 0 to 1, that the next factor must gain
+_FARTHER = 0.003  # distance of colours, 0 to 1, that the next depth must gain
 _LARGEST = 0.99  # quantile that counts as the largest
 _OTHERS = 4  # nearest views that a photo is compared with
 _AROUND = 6  # pixels on either side over which colours are compared
