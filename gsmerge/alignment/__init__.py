@@ -2,7 +2,8 @@
 
 ``search`` tries sizes of the grid and readings of the poses, ``recovery`` the readings of the rows in one grid: from
 ``layouts``, or, with pixels missing, from ``ordered_rows`` and ``incomplete``. ``score`` measures them. ``cameras``
-reads or moves poses, ``unaligned`` chooses those of rows without pixels, ``estimate`` and ``focal`` solve for cameras.
+reads or moves poses, ``unaligned`` chooses those of rows without pixels, ``upright`` those of rows in a frame that no
+file has, ``estimate`` and ``focal`` solve for cameras.
 """
 
 # ruff: noqa: F401  names for other packages

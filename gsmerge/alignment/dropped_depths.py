@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import fields, replace
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt
 
 from gsmerge.alignment.layouts import TRIMS, da3_trim
 from gsmerge.geometry import camera_depths, project_points, rgb_to_sh0
@@ -14,7 +13,7 @@ from gsmerge.types import Gaussians, Scene, grid_ids
 
 _MAX_SPREAD = 0.15  # of the Gaussians' depth over a depth map's: above it the map is not that of the Gaussians
 _FACTORS = np.geomspace(1, 8, 13)  # of the largest depth that was kept: those of far pixels
-_FARTHER = 0.003  # distance of colours, 0 to 1, that the next factor must gain
+_FARTHER = 0.003  # distance of colours, 0 to 1, that the next depth must gain
 _LARGEST = 0.99  # quantile that counts as the largest
 _OTHERS = 4  # nearest views that a photo is compared with
 _AROUND = 6  # pixels on either side over which colours are compared
@@ -88,13 +87,29 @@ def guess_depths(scene: Scene) -> np.ndarray:
         inner = np.zeros_like(kept)
         inner[np.ix_(y, x)] = ~kept[np.ix_(y, x)]
         if kept.any():
-            nearest = distance_transform_edt(~kept, return_distances=False, return_indices=True)
-            beside = depth[tuple(nearest)][inner]
+            beside = depth.reshape(-1)[_nearest_kept(kept)[inner]]
             farthest = float(np.quantile(depth[kept], _LARGEST))
             depths = np.concatenate([beside[None], np.repeat(farthest * _FACTORS[:, None], len(beside), 1)])
             depth[inner] = _agreeing_depths(scene, view, inner, depths)
         maps[view] = np.where(kept, depth, depth[np.ix_(y, x)])
     return maps
+
+
+def _nearest_kept(kept: np.ndarray) -> np.ndarray:
+    """Return for each pixel the index ``y·w + x [h,w]`` of the nearest of ``kept [h,w]`` in its row or column.
+
+    The first one of all where there is none; at least one pixel must be kept.
+    """
+    ids = np.arange(kept.size).reshape(kept.shape)
+    least, chosen = np.full(kept.shape, kept.size), np.full(kept.shape, int(kept.argmax()))
+    for axis, step in ((0, kept.shape[1]), (1, 1)):
+        before = np.maximum.accumulate(np.where(kept, ids, -1), axis=axis)
+        after = np.flip(np.minimum.accumulate(np.flip(np.where(kept, ids, kept.size), axis), axis=axis), axis)
+        for nearest, missing in ((before, before < 0), (after, after == kept.size)):
+            distance = np.where(missing, kept.size, np.abs(nearest - ids) // step)
+            nearer = distance < least
+            least[nearer], chosen[nearer] = distance[nearer], nearest[nearer]
+    return chosen
 
 
 def _without_borders(stored: np.ndarray) -> np.ndarray:

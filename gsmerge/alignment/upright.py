@@ -32,13 +32,14 @@ from gsmerge.types import Cameras
 
 _QUANTILE = 0.95  # of the distances along the widest axis, which is 1 in such a file
 _SMALL = 1e-3  # how exactly
-_ROUGH_SAMPLES, _ROUGH = 2000, 0.5  # rows that are looked at first, and how far their middle may be off
+_ROUGH_SAMPLES, _ROUGH = 2000, 1.0  # rows that are looked at first, and how far off before they are turned back
 _PER_PIXEL = (1, 2, 3)  # Gaussians of a pixel
 _LENGTH, _STRETCHES = 48, 96  # rows of a stretch without gaps, and stretches that are searched
 _PER_STRETCH = 12  # rows of each that the frame is solved from
 _SHARE = 3  # part of the rows that fused views begin and end with
 _SLACK = 8  # pixels more than the bounds on both sides that are searched
 _MAX_COST = 3.0  # times the distance of the nearest quarter of the stretches
+_FAR = 1 << 30  # distance of a stretch that has no place
 _PAIRS = 200  # of stretches from which a frame is tried
 _NEAR = 3.0  # times the limit of pixels that count as agreeing with a frame tried from two stretches
 _ROUNDS = 3  # of a frame and the stretches that agree with it
@@ -94,12 +95,12 @@ def _possible_orders(count: int, cameras: Cameras) -> Iterator[tuple[np.ndarray,
     for per_pixel in _PER_PIXEL:  # row, column, layer, view, with pixels dropped
         step = views * per_pixel
         dropped = len(inner) * step - count
-        if 0 <= dropped < count:
+        if 0 <= dropped < count and count >= _LENGTH * step:
             starts = np.unique(np.linspace(0, count - _LENGTH * step, _STRETCHES).astype(int))
             bounds = [(int(start), start // step - _SLACK, (start + dropped) // step + _SLACK) for start in starts]
             yield inner, [_Try(view, start, step, low, high) for start, low, high in bounds for view in range(views)]
     # views that are fused one after the other: what only the first one shows comes first, of the last one last
-    if count < views * len(every):
+    if _SHARE * _LENGTH <= count < views * len(every):
         starts = np.unique(np.linspace(0, count // _SHARE, _STRETCHES).astype(int))
         first = [_Try(0, int(start), 1, int(start) - _SLACK, len(every)) for start in starts]
         ends = (len(every) - t.start - _LENGTH + _SLACK for t in first)
@@ -115,7 +116,7 @@ def _match(inputs: AlignmentInput, tries: Sequence[_Try], pixels: np.ndarray) ->
     rows = np.array([t.start + t.step * np.arange(_LENGTH) for t in tries])
     bounds = [(max(0, t.low), min(len(pixels), t.high)) for t in tries]
     places = np.array([
-        place_stretch(shown[t.view], colors[:, stretch], low, high) if low < high else (0, 1, 0)
+        place_stretch(shown[t.view], colors[:, stretch], low, high) if low < high else (0, _FAR, 0)
         for t, stretch, (low, high) in zip(tries, rows, bounds, strict=True)
     ])  # fmt: skip
     near = places[:, 1] <= _MAX_COST * max(1.0, float(np.quantile(places[:, 1], 0.25)))

@@ -127,3 +127,9 @@ def test_no_frame_is_chosen_in_which_photos_are_far_from_the_rows(tmp_path: Path
     moved = turned(rows, np.eye(3), scale=1.3, shift=np.array([0.3, -0.2, 0.4]))
     with refuses(SceneError, "scene.ply", "cameras"):
         load_scene(save_export(tmp_path, textured, moved))
+
+
+def test_too_few_rows_for_a_stretch(tmp_path: Path, textured: Smooth) -> None:
+    rows, _, _ = upright(textured, export_rows(textured, far_cut(textured)[:100]))
+    with refuses(SceneError, "scene.ply"):
+        load_scene(save_export(tmp_path, textured, rows))
