@@ -61,6 +61,7 @@ def report_document(
 
     Returns:
         ``schema_version`` 1, within which keys are only ever added. ``unmet``: why a target is not met, or null.
+        ``psnr_reference``: what stands in for photos in ``psnr_input_views``, "photos" where there are some.
         ``psnr_covered``: ``share``, ``before``, ``after`` over the pixels that the input covers, where it lacks some.
         ``worse``: that the result, or the first level that does, shows the photos worse than the input, or null.
     """
@@ -93,6 +94,7 @@ def report_document(
         "choices": numbers["choices"],
         **seconds_document({**seconds_before, **report.seconds, **seconds_after}),
         "psnr_input_views": {"before": numbers["psnr_before"], "after": numbers["psnr_after"]},
+        "psnr_reference": numbers["psnr_reference"] if report.psnr_before is not None else None,
         "psnr_covered": numbers["covered"],
         "peak_memory_bytes": numbers["peak_memory_bytes"],
         "notes": [*notes, *numbers["notes"]],
@@ -158,7 +160,7 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None) -> l
         ("file", human_bytes(before["bytes"]), human_bytes(after["bytes"]), ""),
     ]
     if psnr["before"] is not None and psnr["after"] is not None:
-        views = f"in {document['choices']['scored_views']} of the input views"
+        views = f"in {document['choices']['scored_views']} of the input views{_against(document)}"
         rows += [("PSNR", f"{psnr['before']:.2f} dB", f"{psnr['after']:.2f} dB", views)]
     if covered := document["psnr_covered"]:
         share = f"on the {100 * covered['share']:.0f} % that the input covers"
@@ -207,6 +209,7 @@ def summary_line(document: Mapping[str, Any]) -> str:
         if psnr["before"] is not None and psnr["after"] is not None
         else ""
     )
+    quality += _against(document)
     if covered := document["psnr_covered"]:
         share = f"on the {100 * covered['share']:.0f} % of their pixels that the input covers"
         quality += f", {covered['before']:.2f} -> {covered['after']:.2f} dB {share}"
@@ -215,6 +218,11 @@ def summary_line(document: Mapping[str, Any]) -> str:
         f" ({100 * document['ratio']:.2f} %), {human_bytes(before['bytes'])} -> {human_bytes(after['bytes'])}"
         f"{quality}; {seconds_line(document)}{cameras}"
     )
+
+
+def _against(document: Mapping[str, Any]) -> str:
+    """Say what PSNR is measured against, if not against photos."""
+    return "" if document["psnr_reference"] in (None, "photos") else f" against {document['psnr_reference']}"
 
 
 def seconds_document(seconds: Mapping[str, float]) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from gsmerge.compaction.compact import compact
 from gsmerge.compaction.methods import check_method
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import SceneError, UsageError
+from gsmerge.facts.row_colors import NO_PHOTOS
 from gsmerge.fit.gpu import choose_backend
 from gsmerge.io import atomic_outputs, lost_harmonics, output_format, write_gaussians
 from gsmerge.io.atomic import AddOutput
@@ -32,9 +33,8 @@ from gsmerge.scene.files import SceneFiles
 from gsmerge.scene.read import Loaded, load_files
 from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.settings.reading import OpacityChoice
+from gsmerge.stages.segment import measure_size
 from gsmerge.types import Scene
-
-NO_PHOTOS = "no photos found, so nothing is fitted and no PSNR measured; name their folder with --images"
 
 
 @dataclass(frozen=True)
@@ -122,12 +122,13 @@ def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict
     _, unused = check_method(settings, scene)
     backend, problem = choose_backend(settings.device, scene.num_gaussians)
     settings = replace(settings, device=backend.device)
-    notes = [*load.notes, *unused, *([] if problem is None else [problem])]
+    no_photos = [NO_PHOTOS] if scene.aligned and scene.images is None else []
+    notes = [*load.notes, *unused, *no_photos, *([] if problem is None else [problem])]
     if os.path.lexists(out) and not outputs.overwrite:
         notes.append(f"{out} exists already: --overwrite would replace it")
     with record_run() as record:
         if settings.method == OURS and settings.checkpoint != "auto":  # which the run may refuse
-            load_networks(settings, scene, photos=scene.images is not None)
+            load_networks(settings, scene, photos=measure_size(scene).photos)
         run = estimate(scene, settings)
     paths = {name: path and str(path) for name, path in vars(load.files).items() if name != "more"}
     return {
@@ -194,8 +195,7 @@ def read_input(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: Rea
     """Read a scene from its files, and note what is missing or odd; raise SceneError if it cannot be read."""
     loaded = load_files(files, opacity=opacity, hints=hints).without_photos()
     release_memory()
-    no_photos = [NO_PHOTOS] if loaded.scene.aligned and loaded.scene.images is None else []
-    return replace(loaded, notes=(*loaded.notes, *no_photos, *_compact_notes(loaded)))
+    return replace(loaded, notes=(*loaded.notes, *_compact_notes(loaded)))
 
 
 def check_saved_cameras(scene: Scene, path: Path | None, *, embed: bool = False) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsmerge.facts.prepare import Prepared, scene_depth
+from gsmerge.facts.row_colors import PHOTOS
 from gsmerge.fit import FitBackend, Fitted, run_on
 from gsmerge.io.cameras.camera_file import describe_moves, list_moves
 from gsmerge.plan import Plan
@@ -57,6 +58,7 @@ class CompactReport:
         unmet: Why a target that was asked for is not met, and how far the result got; None if it is.
         worse: That the result shows the scene's own photos by more than .5 dB worse than the input does, a sentence
             that is among the notes, too; None where it does not, or photos cannot say it: none, odd ones, or a crop.
+        psnr_reference: What PSNR of the input views is measured against: "photos", or "the rows' own colours".
         covered: PSNR over the pixels that the input covers, where it lacks more than 2 % of them; None where it does
             not.
 
@@ -78,6 +80,7 @@ class CompactReport:
     unmet: str | None = None
     worse: str | None = None
     covered: Covered | None = None
+    psnr_reference: str = PHOTOS
 
 
 @dataclass(frozen=True)
@@ -217,7 +220,7 @@ def make_result(
     run, seconds = current_record(), search["seconds"]
     input_score = measure_input(prepared, plan)
     before = None if input_score is None else input_score.psnr
-    comparable = prepared.photo_views and not plan.clean.hides  # or photos show something else
+    comparable = prepared.photo_views and prepared.reference == PHOTOS and not plan.clean.hides
     covered = [
         measure_covered(input_score, candidate.gaussians, _move_views(prepared, candidate.fitted.cameras), plan)
         for candidate in (best, *levels)
@@ -227,7 +230,7 @@ def make_result(
         counts, record = (prepared.input_scene.num_gaussians, len(candidate.gaussians)), candidate.record
         made = CompactReport(
             *counts, dict(seconds), before, candidate.psnr, record.choices, record.notes, plan.settings, peak_memory(),
-            covered=covered,
+            covered=covered, psnr_reference=prepared.reference,
         )  # fmt: skip
         compared = (covered.before, covered.after) if covered else (before, candidate.psnr)
         worse = describe_loss(name, *compared) if comparable else None

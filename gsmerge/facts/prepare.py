@@ -17,6 +17,7 @@ from gsmerge.facts.align_views import align_views
 from gsmerge.facts.compare_photos import compare_photos
 from gsmerge.facts.exposure import equalise_exposure
 from gsmerge.facts.place_cameras import add_pictures, add_views
+from gsmerge.facts.row_colors import PHOTOS, ROW_COLORS, add_row_colors
 from gsmerge.facts.views import distinct_views, subset
 from gsmerge.geometry import camera_depths, lower_median, project
 from gsmerge.kernels.matrices import matmul
@@ -119,6 +120,7 @@ class Prepared:
     repeated: tuple[int, ...]  # Place in the scene of every given view
     moved: bool  # Whether views were moved to where their photos agree, before a fit or by it
     unseen: Gaussians | None  # Canonical Gaussians that no view sees, if kept
+    reference: str = PHOTOS  # What the result is fitted to and measured against
 
     def with_cameras(self, cameras: Cameras) -> Prepared:
         """Return a copy with the canonical cameras that a fit has moved."""
@@ -152,6 +154,9 @@ def prepare(scene: Scene, options: PrepareOptions | None = None, frame: Frame | 
         scene = subset(scene, views)
     scene, frame = canonicalise(add_views(scene), frame)
     scene, photo_views = compare_photos(scene)
+    colored = scene.aligned and scene.images is None
+    if colored:
+        scene, photo_views = add_row_colors(scene), tuple(range(len(scene)))
     input_scene = _with_photos(input_scene, scene, repeated)
     scene, moved, unseen = equalise_exposure(scene, photo_views, options.exposure), None, None
     if scene.aligned and scene.images is not None and options.poses != "fixed":
@@ -161,7 +166,17 @@ def prepare(scene: Scene, options: PrepareOptions | None = None, frame: Frame | 
         scene, unseen = _split_unseen(scene)
     if not scene.aligned:  # pixels that are known have colours of their own
         scene = add_pictures(scene)
-    return Prepared(input_scene, scene, frame, photo_views, tuple(repeated), moved is not None, unseen)
+    reference = ROW_COLORS if colored else PHOTOS
+    return Prepared(input_scene, scene, frame, photo_views, tuple(repeated), moved is not None, unseen, reference)
+
+
+def with_row_colors(scene: Scene) -> Scene:
+    """Return a scene with its rows' own colours where it has pixels and no photos, as :func:`prepare` puts them."""
+    if scene.images is not None or not scene.aligned or len(scene) == 0:
+        return scene
+    with record_part(silent=True):
+        colored = add_row_colors(canonicalise(scene)[0])
+    return replace(scene, images=colored.images, masks=colored.masks)
 
 
 def photos_count_as_they_are(scene: Scene) -> bool:
@@ -176,10 +191,11 @@ def photos_count_as_they_are(scene: Scene) -> bool:
 
 def _with_photos(scene: Scene, source: Scene, repeated: Sequence[int]) -> Scene:
     """Return the given scene with the photos and masks of its distinct views; itself where they are its own."""
-    if source.images is None or scene.images is None or (source.images is scene.images and source.masks is scene.masks):
+    if source.images is None or (source.images is scene.images and source.masks is scene.masks):
         return scene
     images, masks = (None if array is None else array[list(repeated)] for array in (source.images, source.masks))
-    return replace(scene, images=images, masks=masks)
+    large = scene.large_photos if source.large_photos is not None else None
+    return replace(scene, images=images, masks=masks, large_photos=large)
 
 
 def _split_unseen(scene: Scene) -> tuple[Scene, Gaussians | None]:
