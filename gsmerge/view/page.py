@@ -87,9 +87,9 @@ def report_page(document: Mapping[str, Any], pictures: Sequence[Sequence[tuple[s
     if len(results) > 1:
         before, after = results[:2]
         split = "target" if "target" in before["mean"] else "context"
-        psnrs = [result["mean"][split]["psnr_visible"] for result in (before, after)]
+        old, new = (result["mean"][split]["psnr_visible"] for result in (before, after))
         reference = PHOTOS if split == "target" else document["reference"]
-        headline = headline_of(before["num_gaussians"], after["num_gaussians"], *psnrs, reference)
+        headline = headline_of(before["num_gaussians"], after["num_gaussians"], old, new, reference)
         milliseconds = [1000 * result["render_seconds"] for result in (before, after)]
         tiles = [
             ("Gaussians", f"{before['num_gaussians']:,}", f"{after['num_gaussians']:,}"),
