@@ -61,7 +61,7 @@ def report_document(
 
     Returns:
         ``schema_version`` 1, within which keys are only ever added. ``unmet``: why a target is not met, or null.
-        ``psnr_reference``: what stands in for photos in ``psnr_input_views``, "photos" where there are some.
+        ``psnr_reference``: what ``psnr_input_views`` are measured against: "photos", or what stands in for them.
         ``psnr_covered``: ``share``, ``before``, ``after`` over the pixels that the input covers, where it lacks some.
         ``worse``: that the result, or the first level that does, shows the photos worse than the input, or null.
     """
@@ -94,7 +94,7 @@ def report_document(
         "choices": numbers["choices"],
         **seconds_document({**seconds_before, **report.seconds, **seconds_after}),
         "psnr_input_views": {"before": numbers["psnr_before"], "after": numbers["psnr_after"]},
-        "psnr_reference": numbers["psnr_reference"] if report.psnr_before is not None else None,
+        "psnr_reference": numbers["psnr_reference"],
         "psnr_covered": numbers["covered"],
         "peak_memory_bytes": numbers["peak_memory_bytes"],
         "notes": [*notes, *numbers["notes"]],
@@ -222,7 +222,8 @@ def summary_line(document: Mapping[str, Any]) -> str:
 
 def _against(document: Mapping[str, Any]) -> str:
     """Say what PSNR is measured against, if not against photos."""
-    return "" if document["psnr_reference"] in (None, "photos") else f" against {document['psnr_reference']}"
+    reference = document.get("psnr_reference")
+    return "" if reference in (None, "photos") else f" against {reference}"
 
 
 def seconds_document(seconds: Mapping[str, float]) -> dict[str, Any]:

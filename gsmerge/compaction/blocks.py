@@ -162,7 +162,7 @@ def fit_part(part: Part, everything: tuple[Gaussians, np.ndarray], number: int, 
     """
     (joined, owners), scene, plan = everything, part.prepared.scene, part.plan
     used = owners == number
-    if plan.fit.fit != "none" and scene.images is not None:
+    if plan.fit.fit != "none":
         used |= peak_weights(joined, blank_photos(scene.cameras, 2))[0] >= plan.fit.min_contribution
     rows = np.flatnonzero(used)
     decoded = Decoded(joined[rows], round(growth * len(rows)), exact=False)
@@ -309,7 +309,7 @@ def join_reports(
         mean([psnr for psnr, _ in scores]),
     )
     covered = _join_covered(parts, scores, sizes)
-    reference = parts[0].prepared.reference
+    reference = None if before is None else parts[0].prepared.reference
     compared = (covered.before, covered.after) if covered else (before, after)
     worse = describe_loss("the result", *compared) if reference == PHOTOS else None
     notes = list(dict.fromkeys(run.notes))

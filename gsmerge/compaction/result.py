@@ -58,7 +58,8 @@ class CompactReport:
         unmet: Why a target that was asked for is not met, and how far the result got; None if it is.
         worse: That the result shows the scene's own photos by more than .5 dB worse than the input does, a sentence
             that is among the notes, too; None where it does not, or photos cannot say it: none, odd ones, or a crop.
-        psnr_reference: What PSNR of the input views is measured against: "photos", or "the rows' own colours".
+        psnr_reference: What PSNR of the input views is measured against: "photos", or "the rows' own colours"; None
+            where it is not measured.
         covered: PSNR over the pixels that the input covers, where it lacks more than 2 % of them; None where it does
             not.
 
@@ -80,7 +81,7 @@ class CompactReport:
     unmet: str | None = None
     worse: str | None = None
     covered: Covered | None = None
-    psnr_reference: str = PHOTOS
+    psnr_reference: str | None = None
 
 
 @dataclass(frozen=True)
@@ -230,7 +231,7 @@ def make_result(
         counts, record = (prepared.input_scene.num_gaussians, len(candidate.gaussians)), candidate.record
         made = CompactReport(
             *counts, dict(seconds), before, candidate.psnr, record.choices, record.notes, plan.settings, peak_memory(),
-            covered=covered, psnr_reference=prepared.reference,
+            covered=covered, psnr_reference=None if before is None else prepared.reference,
         )  # fmt: skip
         compared = (covered.before, covered.after) if covered else (before, candidate.psnr)
         worse = describe_loss(name, *compared) if comparable else None

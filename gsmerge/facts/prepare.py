@@ -159,7 +159,7 @@ def prepare(scene: Scene, options: PrepareOptions | None = None, frame: Frame | 
         scene, photo_views = add_row_colors(scene), tuple(range(len(scene)))
     input_scene = _with_photos(input_scene, scene, repeated)
     scene, moved, unseen = equalise_exposure(scene, photo_views, options.exposure), None, None
-    if scene.aligned and scene.images is not None and options.poses != "fixed":
+    if scene.aligned and options.poses != "fixed":
         moved = align_views(scene, photo_views, always=options.poses == "free")
         scene = moved or scene
     if options.unseen == "keep":
@@ -191,7 +191,8 @@ def photos_count_as_they_are(scene: Scene) -> bool:
 
 def _with_photos(scene: Scene, source: Scene, repeated: Sequence[int]) -> Scene:
     """Return the given scene with the photos and masks of its distinct views; itself where they are its own."""
-    if source.images is None or (source.images is scene.images and source.masks is scene.masks):
+    drawn = scene.images is None and not scene.aligned  # what stands in there is for the fit alone
+    if source.images is None or drawn or (source.images is scene.images and source.masks is scene.masks):
         return scene
     images, masks = (None if array is None else array[list(repeated)] for array in (source.images, source.masks))
     large = scene.large_photos if source.large_photos is not None else None

@@ -111,7 +111,7 @@ def test_without_photos_and_pixels_nothing_is_measured(scene: Scene) -> None:
     bare = unaligned_scenes.without_order(replace(scene, images=None))
     report = compact(bare, fit_steps=4).report
     assert report.psnr_before is None
-    assert not {"input", "curve", "score"} & set(report.seconds)
+    assert not {"input", "curve"} & set(report.seconds)
 
 
 def test_options_and_settings_combine(scene: Scene) -> None:
