@@ -13,7 +13,7 @@ from gsmerge.compaction.compact import compact
 from gsmerge.compaction.methods import check_method
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.facts.row_colors import NO_PHOTOS
+from gsmerge.facts.row_colors import missing_photos
 from gsmerge.fit.gpu import choose_backend
 from gsmerge.io import atomic_outputs, lost_harmonics, output_format, write_gaussians
 from gsmerge.io.atomic import AddOutput
@@ -122,8 +122,7 @@ def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict
     _, unused = check_method(settings, scene)
     backend, problem = choose_backend(settings.device, scene.num_gaussians)
     settings = replace(settings, device=backend.device)
-    no_photos = [NO_PHOTOS] if scene.aligned and scene.images is None else []
-    notes = [*load.notes, *unused, *no_photos, *([] if problem is None else [problem])]
+    notes = [*load.notes, *unused, *missing_photos(scene), *([] if problem is None else [problem])]
     if os.path.lexists(out) and not outputs.overwrite:
         notes.append(f"{out} exists already: --overwrite would replace it")
     with record_run() as record:

@@ -49,7 +49,8 @@ class CompactReport:
         num_output: Gaussians in the result.
         seconds: Wall time of each stage.
         psnr_before: Mean PSNR (dB) of the input views rendered from the input, of many views some, and in a fixed
-            quarter of each unless a quality was asked for; None without photos. :func:`gsmerge.evaluate` is exact.
+            quarter of each unless a quality was asked for; None where neither photos nor pixels are known.
+            :func:`gsmerge.evaluate` is exact.
         psnr_after: The same from the result.
         choices: Decisions of the stages (count, curve, merge, scores, clusters, fit).
         notes: Warnings about the input and adaptations to it, one sentence each.
@@ -122,7 +123,7 @@ class Candidate:
     fitted: Fitted  # Fitted canonical Gaussians
     gaussians: Gaussians  # The same in the world, with those that no view sees
     cameras: Cameras  # The given views as the Gaussians were made from them, in the world
-    psnr: float | None  # Mean PSNR (dB) of the scored views; None without photos
+    psnr: float | None  # Mean PSNR (dB) of the scored views; None without photos and what stands in for them
     record: Record  # Seconds, choices and notes of building and scoring it
 
 

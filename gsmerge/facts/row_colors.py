@@ -32,6 +32,11 @@ BLUR = 8.0  # standard deviation, pixels
 DISAGREE = 0.2  # mean difference of blurred colours over the channels, sRGB, from which on the drawing is taken
 
 
+def missing_photos(scene: Scene) -> list[str]:
+    """Return the note that a run will make on what stands in for photos, before it looks at any colour."""
+    return [NO_PHOTOS] if scene.aligned and scene.images is None else []
+
+
 def add_row_colors(scene: Scene) -> Scene:
     """Put the colours of each view's own Gaussians in the place of a canonical scene's photos; a note says so."""
     kinds, shape = camera_kinds(scene.cameras), scene.valid.shape
