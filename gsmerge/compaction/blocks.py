@@ -309,7 +309,7 @@ def join_reports(
         mean([psnr for psnr, _ in scores]),
     )
     covered = _join_covered(parts, scores, sizes)
-    reference = None if before is None else parts[0].prepared.reference
+    reference = None if before is None else parts[0].prepared.reference.name
     compared = (covered.before, covered.after) if covered else (before, after)
     worse = describe_loss("the result", *compared) if reference == PHOTOS else None
     notes = list(dict.fromkeys(run.notes))

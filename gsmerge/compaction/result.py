@@ -222,7 +222,7 @@ def make_result(
     run, seconds = current_record(), search["seconds"]
     input_score = measure_input(prepared, plan)
     before = None if input_score is None else input_score.psnr
-    comparable = prepared.photo_views and prepared.reference == PHOTOS and not plan.clean.hides
+    comparable = prepared.photo_views and prepared.reference.name == PHOTOS and not plan.clean.hides
     covered = [
         measure_covered(input_score, candidate.gaussians, _move_views(prepared, candidate.fitted.cameras), plan)
         for candidate in (best, *levels)
@@ -232,7 +232,7 @@ def make_result(
         counts, record = (prepared.input_scene.num_gaussians, len(candidate.gaussians)), candidate.record
         made = CompactReport(
             *counts, dict(seconds), before, candidate.psnr, record.choices, record.notes, plan.settings, peak_memory(),
-            covered=covered, psnr_reference=None if before is None else prepared.reference,
+            covered=covered, psnr_reference=None if before is None else prepared.reference.name,
         )  # fmt: skip
         compared = (covered.before, covered.after) if covered else (before, candidate.psnr)
         worse = describe_loss(name, *compared) if comparable else None

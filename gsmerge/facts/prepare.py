@@ -107,6 +107,14 @@ def canonicalise(scene: Scene, frame: Frame | None = None) -> tuple[Scene, Frame
     return replace(scene, gaussians=frame.enter(scene.gaussians), cameras=frame.enter_cameras(scene.cameras)), frame
 
 
+@dataclass(frozen=True)
+class Reference:
+    """Pictures that a result is fitted to and measured against."""
+
+    name: str  # What they are: "photos", or what stands in for them
+    views: tuple[int, ...]  # Views whose pictures a fit may use
+
+
 @dataclass(frozen=True, eq=False)
 class Prepared:
     """A scene in its canonical frame, as the stages use it, with facts about it."""
@@ -116,11 +124,15 @@ class Prepared:
     # has cameras, pictures and only finite Gaussians that are seen, or all if none is set aside
     scene: Scene
     frame: Frame  # The canonical frame
-    photo_views: tuple[int, ...]  # Views whose photos a fit may use
+    reference: Reference  # The photos, or what stands in for them
     repeated: tuple[int, ...]  # Place in the scene of every given view
     moved: bool  # Whether views were moved to where their photos agree, before a fit or by it
     unseen: Gaussians | None  # Canonical Gaussians that no view sees, if kept
-    reference: str = PHOTOS  # What the result is fitted to and measured against
+
+    @property
+    def photo_views(self) -> tuple[int, ...]:
+        """Views whose photos, or what stands in for them, a fit may use."""
+        return self.reference.views
 
     def with_cameras(self, cameras: Cameras) -> Prepared:
         """Return a copy with the canonical cameras that a fit has moved."""
@@ -166,8 +178,8 @@ def prepare(scene: Scene, options: PrepareOptions | None = None, frame: Frame | 
         scene, unseen = _split_unseen(scene)
     if not scene.aligned:  # pixels that are known have colours of their own
         scene = add_pictures(scene)
-    reference = ROW_COLORS if colored else PHOTOS
-    return Prepared(input_scene, scene, frame, photo_views, tuple(repeated), moved is not None, unseen, reference)
+    reference = Reference(ROW_COLORS if colored else PHOTOS, photo_views)
+    return Prepared(input_scene, scene, frame, reference, tuple(repeated), moved is not None, unseen)
 
 
 def with_row_colors(scene: Scene) -> Scene:

@@ -99,6 +99,6 @@ def test_renders_stand_in_for_photos_where_no_pixels_are_known_alone(scene: Scen
     aligned, unaligned = prepare(bare), prepare(replace(bare, pixel_ids=None))
     np.testing.assert_allclose(aligned.scene.images, scene_pictures(bare), atol=1e-6)
     assert aligned.input_scene.images is not None
-    assert aligned.reference == ROW_COLORS
+    assert aligned.reference.name == ROW_COLORS
     assert unaligned.scene.images is not None
     assert unaligned.input_scene.images is None
