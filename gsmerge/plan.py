@@ -119,7 +119,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
     _check_photos(input_scene, options, judged=alone)
     cuts = options.method == OURS and not alone  # views into superpixels
     with stage("prepare"):
-        has_photos = scene.images is not None and bool(prepared.photo_views)
+        has_photos = bool(prepared.photo_views)
         if checkpoint is None and cuts:  # baselines learn nothing
             checkpoint = load_networks(options, input_scene, photos=has_photos)
         segment = options.segment if alone else _resolve_superpixels(options.segment, scene, effort)
@@ -388,7 +388,7 @@ def steps_for(options: CompactOptions, num_views: int, share: float = USUAL_SHAR
 def _fit_photos(prepared: Prepared, options: CompactOptions, fit: FitOptions, backend: FitBackend) -> FitOptions:
     """Fill in the size of the photos that the fit sees, and whether it moves cameras."""
     scene = prepared.scene
-    if scene.images is None or not fit.needs_photos:
+    if not fit.needs_photos:
         return replace(fit, photo_scale=1.0)
     auto = EFFORTS[options.effort].large_photos and backend.device == "cpu"
     scale, problem = photo_scale(scene, fit, auto=auto)

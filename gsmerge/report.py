@@ -61,6 +61,7 @@ def report_document(
 
     Returns:
         ``schema_version`` 1, within which keys are only ever added. ``unmet``: why a target is not met, or null.
+        ``psnr_reference``: what ``psnr_input_views`` are measured against: "photos", or what stands in for them.
         ``psnr_covered``: ``share``, ``before``, ``after`` over the pixels that the input covers, where it lacks some.
         ``worse``: that the result, or the first level that does, shows the photos worse than the input, or null.
     """
@@ -93,6 +94,7 @@ def report_document(
         "choices": numbers["choices"],
         **seconds_document({**seconds_before, **report.seconds, **seconds_after}),
         "psnr_input_views": {"before": numbers["psnr_before"], "after": numbers["psnr_after"]},
+        "psnr_reference": numbers["psnr_reference"],
         "psnr_covered": numbers["covered"],
         "peak_memory_bytes": numbers["peak_memory_bytes"],
         "notes": [*notes, *numbers["notes"]],
@@ -158,7 +160,7 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None) -> l
         ("file", human_bytes(before["bytes"]), human_bytes(after["bytes"]), ""),
     ]
     if psnr["before"] is not None and psnr["after"] is not None:
-        views = f"in {document['choices']['scored_views']} of the input views"
+        views = f"in {document['choices']['scored_views']} of the input views{_against(document)}"
         rows += [("PSNR", f"{psnr['before']:.2f} dB", f"{psnr['after']:.2f} dB", views)]
     if covered := document["psnr_covered"]:
         share = f"on the {100 * covered['share']:.0f} % that the input covers"
@@ -217,6 +219,7 @@ def summary_line(document: Mapping[str, Any]) -> str:
         if judged
         else ""
     )
+    quality += _against(document)
     if covered := document["psnr_covered"]:
         share = f"on the {100 * covered['share']:.0f} % of their pixels that the input covers"
         quality += f", {covered['before']:.2f} -> {covered['after']:.2f} dB {share}"
@@ -225,6 +228,12 @@ def summary_line(document: Mapping[str, Any]) -> str:
         f" ({100 * document['ratio']:.2f} %), {human_bytes(before['bytes'])} -> {human_bytes(after['bytes'])}"
         f"{quality}; {seconds_line(document)}{cameras}"
     )
+
+
+def _against(document: Mapping[str, Any]) -> str:
+    """Say what PSNR is measured against, if not against photos."""
+    reference = document.get("psnr_reference")
+    return "" if reference in (None, "photos") else f" against {reference}"
 
 
 def seconds_document(seconds: Mapping[str, float]) -> dict[str, Any]:

@@ -20,8 +20,8 @@ DONE, FAILED, SKIPPED = "done", "failed", "skipped"  # of records
 BUSY, STUCK = "busy", "stuck"
 COLUMNS = (
     "scene", "output", "status", "num_input", "num_output", "ratio", "bytes_input", "bytes_output", "psnr_before",
-    "psnr_after", "covered_share", "psnr_covered_before", "psnr_covered_after", "seconds", "peak_memory_bytes",
-    "attempt", "unmet", "worse", "error",
+    "psnr_after", "psnr_reference", "covered_share", "psnr_covered_before", "psnr_covered_after", "seconds",
+    "peak_memory_bytes", "attempt", "unmet", "worse", "error",
 )  # fmt: skip
 T = TypeVar("T")
 MAX_LISTED = 20  # scenes in the table, and failures below it
@@ -114,6 +114,7 @@ def row_of(record: Mapping[str, Any]) -> dict[str, Any]:
         "bytes_output": sum(file["bytes"] for file in files),
         "psnr_before": psnr["before"],
         "psnr_after": psnr["after"],
+        "psnr_reference": report.get("psnr_reference"),
         "covered_share": covered.get("share"),
         "psnr_covered_before": covered.get("before"),
         "psnr_covered_after": covered.get("after"),

@@ -88,7 +88,7 @@ def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras]
     notes, start = list[str](), scene.cameras.viewmats
     for name, path in zip(file_names(paths), paths, strict=True):
         holder, read = path if holds_cameras(path) else viewer_cameras_path(path), None
-        if scene.images is not None and holder.is_file():
+        if (scene.images is not None or scene.aligned) and holder.is_file():
             with suppress(SceneError):  # whose ever it is, results can be measured without it
                 read = read_cameras(holder)
         if read is None or read.names != scene.names or np.allclose(read.viewmats, start, rtol=SAME, atol=SAME):

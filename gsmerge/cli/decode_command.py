@@ -15,7 +15,7 @@ from gsmerge.cli.paths import FileOptions, check_format, check_outputs, default_
     opt.argument("encoded", Path, "ENCODED", "A .gsm file of gsmerge encode or extend."),
     opt.changed("k", help="Gaussians per group, up to what was encoded.", show_default="as encoded"),
     opt.changed("budget", help="Gaussians in the result: a number, a share of the input such as 2%, a size such as "
-                "5MB; at least one per group. auto: as many as compact takes without photos."),
+                "5MB; at least one per group. auto: up to the knee of the superpixels' distortion."),
     opt.changed("fit", help="What is fitted to the photos that a state has kept.",
                 show_default="full where there are photos"),
     "effort device set",

@@ -59,7 +59,7 @@ def view(args: opt.Args) -> None:
     page = view_page(data)
     write_texts({output: page}, overwrite=args.overwrite)
     say_notes(data.notes, quiet=args.silent)
-    said = headline(*data.sides[:2])
+    said = headline(data)
     document |= {"bytes": len(page), "headline": said, "notes": [*pair.notes, *data.notes]}
     print_document(document, f"{output}: {said}", as_json=args.json, quiet=args.quiet)
     if args.open and not _open(output):

@@ -28,6 +28,7 @@ from gsmerge.facts.partition import (
     partition_views,
 )
 from gsmerge.facts.prepare import Frame, Prepared, prepare, scene_frame
+from gsmerge.facts.row_colors import PHOTOS
 from gsmerge.facts.views import in_float64, subset
 from gsmerge.fit import fit_scene, peak_weights
 from gsmerge.pipeline import start
@@ -45,6 +46,7 @@ from gsmerge.settings.budget import parse_share, share_text
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.stages import AUTO_SHARE
 from gsmerge.stages.clean import faintest_dropped
+from gsmerge.stages.segment import measure_size
 from gsmerge.types import Decoded, Gaussians, Scene
 
 T = TypeVar("T")
@@ -73,7 +75,7 @@ def compact_in_blocks(scene: Scene, options: CompactOptions, whole: WholePlan) -
         factors = count_factors(blocks, covisibility).tolist()
         frame, options = scene_frame(scene), with_whole_choices(options, whole)
     size = gaussians_at_once(scene.num_gaussians, count)
-    memory = memory_bytes(size, photos=scene.images is not None, num_rest=3 * scene.gaussians.shN.shape[1])
+    memory = memory_bytes(size, photos=measure_size(scene).photos, num_rest=3 * scene.gaussians.shN.shape[1])
     engine = options.blocks.engine
     with start_work(engine.name, engine.address, threads=options.threads, memory=memory) as work:
         seen = work.share(covisibility)
@@ -160,7 +162,7 @@ def fit_part(part: Part, everything: tuple[Gaussians, np.ndarray], number: int, 
     """
     (joined, owners), scene, plan = everything, part.prepared.scene, part.plan
     used = owners == number
-    if plan.fit.fit != "none" and scene.images is not None:
+    if plan.fit.fit != "none":
         used |= peak_weights(joined, blank_photos(scene.cameras, 2))[0] >= plan.fit.min_contribution
     rows = np.flatnonzero(used)
     decoded = Decoded(joined[rows], round(growth * len(rows)), exact=False)
@@ -307,13 +309,15 @@ def join_reports(
         mean([psnr for psnr, _ in scores]),
     )
     covered = _join_covered(parts, scores, sizes)
-    worse = describe_loss("the result", *((covered.before, covered.after) if covered else (before, after)))
+    reference = None if before is None else parts[0].prepared.reference.name
+    compared = (covered.before, covered.after) if covered else (before, after)
+    worse = describe_loss("the result", *compared) if reference == PHOTOS else None
     notes = list(dict.fromkeys(run.notes))
     return CompactReport(
         num_input=scene.num_gaussians, num_output=len(gaussians), seconds=dict(run.seconds), psnr_before=before,
         psnr_after=after, covered=covered, choices=run.choices | {"scored_views": scored},
         notes=notes if worse is None else [*notes, worse], options=options.to_dict(),
-        peak_memory_bytes=peak_memory(), worse=worse,
+        peak_memory_bytes=peak_memory(), worse=worse, psnr_reference=reference,
     )  # fmt: skip
 
 

@@ -13,7 +13,7 @@ from gsmerge.compaction.compact import compact
 from gsmerge.compaction.methods import check_method
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.facts.place_cameras import NO_VIEWS
+from gsmerge.facts.prepare import missing_notes
 from gsmerge.fit.gpu import choose_backend
 from gsmerge.io import atomic_outputs, lost_harmonics, output_format, write_gaussians
 from gsmerge.io.atomic import AddOutput
@@ -34,9 +34,8 @@ from gsmerge.scene.files import SceneFiles
 from gsmerge.scene.read import Loaded, load_files
 from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.settings.reading import OpacityChoice
+from gsmerge.stages.segment import measure_size
 from gsmerge.types import Scene
-
-NO_PHOTOS = "no photos found, so nothing is fitted and no PSNR measured; name their folder with --images"
 
 
 @dataclass(frozen=True)
@@ -125,13 +124,12 @@ def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict
     _, unused = check_method(settings, scene)
     backend, problem = choose_backend(settings.device, scene.num_gaussians)
     settings = replace(settings, device=backend.device)
-    placed = [] if len(scene) else [NO_VIEWS]
-    notes = [*load.notes, *placed, *unused, *([] if problem is None else [problem])]
+    notes = [*load.notes, *unused, *missing_notes(scene), *([] if problem is None else [problem])]
     if os.path.lexists(out) and not outputs.overwrite:
         notes.append(f"{out} exists already: --overwrite would replace it")
     with record_run() as record:
         if settings.method == OURS and settings.checkpoint != "auto":  # which the run may refuse
-            load_networks(settings, scene, photos=scene.images is not None)
+            load_networks(settings, scene, photos=measure_size(scene).photos)
         run = estimate(scene, settings)
     paths = {name: path and str(path) for name, path in vars(load.files).items() if name != "more"}
     return {
@@ -198,8 +196,7 @@ def read_input(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: Rea
     """Read a scene from its files, and note what is missing or odd; raise SceneError if it cannot be read."""
     loaded = load_files(files, opacity=opacity, hints=hints).without_photos()
     release_memory()
-    no_photos = [NO_PHOTOS] if loaded.scene.aligned and loaded.scene.images is None else []
-    return replace(loaded, notes=(*loaded.notes, *no_photos, *_compact_notes(loaded)))
+    return replace(loaded, notes=(*loaded.notes, *_compact_notes(loaded)))
 
 
 def check_saved_cameras(scene: Scene, path: Path | None, *, embed: bool = False) -> None:

@@ -67,7 +67,7 @@ def check_method(options: CompactOptions, scene: Scene) -> tuple[Method | None, 
     if method is None:
         return None, _unused_alone(options) if stands_alone(scene, options) else []
     place = f"method {method.name}"
-    if "photos" in method.needs and scene.images is None:
+    if "photos" in method.needs and scene.images is None and not scene.aligned:
         raise UsageError(f"{place}: expected photos, found none; give --images, or another --method")
     if "pixels" in method.needs and not scene.aligned:
         raise UsageError(f"{place}: expected one Gaussian per pixel, found an unaligned scene; give another --method")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsmerge.facts.prepare import Prepared, scene_depth
+from gsmerge.facts.row_colors import PHOTOS
 from gsmerge.fit import FitBackend, Fitted, run_on
 from gsmerge.io.cameras.camera_file import describe_moves, list_moves
 from gsmerge.plan import Plan
@@ -48,7 +49,8 @@ class CompactReport:
         num_output: Gaussians in the result.
         seconds: Wall time of each stage.
         psnr_before: Mean PSNR (dB) of the input views rendered from the input, of many views some, and in a fixed
-            quarter of each unless a quality was asked for; None without photos. :func:`gsmerge.evaluate` is exact.
+            quarter of each unless a quality was asked for; None where neither photos nor pixels are known.
+            :func:`gsmerge.evaluate` is exact.
         psnr_after: The same from the result.
         choices: Decisions of the stages (count, curve, merge, scores, clusters, fit). Of a scene without cameras,
             ``fidelity`` is the PSNR (dB) against the input from so many held-out ``views``.
@@ -58,6 +60,8 @@ class CompactReport:
         unmet: Why a target that was asked for is not met, and how far the result got; None if it is.
         worse: That the result shows the scene's own photos by more than .5 dB worse than the input does, a sentence
             that is among the notes, too; None where it does not, or photos cannot say it: none, odd ones, or a crop.
+        psnr_reference: What PSNR of the input views is measured against: "photos", or "the rows' own colours"; None
+            where it is not measured.
         covered: PSNR over the pixels that the input covers, where it lacks more than 2 % of them; None where it does
             not.
 
@@ -79,6 +83,7 @@ class CompactReport:
     unmet: str | None = None
     worse: str | None = None
     covered: Covered | None = None
+    psnr_reference: str | None = None
 
 
 @dataclass(frozen=True)
@@ -232,7 +237,7 @@ def make_result(
     run, seconds = current_record(), search["seconds"]
     input_score = measure_input(prepared, plan)
     before = None if input_score is None else input_score.psnr
-    comparable = prepared.photo_views and not plan.clean.hides  # or photos show something else
+    comparable = prepared.photo_views and prepared.reference.name == PHOTOS and not plan.clean.hides
     covered = [
         measure_covered(input_score, candidate.gaussians, _move_views(prepared, candidate.fitted.cameras), plan)
         for candidate in (best, *levels)
@@ -243,7 +248,7 @@ def make_result(
         shown = None if prepared.alone else candidate.psnr
         made = CompactReport(
             *counts, dict(seconds), before, shown, record.choices, record.notes, plan.settings, peak_memory(),
-            covered=covered,
+            covered=covered, psnr_reference=None if before is None else prepared.reference.name,
         )  # fmt: skip
         compared = (covered.before, covered.after) if covered else (before, shown)
         worse = describe_loss(name, *compared) if comparable else None

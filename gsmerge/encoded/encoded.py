@@ -67,7 +67,7 @@ class StoredSettings:
     # Of an unaligned scene, its groups and the empty superpixels whose Gaussians other groups get; None: K Gaussians
     # for each group
     num_slots: int | None = None
-    knee_count: int = 0  # Gaussians at the knee of the scene's own curve of distortion: `--budget auto` without photos
+    knee_count: int = 0  # Gaussians at the knee of the scene's own curve of distortion: `--budget auto`
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -104,7 +104,7 @@ def _to_encoded(prepared: Prepared, plan: Plan, merged: MergedViews, max_k: int 
         k=AUTO if plan.auto_count else options.k,
         max_k=max_k,
         min_opacity=options.min_opacity,
-        min_contribution=plan.fit.min_contribution if scene.images is not None else 0.0,
+        min_contribution=plan.fit.min_contribution,
         target_count=count if exact else None,
         num_slots=None if exact or count is None else count // options.max_k,
         knee_count=knee_count(scene, plan.superpixels),

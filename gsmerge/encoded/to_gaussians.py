@@ -92,7 +92,7 @@ def decode_scene(
         encoded: From :func:`encode_scene` or :func:`load_encoded`.
         k: Gaussians of each group, 1 to the largest number encoded. None: the encoding's own.
         budget: Gaussians in all instead: a number from one for each group on, a share of the input as "2%", a size as
-            "5MB", or ``"auto"``: as many as ``compact`` would take without photos, where they help most.
+            "5MB", or ``"auto"``: up to the knee of the superpixels' distortion, where they help most.
         threads: Threads to use; None: all processors. The result does not depend on it.
 
     Raises:

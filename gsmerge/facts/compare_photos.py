@@ -335,7 +335,8 @@ def _leave_out(scene: Scene, shown: Shown) -> tuple[Scene, tuple[int, ...]]:
     problem = f"{len(odd)} of {len(views)} photos do not show what the Gaussians show"
     if 2 * len(odd) > len(views):
         which = list_names(scene.names, odd)
-        note(f"{problem}, so none is used and nothing is fitted: {which}; check their names and order")
+        result = "" if scene.aligned else " and nothing is fitted"
+        note(f"{problem}, so none is used{result}: {which}; check their names and order")
         return replace(scene, images=None, large_photos=None, masks=None), ()
     note(f"{problem} and are not used: {list_names(scene.names, odd)}")
     images = scene.images.copy()

@@ -152,10 +152,10 @@ def own_pictures(scene: Scene, views: list[int]) -> np.ndarray:
     part = subset(scene, views)
     pictures = scene_pictures(replace(part, images=None))
     valid = part.stored if part.missing is not None else part.valid
-    return np.stack([_fill_gaps(*pair) for pair in zip(pictures, valid, strict=True)])
+    return np.stack([fill_gaps(*pair) for pair in zip(pictures, valid, strict=True)])
 
 
-def _fill_gaps(picture: np.ndarray, valid: np.ndarray) -> np.ndarray:
+def fill_gaps(picture: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """Give pixels ``[h,w]`` that are not known the colour of the nearest one that is."""
     if valid.all() or not valid.any():
         return picture

@@ -17,6 +17,7 @@ from gsmerge.facts.align_views import align_views
 from gsmerge.facts.compare_photos import compare_photos
 from gsmerge.facts.exposure import equalise_exposure
 from gsmerge.facts.place_cameras import NO_VIEWS, add_judges, add_pictures, add_views, draw_pictures, keep_finite
+from gsmerge.facts.row_colors import NO_PHOTOS, PHOTOS, RENDERS, ROW_COLORS, add_row_colors
 from gsmerge.facts.views import distinct_views, subset
 from gsmerge.geometry import camera_depths, lower_median, project
 from gsmerge.kernels.matrices import matmul
@@ -106,6 +107,14 @@ def canonicalise(scene: Scene, frame: Frame | None = None) -> tuple[Scene, Frame
     return replace(scene, gaussians=frame.enter(scene.gaussians), cameras=frame.enter_cameras(scene.cameras)), frame
 
 
+@dataclass(frozen=True)
+class Reference:
+    """Pictures that a result is fitted to and measured against."""
+
+    name: str  # What they are: "photos", or what stands in for them
+    views: tuple[int, ...]  # Views whose pictures a fit may use
+
+
 @dataclass(frozen=True, eq=False)
 class Prepared:
     """A scene in its canonical frame, as the stages use it, with facts about it."""
@@ -115,7 +124,7 @@ class Prepared:
     # has cameras, pictures and only finite Gaussians that are seen, or all if none is set aside
     scene: Scene
     frame: Frame  # The canonical frame
-    photo_views: tuple[int, ...]  # Views whose photos a fit may use
+    reference: Reference  # The photos, or what stands in for them
     repeated: tuple[int, ...]  # Place in the scene of every given view
     moved: bool  # Whether views were moved to where their photos agree, before a fit or by it
     unseen: Gaussians | None  # Canonical Gaussians that no view sees, if kept
@@ -124,6 +133,11 @@ class Prepared:
     def alone(self) -> bool:
         """Whether no view is known, and those of the canonical scene only judge results."""
         return not self.photo_views and len(self.input_scene) == 0
+
+    @property
+    def photo_views(self) -> tuple[int, ...]:
+        """Views whose photos, or what stands in for them, a fit may use."""
+        return self.reference.views
 
     def with_cameras(self, cameras: Cameras) -> Prepared:
         """Return a copy with the canonical cameras that a fit has moved."""
@@ -157,16 +171,36 @@ def prepare(scene: Scene, options: PrepareOptions | None = None, frame: Frame | 
         scene = subset(scene, views)
     scene, frame = canonicalise(add_views(scene), frame)
     scene, photo_views = compare_photos(scene)
+    colored = scene.aligned and scene.images is None
+    if colored:
+        scene, photo_views = add_row_colors(scene), tuple(range(len(scene)))
     input_scene = _with_photos(input_scene, scene, repeated)
     scene, moved, unseen = equalise_exposure(scene, photo_views, options.exposure), None, None
-    if scene.aligned and scene.images is not None and options.poses != "fixed":
+    if scene.aligned and options.poses != "fixed":
         moved = align_views(scene, photo_views, always=options.poses == "free")
         scene = moved or scene
     if options.unseen == "keep":
         scene, unseen = _split_unseen(scene)
     if not scene.aligned:  # pixels that are known have colours of their own
         scene = add_pictures(scene)
-    return Prepared(input_scene, scene, frame, photo_views, tuple(repeated), moved is not None, unseen)
+    reference = Reference(ROW_COLORS if colored else PHOTOS, photo_views)
+    return Prepared(input_scene, scene, frame, reference, tuple(repeated), moved is not None, unseen)
+
+
+def missing_notes(scene: Scene) -> list[str]:
+    """Return the note that a run will make on what stands in for views or photos, before it looks at any colour."""
+    if len(scene) == 0:
+        return [NO_VIEWS]
+    return [NO_PHOTOS] if scene.aligned and scene.images is None else []
+
+
+def with_row_colors(scene: Scene) -> Scene:
+    """Return a scene with its rows' own colours where it has pixels and no photos, as :func:`prepare` puts them."""
+    if scene.images is not None or not scene.aligned or len(scene) == 0:
+        return scene
+    with record_part(silent=True):
+        colored = add_row_colors(canonicalise(scene)[0])
+    return replace(scene, images=colored.images, masks=colored.masks)
 
 
 @stage("prepare")
@@ -179,7 +213,7 @@ def prepare_alone(scene: Scene) -> Prepared:
     finite = keep_finite(scene)
     note(NO_VIEWS)
     judged, frame = canonicalise(add_judges(finite))
-    return Prepared(scene, draw_pictures(judged), frame, photo_views=(), repeated=(), moved=False, unseen=None)
+    return Prepared(scene, draw_pictures(judged), frame, Reference(RENDERS, ()), repeated=(), moved=False, unseen=None)
 
 
 def photos_count_as_they_are(scene: Scene) -> bool:
@@ -194,10 +228,12 @@ def photos_count_as_they_are(scene: Scene) -> bool:
 
 def _with_photos(scene: Scene, source: Scene, repeated: Sequence[int]) -> Scene:
     """Return the given scene with the photos and masks of its distinct views; itself where they are its own."""
-    if source.images is None or scene.images is None or (source.images is scene.images and source.masks is scene.masks):
+    drawn = scene.images is None and not scene.aligned  # what stands in there is for the fit alone
+    if source.images is None or drawn or (source.images is scene.images and source.masks is scene.masks):
         return scene
     images, masks = (None if array is None else array[list(repeated)] for array in (source.images, source.masks))
-    return replace(scene, images=images, masks=masks)
+    large = scene.large_photos if source.large_photos is not None else None
+    return replace(scene, images=images, masks=masks, large_photos=large)
 
 
 def _split_unseen(scene: Scene) -> tuple[Scene, Gaussians | None]:

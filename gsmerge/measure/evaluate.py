@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsmerge.errors import UsageError
-from gsmerge.facts.prepare import photos_count_as_they_are, scene_frame
+from gsmerge.facts.prepare import photos_count_as_they_are, scene_frame, with_row_colors
+from gsmerge.facts.row_colors import RENDERS, ROW_COLORS
 from gsmerge.facts.views import pick_views
 from gsmerge.measure.align import PoseChange, fit_colors, refine_pose
 from gsmerge.measure.fog import ALL, Fog, describe_fog, measure_fog
@@ -30,7 +31,6 @@ MENDED = (
 )
 MIN_SEEN_SHARE = 0.1  # of the held-out pixels, seen by input views; less suggests another world frame
 INPUT = "input"  # name of the scene itself among the results
-RENDERS = "renders of the input"  # what stands in for photos
 Progress = Callable[[str, int, int], None]
 OnImage = Callable[[str, str, int, np.ndarray], None]
 
@@ -112,8 +112,8 @@ class Evaluation:
 
     Args:
         results: The scene itself first, as "input", if it was measured.
-        reference: "photos"; "renders of the input" where there are none, "photos, and renders of the input in its own
-            views" where there are none of those alone.
+        reference: "photos"; where there are none "the rows' own colours" or, of rows without pixels, "renders of the
+            input"; "photos, and ... in its own views" where there are none of those alone.
         num_views: Views by split.
         notes: Warnings, one sentence each.
         options: What was measured.
@@ -210,6 +210,7 @@ def evaluate(
         raise UsageError("expected a scene with views, got none")
     if options.align and targets is None:
         raise UsageError("align: expected held-out views, got none")
+    photos, scene = scene, with_row_colors(scene)
     inputs, results = scene.file_gaussians, {name: gaussians.numpy() for name, gaussians in results.items()}
     if targets is not None:
         targets = replace(targets, cameras=targets.cameras.numpy(), images=as_array(targets.images))
@@ -232,9 +233,10 @@ def evaluate(
                 progress("evaluate", i + 1, len(named))
     counts = {name: len(split.views.names) for name, split in splits.items()}
     reference = "photos"
-    if scene.images is None and "context" in counts:
-        reference = f"photos, and {RENDERS} in its own views" if "target" in counts else RENDERS
-    return Evaluation(tuple(scores), reference, counts, tuple(_notes(scene, splits, scores)), options)
+    if photos.images is None and "context" in counts:
+        stand_in = RENDERS if scene.images is None else ROW_COLORS
+        reference = f"photos, and {stand_in} in its own views" if "target" in counts else stand_in
+    return Evaluation(tuple(scores), reference, counts, tuple(_notes(photos, splits, scores)), options)
 
 
 def near_plane(scene: Scene) -> float:

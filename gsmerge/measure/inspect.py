@@ -12,8 +12,7 @@ from gsmerge.alignment import check_cameras
 from gsmerge.errors import SceneError
 from gsmerge.facts.compare_photos import compare_photos
 from gsmerge.facts.partition import gaussians_at_once
-from gsmerge.facts.place_cameras import NO_VIEWS
-from gsmerge.facts.prepare import canonicalise
+from gsmerge.facts.prepare import canonicalise, missing_notes
 from gsmerge.io import GaussianFile, file_notes
 from gsmerge.io.formats.ply import file_bytes, is_from_gsmerge
 from gsmerge.io.formats.read import degree_notes
@@ -146,8 +145,7 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
         if scene.images is not None:
             means = gaussians.means[stored & np.isfinite(gaussians.means).all(1)]
             num_sky_views = len(sky_regions(means, scene.cameras, scene.images))
-    placed = [] if len(scene) else [NO_VIEWS]
-    facts |= {"notes": [*load.notes, *placed, *_photo_notes(scene)], "num_views": len(load.views.used)}
+    facts |= {"notes": [*load.notes, *missing_notes(scene), *_photo_notes(scene)], "num_views": len(load.views.used)}
     facts |= {"camera_format": load.cameras and load.cameras.source}
     facts |= {"coverage": coverage(scene), "sight": sight and asdict(sight)}
     facts |= {"num_sky_views": num_sky_views, "compact": estimate(scene, CompactOptions())}

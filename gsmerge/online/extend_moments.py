@@ -54,7 +54,7 @@ def _join(groups: GroupSet, rows: np.ndarray, new: BatchFeatures, batch: Batch) 
         groups = merge_into(groups, joining, rows[partners[has_partner]], batch.max_k)
         alone = select_groups(fresh, np.flatnonzero(~has_partner))
         counts, least = {"num_joined": int(has_partner.sum())}, batch.plan.fit.min_contribution
-        if least > 0 and batch.prepared.scene.images is not None:
+        if least > 0:
             in_view = feature_to_gaussians(take(groups.features, rows))
             both = Gaussians.concat([in_view, feature_to_gaussians(alone.features)])
             visible = visible_mask(both, batch.photos.photos(2), least)[len(in_view) :]

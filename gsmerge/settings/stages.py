@@ -36,7 +36,7 @@ class PrepareOptions(Settings):
         "`free`: views of one Gaussian per pixel are moved to where their photos agree, and the full fit moves the "
         "cameras on (on the CPU); `auto`: free where some view is more than 1.5 pixels off and its photo and the "
         "others agree clearly better elsewhere (`gsmerge.facts.align_views` says by how much); fixed elsewhere, and "
-        "without photos.")  # fmt: skip
+        "without photos and pixels.")  # fmt: skip
     exposure: Exposure = setting("auto", "Bring photos that differ in exposure or white balance to their mean: where "
         "they differ at random, never, or always.",
         "The Gaussians of their pixels change with them; `gsmerge.facts.exposure` says when they differ at "

@@ -11,7 +11,7 @@ from pathlib import PurePosixPath
 import cv2
 import numpy as np
 
-from gsmerge.facts.prepare import Frame, scene_frame
+from gsmerge.facts.prepare import Frame, scene_frame, with_row_colors
 from gsmerge.facts.views import even_views
 from gsmerge.geometry import middle_depth
 from gsmerge.io.formats import spz
@@ -122,7 +122,8 @@ def collect(
     ``results`` are Gaussians by name in the scene's world, ``file_bytes`` the sizes of the scene's file and of
     theirs. Stills and scores are from ``cameras`` (as of :func:`gsmerge.evaluate`), 3D from the scene's own.
     """
-    splits = {"context": (scene.cameras.numpy(), scene.images, scene.names)}
+    pictures = with_row_colors(scene).images
+    splits = {"context": (scene.cameras.numpy(), pictures, scene.names)}
     splits |= {} if held_out is None else {"target": (held_out.cameras.numpy(), held_out.images, held_out.names)}
     stills: dict[tuple[str, str, int], bytes] = {}
 
@@ -154,7 +155,7 @@ def collect(
             ))  # fmt: skip
     with use_threads(threads):
         outside = _outside_view(scene, named, frame, len(views))
-        shown, num_superpixels = with_outlines(_shown(views), scene.images, segmentation or SegmentOptions())
+        shown, num_superpixels = with_outlines(_shown(views), pictures, segmentation or SegmentOptions())
     measured = evaluation.notes if results else ()  # which are about what was fitted
     notes = (*measured, *_limits(sides, len(shown), len(views)))
     share, _ = evaluation.results[0].mean_covered("context")

@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsmerge import __version__
+from gsmerge.facts.row_colors import PHOTOS, ROW_COLORS
 from gsmerge.measure.preview import to_picture
 from gsmerge.measure.scores import filled_tables, page_notes, page_title
 from gsmerge.report import human_bytes
-from gsmerge.view.data import PageView, Side, ViewData, encode_still
+from gsmerge.view.data import PageView, ViewData, encode_still
 
 if TYPE_CHECKING:
     import jinja2
@@ -34,7 +35,8 @@ ENGINE = "vendor/spark-three.js.gz"
 def view_page(data: ViewData) -> str:
     """Make the HTML page of a scene and its results."""
     photos = any(view.photo is not None for view in data.views)
-    sources: list[dict[str, Any]] = [{"name": "photo", "splats": None, "count": 0}] if photos else []
+    picture = "own colours" if data.reference == ROW_COLORS else "photo"
+    sources: list[dict[str, Any]] = [{"name": picture, "splats": None, "count": 0}] if photos else []
     sources += [
         {"name": side.name, "splats": None if side.splats is None else f"splats-{i}", "count": side.num_gaussians}
         for i, side in enumerate(data.sides)
@@ -54,7 +56,7 @@ def view_page(data: ViewData) -> str:
         "view.html",
         policy=SOLID,
         data=data,
-        headline=headline(*data.sides[:2]),
+        headline=headline(data),
         sources=sources,
         left=left,
         right=right,
@@ -85,8 +87,9 @@ def report_page(document: Mapping[str, Any], pictures: Sequence[Sequence[tuple[s
     if len(results) > 1:
         before, after = results[:2]
         split = "target" if "target" in before["mean"] else "context"
-        psnrs = [result["mean"][split]["psnr_visible"] for result in (before, after)]
-        headline = headline_of(before["num_gaussians"], after["num_gaussians"], *psnrs)
+        old, new = (result["mean"][split]["psnr_visible"] for result in (before, after))
+        reference = PHOTOS if split == "target" else document["reference"]
+        headline = headline_of(before["num_gaussians"], after["num_gaussians"], old, new, reference)
         milliseconds = [1000 * result["render_seconds"] for result in (before, after)]
         tiles = [
             ("Gaussians", f"{before['num_gaussians']:,}", f"{after['num_gaussians']:,}"),
@@ -102,16 +105,18 @@ def report_page(document: Mapping[str, Any], pictures: Sequence[Sequence[tuple[s
     )  # fmt: skip
 
 
-def headline(before: Side, after: Side | None = None) -> str:
+def headline(data: ViewData) -> str:
     """Write the headline: share of Gaussians and change of quality; for one scene alone its size."""
-    if after is None:
+    before = data.sides[0]
+    if len(data.sides) == 1:
         quality = before.mean.psnr
         has_quality = quality is not None and np.isfinite(quality)
         return f"{before.num_gaussians:,} Gaussians" + (f", {quality:.1f} dB" if has_quality else "")
-    return headline_of(before.num_gaussians, after.num_gaussians, before.mean.psnr, after.mean.psnr)
+    after, reference = data.sides[1], PHOTOS if data.held_out else data.reference
+    return headline_of(before.num_gaussians, after.num_gaussians, before.mean.psnr, after.mean.psnr, reference)
 
 
-def headline_of(num_before: int, num_after: int, old: float | None, new: float | None) -> str:
+def headline_of(num_before: int, num_after: int, old: float | None, new: float | None, reference: str = PHOTOS) -> str:
     """Write the :func:`headline` from counts and PSNR (dB) before and after; infinite ``old``: the reference."""
     share = 100 * num_after / max(num_before, 1)
     said = f"{share:.{1 if share >= 1 else 2}f} % of the Gaussians"
@@ -119,7 +124,8 @@ def headline_of(num_before: int, num_after: int, old: float | None, new: float |
         return said
     if not np.isfinite(old):
         return f"{said}, {new:.1f} dB from the input's own renders"
-    return f"{said}, {abs(new - old):.1f} dB {'closer to' if new >= old else 'farther from'} the photos"
+    words = ROW_COLORS if reference == ROW_COLORS else "the photos"
+    return f"{said}, {abs(new - old):.1f} dB {'closer to' if new >= old else 'farther from'} {words}"
 
 
 def _view(view: PageView) -> dict[str, Any]:

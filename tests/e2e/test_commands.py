@@ -14,7 +14,7 @@ from tiny_scene import edited_json
 
 import gsmerge
 from gsmerge.cli import main
-from gsmerge.compaction.files import NO_PHOTOS
+from gsmerge.facts.row_colors import NO_PHOTOS, ROW_COLORS
 
 from .conftest import Run, assert_refused, listing
 
@@ -102,10 +102,18 @@ def test_progress_only_when_a_terminal_is_there(scene_copy: Path, run: Run, monk
 def test_without_photos_it_still_compacts(scene_copy: Path, run: Run) -> None:
     for path in (scene_copy / "images").iterdir():
         path.unlink()
-    outcome = run("compact", scene_copy, *SMALL, "--json", code=0)
-    document = json.loads(outcome.out)
-    assert document["psnr_input_views"] == {"before": None, "after": None}
-    assert NO_PHOTOS in document["notes"]
+    planned = json.loads(run("compact", scene_copy, *SMALL, "--dry-run", "--json", code=0).out)
+    document = json.loads(run("compact", scene_copy, *SMALL, "--json", code=0).out)
+    assert document["choices"]["fit"]["method"] == planned["compact"]["fit"] == "full"
+    psnr = document["psnr_input_views"]
+    assert psnr["after"] > psnr["before"] + 1
+    assert document["psnr_reference"] == ROW_COLORS
+    for notes in (document["notes"], planned["notes"]):
+        assert notes.count(NO_PHOTOS) == 1
+    assert ROW_COLORS in run("compact", scene_copy, *SMALL, "--overwrite", code=0).out
+    result = scene_copy / document["output"]["path"]
+    assert ROW_COLORS in run("evaluate", scene_copy, result, code=0).out
+    assert ROW_COLORS in json.loads(run("view", scene_copy, result, "--json", code=0).out)["headline"]
 
 
 def test_a_plan_tells_what_is_used(made_scene: Path, run: Run) -> None:

@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 import scenes
 import torch
+import unaligned_scenes
 from messages import refuses
 
 from gsmerge import CompactOptions, Scene, compact
+from gsmerge.facts.row_colors import PHOTOS, ROW_COLORS
+from gsmerge.raster.photos import scene_pictures
 from gsmerge.runtime.record import STAGES
 from gsmerge.settings.stages import SEGMENTATIONS
 
@@ -73,7 +76,6 @@ def test_many_views_are_scored_by_some(scene: Scene, monkeypatch: pytest.MonkeyP
     assert result.report.psnr_before == pytest.approx(scenes.psnr_of(scene.gaussians, some), abs=0.1)
     assert result.report.psnr_after == pytest.approx(scenes.psnr_of(result.gaussians, some), abs=0.1)
     assert result.report.choices["scored_views"] == 1
-    assert "scored_views" not in scenes.compacted(replace(scene, images=None)).report.choices
     better = scenes.compacted(scene, fit="none", quality="20dB")
     assert better.report.choices["scored_views"] == len(scene)
 
@@ -93,10 +95,23 @@ def test_progress_tells_every_step_of_the_full_fit(scene: Scene) -> None:
     assert [name for name, _, _ in calls if not name.startswith("fit:")] == [*USUAL, "done"]
 
 
-def test_without_photos(scene: Scene) -> None:
-    result = scenes.compacted(replace(scene, images=None))
-    assert result.report.psnr_before is None
-    assert not {"input", "curve", "fit", "score"} & set(result.report.seconds)
+def test_without_photos_colours_of_pixels_are_what_a_result_is_fitted_to_and_measured_against(scene: Scene) -> None:
+    with_photos, without = (compact(one, fit_steps=40) for one in (scene, replace(scene, images=None)))
+    report = without.report
+    assert (with_photos.report.psnr_reference, report.psnr_reference) == (PHOTOS, ROW_COLORS)
+    assert report.choices["fit"]["accepted"]
+    pictures = replace(scene, images=scene_pictures(replace(scene, images=None)))
+    assert report.psnr_before == pytest.approx(scenes.psnr_of(scene.gaussians, pictures), abs=0.1)
+    assert report.psnr_after == pytest.approx(scenes.psnr_of(without.gaussians, pictures), abs=0.1)
+    assert scenes.psnr_of(without.gaussians, scene) > scenes.psnr_of(with_photos.gaussians, scene) - 1
+    assert report.worse is None
+
+
+def test_without_photos_and_pixels_nothing_is_measured(scene: Scene) -> None:
+    bare = unaligned_scenes.without_order(replace(scene, images=None))
+    report = compact(bare, fit_steps=4).report
+    assert report.psnr_before is None
+    assert not {"input", "curve"} & set(report.seconds)
 
 
 def test_options_and_settings_combine(scene: Scene) -> None:

@@ -95,20 +95,18 @@ def test_networks_are_loaded_where_they_help(settings: dict[str, Any], photos: b
 
 
 def test_networks_compete_unless_they_are_named(scene: Scene) -> None:
-    blind = replace(scene, images=None)
-    assert [one is None for one in plan_of(blind).networks] == [False, True]
-    assert [one is None for one in plan_of(blind, checkpoint="shipped").networks] == [False]
-    assert plan_of(blind, checkpoint="none").networks == (None,)
+    assert [one is None for one in plan_of(scene, fit="none").networks] == [False, True]
+    assert [one is None for one in plan_of(scene, fit="none", checkpoint="shipped").networks] == [False]
+    assert plan_of(scene, fit="none", checkpoint="none").networks == (None,)
 
 
 def test_quick_efforts_run_the_heads_alone(scene: Scene) -> None:
     """Unless the networks are named: the refiner takes ten times as long."""
-    blind = replace(scene, images=None)
     for settings, refines in (
         ({}, True), ({"effort": "fast"}, False), ({"effort": "draft"}, False),
         ({"effort": "draft", "checkpoint": "shipped"}, True),
     ):  # fmt: skip
-        networks = plan_of(blind, **settings).networks[0]
+        networks = plan_of(scene, fit="none", **settings).networks[0]
         assert networks.options.refiner is refines
         assert any(name.startswith("heads.4") for name in networks.arrays)
         assert any(name.startswith("refiner") for name in networks.arrays) is refines
@@ -121,11 +119,19 @@ def test_a_missing_checkpoint_is_noted(scene: Scene) -> None:
     assert "networks" in record.notes[0]
 
 
-def test_without_photos_nothing_is_fitted_and_a_budget_is_met(scene: Scene) -> None:
-    blind = replace(scene, images=None)
-    assert plan_of(blind).fit.fit == "none"
-    assert plan_of(blind).superpixels.start_share == 1
-    assert len(compact(blind, budget=150).gaussians) == 150
+@pytest.mark.parametrize("settings", [{}, {"fit": "none"}, {"effort": "draft"}, {"quality": "20dB"}], ids=str)
+def test_without_photos_a_plan_is_the_same_where_pixels_are_known(settings: dict[str, Any], scene: Scene) -> None:
+    """Their colours stand in; the estimate, which looks at no colour, knows that."""
+    blind, options = replace(scene, images=None), options_of(**settings)
+    actual, expected = plan_of(blind, **settings), plan_of(scene, **settings)
+    assert actual.settings == expected.settings
+    assert actual.target_psnr == expected.target_psnr
+    assert actual.scored_views == expected.scored_views
+    assert estimate(blind, options) == estimate(scene, options)
+
+
+def test_without_photos_a_budget_is_met(scene: Scene) -> None:
+    assert len(compact(replace(scene, images=None), budget=150, fit_steps=20).gaussians) == 150
 
 
 def test_a_long_fit_begins_with_a_share(scene: Scene) -> None:
@@ -161,15 +167,16 @@ def test_what_no_view_sees_takes_its_share_of_a_budget(scene: Scene) -> None:
 
 @pytest.mark.parametrize(("settings", "reason"), [({"quality": "20dB"}, "quality"), ({"drop_sky": True}, "drop_sky")])
 def test_settings_that_need_photos_are_refused(settings: dict[str, Any], reason: str, scene: Scene) -> None:
+    """Where no pixel is known, whose colour could stand in."""
     with pytest.raises(UsageError, match=reason):
-        plan_of(replace(scene, images=None), **settings)
+        plan_of(unaligned_scenes.without_order(replace(scene, images=None)), **settings)
 
 
 def test_sky_stays_where_no_photo_is_used(scene: Scene) -> None:
     rng = np.random.default_rng(0)
     noise = replace(scene, images=rng.random(scene.images.shape, np.float32))
     with record_run() as record:
-        plan = plan_of(noise, drop_sky=True)
+        plan = plan_of(unaligned_scenes.without_order(noise), drop_sky=True)
     assert plan.fit.fit == "none"
     assert not plan.clean.drop_sky
     assert any("drop_sky" in note for note in record.notes)

@@ -13,6 +13,7 @@ from messages import refuses
 from gsmerge import CompactOptions, compact
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import canonicalise
+from gsmerge.facts.row_colors import ROW_COLORS
 from gsmerge.facts.views import subset
 from gsmerge.fit import FitJob, FitOptions, fit
 from gsmerge.fit.photo_sizes import fit_photos
@@ -76,9 +77,13 @@ def test_threads_do_not_change_a_bit(scene: Scene) -> None:
 
 
 def test_without_photos(scene: Scene) -> None:
-    result = compact(replace(scene, images=None), blocks=2, **SETTINGS)
-    assert result.report.psnr_after is None
-    assert len(result.gaussians)
+    """Each block takes the colours of its own pixels; they are named once."""
+    bare = replace(scene, images=None)
+    whole, report = (compact(bare, blocks=blocks, **SETTINGS).report for blocks in ("none", 2))
+    assert whole.psnr_reference == report.psnr_reference == ROW_COLORS
+    assert report.psnr_before == pytest.approx(whole.psnr_before, abs=0.5)
+    assert report.psnr_after > whole.psnr_after - 1
+    assert sum(ROW_COLORS in note for note in report.notes) == 1
 
 
 @pytest.mark.parametrize("checkpoint", ["none", "shipped"])

@@ -73,7 +73,6 @@ def test_tensors_too(pixels: Scene, encoded: Encoded) -> None:
 
 @pytest.mark.parametrize("k", [1, 2, 4])
 def test_one_encoding_gives_every_k_without_photos(k: int, bare: Scene, encoded_bare: Encoded) -> None:
-    assert encoded_bare.settings.min_contribution == 0
     assert scenes.identical(decode_scene(encoded_bare, k=k), unfitted(bare, k=k))
 
 

@@ -9,7 +9,9 @@ from messages import refuses
 
 from gsmerge import Scene
 from gsmerge.facts.prepare import canonicalise, prepare, scene_frame
+from gsmerge.facts.row_colors import ROW_COLORS
 from gsmerge.geometry import project
+from gsmerge.raster.photos import scene_pictures
 from gsmerge.types import grid_ids
 
 
@@ -92,7 +94,11 @@ def test_gaussians_in_the_cameras_plane_have_a_unit() -> None:
 
 
 def test_renders_stand_in_for_photos_where_no_pixels_are_known_alone(scene: Scene) -> None:
-    """A fit to renders of one Gaussian per pixel would keep its errors."""
+    """A fit to renders of one Gaussian per pixel would keep its errors: its pixels' own colours are taken."""
     bare = replace(scene, images=None)
-    assert prepare(bare).scene.images is None
-    assert prepare(replace(bare, pixel_ids=None)).scene.images is not None
+    aligned, unaligned = prepare(bare), prepare(replace(bare, pixel_ids=None))
+    np.testing.assert_allclose(aligned.scene.images, scene_pictures(bare), atol=1e-6)
+    assert aligned.input_scene.images is not None
+    assert aligned.reference.name == ROW_COLORS
+    assert unaligned.scene.images is not None
+    assert unaligned.input_scene.images is None

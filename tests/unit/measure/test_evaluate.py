@@ -19,6 +19,7 @@ from messages import names, refuse_all, refuses
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 import gsmerge
+from gsmerge.facts.row_colors import ROW_COLORS
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Evaluation, evaluate, near_plane
 from gsmerge.measure.fog import measure_fog
 from gsmerge.measure.scores import (
@@ -28,6 +29,7 @@ from gsmerge.measure.scores import (
     evaluation_lines,
     evaluation_markdown,
 )
+from gsmerge.raster.photos import scene_pictures
 from gsmerge.report import to_json
 from gsmerge.types import Gaussians, Scene, Views
 
@@ -104,8 +106,22 @@ def test_what_is_counted(actual: Evaluation, scene: Scene, half: Gaussians) -> N
     assert actual.notes == ()
 
 
-def test_without_photos_the_input_s_renders_are_the_reference(scene: Scene, half: Gaussians) -> None:
-    actual = evaluate(replace(scene, images=None), {"half": half}, None, PLAIN)
+def no_pixels(scene: Scene) -> Scene:
+    """The same Gaussians without photos, and without the pixels that they belong to."""
+    return replace(scene, images=None, pixel_ids=None)
+
+
+def test_without_photos_the_colours_of_pixels_are_the_reference(scene: Scene, half: Gaussians) -> None:
+    bare = replace(scene, images=None)
+    actual = evaluate(bare, {"half": half}, None, PLAIN)
+    expected = evaluate(replace(bare, images=scene_pictures(bare)), {"half": half}, None, PLAIN)
+    assert actual.reference == ROW_COLORS
+    for before, after in zip(actual.results, expected.results, strict=True):
+        assert before.mean("context")[0].psnr == pytest.approx(after.mean("context")[0].psnr, abs=1e-3)
+
+
+def test_without_photos_and_pixels_the_input_s_renders_are_the_reference(scene: Scene, half: Gaussians) -> None:
+    actual = evaluate(no_pixels(scene), {"half": half}, None, PLAIN)
     assert actual.reference == "renders of the input"
     assert all(math.isinf(s.full.psnr or 0) for s in actual.results[0].scores)
     assert all((s.full.psnr or 99) < 60 for s in actual.results[1].scores)
@@ -241,7 +257,7 @@ def test_a_photo_side_enlarges_nothing(side: int, scene: Scene, half: Gaussians,
 
 
 def test_a_photo_side_without_photos(scene: Scene, half: Gaussians) -> None:
-    actual = evaluate(replace(scene, images=None), {"half": half}, None, replace(PLAIN, photo_side=24))
+    actual = evaluate(no_pixels(scene), {"half": half}, None, replace(PLAIN, photo_side=24))
     assert all(math.isinf(s.full.psnr or 0) for s in actual.results[0].scores)
     document = evaluation_document(actual, {})
     assert document["photo_side"] == 24
@@ -257,7 +273,7 @@ def test_bad_photo_sides(side: float) -> None:
 
 def test_the_input_s_renders_are_the_reference_at_every_size(scene: Scene, half: Gaussians) -> None:
     options = replace(PLAIN, zoom=(0.5, 2), antialiased=True)
-    actual = evaluate(replace(scene, images=None), {"half": half}, None, options)
+    actual = evaluate(no_pixels(scene), {"half": half}, None, options)
     assert all(math.isinf(full.psnr or 0) for s in actual.results[0].scores for full, _ in s.zooms.values())
     assert all((full.psnr or 99) < 60 for s in actual.results[1].scores for full, _ in s.zooms.values())
 
@@ -458,8 +474,9 @@ def test_pictures_too_small_for_lpips(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_what_results_are_compared_with(scene: Scene) -> None:
-    bare = replace(scene, images=None)
-    assert evaluate(bare, {}, held_out(), PLAIN).reference == "photos, and renders of the input in its own views"
+    bare, unaligned = replace(scene, images=None), no_pixels(scene)
+    assert evaluate(unaligned, {}, held_out(), PLAIN).reference == "photos, and renders of the input in its own views"
+    assert evaluate(bare, {}, held_out(), PLAIN).reference == f"photos, and {ROW_COLORS} in its own views"
     assert evaluate(bare, {}, held_out(), replace(PLAIN, context=False)).reference == "photos"
 
 

@@ -17,6 +17,7 @@ from messages import noted
 
 from gsmerge import Gaussians, Scene, evaluate, render
 from gsmerge.facts.prepare import scene_frame
+from gsmerge.facts.row_colors import ROW_COLORS
 from gsmerge.io.formats.spz import spz_bytes
 from gsmerge.measure.camera_path import outside_camera
 from gsmerge.measure.evaluate import EvaluateOptions, near_plane
@@ -94,7 +95,7 @@ def test_one_scene_alone(scene: Scene) -> None:
     values = [view.scores[0].psnr or 0 for view in alone.views]
     assert values == sorted(values)
     assert alone.scored
-    assert not collect("room", replace(scene, images=None), {}, (300,)).scored
+    assert not collect("room", replace(scene, images=None, pixel_ids=None), {}, (300,)).scored
 
 
 def test_the_worst_view_comes_first(actual: ViewData) -> None:
@@ -205,7 +206,7 @@ def test_outlines_are_the_borders_of_superpixels(actual: ViewData, scene: Scene)
 def test_superpixels_as_asked_for(scene: Scene, half: Gaussians) -> None:
     asked = collect("room", scene, {"half": half}, (2, 1), segmentation=SegmentOptions(superpixels=50))
     assert asked.num_superpixels == (50, 50)
-    none = collect("room", replace(scene, images=None), {"half": half}, (2, 1))
+    none = collect("room", replace(scene, images=None, pixel_ids=None), {"half": half}, (2, 1))
     assert none.num_superpixels is None
     assert {view.outlines for view in none.views} == {None}
 
@@ -220,9 +221,13 @@ def test_many_views_are_thinned(scene: Scene, half: Gaussians, monkeypatch: pyte
 
 
 def test_without_photos_results_are_compared_with_the_input(scene: Scene, half: Gaussians) -> None:
-    actual = collect("room", replace(scene, images=None), {"half": half}, (2, 1))
+    bare = replace(scene, images=None)
+    actual = collect("room", replace(bare, pixel_ids=None), {"half": half}, (2, 1))
     assert [view.photo for view in actual.views] == [None] * 3
     assert actual.reference == "renders of the input"
+    colored = collect("room", bare, {"half": half}, (2, 1))
+    assert all(view.photo is not None for view in colored.views)
+    assert colored.reference == ROW_COLORS
 
 
 @pytest.mark.parametrize(

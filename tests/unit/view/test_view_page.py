@@ -176,7 +176,7 @@ def test_one_scene_is_compared_with_its_photos(alone: ViewData) -> None:
     page = view_page(alone)
     read = json.loads(block(page, "data"))
     assert [source["name"] for source in read["sources"]] == ["photo", "input"]
-    assert headline(*alone.sides).replace(" dB", "\u00a0dB") in page
+    assert headline(alone).replace(" dB", "\u00a0dB") in page
     assert re.findall('<option value="(.)" selected>(.*?)<', page) == [("0", "photo"), ("1", "input")]
     assert "<span>→" not in page
     check_policy(page)
@@ -216,8 +216,8 @@ def test_halves_of_characters_become_question_marks(data: ViewData) -> None:
 )
 def test_headline(before: float | None, after: float | None, words: str, data: ViewData) -> None:
     sides = [replace(side, mean=Quality(psnr)) for side, psnr in zip(data.sides, (before, after), strict=True)]
-    line = headline(*sides)
-    assert headline(sides[0]).startswith(f"{sides[0].num_gaussians:,} Gaussians")
+    line = headline(replace(data, sides=tuple(sides)))
+    assert headline(replace(data, sides=(sides[0],))).startswith(f"{sides[0].num_gaussians:,} Gaussians")
     assert line.endswith(words)
     assert line.startswith("50.0 % of the Gaussians")
 

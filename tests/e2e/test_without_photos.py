@@ -1,0 +1,95 @@
+"""Scenes with cameras and without photos: the rows' own colours stand in, which every command says."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from batches import InlinePool
+
+import gsmerge
+from gsmerge.facts.row_colors import NO_PHOTOS, ROW_COLORS
+
+from .conftest import Run
+
+QUICK = ("--superpixels", 200, "--set", "fit_steps=40", "--threads", 1)
+UNFITTED = [("--fit", "none"), ("--recipe", "paper"), ("--blocks", 2)]  # of blocks, each block says how it was
+CLOSE = 0.3  # dB between a result fitted to photos and one fitted to colours that are the photos'
+
+
+@pytest.fixture(scope="module")
+def bare(made_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scene without its photos. Read only."""
+    folder = tmp_path_factory.mktemp("bare") / "scene"
+    shutil.copytree(made_scene, folder, ignore=shutil.ignore_patterns("targets", "images"))
+    return folder
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--effort", "draft"), ("--effort", "fast", "--k", 2), ("--fit", "none"), ("--budget", "5%"),
+        ("--budget", "20KB"), ("--budget", "auto"), ("--quality", "15dB"), ("--quality", "-1dB"), ("--blocks", 2),
+        ("--recipe", "paper"), ("--set", "drop_sky=true"), ("--exposure", "per-photo"), ("--set", "poses=free"),
+        ("--method", "unmerged-fit"), ("--levels", 2),
+    ],
+    ids=lambda options: " ".join(map(str, options)),
+)  # fmt: skip
+def test_every_setting_works(options: tuple[object, ...], bare: Path, tmp_path: Path, run: Run) -> None:
+    sizes = QUICK if options[0] not in ("--effort", "--budget") else QUICK[2:]
+    said = run("compact", bare, "-o", tmp_path / "small.ply", *sizes, *options, "--json", code=0)
+    document = json.loads(said.out)
+    assert document["psnr_reference"] == ROW_COLORS
+    assert document["psnr_input_views"]["after"] > 10
+    assert sum(note.startswith(NO_PHOTOS) for note in document["notes"]) == 1
+    assert ("fit" in document["choices"]) == (options not in UNFITTED)
+
+
+@pytest.mark.parametrize("effort", ["draft", "fast"])
+def test_as_good_as_with_photos(
+    effort: str, bare: Path, made_scene: Path, tmp_path: Path, target_psnr: Callable[[Path, Path], float]
+) -> None:
+    """Judged by photos that neither has seen."""
+    actual = []
+    for folder in (made_scene, bare):
+        out = tmp_path / f"{len(actual)}.ply"
+        gsmerge.write_ply(out, gsmerge.compact(folder, effort=effort, threads=1).gaussians)
+        actual.append(target_psnr(made_scene / "targets", out))
+    assert actual[1] > actual[0] - CLOSE
+
+
+def test_the_summary_says_what_the_result_is_measured_against(bare: Path, tmp_path: Path, run: Run) -> None:
+    out = tmp_path / "small.ply"
+    said = run("compact", bare, "-o", out, *QUICK, code=0)
+    assert f"dB against {ROW_COLORS}" in said.out
+    assert NO_PHOTOS in said.err
+    assert NO_PHOTOS in run("inspect", bare, code=0).out
+    planned = json.loads(run("compact", bare, *QUICK, "--dry-run", "--json", code=0).out)
+    assert NO_PHOTOS in planned["notes"]
+    assert planned["compact"]["fit"] == "full"
+
+
+def test_stored_scenes(bare: Path, tmp_path: Path, run: Run) -> None:
+    encoded, state, out = tmp_path / "scene.gsm", tmp_path / "state.gsm", tmp_path / "small.ply"
+    run("encode", bare, "-o", encoded, "--superpixels", 200, code=0)
+    run("decode", encoded, "-o", out, code=0)
+    run("extend", state, bare, "--superpixels", 200, code=0)
+    document = json.loads(run("decode", state, "-o", out, "--overwrite", "--json", code=0).out)
+    assert document["fit"]["method"] == "full"
+
+
+def test_a_batch_says_it_of_every_scene(
+    bare: Path, made_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gsmerge.batch.schedule.ProcessPool", InlinePool)
+    for name, folder in (("bare", bare), ("photos", made_scene)):
+        ignore = shutil.ignore_patterns("targets")
+        shutil.copytree(folder, tmp_path / "scenes" / name, ignore=ignore)
+    run("batch", tmp_path / "scenes", "--output", tmp_path / "out", *QUICK, "-q", code=0)
+    with open(tmp_path / "out" / "summary.csv", newline="", encoding="utf-8") as file:
+        rows = {Path(row["output"]).stem: row["psnr_reference"] for row in csv.DictReader(file)}
+    assert rows == {"bare": ROW_COLORS, "photos": "photos"}
