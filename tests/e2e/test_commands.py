@@ -16,7 +16,7 @@ import gsmerge
 from gsmerge.cli import main
 from gsmerge.compaction.files import NO_PHOTOS
 
-from .conftest import Run, assert_refused, listing
+from .conftest import Run, listing
 
 VIEWS, HEIGHT, WIDTH = 5, 64, 96
 SMALL = ("--superpixels", 200)
