@@ -16,7 +16,7 @@ import gsmerge
 from gsmerge.cli import main
 from gsmerge.facts.row_colors import NO_PHOTOS, ROW_COLORS
 
-from .conftest import Run, assert_refused, listing
+from .conftest import Run, listing
 
 VIEWS, HEIGHT, WIDTH = 5, 64, 96
 SMALL = ("--superpixels", 200)
@@ -224,7 +224,8 @@ def test_a_view_of_one_scene(scene_copy: Path, run: Run) -> None:
     assert "cameras: " in outcome.err
     assert outcome.out.endswith("bare.view.html: 30,720 Gaussians\n")
     shutil.copy(bare, bare.with_name("x.ply"))
-    assert_refused(run("view", bare, bare.with_name("x.ply"), "--no-open"), 3, bare, "cameras", "none")
+    outcome = run("view", bare, bare.with_name("x.ply"), "--no-open", code=0)
+    assert "no cameras: " in outcome.err
 
 
 def test_version(run: Run) -> None:

@@ -101,7 +101,9 @@ def test_a_scene_without_cameras_takes_those_of_the_path(scene_copy: Path, tmp_p
     out = tmp_path / "out.mp4"
     run("render", bare, "--path", scene_copy / "transforms.json", "-o", out, code=0)
     assert len(read(out)) == 5
-    assert_refused(run("render", bare, "--path", "orbit", "-o", tmp_path / "x.mp4"), 3, bare, "cameras", "--cameras")
+    made = run("render", bare, "--path", "orbit", "--frames", 2, "-o", tmp_path / "x.mp4", code=0)
+    assert "no cameras: " in made.err  # about the views that are placed
+    assert len(read(tmp_path / "x.mp4")) == 2
 
 
 def test_one_camera_has_an_orbit_but_no_spline(made_scene: Path, tmp_path: Path, run: Run) -> None:
