@@ -45,11 +45,7 @@ def weigh_centres(means, scales, opacities, viewmat, K, near, fronts):
     ids, pixels, depths, areas = (np.empty(n, kind) for kind in (np.int32, np.int32, np.float32, np.float32))
     m = _project_centres(means, scales, viewmat, K, width, height, near, ids, pixels, depths, areas)
     ids, pixels, depths, areas = (array[:m].copy() for array in (ids, pixels, depths, areas))
-    weights, passing, most = (
-        np.empty(m, np.float32),
-        np.ones_like(fronts, np.float32),
-        np.zeros_like(fronts, np.float32),
-    )
+    weights, passing = np.empty(m, np.float32), np.ones((height, width), np.float32)
     fronts[:] = -1
     order = depth_order(depths.view(np.uint32))
     _weigh_centres(order, ids, pixels, areas, opacities, passing, np.zeros_like(passing), fronts, weights)
