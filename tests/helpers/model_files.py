@@ -315,7 +315,7 @@ def points_only(model: str, folder: Path) -> Export:
     if model == "VGGT":
         arrays = {"extrinsic": scene.w2c[:, :3], "intrinsic": np.tile(scene.K, (3, 1, 1)), "images": scene.images}
         np.savez(folder / "predictions.npz", **arrays)
-    return Export(folder, scene, np.zeros(0), World(), None)
+    return Export(folder, scene, np.zeros(0), World(), None, np.zeros(0))
 
 
 def npz_alone(name: str, folder: Path) -> Export:
@@ -323,7 +323,7 @@ def npz_alone(name: str, folder: Path) -> Export:
     depth_anything("glb-npz", folder)
     (folder / "gs_ply/0000.ply").unlink()
     (folder / "gs_ply").rmdir()
-    return Export(folder / name if name else folder, made(), np.zeros(0), World(), None)
+    return Export(folder / name if name else folder, made(), np.zeros(0), World(), None, np.zeros(0))
 
 
 SCRIPT = "point_clouds/000000_room/gaussians.ply"  # of the figure scripts of pixelSplat's family

@@ -12,7 +12,7 @@ from exports import Smooth, export_rows, save_export, smooth_scene, turned, with
 from tiny_scene import save_json, write_images, write_transforms
 
 from gsmerge.geometry import multiply_quats, normalize, rotmat_to_quat
-from gsmerge.types import Gaussians
+from gsmerge.types import Gaussians, Scene
 
 HALF = np.sqrt(0.5)
 # pixelSplat's: the first camera's z becomes up, and all is turned by -45 degrees about it
@@ -46,6 +46,7 @@ class Export:
     world: World  # in which the rows are
     # place of each row in a scene of one Gaussian per pixel, layers as views of their own; None where there is none
     pixels: np.ndarray | None
+    opacities: np.ndarray
     options: dict[str, Path] = field(default_factory=dict)  # the cameras and photos that the user names
     quats: np.ndarray | None = None  # ``[n,4]`` true rotations of the rows; None where they cannot be known
 
@@ -188,8 +189,8 @@ def finish_rows(saver: Saver, layered: Smooth, pixels: np.ndarray, world: World,
         rows[f"rot_{i}"] = stored[:, i]
     if saver.raw:
         rows["opacity"] = layered.gaussians.opacities[pixels]
-    known = saver.quats == "wxyz"
-    return Export(Path(saver.place), scene, rows, world, pixels, quats=true if known else None)
+    truth = {"opacities": layered.gaussians.opacities[pixels], "quats": None if saver.quats == "camera" else true}
+    return Export(Path(saver.place), scene, rows, world, pixels, **truth)
 
 
 def save_pixels(saver: Saver, scene: Smooth, folder: Path, keep: np.ndarray | None = None) -> Export:
@@ -227,3 +228,32 @@ def save_unordered(
     world = world_of(saver.frame, scene, gaussians.means) if world is None else world
     export = finish_rows(saver, layered, np.arange(len(gaussians)), world, scene)
     return save(replace(export, pixels=None), folder)
+
+
+def check_cameras(scene: Scene, export: Export) -> None:
+    """Check that a scene has all views: their cameras in the frame of the file, and the photos that belong to them."""
+    poses = export.world.move(export.scene.c2w)
+    layers = len(scene) // len(poses)
+    assert layers * len(poses) == len(scene)
+    turns = scene.cameras.viewmats[::layers, :3, :3] @ poses[:, :3, :3]
+    assert np.degrees(np.arccos(np.clip((np.trace(turns, axis1=1, axis2=2) - 1) / 2, -1, 1))).max() < 0.5
+    middle = np.median(np.stack([export.rows[name] for name in "xyz"], 1), 0)
+    size = np.linalg.norm(poses[:, :3, 3] - middle, axis=1).max()
+    assert np.abs(scene.cameras.centres[::layers] - poses[:, :3, 3]).max() < 0.01 * size
+    assert scene.images is not None
+    for image, photo in zip(scene.images[::layers], export.scene.images, strict=True):
+        expected = cv2.resize(photo, image.shape[1::-1], interpolation=cv2.INTER_CUBIC)
+        assert np.abs(image - expected / 255).mean() < 0.02
+
+
+def check_pixels(scene: Scene, export: Export) -> None:
+    """Check that a scene has every row of a file at its pixel, with its own opacity and rotation."""
+    assert export.pixels is not None
+    assert scene.num_gaussians == len(export.rows)
+    g = scene.gaussians[export.pixels]
+    stored = np.stack([export.rows[name] for name in "xyz"], 1)
+    at_home = np.isclose(g.means, stored, rtol=1e-4, atol=1e-6).all(1)
+    assert at_home.mean() > 0.999
+    assert np.abs(g.opacities - export.opacities)[at_home].max() < 1e-4
+    if export.quats is not None:
+        assert np.median(np.abs((g.quats * export.quats).sum(1))[at_home]) > 0.999

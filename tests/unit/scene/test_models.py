@@ -1,0 +1,68 @@
+"""Files as models leave them, by what is beside them: read right, or refused with what to do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from model_files import MODELS
+from model_rows import check_cameras, check_pixels
+
+from gsmerge.scene.read import load_scene
+
+DA3 = "Depth Anything 3"
+PER_PIXEL = {  # and the names of exporters that may have written each; none: any has its columns
+    f"{DA3}, npz-gs_ply": ("da3",),
+    f"{DA3}, mini_npz-gs_ply": ("da3",),
+    f"{DA3}, glb-npz-gs_ply": ("da3",),
+    f"{DA3}, colmap-npz-gs_ply": ("da3",),
+    f"{DA3}, colmap-gs_ply": ("da3",),
+    f"{DA3}, gs_ply": ("da3",),
+    "DepthSplat": ("depthsplat",),
+    "DepthSplat without cameras": ("depthsplat",),
+    "MVSplat's script": ("mvsplat", "spfsplat"),
+    "pixelSplat": ("pixelsplat",),
+    "pixelSplat's script": ("pixelsplat-script",),
+    "NoPoSplat": ("noposplat",),
+    "Splatt3R": ("splatt3r",),
+    "YoNoSplat": ("yonosplat",),
+    "ReSplat": ("resplat",),
+    "Long-LRM": ("longlrm",),
+    "GS-LRM": (),
+    "GRM": (),
+    "FlashWorld": (),
+    "Flash3D": ("flash3d",),
+    "SHARP": ("sharp",),
+}
+UNALIGNED = {
+    "VicaSplat": ("vicasplat",),
+    "VolSplat": ("volsplat",),
+    "Long-LRM, sorted": ("longlrm-sorted",),
+    "WorldMirror 2": ("worldmirror",),
+    "INRIA": ("inria",),
+    "InstantSplat": ("inria",),
+    "nerfstudio": ("nerfstudio",),
+}
+
+
+@pytest.mark.parametrize("name", PER_PIXEL)
+def test_every_row_is_at_its_pixel(tmp_path: Path, name: str) -> None:
+    export = MODELS[name](tmp_path / "out")
+    loaded = load_scene(export.path, **export.options)
+    check_pixels(loaded.pixel_scene(), export)
+    check_cameras(loaded.scene, export)
+    assert set(PER_PIXEL[name]) <= {exporter.name for exporter in loaded.exporters}
+
+
+@pytest.mark.parametrize("name", UNALIGNED)
+def test_rows_of_no_pixels_have_the_cameras_and_photos_of_their_views(tmp_path: Path, name: str) -> None:
+    export = MODELS[name](tmp_path / "out")
+    loaded = load_scene(export.path, **export.options)
+    assert not loaded.scene.aligned
+    check_cameras(loaded.scene, export)
+    assert set(UNALIGNED[name]) <= {exporter.name for exporter in loaded.exporters}
+    means = np.stack([export.rows[axis] for axis in "xyz"], 1)
+    padding = (means == 0).all(1) if name == "VolSplat" else np.zeros(len(means), bool)
+    assert np.array_equal(loaded.scene.gaussians.means, means[~padding])
+    assert np.abs(loaded.scene.gaussians.opacities - export.opacities[~padding]).max() < 1e-5
