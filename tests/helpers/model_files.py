@@ -5,6 +5,8 @@ Each writer of ``MODELS`` takes a folder, and returns what a user would name, wi
 
 from __future__ import annotations
 
+import json
+import struct
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -56,6 +58,13 @@ def dataset_model(
 # Depth Anything 3
 
 
+def write_points_glb(path: Path) -> None:
+    """Write a ``.glb`` of no Gaussians."""
+    text = json.dumps({"asset": {"version": "2.0"}, "scenes": [{"nodes": [0]}], "nodes": [{}]}).encode()
+    text += b" " * (-len(text) % 4)
+    path.write_bytes(struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text), len(text), b"JSON") + text)
+
+
 def depth_anything(formats: str, folder: Path, *, photos: int = 2) -> Export:
     """Write what the formats of ``export_format`` name, joined by ``-``; the photos are larger than the model's."""
     scene = made(96, 72)
@@ -73,7 +82,7 @@ def depth_anything(formats: str, folder: Path, *, photos: int = 2) -> Export:
         write_colmap_binary(folder, larger)
         (folder / "points3D.bin").write_bytes(bytes(8))
     if "glb" in formats:
-        (folder / "scene.glb").write_bytes(b"glTF")
+        write_points_glb(folder / "scene.glb")
         cv2.imwrite(str(folder / "scene.jpg"), scene.images[0])
         (folder / "gs_video").mkdir()
         (folder / "gs_video/0000_extend.mp4").touch()
@@ -385,7 +394,7 @@ MODELS: dict[str, Callable[[Path], Export]] = {
     "WorldMirror 1": partial(world_mirror, 1),
     "WorldMirror 2": partial(world_mirror, 2),
     "ZipSplat": zip_splat,
-    "INRIA": partial(trained, Saver("point_cloud/iteration_30000/point_cloud.ply", rest=45), cameras="INRIA"),
+    "INRIA 3DGS": partial(trained, Saver("point_cloud/iteration_30000/point_cloud.ply", rest=45), cameras="INRIA"),
     "InstantSplat": partial(trained, Saver("point_cloud/iteration_1000/point_cloud.ply", rest=9), cameras="INRIA"),
     "nerfstudio": partial(trained, Saver("splat.ply", rest=45), cameras="nerfstudio"),
     "gsplat's trainer": partial(trained, Saver("ply/point_cloud_29999.ply", rest=45, normals=""), cameras="gsplat"),

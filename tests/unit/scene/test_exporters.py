@@ -26,7 +26,6 @@ from tiny_scene import Tiny, make_tiny, write_npz
 
 from gsmerge.errors import SceneError
 from gsmerge.io import read_ply
-from gsmerge.scene.exporters import EXPORTERS
 from gsmerge.scene.read import load_scene, read_scene
 
 
@@ -268,11 +267,6 @@ def test_wrong_arguments(tmp_path: Path, smooth: Tiny, name: str, value: object)
     path = save_export(tmp_path, smooth, export_rows(smooth))
     with pytest.raises(ValueError, match="expected"):
         read_scene(path, **{name: value})
-
-
-def test_every_exporter_is_documented(root: Path) -> None:
-    text = (root / "docs" / "reference" / "exporters.md").read_text()
-    assert [name for name in EXPORTERS if f"| `{name}` |" not in text] == []
 
 
 def dump_of(tiny: Tiny, folder: Path, root: Path, **changes: Any) -> Path:

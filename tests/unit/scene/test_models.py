@@ -9,10 +9,11 @@ import pytest
 from model_files import MODELS
 from model_rows import check_cameras, check_pixels
 
+from gsmerge.scene.exporters import EXPORTERS
 from gsmerge.scene.read import load_scene
 
 DA3 = "Depth Anything 3"
-PER_PIXEL = {  # and the names of exporters that may have written each; none: any has its columns
+PER_PIXEL = {  # and the exporters that may have written each
     f"{DA3}, npz-gs_ply": ("da3",),
     f"{DA3}, mini_npz-gs_ply": ("da3",),
     f"{DA3}, glb-npz-gs_ply": ("da3",),
@@ -29,9 +30,9 @@ PER_PIXEL = {  # and the names of exporters that may have written each; none: an
     "YoNoSplat": ("yonosplat",),
     "ReSplat": ("resplat",),
     "Long-LRM": ("longlrm",),
-    "GS-LRM": (),
-    "GRM": (),
-    "FlashWorld": (),
+    "GS-LRM": ("lgm",),
+    "GRM": ("lgm",),
+    "FlashWorld": ("lgm",),
     "Flash3D": ("flash3d",),
     "SHARP": ("sharp",),
 }
@@ -40,7 +41,7 @@ UNALIGNED = {
     "VolSplat": ("volsplat",),
     "Long-LRM, sorted": ("longlrm-sorted",),
     "WorldMirror 2": ("worldmirror",),
-    "INRIA": ("inria",),
+    "INRIA 3DGS": ("inria",),
     "InstantSplat": ("inria",),
     "nerfstudio": ("nerfstudio",),
 }
@@ -66,3 +67,9 @@ def test_rows_of_no_pixels_have_the_cameras_and_photos_of_their_views(tmp_path: 
     padding = (means == 0).all(1) if name == "VolSplat" else np.zeros(len(means), bool)
     assert np.array_equal(loaded.scene.gaussians.means, means[~padding])
     assert np.abs(loaded.scene.gaussians.opacities - export.opacities[~padding]).max() < 1e-5
+
+
+def test_made_files_are_of_models_in_the_table() -> None:
+    titles = tuple(model.title for exporter in EXPORTERS.values() for model in exporter.models)
+    assert len(set(titles)) == len(titles)
+    assert {name for name in MODELS if not name.startswith(titles)} == {"MapAnything", "VGGT"}  # of points
