@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from gsmerge.io.formats.read import FileInfo
 
 FrameKind = Literal["same", "scaled", "shifted", "first", "middle", "upright", "other"]
+TURNED: tuple[FrameKind, ...] = ("first", "middle", "upright")  # by exporters, means and rotations alike
 
 
 AUTO = ReadHints()

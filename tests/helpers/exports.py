@@ -93,7 +93,6 @@ def turned(
     *,
     scale: float = 1.0,
     shift: np.ndarray | None = None,
-    rotate_quats: bool = True,
 ) -> np.ndarray:
     """The rows in another world: ``scale * turn @ x + shift``."""
     out = rows.copy()
@@ -101,11 +100,10 @@ def turned(
     for i, name in enumerate("xyz"):
         out[name] = means[:, i]
         out[f"scale_{i}"] = rows[f"scale_{i}"] + np.log(scale)
-    if rotate_quats:
-        quats = np.stack([rows[f"rot_{i}"] for i in range(4)], 1)
-        moved = wxyz_of(turn @ quat_to_rotmat(quats).astype(np.float64))
-        for i in range(4):
-            out[f"rot_{i}"] = moved[:, i]
+    quats = np.stack([rows[f"rot_{i}"] for i in range(4)], 1)
+    moved = wxyz_of(turn @ quat_to_rotmat(quats).astype(np.float64))
+    for i in range(4):
+        out[f"rot_{i}"] = moved[:, i]
     return out
 
 
