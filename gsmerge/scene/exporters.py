@@ -95,7 +95,7 @@ _UPRIGHT: tuple[FrameKind, ...] = ("upright",)
 _ANY: tuple[FrameKind, ...] = ("same", "scaled", "shifted", "other")
 _NORMALS = ("nx", "ny", "nz")
 # What users have to add, or what is lost
-_NAME_CAMERAS = "read right with the data set's cameras; alone where its grid gives them"
+_NAME_CAMERAS = "read right with cameras, or with those that its grid shows"
 _NO_PIXELS = "unaligned: without pixels"
 _WITH_CAMERAS = "unaligned; photos are used where cameras are named"
 
@@ -211,7 +211,7 @@ _EXPORTERS = (
             Model(
                 "YoNoSplat", "a copy, lksrz/YoNoSplat",
                 "`debug_info/SCENE_gaussians.ply`, 8 pixels trimmed, opacities above 0.01; no cameras",
-                "read right with cameras",
+                "read right with cameras; without where no row is missing",
             ),
         ),
         "raw", "view-fastest", ("trim", "pruned"), _ANY, quats="camera",
@@ -238,7 +238,7 @@ _EXPORTERS = (
         (
             Model(
                 "Splatt3R", "btsmart/splatt3r bda1dd0", "`gaussians.ply` of two views; no cameras",
-                "read right with its two photos",
+                "read right with its photos",
             ),
         ),
         "raw", "view-major", ("full",), _ANY, quats="xyzw-root",

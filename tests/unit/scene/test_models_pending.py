@@ -56,32 +56,33 @@ def test_dropped_pixels_are_put_back_by_cameras_and_photos(tmp_path: Path) -> No
 
 @pytest.mark.parametrize("name", ["DepthSplat, the .ply alone", "Flash3D without cameras"])
 def test_cameras_of_a_grid_without_photos(tmp_path: Path, name: str) -> None:
-    """The poses are in the rows' own frame, up to the focal length of one view that nothing else shows."""
+    """Where no photo shows that a border was cut off, the rows are every pixel of a smaller grid."""
     loaded, export = load(name, tmp_path)
-    check_pixels(loaded.pixel_scene(), export)
+    ranks = np.unique(export.pixels, return_inverse=True)[1].reshape(-1)
+    check_pixels(loaded.pixel_scene(), replace(export, pixels=ranks))
     assert loaded.alignment is not None
     assert loaded.alignment.worst_px < 0.5
 
 
-@pytest.mark.parametrize("name", ["NoPoSplat with the user's own photos", "Splatt3R with the user's own photos"])
-def test_photos_of_another_size_than_the_grid(tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize("model", ["NoPoSplat", "Splatt3R", "YoNoSplat"])
+def test_photos_of_another_size_than_the_grid(tmp_path: Path, model: str) -> None:
     """Twice the model's size, and where it takes squares cropped to one."""
-    loaded, export = load(name, tmp_path)
-    check_pixels(loaded.pixel_scene(), export)
+    loaded, export = load(f"{model} with the user's own photos", tmp_path)
+    check_pixels(loaded.pixel_scene(), export, quats=model != "YoNoSplat")
     check_cameras(loaded.scene, export)
 
 
 def test_photos_beside_the_gaussians_under_names_of_the_scene(tmp_path: Path) -> None:
     """SPFSplat's folder as it is left: the inputs, and drawings of its own that are no photos of these views."""
     loaded, export = load("SPFSplat", tmp_path)
-    check_pixels(loaded.pixel_scene(), replace(export, path=tmp_path))
+    check_pixels(loaded.pixel_scene(), export)
+    check_cameras(loaded.scene, export)
 
 
-@pytest.mark.parametrize("name", ["YoNoSplat with the user's own photos", "VolSplat without cameras"])
-def test_photos_whose_cameras_cannot_be_found(tmp_path: Path, name: str) -> None:
-    """Rows are missing, or belong to no pixels: the message names the photos and the option that brings cameras."""
+def test_photos_whose_cameras_cannot_be_found(tmp_path: Path) -> None:
+    """Voxels and no cameras: the message names the photos and the option that brings cameras."""
     with refuses(SceneError, "", "images", "--cameras"):
-        load(name, tmp_path)
+        load("VolSplat without cameras", tmp_path)
 
 
 # Folders
