@@ -7,7 +7,7 @@ python docs/generate_reference.py --check  # name them, exit code 1 if there are
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from enum import Enum
 from pathlib import Path
 from typing import Any, get_args
@@ -17,6 +17,7 @@ from api_page import api_page
 
 REFERENCE = Path(__file__).parent / "reference"
 COMMANDS, SETTINGS, TRAINING, API = "commands", "settings.md", "training-settings.md", "api.md"
+EXPORTERS = "exporters.md"  # whose prose is written by hand, and whose tables are made
 NOTICE = "<!-- Made by docs/generate_reference.py from the program: change the help there and run it again. -->"
 KINDS = {int: "whole number", float: "number", str: "text", Path: "path"}
 
@@ -58,6 +59,7 @@ def make_pages() -> dict[str, str]:
     pages[f"{COMMANDS}/README.md"] = _index(commands)
     pages[SETTINGS], pages[TRAINING] = _settings_page(), _training_page()
     pages[API] = f"{NOTICE}\n\n{api_page()}"
+    pages[EXPORTERS] = _exporters_page((REFERENCE / EXPORTERS).read_text(encoding="utf-8"))
     return pages
 
 
@@ -162,6 +164,42 @@ def _settings_page() -> str:
     lines += ["", "## Hints", "", "`--hint NAME=VALUE` says how to read a file that is recognised wrongly.", ""]
     lines += _table(flat_settings(FileHints).values(), "hint")
     return "\n".join([*lines, ""])
+
+
+def _exporters_page(page: str) -> str:
+    """Renew the tables of a page: what lies between the comments that name them and those that end them."""
+    from gsmerge.scene.exporters import EXPORTERS
+
+    exporters = EXPORTERS.values()
+    rows = [
+        (f"`{e.name}`", ", ".join(model.title for model in e.models), e.order, ", ".join(e.kinds * (e.order != "none")),
+         e.opacity, e.quats, ", ".join(map(str, e.degrees)), _columns(e))
+        for e in exporters
+    ]  # fmt: skip
+    head = ("name", "models", "order", "pixels", "opacity", "rotations", "degrees", "columns besides")
+    page = _renew(page, "names", head, rows)
+    models = ((m.title, m.source, m.leaves, m.result) for e in exporters for m in e.models)
+    return _renew(
+        page, "models", ("model", "saving code that was read", "what it leaves", "what becomes of it"), models
+    )
+
+
+def _columns(exporter: Any) -> str:
+    """What a file has besides the 14 columns of all."""
+    normals = "normals as bytes" if exporter.byte_columns else "normals" if exporter.normals else ""
+    marks = (normals, *(f"`{name}`" for name in exporter.elements), exporter.comment and f"comment {exporter.comment}")
+    return ", ".join(mark for mark in marks if mark)
+
+
+def _renew(page: str, name: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = ["| " + " | ".join(map(_cell, row)) + " |" for row in (head, *rows)]
+    lines.insert(1, "|---" * len(head) + "|")
+    start, end = f"<!-- {name}: made by docs/generate_reference.py from the program -->\n", "\n<!-- end -->"
+    before, _, rest = page.partition(start)
+    _, found, after = rest.partition(end)
+    if not found:
+        raise ValueError(f"{EXPORTERS}: expected a table {name!r} between {start.strip()} and {end.strip()}")
+    return before + start + "\n".join(["", *lines, ""]) + end + after
 
 
 def _training_page() -> str:

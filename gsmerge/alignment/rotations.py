@@ -8,6 +8,7 @@ import numpy as np
 
 from gsmerge.alignment.layouts import spread_step
 from gsmerge.geometry import multiply_quats, normalize, quat_to_rotmat, rotmat_to_quat
+from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.pictures import convolve
 from gsmerge.runtime.memory import free_pages
 from gsmerge.settings.reading import QuatChoice
@@ -29,8 +30,10 @@ _DESCRIPTIONS = {
 }
 
 
-def read_rotations(scene: Scene, quats: QuatChoice) -> Scene:
+def read_rotations(scene: Scene, quats: QuatChoice, turn: np.ndarray | None = None) -> Scene:
     """Reinterpret a scene's rotations, read as wxyz so far, in another way; see :class:`ReadHints`.
+
+    ``turn [3,3]`` is what the exporter turned its world by, rotations included; None: it did not.
 
     Of the two square roots that "xyzw-root" has, the one whose thinnest axis follows the surface better is taken.
     Where rows belong to no pixels, only "xyzw" changes anything.
@@ -46,7 +49,7 @@ def read_rotations(scene: Scene, quats: QuatChoice) -> Scene:
         first, second = (_cosines(root, thinnest, normals) for root in roots)
         read = np.where((second > first)[:, None], roots[1], roots[0])
     else:
-        read = multiply_quats(_camera_quats(scene).repeat(scene.pixels_per_view, 0), stored)
+        read = multiply_quats(_camera_quats(scene, turn).repeat(scene.pixels_per_view, 0), stored)
     return replace(scene, gaussians=replace(scene.gaussians, quats=read))
 
 
@@ -63,8 +66,11 @@ def square_roots(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return half, _half_a_turn_more(half)
 
 
-def choose_rotations(scene: Scene) -> tuple[QuatChoice, str]:
-    """Choose the reading of rotations whose thinnest axes follow the surface normals, with a note; in doubt "wxyz"."""
+def choose_rotations(scene: Scene, turn: np.ndarray | None = None) -> tuple[QuatChoice, str]:
+    """Choose the reading of rotations whose thinnest axes follow the surface normals, with a note; in doubt "wxyz".
+
+    ``turn`` as in :func:`read_rotations`.
+    """
     normals, rows, views = _normals(scene)
     scales = scene.gaussians.scales[rows]
     free_pages(vars(scene.gaussians).values())
@@ -76,7 +82,7 @@ def choose_rotations(scene: Scene) -> tuple[QuatChoice, str]:
     thinnest, quats = scales[flat].argmin(1), scene.gaussians.quats[rows]
     free_pages([scene.gaussians.quats])
     as_xyzw = from_xyzw(quats)
-    single = [quats, as_xyzw, multiply_quats(_camera_quats(scene)[views], quats)]
+    single = [quats, as_xyzw, multiply_quats(_camera_quats(scene, turn)[views], quats)]
     means = (float(_cosines(read, thinnest, normals).mean()) for read in single)
     cosine: dict[QuatChoice, float] = dict(zip(_READINGS, means, strict=True))
     best: QuatChoice = max(_READINGS, key=lambda name: cosine[name])
@@ -90,9 +96,10 @@ def choose_rotations(scene: Scene) -> tuple[QuatChoice, str]:
     )
 
 
-def _camera_quats(scene: Scene) -> np.ndarray:
-    """Compute rotations ``[v,4]`` from each camera to the world, wxyz."""
-    return rotmat_to_quat(scene.cameras.viewmats[:, :3, :3].swapaxes(1, 2)).astype(np.float32)
+def _camera_quats(scene: Scene, turn: np.ndarray | None) -> np.ndarray:
+    """Compute rotations ``[v,4]`` wxyz from each camera to the world; a turn of the world is undone before."""
+    rotmats = scene.cameras.viewmats[:, :3, :3].swapaxes(1, 2)
+    return rotmat_to_quat(rotmats if turn is None else matmul(rotmats, turn.T)).astype(np.float32)
 
 
 def _cosines(quats: np.ndarray, thinnest: np.ndarray, normals: np.ndarray) -> np.ndarray:

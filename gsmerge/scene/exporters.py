@@ -1,6 +1,7 @@
 """Hints on how to read a file, by its caller and by the exporters that are known by name.
 
-To add an exporter, add an :class:`Exporter` to the tuple below and a row to docs/reference/exporters.md.
+To add a model, add a :class:`Model` to the exporter whose columns, order and encodings it shares, or with an exporter
+of its own; ``python tasks.py reference`` renews docs/reference/exporters.md.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from gsmerge.io.formats.read import FileInfo
 
 FrameKind = Literal["same", "scaled", "shifted", "first", "middle", "upright", "other"]
+TURNED: tuple[FrameKind, ...] = ("first", "middle", "upright")  # by exporters, means and rotations alike
 
 
 AUTO = ReadHints()
@@ -37,11 +39,21 @@ def _listed(names: Iterable[str]) -> str:
 
 
 @dataclass(frozen=True)
+class Model:
+    """A model or program whose saving code was read."""
+
+    title: str  # as people call it
+    source: str  # repository and commit; two commits: the second is that of a file that was read again later
+    leaves: str  # what it writes, but for what its exporter says
+    result: str = "read right"  # what becomes of that, and what the user adds
+
+
+@dataclass(frozen=True)
 class Exporter:
-    """A program that writes files of Gaussians, and the properties by which its files are known."""
+    """A way to save files of Gaussians, and the properties by which its files are known."""
 
     name: str  # as on the command line
-    title: str  # as people call it
+    models: tuple[Model, ...]  # that save so
     opacity: Literal["logit", "raw"]  # how it stores opacities
     order: str  # order of its rows; "unordered": none, but each is made of a pixel; "none": they belong to no pixels
     kinds: tuple[str, ...] = ("full",)  # which pixels it keeps; see ``gsmerge/alignment/layouts.py``
@@ -79,60 +91,279 @@ class Exporter:
         )
 
 
-# The pixelSplat family shares code but differs in order, trimming and rotations. Its worlds are recentred on the
-# median, divided by a quantile and rotated upright: a scale and a shift that are stored nowhere.
 _UPRIGHT: tuple[FrameKind, ...] = ("upright",)
 _ANY: tuple[FrameKind, ...] = ("same", "scaled", "shifted", "other")
 _NORMALS = ("nx", "ny", "nz")
+# What users have to add, or what is lost
+_NAME_CAMERAS = "read right with cameras, or with those that its grid shows"
+_NO_PIXELS = "unaligned: without pixels"
+_WITH_CAMERAS = "unaligned; photos are used where cameras are named"
 
 _EXPORTERS = (
-    # Border and far pixels dropped, cameras of the nested model in another unit. Its own renderer uses its rotations
-    # as they are stored, so they are never read in another way.
+    # Its own renderer uses its rotations as they are stored, so they are never read in another way.
     Exporter(
-        "da3", "Depth Anything 3", "logit", "view-major", ("box+depth", "box", "pruned"), _ANY, check_rotations=False,
+        "da3",
+        (
+            Model(
+                "Depth Anything 3", "ByteDance-Seed/Depth-Anything-3 2c21ea8; `utils/export/gs.py` 831637d",
+                "`gs_ply/0000.ply` without borders and the farthest tenth of each view; cameras of the nested model in"
+                " another unit, in `exports/*/results.npz` or COLMAP's files where they are asked for",
+                'read right with `export_format="npz-gs_ply"`, `"mini_npz-gs_ply"` or `"colmap-gs_ply"`; `gs_ply` alone'
+                " where its photos show the cameras; refused without `gs_ply`",
+            ),
+            Model(
+                "Lyra 2", "nv-tlabs/lyra 67392d9",
+                "`reconstructed_scene.ply`, every pixel of half the size; `cameras.npz`", "read right with its frames",
+            ),
+        ),
+        "logit", "view-major", ("box+depth", "box", "pruned"), _ANY, check_rotations=False,
         cameras=("DA3 npz", "COLMAP binary", "COLMAP text", WITH_PHOTOS),
     ),
-    Exporter("pixelsplat", "pixelSplat", "raw", "view-major", ("full",), _UPRIGHT, per_pixel=(1, 2, 3), quats="camera"),
+    # The family of pixelSplat shares code but differs in order, trimming and rotations. Its worlds are recentred on
+    # the median, divided by a quantile and rotated upright: a scale and a shift that are stored nowhere.
     Exporter(
-        "pixelsplat-script", "pixelSplat's figure script", "raw", "view-fastest", ("trim", "pruned"), _UPRIGHT,
-        per_pixel=(1, 2, 3), quats="camera",
+        "pixelsplat",
+        (Model("pixelSplat", "dcharatan/pixelsplat 32b1b66", "`gaussians/RUN/STEP.ply`; no cameras", _NAME_CAMERAS),),
+        "raw", "view-major", ("full",), _UPRIGHT, per_pixel=(1, 2, 3), quats="camera",
     ),
-    Exporter("mvsplat", "MVSplat", "raw", "view-fastest", ("trim", "pruned"), _UPRIGHT),
-    Exporter("spfsplat", "SPFSplat", "raw", "view-fastest", ("trim",), _UPRIGHT),
-    Exporter("depthsplat", "DepthSplat", "logit", "view-fastest", ("trim",), ("first", "same")),
-    Exporter("volsplat", "VolSplat", "logit", "none", frames=("first", "same")),
     Exporter(
-        "resplat", "ReSplat", "logit", "view-major", ("full",), ("middle", "same"), degrees=(3,), quats="camera"
+        "pixelsplat-script",
+        (
+            Model(
+                "pixelSplat's figure script", "dcharatan/pixelsplat 32b1b66",
+                "`point_clouds/SCENE/gaussians.ply`, far pixels dropped; no cameras", _NAME_CAMERAS,
+            ),
+        ),
+        "raw", "view-fastest", ("trim", "pruned"), _UPRIGHT, per_pixel=(1, 2, 3), quats="camera",
     ),
-    Exporter("noposplat", "NoPoSplat", "raw", "view-major", ("full",), _ANY, degrees=(0, 4)),
-    Exporter("yonosplat", "YoNoSplat", "raw", "view-fastest", ("trim", "pruned"), _ANY, quats="camera"),
-    Exporter("vicasplat", "VicaSplat", "logit", "unordered", ("pruned",), degrees=(0, 4)),
-    Exporter("flash3d", "Flash3D", "raw", "layer-major", ("full",), _UPRIGHT, per_pixel=(2,)),
-    Exporter("splatt3r", "Splatt3R", "raw", "view-major", ("full",), _ANY, quats="xyzw-root"),
-    # Gaussians merged in voxels.
-    Exporter("anysplat", "AnySplat", "raw", "none"),
-    Exporter("worldmirror", "WorldMirror", "raw", "none"),
+    Exporter(
+        "mvsplat",
+        (
+            Model(
+                "MVSplat", "donydchen/mvsplat 175b17a",
+                "`point_clouds/SCENE/gaussians.ply` of two views, far pixels dropped; no cameras", _NAME_CAMERAS,
+            ),
+        ),
+        "raw", "view-fastest", ("trim", "pruned"), _UPRIGHT,
+    ),
+    Exporter(
+        "spfsplat",
+        (
+            Model(
+                "SPFSplat", "ranrhuang/SPFSplat 15e158d, its second version SPFSplatV2 74349e7",
+                "`NAME_gaussians.ply` beside `NAME_input_0.png` and drawings; no cameras", _NAME_CAMERAS,
+            ),
+        ),
+        "raw", "view-fastest", ("trim",), _UPRIGHT,
+    ),
+    Exporter(
+        "depthsplat",
+        (
+            Model(
+                "DepthSplat", "cvg/depthsplat 2dad25a; the exporter in a copy, marcoleg/depthsplat 12f7ec4",
+                "`gaussians/NAME.ply`, 8 pixels trimmed; `images/NAME/color/`; no cameras", _NAME_CAMERAS,
+            ),
+        ),
+        "logit", "view-fastest", ("trim",), ("first", "same"),
+    ),
+    Exporter(
+        "zpressor",
+        (
+            Model(
+                "ZPressor", "ziplab/ZPressor 84b3080", "`gaussians/NAME.ply`, 4 pixels trimmed; no cameras",
+                _NAME_CAMERAS,
+            ),
+        ),
+        "raw", "view-fastest", ("trim",), ("first", "same"),
+    ),
+    Exporter(
+        "volsplat",
+        (
+            Model(
+                "VolSplat", "ziplab/VolSplat 01ef574; the exporter in a copy, dzp62442/VolSplat cacc0bc",
+                "voxels padded or cut to the number of pixels, then trimmed as DepthSplat's, with rotations that are"
+                " wrong; no cameras", f"{_WITH_CAMERAS}; padding is left out",
+            ),
+        ),
+        "logit", "none", frames=("first", "same"),
+    ),
+    Exporter(
+        "resplat",
+        (
+            Model(
+                "ReSplat", "copies: mohammed1916/resplat, baoxperceptionio/resplat",
+                "`gaussians.ply` on a grid of a quarter of the photos' size; `input/`; no cameras", _NAME_CAMERAS,
+            ),
+        ),
+        "logit", "view-major", ("full",), ("middle", "same"), degrees=(3,), quats="camera",
+    ),
+    Exporter(
+        "noposplat",
+        (
+            Model("NoPoSplat", "cvg/NoPoSplat 9b04307", "what its user's call of `export_ply` names", _NAME_CAMERAS),
+            Model("TriSplat", "ziplab/TriSplat fcd7ab1; not what calls the exporter", "no cameras", _NAME_CAMERAS),
+        ),
+        "raw", "view-major", ("full",), _ANY, degrees=(0, 4),
+    ),
+    Exporter(
+        "yonosplat",
+        (
+            Model(
+                "YoNoSplat", "a copy, lksrz/YoNoSplat",
+                "`debug_info/SCENE_gaussians.ply`, 8 pixels trimmed, opacities above 0.01; no cameras",
+                "read right with cameras; without where no row is missing",
+            ),
+        ),
+        "raw", "view-fastest", ("trim", "pruned"), _ANY, quats="camera",
+    ),
+    Exporter(
+        "vicasplat",
+        (
+            Model(
+                "VicaSplat", "WU-CVGL/VicaSplat d1e9368; `demo.py` 4282959, `ply_export.py` 0db1ad3",
+                "opacities from 0.005 on, sorted; harmonics in axes of their own; `transforms.json` as a list of poses"
+                " without intrinsics, `context/`", f"{_NO_PIXELS}; the focal length is searched",
+            ),
+            Model("NAS3R", "mxlcanfly/NAS3R 2ad17fa", "the same with raw opacities; no cameras", _WITH_CAMERAS),
+        ),
+        "logit", "unordered", ("pruned",), degrees=(0, 4),
+    ),
+    Exporter(
+        "flash3d",
+        (Model("Flash3D", "eldar/flash3d", "two layers of one photo; no cameras", _NAME_CAMERAS),),
+        "raw", "layer-major", ("full",), _UPRIGHT, per_pixel=(2,),
+    ),
+    Exporter(
+        "splatt3r",
+        (
+            Model(
+                "Splatt3R", "btsmart/splatt3r bda1dd0", "`gaussians.ply` of two views; no cameras",
+                "read right with its photos",
+            ),
+        ),
+        "raw", "view-major", ("full",), _ANY, quats="xyzw-root",
+    ),
+    # Gaussians merged in voxels or across views.
+    Exporter(
+        "anysplat",
+        (
+            Model(
+                "AnySplat", "InternRobotics/AnySplat 57937e4; a copy, LiYukeee/AnySplat 2f01e79",
+                "`gaussians.ply` among the photos or beside `images/`, in the copy with logits; no cameras",
+                _WITH_CAMERAS,
+            ),
+            Model("FreeSplat", "wangys16/FreeSplat", "fused views in pixelSplat's upright frame", _WITH_CAMERAS),
+            Model("C3G", "a copy, erenovic/C3G 6ba7c4b", "Gaussians of tokens; no cameras", _WITH_CAMERAS),
+        ),
+        "raw", "none",
+    ),
+    Exporter(
+        "worldmirror",
+        (
+            Model(
+                "WorldMirror 1", "Tencent-Hunyuan/HunyuanWorld-Mirror c61300e",
+                "voxels of 0.002; COLMAP's files; `images/`, squeezed where it cropped, and `images_resized/`",
+                _NO_PIXELS,
+            ),
+            Model(
+                "WorldMirror 2", "Tencent-Hunyuan/HY-World-2.0 05d3035; `inference_utils.py` 270f4b4",
+                "the same without masked pixels, at most 5,000,000 drawn at random; `camera_params.json`, COLMAP's"
+                " files on request; no photos", f"{_NO_PIXELS}; name the photos",
+            ),
+        ),
+        "raw", "none",
+    ),
     # Models of one image, or of a few of one object.
     Exporter(
-        "sharp", "SHARP", "logit", "layer-major", ("full",), per_pixel=(2,), normals=False,
-        elements=("extrinsic", "intrinsic"),
+        "sharp",
+        (
+            Model(
+                "SHARP", "apple/ml-sharp 1eaa046; `utils/gaussians.py` 22ac1c0",
+                "`NAME.ply` of 14 columns, sRGB, the camera inside", "read right with its photo",
+            ),
+        ),
+        "logit", "layer-major", ("full",), per_pixel=(2,), normals=False, elements=("extrinsic", "intrinsic"),
     ),
     Exporter(
-        "splatter-image", "Splatter Image", "logit", "view-major", ("pruned", "full"), ("same", "scaled", "other"),
-        degrees=(1,),
+        "splatter-image",
+        (
+            Model(
+                "Splatter Image", "a copy of the demo's `utils/vis_utils.py`",
+                "opacities above 0.08, scales made larger, turned for a viewer; no cameras", _NO_PIXELS,
+            ),
+        ),
+        "logit", "view-major", ("pruned", "full"), ("same", "scaled", "other"), degrees=(1,),
+    ),
+    Exporter(
+        "lgm",
+        (
+            Model("LGM", "3DTopia/LGM be6a87f", "an object of four views that are not kept, and a film", _NO_PIXELS),
+            Model("GRM", "justimyhxu/GRM 0d4efb1", "an object, turned for a viewer", "read right with cameras"),
+            Model(
+                "GS-LRM", "Intern-Nexus/gs-lrm-unofficial 2c2b68d, with LGM's saving code", "no cameras",
+                "read right with cameras",
+            ),
+            Model(
+                "FlashWorld", "imlixinyang/FlashWorld c8df52d", "every pixel, in the first camera's frame",
+                "read right with cameras",
+            ),
+        ),
+        "logit", "view-major", ("pruned", "full"), ("same", "scaled", "shifted", "first", "other"), normals=False,
     ),
     # Normals as bytes, 45 harmonics whatever the degree, sorted by opacity once it prunes.
     Exporter(
-        "longlrm", "Long-LRM", "logit", "view-major", ("full", "pruned"), _ANY, degrees=(3,), byte_columns=_NORMALS
+        "longlrm",
+        (
+            Model(
+                "Long-LRM", "arthurhero/Long-LRM d92dd51; `data/dataset.py` 1fccf47, `main.py` 3c35270",
+                "`gaussians_001.ply`; `input_frame_idx.txt`; in some versions `pos_avg_inv.txt` and `scene_scale.txt`",
+                "read right with the data set's file of cameras",
+            ),
+        ),
+        "logit", "view-major", ("full", "pruned"), _ANY, degrees=(3,), byte_columns=_NORMALS,
     ),
     Exporter(
-        "longlrm-sorted", "Long-LRM, sorted by opacity", "logit", "unordered", ("pruned",), ("same", "scaled"),
-        degrees=(3,), byte_columns=_NORMALS,
+        "longlrm-sorted",
+        (Model("Long-LRM, sorted by opacity", "arthurhero/Long-LRM d92dd51", "the same, where it prunes", _NO_PIXELS),),
+        "logit", "unordered", ("pruned",), ("same", "scaled"), degrees=(3,), byte_columns=_NORMALS,
     ),
-    # Scenes that were optimised, not predicted.
-    Exporter("inria", "INRIA 3DGS", "logit", "none", degrees=(0, 1, 2, 3), cameras=("INRIA cameras.json",)),
-    Exporter("nerfstudio", "nerfstudio", "logit", "none", degrees=(0, 1, 2, 3), comment="Nerstudio"),
-    Exporter("gsplat", "gsplat", "logit", "none", degrees=(0, 1, 2, 3), normals=False),
+    # Scenes that were optimised, or predicted without pixels.
+    Exporter(
+        "inria",
+        (
+            Model(
+                "INRIA 3DGS", "ten copies of graphdeco-inria/gaussian-splatting",
+                "`point_cloud/iteration_N/point_cloud.ply`, `cameras.json`",
+                f"{_NO_PIXELS}; name the photos",
+            ),
+            Model("InstantSplat", "NVlabs/InstantSplat 3c29c20", "the same", f"{_NO_PIXELS}; name the photos"),
+            Model("ZipSplat", "cvg/ZipSplat 69fd35b", "`scene.ply` of tokens and a film; no cameras", _WITH_CAMERAS),
+            Model(
+                "SAM 3D Objects", "facebookresearch/sam-3d-objects; `gaussian_model.py` aa18aba",
+                "an object in a box of its own", _NO_PIXELS,
+            ),
+        ),
+        "logit", "none", degrees=(0, 1, 2, 3), cameras=("INRIA cameras.json",),
+    ),
+    Exporter(
+        "nerfstudio",
+        (
+            Model(
+                "nerfstudio", "nerfstudio-project/nerfstudio 50e0e3c",
+                "`splat.ply` in its own frame; `dataparser_transforms.json` with the map into that", _WITH_CAMERAS,
+            ),
+        ),
+        "logit", "none", degrees=(0, 1, 2, 3), comment="Nerstudio",
+    ),
+    Exporter(
+        "gsplat",
+        (
+            Model(
+                "gsplat", "nerfstudio-project/gsplat 90d7b4b", "`ply/point_cloud_STEP.ply`; no cameras", _WITH_CAMERAS
+            ),
+        ),
+        "logit", "none", degrees=(0, 1, 2, 3), normals=False,
+    ),
 )  # fmt: skip
 EXPORTERS = {exporter.name: exporter for exporter in _EXPORTERS}
 
@@ -164,5 +395,5 @@ def exporter_names(exporters: Sequence[Exporter]) -> str:
     """Join the titles of exporters for a message."""
     if not exporters:
         return "none that is known by name"
-    titles = [exporter.title for exporter in exporters]
+    titles = [model.title for exporter in exporters for model in exporter.models]
     return titles[0] if len(titles) == 1 else f"{', '.join(titles[:-1])} or {titles[-1]}"

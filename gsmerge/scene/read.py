@@ -27,6 +27,7 @@ from gsmerge.alignment import (
 )
 from gsmerge.alignment.registration.join import join_scenes
 from gsmerge.errors import SceneError
+from gsmerge.geometry import Similarity
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views, to_cameras
 from gsmerge.io.cameras.json_files import read_dataparser
 from gsmerge.io.cameras.npz_files import read_depths
@@ -34,7 +35,7 @@ from gsmerge.io.formats.read import FileInfo, GaussianFile, file_notes, kept_com
 from gsmerge.io.photo_files import as_floats, photo_size
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import use_threads
-from gsmerge.scene.exporters import AUTO, Exporter, ReadHints, choose_exporters, find_exporter, make_hints
+from gsmerge.scene.exporters import AUTO, TURNED, Exporter, ReadHints, choose_exporters, find_exporter, make_hints
 from gsmerge.scene.files import SceneFiles, find_scene_files
 from gsmerge.scene.views import (
     check_masks,
@@ -296,7 +297,7 @@ def _make_load(
     frame = None if result.recovery is None else result.recovery.best.frame
     source = "" if camera_file is None else camera_file.source
     exporters = choose_exporters(hints.exporter, ply.info, layout, frame, source)
-    scene, turned = _with_rotations(scene, hints, exporters)
+    scene, turned = _with_rotations(scene, hints, exporters, frame)
     more += turned
     if not scene.aligned and camera_file is not None:
         more.append("the rows belong to no pixels that could be found: unaligned")
@@ -366,16 +367,19 @@ def _place_rows(
     return out, grid_ids(valid), missing.reshape(grid), []
 
 
-def _with_rotations(scene: Scene, hints: ReadHints, exporters: Sequence[Exporter]) -> tuple[Scene, list[str]]:
+def _with_rotations(
+    scene: Scene, hints: ReadHints, exporters: Sequence[Exporter], frame: Similarity | None
+) -> tuple[Scene, list[str]]:
     """Read rotations as given, as the given exporter stores them, or as fits the surface; with a note."""
+    turn = frame.rotation if frame is not None and frame.kind in TURNED else None
     if hints.quats != "auto" or not scene.aligned:
-        return read_rotations(scene, hints.quats), []
+        return read_rotations(scene, hints.quats, turn), []
     if hints.exporter != "auto":
-        return read_rotations(scene, exporters[0].quats), []
+        return read_rotations(scene, exporters[0].quats, turn), []
     if any(not exporter.check_rotations for exporter in exporters):
         return scene, []
-    choice, note = choose_rotations(scene)
-    return read_rotations(scene, choice), [note] if note else []
+    choice, note = choose_rotations(scene, turn)
+    return read_rotations(scene, choice, turn), [note] if note else []
 
 
 def place_cameras_in_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints, photos: bool) -> Loaded:

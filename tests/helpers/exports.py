@@ -22,9 +22,10 @@ class Smooth(Tiny):
     depths: np.ndarray
 
 
-def smooth_scene(width: int, height: int) -> Smooth:
-    """Three views of a smooth surface with smooth colours, jitter a quarter of a pixel."""
+def smooth_scene(width: int, height: int, K: np.ndarray | None = None) -> Smooth:
+    """Three views of a smooth surface with smooth colours, jitter a quarter of a pixel; K None: oblong pixels."""
     tiny, rng = make_tiny(width, height), np.random.default_rng(5)
+    K = tiny.K if K is None else K
     y, x = np.mgrid[:height, :width]
     c2w = tiny.c2w.copy()
     means, depths, images = [], [], []
@@ -33,7 +34,6 @@ def smooth_scene(width: int, height: int) -> Smooth:
         c2w[i, :3, 3] = (0.6 * i - 0.6, 0.2 * i + 0.1, -0.2 * i - 1.5)
         depth = 3 + 0.5 * np.sin(x / 9 + i) * np.cos(y / 7) + 1e-4 * rng.random((height, width))
         u, v = (x + 0.5 + rng.uniform(-0.2, 0.2, x.shape), y + 0.5 + rng.uniform(-0.2, 0.2, x.shape))
-        K = tiny.K
         camera = np.stack([(u - K[0, 2]) / K[0, 0] * depth, (v - K[1, 2]) / K[1, 1] * depth, depth], -1)
         world = camera.reshape(-1, 3) @ c2w[i, :3, :3].T + c2w[i, :3, 3]
         colors = 0.5 + 0.4 * np.sin(2.5 * world + np.array([0, 1, 2]))
@@ -47,7 +47,7 @@ def smooth_scene(width: int, height: int) -> Smooth:
         scales=np.full((n, 3), 0.03, np.float32),
         sh0=((np.stack(images).reshape(n, 1, 3) / 255.0).astype(np.float32) - 0.5) / SH_C0,
     )
-    return Smooth(c2w, tiny.K, width, height, np.stack(images), gaussians, tiny.names, np.stack(depths))
+    return Smooth(c2w, K, width, height, np.stack(images), gaussians, tiny.names, np.stack(depths))
 
 
 def with_intrinsics(tiny: Smooth, K: np.ndarray) -> Smooth:
@@ -93,7 +93,6 @@ def turned(
     *,
     scale: float = 1.0,
     shift: np.ndarray | None = None,
-    rotate_quats: bool = True,
 ) -> np.ndarray:
     """The rows in another world: ``scale * turn @ x + shift``."""
     out = rows.copy()
@@ -101,18 +100,17 @@ def turned(
     for i, name in enumerate("xyz"):
         out[name] = means[:, i]
         out[f"scale_{i}"] = rows[f"scale_{i}"] + np.log(scale)
-    if rotate_quats:
-        quats = np.stack([rows[f"rot_{i}"] for i in range(4)], 1)
-        moved = wxyz_of(turn @ quat_to_rotmat(quats).astype(np.float64))
-        for i in range(4):
-            out[f"rot_{i}"] = moved[:, i]
+    quats = np.stack([rows[f"rot_{i}"] for i in range(4)], 1)
+    moved = wxyz_of(turn @ quat_to_rotmat(quats).astype(np.float64))
+    for i in range(4):
+        out[f"rot_{i}"] = moved[:, i]
     return out
 
 
 def with_surface_rotations(tiny: Tiny, *, relative_to_camera: bool = False) -> Tiny:
     """Discs that lie in the surface, with rotations to the world or to each view's camera."""
     h, w = tiny.height, tiny.width
-    grid = tiny.gaussians.means.astype(np.float64).reshape(3, h, w, 3)
+    grid = tiny.gaussians.means.astype(np.float64).reshape(-1, h, w, 3)
     across, down = np.gradient(grid, axis=2), np.gradient(grid, axis=1)
     across = np.stack([cv2.GaussianBlur(a, (0, 0), 2.0) for a in across])
     down = np.stack([cv2.GaussianBlur(a, (0, 0), 2.0) for a in down])

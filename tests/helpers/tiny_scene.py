@@ -159,8 +159,8 @@ def write_npz(path: Path, tiny: Tiny, **changes: np.ndarray) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     arrays = {
         "extrinsics": tiny.w2c[:, :3].astype(np.float32),
-        "intrinsics": np.tile(tiny.K, (3, 1, 1)).astype(np.float32),
-        "depth": np.ones((3, tiny.height, tiny.width), np.float32),
+        "intrinsics": np.tile(tiny.K, (len(tiny.c2w), 1, 1)).astype(np.float32),
+        "depth": np.ones((len(tiny.c2w), tiny.height, tiny.width), np.float32),
         "image": tiny.images,
     }
     np.savez(path, **{k: v for k, v in (arrays | changes).items() if v is not None})

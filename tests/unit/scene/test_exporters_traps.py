@@ -141,7 +141,7 @@ def test_several_gaussians_per_pixel_before_the_view(tmp_path: Path, trim: int) 
 def test_resplat(tmp_path: Path) -> None:
     """A grid of a quarter of the photos' size, turned into the middle camera, with 45 harmonics."""
     tiny = with_surface_rotations(SMOOTH, relative_to_camera=True)
-    rows = turned(export_rows(tiny, rest=45), tiny.w2c[1, :3, :3], rotate_quats=False)
+    rows = turned(export_rows(tiny, rest=45), tiny.w2c[1, :3, :3])
     large = replace(
         tiny,
         K=tiny.K * np.array([[4.0], [4], [1]]),

@@ -1,0 +1,84 @@
+"""Files as models leave them, by what is beside them: read right, or refused with what to do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from model_files import MODELS
+from model_rows import check_cameras, check_pixels
+
+from gsmerge.scene.exporters import EXPORTERS
+from gsmerge.scene.read import load_scene
+
+DA3 = "Depth Anything 3"
+PER_PIXEL = {  # and the exporters that may have written each
+    f"{DA3}, npz-gs_ply": ("da3",),
+    f"{DA3}, mini_npz-gs_ply": ("da3",),
+    f"{DA3}, glb-npz-gs_ply": ("da3",),
+    f"{DA3}, colmap-npz-gs_ply": ("da3",),
+    f"{DA3}, colmap-gs_ply": ("da3",),
+    f"{DA3}, gs_ply": ("da3",),
+    "DepthSplat": ("depthsplat",),
+    "DepthSplat without cameras": ("depthsplat",),
+    "MVSplat's script": ("mvsplat", "spfsplat"),
+    "pixelSplat": ("pixelsplat",),
+    "pixelSplat's script": ("pixelsplat-script",),
+    "NoPoSplat": ("noposplat",),
+    "Splatt3R": ("splatt3r",),
+    "YoNoSplat": ("yonosplat",),
+    "ReSplat": ("resplat",),
+    "Long-LRM": ("longlrm",),
+    "GS-LRM": ("lgm",),
+    "GRM": ("lgm",),
+    "FlashWorld": ("lgm",),
+    "Flash3D": ("flash3d",),
+    "SHARP": ("sharp",),
+}
+# Their cameras differ by a few degrees: too little to show that rotations are those to the cameras
+CAMERA_FRAME = ("pixelSplat", "pixelSplat's script", "YoNoSplat", "ReSplat")
+UNALIGNED = {
+    "VicaSplat": ("vicasplat",),
+    "VolSplat": ("volsplat",),
+    "Long-LRM, sorted": ("longlrm-sorted",),
+    "WorldMirror 2": ("worldmirror",),
+    "INRIA 3DGS": ("inria",),
+    "InstantSplat": ("inria",),
+    "nerfstudio": ("nerfstudio",),
+}
+
+
+@pytest.mark.parametrize("name", PER_PIXEL)
+def test_every_row_is_at_its_pixel(tmp_path: Path, name: str) -> None:
+    export = MODELS[name](tmp_path / "out")
+    loaded = load_scene(export.path, **export.options)
+    check_pixels(loaded.pixel_scene(), export, quats=name not in CAMERA_FRAME)
+    check_cameras(loaded.scene, export)
+    assert set(PER_PIXEL[name]) <= {exporter.name for exporter in loaded.exporters}
+
+
+@pytest.mark.parametrize("name", CAMERA_FRAME)
+def test_rotations_in_the_cameras_frames(tmp_path: Path, name: str) -> None:
+    """The world is turned, and rotations with it as if they were those of the world."""
+    export = MODELS[name](tmp_path / "out")
+    check_pixels(load_scene(export.path, **export.options, quats="camera").pixel_scene(), export)
+
+
+@pytest.mark.parametrize("name", UNALIGNED)
+def test_rows_of_no_pixels_have_the_cameras_and_photos_of_their_views(tmp_path: Path, name: str) -> None:
+    export = MODELS[name](tmp_path / "out")
+    loaded = load_scene(export.path, **export.options)
+    assert not loaded.scene.aligned
+    check_cameras(loaded.scene, export)
+    assert set(UNALIGNED[name]) <= {exporter.name for exporter in loaded.exporters}
+    means = np.stack([export.rows[axis] for axis in "xyz"], 1)
+    padding = (means == 0).all(1) if name == "VolSplat" else np.zeros(len(means), bool)
+    assert np.array_equal(loaded.scene.gaussians.means, means[~padding])
+    assert np.abs(loaded.scene.gaussians.opacities - export.opacities[~padding]).max() < 1e-5
+
+
+def test_made_files_are_of_models_in_the_table() -> None:
+    titles = tuple(model.title for exporter in EXPORTERS.values() for model in exporter.models)
+    assert len(set(titles)) == len(titles)
+    assert {name for name in MODELS if not name.startswith(titles)} == {"MapAnything", "VGGT"}  # of points

@@ -1,0 +1,127 @@
+"""Files as models leave them that are hard to read: a wrong frame, no cameras, photos of any size, no Gaussians."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from messages import refuses
+from model_files import MODELS
+from model_rows import Export, check_cameras, check_pixels
+
+from gsmerge.errors import SceneError
+from gsmerge.scene.read import Loaded, load_scene
+
+DA3 = "Depth Anything 3"
+
+
+def load(name: str, folder: Path) -> tuple[Loaded, Export]:
+    export = MODELS[name](folder / "out")
+    return load_scene(export.path, **export.options), export
+
+
+# Frames
+
+
+@pytest.mark.parametrize("name", ["ZPressor", "MVSplat's script with its far cut"])
+def test_trims_and_far_cuts(tmp_path: Path, name: str) -> None:
+    """A border of 4 pixels is no resize; dropped rows do not move the frame."""
+    loaded, export = load(name, tmp_path)
+    check_cameras(loaded.scene, export)
+    check_pixels(loaded.pixel_scene(), export)
+
+
+def test_fused_views_in_an_upright_frame(tmp_path: Path) -> None:
+    """Rows of no pixels: stretches of them show the frame, which colours alone would choose wrongly."""
+    loaded, export = load("FreeSplat", tmp_path)
+    assert not loaded.scene.aligned
+    check_cameras(loaded.scene, export)
+
+
+def test_squeezed_photos_beside_the_right_ones(tmp_path: Path) -> None:
+    loaded, export = load("WorldMirror 1", tmp_path)
+    check_cameras(loaded.scene, export)
+
+
+def test_dropped_pixels_are_put_back_by_cameras_and_photos(tmp_path: Path) -> None:
+    loaded, export = load(f"{DA3}, colmap-gs_ply", tmp_path)
+    assert loaded.scene.valid.all()
+    check_pixels(loaded.scene, export)
+
+
+# Cameras from the rows
+
+
+@pytest.mark.parametrize("name", ["DepthSplat, the .ply alone", "Flash3D without cameras"])
+def test_cameras_of_a_grid_without_photos(tmp_path: Path, name: str) -> None:
+    """Where no photo shows that a border was cut off, the rows are every pixel of a smaller grid."""
+    loaded, export = load(name, tmp_path)
+    ranks = np.unique(export.pixels, return_inverse=True)[1].reshape(-1)
+    check_pixels(loaded.pixel_scene(), replace(export, pixels=ranks))
+    assert loaded.alignment is not None
+    assert loaded.alignment.worst_px < 0.5
+
+
+@pytest.mark.parametrize("model", ["NoPoSplat", "Splatt3R", "YoNoSplat"])
+def test_photos_of_another_size_than_the_grid(tmp_path: Path, model: str) -> None:
+    """Twice the model's size, and where it takes squares cropped to one."""
+    loaded, export = load(f"{model} with the user's own photos", tmp_path)
+    check_pixels(loaded.pixel_scene(), export, quats=model != "YoNoSplat")
+    check_cameras(loaded.scene, export)
+
+
+def test_photos_beside_the_gaussians_under_names_of_the_scene(tmp_path: Path) -> None:
+    """SPFSplat's folder as it is left: the inputs, and drawings of its own that are no photos of these views."""
+    loaded, export = load("SPFSplat", tmp_path)
+    check_pixels(loaded.pixel_scene(), export)
+    check_cameras(loaded.scene, export)
+
+
+def test_photos_whose_cameras_cannot_be_found(tmp_path: Path) -> None:
+    """Voxels and no cameras: the message names the photos and the option that brings cameras."""
+    with refuses(SceneError, "", "images", "--cameras"):
+        load("VolSplat without cameras", tmp_path)
+
+
+# Folders
+
+
+def test_cameras_of_lyra(tmp_path: Path) -> None:
+    loaded, export = load("Lyra 2", tmp_path)
+    check_pixels(loaded.pixel_scene(), export)
+    check_cameras(loaded.scene, export)
+
+
+def test_the_folder_of_gsplat_s_trainer(tmp_path: Path) -> None:
+    loaded, export = load("gsplat's trainer", tmp_path)
+    check_cameras(loaded.scene, export)
+    assert "gsplat" in {exporter.name for exporter in loaded.exporters}
+
+
+@pytest.mark.parametrize(
+    ("name", "place", "said"),
+    [
+        (f"{DA3}, npz", "out", ("results.npz", "npz-gs_ply")),
+        (f"{DA3}, results.npz", "results.npz", ("npz-gs_ply",)),
+        (f"{DA3}, scene.glb", "scene.glb", ("npz-gs_ply",)),
+        ("MapAnything", "out", ("MapAnything", "--cameras")),
+        ("VGGT", "out", ("VGGT", "--cameras")),
+    ],
+)
+def test_folders_without_gaussians(tmp_path: Path, name: str, place: str, said: tuple[str, ...]) -> None:
+    with refuses(SceneError, place, *said):
+        load(name, tmp_path)
+
+
+# Nothing but Gaussians
+
+
+@pytest.mark.parametrize("name", ["AnySplat", "LGM", "ZipSplat", "Splatter Image"])
+def test_scenes_without_cameras_are_read_without_a_hint(tmp_path: Path, name: str) -> None:
+    """Every row is there."""
+    export = MODELS[name](tmp_path / "out")
+    loaded = load_scene(export.path)
+    g = loaded.scene.gaussians[loaded.scene.stored.reshape(-1)] if loaded.scene.aligned else loaded.scene.gaussians
+    assert np.array_equal(g.means, np.stack([export.rows[axis] for axis in "xyz"], 1))
