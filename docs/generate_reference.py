@@ -169,6 +169,7 @@ def _settings_page() -> str:
 def _exporters_page(page: str) -> str:
     """Renew the tables of a page: what lies between the comments that name them and those that end them."""
     from gsmerge.scene.exporters import EXPORTERS
+    from gsmerge.scene.no_gaussians import POINTS_ONLY
 
     exporters = EXPORTERS.values()
     rows = [
@@ -179,6 +180,8 @@ def _exporters_page(page: str) -> str:
     head = ("name", "models", "order", "pixels", "opacity", "rotations", "degrees", "columns besides")
     page = _renew(page, "names", head, rows)
     models = ((m.title, m.source, m.leaves, m.result) for e in exporters for m in e.models)
+    points = ((row.title, ", ".join(f"`{file}`" for file in row.files), row.remedy) for row in POINTS_ONLY)
+    page = _renew(page, "points", ("program", "what it leaves", "what to do"), points)
     return _renew(
         page, "models", ("model", "saving code that was read", "what it leaves", "what becomes of it"), models
     )
