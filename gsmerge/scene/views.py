@@ -113,9 +113,17 @@ def _read_grid(ply: GaussianFile, files: SceneFiles, paths: Sequence[Path]) -> C
     cameras, pictures = grid
     match = match_photos(pictures, paths)
     if match is not None:
-        chosen, transform, size = match
-        names = tuple(paths[photo].relative_to(files.images or files.ply.parent).as_posix() for photo in chosen)
-        return replace(cameras, names=names, photo_map=(size, transform))
+        chosen = (paths[photo].relative_to(files.images or files.ply.parent) for photo in match.chosen)
+        Ks = cameras.Ks.copy()
+        Ks[:, :2, 2] += match.trim
+        return replace(
+            cameras,
+            Ks=Ks,
+            widths=cameras.widths + 2 * match.trim,
+            heights=cameras.heights + 2 * match.trim,
+            names=tuple(path.as_posix() for path in chosen),
+            photo_map=(match.size, match.transform),
+        )
     if files.images is None or not paths:
         return cameras
     views, height, width = pictures.shape[:3]
@@ -179,7 +187,11 @@ def _photo_paths(files: SceneFiles, camera_file: CameraFile) -> list[Path] | Non
     if files.images is None:
         folder = Path(camera_file.path).parent
         paths = [path for path in (find_image(folder, name) for name in camera_file.names) if path is not None]
-        if not paths and camera_file.source != ESTIMATED and all(name.removeprefix("view ").isdecimal() for name in camera_file.names):
+        if (
+            not paths
+            and camera_file.source != ESTIMATED
+            and all(name.removeprefix("view ").isdecimal() for name in camera_file.names)
+        ):
             paths = images_beside(files.ply)  # the format has no names; AnySplat writes its Gaussians among the photos
         return paths if len(paths) == len(camera_file) else None
     return None if files.images.suffix in (".npz", CHUNK) else match_images(files.images, camera_file.names)
