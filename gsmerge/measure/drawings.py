@@ -227,7 +227,6 @@ def check_cameras(files: SceneFiles) -> None:
 def _read(options: DrawOptions, *, photos: bool) -> Framed:
     """Read the scenes, and place the cameras in the frame of ``options.like``."""
     files, like, paths = options.files, options.like, options.paths
-    check_cameras(like)
     first = read_rows(files, opacity=options.opacity, hints=options.hints)
     plys = [read_gaussians(path, opacity=options.opacity) for path in paths[1:]]
     same_file = like.ply == files.ply
