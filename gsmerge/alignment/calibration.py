@@ -45,7 +45,6 @@ class Calibration:
 
     cameras: Cameras
     worst_px: float  # largest median distance of a view, pixels
-    separate: bool  # whether the views have intrinsics of their own
 
 
 @dataclass(frozen=True)
@@ -76,6 +75,8 @@ def calibrate(pairs: Correspondences, width: int, height: int) -> Calibration | 
 
     None where the points do not determine cameras, or lie farther from their pixels than the Gaussians of a view may.
     """
+    if not len(pairs.rows):
+        return None
     views = [pairs.select(pairs.views == view) for view in range(int(pairs.views.max(initial=-1)) + 1)]
     middle = np.median(pairs.points, 0)
     unit = float(np.median(np.abs(pairs.points - middle))) or 1.0
@@ -88,8 +89,7 @@ def calibrate(pairs: Correspondences, width: int, height: int) -> Calibration | 
         return None
     viewmats = model.poses.copy()
     viewmats[:, :3, 3] = unit * viewmats[:, :3, 3] - matmul(viewmats[:, :3, :3], middle)
-    separate = bool((model.Ks != model.Ks[0]).any())
-    return Calibration(Cameras(viewmats, model.Ks, width, height), model.worst_px, separate)
+    return Calibration(Cameras(viewmats, model.Ks, width, height), model.worst_px)
 
 
 def _choose_model(
