@@ -45,7 +45,6 @@ class Calibration:
 
     cameras: Cameras
     worst_px: float  # largest median distance of a view, pixels
-    separate: bool  # whether the views have intrinsics of their own
 
 
 @dataclass(frozen=True)
@@ -76,6 +75,8 @@ def calibrate(pairs: Correspondences, width: int, height: int) -> Calibration | 
 
     None where the points do not determine cameras, or lie farther from their pixels than the Gaussians of a view may.
     """
+    if not len(pairs.rows):
+        return None
     views = [pairs.select(pairs.views == view) for view in range(int(pairs.views.max(initial=-1)) + 1)]
     middle = np.median(pairs.points, 0)
     unit = float(np.median(np.abs(pairs.points - middle))) or 1.0
@@ -88,14 +89,13 @@ def calibrate(pairs: Correspondences, width: int, height: int) -> Calibration | 
         return None
     viewmats = model.poses.copy()
     viewmats[:, :3, 3] = unit * viewmats[:, :3, 3] - matmul(viewmats[:, :3, :3], middle)
-    separate = bool((model.Ks != model.Ks[0]).any())
-    return Calibration(Cameras(viewmats, model.Ks, width, height), model.worst_px, separate)
+    return Calibration(Cameras(viewmats, model.Ks, width, height), model.worst_px)
 
 
 def _choose_model(
     points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: Size, bound: float
 ) -> _Model | None:
-    """Choose the simplest intrinsics that explain the pixels; ``bound`` is what any projective cameras leave, pixels."""
+    """Choose the simplest intrinsics that explain the pixels; ``bound`` is what projective cameras leave, pixels."""
     models: list[_Model] = []
     with suppress(np.linalg.LinAlgError):  # of a model that the points do not determine; the simple ones come first
         models.extend(_models(points, pixels, size, bound))
@@ -113,10 +113,11 @@ def _models(points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: Si
         poses = np.stack([pose for pose in starts if pose is not None] or [np.eye(4)])
         if len(poses) < len(starts):
             return
-        model = _Model(np.tile(K, (len(starts), 1, 1)), poses, 0, ())
+        start = _Model(np.tile(K, (len(starts), 1, 1)), poses, 0, ())
         for free in _FREE:
-            model = _solve(points, pixels, model, free)
+            model = _solve(points, pixels, start, free)
             simple += [model] if free == ONE_FOCAL else []
+            start = start if free == ONE_FOCAL else model
             yield model
         if model.worst_px <= max(_AS_NEAR * bound, bound + _AS_NEAR_PX):
             return
@@ -130,7 +131,7 @@ def _models(points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: Si
 
 
 def _solve(points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], start: _Model, free: int) -> _Model:
-    """Solve for poses and ``free`` common intrinsics; numpy.linalg.LinAlgError where the points do not determine them."""
+    """Solve for poses and ``free`` common intrinsics; numpy.linalg.LinAlgError where points do not determine them."""
     K, poses, near, where = start.Ks[0], start.poses, points, pixels
     for _ in range(_ROUNDS):
         K, poses = refine_poses(near, where, K, poses, free=free)

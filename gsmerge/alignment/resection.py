@@ -76,14 +76,14 @@ def _linearise(
         camera = matmul(points[view], pose[:3, :3].T) + pose[:3, 3]
         with np.errstate(all="ignore"):  # points in the camera's plane
             x, y, inverse = camera[:, 0] / camera[:, 2], camera[:, 1] / camera[:, 2], 1 / camera[:, 2]
-            zero, one = np.zeros_like(x), np.ones_like(x)
-            right = np.stack([fx * inverse, zero, -fx * x * inverse], 1)
-            down = np.stack([zero, fy * inverse, -fy * y * inverse], 1)
+            zeros, ones = np.zeros_like(x), np.ones_like(x)
+            right = np.stack([fx * inverse, zeros, -fx * x * inverse], 1)
+            down = np.stack([zeros, fy * inverse, -fy * y * inverse], 1)
             by_K = {
                 0: ([], []),
                 ONE_FOCAL: ([fx * x], [fy * y]),
-                TWO_FOCALS: ([fx * x, zero], [zero, fy * y]),
-                ALL_INTRINSICS: ([fx * x, zero, one, zero], [zero, fy * y, zero, one]),
+                TWO_FOCALS: ([fx * x, zeros], [zeros, fy * y]),
+                ALL_INTRINSICS: ([fx * x, zeros, ones, zeros], [zeros, fy * y, zeros, ones]),
             }[free]
             jacobian = np.concatenate(
                 [
@@ -105,9 +105,8 @@ def _step(curvature: np.ndarray, slope: np.ndarray, damping: float) -> tuple[np.
     if size == 6:
         return np.empty(0), -solve(damped, down)[..., 0]
     solved = solve(damped[:, :6, :6], np.concatenate([down, across], 2))  # the cameras' unknowns are eliminated
-    reduced = (np.concatenate([slope[:, 6:, None], damped[:, 6:, 6:]], 2) - matmul(across.swapaxes(1, 2), solved)).sum(
-        0
-    )
+    whole = np.concatenate([slope[:, 6:, None], damped[:, 6:, 6:]], 2)
+    reduced = (whole - matmul(across.swapaxes(1, 2), solved)).sum(0)
     change = -solve(reduced[:, 1:], reduced[:, 0])
     change[:TWO_FOCALS] = change[:TWO_FOCALS].clip(-MAX_STRETCH, MAX_STRETCH)
     return change, -solved[..., 0] - matmul(solved[..., 1:], change)
@@ -130,12 +129,13 @@ def focal_uncertainty(
     ``points [n,3]`` and ``pixels [n,2]`` are those of each view; that of the views with one focal length together.
     """
     weight = 0.0
-    for view in zip(points, pixels, Ks, poses, strict=True):
-        p, q, K, pose = view
-        curvature, _, _ = _linearise([p], [q], K, pose[None], ONE_FOCAL)
-        weight += float(
-            curvature[0, 6, 6] - matmul(curvature[0, 6, :6], solve(curvature[0, :6, :6], curvature[0, :6, 6]))
-        )
+    for p, q, K, pose in zip(points, pixels, Ks, poses, strict=True):
+        (curvature,), _, _ = _linearise([p], [q], K, pose[None], ONE_FOCAL)
+        try:
+            explained = matmul(curvature[6, :6], solve(curvature[:6, :6], curvature[:6, 6]))
+        except np.linalg.LinAlgError:  # points in one place
+            continue
+        weight += float(curvature[6, 6] - explained)
     return 1 / math.sqrt(weight) if weight > 0 else math.inf
 
 

@@ -24,8 +24,10 @@ _AS_SHORT = 1.5  # times the shortest median step
 _SEGMENT, _SEGMENTS = 1 << 17, 8  # rows whose steps are compared with each other, and how many such parts
 _MAX_STEP = 8.0  # times the median; longer steps, at the edges of things, count as that
 _MIN_PEAK = 8.0  # times the median correlation of steps: a period
-_PERIODS = 4  # that are tried
+_SHARE = 0.25  # of the highest peak: lines that repeat less than views do
+_PERIODS = 6  # that are tried
 _SAMPLES, _MIN_SAMPLES, _MAX_SAMPLES = 200, 60, 10_000  # Gaussians of a view to look at, to solve from, of all views
+_PLACES = tuple(number * 0.6180339887498949 % 1 for number in range(9))  # in the file, of views that are looked at
 _RECURRENCE = 0.7548776662466927, 0.5698402909980532  # powers of the plastic number's inverse
 _SAME, _SAME_PX = 1.3, 0.05  # times as far, and pixels farther: as near
 
@@ -41,7 +43,7 @@ def find_grid(gaussians: Gaussians, valid: np.ndarray) -> tuple[Layout, Calibrat
     if size is None:
         return None
     rows = gaussians.means, valid
-    fastest, width, height = size
+    _, width, height = size
     by_row, by_column = (_layouts(len(valid), *lines) for lines in ((width, height, False), (height, width, True)))
     fits = _calibrate_layouts(*rows, by_row) or _calibrate_layouts(*rows, by_column)
     nearest = min((calibration.worst_px for _, calibration in fits), default=0.0)
@@ -120,7 +122,7 @@ def _find_height(means: np.ndarray, valid: np.ndarray, step: int, width: int) ->
         if height < _MIN_SIDE:
             break
         limit, errors = pixel_limit(width, height), []
-        for view, layer in dict.fromkeys(((0, 0), (views // 2, step // 2), (views - 1, step - 1))):
+        for view, layer in dict.fromkeys((int(share * views), int(share * step)) for share in _PLACES):
             pixels = _spread(_SAMPLES, width, height)
             rows = (view * width * height + pixels) * step + layer
             rows, pixels = rows[valid[rows]], pixels[valid[rows]]
@@ -140,7 +142,7 @@ def _divisors(number: int) -> list[int]:
 
 
 def _find_periods(gaussians: Gaussians, valid: np.ndarray) -> tuple[int, list[int]]:
-    """Find after how many rows the next pixel comes, and the likeliest periods of lines that divide the rows."""
+    """Find after how many rows the next pixel comes, and the periods of the rows, which divide their number."""
     means, count = gaussians.means, len(gaussians)
     lags = np.arange(1, min(_MAX_FASTEST, count // _MIN_SIDE**2) + 1)
     if not len(lags):
@@ -160,8 +162,9 @@ def _find_periods(gaussians: Gaussians, valid: np.ndarray) -> tuple[int, list[in
     peaks = np.zeros(len(alike))
     peaks[fastest:-fastest] = alike[fastest:-fastest] - (alike[: -2 * fastest] + alike[2 * fastest :]) / 2
     likely = [lag for lag in _divisors(count) if _MIN_SIDE <= lag < len(peaks)]
-    high = _MIN_PEAK * float(np.median(np.abs(peaks)))
-    return fastest, sorted((lag for lag in likely if peaks[lag] > high), key=lambda lag: -peaks[lag])[:_PERIODS]
+    lowest = _MIN_PEAK * float(np.median(np.abs(peaks)))
+    lowest = max([lowest, *(_SHARE * peaks[lag] for lag in likely)])
+    return fastest, [lag for lag in likely if peaks[lag] >= lowest > 0][:_PERIODS]
 
 
 def _power(values: np.ndarray, lag: int) -> np.ndarray:

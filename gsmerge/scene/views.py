@@ -110,9 +110,17 @@ def _read_grid(ply: GaussianFile, files: SceneFiles, paths: Sequence[Path]) -> C
     cameras, pictures = grid
     match = match_photos(pictures, paths)
     if match is not None:
-        chosen, transform, size = match
-        names = tuple(paths[photo].relative_to(files.images or files.ply.parent).as_posix() for photo in chosen)
-        return replace(cameras, names=names, photo_map=(size, transform))
+        chosen = (paths[photo].relative_to(files.images or files.ply.parent) for photo in match.chosen)
+        Ks = cameras.Ks.copy()
+        Ks[:, :2, 2] += match.trim
+        return replace(
+            cameras,
+            Ks=Ks,
+            widths=cameras.widths + 2 * match.trim,
+            heights=cameras.heights + 2 * match.trim,
+            names=tuple(path.as_posix() for path in chosen),
+            photo_map=(match.size, match.transform),
+        )
     if files.images is None or not paths:
         return cameras
     views, height, width = pictures.shape[:3]

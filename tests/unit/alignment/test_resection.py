@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from gsmerge.alignment.resection import (
+    ALL_INTRINSICS,
     ONE_FOCAL,
+    focal_uncertainty,
     projection_errors,
     projective_error,
     refine_poses,
@@ -46,6 +48,26 @@ def test_the_focal_length_is_found():
     near_K, poses = refine_poses(points, pixels, guess, starts, free=ONE_FOCAL)
     np.testing.assert_allclose(near_K, K, atol=1e-6)
     np.testing.assert_allclose(poses, TRUE, atol=1e-7)
+
+
+def test_all_intrinsics_are_found():
+    points, pixels = shown(0.0)
+    guess = np.array([[330.0, 0, 150], [0, 280, 126], [0, 0, 1]])
+    starts = np.stack([start_pose(p, q, guess) for p, q in zip(points, pixels, strict=True)])
+    near_K, poses = refine_poses(points, pixels, guess, starts, free=ALL_INTRINSICS)
+    np.testing.assert_allclose(near_K, K, atol=1e-5)
+    np.testing.assert_allclose(poses, TRUE, atol=1e-6)
+
+
+def test_a_plane_in_front_of_the_camera_leaves_the_focal_length_open():
+    points, pixels = shown(0.0)
+    Ks = np.tile(K, (3, 1, 1))
+    assert focal_uncertainty(points, pixels, Ks, TRUE) < 0.01
+    wall = points[0] * [1, 1, 0]
+    ahead = np.eye(4)[None].copy()
+    ahead[0, 2, 3] = 5
+    places = (wall + ahead[0, :3, 3]) @ K.T
+    assert focal_uncertainty([wall], [places[:, :2] / places[:, 2:]], Ks[:1], ahead) > 1
 
 
 @pytest.mark.parametrize("seed", range(3))
