@@ -95,9 +95,9 @@ def test_a_device_is_a_limit(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> N
 
 
 @pytest.mark.parametrize("settings", [{"quality": "-0.2dB"}, {"quality": "30dB"}])
-def test_quality_needs_photos(scene: Scene, settings: dict[str, str]) -> None:
+def test_quality_needs_photos_or_pixels(scene: Scene, settings: dict[str, str]) -> None:
     with pytest.raises(UsageError, match="photos"):
-        compact(replace(scene, images=None), **settings)
+        compact(replace(scene, images=None, pixel_ids=None), **settings)
 
 
 def test_a_search_keeps_what_reading_had_to_say(scene: Scene) -> None:

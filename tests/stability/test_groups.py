@@ -141,9 +141,10 @@ def test_oversized_members_cost_less_than_a_decibel(room: Scene) -> None:
 def test_transparent_pixels_leave_nothing(room: Scene, k: int) -> None:
     opacities = room.gaussians.opacities.copy().reshape(room.valid.shape)
     opacities[0] = 0
-    half = replace(changed(room, opacities=opacities.reshape(-1)), images=None)  # photos would prune what view 0 hides
-    actual = scenes.plain(half, k=k, match="none")
-    others = scenes.plain(scenes.take_views(half, [1, 2]), k=k, match="none")
+    half = replace(changed(room, opacities=opacities.reshape(-1)), images=None)
+    whole = {"k": k, "match": "none", "min_contribution": 0}  # nothing is pruned that view 0 hides
+    actual = scenes.plain(half, **whole)
+    others = scenes.plain(scenes.take_views(half, [1, 2]), **whole)
     scenes.assert_same_set(actual, others, atol=1e-4)
 
 
