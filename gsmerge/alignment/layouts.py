@@ -140,7 +140,7 @@ def exact_layouts(count: int, views: int, width: int, height: int) -> Iterator[L
 
 def full_layouts(views: int, per_pixel: int, width: int, height: int) -> Iterator[Layout]:
     """Yield the layouts of every pixel of all ``views``."""
-    whole, *_ = boxes(width, height)
+    whole = next(iter(boxes(width, height)))
     return _orders(views * per_pixel * width * height, whole, per_pixel, tuple(range(views)), width, height)
 
 

@@ -222,7 +222,7 @@ def test_rows_in_no_order(tmp_path: Path) -> None:
 
 
 def test_no_cameras(tmp_path: Path) -> None:
-    save_export(tmp_path, SMOOTH, export_rows(SMOOTH), cameras=False)
+    save_export(tmp_path, SMOOTH, export_rows(SMOOTH)[:-1], cameras=False)  # no grid
     lines = said(tmp_path)
     assert names(lines["alignment"], "not", "no cameras")
     assert names(lines["compact"], 228, "4.4 %")
