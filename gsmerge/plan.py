@@ -202,7 +202,7 @@ def plan_whole(
     share = limits.share if fit.share is None else fit.share
     fit = replace(fit, fit_steps=steps_for(options, scene.num_views, share), share=share)
     match = options.match.match or ("overlap" if EFFORTS[options.effort].merges else "none")
-    networks = choose_networks(options, photos=scene.photos)
+    networks = choose_networks(options, photos=scene.photos, aligned=scene.aligned)
     return WholePlan(choose_blocks(scene, options), decode, limits, match, networks, fit)
 
 
@@ -265,18 +265,18 @@ def stands_alone(scene: Scene, options: CompactOptions) -> bool:
     return len(scene) == 0 and options.method == OURS and options.checkpoint in ("auto", "none")
 
 
-def choose_networks(options: CompactOptions, *, photos: bool) -> str:
+def choose_networks(options: CompactOptions, *, photos: bool, aligned: bool = True) -> str:
     """Return the name of the checkpoint to load: as asked, or the shipped one where it improves results.
 
-    The shipped networks improve scenes if no fit follows, or a short one under an effort that has time for both
-    (docs/laboratory/networks.md). ``photos``: whether there are any to fit to.
+    The shipped networks improve scenes with one Gaussian per pixel (``aligned``) if no fit follows, or a short one
+    under an effort that has time for both (docs/laboratory/networks.md). ``photos``: whether there are any to fit to.
     """
     if options.checkpoint != "auto":
         return options.checkpoint
     steps = resolve_fit(options).steps * (AUTO_STEPS if options.budget.auto and options.fit.fit_steps is None else 1)
     short = EFFORTS[options.effort].networks and steps <= SHORT_STEPS
     bare = not photos or options.fit.fit == "none"
-    return "shipped" if bare or short else "none"
+    return "shipped" if aligned and (bare or short) else "none"
 
 
 def load_networks(options: CompactOptions, scene: Scene, *, photos: bool) -> Checkpoint | None:
@@ -285,7 +285,7 @@ def load_networks(options: CompactOptions, scene: Scene, *, photos: bool) -> Che
     ``photos``: whether there are any to fit to. SceneError if it is required and cannot be used,
     UsageError if it does not fit.
     """
-    name = choose_networks(options, photos=photos)
+    name = choose_networks(options, photos=photos, aligned=scene.aligned)
     if name == "none":
         return None
     from gsmerge.networks.checkpoint import find_checkpoint

@@ -10,7 +10,7 @@ import numpy as np
 
 from gsmerge.raster.composite import Rendering, background_color, contributions, draw_views, prepare_views
 from gsmerge.raster.photos import NEAR
-from gsmerge.raster.view_plan import ViewPlan, plan_view
+from gsmerge.raster.view_plan import ViewPlan, plan_view, prepare
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Array, Cameras, Gaussians, Scene, as_tensor
 
@@ -129,19 +129,29 @@ def _planner(gaussians: Gaussians, cameras: Cameras, options: Mapping[str, Any])
 def seen_weights(scene: Scene) -> np.ndarray:
     """Measure each Gaussian's largest summed blending weight in one view, ``[n]`` float32, pixels."""
     most, lock = np.zeros(len(scene.gaussians), np.float32), Lock()
-    plan_one = _planner(scene.gaussians, scene.cameras, {"near": NEAR})
 
-    def weigh(view: int) -> None:
-        sums, _peaks = contributions(plan_one(view))
+    def one_view(_: int, plan: ViewPlan) -> None:
+        sums, _peaks = contributions(plan)
         with lock:
             np.maximum(most, sums, out=most)
 
-    if len(scene.gaussians) <= ONE_AT_A_TIME:
-        parallel_map(weigh, range(len(scene)))
-    else:
-        for view in range(len(scene)):
-            weigh(view)
+    plan_views(scene, one_view)
     return most
+
+
+def plan_views(scene: Scene, use: Callable[[int, ViewPlan], None]) -> None:
+    """Call ``use(view, plan)`` with the plan of every view, in parallel if memory allows."""
+    splats, cameras = prepare(scene.gaussians), scene.cameras
+    viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
+
+    def one_view(view: int) -> None:
+        use(view, plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, near=NEAR))
+
+    if len(splats) <= ONE_AT_A_TIME:
+        parallel_map(one_view, range(len(scene)))
+        return
+    for view in range(len(scene)):
+        one_view(view)
 
 
 def seen_depths(scene: Scene) -> tuple[np.ndarray, np.ndarray]:

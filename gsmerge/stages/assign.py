@@ -1,66 +1,42 @@
-"""Unaligned Gaussians -> members: the pixel that each belongs to, and the Gaussian that each pixel shows.
+"""Groups and unaligned Gaussians -> members: the pixel that each Gaussian belongs to.
 
-The paper draws every view and gives a Gaussian to the superpixel with most of its blending weights (supplement
-"Compaction of Non-Pixel-Aligned FF Backbones"). Weights at the pixels of the centres alone lead to results that are as
-good, in less time. Gaussians that no view sees are marked.
+A Gaussian belongs to the superpixel, of all views, that gets most of its blending weights (paper,
+supplement "Compaction of Non-Pixel-Aligned FF Backbones"). Gaussians that no view sees are marked.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from threading import Lock
 
 import numpy as np
 
 from gsmerge.errors import UsageError
 from gsmerge.geometry import morton_codes
-from gsmerge.kernels.gaussians.fronts import weigh_centres
+from gsmerge.kernels.raster.contribution import dominant_labels
 from gsmerge.moments import Members, pool_members, scene_members, unaligned_members
-from gsmerge.raster.images import ONE_AT_A_TIME
-from gsmerge.raster.photos import NEAR
+from gsmerge.raster import ViewPlan
+from gsmerge.raster.images import plan_views
 from gsmerge.runtime.record import stage
-from gsmerge.runtime.threads import in_turn
+from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import DecodeOptions
 from gsmerge.stages.decode import decode
 from gsmerge.stages.encode import from_moments
-from gsmerge.types import Gaussians, Scene
+from gsmerge.types import Gaussians, Groups, Scene
 
 
 @stage("members")
-def assign(scene: Scene) -> Members:
+def assign(scene: Scene, groups: Groups) -> Members:
     """Return all Gaussians of a canonical scene as members with a pixel each; UsageError if no view sees any."""
     if scene.aligned:
         return scene_members(scene)
-    pixels, fronts = find_pixels(scene)
+    pixels = owner_pixels(find_owners(scene, groups), groups)
     if not (pixels >= 0).any():
         raise UsageError(
             f"expected views that see the scene, found that none of {len(scene)} sees any of {len(pixels)} Gaussians: "
             "give the cameras that belong to it"
         )
-    return unaligned_members(scene, pixels, fronts)
-
-
-def find_pixels(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Find the pixel of each Gaussian, ``[n]`` int64 over all views, and the front of each pixel, ``[v,h,w]`` int32.
-
-    A Gaussian's pixel is where its opacity x transmittance x area, pixels, is largest, -1 if no view sees it; the first
-    view wins ties. A pixel's front is the Gaussian with the largest opacity x transmittance of those whose centres it
-    sees, -1 without any.
-    """
-    g, cameras, count = scene.gaussians, scene.cameras, len(scene)
-    means, scales, opacities = (np.ascontiguousarray(column, np.float32) for column in (g.means, g.scales, g.opacities))
-    viewmats, Ks = (np.ascontiguousarray(array, np.float64) for array in (cameras.viewmats, cameras.Ks))
-    fronts = np.empty((count, cameras.height, cameras.width), np.int32)
-    most, pixels = np.zeros(len(g), np.float32), np.full(len(g), -1, np.int64)
-
-    def weigh(view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return weigh_centres(means, scales, opacities, viewmats[view], Ks[view], NEAR, fronts[view])
-
-    of_views = in_turn(weigh, range(count)) if len(g) <= ONE_AT_A_TIME else map(weigh, range(count))
-    for view, (ids, places, weights) in enumerate(of_views):
-        better = weights > most[ids]
-        ids = ids[better]
-        most[ids], pixels[ids] = weights[better], view * scene.pixels_per_view + places[better]
-    return pixels, fronts
+    return unaligned_members(scene, pixels)
 
 
 def merge_unseen(gaussians: Gaussians, scene: Scene, count: int) -> Gaussians:
@@ -70,3 +46,61 @@ def merge_unseen(gaussians: Gaussians, scene: Scene, count: int) -> Gaussians:
     starts = np.linspace(0, len(order), count + 1).astype(np.int64)
     features = from_moments(pool_members(members, starts, order), starts, order, np.full(count, -1))
     return decode(features, members, DecodeOptions(min_opacity=0.0))
+
+
+@dataclass(frozen=True)
+class Owners:
+    """The superpixel to which each of n Gaussians contributes most."""
+
+    values: np.ndarray  # [n] float32 blending weights summed over the superpixel, pixels; or 0
+    views: np.ndarray  # [n] int32, -1 if unseen
+    labels: np.ndarray  # [n] int32 superpixel within the view, -1 if unseen
+
+
+def find_owners(scene: Scene, groups: Groups) -> Owners:
+    """Find the superpixel to which each Gaussian contributes most, over all views; the first view wins ties."""
+    count, lock = len(scene.gaussians), Lock()
+    best = Owners(np.zeros(count, np.float32), np.full(count, -1, np.int32), np.full(count, -1, np.int32))
+
+    def one_view(view: int, plan: ViewPlan) -> None:
+        values, labels = view_owners(plan, groups.labels[view], groups.counts[view])
+        with lock:
+            old, first = best.values[plan.ids], best.views[plan.ids]
+            better = (values > old) | ((values == old) & (labels >= 0) & (view < first))
+            ids = plan.ids[better]
+            best.values[ids], best.views[ids], best.labels[ids] = values[better], view, labels[better]
+
+    plan_views(scene, one_view)
+    return best
+
+
+def view_owners(plan: ViewPlan, labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return each Gaussian's largest contribution ``[m]`` to a superpixel of one view, and that superpixel ``[m]``."""
+    labels = np.ascontiguousarray(labels, np.int32)
+    return dominant_labels(*plan.lists, labels, count)
+
+
+def owner_pixels(owners: Owners, groups: Groups) -> np.ndarray:
+    """Return the middle pixel of each Gaussian's superpixel, ``[n]`` int64 over all views, -1 if unseen."""
+    counts = np.asarray(groups.counts)
+    size, first = groups.labels[0].size, np.cumsum(counts) - counts
+
+    def one_view(view: int) -> np.ndarray:
+        return middle_pixels(groups.labels[view], groups.counts[view]) + view * size
+
+    middles = np.concatenate(parallel_map(one_view, range(len(counts))))
+    return np.where(owners.labels >= 0, middles[first[owners.views] + owners.labels], -1)
+
+
+def middle_pixels(labels: np.ndarray, count: int) -> np.ndarray:
+    """Return the pixel ``[count]`` int64 nearest to the centroid of each superpixel; 0 for an empty one."""
+    height, width = labels.shape
+    flat = labels.reshape(-1)
+    y, x = np.divmod(np.arange(height * width), width)
+    sizes = np.maximum(np.bincount(flat, minlength=count), 1)
+    dy, dx = (axis - (np.bincount(flat, axis, count) / sizes)[flat] for axis in (y, x))
+    order = np.lexsort((dx * dx + dy * dy, flat))
+    present, at = np.unique(flat[order], return_index=True)
+    middles = np.zeros(count, np.int64)
+    middles[present] = order[at]
+    return middles

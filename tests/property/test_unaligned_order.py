@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from gsmerge import Scene, compact
-from gsmerge.stages.assign import assign, find_pixels
+from gsmerge.moments import unaligned_members
+from gsmerge.stages.assign import Owners, find_owners, owner_pixels
 from gsmerge.stages.encode import member_rows
 from gsmerge.stages.segment import SegmentOptions, segment
 from gsmerge.types import Groups
@@ -30,34 +31,36 @@ def groups(count: int) -> Groups:
     return segment(ROOM.images, SegmentOptions(), count)
 
 
+def owners_equal(one: Owners, other: Owners) -> bool:
+    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in ("values", "views", "labels"))
+
+
 @FEW
-@given(st.integers(0, 1000), st.sampled_from([ROOM, TURNED]))
-def test_permuted_gaussians_have_permuted_pixels(seed: int, scene: Scene) -> None:
+@given(st.integers(0, 1000), st.integers(1, 300), st.sampled_from([ROOM, TURNED]))
+def test_permuted_gaussians_have_permuted_owners(seed: int, count: int, scene: Scene) -> None:
     """Of so few no two have the same depth in float32, so that each view has one order."""
     few = replace(unaligned_scenes.without_order(scene), gaussians=scene.gaussians[::8])
     order = np.random.default_rng(seed).permutation(len(few.gaussians))
-    pixels, fronts = find_pixels(few)
-    permuted, others = find_pixels(replace(few, gaussians=few.gaussians[order]))
-    assert (permuted == pixels[order]).all()
-    assert (np.where(others >= 0, order[others], -1) == fronts).all()
+    one = find_owners(few, groups(count))
+    other = find_owners(replace(few, gaussians=few.gaussians[order]), groups(count))
+    assert owners_equal(Owners(*(column[order] for column in (one.values, one.views, one.labels))), other)
 
 
 @FEW
 @given(st.integers(1, 300))
 def test_each_gaussian_is_in_at_most_one_superpixel(count: int) -> None:
     scene = unaligned_scenes.without_order(TURNED)
-    members = assign(scene)
-    assert members.pixels is not None
+    owners = find_owners(scene, groups(count))
+    members = unaligned_members(scene, owner_pixels(owners, groups(count)))
     starts, ids, views = member_rows(scene, members, groups(count))
     assert len(np.unique(ids)) == len(ids)
-    assert set(ids) == set(np.flatnonzero(members.pixels >= 0))
+    assert set(ids) == set(np.flatnonzero(owners.labels >= 0))
     assert (np.diff(starts) > 0).all()
     assert starts[-1] == len(ids)
     assert len(views) == len(starts) - 1
     sizes = np.diff(starts)
-    assert (members.pixels[ids] // scene.pixels_per_view == np.repeat(views, sizes)).all()
-    labels = groups(count).labels.reshape(-1)[members.pixels[ids]]
-    assert len(set(zip(np.repeat(views, sizes), labels, strict=True))) == len(views)
+    assert (owners.views[ids] == np.repeat(views, sizes)).all()
+    assert len(set(zip(owners.views[ids], owners.labels[ids], strict=True))) == len(views)
 
 
 @FEW

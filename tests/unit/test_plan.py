@@ -80,18 +80,18 @@ def test_a_draft_without_a_fit_leaves_out_nothing() -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "photos", "name"),
+    ("settings", "photos", "aligned", "name"),
     [
-        ({}, True, "none"), ({}, False, "shipped"), ({"fit": "none"}, True, "shipped"),
-        ({"fit_steps": 60}, True, "shipped"), ({"fit_steps": 61}, True, "none"),
-        ({"effort": "fast", "fit": "none"}, True, "shipped"),
-        ({"effort": "fast"}, True, "none"), ({"effort": "draft"}, False, "shipped"),
-        ({"checkpoint": "own.safetensors"}, True, "own.safetensors"),
-        ({"checkpoint": "none"}, False, "none"),
+        ({}, True, True, "none"), ({}, False, True, "shipped"), ({"fit": "none"}, True, True, "shipped"),
+        ({"fit_steps": 60}, True, True, "shipped"), ({"fit_steps": 61}, True, True, "none"),
+        ({"effort": "fast", "fit": "none"}, True, True, "shipped"), ({"fit": "none"}, True, False, "none"),
+        ({"effort": "fast"}, True, True, "none"), ({"effort": "draft"}, False, True, "shipped"),
+        ({"checkpoint": "own.safetensors"}, True, True, "own.safetensors"),
+        ({"checkpoint": "none"}, False, True, "none"),
     ],
 )  # fmt: skip
-def test_networks_are_loaded_where_they_help(settings: dict[str, Any], photos: bool, name: str) -> None:
-    assert choose_networks(options_of(**settings), photos=photos) == name
+def test_networks_are_loaded_where_they_help(settings: dict[str, Any], photos: bool, aligned: bool, name: str) -> None:
+    assert choose_networks(options_of(**settings), photos=photos, aligned=aligned) == name
 
 
 def test_networks_compete_unless_they_are_named(scene: Scene) -> None:

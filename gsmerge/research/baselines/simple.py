@@ -60,7 +60,7 @@ def most_important(importance: np.ndarray, count: int) -> np.ndarray:
 
 def merge_groups(prepared: Prepared, groups: Groups, rule: Literal["depth", "paper"] = "depth") -> Gaussians:
     """Merge each group into one Gaussian, without matching across views; empty groups are left out."""
-    members = assign(prepared.scene)
+    members = assign(prepared.scene, groups)
     features = encode(prepared.scene, members, groups, rule=rule)
     with stage("decode"):
         return decode(features, members, DecodeOptions(min_opacity=0.0))

@@ -12,12 +12,16 @@ from gsmerge import Scene, compact
 from gsmerge.errors import UsageError
 from gsmerge.facts.place_cameras import add_views
 from gsmerge.facts.prepare import canonicalise, prepare, scene_frame
-from gsmerge.geometry import project
 from gsmerge.moments import scene_members, unaligned_members
 from gsmerge.raster.images import seen_depths
 from gsmerge.runtime.record import record_run
 from gsmerge.settings.stages import SegmentOptions
-from gsmerge.stages.assign import assign, find_pixels, merge_unseen
+from gsmerge.stages.assign import (
+    find_owners,
+    merge_unseen,
+    middle_pixels,
+    owner_pixels,
+)
 from gsmerge.stages.encode import encode, member_rows
 from gsmerge.stages.segment import measure_size, superpixels_per_view
 from gsmerge.stages.superpixels import segment
@@ -34,33 +38,19 @@ def groups(room: Scene) -> Groups:
     return segment(room.images, SegmentOptions(), 40)
 
 
-def test_rows_get_their_pixels_back(room: Scene) -> None:
-    """Gaussians of a grid lie in their own pixels, or in another view's that shows the same surface larger."""
-    scene = unaligned_scenes.without_order(room)
-    members = assign(scene)
-    assert members.pixels is not None
-    assert members.fronts is not None
-    rows, seen = np.arange(len(room.gaussians)), members.pixels >= 0
-    assert seen.mean() > 0.99
-    views, own = members.pixels // room.pixels_per_view, rows // room.pixels_per_view
-    assert (members.pixels[seen & (views == own)] == rows[seen & (views == own)]).mean() > 0.99
-    assert members.fronts.shape == (3, 24, 32)
-    _, depths = project(scene.gaussians.means[members.fronts.reshape(-1)].astype(np.float64), scene.cameras)
-    _, expected, _ = scenes.trace(scenes.room(), room.cameras)
-    error = depths[own, rows] / expected.reshape(-1) - 1
-    assert np.median(np.abs(error)) < 0.01
+def test_middle_pixels() -> None:
+    labels = np.array([[0, 0, 0, 2], [0, 0, 0, 2], [0, 0, 0, 2]], np.int32)
+    assert middle_pixels(labels, 4).tolist() == [5, 0, 7, 0]
 
 
-def test_a_wide_gaussian_beside_the_picture_has_a_pixel_at_its_border(room: Scene) -> None:
-    """It is no front, and hides nothing."""
-    cameras, place = room.cameras[[0]], np.array([[1.2, 0.0, 1.0, 1.0]])
-    means = (np.linalg.inv(cameras.viewmats[0].astype(np.float64)) @ place.T).T[:, :3]
-    few = room.gaussians[:1]
-    for size, seen in ((0.5, True), (0.01, False)):
-        wide = replace(few, means=means, scales=np.full((1, 3), size), opacities=np.ones(1))
-        pixels, fronts = find_pixels(Scene(wide, cameras, None, None, ("a",)))
-        assert pixels.tolist() == [11 * 32 + 31] if seen else [-1]
-        assert (fronts == -1).all()
+def test_owner_pixels_lie_in_their_superpixel(room: Scene, groups: Groups) -> None:
+    owners = find_owners(unaligned_scenes.without_order(room), groups)
+    pixels = owner_pixels(owners, groups)
+    seen = owners.labels >= 0
+    assert seen.mean() > 0.9
+    assert (pixels[~seen] == -1).all()
+    assert (groups.labels.reshape(-1)[pixels[seen]] == owners.labels[seen]).all()
+    assert (pixels[seen] // (32 * 24) == owners.views[seen]).all()
 
 
 def test_rows_by_pixel_are_those_of_the_grid(room: Scene, groups: Groups) -> None:
@@ -129,7 +119,9 @@ def test_unknown_cameras_are_placed(room: Scene) -> None:
 
 def test_placed_cameras_see_most(room: Scene) -> None:
     blind = add_views(Scene(room.gaussians, unaligned_scenes.NO_CAMERAS, None, None, ()))
-    assert (find_pixels(blind)[0] >= 0).mean() > 0.8
+    groups = Groups(np.zeros((len(blind), blind.cameras.height, blind.cameras.width), np.int32), (1,) * len(blind))
+    owners = find_owners(blind, groups)
+    assert (owners.values > 0).mean() > 0.8
 
 
 def test_neighbours_are_merged(room: Scene) -> None:

@@ -1,0 +1,139 @@
+// The superpixel of one view that every Gaussian adds most to (paper, supplement on non-pixel-aligned backbones).
+//
+// Blending weights are summed per pair of Gaussian and superpixel while the tiles are walked. The pairs of one row of
+// tiles are kept, chained by Gaussian; at its end every Gaussian that does not reach into the next row is decided, and
+// the rest is carried over. So memory goes with a row of tiles, not with the view.
+#include "walk.h"
+
+enum { LABEL, SUM, NEXT, PAIR };  // columns of a pair, the last the next pair of the same Gaussian, -1 for none
+enum { LAST_ROW = 7 };            // column of a conic
+enum { NUM_PAIRS, NUM_ACTIVE, NEXT_TILE, COUNTS };  // what the kernels count, and the tile that comes next
+
+// Write a pair and put it in front of its Gaussian's chain.
+static inline void chain(double *pairs, int64_t at, int32_t *heads, int64_t k, int64_t label, double value) {
+  double *pair = pairs + PAIR * at;
+  pair[LABEL] = (double)label;
+  pair[SUM] = value;
+  pair[NEXT] = heads[k];
+  heads[k] = (int32_t)at;
+}
+
+// Number the superpixels of a tile from 0: lanes gets each pixel's number, names each number's label -> how many.
+static int32_t number_labels(const int32_t *labels, const Tile *t, int64_t w, int32_t *stamps, int32_t *lanes,
+                          int32_t *names) {
+  int32_t count = 0;
+  for (int y = 0; y < t->num_y; y++)
+    for (int x = 0; x < t->num_x; x++) {
+      int32_t label = labels[(t->top + y) * w + t->left + x];
+      if (stamps[label] < 0) {
+        stamps[label] = count;
+        names[count++] = label;
+      }
+      lanes[y * TILE + x] = stamps[label];
+    }
+  for (int32_t i = 0; i < count; i++) stamps[names[i]] = -1;
+  return count;
+}
+
+// Sum one Gaussian's weights by the tile's superpixels -> how many of them are touched.
+static inline int32_t sum_tile(const float *weights, const Batch *b, int64_t j, int32_t y0, int32_t y1, int32_t num_x,
+                               const int32_t *lanes, float *sums, int32_t *touched) {
+  int32_t x0, x1, count = 0;
+  columns_of(b, j, num_x, &x0, &x1);
+  for (int32_t y = y0; y <= y1; y++)
+    for (int32_t x = x0; x <= x1; x++) {
+      float w = weights[y * TILE + x];
+      int32_t label = lanes[y * TILE + x];
+      touched[count] = label;
+      count += w > 0.f && sums[label] == 0.f;
+      sums[label] += w;
+    }
+  return count;
+}
+
+// Append the pairs of a row of tiles from counts[NEXT_TILE] on. A tile whose pairs may not fit is left for a call with
+// more room.
+API int32_t add_row(const float *restrict conics, const int32_t *restrict flatten_ids,
+                    const int64_t *restrict isect_offsets, int64_t tile_width, int64_t line,
+                    const int32_t *restrict labels, int32_t *restrict heads, double *restrict pairs,
+                    int32_t *restrict active, int32_t *restrict stamps, int64_t *restrict counts, int64_t m, int64_t n,
+                    int64_t ends, int64_t h, int64_t w, int64_t room, int64_t slots, int64_t num_labels) {
+  (void)num_labels;
+  if (line < 0 || (line + 1) * tile_width >= ends || slots <= m || counts[NUM_ACTIVE] < 0 || counts[NUM_ACTIVE] > m ||
+      counts[NUM_PAIRS] < 0 || counts[NUM_PAIRS] > room)
+    return OUTSIDE;
+  Lists lists = {conics, flatten_ids, isect_offsets, tile_width, m, n, ends};
+  if (!lists_are_sound(&lists, line * tile_width, (line + 1) * tile_width)) return OUTSIDE;
+  float state[2 * PLANE] __attribute__((aligned(64))), sums[PLANE] = {0};
+  int32_t lanes[PLANE] = {0}, names[PLANE], touched[PLANE + 1];
+  Batch batch;
+  clear_batch(&batch);
+  int64_t num_pairs = counts[NUM_PAIRS], num_active = counts[NUM_ACTIVE];
+  for (int64_t tile = maxi(line * tile_width, counts[NEXT_TILE]); tile < (line + 1) * tile_width; tile++) {
+    int64_t start = isect_offsets[tile], end = isect_offsets[tile + 1];
+    Tile t = open_tile(state, 2, tile, tile_width, h, w);
+    counts[NEXT_TILE] = tile;
+    if (num_pairs + (end - start) * number_labels(labels, &t, w, stamps, lanes, names) > room) return 0;
+    for (; start < end && t.y_low <= t.y_high; start += BATCH) {
+      int64_t stop = mini(end, start + BATCH);
+      if (!gather(&batch, &t, &lists, start, stop, end)) return OUTSIDE;
+      for (int64_t j = 0; j < stop - start; j++) {
+        int32_t y0 = first_row(&t, &batch, j), y1 = last_row(&t, &batch, j), k = flatten_ids[start + j];
+        weigh_rows(state, &batch, j, y0, y1);
+        int32_t count = sum_tile(state + PLANE, &batch, j, y0, y1, t.num_x, lanes, sums, touched);
+        active[num_active] = k;
+        num_active += count > 0 && heads[k] < 0 && num_active < m;
+        for (int32_t i = 0; i < count; i++) {
+          chain(pairs, num_pairs++, heads, k, names[touched[i]], sums[touched[i]]);
+          sums[touched[i]] = 0.f;
+        }
+      }
+      narrow_tile(&t, state);
+    }
+    counts[NUM_PAIRS] = num_pairs;
+    counts[NUM_ACTIVE] = num_active;
+    counts[NEXT_TILE] = tile + 1;
+  }
+  return 0;
+}
+
+// Add up the pairs of every Gaussian; decide on those that end above bottom, carry over the others' sums.
+API int32_t settle_row(int64_t bottom, const float *restrict conics, int32_t *restrict heads,
+                       const double *restrict pairs, double *restrict carried, int32_t *restrict active,
+                       double *restrict totals, int32_t *restrict seen, float *restrict out_values,
+                       int32_t *restrict out_labels, int64_t *restrict counts, int64_t m, int64_t room, int64_t slots,
+                       int64_t num_labels) {
+  int64_t num_carried = 0, num_staying = 0;
+  if (counts[NUM_ACTIVE] > slots || counts[NUM_PAIRS] > room) return OUTSIDE;
+  for (int64_t a = 0; a < counts[NUM_ACTIVE]; a++) {
+    int64_t k = active[a], count = 0;
+    if (k < 0 || k >= m) return OUTSIDE;
+    for (int64_t pair = heads[k]; pair >= 0; pair = (int64_t)pairs[PAIR * pair + NEXT]) {
+      if (pair >= room) return OUTSIDE;
+      int64_t label = (int64_t)pairs[PAIR * pair + LABEL];
+      if (label < 0 || label >= num_labels) return OUTSIDE;
+      if (totals[label] == 0.0) seen[count++] = (int32_t)label;
+      totals[label] += pairs[PAIR * pair + SUM];
+    }
+    if (count == 0) return OUTSIDE;
+    heads[k] = -1;
+    bool final = conics[CONIC * k + LAST_ROW] < (float)bottom;
+    int32_t best = seen[0];
+    for (int64_t i = 0; i < count; i++) {
+      int32_t label = seen[i];
+      double sum = totals[label];
+      best = sum > totals[best] || (sum == totals[best] && label < best) ? label : best;
+      if (!final) chain(carried, num_carried++, heads, k, label, sum);
+    }
+    if (final) {
+      out_values[k] = (float)totals[best];
+      out_labels[k] = best;
+    }
+    for (int64_t i = 0; i < count; i++) totals[seen[i]] = 0.0;
+    active[num_staying] = (int32_t)k;
+    num_staying += !final;
+  }
+  counts[NUM_PAIRS] = num_carried;
+  counts[NUM_ACTIVE] = num_staying;
+  return 0;
+}

@@ -1,0 +1,62 @@
+"""The superpixel of one view that every Gaussian adds most to (paper, supplement on non-pixel-aligned backbones).
+
+Blending weights are summed per pair of Gaussian and superpixel while the tiles are walked. The pairs of one row of
+tiles are kept, chained by Gaussian; at its end every Gaussian that does not reach into the next row is decided, and
+the rest is carried over. So memory goes with a row of tiles, not with the view.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsmerge.kernels.raster.blend import LISTS
+from gsmerge.kernels.raster.project import CONIC, TILE
+from gsmerge.kernels.signature import STATUS, f4, f8, i4, i8, native
+
+FIRST_PAIRS = 1 << 16  # room for pairs of Gaussian and superpixel to begin with
+PAIR = 3  # numbers of a pair: label, sum, the next pair of the same Gaussian or -1
+NUM_PAIRS, NUM_ACTIVE, NEXT_TILE, COUNTS = 0, 1, 2, 3  # what the kernels count, and the tile that comes next
+
+
+@native(
+    STATUS, **LISTS, line=i8(), labels=i4("h", "w", least=0, below="num_labels"), heads=i4("m", out=True),
+    pairs=f8("room", PAIR, out=True), active=i4("slots", out=True), stamps=i4("num_labels", most=-1, out=True),
+    counts=i8(COUNTS, out=True),
+)  # fmt: skip
+def add_row(conics, flatten_ids, isect_offsets, tile_width, line, labels, heads, pairs, active, stamps, counts):
+    """Append the pairs of a row of tiles, from tile ``counts[NEXT_TILE]`` to the last that there is room for."""
+
+
+@native(
+    STATUS, bottom=i8(), conics=f4("m", CONIC), heads=i4("m", out=True), pairs=f8("room", PAIR),
+    carried=f8("room", PAIR, out=True), active=i4("slots", out=True), totals=f8("num_labels", out=True),
+    seen=i4("num_labels", out=True), out_values=f4("m", out=True), out_labels=i4("m", out=True),
+    counts=i8(COUNTS, out=True),
+)  # fmt: skip
+def settle_row(bottom, conics, heads, pairs, carried, active, totals, seen, out_values, out_labels, counts):
+    """Add up the pairs of every Gaussian; decide on those that end above ``bottom``, carry over the others' sums."""
+
+
+def dominant_labels(conics, flatten_ids, isect_offsets, tile_width, labels, count):
+    """Return each Gaussian's largest sum of weights in one superpixel, ``[m]`` float32, and its label, ``[m]`` int32.
+
+    Of equal sums the superpixel with the smallest label counts; 0 and -1 for Gaussians that are not seen.
+
+    Args:
+        labels: ``[h,w]`` int32, below ``count``.
+    """
+    num, last = len(conics), -(-labels.shape[0] // TILE) - 1
+    values, owners = np.zeros(num, np.float32), np.full(num, -1, np.int32)
+    stamps, totals, seen = np.full(count, -1, np.int32), np.zeros(count), np.empty(count, np.int32)
+    heads, active, counts = np.full(num, -1, np.int32), np.empty(num + 1, np.int32), np.zeros(COUNTS, np.int64)
+    pairs = np.empty((FIRST_PAIRS, PAIR))
+    for line in range(last + 1):
+        while counts[NEXT_TILE] < (line + 1) * tile_width:
+            add_row(conics, flatten_ids, isect_offsets, tile_width, line, labels, heads, pairs, active, stamps, counts)
+            if counts[NEXT_TILE] < (line + 1) * tile_width:
+                pairs = np.concatenate([pairs, np.empty_like(pairs)])
+        bottom = (line + 1) * TILE if line < last else np.iinfo(np.int32).max
+        carried = np.empty_like(pairs)
+        settle_row(bottom, conics, heads, pairs, carried, active, totals, seen, values, owners, counts)
+        pairs = carried
+    return values, owners

@@ -1,0 +1,103 @@
+"""The dominant superpixel of every Gaussian against sums over a dense matrix of weights."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_gaussians import random_gaussians
+from numpy.testing import assert_allclose
+from slow_renderer import render_arrays
+
+from gsmerge.kernels.raster.contribution import FIRST_PAIRS
+from gsmerge.raster import plan_view, prepare
+from gsmerge.stages.assign import find_owners, view_owners
+from gsmerge.stages.superpixels import superpixels
+from gsmerge.types import Cameras, Gaussians, Groups, Scene
+
+WIDTH, HEIGHT = 75, 53  # not multiples of a tile
+K = np.array([[60.0, 0, 36.3], [0, 62.0, 27.1], [0, 0, 1]])
+
+
+def some_labels(count: int, seed: int = 0) -> np.ndarray:
+    return superpixels(np.random.default_rng(seed).random((HEIGHT, WIDTH, 3)), count)
+
+
+def superpixel_sums(gaussians: Gaussians, labels: np.ndarray, viewmat: np.ndarray | None = None) -> np.ndarray:
+    """``[n,labels]`` every Gaussian's weights, one pixel after the other, float64."""
+    weights = render_arrays(gaussians, np.eye(4) if viewmat is None else viewmat, K, WIDTH, HEIGHT).weights
+    sums = np.zeros((labels.max() + 1, len(gaussians)))
+    np.add.at(sums, labels.reshape(-1), weights.reshape(len(gaussians), -1).T)
+    return sums.T
+
+
+# Gaussians of a few pixels; wide ones, that reach over many rows of tiles; hardly opaque and fully opaque ones.
+CASES = [(300, 0, 0.5, -3.5, 90), (80, 1, 0.5, -1.0, 200), (400, 2, 3.0, -2.5, 40), (200, 3, 0.05, -2.0, 400),
+         (1, 4, 0.5, -1.0, 7), (100, 5, 0.5, -2.0, 1)]  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_dominant_labels(case: tuple[int, int, float, float, int]) -> None:
+    n, seed, opacity, size, count = case
+    gaussians, labels = random_gaussians(n, seed, opacity=opacity, size=size), some_labels(count)
+    plan = plan_view(prepare(gaussians), np.eye(4), K, WIDTH, HEIGHT)
+    values, actual = view_owners(plan, labels, count)
+    sums = superpixel_sums(gaussians, labels)[plan.ids]
+    assert_allclose(values, sums.max(1), rtol=1e-3, atol=1e-4)
+    seen = actual >= 0
+    assert (seen == (values > 0)).all()
+    # where two superpixels get nearly the same, either may win
+    assert_allclose(sums[seen, actual[seen]], sums[seen].max(1), rtol=1e-3, atol=1e-4)
+    assert sums[~seen].max(initial=0) < 1e-4
+    assert (actual[seen] == sums[seen].argmax(1)).mean() > 0.98
+
+
+def test_pairs_beyond_the_first_room() -> None:
+    """Every pixel its own superpixel, and Gaussians over the whole picture: pairs outgrow their arrays."""
+    gaussians = random_gaussians(400, 7, opacity=3.0, size=0.3)
+    gaussians = replace(gaussians, opacities=0.01 + 0.03 * gaussians.opacities)
+    labels = np.arange(HEIGHT * WIDTH, dtype=np.int32).reshape(HEIGHT, WIDTH)
+    plan = plan_view(prepare(gaussians), np.eye(4), K, WIDTH, HEIGHT)
+    values, actual = view_owners(plan, labels, HEIGHT * WIDTH)
+    sums = superpixel_sums(gaussians, labels)[plan.ids]
+    assert (sums[:, : 16 * WIDTH] > 0).sum() > FIRST_PAIRS
+    assert_allclose(values, sums.max(1), rtol=1e-3, atol=1e-4)
+    assert_allclose(sums[np.arange(len(actual)), actual], sums.max(1), rtol=1e-3, atol=1e-4)
+
+
+def test_equal_sums_go_to_the_smaller_label() -> None:
+    gaussians = random_gaussians(1, 0)
+    middle = Gaussians(
+        np.array([[0.0, 0.0, 3.0]]), np.array([[1.0, 0, 0, 0]]), np.full((1, 3), 0.2), np.array([0.5]),
+        gaussians.sh0, gaussians.shN,
+    )  # fmt: skip
+    even = np.array([[60.0, 0, 32], [0, 60.0, 1], [0, 0, 1]])
+    plan = plan_view(prepare(middle), np.eye(4), even, 64, 2)
+    rows = np.repeat(np.array([[0], [1]], np.int32), 64, 1)
+    assert view_owners(plan, rows, 2)[1].tolist() == [0]
+    assert view_owners(plan, 1 - rows, 2)[1].tolist() == [0]
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_best_of_all_views(seed: int) -> None:
+    gaussians = random_gaussians(150, seed, size=-2.5)
+    viewmats = np.stack([np.eye(4)] * 3)
+    viewmats[1, 0, 3], viewmats[2, 2, 3] = 0.7, 1.0
+    cameras = Cameras(viewmats, np.stack([K] * 3), WIDTH, HEIGHT)
+    labels = np.stack([some_labels(60, view) for view in range(3)])
+    scene = Scene(gaussians, cameras, None, None, ("a", "b", "c"))
+    owners = find_owners(scene, Groups(labels, (60,) * 3))
+    sums = np.stack([superpixel_sums(gaussians, labels[v], viewmats[v]) for v in range(3)], 1)
+    assert_allclose(owners.values, sums.max((1, 2)), rtol=1e-3, atol=1e-4)
+    seen = np.flatnonzero(owners.views >= 0)
+    assert_allclose(sums[seen, owners.views[seen], owners.labels[seen]], sums[seen].max((1, 2)), rtol=1e-3, atol=1e-4)
+    assert len(seen) > 100
+
+
+def test_of_equal_views_the_first() -> None:
+    gaussians = random_gaussians(100, 3, size=-3.5)
+    cameras = Cameras(np.stack([np.eye(4)] * 4), np.stack([K] * 4), WIDTH, HEIGHT)
+    labels = np.stack([some_labels(30)] * 4)
+    owners = find_owners(Scene(gaussians, cameras, None, None, tuple("abcd")), Groups(labels, (30,) * 4))
+    assert set(owners.views.tolist()) <= {-1, 0}
