@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -34,6 +34,8 @@ class Members:
     # [n] int64, the pixel (view-major, row-major over all views) that a member belongs to, -1 for
     # none; None: one member per pixel, in order
     pixels: np.ndarray | None = None
+    # [v,h,w] int32, the member that each pixel shows, -1 for none; None: the one of its own number
+    fronts: np.ndarray | None = None
 
 
 def _array(values: np.ndarray) -> np.ndarray:
@@ -57,8 +59,11 @@ def scene_members(scene: Scene) -> Members:
     return gaussian_members(g, footprints)
 
 
-def unaligned_members(scene: Scene, pixels: np.ndarray) -> Members:
-    """Return the Gaussians of an unaligned scene as members, given their pixels ``[n]`` int64 (-1: none)."""
+def unaligned_members(scene: Scene, pixels: np.ndarray, fronts: np.ndarray | None = None) -> Members:
+    """Return the Gaussians of an unaligned scene as members, given their pixels ``[n]`` int64 (-1: none).
+
+    ``fronts [v,h,w]`` int32: the Gaussian that each pixel shows (-1: none), which statistics across views read.
+    """
     means, cameras = _array(scene.gaussians.means), scene.cameras
     focals = np.sqrt(np.abs(cameras.Ks[:, 0, 0] * cameras.Ks[:, 1, 1])).astype(np.float64)
     views = pixels // scene.pixels_per_view
@@ -70,12 +75,12 @@ def unaligned_members(scene: Scene, pixels: np.ndarray) -> Members:
         for centre, focal in zip(cameras.centres.astype(np.float64), focals, strict=True):
             np.minimum(nearest, np.linalg.norm(means[alone] - centre, axis=1) / focal, out=nearest)
         footprints[alone] = np.maximum(nearest, 1e-6)
-    return gaussian_members(scene.gaussians, footprints.astype(np.float32), pixels)
+    return replace(gaussian_members(scene.gaussians, footprints.astype(np.float32)), pixels=pixels, fronts=fronts)
 
 
-def gaussian_members(g: Gaussians, footprints: np.ndarray, pixels: np.ndarray | None = None) -> Members:
-    """Return Gaussians as members with the given footprints ``[n]`` and pixels ``[n]``."""
-    return Members(**{name: _array(column) for name, column in vars(g).items()}, footprints=footprints, pixels=pixels)
+def gaussian_members(g: Gaussians, footprints: np.ndarray) -> Members:
+    """Return Gaussians as members, one per pixel, with the given footprints ``[n]``."""
+    return Members(**{name: _array(column) for name, column in vars(g).items()}, footprints=footprints)
 
 
 @dataclass(frozen=True)

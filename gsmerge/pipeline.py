@@ -36,7 +36,7 @@ def merge_views(prepared: Prepared, plan: Plan, count: int | None) -> MergedView
     """Merge the superpixels of all views; compacting, encoding and adding views in batches share this part."""
     scene = prepared.scene
     segmentation = segment_scene(scene, plan.superpixels, count)
-    members = assign(scene, segmentation.groups)
+    members = assign(scene, segmentation.groups, draws=plan.checkpoint is None)
     pooled, matches = encode(scene, members, segmentation.groups), None
     starts = list[MergedViews]()
     for networks in plan.networks:

@@ -269,14 +269,15 @@ def choose_networks(options: CompactOptions, *, photos: bool, aligned: bool = Tr
     """Return the name of the checkpoint to load: as asked, or the shipped one where it improves results.
 
     The shipped networks improve scenes with one Gaussian per pixel (``aligned``) if no fit follows, or a short one
-    under an effort that has time for both (docs/laboratory/networks.md). ``photos``: whether there are any to fit to.
+    under an effort that has time for both, and others with photos to choose the start by if no fit follows
+    (docs/laboratory/networks.md). ``photos``: whether there are any to fit to.
     """
     if options.checkpoint != "auto":
         return options.checkpoint
     steps = resolve_fit(options).steps * (AUTO_STEPS if options.budget.auto and options.fit.fit_steps is None else 1)
     short = EFFORTS[options.effort].networks and steps <= SHORT_STEPS
     bare = not photos or options.fit.fit == "none"
-    return "shipped" if aligned and (bare or short) else "none"
+    return "shipped" if (aligned and (bare or short)) or (photos and options.fit.fit == "none") else "none"
 
 
 def load_networks(options: CompactOptions, scene: Scene, *, photos: bool) -> Checkpoint | None:
@@ -285,7 +286,8 @@ def load_networks(options: CompactOptions, scene: Scene, *, photos: bool) -> Che
     ``photos``: whether there are any to fit to. SceneError if it is required and cannot be used,
     UsageError if it does not fit.
     """
-    name = choose_networks(options, photos=photos, aligned=scene.aligned)
+    shows = photos and (scene.aligned or scene.images is not None)  # no pictures drawn of the scene itself
+    name = choose_networks(options, photos=shows, aligned=scene.aligned)
     if name == "none":
         return None
     from gsmerge.networks.checkpoint import find_checkpoint

@@ -30,11 +30,11 @@ def cross_view_stats(
     Points ``means [g,3]`` with base colours ``sh0 [g,1,3]`` belong to ``views [g]`` int64, which are left out. The
     statistics ``[g,7]`` float32 are the logarithm of the number of views that see the point; the shares of these views
     whose surface is at the point, behind it and in front of it; the mean difference of colours and of relative depths;
-    the logarithm of the number of views. For an unaligned scene the first six are zero.
+    the logarithm of the number of views.
     """
     stats = np.zeros((len(means), NUM_STATS), np.float32)
     stats[:, 6] = math.log(len(cameras)) / 4
-    if members.pixels is not None or len(means) == 0:
+    if (members.pixels is not None and members.fronts is None) or len(means) == 0:
         return stats
     points, colors = np.ascontiguousarray(means, np.float64), np.ascontiguousarray(SH_C0 * sh0[:, 0])
     viewmats, Ks = (np.ascontiguousarray(array, np.float64) for array in (cameras.viewmats, cameras.Ks))
@@ -44,7 +44,8 @@ def cross_view_stats(
     def add(first: int) -> None:
         last = min(first + ROWS, len(points))
         sum_cross_view(
-            points, colors, views, viewmats, Ks, *size, m.means, m.opacities, m.sh0, *limits, first, last, sums
+            points, colors, views, viewmats, Ks, *size, m.fronts, m.means, m.opacities, m.sh0, *limits, first, last,
+            sums,
         )  # fmt: skip
 
     parallel_map(add, range(0, len(points), ROWS))

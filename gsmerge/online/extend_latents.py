@@ -123,7 +123,7 @@ def _encode(state: OnlineState | None, batch: Batch, count: int | None) -> Batch
     weights = plan.networks[0]
     assert weights is not None
     superpixels = segment_scene(batch.scene, plan.superpixels, count).groups
-    members = assign(batch.scene, superpixels)
+    members = assign(batch.scene, superpixels, draws=False)
     pooled = encode(batch.scene, members, superpixels)
     context = NetworkContext(weights, members, cameras, plan.seed)
     if state is None:

@@ -79,17 +79,16 @@ class ViewSamples:
 
 
 def sample_views(members: Members, cameras: Cameras, shape: tuple[int, int]) -> ViewSamples:
-    """Sample the Gaussians at the centres of a grid of ``shape``; none of an unaligned scene."""
+    """Sample the Gaussians that the pixels at the centres of a grid of ``shape`` show."""
     (height, width), num_views = shape, len(cameras)
     rows = ((2 * np.arange(height) + 1) * cameras.height) // (2 * height)
     columns = ((2 * np.arange(width) + 1) * cameras.width) // (2 * width)
     pixels = (rows[:, None] * cameras.width + columns).reshape(-1)
     ids = (np.arange(num_views)[:, None] * (cameras.width * cameras.height) + pixels).reshape(-1)
     if members.pixels is not None:
-        nothing = np.zeros((num_views, height, width, 3), np.float32)
-        return ViewSamples(nothing, nothing[..., 0], nothing)
+        ids = np.full_like(ids, -1) if members.fronts is None else members.fronts.reshape(-1)[ids]
     means, sh0 = members.means[ids], members.sh0[ids, 0]
-    usable = np.isfinite(means).all(1) & np.isfinite(sh0).all(1) & np.isfinite(members.opacities[ids])
+    usable = (ids >= 0) & np.isfinite(means).all(1) & np.isfinite(sh0).all(1) & np.isfinite(members.opacities[ids])
     grid = num_views, height, width
     return ViewSamples(
         np.where(usable[:, None], means, 0).astype(np.float32).reshape(*grid, 3),

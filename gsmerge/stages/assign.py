@@ -13,12 +13,14 @@ import numpy as np
 
 from gsmerge.errors import UsageError
 from gsmerge.geometry import morton_codes
+from gsmerge.kernels.gaussians.fronts import weigh_centres
 from gsmerge.kernels.raster.contribution import dominant_labels
 from gsmerge.moments import Members, pool_members, scene_members, unaligned_members
 from gsmerge.raster import ViewPlan
-from gsmerge.raster.images import plan_views
+from gsmerge.raster.images import ONE_AT_A_TIME, plan_views
+from gsmerge.raster.photos import NEAR
 from gsmerge.runtime.record import stage
-from gsmerge.runtime.threads import parallel_map
+from gsmerge.runtime.threads import in_turn, parallel_map
 from gsmerge.settings.stages import DecodeOptions
 from gsmerge.stages.decode import decode
 from gsmerge.stages.encode import from_moments
@@ -26,17 +28,45 @@ from gsmerge.types import Gaussians, Groups, Scene
 
 
 @stage("members")
-def assign(scene: Scene, groups: Groups) -> Members:
-    """Return all Gaussians of a canonical scene as members with a pixel each; UsageError if no view sees any."""
+def assign(scene: Scene, groups: Groups, *, draws: bool = True) -> Members:
+    """Return all Gaussians of a canonical scene as members with a pixel each; UsageError if no view sees any.
+
+    ``draws``: draw every view to assign Gaussians without pixels; otherwise their centres are projected, which takes
+    less time, suits networks better, and says what each pixel shows.
+    """
     if scene.aligned:
         return scene_members(scene)
-    pixels = owner_pixels(find_owners(scene, groups), groups)
+    pixels, fronts = (owner_pixels(find_owners(scene, groups), groups), None) if draws else find_pixels(scene)
     if not (pixels >= 0).any():
         raise UsageError(
             f"expected views that see the scene, found that none of {len(scene)} sees any of {len(pixels)} Gaussians: "
             "give the cameras that belong to it"
         )
-    return unaligned_members(scene, pixels)
+    return unaligned_members(scene, pixels, fronts)
+
+
+def find_pixels(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Find the pixel of each Gaussian, ``[n]`` int64 over all views, and the front of each pixel, ``[v,h,w]`` int32.
+
+    A Gaussian's pixel is where its opacity x transmittance x area, pixels, is largest, -1 if no view sees it; the first
+    view wins ties. A pixel's front is the Gaussian with the largest opacity x transmittance of those whose centres it
+    sees, -1 without any.
+    """
+    g, cameras, count = scene.gaussians, scene.cameras, len(scene)
+    means, scales, opacities = (np.ascontiguousarray(column, np.float32) for column in (g.means, g.scales, g.opacities))
+    viewmats, Ks = (np.ascontiguousarray(array, np.float64) for array in (cameras.viewmats, cameras.Ks))
+    fronts = np.empty((count, cameras.height, cameras.width), np.int32)
+    most, pixels = np.zeros(len(g), np.float32), np.full(len(g), -1, np.int64)
+
+    def weigh(view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return weigh_centres(means, scales, opacities, viewmats[view], Ks[view], NEAR, fronts[view])
+
+    of_views = in_turn(weigh, range(count)) if len(g) <= ONE_AT_A_TIME else map(weigh, range(count))
+    for view, (ids, places, weights) in enumerate(of_views):
+        better = weights > most[ids]
+        ids = ids[better]
+        most[ids], pixels[ids] = weights[better], view * scene.pixels_per_view + places[better]
+    return pixels, fronts
 
 
 def merge_unseen(gaussians: Gaussians, scene: Scene, count: int) -> Gaussians:

@@ -142,8 +142,7 @@ def agreement_factors(
 ) -> np.ndarray:
     """Return factors ``[g]`` float32, at most 1, on the optical depth of points: lower where other views see through.
 
-    Arguments are those of :func:`gsmerge.networks.cross_view_stats.cross_view_stats`; unaligned
-    scenes get ones.
+    Arguments are those of :func:`gsmerge.networks.cross_view_stats.cross_view_stats`.
     """
     _, same, behind, *_ = cross_view_stats(means, sh0, views, members, cameras).T
     disputed = np.where(same > 0, DISPUTED, ALONE)

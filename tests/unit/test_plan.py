@@ -84,7 +84,9 @@ def test_a_draft_without_a_fit_leaves_out_nothing() -> None:
     [
         ({}, True, True, "none"), ({}, False, True, "shipped"), ({"fit": "none"}, True, True, "shipped"),
         ({"fit_steps": 60}, True, True, "shipped"), ({"fit_steps": 61}, True, True, "none"),
-        ({"effort": "fast", "fit": "none"}, True, True, "shipped"), ({"fit": "none"}, True, False, "none"),
+        ({"effort": "fast", "fit": "none"}, True, True, "shipped"), ({"fit": "none"}, True, False, "shipped"),
+        ({"fit": "none"}, False, False, "none"),
+        ({"fit_steps": 60}, True, False, "none"),
         ({"effort": "fast"}, True, True, "none"), ({"effort": "draft"}, False, True, "shipped"),
         ({"checkpoint": "own.safetensors"}, True, True, "own.safetensors"),
         ({"checkpoint": "none"}, False, True, "none"),

@@ -3,30 +3,36 @@
 
 enum { COLUMNS = 6 };
 
-// What a point is compared with: Gaussians of one per pixel, and the limits of agreement.
+// What a point is compared with: Gaussians, which of them each pixel shows, and the limits of agreement.
 typedef struct {
+  const int32_t *fronts;  // null: a pixel shows the Gaussian of its own number
   const float *means, *opacities, *sh0;
   double color_scale, near, far, min_opacity;
-  int64_t width, height;
+  int64_t width, height, count;
 } surface;
 
 static inline double along(const double *row, double x, double y, double z) {
   return row[0] * x + row[1] * y + row[2] * z + row[3];
 }
 
-// Adds what one view, at the pixel that a point projects to, says of it.
-static inline void add_view(const surface *s, const double *m, const double *K, int64_t first,
+// Adds what one view, at the pixel that a point projects to, says of it; false if there is no such Gaussian.
+static inline bool add_view(const surface *s, const double *m, const double *K, int64_t first,
                             const double *point, const float *color, double *out) {
   double x = point[0], y = point[1], z = point[2], depth = along(m + 8, x, y, z);
-  if (!(depth > 1e-9)) return;
+  if (!(depth > 1e-9)) return true;
   double right = along(m, x, y, z), down = along(m + 4, x, y, z);
   double column = (K[0] * right + K[1] * down + K[2] * depth) / depth;
   double row = (K[4] * down + K[5] * depth) / depth;
   if (!(column >= 0.0 && column < (double)s->width && row >= 0.0 && row < (double)s->height))
-    return;
+    return true;
   int64_t j = first + (int64_t)row * s->width + (int64_t)column;
+  if (s->fronts) {
+    j = s->fronts[j];
+    if (j < 0) return true;
+    if (j >= s->count) return false;
+  }
   double there = along(m + 8, s->means[3 * j], s->means[3 * j + 1], s->means[3 * j + 2]);
-  if (!(there > 0.0 && s->opacities[j] > s->min_opacity)) return;
+  if (!(there > 0.0 && s->opacities[j] > s->min_opacity)) return true;
   double ratio = log8(depth / there);
   out[0] += 1.0;
   if (absf8(ratio) < s->near) {
@@ -37,22 +43,26 @@ static inline void add_view(const surface *s, const double *m, const double *K, 
     out[ratio < 0.0 ? 2 : 3] += 1.0;
   }
   out[5] += mind(maxd(ratio, -s->far), s->far);
+  return true;
 }
 
 API int32_t sum_cross_view(const double *restrict points, const float *restrict colors,
                            const int64_t *restrict own, const double *restrict viewmats,
                            const double *restrict Ks, int64_t width, int64_t height,
-                           const float *restrict means, const float *restrict opacities,
-                           const float *restrict sh0, double color_scale, double near, double far,
-                           double min_opacity, int64_t first, int64_t last, double *restrict out,
-                           int64_t g, int64_t views, int64_t n) {
-  if (last > g || (views > 0 && width * height > n / views)) return OUTSIDE;
-  surface s = {means, opacities, sh0, color_scale, near, far, min_opacity, width, height};
+                           const int32_t *restrict fronts, const float *restrict means,
+                           const float *restrict opacities, const float *restrict sh0,
+                           double color_scale, double near, double far, double min_opacity,
+                           int64_t first, int64_t last, double *restrict out, int64_t g,
+                           int64_t views, int64_t n) {
+  if (last > g || (!fronts && views > 0 && width * height > n / views)) return OUTSIDE;
+  surface s = {fronts, means, opacities, sh0, color_scale, near,
+               far, min_opacity, width, height, n};
   for (int64_t v = 0; v < views;
        v++)  // views outside: neighbouring points read neighbouring pixels
     for (int64_t i = first; i < last; i++)
-      if (v != own[i])
-        add_view(&s, viewmats + 16 * v, Ks + 9 * v, v * width * height, points + 3 * i,
-                 colors + 3 * i, out + COLUMNS * i);
+      if (v != own[i]
+          && !add_view(&s, viewmats + 16 * v, Ks + 9 * v, v * width * height, points + 3 * i,
+                       colors + 3 * i, out + COLUMNS * i))
+        return OUTSIDE;
   return 0;
 }

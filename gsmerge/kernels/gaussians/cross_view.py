@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.kernels.signature import STATUS, declare, f4, f8, i1, i8, native
+from gsmerge.kernels.signature import STATUS, declare, f4, f8, i1, i4, i8, native
 
 LEAF = 16  # points up to which a run is not divided
 COLUMNS = 6
@@ -65,13 +65,14 @@ def partition(values, order, low, high, place):
 
 @native(
     STATUS, points=f8("g", 3), colors=f4("g", 3), own=i8("g"), viewmats=f8("views", 4, 4), Ks=f8("views", 3, 3),
-    width=i8(least=0, below=1 << 31), height=i8(least=0, below=1 << 31), means=f4("n", 3), opacities=f4("n"),
-    sh0=f4("n", 1, 3), color_scale=f8(), near=f8(), far=f8(), min_opacity=f8(), first=i8(least=0), last=i8(),
+    width=i8(least=0, below=1 << 31), height=i8(least=0, below=1 << 31),
+    fronts=i4("views", "height", "width", optional=True), means=f4("n", 3), opacities=f4("n"), sh0=f4("n", 1, 3),
+    color_scale=f8(), near=f8(), far=f8(), min_opacity=f8(), first=i8(least=0), last=i8(),
     out=f8("g", COLUMNS, out=True),
 )  # fmt: skip
 def sum_cross_view(
-    points, colors, own, viewmats, Ks, width, height, means, opacities, sh0, color_scale, near, far, min_opacity,
-    first, last, out,
+    points, colors, own, viewmats, Ks, width, height, fronts, means, opacities, sh0, color_scale, near, far,
+    min_opacity, first, last, out,
 ):  # fmt: skip
     """Sum over the views that see each point, for the points from ``first`` to before ``last``.
 
@@ -83,9 +84,10 @@ def sum_cross_view(
         Ks: ``[v,3,3]`` float64.
         width: Of the views, pixels.
         height: Of the views, pixels.
-        means: ``[v h w,3]`` float32 Gaussians, one per pixel.
-        opacities: ``[v h w]`` float32.
-        sh0: ``[v h w,1,3]`` float32.
+        fronts: ``[v,h,w]`` int32 Gaussian of each pixel, -1 for none; None: the pixel's own number.
+        means: ``[n,3]`` float32.
+        opacities: ``[n]`` float32.
+        sh0: ``[n,1,3]`` float32.
         color_scale: From ``sh0`` to colours.
         near: Largest difference of the logarithms of two depths of one surface.
         far: Larger differences are clipped to this.

@@ -64,15 +64,30 @@ def test_every_point_and_view(scene: Scene) -> None:
     np.testing.assert_allclose(actual, expected, atol=1e-5)
 
 
-def test_unaligned_scenes_and_transparent_pixels_have_none() -> None:
+def test_pixels_show_the_gaussians_that_are_named(scene: Scene) -> None:
+    """Rows in another order with the pixels that show them say what the grid says; pixels without any say nothing."""
+    members, g, cameras = scene_members(scene), scene.gaussians, scene.cameras
+    order = np.random.default_rng(1).permutation(len(g))
+    fronts = np.argsort(order).astype(np.int32).reshape(4, 18, 24)
+    columns = {name: getattr(members, name)[order] for name in ("means", "opacities", "sh0")}
+    views = np.arange(len(g)) // scene.pixels_per_view
+    shuffled = replace(members, **columns, pixels=order, fronts=fronts)
+    expected = cross_view_stats(g.means, g.sh0, views, members, cameras)
+    np.testing.assert_array_equal(cross_view_stats(g.means, g.sh0, views, shuffled, cameras), expected)
+    fronts[1:] = -1
+    stats = cross_view_stats(g.means, g.sh0, views, shuffled, cameras)
+    assert not stats[views == 0, :6].any()
+    assert stats[views > 0, 0].any()
+    with pytest.raises(ValueError, match="sum_cross_view: "):
+        cross_view_stats(g.means, g.sh0, views, replace(shuffled, fronts=fronts + len(g)), cameras)
+
+
+def test_transparent_pixels_and_single_views_say_nothing() -> None:
     scene = make_scene(room(), arc(2))
     members, g = scene_members(scene), scene.gaussians
     views = np.zeros(len(g), np.int64)
-    unaligned = replace(members, pixels=np.arange(len(g)))
     clear = replace(members, opacities=np.zeros_like(members.opacities))
-    for unknown in (unaligned, clear):
-        stats = cross_view_stats(g.means, g.sh0, views, unknown, scene.cameras)
-        assert not stats[:, :6].any()
+    assert not cross_view_stats(g.means, g.sh0, views, clear, scene.cameras)[:, :6].any()
     alone = make_scene(room(), arc(1, 24, 18))
     own = alone.gaussians
     stats = cross_view_stats(own.means, own.sh0, views[: len(own)], scene_members(alone), alone.cameras)
@@ -92,7 +107,9 @@ def random_sums(num: int, pixels: int, first: int = 0, last: int | None = None) 
     opacities, own = rng.uniform(0, 1, pixels).astype(np.float32), rng.integers(-1, 3, num)
     out = np.zeros((num, 6))
     last = num if last is None else last
-    sum_cross_view(points, colors, own, viewmats, Ks, 6, 4, means, opacities, sh0, 0.3, 0.5, 2.0, 0.1, first, last, out)
+    sum_cross_view(
+        points, colors, own, viewmats, Ks, 6, 4, None, means, opacities, sh0, 0.3, 0.5, 2.0, 0.1, first, last, out
+    )
     return out
 
 

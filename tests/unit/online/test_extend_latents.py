@@ -270,6 +270,19 @@ def test_samples_of_a_grid(some: Made) -> None:
     means = some.members.means.reshape(3, 18, 24, 3)
     np.testing.assert_array_equal(actual.means, means[:, 3::6, 3::6])
     assert actual.opacities.shape == (3, 3, 4)
+    fronts = np.arange(len(some.members.means), dtype=np.int32)[::-1].reshape(3, 18, 24).copy()
+    turned = sample_views(
+        replace(some.members, pixels=np.arange(fronts.size), fronts=fronts), some.scene.cameras, (3, 4)
+    )
+    np.testing.assert_array_equal(turned.means, means[::-1, ::-1, ::-1][:, 3::6, 3::6])
+    fronts[1] = -1
+    assert (
+        not sample_views(
+            replace(some.members, pixels=np.arange(fronts.size), fronts=fronts), some.scene.cameras, (3, 4)
+        )
+        .opacities[1]
+        .any()
+    )
     broken = replace(some.members, means=np.full_like(some.members.means, np.nan))
     nothing = sample_views(broken, some.scene.cameras, (3, 4))
     assert not nothing.opacities.any()
