@@ -18,6 +18,7 @@ from gsmerge.alignment.ordered_rows import (
     FAR_PX,
     MIN_BLOCK,
     ProjectedRows,
+    concentrated_scale,
     finer_scale,
     read_view_fastest,
     read_view_major,
@@ -71,6 +72,8 @@ def read_incomplete(inputs: AlignmentInput) -> Iterator[Reading | None]:
         search = partial(read_unordered, color_of=_photo_colors(inputs, ids))
         readings = (_read(inputs, rows, search, frame) for frame in frames)
         yield next((reading for reading in readings if reading is not None), None)
+    if missing and inputs.order in ("auto", "view-fastest") and inputs.scale is None:
+        yield _read_view_fastest_scaled(inputs, rows)
 
 
 def _read(
@@ -97,16 +100,33 @@ def _read_view_major(inputs: AlignmentInput, rows: ProjectedRows, frame: Similar
 
 
 def _read_scaled(inputs: AlignmentInput, rows: ProjectedRows) -> Reading | None:
-    """Search for scale and pixels in turn, until neither changes."""
+    """Search for scale and pixels of rows view by view, from the steps between rows."""
     scale = rough_scale(rows)
     best = None if scale is None else _read(inputs, rows, read_view_major, scale_by(scale))
     far = max(FAR_PX, FAR * min(rows.cameras.width, rows.cameras.height))
     if scale is None or best is None or best.worst_px > far:
         return None
     every = replace(rows, points=inputs.gaussians.means.astype(np.float64))
-    frame = scale_by(finer_scale(every, best.layout, scale))
+    return _solve_scale(inputs, rows, read_view_major, best, scale_by(finer_scale(every, best.layout, scale)))
+
+
+def _read_view_fastest_scaled(inputs: AlignmentInput, rows: ProjectedRows) -> Reading | None:
+    """Read pixel by pixel at the scale of the cameras' positions at which rows gather at the centres of pixels."""
+    scale = concentrated_scale(rows)
+    best = None if scale is None else _read(inputs, rows, read_view_fastest, scale_by(scale))
+    return None if scale is None or best is None else _solve_scale(inputs, rows, read_view_fastest, best, best.frame)
+
+
+def _solve_scale(
+    inputs: AlignmentInput,
+    rows: ProjectedRows,
+    search: Callable[[ProjectedRows], Layout | None],
+    best: Reading,
+    frame: Similarity,
+) -> Reading:
+    """Solve scale and pixels in turn from a first reading, until neither changes."""
     for _ in range(_ROUNDS):
-        reading = _read(inputs, rows, read_view_major, frame)
+        reading = _read(inputs, rows, search, frame)
         if reading is None or reading.worst_px > _AS_GOOD * best.worst_px:
             break
         best = reading

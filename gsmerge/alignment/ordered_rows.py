@@ -32,6 +32,11 @@ FAR_PX, FAR = 10.0, 0.1  # pixels, and share of the shorter side, beyond which n
 MAX_BACK = 0.01  # share of the steps that may go back; of rows in no such order a quarter or more do
 MIN_CHANGES = 0.3  # share of the steps that change the view: fewer are views one after the other
 PROBES, PROBE = 5, 4000  # pieces of a file that are tried first, and the rows of each
+NEAR_PX = 0.25  # from a pixel's centre, each way: a quarter of any projections lie there
+GATHERED = 6.0  # standard deviations above that chance at which a scale is believed
+MAX_SCALED_VIEWS = 16  # of more, each shows too few of the rows to tell a scale from chance
+_SCALE_STEP, _SCALES_AT_ONCE = 1e-3, 64  # step of the scale's logarithm; scales at a time
+_FEW_SHOWN, _MANY_SHOWN, _LIKELY = 1600, 9600, 512  # projections in all views, at all scales and at the likely ones
 MAX_PATH_VIEWS = 127  # that an int8 can count
 MAX_CELLS = 300_000_000  # rows times views that are worth the memory
 
@@ -272,6 +277,51 @@ def finer_scale(rows: ProjectedRows, layout: Layout, rough: float) -> float:
         best = float(min(near, key=cost))
         step = min(step, reach) / 8
     return best
+
+
+def concentrated_scale(rows: ProjectedRows) -> float | None:
+    """Find the scale of the camera positions at which projections gather at the centres of pixels, in any order.
+
+    None where no scale within a factor of 30 gathers them beyond chance.
+    """
+    views = len(rows.cameras)
+    if not 1 < views <= MAX_SCALED_VIEWS or len(rows) < MIN_BLOCK * views:
+        return None
+    limit = log(float(SCALES[-1]))
+    grid = exp(np.arange(-limit, limit, _SCALE_STEP))
+    few = _gathered(rows, grid, _FEW_SHOWN)
+    likely = grid[np.sort(np.argsort(-few, kind="stable")[:_LIKELY])]
+    many = _gathered(rows, likely, _MANY_SHOWN)
+    if not many.max() >= GATHERED:
+        return None
+    closer = float(likely[many.argmax()]) * exp(np.linspace(-_SCALE_STEP, _SCALE_STEP, 41))
+    return float(closer[_gathered(rows, closer, _MANY_SHOWN).argmax()])
+
+
+def _gathered(rows: ProjectedRows, scales: np.ndarray, shown: int) -> np.ndarray:
+    """Measure how many more of some projections are near pixels' centres at each scale than by chance, deviations."""
+    cameras, views = rows.cameras, len(rows.cameras)
+    points = rows.points[np.linspace(0, len(rows) - 1, shown // views).astype(np.int64)]
+    K, E = cameras.Ks.astype(np.float64), cameras.viewmats.astype(np.float64)
+    turned = [sum(E[:, i, j, None] * points[:, j] for j in range(3)) for i in range(3)]
+    turned = [part.astype(np.float32) for part in turned]
+    t, K = E[:, :3, 3, None].astype(np.float32), K.astype(np.float32)
+
+    def gather(s: np.ndarray) -> np.ndarray:
+        z = turned[2] + s * t[:, 2]
+        inside, near = z > 0, z > 0
+        for i, side in enumerate((cameras.width, cameras.height)):
+            with np.errstate(all="ignore"):
+                x = (turned[i] + s * t[:, i]) / z * K[:, i, i, None] + K[:, i, 2, None]
+            inside &= (x >= 0) & (x < side)
+            near &= np.abs(x - np.floor(x) - 0.5) < NEAR_PX
+        count, close = inside.sum((1, 2)), (inside & near).sum((1, 2))
+        chance = 4 * NEAR_PX**2
+        deviations = (close - chance * count) / np.sqrt(chance * (1 - chance) * np.maximum(count, 1))
+        return np.where(4 * views * count > inside[0].size, deviations, 0.0)
+
+    columns = scales.astype(np.float32)[:, None, None]
+    return np.concatenate([gather(columns[a : a + _SCALES_AT_ONCE]) for a in range(0, len(scales), _SCALES_AT_ONCE)])
 
 
 def read_view_fastest(rows: ProjectedRows) -> Layout | None:

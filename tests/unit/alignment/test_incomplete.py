@@ -195,6 +195,20 @@ def test_nearly_every_row_comes_to_its_pixel(tmp_path: Path, smooth: Smooth, dro
     assert any("view-fastest" in note for note in loaded.notes)
 
 
+@pytest.mark.parametrize("nested", [0.4, 1.7])
+def test_rows_pixel_by_pixel_at_another_scale(tmp_path: Path, nested: float) -> None:
+    """The scale is where projections gather at the centres of pixels, which no order is needed for."""
+    tiny = smooth_scene(96, 72)
+    kept = view_fastest(tiny, 0.3)
+    c2w = tiny.c2w.copy()
+    c2w[:, :3, 3] *= nested
+    loaded = load_scene(save_export(tmp_path, replace(tiny, c2w=c2w), export_rows(tiny, kept)))
+    assert loaded.recovery.best.layout.order == "view-fastest"
+    assert loaded.recovery.best.frame.scale == pytest.approx(1 / nested, rel=1e-3)
+    actual = loaded.recovery.best.layout.pixel_ids(len(kept))
+    assert np.mean(actual == kept) > 0.985
+
+
 def test_rows_in_no_order_stay_unaligned(tmp_path: Path, smooth: Smooth) -> None:
     kept = np.random.default_rng(1).permutation(view_fastest(smooth, 0.3))
     assert not load_scene(save_export(tmp_path, smooth, export_rows(smooth, kept))).scene.aligned
