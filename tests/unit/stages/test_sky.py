@@ -108,9 +108,11 @@ def test_views_that_show_it_are_counted() -> None:
 
 def test_what_cannot_be() -> None:
     scene, stages = replace(painted(ZENITH, HAZE)[0], images=None), []
-    for one in (scene, unaligned_scenes.without_order(scene)):
-        with refuses(UsageError, "drop_sky", "photos", "--images"):
-            compact(one, **QUICK, drop_sky=True, progress=lambda stage, *_: stages.append(stage))
+    with refuses(UsageError, "drop_sky", "photos", "--images"):
+        compact(
+            unaligned_scenes.without_order(scene), **QUICK, drop_sky=True,
+            progress=lambda stage, *_: stages.append(stage),
+        )  # fmt: skip
     assert set(stages) == {"prepare"}  # before any other work
     with refuses(ValueError, "drop_sky", "budget", "quality 30dB"):
         CompactOptions().with_settings({"drop_sky": True, "quality": "30dB"})
