@@ -311,10 +311,10 @@ def _gathered(rows: ProjectedRows, scales: np.ndarray, shown: int) -> np.ndarray
         z = turned[2] + s * t[:, 2]
         inside, near = z > 0, z > 0
         for i, side in enumerate((cameras.width, cameras.height)):
-            with np.errstate(all="ignore"):
+            with np.errstate(all="ignore"):  # rows in a camera's plane
                 x = (turned[i] + s * t[:, i]) / z * K[:, i, i, None] + K[:, i, 2, None]
+                near &= np.abs(x - np.floor(x) - 0.5) < NEAR_PX
             inside &= (x >= 0) & (x < side)
-            near &= np.abs(x - np.floor(x) - 0.5) < NEAR_PX
         count, close = inside.sum((1, 2)), (inside & near).sum((1, 2))
         chance = 4 * NEAR_PX**2
         deviations = (close - chance * count) / np.sqrt(chance * (1 - chance) * np.maximum(count, 1))

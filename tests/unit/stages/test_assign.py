@@ -17,7 +17,9 @@ from gsmerge.raster.images import seen_depths
 from gsmerge.runtime.record import record_run
 from gsmerge.settings.stages import SegmentOptions
 from gsmerge.stages.assign import (
+    assign,
     find_owners,
+    find_pixels,
     merge_unseen,
     middle_pixels,
     owner_pixels,
@@ -51,6 +53,29 @@ def test_owner_pixels_lie_in_their_superpixel(room: Scene, groups: Groups) -> No
     assert (pixels[~seen] == -1).all()
     assert (groups.labels.reshape(-1)[pixels[seen]] == owners.labels[seen]).all()
     assert (pixels[seen] // (32 * 24) == owners.views[seen]).all()
+
+
+def test_centres_are_projected_where_they_cover_the_views(room: Scene, groups: Groups) -> None:
+    """Two of three Gaussians leave gaps, through which centres seem to be seen that are hidden."""
+    scene = unaligned_scenes.without_order(room)
+    pixels, fronts = find_pixels(scene)
+    covering = assign(scene, groups, draws=False)
+    np.testing.assert_array_equal(covering.pixels, pixels)
+    np.testing.assert_array_equal(covering.fronts, fronts)
+    sparse = replace(scene, gaussians=scene.gaussians[::3])
+    assert assign(sparse, groups, draws=False).fronts is None
+    np.testing.assert_array_equal(assign(sparse, groups, draws=False).pixels, assign(sparse, groups).pixels)
+
+
+def test_rows_do_not_depend_on_their_order(room: Scene) -> None:
+    """Where no two are equally deep."""
+    rng, g = np.random.default_rng(4), room.gaussians
+    uneven = replace(g, means=g.means + rng.normal(0, 1e-3, g.means.shape).astype(np.float32))
+    scene, order = unaligned_scenes.without_order(replace(room, gaussians=uneven)), rng.permutation(len(g))
+    pixels, fronts = find_pixels(scene)
+    moved, moved_fronts = find_pixels(replace(scene, gaussians=scene.gaussians[order]))
+    np.testing.assert_array_equal(moved, pixels[order])
+    np.testing.assert_array_equal(np.where(moved_fronts >= 0, order[moved_fronts], -1), fronts)
 
 
 def test_rows_by_pixel_are_those_of_the_grid(room: Scene, groups: Groups) -> None:
