@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from bare_files import write_without_grid
 from batches import InlinePool
 from messages import names, noted
 
@@ -168,6 +169,7 @@ def test_photos_of_a_given_size_are_measured_anew(copied: Path, run: Run) -> Non
 def test_hints_count_for_all_scenes(copied: Path, run: Run) -> None:
     (copied / "room" / "transforms.json").unlink()  # no pixels can be found, and views have to be placed
     shutil.rmtree(copied / "room" / "images")
+    write_without_grid(copied / "room" / "scene.ply", copied / "room" / "scene.ply")
     said = ("--hint", "order=none", "--fit", "none", "--budgets", "2%", "--proxy-views", "0", "--lpips", "none")
     run("chart", copied / "room", "--output", copied / "unaligned", *said, code=5)
     shutil.copyfile(copied / "room" / "targets" / "transforms.json", copied / "room" / "transforms.json")

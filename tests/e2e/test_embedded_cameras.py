@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bare_files import write_without_grid
 
 import gsmerge
 from gsmerge.io import read_cameras
@@ -101,6 +102,6 @@ def test_where_they_have_no_place_they_are_refused(
 
 
 def test_a_scene_without_cameras_has_none_to_embed(small_scene: Path, tmp_path: Path, run: Run) -> None:
-    shutil.copy(small_scene / "scene.ply", tmp_path / "bare.ply")
-    call = ("compact", tmp_path / "bare.ply", "--hint", "order=none", "--embed-cameras")
+    bare = write_without_grid(small_scene / "scene.ply", tmp_path / "bare.ply")
+    call = ("compact", bare, "--embed-cameras")
     assert_refused(run(*call), 2, "--embed-cameras", "cameras")

@@ -98,7 +98,7 @@ def test_a_failing_program_is_one_line(
 
 def test_missing_photos_are_one_line(scene_copy: Path, run: Run) -> None:
     shutil.rmtree(scene_copy / "images")
-    said = run("compact", scene_copy, "--method", "unmerged-fit", "--quiet")
+    said = run("compact", scene_copy, "--method", "unmerged-fit", "--hint", "order=none", "--quiet")
     assert_refused(said, 2, "method unmerged-fit", "photos", "--images")
 
 

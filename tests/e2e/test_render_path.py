@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from bare_files import write_without_grid
 from messages import names, says
 from tiny_scene import edited_json
 
@@ -95,9 +96,7 @@ def test_the_path_of_a_file_is_placed_as_held_out_views_are(scene_copy: Path, tm
 
 
 def test_a_scene_without_cameras_takes_those_of_the_path(scene_copy: Path, tmp_path: Path, run: Run) -> None:
-    bare = tmp_path / "away" / "bare.ply"
-    bare.parent.mkdir()
-    shutil.copy(scene_copy / "scene.ply", bare)
+    bare = write_without_grid(scene_copy / "scene.ply", tmp_path / "away" / "bare.ply")
     out = tmp_path / "out.mp4"
     run("render", bare, "--path", scene_copy / "transforms.json", "-o", out, code=0)
     assert len(read(out)) == 5

@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from bare_files import write_without_grid
 
 import gsmerge
 from gsmerge.cli import main
@@ -174,7 +175,7 @@ def prepared(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     """The folder that the calls are run in. Read only."""
     folder = tmp_path_factory.mktemp("prepared") / "work"
     shutil.copytree(small_scene, folder / "room")
-    shutil.copy(small_scene / "scene.ply", folder / "alone.ply")
+    write_without_grid(small_scene / "scene.ply", folder / "alone.ply")
     (folder / "run.json").write_text('{"total_seconds": 2}')
     (folder / "occupied").mkdir()
     (folder / "occupied" / "mine.txt").write_text("precious")

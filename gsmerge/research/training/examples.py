@@ -39,6 +39,8 @@ from gsmerge.stages.merge import merge, take
 from gsmerge.stages.superpixels import segment
 from gsmerge.types import SH_C0, Cameras, FeatureGaussians, Gaussians, Matches
 
+NOT_STORED = ("pixels", "fronts")  # of Members: a pixel has one member, in order
+
 
 @dataclass(frozen=True)
 class ColorMap:
@@ -153,7 +155,7 @@ def select_views(example: Example, ids: Sequence[int]) -> Example:
     rows = np.flatnonzero(place[example.features.views] >= 0)
     part = take(example.features, rows)
     members = place[part.members // pixels] * pixels + part.members % pixels
-    columns = {f.name: getattr(example.members, f.name) for f in fields(Members) if f.name != "pixels"}
+    columns = {f.name: getattr(example.members, f.name) for f in fields(Members) if f.name not in NOT_STORED}
     chosen = (np.array(ids)[:, None] * pixels + np.arange(pixels)).reshape(-1)
     order = [*ids, *(photo for photo in range(len(example.photos)) if photo not in set(ids))]
     photos = example.photos

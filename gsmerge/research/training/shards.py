@@ -32,7 +32,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io.atomic import atomic_output
 from gsmerge.moments import Members
 from gsmerge.raster.photos import Photos
-from gsmerge.research.training.examples import Example, make_examples, scene_name
+from gsmerge.research.training.examples import NOT_STORED, Example, make_examples, scene_name
 from gsmerge.research.training.processes import ALONE, Processes
 from gsmerge.research.training.targets import Targets
 from gsmerge.research.training.train_options import TrainOptions
@@ -145,7 +145,7 @@ def write_shard(path: Path, example: Example) -> str:
 def _arrays(example: Example) -> Iterator[tuple[str, np.ndarray]]:
     for part, kind in PARTS.items():
         for f in fields(kind):
-            if f.name != "pixels":  # one member per pixel
+            if f.name not in NOT_STORED:
                 yield f"{part}.{f.name}", np.ascontiguousarray(getattr(getattr(example, part), f.name))
     for part, cameras in (("cameras", example.cameras), ("photos", example.photos)):
         yield f"{part}.viewmats", np.ascontiguousarray(cameras.viewmats)
