@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import photos_count_as_they_are, scene_frame, with_row_colors
-from gsmerge.facts.row_colors import RENDERS, ROW_COLORS
+from gsmerge.facts.row_colors import PHOTOS, RENDERS, ROW_COLORS
 from gsmerge.facts.views import pick_views
 from gsmerge.measure.align import PoseChange, fit_colors, refine_pose
 from gsmerge.measure.fog import ALL, Fog, describe_fog, measure_fog
@@ -232,11 +232,16 @@ def evaluate(
             if progress:
                 progress("evaluate", i + 1, len(named))
     counts = {name: len(split.views.names) for name, split in splits.items()}
-    reference = "photos"
-    if photos.images is None and "context" in counts:
-        stand_in = RENDERS if scene.images is None else ROW_COLORS
-        reference = f"photos, and {stand_in} in its own views" if "target" in counts else stand_in
+    stand_in = RENDERS if scene.images is None else ROW_COLORS
+    reference = PHOTOS if photos.images is not None else _name_reference(stand_in, counts)
     return Evaluation(tuple(scores), reference, counts, tuple(_notes(photos, splits, scores)), options)
+
+
+def _name_reference(stand_in: str, splits: Container[str]) -> str:
+    """Name what results are compared with where something stands in for the photos of the input views."""
+    if "context" not in splits:
+        return PHOTOS
+    return f"{PHOTOS}, and {stand_in} in its own views" if "target" in splits else stand_in
 
 
 def near_plane(scene: Scene) -> float:

@@ -26,8 +26,8 @@ from gsmerge.stages.decode import decode
 from gsmerge.stages.encode import from_moments
 from gsmerge.types import Gaussians, Groups, Scene
 
-# Share of the pixels with a centre. Of 15 captures in voxels, those with .97 and more gain by projection (six were tried
-# both ways), and two with .93 and .95 lose 1.5 and 5 dB.
+# Share of pixels with a centre: of captures in voxels six with .97 and more gain by projection, two with .93 and .95
+# lose 1.5 and 5 dB
 MIN_COVERED = 0.96
 
 
