@@ -18,7 +18,7 @@ from gsmerge.alignment.estimate import (
     estimate_with_photos,
 )
 from gsmerge.alignment.focal import estimate_focal
-from gsmerge.alignment.layouts import MAY_BE_UNALIGNED, Layout
+from gsmerge.alignment.layouts import MAY_BE_UNALIGNED, TRIMS, Layout
 from gsmerge.alignment.recovery import Recovery, explain_misalignment, misalignment_error
 from gsmerge.alignment.rotations import choose_rotations, read_rotations
 from gsmerge.alignment.score import Alignment, check_alignment, check_pairs, sample_pixels

@@ -17,8 +17,7 @@ from gsmerge.alignment.calibration import calibrate
 from gsmerge.alignment.layouts import DEPTH_SHARE, Layout, da3_box, every_nth, exact_layouts, patch_grids, subsample
 from gsmerge.alignment.row_grid import find_grid
 from gsmerge.alignment.score import MARGIN, find_correspondences
-from gsmerge.alignment.stretches import UNIQUE, byte_colors, place_stretch, shown_colors
-from gsmerge.geometry import sh0_to_rgb
+from gsmerge.alignment.stretches import UNIQUE, base_colors, byte_colors, place_stretch, shown_colors
 from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, View, make_camera_file
 from gsmerge.io.photo_files import Photos, PhotoTransform, Size, resize_to
 from gsmerge.types import Cameras, Gaussians
@@ -64,8 +63,7 @@ def estimate_from_rows(path: Path, gaussians: Gaussians, valid: np.ndarray) -> t
         return None
     layout, calibration = grid
     names = [f"view {view}" for view in range(len(calibration.cameras))]
-    with np.errstate(invalid="ignore"):
-        base = np.nan_to_num(sh0_to_rgb(gaussians.sh0[:, 0])).clip(0, 1)
+    base = base_colors(gaussians)
     firsts = [layout.views.index(view) for view in range(len(names))]
     pictures = np.stack([base[layout.rows[first]].reshape(layout.height, layout.width, 3) for first in firsts])
     return _make_cameras(path, ESTIMATED, names, calibration.cameras), pictures

@@ -14,9 +14,13 @@ _STEP = 2  # every how many pixels of a stretch are compared
 
 def byte_colors(gaussians: Gaussians) -> np.ndarray:
     """Return the base colours ``[3,n]`` of Gaussians as int16 from 0 to 255."""
+    return np.ascontiguousarray(np.rint(255 * base_colors(gaussians)).astype(np.int16).T)
+
+
+def base_colors(gaussians: Gaussians) -> np.ndarray:
+    """Return the base colours ``[n,3]`` of Gaussians, 0 to 1; 0 where they are no numbers."""
     with np.errstate(invalid="ignore"):
-        base = np.nan_to_num(sh0_to_rgb(gaussians.sh0[:, 0])).clip(0, 1)
-    return np.ascontiguousarray(np.rint(255 * base).astype(np.int16).T)
+        return np.nan_to_num(sh0_to_rgb(gaussians.sh0[:, 0])).clip(0, 1)
 
 
 def shown_colors(photo: np.ndarray, pixels: np.ndarray, length: int) -> np.ndarray:

@@ -101,10 +101,7 @@ def row_of(record: Mapping[str, Any]) -> dict[str, Any]:
     report = record.get("report")
     if not report:
         return row
-    psnr, covered = (
-        report["psnr_input_views"],
-        report.get("psnr_covered") or {},
-    )  # which records of former versions lack
+    psnr, covered = report["psnr_input_views"], report.get("psnr_covered") or {}  # former versions have no latter
     files = [*report["levels"], report["output"]]
     return row | {
         "num_input": report["input"]["num_gaussians"],

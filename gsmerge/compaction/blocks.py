@@ -304,10 +304,8 @@ def join_reports(
         return None if len(numbers) < len(values) else float(np.average(numbers, weights=sizes))
 
     scored = sum(len(part.plan.scored_views) for part, (psnr, _) in zip(parts, scores, strict=True) if psnr is not None)
-    before, after = (
-        mean([None if part.before is None else part.before.psnr for part in parts]),
-        mean([psnr for psnr, _ in scores]),
-    )
+    before = mean([None if part.before is None else part.before.psnr for part in parts])
+    after = mean([psnr for psnr, _ in scores])
     covered = _join_covered(parts, scores, sizes)
     reference = None if before is None else parts[0].prepared.reference.name
     compared = (covered.before, covered.after) if covered else (before, after)

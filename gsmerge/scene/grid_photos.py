@@ -9,11 +9,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from gsmerge.alignment import TRIMS
 from gsmerge.geometry import correlation
 from gsmerge.io.photo_files import PhotoTransform, Size, decode_image, image_size, resize_and_crop, resize_to
 from gsmerge.runtime.threads import parallel_map
 
-_TRIMS = (0, 8)  # pixels that exporters cut off at every side
 _SIDE = 128  # pixels of the pictures' longer side that are compared
 _MAX_PHOTOS = 100  # that are looked at
 _MIN_ALIKE, _MIN_ALIKE_EACH = 0.7, 0.4  # correlation of greys with the views' on average, and in each
@@ -38,7 +38,9 @@ def match_photos(pictures: np.ndarray, paths: Sequence[Path]) -> PhotoMatch | No
     sizes = [image_size(path) for path in paths]
     size = max(sizes, key=sizes.count)
     fits = [
-        (trim, transform) for trim in _TRIMS for transform in _transforms(size, width + 2 * trim, height + 2 * trim)
+        (trim, transform)
+        for trim in (0, *TRIMS)
+        for transform in _transforms(size, width + 2 * trim, height + 2 * trim)
     ]
     ratio = _SIDE / max(width, height)
     small = max(1, round(width * ratio)), max(1, round(height * ratio))
