@@ -1,4 +1,8 @@
-"""Check the size of a file before anything is read from it or allocated for it."""
+"""Check what a file asks for before anything is read from it or allocated for it.
+
+One budget holds for every reader: reading takes at most 64 MB + 20 x the file's bytes of memory, and 5 s + 2 s per MB
+of processor time. A reader asks a :class:`ReadBudget` before it allocates, or loops, as often as a file says.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +12,7 @@ import stat
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -17,9 +22,57 @@ from gsmerge.types import StrPath
 
 MAX_TEXT_BYTES = 32 << 20  # of a camera file, far more than any has
 MAX_MODEL_BYTES = 256 << 20  # of a COLMAP text file, which lists the points of every image as well
+MAX_SETTINGS_BYTES = 1 << 20
 MAX_VIEWS = 10_000
 MAX_FILES = 100_000  # below a folder of photos
 MAX_PIXELS = 1 << 26  # of one image
+
+_FREE_MEMORY, _MEMORY_PER_BYTE = 64_000_000, 20
+_FREE_STEPS, _BYTES_PER_STEP = 250_000, 10  # of 20 microseconds: 5 s, and 2 s for each MB
+# Bytes of Python's objects for each of these characters in JSON, the most that CPython 3.10 to 3.14 takes
+_JSON_BYTES = {"[": 88, "{": 130, ":": 110, '"': 30, ",": 34}
+
+
+@dataclass(frozen=True)
+class ReadBudget:
+    """What reading a file may take: memory of 64 MB + 20 x its bytes, and a loop's steps for 5 s + 2 s per MB.
+
+    Args:
+        path: The file.
+        file_bytes: Its bytes, with those of files that are read together with it.
+    """
+
+    path: StrPath
+    file_bytes: int
+
+    def check_memory(self, num_bytes: float, what: str) -> None:
+        """Raise SceneError if ``what``, which takes ``num_bytes`` at once, is more than the file allows."""
+        most = _FREE_MEMORY + _MEMORY_PER_BYTE * self.file_bytes
+        if not num_bytes <= most:
+            problem = f"expected at most {most / 1e6:,.0f} MB of memory for a file of {self.file_bytes:,} bytes"
+            raise SceneError(self.path, f"{problem}, found {what} of {num_bytes / 1e6:,.0f} MB")
+
+    def check_steps(self, count: int, what: str) -> None:
+        """Raise SceneError if a loop over ``count`` of ``what`` takes longer than the file allows."""
+        most = _FREE_STEPS + self.file_bytes // _BYTES_PER_STEP
+        if not count <= most:
+            problem = f"expected at most {most:,} {what} in a file of {self.file_bytes:,} bytes"
+            raise SceneError(self.path, f"{problem}, found {count:,}")
+
+
+def read_budget(path: Path) -> ReadBudget:
+    """Return the budget of a file; SceneError as of :func:`check_file`."""
+    return ReadBudget(path, check_file(path))
+
+
+def parse_json(text: str, budget: ReadBudget) -> Any:
+    """Parse JSON; SceneError if its objects would take more memory than the budget, ValueError if it is no JSON."""
+    objects = sum(size * text.count(character) for character, size in _JSON_BYTES.items())
+    budget.check_memory(sys.getsizeof(text) + objects, "JSON")
+    try:
+        return json.loads(text)
+    except RecursionError as error:
+        raise ValueError("nested too deeply") from error
 
 
 @contextmanager
@@ -73,8 +126,8 @@ def read_json(path: Path) -> Any:
     """Read a JSON file of at most 32 MiB; SceneError if it cannot be read or is no JSON."""
     text = read_text(path)
     try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:
+        return parse_json(text, read_budget(path))
+    except ValueError as error:
         raise SceneError(path, f"expected JSON, found something else ({error})") from error
 
 
@@ -83,12 +136,9 @@ def read_table(path: Path) -> dict[str, Any]:
     is_json = path.suffix.lower() == ".json"
     if not is_json and sys.version_info < (3, 11):
         raise SceneError(path, "TOML needs Python 3.11", "write the settings as JSON")
+    text = read_text(path, MAX_SETTINGS_BYTES)
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise SceneError(path, "expected a TOML or JSON file, found none that can be read") from error
-    try:
-        table = json.loads(text) if is_json else import_module("tomllib").loads(text)
+        table = parse_json(text, read_budget(path)) if is_json else import_module("tomllib").loads(text)
     except (ValueError, RecursionError) as error:
         raise SceneError(path, f"expected TOML or JSON, found a mistake ({str(error).splitlines()[0]})") from error
     if not isinstance(table, dict):

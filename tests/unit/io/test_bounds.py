@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
+import tracemalloc
 from pathlib import Path
 
 import pytest
@@ -11,7 +13,7 @@ from messages import refuses
 
 from gsmerge.errors import SceneError
 from gsmerge.io import bounds
-from gsmerge.io.bounds import check_file, check_pixels, read_table, read_text
+from gsmerge.io.bounds import ReadBudget, check_file, check_pixels, parse_json, read_table, read_text
 from gsmerge.io.image_names import list_images
 from gsmerge.scene.content_hash import content_hash
 
@@ -72,9 +74,36 @@ def test_what_is_no_table_is_refused_in_one_line(tmp_path: Path, text: str) -> N
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     (tmp_path / "bytes.json").write_bytes(b"\xff\xfe\x00")
     (tmp_path / "folder.json").mkdir()
-    for name in ("nowhere.json", "bytes.json", "folder.json"):
-        with pytest.raises(SceneError, match="TOML or JSON"):
+    for name, found in (("nowhere.json", "no such file"), ("bytes.json", "as text"), ("folder.json", "a folder")):
+        with refuses(SceneError, tmp_path / name, found):
             read_table(tmp_path / name)
+
+
+def test_a_budget_grows_with_the_file() -> None:
+    for size, memory, steps in ((0, 64_000_000, 250_000), (10**6, 84_000_000, 350_000)):
+        budget = ReadBudget("a", size)
+        budget.check_memory(memory, "rows")
+        budget.check_steps(steps, "rows")
+        for needed in (memory + 1, float("nan")):
+            with refuses(SceneError, "a", f"{memory // 10**6} MB", "rows"):
+                budget.check_memory(needed, "rows")
+        with refuses(SceneError, "a", f"{steps:,}", f"{steps + 1:,}", "rows"):
+            budget.check_steps(steps + 1, "rows")
+
+
+@pytest.mark.parametrize(
+    "item", ["[]", "{}", "[0]", "1.5", '"ab"', '{"a":1}', '{"a":{"b":[]}}', "[[0,0],[1.5]]", '{"a":0,"b":0,"c":0}']
+)
+def test_the_memory_of_json_is_foreseen(item: str) -> None:
+    text = f"[{','.join([item] * 20_000)}]"
+    tracemalloc.start()
+    json.loads(text)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    parse_json(text, ReadBudget("a", len(text)))
+    allowed = ReadBudget("a", (peak - 64_000_000) // 20)  # a little less than it takes
+    with refuses(SceneError, "a", "JSON"):
+        parse_json(text, allowed)
 
 
 def test_content_is_names_and_bytes(tmp_path: Path) -> None:
