@@ -19,7 +19,7 @@ from plyfile import PlyData, PlyElement, PlyElementParseError, PlyListProperty, 
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io.bounds import check_file
 from gsmerge.io.formats import arrays
-from gsmerge.io.formats.compressed import is_compressed, unpack
+from gsmerge.io.formats.compressed import is_compressed, packed_rows
 from gsmerge.kernels.elementary import log, log1p
 from gsmerge.types import Gaussians
 
@@ -42,7 +42,7 @@ def read_rows(path: Path) -> arrays.StoredRows:
     """Open the rows of a PLY file, to be read by :func:`open_rows`; SceneError if it holds no Gaussians."""
     data = open_ply(path)
     compressed = is_compressed(data)
-    rows = unpack(path, data) if compressed else _vertex(path, data).data
+    rows = packed_rows(path, data) if compressed else _vertex(path, data).data
     names = tuple(rows.dtype.names or ())
     comments = (*data.comments, *(c for e in data.elements for c in e.comments))
     return arrays.StoredRows(
@@ -180,7 +180,7 @@ class _BinaryRows(BufferedReader):
 
 
 @contextmanager
-def open_rows(path: Path, rows: np.ndarray) -> Iterator[Callable[[slice], np.ndarray]]:
+def open_rows(path: Path, rows: np.ndarray | arrays.PackedRows) -> Iterator[Callable[[slice], np.ndarray]]:
     """Yield a thread-safe function that returns blocks of a PLY file's rows.
 
     A mapped file that becomes shorter would end the process; here it raises SceneError.

@@ -22,7 +22,7 @@ from gsmerge.types import Gaussians, StrPath
 MIN_FINITE = 0.002  # of the rows: the rest of a file tells nothing about the scene
 OpacityChoice = Literal["auto", "logit", "raw"]
 MAX_HARMONIC = 1e6  # pictures of it can still be squared and summed in float32
-FREED_ROWS = 1 << 20  # after which the pages of large columns leave memory
+FREED_ROWS = 1 << 17  # after which the pages of large columns leave memory
 _MIN_JUDGED = 100  # Gaussians whose scales say something
 _SCALE_SAMPLES = 20_000  # of them that are looked at
 _MAX_WIDTH = 0.25  # share of the scene's width from which on standard deviations are wrong
@@ -150,9 +150,9 @@ def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto") -> Gaussia
     return _convert_files([path], [read(path)], "auto")
 
 
-def read_level(path: Path, level: int) -> GaussianFile:
+def read_level(path: Path, level: int, index: streamed.StreamedIndex | None = None) -> GaussianFile:
     """Read one level of detail of a ``lod-meta.json``; 0 is the finest. SceneError as in :func:`read_gaussians`."""
-    return _convert_files([path], [streamed.read_rows(path, level)], "auto")
+    return _convert_files([path], [streamed.read_rows(path, level, index)], "auto")
 
 
 def _convert_files(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: OpacityChoice) -> GaussianFile:
@@ -163,8 +163,10 @@ def _convert_files(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: 
     n = sum(len(part.rows) for part in parts)
     wide = any(dtype[name].kind == "f" and dtype[name].itemsize == 8 for name in arrays.MEANS)
     shapes = {"quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh0": (n, 1, 3), "shN": (n, num_higher, 3)}
+    file_bytes = sum(path.stat().st_size + part.bytes_beside for path, part in zip(paths, parts, strict=True))
+    most = {"shN": arrays.most_in_memory(file_bytes)}
     out = {"means": make_array((n, 3), np.float64 if wide else np.float32), "valid": np.empty(n, np.bool_)}
-    out |= {name: make_array(shape, np.float32) for name, shape in shapes.items()}
+    out |= {name: make_array(shape, np.float32, most.get(name)) for name, shape in shapes.items()}
     num_clipped = num_zero_quats = first = 0
     for name, part in zip(paths, parts, strict=True):
         part_rows = slice(first, first + len(part.rows))
@@ -183,7 +185,7 @@ def _convert_files(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: 
         layout=stored.layout,
         format=stored.format,
         count=n,
-        file_bytes=sum(path.stat().st_size + part.bytes_beside for path, part in zip(paths, parts, strict=True)),
+        file_bytes=file_bytes,
         bytes_by_attribute={name: sum(part.sizes[name] for part in parts) for name in stored.sizes},
         columns=names,
         extra_columns=extra,
