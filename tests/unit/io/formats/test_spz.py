@@ -16,7 +16,6 @@ from gsmerge import Gaussians
 from gsmerge.cli import main
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import kept_comments, lost_harmonics, read_gaussians, write_gaussians
-from gsmerge.io.formats import spz
 from gsmerge.io.formats.arrays import MIP_COMMENT
 from gsmerge.io.formats.spz import spz_bytes
 
