@@ -16,6 +16,7 @@ MAX_LOG_SCALE = 30.0  # exp(30) squared and exp(-30) squared are still normal fl
 LOGIT_COMMENT = "opacity: logit"  # so that our own files are never guessed at
 RESULT_COMMENT = "gsmerge result"  # in its place in results of commands; as long, so that sizes stay the same
 RENDER_COMMENT = "SplatRenderMode"  # brush writes it: plain, or mip for Gaussians with a filter of their own
+MAX_COPIED, MAX_COPIED_LINES = 100, 10  # characters of a comment that is copied to other files, and such comments
 MIP_COMMENT = f"{RENDER_COMMENT}: mip"
 
 MEANS, NORMALS = ("x", "y", "z"), ("nx", "ny", "nz")
@@ -24,12 +25,20 @@ RGB = ("red", "green", "blue")  # instead of the former, in nerfstudio's files o
 SCALES = ("scale_0", "scale_1", "scale_2")
 QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 REQUIRED = (*MEANS, *SH0, "opacity", *SCALES, *QUATS)
+_UNPACKING = 16_000_000  # bytes of the blocks that are unpacked at a time
 GAUSSIAN_BYTES = 4 * len(REQUIRED) + 1  # in memory, without higher harmonics, and whether it is finite
 
 
 def sh_degree(num_higher: int) -> int:
     """Return the SH degree for ``num_higher`` coefficients above degree 0."""
     return round((num_higher + 1) ** 0.5) - 1
+
+
+def copied_comments(comments: Sequence[object]) -> tuple[str, ...]:
+    """Return the comments of a file that copies of its Gaussians keep: how to render them, in a few short lines."""
+    lines = (line for line in comments if isinstance(line, str) and len(line) <= MAX_COPIED)
+    kept = (line for line in lines if line.startswith(RENDER_COMMENT) and line.isascii() and line.isprintable())
+    return tuple(dict.fromkeys(kept))[:MAX_COPIED_LINES]
 
 
 def color_columns(names: tuple[str, ...] | None) -> tuple[str, ...]:
@@ -167,8 +176,8 @@ def most_in_memory(file_bytes: int) -> int:
 
 def check_count(budget: ReadBudget, count: int, num_higher: int, packed_bytes: int) -> None:
     """Raise SceneError if Gaussians of ``packed_bytes`` each are more than the file's bytes allow."""
-    harmonics = min(12 * num_higher * count, most_in_memory(budget.file_bytes))
-    budget.check_memory(count * (packed_bytes + GAUSSIAN_BYTES) + harmonics, f"{count:,} Gaussians")
+    beside = min(12 * num_higher * count, most_in_memory(budget.file_bytes)) + _UNPACKING
+    budget.check_memory(count * (packed_bytes + GAUSSIAN_BYTES) + beside, f"{count:,} Gaussians")
 
 
 def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Columns:

@@ -75,8 +75,7 @@ class GaussianFile:
 
 def kept_comments(info: FileInfo) -> tuple[str, ...]:
     """Return the header comments that tell viewers how to render the Gaussians."""
-    lines = (comment for comment in info.comments if comment.isascii() and comment.isprintable())
-    return tuple(comment for comment in lines if comment.startswith(arrays.RENDER_COMMENT))
+    return arrays.copied_comments(info.comments)
 
 
 def file_notes(info: FileInfo) -> tuple[str, ...]:
@@ -172,7 +171,7 @@ def _convert_files(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: 
         part_rows = slice(first, first + len(part.rows))
         clipped, zero = _convert_file(name, part, {key: column[part_rows] for key, column in out.items()})
         num_clipped, num_zero_quats, first = num_clipped + clipped, num_zero_quats + zero, part_rows.stop
-    declared_encoding = opacity if opacity != "auto" else stored.encoding
+    declared_encoding = opacity if opacity != "auto" else _declared_encoding(paths, parts, out["opacities"])
     encoding = _activate(out["opacities"], out["valid"], declared_encoding)
     num_bad = clear_invalid(path, out)
     byte_columns = tuple(name for name in names if dtype[name].itemsize == 1)
@@ -296,18 +295,34 @@ def _normalise(quats: list[np.ndarray], out: np.ndarray) -> np.ndarray:
     return zero
 
 
+def _declared_encoding(paths: Sequence[Path], parts: Sequence[StoredRows], opacities: np.ndarray) -> str | None:
+    """Return the encoding of opacities that the parts declare, None without any; SceneError where parts differ in it.
+
+    A part that declares none has the one that its values show, if they are enough to show any.
+    """
+    first, seen = 0, dict[str, str]()  # name of the first part of each encoding
+    for path, part in zip(paths, parts, strict=True):
+        values = opacities[first : first + len(part.rows)]
+        first += len(values)
+        is_clear = len(parts) > 1 and np.isfinite(values).sum() >= _MIN_JUDGED
+        encoding = part.encoding or (_guess_encoding(values) if is_clear else None)
+        if encoding is not None:
+            seen.setdefault(encoding, path.name)
+        if len(seen) > 1:
+            (other, name), _ = seen.items()
+            problem = f"expected opacities as in {name}, which are {other}, found {encoding} ones"
+            raise SceneError(path, problem, "export all parts alike, or say with --hint opacity=logit what all are")
+    return next((part.encoding for part in parts if part.encoding is not None), None)
+
+
 def _activate(opacities: np.ndarray, valid: np.ndarray, encoding: str | None) -> str:
     """Convert stored opacities to [0, 1] in place, and return their encoding, guessed where it is not known.
 
     They are raw if all finite ones lie in [0, 1]. An infinite raw one makes its row invalid.
     """
-    finite = np.isfinite(opacities)
-    if encoding is None:
-        low = opacities.min(where=finite, initial=np.inf)
-        high = opacities.max(where=finite, initial=-np.inf)
-        encoding = "raw" if 0 <= low <= high <= 1 else "logit"
+    encoding = encoding or _guess_encoding(opacities)
     if encoding == "raw":
-        valid &= finite
+        valid &= np.isfinite(opacities)
         np.clip(opacities, 0, 1, out=opacities)
         return encoding
     with np.errstate(all="ignore"):
@@ -315,6 +330,13 @@ def _activate(opacities: np.ndarray, valid: np.ndarray, encoding: str | None) ->
         np.add(opacities, 1, out=opacities)
         np.reciprocal(opacities, out=opacities)
     return encoding
+
+
+def _guess_encoding(opacities: np.ndarray) -> str:
+    finite = np.isfinite(opacities)
+    low = opacities.min(where=finite, initial=np.inf)
+    high = opacities.max(where=finite, initial=-np.inf)
+    return "raw" if 0 <= low <= high <= 1 else "logit"
 
 
 def _describe_odd_scales(means: np.ndarray, scales: np.ndarray, valid: np.ndarray) -> str:
