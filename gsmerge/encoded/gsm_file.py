@@ -313,7 +313,7 @@ def _read_header(text: str, entries: Mapping[str, Any], budget: ReadBudget) -> d
         problem = f"expected schema {SCHEMA}, found {header['schema']}"
         raise SceneError(path, problem, newer if header["schema"] > SCHEMA else REMEDY)
     for name, kind in entries.items():
-        if name not in header or not isinstance(header[name], kind):
+        if not isinstance(header.get(name, ...), kind) or isinstance(header[name], bool):
             raise SceneError(path, f"expected {name} in the header, found {header.get(name)!r:.40}", REMEDY)
     about = header["about"]
     for name, kind in ABOUT.items():

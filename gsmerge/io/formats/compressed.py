@@ -128,8 +128,6 @@ def compressed_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> byte
 def _ranged(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the float32 minima and maxima ``[c,3]`` of each chunk, and all values between 0 and 1."""
     starts = np.arange(0, len(values), CHUNK)
-    if len(starts) == 0:
-        return values, values, values
     low, high = (end.reduceat(values, starts).astype(np.float32).astype(float) for end in (np.minimum, np.maximum))
     ids, span = np.arange(len(values)) // CHUNK, high - low
     return low, high, (values - low[ids]) / np.where(span > 0, span, 1)[ids]

@@ -54,36 +54,35 @@ def glb_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
         values[f"{NAME}:SH_DEGREE_{degree}_COEF_{i + 1 - degree**2}"] = columns.harmonics[:, i]
     attributes = {name: array.astype("<f4") for name, array in values.items()}
     attributes["COLOR_0"] = to_bytes(255 * np.concatenate([columns.colors, columns.opacities[:, None]], 1))
-    document: dict[str, Any] = {"asset": {"version": "2.0", "generator": "gsmerge"}, "scene": 0, "scenes": [{}]}
-    content = b""
-    if len(gaussians):
-        at, views = 0, []
-        accessors: list[dict[str, Any]] = []
-        for array in attributes.values():
-            views.append({"buffer": 0, "byteOffset": at, "byteLength": array.nbytes, "target": _VERTICES})
-            kind = {"componentType": _BYTE, "normalized": True}
-            if array.dtype != np.uint8:
-                kind = {"componentType": _FLOAT}
-            shape = {"count": len(array), "type": _TYPES[array[0].size]}
-            accessors.append({"bufferView": len(accessors), **kind, **shape})
-            at += array.nbytes
-        for name, end in (("min", np.min), ("max", np.max)):  # of the positions, which glTF asks for
-            accessors[0][name] = end(attributes["POSITION"], axis=0).tolist()
-        content = b"".join(array.tobytes() for array in attributes.values())
-        splats = {"kernel": "ellipse", "colorSpace": COLOR_SPACE}
-        splats |= {"sortingMethod": "cameraDistance", "projection": "perspective"}
-        places = {name: i for i, name in enumerate(attributes)}
-        document |= {
-            "extensionsUsed": [NAME],
-            "scenes": [{"nodes": [0]}],
-            "nodes": [{"mesh": 0, "rotation": [0, 0, 1, 0]}],
-            "meshes": [{"primitives": [{"attributes": places, "mode": _POINTS, "extensions": {NAME: splats}}]}],
-            "accessors": accessors,
-            "bufferViews": views,
-            "buffers": [{"byteLength": len(content)}],
-        }
+    at, views = 0, []
+    accessors: list[dict[str, Any]] = []
+    for array in attributes.values():
+        views.append({"buffer": 0, "byteOffset": at, "byteLength": array.nbytes, "target": _VERTICES})
+        kind = {"componentType": _BYTE, "normalized": True}
+        if array.dtype != np.uint8:
+            kind = {"componentType": _FLOAT}
+        shape = {"count": len(array), "type": _TYPES[array[0].size]}
+        accessors.append({"bufferView": len(accessors), **kind, **shape})
+        at += array.nbytes
+    for name, end in (("min", np.min), ("max", np.max)):  # of the positions, which glTF asks for
+        accessors[0][name] = end(attributes["POSITION"], axis=0).tolist()
+    content = b"".join(array.tobytes() for array in attributes.values())
+    splats = {"kernel": "ellipse", "colorSpace": COLOR_SPACE}
+    splats |= {"sortingMethod": "cameraDistance", "projection": "perspective"}
+    places = {name: i for i, name in enumerate(attributes)}
+    document = {
+        "asset": {"version": "2.0", "generator": "gsmerge"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "extensionsUsed": [NAME],
+        "nodes": [{"mesh": 0, "rotation": [0, 0, 1, 0]}],
+        "meshes": [{"primitives": [{"attributes": places, "mode": _POINTS, "extensions": {NAME: splats}}]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": len(content)}],
+    }
     text = json.dumps(document, separators=(",", ":")).encode("ascii")
-    chunks = _chunk(b"JSON", text, b" ") + (_chunk(b"BIN\0", content, b"\0") if content else b"")
+    chunks = _chunk(b"JSON", text, b" ") + _chunk(b"BIN\0", content, b"\0")
     return _HEADER.pack(b"glTF", 2, _HEADER.size + len(chunks)) + chunks
 
 

@@ -271,7 +271,7 @@ def sog_files(columns: arrays.Columns, *, mip: bool = False) -> dict[str, bytes]
         textures.update(files)
 
     logs = np.sign(columns.means) * log1p(np.abs(columns.means))
-    low, high = (end(logs, axis=0) if count else np.zeros(3) for end in (np.min, np.max))
+    low, high = (end(logs, axis=0) for end in (np.min, np.max))
     fixed = np.round((logs - low) / np.where(high > low, high - low, 1) * 65535).astype(int)
     halves = {"means_l.webp": _texture(fixed & 255), "means_u.webp": _texture(fixed >> 8)}
     add("means", halves, mins=_shorten(low), maxs=_shorten(high))

@@ -161,8 +161,9 @@ def test_failures_leave_existing_files_and_nothing_else(ending: str, tmp_path: P
 
 @pytest.mark.parametrize("ending", OUTPUT_FORMATS)
 def test_no_gaussians(ending: str, tmp_path: Path) -> None:
-    write_gaussians(tmp_path / f"a{ending}", corners()[:0])
-    assert (tmp_path / f"a{ending}").exists()
+    with refuses(ValueError, "gaussians", "none"):
+        write_gaussians(tmp_path / f"a{ending}", corners()[:0])
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_comments_reach_the_headers(tmp_path: Path) -> None:
