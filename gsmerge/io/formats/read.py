@@ -311,7 +311,7 @@ def _declared_encoding(paths: Sequence[Path], parts: Sequence[StoredRows], opaci
         if len(seen) > 1:
             (other, name), _ = seen.items()
             problem = f"expected opacities as in {name}, which are {other}, found {encoding} ones"
-            raise SceneError(path, problem, "export all parts alike, or say with --hint opacity=logit what all are")
+            raise SceneError(path, problem, "export all parts alike; if all are logits, say --hint opacity=logit")
     return next((part.encoding for part in parts if part.encoding is not None), None)
 
 

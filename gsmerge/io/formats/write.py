@@ -107,8 +107,8 @@ def add_levels(
 
     Returns, for each level, the final path of its first chunk's ``meta.json``, and the present paths of all its files.
     """
-    for level in levels:
-        _check_readable(level, comments)
+    for gaussians in levels:
+        _check_readable(gaussians, comments)
     firsts: dict[str, Path] = {}
     written: dict[str, list[Path]] = {}
     for name, data in streamed.streamed_files(levels, mip=MIP_COMMENT in comments).items():

@@ -173,6 +173,15 @@ def test_comments_reach_the_headers(tmp_path: Path) -> None:
         write_gaussians(tmp_path / "b.compressed.ply", corners(), comments=["two\nlines"])
 
 
+@pytest.mark.parametrize("ending", [".ply", ".compressed.ply"])
+def test_comments_that_no_reader_takes(ending: str, tmp_path: Path) -> None:
+    lines = ["gsmerge cameras: " + "A" * 900] * 500
+    write_gaussians(tmp_path / f"a{ending}", corners(), comments=lines)
+    assert len(read_ply(tmp_path / f"a{ending}").gaussians) == len(corners())
+    with refuses(ValueError, "comments", "524,288"):
+        write_gaussians(tmp_path / f"b{ending}", corners(), comments=2 * lines)
+
+
 def test_no_normals_is_the_same_without_twelve_bytes(scene: Scene, tmp_path: Path) -> None:
     gaussians = drawn(scene, 1)
     for name, normals in {"with": True, "without": False}.items():
