@@ -19,7 +19,7 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import apply_turn, harmonics_turn, multiply_quats, quat_to_rotmat, rgb_to_sh0, rotmat_to_quat
-from gsmerge.io.bounds import MAX_TEXT_BYTES, ReadBudget, parse_json, read_budget, read_errors
+from gsmerge.io.bounds import ReadBudget, parse_json, read_budget, read_errors
 from gsmerge.io.formats.arrays import Columns, Packed, StoredRows, to_bytes, to_columns, to_stored
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.matrices import matmul
@@ -184,8 +184,8 @@ def _read_document(file: IO[bytes], budget: ReadBudget) -> dict[str, Any]:
     (magic, version, total), (length, kind) = _HEADER.unpack_from(start), _CHUNK.unpack_from(start, _HEADER.size)
     if (magic, version, kind) != (b"glTF", 2, b"JSON"):
         raise _ForeignError("a file that is no binary glTF 2.0")
-    if total > size or length > min(total - len(start), MAX_TEXT_BYTES):
-        raise _ForeignError(f"one that is cut: {max(total, length)} bytes are not in its {size}, or of JSON too many")
+    if total > size or length > total - len(start):
+        raise _ForeignError(f"one that is cut: {max(total, length)} bytes are not in its {size}")
     document = parse_json(file.read(length).decode("utf-8-sig"), budget)
     if not isinstance(document, dict):
         raise _ForeignError("one without an object of JSON")

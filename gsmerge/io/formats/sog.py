@@ -43,7 +43,6 @@ PALETTE_BITS = 16
 PALETTE_COLUMNS = 64  # sets of harmonics side by side in the texture of the palette
 _LOSSLESS = 101  # OpenCV's WebP quality
 PACKED_BYTES = 19  # of a Gaussian as its textures are held
-MAX_META_BYTES = 1 << 20
 CODES = 256
 _CELLS = 1 << 11  # as many of equal width, and of equally many values
 _MAX_STEPS = 200
@@ -145,7 +144,7 @@ def _damage(path: Path) -> Iterator[None]:
 
 
 def _read_content(files: _Files, budget: ReadBudget) -> SogContent:
-    meta = parse_json(files.member(META, MAX_META_BYTES).decode("utf-8-sig"), budget)
+    meta = parse_json(files.member(META, files.size).decode("utf-8-sig"), budget)
     version = meta.get("version", 1) if isinstance(meta, dict) else "none"
     if version != VERSION:
         problem = f"expected .sog version {VERSION}, found {version}"

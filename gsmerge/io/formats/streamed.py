@@ -21,7 +21,7 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.geometry import morton_codes, quat_to_rotmat
 from gsmerge.io.atomic import remove_stale
-from gsmerge.io.bounds import MAX_FILES, ReadBudget, check_file, read_json
+from gsmerge.io.bounds import ReadBudget, check_file, read_json
 from gsmerge.io.formats import arrays, sog
 from gsmerge.kernels.elementary import exp, log1p
 from gsmerge.types import Gaussians
@@ -170,8 +170,8 @@ def _check_index(path: Path, document: dict[str, Any]) -> StreamedIndex:
         raise SceneError(path, problem, "export it as that version")
     names = document["filenames"]
     num_levels = sog.check_whole(document["lodLevels"], "lodLevels", 1, MAX_LEVELS)
-    if not isinstance(names, list) or not 1 <= len(names) <= MAX_FILES:
-        raise ValueError(f"filenames: expected a list of 1 to {MAX_FILES} paths")
+    if not isinstance(names, list) or not names:
+        raise ValueError("filenames: expected a list of paths")
     chunks = [_inside(path, name) for name in names]
     runs: list[list[tuple[int, int, int]]] = [[] for _ in range(num_levels)]
     for level, run in _walk_runs(document["tree"]):
