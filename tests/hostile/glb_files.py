@@ -125,6 +125,7 @@ def _cases() -> dict[str, Case]:
     cases["copies without end"] = Case(document(copies), says=("scene.glb", "same values"))
     cases["200,000 empty nodes"] = Case(document(empty), says=("scene.glb", "nodes"))
     cases["values for many attributes"] = Case(document(shared), says=("scene.glb", "same values"))
+    cases["a count of true"] = Case(placed("accessors", 0, "count", value=True), says=("scene.glb", "True"))
     cases["a promise"] = Case(placed("accessors", 0, "count", value=10**9), says=("scene.glb", "1000000000"))
     return cases
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import apply_turn, harmonics_turn, multiply_quats, quat_to_rotmat, rgb_to_sh0, rotmat_to_quat
-from gsmerge.io.bounds import ReadBudget, parse_json, read_budget, read_errors
+from gsmerge.io.bounds import ReadBudget, check_whole, parse_json, read_budget, read_errors
 from gsmerge.io.formats.arrays import Columns, Packed, StoredRows, to_bytes, to_columns, to_stored
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.matrices import matmul
@@ -35,6 +35,7 @@ _WIDTHS = {name: width for width, name in _TYPES.items()}
 _DTYPES = {5120: "<i1", _BYTE: "<u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
+_MAX_STRIDE = 252  # bytes from a value to the next that glTF allows
 _STEPS_PER_NODE, _STEPS_PER_PART = 4, 100  # of a budget's 20 microseconds
 _EVEN = 1e-3  # by how much the scales of a node's axes may differ, and its axes be oblique
 
@@ -161,12 +162,12 @@ class _Content:
         if view.get("extensions") or view["buffer"] != 0 or "uri" in self.document["buffers"][0]:
             raise _ForeignError(f"one with compressed values or values in another file ({list(view)})")
         dtype, width = np.dtype(_DTYPES[accessor["componentType"]]), _WIDTHS[accessor["type"]]
-        each, count, first = dtype.itemsize * width, accessor["count"], accessor.get("byteOffset", 0)
-        stride = view.get("byteStride", each)
+        each, first = dtype.itemsize * width, accessor.get("byteOffset", 0)
+        count, stride = check_whole(accessor["count"], "count", 1), view.get("byteStride", each)
         span, at = (count - 1) * stride + each, self.start + view.get("byteOffset", 0) + first
         self.num_read[0] += count * each
         inside = first >= 0 and first + span <= view["byteLength"] and self.start <= at and at + span <= self.end
-        if count < 1 or stride < each or not inside:
+        if not each <= stride <= _MAX_STRIDE or not inside:
             raise _ForeignError(f"one that is cut: {count} values of {each} bytes are not in its {self.end} bytes")
         if self.num_read[0] > self.end - self.start:
             raise _ForeignError("one that shows the same values in several places")

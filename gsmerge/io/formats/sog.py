@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.io.bounds import ReadBudget, check_file, parse_json, read_budget, read_errors
+from gsmerge.io.bounds import ReadBudget, check_file, check_whole, parse_json, read_budget, read_errors
 from gsmerge.io.formats import arrays
 from gsmerge.kernels.elementary import expm1, log1p
 from gsmerge.types import Gaussians
@@ -159,16 +159,6 @@ def _read_content(files: _Files, budget: ReadBudget) -> SogContent:
     return SogContent(packed, sizes, mip, files.size)
 
 
-def check_whole(value: Any, name: str, least: int, most: int = 2**53) -> int:
-    """Return a number of a document if it is whole and in its range; ValueError otherwise.
-
-    2^53 is the largest whole number that JSON keeps everywhere.
-    """
-    if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
-        raise ValueError(f"{name}: expected a whole number from {least} to {most}, not {value!r:.40}")
-    return value
-
-
 def _image_size(data: bytes) -> tuple[int, int]:
     """Return width and height of a WebP image; ValueError if it is none, or one with loss."""
     at = 12
@@ -199,15 +189,13 @@ def _read_texture(files: _Files, name: str, count: int, budget: ReadBudget) -> n
 
 
 def _read_packed(files: _Files, meta: dict[str, Any], count: int, budget: ReadBudget) -> arrays.Packed:
-    def texture(key: str, index: int = 0) -> np.ndarray:
-        return _read_texture(files, meta[key]["files"][index], count, budget)
-
-    def colors(key: str, index: int = 0) -> np.ndarray:
-        return texture(key, index)[:, :3].copy()  # less memory than with the alpha that nothing reads
+    def texture(key: str, index: int = 0, channels: int = 3) -> np.ndarray:
+        pixels = _read_texture(files, meta[key]["files"][index], count, budget)
+        return pixels[:, :channels].copy()  # without pixels and channels that nothing reads
 
     low, high = (_check_numbers(meta["means"][key], 3) for key in ("mins", "maxs"))
-    lower, upper, scales = colors("means", 0), colors("means", 1), colors("scales")
-    quats, sh0 = texture("quats"), texture("sh0")
+    lower, upper, scales = texture("means"), texture("means", 1), texture("scales")
+    quats, sh0 = texture("quats", channels=4), texture("sh0", channels=4)
     scale_codes, color_codes = (_check_numbers(meta[key]["codebook"], CODES) for key in ("scales", "sh0"))
     if quats[:, 3].min() < FIRST_MODE:
         raise ValueError(f"rotations of mode {quats[:, 3].min()}")

@@ -21,7 +21,7 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.geometry import morton_codes, quat_to_rotmat
 from gsmerge.io.atomic import remove_stale
-from gsmerge.io.bounds import ReadBudget, check_file, read_json
+from gsmerge.io.bounds import ReadBudget, check_file, check_whole, read_json
 from gsmerge.io.formats import arrays, sog
 from gsmerge.kernels.elementary import exp, log1p
 from gsmerge.types import Gaussians
@@ -169,16 +169,16 @@ def _check_index(path: Path, document: dict[str, Any]) -> StreamedIndex:
         problem = f"expected Streamed SOG version {VERSION}, found {version}"
         raise SceneError(path, problem, "export it as that version")
     names = document["filenames"]
-    num_levels = sog.check_whole(document["lodLevels"], "lodLevels", 1, MAX_LEVELS)
+    num_levels = check_whole(document["lodLevels"], "lodLevels", 1, MAX_LEVELS)
     if not isinstance(names, list) or not names:
         raise ValueError("filenames: expected a list of paths")
     chunks = [_inside(path, name) for name in names]
     runs: list[list[tuple[int, int, int]]] = [[] for _ in range(num_levels)]
     for level, run in _walk_runs(document["tree"]):
-        file = sog.check_whole(run["file"], "file", 0, len(chunks) - 1)
-        offset, count = (sog.check_whole(run[key], key, 0) for key in ("offset", "count"))
+        file = check_whole(run["file"], "file", 0, len(chunks) - 1)
+        offset, count = (check_whole(run[key], key, 0) for key in ("offset", "count"))
         if count:
-            runs[sog.check_whole(level, "level", 0, num_levels - 1)].append((file, offset, count))
+            runs[check_whole(level, "level", 0, num_levels - 1)].append((file, offset, count))
     levels = tuple(_cover(chunks, level) for level in runs)
     if len({chunk for level in levels for chunk in level}) != sum(map(len, levels)):
         raise ValueError("a chunk is that of two levels")
@@ -256,7 +256,7 @@ def _read_chunks(path: Path, chunks: Mapping[Path, int | None]) -> list[sog.SogC
     """Read chunks, each with its number of Gaussians if the index has that, within the budget of all together."""
     root, seen = os.path.realpath(path.parent), set[str]()
     contents: list[sog.SogContent] = []
-    num_bytes, total = check_file(path), 0
+    num_bytes, total, num_higher = check_file(path), 0, 0
     for chunk, count in chunks.items():
         place = os.path.realpath(chunk)
         if os.path.commonpath([root, place]) != root or place in seen:
@@ -269,7 +269,7 @@ def _read_chunks(path: Path, chunks: Mapping[Path, int | None]) -> list[sog.SogC
             problem = f"expected {count:,} Gaussians as {INDEX} says, found {packed.count:,}"
             raise SceneError(chunk, problem, "export it again")
         num_bytes, total = num_bytes + contents[-1].num_bytes, total + packed.count
-        num_higher = max(content.packed.num_higher for content in contents)
+        num_higher = max(num_higher, packed.num_higher)
         arrays.check_count(ReadBudget(path, num_bytes), total, num_higher, sog.PACKED_BYTES)
     return contents
 
