@@ -175,7 +175,7 @@ def _unpack(parts: list[np.ndarray], header: _Header) -> arrays.Columns:
         log_scales=scales / 16 - 10,
         opacities=opacities[:, 0] / 255,
         sh0=rgb_to_sh0(0.5 + SH_C0 * (colors / 255 - 0.5) / COLOR_SCALE),
-        harmonics=(harmonics.reshape(len(harmonics), -1, 3) - 128.0) / 128,
+        harmonics=(harmonics.reshape(len(harmonics), -1, 3) - np.float32(128)) / np.float32(128),  # exact
     )
 
 
