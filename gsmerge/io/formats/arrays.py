@@ -170,7 +170,7 @@ def to_stored(parts: Sequence[Packed], name: str, sizes: dict[str, int], *, mip:
 
 
 def most_in_memory(file_bytes: int) -> int:
-    """Return from how many bytes on the harmonics of a file are mapped, as they may be many times the file's bytes."""
+    """Return from how many bytes on an array of a file's Gaussians is mapped: harmonics may be many times the file."""
     return max(1 << 25, 8 * file_bytes)
 
 

@@ -163,9 +163,9 @@ def _convert_files(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: 
     wide = any(dtype[name].kind == "f" and dtype[name].itemsize == 8 for name in arrays.MEANS)
     shapes = {"quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh0": (n, 1, 3), "shN": (n, num_higher, 3)}
     file_bytes = sum(path.stat().st_size + part.bytes_beside for path, part in zip(paths, parts, strict=True))
-    most = {"shN": arrays.most_in_memory(file_bytes)}
+    most = arrays.most_in_memory(file_bytes)
     out = {"means": make_array((n, 3), np.float64 if wide else np.float32), "valid": np.empty(n, np.bool_)}
-    out |= {name: make_array(shape, np.float32, most.get(name)) for name, shape in shapes.items()}
+    out |= {name: make_array(shape, np.float32, most) for name, shape in shapes.items()}
     num_clipped = num_zero_quats = first = 0
     for name, part in zip(paths, parts, strict=True):
         part_rows = slice(first, first + len(part.rows))

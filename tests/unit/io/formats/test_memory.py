@@ -8,9 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from messages import refuses
 
+from gsmerge.errors import SceneError
 from gsmerge.geometry import normalize
 from gsmerge.io import write_gaussians, write_ply
+from gsmerge.io.bounds import ReadBudget
+from gsmerge.io.formats.arrays import check_count
+from gsmerge.io.formats.sog import PACKED_BYTES
 from gsmerge.types import Gaussians
 
 COUNT, HIGHER = 150_000, 15
@@ -50,6 +55,15 @@ def test_memory_is_within_the_budget(ending: str, tmp_path: Path) -> None:
     write_gaussians(path, some(FILES[ending]))
     peak = subprocess.run([sys.executable, "-c", READ, small, path], check=True, capture_output=True, text=True).stdout
     assert int(peak) <= FREE + PER_BYTE * path.stat().st_size
+
+
+@pytest.mark.parametrize("count", [100_000, 1_000_000, 4_000_000, 20_000_000])
+@pytest.mark.parametrize(("each", "num_higher"), [(8, 0), (10, 15), (12, 24)])
+def test_files_of_real_density_are_read(each: int, num_higher: int, count: int) -> None:
+    """Bytes per Gaussian of the smallest .sog and .spz of real scenes, at any size; a twentieth of them are none."""
+    check_count(ReadBudget("a.sog", each * count), count, num_higher, PACKED_BYTES)
+    with refuses(SceneError, "a.sog", f"{20 * count:,}"):
+        check_count(ReadBudget("a.sog", each * count), 20 * count, num_higher, PACKED_BYTES)
 
 
 def test_memory_of_text_is_within_the_budget(tmp_path: Path) -> None:
