@@ -110,7 +110,8 @@ def _read_scene(path: Path) -> FileCheck:
 
 def _read_levels(path: Path) -> FileCheck:
     """Read all levels of an index, one after the other."""
-    infos = [read_level(path, level).info for level in range(len(streamed.read_index(path).levels))]
+    index = streamed.read_index(path)
+    infos = [read_level(path, level, index).info for level in range(len(index.levels))]
     problems = [f"level {level}: {problem}" for level, info in enumerate(infos) for problem in _problems(info)]
     beside = sum(info.file_bytes for info in infos) - (len(infos) - 1) * path.stat().st_size
     return FileCheck(str(path), "Gaussians", infos[0].count, infos[0].layout, beside, tuple(problems))

@@ -195,19 +195,28 @@ def morton_codes(points: np.ndarray) -> np.ndarray:
 
 
 def turn_harmonics(shN: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """Rotate spherical harmonics ``[n,k-1,3]`` by ``rotation [3,3]``, as their Gaussians rotate.
-
-    Each degree is fitted to the same colours in rotated directions, which is exact.
-    """
+    """Rotate spherical harmonics ``[n,k-1,3]`` by ``rotation [3,3]``, as their Gaussians rotate."""
     num = shN.shape[1]
     if num == 0 or len(shN) == 0:
         return shN
+    return apply_turn(shN, harmonics_turn(num, rotation))
+
+
+def harmonics_turn(num: int, rotation: np.ndarray) -> np.ndarray:
+    """Return the matrix ``[num,num]`` that rotates as many harmonics; see :func:`apply_turn`.
+
+    Each degree is fitted to the same colours in rotated directions, which is exact.
+    """
     directions = normalize(np.random.default_rng(0).normal(size=(DIRECTIONS, 3)))
     before = _harmonics_in(matmul(directions, rotation), num)
     after = _harmonics_in(directions, num)
-    turn = solve(matmul(after.T, after), matmul(after.T, before))
-    rows = matmul(shN.swapaxes(1, 2).reshape(-1, num), turn.T)
-    return np.ascontiguousarray(rows.reshape(-1, 3, num).swapaxes(1, 2), shN.dtype)
+    return solve(matmul(after.T, after), matmul(after.T, before))
+
+
+def apply_turn(shN: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """Multiply harmonics ``[n,k-1,3]`` by a matrix ``[k-1,k-1]``."""
+    rows = matmul(shN.swapaxes(1, 2).reshape(-1, len(turn)), turn.T)
+    return np.ascontiguousarray(rows.reshape(-1, 3, len(turn)).swapaxes(1, 2), shN.dtype)
 
 
 def _harmonics_in(directions: np.ndarray, num: int) -> np.ndarray:

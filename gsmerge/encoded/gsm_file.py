@@ -24,7 +24,7 @@ from gsmerge.encoded.encoded import Division, Encoded, StoredHeads, StoredScene,
 from gsmerge.errors import SceneError
 from gsmerge.facts.prepare import Frame
 from gsmerge.io.atomic import atomic_output
-from gsmerge.io.bounds import check_file, check_pixels
+from gsmerge.io.bounds import ReadBudget, check_pixels, parse_json, read_budget
 from gsmerge.io.cameras.camera_file import MAX_NUMBER as MAX_LENGTH
 from gsmerge.io.cameras.camera_file import check_camera, check_size
 from gsmerge.settings.stages import MAX_CHILDREN
@@ -38,6 +38,7 @@ SUFFIX = ".gsm"
 ENCODED, STATE = "gsmerge-encoded", "gsmerge-state"  # names of the metadata entry
 REMEDY = "copy it again, or encode the scene again"
 MAX_COUNT = 1 << 40
+NUM_HIGHER = (0, 3, 8, 15, 24)  # harmonics above degree 0
 MAX_NUMBER = 1e37  # of any array: float32 ends at 3e38
 MAX_FACTOR = 1e6  # of what is multiplied with others
 FACTORS = ("gains", "quats")
@@ -59,6 +60,7 @@ ENTRIES: dict[str, dict[str, Any]] = {  # types of the header's entries, by kind
     ENCODED: COMMON_ENTRIES | {"networks": dict | None},
     STATE: COMMON_ENTRIES,
 }
+ABOUT = {"gsmerge": str, "options": dict, "choices": dict, "notes": list, "batches": list, "source": dict}  # types
 PREFIXES = (
     "features.", "division.", "children.", "kept.", "cameras.", "frame.", "heads.", "networks.", "replay.", "refined.",
     "samples.",
@@ -204,8 +206,11 @@ class GsmFile:
     def features(self) -> FeatureGaussians:
         """Return the Feature Gaussians without their members."""
         g = len(self.array("features.means", np.float32, None, 3))
+        num_higher = self.array("features.shN", np.float32, g, None, 3).shape[1]
+        if num_higher not in NUM_HIGHER:
+            raise self.error(f"features.shN: expected {NUM_HIGHER} harmonics, found {num_higher}")
         shapes: dict[str, tuple[int | None, ...]] = {
-            "means": (3,), "covars": (3, 3), "sh0": (1, 3), "shN": (None, 3), "latents": (None,),
+            "means": (3,), "covars": (3, 3), "sh0": (1, 3), "shN": (num_higher, 3), "latents": (None,),
         }  # fmt: skip
         return FeatureGaussians(
             **{name: self.array(f"features.{name}", np.float32, g, *shapes.get(name, ())) for name in FEATURE_COLUMNS},
@@ -279,7 +284,7 @@ class GsmFile:
 def read_gsm(path: str | PathLike[str], *kinds: str) -> GsmFile:
     """Read a ``.gsm`` file that has one of the ``kinds``; SceneError for other files."""
     path = Path(path)
-    check_file(path)
+    budget = read_budget(path)
     try:
         with safe_open(path, "np") as file:
             names = [name for name in file.keys() if name.startswith(PREFIXES)]  # noqa: SIM118 - no mapping
@@ -291,14 +296,15 @@ def read_gsm(path: str | PathLike[str], *kinds: str) -> GsmFile:
     kind = next((kind for kind in kinds if kind in metadata), None)
     if kind is None:
         raise SceneError(path, "expected Feature Gaussians of gsmerge, found another safetensors file", "name the .gsm")
-    return GsmFile(path, kind, _read_header(path, metadata[kind], ENTRIES[kind]), arrays)
+    return GsmFile(path, kind, _read_header(metadata[kind], ENTRIES[kind], budget), arrays)
 
 
-def _read_header(path: Path, text: str, entries: Mapping[str, Any]) -> dict[str, Any]:
+def _read_header(text: str, entries: Mapping[str, Any], budget: ReadBudget) -> dict[str, Any]:
     """Parse the header of a known schema; ``entries``: the type of each required entry."""
+    path = budget.path
     try:
-        header = json.loads(text)
-    except (ValueError, RecursionError) as error:
+        header = parse_json(text, budget)
+    except ValueError as error:
         raise SceneError(path, "expected a header in JSON, found something else", REMEDY) from error
     if not isinstance(header, dict) or not isinstance(header.get("schema"), int):
         raise SceneError(path, "expected a header with its schema, found none", REMEDY)
@@ -307,8 +313,13 @@ def _read_header(path: Path, text: str, entries: Mapping[str, Any]) -> dict[str,
         problem = f"expected schema {SCHEMA}, found {header['schema']}"
         raise SceneError(path, problem, newer if header["schema"] > SCHEMA else REMEDY)
     for name, kind in entries.items():
-        if name not in header or not isinstance(header[name], kind):
+        if not isinstance(header.get(name, ...), kind) or isinstance(header[name], bool):
             raise SceneError(path, f"expected {name} in the header, found {header.get(name)!r:.40}", REMEDY)
+    about = header["about"]
+    for name, kind in ABOUT.items():
+        if name in about and not isinstance(about[name], kind):
+            problem = f"about: expected {name} as a {kind.__name__}, found {about[name]!r:.40}"
+            raise SceneError(path, problem, REMEDY)
     return header
 
 

@@ -153,3 +153,13 @@ def check_pixels(path: StrPath, width: int, height: int) -> None:
     if width * height > MAX_PIXELS:
         millions = MAX_PIXELS // 1_000_000
         raise SceneError(path, f"expected at most {millions} million pixels an image, found {width} x {height}")
+
+
+def check_whole(value: Any, name: str, least: int, most: int = 2**53) -> int:
+    """Return a number of a document if it is whole and in its range; ValueError otherwise.
+
+    2^53 is the largest whole number that JSON keeps everywhere.
+    """
+    if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
+        raise ValueError(f"{name}: expected a whole number from {least} to {most}, not {value!r:.40}")
+    return value

@@ -16,8 +16,10 @@ from safetensors.numpy import save
 from gsmerge import __version__
 from gsmerge.errors import SceneError
 from gsmerge.io.atomic import atomic_output
+from gsmerge.io.bounds import ReadBudget, parse_json, read_budget
 from gsmerge.networks.options import NetworkOptions, weight_shapes
 from gsmerge.networks.weights import NetworkWeights
+from gsmerge.types import StrPath
 
 SCHEMA = 2  # version of the tensors' names and of the tokens that they were trained on
 FORMAT = "gsmerge-networks"
@@ -62,6 +64,7 @@ def load_checkpoint(path: str | PathLike[str]) -> Checkpoint:
     path = Path(path)
     if not path.is_file():
         raise SceneError(path, "expected a checkpoint, found no such file", REMEDY)
+    budget = read_budget(path)
     try:
         with safe_open(path, "np") as file:
             header = file.metadata() or {}
@@ -69,7 +72,7 @@ def load_checkpoint(path: str | PathLike[str]) -> Checkpoint:
     except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as error:  # the last two: types of torch
         reason = str(error).splitlines()[0]
         raise SceneError(path, f"expected a safetensors file, could not read it ({reason})", REMEDY) from error
-    options, training, version = _header(path, header)
+    options, training, version = _header(header, budget)
     return Checkpoint(build_networks(path, options, tensors), path, version, training)
 
 
@@ -97,12 +100,13 @@ def build_networks(
     return NetworkWeights(sizes, {name: np.ascontiguousarray(array) for name, array in arrays.items()})
 
 
-def _header(path: Path, header: Mapping[str, str]) -> tuple[dict[str, Any], dict[str, Any], str]:
+def _header(header: Mapping[str, str], budget: ReadBudget) -> tuple[dict[str, Any], dict[str, Any], str]:
     """Read sizes of the networks, facts about the training, and the version that wrote them."""
+    path = budget.path
     if FORMAT not in header:
         raise SceneError(path, "expected networks of gsmerge, found another safetensors file", REMEDY)
     try:
-        values = json.loads(header[FORMAT])
+        values = parse_json(header[FORMAT], budget)
         if not isinstance(values, dict) or values.get("schema") != SCHEMA:
             schema = values.get("schema") if isinstance(values, dict) else "none"
             raise SceneError(path, f"expected schema {SCHEMA}, found {schema!r}", REMEDY)
@@ -110,11 +114,11 @@ def _header(path: Path, header: Mapping[str, str]) -> tuple[dict[str, Any], dict
             if not isinstance(values.get(name), kind):
                 raise ValueError(f"no {name}")
         return values["options"], values["training"], values["gsmerge"]
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise _header_error(path, error, REMEDY) from error
 
 
-def _header_error(path: Path, error: Exception, remedy: str) -> SceneError:
+def _header_error(path: StrPath, error: Exception, remedy: str) -> SceneError:
     reason = str(error).splitlines()[0]
     return SceneError(path, f"expected a header that describes the networks ({reason})", remedy)
 

@@ -49,7 +49,7 @@ class Compactor:
         state = load_state(path)
         compactor = cls.__new__(cls)
         compactor._state = state
-        compactor._options, compactor._online = merge_settings(settings, state)
+        compactor._options, compactor._online = merge_settings(settings, state.about["options"])
         return compactor
 
     def __len__(self) -> int:

@@ -17,7 +17,7 @@ from gsmerge.facts.prepare import Frame
 from gsmerge.fit import FitJob, FitOptions, FitReport, fit, report_steps, start_share
 from gsmerge.fit.gpu import choose_backend
 from gsmerge.io import atomic_output, lost_harmonics, output_format, write_gaussians
-from gsmerge.io.formats.arrays import RESULT_COMMENT
+from gsmerge.io.formats.arrays import RESULT_COMMENT, copied_comments
 from gsmerge.online.batch import BatchPhotos
 from gsmerge.online.file import load_stored
 from gsmerge.online.state import OnlineState, to_encoded
@@ -170,10 +170,8 @@ def decode_file(
 
 def _comments(stored: Encoded | OnlineState) -> list[str]:
     """Return the lines of the header: that of a result, and those of the file that was encoded, as compact does."""
-    source = stored.about.get("source")
-    texts = source.get("comments") if isinstance(source, dict) else None
-    lines = [line for line in texts if isinstance(line, str)] if isinstance(texts, list) else []
-    return [RESULT_COMMENT, *(line for line in lines if line.isascii() and line.isprintable())]
+    texts = stored.about.get("source", {}).get("comments")
+    return [RESULT_COMMENT, *copied_comments(texts if isinstance(texts, list) else ())]
 
 
 def decoding_line(document: Mapping[str, Any]) -> str:

@@ -84,15 +84,22 @@ def load_stored(path: str | PathLike[str]) -> Encoded | OnlineState:
     an array, or holds numbers out of range.
     """
     file = read_gsm(path, ENCODED, STATE)
+    about = file.header["about"]
+    try:
+        merge_settings({}, about.get("options"))
+    except ValueError as error:
+        raise file.error(f"about: expected options of gsmerge, found others ({error})") from error
     if file.kind == ENCODED:
         return read_encoded(file)
-    about, settings = file.header["about"], file.settings()
-    if not (isinstance(about.get("options"), dict) and isinstance(about.get("batches"), list)):
+    if not about.keys() >= {"options", "batches"}:
         raise file.error("about: expected options and batches in the header, found none")
-    weights = file.networks()
+    settings, weights = file.settings(), file.networks()
     groups = _read_groups(file, settings.max_k, weights)
     common = file.common(groups.children.shN.shape[1])
     networks = None
+    num_latents = groups.features.latents.shape[1]
+    if weights is None and num_latents:
+        raise file.error(f"features.latents: expected 0 numbers in a state without networks, found {num_latents}")
     if weights is not None:
         num_views = len(common["cameras"])
         groups = replace(groups, learned=_read_learned(file, groups.features, weights, num_views))
@@ -174,7 +181,7 @@ def extend_file(
     start, identity = perf_counter(), _file_identity(path)
     state = None if identity is None else load_state(path)
     try:
-        options, online = merge_settings(settings, state)
+        options, online = merge_settings(settings, None if state is None else state.about["options"])
     except ValueError as error:
         raise UsageError(str(error)) from error
     with atomic_output(path, overwrite=identity is not None) as temporary:

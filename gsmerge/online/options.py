@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.setting import Settings, setting
 from gsmerge.settings.stages import MAX_CHILDREN
-
-if TYPE_CHECKING:
-    from gsmerge.encoded.encoded import StoredScene
 
 # Settings of this module under the name of a recipe, see gsmerge.settings.compact.RECIPES
 RECIPES: Mapping[str, Mapping[str, Any]] = {"paper": {"tolerance": 0.0, "replay": 0}}
@@ -37,13 +34,12 @@ class OnlineOptions(Settings):
 
 
 def merge_settings(
-    settings: Mapping[str, Any], state: StoredScene | None = None
+    settings: Mapping[str, Any], stored: Mapping[str, Any] | None = None
 ) -> tuple[CompactOptions, OnlineOptions]:
-    """Combine settings: those given, else the state's, else the defaults without a full fit."""
+    """Combine settings: those given, else those stored in a state, else the defaults without a full fit."""
     names = OnlineOptions.__dataclass_fields__.keys()
     all_names = names | CompactOptions().to_dict().keys()
-    stored = {} if state is None else state.about["options"]
-    before = {name: value for name, value in stored.items() if name in all_names}
+    before = {name: value for name, value in (stored or {}).items() if name in all_names}
     recipe = settings.get("recipe", before.get("recipe"))
     merged = {"fit": "none"} | dict(RECIPES.get(str(recipe), {})) | before | dict(settings)
     online = OnlineOptions(**{name: merged.pop(name) for name in names if name in merged})

@@ -51,14 +51,16 @@ def release_memory() -> None:
             ctypes.CDLL(None).malloc_trim(0)
 
 
-def make_array(shape: tuple[int, ...], dtype: type[np.generic]) -> np.ndarray:
+def make_array(shape: tuple[int, ...], dtype: type[np.generic], mapped_bytes: int | None = None) -> np.ndarray:
     """Make an uninitialised array; a large one is mapped from an unnamed temporary file, if there is room.
+
+    ``mapped_bytes``: from how many bytes on it is large, at most ``MAPPED_BYTES``, which is also the default.
 
     A mapped array takes memory only while it is in use, and none after :func:`free_pages`. The file is in the system's
     temporary folder (``TMPDIR``), and goes with the array.
     """
     size = prod(shape) * np.dtype(dtype).itemsize
-    if size >= MAPPED_BYTES and hasattr(os, "posix_fallocate"):
+    if size >= min(MAPPED_BYTES, mapped_bytes or MAPPED_BYTES) and hasattr(os, "posix_fallocate"):
         with suppress(OSError), tempfile.TemporaryFile() as file:
             os.posix_fallocate(file.fileno(), 0, size)  # a page without room on the disk would end the process
             pages = mmap.mmap(file.fileno(), size)

@@ -194,7 +194,7 @@ def parse_crop(text: str) -> tuple[str, tuple[float, ...]]:
         >>> parse_crop("sphere:0,0,2,1.5")
         ('sphere', (0.0, 0.0, 2.0, 1.5))
     """
-    match = re.fullmatch(r"\s*(sphere|box)\s*:(.*)", text)
+    match = re.fullmatch(r"\s*(sphere|box)\s*:(.*)", str(text))
     try:
         numbers = tuple(float(part) for part in match[2].split(",")) if match else ()
     except ValueError:

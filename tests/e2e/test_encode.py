@@ -8,6 +8,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from hostile.gsm_files import with_about
 
 import gsmerge
 
@@ -97,6 +98,17 @@ def test_half_a_file_is_refused_and_nothing_is_lost(encoded: Path, tmp_path: Pat
     outcome = run("decode", tmp_path / "scene.gsm", "-o", tmp_path / "out.ply", "--overwrite")
     assert_refused(outcome, 3, tmp_path / "scene.gsm", "encode")
     assert (tmp_path / "out.ply").read_text() == "precious"
+
+
+def test_comments_of_the_source_are_copied_as_by_compact(encoded: Path, tmp_path: Path, run: Run) -> None:
+    """How to render the Gaussians, and nothing else: neither cameras nor megabytes."""
+    path, out = Path(shutil.copy(encoded, tmp_path / "scene.gsm")), tmp_path / "out.ply"
+    long = [f"SplatRenderMode: {i:01000}" for i in range(2000)]
+    cameras = ["gsmerge cameras: AAAA", "of no use", 5, None, "SplatRenderMode: mip\nelement vertex 1"]
+    with_about(source={"comments": [*long, *cameras, "SplatRenderMode: mip"]})(path)
+    run("decode", path, "-o", out, code=0)
+    assert gsmerge.read_ply(out).info.comments == ("gsmerge result", "SplatRenderMode: mip")
+    run("check", out, code=0)
 
 
 @pytest.mark.parametrize("ending", [".compressed.ply", ".spz", ".sog", ".splat", ".glb"])

@@ -6,13 +6,14 @@ sound files; ``gsm_files`` damages encoded scenes and states.
 
 from __future__ import annotations
 
-from . import array_files, camera_files, camera_models, chunks, glb_files, pictures, places, ply_files
+from . import array_files, camera_files, camera_models, chunks, glb_files, packed_files, pictures, places, ply_files
 from .array_files import MARKER
 from .case import Case
 
 CASES: dict[str, Case] = {
     **ply_files.CASES,
     **glb_files.CASES,
+    **packed_files.CASES,
     **camera_files.CASES,
     **camera_models.CASES,
     **array_files.CASES,

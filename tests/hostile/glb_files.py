@@ -75,6 +75,11 @@ def copies(parsed: dict[str, Any]) -> None:
     parsed["nodes"] = [{"children": list(range(1, DEEP))}, *([{"mesh": 0}] * DEEP)]
 
 
+def empty(parsed: dict[str, Any]) -> None:
+    """Nodes of a few bytes, each of which takes longer to place than they allow."""
+    parsed["nodes"] = [{"children": list(range(1, 200_000))}, *([{}] * 200_000)]
+
+
 def shared(parsed: dict[str, Any]) -> None:
     """All harmonics are the positions."""
     names = [f"{NAME}:SH_DEGREE_{d}_COEF_{i}" for d in (1, 2, 3) for i in range(2 * d + 1)]
@@ -118,7 +123,9 @@ def _cases() -> dict[str, Case]:
     cases["nodes in one another"] = Case(document(chain))
     cases["a node in itself"] = Case(placed("nodes", 0, "children", value=[0]), says=("scene.glb", "node 0"))
     cases["copies without end"] = Case(document(copies), says=("scene.glb", "same values"))
+    cases["200,000 empty nodes"] = Case(document(empty), says=("scene.glb", "nodes"))
     cases["values for many attributes"] = Case(document(shared), says=("scene.glb", "same values"))
+    cases["a count of true"] = Case(placed("accessors", 0, "count", value=True), says=("scene.glb", "True"))
     cases["a promise"] = Case(placed("accessors", 0, "count", value=10**9), says=("scene.glb", "1000000000"))
     return cases
 

@@ -44,6 +44,13 @@ def with_settings(**changes: Any) -> Spoil:
     return spoil
 
 
+def with_about(**changes: Any) -> Spoil:
+    def spoil(path: Path) -> None:
+        with_header(about=header(path)["about"] | changes)(path)
+
+    return spoil
+
+
 def without(name: str) -> Spoil:
     def spoil(path: Path) -> None:
         said = header(path)
@@ -70,6 +77,14 @@ def filled(value: float) -> Callable[[np.ndarray], np.ndarray]:
         return array
 
     return change
+
+
+def both(*spoils: Spoil) -> Spoil:
+    def spoil(path: Path) -> None:
+        for each in spoils:
+            each(path)
+
+    return spoil
 
 
 def cut(share: float) -> Spoil:
@@ -129,6 +144,16 @@ GSM_HEADERS: dict[str, Spoil] = {
     "most of none": with_settings(max_k=0),
     "an opacity of two": with_settings(min_opacity=2.0),
     "a share that is none": with_settings(min_contribution=float("nan")),
+    "a width of true": with_header(width=True),
+    "options and batches by number": with_about(options=5, batches=5),
+    "a source by number": with_about(source=5),
+    "notes in an object": with_about(notes={}),
+    "a version of true": with_about(gsmerge=True),
+    "a million objects": with_about(notes=[[]] * 3_000_000),
+    "harmonics of degree 5": both(
+        with_array("features.shN", lambda a: np.zeros((len(a), 35, 3), np.float32)),
+        with_array("kept.shN", lambda a: np.zeros((len(a), 35, 3), np.float32)),
+    ),
 }
 
 

@@ -197,6 +197,8 @@ def _headers() -> dict[str, Case]:
     out["1000 comments"] = Case(insert(vertex, *(["comment nothing"] * 1000)), READ)
     out["comment that is not ascii"] = Case(insert(vertex, "comment \xff\xfe"), READ)
     out["comment with an escape sequence"] = Case(insert(vertex, "comment \x1b[2J\x07"), READ)
+    elements = [line for i in range(20_000) for line in (f"element other_{i} 0", "property char a")]
+    out["20,000 elements"] = Case(insert("end_header", *elements), says=("scene.ply", "elements"))
     out["empty element"] = Case(insert("end_header", "element nothing 0", "property float a"), EITHER)
     out["big-endian by name only"] = Case(swap(LINES[1], "format binary_big_endian 1.0"))
     out["ascii by name only"] = Case(swap(LINES[1], "format ascii 1.0"))
@@ -261,6 +263,38 @@ def _texts() -> dict[str, Case]:
     return {f"ascii with {name}": Case(text(change), codes) for name, (change, codes) in changes.items()}
 
 
+def empty_lists(folder: Path) -> None:
+    """A million lists of a byte each, every one an object in memory."""
+    lines, body = parts(folder)
+    lines[-1:] = ["element face 1000000", "property list uchar uchar vertex_index", "end_header"]
+    put(folder, lines, body + bytes(1_000_000))
+
+
+def parts_with(opacity: float, count: int = COUNT // VIEWS) -> Spoil:
+    """A file for each view, the opacities of ``count`` rows of the second one changed."""
+
+    def spoil(folder: Path) -> None:
+        lines, body = parts(folder)
+        (folder / "scene.ply").unlink()
+        values = np.frombuffer(body, "<f4").reshape(VIEWS, -1, len(COLUMNS)).copy()
+        values[1, :count, 9] = opacity
+        for view, part in enumerate(values):
+            head = "\n".join([*lines, ""]).replace(str(COUNT), str(len(part)))
+            (folder / f"view_{view:03d}.ply").write_bytes(head.encode() + part.tobytes())
+
+    return spoil
+
+
+def _parts() -> dict[str, Case]:
+    return {
+        "parts": Case(parts_with(3.0), READ),
+        "parts of logits and of opacities": Case(
+            parts_with(0.9), says=("view_001.ply", "view_000.ply", "raw", "logit")
+        ),
+        "million empty lists after the vertices": Case(empty_lists, says=("scene.ply", "1,000,000")),
+    }
+
+
 def _packed() -> dict[str, Case]:
     return {
         "packed noise": Case(packed(), EITHER),
@@ -306,5 +340,5 @@ def _huge() -> dict[str, Case]:
     }
 
 
-GROUPS = (_truncations, _counts, _headers, _values, _texts, _packed, _huge)
+GROUPS = (_truncations, _counts, _headers, _values, _texts, _parts, _packed, _huge)
 CASES = {f"ply: {name}": case for group in GROUPS for name, case in group().items()}

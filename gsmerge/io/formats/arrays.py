@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from gsmerge.geometry import morton_codes, sh0_to_rgb
+from gsmerge.io.bounds import ReadBudget
 from gsmerge.kernels.elementary import log
 from gsmerge.types import Array, Gaussians, as_array
 
@@ -15,6 +16,7 @@ MAX_LOG_SCALE = 30.0  # exp(30) squared and exp(-30) squared are still normal fl
 LOGIT_COMMENT = "opacity: logit"  # so that our own files are never guessed at
 RESULT_COMMENT = "gsmerge result"  # in its place in results of commands; as long, so that sizes stay the same
 RENDER_COMMENT = "SplatRenderMode"  # brush writes it: plain, or mip for Gaussians with a filter of their own
+MAX_COPIED, MAX_COPIED_LINES = 100, 10  # characters of a comment that is copied to other files, and such comments
 MIP_COMMENT = f"{RENDER_COMMENT}: mip"
 
 MEANS, NORMALS = ("x", "y", "z"), ("nx", "ny", "nz")
@@ -23,11 +25,20 @@ RGB = ("red", "green", "blue")  # instead of the former, in nerfstudio's files o
 SCALES = ("scale_0", "scale_1", "scale_2")
 QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 REQUIRED = (*MEANS, *SH0, "opacity", *SCALES, *QUATS)
+_UNPACKING = 16_000_000  # bytes of the blocks that are unpacked at a time
+GAUSSIAN_BYTES = 4 * len(REQUIRED) + 1  # in memory, without higher harmonics, and whether it is finite
 
 
 def sh_degree(num_higher: int) -> int:
     """Return the SH degree for ``num_higher`` coefficients above degree 0."""
     return round((num_higher + 1) ** 0.5) - 1
+
+
+def copied_comments(comments: Sequence[object]) -> tuple[str, ...]:
+    """Return the comments of a file that copies of its Gaussians keep: how to render them, in a few short lines."""
+    lines = (line for line in comments if isinstance(line, str) and len(line) <= MAX_COPIED)
+    kept = (line for line in lines if line.startswith(RENDER_COMMENT) and line.isascii() and line.isprintable())
+    return tuple(dict.fromkeys(kept))[:MAX_COPIED_LINES]
 
 
 def color_columns(names: tuple[str, ...] | None) -> tuple[str, ...]:
@@ -67,22 +78,68 @@ class Columns:
         return Columns(*(column[rows] for column in vars(self).values()))
 
 
-def concatenate(parts: Sequence[Columns]) -> Columns:
-    """Concatenate rows; missing higher harmonics become zeros."""
-    most = max(part.harmonics.shape[1] for part in parts)
+def concatenate(parts: Sequence[Columns], num_higher: int) -> Columns:
+    """Concatenate rows with ``num_higher`` harmonics above degree 0; missing ones become zeros."""
+    if len(parts) == 1 and parts[0].harmonics.shape[1] == num_higher:
+        return parts[0]
 
     def widen(harmonics: np.ndarray) -> np.ndarray:
-        return np.pad(harmonics, ((0, 0), (0, most - harmonics.shape[1]), (0, 0)))
+        return np.pad(harmonics, ((0, 0), (0, num_higher - harmonics.shape[1]), (0, 0)))
 
     even = [replace(part, harmonics=widen(part.harmonics)) for part in parts]
     return Columns(*(np.concatenate([vars(part)[f.name] for part in even]) for f in fields(Columns)))
 
 
 @dataclass(frozen=True)
+class Packed:
+    """``count`` Gaussians as a file packs them; ``unpack``, which is thread-safe, returns a block of them.
+
+    All at once would take several times the memory of both the file and the result.
+    """
+
+    count: int
+    num_higher: int  # harmonics above degree 0
+    unpack: Callable[[slice], Columns]
+
+
+@dataclass(frozen=True)
+class PackedRows:
+    """Rows of a PLY file, of which each block is unpacked when it is taken."""
+
+    parts: Sequence[Packed]
+    dtype: np.dtype[np.void]
+
+    def __len__(self) -> int:
+        return sum(part.count for part in self.parts)
+
+    def __getitem__(self, block: slice) -> np.ndarray:
+        start, stop, _ = block.indices(len(self))
+        num_higher, first, columns = _num_rest(self.dtype) // 3, 0, []
+        with np.errstate(all="ignore"):  # a scale of 0 is a value, what is not finite is set aside later
+            for part in self.parts:
+                inside = slice(max(start - first, 0), min(stop - first, part.count))
+                columns += [part.unpack(inside)] if inside.start < inside.stop else []
+                first += part.count
+            return _to_table(concatenate(columns, num_higher)).view(self.dtype)[:, 0]
+
+
+def _num_rest(row: np.dtype[np.void]) -> int:
+    return sum(name.startswith("f_rest_") for name in row.names or ())
+
+
+def _to_table(columns: Columns) -> np.ndarray:
+    """Put columns side by side in the order of :func:`pack_rows`, as float32."""
+    count, num_higher = columns.harmonics.shape[:2]
+    harmonics = columns.harmonics.transpose(0, 2, 1).reshape(count, 3 * num_higher)
+    parts = (columns.means, columns.sh0, harmonics, columns.opacities[:, None], columns.log_scales, columns.quats)
+    return np.concatenate(parts, axis=1, dtype=np.float32, casting="same_kind")
+
+
+@dataclass(frozen=True)
 class StoredRows:
     """Gaussians as a file stores them; ``rows`` has the columns of a PLY file, at least ``REQUIRED``."""
 
-    rows: np.ndarray
+    rows: np.ndarray | PackedRows
     layout: str  # for people
     format: str
     encoding: str | None  # of the opacities: "logit", "raw", or None where the file does not say
@@ -92,22 +149,35 @@ class StoredRows:
     bytes_beside: int = 0  # of other files that the rows are in
 
 
-def to_rows(columns: Columns, name: str, sizes: dict[str, int], *, mip: bool = False) -> StoredRows:
-    """Convert columns to rows of a PLY file; ``sizes``: bytes by attribute, ``mip``: antialiased."""
-    count, num_higher = columns.harmonics.shape[:2]
-    names = (*MEANS, *SH0, *(f"f_rest_{i}" for i in range(3 * num_higher)), "opacity", *SCALES, *QUATS)
-    harmonics = columns.harmonics.transpose(0, 2, 1).reshape(count, 3 * num_higher)
-    parts = (columns.means, columns.sh0, harmonics, columns.opacities[:, None], columns.log_scales, columns.quats)
-    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is set aside later
-        table = np.concatenate(parts, axis=1, dtype=np.float32, casting="same_kind")
+def pack_rows(parts: Sequence[Packed]) -> PackedRows:
+    """Make rows of a PLY file of packed Gaussians, with the harmonics of the part that has most."""
+    num_rest = 3 * max(part.num_higher for part in parts)
+    names = (*MEANS, *SH0, *(f"f_rest_{i}" for i in range(num_rest)), "opacity", *SCALES, *QUATS)
+    return PackedRows(parts, np.dtype([(name, np.float32) for name in names]))
+
+
+def to_stored(parts: Sequence[Packed], name: str, sizes: dict[str, int], *, mip: bool = False) -> StoredRows:
+    """Describe packed Gaussians as a file's content; ``sizes``: bytes by attribute, ``mip``: antialiased."""
+    rows = pack_rows(parts)
     return StoredRows(
-        rows=table.view([(column, np.float32) for column in names])[:, 0],
-        layout=f"{name}, SH degree {sh_degree(num_higher)}",
+        rows=rows,
+        layout=f"{name}, SH degree {sh_degree(_num_rest(rows.dtype) // 3)}",
         format="quantised",
         encoding="raw",
         sizes=sizes,
         comments=(MIP_COMMENT,) if mip else (),
     )
+
+
+def most_in_memory(file_bytes: int) -> int:
+    """Return from how many bytes on an array of a file's Gaussians is mapped: harmonics may be many times the file."""
+    return max(1 << 25, 8 * file_bytes)
+
+
+def check_count(budget: ReadBudget, count: int, num_higher: int, packed_bytes: int) -> None:
+    """Raise SceneError if Gaussians of ``packed_bytes`` each are more than the file's bytes allow."""
+    beside = min(12 * num_higher * count, most_in_memory(budget.file_bytes)) + _UNPACKING
+    budget.check_memory(count * (packed_bytes + GAUSSIAN_BYTES) + beside, f"{count:,} Gaussians")
 
 
 def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Columns:

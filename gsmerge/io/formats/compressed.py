@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from plyfile import PlyData, PlyElement, PlyListProperty
+from plyfile import PlyData, PlyListProperty
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import rgb_to_sh0
@@ -26,6 +26,7 @@ RANGES = (
 )
 COLORS = tuple(f"{end}_{channel}" for end in ("min", "max") for channel in "rgb")
 SH_RANGE = 8.0  # bytes of harmonics span -4 to 4
+_HARMONICS = (np.r_[0, (np.arange(1, 255) + 0.5) / 256, 1].astype(np.float32) - 0.5) * SH_RANGE  # of each byte
 MAX_DEGREE = 3  # of the harmonics that are written
 
 
@@ -34,8 +35,8 @@ def is_compressed(data: PlyData) -> bool:
     return "chunk" in data and "vertex" in data and {p.name for p in data["vertex"].properties} >= set(PACKED)
 
 
-def unpack(path: Path, data: PlyData) -> np.ndarray:
-    """Unpack a compressed PLY to the rows of an ordinary one, with opacities as logits."""
+def packed_rows(path: Path, data: PlyData) -> arrays.PackedRows:
+    """Return the rows of a compressed PLY as those of an ordinary one, with opacities as logits."""
     vertex, chunk = data["vertex"], data["chunk"]
     for element, needed, types in ((vertex, PACKED, ("u4", "i4")), (chunk, RANGES, ("f4", "f8"))):
         dtypes = {p.name: p.val_dtype for p in element.properties if not isinstance(p, PlyListProperty)}
@@ -49,25 +50,28 @@ def unpack(path: Path, data: PlyData) -> np.ndarray:
     if chunk.count < num_chunks:
         problem = f"expected {num_chunks} chunks for {count} Gaussians, found {chunk.count}"
         raise SceneError(path, problem, "export it again")
-    num_rest = _num_rest(path, data, count)
-    rows = np.empty(count, [(name, "<f4") for name in (*arrays.REQUIRED, *(f"f_rest_{i}" for i in range(num_rest)))])
-    words = {name: np.asarray(vertex[name]).astype(np.uint32) for name in PACKED}
-    with np.errstate(all="ignore"):  # what is not finite is set aside later
-        _fill_between(rows, arrays.MEANS, _shares(words["packed_position"], (11, 10, 11)), chunk, RANGES[:6])
-        _fill_between(rows, arrays.SCALES, _shares(words["packed_scale"], (11, 10, 11)), chunk, RANGES[6:])
-        *colors, alpha = _shares(words["packed_color"], (8, 8, 8, 8))
-        _fill_between(rows, arrays.SH0, colors, chunk, COLORS)
-        rows["opacity"] = log(alpha) - log1p(-alpha)  # infinite for 0 and 1, which the reader takes as such
+    num_higher = _num_rest(path, data, count) // 3
+    return arrays.pack_rows([arrays.Packed(count, num_higher, lambda block: _unpack(data, num_higher, block))])
+
+
+def _unpack(data: PlyData, num_higher: int, block: slice) -> arrays.Columns:
+    vertex, chunk = data["vertex"].data[block], data["chunk"].data
+    words = {name: vertex[name].astype(np.uint32) for name in PACKED}
+    ids = np.arange(block.start, block.stop) // CHUNK
+    *colors, alpha = _shares(words["packed_color"], (8, 8, 8, 8))
     largest = (words["packed_rotation"] >> np.uint32(30)).astype(np.int64)  # of wxyz
     smallest = np.stack(_shares(words["packed_rotation"], (10, 10, 10)), 1) - 0.5  # within +-sqrt(1/2)
-    quats = arrays.from_smallest_three(largest, smallest * np.sqrt(2.0))
-    for i, name in enumerate(arrays.QUATS):
-        rows[name] = quats[:, i]
-    for i in range(num_rest):
-        stored = np.asarray(data["sh"][f"f_rest_{i}"], np.float32)
-        share = np.where(stored == 0, 0, np.where(stored == 255, 1, (stored + 0.5) / 256))
-        rows[f"f_rest_{i}"] = (share - 0.5) * SH_RANGE
-    return rows
+    codes = np.empty((len(vertex), 3 * num_higher), np.uint8)
+    for i in range(3 * num_higher):
+        codes[:, i] = data["sh"].data[f"f_rest_{i}"][block]
+    return arrays.Columns(
+        means=_between(_shares(words["packed_position"], (11, 10, 11)), chunk, RANGES[:6], ids),
+        quats=arrays.from_smallest_three(largest, smallest * np.sqrt(2.0)),
+        log_scales=_between(_shares(words["packed_scale"], (11, 10, 11)), chunk, RANGES[6:], ids),
+        opacities=log(alpha) - log1p(-alpha),  # infinite for 0 and 1, which the reader takes as such
+        sh0=rgb_to_sh0(_between(colors, chunk, COLORS, ids)),
+        harmonics=_HARMONICS[codes.reshape(len(vertex), 3, num_higher).transpose(0, 2, 1)],
+    )
 
 
 def _num_rest(path: Path, data: PlyData, count: int) -> int:
@@ -80,17 +84,12 @@ def _num_rest(path: Path, data: PlyData, count: int) -> int:
     return number
 
 
-def _fill_between(
-    rows: np.ndarray, columns: tuple[str, ...], shares: list[np.ndarray], chunk: PlyElement, ranges: tuple[str, ...]
-) -> None:
-    """Fill three columns from shares between a chunk's least and largest values, if the file has them."""
-    ids, dtype = np.arange(len(rows)) // CHUNK, chunk.data.dtype
-    has_ranges = all(name in dtype.names and dtype[name].kind == "f" for name in ranges)
-    for column, share, low, high in zip(columns, shares, ranges[:3], ranges[3:], strict=True):
-        if has_ranges:
-            least, most = (np.asarray(chunk[name], np.float32)[ids] for name in (low, high))
-            share = least * (1 - share) + most * share
-        rows[column] = rgb_to_sh0(share) if column in arrays.SH0 else share
+def _between(shares: list[np.ndarray], chunk: np.ndarray, ranges: tuple[str, ...], ids: np.ndarray) -> np.ndarray:
+    """Return ``[n,3]`` numbers from shares between the least and largest values of chunks, if the file has them."""
+    if all(name in (chunk.dtype.names or ()) and chunk.dtype[name].kind == "f" for name in ranges):
+        ends = [chunk[name][ids].astype(np.float32) for name in ranges]
+        shares = [low * (1 - share) + high * share for share, low, high in zip(shares, ends, ends[3:], strict=False)]
+    return np.stack(shares, 1)
 
 
 def _shares(words: np.ndarray, bits: tuple[int, ...]) -> list[np.ndarray]:
@@ -129,8 +128,6 @@ def compressed_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> byte
 def _ranged(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the float32 minima and maxima ``[c,3]`` of each chunk, and all values between 0 and 1."""
     starts = np.arange(0, len(values), CHUNK)
-    if len(starts) == 0:
-        return values, values, values
     low, high = (end.reduceat(values, starts).astype(np.float32).astype(float) for end in (np.minimum, np.maximum))
     ids, span = np.arange(len(values)) // CHUNK, high - low
     return low, high, (values - low[ids]) / np.where(span > 0, span, 1)[ids]

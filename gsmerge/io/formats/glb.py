@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,9 +18,9 @@ from typing import IO, Any
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import multiply_quats, quat_to_rotmat, rgb_to_sh0, rotmat_to_quat, turn_harmonics
-from gsmerge.io.bounds import MAX_TEXT_BYTES, check_file, read_errors
-from gsmerge.io.formats.arrays import Columns, StoredRows, concatenate, to_bytes, to_columns, to_rows
+from gsmerge.geometry import apply_turn, harmonics_turn, multiply_quats, quat_to_rotmat, rgb_to_sh0, rotmat_to_quat
+from gsmerge.io.bounds import ReadBudget, check_whole, parse_json, read_budget, read_errors
+from gsmerge.io.formats.arrays import Columns, Packed, StoredRows, to_bytes, to_columns, to_stored
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Gaussians
@@ -35,6 +35,8 @@ _WIDTHS = {name: width for width, name in _TYPES.items()}
 _DTYPES = {5120: "<i1", _BYTE: "<u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
+_MAX_STRIDE = 252  # bytes from a value to the next that glTF allows
+_STEPS_PER_NODE, _STEPS_PER_PART = 4, 100  # of a budget's 20 microseconds
 _EVEN = 1e-3  # by how much the scales of a node's axes may differ, and its axes be oblique
 
 
@@ -53,36 +55,35 @@ def glb_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
         values[f"{NAME}:SH_DEGREE_{degree}_COEF_{i + 1 - degree**2}"] = columns.harmonics[:, i]
     attributes = {name: array.astype("<f4") for name, array in values.items()}
     attributes["COLOR_0"] = to_bytes(255 * np.concatenate([columns.colors, columns.opacities[:, None]], 1))
-    document: dict[str, Any] = {"asset": {"version": "2.0", "generator": "gsmerge"}, "scene": 0, "scenes": [{}]}
-    content = b""
-    if len(gaussians):
-        at, views = 0, []
-        accessors: list[dict[str, Any]] = []
-        for array in attributes.values():
-            views.append({"buffer": 0, "byteOffset": at, "byteLength": array.nbytes, "target": _VERTICES})
-            kind = {"componentType": _BYTE, "normalized": True}
-            if array.dtype != np.uint8:
-                kind = {"componentType": _FLOAT}
-            shape = {"count": len(array), "type": _TYPES[array[0].size]}
-            accessors.append({"bufferView": len(accessors), **kind, **shape})
-            at += array.nbytes
-        for name, end in (("min", np.min), ("max", np.max)):  # of the positions, which glTF asks for
-            accessors[0][name] = end(attributes["POSITION"], axis=0).tolist()
-        content = b"".join(array.tobytes() for array in attributes.values())
-        splats = {"kernel": "ellipse", "colorSpace": COLOR_SPACE}
-        splats |= {"sortingMethod": "cameraDistance", "projection": "perspective"}
-        places = {name: i for i, name in enumerate(attributes)}
-        document |= {
-            "extensionsUsed": [NAME],
-            "scenes": [{"nodes": [0]}],
-            "nodes": [{"mesh": 0, "rotation": [0, 0, 1, 0]}],
-            "meshes": [{"primitives": [{"attributes": places, "mode": _POINTS, "extensions": {NAME: splats}}]}],
-            "accessors": accessors,
-            "bufferViews": views,
-            "buffers": [{"byteLength": len(content)}],
-        }
+    at, views = 0, []
+    accessors: list[dict[str, Any]] = []
+    for array in attributes.values():
+        views.append({"buffer": 0, "byteOffset": at, "byteLength": array.nbytes, "target": _VERTICES})
+        kind = {"componentType": _BYTE, "normalized": True}
+        if array.dtype != np.uint8:
+            kind = {"componentType": _FLOAT}
+        shape = {"count": len(array), "type": _TYPES[array[0].size]}
+        accessors.append({"bufferView": len(accessors), **kind, **shape})
+        at += array.nbytes
+    for name, end in (("min", np.min), ("max", np.max)):  # of the positions, which glTF asks for
+        accessors[0][name] = end(attributes["POSITION"], axis=0).tolist()
+    content = b"".join(array.tobytes() for array in attributes.values())
+    splats = {"kernel": "ellipse", "colorSpace": COLOR_SPACE}
+    splats |= {"sortingMethod": "cameraDistance", "projection": "perspective"}
+    places = {name: i for i, name in enumerate(attributes)}
+    document = {
+        "asset": {"version": "2.0", "generator": "gsmerge"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "extensionsUsed": [NAME],
+        "nodes": [{"mesh": 0, "rotation": [0, 0, 1, 0]}],
+        "meshes": [{"primitives": [{"attributes": places, "mode": _POINTS, "extensions": {NAME: splats}}]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": len(content)}],
+    }
     text = json.dumps(document, separators=(",", ":")).encode("ascii")
-    chunks = _chunk(b"JSON", text, b" ") + (_chunk(b"BIN\0", content, b"\0") if content else b"")
+    chunks = _chunk(b"JSON", text, b" ") + _chunk(b"BIN\0", content, b"\0")
     return _HEADER.pack(b"glTF", 2, _HEADER.size + len(chunks)) + chunks
 
 
@@ -95,23 +96,24 @@ def holds_gaussians(path: Path) -> bool:
     """Return whether a ``.glb`` names the extension; True for one that cannot be read, so that its reader says why."""
     try:
         with _damage(path), path.open("rb") as file:
-            return NAME in str(_read_document(file, check_file(path)).get("extensionsUsed"))
+            return NAME in str(_read_document(file, read_budget(path)).get("extensionsUsed"))
     except SceneError:
         return True
 
 
 def read_rows(path: Path) -> StoredRows:
     """Read all Gaussians of a ``.glb`` in the frame of a ``.ply``; SceneError if there are none, or it is damaged."""
-    size = check_file(path)
-    sizes: dict[str, int] = {}
-    # a scale of 0 is a value, what is not finite is set aside later
-    with _damage(path), path.open("rb") as file, np.errstate(all="ignore"):
-        content = _Content(file, _read_document(file, size), file.tell(), size)
-        parts = [_move(_read_splats(content, mesh, sizes), place) for mesh, place in _walk_splats(content.document)]
+    budget, parts, sizes = read_budget(path), list[Packed](), dict[str, int]()
+    with _damage(path), path.open("rb") as file, np.errstate(all="ignore"):  # what is not finite is set aside later
+        document = _read_document(file, budget)
+        content = _Content(file, document, file.tell(), budget.file_bytes)
+        for mesh, place in _walk_splats(document, budget):
+            budget.check_steps(_STEPS_PER_PART * len(parts), "steps for meshes")
+            parts.append(_read_splats(content, mesh, place, sizes))
     if not parts:
         problem = f"expected Gaussians ({NAME}), found a .glb of points or a mesh"
         raise SceneError(path, problem, "name the .ply that the model wrote with it")
-    return replace(to_rows(concatenate(parts), ".glb", sizes), format="binary little-endian")
+    return replace(to_stored(parts, ".glb", sizes), format="binary little-endian")
 
 
 @contextmanager
@@ -130,6 +132,18 @@ class _ForeignError(ValueError):
 
 
 @dataclass(frozen=True)
+class _Values:
+    """Values ``[n,width]`` of an accessor as they are stored; blocks of them are float64."""
+
+    stored: np.ndarray
+    most: int  # what stands for 1
+
+    def __getitem__(self, block: slice) -> np.ndarray:
+        rows = self.stored[block]
+        return np.maximum(rows / self.most, -1) if self.most > 1 else rows.astype(np.float64)
+
+
+@dataclass(frozen=True)
 class _Content:
     """The content of a ``.glb`` whose binary chunk, of ``end - start`` bytes, is read part by part."""
 
@@ -137,10 +151,10 @@ class _Content:
     document: dict[str, Any]
     start: int
     end: int
-    num_read: list[int] = field(default_factory=list)  # bytes of all parts so far, which are different ones
+    num_read: list[int] = field(default_factory=lambda: [0])  # bytes of all parts so far, which are different ones
 
-    def values(self, accessor_id: int) -> np.ndarray:
-        """Read the values ``[n,width]`` of an accessor as float64, which have to be in the chunk."""
+    def values(self, accessor_id: int) -> _Values:
+        """Read the values of an accessor, which have to be in the chunk."""
         accessor = self.document["accessors"][accessor_id]
         if "sparse" in accessor or "bufferView" not in accessor:
             raise _ForeignError("one with sparse values")
@@ -148,32 +162,32 @@ class _Content:
         if view.get("extensions") or view["buffer"] != 0 or "uri" in self.document["buffers"][0]:
             raise _ForeignError(f"one with compressed values or values in another file ({list(view)})")
         dtype, width = np.dtype(_DTYPES[accessor["componentType"]]), _WIDTHS[accessor["type"]]
-        each, count, first = dtype.itemsize * width, accessor["count"], accessor.get("byteOffset", 0)
-        stride = view.get("byteStride", each)
+        each, first = dtype.itemsize * width, accessor.get("byteOffset", 0)
+        count, stride = check_whole(accessor["count"], "count", 1), view.get("byteStride", each)
         span, at = (count - 1) * stride + each, self.start + view.get("byteOffset", 0) + first
-        self.num_read.append(count * each)
+        self.num_read[0] += count * each
         inside = first >= 0 and first + span <= view["byteLength"] and self.start <= at and at + span <= self.end
-        if count < 1 or stride < each or not inside:
+        if not each <= stride <= _MAX_STRIDE or not inside:
             raise _ForeignError(f"one that is cut: {count} values of {each} bytes are not in its {self.end} bytes")
-        if sum(self.num_read) > self.end - self.start:
+        if self.num_read[0] > self.end - self.start:
             raise _ForeignError("one that shows the same values in several places")
         self.file.seek(at)
         rows = np.ndarray((count, width), dtype, self.file.read(span), strides=(stride, dtype.itemsize))
-        most = np.iinfo(dtype).max if accessor.get("normalized") else 1
-        return np.maximum(rows / most, -1) if most > 1 else rows.astype(np.float64)
+        return _Values(np.ascontiguousarray(rows), np.iinfo(dtype).max if accessor.get("normalized") else 1)
 
 
-def _read_document(file: IO[bytes], size: int) -> dict[str, Any]:
+def _read_document(file: IO[bytes], budget: ReadBudget) -> dict[str, Any]:
     """Read the JSON of a ``.glb``, and go to the start of its binary chunk."""
+    size = budget.file_bytes
     start = file.read(_HEADER.size + _CHUNK.size)
     if len(start) < _HEADER.size + _CHUNK.size:
         raise _ForeignError("an early end of file")
     (magic, version, total), (length, kind) = _HEADER.unpack_from(start), _CHUNK.unpack_from(start, _HEADER.size)
     if (magic, version, kind) != (b"glTF", 2, b"JSON"):
         raise _ForeignError("a file that is no binary glTF 2.0")
-    if total > size or length > min(total - len(start), MAX_TEXT_BYTES):
-        raise _ForeignError(f"one that is cut: {max(total, length)} bytes are not in its {size}, or of JSON too many")
-    document = json.loads(file.read(length))
+    if total > size or length > total - len(start):
+        raise _ForeignError(f"one that is cut: {max(total, length)} bytes are not in its {size}")
+    document = parse_json(file.read(length).decode("utf-8-sig"), budget)
     if not isinstance(document, dict):
         raise _ForeignError("one without an object of JSON")
     missing = set(document.get("extensionsRequired", ())) - READ_EXTENSIONS
@@ -183,9 +197,10 @@ def _read_document(file: IO[bytes], size: int) -> dict[str, Any]:
     return document
 
 
-def _walk_splats(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
+def _walk_splats(document: dict[str, Any], budget: ReadBudget) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
     """Yield the primitives of Gaussians, and the matrix ``[4,4]`` of each into the frame of a ``.ply``."""
     scenes, nodes, seen = document.get("scenes") or [{}], document.get("nodes", []), set[int]()
+    budget.check_steps(_STEPS_PER_NODE * len(nodes), "steps for nodes")
     stack = [(node_id, _HALF_TURN) for node_id in scenes[document.get("scene", 0)].get("nodes", [])]
     while stack:
         node_id, above = stack.pop()
@@ -209,44 +224,54 @@ def _node_matrix(node: dict[str, Any]) -> np.ndarray:
     return matrix
 
 
-def _read_splats(content: _Content, primitive: dict[str, Any], sizes: dict[str, int]) -> Columns:
-    """Read the columns of one primitive, and add their bytes to ``sizes`` by attribute."""
+def _read_splats(content: _Content, primitive: dict[str, Any], place: np.ndarray, sizes: dict[str, int]) -> Packed:
+    """Read one primitive, which ``place [4,4]`` moves, and add its bytes to ``sizes`` by attribute."""
     splats, attributes = primitive["extensions"][NAME], primitive["attributes"]
     kernel, space = splats.get("kernel", "ellipse"), splats.get("colorSpace", COLOR_SPACE)
     if splats.get("extensions") or (kernel, space) != ("ellipse", COLOR_SPACE):
         more = ", ".join(map(str, splats.get("extensions") or (kernel, space)))
         raise _ForeignError(f"Gaussians of another kind ({more})")
 
-    def read(kind: str, width: int, *names: str) -> np.ndarray:
+    def read(kind: str, width: int, *names: str) -> _Values:
         name = next((name for name in names if name in attributes), None)
         if name is None:
             raise _ForeignError(f"one whose Gaussians have no {names[0]}")
-        before = sum(content.num_read)
+        before = content.num_read[0]
         values = content.values(attributes[name])
-        if values.shape[1] != width:
-            raise _ForeignError(f"one with {values.shape[1]} numbers of {name} each")
-        sizes[kind] = sizes.get(kind, 0) + sum(content.num_read) - before
+        if values.stored.shape[1] != width:
+            raise _ForeignError(f"one with {values.stored.shape[1]} numbers of {name} each")
+        sizes[kind] = sizes.get(kind, 0) + content.num_read[0] - before
         return values
 
     means, scales = read("means", 3, "POSITION"), read("scales", 3, f"{NAME}:SCALE", "_SCALE")
-    quats, names = np.roll(read("quats", 4, f"{NAME}:ROTATION", "_ROTATION"), 1, axis=1), _harmonic_names(attributes)
+    quats, names = read("quats", 4, f"{NAME}:ROTATION", "_ROTATION"), _harmonic_names(attributes)
     if names:
         sh0, *harmonics = [read("shN" if i else "sh0", 3, name) for i, name in enumerate(names)]
         opacities = read("opacities", 1, f"{NAME}:OPACITY")
     else:
-        colors, harmonics = read("sh0", 4, "COLOR_0"), []
-        sh0, opacities = rgb_to_sh0(colors[:, :3]), colors[:, 3:]
-    count = len(means)
-    if any(len(column) != count for column in (quats, scales, sh0, opacities, *harmonics)):
+        sh0, harmonics, opacities = read("sh0", 4, "COLOR_0"), [], None
+    count = len(means.stored)
+    columns = (quats, scales, sh0, *([] if opacities is None else [opacities]), *harmonics)
+    if any(len(column.stored) != count for column in columns):
         raise _ForeignError(f"one with values for others than its {count} Gaussians")
-    return Columns(
-        means=means,
-        quats=quats,
-        log_scales=scales if scales.min() < 0 else log(scales),
-        opacities=opacities[:, 0],
-        sh0=sh0,
-        harmonics=np.stack(harmonics, 1) if harmonics else np.zeros((count, 0, 3)),
-    )
+    are_logs, move = scales.stored.min() < 0, _mover(place, len(harmonics))
+
+    def unpack(block: slice) -> Columns:
+        colors = sh0[block]
+        return move(
+            Columns(
+                means=means[block],
+                quats=np.roll(quats[block], 1, axis=1),
+                log_scales=scales[block] if are_logs else log(scales[block]),
+                opacities=colors[:, 3] if opacities is None else opacities[block][:, 0],
+                sh0=rgb_to_sh0(colors[:, :3]) if opacities is None else colors,
+                harmonics=np.stack([values[block] for values in harmonics], 1)
+                if harmonics
+                else np.zeros((len(colors), 0, 3)),
+            )
+        )
+
+    return Packed(count, len(harmonics), unpack)
 
 
 def _harmonic_names(attributes: dict[str, Any]) -> list[str]:
@@ -256,20 +281,21 @@ def _harmonic_names(attributes: dict[str, Any]) -> list[str]:
     return [name for degree in names[:num_degrees] for name in degree]
 
 
-def _move(columns: Columns, place: np.ndarray) -> Columns:
-    """Move Gaussians by the matrix of their node ``[4,4]``, which has to be a similarity."""
+def _mover(place: np.ndarray, num_higher: int) -> Callable[[Columns], Columns]:
+    """Return what moves Gaussians by the matrix of their node ``[4,4]``, which has to be a similarity."""
     if np.array_equal(place, np.eye(4)):
-        return columns
+        return lambda columns: columns
     scale = np.sqrt((place[:3, :3] ** 2).sum(0)).mean()
     rotation = place[:3, :3] / scale
     oblique = np.abs(matmul(rotation.T, rotation) - np.eye(3)).max()
     mirrored = (np.cross(rotation[0], rotation[1]) * rotation[2]).sum() < 0
     if mirrored or not (np.isfinite(place).all() and oblique < _EVEN):
         raise _ForeignError("one with a node that stretches or mirrors its Gaussians")
-    return replace(
+    quat, turn = rotmat_to_quat(rotation[None])[0], harmonics_turn(num_higher, rotation) if num_higher else None
+    return lambda columns: replace(
         columns,
         means=scale * matmul(columns.means, rotation.T) + place[:3, 3],
-        quats=multiply_quats(rotmat_to_quat(rotation[None])[0], columns.quats),
+        quats=multiply_quats(quat, columns.quats),
         log_scales=columns.log_scales + float(log(scale)),
-        harmonics=turn_harmonics(columns.harmonics, rotation),
+        harmonics=columns.harmonics if turn is None else apply_turn(columns.harmonics, turn),
     )

@@ -17,9 +17,9 @@ import numpy as np
 from plyfile import PlyData, PlyElement, PlyElementParseError, PlyListProperty, PlyParseError
 
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.io.bounds import check_file
+from gsmerge.io.bounds import ReadBudget, check_file, read_budget
 from gsmerge.io.formats import arrays
-from gsmerge.io.formats.compressed import is_compressed, unpack
+from gsmerge.io.formats.compressed import is_compressed, packed_rows
 from gsmerge.kernels.elementary import log, log1p
 from gsmerge.types import Gaussians
 
@@ -29,7 +29,10 @@ MAX_LOGIT = 16.0  # from 16.6 on the sigmoid is 1 in float32, and its logit infi
 BLOCK_BYTES = 1 << 19  # of file rows converted at a time: they stay in the cache from the first column to the last
 
 MAX_HEADER_BYTES = 1 << 20
+MAX_LINE = 1 << 20  # characters of a row of text: its words take many times as much memory
 MAX_LIST_VALUES = 1_000_000  # of elements with lists, which are read one value at a time
+_LIST_BYTES = 140  # of memory for each of these values
+_STEPS_PER_ELEMENT = 50  # of a budget's 20 microseconds: several readers open a file one after the other
 _SIZES = {
     **dict.fromkeys(("char", "uchar", "int8", "uint8", "i1", "u1", "b1"), 1),
     **dict.fromkeys(("short", "ushort", "int16", "uint16", "i2", "u2"), 2),
@@ -42,7 +45,7 @@ def read_rows(path: Path) -> arrays.StoredRows:
     """Open the rows of a PLY file, to be read by :func:`open_rows`; SceneError if it holds no Gaussians."""
     data = open_ply(path)
     compressed = is_compressed(data)
-    rows = unpack(path, data) if compressed else _vertex(path, data).data
+    rows = packed_rows(path, data) if compressed else _vertex(path, data).data
     names = tuple(rows.dtype.names or ())
     comments = (*data.comments, *(c for e in data.elements for c in e.comments))
     return arrays.StoredRows(
@@ -126,14 +129,14 @@ def open_ply(path: Path) -> PlyData:
 
     SceneError if it is no PLY file, is truncated or damaged, or its header promises more than it has.
     """
-    size = check_file(path)
+    budget = read_budget(path)
     try:
         with path.open("rb") as file:
             start = file.read(MAX_HEADER_BYTES)
         if start[:4] not in (b"ply\n", b"ply\r"):
             problem = "expected a PLY file, found one that does not start with the line 'ply'"
             raise SceneError(path, problem, "name the .ply")
-        end, text = _check_header(path, start, size)
+        end, text = _check_header(start, budget)
         with _stream(path, end, text=text) as file, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # an empty list, a number beyond the column's type
             data = PlyData.read(file, mmap="r")
@@ -163,9 +166,9 @@ def _stream(path: Path, end: int, *, text: bool) -> IO[Any]:
 
 class _TextRows(TextIOWrapper):
     def readline(self, size: int = -1, /) -> str:  # type: ignore[override]  # bytes in the base of all
-        line = super().readline(size)
+        line = super().readline(MAX_LINE)
         while line and not line.strip():
-            line = super().readline(size)
+            line = super().readline(MAX_LINE)
         return line
 
 
@@ -180,7 +183,7 @@ class _BinaryRows(BufferedReader):
 
 
 @contextmanager
-def open_rows(path: Path, rows: np.ndarray) -> Iterator[Callable[[slice], np.ndarray]]:
+def open_rows(path: Path, rows: np.ndarray | arrays.PackedRows) -> Iterator[Callable[[slice], np.ndarray]]:
     """Yield a thread-safe function that returns blocks of a PLY file's rows.
 
     A mapped file that becomes shorter would end the process; here it raises SceneError.
@@ -211,8 +214,8 @@ def bytes_after_rows(path: Path) -> int:
     if data.text or any(isinstance(p, PlyListProperty) for element in data.elements for p in element.properties):
         return 0
     with path.open("rb") as file:
-        end, _ = _check_header(path, file.read(MAX_HEADER_BYTES), size := check_file(path))
-    return size - end - sum(element.data.nbytes for element in data.elements)
+        end, _ = _check_header(file.read(MAX_HEADER_BYTES), budget := read_budget(path))
+    return budget.file_bytes - end - sum(element.data.nbytes for element in data.elements)
 
 
 def header_counts(path: Path) -> tuple[int, int]:
@@ -245,11 +248,12 @@ def header_content(path: Path) -> Literal["result", "Gaussians", "other"]:
     return "Gaussians" if not columns or any(name.startswith(expected) for name in columns) else "other"
 
 
-def _check_header(path: Path, start: bytes, size: int) -> tuple[int, bool]:
+def _check_header(start: bytes, budget: ReadBudget) -> tuple[int, bool]:
     """Return the size of a header and whether rows are text; SceneError if the file is too short for it.
 
-    ``start`` has the first bytes of ``size``. Everything else is left to the parser.
+    ``start`` has the file's first bytes. Everything else is left to the parser.
     """
+    path, size = Path(budget.path), budget.file_bytes
     newline = b"\r\n" if start[3:5] == b"\r\n" else start[3:4]
     last = newline + b"end_header" + newline
     end = start.find(last)
@@ -264,6 +268,7 @@ def _check_header(path: Path, start: bytes, size: int) -> tuple[int, bool]:
             elements.append((line[1], int(line[2]), []))
         elif line[:1] == ["property"] and len(line) > 2 and elements:
             elements[-1][2].append(line[1:-1])
+    budget.check_steps(_STEPS_PER_ELEMENT * len(elements), "steps for elements")
     left = size - end - len(last)
     for name, count, properties in elements:
         lists = any(kind[0] == "list" for kind in properties)
@@ -275,6 +280,8 @@ def _check_header(path: Path, start: bytes, size: int) -> tuple[int, bool]:
             raise SceneError(path, "expected one number a column and vertex, found a list property")
         if lists and count * len(properties) > MAX_LIST_VALUES:
             raise SceneError(path, f"found element '{name}' with lists in {count} rows", "export it without this one")
+        if lists:
+            budget.check_memory(_LIST_BYTES * count * len(properties), f"lists in {count:,} rows")
         each = sum(2 if text else _SIZES.get((kind[1:2] or kind)[0], 1) for kind in properties)
         before, left = left, left - count * each
         if left < -1:  # the last row of a text may end without a new line

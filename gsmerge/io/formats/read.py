@@ -22,7 +22,7 @@ from gsmerge.types import Gaussians, StrPath
 MIN_FINITE = 0.002  # of the rows: the rest of a file tells nothing about the scene
 OpacityChoice = Literal["auto", "logit", "raw"]
 MAX_HARMONIC = 1e6  # pictures of it can still be squared and summed in float32
-FREED_ROWS = 1 << 20  # after which the pages of large columns leave memory
+FREED_ROWS = 1 << 17  # after which the pages of large columns leave memory
 _MIN_JUDGED = 100  # Gaussians whose scales say something
 _SCALE_SAMPLES = 20_000  # of them that are looked at
 _MAX_WIDTH = 0.25  # share of the scene's width from which on standard deviations are wrong
@@ -75,8 +75,7 @@ class GaussianFile:
 
 def kept_comments(info: FileInfo) -> tuple[str, ...]:
     """Return the header comments that tell viewers how to render the Gaussians."""
-    lines = (comment for comment in info.comments if comment.isascii() and comment.isprintable())
-    return tuple(comment for comment in lines if comment.startswith(arrays.RENDER_COMMENT))
+    return arrays.copied_comments(info.comments)
 
 
 def file_notes(info: FileInfo) -> tuple[str, ...]:
@@ -150,9 +149,9 @@ def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto") -> Gaussia
     return _convert_files([path], [read(path)], "auto")
 
 
-def read_level(path: Path, level: int) -> GaussianFile:
+def read_level(path: Path, level: int, index: streamed.StreamedIndex | None = None) -> GaussianFile:
     """Read one level of detail of a ``lod-meta.json``; 0 is the finest. SceneError as in :func:`read_gaussians`."""
-    return _convert_files([path], [streamed.read_rows(path, level)], "auto")
+    return _convert_files([path], [streamed.read_rows(path, level, index)], "auto")
 
 
 def _convert_files(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: OpacityChoice) -> GaussianFile:
@@ -163,14 +162,16 @@ def _convert_files(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: 
     n = sum(len(part.rows) for part in parts)
     wide = any(dtype[name].kind == "f" and dtype[name].itemsize == 8 for name in arrays.MEANS)
     shapes = {"quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh0": (n, 1, 3), "shN": (n, num_higher, 3)}
+    file_bytes = sum(path.stat().st_size + part.bytes_beside for path, part in zip(paths, parts, strict=True))
+    most = arrays.most_in_memory(file_bytes)
     out = {"means": make_array((n, 3), np.float64 if wide else np.float32), "valid": np.empty(n, np.bool_)}
-    out |= {name: make_array(shape, np.float32) for name, shape in shapes.items()}
+    out |= {name: make_array(shape, np.float32, most) for name, shape in shapes.items()}
     num_clipped = num_zero_quats = first = 0
     for name, part in zip(paths, parts, strict=True):
         part_rows = slice(first, first + len(part.rows))
         clipped, zero = _convert_file(name, part, {key: column[part_rows] for key, column in out.items()})
         num_clipped, num_zero_quats, first = num_clipped + clipped, num_zero_quats + zero, part_rows.stop
-    declared_encoding = opacity if opacity != "auto" else stored.encoding
+    declared_encoding = opacity if opacity != "auto" else _declared_encoding(paths, parts, out["opacities"])
     encoding = _activate(out["opacities"], out["valid"], declared_encoding)
     num_bad = clear_invalid(path, out)
     byte_columns = tuple(name for name in names if dtype[name].itemsize == 1)
@@ -183,7 +184,7 @@ def _convert_files(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: 
         layout=stored.layout,
         format=stored.format,
         count=n,
-        file_bytes=sum(path.stat().st_size + part.bytes_beside for path, part in zip(paths, parts, strict=True)),
+        file_bytes=file_bytes,
         bytes_by_attribute={name: sum(part.sizes[name] for part in parts) for name in stored.sizes},
         columns=names,
         extra_columns=extra,
@@ -294,18 +295,34 @@ def _normalise(quats: list[np.ndarray], out: np.ndarray) -> np.ndarray:
     return zero
 
 
+def _declared_encoding(paths: Sequence[Path], parts: Sequence[StoredRows], opacities: np.ndarray) -> str | None:
+    """Return the encoding of opacities that the parts declare, None without any; SceneError where parts differ in it.
+
+    A part that declares none has the one that its values show, if they are enough to show any.
+    """
+    first, seen = 0, dict[str, str]()  # name of the first part of each encoding
+    for path, part in zip(paths, parts, strict=True):
+        values = opacities[first : first + len(part.rows)]
+        first += len(values)
+        is_clear = len(parts) > 1 and np.isfinite(values).sum() >= _MIN_JUDGED
+        encoding = part.encoding or (_guess_encoding(values) if is_clear else None)
+        if encoding is not None:
+            seen.setdefault(encoding, path.name)
+        if len(seen) > 1:
+            (other, name), _ = seen.items()
+            problem = f"expected opacities as in {name}, which are {other}, found {encoding} ones"
+            raise SceneError(path, problem, "export all parts alike; if all are logits, say --hint opacity=logit")
+    return next((part.encoding for part in parts if part.encoding is not None), None)
+
+
 def _activate(opacities: np.ndarray, valid: np.ndarray, encoding: str | None) -> str:
     """Convert stored opacities to [0, 1] in place, and return their encoding, guessed where it is not known.
 
     They are raw if all finite ones lie in [0, 1]. An infinite raw one makes its row invalid.
     """
-    finite = np.isfinite(opacities)
-    if encoding is None:
-        low = opacities.min(where=finite, initial=np.inf)
-        high = opacities.max(where=finite, initial=-np.inf)
-        encoding = "raw" if 0 <= low <= high <= 1 else "logit"
+    encoding = encoding or _guess_encoding(opacities)
     if encoding == "raw":
-        valid &= finite
+        valid &= np.isfinite(opacities)
         np.clip(opacities, 0, 1, out=opacities)
         return encoding
     with np.errstate(all="ignore"):
@@ -313,6 +330,13 @@ def _activate(opacities: np.ndarray, valid: np.ndarray, encoding: str | None) ->
         np.add(opacities, 1, out=opacities)
         np.reciprocal(opacities, out=opacities)
     return encoding
+
+
+def _guess_encoding(opacities: np.ndarray) -> str:
+    finite = np.isfinite(opacities)
+    low = opacities.min(where=finite, initial=np.inf)
+    high = opacities.max(where=finite, initial=-np.inf)
+    return "raw" if 0 <= low <= high <= 1 else "logit"
 
 
 def _describe_odd_scales(means: np.ndarray, scales: np.ndarray, valid: np.ndarray) -> str:

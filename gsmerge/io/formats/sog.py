@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.io.bounds import check_file, read_errors
+from gsmerge.io.bounds import ReadBudget, check_file, check_whole, parse_json, read_budget, read_errors
 from gsmerge.io.formats import arrays
 from gsmerge.kernels.elementary import expm1, log1p
 from gsmerge.types import Gaussians
@@ -42,8 +42,7 @@ FIRST_MODE = 252  # alpha of a rotation whose largest component is the first
 PALETTE_BITS = 16
 PALETTE_COLUMNS = 64  # sets of harmonics side by side in the texture of the palette
 _LOSSLESS = 101  # OpenCV's WebP quality
-MAX_PER_BYTE = 16  # Gaussians: no real file has more than a fifth of one
-MAX_META_BYTES = 1 << 20
+PACKED_BYTES = 19  # of a Gaussian as its textures are held
 CODES = 256
 _CELLS = 1 << 11  # as many of equal width, and of equally many values
 _MAX_STEPS = 200
@@ -85,10 +84,7 @@ class _Folder:
     """The files in a folder, and in no other."""
 
     folder: Path
-
-    @property
-    def size(self) -> int:
-        return sum(entry.stat().st_size for entry in os.scandir(self.folder))
+    size: int
 
     def num_bytes(self, name: str) -> int:
         path = self.folder / name
@@ -108,7 +104,7 @@ class _Folder:
 class SogContent:
     """Content of one ``.sog``."""
 
-    columns: arrays.Columns
+    packed: arrays.Packed
     sizes: dict[str, int]  # bytes of the textures by attribute
     mip: bool  # whether its Gaussians are antialiased
     num_bytes: int  # of all files
@@ -116,17 +112,18 @@ class SogContent:
 
 def read_rows(path: Path) -> arrays.StoredRows:
     """Read the Gaussians of a ``.sog``; SceneError if it is another file, another version, or damaged."""
-    size = check_file(path)
+    budget = read_budget(path)
     with _damage(path), zipfile.ZipFile(path) as archive:
-        content = _read_content(path, _Bundle(archive, size))
-    return arrays.to_rows(content.columns, f".sog version {VERSION}", content.sizes, mip=content.mip)
+        content = _read_content(_Bundle(archive, budget.file_bytes), budget)
+    return arrays.to_stored([content.packed], f".sog version {VERSION}", content.sizes, mip=content.mip)
 
 
 def read_unbundled(path: Path) -> SogContent:
     """Read the Gaussians of a ``meta.json`` and the textures beside it; SceneError as of :func:`read_rows`."""
     check_file(path)
     with _damage(path):
-        return _read_content(path, _Folder(path.parent))
+        size = sum(entry.stat().st_size for entry in os.scandir(path.parent))
+        return _read_content(_Folder(path.parent, size), ReadBudget(path, size))
 
 
 @contextmanager
@@ -146,67 +143,79 @@ def _damage(path: Path) -> Iterator[None]:
         raise SceneError(path, f"expected a readable .sog file, found a damaged one ({error})") from error
 
 
-def _read_content(path: Path, files: _Files) -> SogContent:
-    meta = json.loads(files.member(META, MAX_META_BYTES))
+def _read_content(files: _Files, budget: ReadBudget) -> SogContent:
+    meta = parse_json(files.member(META, files.size).decode("utf-8-sig"), budget)
     version = meta.get("version", 1) if isinstance(meta, dict) else "none"
     if version != VERSION:
         problem = f"expected .sog version {VERSION}, found {version}"
-        raise SceneError(path, problem, "export it with a newer program")
-    count, size = int(meta["count"]), files.size
-    if not 0 < count <= MAX_PER_BYTE * size:
-        raise SceneError(path, f"expected Gaussians in {size} bytes, found {count} promised")
+        raise SceneError(budget.path, problem, "export it with a newer program")
+    count = check_whole(meta["count"], "count", 1)
+    bands = check_whole(meta["shN"]["bands"], "bands", 1, MAX_DEGREE) if meta.get("shN") else 0
+    arrays.check_count(budget, count, (bands + 1) ** 2 - 1, PACKED_BYTES)
     mip = meta.get("antialias") is True or meta.get("model") == "antialiased"
-    columns = _read_columns(files, meta, count)
+    packed = _read_packed(files, meta, count, budget)
     keys = [key for key in ("means", "scales", "quats", "sh0", "shN") if meta.get(key)]
     sizes = {key: sum(files.num_bytes(name) for name in meta[key]["files"]) for key in keys}
-    return SogContent(columns, sizes, mip, size)
+    return SogContent(packed, sizes, mip, files.size)
 
 
-def _read_texture(files: _Files, name: str, count: int) -> np.ndarray:
+def _image_size(data: bytes) -> tuple[int, int]:
+    """Return width and height of a WebP image; ValueError if it is none, or one with loss."""
+    at = 12
+    if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+        while at + 8 <= len(data) and data[at : at + 4] in (b"VP8X", b"ICCP"):  # before the image of an extended file
+            at += 8 + (int.from_bytes(data[at + 4 : at + 8], "little") + 1) // 2 * 2
+        if data[at : at + 4] == b"VP8L" and len(data) >= at + 13:
+            bits = int.from_bytes(data[at + 9 : at + 13], "little")
+            return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    raise ValueError("no WebP texture without loss")
+
+
+def _read_texture(files: _Files, name: str, count: int, budget: ReadBudget) -> np.ndarray:
     """Decode ``[count,4]`` pixels RGBA of a texture; alpha is 255 if it has none."""
     data = files.member(name, files.size)
-    kind = data[12:16] if data[:4] == b"RIFF" and data[8:12] == b"WEBP" else b""
-    if kind == b"VP8X" and len(data) >= 30:
-        width, height = (int.from_bytes(data[at : at + 3], "little") + 1 for at in (24, 27))
-    elif kind == b"VP8L" and len(data) >= 25:
-        bits = int.from_bytes(data[21:25], "little")
-        width, height = (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
-    else:
-        raise ValueError("no WebP texture without loss")
+    width, height = _image_size(data)
     if not count <= width * height <= 4 * count + (1 << 16):
         raise ValueError(f"{name} of {width} x {height} pixels for {count}")
+    budget.check_memory(12 * width * height, f"{name} of {width} x {height} pixels")  # as decoded, and in two orders
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise ValueError(f"{name} is damaged") from error
     if image is None or image.shape[:2] != (height, width) or image.ndim != 3:
         raise ValueError(f"{name} is damaged")
-    pixels = image.reshape(width * height, -1)[:count]
-    colors, alpha = pixels[:, 2::-1], pixels[:, 3:] if pixels.shape[1] == 4 else np.full((count, 1), 255, np.uint8)
-    return np.concatenate([colors, alpha], 1)
+    order = cv2.COLOR_BGRA2RGBA if image.shape[2] == 4 else cv2.COLOR_BGR2RGBA
+    return cv2.cvtColor(image, order).reshape(width * height, 4)[:count]
 
 
-def _read_columns(files: _Files, meta: dict[str, Any], count: int) -> arrays.Columns:
-    def texture(key: str, index: int = 0) -> np.ndarray:
-        return _read_texture(files, meta[key]["files"][index], count)
+def _read_packed(files: _Files, meta: dict[str, Any], count: int, budget: ReadBudget) -> arrays.Packed:
+    def texture(key: str, index: int = 0, channels: int = 3) -> np.ndarray:
+        pixels = _read_texture(files, meta[key]["files"][index], count, budget)
+        return pixels[:, :channels].copy()  # without pixels and channels that nothing reads
 
     low, high = (_check_numbers(meta["means"][key], 3) for key in ("mins", "maxs"))
-    fixed = texture("means", 0)[:, :3] + 256.0 * texture("means", 1)[:, :3]
-    quats, colors = texture("quats"), texture("sh0")
+    lower, upper, scales = texture("means"), texture("means", 1), texture("scales")
+    quats, sh0 = texture("quats", channels=4), texture("sh0", channels=4)
+    scale_codes, color_codes = (_check_numbers(meta[key]["codebook"], CODES) for key in ("scales", "sh0"))
     if quats[:, 3].min() < FIRST_MODE:
         raise ValueError(f"rotations of mode {quats[:, 3].min()}")
-    with np.errstate(all="ignore"):  # what is not finite is set aside later
-        logs = low + (high - low) * fixed / 65535
+    labels, palette = _read_palette(files, meta["shN"], count, budget) if meta.get("shN") else (None, np.zeros((0, 3)))
+    harmonic_codes = np.zeros(CODES) if labels is None else _check_numbers(meta["shN"]["codebook"], CODES)
+
+    def unpack(block: slice) -> arrays.Columns:
+        logs = low + (high - low) * (lower[block] + 256.0 * upper[block]) / 65535
+        modes, smallest = quats[block, 3].astype(int) - FIRST_MODE, (quats[block, :3] / 255 - 0.5) * np.sqrt(2.0)
+        codes = np.zeros((len(logs), 0, 3), np.uint8) if labels is None else palette[labels[block]]
         return arrays.Columns(
             means=np.sign(logs) * expm1(np.abs(logs)),
-            quats=arrays.from_smallest_three(
-                quats[:, 3].astype(int) - FIRST_MODE, (quats[:, :3] / 255 - 0.5) * np.sqrt(2.0)
-            ),
-            log_scales=_decode_values(meta["scales"], texture("scales")[:, :3]),
-            opacities=colors[:, 3] / 255,
-            sh0=_decode_values(meta["sh0"], colors[:, :3]),
-            harmonics=_read_harmonics(files, meta["shN"], count) if meta.get("shN") else np.zeros((count, 0, 3)),
+            quats=arrays.from_smallest_three(modes, smallest),
+            log_scales=scale_codes[scales[block]],
+            opacities=sh0[block, 3] / 255,
+            sh0=color_codes[sh0[block, :3]],
+            harmonics=harmonic_codes[codes],
         )
+
+    return arrays.Packed(count, 0 if labels is None else palette.shape[1], unpack)
 
 
 def _check_numbers(values: Any, length: int) -> np.ndarray:
@@ -216,22 +225,14 @@ def _check_numbers(values: Any, length: int) -> np.ndarray:
     return numbers
 
 
-def _decode_values(part: dict[str, Any], codes: np.ndarray) -> np.ndarray:
-    """Look codes up in the codebook of a part."""
-    return _check_numbers(part["codebook"], 256)[codes]
-
-
-def _read_harmonics(files: _Files, part: dict[str, Any], count: int) -> np.ndarray:
-    size, bands = int(part["count"]), int(part["bands"])
-    if not (1 <= bands <= MAX_DEGREE and 1 <= size <= 2**PALETTE_BITS):
-        raise ValueError(f"{size} harmonics of degree {bands}")
-    num_higher = (bands + 1) ** 2 - 1
+def _read_palette(files: _Files, part: dict[str, Any], count: int, budget: ReadBudget) -> tuple[np.ndarray, np.ndarray]:
+    """Return the label ``[count]`` of each Gaussian's harmonics, and the palette ``[n,num_higher,3]`` of codes."""
+    size, num_higher = check_whole(part["count"], "count", 1, 2**PALETTE_BITS), (part["bands"] + 1) ** 2 - 1
     name, labels_name = part["files"]
-    low, high = _read_texture(files, labels_name, count)[:, :2].T.astype(int)
-    labels = low + 256 * high
-    rows = max(-(-size // PALETTE_COLUMNS), labels.max() // PALETTE_COLUMNS + 1)
-    centroids = _read_texture(files, name, rows * PALETTE_COLUMNS * num_higher)[:, :3]
-    return _decode_values(part, centroids.reshape(-1, num_higher, 3)[labels])
+    labels = _read_texture(files, labels_name, count, budget)[:, :2].copy().view("<u2")[:, 0]
+    rows = max(-(-size // PALETTE_COLUMNS), int(labels.max()) // PALETTE_COLUMNS + 1)
+    centroids = _read_texture(files, name, rows * PALETTE_COLUMNS * num_higher, budget)[:, :3]
+    return labels, centroids.reshape(-1, num_higher, 3)
 
 
 def sog_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
@@ -257,7 +258,7 @@ def sog_files(columns: arrays.Columns, *, mip: bool = False) -> dict[str, bytes]
         textures.update(files)
 
     logs = np.sign(columns.means) * log1p(np.abs(columns.means))
-    low, high = (end(logs, axis=0) if count else np.zeros(3) for end in (np.min, np.max))
+    low, high = (end(logs, axis=0) for end in (np.min, np.max))
     fixed = np.round((logs - low) / np.where(high > low, high - low, 1) * 65535).astype(int)
     halves = {"means_l.webp": _texture(fixed & 255), "means_u.webp": _texture(fixed >> 8)}
     add("means", halves, mins=_shorten(low), maxs=_shorten(high))

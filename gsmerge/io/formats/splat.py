@@ -13,7 +13,7 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.geometry import rgb_to_sh0
 from gsmerge.io.bounds import check_file, read_errors
-from gsmerge.io.formats.arrays import Columns, StoredRows, to_bytes, to_columns, to_rows
+from gsmerge.io.formats.arrays import Columns, Packed, StoredRows, to_bytes, to_columns, to_stored
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.types import Gaussians
 
@@ -39,15 +39,18 @@ def read_rows(path: Path) -> StoredRows:
         raise SceneError(path, problem, "copy or export it again")
     with read_errors(path):
         rows = np.fromfile(path, ROW)
-    colors = rows["colors"] / 255
-    with np.errstate(all="ignore"):  # a scale of 0 is a value, what is not finite is set aside later
-        columns = Columns(
-            means=rows["means"],
-            quats=(rows["quats"] - 128.0) / 128,
-            log_scales=log(rows["scales"]),
-            opacities=colors[:, 3],
-            sh0=rgb_to_sh0(colors[:, :3]),
-            harmonics=np.zeros((len(rows), 0, 3)),
-        )
     sizes = {"means": 12, "scales": 12, "sh0": 3, "opacities": 1, "quats": 4}
-    return to_rows(columns, ".splat", {name: each * len(rows) for name, each in sizes.items()})
+    packed = Packed(len(rows), 0, lambda block: _unpack(rows[block]))
+    return to_stored([packed], ".splat", {name: each * len(rows) for name, each in sizes.items()})
+
+
+def _unpack(rows: np.ndarray) -> Columns:
+    colors = rows["colors"] / 255
+    return Columns(
+        means=rows["means"],
+        quats=(rows["quats"] - 128.0) / 128,
+        log_scales=log(rows["scales"]),
+        opacities=colors[:, 3],
+        sh0=rgb_to_sh0(colors[:, :3]),
+        harmonics=np.zeros((len(rows), 0, 3)),
+    )

@@ -25,7 +25,7 @@ import numpy as np
 
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry import rgb_to_sh0
-from gsmerge.io.bounds import check_file, read_errors
+from gsmerge.io.bounds import ReadBudget, check_file, read_errors
 from gsmerge.io.formats import arrays
 from gsmerge.types import SH_C0, Gaussians
 
@@ -45,9 +45,6 @@ LARGEST = 2**23 - 1
 COLOR_SCALE = 0.15  # of sh0: colours somewhat outside [0, 1] survive
 ATTRIBUTES = ("means", "opacities", "sh0", "scales", "quats", "shN")  # in the order of the file
 MAX_READ_DEGREE = 4  # which some write as version 3, too
-MAX_RATIO = 1032  # of gzip: no stream unpacks to more; nor do the columns of version 4 together, of any scene
-MAX_PER_BYTE = 1  # Gaussians: no real file has more than a fifth of one; each takes 140 bytes of memory
-FREE_COUNT = 1_000_000  # Gaussians that are read however well they are compressed
 FOUND_EARLY_END = "expected a .spz file, found an early end of file"
 AGAIN = "copy or export it again"
 
@@ -62,10 +59,14 @@ class _Header:
     num_streams: int  # of version 4
 
     @property
+    def num_higher(self) -> int:
+        """Number of harmonics above degree 0."""
+        return (self.degree + 1) ** 2 - 1
+
+    @property
     def widths(self) -> tuple[int, ...]:
         """Bytes per Gaussian of each attribute."""
-        harmonics = 3 * ((self.degree + 1) ** 2 - 1)
-        return 6 if self.version == 1 else 9, 1, 3, 3, 4 if self.version > 2 else 3, harmonics
+        return 6 if self.version == 1 else 9, 1, 3, 3, 4 if self.version > 2 else 3, 3 * self.num_higher
 
 
 def read_rows(path: Path) -> arrays.StoredRows:
@@ -76,8 +77,8 @@ def read_rows(path: Path) -> arrays.StoredRows:
     read = _zstandard_parts if packed[:4] == MAGIC.to_bytes(4, "little") else _gzip_parts
     header, parts = read(path, packed)
     sizes = {name: part.size for name, part in zip(ATTRIBUTES, parts, strict=True) if part.size}
-    mip = bool(header.flags & MIP_FLAG)
-    return arrays.to_rows(_read_columns(parts, header), f".spz version {header.version}", sizes, mip=mip)
+    rows = arrays.Packed(header.count, header.num_higher, lambda at: _unpack([part[at] for part in parts], header))
+    return arrays.to_stored([rows], f".spz version {header.version}", sizes, mip=bool(header.flags & MIP_FLAG))
 
 
 def _read_header(path: Path, packed: bytes, start: bytes, versions: Sequence[int]) -> _Header:
@@ -89,12 +90,9 @@ def _read_header(path: Path, packed: bytes, start: bytes, versions: Sequence[int
     if magic != MAGIC or header.version not in versions or header.degree > MAX_READ_DEGREE or header.fraction > 30:
         found = f"version {header.version}, SH degree {header.degree}" if magic == MAGIC else "another file"
         raise SceneError(path, f"expected .spz of version 1 to 4 and SH degree 0 to {MAX_READ_DEGREE}, found {found}")
-    if header.count == 0 or header.count * sum(header.widths) > MAX_RATIO * len(packed):
-        raise SceneError(path, f"expected Gaussians in {len(packed)} bytes, found {header.count} promised")
-    most = max(FREE_COUNT, MAX_PER_BYTE * len(packed))
-    if header.count > most:
-        problem = f"expected at most {most:,} Gaussians in {len(packed):,} bytes, found {header.count:,} promised"
-        raise SceneError(path, problem, "no scene is compressed so well: export it again")
+    if header.count == 0:
+        raise SceneError(path, f"expected Gaussians in {len(packed)} bytes, found none promised")
+    arrays.check_count(ReadBudget(path, len(packed)), header.count, header.num_higher, sum(header.widths))
     return header
 
 
@@ -165,10 +163,10 @@ def _zstandard_parts(path: Path, packed: bytes) -> tuple[_Header, list[np.ndarra
     return header, [np.frombuffer(column, np.uint8).reshape(header.count, -1) for column in columns]
 
 
-def _read_columns(parts: list[np.ndarray], header: _Header) -> arrays.Columns:
+def _unpack(parts: list[np.ndarray], header: _Header) -> arrays.Columns:
     version, fraction = header.version, header.fraction
     means, opacities, colors, scales, rotations, harmonics = parts
-    words = np.zeros((header.count, 3, 4), np.uint8)  # signed numbers of three little-endian bytes
+    words = np.zeros((len(means), 3, 4), np.uint8)  # signed numbers of three little-endian bytes
     if version > 1:
         words[..., 1:] = means.reshape(-1, 3, 3)
     return arrays.Columns(
@@ -177,7 +175,7 @@ def _read_columns(parts: list[np.ndarray], header: _Header) -> arrays.Columns:
         log_scales=scales / 16 - 10,
         opacities=opacities[:, 0] / 255,
         sh0=rgb_to_sh0(0.5 + SH_C0 * (colors / 255 - 0.5) / COLOR_SCALE),
-        harmonics=(harmonics.reshape(len(harmonics), -1, 3) - 128.0) / 128,
+        harmonics=(harmonics.reshape(len(harmonics), -1, 3) - np.float32(128)) / np.float32(128),  # exact
     )
 
 

@@ -10,7 +10,7 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -21,7 +21,7 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.geometry import morton_codes, quat_to_rotmat
 from gsmerge.io.atomic import remove_stale
-from gsmerge.io.bounds import MAX_FILES, read_json
+from gsmerge.io.bounds import ReadBudget, check_file, check_whole, read_json
 from gsmerge.io.formats import arrays, sog
 from gsmerge.kernels.elementary import exp, log1p
 from gsmerge.types import Gaussians
@@ -158,7 +158,7 @@ def read_index(path: Path) -> StreamedIndex:
     document = read_json(path)
     try:
         return _check_index(path, document)
-    except (ValueError, LookupError, TypeError, AttributeError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError) as error:
         problem = f"expected the index of a Streamed SOG, found another file ({error})"
         raise SceneError(path, " ".join(problem.split()), "export it again") from error
 
@@ -169,22 +169,23 @@ def _check_index(path: Path, document: dict[str, Any]) -> StreamedIndex:
         problem = f"expected Streamed SOG version {VERSION}, found {version}"
         raise SceneError(path, problem, "export it as that version")
     names = document["filenames"]
-    num_levels = _whole(document["lodLevels"], "lodLevels", 1, MAX_LEVELS)
-    if not isinstance(names, list) or not 1 <= len(names) <= MAX_FILES:
-        raise ValueError(f"filenames: expected a list of 1 to {MAX_FILES} paths")
+    num_levels = check_whole(document["lodLevels"], "lodLevels", 1, MAX_LEVELS)
+    if not isinstance(names, list) or not names:
+        raise ValueError("filenames: expected a list of paths")
     chunks = [_inside(path, name) for name in names]
     runs: list[list[tuple[int, int, int]]] = [[] for _ in range(num_levels)]
     for level, run in _walk_runs(document["tree"]):
-        file = _whole(run["file"], "file", 0, len(chunks) - 1)
-        most = 2**53  # the largest whole number that JSON keeps everywhere
-        offset, count = (_whole(run[key], key, least, most) for key, least in (("offset", 0), ("count", 0)))
+        file = check_whole(run["file"], "file", 0, len(chunks) - 1)
+        offset, count = (check_whole(run[key], key, 0) for key in ("offset", "count"))
         if count:
-            runs[_whole(level, "level", 0, num_levels - 1)].append((file, offset, count))
+            runs[check_whole(level, "level", 0, num_levels - 1)].append((file, offset, count))
     levels = tuple(_cover(chunks, level) for level in runs)
     if len({chunk for level in levels for chunk in level}) != sum(map(len, levels)):
         raise ValueError("a chunk is that of two levels")
-    environment = document.get("environment")
-    index = StreamedIndex(levels, None if environment is None else _inside(path, environment))
+    environment = None if document.get("environment") is None else _inside(path, document["environment"])
+    if any(environment in level for level in levels):
+        raise ValueError("the environment is a chunk of a level")
+    index = StreamedIndex(levels, environment)
     counts = index.counts
     for name, found in {"counts": counts, "count": sum(counts)}.items():
         if document.get(name, found) != found:  # older files have neither
@@ -192,21 +193,13 @@ def _check_index(path: Path, document: dict[str, Any]) -> StreamedIndex:
     return index
 
 
-def _whole(value: Any, name: str, least: int, most: int) -> int:
-    if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
-        raise ValueError(f"{name}: expected a whole number from {least} to {most}, not {value!r:.40}")
-    return value
-
-
 def _inside(index: Path, name: Any) -> Path:
-    """Return the path of a chunk; ValueError if it leads out of the folder of the index."""
+    """Return the path of a chunk; ValueError if its name leads out of the folder of the index."""
     place = PurePosixPath(str(name))
-    path = index.parent / place
-    root = os.path.realpath(index.parent)
     outside = place.is_absolute() or ".." in place.parts or "\\" in str(name) or "\0" in str(name)
-    if outside or place.name != sog.META or os.path.commonpath([root, os.path.realpath(path)]) != root:
+    if outside or place.name != sog.META:
         raise ValueError(f"{name!r:.80}: expected the path of a {sog.META} inside the folder")
-    return path
+    return index.parent / place
 
 
 def _walk_runs(tree: dict[str, Any]) -> Iterator[tuple[int, dict[str, Any]]]:
@@ -236,32 +229,49 @@ def _cover(chunks: Sequence[Path], runs: Sequence[tuple[int, int, int]]) -> dict
     return counts
 
 
-def read_rows(path: Path, level: int = 0) -> arrays.StoredRows:
+def read_rows(path: Path, level: int = 0, index: StreamedIndex | None = None) -> arrays.StoredRows:
     """Read the Gaussians of one level; level 0, the finest, comes with those of the environment.
 
-    SceneError if the index or a chunk cannot be read, or they do not agree.
+    ``index``: what :func:`read_index` returned of the path. SceneError if the index or a chunk cannot be read, or they
+    do not agree.
     """
-    index = read_index(path)
+    index = index or read_index(path)
     chunks: dict[Path, int | None] = {**index.levels[level]}
     if index.environment is not None and level == 0:
         chunks[index.environment] = None
     if not chunks:
         raise SceneError(path, f"expected Gaussians at level {level}, found none")
-    contents = []
-    for chunk, count in chunks.items():
-        contents.append(sog.read_unbundled(chunk))
-        if count not in (None, len(contents[-1].columns)):
-            problem = f"expected {count:,} Gaussians as {INDEX} says, found {len(contents[-1].columns):,}"
-            raise SceneError(chunk, problem, "export it again")
+    contents = _read_chunks(path, chunks)
     sizes: dict[str, int] = {}
     for content in contents:
         for name, size in content.sizes.items():
             sizes[name] = sizes.get(name, 0) + size
     counts = " + ".join(f"{count:,}" for count in index.counts)
     name = f"Streamed SOG version {VERSION}, {counts} Gaussians at {len(index.levels)} level(s)"
-    columns = arrays.concatenate([content.columns for content in contents])
-    rows = arrays.to_rows(columns, name, sizes, mip=contents[0].mip)
+    rows = arrays.to_stored([content.packed for content in contents], name, sizes, mip=contents[0].mip)
     return replace(rows, bytes_beside=sum(content.num_bytes for content in contents))
+
+
+def _read_chunks(path: Path, chunks: Mapping[Path, int | None]) -> list[sog.SogContent]:
+    """Read chunks, each with its number of Gaussians if the index has that, within the budget of all together."""
+    root, seen = os.path.realpath(path.parent), set[str]()
+    contents: list[sog.SogContent] = []
+    num_bytes, total, num_higher = check_file(path), 0, 0
+    for chunk, count in chunks.items():
+        place = os.path.realpath(chunk)
+        if os.path.commonpath([root, place]) != root or place in seen:
+            problem = f"{chunk}: expected a file of its own inside the folder, found a link to another"
+            raise SceneError(path, problem, "export it again")
+        seen.add(place)
+        contents.append(sog.read_unbundled(chunk))
+        packed = contents[-1].packed
+        if count not in (None, packed.count):
+            problem = f"expected {count:,} Gaussians as {INDEX} says, found {packed.count:,}"
+            raise SceneError(chunk, problem, "export it again")
+        num_bytes, total = num_bytes + contents[-1].num_bytes, total + packed.count
+        num_higher = max(num_higher, packed.num_higher)
+        arrays.check_count(ReadBudget(path, num_bytes), total, num_higher, sog.PACKED_BYTES)
+    return contents
 
 
 def remove_unused_chunks(path: Path) -> None:

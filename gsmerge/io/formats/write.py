@@ -51,7 +51,8 @@ def write_gaussians(
     Raises:
         UsageError: If the name ends in none of these, or ``zstandard`` is needed and not installed.
         SceneError: If the file exists or cannot be written.
-        ValueError: If there is NaN or inf, a comment is no line of ASCII, or there is no such version.
+        ValueError: If there is no Gaussian, NaN or inf, a comment is no line of ASCII, or there are half a million
+            characters of them, or there is no such version.
 
     Example:
         >>> gaussians = gsmerge.compact("demo", effort="draft", budget=300).gaussians
@@ -62,7 +63,7 @@ def write_gaussians(
         degree = min(gaussians.sh_degree, chosen.max_degree)
         write_ply(path, gaussians, overwrite=overwrite, sh_degree=degree, comments=comments, normals=normals)
         return
-    _check_comments(comments)
+    _check_readable(gaussians, comments)
     with atomic_output(path, overwrite=overwrite) as temporary:
         temporary.write_bytes(chosen.encode(gaussians, comments))
 
@@ -106,7 +107,8 @@ def add_levels(
 
     Returns, for each level, the final path of its first chunk's ``meta.json``, and the present paths of all its files.
     """
-    _check_comments(comments)
+    for gaussians in levels:
+        _check_readable(gaussians, comments)
     firsts: dict[str, Path] = {}
     written: dict[str, list[Path]] = {}
     for name, data in streamed.streamed_files(levels, mip=MIP_COMMENT in comments).items():
@@ -147,13 +149,14 @@ def write_ply(
 
     Raises:
         SceneError: If the file exists or cannot be written.
-        ValueError: If there is NaN or inf, fewer harmonics than asked for, or a comment is no line of ASCII.
+        ValueError: If there is no Gaussian, NaN or inf, fewer harmonics than asked for, a comment is no line of ASCII,
+            or there are half a million characters of them.
 
     Example:
         >>> result = gsmerge.compact("demo", effort="draft", budget=300)
         >>> gsmerge.write_ply("demo/small.ply", result.gaussians, overwrite=True)
     """
-    _check_comments(comments)
+    _check_readable(gaussians, comments)
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     if not 0 <= degree <= gaussians.sh_degree:
         raise ValueError(f"sh_degree: expected 0 to {gaussians.sh_degree}, got {sh_degree}")
@@ -161,6 +164,12 @@ def write_ply(
         file.writelines(ply.ply_blocks(gaussians, degree, comments, normals=normals))
 
 
-def _check_comments(comments: Sequence[str]) -> None:
+def _check_readable(gaussians: Gaussians, comments: Sequence[str]) -> None:
+    """Raise ValueError for what the readers refuse."""
+    if len(gaussians) == 0:
+        raise ValueError("gaussians: expected at least one, got none")
+    length = sum(len(f"comment {comment}\n") for comment in comments)
+    if length > ply.MAX_HEADER_BYTES // 2:
+        raise ValueError(f"comments: expected at most {ply.MAX_HEADER_BYTES // 2:,} characters, got {length:,}")
     if not all(comment.isascii() and comment.isprintable() for comment in comments):
         raise ValueError(f"comments: expected printable lines of ASCII, got {list(comments)}")

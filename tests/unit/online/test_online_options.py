@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-from typing import Any
-
 import pytest
 from messages import refuses
 
@@ -36,7 +33,6 @@ def test_colours_are_fitted_unless_told_otherwise() -> None:
 
 def test_the_state_s_settings_come_before_the_defaults() -> None:
     said = {"superpixels": "7%", "fit_colors": False, "tolerance": 0.2, "threads": 3, "of another version": 5}
-    state: Any = SimpleNamespace(about={"options": said, "batches": []})
-    options, online = merge_settings({"tolerance": 0.3, "seed": 4}, state)
+    options, online = merge_settings({"tolerance": 0.3, "seed": 4}, said)
     assert options.to_dict().items() >= {"superpixels": "7%", "seed": 4}.items()
     assert (online.tolerance, online.fit_colors) == (0.3, False)

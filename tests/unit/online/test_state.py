@@ -208,7 +208,7 @@ def test_the_device_of_another_machine_is_not_asked_for(pixels: Scene) -> None:
     encoded = encode_scene(pixels, superpixels="5%", checkpoint="none")
     options = encoded.about["options"] | {"device": "cuda"}
     state = from_encoded(replace(encoded, about=encoded.about | {"options": options}))
-    settings, _ = merge_settings({}, state)
+    settings, _ = merge_settings({}, state.about["options"])
     assert (settings.device, settings.segment.superpixels) == ("cpu", "5%")
 
 

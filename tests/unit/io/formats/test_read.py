@@ -14,7 +14,7 @@ from slow_readers import corners, drawn, read_splat, read_spz
 
 from gsmerge.errors import SceneError
 from gsmerge.io import kept_comments, read_gaussians, read_ply, write_gaussians, write_ply
-from gsmerge.io.formats.read import file_notes
+from gsmerge.io.formats.read import file_notes, read_parts
 from gsmerge.io.formats.sog import sog_bytes
 from gsmerge.io.formats.spz import spz_bytes
 from gsmerge.runtime.threads import use_threads
@@ -318,6 +318,22 @@ def test_a_filter_of_their_own_is_passed_on(ending: str, gaussians: Gaussians, t
     for name, comments in {"mip": ["SplatRenderMode: mip"], "plain": []}.items():
         write_gaussians(tmp_path / f"{name}{ending}", gaussians, comments=comments)
         assert list(kept_comments(read_gaussians(tmp_path / f"{name}{ending}").info)) == comments
+
+
+def test_parts_have_one_encoding_of_opacities(tmp_path: Path) -> None:
+    """A few rows say nothing of it; more that contradict others are refused, unless the caller says what all are."""
+    paths = []
+    for i, (count, low, high) in enumerate([(300, -3, 3), (20, 0.1, 0.9), (300, 0.12, 0.995)]):
+        rows = columns(count)
+        rows["opacity"] = np.linspace(low, high, count)
+        paths.append(save(tmp_path / f"{i}.ply", rows))
+    opacities = read_parts(paths[:2]).gaussians.opacities
+    assert opacities[300] == pytest.approx(1 / (1 + np.exp(-0.1)))
+    for order in (paths, paths[::-1]):
+        with refuses(SceneError, "", order[0].name, "opacity=logit"):
+            read_parts(order)
+    assert read_parts(paths, opacity="logit").gaussians.opacities[-1] == pytest.approx(1 / (1 + np.exp(-0.995)))
+    assert read_parts(paths[:0:-1]).gaussians.opacities[0] == pytest.approx(0.12)
 
 
 def test_noise_in_a_file_is_no_traceback(tmp_path: Path) -> None:

@@ -161,8 +161,9 @@ def test_failures_leave_existing_files_and_nothing_else(ending: str, tmp_path: P
 
 @pytest.mark.parametrize("ending", OUTPUT_FORMATS)
 def test_no_gaussians(ending: str, tmp_path: Path) -> None:
-    write_gaussians(tmp_path / f"a{ending}", corners()[:0])
-    assert (tmp_path / f"a{ending}").exists()
+    with refuses(ValueError, "gaussians", "none"):
+        write_gaussians(tmp_path / f"a{ending}", corners()[:0])
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_comments_reach_the_headers(tmp_path: Path) -> None:
@@ -170,6 +171,15 @@ def test_comments_reach_the_headers(tmp_path: Path) -> None:
     assert "SplatRenderMode: mip" in read_ply(tmp_path / "a.compressed.ply").info.comments
     with refuses(ValueError, "comments", "ASCII"):
         write_gaussians(tmp_path / "b.compressed.ply", corners(), comments=["two\nlines"])
+
+
+@pytest.mark.parametrize("ending", [".ply", ".compressed.ply"])
+def test_comments_that_no_reader_takes(ending: str, tmp_path: Path) -> None:
+    lines = ["gsmerge cameras: " + "A" * 900] * 500
+    write_gaussians(tmp_path / f"a{ending}", corners(), comments=lines)
+    assert len(read_ply(tmp_path / f"a{ending}").gaussians) == len(corners())
+    with refuses(ValueError, "comments", "524,288"):
+        write_gaussians(tmp_path / f"b{ending}", corners(), comments=2 * lines)
 
 
 def test_no_normals_is_the_same_without_twelve_bytes(scene: Scene, tmp_path: Path) -> None:
