@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image
 
 from gsmerge.errors import SceneError
-from gsmerge.io.bounds import MAX_PIXELS, check_file, check_pixels, read_errors
+from gsmerge.io.bounds import MAX_PIXELS, ReadBudget, check_file, check_pixels, read_errors
 from gsmerge.io.image_names import ImageSource, match_images
 from gsmerge.kernels.matrices import matmul
 from gsmerge.runtime.memory import free_pages, make_array
@@ -218,19 +218,18 @@ def _header_size(path: Path, file: BinaryIO) -> Size:
     return width, height
 
 
-def decode_embedded(path: Path, names: Sequence[str], files: Sequence[np.ndarray], limit: int) -> np.ndarray:
-    """Decode images that the file ``path`` holds as image files in bytes (``[b]`` uint8) to ``[c,h,w,3]`` uint8.
+def decode_embedded(budget: ReadBudget, names: Sequence[str], files: Sequence[np.ndarray]) -> np.ndarray:
+    """Decode images that a file holds as image files in bytes (``[b]`` uint8) to ``[c,h,w,3]`` uint8.
 
-    SceneError if one cannot be decoded, two differ in size, or they have more than ``limit`` bytes when decoded.
+    SceneError if one cannot be decoded, two differ in size, or they take more memory than the file's budget.
     """
+    path = Path(budget.path)
     sizes = [_header_size(path, io.BytesIO(data.tobytes())) for data in files]
     width, height = sizes[0]
     odd = next((name for name, size in zip(names, sizes, strict=True) if size != sizes[0]), None)
     if odd is not None:
         raise SceneError(path, f"{odd}: expected images of one size, found another than {width} x {height}")
-    if 3 * width * height * len(files) > limit:
-        problem = f"expected images of at most {limit >> 20} MiB, found {len(files)} of {width} x {height}"
-        raise SceneError(path, problem)
+    budget.check_memory(3 * width * height * len(files), f"{len(files)} photos")
     out = np.empty((len(files), height, width, 3), np.uint8)
     parallel_map(lambda i: np.copyto(out[i], _decode(path, files[i], sizes[i])), range(len(files)))
     return out
