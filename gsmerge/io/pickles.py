@@ -18,25 +18,27 @@ from gsmerge.io.bounds import ReadBudget
 _MAX_DEPTH = 20  # of containers in containers
 _MAX_KEY = 1 << 31  # of numbers that are keys: dictionaries are slow with some larger ones
 
+_U2, _U4, _U8, _I4, _F8 = (struct.Struct(form) for form in ("<H", "<I", "<Q", "<i", ">d"))
+
 Names = Mapping[tuple[str, str], object]
 """What the module and name of a global stand for; a function there takes the tuple of its arguments."""
 
 
 class StandIn:
-    """Stands for an object that a pickle calls first, and sets the state of then."""
+    """Stands for an object that a pickle makes in two steps: by a call, and by its state."""
 
     def set_state(self, state: object) -> None:
         """Take the state; ValueError if it is not the expected one."""
         raise NotImplementedError
 
 
-def no_storage(pid: object) -> object:
+def refuse_storage(pid: object) -> object:
     """Refuse a persistent id."""
     raise ValueError("expected no data outside of the pickle, found some")
 
 
 def read_pickle(
-    content: bytes, budget: ReadBudget, names: Names, find_storage: Callable[[object], object] = no_storage
+    content: bytes, budget: ReadBudget, names: Names, find_storage: Callable[[object], object] = refuse_storage
 ) -> Any:
     """Read a pickle; ``find_storage`` returns what a persistent id stands for.
 
@@ -54,10 +56,8 @@ def read_pickle(
                 raise ValueError(f"expected plain values, found the instruction {instruction!r}")
             _STEPS[instruction](reader)
         ((value,),) = reader.stacks
-    except IndexError as error:
-        raise ValueError("expected a value, found none") from error
-    if reader.at != len(content):
-        raise ValueError("expected the end of the pickle, found more")
+    except (IndexError, struct.error) as error:
+        raise ValueError("expected more values, found the end of the pickle or of a list") from error
     _check_depth(value)
     return value
 
@@ -88,8 +88,13 @@ class _Reader:
             raise ValueError("expected more bytes, found the end of the pickle")
         return self.content[start : self.at]
 
-    def number(self, form: str) -> Any:
-        return struct.unpack(form, self.take(struct.calcsize(form)))[0]
+    def byte(self) -> int:
+        self.at += 1
+        return self.content[self.at - 1]
+
+    def number(self, form: struct.Struct) -> Any:
+        start, self.at = self.at, self.at + form.size
+        return form.unpack_from(self.content, start)[0]
 
     def text(self, length: int) -> str:
         return str(self.take(length), "utf-8", "surrogatepass")
@@ -103,7 +108,11 @@ class _Reader:
         self.stacks[-1].append(value)
 
     def pop(self, length: int) -> list[Any]:
-        return [self.stacks[-1].pop() for _ in range(length)][::-1]
+        stack = self.stacks[-1]
+        if len(stack) < length:
+            raise IndexError
+        values, stack[-length:] = stack[-length:], []
+        return values
 
     def pop_mark(self) -> list[Any]:
         if len(self.stacks) < 2:
@@ -151,21 +160,21 @@ class _Reader:
         return target
 
 
-_STEPS: dict[bytes, Callable[[_Reader], None]] = {
-    pickle.PROTO: lambda r: r.number("B"),
-    pickle.FRAME: lambda r: r.number("<Q"),
+_STEPS: dict[bytes, Callable[[_Reader], object]] = {
+    pickle.PROTO: lambda r: r.byte(),
+    pickle.FRAME: lambda r: r.number(_U8),
     pickle.NONE: lambda r: r.push(None),
     pickle.NEWTRUE: lambda r: r.push(True),
     pickle.NEWFALSE: lambda r: r.push(False),
-    pickle.BININT: lambda r: r.push(r.number("<i")),
-    pickle.BININT1: lambda r: r.push(r.number("B")),
-    pickle.BININT2: lambda r: r.push(r.number("<H")),
-    pickle.LONG1: lambda r: r.push(int.from_bytes(r.take(r.number("B")), "little", signed=True)),
-    pickle.BINFLOAT: lambda r: r.push(r.number(">d")),
-    pickle.SHORT_BINUNICODE: lambda r: r.push(r.text(r.number("B"))),
-    pickle.BINUNICODE: lambda r: r.push(r.text(r.number("<I"))),
-    pickle.SHORT_BINBYTES: lambda r: r.push(r.take(r.number("B"))),
-    pickle.BINBYTES: lambda r: r.push(r.take(r.number("<I"))),
+    pickle.BININT: lambda r: r.push(r.number(_I4)),
+    pickle.BININT1: lambda r: r.push(r.byte()),
+    pickle.BININT2: lambda r: r.push(r.number(_U2)),
+    pickle.LONG1: lambda r: r.push(int.from_bytes(r.take(r.byte()), "little", signed=True)),
+    pickle.BINFLOAT: lambda r: r.push(r.number(_F8)),
+    pickle.SHORT_BINUNICODE: lambda r: r.push(r.text(r.byte())),
+    pickle.BINUNICODE: lambda r: r.push(r.text(r.number(_U4))),
+    pickle.SHORT_BINBYTES: lambda r: r.push(r.take(r.byte())),
+    pickle.BINBYTES: lambda r: r.push(r.take(r.number(_U4))),
     pickle.EMPTY_LIST: lambda r: r.push([]),
     pickle.APPEND: lambda r: r.extend(r.pop(1)),
     pickle.APPENDS: lambda r: r.extend(r.pop_mark()),
@@ -179,10 +188,10 @@ _STEPS: dict[bytes, Callable[[_Reader], None]] = {
     pickle.TUPLE2: lambda r: r.push(tuple(r.pop(2))),
     pickle.TUPLE3: lambda r: r.push(tuple(r.pop(3))),
     pickle.MEMOIZE: lambda r: r.put(len(r.memo)),
-    pickle.BINPUT: lambda r: r.put(r.number("B")),
-    pickle.LONG_BINPUT: lambda r: r.put(r.number("<I")),
-    pickle.BINGET: lambda r: r.push(r.memo[r.number("B")]),
-    pickle.LONG_BINGET: lambda r: r.push(r.memo[r.number("<I")]),
+    pickle.BINPUT: lambda r: r.put(r.byte()),
+    pickle.LONG_BINPUT: lambda r: r.put(r.number(_U4)),
+    pickle.BINGET: lambda r: r.push(r.memo[r.byte()]),
+    pickle.LONG_BINGET: lambda r: r.push(r.memo[r.number(_U4)]),
     pickle.GLOBAL: lambda r: r.push(r.find(r.line(), r.line())),
     pickle.STACK_GLOBAL: lambda r: r.push(r.find(*r.pop(2))),
     pickle.REDUCE: lambda r: r.push(r.call(*r.pop(2))),

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -76,8 +76,8 @@ def _rows(path: Path, cameras: Any) -> np.ndarray:
         raise SceneError(path, f"expected cameras [v,{_COLUMNS}], found {shape}")
     if not 0 < cameras.shape[0] <= MAX_VIEWS:
         raise SceneError(path, f"expected 1 to {MAX_VIEWS} cameras, found {cameras.shape[0]}")
-    if cameras.dtype is None or cameras.dtype.kind != "f":
-        raise SceneError(path, f"expected cameras of numbers, found {cameras.dtype or 'another type'}")
+    if cameras.storage.dtype is None or cameras.storage.dtype.kind != "f":
+        raise SceneError(path, f"expected cameras of numbers, found {cameras.storage.dtype or 'another type'}")
     return cameras.read().astype(np.float64)
 
 
@@ -90,7 +90,7 @@ def _photos(budget: ReadBudget, images: Any, names: list[str]) -> np.ndarray | N
         count = len(images) if listed else type(images).__name__
         raise SceneError(budget.path, f"expected {len(names)} images, one per camera, found {count}")
     for image in images:
-        if not isinstance(image, StoredTensor) or image.dtype != np.uint8 or image.strides != (1,):
+        if not isinstance(image, StoredTensor) or image.storage.dtype != np.uint8 or image.strides != (1,):
             raise SceneError(budget.path, "expected images as tensors [bytes] of uint8, found others")
     num_bytes = sum(image.size for image in images)
     if num_bytes > budget.file_bytes:
@@ -99,13 +99,17 @@ def _photos(budget: ReadBudget, images: Any, names: list[str]) -> np.ndarray | N
     return decode_embedded(budget, names, [image.read() for image in images])
 
 
+class _Storage(NamedTuple):
+    member: zipfile.ZipInfo  # with its bytes
+    dtype: np.dtype[Any] | None  # None: of a type that is not read
+
+
 @dataclass(frozen=True)
 class StoredTensor:
     """A tensor in a file whose values are read on request."""
 
     budget: ReadBudget
-    member: zipfile.ZipInfo  # with the bytes of its storage
-    dtype: np.dtype[Any] | None  # None: of a type that is not read
+    storage: _Storage
     offset: int  # of its first number in the storage
     shape: tuple[int, ...]
     strides: tuple[int, ...]  # in numbers
@@ -117,7 +121,7 @@ class StoredTensor:
 
     def read(self) -> np.ndarray:
         """Read the values; SceneError if the file does not hold them, each by itself."""
-        path, dtype = self.budget.path, self.dtype
+        path, dtype = self.budget.path, self.storage.dtype
         if dtype is None:
             raise SceneError(path, "expected plain numbers, found another type")
         span = min(self.size, 1)
@@ -134,9 +138,9 @@ class StoredTensor:
     def _bytes(self, start: int, count: int) -> bytes:
         """Read bytes of the storage, fewer where the file ends before."""
         with read_errors(self.budget.path), open(self.budget.path, "rb") as file:
-            file.seek(self.member.header_offset)
+            file.seek(self.storage.member.header_offset)
             head = file.read(_LOCAL_HEADER.size)
-            if len(head) < _LOCAL_HEADER.size or start + count > self.member.file_size:
+            if len(head) < _LOCAL_HEADER.size or start + count > self.storage.member.file_size:
                 return b""
             mark, name, more = _LOCAL_HEADER.unpack(head)
             file.seek(name + more + start, 1)
@@ -156,15 +160,16 @@ def read_torch_file(budget: ReadBudget) -> Any:
             if any(member.compress_type != zipfile.ZIP_STORED for member in members):
                 raise SceneError(path, f"{problem} packed members")
             _check_places(budget, members)
-            (name,) = (member.filename for member in members if member.filename.split("/")[1:] == ["data.pkl"])
-            content = archive.read(name)
-        folder = f"{name.removesuffix('.pkl')}/"
+            (structure,) = (member for member in members if member.filename.split("/")[1:] == ["data.pkl"])
+            content = archive.read(structure)
+        folder = f"{structure.filename.removesuffix('.pkl')}/"
         storages = {member.filename.removeprefix(folder): member for member in members}
         return read_pickle(content, budget, _names(budget), lambda pid: _find_storage(storages, pid))
     except zipfile.BadZipFile as error:
         raise SceneError(path, f"{problem} something else, or a damaged one") from error
     except (ValueError, RuntimeError, ArithmeticError, EOFError, struct.error) as error:  # of zipfile and read_pickle
-        raise SceneError(path, f"{problem} a damaged one, or objects, which are not read") from error
+        problem = f"{problem} a damaged one, or objects, which are not read ({str(error)[:100]})"
+        raise SceneError(path, problem) from error
 
 
 def _check_places(budget: ReadBudget, members: list[zipfile.ZipInfo]) -> None:
@@ -176,7 +181,7 @@ def _check_places(budget: ReadBudget, members: list[zipfile.ZipInfo]) -> None:
 
 
 def _names(budget: ReadBudget) -> Names:
-    """Table what the globals of torch's pickles stand for: of a storage the type of its numbers."""
+    """Return what the globals of torch's pickles stand for: those of storages for the type of their numbers."""
     return {
         ("collections", "OrderedDict"): _make_dictionary,
         ("torch._utils", "_rebuild_tensor_v2"): lambda arguments: _make_tensor(budget, arguments),
@@ -191,24 +196,17 @@ def _make_dictionary(arguments: tuple[object, ...]) -> dict[str, object]:
     return {}
 
 
-def _find_storage(storages: Mapping[str, zipfile.ZipInfo], pid: object) -> object:
+def _find_storage(storages: Mapping[str, zipfile.ZipInfo], pid: object) -> _Storage:
     match pid:
-        case ("storage", dtype, str(key), _, _) if key in storages:
-            return storages[key], dtype
+        case ("storage", None | np.dtype() as dtype, str(key), _, _) if key in storages:
+            return _Storage(storages[key], dtype)
     raise ValueError("expected a storage of the file, found none")
 
 
 def _make_tensor(budget: ReadBudget, arguments: object) -> StoredTensor:
     match arguments:
-        case (
-            (zipfile.ZipInfo() as member, None | np.dtype() as dtype),
-            int(offset),
-            tuple(shape),
-            tuple(strides),
-            _,
-            _,
-        ):
-            numbers = (offset, *shape, *strides) if len(shape) == len(strides) <= _MAX_AXES else (None,)
-            if all(type(number) is int and 0 <= number < _MAX_INDEX for number in numbers):
-                return StoredTensor(budget, member, dtype, offset, shape, strides)
+        case (_Storage() as storage, int(offset), tuple(shape), tuple(strides), _, _):
+            numbers = (offset, *shape, *strides) if len(shape) == len(strides) <= _MAX_AXES else ()
+            if set(map(type, numbers)) == {int} and 0 <= min(numbers) <= max(numbers) < _MAX_INDEX:
+                return StoredTensor(budget, storage, offset, shape, strides)
     raise ValueError("expected a tensor, found one of another form")
