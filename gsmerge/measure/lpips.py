@@ -247,7 +247,7 @@ def _values(stored: Any, shape: tuple[int, ...]) -> np.ndarray:
 class _StoredArray(StandIn):
     """Stands for a numpy array in a pickle: takes its state, bytes and a shape, and nothing else."""
 
-    values = np.zeros(0, np.float32)
+    values: np.ndarray = np.zeros(0, np.float32)
 
     def set_state(self, state: object) -> None:
         """Take the values of an array of float32."""
