@@ -32,6 +32,8 @@ _OPAQUE_SUFFIXES = frozenset({".jpg", ".jpeg", ".ppm"})
 _HALF_OPAQUE = 127
 ASPECT_TOLERANCE = 0.04  # of width over height: backbones round each side to a multiple of 14 by itself
 _PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
+_JPEG, _SCAN = b"\xff\xd8", b"\xff\xda"  # marks of a file and of its scans, of which a progressive one has any number
+_PIXELS_PER_STEP = 50_000  # of a scan that changes nothing
 _PNG_CHUNKS = frozenset({b"IHDR", b"PLTE", b"tRNS", b"IDAT"})
 
 Size = tuple[int, int]  # width, height, pixels
@@ -97,7 +99,9 @@ def keep_photos(photos: Photos) -> Photos:
 def decode_image(path: Path, size: Size) -> np.ndarray:
     """Decode an image file of known size to ``[h,w,3]`` uint8 sRGB; SceneError if it cannot be read."""
     with read_errors(path):
-        return _decode(path, np.fromfile(path, np.uint8), size)
+        data = np.fromfile(path, np.uint8)
+    _check_scans(ReadBudget(path, len(data)), [data], size)
+    return _decode(path, data, size)
 
 
 def as_floats(images: Photos) -> np.ndarray:
@@ -230,9 +234,16 @@ def decode_embedded(budget: ReadBudget, names: Sequence[str], files: Sequence[np
     if odd is not None:
         raise SceneError(path, f"{odd}: expected images of one size, found another than {width} x {height}")
     budget.check_memory(3 * width * height * len(files), f"{len(files)} photos")
+    _check_scans(budget, files, sizes[0])
     out = np.empty((len(files), height, width, 3), np.uint8)
     parallel_map(lambda i: np.copyto(out[i], _decode(path, files[i], sizes[i])), range(len(files)))
     return out
+
+
+def _check_scans(budget: ReadBudget, files: Sequence[np.ndarray], size: Size) -> None:
+    """Raise SceneError if JPEG files have more scans, each a walk over all pixels, than there is time for."""
+    num_scans = sum(data.tobytes().count(_SCAN) for data in files if data[:2].tobytes() == _JPEG)
+    budget.check_steps(num_scans * size[0] * size[1] // _PIXELS_PER_STEP, f"steps of decoding {num_scans:,} scans")
 
 
 def _decode(path: Path, data: np.ndarray, size: Size) -> np.ndarray:

@@ -67,7 +67,7 @@ def _check_depth(value: object) -> None:
     level: list[Any] = [[value]]
     for _ in range(_MAX_DEPTH):
         inner = (item for each in level for item in (each.values() if isinstance(each, dict) else each))
-        level = list({id(item): item for item in inner if isinstance(item, list | tuple | dict)}.values())
+        level = list({id(item): item for item in inner if isinstance(item, list | tuple | dict) and item}.values())
         if not level:
             return
     raise ValueError(f"expected at most {_MAX_DEPTH} containers in one another, found more")

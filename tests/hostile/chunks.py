@@ -151,6 +151,13 @@ def wide_photos(entry: dict[str, Any], _: Path) -> None:
     entry["images"] = [torch.from_numpy(data.copy()) for _ in range(VIEWS)]
 
 
+def many_scans(entry: dict[str, Any], _: Path) -> None:
+    """Progressive photos whose last scan, of 16 bytes, is there 40,000 times."""
+    data = cv2.imencode(".jpg", np.zeros((2048, 2048), np.uint8), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
+    data = data[:-2] + data[data.rindex(b"\xff\xda") : -2] * 40_000 + data[-2:]
+    entry["images"] = [torch.frombuffer(bytearray(data), dtype=torch.uint8) for _ in range(VIEWS)]
+
+
 def one_photo(entry: dict[str, Any], _: Path) -> None:
     """A photo of 300 kB that has as many names as there are cameras."""
     entry.update(cameras=entry["cameras"][:1].repeat(MANY, 1), images=[torch.zeros(300_000, dtype=torch.uint8)] * MANY)
@@ -218,6 +225,7 @@ def _shapes() -> dict[str, Case]:
     cases["one scene and a part of one"] = Case(saved(lambda entry, _: [entry, {"key": "b"}]), says=listed)
     cases["images that are one tensor"] = Case(saved(one_photo), says=("images", "3,000,000,000"))
     cases["images of 150 MB in few bytes"] = Case(saved(wide_photos), says=("memory", "3 photos"))
+    cases["images of 40,000 scans"] = Case(saved(many_scans), says=("steps", "scans"))
     cases["a key of many lists"] = Case(saved(printed_for_ever), says=("key", "2"))
     cases["a key that is no text"] = Case(saved(lambda entry, _: [{**entry, "key": "\ud800"}, {**entry, "key": "b"}]))
     cases["images of two sizes"] = Case(saved(two_sizes), says=("images", "size"))
