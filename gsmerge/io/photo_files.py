@@ -34,6 +34,7 @@ ASPECT_TOLERANCE = 0.04  # of width over height: backbones round each side to a 
 _PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
 _JPEG, _SCAN = b"\xff\xd8", b"\xff\xda"  # marks of a file and of its scans, of which a progressive one has any number
 _PIXELS_PER_STEP = 50_000  # of a scan that changes nothing
+_DECODING_BYTES = 9  # more of a pixel while a photo is decoded: a copy, and the coefficients of a progressive JPEG
 _PNG_CHUNKS = frozenset({b"IHDR", b"PLTE", b"tRNS", b"IDAT"})
 
 Size = tuple[int, int]  # width, height, pixels
@@ -225,7 +226,7 @@ def _header_size(path: Path, file: BinaryIO) -> Size:
 def decode_embedded(budget: ReadBudget, names: Sequence[str], files: Sequence[np.ndarray]) -> np.ndarray:
     """Decode images that a file holds as image files in bytes (``[b]`` uint8) to ``[c,h,w,3]`` uint8.
 
-    SceneError if one cannot be decoded, two differ in size, or they take more memory than the file's budget.
+    SceneError if one cannot be decoded, two differ in size, or they take more memory or time than the file's budget.
     """
     path = Path(budget.path)
     sizes = [_header_size(path, io.BytesIO(data.tobytes())) for data in files]
@@ -233,7 +234,8 @@ def decode_embedded(budget: ReadBudget, names: Sequence[str], files: Sequence[np
     odd = next((name for name, size in zip(names, sizes, strict=True) if size != sizes[0]), None)
     if odd is not None:
         raise SceneError(path, f"{odd}: expected images of one size, found another than {width} x {height}")
-    budget.check_memory(3 * width * height * len(files), f"{len(files)} photos")
+    num_bytes = (3 * len(files) + _DECODING_BYTES) * width * height
+    budget.check_memory(num_bytes, f"{len(files)} photos of {width} x {height}")
     _check_scans(budget, files, sizes[0])
     out = np.empty((len(files), height, width, 3), np.uint8)
     parallel_map(lambda i: np.copyto(out[i], _decode(path, files[i], sizes[i])), range(len(files)))

@@ -66,7 +66,7 @@ def _check_depth(value: object) -> None:
     """Raise ValueError if containers are nested deeply, or one holds itself."""
     level: list[Any] = [[value]]
     for _ in range(_MAX_DEPTH):
-        inner = (item for each in level for item in (each.values() if isinstance(each, dict) else each))
+        inner = (item for outer in level for item in (outer.values() if isinstance(outer, dict) else outer))
         level = list({id(item): item for item in inner if isinstance(item, list | tuple | dict) and item}.values())
         if not level:
             return

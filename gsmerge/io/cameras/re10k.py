@@ -120,14 +120,15 @@ class StoredTensor:
         return prod(self.shape)
 
     def read(self) -> np.ndarray:
-        """Read the values; SceneError if the file does not hold them, each by itself."""
+        """Read the values; SceneError if the file does not hold each of them."""
         path, dtype = self.budget.path, self.storage.dtype
         if dtype is None:
             raise SceneError(path, "expected plain numbers, found another type")
         span = min(self.size, 1)
         for stride, length in sorted(zip(self.strides, self.shape, strict=True)):
             if length > 1 and stride < span:
-                raise SceneError(path, "expected a number for each value of a tensor, found values that share some")
+                problem = "expected a tensor that stores each value, found an expanded or overlapping one"
+                raise SceneError(path, problem, "save a contiguous copy")
             span += (length - 1) * stride if self.size else 0
         content = self._bytes(dtype.itemsize * self.offset, dtype.itemsize * span)
         if len(content) < dtype.itemsize * span:
