@@ -12,7 +12,6 @@ import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import prod
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,6 +22,7 @@ from gsmerge.io.cameras.camera_file import View, make_pinhole
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
 from gsmerge.io.photo_files import decode_embedded, photo_size
 from gsmerge.io.pickles import Names, read_pickle
+from gsmerge.types import StrPath
 
 SUFFIX = ".torch"
 _COLUMNS = 18  # fx fy cx cy 0 0, then world to camera, 3x4
@@ -50,8 +50,11 @@ def read_re10k(source: CameraSource) -> StoredCameras:
         keys = ", ".join(key[:40] for entry in entries[:3] if isinstance(key := entry.get("key"), str))
         problem = f"expected one scene with the key {scene!r}, found {len(named)} among {len(entries)} ({keys}, ...)"
         raise SceneError(path, problem, "name the .ply as its scene is named")
-    entry = entries[0] if len(entries) == 1 else named[0]
-    rows = _rows(path, entry.get("cameras"))
+    return _read_scene(budget, entries[0] if len(entries) == 1 else named[0])
+
+
+def _read_scene(budget: ReadBudget, entry: Mapping[str, Any]) -> StoredCameras:
+    rows = _rows(budget.path, entry.get("cameras"))
     names = [f"view {i}" for i in range(len(rows))]
     photos = _photos(budget, entry.get("images"), names)
     size = photo_size(photos) or (0, 0)
@@ -70,7 +73,7 @@ def _load(budget: ReadBudget) -> list[Mapping[str, Any]]:
     return entries
 
 
-def _rows(path: Path, cameras: Any) -> np.ndarray:
+def _rows(path: StrPath, cameras: Any) -> np.ndarray:
     if not isinstance(cameras, StoredTensor) or cameras.shape[1:] != (_COLUMNS,):
         shape = list(cameras.shape) if isinstance(cameras, StoredTensor) else type(cameras).__name__
         raise SceneError(path, f"expected cameras [v,{_COLUMNS}], found {shape}")
@@ -92,10 +95,6 @@ def _photos(budget: ReadBudget, images: Any, names: list[str]) -> np.ndarray | N
     for image in images:
         if not isinstance(image, StoredTensor) or image.storage.dtype != np.uint8 or image.strides != (1,):
             raise SceneError(budget.path, "expected images as tensors [bytes] of uint8, found others")
-    num_bytes = sum(image.size for image in images)
-    if num_bytes > budget.file_bytes:
-        problem = f"expected images of at most the file's {budget.file_bytes:,} bytes, found {num_bytes:,}"
-        raise SceneError(budget.path, problem, "save each image once")
     return decode_embedded(budget, names, [image.read() for image in images])
 
 
@@ -104,11 +103,26 @@ class _Storage(NamedTuple):
     dtype: np.dtype[Any] | None  # None: of a type that is not read
 
 
+@dataclass
+class _TorchFile:
+    """A file whose tensors are read, all of which together have at most its bytes."""
+
+    budget: ReadBudget
+    num_bytes: int = 0  # read so far
+
+    def count(self, num_bytes: int) -> None:
+        """Count bytes that are read next; SceneError if they are more than the file has."""
+        self.num_bytes += num_bytes
+        if self.num_bytes > self.budget.file_bytes:
+            problem = f"expected tensors of at most the file's {self.budget.file_bytes:,} bytes in all, found more"
+            raise SceneError(self.budget.path, problem, "save each once")
+
+
 @dataclass(frozen=True)
 class StoredTensor:
     """A tensor in a file whose values are read on request."""
 
-    budget: ReadBudget
+    file: _TorchFile
     storage: _Storage
     offset: int  # of its first number in the storage
     shape: tuple[int, ...]
@@ -121,7 +135,7 @@ class StoredTensor:
 
     def read(self) -> np.ndarray:
         """Read the values; SceneError if the file does not hold each of them."""
-        path, dtype = self.budget.path, self.storage.dtype
+        path, dtype = self.file.budget.path, self.storage.dtype
         if dtype is None:
             raise SceneError(path, "expected plain numbers, found another type")
         span = min(self.size, 1)
@@ -130,6 +144,7 @@ class StoredTensor:
                 problem = "expected a tensor that stores each value, found an expanded or overlapping one"
                 raise SceneError(path, problem, "save a contiguous copy")
             span += (length - 1) * stride if self.size else 0
+        self.file.count(dtype.itemsize * self.size)
         content = self._bytes(dtype.itemsize * self.offset, dtype.itemsize * span)
         if len(content) < dtype.itemsize * span:
             raise SceneError(path, "expected a chunk written by torch.save, found a damaged one")
@@ -138,7 +153,8 @@ class StoredTensor:
 
     def _bytes(self, start: int, count: int) -> bytes:
         """Read bytes of the storage, fewer where the file ends before."""
-        with read_errors(self.budget.path), open(self.budget.path, "rb") as file:
+        path = self.file.budget.path
+        with read_errors(path), open(path, "rb") as file:
             file.seek(self.storage.member.header_offset)
             head = file.read(_LOCAL_HEADER.size)
             if len(head) < _LOCAL_HEADER.size or start + count > self.storage.member.file_size:
@@ -183,9 +199,10 @@ def _check_places(budget: ReadBudget, members: list[zipfile.ZipInfo]) -> None:
 
 def _names(budget: ReadBudget) -> Names:
     """Return what the globals of torch's pickles stand for: those of storages for the type of their numbers."""
+    file = _TorchFile(budget)
     return {
         ("collections", "OrderedDict"): _make_dictionary,
-        ("torch._utils", "_rebuild_tensor_v2"): lambda arguments: _make_tensor(budget, arguments),
+        ("torch._utils", "_rebuild_tensor_v2"): lambda arguments: _make_tensor(file, arguments),
         ("torch._utils", "_rebuild_parameter"): lambda arguments: arguments[0],
         **{("torch", name): dtype and np.dtype(dtype) for name, dtype in _DTYPES.items()},
     }
@@ -204,10 +221,10 @@ def _find_storage(storages: Mapping[str, zipfile.ZipInfo], pid: object) -> _Stor
     raise ValueError("expected a storage of the file, found none")
 
 
-def _make_tensor(budget: ReadBudget, arguments: object) -> StoredTensor:
+def _make_tensor(file: _TorchFile, arguments: object) -> StoredTensor:
     match arguments:
         case (_Storage() as storage, int(offset), tuple(shape), tuple(strides), _, _):
             numbers = (offset, *shape, *strides) if len(shape) == len(strides) <= _MAX_AXES else ()
             if set(map(type, numbers)) == {int} and 0 <= min(numbers) <= max(numbers) < _MAX_INDEX:
-                return StoredTensor(budget, storage, offset, shape, strides)
+                return StoredTensor(file, storage, offset, shape, strides)
     raise ValueError("expected a tensor, found one of another form")
